@@ -1,0 +1,116 @@
+"""A session in memory: the finger as ID.1 gives it, and the trials, in NumPy, as the file holds them (SI units)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+EXPERIMENTS = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4", "VD.1", "VD.2", "VD.3")
+
+
+@dataclass(frozen=True)
+class FingerDescription:
+    """`/finger`: m joints from base to tip, n tendons; frames as in the format (x to the tip, z dorsal).
+
+    Lengths m, masses kg, inertia kg m² about the centre of mass, gravity m/s² in the base frame.
+    `mass_std` and `com_std` are None where CAD and scale gave none.
+    """
+
+    gravity: Float[np.ndarray, "3"]
+    joint_names: tuple[str, ...]
+    axis: Float[np.ndarray, "m 3"]
+    origin: Float[np.ndarray, "m 3"]
+    limits: Float[np.ndarray, "m 2"]
+    mass: Float[np.ndarray, " m"]
+    com: Float[np.ndarray, "m 3"]
+    inertia: Float[np.ndarray, "m 3 3"]
+    fingertip: Float[np.ndarray, "3"]
+    tendon_names: tuple[str, ...]
+    active: Bool[np.ndarray, " n"]
+    crosses: Bool[np.ndarray, "n m"]
+    prismatic: tuple[bool, ...] = ()
+    mass_std: Float[np.ndarray, " m"] | None = None
+    com_std: Float[np.ndarray, "m 3"] | None = None
+
+    def __post_init__(self):
+        if not self.prismatic:
+            object.__setattr__(self, "prismatic", (False,) * len(self.joint_names))
+
+    @property
+    def m(self) -> int:
+        """Number of joints."""
+        return len(self.joint_names)
+
+    @property
+    def n(self) -> int:
+        """Number of tendons, passive ones included."""
+        return len(self.tendon_names)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """`/trials/<name>`: one recording of N samples. Channels that the trial did not measure are None; columns NaN."""
+
+    name: str
+    experiment: str
+    time: Float[np.ndarray, " N"]
+    q: Float[np.ndarray, "N m"]
+    tendon_force: Float[np.ndarray, "N n"] | None = None
+    tendon_excursion: Float[np.ndarray, "N n"] | None = None
+    joint_torque: Float[np.ndarray, "N m"] | None = None
+    fingertip_force: Float[np.ndarray, "N 3"] | None = None
+    joint_direction: Int[np.ndarray, "N m"] | None = None
+    tendon_direction: Int[np.ndarray, "N n"] | None = None
+    hold: Int[np.ndarray, " N"] | None = None
+    joint: str | None = None
+    tendon: str | None = None
+    complete: bool = True
+    motion: str | None = None
+    session_start: float | None = None
+
+    @property
+    def duration(self) -> float:
+        """Length of the recording in s."""
+        return float(self.time[-1] - self.time[0]) if len(self.time) else 0.0
+
+
+@dataclass(frozen=True)
+class Session:
+    """One specimen, its finger, and its trials by name (in the order of the session)."""
+
+    specimen: str
+    finger: FingerDescription
+    trials: Mapping[str, Trial] = field(default_factory=dict)
+    source: str = "jaxfinger"
+    created: str = ""
+    file: str = ""  # where it was read from; empty in memory
+
+    def __iter__(self) -> Iterator[Trial]:
+        return iter(self.trials.values())
+
+    def __len__(self) -> int:
+        return len(self.trials)
+
+    def __getitem__(self, name: str) -> Trial:
+        return self.trials[name]
+
+    def select(
+        self, *experiments: str, joint: str | None = None, tendon: str | None = None, complete: bool | None = None
+    ) -> Session:
+        """The session with only the trials of these experiments (all if none named), joint and tendon."""
+        keep = {
+            t.name: t
+            for t in self
+            if (not experiments or t.experiment in experiments)
+            and (joint is None or t.joint == joint)
+            and (tendon is None or t.tendon == tendon)
+            and (complete is None or t.complete == complete)
+        }
+        return replace(self, trials=keep)
+
+    def with_trials(self, names) -> Session:
+        """The session with only the named trials."""
+        return replace(self, trials={name: self.trials[name] for name in names})
