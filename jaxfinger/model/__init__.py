@@ -1,1 +1,39 @@
-"""."""
+"""Equation (1) of the paper as pure functions of a parameter pytree and a motion; estimation needs float64."""
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+from jaxfinger.model.dynamics import (  # noqa: E402
+    elastic_and_friction,
+    excursion,
+    external_torque,
+    fingertip_force,
+    joint_tension,
+    memories,
+)
+from jaxfinger.model.finger import Finger  # noqa: E402
+from jaxfinger.model.joint_torque import JointTorque  # noqa: E402
+from jaxfinger.model.model import Effect, Model  # noqa: E402
+from jaxfinger.model.moment_arm import MomentArm  # noqa: E402
+from jaxfinger.model.motion import Motion  # noqa: E402
+from jaxfinger.model.simulate import forward_dynamics, simulate  # noqa: E402
+from jaxfinger.model.tendon_friction import TendonFriction  # noqa: E402
+
+__all__ = [
+    "Effect",
+    "Finger",
+    "JointTorque",
+    "Model",
+    "MomentArm",
+    "Motion",
+    "TendonFriction",
+    "elastic_and_friction",
+    "excursion",
+    "external_torque",
+    "fingertip_force",
+    "forward_dynamics",
+    "joint_tension",
+    "memories",
+    "simulate",
+]

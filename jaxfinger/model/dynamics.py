@@ -1,0 +1,127 @@
+"""Equation (1), once:
+
+    M(q) q̈ + N(q, q̇) + G(q) + h(q, q̇) = Cᵀ(q) (f_t − f_f) + Jᵀ(q) f_ext + τ_ext
+
+Every experiment reads one of its unknowns from the others; all functions broadcast over the batch, which is last.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxfinger.model import rigid_body
+from jaxfinger.model.finger import Finger
+from jaxfinger.model.model import Memory, Model
+from jaxfinger.model.motion import Motion
+from jaxfinger.model.tendon_friction import bounded, held
+
+
+class Terms(NamedTuple):
+    """The terms of (1) other than the rigid body's, for one motion."""
+
+    finger: Finger
+    f_t: Float[Array, "n *T"]  # tension that enters the tendon's path, N
+    C: Float[Array, "n m *T"]
+    loss: Float[Array, "n *T"]  # of a sliding tendon, N
+    f_j: Float[Array, "n *T"]  # f_t − f_f: tension at the joints, N
+    h: Float[Array, "m *T"]  # τ_k + τ_d, N m
+    friction: Float[Array, "m *T"]  # |τ_f|, N m
+    direction: Float[Array, "m *T"]  # share of it that is built up
+    tendon_direction: Float[Array, "n *T"]
+
+
+def memories(model: Model, x: Motion) -> tuple[Memory, ...]:
+    """State of every effect with memory at each sample, driven along the motion's last axis."""
+    return tuple(_along(effect, x) if effect.has_memory else () for effect in model.effects)
+
+
+def _along(effect, x: Motion) -> Memory:
+    samples = jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), x)
+    first = jax.tree.map(lambda a: a[0], samples)
+
+    def step(carry, sample):
+        memory, before = carry
+        memory = effect.next_memory(memory, before, sample)
+        return (memory, sample), memory
+
+    _, memory = jax.lax.scan(step, (effect.initial_memory(first), first), samples)
+    return jax.tree.map(lambda a: jnp.moveaxis(a, 0, -1), memory)
+
+
+def terms(model: Model, x: Motion, memory: tuple[Memory, ...]) -> Terms:
+    """Each term as the nominal model has it, then as the effects change it."""
+    effects = list(zip(model.effects, memory, strict=True))
+    finger, f_t = model.finger, x.tension
+    direction, tendon_direction = x.joint_direction, x.tendon_direction
+    for effect, state in effects:
+        finger = effect.finger(finger)
+        f_t = effect.tension(x, state, f_t)
+        direction, tendon_direction = effect.directions(x, state, direction, tendon_direction)
+
+    C = model.moment_arm.coupling(x.q)
+    for effect, _ in effects:
+        C = effect.coupling(x, f_t, C)
+    loss = model.tendon_friction.loss(f_t)
+    for effect, _ in effects:
+        loss = effect.loss(x, f_t, C, loss)
+    loss = bounded(loss, f_t)
+    f_j = held(f_t, loss) if x.held else f_t - tendon_direction * loss
+
+    h = model.joint_torque.elastic_torque(x.q) + model.joint_torque.damping_torque(x.qd)
+    friction = model.joint_torque.friction_magnitude(x.q)
+    for effect, state in effects:
+        h = effect.torque(x, state, h)
+        friction = effect.joint_friction(x, f_j, C, friction)
+    return Terms(finger, f_t, C, loss, f_j, h, friction, direction, tendon_direction)
+
+
+def external_torque(model: Model, x: Motion, f_ext: Float[Array, "3 *T"] | None = None) -> Float[Array, "m *T"]:
+    """τ_ext of (1): the torque that must act on the joints from outside for the motion to be as it is, N m."""
+    e = terms(model, x, memories(model, x))
+    tau = rigid_body.inverse_dynamics(e.finger, x.q, x.qd, x.qdd) + e.h + e.direction * e.friction
+    tau = tau - jnp.sum(e.C * e.f_j[:, None], axis=0)
+    if f_ext is not None:
+        _, J = rigid_body.fingertip(e.finger, x.q)
+        tau = tau - jnp.sum(J * f_ext[:, None], axis=0)
+    return tau
+
+
+def fingertip_force(model: Model, x: Motion) -> Float[Array, "3 *T"]:
+    """f_ext at rest, base frame, N: the least-squares solution of Jᵀ f_ext = G + h − Cᵀ(f_t − f_f).
+
+    The joints over-determine a planar contact force; what it cannot take is taken by the joints' static friction. A
+    direction in which the fingertip cannot be moved carries no force.
+    """
+    tau = external_torque(model, x)
+    _, J = rigid_body.fingertip(model.finger, x.q)
+    # (J Jᵀ + ε I) f = J τ, the minimum-norm solution as ε → 0.
+    gram = jnp.sum(J[:, None] * J[None], axis=2)
+    eps = 1e-10 * (gram[0, 0] + gram[1, 1] + gram[2, 2])
+    matrix = jnp.moveaxis(gram, (0, 1), (-2, -1)) + eps[..., None, None] * jnp.eye(3)
+    rhs = jnp.moveaxis(jnp.sum(J * tau[None], axis=1), 0, -1)
+    return jnp.moveaxis(jnp.linalg.solve(matrix, rhs[..., None])[..., 0], -1, 0)
+
+
+def excursion(model: Model, x: Motion) -> Float[Array, "n *T"]:
+    """l, m: f(q), and what the effects add."""
+    l = model.moment_arm.excursion(x.q)
+    f = x.tension
+    states = memories(model, x)
+    for effect, state in zip(model.effects, states, strict=True):
+        f = effect.tension(x, state, f)
+    for effect, state in zip(model.effects, states, strict=True):
+        l = effect.excursion(x, state, f, l)
+    return l
+
+
+def joint_tension(model: Model, x: Motion) -> Float[Array, "n *T"]:
+    """f_t − f_f: the tension that reaches the joints, N."""
+    return terms(model, x, memories(model, x)).f_j
+
+
+def elastic_and_friction(model: Model, x: Motion) -> Float[Array, "m *T"]:
+    """h of (1), N m."""
+    e = terms(model, x, memories(model, x))
+    return e.h + e.direction * e.friction

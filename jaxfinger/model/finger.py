@@ -1,0 +1,76 @@
+"""What ID.1 gives: the rigid chain, its inertia, how it is mounted, and which tendon crosses which joint."""
+
+from typing import Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class Description(Protocol):
+    """The arrays of ID.1, however they were read."""
+
+    gravity: Array
+    axis: Array
+    origin: Array
+    mass: Array
+    com: Array
+    inertia: Array
+    fingertip: Array
+    prismatic: tuple[bool, ...]
+    joint_names: tuple[str, ...]
+    tendon_names: tuple[str, ...]
+    active: Array
+    crosses: Array
+
+
+class Finger(eqx.Module):
+    """A serial chain of m joints, base to tip, moved by n tendons.
+
+    Link i moves with joint i; its frame sits on the joint and is parallel to its parent's frame at q = 0. A positive
+    angle about `axis` is flexion or abduction. A prismatic joint moves along its axis.
+    """
+
+    gravity: Float[Array, "3"]  # m/s², base frame
+    axis: Float[Array, "m 3"]
+    origin: Float[Array, "m 3"]  # m, in the parent link's frame
+    mass: Float[Array, " m"]  # kg
+    com: Float[Array, "m 3"]  # m, in the link frame
+    inertia: Float[Array, "m 3 3"]  # kg m², about the centre of mass
+    fingertip: Float[Array, "3"]  # m, in the last link's frame
+    prismatic: tuple[bool, ...] = eqx.field(static=True)
+    joint_names: tuple[str, ...] = eqx.field(static=True)
+    tendon_names: tuple[str, ...] = eqx.field(static=True)
+    active: tuple[bool, ...] = eqx.field(static=True)
+    crosses: tuple[tuple[bool, ...], ...] = eqx.field(static=True)  # n rows of m
+
+    @classmethod
+    def from_description(cls, d: Description) -> "Finger":
+        """From anything that holds the arrays of ID.1 under the format's names."""
+        arrays = {
+            k: jnp.asarray(getattr(d, k), dtype=float)
+            for k in ("gravity", "axis", "origin", "mass", "com", "inertia", "fingertip")
+        }
+        return cls(
+            **arrays,
+            prismatic=tuple(bool(p) for p in d.prismatic),
+            joint_names=tuple(d.joint_names),
+            tendon_names=tuple(d.tendon_names),
+            active=tuple(bool(a) for a in d.active),
+            crosses=tuple(tuple(bool(c) for c in row) for row in d.crosses),
+        )
+
+    @property
+    def m(self) -> int:
+        """Number of joints."""
+        return len(self.joint_names)
+
+    @property
+    def n(self) -> int:
+        """Number of tendons, passive ones included."""
+        return len(self.tendon_names)
+
+    def expand(self, dims: int) -> "Finger":
+        """The same finger with `dims` trailing axes of length one, to broadcast against a batch."""
+        return jax.tree.map(lambda x: x.reshape(x.shape + (1,) * dims), self)

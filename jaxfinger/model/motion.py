@@ -1,0 +1,24 @@
+"""What drives the finger: measured, commanded or simulated; batch last, time the very last axis."""
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+
+class Motion(eqx.Module):
+    """The state and inputs of equation (1) at the same instants.
+
+    Directions are the signs s(q̇), s(l̇) in [−1, 1]: the protocol's where it is known, smooth where a derivative is needed.
+    A tendon without tension measurement (passive, slack) carries zero. `held`: a fixture holds the joints, so that
+    tendons move only when their loss is exceeded.
+    """
+
+    time: Float[Array, "*T"]  # s, from the trial's start
+    q: Float[Array, "m *T"]  # rad
+    qd: Float[Array, "m *T"]  # rad/s
+    qdd: Float[Array, "m *T"]  # rad/s²
+    tension: Float[Array, "n *T"]  # N, at the actuator
+    joint_direction: Float[Array, "m *T"]
+    tendon_direction: Float[Array, "n *T"]
+    session_time: Float[Array, "*T"]  # s, from the session's start
+    motorised: Float[Array, "m *T"]  # 1 where the external motor is coupled to the joint
+    held: bool = eqx.field(static=True, default=False)

@@ -1,0 +1,122 @@
+"""Forward dynamics, and simulation in time under measured tension.
+
+Coulomb friction is a set-valued law: regularised with a narrow tanh it is stiff, and explicit steps give right-looking
+trajectories with meaningless derivatives. Moreau's midpoint rule (Moreau 1988; Acary & Brogliato 2008, ch. 10) solves
+for the friction impulses of a step instead, so that joints and tendons stick and slide without a smoothing width.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxfinger.model import rigid_body
+from jaxfinger.model.dynamics import terms
+from jaxfinger.model.model import Memory, Model
+from jaxfinger.model.motion import Motion
+
+SWEEPS = 12  # of projected Gauss–Seidel over the frictions of a step, warm-started from the last step
+
+
+def forward_dynamics(
+    model: Model, x: Motion, memory: tuple[Memory, ...], tau_ext: Float[Array, " m"] | float = 0.0
+) -> Float[Array, " m"]:
+    """q̈ of (1) at one sample, rad/s², friction in the directions that `x` states."""
+    e = terms(model, x, memory)
+    resisting = rigid_body.inverse_dynamics(e.finger, x.q, x.qd, jnp.zeros_like(x.q)) + e.h + e.direction * e.friction
+    return jnp.linalg.solve(rigid_body.mass_matrix(e.finger, x.q), e.C.T @ e.f_j + tau_ext - resisting)
+
+
+class _State(NamedTuple):
+    x: Motion
+    memory: tuple[Memory, ...]
+    friction: Float[Array, " m+n"]  # torques and tensions of friction, N m and N
+
+
+def simulate(
+    model: Model,
+    time: Float[Array, " T"],
+    tension: Float[Array, "n T"],
+    q0: Float[Array, " m"],
+    qd0: Float[Array, " m"],
+    tau_ext: Float[Array, "m T"] | None = None,
+    session_start: float = 0.0,
+    substeps: int = 2,
+) -> tuple[Float[Array, "m T"], Float[Array, "m T"]]:
+    """q, rad, and q̇, rad/s, from the first sample on, under the tension measured at the uniform instants `time`."""
+    dt = (time[1] - time[0]) / substeps
+    if tau_ext is None:
+        tau_ext = jnp.zeros((model.finger.m, time.size))
+    unknown_m, unknown_n = jnp.full(model.finger.m, jnp.nan), jnp.full(model.finger.n, jnp.nan)
+
+    def motion(t, q, qd, f):
+        return Motion(
+            t, q, qd, jnp.zeros_like(q), f, unknown_m, unknown_n, t + session_start, jnp.zeros_like(q)
+        )
+
+    x0 = motion(time[0], q0, qd0, tension[:, 0])
+    memory0 = tuple(effect.initial_memory(x0) for effect in model.effects)
+    state0 = _State(x0, memory0, jnp.zeros(model.finger.m + model.finger.n))
+
+    def sample(state, inputs):
+        t, f0, f1, tau0, tau1 = inputs
+
+        def substep(state, share):
+            f, tau = f0 + share * (f1 - f0), tau0 + share * (tau1 - tau0)
+            return _step(model, state, motion, t + share * dt * substeps, f, tau, dt), None
+
+        state, _ = jax.lax.scan(substep, state, (jnp.arange(substeps) + 0.5) / substeps)
+        return state, (state.x.q, state.x.qd)
+
+    inputs = (time[:-1], tension.T[:-1], tension.T[1:], tau_ext.T[:-1], tau_ext.T[1:])
+    _, (q, qd) = jax.lax.scan(sample, state0, inputs)
+    return jnp.concatenate([q0[:, None], q.T], axis=1), jnp.concatenate([qd0[:, None], qd.T], axis=1)
+
+
+def _step(model: Model, state: _State, motion, t, f, tau, dt) -> _State:
+    """One midpoint step: forces at the middle position, friction from the velocity that it leads to."""
+    qd = state.x.qd
+    x = motion(t, state.x.q + 0.5 * dt * qd, qd, f)
+    memory = tuple(
+        effect.next_memory(m, state.x, x) for effect, m in zip(model.effects, state.memory, strict=True)
+    )
+    # A direction that no effect has resolved is NaN: its friction is solved for below.
+    known = eqx.tree_at(
+        lambda x: (x.joint_direction, x.tendon_direction), x, (jnp.zeros_like(qd), jnp.zeros_like(f))
+    )
+    e = terms(model, known, memory)
+    open_joint, open_tendon = _unresolved(model, x, memory)
+    M = rigid_body.mass_matrix(e.finger, x.q)
+    resisting = rigid_body.inverse_dynamics(e.finger, x.q, qd, jnp.zeros_like(qd)) + e.h + e.direction * e.friction
+    M_inv = jnp.linalg.inv(M)
+    free = qd + dt * M_inv @ (e.C.T @ e.f_j + tau - resisting)
+
+    D = jnp.concatenate([jnp.eye(qd.size), e.C])  # rates of joints and tendons: D q̇
+    limit = jnp.concatenate([jnp.where(open_joint, e.friction, 0.0), jnp.where(open_tendon, e.loss, 0.0)])
+    A = dt * D @ M_inv @ D.T
+    friction = _gauss_seidel(A, D @ free, limit, state.friction)
+    qd = free - dt * M_inv @ (D.T @ friction)
+    x = eqx.tree_at(lambda x: (x.q, x.qd), x, (x.q + 0.5 * dt * qd, qd))
+    return _State(x, memory, friction)
+
+
+def _unresolved(model: Model, x: Motion, memory):
+    joint, tendon = x.joint_direction, x.tendon_direction
+    for effect, m in zip(model.effects, memory, strict=True):
+        joint, tendon = effect.directions(x, m, joint, tendon)
+    return jnp.isnan(joint), jnp.isnan(tendon)
+
+
+def _gauss_seidel(A, rates, limit, start):
+    """Friction λ with |λ| ≤ limit that opposes the rates v = rates − A λ which remain: λ_i = limit_i sign(v_i)."""
+    diagonal = jnp.maximum(jnp.diagonal(A), 1e-30)
+
+    def sweep(_, friction):
+        for i in range(limit.size):
+            v = rates[i] - A[i] @ friction
+            friction = friction.at[i].set(jnp.clip(friction[i] + v / diagonal[i], -limit[i], limit[i]))
+        return friction
+
+    return jax.lax.fori_loop(0, SWEEPS, sweep, jnp.clip(start, -limit, limit))
