@@ -1,1 +1,21 @@
-"""."""
+"""Sessions: read, write and check the HDF5 format; filtering, derivatives, directions, holds, decimation; importers."""
+
+from jaxfinger.data.check import check_file as check_file
+from jaxfinger.data.filtering import decimate as decimate
+from jaxfinger.data.filtering import outlier_mask as outlier_mask
+from jaxfinger.data.filtering import smooth as smooth
+from jaxfinger.data.findings import Finding as Finding
+from jaxfinger.data.hdf5 import data_hash as data_hash
+from jaxfinger.data.hdf5 import read_session as read_session
+from jaxfinger.data.hdf5 import write_session as write_session
+from jaxfinger.data.motion import decimate_trial as decimate_trial
+from jaxfinger.data.motion import directions as directions
+from jaxfinger.data.motion import find_holds as find_holds
+from jaxfinger.data.motion import joint_directions as joint_directions
+from jaxfinger.data.motion import tendon_directions as tendon_directions
+from jaxfinger.data.predictions import read_predictions as read_predictions
+from jaxfinger.data.predictions import write_predictions as write_predictions
+from jaxfinger.data.session import EXPERIMENTS as EXPERIMENTS
+from jaxfinger.data.session import FingerDescription as FingerDescription
+from jaxfinger.data.session import Session as Session
+from jaxfinger.data.session import Trial as Trial

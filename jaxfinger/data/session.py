@@ -19,7 +19,7 @@ class FingerDescription:
     `mass_std` and `com_std` are None where CAD and scale gave none.
     """
 
-    gravity: Float[np.ndarray, "3"]
+    gravity: Float[np.ndarray, 3]
     joint_names: tuple[str, ...]
     axis: Float[np.ndarray, "m 3"]
     origin: Float[np.ndarray, "m 3"]
@@ -27,7 +27,7 @@ class FingerDescription:
     mass: Float[np.ndarray, " m"]
     com: Float[np.ndarray, "m 3"]
     inertia: Float[np.ndarray, "m 3 3"]
-    fingertip: Float[np.ndarray, "3"]
+    fingertip: Float[np.ndarray, 3]
     tendon_names: tuple[str, ...]
     active: Bool[np.ndarray, " n"]
     crosses: Bool[np.ndarray, "n m"]

@@ -1,0 +1,144 @@
+"""Sessions as files: read, write, hash (dataset format, version 1)."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Collection, Sequence
+from dataclasses import fields
+from datetime import UTC, datetime
+
+import h5py
+import numpy as np
+
+from jaxfinger.data.atomic import atomic_path
+from jaxfinger.data.check import inspect
+from jaxfinger.data.schema import (
+    CHANNELS,
+    FINGERTIP,
+    FORMAT,
+    JOINTS,
+    LINKS,
+    TENDONS,
+    TIME,
+    VERSION,
+    Entry,
+    units_of,
+)
+from jaxfinger.data.session import FingerDescription, Session, Trial
+from jaxfinger.errors import UserError
+
+# The newest file version that MATLAB before R2021b and other old tools open.
+LIBVER = ("earliest", "v108")
+_TEXT = h5py.string_dtype("utf-8")
+
+
+def read_session(path: str | os.PathLike, trials: Collection[str] | None = None) -> Session:
+    """The session in a file, in float64, or only the named trials of it.
+
+    Raises:
+        UserError: the first error that `check_file` finds, in one sentence with file, place and mend.
+    """
+    session, findings = inspect(path, trials)
+    fault = findings.fatal
+    if fault is not None:
+        raise UserError(f"{path}: {fault.place}: {fault.message}")
+    assert session is not None
+    return session
+
+
+def write_session(session: Session, path: str | os.PathLike, overwrite: bool = False) -> None:
+    """Write a session; the file appears whole or not at all.
+
+    Raises:
+        UserError: the file exists and `overwrite` is false, a channel has the wrong shape, or it cannot be written.
+    """
+    for trial in session:
+        _refuse_misshapen(trial, session.finger, path)
+    with atomic_path(path, overwrite) as part, h5py.File(part, "w", libver=LIBVER) as file:
+        write_header(file, session)
+        trials = file.create_group("trials")
+        for name, trial in session.trials.items():
+            _write_trial(trials.create_group(name), trial, session.finger)
+
+
+def data_hash(path: str | os.PathLike) -> str:
+    """SHA-256 of a file's bytes, in hexadecimal."""
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); check the name") from None
+
+
+def write_header(file: h5py.File, session: Session) -> None:
+    """Root attributes and `/finger`."""
+    file.attrs["format"] = FORMAT
+    file.attrs["format_version"] = VERSION
+    file.attrs["specimen"] = session.specimen
+    file.attrs["source"] = session.source
+    file.attrs["created"] = session.created or datetime.now(UTC).isoformat(timespec="seconds")
+    finger = session.finger
+    group = file.create_group("finger")
+    group.attrs["gravity"] = np.asarray(finger.gravity, np.float64)
+    types = tuple("prismatic" if slides else "revolute" for slides in finger.prismatic)
+    joints = {
+        "name": finger.joint_names,
+        "axis": finger.axis,
+        "type": types if any(finger.prismatic) else None,
+        "origin": finger.origin,
+        "limits": finger.limits,
+    }
+    links = {entry.name: getattr(finger, entry.name) for entry in LINKS}
+    tendons = {"name": finger.tendon_names, "active": finger.active, "crosses": finger.crosses}
+    for name, entries, values in (("joints", JOINTS, joints), ("links", LINKS, links), ("tendons", TENDONS, tendons)):
+        table = group.create_group(name)
+        for entry in entries:
+            if values[entry.name] is not None:
+                write_dataset(table, entry, values[entry.name], finger.prismatic)
+    write_dataset(group, FINGERTIP, finger.fingertip, finger.prismatic)
+
+
+def _write_trial(group: h5py.Group, trial: Trial, finger: FingerDescription) -> None:
+    for key in ("experiment", "joint", "tendon", "complete", "motion", "session_start"):
+        value = getattr(trial, key)
+        if value is not None:
+            group.attrs[key] = value
+    write_dataset(group, TIME, trial.time, finger.prismatic)
+    for name, entry in CHANNELS.items():
+        value = getattr(trial, name)
+        if value is not None:
+            write_dataset(group, entry, value, finger.prismatic)
+
+
+def write_dataset(group: h5py.Group, entry: Entry, value, prismatic: Sequence[bool]) -> None:
+    """One dataset with its `units`, compressed where it is a channel."""
+    if entry.kind == "text":
+        group.create_dataset(entry.name, data=list(value), dtype=_TEXT)
+        return
+    value = np.asarray(value, np.float64 if entry.kind == "float" else entry.kind)
+    if entry.kind == "float" and entry is not TIME:
+        value = _lossless_single(value)
+    long = value.size > 1024
+    item = group.create_dataset(
+        entry.name, data=value, compression="gzip" if long else None, compression_opts=1 if long else None, shuffle=long
+    )
+    if entry.units is not None:
+        item.attrs["units"] = units_of(entry, prismatic)
+
+
+def _lossless_single(value: np.ndarray) -> np.ndarray:
+    """float32 where that loses nothing: sensors of 16 bits or fewer then take half the space."""
+    with np.errstate(over="ignore"):
+        single = value.astype(np.float32)
+    return single if np.array_equal(single, value, equal_nan=True) else value
+
+
+def _refuse_misshapen(trial: Trial, finger: FingerDescription, path) -> None:
+    sizes = {"N": len(trial.time), "m": finger.m, "n": finger.n}
+    channels = {field.name for field in fields(Trial)} & CHANNELS.keys()
+    for name in sorted(channels):
+        value = getattr(trial, name)
+        wanted = tuple(sizes.get(axis, axis) for axis in CHANNELS[name].shape)  # type: ignore[call-overload]
+        if value is not None and np.shape(value) != wanted:
+            raise UserError(f"{path}: /trials/{trial.name}/{name}: has shape {np.shape(value)}; it must be {wanted}")

@@ -1,0 +1,83 @@
+"""The dataset format, version 1, as tables: reader, writer and checker go by these."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+FORMAT = "jaxfinger-dataset"
+VERSION = "1.0"
+MAJOR = "1"
+
+Kind = Literal["float", "bool", "text", "int8", "int32"]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One dataset: its name, its shape (N samples, m joints, n tendons), its units, and whether it may be absent."""
+
+    name: str
+    shape: tuple[str | int, ...]
+    units: str | None
+    kind: Kind = "float"
+    optional: bool = False
+
+
+JOINTS = (
+    Entry("name", ("m",), None, "text"),
+    Entry("axis", ("m", 3), "1"),
+    Entry("type", ("m",), None, "text", optional=True),
+    Entry("origin", ("m", 3), "m"),
+    Entry("limits", ("m", 2), "rad"),
+)
+LINKS = (
+    Entry("mass", ("m",), "kg"),
+    Entry("com", ("m", 3), "m"),
+    Entry("inertia", ("m", 3, 3), "kg m2"),
+    Entry("mass_std", ("m",), "kg", optional=True),
+    Entry("com_std", ("m", 3), "m", optional=True),
+)
+TENDONS = (
+    Entry("name", ("n",), None, "text"),
+    Entry("active", ("n",), None, "bool"),
+    Entry("crosses", ("n", "m"), None, "bool"),
+)
+FINGERTIP = Entry("fingertip", (3,), "m")
+
+TIME = Entry("time", ("N",), "s")
+CHANNELS = {
+    entry.name: entry
+    for entry in (
+        Entry("q", ("N", "m"), "rad"),
+        Entry("tendon_force", ("N", "n"), "N", optional=True),
+        Entry("tendon_excursion", ("N", "n"), "m", optional=True),
+        Entry("joint_torque", ("N", "m"), "N m", optional=True),
+        Entry("fingertip_force", ("N", 3), "N", optional=True),
+        Entry("joint_direction", ("N", "m"), "1", "int8", optional=True),
+        Entry("tendon_direction", ("N", "n"), "1", "int8", optional=True),
+        Entry("hold", ("N",), "1", "int32", optional=True),
+    )
+}
+MEASURED = tuple(name for name, entry in CHANNELS.items() if entry.kind == "float")
+
+# What each experiment moves or holds (its attributes), and what it drives and measures (its channels).
+NEEDS_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4")
+NEEDS_TENDON = ("ID.4", "VD.2")
+DRIVES = {"ID.4": ("tendon_force",), "VD.2": ("tendon_force",), "VD.3": ("tendon_force",)}
+MEASURES = {
+    "ID.2": ("tendon_excursion",),
+    "ID.3-static": ("joint_torque",),
+    "ID.3-dynamic": ("joint_torque",),
+    "ID.4": ("joint_torque",),
+    "VD.1": ("tendon_excursion",),
+    "VD.2": ("fingertip_force",),
+    "VD.3": (),
+}
+
+
+def units_of(entry: Entry, prismatic: Sequence[bool]) -> str | None:
+    """The units of a dataset: where every joint is prismatic, angles are lengths and torques forces."""
+    if prismatic and all(prismatic):
+        return {"rad": "m", "N m": "N"}.get(entry.units or "", entry.units)
+    return entry.units
