@@ -1,0 +1,144 @@
+"""Is the finger of a file physically possible, and in SI units?"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from jaxfinger.data.findings import Report
+from jaxfinger.data.schema import JOINTS, LINKS
+from jaxfinger.data.session import FingerDescription
+
+_UNIT_AXIS = 1e-3
+_ROUNDING = 1e-5  # of float32 tables
+_LARGEST_FINGER = 2.0  # m; lengths beyond it are taken for mm
+
+
+def check_finger(finger: FingerDescription, report: Report) -> None:
+    """Report every fault of `/finger`."""
+    _names(finger.joint_names, "/finger/joints/name", "joint", report)
+    _names(finger.tendon_names, "/finger/tendons/name", "tendon", report)
+    if _finite(finger, report):
+        _gravity(finger, report)
+        _joints(finger, report)
+        _links(finger, report)
+        _lengths(finger, report)
+    _tendons(finger, report)
+
+
+def _names(names: tuple[str, ...], place: str, what: str, report: Report) -> None:
+    for name, count in Counter(names).items():
+        if count > 1:
+            report.error(place, f"{what} {name!r} is listed {count} times; give each its own name")
+        if not name.strip():
+            report.error(place, f"a {what} has no name; name it")
+
+
+def _finite(finger: FingerDescription, report: Report) -> bool:
+    ok = True
+    for folder, entries in (("joints", JOINTS), ("links", LINKS)):
+        for entry in entries:
+            if entry.kind != "float" or (value := getattr(finger, entry.name)) is None:
+                continue
+            bad = ~np.isfinite(value).reshape(finger.m, -1).all(axis=1)
+            for name in np.array(finger.joint_names)[bad]:
+                report.error(
+                    f"/finger/{folder}/{entry.name}", f"joint {name} has a value that is not finite; write a number"
+                )
+                ok = False
+    if not np.isfinite(finger.fingertip).all():
+        report.error("/finger/fingertip", "is not finite; write the contact point in the last link's frame")
+        ok = False
+    return ok
+
+
+def _gravity(finger: FingerDescription, report: Report) -> None:
+    size = float(np.linalg.norm(finger.gravity))
+    if size == 0.0:
+        report.warning(
+            "/finger", "has `gravity` zero: no mass can be seen; write the base frame's gravity, 9.81 m s-2 long"
+        )
+    elif not 9.0 < size < 10.5:
+        report.error("/finger", f"has `gravity` {size:.4g} long; it must be in m s-2, about 9.81")
+    elif not 9.76 < size < 9.84:
+        report.warning("/finger", f"has `gravity` {size:.4g} m s-2 long, which is found nowhere on Earth; correct it")
+
+
+def _joints(finger: FingerDescription, report: Report) -> None:
+    for name, axis, (lower, upper) in zip(finger.joint_names, finger.axis, finger.limits, strict=True):
+        size = float(np.linalg.norm(axis))
+        if abs(size - 1.0) > _UNIT_AXIS:
+            report.error("/finger/joints/axis", f"joint {name} has an axis {size:.4g} long; divide it by its length")
+        if lower >= upper:
+            report.error(
+                "/finger/joints/limits",
+                f"joint {name} has its lower limit {lower:.4g} at or above its upper {upper:.4g}; swap them",
+            )
+    angles = np.abs(finger.limits[~np.array(finger.prismatic)])
+    if angles.size and angles.max() > 2 * np.pi + 0.1:
+        report.error(
+            "/finger/joints/limits", f"reaches {angles.max():.4g} rad, more than a turn; convert degrees to rad"
+        )
+
+
+def _links(finger: FingerDescription, report: Report) -> None:
+    for i, name in enumerate(finger.joint_names):
+        mass = finger.mass[i]
+        if mass <= 0.0:
+            report.error(
+                "/finger/links/mass", f"the link of joint {name} weighs {mass:.4g} kg; a mass must be positive"
+            )
+        elif mass > 10.0 and not finger.prismatic[i]:
+            report.warning(
+                "/finger/links/mass", f"the link of joint {name} weighs {mass:.4g} kg; check that these are no grams"
+            )
+        _inertia(finger.inertia[i], mass, name, report)
+    for key in ("mass_std", "com_std"):
+        value = getattr(finger, key)
+        if value is not None and np.any(value < 0.0):
+            report.error(f"/finger/links/{key}", "holds a negative standard deviation; write its size")
+
+
+def _inertia(inertia: np.ndarray, mass: float, name: str, report: Report) -> None:
+    place, whose = "/finger/links/inertia", f"the link of joint {name}"
+    scale = float(np.abs(inertia).max())
+    if np.abs(inertia - inertia.T).max() > _ROUNDING * scale:
+        report.error(
+            place, f"{whose} has an inertia that is not symmetric; write the full matrix with both halves equal"
+        )
+        return
+    small, middle, large = np.linalg.eigvalsh(inertia)
+    if small <= 0.0:
+        report.error(
+            place, f"{whose} has the principal inertia {small:.3g} kg m2; all three must be positive: check the signs"
+        )
+    elif large > (small + middle) * (1.0 + _ROUNDING):
+        report.error(
+            place,
+            f"{whose} has principal inertias {small:.3g}, {middle:.3g}, {large:.3g} kg m2, and no body has one larger than "
+            "the sum of the others; check frame, signs and units",
+        )
+    elif mass > 0.0 and large / mass > _LARGEST_FINGER**2:
+        report.error(place, f"{whose} has a radius of gyration of {np.sqrt(large / mass):.3g} m; convert to kg m2")
+
+
+def _lengths(finger: FingerDescription, report: Report) -> None:
+    if any(finger.prismatic):
+        return
+    lengths = {"joints/origin": finger.origin, "links/com": finger.com, "fingertip": finger.fingertip}
+    for key, value in lengths.items():
+        longest = float(np.linalg.norm(np.atleast_2d(value), axis=1).max())
+        if longest > _LARGEST_FINGER:
+            report.error(f"/finger/{key}", f"reaches {longest:.4g} m; convert mm to m")
+
+
+def _tendons(finger: FingerDescription, report: Report) -> None:
+    place = "/finger/tendons/crosses"
+    for name, active, crosses in zip(finger.tendon_names, finger.active, finger.crosses, strict=True):
+        if not crosses.any():
+            say = report.error if active else report.warning
+            say(
+                place,
+                f"{'active' if active else 'passive'} tendon {name} crosses no joint; mark the joints that it spans",
+            )

@@ -1,0 +1,271 @@
+"""Can a trial be what it says it is?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxfinger.data.findings import Report
+from jaxfinger.data.parse import listed
+from jaxfinger.data.schema import CHANNELS, DRIVES, MEASURED, MEASURES, NEEDS_JOINT, NEEDS_TENDON
+from jaxfinger.data.session import FingerDescription, Trial
+
+STILL_JOINT = 0.01  # rad: five times the noise of a 14-bit encoder
+STILL_AXIS = 1e-4  # m
+SLACK = 0.5  # N: below it a tendon may be slack, and its excursion NaN
+_MOVES_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic")
+_STEPPED = ("ID.3-static", "ID.4", "VD.2")
+
+
+def check_trial(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Report every fault of one trial that could be read."""
+    _named(trial, finger, report)
+    _time(trial, report)
+    for name in MEASURED:
+        if getattr(trial, name) is not None:
+            _holes(trial, name, finger, report)
+    _present(trial, finger, report)
+    _motion(trial, finger, report)
+    _sizes(trial, finger, report)
+    _holds(trial, report)
+
+
+def _place(trial: Trial, channel: str = "") -> str:
+    return f"/trials/{trial.name}/{channel}".rstrip("/")
+
+
+def _columns(finger: FingerDescription, channel: str) -> tuple[str, ...]:
+    return {"m": finger.joint_names, "n": finger.tendon_names}.get(str(CHANNELS[channel].shape[1]), ("x", "y", "z"))
+
+
+def _named(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Do the attributes `joint` and `tendon` fit the experiment and the finger's tables?"""
+    place = _place(trial)
+    for kind, value, names, needed in (
+        ("joint", trial.joint, finger.joint_names, trial.experiment in NEEDS_JOINT),
+        ("tendon", trial.tendon, finger.tendon_names, trial.experiment in NEEDS_TENDON),
+    ):
+        if value is None and needed:
+            report.error(
+                place, f"is {trial.experiment} and has no attribute `{kind}`; write which one of {listed(names)}"
+            )
+        elif value is not None and value not in names:
+            report.error(
+                place, f"names the {kind} {value!r}, which the finger has not; it must be one of {listed(names)}"
+            )
+    if trial.tendon not in finger.tendon_names or trial.experiment not in NEEDS_TENDON:
+        return
+    tendon = finger.tendon_names.index(trial.tendon)
+    if not finger.active[tendon]:
+        report.error(
+            place, f"pulls tendon {trial.tendon}, which is passive; correct the trial or /finger/tendons/active"
+        )
+    if trial.experiment == "ID.4" and trial.joint in finger.joint_names:
+        if not finger.crosses[tendon, finger.joint_names.index(trial.joint)]:
+            report.error(
+                place,
+                f"pulls {trial.tendon} at joint {trial.joint}, which it does not cross; correct it or /finger/tendons/crosses",
+            )
+
+
+def _time(trial: Trial, report: Report) -> None:
+    place, time = _place(trial, "time"), trial.time
+    if not np.isfinite(time).all():
+        report.error(
+            place, f"is not finite at sample {int(np.argmin(np.isfinite(time)))}; write seconds from the trial's start"
+        )
+        return
+    if len(time) < 2:
+        report.warning(place, "holds a single sample, from which no motion can be seen; record the trial again")
+        return
+    steps = np.diff(time)
+    if steps.min() <= 0.0:
+        at = int(np.argmax(steps <= 0.0))
+        what = "runs backwards" if (steps < 0.0).any() else "repeats"
+        count = int((steps <= 0.0).sum())
+        report.error(
+            place, f"{what} after sample {at} ({time[at]:.6g} s), {count} times in all; sort or drop these samples"
+        )
+        return
+    usual = float(np.median(steps))
+    if abs(time[0]) > max(10.0 * usual, 0.01):
+        report.warning(place, f"starts at {time[0]:.6g} s; count from 0 in each trial")
+    if usual > 0.2:
+        report.warning(place, f"has a sample every {usual:.3g} s; convert ms to s if that is what it is")
+    gaps = steps > max(20.0 * usual, 0.02)
+    if gaps.any():
+        report.warning(
+            place, f"has {gaps.sum()} gaps, the longest {steps.max():.3g} s; samples were lost, derivatives bridge them"
+        )
+
+
+def _holes(trial: Trial, name: str, finger: FingerDescription, report: Report) -> None:
+    """NaN is a whole column's way to say «not measured»; inside a column only a slack tendon's excursion may be NaN."""
+    values = getattr(trial, name)
+    bad = ~np.isfinite(values)
+    if not bad.any():
+        return
+    for k, column in enumerate(_columns(finger, name)):
+        count = int(bad[:, k].sum())
+        if count == 0 or np.isnan(values[:, k]).all():
+            continue
+        if np.isinf(values[:, k]).any():
+            report.error(
+                _place(trial, name),
+                f"column {column} holds infinite values; write NaN for a column that was not measured",
+            )
+        elif name == "tendon_excursion" and _slack(trial, bad[:, k], k):
+            report.note(_place(trial, name), f"column {column} is NaN while the tendon is slack, in {count} samples")
+        else:
+            at = trial.time[int(np.argmax(bad[:, k]))]
+            report.error(
+                _place(trial, name),
+                f"column {column} is NaN in {count} of {len(bad)} samples, first at {at:.6g} s; cut these samples out, "
+                "or make the whole column NaN if it was not measured",
+            )
+
+
+def _slack(trial: Trial, where: np.ndarray, tendon: int) -> bool:
+    return trial.tendon_force is not None and bool(np.all(trial.tendon_force[where, tendon] < SLACK))
+
+
+def _present(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Are the channels there that the experiment lives by?"""
+    what = trial.experiment
+    for name in DRIVES.get(what, ()):
+        if getattr(trial, name) is None:
+            report.error(_place(trial, name), f"is missing, and {what} cannot be read without it; write this channel")
+        elif what == "ID.4" and trial.tendon in finger.tendon_names:
+            if np.isnan(getattr(trial, name)[:, finger.tendon_names.index(trial.tendon)]).all():
+                report.error(
+                    _place(trial, name), f"column {trial.tendon}, the tendon that is pulled, is NaN; write its tension"
+                )
+    for name in MEASURES[what]:
+        values = getattr(trial, name)
+        if values is None:
+            message = f"is missing, and it is what {what} measures: nothing can be identified from this trial; write this channel"
+            report.error(_place(trial, name), message, local=True)
+            continue
+        if name == "joint_torque" and trial.joint in finger.joint_names:
+            values = values[:, finger.joint_names.index(trial.joint)]
+        if np.isnan(values).all():
+            whose = f"column {trial.joint} " if name == "joint_torque" else ""
+            message = (
+                f"{whose}is NaN throughout, and it is what {what} measures: nothing can be identified from this trial"
+            )
+            report.error(_place(trial, name), f"{message}; write this channel", local=True)
+    for k, joint in enumerate(finger.joint_names):
+        if np.isnan(trial.q[:, k]).all():
+            say = report.error if joint == trial.joint else report.warning
+            say(
+                _place(trial, "q"),
+                f"column {joint} is not measured (NaN), so no torque that depends on it can be predicted; write it",
+            )
+
+
+def _span(values: np.ndarray) -> float:
+    """How far a column travels, outliers aside."""
+    if len(values) == 0 or not np.isfinite(values).all():
+        return np.nan
+    low, high = np.percentile(values, [1.0, 99.0])
+    return float(high - low)
+
+
+def _motion(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Does what the experiment moves move, and what it holds stand still?"""
+    spans = np.array([_span(trial.q[:, k]) for k in range(finger.m)])
+    still = np.where(finger.prismatic, STILL_AXIS, STILL_JOINT)
+    say = report.error if trial.complete else report.warning
+    place = _place(trial, "q")
+    if trial.experiment in _MOVES_JOINT and trial.joint in finger.joint_names:
+        k = finger.joint_names.index(trial.joint)
+        if spans[k] < still[k]:
+            say(
+                place,
+                f"joint {trial.joint} never moves (it spans {spans[k]:.2g}), though {trial.experiment} moves it; record it again",
+            )
+    elif trial.experiment in ("VD.1", "VD.3") and np.all(spans < still):
+        say(place, f"no joint moves, though {trial.experiment} moves them; record it again")
+    held = [
+        (name, span)
+        for name, span, slides in zip(finger.joint_names, spans, finger.prismatic, strict=True)
+        if not slides
+        and span > 0.1
+        and (trial.experiment in ("ID.4", "VD.2") or (trial.experiment == "ID.2" and name != trial.joint))
+    ]
+    for name, span in held:
+        report.warning(
+            place, f"joint {name} moves by {span:.2g} rad though {trial.experiment} holds it; check the fixture"
+        )
+    if trial.experiment in NEEDS_TENDON and trial.tendon_force is not None and trial.tendon in finger.tendon_names:
+        if _span(trial.tendon_force[:, finger.tendon_names.index(trial.tendon)]) < SLACK:
+            report.warning(
+                _place(trial, "tendon_force"), f"tendon {trial.tendon} is never pulled; check the attribute `tendon`"
+            )
+
+
+def _sizes(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Are the values of the size that SI units give them, and on the right side of zero?"""
+    turning = ~np.array(finger.prismatic)
+    for k, name in enumerate(finger.joint_names):
+        if not turning[k] or not np.isfinite(trial.q[:, k]).all():
+            continue
+        low, high = np.percentile(trial.q[:, k], [1.0, 99.0])
+        lower, upper = finger.limits[k]
+        if max(-low, high) > 2.0 * np.pi:
+            report.error(
+                _place(trial, "q"),
+                f"column {name} reaches {max(-low, high, key=abs):.4g} rad, more than a turn; convert degrees to rad",
+            )
+        elif low < lower - 0.35 or high > upper + 0.35:
+            report.warning(
+                _place(trial, "q"),
+                f"column {name} runs from {low:.3g} to {high:.3g} rad, far outside its limits {lower:.3g} to {upper:.3g}; correct one or the other",
+            )
+    if trial.tendon_force is not None:
+        _tension(trial, finger, report)
+    if not turning.all():
+        return
+    small = float(finger.mass.sum()) < 5.0
+    for name, most, mend in (("tendon_excursion", 0.5, "mm to m"), ("joint_torque", 5.0, "N mm to N m")):
+        values = getattr(trial, name)
+        if values is None or not small:
+            continue
+        for column, x in zip(_columns(finger, name), values.T, strict=True):
+            if np.isfinite(x).all() and np.percentile(np.abs(x), 90.0) > most:
+                size = np.percentile(np.abs(x), 90.0)
+                report.error(
+                    _place(trial, name),
+                    f"column {column} is of size {size:.3g}, too large for a finger; convert {mend}",
+                )
+
+
+def _tension(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    assert trial.tendon_force is not None
+    place = _place(trial, "tendon_force")
+    for name, active, x in zip(finger.tendon_names, finger.active, trial.tendon_force.T, strict=True):
+        if not np.isfinite(x).all():
+            continue
+        if not active:
+            report.note(place, f"column {name} is measured though the tendon is passive; it is ignored")
+            continue
+        low = float(np.percentile(x, 5.0))
+        if low < -1.0:
+            report.error(place, f"column {name} falls to {low:.3g} N, and a tendon cannot push; check sign and tare")
+        elif low < -0.3:
+            report.warning(place, f"column {name} falls to {low:.3g} N, below zero by more than noise; check the tare")
+        if np.percentile(x, 95.0) > 2000.0:
+            report.warning(place, f"column {name} exceeds 2000 N; check that it is in N and not in mN")
+
+
+def _holds(trial: Trial, report: Report) -> None:
+    if trial.hold is None:
+        return
+    place = _place(trial, "hold")
+    starts = np.flatnonzero(np.diff(trial.hold, prepend=-2))
+    runs = trial.hold[starts]
+    runs = runs[runs >= 0]
+    if len(runs) == 0 and trial.experiment in _STEPPED:
+        report.warning(place, "marks no hold; leave the channel out to have holds derived from stillness")
+    elif len(np.unique(runs)) < len(runs):
+        index = int(next(i for i in runs if (runs == i).sum() > 1))
+        report.warning(place, f"hold {index} is interrupted and comes back; give each hold its own index")
