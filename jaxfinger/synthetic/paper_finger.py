@@ -1,0 +1,83 @@
+"""The specimen of the paper: a planar three-joint finger of Dexmart's design, built to the figures that it gives.
+
+Lengths, masses and via points are chosen so that the moment arms, torques and losses come out as in the paper's
+Table I and Figs. 4–9; what the paper does not give is of the size of an index finger.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxfinger.data import FingerDescription
+from jaxfinger.synthetic.routes import Point, PolynomialRoute, WrappedRoute
+from jaxfinger.synthetic.specimen import Band, GrowingFriction, Specimen
+
+LENGTHS = np.array([43.0, 27.0, 23.0]) * 1e-3  # m
+MASSES = np.array([20.0, 11.0, 6.0]) * 1e-3  # kg, encoder boards and screws included
+THICKNESS = 12e-3  # m
+LIMITS = np.deg2rad([[0.0, 90.0], [0.0, 95.0], [0.0, 80.0]])
+
+
+def _mm(along: float, above: float) -> Point:
+    return along * 1e-3, above * 1e-3
+
+
+# Flexors pass on the palm's side and leave their pulley halfway: the moment arm rises beyond the pulley's radius.
+T1_MCP = WrappedRoute(_mm(-8.72, 1.07), _mm(4.86, 0.80))  # between two eyes, from extensor to flexor
+T1_PIP = WrappedRoute(_mm(-13.0, -0.37), _mm(11.0, 0.17), _mm(-0.13, -0.20), 4.17e-3)
+T3_MCP = WrappedRoute(_mm(-16.0, -0.77), _mm(13.0, 0.08), _mm(-0.25, -0.51), 5.45e-3)
+T4_MCP = WrappedRoute(_mm(-16.0, -1.08), _mm(13.0, -0.21), _mm(-0.29, -0.36), 5.29e-3)
+# The extensor wraps heads that are not concentric with the joints.
+T2_MCP = WrappedRoute(_mm(-18.0, 6.5), _mm(16.0, 6.0), _mm(-1.83, 0.17), 7.73e-3, dorsal=True)
+T2_PIP = WrappedRoute(_mm(-13.0, 5.0), _mm(11.0, 5.0), _mm(1.54, 1.62), 6.45e-3, dorsal=True, on_distal=True)
+T2_DIP = WrappedRoute(_mm(-11.0, 6.0), _mm(9.0, 5.5), _mm(1.99, 1.85), 3.89e-3, dorsal=True)
+# The passive tendon: taut when the PIP is flexed far more than the DIP, which it then flexes.
+T5_PIP = PolynomialRoute((-4e-3,))
+T5_DIP = PolynomialRoute((5e-3,))
+T5 = (None, T5_PIP, T5_DIP)
+
+RUBBER_BAND = Band((WrappedRoute(_mm(-12.0, 18.0), _mm(12.0, 18.0)), None, None), stiffness=156.0, stretch=4e-3)
+# No active tendon flexes the DIP: a soft spring does, so that tendons alone can move the whole finger.
+DIP_SPRING = Band((None, None, PolynomialRoute((5e-3,))), stiffness=800.0, stretch=7e-3)
+PASSIVE_TENDON = Band(T5, stiffness=1500.0, stretch=-3e-3)
+
+
+def paper_finger(passive_tendon: bool = False) -> Specimen:
+    """The paper's finger; with `passive_tendon`, T5 pulls where it is taut, else it is there but never taut."""
+    return Specimen(
+        name="paper-finger",
+        description=_description(),
+        routes=((T1_MCP, T1_PIP, None), (T2_MCP, T2_PIP, T2_DIP), (T3_MCP, None, None), (T4_MCP, None, None), T5),
+        springs=(RUBBER_BAND, DIP_SPRING, *((PASSIVE_TENDON,) if passive_tendon else ())),
+        friction=GrowingFriction((2.5e-3, 1.6e-3, 1.0e-3), (9.88e-3, 1.5e-3, 0.8e-3)),  # 9 N mm at 70° at the MCP
+        damping=(6e-5, 3e-5, 1e-5),
+        # T3: 1.5 N of 4 N, 4 N of 10 N. T1 loses less at low tension and more at high.
+        loss_constant=(-1.2, 0.1, -1.0 / 6.0, -0.1, 0.0),
+        loss_proportional=(0.55, 0.20, 2.5 / 6.0, 0.40, 0.0),
+    )
+
+
+def _description() -> FingerDescription:
+    com = np.stack([0.5 * LENGTHS, np.zeros(3), np.zeros(3)], axis=1)
+    origin = np.zeros((3, 3))
+    origin[1:, 0] = LENGTHS[:-1]
+    return FingerDescription(
+        gravity=np.array([0.0, 0.0, 9.81]),  # palm up: gravity extends the finger
+        joint_names=("MCP", "PIP", "DIP"),
+        axis=np.tile([0.0, 1.0, 0.0], (3, 1)),
+        origin=origin,
+        limits=LIMITS,
+        mass=MASSES,
+        com=com,
+        inertia=np.stack([box_inertia(m, length) for m, length in zip(MASSES, LENGTHS, strict=True)]),
+        fingertip=np.array([LENGTHS[2], 0.0, -3e-3]),
+        tendon_names=("T1", "T2", "T3", "T4", "T5"),
+        active=np.array([True, True, True, True, False]),
+        crosses=np.array([[1, 1, 0], [1, 1, 1], [1, 0, 0], [1, 0, 0], [0, 1, 1]], dtype=bool),
+    )
+
+
+def box_inertia(mass: float, length: float) -> np.ndarray:
+    """Inertia about the centre of mass of a bar along x with a square section, kg m²."""
+    across = mass * (length**2 + THICKNESS**2) / 12.0
+    return np.diag([mass * THICKNESS**2 / 6.0, across, across])
