@@ -1,0 +1,50 @@
+"""The simulated specimen in this process: the controller's program around the simulated finger, as fast as it is read."""
+
+from __future__ import annotations
+
+from jaxfinger.rig.channels import RigDescription
+from jaxfinger.rig.controller import Controller, HardLimits
+from jaxfinger.rig.ring import RingRig
+from jaxfinger.rig.toml_file import Table
+
+
+def address(table: Table) -> dict[str, str | int]:
+    """`seed` of the sensors' noise; `filtered = 1` for terminals at their factory filter."""
+    return {"seed": table.integer("seed", 0), "filtered": table.integer("filtered", 0, high=1)}
+
+
+class SimulatedRig(RingRig):
+    """Samples are made when they are read, so a session takes no longer than its computation and repeats exactly."""
+
+    synchronous = True
+
+    def __init__(self, description: RigDescription, controller: Controller | None = None):
+        super().__init__(description)
+        seed, filtered = int(description.address.get("seed", 0)), bool(description.address.get("filtered", 0))
+        self.controller = controller or Controller(limits=HardLimits(heartbeat_s=1e9), seed=seed, filtered=filtered)
+
+    def _open(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def _read(self, symbol: str, offset: int, size: int) -> bytes:
+        at = self.controller.place[symbol][0] + offset
+        return bytes(self.controller.memory[at : at + size])
+
+    def _write(self, symbol: str, data: bytes) -> None:
+        at = self.controller.place[symbol][0]
+        self.controller.memory[at : at + len(data)] = data
+
+    def _wait(self, seconds: float) -> None:
+        for _ in range(max(1, round(seconds * self.description.rate_hz))):
+            self.controller.cycle()
+
+    def _has_bench(self) -> bool:
+        return True
+
+
+def make(description: RigDescription) -> SimulatedRig:
+    """The rig of a rig file."""
+    return SimulatedRig(description)

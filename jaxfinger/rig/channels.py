@@ -1,0 +1,260 @@
+"""The rig file: which channel sits in which slot, its calibration and unit, the limits, and the finger on the bench."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxfinger.data.session import FingerDescription
+from jaxfinger.rig import backends, contract
+from jaxfinger.rig.finger_file import read_finger
+from jaxfinger.rig.toml_file import Table, parse_toml, read_toml
+
+# Dimension of each kind of channel, and the units in which a calibration may be written, as factors to SI.
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "tension": {"N": 1.0},
+    "excursion": {"m": 1.0, "mm": 1e-3},
+    "joint_position": {"rad": 1.0, "deg": np.pi / 180},
+    "external_torque": {"N m": 1.0, "N mm": 1e-3},
+    "fingertip_force": {"N": 1.0},
+}
+SI = {kind: next(iter(units)) for kind, units in UNITS.items()}
+BACKENDS = tuple(module.name for module in iter_modules(backends.__path__))
+DYNAMIC_BANDWIDTH = 100.0  # Hz: below it, a channel is refused for dynamic experiments
+
+
+@dataclass(frozen=True)
+class Filter:
+    """The filter that a terminal runs: switched on or not, its setting, its −3 dB bandwidth in Hz (None: unknown)."""
+
+    enabled: bool
+    setting: int
+    bandwidth: float | None
+
+
+@dataclass(frozen=True)
+class Channel:
+    """value in SI = (raw · scale + offset) · factor; `of` is the tendon, joint or axis that it measures.
+
+    `frozen` is the time in s after which identical raw values count as a fault (0: never).
+    """
+
+    name: str
+    kind: str
+    of: str
+    slot: int
+    unit: str
+    scale: float
+    offset: float
+    source: str
+    frozen: float
+
+    @property
+    def factor(self) -> float:
+        """From the calibration's unit to SI."""
+        return UNITS[self.kind][self.unit]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits that the host watches (SI); the controller's own are never looser.
+
+    `joint_margin` is the distance in rad that a joint keeps from its mechanical limits.
+    """
+
+    tension_max: float
+    tension_rate: float  # of set-points
+    tension_rate_max: float  # measured
+    joint_margin: float
+    joint_velocity: float  # of set-points
+    joint_velocity_max: float  # measured
+    joint_torque_max: float
+    fingertip_force_max: float
+
+
+@dataclass(frozen=True)
+class RigDescription:
+    """A rig file, read: `text` is the file itself, which goes into every session."""
+
+    name: str
+    backend: str
+    specimen: str
+    finger: FingerDescription
+    channels: tuple[Channel, ...]
+    limits: Limits
+    rate_hz: float
+    stale_s: float
+    poll_s: float
+    address: Mapping[str, str | int]
+    sensor_rotation: Float[np.ndarray, "3 3"]
+    allow_filtered: bool
+    text: str
+    path: str = ""
+
+    @property
+    def slots(self) -> list[int]:
+        """Slot of each channel in the controller's sample."""
+        return [c.slot for c in self.channels]
+
+    def calibrate(self, raw: Float[np.ndarray, "N V"]) -> Float[np.ndarray, "N C"]:
+        """Raw values of the controller's sample to SI; the fingertip's force turned into the base frame."""
+        gain = np.array([c.scale * c.factor for c in self.channels])
+        bias = np.array([c.offset * c.factor for c in self.channels])
+        x = raw[:, self.slots] * gain + bias
+        force = [self.index("fingertip_force", axis) for axis in "xyz"]
+        if all(i is not None for i in force):
+            x[:, force] = x[:, force] @ self.sensor_rotation.T
+        return x
+
+    def index(self, kind: str, of: str = "") -> int | None:
+        """Column of the channel of this kind and tendon, joint or axis; None where the rig has none."""
+        for i, channel in enumerate(self.channels):
+            if channel.kind == kind and channel.of == of:
+                return i
+        return None
+
+    def columns(self, kind: str, of: tuple[str, ...]) -> list[int | None]:
+        """Columns of a kind for several tendons or joints."""
+        return [self.index(kind, name) for name in of]
+
+
+def read_rig(path: str | Path) -> RigDescription:
+    """Read and check a rig file; raises UserError with the line to mend. Nothing is connected."""
+    return _rig(read_toml(path))
+
+
+def parse_rig(text: str, path: str | Path = "rig.toml") -> RigDescription:
+    """A rig file that is already in memory, as a session or a log carries it."""
+    return _rig(parse_toml(text, Path(path)))
+
+
+def _rig(file: Table) -> RigDescription:
+    head = file.table("rig")
+    assert head is not None
+    backend = head.text_of("backend", choices=BACKENDS)
+    if (where := file.table("address", required=False)) is None:
+        where = Table(file.path, file.text, {}, "address")
+    address = import_module(f"jaxfinger.rig.backends.{backend}").address(where)
+    where.finish()
+    finger = read_finger(file)
+    channels = _channels(file, finger)
+    rotation = np.eye(3)
+    if sensor := file.table("fingertip_sensor", required=False):
+        rotation = np.array(sensor.vector("rotation", length=9)).reshape(3, 3)
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
+            sensor.fail(
+                "rotation", "'rotation' must be a rotation matrix (9 numbers, row by row, sensor to base frame)."
+            )
+        sensor.finish()
+    description = RigDescription(
+        name=head.text_of("name"),
+        backend=backend,
+        specimen=head.text_of("specimen"),
+        finger=finger,
+        channels=channels,
+        limits=_limits(file, finger),
+        rate_hz=head.number("rate_hz", 1000.0, 1.0, 20000.0, "Hz"),
+        stale_s=head.number("stale_s", 0.2, 0.01, 60.0, "s"),
+        poll_s=head.number("poll_s", 0.05, 0.001, 1.0, "s"),
+        address=address,
+        sensor_rotation=rotation,
+        allow_filtered=head.flag("allow_filtered", False),
+        text=file.text,
+        path=str(file.path),
+    )
+    head.finish()
+    file.finish()
+    return description
+
+
+def _channels(file: Table, finger: FingerDescription) -> tuple[Channel, ...]:
+    owners = {
+        "tension": finger.tendon_names,
+        "excursion": finger.tendon_names,
+        "joint_position": finger.joint_names,
+        "external_torque": ("",),
+        "fingertip_force": ("x", "y", "z"),
+    }
+    channels: list[Channel] = []
+    for table in file.tables("channel"):
+        kind = table.text_of("kind", choices=tuple(UNITS))
+        of = table.text_of("of", "" if kind == "external_torque" else ..., choices=None)
+        if of not in owners[kind]:
+            table.fail(
+                "of", f"a channel of kind '{kind}' cannot be of '{of}'; the finger has {', '.join(owners[kind])}."
+            )
+        name = table.text_of("name", f"{kind} {of}".strip())
+        unit = table.text_of("unit")
+        if unit not in UNITS[kind]:
+            table.fail("unit", f"'{unit}' is no unit for {kind} ('{name}'); choose one of {', '.join(UNITS[kind])}.")
+        channel = Channel(
+            name=name,
+            kind=kind,
+            of=of,
+            slot=table.integer("slot", high=contract.VALUES - 1),
+            unit=unit,
+            scale=table.number("scale"),
+            offset=table.number("offset", 0.0),
+            source=table.text_of("source", ""),
+            frozen=table.number("frozen_s", 0.0 if kind in ("joint_position", "excursion") else 1.0, 0.0, 60.0, "s"),
+        )
+        if channel.scale == 0:
+            table.fail("scale", f"'scale' of '{name}' is zero; give {unit} per raw unit.")
+        for other in channels:
+            if other.slot == channel.slot:
+                table.fail(
+                    "slot", f"slot {channel.slot} already holds '{other.name}'; every channel has a slot of its own."
+                )
+            if (other.kind, other.of) == (kind, of):
+                table.fail("of", f"'{other.name}' already measures the {kind} of '{of}'; remove one of the two.")
+        table.finish()
+        channels.append(channel)
+    present = {(c.kind, c.of) for c in channels}
+    for joint in finger.joint_names:
+        if ("joint_position", joint) not in present:
+            file.fail(
+                None,
+                f'joint \'{joint}\' has no channel; add a [[channel]] of kind "joint_position" with of = "{joint}".',
+            )
+    for tendon in np.array(finger.tendon_names)[finger.active]:
+        if ("tension", tendon) not in present:
+            file.fail(
+                None, f'tendon \'{tendon}\' has no channel; add a [[channel]] of kind "tension" with of = "{tendon}".'
+            )
+    if len(finger.tendon_names) > contract.TARGETS:
+        file.fail(None, f"{finger.n} tendons, but the controller has {contract.TARGETS} actuation modules.")
+    return tuple(channels)
+
+
+def _limits(file: Table, finger: FingerDescription) -> Limits:
+    table = file.table("limits")
+    assert table is not None
+    limits = Limits(
+        tension_max=table.number("tension_max", low=0.1, high=100.0, unit="N"),
+        tension_rate=table.number("tension_rate", low=0.1, high=1000.0, unit="N/s"),
+        tension_rate_max=table.number("tension_rate_max", low=1.0, high=1e5, unit="N/s"),
+        joint_margin=np.radians(table.number("joint_margin_deg", low=0.0, high=45.0, unit="deg")),
+        joint_velocity=np.radians(table.number("joint_velocity_deg_s", low=1.0, high=2000.0, unit="deg/s")),
+        joint_velocity_max=np.radians(table.number("joint_velocity_max_deg_s", low=1.0, high=5000.0, unit="deg/s")),
+        joint_torque_max=table.number("joint_torque_max", low=1e-3, high=10.0, unit="N m"),
+        fingertip_force_max=table.number("fingertip_force_max", low=0.1, high=100.0, unit="N"),
+    )
+    if limits.tension_rate > limits.tension_rate_max:
+        table.fail(
+            "tension_rate", "'tension_rate' of set-points is above 'tension_rate_max', so every ramp would trip."
+        )
+    if limits.joint_velocity > limits.joint_velocity_max:
+        table.fail(
+            "joint_velocity_deg_s",
+            "'joint_velocity_deg_s' is above 'joint_velocity_max_deg_s', so every move would trip.",
+        )
+    if np.any(finger.limits[:, 1] - finger.limits[:, 0] <= 2 * limits.joint_margin):
+        table.fail("joint_margin_deg", "'joint_margin_deg' leaves no range between the joint limits.")
+    table.finish()
+    return limits

@@ -1,0 +1,199 @@
+"""The contract with the controller's program: memory layout, commands, states. `docs/plc-contract.md` says it in words.
+
+Every structure holds fields of 4 or 8 bytes on their natural boundary, so that TwinCAT's packing and NumPy's agree;
+sizes are compared when the adapter connects.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+
+import numpy as np
+
+VERSION = 1
+VALUES = 60  # LREAL channels in one sample
+TARGETS = 18  # actuation modules of the rig
+RING = 16384  # samples: 16 s at 1 kHz, 8 MiB
+CYCLE_NS = 1_000_000
+PREFIX = "GVL_Jaxfinger."
+
+INFO = np.dtype(
+    [
+        ("version", "<u4"),
+        ("sample_size", "<u4"),
+        ("ring_length", "<u4"),
+        ("values", "<u4"),
+        ("cycle_ns", "<u8"),
+        ("boot", "<u8"),  # differs after every restart of the program
+        ("program", "S80"),
+    ]
+)
+SAMPLE = np.dtype(
+    [
+        ("seq", "<u8"),
+        ("t_ns", "<u8"),  # distributed clock at the start of the task, ns since 2000-01-01
+        ("state", "<u4"),
+        ("flags", "<u4"),
+        ("value", "<f8", VALUES),
+        ("seq_end", "<u8"),  # equals seq unless the record was read while being written
+    ]
+)
+STATUS = np.dtype(
+    [
+        ("head", "<u8"),  # samples written since the start: the next sample's seq
+        ("boot", "<u8"),
+        ("state", "<u4"),
+        ("trip", "<u4"),
+        ("trip_seq", "<u8"),
+        ("trip_value", "<f8"),
+        ("trip_slot", "<i4"),
+        ("acknowledged", "<u4"),  # id of the last command seen
+        ("refused", "<u4"),  # why that command was refused; 0: accepted
+        ("spare", "<u4"),
+    ]
+)
+COMMAND = np.dtype(
+    [
+        ("id", "<u4"),
+        ("kind", "<u4"),
+        ("index", "<i4"),  # joint of a JOINT command, trip code of a STOP
+        ("spare", "<u4"),
+        ("rate", "<f8"),  # N/s or rad/s
+        ("acceleration", "<f8"),  # rad/s²
+        ("target", "<f8", TARGETS),  # N per tendon (NaN: leave as it is), or rad in target[0]
+    ]
+)
+LIMITS = np.dtype(
+    [
+        ("tension_max", "<f8"),
+        ("tension_rate_max", "<f8"),
+        ("joint_velocity_max", "<f8"),
+        ("joint_torque_max", "<f8"),
+        ("fingertip_force_max", "<f8"),
+        ("heartbeat_s", "<f8"),
+    ]
+)
+FILTER = np.dtype([("enabled", "<u4"), ("setting", "<u4"), ("bandwidth", "<f8")])  # per slot, as read from CoE
+
+# What a bench has besides the controller: the stand-in's operator and its faults. A real controller has no such symbol.
+BENCH = np.dtype(
+    [
+        ("id", "<u4"),
+        ("contact", "<u4"),
+        ("fault", "<u4"),
+        ("fault_slot", "<i4"),
+        ("fault_seq", "<u8"),
+        ("mode", "<i4", TARGETS),
+        ("pose", "<f8", TARGETS),
+    ]
+)
+FAULTS = ("none", "nan", "freeze", "spike", "clock", "flag", "stall", "restart", "cut")
+
+SYMBOLS: dict[str, tuple[np.dtype, int]] = {
+    "stInfo": (INFO, 1),
+    "stStatus": (STATUS, 1),
+    "stLimits": (LIMITS, 1),
+    "aFilter": (FILTER, VALUES),
+    "stCommand": (COMMAND, 1),
+    "nHostBeat": (np.dtype("<u8"), 1),
+    "aRing": (SAMPLE, RING),
+    "stBench": (BENCH, 1),
+}
+
+
+class State(IntEnum):
+    """States of the controller."""
+
+    INIT = 0
+    IDLE = 1
+    ARMED = 2  # tensions and external motor hold their set-points
+    MOVING = 3  # a ramp or a move is under way
+    RELEASING = 4
+    TRIPPED = 5  # latched: drives are off until RESET
+
+
+class Kind(IntEnum):
+    """Commands of the host."""
+
+    NONE = 0
+    ARM = 1
+    DISARM = 2
+    TENSION = 3
+    JOINT = 4
+    HOLD = 5
+    RELEASE = 6
+    RESET = 7
+    STOP = 8  # latched stop with the host's cause in `index`
+
+
+class Trip(IntEnum):
+    """Causes of a latched stop; the value is the code on the wire."""
+
+    NONE = 0
+    TENSION = 1
+    TENSION_RATE = 2
+    SLACK = 3
+    POSITION = 4
+    VELOCITY = 5
+    TORQUE = 6
+    FORCE = 7
+    INVALID = 8  # NaN, infinite, or flagged by the terminal
+    HEARTBEAT = 9
+    FROZEN = 20  # codes from 20 on are found by the host
+    STALE = 21
+    CLOCK = 22
+    OPERATOR = 23
+    RECORDER = 24
+    HOST = 25
+
+    @property
+    def sentence(self) -> str:
+        """The cause in words."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Trip.NONE: "no trip",
+    Trip.TENSION: "tendon tension above its limit",
+    Trip.TENSION_RATE: "tendon tension changes faster than its limit",
+    Trip.SLACK: "a loaded tendon went slack",
+    Trip.POSITION: "joint beyond its limits",
+    Trip.VELOCITY: "joint velocity above its limit",
+    Trip.TORQUE: "external joint torque above its limit",
+    Trip.FORCE: "fingertip force above its limit",
+    Trip.INVALID: "a channel is not a number or was flagged by its terminal",
+    Trip.HEARTBEAT: "the host's heartbeat stopped",
+    Trip.FROZEN: "a channel is frozen",
+    Trip.STALE: "the controller writes no new samples",
+    Trip.CLOCK: "the controller's clock jumped back",
+    Trip.OPERATOR: "the operator pressed the stop key",
+    Trip.RECORDER: "the recorder can no longer write",
+    Trip.HOST: "the host gave up",
+}
+
+
+class Refusal(IntEnum):
+    """Why the controller refused a command."""
+
+    NONE = 0
+    STATE = 1  # not in this state
+    RANGE = 2  # a target or rate beyond the hard limits, or not a number
+    KIND = 3  # an unknown kind
+
+
+class Flag(IntFlag):
+    """Low half of a sample's flags; the high half is the id of the last command seen, modulo 65536."""
+
+    BUS = 1  # working counter or device state not OK
+    ENCODER = 2  # parity or magnet error of a joint encoder
+    ANALOG = 4  # over- or under-range of an analog input
+
+
+def layout(ring: int = RING) -> dict[str, tuple[int, int]]:
+    """Offset and size in bytes of every symbol when they are laid end to end on 8-byte boundaries."""
+    place, offset = {}, 0
+    for name, (dtype, count) in SYMBOLS.items():
+        size = dtype.itemsize * (ring if name == "aRing" else count)
+        place[name] = (offset, size)
+        offset += -(-size // 8) * 8
+    return place

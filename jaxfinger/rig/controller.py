@@ -1,0 +1,366 @@
+"""The controller's program in Python: what the Structured Text of `docs/JaxfingerRing.st` does, cycle by cycle.
+
+The stand-in and the in-process simulated rig both run it around the simulated finger: commands, ramps, hard limits,
+heartbeat, release, and the ring of samples, in the memory layout of the contract.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxfinger.rig import contract
+from jaxfinger.rig.contract import Flag, Kind, Refusal, State, Trip
+from jaxfinger.rig.plant import DT, Mode, Plant, Sensors
+
+_SAMPLE = struct.Struct(f"<QQII{contract.VALUES}dQ")
+_COMMAND = struct.Struct(f"<IIiIdd{contract.TARGETS}d")
+_STATUS = struct.Struct("<QQIIQdiIII")
+_EPOCH_NS = 820_000_000 * 1_000_000_000  # the simulated distributed clock starts in the year 2025
+
+
+@dataclass(frozen=True)
+class HardLimits:
+    """The controller's own limits, SI; the fields of ST_Limits."""
+
+    tension_max: float = 20.0
+    tension_rate_max: float = 500.0
+    joint_velocity_max: float = 10.5
+    joint_torque_max: float = 0.5
+    fingertip_force_max: float = 20.0
+    heartbeat_s: float = 0.25
+
+
+class Slots:
+    """Where the simulated rig puts its channels: tensions, excursions, angles, external torque, fingertip force."""
+
+    def __init__(self, n: int, m: int):
+        self.tension = list(range(n))
+        self.excursion = list(range(n, 2 * n))
+        self.angle = list(range(2 * n, 2 * n + m))
+        self.torque = 2 * n + m
+        self.force = list(range(2 * n + m + 1, 2 * n + m + 4))
+        self.used = 2 * n + m + 4
+
+
+class Controller:
+    """One cycle of the program per `cycle()`; `memory` is the controller's memory as ADS serves it."""
+
+    def __init__(
+        self,
+        plant: Plant | None = None,
+        limits: HardLimits | None = None,
+        seed: int = 0,
+        ring: int = contract.RING,
+        sensors: Sensors | None = None,
+        filtered: bool = False,
+    ):
+        self.plant = plant or Plant()
+        self.limits = limits or HardLimits()
+        self.sensors = sensors or Sensors()
+        self.slots = Slots(self.plant.n, self.plant.m)
+        self.ring = ring
+        self.place = contract.layout(ring)
+        self.memory = bytearray(sum(self.place["stBench"]))
+        self.faults: dict[str, tuple[int, int]] = {}  # kind: (slot, first seq)
+        self.filtered = filtered
+        self.cut = False  # the server is asked to drop its connections
+        self.rng = np.random.default_rng(seed)
+        self.boot = 0
+        self.start()
+
+    def start(self) -> None:
+        """Start the program: counters at zero, a new boot number, everything off."""
+        n = self.plant.n
+        self.boot += 1
+        self.seq = 0
+        self.state = State.IDLE
+        self.trip, self.trip_seq, self.trip_value, self.trip_slot = Trip.NONE, 0, 0.0, -1
+        self.acknowledged, self.refused = 0, Refusal.NONE
+        self.target, self.setpoint, self.tension = [0.0] * n, [0.0] * n, [0.0] * n
+        self.rate = 10.0
+        self.motor: tuple[float, float, float] | None = None  # angle, velocity, acceleration of the external motor
+        self.goal, self.speed, self.acceleration = 0.0, 0.5, 20.0
+        self.beat, self.beat_age = 0, 0
+        self.ramps: list[tuple[float, float]] = []  # of a release: (tension, seconds)
+        self.bench = 0
+        self.over: dict[tuple[Trip, int], int] = {}
+        self.memory[:] = bytes(len(self.memory))
+        info = np.zeros((), contract.INFO)
+        info["version"], info["sample_size"], info["ring_length"] = (
+            contract.VERSION,
+            contract.SAMPLE.itemsize,
+            self.ring,
+        )
+        info["values"], info["cycle_ns"], info["boot"] = contract.VALUES, contract.CYCLE_NS, self.boot
+        info["program"] = b"jaxfinger stand-in"
+        self._put("stInfo", info.tobytes())
+        limits = self.limits
+        self._put("stLimits", struct.pack("<6d", *(getattr(limits, name) for name in contract.LIMITS.names or ())))
+        filters = np.zeros(contract.VALUES, contract.FILTER)
+        if self.filtered:  # the factory setting of an EL3008: 50 Hz FIR, -3 dB at 22 Hz
+            filters["enabled"][self.slots.tension + [self.slots.torque] + self.slots.force] = 1
+            filters["bandwidth"][filters["enabled"] == 1] = 22.0
+        self._put("aFilter", filters.tobytes())
+        self._noise = self.rng.standard_normal((4096, self.slots.used))
+        self._values = self._before = [0.0] * contract.VALUES
+        self._status()
+
+    def _put(self, symbol: str, data: bytes) -> None:
+        offset, size = self.place[symbol]
+        assert len(data) == size
+        self.memory[offset : offset + size] = data
+
+    # one cycle --------------------------------------------------------------------------------------------------
+    def cycle(self) -> None:
+        """Read the command, advance ramps and finger by 1 ms, measure, check, write the sample."""
+        self._bench()
+        fault = {kind: slot for kind, (slot, first) in self.faults.items() if self.seq >= first}
+        if "restart" in fault:
+            self.faults.clear()
+            self.start()
+        if "cut" in fault:
+            self.cut = True
+            del self.faults["cut"]
+        if "stall" in fault:
+            return
+        self._commands()
+        self._heartbeat()
+        self._ramps()
+        self.plant.step(self.tension, self.motor)
+        flags = self._measure(fault)
+        self._check(flags)
+        self._sample(flags, 500 * contract.CYCLE_NS if "clock" in fault else 0)
+
+    def _commands(self) -> None:
+        offset, size = self.place["stCommand"]
+        number, kind, index, _, rate, acceleration, *target = _COMMAND.unpack_from(self.memory, offset)
+        if number == self.acknowledged:
+            return
+        self.acknowledged = number
+        self.refused = self._obey(kind, index, rate, acceleration, target)
+
+    def _obey(self, kind: int, index: int, rate: float, acceleration: float, target: list[float]) -> Refusal:
+        on = self.state in (State.ARMED, State.MOVING)
+        if kind == Kind.STOP:
+            self._stop(Trip(index), -1, 0.0)
+        elif kind == Kind.RESET:
+            if self.state is not State.TRIPPED or self.ramps:
+                return Refusal.STATE
+            self.state, self.trip, self.trip_slot = State.IDLE, Trip.NONE, -1
+            self.target = self.setpoint[:]
+        elif kind == Kind.ARM:
+            if self.state is not State.IDLE:
+                return Refusal.STATE
+            self.state, self.beat_age = State.ARMED, 0
+        elif kind == Kind.DISARM:
+            if not on and self.state is not State.IDLE:
+                return Refusal.STATE
+            self.state, self.motor = State.IDLE, None
+            self.setpoint, self.target = [0.0] * self.plant.n, [0.0] * self.plant.n
+        elif kind == Kind.RELEASE:
+            if on:
+                self._release()
+        elif kind in (Kind.TENSION, Kind.JOINT, Kind.HOLD):
+            if not on:
+                return Refusal.STATE
+            return self._set(kind, rate, acceleration, target)
+        else:
+            return Refusal.KIND
+        return Refusal.NONE
+
+    def _set(self, kind: int, rate: float, acceleration: float, target: list[float]) -> Refusal:
+        limits, n = self.limits, self.plant.n
+        if kind == Kind.HOLD:
+            self.target = self.setpoint[:]
+            if self.motor is not None:
+                self.goal = self.motor[0] + math.copysign(self.motor[1] ** 2 / (2 * self.acceleration), self.motor[1])
+            return Refusal.NONE
+        if not 0 < rate < math.inf:
+            return Refusal.RANGE
+        if kind == Kind.TENSION:
+            wanted = [new if not math.isnan(new) else old for new, old in zip(target[:n], self.target, strict=True)]
+            if rate > limits.tension_rate_max or not all(0 <= w <= limits.tension_max for w in wanted):
+                return Refusal.RANGE
+            self.target, self.rate = wanted, rate
+        else:
+            if Mode.MOTOR not in self.plant.mode:
+                return Refusal.STATE
+            low, high = self.plant.truth.finger.limits[self.plant.mode.index(Mode.MOTOR)]
+            if rate > limits.joint_velocity_max or not low <= target[0] <= high or not 0 < acceleration < math.inf:
+                return Refusal.RANGE
+            self.goal, self.speed, self.acceleration = target[0], rate, acceleration
+        self.state = State.MOVING
+        return Refusal.NONE
+
+    def _heartbeat(self) -> None:
+        offset, _ = self.place["nHostBeat"]
+        (beat,) = struct.unpack_from("<Q", self.memory, offset)
+        self.beat_age = 0 if beat != self.beat else self.beat_age + 1
+        self.beat = beat
+        if self.state in (State.ARMED, State.MOVING) and self.beat_age * DT > self.limits.heartbeat_s:
+            self._stop(Trip.HEARTBEAT, -1, self.beat_age * DT)
+
+    def _release(self) -> None:
+        """All tendons together, in proportion: 2 N within 0.2 s, then 0.5 N within 0.5 s, then drives off."""
+        self.state, self.motor = State.RELEASING, None
+        peak = max([*self.setpoint, 1e-9])
+        self.ramps = [(min(2.0 / peak, 1.0), 0.2), (min(0.5 / peak, 1.0), 0.5)]
+        self._from, self._ramp_time = self.setpoint[:], 0.0
+
+    def _stop(self, trip: Trip, slot: int, value: float) -> None:
+        if self.state is State.TRIPPED:
+            return
+        self.trip, self.trip_seq, self.trip_slot, self.trip_value = trip, self.seq, slot, value
+        if self.state in (State.ARMED, State.MOVING):
+            self._release()
+        if trip in (Trip.TENSION, Trip.SLACK):  # over-tension or a broken tendon: drives off at once
+            self.ramps, self.setpoint = [], [0.0] * self.plant.n
+        self.target, self.state = self.setpoint[:], State.TRIPPED
+
+    def _ramps(self) -> None:
+        n = self.plant.n
+        if self.ramps:
+            share, seconds = self.ramps[0]
+            self._ramp_time += DT
+            part = min(self._ramp_time / seconds, 1.0)
+            start = self._from
+            peak_share = 1.0 + (share - 1.0) * part
+            self.setpoint = [s * peak_share for s in start]
+            if part == 1.0:
+                self.ramps.pop(0)
+                if self.ramps:
+                    peak = max([*self.setpoint, 1e-9])
+                    self._from, self._ramp_time = self.setpoint[:], 0.0
+                    self.ramps[0] = (min(0.5 / peak, 1.0), self.ramps[0][1])
+                else:
+                    self.setpoint = [0.0] * n
+            self.target = self.setpoint[:]
+            if not self.ramps and self.state is State.RELEASING:
+                self.state = State.IDLE
+        elif self.state is State.MOVING:
+            step = self.rate * DT
+            self.setpoint = [s + min(max(t - s, -step), step) for s, t in zip(self.setpoint, self.target, strict=True)]
+            if self.setpoint == self.target and not self._move():
+                self.state = State.ARMED
+        elif Mode.MOTOR in self.plant.mode and self.motor is not None:
+            self.motor = (self.motor[0], 0.0, 0.0)
+        if Mode.MOTOR in self.plant.mode and self.motor is None and self.state in (State.ARMED, State.MOVING):
+            self.goal = self.plant.q[self.plant.mode.index(Mode.MOTOR)]
+            self.motor = (self.goal, 0.0, 0.0)
+        if Mode.MOTOR not in self.plant.mode:
+            self.motor = None
+        lag = DT / (DT + 0.015)  # the drive's force loop
+        self.tension = [f + lag * (s - f) for f, s in zip(self.tension, self.setpoint, strict=True)]
+
+    def _move(self) -> bool:
+        """Trapezoidal velocity profile of the external motor toward its goal; False when it is there."""
+        if self.motor is None:
+            return False
+        angle, velocity, _ = self.motor
+        distance = self.goal - angle
+        if abs(distance) <= abs(velocity) * DT + 1e-9 and abs(velocity) <= 2 * self.acceleration * DT:
+            self.motor = (self.goal, 0.0, 0.0)
+            return False
+        allowed = min(self.speed, math.sqrt(2 * self.acceleration * abs(distance)))
+        change = math.copysign(allowed, distance) - velocity
+        change = min(max(change, -self.acceleration * DT), self.acceleration * DT)
+        velocity += change
+        self.motor = (angle + velocity * DT, velocity, change / DT)
+        return True
+
+    # measuring --------------------------------------------------------------------------------------------------
+    def _measure(self, fault: dict[str, int]) -> int:
+        plant, s, slots = self.plant, self.sensors, self.slots
+        noise = self._noise[self.seq % 4096].tolist()
+        fresh = self._values[:]
+        for i, slot in enumerate(slots.tension):
+            fresh[slot] = self.tension[i] + s.tension_noise * noise[slot]
+        for slot, length in zip(slots.excursion, plant.excursion(), strict=True):
+            fresh[slot] = length + s.excursion_noise * noise[slot]
+        for j, slot in enumerate(slots.angle):
+            fresh[slot] = round((plant.q[j] + s.angle_noise * noise[slot]) / s.angle_step) * s.angle_step
+        fresh[slots.torque] = plant.external_torque + s.torque_offset + s.torque_noise * noise[slots.torque]
+        for axis, slot in enumerate(slots.force):
+            fresh[slot] = plant.tip_force[axis] + s.force_offset[axis] + s.force_noise * noise[slot]
+        flags = 0
+        for kind, slot in fault.items():
+            if kind == "nan":
+                fresh[slot] = math.nan
+            elif kind == "freeze":
+                fresh[slot] = self._values[slot]
+            elif kind == "spike":
+                fresh[slot] += 60.0
+            elif kind == "flag":
+                flags |= Flag.ANALOG
+        self._before, self._values = self._values, fresh
+        return flags
+
+    def _check(self, flags: int) -> None:
+        """Hard limits, each after three cycles: one odd sample must not drop the finger."""
+        if self.state not in (State.ARMED, State.MOVING):
+            self.over.clear()
+            return
+        limits, slots, values = self.limits, self.slots, self._values
+        found: list[tuple[Trip, int, float]] = []
+        if flags or not all(map(math.isfinite, values)):
+            slot = next((i for i, v in enumerate(values) if not math.isfinite(v)), -1)
+            found.append((Trip.INVALID, slot, math.nan))
+        found += [
+            (Trip.TENSION_RATE, i, (values[i] - self._before[i]) / DT)
+            for i in slots.tension
+            if abs(values[i] - self._before[i]) > limits.tension_rate_max * DT
+        ]
+        found += [(Trip.TENSION, i, values[i]) for i in slots.tension if values[i] > limits.tension_max]
+        found += [
+            (Trip.SLACK, i, values[i])
+            for i, wanted in zip(slots.tension, self.setpoint, strict=True)
+            if wanted > 1.5 and values[i] < 0.2
+        ]
+        found += [
+            (Trip.VELOCITY, slot, velocity)
+            for slot, velocity in zip(slots.angle, self.plant.qd, strict=True)
+            if abs(velocity) > limits.joint_velocity_max
+        ]
+        if abs(values[slots.torque]) > limits.joint_torque_max:
+            found.append((Trip.TORQUE, slots.torque, values[slots.torque]))
+        found += [(Trip.FORCE, i, values[i]) for i in slots.force if abs(values[i]) > limits.fingertip_force_max]
+        self.over = {(trip, slot): self.over.get((trip, slot), 0) + 1 for trip, slot, _ in found}
+        for trip, slot, value in found:
+            if self.over[trip, slot] >= 3:
+                self._stop(trip, slot, value)
+                return
+
+    def _sample(self, flags: int, back_ns: int) -> None:
+        offset, _ = self.place["aRing"]
+        at = offset + (self.seq % self.ring) * _SAMPLE.size
+        t_ns = _EPOCH_NS + self.seq * contract.CYCLE_NS - back_ns
+        flags |= (self.acknowledged & 0xFFFF) << 16
+        _SAMPLE.pack_into(self.memory, at, self.seq, t_ns, self.state, flags, *self._values, self.seq)
+        self.seq += 1
+        self._status()
+
+    def _status(self) -> None:
+        offset, _ = self.place["stStatus"]
+        _STATUS.pack_into(
+            self.memory, offset, self.seq, self.boot, self.state, self.trip, self.trip_seq, self.trip_value,
+            self.trip_slot, self.acknowledged, self.refused, 0,
+        )  # fmt: skip
+
+    def _bench(self) -> None:
+        """The simulated operator: how each joint is held and where, the fingertip on its sensor, and faults to inject."""
+        offset, size = self.place["stBench"]
+        (number,) = struct.unpack_from("<I", self.memory, offset)
+        if number == self.bench:
+            return
+        order = np.frombuffer(self.memory[offset : offset + size], contract.BENCH)[0]
+        self.bench = number
+        if kind := int(order["fault"]):
+            self.faults[contract.FAULTS[kind]] = (int(order["fault_slot"]), int(order["fault_seq"]))
+            return
+        m = self.plant.m
+        self.plant.prepare([Mode(v) for v in order["mode"][:m]], order["pose"][:m].tolist(), bool(order["contact"]))
+        self.motor = None

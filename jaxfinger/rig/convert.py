@@ -1,0 +1,271 @@
+"""From the log to a session: trials in the dataset format, and beside them what the recorder saw (gaps, trips, filters)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from jaxfinger.data import Session, Trial, write_session
+from jaxfinger.data.atomic import atomic_path
+from jaxfinger.data.hdf5 import LIBVER
+from jaxfinger.data.session import FingerDescription
+from jaxfinger.errors import UserError
+from jaxfinger.rig import wal
+from jaxfinger.rig.backend import Block
+from jaxfinger.rig.channels import Filter, RigDescription
+
+
+@dataclass
+class Recording:
+    """One trial as it lies in the log."""
+
+    start: dict[str, Any]
+    blocks: list[Block] = field(default_factory=list)
+    marks: list[dict[str, Any]] = field(default_factory=list)
+    end: dict[str, Any] | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the trial."""
+        return self.start["name"]
+
+    @property
+    def complete(self) -> bool:
+        """Whether the trial ran to its end."""
+        return bool(self.end and self.end["complete"])
+
+    @property
+    def cause(self) -> str:
+        """Why it did not, in words."""
+        return "the recorder was killed" if self.end is None else str(self.end.get("cause", ""))
+
+
+@dataclass
+class Log:
+    """A log, read: header, trials in their order, events."""
+
+    header: dict[str, Any]
+    recordings: list[Recording]
+    events: list[dict[str, Any]]
+
+    @property
+    def last_seq(self) -> int | None:
+        """Number of the last sample in it."""
+        return next((int(r.blocks[-1].seq[-1]) for r in reversed(self.recordings) if r.blocks), None)
+
+
+def header(rig: RigDescription, plan: str, filters: dict[str, Filter], fingerprint: dict[str, str]) -> dict[str, Any]:
+    """The log's first frame: all that a session file needs besides the samples."""
+    finger = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(rig.finger).items()}
+    return {
+        "specimen": rig.specimen,
+        "source": f"rig {rig.name} ({rig.backend})",
+        "finger": finger,
+        "channels": [asdict(c) for c in rig.channels],
+        "rate_hz": rig.rate_hz,
+        "rig": rig.text,
+        "plan": plan,
+        "filters": {name: asdict(f) for name, f in filters.items()},
+        "fingerprint": fingerprint,
+    }
+
+
+def read_frames(frames: Iterable[wal.Frame], name: str = "log") -> Log:
+    """Group the frames of a log; a trial whose end is missing was cut short."""
+    head: dict[str, Any] | None = None
+    recordings: list[Recording] = []
+    events: list[dict[str, Any]] = []
+    for frame in frames:
+        if frame.tag == wal.HEADER:
+            head = frame.json
+        elif frame.tag == wal.TRIAL:
+            recordings.append(Recording(frame.json))
+        elif frame.tag == wal.EVENT:
+            events.append(frame.json)
+        elif recordings and frame.tag == wal.DATA:
+            recordings[-1].blocks.append(frame.block)
+        elif recordings and frame.tag == wal.MARK:
+            recordings[-1].marks.append(frame.json)
+        elif recordings and frame.tag == wal.END:
+            recordings[-1].end = frame.json
+    if head is None:
+        raise UserError(f"{name}: the log ends within its first frame, before any sample was recorded.")
+    return Log(head, recordings, events)
+
+
+def _finger(values: dict[str, Any]) -> FingerDescription:
+    arrays = {"active": bool, "crosses": bool}
+    names = ("joint_names", "tendon_names", "prismatic")
+    return FingerDescription(
+        **{
+            key: tuple(value) if key in names else None if value is None else np.array(value, arrays.get(key, float))
+            for key, value in values.items()
+        }
+    )
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The samples of one trial, each once: `kept` of them make the trial, the rest came after a trip or were not numbers."""
+
+    seq: np.ndarray
+    time: np.ndarray
+    x: np.ndarray
+    kept: np.ndarray
+    gaps: list[tuple[int, int]]  # (first seq after the gap, samples lost)
+    clock_jumps: int
+
+
+def _samples(recording: Recording, width: int, rate_hz: float) -> Samples:
+    blocks = recording.blocks
+    empty = np.empty(0, np.int64)
+    seq = np.concatenate([empty, *(b.seq.astype(np.int64) for b in blocks)])
+    t = np.concatenate([empty, *(b.t_ns.astype(np.int64) for b in blocks)])
+    x = np.concatenate([np.empty((0, width)), *(b.x for b in blocks)])
+    fresh = seq > np.maximum.accumulate(np.concatenate([[-1], seq[:-1]])) if len(seq) else np.empty(0, bool)
+    keep = fresh & (seq >= int(recording.start["seq"]))
+    seq, t, x = seq[keep], t[keep], x[keep]
+    if not len(seq):
+        return Samples(seq, seq * 1.0, x, keep[:0], [], 0)
+    steps, jump = np.diff(t), np.diff(seq)
+    nominal = np.round(jump * 1e9 / rate_hz).astype(np.int64)
+    wrong = steps <= 0
+    if wrong.any():  # a clock that ran back: the counter says how much time went by
+        steps = np.where(wrong, nominal, steps)
+    time = np.concatenate([[0], np.cumsum(steps)]) * 1e-9
+    gaps = [(int(seq[i + 1]), int(jump[i] - 1)) for i in np.flatnonzero(jump > 1)]
+    end = recording.end or {}
+    last = int(end.get("seq", seq[-1] + 1))
+    return Samples(seq, time, x, (seq < last) & np.isfinite(x).all(1), gaps, int(wrong.sum()))
+
+
+def _trial(recording: Recording, samples: Samples, head: dict[str, Any], finger: FingerDescription) -> Trial:
+    start, keep = recording.start, samples.kept
+    seq, x, count = samples.seq[keep], samples.x[keep], int(keep.sum())
+    where = {(c["kind"], c["of"]): i for i, c in enumerate(head["channels"])}
+    tare = np.array([start["tare"].get(c["name"], 0.0) for c in head["channels"]])
+    x = x - tare
+
+    def columns(kind: str, names: Iterable[str]) -> np.ndarray | None:
+        places = [where.get((kind, name)) for name in names]
+        if all(p is None for p in places):
+            return None
+        return np.stack([x[:, p] if p is not None else np.full(count, np.nan) for p in places], 1)
+
+    q = columns("joint_position", finger.joint_names)
+    assert q is not None
+    excursion = torque = None
+    if start["loaded"]:
+        excursion = columns("excursion", finger.tendon_names)
+        if excursion is not None:
+            excursion[:, [name not in start["loaded"] for name in finger.tendon_names]] = np.nan
+    if start["motor"] and (sensor := where.get(("external_torque", ""))) is not None:
+        torque = np.full((count, finger.m), np.nan)
+        torque[:, finger.joint_names.index(start["motor"])] = x[:, sensor]
+    time = samples.time[keep]
+    hold, joint_direction, tendon_direction = _marks(recording.marks, seq, finger)
+    return Trial(
+        name=start["name"],
+        experiment=start["experiment"],
+        time=time - time[0],
+        q=q,
+        tendon_force=columns("tension", finger.tendon_names),
+        tendon_excursion=excursion,
+        joint_torque=torque,
+        fingertip_force=columns("fingertip_force", "xyz") if start["contact"] else None,
+        joint_direction=joint_direction,
+        tendon_direction=tendon_direction,
+        hold=hold,
+        joint=start["joint"],
+        tendon=start["tendon"],
+        complete=recording.complete,
+        motion=start["motion"],
+        session_start=start["session_start"],
+    )
+
+
+def _marks(marks: list[dict[str, Any]], seq: np.ndarray, finger: FingerDescription):
+    """Holds and commanded directions: each mark counts from its sample to the next mark."""
+    if not marks:
+        return None, None, None
+    hold = np.full(len(seq), -1, np.int32)
+    joint, tendon = np.zeros((len(seq), finger.m), np.int8), np.zeros((len(seq), finger.n), np.int8)
+    for mark in marks:
+        after = seq >= int(mark["seq"])
+        hold[after] = mark["hold"]
+        for values, names, directions in (
+            (joint, finger.joint_names, mark["joint_direction"]),
+            (tendon, finger.tendon_names, mark["tendon_direction"]),
+        ):
+            values[after] = [directions.get(name, 0) for name in names]
+    return hold, joint, tendon if any(m["tendon_direction"] for m in marks) else None
+
+
+def publish(log: Log, output: str | Path, overwrite: bool = False) -> Session:
+    """Write the session of a log: whole or not at all, in a file version that old tools open."""
+    finger = _finger(log.header["finger"])
+    trials, extras = {}, {}
+    for recording in log.recordings:
+        samples = _samples(recording, len(log.header["channels"]), float(log.header["rate_hz"]))
+        if samples.kept.sum() >= 2:
+            trials[recording.name] = _trial(recording, samples, log.header, finger)
+            extras[recording.name] = (recording, samples)
+    session = Session(
+        specimen=log.header["specimen"], finger=finger, trials=trials, source=log.header["source"],
+        created=log.header["created"],
+    )  # fmt: skip
+    with atomic_path(output, overwrite) as part:
+        write_session(session, part, overwrite=True)
+        with h5py.File(part, "r+", libver=LIBVER) as file:
+            for name, (recording, samples) in extras.items():
+                _annotate(file["trials"][name].attrs, recording, samples)
+            _beside(file.create_group("rig"), log, extras)
+    return session
+
+
+def _annotate(attributes: h5py.AttributeManager, recording: Recording, samples: Samples) -> None:
+    attributes["parameters"] = json.dumps(recording.start["parameters"])
+    attributes["lost_samples"] = sum(lost for _, lost in samples.gaps)
+    if samples.clock_jumps:
+        attributes["clock_jumps"] = samples.clock_jumps
+    last = int((recording.end or {}).get("seq", 2**62))
+    if broken := int((~samples.kept & (samples.seq < last)).sum()):
+        attributes["dropped_samples"] = broken  # not a number in some channel; they lie in /rig/dropped
+    if not recording.complete:
+        attributes["cause"] = recording.cause
+        attributes["trip"] = int((recording.end or {}).get("trip", 0))
+
+
+def _beside(group: h5py.Group, log: Log, extras: dict[str, tuple[Recording, Samples]]) -> None:
+    """`/rig`: what readers of the format ignore and people want to know."""
+    text = h5py.string_dtype("utf-8")
+    group.attrs["rig_file"], group.attrs["plan_file"] = log.header["rig"], log.header["plan"]
+    group.attrs["fingerprint"] = json.dumps(log.header["fingerprint"])
+    group.create_dataset("events", data=[json.dumps(e) for e in log.events] or np.empty(0, object), dtype=text)
+    filters = group.create_group("filters")
+    names = list(log.header["filters"])
+    rows = [log.header["filters"][n] for n in names]
+    filters.create_dataset("channel", data=names or np.empty(0, object), dtype=text)
+    filters.create_dataset("enabled", data=np.array([r["enabled"] for r in rows], bool))
+    filters.create_dataset("setting", data=np.array([r["setting"] for r in rows], np.int64))
+    bandwidth = filters.create_dataset("bandwidth", data=np.array([r["bandwidth"] or np.nan for r in rows], float))
+    bandwidth.attrs["units"] = "Hz"
+    gaps = [(name, first, lost) for name, (_, samples) in extras.items() for first, lost in samples.gaps]
+    table = group.create_group("gaps")
+    table.create_dataset("trial", data=[g[0] for g in gaps] or np.empty(0, object), dtype=text)
+    table.create_dataset("seq", data=np.array([g[1] for g in gaps], np.int64))
+    table.create_dataset("lost", data=np.array([g[2] for g in gaps], np.int64))
+    dropped = group.create_group("dropped")  # samples after a trip, or not a number
+    dropped.create_dataset("channel", data=[c["name"] for c in log.header["channels"]], dtype=text)
+    for name, (_, samples) in extras.items():
+        if not samples.kept.all():
+            rest = dropped.create_group(name)
+            rest.create_dataset("seq", data=samples.seq[~samples.kept])
+            rest.create_dataset("time", data=samples.time[~samples.kept]).attrs["units"] = "s"
+            rest.create_dataset("value", data=samples.x[~samples.kept])

@@ -1,0 +1,322 @@
+"""The paper's experiments, each a generator of commands, waits and marks; the same code drives simulator and rig.
+
+A protocol starts unrecorded (posture, pretension, taring), yields `Start`, and is recorded until it ends. Angles in plan
+files are degrees, tensions N, torques N m, times s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from jaxfinger.data.session import FingerDescription
+from jaxfinger.rig.backend import Command, JointMove, Setup, TensionRamp
+
+
+@dataclass(frozen=True)
+class Reached:
+    """Wait until the controller has carried out the last command."""
+
+    timeout: float = 60.0
+
+
+@dataclass(frozen=True)
+class Dwell:
+    """Wait so many seconds of device time."""
+
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Wait until every named tension stayed within `within` N of its value for `seconds`."""
+
+    tensions: dict[str, float]
+    within: float = 0.3
+    seconds: float = 0.5
+    timeout: float = 20.0
+
+
+@dataclass(frozen=True)
+class Covered:
+    """Wait until the joints have been moved through `share` of their range, `passes` times each way."""
+
+    joints: tuple[str, ...]
+    share: float
+    passes: int
+    timeout: float
+
+
+@dataclass(frozen=True)
+class Tare:
+    """Take the mean of these kinds of channel over `seconds`, unloaded, as their zero."""
+
+    kinds: tuple[str, ...]
+    seconds: float = 0.5
+
+
+@dataclass(frozen=True)
+class Mark:
+    """From here on, samples belong to this hold (−1: none), with these commanded directions."""
+
+    hold: int = -1
+    joint_direction: dict[str, int] = field(default_factory=dict)
+    tendon_direction: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Record from here on; `loaded` are the tendons whose excursion means something."""
+
+    loaded: tuple[str, ...] = ()
+
+
+Step = Command | Setup | Reached | Dwell | Settled | Covered | Tare | Mark | Start
+Protocol = Iterator[Step]
+
+
+@dataclass(frozen=True)
+class Common:
+    """What every experiment takes from the plan."""
+
+    posture_deg: tuple[float, ...] = ()  # of the joints that are fixed; empty: all at 20°
+    tension_rate: float = 10.0  # N/s
+    repeats: int = 1
+
+    def posture(self, finger: FingerDescription) -> dict[str, float]:
+        """Angle of every joint in rad."""
+        angles = self.posture_deg or (20.0,) * finger.m
+        return dict(zip(finger.joint_names, np.radians(angles).tolist(), strict=True))
+
+
+@dataclass(frozen=True)
+class MomentArms(Common):
+    """ID.2: `passes` times through `share` of the joint's range by hand, all tendons at `pretension` N."""
+
+    joint: str = ""
+    pretension: float = 2.0
+    share: float = 0.8
+    passes: int = 3
+    timeout: float = 120.0
+
+
+@dataclass(frozen=True)
+class StaticTorque(Common):
+    """ID.3-static: every `step_deg` of `range_deg`, up and back, `dwell` s each, of which the first `settle` s are left out."""
+
+    joint: str = ""
+    range_deg: tuple[float, float] = (0.0, 70.0)
+    step_deg: float = 10.0
+    speed_deg_s: float = 30.0
+    settle: float = 0.2
+    dwell: float = 0.5
+
+
+@dataclass(frozen=True)
+class DynamicTorque(Common):
+    """ID.3-dynamic: to and fro through `range_deg` at each of `speeds_deg_s`, `passes` times."""
+
+    joint: str = ""
+    range_deg: tuple[float, float] = (10.0, 65.0)
+    speeds_deg_s: tuple[float, ...] = (28.6, 57.3, 85.9)  # 0.5, 1, 1.5 rad/s
+    acceleration_deg_s2: float = 600.0
+    passes: int = 2
+
+
+@dataclass(frozen=True)
+class TendonFriction(Common):
+    """ID.4: one tendon in `levels` N, up and, where `down`, back; the joint is held by the torque sensor."""
+
+    joint: str = ""
+    tendon: str = ""
+    levels: tuple[float, ...] = (2.0, 4.0, 6.0, 8.0, 10.0)
+    down: bool = True
+    settle: float = 0.3
+    dwell: float = 0.5
+
+
+@dataclass(frozen=True)
+class FreeExcursion(Common):
+    """VD.1: all joints moved by hand for `seconds`, all tendons at `pretension` N."""
+
+    pretension: float = 2.0
+    seconds: float = 20.0
+
+
+@dataclass(frozen=True)
+class FingertipForce(Common):
+    """VD.2: fingertip on its sensor, one tendon in `levels` N, the others slack."""
+
+    tendon: str = ""
+    levels: tuple[float, ...] = (4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0)
+    settle: float = 0.3
+    dwell: float = 0.5
+
+
+@dataclass(frozen=True)
+class Trajectory(Common):
+    """VD.3: the free finger along a random path of tensions about `mean` N, a new target every `interval` s."""
+
+    mean: tuple[float, ...] = ()  # N per active tendon; empty: 2 N each
+    amplitude: float = 0.8  # N
+    interval: float = 0.5
+    seconds: float = 10.0
+    seed: int = 0
+
+
+def _all(finger: FingerDescription, tension: float) -> dict[str, float]:
+    return {name: tension for name, active in zip(finger.tendon_names, finger.active, strict=True) if active}
+
+
+def _angles(posture: dict[str, float]) -> str:
+    return ", ".join(f"{name} {np.degrees(angle):.0f}°" for name, angle in posture.items())
+
+
+def _tension(targets: dict[str, float], rate: float) -> Protocol:
+    yield TensionRamp(targets, rate)
+    yield Reached()
+
+
+def _tared(finger: FingerDescription, posture: dict[str, float], kinds: tuple[str, ...], rate: float) -> Protocol:
+    """Tendons slack, sensors unloaded, zero taken: before every trial."""
+    yield Setup(f"Fix all joints: {_angles(posture)}. Uncouple the external motor, free the fingertip.", fixed=posture)
+    yield from _tension(_all(finger, 0.0), rate)
+    yield Dwell(0.3)
+    yield Tare(kinds)
+
+
+def moment_arms(finger: FingerDescription, p: MomentArms) -> Protocol:
+    """ID.2: all tendons are pre-tensioned; the operator moves one joint slowly through its range, the others are fixed."""
+    posture = p.posture(finger)
+    yield Setup(f"Fix all joints: {_angles(posture)}.", fixed=posture)
+    pretension = _all(finger, p.pretension)
+    yield from _tension(pretension, p.tension_rate)
+    yield Settled(pretension)
+    others = {name: angle for name, angle in posture.items() if name != p.joint}
+    yield Setup(
+        f"Free {p.joint} and move it slowly by hand, to and fro through its range.", fixed=others, hand=(p.joint,)
+    )
+    yield Start(loaded=tuple(pretension))
+    yield Covered((p.joint,), p.share, p.passes, p.timeout)
+
+
+def static_torque(finger: FingerDescription, p: StaticTorque) -> Protocol:
+    """ID.3-static: tendons slack; the motor stops the joint at sampled angles from extension to flexion, and back."""
+    posture = p.posture(finger)
+    low, high = np.radians(p.range_deg)
+    grid = np.linspace(low, high, max(2, round((p.range_deg[1] - p.range_deg[0]) / p.step_deg) + 1))
+    yield from _tared(finger, posture, ("external_torque",), p.tension_rate)
+    yield from _coupled(posture, p.joint)
+    speed = float(np.radians(p.speed_deg_s))
+    approach = min(0.05, float(grid[1] - grid[0]) / 2)
+    yield JointMove(p.joint, float(low), speed)
+    yield Reached()
+    yield JointMove(p.joint, float(low) + approach, speed)  # friction has a direction before the first hold
+    yield Reached()
+    yield Start()
+    up = [float(low) + approach + 0.02, *grid[1:].tolist()]
+    hold = 0
+    for direction, angles in ((+1, up), (-1, [float(high) - 0.05, *grid[-2::-1].tolist()])):
+        for angle in angles:
+            yield Mark(-1, {p.joint: direction})
+            yield JointMove(p.joint, angle, speed)
+            yield Reached()
+            yield Dwell(p.settle)
+            yield Mark(hold, {p.joint: direction})
+            yield Dwell(p.dwell)
+            hold += 1
+    yield Mark(-1, {p.joint: -1})
+
+
+def dynamic_torque(finger: FingerDescription, p: DynamicTorque) -> Protocol:
+    """ID.3-dynamic: as the static phase, but the joint is driven to and fro at several velocities."""
+    posture = p.posture(finger)
+    low, high = np.radians(p.range_deg).tolist()
+    yield from _tared(finger, posture, ("external_torque",), p.tension_rate)
+    yield from _coupled(posture, p.joint)
+    yield JointMove(p.joint, low, float(np.radians(min(p.speeds_deg_s))))
+    yield Reached()
+    yield Start()
+    for speed in np.radians(p.speeds_deg_s).tolist():
+        for target in (high, low) * p.passes:
+            yield JointMove(p.joint, target, speed, float(np.radians(p.acceleration_deg_s2)))
+            yield Reached()
+
+
+def _coupled(posture: dict[str, float], joint: str) -> Protocol:
+    others = {name: angle for name, angle in posture.items() if name != joint}
+    yield Setup(f"Couple the external motor to {joint}; the other joints stay fixed.", fixed=others, motor=joint)
+
+
+def tendon_friction(finger: FingerDescription, p: TendonFriction) -> Protocol:
+    """ID.4: the joint is held by the torque sensor; one tendon is pulled in steps, the others are slack."""
+    posture = p.posture(finger)
+    yield from _tared(finger, posture, ("external_torque",), p.tension_rate)
+    yield from _coupled(posture, p.joint)
+    yield from _steps(p.tendon, p.levels, p.down, p.settle, p.dwell, p.tension_rate)
+    yield from _tension(_all(finger, 0.0), p.tension_rate)
+
+
+def fingertip_force(finger: FingerDescription, p: FingertipForce) -> Protocol:
+    """VD.2: the fingertip rests on its force sensor; one tendon is pulled in steps, the others are slack."""
+    posture = p.posture(finger)
+    yield from _tared(finger, posture, ("fingertip_force",), p.tension_rate)
+    text = f"Bring the force sensor to the fingertip at {_angles(posture)}; only the contact holds the finger."
+    yield Setup(text, fixed=posture, contact=True)
+    yield from _steps(p.tendon, p.levels, False, p.settle, p.dwell, p.tension_rate)
+    yield from _tension(_all(finger, 0.0), p.tension_rate)
+
+
+def _steps(tendon: str, levels: tuple[float, ...], down: bool, settle: float, dwell: float, rate: float) -> Protocol:
+    first = levels[0]
+    yield from _tension({tendon: first / 2}, rate)
+    yield Start(loaded=(tendon,))
+    back = levels[-2::-1] if down else ()
+    for hold, (direction, level) in enumerate([(+1, v) for v in levels] + [(-1, v) for v in back]):
+        yield Mark(-1, {}, {tendon: direction})
+        yield from _tension({tendon: level}, rate)
+        yield Dwell(settle)
+        yield Mark(hold, {}, {tendon: direction})
+        yield Dwell(dwell)
+    yield Mark(-1, {}, {tendon: -1 if down else 1})
+
+
+def free_excursion(finger: FingerDescription, p: FreeExcursion) -> Protocol:
+    """VD.1: all joints are free and moved gently by hand; tendons are pre-tensioned."""
+    posture, pretension = p.posture(finger), _all(finger, p.pretension)
+    yield Setup(f"Fix all joints: {_angles(posture)}.", fixed=posture)
+    yield from _tension(pretension, p.tension_rate)
+    yield Settled(pretension)
+    yield Setup("Hold the fingertip and move the finger gently about.", hand=finger.joint_names)
+    yield Start(loaded=tuple(pretension))
+    yield Dwell(p.seconds)
+
+
+def trajectory(finger: FingerDescription, p: Trajectory) -> Protocol:
+    """VD.3: tendons alone drive the free finger."""
+    posture, names = p.posture(finger), list(_all(finger, 0.0))
+    mean = np.array(p.mean or (2.0,) * len(names))
+    rng = np.random.default_rng(p.seed)
+    yield Setup(f"Fix all joints: {_angles(posture)}.", fixed=posture)
+    yield from _tension(dict(zip(names, mean.tolist(), strict=True)), p.tension_rate)
+    yield Setup("Remove all fixtures; keep hands off: the tendons move the finger.")
+    yield Dwell(0.5)
+    yield Start(loaded=tuple(names))
+    for _ in range(round(p.seconds / p.interval)):
+        target = np.maximum(mean + p.amplitude * rng.uniform(-1, 1, len(names)), 0.6)
+        yield TensionRamp(dict(zip(names, target.tolist(), strict=True)), p.tension_rate)
+        yield Dwell(p.interval)
+
+
+EXPERIMENTS = {
+    "ID.2": (moment_arms, MomentArms),
+    "ID.3-static": (static_torque, StaticTorque),
+    "ID.3-dynamic": (dynamic_torque, DynamicTorque),
+    "ID.4": (tendon_friction, TendonFriction),
+    "VD.1": (free_excursion, FreeExcursion),
+    "VD.2": (fingertip_force, FingertipForce),
+    "VD.3": (trajectory, Trajectory),
+}
+DYNAMIC = ("ID.3-dynamic", "VD.1", "VD.3")  # experiments that a filtered terminal spoils

@@ -1,0 +1,95 @@
+"""The recorder: a queue and a thread that writes the log, so that a slow disk never holds up the reader of the rig."""
+
+from __future__ import annotations
+
+import queue
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from jaxfinger.errors import UserError
+from jaxfinger.rig import wal
+from jaxfinger.rig.backend import Block
+
+SYNC_S = 1.0  # between two fdatasync: what a power cut can cost
+QUEUE_LIMIT = 1_000_000  # samples waiting for a slow disk before the run is ended
+LEAST_FREE = 500 * 2**20  # bytes that must be free on the disk before a session starts
+
+
+class Recorder:
+    """Takes frames without waiting; `failure` says, from then on, why the log could not be written any more."""
+
+    def __init__(self, path: Path, header: dict[str, Any], resume: bool = False, opener: Callable | None = None):
+        self.path = path
+        if not resume:
+            if (free := shutil.disk_usage(path.parent).free) < LEAST_FREE:
+                raise UserError(
+                    f"{path.parent}: only {free / 2**20:.0f} MiB are free; a session needs {LEAST_FREE >> 20} MiB."
+                )
+        self._log = opener(path) if opener else wal.LogWriter.append(path) if resume else wal.LogWriter.create(path)
+        self._queue: queue.SimpleQueue[tuple[bytes, Any] | None] = queue.SimpleQueue()
+        self._waiting = 0
+        self._lock = threading.Lock()
+        self.failure: str | None = None
+        self.written_seq = -1
+        self._thread = threading.Thread(target=self._work, name="jaxfinger-writer", daemon=True)
+        self._thread.start()
+        if not resume:
+            self.put(wal.HEADER, header)
+
+    def put(self, tag: bytes, value: dict[str, Any]) -> None:
+        """Queue a frame of JSON."""
+        self._queue.put((tag, value))
+
+    def block(self, block: Block) -> None:
+        """Queue a block of samples; never waits."""
+        with self._lock:
+            self._waiting += len(block)
+            if self._waiting > QUEUE_LIMIT and self.failure is None:
+                self.failure = f"the disk is too slow: {self._waiting} samples wait to be written to {self.path.name}"
+        self._queue.put((wal.DATA, block))
+
+    @property
+    def waiting(self) -> int:
+        """Samples that are not yet written."""
+        return self._waiting
+
+    def flush(self, timeout: float = 60.0) -> None:
+        """Wait until all that was queued is written (or has failed)."""
+        done = threading.Event()
+        self._queue.put((b"", done))
+        done.wait(timeout)
+
+    def close(self) -> None:
+        """Write the rest, force it to the disk, and stop the thread."""
+        self._queue.put(None)
+        self._thread.join()
+
+    def _work(self) -> None:
+        synced = time.monotonic()
+        while (item := self._queue.get()) is not None:
+            tag, value = item
+            if tag == b"":
+                value.set()
+                continue
+            try:
+                if self.failure is None or tag != wal.DATA:
+                    self._log.write(tag, wal.pack_block(value) if tag == wal.DATA else wal.pack_json(value))
+                    if tag == wal.DATA:
+                        self.written_seq = int(value.seq[-1])
+                    if time.monotonic() - synced > SYNC_S:
+                        self._log.sync()
+                        synced = time.monotonic()
+            except OSError as error:
+                self.failure = self.failure or f"{self.path.name} cannot be written: {error.strerror or error}"
+            if tag == wal.DATA:
+                with self._lock:
+                    self._waiting -= len(value)
+        try:
+            self._log.sync()
+        except OSError as error:
+            self.failure = self.failure or f"{self.path.name} cannot be written: {error.strerror or error}"
+        self._log.close()

@@ -1,0 +1,275 @@
+"""The host's side of the contract: pull the controller's ring without losing a sample, send commands, read states.
+
+A subclass only says how bytes of a symbol are read and written: over ADS, or in the memory of a simulated controller.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from abc import abstractmethod
+
+import numpy as np
+
+from jaxfinger.errors import UserError
+from jaxfinger.rig import contract
+from jaxfinger.rig.backend import (
+    Block,
+    Command,
+    CommandRefused,
+    ConnectionLost,
+    ControllerRestarted,
+    Hold,
+    JointMove,
+    Rig,
+    Setup,
+    StaleRig,
+    Status,
+    TensionRamp,
+)
+from jaxfinger.rig.channels import Filter, RigDescription
+from jaxfinger.rig.contract import Kind, Refusal, State, Trip
+from jaxfinger.rig.plant import Mode
+from jaxfinger.rig.safety import admit
+
+MARGIN = 64  # records that the controller may overwrite while a block is on its way
+LARGEST = 100  # records in one request: 50 KiB keep the controller's task short
+
+
+class RingRig(Rig):
+    """A rig behind the contract's symbols."""
+
+    answer_s = 2.0  # longest wait for the acknowledgement of a command
+
+    def __init__(self, description: RigDescription):
+        self.description = description
+        self.next_seq = 0
+        self.ring = contract.RING
+        self.boot = 0
+        self._id = 0
+        self._sending = threading.Lock()  # runner and reader may both command
+        self._beat = 0
+        self._program = ""
+
+    # how bytes travel -------------------------------------------------------------------------------------------
+    @abstractmethod
+    def _open(self) -> None:
+        """Open the way to the controller."""
+
+    @abstractmethod
+    def _read(self, symbol: str, offset: int, size: int) -> bytes:
+        """`size` bytes of a symbol from `offset` on."""
+
+    @abstractmethod
+    def _write(self, symbol: str, data: bytes) -> None:
+        """Write a symbol whole."""
+
+    @abstractmethod
+    def _wait(self, seconds: float) -> None:
+        """Let time pass on the controller."""
+
+    def _has_bench(self) -> bool:
+        """Whether the controller is a stand-in that has its own operator."""
+        return False
+
+    # connect ----------------------------------------------------------------------------------------------------
+    def connect(self) -> None:
+        self._open()
+        info = self._record("stInfo", contract.INFO)
+        for what, found, wanted in (
+            ("contract version", int(info["version"]), contract.VERSION),
+            ("size of ST_Sample", int(info["sample_size"]), contract.SAMPLE.itemsize),
+            ("number of values in ST_Sample", int(info["values"]), contract.VALUES),
+        ):
+            if found != wanted:
+                raise UserError(
+                    f"the controller's {what} is {found}, the adapter's is {wanted}; load the program of docs/plc-contract.md."
+                )
+        cycle = 1e9 / self.description.rate_hz
+        if abs(int(info["cycle_ns"]) - cycle) > 1e-3 * cycle:
+            raise UserError(
+                f"the controller samples every {int(info['cycle_ns'])} ns, but the rig file says rate_hz = "
+                f"{self.description.rate_hz:g}; mend 'rate_hz' or the task's cycle."
+            )
+        self.ring, self._program = int(info["ring_length"]), bytes(info["program"]).decode(errors="replace")
+        self._compare_limits()
+        status = self._status()
+        self.boot, self.next_seq, self._id = int(status["boot"]), int(status["head"]), int(status["acknowledged"])
+
+    def _compare_limits(self) -> None:
+        hard, soft = self._record("stLimits", contract.LIMITS), self.description.limits
+        for name, wanted in (
+            ("tension_max", soft.tension_max),
+            ("tension_rate_max", soft.tension_rate_max),
+            ("joint_torque_max", soft.joint_torque_max),
+            ("fingertip_force_max", soft.fingertip_force_max),
+        ):
+            if not float(hard[name]) >= wanted - 1e-9:
+                raise UserError(
+                    f"the rig file's '{name}' = {wanted:g} is looser than the controller's {float(hard[name]):g}; "
+                    f"lower it in [limits]."
+                )
+
+    # samples ----------------------------------------------------------------------------------------------------
+    def read_block(self, timeout: float) -> Block:
+        deadline = time.monotonic() + timeout
+        while True:
+            self._beat += 1
+            self._write("nHostBeat", np.uint64(self._beat).tobytes())
+            status = self._status()
+            head = int(status["head"])
+            if int(status["boot"]) != self.boot or head < self.next_seq:
+                raise ControllerRestarted(
+                    "the controller's program was restarted, so this recording cannot go on; start the session again with --resume."
+                )
+            if head > self.next_seq:
+                return self._pull(head)
+            if time.monotonic() > deadline:
+                raise StaleRig(
+                    f"the controller answers but wrote no sample for {timeout:g} s; see whether its task runs."
+                )
+            self._wait(self.description.poll_s)
+
+    def _pull(self, head: int) -> Block:
+        lost = 0
+        for _ in range(10):
+            oldest = head - self.ring + MARGIN
+            if self.next_seq < oldest:
+                lost, self.next_seq = lost + oldest - self.next_seq, oldest
+            count = min(head - self.next_seq, LARGEST)
+            start = self.next_seq % self.ring
+            first = min(count, self.ring - start)
+            size = contract.SAMPLE.itemsize
+            data = self._read("aRing", start * size, first * size)
+            if first < count:
+                data += self._read("aRing", 0, (count - first) * size)
+            records = np.frombuffer(data, contract.SAMPLE)
+            expected = self.next_seq + np.arange(count, dtype=np.uint64)
+            good = (records["seq"] == expected) & (records["seq_end"] == expected)
+            if good.all():
+                self.next_seq += count
+                return Block(
+                    records["seq"].copy(), records["t_ns"].copy(), self.description.calibrate(records["value"]),
+                    records["state"].copy(), records["flags"].copy(), lost,
+                )  # fmt: skip
+            head = int(
+                self._status()["head"]
+            )  # torn, or overtaken by the writer: look again from where the ring now starts
+        raise ConnectionLost(
+            "ten reads of the controller's ring were torn; its task writes records in the wrong order."
+        )
+
+    def rewind(self, seq: int) -> None:
+        self.next_seq = min(seq, int(self._status()["head"]))
+
+    # commands ---------------------------------------------------------------------------------------------------
+    def command(self, command: Command) -> int:
+        admit(command, self.description)
+        finger = self.description.finger
+        target = np.full(contract.TARGETS, np.nan)
+        if isinstance(command, TensionRamp):
+            for tendon, tension in command.targets.items():
+                target[finger.tendon_names.index(tendon)] = tension
+            return self._send(Kind.TENSION, rate=command.rate, target=target)
+        if isinstance(command, JointMove):
+            target[0] = command.target
+            index = finger.joint_names.index(command.joint)
+            return self._send(Kind.JOINT, index, command.speed, command.acceleration, target)
+        assert isinstance(command, Hold)
+        return self._send(Kind.HOLD)
+
+    def arm(self) -> int:
+        return self._send(Kind.ARM)
+
+    def disarm(self) -> int:
+        return self._send(Kind.DISARM)
+
+    def release(self) -> int:
+        return self._send(Kind.RELEASE)
+
+    def stop(self, cause: Trip) -> None:
+        self._send(Kind.STOP, int(cause))
+
+    def reset(self, operator: str) -> int:
+        if not operator.strip():
+            raise CommandRefused("a latched stop is cleared in the name of an operator; give the name.")
+        return self._send(Kind.RESET)
+
+    def _send(self, kind: Kind, index: int = 0, rate: float = 0.0, acceleration: float = 0.0, target=None) -> int:
+        with self._sending:
+            return self._send_alone(kind, index, rate, acceleration, target)
+
+    def _send_alone(self, kind: Kind, index: int, rate: float, acceleration: float, target) -> int:
+        self._id += 1
+        order = np.zeros((), contract.COMMAND)
+        order["id"], order["kind"], order["index"] = self._id, kind, index
+        order["rate"], order["acceleration"] = rate, acceleration
+        order["target"] = np.nan if target is None else target
+        self._write("stCommand", order.tobytes())
+        deadline = time.monotonic() + self.answer_s
+        while int((status := self._status())["acknowledged"]) != self._id:
+            if time.monotonic() > deadline:
+                raise ConnectionLost(f"the controller did not acknowledge {kind.name} within {self.answer_s:g} s.")
+            self._wait(0.002)
+        if reason := int(status["refused"]):
+            why = {1: f"not in state {State(int(status['state'])).name}", 2: "beyond its limits", 3: "unknown to it"}
+            raise CommandRefused(f"the controller refused {kind.name}: {why.get(reason, Refusal(reason).name)}.")
+        return self._id
+
+    # states -----------------------------------------------------------------------------------------------------
+    def _record(self, symbol: str, dtype: np.dtype) -> np.void:
+        return np.frombuffer(self._read(symbol, 0, dtype.itemsize), dtype)[0]
+
+    def _status(self) -> np.void:
+        return self._record("stStatus", contract.STATUS)
+
+    def status(self) -> Status:
+        record = self._status()
+        slot = int(record["trip_slot"])
+        channel = next((c for c in self.description.channels if c.slot == slot), None)
+        value = float(record["trip_value"])
+        return Status(
+            state=State(int(record["state"])),
+            trip=Trip(int(record["trip"])),
+            trip_seq=int(record["trip_seq"]),
+            trip_value=(value * channel.scale + channel.offset) * channel.factor if channel else value,
+            trip_channel=channel.name if channel else "",
+            head=int(record["head"]),
+            acknowledged=int(record["acknowledged"]),
+        )
+
+    def filters(self) -> dict[str, Filter]:
+        table = np.frombuffer(self._read("aFilter", 0, contract.FILTER.itemsize * contract.VALUES), contract.FILTER)
+        return {
+            c.name: Filter(bool(row["enabled"]), int(row["setting"]), float(row["bandwidth"]) or None)
+            for c in self.description.channels
+            for row in [table[c.slot]]
+        }
+
+    def fingerprint(self) -> dict[str, str]:
+        return {"program": self._program, "contract": str(contract.VERSION), "boot": str(self.boot)}
+
+    # a stand-in's operator ----------------------------------------------------------------------------------------
+    def prepare(self, setup: Setup) -> bool:
+        if not self._has_bench():
+            return False
+        finger = self.description.finger
+        order = np.zeros((), contract.BENCH)
+        for j, name in enumerate(finger.joint_names):
+            mode = Mode.MOTOR if name == setup.motor else Mode.HAND if name in setup.hand else Mode.FREE
+            order["mode"][j] = Mode.FIXED if name in setup.fixed else mode
+            order["pose"][j] = setup.fixed.get(name, 0.0)
+        order["contact"] = setup.contact
+        self._order(order)
+        return True
+
+    def inject(self, fault: str, slot: int = 0, after: int = 0) -> None:
+        """Let the stand-in fail: `fault` of contract.FAULTS, from `after` samples from now on. For tests and drills."""
+        order = np.zeros((), contract.BENCH)
+        order["fault"], order["fault_slot"] = contract.FAULTS.index(fault), slot
+        order["fault_seq"] = int(self._status()["head"]) + after
+        self._order(order)
+
+    def _order(self, order: np.ndarray) -> None:
+        order["id"] = self._record("stBench", contract.BENCH)["id"] + 1
+        self._write("stBench", order.tobytes())

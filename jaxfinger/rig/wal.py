@@ -1,0 +1,166 @@
+"""A write-ahead log: frames of tag, length and CRC, appended and never changed, so that every prefix of it is readable.
+
+    file  = "JXFWAL01" frame*
+    frame = tag (4 bytes), length (u32), crc32 of tag + length + payload (u32), payload
+
+HDF5 itself cannot be the log: killed between two flushes it loses all or cannot be opened (measured), while a prefix of
+this file loses only the frame that was being written.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from jaxfinger.errors import UserError
+from jaxfinger.rig.backend import Block
+
+MAGIC = b"JXFWAL01"
+_HEAD = struct.Struct("<4sII")
+_DATA = struct.Struct("<IIQ")  # samples, channels, lost before
+LARGEST_FRAME = 64 * 2**20
+
+HEADER, TRIAL, DATA, MARK, EVENT, END = b"HEAD", b"TRIA", b"DATA", b"MARK", b"EVNT", b"ENDT"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame: its tag, payload, and where the next one starts in the file."""
+
+    tag: bytes
+    payload: bytes
+    end: int
+
+    @property
+    def json(self) -> dict[str, Any]:
+        """The payload of every frame but DATA."""
+        return json.loads(self.payload)
+
+    @property
+    def block(self) -> Block:
+        """The payload of a DATA frame."""
+        count, channels, lost = _DATA.unpack_from(self.payload)
+        at = _DATA.size
+        parts = []
+        for dtype, size in (("<u8", count), ("<u8", count), ("<u4", count), ("<u4", count), ("<f8", count * channels)):
+            parts.append(np.frombuffer(self.payload, dtype, size, at))
+            at += parts[-1].nbytes
+        seq, t_ns, state, flags, x = parts
+        return Block(seq, t_ns, x.reshape(count, channels), state, flags, lost)
+
+
+def pack_block(block: Block) -> bytes:
+    """Payload of a DATA frame."""
+    arrays = (
+        block.seq.astype("<u8"), block.t_ns.astype("<u8"), block.state.astype("<u4"), block.flags.astype("<u4"),
+        np.ascontiguousarray(block.x, "<f8"),
+    )  # fmt: skip
+    return _DATA.pack(len(block), block.x.shape[1], block.lost_before) + b"".join(a.tobytes() for a in arrays)
+
+
+def pack_json(value: dict[str, Any]) -> bytes:
+    """Payload of every other frame."""
+    return json.dumps(value, separators=(",", ":")).encode()
+
+
+def pack_frame(tag: bytes, payload: bytes) -> bytes:
+    """One frame, ready to append."""
+    crc = zlib.crc32(payload, zlib.crc32(tag + struct.pack("<I", len(payload))))
+    return _HEAD.pack(tag, len(payload), crc) + payload
+
+
+class LogWriter:
+    """Appends frames; each is handed to the system at once, so the death of this process loses none of them."""
+
+    def __init__(self, file: BinaryIO):
+        self._file = file
+
+    @classmethod
+    def create(cls, path: Path) -> LogWriter:
+        """A new log; refuses to replace one."""
+        try:
+            file = open(path, "xb", buffering=0)
+        except FileExistsError as error:
+            raise UserError(
+                f"{path}: a recording was interrupted here; go on with --resume, or rescue it with jaxfinger recover."
+            ) from error
+        except OSError as error:
+            raise UserError(
+                f"{path}: cannot be written ({error.strerror}); choose another place for the session."
+            ) from error
+        writer = cls(file)
+        writer._write(MAGIC)
+        return writer
+
+    @classmethod
+    def append(cls, path: Path) -> LogWriter:
+        """Go on with a log, after cutting off a torn last frame."""
+        end = sound_length(path)
+        file = open(path, "r+b", buffering=0)
+        file.truncate(end)
+        file.seek(end)
+        return cls(file)
+
+    def write(self, tag: bytes, payload: bytes) -> None:
+        """Append one frame; raises OSError on a full disk, with everything before it intact."""
+        self._write(pack_frame(tag, payload))
+
+    def _write(self, data: bytes) -> None:
+        view = memoryview(data)
+        while view:
+            view = view[self._file.write(view) or 0 :]
+
+    def sync(self) -> None:
+        """Force what was written to the disk."""
+        os.fdatasync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def frames(file: BinaryIO, name: str = "log") -> Iterator[Frame]:
+    """The sound frames from the start on; stops, without complaint, at a torn or damaged one."""
+    if file.read(len(MAGIC)) != MAGIC:
+        raise UserError(f"{name}: not a recording log of jaxfinger; give the file that ends in .wal.")
+    end = len(MAGIC)
+    while len(head := file.read(_HEAD.size)) == _HEAD.size:
+        tag, length, crc = _HEAD.unpack(head)
+        if length > LARGEST_FRAME or len(payload := file.read(length)) < length:
+            return
+        if zlib.crc32(payload, zlib.crc32(head[:8])) != crc:
+            return
+        end += _HEAD.size + length
+        yield Frame(tag, payload, end)
+
+
+def read_log(path: str | Path) -> Iterator[Frame]:
+    """The sound frames of a log file."""
+    try:
+        file = open(path, "rb")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); give the path of a .wal file.") from error
+    with file:
+        yield from frames(file, str(path))
+
+
+def read_bytes(data: bytes) -> Iterator[Frame]:
+    """The sound frames of a log in memory."""
+    return frames(io.BytesIO(data))
+
+
+def sound_length(path: str | Path) -> int:
+    """Length in bytes of the sound part of a log."""
+    end = len(MAGIC)
+    for frame in read_log(path):
+        end = frame.end
+    return end
