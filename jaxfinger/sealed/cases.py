@@ -1,0 +1,222 @@
+"""Sealed cases: a session to diagnose, fresh trials, and the truth in another tree that nothing under test reads.
+
+    ROOT/case-001/fit.h5, fresh.h5          TRUTH/case-001.json
+
+Everything follows from (split, number): the same case comes out bit for bit on any machine.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from jaxfinger.data import Session as Recording
+from jaxfinger.data import write_session
+
+from .departures import LISTED, UNLISTED, draw
+from .departures.base import Departure
+from .drive import simulate, wish
+from .laws import Finger
+from .protocols import Plan, draw_style, session_plans
+from .record import commanded, driven, read, record
+from .sensors import STD, UNITS, Sensors, draw_sensors, measure
+from .severity import Session, by_channel, calibrate
+from .specimens import LAYOUTS, Specimen, make_specimen
+
+SCHEMA = "jaxfinger-sealed/1"
+SPLITS = {"develop": 1, "fresh": 2}
+SEVERITIES = (2.0, 5.0, 10.0)
+CREATED = "2026-01-15T10:00:00+00:00"
+
+
+@dataclass(frozen=True)
+class CaseSpec:
+    """What a case is about. Effects by id; a severity each, in units of a hold's noise."""
+
+    kind: str  # none, listed, unlisted, double
+    specimen: str
+    effects: tuple[str, ...] = ()
+    severities: tuple[float, ...] = ()
+
+
+def case_specs(split: str, count: int) -> list[CaseSpec]:
+    """The first `count` cases of a split. In every ten: six listed effects, one or two without any, one or two unlisted, one double.
+
+    Listed effects come in turn, each severity equally often, on specimens that differ from round to round.
+    """
+    rng = np.random.default_rng([SPLITS[split], 7])
+    listed = _endless([(e, s) for s in (5.0, 10.0, 2.0) for e in LISTED], rng)
+    unlisted = _endless([(e, s) for s in (5.0, 10.0) for e in UNLISTED], rng)
+    specimens = _endless([*["planar"] * 3, *[k for k in LAYOUTS if k != "planar"]], rng)
+    specs = []
+    for i in range(count):
+        place = i % 10
+        kind = "none" if place == 4 or (place == 9 and i % 20 == 9) else "unlisted" if place in (7, 9) else "double" if place == 2 else "listed"
+        specimen = next(specimens)
+        if kind == "none":
+            specs.append(CaseSpec(kind, specimen))
+        elif kind == "double":
+            first, second = (str(e) for e in rng.choice(list(LISTED), 2, replace=False))
+            specs.append(CaseSpec(kind, specimen, (first, second), (10.0, 5.0)))
+        else:
+            effect, severity = next(unlisted if kind == "unlisted" else listed)
+            if effect == "passive_tendon" and not LAYOUTS[specimen].passive:
+                specimen = "planar"
+            specs.append(CaseSpec(kind, specimen, (effect,), (severity,)))
+    return specs
+
+
+def _endless(items: list, rng: np.random.Generator):
+    while True:
+        for i in rng.permutation(len(items)):
+            yield items[i]
+
+
+def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: Path) -> Path:
+    """Write one case; a finished one is left alone. The truth is written last, so that its file means «finished»."""
+    name = f"case-{number:03d}"
+    folder, truth_file = root / name, truth_root / f"{name}.json"
+    if truth_file.exists() and (folder / "fit.h5").exists() and (folder / "fresh.h5").exists():
+        return folder
+    rng = np.random.default_rng([SPLITS[split], number])
+    specimen = make_specimen(spec.specimen, rng)
+    nominal, sensors, style = Finger(specimen), draw_sensors(rng), draw_style(rng)
+    plans = _with_trajectories(nominal, session_plans(specimen, style, rng), rng)
+    later = _with_trajectories(nominal, session_plans(specimen, style, rng, fresh=True), rng)
+    quiet = Session(specimen, plans, sensors)
+    departures, severities, where = _withheld(spec, specimen, quiet, style.speeds, rng)
+
+    folder.mkdir(parents=True, exist_ok=True)
+    truth_root.mkdir(parents=True, exist_ok=True)
+    finger = Finger(specimen, departures)
+    zero = rng.normal(0, 1e-4, nominal.n)
+    for file, file_plans in (("fit.h5", plans), ("fresh.h5", later)):
+        trials = _trials(finger, nominal, file_plans, sensors, zero, rng)
+        session = Recording(
+            specimen=f"sealed-{split}-{number:03d}", finger=specimen.cad, trials={t.name: t for t in trials},
+            source="jaxfinger sealed plant (MuJoCo)", created=CREATED,
+        )
+        write_session(session, folder / file, overwrite=True)
+    truth = {
+        "schema": SCHEMA, "case": name, "split": split, "seed": [SPLITS[split], number], "kind": spec.kind, "specimen": spec.specimen,
+        "effects": [
+            {
+                "effect": d.effect, "listed": d.listed, "site": list(d.site), "form": d.form, "severity": wanted, "reached": reached,
+                "seen_in": list(seen), "parameters": {"size": d.size, "units": d.units, **d.shape},
+            }
+            for d, wanted, reached, seen in zip(departures, spec.severities, severities, where, strict=True)
+        ],
+        "noise": {c: {"std": sensors.std[c], "hold": sensors.hold_std(c), "units": UNITS[c]} for c in STD},
+        "fresh": _fresh_gap(specimen, departures, quiet, later, sensors),
+    }
+    part = truth_file.with_suffix(".part")
+    part.write_text(json.dumps(truth, indent=1))
+    os.replace(part, truth_file)
+    return folder
+
+
+def _with_trajectories(nominal: Finger, plans: Sequence[Plan], rng: np.random.Generator) -> list[Plan]:
+    """VD.3 plans get a trajectory; repeats of a motion share it."""
+    profiles = {}
+    out = []
+    for plan in plans:
+        if plan.experiment == "VD.3":
+            if plan.motion not in profiles:
+                profiles[plan.motion] = wish(nominal, plan, rng)
+            plan = replace(plan, q=profiles[plan.motion])
+        out.append(plan)
+    return out
+
+
+def _withheld(spec: CaseSpec, specimen: Specimen, quiet: Session, speeds: Sequence[float], rng: np.random.Generator):
+    """The case's departures, sized; a site where the effect cannot be seen is drawn again, three times."""
+    chosen: list[Departure] = []
+    reached, where = [], []
+    for effect, target in zip(spec.effects, spec.severities, strict=True):
+        best = None
+        for _ in range(4):
+            departure = draw(effect, specimen.finger, rng, speeds)
+            assert departure is not None, f"{effect} has no site on {spec.specimen}"
+            candidate = calibrate(quiet, departure, target)
+            if best is None or abs(np.log(candidate[1] / target)) < abs(np.log(best[1] / target)):
+                best = candidate
+            if best[1] > 0.7 * target:
+                break
+        assert best is not None
+        chosen.append(best[0])
+        reached.append(best[1])
+        where.append((best[2][0], best[2][1], _column(specimen, best[2])))
+    return chosen, reached, where
+
+
+def _column(specimen: Specimen, label: tuple[str, str, int]) -> str:
+    names = {"tendon_excursion": specimen.finger.tendon_names, "joint_torque": specimen.finger.joint_names, "fingertip_force": "xyz"}
+    return names[label[1]][label[2]]
+
+
+def _trials(finger: Finger, nominal: Finger, plans: Sequence[Plan], sensors: Sensors, zero: np.ndarray, rng: np.random.Generator):
+    driven_plans = [p for p in plans if p.experiment == "VD.3"]
+    motions = {p.name: driven(run) for p, run in zip(driven_plans, simulate(finger, nominal, driven_plans), strict=True)}
+    for plan in plans:
+        motion = motions.get(plan.name) or commanded(plan)
+        yield measure(read(finger, record(finger, plan, motion)), finger.specimen, sensors, zero, rng)
+
+
+def _fresh_gap(specimen: Specimen, departures: Sequence[Departure], quiet: Session, plans: Sequence[Plan], sensors: Sensors):
+    """rms on the fresh trials by experiment and channel, of the nominal model refitted (before) and with the true effects (after)."""
+    later = Session(specimen, plans, sensors)
+    moved = quiet.absorb(quiet.trace(departures)[0])
+    rows, labels = later.trace(departures)
+    gap = by_channel(rows - later.absorbed[0] @ moved, [(e, c, 0) for e, c, _ in labels])
+    out = []
+    for (experiment, channel, _), value in sorted(gap.items()):
+        noise = sensors.std[channel]
+        left = value * sensors.hold_std(channel)
+        out.append({
+            "experiment": experiment, "channel": channel, "units": UNITS[channel], "noise": noise, "gap": left,
+            "before": float(np.hypot(noise, left)), "after": noise,
+        })
+    return out
+
+
+def make_cases(
+    split: str, count: int, root: Path, truth_root: Path, workers: int = 1, share: tuple[int, int] = (1, 1),
+    progress: Callable[[int, int, str], None] | None = None, only: Iterable[int] | None = None,
+) -> list[int]:
+    """Make the cases 1 … count of a split (or share i of n of them) on several cores; returns their numbers.
+
+    Finished cases are skipped, so a stopped run is taken up by calling again.
+    """
+    specs = case_specs(split, count)
+    wanted = set(only) if only is not None else None
+    numbers = [i for i in range(1, count + 1) if i % share[1] == share[0] % share[1] and (wanted is None or i in wanted)]
+    if workers == 1:
+        for done, i in enumerate(numbers, start=1):
+            make_case(i, split, specs[i - 1], root, truth_root)
+            if progress:
+                progress(done, len(numbers), f"case-{i:03d}")
+        return numbers
+    with ProcessPoolExecutor(workers) as pool:
+        jobs = {pool.submit(make_case, i, split, specs[i - 1], root, truth_root): i for i in numbers}
+        for done, job in enumerate(as_completed(jobs), start=1):
+            job.result()
+            if progress:
+                progress(done, len(numbers), f"case-{jobs[job]:03d}")
+    return numbers
+
+
+def spec_of(truth: dict) -> CaseSpec:
+    """The specification that a truth file records."""
+    effects = truth["effects"]
+    return CaseSpec(truth["kind"], truth["specimen"], tuple(e["effect"] for e in effects), tuple(e["severity"] for e in effects))
+
+
+def describe(spec: CaseSpec) -> str:
+    """One line for a person."""
+    return json.dumps(asdict(spec))

@@ -1,0 +1,124 @@
+"""Draws a departure for a specimen: where it sits, its form and its shape. The size comes from calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxfinger.data import FingerDescription
+
+from . import joint, sensor, tendon, unlisted
+from .base import Departure
+
+LISTED: dict[str, type[Departure]] = {
+    kind.effect: kind
+    for kind in (
+        joint.Stribeck, joint.JointPresliding, joint.LoadFriction, joint.Hardening, joint.Relaxation, joint.Stop,
+        joint.PassiveTendon, tendon.Stretch, tendon.Creep, tendon.Backlash, tendon.Coupling, tendon.Bowstring,
+        tendon.Capstan, tendon.ViscousTendon, tendon.TendonPresliding, tendon.Saturating, tendon.Crosstalk,
+        sensor.Payload, sensor.Tilt, joint.DriveInertia, sensor.TorqueScale, sensor.TorqueDrift, joint.TorqueRipple,
+        sensor.TensionScale, sensor.EncoderOffset, sensor.Eccentricity, sensor.ForceRotation, sensor.Delay,
+    )
+}
+UNLISTED: dict[str, type[Departure]] = {
+    kind.effect: kind
+    for kind in (
+        unlisted.MotorCogging, unlisted.WarmingGrease, unlisted.SlackSag, unlisted.SidewaysYield, unlisted.StickSlip,
+        unlisted.Saturation, unlisted.EncoderCrosstalk, unlisted.SumOfAngles, unlisted.BaseYield, unlisted.QuadraticDrag,
+    )
+}
+
+AT_JOINT = (
+    joint.Stribeck, joint.JointPresliding, joint.LoadFriction, joint.Hardening, joint.Relaxation, joint.Stop, joint.DriveInertia,
+    joint.TorqueRipple, sensor.Payload, sensor.EncoderOffset, sensor.Eccentricity, unlisted.WarmingGrease, unlisted.QuadraticDrag,
+)
+AT_TENDON = (
+    tendon.Stretch, tendon.Creep, tendon.Backlash, tendon.Bowstring, tendon.Capstan, tendon.ViscousTendon,
+    tendon.TendonPresliding, tendon.Saturating, sensor.TensionScale, unlisted.MotorCogging, unlisted.SlackSag,
+)
+JOINT_PAIR = (joint.PassiveTendon, unlisted.EncoderCrosstalk, unlisted.SumOfAngles)
+AT_SENSOR = {
+    sensor.TorqueScale: "torque_sensor", sensor.TorqueDrift: "torque_sensor", unlisted.Saturation: "torque_sensor",
+    sensor.ForceRotation: "fingertip", unlisted.SidewaysYield: "fingertip", unlisted.StickSlip: "fingertip",
+    sensor.Tilt: "base", unlisted.BaseYield: "base",
+}
+
+
+def draw(effect: str, finger: FingerDescription, rng: np.random.Generator, speeds: Sequence[float] = (0.5, 1.0)) -> Departure | None:
+    """A departure of its start size, or None where this finger has no site for it. `speeds`: of the dynamic sweeps, rad/s."""
+    kind = {**LISTED, **UNLISTED}[effect]
+    site = _site(kind, finger, rng)
+    if site is None:
+        return None
+    names, index = site
+    return kind(kind.start_size, names, index, str(rng.choice(kind.forms)), _shape(kind, finger, index, rng, speeds))
+
+
+def _site(kind: type[Departure], finger: FingerDescription, rng: np.random.Generator):
+    joints, tendons = finger.joint_names, finger.tendon_names
+    active = np.flatnonzero(finger.active)
+    if kind in AT_JOINT:
+        j = int(rng.integers(finger.m))
+        return (joints[j],), (j,)
+    if kind in AT_TENDON:
+        k = int(rng.choice(active))
+        return (tendons[k],), (k,)
+    if kind is joint.PassiveTendon:
+        passive = np.flatnonzero(~finger.active)
+        if not len(passive):
+            return None
+        a, b = np.flatnonzero(finger.crosses[passive[0]])[:2]
+        return (joints[a], joints[b]), (int(a), int(b))
+    if kind in JOINT_PAIR:
+        a = int(rng.integers(finger.m - 1))
+        return (joints[a], joints[a + 1]), (a, a + 1)
+    if kind is tendon.Coupling:
+        wide = [k for k in active if finger.crosses[k].sum() > 1]
+        k = int(rng.choice(wide))
+        a, b = sorted(rng.choice(np.flatnonzero(finger.crosses[k]), 2, replace=False))
+        return (tendons[k],), (k, int(a), int(b))
+    if kind is tendon.Crosstalk:
+        pairs = [(a, b) for a in active for b in active if a != b and np.any(finger.crosses[a] & finger.crosses[b])]
+        a, b = pairs[int(rng.integers(len(pairs)))]
+        return (tendons[a], tendons[b]), (int(a), int(b))
+    if kind is sensor.Delay:
+        return (str(rng.choice(list(sensor.Delay.FIELDS))),), ()
+    return (AT_SENSOR[kind],), ()
+
+
+def _shape(kind: type[Departure], finger: FingerDescription, index: tuple[int, ...], rng: np.random.Generator, speeds: Sequence[float]):
+    sign = float(rng.choice([-1.0, 1.0]))
+    phase = float(rng.uniform(0, 2 * np.pi))
+    if kind is joint.Stribeck:
+        return {"v_s": float(rng.uniform(0.25, 0.9) * speeds[len(speeds) // 2])}
+    if kind is joint.Hardening:
+        return {"side": sign, "b": float(rng.uniform(4, 8)), "onset": float(rng.uniform(0.5, 0.7))}
+    if kind is joint.Relaxation:
+        return {"tau": float(np.exp(rng.uniform(np.log(0.4), np.log(8.0))))}
+    if kind is joint.Stop:
+        low, high = finger.limits[index[0]]
+        depth = rng.uniform(0.14, 0.24) * (high - low)
+        return {"side": sign, "angle": float(high - depth if sign > 0 else low + depth)}
+    if kind is joint.PassiveTendon:
+        return {"r_a": float(rng.uniform(4e-3, 7e-3)), "r_b": float(rng.uniform(4e-3, 6e-3)), "slack": float(rng.uniform(0, 1.5e-3))}
+    if kind is joint.TorqueRipple:
+        return {"p": float(rng.integers(7, 22)), "phase": phase}
+    if kind is tendon.Stretch:
+        return {"toe": float(rng.uniform(2, 6))}
+    if kind is tendon.Creep:
+        return {"tau": float(np.exp(rng.uniform(np.log(1.0), np.log(10.0))))}
+    if kind is sensor.Payload:
+        last = finger.fingertip[0] if index[0] == finger.m - 1 else finger.origin[index[0] + 1, 0]
+        return {"x": float(last * rng.uniform(0.5, 1.0)), "z": float(rng.uniform(-5e-3, 5e-3))}
+    if kind is unlisted.MotorCogging:
+        return {"pitch": float(rng.uniform(1e-3, 2.5e-3)), "phase": phase}
+    if kind is unlisted.WarmingGrease:
+        return {"tau": float(rng.uniform(250, 600))}
+    if kind is unlisted.StickSlip:
+        return {"pitch": float(rng.uniform(1.3, 2.7))}
+    if kind is unlisted.Saturation:
+        return {"ceiling": float(rng.uniform(0.018, 0.026))}
+    if kind is unlisted.SumOfAngles:
+        return {"p": float(rng.integers(5, 9)), "phase": phase}
+    return {"sign": sign, "phase": phase, "polar": float(rng.uniform(0.2, np.pi - 0.2))}

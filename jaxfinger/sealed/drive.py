@@ -1,0 +1,185 @@
+"""VD.3: tendons drive the free finger. Forward simulation in MuJoCo with true dry friction, under a tracking controller.
+
+The controller knows the nominal specimen only. What it commands is recorded as tension; the finger goes where physics puts it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import nnls
+
+from .laws import Finger, State
+from .profiles import Builder, Profile
+from .protocols import Plan, sample_times
+
+LEAST, MOST = 2.0, 14.0  # N, range of commanded tension
+STEP = 5e-4  # s
+CONTROL = 4  # steps a control cycle
+LAG = 3e-3  # s, of the drives
+
+
+@dataclass(frozen=True)
+class Run:
+    """A simulated trial, time first at 1 kHz: time s, q rad, q̇, tension N."""
+
+    time: Float[np.ndarray, " N"]
+    q: Float[np.ndarray, "N m"]
+    qd: Float[np.ndarray, "N m"]
+    tension: Float[np.ndarray, "N n"]
+
+
+def wish(nominal: Finger, plan: Plan, rng: np.random.Generator) -> tuple[Profile, ...]:
+    """A trajectory between postures that tensions can hold; joints start and stop at their own times."""
+    count = int(plan.duration / 1.6)
+    postures = _reachable(nominal, count + 1, rng)
+    profiles = []
+    for j in range(nominal.m):
+        b = Builder(float(postures[0][j])).rest(0.25)
+        slot = (plan.duration - 0.4) / count
+        for i in range(count):
+            to = float(postures[i + 1][j])
+            b = b.rest(rng.uniform(0.02, 0.25) * slot).move(to, 0.65 * slot)
+            b = b.rest(max((i + 1) * slot + 0.25 - b.now, 1e-3))
+        profiles.append(b.profile())
+    return tuple(profiles)
+
+
+def _reachable(nominal: Finger, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count m"]:
+    """Postures that tensions within bounds hold, with the joints' friction either way: the best of many random ones."""
+    low, high = nominal.specimen.finger.limits.T
+    q = low + (high - low) * rng.uniform(0.12, 0.8, (600, nominal.m))
+    zero = np.zeros_like(q)
+    c = nominal.specimen.elastic
+    torque = nominal.plant.inverse_dynamics(q, zero, zero) + c[:, 0] + c[:, 1] * q + c[:, 2] * q**2
+    s = State(zero[:, 0], zero[:, 0], q, zero, zero, np.zeros((len(q), nominal.n)), zero)
+    margin = nominal.coulomb(s)[0]
+    allocate = Allocator(nominal)
+    still = np.zeros(nominal.n)
+    miss = np.zeros(len(q))
+    for i, arm in enumerate(nominal.geometry(q)[1]):
+        for sign in (-1.5, 1.5):
+            wanted = torque[i] + sign * margin[i]
+            f = allocate(arm, wanted, still)
+            miss[i] = max(miss[i], np.abs(arm.T @ f - wanted).max() + 1e-3 * max(f.max() - 9.0, 0.0))
+    best = np.argsort(miss)[: max(3 * count, int(np.sum(miss < 2e-4)))]
+    return q[rng.choice(best, count, replace=False)]
+
+
+def feedforward(nominal: Finger, q: Float[np.ndarray, "N m"], qd: Float[np.ndarray, "N m"], qdd: Float[np.ndarray, "N m"]):
+    """Joint torque of the nominal finger along a trajectory (friction included, smooth in velocity), and the tendons' directions."""
+    zero = np.zeros(len(q))
+    s = State(zero, zero, q, qd, qdd, np.zeros((len(q), nominal.n)), np.tanh(qd / 0.02))
+    torque = nominal.plant.inverse_dynamics(q, qd, qdd) + nominal.passive(s) + nominal.friction(s)
+    return torque, np.tanh(nominal.speed(s) / 5e-4)
+
+
+class Allocator:
+    """Tensions at the actuators that give joint torques, at least LEAST N, small otherwise."""
+
+    def __init__(self, nominal: Finger):
+        self.active = np.flatnonzero(nominal.specimen.finger.active)
+        self.friction = nominal.specimen.friction[self.active]
+        self.n = nominal.n
+        self._small = 2e-4 * np.eye(len(self.active))
+
+    def __call__(self, arm: Float[np.ndarray, "n m"], torque: Float[np.ndarray, " m"], direction: Float[np.ndarray, " n"]):
+        arm, s = arm[self.active], direction[self.active]
+        a0, a1 = self.friction.T
+        gain, offset = 1 - s * a1, -s * a0
+        matrix = (arm * gain[:, None]).T
+        rest = torque - arm.T @ offset - matrix @ np.full(len(self.active), LEAST)
+        extra, _ = nnls(np.vstack([matrix, self._small]), np.concatenate([rest, np.zeros(len(self.active))]))
+        tension = np.zeros(self.n)
+        tension[self.active] = np.minimum(LEAST + extra, MOST + 2.0)
+        return tension
+
+
+def planned_tension(nominal: Finger, profiles: Sequence[Profile], t: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N n"]:
+    """Tension that would drive the wished trajectory open loop, N."""
+    q, qd, qdd = (np.stack(x, axis=1) for x in zip(*(p(t) for p in profiles), strict=True))
+    torque, direction = feedforward(nominal, q, qd, qdd)
+    arms = nominal.geometry(q)[1]
+    allocate = Allocator(nominal)
+    return np.stack([allocate(*row) for row in zip(arms, torque, direction, strict=True)])
+
+
+def simulate(finger: Finger, nominal: Finger, plans: Sequence[Plan]) -> list[Run]:
+    """Run the VD.3 trials side by side; all have the same duration."""
+    if not plans:
+        return []
+    model = finger.plant.model
+    active = np.flatnonzero(finger.specimen.finger.active)
+    batch, m, n = len(plans), finger.m, finger.n
+    fine = sample_times(plans[0], 1 / (STEP * CONTROL))
+    wished = [[np.stack(x, axis=1) for x in zip(*(p(fine) for p in plan.q), strict=True)] for plan in plans]
+    forward = [feedforward(nominal, *w) for w in wished]
+    noises = np.stack([_wander(np.random.default_rng(plan.seed), len(fine), n, STEP * CONTROL) for plan in plans])
+    allocate = Allocator(nominal)
+    inertia = np.diag(nominal.plant.mass_matrix(wished[0][0][0]))
+    stiff = 0.04 + 0.04 * inertia / inertia.max()
+    damp = 1.2 * np.sqrt(stiff * np.maximum(inertia, 2e-6))
+
+    data = [mujoco.MjData(model) for _ in plans]
+    for d, w in zip(data, wished, strict=True):
+        d.qpos = w[0][0]
+    f = np.stack([allocate(nominal.geometry(w[0][0])[1], ff[0][0], ff[1][0]) for w, ff in zip(wished, forward, strict=True)])
+    command, starts = f.copy(), np.array([plan.start for plan in plans])
+    q = np.stack([d.qpos.copy() for d in data])
+    qd = np.zeros_like(q)
+    memories = [d for d in finger.departures if hasattr(d, "states")]
+    memory, driven = {}, {}
+    keep_q, keep_qd, keep_f = (np.empty((len(fine) * CONTROL // 2, batch, size)) for size in (m, m, n))
+
+    for i in range(len(fine) * CONTROL):
+        if i % CONTROL == 0:
+            c = i // CONTROL
+            for b in range(batch):
+                w = wished[b]
+                torque = forward[b][0][c] + stiff * (w[0][c] - q[b]) + damp * (w[1][c] - qd[b])
+                command[b] = allocate(nominal.geometry(q[b])[1], torque, forward[b][1][c])
+            command = command * (1 + 0.004 * noises[:, c]) + 0.02 * noises[:, c] * (command > 0)
+        f = f + (command - f) * (STEP / LAG)
+        t = np.full(batch, i * STEP)
+        s = State(t, starts + t, q, qd, np.zeros_like(q), f, np.sign(qd), memory=memory)
+        s.st = np.tanh(finger.speed(s) / 1e-4)
+        for d in memories:
+            u = d.inputs(finger, s)
+            z = d.start(u[None]) if i == 0 else d.step(memory[id(d)], driven[id(d)], u, STEP)
+            memory[id(d)], driven[id(d)] = z, u
+        if i % 2 == 0:
+            keep_q[i // 2], keep_qd[i // 2], keep_f[i // 2] = q, qd, f
+        q, qd = _advance(finger, s, data, active)
+    return [Run(np.arange(len(keep_q)) * 2 * STEP, keep_q[:, b], keep_qd[:, b], keep_f[:, b]) for b in range(batch)]
+
+
+def _advance(finger: Finger, s: State, data: list, active: np.ndarray):
+    """One MuJoCo step of every trial: smooth forces applied, dry friction left to its solver."""
+    model = finger.plant.model
+    _, arm = finger.path(s)
+    limit, decided = finger.coulomb(s)
+    loss, lost = finger.loss(s)
+    assert s.st is not None
+    sliding = s.st * loss
+    # The solver takes `sliding` off through the fixed tendons; what a departure adds to the delivered tension comes on top.
+    delivered = finger.delivered(s, s.f - lost - sliding) + sliding
+    applied = np.einsum("bnm,bn->bm", arm, delivered) - finger.passive(s) - decided
+    limit, loss = np.maximum(limit, 1e-9), np.maximum(loss, 1e-9)
+    for b, d in enumerate(data):
+        model.dof_frictionloss = limit[b]
+        model.tendon_frictionloss = loss[b, active]
+        model.wrap_prm = arm[b, active].ravel()
+        d.qfrc_applied = applied[b]
+        mujoco.mj_step(model, d)
+    return np.stack([d.qpos.copy() for d in data]), np.stack([d.qvel.copy() for d in data])
+
+
+def _wander(rng: np.random.Generator, count: int, n: int, dt: float) -> Float[np.ndarray, "K n"]:
+    """Unit slow noise, correlated over half a second."""
+    knots = rng.normal(size=(int(count * dt / 0.5) + 3, n))
+    at = np.arange(count) * dt / 0.5
+    return np.stack([np.interp(at, np.arange(len(knots)), column) for column in knots.T], axis=1)

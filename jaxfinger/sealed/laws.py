@@ -1,0 +1,151 @@
+"""A true finger: the nominal laws of a specimen, and what departs from them.
+
+Every law takes a `State` and works on whatever leading axes its arrays have: a whole recording (time first), or one instant
+of several trials that are simulated side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from .departures.base import Departure, Memory
+from .plant import Plant
+from .specimens import Specimen
+
+
+@dataclass
+class State:
+    """Where the finger is. Angles rad, tension at the actuator N, time s; directions −1, 0, +1."""
+
+    t: Float[np.ndarray, "..."]
+    session: Float[np.ndarray, "..."]  # seconds since the session began
+    q: Float[np.ndarray, "... m"]
+    qd: Float[np.ndarray, "... m"]
+    qdd: Float[np.ndarray, "... m"]
+    f: Float[np.ndarray, "... n"]
+    sj: Float[np.ndarray, "... m"]  # direction in which each joint slides; 0 where a fixture holds it
+    st: Float[np.ndarray, "... n"] | None = None
+    held: bool = False  # every joint is at rest in a fixture
+    motor: bool = False  # the external motor with its torque sensor is coupled
+    memory: dict = field(default_factory=dict)  # by departure: (..., k)
+
+
+class Finger:
+    """A specimen with its departures. Without any it is the nominal plant."""
+
+    def __init__(self, specimen: Specimen, departures: Sequence[Departure] = (), plant: Plant | None = None):
+        self.specimen = specimen
+        self.departures = tuple(departures)
+        body = specimen.finger
+        for d in self.departures:
+            body = d.body(body)
+        self.plant = plant if plant is not None and body is specimen.finger else Plant(body)
+        self.m, self.n = body.m, body.n
+
+    @cached_property
+    def _powers(self):
+        return np.arange(1, self.specimen.excursion.shape[-1] + 1)
+
+    def geometry(self, q: Float[np.ndarray, "... m"]) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n m"]]:
+        """Nominal excursion l = f(q) in m, and C = ∂f/∂q."""
+        low = q[..., None] ** (self._powers - 1)
+        arms = self.specimen.excursion
+        length = np.einsum("...mp,nmp->...n", low * q[..., None], arms)
+        return length, np.einsum("...mp,nmp->...nm", low, arms * self._powers)
+
+    def path(self, s: State) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n m"]]:
+        """Excursion as the tendon is pulled in, and its derivative by q, departures included."""
+        length, arm = self.geometry(s.q)
+        for d in self._ready(s):
+            length, arm = d.path(self, s, length, arm)
+        return length, arm
+
+    def speed(self, s: State) -> Float[np.ndarray, "... n"]:
+        """l̇ = C q̇ in m/s."""
+        return np.einsum("...nm,...m->...n", self.geometry(s.q)[1], s.qd)
+
+    def passive(self, s: State) -> Float[np.ndarray, "... m"]:
+        """τ_k + τ_d in N m: what resists without dry friction."""
+        c = self.specimen.elastic
+        torque = c[:, 0] + c[:, 1] * s.q + c[:, 2] * s.q**2 + self.specimen.damping * s.qd
+        for d in self._ready(s):
+            torque = d.passive(self, s, torque)
+        return torque
+
+    def coulomb(self, s: State) -> tuple[Float[np.ndarray, "... m"], Float[np.ndarray, "... m"]]:
+        """Limit of the joints' dry friction, and friction that is already decided by a memory state, N m."""
+        c = self.specimen.coulomb
+        limit, decided = c[:, 0] + c[:, 1] * s.q + c[:, 2] * s.q**2, np.zeros_like(s.q)
+        for d in self._ready(s):
+            limit, decided = d.coulomb(self, s, limit, decided)
+        return limit, decided
+
+    def loss(self, s: State) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n"]]:
+        """Limit of the tendons' dry friction, and friction that is already decided, N. Never more than the tension."""
+        a = self.specimen.friction
+        limit, decided = np.clip(a[:, 0] + a[:, 1] * s.f, 0.0, np.maximum(s.f, 0.0)), np.zeros_like(s.f)
+        for d in self._ready(s):
+            limit, decided = d.loss(self, s, limit, decided)
+        return np.clip(limit, 0.0, np.maximum(s.f, 0.0)), decided
+
+    def delivered(self, s: State, reaching: Float[np.ndarray, "... n"]) -> Float[np.ndarray, "... n"]:
+        """Tension that acts on the joints, given what is left of each tendon's own."""
+        for d in self._ready(s):
+            reaching = d.deliver(self, s, reaching)
+        return reaching
+
+    def friction(self, s: State) -> Float[np.ndarray, "... m"]:
+        """Joint friction where the directions are known, N m."""
+        limit, decided = self.coulomb(s)
+        return limit * s.sj + decided
+
+    def reaching_sliding(self, s: State) -> Float[np.ndarray, "... n"]:
+        """f_j = f_t − s(l̇) loss where the tendons slide, N."""
+        limit, decided = self.loss(s)
+        assert s.st is not None
+        return s.f - s.st * limit - decided
+
+    def reaching_held(self, s: State) -> Float[np.ndarray, "N n"]:
+        """f_j at joints held at rest: it slips only when the loss is exceeded, starting from slack."""
+        limit, decided = self.loss(s)
+        high, low = s.f + limit, s.f - limit
+        reaching = np.empty_like(s.f)
+        for k in range(self.n):
+            if np.ptp(s.f[:, k]) == 0.0 and s.f[0, k] == 0.0:
+                reaching[:, k] = 0.0
+                continue
+            value = 0.0
+            column = np.empty(len(s.f))
+            for i, (lower, upper) in enumerate(zip(low[:, k].tolist(), high[:, k].tolist(), strict=True)):
+                value = min(max(value, lower), upper)
+                column[i] = value
+            reaching[:, k] = column
+        return reaching - decided
+
+    def remember(self, s: State) -> State:
+        """The state with every memory driven along the recording."""
+        memory = {}
+        for d in self.departures:
+            if not isinstance(d, Memory):
+                continue
+            u = d.inputs(self, s)
+            z = np.empty((len(u), d.states))
+            z[0] = d.start(u)
+            steps = np.diff(s.t, prepend=s.t[0])
+            current = z[0]
+            for i in range(1, len(u)):
+                current = d.step(current, u[i - 1], u[i], steps[i])
+                z[i] = current
+            memory[id(d)] = z
+        return replace(s, memory=memory)
+
+    def _ready(self, s: State):
+        """Departures that can act: a memory acts only once it has been driven."""
+        for d in self.departures:
+            if not isinstance(d, Memory) or id(d) in s.memory:
+                yield d

@@ -1,0 +1,70 @@
+"""Tendon paths: MuJoCo's spatial tendons through eyelets on both sides of every joint, and the polynomials that fit them.
+
+Between two eyelets that sit on neighbouring links the path depends on one angle only, so the excursion separates by joint.
+With equal distances it is 2R (cos(α) − cos(α + q/2)): over a finger's range a polynomial of fourth order misses it by
+about 1e-5 R, a hundredth of the excursion's noise. The specimens use these polynomials, so that they lie in the nominal class.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from jaxfinger.data import FingerDescription
+
+from .plant import add_chain
+
+DEGREE = 4
+
+
+def spatial_lengths(
+    finger: FingerDescription, arm: Float[np.ndarray, "n m"], alpha: Float[np.ndarray, "n m"], joint: int, q: Float[np.ndarray, " K"]
+) -> Float[np.ndarray, "K n"]:
+    """Path lengths in m as joint `joint` turns through q and the others rest at zero.
+
+    `arm` is the moment arm at q = 0 in m (0: the tendon does not cross); `alpha` the eyelets' angle above the link in rad.
+    """
+    spec = mujoco.MjSpec()
+    bodies = add_chain(spec, finger)
+    for k, name in enumerate(finger.tendon_names):
+        crossed = np.flatnonzero(arm[k])
+        if not len(crossed):
+            continue
+        tendon = spec.add_tendon(name=name)
+        for i in crossed:
+            radius = abs(arm[k, i]) / np.sin(alpha[k, i])
+            # A pull along −x at height h turns the joint by (h × −x)·axis: positive on the side axis × x.
+            height = np.sign(arm[k, i]) * radius * np.sin(alpha[k, i]) * np.cross(finger.axis[i], [1.0, 0.0, 0.0])
+            along = np.array([radius * np.cos(alpha[k, i]), 0.0, 0.0])
+            bodies[i].add_site(name=f"{name}-{i}-in", pos=finger.origin[i] - along + height)
+            bodies[i + 1].add_site(name=f"{name}-{i}-out", pos=along + height)
+            tendon.wrap_site(f"{name}-{i}-in")
+            tendon.wrap_site(f"{name}-{i}-out")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    present = [k for k in range(finger.n) if np.any(arm[k])]
+    lengths = np.zeros((len(q), finger.n))
+    for row, angle in zip(lengths, q, strict=True):
+        data.qpos[:] = 0.0
+        data.qpos[joint] = angle
+        mujoco.mj_fwdPosition(model, data)
+        row[present] = data.ten_length
+    return lengths
+
+
+def excursion_polynomials(
+    finger: FingerDescription, arm: Float[np.ndarray, "n m"], alpha: Float[np.ndarray, "n m"]
+) -> tuple[Float[np.ndarray, "n m 4"], float]:
+    """Coefficients of q, q², q³, q⁴ of the excursion (pulled in positive), and the worst misfit in m."""
+    coefficients = np.zeros((finger.n, finger.m, DEGREE))
+    misfit = 0.0
+    for i in range(finger.m):
+        q = np.linspace(*finger.limits[i], 81)
+        lengths = spatial_lengths(finger, arm, alpha, i, np.append(q, 0.0))
+        excursion = lengths[-1] - lengths[:-1]
+        basis = q[:, None] ** np.arange(1, DEGREE + 1)
+        fit, *_ = np.linalg.lstsq(basis, excursion, rcond=None)
+        coefficients[:, i] = np.where((arm[:, i] != 0)[:, None], fit.T, 0.0)
+        misfit = max(misfit, float(np.abs(basis @ fit - excursion).max()))
+    return coefficients, misfit

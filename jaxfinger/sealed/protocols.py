@@ -1,0 +1,237 @@
+"""The experiments of a session: what is commanded, trial by trial, drawn from a seed.
+
+A session has some forty trials like those of a bench; a fresh file has other postures, speeds and levels and repeats nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from .profiles import Builder, Profile
+from .specimens import Specimen
+
+SLOW, FAST = 250.0, 1000.0  # samples per second
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One commanded trial. `q` and `tension` hold a profile per joint and tendon; holds are (begin, end, direction)."""
+
+    name: str
+    motion: str
+    experiment: str
+    start: float
+    duration: float
+    rate: float
+    q: tuple[Profile, ...]
+    tension: tuple[Profile, ...]
+    joint: int | None = None
+    tendon: int | None = None
+    holds: tuple[tuple[float, float, int], ...] = ()
+    wander: float = 0.0  # N, slow wander of the hand-held or constant tension
+    seed: int = 0  # process noise of this very trial
+
+
+@dataclass(frozen=True)
+class Style:
+    """How this bench runs its experiments."""
+
+    holds: int
+    hold_time: float
+    levels: int
+    top: float  # N
+    speeds: tuple[float, ...]  # rad/s
+    repeat: float  # chance that a trial is run again
+    unload: bool  # ID.4 lets tension go in steps, too
+    missing: str  # an experiment that this session lacks, or nothing
+    postures: int
+    base_tension: float
+
+
+def draw_style(rng: np.random.Generator) -> Style:
+    """Habits of one bench."""
+    speeds = np.sort(rng.choice([0.3, 0.5, 0.7, 1.0, 1.4, 1.8, 2.3], size=int(rng.integers(3, 5)), replace=False))
+    return Style(
+        holds=int(rng.integers(7, 11)), hold_time=float(rng.uniform(0.9, 1.3)), levels=int(rng.integers(5, 8)),
+        top=float(rng.uniform(10.0, 14.0)), speeds=tuple(speeds.tolist()), repeat=float(rng.uniform(0.2, 0.35)),
+        unload=bool(rng.random() < 0.75), missing=str(rng.choice(["", "", "", "", "", "VD.1", "VD.2", "ID.3-dynamic"])),
+        postures=2, base_tension=float(rng.uniform(1.9, 2.2)),
+    )
+
+
+def session_plans(specimen: Specimen, style: Style, rng: np.random.Generator, fresh: bool = False) -> list[Plan]:
+    """Every trial of the session in order."""
+    protocol = _Protocol(specimen, style, rng, fresh)
+    plans: list[Plan] = []
+    for experiment, draft in protocol.drafts():
+        if experiment == style.missing and not fresh:
+            continue
+        again = not fresh and (rng.random() < style.repeat or (experiment == "VD.3" and draft.motion.endswith("b")))
+        plans += [draft, draft] if again else [draft]
+    start, numbered = 20.0, []
+    for i, plan in enumerate(plans, start=1):
+        suffix = "-x" if fresh else ""
+        numbered.append(replace(
+            plan, name=f"{i:02d}-{plan.motion}", motion=plan.motion + suffix, start=start, seed=int(rng.integers(2**31))
+        ))
+        start += plan.duration + rng.uniform(5.0, 18.0)
+    return numbered
+
+
+class _Protocol:
+    def __init__(self, specimen: Specimen, style: Style, rng: np.random.Generator, fresh: bool):
+        self.specimen, self.style, self.rng, self.fresh = specimen, style, rng, fresh
+        self.finger = specimen.finger
+        self.m, self.n = self.finger.m, self.finger.n
+        self.low, self.high = self.finger.limits.T
+        self.active = np.flatnonzero(self.finger.active)
+        self.letters = "a" if fresh else "abcdefg"[: style.postures]
+
+    def drafts(self):
+        """(experiment, plan) in the order of a session, before repeats and numbering."""
+        for j in range(self.m):
+            for letter in () if self.fresh else self.letters:
+                yield "ID.2", self.id2(j, letter)
+        for letter in "ab" if self.fresh else "abc":
+            yield "VD.1", self.vd1(letter)
+        for j in range(self.m):
+            for letter in "ab" if j < 2 and not self.fresh else "a":
+                yield "ID.3-static", self.static(j, letter)
+        for j in range(self.m):
+            for letter in "ab" if j < 1 and not self.fresh else "a":
+                yield "ID.3-dynamic", self.dynamic(j, letter)
+        for k in self.active:
+            for j in self._arms(k):
+                for letter in self.letters:
+                    yield "ID.4", self.id4(int(k), int(j), letter)
+        for k in self.active[: 3 if self.n < 6 else 4]:
+            yield "VD.2", self.vd2(int(k))
+        for letter in "ab":
+            yield "VD.3", self.vd3(letter)
+
+    def _arms(self, k: int):
+        """Joints at which the tendon's torque is measured: those with a real moment arm, three at most."""
+        arm = np.abs(self.specimen.excursion[k, :, 0])
+        joints = [j for j in np.argsort(-arm) if self.finger.crosses[k, j] and arm[j] > 1.5e-3]
+        return sorted(joints[:3] if self.m < 5 else joints[:2])
+
+    def posture(self, low: float = 0.08, high: float = 0.7) -> Float[np.ndarray, " m"]:
+        """A fixed posture within the range."""
+        return self.low + (self.high - self.low) * self.rng.uniform(low, high, self.m)
+
+    def _rest(self, values) -> list[Profile]:
+        return [Builder(float(v)).profile() for v in values]
+
+    def _ends(self, j: int) -> tuple[float, float]:
+        span = self.high[j] - self.low[j]
+        a, b = (0.12, 0.85) if self.fresh else (0.1, 0.95)
+        return (
+            self.low[j] + span * (a + self.rng.uniform(-0.02, 0.05)), self.low[j] + span * (b + self.rng.uniform(-0.05, 0.02))
+        )
+
+    def _tensions(self, value: float) -> tuple[Profile, ...]:
+        return tuple(self._rest(np.where(self.finger.active, value, 0.0)))
+
+    def id2(self, j: int, letter: str) -> Plan:
+        """Tendons at about 2 N, one joint through its range and back, twice, the second time another depth."""
+        low, high = self._ends(j)
+        q = self._rest(self.posture())
+        pace = self.rng.uniform(4.5, 6.0)
+        b = Builder(low).rest(0.5).move(high, pace).rest(0.4).move(low, pace).rest(0.4)
+        middle = low + (high - low) * self.rng.uniform(0.4, 0.9)
+        b = b.move(middle, 0.8 * pace).rest(0.3).move(low, 0.8 * pace).rest(0.5)
+        q[j] = b.profile()
+        name = f"ID.2-{self.finger.joint_names[j]}-{letter}"
+        return Plan(name, name, "ID.2", 0, b.now, SLOW, tuple(q), self._tensions(self.style.base_tension), j, wander=0.15)
+
+    def vd1(self, letter: str) -> Plan:
+        """All joints by hand along a free path."""
+        q, duration = [], self.rng.uniform(18.0, 24.0)
+        for j in range(self.m):
+            b = Builder(self.low[j] + 0.15 * (self.high[j] - self.low[j]))
+            while b.now < duration - 4.0:
+                if self.rng.random() < 0.3:
+                    b = b.rest(self.rng.uniform(0.3, 1.0))
+                to = self.low[j] + (self.high[j] - self.low[j]) * self.rng.uniform(0.08, 0.92)
+                b = b.move(to, self.rng.uniform(1.3, 3.5))
+            q.append(b.profile())
+        name = f"VD.1-{letter}"
+        return Plan(name, name, "VD.1", 0, duration, SLOW, tuple(q), self._tensions(self.style.base_tension), wander=0.2)
+
+    def static(self, j: int, letter: str) -> Plan:
+        """Tendons slack; one joint through holds, up and back."""
+        low, high = self._ends(j)
+        count = self.style.holds - (2 if self.fresh else 0)
+        up = np.linspace(low, high, count) + self.rng.uniform(-0.01, 0.01, count)
+        b, holds, way = Builder(float(up[0]) - 0.06), [], 0.5
+        for direction, targets in ((1, up), (-1, up[::-1][1:] - 0.02)):
+            for to in targets:
+                b = b.move(float(to), max(way, abs(to - b.here) / 0.25))
+                holds.append((b.now + 0.15, b.now + 0.15 + self.style.hold_time, direction))
+                b = b.rest(self.style.hold_time + 0.2)
+        q = self._rest(self.posture())
+        q[j] = b.profile()
+        name = f"ID.3-static-{self.finger.joint_names[j]}-{letter}"
+        return Plan(name, name, "ID.3-static", 0, b.now, SLOW, tuple(q), self._tensions(0.0), j, holds=tuple(holds))
+
+    def dynamic(self, j: int, letter: str) -> Plan:
+        """Tendons slack; sweeps there and back at several speeds, and a small loop inside the range."""
+        low, high = self._ends(j)
+        speeds = np.array(self.style.speeds) * (0.8 if self.fresh else 1.0) * self.rng.uniform(0.95, 1.05)
+        b = Builder(low).rest(0.3)
+        for speed in speeds:
+            turn = float(np.clip(0.06 / speed, 0.04, 0.15))
+            b = b.sweep(high, float(speed), turn).sweep(low, float(speed), turn)
+        inner = low + (high - low) * self.rng.uniform(0.4, 0.6)
+        b = b.sweep(inner, float(speeds[0]), 0.12).sweep(inner - 0.12, float(speeds[0]), 0.12).sweep(high, float(speeds[0]), 0.12)
+        q = self._rest(self.posture())
+        q[j] = b.profile()
+        name = f"ID.3-dynamic-{self.finger.joint_names[j]}-{letter}"
+        return Plan(name, name, "ID.3-dynamic", 0, b.now + 0.2, FAST, tuple(q), self._tensions(0.0), j)
+
+    def _steps(self, levels, hold: float) -> tuple[Builder, list[tuple[float, float, int]]]:
+        b, holds = Builder(0.0).rest(0.15), []
+        for level in levels:
+            direction = 1 if level > b.here else -1
+            b = b.move(float(level), 0.35)
+            holds.append((b.now + 0.1, b.now + 0.1 + hold, direction))
+            b = b.rest(hold + 0.15)
+        return b, holds
+
+    def id4(self, k: int, j: int, letter: str) -> Plan:
+        """The joint held by the torque sensor; one tendon up in steps, and down."""
+        top = self.style.top * (0.85 if self.fresh else 1.0)
+        up = np.linspace(2.0, top, self.style.levels) + (self.rng.uniform(0.2, 0.6) if self.fresh else 0.0)
+        down = np.array([0.68, 0.42, 0.2]) * top if self.style.unload else np.array([])
+        b, holds = self._steps(np.concatenate([up, down]), self.style.hold_time * 0.8)
+        posture = self.posture() if letter == "a" else self.posture(0.45, 0.92)
+        tension = self._rest(np.zeros(self.n))
+        tension[k] = b.profile()
+        name = f"ID.4-{self.finger.tendon_names[k]}-{self.finger.joint_names[j]}-{letter}"
+        return Plan(name, name, "ID.4", 0, b.now, SLOW, tuple(self._rest(posture)), tuple(tension), j, k, tuple(holds))
+
+    def vd2(self, k: int) -> Plan:
+        """Fingertip against the force sensor; one tendon up to 15 N, others at a constant tension or slack."""
+        up = np.arange(4.0, 15.1, 1.0 if not self.fresh else 1.4)
+        down = np.array([11.0, 7.0]) if self.style.unload else np.array([])
+        b, holds = self._steps(np.concatenate([up, down]), self.style.hold_time * 0.75)
+        tension = []
+        for i in range(self.n):
+            level = self.rng.uniform(3.0, 6.0) if self.finger.active[i] and self.rng.random() < 0.5 else 0.0
+            tension.append(Builder(0.0).move(level, 0.14).profile() if level else Builder(0.0).profile())
+        tension[k] = b.profile()
+        name = f"VD.2-{self.finger.tendon_names[k]}"
+        posture = self.posture(0.3, 0.75)
+        return Plan(name, name, "VD.2", 0, b.now, SLOW, tuple(self._rest(posture)), tuple(tension), None, k, tuple(holds))
+
+    def vd3(self, letter: str) -> Plan:
+        """A wish of the free finger's trajectory; `drive` finds postures and tensions that the finger can follow."""
+        return Plan(f"VD.3-{letter}", f"VD.3-{letter}", "VD.3", 0, 8.0, FAST, (), ())
+
+
+def sample_times(plan: Plan, rate: float | None = None) -> Float[np.ndarray, " N"]:
+    """Sampling times in s at the plan's rate or another."""
+    return np.arange(int(plan.duration * (rate or plan.rate))) / (rate or plan.rate)
