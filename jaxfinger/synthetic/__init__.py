@@ -1,1 +1,20 @@
 """A simulated specimen on a simulated rig: it stands in for the bench, so it shares no assumption with the fit."""
+
+from jaxfinger.synthetic.fingers import nominal_model as nominal_model
+from jaxfinger.synthetic.fingers import polynomial_finger as polynomial_finger
+from jaxfinger.synthetic.fingers import specimen_of as specimen_of
+from jaxfinger.synthetic.paper_finger import paper_finger as paper_finger
+from jaxfinger.synthetic.plant import Plant as Plant
+from jaxfinger.synthetic.plant import SpecimenPlant as SpecimenPlant
+from jaxfinger.synthetic.protocols import TrialPlan as TrialPlan
+from jaxfinger.synthetic.protocols import session_plan as session_plan
+from jaxfinger.synthetic.random_finger import random_finger as random_finger
+from jaxfinger.synthetic.recipe import Recipe as Recipe
+from jaxfinger.synthetic.recipe import read_recipe as read_recipe
+from jaxfinger.synthetic.recipe import recipe_from as recipe_from
+from jaxfinger.synthetic.simulate import CleanSession as CleanSession
+from jaxfinger.synthetic.simulate import clean_session as clean_session
+from jaxfinger.synthetic.simulate import measure as measure
+from jaxfinger.synthetic.simulate import simulate as simulate
+from jaxfinger.synthetic.simulate import simulate_many as simulate_many
+from jaxfinger.synthetic.specimen import Specimen as Specimen

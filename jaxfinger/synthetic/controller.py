@@ -34,9 +34,8 @@ class Controller(NamedTuple):
     targets: Targets
     active: Float[Array, " n"]  # 1 or 0
     leverage: Float[Array, " m"]  # m²: sum of the squared moment arms at each joint
-    dt: float  # s
 
-    def tension(self, specimen: Specimen, q, v, before, target: Targets):
+    def tension(self, specimen: Specimen, q, v, before, target: Targets, dt):
         """Next tension, N: the tension loop follows its command with a first-order lag.
 
         Feedback torque τ becomes tension C τ / Σ c², whose torque CᵀC τ / Σ c² always acts against the error.
@@ -44,7 +43,7 @@ class Controller(NamedTuple):
         torque = STIFFNESS * (target.q - q) + DAMPING * (target.qd - v)
         command = target.tension + specimen.moment_arm(q) @ (torque / self.leverage)
         command = self.active * jnp.maximum(command, FLOOR)
-        return before + (1.0 - jnp.exp(-self.dt / LAG)) * (command - before)
+        return before + (1.0 - jnp.exp(-dt / LAG)) * (command - before)
 
 
 def feedforward(specimen: Specimen, plan: TrialPlan, rigid_body: Float[Array, "m N"]) -> Controller:
@@ -62,7 +61,6 @@ def feedforward(specimen: Specimen, plan: TrialPlan, rigid_body: Float[Array, "m
         Targets(plan.q, plan.qd, np.maximum(tension, FLOOR * active[:, None])),
         active,
         np.maximum((leverage**2).sum(axis=0), 1e-6),
-        float(plan.time[1] - plan.time[0]),
     )
 
 
@@ -71,7 +69,7 @@ def distribute(C: Float[Array, "n m N"], torque: Float[Array, "m N"], sweeps: in
     at once, on ‖Cᵀ f − τ‖² + ε ‖f‖²."""
     f = np.full((C.shape[0], C.shape[2]), LEAST)
     gram = np.einsum("kmt,jmt->kjt", C, C)
-    ridge = 1e-4 * np.einsum("kkt->kt", gram).max(axis=0)
+    ridge = 1e-3 * np.einsum("kkt->kt", gram).max(axis=0)
     pull = np.einsum("nmt,mt->nt", C, torque)
     for _ in range(sweeps):
         for k in range(len(f)):

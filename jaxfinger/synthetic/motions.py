@@ -92,7 +92,10 @@ def swing(
     """Two sines about a centre, let in over the first second so that the motion starts at rest. Frequencies in Hz."""
     w = 2.0 * np.pi * np.sort(rng.uniform(*frequencies, 2))
     share = rng.uniform(0.4, 0.6)
-    sines = [(share * amplitude, w[0], rng.uniform(-0.5, 0.5)), ((1.0 - share) * amplitude, w[1], rng.uniform(-0.5, 0.5))]
+    sines = [
+        (share * amplitude, w[0], rng.uniform(-0.5, 0.5)),
+        ((1.0 - share) * amplitude, w[1], rng.uniform(-0.5, 0.5)),
+    ]
     y = sum(a * np.sin(w * time + p) for a, w, p in sines)
     dy = sum(a * w * np.cos(w * time + p) for a, w, p in sines)
     ddy = sum(-a * w**2 * np.sin(w * time + p) for a, w, p in sines)

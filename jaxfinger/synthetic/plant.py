@@ -6,14 +6,16 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Protocol
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxfinger.errors import UserError
 from jaxfinger.model import rigid_body
 from jaxfinger.model.finger import Finger
-from jaxfinger.synthetic.driven import drive
+from jaxfinger.synthetic.controller import feedforward
+from jaxfinger.synthetic.driven import QUICK, Simulator
 from jaxfinger.synthetic.protocols import TrialPlan
 from jaxfinger.synthetic.specimen import Specimen
 
@@ -43,14 +45,19 @@ class SpecimenPlant:
 
     def prescribed(self, plan: TrialPlan) -> Channels:
         """All channels of the plan's experiment; those that the rig does not measure are left out later."""
-        channels = {"q": plan.q, "tendon_force": plan.tension, "tendon_excursion": self.specimen.excursion(plan.q)}
-        if plan.experiment.startswith("ID.3"):
-            channels["joint_torque"] = self._torque(plan, np.zeros_like(plan.tension))
-        elif plan.held:
-            torque = self._torque(plan, joint_tension(plan.tension, self.specimen.loss(plan.tension)))
-            channels["fingertip_force" if plan.experiment == "VD.2" else "joint_torque"] = (
-                self._contact_force(plan.q, torque) if plan.experiment == "VD.2" else torque
-            )
+        channels = {"q": plan.q, "tendon_force": plan.tension}
+        if plan.held:
+            pose = plan.q[:, :1]  # held all the time: the terms of the pose are wanted once
+            torque = self._holding_torque(pose, joint_tension(plan.tension, self.specimen.loss(plan.tension)))
+            channels["tendon_excursion"] = np.repeat(self.specimen.excursion(pose), plan.time.size, axis=1)
+            if plan.experiment == "VD.2":
+                channels["fingertip_force"] = self._contact_force(pose, torque)
+            else:
+                channels["joint_torque"] = torque
+        elif plan.experiment.startswith("ID.3"):
+            channels["joint_torque"] = self._moving_torque(plan)
+        else:
+            channels["tendon_excursion"] = self.specimen.excursion(plan.q)
         return channels
 
     def driven(self, plan: TrialPlan) -> Channels:
@@ -59,30 +66,49 @@ class SpecimenPlant:
         Raises:
             UserError: the motion leaves the joints' limits.
         """
-        q, tension = drive(self.specimen, self.finger, plan)
+        needed = self._rigid_body(plan.q, plan.qd, plan.qdd)
+        controller = feedforward(self.specimen, plan, needed)
+        q, _, tension = self._simulator(plan.q[:, 0], float(plan.time[1] - plan.time[0]), controller)
+        limits = self.specimen.description.limits
+        within = ((q >= limits[:, :1]) & (q <= limits[:, 1:])).all(axis=1)
+        if not within.all():
+            joint = self.specimen.description.joint_names[np.argmin(within)]
+            raise UserError(
+                f"recipe: trial {plan.name} drives {joint} beyond its limits; lower trials.vd3.amplitude or change motion_seed"
+            )
         return {"q": q, "tendon_force": tension, "tendon_excursion": self.specimen.excursion(q)}
 
-    def _torque(self, plan: TrialPlan, tension: Float[Array, "n N"]) -> Float[Array, "m N"]:
-        """τ_ext of (1), N m: M q̈ + N + G + τ_k + τ_d + τ_f − Cᵀ (f_t − f_f). A held joint carries no friction."""
-        direction = np.zeros_like(plan.q) if plan.joint_direction is None else plan.joint_direction
-        tau = self._rigid_body(plan.q, plan.qd, plan.qdd)
-        tau = tau + self.specimen.elastic(plan.q) + self.specimen.viscous(plan.qd)
-        tau = tau + direction * self.specimen.coulomb(plan.q)
-        if tension.any():
-            tau = tau - np.einsum("nmt,nt->mt", self.specimen.moment_arm(plan.q), tension)
-        return tau
+    def _moving_torque(self, plan: TrialPlan) -> Float[Array, "m N"]:
+        """τ_ext of (1) with slack tendons, N m: M q̈ + N + G + τ_k + τ_d + τ_f, friction in the commanded direction."""
+        resisting = self.specimen.elastic(plan.q) + self.specimen.viscous(plan.qd)
+        resisting = resisting + plan.joint_direction * self.specimen.coulomb(plan.q)
+        return self._rigid_body(plan.q, plan.qd, plan.qdd) + resisting
 
-    def _contact_force(self, q: Float[Array, "m N"], torque: Float[Array, "m N"]) -> Float[Array, "3 N"]:
-        """Least-squares solution of Jᵀ f_ext = τ, N; the joints do not move, so that one Jacobian serves the trial.
+    def _holding_torque(self, pose: Float[Array, "m 1"], tension: Float[Array, "n N"]) -> Float[Array, "m N"]:
+        """τ_ext of (1) at rest, N m: G + τ_k − Cᵀ (f_t − f_f); a joint that a fixture holds carries no friction."""
+        rest = np.zeros_like(pose)
+        gravity = self._rigid_body(pose, rest, rest)
+        return gravity + self.specimen.elastic(pose) - self.specimen.moment_arm(pose)[:, :, 0].T @ tension
+
+    def _contact_force(self, pose: Float[Array, "m 1"], torque: Float[Array, "m N"]) -> Float[Array, "3 N"]:
+        """Least-squares solution of Jᵀ f_ext = τ, N.
 
         What a planar contact force cannot take is taken by the joints' static friction (dataset format, VD.2).
         """
-        _, jacobian = rigid_body.fingertip(self.finger, jnp.asarray(q[:, 0]))
+        _, jacobian = self._fingertip(self.finger, jnp.asarray(pose[:, 0]))
         return np.linalg.pinv(np.asarray(jacobian).T, rcond=1e-9) @ torque
 
     @cached_property
+    def _simulator(self) -> Simulator:
+        return Simulator(self.specimen, self.finger)
+
+    @cached_property
     def _inverse_dynamics(self) -> Callable:
-        return eqx.filter_jit(rigid_body.inverse_dynamics)
+        return jax.jit(rigid_body.inverse_dynamics, compiler_options=QUICK)
+
+    @cached_property
+    def _fingertip(self) -> Callable:
+        return jax.jit(rigid_body.fingertip, compiler_options=QUICK)
 
     def _rigid_body(self, *state: Float[Array, "m N"]) -> Float[Array, "m N"]:
         """M q̈ + N + G, in blocks of equal length."""

@@ -137,7 +137,16 @@ def _pulls(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
                 motion = f"ID.4-{finger.tendon_names[tendon]}-{finger.joint_names[joint]}-{letter}"
                 down = e.tensions[-2::-1] if e.release else ()
                 yield _stepped(
-                    finger, trials.rate, "ID.4", motion, posture, int(tendon), (*e.tensions, *down), e.move, e.dwell, int(joint)
+                    finger,
+                    trials.rate,
+                    "ID.4",
+                    motion,
+                    posture,
+                    int(tendon),
+                    (*e.tensions, *down),
+                    e.move,
+                    e.dwell,
+                    int(joint),
                 )
 
 
@@ -147,7 +156,9 @@ def _contacts(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
     most = max(np.flatnonzero(finger.active), key=lambda k: finger.crosses[k].sum())
     for name in e.tendons or (finger.tendon_names[most],):
         if name not in finger.tendon_names:
-            raise UserError(f"recipe: trials.vd2.tendons names {name!r}; the finger has {', '.join(finger.tendon_names)}")
+            raise UserError(
+                f"recipe: trials.vd2.tendons names {name!r}; the finger has {', '.join(finger.tendon_names)}"
+            )
         for letter, posture in _postures(finger, e.postures, "trials.vd2", count=1):
             motion, tendon = f"VD.2-{name}-{letter}", finger.tendon_names.index(name)
             yield _stepped(finger, trials.rate, "VD.2", motion, posture, tendon, e.tensions, e.move, e.dwell)
@@ -215,7 +226,9 @@ def _postures(finger: FingerDescription, given: Postures, key: str, count: int =
             yield _letter(k), lower + fraction * (upper - lower)
     for k, degrees in enumerate(given):
         if len(degrees) != finger.m:
-            raise UserError(f"recipe: {key}.postures has {len(degrees)} angles in one posture; give one a joint, {finger.m}")
+            raise UserError(
+                f"recipe: {key}.postures has {len(degrees)} angles in one posture; give one a joint, {finger.m}"
+            )
         posture = np.deg2rad(degrees)
         outside = np.flatnonzero((posture < finger.limits[:, 0]) | (posture > finger.limits[:, 1]))
         if outside.size:

@@ -80,7 +80,9 @@ class WrappedRoute:
     def _path(self, q):
         """Length L and dL/dq, seen from the link that carries the surface: only the other link's point moves."""
         xp = q.__array_namespace__()
-        moving, fixed, turn = (self.proximal, self.distal, -1.0) if self.on_distal else (self.distal, self.proximal, 1.0)
+        moving, fixed, turn = (
+            (self.proximal, self.distal, -1.0) if self.on_distal else (self.distal, self.proximal, 1.0)
+        )
         s, c = xp.sin(turn * q), xp.cos(turn * q)
         x, z = moving[0] * c + moving[1] * s, moving[1] * c - moving[0] * s
         dx, dz = turn * z, -turn * x

@@ -1,0 +1,79 @@
+"""Specimens by recipe: the paper's, one whose truth the nominal model can express, and random ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfinger.errors import UserError
+from jaxfinger.model import Finger, JointTorque, Model, MomentArm, TendonFriction
+from jaxfinger.synthetic.paper_finger import paper_finger
+from jaxfinger.synthetic.random_finger import random_finger
+from jaxfinger.synthetic.recipe import SpecimenRecipe
+from jaxfinger.synthetic.routes import PolynomialRoute, Route
+from jaxfinger.synthetic.specimen import PolynomialFriction, PolynomialSpring, Specimen
+
+EXCURSION_DEGREE, TORQUE_DEGREE = 4, 2  # the paper's
+
+
+def specimen_of(recipe: SpecimenRecipe) -> Specimen:
+    """The specimen that `[specimen]` asks for.
+
+    Raises:
+        UserError: the random finger is to have fewer than 1 or more than 7 joints.
+    """
+    if recipe.kind == "polynomial":
+        return polynomial_finger(paper_finger())
+    if recipe.kind == "random":
+        if not 1 <= recipe.joints <= 7:
+            raise UserError(f"recipe: specimen.joints is {recipe.joints}; choose 1 to 7")
+        return random_finger(recipe.seed, recipe.joints, recipe.layout, recipe.tendons)
+    return paper_finger(recipe.passive_tendon)
+
+
+def polynomial_finger(specimen: Specimen) -> Specimen:
+    """The nearest specimen whose terms are the nominal model's polynomials, so that statistics have an exact truth."""
+    limits = specimen.description.limits
+    q = np.linspace(limits[:, 0], limits[:, 1], 401, axis=1)
+
+    def route(k: int, i: int) -> Route | None:
+        old = specimen.routes[k][i]
+        return old and PolynomialRoute(_fitted(q[i], old.excursion(q[i]), range(1, EXCURSION_DEGREE + 1)))
+
+    powers = range(TORQUE_DEGREE + 1)
+    torques = [
+        tuple(_fitted(q[i], torque[i], powers) for i in range(len(q)))
+        for torque in (specimen.elastic(q), specimen.coulomb(q))
+    ]
+    return replace(
+        specimen,
+        name=f"polynomial {specimen.name}",
+        routes=tuple(tuple(route(k, i) for i in range(len(q))) for k in range(len(specimen.routes))),
+        springs=(PolynomialSpring(torques[0]),),
+        friction=PolynomialFriction(torques[1]),
+    )
+
+
+def nominal_model(specimen: Specimen) -> Model:
+    """The true parameters of a polynomial specimen, as the nominal model holds them; zero for a passive tendon's path."""
+    (spring,), friction, finger = specimen.springs, specimen.friction, Finger.from_description(specimen.description)
+    assert isinstance(spring, PolynomialSpring) and isinstance(friction, PolynomialFriction)
+    moment_arm = MomentArm.zeros(finger.n, finger.m, EXCURSION_DEGREE)
+    coefficients = np.zeros((finger.n, finger.m, EXCURSION_DEGREE))
+    for k in np.flatnonzero(finger.active):
+        for i, route in enumerate(specimen.routes[k]):
+            if isinstance(route, PolynomialRoute):
+                coefficients[k, i] = route.coefficients
+    return Model(
+        finger,
+        MomentArm(jnp.asarray(coefficients.reshape(finger.n, -1)), moment_arm.exponents),
+        JointTorque(*(jnp.asarray(x) for x in (spring.coefficients, specimen.damping, friction.coefficients))),
+        TendonFriction(jnp.asarray(specimen.loss_constant), jnp.asarray(specimen.loss_proportional)),
+    )
+
+
+def _fitted(q, values, powers) -> tuple[float, ...]:
+    """Coefficients of the least-squares polynomial in the given powers."""
+    return tuple(np.linalg.lstsq(np.stack([q**p for p in powers], axis=1), values, rcond=None)[0].tolist())

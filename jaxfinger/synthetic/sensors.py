@@ -1,0 +1,103 @@
+"""What the rig records of clean channels: offsets, coloured noise, spikes, converters with a finite resolution."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.signal import lfilter
+
+from jaxfinger.data import FingerDescription, Trial
+from jaxfinger.synthetic.plant import Channels
+from jaxfinger.synthetic.protocols import TrialPlan
+from jaxfinger.synthetic.recipe import Cad, Channel, Sensors
+
+Array = np.ndarray
+
+
+def record(
+    plan: TrialPlan, clean: Channels, finger: FingerDescription, sensors: Sensors, rng: np.random.Generator
+) -> Trial:
+    """The trial as the rig writes it, in the file's orientation; columns without a sensor are NaN."""
+    dt = float(plan.time[1] - plan.time[0])
+    channels = {
+        name: _measured(clean[name].T, seen, getattr(sensors, name), sensors, dt, rng)
+        for name, seen in _instrumented(plan, finger).items()
+        if name in clean
+    }
+    jitter = np.clip(rng.normal(0.0, sensors.clock_jitter, plan.time.size), -0.2 * dt, 0.2 * dt)
+    time = plan.time + jitter
+    return Trial(
+        plan.name,
+        plan.experiment,
+        time - time[0],
+        **channels,
+        joint_direction=None if plan.joint_direction is None else plan.joint_direction.T.astype(np.int8),
+        tendon_direction=None if plan.tendon_direction is None else plan.tendon_direction.T.astype(np.int8),
+        hold=None if plan.hold is None else plan.hold.astype(np.int32),
+        joint=None if plan.joint is None else finger.joint_names[plan.joint],
+        tendon=None if plan.tendon is None else finger.tendon_names[plan.tendon],
+        motion=plan.motion,
+        session_start=plan.session_start,
+    )
+
+
+def drawn_from_cad(finger: FingerDescription, cad: Cad, rng: np.random.Generator) -> FingerDescription:
+    """The finger as ID.1 gives it: masses and centres of mass off by what their standard deviations say."""
+    mass_std = cad.mass * finger.mass
+    com_std = np.full(finger.com.shape, cad.com)
+    mass = np.maximum(finger.mass + mass_std * rng.standard_normal(finger.m), 0.1 * finger.mass)
+    com = finger.com + com_std * rng.standard_normal(finger.com.shape)
+    return replace(
+        finger,
+        mass=mass,
+        com=com,
+        mass_std=mass_std if cad.mass else None,
+        com_std=com_std if cad.com else None,
+    )
+
+
+def coloured_noise(channel: Channel, shape: tuple[int, int], dt: float, rng: np.random.Generator) -> Array:
+    """Noise of variance std², of which the share `coloured` decays as exp(−t / correlation_time) and the rest is white.
+
+    The coloured part is the stationary AR(1) process x⁺ = a x + √(1 − a²) e, a = exp(−dt / correlation_time).
+    """
+    white = np.sqrt(1.0 - channel.coloured) * rng.standard_normal(shape)
+    a = np.exp(-dt / channel.correlation_time)
+    start = a * rng.standard_normal((1, shape[1]))
+    colour, _ = lfilter([np.sqrt(1.0 - a**2)], [1.0, -a], rng.standard_normal(shape), axis=0, zi=start)
+    return channel.std * (white + np.sqrt(channel.coloured) * colour)
+
+
+def _instrumented(plan: TrialPlan, finger: FingerDescription) -> dict[str, Bool[Array, " columns"]]:
+    """Which columns of each channel have a sensor that says something in this experiment."""
+    joint = np.arange(finger.m) == (-1 if plan.joint is None else plan.joint)
+    pulled = finger.active & (np.arange(finger.n) == plan.tendon) if plan.held else finger.active
+    return {
+        "q": np.ones(finger.m, dtype=bool),
+        "tendon_force": finger.active,
+        "tendon_excursion": pulled,  # a slack tendon's encoder says nothing
+        "joint_torque": joint,
+        "fingertip_force": np.ones(3, dtype=bool),
+    }
+
+
+def _measured(
+    clean: Float[Array, "N columns"],
+    seen: Bool[Array, " columns"],
+    channel: Channel,
+    sensors: Sensors,
+    dt: float,
+    rng: np.random.Generator,
+) -> Float[Array, "N columns"]:
+    count = int(seen.sum())
+    value = clean[:, seen] + channel.offset * rng.standard_normal(count)
+    value = value + coloured_noise(channel, (len(clean), count), dt, rng)
+    if sensors.outliers:
+        hit = rng.random(value.shape) < sensors.outliers
+        size = rng.uniform(*sensors.outlier_size, value.shape) * rng.choice((-1.0, 1.0), value.shape)
+        value = value + hit * size * channel.std
+    recorded = np.full(clean.shape, np.nan)
+    recorded[:, seen] = np.round(value / channel.resolution) * channel.resolution
+    return recorded

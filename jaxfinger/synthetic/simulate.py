@@ -1,0 +1,79 @@
+"""A simulated session: plan, run the plant, record. Plant and plan cost time once; noise is drawn anew for every seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxfinger.data import FingerDescription, Session
+from jaxfinger.synthetic.fingers import specimen_of
+from jaxfinger.synthetic.plant import Channels, Plant, SpecimenPlant
+from jaxfinger.synthetic.protocols import TrialPlan, session_plan
+from jaxfinger.synthetic.recipe import Recipe
+from jaxfinger.synthetic.sensors import drawn_from_cad, record
+
+Progress = Callable[[int, int, str], None]  # trials done, trials in all, name of the next
+
+
+@dataclass(frozen=True)
+class CleanSession:
+    """Every trial as planned, and its channels without noise."""
+
+    recipe: Recipe
+    name: str
+    finger: FingerDescription  # exact
+    trials: tuple[tuple[TrialPlan, Channels], ...]
+
+
+def clean_session(
+    recipe: Recipe,
+    plant: Plant | None = None,
+    finger: FingerDescription | None = None,
+    progress: Progress | None = None,
+) -> CleanSession:
+    """Plan the recipe's trials and run them on the recipe's specimen, or on another plant with its finger.
+
+    Raises:
+        UserError: the recipe does not fit the finger, or a driven motion leaves the joints' limits.
+    """
+    specimen = specimen_of(recipe.specimen)
+    finger = finger or specimen.description
+    plant = plant or SpecimenPlant(specimen)
+    plans = session_plan(finger, recipe.trials)
+    done: dict[str, Channels] = {}  # by motion: repeats command the same, and a plant repeats itself
+    trials = []
+    for k, plan in enumerate(plans):
+        if progress:
+            progress(k, len(plans), plan.name)
+        if plan.motion not in done:
+            done[plan.motion] = plant.driven(plan) if plan.experiment == "VD.3" else plant.prescribed(plan)
+        trials.append((plan, done[plan.motion]))
+    return CleanSession(recipe, recipe.specimen.name or specimen.name, finger, tuple(trials))
+
+
+def measure(clean: CleanSession, seed: int) -> Session:
+    """The session as the rig records it; the seed fixes noise, offsets, spikes and the errors of CAD."""
+    recipe = clean.recipe
+    cad, *streams = np.random.default_rng(seed).spawn(len(clean.trials) + 1)
+    trials = {
+        plan.name: record(plan, channels, clean.finger, recipe.sensors, rng)
+        for (plan, channels), rng in zip(clean.trials, streams, strict=True)
+    }
+    finger = drawn_from_cad(clean.finger, recipe.cad, cad)
+    return Session(clean.name, finger, trials, source=f"jaxfinger simulated rig, seed {seed}")
+
+
+def simulate(
+    recipe: Recipe, seed: int | None = None, plant: Plant | None = None, progress: Progress | None = None
+) -> Session:
+    """A session made to the recipe, with the recipe's seed unless another is given."""
+    return measure(clean_session(recipe, plant, progress=progress), recipe.seed if seed is None else seed)
+
+
+def simulate_many(recipe: Recipe, seeds: Iterable[int], plant: Plant | None = None) -> Iterator[Session]:
+    """Sessions that differ in nothing but the noise, one a seed."""
+    clean = clean_session(recipe, plant)
+    for seed in seeds:
+        yield measure(clean, seed)
