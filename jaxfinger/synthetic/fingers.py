@@ -57,9 +57,10 @@ def polynomial_finger(specimen: Specimen) -> Specimen:
 
 
 def nominal_model(specimen: Specimen) -> Model:
-    """The true parameters of a polynomial specimen, as the nominal model holds them; zero for a passive tendon's path."""
+    """The true parameters of a polynomial specimen, as the nominal model holds them; passive tendons have no path."""
     (spring,), friction, finger = specimen.springs, specimen.friction, Finger.from_description(specimen.description)
-    assert isinstance(spring, PolynomialSpring) and isinstance(friction, PolynomialFriction)
+    assert isinstance(spring, PolynomialSpring)
+    assert isinstance(friction, PolynomialFriction)
     moment_arm = MomentArm.zeros(finger.n, finger.m, EXCURSION_DEGREE)
     coefficients = np.zeros((finger.n, finger.m, EXCURSION_DEGREE))
     for k in np.flatnonzero(finger.active):

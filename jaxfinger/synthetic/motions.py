@@ -80,7 +80,7 @@ def sweeps(
 def wander(
     time: Float[Array, " N"], lower: float, upper: float, rng: np.random.Generator, stroke: tuple[float, float]
 ) -> Path:
-    """As a hand leads a joint: minimum-jerk strokes of random length (s, between the two of `stroke`) to random places."""
+    """As a hand leads a joint: minimum-jerk strokes, of a random time within `stroke` s, to random places."""
     strokes = rng.uniform(*stroke, int(time[-1] / stroke[0]) + 2)
     places = rng.uniform(lower, upper, strokes.size + 1)
     return minimum_jerk(time, places, strokes, np.zeros(strokes.size)).path

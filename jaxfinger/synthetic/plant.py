@@ -74,7 +74,8 @@ class SpecimenPlant:
         if not within.all():
             joint = self.specimen.description.joint_names[np.argmin(within)]
             raise UserError(
-                f"recipe: trial {plan.name} drives {joint} beyond its limits; lower trials.vd3.amplitude or change motion_seed"
+                f"recipe: trial {plan.name} drives {joint} beyond its limits; "
+                "lower trials.vd3.amplitude or change trials.motion_seed"
             )
         return {"q": q, "tendon_force": tension, "tendon_excursion": self.specimen.excursion(q)}
 

@@ -1,4 +1,4 @@
-"""The rig's programme: every trial of a session as commanded, before anything is measured. One function an experiment."""
+"""The rig's programme: every trial of a session as commanded, one function an experiment."""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tomllib
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -198,7 +199,7 @@ def recipe_from(table: dict[str, Any], place: str = "recipe") -> Recipe:
     try:
         recipe = _CONVERTER.structure(_merged(asdict(Recipe()), table), Recipe)
     except cattrs.BaseValidationError as error:
-        raise UserError(f"{place}: {cattrs.transform_error(error, path='')[0]}; mend this key") from None
+        raise UserError(f"{place}: {_sentence(cattrs.transform_error(error, path='')[0])}; mend this key") from None
     _refuse_impossible(recipe, place)
     return recipe
 
@@ -210,37 +211,38 @@ def _merged(default: Any, given: Any) -> Any:
     return {**default, **{key: _merged(default.get(key), value) for key, value in given.items()}}
 
 
+def _sentence(message: str) -> str:
+    """`reason @ .table.key` of cattrs, the place first."""
+    reason, _, place = message.rpartition(" @ ")
+    reason = reason.replace("extra fields found", "unknown key").replace("unknown error ", "")
+    return f"{place.strip('.') or 'top level'}: {reason}"
+
+
 def _refuse_impossible(recipe: Recipe, place: str) -> None:
-    t = recipe.trials
-    positive = {
-        "trials.rate": t.rate,
-        "trials.vd3.rate": t.vd3.rate,
-        "trials.id2.stroke_time": t.id2.stroke_time,
-        "trials.id3_static.step": t.id3_static.step,
-        "trials.id3_static.move": t.id3_static.move,
-        "trials.id4.move": t.id4.move,
-        "trials.vd2.move": t.vd2.move,
-        "trials.vd1.duration": t.vd1.duration,
-        "trials.vd3.duration": t.vd3.duration,
-        "specimen.joints": recipe.specimen.joints,
-        **{f"sensors.{k}.correlation_time": v["correlation_time"] for k, v in _channels(recipe).items()},
-        **{f"sensors.{k}.resolution": v["resolution"] for k, v in _channels(recipe).items()},
-    }
-    for key, value in positive.items():
-        if not value > 0:
-            raise UserError(f"{place}: {key} is {value}; it must be greater than zero")
-    shares = {"sensors.outliers": recipe.sensors.outliers}
-    shares |= {f"sensors.{k}.coloured": v["coloured"] for k, v in _channels(recipe).items()}
-    for key, value in shares.items():
-        if not 0 <= value <= 1:
-            raise UserError(f"{place}: {key} is {value}; it must lie between 0 and 1")
-    for name in t.experiments:
+    """Durations, rates, tensions and resolutions are positive, shares lie within [0, 1], experiments exist."""
+    for key, value in _leaves(asdict(recipe)):
+        name = key.rpartition(".")[2]
+        if name in ("coloured", "outliers", "amplitude"):
+            if not 0.0 <= value <= 1.0:
+                raise UserError(f"{place}: {key} is {value}; it must lie between 0 and 1")
+        elif name in ("tensions", "speeds"):
+            if not value or min(value) <= 0.0:
+                raise UserError(f"{place}: {key} is {list(value)}; give at least one number greater than zero")
+        elif isinstance(value, int | float):
+            may_vanish = name in ("repeats", "motions", "dwell", "seed", "motion_seed", "std", "offset", "clock_jitter")
+            if not (value >= 0 if may_vanish or key.startswith("cad.") else value > 0 or isinstance(value, bool)):
+                raise UserError(f"{place}: {key} is {value}; it must be greater than zero")
+    for name in recipe.trials.experiments:
         if name not in EXPERIMENTS:
             raise UserError(f"{place}: trials.experiments names {name!r}; choose from {', '.join(EXPERIMENTS)}")
 
 
-def _channels(recipe: Recipe) -> dict[str, dict[str, float]]:
-    return {key: value for key, value in asdict(recipe.sensors).items() if isinstance(value, dict)}
+def _leaves(table: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
 
 
 def _number(value: Any) -> float:

@@ -98,6 +98,6 @@ def _measured(
         hit = rng.random(value.shape) < sensors.outliers
         size = rng.uniform(*sensors.outlier_size, value.shape) * rng.choice((-1.0, 1.0), value.shape)
         value = value + hit * size * channel.std
-    recorded = np.full(clean.shape, np.nan)
+    recorded = np.full(clean.shape, np.nan, dtype=np.float32)  # as the rig stores it
     recorded[:, seen] = np.round(value / channel.resolution) * channel.resolution
-    return recorded
+    return recorded.astype(float)

@@ -1,4 +1,4 @@
-"""A simulated session: plan, run the plant, record. Plant and plan cost time once; noise is drawn anew for every seed."""
+"""A simulated session: plan, run the plant, record. Noise can be drawn anew without running the plant again."""
 
 from __future__ import annotations
 
