@@ -1,1 +1,7 @@
-"""."""
+"""Staged fits, joint refinement, their uncertainty, and the file that holds a result."""
+
+from jaxfinger.identify.fit import Fit, StageReport
+from jaxfinger.identify.recipe import Recipe, read_recipe
+from jaxfinger.identify.stages import STAGES, identify
+
+__all__ = ["STAGES", "Fit", "Recipe", "StageReport", "identify", "read_recipe"]

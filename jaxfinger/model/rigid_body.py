@@ -1,10 +1,13 @@
 """Rigid-body terms of equation (1) by recursive Newton–Euler (Luh, Walker, Paul 1980; Featherstone 2008, ch. 5).
 
-Every function takes joint arrays `(m, *T)` with the batch last and broadcasts over it: products of 3-vectors are
-written out, so that XLA fuses the whole recursion into loops along the long axis.
+Every function takes joint arrays `(m, *T)` with the batch last and broadcasts over it. The recursion is a scan over the
+joints of a few products of 3-vectors, each a loop along the long axis: quick to compile for any m, and to run.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -15,88 +18,85 @@ Rotation = Float[Array, "3 3 *T"]
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
-    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    def roll(v, k):
+        return jnp.concatenate([v[k:], v[:k]])
 
-
-def _dot(a: Vector, b: Vector) -> Float[Array, "*T"]:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return roll(a, 1) * roll(b, 2) - roll(a, 2) * roll(b, 1)
 
 
 def _mul(R: Rotation, v: Vector) -> Vector:
-    return jnp.stack([_dot(R[i], v) for i in range(3)])
+    return jnp.sum(R * v[None], axis=1)
 
 
 def _mul_transposed(R: Rotation, v: Vector) -> Vector:
-    return jnp.stack([_dot(R[:, i], v) for i in range(3)])
+    return jnp.sum(R * v[:, None], axis=0)
 
 
 def _rotation(axis: Vector, angle: Float[Array, "*T"]) -> Rotation:
     """Rodrigues: R = cos θ I + sin θ [a]ₓ + (1 − cos θ) a aᵀ."""
-    s, c = jnp.sin(angle), jnp.cos(angle)
+    c, s = jnp.cos(angle), jnp.sin(angle)
     x, y, z = axis
-    d = 1.0 - c
-    return jnp.stack(
-        [
-            jnp.stack([c + d * x * x, d * x * y - s * z, d * x * z + s * y]),
-            jnp.stack([d * x * y + s * z, c + d * y * y, d * y * z - s * x]),
-            jnp.stack([d * x * z - s * y, d * y * z + s * x, c + d * z * z]),
-        ]
-    )
+    o = jnp.zeros_like(x)
+    skew = jnp.stack([jnp.stack([o, -z, y]), jnp.stack([z, o, -x]), jnp.stack([-y, x, o])])
+    identity = jnp.eye(3).reshape(3, 3, *(1,) * angle.ndim)
+    return c * identity + s * skew + (1.0 - c) * axis[:, None] * axis[None]
 
 
-def _placements(f: Finger, q: Float[Array, "m *T"]) -> list[tuple[Rotation | None, Vector]]:
-    """Rotation and position of each link's frame in its parent's; None where a prismatic joint does not turn."""
-    return [
-        (None, f.origin[i] + f.axis[i] * q[i])
-        if f.prismatic[i]
-        else (_rotation(f.axis[i], q[i]), f.origin[i] + 0.0 * q[i])
-        for i in range(f.m)
-    ]
+class _Joint(NamedTuple):
+    """One joint and its link, ready to broadcast against the batch."""
+
+    axis: Vector
+    com: Vector
+    mass: Float[Array, "*T"]
+    inertia: Rotation
+    slides: Float[Array, "*T"]  # 1 for a prismatic joint
+    R: Rotation  # the link's frame in its parent's
+    p: Vector
 
 
-def _to_link(R: Rotation | None, v: Vector) -> Vector:
-    return v if R is None else _mul_transposed(R, v)
-
-
-def _to_parent(R: Rotation | None, v: Vector) -> Vector:
-    return v if R is None else _mul(R, v)
+def _joints(finger: Finger, q: Float[Array, "m *T"]) -> _Joint:
+    """Stacked along the first axis, base to tip."""
+    f = finger.expand(q.ndim - 1)
+    slides = jnp.array(finger.prismatic, dtype=float).reshape(-1, *(1,) * (q.ndim - 1))
+    R = jax.vmap(_rotation)(f.axis, q * (1.0 - slides))
+    p = f.origin + f.axis * (q * slides)[:, None]
+    return _Joint(f.axis, f.com, f.mass, f.inertia, slides, R, p)
 
 
 def inverse_dynamics(
     finger: Finger, q: Float[Array, "m *T"], qd: Float[Array, "m *T"], qdd: Float[Array, "m *T"]
 ) -> Float[Array, "m *T"]:
     """M(q) q̈ + N(q, q̇) + G(q), in N m (N for a prismatic joint)."""
-    f = finger.expand(q.ndim - 1)
-    placements = _placements(f, q)
+    joints = _joints(finger, q)
     zero = jnp.zeros((3, *q.shape[1:]))
-    # Outward: angular velocity ω, angular acceleration α and linear acceleration a of each link's frame, in that frame.
+    gravity = finger.gravity.reshape(3, *(1,) * (q.ndim - 1))
+
+    def outward(state, joint_and_rates):
+        """Angular velocity ω, angular and linear acceleration α, a of the link's frame, in that frame."""
+        (omega, alpha, a), (j, qd, qdd) = state, joint_and_rates
+        a = _mul_transposed(j.R, a + _cross(alpha, j.p) + _cross(omega, _cross(omega, j.p)))
+        omega, alpha = _mul_transposed(j.R, omega), _mul_transposed(j.R, alpha)
+        rate, change = j.axis * qd, j.axis * qdd + _cross(omega, j.axis * qd)
+        a = a + j.slides * (change + _cross(omega, rate))
+        alpha = alpha + (1.0 - j.slides) * change
+        omega = omega + (1.0 - j.slides) * rate
+        force = j.mass * (a + _cross(alpha, j.com) + _cross(omega, _cross(omega, j.com)))
+        moment = _mul(j.inertia, alpha) + _cross(omega, _mul(j.inertia, omega)) + _cross(j.com + zero, force)
+        return (omega, alpha, a), (force, moment)
+
     # Gravity enters as an upward acceleration of the base.
-    omega, alpha, acc = zero, zero, zero - f.gravity
-    forces, moments = [], []
-    for i, (R, p) in enumerate(placements):
-        acc = _to_link(R, acc + _cross(alpha, p) + _cross(omega, _cross(omega, p)))
-        omega, alpha = _to_link(R, omega), _to_link(R, alpha)
-        rate = f.axis[i] * qd[i]
-        if f.prismatic[i]:
-            acc = acc + 2.0 * _cross(omega, rate) + f.axis[i] * qdd[i]
-        else:
-            alpha = alpha + _cross(omega, rate) + f.axis[i] * qdd[i]
-            omega = omega + rate
-        c = f.com[i]
-        forces.append(f.mass[i] * (acc + _cross(alpha, c) + _cross(omega, _cross(omega, c))))
-        moments.append(_mul(f.inertia[i], alpha) + _cross(omega, _mul(f.inertia[i], omega)))
-    # Inward: force and moment that the parent applies to each link, at the link's frame.
-    torques = [zero[0]] * f.m
-    force, moment = zero, zero
-    for i in reversed(range(f.m)):
-        if i + 1 < f.m:
-            R, p = placements[i + 1]
-            force = _to_parent(R, force)
-            moment = _to_parent(R, moment) + _cross(p, force)
-        force = forces[i] + force
-        moment = moments[i] + _cross(f.com[i] + zero, forces[i]) + moment
-        torques[i] = _dot(f.axis[i], force if f.prismatic[i] else moment)
-    return jnp.stack(torques)
+    _, (forces, moments) = jax.lax.scan(outward, (zero, zero, zero - gravity), (joints, qd, qdd))
+
+    def inward(wrench, link):
+        """Force and moment that the parent applies to the link, at its joint; then both in the parent's frame."""
+        (force, moment), (j, f, n) = wrench, link
+        force, moment = f + force, n + moment
+        torque = jnp.sum(j.axis * (j.slides * force + (1.0 - j.slides) * moment), axis=0)
+        force, moment = _mul(j.R, force), _mul(j.R, moment)
+        return (force, moment + _cross(j.p, force)), torque
+
+    _, torques = jax.lax.scan(inward, (zero, zero), (joints, forces, moments), reverse=True)
+    return torques
 
 
 def gravity_torque(finger: Finger, q: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
@@ -113,8 +113,9 @@ def coriolis(finger: Finger, q: Float[Array, "m *T"], qd: Float[Array, "m *T"]) 
 def mass_matrix(finger: Finger, q: Float[Array, "m *T"]) -> Float[Array, "m m *T"]:
     """M(q), kg m²: its columns are the torques of a unit acceleration of one joint, without gravity."""
     zero = jnp.zeros_like(q)
+    unit = jnp.stack([zero.at[i].set(1.0) for i in range(finger.m)])
     weightless = _weightless(finger)
-    return jnp.stack([inverse_dynamics(weightless, q, zero, zero.at[i].set(1.0)) for i in range(finger.m)], axis=1)
+    return jax.vmap(lambda qdd: inverse_dynamics(weightless, q, zero, qdd), out_axes=1)(unit)
 
 
 def _weightless(finger: Finger) -> Finger:
@@ -123,19 +124,18 @@ def _weightless(finger: Finger) -> Finger:
 
 def fingertip(finger: Finger, q: Float[Array, "m *T"]) -> tuple[Vector, Float[Array, "3 m *T"]]:
     """Position of the fingertip, m, and its Jacobian J, m/rad, in the base frame."""
-    f = finger.expand(q.ndim - 1)
-    R: Rotation | None = None
-    position = jnp.zeros((3, *q.shape[1:]))
-    axes, joints = [], []
-    for i, (R_i, p) in enumerate(_placements(f, q)):
-        position = position + _to_parent(R, p)
-        if R_i is not None:
-            R = R_i if R is None else jnp.stack([_mul(R, R_i[:, k]) for k in range(3)], axis=1)
-        axes.append(_to_parent(R, f.axis[i]) + jnp.zeros_like(position))
-        joints.append(position)
-    tip = position + _to_parent(R, f.fingertip)
-    columns = [
-        a if prismatic else _cross(a, tip - p)
-        for a, p, prismatic in zip(axes, joints, finger.prismatic, strict=True)
-    ]
-    return tip, jnp.stack(columns, axis=1)
+    joints = _joints(finger, q)
+    zero = jnp.zeros((3, *q.shape[1:]))
+
+    def outward(pose, j):
+        R, p = pose
+        p = p + _mul(R, j.p)
+        R = jax.vmap(_mul, in_axes=(None, 1), out_axes=1)(R, j.R)
+        return (R, p), (_mul(R, j.axis + zero), p)
+
+    start = (jnp.eye(3).reshape(3, 3, *(1,) * (q.ndim - 1)) + zero[None], zero)
+    (R, p), (axes, places) = jax.lax.scan(outward, start, joints)
+    tip = p + _mul(R, finger.fingertip.reshape(3, *(1,) * (q.ndim - 1)) + zero)
+    slides = joints.slides[:, None]
+    columns = slides * axes + (1.0 - slides) * jax.vmap(_cross)(axes, tip - places)
+    return tip, jnp.moveaxis(columns, 0, 1)

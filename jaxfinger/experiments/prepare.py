@@ -1,0 +1,175 @@
+"""From recordings to arrays that a fit can take: derivatives, directions, block means, padded stacks of trials."""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxfinger.data import Session, Trial, find_holds, joint_directions, outlier_mask, smooth, tendon_directions
+from jaxfinger.errors import UserError
+from jaxfinger.experiments.table import EXPERIMENTS, MIN_JOINT_SPEED, MIN_TENDON_SPEED, SLACK, Experiment
+from jaxfinger.model import Motion
+
+
+class Batch(eqx.Module):
+    """All trials of one experiment, reduced, padded to one length: B trials of T samples."""
+
+    x: Motion  # (…, B, T)
+    y: dict[str, Float[Array, "columns B T"]]  # measured channels, zero where they do not count
+    mask: dict[str, Float[Array, "columns B T"]]  # 1 where a sample counts
+
+
+@dataclass(frozen=True)
+class Stack:
+    """A batch with the names of its trials, on the host."""
+
+    experiment: Experiment
+    batch: Batch
+    trials: tuple[str, ...]
+    motions: tuple[str | None, ...]  # trials with the same motion repeat one another
+    dt: float  # s
+
+
+def prepare(session: Session, names: list[str] | None = None, reduced: bool = True) -> dict[str, Stack]:
+    """One stack an experiment, of the named trials (default all), averaged to the experiment's rate unless told."""
+    stacks = {}
+    for spec in EXPERIMENTS.values():
+        trials = [t for t in session if t.experiment == spec.name and (names is None or t.name in names)]
+        rows = [_reduce(spec, t, session, reduced) for t in trials if len(t.time) > 1]
+        if rows:
+            stacks[spec.name] = _stack(spec, trials, rows)
+    return stacks
+
+
+@dataclass(frozen=True)
+class _Row:
+    """One trial, reduced: NumPy arrays with time last."""
+
+    motion: dict[str, np.ndarray]
+    y: dict[str, np.ndarray]
+    mask: dict[str, np.ndarray]
+    dt: float
+
+
+def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool) -> _Row:
+    m, n = session.finger.m, session.finger.n
+    N = len(trial.time)
+    step = float(np.median(np.diff(trial.time)))
+    block = max(1, round(1.0 / (spec.rate * step))) if reduced else 1
+    holds = find_holds(trial) if spec.samples == "holds" else np.full(N, -1)
+
+    q, qd, qdd = smooth(trial.time, trial.q, min(spec.cutoff, 0.2 / step))
+    if spec.held:
+        q, qd, qdd = trial.q, np.zeros_like(q), np.zeros_like(q)
+    joint_direction = np.zeros((N, m)) if spec.held else joint_directions(trial).astype(float)
+    tension = np.zeros((N, n)) if trial.tendon_force is None else np.nan_to_num(trial.tendon_force)
+    tendon_direction = np.zeros((N, n))
+    if spec.samples == "sliding":
+        tendon_direction = tendon_directions(trial).astype(float)
+    motorised = np.zeros((N, m))
+    if trial.joint is not None and "joint_torque" in spec.channels:
+        motorised[:, session.finger.joint_names.index(trial.joint)] = 1.0
+
+    y, mask = _measured(spec, trial, session, holds, qd)
+    M = N // block
+
+    def mean(a):
+        return a[: M * block].reshape(M, block, *a.shape[1:]).mean(axis=1)
+
+    tension_mean = mean(tension)
+    slack = np.percentile(tension_mean, 95, axis=0) < SLACK
+    tension_mean[:, slack | spec.slack] = 0.0
+    hold = _whole(holds, M, block)
+    if spec.held:
+        # A running maximum over noise drifts upwards: at a hold the tension is the hold's mean.
+        for h in np.unique(hold[hold >= 0]):
+            tension_mean[hold == h] = tension_mean[hold == h].mean(axis=0)
+    start = trial.session_start if trial.session_start is not None else 0.0
+    time = mean(trial.time)
+    motion = {
+        "time": time, "q": mean(q).T, "qd": mean(qd).T, "qdd": mean(qdd).T, "tension": tension_mean.T,
+        "joint_direction": mean(joint_direction).T, "tendon_direction": mean(tendon_direction).T,
+        "session_time": time + start, "motorised": mean(motorised).T,
+    }
+    y_mean, mask_mean = {}, {}
+    for c in y:
+        counts = mean(mask[c])
+        y_mean[c] = np.where(counts > 0, mean(y[c] * mask[c]) / np.maximum(counts, 1e-9), 0.0).T
+        mask_mean[c] = (counts > 0.5).astype(float).T
+        if spec.samples == "holds":
+            mask_mean[c] *= hold >= 0
+        y_mean[c] *= mask_mean[c]
+    return _Row(motion, y_mean, mask_mean, block * step)
+
+
+def _measured(spec, trial, session, holds, qd):
+    """The channels to be predicted, and which samples of them count: measured, no spike, holding or sliding."""
+    N, m = qd.shape
+    width = {"tendon_excursion": session.finger.n, "joint_torque": m, "fingertip_force": 3}
+    y, mask = {}, {}
+    for c in spec.channels:
+        values = getattr(trial, c)
+        if spec.samples == "sliding" and c == "joint_torque":
+            values = np.zeros((N, m))  # nothing acts from outside on the free finger
+        if values is None:
+            values = np.full((N, width[c]), np.nan)
+        measured = np.isfinite(values).all(axis=0)
+        counts = np.zeros(values.shape)
+        counts[:, measured] = 1.0
+        if measured.any():
+            counts[:, measured] *= ~outlier_mask(values[:, measured])
+        if spec.samples == "holds":
+            counts *= (holds >= 0)[:, None]
+        if spec.samples == "sliding" and c == "joint_torque":
+            counts *= _sliding(trial, session, qd)
+        y[c], mask[c] = np.nan_to_num(values), counts
+    return y, mask
+
+
+def _sliding(trial: Trial, session: Session, qd) -> np.ndarray:
+    """(N, m): 1 where a joint and every taut tendon across it slide, so that the directions of friction are known."""
+    moving = np.abs(qd) > MIN_JOINT_SPEED
+    finger = session.finger
+    known = np.ones((len(qd), finger.n), dtype=bool)
+    if trial.tendon_excursion is not None and trial.tendon_force is not None:
+        _, rate, _ = smooth(trial.time, np.nan_to_num(trial.tendon_excursion), EXPERIMENTS["VD.3"].cutoff / 2)
+        taut = np.nan_to_num(trial.tendon_force) > SLACK
+        measured = np.isfinite(trial.tendon_excursion).all(axis=0)
+        known = ~taut | ((np.abs(rate) > MIN_TENDON_SPEED) & measured)
+    for i in range(finger.m):
+        moving[:, i] &= known[:, finger.crosses[:, i] & finger.active].all(axis=1)
+    return moving.astype(float)
+
+
+def _whole(holds: np.ndarray, M: int, block: int) -> np.ndarray:
+    """Hold of each block, −1 where it is not wholly within one."""
+    blocks = holds[: M * block].reshape(M, block)
+    return np.where((blocks == blocks[:, :1]).all(axis=1), blocks[:, 0], -1)
+
+
+def _stack(spec: Experiment, trials: list[Trial], rows: list[_Row]) -> Stack:
+    steps = {round(r.dt, 6) for r in rows}
+    if max(steps) > 1.5 * min(steps):
+        raise UserError(
+            f"the {spec.name} trials are sampled at different rates ({min(steps):g} s and {max(steps):g} s a sample "
+            f"after reduction): resample trial {trials[int(np.argmax([r.dt for r in rows]))].name} to at least "
+            f"{spec.rate:g} Hz"
+        )
+    T = max(r.motion["time"].size for r in rows)
+    T = -(-T // 64) * 64  # few distinct lengths, few compilations
+
+    def pad(arrays, constant=False):
+        width = [T - a.shape[-1] for a in arrays]
+        mode = {"mode": "constant"} if constant else {"mode": "edge"}
+        padded = [np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, w)], **mode) for a, w in zip(arrays, width, strict=True)]
+        return jnp.asarray(np.stack(padded, axis=-2))
+
+    x = Motion(**{k: pad([r.motion[k] for r in rows]) for k in rows[0].motion}, held=spec.held)
+    y = {c: pad([r.y[c] for r in rows], constant=True) for c in spec.channels}
+    mask = {c: pad([r.mask[c] for r in rows], constant=True) for c in spec.channels}
+    return Stack(
+        spec, Batch(x, y, mask), tuple(t.name for t in trials), tuple(t.motion for t in trials),
+        float(np.median([r.dt for r in rows])),
+    )

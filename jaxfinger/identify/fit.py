@@ -1,0 +1,93 @@
+"""The result of an identification, and its file."""
+
+import json
+from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime, timezone
+from importlib.metadata import version
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfinger.data import Session, data_hash
+from jaxfinger.errors import UserError
+from jaxfinger.identify.noise import Noise
+from jaxfinger.identify.parameters import describe, ravel
+from jaxfinger.identify.recipe import Recipe, as_dict, structure
+from jaxfinger.model import Finger, JointTorque, Model, MomentArm, TendonFriction
+
+SCHEMA = "jaxfinger-fit/1"
+
+
+@dataclass(frozen=True)
+class StageReport:
+    """What became of one stage."""
+
+    name: str
+    status: str  # `fitted`, `not converged` or `skipped`
+    message: str = ""
+    trials: tuple[str, ...] = ()
+    rows: int = 0
+    chi2_per_row: float = float("nan")  # 1 where model and noise are right
+    outliers: float = 0.0  # share of white residuals beyond the robust limit
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model with the covariance of its flat vector of parameters (see `parameters`), and what made it."""
+
+    model: Model
+    covariance: np.ndarray  # (P, P); zero where a parameter was given, infinite on the diagonal where it is not seen
+    estimated: np.ndarray  # positions of the estimated parameters
+    recipe: Recipe
+    noise: dict[tuple[str, str], Noise] = field(default_factory=dict)  # by experiment and channel
+    stages: tuple[StageReport, ...] = ()
+    specimen: str = ""
+    data: str = ""  # file name
+    data_hash: str = ""
+    created: str = ""
+    versions: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def before(cls, session: Session, recipe: Recipe, model: Model) -> "Fit":
+        """Nothing estimated yet."""
+        P = ravel(model).size
+        return cls(
+            model, np.zeros((P, P)), np.zeros(0, int), recipe, specimen=session.specimen,
+            data=Path(session.file).name, data_hash=data_hash(session.file) if session.file else "",
+            created=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            versions={p: version(p) for p in ("jaxfinger", "jax", "optimistix", "equinox", "numpy", "h5py")},
+        )
+
+    @property
+    def std(self) -> np.ndarray:
+        """Standard deviation of every entry of the flat vector."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    def table(self) -> list[dict]:
+        """One row an estimated parameter: name, value, std, units."""
+        values, std, parameters = np.asarray(ravel(self.model)), self.std, describe(self.model)
+        return [
+            {
+                "name": parameters[i].name, "group": parameters[i].group, "value": float(values[i]),
+                "std": float(std[i]) if np.isfinite(std[i]) else None, "units": parameters[i].units,
+            }
+            for i in self.estimated
+        ]
+
+    def function(self, f) -> tuple[np.ndarray, np.ndarray]:
+        """Value and standard deviation of any function of the model, by the delta method."""
+        import jax
+
+        from jaxfinger.identify.parameters import with_flat
+
+        flat = ravel(self.model)
+        seen = np.isfinite(np.diag(self.covariance))
+        covariance = np.where(np.outer(seen, seen), self.covariance, 0.0)
+        positions = np.flatnonzero(np.diag(covariance) > 0)
+        value = f(self.model)
+        J = jax.jacfwd(lambda t: f(with_flat(self.model, flat.at[positions].set(t))))(flat[positions])
+        J = np.asarray(J)
+        variance = np.einsum("...i,ij,...j->...", J, covariance[np.ix_(positions, positions)], J)
+        return np.asarray(value), np.sqrt(np.maximum(variance, 0.0))

@@ -1,0 +1,55 @@
+"""Equation (1) linearised at a model, trial by trial, and compressed: the common ground of every fit.
+
+With J the Jacobian of a trial's white residuals r, one QR factorisation [J r] = Q [R d; 0 ρ] keeps all that least
+squares needs: ‖r + J δ‖² = ‖d + R δ‖² + ρ². A stage, the joint refinement, a bootstrap resample and a leave-one-out
+refit are sums over these small factors; their cost no longer depends on the number of samples.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxfinger.experiments import Batch, predict
+from jaxfinger.identify.noise import whiten
+from jaxfinger.identify.parameters import Free
+from jaxfinger.model import Model
+
+Filters = dict[str, Float[Array, "columns order+1"]]
+
+
+class Linearised(NamedTuple):
+    """One experiment's residuals and compressed Jacobian at a model."""
+
+    residuals: dict[str, Float[Array, "columns B T"]]  # measured − predicted, by channel, in the channel's unit
+    white: Float[Array, "B rows"]  # the same, whitened and flat, before weights
+    factor: Float[Array, "B p+1 p+1"]  # triangular, of [J r] with weights
+
+
+def white_rows(model: Model, batch: Batch, filters: Filters) -> tuple[dict, Float[Array, "B rows"]]:
+    """Residuals by channel, and the same white, one row a trial: unit variance where model and noise are right."""
+    predicted = predict(model, batch.x, tuple(filters))
+    residuals = {c: batch.y[c] - predicted[c] for c in filters}
+    white = [whiten(residuals[c], batch.mask[c], filters[c], demean=c == "tendon_excursion") for c in filters]
+    return residuals, jnp.concatenate([jnp.moveaxis(w, 1, 0).reshape(w.shape[1], -1) for w in white], axis=1)
+
+
+@eqx.filter_jit
+def linearise(
+    model: Model, free: Free, batch: Batch, filters: Filters, weights: Float[Array, "B rows"] | None = None
+) -> Linearised:
+    """Residuals and per-trial factors at `model`, with respect to the parameters in `free`."""
+    theta = free.get(model)
+
+    def f(theta):
+        residuals, white = white_rows(free.set(model, theta), batch, filters)
+        return white, residuals
+
+    white, pushforward, residuals = jax.linearize(f, theta, has_aux=True)
+    J = jnp.moveaxis(jax.lax.map(pushforward, jnp.eye(theta.size)), 0, -1)
+    columns = jnp.concatenate([J, white[..., None]], axis=-1)
+    if weights is not None:
+        columns = columns * weights[..., None]
+    return Linearised(residuals, white, jnp.linalg.qr(columns, mode="r"))

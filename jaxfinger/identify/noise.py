@@ -1,0 +1,150 @@
+"""Noise of each channel, and the filter that makes it white.
+
+At a fit's rate the noise of a channel is autoregressive: e_t = Σ_k a_k e_{t−k} + σ w_t, w white. Then
+r_t − Σ_k a_k r_{t−k}, divided by σ, is white when r is, which is generalised least squares with a short filter.
+Its source, best first: differences between trials that repeat one motion (pure error, the motion's and the inputs'
+noise included), scatter within holds, the residuals themselves (which hide part of a gap, and are named so).
+"""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jaxtyping import Array, Float
+
+from jaxfinger.experiments import Batch, Stack
+
+ORDER = 3  # of the autoregression
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of one channel in one experiment, at the rate of the reduced data; one row a column of the channel."""
+
+    std: Float[np.ndarray, " columns"]  # of a sample, in the channel's unit
+    innovation: Float[np.ndarray, " columns"]  # σ, likewise
+    ar: Float[np.ndarray, "columns order"]  # a_k
+    source: str  # `repeats`, `holds` or `residuals`
+
+    @property
+    def coefficients(self) -> Float[np.ndarray, "columns order+1"]:
+        """The whitening filter [1, −a₁, …] / σ."""
+        return np.concatenate([np.ones((len(self.std), 1)), -self.ar], axis=1) / self.innovation[:, None]
+
+
+def whiten(
+    r: Float[Array, "columns B T"], mask: Float[Array, "columns B T"], coefficients: Float[Array, "columns order+1"],
+    demean: bool,
+) -> Float[Array, "columns B T"]:
+    """White residuals of unit variance, zero where the filter has no full history of samples that count.
+
+    With `demean`, what a constant per trial and column could explain is projected out (the encoders' arbitrary zero).
+    """
+    lags = coefficients.shape[1]
+    r = r * mask
+
+    def lag(a, k):
+        return a if k == 0 else jnp.pad(a[..., :-k], ((0, 0), (0, 0), (k, 0)))
+
+    complete = mask
+    for k in range(1, lags):
+        complete = complete * lag(mask, k)
+    white = sum(coefficients[:, k, None, None] * lag(r, k) for k in range(lags)) * complete
+    if demean:
+        constant = coefficients.sum(axis=1)[:, None, None] * complete
+        energy = jnp.maximum(jnp.sum(constant * constant, axis=-1, keepdims=True), 1e-300)
+        white = white - constant * jnp.sum(constant * white, axis=-1, keepdims=True) / energy
+    return white
+
+
+def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B T"]) -> Noise:
+    """Noise of a channel from the residuals of a model, by the best source that the stack offers."""
+    batch: Batch = stack.batch
+    mask = np.asarray(batch.mask[channel]) > 0
+    demean = channel == "tendon_excursion"
+    series, source = _repeats(stack, residual, mask, demean), "repeats"
+    if not _enough(series) and stack.experiment.samples == "holds":
+        series, source = _within_holds(residual, mask), "holds"
+    if not _enough(series):
+        series, source = _all(residual, mask, demean), "residuals"
+    pooled = _autoregression([s for column in series for s in column])
+    rows = []
+    for column in series:
+        count = sum(int(m.sum()) for _, m in column)
+        # A column with few samples of its own borrows the channel's.
+        rows.append(_autoregression(column) if count > 400 else pooled)
+    std, innovation, ar = (np.array(x) for x in zip(*rows, strict=True))
+    return Noise(std, innovation, ar, source)
+
+
+Series = list[tuple[np.ndarray, np.ndarray]]  # values and which of them count
+
+
+def _enough(series: list[Series]) -> bool:
+    return sum(int(m.sum()) for column in series for _, m in column) > 100
+
+
+def _centred(e: np.ndarray, mask: np.ndarray, demean: bool) -> np.ndarray:
+    return np.where(mask, e - (e[mask].mean() if demean and mask.any() else 0.0), 0.0)
+
+
+def _repeats(stack: Stack, residual, mask, demean) -> list[Series]:
+    """Residuals about the mean of the trials that repeat one motion, scaled to the noise of a single trial."""
+    series: list[Series] = [[] for _ in range(len(residual))]
+    motions = [m for m in dict.fromkeys(stack.motions) if m is not None and stack.motions.count(m) > 1]
+    for motion in motions:
+        members = [b for b, name in enumerate(stack.motions) if name == motion]
+        for c, column in enumerate(series):
+            both = mask[c, members].all(axis=0)
+            if both.sum() < 20:
+                continue
+            mean = residual[c, members].mean(axis=0)
+            scale = np.sqrt(len(members) / (len(members) - 1))
+            column += [(_centred(scale * (residual[c, b] - mean), both, demean), both) for b in members]
+    return series
+
+
+def _within_holds(residual, mask) -> list[Series]:
+    series: list[Series] = [[] for _ in range(len(residual))]
+    for c, b in np.ndindex(residual.shape[:2]):
+        e = residual[c, b].copy()
+        for segment in np.ma.clump_unmasked(np.ma.masked_array(e, ~mask[c, b])):
+            e[segment] -= e[segment].mean()
+        if mask[c, b].any():
+            series[c].append((np.where(mask[c, b], e, 0.0), mask[c, b]))
+    return series
+
+
+def _all(residual, mask, demean) -> list[Series]:
+    return [
+        [(_centred(residual[c, b], mask[c, b], demean), mask[c, b]) for b in range(residual.shape[1]) if mask[c, b].any()]
+        for c in range(len(residual))
+    ]
+
+
+def _autoregression(series: Series) -> tuple[float, float, np.ndarray]:
+    """Standard deviation, innovation and coefficients by Yule–Walker, robust to a few outliers."""
+    if not series or not any(m.any() for _, m in series):
+        return 1.0, 1.0, np.zeros(ORDER)
+    values = np.concatenate([e[m] for e, m in series])
+    limit = 4.0 * 1.4826 * np.median(np.abs(values)) + 1e-300
+    clipped = [(np.clip(e, -limit, limit), m) for e, m in series]
+    covariance = np.array([_lagged(clipped, k) for k in range(ORDER + 1)])
+    if covariance[0] <= 0:
+        return 1e-12, 1e-12, np.zeros(ORDER)
+    covariance[0] *= 1.0 + 1e-6
+    ar = scipy.linalg.solve_toeplitz(covariance[:-1], covariance[1:])
+    innovation = covariance[0] - ar @ covariance[1:]
+    if not 0 < innovation <= covariance[0] * 1.001:
+        return float(np.sqrt(covariance[0])), float(np.sqrt(covariance[0])), np.zeros(ORDER)
+    return float(np.sqrt(covariance[0])), float(np.sqrt(innovation)), ar
+
+
+def _lagged(series: Series, k: int) -> float:
+    total = count = 0.0
+    for e, m in series:
+        both = m[k:] & m[: m.size - k]
+        total += float(np.sum(e[k:][both] * e[: e.size - k][both]))
+        count += int(both.sum())
+    return total / count if count else 0.0

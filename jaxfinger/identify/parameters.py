@@ -1,0 +1,142 @@
+"""The model's parameters as one flat vector, with a name and a unit for every entry.
+
+Flat vectors exist only inside a solver call and in a covariance; a parameter lives in its module.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxfinger.model import Model
+
+
+def ravel(model: Model) -> Float[Array, " P"]:
+    """Every floating-point leaf of the model, flat."""
+    return jnp.concatenate([jnp.ravel(leaf) for leaf in _leaves(model)])
+
+
+def with_flat(model: Model, flat: Float[Array, " P"]) -> Model:
+    """The model with its floating-point leaves replaced by `flat`."""
+    arrays, rest = eqx.partition(model, eqx.is_inexact_array)
+    leaves, treedef = jax.tree.flatten(arrays)
+    ends = np.cumsum([0] + [leaf.size for leaf in leaves])
+    new = [flat[a:b].reshape(leaf.shape) for leaf, (a, b) in zip(leaves, pairwise(ends), strict=True)]
+    return eqx.combine(jax.tree.unflatten(treedef, new), rest)
+
+
+class Free(eqx.Module):
+    """Which entries of the flat vector are free: per leaf, so that the derivative of the rest is known to vanish."""
+
+    leaves: tuple[int, ...] = eqx.field(static=True)
+    entries: tuple[Int[Array, " k"], ...]  # positions within each of those leaves
+
+    @classmethod
+    def at(cls, model: Model, positions: Int[np.ndarray, " p"]) -> "Free":
+        """The entries at these positions of the flat vector, in ascending order."""
+        starts = np.cumsum([0] + [leaf.size for leaf in _leaves(model)])
+        positions = np.asarray(positions)
+        if np.any(np.diff(positions) <= 0):
+            raise ValueError("positions must ascend")
+        within = {
+            i: positions[(positions >= a) & (positions < b)] - a for i, (a, b) in enumerate(pairwise(starts))
+        }
+        return cls(
+            tuple(i for i, e in within.items() if e.size),
+            tuple(jnp.asarray(e) for e in within.values() if e.size),
+        )
+
+    def get(self, model: Model) -> Float[Array, " p"]:
+        """The free parameters of a model."""
+        leaves = _leaves(model)
+        return jnp.concatenate([leaves[i].ravel()[e] for i, e in zip(self.leaves, self.entries, strict=True)])
+
+    def set(self, model: Model, theta: Float[Array, " p"]) -> Model:
+        """The model with its free parameters set to `theta`."""
+        arrays, rest = eqx.partition(model, eqx.is_inexact_array)
+        leaves, treedef = jax.tree.flatten(arrays)
+        start = 0
+        for i, e in zip(self.leaves, self.entries, strict=True):
+            part = theta[start : start + e.size]
+            leaves[i] = leaves[i].ravel().at[e].set(part).reshape(leaves[i].shape)
+            start += e.size
+        return eqx.combine(jax.tree.unflatten(treedef, leaves), rest)
+
+
+def _leaves(model: Model):
+    return jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One entry of the flat vector."""
+
+    name: str  # for people, for example `moment arm T1 MCP^2`
+    group: str  # the field of the model it lives in, for example `moment_arm`
+    units: str
+    joint: str | None = None
+    tendon: str | None = None
+    power: int | None = None
+    determinable: bool = True  # false where the finger has no such parameter: a tendon that does not cross the joint
+
+
+def describe(model: Model) -> list[Parameter]:
+    """The flat vector's entries, in order."""
+    arrays = eqx.filter(model, eqx.is_inexact_array)
+    paths, _ = jax.tree_util.tree_flatten_with_path(arrays)
+    entries = []
+    for path, leaf in paths:
+        keys = [getattr(k, "name", getattr(k, "idx", None)) for k in path]
+        for index in np.ndindex(leaf.shape):
+            entries.append(_describe(model, keys, index))
+    return entries
+
+
+def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
+    joints, tendons = model.finger.joint_names, model.finger.tendon_names
+    match keys:
+        case ["finger", "mass"]:
+            return Parameter(f"mass {joints[index[0]]}", "mass", "kg", joints[index[0]])
+        case ["finger", "com"]:
+            return Parameter(f"centre of mass {joints[index[0]]} {'xyz'[index[1]]}", "com", "m", joints[index[0]])
+        case ["finger", field]:
+            return Parameter(f"{field} {index}", field, {"inertia": "kg m2", "gravity": "m s-2"}.get(field, "m"))
+        case ["moment_arm", _]:
+            return _moment_arm(model, *index)
+        case ["joint_torque", "damping"]:
+            return Parameter(f"damping {joints[index[0]]}", "damping", "N m s/rad", joints[index[0]])
+        case ["joint_torque", field]:
+            joint, power = joints[index[0]], index[1]
+            return Parameter(f"{field} torque {joint}^{power}", field, _per_rad("N m", power), joint, power=power)
+        case ["tendon_friction", field]:
+            tendon = tendons[index[0]]
+            active = model.finger.active[index[0]]
+            symbol, units = {"constant": ("a0", "N"), "proportional": ("a1", "1")}[field]
+            return Parameter(f"tendon friction {tendon} {symbol}", "tendon_friction", units, tendon=tendon,
+                             determinable=active)
+        case ["effects", int(i), field]:
+            effect = model.effects[i]
+            label = f"{effect.id} {'-'.join(effect.site)} {field}"
+            return Parameter(label, "effects", effect.units()[field])
+    raise AssertionError(keys)
+
+
+def _moment_arm(model: Model, k: int, t: int) -> Parameter:
+    exponents = model.moment_arm.exponents[t]
+    joints, tendon = model.finger.joint_names, model.finger.tendon_names[k]
+    spanned = [i for i, p in enumerate(exponents) if p]
+    label = " ".join(f"{joints[i]}^{exponents[i]}" for i in spanned)
+    crosses = all(model.finger.crosses[k][i] for i in spanned)
+    return Parameter(
+        f"excursion {tendon} {label}", "moment_arm", _per_rad("m", sum(exponents)),
+        joints[spanned[0]] if len(spanned) == 1 else None, tendon, sum(exponents),
+        determinable=crosses and model.finger.active[k],
+    )
+
+
+def _per_rad(units: str, power: int) -> str:
+    return units if power == 0 else f"{units}/rad" if power == 1 else f"{units}/rad^{power}"

@@ -1,0 +1,176 @@
+"""The one seam to optimistix: least squares on compressed trials.
+
+    min_θ  Σ_trials ‖white residuals‖² + ‖W (θ − μ)‖²
+
+1. Each experiment is linearised and compressed at the current model (`linearise`).
+2. The stacked factors are scaled by columns; their singular vectors say which combinations of parameters the trials
+   can see. The rest stays where it was, and is named.
+3. optimistix solves in coordinates z along the visible singular vectors, θ = θ_k + B z, in which the Gauss–Newton matrix
+   is the identity. Most of equation (1) is linear in its parameters: one step, whatever the conditioning of θ.
+4. Where it is not (slip of held tendons, products of moment arms and losses) the model is linearised again at the new
+   point, and a step that did not lower the cost is halved, until a step is a small part of a standard deviation.
+5. Outliers: Huber's weights from the white residuals at the optimum, then again from 1.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float, Int
+
+from jaxfinger.experiments import Batch
+from jaxfinger.identify.linearise import Filters, Linearised, linearise
+from jaxfinger.identify.parameters import Free, ravel
+from jaxfinger.model import Model
+
+VISIBLE = 1e-7  # relative singular value of the column-scaled Jacobian below which a combination is not seen
+SMALL = 0.02  # a step this small, in standard deviations of the estimate, ends the iteration
+STEPS = 40
+PAD = 16  # compressed problems are padded to multiples of this, to share compilations
+
+
+class Prior(NamedTuple):
+    """Gaussian prior rows `root (θ − mean)` on the free parameters; `root` is a square root of the precision."""
+
+    mean: Float[np.ndarray, " p"]
+    root: Float[np.ndarray, "rows p"]
+
+
+class Source(NamedTuple):
+    """One experiment as a fit reads it: its data, its whitening, and the parameters that it depends on."""
+
+    batch: Batch
+    filters: Filters
+    positions: Int[np.ndarray, " k"]  # in the flat vector, ascending
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A least-squares estimate at its optimum."""
+
+    converged: bool
+    message: str
+    cost: float  # half the sum of squared white residuals, weights included, priors apart
+    rows: int  # white residuals that count
+    information: Float[np.ndarray, "P P"]  # JᵀJ over the whole flat vector, priors apart
+    invisible: Float[np.ndarray, "k p"]  # unit combinations of scaled parameters that neither trials nor prior see
+    scale: Float[np.ndarray, " p"]
+    outliers: float  # share of white residuals beyond the robust limit
+    linearised: dict[str, Linearised]
+
+
+def solve(
+    model: Model, free: Int[np.ndarray, " p"], sources: dict[str, Source], prior: Prior | None = None,
+    huber: float = 0.0,
+) -> tuple[Model, Solution]:
+    """The model with its free parameters (positions in the flat vector) at the optimum, and what is known of it."""
+    size = ravel(model).size
+    frees = {name: Free.at(model, s.positions) for name, s in sources.items()}
+    moved = Free.at(model, free)
+    theta = np.asarray(moved.get(model))
+    if prior is None:
+        prior = Prior(theta, np.zeros((0, theta.size)))
+    weights: dict[str, Array | None] = dict.fromkeys(sources)
+    share = 0.0
+    for robust in (False, True) if huber else (False,):
+        if robust:
+            weights, share = _huber(linearised, huber)
+            # Gaussian residuals pass a limit of 3 in 0.3 % of cases: half as many again are outliers.
+            if share < 0.005:
+                break
+        best, step, converged = np.inf, np.zeros_like(theta), False
+        for _ in range(STEPS):
+            linearised = {
+                n: linearise(model, frees[n], s.batch, s.filters, weights[n]) for n, s in sources.items()
+            }
+            factor = _stacked(linearised, sources, size)
+            offset = prior.root @ (theta - prior.mean)
+            cost = 0.5 * float(factor[:, -1] @ factor[:, -1] + offset @ offset)
+            if cost > best * (1 + 1e-9) and np.any(step):
+                step = 0.5 * step
+                theta = theta - step
+                model = moved.set(model, jnp.asarray(theta))
+                if small / 2 < SMALL * 0.1:
+                    break
+                small /= 2
+                continue
+            best = cost
+            A = np.concatenate([factor[:, free], prior.root])
+            b = np.concatenate([factor[:, -1], offset])
+            basis, invisible, scale = _visible(A)
+            z = _minimise(A @ basis, b)
+            step = basis @ z
+            small = float(np.max(np.abs(z), initial=0.0))
+            if small < SMALL:
+                converged = True
+                break
+            theta = theta + step
+            model = moved.set(model, jnp.asarray(theta))
+    message = "" if converged else f"no further descent after {STEPS} linearisations; the last step was {small:.2g} standard deviations"
+    factor = _stacked(linearised, sources, size)
+    rows = sum(int(np.count_nonzero(lin.white)) for lin in linearised.values())
+    information = factor[:, :-1].T @ factor[:, :-1]
+    cost = 0.5 * float(factor[:, -1] @ factor[:, -1])
+    return model, Solution(converged, message, cost, rows, information, invisible, scale, share, linearised)
+
+
+def _stacked(linearised: dict[str, Linearised], sources: dict[str, Source], size: int) -> Float[np.ndarray, "k P+1"]:
+    """One triangular factor of all trials, its columns those of the flat vector, then the residual."""
+    blocks = []
+    for name, lin in linearised.items():
+        factor = np.asarray(lin.factor)
+        block = np.zeros((factor.shape[0] * factor.shape[1], size + 1))
+        block[:, [*sources[name].positions, size]] = factor.reshape(-1, factor.shape[-1])
+        blocks.append(block)
+    used = np.flatnonzero(np.any(np.concatenate(blocks) != 0, axis=0))
+    used = np.union1d(used, [size])
+    small = np.linalg.qr(np.concatenate(blocks)[:, used], mode="r")
+    out = np.zeros((small.shape[0], size + 1))
+    out[:, used] = small
+    return out
+
+
+def _visible(A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Basis B of the combinations that data or prior see, the others, and the scale of each parameter."""
+    norm = np.linalg.norm(A, axis=0)
+    scale = 1.0 / np.where(norm > 0, norm, 1.0)
+    _, s, Vt = np.linalg.svd(A * scale, full_matrices=True)
+    s = np.concatenate([s, np.zeros(len(Vt) - len(s))])
+    seen = s > VISIBLE * max(s[0], 1e-300)
+    return scale[:, None] * Vt[seen].T / s[seen], Vt[~seen], scale
+
+
+def _compressed(z: Float[Array, " k"], problem: tuple[Array, Array]) -> Float[Array, " rows"]:
+    A, b = problem
+    return A @ z + b
+
+
+@eqx.filter_jit
+def _dogleg(A: Float[Array, "k k"], b: Float[Array, " k"]):
+    solver = optx.Dogleg(rtol=1e-6, atol=1e-6, norm=optx.rms_norm)
+    return optx.least_squares(_compressed, solver, jnp.zeros(A.shape[1]), (A, b), max_steps=64, throw=False).value
+
+
+def _minimise(A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """argmin ‖A z + b‖ by optimistix, on the triangular factor, padded to a common size."""
+    k = A.shape[1]
+    R = np.linalg.qr(np.column_stack([A, b]), mode="r")[:k]
+    size = -(-max(k, 1) // PAD) * PAD
+    square, right = np.eye(size), np.zeros(size)
+    square[:k, :k], right[:k] = 0.0, 0.0
+    square[: len(R), :k], right[: len(R)] = R[:, :k], R[:, k]
+    return np.asarray(_dogleg(jnp.asarray(square), jnp.asarray(right)))[:k]
+
+
+def _huber(linearised: dict[str, Linearised], limit: float) -> tuple[dict[str, Array | None], float]:
+    """Square roots of Huber's weights, and the share of residuals beyond the limit."""
+    beyond = count = 0
+    weights: dict[str, Array | None] = {}
+    for name, lin in linearised.items():
+        r = np.abs(np.asarray(lin.white))
+        beyond, count = beyond + int((r > limit).sum()), count + int((r > 0).sum())
+        weights[name] = jnp.asarray(np.sqrt(np.where(r > limit, limit / np.maximum(r, limit), 1.0)))
+    return weights, beyond / max(1, count)

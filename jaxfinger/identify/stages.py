@@ -1,0 +1,268 @@
+"""The paper's staged identification, ID.2 → ID.3-static → ID.3-dynamic → ID.4.
+
+Each stage is equation (1) with the terms that its experiment makes vanish, and frees the parameters that it shows. The
+parameters of earlier stages stay fixed, and their errors go on: with J_F the whitened Jacobian of a stage's own
+parameters and J_O of the others, whose covariance is Σ_OO,
+
+    K = (J_Fᵀ J_F)⁻¹ J_Fᵀ J_O,   Σ_FF = (J_Fᵀ J_F)⁻¹ + K Σ_OO Kᵀ,   Σ_FO = −K Σ_OO.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfinger.data import Session
+from jaxfinger.experiments import Stack, prepare
+from jaxfinger.identify.fit import Fit, StageReport
+from jaxfinger.identify.identifiability import name_invisible
+from jaxfinger.identify.noise import ORDER, Noise, estimate
+from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
+from jaxfinger.identify.recipe import Recipe
+from jaxfinger.identify.solve import Prior, Solution, Source, solve
+from jaxfinger.model import Finger, Model
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Which experiments and channels a stage reads, and which groups of parameters it frees."""
+
+    name: str
+    reads: dict[str, tuple[str, ...]]
+    frees: tuple[str, ...]
+
+
+STAGES = {
+    s.name: s
+    for s in (
+        Stage("ID.2", {"ID.2": ("tendon_excursion",)}, ("moment_arm",)),
+        Stage("ID.3-static", {"ID.3-static": ("joint_torque",)}, ("elastic", "friction")),
+        # The dynamic phase augments the static one: both are read, so that a sweep refines what the holds gave.
+        Stage(
+            "ID.3-dynamic",
+            {"ID.3-static": ("joint_torque",), "ID.3-dynamic": ("joint_torque",)},
+            ("elastic", "friction", "damping"),
+        ),
+        Stage("ID.4", {"ID.4": ("joint_torque",)}, ("tendon_friction",)),
+    )
+}
+
+# Groups of parameters on which each channel of each experiment depends.
+_TORQUE = {"elastic", "friction", "damping", "mass", "com"}
+_HELD_TORQUE = {"elastic", "mass", "com", "moment_arm", "tendon_friction"}
+DEPENDS = {
+    ("ID.2", "tendon_excursion"): {"moment_arm"},
+    ("ID.3-static", "joint_torque"): _TORQUE,
+    ("ID.3-dynamic", "joint_torque"): _TORQUE,
+    ("ID.4", "joint_torque"): _HELD_TORQUE,
+    ("ID.4", "tendon_excursion"): {"moment_arm"},
+    ("VD.1", "tendon_excursion"): {"moment_arm"},
+    ("VD.2", "fingertip_force"): _HELD_TORQUE,
+    ("VD.2", "tendon_excursion"): {"moment_arm"},
+    ("VD.3", "joint_torque"): _TORQUE | _HELD_TORQUE,
+    ("VD.3", "tendon_excursion"): {"moment_arm"},
+}
+
+GROUP_OF_TERM = {
+    "joint_elastic": "elastic", "joint_coulomb": "friction", "joint_damping": "damping",
+    "tendon_friction": "tendon_friction",
+}
+
+
+def nominal_model(session: Session, recipe: Recipe) -> Model:
+    """The recipe's nominal model of the session's finger, all fitted terms zero."""
+    finger = Finger.from_description(session.finger)
+    r = recipe.model
+    model = Model.zeros(
+        finger, moment_arm_degree=r.moment_arm_degree, cross=r.cross_terms, elastic_degree=r.elastic_degree,
+        friction_degree=r.friction_degree,
+    )
+    if "gravity" not in r.terms:
+        import equinox as eqx
+
+        model = eqx.tree_at(lambda m: m.finger.gravity, model, jnp.zeros(3))
+    return model
+
+
+def free_groups(recipe: Recipe) -> set[str]:
+    """Groups of parameters that the recipe's nominal model has."""
+    return {"moment_arm"} | {GROUP_OF_TERM[t] for t in recipe.model.terms if t in GROUP_OF_TERM}
+
+
+def cad_covariance(session: Session, parameters: list[Parameter]) -> np.ndarray:
+    """Covariance of the flat vector before any fit: what CAD and scale say of masses and centres of mass."""
+    variance = np.zeros(len(parameters))
+    position = {g: [i for i, p in enumerate(parameters) if p.group == g] for g in ("mass", "com")}
+    for group, std in (("mass", session.finger.mass_std), ("com", session.finger.com_std)):
+        if std is not None:
+            variance[position[group]] = np.ravel(std) ** 2
+    return np.diag(variance)
+
+
+def identify(
+    session: Session, recipe: Recipe | None = None, stages: tuple[str, ...] | None = None, start: Fit | None = None,
+    progress: Progress = lambda message: None,
+) -> Fit:
+    """Run the staged fits on a session; a stage whose data are missing is skipped and named.
+
+    `stages` limits the run to some of them; `start` gives the parameters of earlier ones.
+    """
+    recipe = recipe or (start.recipe if start else Recipe())
+    wanted = stages or recipe.fit.stages
+    experiments = {e for s in wanted for e in STAGES[s].reads}
+    names = [t.name for t in session if t.experiment in experiments]
+    progress("reading the recordings")
+    stacks = prepare(session, names)
+    fit = start or Fit.before(session, recipe, nominal_model(session, recipe))
+    if start is None:
+        fit = replace(fit, covariance=cad_covariance(session, describe(fit.model)))
+    for name in wanted:
+        progress(f"fitting {name}")
+        fit = run_stage(fit, STAGES[name], stacks, session)
+    return fit
+
+
+def run_stage(fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session) -> Fit:
+    """One stage: noise, estimate, covariance, and what its trials cannot see."""
+    recipe = fit.recipe
+    if stage.name not in stacks:
+        report = StageReport(stage.name, "skipped", message=f"the session has no {stage.name} trial")
+        return replace(fit, stages=(*fit.stages, report))
+    reads = {e: c for e, c in stage.reads.items() if e in stacks}
+    parameters = describe(fit.model)
+    groups = set(stage.frees) & free_groups(recipe)
+    prior_groups = {"mass", "com"} if recipe.fit.free_inertia and stage.name.startswith("ID.3") else set()
+    touched = _touched(stacks, reads, session)
+    free = np.array(
+        [
+            i
+            for i, p in enumerate(parameters)
+            if (p.group in groups and p.determinable and (p.joint or p.tendon) is not None and _seen(p, touched))
+            or (p.group in prior_groups and fit.covariance[i, i] > 0)
+        ],
+        dtype=int,
+    )
+    if not free.size:
+        report = StageReport(stage.name, "skipped", message="the recipe leaves its terms out of the nominal model")
+        return replace(fit, stages=(*fit.stages, report))
+    prior = _cad_prior(fit, free, parameters, prior_groups)
+
+    # Noise first from the residuals of a fit with first guesses of it, then the fit under that noise.
+    noise = dict(fit.noise)
+    model = start_values(fit.model, free, parameters)
+    unknown = {(e, c): _unit_noise(stacks[e], c) for e in reads for c in reads[e] if (e, c) not in noise}
+    for _ in range(2):
+        rough, solution = solve(model, free, _sources(stacks, reads, noise | unknown, parameters), prior)
+        noise |= _noise(solution, stacks, reads)
+        model, unknown = rough, {}
+    sources = _sources(stacks, reads, noise, parameters)
+    model, solution = solve(model, free, sources, prior, recipe.fit.huber)
+
+    linked = np.flatnonzero(np.diag(fit.covariance) > 0)
+    covariance = _propagate(fit.covariance, solution, free, linked, prior)
+    warnings = name_invisible(parameters, free, solution.invisible)
+    warnings += _unseen(parameters, groups, free, touched)
+    report = StageReport(
+        stage.name, "fitted" if solution.converged else "not converged", solution.message,
+        trials=tuple(t for e in reads for t in stacks[e].trials), rows=solution.rows,
+        chi2_per_row=2 * solution.cost / max(1, solution.rows - free.size), outliers=solution.outliers,
+        warnings=tuple(warnings),
+    )
+    estimated = np.union1d(fit.estimated, free).astype(int)
+    return replace(
+        fit, model=model, covariance=covariance, estimated=estimated, noise=noise, stages=(*fit.stages, report)
+    )
+
+
+def _touched(stacks, reads, session: Session) -> tuple[set[str], set[tuple[str, str]], set[str]]:
+    """Joints instrumented or moved, (tendon, joint) pairs recorded together, tendons pulled, by the trials read."""
+    trials = [session[t] for e in reads for t in stacks[e].trials]
+    joints = {t.joint for t in trials if t.joint}
+    moved = {(k, t.joint) for t in trials if t.joint for k in session.finger.tendon_names}
+    return joints, moved, {t.tendon for t in trials if t.tendon}
+
+
+def _seen(p: Parameter, touched) -> bool:
+    joints, moved, tendons = touched
+    if p.group == "moment_arm":
+        return p.joint is None or (p.tendon, p.joint) in moved
+    if p.group == "tendon_friction":
+        return p.tendon in tendons
+    return p.joint in joints
+
+
+def _unseen(parameters, groups, free, touched) -> list[str]:
+    names = [p.name for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in set(free)]
+    return [f"no trial shows {', '.join(names)}: left at zero"] if names else []
+
+
+def _cad_prior(fit: Fit, free, parameters, groups) -> Prior | None:
+    rows = [k for k, i in enumerate(free) if parameters[i].group in groups]
+    if not rows:
+        return None
+    root = np.zeros((len(rows), free.size))
+    for r, k in enumerate(rows):
+        root[r, k] = fit.covariance[free[k], free[k]] ** -0.5
+    return Prior(ravel(fit.model)[free], jnp.asarray(root))
+
+
+def _unit_noise(stack: Stack, channel: str) -> Noise:
+    """White noise of the channel's own size: good enough to find residuals whose noise can then be estimated."""
+    columns = stack.batch.y[channel].shape[0]
+    y, mask = np.asarray(stack.batch.y[channel]), np.asarray(stack.batch.mask[channel]) > 0
+    step = np.diff(y, axis=-1)[mask[..., 1:] & mask[..., :-1]]
+    size = float(np.median(np.abs(step))) if step.size else 1.0
+    std = np.full(columns, max(size, 1e-12))
+    return Noise(std, std, np.zeros((columns, ORDER)), "first guess")
+
+
+def _noise(solution: Solution, stacks, reads) -> dict[tuple[str, str], Noise]:
+    return {
+        (e, c): estimate(stacks[e], c, np.asarray(solution.linearised[e].residuals[c]))
+        for e, channels in reads.items()
+        for c in channels
+    }
+
+
+def _sources(stacks, reads, noise, parameters) -> dict[str, Source]:
+    out = {}
+    for e, channels in reads.items():
+        groups = set().union(*(DEPENDS[e, c] for c in channels))
+        positions = np.array([i for i, p in enumerate(parameters) if p.group in groups and p.determinable])
+        filters = {c: jnp.asarray(noise[e, c].coefficients) for c in channels}
+        out[e] = Source(stacks[e].batch, filters, positions)
+    return out
+
+
+def start_values(model: Model, free: np.ndarray, parameters: list[Parameter]) -> Model:
+    """A tendon that loses nothing cannot show in which direction its loss would change: start from a plausible one."""
+    flat = np.array(ravel(model))
+    for i in free:
+        if parameters[i].group == "tendon_friction" and flat[i] == 0.0:
+            flat[i] = {"N": 0.2, "1": 0.2}[parameters[i].units]
+    return Free.at(model, free).set(model, jnp.asarray(flat[free]))
+
+
+def _propagate(covariance, solution: Solution, free, linked, prior) -> np.ndarray:
+    """Covariance of the flat vector after a stage (see the module's equation); infinite where nothing is seen."""
+    information, scale = solution.information, solution.scale
+    others = np.setdiff1d(linked, free)
+    N = information[np.ix_(free, free)]
+    if prior is not None:
+        N = N + np.asarray(prior.root).T @ np.asarray(prior.root)
+    scaled = N * np.outer(scale, scale)
+    inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True) * np.outer(scale, scale)
+    out = covariance.copy()
+    out[free, :] = out[:, free] = 0.0
+    cross = inverse @ information[np.ix_(free, others)]
+    inherited = covariance[np.ix_(others, others)]
+    out[np.ix_(free, free)] = inverse + cross @ inherited @ cross.T
+    out[np.ix_(free, others)] = -cross @ inherited
+    out[np.ix_(others, free)] = out[np.ix_(free, others)].T
+    for combination in solution.invisible:
+        blind = free[np.abs(combination) > 1e-3]
+        out[blind, blind] = np.inf
+    return out
