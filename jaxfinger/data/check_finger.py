@@ -110,13 +110,11 @@ def _inertia(inertia: np.ndarray, mass: float, name: str, report: Report) -> Non
         return
     small, middle, large = np.linalg.eigvalsh(inertia)
     if small <= 0.0:
-        report.error(
-            place, f"{whose} has the principal inertia {small:.3g} kg m2; all three must be positive: check the signs"
-        )
+        report.error(place, f"{whose} has the principal inertia {small:.3g} kg m2; all three must be positive")
     elif large > (small + middle) * (1.0 + _ROUNDING):
         report.error(
             place,
-            f"{whose} has principal inertias {small:.3g}, {middle:.3g}, {large:.3g} kg m2, and no body has one larger than "
+            f"{whose} has principal inertias {small:.3g}, {middle:.3g}, {large:.3g} kg m2; no body has one larger than "
             "the sum of the others; check frame, signs and units",
         )
     elif mass > 0.0 and large / mass > _LARGEST_FINGER**2:

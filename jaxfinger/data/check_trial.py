@@ -11,6 +11,7 @@ from jaxfinger.data.session import FingerDescription, Trial
 
 STILL_JOINT = 0.01  # rad: five times the noise of a 14-bit encoder
 STILL_AXIS = 1e-4  # m
+OUTSIDE = 0.35  # rad beyond its limits that a joint is allowed to read
 SLACK = 0.5  # N: below it a tendon may be slack, and its excursion NaN
 _MOVES_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic")
 _STEPPED = ("ID.3-static", "ID.4", "VD.2")
@@ -59,12 +60,14 @@ def _named(trial: Trial, finger: FingerDescription, report: Report) -> None:
         report.error(
             place, f"pulls tendon {trial.tendon}, which is passive; correct the trial or /finger/tendons/active"
         )
-    if trial.experiment == "ID.4" and trial.joint in finger.joint_names:
-        if not finger.crosses[tendon, finger.joint_names.index(trial.joint)]:
-            report.error(
-                place,
-                f"pulls {trial.tendon} at joint {trial.joint}, which it does not cross; correct it or /finger/tendons/crosses",
-            )
+    joint = _index(finger.joint_names, trial.joint)
+    if trial.experiment == "ID.4" and joint is not None and not finger.crosses[tendon, joint]:
+        message = f"pulls {trial.tendon} at joint {trial.joint}, which it does not cross"
+        report.error(place, f"{message}; correct the trial or /finger/tendons/crosses")
+
+
+def _index(names: tuple[str, ...], name: str | None) -> int | None:
+    return names.index(name) if name in names else None
 
 
 def _time(trial: Trial, report: Report) -> None:
@@ -134,32 +137,31 @@ def _present(trial: Trial, finger: FingerDescription, report: Report) -> None:
     for name in DRIVES.get(what, ()):
         if getattr(trial, name) is None:
             report.error(_place(trial, name), f"is missing, and {what} cannot be read without it; write this channel")
-        elif what == "ID.4" and trial.tendon in finger.tendon_names:
-            if np.isnan(getattr(trial, name)[:, finger.tendon_names.index(trial.tendon)]).all():
-                report.error(
-                    _place(trial, name), f"column {trial.tendon}, the tendon that is pulled, is NaN; write its tension"
-                )
+        elif what == "ID.4" and np.isnan(_pulled(trial, finger)).all():
+            message = f"column {trial.tendon}, the tendon that is pulled, is NaN; write its tension"
+            report.error(_place(trial, name), message)
     for name in MEASURES[what]:
         values = getattr(trial, name)
+        lost = f", and it is what {what} measures: nothing can be identified from this trial; write this channel"
+        joint = _index(finger.joint_names, trial.joint)
         if values is None:
-            message = f"is missing, and it is what {what} measures: nothing can be identified from this trial; write this channel"
-            report.error(_place(trial, name), message, local=True)
-            continue
-        if name == "joint_torque" and trial.joint in finger.joint_names:
-            values = values[:, finger.joint_names.index(trial.joint)]
-        if np.isnan(values).all():
-            whose = f"column {trial.joint} " if name == "joint_torque" else ""
-            message = (
-                f"{whose}is NaN throughout, and it is what {what} measures: nothing can be identified from this trial"
-            )
-            report.error(_place(trial, name), f"{message}; write this channel", local=True)
+            report.error(_place(trial, name), f"is missing{lost}", local=True)
+        elif np.isnan(values).all():
+            report.error(_place(trial, name), f"is NaN throughout{lost}", local=True)
+        elif name == "joint_torque" and joint is not None and np.isnan(values[:, joint]).all():
+            report.error(_place(trial, name), f"column {trial.joint} is NaN throughout{lost}", local=True)
     for k, joint in enumerate(finger.joint_names):
         if np.isnan(trial.q[:, k]).all():
             say = report.error if joint == trial.joint else report.warning
             say(
-                _place(trial, "q"),
-                f"column {joint} is not measured (NaN), so no torque that depends on it can be predicted; write it",
+                _place(trial, "q"), f"column {joint} is not measured (NaN), and no torque is known without it; write it"
             )
+
+
+def _pulled(trial: Trial, finger: FingerDescription) -> np.ndarray:
+    """Tension of the tendon that the trial pulls; empty where there is none."""
+    tendon = _index(finger.tendon_names, trial.tendon)
+    return np.zeros(0) if trial.tendon_force is None or tendon is None else trial.tendon_force[:, tendon]
 
 
 def _span(values: np.ndarray) -> float:
@@ -176,13 +178,10 @@ def _motion(trial: Trial, finger: FingerDescription, report: Report) -> None:
     still = np.where(finger.prismatic, STILL_AXIS, STILL_JOINT)
     say = report.error if trial.complete else report.warning
     place = _place(trial, "q")
-    if trial.experiment in _MOVES_JOINT and trial.joint in finger.joint_names:
-        k = finger.joint_names.index(trial.joint)
-        if spans[k] < still[k]:
-            say(
-                place,
-                f"joint {trial.joint} never moves (it spans {spans[k]:.2g}), though {trial.experiment} moves it; record it again",
-            )
+    moved = _index(finger.joint_names, trial.joint) if trial.experiment in _MOVES_JOINT else None
+    if moved is not None and spans[moved] < still[moved]:
+        message = f"joint {trial.joint} never moves (it spans {spans[moved]:.2g}), though {trial.experiment} moves it"
+        say(place, f"{message}; correct the attribute `joint`, or record the trial again")
     elif trial.experiment in ("VD.1", "VD.3") and np.all(spans < still):
         say(place, f"no joint moves, though {trial.experiment} moves them; record it again")
     held = [
@@ -196,11 +195,9 @@ def _motion(trial: Trial, finger: FingerDescription, report: Report) -> None:
         report.warning(
             place, f"joint {name} moves by {span:.2g} rad though {trial.experiment} holds it; check the fixture"
         )
-    if trial.experiment in NEEDS_TENDON and trial.tendon_force is not None and trial.tendon in finger.tendon_names:
-        if _span(trial.tendon_force[:, finger.tendon_names.index(trial.tendon)]) < SLACK:
-            report.warning(
-                _place(trial, "tendon_force"), f"tendon {trial.tendon} is never pulled; check the attribute `tendon`"
-            )
+    if trial.experiment in NEEDS_TENDON and _span(_pulled(trial, finger)) < SLACK:
+        message = f"tendon {trial.tendon} is never pulled; check the attribute `tendon`"
+        report.warning(_place(trial, "tendon_force"), message)
 
 
 def _sizes(trial: Trial, finger: FingerDescription, report: Report) -> None:
@@ -211,16 +208,12 @@ def _sizes(trial: Trial, finger: FingerDescription, report: Report) -> None:
             continue
         low, high = np.percentile(trial.q[:, k], [1.0, 99.0])
         lower, upper = finger.limits[k]
+        where = f"column {name} runs from {low:.3g} to {high:.3g} rad"
         if max(-low, high) > 2.0 * np.pi:
-            report.error(
-                _place(trial, "q"),
-                f"column {name} reaches {max(-low, high, key=abs):.4g} rad, more than a turn; convert degrees to rad",
-            )
-        elif low < lower - 0.35 or high > upper + 0.35:
-            report.warning(
-                _place(trial, "q"),
-                f"column {name} runs from {low:.3g} to {high:.3g} rad, far outside its limits {lower:.3g} to {upper:.3g}; correct one or the other",
-            )
+            report.error(_place(trial, "q"), f"{where}, more than a turn; convert degrees to rad")
+        elif low < lower - OUTSIDE or high > upper + OUTSIDE:
+            message = f"{where}, far outside its limits {lower:.3g} to {upper:.3g}; correct one or the other"
+            report.warning(_place(trial, "q"), message)
     if trial.tendon_force is not None:
         _tension(trial, finger, report)
     if not turning.all():

@@ -220,7 +220,7 @@ def child(parent: h5py.Group, name: str, place: str, report: Report, kind: type)
     """A group or dataset of the parent, or None with the reason reported."""
     what = "group" if kind is h5py.Group else "dataset"
     try:
-        item = parent[name] if name in parent else None
+        item = parent.get(name)
     except Exception:  # a damaged file raises nearly anything
         report.error(
             place, "cannot be opened: the file is damaged or its link leads nowhere; record or import it again"

@@ -23,7 +23,7 @@ Predictions = Mapping[str, Mapping[str, np.ndarray]]
 def write_predictions(
     path: str | os.PathLike, session: Session, predictions: Predictions, overwrite: bool = False
 ) -> None:
-    """Write predicted channels, `{trial: {channel: array}}`, beside the times, root attributes and finger of the session.
+    """Write predicted channels, `{trial: {channel: array}}`, beside times, root attributes and finger of the session.
 
     Shapes and units are those of the measured channels; `time` may be given where it is not the trial's.
 
