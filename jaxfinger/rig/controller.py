@@ -102,7 +102,7 @@ class Controller:
         self._put("stLimits", struct.pack("<6d", *(getattr(limits, name) for name in contract.LIMITS.names or ())))
         filters = np.zeros(contract.VALUES, contract.FILTER)
         if self.filtered:  # the factory setting of an EL3008: 50 Hz FIR, -3 dB at 22 Hz
-            filters["enabled"][self.slots.tension + [self.slots.torque] + self.slots.force] = 1
+            filters["enabled"][[*self.slots.tension, self.slots.torque, *self.slots.force]] = 1
             filters["bandwidth"][filters["enabled"] == 1] = 22.0
         self._put("aFilter", filters.tobytes())
         self._noise = self.rng.standard_normal((4096, self.slots.used))
@@ -136,7 +136,7 @@ class Controller:
         self._sample(flags, 500 * contract.CYCLE_NS if "clock" in fault else 0)
 
     def _commands(self) -> None:
-        offset, size = self.place["stCommand"]
+        offset, _ = self.place["stCommand"]
         number, kind, index, _, rate, acceleration, *target = _COMMAND.unpack_from(self.memory, offset)
         if number == self.acknowledged:
             return
@@ -262,13 +262,14 @@ class Controller:
             return False
         angle, velocity, _ = self.motor
         distance = self.goal - angle
-        if abs(distance) <= abs(velocity) * DT + 1e-9 and abs(velocity) <= 2 * self.acceleration * DT:
-            self.motor = (self.goal, 0.0, 0.0)
-            return False
-        allowed = min(self.speed, math.sqrt(2 * self.acceleration * abs(distance)))
+        brake = self.acceleration * DT / 2  # the fastest from which whole cycles of braking stop at the goal
+        allowed = min(self.speed, math.sqrt(brake**2 + 2 * self.acceleration * abs(distance)) - brake)
         change = math.copysign(allowed, distance) - velocity
         change = min(max(change, -self.acceleration * DT), self.acceleration * DT)
         velocity += change
+        if abs(distance) <= abs(velocity) * DT + 1e-6:  # never past the goal: friction remembers the direction
+            self.motor = (self.goal, 0.0, 0.0)
+            return False
         self.motor = (angle + velocity * DT, velocity, change / DT)
         return True
 

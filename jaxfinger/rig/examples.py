@@ -72,5 +72,5 @@ def plan_toml(repeats: int = 1) -> str:
                 f'experiment = "ID.4"\ntendon = "{tendon}"\njoint = "{joint}"\nlevels = {levels}\nposture_deg = {posture}\nrepeats = {repeats}'
             )
     trials.append('experiment = "VD.2"\ntendon = "T2"\nposture_deg = [10.0, 40.0, 35.0]')
-    trials.append('experiment = "VD.3"\nseconds = 8.0\nseed = 1')
+    trials.append('experiment = "VD.3"\nmean = [4.0, 2.5, 3.0, 3.0]\namplitude = 2.0\ninterval = 0.4\ntension_rate = 20.0\nseconds = 8.0\nseed = 1')
     return '[plan]\nname = "paper, shortened"\noperator = "operator"\n' + "".join(f"\n[[trial]]\n{t}\n" for t in trials)

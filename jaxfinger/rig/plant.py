@@ -241,17 +241,17 @@ class Plant:
         arms = self.moment_arms()
         gravity, coriolis = self.gravity_torque(), self.coriolis()
         matrix = self.mass_matrix()[np.ix_(free, free)]
+        letting_go = 1e-2 * max(1.0 - self._clock / 0.6, 0.0)  # N m s/rad: a hand lets the finger go gently
         drive = []
         for j in free:
             torque = sum(arms[i][j] * tension[i] for i in range(self.n)) - gravity[j] - coriolis[j]
-            torque -= _poly(self._elastic[j], self.q[j]) + self._damping[j] * self.qd[j]
+            torque -= _poly(self._elastic[j], self.q[j]) + (self._damping[j] + letting_go) * self.qd[j]
             low, high = self._limits[j]
             beyond = max(low - self.q[j], 0.0) - max(self.q[j] - high, 0.0)
             torque += self.stop_stiffness * beyond
-            a = free.index(
-                j
-            )  # damping and the stop's spring are taken implicitly: links of a few grams are stiff at 1 ms
-            matrix[a, a] += DT * self._damping[j] + (DT**2 * self.stop_stiffness + DT * 5e-3 if beyond else 0.0)
+            # damping and the stop's spring are taken implicitly: links of a few grams are stiff at 1 ms
+            stop = DT**2 * self.stop_stiffness + DT * 5e-3 if beyond else 0.0
+            matrix[len(drive), len(drive)] += DT * (self._damping[j] + letting_go) + stop
             drive.append(torque)
         inverse = np.linalg.inv(matrix)
         velocity = np.array([self.qd[j] for j in free]) + DT * inverse @ np.array(drive)

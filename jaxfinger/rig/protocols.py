@@ -302,7 +302,7 @@ def trajectory(finger: FingerDescription, p: Trajectory) -> Protocol:
     yield Setup(f"Fix all joints: {_angles(posture)}.", fixed=posture)
     yield from _tension(dict(zip(names, mean.tolist(), strict=True)), p.tension_rate)
     yield Setup("Remove all fixtures; keep hands off: the tendons move the finger.")
-    yield Dwell(0.5)
+    yield Dwell(1.0)
     yield Start(loaded=tuple(names))
     for _ in range(round(p.seconds / p.interval)):
         target = np.maximum(mean + p.amplitude * rng.uniform(-1, 1, len(names)), 0.6)

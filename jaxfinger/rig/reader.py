@@ -14,6 +14,7 @@ from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.safety import Supervisor, Violation, armed
 
+BACKLOG = 100  # samples in a block from which on the controller is ahead
 KEEP = 3000  # blocks that a busy runner may lag behind
 
 
@@ -54,10 +55,11 @@ class Reader:
         poll = self.rig.description.poll_s
         while self._running and self.error is None:
             started = time.monotonic()
-            self._step()
-            time.sleep(max(0.0, poll - (time.monotonic() - started)) if len(self._blocks) < 2 else 0.0)
+            count = self._step()
+            if count < BACKLOG:  # else there is more to fetch at once
+                time.sleep(max(0.0, poll - (time.monotonic() - started)))
 
-    def _step(self) -> None:
+    def _step(self) -> int:
         try:
             block = self.rig.read_block(self.rig.description.stale_s)
             found = self.supervisor.check(block)
@@ -76,10 +78,12 @@ class Reader:
                     self.stop(found[0])
                 elif self.recorder.failure is not None:
                     self.stop(Violation(Trip.RECORDER, "recorder", self.latest_seq, float("nan")))
+            return len(block)
         except UserError as error:
             with self._news:
                 self.error = error
                 self._news.notify_all()
+            return 0
 
     def stop(self, violation: Violation) -> None:
         """Stop the rig for this cause; the first cause counts."""
