@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from pkgutil import iter_modules
 
 import numpy as np
 from jaxtyping import Float
@@ -25,7 +24,6 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "fingertip_force": {"N": 1.0},
 }
 SI = {kind: next(iter(units)) for kind, units in UNITS.items()}
-BACKENDS = tuple(module.name for module in iter_modules(backends.__path__))
 DYNAMIC_BANDWIDTH = 100.0  # Hz: below it, a channel is refused for dynamic experiments
 
 
@@ -137,7 +135,7 @@ def parse_rig(text: str, path: str | Path = "rig.toml") -> RigDescription:
 def _rig(file: Table) -> RigDescription:
     head = file.table("rig")
     assert head is not None
-    backend = head.text_of("backend", choices=BACKENDS)
+    backend = head.text_of("backend", choices=backends.NAMES)
     if (where := file.table("address", required=False)) is None:
         where = Table(file.path, file.text, {}, "address")
     address = import_module(f"jaxfinger.rig.backends.{backend}").address(where)

@@ -34,7 +34,7 @@ class Recorder:
         self._waiting = 0
         self._lock = threading.Lock()
         self.failure: str | None = None
-        self.written_seq = -1
+        self.unwritten: list[tuple[bytes, dict[str, Any]]] = []  # frames of JSON that found no room
         self._thread = threading.Thread(target=self._work, name="jaxfinger-writer", daemon=True)
         self._thread.start()
         if not resume:
@@ -78,13 +78,13 @@ class Recorder:
             try:
                 if self.failure is None or tag != wal.DATA:
                     self._log.write(tag, wal.pack_block(value) if tag == wal.DATA else wal.pack_json(value))
-                    if tag == wal.DATA:
-                        self.written_seq = int(value.seq[-1])
                     if time.monotonic() - synced > SYNC_S:
                         self._log.sync()
                         synced = time.monotonic()
             except OSError as error:
                 self.failure = self.failure or f"{self.path.name} cannot be written: {error.strerror or error}"
+                if tag != wal.DATA:
+                    self.unwritten.append((tag, value))
             if tag == wal.DATA:
                 with self._lock:
                     self._waiting -= len(value)

@@ -324,6 +324,9 @@ def run(
             recorder.close()
     cause = cause or recorder.failure or ""
     log = read_log(path)
+    for tag, value in recorder.unwritten:
+        if tag == wal.END and log.recordings and log.recordings[-1].end is None:
+            log.recordings[-1].end = value
     convert.publish(log, output, overwrite=resume)
     if not cause:
         path.unlink()

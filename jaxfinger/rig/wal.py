@@ -81,8 +81,8 @@ def pack_frame(tag: bytes, payload: bytes) -> bytes:
 class LogWriter:
     """Appends frames; each is handed to the system at once, so the death of this process loses none of them."""
 
-    def __init__(self, file: BinaryIO):
-        self._file = file
+    def __init__(self, file: BinaryIO, end: int = 0):
+        self._file, self._end = file, end
 
     @classmethod
     def create(cls, path: Path) -> LogWriter:
@@ -108,7 +108,7 @@ class LogWriter:
         file = open(path, "r+b", buffering=0)
         file.truncate(end)
         file.seek(end)
-        return cls(file)
+        return cls(file, end)
 
     def write(self, tag: bytes, payload: bytes) -> None:
         """Append one frame; raises OSError on a full disk, with everything before it intact."""
@@ -116,8 +116,14 @@ class LogWriter:
 
     def _write(self, data: bytes) -> None:
         view = memoryview(data)
-        while view:
-            view = view[self._file.write(view) or 0 :]
+        try:
+            while view:
+                view = view[self._file.write(view) or 0 :]
+        except OSError:
+            self._file.seek(self._end)  # half a frame must not hide what is written after it
+            self._file.truncate()
+            raise
+        self._end += len(data)
 
     def sync(self) -> None:
         """Force what was written to the disk."""

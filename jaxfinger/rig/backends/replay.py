@@ -1,0 +1,111 @@
+"""A recorded trial, played back as if it came from a rig: to look at it live, or to supervise it again with other limits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from jaxfinger.data import Trial, read_session
+from jaxfinger.errors import UserError
+from jaxfinger.rig.backend import Block, Command, CommandRefused, EndOfReplay, Rig, Status
+from jaxfinger.rig.channels import Channel, Filter, RigDescription
+from jaxfinger.rig.contract import State, Trip
+from jaxfinger.rig.toml_file import Table
+
+BLOCK = 50
+
+
+def address(table: Table) -> dict[str, str | int]:
+    """`file`, a session beside the rig file, and the name of a `trial` in it."""
+    return {"file": str((table.path.parent / table.text_of("file")).resolve()), "trial": table.text_of("trial")}
+
+
+class ReplayRig(Rig):
+    """Blocks of a recorded trial; its channels are those that the trial measured, and nothing can be commanded."""
+
+    synchronous = True
+
+    def __init__(self, description: RigDescription):
+        self.description = description
+        self._at = 0
+
+    def connect(self) -> None:
+        path, name = Path(str(self.description.address["file"])), str(self.description.address["trial"])
+        session = read_session(path)
+        if name not in session.trials:
+            raise UserError(f"{path}: has no trial '{name}'; choose one of {', '.join(session.trials)}.")
+        trial, finger = session[name], session.finger
+        measured: list[Channel] = []
+        columns: list[np.ndarray] = []
+        for channel in self.description.channels:
+            column = _column(trial, channel, finger.joint_names, finger.tendon_names)
+            if column is not None and not np.isnan(column).all():
+                measured.append(channel)
+                columns.append(column)
+        self.description = replace(self.description, channels=tuple(measured), finger=finger)
+        self._time = np.round(trial.time * 1e9).astype(np.uint64)
+        self._x = np.stack(columns, 1)
+        self._at = 0
+
+    def close(self) -> None:
+        pass
+
+    def read_block(self, timeout: float) -> Block:
+        part = slice(self._at, self._at + BLOCK)
+        t_ns, x = self._time[part], self._x[part]
+        if not len(x):
+            raise EndOfReplay("the recording is at its end.")
+        seq = np.arange(self._at, self._at + len(x), dtype=np.uint64)
+        self._at += len(x)
+        state = np.full(len(x), State.ARMED, np.uint32)
+        return Block(seq, t_ns, x.copy(), state, np.zeros(len(x), np.uint32))
+
+    def rewind(self, seq: int) -> None:
+        self._at = min(max(seq, 0), len(self._x))
+
+    def command(self, command: Command) -> int:
+        raise CommandRefused("a recording cannot be moved; use the backend 'simulated' or 'ads'.")
+
+    def arm(self) -> int:
+        raise CommandRefused("a recording cannot be armed; use the backend 'simulated' or 'ads'.")
+
+    def disarm(self) -> int:
+        return 0
+
+    def release(self) -> int:
+        return 0
+
+    def stop(self, cause: Trip) -> None:
+        pass
+
+    def reset(self, operator: str) -> int:
+        return 0
+
+    def status(self) -> Status:
+        return Status(State.IDLE, head=self._at)
+
+    def filters(self) -> dict[str, Filter]:
+        return {}
+
+    def fingerprint(self) -> dict[str, str]:
+        return {"replay": str(self.description.address["file"])}
+
+
+def _column(trial: Trial, channel: Channel, joints: tuple[str, ...], tendons: tuple[str, ...]) -> np.ndarray | None:
+    """The trial's column for a channel; the external torque sits in the column of the joint that it was coupled to."""
+    array, names = {
+        "tension": (trial.tendon_force, tendons),
+        "excursion": (trial.tendon_excursion, tendons),
+        "joint_position": (trial.q, joints),
+        "fingertip_force": (trial.fingertip_force, ("x", "y", "z")),
+        "external_torque": (trial.joint_torque, joints),
+    }[channel.kind]
+    of = channel.of or (trial.joint or "")
+    return array[:, names.index(of)] if array is not None and of in names else None
+
+
+def make(description: RigDescription) -> ReplayRig:
+    """The rig of a rig file."""
+    return ReplayRig(description)
