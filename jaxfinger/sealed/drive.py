@@ -17,10 +17,10 @@ from .laws import Finger, State
 from .profiles import Builder, Profile
 from .protocols import Plan, sample_times
 
-LEAST, MOST = 2.0, 14.0  # N, range of commanded tension
+MOST = 16.0  # N, largest commanded tension
 STEP = 5e-4  # s
-CONTROL = 4  # steps a control cycle
-LAG = 3e-3  # s, of the drives
+CONTROL = 2  # steps a control cycle: 1 kHz, the rate of the record
+LAG = 1.5e-3  # s, of the drives
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Run:
 def wish(nominal: Finger, plan: Plan, rng: np.random.Generator) -> tuple[Profile, ...]:
     """A trajectory between postures that tensions can hold; joints start and stop at their own times."""
     count = int(plan.duration / 1.6)
-    postures = _reachable(nominal, count + 1, rng)
+    postures = _reachable(nominal, plan.least, count + 1, rng)
     profiles = []
     for j in range(nominal.m):
         b = Builder(float(postures[0][j])).rest(0.25)
@@ -49,16 +49,16 @@ def wish(nominal: Finger, plan: Plan, rng: np.random.Generator) -> tuple[Profile
     return tuple(profiles)
 
 
-def _reachable(nominal: Finger, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count m"]:
+def _reachable(nominal: Finger, least: float, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count m"]:
     """Postures that tensions within bounds hold, with the joints' friction either way: the best of many random ones."""
     low, high = nominal.specimen.finger.limits.T
-    q = low + (high - low) * rng.uniform(0.12, 0.8, (600, nominal.m))
+    q = low + (high - low) * rng.uniform(0.12, 0.8, (1500, nominal.m))
     zero = np.zeros_like(q)
     c = nominal.specimen.elastic
     torque = nominal.plant.inverse_dynamics(q, zero, zero) + c[:, 0] + c[:, 1] * q + c[:, 2] * q**2
     s = State(zero[:, 0], zero[:, 0], q, zero, zero, np.zeros((len(q), nominal.n)), zero)
     margin = nominal.coulomb(s)[0]
-    allocate = Allocator(nominal)
+    allocate = Allocator(nominal, least)
     still = np.zeros(nominal.n)
     miss = np.zeros(len(q))
     for i, arm in enumerate(nominal.geometry(q)[1]):
@@ -79,9 +79,10 @@ def feedforward(nominal: Finger, q: Float[np.ndarray, "N m"], qd: Float[np.ndarr
 
 
 class Allocator:
-    """Tensions at the actuators that give joint torques, at least LEAST N, small otherwise."""
+    """Tensions at the actuators that give joint torques, at least `least` N, small otherwise."""
 
-    def __init__(self, nominal: Finger):
+    def __init__(self, nominal: Finger, least: float):
+        self.least = least
         self.active = np.flatnonzero(nominal.specimen.finger.active)
         self.friction = nominal.specimen.friction[self.active]
         self.n = nominal.n
@@ -92,19 +93,19 @@ class Allocator:
         a0, a1 = self.friction.T
         gain, offset = 1 - s * a1, -s * a0
         matrix = (arm * gain[:, None]).T
-        rest = torque - arm.T @ offset - matrix @ np.full(len(self.active), LEAST)
+        rest = torque - arm.T @ offset - matrix @ np.full(len(self.active), self.least)
         extra, _ = nnls(np.vstack([matrix, self._small]), np.concatenate([rest, np.zeros(len(self.active))]))
         tension = np.zeros(self.n)
-        tension[self.active] = np.minimum(LEAST + extra, MOST + 2.0)
+        tension[self.active] = np.minimum(self.least + extra, MOST)
         return tension
 
 
-def planned_tension(nominal: Finger, profiles: Sequence[Profile], t: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N n"]:
+def planned_tension(nominal: Finger, plan: Plan, t: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N n"]:
     """Tension that would drive the wished trajectory open loop, N."""
-    q, qd, qdd = (np.stack(x, axis=1) for x in zip(*(p(t) for p in profiles), strict=True))
+    q, qd, qdd = (np.stack(x, axis=1) for x in zip(*(p(t) for p in plan.q), strict=True))
     torque, direction = feedforward(nominal, q, qd, qdd)
     arms = nominal.geometry(q)[1]
-    allocate = Allocator(nominal)
+    allocate = Allocator(nominal, plan.least)
     return np.stack([allocate(*row) for row in zip(arms, torque, direction, strict=True)])
 
 
@@ -119,21 +120,21 @@ def simulate(finger: Finger, nominal: Finger, plans: Sequence[Plan]) -> list[Run
     wished = [[np.stack(x, axis=1) for x in zip(*(p(fine) for p in plan.q), strict=True)] for plan in plans]
     forward = [feedforward(nominal, *w) for w in wished]
     noises = np.stack([_wander(np.random.default_rng(plan.seed), len(fine), n, STEP * CONTROL) for plan in plans])
-    allocate = Allocator(nominal)
+    allocate = [Allocator(nominal, plan.least) for plan in plans]
     inertia = np.diag(nominal.plant.mass_matrix(wished[0][0][0]))
-    stiff = 0.04 + 0.04 * inertia / inertia.max()
+    stiff = 0.03 + 0.05 * inertia / inertia.max()
     damp = 1.2 * np.sqrt(stiff * np.maximum(inertia, 2e-6))
 
     data = [mujoco.MjData(model) for _ in plans]
     for d, w in zip(data, wished, strict=True):
         d.qpos = w[0][0]
-    f = np.stack([allocate(nominal.geometry(w[0][0])[1], ff[0][0], ff[1][0]) for w, ff in zip(wished, forward, strict=True)])
+    f = np.stack([a(nominal.geometry(w[0][0])[1], ff[0][0], ff[1][0]) for a, w, ff in zip(allocate, wished, forward, strict=True)])
     command, starts = f.copy(), np.array([plan.start for plan in plans])
     q = np.stack([d.qpos.copy() for d in data])
     qd = np.zeros_like(q)
     memories = [d for d in finger.departures if hasattr(d, "states")]
     memory, driven = {}, {}
-    keep_q, keep_qd, keep_f = (np.empty((len(fine) * CONTROL // 2, batch, size)) for size in (m, m, n))
+    keep_q, keep_qd, keep_f = (np.empty((len(fine), batch, size)) for size in (m, m, n))
 
     for i in range(len(fine) * CONTROL):
         if i % CONTROL == 0:
@@ -141,7 +142,7 @@ def simulate(finger: Finger, nominal: Finger, plans: Sequence[Plan]) -> list[Run
             for b in range(batch):
                 w = wished[b]
                 torque = forward[b][0][c] + stiff * (w[0][c] - q[b]) + damp * (w[1][c] - qd[b])
-                command[b] = allocate(nominal.geometry(q[b])[1], torque, forward[b][1][c])
+                command[b] = allocate[b](nominal.geometry(q[b])[1], torque, forward[b][1][c])
             command = command * (1 + 0.004 * noises[:, c]) + 0.02 * noises[:, c] * (command > 0)
         f = f + (command - f) * (STEP / LAG)
         t = np.full(batch, i * STEP)
@@ -151,10 +152,10 @@ def simulate(finger: Finger, nominal: Finger, plans: Sequence[Plan]) -> list[Run
             u = d.inputs(finger, s)
             z = d.start(u[None]) if i == 0 else d.step(memory[id(d)], driven[id(d)], u, STEP)
             memory[id(d)], driven[id(d)] = z, u
-        if i % 2 == 0:
-            keep_q[i // 2], keep_qd[i // 2], keep_f[i // 2] = q, qd, f
+        if i % CONTROL == 0:
+            keep_q[i // CONTROL], keep_qd[i // CONTROL], keep_f[i // CONTROL] = q, qd, f
         q, qd = _advance(finger, s, data, active)
-    return [Run(np.arange(len(keep_q)) * 2 * STEP, keep_q[:, b], keep_qd[:, b], keep_f[:, b]) for b in range(batch)]
+    return [Run(fine, keep_q[:, b], keep_qd[:, b], keep_f[:, b]) for b in range(batch)]
 
 
 def _advance(finger: Finger, s: State, data: list, active: np.ndarray):

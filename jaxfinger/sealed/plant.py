@@ -13,6 +13,8 @@ from jaxfinger.data import FingerDescription
 
 STICK = (0.9999, 0.9999, 1e-3, 0.5, 2.0)  # impedance of dry friction: creep of a sticking joint below 1e-3 rad/s
 
+TYPICAL_ARM = 5e-3  # m; MuJoCo scales the softness of a tendon's friction by the coefficients at compile time
+
 
 def build(finger: FingerDescription, timestep: float = 5e-4) -> mujoco.MjModel:
     """MuJoCo model of the serial chain; the active tendons are fixed tendons whose coefficients are C(q) of the moment.
@@ -27,7 +29,7 @@ def build(finger: FingerDescription, timestep: float = 5e-4) -> mujoco.MjModel:
     for k in np.flatnonzero(finger.active):
         tendon = spec.add_tendon(name=finger.tendon_names[k], frictionloss=1.0)
         for joint in finger.joint_names:
-            tendon.wrap_joint(joint, 1.0)
+            tendon.wrap_joint(joint, TYPICAL_ARM)
     model = spec.compile()
     fast = [2.0 * timestep, 1.0]
     model.dof_solref[:], model.dof_solimp[:] = fast, STICK

@@ -31,6 +31,7 @@ class Plan:
     joint: int | None = None
     tendon: int | None = None
     holds: tuple[tuple[float, float, int], ...] = ()
+    least: float = 2.0  # N, tension that VD.3 keeps on every tendon
     wander: float = 0.0  # N, slow wander of the hand-held or constant tension
     seed: int = 0  # process noise of this very trial
 
@@ -229,7 +230,7 @@ class _Protocol:
 
     def vd3(self, letter: str) -> Plan:
         """A wish of the free finger's trajectory; `drive` finds postures and tensions that the finger can follow."""
-        return Plan(f"VD.3-{letter}", f"VD.3-{letter}", "VD.3", 0, 8.0, FAST, (), ())
+        return Plan(f"VD.3-{letter}", f"VD.3-{letter}", "VD.3", 0, 8.0, FAST, (), (), least=float(self.rng.uniform(1.2, 2.2)))
 
 
 def sample_times(plan: Plan, rate: float | None = None) -> Float[np.ndarray, " N"]:

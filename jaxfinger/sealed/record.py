@@ -61,10 +61,10 @@ def commanded(plan: Plan, rate: float | None = None) -> Motion:
 
 
 def _reversals(profile: Profile, plan: Plan) -> Float[np.ndarray, " r"]:
-    """Times at which a profile's rate changes sign, s."""
+    """Times just before a profile's rate changes sign, s."""
     t = sample_times(plan)
     sign = last_direction(profile(t)[1][:, None])[:, 0]
-    return t[1:][np.diff(sign) != 0] - 0.5 / plan.rate
+    return t[1:][np.diff(sign) != 0] - 2e-3
 
 
 def driven(run: Run) -> Motion:

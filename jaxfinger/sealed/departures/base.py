@@ -32,6 +32,7 @@ class Departure:
     units: ClassVar[str] = ""
     start_size: ClassVar[float]  # where the calibration begins
     largest: ClassVar[float]  # not physical beyond
+    smallest: ClassVar[float] = 1e-12  # nor below
     forms: ClassVar[tuple[str, ...]]
 
     def resized(self, size: float) -> Departure:

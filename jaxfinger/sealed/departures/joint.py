@@ -36,6 +36,7 @@ class JointPresliding(Memory):
     units: ClassVar[str] = "rad"
     start_size: ClassVar[float] = 0.02
     largest: ClassVar[float] = 0.15
+    smallest: ClassVar[float] = 2e-3
     forms: ClassVar[tuple[str, ...]] = ("dahl", "lugre", "maxwell_slip")
     states: ClassVar[int] = presliding.ELEMENTS
 

@@ -21,6 +21,8 @@ def advance(form: str, z: np.ndarray, dx: np.ndarray, x0: float) -> np.ndarray:
     sign = np.sign(dx)
     if form == "dahl":  # exact over one step of constant direction
         return sign - (sign - z) * np.exp(-np.abs(dx) / x0)
+    if np.all(np.abs(dx) > 6 * x0):
+        return np.broadcast_to(sign, z.shape).astype(float)
     # Sharper knee: dz/dx = (1 − z sgn ẋ |z|^(p−1)) / x₀ with p = 3; sub-stepped where the step is long.
     steps = int(min(50, 1 + np.ceil(np.max(np.abs(dx)) / (0.2 * x0))))
     for _ in range(steps):

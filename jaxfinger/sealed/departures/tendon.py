@@ -177,6 +177,7 @@ class TendonPresliding(Memory):
     units: ClassVar[str] = "m"
     start_size: ClassVar[float] = 2e-4
     largest: ClassVar[float] = 2e-3
+    smallest: ClassVar[float] = 5e-5
     forms: ClassVar[tuple[str, ...]] = ("dahl", "lugre", "maxwell_slip")
     states: ClassVar[int] = presliding.ELEMENTS
 
