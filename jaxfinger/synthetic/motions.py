@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 Array = np.ndarray
 
@@ -28,15 +29,13 @@ class Staircase(NamedTuple):
     direction: Int[Array, " N"]  # −1, 0, 1
 
 
-def minimum_jerk(
-    time: Float[Array, " N"], points: Sequence[float], move: Sequence[float], dwell: Sequence[float]
-) -> Staircase:
+def minimum_jerk(time: Float[Array, " N"], points: ArrayLike, move: ArrayLike, dwell: ArrayLike) -> Staircase:
     """From points[0] on to each next point in `move` s and a rest of `dwell` s, without jumps of acceleration.
 
     x = x₀ + Δ (10 s³ − 15 s⁴ + 6 s⁵): Flash and Hogan (1985), eq. 3.
     """
     start = np.concatenate([[0.0], np.cumsum(np.add(move, dwell))])[:-1]
-    k = np.clip(np.searchsorted(start, time, side="right") - 1, 0, len(move) - 1)
+    k = np.clip(np.searchsorted(start, time, side="right") - 1, 0, start.size - 1)
     duration = np.asarray(move, dtype=float)[k]
     s = np.clip((time - start[k]) / duration, 0.0, 1.0)
     x0, delta = np.asarray(points)[k], np.diff(points)[k]
@@ -49,7 +48,7 @@ def minimum_jerk(
 
 
 def sweeps(
-    rate: float, lower: float, upper: float, speeds: Sequence[float], cycles: int, acceleration: float = 20.0
+    rate: float, lower: float, upper: float, speeds: Sequence[float], cycles: int, acceleration: float = 10.0
 ) -> Path:
     """Back and forth from lower to upper and back, `cycles` times at each speed (rad/s), from rest to rest.
 
@@ -87,14 +86,19 @@ def wander(
 
 
 def swing(
-    time: Float[Array, " N"], centre: float, amplitude: float, rng: np.random.Generator, frequencies=(0.25, 0.7)
+    time: Float[Array, " N"],
+    centre: float,
+    amplitude: float,
+    rng: np.random.Generator,
+    slow: float = 0.25,
+    fast: float = 0.7,
 ) -> Path:
-    """Two sines about a centre, let in over the first second so that the motion starts at rest. Frequencies in Hz."""
-    w = 2.0 * np.pi * np.sort(rng.uniform(*frequencies, 2))
+    """Two sines, of `slow` to `fast` Hz, about a centre, let in over the first second: the motion starts at rest."""
+    w = 2.0 * np.pi * np.sort(rng.uniform(slow, fast, 2))
     share = rng.uniform(0.4, 0.6)
     sines = [
-        (share * amplitude, w[0], rng.uniform(-0.5, 0.5)),
-        ((1.0 - share) * amplitude, w[1], rng.uniform(-0.5, 0.5)),
+        (share * amplitude, w[0], rng.uniform(-np.pi, np.pi)),
+        ((1.0 - share) * amplitude, w[1], rng.uniform(-np.pi, np.pi)),
     ]
     y = sum(a * np.sin(w * time + p) for a, w, p in sines)
     dy = sum(a * w * np.cos(w * time + p) for a, w, p in sines)

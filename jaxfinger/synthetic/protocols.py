@@ -172,7 +172,7 @@ def _free_paths(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan
         rng = _rng(trials, motion)
         time = _clock(trials.rate, e.duration)
         paths = [motions.wander(time, *_inset(limits), rng, (1.0, 3.0)) for limits in finger.limits]
-        yield TrialPlan(motion, "VD.1", motion, time, *_stacked(paths), _taut(finger, time, e.tension, rng))
+        yield TrialPlan(motion, "VD.1", motion, time, *_stacked(paths), tension=_taut(finger, time, e.tension, rng))
 
 
 def _drives(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
@@ -184,7 +184,7 @@ def _drives(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
         time = _clock(e.rate, e.duration)
         ranges = [(limits.mean() - 0.05 * np.ptp(limits), e.amplitude * np.ptp(limits)) for limits in finger.limits]
         paths = [motions.swing(time, *span, rng) for span in ranges]
-        yield TrialPlan(motion, "VD.3", motion, time, *_stacked(paths), _slack(finger, time))
+        yield TrialPlan(motion, "VD.3", motion, time, *_stacked(paths), tension=_slack(finger, time))
 
 
 def _moved(finger, experiment, motion, time, posture, joint, path, tension) -> TrialPlan:
@@ -192,7 +192,7 @@ def _moved(finger, experiment, motion, time, posture, joint, path, tension) -> T
     q = np.repeat(posture[:, None], time.size, axis=1)
     q[joint] = path.x
     rates = [_row(finger.m, joint, x) for x in (path.v, path.a)]
-    return TrialPlan(motion, experiment, motion, time, q, *rates, tension, joint=joint)
+    return TrialPlan(motion, experiment, motion, time, q, *rates, tension=tension, joint=joint)
 
 
 def _stepped(finger, rate, experiment, motion, posture, tendon, tensions, move, dwell, joint=None) -> TrialPlan:

@@ -88,7 +88,7 @@ def _routes(rng: np.random.Generator, crosses: np.ndarray, flexor: bool) -> Rout
 def _route(rng: np.random.Generator, flexor: bool, scale: float) -> Route:
     """As the paper's T3 (lifts off its pulley) or T2 (wraps an eccentric head), at random sizes."""
     radius, x, z = scale * rng.uniform(4.5e-3, 6.5e-3), *(scale * rng.uniform(-1e-3, 1e-3, 2))
-    proximal, distal = rng.uniform(12e-3, 18e-3, 2)
+    proximal, distal = scale * rng.uniform(12e-3, 18e-3, 2)
     height = scale * rng.uniform(-0.8e-3, 0.2e-3) if flexor else radius
     return WrappedRoute(
         (-proximal, height), (distal, height), (x, z), radius, dorsal=not flexor, on_distal=bool(rng.integers(2))
