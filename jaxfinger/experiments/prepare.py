@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfinger.data import Session, Trial, find_holds, joint_directions, outlier_mask, smooth, tendon_directions
+from jaxfinger.data import Session, Trial, find_holds, outlier_mask, smooth
 from jaxfinger.errors import UserError
-from jaxfinger.experiments.table import EXPERIMENTS, MIN_JOINT_SPEED, MIN_TENDON_SPEED, SLACK, Experiment
+from jaxfinger.experiments.table import EXPERIMENTS, MIN_JOINT_SPEED, MIN_TENDON_SPEED, SLACK, STILL, Experiment
 from jaxfinger.model import Motion
 
 
@@ -61,13 +61,14 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool) -> 
     holds = find_holds(trial) if spec.samples == "holds" else np.full(N, -1)
 
     q, qd, qdd = smooth(trial.time, trial.q, min(spec.cutoff, 0.2 / step))
-    if spec.held:
+    if spec.samples == "holds":
         q, qd, qdd = trial.q, np.zeros_like(q), np.zeros_like(q)
-    joint_direction = np.zeros((N, m)) if spec.held else joint_directions(trial).astype(float)
+    joint_direction = np.zeros((N, m)) if spec.held else _direction(trial.joint_direction, qd, STILL)
     tension = np.zeros((N, n)) if trial.tendon_force is None else np.nan_to_num(trial.tendon_force)
     tendon_direction = np.zeros((N, n))
-    if spec.samples == "sliding":
-        tendon_direction = tendon_directions(trial).astype(float)
+    if not spec.slack and spec.samples == "sliding":
+        rate = np.zeros((N, n)) if trial.tendon_excursion is None else _rates(trial, spec)
+        tendon_direction = _direction(trial.tendon_direction, rate, 0.1 * MIN_TENDON_SPEED)
     motorised = np.zeros((N, m))
     if trial.joint is not None and "joint_torque" in spec.channels:
         motorised[:, session.finger.joint_names.index(trial.joint)] = 1.0
@@ -89,9 +90,15 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool) -> 
     start = trial.session_start if trial.session_start is not None else 0.0
     time = mean(trial.time)
     motion = {
-        "time": time, "q": mean(q).T, "qd": mean(qd).T, "qdd": mean(qdd).T, "tension": tension_mean.T,
-        "joint_direction": mean(joint_direction).T, "tendon_direction": mean(tendon_direction).T,
-        "session_time": time + start, "motorised": mean(motorised).T,
+        "time": time,
+        "q": mean(q).T,
+        "qd": mean(qd).T,
+        "qdd": mean(qdd).T,
+        "tension": tension_mean.T,
+        "joint_direction": mean(joint_direction).T,
+        "tendon_direction": mean(tendon_direction).T,
+        "session_time": time + start,
+        "motorised": mean(motorised).T,
     }
     y_mean, mask_mean = {}, {}
     for c in y:
@@ -111,7 +118,7 @@ def _measured(spec, trial, session, holds, qd):
     y, mask = {}, {}
     for c in spec.channels:
         values = getattr(trial, c)
-        if spec.samples == "sliding" and c == "joint_torque":
+        if values is None and c == "joint_torque" and spec.samples == "sliding":
             values = np.zeros((N, m))  # nothing acts from outside on the free finger
         if values is None:
             values = np.full((N, width[c]), np.nan)
@@ -123,23 +130,35 @@ def _measured(spec, trial, session, holds, qd):
         if spec.samples == "holds":
             counts *= (holds >= 0)[:, None]
         if spec.samples == "sliding" and c == "joint_torque":
-            counts *= _sliding(trial, session, qd)
+            counts *= _sliding(spec, trial, session, qd)
         y[c], mask[c] = np.nan_to_num(values), counts
     return y, mask
 
 
-def _sliding(trial: Trial, session: Session, qd) -> np.ndarray:
+def _direction(commanded: np.ndarray | None, rate: np.ndarray, still: float) -> np.ndarray:
+    """The protocol's directions, else the sign of the filtered rate, which keeps the last one through a stop."""
+    if commanded is not None:
+        return commanded.astype(float)
+    known = np.where(np.abs(rate) > still, np.arange(len(rate))[:, None], 0)
+    return np.sign(np.take_along_axis(rate, np.maximum.accumulate(known, axis=0), axis=0))
+
+
+def _rates(trial: Trial, spec: Experiment) -> np.ndarray:
+    """Tendon speeds, m/s; zero where the excursion was not measured."""
+    return smooth(trial.time, np.nan_to_num(trial.tendon_excursion), spec.cutoff / 2)[1]
+
+
+def _sliding(spec: Experiment, trial: Trial, session: Session, qd) -> np.ndarray:
     """(N, m): 1 where a joint and every taut tendon across it slide, so that the directions of friction are known."""
-    moving = np.abs(qd) > MIN_JOINT_SPEED
-    finger = session.finger
-    known = np.ones((len(qd), finger.n), dtype=bool)
-    if trial.tendon_excursion is not None and trial.tendon_force is not None:
-        _, rate, _ = smooth(trial.time, np.nan_to_num(trial.tendon_excursion), EXPERIMENTS["VD.3"].cutoff / 2)
-        taut = np.nan_to_num(trial.tendon_force) > SLACK
-        measured = np.isfinite(trial.tendon_excursion).all(axis=0)
-        known = ~taut | ((np.abs(rate) > MIN_TENDON_SPEED) & measured)
-    for i in range(finger.m):
-        moving[:, i] &= known[:, finger.crosses[:, i] & finger.active].all(axis=1)
+    fast = np.percentile(np.abs(qd), 95, axis=0)
+    moving = np.abs(qd) > np.minimum(MIN_JOINT_SPEED, 0.2 * fast)
+    if spec.slack or trial.tendon_excursion is None or trial.tendon_force is None:
+        return moving.astype(float)
+    taut = np.nan_to_num(trial.tendon_force) > SLACK
+    measured = np.isfinite(trial.tendon_excursion).all(axis=0)
+    known = ~taut | ((np.abs(_rates(trial, spec)) > MIN_TENDON_SPEED) & measured)
+    for i in range(session.finger.m):
+        moving[:, i] &= known[:, session.finger.crosses[:, i] & session.finger.active].all(axis=1)
     return moving.astype(float)
 
 
@@ -170,6 +189,9 @@ def _stack(spec: Experiment, trials: list[Trial], rows: list[_Row]) -> Stack:
     y = {c: pad([r.y[c] for r in rows], constant=True) for c in spec.channels}
     mask = {c: pad([r.mask[c] for r in rows], constant=True) for c in spec.channels}
     return Stack(
-        spec, Batch(x, y, mask), tuple(t.name for t in trials), tuple(t.motion for t in trials),
+        spec,
+        Batch(x, y, mask),
+        tuple(t.name for t in trials),
+        tuple(t.motion for t in trials),
         float(np.median([r.dt for r in rows])),
     )

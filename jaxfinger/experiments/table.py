@@ -15,7 +15,9 @@ class Experiment:
     channels: tuple[str, ...]  # what the model predicts
     rate: float  # Hz
     cutoff: float  # Hz
-    samples: str = "all"  # which ones count: `all`, `holds`, or `sliding` (friction known where joint and tendons slide)
+    samples: str = (
+        "all"  # which ones count: `all`, `holds`, or `sliding` (friction known where joint and tendons slide)
+    )
     held: bool = False  # a fixture holds the joints: they carry no friction, and tendons slip only past their loss
     slack: bool = False  # the tendons are slack by protocol
 
@@ -25,7 +27,7 @@ EXPERIMENTS = {
     for e in (
         Experiment("ID.2", ("tendon_excursion",), 20.0, 5.0),
         Experiment("ID.3-static", ("joint_torque",), 20.0, 5.0, samples="holds", slack=True),
-        Experiment("ID.3-dynamic", ("joint_torque",), 100.0, 20.0, slack=True),
+        Experiment("ID.3-dynamic", ("joint_torque",), 100.0, 20.0, samples="sliding", slack=True),
         Experiment("ID.4", ("joint_torque", "tendon_excursion"), 20.0, 5.0, samples="holds", held=True),
         Experiment("VD.1", ("tendon_excursion",), 20.0, 5.0),
         Experiment("VD.2", ("fingertip_force", "tendon_excursion"), 20.0, 5.0, samples="holds", held=True),
@@ -36,5 +38,6 @@ EXPERIMENTS = {
 UNITS = {"tendon_excursion": "m", "joint_torque": "N m", "fingertip_force": "N", "q": "rad", "tendon_force": "N"}
 
 SLACK = 0.2  # N: a tendon whose tension stays below this is slack, and carries neither tension nor friction
-MIN_JOINT_SPEED = 0.1  # rad/s: below this a joint of VD.3 may stick, and its friction is unknown
+STILL = 0.01  # rad/s: below this a joint keeps the direction that it had
+MIN_JOINT_SPEED = 0.1  # rad/s (or a fifth of the motion's speed): below this a joint may stick, its friction unknown
 MIN_TENDON_SPEED = 5e-4  # m/s: likewise a tendon

@@ -1,20 +1,17 @@
 """The result of an identification, and its file."""
 
-import json
-from dataclasses import asdict, dataclass, field, replace
-from datetime import datetime, timezone
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxfinger.data import Session, data_hash
-from jaxfinger.errors import UserError
 from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.parameters import describe, ravel
-from jaxfinger.identify.recipe import Recipe, as_dict, structure
-from jaxfinger.model import Finger, JointTorque, Model, MomentArm, TendonFriction
+from jaxfinger.identify.recipe import Recipe
+from jaxfinger.model import Model
 
 SCHEMA = "jaxfinger-fit/1"
 
@@ -54,9 +51,14 @@ class Fit:
         """Nothing estimated yet."""
         P = ravel(model).size
         return cls(
-            model, np.zeros((P, P)), np.zeros(0, int), recipe, specimen=session.specimen,
-            data=Path(session.file).name, data_hash=data_hash(session.file) if session.file else "",
-            created=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            model,
+            np.zeros((P, P)),
+            np.zeros(0, int),
+            recipe,
+            specimen=session.specimen,
+            data=Path(session.file).name,
+            data_hash=data_hash(session.file) if session.file else "",
+            created=datetime.now(UTC).isoformat(timespec="seconds"),
             versions={p: version(p) for p in ("jaxfinger", "jax", "optimistix", "equinox", "numpy", "h5py")},
         )
 
@@ -70,8 +72,11 @@ class Fit:
         values, std, parameters = np.asarray(ravel(self.model)), self.std, describe(self.model)
         return [
             {
-                "name": parameters[i].name, "group": parameters[i].group, "value": float(values[i]),
-                "std": float(std[i]) if np.isfinite(std[i]) else None, "units": parameters[i].units,
+                "name": parameters[i].name,
+                "group": parameters[i].group,
+                "value": float(values[i]),
+                "std": float(std[i]) if np.isfinite(std[i]) else None,
+                "units": parameters[i].units,
             }
             for i in self.estimated
         ]

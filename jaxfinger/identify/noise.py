@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxfinger.experiments import Batch, Stack
 
 ORDER = 3  # of the autoregression
+SLOW = 15  # samples of the moving average that is taken for signal where nothing is repeated
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Noise:
     std: Float[np.ndarray, " columns"]  # of a sample, in the channel's unit
     innovation: Float[np.ndarray, " columns"]  # σ, likewise
     ar: Float[np.ndarray, "columns order"]  # a_k
-    source: str  # `repeats`, `holds` or `residuals`
+    source: str  # `repeats`, `holds`, both, or `residuals`
 
     @property
     def coefficients(self) -> Float[np.ndarray, "columns order+1"]:
@@ -34,7 +35,9 @@ class Noise:
 
 
 def whiten(
-    r: Float[Array, "columns B T"], mask: Float[Array, "columns B T"], coefficients: Float[Array, "columns order+1"],
+    r: Float[Array, "columns B T"],
+    mask: Float[Array, "columns B T"],
+    coefficients: Float[Array, "columns order+1"],
     demean: bool,
 ) -> Float[Array, "columns B T"]:
     """White residuals of unit variance, zero where the filter has no full history of samples that count.
@@ -64,25 +67,28 @@ def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B 
     mask = np.asarray(batch.mask[channel]) > 0
     demean = channel == "tendon_excursion"
     series, source = _repeats(stack, residual, mask, demean), "repeats"
-    if not _enough(series) and stack.experiment.samples == "holds":
-        series, source = _within_holds(residual, mask), "holds"
+    if stack.experiment.samples == "holds":
+        holds = _within_holds(residual, mask)
+        source = "repeats and holds" if _enough(series) else "holds"
+        series = [a + b for a, b in zip(series, holds, strict=True)]
     if not _enough(series):
-        series, source = _all(residual, mask, demean), "residuals"
+        series, source = _fast_part(residual, mask), "residuals"
     pooled = _autoregression([s for column in series for s in column])
     rows = []
     for column in series:
-        count = sum(int(m.sum()) for _, m in column)
+        count = sum(int(m.sum()) for _, m, _ in column)
         # A column with few samples of its own borrows the channel's.
         rows.append(_autoregression(column) if count > 400 else pooled)
     std, innovation, ar = (np.array(x) for x in zip(*rows, strict=True))
     return Noise(std, innovation, ar, source)
 
 
-Series = list[tuple[np.ndarray, np.ndarray]]  # values and which of them count
+# Values, which of them count, and the share of their covariance that centring has taken from every lag.
+Series = list[tuple[np.ndarray, np.ndarray, float]]
 
 
 def _enough(series: list[Series]) -> bool:
-    return sum(int(m.sum()) for column in series for _, m in column) > 100
+    return sum(int(m.sum()) for column in series for _, m, _ in column) > 100
 
 
 def _centred(e: np.ndarray, mask: np.ndarray, demean: bool) -> np.ndarray:
@@ -101,35 +107,46 @@ def _repeats(stack: Stack, residual, mask, demean) -> list[Series]:
                 continue
             mean = residual[c, members].mean(axis=0)
             scale = np.sqrt(len(members) / (len(members) - 1))
-            column += [(_centred(scale * (residual[c, b] - mean), both, demean), both) for b in members]
+            column += [(_centred(scale * (residual[c, b] - mean), both, demean), both, 0.0) for b in members]
     return series
 
 
 def _within_holds(residual, mask) -> list[Series]:
+    """Scatter about a straight line through each hold: what creeps or relaxes in it is no noise."""
     series: list[Series] = [[] for _ in range(len(residual))]
     for c, b in np.ndindex(residual.shape[:2]):
-        e = residual[c, b].copy()
-        for segment in np.ma.clump_unmasked(np.ma.masked_array(e, ~mask[c, b])):
-            e[segment] -= e[segment].mean()
-        if mask[c, b].any():
-            series[c].append((np.where(mask[c, b], e, 0.0), mask[c, b]))
+        e, counts, lost = np.zeros(residual.shape[2]), np.zeros(residual.shape[2], bool), []
+        for hold in np.ma.clump_unmasked(np.ma.masked_array(residual[c, b], ~mask[c, b])):
+            n = hold.stop - hold.start
+            if n > 5:
+                t = np.arange(n)
+                line = np.polyval(np.polyfit(t, residual[c, b, hold], 1), t)
+                e[hold], counts[hold] = residual[c, b, hold] - line, True
+                lost.append(2 / n)
+        if counts.any():
+            series[c].append((e, counts, float(np.mean(lost))))
     return series
 
 
-def _all(residual, mask, demean) -> list[Series]:
-    return [
-        [(_centred(residual[c, b], mask[c, b], demean), mask[c, b]) for b in range(residual.shape[1]) if mask[c, b].any()]
-        for c in range(len(residual))
-    ]
+def _fast_part(residual, mask) -> list[Series]:
+    """Residuals less their moving average: without repeats, what a law could explain is taken to be slow."""
+    kernel = np.ones(SLOW) / SLOW
+    series: list[Series] = [[] for _ in range(len(residual))]
+    for c, b in np.ndindex(residual.shape[:2]):
+        e, counts = np.where(mask[c, b], residual[c, b], 0.0), mask[c, b]
+        if counts.any():
+            mean = np.convolve(e, kernel, "same") / np.maximum(np.convolve(counts, kernel, "same"), 1e-9)
+            series[c].append((np.where(counts, e - mean, 0.0), counts, 1 / SLOW))
+    return series
 
 
 def _autoregression(series: Series) -> tuple[float, float, np.ndarray]:
     """Standard deviation, innovation and coefficients by Yule–Walker, robust to a few outliers."""
-    if not series or not any(m.any() for _, m in series):
+    if not series or not any(m.any() for _, m, _ in series):
         return 1.0, 1.0, np.zeros(ORDER)
-    values = np.concatenate([e[m] for e, m in series])
+    values = np.concatenate([e[m] for e, m, _ in series])
     limit = 4.0 * 1.4826 * np.median(np.abs(values)) + 1e-300
-    clipped = [(np.clip(e, -limit, limit), m) for e, m in series]
+    clipped = [(np.clip(e, -limit, limit), m, lost) for e, m, lost in series]
     covariance = np.array([_lagged(clipped, k) for k in range(ORDER + 1)])
     if covariance[0] <= 0:
         return 1e-12, 1e-12, np.zeros(ORDER)
@@ -142,9 +159,12 @@ def _autoregression(series: Series) -> tuple[float, float, np.ndarray]:
 
 
 def _lagged(series: Series, k: int) -> float:
-    total = count = 0.0
-    for e, m in series:
+    """Autocovariance at lag k, with what centring took given back: removing d fitted terms from n white samples
+    takes a share d/n of the variance from every lag."""
+    total = count = back = 0.0
+    for e, m, lost in series:
         both = m[k:] & m[: m.size - k]
-        total += float(np.sum(e[k:][both] * e[: e.size - k][both]))
-        count += int(both.sum())
-    return total / count if count else 0.0
+        n = int(both.sum())
+        total, count = total + float(np.sum(e[k:][both] * e[: e.size - k][both])), count + n
+        back += n * lost * float(np.mean(e[m] ** 2)) / max(1e-9, 1 - lost) if n else 0.0
+    return (total + back) / count if count else 0.0

@@ -42,9 +42,7 @@ class Free(eqx.Module):
         positions = np.asarray(positions)
         if np.any(np.diff(positions) <= 0):
             raise ValueError("positions must ascend")
-        within = {
-            i: positions[(positions >= a) & (positions < b)] - a for i, (a, b) in enumerate(pairwise(starts))
-        }
+        within = {i: positions[(positions >= a) & (positions < b)] - a for i, (a, b) in enumerate(pairwise(starts))}
         return cls(
             tuple(i for i, e in within.items() if e.size),
             tuple(jnp.asarray(e) for e in within.values() if e.size),
@@ -116,8 +114,9 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
             tendon = tendons[index[0]]
             active = model.finger.active[index[0]]
             symbol, units = {"constant": ("a0", "N"), "proportional": ("a1", "1")}[field]
-            return Parameter(f"tendon friction {tendon} {symbol}", "tendon_friction", units, tendon=tendon,
-                             determinable=active)
+            return Parameter(
+                f"tendon friction {tendon} {symbol}", "tendon_friction", units, tendon=tendon, determinable=active
+            )
         case ["effects", int(i), field]:
             effect = model.effects[i]
             label = f"{effect.id} {'-'.join(effect.site)} {field}"
@@ -132,8 +131,12 @@ def _moment_arm(model: Model, k: int, t: int) -> Parameter:
     label = " ".join(f"{joints[i]}^{exponents[i]}" for i in spanned)
     crosses = all(model.finger.crosses[k][i] for i in spanned)
     return Parameter(
-        f"excursion {tendon} {label}", "moment_arm", _per_rad("m", sum(exponents)),
-        joints[spanned[0]] if len(spanned) == 1 else None, tendon, sum(exponents),
+        f"excursion {tendon} {label}",
+        "moment_arm",
+        _per_rad("m", sum(exponents)),
+        joints[spanned[0]] if len(spanned) == 1 else None,
+        tendon,
+        sum(exponents),
         determinable=crosses and model.finger.active[k],
     )
 

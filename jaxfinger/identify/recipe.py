@@ -5,8 +5,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import cattrs
-from cattrs.errors import ClassValidationError
 from cattrs import transform_error
+from cattrs.errors import ClassValidationError
 
 from jaxfinger.errors import UserError
 
@@ -76,7 +76,8 @@ def structure(content: dict, where: str) -> Recipe:
     except ClassValidationError as e:
         raise UserError(f"{where}: {'; '.join(transform_error(e))}") from None
     for value, known, key in (
-        (recipe.model.terms, TERMS, "model.terms"), (recipe.fit.stages, STAGES, "fit.stages"),
+        (recipe.model.terms, TERMS, "model.terms"),
+        (recipe.fit.stages, STAGES, "fit.stages"),
     ):
         if unknown := set(value) - set(known):
             raise UserError(f"{where}: {key} has {sorted(unknown)}; it takes some of {list(known)}")

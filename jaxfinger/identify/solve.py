@@ -63,7 +63,10 @@ class Solution:
 
 
 def solve(
-    model: Model, free: Int[np.ndarray, " p"], sources: dict[str, Source], prior: Prior | None = None,
+    model: Model,
+    free: Int[np.ndarray, " p"],
+    sources: dict[str, Source],
+    prior: Prior | None = None,
     huber: float = 0.0,
 ) -> tuple[Model, Solution]:
     """The model with its free parameters (positions in the flat vector) at the optimum, and what is known of it."""
@@ -73,7 +76,7 @@ def solve(
     theta = np.asarray(moved.get(model))
     if prior is None:
         prior = Prior(theta, np.zeros((0, theta.size)))
-    weights: dict[str, Array | None] = dict.fromkeys(sources)
+    weights = {n: _ones(s) for n, s in sources.items()}
     share = 0.0
     for robust in (False, True) if huber else (False,):
         if robust:
@@ -83,9 +86,7 @@ def solve(
                 break
         best, step, converged = np.inf, np.zeros_like(theta), False
         for _ in range(STEPS):
-            linearised = {
-                n: linearise(model, frees[n], s.batch, s.filters, weights[n]) for n, s in sources.items()
-            }
+            linearised = {n: linearise(model, frees[n], s.batch, s.filters, weights[n]) for n, s in sources.items()}
             factor = _stacked(linearised, sources, size)
             offset = prior.root @ (theta - prior.mean)
             cost = 0.5 * float(factor[:, -1] @ factor[:, -1] + offset @ offset)
@@ -109,7 +110,11 @@ def solve(
                 break
             theta = theta + step
             model = moved.set(model, jnp.asarray(theta))
-    message = "" if converged else f"no further descent after {STEPS} linearisations; the last step was {small:.2g} standard deviations"
+    message = (
+        ""
+        if converged
+        else f"no further descent after {STEPS} linearisations; the last step was {small:.2g} standard deviations"
+    )
     factor = _stacked(linearised, sources, size)
     rows = sum(int(np.count_nonzero(lin.white)) for lin in linearised.values())
     information = factor[:, :-1].T @ factor[:, :-1]
@@ -174,3 +179,8 @@ def _huber(linearised: dict[str, Linearised], limit: float) -> tuple[dict[str, A
         beyond, count = beyond + int((r > limit).sum()), count + int((r > 0).sum())
         weights[name] = jnp.asarray(np.sqrt(np.where(r > limit, limit / np.maximum(r, limit), 1.0)))
     return weights, beyond / max(1, count)
+
+
+def _ones(source: Source) -> Array:
+    B, T = source.batch.x.time.shape
+    return jnp.ones((B, T * sum(f.shape[0] for f in source.filters.values())))

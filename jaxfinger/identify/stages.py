@@ -67,7 +67,9 @@ DEPENDS = {
 }
 
 GROUP_OF_TERM = {
-    "joint_elastic": "elastic", "joint_coulomb": "friction", "joint_damping": "damping",
+    "joint_elastic": "elastic",
+    "joint_coulomb": "friction",
+    "joint_damping": "damping",
     "tendon_friction": "tendon_friction",
 }
 
@@ -77,7 +79,10 @@ def nominal_model(session: Session, recipe: Recipe) -> Model:
     finger = Finger.from_description(session.finger)
     r = recipe.model
     model = Model.zeros(
-        finger, moment_arm_degree=r.moment_arm_degree, cross=r.cross_terms, elastic_degree=r.elastic_degree,
+        finger,
+        moment_arm_degree=r.moment_arm_degree,
+        cross=r.cross_terms,
+        elastic_degree=r.elastic_degree,
         friction_degree=r.friction_degree,
     )
     if "gravity" not in r.terms:
@@ -103,7 +108,10 @@ def cad_covariance(session: Session, parameters: list[Parameter]) -> np.ndarray:
 
 
 def identify(
-    session: Session, recipe: Recipe | None = None, stages: tuple[str, ...] | None = None, start: Fit | None = None,
+    session: Session,
+    recipe: Recipe | None = None,
+    stages: tuple[str, ...] | None = None,
+    start: Fit | None = None,
     progress: Progress = lambda message: None,
 ) -> Fit:
     """Run the staged fits on a session; a stage whose data are missing is skipped and named.
@@ -166,9 +174,13 @@ def run_stage(fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session
     warnings = name_invisible(parameters, free, solution.invisible)
     warnings += _unseen(parameters, groups, free, touched)
     report = StageReport(
-        stage.name, "fitted" if solution.converged else "not converged", solution.message,
-        trials=tuple(t for e in reads for t in stacks[e].trials), rows=solution.rows,
-        chi2_per_row=2 * solution.cost / max(1, solution.rows - free.size), outliers=solution.outliers,
+        stage.name,
+        "fitted" if solution.converged else "not converged",
+        solution.message,
+        trials=tuple(t for e in reads for t in stacks[e].trials),
+        rows=solution.rows,
+        chi2_per_row=2 * solution.cost / max(1, solution.rows - free.size),
+        outliers=solution.outliers,
         warnings=tuple(warnings),
     )
     estimated = np.union1d(fit.estimated, free).astype(int)

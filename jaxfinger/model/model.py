@@ -57,9 +57,7 @@ class Effect(eqx.Module):
         """Share of the friction that is built up, in [−1, 1], in place of the sign of the motion."""
         return joint, tendon
 
-    def coupling(
-        self, x: Motion, f: Float[Array, "n *T"], C: Float[Array, "n m *T"]
-    ) -> Float[Array, "n m *T"]:
+    def coupling(self, x: Motion, f: Float[Array, "n *T"], C: Float[Array, "n m *T"]) -> Float[Array, "n m *T"]:
         """Coupling matrix C, m/rad."""
         return C
 
@@ -97,7 +95,12 @@ class Model(eqx.Module):
 
     @classmethod
     def zeros(
-        cls, finger: Finger, *, moment_arm_degree: int = 4, cross: bool = False, elastic_degree: int = 2,
+        cls,
+        finger: Finger,
+        *,
+        moment_arm_degree: int = 4,
+        cross: bool = False,
+        elastic_degree: int = 2,
         friction_degree: int = 2,
     ) -> "Model":
         """The rigid body alone: no moment arms, no joint torque, no tendon friction."""
