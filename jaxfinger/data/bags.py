@@ -69,7 +69,7 @@ def _rosbag_messages(path: Path) -> Iterator[tuple[str, int, Any]]:
 
 
 def _mcap_messages(path: Path) -> Iterator[tuple[str, int, Any]]:
-    """Messages in JSON, or in CDR with the ROS 2 definition that the file carries. A file cut short is read to the cut."""
+    """Messages in JSON, or in CDR by the definition that the file carries. A file cut short is read to the cut."""
     from mcap.exceptions import EndOfFile
     from mcap.reader import NonSeekingReader
 

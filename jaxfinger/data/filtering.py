@@ -24,6 +24,7 @@ from jaxfinger.errors import UserError
 
 _PASSES = (np.sqrt(2.0) - 1.0) ** -0.25
 _EVEN = 1e-3  # intervals this equal (relative) need no resampling
+_SMALL = 1e-4  # of a column's travel: what bends away from its running median by less is no spike
 
 
 def smooth(
@@ -136,8 +137,16 @@ def outlier_mask(x: Float[np.ndarray, N * k], threshold: float = 8.0, longest: i
 def _spikes(values: Float[np.ndarray, " N"], threshold: float, longest: int) -> Bool[np.ndarray, " N"]:
     rough = values - median_filter(values, size=2 * longest + 1, mode="nearest")
     # A steady motion is its own running median: there the second difference, of variance 6 sigma^2, shows the noise.
-    noise = max(_robust_std(rough), _robust_std(np.diff(values, 2)) / np.sqrt(6.0), _step(values))
-    return np.abs(rough) > threshold * noise
+    noise = max(
+        _robust_std(rough), _robust_std(np.diff(values, 2)) / np.sqrt(6.0), _step(values), _SMALL * np.ptp(values)
+    )
+    suspect = np.abs(rough) > threshold * noise
+    if not suspect.any() or suspect.all():
+        return suspect
+    # Two spikes in one window shift its median, and a fast motion then looks far from it: judge again without them.
+    samples = np.arange(len(values))
+    bridged = np.interp(samples, samples[~suspect], values[~suspect])
+    return np.abs(values - median_filter(bridged, size=2 * longest + 1, mode="nearest")) > threshold * noise
 
 
 def _robust_std(values: Float[np.ndarray, " N"]) -> float:

@@ -257,14 +257,12 @@ def _term(spec: Any, time: np.ndarray | None, units: str, variables: Variables, 
         clock = _variable({"from": spec["time"]}, variables, where / "time")
         if len(clock) != len(values):
             where.fail(
-                f"has {len(values)} samples, and its clock {spec['time']!r} has {len(clock)}; name the clock it was logged by"
+                f"has {len(values)} samples, and its clock {spec['time']!r} has {len(clock)}; name its own clock"
             )
         if time is not None:
             values = np.interp(time, clock, values)
     if time is not None and len(values) != len(time):
-        where.fail(
-            f"has {len(values)} samples where the trial's time has {len(time)}; give it a `time` of its own to interpolate"
-        )
+        where.fail(f"has {len(values)} samples where the trial's time has {len(time)}; give it its own `time`")
     return values
 
 
