@@ -10,6 +10,8 @@ with the joints' rates first and the tendons' after. Gauss–Seidel projection s
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -44,35 +46,48 @@ class Simulator:
         return tuple(np.asarray(x).T for x in outputs)  # type: ignore[return-value]
 
     def _simulate(self, q0, dt, controller: Controller):
-        def sample(state, target):
-            q, v, tension, impulse = state
-            tension = controller.tension(self.specimen, q, v, tension, target, dt)
+        def sample(carry, target):
+            state, tension = carry
+            tension = controller.tension(self.specimen, state.q, state.v, tension, target, dt)
 
             def substep(_, state):
-                return step(self.specimen, self.finger, *state, tension, dt / SUBSTEPS)
+                return step(self.specimen, self.finger, state, tension, dt / SUBSTEPS)
 
-            q_next, v_next, impulse = jax.lax.fori_loop(0, SUBSTEPS, substep, (q, v, impulse))
-            return (q_next, v_next, tension, impulse), (q, v, tension)
+            return (jax.lax.fori_loop(0, SUBSTEPS, substep, state), tension), (state.q, state.v, tension)
 
-        frictions = self.finger.m + self.finger.n
-        start = (q0, jnp.zeros_like(q0), controller.targets.tension[0], jnp.zeros(frictions))
+        start = at_rest(self.finger, q0), controller.targets.tension[0]
         return jax.lax.scan(sample, start, controller.targets)[1]
 
 
-def step(specimen: Specimen, finger: Finger, q, v, impulse, tension, h):
-    """One step of h s: position, velocity and friction impulses (joints, then tendons) after it."""
-    middle = q + 0.5 * h * v
+class State(NamedTuple):
+    """Position, rad, velocity now and a step before, rad/s, and friction impulses of joints, then tendons."""
+
+    q: Float[Array, " m"]
+    v: Float[Array, " m"]
+    v_before: Float[Array, " m"]
+    impulse: Float[Array, " m+n"]  # N m s and N s
+
+
+def at_rest(finger: Finger, q: Float[Array, " m"]) -> State:
+    """Nothing moves and nothing rubs yet."""
+    return State(q, jnp.zeros_like(q), jnp.zeros_like(q), jnp.zeros(finger.m + finger.n))
+
+
+def step(specimen: Specimen, finger: Finger, state: State, tension: Float[Array, " n"], h: float) -> State:
+    """One step of h s. Forces that depend on velocity take it extrapolated to the middle of the step."""
+    q, v, v_before, impulse = state
+    middle, v_middle = q + 0.5 * h * v, 1.5 * v - 0.5 * v_before
     C = specimen.moment_arm(middle)
-    M, bias = _mass_and_bias(finger, middle, v)
-    resisting = bias + specimen.elastic(middle) + specimen.viscous(v)
+    M, bias = _mass_and_bias(finger, middle, v_middle)
+    resisting = bias + specimen.elastic(middle) + specimen.viscous(v_middle)
     M_inv = jnp.linalg.inv(M)
     free = v + h * M_inv @ (C.T @ tension - resisting)
 
     D = jnp.concatenate([jnp.eye(v.size), C])
     limit = h * jnp.concatenate([specimen.coulomb(middle), specimen.loss(tension)])
     impulse = friction_impulse(D @ M_inv @ D.T, D @ free, limit, impulse)
-    v = free - M_inv @ (D.T @ impulse)
-    return middle + 0.5 * h * v, v, impulse
+    v_after = free - M_inv @ (D.T @ impulse)
+    return State(middle + 0.5 * h * v_after, v_after, v, impulse)
 
 
 def _mass_and_bias(finger: Finger, q, v):

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from jaxfinger.errors import UserError
 from jaxfinger.model import rigid_body
 from jaxfinger.model.finger import Finger
-from jaxfinger.synthetic.controller import feedforward
+from jaxfinger.synthetic.controller import Controller, feedforward
 from jaxfinger.synthetic.driven import QUICK, Simulator
 from jaxfinger.synthetic.protocols import TrialPlan
 from jaxfinger.synthetic.specimen import Specimen
@@ -66,9 +66,8 @@ class SpecimenPlant:
         Raises:
             UserError: the motion leaves the joints' limits.
         """
-        needed = self._rigid_body(plan.q, plan.qd, plan.qdd)
-        controller = feedforward(self.specimen, plan, needed)
-        q, _, tension = self._simulator(plan.q[:, 0], float(plan.time[1] - plan.time[0]), controller)
+        dt = float(plan.time[1] - plan.time[0])
+        q, _, tension = self.simulator(plan.q[:, 0], dt, self.controller(plan))
         limits = self.specimen.description.limits
         within = ((q >= limits[:, :1]) & (q <= limits[:, 1:])).all(axis=1)
         if not within.all():
@@ -99,8 +98,13 @@ class SpecimenPlant:
         _, jacobian = self._fingertip(self.finger, jnp.asarray(pose[:, 0]))
         return np.linalg.pinv(np.asarray(jacobian).T, rcond=1e-9) @ torque
 
+    def controller(self, plan: TrialPlan) -> Controller:
+        """The rig's controller for a VD.3 plan."""
+        return feedforward(self.specimen, plan, self._rigid_body(plan.q, plan.qd, plan.qdd))
+
     @cached_property
-    def _simulator(self) -> Simulator:
+    def simulator(self) -> Simulator:
+        """Forward simulation of the specimen."""
         return Simulator(self.specimen, self.finger)
 
     @cached_property

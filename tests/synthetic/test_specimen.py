@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxfinger.model import Motion, external_torque
+from jaxfinger.model import Motion, external_torque, rigid_body
 from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger, random_finger
 from jaxfinger.synthetic.routes import WrappedRoute
 
@@ -98,8 +98,6 @@ def test_polynomial_finger_is_exactly_the_nominal_model():
     x = Motion(np.zeros(30), q, 0.3 + zero, zero, f, 1.0 + zero, np.ones_like(f), np.zeros(30), zero)
     at_rest = Motion(np.zeros(30), q, zero, zero, 0.0 * f, zero, np.ones_like(f), np.zeros(30), zero)
     difference = np.asarray(external_torque(model, x) - external_torque(model, at_rest))
-    from jaxfinger.model import rigid_body
-
     moving = np.asarray(rigid_body.coriolis(model.finger, q, 0.3 + zero))
     expected = moving + specimen.viscous(0.3 + zero) + specimen.coulomb(q)
     expected -= np.einsum("nmt,nt->mt", specimen.moment_arm(q), f - specimen.loss(f))

@@ -1,0 +1,135 @@
+"""The driven finger: dry friction that is not smoothed, and where the energy goes."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfinger.errors import UserError
+from jaxfinger.model import Finger, rigid_body
+from jaxfinger.synthetic import SpecimenPlant, paper_finger, recipe_from, session_plan
+from jaxfinger.synthetic.driven import QUICK, at_rest, friction_impulse, step
+from jaxfinger.synthetic.specimen import GrowingFriction
+
+SPECIMEN = paper_finger()
+FINGER = Finger.from_description(SPECIMEN.description)
+
+
+def _potential(q):
+    """Gravity and springs, J, by plane geometry."""
+    d = SPECIMEN.description
+    pitch = np.cumsum(q, axis=0)
+    height, energy = np.zeros(q.shape[1]), SPECIMEN.elastic_energy(q)
+    for i in range(3):
+        energy = energy - d.mass[i] * d.gravity[2] * (height - d.com[i, 0] * np.sin(pitch[i]))
+        height = height - (d.origin[i + 1, 0] if i < 2 else 0.0) * np.sin(pitch[i])
+    return energy
+
+
+def _energy(q, v):
+    M = np.asarray(jax.jit(rigid_body.mass_matrix, compiler_options=QUICK)(FINGER, jnp.asarray(q)))
+    return 0.5 * np.einsum("it,ijt,jt->t", v, M, v) + _potential(q)
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """Plan, plant, and a driven trial with its velocity."""
+    recipe = recipe_from({"trials": {"experiments": ["VD.3"], "vd3": {"motions": 1, "duration": 3.0}}})
+    plan = session_plan(SPECIMEN.description, recipe.trials)[0]
+    plant = SpecimenPlant(SPECIMEN)
+    controller = plant.controller(plan)
+    return plan, plant, plant.simulator(plan.q[:, 0], plan.time[1], controller)
+
+
+def test_tendons_move_every_joint_along_the_plan(driven):
+    plan, _, (q, v, tension) = driven
+    assert np.abs(q - plan.q).max() < 0.1
+    assert (np.ptp(q, axis=1) > 0.15).all()
+    assert (np.mean(np.abs(v) > 1e-3, axis=1) > 0.7).all()
+    active = SPECIMEN.description.active
+    assert (tension[active] >= 0.99).all()
+    assert tension[active].max() < 20.0
+    assert not tension[~active].any()
+
+
+def test_work_of_the_tendons_is_stored_or_lost_to_friction(driven):
+    plan, _, (q, v, tension) = driven
+    dt = plan.time[1]
+    middle, rate = 0.5 * (q[:, 1:] + q[:, :-1]), np.diff(q, axis=1) / dt
+    pulled = np.diff(SPECIMEN.excursion(q), axis=1)
+    f = tension[:, :-1]  # acts from this sample to the next
+    work = (f * pulled).sum()
+    joints = (SPECIMEN.coulomb(middle) * np.abs(rate)).sum() * dt
+    tendons = (SPECIMEN.loss(f) * np.abs(pulled)).sum()
+    damping = (SPECIMEN.viscous(rate) * rate).sum() * dt
+    stored = np.diff(_energy(q[:, [0, -1]], v[:, [0, -1]]))[0]
+    lost = joints + tendons + damping
+    assert lost > 0.01
+    assert work == pytest.approx(stored + lost, rel=0.01)
+
+
+def test_frictionless_undriven_finger_keeps_its_energy():
+    free = replace(
+        SPECIMEN,
+        friction=GrowingFriction((0.0,) * 3, (0.0,) * 3),
+        damping=(0.0,) * 3,
+        loss_constant=(0.0,) * 5,
+        loss_proportional=(0.0,) * 5,
+    )
+
+    start = at_rest(FINGER, jnp.array([0.6, 0.4, 0.7]))
+    advance = jax.jit(lambda state, h: step(free, FINGER, state, jnp.zeros(5), h), compiler_options=QUICK)
+
+    def drift(h):
+        """Change of energy over 50 ms of free motion, as a share of what became kinetic."""
+        state = start
+        for _ in range(round(0.05 / h)):
+            state = advance(state, h)
+        q, v = (np.stack(x, axis=1) for x in ((start.q, state.q), (start.v, state.v)))
+        return abs(np.diff(_energy(q, v))[0]) / np.diff(_potential(q))[0] * -1
+
+    coarse, fine = drift(5e-4), drift(2.5e-4)
+    assert 0 < coarse < 5e-3
+    assert fine < 0.4 * coarse  # second order
+
+
+def test_finger_sticks_where_friction_can_hold_it():
+    """Between the tensions that pull it up and let it down, nothing moves at all."""
+    advance = jax.jit(lambda state, f: step(SPECIMEN, FINGER, state, f, 5e-4), compiler_options=QUICK)
+    q0 = np.deg2rad([[55.0], [50.0], [40.0]])
+    zero = np.zeros_like(q0)
+    resisting = np.asarray(rigid_body.inverse_dynamics(FINGER, q0, zero, zero)) + SPECIMEN.elastic(q0)
+    C = SPECIMEN.moment_arm(q0)[:, :, 0]
+    tension = np.array([*np.linalg.lstsq(C[:3].T, resisting[:, 0], rcond=None)[0], 0.0, 0.0])
+    assert (tension[:3] > 0).all()
+    state = at_rest(FINGER, jnp.asarray(q0[:, 0]))
+    for shift in (0.0, 0.3, -0.3):
+        state = advance(state, jnp.asarray(tension + np.array([0, 0, shift, 0, 0])))
+        assert np.abs(state.v).max() < 1e-9
+    state = advance(state, jnp.asarray(tension + np.array([0, 0, 8.0, 0, 0])))
+    assert state.v[0] > 1e-3
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_friction_impulses_oppose_sliding_and_nothing_else(seed):
+    """Coulomb's law: below its limit where nothing slides, at its limit and against the motion where it does."""
+    rng = np.random.default_rng(seed)
+    D = np.vstack([np.eye(3), rng.uniform(-0.01, 0.01, (4, 3))])
+    root = rng.standard_normal((3, 3))
+    A = D @ (root @ root.T + np.eye(3)) @ D.T
+    limit, rates = rng.uniform(0.0, 1.0, 7) * np.r_[np.ones(3), 50 * np.ones(4)], D @ rng.standard_normal(3) * 3
+    impulse = np.asarray(friction_impulse(jnp.asarray(A), jnp.asarray(rates), jnp.asarray(limit), jnp.zeros(7)))
+    left = rates - A @ impulse
+    assert (np.abs(impulse) <= limit + 1e-12).all()
+    sliding = np.abs(left) > 1e-6
+    assert np.abs(impulse[sliding]) == pytest.approx(limit[sliding], rel=1e-6)
+    assert (np.sign(impulse[sliding]) == np.sign(left[sliding])).all()
+
+
+def test_motion_beyond_the_limits_is_refused(driven):
+    plan, plant, _ = driven
+    far = replace(plan, q=plan.q + np.array([[0.0], [1.2], [0.0]]))
+    with pytest.raises(UserError, match="beyond its limits; lower"):
+        plant.driven(far)
