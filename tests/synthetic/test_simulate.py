@@ -1,0 +1,167 @@
+"""Whole sessions: reproducible, in the format, from any plant; recipes with mistakes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxfinger.data import EXPERIMENTS, check_file, read_session, write_session
+from jaxfinger.errors import UserError
+from jaxfinger.synthetic import (
+    clean_session,
+    measure,
+    paper_finger,
+    read_recipe,
+    recipe_from,
+    session_plan,
+    simulate,
+    simulate_many,
+)
+
+QUICK_TRIALS = {
+    "rate": 50.0,
+    "experiments": [e for e in EXPERIMENTS if e != "VD.3"],
+    "id2": {"stroke_time": 1.0, "strokes": 2},
+    "vd1": {"motions": 1, "duration": 4.0},
+}
+SHIPPED = Path(__file__).parents[2] / "datasets" / "paper-finger"
+CHANNELS = ("time", "q", "tendon_force", "tendon_excursion", "joint_torque", "fingertip_force")
+
+
+def _same(one, other):
+    return all(
+        np.array_equal(getattr(a, c), getattr(b, c), equal_nan=True)
+        for a, b in zip(one, other, strict=True)
+        for c in CHANNELS
+        if getattr(a, c) is not None
+    )
+
+
+def _errors(path):
+    return [f for f in check_file(path) if f.severity == "error"]
+
+
+@pytest.fixture(scope="module")
+def clean():
+    return clean_session(recipe_from({"trials": QUICK_TRIALS}))
+
+
+def test_a_seed_makes_a_session(clean):
+    assert _same(measure(clean, 3), measure(clean, 3))
+    assert not _same(measure(clean, 3), measure(clean, 4))
+    assert _same(next(simulate_many(clean.recipe, [3])), measure(clean, 3))
+
+
+def test_repeats_differ_by_noise_alone(clean):
+    session = measure(clean, 0)
+    first, second = list(session.select("ID.3-dynamic"))[:2]
+    assert first.motion == second.motion
+    difference = (first.joint_torque - second.joint_torque)[:, 0]
+    assert difference.std() == pytest.approx(np.sqrt(2) * 3e-4, rel=0.15)
+    assert abs(difference.mean()) < 1e-4
+
+
+def test_noise_is_independent_from_trial_to_trial(clean):
+    a, b = (t.q[:200, 2] - t.q[:200, 2].mean() for t in list(measure(clean, 0).select("ID.2"))[:2])
+    assert abs(np.corrcoef(a, b)[0, 1]) < 0.4
+
+
+@pytest.mark.parametrize(
+    "specimen",
+    [
+        {"kind": "paper", "passive_tendon": True},
+        {"kind": "polynomial"},
+        {"kind": "random", "seed": 7, "joints": 4, "layout": "abduction"},
+        {"kind": "random", "seed": 8, "joints": 1, "tendons": "fewest"},
+    ],
+    ids=lambda s: f"{s['kind']}-{s.get('joints', 3)}",
+)
+def test_sessions_follow_the_format(specimen, tmp_path):
+    session = simulate(recipe_from({"specimen": specimen, "trials": QUICK_TRIALS, "cad": {"mass": 0.01}}), seed=1)
+    path = tmp_path / "session.h5"
+    write_session(session, path)
+    assert not _errors(path)
+    assert _same(read_session(path), session)
+
+
+def test_driven_session_follows_the_format(tmp_path):
+    recipe = recipe_from({"trials": {"experiments": ["VD.3"], "vd3": {"motions": 2, "duration": 1.5}}})
+    steps = []
+    session = simulate(recipe, seed=1, progress=lambda *step: steps.append(step))
+    write_session(session, tmp_path / "session.h5")
+    assert not _errors(tmp_path / "session.h5")
+    assert [s[:2] for s in steps] == [(0, 2), (1, 2)]
+    trial = session["01-VD.3-a"]
+    assert np.ptp(trial.q, axis=0).min() > 0.05
+    assert trial.joint_torque is None
+
+
+def test_spikes_reach_the_session():
+    recipe = recipe_from({"trials": QUICK_TRIALS | {"experiments": ["ID.3-static"]}, "sensors": {"outliers": 0.02}})
+    force = next(iter(simulate(recipe))).tendon_force[:, :4]
+    assert (np.abs(force) > 0.27).mean() == pytest.approx(0.02, abs=0.008)
+
+
+def test_any_model_can_stand_in_for_the_finger():
+    """A plant that predicts prescribed channels is recorded by the same rig."""
+
+    class Rope:
+        def prescribed(self, plan):
+            return {
+                "q": plan.q,
+                "tendon_force": plan.tension,
+                "tendon_excursion": 0.01 * np.repeat(plan.q[:1], 5, axis=0),
+            }
+
+        def driven(self, plan):
+            raise NotImplementedError
+
+    recipe = recipe_from({"trials": QUICK_TRIALS | {"experiments": ["VD.1"]}})
+    trial = next(iter(simulate(recipe, plant=Rope())))
+    l = trial.tendon_excursion[:, 0] - 0.01 * trial.q[:, 0]
+    assert (l - l.mean()).std() == pytest.approx(1e-5, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ({"sensor": {}}, r"top level: unknown key \(sensor\)"),
+        ({"sensors": {"q": {"stdd": 1}}}, r"sensors\.q: unknown key \(stdd\)"),
+        ({"trials": {"rate": "fast"}}, r"trials\.rate: .*expected float"),
+        ({"trials": {"rate": 0}}, "greater than zero"),
+        ({"trials": {"id4": {"tensions": []}}}, "at least one number"),
+        ({"trials": {"experiments": ["ID.9"]}}, "choose from"),
+        ({"specimen": {"kind": "cadaver"}}, r"specimen\.kind: .*cadaver"),
+        ({"sensors": {"outliers": 2}}, "between 0 and 1"),
+        ({"seed": 1.5}, "seed: .*expected int"),
+        ({"specimen": {"passive_tendon": 1}}, "passive_tendon: .*expected bool"),
+    ],
+)
+def test_mistakes_in_a_recipe_are_named(table, said):
+    with pytest.raises(UserError, match=said):
+        recipe_from(table)
+
+
+def test_too_many_joints():
+    with pytest.raises(UserError, match="choose 1 to 7"):
+        simulate(recipe_from({"specimen": {"kind": "random", "joints": 8}}))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"), [(None, "cannot be read"), ("a = ", "is not TOML"), ("[trial]", "unknown key")]
+)
+def test_files_that_are_no_recipe(tmp_path, text, said):
+    path = tmp_path / "recipe.toml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(UserError, match=rf"recipe\.toml.*{said}"):
+        read_recipe(path)
+
+
+def test_shipped_session_is_the_shipped_recipe():
+    recipe = read_recipe(SHIPPED / "recipe.toml")
+    session = read_session(SHIPPED / "session.h5")
+    assert not _errors(SHIPPED / "session.h5")
+    assert list(session.trials) == [p.name for p in session_plan(paper_finger().description, recipe.trials)]
+    assert (SHIPPED / "session.h5").stat().st_size < 1.9e6
+    assert {t.experiment for t in session} == set(EXPERIMENTS)
