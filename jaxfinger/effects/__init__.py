@@ -1,1 +1,62 @@
-"""."""
+"""The catalogue of effects that the nominal model leaves out. Adding one touches one file: see `docs/add-an-effect.md`."""
+
+import importlib.util
+import inspect
+from pathlib import Path
+
+from jaxfinger.effects import body, joint, nominal, sensors, tendon, transmission
+from jaxfinger.effects.base import CatalogueEffect, Site
+from jaxfinger.errors import UserError
+from jaxfinger.model import Effect, Finger
+
+
+def _effects_in(module) -> dict[str, type[CatalogueEffect]]:
+    return {
+        c.ID: c
+        for _, c in inspect.getmembers(module, inspect.isclass)
+        if issubclass(c, CatalogueEffect) and "ID" in c.__dict__ and c.__module__ == module.__name__
+    }
+
+
+CATALOGUE: dict[str, type[CatalogueEffect]] = {}
+for _module in (joint, tendon, transmission, body, sensors):
+    CATALOGUE |= _effects_in(_module)
+NOMINAL_TERMS = _effects_in(nominal)  # candidates only where a recipe leaves the term out
+
+
+def load(path: str | Path) -> dict[str, type[CatalogueEffect]]:
+    """The effects that a user's Python file defines, by id. UserError where it cannot be loaded or defines none."""
+    path = Path(path)
+    spec = importlib.util.spec_from_file_location(f"jaxfinger_user_{path.stem}", path)
+    if spec is None or spec.loader is None or not path.exists():
+        raise UserError(f"{path}: is not a Python file with effects")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as e:
+        raise UserError(f"{path}: cannot be loaded: {type(e).__name__}: {e}") from e
+    found = _effects_in(module)
+    if not found:
+        raise UserError(f"{path}: defines no effect; subclass jaxfinger.effects.CatalogueEffect and give it an ID")
+    return found
+
+
+def to_dict(effect: Effect) -> dict:
+    """An effect as a result file holds it."""
+    if not isinstance(effect, CatalogueEffect):
+        raise TypeError(f"{type(effect).__name__} is no effect of the catalogue")
+    units = effect.units()
+    parameters = {k: {"value": v, "units": units[k]} for k, v in effect.values().items()}
+    return {"effect": effect.ID, "site": list(effect.site), "parameters": parameters}
+
+
+def from_dict(finger: Finger, content: dict, extra: dict[str, type[CatalogueEffect]] | None = None) -> CatalogueEffect:
+    """The effect that `to_dict` described."""
+    known = CATALOGUE | NOMINAL_TERMS | (extra or {})
+    if content["effect"] not in known:
+        raise UserError(f"the effect {content['effect']!r} is not in the catalogue; load the file that defines it")
+    values = {k: v["value"] for k, v in content["parameters"].items()}
+    return known[content["effect"]].at(finger, tuple(content["site"]), **values)
+
+
+__all__ = ["CATALOGUE", "NOMINAL_TERMS", "CatalogueEffect", "Site", "from_dict", "load", "to_dict"]

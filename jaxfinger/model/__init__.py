@@ -5,12 +5,15 @@ import jax
 jax.config.update("jax_enable_x64", True)
 
 from jaxfinger.model.dynamics import (  # noqa: E402
+    contact_map,
     elastic_and_friction,
     excursion,
     external_torque,
     fingertip_force,
     joint_tension,
     memories,
+    resisting_torque,
+    rigid_body_torque,
 )
 from jaxfinger.model.finger import Finger  # noqa: E402
 from jaxfinger.model.joint_torque import JointTorque  # noqa: E402
@@ -28,6 +31,7 @@ __all__ = [
     "MomentArm",
     "Motion",
     "TendonFriction",
+    "contact_map",
     "elastic_and_friction",
     "excursion",
     "external_torque",
@@ -35,5 +39,7 @@ __all__ = [
     "forward_dynamics",
     "joint_tension",
     "memories",
+    "resisting_torque",
+    "rigid_body_torque",
     "simulate",
 ]

@@ -34,19 +34,19 @@ class Terms(NamedTuple):
 
 def memories(model: Model, x: Motion) -> tuple[Memory, ...]:
     """State of every effect with memory at each sample, driven along the motion's last axis."""
-    return tuple(_along(effect, x) if effect.has_memory else () for effect in model.effects)
+    return tuple(_along(model, effect, x) if effect.has_memory else () for effect in model.effects)
 
 
-def _along(effect, x: Motion) -> Memory:
+def _along(model: Model, effect, x: Motion) -> Memory:
     samples = jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), x)
     first = jax.tree.map(lambda a: a[0], samples)
 
     def step(carry, sample):
         memory, before = carry
-        memory = effect.next_memory(memory, before, sample)
+        memory = effect.next_memory(model, memory, before, sample)
         return (memory, sample), memory
 
-    _, memory = jax.lax.scan(step, (effect.initial_memory(first), first), samples)
+    _, memory = jax.lax.scan(step, (effect.initial_memory(model, first), first), samples)
     return jax.tree.map(lambda a: jnp.moveaxis(a, 0, -1), memory)
 
 
@@ -67,7 +67,12 @@ def terms(model: Model, x: Motion, memory: tuple[Memory, ...]) -> Terms:
     for effect, _ in effects:
         loss = effect.loss(x, f_t, C, loss)
     loss = bounded(loss, f_t)
-    f_j = held(f_t, loss) if x.held else f_t - tendon_direction * loss
+    if x.held:
+        f_j = held(f_t, loss)
+        for effect, state in effects:
+            f_j = effect.held_tension(x, state, f_t, loss, f_j)
+    else:
+        f_j = f_t - tendon_direction * loss
 
     h = model.joint_torque.elastic_torque(x.q) + model.joint_torque.damping_torque(x.qd)
     friction = model.joint_torque.friction_magnitude(x.q)
@@ -77,13 +82,25 @@ def terms(model: Model, x: Motion, memory: tuple[Memory, ...]) -> Terms:
     return Terms(finger, f_t, C, loss, f_j, h, friction, direction, tendon_direction)
 
 
+def resisting_torque(model: Model, x: Motion) -> Float[Array, "m *T"]:
+    """h − Cᵀ(f_t − f_f): all of (1) but the rigid body and the surroundings, N m."""
+    e = terms(model, x, memories(model, x))
+    return e.h + e.direction * e.friction - jnp.sum(e.C * e.f_j[:, None], axis=0)
+
+
+def rigid_body_torque(model: Model, x: Motion) -> Float[Array, "m *T"]:
+    """M q̈ + N + G of the finger as the effects have it, N m."""
+    finger = model.finger
+    for effect in model.effects:
+        finger = effect.finger(finger)
+    return rigid_body.inverse_dynamics(finger, x.q, x.qd, x.qdd)
+
+
 def external_torque(model: Model, x: Motion, f_ext: Float[Array, "3 *T"] | None = None) -> Float[Array, "m *T"]:
     """τ_ext of (1): the torque that must act on the joints from outside for the motion to be as it is, N m."""
-    e = terms(model, x, memories(model, x))
-    tau = rigid_body.inverse_dynamics(e.finger, x.q, x.qd, x.qdd) + e.h + e.direction * e.friction
-    tau = tau - jnp.sum(e.C * e.f_j[:, None], axis=0)
+    tau = rigid_body_torque(model, x) + resisting_torque(model, x)
     if f_ext is not None:
-        _, J = rigid_body.fingertip(e.finger, x.q)
+        _, J = rigid_body.fingertip(model.finger, x.q)
         tau = tau - jnp.sum(J * f_ext[:, None], axis=0)
     return tau
 
@@ -94,14 +111,17 @@ def fingertip_force(model: Model, x: Motion) -> Float[Array, "3 *T"]:
     The joints over-determine a planar contact force; what it cannot take is taken by the joints' static friction. A
     direction in which the fingertip cannot be moved carries no force.
     """
-    tau = external_torque(model, x)
+    return jnp.sum(contact_map(model, x) * external_torque(model, x)[None], axis=1)
+
+
+def contact_map(model: Model, x: Motion) -> Float[Array, "3 m *T"]:
+    """Pseudo-inverse of Jᵀ: the fingertip force that balances joint torques best, N/(N m)."""
     _, J = rigid_body.fingertip(model.finger, x.q)
     # (J Jᵀ + ε I) f = J τ, the minimum-norm solution as ε → 0.
     gram = jnp.sum(J[:, None] * J[None], axis=2)
     eps = 1e-10 * (gram[0, 0] + gram[1, 1] + gram[2, 2])
     matrix = jnp.moveaxis(gram, (0, 1), (-2, -1)) + eps[..., None, None] * jnp.eye(3)
-    rhs = jnp.moveaxis(jnp.sum(J * tau[None], axis=1), 0, -1)
-    return jnp.moveaxis(jnp.linalg.solve(matrix, rhs[..., None])[..., 0], -1, 0)
+    return jnp.moveaxis(jnp.linalg.solve(matrix, jnp.moveaxis(J, (0, 1), (-2, -1))), (-2, -1), (0, 1))
 
 
 def excursion(model: Model, x: Motion) -> Float[Array, "n *T"]:

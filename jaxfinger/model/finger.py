@@ -18,6 +18,7 @@ class Description(Protocol):
     com: Array
     inertia: Array
     fingertip: Array
+    limits: Array
     prismatic: tuple[bool, ...]
     joint_names: tuple[str, ...]
     tendon_names: tuple[str, ...]
@@ -39,6 +40,7 @@ class Finger(eqx.Module):
     com: Float[Array, "m 3"]  # m, in the link frame
     inertia: Float[Array, "m 3 3"]  # kg m², about the centre of mass
     fingertip: Float[Array, "3"]  # m, in the last link's frame
+    limits: tuple[tuple[float, float], ...] = eqx.field(static=True)  # rad
     prismatic: tuple[bool, ...] = eqx.field(static=True)
     joint_names: tuple[str, ...] = eqx.field(static=True)
     tendon_names: tuple[str, ...] = eqx.field(static=True)
@@ -54,6 +56,7 @@ class Finger(eqx.Module):
         }
         return cls(
             **arrays,
+            limits=tuple((float(a), float(b)) for a, b in d.limits),
             prismatic=tuple(bool(p) for p in d.prismatic),
             joint_names=tuple(d.joint_names),
             tendon_names=tuple(d.tendon_names),

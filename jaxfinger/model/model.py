@@ -34,11 +34,11 @@ class Effect(eqx.Module):
         return y
 
     # Memory.
-    def initial_memory(self, x: Motion) -> Memory:
+    def initial_memory(self, model: "Model", x: Motion) -> Memory:
         """State at the first sample `x`."""
         return ()
 
-    def next_memory(self, memory: Memory, before: Motion, x: Motion) -> Memory:
+    def next_memory(self, model: "Model", memory: Memory, before: Motion, x: Motion) -> Memory:
         """State at the sample `x`, one step after `before`."""
         return memory
 
@@ -66,6 +66,12 @@ class Effect(eqx.Module):
     ) -> Float[Array, "n *T"]:
         """Tension lost by a sliding tendon, N, before it is bounded by the tension."""
         return loss
+
+    def held_tension(
+        self, x: Motion, memory: Memory, f: Float[Array, "n *T"], loss: Float[Array, "n *T"], f_j: Float[Array, "n *T"]
+    ) -> Float[Array, "n *T"]:
+        """Tension f_j at joints that a fixture holds, N."""
+        return f_j
 
     def joint_friction(
         self, x: Motion, f_j: Float[Array, "n *T"], C: Float[Array, "n m *T"], F: Float[Array, "m *T"]

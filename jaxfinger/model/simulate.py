@@ -55,7 +55,7 @@ def simulate(
         return Motion(t, q, qd, jnp.zeros_like(q), f, unknown_m, unknown_n, t + session_start, jnp.zeros_like(q))
 
     x0 = motion(time[0], q0, qd0, tension[:, 0])
-    memory0 = tuple(effect.initial_memory(x0) for effect in model.effects)
+    memory0 = tuple(effect.initial_memory(model, x0) for effect in model.effects)
     state0 = _State(x0, memory0, jnp.zeros(model.finger.m + model.finger.n))
 
     def sample(state, inputs):
@@ -77,7 +77,9 @@ def _step(model: Model, state: _State, motion, t, f, tau, dt) -> _State:
     """One midpoint step: forces at the middle position, friction from the velocity that it leads to."""
     qd = state.x.qd
     x = motion(t, state.x.q + 0.5 * dt * qd, qd, f)
-    memory = tuple(effect.next_memory(m, state.x, x) for effect, m in zip(model.effects, state.memory, strict=True))
+    memory = tuple(
+        effect.next_memory(model, m, state.x, x) for effect, m in zip(model.effects, state.memory, strict=True)
+    )
     # A direction that no effect has resolved is NaN: its friction is solved for below.
     known = eqx.tree_at(lambda x: (x.joint_direction, x.tendon_direction), x, (jnp.zeros_like(qd), jnp.zeros_like(f)))
     e = terms(model, known, memory)

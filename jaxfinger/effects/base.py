@@ -1,0 +1,121 @@
+"""What every effect of the catalogue says of itself, so that others can look for it."""
+
+from itertools import combinations, permutations, product
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxfinger.model import Effect, Finger, Motion
+
+Site = tuple[str, ...]
+
+
+class CatalogueEffect(Effect):
+    """An effect with a name, the places where it can act, and its parameters.
+
+    Amplitudes enter (nearly) in proportion and vanish with the effect; shapes say how it acts and mean nothing without
+    an amplitude. A subclass declares each as a scalar array field, and in `AMPLITUDES` its unit, its plausible size and
+    whether it may be negative, in `SHAPES` its unit and the values worth trying. The site enters as indices, so that one
+    compilation serves every site and shape.
+    """
+
+    ID: ClassVar[str]
+    PLACE: ClassVar[str]  # joint, tendon, joint pair, tendon pair, channel, or the site's own name
+    AMPLITUDES: ClassVar[dict[str, tuple[str, float, bool]]]
+    SHAPES: ClassVar[dict[str, tuple[str, tuple[float, ...]]]] = {}
+    # Experiments and channels that can show the effect; everywhere else it is silent.
+    SHOWS: ClassVar[dict[str, tuple[str, ...]]]
+    # Whether it changes the rigid body or the motion that drives it, beside the other terms of (1).
+    MOVES_RIGID_BODY: ClassVar[bool] = False
+
+    site: Site = eqx.field(static=True)
+    index: Int[Array, " k"]
+
+    @classmethod
+    def at(cls, finger: Finger, site: Site, **values: float) -> Self:
+        """At a site of a finger; amplitudes default to zero, shapes to the first value worth trying."""
+        defaults = dict.fromkeys(cls.AMPLITUDES, 0.0) | {k: grid[0] for k, (_, grid) in cls.SHAPES.items()}
+        if unknown := set(values) - set(defaults):
+            raise TypeError(f"{cls.ID} has no parameter {sorted(unknown)}; it has {sorted(defaults)}")
+        fields = {k: jnp.asarray(v, dtype=float) for k, v in (defaults | values).items()}
+        return cls(
+            tuple(site), jnp.asarray(cls.place(finger, tuple(site)), dtype=int), **fields, **cls.constants(finger, site)
+        )
+
+    @classmethod
+    def place(cls, finger: Finger, site: Site) -> tuple[int, ...]:
+        """Indices of the site's joints, tendons or channel."""
+        match cls.PLACE:
+            case "joint" | "joint pair":
+                return tuple(finger.joint_names.index(s) for s in site)
+            case "tendon" | "tendon pair":
+                return tuple(finger.tendon_names.index(s) for s in site)
+        return ()
+
+    @classmethod
+    def constants(cls, finger: Finger, site: Site) -> dict[str, Any]:
+        """Further fields that the finger decides."""
+        return {}
+
+    @classmethod
+    def sites(cls, finger: Finger) -> list[Site]:
+        """Every place of a finger where the effect can act."""
+        active = [name for name, a in zip(finger.tendon_names, finger.active, strict=True) if a]
+        match cls.PLACE:
+            case "joint":
+                return [(j,) for j in finger.joint_names]
+            case "tendon":
+                return [(t,) for t in active]
+            case "joint pair":
+                return list(combinations(finger.joint_names, 2))
+            case "tendon pair":
+                return list(permutations(active, 2))
+            case place:
+                return [(place,)]
+
+    @classmethod
+    def shapes(cls, finger: Finger, site: Site) -> list[dict[str, float]]:
+        """Every combination of shapes worth trying at a site."""
+        names = list(cls.SHAPES)
+        return [dict(zip(names, v, strict=True)) for v in product(*(cls.SHAPES[n][1] for n in names))]
+
+    def units(self) -> dict[str, str]:
+        """Units of every parameter, amplitudes and shapes."""
+        return {k: v[0] for k, v in (self.AMPLITUDES | self.SHAPES).items()}
+
+    def values(self) -> dict[str, float]:
+        """Every parameter by name."""
+        return {k: float(getattr(self, k)) for k in (*self.AMPLITUDES, *self.SHAPES)}
+
+
+def step(before: Motion, x: Motion) -> Float[Array, "*T"]:
+    """Time between two samples, s."""
+    return x.time - before.time
+
+
+def dahl(z: Float[Array, "*T"], dx: Float[Array, "*T"], length: Float[Array, ""]) -> Float[Array, "*T"]:
+    """Share of the friction that is built up after a displacement: dz = (dx − |dx| z)/length, exactly (Dahl 1968)."""
+    target = jnp.sign(dx)
+    return target + (z - target) * jnp.exp(-jnp.abs(dx) / length)
+
+
+def rate(y: Float[Array, "*T"], time: Float[Array, "*T"]) -> Float[Array, "*T"]:
+    """Time derivative along the last axis by central differences; zero where time stands still."""
+    dy, dt = jnp.gradient(y, axis=-1), jnp.gradient(time, axis=-1)
+    return jnp.where(dt > 0, dy / jnp.where(dt > 0, dt, 1.0), 0.0)
+
+
+TORQUE = {"ID.3-static": ("joint_torque",), "ID.3-dynamic": ("joint_torque",), "VD.3": ("joint_torque",)}
+ELASTIC = TORQUE | {"ID.4": ("joint_torque",), "VD.2": ("fingertip_force",)}
+TENSION = {"ID.4": ("joint_torque",), "VD.2": ("fingertip_force",), "VD.3": ("joint_torque",)}
+EXCURSION = {e: ("tendon_excursion",) for e in ("ID.2", "VD.1", "ID.4", "VD.2", "VD.3")}
+BOTH = {
+    "ID.2": ("tendon_excursion",),
+    "VD.1": ("tendon_excursion",),
+    "ID.4": ("joint_torque", "tendon_excursion"),
+    "VD.2": ("fingertip_force", "tendon_excursion"),
+    "VD.3": ("joint_torque", "tendon_excursion"),
+}
+ALL = BOTH | TORQUE | {"VD.3": ("joint_torque", "tendon_excursion")}

@@ -1,0 +1,180 @@
+"""Joints: friction that falls with speed, builds up after a reversal or grows with load; elasticity that hardens,
+relaxes, meets a stop, or couples two joints through a passive tendon."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxfinger.effects.base import ELASTIC, TORQUE, CatalogueEffect, dahl, step
+
+
+class JointStribeck(CatalogueEffect):
+    """τ_f (1 + a exp(−(|q̇|/v_s)^δ)): friction falls with speed after breakaway (Armstrong-Hélouvry 1994)."""
+
+    ID: ClassVar = "joint_stribeck"
+    PLACE: ClassVar = "joint"
+    AMPLITUDES: ClassVar = {"a": ("1", 0.5, False)}
+    SHAPES: ClassVar = {"v_s": ("rad/s", (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)), "delta": ("1", (1.0, 2.0))}
+    SHOWS: ClassVar = TORQUE
+
+    a: Float[Array, ""]
+    v_s: Float[Array, ""]
+    delta: Float[Array, ""]
+
+    def joint_friction(self, x, f_j, C, F):
+        i = self.index[0]
+        speed = jnp.maximum(jnp.abs(x.qd[i]), 1e-12) / self.v_s
+        return F.at[i].add(self.a * F[i] * jnp.exp(-(speed**self.delta)))
+
+
+class JointPresliding(CatalogueEffect):
+    """After a reversal friction builds up over an angle x₀ instead of at once: dz = (dq − |dq| z)/x₀ (Dahl 1968).
+
+    `a` is the share of the friction that behaves so; 1 where all of it does.
+    """
+
+    ID: ClassVar = "joint_presliding"
+    PLACE: ClassVar = "joint"
+    AMPLITUDES: ClassVar = {"a": ("1", 1.0, False)}
+    SHAPES: ClassVar = {"x0": ("rad", (0.004, 0.008, 0.016, 0.03, 0.06, 0.12, 0.24))}
+    SHOWS: ClassVar = TORQUE
+    has_memory: ClassVar = True
+
+    a: Float[Array, ""]
+    x0: Float[Array, ""]
+
+    def initial_memory(self, model, x):
+        return jnp.zeros_like(x.q[self.index[0]])
+
+    def next_memory(self, model, memory, before, x):
+        i = self.index[0]
+        return dahl(memory, x.q[i] - before.q[i], self.x0)
+
+    def directions(self, x, memory, joint, tendon):
+        i = self.index[0]
+        sign = jnp.where(jnp.isnan(joint[i]), memory, joint[i])
+        built = jnp.where(joint[i] == 0, 0.0, (1 - self.a) * sign + self.a * memory)  # 0: a fixture carries it
+        return joint.at[i].set(built), tendon
+
+
+class JointLoadFriction(CatalogueEffect):
+    """μ Σ_k |c_k f_k|: joint friction grows with the load that the tendons press onto the joint (Palli 2014)."""
+
+    ID: ClassVar = "joint_load_friction"
+    PLACE: ClassVar = "joint"
+    AMPLITUDES: ClassVar = {"mu": ("1", 0.1, False)}
+    SHOWS: ClassVar = {"VD.3": ("joint_torque",)}
+
+    mu: Float[Array, ""]
+
+    def joint_friction(self, x, f_j, C, F):
+        i = self.index[0]
+        return F.at[i].add(self.mu * jnp.sum(jnp.abs(C[:, i] * f_j), axis=0))
+
+
+class _TowardsAnEnd(CatalogueEffect):
+    """Shared by what happens near one end of a joint's range: `end` is +1 for the upper one, −1 for the lower."""
+
+    @classmethod
+    def constants(cls, finger, site):
+        return {"limits": jnp.asarray(finger.limits[finger.joint_names.index(site[0])])}
+
+
+class ElasticHardening(_TowardsAnEnd):
+    """± τ_end exp(−d/w), d the angle to an end of the range: the joint stiffens exponentially towards it (Esteki 1996)."""
+
+    ID: ClassVar = "elastic_hardening"
+    PLACE: ClassVar = "joint"
+    AMPLITUDES: ClassVar = {"tau_end": ("N m", 0.02, False)}
+    SHAPES: ClassVar = {"width": ("rad", (0.1, 0.2, 0.4, 0.7)), "end": ("1", (1.0, -1.0))}
+    SHOWS: ClassVar = ELASTIC
+
+    tau_end: Float[Array, ""]
+    width: Float[Array, ""]
+    end: Float[Array, ""]
+    limits: Float[Array, "2"]
+
+    def torque(self, x, memory, h):
+        i = self.index[0]
+        distance = jnp.where(self.end > 0, self.limits[1] - x.q[i], x.q[i] - self.limits[0])
+        return h.at[i].add(self.end * self.tau_end * jnp.exp(-distance / self.width))
+
+
+class JointStop(_TowardsAnEnd):
+    """± k ⟨d⟩₊ (1 + c ḋ): contact with a stop inside the range, `place` of the way from the lower to the upper limit."""
+
+    ID: ClassVar = "joint_stop"
+    PLACE: ClassVar = "joint"
+    AMPLITUDES: ClassVar = {"stiffness": ("N m/rad", 0.1, False)}
+    SHAPES: ClassVar = {
+        "place": ("1", (0.55, 0.62, 0.69, 0.76, 0.82, 0.88, 0.94)),
+        "end": ("1", (1.0, -1.0)),
+        "damping": ("s/rad", (0.0,)),
+    }
+    SHOWS: ClassVar = ELASTIC
+
+    stiffness: Float[Array, ""]
+    place: Float[Array, ""]
+    end: Float[Array, ""]
+    damping: Float[Array, ""]
+    limits: Float[Array, "2"]
+
+    def torque(self, x, memory, h):
+        i = self.index[0]
+        low, high = self.limits
+        at = jnp.where(self.end > 0, low + self.place * (high - low), high - self.place * (high - low))
+        depth = jnp.maximum(self.end * (x.q[i] - at), 0.0)
+        force = self.stiffness * depth * jnp.maximum(1.0 + self.damping * self.end * x.qd[i], 0.0)
+        return h.at[i].add(self.end * force)
+
+
+class ElasticRelaxation(CatalogueEffect):
+    """ż = k q̇ − z/T: a Maxwell branch beside the elastic torque, which relaxes at a hold (standard linear solid)."""
+
+    ID: ClassVar = "elastic_relaxation"
+    PLACE: ClassVar = "joint"
+    AMPLITUDES: ClassVar = {"stiffness": ("N m/rad", 0.01, False)}
+    SHAPES: ClassVar = {"T": ("s", (0.1, 0.3, 1.0, 3.0, 10.0, 30.0))}
+    SHOWS: ClassVar = ELASTIC
+    has_memory: ClassVar = True
+
+    stiffness: Float[Array, ""]
+    T: Float[Array, ""]
+
+    def initial_memory(self, model, x):
+        return jnp.zeros_like(x.q[self.index[0]])
+
+    def next_memory(self, model, memory, before, x):
+        i, dt = self.index[0], step(before, x)
+        return memory * jnp.exp(-dt / self.T) + (x.q[i] - before.q[i]) * jnp.exp(-0.5 * dt / self.T)
+
+    def torque(self, x, memory, h):
+        return h.at[self.index[0]].add(self.stiffness * memory)
+
+
+class PassiveTendon(CatalogueEffect):
+    """An unmeasured elastic tendon over two joints, taut where x = q_a − ρ q_b − φ > 0: torques κx and −ρκx.
+
+    κ = k r_a², ρ = r_b/r_a, φ = l₀/r_a for a spring k on moment arms r_a, r_b with slack l₀ (Borghesan 2010).
+    """
+
+    ID: ClassVar = "passive_tendon"
+    PLACE: ClassVar = "joint pair"
+    AMPLITUDES: ClassVar = {"kappa": ("N m/rad", 0.05, False)}
+    SHAPES: ClassVar = {
+        "rho": ("1", (0.5, 0.8, 1.0, 1.3, 2.0)),
+        "phi": ("rad", (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5)),
+        "side": ("1", (1.0, -1.0)),
+    }
+    SHOWS: ClassVar = ELASTIC
+
+    kappa: Float[Array, ""]
+    rho: Float[Array, ""]
+    phi: Float[Array, ""]
+    side: Float[Array, ""]
+
+    def torque(self, x, memory, h):
+        a, b = self.index
+        tension = self.kappa * jnp.maximum(self.side * (x.q[a] - self.rho * x.q[b] - self.phi), 0.0)
+        return h.at[a].add(self.side * tension).at[b].add(-self.side * self.rho * tension)

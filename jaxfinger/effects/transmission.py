@@ -1,0 +1,117 @@
+"""Friction of the tendons' paths beyond the affine law, and tendons that drag one another."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxfinger.effects.base import TENSION, CatalogueEffect, dahl
+
+
+class TendonFrictionCapstan(CatalogueEffect):
+    """f (1 − exp(−μ θ(q))), θ = Σ |q_i| over the joints crossed: the loss grows with the wrap angle, so with posture."""
+
+    ID: ClassVar = "tendon_friction_capstan"
+    PLACE: ClassVar = "tendon"
+    AMPLITUDES: ClassVar = {"mu": ("1/rad", 0.1, False)}
+    SHOWS: ClassVar = TENSION
+
+    mu: Float[Array, ""]
+    crossed: Float[Array, " m"]
+
+    @classmethod
+    def constants(cls, finger, site):
+        return {"crossed": jnp.asarray(finger.crosses[finger.tendon_names.index(site[0])], dtype=float)}
+
+    def loss(self, x, f, C, loss):
+        k = self.index[0]
+        wrap = jnp.sum(self.crossed.reshape(-1, *(1,) * (x.q.ndim - 1)) * jnp.abs(x.q), axis=0)
+        return loss.at[k].add(f[k] * (1.0 - jnp.exp(-self.mu * wrap)))
+
+
+class TendonFrictionViscous(CatalogueEffect):
+    """b |l̇|: friction grows with the tendon's speed (sheath, lubricant)."""
+
+    ID: ClassVar = "tendon_friction_viscous"
+    PLACE: ClassVar = "tendon"
+    AMPLITUDES: ClassVar = {"b": ("N s/m", 30.0, False)}
+    SHOWS: ClassVar = {"VD.3": ("joint_torque",)}
+
+    b: Float[Array, ""]
+
+    def loss(self, x, f, C, loss):
+        k = self.index[0]
+        return loss.at[k].add(self.b * jnp.abs(jnp.sum(C[k] * x.qd, axis=0)))
+
+
+class TendonFrictionPresliding(CatalogueEffect):
+    """Friction builds up over a small excursion x₀ after each reversal: dz = (dl − |dl| z)/x₀ (Dahl, LuGre).
+
+    At a held joint the tendon slides by its own stretch, in proportion to tension: there the length is f₀ of tension.
+    `a` is the share of the loss that behaves so.
+    """
+
+    ID: ClassVar = "tendon_friction_presliding"
+    PLACE: ClassVar = "tendon"
+    AMPLITUDES: ClassVar = {"a": ("1", 1.0, False)}
+    SHAPES: ClassVar = {"x0": ("m", (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)), "f0": ("N", (0.3, 1.0, 3.0))}
+    SHOWS: ClassVar = TENSION
+    has_memory: ClassVar = True
+
+    a: Float[Array, ""]
+    x0: Float[Array, ""]
+    f0: Float[Array, ""]
+
+    def initial_memory(self, model, x):
+        k = self.index[0]
+        zero = jnp.zeros_like(x.tension[k])
+        return zero, model.moment_arm.excursion(x.q)[k]
+
+    def next_memory(self, model, memory, before, x):
+        k, (z, l_before) = self.index[0], memory
+        l = model.moment_arm.excursion(x.q)[k]
+        if x.held:
+            return dahl(z, x.tension[k] - before.tension[k], self.f0), l
+        return dahl(z, l - l_before, self.x0), l
+
+    def directions(self, x, memory, joint, tendon):
+        k = self.index[0]
+        sign = jnp.where(jnp.isnan(tendon[k]), memory[0], tendon[k])
+        return joint, tendon.at[k].set((1 - self.a) * sign + self.a * memory[0])
+
+    def held_tension(self, x, memory, f, loss, f_j):
+        k = self.index[0]
+        return f_j.at[k].set((1 - self.a) * f_j[k] + self.a * (f[k] - memory[0] * loss[k]))
+
+
+class TendonFrictionSaturating(CatalogueEffect):
+    """c f* ((f/f*)^p − f/f*), f* = 10 N: the loss is not affine in tension."""
+
+    ID: ClassVar = "tendon_friction_saturating"
+    PLACE: ClassVar = "tendon"
+    AMPLITUDES: ClassVar = {"c": ("1", 0.15, True)}
+    SHAPES: ClassVar = {"p": ("1", (0.5, 2.0))}
+    SHOWS: ClassVar = TENSION
+
+    c: Float[Array, ""]
+    p: Float[Array, ""]
+
+    def loss(self, x, f, C, loss):
+        k = self.index[0]
+        u = jnp.maximum(f[k], 1e-6) / 10.0
+        return loss.at[k].add(10.0 * self.c * (u**self.p - u))
+
+
+class TendonCrosstalk(CatalogueEffect):
+    """f_k + ε f_j: a pulled tendon j drags its neighbour k."""
+
+    ID: ClassVar = "tendon_crosstalk"
+    PLACE: ClassVar = "tendon pair"
+    AMPLITUDES: ClassVar = {"epsilon": ("1", 0.05, False)}
+    SHOWS: ClassVar = TENSION
+
+    epsilon: Float[Array, ""]
+
+    def tension(self, x, memory, f):
+        dragged, pulled = self.index
+        return f.at[dragged].add(self.epsilon * x.tension[pulled])
