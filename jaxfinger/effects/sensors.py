@@ -142,7 +142,7 @@ class ChannelDelay(CatalogueEffect):
         return [(c,) for c in CHANNELS]
 
     @classmethod
-    def place(cls, finger, site):
+    def indices(cls, finger, site):
         return (CHANNELS.index(site[0]),)
 
     def _of(self, channel: str) -> Float[Array, ""]:
