@@ -16,6 +16,7 @@ from jaxfinger.data.check_trial import check_trial
 from jaxfinger.data.filtering import outlier_mask
 from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.parse import listed, parse_file
+from jaxfinger.data.probe import survives
 from jaxfinger.data.schema import MEASURED
 from jaxfinger.data.session import Session, Trial
 
@@ -65,6 +66,9 @@ def open_file(path: str | os.PathLike, report: Report) -> h5py.File | None:
     if not Path(path).is_file():
         what = "is a folder" if Path(path).is_dir() else "does not exist"
         report.error("/", f"{what}; name a dataset file")
+        return None
+    if not survives(path):
+        report.error("/", "is damaged in its structure; copy it again, or recover it from the recorder's log")
         return None
     try:
         return h5py.File(path, "r")

@@ -306,7 +306,8 @@ def _as_kind(value: np.ndarray, entry: Entry, place: str, report: Report) -> np.
         if value.dtype.kind not in "fiu":
             report.error(place, f"holds {value.dtype}, not numbers; write it as float64")
             return None
-        return np.ascontiguousarray(value, np.float64)
+        with np.errstate(invalid="ignore", over="ignore"):  # of wild values the checks will tell
+            return np.ascontiguousarray(value, np.float64)
     if (
         value.dtype.kind not in "biuf"
         or not np.all(np.isfinite(value))

@@ -1,0 +1,223 @@
+"""Every fault that users make is found, named with its place, and refused by the reader without a traceback."""
+
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+
+from jaxfinger.data import Session, check_file, read_session, write_session
+from jaxfinger.errors import UserError
+
+
+@pytest.fixture(scope="module")
+def good(session, tmp_path_factory):
+    path = tmp_path_factory.mktemp("good") / "session.h5"
+    write_session(session, path)
+    return path
+
+
+@pytest.fixture
+def file(good, tmp_path):
+    path = tmp_path / "bad.h5"
+    shutil.copyfile(good, path)
+    return path
+
+
+def put(group, name, change):
+    """Replace a dataset by a changed copy, with its attributes."""
+    old = group[name]
+    value, attributes = change(old[()]), dict(old.attrs)
+    del group[name]
+    group[name] = value
+    group[name].attrs.update(attributes)
+
+
+def at(index, value):
+    def change(x):
+        x = x.copy()
+        x[index] = value
+        return x
+
+    return change
+
+
+def values(name, change):
+    return lambda f: put(f, name, change)
+
+
+def attribute(place, key, value):
+    def change(f):
+        if value is None:
+            del f[place].attrs[key]
+        else:
+            f[place].attrs[key] = value
+
+    return change
+
+
+def remove(name):
+    return lambda f: f.pop(name)
+
+
+ID2, STATIC, ID4, VD3 = (f"trials/{n}" for n in ("01-ID.2-MCP", "02-ID.3-static-PIP", "04-ID.4-T1-MCP", "07-VD.3"))
+ERRORS = {
+    "no format": (attribute("/", "format", None), "/", "is not a dataset file"),
+    "other format": (attribute("/", "format", "images"), "/", "'images'"),
+    "version 2": (attribute("/", "format_version", "2.0"), "/", "format_version '2.0'"),
+    "no finger": (remove("finger"), "/finger", "is missing"),
+    "no trials": (remove("trials"), "/trials", "is missing"),
+    "no gravity": (attribute("finger", "gravity", None), "/finger", "gravity"),
+    "gravity in g": (attribute("finger", "gravity", [0, 0, -1.0]), "/finger", "about 9.81"),
+    "gravity in mm": (attribute("finger", "gravity", [0, 0, -9810.0]), "/finger", "about 9.81"),
+    "gravity a word": (attribute("finger", "gravity", "down"), "/finger", "gravity"),
+    "axis twice as long": (values("finger/joints/axis", lambda x: 2 * x), "/finger/joints/axis", "2 long"),
+    "limits reversed": (values("finger/joints/limits", lambda x: x[:, ::-1]), "/finger/joints/limits", "swap"),
+    "limits in degrees": (values("finger/joints/limits", np.rad2deg), "/finger/joints/limits", "degrees"),
+    "lengths in mm": (values("finger/joints/origin", lambda x: 1e3 * x), "/finger/joints/origin", "mm to m"),
+    "mass zero": (values("finger/links/mass", at(0, 0.0)), "/finger/links/mass", "positive"),
+    "mass NaN": (values("finger/links/mass", at(0, np.nan)), "/finger/links/mass", "not finite"),
+    "inertia skew": (values("finger/links/inertia", at((0, 0, 1), 1e-6)), "/finger/links/inertia", "symmetric"),
+    "inertia negative": (values("finger/links/inertia", at((0, 0, 0), -1e-6)), "/finger/links/inertia", "positive"),
+    "inertia impossible": (values("finger/links/inertia", at((0, 1, 1), 9e-6)), "/finger/links/inertia", "the sum"),
+    "inertia in kg mm2": (values("finger/links/inertia", lambda x: 1e6 * x), "/finger/links/inertia", "gyration"),
+    "names repeat": (values("finger/joints/name", at(1, "MCP")), "/finger/joints/name", "2 times"),
+    "crosses misshapen": (values("finger/tendons/crosses", lambda x: x.T), "/finger/tendons/crosses", "shape"),
+    "active too short": (values("finger/tendons/active", lambda x: x[:2]), "/finger/tendons/active", "shape"),
+    "tendon across nothing": (values("finger/tendons/crosses", at(1, False)), "/finger/tendons/crosses", "T2"),
+    "units missing": (attribute(f"{ID2}/q", "units", None), f"/{ID2}/q", "no `units`"),
+    "units degrees": (attribute(f"{ID2}/q", "units", "deg"), f"/{ID2}/q", "must be 'rad'"),
+    "units mm": (attribute("finger/links/com", "units", "mm"), "/finger/links/com", "must be 'm'"),
+    "experiment unknown": (attribute(ID2, "experiment", "ID.7"), f"/{ID2}", "'ID.7'"),
+    "experiment absent": (attribute(ID2, "experiment", None), f"/{ID2}", "experiment"),
+    "joint absent": (attribute(ID2, "joint", None), f"/{ID2}", "no attribute `joint`"),
+    "joint unknown": (attribute(ID2, "joint", "DIP"), f"/{ID2}", "'DIP'"),
+    "tendon absent": (attribute(ID4, "tendon", None), f"/{ID4}", "no attribute `tendon`"),
+    "tendon unknown": (attribute(ID4, "tendon", "T9"), f"/{ID4}", "'T9'"),
+    "tendon passive": (attribute(ID4, "tendon", "T3"), f"/{ID4}", "passive"),
+    "tendon elsewhere": (lambda f: f[ID4].attrs.update(tendon="T2", joint="PIP"), f"/{ID4}", "not cross"),
+    "time missing": (remove(f"{ID2}/time"), f"/{ID2}/time", "is missing"),
+    "time backwards": (values(f"{ID2}/time", lambda t: t[::-1]), f"/{ID2}/time", "backwards"),
+    "time repeats": (values(f"{ID2}/time", lambda t: np.round(t, 1)), f"/{ID2}/time", "repeats"),
+    "time NaN": (values(f"{ID2}/time", at(5, np.nan)), f"/{ID2}/time", "sample 5"),
+    "q missing": (remove(f"{ID2}/q"), f"/{ID2}/q", "is missing"),
+    "q one column": (values(f"{ID2}/q", lambda q: q[:, 0]), f"/{ID2}/q", "shape (900,)"),
+    "q too short": (values(f"{ID2}/q", lambda q: q[:-1]), f"/{ID2}/q", "shape (899, 2)"),
+    "q transposed": (values(f"{ID2}/q", lambda q: q.T), f"/{ID2}/q", "shape (2, 900)"),
+    "q with a hole": (values(f"{ID2}/q", at((slice(100, 110), 0), np.nan)), f"/{ID2}/q", "column MCP is NaN in 10"),
+    "q infinite": (values(f"{ID2}/q", at((3, 1), np.inf)), f"/{ID2}/q", "infinite"),
+    "q words": (values(f"{ID2}/q", lambda q: np.full(q.shape, b"x")), f"/{ID2}/q", "numbers"),
+    "q degrees": (values(f"{ID2}/q", np.rad2deg), f"/{ID2}/q", "degrees"),
+    "joint still": (values(f"{ID2}/q", at((slice(None), 0), 0.3)), f"/{ID2}/q", "MCP never moves"),
+    "all joints still": (values(f"{VD3}/q", lambda q: 0 * q), f"/{VD3}/q", "no joint moves"),
+    "excursion in mm": (values(f"{ID2}/tendon_excursion", lambda x: 1e3 * x), f"/{ID2}/tendon_excursion", "mm to m"),
+    "hole in excursion": (
+        values(f"{ID2}/tendon_excursion", at((7, 1), np.nan)),
+        f"/{ID2}/tendon_excursion",
+        "column T2 is NaN in 1",
+    ),
+    "torque in N mm": (values(f"{STATIC}/joint_torque", lambda x: 1e3 * x), f"/{STATIC}/joint_torque", "N mm"),
+    "tension pushes": (values(f"{VD3}/tendon_force", lambda x: -x), f"/{VD3}/tendon_force", "cannot push"),
+    "tension missing": (remove(f"{VD3}/tendon_force"), f"/{VD3}/tendon_force", "is missing"),
+    "direction of 2": (values(f"{STATIC}/joint_direction", at((0, 0), 2)), f"/{STATIC}/joint_direction", "-1, 0 or 1"),
+    "hold of -2": (values(f"{STATIC}/hold", at(0, -2)), f"/{STATIC}/hold", "index"),
+    "no samples": (
+        lambda f: [put(f[VD3], name, lambda x: x[:0]) for name in list(f[VD3])],
+        f"/{VD3}/time",
+        "no sample",
+    ),
+    "trial is a dataset": (lambda f: f.create_dataset("trials/x", data=1.0), "/trials/x", "must be a group"),
+}
+
+
+@pytest.mark.parametrize("fault", ERRORS)
+def test_each_fault_is_named_and_refused(file, fault):
+    change, place, words = ERRORS[fault]
+    with h5py.File(file, "r+") as opened:
+        change(opened)
+    errors = [f for f in check_file(file) if f.severity == "error"]
+    assert any(f.place == place and words in f.message for f in errors), errors
+    with pytest.raises(UserError) as refused:
+        read_session(file)
+    assert str(refused.value).startswith(f"{file}: /")
+    assert "\n" not in str(refused.value)
+
+
+def test_all_faults_are_reported_at_once(file):
+    for fault in ("mass zero", "limits reversed", "joint unknown", "q with a hole", "tension pushes", "time repeats"):
+        with h5py.File(file, "r+") as opened:
+            ERRORS[fault][0](opened)
+    places = {f.place for f in check_file(file) if f.severity == "error"}
+    assert places >= {
+        "/finger/links/mass",
+        "/finger/joints/limits",
+        f"/{ID2}",
+        f"/{ID2}/q",
+        f"/{VD3}/tendon_force",
+        f"/{ID2}/time",
+    }
+
+
+def test_a_measured_channel_that_is_missing_is_an_error_but_the_rest_is_read(file, session):
+    with h5py.File(file, "r+") as opened:
+        del opened[f"{ID2}/tendon_excursion"]
+    (error,) = [f for f in check_file(file) if f.severity == "error"]
+    assert error.place == f"/{ID2}/tendon_excursion"
+    assert len(read_session(file)) == len(session)
+
+
+def test_a_slack_tendons_excursion_may_be_nan(file):
+    with h5py.File(file, "r+") as opened:
+        put(opened[ID2], "tendon_force", at((slice(0, 50), 0), 0.01))
+        put(opened[ID2], "tendon_excursion", at((slice(0, 50), 0), np.nan))
+    assert not [f for f in check_file(file) if f.severity == "error"]
+
+
+def test_a_trial_cut_short_is_read_and_one_without_samples_left_out(file, session):
+    with h5py.File(file, "r+") as opened:
+        opened[VD3].attrs["complete"] = False
+        for name in list(opened[VD3]):
+            put(opened[VD3], name, lambda x: x[:0])
+    back = read_session(file)
+    assert not back["06-VD.2-T1"].complete
+    assert set(session.trials) - set(back.trials) == {"07-VD.3"}
+    assert any(f.severity == "warning" and "left out" in f.message for f in check_file(file))
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(b"", "empty"), (b"time,q\n0,1\n", "not an HDF5 file"), (None, "truncated")],
+)
+def test_files_that_are_no_sessions(good, tmp_path, content, words):
+    path = tmp_path / "x.h5"
+    raw = good.read_bytes()
+    path.write_bytes(raw[: len(raw) // 2] if content is None else content)
+    with pytest.raises(UserError, match=words):
+        read_session(path)
+
+
+def test_no_file_and_a_folder(tmp_path):
+    with pytest.raises(UserError, match="does not exist"):
+        read_session(tmp_path / "none.h5")
+    with pytest.raises(UserError, match="is a folder"):
+        read_session(tmp_path)
+
+
+@pytest.mark.parametrize("seed", range(32))
+def test_a_damaged_file_is_a_session_or_one_sentence(good, tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    raw = bytearray(good.read_bytes())
+    if seed % 4 == 0:
+        raw = raw[: rng.integers(len(raw))]
+    else:
+        where = rng.integers(min(len(raw), 40_000), size=rng.integers(1, 12))
+        for i in where:
+            raw[i] = rng.integers(256)
+    path = tmp_path / "x.h5"
+    path.write_bytes(raw)
+    check_file(path)
+    try:
+        outcome = read_session(path)
+    except UserError as error:
+        outcome = error
+    assert isinstance(outcome, Session) or "\n" not in str(outcome)

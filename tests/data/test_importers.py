@@ -1,0 +1,180 @@
+"""Recordings of other tools come in with their numbers intact; mistakes in a mapping are named."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+
+from jaxfinger.data import check_file, import_file, read_session, smooth
+from jaxfinger.errors import UserError
+
+EMPS = Path(__file__).parents[2] / "datasets" / "emps"
+
+MAPPING = """
+specimen = "bench finger"
+[finger]
+gravity = [0.0, 0.0, -9.81]
+fingertip = [0.03, 0.0, 0.0]
+[[finger.joints]]
+name = "MCP"
+axis = [0.0, 1.0, 0.0]
+origin = [0.0, 0.0, 0.0]
+limits = [-0.3, 1.6]
+mass = 0.02
+com = [0.02, 0.0, 0.0]
+inertia = [[1e-6, 0.0, 0.0], [0.0, 4e-6, 0.0], [0.0, 0.0, 4e-6]]
+[[finger.tendons]]
+name = "T1"
+crosses = ["MCP"]
+[[finger.tendons]]
+name = "T2"
+crosses = ["MCP"]
+[trials.01-ID2]
+experiment = "ID.2"
+joint = "MCP"
+time = "t"
+[trials.01-ID2.channels]
+q.MCP = { from = "enc", column = 1, units = "deg" }
+tendon_force.T1 = [{ from = "volts", scale = "gain", offset = -0.5, units = "N" }, { from = "extra", units = "mN" }]
+tendon_excursion.T1 = { from = "pull", units = "mm" }
+"""
+TIME = np.arange(500) / 100
+ANGLE = 0.6 + 0.5 * np.sin(TIME)
+RECORDED = {
+    "t": TIME + 7.0,
+    "enc": np.column_stack([0 * TIME, np.rad2deg(ANGLE)]),
+    "volts": 0.25 + 0.01 * TIME,
+    "extra": 100.0 + 0 * TIME,
+    "pull": 8.0 * ANGLE,
+    "gain": 10.0,
+}
+
+
+@pytest.fixture
+def mapping(tmp_path):
+    path = tmp_path / "map.toml"
+    path.write_text(MAPPING)
+    return path
+
+
+def assert_imported(path):
+    assert [f for f in check_file(path) if f.severity != "note"] == []
+    session = read_session(path)
+    trial = session["01-ID2"]
+    np.testing.assert_allclose(trial.time, TIME, atol=1e-9)
+    np.testing.assert_allclose(trial.q[:, 0], ANGLE, atol=1e-9)
+    np.testing.assert_allclose(trial.tendon_force[:, 0], 10 * (0.25 + 0.01 * TIME) - 0.5 + 0.1, atol=1e-9)
+    np.testing.assert_allclose(trial.tendon_excursion[:, 0], 0.008 * ANGLE, atol=1e-9)
+    assert np.isnan(trial.tendon_force[:, 1]).all()
+    assert session.specimen == "bench finger"
+
+
+def test_matlab_version_5(mapping, tmp_path):
+    scipy.io.savemat(tmp_path / "log.mat", {k: v[:, None] if np.ndim(v) == 1 else v for k, v in RECORDED.items()})
+    import_file([tmp_path / "log.mat"], mapping, tmp_path / "out.h5")
+    assert_imported(tmp_path / "out.h5")
+    with pytest.raises(UserError, match="exists already"):
+        import_file([tmp_path / "log.mat"], mapping, tmp_path / "out.h5")
+
+
+def test_matlab_version_7_3_with_a_structure(mapping, tmp_path):
+    """v7.3 is HDF5 behind a 512-byte user block, its arrays transposed, its structures groups."""
+    with h5py.File(tmp_path / "log.mat", "w", userblock_size=512) as file:
+        for name, value in RECORDED.items():
+            file[f"log/{name}"] = np.atleast_2d(np.transpose(value))
+    text = MAPPING
+    for name in RECORDED:
+        text = text.replace(f'"{name}"', f'"log.{name}"')
+    mapping.write_text(text)
+    import_file([tmp_path / "log.mat"], mapping, tmp_path / "out.h5")
+    assert_imported(tmp_path / "out.h5")
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_csv(mapping, tmp_path, delimiter):
+    columns = [RECORDED[name] for name in ("t", "volts", "extra", "pull")] + [np.rad2deg(ANGLE)]
+    lines = ["# logged", delimiter.join(("t", "volts", "extra", "pull", "enc"))]
+    lines += [delimiter.join(repr(float(x)) for x in row) for row in zip(*columns, strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    text = MAPPING.replace(", column = 1", "").replace('scale = "gain"', "scale = 10.0")
+    mapping.write_text(text)
+    import_file([tmp_path / "log.csv"], mapping, tmp_path / "out.h5")
+    assert_imported(tmp_path / "out.h5")
+
+
+def test_sampling_rate_span_and_own_clock(mapping, tmp_path):
+    recorded = RECORDED | {"slow_t": TIME[::5], "pull": 8.0 * (0.6 + 0.1 * TIME[::5])}
+    scipy.io.savemat(tmp_path / "log.mat", recorded)
+    text = MAPPING.replace('time = "t"', "rate_hz = 100.0\nspan = [1.0, 3.0]")
+    mapping.write_text(text.replace('from = "pull"', 'from = "pull", time = "slow_t"'))
+    trial = import_file([tmp_path / "log.mat"], mapping, tmp_path / "out.h5")["01-ID2"]
+    np.testing.assert_allclose(trial.time, TIME[:200], atol=1e-9)
+    np.testing.assert_allclose(trial.q[:, 0], ANGLE[100:300], atol=1e-9)
+    np.testing.assert_allclose(trial.tendon_excursion[:, 0], 0.008 * (0.6 + 0.1 * TIME[100:300]), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('time = "t"', 'tyme = "t"', "unknown key 'tyme'"),
+        ('from = "enc"', 'from = "encoder"', r"'encoder', which the recording has not; it has enc, extra, gain"),
+        (", column = 1", "", "has 2 columns; choose one by `column`"),
+        ('from = "pull"', 'from = "gain"', "has 1 samples where the trial's time has 500"),
+        ('units = "deg"', 'units = "mm"', "units 'mm'; it must be one of rad, deg"),
+        ('units = "mN"', 'units = "mN"\n', "not valid TOML"),
+        ("q.MCP", "q.PIP", "column 'PIP'; it must be one of MCP"),
+        ("tendon_excursion.T1", "excursion.T1", "is no channel"),
+        ('joint = "MCP"', "", "no attribute `joint`"),
+        ('experiment = "ID.2"', 'experiment = "ID.9"', "ID.9"),
+        ("gravity = [0.0, 0.0, -9.81]", "gravity = [0.0, -9.81]", "`gravity` that is not 3 numbers"),
+        ('crosses = ["MCP"]', 'crosses = ["DIP"]', "crosses 'DIP', which is no joint"),
+        ("mass = 0.02", "", "has no `mass`"),
+        ('units = "deg"', 'units = "rad"', "convert degrees to rad"),
+    ],
+)
+def test_a_mistake_in_the_mapping_is_named(mapping, tmp_path, old, new, words):
+    assert old in MAPPING
+    mapping.write_text(MAPPING.replace(old, new))
+    scipy.io.savemat(tmp_path / "log.mat", RECORDED)
+    with pytest.raises(UserError, match=words) as refused:
+        import_file([tmp_path / "log.mat"], mapping, tmp_path / "out.h5")
+    assert str(refused.value).startswith(str(mapping))
+    assert not (tmp_path / "out.h5").exists()
+
+
+def test_a_recording_that_cannot_be_read(mapping, tmp_path):
+    (tmp_path / "log.mat").write_bytes(b"not a recording")
+    with pytest.raises(UserError, match="cannot be read"):
+        import_file([tmp_path / "log.mat"], mapping, tmp_path / "out.h5")
+    with pytest.raises(UserError, match="does not exist"):
+        import_file([tmp_path / "none.mat"], mapping, tmp_path / "out.h5")
+
+
+def emps_balance(path, mapping, out):
+    session = import_file([path], mapping, out)
+    assert [f for f in check_file(out) if f.severity == "error"] == []
+    (trial,) = session
+    _, velocity, acceleration = smooth(trial.time, trial.q[:, 0], 40.0)
+    force = smooth(trial.time, trial.joint_torque[:, 0], 40.0)[0]
+    ones = np.ones_like(force)
+    regressor = np.column_stack([acceleration, velocity, np.sign(velocity), ones])[500:-500]
+    return np.linalg.lstsq(regressor, force[500:-500], rcond=None)[0]
+
+
+def test_the_servo_axis_gives_its_published_parameters(tmp_path):
+    """Janot, Gautier, Brunot 2019: M 95.11 kg, Fv 203.5 N s/m, Fc 20.39 N, offset -3.16 N."""
+    mass, viscous, coulomb, offset = emps_balance(EMPS / "DATA_EMPS.mat", EMPS / "emps.toml", tmp_path / "a.h5")
+    assert mass == pytest.approx(95.11, rel=0.01)
+    assert viscous == pytest.approx(203.5, rel=0.06)
+    assert coulomb == pytest.approx(20.39, rel=0.03)
+    assert offset == pytest.approx(-3.16, rel=0.05)
+
+
+def test_the_pulses_are_within_the_control_signal(tmp_path):
+    """The balance closes on vir alone in the disturbed recording (datasets/emps/README.md)."""
+    mass, _, coulomb, offset = emps_balance(EMPS / "DATA_EMPS_PULSES.mat", EMPS / "emps-pulses.toml", tmp_path / "a.h5")
+    assert mass == pytest.approx(95.11, rel=0.02)
+    assert coulomb == pytest.approx(20.39, rel=0.03)
+    assert offset == pytest.approx(-3.16, rel=0.06)
