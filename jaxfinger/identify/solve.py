@@ -5,8 +5,8 @@
 1. Each experiment is linearised and compressed at the current model (`linearise`).
 2. The stacked factors are scaled by columns; their singular vectors say which combinations of parameters the trials
    can see. The rest stays where it was, and is named.
-3. optimistix solves in coordinates z along the visible singular vectors, θ = θ_k + B z, in which the Gauss–Newton matrix
-   is the identity. Most of equation (1) is linear in its parameters: one step, whatever the conditioning of θ.
+3. optimistix solves in coordinates z along the visible singular vectors, θ = θ_k + B z, in which the Gauss–Newton
+   matrix is the identity. Most of equation (1) is linear in its parameters: one step, whatever the conditioning of θ.
 4. Where it is not (slip of held tendons, products of moment arms and losses) the model is linearised again at the new
    point, and a step that did not lower the cost is halved, until a step is a small part of a standard deviation.
 5. Outliers: Huber's weights from the white residuals at the optimum, then again from 1.

@@ -1,0 +1,186 @@
+"""The file of a fit: JSON that people can read, floats to the last bit, infinities and NaN as null.
+
+Parameters are named as in `describe`; the covariance is stored only where it is not zero.
+"""
+
+import json
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfinger.data.atomic import atomic_path
+from jaxfinger.errors import UserError
+from jaxfinger.identify.fit import SCHEMA, Fit, StageReport
+from jaxfinger.identify.noise import Noise
+from jaxfinger.identify.parameters import describe
+from jaxfinger.identify.recipe import as_dict, structure
+from jaxfinger.model import Finger, JointTorque, Model, MomentArm, TendonFriction
+
+FINGER: dict[str, tuple] = {
+    "gravity": (3,),
+    "axis": ("m", 3),
+    "origin": ("m", 3),
+    "mass": ("m",),
+    "com": ("m", 3),
+    "inertia": ("m", 3, 3),
+    "fingertip": (3,),
+}
+FINGER_STATIC = ("limits", "prismatic", "joint_names", "tendon_names", "active", "crosses")
+
+
+def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None:
+    """Write a fit to `path`, whole or not at all.
+
+    Raises:
+        UserError: the file exists and `overwrite` is false, or its folder cannot be written.
+    """
+    content = _to_dict(fit)
+    lines = ",\n".join(f" {json.dumps(k)}: {json.dumps(v, allow_nan=False)}" for k, v in content.items())
+    with atomic_path(path, overwrite) as part:
+        part.write_text("{\n" + lines + "\n}\n", encoding="utf-8")
+
+
+def load_fit(path: str | os.PathLike) -> Fit:
+    """Read a fit that `save_fit` wrote.
+
+    Raises:
+        UserError: the file cannot be read, is no fit, or has been damaged.
+    """
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as e:
+        raise UserError(f"{path}: cannot be read ({e.strerror}); give a file that `identify` wrote") from None
+    except ValueError as e:
+        raise UserError(f"{path}: is not a fit ({e}); give a file that `identify` wrote") from None
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
+        found = content.get("schema") if isinstance(content, dict) else None
+        raise UserError(f"{path}: has schema {found!r} where {SCHEMA!r} is read; identify the session again")
+    try:
+        return _from_dict(content, str(path))
+    except KeyError as e:
+        raise UserError(f"{path}: is damaged, {e.args[0]!r} is missing; identify the session again") from None
+    except (TypeError, ValueError, AttributeError, IndexError) as e:
+        raise UserError(f"{path}: is damaged ({e}); identify the session again") from None
+
+
+def _to_dict(fit: Fit) -> dict[str, Any]:
+    model, names = fit.model, [p.name for p in describe(fit.model)]
+    rows = np.flatnonzero(np.diag(fit.covariance) != 0)
+    covariance = np.where(np.isfinite(fit.covariance), fit.covariance, np.inf)[np.ix_(rows, rows)]
+    effects = []
+    if model.effects:
+        from jaxfinger.effects import to_dict
+
+        effects = [to_dict(e) for e in model.effects]
+    content = {
+        "schema": SCHEMA,
+        "specimen": fit.specimen,
+        "data": fit.data,
+        "data_hash": fit.data_hash,
+        "created": fit.created,
+        "versions": fit.versions,
+        "recipe": as_dict(fit.recipe),
+        "stages": [asdict(s) for s in fit.stages],
+        "finger": {k: np.asarray(getattr(model.finger, k)).tolist() for k in FINGER}
+        | {k: getattr(model.finger, k) for k in FINGER_STATIC},
+        "moment_arm": {
+            "coefficients": np.asarray(model.moment_arm.coefficients).tolist(),
+            "exponents": model.moment_arm.exponents,
+        },
+        "joint_torque": _arrays(model.joint_torque),
+        "tendon_friction": _arrays(model.tendon_friction),
+        "effects": effects,
+        "estimated": [names[i] for i in fit.estimated],
+        "covariance": {"names": [names[i] for i in rows], "matrix": covariance.tolist()},
+        "noise": [
+            {"experiment": e, "channel": c} | {k: v if isinstance(v, str) else v.tolist() for k, v in asdict(n).items()}
+            for (e, c), n in fit.noise.items()
+        ],
+    }
+    return _without_infinities(content)
+
+
+def _arrays(module) -> dict[str, list]:
+    return {k: np.asarray(v).tolist() for k, v in vars(module).items()}
+
+
+def _without_infinities(value):
+    """JSON has no infinity and no NaN: null."""
+    match value:
+        case dict():
+            return {k: _without_infinities(v) for k, v in value.items()}
+        case list() | tuple():
+            return [_without_infinities(v) for v in value]
+        case float() if not np.isfinite(value):
+            return None
+    return value
+
+
+def _from_dict(content: dict[str, Any], path: str) -> Fit:
+    model = _model(content)
+    position = {p.name: i for i, p in enumerate(describe(model))}
+    rows = np.array([position[name] for name in content["covariance"]["names"]], dtype=int)
+    block = np.array(content["covariance"]["matrix"], dtype=float).reshape(rows.size, rows.size)
+    covariance = np.zeros((len(position), len(position)))
+    covariance[np.ix_(rows, rows)] = np.where(np.isnan(block), np.inf, block)
+    return Fit(
+        model,
+        covariance,
+        np.array([position[name] for name in content["estimated"]], dtype=int),
+        structure(content["recipe"], path),
+        noise={(n["experiment"], n["channel"]): _noise(n) for n in content["noise"]},
+        stages=tuple(_stage(s) for s in content["stages"]),
+        **{k: content[k] for k in ("specimen", "data", "data_hash", "created", "versions")},
+    )
+
+
+def _model(content: dict[str, Any]) -> Model:
+    f, arm = content["finger"], content["moment_arm"]
+    m, n = len(f["joint_names"]), len(f["tendon_names"])
+    finger = Finger(
+        **{k: _array(f[k], tuple(m if s == "m" else s for s in shape), f"finger.{k}") for k, shape in FINGER.items()},
+        **{k: _tuple(f[k]) for k in FINGER_STATIC},
+    )
+    exponents = _tuple(arm["exponents"])
+    model = Model(
+        finger,
+        MomentArm(_array(arm["coefficients"], (n, len(exponents)), "moment_arm.coefficients"), exponents),
+        JointTorque(**_fields(content, "joint_torque", elastic=(m, -1), damping=(m,), friction=(m, -1))),
+        TendonFriction(**_fields(content, "tendon_friction", constant=(n,), proportional=(n,))),
+    )
+    if content["effects"]:
+        from jaxfinger.effects import from_dict
+
+        effects = tuple(from_dict(finger, e) for e in content["effects"])
+        model = Model(finger, model.moment_arm, model.joint_torque, model.tendon_friction, effects)
+    return model
+
+
+def _fields(content, group: str, **shapes: tuple[int, ...]) -> dict[str, jnp.ndarray]:
+    return {k: _array(content[group][k], shape, f"{group}.{k}") for k, shape in shapes.items()}
+
+
+def _array(values: list, shape: tuple[int, ...], name: str) -> jnp.ndarray:
+    array = np.array(values, dtype=float)
+    if array.ndim != len(shape) or any(a != s for a, s in zip(array.shape, shape, strict=True) if s >= 0):
+        raise ValueError(f"{name} has shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} holds a number that is not finite")
+    return jnp.asarray(array)
+
+
+def _tuple(value):
+    return tuple(_tuple(v) for v in value) if isinstance(value, list) else value
+
+
+def _noise(n: dict[str, Any]) -> Noise:
+    return Noise(*(np.array(n[k], dtype=float) for k in ("std", "innovation", "ar")), source=n["source"])
+
+
+def _stage(s: dict[str, Any]) -> StageReport:
+    chi2 = float("nan") if s["chi2_per_row"] is None else s["chi2_per_row"]
+    return StageReport(**{**s, "chi2_per_row": chi2, "trials": tuple(s["trials"]), "warnings": tuple(s["warnings"])})
