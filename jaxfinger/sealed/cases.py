@@ -57,7 +57,15 @@ def case_specs(split: str, count: int) -> list[CaseSpec]:
     specs = []
     for i in range(count):
         place = i % 10
-        kind = "none" if place == 4 or (place == 9 and i % 20 == 9) else "unlisted" if place in (7, 9) else "double" if place == 2 else "listed"
+        kind = (
+            "none"
+            if place == 4 or (place == 9 and i % 20 == 9)
+            else "unlisted"
+            if place in (7, 9)
+            else "double"
+            if place == 2
+            else "listed"
+        )
         specimen = next(specimens)
         if kind == "none":
             specs.append(CaseSpec(kind, specimen))
@@ -99,16 +107,30 @@ def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: P
     for file, file_plans in (("fit.h5", plans), ("fresh.h5", later)):
         trials = _trials(finger, nominal, file_plans, sensors, zero, rng)
         session = Recording(
-            specimen=f"sealed-{split}-{number:03d}", finger=specimen.cad, trials={t.name: t for t in trials},
-            source="jaxfinger sealed plant (MuJoCo)", created=CREATED,
+            specimen=f"sealed-{split}-{number:03d}",
+            finger=specimen.cad,
+            trials={t.name: t for t in trials},
+            source="jaxfinger sealed plant (MuJoCo)",
+            created=CREATED,
         )
         write_session(session, folder / file, overwrite=True)
     truth = {
-        "schema": SCHEMA, "case": name, "split": split, "seed": [SPLITS[split], number], "kind": spec.kind, "specimen": spec.specimen,
+        "schema": SCHEMA,
+        "case": name,
+        "split": split,
+        "seed": [SPLITS[split], number],
+        "kind": spec.kind,
+        "specimen": spec.specimen,
         "effects": [
             {
-                "effect": d.effect, "listed": d.listed, "site": list(d.site), "form": d.form, "severity": wanted, "reached": reached,
-                "seen_in": list(seen), "parameters": {"size": d.size, "units": d.units, **d.shape},
+                "effect": d.effect,
+                "listed": d.listed,
+                "site": list(d.site),
+                "form": d.form,
+                "severity": wanted,
+                "reached": reached,
+                "seen_in": list(seen),
+                "parameters": {"size": d.size, "units": d.units, **d.shape},
             }
             for d, wanted, reached, seen in zip(departures, spec.severities, severities, where, strict=True)
         ],
@@ -156,19 +178,29 @@ def _withheld(spec: CaseSpec, specimen: Specimen, quiet: Session, speeds: Sequen
 
 
 def _column(specimen: Specimen, label: tuple[str, str, int]) -> str:
-    names = {"tendon_excursion": specimen.finger.tendon_names, "joint_torque": specimen.finger.joint_names, "fingertip_force": "xyz"}
+    names = {
+        "tendon_excursion": specimen.finger.tendon_names,
+        "joint_torque": specimen.finger.joint_names,
+        "fingertip_force": "xyz",
+    }
     return names[label[1]][label[2]]
 
 
-def _trials(finger: Finger, nominal: Finger, plans: Sequence[Plan], sensors: Sensors, zero: np.ndarray, rng: np.random.Generator):
+def _trials(
+    finger: Finger, nominal: Finger, plans: Sequence[Plan], sensors: Sensors, zero: np.ndarray, rng: np.random.Generator
+):
     driven_plans = [p for p in plans if p.experiment == "VD.3"]
-    motions = {p.name: driven(run) for p, run in zip(driven_plans, simulate(finger, nominal, driven_plans), strict=True)}
+    motions = {
+        p.name: driven(run) for p, run in zip(driven_plans, simulate(finger, nominal, driven_plans), strict=True)
+    }
     for plan in plans:
         motion = motions.get(plan.name) or commanded(plan)
         yield measure(read(finger, record(finger, plan, motion)), finger.specimen, sensors, zero, rng)
 
 
-def _fresh_gap(specimen: Specimen, departures: Sequence[Departure], quiet: Session, plans: Sequence[Plan], sensors: Sensors):
+def _fresh_gap(
+    specimen: Specimen, departures: Sequence[Departure], quiet: Session, plans: Sequence[Plan], sensors: Sensors
+):
     """rms on the fresh trials by experiment and channel, of the nominal model refitted (before) and with the true effects (after)."""
     later = Session(specimen, plans, sensors)
     moved = quiet.absorb(quiet.trace(departures)[0])
@@ -178,16 +210,29 @@ def _fresh_gap(specimen: Specimen, departures: Sequence[Departure], quiet: Sessi
     for (experiment, channel, _), value in sorted(gap.items()):
         noise = sensors.std[channel]
         left = value * sensors.hold_std(channel)
-        out.append({
-            "experiment": experiment, "channel": channel, "units": UNITS[channel], "noise": noise, "gap": left,
-            "before": float(np.hypot(noise, left)), "after": noise,
-        })
+        out.append(
+            {
+                "experiment": experiment,
+                "channel": channel,
+                "units": UNITS[channel],
+                "noise": noise,
+                "gap": left,
+                "before": float(np.hypot(noise, left)),
+                "after": noise,
+            }
+        )
     return out
 
 
 def make_cases(
-    split: str, count: int, root: Path, truth_root: Path, workers: int = 1, share: tuple[int, int] = (1, 1),
-    progress: Callable[[int, int, str], None] | None = None, only: Iterable[int] | None = None,
+    split: str,
+    count: int,
+    root: Path,
+    truth_root: Path,
+    workers: int = 1,
+    share: tuple[int, int] = (1, 1),
+    progress: Callable[[int, int, str], None] | None = None,
+    only: Iterable[int] | None = None,
 ) -> list[int]:
     """Make the cases 1 … count of a split (or share i of n of them) on several cores; returns their numbers.
 
@@ -195,7 +240,9 @@ def make_cases(
     """
     specs = case_specs(split, count)
     wanted = set(only) if only is not None else None
-    numbers = [i for i in range(1, count + 1) if i % share[1] == share[0] % share[1] and (wanted is None or i in wanted)]
+    numbers = [
+        i for i in range(1, count + 1) if i % share[1] == share[0] % share[1] and (wanted is None or i in wanted)
+    ]
     if workers == 1:
         for done, i in enumerate(numbers, start=1):
             make_case(i, split, specs[i - 1], root, truth_root)
@@ -214,7 +261,9 @@ def make_cases(
 def spec_of(truth: dict) -> CaseSpec:
     """The specification that a truth file records."""
     effects = truth["effects"]
-    return CaseSpec(truth["kind"], truth["specimen"], tuple(e["effect"] for e in effects), tuple(e["severity"] for e in effects))
+    return CaseSpec(
+        truth["kind"], truth["specimen"], tuple(e["effect"] for e in effects), tuple(e["severity"] for e in effects)
+    )
 
 
 def describe(spec: CaseSpec) -> str:

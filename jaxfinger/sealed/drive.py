@@ -70,7 +70,9 @@ def _reachable(nominal: Finger, least: float, count: int, rng: np.random.Generat
     return q[rng.choice(best, count, replace=False)]
 
 
-def feedforward(nominal: Finger, q: Float[np.ndarray, "N m"], qd: Float[np.ndarray, "N m"], qdd: Float[np.ndarray, "N m"]):
+def feedforward(
+    nominal: Finger, q: Float[np.ndarray, "N m"], qd: Float[np.ndarray, "N m"], qdd: Float[np.ndarray, "N m"]
+):
     """Joint torque of the nominal finger along a trajectory (friction included, smooth in velocity), and the tendons' directions."""
     zero = np.zeros(len(q))
     s = State(zero, zero, q, qd, qdd, np.zeros((len(q), nominal.n)), np.tanh(qd / 0.02))
@@ -88,7 +90,9 @@ class Allocator:
         self.n = nominal.n
         self._small = 2e-4 * np.eye(len(self.active))
 
-    def __call__(self, arm: Float[np.ndarray, "n m"], torque: Float[np.ndarray, " m"], direction: Float[np.ndarray, " n"]):
+    def __call__(
+        self, arm: Float[np.ndarray, "n m"], torque: Float[np.ndarray, " m"], direction: Float[np.ndarray, " n"]
+    ):
         arm, s = arm[self.active], direction[self.active]
         a0, a1 = self.friction.T
         gain, offset = 1 - s * a1, -s * a0
@@ -128,7 +132,12 @@ def simulate(finger: Finger, nominal: Finger, plans: Sequence[Plan]) -> list[Run
     data = [mujoco.MjData(model) for _ in plans]
     for d, w in zip(data, wished, strict=True):
         d.qpos = w[0][0]
-    f = np.stack([a(nominal.geometry(w[0][0])[1], ff[0][0], ff[1][0]) for a, w, ff in zip(allocate, wished, forward, strict=True)])
+    f = np.stack(
+        [
+            a(nominal.geometry(w[0][0])[1], ff[0][0], ff[1][0])
+            for a, w, ff in zip(allocate, wished, forward, strict=True)
+        ]
+    )
     command, starts = f.copy(), np.array([plan.start for plan in plans])
     q = np.stack([d.qpos.copy() for d in data])
     qd = np.zeros_like(q)

@@ -22,8 +22,8 @@ from .specimens import Specimen
 class State:
     """Where the finger is. Angles rad, tension at the actuator N, time s; directions −1, 0, +1."""
 
-    t: Float[np.ndarray, "..."]
-    session: Float[np.ndarray, "..."]  # seconds since the session began
+    t: Float[np.ndarray, ...]
+    session: Float[np.ndarray, ...]  # seconds since the session began
     q: Float[np.ndarray, "... m"]
     qd: Float[np.ndarray, "... m"]
     qdd: Float[np.ndarray, "... m"]
@@ -51,7 +51,9 @@ class Finger:
     def _powers(self):
         return np.arange(1, self.specimen.excursion.shape[-1] + 1)
 
-    def geometry(self, q: Float[np.ndarray, "... m"]) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n m"]]:
+    def geometry(
+        self, q: Float[np.ndarray, "... m"]
+    ) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n m"]]:
         """Nominal excursion l = f(q) in m, and C = ∂f/∂q."""
         low = q[..., None] ** (self._powers - 1)
         arms = self.specimen.excursion

@@ -19,7 +19,11 @@ DEGREE = 4
 
 
 def spatial_lengths(
-    finger: FingerDescription, arm: Float[np.ndarray, "n m"], alpha: Float[np.ndarray, "n m"], joint: int, q: Float[np.ndarray, " K"]
+    finger: FingerDescription,
+    arm: Float[np.ndarray, "n m"],
+    alpha: Float[np.ndarray, "n m"],
+    joint: int,
+    q: Float[np.ndarray, " K"],
 ) -> Float[np.ndarray, "K n"]:
     """Path lengths in m as joint `joint` turns through q and the others rest at zero.
 

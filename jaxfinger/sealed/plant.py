@@ -44,10 +44,19 @@ def add_chain(spec: mujoco.MjSpec, finger: FingerDescription) -> list:
         inertia = finger.inertia[i]
         full = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
         body = bodies[-1].add_body(
-            name=name, pos=finger.origin[i], mass=finger.mass[i], ipos=finger.com[i], fullinertia=full, explicitinertial=True
+            name=name,
+            pos=finger.origin[i],
+            mass=finger.mass[i],
+            ipos=finger.com[i],
+            fullinertia=full,
+            explicitinertial=True,
         )
         body.add_joint(
-            name=name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=finger.axis[i], frictionloss=1e-3, limited=mujoco.mjtLimited.mjLIMITED_FALSE
+            name=name,
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=finger.axis[i],
+            frictionloss=1e-3,
+            limited=mujoco.mjtLimited.mjLIMITED_FALSE,
         )
         bodies.append(body)
     return bodies
@@ -102,7 +111,7 @@ class Plant:
         mujoco.mj_jac(model, data, jac, None, point, last)
         return jac
 
-    def fingertip(self, q: Float[np.ndarray, " m"]) -> Float[np.ndarray, "3"]:
+    def fingertip(self, q: Float[np.ndarray, " m"]) -> Float[np.ndarray, 3]:
         """Place of the contact point in the base frame in m."""
         model, data = self.model, self._data
         data.qpos = q

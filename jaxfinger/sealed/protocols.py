@@ -56,10 +56,16 @@ def draw_style(rng: np.random.Generator) -> Style:
     """Habits of one bench."""
     speeds = np.sort(rng.choice([0.3, 0.5, 0.7, 1.0, 1.4, 1.8, 2.3], size=int(rng.integers(3, 5)), replace=False))
     return Style(
-        holds=int(rng.integers(7, 11)), hold_time=float(rng.uniform(0.9, 1.3)), levels=int(rng.integers(5, 8)),
-        top=float(rng.uniform(10.0, 14.0)), speeds=tuple(speeds.tolist()), repeat=float(rng.uniform(0.2, 0.35)),
-        unload=bool(rng.random() < 0.75), missing=str(rng.choice(["", "", "", "", "", "VD.1", "VD.2", "ID.3-dynamic"])),
-        postures=2, base_tension=float(rng.uniform(1.9, 2.2)),
+        holds=int(rng.integers(7, 11)),
+        hold_time=float(rng.uniform(0.9, 1.3)),
+        levels=int(rng.integers(5, 8)),
+        top=float(rng.uniform(10.0, 14.0)),
+        speeds=tuple(speeds.tolist()),
+        repeat=float(rng.uniform(0.2, 0.35)),
+        unload=bool(rng.random() < 0.75),
+        missing=str(rng.choice(["", "", "", "", "", "VD.1", "VD.2", "ID.3-dynamic"])),
+        postures=2,
+        base_tension=float(rng.uniform(1.9, 2.2)),
     )
 
 
@@ -75,9 +81,15 @@ def session_plans(specimen: Specimen, style: Style, rng: np.random.Generator, fr
     start, numbered = 20.0, []
     for i, plan in enumerate(plans, start=1):
         suffix = "-x" if fresh else ""
-        numbered.append(replace(
-            plan, name=f"{i:02d}-{plan.motion}", motion=plan.motion + suffix, start=start, seed=int(rng.integers(2**31))
-        ))
+        numbered.append(
+            replace(
+                plan,
+                name=f"{i:02d}-{plan.motion}",
+                motion=plan.motion + suffix,
+                start=start,
+                seed=int(rng.integers(2**31)),
+            )
+        )
         start += plan.duration + rng.uniform(5.0, 18.0)
     return numbered
 
@@ -130,7 +142,8 @@ class _Protocol:
         span = self.high[j] - self.low[j]
         a, b = (0.12, 0.85) if self.fresh else (0.1, 0.95)
         return (
-            self.low[j] + span * (a + self.rng.uniform(-0.02, 0.05)), self.low[j] + span * (b + self.rng.uniform(-0.05, 0.02))
+            self.low[j] + span * (a + self.rng.uniform(-0.02, 0.05)),
+            self.low[j] + span * (b + self.rng.uniform(-0.05, 0.02)),
         )
 
     def _tensions(self, value: float) -> tuple[Profile, ...]:
@@ -146,7 +159,9 @@ class _Protocol:
         b = b.move(middle, 0.8 * pace).rest(0.3).move(low, 0.8 * pace).rest(0.5)
         q[j] = b.profile()
         name = f"ID.2-{self.finger.joint_names[j]}-{letter}"
-        return Plan(name, name, "ID.2", 0, b.now, SLOW, tuple(q), self._tensions(self.style.base_tension), j, wander=0.15)
+        return Plan(
+            name, name, "ID.2", 0, b.now, SLOW, tuple(q), self._tensions(self.style.base_tension), j, wander=0.15
+        )
 
     def vd1(self, letter: str) -> Plan:
         """All joints by hand along a free path."""
@@ -160,7 +175,9 @@ class _Protocol:
                 b = b.move(to, self.rng.uniform(1.3, 3.5))
             q.append(b.profile())
         name = f"VD.1-{letter}"
-        return Plan(name, name, "VD.1", 0, duration, SLOW, tuple(q), self._tensions(self.style.base_tension), wander=0.2)
+        return Plan(
+            name, name, "VD.1", 0, duration, SLOW, tuple(q), self._tensions(self.style.base_tension), wander=0.2
+        )
 
     def static(self, j: int, letter: str) -> Plan:
         """Tendons slack; one joint through holds, up and back."""
@@ -187,7 +204,11 @@ class _Protocol:
             turn = float(np.clip(0.06 / speed, 0.04, 0.15))
             b = b.sweep(high, float(speed), turn).sweep(low, float(speed), turn)
         inner = low + (high - low) * self.rng.uniform(0.4, 0.6)
-        b = b.sweep(inner, float(speeds[0]), 0.12).sweep(inner - 0.12, float(speeds[0]), 0.12).sweep(high, float(speeds[0]), 0.12)
+        b = (
+            b.sweep(inner, float(speeds[0]), 0.12)
+            .sweep(inner - 0.12, float(speeds[0]), 0.12)
+            .sweep(high, float(speeds[0]), 0.12)
+        )
         q = self._rest(self.posture())
         q[j] = b.profile()
         name = f"ID.3-dynamic-{self.finger.joint_names[j]}-{letter}"
@@ -226,11 +247,15 @@ class _Protocol:
         tension[k] = b.profile()
         name = f"VD.2-{self.finger.tendon_names[k]}"
         posture = self.posture(0.3, 0.75)
-        return Plan(name, name, "VD.2", 0, b.now, SLOW, tuple(self._rest(posture)), tuple(tension), None, k, tuple(holds))
+        return Plan(
+            name, name, "VD.2", 0, b.now, SLOW, tuple(self._rest(posture)), tuple(tension), None, k, tuple(holds)
+        )
 
     def vd3(self, letter: str) -> Plan:
         """A wish of the free finger's trajectory; `drive` finds postures and tensions that the finger can follow."""
-        return Plan(f"VD.3-{letter}", f"VD.3-{letter}", "VD.3", 0, 8.0, FAST, (), (), least=float(self.rng.uniform(1.2, 2.2)))
+        return Plan(
+            f"VD.3-{letter}", f"VD.3-{letter}", "VD.3", 0, 8.0, FAST, (), (), least=float(self.rng.uniform(1.2, 2.2))
+        )
 
 
 def sample_times(plan: Plan, rate: float | None = None) -> Float[np.ndarray, " N"]:

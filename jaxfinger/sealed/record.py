@@ -52,7 +52,12 @@ def commanded(plan: Plan, rate: float | None = None) -> Motion:
     pulled = np.array([p.start > 0 or len(p.times) > 1 for p in plan.tension])
     wander = sum(
         a * np.sin(2 * np.pi * t[:, None] / p + ph)
-        for a, p, ph in zip(rng.uniform(0.3, 0.6, (3, len(pulled))), rng.uniform(3, 15, (3, len(pulled))), rng.uniform(0, 6.28, (3, len(pulled))), strict=True)
+        for a, p, ph in zip(
+            rng.uniform(0.3, 0.6, (3, len(pulled))),
+            rng.uniform(3, 15, (3, len(pulled))),
+            rng.uniform(0, 6.28, (3, len(pulled))),
+            strict=True,
+        )
     )
     tension = tension + plan.wander * wander * pulled
     if not plan.wander:  # a tension controller holds a level to a few hundredths
@@ -88,8 +93,15 @@ def record(finger: Finger, plan: Plan, motion: Motion, rigid: Float[np.ndarray, 
     held = plan.experiment in ("ID.4", "VD.2")
     direction = np.zeros_like(motion.direction) if held else motion.direction
     s = State(
-        motion.time, session, motion.q, motion.qd, motion.qdd, motion.tension, direction,
-        held=held, motor=plan.experiment.startswith(("ID.3", "ID.4")),
+        motion.time,
+        session,
+        motion.q,
+        motion.qd,
+        motion.qdd,
+        motion.tension,
+        direction,
+        held=held,
+        motor=plan.experiment.startswith(("ID.3", "ID.4")),
     )
     if not held:
         s.st = last_direction(finger.speed(s), 1e-6)
@@ -115,7 +127,9 @@ def record(finger: Finger, plan: Plan, motion: Motion, rigid: Float[np.ndarray, 
     return out
 
 
-def needed_torque(finger: Finger, plan: Plan, motion: Motion, rigid: Float[np.ndarray, "N m"] | None = None) -> Float[np.ndarray, "N m"]:
+def needed_torque(
+    finger: Finger, plan: Plan, motion: Motion, rigid: Float[np.ndarray, "N m"] | None = None
+) -> Float[np.ndarray, "N m"]:
     """VD.3: the external torque that the finger would need to follow a motion under these tensions, N m."""
     session = plan.start + motion.time
     s = State(motion.time, session, motion.q, motion.qd, motion.qdd, motion.tension, motion.direction)

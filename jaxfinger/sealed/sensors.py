@@ -17,7 +17,10 @@ CORRELATION = 0.012  # s
 UNITS = {"q": "rad", "tendon_force": "N", "tendon_excursion": "m", "joint_torque": "N m", "fingertip_force": "N"}
 STD = {"q": 2e-4, "tendon_force": 0.02, "tendon_excursion": 1e-5, "joint_torque": 3e-4, "fingertip_force": 0.02}
 RESOLUTION = {
-    "q": 2 * np.pi / 2**14, "tendon_force": 50 / 2**12, "tendon_excursion": 2.0**-20, "joint_torque": 2.0**-16,
+    "q": 2 * np.pi / 2**14,
+    "tendon_force": 50 / 2**12,
+    "tendon_excursion": 2.0**-20,
+    "joint_torque": 2.0**-16,
     "fingertip_force": 2.0**-10,
 }
 
@@ -53,7 +56,9 @@ def noise(shape: tuple[int, int], dt: float, std: float, rng: np.random.Generato
     return std * (np.sqrt(WHITE) * rng.normal(size=shape) + np.sqrt(1 - WHITE) * coloured)
 
 
-def measure(channels: Channels, specimen: Specimen, sensors: Sensors, zero: Float[np.ndarray, " n"], rng: np.random.Generator) -> Trial:
+def measure(
+    channels: Channels, specimen: Specimen, sensors: Sensors, zero: Float[np.ndarray, " n"], rng: np.random.Generator
+) -> Trial:
     """The trial as the bench writes it. `zero`: the session's excursion offsets in m."""
     plan, finger = channels.plan, specimen.finger
     dt = 1.0 / plan.rate
@@ -81,10 +86,21 @@ def measure(channels: Channels, specimen: Specimen, sensors: Sensors, zero: Floa
         force = sense("fingertip_force", channels.force)
     hold, joint_direction, tendon_direction = _protocol_channels(channels, finger.active)
     return Trial(
-        name=plan.name, experiment=plan.experiment, time=time, q=sense("q", channels.q), tendon_force=sense("tendon_force", tension),
-        tendon_excursion=excursion, joint_torque=torque, fingertip_force=force, joint_direction=joint_direction,
-        tendon_direction=tendon_direction, hold=hold, joint=None if plan.joint is None else finger.joint_names[plan.joint],
-        tendon=None if plan.tendon is None else finger.tendon_names[plan.tendon], motion=plan.motion, session_start=plan.start,
+        name=plan.name,
+        experiment=plan.experiment,
+        time=time,
+        q=sense("q", channels.q),
+        tendon_force=sense("tendon_force", tension),
+        tendon_excursion=excursion,
+        joint_torque=torque,
+        fingertip_force=force,
+        joint_direction=joint_direction,
+        tendon_direction=tendon_direction,
+        hold=hold,
+        joint=None if plan.joint is None else finger.joint_names[plan.joint],
+        tendon=None if plan.tendon is None else finger.tendon_names[plan.tendon],
+        motion=plan.motion,
+        session_start=plan.start,
     )
 
 

@@ -61,9 +61,15 @@ class Session:
     def _rigid(finger: Finger, plan: Plan, motion: Motion) -> Float[np.ndarray, "N m"] | None:
         if plan.experiment in ("ID.2", "VD.1"):
             return None
-        return finger.plant.gravity_torque(motion.q) if plan.experiment in ("ID.4", "VD.2") else rigid_torque(finger, motion)
+        return (
+            finger.plant.gravity_torque(motion.q)
+            if plan.experiment in ("ID.4", "VD.2")
+            else rigid_torque(finger, motion)
+        )
 
-    def rows(self, finger: Finger, look: Look, motion: Motion, same_body: bool) -> Iterator[tuple[str, str, int, np.ndarray]]:
+    def rows(
+        self, finger: Finger, look: Look, motion: Motion, same_body: bool
+    ) -> Iterator[tuple[str, str, int, np.ndarray]]:
         """(experiment, channel, column, values in units of a hold's noise) of one trial as this finger makes it."""
         plan = look.plan
         rigid = look.rigid if same_body and motion is look.motion else self._rigid(finger, plan, motion)
@@ -135,7 +141,9 @@ class Session:
 
     @cached_property
     def _base(self) -> list[np.ndarray]:
-        return [np.concatenate([x for *_, x in self.rows(self.nominal, look, look.motion, True)]) for look in self.looks]
+        return [
+            np.concatenate([x for *_, x in self.rows(self.nominal, look, look.motion, True)]) for look in self.looks
+        ]
 
     @cached_property
     def absorbed(self) -> tuple[Float[np.ndarray, "R P"], Float[np.ndarray, " P"]]:
@@ -160,8 +168,11 @@ class Session:
         """Specimens one small parameter change away: (trials it concerns, specimen, size of the change, prior precision)."""
         s = self.specimen
         for name, array, step, unit in (
-            ("excursion", s.excursion, 1e-6, 1e-4), ("elastic", s.elastic, 1e-5, 1e-3), ("coulomb", s.coulomb, 1e-5, 1e-3),
-            ("damping", s.damping, 1e-6, 1e-4), ("friction", s.friction, 1e-4, 1e-2),
+            ("excursion", s.excursion, 1e-6, 1e-4),
+            ("elastic", s.elastic, 1e-5, 1e-3),
+            ("coulomb", s.coulomb, 1e-5, 1e-3),
+            ("damping", s.damping, 1e-6, 1e-4),
+            ("friction", s.friction, 1e-4, 1e-2),
         ):
             for index in np.ndindex(array.shape):
                 if name == "excursion" and not (s.finger.crosses[index[:2]] and s.finger.active[index[0]]):
@@ -214,7 +225,9 @@ def _concern(parameter: str, index: int) -> Callable[[Plan], bool]:
     return concerns
 
 
-def by_channel(rows: Float[np.ndarray, " R"], labels: Sequence[tuple[str, str, int]]) -> dict[tuple[str, str, int], float]:
+def by_channel(
+    rows: Float[np.ndarray, " R"], labels: Sequence[tuple[str, str, int]]
+) -> dict[tuple[str, str, int], float]:
     """rms of the rows by (experiment, channel, column)."""
     groups: dict[tuple[str, str, int], list[float]] = {}
     for value, label in zip(rows.tolist(), labels, strict=True):
@@ -230,7 +243,9 @@ def severity(session: Session, departures: Sequence[Departure]) -> tuple[float, 
     return sizes[where], where
 
 
-def calibrate(session: Session, departure: Departure, target: float, attempts: int = 8) -> tuple[Departure, float, tuple[str, str, int]]:
+def calibrate(
+    session: Session, departure: Departure, target: float, attempts: int = 8
+) -> tuple[Departure, float, tuple[str, str, int]]:
     """Resize a departure until its severity is `target`, within a tenth or as far as physical sizes go."""
     low = high = None  # (log size, log severity) below and above the target
     best = None

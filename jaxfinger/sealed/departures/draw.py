@@ -14,38 +14,96 @@ from .base import Departure
 LISTED: dict[str, type[Departure]] = {
     kind.effect: kind
     for kind in (
-        joint.Stribeck, joint.JointPresliding, joint.LoadFriction, joint.Hardening, joint.Relaxation, joint.Stop,
-        joint.PassiveTendon, tendon.Stretch, tendon.Creep, tendon.Backlash, tendon.Coupling, tendon.Bowstring,
-        tendon.Capstan, tendon.ViscousTendon, tendon.TendonPresliding, tendon.Saturating, tendon.Crosstalk,
-        sensor.Payload, sensor.Tilt, joint.DriveInertia, sensor.TorqueScale, sensor.TorqueDrift, joint.TorqueRipple,
-        sensor.TensionScale, sensor.EncoderOffset, sensor.Eccentricity, sensor.ForceRotation, sensor.Delay,
+        joint.Stribeck,
+        joint.JointPresliding,
+        joint.LoadFriction,
+        joint.Hardening,
+        joint.Relaxation,
+        joint.Stop,
+        joint.PassiveTendon,
+        tendon.Stretch,
+        tendon.Creep,
+        tendon.Backlash,
+        tendon.Coupling,
+        tendon.Bowstring,
+        tendon.Capstan,
+        tendon.ViscousTendon,
+        tendon.TendonPresliding,
+        tendon.Saturating,
+        tendon.Crosstalk,
+        sensor.Payload,
+        sensor.Tilt,
+        joint.DriveInertia,
+        sensor.TorqueScale,
+        sensor.TorqueDrift,
+        joint.TorqueRipple,
+        sensor.TensionScale,
+        sensor.EncoderOffset,
+        sensor.Eccentricity,
+        sensor.ForceRotation,
+        sensor.Delay,
     )
 }
 UNLISTED: dict[str, type[Departure]] = {
     kind.effect: kind
     for kind in (
-        unlisted.MotorCogging, unlisted.WarmingGrease, unlisted.SlackSag, unlisted.SidewaysYield, unlisted.StickSlip,
-        unlisted.Saturation, unlisted.EncoderCrosstalk, unlisted.SumOfAngles, unlisted.BaseYield, unlisted.QuadraticDrag,
+        unlisted.MotorCogging,
+        unlisted.WarmingGrease,
+        unlisted.SlackSag,
+        unlisted.SidewaysYield,
+        unlisted.StickSlip,
+        unlisted.Saturation,
+        unlisted.EncoderCrosstalk,
+        unlisted.SumOfAngles,
+        unlisted.BaseYield,
+        unlisted.QuadraticDrag,
     )
 }
 
 AT_JOINT = (
-    joint.Stribeck, joint.JointPresliding, joint.LoadFriction, joint.Hardening, joint.Relaxation, joint.Stop, joint.DriveInertia,
-    joint.TorqueRipple, sensor.Payload, sensor.EncoderOffset, sensor.Eccentricity, unlisted.WarmingGrease, unlisted.QuadraticDrag,
+    joint.Stribeck,
+    joint.JointPresliding,
+    joint.LoadFriction,
+    joint.Hardening,
+    joint.Relaxation,
+    joint.Stop,
+    joint.DriveInertia,
+    joint.TorqueRipple,
+    sensor.Payload,
+    sensor.EncoderOffset,
+    sensor.Eccentricity,
+    unlisted.WarmingGrease,
+    unlisted.QuadraticDrag,
 )
 AT_TENDON = (
-    tendon.Stretch, tendon.Creep, tendon.Backlash, tendon.Bowstring, tendon.Capstan, tendon.ViscousTendon,
-    tendon.TendonPresliding, tendon.Saturating, sensor.TensionScale, unlisted.MotorCogging, unlisted.SlackSag,
+    tendon.Stretch,
+    tendon.Creep,
+    tendon.Backlash,
+    tendon.Bowstring,
+    tendon.Capstan,
+    tendon.ViscousTendon,
+    tendon.TendonPresliding,
+    tendon.Saturating,
+    sensor.TensionScale,
+    unlisted.MotorCogging,
+    unlisted.SlackSag,
 )
 JOINT_PAIR = (joint.PassiveTendon, unlisted.EncoderCrosstalk, unlisted.SumOfAngles)
 AT_SENSOR = {
-    sensor.TorqueScale: "torque_sensor", sensor.TorqueDrift: "torque_sensor", unlisted.Saturation: "torque_sensor",
-    sensor.ForceRotation: "fingertip", unlisted.SidewaysYield: "fingertip", unlisted.StickSlip: "fingertip",
-    sensor.Tilt: "base", unlisted.BaseYield: "base",
+    sensor.TorqueScale: "torque_sensor",
+    sensor.TorqueDrift: "torque_sensor",
+    unlisted.Saturation: "torque_sensor",
+    sensor.ForceRotation: "fingertip",
+    unlisted.SidewaysYield: "fingertip",
+    unlisted.StickSlip: "fingertip",
+    sensor.Tilt: "base",
+    unlisted.BaseYield: "base",
 }
 
 
-def draw(effect: str, finger: FingerDescription, rng: np.random.Generator, speeds: Sequence[float] = (0.5, 1.0)) -> Departure | None:
+def draw(
+    effect: str, finger: FingerDescription, rng: np.random.Generator, speeds: Sequence[float] = (0.5, 1.0)
+) -> Departure | None:
     """A departure of its start size, or None where this finger has no site for it. `speeds`: of the dynamic sweeps, rad/s."""
     kind = {**LISTED, **UNLISTED}[effect]
     site = _site(kind, finger, rng)
@@ -87,7 +145,13 @@ def _site(kind: type[Departure], finger: FingerDescription, rng: np.random.Gener
     return (AT_SENSOR[kind],), ()
 
 
-def _shape(kind: type[Departure], finger: FingerDescription, index: tuple[int, ...], rng: np.random.Generator, speeds: Sequence[float]):
+def _shape(
+    kind: type[Departure],
+    finger: FingerDescription,
+    index: tuple[int, ...],
+    rng: np.random.Generator,
+    speeds: Sequence[float],
+):
     sign = float(rng.choice([-1.0, 1.0]))
     phase = float(rng.uniform(0, 2 * np.pi))
     if kind is joint.Stribeck:
@@ -101,7 +165,11 @@ def _shape(kind: type[Departure], finger: FingerDescription, index: tuple[int, .
         depth = rng.uniform(0.14, 0.24) * (high - low)
         return {"side": sign, "angle": float(high - depth if sign > 0 else low + depth)}
     if kind is joint.PassiveTendon:
-        return {"r_a": float(rng.uniform(4e-3, 7e-3)), "r_b": float(rng.uniform(4e-3, 6e-3)), "slack": float(rng.uniform(0, 1.5e-3))}
+        return {
+            "r_a": float(rng.uniform(4e-3, 7e-3)),
+            "r_b": float(rng.uniform(4e-3, 6e-3)),
+            "slack": float(rng.uniform(0, 1.5e-3)),
+        }
     if kind is joint.TorqueRipple:
         return {"p": float(rng.integers(7, 22)), "phase": phase}
     if kind is tendon.Stretch:

@@ -177,7 +177,10 @@ class Delay(Departure):
     forms: ClassVar[tuple[str, ...]] = ("shift", "low_pass")
 
     FIELDS: ClassVar[dict[str, str]] = {
-        "q": "q", "tendon_force": "tension", "tendon_excursion": "excursion", "joint_torque": "torque"
+        "q": "q",
+        "tendon_force": "tension",
+        "tendon_excursion": "excursion",
+        "joint_torque": "torque",
     }
 
     def read(self, channels):

@@ -118,7 +118,9 @@ class Bowstring(Departure):
     def path(self, finger, s, length, arm):
         k = self.index[0]
         f = np.maximum(s.f[..., k], 0.0)
-        g = {"linear": f, "saturating": f / (1 + f / 12.0), "threshold": np.logaddexp(0.0, (f - 4.0) / 0.7) * 0.7}[self.form]
+        g = {"linear": f, "saturating": f / (1 + f / 12.0), "threshold": np.logaddexp(0.0, (f - 4.0) / 0.7) * 0.7}[
+            self.form
+        ]
         nominal, nominal_arm = finger.geometry(s.q)
         arm = np.array(arm)
         arm[..., k, :] += self.size * g[..., None] * nominal_arm[..., k, :]

@@ -1,0 +1,141 @@
+"""`jaxfinger sealed make | run | score`: the benchmark of the diagnosis on data whose effect is withheld."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal
+
+from jaxfinger.errors import UserError
+
+DIAGNOSE = "jaxfinger diagnose {fit} -o {out}"
+
+
+def make(
+    folder: Path,
+    *,
+    split: Literal["develop", "fresh"] = "develop",
+    count: int = 60,
+    truth: Path | None = None,
+    workers: int | None = None,
+    share: str = "1/1",
+) -> None:
+    """Make sealed cases: FOLDER/case-NNN/{fit,fresh}.h5, and their truth in another tree. Finished cases are left alone.
+
+    Args:
+        folder: where the cases go.
+        split: `develop` to work with; `fresh` has other seeds, and is for a published table only.
+        count: how many cases; a larger count adds to a smaller one.
+        truth: where the truth goes; by default a folder beside it, named FOLDER-truth.
+        workers: processes; by default as many as there are cores.
+        share: this machine's part of the work, for example 2/8.
+    """
+    from jaxfinger.sealed.cases import make_cases
+
+    if count < 1:
+        raise UserError(f"--count {count}: ask for at least one case")
+    truth_root = truth or _beside(folder, "truth")
+    with _bar("making cases") as progress:
+        make_cases(split, count, folder, truth_root, workers or os.cpu_count() or 1, _share(share), progress)
+    print(f"{folder}: cases; {truth_root}: truth. Diagnose them with: jaxfinger sealed run {folder}")
+
+
+def run(
+    folder: Path, *, output: Path | None = None, command: str = DIAGNOSE, workers: int | None = None, share: str = "1/1"
+) -> None:
+    """Diagnose every case of FOLDER, each from a lone copy of its fit.h5. Cases that are done are skipped.
+
+    Args:
+        folder: the cases.
+        output: where each case's gap.json goes; by default a folder beside it, named FOLDER-diagnoses.
+        command: what diagnoses; {fit} and {out} stand for the session and the folder to write.
+        workers: cases at a time; by default as many as there are cores.
+        share: this machine's part of the work, for example 2/8.
+    """
+    from jaxfinger.sealed.run import Command, run_cases
+
+    if "{fit}" not in command or "{out}" not in command:
+        raise UserError(f"--command {command!r}: it must hold {{fit}} and {{out}}, as in {DIAGNOSE!r}")
+    out = output or _beside(folder, "diagnoses")
+    with _bar("diagnosing") as progress:
+        results = run_cases(folder, out, Command(command), workers or os.cpu_count() or 1, _share(share), progress)
+    failed = sorted(name for name, what in results.items() if what == "failed")
+    print(
+        f"{out}: {len(results) - len(failed)} diagnosed"
+        + (f"; failed, see run.json: {', '.join(failed)}" if failed else "")
+    )
+
+
+def score(
+    folder: Path, *, diagnoses: Path | None = None, truth: Path | None = None, output: Path | None = None
+) -> None:
+    """Print every score of the diagnosis on FOLDER's cases, with intervals, confusions and reliability.
+
+    Args:
+        folder: the cases.
+        diagnoses: what `run` wrote; by default FOLDER-diagnoses.
+        truth: what `make` hid; by default FOLDER-truth, or truth.json beside each fit.h5.
+        output: a folder for scores.json and reliability.svg.
+    """
+    from rich.console import Console
+
+    from jaxfinger.sealed.figures import reliability_diagram
+    from jaxfinger.sealed.score import score_folder
+    from jaxfinger.sealed.tables import render
+
+    results = diagnoses or _beside(folder, "diagnoses")
+    if not results.is_dir():
+        raise UserError(f"{results}: no diagnoses here; run them first with: jaxfinger sealed run {folder}")
+    scores = score_folder(folder, results, truth or _beside(folder, "truth"))
+    if not scores.cases:
+        raise UserError(
+            f"{results}: holds no diagnosis of a case in {folder}; run them first with: jaxfinger sealed run {folder}"
+        )
+    Console().print(render(scores))
+    if output:
+        output.mkdir(parents=True, exist_ok=True)
+        (output / "scores.json").write_text(json.dumps(scores.to_json(), indent=1))
+        reliability_diagram(scores.reliability, output / "reliability.svg")
+        print(f"{output}: scores.json, reliability.svg")
+
+
+def _beside(folder: Path, what: str) -> Path:
+    return folder.with_name(f"{folder.name}-{what}")
+
+
+def _share(text: str) -> tuple[int, int]:
+    try:
+        i, n = (int(x) for x in text.split("/"))
+    except ValueError:
+        raise UserError(f"--share {text}: say it as i/n, for example 2/8") from None
+    if not 1 <= i <= n:
+        raise UserError(f"--share {text}: i runs from 1 to n")
+    return i, n
+
+
+@contextmanager
+def _bar(title: str) -> Iterator[Callable[[int, int, str], None]]:
+    """A progress bar that takes (done, total, what)."""
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn(title),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+    )
+    with Progress(*columns) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)

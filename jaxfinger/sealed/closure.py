@@ -1,0 +1,87 @@
+"""How far the gap closes on fresh trials: rms of measurement minus prediction, by experiment and channel.
+
+The predictions come from any tool in the predictions layout; nothing is assumed of the model.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from jaxfinger.data import Session, Trial, read_predictions, read_session
+
+CHANNELS = {
+    "ID.2": ("tendon_excursion",),
+    "VD.1": ("tendon_excursion",),
+    "ID.3-static": ("joint_torque",),
+    "ID.3-dynamic": ("joint_torque",),
+    "ID.4": ("joint_torque", "tendon_excursion"),
+    "VD.2": ("fingertip_force", "tendon_excursion"),
+    "VD.3": ("tendon_excursion", "joint_torque"),
+}
+MOVING = 0.05  # rad/s, and that speed times 5 mm for a tendon: VD.3's torque is judged where both slide
+
+
+def gap_by_channel(
+    measured: Session, predicted: Mapping[str, Mapping[str, np.ndarray]]
+) -> dict[tuple[str, str], float]:
+    """rms of measured minus predicted over all samples that both have, SI units; excursions less one constant a trial and tendon."""
+    squares: dict[tuple[str, str], list[np.ndarray]] = defaultdict(list)
+    for trial in measured:
+        if trial.name not in predicted:
+            continue
+        for channel in CHANNELS[trial.experiment]:
+            said = predicted[trial.name].get(channel)
+            seen = getattr(trial, channel)
+            if said is None:
+                continue
+            if trial.experiment == "VD.3" and channel == "joint_torque":
+                difference = np.where(
+                    _sliding(trial, measured), -np.asarray(said, dtype=float), np.nan
+                )  # the truth is zero
+            elif seen is None:
+                continue
+            else:
+                difference = np.asarray(seen, dtype=float) - said
+            for column in difference.T:
+                rest = column[np.isfinite(column)]
+                if len(rest):
+                    squares[trial.experiment, channel].append(
+                        (rest - rest.mean() if channel == "tendon_excursion" else rest) ** 2
+                    )
+    return {key: float(np.sqrt(np.concatenate(parts).mean())) for key, parts in sorted(squares.items())}
+
+
+def _sliding(trial: Trial, session: Session) -> np.ndarray:
+    """(N, m) where a joint moves and so does every tendon across it."""
+    rate = float(1.0 / np.median(np.diff(trial.time)))
+    width = max(int(0.05 * rate), 3)
+    speed = _slope(trial.q, trial.time, width)
+    joint = np.abs(speed) > MOVING
+    if trial.tendon_excursion is None:
+        return joint
+    tendon = np.abs(_slope(trial.tendon_excursion, trial.time, width)) > MOVING * 5e-3
+    blocked = ~tendon @ (session.finger.crosses & session.finger.active[:, None])
+    return joint & ~blocked
+
+
+def _slope(values: np.ndarray, time: np.ndarray, width: int) -> np.ndarray:
+    """Central difference over ± width samples."""
+    x = np.asarray(values, dtype=float)
+    out = np.zeros_like(x)
+    out[width:-width] = (x[2 * width :] - x[: -2 * width]) / (time[2 * width :] - time[: -2 * width])[:, None]
+    return out
+
+
+def fresh_rows(fresh: Path, before: Path, after: Path) -> list[dict]:
+    """Rows for `fresh.json`: rms on the fresh trials of the nominal fit's and the augmented fit's predictions."""
+    measured = read_session(fresh)
+    first, second = (gap_by_channel(measured, read_predictions(p)) for p in (before, after))
+    return [
+        {"experiment": e, "channel": c, "before": first[e, c], "after": second[e, c]}
+        for e, c in first
+        if (e, c) in second
+    ]

@@ -1,0 +1,98 @@
+"""Runs a diagnosis over sealed cases: on many cores, on many machines by shares, taken up again after a stop.
+
+The diagnosis sees a copy of `fit.h5` in an empty folder and nothing else: neither the fresh trials nor any path to the truth.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+from jaxfinger.errors import UserError
+
+Diagnose = Callable[[Path, Path], None]  # (session file, folder to write gap.json into)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A shell command line with {fit} and {out}, for example `jaxfinger diagnose {fit} -o {out}`."""
+
+    line: str
+
+    def __call__(self, fit: Path, out: Path) -> None:
+        words = [w.format(fit=fit, out=out) for w in shlex.split(self.line)]
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise RuntimeError((done.stderr or done.stdout).strip()[-2000:] or f"exit status {done.returncode}")
+
+
+def run_case(diagnose: Diagnose, folder: Path, out: Path) -> str:
+    """Diagnose one case into `out/<case>`; returns "done", "failed" or "skipped". A failure is recorded, and scored as one."""
+    target = out / folder.name
+    if (target / "run.json").exists():
+        return "skipped"
+    record: dict = {"case": folder.name}
+    with tempfile.TemporaryDirectory() as sealed:
+        fit, result = Path(sealed) / "fit.h5", Path(sealed) / "out"
+        shutil.copyfile(folder / "fit.h5", fit)
+        begun = time.perf_counter()
+        try:
+            diagnose(fit, result)
+            if not (result / "gap.json").exists():
+                raise RuntimeError("the diagnosis wrote no gap.json")
+        except Exception as error:  # whatever the code under test raises is its result
+            record["error"] = f"{type(error).__name__}: {error}"
+        record["seconds"] = time.perf_counter() - begun
+        target.mkdir(parents=True, exist_ok=True)
+        if result.exists():
+            shutil.copytree(result, target, dirs_exist_ok=True)
+    part = target / "run.json.part"
+    part.write_text(json.dumps(record, indent=1))
+    os.replace(part, target / "run.json")
+    return "failed" if "error" in record else "done"
+
+
+def run_cases(
+    cases: Path,
+    out: Path,
+    diagnose: Diagnose,
+    workers: int = 1,
+    share: tuple[int, int] = (1, 1),
+    progress: Callable[[int, int, str], None] | None = None,
+    names: Sequence[str] | None = None,
+) -> dict[str, str]:
+    """Diagnose every case of a folder, or share i of n of them; returns what became of each."""
+    folders = sorted(f.parent for f in cases.glob("*/fit.h5"))
+    if not folders:
+        raise UserError(
+            f"{cases}: no case here; each case is a folder with a fit.h5 (make them with: jaxfinger sealed make)"
+        )
+    mine = [
+        f
+        for k, f in enumerate(folders, start=1)
+        if k % share[1] == share[0] % share[1] and (names is None or f.name in names)
+    ]
+    results: dict[str, str] = {}
+    if workers == 1:
+        for f in mine:
+            results[f.name] = run_case(diagnose, f, out)
+            if progress:
+                progress(len(results), len(mine), f"{f.name} {results[f.name]}")
+        return results
+    pool = ThreadPoolExecutor(workers) if isinstance(diagnose, Command) else ProcessPoolExecutor(workers)
+    with pool:
+        jobs = {pool.submit(run_case, diagnose, f, out): f.name for f in mine}
+        for job in as_completed(jobs):
+            results[jobs[job]] = job.result()
+            if progress:
+                progress(len(results), len(mine), f"{jobs[job]} {job.result()}")
+    return results

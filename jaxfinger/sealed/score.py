@@ -1,0 +1,251 @@
+"""The scores of the diagnosis on sealed cases, each with an interval, from `gap.json` and the truth alone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from .truth import NONE, UNLISTED, Cause, Diagnosis, Truth, read_diagnosis, read_truth
+
+LARGEST_SET = 3
+BINS = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A share or a mean with its 95 % interval over `count` cases; NaN where there are none."""
+
+    value: float
+    low: float
+    high: float
+    count: int
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Everything that the specification asks of a benchmark. See `score_cases` for what each figure counts."""
+
+    cases: int
+    failed: int
+    figures: dict[str, Figure]
+    by_effect: dict[str, dict[str, Figure]]
+    by_severity: dict[str, dict[str, Figure]]
+    by_specimen: dict[str, dict[str, Figure]]
+    confusions: list[tuple[str, str, int]]
+    reliability: list[dict[str, float]]
+    missed: list[dict] = field(default_factory=list)
+
+    def to_json(self) -> dict:
+        """Plain dictionaries for a file."""
+        return asdict(self)
+
+
+def wilson(hits: int, count: int, z: float = 1.959964) -> Figure:
+    """Share with Wilson's score interval (Wilson 1927), which stays within [0, 1] and is honest at 0 and at 1."""
+    if count == 0:
+        return Figure(float("nan"), float("nan"), float("nan"), 0)
+    p = hits / count
+    centre = (p + z**2 / (2 * count)) / (1 + z**2 / count)
+    half = z * np.sqrt(p * (1 - p) / count + z**2 / (4 * count**2)) / (1 + z**2 / count)
+    return Figure(p, float(max(centre - half, 0.0)), float(min(centre + half, 1.0)), count)
+
+
+def bootstrap(values: Sequence[float], draws: int = 2000) -> Figure:
+    """Mean with a percentile interval over resampled cases (fixed seed: scoring twice gives the same figures)."""
+    x = np.asarray(values, dtype=float)
+    if not len(x):
+        return Figure(float("nan"), float("nan"), float("nan"), 0)
+    means = x[np.random.default_rng(0).integers(len(x), size=(draws, len(x)))].mean(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return Figure(float(x.mean()), float(low), float(high), len(x))
+
+
+def cause_right(truth: Truth, diagnosis: Diagnosis) -> bool:
+    """The first named effect and its site are true; of a double, either of its effects."""
+    return bool(diagnosis.named) and bool(diagnosis.answer) and diagnosis.named[0] in truth.causes
+
+
+def both_right(truth: Truth, diagnosis: Diagnosis) -> bool:
+    """Both effects of a double are named, and nothing else."""
+    return set(diagnosis.named) == set(truth.causes)
+
+
+def covered(truth: Truth, diagnosis: Diagnosis) -> bool:
+    """The truth is the named effect, or in the named set of at most three members; none and unlisted likewise by status."""
+    if truth.kind == "none":
+        return diagnosis.status == "no_gap"
+    if truth.kind == "unlisted":
+        return diagnosis.status == "unexplained"
+    if diagnosis.status == "ambiguous":
+        members = diagnosis.answer
+        return len(members) <= LARGEST_SET and any(c in members for c in truth.causes)
+    return cause_right(truth, diagnosis)
+
+
+def brier(truth: Truth, diagnosis: Diagnosis) -> float:
+    """Σ (p − y)² over all candidates, «none» and «unlisted»; a truth that is no candidate has probability zero."""
+    wanted = truth.shares()
+    return float(
+        sum((diagnosis.probability.get(c, 0.0) - wanted.get(c, 0.0)) ** 2 for c in {*diagnosis.probability, *wanted})
+    )
+
+
+def on_truth(truth: Truth, diagnosis: Diagnosis) -> float:
+    """Probability given to what is true."""
+    return float(sum(diagnosis.probability.get(c, 0.0) for c in truth.shares()))
+
+
+def closed_share(rows: Sequence[Mapping], ceiling: Sequence[Mapping]) -> float:
+    """Gap closed on fresh trials, as a share of what refitting with the true effect closes.
+
+    `rows`: rms by experiment and channel before and after, as measured on the diagnosis's predictions; `ceiling`: the truth's rows.
+    Energy above noise is summed over channels in units of each channel's noise. NaN where the ceiling has nothing to close.
+    Forward simulation of VD.3 (`q`) amplifies and is left out.
+    """
+    at = {(r["experiment"], r["channel"]): r for r in rows}
+    done = possible = 0.0
+    for r in ceiling:
+        seen = at.get((r["experiment"], r["channel"]))
+        if seen is None or (r["experiment"], r["channel"]) == ("VD.3", "q"):
+            continue
+        noise = float(r.get("noise", r["after"])) or 1.0
+        done += (seen["before"] ** 2 - seen["after"] ** 2) / noise**2
+        possible += (r["before"] ** 2 - r["after"] ** 2) / noise**2
+    return done / possible if possible > 0 else float("nan")
+
+
+FIGURES: dict[str, tuple[Callable[[Truth], bool], Callable[[Truth, Diagnosis], bool]]] = {
+    "cause": (lambda t: t.kind == "listed", cause_right),
+    "covered": (lambda t: t.kind == "listed", covered),
+    "false alarm": (lambda t: t.kind == "none", lambda t, d: bool(d.answer)),
+    "open set": (lambda t: t.kind == "unlisted", lambda t, d: d.status == "unexplained"),
+    "double, one right": (lambda t: t.kind == "double", cause_right),
+    "double, both right": (lambda t: t.kind == "double", both_right),
+}
+
+
+def score_cases(pairs: Sequence[tuple[Truth, Diagnosis]]) -> Scores:
+    """All scores of a set of cases.
+
+    cause, covered: single listed effects. false alarm: cases without an effect. open set: effects that the catalogue lacks.
+    Brier, probability on the truth: every case that was diagnosed. set size: verdicts that name something. closed: cases with
+    predictions on the fresh trials. seconds: cost of a case.
+    """
+    done = [(t, d) for t, d in pairs if d.status != "failed"]
+    figures = _shares(pairs)
+    figures["Brier"] = bootstrap([brier(t, d) for t, d in done])
+    figures["probability on the truth"] = bootstrap([on_truth(t, d) for t, d in done])
+    figures["set size"] = bootstrap(
+        [float(len(d.answer)) if d.status == "ambiguous" else 1.0 for _, d in done if d.answer]
+    )
+    closed = [closed_share(d.fresh, t.fresh) for t, d in done if d.fresh and t.kind in ("listed", "double")]
+    figures["closed"] = bootstrap([x for x in closed if np.isfinite(x)])
+    figures["seconds"] = bootstrap([d.seconds for _, d in pairs if d.seconds is not None])
+    wrong = Counter((_truth_name(t), _answer_name(d)) for t, d in pairs if not _right(t, d))
+    return Scores(
+        cases=len(pairs),
+        failed=len(pairs) - len(done),
+        figures=figures,
+        by_effect=_split(pairs, lambda t: t.causes[0][0] if t.kind in ("listed", "unlisted") else ""),
+        by_severity=_split(
+            pairs, lambda t: f"{t.severity:g}" if isinstance(t.severity, float | int) else str(t.severity or "")
+        ),
+        by_specimen=_split(pairs, lambda t: t.specimen),
+        confusions=[(a, b, k) for (a, b), k in sorted(wrong.items(), key=lambda x: (-x[1], x[0]))],
+        reliability=reliability(done),
+        missed=[
+            {
+                "case": t.name,
+                "truth": _truth_name(t),
+                "answer": _answer_name(d),
+                "severity": t.severity,
+                "reached": t.reached,
+                "probability": on_truth(t, d),
+            }
+            for t, d in pairs
+            if not _right(t, d)
+        ],
+    )
+
+
+def reliability(pairs: Sequence[tuple[Truth, Diagnosis]]) -> list[dict[str, float]]:
+    """Probabilities said against how often they came true, over all candidates, «none» and «unlisted» of all cases."""
+    said, came = [], []
+    for t, d in pairs:
+        wanted = t.shares()
+        for c, p in d.probability.items():
+            said.append(p)
+            came.append(wanted.get(c, 0.0))
+    p, y = np.array(said), np.array(came)
+    rows = []
+    for low, high in zip(BINS[:-1], BINS[1:], strict=True):
+        inside = (p >= low) & ((p < high) | ((high == 1.0) & (p <= 1.0)))
+        if inside.any():
+            interval = wilson(round(float(y[inside].sum())), int(inside.sum()))
+            rows.append(
+                {
+                    "low": low,
+                    "high": high,
+                    "said": float(p[inside].mean()),
+                    "came true": float(y[inside].mean()),
+                    "ci low": interval.low,
+                    "ci high": interval.high,
+                    "count": int(inside.sum()),
+                }
+            )
+    return rows
+
+
+def score_folder(cases: Path, diagnoses: Path, truth_root: Path | None) -> Scores:
+    """Scores of every case under a folder for which a diagnosis was tried."""
+    folders = sorted(f.parent for f in cases.glob("*/fit.h5"))
+    return score_cases(
+        [
+            (read_truth(f, truth_root), read_diagnosis(diagnoses / f.name))
+            for f in folders
+            if (diagnoses / f.name).exists()
+        ]
+    )
+
+
+def _shares(pairs: Sequence[tuple[Truth, Diagnosis]]) -> dict[str, Figure]:
+    out = {}
+    for name, (concerns, right) in FIGURES.items():
+        results = [right(t, d) for t, d in pairs if concerns(t)]
+        out[name] = wilson(sum(results), len(results))
+    return out
+
+
+def _split(pairs: Sequence[tuple[Truth, Diagnosis]], key: Callable[[Truth], str]) -> dict[str, dict[str, Figure]]:
+    keys = sorted({key(t) for t, _ in pairs} - {""})
+    out = {}
+    for k in keys:
+        inside = [(t, d) for t, d in pairs if key(t) == k]
+        figures = {n: f for n, f in _shares(inside).items() if f.count}
+        figures["probability on the truth"] = bootstrap([on_truth(t, d) for t, d in inside if d.status != "failed"])
+        out[k] = figures
+    return out
+
+
+def _right(truth: Truth, diagnosis: Diagnosis) -> bool:
+    if truth.kind in ("none", "unlisted"):
+        return covered(truth, diagnosis)
+    return both_right(truth, diagnosis) if truth.kind == "double" else cause_right(truth, diagnosis)
+
+
+def _name(cause: Cause) -> str:
+    return cause[0] if cause in (NONE, UNLISTED) else f"{cause[0]} ({', '.join(cause[1])})"
+
+
+def _truth_name(truth: Truth) -> str:
+    return " + ".join(_name(c) for c in truth.causes) if truth.causes else "none"
+
+
+def _answer_name(diagnosis: Diagnosis) -> str:
+    names = [_name(c) for c in (diagnosis.answer or ())]
+    joiner = " | " if diagnosis.status == "ambiguous" else " + "
+    return joiner.join(names) if names else diagnosis.status
