@@ -18,7 +18,7 @@ from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.parse import listed, parse_file
 from jaxfinger.data.probe import survives
 from jaxfinger.data.schema import MEASURED
-from jaxfinger.data.session import Session, Trial
+from jaxfinger.data.session import EXPERIMENTS, Session, Trial
 
 _MANY_SPIKES = 0.05
 
@@ -54,6 +54,10 @@ def check_session(session: Session, report: Report) -> None:
     with np.errstate(all="ignore"):
         check_finger(session.finger, report)
         for trial in session:
+            if trial.experiment not in EXPERIMENTS:
+                message = f"has the unknown experiment {trial.experiment!r}; it must be one of {', '.join(EXPERIMENTS)}"
+                report.error(f"/trials/{trial.name}", message)
+                continue
             check_trial(trial, session.finger, report)
     _check_order(session, report)
     _check_motions(session, report)

@@ -42,7 +42,7 @@ def steps(count, levels):
 def make_session() -> Session:
     rng = np.random.default_rng(0)
     count = 900
-    time = np.arange(count) / 250.0
+    time = np.arange(count) / 100.0
     noise = lambda *shape: rng.standard_normal(shape)  # noqa: E731
     sweep = 0.6 - 0.5 * np.cos(2 * np.pi * time / time[-1] * 2)
     still = np.full(count, 0.4) + 1e-4 * noise(count)
