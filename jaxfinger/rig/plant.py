@@ -120,6 +120,7 @@ class Plant:
         self.external_torque = 0.0
         self.tip_force = [0.0, 0.0, 0.0]
         self._clock = 0.0
+        self._impulses: dict[tuple[str, int], float] = {}  # of friction on free joints, in the last step
         self._approach = 0.0  # direction in which the external motor last moved its joint
         self._length = [*f.origin[1:, 0].tolist(), float(f.fingertip[0])]
         self._com = f.com[:, 0].tolist()
@@ -204,7 +205,7 @@ class Plant:
     def prepare(self, mode: list[Mode], pose: list[float], contact: bool) -> None:
         """What the operator does between trials: fixtures, the external motor, hands, the fingertip's sensor."""
         self.mode, self.pose, self.contact = list(mode), list(pose), contact
-        self._clock, self._approach = 0.0, 0.0
+        self._clock, self._approach, self._impulses = 0.0, 0.0, {}
 
     def step(self, tension: list[float], motor: tuple[float, float, float] | None) -> None:
         """Advance by 1 ms under tensions (N); `motor` is the external motor's angle, velocity and acceleration."""
@@ -255,21 +256,27 @@ class Plant:
             drive.append(torque)
         inverse = np.linalg.inv(matrix)
         velocity = np.array([self.qd[j] for j in free]) + DT * inverse @ np.array(drive)
-        constraints = []  # (direction in joint space, bound on the impulse)
+        constraints = {}  # name: (direction in joint space, bound on the impulse)
         for a, j in enumerate(free):
-            constraints.append((np.eye(len(free))[a], DT * max(_poly(self._friction[j], self.q[j]), 0.0)))
+            constraints["joint", j] = (np.eye(len(free))[a], DT * max(_poly(self._friction[j], self.q[j]), 0.0))
         for i in range(self.n):
             direction = np.array([arms[i][j] for j in free])
             if direction.any() and (loss := self._loss(i, tension[i])) > 0:
-                constraints.append((direction, DT * loss))
-        responses = [inverse @ d for d, _ in constraints]
-        weights = [float(d @ r) for (d, _), r in zip(constraints, responses, strict=True)]
-        impulse = [0.0] * len(constraints)
+                constraints["tendon", i] = (direction, DT * loss)
+        impulses = {}
+        rows = []
+        for name, (direction, bound) in constraints.items():
+            response = inverse @ direction
+            start = min(max(self._impulses.get(name, 0.0), -bound), bound)  # the last step's: so that sticking converges
+            velocity = velocity + response * start
+            impulses[name] = start
+            rows.append((name, direction, bound, response, float(direction @ response)))
         for _ in range(12):
-            for c, (direction, bound) in enumerate(constraints):
-                new = min(max(impulse[c] - float(direction @ velocity) / weights[c], -bound), bound)
-                velocity = velocity + responses[c] * (new - impulse[c])
-                impulse[c] = new
+            for name, direction, bound, response, weight in rows:
+                new = min(max(impulses[name] - float(direction @ velocity) / weight, -bound), bound)
+                velocity = velocity + response * (new - impulses[name])
+                impulses[name] = new
+        self._impulses = impulses
         for a, j in enumerate(free):
             self.qd[j] = float(velocity[a])
             self.q[j] += DT * self.qd[j]

@@ -151,7 +151,8 @@ class Supervisor:
 
     def _frozen(self, block: Block) -> list[Violation]:
         last = self._tail[-1:] if len(self._tail) else block.x[:1] + np.nan
-        same = np.diff(np.concatenate([last, block.x]), axis=0) == 0
+        x = np.concatenate([last, block.x])
+        same = x[1:] == x[:-1]
         found = []
         for channel in np.flatnonzero(self._patience > 0):
             runs = _runs(same[:, channel], int(self._same[channel]))
@@ -169,6 +170,7 @@ class Supervisor:
         x = np.concatenate([self._tail[-VELOCITY_SPAN:], block.x])
         if len(x) <= VELOCITY_SPAN:
             return []
+        x = np.where(np.isfinite(x), x, np.nan)
         rate = (x[VELOCITY_SPAN:] - x[:-VELOCITY_SPAN]) * self.rig.rate_hz / VELOCITY_SPAN
         seq = block.seq[len(block) - len(rate) :]
         found = []

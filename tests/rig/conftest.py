@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxfinger.rig import parse_plan, parse_rig, run, standin
+from jaxfinger.rig.backend import Block
+from jaxfinger.rig.backends.ads import AdsRig
+from jaxfinger.rig.backends.simulated import SimulatedRig
+from jaxfinger.rig.channels import RigDescription
+from jaxfinger.rig.contract import State
+from jaxfinger.rig.examples import rig_toml
+
+SHORT = """
+[plan]
+name = "short"
+operator = "tester"
+[[trial]]
+experiment = "ID.2"
+joint = "DIP"
+passes = 1
+[[trial]]
+experiment = "ID.4"
+tendon = "T3"
+joint = "MCP"
+levels = [3.0, 6.0]
+"""
+
+
+@pytest.fixture(scope="session")
+def rig() -> RigDescription:
+    """The example rig file, read."""
+    return parse_rig(rig_toml())
+
+
+@pytest.fixture
+def simulated(rig) -> SimulatedRig:
+    return SimulatedRig(rig)
+
+
+@pytest.fixture(scope="session")
+def short(rig):
+    """A plan of two short trials."""
+    return parse_plan(SHORT, rig)
+
+
+def ads_rig(where: str, **rig) -> AdsRig:
+    """An ADS rig for a stand-in at host:port, patient with a loaded machine."""
+    keys = {"stale_s": 20.0, "poll_s": 0.002, **rig}
+    address = {"net_id": standin.NET_ID, "ip": where, "port": 851, "reconnect_s": 20}
+    return AdsRig(parse_rig(rig_toml("ads", address, **keys)))
+
+
+@pytest.fixture
+def quiet_block(rig) -> Callable[..., Block]:
+    """Blocks of an armed finger at rest: sensor noise, nothing wrong."""
+
+    def make(count: int = 400, first: int = 0, seed: int = 0, state: State = State.ARMED) -> Block:
+        rng = np.random.default_rng(seed)
+        x = rng.normal(0.0, 1e-3, (count, len(rig.channels)))
+        x[:, rig.columns("excursion", rig.finger.tendon_names)] *= 1e-3
+        x[:, rig.columns("tension", rig.finger.tendon_names)] += 2.0
+        x[:, rig.columns("joint_position", rig.finger.joint_names)] = 0.35
+        seq = np.arange(first, first + count, dtype=np.uint64)
+        return Block(seq, seq * 1_000_000 + 10**15, x, np.full(count, state, np.uint32), np.zeros(count, np.uint32))
+
+    return make
+
+
+@pytest.fixture
+def record(short, tmp_path) -> Callable:
+    """Record the short plan on a rig, with a fault once a named trial is being recorded."""
+
+    def go(rig, fault: Callable | None = None, at: tuple[str, str] = ("02-ID.4-T3-MCP", "waiting"), **options):
+        done = []
+
+        def observe(view):
+            if fault is not None and not done and (view.trial, view.doing) == at:
+                done.append(True)
+                fault(rig)
+
+        path: Path = options.pop("output", tmp_path / "session.h5")
+        return run(options.pop("plan", short), rig, path, observe=observe, **options)
+
+    return go

@@ -1,0 +1,118 @@
+"""A rig file with an error is refused with the line to mend; calibration turns raw values into SI."""
+
+import numpy as np
+import pytest
+
+from jaxfinger.data import Session, write_session
+from jaxfinger.errors import UserError
+from jaxfinger.rig import parse_rig, read_rig
+from jaxfinger.rig.examples import rig_toml
+from jaxfinger.rig.plant import default_truth
+
+GOOD = rig_toml()
+
+
+def line_of(text: str, fragment: str, after: str = "") -> int:
+    start = text.index(after) if after else 0
+    return text[: text.index(fragment, start)].count("\n") + 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('unit = "N m"', 'unit = "kg"', "'kg' is no unit for external_torque"),
+        ('kind = "external_torque"', 'kind = "torque"', "choose one of"),
+        ('of = "T3"\nslot = 2', 'of = "T9"\nslot = 2', "cannot be of 'T9'"),
+        ("slot = 3\n", "slot = 2\n", "slot 2 already holds"),
+        ("slot = 3\n", "slot = 60\n", "outside 0 to 59"),
+        ("scale = 1.0", "scale = 0.0", "is zero"),
+        ("scale = 1.0", "scale = nan", "must be a number"),
+        ("tension_max = 18.0", 'tension_max = "18 N"', "must be a number in N"),
+        ("tension_max = 18.0", "tension_max = -1.0", "outside 0.1 to 100"),
+        ("joint_margin_deg = 2.0", "joint_margn_deg = 2.0", "'joint_margin_deg' is missing"),
+        ("tension_rate = 20.0", "tension_rate = 900.0", "every ramp would trip"),
+        ('backend = "simulated"', 'backend = "simulatd"', "choose one of"),
+        ("rate_hz = 1000.0", "rate_hz = true", "must be a number"),
+        ('axis = [0.0, 1.0, 0.0]', 'axis = [0.0, 2.0, 0.0]', "length 1"),
+        ('crosses = ["MCP", "PIP"]', 'crosses = ["MCP", "XIP"]', "'XIP' is no joint"),
+    ],
+)
+def test_a_mistake_names_its_line(old, new, says):
+    assert old in GOOD
+    with pytest.raises(UserError, match="line") as error:
+        parse_rig(GOOD.replace(old, new, 1), "bench.toml")
+    assert says in str(error.value)
+    line = int(str(error.value).split("line ")[1].split(":")[0])
+    found = GOOD.replace(old, new, 1).splitlines()[line - 1]
+    wanted = ("[limits]",) if "missing" in says else tuple(new.splitlines())
+    assert found.startswith(wanted), (line, found)
+
+
+def test_the_line_is_the_very_line():
+    text = GOOD.replace('of = "T3"\nslot = 2', 'of = "T9"\nslot = 2', 1)
+    with pytest.raises(UserError, match=f"bench.toml, line {line_of(text, 'T9')}:"):
+        parse_rig(text, "bench.toml")
+
+
+@pytest.mark.parametrize("name", ["tension_max", "joint_torque_max", "fingertip_force_max", "joint_velocity_max_deg_s"])
+def test_a_missing_limit_is_refused(name):
+    text = "\n".join(row for row in GOOD.splitlines() if not row.startswith(f"{name} ="))
+    with pytest.raises(UserError, match=f"'{name}' is missing in \\[limits\\]"):
+        parse_rig(text)
+
+
+def test_a_joint_without_a_channel_is_refused():
+    blocks = GOOD.split("[[channel]]")
+    text = "[[channel]]".join(b for b in blocks if 'of = "PIP"' not in b)
+    with pytest.raises(UserError, match="joint 'PIP' has no channel"):
+        parse_rig(text)
+
+
+def test_an_unknown_key_is_refused():
+    with pytest.raises(UserError, match="'tension_maks' is unknown"):
+        parse_rig(GOOD.replace("[limits]", "[limits]\ntension_maks = 5.0"))
+
+
+def test_calibration_in_millimetres_and_degrees():
+    text = GOOD.replace('unit = "m"\nscale = 1.0\noffset = 0.0', 'unit = "mm"\nscale = 0.5\noffset = -2.0', 1)
+    text = text.replace('unit = "rad"\nscale = 1.0', 'unit = "deg"\nscale = 2.0', 1)
+    rig = parse_rig(text)
+    raw = np.full((2, 60), 30.0)
+    x = rig.calibrate(raw)
+    assert x[0, rig.index("excursion", "T1")] == pytest.approx((30 * 0.5 - 2.0) * 1e-3)
+    assert x[1, rig.index("joint_position", "MCP")] == pytest.approx(np.radians(60.0))
+
+
+def test_the_force_sensor_is_turned_into_the_base_frame():
+    quarter = "[fingertip_sensor]\nrotation = [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]\n"
+    rig = parse_rig(quarter + GOOD)
+    raw = np.zeros((1, 60))
+    raw[0, rig.channels[rig.index("fingertip_force", "x")].slot] = 5.0
+    force = rig.calibrate(raw)[0, [rig.index("fingertip_force", a) for a in "xyz"]]
+    np.testing.assert_allclose(force, [0.0, 5.0, 0.0])
+    with pytest.raises(UserError, match="rotation matrix"):
+        parse_rig(quarter.replace("-1.0", "-2.0") + GOOD)
+
+
+def test_the_finger_of_the_file_is_the_finger(rig):
+    truth = default_truth().finger
+    assert rig.finger.joint_names == truth.joint_names
+    for name in ("axis", "origin", "limits", "mass", "com", "inertia", "fingertip", "crosses", "gravity"):
+        np.testing.assert_allclose(getattr(rig.finger, name), getattr(truth, name), rtol=1e-12, atol=0)
+
+
+def test_the_finger_may_come_from_an_earlier_session(tmp_path):
+    truth = default_truth().finger
+    write_session(Session("specimen", truth, {}, created="2026-01-01T00:00:00+00:00"), tmp_path / "old.h5")
+    head, rest = GOOD.split("[finger]")
+    channels = rest[rest.index("[[channel]]") :]
+    (tmp_path / "rig.toml").write_text(f'{head}[finger]\nfrom = "old.h5"\n\n{channels}')
+    np.testing.assert_allclose(read_rig(tmp_path / "rig.toml").finger.mass, truth.mass)
+
+
+def test_a_file_that_is_not_there_or_not_toml(tmp_path):
+    with pytest.raises(UserError, match="cannot be read"):
+        read_rig(tmp_path / "none.toml")
+    (tmp_path / "bad.toml").write_text("[rig\nname = 1")
+    with pytest.raises(UserError, match=r"bad.toml: not valid TOML: .*line 1"):
+        read_rig(tmp_path / "bad.toml")

@@ -1,0 +1,97 @@
+"""Plans are checked command by command before anything moves."""
+
+import numpy as np
+import pytest
+
+from jaxfinger.errors import UserError
+from jaxfinger.rig import estimate, parse_plan
+from jaxfinger.rig.backend import JointMove, Setup, TensionRamp
+from jaxfinger.rig.examples import plan_toml
+from jaxfinger.rig.protocols import EXPERIMENTS, Mark, Start
+
+HEAD = '[plan]\nname = "p"\n[[trial]]\n'
+
+
+def steps(text, rig):
+    (trial,) = parse_plan(HEAD + text, rig).trials
+    return list(trial.protocol(rig))
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "says"),
+    [
+        ('experiment = "ID.5"', 4, "choose one of"),
+        ('experiment = "ID.2"\njoint = "XIP"', 5, "choose one of MCP, PIP, DIP"),
+        ('experiment = "ID.2"', 3, "'joint' is missing"),
+        ('experiment = "ID.2"\njoint = "MCP"\npretention = 2.0', 6, "'pretention' is unknown"),
+        ('experiment = "ID.2"\njoint = "MCP"\nshare = 0.99', 6, "into its stops"),
+        ('experiment = "ID.4"\njoint = "PIP"\ntendon = "T3"', 5, "T3 does not cross PIP"),
+        ('experiment = "VD.2"\ntendon = "T2"\nlevels = [15.0, 4.0]', 6, "rising"),
+        ('experiment = "VD.2"\ntendon = "T2"\nlevels = [4.0, 25.0]', 3, "25 N for T2 is outside 0 to 18 N"),
+        ('experiment = "ID.3-static"\njoint = "MCP"\nrange_deg = [0.0, 92.0]', 3, "outside -8.0° to 90.0°"),
+        ('experiment = "ID.3-dynamic"\njoint = "MCP"\nspeeds_deg_s = [400.0]', 3, "°/s for MCP is outside"),
+        ('experiment = "ID.2"\njoint = "MCP"\nposture_deg = [0.0, 190.0, 0.0]', 6, "outside its limits"),
+        ('experiment = "VD.3"\nmean = [1.0]', 5, "4 active tendons"),
+    ],
+)
+def test_a_mistake_names_its_line(rig, text, line, says):
+    with pytest.raises(UserError, match=f"plan.toml, line {line}: ") as error:
+        parse_plan(HEAD + text, rig)
+    assert says in str(error.value)
+
+
+def test_repeats_share_their_motion(rig):
+    plan = parse_plan(HEAD + 'experiment = "ID.2"\njoint = "MCP"\nrepeats = 3', rig)
+    assert [t.name for t in plan.trials] == ["01-ID.2-MCP", "02-ID.2-MCP", "03-ID.2-MCP"]
+    assert len({t.motion for t in plan.trials}) == 1
+    assert len({t.motion for t in parse_plan(plan_toml(2), rig).trials}) == len({t.line for t in parse_plan(plan_toml(2), rig).trials})
+
+
+def test_the_shipped_plan_holds_every_experiment(rig):
+    plan = parse_plan(plan_toml(), rig)
+    assert {t.experiment for t in plan.trials} == set(EXPERIMENTS)
+    assert all(estimate(t, rig).seconds > 1.0 for t in plan.trials)
+
+
+def test_static_torque_holds_up_and_back(rig):
+    done = steps('experiment = "ID.3-static"\njoint = "PIP"\nrange_deg = [0.0, 40.0]\nstep_deg = 10.0', rig)
+    angle, held = None, []
+    for step in done:
+        if isinstance(step, JointMove):
+            angle = step.target
+        elif isinstance(step, Mark) and step.hold >= 0:
+            held.append((np.degrees(angle), step.joint_direction["PIP"]))
+    angles, directions = zip(*held, strict=True)
+    assert directions == (1,) * 5 + (-1,) * 5
+    np.testing.assert_allclose(angles[1:5], [10, 20, 30, 40])
+    np.testing.assert_allclose(angles[6:], [30, 20, 10, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("experiment", ["ID.3-static", "ID.3-dynamic", "ID.4"])
+def test_torque_is_tared_unloaded_before_the_motor_is_coupled(rig, experiment):
+    extra = '\ntendon = "T3"' if experiment == "ID.4" else ""
+    names = []
+    tensions = dict.fromkeys(rig.finger.tendon_names, 9.0)
+    for step in steps(f'experiment = "{experiment}"\njoint = "MCP"{extra}', rig):
+        names.append(f"motor {step.motor}" if isinstance(step, Setup) else type(step).__name__)
+        if isinstance(step, TensionRamp):
+            tensions.update(step.targets)
+        if names[-1] == "Tare":
+            assert set(tensions.values()) == {0.0}
+            assert "motor MCP" not in names
+    assert names.index("Tare") < names.index("motor MCP") < names.index("Start")
+
+
+def test_tendon_friction_steps_up_and_down_with_the_others_slack(rig):
+    done = steps('experiment = "ID.4"\njoint = "MCP"\ntendon = "T2"\nlevels = [2.0, 4.0, 6.0]', rig)
+    begin = next(i for i, s in enumerate(done) if isinstance(s, Start))
+    pulled = [s.targets for s in done[begin:] if isinstance(s, TensionRamp)]
+    assert [t["T2"] for t in pulled[:-1]] == [2.0, 4.0, 6.0, 4.0, 2.0]
+    assert all(set(t) == {"T2"} for t in pulled[:-1])
+    assert [s.tendon_direction["T2"] for s in done if isinstance(s, Mark) and s.hold >= 0] == [1, 1, 1, -1, -1]
+
+
+def test_trajectory_is_the_same_for_the_same_seed(rig):
+    first, second = (steps(f'experiment = "VD.3"\nseed = {seed}', rig) for seed in (3, 3))
+    assert first == second
+    assert first != steps('experiment = "VD.3"\nseed = 4', rig)

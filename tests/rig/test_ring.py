@@ -1,0 +1,153 @@
+"""Pulling the ring: no sample lost, none twice, overruns counted, torn records read again, restarts never spliced."""
+
+import threading
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxfinger.errors import UserError
+from jaxfinger.rig import contract, parse_rig
+from jaxfinger.rig.backend import CommandRefused, ControllerRestarted, StaleRig
+from jaxfinger.rig.backends.simulated import SimulatedRig
+from jaxfinger.rig.controller import Controller, HardLimits
+from jaxfinger.rig.contract import State, Trip
+from jaxfinger.rig.examples import rig_toml
+from jaxfinger.rig.ring import LARGEST, MARGIN
+
+
+def small(rig, ring=512) -> SimulatedRig:
+    return SimulatedRig(rig, Controller(limits=HardLimits(heartbeat_s=1e9), ring=ring))
+
+
+@settings(max_examples=20, deadline=None)
+@given(pauses=st.lists(st.integers(1, 900), min_size=1, max_size=12))
+def test_every_sample_comes_once_or_is_counted_as_lost(rig, pauses):
+    machine = small(rig)
+    with machine:
+        expected = 0
+        for pause in pauses:
+            for _ in range(pause):
+                machine.controller.cycle()
+            while machine.next_seq < machine.controller.seq:
+                block = machine.read_block(1.0)
+                assert len(block) <= LARGEST
+                assert int(block.seq[0]) == expected + block.lost_before
+                np.testing.assert_array_equal(np.diff(block.seq.astype(np.int64)), 1)
+                assert block.lost_before == 0 or pause > 512 - MARGIN
+                expected = int(block.seq[-1]) + 1
+        assert expected == sum(pauses)
+
+
+def test_a_torn_record_is_read_again(rig):
+    machine = small(rig)
+    with machine:
+        for _ in range(50):
+            machine.controller.cycle()
+        at = machine.controller.place["aRing"][0] + 20 * 512 + 504
+        whole = bytes(machine.controller.memory[at : at + 8])
+        machine.controller.memory[at : at + 8] = b"\xff" * 8
+        reads = []
+        plain = machine._read
+
+        def mended(symbol, offset, size):
+            reads.append(symbol)
+            if reads.count("aRing") == 2:
+                machine.controller.memory[at : at + 8] = whole
+            return plain(symbol, offset, size)
+
+        machine._read = mended
+        block = machine.read_block(1.0)
+        assert reads.count("aRing") == 2
+        np.testing.assert_array_equal(block.seq, np.arange(50))
+
+
+def test_a_restart_is_never_spliced(rig):
+    machine = small(rig)
+    with machine:
+        for _ in range(50):
+            machine.controller.cycle()
+        machine.read_block(1.0)
+        machine.controller.start()
+        for _ in range(500):
+            machine.controller.cycle()
+        with pytest.raises(ControllerRestarted):
+            machine.read_block(1.0)
+
+
+def test_a_controller_that_stands_still_is_stale(rig):
+    machine = small(rig)
+    with machine:
+        machine.inject("stall")
+        machine._wait(0.001)
+        while machine.next_seq < machine.controller.seq:
+            machine.read_block(1.0)
+        with pytest.raises(StaleRig):
+            machine.read_block(0.01)
+
+
+@pytest.mark.parametrize(("field", "value", "says"), [("version", 2, "contract version"), ("sample_size", 504, "size of ST_Sample"), ("cycle_ns", 2_000_000, "rate_hz")])
+def test_another_program_is_refused(rig, field, value, says):
+    machine = small(rig)
+    info = np.frombuffer(machine._read("stInfo", 0, contract.INFO.itemsize), contract.INFO).copy()
+    info[field] = value
+    machine._write("stInfo", info.tobytes())
+    with pytest.raises(UserError, match=says):
+        machine.connect()
+
+
+def test_limits_looser_than_the_controllers_are_refused():
+    machine = SimulatedRig(parse_rig(rig_toml().replace("tension_max = 18.0", "tension_max = 25.0")))
+    with pytest.raises(UserError, match=r"'tension_max' = 25 is looser than the controller's 20"):
+        machine.connect()
+
+
+def test_leaving_releases_the_finger(rig):
+    machine = small(rig)
+    with machine:
+        machine.arm()
+    assert machine.controller.state is State.RELEASING
+
+
+def test_an_error_inside_releases_too_and_is_not_hidden(rig):
+    machine = small(rig)
+    with pytest.raises(ZeroDivisionError), machine:
+        machine.arm()
+        raise ZeroDivisionError
+    assert machine.controller.state is State.RELEASING
+
+
+def test_a_latched_stop_needs_a_name_and_a_reset(rig):
+    machine = small(rig)
+    with machine:
+        machine.arm()
+        machine.stop(Trip.OPERATOR)
+        assert machine.status().state is State.TRIPPED
+        assert "operator" in machine.status().cause
+        with pytest.raises(CommandRefused, match="ARM"):
+            machine.arm()
+        with pytest.raises(CommandRefused, match="give the name"):
+            machine.reset(" ")
+        machine._wait(1.0)
+        machine.reset("tester")
+        machine.arm()
+
+
+def test_two_threads_may_command(rig):
+    machine = small(rig)
+    with machine:
+        machine.arm()
+        numbers = []
+
+        def hold():
+            from jaxfinger.rig.backend import Hold
+
+            numbers.extend(machine.command(Hold()) for _ in range(50))
+
+        threads = [threading.Thread(target=hold) for _ in range(2)]
+        for t in threads:
+            t.start()
+        for t in threads:
+            t.join()
+        assert sorted(numbers) == list(range(2, 102))

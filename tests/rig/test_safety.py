@@ -1,0 +1,196 @@
+"""The supervisor finds each fault, never a healthy finger, and finds the same however the samples are cut into blocks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from jaxfinger.rig.backend import Block, CommandRefused, JointMove, TensionRamp
+from jaxfinger.rig.contract import Flag, State, Trip
+from jaxfinger.rig.safety import Supervisor, _runs, admit
+
+
+def first(rig, block: Block):
+    found = Supervisor(rig).check(block)
+    return found[0] if found else None
+
+
+def test_a_finger_at_rest_is_left_alone(rig, quiet_block):
+    supervisor = Supervisor(rig)
+    for start in range(0, 4000, 100):
+        assert supervisor.check(quiet_block(100, start, seed=start)) == []
+
+
+def column(rig, kind, of=""):
+    return rig.index(kind, of)
+
+
+def spoil(block: Block, change) -> Block:
+    x = block.x.copy()
+    change(x)
+    return replace(block, x=x)
+
+
+@pytest.mark.parametrize(
+    ("kind", "of", "value", "trip"),
+    [
+        ("tension", "T2", 19.0, Trip.TENSION),
+        ("tension", "T2", np.nan, Trip.INVALID),
+        ("tension", "T1", np.inf, Trip.INVALID),
+        ("joint_position", "PIP", 3.0, Trip.POSITION),
+        ("joint_position", "DIP", -0.5, Trip.POSITION),
+        ("external_torque", "", -0.4, Trip.TORQUE),
+        ("fingertip_force", "z", -25.0, Trip.FORCE),
+    ],
+)
+def test_a_limit_trips_after_three_samples_and_not_before(rig, quiet_block, kind, of, value, trip):
+    at = column(rig, kind, of)
+    block = quiet_block()
+
+    def three(x):
+        x[200:203, at] = value
+
+    found = first(rig, spoil(block, three))
+    assert found is not None
+    assert (found.trip, found.seq) == (trip, 202)
+    assert found.channel == rig.channels[at].name
+
+    def two(x):
+        x[200:202, at] = value
+
+    calm = [v for v in Supervisor(rig).check(spoil(block, two)) if v.trip not in (Trip.VELOCITY, Trip.TENSION_RATE)]
+    assert calm == []
+
+
+def test_a_frozen_sensor_trips_after_its_time(rig, quiet_block):
+    at = column(rig, "tension", "T3")
+
+    def freeze(x):
+        x[300:, at] = x[300, at]
+
+    found = first(rig, spoil(quiet_block(1500), freeze))
+    assert found is not None
+    assert (found.trip, found.seq) == (Trip.FROZEN, 1300)
+
+
+def test_a_frozen_encoder_is_found_by_the_tendons_that_run(rig, quiet_block):
+    ramp = np.linspace(0, 0.01, 400)
+    run = spoil(quiet_block(), lambda x: x.__setitem__((slice(None), column(rig, "excursion", "T2")), ramp))
+    supervisor = Supervisor(rig)
+    found = [v for k in range(0, 400, 20) for v in supervisor.check(part(run, k, k + 20))]
+    assert found
+    assert found[0].trip is Trip.FROZEN
+    assert found[0].seq < 120  # 1.5 mm of 10 mm in 400 samples, and three blocks
+
+    def moves_too(x):
+        x[:, column(rig, "excursion", "T2")] = ramp
+        x[:, column(rig, "joint_position", "DIP")] += np.linspace(0, -0.3, 400)
+
+    supervisor = Supervisor(rig)
+    moving = spoil(quiet_block(), moves_too)
+    assert [v for k in range(0, 400, 20) for v in supervisor.check(part(moving, k, k + 20))] == []
+
+
+def test_an_encoder_that_does_not_follow_the_motor(rig, quiet_block):
+    supervisor = Supervisor(rig)
+    supervisor.check(quiet_block(50))
+    supervisor.commanded(JointMove("MCP", 1.0, 0.5))
+    blocks = [quiet_block(50, 50 * k, seed=k, state=State.MOVING) for k in range(1, 12)]
+    found = [v for b in blocks for v in supervisor.check(b)]
+    assert [v.trip for v in found] == [Trip.FROZEN]
+    assert found[0].channel == "joint_position MCP"
+
+
+def test_speed_and_tension_rate(rig, quiet_block):
+    def fast(x):
+        x[:, column(rig, "joint_position", "MCP")] = np.clip(np.arange(400) * 0.012 - 2.0, 0.0, 1.2)
+
+    found = first(rig, spoil(quiet_block(), fast))
+    assert found is not None
+    assert found.trip is Trip.VELOCITY
+
+    def steep(x):
+        x[200:, column(rig, "tension", "T1")] += np.clip(np.arange(200) * 0.8, 0, 12)
+
+    found = first(rig, spoil(quiet_block(), steep))
+    assert found is not None
+    assert found.trip is Trip.TENSION_RATE
+
+
+def test_time_that_jumps_back(rig, quiet_block):
+    block = quiet_block()
+    t = block.t_ns.copy()
+    t[250:] -= np.uint64(10**9)
+    found = first(rig, replace(block, t_ns=t))
+    assert found is not None
+    assert (found.trip, found.seq) == (Trip.CLOCK, 250)
+
+
+def test_flags_of_the_terminals(rig, quiet_block):
+    block = quiet_block()
+    flags = block.flags.copy()
+    flags[100:103] = int(Flag.ENCODER) | 7 << 16
+    found = first(rig, replace(block, flags=flags))
+    assert found is not None
+    assert (found.trip, found.seq) == (Trip.INVALID, 102)
+
+
+def part(block: Block, start: int, stop: int) -> Block:
+    cut = slice(start, stop)
+    return Block(block.seq[cut], block.t_ns[cut], block.x[cut], block.state[cut], block.flags[cut])
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.integers(1, 399), max_size=8, unique=True), st.integers(0, 380), st.integers(1, 10), st.integers(0, 14))
+def test_online_is_offline(rig, quiet_block, cuts, start, length, channel):
+    """The first violation does not depend on how the samples were cut into blocks."""
+
+    def bad(x):
+        x[start : start + length, channel] = np.nan
+
+    block = spoil(quiet_block(), bad)
+    whole = [v for v in Supervisor(rig).check(block) if v.trip is Trip.INVALID]
+    supervisor, edges = Supervisor(rig), [0, *sorted(cuts), 400]
+    online = [v for a, b in zip(edges, edges[1:], strict=False) for v in supervisor.check(part(block, a, b))]
+    online = [v for v in online if v.trip is Trip.INVALID]
+    assert [v.seq for v in online[:1]] == [v.seq for v in whole[:1]]
+    assert bool(whole) == (length >= 3)
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=60), st.integers(0, 5))
+def test_runs_against_a_loop(bad, before):
+    expected, run = [], before
+    for b in bad:
+        run = run + 1 if b else 0
+        expected.append(run)
+    np.testing.assert_array_equal(_runs(np.array(bad), before), expected)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        TensionRamp({"T1": 18.5}, 5.0),
+        TensionRamp({"T1": -0.1}, 5.0),
+        TensionRamp({"T1": float("nan")}, 5.0),
+        TensionRamp({"T9": 2.0}, 5.0),
+        TensionRamp({"T1": 2.0}, 50.0),
+        TensionRamp({"T1": 2.0}, 0.0),
+        TensionRamp({"T1": 2.0}, float("nan")),
+        JointMove("MCP", 1.6, 0.5),
+        JointMove("MCP", float("nan"), 0.5),
+        JointMove("XIP", 0.5, 0.5),
+        JointMove("MCP", 0.5, 9.0),
+        JointMove("MCP", 0.5, 0.5, float("inf")),
+    ],
+)
+def test_a_set_point_beyond_the_limits_is_refused_and_nothing_is_sent(rig, simulated, command):
+    with pytest.raises(CommandRefused):
+        admit(command, rig)
+    with simulated:
+        simulated.arm()
+        before = simulated.status().acknowledged
+        with pytest.raises(CommandRefused):
+            simulated.command(command)
+        assert simulated.status().acknowledged == before
