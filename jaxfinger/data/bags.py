@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -83,7 +84,7 @@ def _mcap_messages(path: Path) -> Iterator[tuple[str, int, Any]]:
                     decode = decoders.setdefault(schema.id, None) or _ros_decoder(schema)
                     decoders[schema.id] = decode
                     yield channel.topic, message.log_time, decode(message.data)
-        except EndOfFile:
+        except (EndOfFile, struct.error):  # cut between records, or inside one
             return
 
 
