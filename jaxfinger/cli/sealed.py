@@ -23,7 +23,8 @@ def make(
     workers: int | None = None,
     share: str = "1/1",
 ) -> None:
-    """Make sealed cases: FOLDER/case-NNN/{fit,fresh}.h5, and their truth in another tree. Finished cases are left alone.
+    """Make sealed cases: FOLDER/case-NNN/{fit,fresh}.h5, and their truth in another tree. Finished cases are left
+    alone.
 
     Args:
         folder: where the cases go.

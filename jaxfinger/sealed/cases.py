@@ -46,7 +46,8 @@ class CaseSpec:
 
 
 def case_specs(split: str, count: int) -> list[CaseSpec]:
-    """The first `count` cases of a split. In every ten: six listed effects, one or two without any, one or two unlisted, one double.
+    """The first `count` cases of a split. In every ten: six listed effects, one or two without any, one or two
+    unlisted, one double.
 
     Listed effects come in turn, each severity equally often, on specimens that differ from round to round.
     """
@@ -201,7 +202,9 @@ def _trials(
 def _fresh_gap(
     specimen: Specimen, departures: Sequence[Departure], quiet: Session, plans: Sequence[Plan], sensors: Sensors
 ):
-    """rms on the fresh trials by experiment and channel, of the nominal model refitted (before) and with the true effects (after)."""
+    """rms on the fresh trials by experiment and channel, of the nominal model refitted (before) and with the
+    true effects (after).
+    """
     later = Session(specimen, plans, sensors)
     moved = quiet.absorb(quiet.trace(departures)[0])
     rows, labels = later.trace(departures)

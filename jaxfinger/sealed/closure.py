@@ -28,7 +28,9 @@ MOVING = 0.05  # rad/s, and that speed times 5 mm for a tendon: VD.3's torque is
 def gap_by_channel(
     measured: Session, predicted: Mapping[str, Mapping[str, np.ndarray]]
 ) -> dict[tuple[str, str], float]:
-    """rms of measured minus predicted over all samples that both have, SI units; excursions less one constant a trial and tendon."""
+    """rms of measured minus predicted over all samples that both have, SI units; excursions less one constant a
+    trial and tendon.
+    """
     squares: dict[tuple[str, str], list[np.ndarray]] = defaultdict(list)
     for trial in measured:
         if trial.name not in predicted:

@@ -1,8 +1,12 @@
-"""VD.3: tendons drive the free finger. Forward simulation in MuJoCo with true dry friction, under a tracking controller.
+"""VD.3: tendons drive the free finger. Forward simulation in MuJoCo with true dry friction, under a tracking
+controller.
 
-The controller knows the nominal specimen only. What it commands is recorded as tension; the finger goes where physics puts it.
+The controller knows the nominal specimen only. What it commands is recorded as tension; the finger goes where
+physics puts it.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module tells a type checker nothing of its functions.)
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -13,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import nnls
 
+from .departures.base import Memory
 from .laws import Finger, State
 from .profiles import Builder, Profile
 from .protocols import Plan, sample_times
@@ -73,7 +78,9 @@ def _reachable(nominal: Finger, least: float, count: int, rng: np.random.Generat
 def feedforward(
     nominal: Finger, q: Float[np.ndarray, "N m"], qd: Float[np.ndarray, "N m"], qdd: Float[np.ndarray, "N m"]
 ):
-    """Joint torque of the nominal finger along a trajectory (friction included, smooth in velocity), and the tendons' directions."""
+    """Joint torque of the nominal finger along a trajectory (friction included, smooth in velocity), and the
+    tendons' directions.
+    """
     zero = np.zeros(len(q))
     s = State(zero, zero, q, qd, qdd, np.zeros((len(q), nominal.n)), np.tanh(qd / 0.02))
     torque = nominal.plant.inverse_dynamics(q, qd, qdd) + nominal.passive(s) + nominal.friction(s)
@@ -141,7 +148,7 @@ def simulate(finger: Finger, nominal: Finger, plans: Sequence[Plan]) -> list[Run
     command, starts = f.copy(), np.array([plan.start for plan in plans])
     q = np.stack([d.qpos.copy() for d in data])
     qd = np.zeros_like(q)
-    memories = [d for d in finger.departures if hasattr(d, "states")]
+    memories = [d for d in finger.departures if isinstance(d, Memory)]
     memory, driven = {}, {}
     keep_q, keep_qd, keep_f = (np.empty((len(fine), batch, size)) for size in (m, m, n))
 
@@ -175,7 +182,8 @@ def _advance(finger: Finger, s: State, data: list, active: np.ndarray):
     loss, lost = finger.loss(s)
     assert s.st is not None
     sliding = s.st * loss
-    # The solver takes `sliding` off through the fixed tendons; what a departure adds to the delivered tension comes on top.
+    # The solver takes `sliding` off through the fixed tendons; what a departure adds to the delivered tension
+    # comes on top.
     delivered = finger.delivered(s, s.f - lost - sliding) + sliding
     applied = np.einsum("bnm,bn->bm", arm, delivered) - finger.passive(s) - decided
     limit, loss = np.maximum(limit, 1e-9), np.maximum(loss, 1e-9)

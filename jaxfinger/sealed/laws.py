@@ -1,7 +1,7 @@
 """A true finger: the nominal laws of a specimen, and what departs from them.
 
-Every law takes a `State` and works on whatever leading axes its arrays have: a whole recording (time first), or one instant
-of several trials that are simulated side by side.
+Every law takes a `State` and works on whatever leading axes its arrays have: a whole recording (time first), or
+one instant of several trials that are simulated side by side.
 """
 
 from __future__ import annotations

@@ -1,10 +1,15 @@
-"""Tendon paths: MuJoCo's spatial tendons through eyelets on both sides of every joint, and the polynomials that fit them.
+"""Tendon paths: MuJoCo's spatial tendons through eyelets on both sides of every joint, and the polynomials that
+fit them.
 
-Between two eyelets that sit on neighbouring links the path depends on one angle only, so the excursion separates by joint.
+Between two eyelets that sit on neighbouring links the path depends on one angle only, so the excursion separates
+by joint.
 With equal distances it is 2R (cos(α) − cos(α + q/2)): over a finger's range a polynomial of fourth order misses it by
-about 1e-5 R, a hundredth of the excursion's noise. The specimens use these polynomials, so that they lie in the nominal class.
+about 1e-5 R, a hundredth of the excursion's noise. The specimens use these polynomials, so that they lie in the
+nominal class.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module tells a type checker nothing of its functions.)
 from __future__ import annotations
 
 import mujoco
@@ -27,7 +32,8 @@ def spatial_lengths(
 ) -> Float[np.ndarray, "K n"]:
     """Path lengths in m as joint `joint` turns through q and the others rest at zero.
 
-    `arm` is the moment arm at q = 0 in m (0: the tendon does not cross); `alpha` the eyelets' angle above the link in rad.
+    `arm` is the moment arm at q = 0 in m (0: the tendon does not cross); `alpha` the eyelets' angle above the link
+    in rad.
     """
     spec = mujoco.MjSpec()
     bodies = add_chain(spec, finger)
@@ -64,7 +70,7 @@ def excursion_polynomials(
     coefficients = np.zeros((finger.n, finger.m, DEGREE))
     misfit = 0.0
     for i in range(finger.m):
-        q = np.linspace(*finger.limits[i], 81)
+        q = np.linspace(finger.limits[i, 0], finger.limits[i, 1], 81)
         lengths = spatial_lengths(finger, arm, alpha, i, np.append(q, 0.0))
         excursion = lengths[-1] - lengths[:-1]
         basis = q[:, None] ** np.arange(1, DEGREE + 1)

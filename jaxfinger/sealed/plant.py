@@ -3,6 +3,8 @@
 It shares no code with `jaxfinger.model`: the sealed cases are only worth something if their plant is another one.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's compiled module tells a type checker nothing of its functions.)
 from __future__ import annotations
 
 import mujoco
@@ -19,8 +21,8 @@ TYPICAL_ARM = 5e-3  # m; MuJoCo scales the softness of a tendon's friction by th
 def build(finger: FingerDescription, timestep: float = 5e-4) -> mujoco.MjModel:
     """MuJoCo model of the serial chain; the active tendons are fixed tendons whose coefficients are C(q) of the moment.
 
-    A fixed tendon's force acts through its coefficients, and MuJoCo solves the dry friction of joints and tendons together as
-    one convex problem. The caller sets coefficients and friction before every step.
+    A fixed tendon's force acts through its coefficients, and MuJoCo solves the dry friction of joints and tendons
+    together as one convex problem. The caller sets coefficients and friction before every step.
     """
     spec = mujoco.MjSpec()
     spec.option.timestep = timestep
@@ -111,7 +113,7 @@ class Plant:
         mujoco.mj_jac(model, data, jac, None, point, last)
         return jac
 
-    def fingertip(self, q: Float[np.ndarray, " m"]) -> Float[np.ndarray, 3]:
+    def fingertip(self, q: Float[np.ndarray, " m"]) -> Float[np.ndarray, " xyz"]:
         """Place of the contact point in the base frame in m."""
         model, data = self.model, self._data
         data.qpos = q

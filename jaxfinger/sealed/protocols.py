@@ -1,6 +1,7 @@
 """The experiments of a session: what is commanded, trial by trial, drawn from a seed.
 
-A session has some forty trials like those of a bench; a fresh file has other postures, speeds and levels and repeats nothing.
+A session has some forty trials like those of a bench; a fresh file has other postures, speeds and levels and
+repeats nothing.
 """
 
 from __future__ import annotations
@@ -117,7 +118,7 @@ class _Protocol:
             for letter in "ab" if j < 1 and not self.fresh else "a":
                 yield "ID.3-dynamic", self.dynamic(j, letter)
         for k in self.active:
-            for j in self._arms(k):
+            for j in self._arms(int(k)):
                 for letter in self.letters:
                     yield "ID.4", self.id4(int(k), int(j), letter)
         for k in self.active[: 3 if self.n < 6 else 4]:

@@ -40,7 +40,9 @@ class Motion:
 
 
 def commanded(plan: Plan, rate: float | None = None) -> Motion:
-    """The motion that a plan prescribes, with the process noise of this very trial: a repeat is never quite the same."""
+    """The motion that a plan prescribes, with the process noise of this very trial: a repeat is never quite the
+    same.
+    """
     rng = np.random.default_rng(plan.seed)
     t = sample_times(plan, rate)
     if rate is not None and plan.joint is not None:  # a coarse look still sees every reversal

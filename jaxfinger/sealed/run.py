@@ -1,6 +1,7 @@
 """Runs a diagnosis over sealed cases: on many cores, on many machines by shares, taken up again after a stop.
 
-The diagnosis sees a copy of `fit.h5` in an empty folder and nothing else: neither the fresh trials nor any path to the truth.
+The diagnosis sees a copy of `fit.h5` in an empty folder and nothing else: neither the fresh trials nor any path to
+the truth.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ class Command:
 
 
 def run_case(diagnose: Diagnose, folder: Path, out: Path) -> str:
-    """Diagnose one case into `out/<case>`; returns "done", "failed" or "skipped". A failure is recorded, and scored as one."""
+    """Diagnose one case into `out/<case>`; returns "done", "failed" or "skipped". A failure is recorded, and
+    scored as one.
+    """
     target = out / folder.name
     if (target / "run.json").exists():
         return "skipped"

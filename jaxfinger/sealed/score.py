@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +76,9 @@ def both_right(truth: Truth, diagnosis: Diagnosis) -> bool:
 
 
 def covered(truth: Truth, diagnosis: Diagnosis) -> bool:
-    """The truth is the named effect, or in the named set of at most three members; none and unlisted likewise by status."""
+    """The truth is the named effect, or in the named set of at most three members; none and unlisted likewise
+    by status.
+    """
     if truth.kind == "none":
         return diagnosis.status == "no_gap"
     if truth.kind == "unlisted":
@@ -102,9 +105,10 @@ def on_truth(truth: Truth, diagnosis: Diagnosis) -> float:
 def closed_share(rows: Sequence[Mapping], ceiling: Sequence[Mapping]) -> float:
     """Gap closed on fresh trials, as a share of what refitting with the true effect closes.
 
-    `rows`: rms by experiment and channel before and after, as measured on the diagnosis's predictions; `ceiling`: the truth's rows.
-    Energy above noise is summed over channels in units of each channel's noise. NaN where the ceiling has nothing to close.
-    Forward simulation of VD.3 (`q`) amplifies and is left out.
+    `rows`: rms by experiment and channel before and after, as measured on the diagnosis's predictions; `ceiling`:
+    the truth's rows.
+    Energy above noise is summed over channels in units of each channel's noise. NaN where the ceiling has nothing
+    to close. Forward simulation of VD.3 (`q`) amplifies and is left out.
     """
     at = {(r["experiment"], r["channel"]): r for r in rows}
     done = possible = 0.0
@@ -131,9 +135,10 @@ FIGURES: dict[str, tuple[Callable[[Truth], bool], Callable[[Truth, Diagnosis], b
 def score_cases(pairs: Sequence[tuple[Truth, Diagnosis]]) -> Scores:
     """All scores of a set of cases.
 
-    cause, covered: single listed effects. false alarm: cases without an effect. open set: effects that the catalogue lacks.
-    Brier, probability on the truth: every case that was diagnosed. set size: verdicts that name something. closed: cases with
-    predictions on the fresh trials. seconds: cost of a case.
+    cause, covered: single listed effects. false alarm: cases without an effect. open set: effects that the
+    catalogue lacks.
+    Brier, probability on the truth: every case that was diagnosed. set size: verdicts that name something. closed:
+    cases with predictions on the fresh trials. seconds: cost of a case.
     """
     done = [(t, d) for t, d in pairs if d.status != "failed"]
     figures = _shares(pairs)
@@ -182,7 +187,7 @@ def reliability(pairs: Sequence[tuple[Truth, Diagnosis]]) -> list[dict[str, floa
             came.append(wanted.get(c, 0.0))
     p, y = np.array(said), np.array(came)
     rows = []
-    for low, high in zip(BINS[:-1], BINS[1:], strict=True):
+    for low, high in pairwise(BINS):
         inside = (p >= low) & ((p < high) | ((high == 1.0) & (p <= 1.0)))
         if inside.any():
             interval = wilson(round(float(y[inside].sum())), int(inside.sum()))

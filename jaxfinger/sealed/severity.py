@@ -1,9 +1,11 @@
 """How large a departure's trace is once the nominal parameters have been refitted.
 
-The nominal model is linearised here, in NumPy, around the true specimen: every parameter that a fit may move is perturbed, and
-what the departure adds to the noise-free channels is projected off those directions. Channels are weighted by the noise of a
-hold's mean, and CAD's uncertainty enters as prior rows. Severity is the rms of what is left, in the channel (experiment, quantity,
-joint or tendon) where it is largest, in units of that noise.
+The nominal model is linearised here, in NumPy, around the true specimen: every parameter that a fit may move is
+perturbed, and
+what the departure adds to the noise-free channels is projected off those directions. Channels are weighted by the
+noise of a
+hold's mean, and CAD's uncertainty enters as prior rows. Severity is the rms of what is left, in the channel
+(experiment, quantity, joint or tendon) where it is largest, in units of that noise.
 """
 
 from __future__ import annotations
@@ -30,7 +32,9 @@ SLIDING = 0.03  # rad/s: what counts as a sliding joint
 
 @dataclass(frozen=True)
 class Look:
-    """A trial at a coarse rate: its plan, the motion that nominal tensions and angles make, the rigid torque along it."""
+    """A trial at a coarse rate: its plan, the motion that nominal tensions and angles make, the rigid torque
+    along it.
+    """
 
     plan: Plan
     motion: Motion
@@ -93,9 +97,8 @@ class Session:
         if channels.torque is not None:
             slides = self._sliding(look.motion) if e == "VD.3" else np.ones(look.motion.q.shape)
             scale = self.sensors.hold_std("joint_torque")
-            for j in range(finger.m) if e == "VD.3" else [plan.joint]:
-                x = channels.torque[:, j] / scale
-                yield e, "joint_torque", int(j), x * slides[:, j]
+            for j in range(finger.m) if plan.joint is None else [plan.joint]:
+                yield e, "joint_torque", j, channels.torque[:, j] / scale * slides[:, j]
         if channels.force is not None:
             for i in range(3):
                 yield e, "fingertip_force", i, channels.force[:, i] / self.sensors.hold_std("fingertip_force")
@@ -147,7 +150,9 @@ class Session:
 
     @cached_property
     def absorbed(self) -> tuple[Float[np.ndarray, "R P"], Float[np.ndarray, " P"]]:
-        """Derivatives of all rows by every nominal parameter, scaled so that 1 is a free or prior-sized change; prior precisions."""
+        """Derivatives of all rows by every nominal parameter, scaled so that 1 is a free or prior-sized change;
+        prior precisions.
+        """
         base = np.concatenate(self._base)
         columns, prior = [], []
         for concerns, changed, size, weight in self._neighbours():
@@ -165,7 +170,9 @@ class Session:
         return np.stack(columns, axis=1), np.array(prior)
 
     def _neighbours(self) -> Iterator[tuple[Callable[[Plan], bool], Specimen, float, float]]:
-        """Specimens one small parameter change away: (trials it concerns, specimen, size of the change, prior precision)."""
+        """Specimens one small parameter change away: (trials it concerns, specimen, size of the change, prior
+        precision).
+        """
         s = self.specimen
         for name, array, step, unit in (
             ("excursion", s.excursion, 1e-6, 1e-4),
@@ -183,7 +190,8 @@ class Session:
                 moved[index] += step
                 yield _concern(name, index[0]), replace(s, **{name: moved}), step / unit, 1e-8
         finger = s.finger
-        assert finger.mass_std is not None and finger.com_std is not None
+        assert finger.mass_std is not None
+        assert finger.com_std is not None
         for i in range(finger.m):
             mass = finger.mass.copy()
             mass[i] += finger.mass_std[i]
@@ -210,7 +218,9 @@ class Session:
 
 
 def _concern(parameter: str, index: int) -> Callable[[Plan], bool]:
-    """Whether a trial can depend on a parameter of the joint or tendon `index`; sparing the others is what makes this fast."""
+    """Whether a trial can depend on a parameter of the joint or tendon `index`; sparing the others is what
+    makes this fast.
+    """
 
     def concerns(plan: Plan) -> bool:
         if parameter in ("excursion", "friction"):

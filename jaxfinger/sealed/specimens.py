@@ -16,7 +16,9 @@ Y, Z = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class Layout:
-    """What tells one kind of finger from another. Lengths mm, masses g, angles deg; arms mm at q = 0, flexion positive."""
+    """What tells one kind of finger from another. Lengths mm, masses g, angles deg; arms mm at q = 0, flexion
+    positive.
+    """
 
     joints: tuple[str, ...]
     axis: tuple[tuple[float, float, float], ...]
@@ -182,6 +184,8 @@ def _body(
 
 def _cad(truth: FingerDescription, rng: np.random.Generator) -> FingerDescription:
     """What CAD and scale say: off by about one standard deviation, inertia scaled with mass."""
+    assert truth.mass_std is not None
+    assert truth.com_std is not None
     mass = truth.mass + truth.mass_std * rng.normal(size=truth.m)
     return replace(
         truth,
@@ -191,7 +195,7 @@ def _cad(truth: FingerDescription, rng: np.random.Generator) -> FingerDescriptio
     )
 
 
-def _rotation(vector: Float[np.ndarray, 3]) -> Float[np.ndarray, "3 3"]:
+def _rotation(vector: Float[np.ndarray, " xyz"]) -> Float[np.ndarray, "3 3"]:
     """Rotation by |vector| about its direction (Rodrigues)."""
     angle = np.linalg.norm(vector)
     x, y, z = vector / angle

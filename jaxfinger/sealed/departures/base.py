@@ -91,7 +91,7 @@ class Memory(Departure):
         return s.memory[id(self)]
 
 
-def add_at(array: np.ndarray, k: int, value: np.ndarray) -> np.ndarray:
+def add_at(array: np.ndarray, k: int, value: np.ndarray | float) -> np.ndarray:
     """A copy of the array with `value` added to column k."""
     out = np.array(array, dtype=float)
     out[..., k] += value

@@ -104,7 +104,9 @@ AT_SENSOR = {
 def draw(
     effect: str, finger: FingerDescription, rng: np.random.Generator, speeds: Sequence[float] = (0.5, 1.0)
 ) -> Departure | None:
-    """A departure of its start size, or None where this finger has no site for it. `speeds`: of the dynamic sweeps, rad/s."""
+    """A departure of its start size, or None where this finger has no site for it. `speeds`: of the dynamic
+    sweeps, rad/s.
+    """
     kind = {**LISTED, **UNLISTED}[effect]
     site = _site(kind, finger, rng)
     if site is None:

@@ -181,7 +181,9 @@ class DriveInertia(Departure):
 
 @dataclass(frozen=True, eq=False)
 class TorqueRipple(Departure):
-    """Torque periodic in the joint's angle: cogging of the external motor or a misaligned coupler; with a second harmonic or not."""
+    """Torque periodic in the joint's angle: cogging of the external motor or a misaligned coupler; with a
+    second harmonic or not.
+    """
 
     effect: ClassVar[str] = "torque_ripple"
     units: ClassVar[str] = "N m"

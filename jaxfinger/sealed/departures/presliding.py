@@ -1,8 +1,9 @@
 """Presliding: normalised friction z ∈ [−1, 1] as a function of displacement, in three textbook forms.
 
 Dahl (1968): dz/dx = (1 − z sgn ẋ)/x₀, the bristle model's quasi-static limit.
-LuGre (Canudas de Wit 1995): the same bristle with a micro-damping that matters only while z changes; quasi-static here: an
-exponent above one makes its knee sharper. Generalised Maxwell-slip (Lampaert 2003): parallel elasto-slip elements.
+LuGre (Canudas de Wit 1995): the same bristle with a micro-damping that matters only while z changes; quasi-static
+here: an exponent above one makes its knee sharper.
+Generalised Maxwell-slip (Lampaert 2003): parallel elasto-slip elements.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ def advance(form: str, z: np.ndarray, dx: np.ndarray, x0: float) -> np.ndarray:
 
 
 def towards_first_motion(x: np.ndarray) -> np.ndarray:
-    """State (..., ELEMENTS) of a trial that goes on as it was approached: fully built up in the direction of its first motion."""
+    """State (..., ELEMENTS) of a trial that goes on as it was approached: fully built up in the direction of
+    its first motion.
+    """
     moved = np.sign(np.where(np.abs(x - x[0]) > 1e-7, x - x[0], 0.0))
     first = np.take_along_axis(moved, np.argmax(moved != 0, axis=0)[None], axis=0)[0]
     return np.broadcast_to(first[..., None], (*first.shape, ELEMENTS)).astype(float)

@@ -13,8 +13,8 @@ from .base import Departure, Memory, add_at, put_at
 
 @dataclass(frozen=True, eq=False)
 class Stretch(Departure):
-    """Lengthening under tension; the size is the compliance. Linear, a toe that stiffens, or under the mean tension along
-    the path, which friction makes smaller than the actuator's."""
+    """Lengthening under tension; the size is the compliance. Linear, a toe that stiffens, or under the mean
+    tension along the path, which friction makes smaller than the actuator's."""
 
     effect: ClassVar[str] = "tendon_stretch"
     units: ClassVar[str] = "m/N"
@@ -58,7 +58,9 @@ class Creep(Memory):
 
 @dataclass(frozen=True, eq=False)
 class Backlash(Memory):
-    """The encoder's side lags by a dead zone at each reversal: a play operator, or elastic slip with a rounded corner."""
+    """The encoder's side lags by a dead zone at each reversal: a play operator, or elastic slip with a rounded
+    corner.
+    """
 
     effect: ClassVar[str] = "tendon_backlash"
     units: ClassVar[str] = "m"

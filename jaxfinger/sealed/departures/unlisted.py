@@ -1,4 +1,6 @@
-"""Departures that the catalogue of the diagnosis lacks; the right verdict is that none of the known effects explains them."""
+"""Departures that the catalogue of the diagnosis lacks; the right verdict is that none of the known effects
+explains them.
+"""
 
 from __future__ import annotations
 
