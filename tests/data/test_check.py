@@ -131,7 +131,8 @@ ERRORS = {
 
 
 @pytest.mark.parametrize("fault", ERRORS)
-def test_each_fault_is_named_and_refused(file, fault):
+def test_each_fault_is_named_and_refused(file, fault, monkeypatch):
+    monkeypatch.setattr("jaxfinger.data.check.survives", lambda path: True)  # whole files with wrong content
     change, place, words = ERRORS[fault]
     with h5py.File(file, "r+") as opened:
         change(opened)
@@ -203,7 +204,7 @@ def test_no_file_and_a_folder(tmp_path):
         read_session(tmp_path)
 
 
-@pytest.mark.parametrize("seed", range(32))
+@pytest.mark.parametrize("seed", range(24))
 def test_a_damaged_file_is_a_session_or_one_sentence(good, tmp_path, seed):
     rng = np.random.default_rng(seed)
     raw = bytearray(good.read_bytes())
