@@ -12,8 +12,8 @@ from jaxfinger.synthetic.protocols import TrialPlan
 from jaxfinger.synthetic.specimen import Specimen
 
 Array = np.ndarray
-LEAST = 1.5  # N at the joints, so that no tendon falls slack
-FLOOR = 1.0  # N at the actuator
+LEAST = 0.7  # N at the joints, so that no tendon falls slack
+FLOOR = 0.5  # N at the actuator
 SLOW = 0.05  # rad/s: below it the feed-forward of friction fades, so that tension does not jump at a reversal
 STIFFNESS = 0.3  # N m/rad
 DAMPING = 0.006  # N m s/rad

@@ -27,9 +27,9 @@ T1_MCP = WrappedRoute(_mm(-8.72, 1.07), _mm(4.86, 0.80))  # between two eyes, fr
 T1_PIP = WrappedRoute(_mm(-13.0, -0.37), _mm(11.0, 0.17), _mm(-0.13, -0.20), 4.17e-3)
 T3_MCP = WrappedRoute(_mm(-16.0, -0.77), _mm(13.0, 0.08), _mm(-0.25, -0.51), 5.45e-3)
 T4_MCP = WrappedRoute(_mm(-16.0, -1.08), _mm(13.0, -0.21), _mm(-0.29, -0.36), 5.29e-3)
-# The extensor wraps heads that are not concentric with the joints.
-T2_MCP = WrappedRoute(_mm(-18.0, 6.5), _mm(16.0, 6.0), _mm(-1.83, 0.17), 7.73e-3, dorsal=True)
-T2_PIP = WrappedRoute(_mm(-13.0, 5.0), _mm(11.0, 5.0), _mm(1.54, 1.62), 6.45e-3, dorsal=True, on_distal=True)
+# The extensor wraps heads that are not concentric with the joints, and gains leverage as they flex.
+T2_MCP = WrappedRoute(_mm(-18.0, 5.0), _mm(16.0, 5.0), _mm(1.60, -0.27), 6.08e-3, dorsal=True)
+T2_PIP = WrappedRoute(_mm(-13.0, 4.5), _mm(11.0, 4.5), _mm(-2.08, -0.74), 5.49e-3, dorsal=True, on_distal=True)
 T2_DIP = WrappedRoute(_mm(-11.0, 6.0), _mm(9.0, 5.5), _mm(1.99, 1.85), 3.89e-3, dorsal=True)
 # The passive tendon: taut when the PIP is flexed far more than the DIP, which it then flexes.
 T5_PIP = PolynomialRoute((-4e-3,))
@@ -37,8 +37,10 @@ T5_DIP = PolynomialRoute((5e-3,))
 T5 = (None, T5_PIP, T5_DIP)
 
 RUBBER_BAND = Band((WrappedRoute(_mm(-12.0, 18.0), _mm(12.0, 18.0)), None, None), stiffness=156.0, stretch=4e-3)
-# No active tendon flexes the DIP: a soft spring does, so that tendons alone can move the whole finger.
-DIP_SPRING = Band((None, None, PolynomialRoute((5e-3,))), stiffness=800.0, stretch=7e-3)
+# No active tendon flexes the DIP: a soft spring does, so that tendons alone can move the whole finger. One at the PIP
+# keeps the finger stable under given tensions, which bowstringing flexors and gravity would upset.
+PIP_SPRING = Band((None, PolynomialRoute((5e-3,)), None), stiffness=180.0, stretch=8.3e-3)
+DIP_SPRING = Band((None, None, PolynomialRoute((5e-3,))), stiffness=400.0, stretch=7e-3)
 PASSIVE_TENDON = Band(T5, stiffness=1500.0, stretch=-3e-3)
 
 
@@ -48,7 +50,7 @@ def paper_finger(passive_tendon: bool = False) -> Specimen:
         name="paper-finger",
         description=_description(),
         routes=((T1_MCP, T1_PIP, None), (T2_MCP, T2_PIP, T2_DIP), (T3_MCP, None, None), (T4_MCP, None, None), T5),
-        springs=(RUBBER_BAND, DIP_SPRING, *((PASSIVE_TENDON,) if passive_tendon else ())),
+        springs=(RUBBER_BAND, PIP_SPRING, DIP_SPRING, *((PASSIVE_TENDON,) if passive_tendon else ())),
         friction=GrowingFriction((2.5e-3, 1.6e-3, 1.0e-3), (9.88e-3, 1.5e-3, 0.8e-3)),  # 9 N mm at 70° at the MCP
         damping=(6e-5, 3e-5, 1e-5),
         # T3: 1.5 N of 4 N, 4 N of 10 N. T1 loses less at low tension and more at high.

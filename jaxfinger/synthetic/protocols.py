@@ -182,7 +182,7 @@ def _drives(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
         motion = f"VD.3-{_letter(k)}"
         rng = _rng(trials, motion)
         time = _clock(e.rate, e.duration)
-        ranges = [(limits.mean() - 0.05 * np.ptp(limits), e.amplitude * np.ptp(limits)) for limits in finger.limits]
+        ranges = [(limits[0] + e.centre * np.ptp(limits), e.amplitude * np.ptp(limits)) for limits in finger.limits]
         paths = [motions.swing(time, *span, rng) for span in ranges]
         yield TrialPlan(motion, "VD.3", motion, time, *_stacked(paths), tension=_slack(finger, time))
 

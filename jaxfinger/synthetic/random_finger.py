@@ -97,5 +97,5 @@ def _route(rng: np.random.Generator, flexor: bool, scale: float) -> Route:
 
 def _springs(rng: np.random.Generator, m: int) -> PolynomialSpring:
     """Soft springs about a posture within each joint's range, stiffening as q³, beyond the nominal degree."""
-    stiffness, rest = rng.uniform(0.005, 0.015, m), rng.uniform(0.0, 1.0, m)
+    stiffness, rest = rng.uniform(0.02, 0.04, m), rng.uniform(0.2, 0.8, m)
     return PolynomialSpring(tuple((-k * r, k, 0.0, 0.2 * k) for k, r in zip(stiffness, rest, strict=True)))

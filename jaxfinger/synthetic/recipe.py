@@ -104,7 +104,8 @@ class Drives:
     repeats: int = 1
     motions: int = 2
     duration: float = 8.0  # s
-    amplitude: float = 0.2  # share of a joint's range to either side
+    centre: float = 0.2  # share of a joint's range: bowstringing flexors make a far flexed finger unstable
+    amplitude: float = 0.12  # share of a joint's range to either side
     rate: float = 1000.0  # Hz: the simulation's own and the recording's
 
 
@@ -222,7 +223,7 @@ def _refuse_impossible(recipe: Recipe, place: str) -> None:
     """Durations, rates, tensions and resolutions are positive, shares lie within [0, 1], experiments exist."""
     for key, value in _leaves(asdict(recipe)):
         name = key.rpartition(".")[2]
-        if name in ("coloured", "outliers", "amplitude"):
+        if name in ("coloured", "outliers", "amplitude", "centre"):
             if not 0.0 <= value <= 1.0:
                 raise UserError(f"{place}: {key} is {value}; it must lie between 0 and 1")
         elif name in ("tensions", "speeds"):

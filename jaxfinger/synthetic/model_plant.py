@@ -1,0 +1,110 @@
+"""A model in place of the finger: a fit, or the nominal model with effects switched on, recorded by the same rig."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxfinger.errors import UserError
+from jaxfinger.experiments.predict import predict
+from jaxfinger.model import Model, Motion
+from jaxfinger.model import simulate as simulate_forward
+from jaxfinger.synthetic.plant import Channels, Plant
+from jaxfinger.synthetic.protocols import TrialPlan
+
+Array = np.ndarray
+LEAST = 1024  # samples: lengths are rounded up to a power of two from here on, so that few programs are compiled
+
+
+class ModelPlant:
+    """What a model predicts of a plan; the encoders read the planned motion.
+
+    VD.3 is simulated forward under the tensions of `driver`, a plant whose controller closes the loop: the model's own
+    motion departs from the plan as far as the two plants differ.
+    """
+
+    def __init__(self, model: Model, driver: Plant | None = None):
+        self.model = model
+        self.driver = driver
+
+    def prescribed(self, plan: TrialPlan) -> Channels:
+        """All channels of the plan's experiment."""
+        channels = ("tendon_excursion",)
+        if plan.experiment.startswith("ID.3"):
+            channels = ("joint_torque",)
+        elif plan.held:
+            channels += ("fingertip_force",) if plan.experiment == "VD.2" else ("joint_torque",)
+        samples = plan.time.size
+        predicted = _predict(self.model, self._motion(plan), channels)
+        return {
+            "q": plan.q,
+            "tendon_force": plan.tension,
+            **{name: np.asarray(value)[:, :samples] for name, value in predicted.items()},
+        }
+
+    def driven(self, plan: TrialPlan) -> Channels:
+        """VD.3 under the driver's tensions, from rest at its first position.
+
+        Raises:
+            UserError: there is no driver.
+        """
+        if self.driver is None:
+            raise UserError(f"recipe: trial {plan.name} needs tensions that the model alone does not give; drop VD.3")
+        driven = self.driver.driven(plan)
+        tension, q0 = jnp.asarray(driven["tendon_force"]), jnp.asarray(driven["q"][:, 0])
+        start = jnp.asarray(plan.session_start)
+        q, _ = _simulate(self.model, jnp.asarray(plan.time), tension, q0, jnp.zeros_like(q0), session_start=start)
+        excursion = _predict(
+            self.model, self._motion(plan, np.asarray(q), driven["tendon_force"]), ("tendon_excursion",)
+        )
+        return {
+            "q": np.asarray(q),
+            "tendon_force": driven["tendon_force"],
+            "tendon_excursion": np.asarray(excursion["tendon_excursion"])[:, : plan.time.size],
+        }
+
+    def _motion(
+        self, plan: TrialPlan, q: Float[Array, "m N"] | None = None, tension: Float[Array, "n N"] | None = None
+    ) -> Motion:
+        """The plan, or a motion at the plan's instants, as the model takes it; the last sample repeated as padding."""
+        q, tension = plan.q if q is None else q, plan.tension if tension is None else tension
+        qd, qdd = (plan.qd, plan.qdd) if q is plan.q else _derivatives(plan.time, q)
+        joint = np.sign(qd) if plan.joint_direction is None else 1.0 * plan.joint_direction
+        sliding = np.sign(np.einsum("nmt,mt->nt", np.asarray(_coupling(self.model, jnp.asarray(q))), qd))
+        tendon = sliding if plan.tendon_direction is None else 1.0 * plan.tendon_direction
+        motorised = np.zeros_like(q)
+        if plan.joint is not None and plan.experiment != "ID.2":
+            motorised[plan.joint] = 1.0
+        padded = max(LEAST, 1 << (plan.time.size - 1).bit_length()) - plan.time.size
+
+        def pad(x: Array):
+            return jnp.asarray(np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, padded)], mode="edge"))
+
+        return Motion(
+            time=pad(plan.time),
+            q=pad(q),
+            qd=pad(qd),
+            qdd=pad(qdd),
+            tension=pad(tension),
+            joint_direction=pad(joint),
+            tendon_direction=pad(tendon),
+            session_time=pad(plan.time + plan.session_start),
+            motorised=pad(motorised),
+            held=plan.held,
+        )
+
+
+_predict = eqx.filter_jit(predict)
+_simulate = eqx.filter_jit(simulate_forward)
+
+
+@eqx.filter_jit
+def _coupling(model: Model, q):
+    return model.moment_arm.coupling(q)
+
+
+def _derivatives(time: Float[Array, " N"], q: Float[Array, "m N"]) -> tuple[Float[Array, "m N"], Float[Array, "m N"]]:
+    qd = np.gradient(q, time, axis=1)
+    return qd, np.gradient(qd, time, axis=1)
