@@ -38,7 +38,7 @@ def test_prescribed_channels_agree(plans, experiment):
 
 
 def test_driven_motion_agrees_under_the_same_tension(plans):
-    """Two independent steppings of dry friction, one with the tension held over a sample and one with it interpolated."""
+    """Two independent steppings of dry friction, under tension that is held over a sample and interpolated."""
     ours = SpecimenPlant(SPECIMEN)
     first = ours.driven(plans["VD.3"])
     second = ModelPlant(nominal_model(SPECIMEN), driver=ours).driven(plans["VD.3"])
