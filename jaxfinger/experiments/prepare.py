@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.ndimage import uniform_filter1d
 
 from jaxfinger.data import Session, Trial, find_holds, outlier_mask, smooth
 from jaxfinger.errors import UserError
@@ -36,10 +37,11 @@ def prepare(session: Session, names: list[str] | None = None, reduced: bool = Tr
     """One stack an experiment, of the named trials (default all), averaged to the experiment's rate unless told."""
     stacks = {}
     for spec in EXPERIMENTS.values():
-        trials = [t for t in session if t.experiment == spec.name and (names is None or t.name in names)]
-        rows = [_reduce(spec, t, session, reduced) for t in trials if len(t.time) > 1]
+        chosen = [t for t in session if t.experiment == spec.name and (names is None or t.name in names)]
+        trials = [t for t in chosen if len(t.time) > 1]
+        rows = [_reduce(spec, t, session, reduced) for t in trials]
         if rows:
-            stacks[spec.name] = _stack(spec, trials, rows)
+            stacks[spec.name] = _stack(spec, trials, rows, reduced)
     return stacks
 
 
@@ -62,9 +64,14 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool) -> 
 
     q, qd, qdd = smooth(trial.time, trial.q, min(spec.cutoff, 0.2 / step))
     if spec.samples == "holds":
-        q, qd, qdd = trial.q, np.zeros_like(q), np.zeros_like(q)
+        # Only holds count in a fit, and there nothing moves; at the full rate joints also move between them.
+        moves = (holds < 0)[:, None] & (not reduced and not spec.held)
+        q, qd, qdd = trial.q, qd * moves, qdd * moves
     joint_direction = np.zeros((N, m)) if spec.held else _direction(trial.joint_direction, qd, STILL)
     tension = np.zeros((N, n)) if trial.tendon_force is None else np.nan_to_num(trial.tendon_force)
+    if spec.held and not reduced:
+        # As smooth as the blocks of a fit: what slips at a noise peak would stay there until the next step.
+        tension = uniform_filter1d(tension, max(1, round(1.0 / (spec.rate * step))), axis=0, mode="nearest")
     tendon_direction = np.zeros((N, n))
     if not spec.slack and spec.samples == "sliding":
         rate = np.zeros((N, n)) if trial.tendon_excursion is None else _rates(trial, spec)
@@ -136,11 +143,12 @@ def _measured(spec, trial, session, holds, qd):
 
 
 def _direction(commanded: np.ndarray | None, rate: np.ndarray, still: float) -> np.ndarray:
-    """The protocol's directions, else the sign of the filtered rate, which keeps the last one through a stop."""
+    """The protocol's directions, else the sign of the filtered rate: 0 before the first motion, the last in a stop."""
     if commanded is not None:
         return commanded.astype(float)
-    known = np.where(np.abs(rate) > still, np.arange(len(rate))[:, None], 0)
-    return np.sign(np.take_along_axis(rate, np.maximum.accumulate(known, axis=0), axis=0))
+    moves = np.abs(rate) > np.minimum(still, 0.1 * np.percentile(np.abs(rate), 95, axis=0))
+    known = np.maximum.accumulate(np.where(moves, np.arange(len(rate))[:, None], -1), axis=0)
+    return np.where(known < 0, 0.0, np.sign(np.take_along_axis(rate, np.maximum(known, 0), axis=0)))
 
 
 def _rates(trial: Trial, spec: Experiment) -> np.ndarray:
@@ -168,9 +176,9 @@ def _whole(holds: np.ndarray, M: int, block: int) -> np.ndarray:
     return np.where((blocks == blocks[:, :1]).all(axis=1), blocks[:, 0], -1)
 
 
-def _stack(spec: Experiment, trials: list[Trial], rows: list[_Row]) -> Stack:
+def _stack(spec: Experiment, trials: list[Trial], rows: list[_Row], reduced: bool) -> Stack:
     steps = {round(r.dt, 6) for r in rows}
-    if max(steps) > 1.5 * min(steps):
+    if reduced and max(steps) > 1.5 * min(steps):
         raise UserError(
             f"the {spec.name} trials are sampled at different rates ({min(steps):g} s and {max(steps):g} s a sample "
             f"after reduction): resample trial {trials[int(np.argmax([r.dt for r in rows]))].name} to at least "

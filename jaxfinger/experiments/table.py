@@ -38,6 +38,6 @@ EXPERIMENTS = {
 UNITS = {"tendon_excursion": "m", "joint_torque": "N m", "fingertip_force": "N", "q": "rad", "tendon_force": "N"}
 
 SLACK = 0.2  # N: a tendon whose tension stays below this is slack, and carries neither tension nor friction
-STILL = 0.01  # rad/s: below this a joint keeps the direction that it had
+STILL = 0.05  # rad/s (or a tenth of the motion's speed): below this a joint keeps the direction that it had
 MIN_JOINT_SPEED = 0.1  # rad/s (or a fifth of the motion's speed): below this a joint may stick, its friction unknown
 MIN_TENDON_SPEED = 5e-4  # m/s: likewise a tendon

@@ -1,0 +1,138 @@
+"""What a model predicts for every sample of a session, trial by trial: the format's table "Predictions"."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxfinger.data import Session, Trial
+from jaxfinger.errors import UserError
+from jaxfinger.experiments import Stack, predict, prepare
+from jaxfinger.identify.fit import Fit
+from jaxfinger.model import Model, Motion, simulate
+
+STEP = 5e-4  # s: longest step of the forward simulation
+
+Predictions = dict[str, dict[str, np.ndarray]]
+
+
+def predict_session(
+    fit: Fit | Model,
+    session: Session,
+    names: list[str] | None = None,
+    progress: Callable[[str], None] = lambda message: None,
+) -> Predictions:
+    """Predicted channels of the named trials (default all): `{trial: {channel: (N, columns)}}`, SI units.
+
+    Channels are those of the format's table. A joint whose torque was not measured stays NaN, and so does the excursion
+    of a passive tendon. A trial of fewer than two samples is left out.
+
+    Raises:
+        UserError: the model's joints or tendons are not those of the session.
+    """
+    model = model_for(fit, session)
+    out: Predictions = {}
+    for experiment, stack in prepare(session, names, reduced=False).items():
+        progress(f"predicting {len(stack.trials)} trials of {experiment}")
+        free = simulate_trials(model, session, stack) if experiment == "VD.3" else {}
+        for b, name in enumerate(stack.trials):
+            N = len(session[name].time)
+            x = jax.tree.map(lambda a, b=b: a[..., b : b + 1, :], stack.batch.x)
+            values = _predict(model, x, stack.experiment.channels)
+            channels = {c: np.array(v[:, 0, :N]).T for c, v in values.items()}
+            out[name] = _only_measurable(channels, session[name], session) | free.get(name, {})
+    return {t.name: out[t.name] for t in session if t.name in out}
+
+
+def model_for(fit: Fit | Model, session: Session) -> Model:
+    """The fit's model, mounted as the session's finger is: `gravity` belongs to the rig and not to the finger.
+
+    Raises:
+        UserError: the model's joints or tendons are not those of the session.
+    """
+    model = fit.model if isinstance(fit, Fit) else fit
+    finger, file = session.finger, session.file or "the session"
+    for kind, ours, theirs in (
+        ("joints", model.finger.joint_names, finger.joint_names),
+        ("tendons", model.finger.tendon_names, finger.tendon_names),
+    ):
+        if ours != tuple(theirs):
+            raise UserError(
+                f"{file}: /finger/{kind}: has {', '.join(theirs) or 'none'} where the fit has "
+                f"{', '.join(ours) or 'none'}; give a session of the finger that was identified"
+            )
+    if not np.any(model.finger.gravity):
+        return model  # the recipe leaves gravity out
+    return eqx.tree_at(lambda m: m.finger.gravity, model, jnp.asarray(finger.gravity, dtype=float))
+
+
+@eqx.filter_jit
+def _predict(model: Model, x: Motion, channels: tuple[str, ...]) -> dict[str, Float[Array, "columns 1 T"]]:
+    return predict(model, x, channels)
+
+
+def _only_measurable(channels: dict[str, np.ndarray], trial: Trial, session: Session) -> dict[str, np.ndarray]:
+    """NaN where the rig has no sensor: passive tendons, and joints without the torque sensor."""
+    finger = session.finger
+    if "tendon_excursion" in channels:
+        channels["tendon_excursion"][:, ~finger.active] = np.nan
+    if "joint_torque" in channels and trial.experiment != "VD.3":
+        if trial.joint_torque is not None and np.isfinite(trial.joint_torque).any():
+            measured = np.isfinite(trial.joint_torque).any(axis=0)
+        else:
+            measured = np.array([name == trial.joint for name in finger.joint_names])
+        channels["joint_torque"][:, ~measured] = np.nan
+    return channels
+
+
+def simulate_trials(model: Model, session: Session, stack: Stack) -> dict[str, dict[str, np.ndarray]]:
+    """q of each VD.3 trial of a full-rate stack, simulated from its first sample under the measured tension."""
+    x = model.true_motion(stack.batch.x)
+    steps = np.array([np.median(np.diff(session[name].time)) for name in stack.trials])
+    # Moreau's rule wants even steps: each trial gets its own uniform clock, all the same number of samples.
+    longest = max(session[name].duration / step for name, step in zip(stack.trials, steps, strict=True))
+    grid = steps[:, None] * np.arange(-(-int(np.ceil(longest) + 1) // 512) * 512)
+    tension = np.asarray(x.tension)
+    even = np.stack(
+        [[np.interp(g, t, f) for f in tension[:, b]] for b, (g, t) in enumerate(zip(grid, _times(stack), strict=True))]
+    ).reshape(len(steps), session.finger.n, -1)
+    starts = np.asarray(x.session_time - x.time)[:, 0]
+    substeps = max(1, int(np.ceil(steps.max() / STEP - 1e-6)))
+    q = np.asarray(
+        _simulate(model, jnp.asarray(grid), jnp.asarray(even), x.q[..., 0].T, x.qd[..., 0].T, starts, substeps)
+    )
+    out = {}
+    for b, name in enumerate(stack.trials):
+        time = np.asarray(session[name].time)
+        path = jnp.asarray(np.stack([np.interp(time, grid[b], row) for row in q[b]]))
+        N = len(time)
+        moved = jax.tree.map(lambda a, b=b, N=N: a[..., b, :N], x)
+        out[name] = {"q": np.array(model.reading("q", moved, path)).T}
+    return out
+
+
+def _times(stack: Stack) -> list[np.ndarray]:
+    """Times of each trial from its first sample; the padding at the end repeats the last one."""
+    time = np.asarray(stack.batch.x.time)
+    return [row - row[0] for row in time]
+
+
+@eqx.filter_jit
+def _simulate(
+    model: Model,
+    time: Float[Array, "B T"],
+    tension: Float[Array, "B n T"],
+    q0: Float[Array, "B m"],
+    qd0: Float[Array, "B m"],
+    start: Float[Array, " B"],
+    substeps: int,
+) -> Float[Array, "B m T"]:
+    def one(t, f, q, qd, s):
+        return simulate(model, t, f, q, qd, session_start=s, substeps=substeps)[0]
+
+    return jax.vmap(one)(time, tension, q0, qd0, start)

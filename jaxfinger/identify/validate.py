@@ -1,0 +1,338 @@
+"""How well a model predicts trials: error of every channel in the units that people read, beside the noise floor.
+
+Errors are those of block means at the rate at which a fit reads the experiment (20 Hz, 100 Hz where it moves fast), so
+that they are compared with the noise at that rate. Excursions and angles are scored after removing one constant a
+trial (the encoders' arbitrary zero) or none; the mean error of an excursion counts from the trial's first sample, as
+the paper's does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.signal import butter, sosfilt, sosfilt_zi
+
+from jaxfinger.data import Session, Trial, smooth
+from jaxfinger.errors import UserError
+from jaxfinger.experiments import Stack, predict, prepare
+from jaxfinger.identify.fit import Fit
+from jaxfinger.identify.noise import estimate
+from jaxfinger.identify.predictions import model_for, simulate_trials
+from jaxfinger.model import Model
+
+ONLINE_CUTOFF = 10.0  # Hz, of the causal filter that a controller would differentiate
+DISPLAY = {  # channel: factor and unit for people, revolute joints
+    "tendon_excursion": (1e3, "mm"),
+    "joint_torque": (1e3, "N mm"),
+    "fingertip_force": (1.0, "N"),
+    "q": (180.0 / np.pi, "degrees"),
+}
+
+
+@dataclass(frozen=True)
+class Score:
+    """Error of one column of one channel over all trials of an experiment; `units` are those of the numbers."""
+
+    experiment: str
+    channel: str
+    column: str  # joint, tendon or axis
+    units: str
+    rms: float
+    mean: float
+    noise: float | None  # standard deviation of the sensor at the same rate; None where nothing shows it
+    noise_source: str
+    samples: int
+    trials: int
+    method: str = ""  # where an experiment is judged in two ways
+
+
+@dataclass(frozen=True)
+class Slope:
+    """VD.2: force along one axis against tension, a straight line through the holds (the paper's Fig. 9)."""
+
+    trial: str
+    tendon: str
+    axis: str
+    measured: float  # N/N
+    measured_std: float  # scatter of the holds about the model's curve
+    predicted: float
+    predicted_std: float  # from the fit's covariance
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Every score of a fit on a session."""
+
+    specimen: str
+    session: str
+    scores: tuple[Score, ...]
+    slopes: tuple[Slope, ...] = ()
+    messages: tuple[str, ...] = ()  # what was not validated, and why
+
+    def as_dict(self) -> dict:
+        """Plain dictionaries, for JSON."""
+        return asdict(self)
+
+
+def validate(
+    fit: Fit,
+    session: Session,
+    experiments: tuple[str, ...] | None = None,
+    progress: Callable[[str], None] = lambda message: None,
+) -> Validation:
+    """Scores of the recipe's validation experiments, or of others by name.
+
+    Raises:
+        UserError: the session has none of them, or is of another finger.
+    """
+    model = model_for(fit, session)
+    wanted = experiments or fit.recipe.validation.experiments
+    stacks = prepare(session, [t.name for t in session if t.experiment in wanted])
+    if not stacks:
+        has = ", ".join(dict.fromkeys(t.experiment for t in session)) or "no trials"
+        raise UserError(
+            f"{session.file or 'the session'}: has no trial of {', '.join(wanted)} to validate with, it has {has}; "
+            "name its experiments with --experiments"
+        )
+    scores, slopes = [], []
+    for name, stack in stacks.items():
+        progress(f"validating {name}")
+        residuals, floors = _residuals(model, fit, stack)
+        if name == "VD.1":
+            scores += _integral_scores(model, session, stack, floors["tendon_excursion"])
+        for channel, residual in residuals.items():
+            scores += _channel_scores(session, stack, channel, residual, floors[channel])
+        if name == "VD.2":
+            slopes += _slopes(fit, model, session, stack)
+        if name == "VD.3":
+            progress("simulating VD.3 forward in time")
+            scores += _simulation_scores(model, session, list(stack.trials))
+    missing = tuple(f"the session has no {e} trial" for e in wanted if e not in stacks)
+    return Validation(session.specimen, session.file, tuple(scores), tuple(slopes), missing)
+
+
+# -- channels ---------------------------------------------------------------------------------------------------------
+
+
+def _residuals(model: Model, fit: Fit, stack: Stack) -> tuple[dict, dict[str, tuple[np.ndarray, str]]]:
+    """Measured less predicted, NaN where a sample does not count, and the noise floor by channel."""
+    channels = stack.experiment.channels
+    predicted = _predict(model, stack.batch.x, channels)
+    residuals, floors = {}, {}
+    for c in channels:
+        mask = np.asarray(stack.batch.mask[c]) > 0
+        raw = np.asarray(stack.batch.y[c]) - np.asarray(predicted[c])
+        residuals[c] = np.where(mask, raw, np.nan)
+        floors[c] = _floor(fit, stack, c, raw)
+    return residuals, floors
+
+
+_predict = eqx.filter_jit(predict)
+
+
+def _floor(fit: Fit, stack: Stack, channel: str, residual: np.ndarray) -> tuple[np.ndarray, str]:
+    """Noise of each column: from repeats and holds here, else the fit's of the same sensor, else the fast residuals."""
+    here = estimate(stack, channel, residual)
+    if here.source == "residuals":
+        rate = stack.experiment.rate
+        for (experiment, c), noise in fit.noise.items():
+            if c == channel and noise.source != "residuals" and _rate(experiment) == rate:
+                return noise.std, f"{noise.source} of {experiment}"
+    return here.std, "fast part of the residuals" if here.source == "residuals" else here.source
+
+
+def _rate(experiment: str) -> float:
+    from jaxfinger.experiments import EXPERIMENTS
+
+    return EXPERIMENTS[experiment].rate
+
+
+def _channel_scores(session: Session, stack: Stack, channel: str, residual, floor) -> list[Score]:
+    """One score a column that was measured; residual (columns, B, T), NaN where it does not count."""
+    method = {"VD.1": "f(q) − f(q(0))", "VD.3": "inverse dynamics where it slides" if channel == "joint_torque" else ""}
+    scores = []
+    for k, column in enumerate(columns(session, channel)):
+        series = [r[np.isfinite(r)] for r in residual[k]]
+        series = [r for r in series if r.size]
+        if series:
+            found = _score(series, channel == "tendon_excursion")
+            scores.append(
+                _make(session, stack.experiment.name, channel, k, column, *found, (floor[0][k], floor[1]), method)
+            )
+    return scores
+
+
+def _score(series: list[np.ndarray], zeroed: bool) -> tuple[float, float, int, int]:
+    """rms, mean, samples and trials of the errors of several trials."""
+    mean = float(np.mean(np.concatenate([r - r[0] if zeroed else r for r in series])))
+    errors = np.concatenate([r - r.mean() if zeroed else r for r in series])
+    return float(np.sqrt(np.mean(errors**2))), mean, errors.size, len(series)
+
+
+def _make(session, experiment, channel, k, column, rms, mean, samples, trials, floor, method) -> Score:
+    factor, units = display(session, channel, k)
+    noise = None if floor[0] is None or not np.isfinite(floor[0]) else float(floor[0]) * factor
+    return Score(
+        experiment,
+        channel,
+        column,
+        units,
+        rms * factor,
+        mean * factor,
+        noise,
+        floor[1],
+        samples,
+        trials,
+        method.get(experiment, "") if isinstance(method, dict) else method,
+    )
+
+
+def columns(session: Session, channel: str) -> tuple[str, ...]:
+    """Names of a channel's columns."""
+    return {
+        "tendon_excursion": session.finger.tendon_names,
+        "fingertip_force": ("x", "y", "z"),
+    }.get(channel, session.finger.joint_names)
+
+
+def display(session: Session, channel: str, k: int) -> tuple[float, str]:
+    """Factor and unit in which people read a column: mm, N mm, N and degrees; mm and N for a prismatic joint."""
+    if channel in ("q", "joint_torque") and session.finger.prismatic[k]:
+        return (1e3, "mm") if channel == "q" else (1.0, "N")
+    return DISPLAY[channel]
+
+
+# -- VD.1: the paper's integral ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ExcursionPath:
+    """VD.1 of one trial: all (N, n) in m, from the first sample."""
+
+    time: Float[np.ndarray, " N"]
+    measured: Float[np.ndarray, "N n"]
+    integral: Float[np.ndarray, "N n"]  # ∫ C(q) q̇ dt, q̇ from a causal filter, as a controller has it
+    direct: Float[np.ndarray, "N n"]  # f(q) − f(q(0))
+
+
+def excursion_path(model: Model, trial: Trial) -> ExcursionPath:
+    """Both forms of VD.1: the paper's integral drifts with every error of q̇, the difference does not."""
+    q = trial.q
+    step = float(np.median(np.diff(trial.time)))
+    sos = butter(2, min(0.9, 2.0 * ONLINE_CUTOFF * step), output="sos")
+    filtered = sosfilt(sos, q, axis=0, zi=sosfilt_zi(sos)[:, :, None] * q[0])[0]
+    qd = np.diff(filtered, axis=0, prepend=filtered[:1]) / np.diff(trial.time, prepend=trial.time[0] - step)[:, None]
+    C = np.asarray(_coupling(model, jnp.asarray(q.T)))
+    rate = np.einsum("nmt,tm->tn", C, qd)
+    integral = np.cumsum(rate * np.diff(trial.time, prepend=trial.time[0])[:, None], axis=0)
+    direct = np.asarray(_excursion(model, jnp.asarray(q.T))).T
+    measured = np.full(direct.shape, np.nan) if trial.tendon_excursion is None else trial.tendon_excursion
+    return ExcursionPath(trial.time, measured - measured[0], integral, direct - direct[0])
+
+
+@eqx.filter_jit
+def _coupling(model: Model, q):
+    return model.moment_arm.coupling(q)
+
+
+@eqx.filter_jit
+def _excursion(model: Model, q):
+    return model.moment_arm.excursion(q)
+
+
+def _integral_scores(model: Model, session: Session, stack: Stack, floor) -> list[Score]:
+    """The paper's: mean over the path and error at its end, nothing removed but the start."""
+    paths = [excursion_path(model, session[name]) for name in stack.trials]
+    scores = []
+    for k, column in enumerate(columns(session, "tendon_excursion")):
+        series = [(p.measured - p.integral)[:, k] for p in paths]
+        series = [e[np.isfinite(e)] for e in series if np.isfinite(e).any()]
+        if series:
+            errors = np.concatenate(series)
+            found = (float(np.sqrt(np.mean(errors**2))), float(errors.mean()), errors.size, len(series))
+            method = "∫ C q̇ dt, the paper's"
+            scores.append(
+                _make(session, "VD.1", "tendon_excursion", k, column, *found, (floor[0][k], floor[1]), method)
+            )
+    return scores
+
+
+# -- VD.2: slope of the force against tension -------------------------------------------------------------------------
+
+
+def _slopes(fit: Fit, model: Model, session: Session, stack: Stack) -> list[Slope]:
+    """Slopes along every axis against the tension of the tendon that is pulled, through the samples of the holds."""
+    x, measured = stack.batch.x, np.asarray(stack.batch.y["fingertip_force"])
+    mask, tension = np.asarray(stack.batch.mask["fingertip_force"]), np.asarray(x.tension)
+    lines = []
+    for b, name in enumerate(stack.trials):
+        if (tendon := session[name].tendon) is None:
+            continue
+        f = tension[session.finger.tendon_names.index(tendon), b]
+        for axis in range(3):
+            counts = mask[axis, b] > 0
+            if counts.any() and np.ptp(f[counts]) > 0:
+                centred = np.where(counts, f - f[counts].mean(), 0.0)
+                lines.append((name, tendon, axis, b, centred / (centred @ f)))  # slope = weights · force
+    if not lines:
+        return []
+
+    def slopes(m: Model):
+        force = predict(m, x, ("fingertip_force",))["fingertip_force"]
+        return jnp.stack([jnp.asarray(w) @ force[axis, b] for _, _, axis, b, w in lines])
+
+    values, std = replace(fit, model=model).function(eqx.filter_jit(slopes))
+    predicted = np.asarray(_predict(model, x, ("fingertip_force",))["fingertip_force"])
+    return [
+        Slope(
+            name,
+            tendon,
+            "xyz"[axis],
+            float(w @ measured[axis, b]),
+            _slope_std(
+                tension[session.finger.tendon_names.index(tendon), b], measured[axis, b] - predicted[axis, b], w
+            ),
+            float(values[k]),
+            float(std[k]),
+        )
+        for k, (name, tendon, axis, b, w) in enumerate(lines)
+    ]
+
+
+def _slope_std(f: np.ndarray, errors: np.ndarray, weights: np.ndarray) -> float:
+    """Standard deviation of a slope from the scatter of the holds about the model's curve; a hold counts once."""
+    counts = weights != 0
+    levels, hold = np.unique(f[counts], return_inverse=True)  # at a hold the tension is the hold's mean
+    mean = np.bincount(hold, errors[counts]) / np.bincount(hold)
+    centred = levels - levels.mean()
+    rest = mean - mean.mean() - (centred @ mean) / (centred @ centred) * centred
+    return float(np.sqrt(rest @ rest / max(1, levels.size - 2) / (centred @ centred)))
+
+
+# -- VD.3: forward simulation -----------------------------------------------------------------------------------------
+
+
+def _simulation_scores(model: Model, session: Session, names: list[str]) -> list[Score]:
+    """q simulated from the first sample under the measured tension, against q, at every sample."""
+    stack = prepare(session, names, reduced=False)["VD.3"]
+    paths = simulate_trials(model, session, stack)
+    scores = []
+    for k, column in enumerate(session.finger.joint_names):
+        series = [session[name].q[:, k] - paths[name]["q"][:, k] for name in stack.trials]
+        found = _score([e[np.isfinite(e)] for e in series], False)
+        encoder = float(np.sqrt(np.mean([_encoder(session[name], k) ** 2 for name in stack.trials])))
+        method = "simulated forward from the first sample"
+        scores.append(_make(session, "VD.3", "q", k, column, *found, (encoder, "fast part of the reading"), method))
+    return scores
+
+
+def _encoder(trial: Trial, k: int) -> float:
+    """Scatter of an encoder about its own smooth motion, rad."""
+    step = float(np.median(np.diff(trial.time)))
+    q = trial.q[:, k]
+    return float(np.std(q - smooth(trial.time, q, min(20.0, 0.2 / step))[0]))
