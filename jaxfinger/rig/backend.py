@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -191,11 +192,7 @@ class Rig(ABC):
         return self
 
     def __exit__(self, kind, error, trace) -> None:
-        try:
+        with suppress(UserError):  # a rig that does not answer any more misses our heartbeat, and lets go by itself
             if self.status().state in (State.ARMED, State.MOVING):
                 self.release()
-        except UserError:
-            if error is None:
-                raise
-        finally:
-            self.close()
+        self.close()

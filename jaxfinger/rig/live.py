@@ -70,5 +70,6 @@ class LiveView(AbstractContextManager):
                 elif channel.kind == "external_torque":
                     table.add_row("motor", f"{value * 1e3:6.1f} N mm", "")
         lost = f", {view.lost} samples lost" if view.lost else ""
-        head = Text(f"{view.number}/{view.count} {view.trial}: {view.doing}{lost}   (q, space or Esc stops)")
+        dot = "● " if view.recording else "  "
+        head = Text(f"{dot}{view.number}/{view.count} {view.trial}: {view.doing}{lost}   (q, space or Esc stops)")
         return Group(head, table)

@@ -32,6 +32,7 @@ from jaxfinger.rig.recover import read_log
 from jaxfinger.rig.safety import PERSIST, Supervisor, Violation
 
 AFTER_TRIP_S = 1.0  # device time that is still recorded after a trip
+LET_GO_S = 1.0  # device time in which the controller has released all tension
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ class View:
     doing: str
     block: Block | None
     lost: int
+    recording: bool
 
 
 @dataclass(frozen=True)
@@ -211,7 +213,7 @@ class Runner:
             self._check(block)
             if block is None:
                 continue
-            self.observe(View(*self._place, doing, block, self.reader.lost))
+            self.observe(View(*self._place, doing, block, self.reader.lost, self.reader.recording))
             if done(block):
                 return
             if (int(block.t_ns[-1]) - start) * 1e-9 > timeout:
@@ -419,15 +421,25 @@ def _trials(plan, rig: Rig, recorder: Recorder, operator: Operator, observe, log
 
 
 def _ready(plan: Plan, rig: Rig, operator: Operator) -> None:
-    """Clear a latched stop with the operator's consent, and arm."""
+    """Let go what an earlier host left loaded, clear a latched stop with the operator's consent, and arm."""
     status = rig.status()
+    if status.state in (State.ARMED, State.MOVING):
+        rig.release()
+    if status.state is State.TRIPPED and not rig.prepare(Setup("")):
+        operator.ask(f"The controller is stopped: {status.cause}. See that finger and hands are safe.", lambda: True)
+    if status.state is not State.IDLE:
+        _pass(rig, LET_GO_S)
     if status.state is State.TRIPPED:
-        if not rig.prepare(Setup("")):
-            operator.ask(
-                f"The controller is stopped: {status.cause}. See that finger and hands are safe.", lambda: True
-            )
         rig.reset(plan.operator or "operator")
     if not rig.prepare(Setup("", fixed=dict.fromkeys(rig.description.finger.joint_names, 0.0))):
         operator.ask("Hands off: the drives are about to be switched on.", lambda: True)
     if not operator.stop_requested():
         rig.arm()
+
+
+def _pass(rig: Rig, seconds: float) -> None:
+    """Let so much device time pass."""
+    start = None
+    while start is None or (int(block.t_ns[-1]) - start) * 1e-9 < seconds:
+        block = rig.read_block(rig.description.stale_s)
+        start = int(block.t_ns[0]) if start is None else start

@@ -78,7 +78,7 @@ def record(short, tmp_path) -> Callable:
         done = []
 
         def observe(view):
-            if fault is not None and not done and (view.trial, view.doing) == at:
+            if fault is not None and not done and view.recording and (view.trial, view.doing) == at:
                 done.append(True)
                 fault(rig)
 

@@ -49,9 +49,10 @@ class AdsRig(RingRig):
         self._lock = threading.Lock()
         self._places: dict[str, tuple[int, int]] = {}
         self.reconnects = 0
+        self._given_up = False
 
     def _open(self) -> None:
-        where = self.description.address
+        where, self._given_up = self.description.address, False
         try:
             self._attach()
         except self._pyads.ADSError as error:
@@ -97,7 +98,7 @@ class AdsRig(RingRig):
                 return request()
             except self._pyads.ADSError as first:
                 deadline = time.monotonic() + float(self.description.address["reconnect_s"])
-                while time.monotonic() < deadline:
+                while not self._given_up and time.monotonic() < deadline:
                     self.close()
                     try:
                         self._attach()
@@ -106,6 +107,7 @@ class AdsRig(RingRig):
                         return answer
                     except self._pyads.ADSError:
                         time.sleep(0.1)
+                self._given_up = True
                 raise ConnectionLost(f"the connection to the controller is lost ({first}).") from first
 
     def _read(self, symbol: str, offset: int, size: int) -> bytes:

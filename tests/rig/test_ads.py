@@ -1,0 +1,221 @@
+"""The adapter over the wire: real AMS/TCP from another process. Judged by sequence numbers, never by the wall clock."""
+
+import socket
+import threading
+import time
+
+import numpy as np
+import pyads
+import pytest
+from conftest import ads_rig
+
+from jaxfinger.errors import UserError
+from jaxfinger.rig import contract, standin
+from jaxfinger.rig.ams import AmsServer
+from jaxfinger.rig.backend import CommandRefused, ConnectionLost, ControllerRestarted, Hold, Setup, StaleRig, TensionRamp
+from jaxfinger.rig.contract import State, Trip
+
+
+@pytest.fixture
+def real_time():
+    with standin.running(speed=1.0, heartbeat=60.0) as where:
+        yield where
+
+
+def collect(rig, samples):
+    """Sequence numbers and times of at least so many samples, and how many were lost."""
+    seq, t, lost = [], [], 0
+    while sum(map(len, seq)) < samples:
+        block = rig.read_block(20.0)
+        seq.append(block.seq.astype(np.int64))
+        t.append(block.t_ns.astype(np.int64))
+        lost += block.lost_before
+    return np.concatenate(seq), np.concatenate(t), lost
+
+
+def test_every_sample_arrives_also_after_the_host_slept(real_time):
+    with ads_rig(real_time) as rig:
+        assert rig.fingerprint()["program"] == "jaxfinger stand-in"
+        first, _, _ = collect(rig, 300)
+        time.sleep(2.0)  # a long compilation, say: notifications would start to be thrown away
+        seq, t, lost = collect(rig, 2500)
+        assert lost == 0
+        assert seq[0] == first[-1] + 1
+        np.testing.assert_array_equal(np.diff(seq), 1)
+        np.testing.assert_array_equal(np.diff(t), 1_000_000)
+
+
+def test_a_cut_connection_is_mended_without_a_gap(real_time):
+    with ads_rig(real_time) as rig:
+        first, _, _ = collect(rig, 100)
+        rig.inject("cut")
+        seq, _, lost = collect(rig, 500)
+        assert rig.reconnects >= 1
+        assert lost == 0
+        assert seq[0] == first[-1] + 1
+        np.testing.assert_array_equal(np.diff(seq), 1)
+
+
+def test_a_restarted_controller_is_noticed(real_time):
+    with ads_rig(real_time) as rig:
+        collect(rig, 50)
+        rig.inject("restart")
+        with pytest.raises(ControllerRestarted):
+            collect(rig, 10**6)
+
+
+def test_a_task_that_stands_still_is_noticed(real_time):
+    with ads_rig(real_time) as rig:
+        collect(rig, 50)
+        rig.inject("stall")
+        with pytest.raises(StaleRig):
+            while True:
+                rig.read_block(1.0)
+        rig.answer_s = 0.3
+        with pytest.raises(ConnectionLost, match="acknowledge"):
+            rig.arm()
+
+
+def test_commands_states_and_the_latch(real_time):
+    with ads_rig(real_time) as rig:
+        assert rig.status().state is State.IDLE
+        with pytest.raises(CommandRefused, match="not in state IDLE"):
+            rig.command(Hold())
+        rig.prepare(Setup("", fixed=dict.fromkeys(rig.description.finger.joint_names, 0.2)))
+        rig.arm()
+        number = rig.command(TensionRamp({"T1": 3.0}, 20.0))
+        while True:
+            block = rig.read_block(20.0)
+            if np.any((block.acknowledged == number) & (block.state == State.ARMED)):
+                break
+        rig.inject("spike", rig.description.channels[rig.description.index("tension", "T1")].slot)
+        while rig.status().state is not State.TRIPPED:
+            rig.read_block(20.0)
+        status = rig.status()
+        assert status.trip is Trip.TENSION
+        assert status.trip_channel == "tension T1"
+        assert "tension T1 = " in status.cause
+
+
+def test_heartbeat_loss_releases_the_finger():
+    """A host that dies while armed: the controller lets go by itself."""
+    with standin.running(speed=1.0, heartbeat=0.5) as where:
+        rig = ads_rig(where)
+        rig.connect()
+        rig.arm()
+        until = rig.status().head + 60_000
+        while rig.status().state is not State.TRIPPED:  # status alone is no heartbeat
+            assert rig.status().head < until
+        assert rig.status().trip is Trip.HEARTBEAT
+        rig.close()
+
+
+def test_nobody_there(tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with pytest.raises(ConnectionLost, match="route back"):
+        ads_rig(f"127.0.0.1:{port}").connect()
+
+
+def test_a_program_without_the_symbols_is_refused():
+    lock = threading.Lock()
+    server = AmsServer(bytearray(64), {"MAIN.x": (0, 8)}, lock)
+    try:
+        with pytest.raises(UserError, match=r"no symbol GVL_Jaxfinger\.stInfo"):
+            ads_rig(f"127.0.0.1:{server.port}").connect()
+    finally:
+        server.close()
+
+
+def listening(pid: int) -> set[str]:
+    """Local addresses (hex) on which a process listens, from /proc."""
+    import os
+
+    inodes = set()
+    for link in os.listdir(f"/proc/{pid}/fd"):
+        try:
+            target = os.readlink(f"/proc/{pid}/fd/{link}")
+        except OSError:
+            continue
+        if target.startswith("socket:["):
+            inodes.add(target[8:-1])
+    rows = []
+    for table in ("tcp", "tcp6"):
+        with open(f"/proc/{pid}/net/{table}") as file:
+            rows += [line.split() for line in file.readlines()[1:]]
+    return {row[1].split(":")[0] for row in rows if row[3] == "0A" and row[9] in inodes}
+
+
+def test_the_adapter_listens_nowhere_and_the_stand_in_on_loopback_alone(real_time):
+    import os
+
+    with ads_rig(real_time) as rig:
+        collect(rig, 50)
+        assert listening(os.getpid()) == set()
+    server = AmsServer(bytearray(64), {"MAIN.x": (0, 8)}, threading.Lock())
+    assert listening(os.getpid()) == {"0100007F"}
+    server.close()
+
+
+def test_any_ads_client_can_read_the_stand_in(real_time):
+    """By name and by handle, with an error code for what is not there: pyads' own calls, not the adapter's."""
+    plc = pyads.Connection(standin.NET_ID, 851, real_time)
+    plc.open()
+    try:
+        assert plc.read_device_info()[0] == "jaxfinger"
+        assert plc.read_state()[0] == pyads.ADSSTATE_RUN
+        handle = plc.get_handle("GVL_Jaxfinger.nHostBeat")
+        plc.write_by_name("", 41, pyads.PLCTYPE_ULINT, handle=handle)
+        assert plc.read_by_name("GVL_Jaxfinger.nHostBeat", pyads.PLCTYPE_ULINT) == 41
+        plc.release_handle(handle)
+        with pytest.raises(pyads.ADSError) as error:
+            plc.read_by_name("GVL_Jaxfinger.nothing", pyads.PLCTYPE_INT)
+        assert error.value.err_code == 1808
+        with pytest.raises(pyads.ADSError):
+            plc.read(0x4040, 2**31, pyads.PLCTYPE_INT)
+    finally:
+        plc.close()
+
+
+def test_a_session_over_the_wire(short, record, tmp_path):
+    from jaxfinger.data import read_session
+
+    with standin.running(speed=0, heartbeat=60.0) as where:
+        outcome = record(ads_rig(where))
+    assert outcome.cause == ""
+    session = read_session(outcome.session)
+    assert [t.complete for t in session] == [True, True]
+    for trial in session:
+        np.testing.assert_allclose(np.diff(trial.time), 1e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize("fault", ["stall", "restart", "nan"])
+def test_faults_over_the_wire_end_the_trial_and_keep_it(record, fault):
+    from jaxfinger.data import read_session
+
+    with standin.running(speed=0, heartbeat=60.0) as where:
+        rig = ads_rig(where, stale_s=1.0)
+        outcome = record(rig, lambda r: r.inject(fault, 8))
+    assert outcome.cause
+    assert outcome.complete == ("01-ID.2-DIP",)
+    cut = read_session(outcome.session)["02-ID.4-T3-MCP"]
+    assert not cut.complete
+    assert len(cut.time) > 100
+    assert contract.VERSION == 1
+
+
+def test_a_connection_that_stays_cut_ends_the_trial(record):
+    from jaxfinger.data import read_session
+
+    with standin.running(speed=0, heartbeat=60.0) as where:
+        rig = ads_rig(where)
+        rig.description.address["reconnect_s"] = 1
+
+        def pull_the_plug(r):
+            r.description.address["ip"] = "127.0.0.1:1"
+            r.inject("cut")
+
+        outcome = record(rig, pull_the_plug)
+    assert "connection to the controller is lost" in outcome.cause
+    assert not read_session(outcome.session)["02-ID.4-T3-MCP"].complete

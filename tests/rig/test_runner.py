@@ -1,0 +1,291 @@
+"""Whole sessions on the simulated rig: complete ones, and what each fault leaves behind."""
+
+import json
+import resource
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from jaxfinger.data import check_file, read_session
+from jaxfinger.errors import UserError
+from jaxfinger.rig import parse_plan, parse_rig, recover
+from jaxfinger.rig.backends.simulated import SimulatedRig
+from jaxfinger.rig.contract import State, Trip
+from jaxfinger.rig.controller import Controller, HardLimits
+from jaxfinger.rig.examples import rig_toml
+from jaxfinger.rig.runner import log_path, run
+
+
+def serious(path):
+    return [f for f in check_file(path) if f.severity != "note"]
+
+
+def slot(rig, kind, of=""):
+    return rig.description.channels[rig.description.index(kind, of)].slot
+
+
+def test_a_session_is_recorded_and_the_finger_released(simulated, record, tmp_path):
+    outcome = record(simulated)
+    assert outcome.cause == ""
+    assert outcome.complete == ("01-ID.2-DIP", "02-ID.4-T3-MCP")
+    assert not log_path(outcome.session).exists()
+    assert serious(outcome.session) == []
+    session = read_session(outcome.session)
+    arms, friction = session
+    assert (arms.experiment, arms.joint, arms.tendon, arms.complete) == ("ID.2", "DIP", None, True)
+    np.testing.assert_allclose(np.diff(arms.time), 1e-3, atol=1e-9)
+    assert np.ptp(arms.q[:, 2]) > 1.0
+    assert arms.joint_torque is None
+    assert (friction.experiment, friction.joint, friction.tendon) == ("ID.4", "MCP", "T3")
+    assert friction.session_start > arms.session_start + arms.duration
+    assert np.isnan(friction.joint_torque[:, 1:]).all()
+    assert np.isnan(friction.tendon_excursion[:, [0, 1, 3]]).all()
+    assert sorted(set(friction.hold.tolist())) == [-1, 0, 1, 2]
+    for hold, level, direction in ((0, 3.0, 1), (1, 6.0, 1), (2, 3.0, -1)):
+        at = friction.hold == hold
+        assert friction.tendon_force[at, 2].mean() == pytest.approx(level, abs=0.02)
+        assert np.all(friction.tendon_direction[at, 2] == direction)
+        assert np.all(friction.joint_direction[at] == 0)
+    assert simulated.controller.state in (State.RELEASING, State.IDLE)
+
+
+def test_the_file_opens_in_old_tools_and_says_how_it_was_made(simulated, record):
+    outcome = record(simulated)
+    with h5py.File(outcome.session) as file:
+        assert file.id.get_create_plist().get_version()[0] == 0  # superblock 0: HDF5 1.8 and MATLAB before R2021b
+        assert file["rig"].attrs["rig_file"] == simulated.description.text
+        assert file["rig/filters/channel"].shape[0] == len(simulated.description.channels)
+        assert not file["rig/filters/enabled"][()].any()
+        assert file["rig/gaps/seq"].shape == (0,)
+        trial = file["trials/02-ID.4-T3-MCP"]
+        assert json.loads(trial.attrs["parameters"])["levels"] == [3.0, 6.0]
+        assert trial.attrs["lost_samples"] == 0
+
+
+def test_the_same_seed_gives_the_same_session(rig, record, tmp_path):
+    sessions = []
+    for name in "ab":
+        sessions.append(read_session(record(SimulatedRig(rig), output=tmp_path / f"{name}.h5").session))
+    for first, second in zip(*sessions, strict=True):
+        np.testing.assert_array_equal(first.q, second.q)
+        np.testing.assert_array_equal(first.tendon_force, second.tendon_force)
+
+
+FAULTS = [
+    ("nan", ("external_torque", ""), Trip.INVALID, 20),
+    ("spike", ("tension", "T3"), Trip.TENSION, 20),
+    ("freeze", ("tension", "T1"), Trip.FROZEN, 1300),
+    ("clock", ("tension", "T1"), Trip.CLOCK, 20),
+    ("flag", ("tension", "T1"), Trip.INVALID, 20),
+]
+
+
+@pytest.mark.parametrize(("fault", "channel", "trip", "within"), FAULTS, ids=[f[0] for f in FAULTS])
+def test_a_fault_ends_the_trial_safely_with_cause_and_data(rig, record, fault, channel, trip, within):
+    machine = SimulatedRig(rig)
+    at = []
+
+    def strike(machine):
+        at.append(machine.controller.seq)
+        machine.inject(fault, slot(machine, *channel))
+
+    outcome = record(machine, strike)
+    assert trip.sentence in outcome.cause
+    assert machine.controller.state is State.TRIPPED
+    assert max(machine.controller.setpoint) <= 8.0
+    assert 0 < machine.controller.trip_seq - at[0] <= within + 100  # samples; a block of the host may be 100 long
+    assert outcome.complete == ("01-ID.2-DIP",)
+    assert serious(outcome.session) == []
+    session = read_session(outcome.session)
+    assert session["01-ID.2-DIP"].complete
+    cut = session["02-ID.4-T3-MCP"]
+    assert not cut.complete
+    assert np.isfinite(cut.tendon_force).all()
+    assert cut.tendon_force.max() < 8.0  # the spike itself is not in the trial
+    with h5py.File(outcome.session) as file:
+        attributes = file["trials/02-ID.4-T3-MCP"].attrs
+        assert attributes["trip"] == trip
+        assert trip.sentence in attributes["cause"]
+        after = file["rig/dropped/02-ID.4-T3-MCP"]
+        assert after["seq"].shape[0] > 500  # what came after the trip lies beside the trial
+        assert any(trip.sentence in json.loads(e)["text"] for e in file["rig/events"].asstr()[()])
+
+
+def test_tension_is_off_a_second_after_a_trip(rig, record):
+    machine = SimulatedRig(rig)
+    record(machine, lambda m: m.inject("nan", slot(m, "external_torque")))
+    assert machine.controller.seq - machine.controller.trip_seq > 900
+    assert max(machine.controller.setpoint) == 0.0
+
+
+def test_a_frozen_encoder_under_the_operators_hand(rig, record):
+    machine = SimulatedRig(rig)
+
+    def strike(m):
+        m.inject("freeze", slot(m, "joint_position", "DIP"))
+
+    outcome = record(machine, strike, at=("01-ID.2-DIP", "moved by hand"))
+    assert Trip.FROZEN.sentence in outcome.cause
+    assert "encoder" in outcome.cause
+
+
+def test_resume_goes_on_where_the_session_was_interrupted(rig, record, tmp_path):
+    machine = SimulatedRig(rig)
+    first = record(machine, lambda m: m.inject("nan", slot(m, "external_torque")))
+    assert first.log is not None
+    with pytest.raises(UserError, match="exists already"):
+        record(SimulatedRig(rig))
+    second = record(SimulatedRig(rig), resume=True)
+    assert second.cause == ""
+    session = read_session(second.session)
+    assert list(session.trials) == ["01-ID.2-DIP", "02-ID.4-T3-MCP", "02-ID.4-T3-MCP-2"]
+    assert [t.complete for t in session] == [True, False, True]
+    starts = [t.session_start for t in session]
+    assert starts == sorted(starts)
+    assert serious(second.session) == []
+    assert not log_path(second.session).exists()
+    with pytest.raises(UserError, match="no interrupted recording"):
+        record(SimulatedRig(rig), resume=True)
+
+
+def test_resume_with_another_plan_is_refused(rig, record, short):
+    record(SimulatedRig(rig), lambda m: m.inject("nan", slot(m, "external_torque")))
+    other = parse_plan(short.text.replace("passes = 1", "passes = 2"), rig)
+    with pytest.raises(UserError, match="another plan"):
+        record(SimulatedRig(rig), plan=other, resume=True)
+
+
+def test_a_latched_controller_is_reset_before_a_resumed_run(rig, record):
+    machine = SimulatedRig(rig)
+    record(machine, lambda m: m.inject("spike", slot(m, "tension", "T3")))
+    assert machine.controller.state is State.TRIPPED
+    machine.controller.faults.clear()
+    again = SimulatedRig(rig, machine.controller)
+    assert record(again, resume=True).cause == ""
+
+
+def test_the_recorder_may_die_and_the_ring_fills_the_trial(rig, record, short, tmp_path):
+    """A log that ends within a trial is closed with what the controller's ring still holds."""
+    machine = SimulatedRig(rig)
+    lengths = []
+
+    class Died(BaseException):
+        pass
+
+    def die(m):
+        lengths.append(m.controller.seq)
+        raise Died
+
+    with pytest.raises(Died):
+        record(machine, die, at=("02-ID.4-T3-MCP", "waiting"))
+    path = log_path(tmp_path / "session.h5")
+    for _ in range(700):
+        machine.controller.cycle()
+    again = SimulatedRig(rig, machine.controller)
+    outcome = record(again, resume=True)
+    assert outcome.cause == ""
+    assert not path.exists()
+    session = read_session(outcome.session)
+    cut = session["02-ID.4-T3-MCP"]
+    assert not cut.complete
+    np.testing.assert_allclose(np.diff(cut.time), 1e-3, atol=1e-9)  # no gap where the recorder died
+
+
+def test_the_operators_stop_key(rig, record):
+    class Presses:
+        asked = 0
+
+        def ask(self, text, alive):
+            raise AssertionError("a simulated rig prepares itself")
+
+        def stop_requested(self):
+            self.asked += 1
+            return self.asked > 60
+
+    machine = SimulatedRig(rig)
+    outcome = record(machine, operator=Presses())
+    assert Trip.OPERATOR.sentence in outcome.cause
+    assert machine.controller.trip is Trip.OPERATOR
+
+
+def test_ctrl_c_stops_the_rig_and_keeps_the_trial(rig, record):
+    def interrupt(m):
+        raise KeyboardInterrupt
+
+    machine = SimulatedRig(rig)
+    outcome = record(machine, interrupt)
+    assert "interrupted" in outcome.cause
+    assert machine.controller.state is State.TRIPPED
+    assert not read_session(outcome.session)["02-ID.4-T3-MCP"].complete
+
+
+def test_a_full_disk_ends_the_trial_and_keeps_what_was_written(rig, record):
+    machine = SimulatedRig(rig)
+    old = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(m):
+        size = log_path(path).stat().st_size
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size + 30_000, old[1]))
+
+    import pathlib
+    import tempfile
+
+    path = pathlib.Path(tempfile.mkdtemp()) / "session.h5"
+    try:
+        outcome = record(machine, fill, output=path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
+    assert "cannot be written" in outcome.cause
+    assert machine.controller.trip is Trip.RECORDER
+    session = recover(log_path(path), path.with_name("again.h5"))
+    assert session.incomplete == ("02-ID.4-T3-MCP",)
+    assert read_session(path)["01-ID.2-DIP"].complete
+
+
+def test_filtered_terminals_are_refused_for_dynamic_experiments(rig, tmp_path):
+    filtered = Controller(limits=HardLimits(heartbeat_s=1e9), filtered=True)
+    plan = parse_plan('[plan]\nname = "p"\n[[trial]]\nexperiment = "ID.3-dynamic"\njoint = "DIP"\n', rig)
+    with pytest.raises(UserError, match=r"filters at 22 Hz .* spoils 01-ID.3-dynamic-DIP"):
+        run(plan, SimulatedRig(rig, filtered), tmp_path / "s.h5")
+    assert filtered.state is State.IDLE
+    assert list(tmp_path.iterdir()) == []
+    allowed = parse_rig(rig_toml(allow_filtered=True))
+    machine = SimulatedRig(allowed, Controller(limits=HardLimits(heartbeat_s=1e9), filtered=True))
+    outcome = run(plan, machine, tmp_path / "s.h5")
+    with h5py.File(outcome.session) as file:
+        bandwidth = dict(zip(file["rig/filters/channel"].asstr()[()], file["rig/filters/bandwidth"][()], strict=True))
+        assert bandwidth["tension T1"] == 22.0
+
+
+def test_static_experiments_may_be_filtered(rig, record):
+    machine = SimulatedRig(rig, Controller(limits=HardLimits(heartbeat_s=1e9), filtered=True))
+    assert record(machine).cause == ""
+
+
+def test_a_loaded_torque_sensor_cannot_be_tared(rig, record):
+    machine = SimulatedRig(rig)
+    sensors = machine.controller.sensors
+    machine.controller.sensors = replace(sensors, torque_offset=0.1)
+    outcome = record(machine)
+    assert "cannot be tared" in outcome.cause
+    assert outcome.complete == ("01-ID.2-DIP",)
+
+
+def test_a_gap_is_counted_and_written(rig, record, tmp_path):
+    """A host that sleeps longer than the ring lasts: the samples are lost, and the file says how many."""
+    machine = SimulatedRig(rig, Controller(limits=HardLimits(heartbeat_s=1e9), ring=1024))
+
+    def sleep(m):
+        for _ in range(3000):
+            m.controller.cycle()
+
+    outcome = record(machine, sleep, at=("01-ID.2-DIP", "moved by hand"))
+    assert outcome.cause == ""
+    with h5py.File(outcome.session) as file:
+        lost = int(file["trials/01-ID.2-DIP"].attrs["lost_samples"])
+        assert 1900 < lost < 2200
+        assert file["rig/gaps/lost"][()].tolist() == [lost]
+        time = file["trials/01-ID.2-DIP/time"][()]
+        assert np.diff(time).max() == pytest.approx((lost + 1) * 1e-3)
