@@ -25,6 +25,7 @@ class Linearised(NamedTuple):
 
     residuals: dict[str, Float[Array, "columns B T"]]  # measured − predicted, by channel, in the channel's unit
     white: Float[Array, "B rows"]  # the same, whitened and flat, before weights
+    jacobian: Float[Array, "B rows p"]  # J, before weights
     factor: Float[Array, "B p+1 p+1"]  # triangular, of [J r] with weights
 
 
@@ -52,4 +53,4 @@ def linearise(
     columns = jnp.concatenate([J, white[..., None]], axis=-1)
     if weights is not None:
         columns = columns * weights[..., None]
-    return Linearised(residuals, white, jnp.linalg.qr(columns, mode="r"))
+    return Linearised(residuals, white, J, jnp.linalg.qr(columns, mode="r"))

@@ -161,7 +161,7 @@ def run_stage(fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session
     # Noise first from the residuals of a fit with first guesses of it, then the fit under that noise.
     noise = dict(fit.noise)
     model = start_values(fit.model, free, parameters)
-    unknown = {(e, c): _unit_noise(stacks[e], c) for e in reads for c in reads[e] if (e, c) not in noise}
+    unknown = {(e, c): first_noise(stacks[e], c) for e in reads for c in reads[e] if (e, c) not in noise}
     for _ in range(2):
         rough, solution = solve(model, free, _sources(stacks, reads, noise | unknown, parameters), prior)
         noise |= _noise(solution, stacks, reads)
@@ -221,7 +221,7 @@ def _cad_prior(fit: Fit, free, parameters, groups) -> Prior | None:
     return Prior(ravel(fit.model)[free], jnp.asarray(root))
 
 
-def _unit_noise(stack: Stack, channel: str) -> Noise:
+def first_noise(stack: Stack, channel: str) -> Noise:
     """White noise of the channel's own size: good enough to find residuals whose noise can then be estimated."""
     columns = stack.batch.y[channel].shape[0]
     y, mask = np.asarray(stack.batch.y[channel]), np.asarray(stack.batch.mask[channel]) > 0

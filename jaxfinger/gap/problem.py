@@ -1,0 +1,170 @@
+"""The gap as one whitened regression: every trial's residuals after the nominal parameters are refitted to all of them.
+
+    r = y − ŷ(θ̂),   r̃ = (I − Q Qᵀ) W r,   z̃ = (I − Q Qᵀ) W ∂ŷ/∂a
+
+Q spans the whitened Jacobian of the nominal parameters, so that what they can absorb is no evidence (Frisch–Waugh–Lovell).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxfinger.data import Session
+from jaxfinger.experiments import EXPERIMENTS, Stack, prepare
+from jaxfinger.identify import Fit, Recipe, identify
+from jaxfinger.identify.linearise import linearise
+from jaxfinger.identify.noise import Noise, estimate
+from jaxfinger.identify.parameters import Free, describe, ravel
+from jaxfinger.identify.solve import Prior, Source, solve
+from jaxfinger.identify.stages import DEPENDS, cad_covariance, first_noise, nominal_model
+from jaxfinger.model import Model
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Where the rows of one experiment come from: indices into (columns of its channels, trial, time)."""
+
+    experiment: str
+    start: int  # first row in the stacked vector
+    keep: np.ndarray  # (rows,) positions in the flattened (B, channels × T) block
+    channel: np.ndarray  # (rows,) index of the channel among the experiment's
+    column: np.ndarray  # (rows,) joint, tendon or axis
+    trial: np.ndarray  # (rows,) index of the trial in the stack
+    time: np.ndarray  # (rows,) index of the sample
+
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+        return len(self.keep)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything that the search for effects reads."""
+
+    session: Session
+    stacks: dict[str, Stack]
+    noise: dict[tuple[str, str], Noise]
+    nominal: Model
+    free: np.ndarray  # positions of the nominal parameters in the flat vector
+    rows: dict[str, Rows]
+    r: Float[np.ndarray, " N"]  # whitened residuals of the nominal model
+    J: Float[np.ndarray, "N p"]  # their Jacobian, whitened
+    root: Float[np.ndarray, "k p"]  # prior rows on the nominal parameters
+    offset: Float[np.ndarray, " k"]  # root (θ̂ − μ)
+    predicted: dict[tuple[str, str], np.ndarray]  # ŷ of the nominal model, (columns, B, T)
+    fit: Fit
+
+    @property
+    def trial_of_row(self) -> np.ndarray:
+        """(N,) running number of each row's trial over all experiments."""
+        out, first = np.empty(self.r.size, int), 0
+        for rows in self.rows.values():
+            out[rows.start : rows.start + rows.size] = rows.trial + first
+            first += len(self.stacks[rows.experiment].trials)
+        return out
+
+    @property
+    def trial_names(self) -> list[str]:
+        """Names in the order of `trial_of_row`."""
+        return [t for e in self.rows for t in self.stacks[e].trials]
+
+
+def build(session: Session, recipe: Recipe, progress: Progress = lambda message: None) -> Problem:
+    """Identify the nominal model, refit it to all trials together, and stack the whitened residuals."""
+    fit = identify(session, recipe, progress=progress)
+    stacks = prepare(session)
+    parameters = describe(fit.model)
+    progress("refitting the nominal model to all trials")
+    cad = [i for i, p in enumerate(parameters) if p.group in ("mass", "com") and fit.covariance[i, i] > 0]
+    cad = np.setdiff1d(cad, fit.estimated)
+    free = np.union1d(fit.estimated, cad).astype(int)
+    prior = _cad_prior(session, recipe, free, parameters)
+    noise = dict(fit.noise)
+    sources = {e: _source(stacks[e], noise, parameters) for e in stacks}
+    for e, stack in stacks.items():
+        missing = [c for c in stack.experiment.channels if (e, c) not in noise]
+        if missing:
+            flat = _first_filters(stack, missing)
+            source = sources[e]._replace(filters={c: flat.get(c, _filters(noise, e, c)) for c in stack.experiment.channels})
+            lin = linearise(fit.model, Free.at(fit.model, source.positions), source.batch, source.filters, _ones(source))
+            noise |= {(e, c): estimate(stack, c, np.asarray(lin.residuals[c])) for c in missing}
+    sources = {e: _source(stacks[e], noise, parameters) for e in stacks}
+    nominal, solution = solve(fit.model, free, sources, prior)
+
+    size = ravel(nominal).size
+    rows, r, J, predicted, start = {}, [], [], {}, 0
+    for e, lin in solution.linearised.items():
+        layout = _layout(stacks[e], sources[e].filters, start)
+        rows[e] = layout
+        start += layout.size
+        white = np.asarray(lin.white).reshape(-1)[layout.keep]
+        full = np.zeros((layout.size, size))
+        full[:, sources[e].positions] = -np.asarray(lin.jacobian).reshape(white_size(lin), -1)[layout.keep]
+        r.append(white)
+        J.append(full[:, free])
+        for c in stacks[e].experiment.channels:
+            predicted[e, c] = np.asarray(stacks[e].batch.y[c]) - np.asarray(lin.residuals[c])
+    theta = np.asarray(ravel(nominal))[free]
+    return Problem(
+        session, stacks, noise, nominal, free, rows, np.concatenate(r), np.concatenate(J), np.asarray(prior.root),
+        np.asarray(prior.root) @ (theta - np.asarray(prior.mean)), predicted, fit,
+    )
+
+
+def white_size(lin) -> int:
+    """Number of rows of an experiment before those that do not count are left out."""
+    return lin.white.shape[0] * lin.white.shape[1]
+
+
+def _cad_prior(session: Session, recipe: Recipe, free, parameters) -> Prior:
+    """What CAD and scale say of masses and centres of mass: the only prior, since all trials are read again."""
+    std = np.sqrt(np.diag(cad_covariance(session, parameters)))
+    rows = [k for k, i in enumerate(free) if std[i] > 0]
+    root = np.zeros((len(rows), free.size))
+    root[np.arange(len(rows)), rows] = 1.0 / std[free[rows]]
+    return Prior(np.asarray(ravel(nominal_model(session, recipe)))[free], root)
+
+
+def _filters(noise, e: str, c: str):
+    return jnp.asarray(noise[e, c].coefficients) if (e, c) in noise else None
+
+
+def _first_filters(stack: Stack, channels) -> dict:
+    return {c: jnp.asarray(first_noise(stack, c).coefficients) for c in channels}
+
+
+def _source(stack: Stack, noise, parameters) -> Source:
+    e, channels = stack.experiment.name, stack.experiment.channels
+    groups = set().union(*(DEPENDS[e, c] for c in channels))
+    positions = np.array([i for i, p in enumerate(parameters) if p.group in groups and p.determinable])
+    return Source(stack.batch, {c: _filters(noise, e, c) for c in channels}, positions)
+
+
+def _ones(source: Source):
+    B, T = source.batch.x.time.shape
+    return jnp.ones((B, T * sum(f.shape[0] for f in source.filters.values())))
+
+
+def _layout(stack: Stack, filters, start: int) -> Rows:
+    """Rows whose whitening has its full history, in the order of `white_rows`: trial, then channel's column, then time."""
+    B, T = stack.batch.x.time.shape
+    complete, channel, column = [], [], []
+    for number, c in enumerate(filters):
+        mask = np.asarray(stack.batch.mask[c]) > 0
+        whole = mask.copy()
+        for k in range(1, filters[c].shape[1]):
+            whole[..., k:] &= mask[..., :-k]
+            whole[..., :k] = False
+        complete.append(np.moveaxis(whole, 1, 0))
+        channel += [number] * len(mask)
+        column += list(range(len(mask)))
+    block = np.concatenate(complete, axis=1)  # (B, columns of all channels, T)
+    keep = np.flatnonzero(block.reshape(-1))
+    trial, wide, time = np.unravel_index(keep, block.shape)
+    return Rows(stack.experiment.name, start, keep, np.array(channel)[wide], np.array(column)[wide], trial, time)
