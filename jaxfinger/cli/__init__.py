@@ -1,1 +1,44 @@
-"""."""
+"""The command line: parse, call, print. Nothing here imports JAX before a command runs."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+
+def main(tokens: Sequence[str] | None = None) -> None:
+    """Entry point of `jaxfinger`. Exits 2 with one sentence where the user can mend something."""
+    _environment()
+    from cyclopts import CycloptsError
+
+    from jaxfinger.cli.app import app
+    from jaxfinger.errors import UserError
+
+    try:
+        app(tokens, exit_on_error=False, result_action="return_none")
+    except UserError as error:
+        print(f"jaxfinger: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except CycloptsError:
+        raise SystemExit(2) from None  # cyclopts has said what is wrong
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
+
+
+def _environment() -> None:
+    """Before any import of NumPy or JAX: small factorisations on one thread, compilations kept between runs."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        from platformdirs import user_cache_path
+
+        folder: Path = user_cache_path("jaxfinger", appauthor=False) / "compiled"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            return  # a home without room for a cache: compile each time
+        if os.access(folder, os.W_OK):
+            os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

@@ -273,18 +273,18 @@ def _slopes(fit: Fit, model: Model, session: Session, stack: Stack) -> list[Slop
     for b, name in enumerate(stack.trials):
         if (tendon := session[name].tendon) is None:
             continue
-        f = tension[session.finger.tendon_names.index(tendon), b]
+        f = tension[session.finger.tendon_names.index(tendon), b]  # N
         for axis in range(3):
             counts = mask[axis, b] > 0
             if counts.any() and np.ptp(f[counts]) > 0:
                 centred = np.where(counts, f - f[counts].mean(), 0.0)
-                lines.append((name, tendon, axis, b, centred / (centred @ f)))  # slope = weights · force
+                lines.append((name, tendon, axis, b, f, centred / (centred @ f)))  # slope = weights · force
     if not lines:
         return []
 
     def slopes(m: Model):
         force = predict(m, x, ("fingertip_force",))["fingertip_force"]
-        return jnp.stack([jnp.asarray(w) @ force[axis, b] for _, _, axis, b, w in lines])
+        return jnp.stack([jnp.asarray(w) @ force[axis, b] for _, _, axis, b, _, w in lines])
 
     values, std = replace(fit, model=model).function(eqx.filter_jit(slopes))
     predicted = np.asarray(_predict(model, x, ("fingertip_force",))["fingertip_force"])
@@ -300,7 +300,7 @@ def _slopes(fit: Fit, model: Model, session: Session, stack: Stack) -> list[Slop
             float(values[k]),
             float(std[k]),
         )
-        for k, (name, tendon, axis, b, w) in enumerate(lines)
+        for k, (name, tendon, axis, b, f, w) in enumerate(lines)
     ]
 
 

@@ -1,0 +1,50 @@
+"""Which commands there are; each is imported when it runs."""
+
+from cyclopts import App, Parameter
+
+app = App(
+    name="jaxfinger",
+    help="Identify the dynamic model of a tendon-driven finger, and say why the simulation still differs from it.",
+    default_parameter=Parameter(negative=()),
+)
+
+COMMANDS = {
+    "demo": ("demo:demo", "Identify and validate the shipped session, and compare it with the paper."),
+    "check": ("files:check", "Say what is wrong with a session file."),
+    "identify": ("model:identify", "The complete dynamic model of a session, with error bars."),
+    "validate": ("model:validate", "How well a fit predicts the trials of a session."),
+    "predict": ("model:predict", "What a fit predicts for every sample of a session."),
+    "show": ("model:show", "What a fit file says."),
+    "diagnose": (
+        "diagnose:diagnose",
+        "Where the model misses the finger, what is to blame, how far it shrinks.",
+    ),
+    "simulate": ("files:simulate", "A simulated session, from a recipe or from a fit."),
+    "import": ("files:import_", "Turn MATLAB, CSV or bag recordings into a session."),
+    "record": ("record:record", "Run a plan on the rig."),
+    "recover": ("record:recover", "Rescue a recording that was killed."),
+}
+STAGES = {
+    "id2": "Moment arms alone.",
+    "id3": "Elastic torque, friction and damping of the joints alone.",
+    "id4": "Tendon friction alone.",
+    "joint": "All trials at once, with the staged estimates as the start.",
+}
+SEALED = {
+    "make": "Make cases and hide their truth.",
+    "run": "Diagnose every case.",
+    "score": "Score the diagnoses against the truth.",
+}
+
+for name, (place, text) in COMMANDS.items():
+    app.command(f"jaxfinger.cli.{place}", name=name, help=text)
+
+fit = App(name="fit", help="One stage of the identification at a time.")
+for name, text in STAGES.items():
+    fit.command(f"jaxfinger.cli.model:fit_{name}", name=name, help=text)
+app.command(fit)
+
+sealed = App(name="sealed", help="The benchmark of the diagnosis, on cases whose truth is withheld.")
+for name, text in SEALED.items():
+    sealed.command(f"jaxfinger.cli.sealed:{name}", name=name, help=text)
+app.command(sealed)

@@ -1,0 +1,112 @@
+"""`jaxfinger check`, `simulate`, `import`: session files in and out."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from jaxfinger.cli.output import console, print_json, progress, refuse_existing
+from jaxfinger.errors import UserError
+
+Output = Annotated[Path, Parameter(name=["--output", "-o"])]
+
+
+def check(file: Path, *, json: bool = False) -> None:
+    """Say what is wrong with a session file, one sentence a finding. Exits 2 where the file breaks the format.
+
+    Parameters
+    ----------
+    file
+        Session (HDF5).
+    json
+        Print the findings as JSON.
+    """
+    from jaxfinger.data import check_file
+
+    with progress("check") as say:
+        say(file.name)
+        findings = check_file(file)
+    errors = sum(f.severity == "error" for f in findings)
+    if json:
+        print_json({"file": file, "ok": not errors, "findings": [asdict(f) for f in findings]})
+    else:
+        for finding in findings:
+            console().print(str(finding), markup=False, soft_wrap=True)
+        rest = len(findings) - errors
+        print(f"{file}: " + (f"{errors} errors, {rest} remarks" if findings else "nothing to complain about"))
+    if errors:
+        raise SystemExit(2)
+
+
+def simulate(source: Path, *, output: Output, seed: int | None = None, overwrite: bool = False) -> None:
+    """Write a simulated session: the specimen and protocol of a recipe, or the finger that a fit describes.
+
+    Parameters
+    ----------
+    source
+        Recipe of the simulator (TOML), or a fit (JSON): then its model is driven through the standard protocol.
+    output
+        Session to write (HDF5).
+    seed
+        Of the noise; by default the recipe's.
+    overwrite
+        Replace a file that is already there.
+    """
+    refuse_existing(output, overwrite)
+    from jaxfinger.data import write_session
+    from jaxfinger.synthetic import Recipe, read_recipe
+    from jaxfinger.synthetic import simulate as run
+
+    with progress("simulate") as say:
+
+        def count(done: int, total: int, name: str) -> None:
+            say(f"trial {done + 1} of {total}, {name}")
+
+        if source.suffix == ".json":
+            session = _of_fit(source, Recipe(), seed or 0, count)
+        else:
+            session = run(read_recipe(source), seed, progress=count)
+        say("writing")
+        write_session(session, output, overwrite)
+    print(f"{output}: {len(session)} trials of {session.specimen}")
+
+
+def _of_fit(source: Path, recipe, seed: int, count):
+    """The session that the rig would record of the fitted model, effects included."""
+    from jaxfinger.cli.model_plant import session_of_fit
+    from jaxfinger.identify import load_fit
+
+    return session_of_fit(load_fit(source), recipe, seed, count)
+
+
+def import_(
+    *sources: Path,
+    mapping: Annotated[Path, Parameter(name=["--mapping", "-m"])],
+    output: Output,
+    overwrite: bool = False,
+) -> None:
+    """Turn recordings (MATLAB v5 and v7.3, CSV, rosbag2, MCAP) into one session.
+
+    Parameters
+    ----------
+    sources
+        The recordings that the mapping names.
+    mapping
+        Mapping file (TOML): which variable is which channel, units, the finger.
+    output
+        Session to write (HDF5).
+    overwrite
+        Replace a file that is already there.
+    """
+    if not sources:
+        raise UserError(f"{mapping}: no recording was given; name at least one before --mapping")
+    refuse_existing(output, overwrite)
+    from jaxfinger.data import import_file
+
+    with progress("import") as say:
+        say(", ".join(s.name for s in sources))
+        session = import_file(sources, mapping, output, overwrite)
+    print(f"{output}: {len(session)} trials of {session.specimen}")

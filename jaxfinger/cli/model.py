@@ -1,0 +1,307 @@
+"""`jaxfinger identify`, `fit`, `validate`, `predict`, `show`: sessions to models, models to predictions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from jaxfinger.cli.output import print_json, progress, refuse_existing
+from jaxfinger.errors import UserError
+
+Output = Annotated[Path, Parameter(name=["--output", "-o"])]
+Experiments = Annotated[list[str] | None, Parameter(name=["--experiments", "-e"], consume_multiple=True)]
+
+
+def identify(
+    file: Path,
+    *,
+    output: Output,
+    recipe: str | None = None,
+    joint: bool = False,
+    figures: Path | None = None,
+    json: bool = False,
+    overwrite: bool = False,
+) -> None:
+    """Identify the complete dynamic model of a session: ID.2, ID.3-static, ID.3-dynamic, ID.4.
+
+    A stage whose trials are missing is skipped and named; what the trials cannot determine is said by name.
+
+    Parameters
+    ----------
+    file
+        Session (HDF5).
+    output
+        Fit to write (JSON).
+    recipe
+        What to fit (TOML), or the name of a shipped one: paper, human-like, emps. By default the paper's.
+    joint
+        Refine all parameters on all trials at once afterwards.
+    figures
+        Folder for the paper's figures of this fit.
+    json
+        Print the parameters as JSON.
+    overwrite
+        Replace files that are already there.
+    """
+    refuse_existing(output, overwrite)
+    from jaxfinger.data import read_session
+    from jaxfinger.identify import identify as run
+    from jaxfinger.identify import read_recipe, save_fit
+
+    with progress("identify") as say:
+        wanted = read_recipe(recipe)
+        say("reading the file")
+        session = read_session(file)
+        fit = run(session, wanted, progress=say)
+        if joint:
+            fit = _refine(fit, session, say)
+        save_fit(fit, output, overwrite)
+        if figures is not None:
+            _draw(fit, session, figures, say)
+    _report(fit, json)
+
+
+def _fit(
+    stages: tuple[str, ...], file: Path, output: Path, start: Path | None, recipe: str | None, json: bool, overwrite
+):
+    refuse_existing(output, overwrite)
+    if start is not None and recipe is not None:
+        raise UserError(f"{start}: a fit to start from brings its own recipe; leave out --recipe or --start")
+    from jaxfinger.data import read_session
+    from jaxfinger.identify import identify as run
+    from jaxfinger.identify import load_fit, read_recipe, save_fit
+    from jaxfinger.identify.predictions import model_for
+
+    with progress("fit") as say:
+        say("reading the file")
+        session = read_session(file)
+        first = load_fit(start) if start else None
+        if first is not None:
+            model_for(first, session)  # refuses the session of another finger
+        fit = run(session, None if first else read_recipe(recipe), stages, first, say)
+        save_fit(fit, output, overwrite)
+    _report(fit, json)
+
+
+def fit_id2(
+    file: Path,
+    *,
+    output: Output,
+    start: Path | None = None,
+    recipe: str | None = None,
+    json: bool = False,
+    overwrite: bool = False,
+) -> None:
+    """Fit the moment arms alone (ID.2).
+
+    Parameters
+    ----------
+    file
+        Session (HDF5).
+    output
+        Fit to write (JSON).
+    start
+        A fit that holds the other parameters.
+    recipe
+        What to fit (TOML), without --start.
+    json
+        Print the parameters as JSON.
+    overwrite
+        Replace a file that is already there.
+    """
+    _fit(("ID.2",), file, output, start, recipe, json, overwrite)
+
+
+def fit_id3(
+    file: Path,
+    *,
+    output: Output,
+    start: Path | None = None,
+    recipe: str | None = None,
+    json: bool = False,
+    overwrite: bool = False,
+) -> None:
+    """Fit elastic torque, friction and damping of the joints alone (ID.3-static, ID.3-dynamic).
+
+    Parameters
+    ----------
+    file
+        Session (HDF5).
+    output
+        Fit to write (JSON).
+    start
+        A fit that holds the other parameters.
+    recipe
+        What to fit (TOML), without --start.
+    json
+        Print the parameters as JSON.
+    overwrite
+        Replace a file that is already there.
+    """
+    _fit(("ID.3-static", "ID.3-dynamic"), file, output, start, recipe, json, overwrite)
+
+
+def fit_id4(
+    file: Path,
+    *,
+    output: Output,
+    start: Path,
+    json: bool = False,
+    overwrite: bool = False,
+) -> None:
+    """Fit the tendons' friction alone (ID.4); it stands on the moment arms and joint torques of `start`.
+
+    Parameters
+    ----------
+    file
+        Session (HDF5).
+    output
+        Fit to write (JSON).
+    start
+        A fit of ID.2 and ID.3.
+    json
+        Print the parameters as JSON.
+    overwrite
+        Replace a file that is already there.
+    """
+    _fit(("ID.4",), file, output, start, None, json, overwrite)
+
+
+def fit_joint(file: Path, *, output: Output, start: Path, json: bool = False, overwrite: bool = False) -> None:
+    """Refine every parameter on all trials at once.
+
+    Parameters
+    ----------
+    file
+        Session (HDF5).
+    output
+        Fit to write (JSON).
+    start
+        The staged fit to refine.
+    json
+        Print the parameters as JSON.
+    overwrite
+        Replace a file that is already there.
+    """
+    refuse_existing(output, overwrite)
+    from jaxfinger.data import read_session
+    from jaxfinger.identify import load_fit, save_fit
+    from jaxfinger.identify.predictions import model_for
+
+    with progress("fit") as say:
+        say("reading the file")
+        session, first = read_session(file), load_fit(start)
+        model_for(first, session)
+        fit = _refine(first, session, say)
+        save_fit(fit, output, overwrite)
+    _report(fit, json)
+
+
+def validate(
+    fit: Path,
+    file: Path,
+    *,
+    experiments: Experiments = None,
+    figures: Path | None = None,
+    json: bool = False,
+) -> None:
+    """Say how well a fit predicts a session: error of every channel beside the noise floor.
+
+    Parameters
+    ----------
+    fit
+        Fit (JSON).
+    file
+        Session (HDF5), best of trials that the fit has not seen.
+    experiments
+        Which experiments; by default the recipe's, VD.1, VD.2 and VD.3.
+    figures
+        Folder for the traces.
+    json
+        Print the scores as JSON.
+    """
+    from jaxfinger.cli.tables import print_validation
+    from jaxfinger.data import read_session
+    from jaxfinger.identify import load_fit
+    from jaxfinger.identify.validate import validate as run
+
+    with progress("validate") as say:
+        say("reading the files")
+        loaded, session = load_fit(fit), read_session(file)
+        result = run(loaded, session, tuple(experiments) if experiments else None, say)
+        if figures is not None:
+            from jaxfinger.report.identification import draw_validation
+
+            say("drawing")
+            draw_validation(loaded, session, figures)
+    if json:
+        print_json(result.as_dict())
+    else:
+        print_validation(result)
+
+
+def predict(fit: Path, file: Path, *, output: Output, overwrite: bool = False) -> None:
+    """Write what a fit predicts for every sample of a session, in the session's own layout.
+
+    Parameters
+    ----------
+    fit
+        Fit (JSON).
+    file
+        Session (HDF5).
+    output
+        Predictions to write (HDF5).
+    overwrite
+        Replace a file that is already there.
+    """
+    refuse_existing(output, overwrite)
+    from jaxfinger.data import read_session, write_predictions
+    from jaxfinger.identify import load_fit
+    from jaxfinger.identify.predictions import predict_session
+
+    with progress("predict") as say:
+        say("reading the files")
+        loaded, session = load_fit(fit), read_session(file)
+        predictions = predict_session(loaded, session, progress=say)
+        write_predictions(output, session, predictions, overwrite)
+    print(f"{output}: {len(predictions)} trials predicted")
+
+
+def show(fit: Path, *, json: bool = False) -> None:
+    """Say what a fit file holds: stages, warnings, what the finger is like, every parameter with its 95 % interval.
+
+    Parameters
+    ----------
+    fit
+        Fit (JSON).
+    json
+        Print it as JSON.
+    """
+    from jaxfinger.identify import load_fit
+
+    _report(load_fit(fit), json)
+
+
+def _refine(fit, session, say):
+    from jaxfinger.identify import refine
+
+    say("refining on all trials at once")
+    return refine(fit, session)
+
+
+def _draw(fit, session, folder: Path, say) -> None:
+    from jaxfinger.report.identification import draw_identification
+
+    say("drawing")
+    draw_identification(fit, session, folder)
+
+
+def _report(fit, json: bool) -> None:
+    from jaxfinger.cli.tables import fit_as_dict, print_fit
+
+    if json:
+        print_json(fit_as_dict(fit))
+    else:
+        print_fit(fit)

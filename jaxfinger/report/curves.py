@@ -1,0 +1,136 @@
+"""The curves of the paper's figures, from a fit: values with standard deviations, in the units that people read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxfinger.identify import Fit
+from jaxfinger.model import Model, rigid_body
+from jaxfinger.model.tendon_friction import bounded
+
+SAMPLES = 61
+TENSION = 12.0  # N: the paper's protocol goes to 10 N, its validation to 15 N
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A function of one variable with its standard deviation."""
+
+    x: Float[np.ndarray, " S"]
+    y: Float[np.ndarray, " S"]
+    std: Float[np.ndarray, " S"]
+
+    def range(self) -> tuple[float, float, float]:
+        """Largest and smallest value, and the largest standard deviation."""
+        return float(self.y.max()), float(self.y.min()), float(self.std.max())
+
+
+@dataclass(frozen=True)
+class JointCurves:
+    """One joint over its range, torques in N mm (N for a prismatic joint) against degrees (mm)."""
+
+    elastic: Curve
+    friction: Curve
+    gravity: Float[np.ndarray, " S"]
+    damping: tuple[float, float]  # N mm s/rad (N s/m), its standard deviation
+    prismatic: bool
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Everything that the paper draws of a model."""
+
+    moment_arm: dict[tuple[str, str], Curve]  # (tendon, joint): mm against degrees
+    joints: dict[str, JointCurves]
+    tendon_friction: dict[str, Curve]  # loss of a sliding tendon, N against N of tension
+
+
+def curves(fit: Fit) -> Curves:
+    """One joint over its range, the others in the middle of theirs; pairs that the finger has and the fit estimated."""
+    model, finger = fit.model, fit.model.finger
+    limits = np.asarray(finger.limits)
+    m, S = finger.m, SAMPLES
+    q = np.tile(limits.mean(axis=1)[:, None, None], (1, m, S))
+    for i in range(m):
+        q[i, i] = np.linspace(*limits[i], S)
+    f = np.linspace(0.0, TENSION, S)
+    values, std = fit.function(_evaluate(jnp.asarray(q), jnp.asarray(np.tile(f, (finger.n, 1)))))
+    cuts = np.cumsum((finger.n * m * S, m * S, m * S, m))
+    arms, elastic, friction, damping, loss = zip(np.split(values, cuts), np.split(std, cuts), strict=True)
+    gravity = np.asarray(_gravity(model, jnp.asarray(q)))
+
+    def shaped(pair, shape):
+        return tuple(a.reshape(shape) for a in pair)
+
+    arms, elastic, friction = shaped(arms, (finger.n, m, S)), shaped(elastic, (m, S)), shaped(friction, (m, S))
+    loss = shaped(loss, (finger.n, S))
+    angle = [(1e3 if p else 180 / np.pi) for p in finger.prismatic]
+    torque = [(1.0 if p else 1e3) for p in finger.prismatic]
+    estimated = _estimated(fit)
+    return Curves(
+        {
+            (t, j): Curve(q[i, i] * angle[i], arms[0][k, i] * torque[i], arms[1][k, i] * torque[i])
+            for k, t in enumerate(finger.tendon_names)
+            for i, j in enumerate(finger.joint_names)
+            if (t, j) in estimated
+        },
+        {
+            j: JointCurves(
+                Curve(q[i, i] * angle[i], elastic[0][i] * torque[i], elastic[1][i] * torque[i]),
+                Curve(q[i, i] * angle[i], friction[0][i] * torque[i], friction[1][i] * torque[i]),
+                gravity[i, i] * torque[i],
+                (float(damping[0][i] * torque[i]), float(damping[1][i] * torque[i])),
+                finger.prismatic[i],
+            )
+            for i, j in enumerate(finger.joint_names)
+            if j in estimated
+        },
+        {t: Curve(f, loss[0][k], loss[1][k]) for k, t in enumerate(finger.tendon_names) if t in estimated},
+    )
+
+
+def _estimated(fit: Fit) -> set:
+    """Joints, tendons and (tendon, joint) pairs of which the fit has estimated something."""
+    from jaxfinger.identify.parameters import describe
+
+    found, parameters = set(), describe(fit.model)
+    for i in fit.estimated:
+        p = parameters[i]
+        if p.group == "moment_arm":
+            found.add((p.tendon, p.joint))
+        elif p.group in ("elastic", "friction", "damping"):
+            found.add(p.joint)
+        elif p.group == "tendon_friction":
+            found.add(p.tendon)
+    return found
+
+
+def _evaluate(q: Float[np.ndarray, "m m S"], tension: Float[np.ndarray, "n S"]):
+    """All curves of a model as one flat vector, so that one derivative gives every standard deviation."""
+    m = q.shape[0]
+    own = jnp.arange(m)
+
+    @eqx.filter_jit
+    def evaluate(model: Model):
+        h = model.joint_torque
+        C = model.moment_arm.coupling(q)  # (n, m, m, S); a joint's own angle varies in its own row
+        parts = (
+            C[:, own, own],
+            h.elastic_torque(q)[own, own],
+            h.friction_magnitude(q)[own, own],
+            h.damping,
+            bounded(model.tendon_friction.loss(tension), tension),
+        )
+        return jnp.concatenate([jnp.ravel(p) for p in parts])
+
+    return evaluate
+
+
+@eqx.filter_jit
+def _gravity(model: Model, q):
+    return rigid_body.inverse_dynamics(model.finger, q, jnp.zeros_like(q), jnp.zeros_like(q))
