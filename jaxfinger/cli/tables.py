@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from jaxfinger.identify.validate import Validation
 
 
+MISFIT = 1.5  # χ² per row above which a model or its noise is not right
+
+
 def fit_as_dict(fit: Fit) -> dict:
     """What made the fit, its stages and its parameters (SI units)."""
     return {
@@ -60,11 +63,20 @@ def _taut(found):
 
 
 def _warnings(fit: Fit) -> None:
-    out = console()
+    out, said = console(), False
     for s in fit.stages:
+        said = said or bool(s.message or s.warnings)
         for text in ([s.message] if s.message else []) + list(s.warnings):
             out.print(f"{s.name}: {text}", markup=False, soft_wrap=True)
-    if any(s.message or s.warnings for s in fit.stages):
+        if s.status == "fitted" and s.chi2_per_row > MISFIT:
+            out.print(
+                f"{s.name}: the residuals are {s.chi2_per_row**0.5:.1f} times the noise, so the model misses something "
+                "and the intervals are too narrow: run `jaxfinger diagnose`, or give the recipe more terms",
+                markup=False,
+                soft_wrap=True,
+            )
+            said = True
+    if said:
         out.print()
 
 
@@ -105,18 +117,18 @@ def _joints(found) -> None:
     table("Torque of the joints over their range (max; min)", header, rows)
 
 
-SCALE = {"m": (1e3, "mm"), "N m": (1e3, "N mm"), "N m s/rad": (1e3, "N mm s/rad"), "kg": (1e3, "g")}
+SCALE = {"m": (1e3, "mm"), "N m": (1e3, "N mm"), "N m s": (1e3, "N mm s")}
 
 
 def _parameters(fit: Fit) -> list[tuple[str, str, str]]:
     rows = []
     for p in fit.table():
-        base, _, per = p["units"].partition("/")
-        factor, unit = SCALE.get(p["units"], SCALE.get(base, (1.0, base)))
-        if p["units"] not in SCALE:
-            unit += f"/{per}" if per else ""
+        base, slash, per = p["units"].partition("/")
+        factor, unit = SCALE.get(base, (1.0, base)) if per != "m" else (1.0, base)
+        if p["group"] == "mass":
+            factor, unit = (1e3, "g") if abs(p["value"]) < 1 else (1.0, "kg")
         std = None if p["std"] is None else p["std"] * factor
-        rows.append((p["name"], with_error(p["value"] * factor, std), unit))
+        rows.append((p["name"], with_error(p["value"] * factor, std), unit + slash + per))
     return rows
 
 

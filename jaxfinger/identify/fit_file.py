@@ -166,6 +166,8 @@ def _fields(content, group: str, **shapes: tuple[int, ...]) -> dict[str, jnp.nda
 
 def _array(values: list, shape: tuple[int, ...], name: str) -> jnp.ndarray:
     array = np.array(values, dtype=float)
+    if 0 in shape and not array.size:
+        array = array.reshape(shape)  # a finger without tendons: lists do not tell how wide nothing is
     if array.ndim != len(shape) or any(a != s for a, s in zip(array.shape, shape, strict=True) if s >= 0):
         raise ValueError(f"{name} has shape {array.shape}")
     if not np.isfinite(array).all():

@@ -106,10 +106,13 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
         case ["moment_arm", _]:
             return _moment_arm(model, *index)
         case ["joint_torque", "damping"]:
-            return Parameter(f"damping {joints[index[0]]}", "damping", "N m s/rad", joints[index[0]])
+            units = "N s/m" if model.finger.prismatic[index[0]] else "N m s/rad"
+            return Parameter(f"damping {joints[index[0]]}", "damping", units, joints[index[0]])
         case ["joint_torque", field]:
             joint, power = joints[index[0]], index[1]
-            return Parameter(f"{field} torque {joint}^{power}", field, _per_rad("N m", power), joint, power=power)
+            slides = model.finger.prismatic[index[0]]
+            units = _per_rad("N", power).replace("rad", "m") if slides else _per_rad("N m", power)
+            return Parameter(f"{field} torque {joint}^{power}", field, units, joint, power=power)
         case ["tendon_friction", field]:
             tendon = tendons[index[0]]
             active = model.finger.active[index[0]]
