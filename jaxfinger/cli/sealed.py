@@ -44,6 +44,27 @@ def make(
     print(f"{folder}: cases; {truth_root}: truth. Diagnose them with: jaxfinger sealed run {folder}")
 
 
+def rivals(folder: Path, *, truth: Path | None = None, workers: int | None = None, share: str = "1/1") -> None:
+    """Compute the ceiling: which other causes no method could tell from the true one. Written into the truth;
+    takes minutes a case.
+
+    Args:
+        folder: the cases.
+        truth: what `make` hid; by default FOLDER-truth.
+        workers: processes; by default as many as there are cores.
+        share: this machine's part of the work, for example 2/8.
+    """
+    from jaxfinger.sealed.rivals import add_all
+
+    truth_root = truth or _beside(folder, "truth")
+    if not any(truth_root.glob("case-*.json")):
+        raise UserError(
+            f"{truth_root}: no truth of a case here; make the cases first with: jaxfinger sealed make {folder}"
+        )
+    with _bar("rivals") as progress:
+        add_all(truth_root, workers or os.cpu_count() or 1, _share(share), progress)
+
+
 def run(
     folder: Path, *, output: Path | None = None, command: str = DIAGNOSE, workers: int | None = None, share: str = "1/1"
 ) -> None:

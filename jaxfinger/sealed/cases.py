@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,7 @@ from .specimens import LAYOUTS, Specimen, make_specimen
 SCHEMA = "jaxfinger-sealed/1"
 SPLITS = {"develop": 1, "fresh": 2}
 SEVERITIES = (2.0, 5.0, 10.0)
+TEN = ("listed", "listed", "double", "listed", "none", "listed", "listed", "unlisted", "listed", "unlisted")
 CREATED = "2026-01-15T10:00:00+00:00"
 
 
@@ -52,26 +53,16 @@ def case_specs(split: str, count: int) -> list[CaseSpec]:
     Listed effects come in turn, each severity equally often, on specimens that differ from round to round.
     """
     rng = np.random.default_rng([SPLITS[split], 7])
-    listed = _endless([(e, s) for s in (5.0, 10.0, 2.0) for e in LISTED], rng)
-    unlisted = _endless([(e, s) for s in (5.0, 10.0) for e in UNLISTED], rng)
-    specimens = _endless([*["planar"] * 3, *[k for k in LAYOUTS if k != "planar"]], rng)
+    listed, unlisted = _rounds(list(LISTED), SEVERITIES, rng), _rounds(list(UNLISTED), SEVERITIES[1:], rng)
+    specimens = _rounds(["planar", *LAYOUTS], [1.0], rng)
     specs = []
     for i in range(count):
-        place = i % 10
-        kind = (
-            "none"
-            if place == 4 or (place == 9 and i % 20 == 9)
-            else "unlisted"
-            if place in (7, 9)
-            else "double"
-            if place == 2
-            else "listed"
-        )
-        specimen = next(specimens)
+        specimen, _ = next(specimens)
+        kind = TEN[i % 10] if i % 20 != 19 else "none"
         if kind == "none":
             specs.append(CaseSpec(kind, specimen))
         elif kind == "double":
-            first, second = (str(e) for e in rng.choice(list(LISTED), 2, replace=False))
+            first, second = (str(e) for e in rng.choice([e for e in LISTED if e != "passive_tendon"], 2, replace=False))
             specs.append(CaseSpec(kind, specimen, (first, second), (10.0, 5.0)))
         else:
             effect, severity = next(unlisted if kind == "unlisted" else listed)
@@ -81,10 +72,13 @@ def case_specs(split: str, count: int) -> list[CaseSpec]:
     return specs
 
 
-def _endless(items: list, rng: np.random.Generator):
+def _rounds(items: list[str], severities: Sequence[float], rng: np.random.Generator) -> Iterator[tuple[str, float]]:
+    """Round after round through all items, each in another order and with its next severity."""
+    turn = 0
     while True:
         for i in rng.permutation(len(items)):
-            yield items[i]
+            yield items[i], severities[(i + turn) % len(severities)]
+        turn += 1
 
 
 def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: Path) -> Path:
@@ -93,20 +87,16 @@ def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: P
     folder, truth_file = root / name, truth_root / f"{name}.json"
     if truth_file.exists() and (folder / "fit.h5").exists() and (folder / "fresh.h5").exists():
         return folder
-    rng = np.random.default_rng([SPLITS[split], number])
-    specimen = make_specimen(spec.specimen, rng)
-    nominal, sensors, style = Finger(specimen), draw_sensors(rng), draw_style(rng)
-    plans = _with_trajectories(nominal, session_plans(specimen, style, rng), rng)
-    later = _with_trajectories(nominal, session_plans(specimen, style, rng, fresh=True), rng)
-    quiet = Session(specimen, plans, sensors)
-    departures, severities, where = _withheld(spec, specimen, quiet, style.speeds, rng)
+    case = _draw(number, split, spec)
+    departures = case.departures
 
     folder.mkdir(parents=True, exist_ok=True)
     truth_root.mkdir(parents=True, exist_ok=True)
+    specimen, sensors, rng = case.quiet.specimen, case.quiet.sensors, case.rng
     finger = Finger(specimen, departures)
-    zero = rng.normal(0, 1e-4, nominal.n)
-    for file, file_plans in (("fit.h5", plans), ("fresh.h5", later)):
-        trials = _trials(finger, nominal, file_plans, sensors, zero, rng)
+    zero = rng.normal(0, 1e-4, finger.n)
+    for file, plans in (("fit.h5", case.plans), ("fresh.h5", case.later)):
+        trials = _trials(finger, case.quiet.nominal, plans, sensors, zero, rng)
         session = Recording(
             specimen=f"sealed-{split}-{number:03d}",
             finger=specimen.cad,
@@ -133,15 +123,48 @@ def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: P
                 "seen_in": list(seen),
                 "parameters": {"size": d.size, "units": d.units, **d.shape},
             }
-            for d, wanted, reached, seen in zip(departures, spec.severities, severities, where, strict=True)
+            for d, wanted, reached, seen in zip(departures, spec.severities, case.reached, case.where, strict=True)
         ],
         "noise": {c: {"std": sensors.std[c], "hold": sensors.hold_std(c), "units": UNITS[c]} for c in STD},
-        "fresh": _fresh_gap(specimen, departures, quiet, later, sensors),
+        "fresh": _fresh_gap(departures, case.quiet, case.later),
     }
     part = truth_file.with_suffix(".part")
     part.write_text(json.dumps(truth, indent=1))
     os.replace(part, truth_file)
     return folder
+
+
+@dataclass(frozen=True)
+class _Case:
+    """Everything that a case's seed decides before anything is measured; `rng` goes on to draw the noise."""
+
+    quiet: Session
+    plans: list[Plan]
+    later: list[Plan]
+    departures: list[Departure]
+    reached: list[float]
+    where: list[tuple[str, str, str]]
+    rng: np.random.Generator
+
+
+def _draw(number: int, split: str, spec: CaseSpec) -> _Case:
+    rng = np.random.default_rng([SPLITS[split], number])
+    specimen = make_specimen(spec.specimen, rng)
+    nominal, sensors, style = Finger(specimen), draw_sensors(rng), draw_style(rng)
+    plans = _with_trajectories(nominal, session_plans(specimen, style, rng), rng)
+    later = _with_trajectories(nominal, session_plans(specimen, style, rng, fresh=True), rng)
+    quiet = Session(specimen, plans, sensors)
+    return _Case(quiet, plans, later, *_withheld(spec, specimen, quiet, style.speeds, rng), rng)
+
+
+def rebuild(truth: dict) -> tuple[Session, list[Departure]]:
+    """The noise-free session and the departures of a case, from its truth file alone."""
+    effects = truth["effects"]
+    spec = CaseSpec(
+        truth["kind"], truth["specimen"], tuple(e["effect"] for e in effects), tuple(e["severity"] for e in effects)
+    )
+    case = _draw(truth["seed"][1], truth["split"], spec)
+    return case.quiet, case.departures
 
 
 def _with_trajectories(nominal: Finger, plans: Sequence[Plan], rng: np.random.Generator) -> list[Plan]:
@@ -199,13 +222,12 @@ def _trials(
         yield measure(read(finger, record(finger, plan, motion)), finger.specimen, sensors, zero, rng)
 
 
-def _fresh_gap(
-    specimen: Specimen, departures: Sequence[Departure], quiet: Session, plans: Sequence[Plan], sensors: Sensors
-):
+def _fresh_gap(departures: Sequence[Departure], quiet: Session, plans: Sequence[Plan]):
     """rms on the fresh trials by experiment and channel, of the nominal model refitted (before) and with the
     true effects (after).
     """
-    later = Session(specimen, plans, sensors)
+    sensors = quiet.sensors
+    later = Session(quiet.specimen, plans, sensors)
     moved = quiet.absorb(quiet.trace(departures)[0])
     rows, labels = later.trace(departures)
     gap = by_channel(rows - later.absorbed[0] @ moved, [(e, c, 0) for e, c, _ in labels])
@@ -259,16 +281,3 @@ def make_cases(
             if progress:
                 progress(done, len(numbers), f"case-{jobs[job]:03d}")
     return numbers
-
-
-def spec_of(truth: dict) -> CaseSpec:
-    """The specification that a truth file records."""
-    effects = truth["effects"]
-    return CaseSpec(
-        truth["kind"], truth["specimen"], tuple(e["effect"] for e in effects), tuple(e["severity"] for e in effects)
-    )
-
-
-def describe(spec: CaseSpec) -> str:
-    """One line for a person."""
-    return json.dumps(asdict(spec))

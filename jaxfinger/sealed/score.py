@@ -124,6 +124,7 @@ def closed_share(rows: Sequence[Mapping], ceiling: Sequence[Mapping]) -> float:
 
 FIGURES: dict[str, tuple[Callable[[Truth], bool], Callable[[Truth, Diagnosis], bool]]] = {
     "cause": (lambda t: t.kind == "listed", cause_right),
+    "cause, where distinguishable": (lambda t: t.kind == "listed" and t.rivals == 0, cause_right),
     "covered": (lambda t: t.kind == "listed", covered),
     "false alarm": (lambda t: t.kind == "none", lambda t, d: bool(d.answer)),
     "open set": (lambda t: t.kind == "unlisted", lambda t, d: d.status == "unexplained"),
@@ -135,8 +136,8 @@ FIGURES: dict[str, tuple[Callable[[Truth], bool], Callable[[Truth, Diagnosis], b
 def score_cases(pairs: Sequence[tuple[Truth, Diagnosis]]) -> Scores:
     """All scores of a set of cases.
 
-    cause, covered: single listed effects. false alarm: cases without an effect. open set: effects that the
-    catalogue lacks.
+    cause, covered: single listed effects; «where distinguishable»: of these, where no other cause fits as well
+    (see `rivals`). false alarm: cases without an effect. open set: effects that the catalogue lacks.
     Brier, probability on the truth: every case that was diagnosed. set size: verdicts that name something. closed:
     cases with predictions on the fresh trials. seconds: cost of a case.
     """

@@ -9,7 +9,15 @@ from rich.table import Table
 
 from .score import Figure, Scores
 
-SHARES = ("cause", "covered", "false alarm", "open set", "double, one right", "double, both right")
+SHARES = (
+    "cause",
+    "cause, where distinguishable",
+    "covered",
+    "false alarm",
+    "open set",
+    "double, one right",
+    "double, both right",
+)
 
 
 def render(scores: Scores) -> Group:

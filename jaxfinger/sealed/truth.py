@@ -12,6 +12,7 @@ from jaxfinger.errors import UserError
 Cause = tuple[str, tuple[str, ...]]  # effect, site
 NONE: Cause = ("none", ())
 UNLISTED: Cause = ("unlisted", ())
+TELLING = 3.0  # nats: below, two causes look alike, or a cause looks like none
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class Truth:
     reached: float | None = None  # severity that the calibration reached; None where the source does not say
     specimen: str = ""
     fresh: tuple[Mapping, ...] = ()
+    rivals: int | None = None  # causes that no method could tell from the truth with this session; None: not computed
 
     def shares(self) -> dict[Cause, float]:
         """Where the probability should lie: one half on each effect of a double."""
@@ -80,6 +82,7 @@ def read_truth(folder: Path, truth_root: Path | None) -> Truth:
         effects[0].get("reached") if effects else None,
         data.get("specimen", ""),
         tuple(data.get("fresh", ())),
+        len(data["rivals"]) + (data["energy"] < TELLING) if "rivals" in data else None,
     )
 
 

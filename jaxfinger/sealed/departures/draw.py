@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations, permutations
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from jaxfinger.data import FingerDescription
 
 from . import joint, sensor, tendon, unlisted
 from .base import Departure
+
+Names = tuple[str, ...]
+Index = tuple[int, ...]
 
 LISTED: dict[str, type[Departure]] = {
     kind.effect: kind
@@ -107,44 +111,44 @@ def draw(
     """A departure of its start size, or None where this finger has no site for it. `speeds`: of the dynamic
     sweeps, rad/s.
     """
+    possible = sites(effect, finger)
+    return draw_at(effect, possible[int(rng.integers(len(possible)))], finger, rng, speeds) if possible else None
+
+
+def draw_at(
+    effect: str, site: tuple[Names, Index], finger: FingerDescription, rng: np.random.Generator, speeds: Sequence[float]
+) -> Departure:
+    """A departure of its start size at a given site, its form and shape drawn."""
     kind = {**LISTED, **UNLISTED}[effect]
-    site = _site(kind, finger, rng)
-    if site is None:
-        return None
-    names, index = site
-    return kind(kind.start_size, names, index, str(rng.choice(kind.forms)), _shape(kind, finger, index, rng, speeds))
+    return kind(kind.start_size, *site, str(rng.choice(kind.forms)), _shape(kind, finger, site[1], rng, speeds))
 
 
-def _site(kind: type[Departure], finger: FingerDescription, rng: np.random.Generator):
+def sites(effect: str, finger: FingerDescription) -> list[tuple[Names, Index]]:
+    """Every place where an effect can sit on this finger: names as the diagnosis writes them, and indices."""
+    kind = {**LISTED, **UNLISTED}[effect]
     joints, tendons = finger.joint_names, finger.tendon_names
-    active = np.flatnonzero(finger.active)
+    active = [int(k) for k in np.flatnonzero(finger.active)]
     if kind in AT_JOINT:
-        j = int(rng.integers(finger.m))
-        return (joints[j],), (j,)
+        return [((joints[j],), (j,)) for j in range(finger.m)]
     if kind in AT_TENDON:
-        k = int(rng.choice(active))
-        return (tendons[k],), (k,)
+        return [((tendons[k],), (k,)) for k in active]
     if kind is joint.PassiveTendon:
-        passive = np.flatnonzero(~finger.active)
-        if not len(passive):
-            return None
-        a, b = np.flatnonzero(finger.crosses[passive[0]])[:2]
-        return (joints[a], joints[b]), (int(a), int(b))
+        pairs = [[int(j) for j in np.flatnonzero(finger.crosses[k])[:2]] for k in np.flatnonzero(~finger.active)]
+        return [((joints[a], joints[b]), (a, b)) for a, b in pairs]
     if kind in JOINT_PAIR:
-        a = int(rng.integers(finger.m - 1))
-        return (joints[a], joints[a + 1]), (a, a + 1)
+        return [((joints[a], joints[a + 1]), (a, a + 1)) for a in range(finger.m - 1)]
     if kind is tendon.Coupling:
-        wide = [k for k in active if finger.crosses[k].sum() > 1]
-        k = int(rng.choice(wide))
-        a, b = sorted(rng.choice(np.flatnonzero(finger.crosses[k]), 2, replace=False))
-        return (tendons[k],), (k, int(a), int(b))
+        crossed = {k: [int(j) for j in np.flatnonzero(finger.crosses[k])] for k in active}
+        return [((tendons[k],), (k, a, b)) for k in active for a, b in combinations(crossed[k], 2)]
     if kind is tendon.Crosstalk:
-        pairs = [(a, b) for a in active for b in active if a != b and np.any(finger.crosses[a] & finger.crosses[b])]
-        a, b = pairs[int(rng.integers(len(pairs)))]
-        return (tendons[a], tendons[b]), (int(a), int(b))
+        return [
+            ((tendons[a], tendons[b]), (a, b))
+            for a, b in permutations(active, 2)
+            if np.any(finger.crosses[a] & finger.crosses[b])
+        ]
     if kind is sensor.Delay:
-        return (str(rng.choice(list(sensor.Delay.FIELDS))),), ()
-    return (AT_SENSOR[kind],), ()
+        return [((channel,), ()) for channel in sensor.Delay.FIELDS]
+    return [((AT_SENSOR[kind],), ())]
 
 
 def _shape(

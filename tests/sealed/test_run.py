@@ -1,0 +1,98 @@
+"""Running a diagnosis over cases: sealed, resumable, in shares."""
+
+import json
+import sys
+
+import pytest
+
+from jaxfinger.cli import sealed as cli
+from jaxfinger.errors import UserError
+from jaxfinger.sealed.run import Command, run_case, run_cases
+
+READ = "import sys, json, pathlib; o = pathlib.Path(sys.argv[2]); o.mkdir(); "
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for i in range(1, 6):
+        case = tmp_path / "cases" / f"case-{i:03d}"
+        case.mkdir(parents=True)
+        (case / "fit.h5").write_text(f"session {i}")
+        (case / "fresh.h5").write_text("not to be seen")
+        (case / "truth.json").write_text("not to be seen")
+    return tmp_path / "cases"
+
+
+def diagnose(fit, out):
+    """Says what it can see."""
+    out.mkdir()
+    if fit.read_text() == "session 4":
+        raise ValueError("cannot")
+    (out / "gap.json").write_text(
+        json.dumps({"saw": sorted(p.name for p in fit.parent.rglob("*") if p.is_file()), "read": fit.read_text()})
+    )
+
+
+def test_the_diagnosis_sees_the_session_alone(folder, tmp_path):
+    assert run_case(diagnose, folder / "case-001", tmp_path / "out") == "done"
+    assert json.loads((tmp_path / "out" / "case-001" / "gap.json").read_text()) == {
+        "saw": ["fit.h5"],
+        "read": "session 1",
+    }
+
+
+def test_failures_are_kept_and_finished_cases_skipped(folder, tmp_path):
+    told = []
+    results = run_cases(folder, tmp_path / "out", diagnose, progress=lambda *a: told.append(a))
+    assert results == {
+        "case-001": "done",
+        "case-002": "done",
+        "case-003": "done",
+        "case-004": "failed",
+        "case-005": "done",
+    }
+    assert [t[0] for t in told] == [1, 2, 3, 4, 5]
+    record = json.loads((tmp_path / "out" / "case-004" / "run.json").read_text())
+    assert record["error"] == "ValueError: cannot"
+    assert record["seconds"] >= 0
+    assert set(run_cases(folder, tmp_path / "out", diagnose).values()) == {"skipped"}
+
+
+def test_shares_are_a_partition_and_workers_agree(folder, tmp_path):
+    one = run_cases(folder, tmp_path / "a", diagnose, share=(1, 2))
+    two = run_cases(folder, tmp_path / "b", diagnose, share=(2, 2))
+    assert not set(one) & set(two)
+    assert len(one) + len(two) == 5
+    copy = f"{READ}(o / 'gap.json').write_text(pathlib.Path(sys.argv[1]).read_text())"
+    command = Command(f'{sys.executable} -c "{copy}" {{fit}} {{out}}')
+    assert set(run_cases(folder, tmp_path / "c", command, workers=2).values()) == {"done"}
+    assert (tmp_path / "c" / "case-004" / "gap.json").read_text() == "session 4"
+
+
+def test_a_command_that_fails_says_why(folder, tmp_path):
+    command = Command(f"{sys.executable} -c \"import sys; sys.exit('no tendon')\" {{fit}} {{out}}")
+    assert run_case(command, folder / "case-001", tmp_path / "out") == "failed"
+    assert "no tendon" in json.loads((tmp_path / "out" / "case-001" / "run.json").read_text())["error"]
+
+
+def test_the_commands_say_what_to_do(folder, tmp_path, capsys):
+    with pytest.raises(UserError, match="no case here"):
+        run_cases(tmp_path / "nothing", tmp_path / "out", diagnose)
+    with pytest.raises(UserError, match=r"\{fit\}"):
+        cli.run(folder, command="diagnose this")
+    with pytest.raises(UserError, match="no diagnoses here"):
+        cli.score(folder)
+    with pytest.raises(UserError, match="i/n"):
+        cli.make(tmp_path / "new", share="half")
+    verdict = "verdict=dict(status='no_gap', effects=[]), none=1.0, unlisted=0.0, candidates=[], ambiguous_sets=[]"
+    script = f"{READ}(o / 'gap.json').write_text(json.dumps(dict({verdict})))"
+    cli.run(folder, command=f'{sys.executable} -c "{script}" {{fit}} {{out}}', workers=1)
+    for case in folder.iterdir():
+        (case / "truth.json").write_text(json.dumps({"effects": []}))
+    cli.score(folder, output=tmp_path / "scores")
+    assert "false alarm" in capsys.readouterr().out
+    saved = json.loads((tmp_path / "scores" / "scores.json").read_text())
+    assert saved["figures"]["false alarm"] == pytest.approx(
+        {"value": 0.0, "low": 0.0, "high": 0.434, "count": 5}, abs=1e-3
+    )
+    assert (tmp_path / "scores" / "reliability.svg").exists()
