@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,7 @@ from jaxtyping import Float
 from jaxfinger.synthetic.protocols import TrialPlan
 from jaxfinger.synthetic.specimen import Specimen
 
-Array = np.ndarray
+Array = Any  # NumPy or JAX
 LEAST = 0.7  # N at the joints, so that no tendon falls slack
 FLOOR = 0.5  # N at the actuator
 SLOW = 0.05  # rad/s: below it the feed-forward of friction fades, so that tension does not jump at a reversal

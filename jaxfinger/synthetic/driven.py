@@ -10,7 +10,7 @@ with the joints' rates first and the tendons' after. Gauss–Seidel projection s
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from jaxfinger.model.finger import Finger
 from jaxfinger.synthetic.controller import Controller, Targets
 from jaxfinger.synthetic.specimen import Specimen
 
-Array = np.ndarray
+Array = Any  # NumPy or JAX
 # XLA's fusion emitters take three times as long to compile these scalar formulas, and run no faster.
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 SUBSTEPS = 2  # a sample of the rig's clock

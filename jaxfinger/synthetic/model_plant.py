@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -54,7 +56,7 @@ class ModelPlant:
             raise UserError(f"recipe: trial {plan.name} needs tensions that the model alone does not give; drop VD.3")
         driven = self.driver.driven(plan)
         tension, q0 = jnp.asarray(driven["tendon_force"]), jnp.asarray(driven["q"][:, 0])
-        start = jnp.asarray(plan.session_start)
+        start: Any = jnp.asarray(plan.session_start)  # traced, so that trials share a program
         q, _ = _simulate(self.model, jnp.asarray(plan.time), tension, q0, jnp.zeros_like(q0), session_start=start)
         excursion = _predict(
             self.model, self._motion(plan, np.asarray(q), driven["tendon_force"]), ("tendon_excursion",)

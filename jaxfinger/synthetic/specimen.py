@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +15,7 @@ from jaxtyping import Float
 from jaxfinger.data import FingerDescription
 from jaxfinger.synthetic.routes import Route
 
-Array = np.ndarray
+Array = Any  # NumPy or JAX
 Routes = tuple[Route | None, ...]  # one a joint, None where the joint is not crossed
 
 
