@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxfinger.experiments import Batch
 from jaxfinger.identify.linearise import Filters, Linearised, linearise
-from jaxfinger.identify.parameters import Free, ravel
+from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.model import Model
 
 VISIBLE = 1e-7  # relative singular value of the column-scaled Jacobian below which a combination is not seen
@@ -74,6 +74,7 @@ def solve(
     frees = {name: Free.at(model, s.positions) for name, s in sources.items()}
     moved = Free.at(model, free)
     theta = np.asarray(moved.get(model))
+    masses = np.array([p.group == "mass" for p in describe(model)])[free]
     if prior is None:
         prior = Prior(theta, np.zeros((0, theta.size)))
     weights = {n: _ones(s) for n, s in sources.items()}
@@ -108,6 +109,7 @@ def solve(
             if small < SMALL:
                 converged = True
                 break
+            step = step * _within(theta, step, masses)
             theta = theta + step
             model = moved.set(model, jnp.asarray(theta))
     message = (
@@ -146,6 +148,12 @@ def _visible(A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     s = np.concatenate([s, np.zeros(len(Vt) - len(s))])
     seen = s > VISIBLE * max(s[0], 1e-300)
     return scale[:, None] * Vt[seen].T / s[seen], Vt[~seen], scale
+
+
+def _within(theta: np.ndarray, step: np.ndarray, positive: np.ndarray) -> float:
+    """Share of a step that leaves every positive parameter at least a tenth of its value."""
+    falling = positive & (step < 0)
+    return float(np.min(0.9 * theta[falling] / -step[falling], initial=1.0))
 
 
 def _compressed(z: Float[Array, " k"], problem: tuple[Array, Array]) -> Float[Array, " rows"]:

@@ -143,12 +143,12 @@ def run_stage(fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session
     parameters = describe(fit.model)
     groups = set(stage.frees) & free_groups(recipe)
     prior_groups = {"mass", "com"} if recipe.fit.free_inertia and stage.name.startswith("ID.3") else set()
-    touched = _touched(stacks, reads, session)
+    touched = touched_by(stacks, reads, session)
     free = np.array(
         [
             i
             for i, p in enumerate(parameters)
-            if (p.group in groups and p.determinable and (p.joint or p.tendon) is not None and _seen(p, touched))
+            if (p.group in groups and p.determinable and (p.joint or p.tendon) is not None and seen_by(p, touched))
             or (p.group in prior_groups and fit.covariance[i, i] > 0)
         ],
         dtype=int,
@@ -158,19 +158,13 @@ def run_stage(fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session
         return replace(fit, stages=(*fit.stages, report))
     prior = _cad_prior(fit, free, parameters, prior_groups)
 
-    # Noise first from the residuals of a fit with first guesses of it, then the fit under that noise.
-    noise = dict(fit.noise)
     model = start_values(fit.model, free, parameters)
-    unknown = {(e, c): first_noise(stacks[e], c) for e in reads for c in reads[e] if (e, c) not in noise}
-    for _ in range(2):
-        rough, solution = solve(model, free, _sources(stacks, reads, noise | unknown, parameters), prior)
-        noise |= _noise(solution, stacks, reads)
-        model, unknown = rough, {}
-    sources = _sources(stacks, reads, noise, parameters)
-    model, solution = solve(model, free, sources, prior, recipe.fit.huber)
+    model, solution, noise = estimate_with_noise(
+        model, free, stacks, reads, fit.noise, parameters, prior, recipe.fit.huber
+    )
 
     linked = np.flatnonzero(np.diag(fit.covariance) > 0)
-    covariance = _propagate(fit.covariance, solution, free, linked, prior)
+    covariance = propagate(fit.covariance, solution, free, linked, prior)
     warnings = name_invisible(parameters, free, solution.invisible)
     warnings += _unseen(parameters, groups, free, touched)
     report = StageReport(
@@ -189,7 +183,28 @@ def run_stage(fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session
     )
 
 
-def _touched(stacks, reads, session: Session) -> tuple[set[str], set[tuple[str, str]], set[str]]:
+def estimate_with_noise(
+    model: Model,
+    free: np.ndarray,
+    stacks: dict[str, Stack],
+    reads: dict[str, tuple[str, ...]],
+    known: dict[tuple[str, str], Noise],
+    parameters: list[Parameter],
+    prior: Prior | None,
+    huber: float,
+) -> tuple[Model, Solution, dict[tuple[str, str], Noise]]:
+    """Noise from the residuals of a fit with first guesses of it, where it is not known; then the fit under it."""
+    noise = dict(known)
+    unknown = {(e, c): first_noise(stacks[e], c) for e in reads for c in reads[e] if (e, c) not in noise}
+    for _ in range(2 if unknown else 0):
+        model, solution = solve(model, free, sources_of(stacks, reads, noise | unknown, parameters), prior)
+        noise |= _noise(solution, stacks, reads)
+        unknown = {}
+    model, solution = solve(model, free, sources_of(stacks, reads, noise, parameters), prior, huber)
+    return model, solution, noise
+
+
+def touched_by(stacks, reads, session: Session) -> tuple[set[str], set[tuple[str, str]], set[str]]:
     """Joints instrumented or moved, (tendon, joint) pairs recorded together, tendons pulled, by the trials read."""
     trials = [session[t] for e in reads for t in stacks[e].trials]
     joints = {t.joint for t in trials if t.joint}
@@ -197,7 +212,7 @@ def _touched(stacks, reads, session: Session) -> tuple[set[str], set[tuple[str, 
     return joints, moved, {t.tendon for t in trials if t.tendon}
 
 
-def _seen(p: Parameter, touched) -> bool:
+def seen_by(p: Parameter, touched) -> bool:
     joints, moved, tendons = touched
     if p.group == "moment_arm":
         return p.joint is None or (p.tendon, p.joint) in moved
@@ -239,10 +254,10 @@ def _noise(solution: Solution, stacks, reads) -> dict[tuple[str, str], Noise]:
     }
 
 
-def _sources(stacks, reads, noise, parameters) -> dict[str, Source]:
+def sources_of(stacks, reads, noise, parameters) -> dict[str, Source]:
     out = {}
     for e, channels in reads.items():
-        groups = set().union(*(DEPENDS[e, c] for c in channels))
+        groups = set().union(*(DEPENDS[e, c] for c in channels), {"effects"})
         positions = np.array([i for i, p in enumerate(parameters) if p.group in groups and p.determinable])
         filters = {c: jnp.asarray(noise[e, c].coefficients) for c in channels}
         out[e] = Source(stacks[e].batch, filters, positions)
@@ -258,7 +273,7 @@ def start_values(model: Model, free: np.ndarray, parameters: list[Parameter]) ->
     return Free.at(model, free).set(model, jnp.asarray(flat[free]))
 
 
-def _propagate(covariance, solution: Solution, free, linked, prior) -> np.ndarray:
+def propagate(covariance, solution: Solution, free, linked, prior) -> np.ndarray:
     """Covariance of the flat vector after a stage (see the module's equation); infinite where nothing is seen."""
     information, scale = solution.information, solution.scale
     others = np.setdiff1d(linked, free)

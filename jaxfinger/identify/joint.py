@@ -1,0 +1,165 @@
+"""Joint refinement: every parameter of equation (1) from all trials at once.
+
+    min_θ  Σ_trials ‖white residuals(θ)‖² + ‖Σ^(−1/2) (θ − μ)‖²
+
+(μ, Σ) is a fit of other recordings, with all that it knew. A fit of these very recordings is no more than the start:
+then the prior is what CAD and scale say, and nothing is counted twice. Masses and centres of mass are free wherever
+CAD states how well it knows them; masses stay positive, and the links' inertias are CAD's.
+"""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfinger.data import Session, data_hash
+from jaxfinger.errors import UserError
+from jaxfinger.experiments import EXPERIMENTS, prepare
+from jaxfinger.identify.fit import Fit, StageReport
+from jaxfinger.identify.identifiability import name_invisible
+from jaxfinger.identify.parameters import Free, describe, ravel
+from jaxfinger.identify.predictions import model_for
+from jaxfinger.identify.solve import Prior, Solution, solve
+from jaxfinger.identify.stages import (
+    Progress,
+    cad_covariance,
+    estimate_with_noise,
+    free_groups,
+    propagate,
+    seen_by,
+    sources_of,
+    start_values,
+    touched_by,
+)
+from jaxfinger.model import Model
+
+STAGE = "joint"
+MISFIT = 1.3  # χ² a row above which another start is tried
+
+
+def refine(session: Session, fit: Fit, progress: Progress = lambda message: None) -> Fit:
+    """The fit refined on all trials of `recipe.fit.joint_experiments`; its last stage report says what it gained.
+
+    Raises:
+        UserError: the session has none of these trials, or its finger is another one.
+    """
+    recipe = fit.recipe
+    model = model_for(fit, session)
+    progress("reading the recordings")
+    stacks = prepare(session, [t.name for t in session if t.experiment in recipe.fit.joint_experiments])
+    reads = {e: _channels(e) for e in stacks}
+    if not reads:
+        raise UserError(
+            f"{session.file or 'the session'}: has no trial of {', '.join(recipe.fit.joint_experiments)}; "
+            "name others in fit.joint_experiments of the recipe"
+        )
+    parameters = describe(model)
+    cad = np.diag(cad_covariance(session, parameters))
+    touched = touched_by(stacks, reads, session)
+    groups = free_groups(recipe)
+    seen = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and seen_by(p, touched)]
+    free = np.union1d(np.union1d(fit.estimated, np.flatnonzero(cad)), seen).astype(int)
+
+    same = fit.data_hash == (data_hash(session.file) if session.file else "")
+    prior = _cad_prior(session, cad, free, parameters, model) if same else _prior(fit, free)
+    progress("refining on all trials at once")
+    model, solution, noise = estimate_with_noise(
+        start_values(model, free, parameters),
+        free,
+        stacks,
+        reads,
+        fit.noise if same else {},
+        parameters,
+        prior,
+        recipe.fit.huber,
+    )
+    warnings = name_invisible(parameters, free, solution.invisible)
+    if not solution.converged or warnings or _chi2(solution, free) > MISFIT:
+        progress("refining from a neutral start")
+        neutral = start_values(_neutral(model, free, parameters), free, parameters)
+        sources = sources_of(stacks, reads, noise, parameters)
+        other, second = solve(neutral, free, sources, prior, recipe.fit.huber)
+        if _total(second, other, free, prior) < _total(solution, model, free, prior) * (1 - 1e-6):
+            model, solution = other, second
+            warnings = [
+                *name_invisible(parameters, free, solution.invisible),
+                "the earlier fit led to a poorer optimum",
+            ]
+
+    linked = np.flatnonzero(np.diag(fit.covariance) > 0)
+    covariance = propagate(fit.covariance, solution, free, linked, prior)
+    refined = replace(
+        fit,
+        model=model,
+        covariance=covariance,
+        estimated=free,
+        noise=noise if same else fit.noise | noise,
+        specimen=session.specimen,
+    )
+    report = StageReport(
+        STAGE,
+        "fitted" if solution.converged else "not converged",
+        solution.message or _gain(fit, refined, same),
+        trials=tuple(t for s in stacks.values() for t in s.trials),
+        rows=solution.rows,
+        chi2_per_row=_chi2(solution, free),
+        outliers=solution.outliers,
+        warnings=tuple(warnings),
+    )
+    return replace(refined, stages=(*fit.stages, report))
+
+
+def _channels(experiment: str) -> tuple[str, ...]:
+    """What a held joint's tendons show of their excursion is stretch, not moment arm."""
+    e = EXPERIMENTS[experiment]
+    return tuple(c for c in e.channels if not (e.held and c == "tendon_excursion"))
+
+
+def _chi2(solution: Solution, free) -> float:
+    return 2 * solution.cost / max(1, solution.rows - free.size)
+
+
+def _total(solution: Solution, model: Model, free, prior: Prior) -> float:
+    offset = prior.root @ (np.asarray(ravel(model))[free] - prior.mean)
+    return solution.cost + 0.5 * float(offset @ offset)
+
+
+def _cad_prior(session: Session, cad: np.ndarray, free, parameters, model: Model) -> Prior:
+    """Masses and centres of mass as the file gives them."""
+    given = np.asarray(ravel(model)).copy()
+    for group in ("mass", "com"):
+        given[[i for i, p in enumerate(parameters) if p.group == group]] = np.ravel(getattr(session.finger, group))
+    rows = np.flatnonzero(cad[free] > 0)
+    root = np.zeros((rows.size, free.size))
+    root[np.arange(rows.size), rows] = cad[free[rows]] ** -0.5
+    return Prior(given[free], root)
+
+
+def _prior(fit: Fit, free) -> Prior:
+    """The whole covariance of an earlier fit, where it is finite."""
+    variance = np.diag(fit.covariance)[free]
+    known = np.flatnonzero(np.isfinite(variance) & (variance > 0))
+    std = np.sqrt(variance[known])
+    correlation = fit.covariance[np.ix_(free[known], free[known])] / np.outer(std, std)
+    values, vectors = np.linalg.eigh(correlation)
+    root = np.zeros((known.size, free.size))
+    root[:, known] = (vectors / np.sqrt(np.maximum(values, 1e-12))).T / std
+    return Prior(np.asarray(ravel(fit.model))[free], root)
+
+
+def _neutral(model: Model, free, parameters) -> Model:
+    """Every coefficient zero, the links as they are: most of (1) is linear, and a few steps lead to the data."""
+    flat = np.array(ravel(model))
+    linear = [i for i in free if parameters[i].group not in ("mass", "com")]
+    flat[linear] = 0.0
+    return Free.at(model, free).set(model, jnp.asarray(flat[free]))
+
+
+def _gain(before: Fit, after: Fit, same: bool) -> str:
+    """How much narrower the intervals are than those of the earlier fit."""
+    common = before.estimated[(before.std[before.estimated] > 0) & np.isfinite(before.std[before.estimated])]
+    if not common.size:
+        return ""
+    ratio = after.std[common] / before.std[common]
+    prior = "CAD is the prior, the trials are read once" if same else "the earlier fit of other data is the prior"
+    return f"standard deviations are {np.median(ratio):.2f} of the earlier ones in the median ({prior})"
