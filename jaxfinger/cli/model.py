@@ -59,7 +59,7 @@ def identify(
             fit = _refine(fit, session, say)
         save_fit(fit, output, overwrite)
         if figures is not None:
-            _draw(fit, session, figures, say)
+            _draw(fit, session, figures, overwrite, say)
     _report(fit, json)
 
 
@@ -206,6 +206,7 @@ def validate(
     experiments: Experiments = None,
     figures: Path | None = None,
     json: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Say how well a fit predicts a session: error of every channel beside the noise floor.
 
@@ -221,6 +222,8 @@ def validate(
         Folder for the traces.
     json
         Print the scores as JSON.
+    overwrite
+        Replace figures that are already there.
     """
     from jaxfinger.cli.tables import print_validation
     from jaxfinger.data import read_session
@@ -232,10 +235,10 @@ def validate(
         loaded, session = load_fit(fit), read_session(file)
         result = run(loaded, session, tuple(experiments) if experiments else None, say)
         if figures is not None:
-            from jaxfinger.report.identification import draw_validation
+            from jaxfinger.report.validation import draw_validation
 
             say("drawing")
-            draw_validation(loaded, session, figures)
+            draw_validation(loaded, session, figures, overwrite)
     if json:
         print_json(result.as_dict())
     else:
@@ -291,11 +294,11 @@ def _refine(fit, session, say):
     return refine(fit, session)
 
 
-def _draw(fit, session, folder: Path, say) -> None:
+def _draw(fit, session, folder: Path, overwrite: bool, say) -> None:
     from jaxfinger.report.identification import draw_identification
 
     say("drawing")
-    draw_identification(fit, session, folder)
+    draw_identification(fit, session, folder, overwrite)
 
 
 def _report(fit, json: bool) -> None:
