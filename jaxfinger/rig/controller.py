@@ -363,5 +363,6 @@ class Controller:
             self.faults[contract.FAULTS[kind]] = (int(order["fault_slot"]), int(order["fault_seq"]))
             return
         m = self.plant.m
+        self.faults.clear()  # who prepares the finger has mended the rig
         self.plant.prepare([Mode(v) for v in order["mode"][:m]], order["pose"][:m].tolist(), bool(order["contact"]))
         self.motor = None

@@ -116,12 +116,7 @@ class RingRig(Rig):
         while True:
             self._beat += 1
             self._write("nHostBeat", np.uint64(self._beat).tobytes())
-            status = self._status()
-            head = int(status["head"])
-            if int(status["boot"]) != self.boot or head < self.next_seq:
-                raise ControllerRestarted(
-                    "the controller's program was restarted, so this recording cannot go on; start the session again with --resume."
-                )
+            head = self._head()
             if head > self.next_seq:
                 return self._pull(head)
             if time.monotonic() > deadline:
@@ -129,6 +124,15 @@ class RingRig(Rig):
                     f"the controller answers but wrote no sample for {timeout:g} s; see whether its task runs."
                 )
             self._wait(self.description.poll_s)
+
+    def _head(self) -> int:
+        """Samples that the controller has written, if it is still the same run of its program."""
+        status = self._status()
+        if int(status["boot"]) != self.boot or int(status["head"]) < self.next_seq:
+            raise ControllerRestarted(
+                "the controller's program was restarted, so this recording cannot go on; start again with --resume."
+            )
+        return int(status["head"])
 
     def _pull(self, head: int) -> Block:
         lost = 0
@@ -209,6 +213,9 @@ class RingRig(Rig):
         deadline = time.monotonic() + self.answer_s
         while int((status := self._status())["acknowledged"]) != self._id:
             if time.monotonic() > deadline:
+                if kind not in (Kind.RELEASE, Kind.STOP, Kind.DISARM):  # must not take effect when nobody expects it
+                    order["kind"] = Kind.NONE
+                    self._write("stCommand", order.tobytes())
                 raise ConnectionLost(f"the controller did not acknowledge {kind.name} within {self.answer_s:g} s.")
             self._wait(0.002)
         if reason := int(status["refused"]):
