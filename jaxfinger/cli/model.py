@@ -291,7 +291,7 @@ def _refine(fit, session, say):
     from jaxfinger.identify import refine
 
     say("refining on all trials at once")
-    return refine(fit, session)
+    return refine(session, fit, say)
 
 
 def _draw(fit, session, folder: Path, overwrite: bool, say) -> None:

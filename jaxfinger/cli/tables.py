@@ -34,7 +34,7 @@ def fit_as_dict(fit: Fit) -> dict:
     }
 
 
-def print_fit(fit: Fit) -> None:
+def print_fit(fit: Fit, parameters: bool = True) -> None:
     """Stages, warnings, and the finger as the paper describes it; ± is half of a 95 % interval."""
     from jaxfinger.report.curves import curves
 
@@ -52,7 +52,7 @@ def print_fit(fit: Fit) -> None:
     if found.tendon_friction:
         rows = [(t, with_error(c.y[-1], c.std[-1]), f"{100 * (1 - c.y[-1] / c.x[-1]):.0f} %") for t, c in _taut(found)]
         table(f"Tendon friction at {_taut(found)[0][1].x[-1]:.0f} N", ("tendon", "loss N", "transmitted"), rows)
-    if rows := _parameters(fit):
+    if parameters and (rows := _parameters(fit)):
         table("Parameters", ("parameter", "value", "units"), rows)
     for effect in fit.model.effects:
         print(f"with {type(effect).__name__} at {'-'.join(getattr(effect, 'site', ()))}")
