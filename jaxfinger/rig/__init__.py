@@ -1,4 +1,4 @@
-"""The hardware adapter: channels, safety, experiment protocols, recorder; backends for TwinCAT, replay and simulation."""
+"""The hardware adapter: channels, safety, experiment protocols, recorder; for TwinCAT, replay and simulation."""
 
 from jaxfinger.rig.backend import Block as Block
 from jaxfinger.rig.backend import Rig as Rig

@@ -109,8 +109,9 @@ Command = TensionRamp | JointMove | Hold
 
 @dataclass(frozen=True)
 class Setup:
-    """What the operator prepares: joints fixed at an angle (rad), the joint on the external motor, joints moved by hand,
-    the fingertip on its force sensor. Joints that are not named are free."""
+    """What the operator prepares: joints fixed at an angle (rad), one on the external motor, joints moved by hand, the
+    fingertip on its force sensor. Joints that are not named are free.
+    """
 
     text: str
     fixed: dict[str, float] = field(default_factory=dict)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -105,8 +105,8 @@ class RigDescription:
         gain = np.array([c.scale * c.factor for c in self.channels])
         bias = np.array([c.offset * c.factor for c in self.channels])
         x = raw[:, self.slots] * gain + bias
-        force = [self.index("fingertip_force", axis) for axis in "xyz"]
-        if all(i is not None for i in force):
+        force = self.columns("fingertip_force", "xyz")
+        if len(force) == 3:
             x[:, force] = x[:, force] @ self.sensor_rotation.T
         return x
 
@@ -117,9 +117,9 @@ class RigDescription:
                 return i
         return None
 
-    def columns(self, kind: str, of: tuple[str, ...]) -> list[int | None]:
-        """Columns of a kind for several tendons or joints."""
-        return [self.index(kind, name) for name in of]
+    def columns(self, kind: str, of: Iterable[str]) -> list[int]:
+        """Columns of a kind for several tendons or joints, without those that the rig does not measure."""
+        return [column for name in of if (column := self.index(kind, name)) is not None]
 
 
 def read_rig(path: str | Path) -> RigDescription:

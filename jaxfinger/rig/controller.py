@@ -352,7 +352,7 @@ class Controller:
         )  # fmt: skip
 
     def _bench(self) -> None:
-        """The simulated operator: how each joint is held and where, the fingertip on its sensor, and faults to inject."""
+        """The simulated operator: how each joint is held and where, the fingertip's contact, faults to inject."""
         offset, size = self.place["stBench"]
         (number,) = struct.unpack_from("<I", self.memory, offset)
         if number == self.bench:

@@ -1,4 +1,4 @@
-"""From the log to a session: trials in the dataset format, and beside them what the recorder saw (gaps, trips, filters)."""
+"""From the log to a session: trials in the dataset format, and beside them gaps, trips, filters and events."""
 
 from __future__ import annotations
 
@@ -102,17 +102,16 @@ def read_frames(frames: Iterable[wal.Frame], name: str = "log") -> Log:
 def _finger(values: dict[str, Any]) -> FingerDescription:
     arrays = {"active": bool, "crosses": bool}
     names = ("joint_names", "tendon_names", "prismatic")
-    return FingerDescription(
-        **{
-            key: tuple(value) if key in names else None if value is None else np.array(value, arrays.get(key, float))
-            for key, value in values.items()
-        }
-    )
+    fields: dict[str, Any] = {
+        key: tuple(value) if key in names else None if value is None else np.array(value, arrays.get(key, float))
+        for key, value in values.items()
+    }
+    return FingerDescription(**fields)
 
 
 @dataclass(frozen=True)
 class Samples:
-    """The samples of one trial, each once: `kept` of them make the trial, the rest came after a trip or were not numbers."""
+    """The samples of one trial, each once: `kept` make the trial, the rest came after a trip or were not numbers."""
 
     seq: np.ndarray
     time: np.ndarray
@@ -224,7 +223,7 @@ def publish(log: Log, output: str | Path, overwrite: bool = False) -> Session:
         write_session(session, part, overwrite=True)
         with h5py.File(part, "r+", libver=LIBVER) as file:
             for name, (recording, samples) in extras.items():
-                _annotate(file["trials"][name].attrs, recording, samples)
+                _annotate(file.require_group(f"trials/{name}").attrs, recording, samples)
             _beside(file.create_group("rig"), log, extras)
     return session
 

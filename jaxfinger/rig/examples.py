@@ -57,7 +57,8 @@ def plan_toml(repeats: int = 1) -> str:
     trials.append('experiment = "VD.1"\nseconds = 12.0')
     for joint in ("MCP", "PIP", "DIP"):
         trials.append(
-            f'experiment = "ID.3-static"\njoint = "{joint}"\nrange_deg = [0.0, 70.0]\nspeed_deg_s = 60.0\nrepeats = {repeats}'
+            f'experiment = "ID.3-static"\njoint = "{joint}"\nrange_deg = [0.0, 70.0]\n'
+            f"speed_deg_s = 60.0\nrepeats = {repeats}"
         )
     for joint in ("MCP", "PIP", "DIP"):
         trials.append(f'experiment = "ID.3-dynamic"\njoint = "{joint}"\nrange_deg = [10.0, 65.0]')
@@ -69,8 +70,12 @@ def plan_toml(repeats: int = 1) -> str:
     ):
         for posture in ("[25.0, 60.0, 20.0]", "[50.0, 30.0, 20.0]"):
             trials.append(
-                f'experiment = "ID.4"\ntendon = "{tendon}"\njoint = "{joint}"\nlevels = {levels}\nposture_deg = {posture}\nrepeats = {repeats}'
+                f'experiment = "ID.4"\ntendon = "{tendon}"\njoint = "{joint}"\nlevels = {levels}\n'
+                f"posture_deg = {posture}\nrepeats = {repeats}"
             )
     trials.append('experiment = "VD.2"\ntendon = "T2"\nposture_deg = [10.0, 40.0, 35.0]')
-    trials.append('experiment = "VD.3"\nmean = [4.0, 2.5, 3.0, 3.0]\namplitude = 2.0\ninterval = 0.4\ntension_rate = 20.0\nseconds = 8.0\nseed = 1')
+    trials.append(
+        'experiment = "VD.3"\nmean = [4.0, 2.5, 3.0, 3.0]\namplitude = 2.0\n'
+        "interval = 0.4\ntension_rate = 20.0\nseconds = 8.0\nseed = 1"
+    )
     return '[plan]\nname = "paper, shortened"\noperator = "operator"\n' + "".join(f"\n[[trial]]\n{t}\n" for t in trials)

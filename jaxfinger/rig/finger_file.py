@@ -9,7 +9,7 @@ from jaxfinger.rig.toml_file import Table
 
 
 def read_finger(file: Table) -> FingerDescription:
-    """`[finger]` with `from = "session.h5"`, or with `[[finger.joint]]` and `[[finger.tendon]]`. SI units, limits in deg."""
+    """`[finger]` with `from = "session.h5"`, or `[[finger.joint]]` and `[[finger.tendon]]`; SI units, limits in deg."""
     table = file.table("finger")
     assert table is not None
     if (source := table.get("from", None)) is not None:

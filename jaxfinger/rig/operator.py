@@ -44,7 +44,7 @@ class AtTerminal:
         self._stop = threading.Event()
         self._enter = threading.Event()
         self._closing = threading.Event()
-        self._settings = None
+        self._settings: list = []
         self._thread: threading.Thread | None = None
 
     def __enter__(self) -> AtTerminal:

@@ -1,4 +1,4 @@
-"""Plan files: which experiments, in which order, how often. Checked whole, command by command, before anything moves."""
+"""Plan files: which experiments, in which order, how often. Checked command by command before anything moves."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def _sensible(table: Table, experiment: str, values: dict[str, Any], rig: RigDes
 
 
 def commands(trial: PlannedTrial, rig: RigDescription) -> Iterator[Any]:
-    """Every step of a trial, each command checked against the limits: the protocols do not depend on what is measured."""
+    """Every step of a trial, each command checked against the limits: protocols do not depend on measurements."""
     for step in trial.protocol(rig):
         if isinstance(step, TensionRamp | JointMove):
             admit(step, rig)

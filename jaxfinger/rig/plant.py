@@ -32,8 +32,8 @@ class Mode(IntEnum):
 class PlantTruth:
     """The true parameters, for comparison with what `identify` finds from a recording. SI units.
 
-    `excursion[i, j, k]` multiplies q_j^(k+1) in tendon i's excursion; `elastic` and `friction` are polynomials in q from
-    degree 0; `a0`, `a1` give the tension lost on the way; `loss = min(max(a0 + a1 f_t, 0), f_t)`.
+    `excursion[i, j, k]` multiplies q_j^(k+1) in tendon i's excursion; `elastic` and `friction` are polynomials in q
+    from degree 0; `a0`, `a1` give the tension lost on the way; `loss = min(max(a0 + a1 f_t, 0), f_t)`.
     """
 
     finger: FingerDescription
@@ -267,7 +267,7 @@ class Plant:
         rows = []
         for name, (direction, bound) in constraints.items():
             response = inverse @ direction
-            start = min(max(self._impulses.get(name, 0.0), -bound), bound)  # the last step's: so that sticking converges
+            start = min(max(self._impulses.get(name, 0.0), -bound), bound)  # warm: sticking converges
             velocity = velocity + response * start
             impulses[name] = start
             rows.append((name, direction, bound, response, float(direction @ response)))

@@ -1,7 +1,7 @@
 """The paper's experiments, each a generator of commands, waits and marks; the same code drives simulator and rig.
 
-A protocol starts unrecorded (posture, pretension, taring), yields `Start`, and is recorded until it ends. Angles in plan
-files are degrees, tensions N, torques N m, times s.
+A protocol starts unrecorded (posture, pretension, taring), yields `Start`, and is recorded until it ends. Angles in
+plan files are degrees, tensions N, torques N m, times s.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class MomentArms(Common):
 
 @dataclass(frozen=True)
 class StaticTorque(Common):
-    """ID.3-static: every `step_deg` of `range_deg`, up and back, `dwell` s each, of which the first `settle` s are left out."""
+    """ID.3-static: every `step_deg` of `range_deg`, up and back; holds last `dwell` s, after `settle` s."""
 
     joint: str = ""
     range_deg: tuple[float, float] = (0.0, 70.0)
@@ -188,7 +188,7 @@ def _tared(finger: FingerDescription, posture: dict[str, float], kinds: tuple[st
 
 
 def moment_arms(finger: FingerDescription, p: MomentArms) -> Protocol:
-    """ID.2: all tendons are pre-tensioned; the operator moves one joint slowly through its range, the others are fixed."""
+    """ID.2: all tendons pre-tensioned; the operator moves one joint through its range, the others are fixed."""
     posture = p.posture(finger)
     yield Setup(f"Fix all joints: {_angles(posture)}.", fixed=posture)
     pretension = _all(finger, p.pretension)

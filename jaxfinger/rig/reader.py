@@ -1,4 +1,4 @@
-"""Reads the rig without pause: every block goes to the recorder, past the supervisor, and on to whoever waits for it."""
+"""Reads the rig without pause: every block goes to the recorder, past the supervisor, and on to who waits for it."""
 
 from __future__ import annotations
 

@@ -24,11 +24,10 @@ class Recorder:
 
     def __init__(self, path: Path, header: dict[str, Any], resume: bool = False, opener: Callable | None = None):
         self.path = path
-        if not resume:
-            if (free := shutil.disk_usage(path.parent).free) < LEAST_FREE:
-                raise UserError(
-                    f"{path.parent}: only {free / 2**20:.0f} MiB are free; a session needs {LEAST_FREE >> 20} MiB."
-                )
+        if not resume and (free := shutil.disk_usage(path.parent).free) < LEAST_FREE:
+            raise UserError(
+                f"{path.parent}: only {free / 2**20:.0f} MiB are free; a session needs {LEAST_FREE >> 20} MiB."
+            )
         self._log = opener(path) if opener else wal.LogWriter.append(path) if resume else wal.LogWriter.create(path)
         self._queue: queue.SimpleQueue[tuple[bytes, Any] | None] = queue.SimpleQueue()
         self._waiting = 0

@@ -11,7 +11,7 @@ from jaxfinger.rig.convert import Log, publish, read_frames
 
 @dataclass(frozen=True)
 class Recovered:
-    """What came out: trials written, those of them that were cut short, and bytes at the log's end that were not sound."""
+    """What came out: trials written, those that were cut short, and bytes at the log's end that were not sound."""
 
     trials: tuple[str, ...]
     incomplete: tuple[str, ...]

@@ -83,7 +83,8 @@ class RingRig(Rig):
         ):
             if found != wanted:
                 raise UserError(
-                    f"the controller's {what} is {found}, the adapter's is {wanted}; load the program of docs/plc-contract.md."
+                    f"the controller's {what} is {found}, the adapter's is {wanted}; "
+                    "load the program of docs/plc-contract.md."
                 )
         cycle = 1e9 / self.description.rate_hz
         if abs(int(info["cycle_ns"]) - cycle) > 1e-3 * cycle:

@@ -1,4 +1,4 @@
-"""Runs a plan on a rig: steps of the protocols become commands and waits, trials go to the log, the log to a session."""
+"""Runs a plan on a rig: protocols become commands and waits, trials go to the log, the log becomes a session."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class View:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A run: trials that are complete, and why it ended early (empty: it did not). `log` is what --resume goes on from."""
+    """A run: trials that are complete, why it ended early (empty: it did not), and the log to resume from."""
 
     session: Path
     complete: tuple[str, ...]
@@ -200,7 +200,8 @@ class Runner:
             top = tops.get(rig.channels[i].kind)
             if not np.isfinite(mean) or (top is not None and (abs(mean) > 0.2 * top or spread > 0.02 * top)):
                 raise UserError(
-                    f"'{rig.channels[i].name}' cannot be tared: it reads {mean:.3g} ± {spread:.2g}; unload it and see its cable."
+                    f"'{rig.channels[i].name}' cannot be tared: it reads {mean:.3g} ± {spread:.2g}; "
+                    "unload it and see its cable."
                 )
             self.tare[rig.channels[i].name] = float(mean)
 
@@ -254,7 +255,7 @@ class _Steady:
     """Every tension within its band for long enough."""
 
     def __init__(self, rig: RigDescription, step: Settled):
-        self._columns = [rig.index("tension", name) for name in step.tensions]
+        self._columns = rig.columns("tension", step.tensions)
         self._targets = np.array(list(step.tensions.values()))
         self._within, self._need = step.within, round(step.seconds * rig.rate_hz)
         self._good = 0
@@ -270,7 +271,7 @@ class _Passes:
     """Every joint through its range, to and fro, often enough."""
 
     def __init__(self, rig: RigDescription, step: Covered):
-        self._columns = [rig.index("joint_position", name) for name in step.joints]
+        self._columns = rig.columns("joint_position", step.joints)
         limits = rig.finger.limits[[rig.finger.joint_names.index(name) for name in step.joints]]
         slack = (1 - step.share) / 2 * (limits[:, 1] - limits[:, 0])
         self._low, self._high = limits[:, 0] + slack, limits[:, 1] - slack
@@ -289,7 +290,7 @@ class _AtPose:
     """Fixed joints where their fixtures hold them."""
 
     def __init__(self, rig: RigDescription, setup: Setup):
-        self._columns = [rig.index("joint_position", name) for name in setup.fixed]
+        self._columns = rig.columns("joint_position", setup.fixed)
         self._pose = np.array(list(setup.fixed.values()))
 
     def __call__(self, block: Block) -> bool:
@@ -305,9 +306,10 @@ def run(
     operator: Operator | None = None,
     observe: Callable[[View], None] | None = None,
 ) -> Outcome:
-    """Record a session: every trial of the plan that the log does not hold yet. Publishes what there is, also when cut short.
+    """Record a session: every trial of the plan that the log does not hold yet.
 
-    Raises UserError before anything moves where plan, rig and files do not fit together.
+    Publishes what there is, also when cut short. Raises UserError before anything moves where plan, rig and files do
+    not fit together.
     """
     output, operator = Path(output), operator or Nobody()
     path = log_path(output)
@@ -392,9 +394,11 @@ def _reference(rig: RigDescription) -> Protocol:
 
 
 def _trials(plan, rig: Rig, recorder: Recorder, operator: Operator, observe, log: convert.Log | None) -> str:
-    done = {r.start["planned"] for r in log.recordings if r.complete} if log else set()
-    names = {r.name for r in log.recordings} if log else set()
-    begun = max((r.start["session_start"] + sum(map(len, r.blocks)) / rig.description.rate_hz for r in log.recordings), default=0.0) if log else 0.0  # fmt: skip
+    earlier = log.recordings if log else []
+    done = {r.start["planned"] for r in earlier if r.complete}
+    names = {r.name for r in earlier}
+    ends = [r.start["session_start"] + sum(map(len, r.blocks)) / rig.description.rate_hz for r in earlier]
+    begun = max(ends, default=0.0)
     left = [t for t in plan.trials if t.name not in done]
     reader = Reader(rig, recorder, Supervisor(rig.description))
     runner = Runner(rig, reader, operator, observe)

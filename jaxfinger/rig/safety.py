@@ -52,11 +52,13 @@ def admit(command: Command, rig: RigDescription) -> None:
         low, high = low + limits.joint_margin, high - limits.joint_margin
         if not low <= command.target <= high:
             raise CommandRefused(
-                f"{np.degrees(command.target):.1f}° for {command.joint} is outside {np.degrees(low):.1f}° to {np.degrees(high):.1f}°."
+                f"{np.degrees(command.target):.1f}° for {command.joint} is outside "
+                f"{np.degrees(low):.1f}° to {np.degrees(high):.1f}°."
             )
         if not 0 < command.speed <= limits.joint_velocity or not 0 < command.acceleration < np.inf:
             raise CommandRefused(
-                f"{np.degrees(command.speed):.1f}°/s for {command.joint} is outside 0 to {np.degrees(limits.joint_velocity):.1f}°/s."
+                f"{np.degrees(command.speed):.1f}°/s for {command.joint} is outside "
+                f"0 to {np.degrees(limits.joint_velocity):.1f}°/s."
             )
 
 
@@ -69,7 +71,7 @@ class Supervisor:
         kind = np.array([c.kind for c in rig.channels])
         self._tension = np.flatnonzero(kind == "tension")
         self._excursion = np.flatnonzero(kind == "excursion")
-        self._angle = np.array([i for i in rig.columns("joint_position", finger.joint_names) if i is not None])
+        self._angle = np.array(rig.columns("joint_position", finger.joint_names))
         self._high = np.full(n, np.inf)
         self._low = np.full(n, -np.inf)
         self._high[self._tension] = rig.limits.tension_max
@@ -118,8 +120,8 @@ class Supervisor:
         self._last = block.x[-1]
         return found
 
-    def _name(self, channel: int) -> str:
-        return self.rig.channels[channel].name
+    def _name(self, channel: int | np.intp) -> str:
+        return self.rig.channels[int(channel)].name
 
     def _clock(self, block: Block) -> list[Violation]:
         t = block.t_ns.astype(np.int64)

@@ -91,7 +91,8 @@ def running(speed: float = 1.0, heartbeat: float = 0.25, seed: int = 0, filtered
     arguments = ["--speed", str(speed), "--heartbeat", str(heartbeat), "--seed", str(seed)]
     command = [sys.executable, "-m", "jaxfinger.rig.standin", *arguments, *(["--filtered"] if filtered else [])]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None and process.stdin is not None
+    assert process.stdout is not None
+    assert process.stdin is not None
     try:
         word = process.stdout.readline().split()
         if word[:1] != ["listening"]:
@@ -112,7 +113,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--port", type=int, default=0, help="TCP port on 127.0.0.1 (0: any free one)")
     parser.add_argument("--speed", type=float, default=1.0, help="times real time; 0: as fast as the host reads")
-    parser.add_argument("--heartbeat", type=float, default=0.25, help="seconds of wall time without the host's beat before it stops")
+    parser.add_argument(
+        "--heartbeat", type=float, default=0.25, help="seconds of wall time without the host's beat before it stops"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the sensors' noise")
     parser.add_argument("--filtered", action="store_true", help="terminals at their factory filter of 22 Hz")
     options = parser.parse_args()

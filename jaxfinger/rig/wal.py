@@ -88,7 +88,7 @@ class LogWriter:
     def create(cls, path: Path) -> LogWriter:
         """A new log; refuses to replace one."""
         try:
-            file = open(path, "xb", buffering=0)
+            file = open(path, "xb", buffering=0)  # noqa: SIM115 - the writer owns it
         except FileExistsError as error:
             raise UserError(
                 f"{path}: a recording was interrupted here; go on with --resume, or rescue it with jaxfinger recover."
@@ -105,7 +105,7 @@ class LogWriter:
     def append(cls, path: Path) -> LogWriter:
         """Go on with a log, after cutting off a torn last frame."""
         end = sound_length(path)
-        file = open(path, "r+b", buffering=0)
+        file = open(path, "r+b", buffering=0)  # noqa: SIM115 - the writer owns it
         file.truncate(end)
         file.seek(end)
         return cls(file, end)
@@ -152,7 +152,7 @@ def frames(file: BinaryIO, name: str = "log") -> Iterator[Frame]:
 def read_log(path: str | Path) -> Iterator[Frame]:
     """The sound frames of a log file."""
     try:
-        file = open(path, "rb")
+        file = open(path, "rb")  # noqa: SIM115 - closed below
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); give the path of a .wal file.") from error
     with file:

@@ -15,7 +15,15 @@ from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
 from jaxfinger.rig import standin
 from jaxfinger.rig.ams import AmsServer
-from jaxfinger.rig.backend import CommandRefused, ConnectionLost, ControllerRestarted, Hold, Setup, StaleRig, TensionRamp
+from jaxfinger.rig.backend import (
+    CommandRefused,
+    ConnectionLost,
+    ControllerRestarted,
+    Hold,
+    Setup,
+    StaleRig,
+    TensionRamp,
+)
 from jaxfinger.rig.contract import State, Trip
 
 
@@ -55,11 +63,11 @@ def lockstep(fast_process):
     return mend(fast_process)
 
 
-def collect(rig, samples):
+def collect(rig, samples, patience=20.0):
     """Sequence numbers and times of at least so many samples, and how many were lost."""
     seq, t, lost = [], [], 0
     while sum(map(len, seq)) < samples:
-        block = rig.read_block(20.0)
+        block = rig.read_block(patience)
         seq.append(block.seq.astype(np.int64))
         t.append(block.t_ns.astype(np.int64))
         lost += block.lost_before
@@ -102,8 +110,7 @@ def test_a_task_that_stands_still_is_noticed(real_time):
         collect(rig, 50)
         rig.inject("stall")
         with pytest.raises(StaleRig):
-            while True:
-                rig.read_block(1.0)
+            collect(rig, 10**6, patience=1.0)
         rig.answer_s = 0.3
         with pytest.raises(ConnectionLost, match="acknowledge"):
             rig.arm()

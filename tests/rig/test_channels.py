@@ -33,7 +33,7 @@ def line_of(text: str, fragment: str, after: str = "") -> int:
         ("tension_rate = 20.0", "tension_rate = 900.0", "every ramp would trip"),
         ('backend = "simulated"', 'backend = "simulatd"', "choose one of"),
         ("rate_hz = 1000.0", "rate_hz = true", "must be a number"),
-        ('axis = [0.0, 1.0, 0.0]', 'axis = [0.0, 2.0, 0.0]', "length 1"),
+        ("axis = [0.0, 1.0, 0.0]", "axis = [0.0, 2.0, 0.0]", "length 1"),
         ('crosses = ["MCP", "PIP"]', 'crosses = ["MCP", "XIP"]', "'XIP' is no joint"),
     ],
 )

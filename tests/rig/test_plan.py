@@ -44,7 +44,9 @@ def test_repeats_share_their_motion(rig):
     plan = parse_plan(HEAD + 'experiment = "ID.2"\njoint = "MCP"\nrepeats = 3', rig)
     assert [t.name for t in plan.trials] == ["01-ID.2-MCP", "02-ID.2-MCP", "03-ID.2-MCP"]
     assert len({t.motion for t in plan.trials}) == 1
-    assert len({t.motion for t in parse_plan(plan_toml(2), rig).trials}) == len({t.line for t in parse_plan(plan_toml(2), rig).trials})
+    assert len({t.motion for t in parse_plan(plan_toml(2), rig).trials}) == len(
+        {t.line for t in parse_plan(plan_toml(2), rig).trials}
+    )
 
 
 def test_the_shipped_plan_holds_every_experiment(rig):

@@ -50,7 +50,13 @@ def test_moment_arms_are_the_slope_of_excursion(q):
 
 def test_moment_arms_have_the_papers_range():
     plant = Plant()
-    for tendon, joint, low, high in ((0, 0, -0.9, 3.7), (0, 1, 4.3, 8.8), (1, 2, -6.6, -5.8), (2, 0, 5.8, 10.3), (3, 0, 5.5, 10.5)):
+    for tendon, joint, low, high in (
+        (0, 0, -0.9, 3.7),
+        (0, 1, 4.3, 8.8),
+        (1, 2, -6.6, -5.8),
+        (2, 0, 5.8, 10.3),
+        (3, 0, 5.5, 10.5),
+    ):
         values = []
         for angle in np.linspace(0.0, 1.57, 30):
             plant.q = [0.0, 0.0, 0.0]

@@ -11,8 +11,8 @@ from jaxfinger.errors import UserError
 from jaxfinger.rig import contract, parse_rig
 from jaxfinger.rig.backend import CommandRefused, ControllerRestarted, StaleRig
 from jaxfinger.rig.backends.simulated import SimulatedRig
-from jaxfinger.rig.controller import Controller, HardLimits
 from jaxfinger.rig.contract import State, Trip
+from jaxfinger.rig.controller import Controller, HardLimits
 from jaxfinger.rig.examples import rig_toml
 from jaxfinger.rig.ring import LARGEST, MARGIN
 
@@ -87,7 +87,10 @@ def test_a_controller_that_stands_still_is_stale(rig):
             machine.read_block(0.01)
 
 
-@pytest.mark.parametrize(("field", "value", "says"), [("version", 2, "contract version"), ("sample_size", 504, "size of ST_Sample"), ("cycle_ns", 2_000_000, "rate_hz")])
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [("version", 2, "contract version"), ("sample_size", 504, "size of ST_Sample"), ("cycle_ns", 2_000_000, "rate_hz")],
+)
 def test_another_program_is_refused(rig, field, value, says):
     machine = small(rig)
     info = np.frombuffer(machine._read("stInfo", 0, contract.INFO.itemsize), contract.INFO).copy()
@@ -112,9 +115,14 @@ def test_leaving_releases_the_finger(rig):
 
 def test_an_error_inside_releases_too_and_is_not_hidden(rig):
     machine = small(rig)
-    with pytest.raises(ZeroDivisionError), machine:
-        machine.arm()
-        raise ZeroDivisionError
+
+    def fail():
+        with machine:
+            machine.arm()
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
     assert machine.controller.state is State.RELEASING
 
 

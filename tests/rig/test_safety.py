@@ -1,6 +1,7 @@
-"""The supervisor finds each fault, never a healthy finger, and finds the same however the samples are cut into blocks."""
+"""The supervisor finds each fault, never a healthy finger, and finds the same however samples are cut into blocks."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -143,7 +144,9 @@ def part(block: Block, start: int, stop: int) -> Block:
 
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(st.integers(1, 399), max_size=8, unique=True), st.integers(0, 380), st.integers(1, 10), st.integers(0, 14))
+@given(
+    st.lists(st.integers(1, 399), max_size=8, unique=True), st.integers(0, 380), st.integers(1, 10), st.integers(0, 14)
+)
 def test_online_is_offline(rig, quiet_block, cuts, start, length, channel):
     """The first violation does not depend on how the samples were cut into blocks."""
 
@@ -153,7 +156,7 @@ def test_online_is_offline(rig, quiet_block, cuts, start, length, channel):
     block = spoil(quiet_block(), bad)
     whole = [v for v in Supervisor(rig).check(block) if v.trip is Trip.INVALID]
     supervisor, edges = Supervisor(rig), [0, *sorted(cuts), 400]
-    online = [v for a, b in zip(edges, edges[1:], strict=False) for v in supervisor.check(part(block, a, b))]
+    online = [v for a, b in pairwise(edges) for v in supervisor.check(part(block, a, b))]
     online = [v for v in online if v.trip is Trip.INVALID]
     assert [v.seq for v in online[:1]] == [v.seq for v in whole[:1]]
     assert bool(whole) == (length >= 3)

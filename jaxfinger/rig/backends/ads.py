@@ -58,8 +58,8 @@ class AdsRig(RingRig):
         except self._pyads.ADSError as error:
             self.close()
             raise ConnectionLost(
-                f"no answer from {where['net_id']} port {where['port']} at {where['ip']} ({error}); check cable, NetId, and "
-                f"that the controller has a route back to this computer."
+                f"no answer from {where['net_id']} port {where['port']} at {where['ip']} ({error}); check cable, "
+                f"NetId, and that the controller has a route back to this computer."
             ) from error
 
     def _attach(self) -> None:

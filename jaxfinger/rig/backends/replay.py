@@ -1,4 +1,4 @@
-"""A recorded trial, played back as if it came from a rig: to look at it live, or to supervise it again with other limits."""
+"""A recorded trial, played back as if it came from a rig: to look at it live, or to supervise it again."""
 
 from __future__ import annotations
 

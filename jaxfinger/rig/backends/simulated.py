@@ -1,4 +1,4 @@
-"""The simulated specimen in this process: the controller's program around the simulated finger, as fast as it is read."""
+"""The simulated specimen in this process: the controller's program around a finger, as fast as it is read."""
 
 from __future__ import annotations
 

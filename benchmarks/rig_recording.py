@@ -1,0 +1,232 @@
+"""Recording at full rate, and killing the recorder: the figures behind the promises of `jaxfinger record`.
+
+    python benchmarks/rig_recording.py stream --minutes 10    1 kHz x 60 channels over ADS beside a busy interpreter
+    python benchmarks/rig_recording.py kill --count 200       kill -9 at random moments; every session must be readable
+    python benchmarks/rig_recording.py plant                  cost of one cycle of the stand-in
+
+Prints one JSON object. Timings are of this machine; load on it is printed beside them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+from jaxfinger.data import check_file, read_session
+from jaxfinger.rig import parse_rig, recover, standin, wal
+from jaxfinger.rig.backends.ads import AdsRig
+from jaxfinger.rig.channels import RigDescription
+from jaxfinger.rig.contract import VALUES
+from jaxfinger.rig.controller import Controller
+from jaxfinger.rig.convert import header
+from jaxfinger.rig.examples import rig_toml
+from jaxfinger.rig.plant import Mode
+from jaxfinger.rig.reader import Reader
+from jaxfinger.rig.recorder import Recorder
+from jaxfinger.rig.runner import log_path
+from jaxfinger.rig.safety import Supervisor
+
+
+def all_slots(where: str, **rig) -> RigDescription:
+    """A rig file with 60 channels: the finger's 15, and the slots that the stand-in leaves at zero."""
+    description = parse_rig(rig_toml("ads", {"net_id": standin.NET_ID, "ip": where, "port": 851}, **rig))
+    used = {c.slot for c in description.channels}
+    spare = [s for s in range(VALUES) if s not in used]
+    first = description.channels[0]
+    extra = tuple(replace_channel(first, name=f"spare {s}", slot=s) for s in spare)
+    return replace_channel(description, channels=description.channels + extra)
+
+
+def replace_channel(record, **changes):
+    """dataclasses.replace; spare channels sit still at zero, so they are not watched for being frozen."""
+    from dataclasses import replace
+
+    return replace(record, **({"frozen": 0.0} if "slot" in changes else {}), **changes)
+
+
+def stream(minutes: float, busy: bool) -> dict:
+    """Record for so long; count what was lost; latency is from the sample's own time to its arrival in Python."""
+    samples = round(minutes * 60_000)
+    with standin.running(speed=1.0, heartbeat=5.0) as where, tempfile.TemporaryDirectory() as folder:
+        description = all_slots(where, stale_s=5.0)
+        stop = threading.Event()
+
+        def spin() -> None:
+            while not stop.is_set():
+                sum(range(2000))
+
+        with AdsRig(description) as rig:
+            recorder = Recorder(
+                Path(folder) / "s.wal", {**header(description, "", rig.filters(), rig.fingerprint()), "created": ""}
+            )
+            reader = Reader(rig, recorder, Supervisor(description))
+            start = {"name": "t", "tare": {}, "loaded": [], "motor": None, "contact": False}
+            if busy:
+                threading.Thread(target=spin, daemon=True).start()
+            reader.begin(start)
+            wall = time.monotonic()
+            cpu_all = time.process_time()
+            reader.start()
+            arrivals = []
+            while reader.samples < samples and reader.error is None:
+                block = reader.next(1.0)
+                if block is not None:
+                    arrivals.append((time.monotonic_ns(), block.t_ns.astype(np.int64)))
+            stop.set()
+            reader.close()
+            wall, cpu_all = time.monotonic() - wall, time.process_time() - cpu_all
+            recorder.close()
+        offsets = np.array(
+            [arrived - t[-1] for arrived, t in arrivals]
+        )  # both clocks run at the same rate on one machine
+        ages = np.concatenate([arrived - t for arrived, t in arrivals]) - offsets.min()
+        blocks = [f.block for f in wal.read_log(recorder.path) if f.tag == wal.DATA]
+        seq = np.concatenate([b.seq for b in blocks]).astype(np.int64)
+        return {
+            "minutes": minutes,
+            "channels": len(description.channels),
+            "busy_interpreter": busy,
+            "samples_in_log": len(seq),
+            "lost": int(reader.lost) + int((np.diff(seq) - 1).sum()),
+            "error": None if reader.error is None else str(reader.error),
+            "latency_ms": {f"p{p}": round(float(np.percentile(ages, p)) / 1e6, 1) for p in (50, 99, 99.9, 100)},
+            "poll_ms": description.poll_s * 1e3,
+            "cores_used": round(cpu_all / wall, 3),
+            "cores_note": "includes the busy thread" if busy else "reader, supervisor, writer, everything",
+            "log_MB": round(recorder_size(blocks) / 1e6, 1),
+            "load_average": os.getloadavg()[0],
+        }
+
+
+def recorder_size(blocks) -> int:
+    """Bytes of the blocks in the log."""
+    return sum(len(wal.pack_block(b)) for b in blocks)
+
+
+PLAN = '[plan]\nname = "p"\noperator = "t"\n[[trial]]\nexperiment = "VD.1"\nseconds = 20000.0\n'
+NURSERY = """
+import os, signal, sys
+from pathlib import Path
+from jaxfinger.cli.record import record
+import jaxfinger.rig.live, pyads
+signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+for line in sys.stdin:
+    pid = os.fork()
+    if pid == 0:
+        plan, rig, output = map(Path, line.split())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        record(plan, rig=rig, output=output, yes=True)
+        os._exit(0)
+    print(pid, flush=True)
+"""
+
+
+def kill(count: int, seed: int) -> dict:
+    """Kill the recorder `count` times at random moments of a recording at real speed; recover and check every log.
+
+    `unsaved_ms` is how far the log was behind the controller when a new connection asked it, just after the kill.
+    """
+    rng = random.Random(seed)
+    unreadable, unsaved, torn = 0, [], 0
+    # one process imports once and bears the recorders: 200 starts of Python would measure imports
+    born = subprocess.Popen([sys.executable, "-c", NURSERY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    with (
+        standin.running(speed=1.0, heartbeat=3.0) as where,
+        tempfile.TemporaryDirectory() as root,
+        born as nursery,
+    ):
+        assert nursery.stdin is not None
+        assert nursery.stdout is not None
+        for k in range(count):
+            folder = Path(root) / str(k)
+            folder.mkdir()
+            address = {"net_id": standin.NET_ID, "ip": where, "port": 851}
+            (folder / "rig.toml").write_text(rig_toml("ads", address, stale_s=5.0))
+            (folder / "plan.toml").write_text(PLAN)
+            files = [str(folder / name) for name in ("plan.toml", "rig.toml", "session.h5")]
+            nursery.stdin.write(" ".join(files) + "\n")
+            nursery.stdin.flush()
+            recorder = int(nursery.stdout.readline())
+            path = log_path(folder / "session.h5")
+            while not (path.exists() and path.stat().st_size > 15_000):
+                if not Path(f"/proc/{recorder}").exists():
+                    raise SystemExit("a recorder ended by itself; the machine is too busy for this measurement")
+                time.sleep(0.005)
+            time.sleep(rng.uniform(0.0, 1.5))
+            os.kill(recorder, signal.SIGKILL)
+            with AdsRig(parse_rig(rig_toml("ads", address))) as rig:
+                head = rig.status().head
+            try:
+                found = recover(path, folder / "rescued.h5")
+                errors = [f for f in check_file(folder / "rescued.h5") if f.severity == "error"]
+                trial = read_session(folder / "rescued.h5")["01-VD.1"]
+                torn += found.torn_bytes > 0
+                unreadable += bool(errors) or np.any(np.abs(np.diff(trial.time) - 1e-3) > 1e-9)
+                last = max(int(f.block.seq[-1]) for f in wal.read_log(path) if f.tag == wal.DATA)
+                unsaved.append(head - 1 - last)
+            except Exception as error:
+                unreadable += 1
+                print(f"kill {k}: {error}", file=sys.stderr)
+        nursery.stdin.close()
+    return {
+        "kills": count,
+        "unreadable": int(unreadable),
+        "ended_within_a_frame": int(torn),
+        "unsaved_ms": {"median": float(np.median(unsaved)), "max": float(np.max(unsaved))},
+        "load_average": os.getloadavg()[0],
+    }
+
+
+def plant() -> dict:
+    """Microseconds of one cycle: controller, finger, sample."""
+    found = {}
+    for name, mode, contact in (
+        ("fixed", (1, 1, 1), 0),
+        ("motor", (2, 1, 1), 0),
+        ("hand", (3, 3, 3), 0),
+        ("free", (0, 0, 0), 0),
+        ("contact", (1, 1, 1), 1),
+    ):
+        controller = Controller()
+        controller.plant.prepare([Mode(m) for m in mode], [0.3, 0.3, 0.3], bool(contact))
+        times = []
+        for _ in range(20):
+            start = time.process_time()
+            for _ in range(200):
+                controller.cycle()
+            times.append((time.process_time() - start) / 200 * 1e6)
+        found[name] = round(float(np.median(times)), 1)
+    return {"microseconds_per_cycle": found}
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("stream", "kill", "plant"))
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--idle", action="store_true", help="no busy interpreter beside the recorder")
+    parser.add_argument("--count", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    if options.what == "stream":
+        result = stream(options.minutes, not options.idle)
+    elif options.what == "kill":
+        result = kill(options.count, options.seed)
+    else:
+        result = plant()
+    print(json.dumps(result, indent=2))
+
+
+if __name__ == "__main__":
+    main()
