@@ -41,21 +41,27 @@ def check(file: Path, *, json: bool = False) -> None:
         raise SystemExit(2)
 
 
-def simulate(source: Path, *, output: Output, seed: int | None = None, overwrite: bool = False) -> None:
+def simulate(
+    source: Path, *, output: Output, protocol: Path | None = None, seed: int | None = None, overwrite: bool = False
+) -> None:
     """Write a simulated session: the specimen and protocol of a recipe, or the finger that a fit describes.
 
     Parameters
     ----------
     source
-        Recipe of the simulator (TOML), or a fit (JSON): then its model is driven through the standard protocol.
+        Recipe of the simulator (TOML), or a fit (JSON): then its model takes the place of the specimen.
     output
         Session to write (HDF5).
+    protocol
+        With a fit: the recipe whose trials and sensors it goes through; by default all experiments at 1 kHz.
     seed
         Of the noise; by default the recipe's.
     overwrite
         Replace a file that is already there.
     """
     refuse_existing(output, overwrite)
+    if protocol is not None and source.suffix != ".json":
+        raise UserError(f"{source}: a recipe brings its own trials; leave out --protocol, or give a fit")
     from jaxfinger.data import write_session
     from jaxfinger.synthetic import Recipe, read_recipe
     from jaxfinger.synthetic import simulate as run
@@ -66,20 +72,17 @@ def simulate(source: Path, *, output: Output, seed: int | None = None, overwrite
             say(f"trial {done + 1} of {total}, {name}")
 
         if source.suffix == ".json":
-            session = _of_fit(source, Recipe(), seed or 0, count)
+            from jaxfinger.identify import load_fit
+            from jaxfinger.synthetic.fitted import session_of_model
+
+            fit = load_fit(source)
+            recipe = read_recipe(protocol) if protocol else Recipe()
+            session = session_of_model(fit.model, fit.specimen, recipe, seed, count)
         else:
             session = run(read_recipe(source), seed, progress=count)
         say("writing")
         write_session(session, output, overwrite)
     print(f"{output}: {len(session)} trials of {session.specimen}")
-
-
-def _of_fit(source: Path, recipe, seed: int, count):
-    """The session that the rig would record of the fitted model, effects included."""
-    from jaxfinger.cli.model_plant import session_of_fit
-    from jaxfinger.identify import load_fit
-
-    return session_of_fit(load_fit(source), recipe, seed, count)
 
 
 def import_(
