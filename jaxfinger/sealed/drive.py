@@ -174,6 +174,24 @@ def simulate(finger: Finger, nominal: Finger, plans: Sequence[Plan]) -> list[Run
     return [Run(fine, keep_q[:, b], keep_qd[:, b], keep_f[:, b]) for b in range(batch)]
 
 
+def replay(finger: Finger, q: Float[np.ndarray, " m"], tension: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
+    """Angles from rest at q under recorded tensions at 1 kHz, without a controller: how well motion can be
+    predicted at all.
+    """
+    data, active = mujoco.MjData(finger.plant.model), np.flatnonzero(finger.specimen.finger.active)
+    data.qpos = q
+    angle, rate = q[None].copy(), np.zeros((1, len(q)))
+    out = []
+    for k, f in enumerate(np.repeat(tension, CONTROL, axis=0)):
+        if k % CONTROL == 0:
+            out.append(angle[0])
+        t = np.full(1, k * STEP)
+        s = State(t, t, angle, rate, np.zeros_like(angle), f[None], np.sign(rate))
+        s.st = np.tanh(finger.speed(s) / 1e-4)
+        angle, rate = _advance(finger, s, [data], active)
+    return np.array(out)
+
+
 def _advance(finger: Finger, s: State, data: list, active: np.ndarray):
     """One MuJoCo step of every trial: smooth forces applied, dry friction left to its solver."""
     model = finger.plant.model

@@ -1,11 +1,10 @@
-"""Tendon paths: MuJoCo's spatial tendons through eyelets on both sides of every joint, and the polynomials that
-fit them.
+"""Tendon paths of MuJoCo's spatial tendons, and the polynomials that fit them.
 
-Between two eyelets that sit on neighbouring links the path depends on one angle only, so the excursion separates
-by joint.
-With equal distances it is 2R (cos(α) − cos(α + q/2)): over a finger's range a polynomial of fourth order misses it by
-about 1e-5 R, a hundredth of the excursion's noise. The specimens use these polynomials, so that they lie in the
-nominal class.
+Between two eyelets that sit on neighbouring links the path depends on one angle only, so the excursion separates by
+joint. A flexor runs straight from eyelet to eyelet: with equal distances its excursion is 2R (cos α − cos(α + q/2)),
+and its moment arm grows as it bowstrings. An extensor wraps a pulley on the joint: r q. Over a finger's range a
+polynomial of fourth order misses the first by about 1e-5 R, a fiftieth of the excursion's noise. The specimens use
+these polynomials, so that they lie in the nominal class.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -43,14 +42,27 @@ def spatial_lengths(
             continue
         tendon = spec.add_tendon(name=name)
         for i in crossed:
-            radius = abs(arm[k, i]) / np.sin(alpha[k, i])
             # A pull along −x at height h turns the joint by (h × −x)·axis: positive on the side axis × x.
-            height = np.sign(arm[k, i]) * radius * np.sin(alpha[k, i]) * np.cross(finger.axis[i], [1.0, 0.0, 0.0])
-            along = np.array([radius * np.cos(alpha[k, i]), 0.0, 0.0])
-            bodies[i].add_site(name=f"{name}-{i}-in", pos=finger.origin[i] - along + height)
-            bodies[i + 1].add_site(name=f"{name}-{i}-out", pos=along + height)
-            tendon.wrap_site(f"{name}-{i}-in")
-            tendon.wrap_site(f"{name}-{i}-out")
+            side = np.sign(arm[k, i]) * np.cross(finger.axis[i], [1.0, 0.0, 0.0])
+            wraps = arm[k, i] < 0 and np.ptp(finger.limits[i]) > 1.0
+            if wraps:  # eyelets low enough that the straight line would cut the pulley over the whole range
+                height, along = 0.4 * abs(arm[k, i]), 2.5 * abs(arm[k, i])
+            else:
+                height, along = abs(arm[k, i]), abs(arm[k, i]) / np.tan(alpha[k, i])
+            reach = np.array([along, 0.0, 0.0])
+            label = f"{name}-{i}"
+            bodies[i].add_site(name=f"{label}-in", pos=finger.origin[i] - reach + height * side)
+            bodies[i + 1].add_site(name=f"{label}-out", pos=reach + height * side)
+            tendon.wrap_site(f"{label}-in")
+            if wraps:
+                radius = abs(arm[k, i])
+                ends = np.concatenate([-finger.axis[i], finger.axis[i]]) * radius
+                bodies[i + 1].add_geom(
+                    name=label, type=mujoco.mjtGeom.mjGEOM_CYLINDER, fromto=ends, size=[radius, 0, 0], mass=0.0
+                )
+                bodies[i].add_site(name=f"{label}-side", pos=finger.origin[i] + 2 * radius * side)
+                tendon.wrap_geom(label, f"{label}-side")
+            tendon.wrap_site(f"{label}-out")
     model = spec.compile()
     data = mujoco.MjData(model)
     present = [k for k in range(finger.n) if np.any(arm[k])]

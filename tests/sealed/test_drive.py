@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from jaxfinger.sealed.departures import draw
-from jaxfinger.sealed.drive import Allocator, simulate
+from jaxfinger.sealed.drive import Allocator, replay, simulate, wish
 from jaxfinger.sealed.laws import Finger
+from jaxfinger.sealed.protocols import draw_style, session_plans
 from jaxfinger.sealed.record import Motion, last_direction, needed_torque
+from jaxfinger.sealed.specimens import LAYOUTS, make_specimen
 
 
 @pytest.mark.parametrize("effect", [None, "tendon_friction_viscous", "passive_tendon", "payload"])
@@ -46,3 +48,20 @@ def test_allocation_gives_the_wanted_torque_within_its_bounds(nominal):
 
 def specimen_active(nominal):
     return nominal.specimen.finger.active
+
+
+@pytest.mark.parametrize("kind", LAYOUTS)
+def test_the_same_tensions_open_loop_lead_to_the_same_motion(kind):
+    """The fingers are statically stable under the recorded tensions, so a simulator can replay them."""
+    rng = np.random.default_rng([3, 1])
+    specimen = make_specimen(kind, rng)
+    nominal = Finger(specimen)
+    plan = next(p for p in session_plans(specimen, draw_style(rng), rng) if p.experiment == "VD.3")
+    plan = replace(plan, duration=2.0)
+    plan = replace(plan, q=wish(nominal, plan, rng))
+    run = simulate(nominal, nominal, [plan])[0]
+    assert np.ptp(run.q, axis=0).max() > 0.1
+    wished = np.stack([p(run.time)[0] for p in plan.q], axis=1)
+    assert np.abs(run.q - wished).max() < 0.2
+    motion = np.array(replay(nominal, run.q[0], run.tension))
+    assert np.sqrt(np.mean((motion - run.q) ** 2)) < 5e-3

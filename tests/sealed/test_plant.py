@@ -92,6 +92,9 @@ def test_paths_separate_by_joint(specimen):
     np.testing.assert_allclose(lengths[-1] - lengths[:-1], 2 * radius * (np.cos(0.6) - np.cos(0.6 + q / 2)), atol=1e-12)
     coefficients, _ = excursion_polynomials(f, arm, alpha)
     assert coefficients[0, 1, 0] == pytest.approx(6e-3, rel=2e-3)
+    arm[0, 1] = -6e-3  # an extensor wraps its pulley: the arm is constant
+    lengths = spatial_lengths(f, arm, alpha, 1, np.append(q, 0.0))[:, 0]
+    np.testing.assert_allclose(lengths[-1] - lengths[:-1], -6e-3 * q, atol=1e-9)
 
 
 def test_cad_is_off_by_what_it_admits():
