@@ -203,7 +203,8 @@ def _marks(marks: list[dict[str, Any]], seq: np.ndarray, finger: FingerDescripti
             (tendon, finger.tendon_names, mark["tendon_direction"]),
         ):
             values[after] = [directions.get(name, 0) for name in names]
-    return hold, joint, tendon if any(m["tendon_direction"] for m in marks) else None
+    held = hold if (hold >= 0).any() else None  # cut short before the first hold
+    return held, joint, tendon if any(m["tendon_direction"] for m in marks) else None
 
 
 def publish(log: Log, output: str | Path, overwrite: bool = False) -> Session:

@@ -51,8 +51,8 @@ def _toml(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else f'"{value}"' if isinstance(value, str) else repr(value)
 
 
-def plan_toml(repeats: int = 1) -> str:
-    """The paper's session, shortened: every experiment, every joint, every tendon."""
+def plan_toml(repeats: int = 1, postures: int = 2) -> str:
+    """The paper's session, shortened: every experiment, every joint, every tendon, ID.4 at one or two postures."""
     trials = [f'experiment = "ID.2"\njoint = "{j}"\nrepeats = {repeats}' for j in ("MCP", "PIP", "DIP")]
     trials.append('experiment = "VD.1"\nseconds = 12.0')
     for joint in ("MCP", "PIP", "DIP"):
@@ -68,7 +68,7 @@ def plan_toml(repeats: int = 1) -> str:
         ("T3", "MCP", "[4.0, 6.0, 8.0, 10.0]"),
         ("T4", "MCP", "[4.0, 6.0, 8.0, 10.0]"),
     ):
-        for posture in ("[25.0, 60.0, 20.0]", "[50.0, 30.0, 20.0]"):
+        for posture in ("[25.0, 60.0, 20.0]", "[50.0, 30.0, 20.0]")[:postures]:
             trials.append(
                 f'experiment = "ID.4"\ntendon = "{tendon}"\njoint = "{joint}"\nlevels = {levels}\n'
                 f"posture_deg = {posture}\nrepeats = {repeats}"

@@ -19,7 +19,7 @@ from jaxfinger.rig.runner import log_path, run
 
 
 def serious(path):
-    return [f for f in check_file(path) if f.severity != "note"]
+    return [f for f in check_file(path) if f.severity == "error"]
 
 
 def slot(rig, kind, of=""):

@@ -67,13 +67,13 @@ class AdsRig(RingRig):
         connection = self._pyads.Connection(str(where["net_id"]), int(where["port"]), str(where["ip"]))
         connection.open()
         self._connection = connection
+        port = connection._port
+        assert port is not None
         connection.set_timeout(TIMEOUT_MS)  # belongs to the port, so it is lost with every close
         self._places = {}
         for symbol in contract.SYMBOLS:
             try:
-                info = self._pyads.pyads_ex.adsGetSymbolInfo(
-                    connection._port, connection._adr, contract.PREFIX + symbol
-                )
+                info = self._pyads.pyads_ex.adsGetSymbolInfo(port, connection._adr, contract.PREFIX + symbol)
             except self._pyads.ADSError as error:
                 if error.err_code != 1808:  # symbol not found
                     raise
