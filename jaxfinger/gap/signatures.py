@@ -1,12 +1,12 @@
-"""Signatures: what an effect adds to every whitened row, nominal parameters as they are.
+"""Signatures: what an effect adds to every whitened row, the nominal parameters as they are.
 
-One compiled function a class of effects and experiment serves every site, shape and amplitude: they are arrays, mapped over.
-Only what the effect changes is evaluated; the rigid body is left out where it does not move.
+Site, shape and amplitude of an effect are arrays, and trials of one kind are stacked whatever their experiment: one
+compiled function a class of effects and kind of prediction serves them all. Only what the effect changes is evaluated.
 """
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property
 from itertools import product
 
 import equinox as eqx
@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.effects import CatalogueEffect, Site
-from jaxfinger.gap.problem import Problem
-from jaxfinger.identify.noise import whiten
+from jaxfinger.gap.problem import Problem, Rows
 from jaxfinger.model import (
     Model,
     Motion,
@@ -28,6 +27,10 @@ from jaxfinger.model import (
     resisting_torque,
 )
 
+CHUNK = 8  # members of one call
+LENGTH, COUNT = 512, 8  # stacks are padded to multiples of these, so that sessions share compilations
+QUICK = {"xla_backend_optimization_level": 0}  # a signature runs a few times: compiling it must be cheap
+
 
 @dataclass(frozen=True)
 class Variant:
@@ -35,7 +38,7 @@ class Variant:
 
     effect: type[CatalogueEffect]
     site: Site
-    shape: dict[str, float]
+    shape: tuple[tuple[str, float], ...]
 
     @property
     def key(self) -> tuple[str, Site]:
@@ -44,52 +47,54 @@ class Variant:
 
     def at(self, finger, amplitudes: dict[str, float]) -> CatalogueEffect:
         """The effect itself."""
-        return self.effect.at(finger, self.site, **self.shape, **amplitudes)
+        return self.effect.at(finger, self.site, **dict(self.shape), **amplitudes)
 
 
 def variants(effects: dict[str, type[CatalogueEffect]], finger) -> list[Variant]:
     """Every effect at every site with every shape worth trying."""
     return [
-        Variant(effect, site, shape)
+        Variant(effect, site, tuple(shape.items()))
         for effect in effects.values()
         for site in effect.sites(finger)
         for shape in effect.shapes(finger, site)
     ]
 
 
-@eqx.filter_jit
-def _deltas(
-    effects: CatalogueEffect, nominal: Model, x: Motion, y0: dict[str, Array], mask: dict[str, Array],
-    filters: dict[str, Array], contact: Array | None,
-) -> Float[Array, "variants rows"]:
-    """Whitened change of the prediction, one row a member of `effects` (arrays stacked along their first axis)."""
-    base = resisting_torque(nominal, x)
+@eqx.filter_jit(compiler_options=QUICK)
+def _change(
+    channel: str, effects: CatalogueEffect, nominal: Model, x: Motion, y0: Float[Array, "columns B T"],
+    contact: Array | None,
+) -> Float[Array, "variants columns B T"]:
+    """Change of one channel's prediction, one row a member of `effects` (arrays stacked along their first axis)."""
+    base = None if channel == "tendon_excursion" else resisting_torque(nominal, x)
 
     def one(effect):
         model = eqx.tree_at(lambda m: m.effects, nominal, (effect,), is_leaf=lambda v: isinstance(v, tuple))
         true = model.true_motion(x)
-        out = []
-        for c in filters:
-            y = effect.reading(c, true, _changed(c, effect, model, nominal, true, x, y0[c], base, contact))
-            w = whiten(y - y0[c], mask[c], filters[c], demean=c == "tendon_excursion")
-            out.append(jnp.moveaxis(w, 1, 0).reshape(w.shape[1], -1))
-        return jnp.concatenate(out, axis=1).reshape(-1)
+        if channel == "tendon_excursion":
+            y = y0 + excursion(model, true) - excursion(nominal, x)
+        elif effect.MOVES_RIGID_BODY:
+            full = external_torque if channel == "joint_torque" else fingertip_force
+            y = y0 + full(model, true) - full(nominal, x)
+        else:
+            change = resisting_torque(model, true) - base
+            y = y0 + (change if channel == "joint_torque" else jnp.sum(contact * change[None], axis=1))
+        return effect.reading(channel, true, y) - y0
 
     return jax.lax.map(one, effects)
 
 
-def _changed(c, effect, model, nominal, true, x, y0, base, contact):
-    """The channel's prediction with the effect, its sensor apart."""
-    if c == "tendon_excursion":
-        return y0 + excursion(model, true) - excursion(nominal, x)
-    if effect.MOVES_RIGID_BODY:
-        full = external_torque if c == "joint_torque" else fingertip_force
-        return y0 + full(model, true) - full(nominal, x)
-    change = resisting_torque(model, true) - base
-    return y0 + (change if c == "joint_torque" else jnp.sum(contact * change[None], axis=1))
-
-
 _contact = eqx.filter_jit(contact_map)
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Trials of several experiments that are predicted alike."""
+
+    channel: str
+    x: Motion
+    y0: Float[Array, "columns B T"]
+    first: dict[str, int]  # first trial of each experiment
 
 
 @dataclass(frozen=True)
@@ -99,55 +104,83 @@ class Signatures:
     problem: Problem
     nominal: Model
 
+    @cached_property
+    def _groups(self) -> list[_Group]:
+        kinds: dict[tuple, list[str]] = {}
+        for e, stack in self.problem.stacks.items():
+            if self.problem.rows[e].size:
+                for c in stack.experiment.channels:
+                    held = stack.experiment.held and c != "tendon_excursion"
+                    kinds.setdefault((c, held), []).append(e)
+        return [self._group(c, held, experiments) for (c, held), experiments in kinds.items()]
+
+    def _group(self, channel: str, held: bool, experiments: list[str]) -> _Group:
+        batches = [self.problem.stacks[e].batch for e in experiments]
+        T = -(-max(b.x.time.shape[-1] for b in batches) // LENGTH) * LENGTH
+        count = sum(b.x.time.shape[0] for b in batches)
+        B = -(-count // COUNT) * COUNT
+
+        def merge(*arrays):
+            padded = [np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, T - a.shape[-1])], mode="edge") for a in map(np.asarray, arrays)]
+            whole = np.concatenate(padded, axis=-2)
+            extra = [(0, 0)] * (whole.ndim - 2) + [(0, B - count), (0, 0)]
+            return jnp.asarray(np.pad(whole, extra, mode="edge"))
+
+        motions = [replace(b.x, held=held) for b in batches]
+        x = jax.tree.map(merge, *motions)
+        y0 = merge(*(self.problem.predicted[e, channel] for e in experiments))
+        starts = np.cumsum([0] + [b.x.time.shape[0] for b in batches])
+        return _Group(channel, x, y0, dict(zip(experiments, starts.tolist(), strict=False)))
+
     def of(self, members: list[CatalogueEffect]) -> Float[np.ndarray, "members N"]:
         """Whitened change of every row, for effects of one class."""
+        padded = members + [members[0]] * (-len(members) % CHUNK)
+        chunks = [self._chunk(padded[k : k + CHUNK]) for k in range(0, len(padded), CHUNK)]
+        return np.concatenate(chunks)[: len(members)]
+
+    def _chunk(self, members: list[CatalogueEffect]) -> Float[np.ndarray, "members N"]:
         out = np.zeros((len(members), self.problem.r.size))
         kind = type(members[0])
-        stacked = jax.tree.map(lambda *a: jnp.stack(a), *[_nameless(m) for m in members])
-        for e, rows in self.problem.rows.items():
-            shown = kind.SHOWS.get(e, ())
-            if not shown or not rows.size:
+        stacked = jax.tree.map(lambda *a: np.stack(a), *[replace(m, site=()) for m in members])
+        for group in self._groups:
+            shown = [e for e in group.first if group.channel in kind.SHOWS.get(e, ())]
+            if not shown:
                 continue
-            stack = self.problem.stacks[e]
-            channels = stack.experiment.channels
-            contact = _contact(self.nominal, stack.batch.x) if "fingertip_force" in shown else None
-            filters = {c: jnp.asarray(self.problem.noise[e, c].coefficients) for c in shown}
-            y0 = {c: jnp.asarray(self.problem.predicted[e, c]) for c in shown}
-            mask = {c: stack.batch.mask[c] for c in shown}
-            flat = np.asarray(_deltas(stacked, self.nominal, stack.batch.x, y0, mask, filters, contact))
-            out[:, rows.start : rows.start + rows.size] = _place(flat, rows, channels, shown, stack)
+            contact = _contact(self.nominal, group.x) if group.channel == "fingertip_force" else None
+            raw = np.asarray(_change(group.channel, stacked, self.nominal, group.x, group.y0, contact))
+            for e in shown:
+                rows = self.problem.rows[e]
+                B = len(self.problem.stacks[e].trials)
+                mine = raw[:, :, group.first[e] : group.first[e] + B]
+                number = self.problem.stacks[e].experiment.channels.index(group.channel)
+                of_channel = np.flatnonzero(rows.channel == number)
+                white = whitened(mine, self.problem, rows, of_channel, group.channel)
+                out[:, rows.start + of_channel] = white
         return out
 
-    def columns(self, variant_list: list[Variant], amplitudes: list[dict[str, float]] | None = None):
-        """(variants, amplitudes, N) signatures per unit of plausible size, for variants of one class."""
-        effect, finger = variant_list[0].effect, self.nominal.finger
+    def columns(self, items: list[Variant]) -> Float[np.ndarray, "variants amplitudes N"]:
+        """Signatures at plausible sizes, one amplitude at a time, for variants of one class."""
+        effect, finger = items[0].effect, self.nominal.finger
         names = list(effect.AMPLITUDES)
-        members = [
-            v.at(finger, {n: effect.AMPLITUDES[n][1]}) for v, n in product(variant_list, names)
-        ]
-        return self.of(members).reshape(len(variant_list), len(names), -1)
+        members = [v.at(finger, {n: effect.AMPLITUDES[n][1]}) for v, n in product(items, names)]
+        return self.of(members).reshape(len(items), len(names), -1)
 
 
-def _nameless(effect: CatalogueEffect) -> CatalogueEffect:
-    return replace(effect, site=())
-
-
-def _place(flat, rows, channels, shown, stack):
-    """The rows that count, from a block that holds only the channels shown."""
-    B, T = stack.batch.x.time.shape
-    widths = {c: stack.batch.mask[c].shape[0] for c in channels}
-    if tuple(shown) == tuple(channels):
-        return flat[:, rows.keep]
-    first, offset = {}, 0
-    for c in shown:
-        first[channels.index(c)] = offset
-        offset += widths[c]
-    out = np.zeros((len(flat), rows.size))
-    inside = np.isin(rows.channel, list(first))
-    wide = np.array([first.get(k, 0) for k in range(len(channels))])[rows.channel] + rows.column
-    position = np.ravel_multi_index((rows.trial, wide, rows.time), (B, offset, T), mode="clip")
-    out[:, inside] = flat[:, position[inside]]
-    return out
+def whitened(
+    raw: Float[np.ndarray, "members columns B T"], problem: Problem, rows: Rows, of_channel: np.ndarray, channel: str
+) -> Float[np.ndarray, "members rows"]:
+    """The rows that count, whitened as the residuals are (`noise.whiten`): each has its filter's whole history."""
+    coefficients = problem.noise[rows.experiment, channel].coefficients
+    column, trial, time = rows.column[of_channel], rows.trial[of_channel], rows.time[of_channel]
+    white = sum(coefficients[column, k] * raw[:, column, trial, time - k] for k in range(coefficients.shape[1]))
+    if channel == "tendon_excursion":
+        constant = coefficients.sum(axis=1)[column]
+        series = trial * raw.shape[1] + column
+        count = int(series.max(initial=0)) + 1
+        energy = np.bincount(series, constant**2, count)
+        share = np.stack([np.bincount(series, constant * w, count) for w in white]) / np.maximum(energy, 1e-300)
+        white = white - constant * share[:, series]
+    return white
 
 
 def by_class(items: list[Variant]) -> dict[str, list[Variant]]:
@@ -161,18 +194,10 @@ def by_class(items: list[Variant]) -> dict[str, list[Variant]]:
 def all_columns(signatures: Signatures, items: list[Variant], progress=lambda message: None, threads: int = 2):
     """Signatures of every variant by effect; classes are compiled side by side."""
     groups = by_class(items)
-    done = 0
-
-    def work(name):
-        return name, signatures.columns(groups[name])
-
     out = {}
+    _ = signatures._groups
     with ThreadPoolExecutor(threads) as pool:
-        for name, columns in pool.map(work, groups):
+        for name, columns in zip(groups, pool.map(lambda n: signatures.columns(groups[n]), groups), strict=True):
             out[name] = columns
-            done += 1
-            progress(f"signatures of {name} ({done} of {len(groups)} effects)")
+            progress(f"signatures of {name} ({len(out)} of {len(groups)} effects)")
     return groups, out
-
-
-__all__ = ["Signatures", "Variant", "all_columns", "by_class", "partial", "variants"]

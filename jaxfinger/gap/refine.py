@@ -1,0 +1,155 @@
+"""Refit of a few candidates: amplitudes and shapes move, the nominal parameters with them.
+
+Gauss–Newton on [nominal parameters, amplitudes, shapes] with signatures re-evaluated at each step and the nominal parameters
+eliminated by projection: equation (1) is linear in them to a good approximation, but for slip. The effects' signatures are
+read at the nominal model of the problem; the exact fit of the few effects that a verdict names comes last (`augment`).
+"""
+
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxfinger.effects import CatalogueEffect
+from jaxfinger.gap.evidence import Projector
+from jaxfinger.gap.problem import Problem
+from jaxfinger.gap.signatures import Signatures, Variant
+
+STEPS = 6
+ADDITIVE = {"phi", "place", "p", "toe"}  # shapes that move by differences; the others by factors
+FIXED = {"end", "side", "joint_a", "joint_b", "delta", "damping"}  # shapes that are choices
+
+
+@dataclass(frozen=True)
+class Refined:
+    """One set of effects, refitted together with the nominal parameters."""
+
+    variants: tuple[Variant, ...]
+    effects: tuple[CatalogueEffect, ...]  # at the optimum
+    std: tuple[dict[str, float], ...]  # of every amplitude and moving shape, per effect
+    chi2: float
+    log_evidence: float  # Laplace, against the nominal model
+    residual: Float[np.ndarray, " N"]  # white, at the optimum
+    change: Float[np.ndarray, " N"]  # what the effects add to every row, at the optimum
+    columns: Float[np.ndarray, "k N"]  # its derivatives by amplitudes and moving shapes
+
+    @property
+    def keys(self) -> tuple:
+        """(effect, site) of each."""
+        return tuple(v.key for v in self.variants)
+
+
+@dataclass
+class _Coordinate:
+    effect: int
+    name: str
+    amplitude: bool
+    unit: float  # plausible size, or step of the shape
+
+
+def refine(problem: Problem, variants: list[Variant], start: list[dict[str, float]], chi2_null: float,
+           projector: Projector | None = None) -> Refined:
+    """The variants together, from amplitudes `start` (in their own units)."""
+    finger = problem.nominal.finger
+    effects = [v.at(finger, s) for v, s in zip(variants, start, strict=True)]
+    coordinates = [c for i, v in enumerate(variants) for c in _coordinates(i, v)]
+    signatures, projector = Signatures(problem, problem.nominal), projector or Projector(problem)
+    base, slopes = _evaluate(signatures, effects, coordinates)
+    r = problem.r - base
+    cost = _cost(projector, problem, r)
+    for _ in range(STEPS):
+        rt = projector.residual(problem, r)
+        St = projector(slopes)
+        prior = np.array([1.0 / 3.0**2 if c.amplitude else 1.0 for c in coordinates])
+        G = St @ St.T
+        delta = np.linalg.solve(G + np.diag(prior), St @ rt)
+        moved = False
+        for _ in range(4):
+            trial_effects = _moved(effects, coordinates, delta)
+            trial_base, trial_slopes = _evaluate(signatures, trial_effects, coordinates)
+            trial_r = problem.r - trial_base
+            trial_cost = _cost(projector, problem, trial_r)
+            if trial_cost < cost:
+                moved = True
+                break
+            delta = delta / 3
+        if not moved:
+            break
+        gain = cost - trial_cost
+        effects, slopes, r, cost = trial_effects, trial_slopes, trial_r, trial_cost
+        if gain < 0.1 + 1e-4 * max(chi2_null - cost, 0.0):
+            break
+    St = projector(slopes)
+    G = St @ St.T
+    covariance = np.linalg.pinv(G + 1e-12 * np.trace(G) * np.eye(len(G)), hermitian=True)
+    std: list[dict[str, float]] = [{} for _ in variants]
+    for c, v in zip(coordinates, np.sqrt(np.maximum(np.diag(covariance), 0.0)), strict=True):
+        value = float(getattr(effects[c.effect], c.name))
+        std[c.effect][c.name] = float(v * c.unit if c.amplitude or c.name in ADDITIVE else v * value)
+    occam = 0.5 * np.linalg.slogdet(np.eye(len(G)) + G)[1]
+    residual = projector.residual(problem, r)[: r.size]
+    return Refined(
+        tuple(variants), tuple(effects), tuple(std), cost, float(0.5 * (chi2_null - cost) - occam), residual,
+        problem.r - r, slopes,
+    )
+
+
+def _coordinates(i: int, variant: Variant) -> list[_Coordinate]:
+    kind = variant.effect
+    out = [_Coordinate(i, n, True, unit) for n, (_, unit, _) in kind.AMPLITUDES.items()]
+    for n, (_, values) in kind.SHAPES.items():
+        if n not in FIXED and len(values) > 1:
+            unit = float(np.mean(np.diff(values))) / 2 if n in ADDITIVE else 1.0
+            out.append(_Coordinate(i, n, False, unit))
+    return out
+
+
+def _shifted(effect: CatalogueEffect, c: _Coordinate, by: float) -> CatalogueEffect:
+    value = float(getattr(effect, c.name))
+    if c.amplitude or c.name in ADDITIVE:
+        value += by * c.unit
+    else:
+        value *= float(np.exp(np.clip(by, -0.7, 0.7)))
+    if c.amplitude and not effect.AMPLITUDES[c.name][2]:
+        value = max(value, 0.0)
+    if not c.amplitude:
+        grid = effect.SHAPES[c.name][1]
+        wide = 0.0 if c.name in ADDITIVE else 2.0
+        value = float(np.clip(value, min(grid) / wide if wide else min(grid), max(grid) * wide if wide else max(grid)))
+    return replace(effect, **{c.name: jnp.asarray(value)})
+
+
+def _moved(effects, coordinates, delta):
+    out = list(effects)
+    for c, d in zip(coordinates, delta, strict=True):
+        out[c.effect] = _shifted(out[c.effect], c, float(d))
+    return out
+
+
+def _evaluate(signatures: Signatures, effects, coordinates):
+    """White change by all effects, and its derivatives by every coordinate."""
+    size = signatures.problem.r.size
+    base, slopes = np.zeros(size), np.zeros((len(coordinates), size))
+    for i, effect in enumerate(effects):
+        mine = [k for k, c in enumerate(coordinates) if c.effect == i]
+        h = 0.05
+        members = [effect] + [_shifted(effect, coordinates[k], h) for k in mine]
+        flat = signatures.of(members)
+        base += flat[0]
+        for row, k in enumerate(mine, start=1):
+            step = _step_taken(effect, members[row], coordinates[k])
+            slopes[k] = (flat[row] - flat[0]) / step if step else 0.0
+    return base, slopes
+
+
+def _step_taken(before, after, c: _Coordinate) -> float:
+    a, b = float(getattr(before, c.name)), float(getattr(after, c.name))
+    return (b - a) / c.unit if c.amplitude or c.name in ADDITIVE else float(np.log(b / a))
+
+
+def _cost(projector, problem, r) -> float:
+    rt = projector.residual(problem, r)
+    return float(rt @ rt)
+
+

@@ -1,0 +1,217 @@
+"""Which effects: every candidate on its own, then further ones on top, against «none» and «unlisted».
+
+1. Screen every effect at every site and shape linearly; refit the strongest few with their shapes free.
+2. Take the best. What is left of the gap is screened again on top of it; a further effect joins while it explains a
+   fair part of the whole gap, and all are refitted together.
+3. «Unlisted» competes through the flexible stand-in: the part of the gap that it explains beyond the chosen effects.
+4. Evidence counts a limited number of independent looks. A candidate that leaves the energy U unexplained has
+   log L = −½ ν log(1 + U/ν), Student's t with ν looks: Gaussian for a candidate that fits to the noise, and tolerant where
+   all forms are a little wrong, as textbook forms are.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import expit, logsumexp
+
+from jaxfinger.effects import CatalogueEffect
+from jaxfinger.gap.evidence import Evidence, Projector, by_site, screen
+from jaxfinger.gap.problem import Problem
+from jaxfinger.gap.refine import Refined, refine
+from jaxfinger.gap.signatures import Signatures, all_columns, variants
+from jaxfinger.gap.standin import Explained, explained
+
+Progress = Callable[[str], None]
+
+DETECT = 25.0  # log evidence that an effect needs before anything is called a gap
+LOOKS = 25.0  # ν: independent looks that evidence counts
+ADD = 0.04  # share of the gap that a further effect must explain
+OPEN = 0.25  # share of the gap left to the stand-in at which «unlisted» is as likely as the catalogue
+OPEN_WIDTH = 0.06
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect at one site, judged."""
+
+    key: tuple[str, tuple[str, ...]]
+    probability: float
+    explained: float  # share of the gap
+    refined: Refined | None
+    evidence: Evidence
+
+
+@dataclass(frozen=True)
+class Search:
+    """What the search found."""
+
+    gap: float  # energy of the gap that can be explained at all, in squared standard deviations
+    detected: bool
+    chosen: Refined | None  # the effects of the verdict, refitted together, in order of what they explain
+    shares: tuple[float, ...]  # of the gap, one a chosen effect: what is lost when it alone is dropped
+    candidates: list[Candidate]
+    none: float
+    unlisted: float
+    rival_sets: list[list[tuple]]  # effects that explain as much as the chosen first one
+    left: list[Explained]  # what the stand-in explains beyond the chosen effects
+    strongest: float  # log evidence of the strongest candidate
+    absorbed: list[tuple] = field(default_factory=list)  # (key, share) of effects that the file cannot show
+
+
+def search(
+    problem: Problem, catalogue: dict[str, type[CatalogueEffect]], quick: bool = False,
+    progress: Progress = lambda message: None,
+) -> Search:
+    """Judge every effect of the catalogue at every site of the finger."""
+    signatures = Signatures(problem, problem.nominal)
+    groups, columns = all_columns(signatures, variants(catalogue, problem.nominal.finger), progress)
+    projector = Projector(problem)
+    rt = projector.residual(problem)
+    chi2 = float(rt @ rt)
+    progress("weighing the evidence")
+    found = by_site(screen(groups, columns, projector, rt))
+    ranked = list(found.values())
+    absorbed = [(e.variant.key, e.absorbed) for e in ranked if e.absorbed > 0.99]
+    strongest = ranked[0].log_bf
+    refined: dict[tuple, Refined] = {}
+    for e in _worth(ranked, 3 if quick else 8):
+        progress(f"refitting with {e.variant.effect.ID} at {', '.join(e.variant.site)}")
+        refined[e.variant.key] = refine(problem, [e.variant], [_start(e)], chi2, projector)
+    if not refined or max(r.log_evidence for r in refined.values()) < DETECT:
+        return _nothing(ranked, strongest, absorbed)
+
+    best = max(refined.values(), key=lambda r: r.log_evidence)
+    chosen = best if quick else _add(problem, groups, columns, best, chi2, projector, progress)
+    left = explained(problem, chosen.residual)
+    beyond = sum(max(x.energy, 0.0) for x in left if x.energy > 15.0)
+    gap = chi2 - chosen.chi2 + beyond
+    shares = _shares(problem, chosen, chi2, projector, gap)
+    order = np.argsort(-np.asarray(shares))
+    return _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, strongest, absorbed)
+
+
+def _worth(ranked: list[Evidence], most: int) -> list[Evidence]:
+    """The candidates that a refit of their shapes could still bring to the top."""
+    best = ranked[0].explained
+    return [e for e in ranked[:most] if e.log_bf > 5.0 and e.explained > 0.2 * best]
+
+
+def _start(e: Evidence) -> dict[str, float]:
+    names = e.variant.effect.AMPLITUDES
+    return {n: float(a) * unit for (n, (_, unit, _)), a in zip(names.items(), e.amplitudes, strict=True)}
+
+
+def _values(effect: CatalogueEffect) -> dict[str, float]:
+    return {n: float(getattr(effect, n)) for n in effect.AMPLITUDES}
+
+
+def _at_optimum(refined: Refined):
+    """Variants with the shapes that a refit found, and the amplitudes to start from."""
+    from jaxfinger.gap.signatures import Variant
+
+    items = [
+        Variant(type(x), v.site, tuple((n, float(getattr(x, n))) for n in x.SHAPES))
+        for v, x in zip(refined.variants, refined.effects, strict=True)
+    ]
+    return items, [_values(x) for x in refined.effects]
+
+
+def _add(problem, groups, columns, best: Refined, chi2: float, projector, progress) -> Refined:
+    """Further effects on top of the best, while each explains a fair part of the gap."""
+    chosen = best
+    while len(chosen.variants) < 3:
+        beyond = sum(max(x.energy, 0.0) for x in explained(problem, chosen.residual) if x.energy > 15.0)
+        gap = chi2 - chosen.chi2 + beyond
+        if beyond < ADD * gap:
+            break
+        on_top = Projector(problem, chosen.columns)
+        rt = on_top.residual(problem, problem.r - chosen.change)
+        ranked = [e for e in by_site(screen(groups, columns, on_top, rt)).values() if e.variant.key not in chosen.keys]
+        e = ranked[0]
+        if e.log_bf < DETECT or e.explained < ADD * gap:
+            break
+        progress(f"adding {e.variant.effect.ID} at {', '.join(e.variant.site)}")
+        items, starts = _at_optimum(chosen)
+        together = refine(problem, [*items, e.variant], [*starts, _start(e)], chi2, projector)
+        if chosen.chi2 - together.chi2 < max(ADD * gap, 2 * DETECT):
+            break
+        chosen = together
+    return chosen
+
+
+def _shares(problem, chosen: Refined, chi2: float, projector, gap: float) -> tuple[float, ...]:
+    """What is lost when one effect alone is dropped, as a share of the gap."""
+    if len(chosen.variants) == 1:
+        return ((chi2 - chosen.chi2) / gap,)
+    items, starts = _at_optimum(chosen)
+    out = []
+    for i in range(len(items)):
+        rest = refine(problem, items[:i] + items[i + 1 :], starts[:i] + starts[i + 1 :], chi2, projector)
+        out.append((rest.chi2 - chosen.chi2) / gap)
+    return tuple(out)
+
+
+def _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, strongest, absorbed) -> Search:
+    """Probabilities: rivals of the first effect by what they leave unexplained, «unlisted» by what all leave."""
+    first = chosen.keys[order[0]]
+    alone = refined.get(first)
+    floor = min(r.chi2 for r in refined.values())
+    keys = [e.variant.key for e in ranked]
+    unexplained = {}
+    for e in ranked:
+        r = refined.get(e.variant.key)
+        unexplained[e.variant.key] = (r.chi2 if r else chi2 - e.explained) - floor
+        if r is None and e.log_bf <= 0:
+            unexplained[e.variant.key] = chi2 - floor
+    # A chosen effect is judged by what the others leave it, not by what it explains alone.
+    log_l = {k: -0.5 * LOOKS * np.log1p(max(u, 0.0) / LOOKS) for k, u in unexplained.items()}
+    total = logsumexp(list(log_l.values()))
+    share_left = beyond / gap
+    unlisted = float(expit((share_left - OPEN) / OPEN_WIDTH)) if beyond > 60.0 else 0.01
+    probability = {k: float(np.exp(v - total)) * (1 - unlisted) for k, v in log_l.items()}
+    if len(chosen.variants) > 1:
+        # Several effects: each carries its part of what the catalogue explains.
+        rest = 1 - unlisted
+        named = {chosen.keys[i]: shares[i] / sum(shares) for i in range(len(shares))}
+        weight = 0.9
+        probability = {k: p * (1 - weight) for k, p in probability.items()}
+        # each effect at work counts alike: a double is scored one half for each of its effects
+        for k in named:
+            probability[k] += weight * rest / len(named)
+    none = 1e-6
+    scale = (1 - none) / (sum(probability.values()) + unlisted)
+    candidates = [
+        Candidate(
+            e.variant.key, probability[e.variant.key] * scale,
+            max(0.0, (chi2 - (refined[e.variant.key].chi2 if e.variant.key in refined else chi2 - e.explained)) / gap),
+            refined.get(e.variant.key), e,
+        )
+        for e in ranked
+    ]
+    candidates.sort(key=lambda c: -c.probability)
+    rivals = [first]
+    mass = np.exp(log_l[first] - total)
+    for k in sorted(keys, key=lambda k: -log_l[k]):
+        if mass >= 0.9:
+            break
+        if k != first and log_l[k] > log_l[first] - 4.0:
+            rivals.append(k)
+            mass += np.exp(log_l[k] - total)
+    _ = alone
+    return Search(
+        gap, True, chosen, shares, candidates, none, unlisted * scale, [rivals] if len(rivals) > 1 else [], left,
+        strongest, absorbed,
+    )
+
+
+def _nothing(ranked: list[Evidence], strongest: float, absorbed) -> Search:
+    """No effect is seen above the noise: the weak evidence that there is shares what «none» leaves."""
+    logs = np.array([max(e.log_bf, -5.0) for e in ranked])
+    none = float(np.clip(expit((DETECT - strongest) / 3.0), 0.5, 0.995))
+    weights = np.exp(0.2 * (logs - logs.max()))
+    weights *= (1 - none) * 0.7 / weights.sum()
+    candidates = [
+        Candidate(e.variant.key, float(w), 0.0, None, e) for e, w in zip(ranked, weights, strict=True)
+    ]
+    return Search(0.0, False, None, (), candidates, none, (1 - none) * 0.3, [], [], strongest, absorbed)

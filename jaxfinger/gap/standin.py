@@ -1,0 +1,120 @@
+"""The flexible stand-in: how much of a residual any smooth law, with or without memory, could explain.
+
+Features of each channel's column: polynomials of the angles, tension, speed, directions, distance and time since reversal,
+time in the trial. It is the yardstick for «none of these», never the answer.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxfinger.gap.problem import Problem
+from jaxfinger.gap.signatures import whitened
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What the stand-in explains of one channel's column in one experiment."""
+
+    experiment: str
+    channel: str
+    column: int
+    energy: float  # of the residual above noise: drop of the sum of squares, less its expectation under noise
+    rows: int
+    by_variable: dict[str, float]  # the same, for the features of one variable alone
+
+
+def features(problem: Problem, experiment: str, channel: str, column: int) -> dict[str, list[np.ndarray]]:
+    """Features (B, T) by the variable that they depend on."""
+    stack = problem.stacks[experiment]
+    x = stack.batch.x
+    finger = problem.nominal.finger
+    q, qd, f = np.asarray(x.q), np.asarray(x.qd), np.asarray(x.tension)
+    direction, time = np.asarray(x.joint_direction), np.asarray(x.time)
+    if channel == "joint_torque":
+        own, taut = [column], [k for k in range(finger.n) if finger.crosses[k][column]]
+    elif channel == "tendon_excursion":
+        own, taut = [i for i in range(finger.m) if finger.crosses[column][i]], [column]
+    else:
+        own, taut = list(range(finger.m)), list(range(finger.n))
+    out: dict[str, list[np.ndarray]] = {
+        "q": [], "qd": [], "direction": [], "tension": [], "distance since reversal": [], "time": [], "other joints": [],
+    }
+    for i in own:
+        u = _unit(q[i])
+        out["q"] += [np.cos(k * np.arccos(u)) for k in range(1, 7)]
+        out["qd"] += [_unit(qd[i]) ** p for p in (1, 2, 3)] + [np.exp(-np.abs(qd[i]) / 0.1)]
+        out["direction"] += [direction[i] * u**p for p in range(3)]
+        travelled = _since_reversal(q[i])
+        for length in (0.02, 0.1):
+            out["distance since reversal"] += [np.exp(-np.abs(travelled) / length) * s for s in (1.0, direction[i], np.sign(travelled))]
+    for k in taut:
+        if f[k].any():
+            u = f[k] / max(f[k].max(), 1e-9)
+            out["tension"] += [u, u**2, np.sqrt(np.maximum(u, 0))] + [u * _unit(q[i]) for i in own]
+            pulled = _since_reversal(f[k])
+            out["distance since reversal"] += [np.exp(-np.abs(pulled) / 1.0) * np.sign(pulled)]
+    for i in range(finger.m):
+        if i not in own:
+            out["other joints"] += [_unit(q[i]), _unit(q[i]) ** 2] + [_unit(q[i]) * _unit(q[j]) for j in own]
+        else:
+            out["other joints"] += [_unit(q[i]) * _unit(q[j]) for j in own if j > i]
+    span = max(float(time.max()), 1e-9)
+    out["time"] += [(time / span) ** p for p in (1, 2)] + [np.exp(-time / s) for s in (1.0, 5.0)]
+    out["time"] += [np.asarray(x.session_time) / max(float(np.asarray(x.session_time).max()), 1e-9)]
+    return out
+
+
+def explained(problem: Problem, residual: np.ndarray) -> list[Explained]:
+    """Column by column, largest energy first."""
+    found = []
+    for e, rows in problem.rows.items():
+        mine = residual[rows.start : rows.start + rows.size]
+        for number, c in enumerate(problem.stacks[e].experiment.channels):
+            for column in np.unique(rows.column[rows.channel == number]):
+                pick = np.flatnonzero((rows.channel == number) & (rows.column == column))
+                if len(pick) < 50:
+                    continue
+                by = {}
+                blocks = []
+                for variable, members in features(problem, e, c, int(column)).items():
+                    if members:
+                        raw = np.zeros((len(members), problem.stacks[e].batch.y[c].shape[0], *members[0].shape))
+                        raw[:, column] = np.stack(members)
+                        white = whitened(raw, problem, rows, pick, c)
+                        blocks.append(white)
+                        by[variable] = _energy(white, mine[pick])
+                found.append(Explained(e, c, int(column), _energy(np.concatenate(blocks), mine[pick]), len(pick), by))
+    return sorted(found, key=lambda x: -x.energy)
+
+
+def _energy(features: np.ndarray, r: np.ndarray) -> float:
+    scale = np.linalg.norm(features, axis=1, keepdims=True)
+    Q, R = np.linalg.qr((features / np.maximum(scale, 1e-300)).T)
+    kept = np.abs(np.diag(R)) > 1e-2  # what is nearly a combination of the others would single out samples
+    b = Q[:, kept].T @ r
+    return float(b @ b - kept.sum())
+
+
+def _unit(u: np.ndarray) -> np.ndarray:
+    """Onto [−1, 1]."""
+    low, high = float(u.min()), float(u.max())
+    return np.zeros_like(u) if high - low < 1e-9 else np.clip(2 * (u - low) / (high - low) - 1, -1, 1)
+
+
+def _since_reversal(u: np.ndarray) -> np.ndarray:
+    """Signed distance along the last axis since the last turning point."""
+    step = np.diff(u, axis=-1, prepend=u[..., :1])
+    threshold = 0.02 * max(float(np.ptp(u)), 1e-12)
+    out = np.zeros_like(u)
+    for index in np.ndindex(u.shape[:-1]):
+        turn = extreme = u[index][0]
+        sign = 0.0
+        for t, (value, d) in enumerate(zip(u[index].tolist(), step[index].tolist(), strict=True)):
+            if sign * (value - extreme) >= 0:
+                extreme = value
+                sign = sign or float(np.sign(d))
+            elif abs(value - extreme) > threshold:
+                turn, sign, extreme = extreme, -sign, value
+            out[(*index, t)] = value - turn
+    return out
