@@ -1,9 +1,32 @@
 """Staged fits, joint refinement, their uncertainty, and the file that holds a result."""
 
+from jaxfinger.identify.batch import Members, fit_many
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.fit_file import load_fit, save_fit
+from jaxfinger.identify.identifiability import base_parameters
 from jaxfinger.identify.joint import refine
 from jaxfinger.identify.recipe import Recipe, read_recipe
+from jaxfinger.identify.resample import compress, refit
 from jaxfinger.identify.stages import STAGES, identify
+from jaxfinger.identify.uncertainty import bootstrap, identifiability, robust, sandwich
 
-__all__ = ["STAGES", "Fit", "Recipe", "StageReport", "identify", "load_fit", "read_recipe", "refine", "save_fit"]
+__all__ = [
+    "STAGES",
+    "Fit",
+    "Members",
+    "Recipe",
+    "StageReport",
+    "base_parameters",
+    "bootstrap",
+    "compress",
+    "fit_many",
+    "identifiability",
+    "identify",
+    "load_fit",
+    "read_recipe",
+    "refine",
+    "refit",
+    "robust",
+    "sandwich",
+    "save_fit",
+]

@@ -1,19 +1,149 @@
-"""Which combinations of parameters the trials cannot see, in words."""
+"""Which combinations of parameters the trials cannot see, in words; what would show them; the rigid body's base."""
 
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfinger.identify.parameters import Parameter
+from jaxfinger.model import Finger, rigid_body
+
+WEAK = 1e-3  # relative singular value below which a combination is seen, but badly
+
+# What each group of parameters needs, as an experiment of the format.
+SHOWN_BY = {
+    "moment_arm": "ID.2 of joint {joint} with tendon {tendon} taut",
+    "elastic": "ID.3-static of joint {joint}",
+    "friction": "ID.3-static of joint {joint}, every hold approached from both sides",
+    "damping": "ID.3-dynamic of joint {joint} at two speeds or more",
+    "tendon_friction": "ID.4 of tendon {tendon} at two tensions or more",
+    "mass": "ID.3-dynamic of joint {joint} with fast reversals, or a better scale",
+    "com": "ID.3-static of joint {joint} with the finger mounted otherwise, so that gravity differs",
+}
+
+
+@dataclass(frozen=True)
+class Direction:
+    """One singular direction of the whitened Jacobian, its columns scaled to unit length."""
+
+    singular_value: float  # relative to the largest
+    shares: dict[str, float]  # of the parameters that make it up, largest first
+    remedy: str  # experiments that would show it; empty where it is seen well
+
+    @property
+    def status(self) -> str:
+        """`seen`, `weak` or `invisible`."""
+        return "invisible" if self.singular_value < 1e-7 else "weak" if self.singular_value < WEAK else "seen"
+
+    def __str__(self) -> str:
+        names = " ".join(f"{c:+.2f}·[{name}]" for name, c in self.shares.items())
+        return f"{self.status} ({self.singular_value:.1e}): {names}" + (f"; record {self.remedy}" * bool(self.remedy))
+
+
+def directions(
+    parameters: list[Parameter], free: Int[np.ndarray, " p"], information: Float[np.ndarray, "P P"]
+) -> list[Direction]:
+    """Singular directions of the Jacobian J of the free parameters, weakest first, from JᵀJ over the flat vector.
+
+    Singular values below 1e-7 of the largest are zero to rounding: JᵀJ holds their squares.
+    """
+    N = information[np.ix_(free, free)]
+    norm = np.sqrt(np.diag(N))
+    scale = np.where(norm > 0, 1.0 / np.where(norm > 0, norm, 1.0), 0.0)
+    values, vectors = np.linalg.eigh(N * np.outer(scale, scale))
+    values = np.sqrt(np.maximum(values, 0.0))
+    out = []
+    for value, v in zip(values / max(values[-1], 1e-300), vectors.T, strict=True):
+        shares = _shares(parameters, free, v)
+        out.append(Direction(float(value), shares, _remedy(parameters, free, v) if value < WEAK else ""))
+    return out
 
 
 def name_invisible(
     parameters: list[Parameter], free: Int[np.ndarray, " p"], invisible: Float[np.ndarray, "k p"]
 ) -> list[str]:
-    """One sentence a combination: its parameters with their shares, largest first."""
+    """One sentence a combination: its parameters with their shares, largest first, and what would show it."""
     sentences = []
-    for combination in invisible:
-        order = np.argsort(-np.abs(combination))
-        share = [(k, combination[k]) for k in order if abs(combination[k]) > 0.05]
-        names = " ".join(f"{c:+.2f}·[{parameters[free[k]].name}]" for k, c in share)
-        sentences.append(f"the trials cannot see the combination {names} (in units of each parameter's own column)")
+    for v in invisible:
+        names = " ".join(f"{c:+.2f}·[{name}]" for name, c in _shares(parameters, free, v).items())
+        sentences.append(
+            f"the trials cannot see the combination {names} (in units of each parameter's own column); "
+            f"record {_remedy(parameters, free, v)}"
+        )
     return sentences
+
+
+def _shares(parameters, free, v) -> dict[str, float]:
+    return {parameters[free[k]].name: float(v[k]) for k in np.argsort(-np.abs(v)) if abs(v[k]) > 0.05}
+
+
+def _remedy(parameters, free, v) -> str:
+    """The experiment of the group that weighs most in the combination, for its joints and tendons."""
+    involved = [parameters[free[k]] for k in np.argsort(-np.abs(v)) if abs(v[k]) > 0.3]
+    wanted = [
+        SHOWN_BY[p.group].format(joint=p.joint or "by joint, two of them moved together", tendon=p.tendon)
+        for p in involved
+        if p.group in SHOWN_BY
+    ]
+    return " and ".join(dict.fromkeys(wanted)) or "a trial that moves what it acts on"
+
+
+@dataclass(frozen=True)
+class BaseParameters:
+    """The combinations of the links' inertial parameters that torques can ever show."""
+
+    names: tuple[str, ...]  # ten a link: m, m c (3), I about the joint (6)
+    singular_values: Float[np.ndarray, " k"]  # of the regressor with columns of unit length, largest first
+    combinations: Float[np.ndarray, "rank k"]  # orthonormal rows, in units of each column
+
+    @property
+    def rank(self) -> int:
+        """Number of base parameters."""
+        return len(self.combinations)
+
+
+def base_parameters(
+    finger: Finger, instrumented: list[int] | None = None, samples: int = 200, seed: int = 0
+) -> BaseParameters:
+    """Base parameters of the chain from random motions (Gautier 1991): what no motion can tell apart is joined.
+
+    `instrumented`: joints whose torque is measured (default all). The torque is linear in m, m c and the inertia about
+    the joint, π; the regressor's columns are the torques of one unit of each.
+    """
+    rng = np.random.default_rng(seed)
+    q, qd, qdd = rng.uniform(-1.5, 1.5, (3, finger.m, samples))
+    torque = jax.jit(rigid_body.inverse_dynamics)
+    rows = slice(None) if instrumented is None else instrumented
+
+    def column(i: int, mass: float, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
+        """Torques of the chain with nothing but these on link i."""
+        values = [np.zeros_like(v) for v in (finger.mass, finger.com, finger.inertia)]
+        for array, value in zip(values, (mass, com, inertia), strict=True):
+            array[i] = value
+        lone = eqx.tree_at(lambda f: (f.mass, f.com, f.inertia), finger, tuple(jnp.asarray(v) for v in values))
+        return np.asarray(torque(lone, q, qd, qdd))[rows].ravel()
+
+    names, columns, axes, none = [], [], np.eye(3), np.zeros((3, 3))
+    for i, joint in enumerate(finger.joint_names):
+        mass = column(i, 1.0, np.zeros(3), none)
+        # A mass at a unit distance, its inertia about the joint taken away, less one at the joint: m c alone.
+        first = [column(i, 1.0, e, np.outer(e, e) - np.eye(3)) - mass for e in axes]
+        pairs = [(a, b) for a in range(3) for b in range(a, 3)]
+        second = [column(i, 0.0, np.zeros(3), _symmetric(a, b)) for a, b in pairs]
+        columns += [mass, *first, *second]
+        labels = ["m", *(f"m c{a}" for a in "xyz"), *(f"I{'xyz'[a]}{'xyz'[b]}" for a, b in pairs)]
+        names += [f"{label} {joint}" for label in labels]
+    Y = np.stack(columns, axis=1)
+    norm = np.linalg.norm(Y, axis=0)
+    Y = Y / np.where(norm > 1e-9 * norm.max(), norm, np.inf)
+    _, s, Vt = np.linalg.svd(Y, full_matrices=False)
+    return BaseParameters(tuple(names), s, Vt[s > 1e-9 * s[0]])
+
+
+def _symmetric(a: int, b: int) -> Float[np.ndarray, "3 3"]:
+    unit = np.zeros((3, 3))
+    unit[a, b] = unit[b, a] = 1.0
+    return unit

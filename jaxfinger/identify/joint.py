@@ -47,7 +47,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
     model = model_for(fit, session)
     progress("reading the recordings")
     stacks = prepare(session, [t.name for t in session if t.experiment in recipe.fit.joint_experiments])
-    reads = {e: _channels(e) for e in stacks}
+    reads = {e: channels_of(e) for e in stacks}
     if not reads:
         raise UserError(
             f"{session.file or 'the session'}: has no trial of {', '.join(recipe.fit.joint_experiments)}; "
@@ -55,13 +55,13 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         )
     parameters = describe(model)
     cad = np.diag(cad_covariance(session, parameters))
-    touched = touched_by(stacks, reads, session)
+    touched = touched_by(reads, session)
     groups = free_groups(recipe)
     seen = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and seen_by(p, touched)]
     free = np.union1d(np.union1d(fit.estimated, np.flatnonzero(cad)), seen).astype(int)
 
     same = fit.data_hash == (data_hash(session.file) if session.file else "")
-    prior = _cad_prior(session, cad, free, parameters, model) if same else _prior(fit, free)
+    prior = cad_prior(session, cad, free, parameters, model) if same else _prior(fit, free)
     progress("refining on all trials at once")
     model, solution, noise = estimate_with_noise(
         start_values(model, free, parameters),
@@ -109,7 +109,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
     return replace(refined, stages=(*fit.stages, report))
 
 
-def _channels(experiment: str) -> tuple[str, ...]:
+def channels_of(experiment: str) -> tuple[str, ...]:
     """What a held joint's tendons show of their excursion is stretch, not moment arm."""
     e = EXPERIMENTS[experiment]
     return tuple(c for c in e.channels if not (e.held and c == "tendon_excursion"))
@@ -124,7 +124,7 @@ def _total(solution: Solution, model: Model, free, prior: Prior) -> float:
     return solution.cost + 0.5 * float(offset @ offset)
 
 
-def _cad_prior(session: Session, cad: np.ndarray, free, parameters, model: Model) -> Prior:
+def cad_prior(session: Session, cad: np.ndarray, free, parameters, model: Model) -> Prior:
     """Masses and centres of mass as the file gives them."""
     given = np.asarray(ravel(model)).copy()
     for group in ("mass", "com"):

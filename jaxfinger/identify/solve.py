@@ -77,11 +77,11 @@ def solve(
     masses = np.array([p.group == "mass" for p in describe(model)])[free]
     if prior is None:
         prior = Prior(theta, np.zeros((0, theta.size)))
-    weights = {n: _ones(s) for n, s in sources.items()}
+    weights = {n: unit_weights(s) for n, s in sources.items()}
     share = 0.0
     for robust in (False, True) if huber else (False,):
         if robust:
-            weights, share = _huber(linearised, huber)
+            weights, share = huber_weights(linearised, huber)
             # Gaussian residuals pass a limit of 3 in 0.3 % of cases: half as many again are outliers.
             if share < 0.005:
                 break
@@ -102,7 +102,7 @@ def solve(
             best = cost
             A = np.concatenate([factor[:, free], prior.root])
             b = np.concatenate([factor[:, -1], offset])
-            basis, invisible, scale = _visible(A)
+            basis, invisible, scale = visible(A)
             z = _minimise(A @ basis, b)
             step = basis @ z
             small = float(np.max(np.abs(z), initial=0.0))
@@ -140,7 +140,7 @@ def _stacked(linearised: dict[str, Linearised], sources: dict[str, Source], size
     return out
 
 
-def _visible(A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def visible(A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Basis B of the combinations that data or prior see, the others, and the scale of each parameter."""
     norm = np.linalg.norm(A, axis=0)
     scale = 1.0 / np.where(norm > 0, norm, 1.0)
@@ -178,7 +178,7 @@ def _minimise(A: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray(_dogleg(jnp.asarray(square), jnp.asarray(right)))[:k]
 
 
-def _huber(linearised: dict[str, Linearised], limit: float) -> tuple[dict[str, Array | None], float]:
+def huber_weights(linearised: dict[str, Linearised], limit: float) -> tuple[dict[str, Array | None], float]:
     """Square roots of Huber's weights, and the share of residuals beyond the limit."""
     beyond = count = 0
     weights: dict[str, Array | None] = {}
@@ -189,6 +189,7 @@ def _huber(linearised: dict[str, Linearised], limit: float) -> tuple[dict[str, A
     return weights, beyond / max(1, count)
 
 
-def _ones(source: Source) -> Array:
+def unit_weights(source: Source) -> Array:
+    """Weights of plain least squares."""
     B, T = source.batch.x.time.shape
     return jnp.ones((B, T * sum(f.shape[0] for f in source.filters.values())))

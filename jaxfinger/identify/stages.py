@@ -143,16 +143,8 @@ def run_stage(fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session
     parameters = describe(fit.model)
     groups = set(stage.frees) & free_groups(recipe)
     prior_groups = {"mass", "com"} if recipe.fit.free_inertia and stage.name.startswith("ID.3") else set()
-    touched = touched_by(stacks, reads, session)
-    free = np.array(
-        [
-            i
-            for i, p in enumerate(parameters)
-            if (p.group in groups and p.determinable and (p.joint or p.tendon) is not None and seen_by(p, touched))
-            or (p.group in prior_groups and fit.covariance[i, i] > 0)
-        ],
-        dtype=int,
-    )
+    touched = touched_by(reads, session)
+    free = stage_free(fit, stage, parameters, touched)
     if not free.size:
         report = StageReport(stage.name, "skipped", message="the recipe leaves its terms out of the nominal model")
         return replace(fit, stages=(*fit.stages, report))
@@ -183,6 +175,19 @@ def run_stage(fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session
     )
 
 
+def stage_free(fit: Fit, stage: Stage, parameters: list[Parameter], touched) -> np.ndarray:
+    """Positions of the parameters that a stage estimates: those of its groups that its trials touch."""
+    groups = set(stage.frees) & free_groups(fit.recipe)
+    prior_groups = {"mass", "com"} if fit.recipe.fit.free_inertia and stage.name.startswith("ID.3") else set()
+    free = [
+        i
+        for i, p in enumerate(parameters)
+        if (p.group in groups and p.determinable and (p.joint or p.tendon) is not None and seen_by(p, touched))
+        or (p.group in prior_groups and fit.covariance[i, i] > 0)
+    ]
+    return np.array(free, dtype=int)
+
+
 def estimate_with_noise(
     model: Model,
     free: np.ndarray,
@@ -204,9 +209,9 @@ def estimate_with_noise(
     return model, solution, noise
 
 
-def touched_by(stacks, reads, session: Session) -> tuple[set[str], set[tuple[str, str]], set[str]]:
+def touched_by(reads, session: Session) -> tuple[set[str], set[tuple[str, str]], set[str]]:
     """Joints instrumented or moved, (tendon, joint) pairs recorded together, tendons pulled, by the trials read."""
-    trials = [session[t] for e in reads for t in stacks[e].trials]
+    trials = [t for t in session if t.experiment in reads and len(t.time) > 1]
     joints = {t.joint for t in trials if t.joint}
     moved = {(k, t.joint) for t in trials if t.joint for k in session.finger.tendon_names}
     return joints, moved, {t.tendon for t in trials if t.tendon}

@@ -1,0 +1,158 @@
+"""Many sessions fitted in one compiled call: forty specimens of a lab, or hundreds of simulated sessions.
+
+All members share the protocol, the recipe and the rig's noise with one session that was identified by itself (the
+template). Each is then a Gauss–Newton iteration of the whole staged fit in the coordinates of the template, in which
+every stage's matrix is near the identity: a handful of products of small matrices an iteration (see `resample`).
+A member that fails or does not converge is named and leaves the rest as they are.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxfinger.data import Session
+from jaxfinger.errors import UserError
+from jaxfinger.experiments import Batch, prepare
+from jaxfinger.identify.fit import Fit
+from jaxfinger.identify.linearise import Filters, white_rows
+from jaxfinger.identify.parameters import Free, ravel, with_flat
+from jaxfinger.identify.resample import Batching, Compressed, batching_here, compress, plan_of, staged_step
+from jaxfinger.identify.solve import SMALL
+from jaxfinger.model import Model
+
+STEPS = 12
+
+
+@dataclass(frozen=True)
+class Members:
+    """Fits of many sessions."""
+
+    values: Float[np.ndarray, "S P"]  # flat vectors; NaN where a member failed
+    std: Float[np.ndarray, "S P"]
+    failed: Bool[np.ndarray, " S"]  # did not converge, or holds data that no fit can take
+    steps: np.ndarray  # Gauss–Newton steps of each
+    template: Fit
+
+    def model(self, k: int) -> Model:
+        """The model of one member, with the template's links."""
+        return with_flat(self.template.model, jnp.asarray(self.values[k]))
+
+
+class _Source(NamedTuple):
+    """One experiment of all members, and how it is read."""
+
+    batch: Batch  # every array with the members first
+    filters: Filters
+    basis: Float[Array, "k q"]  # rows of the basis for the parameters that the experiment depends on
+    free: Free
+    reads: Float[Array, " S"]
+
+
+def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: Batching | None = None) -> Members:
+    """Fit every session as the template was fitted to the session `of`.
+
+    Raises:
+        UserError: a session has another protocol, another finger or other links than the template's.
+    """
+    compressed = compress(of, template)
+    sources = _stack_sessions(sessions, template, compressed)
+    prior = (compressed.grams.H[-1], compressed.grams.reads[:, -1])
+    members = _fit_all(
+        template.model, sources, jnp.asarray(compressed.basis), compressed.sizes, prior, batching_here(batching)
+    )
+    values, std, sound, steps = (np.array(a) for a in members)
+    values[~sound], std[~sound] = np.nan, np.nan
+    return Members(values, std, ~sound, steps, template)
+
+
+def _stack_sessions(sessions: Sequence[Session], template: Fit, compressed: Compressed) -> tuple[_Source, ...]:
+    plan = plan_of(sessions[0], template)
+    reads = {e: c for r, _ in plan for e, c in r.items()}
+    prepared = [prepare(s, [t.name for t in s if t.experiment in reads]) for s in sessions]
+    out = []
+    for e, positions in compressed.positions.items():
+        batches = []
+        for s, stacks in zip(sessions, prepared, strict=True):
+            if e not in stacks or len(stacks[e].trials) != len(prepared[0][e].trials):
+                raise UserError(f"{s.file or s.specimen}: has not the {e} trials of the other sessions; fit it alone")
+            batches.append(stacks[e].batch)
+        T = max(b.x.time.shape[-1] for b in batches)
+        whole = jax.tree.map(lambda *a: jnp.stack(a), *(_padded(b, T) for b in batches))
+        filters = {c: jnp.asarray(template.noise[e, c].coefficients) for c in reads[e]}
+        out.append(
+            _Source(
+                whole,
+                filters,
+                jnp.asarray(compressed.basis[positions]),
+                Free.at(template.model, positions),
+                jnp.array([float(e in r) for r, _ in plan]),
+            )
+        )
+    return tuple(out)
+
+
+def _padded(batch: Batch, T: int) -> Batch:
+    """Longer by samples that do not count."""
+    more = T - batch.x.time.shape[-1]
+
+    def pad(a, mode):
+        return np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, more)], mode=mode)
+
+    x = jax.tree.map(lambda a: pad(a, "edge"), batch.x)
+    return Batch(x, *({c: pad(v, "constant") for c, v in d.items()} for d in (batch.y, batch.mask)))
+
+
+@eqx.filter_jit
+def _fit_all(model, sources, basis, sizes, prior, batching):
+    def one(batches):
+        return _fit(model, [s._replace(batch=b) for s, b in zip(sources, batches, strict=True)], basis, sizes, prior)
+
+    batches = [s.batch for s in sources]
+    return jax.lax.map(one, batches) if batching == "map" else jax.vmap(one)(batches)
+
+
+def _fit(model: Model, sources: list[_Source], basis, sizes, prior):
+    """Gauss–Newton on all stages at once, θ = θ_template + basis z, until nothing moves by more than SMALL."""
+    start = ravel(model)
+    (prior_gram, prior_reads), q = prior, basis.shape[1]
+
+    def stages(z):
+        """H of every stage at z; the prior's residual has moved with z."""
+        shift = jnp.eye(q + 1).at[:-1, -1].set(z)
+        H = prior_reads[:, None, None] * (shift.T @ prior_gram @ shift)
+        at = with_flat(model, start + basis @ z)
+        for s in sources:
+            H = H + s.reads[:, None, None] * _gram(at, s)
+        return H
+
+    def step(state):
+        z, _, k, _ = state
+        dz, _, sound = staged_step(stages(z), sizes, jnp.zeros(sizes[0]))
+        return z + dz, jnp.max(jnp.abs(dz)), k + 1, sound & jnp.all(jnp.isfinite(dz))
+
+    def going(state):
+        _, size, k, sound = state
+        return sound & (size > SMALL) & (k < STEPS)
+
+    z, size, k, sound = jax.lax.while_loop(going, step, (jnp.zeros(q), jnp.inf, 0, jnp.array(True)))
+    _, covariance, _ = staged_step(stages(z), sizes, jnp.zeros(sizes[0]))
+    variance = jnp.sum((basis @ covariance) * basis, axis=1)
+    return start + basis @ z, jnp.sqrt(jnp.maximum(variance, 0.0)), sound & (size <= SMALL), k
+
+
+def _gram(model: Model, source: _Source) -> Float[Array, "q+1 q+1"]:
+    """[J r]ᵀ[J r] of one experiment, J in the coordinates of the stages."""
+    theta = source.free.get(model)
+
+    def rows(dz):
+        return white_rows(source.free.set(model, theta + source.basis @ dz), source.batch, source.filters)[1].ravel()
+
+    r, push = jax.linearize(rows, jnp.zeros(source.basis.shape[1]))
+    A = jnp.concatenate([jax.lax.map(push, jnp.eye(source.basis.shape[1])), r[None]])
+    return A @ A.T

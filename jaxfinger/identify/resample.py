@@ -1,0 +1,198 @@
+"""Refits of a fit's own trials under other weights, all in one compiled call.
+
+At the optimum each trial b is a triangular factor [R_b d_b] (`linearise`). A stage s with basis B_s of what it sees,
+reading trials with weights w_b, moves its parameters by B_s z_s,
+
+    H_s = Σ_b w_b [R_b B_1 … R_b B_s d_b]ᵀ [R_b B_1 … R_b B_s d_b]
+    z_s = −H_s[s, s]⁻¹ (H_s[s, d] + Σ_{t<s} H_s[s, t] z_t),
+
+so that a refit passes its errors on from stage to stage as the fit itself does, and costs a sum of small matrices.
+In these coordinates H_s[s, s] is near the identity: Gram matrices lose nothing. z_0 is given, not solved for: what CAD
+leaves open of the links and no stage estimates, in standard deviations.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxfinger.data import Session
+from jaxfinger.experiments import prepare
+from jaxfinger.identify.fit import Fit
+from jaxfinger.identify.joint import STAGE as JOINT
+from jaxfinger.identify.joint import cad_prior, channels_of
+from jaxfinger.identify.linearise import linearise
+from jaxfinger.identify.parameters import Free, describe, ravel
+from jaxfinger.identify.solve import huber_weights, unit_weights, visible
+from jaxfinger.identify.stages import STAGES, cad_covariance, sources_of, stage_free, touched_by
+
+Batching = Literal["map", "vmap"]
+PIVOT = 1e-4  # smallest pivot of a Cholesky factor of H_s[s, s], which is the identity for the trials as they are
+
+
+class Grams(NamedTuple):
+    """The compressed trials in the coordinates of the stages; the last column is the residual."""
+
+    H: Float[Array, "K q+1 q+1"]  # one a trial, then the prior's, which is never resampled
+    reads: Float[Array, "S K"]  # 1 where a stage reads a trial
+
+
+@dataclass(frozen=True)
+class Compressed:
+    """A fit's trials, ready to be weighted anew."""
+
+    grams: Grams
+    sizes: tuple[int, ...]  # number of coordinates: given by CAD, then of each stage
+    basis: Float[np.ndarray, "P q"]  # δθ = basis z
+    theta: Float[np.ndarray, " P"]  # the fit's flat vector
+    positions: dict[str, np.ndarray]  # in the flat vector, of what each experiment depends on
+    information: Float[np.ndarray, "P P"]  # JᵀJ of all trials, without priors
+    trials: tuple[str, ...]
+    strata: tuple[tuple, ...]  # experiment, joint and tendon of each trial: what is resampled together
+
+
+def compress(session: Session, fit: Fit) -> Compressed:
+    """The trials of the session that the fit was made from, linearised at the fit: the only pass over the samples."""
+    parameters = describe(fit.model)
+    plan = plan_of(session, fit)
+    names = [t.name for t in session if any(t.experiment in reads for reads, _ in plan)]
+    stacks = prepare(session, names)
+    plan = [({e: c for e, c in reads.items() if e in stacks}, free) for reads, free in plan]
+    everything = {e: c for reads, _ in plan for e, c in reads.items()}
+    sources = sources_of(stacks, everything, fit.noise, parameters)
+    P = len(parameters)
+    blocks, trials = [], []
+    for e, source in sources.items():
+        at = Free.at(fit.model, source.positions)
+        lin = linearise(fit.model, at, source.batch, source.filters, unit_weights(source))
+        weights, share = huber_weights({e: lin}, fit.recipe.fit.huber) if fit.recipe.fit.huber else ({}, 0.0)
+        if share > 0.005:
+            lin = linearise(fit.model, at, source.batch, source.filters, weights[e])
+        factor = np.asarray(lin.factor)
+        block = np.zeros((*factor.shape[:2], P + 1))
+        block[..., [*source.positions, P]] = factor
+        blocks += list(block)
+        trials += [(e, t) for t in stacks[e].trials]
+
+    information = sum(b[:, :-1].T @ b[:, :-1] for b in blocks)
+    prior = _prior_block(session, fit, plan, parameters)
+    blocks.append(prior)
+    reads = np.array([[*(float(e in r) for e, _ in trials), 1.0] for r, _ in plan])
+    bases = [_given(session, plan, parameters)]
+    for k, (_, free) in enumerate(plan):
+        A = np.concatenate([b[:, free] for b, w in zip(blocks, reads[k], strict=True) if w])
+        basis = np.zeros((P, 0))
+        if A.size:
+            small, _, _ = visible(np.linalg.qr(A, mode="r"))
+            basis = np.zeros((P, small.shape[1]))
+            basis[free] = small
+        bases.append(basis)
+    basis = np.concatenate(bases, axis=1)
+    M = [np.column_stack([b[:, :-1] @ basis, b[:, -1]]) for b in blocks]
+    return Compressed(
+        Grams(jnp.asarray(np.stack([m.T @ m for m in M])), jnp.asarray(reads)),
+        tuple(b.shape[1] for b in bases),
+        basis,
+        np.asarray(ravel(fit.model)),
+        {e: source.positions for e, source in sources.items()},
+        np.asarray(information),
+        tuple(t for _, t in trials),
+        tuple((e, session[t].joint, session[t].tendon) for e, t in trials),
+    )
+
+
+def plan_of(session: Session, fit: Fit) -> list[tuple[dict[str, tuple[str, ...]], np.ndarray]]:
+    """What each stage read and estimated; a stage whose parameters a later one estimates again is left out."""
+    parameters = describe(fit.model)
+    done = [s.name for s in fit.stages if s.status != "skipped"]
+    if JOINT in done:
+        return [({e: channels_of(e) for e in fit.recipe.fit.joint_experiments}, fit.estimated)]
+    touched = {name: touched_by(STAGES[name].reads, session) for name in done}
+    plan = [(STAGES[n].reads, stage_free(fit, STAGES[n], parameters, touched[n])) for n in done]
+    later = [np.concatenate([np.zeros(0, int), *(f for _, f in plan[k + 1 :])]) for k in range(len(plan))]
+    return [p for p, after in zip(plan, later, strict=True) if not np.isin(p[1], after).all()]
+
+
+def _prior_block(session: Session, fit: Fit, plan, parameters) -> Float[np.ndarray, "rows P+1"]:
+    """CAD's rows on the masses and centres of mass that the fit estimated, at the fit."""
+    free = np.unique(np.concatenate([f for _, f in plan]))
+    cad = np.diag(cad_covariance(session, parameters))
+    prior = cad_prior(session, cad, free, parameters, fit.model)
+    rows = np.zeros((len(prior.root), len(parameters) + 1))
+    rows[:, free] = prior.root
+    rows[:, -1] = prior.root @ (np.asarray(ravel(fit.model))[free] - prior.mean)
+    return rows
+
+
+def _given(session: Session, plan, parameters) -> Float[np.ndarray, "P k"]:
+    """One standard deviation of every mass and centre of mass that CAD gives and no stage estimates."""
+    std = np.sqrt(np.diag(cad_covariance(session, parameters)))
+    std[np.concatenate([free for _, free in plan])] = 0.0
+    return np.diag(std)[:, std > 0]
+
+
+def refit(
+    compressed: Compressed,
+    weights: Float[np.ndarray, "R K"],
+    given: Float[np.ndarray, "R k"] | None = None,
+    batching: Batching | None = None,
+) -> tuple[Float[np.ndarray, "R P"], Bool[np.ndarray, " R"]]:
+    """Flat vectors of the refits under each row of trial weights, and which of them failed (and are NaN).
+
+    `given`: what CAD gives moves by so many of its standard deviations (default none).
+    `batching`: one after another (`map`, best on a CPU) or in lockstep (`vmap`, best on a GPU); by default what suits
+    the device at hand.
+    """
+    weights = np.concatenate([weights, np.ones((len(weights), 1))], axis=1)
+    if given is None:
+        given = np.zeros((len(weights), compressed.sizes[0]))
+    z, sound = _refit_all(
+        compressed.grams, compressed.sizes, jnp.asarray(weights), jnp.asarray(given), batching_here(batching)
+    )
+    theta = compressed.theta + np.asarray(z) @ compressed.basis.T
+    failed = ~np.asarray(sound)
+    theta[failed] = np.nan
+    return theta, failed
+
+
+def batching_here(batching: Batching | None) -> Batching:
+    """What was asked for, or what suits the device at hand."""
+    return batching or ("map" if jax.default_backend() == "cpu" else "vmap")
+
+
+@eqx.filter_jit
+def _refit_all(grams: Grams, sizes: tuple[int, ...], members: tuple[Array, Array], batching: Batching):
+    def one(member):
+        return _refit(grams, sizes, *member)
+
+    return jax.lax.map(one, members) if batching == "map" else jax.vmap(one)(members)
+
+
+def _refit(grams: Grams, sizes: tuple[int, ...], weights: Float[Array, " K"], given: Float[Array, " k"]):
+    H = jnp.tensordot(grams.reads * weights, grams.H, 1)
+    z, _, sound = staged_step(H, sizes, given)
+    return z, sound & jnp.all(jnp.isfinite(z))
+
+
+def staged_step(
+    H: Float[Array, "S q+1 q+1"], sizes: tuple[int, ...], given: Float[Array, " k"]
+) -> tuple[Float[Array, " q"], Float[Array, "q q"], Bool[Array, ""]]:
+    """z of all stages, its covariance with the earlier stages' errors carried on, and whether all of it is seen."""
+    z, covariance, sound = given, jnp.eye(given.size), jnp.array(True)
+    for stage, size in zip(H, sizes[1:], strict=True):
+        start = z.size
+        own = slice(start, start + size)
+        L = jnp.linalg.cholesky(stage[own, own])
+        sound &= jnp.all(jnp.diagonal(L) > PIVOT)  # false for NaN too
+        # K of the earlier stages' errors, and the step
+        solved = jax.scipy.linalg.cho_solve((L, True), stage[own])
+        K = solved[:, :start]
+        z = jnp.concatenate([z, -solved[:, -1] - K @ z])
+        cross = K @ covariance
+        new = jax.scipy.linalg.cho_solve((L, True), jnp.eye(size)) + cross @ K.T
+        covariance = jnp.block([[covariance, -cross.T], [-cross, new]])
+    return z, covariance, sound

@@ -1,0 +1,55 @@
+"""What trials cannot see is named with the experiment that would show it; base parameters of known chains."""
+
+import numpy as np
+import pytest
+
+from jaxfinger.identify import base_parameters
+from jaxfinger.identify.identifiability import directions, name_invisible
+from jaxfinger.identify.parameters import Parameter
+from jaxfinger.model import Finger
+from tests.model.fingers import description
+
+PARAMETERS = [
+    Parameter("elastic torque MCP^0", "elastic", "N m", "MCP"),
+    Parameter("elastic torque MCP^1", "elastic", "N m/rad", "MCP"),
+    Parameter("centre of mass MCP x", "com", "m", "MCP"),
+]
+
+
+def test_a_combination_that_is_not_seen_is_named():
+    rng = np.random.default_rng(0)
+    a, b = rng.standard_normal((2, 50))
+    J = np.column_stack([a, b, 2 * a])  # the first and the last parameter cannot be told apart
+    found = directions(PARAMETERS, np.arange(3), J.T @ J)
+    assert [d.status for d in found] == ["invisible", "seen", "seen"]
+    assert set(found[0].shares) == {"elastic torque MCP^0", "centre of mass MCP x"}
+    assert "mounted otherwise" in found[0].remedy
+    assert "mounted otherwise" in str(found[0])
+    (sentence,) = name_invisible(PARAMETERS, np.arange(3), np.array([[1.0, 0.0, -1.0]]) / np.sqrt(2))
+    assert "elastic torque MCP^0" in sentence
+    assert "ID.3-static of joint MCP" in sentence
+
+
+def test_a_parameter_that_no_trial_touches_is_invisible():
+    J = np.column_stack([np.ones(5), np.zeros(5), np.arange(5.0)])
+    assert directions(PARAMETERS, np.arange(3), J.T @ J)[0].shares.keys() == {"elastic torque MCP^1"}
+
+
+@pytest.mark.parametrize("m", [1, 3])
+def test_base_parameters_of_a_spatial_chain(m):
+    """A revolute chain with generic axes and gravity along no axis: 3 + 7 (m − 1) (Gautier 1991; Khalil 2002)."""
+    base = base_parameters(Finger.from_description(description(m, m, prismatic=False)))
+    assert base.rank == 3 + 7 * (m - 1)
+    np.testing.assert_allclose(base.combinations @ base.combinations.T, np.eye(base.rank), atol=1e-10)
+
+
+def test_base_parameters_of_a_planar_finger():
+    """Parallel axes, gravity in the plane: 3 a link, the first's mass moments 2 and its inertia 1."""
+    d = description(3, 3, prismatic=False)
+    planar = dict(
+        axis=np.tile([0.0, 1.0, 0.0], (3, 1)),
+        origin=np.array([[0.0, 0, 0], [0.05, 0, 0], [0.03, 0, 0]]),
+        gravity=np.array([0.0, 0.0, -9.81]),
+    )
+    base = base_parameters(Finger.from_description(type(d)(**{**vars(d), **planar})))
+    assert base.rank == 9

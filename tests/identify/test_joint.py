@@ -1,0 +1,104 @@
+"""The joint refinement: right, no wider than the stages, the same from poor starts, and never counting data twice."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfinger.errors import UserError
+from jaxfinger.identify import Recipe, identify, refine
+from jaxfinger.identify.parameters import Free, describe, ravel
+from jaxfinger.identify.recipe import FitRecipe
+from jaxfinger.synthetic import measure
+
+
+def values(fit):
+    return np.asarray(ravel(fit.model))
+
+
+def scaled(fit, factor, *groups):
+    positions = np.array([i for i in fit.estimated if describe(fit.model)[i].group in groups])
+    free = Free.at(fit.model, positions)
+    return replace(fit, model=free.set(fit.model, jnp.asarray(factor * values(fit)[positions])))
+
+
+def test_estimates_lie_within_their_intervals(joint, true_values):
+    free = joint.estimated
+    z = (values(joint) - true_values)[free] / joint.std[free]
+    assert joint.stages[-1].status == "fitted"
+    assert 0.6 < np.sqrt(np.mean(z**2)) < 1.4  # some thirty independent numbers
+    assert np.abs(z).max() < 4.5
+    assert 0.9 < joint.stages[-1].chi2_per_row < 1.1
+
+
+def test_no_interval_is_wider_than_the_stages(staged, joint):
+    ratio = joint.std[staged.estimated] / staged.std[staged.estimated]
+    assert ratio.max() < 1.02
+    assert np.median(ratio) < 1.0
+
+
+def test_the_same_data_are_counted_once(session, joint):
+    """A second refinement changes nothing: neither the estimate nor the intervals."""
+    again = refine(session, joint)
+    free = joint.estimated
+    np.testing.assert_allclose(again.std[free], joint.std[free], rtol=1e-3)
+    assert np.abs((values(again) - values(joint))[free] / joint.std[free]).max() < 0.05
+
+
+def test_other_data_are_the_prior(clean, staged, joint):
+    """A second session halves the variance of what CAD has no part in, and the estimate stays between the two."""
+    other = measure(clean, 1)
+    both = refine(other, replace(joint, data_hash="of another file"))
+    groups = np.array([p.group for p in describe(joint.model)])
+    free = joint.estimated[np.isin(groups[joint.estimated], ["moment_arm", "friction", "damping"])]
+    ratio = both.std[free] / joint.std[free]
+    assert abs(np.median(ratio) - np.sqrt(0.5)) < 0.05  # each session estimates its own noise
+    assert ratio.min() > 0.55
+    assert ratio.max() < 0.9
+
+
+@pytest.mark.parametrize(
+    ("factor", "groups"),
+    [
+        (0.0, ("moment_arm",)),
+        (0.0, ("tendon_friction",)),
+        (0.0, ("elastic", "friction")),
+        (3.0, ("moment_arm", "elastic", "friction", "damping", "tendon_friction")),
+        (1 / 3, ("moment_arm", "elastic", "friction", "damping", "tendon_friction")),
+    ],
+)
+def test_poor_starts_lead_to_the_same_optimum(session, staged, joint, factor, groups):
+    found = refine(session, scaled(staged, factor, *groups))
+    free = joint.estimated
+    assert found.stages[-1].status == "fitted"
+    assert np.abs((values(found) - values(joint))[free] / joint.std[free]).max() < 0.1
+
+
+def test_a_start_without_a_slope_is_left(session, staged, joint):
+    """Losses so negative that every one is bounded at zero have no derivative: the same optimum, or the fit says so."""
+    found = refine(session, scaled(staged, -3.0, "tendon_friction"))
+    free = joint.estimated
+    same = np.abs((values(found) - values(joint))[free] / joint.std[free]).max() < 0.1
+    assert same or found.stages[-1].status == "not converged"
+
+
+def test_masses_stay_positive(session, staged):
+    """CAD that is far too heavy and sure of itself in nothing pulls the masses down, not below zero."""
+    finger = replace(session.finger, mass=session.finger.mass * 3, mass_std=session.finger.mass * 3)
+    fit = refine(replace(session, finger=finger), staged)
+    assert np.all(np.asarray(fit.model.finger.mass) > 0)
+    assert fit.stages[-1].status == "fitted"
+
+
+def test_a_session_without_such_trials_is_refused(session, staged):
+    with pytest.raises(UserError, match=r"has no trial of ID\.2"):
+        refine(session.with_trials([]), staged)
+
+
+def test_a_missing_stage_is_named_and_its_parameters_left_alone(session):
+    partial = session.select("ID.2", "ID.4")
+    fit = identify(partial, Recipe(fit=FitRecipe()))
+    assert [s.status == "skipped" for s in fit.stages] == [False, True, True, False]
+    assert "ID.3-static" in fit.stages[1].message
+    assert not np.any(np.asarray(fit.model.joint_torque.friction))
