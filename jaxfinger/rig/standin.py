@@ -2,7 +2,7 @@
 
     python -m jaxfinger.rig.standin --port 48898
 
-It prints `listening 127.0.0.1:PORT` and runs until its standard input closes or it is stopped.
+It prints `listening 127.0.0.1:PORT` and runs until it is stopped.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from jaxfinger.rig import contract
 from jaxfinger.rig.ams import AmsServer
@@ -89,7 +89,14 @@ class Lockstep:
 def running(speed: float = 1.0, heartbeat: float = 0.25, seed: int = 0, filtered: bool = False) -> Iterator[str]:
     """A stand-in in a process of its own; yields host:port for the rig file's `ip`."""
     arguments = ["--speed", str(speed), "--heartbeat", str(heartbeat), "--seed", str(seed)]
-    command = [sys.executable, "-m", "jaxfinger.rig.standin", *arguments, *(["--filtered"] if filtered else [])]
+    command = [
+        sys.executable,
+        "-m",
+        "jaxfinger.rig.standin",
+        "--with-parent",
+        *arguments,
+        *(["--filtered"] if filtered else []),
+    ]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stdin is not None
@@ -118,6 +125,7 @@ def main() -> None:
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the sensors' noise")
     parser.add_argument("--filtered", action="store_true", help="terminals at their factory filter of 22 Hz")
+    parser.add_argument("--with-parent", action="store_true", help="end when standard input closes")
     options = parser.parse_args()
     limits = HardLimits(heartbeat_s=options.heartbeat * (options.speed or 1000.0))
     stop = threading.Event()
@@ -126,8 +134,12 @@ def main() -> None:
         sys.stdin.read()
         stop.set()
 
-    threading.Thread(target=parent_is_gone, daemon=True).start()
-    serve(Controller(limits=limits, seed=options.seed, filtered=options.filtered), options.speed, options.port, stop)
+    if options.with_parent:
+        threading.Thread(target=parent_is_gone, daemon=True).start()
+    with suppress(KeyboardInterrupt):
+        serve(
+            Controller(limits=limits, seed=options.seed, filtered=options.filtered), options.speed, options.port, stop
+        )
 
 
 if __name__ == "__main__":

@@ -1,0 +1,167 @@
+"""What a person meets: the commands, the live view, the keys, a recording played back."""
+
+import io
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import SHORT
+from rich.console import Console
+
+from jaxfinger.cli.record import record, recover
+from jaxfinger.data import read_session
+from jaxfinger.errors import UserError
+from jaxfinger.rig import Supervisor, open_rig, parse_plan, parse_rig, read_plan, read_rig, run
+from jaxfinger.rig.backend import CommandRefused, EndOfReplay, Setup, TensionRamp
+from jaxfinger.rig.backends.simulated import SimulatedRig
+from jaxfinger.rig.contract import Trip
+from jaxfinger.rig.examples import plan_toml, rig_toml
+from jaxfinger.rig.live import LiveView
+from jaxfinger.rig.operator import AtTerminal, Nobody
+from jaxfinger.rig.runner import View
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+@pytest.fixture
+def files(tmp_path):
+    (tmp_path / "rig.toml").write_text(rig_toml())
+    (tmp_path / "plan.toml").write_text(SHORT)
+    return tmp_path
+
+
+def test_a_dry_run_says_what_would_be_done_and_writes_nothing(files, capsys):
+    before = sorted(files.iterdir())
+    record(files / "plan.toml", rig=files / "rig.toml", output=files / "s.h5", dry_run=True)
+    said = capsys.readouterr().out
+    assert "02-ID.4-T3-MCP" in said
+    assert "up to 6 N" in said
+    assert "Couple the external motor to MCP" in said
+    assert "nothing was moved" in said
+    assert sorted(files.iterdir()) == before
+
+
+def test_record_from_the_command_line(files, capsys):
+    record(files / "plan.toml", rig=files / "rig.toml", output=files / "s.h5", yes=True)
+    assert "2 trials, all complete" in capsys.readouterr().out
+    assert len(read_session(files / "s.h5")) == 2
+    with pytest.raises(UserError, match="exists already"):
+        record(files / "plan.toml", rig=files / "rig.toml", output=files / "s.h5", yes=True)
+
+
+def test_without_a_terminal_nobody_can_stop_it(files):
+    with pytest.raises(UserError, match="stop key needs a terminal"):
+        record(files / "plan.toml", rig=files / "rig.toml", output=files / "s.h5")
+    assert not (files / "s.h5").exists()
+
+
+def test_recover_from_the_command_line(files, capsys, monkeypatch):
+    monkeypatch.setattr(SimulatedRig, "filters", lambda self: (_ for _ in ()).throw(UserError("no filters")))
+    with pytest.raises(UserError, match="no filters"):
+        record(files / "plan.toml", rig=files / "rig.toml", output=files / "s.h5", yes=True)
+    monkeypatch.undo()
+    rig = parse_rig(rig_toml())
+
+    class Died(BaseException):
+        pass
+
+    def die(view):
+        if view.number == 2 and view.recording:
+            raise Died
+
+    with pytest.raises(Died):
+        run(parse_plan(SHORT, rig), SimulatedRig(rig), files / "s.h5", observe=die)
+    recover(files / "s.h5.wal", output=files / "rescued.h5")
+    assert "2 trials, cut short: 02-ID.4-T3-MCP" in capsys.readouterr().out
+    with pytest.raises(UserError, match="not overwritten"):
+        recover(files / "s.h5.wal", output=files / "rescued.h5")
+
+
+def test_the_documents_examples_are_good():
+    rig = read_rig(DOCS / "rig-example.toml")
+    assert rig.backend == "ads"
+    plan = read_plan(DOCS / "plan-example.toml", rig)
+    assert {t.experiment for t in plan.trials} == {t.experiment for t in parse_plan(plan_toml(), rig).trials}
+
+
+def test_the_live_view_shows_tension_and_angle(rig, quiet_block):
+    text = io.StringIO()
+    view = LiveView(rig, Console(file=text, force_terminal=True, width=100, color_system=None))
+    with view:
+        view(View("02-ID.4-T3-MCP", 2, 9, "moving", quiet_block(), 7, True))
+    shown = text.getvalue()
+    for part in ("● 2/9 02-ID.4-T3-MCP: moving, 7 samples lost", "T3", "2.00 N", "MCP", "20.1 °", "N mm"):
+        assert part in shown
+
+
+def test_outside_a_terminal_it_is_a_line_a_trial(rig, quiet_block):
+    text = io.StringIO()
+    with LiveView(rig, Console(file=text, width=100)) as view:
+        for _ in range(3):
+            view(View("a", 1, 2, "moving", quiet_block(), 0, True))
+        view(View("b", 2, 2, "moving", quiet_block(), 0, True))
+    assert text.getvalue().splitlines() == ["1/2 a", "2/2 b"]
+
+
+@pytest.mark.parametrize("key", ["q", " ", "\x1b"])
+def test_keys_at_the_terminal(key):
+    said = []
+    person = AtTerminal(said.append)
+    answered = threading.Thread(target=person.ask, args=("Fix the joints.", lambda: True))
+    answered.start()
+    while not said:
+        pass
+    person.key("x")
+    assert answered.is_alive()
+    person.key("\n")
+    answered.join(20)
+    assert not answered.is_alive()
+    assert not person.stop_requested()
+    person.key(key)
+    assert person.stop_requested()
+    person.ask("again", lambda: True)  # returns at once: the rig is being stopped
+    AtTerminal(said.append).ask("dead", lambda: False)
+
+
+def test_a_bench_cannot_prepare_itself(rig, tmp_path, monkeypatch):
+    """--yes on a rig that needs hands is refused before it is armed."""
+    machine = SimulatedRig(rig)
+    monkeypatch.setattr(machine, "_has_bench", lambda: False)
+    with pytest.raises(UserError, match="run without --yes"):
+        run(parse_plan(SHORT, rig), machine, tmp_path / "s.h5", operator=Nobody())
+    assert machine.controller.acknowledged == 0
+    assert not machine.prepare(Setup("x"))
+
+
+def test_a_recording_played_back(files, rig):
+    record(files / "plan.toml", rig=files / "rig.toml", output=files / "s.h5", yes=True)
+    (files / "replay.toml").write_text(rig_toml("replay", {"file": "s.h5", "trial": "02-ID.4-T3-MCP"}))
+    trial = read_session(files / "s.h5")["02-ID.4-T3-MCP"]
+    with open_rig(read_rig(files / "replay.toml")) as replay:
+        assert "fingertip_force x" not in [c.name for c in replay.description.channels]
+        supervisor, tension = Supervisor(replay.description), []
+        column = replay.description.index("tension", "T3")
+        with pytest.raises(EndOfReplay):
+            play(replay, supervisor, tension, column)
+        np.testing.assert_array_equal(np.concatenate(tension), trial.tendon_force[:, 2])
+        for refused in (replay.arm, lambda: replay.command(TensionRamp({"T1": 1.0}, 1.0))):
+            with pytest.raises(CommandRefused):
+                refused()
+    tight = rig_toml("replay", {"file": "s.h5", "trial": "02-ID.4-T3-MCP"}).replace(
+        "tension_max = 18.0", "tension_max = 5.0"
+    )
+    (files / "replay.toml").write_text(tight)
+    with open_rig(read_rig(files / "replay.toml")) as replay:
+        supervisor = Supervisor(replay.description)
+        with pytest.raises(AssertionError):
+            play(replay, supervisor, [], 0)
+        assert supervisor.tripped[0].trip is Trip.TENSION
+        assert trial.tendon_force[supervisor.tripped[0].seq, 2] > 5.0
+
+
+def play(replay, supervisor, tension, column):
+    while True:
+        block = replay.read_block(1.0)
+        assert supervisor.check(block) == []
+        tension.append(block.x[:, column])
