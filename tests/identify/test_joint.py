@@ -23,9 +23,9 @@ def scaled(fit, factor, *groups):
     return replace(fit, model=free.set(fit.model, jnp.asarray(factor * values(fit)[positions])))
 
 
-def test_estimates_lie_within_their_intervals(joint, true_values):
+def test_estimates_lie_within_their_intervals(joint, truth):
     free = joint.estimated
-    z = (values(joint) - true_values)[free] / joint.std[free]
+    z = (values(joint) - truth)[free] / joint.std[free]
     assert joint.stages[-1].status == "fitted"
     assert 0.6 < np.sqrt(np.mean(z**2)) < 1.4  # some thirty independent numbers
     assert np.abs(z).max() < 4.5
