@@ -1,0 +1,53 @@
+"""A slow disk never holds up whoever hands samples over, and loses none of them."""
+
+import threading
+
+import numpy as np
+
+from jaxfinger.rig import recorder as module
+from jaxfinger.rig import wal
+from jaxfinger.rig.backend import Block
+from jaxfinger.rig.recorder import Recorder
+
+
+def block(first, count=50):
+    seq = np.arange(first, first + count, dtype=np.uint64)
+    return Block(seq, seq, np.zeros((count, 2)), np.zeros(count, np.uint32), np.zeros(count, np.uint32))
+
+
+class Slow(wal.LogWriter):
+    """A disk that does not answer until it is let go."""
+
+    go = threading.Event()
+
+    def write(self, tag, payload):
+        self.go.wait(60)
+        super().write(tag, payload)
+
+
+def test_a_disk_that_stands_still_does_not_hold_up_the_reader(tmp_path):
+    Slow.go = threading.Event()
+    log = Recorder(tmp_path / "a.wal", {}, opener=Slow.create)
+    for k in range(400):
+        log.block(block(50 * k))
+    assert log.waiting == 20_000  # all taken, none written: this line is reached while the disk stands still
+    Slow.go.set()
+    log.flush()
+    log.close()
+    assert log.failure is None
+    seq = np.concatenate([f.block.seq for f in wal.read_log(log.path) if f.tag == wal.DATA])
+    np.testing.assert_array_equal(seq, np.arange(20_000))
+
+
+def test_a_disk_too_slow_for_too_long_is_a_reason_to_stop(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "QUEUE_LIMIT", 1000)
+    Slow.go = threading.Event()
+    log = Recorder(tmp_path / "a.wal", {}, opener=Slow.create)
+    for k in range(30):
+        log.block(block(50 * k))
+    assert log.failure is not None
+    assert "too slow" in log.failure
+    log.put(wal.END, {"complete": False})
+    Slow.go.set()
+    log.close()
+    assert [f.tag for f in wal.read_log(log.path)][-1] == wal.END
