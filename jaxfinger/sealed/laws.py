@@ -46,19 +46,34 @@ class Finger:
             body = d.body(body)
         self.plant = plant if plant is not None and body is specimen.finger else Plant(body)
         self.m, self.n = body.m, body.n
+        self._last: tuple | None = None
 
     @cached_property
-    def _powers(self):
-        return np.arange(1, self.specimen.excursion.shape[-1] + 1)
+    def _maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Exponents 1 … 4, and the matrices that take all qᵖ to l and all qᵖ⁻¹ to C: one product each instead
+        of a sum a joint.
+        """
+        arms = self.specimen.excursion
+        n, m, degree = arms.shape
+        powers = np.arange(1, degree + 1)
+        slopes = np.zeros((m, degree, n, m))
+        for j in range(m):
+            slopes[j, :, :, j] = (arms[:, j] * powers).T
+        return powers, arms.reshape(n, m * degree).T.copy(), slopes.reshape(m * degree, n * m)
 
     def geometry(
         self, q: Float[np.ndarray, "... m"]
     ) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n m"]]:
-        """Nominal excursion l = f(q) in m, and C = ∂f/∂q."""
-        low = q[..., None] ** (self._powers - 1)
-        arms = self.specimen.excursion
-        length = np.einsum("...mp,nmp->...n", low * q[..., None], arms)
-        return length, np.einsum("...mp,nmp->...nm", low, arms * self._powers)
+        """Nominal excursion l = f(q) in m, and C = ∂f/∂q. The last result is kept: every law of an instant asks."""
+        if self._last is not None and self._last[0] is q:
+            return self._last[1]
+        powers, to_length, to_arm = self._maps
+        low = q[..., None] ** (powers - 1)
+        flat = (*q.shape[:-1], len(to_length))
+        length = (low * q[..., None]).reshape(flat) @ to_length
+        result = length, (low.reshape(flat) @ to_arm).reshape(*q.shape[:-1], self.n, self.m)
+        self._last = q, result
+        return result
 
     def path(self, s: State) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n m"]]:
         """Excursion as the tendon is pulled in, and its derivative by q, departures included."""
@@ -69,7 +84,7 @@ class Finger:
 
     def speed(self, s: State) -> Float[np.ndarray, "... n"]:
         """l̇ = C q̇ in m/s."""
-        return np.einsum("...nm,...m->...n", self.geometry(s.q)[1], s.qd)
+        return (self.geometry(s.q)[1] @ s.qd[..., None])[..., 0]
 
     def passive(self, s: State) -> Float[np.ndarray, "... m"]:
         """τ_k + τ_d in N m: what resists without dry friction."""

@@ -27,6 +27,7 @@ from .sensors import Sensors
 from .specimens import Specimen
 
 COARSE = {250.0: 25.0, 1000.0: 60.0}  # Hz: enough for what survives in the mean
+UNSEEN = 1e-9  # severity of what leaves no trace at all, so that its logarithm exists
 SLIDING = 0.03  # rad/s: what counts as a sliding joint
 
 
@@ -250,7 +251,7 @@ def severity(session: Session, departures: Sequence[Departure]) -> tuple[float, 
     trace, labels = session.trace(departures)
     sizes = by_channel(session.left(trace), labels)
     where = max(sizes, key=lambda label: sizes[label])
-    return sizes[where], where
+    return max(sizes[where], UNSEEN), where
 
 
 def calibrate(
@@ -267,7 +268,7 @@ def calibrate(
             best = current, reached, where
         if abs(reached / target - 1) < 0.1 or size == (departure.largest if reached < target else departure.smallest):
             break
-        point = np.log(size), np.log(max(reached, 1e-9) / target)
+        point = np.log(size), np.log(reached / target)
         low, high = (point, high) if point[1] < 0 else (low, point)
         if low and high:  # false position, kept off the ends
             share = np.clip(low[1] / (low[1] - high[1]), 0.1, 0.9)

@@ -1,0 +1,48 @@
+"""rms on fresh trials, of differences put in by hand."""
+
+import numpy as np
+import pytest
+
+from jaxfinger.data import Session, Trial
+from jaxfinger.sealed.closure import gap_by_channel
+from jaxfinger.sealed.laws import Finger
+from jaxfinger.sealed.record import commanded, record
+
+
+def test_differences_put_in_come_out(specimen, nominal: Finger, plans):
+    rng = np.random.default_rng(0)
+    trials, predicted = {}, {}
+    for plan in plans:
+        if plan.experiment not in ("ID.4", "ID.2", "VD.2"):
+            continue
+        truth = record(nominal, plan, commanded(plan, 50.0))
+        trial = Trial(
+            plan.name, plan.experiment, truth.time, truth.q, truth.tension, tendon_excursion=truth.excursion,
+            joint_torque=truth.torque,
+            fingertip_force=truth.force,
+        )  # fmt: skip
+        said = {"time": truth.time, "tendon_excursion": truth.excursion + 3e-3}  # a constant is no gap
+        if truth.torque is not None:
+            said["joint_torque"] = truth.torque + 2e-3
+        if truth.force is not None:
+            said["fingertip_force"] = truth.force + 0.1 * rng.choice([-1, 1], truth.force.shape)
+        trials[plan.name], predicted[plan.name] = trial, said
+    gap = gap_by_channel(Session("s", specimen.cad, trials), predicted)
+    assert gap["ID.4", "joint_torque"] == pytest.approx(2e-3)
+    assert gap["VD.2", "fingertip_force"] == pytest.approx(0.1)
+    for experiment in ("ID.2", "ID.4", "VD.2"):
+        assert gap[experiment, "tendon_excursion"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_torque_of_vd3_counts_only_where_joint_and_tendons_slide(specimen):
+    t = np.arange(4000) * 1e-3
+    q = np.full((4000, 3), 0.4)
+    q[:, 0] += np.where(t < 2, 0.0, 0.3 * (t - 2))  # the base joint rests, then moves at 0.3 rad/s
+    length = Finger(specimen).geometry(q)[0]
+    trial = Trial("v", "VD.3", t, q, np.full((4000, 5), 3.0), tendon_excursion=length)
+    torque = np.zeros((4000, 3))
+    torque[t < 1.9, 0] = 1.0  # friction at rest takes any value
+    torque[t > 2.1, 0] = 2e-3
+    torque[:, 1:] = 1.0
+    gap = gap_by_channel(Session("s", specimen.cad, {"v": trial}), {"v": {"time": t, "joint_torque": torque}})
+    assert gap["VD.3", "joint_torque"] == pytest.approx(2e-3, rel=0.05)
