@@ -1,11 +1,9 @@
 """The ceiling: which other causes could not be told from the true one, by any method, with the session at hand.
 
-For the truth and each rival, the trace that a nominal refit leaves is known without noise. The log-likelihood that
-is left when the
-rival, at its best size, stands in for the truth is D = ½ ‖z‖² (1 − cos²(z, z_rival)), with rows weighted so that
-samples of one hold
-count once. Below `TELLING` nats the two look alike; `research` on fault isolation calls this quantitative
-distinguishability.
+For the truth and each rival, the trace that a nominal refit leaves is known without noise. The log-likelihood that is
+lost when the rival, at its best size, stands in for the truth is D = ½ ‖z‖² (1 − cos²(z, z_rival)), with rows weighted
+so that the samples of one second count once: the quantitative distinguishability of Lundgren and Jung (2020, arXiv
+2009.04756) for known noise. Below `TELLING` nats the two look alike.
 """
 
 from __future__ import annotations
