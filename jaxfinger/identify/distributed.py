@@ -17,7 +17,7 @@ from jaxfinger.identify.resample import Batching, Compressed, refit
 
 def initialise(address: str | None = None, processes: int | None = None, process: int | None = None) -> None:
     """Join the job; before anything else touches a device."""
-    jax.distributed.initialize(address, processes, process)
+    jax.distributed.initialize(coordinator_address=address, num_processes=processes, process_id=process)
 
 
 def share(count: int) -> slice:

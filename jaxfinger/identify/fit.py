@@ -1,6 +1,6 @@
 """The result of an identification, and its file."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -11,7 +11,7 @@ from jaxfinger.data import Session, data_hash
 from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.identify.recipe import Recipe
-from jaxfinger.model import Model
+from jaxfinger.model import Effect, Model
 
 SCHEMA = "jaxfinger-fit/1"
 
@@ -66,6 +66,15 @@ class Fit:
     def std(self) -> np.ndarray:
         """Standard deviation of every entry of the flat vector."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    def with_effect(self, effect: Effect, free: tuple[str, ...]) -> "Fit":
+        """The fit with an effect on top of its model, whose named parameters a joint refinement is to estimate."""
+        model = replace(self.model, effects=(*self.model.effects, effect))
+        old, new = ravel(self.model).size, ravel(model).size
+        added = [i for i in range(old, new) if describe(model)[i].name.split()[-1] in free]
+        covariance = np.zeros((new, new))
+        covariance[:old, :old] = self.covariance
+        return replace(self, model=model, covariance=covariance, estimated=np.append(self.estimated, added).astype(int))
 
     def table(self) -> list[dict]:
         """One row an estimated parameter: name, value, std, units."""

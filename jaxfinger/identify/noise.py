@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
+import scipy.signal
 from jaxtyping import Array, Float
 
 from jaxfinger.experiments import Batch, Stack
@@ -78,8 +79,11 @@ def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B 
     for column in series:
         count = sum(int(m.sum()) for _, m, _ in column)
         # A column with few samples of its own borrows the channel's.
-        rows.append(_autoregression(column) if count > 400 else pooled)
+        rows.append(_autoregression(column) if count > 100 else pooled)
     std, innovation, ar = (np.array(x) for x in zip(*rows, strict=True))
+    if stack.experiment.held:
+        scale = _between_holds(_repeats(stack, residual, mask, demean), ar, innovation)
+        std, innovation = std * scale, innovation * scale
     return Noise(std, innovation, ar, source)
 
 
@@ -126,6 +130,24 @@ def _within_holds(residual, mask) -> list[Series]:
         if counts.any():
             series[c].append((e, counts, float(np.mean(lost))))
     return series
+
+
+def _between_holds(series: list[Series], ar: np.ndarray, innovation: np.ndarray) -> float:
+    """How much more the means of holds scatter between repeats than their samples' noise explains; at least 1.
+
+    A hold's tension is measured with an error of its own, which all samples of the hold share: no scatter within holds
+    shows it, and the held joint's torque depends on the tension at holds alone.
+    """
+    ratios = []
+    for column, a, sigma in zip(series, ar, innovation, strict=True):
+        impulse = scipy.signal.lfilter([sigma], np.r_[1.0, -a], np.eye(1, 400)[0])
+        covariance = np.correlate(impulse, impulse, "full")[399:]
+        for e, counts, _ in column:
+            for hold in np.ma.clump_unmasked(np.ma.masked_array(e, ~counts)):
+                n = min(hold.stop - hold.start, 400)
+                expected = (covariance[0] + 2 * ((1 - np.arange(1, n) / n) @ covariance[1:n])) / n
+                ratios.append(e[hold].mean() ** 2 / expected)
+    return max(1.0, float(np.sqrt(np.mean(ratios)))) if len(ratios) > 20 else 1.0
 
 
 def _fast_part(residual, mask) -> list[Series]:

@@ -150,9 +150,8 @@ def refit(
     weights = np.concatenate([weights, np.ones((len(weights), 1))], axis=1)
     if given is None:
         given = np.zeros((len(weights), compressed.sizes[0]))
-    z, sound = _refit_all(
-        compressed.grams, compressed.sizes, jnp.asarray(weights), jnp.asarray(given), batching_here(batching)
-    )
+    members = (jnp.asarray(weights), jnp.asarray(given))
+    z, sound = _refit_all(compressed.grams, compressed.sizes, members, batching_here(batching))
     theta = compressed.theta + np.asarray(z) @ compressed.basis.T
     failed = ~np.asarray(sound)
     theta[failed] = np.nan

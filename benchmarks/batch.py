@@ -1,0 +1,112 @@
+"""Batch fits against one after another, and bootstrap refits against SciPy: ratios from one run.
+
+    python benchmarks/batch.py [--resamples 1000] [--sessions 100]
+
+Every count of resamples and sessions is compiled once, and its compile time stated apart.
+"""
+
+import argparse
+import time
+
+import numpy as np
+import scipy.optimize
+
+from jaxfinger.identify import compress, fit_many, identify, refit
+from jaxfinger.identify.parameters import ravel
+from jaxfinger.identify.uncertainty import draw_weights
+from jaxfinger.synthetic import clean_session, measure, recipe_from
+
+RECIPE = {
+    "specimen": {"kind": "polynomial"},
+    "trials": {
+        "experiments": ["ID.2", "ID.3-static", "ID.3-dynamic", "ID.4"],
+        "rate": 200.0,
+        "id2": {"strokes": 2, "stroke_time": 3.0},
+        "id3_static": {"step": 20.0},
+        "id3_dynamic": {"cycles": 1, "speeds": [1.0, 2.0]},
+        "id4": {"tensions": [4.0, 7.0, 10.0]},
+    },
+}
+
+
+def timed(work):
+    """Result and seconds of a first call (with compilation) and of a second."""
+    start = time.perf_counter()
+    work()
+    first = time.perf_counter() - start
+    start = time.perf_counter()
+    result = work()
+    return result, first, time.perf_counter() - start
+
+
+def scipy_refit(compressed, roots, weights) -> np.ndarray:
+    """One staged refit as SciPy does it: a least-squares problem a stage, on the rows of the compressed trials."""
+    z, start = np.zeros(compressed.sizes[0]), compressed.sizes[0]
+    for row, size in zip(np.asarray(compressed.grams.reads), compressed.sizes[1:], strict=True):
+        w = np.sqrt(row * np.append(weights, 1.0))
+        A = np.concatenate([s * r for s, r in zip(w, roots, strict=True) if s > 0])
+        own, given = A[:, start : start + size], A[:, -1] + A[:, :start] @ z
+        found = scipy.optimize.least_squares(
+            lambda x, o=own, g=given: o @ x + g, np.zeros(size), jac=lambda x, o=own: o, method="lm"
+        )
+        z, start = np.concatenate([z, found.x]), start + size
+    return compressed.theta + compressed.basis @ z
+
+
+def bootstrap_table(session, fit, resamples: int) -> None:
+    """1,000 refits in one call against a SciPy loop over the same compressed trials, and how the cost grows."""
+    compressed, first, again = timed(lambda: compress(session, fit))
+    print(f"compress the session: {first:.2f} s, {again:.2f} s warm")
+    roots = []
+    for H in np.asarray(compressed.grams.H):
+        values, vectors = np.linalg.eigh(H)
+        roots.append(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
+    rng = np.random.default_rng(0)
+    cost = {}
+    for count in (10, 100, resamples):
+        weights = draw_weights(compressed.strata, count, rng)
+        (theta, failed), first, cost[count] = timed(lambda w=weights: refit(compressed, w))
+        print(f"{count:5d} refits: {cost[count]:8.4f} s, compile {first - cost[count]:.2f} s, failed {failed.sum()}")
+    few = min(resamples, 100)
+    start = time.perf_counter()
+    expected = np.array([scipy_refit(compressed, roots, w) for w in weights[:few]])
+    loop = (time.perf_counter() - start) * resamples / few
+    free = fit.estimated
+    difference = np.abs((theta[:few] - expected)[:, free] / np.maximum(np.abs(expected[:, free]), fit.std[free])).max()
+    print(f"SciPy loop: {loop:.2f} s for {resamples} ({few} run); ratio {loop / cost[resamples]:.0f}")
+    print(f"largest relative difference {difference:.1e}")
+    print(f"cost of {resamples} over 10: {cost[resamples] / cost[10]:.1f} for {resamples / 10:.0f} times the members")
+
+
+def session_table(clean, session, fit, count: int) -> None:
+    """Sessions in one batch against `identify` one after another, reading and filtering included in both."""
+    sessions = [measure(clean, seed) for seed in range(count)]
+    members, first, batch = timed(lambda: fit_many(sessions, fit, session))
+    few = min(count, 10)
+    start = time.perf_counter()
+    alone = [identify(s) for s in sessions[:few]]
+    each = (time.perf_counter() - start) / few
+    difference = max(
+        np.abs((members.values[k] - np.asarray(ravel(a.model)))[fit.estimated] / a.std[fit.estimated]).max()
+        for k, a in enumerate(alone)
+    )
+    print(f"{count} sessions in one batch: {batch:.2f} s, compile {first - batch:.2f} s, failed {members.failed.sum()}")
+    print(f"one after another: {each * count:.2f} s ({few} run); ratio {each * count / batch:.1f}")
+    print(f"largest difference {difference:.2f} standard deviations (the batch takes the template's noise)")
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--resamples", type=int, default=1000)
+    parser.add_argument("--sessions", type=int, default=100)
+    options = parser.parse_args()
+    clean = clean_session(recipe_from(RECIPE))
+    session = measure(clean, 0)
+    fit = identify(session)
+    bootstrap_table(session, fit, options.resamples)
+    session_table(clean, session, fit, options.sessions)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""Are the stated intervals true? Bias, coverage and spread of the staged and joint fits over simulated sessions.
+
+    python benchmarks/coverage.py [--sessions 200] [--joints 1|3] [--joint]
+
+Every session has new noise, new offsets and new errors of CAD. `z` is (estimate − truth)/stated standard deviation.
+Coverage: share of |z| < 1.96. Spread: standard deviation of the estimates over the mean stated one, which for a right
+noise model is the Cramér–Rao bound of the stage.
+"""
+
+import argparse
+
+import numpy as np
+
+from jaxfinger.identify import identify, refine
+from jaxfinger.identify.parameters import describe, ravel
+from jaxfinger.synthetic import (
+    SpecimenPlant,
+    clean_session,
+    measure,
+    nominal_model,
+    paper_finger,
+    polynomial_finger,
+    random_finger,
+    recipe_from,
+)
+
+SHORT = {
+    "experiments": ["ID.2", "ID.3-static", "ID.3-dynamic", "ID.4"],
+    "rate": 200.0,
+    "id2": {"strokes": 2, "stroke_time": 3.0},
+    "id3_static": {"step": 20.0},
+    "id3_dynamic": {"cycles": 1, "speeds": [1.0, 2.0]},
+    "id4": {"tensions": [4.0, 7.0, 10.0]},
+}
+
+
+def study(sessions: int, joints: int = 1, joint: bool = False):
+    """`(z (sessions, p), ratio of spread to stated (p,), names)` over seeded sessions of a polynomial specimen."""
+    specimen = polynomial_finger(paper_finger() if joints == 3 else random_finger(0, joints, "planar", "antagonists"))
+    recipe = recipe_from({"trials": SHORT, "cad": {"mass": 0.02, "com": 3e-4}})
+    clean = clean_session(recipe, SpecimenPlant(specimen), specimen.description)
+    model = nominal_model(specimen)
+    truth = np.asarray(ravel(model))
+    z, spread, stated = [], [], []
+    for seed in range(sessions):
+        session = measure(clean, seed)
+        fit = identify(session)
+        fit = refine(session, fit) if joint else fit
+        free, values = fit.estimated, np.asarray(ravel(fit.model))
+        z.append((values - truth)[free] / fit.std[free])
+        spread.append(values[free])
+        stated.append(fit.std[free])
+    names = [describe(model)[i].name for i in free]
+    return np.array(z), np.std(spread, axis=0, ddof=1) / np.mean(stated, axis=0), names
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sessions", type=int, default=200)
+    parser.add_argument("--joints", type=int, default=1, choices=(1, 3))
+    parser.add_argument("--joint", action="store_true", help="refine jointly after the stages")
+    options = parser.parse_args()
+    z, ratio, names = study(options.sessions, options.joints, options.joint)
+    print(f"{'parameter':34} {'bias in σ':>10} {'coverage':>9} {'spread/σ':>9}")
+    for k, name in enumerate(names):
+        print(f"{name:34} {z[:, k].mean():10.2f} {np.mean(np.abs(z[:, k]) < 1.96):9.3f} {ratio[k]:9.2f}")
+    print(
+        f"all {len(names)} parameters, {len(z)} sessions: coverage {np.mean(np.abs(z) < 1.96):.3f}, "
+        f"spread/σ {np.sqrt(np.mean(ratio**2)):.3f}, largest bias {np.abs(z.mean(axis=0)).max():.2f} σ "
+        f"(chance: {3 / np.sqrt(len(z)):.2f})"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""Many sessions at once give what each gives alone; members that fail are named; work spreads over processes."""
+
+import pickle
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaxfinger.errors import UserError
+from jaxfinger.identify import compress, fit_many, identify, refit
+from jaxfinger.identify.parameters import ravel
+from jaxfinger.identify.uncertainty import draw_weights
+from jaxfinger.synthetic import measure
+
+
+@pytest.fixture(scope="module")
+def sessions(clean):
+    return [measure(clean, seed) for seed in range(3)]
+
+
+@pytest.fixture(scope="module")
+def members(sessions, session, staged):
+    lost = {
+        t.name: replace(t, tendon_excursion=np.full_like(t.tendon_excursion, np.nan))
+        for t in sessions[2].select("ID.2", joint="MCP")
+    }
+    return fit_many([*sessions[:2], replace(sessions[2], trials={**sessions[2].trials, **lost})], staged, session)
+
+
+def test_members_that_fail_are_named_and_spoil_nothing(members):
+    np.testing.assert_array_equal(members.failed, [False, False, True])
+    assert np.isnan(members.values[2]).all()
+    assert np.isfinite(members.values[:2]).all()
+
+
+def test_members_are_the_fits_of_each_session_alone(members, sessions, staged):
+    free = staged.estimated
+    for k, session in enumerate(sessions[:2]):
+        alone = identify(replace(session, finger=sessions[0].finger))
+        difference = (members.values[k] - np.asarray(ravel(alone.model)))[free] / alone.std[free]
+        # Alone it estimates its own noise, and so weighs its samples a little differently.
+        assert np.abs(difference).max() < 0.5
+        assert np.median(np.abs(difference)) < 0.1
+        np.testing.assert_allclose(members.std[k][free], alone.std[free], rtol=0.25)
+
+
+def test_the_template_itself_comes_back(members, staged):
+    free = staged.estimated
+    difference = (members.values[0] - np.asarray(ravel(staged.model)))[free] / staged.std[free]
+    assert np.abs(difference).max() < 0.05
+    np.testing.assert_allclose(members.std[0][free], staged.std[free], rtol=0.02)
+
+
+def test_a_session_of_another_protocol_is_refused(session, staged):
+    with pytest.raises(UserError, match=r"has not the ID\.2 trials"):
+        fit_many([session, session.select("ID.4")], staged, session)
+
+
+PROCESS = """
+import pickle, sys
+import numpy as np
+from jaxfinger.identify.distributed import initialise, refit_distributed
+address, process, source, target = sys.argv[1:]
+initialise(address, 2, int(process))
+compressed, weights = pickle.load(open(source, "rb"))
+theta, failed = refit_distributed(compressed, weights)
+np.savez(target + process, theta=theta, failed=failed)
+"""
+
+
+def test_two_processes_share_the_refits(session, staged, tmp_path):
+    compressed = compress(session, staged)
+    weights = draw_weights(compressed.strata, 5, np.random.default_rng(0))
+    weights[3] = np.nan
+    source, target = tmp_path / "work", str(tmp_path / "result")
+    source.write_bytes(pickle.dumps((compressed, weights)))
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{s.getsockname()[1]}"
+    command = [sys.executable, "-c", PROCESS, address]
+    running = [subprocess.Popen([*command, str(k), str(source), target]) for k in range(2)]
+    try:
+        assert [p.wait(timeout=200) for p in running] == [0, 0]
+    finally:
+        for p in running:
+            p.kill()
+    theta, failed = refit(compressed, weights)
+    for k in range(2):
+        result = np.load(f"{target}{k}.npz")
+        np.testing.assert_array_equal(result["failed"], failed)
+        np.testing.assert_allclose(result["theta"], theta, rtol=1e-9)
