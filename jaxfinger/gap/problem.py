@@ -18,7 +18,7 @@ from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.linearise import linearise
 from jaxfinger.identify.noise import Noise, estimate
 from jaxfinger.identify.parameters import Free, describe, ravel
-from jaxfinger.identify.solve import Prior, Source, solve
+from jaxfinger.identify.solve import Prior, Solution, Source, solve
 from jaxfinger.identify.stages import DEPENDS, cad_covariance, first_noise, nominal_model
 from jaxfinger.model import Model
 
@@ -58,7 +58,9 @@ class Problem:
     root: Float[np.ndarray, "k p"]  # prior rows on the nominal parameters
     offset: Float[np.ndarray, " k"]  # root (θ̂ − μ)
     predicted: dict[tuple[str, str], np.ndarray]  # ŷ of the nominal model, (columns, B, T)
-    fit: Fit
+    fit: Fit  # the staged fit
+    sources: dict[str, Source]
+    prior: Prior
 
     @property
     def trial_of_row(self) -> np.ndarray:
@@ -97,29 +99,41 @@ def build(session: Session, recipe: Recipe, progress: Progress = lambda message:
     sources = {e: _source(stacks[e], noise, parameters) for e in stacks}
     nominal, solution = solve(fit.model, free, sources, prior)
 
-    size = ravel(nominal).size
-    rows, r, J, predicted, start = {}, [], [], {}, 0
-    for e, lin in solution.linearised.items():
-        layout = _layout(stacks[e], sources[e].filters, start)
-        rows[e] = layout
-        start += layout.size
-        white = np.asarray(lin.white).reshape(-1)[layout.keep]
-        full = np.zeros((layout.size, size))
-        full[:, sources[e].positions] = -np.asarray(lin.jacobian).reshape(white_size(lin), -1)[layout.keep]
-        r.append(white)
-        J.append(full[:, free])
-        for c in stacks[e].experiment.channels:
-            predicted[e, c] = np.asarray(stacks[e].batch.y[c]) - np.asarray(lin.residuals[c])
+    rows = layouts(stacks, sources)
+    r, J = assemble(solution, sources, rows, free, ravel(nominal).size)
+    predicted = {
+        (e, c): np.asarray(stacks[e].batch.y[c]) - np.asarray(solution.linearised[e].residuals[c])
+        for e in stacks
+        for c in stacks[e].experiment.channels
+    }
     theta = np.asarray(ravel(nominal))[free]
     return Problem(
-        session, stacks, noise, nominal, free, rows, np.concatenate(r), np.concatenate(J), np.asarray(prior.root),
-        np.asarray(prior.root) @ (theta - np.asarray(prior.mean)), predicted, fit,
+        session, stacks, noise, nominal, free, rows, r, J, np.asarray(prior.root),
+        np.asarray(prior.root) @ (theta - np.asarray(prior.mean)), predicted, fit, sources, prior,
     )
 
 
-def white_size(lin) -> int:
-    """Number of rows of an experiment before those that do not count are left out."""
-    return lin.white.shape[0] * lin.white.shape[1]
+def layouts(stacks: dict[str, Stack], sources: dict[str, Source]) -> dict[str, Rows]:
+    """The rows that count, experiment by experiment, stacked."""
+    rows, start = {}, 0
+    for e in sources:
+        rows[e] = _layout(stacks[e], sources[e].filters, start)
+        start += rows[e].size
+    return rows
+
+
+def assemble(
+    solution: Solution, sources: dict[str, Source], rows: dict[str, Rows], free: np.ndarray, size: int
+) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N p"]]:
+    """White residuals at an optimum and the derivatives of the white predictions by the free parameters."""
+    r, J = [], []
+    for e, lin in solution.linearised.items():
+        keep = rows[e].keep
+        r.append(np.asarray(lin.white).reshape(-1)[keep])
+        full = np.zeros((keep.size, size))
+        full[:, sources[e].positions] = -np.asarray(lin.jacobian).reshape(-1, lin.jacobian.shape[-1])[keep]
+        J.append(full[:, free])
+    return np.concatenate(r), np.concatenate(J)
 
 
 def _cad_prior(session: Session, recipe: Recipe, free, parameters) -> Prior:

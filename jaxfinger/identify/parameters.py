@@ -122,7 +122,9 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
             )
         case ["effects", int(i), field]:
             effect = model.effects[i]
-            label = f"{effect.id} {'-'.join(effect.site)} {field}"
+            label = f"{effect.ID} {'-'.join(effect.site)} {field}"
+            if index:  # a constant of the finger that the effect carries
+                return Parameter(f"{label} {index}", "constant", "", determinable=False)
             return Parameter(label, "effects", effect.units()[field])
     raise AssertionError(keys)
 

@@ -1,0 +1,86 @@
+"""The augmented model: the effects of the verdict and every nominal parameter, fitted exactly and together."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import numpy as np
+
+from jaxfinger.gap.problem import Problem, assemble
+from jaxfinger.gap.refine import FIXED, Refined
+from jaxfinger.identify import Fit
+from jaxfinger.identify.fit import StageReport
+from jaxfinger.identify.parameters import describe, ravel
+from jaxfinger.identify.solve import Prior, Solution, Source, solve
+from jaxfinger.model import Model
+
+
+def nominal_fit(problem: Problem) -> Fit:
+    """The nominal model refitted to all trials."""
+    return _fit(problem, problem.nominal, problem.free, _information(problem.J, problem.root), "all trials")
+
+
+def augmented_fit(problem: Problem, chosen: Refined) -> tuple[Fit, np.ndarray, np.ndarray]:
+    """Nominal parameters, amplitudes and moving shapes at the common optimum, with their covariance.
+
+    Also the white residuals there, and their Jacobian by the fit's estimated parameters.
+    """
+    model = eqx.tree_at(lambda m: m.effects, problem.nominal, chosen.effects, is_leaf=lambda v: isinstance(v, tuple))
+    parameters = describe(model)
+    first = ravel(problem.nominal).size
+    moving = [i for i in range(first, len(parameters)) if _moves(model, parameters[i].name)]
+    free = np.concatenate([problem.free, moving]).astype(int)
+    sources = {e: _with_effects(s, chosen, moving, first, len(parameters), e) for e, s in problem.sources.items()}
+    values = np.asarray(ravel(model))
+    # Amplitudes keep a weak prior of three plausible sizes, shapes of a factor three, so that a flat direction stays put.
+    mean = np.concatenate([problem.prior.mean, values[moving]])
+    root = np.zeros((len(problem.root) + len(moving), free.size))
+    root[: len(problem.root), : problem.free.size] = problem.root
+    scale = np.maximum(np.abs(values[moving]), 1e-12)
+    root[len(problem.root) :, problem.free.size :] = np.diag(1.0 / (3.0 * scale))
+    fitted, solution = solve(model, free, sources, Prior(mean, root))
+    information = solution.information[np.ix_(free, free)] + root.T @ root
+    r, J = assemble(solution, sources, problem.rows, free, ravel(model).size)
+    return _fit(problem, fitted, free, information, "with the effects of the diagnosis", solution), r, J
+
+
+def _moves(model: Model, name: str) -> bool:
+    return name.rsplit(" ", 1)[-1] not in FIXED | {"limits", "crossed"} and "[" not in name
+
+
+def _with_effects(source: Source, chosen: Refined, moving, first: int, size: int, experiment: str) -> Source:
+    """The source, reading the effects' parameters too where one of them shows."""
+    if not any(experiment in type(e).SHOWS for e in chosen.effects):
+        return source
+    return source._replace(positions=np.union1d(source.positions, moving).astype(int))
+
+
+def _information(J: np.ndarray, root: np.ndarray) -> np.ndarray:
+    return J.T @ J + root.T @ root
+
+
+def _fit(problem: Problem, model: Model, free, information, what: str, solution: Solution | None = None) -> Fit:
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    covariance = np.zeros((ravel(model).size,) * 2)
+    inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-13, hermitian=True) * np.outer(scale, scale)
+    covariance[np.ix_(free, free)] = inverse
+    chi2 = 2 * solution.cost if solution else float(problem.r @ problem.r)
+    report = StageReport(
+        what, "fitted" if solution is None or solution.converged else "not converged",
+        solution.message if solution else "", tuple(problem.trial_names), problem.r.size,
+        chi2 / max(1, problem.r.size - len(free)),
+    )
+    return replace(
+        problem.fit, model=model, covariance=covariance, estimated=np.asarray(free), noise=problem.noise,
+        stages=(*problem.fit.stages, report),
+    )
+
+
+def parameter_values(fit: Fit, index: int) -> dict[str, dict]:
+    """Value, std and units of every parameter of the fit's effect number `index`."""
+    effect = fit.model.effects[index]
+    label = f"{effect.ID} {'-'.join(effect.site)} "
+    std = {p.name: s for p, s in zip(describe(fit.model), fit.std, strict=True)}
+    units = effect.units()
+    return {
+        n: {"value": v, "std": float(std.get(label + n, 0.0)), "units": units[n]} for n, v in effect.values().items()
+    }

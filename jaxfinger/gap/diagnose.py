@@ -1,0 +1,230 @@
+"""Diagnose the sim-to-real gap of a session: where, which effect, how far it shrinks, what next; and write it down."""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from jaxfinger.data import Session
+from jaxfinger.data.atomic import atomic_path
+from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, CatalogueEffect
+from jaxfinger.errors import UserError
+from jaxfinger.gap.augment import augmented_fit, nominal_fit, parameter_values
+from jaxfinger.gap.evidence import Projector
+from jaxfinger.gap.next_experiment import NextExperiment, next_experiment
+from jaxfinger.gap.problem import Problem, build
+from jaxfinger.gap.refine import Refined, refine
+from jaxfinger.gap.search import Search, search
+from jaxfinger.gap.shrinkage import Shrinkage, shrinkage
+from jaxfinger.gap.signatures import Signatures, Variant
+from jaxfinger.gap.where import Place, where
+from jaxfinger.identify import Fit, Recipe
+from jaxfinger.identify.fit_file import save_fit
+
+Progress = Callable[[str], None]
+MOST_IN_A_SET = 3
+UNSEEN = 10.0  # plausible sizes: the stated deviation of an amplitude that the trials do not see at all
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is the matter."""
+
+    status: str  # no_gap, explained, ambiguous, unexplained
+    effects: tuple[tuple[str, tuple[str, ...]], ...]
+    summary: str
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Everything that a report shows."""
+
+    problem: Problem
+    verdict: Verdict
+    where: list[Place]
+    search: Search
+    shrinkage: list[Shrinkage]
+    next: NextExperiment | None
+    nominal: Fit
+    augmented: Fit
+
+
+def diagnose(
+    session: Session, recipe: Recipe | None = None, quick: bool = False,
+    effects: dict[str, type[CatalogueEffect]] | None = None, without: tuple[str, ...] = (),
+    progress: Progress = lambda message: None,
+) -> Diagnosis:
+    """Diagnose a session. `effects` adds a user's own, `without` withholds some of the catalogue by id."""
+    recipe = recipe or Recipe()
+    catalogue = CATALOGUE | (effects or {})
+    catalogue |= {k: c for k, c in NOMINAL_TERMS.items() if k not in recipe.model.terms}
+    if unknown := set(without) - set(catalogue):
+        raise UserError(f"the catalogue has no effect {', '.join(sorted(unknown))} to leave out; it has {', '.join(sorted(catalogue))}")
+    catalogue = {k: c for k, c in catalogue.items() if k not in without}
+    problem = build(session, recipe, progress)
+    progress("reading the signatures of all effects")
+    found = search(problem, catalogue, quick, progress)
+    nominal = nominal_fit(problem)
+    if found.chosen is None or not found.detected:
+        summary = _no_gap_summary(found)
+        return Diagnosis(problem, Verdict("no_gap", (), summary), [], found, _unchanged(problem, nominal), None, nominal, nominal)
+
+    progress("fitting the effects and all nominal parameters together")
+    fit, r, J = augmented_fit(problem, found.chosen)
+    order = np.argsort(-np.asarray(found.shares))
+    first = found.chosen.keys[order[0]]
+    progress("refitting without each third of the trials")
+    lines = shrinkage(problem, nominal, fit, r, J, _rivals(problem, found), first)
+    verdict = _verdict(found, lines)
+    places = where(problem)
+    members = _members(problem, found)
+    return Diagnosis(
+        problem, verdict, places, found, lines,
+        next_experiment(problem, members) if verdict.status == "ambiguous" else None, nominal, fit,
+    )
+
+
+def _rivals(problem: Problem, found: Search):
+    """The strongest candidates with their signatures."""
+    signatures = Signatures(problem, problem.nominal)
+    top = [c for c in found.candidates if c.refined][:6]
+    out = []
+    for c in top:
+        effect = c.refined.effects[0]
+        variant = Variant(type(effect), c.refined.variants[0].site, tuple((n, float(getattr(effect, n))) for n in effect.SHAPES))
+        out.append((c.evidence, signatures.columns([variant])[0]))
+    return out
+
+
+def _members(problem: Problem, found: Search) -> list[Refined]:
+    """Refits of the members of the first ambiguous set."""
+    if not found.rival_sets:
+        return []
+    projector = Projector(problem)
+    rt = projector.residual(problem)
+    chi2 = float(rt @ rt)
+    by_key = {c.key: c for c in found.candidates}
+    out = []
+    for key in found.rival_sets[0][:MOST_IN_A_SET]:
+        c = by_key[key]
+        e = c.evidence
+        units = [u for _, u, _ in e.variant.effect.AMPLITUDES.values()]
+        start = dict(zip(e.variant.effect.AMPLITUDES, (e.amplitudes * units).tolist(), strict=True))
+        out.append(c.refined or refine(problem, [e.variant], [start], chi2, projector))
+    return out
+
+
+def _verdict(found: Search, lines: list[Shrinkage]) -> Verdict:
+    chosen = found.chosen
+    assert chosen is not None
+    order = np.argsort(-np.asarray(found.shares))
+    effects = tuple(chosen.keys[i] for i in order)
+    names = " and ".join(f"{e} at {'-'.join(s)}" for e, s in effects)
+    share = sum(found.shares) if len(effects) == 1 else 1.0 - _left_share(found)
+    if found.unlisted > 0.5:
+        depends = _depends(found)
+        return Verdict(
+            "unexplained", (),
+            f"There is a gap, and none of the known effects explains it: the nearest, {names}, leaves "
+            f"{100 * _left_share(found):.0f} % of what a smooth law could explain. {depends}",
+        )
+    if found.rival_sets:
+        rivals = "; ".join(f"{e} at {'-'.join(s)}" for e, s in found.rival_sets[0][:MOST_IN_A_SET])
+        return Verdict(
+            "ambiguous", effects[:1],
+            f"The gap is explained about equally well by {rivals}; these trials cannot tell them apart. "
+            f"The most probable is {effects[0][0]} at {'-'.join(effects[0][1])}.",
+        )
+    best = max((x.closed for x in lines if x.resolvable), default=0.0)
+    return Verdict(
+        "explained", effects,
+        f"The gap is explained by {names}: {100 * share:.0f} % of what can be explained. "
+        f"On held-out trials it closes up to {100 * best:.0f} % of the gap in the channel that shows it best.",
+    )
+
+
+def _left_share(found: Search) -> float:
+    return sum(max(x.energy, 0.0) for x in found.left if x.energy > 15.0) / max(found.gap, 1e-9)
+
+
+def _depends(found: Search) -> str:
+    if not found.left:
+        return ""
+    worst = found.left[0]
+    variables = sorted(worst.by_variable.items(), key=lambda kv: -kv[1])[:2]
+    named = " and ".join(k for k, v in variables if v > 0.2 * max(worst.energy, 1e-9)) or "no single variable"
+    return f"What remains lies mostly in {worst.channel} of {worst.experiment} and depends on {named}."
+
+
+def _no_gap_summary(found: Search) -> str:
+    strongest = found.candidates[0]
+    return (
+        f"No gap beyond the noise: the strongest candidate, {strongest.key[0]} at {'-'.join(strongest.key[1])}, has a log "
+        f"evidence of {strongest.evidence.log_bf:.1f}, which the noise of such a file also gives."
+    )
+
+
+def _unchanged(problem: Problem, nominal: Fit) -> list[Shrinkage]:
+    """The lines of `gap` where there is nothing to close."""
+    return shrinkage(problem, nominal, nominal, problem.r, problem.J, [], ("none", ()))
+
+
+def as_gap_json(d: Diagnosis) -> dict:
+    """`gap.json`, to the letter."""
+    by_effect = {e.ID + "".join(e.site): parameter_values(d.augmented, i) for i, e in enumerate(d.augmented.model.effects)}
+    candidates = []
+    for c in d.search.candidates:
+        values = by_effect.get(c.key[0] + "".join(c.key[1]))
+        if values is None:
+            effect = c.evidence.variant.effect
+            units = {k: v[0] for k, v in effect.AMPLITUDES.items()}
+            sizes = [v[1] for v in effect.AMPLITUDES.values()]
+            values = {
+                n: {"value": float(a * s), "std": float(min(u, UNSEEN) * s), "units": units[n]}
+                for n, a, u, s in zip(units, c.evidence.amplitudes, c.evidence.std, sizes, strict=True)
+            }
+        candidates.append(
+            {
+                "effect": c.key[0], "site": list(c.key[1]), "probability": c.probability, "parameters": values,
+                "held_out_gain": float(np.clip(c.explained, 0.0, 1.0)),
+            }
+        )
+    return {
+        "schema": "jaxfinger-gap/1", "data": Path(d.problem.session.file).name, "specimen": d.problem.session.specimen,
+        "verdict": {
+            "status": d.verdict.status, "effects": [{"effect": e, "site": list(s)} for e, s in d.verdict.effects],
+            "summary": d.verdict.summary,
+        },
+        "where": [
+            {
+                "experiment": p.experiment, "trial": p.trial, "channel": p.channel, "site": p.site,
+                "region": {"variable": p.variable, "low": p.low, "high": p.high}, "share": p.share,
+            }
+            for p in d.where
+        ],
+        "candidates": candidates, "none": d.search.none, "unlisted": d.search.unlisted,
+        "ambiguous_sets": [
+            [{"effect": e, "site": list(s)} for e, s in members[:MOST_IN_A_SET]]
+            for members in (d.search.rival_sets if d.verdict.status == "ambiguous" else [])
+        ],
+        "next_experiment": asdict(d.next) | {"separates": list(d.next.separates)} if d.next else None,
+        "gap": [
+            {
+                "experiment": x.experiment, "channel": x.channel, "units": x.units, "noise": x.noise, "before": x.before,
+                "after": x.after, "closed": x.closed, "closed_ci95": list(x.closed_ci95),
+            }
+            for x in d.shrinkage
+        ],
+    }
+
+
+def write(d: Diagnosis, folder: str | Path, overwrite: bool = False) -> None:
+    """`gap.json`, `nominal.json` and `augmented.json` in a folder."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_path(folder / "gap.json", overwrite) as part:
+        part.write_text(json.dumps(as_gap_json(d), indent=1, allow_nan=False), encoding="utf-8")
+    save_fit(d.nominal, folder / "nominal.json", overwrite)
+    save_fit(d.augmented, folder / "augmented.json", overwrite)

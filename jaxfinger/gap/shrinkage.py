@@ -1,0 +1,146 @@
+"""How far the gap shrinks: before, after and noise on trials that neither the fit nor the choice of the effect has seen.
+
+Trials are held out in turn, stratified by experiment, joint and tendon. The choice is made again without them; where it
+differs from the verdict, the held-out trials count as not improved.
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfinger.experiments import UNITS, Batch, predict
+from jaxfinger.gap.evidence import Evidence
+from jaxfinger.gap.problem import Problem
+from jaxfinger.identify import Fit
+from jaxfinger.identify.parameters import Free, ravel
+from jaxfinger.model import Model
+
+FOLDS = 3
+
+
+@dataclass(frozen=True)
+class Shrinkage:
+    """One line of `gap` in gap.json: rms in the channel's unit, at the rate of the fit."""
+
+    experiment: str
+    channel: str
+    units: str
+    noise: float
+    before: float
+    after: float
+    closed: float
+    closed_ci95: tuple[float, float]
+    resolvable: bool  # whether the gap before stands out of the noise
+
+
+def folds(problem: Problem) -> np.ndarray:
+    """Fold of each trial, in the order of `Problem.trial_names`."""
+    seen: dict[tuple, int] = {}
+    out = []
+    for name in problem.trial_names:
+        trial = problem.session[name]
+        stratum = (trial.experiment, trial.joint, trial.tendon)
+        out.append(seen.get(stratum, len(seen) % FOLDS))
+        seen[stratum] = (out[-1] + 1) % FOLDS
+    return np.array(out)
+
+
+@eqx.filter_jit
+def _residuals(model: Model, batch: Batch, channels: tuple[str, ...]):
+    predicted = predict(model, batch.x, channels)
+    return {c: batch.y[c] - predicted[c] for c in channels}
+
+
+def shrinkage(
+    problem: Problem, nominal: Fit, augmented: Fit, r: np.ndarray, J: np.ndarray, rivals: list[tuple[Evidence, np.ndarray]],
+    first: tuple,
+) -> list[Shrinkage]:
+    """One line an experiment and channel. `r`, `J`: white residuals and Jacobian of the augmented model at its optimum;
+    `rivals`: the strongest candidates with their signatures, among which each fold chooses again."""
+    fold = folds(problem)
+    energies: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
+    for k in range(FOLDS):
+        training = fold[problem.trial_of_row] != k
+        before = _refit(problem.nominal, problem.free, problem.J, problem.r, training)
+        same = _choice(problem, rivals, training) == first
+        after = _refit(augmented.model, augmented.estimated, J, r, training) if same else before
+        number = 0
+        for e, stack in problem.stacks.items():
+            held = [b for b in range(len(stack.trials)) if fold[number + b] == k]
+            number += len(stack.trials)
+            if not held:
+                continue
+            channels = stack.experiment.channels
+            old, new = _residuals(before, stack.batch, channels), _residuals(after, stack.batch, channels)
+            for c in channels:
+                mask = np.asarray(stack.batch.mask[c])
+                std = problem.noise[e, c].std[:, None]
+                for b in held:
+                    count = mask[:, b].sum()
+                    if count < 10:
+                        continue
+                    energies.setdefault((e, c), []).append(
+                        (
+                            _mean_square(old[c], mask, b, c), _mean_square(new[c], mask, b, c),
+                            float((mask[:, b] * std**2).sum() / count), float(count),
+                        )
+                    )
+    return [_line(e, c, np.array(values)) for (e, c), values in energies.items()]
+
+
+def _refit(model: Model, free, J, r, training) -> Model:
+    """The model refitted to the training rows; what they do not see stays within a few deviations of the whole fit."""
+    scale = 1.0 / np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    A = np.vstack([J[training] * scale, 0.05 * np.eye(len(free))])
+    delta = np.linalg.lstsq(A, np.concatenate([r[training], np.zeros(len(free))]), rcond=1e-12)[0] * scale
+    theta = np.asarray(ravel(model))[free] + delta
+    return Free.at(model, free).set(model, jnp.asarray(theta))
+
+
+def _choice(problem: Problem, rivals, training):
+    """The candidate that explains most of the training rows."""
+    A = np.vstack([problem.J[training], problem.root])
+    Q, _ = np.linalg.qr(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300))
+    r = np.concatenate([problem.r[training], np.zeros(len(problem.root))])
+    r = r - Q @ (Q.T @ r)
+    best, gain = None, -np.inf
+    for e, Z in rivals:
+        z = np.pad(Z[:, training], ((0, 0), (0, len(problem.root))))
+        z = z - (z @ Q) @ Q.T
+        a = np.linalg.lstsq(z.T, r, rcond=1e-10)[0]
+        explained = float(a @ (z @ r))
+        if explained > gain:
+            best, gain = e.variant.key, explained
+    return best
+
+
+def _mean_square(residual, mask, b, channel) -> float:
+    m = mask[:, b]
+    x = np.asarray(residual[:, b]) * m
+    if channel == "tendon_excursion":
+        x = (x - x.sum(axis=-1, keepdims=True) / np.maximum(m.sum(axis=-1, keepdims=True), 1.0)) * m
+    return float((x**2).sum() / m.sum())
+
+
+def _line(e: str, c: str, values: np.ndarray) -> Shrinkage:
+    """rms over the held-out trials, and the interval of `closed` from a bootstrap over trials."""
+    rng = np.random.default_rng(0)
+    weight = values[:, 3]
+
+    def closed(rows):
+        before, after, noise = (np.average(values[rows, k], weights=weight[rows]) for k in range(3))
+        return 1.0 - (after - noise) / (before - noise) if before > noise else np.nan
+
+    rows = np.arange(len(values))
+    before, after, noise = (float(np.average(values[:, k], weights=weight)) for k in range(3))
+    resolvable = before > 1.1 * noise
+    draws = np.array([closed(rng.choice(rows, len(rows))) for _ in range(400)])
+    draws = draws[np.isfinite(draws)]
+    low, high = (np.quantile(draws, (0.025, 0.975)) if resolvable and len(draws) else (0.0, 0.0))
+    value = closed(rows) if resolvable else 0.0
+    return Shrinkage(
+        e, c, UNITS[c], noise**0.5, before**0.5, after**0.5, float(np.clip(value, -1.0, 1.0)),
+        (float(np.clip(low, -1, 1)), float(np.clip(high, -1, 1))), resolvable,
+    )
