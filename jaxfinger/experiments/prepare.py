@@ -91,9 +91,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool) -> 
     tension_mean[:, slack | spec.slack] = 0.0
     hold = _whole(holds, M, block)
     if spec.held:
-        # A running maximum over noise drifts upwards: at a hold the tension is the hold's mean.
-        for h in np.unique(hold[hold >= 0]):
-            tension_mean[hold == h] = tension_mean[hold == h].mean(axis=0)
+        tension_mean = _in_steps(tension_mean, hold)
     start = trial.session_start if trial.session_start is not None else 0.0
     time = mean(trial.time)
     motion = {
@@ -168,6 +166,31 @@ def _sliding(spec: Experiment, trial: Trial, session: Session, qd) -> np.ndarray
     for i in range(session.finger.m):
         moving[:, i] &= known[:, session.finger.crosses[:, i] & session.finger.active].all(axis=1)
     return moving.astype(float)
+
+
+def _in_steps(tension: np.ndarray, hold: np.ndarray) -> np.ndarray:
+    """(N, n): at a hold its mean, and between holds nothing beyond the two means, or slack before and after all.
+
+    A held tendon keeps the highest tension that it has seen, so a running maximum over noise would drift upwards. What
+    lies beyond the two means by more than four standard deviations is a real overshoot, and stays but for those four.
+    """
+    starts, stops = (np.flatnonzero(np.diff(hold, **edge)) for edge in ({"prepend": -1}, {"append": -1}))
+    runs = [(a, np.flatnonzero(hold == hold[a])) for a in starts if hold[a] >= 0]
+    if not runs:
+        return tension
+    out, rest = tension.copy(), np.zeros(tension.shape[1])
+    means = np.stack([rest, *(tension[run].mean(axis=0) for _, run in runs), rest])
+    noise = np.sqrt(np.mean([tension[run].var(axis=0) for _, run in runs], axis=0))
+    ends = [b for b in stops if hold[b] >= 0]
+    before = np.searchsorted(ends, np.arange(len(tension)))
+    after = np.searchsorted([a for a, _ in runs], np.arange(len(tension)), side="right") + 1
+    after = np.minimum(after, len(means) - 1)
+    kept = np.clip(out, np.minimum(means[before], means[after]), np.maximum(means[before], means[after]))
+    beyond = out - kept
+    out = kept + np.sign(beyond) * np.maximum(np.abs(beyond) - 4.0 * noise, 0.0)
+    for mean, (_, run) in zip(means[1:], runs, strict=False):
+        out[run] = mean
+    return out
 
 
 def _whole(holds: np.ndarray, M: int, block: int) -> np.ndarray:
