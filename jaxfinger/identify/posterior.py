@@ -1,0 +1,90 @@
+"""The whole posterior of a joint fit by NUTS, through blackjax: the reference that Laplace's covariance is held to.
+
+Sampled in the coordinates of `resample`, in which Laplace's posterior is the unit Gaussian: a short trajectory crosses
+it, and a small effective sample size or divergences are themselves a sign that the intervals are not to be trusted.
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxfinger.data import Session
+from jaxfinger.errors import UserError
+from jaxfinger.experiments import prepare
+from jaxfinger.identify.fit import Fit
+from jaxfinger.identify.joint import STAGE as JOINT
+from jaxfinger.identify.linearise import white_rows
+from jaxfinger.identify.parameters import Free, describe, ravel
+from jaxfinger.identify.resample import compress, plan_of
+from jaxfinger.identify.stages import sources_of
+from jaxfinger.identify.uncertainty import Samples
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Draws, and how far they can be trusted."""
+
+    samples: Samples
+    effective: Float[np.ndarray, " q"]  # effective sample size of each coordinate
+    divergences: int
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the chain has seen enough of the posterior to judge another approximation by it."""
+        return self.divergences == 0 and bool(self.effective.min() > 100)
+
+
+def posterior(session: Session, fit: Fit, draws: int = 500, warmup: int = 300, seed: int = 0) -> Posterior:
+    """Draws from the posterior of a joint fit under its own noise, on the session that it was made from.
+
+    Raises:
+        UserError: the fit is not a joint one, or blackjax is not installed.
+    """
+    try:
+        import blackjax
+    except ImportError:
+        raise UserError("sampling needs blackjax: install jaxfinger[posterior]") from None
+    if JOINT not in {s.name for s in fit.stages}:
+        raise UserError("a staged fit is not the optimum of one posterior; refine it first")
+    compressed = compress(session, fit)
+    ((reads, _),) = plan_of(session, fit)
+    stacks = prepare(session, [t.name for t in session if t.experiment in reads])
+    reads = {e: c for e, c in reads.items() if e in stacks}
+    basis, start, prior = jnp.asarray(compressed.basis), ravel(fit.model), compressed.grams.H[-1]
+    sources = [
+        (s.batch, s.filters, Free.at(fit.model, s.positions), s.positions)
+        for s in sources_of(stacks, reads, fit.noise, describe(fit.model)).values()
+    ]
+
+    def log_density(z):
+        theta = start + basis @ z
+        extended = jnp.append(z, 1.0)
+        squares = extended @ prior @ extended
+        for batch, filters, free, positions in sources:
+            at = free.set(fit.model, theta[positions])
+            squares = squares + jnp.sum(white_rows(at, batch, filters)[1] ** 2)
+        return -0.5 * squares
+
+    @eqx.filter_jit
+    def sample(key):
+        adapt, walk = jax.random.split(key)
+        adaptation = blackjax.window_adaptation(blackjax.nuts, log_density)
+        (state, parameters), _ = adaptation.run(adapt, jnp.zeros(basis.shape[1]), warmup)
+        kernel = blackjax.nuts(log_density, **parameters)
+
+        def step(state, key):
+            state, info = kernel.step(key, state)
+            return state, (state.position, info.is_divergent)
+
+        return jax.lax.scan(step, state, jax.random.split(walk, draws))[1]
+
+    z, divergent = sample(jax.random.key(seed))
+    effective = np.asarray(blackjax.diagnostics.effective_sample_size(z[None]))
+    values = compressed.theta + np.asarray(z) @ compressed.basis.T
+    return Posterior(
+        Samples(values, np.zeros(draws, bool), fit.estimated), np.atleast_1d(effective), int(np.sum(divergent))
+    )

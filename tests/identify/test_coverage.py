@@ -1,0 +1,48 @@
+"""Are the stated intervals true? Two hundred sessions of a finger whose truth the nominal model can express."""
+
+import numpy as np
+
+from jaxfinger.identify import fit_many, identify
+from jaxfinger.identify.parameters import ravel
+from jaxfinger.synthetic import (
+    SpecimenPlant,
+    clean_session,
+    measure,
+    nominal_model,
+    polynomial_finger,
+    random_finger,
+    recipe_from,
+)
+
+SESSIONS = 200
+RECIPE = {
+    "trials": {
+        "experiments": ["ID.2", "ID.3-static", "ID.3-dynamic", "ID.4"],
+        "rate": 100.0,
+        "id2": {"strokes": 2, "stroke_time": 2.0},
+        "id3_static": {"step": 20.0, "move": 0.4, "dwell": 0.6},
+        "id3_dynamic": {"cycles": 1, "speeds": [1.0, 2.0]},
+        "id4": {"tensions": [4.0, 7.0, 10.0], "dwell": 0.6},
+    }
+}
+
+
+def test_intervals_cover_the_truth_and_estimates_are_unbiased_and_efficient():
+    specimen = polynomial_finger(random_finger(0, 1, "planar", "antagonists"))
+    clean = clean_session(recipe_from(RECIPE), SpecimenPlant(specimen), specimen.description)
+    truth = np.asarray(ravel(nominal_model(specimen)))
+    sessions = [measure(clean, seed) for seed in range(SESSIONS)]
+    # The rig's noise is estimated on a session of its own.
+    other = measure(clean, SESSIONS)
+    template = identify(other)
+    members = fit_many(sessions, template, other)
+    assert not members.failed.any()
+
+    free = template.estimated
+    z = ((members.values - truth) / members.std)[:, free]
+    coverage = np.mean(np.abs(z) < 1.96)
+    assert 0.93 < coverage < 0.97
+    assert np.abs(z.mean(axis=0)).max() < 4 / np.sqrt(SESSIONS)
+    # The stated deviation is the Cramér–Rao bound of the stage under the noise that was found.
+    spread = members.values[:, free].std(axis=0, ddof=1) / members.std[:, free].mean(axis=0)
+    assert spread.max() < 1.2
