@@ -1,0 +1,156 @@
+"""The command line, in this process: what it prints, where it writes, how it refuses."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from jaxfinger.cli import main
+from jaxfinger.cli.app import COMMANDS, SEALED, STAGES
+
+ROOT = Path(__file__).parents[2]
+EMPS = ROOT / "datasets" / "emps"
+
+
+def run(*tokens) -> int:
+    """Exit code of a command."""
+    try:
+        main([str(t) for t in tokens])
+    except SystemExit as end:
+        return end.code or 0
+    return 0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """The servo axis: estimation and validation recordings imported, and the fit of the first."""
+    folder = tmp_path_factory.mktemp("emps")
+    for name, recording in (("emps", "DATA_EMPS"), ("emps-pulses", "DATA_EMPS_PULSES")):
+        mapping = EMPS / f"{name}.toml"
+        assert run("import", EMPS / f"{recording}.mat", "--mapping", mapping, "-o", folder / f"{name}.h5") == 0
+    assert run("identify", folder / "emps.h5", "-o", folder / "fit.json", "--recipe", "emps") == 0
+    return folder
+
+
+def test_help_needs_neither_jax_nor_numpy():
+    code = (
+        "import sys; from jaxfinger.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "print('loaded', [m for m in ('jax', 'numpy', 'h5py') if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "loaded []" in out
+    assert all(name in out for name in COMMANDS)
+
+
+@pytest.mark.parametrize(
+    "tokens", [*([c] for c in COMMANDS), *(["fit", s] for s in STAGES), *(["sealed", s] for s in SEALED)]
+)
+def test_every_command_explains_itself(tokens, capsys):
+    assert run(*tokens, "--help") == 0
+    assert "Usage" in capsys.readouterr().out
+
+
+def test_check_of_a_sound_file(folder, capsys):
+    assert run("check", folder / "emps.h5", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["ok"]
+    assert not [f for f in found["findings"] if f["severity"] == "error"]
+
+
+def test_check_names_what_is_wrong(folder, tmp_path, capsys):
+    bad = tmp_path / "bad.h5"
+    bad.write_bytes((folder / "emps.h5").read_bytes())
+    with h5py.File(bad, "r+") as file:
+        del next(iter(file["trials"].values()))["q"]
+    assert run("check", bad) == 2
+    assert "q" in capsys.readouterr().out
+
+
+def test_the_published_axis_comes_back(folder, capsys):
+    """Janot, Gautier, Brunot 2019: M 95.11 kg, Fv 203.5 N s/m, Fc 20.39 N, offset −3.16 N."""
+    assert run("show", folder / "fit.json", "--json") == 0
+    values = {p["name"]: p for p in json.loads(capsys.readouterr().out)["parameters"]}
+    for name, published, tolerance, units in (
+        ("mass axis", 95.11, 0.01, "kg"),
+        ("damping axis", 203.5, 0.08, "N s/m"),
+        ("friction torque axis^0", 20.39, 0.08, "N"),
+        ("elastic torque axis^0", -3.16, 0.12, "N"),
+    ):
+        assert values[name]["value"] == pytest.approx(published, rel=tolerance)
+        assert values[name]["units"] == units
+
+
+def test_show_prints_tables_and_what_to_do_about_a_misfit(folder, capsys):
+    assert run("show", folder / "fit.json") == 0
+    out = capsys.readouterr().out
+    assert "mass axis" in out
+    assert "jaxfinger diagnose" in out
+
+
+def test_validation_on_the_other_recording(folder, tmp_path, capsys):
+    assert run("validate", folder / "fit.json", folder / "emps-pulses.h5", "--json") == 0
+    (score,) = json.loads(capsys.readouterr().out)["scores"]
+    assert (score["experiment"], score["column"], score["units"]) == ("ID.3-dynamic", "axis", "N")
+    assert 0 < score["noise"] < score["rms"] < 12  # of forces up to 150 N
+
+
+def test_prediction_is_a_file_of_the_same_layout(folder, tmp_path):
+    out = tmp_path / "p.h5"
+    assert run("predict", folder / "fit.json", folder / "emps-pulses.h5", "-o", out) == 0
+    with h5py.File(out) as predicted, h5py.File(folder / "emps-pulses.h5") as measured:
+        (name,) = predicted["trials"]
+        force, truth = (f["trials"][name]["joint_torque"][:] for f in (predicted, measured))
+    assert force.shape == truth.shape
+    assert 1 - np.var(truth - force) / np.var(truth) > 0.9  # at every sample, the drive's own ripple included
+
+
+def test_a_stage_at_a_time(folder, tmp_path, capsys):
+    assert run("fit", "id3", folder / "emps.h5", "-o", tmp_path / "f.json", "--recipe", "emps", "--json") == 0
+    one = json.loads(capsys.readouterr().out)["parameters"]
+    assert run("show", folder / "fit.json", "--json") == 0
+    all_at_once = json.loads(capsys.readouterr().out)["parameters"]
+    assert [p["value"] for p in one] == pytest.approx([p["value"] for p in all_at_once])
+
+
+@pytest.mark.parametrize(
+    ("tokens", "sentence"),
+    [
+        (("check", "{f}/none.h5"), None),
+        (("identify", "{f}/none.h5", "-o", "{t}/x.json"), "none.h5"),
+        (("identify", "{f}/fit.json", "-o", "{t}/x.json"), "HDF5"),
+        (("identify", "{f}/emps.h5", "-o", "{t}/x.json", "--recipe", "none.toml"), "none.toml"),
+        (("identify", "{f}/emps.h5", "-o", "{f}/fit.json"), "--overwrite"),
+        (("identify", "{f}/emps.h5", "-o", "{t}/no/x.json"), "is no folder"),
+        (("show", "{f}/emps.h5"), "is not a fit"),
+        (("validate", "{f}/fit.json", "{f}/emps.h5", "-e", "VD.1"), "has no trial of VD.1"),
+        (("predict", "{f}/fit.json", "{f}/emps.h5", "-o", "{f}/emps.h5"), "not overwritten"),
+        (("fit", "id3", "{f}/emps.h5", "-o", "{t}/x.json", "--start", "{f}/fit.json", "--recipe", "emps"), "--start"),
+        (("simulate", "{f}/none.toml", "-o", "{t}/x.h5"), "none.toml"),
+        (("import", "--mapping", "{f}/m.toml", "-o", "{t}/x.h5"), "no recording was given"),
+        (("identify", "{f}/emps.h5"), None),
+        (("identfy",), None),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_exit_code_2(folder, tmp_path, capsys, tokens, sentence):
+    before = {p: p.read_bytes() for p in folder.iterdir()}
+    assert run(*(t.format(f=folder, t=tmp_path) for t in tokens)) == 2
+    said = capsys.readouterr()
+    assert "Traceback" not in said.err + said.out
+    if sentence is not None:
+        (line,) = [line for line in said.err.splitlines() if line.startswith("jaxfinger: ")]
+        assert sentence in line
+    assert {p: p.read_bytes() for p in folder.iterdir()} == before
+    assert not list(tmp_path.iterdir())
+
+
+def test_overwriting_when_asked(folder, tmp_path):
+    out = tmp_path / "p.h5"
+    out.write_text("old")
+    assert run("predict", folder / "fit.json", folder / "emps.h5", "-o", out, "--overwrite") == 0
+    assert h5py.is_hdf5(out)

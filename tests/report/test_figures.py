@@ -1,0 +1,107 @@
+"""The curves are those of the model, with the spread that its covariance makes; the figures are written whole."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaxfinger.errors import UserError
+from jaxfinger.identify import Fit, Recipe
+from jaxfinger.identify.parameters import describe, ravel
+from jaxfinger.report.curves import curves
+from jaxfinger.report.identification import draw_identification
+from jaxfinger.report.validation import draw_validation
+from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger, recipe_from, simulate
+
+RECIPE = {
+    "specimen": {"kind": "polynomial"},
+    "trials": {
+        "rate": 50.0,
+        "experiments": ["ID.3-static", "ID.4", "VD.1", "VD.2"],
+        "id3_static": {"repeats": 1, "postures": [[25, 30, 45]], "step": 20.0, "move": 0.4, "dwell": 0.5},
+        "id4": {"repeats": 1, "postures": [[50, 30, 30]], "tensions": [4.0, 8.0]},
+        "vd1": {"motions": 1, "duration": 5.0},
+        "vd2": {"repeats": 1, "postures": [[10, 40, 35]], "tensions": [4.0, 10.0]},
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def session():
+    return simulate(recipe_from(RECIPE), seed=1)
+
+
+@pytest.fixture(scope="module")
+def fit(session) -> Fit:
+    """The truth, said to be known to one per cent."""
+    before = Fit.before(session, Recipe(), nominal_model(polynomial_finger(paper_finger())))
+    groups = ("moment_arm", "elastic", "friction", "damping", "tendon_friction")
+    chosen = [i for i, p in enumerate(describe(before.model)) if p.group in groups and p.determinable]
+    flat = np.asarray(ravel(before.model))
+    covariance = np.zeros_like(before.covariance)
+    covariance[chosen, chosen] = (0.01 * flat[chosen]) ** 2
+    return replace(before, covariance=covariance, estimated=np.array(chosen))
+
+
+def test_curves_are_polynomials_with_their_spread(fit):
+    found = curves(fit)
+    names = [p.name for p in describe(fit.model)]
+    value = dict(zip(names, np.asarray(ravel(fit.model)), strict=True))
+    curve = found.moment_arm["T1", "PIP"]
+    q = np.radians(curve.x)
+    terms = np.array([1e3 * p * value[f"excursion T1 PIP^{p}"] * q ** (p - 1) for p in range(1, 5)])
+    np.testing.assert_allclose(curve.y, terms.sum(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(curve.std, 0.01 * np.sqrt((terms**2).sum(axis=0)), rtol=1e-9)
+    friction = found.joints["DIP"].friction
+    terms = np.array([1e3 * value[f"friction torque DIP^{p}"] * np.radians(friction.x) ** p for p in range(3)])
+    np.testing.assert_allclose(friction.y, terms.sum(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(friction.std, 0.01 * np.sqrt((terms**2).sum(axis=0)), rtol=1e-9)
+    loss = found.tendon_friction["T3"]
+    raw = value["tendon friction T3 a0"] + value["tendon friction T3 a1"] * loss.x
+    np.testing.assert_allclose(loss.y, np.clip(raw, 0, loss.x), atol=1e-12)
+
+
+def test_only_what_was_estimated_is_shown(fit):
+    names = [p.name for p in describe(fit.model)]
+    one = replace(fit, estimated=np.array([names.index("excursion T2 DIP^1")]))
+    found = curves(one)
+    assert list(found.moment_arm) == [("T2", "DIP")]
+    assert not found.joints
+    assert not found.tendon_friction
+
+
+def test_figures_are_written_and_not_overwritten(fit, session, tmp_path):
+    written = draw_identification(fit, session, tmp_path) + draw_validation(fit, session, tmp_path)
+    assert [p.name for p in written] == [
+        "moment-arms.svg",
+        "joint-torque.svg",
+        "tendon-friction.svg",
+        "vd1.svg",
+        "vd2.svg",
+    ]
+    for path, words in zip(
+        written, (("T1", "DIP"), ("elastic",), ("tension lost (N)",), ("T4",), ("f_x",)), strict=True
+    ):
+        text = path.read_text()
+        assert text.rstrip().endswith("</svg>")
+        assert all(w in text for w in words)
+    with pytest.raises(UserError, match=r"moment-arms\.svg: exists"):
+        draw_identification(fit, session, tmp_path)
+
+
+def test_dots_of_the_holds_lie_on_the_lines(fit, session):
+    """Measured losses and torques, from a specimen that shares no code with the model, against the true curves."""
+    from jaxfinger.experiments import prepare
+    from jaxfinger.report.identification import _holds, _losses
+
+    found, stacks = curves(fit), prepare(session)
+    for tendon, points in _losses(fit.model, session, stacks["ID.4"]).items():
+        curve = found.tendon_friction[tendon]
+        for tension, lost in points:
+            assert lost == pytest.approx(np.interp(tension, curve.x, curve.y), abs=0.25)
+    joints = session.finger.joint_names
+    for i, points in _holds(fit.model, stacks["ID.3-static"]).items():
+        c = found.joints[joints[i]]
+        for q, h, _, way in points:
+            line = np.interp(np.degrees(q), c.elastic.x, c.elastic.y + way * c.friction.y)
+            assert 1e3 * h == pytest.approx(line, abs=0.6)
