@@ -7,7 +7,10 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import console, progress
+from jaxfinger.cli.output import console, progress, refuse_existing
+from jaxfinger.errors import UserError
+
+FILES = ("gap.json", "nominal.json", "augmented.json", "report.html")
 
 
 def diagnose(
@@ -15,31 +18,57 @@ def diagnose(
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     recipe: str | None = None,
-    predictions: Path | None = None,
+    effects: Path | None = None,
+    without: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
     quick: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Diagnose the gap between a session and the nominal model, or another simulator's predictions.
+    """Diagnose the gap between a session and the nominal model that is identified from it.
 
     Parameters
     ----------
     session
         Session (HDF5).
     output
-        Folder for gap.json, nominal.json, augmented.json and the page.
+        Folder for gap.json, nominal.json, augmented.json and report.html; it is made where there is none.
     recipe
-        The nominal model (TOML), or the name of a shipped recipe.
-    predictions
-        Another simulator's predictions for this session, in the layout that `predict` writes.
+        The nominal model (TOML), or the name of a shipped recipe. A term that it leaves out is a candidate.
+    effects
+        A Python file with effects of your own, beside those of the catalogue.
+    without
+        Effects of the catalogue to leave out, by id.
     quick
-        A first look: fewer resamples.
+        A first look: fewer refits, one effect.
     overwrite
         Replace an earlier diagnosis in the folder.
     """
+    _refuse(output, overwrite)
+    from jaxfinger.data import read_session
+    from jaxfinger.effects import load
     from jaxfinger.gap import diagnose as run
+    from jaxfinger.gap import write
+    from jaxfinger.identify import read_recipe
+    from jaxfinger.report.diagnosis_page import summary, write_page
 
     with progress("diagnose") as say:
-        result = run(
-            session, output, recipe=recipe, predictions=predictions, quick=quick, overwrite=overwrite, progress=say
-        )
-    console().print(result.summary(), markup=False, soft_wrap=True)
+        wanted = read_recipe(recipe)
+        own = load(effects) if effects is not None else {}
+        say("reading the file")
+        found = run(read_session(session), wanted, quick, own, tuple(without or ()), say)
+        say("writing the report")
+        write(found, output, overwrite)
+        write_page(found, output / "report.html", overwrite)
+    console().print(summary(found), markup=False, soft_wrap=True)
+    print(f"\n{output / 'report.html'}: the evidence")
+
+
+def _refuse(output: Path, overwrite: bool) -> None:
+    """Before any work: all that will be written can be."""
+    if output.exists() and not output.is_dir():
+        raise UserError(f"{output}: is a file; name a folder")
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{output}: cannot be made ({error.strerror}); choose another folder") from None
+    for name in FILES:
+        refuse_existing(output / name, overwrite)
