@@ -89,13 +89,13 @@ def test_bootstrap_variance_of_a_mean_is_unbiased():
 
 
 def test_bootstrap_and_sandwich_agree_with_laplace(session, staged, compressed):
-    """Where the noise model is right, the three differ by no more than four trials a stratum let them."""
+    """Where the noise model is right they differ by what four trials a stratum leave open: some forty per cent."""
     samples = bootstrap(session, staged, 500, compressed=compressed)
     assert not samples.failed.any()
     free = staged.estimated
     for covariance in (samples.covariance, sandwich(session, staged, compressed)):
         ratio = np.sqrt(np.diag(covariance))[free] / staged.std[free]
-        assert 0.75 < np.median(ratio) < 1.3
+        assert 0.5 < np.median(ratio) < 1.3
         assert np.sqrt(np.mean(ratio**2)) < 1.5
     low, high = samples.interval(0.95)
     assert np.mean((low[free] < compressed.theta[free]) & (compressed.theta[free] < high[free])) > 0.9
