@@ -41,7 +41,10 @@ class CatalogueEffect(Effect):
             raise TypeError(f"{cls.ID} has no parameter {sorted(unknown)}; it has {sorted(defaults)}")
         fields = {k: jnp.asarray(v, dtype=float) for k, v in (defaults | values).items()}
         return cls(
-            tuple(site), jnp.asarray(cls.indices(finger, tuple(site)), dtype=int), **fields, **cls.constants(finger, site)
+            tuple(site),
+            jnp.asarray(cls.indices(finger, tuple(site)), dtype=int),
+            **fields,
+            **cls.constants(finger, site),
         )
 
     @classmethod

@@ -65,12 +65,19 @@ def _fit(problem: Problem, model: Model, free, information, what: str, solution:
     covariance[np.ix_(free, free)] = inverse
     chi2 = 2 * solution.cost if solution else float(problem.r @ problem.r)
     report = StageReport(
-        what, "fitted" if solution is None or solution.converged else "not converged",
-        solution.message if solution else "", tuple(problem.trial_names), problem.r.size,
+        what,
+        "fitted" if solution is None or solution.converged else "not converged",
+        solution.message if solution else "",
+        tuple(problem.trial_names),
+        problem.r.size,
         chi2 / max(1, problem.r.size - len(free)),
     )
     return replace(
-        problem.fit, model=model, covariance=covariance, estimated=np.asarray(free), noise=problem.noise,
+        problem.fit,
+        model=model,
+        covariance=covariance,
+        estimated=np.asarray(free),
+        noise=problem.noise,
         stages=(*problem.fit.stages, report),
     )
 

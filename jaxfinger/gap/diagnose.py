@@ -52,8 +52,11 @@ class Diagnosis:
 
 
 def diagnose(
-    session: Session, recipe: Recipe | None = None, quick: bool = False,
-    effects: dict[str, type[CatalogueEffect]] | None = None, without: tuple[str, ...] = (),
+    session: Session,
+    recipe: Recipe | None = None,
+    quick: bool = False,
+    effects: dict[str, type[CatalogueEffect]] | None = None,
+    without: tuple[str, ...] = (),
     progress: Progress = lambda message: None,
 ) -> Diagnosis:
     """Diagnose a session. `effects` adds a user's own, `without` withholds some of the catalogue by id."""
@@ -61,7 +64,9 @@ def diagnose(
     catalogue = CATALOGUE | (effects or {})
     catalogue |= {k: c for k, c in NOMINAL_TERMS.items() if k not in recipe.model.terms}
     if unknown := set(without) - set(catalogue):
-        raise UserError(f"the catalogue has no effect {', '.join(sorted(unknown))} to leave out; it has {', '.join(sorted(catalogue))}")
+        raise UserError(
+            f"the catalogue has no effect {', '.join(sorted(unknown))} to leave out; it has {', '.join(sorted(catalogue))}"
+        )
     catalogue = {k: c for k, c in catalogue.items() if k not in without}
     problem = build(session, recipe, progress)
     progress("reading the signatures of all effects")
@@ -69,7 +74,9 @@ def diagnose(
     nominal = nominal_fit(problem)
     if found.chosen is None or not found.detected:
         summary = _no_gap_summary(found)
-        return Diagnosis(problem, Verdict("no_gap", (), summary), [], found, _unchanged(problem, nominal), None, nominal, nominal)
+        return Diagnosis(
+            problem, Verdict("no_gap", (), summary), [], found, _unchanged(problem, nominal), None, nominal, nominal
+        )
 
     progress("fitting the effects and all nominal parameters together")
     fit, r, J = augmented_fit(problem, found.chosen)
@@ -81,8 +88,14 @@ def diagnose(
     places = where(problem)
     members = _members(problem, found)
     return Diagnosis(
-        problem, verdict, places, found, lines,
-        next_experiment(problem, members) if verdict.status == "ambiguous" else None, nominal, fit,
+        problem,
+        verdict,
+        places,
+        found,
+        lines,
+        next_experiment(problem, members) if verdict.status == "ambiguous" else None,
+        nominal,
+        fit,
     )
 
 
@@ -93,7 +106,9 @@ def _rivals(problem: Problem, found: Search):
     out = []
     for c in top:
         effect = c.refined.effects[0]
-        variant = Variant(type(effect), c.refined.variants[0].site, tuple((n, float(getattr(effect, n))) for n in effect.SHAPES))
+        variant = Variant(
+            type(effect), c.refined.variants[0].site, tuple((n, float(getattr(effect, n))) for n in effect.SHAPES)
+        )
         out.append((c.evidence, signatures.columns([variant])[0]))
     return out
 
@@ -126,20 +141,23 @@ def _verdict(found: Search, lines: list[Shrinkage]) -> Verdict:
     if found.unlisted > 0.5:
         depends = _depends(found)
         return Verdict(
-            "unexplained", (),
+            "unexplained",
+            (),
             f"There is a gap, and none of the known effects explains it: the nearest, {names}, leaves "
             f"{100 * _left_share(found):.0f} % of what a smooth law could explain. {depends}",
         )
     if found.rival_sets:
         rivals = "; ".join(f"{e} at {'-'.join(s)}" for e, s in found.rival_sets[0][:MOST_IN_A_SET])
         return Verdict(
-            "ambiguous", effects[:1],
+            "ambiguous",
+            effects[:1],
             f"The gap is explained about equally well by {rivals}; these trials cannot tell them apart. "
             f"The most probable is {effects[0][0]} at {'-'.join(effects[0][1])}.",
         )
     best = max((x.closed for x in lines if x.resolvable), default=0.0)
     return Verdict(
-        "explained", effects,
+        "explained",
+        effects,
         f"The gap is explained by {names}: {100 * share:.0f} % of what can be explained. "
         f"On held-out trials it closes up to {100 * best:.0f} % of the gap in the channel that shows it best.",
     )
@@ -173,7 +191,9 @@ def _unchanged(problem: Problem, nominal: Fit) -> list[Shrinkage]:
 
 def as_gap_json(d: Diagnosis) -> dict:
     """`gap.json`, to the letter."""
-    by_effect = {e.ID + "".join(e.site): parameter_values(d.augmented, i) for i, e in enumerate(d.augmented.model.effects)}
+    by_effect = {
+        e.ID + "".join(e.site): parameter_values(d.augmented, i) for i, e in enumerate(d.augmented.model.effects)
+    }
     candidates = []
     for c in d.search.candidates:
         values = by_effect.get(c.key[0] + "".join(c.key[1]))
@@ -187,24 +207,36 @@ def as_gap_json(d: Diagnosis) -> dict:
             }
         candidates.append(
             {
-                "effect": c.key[0], "site": list(c.key[1]), "probability": c.probability, "parameters": values,
+                "effect": c.key[0],
+                "site": list(c.key[1]),
+                "probability": c.probability,
+                "parameters": values,
                 "held_out_gain": float(np.clip(c.explained, 0.0, 1.0)),
             }
         )
     return {
-        "schema": "jaxfinger-gap/1", "data": Path(d.problem.session.file).name, "specimen": d.problem.session.specimen,
+        "schema": "jaxfinger-gap/1",
+        "data": Path(d.problem.session.file).name,
+        "specimen": d.problem.session.specimen,
         "verdict": {
-            "status": d.verdict.status, "effects": [{"effect": e, "site": list(s)} for e, s in d.verdict.effects],
+            "status": d.verdict.status,
+            "effects": [{"effect": e, "site": list(s)} for e, s in d.verdict.effects],
             "summary": d.verdict.summary,
         },
         "where": [
             {
-                "experiment": p.experiment, "trial": p.trial, "channel": p.channel, "site": p.site,
-                "region": {"variable": p.variable, "low": p.low, "high": p.high}, "share": p.share,
+                "experiment": p.experiment,
+                "trial": p.trial,
+                "channel": p.channel,
+                "site": p.site,
+                "region": {"variable": p.variable, "low": p.low, "high": p.high},
+                "share": p.share,
             }
             for p in d.where
         ],
-        "candidates": candidates, "none": d.search.none, "unlisted": d.search.unlisted,
+        "candidates": candidates,
+        "none": d.search.none,
+        "unlisted": d.search.unlisted,
         "ambiguous_sets": [
             [{"effect": e, "site": list(s)} for e, s in members[:MOST_IN_A_SET]]
             for members in (d.search.rival_sets if d.verdict.status == "ambiguous" else [])
@@ -212,8 +244,14 @@ def as_gap_json(d: Diagnosis) -> dict:
         "next_experiment": asdict(d.next) | {"separates": list(d.next.separates)} if d.next else None,
         "gap": [
             {
-                "experiment": x.experiment, "channel": x.channel, "units": x.units, "noise": x.noise, "before": x.before,
-                "after": x.after, "closed": x.closed, "closed_ci95": list(x.closed_ci95),
+                "experiment": x.experiment,
+                "channel": x.channel,
+                "units": x.units,
+                "noise": x.noise,
+                "before": x.before,
+                "after": x.after,
+                "closed": x.closed,
+                "closed_ci95": list(x.closed_ci95),
             }
             for x in d.shrinkage
         ],

@@ -34,7 +34,9 @@ class Projector:
         diagonal = np.abs(np.diag(R))
         self.Q = Q[:, diagonal > 1e-9 * diagonal.max()]
 
-    def __call__(self, rows: Float[np.ndarray, "k N"], prior: np.ndarray | None = None) -> Float[np.ndarray, "k N+prior"]:
+    def __call__(
+        self, rows: Float[np.ndarray, "k N"], prior: np.ndarray | None = None
+    ) -> Float[np.ndarray, "k N+prior"]:
         """Rows off the span; `prior` are the values of the prior rows (zero for a signature)."""
         tail = np.zeros((len(rows), self.Q.shape[0] - self.N)) if prior is None else prior[None]
         x = np.concatenate([rows, tail], axis=1)

@@ -18,9 +18,17 @@ from jaxfinger.gap.refine import Refined
 # Separating trials that no trial of the file resembles, by pairs that imitate each other exactly in the usual protocol.
 KNOWN = {
     frozenset({"tension_sensor_scale", "tendon_friction_saturating"}): (
-        "ID.4", "pull the tendon in steps up and down again: a gain is the same both ways, friction is not"),
-    frozenset({"payload", "gravity_tilt"}): ("ID.3-static", "mount the finger at another angle and step all joints again"),
-    frozenset({"torque_sensor_scale", "payload"}): ("ID.3-static", "hang a known weight on the link and step the joint again"),
+        "ID.4",
+        "pull the tendon in steps up and down again: a gain is the same both ways, friction is not",
+    ),
+    frozenset({"payload", "gravity_tilt"}): (
+        "ID.3-static",
+        "mount the finger at another angle and step all joints again",
+    ),
+    frozenset({"torque_sensor_scale", "payload"}): (
+        "ID.3-static",
+        "hang a known weight on the link and step the joint again",
+    ),
 }
 
 
@@ -64,8 +72,11 @@ def next_experiment(problem: Problem, members: list[Refined]) -> NextExperiment 
     detail = {
         "ID.3-dynamic": f"at speeds from {0.3 * speed:.2g} to {3 * max(speed, 0.1):.2g} rad/s",
         "VD.3": f"at speeds around {max(speed, 0.1):.2g} rad/s and tensions around {tension:.1f} N",
-        "ID.4": f"with steps up to {1.5 * tension:.0f} N and down again", "VD.2": f"with steps up to {1.5 * tension:.0f} N",
+        "ID.4": f"with steps up to {1.5 * tension:.0f} N and down again",
+        "VD.2": f"with steps up to {1.5 * tension:.0f} N",
     }.get(what, "over the whole range, both ways")
     return NextExperiment(
-        what, f"repeat {what}{place} near {posture}, {detail}; there the fitted models differ most (as in trial {name})", ids
+        what,
+        f"repeat {what}{place} near {posture}, {detail}; there the fitted models differ most (as in trial {name})",
+        ids,
     )

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.data import Session
-from jaxfinger.experiments import EXPERIMENTS, Stack, prepare
+from jaxfinger.experiments import Stack, prepare
 from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.linearise import linearise
 from jaxfinger.identify.noise import Noise, estimate
@@ -93,8 +93,12 @@ def build(session: Session, recipe: Recipe, progress: Progress = lambda message:
         missing = [c for c in stack.experiment.channels if (e, c) not in noise]
         if missing:
             flat = _first_filters(stack, missing)
-            source = sources[e]._replace(filters={c: flat.get(c, _filters(noise, e, c)) for c in stack.experiment.channels})
-            lin = linearise(fit.model, Free.at(fit.model, source.positions), source.batch, source.filters, _ones(source))
+            source = sources[e]._replace(
+                filters={c: flat.get(c, _filters(noise, e, c)) for c in stack.experiment.channels}
+            )
+            lin = linearise(
+                fit.model, Free.at(fit.model, source.positions), source.batch, source.filters, _ones(source)
+            )
             noise |= {(e, c): estimate(stack, c, np.asarray(lin.residuals[c])) for c in missing}
     sources = {e: _source(stacks[e], noise, parameters) for e in stacks}
     nominal, solution = solve(fit.model, free, sources, prior)
@@ -108,8 +112,20 @@ def build(session: Session, recipe: Recipe, progress: Progress = lambda message:
     }
     theta = np.asarray(ravel(nominal))[free]
     return Problem(
-        session, stacks, noise, nominal, free, rows, r, J, np.asarray(prior.root),
-        np.asarray(prior.root) @ (theta - np.asarray(prior.mean)), predicted, fit, sources, prior,
+        session,
+        stacks,
+        noise,
+        nominal,
+        free,
+        rows,
+        r,
+        J,
+        np.asarray(prior.root),
+        np.asarray(prior.root) @ (theta - np.asarray(prior.mean)),
+        predicted,
+        fit,
+        sources,
+        prior,
     )
 
 

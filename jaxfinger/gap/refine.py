@@ -48,8 +48,13 @@ class _Coordinate:
     unit: float  # plausible size, or step of the shape
 
 
-def refine(problem: Problem, variants: list[Variant], start: list[dict[str, float]], chi2_null: float,
-           projector: Projector | None = None) -> Refined:
+def refine(
+    problem: Problem,
+    variants: list[Variant],
+    start: list[dict[str, float]],
+    chi2_null: float,
+    projector: Projector | None = None,
+) -> Refined:
     """The variants together, from amplitudes `start` (in their own units)."""
     finger = problem.nominal.finger
     effects = [v.at(finger, s) for v, s in zip(variants, start, strict=True)]
@@ -90,8 +95,14 @@ def refine(problem: Problem, variants: list[Variant], start: list[dict[str, floa
     occam = 0.5 * np.linalg.slogdet(np.eye(len(G)) + G)[1]
     residual = projector.residual(problem, r)[: r.size]
     return Refined(
-        tuple(variants), tuple(effects), tuple(std), cost, float(0.5 * (chi2_null - cost) - occam), residual,
-        problem.r - r, slopes,
+        tuple(variants),
+        tuple(effects),
+        tuple(std),
+        cost,
+        float(0.5 * (chi2_null - cost) - occam),
+        residual,
+        problem.r - r,
+        slopes,
     )
 
 
@@ -151,5 +162,3 @@ def _step_taken(before, after, c: _Coordinate) -> float:
 def _cost(projector, problem, r) -> float:
     rt = projector.residual(problem, r)
     return float(rt @ rt)
-
-

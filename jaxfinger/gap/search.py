@@ -19,14 +19,16 @@ from jaxfinger.effects import CatalogueEffect
 from jaxfinger.gap.evidence import Evidence, Projector, by_site, screen
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.refine import Refined, refine
-from jaxfinger.gap.signatures import Signatures, all_columns, variants
+from jaxfinger.gap.signatures import Signatures, Variant, all_columns, variants
 from jaxfinger.gap.standin import Explained, explained
 
 Progress = Callable[[str], None]
 
-DETECT = 25.0  # log evidence that an effect needs before anything is called a gap
+DETECT = 35.0  # log evidence that an effect needs before anything is called a gap
 LOOKS = 25.0  # ν: independent looks that evidence counts
-ADD = 0.04  # share of the gap that a further effect must explain
+ADD = 0.04  # share of the gap that a further effect at the same site must explain
+ADD_ELSEWHERE = 0.3  # share of what is left that a further effect at another site must explain
+LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for
 OPEN = 0.25  # share of the gap left to the stand-in at which «unlisted» is as likely as the catalogue
 OPEN_WIDTH = 0.06
 
@@ -60,7 +62,9 @@ class Search:
 
 
 def search(
-    problem: Problem, catalogue: dict[str, type[CatalogueEffect]], quick: bool = False,
+    problem: Problem,
+    catalogue: dict[str, type[CatalogueEffect]],
+    quick: bool = False,
     progress: Progress = lambda message: None,
 ) -> Search:
     """Judge every effect of the catalogue at every site of the finger."""
@@ -108,8 +112,6 @@ def _values(effect: CatalogueEffect) -> dict[str, float]:
 
 def _at_optimum(refined: Refined):
     """Variants with the shapes that a refit found, and the amplitudes to start from."""
-    from jaxfinger.gap.signatures import Variant
-
     items = [
         Variant(type(x), v.site, tuple((n, float(getattr(x, n))) for n in x.SHAPES))
         for v, x in zip(refined.variants, refined.effects, strict=True)
@@ -123,18 +125,22 @@ def _add(problem, groups, columns, best: Refined, chi2: float, projector, progre
     while len(chosen.variants) < 3:
         beyond = sum(max(x.energy, 0.0) for x in explained(problem, chosen.residual) if x.energy > 15.0)
         gap = chi2 - chosen.chi2 + beyond
-        if beyond < ADD * gap:
+        if beyond < LEAST:
             break
         on_top = Projector(problem, chosen.columns)
         rt = on_top.residual(problem, problem.r - chosen.change)
         ranked = [e for e in by_site(screen(groups, columns, on_top, rt)).values() if e.variant.key not in chosen.keys]
         e = ranked[0]
-        if e.log_bf < DETECT or e.explained < ADD * gap:
+        # At a site of the verdict it may be the wrong form of what is there already: it must weigh in the whole gap.
+        # Elsewhere it must explain what is left.
+        same = any(set(e.variant.site) & set(v.site) for v in chosen.variants)
+        need = max(ADD * gap if same else ADD_ELSEWHERE * beyond, 2 * DETECT)
+        if e.log_bf < DETECT or e.explained < need:
             break
         progress(f"adding {e.variant.effect.ID} at {', '.join(e.variant.site)}")
         items, starts = _at_optimum(chosen)
         together = refine(problem, [*items, e.variant], [*starts, _start(e)], chi2, projector)
-        if chosen.chi2 - together.chi2 < max(ADD * gap, 2 * DETECT):
+        if chosen.chi2 - together.chi2 < need:
             break
         chosen = together
     return chosen
@@ -155,7 +161,6 @@ def _shares(problem, chosen: Refined, chi2: float, projector, gap: float) -> tup
 def _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, strongest, absorbed) -> Search:
     """Probabilities: rivals of the first effect by what they leave unexplained, «unlisted» by what all leave."""
     first = chosen.keys[order[0]]
-    alone = refined.get(first)
     floor = min(r.chi2 for r in refined.values())
     keys = [e.variant.key for e in ranked]
     unexplained = {}
@@ -164,7 +169,6 @@ def _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, stro
         unexplained[e.variant.key] = (r.chi2 if r else chi2 - e.explained) - floor
         if r is None and e.log_bf <= 0:
             unexplained[e.variant.key] = chi2 - floor
-    # A chosen effect is judged by what the others leave it, not by what it explains alone.
     log_l = {k: -0.5 * LOOKS * np.log1p(max(u, 0.0) / LOOKS) for k, u in unexplained.items()}
     total = logsumexp(list(log_l.values()))
     share_left = beyond / gap
@@ -183,9 +187,11 @@ def _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, stro
     scale = (1 - none) / (sum(probability.values()) + unlisted)
     candidates = [
         Candidate(
-            e.variant.key, probability[e.variant.key] * scale,
+            e.variant.key,
+            probability[e.variant.key] * scale,
             max(0.0, (chi2 - (refined[e.variant.key].chi2 if e.variant.key in refined else chi2 - e.explained)) / gap),
-            refined.get(e.variant.key), e,
+            refined.get(e.variant.key),
+            e,
         )
         for e in ranked
     ]
@@ -198,10 +204,18 @@ def _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, stro
         if k != first and log_l[k] > log_l[first] - 4.0:
             rivals.append(k)
             mass += np.exp(log_l[k] - total)
-    _ = alone
     return Search(
-        gap, True, chosen, shares, candidates, none, unlisted * scale, [rivals] if len(rivals) > 1 else [], left,
-        strongest, absorbed,
+        gap,
+        True,
+        chosen,
+        shares,
+        candidates,
+        none,
+        unlisted * scale,
+        [rivals] if len(rivals) > 1 else [],
+        left,
+        strongest,
+        absorbed,
     )
 
 
@@ -211,7 +225,5 @@ def _nothing(ranked: list[Evidence], strongest: float, absorbed) -> Search:
     none = float(np.clip(expit((DETECT - strongest) / 3.0), 0.5, 0.995))
     weights = np.exp(0.2 * (logs - logs.max()))
     weights *= (1 - none) * 0.7 / weights.sum()
-    candidates = [
-        Candidate(e.variant.key, float(w), 0.0, None, e) for e, w in zip(ranked, weights, strict=True)
-    ]
+    candidates = [Candidate(e.variant.key, float(w), 0.0, None, e) for e, w in zip(ranked, weights, strict=True)]
     return Search(0.0, False, None, (), candidates, none, (1 - none) * 0.3, [], [], strongest, absorbed)

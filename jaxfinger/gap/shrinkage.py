@@ -54,7 +54,12 @@ def _residuals(model: Model, batch: Batch, channels: tuple[str, ...]):
 
 
 def shrinkage(
-    problem: Problem, nominal: Fit, augmented: Fit, r: np.ndarray, J: np.ndarray, rivals: list[tuple[Evidence, np.ndarray]],
+    problem: Problem,
+    nominal: Fit,
+    augmented: Fit,
+    r: np.ndarray,
+    J: np.ndarray,
+    rivals: list[tuple[Evidence, np.ndarray]],
     first: tuple,
 ) -> list[Shrinkage]:
     """One line an experiment and channel. `r`, `J`: white residuals and Jacobian of the augmented model at its optimum;
@@ -83,8 +88,10 @@ def shrinkage(
                         continue
                     energies.setdefault((e, c), []).append(
                         (
-                            _mean_square(old[c], mask, b, c), _mean_square(new[c], mask, b, c),
-                            float((mask[:, b] * std**2).sum() / count), float(count),
+                            _mean_square(old[c], mask, b, c),
+                            _mean_square(new[c], mask, b, c),
+                            float((mask[:, b] * std**2).sum() / count),
+                            float(count),
                         )
                     )
     return [_line(e, c, np.array(values)) for (e, c), values in energies.items()]
@@ -138,9 +145,16 @@ def _line(e: str, c: str, values: np.ndarray) -> Shrinkage:
     resolvable = before > 1.1 * noise
     draws = np.array([closed(rng.choice(rows, len(rows))) for _ in range(400)])
     draws = draws[np.isfinite(draws)]
-    low, high = (np.quantile(draws, (0.025, 0.975)) if resolvable and len(draws) else (0.0, 0.0))
+    low, high = np.quantile(draws, (0.025, 0.975)) if resolvable and len(draws) else (0.0, 0.0)
     value = closed(rows) if resolvable else 0.0
     return Shrinkage(
-        e, c, UNITS[c], noise**0.5, before**0.5, after**0.5, float(np.clip(value, -1.0, 1.0)),
-        (float(np.clip(low, -1, 1)), float(np.clip(high, -1, 1))), resolvable,
+        e,
+        c,
+        UNITS[c],
+        noise**0.5,
+        before**0.5,
+        after**0.5,
+        float(np.clip(value, -1.0, 1.0)),
+        (float(np.clip(low, -1, 1)), float(np.clip(high, -1, 1))),
+        resolvable,
     )

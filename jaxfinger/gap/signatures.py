@@ -62,7 +62,11 @@ def variants(effects: dict[str, type[CatalogueEffect]], finger) -> list[Variant]
 
 @eqx.filter_jit(compiler_options=QUICK)
 def _change(
-    channel: str, effects: CatalogueEffect, nominal: Model, x: Motion, y0: Float[Array, "columns B T"],
+    channel: str,
+    effects: CatalogueEffect,
+    nominal: Model,
+    x: Motion,
+    y0: Float[Array, "columns B T"],
     contact: Array | None,
 ) -> Float[Array, "variants columns B T"]:
     """Change of one channel's prediction, one row a member of `effects` (arrays stacked along their first axis)."""
@@ -121,7 +125,10 @@ class Signatures:
         B = -(-count // COUNT) * COUNT
 
         def merge(*arrays):
-            padded = [np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, T - a.shape[-1])], mode="edge") for a in map(np.asarray, arrays)]
+            padded = [
+                np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, T - a.shape[-1])], mode="edge")
+                for a in map(np.asarray, arrays)
+            ]
             whole = np.concatenate(padded, axis=-2)
             extra = [(0, 0)] * (whole.ndim - 2) + [(0, B - count), (0, 0)]
             return jnp.asarray(np.pad(whole, extra, mode="edge"))

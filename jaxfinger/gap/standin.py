@@ -38,7 +38,13 @@ def features(problem: Problem, experiment: str, channel: str, column: int) -> di
     else:
         own, taut = list(range(finger.m)), list(range(finger.n))
     out: dict[str, list[np.ndarray]] = {
-        "q": [], "qd": [], "direction": [], "tension": [], "distance since reversal": [], "time": [], "other joints": [],
+        "q": [],
+        "qd": [],
+        "direction": [],
+        "tension": [],
+        "distance since reversal": [],
+        "time": [],
+        "other joints": [],
     }
     for i in own:
         u = _unit(q[i])
@@ -47,7 +53,9 @@ def features(problem: Problem, experiment: str, channel: str, column: int) -> di
         out["direction"] += [direction[i] * u**p for p in range(3)]
         travelled = _since_reversal(q[i])
         for length in (0.02, 0.1):
-            out["distance since reversal"] += [np.exp(-np.abs(travelled) / length) * s for s in (1.0, direction[i], np.sign(travelled))]
+            out["distance since reversal"] += [
+                np.exp(-np.abs(travelled) / length) * s for s in (1.0, direction[i], np.sign(travelled))
+            ]
     for k in taut:
         if f[k].any():
             u = f[k] / max(f[k].max(), 1e-9)

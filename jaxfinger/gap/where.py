@@ -44,7 +44,9 @@ def where(problem: Problem, most: int = 12) -> list[Place]:
     for energy, e, c, column, b, pick, values in found[:most]:
         variable, low, high, share = _region(problem, e, c, column, b, problem.rows[e].time[pick], values)
         places.append(
-            Place(e, problem.stacks[e].trials[b], c, site(problem, c, column), variable, low, high, energy / total * share)
+            Place(
+                e, problem.stacks[e].trials[b], c, site(problem, c, column), variable, low, high, energy / total * share
+            )
         )
     return sorted(places, key=lambda p: -p.share)
 
@@ -67,8 +69,10 @@ def _region(problem: Problem, e, c, column, b, time, energy):
         joint = column if c == "joint_torque" else 0
         tendon = int(np.argmax(np.asarray(x.tension)[:, b].max(axis=-1)))
     variables = {
-        "q": np.asarray(x.q)[joint, b], "qd": np.asarray(x.qd)[joint, b],
-        "tendon_force": np.asarray(x.tension)[tendon, b], "time": np.asarray(x.time)[b],
+        "q": np.asarray(x.q)[joint, b],
+        "qd": np.asarray(x.qd)[joint, b],
+        "tendon_force": np.asarray(x.tension)[tendon, b],
+        "time": np.asarray(x.time)[b],
     }
     best = ("time", float(variables["time"][time].min()), float(variables["time"][time].max()), 1.0, 0.0)
     for name, values in variables.items():
@@ -84,6 +88,6 @@ def _region(problem: Problem, e, c, column, b, time, energy):
         for i in range(len(part)):
             for j in range(i, len(part)):
                 share, size = part[i : j + 1].sum(), width[i : j + 1].sum()
-                if 0.5 <= share and share - size > best[4]:
+                if share >= 0.5 and share - size > best[4]:
                     best = (name, float(edges[i]), float(edges[j + 1]), float(min(share, 1.0)), float(share - size))
     return best[:4]
