@@ -1,4 +1,4 @@
-"""The only place that joins data to model: which trials an experiment takes, and what it predicts from which channels."""
+"""The only place that joins data to model: which trials an experiment takes, and what it predicts from what."""
 
 from jaxfinger.experiments.predict import demean, predict
 from jaxfinger.experiments.prepare import Batch, Stack, prepare
