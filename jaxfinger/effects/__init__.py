@@ -1,4 +1,4 @@
-"""The catalogue of effects that the nominal model leaves out. Adding one touches one file: see `docs/add-an-effect.md`."""
+"""The catalogue of effects that the nominal model leaves out. Adding one touches one file: `docs/add-an-effect.md`."""
 
 import importlib.util
 import inspect

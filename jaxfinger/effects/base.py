@@ -16,9 +16,9 @@ class CatalogueEffect(Effect):
     """An effect with a name, the places where it can act, and its parameters.
 
     Amplitudes enter (nearly) in proportion and vanish with the effect; shapes say how it acts and mean nothing without
-    an amplitude. A subclass declares each as a scalar array field, and in `AMPLITUDES` its unit, its plausible size and
-    whether it may be negative, in `SHAPES` its unit and the values worth trying. The site enters as indices, so that one
-    compilation serves every site and shape.
+    an amplitude. A subclass declares each as a scalar array field, and in `AMPLITUDES` its unit, its plausible size
+    and whether it may be negative, in `SHAPES` its unit and the values worth trying. The site enters as indices, so
+    that one compilation serves every site and shape.
     """
 
     ID: ClassVar[str]

@@ -82,7 +82,7 @@ class _TowardsAnEnd(CatalogueEffect):
 
 
 class ElasticHardening(_TowardsAnEnd):
-    """± τ_end exp(−d/w), d the angle to an end of the range: the joint stiffens exponentially towards it (Esteki 1996)."""
+    """± τ_end exp(−d/w), d the angle to an end of the range: it stiffens exponentially towards it (Esteki 1996)."""
 
     ID: ClassVar = "elastic_hardening"
     PLACE: ClassVar = "joint"
@@ -102,7 +102,7 @@ class ElasticHardening(_TowardsAnEnd):
 
 
 class JointStop(_TowardsAnEnd):
-    """± k ⟨d⟩₊ (1 + c ḋ): contact with a stop inside the range, `place` of the way from the lower to the upper limit."""
+    """± k ⟨d⟩₊ (1 + c ḋ): contact with a stop inside the range, `place` of the way from limit to limit."""
 
     ID: ClassVar = "joint_stop"
     PLACE: ClassVar = "joint"

@@ -10,7 +10,7 @@ from jaxfinger.effects.base import BOTH, EXCURSION, CatalogueEffect, step
 
 
 class TendonStretch(CatalogueEffect):
-    """c (f + β f₀ (1 − exp(−f/f₀))): the tendon lengthens under tension, softer while its fibres straighten (the toe)."""
+    """c (f + β f₀ (1 − exp(−f/f₀))): it lengthens under tension, softer while its fibres straighten (the toe)."""
 
     ID: ClassVar = "tendon_stretch"
     PLACE: ClassVar = "tendon"

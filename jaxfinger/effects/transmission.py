@@ -9,7 +9,7 @@ from jaxfinger.effects.base import TENSION, CatalogueEffect, dahl
 
 
 class TendonFrictionCapstan(CatalogueEffect):
-    """f (1 − exp(−μ θ(q))), θ = Σ |q_i| over the joints crossed: the loss grows with the wrap angle, so with posture."""
+    """f (1 − exp(−μ θ(q))), θ = Σ |q_i| over the joints crossed: the loss grows with the wrap, so with posture."""
 
     ID: ClassVar = "tendon_friction_capstan"
     PLACE: ClassVar = "tendon"

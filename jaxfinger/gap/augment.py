@@ -31,7 +31,7 @@ def augmented_fit(problem: Problem, chosen: Refined) -> tuple[Fit, np.ndarray, n
     free = np.concatenate([problem.free, moving]).astype(int)
     sources = {e: _with_effects(s, chosen, moving, first, len(parameters), e) for e, s in problem.sources.items()}
     values = np.asarray(ravel(model))
-    # Amplitudes keep a weak prior of three plausible sizes, shapes of a factor three, so that a flat direction stays put.
+    # A weak prior of three times their own size on amplitudes and shapes, so that a flat direction stays put.
     mean = np.concatenate([problem.prior.mean, values[moving]])
     root = np.zeros((len(problem.root) + len(moving), free.size))
     root[: len(problem.root), : problem.free.size] = problem.root
@@ -59,7 +59,8 @@ def _information(J: np.ndarray, root: np.ndarray) -> np.ndarray:
 
 
 def _fit(problem: Problem, model: Model, free, information, what: str, solution: Solution | None = None) -> Fit:
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    diagonal = np.diag(information)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     covariance = np.zeros((ravel(model).size,) * 2)
     inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-13, hermitian=True) * np.outer(scale, scale)
     covariance[np.ix_(free, free)] = inverse

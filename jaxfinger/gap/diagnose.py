@@ -65,7 +65,8 @@ def diagnose(
     catalogue |= {k: c for k, c in NOMINAL_TERMS.items() if k not in recipe.model.terms}
     if unknown := set(without) - set(catalogue):
         raise UserError(
-            f"the catalogue has no effect {', '.join(sorted(unknown))} to leave out; it has {', '.join(sorted(catalogue))}"
+            f"the catalogue has no effect {', '.join(sorted(unknown))} to leave out; "
+            f"it has {', '.join(sorted(catalogue))}"
         )
     catalogue = {k: c for k, c in catalogue.items() if k not in without}
     problem = build(session, recipe, progress)
@@ -179,8 +180,8 @@ def _depends(found: Search) -> str:
 def _no_gap_summary(found: Search) -> str:
     strongest = found.candidates[0]
     return (
-        f"No gap beyond the noise: the strongest candidate, {strongest.key[0]} at {'-'.join(strongest.key[1])}, has a log "
-        f"evidence of {strongest.evidence.log_bf:.1f}, which the noise of such a file also gives."
+        f"No gap beyond the noise: the strongest candidate, {strongest.key[0]} at {'-'.join(strongest.key[1])}, has a "
+        f"log evidence of {strongest.evidence.log_bf:.1f}, which the noise of such a file also gives."
     )
 
 

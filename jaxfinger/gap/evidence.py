@@ -73,7 +73,7 @@ def evidence(variant: Variant, Z: np.ndarray, Zt: np.ndarray, rt: np.ndarray) ->
             # half-normal prior: twice the mass of the right sign
             log_bf += np.log(2.0) + log_ndtr(a[0] * np.sqrt(precision[0, 0]))
         logs.append(log_bf)
-    floor = 1e-12 * max(np.trace(G), 1e-300)
+    floor = max(1e-12 * np.trace(G), 1e-20)
     information = G + floor * np.eye(k)
     a = np.linalg.lstsq(information, b, rcond=1e-10)[0]
     std = np.sqrt(np.diag(np.linalg.pinv(information, rcond=1e-10)))

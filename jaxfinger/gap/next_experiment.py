@@ -1,8 +1,9 @@
 """What next: the trial of the format that would separate the members of an ambiguous set best.
 
-Expected discrimination of i from j in a trial: half the energy of i's signature there that j and the nominal parameters,
-refitted to the whole file, cannot imitate, at the sizes that the file suggests (T-optimality, Atkinson & Fedorov 1975).
-The file's own trials are the short list; a repeat of the best one, further out in the variable where the difference lies,
+Expected discrimination of i from j in a trial: half the energy of i's signature there that j and the nominal
+parameters, refitted to the whole file, cannot imitate, at the sizes that the file suggests (T-optimality, Atkinson &
+Fedorov 1975).
+The file's own trials are the short list; a repeat of the best one, further out where the difference lies,
 is the suggestion.
 """
 

@@ -2,7 +2,7 @@
 
     r = y − ŷ(θ̂),   r̃ = (I − Q Qᵀ) W r,   z̃ = (I − Q Qᵀ) W ∂ŷ/∂a
 
-Q spans the whitened Jacobian of the nominal parameters, so that what they can absorb is no evidence (Frisch–Waugh–Lovell).
+Q spans the whitened Jacobian of the nominal parameters: what they can absorb is no evidence (Frisch–Waugh–Lovell).
 """
 
 from collections.abc import Callable
@@ -182,8 +182,7 @@ def _ones(source: Source):
 
 
 def _layout(stack: Stack, filters, start: int) -> Rows:
-    """Rows whose whitening has its full history, in the order of `white_rows`: trial, then channel's column, then time."""
-    B, T = stack.batch.x.time.shape
+    """Rows whose whitening has its full history, in the order of `white_rows`: trial, channel's column, time."""
     complete, channel, column = [], [], []
     for number, c in enumerate(filters):
         mask = np.asarray(stack.batch.mask[c]) > 0

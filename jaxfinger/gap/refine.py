@@ -1,8 +1,8 @@
 """Refit of a few candidates: amplitudes and shapes move, the nominal parameters with them.
 
-Gauss–Newton on [nominal parameters, amplitudes, shapes] with signatures re-evaluated at each step and the nominal parameters
-eliminated by projection: equation (1) is linear in them to a good approximation, but for slip. The effects' signatures are
-read at the nominal model of the problem; the exact fit of the few effects that a verdict names comes last (`augment`).
+Gauss–Newton on [nominal parameters, amplitudes, shapes] with signatures re-evaluated at each step and the nominal
+parameters eliminated by projection: equation (1) is linear in them to a good approximation, but for slip. Signatures
+are read at the nominal model of the problem; the exact fit of the few effects that a verdict names comes last (`augment`).
 """
 
 from dataclasses import dataclass, replace
@@ -87,7 +87,7 @@ def refine(
             break
     St = projector(slopes)
     G = St @ St.T
-    covariance = np.linalg.pinv(G + 1e-12 * np.trace(G) * np.eye(len(G)), hermitian=True)
+    covariance = np.linalg.pinv(G + max(1e-12 * np.trace(G), 1e-20) * np.eye(len(G)), hermitian=True)
     std: list[dict[str, float]] = [{} for _ in variants]
     for c, v in zip(coordinates, np.sqrt(np.maximum(np.diag(covariance), 0.0)), strict=True):
         value = float(getattr(effects[c.effect], c.name))

@@ -5,8 +5,8 @@
    fair part of the whole gap, and all are refitted together.
 3. «Unlisted» competes through the flexible stand-in: the part of the gap that it explains beyond the chosen effects.
 4. Evidence counts a limited number of independent looks. A candidate that leaves the energy U unexplained has
-   log L = −½ ν log(1 + U/ν), Student's t with ν looks: Gaussian for a candidate that fits to the noise, and tolerant where
-   all forms are a little wrong, as textbook forms are.
+   log L = −½ ν log(1 + U/ν), Student's t with ν looks: Gaussian for a candidate that fits to the noise, and tolerant
+   where all forms are a little wrong, as textbook forms are.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""How far the gap shrinks: before, after and noise on trials that neither the fit nor the choice of the effect has seen.
+"""How far the gap shrinks: before, after and noise on trials that neither fit nor choice of the effect has seen.
 
 Trials are held out in turn, stratified by experiment, joint and tendon. The choice is made again without them; where it
 differs from the verdict, the held-out trials count as not improved.
@@ -35,16 +35,23 @@ class Shrinkage:
     resolvable: bool  # whether the gap before stands out of the noise
 
 
-def folds(problem: Problem) -> np.ndarray:
-    """Fold of each trial, in the order of `Problem.trial_names`."""
+def folds(problem: Problem) -> dict[str, np.ndarray]:
+    """(B, T) fold of every sample, by experiment: whole trials, or contiguous blocks of one that stands alone."""
+    strata = {n: (t.experiment, t.joint, t.tendon) for n in problem.trial_names for t in [problem.session[n]]}
+    count = {s: list(strata.values()).count(s) for s in strata.values()}
     seen: dict[tuple, int] = {}
-    out = []
-    for name in problem.trial_names:
-        trial = problem.session[name]
-        stratum = (trial.experiment, trial.joint, trial.tendon)
-        out.append(seen.get(stratum, len(seen) % FOLDS))
-        seen[stratum] = (out[-1] + 1) % FOLDS
-    return np.array(out)
+    out = {}
+    for e, stack in problem.stacks.items():
+        out[e] = np.zeros(stack.batch.x.time.shape, dtype=int)
+        for b, name in enumerate(stack.trials):
+            stratum = strata[name]
+            if count[stratum] == 1:
+                time = np.asarray(stack.batch.x.time)[b]
+                out[e][b] = np.minimum(2 * FOLDS * time / max(time.max(), 1e-9), 2 * FOLDS - 1).astype(int) % FOLDS
+                continue
+            out[e][b] = seen.get(stratum, len(seen) % FOLDS)
+            seen[stratum] = (out[e][b, 0] + 1) % FOLDS
+    return out
 
 
 @eqx.filter_jit
@@ -65,24 +72,20 @@ def shrinkage(
     """One line an experiment and channel. `r`, `J`: white residuals and Jacobian of the augmented model at its optimum;
     `rivals`: the strongest candidates with their signatures, among which each fold chooses again."""
     fold = folds(problem)
+    of_row = np.concatenate([fold[e][rows.trial, rows.time] for e, rows in problem.rows.items()])
     energies: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
     for k in range(FOLDS):
-        training = fold[problem.trial_of_row] != k
+        training = of_row != k
         before = _refit(problem.nominal, problem.free, problem.J, problem.r, training)
         same = _choice(problem, rivals, training) == first
         after = _refit(augmented.model, augmented.estimated, J, r, training) if same else before
-        number = 0
         for e, stack in problem.stacks.items():
-            held = [b for b in range(len(stack.trials)) if fold[number + b] == k]
-            number += len(stack.trials)
-            if not held:
-                continue
             channels = stack.experiment.channels
             old, new = _residuals(before, stack.batch, channels), _residuals(after, stack.batch, channels)
             for c in channels:
-                mask = np.asarray(stack.batch.mask[c])
+                mask = np.asarray(stack.batch.mask[c]) * (fold[e] == k)
                 std = problem.noise[e, c].std[:, None]
-                for b in held:
+                for b in range(len(stack.trials)):
                     count = mask[:, b].sum()
                     if count < 10:
                         continue

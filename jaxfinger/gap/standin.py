@@ -1,6 +1,6 @@
 """The flexible stand-in: how much of a residual any smooth law, with or without memory, could explain.
 
-Features of each channel's column: polynomials of the angles, tension, speed, directions, distance and time since reversal,
+Features of each channel's column: polynomials of the angles, tension, speed, directions, distance since reversal and
 time in the trial. It is the yardstick for «none of these», never the answer.
 """
 
