@@ -1,3 +1,3 @@
-"""jaxfinger: the dynamic model of a tendon-driven finger, from a rig's recordings, and why it still misses the bench."""
+"""jaxfinger: the dynamic model of a tendon-driven finger, from recordings, and why it still misses the bench."""
 
 __version__ = "0.1.0"

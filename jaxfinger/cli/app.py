@@ -34,6 +34,7 @@ SEALED = {
     "make": "Make cases and hide their truth.",
     "run": "Diagnose every case.",
     "score": "Score the diagnoses against the truth.",
+    "rivals": "Work out what is distinguishable in principle, for the ceiling of the score.",
 }
 
 for name, (place, text) in COMMANDS.items():

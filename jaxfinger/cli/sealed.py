@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +13,7 @@ from typing import Literal
 
 from jaxfinger.errors import UserError
 
-DIAGNOSE = "jaxfinger diagnose {fit} -o {out}"
+DIAGNOSE = f"{shlex.quote(sys.executable)} -m jaxfinger diagnose {{fit}} -o {{out}}"
 
 
 def make(

@@ -2,7 +2,7 @@
 
 Gauss–Newton on [nominal parameters, amplitudes, shapes] with signatures re-evaluated at each step and the nominal
 parameters eliminated by projection: equation (1) is linear in them to a good approximation, but for slip. Signatures
-are read at the nominal model of the problem; the exact fit of the few effects that a verdict names comes last (`augment`).
+are read at the nominal model of the problem; the exact fit of the effects that a verdict names comes last (`augment`).
 """
 
 from dataclasses import dataclass, replace

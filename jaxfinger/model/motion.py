@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 class Motion(eqx.Module):
     """The state and inputs of equation (1) at the same instants.
 
-    Directions are the signs of q̇ and l̇ in [−1, 1]: the protocol's where it is known, smooth where derivatives are needed.
+    Directions are the signs of q̇ and l̇: the protocol's where it is known, smooth where derivatives are needed.
     A tendon without tension measurement (passive, slack) carries zero. `held`: a fixture holds the joints, so that
     tendons move only when their loss is exceeded.
     """
