@@ -1,0 +1,139 @@
+"""Every effect of the catalogue: absent at zero, differentiable there, at every site and shape, written and read."""
+
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, from_dict, load, to_dict
+from jaxfinger.errors import UserError
+from jaxfinger.experiments import EXPERIMENTS, predict
+from jaxfinger.model import simulate
+from tests.effects.motion import MODEL, MOTIONS, with_effects
+
+EVERY = CATALOGUE | NOMINAL_TERMS
+FINGER = MODEL.finger
+DOCUMENT = Path(__file__).parents[2] / "docs" / "add-an-effect.md"
+CHEAP = {"xla_backend_optimization_level": 0}
+
+
+def plausible(kind, site, shape, size=1.0):
+    return kind.at(FINGER, site, **shape, **{n: size * unit for n, (_, unit, _) in kind.AMPLITUDES.items()})
+
+
+def value_and_slopes(effect, x, names):
+    """Channels, and by amplitude their derivatives; one operation at a time, so that effects share compilations."""
+
+    def along(name):
+        def channels(a):
+            return predict(with_effects(eqx.tree_at(lambda e: getattr(e, name), effect, a)), x, names)
+
+        return jax.jvp(channels, (getattr(effect, name),), (jnp.ones(()),))
+
+    found = {name: along(name) for name in effect.AMPLITUDES}
+    return next(iter(found.values()))[0], {name: slope for name, (_, slope) in found.items()}
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_absent_at_zero_and_differentiable_there(name):
+    kind = EVERY[name]
+    site = kind.sites(FINGER)[0]
+    shown = {c for channels in kind.SHOWS.values() for c in channels}
+    largest = dict.fromkeys(kind.AMPLITUDES, 0.0)
+    for x, nominal in MOTIONS:
+        y, slopes = value_and_slopes(kind.at(FINGER, site, **kind.shapes(FINGER, site)[0]), x, tuple(nominal))
+        for channel in nominal:
+            np.testing.assert_allclose(y[channel], nominal[channel], rtol=1e-11, atol=1e-14, err_msg=channel)
+            for n, slope in slopes.items():
+                assert np.isfinite(slope[channel]).all(), (channel, n)
+                if channel in shown:
+                    largest[n] = max(largest[n], float(np.abs(slope[channel]).max()))
+    assert all(v > 0 for v in largest.values()), largest
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_site_and_shape(name):
+    kind = EVERY[name]
+    sites = kind.sites(FINGER)
+    assert sites
+    for experiment, channels in kind.SHOWS.items():
+        assert set(channels) <= set(EXPERIMENTS[experiment].channels)
+    seen = set()
+    for site in sites:
+        for shape in kind.shapes(FINGER, site):
+            effect = plausible(kind, site, shape)
+            seen.add((effect.site, *effect.values().items()))
+            assert set(effect.values()) == set(kind.AMPLITUDES) | set(kind.SHAPES) == set(effect.units())
+            read = from_dict(FINGER, to_dict(effect))
+            assert eqx.tree_equal(read, effect)
+    assert len(seen) == sum(len(kind.shapes(FINGER, s)) for s in sites)
+
+
+def test_the_catalogue_is_the_published_one():
+    published = """joint_stribeck joint_presliding joint_load_friction elastic_hardening elastic_relaxation joint_stop
+        passive_tendon tendon_stretch tendon_creep tendon_backlash moment_arm_coupling moment_arm_bowstring
+        tendon_friction_capstan tendon_friction_viscous tendon_friction_presliding tendon_friction_saturating
+        tendon_crosstalk payload gravity_tilt drive_inertia torque_sensor_scale torque_sensor_drift torque_ripple
+        tension_sensor_scale encoder_offset encoder_eccentricity force_sensor_rotation channel_delay"""
+    assert set(CATALOGUE) == set(published.split())
+    assert set(NOMINAL_TERMS) == {"joint_elastic", "joint_coulomb", "joint_damping", "tendon_friction", "gravity"}
+
+
+def test_all_effects_together_simulate_forward():
+    """Sensors apart, all act in one finger; its motion stays finite and differs from the nominal one."""
+    effects = []
+    for kind in CATALOGUE.values():
+        site = kind.sites(FINGER)[-1]
+        effects.append(plausible(kind, site, kind.shapes(FINGER, site)[0], 0.5))
+    T = 60
+    time = jnp.arange(T) * 1e-3
+    tension = jnp.zeros((FINGER.n, T)).at[:].set(jnp.asarray(FINGER.active, float)[:, None] * (2 + 40 * time))
+    q0 = jnp.asarray(FINGER.limits).mean(axis=1)
+    run = eqx.filter_jit(simulate, compiler_options=CHEAP)
+    q, qd = run(with_effects(*effects), time, tension, q0, jnp.zeros(FINGER.m))
+    assert np.isfinite(q).all()
+    assert np.isfinite(qd).all()
+    nominal, _ = run(MODEL, time, tension, q0, jnp.zeros(FINGER.m))
+    assert np.abs(q - nominal).max() > 1e-4
+
+
+def test_the_documented_example_loads_and_acts(tmp_path):
+    text = DOCUMENT.read_text(encoding="utf-8")
+    path = tmp_path / "drag.py"
+    path.write_text(text.split("```python\n")[1].split("```")[0], encoding="utf-8")
+    own = load(path)
+    assert set(own) == {"joint_drag"}
+    effect = own["joint_drag"].at(FINGER, ("PIP",), b=3e-4)
+    (x, nominal), _ = MOTIONS
+    y = predict(with_effects(effect), x, tuple(nominal))
+    qd = np.asarray(x.qd)
+    added = np.zeros_like(qd)
+    added[1] = 3e-4 * np.abs(qd[1]) * qd[1]
+    np.testing.assert_allclose(y["joint_torque"] - nominal["joint_torque"], added, atol=1e-15)
+    assert eqx.tree_equal(from_dict(FINGER, to_dict(effect), own), effect)
+    with pytest.raises(UserError, match="not in the catalogue"):
+        from_dict(FINGER, to_dict(effect))
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        ("x = 1\n", "defines no effect"),
+        ("import nothing_of_that_name\n", "cannot be loaded"),
+        (None, "not a Python file"),
+    ],
+)
+def test_a_file_without_effects_is_refused(tmp_path, content, complaint):
+    path = tmp_path / "mine.py"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(UserError, match=complaint):
+        load(path)
+
+
+def test_an_unknown_parameter_is_refused():
+    with pytest.raises(TypeError, match="no parameter"):
+        CATALOGUE["payload"].at(FINGER, ("MCP",), weight=1.0)

@@ -1,0 +1,144 @@
+"""Memory operators against loops that integrate the differential equations of their docstrings in tiny steps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxfinger.effects import CATALOGUE
+from jaxfinger.effects.base import dahl, rate
+from jaxfinger.model import excursion, memories
+from jaxfinger.model.dynamics import terms
+from tests.effects.motion import MODEL, motion, with_effects
+
+FINGER = MODEL.finger
+X = motion()
+TIME = np.asarray(X.time)
+FINE = 400  # steps of the loop between two samples
+
+
+def state(effect):
+    return memories(with_effects(effect), X)[0]
+
+
+def fine(values):
+    """Time and the piecewise linear values, FINE steps a sample."""
+    t = np.linspace(TIME[0], TIME[-1], FINE * (TIME.size - 1) + 1)
+    return t, np.interp(t, TIME, np.asarray(values))
+
+
+def test_dahl_friction_builds_up_over_its_angle():
+    _, q = fine(X.q[1])
+    z = np.zeros(q.size)
+    for t in range(1, q.size):
+        dq = q[t] - q[t - 1]
+        z[t] = z[t - 1] + (dq - abs(dq) * z[t - 1]) / 0.06
+    found = state(CATALOGUE["joint_presliding"].at(FINGER, (FINGER.joint_names[1],), x0=0.06))
+    # Between samples the operator sees a straight line: a reversal inside a step is seen at its end.
+    np.testing.assert_allclose(found, z[::FINE], atol=2e-3)
+
+
+@given(st.lists(st.floats(-0.2, 0.2), min_size=1, max_size=20), st.floats(-1, 1))
+@settings(max_examples=40, deadline=None)
+def test_dahl_state_stays_within_the_friction(steps, z):
+    for dx in steps:
+        z = float(dahl(jnp.asarray(z), jnp.asarray(dx), jnp.asarray(0.05)))
+        assert -1 - 1e-12 <= z <= 1 + 1e-12
+
+
+def test_play_keeps_the_dead_zone():
+    effect = CATALOGUE["tendon_backlash"].at(FINGER, ("T1",), width=3e-4, a=1.0)
+    k = FINGER.tendon_names.index("T1")
+    l = np.asarray(MODEL.moment_arm.excursion(X.q))[k]
+    p = [l[0]]
+    for value in l[1:]:
+        behind = p[-1]
+        if value - behind > 1.5e-4:
+            behind = value - 1.5e-4
+        elif behind - value > 1.5e-4:
+            behind = value + 1.5e-4
+        p.append(behind)
+    np.testing.assert_allclose(np.asarray(excursion(with_effects(effect), X))[k], p, atol=1e-15)
+
+
+def test_maxwell_branch_relaxes():
+    _, q = fine(X.q[0])
+    dt = (TIME[1] - TIME[0]) / FINE
+    z = np.zeros(q.size)
+    for t in range(1, q.size):
+        z[t] = z[t - 1] + (q[t] - q[t - 1]) - dt * z[t - 1] / 0.3
+    found = state(CATALOGUE["elastic_relaxation"].at(FINGER, (FINGER.joint_names[0],), T=0.3))
+    np.testing.assert_allclose(found, z[::FINE], atol=2e-3 * np.ptp(z))
+
+
+def test_kelvin_voigt_creeps_to_the_tension():
+    k = FINGER.tendon_names.index("T2")
+    found = state(CATALOGUE["tendon_creep"].at(FINGER, ("T2",), T=0.5))
+    f, dt = np.asarray(X.tension)[k], (TIME[1] - TIME[0]) / FINE
+    y = [0.0]
+    for held in np.concatenate([[f[0]], f[1:]])[1:]:  # tension is held over a sample
+        creeping = y[-1]
+        for _ in range(FINE):
+            creeping += dt * (held - creeping) / 0.5
+        y.append(creeping)
+    # At the first sample there is no step yet.
+    np.testing.assert_allclose(found, y, atol=1e-3 * np.ptp(f))
+
+
+def test_tendon_presliding_follows_its_excursion():
+    k = FINGER.tendon_names.index("T2")
+    l = np.asarray(MODEL.moment_arm.excursion(X.q))[k]
+    _, path = fine(l)
+    z = np.zeros(path.size)
+    for t in range(1, path.size):
+        dl = path[t] - path[t - 1]
+        z[t] = z[t - 1] + (dl - abs(dl) * z[t - 1]) / 1e-3
+    found = state(CATALOGUE["tendon_friction_presliding"].at(FINGER, ("T2",), x0=1e-3))[0]
+    np.testing.assert_allclose(found, z[::FINE], atol=5e-3)
+
+
+@pytest.mark.parametrize(("name", "values"), [
+    ("moment_arm_coupling", {"A": 4e-4, "B": -2e-4, "D": 3e-4, "joint_a": 0.0, "joint_b": 2.0}),
+    ("moment_arm_bowstring", {"b": 0.02}),
+])  # fmt: skip
+def test_moment_arms_are_derivatives_of_the_excursion(name, values):
+    """C = ∂l/∂q, as virtual work demands; tension is a parameter."""
+    effect = CATALOGUE[name].at(FINGER, ("T1",), **values)
+    model = with_effects(effect)
+
+    def length(q, sample):
+        x = jax.tree.map(lambda a: a[..., sample : sample + 1], X)
+        x = type(x)(x.time, q[:, None], *(getattr(x, n) for n in (
+            "qd", "qdd", "tension", "joint_direction", "tendon_direction", "session_time", "motorised")))  # fmt: skip
+        return excursion(model, x)[:, 0]
+
+    C = terms(model, X, memories(model, X)).C
+    for sample in (3, 20, 41):
+        np.testing.assert_allclose(C[..., sample], jax.jacfwd(length)(X.q[:, sample], sample), atol=1e-13)
+
+
+def test_a_delayed_channel_is_the_signal_a_while_ago():
+    """First order in the delay: the error is half its square times the second derivative."""
+    effect = CATALOGUE["channel_delay"].at(FINGER, ("tendon_excursion",), delay=2e-3)
+    y = np.sin(2 * np.pi * TIME)[None]
+    read = effect.reading("tendon_excursion", X, jnp.asarray(y))
+    late = np.sin(2 * np.pi * (TIME - 2e-3))
+    np.testing.assert_allclose(read[0, 2:-2], late[2:-2], atol=0.5 * (2 * np.pi * 2e-3) ** 2 + 1e-4)
+    assert np.abs(read[0] - y[0]).max() > 1e-2
+
+
+def test_rate_is_zero_where_time_stands_still():
+    time = jnp.array([0.0, 0.1, 0.2, 0.2, 0.2])
+    np.testing.assert_allclose(rate(jnp.array([0.0, 1, 2, 2, 2]), time)[-1], 0.0)
+
+
+def test_payload_is_the_finger_with_another_mass():
+    i = 2
+    effect = CATALOGUE["payload"].at(FINGER, (FINGER.joint_names[i],), mass=2e-3, moment_x=3e-5, moment_z=-1e-5)
+    loaded = effect.finger(FINGER)
+    assert float(loaded.mass[i] - FINGER.mass[i]) == pytest.approx(2e-3)
+    added = loaded.mass[:, None] * loaded.com - FINGER.mass[:, None] * FINGER.com
+    np.testing.assert_allclose(added[i], [3e-5, 0, -1e-5], atol=1e-17)
+    np.testing.assert_allclose(np.delete(added, i, 0), 0, atol=1e-17)
