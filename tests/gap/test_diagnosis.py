@@ -1,0 +1,163 @@
+"""A diagnosis from end to end: the planted cause is found, and all that is written says so."""
+
+import json
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfinger.errors import UserError
+from jaxfinger.gap import as_gap_json, diagnose, write
+from jaxfinger.gap.signatures import whitened
+from jaxfinger.gap.where import where
+from jaxfinger.identify import load_fit
+from jaxfinger.identify.noise import whiten
+from jaxfinger.report.diagnosis_page import summary, write_page
+
+from .conftest import TRUTH, WITHOUT, session_with
+
+
+@pytest.fixture(scope="module")
+def gap(diagnosis):
+    return json.loads(json.dumps(as_gap_json(diagnosis), allow_nan=False))
+
+
+def test_the_planted_cause_and_its_site_are_named(gap):
+    assert gap["verdict"]["status"] == "explained"
+    (first, *_) = gap["verdict"]["effects"]
+    assert (first["effect"], tuple(first["site"])) == TRUTH
+    best = gap["candidates"][0]
+    assert (best["effect"], tuple(best["site"])) == TRUTH
+    assert best["probability"] > 0.8
+    x0 = best["parameters"]["x0"]
+    assert x0["units"] == "rad"
+    assert x0["value"] == pytest.approx(0.1, rel=0.2)
+    assert best["parameters"]["a"]["value"] == pytest.approx(1.0, abs=0.15)
+
+
+def test_the_gap_lies_at_the_joint_and_closes_on_held_out_trials(gap):
+    assert gap["where"][0]["channel"] == "joint_torque"
+    assert gap["where"][0]["site"] == "PIP"
+    line = max(gap["gap"], key=lambda x: x["before"] / x["noise"])
+    assert line["channel"] == "joint_torque"
+    assert line["closed"] > 0.9
+    assert line["after"] < line["before"]
+
+
+def test_gap_json_is_to_the_letter(gap, diagnosis):
+    assert set(gap) == {
+        "schema", "data", "specimen", "verdict", "where", "candidates", "none", "unlisted", "ambiguous_sets",
+        "next_experiment", "gap",
+    }  # fmt: skip
+    assert gap["schema"] == "jaxfinger-gap/1"
+    assert set(gap["verdict"]) == {"status", "effects", "summary"}
+    for place in gap["where"]:
+        assert set(place) == {"experiment", "trial", "channel", "site", "region", "share"}
+        assert set(place["region"]) == {"variable", "low", "high"}
+        assert place["region"]["low"] <= place["region"]["high"]
+    shares = [p["share"] for p in gap["where"]]
+    assert shares == sorted(shares, reverse=True)
+    assert 0 < sum(shares) <= 1 + 1e-9
+    for c in gap["candidates"]:
+        assert set(c) == {"effect", "site", "probability", "parameters", "held_out_gain"}
+        for p in c["parameters"].values():
+            assert set(p) == {"value", "std", "units"}
+    probabilities = [c["probability"] for c in gap["candidates"]]
+    assert probabilities == sorted(probabilities, reverse=True)
+    assert sum(probabilities) + gap["none"] + gap["unlisted"] == pytest.approx(1.0, abs=1e-9)
+    for line in gap["gap"]:
+        assert set(line) == {"experiment", "channel", "units", "noise", "before", "after", "closed", "closed_ci95"}
+        assert line["units"] == {"joint_torque": "N m", "tendon_excursion": "m"}[line["channel"]]
+        squares = {k: line[k] ** 2 for k in ("noise", "before", "after")}
+        if line["before"] > 1.2 * line["noise"]:
+            closed = 1 - (squares["after"] - squares["noise"]) / (squares["before"] - squares["noise"])
+            assert line["closed"] == pytest.approx(np.clip(closed, -1, 1), abs=1e-9)
+            assert line["closed_ci95"][0] <= line["closed"] <= line["closed_ci95"][1]
+
+
+def test_written_fits_carry_the_effect(diagnosis, tmp_path):
+    write(diagnosis, tmp_path / "out")
+    nominal, augmented = (load_fit(tmp_path / "out" / f"{n}.json") for n in ("nominal", "augmented"))
+    assert not nominal.model.effects
+    assert TRUTH[0] == augmented.model.effects[0].ID
+    assert augmented.model.effects[0].site == TRUTH[1]
+    before = (tmp_path / "out" / "gap.json").read_bytes()
+    with pytest.raises(UserError, match="not overwritten"):
+        write(diagnosis, tmp_path / "out")
+    assert (tmp_path / "out" / "gap.json").read_bytes() == before
+
+
+def test_page_and_screen(diagnosis, gap, tmp_path):
+    path = tmp_path / "report.html"
+    write_page(diagnosis, path)
+    text = path.read_text(encoding="utf-8")
+    assert text.count("<svg") == 2
+    assert "src=" not in text.replace("xlink:href", "")
+    assert "<script" not in text
+    assert "<link" not in text
+    assert gap["verdict"]["summary"] in text
+    with pytest.raises(UserError, match="not overwritten"):
+        write_page(diagnosis, path)
+    screen = summary(diagnosis).splitlines()
+    assert len(screen) <= 45
+    assert any("joint_presliding · PIP" in line for line in screen)
+
+
+def test_signatures_are_whitened_as_the_residuals_are(diagnosis):
+    problem = diagnosis.problem
+    rng = np.random.default_rng(0)
+    for e, channel in (("ID.3-dynamic", "joint_torque"), ("ID.2", "tendon_excursion")):
+        rows, stack = problem.rows[e], problem.stacks[e]
+        raw = rng.standard_normal((1, *stack.batch.y[channel].shape))
+        pick = np.arange(rows.size)
+        mine = whitened(raw, problem, rows, pick, channel)[0]
+        filters = jnp.asarray(problem.noise[e, channel].coefficients)
+        white = whiten(jnp.asarray(raw[0]), stack.batch.mask[channel], filters, channel == "tendon_excursion")
+        reference = np.asarray(white)[rows.column, rows.trial, rows.time]
+        np.testing.assert_allclose(mine, reference, rtol=1e-6, atol=1e-6 * np.abs(reference).max())
+
+
+def test_where_finds_a_planted_gap(diagnosis):
+    """White noise everywhere, and five deviations more in the upper angles of one trial."""
+    problem = diagnosis.problem
+    rows = problem.rows["ID.3-dynamic"]
+    r = np.random.default_rng(1).standard_normal(problem.r.size)
+    trial, column = int(rows.trial[-1]), int(rows.column[rows.trial == rows.trial[-1]][0])
+    mine = (rows.trial == trial) & (rows.column == column)
+    q = np.asarray(problem.stacks["ID.3-dynamic"].batch.x.q)[column, trial, rows.time]
+    threshold = np.quantile(q[mine], 2 / 3)
+    r[rows.start : rows.start + rows.size][mine & (q > threshold)] += 5.0
+    (place, *rest) = where(replace(problem, r=r))
+    assert not rest
+    assert place.trial == problem.stacks["ID.3-dynamic"].trials[trial]
+    assert place.site == problem.nominal.finger.joint_names[column]
+    assert place.variable == "q"
+    assert place.low == pytest.approx(threshold, abs=0.05)
+    assert place.share > 0.9
+
+
+def test_no_place_stands_out_of_white_noise(diagnosis):
+    problem = diagnosis.problem
+    assert where(replace(problem, r=np.random.default_rng(2).standard_normal(problem.r.size))) == []
+
+
+def test_progress_is_told(diagnosis, messages):
+    assert len(messages) > 5
+    assert any("refitting" in m for m in messages)
+
+
+def test_nothing_is_named_where_nothing_is():
+    found = diagnose(session_with(), without=WITHOUT)
+    gap = as_gap_json(found)
+    assert gap["verdict"]["status"] == "no_gap"
+    assert gap["verdict"]["effects"] == []
+    assert gap["none"] > 0.8
+    total = sum(c["probability"] for c in gap["candidates"])
+    assert total + gap["none"] + gap["unlisted"] == pytest.approx(1.0, abs=1e-9)
+    assert "no place stands out" in summary(found) or "NO GAP" in summary(found)
+
+
+def test_an_unknown_effect_to_leave_out_is_refused():
+    with pytest.raises(UserError, match="no effect joint_magic"):
+        diagnose(session_with(), without=("joint_magic",))
