@@ -78,8 +78,8 @@ def _bars(ax, labels, values, colours) -> None:
     at = np.arange(len(labels))
     ax.barh(at, values, color=colours, height=0.7)
     for y, v in zip(at, values, strict=True):
-        ax.text(v, y, f" {100 * v:.0f} %", va="center", fontsize=8)
-    ax.set(yticks=at, yticklabels=labels, xticks=[0, 0.5, 1], xlim=(0, 1.18), ylim=(len(labels) - 0.4, -0.6))
+        ax.text(v + 0.02, y, f"{100 * v:.0f} %", va="center", fontsize=8)
+    ax.set(yticks=at, yticklabels=labels, xticks=[0, 0.5, 1], xlim=(0, 1.22), ylim=(len(labels) - 0.4, -0.6))
     ax.set_xticklabels(["0", "50 %", "100 %"])
     ax.grid(axis="y", visible=False)
 
@@ -156,13 +156,9 @@ def traces(d: Diagnosis):
     std = factor * float(d.problem.noise[e, channel].std[column])
     missed.axhspan(-std, std, color="#bbbbbb", alpha=0.5, linewidth=0, label="noise ±1σ")
     span = factor * float(np.ptp(y[mask]))
-    missed.set(
-        ylabel=f"missed ({unit})",
-        title=(
-            f"{stack.trials[b]}: {SHORT.get(channel, channel)} {site(d.problem, channel, column)}, "
-            f"measured − predicted (the signal spans {span:.3g} {unit})"
-        ),
-    )
+    what = f"{stack.trials[b]}: {SHORT.get(channel, channel)} {site(d.problem, channel, column)}, measured − predicted"
+    spans = f" (the signal spans {span:.3g} {unit})" if span else ""  # the free finger's external torque is zero
+    missed.set(ylabel=f"missed ({unit})", title=what + spans)
     for i, name in enumerate(d.problem.nominal.finger.joint_names):
         angle.plot(time[seen], np.degrees(np.asarray(x.q)[i, b][seen]), color=COLOURS[i % len(COLOURS)], label=name)
     for k, name in enumerate(d.problem.nominal.finger.tendon_names):

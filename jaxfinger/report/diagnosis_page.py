@@ -71,7 +71,7 @@ def _content(d: Diagnosis) -> dict:
             }
             for c in gap["candidates"][:ROWS]
         ],
-        "none": _percent(gap["none"]),
+        "no_gap": _percent(gap["none"]),
         "unlisted": _percent(gap["unlisted"]),
         "others": f"{len(rest)} more candidates were tried; together they have {together}." if rest else "",
         "sets": [" or ".join(_effect(e) for e in members) for members in gap["ambiguous_sets"]],
@@ -163,7 +163,7 @@ def summary(d: Diagnosis) -> str:
     gap = as_gap_json(d)
     counts = Counter(d.problem.session[name].experiment for name in d.problem.trial_names)
     trials = ", ".join(f"{n} {e}" for e, n in counts.items())
-    out = [f"{gap['specimen']} · {gap['data']} · {trials}", "", headline(gap).upper(), gap["verdict"]["summary"], ""]
+    out = [f"{gap['specimen']} · {gap['data']} · {trials}", "", headline(gap), gap["verdict"]["summary"], ""]
     if shares := places(gap):
         out.append("WHERE      share of the gap")
         regions = {}
