@@ -19,6 +19,7 @@ from jaxfinger.gap.refine import Refined, refine
 from jaxfinger.gap.search import Search, search
 from jaxfinger.gap.shrinkage import Shrinkage, shrinkage
 from jaxfinger.gap.signatures import Signatures, Variant
+from jaxfinger.gap.standin import energy_left
 from jaxfinger.gap.where import Place, where
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.fit_file import save_fit
@@ -165,7 +166,7 @@ def _verdict(found: Search, lines: list[Shrinkage]) -> Verdict:
 
 
 def _left_share(found: Search) -> float:
-    return sum(max(x.energy, 0.0) for x in found.left if x.energy > 15.0) / max(found.gap, 1e-9)
+    return energy_left(found.left) / max(found.gap, 1e-9)
 
 
 def _depends(found: Search) -> str:

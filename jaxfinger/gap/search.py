@@ -20,7 +20,7 @@ from jaxfinger.gap.evidence import Evidence, Projector, by_site, screen
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.refine import Refined, refine
 from jaxfinger.gap.signatures import Signatures, Variant, all_columns, variants
-from jaxfinger.gap.standin import Explained, explained
+from jaxfinger.gap.standin import Explained, energy_left, explained
 
 Progress = Callable[[str], None]
 
@@ -88,7 +88,7 @@ def search(
     best = max(refined.values(), key=lambda r: r.log_evidence)
     chosen = best if quick else _add(problem, groups, columns, best, chi2, projector, progress)
     left = explained(problem, chosen.residual)
-    beyond = sum(max(x.energy, 0.0) for x in left if x.energy > 15.0)
+    beyond = energy_left(left)
     gap = chi2 - chosen.chi2 + beyond
     shares = _shares(problem, chosen, chi2, projector, gap)
     order = np.argsort(-np.asarray(shares))
@@ -123,7 +123,7 @@ def _add(problem, groups, columns, best: Refined, chi2: float, projector, progre
     """Further effects on top of the best, while each explains a fair part of the gap."""
     chosen = best
     while len(chosen.variants) < 3:
-        beyond = sum(max(x.energy, 0.0) for x in explained(problem, chosen.residual) if x.energy > 15.0)
+        beyond = energy_left(explained(problem, chosen.residual))
         gap = chi2 - chosen.chi2 + beyond
         if beyond < LEAST:
             break

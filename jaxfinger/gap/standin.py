@@ -11,6 +11,8 @@ import numpy as np
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signatures import whitened
 
+REACH = 60.0  # energy of a column that coloured noise, estimated from few repeats, can still give
+
 
 @dataclass(frozen=True)
 class Explained:
@@ -73,6 +75,11 @@ def features(problem: Problem, experiment: str, channel: str, column: int) -> di
     return out
 
 
+def energy_left(left: list[Explained]) -> float:
+    """What the stand-in explains in all, columns within reach of the noise apart."""
+    return sum(x.energy for x in left if x.energy > REACH)
+
+
 def explained(problem: Problem, residual: np.ndarray) -> list[Explained]:
     """Column by column, largest energy first."""
     found = []
@@ -97,10 +104,12 @@ def explained(problem: Problem, residual: np.ndarray) -> list[Explained]:
 
 
 def _energy(features: np.ndarray, r: np.ndarray) -> float:
+    """Energy of the residual in the span of the features, less its expectation. Nearly collinear features are left out:
+    their differences are narrow, and would single out samples."""
     scale = np.linalg.norm(features, axis=1, keepdims=True)
-    Q, R = np.linalg.qr((features / np.maximum(scale, 1e-300)).T)
-    kept = np.abs(np.diag(R)) > 1e-2  # what is nearly a combination of the others would single out samples
-    b = Q[:, kept].T @ r
+    U, s, _ = np.linalg.svd((features / np.maximum(scale, 1e-300)).T, full_matrices=False)
+    kept = s > 0.1 * s[0]
+    b = U[:, kept].T @ r
     return float(b @ b - kept.sum())
 
 
