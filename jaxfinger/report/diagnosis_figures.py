@@ -152,7 +152,15 @@ def traces(d: Diagnosis):
         residual = np.asarray(_residuals(fit.model, stack.batch, (channel,))[channel])[column, b]
         if channel == "tendon_excursion":  # its zero is free in every trial
             residual = residual - residual[mask].mean()
-        missed.plot(time, np.where(mask, factor * residual, np.nan), color=colour, linewidth=0.9, label=label)
+        missed.plot(
+            time,
+            np.where(mask, factor * residual, np.nan),
+            ".-",
+            color=colour,
+            linewidth=0.9,
+            markersize=1.5,
+            label=label,
+        )
     std = factor * float(d.problem.noise[e, channel].std[column])
     missed.axhspan(-std, std, color="#bbbbbb", alpha=0.5, linewidth=0, label="noise ±1σ")
     span = factor * float(np.ptp(y[mask]))
