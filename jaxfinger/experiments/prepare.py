@@ -6,11 +6,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
 from jaxfinger.data import Session, Trial, find_holds, outlier_mask, smooth
 from jaxfinger.errors import UserError
-from jaxfinger.experiments.table import EXPERIMENTS, MIN_JOINT_SPEED, MIN_TENDON_SPEED, SLACK, STILL, Experiment
+from jaxfinger.experiments.table import CLEAR, EXPERIMENTS, MIN_JOINT_SPEED, MIN_TENDON_SPEED, SLACK, STILL, Experiment
 from jaxfinger.model import Motion
 
 
@@ -165,7 +165,9 @@ def _sliding(spec: Experiment, trial: Trial, session: Session, qd) -> np.ndarray
     known = ~taut | ((np.abs(_rates(trial, spec)) > MIN_TENDON_SPEED) & measured)
     for i in range(session.finger.m):
         moving[:, i] &= known[:, session.finger.crosses[:, i] & session.finger.active].all(axis=1)
-    return moving.astype(float)
+    # Filtered rates cross zero a little off the true reversal: stay clear of every one.
+    samples = 2 * round(CLEAR / float(np.median(np.diff(trial.time)))) + 1
+    return minimum_filter1d(moving.astype(float), samples, axis=0)
 
 
 def _in_steps(tension: np.ndarray, hold: np.ndarray) -> np.ndarray:

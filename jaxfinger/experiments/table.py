@@ -41,3 +41,4 @@ SLACK = 0.2  # N: a tendon whose tension stays below this is slack, and carries 
 STILL = 0.05  # rad/s (or a tenth of the motion's speed): below this a joint keeps the direction that it had
 MIN_JOINT_SPEED = 0.1  # rad/s (or a fifth of the motion's speed): below this a joint may stick, its friction unknown
 MIN_TENDON_SPEED = 5e-4  # m/s: likewise a tendon
+CLEAR = 0.03  # s: kept clear on either side of where a joint or tendon of VD.3 may stick

@@ -182,7 +182,7 @@ def _no_gap_summary(found: Search) -> str:
     strongest = found.candidates[0]
     return (
         f"No gap beyond the noise: the strongest candidate, {strongest.key[0]} at {'-'.join(strongest.key[1])}, has a "
-        f"log evidence of {strongest.evidence.log_bf:.1f}, which the noise of such a file also gives."
+        f"log evidence of {found.strongest:.1f}, which the noise of such a file also gives."
     )
 
 

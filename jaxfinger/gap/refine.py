@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.effects import CatalogueEffect
+from jaxfinger.effects import NOMINAL_TERMS, CatalogueEffect
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signatures import Signatures, Variant
 
 STEPS = 6
+LARGE = 3.0  # plausible sizes: the width of the prior on an amplitude
 ADDITIVE = {"phi", "place", "p", "toe"}  # shapes that move by differences; the others by factors
 FIXED = {"end", "side", "joint_a", "joint_b", "delta", "damping"}  # shapes that are choices
 
@@ -66,7 +67,7 @@ def refine(
     for _ in range(STEPS):
         rt = projector.residual(problem, r)
         St = projector(slopes)
-        prior = np.array([1.0 / 3.0**2 if c.amplitude else 1.0 for c in coordinates])
+        prior = np.array([LARGE**-2 if c.amplitude else 1.0 for c in coordinates])
         G = St @ St.T
         delta = np.linalg.solve(G + np.diag(prior), St @ rt)
         moved = False
@@ -92,14 +93,21 @@ def refine(
     for c, v in zip(coordinates, np.sqrt(np.maximum(np.diag(covariance), 0.0)), strict=True):
         value = float(getattr(effects[c.effect], c.name))
         std[c.effect][c.name] = float(v * c.unit if c.amplitude or c.name in ADDITIVE else v * value)
-    occam = 0.5 * np.linalg.slogdet(np.eye(len(G)) + G)[1]
+    # A term that the recipe left out has the size of what it was; an effect beside the nominal terms is not much larger
+    # than plausible.
+    sizes = [
+        float(getattr(effects[c.effect], c.name)) / c.unit
+        for c in coordinates
+        if c.amplitude and effects[c.effect].ID not in NOMINAL_TERMS
+    ]
+    occam = 0.5 * np.linalg.slogdet(np.eye(len(G)) + G)[1] + 0.5 * float(np.sum(np.square(sizes))) / LARGE**2
     residual = projector.residual(problem, r)[: r.size]
     return Refined(
         tuple(variants),
         tuple(effects),
         tuple(std),
         cost,
-        float(0.5 * (chi2_null - cost) - occam),
+        float(0.5 * (chi2_null - cost) - occam - sum(e.HANDICAP for e in effects)),
         residual,
         problem.r - r,
         slopes,

@@ -83,6 +83,7 @@ def search(
         progress(f"refitting with {e.variant.effect.ID} at {', '.join(e.variant.site)}")
         refined[e.variant.key] = refine(problem, [e.variant], [_start(e)], chi2, projector)
     if not refined or max(r.log_evidence for r in refined.values()) < DETECT:
+        strongest = max((r.log_evidence for r in refined.values()), default=strongest)
         return _nothing(ranked, strongest, absorbed)
 
     best = max(refined.values(), key=lambda r: r.log_evidence)

@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pyads
 import pytest
-from conftest import ads_rig
+from tests.rig.conftest import ads_rig
 
 from jaxfinger.data import read_session
 from jaxfinger.errors import UserError

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import ads_rig
+from tests.rig.conftest import ads_rig
 
 from jaxfinger.data import check_file, read_session
 from jaxfinger.identify import identify

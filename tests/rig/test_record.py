@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import SHORT
+from tests.rig.conftest import SHORT
 from rich.console import Console
 
 from jaxfinger.cli.record import record, recover

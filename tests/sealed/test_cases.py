@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from conftest import short
+from tests.sealed.conftest import short
 
 from jaxfinger.data import check_file, read_session
 from jaxfinger.sealed import cases
