@@ -9,7 +9,6 @@ import time
 import numpy as np
 import pyads
 import pytest
-from tests.rig.conftest import ads_rig
 
 from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
@@ -25,6 +24,7 @@ from jaxfinger.rig.backend import (
     TensionRamp,
 )
 from jaxfinger.rig.contract import State, Trip
+from tests.rig.conftest import ads_rig
 
 
 @pytest.fixture(scope="module")

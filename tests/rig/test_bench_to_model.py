@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from tests.rig.conftest import ads_rig
 
 from jaxfinger.data import check_file, read_session
 from jaxfinger.identify import identify
@@ -10,6 +9,7 @@ from jaxfinger.identify.validate import validate
 from jaxfinger.rig import parse_plan, run, standin
 from jaxfinger.rig.examples import plan_toml
 from jaxfinger.rig.plant import Plant, default_truth
+from tests.rig.conftest import ads_rig
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.rig.conftest import SHORT
 from rich.console import Console
 
 from jaxfinger.cli.record import record, recover
@@ -20,6 +19,7 @@ from jaxfinger.rig.examples import plan_toml, rig_toml
 from jaxfinger.rig.live import LiveView
 from jaxfinger.rig.operator import AtTerminal, Nobody
 from jaxfinger.rig.runner import View
+from tests.rig.conftest import SHORT
 
 DOCS = Path(__file__).parents[2] / "docs"
 

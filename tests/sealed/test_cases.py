@@ -4,12 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from tests.sealed.conftest import short
 
 from jaxfinger.data import check_file, read_session
 from jaxfinger.sealed import cases
 from jaxfinger.sealed.cases import SPLITS, CaseSpec, case_specs, make_case, make_cases
 from jaxfinger.sealed.departures import LISTED, UNLISTED
+from tests.sealed.conftest import short
 
 
 @pytest.fixture
