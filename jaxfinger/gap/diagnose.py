@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ from jaxfinger.identify.fit_file import save_fit
 
 Progress = Callable[[str], None]
 MOST_IN_A_SET = 3
+FAINT = 200.0  # log evidence below which a gap must also stand out of the noise on held-out trials
 UNSEEN = 10.0  # plausible sizes: the stated deviation of an amplitude that the trials do not see at all
 
 
@@ -86,6 +87,12 @@ def diagnose(
     first = found.chosen.keys[order[0]]
     progress("refitting without each third of the trials")
     lines = shrinkage(problem, nominal, fit, r, J, _rivals(problem, found), first)
+    if found.chosen.log_evidence < FAINT and not any(x.resolvable for x in lines):
+        # Nothing stands out of the noise on held-out trials, and the evidence is what small doubts of CAD can give.
+        found = _as_none(found)
+        return Diagnosis(
+            problem, Verdict("no_gap", (), _no_gap_summary(found)), [], found, lines, None, nominal, nominal
+        )
     verdict = _verdict(found, lines)
     places = where(problem)
     members = _members(problem, found)
@@ -99,6 +106,14 @@ def diagnose(
         nominal,
         fit,
     )
+
+
+def _as_none(found: Search) -> Search:
+    """The same search where its evidence does not show on held-out trials: what is left for it is small."""
+    scale = 0.07 / max(sum(c.probability for c in found.candidates), 1e-12)
+    candidates = [replace(c, probability=c.probability * scale) for c in found.candidates]
+    strongest = found.chosen.log_evidence if found.chosen else found.strongest
+    return replace(found, detected=False, candidates=candidates, none=0.9, unlisted=0.03, strongest=strongest)
 
 
 def _rivals(problem: Problem, found: Search):
