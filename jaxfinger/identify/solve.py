@@ -9,7 +9,8 @@
    matrix is the identity. Most of equation (1) is linear in its parameters: one step, whatever the conditioning of θ.
 4. Where it is not (slip of held tendons, products of moment arms and losses) the model is linearised again at the new
    point, and a step that did not lower the cost is halved, until a step is a small part of a standard deviation.
-5. Outliers: Huber's weights from the white residuals at the optimum, then again from 1.
+5. A mass that would fall to nothing stays on its floor while the others are minimised with it there.
+6. Outliers: Huber's weights from the white residuals at the optimum, then again from 1.
 """
 
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
+from scipy.optimize import lsq_linear
 
 from jaxfinger.experiments import Batch
 from jaxfinger.identify.linearise import Filters, Linearised, linearise
@@ -29,6 +31,7 @@ from jaxfinger.model import Model
 VISIBLE = 1e-7  # relative singular value of the column-scaled Jacobian below which a combination is not seen
 SMALL = 0.02  # a step this small, in standard deviations of the estimate, ends the iteration
 STEPS = 40
+LIGHTEST = 0.02  # share of its starting value below which no mass is let to fall
 PAD = 16  # compressed problems are padded to multiples of this, to share compilations
 
 
@@ -75,6 +78,7 @@ def solve(
     moved = Free.at(model, free)
     theta = np.asarray(moved.get(model))
     masses = np.array([p.group == "mass" for p in describe(model)])[free]
+    floor = np.where(masses, LIGHTEST * theta, -np.inf)
     if prior is None:
         prior = Prior(theta, np.zeros((0, theta.size)))
     weights = {n: unit_weights(s) for n, s in sources.items()}
@@ -105,11 +109,13 @@ def solve(
             basis, invisible, scale = visible(A)
             z = _minimise(A @ basis, b)
             step = basis @ z
+            if np.any((theta + step)[masses] < floor[masses]):
+                step = _bounded(A, b, np.where(masses, floor - theta, -np.inf))
+                z = np.linalg.lstsq(basis, step, rcond=None)[0]
             small = float(np.max(np.abs(z), initial=0.0))
             if small < SMALL:
                 converged = True
                 break
-            step = step * _within(theta, step, masses)
             theta = theta + step
             model = moved.set(model, jnp.asarray(theta))
     message = (
@@ -150,10 +156,13 @@ def visible(A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return scale[:, None] * Vt[seen].T / s[seen], Vt[~seen], scale
 
 
-def _within(theta: np.ndarray, step: np.ndarray, positive: np.ndarray) -> float:
-    """Share of a step that leaves every positive parameter at least a tenth of its value."""
-    falling = positive & (step < 0)
-    return float(np.min(0.9 * theta[falling] / -step[falling], initial=1.0))
+def _bounded(A: np.ndarray, b: np.ndarray, lower: np.ndarray) -> np.ndarray:
+    """argmin ‖A δ + b‖ over δ ≥ lower: optimistix has no bounds, so the few problems that need them go to scipy."""
+    R = np.linalg.qr(np.column_stack([A, b]), mode="r")
+    norm = np.linalg.norm(A, axis=0)
+    scale = 1.0 / np.where(norm > 0, norm, 1.0)
+    lower = np.minimum(lower, 0.0) / scale
+    return scale * lsq_linear(R[:, :-1] * scale, -R[:, -1], (lower, np.inf), method="bvls").x
 
 
 def _compressed(z: Float[Array, " k"], problem: tuple[Array, Array]) -> Float[Array, " rows"]:
