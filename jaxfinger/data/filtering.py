@@ -1,10 +1,9 @@
 """Derivatives from noisy encoders, without phase: low-pass, then a spline.
 
-1. A forward and backward Butterworth filter (second order each way) has no phase, a flat pass band and one number to
-   state, its cut-off. Savitzky–Golay was the other choice; its cut-off depends on window, degree and rate together.
-2. Two passes lower the -3 dB point; the design frequency is raised so that the *result* has -3 dB at `cutoff_hz`:
-   |H|² = 1/(1 + (w/w_c)⁴) per pass pair, so w_c = w (√2 − 1)^(−1/4) in the pre-warped (tangent) frequency
-   (Winter, Biomechanics and Motor Control of Human Movement, 4th ed., §3.4.4.2).
+1. The low-pass is a Gaussian: no phase, no ringing, and one number to state, its cut-off, where |H| = 1/√2. Butterworth
+   both ways was the other choice: flatter below the cut-off, but it lets more noise into the second derivative, and
+   spreads a jump of friction three times as far.
+2. Its standard deviation in time is √(ln 2) / (2π cutoff): 13 ms at 10 Hz.
 3. Samples that are not evenly spaced are first interpolated to the median interval: the filter knows no other.
 4. Derivatives are those of the quintic spline through the filtered samples, so differencing adds no error of its own.
 
@@ -17,12 +16,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import make_interp_spline
-from scipy.ndimage import median_filter
-from scipy.signal import butter, sosfiltfilt
+from scipy.ndimage import gaussian_filter1d, median_filter
 
 from jaxfinger.errors import UserError
 
-_PASSES = (np.sqrt(2.0) - 1.0) ** -0.25
 _EVEN = 1e-3  # intervals this equal (relative) need no resampling
 _SMALL = 1e-4  # of a column's travel: what bends away from its running median by less is no spike
 
@@ -77,10 +74,14 @@ def _on_grid(time: np.ndarray, column: np.ndarray, grid: np.ndarray) -> np.ndarr
 
 
 def _low_pass(x: Float[np.ndarray, "N k"], rate: float, cutoff_hz: float) -> Float[np.ndarray, "N k"]:
-    warped = np.tan(np.pi * cutoff_hz / rate) * _PASSES
-    sos = butter(2, 2.0 / np.pi * np.arctan(warped), output="sos")
-    padding = min(len(x) - 1, round(3.0 * rate / cutoff_hz))
-    return sosfiltfilt(sos, x, axis=0, padlen=padding)
+    padding = min(len(x) - 1, round(rate / cutoff_hz))
+    padded = np.pad(x, [(padding, padding), (0, 0)], mode="reflect", reflect_type="odd")
+    return gaussian_filter1d(padded, rate * width(cutoff_hz), axis=0, truncate=6.0)[padding : padding + len(x)]
+
+
+def width(cutoff_hz: float) -> float:
+    """Standard deviation, s, of the Gaussian whose transfer function is 1/√2 at `cutoff_hz`."""
+    return np.sqrt(np.log(2.0)) / (2.0 * np.pi * cutoff_hz)
 
 
 def _odd(degree: int) -> int:

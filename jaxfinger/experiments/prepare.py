@@ -10,7 +10,16 @@ from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
 from jaxfinger.data import Session, Trial, find_holds, outlier_mask, smooth
 from jaxfinger.errors import UserError
-from jaxfinger.experiments.table import CLEAR, EXPERIMENTS, MIN_JOINT_SPEED, MIN_TENDON_SPEED, SLACK, STILL, Experiment
+from jaxfinger.experiments.table import (
+    CLEAR,
+    EVERY_SAMPLE,
+    EXPERIMENTS,
+    MIN_JOINT_SPEED,
+    MIN_TENDON_SPEED,
+    SLACK,
+    STILL,
+    Experiment,
+)
 from jaxfinger.model import Motion
 
 
@@ -62,7 +71,10 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool) -> 
     block = max(1, round(1.0 / (spec.rate * step))) if reduced else 1
     holds = find_holds(trial) if spec.samples == "holds" else np.full(N, -1)
 
-    q, qd, qdd = smooth(trial.time, trial.q, min(spec.cutoff, 0.2 / step))
+    cutoff = min(spec.cutoff * (1.0 if reduced else EVERY_SAMPLE), 0.2 / step)
+    q, qd, qdd = smooth(trial.time, trial.q, cutoff)
+    if reduced:
+        q = trial.q  # averaged over the same blocks as what it predicts, and not filtered where that is not
     if spec.samples == "holds":
         # Only holds count in a fit, and there nothing moves; at the full rate joints also move between them.
         moves = (holds < 0)[:, None] & (not reduced and not spec.held)
@@ -81,6 +93,12 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool) -> 
         motorised[:, session.finger.joint_names.index(trial.joint)] = 1.0
 
     y, mask = _measured(spec, trial, session, holds, qd)
+    if reduced and spec.samples == "sliding":
+        # q̈ is low-passed, so every other term of (1) is too: else a fit would find too little inertia.
+        joint_direction, tendon_direction, tension = (
+            smooth(trial.time, a, cutoff)[0] for a in (joint_direction, tendon_direction, tension)
+        )
+        y["joint_torque"] = smooth(trial.time, y["joint_torque"], cutoff)[0]
     M = N // block
 
     def mean(a):
@@ -129,15 +147,24 @@ def _measured(spec, trial, session, holds, qd):
             values = np.full((N, width[c]), np.nan)
         measured = np.isfinite(values).all(axis=0)
         counts = np.zeros(values.shape)
-        counts[:, measured] = 1.0
         if measured.any():
-            counts[:, measured] *= ~outlier_mask(values[:, measured])
+            spikes = outlier_mask(values[:, measured])
+            counts[:, measured] = ~spikes
+            values = values.copy()
+            values[:, measured] = _bridged(values[:, measured], spikes)
         if spec.samples == "holds":
             counts *= (holds >= 0)[:, None]
         if spec.samples == "sliding" and c == "joint_torque":
             counts *= _sliding(spec, trial, session, qd)
         y[c], mask[c] = np.nan_to_num(values), counts
     return y, mask
+
+
+def _bridged(values: np.ndarray, spikes: np.ndarray) -> np.ndarray:
+    """Straight lines across the spikes, so that a filter does not spread them."""
+    n = np.arange(len(values))
+    columns = zip(values.T, ~spikes.T, strict=True)
+    return np.stack([np.interp(n, n[good], v[good]) if good.any() else v for v, good in columns], axis=1)
 
 
 def _direction(commanded: np.ndarray | None, rate: np.ndarray, still: float) -> np.ndarray:
@@ -157,17 +184,16 @@ def _rates(trial: Trial, spec: Experiment) -> np.ndarray:
 def _sliding(spec: Experiment, trial: Trial, session: Session, qd) -> np.ndarray:
     """(N, m): 1 where a joint and every taut tendon across it slide, so that the directions of friction are known."""
     fast = np.percentile(np.abs(qd), 95, axis=0)
-    moving = np.abs(qd) > np.minimum(MIN_JOINT_SPEED, 0.2 * fast)
-    if spec.slack or trial.tendon_excursion is None or trial.tendon_force is None:
-        return moving.astype(float)
-    taut = np.nan_to_num(trial.tendon_force) > SLACK
-    measured = np.isfinite(trial.tendon_excursion).all(axis=0)
-    known = ~taut | ((np.abs(_rates(trial, spec)) > MIN_TENDON_SPEED) & measured)
-    for i in range(session.finger.m):
-        moving[:, i] &= known[:, session.finger.crosses[:, i] & session.finger.active].all(axis=1)
-    # Filtered rates cross zero a little off the true reversal: stay clear of every one.
+    slides = np.abs(qd) > np.minimum(MIN_JOINT_SPEED, 0.05 * fast)
+    if not spec.slack and trial.tendon_excursion is not None and trial.tendon_force is not None:
+        taut = np.nan_to_num(trial.tendon_force) > SLACK
+        measured = np.isfinite(trial.tendon_excursion).all(axis=0)
+        known = ~taut | ((np.abs(_rates(trial, spec)) > MIN_TENDON_SPEED) & measured)
+        for i in range(session.finger.m):
+            slides[:, i] &= known[:, session.finger.crosses[:, i] & session.finger.active].all(axis=1)
+    # The filter spreads the jump of friction at a reversal, and friction before it slides is not known.
     samples = 2 * round(CLEAR / float(np.median(np.diff(trial.time)))) + 1
-    return minimum_filter1d(moving.astype(float), samples, axis=0)
+    return minimum_filter1d(slides.astype(float), samples, axis=0)
 
 
 def _in_steps(tension: np.ndarray, hold: np.ndarray) -> np.ndarray:

@@ -8,7 +8,8 @@ class Experiment:
     """One row of the format's table of experiments.
 
     `rate` and `cutoff` say how a trial is reduced before a fit: slow experiments are averaged over blocks of 1/rate s,
-    q̇ and q̈ come from a zero-phase low-pass at `cutoff`. Whatever is averaged is averaged alike on both sides of (1).
+    q̇ and q̈ come from a zero-phase low-pass at `cutoff`. Both sides of (1) are averaged and filtered alike. A higher
+    cut-off lets the encoder's noise into q̈, and a fit takes that for less inertia.
     """
 
     name: str
@@ -27,11 +28,11 @@ EXPERIMENTS = {
     for e in (
         Experiment("ID.2", ("tendon_excursion",), 20.0, 5.0),
         Experiment("ID.3-static", ("joint_torque",), 20.0, 5.0, samples="holds", slack=True),
-        Experiment("ID.3-dynamic", ("joint_torque",), 100.0, 40.0, samples="sliding", slack=True),
+        Experiment("ID.3-dynamic", ("joint_torque",), 50.0, 10.0, samples="sliding", slack=True),
         Experiment("ID.4", ("joint_torque", "tendon_excursion"), 20.0, 5.0, samples="holds", held=True),
         Experiment("VD.1", ("tendon_excursion",), 20.0, 5.0),
         Experiment("VD.2", ("fingertip_force", "tendon_excursion"), 20.0, 5.0, samples="holds", held=True),
-        Experiment("VD.3", ("joint_torque", "tendon_excursion"), 100.0, 20.0, samples="sliding"),
+        Experiment("VD.3", ("joint_torque", "tendon_excursion"), 50.0, 10.0, samples="sliding"),
     )
 }
 
@@ -41,4 +42,5 @@ SLACK = 0.2  # N: a tendon whose tension stays below this is slack, and carries 
 STILL = 0.05  # rad/s (or a tenth of the motion's speed): below this a joint keeps the direction that it had
 MIN_JOINT_SPEED = 0.1  # rad/s (or a fifth of the motion's speed): below this a joint may stick, its friction unknown
 MIN_TENDON_SPEED = 5e-4  # m/s: likewise a tendon
-CLEAR = 0.03  # s: kept clear on either side of where a joint or tendon of VD.3 may stick
+CLEAR = 0.03  # s: kept clear on either side of where a joint or tendon may stick: over two widths of the filter
+EVERY_SAMPLE = 4.0  # times the cut-off where every sample is predicted: noise of q̈ biases nothing there

@@ -74,7 +74,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         recipe.fit.huber,
     )
     warnings = name_invisible(parameters, free, solution.invisible)
-    if not solution.converged or warnings or _chi2(solution, free) > MISFIT:
+    if not solution.converged or warnings or solution.chi2_per_row(free.size) > MISFIT:
         progress("refining from a neutral start")
         neutral = start_values(_neutral(model, free, parameters), free, parameters)
         sources = sources_of(stacks, reads, noise, parameters)
@@ -102,7 +102,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         solution.message or _gain(fit, refined, same),
         trials=tuple(t for s in stacks.values() for t in s.trials),
         rows=solution.rows,
-        chi2_per_row=_chi2(solution, free),
+        chi2_per_row=solution.chi2_per_row(free.size),
         outliers=solution.outliers,
         warnings=tuple(warnings),
     )
@@ -113,10 +113,6 @@ def channels_of(experiment: str) -> tuple[str, ...]:
     """What a held joint's tendons show of their excursion is stretch, not moment arm."""
     e = EXPERIMENTS[experiment]
     return tuple(c for c in e.channels if not (e.held and c == "tendon_excursion"))
-
-
-def _chi2(solution: Solution, free) -> float:
-    return 2 * solution.cost / max(1, solution.rows - free.size)
 
 
 def _total(solution: Solution, model: Model, free, prior: Prior) -> float:

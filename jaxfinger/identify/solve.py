@@ -64,6 +64,10 @@ class Solution:
     outliers: float  # share of white residuals beyond the robust limit
     linearised: dict[str, Linearised]
 
+    def chi2_per_row(self, estimated: int) -> float:
+        """1 where model and noise are right, with so many parameters estimated."""
+        return 2.0 * self.cost / max(1, self.rows - estimated)
+
 
 def solve(
     model: Model,

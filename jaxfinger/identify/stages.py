@@ -165,7 +165,7 @@ def run_stage(fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session
         solution.message,
         trials=tuple(t for e in reads for t in stacks[e].trials),
         rows=solution.rows,
-        chi2_per_row=2 * solution.cost / max(1, solution.rows - free.size),
+        chi2_per_row=solution.chi2_per_row(free.size),
         outliers=solution.outliers,
         warnings=tuple(warnings),
     )
@@ -279,8 +279,13 @@ def start_values(model: Model, free: np.ndarray, parameters: list[Parameter]) ->
 
 
 def propagate(covariance, solution: Solution, free, linked, prior) -> np.ndarray:
-    """Covariance of the flat vector after a stage (see the module's equation); infinite where nothing is seen."""
-    information, scale = solution.information, solution.scale
+    """Covariance of the flat vector after a stage (see the module's equation); infinite where nothing is seen.
+
+    Residuals larger than the noise say that the model misses something: intervals then widen with them (Birge's ratio,
+    as the Particle Data Group's scale factor S; Review of Particle Physics, §5.2.2).
+    """
+    information = solution.information / max(1.0, solution.chi2_per_row(free.size))
+    scale = solution.scale
     others = np.setdiff1d(linked, free)
     N = information[np.ix_(free, free)]
     if prior is not None:

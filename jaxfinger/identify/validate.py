@@ -1,6 +1,6 @@
 """How well a model predicts trials: error of every channel in the units that people read, beside the noise floor.
 
-Errors are those of block means at the rate at which a fit reads the experiment (20 Hz, 100 Hz where it moves fast), so
+Errors are those of block means at the rate at which a fit reads the experiment (20 Hz, 50 Hz where it moves fast), so
 that they are compared with the noise at that rate. Excursions and angles are scored after removing one constant a
 trial (the encoders' arbitrary zero) or none; the mean error of an excursion counts from the trial's first sample, as
 the paper's does.
