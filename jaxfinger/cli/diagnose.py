@@ -18,6 +18,7 @@ def diagnose(
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     recipe: str | None = None,
+    predictions: Path | None = None,
     effects: Path | None = None,
     without: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
     quick: bool = False,
@@ -33,6 +34,9 @@ def diagnose(
         Folder for gap.json, nominal.json, augmented.json and report.html; it is made where there is none.
     recipe
         The nominal model (TOML), or the name of a shipped recipe. A term that it leaves out is a candidate.
+    predictions
+        Another simulator's predictions of the session's trials (HDF5, as `predict` writes them): the gap is then
+        that between the measurements and this simulator.
     effects
         A Python file with effects of your own, beside those of the catalogue.
     without
@@ -43,7 +47,7 @@ def diagnose(
         Replace an earlier diagnosis in the folder.
     """
     _refuse(output, overwrite)
-    from jaxfinger.data import read_session
+    from jaxfinger.data import read_predictions, read_session
     from jaxfinger.effects import load
     from jaxfinger.gap import diagnose as run
     from jaxfinger.gap import write
@@ -54,7 +58,8 @@ def diagnose(
         wanted = read_recipe(recipe)
         own = load(effects) if effects is not None else {}
         say("reading the file")
-        found = run(read_session(session), wanted, quick, own, tuple(without or ()), say)
+        simulated = read_predictions(predictions) if predictions is not None else None
+        found = run(read_session(session), wanted, quick, own, tuple(without or ()), say, simulated)
         say("writing the report")
         write(found, output, overwrite)
         write_page(found, output / "report.html", overwrite)

@@ -42,7 +42,13 @@ def check(file: Path, *, json: bool = False) -> None:
 
 
 def simulate(
-    source: Path, *, output: Output, protocol: Path | None = None, seed: int | None = None, overwrite: bool = False
+    source: Path,
+    *,
+    output: Output,
+    protocol: Path | None = None,
+    effects: Path | None = None,
+    seed: int | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Write a simulated session: the specimen and protocol of a recipe, or the finger that a fit describes.
 
@@ -54,6 +60,8 @@ def simulate(
         Session to write (HDF5).
     protocol
         With a fit: the recipe whose trials and sensors it goes through; by default all experiments at 1 kHz.
+    effects
+        The Python file of effects of your own, where the fit's model has some.
     seed
         Of the noise; by default the recipe's.
     overwrite
@@ -75,7 +83,7 @@ def simulate(
             from jaxfinger.identify import load_fit
             from jaxfinger.synthetic.fitted import session_of_model
 
-            fit = load_fit(source)
+            fit = load_fit(source, effects)
             recipe = read_recipe(protocol) if protocol else Recipe()
             session = session_of_model(fit.model, fit.specimen, recipe, seed, count)
         else:

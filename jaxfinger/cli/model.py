@@ -85,16 +85,22 @@ def _fit(
     _report(fit, json)
 
 
-def fit_id2(
-    file: Path,
-    *,
-    output: Output,
-    start: Path | None = None,
-    recipe: str | None = None,
-    json: bool = False,
-    overwrite: bool = False,
-) -> None:
-    """Fit the moment arms alone (ID.2).
+def _of_stages(name: str, stages: tuple[str, ...], summary: str):
+    """The command that runs some of the first stages."""
+
+    def command(
+        file: Path,
+        *,
+        output: Output,
+        start: Path | None = None,
+        recipe: str | None = None,
+        json: bool = False,
+        overwrite: bool = False,
+    ) -> None:
+        _fit(stages, file, output, start, recipe, json, overwrite)
+
+    command.__name__ = name
+    command.__doc__ = f"""{summary}
 
     Parameters
     ----------
@@ -111,36 +117,15 @@ def fit_id2(
     overwrite
         Replace a file that is already there.
     """
-    _fit(("ID.2",), file, output, start, recipe, json, overwrite)
+    return command
 
 
-def fit_id3(
-    file: Path,
-    *,
-    output: Output,
-    start: Path | None = None,
-    recipe: str | None = None,
-    json: bool = False,
-    overwrite: bool = False,
-) -> None:
-    """Fit elastic torque, friction and damping of the joints alone (ID.3-static, ID.3-dynamic).
-
-    Parameters
-    ----------
-    file
-        Session (HDF5).
-    output
-        Fit to write (JSON).
-    start
-        A fit that holds the other parameters.
-    recipe
-        What to fit (TOML), without --start.
-    json
-        Print the parameters as JSON.
-    overwrite
-        Replace a file that is already there.
-    """
-    _fit(("ID.3-static", "ID.3-dynamic"), file, output, start, recipe, json, overwrite)
+fit_id2 = _of_stages("fit_id2", ("ID.2",), "Fit the moment arms alone (ID.2).")
+fit_id3 = _of_stages(
+    "fit_id3",
+    ("ID.3-static", "ID.3-dynamic"),
+    "Fit elastic torque, friction and damping of the joints alone (ID.3-static, ID.3-dynamic).",
+)
 
 
 def fit_id4(
@@ -204,6 +189,7 @@ def validate(
     file: Path,
     *,
     experiments: Experiments = None,
+    effects: Path | None = None,
     figures: Path | None = None,
     json: bool = False,
     overwrite: bool = False,
@@ -218,6 +204,8 @@ def validate(
         Session (HDF5), best of trials that the fit has not seen.
     experiments
         Which experiments; by default the recipe's, VD.1, VD.2 and VD.3.
+    effects
+        The Python file of effects of your own, where the fit's model has some.
     figures
         Folder for the traces.
     json
@@ -232,7 +220,7 @@ def validate(
 
     with progress("validate") as say:
         say("reading the files")
-        loaded, session = load_fit(fit), read_session(file)
+        loaded, session = load_fit(fit, effects), read_session(file)
         result = run(loaded, session, tuple(experiments) if experiments else None, say)
         if figures is not None:
             from jaxfinger.report.validation import draw_validation
@@ -245,7 +233,7 @@ def validate(
         print_validation(result)
 
 
-def predict(fit: Path, file: Path, *, output: Output, overwrite: bool = False) -> None:
+def predict(fit: Path, file: Path, *, output: Output, effects: Path | None = None, overwrite: bool = False) -> None:
     """Write what a fit predicts for every sample of a session, in the session's own layout.
 
     Parameters
@@ -256,6 +244,8 @@ def predict(fit: Path, file: Path, *, output: Output, overwrite: bool = False) -
         Session (HDF5).
     output
         Predictions to write (HDF5).
+    effects
+        The Python file of effects of your own, where the fit's model has some.
     overwrite
         Replace a file that is already there.
     """
@@ -266,25 +256,27 @@ def predict(fit: Path, file: Path, *, output: Output, overwrite: bool = False) -
 
     with progress("predict") as say:
         say("reading the files")
-        loaded, session = load_fit(fit), read_session(file)
+        loaded, session = load_fit(fit, effects), read_session(file)
         predictions = predict_session(loaded, session, progress=say)
         write_predictions(output, session, predictions, overwrite)
     print(f"{output}: {len(predictions)} trials predicted")
 
 
-def show(fit: Path, *, json: bool = False) -> None:
+def show(fit: Path, *, effects: Path | None = None, json: bool = False) -> None:
     """Say what a fit file holds: stages, warnings, what the finger is like, every parameter with its 95 % interval.
 
     Parameters
     ----------
     fit
         Fit (JSON).
+    effects
+        The Python file of effects of your own, where the fit's model has some.
     json
         Print it as JSON.
     """
     from jaxfinger.identify import load_fit
 
-    _report(load_fit(fit), json)
+    _report(load_fit(fit, effects), json)
 
 
 def _refine(fit, session, say):

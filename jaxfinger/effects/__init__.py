@@ -54,7 +54,9 @@ def from_dict(finger: Finger, content: dict, extra: dict[str, type[CatalogueEffe
     """The effect that `to_dict` described."""
     known = CATALOGUE | NOMINAL_TERMS | (extra or {})
     if content["effect"] not in known:
-        raise UserError(f"the effect {content['effect']!r} is not in the catalogue; load the file that defines it")
+        raise UserError(
+            f"the effect {content['effect']!r} is not in the catalogue; name the file that defines it with --effects"
+        )
     values = {k: v["value"] for k, v in content["parameters"].items()}
     return known[content["effect"]].at(finger, tuple(content["site"]), **values)
 

@@ -29,8 +29,6 @@ class CatalogueEffect(Effect):
     SHOWS: ClassVar[dict[str, tuple[str, ...]]]
     # Whether it changes the rigid body or the motion that drives it, beside the other terms of (1).
     MOVES_RIGID_BODY: ClassVar[bool] = False
-    # Log evidence that the nominal model's own doubts can give it, and that is therefore no evidence.
-    HANDICAP: ClassVar[float] = 0.0
 
     site: Site = eqx.field(static=True)
     index: Int[Array, " k"]

@@ -12,7 +12,6 @@ from jaxfinger.effects.base import ELASTIC, CatalogueEffect
 class Payload(CatalogueEffect):
     """A link's mass and first moment differ from CAD by Δm and Δ(m c)."""
 
-    HANDICAP: ClassVar = 60.0  # CAD's inertia tensors have errors that no file states
     ID: ClassVar = "payload"
     PLACE: ClassVar = "joint"  # a link goes by its joint's name
     AMPLITUDES: ClassVar = {
@@ -61,7 +60,6 @@ class GravityTilt(CatalogueEffect):
 class DriveInertia(CatalogueEffect):
     """I q̈: shaft and coupler of the external motor add inertia where it is coupled."""
 
-    HANDICAP: ClassVar = 60.0  # CAD's inertia tensors have errors that no file states
     ID: ClassVar = "drive_inertia"
     PLACE: ClassVar = "joint"
     AMPLITUDES: ClassVar = {"inertia": ("kg m2", 2e-5, False)}

@@ -9,14 +9,19 @@ from jaxfinger.effects.base import TENSION, CatalogueEffect, dahl
 
 
 class TendonFrictionCapstan(CatalogueEffect):
-    """f (1 − exp(−μ θ(q))), θ = Σ |q_i| over the joints crossed: the loss grows with the wrap, so with posture."""
+    """f (1 − exp(−μ θ(q))), θ = Σ |q_i| over the joints crossed: the loss grows with the wrap, so with posture.
+
+    `curvature` 1 is Euler and Eytelwein's law, 0 its first order, f μ θ.
+    """
 
     ID: ClassVar = "tendon_friction_capstan"
     PLACE: ClassVar = "tendon"
     AMPLITUDES: ClassVar = {"mu": ("1/rad", 0.1, False)}
+    SHAPES: ClassVar = {"curvature": ("1", (1.0, 0.0))}
     SHOWS: ClassVar = TENSION
 
     mu: Float[Array, ""]
+    curvature: Float[Array, ""]
     crossed: Float[Array, " m"]
 
     @classmethod
@@ -26,7 +31,8 @@ class TendonFrictionCapstan(CatalogueEffect):
     def loss(self, x, f, C, loss):
         k = self.index[0]
         wrap = jnp.sum(self.crossed.reshape(-1, *(1,) * (x.q.ndim - 1)) * jnp.abs(x.q), axis=0)
-        return loss.at[k].add(f[k] * (1.0 - jnp.exp(-self.mu * wrap)))
+        straight = self.mu * wrap
+        return loss.at[k].add(f[k] * (straight + self.curvature * (1.0 - jnp.exp(-straight) - straight)))
 
 
 class TendonFrictionViscous(CatalogueEffect):

@@ -1,5 +1,6 @@
 """From recordings to arrays that a fit can take: derivatives, directions, block means, padded stacks of trials."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -42,13 +43,21 @@ class Stack:
     dt: float  # s
 
 
-def prepare(session: Session, names: list[str] | None = None, reduced: bool = True) -> dict[str, Stack]:
-    """One stack an experiment, of the named trials (default all), averaged to the experiment's rate unless told."""
+Predictions = Mapping[str, Mapping[str, np.ndarray]]  # {trial: {channel: (N, columns)}}, as in a predictions file
+
+
+def prepare(
+    session: Session, names: list[str] | None = None, reduced: bool = True, minus: Predictions | None = None
+) -> dict[str, Stack]:
+    """One stack an experiment, of the named trials (default all), averaged to the experiment's rate unless told.
+
+    With `minus` the channels are measurement minus prediction, and what is not predicted does not count.
+    """
     stacks = {}
     for spec in EXPERIMENTS.values():
         chosen = [t for t in session if t.experiment == spec.name and (names is None or t.name in names)]
         trials = [t for t in chosen if len(t.time) > 1]
-        rows = [_reduce(spec, t, session, reduced) for t in trials]
+        rows = [_reduce(spec, t, session, reduced, minus) for t in trials]
         if rows:
             stacks[spec.name] = _stack(spec, trials, rows, reduced)
     return stacks
@@ -64,7 +73,7 @@ class _Row:
     dt: float
 
 
-def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool) -> _Row:
+def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, minus: Predictions | None) -> _Row:
     m, n = session.finger.m, session.finger.n
     N = len(trial.time)
     step = float(np.median(np.diff(trial.time)))
@@ -92,7 +101,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool) -> 
     if trial.joint is not None and "joint_torque" in spec.channels:
         motorised[:, session.finger.joint_names.index(trial.joint)] = 1.0
 
-    y, mask = _measured(spec, trial, session, holds, qd)
+    y, mask = _measured(spec, trial, session, holds, qd, minus)
     if reduced and spec.samples == "sliding":
         # q̈ is low-passed, so every other term of (1) is too: else a fit would find too little inertia.
         joint_direction, tendon_direction, tension = (
@@ -134,7 +143,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool) -> 
     return _Row(motion, y_mean, mask_mean, block * step)
 
 
-def _measured(spec, trial, session, holds, qd):
+def _measured(spec, trial, session, holds, qd, minus: Predictions | None):
     """The channels to be predicted, and which samples of them count: measured, no spike, holding or sliding."""
     N, m = qd.shape
     width = {"tendon_excursion": session.finger.n, "joint_torque": m, "fingertip_force": 3}
@@ -145,6 +154,8 @@ def _measured(spec, trial, session, holds, qd):
             values = np.zeros((N, m))  # nothing acts from outside on the free finger
         if values is None:
             values = np.full((N, width[c]), np.nan)
+        if minus is not None:
+            values = values - _predicted(minus.get(trial.name, {}), c, trial, values)
         measured = np.isfinite(values).all(axis=0)
         counts = np.zeros(values.shape)
         if measured.any():
@@ -158,6 +169,14 @@ def _measured(spec, trial, session, holds, qd):
             counts *= _sliding(spec, trial, session, qd)
         y[c], mask[c] = np.nan_to_num(values), counts
     return y, mask
+
+
+def _predicted(prediction: Mapping[str, np.ndarray], channel: str, trial: Trial, like: np.ndarray) -> np.ndarray:
+    """A predicted channel at the trial's times, NaN where there is none."""
+    if channel not in prediction:
+        return np.full(like.shape, np.nan)
+    columns = prediction[channel].T
+    return np.stack([np.interp(trial.time, prediction.get("time", trial.time), a) for a in columns], axis=1)
 
 
 def _bridged(values: np.ndarray, spikes: np.ndarray) -> np.ndarray:

@@ -11,10 +11,12 @@ from jaxfinger.data import Session
 from jaxfinger.data.atomic import atomic_path
 from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, CatalogueEffect
 from jaxfinger.errors import UserError
+from jaxfinger.experiments import Predictions
 from jaxfinger.gap.augment import augmented_fit, nominal_fit, parameter_values
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.next_experiment import NextExperiment, next_experiment
 from jaxfinger.gap.problem import Problem, build
+from jaxfinger.gap.propose import Proposal, propose
 from jaxfinger.gap.refine import Refined, refine
 from jaxfinger.gap.search import Search, search
 from jaxfinger.gap.shrinkage import Shrinkage, shrinkage
@@ -23,10 +25,10 @@ from jaxfinger.gap.standin import energy_left
 from jaxfinger.gap.where import Place, where
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.fit_file import save_fit
+from jaxfinger.identify.parameters import describe, ravel
 
 Progress = Callable[[str], None]
 MOST_IN_A_SET = 3
-FAINT = 200.0  # log evidence below which a gap must also stand out of the noise on held-out trials
 UNSEEN = 10.0  # plausible sizes: the stated deviation of an amplitude that the trials do not see at all
 
 
@@ -51,6 +53,7 @@ class Diagnosis:
     next: NextExperiment | None
     nominal: Fit
     augmented: Fit
+    proposal: Proposal | None = None  # a closed form for what no known effect explains
 
 
 def diagnose(
@@ -60,40 +63,43 @@ def diagnose(
     effects: dict[str, type[CatalogueEffect]] | None = None,
     without: tuple[str, ...] = (),
     progress: Progress = lambda message: None,
+    predictions: Predictions | None = None,
 ) -> Diagnosis:
-    """Diagnose a session. `effects` adds a user's own, `without` withholds some of the catalogue by id."""
-    recipe = recipe or Recipe()
-    catalogue = CATALOGUE | (effects or {})
-    catalogue |= {k: c for k, c in NOMINAL_TERMS.items() if k not in recipe.model.terms}
+    """Diagnose a session. `effects` adds a user's own, `without` withholds some of the catalogue by id.
+
+    With `predictions` the gap is that between the measurements and another simulator's predictions.
+    """
+    catalogue = CATALOGUE | NOMINAL_TERMS | (effects or {})
     if unknown := set(without) - set(catalogue):
         raise UserError(
             f"the catalogue has no effect {', '.join(sorted(unknown))} to leave out; "
             f"it has {', '.join(sorted(catalogue))}"
         )
-    catalogue = {k: c for k, c in catalogue.items() if k not in without}
-    problem = build(session, recipe, progress)
+    problem = build(session, recipe or Recipe(), progress, predictions)
+    kept = set(problem.fit.recipe.model.terms) | set(without)
+    catalogue = {k: c for k, c in catalogue.items() if k not in kept}
     progress("reading the signatures of all effects")
     found = search(problem, catalogue, quick, progress)
     nominal = nominal_fit(problem)
     if found.chosen is None or not found.detected:
-        summary = _no_gap_summary(found)
-        return Diagnosis(
-            problem, Verdict("no_gap", (), summary), [], found, _unchanged(problem, nominal), None, nominal, nominal
-        )
+        lines = _unchanged(problem, nominal, not quick)
+        verdict = Verdict("no_gap", (), _no_gap_summary(found) + _retuned(problem, nominal))
+        return Diagnosis(problem, verdict, [], found, lines, None, nominal, nominal)
 
     progress("fitting the effects and all nominal parameters together")
     fit, r, J = augmented_fit(problem, found.chosen)
     order = np.argsort(-np.asarray(found.shares))
     first = found.chosen.keys[order[0]]
     progress("refitting without each third of the trials")
-    lines = shrinkage(problem, nominal, fit, r, J, _rivals(problem, found), first)
-    if found.chosen.log_evidence < FAINT and not any(x.resolvable for x in lines):
-        # Nothing stands out of the noise on held-out trials, and the evidence is what small doubts of CAD can give.
-        found = _as_none(found)
-        return Diagnosis(
-            problem, Verdict("no_gap", (), _no_gap_summary(found)), [], found, lines, None, nominal, nominal
-        )
-    verdict = _verdict(found, lines)
+    lines = shrinkage(problem, nominal, fit, r, J, _rivals(problem, found), first, not quick)
+    verdict, proposal = _verdict(found, lines), None
+    if verdict.status == "unexplained" and found.left:
+        progress("looking for a closed form of what remains")
+        proposal = propose(problem, found.chosen.residual, found.left[0], found.chosen.columns)
+        if proposal:
+            text = f" A proposal, unproven, for {100 * proposal.share:.0f} % of that: {proposal.formula}."
+            verdict = replace(verdict, summary=verdict.summary + text)
+    verdict = replace(verdict, summary=verdict.summary + _retuned(problem, fit))
     places = where(problem)
     members = _members(problem, found)
     return Diagnosis(
@@ -105,15 +111,27 @@ def diagnose(
         next_experiment(problem, members) if verdict.status == "ambiguous" else None,
         nominal,
         fit,
+        proposal,
     )
 
 
-def _as_none(found: Search) -> Search:
-    """The same search where its evidence does not show on held-out trials: what is left for it is small."""
-    scale = 0.07 / max(sum(c.probability for c in found.candidates), 1e-12)
-    candidates = [replace(c, probability=c.probability * scale) for c in found.candidates]
-    strongest = found.chosen.log_evidence if found.chosen else found.strongest
-    return replace(found, detected=False, candidates=candidates, none=0.9, unlisted=0.03, strongest=strongest)
+def _retuned(problem: Problem, fit: Fit) -> str:
+    """For another simulator: which of its parameters the measurements contradict most."""
+    if problem.simulator is None:
+        return ""
+    old, new = (np.asarray(ravel(model))[problem.free] for model in (problem.simulator, fit.model))
+    std = fit.std[problem.free]
+    weight = np.abs(new - old) * np.linalg.norm(problem.J, axis=0) * (np.abs(new - old) > 3.0 * std)
+    worst = [i for i in np.argsort(-weight)[:3] if weight[i] > 0]
+    if not worst:
+        return " The simulator's parameters agree with the measurements."
+    parameters = describe(problem.nominal)
+    named = [
+        f"{p.name} ({old[i]:.3g} to {new[i]:.3g} ± {std[i]:.1g} {p.units})"
+        for i in worst
+        for p in [parameters[problem.free[i]]]
+    ]
+    return f" All this is with the simulator's parameters retuned, most of all {', '.join(named)}."
 
 
 def _rivals(problem: Problem, found: Search):
@@ -201,9 +219,9 @@ def _no_gap_summary(found: Search) -> str:
     )
 
 
-def _unchanged(problem: Problem, nominal: Fit) -> list[Shrinkage]:
+def _unchanged(problem: Problem, nominal: Fit, forward: bool) -> list[Shrinkage]:
     """The lines of `gap` where there is nothing to close."""
-    return shrinkage(problem, nominal, nominal, problem.r, problem.J, [], ("none", ()))
+    return shrinkage(problem, nominal, nominal, problem.r, problem.J, [], ("none", ()), forward)
 
 
 def as_gap_json(d: Diagnosis) -> dict:

@@ -64,7 +64,7 @@ def evidence(variant: Variant, Z: np.ndarray, Zt: np.ndarray, rt: np.ndarray) ->
     G, b = Zt @ Zt.T, Zt @ rt
     raw = float(np.sum(Z * Z))
     absorbed = 1.0 - float(np.trace(G)) / raw if raw > 0 else 1.0
-    logs, k, handicap = [], len(b), variant.effect.HANDICAP
+    logs, k = [], len(b)
     for s in SCALES:
         precision = G + np.eye(k) / s**2
         a = np.linalg.solve(precision, b)
@@ -78,8 +78,8 @@ def evidence(variant: Variant, Z: np.ndarray, Zt: np.ndarray, rt: np.ndarray) ->
     a = np.linalg.lstsq(information, b, rcond=1e-10)[0]
     std = np.sqrt(np.diag(np.linalg.pinv(information, rcond=1e-10)))
     if k == 1 and a[0] < 0 and not next(iter(variant.effect.AMPLITUDES.values()))[2]:
-        return Evidence(variant, np.zeros(1), std, 0.0, float(logsumexp(logs) - np.log(len(logs)) - handicap), absorbed)
-    return Evidence(variant, a, std, float(b @ a), float(logsumexp(logs) - np.log(len(logs)) - handicap), absorbed)
+        return Evidence(variant, np.zeros(1), std, 0.0, float(logsumexp(logs) - np.log(len(logs))), absorbed)
+    return Evidence(variant, a, std, float(b @ a), float(logsumexp(logs) - np.log(len(logs))), absorbed)
 
 
 def screen(groups, columns, projector: Projector, rt: np.ndarray) -> list[Evidence]:

@@ -7,13 +7,15 @@ Q spans the whitened Jacobian of the nominal parameters: what they can absorb is
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.data import Session
-from jaxfinger.experiments import Stack, prepare
+from jaxfinger.experiments import Predictions, Stack, prepare
+from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.linearise import linearise
 from jaxfinger.identify.noise import Noise, estimate
@@ -61,6 +63,7 @@ class Problem:
     fit: Fit  # the staged fit
     sources: dict[str, Source]
     prior: Prior
+    simulator: Model | None = None  # the emulator, where another simulator's predictions are diagnosed
 
     @property
     def trial_of_row(self) -> np.ndarray:
@@ -71,16 +74,48 @@ class Problem:
             first += len(self.stacks[rows.experiment].trials)
         return out
 
+    @cached_property
+    def columns(self) -> list[tuple[str, str, int]]:
+        """Experiment, channel and column of every measured column."""
+        return [
+            (e, c, k)
+            for e, stack in self.stacks.items()
+            for c in stack.experiment.channels
+            for k in range(len(stack.batch.y[c]))
+        ]
+
+    @cached_property
+    def column_of_row(self) -> np.ndarray:
+        """(N,) position in `columns` of every row."""
+        position = {key: i for i, key in enumerate(self.columns)}
+        out = np.empty(self.r.size, int)
+        for e, rows in self.rows.items():
+            channels = self.stacks[e].experiment.channels
+            keys = zip(rows.channel, rows.column, strict=True)
+            out[rows.start : rows.start + rows.size] = [position[e, channels[c], int(k)] for c, k in keys]
+        return out
+
     @property
     def trial_names(self) -> list[str]:
         """Names in the order of `trial_of_row`."""
         return [t for e in self.rows for t in self.stacks[e].trials]
 
 
-def build(session: Session, recipe: Recipe, progress: Progress = lambda message: None) -> Problem:
-    """Identify the nominal model, refit it to all trials together, and stack the whitened residuals."""
+def build(
+    session: Session,
+    recipe: Recipe,
+    progress: Progress = lambda message: None,
+    predictions: Predictions | None = None,
+) -> Problem:
+    """Identify the nominal model, refit it to all trials together, and stack the whitened residuals.
+
+    With `predictions` another simulator takes the nominal model's place (see `simulator`).
+    """
+    stacks, simulator = prepare(session), None
+    if predictions is not None:
+        progress("imitating the simulator")
+        simulator, recipe, stacks = emulate(session, recipe, stacks, predictions)
     fit = identify(session, recipe, progress=progress)
-    stacks = prepare(session)
     parameters = describe(fit.model)
     progress("refitting the nominal model to all trials")
     cad = [i for i, p in enumerate(parameters) if p.group in ("mass", "com") and fit.covariance[i, i] > 0]
@@ -126,6 +161,7 @@ def build(session: Session, recipe: Recipe, progress: Progress = lambda message:
         fit,
         sources,
         prior,
+        simulator,
     )
 
 

@@ -19,7 +19,7 @@ from jaxfinger.gap.signatures import Signatures, Variant
 STEPS = 6
 LARGE = 3.0  # plausible sizes: the width of the prior on an amplitude
 ADDITIVE = {"phi", "place", "p", "toe"}  # shapes that move by differences; the others by factors
-FIXED = {"end", "side", "joint_a", "joint_b", "delta", "damping"}  # shapes that are choices
+FIXED = {"curvature", "end", "side", "joint_a", "joint_b", "delta", "damping"}  # shapes that are choices
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def refine(
         tuple(effects),
         tuple(std),
         cost,
-        float(0.5 * (chi2_null - cost) - occam - sum(e.HANDICAP for e in effects)),
+        float(0.5 * (chi2_null - cost) - occam),
         residual,
         problem.r - r,
         slopes,

@@ -2,7 +2,7 @@
 
 1. Screen every effect at every site and shape linearly; refit the strongest few with their shapes free.
 2. Take the best. What is left of the gap is screened again on top of it; a further effect joins while it explains a
-   fair part of the whole gap, and all are refitted together.
+   fair part of what is left beyond the first one's own error of form, and all are refitted together.
 3. «Unlisted» competes through the flexible stand-in: the part of the gap that it explains beyond the chosen effects.
 4. Evidence counts a limited number of independent looks. A candidate that leaves the energy U unexplained has
    log L = −½ ν log(1 + U/ν), Student's t with ν looks: Gaussian for a candidate that fits to the noise, and tolerant
@@ -20,14 +20,16 @@ from jaxfinger.gap.evidence import Evidence, Projector, by_site, screen
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.refine import Refined, refine
 from jaxfinger.gap.signatures import Signatures, Variant, all_columns, variants
-from jaxfinger.gap.standin import Explained, energy_left, explained
+from jaxfinger.gap.standin import REACH, Explained, energy_left, explained
 
 Progress = Callable[[str], None]
 
 DETECT = 35.0  # log evidence that an effect needs before anything is called a gap
 LOOKS = 25.0  # ν: independent looks that evidence counts
-ADD = 0.04  # share of the gap that a further effect at the same site must explain
-ADD_ELSEWHERE = 0.3  # share of what is left that a further effect at another site must explain
+FORM = 0.1  # share of what an effect explains in a column, that the form of its law may miss
+ADD = 0.3  # share of what is left, that a further effect must explain
+SAME_SITE = 0.1  # share of what is explained, that a further effect at the same site must explain
+LOOKED_AT = 12  # candidates for a further effect
 LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for
 OPEN = 0.25  # share of the gap left to the stand-in at which «unlisted» is as likely as the catalogue
 OPEN_WIDTH = 0.06
@@ -121,22 +123,28 @@ def _at_optimum(refined: Refined):
 
 
 def _add(problem, groups, columns, best: Refined, chi2: float, projector, progress) -> Refined:
-    """Further effects on top of the best, while each explains a fair part of the gap."""
-    chosen = best
+    """Further effects on top of the best, while each explains a fair part of what is left.
+
+    Real effects do not follow a textbook form to the letter: in a column that the chosen effects changed, the share
+    FORM of what they explain there may be theirs still, and counts for no other.
+    """
+    chosen, without = best, projector.residual(problem)[: problem.r.size]
+    cell = problem.column_of_row
     while len(chosen.variants) < 3:
-        beyond = energy_left(explained(problem, chosen.residual))
-        gap = chi2 - chosen.chi2 + beyond
-        if beyond < LEAST:
+        theirs = FORM * np.maximum(np.bincount(cell, without**2 - chosen.residual**2), 0.0)
+        left = explained(problem, chosen.residual)
+        owed = {problem.columns[i]: energy for i, energy in enumerate(theirs)}
+        still = sum(max(x.energy - owed[x.experiment, x.channel, x.column], 0.0) for x in left if x.energy > REACH)
+        if still < LEAST:
             break
         on_top = Projector(problem, chosen.columns)
         rt = on_top.residual(problem, problem.r - chosen.change)
         ranked = [e for e in by_site(screen(groups, columns, on_top, rt)).values() if e.variant.key not in chosen.keys]
-        e = ranked[0]
-        # At a site of the verdict it may be the wrong form of what is there already: it must weigh in the whole gap.
-        # Elsewhere it must explain what is left.
+        e = max(ranked[:LOOKED_AT], key=lambda e: _credit(e, groups, columns, on_top, rt, cell, theirs))
+        # At the site of an effect that is there already, another form of it is likelier than a second cause.
         same = any(set(e.variant.site) & set(v.site) for v in chosen.variants)
-        need = max(ADD * gap if same else ADD_ELSEWHERE * beyond, 2 * DETECT)
-        if e.log_bf < DETECT or e.explained < need:
+        need = max(ADD * still, 2 * DETECT, SAME_SITE * (chi2 - chosen.chi2) if same else 0.0)
+        if e.log_bf < DETECT or _credit(e, groups, columns, on_top, rt, cell, theirs) < need:
             break
         progress(f"adding {e.variant.effect.ID} at {', '.join(e.variant.site)}")
         items, starts = _at_optimum(chosen)
@@ -145,6 +153,14 @@ def _add(problem, groups, columns, best: Refined, chi2: float, projector, progre
             break
         chosen = together
     return chosen
+
+
+def _credit(e: Evidence, groups, columns, projector: Projector, rt, cell, theirs) -> float:
+    """What a candidate explains in every column, beyond what may belong to the effects that are there already."""
+    name = e.variant.effect.ID
+    change = e.amplitudes @ projector(columns[name][groups[name].index(e.variant)])
+    drop = np.bincount(cell, (rt**2 - (rt - change) ** 2)[: cell.size])
+    return float(np.maximum(drop - theirs, 0.0).sum())
 
 
 def _shares(problem, chosen: Refined, chi2: float, projector, gap: float) -> tuple[float, ...]:

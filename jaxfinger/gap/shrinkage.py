@@ -10,11 +10,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfinger.experiments import UNITS, Batch, predict
+from jaxfinger.experiments import UNITS, Batch, predict, prepare
 from jaxfinger.gap.evidence import Evidence
 from jaxfinger.gap.problem import Problem
 from jaxfinger.identify import Fit
 from jaxfinger.identify.parameters import Free, ravel
+from jaxfinger.identify.predictions import simulate_trials
 from jaxfinger.model import Model
 
 FOLDS = 3
@@ -68,17 +69,24 @@ def shrinkage(
     J: np.ndarray,
     rivals: list[tuple[Evidence, np.ndarray]],
     first: tuple,
+    forward: bool = True,
 ) -> list[Shrinkage]:
-    """One line an experiment and channel. `r`, `J`: white residuals and Jacobian of the augmented model at its optimum;
-    `rivals`: the strongest candidates with their signatures, among which each fold chooses again."""
+    """One line an experiment and channel, and one for q of VD.3, simulated forward, unless `forward` is false.
+
+    `r`, `J`: white residuals and Jacobian of the augmented model at its optimum; `rivals`: the strongest candidates
+    with their signatures, among which each fold chooses again.
+    """
     fold = folds(problem)
     of_row = np.concatenate([fold[e][rows.trial, rows.time] for e, rows in problem.rows.items()])
-    energies: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
+    energies: dict[tuple[str, str], list[tuple[float, float, float, float]]] = {}
+    models = []
     for k in range(FOLDS):
         training = of_row != k
-        before = _refit(problem.nominal, problem.free, problem.J, problem.r, training)
+        refitted = _refit(problem.nominal, problem.free, problem.J, problem.r, training)
+        before = problem.simulator or refitted
         same = _choice(problem, rivals, training) == first
-        after = _refit(augmented.model, augmented.estimated, J, r, training) if same else before
+        after = _refit(augmented.model, augmented.estimated, J, r, training) if same else refitted
+        models.append((before, after))
         for e, stack in problem.stacks.items():
             channels = stack.experiment.channels
             old, new = _residuals(before, stack.batch, channels), _residuals(after, stack.batch, channels)
@@ -97,7 +105,41 @@ def shrinkage(
                             float(count),
                         )
                     )
+    if forward and "VD.3" in problem.stacks:
+        energies["VD.3", "q"] = _forward(problem, fold["VD.3"], models)
     return [_line(e, c, np.array(values)) for (e, c), values in energies.items()]
+
+
+def _forward(problem: Problem, fold: np.ndarray, models: list[tuple[Model, Model]]):
+    """Mean squares of q, simulated forward by the models that have not seen (the start of) a trial; the noise is the
+    spread between repeats of its motion."""
+    session, trials = problem.session, problem.stacks["VD.3"].trials
+    stack = prepare(session, list(trials), reduced=False)["VD.3"]
+    out = []
+    for k, pair in enumerate(models):
+        held_out = [name for b, name in enumerate(trials) if fold[b, 0] == k]
+        if not held_out:
+            continue
+        paths = [simulate_trials(model, session, stack) for model in pair]
+        for name in held_out:
+            q = session[name].q
+            errors = [float(np.nanmean((q - p[name]["q"]) ** 2)) for p in paths]
+            out.append((*errors, _spread(problem, name), float(len(q))))
+    return out
+
+
+def _spread(problem: Problem, name: str) -> float:
+    """Mean square of what tells a trial's q from its repeats', rad²; 0 without repeats."""
+    trial = problem.session[name]
+    if trial.motion is None:
+        return 0.0
+    repeats = [t for t in problem.session if t.motion == trial.motion and t.experiment == "VD.3" and t.name != name]
+    squares = [
+        np.mean((trial.q[: len(t.q)] - t.q[: len(trial.q)]) ** 2)
+        for t in repeats
+        if abs(len(t.q) - len(trial.q)) < 0.1 * len(trial.q)
+    ]
+    return float(0.5 * np.mean(squares)) if squares else 0.0
 
 
 def _refit(model: Model, free, J, r, training) -> Model:

@@ -53,7 +53,7 @@ def features(problem: Problem, experiment: str, channel: str, column: int) -> di
         out["q"] += [np.cos(k * np.arccos(u)) for k in range(1, 7)]
         out["qd"] += [_unit(qd[i]) ** p for p in (1, 2, 3)] + [np.exp(-np.abs(qd[i]) / 0.1)]
         out["direction"] += [direction[i] * u**p for p in range(3)]
-        travelled = _since_reversal(q[i])
+        travelled = since_reversal(q[i])
         for length in (0.02, 0.1):
             out["distance since reversal"] += [
                 np.exp(-np.abs(travelled) / length) * s for s in (1.0, direction[i], np.sign(travelled))
@@ -62,7 +62,7 @@ def features(problem: Problem, experiment: str, channel: str, column: int) -> di
         if f[k].any():
             u = f[k] / max(f[k].max(), 1e-9)
             out["tension"] += [u, u**2, np.sqrt(np.maximum(u, 0))] + [u * _unit(q[i]) for i in own]
-            pulled = _since_reversal(f[k])
+            pulled = since_reversal(f[k])
             out["distance since reversal"] += [np.exp(-np.abs(pulled) / 1.0) * np.sign(pulled)]
     for i in range(finger.m):
         if i not in own:
@@ -119,7 +119,7 @@ def _unit(u: np.ndarray) -> np.ndarray:
     return np.zeros_like(u) if high - low < 1e-9 else np.clip(2 * (u - low) / (high - low) - 1, -1, 1)
 
 
-def _since_reversal(u: np.ndarray) -> np.ndarray:
+def since_reversal(u: np.ndarray) -> np.ndarray:
     """Signed distance along the last axis since the last turning point."""
     step = np.diff(u, axis=-1, prepend=u[..., :1])
     threshold = 0.02 * max(float(np.ptp(u)), 1e-12)

@@ -44,8 +44,8 @@ def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None
         part.write_text("{\n" + lines + "\n}\n", encoding="utf-8")
 
 
-def load_fit(path: str | os.PathLike) -> Fit:
-    """Read a fit that `save_fit` wrote.
+def load_fit(path: str | os.PathLike, effects: str | os.PathLike | None = None) -> Fit:
+    """Read a fit that `save_fit` wrote; `effects` is the Python file of a user's own effects in its model.
 
     Raises:
         UserError: the file cannot be read, is no fit, or has been damaged.
@@ -60,7 +60,7 @@ def load_fit(path: str | os.PathLike) -> Fit:
         found = content.get("schema") if isinstance(content, dict) else None
         raise UserError(f"{path}: has schema {found!r} where {SCHEMA!r} is read; identify the session again")
     try:
-        return _from_dict(content, str(path))
+        return _from_dict(content, str(path), effects)
     except KeyError as e:
         raise UserError(f"{path}: is damaged, {e.args[0]!r} is missing; identify the session again") from None
     except (TypeError, ValueError, AttributeError, IndexError) as e:
@@ -120,8 +120,8 @@ def _without_infinities(value):
     return value
 
 
-def _from_dict(content: dict[str, Any], path: str) -> Fit:
-    model = _model(content)
+def _from_dict(content: dict[str, Any], path: str, effects: str | os.PathLike | None) -> Fit:
+    model = _model(content, effects)
     position = {p.name: i for i, p in enumerate(describe(model))}
     rows = np.array([position[name] for name in content["covariance"]["names"]], dtype=int)
     block = np.array(content["covariance"]["matrix"], dtype=float).reshape(rows.size, rows.size)
@@ -138,7 +138,7 @@ def _from_dict(content: dict[str, Any], path: str) -> Fit:
     )
 
 
-def _model(content: dict[str, Any]) -> Model:
+def _model(content: dict[str, Any], effects: str | os.PathLike | None) -> Model:
     f, arm = content["finger"], content["moment_arm"]
     m, n = len(f["joint_names"]), len(f["tendon_names"])
     finger = Finger(
@@ -153,10 +153,11 @@ def _model(content: dict[str, Any]) -> Model:
         TendonFriction(**_fields(content, "tendon_friction", constant=(n,), proportional=(n,))),
     )
     if content["effects"]:
-        from jaxfinger.effects import from_dict
+        from jaxfinger.effects import from_dict, load
 
-        effects = tuple(from_dict(finger, e) for e in content["effects"])
-        model = Model(finger, model.moment_arm, model.joint_torque, model.tendon_friction, effects)
+        own = load(effects) if effects is not None else {}
+        known = tuple(from_dict(finger, e, own) for e in content["effects"])
+        model = Model(finger, model.moment_arm, model.joint_torque, model.tendon_friction, known)
     return model
 
 

@@ -106,6 +106,10 @@ def simulate_trials(model: Model, session: Session, stack: Stack) -> dict[str, d
     q = np.asarray(
         _simulate(model, jnp.asarray(grid), jnp.asarray(even), x.q[..., 0].T, x.qd[..., 0].T, starts, substeps)
     )
+    # Whatever has left the finger's range by its whole width has no more to say, and may grow beyond all numbers.
+    low, high = session.finger.limits.T[:, :, None]
+    span = np.where(np.isfinite(high - low), high - low, 2 * np.pi)
+    q = np.clip(np.nan_to_num(q, nan=np.inf), low - span, high + span)
     out = {}
     for b, name in enumerate(stack.trials):
         time = np.asarray(session[name].time)

@@ -28,7 +28,9 @@ TRUTH = ("joint_presliding", ("PIP",))
 
 def session_with(*effects, seed=3):
     model = nominal_model(polynomial_finger(paper_finger()))
-    members = tuple(CATALOGUE[e].at(model.finger, site, **values) for e, site, values in effects)
+    members = tuple(
+        (CATALOGUE[e] if isinstance(e, str) else e).at(model.finger, site, **values) for e, site, values in effects
+    )
     model = eqx.tree_at(lambda m: m.effects, model, members, is_leaf=lambda v: isinstance(v, tuple))
     return simulate(RECIPE, seed=seed, plant=ModelPlant(model))
 

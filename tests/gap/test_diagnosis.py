@@ -6,7 +6,9 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array, Float
 
+from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError
 from jaxfinger.gap import as_gap_json, diagnose, write
 from jaxfinger.gap.signatures import whitened
@@ -161,3 +163,27 @@ def test_nothing_is_named_where_nothing_is():
 def test_an_unknown_effect_to_leave_out_is_refused():
     with pytest.raises(UserError, match="no effect joint_magic"):
         diagnose(session_with(), without=("joint_magic",))
+
+
+def test_a_law_that_nobody_listed_gets_a_proposal_in_closed_form():
+    """A torque periodic in the sum of two angles, seen by a catalogue that has nothing like it."""
+
+    class SumOfAngles(CatalogueEffect):
+        ID = "sum_of_angles"
+        PLACE = "joint pair"
+        AMPLITUDES = {"a": ("N m", 1e-3, True)}  # noqa: RUF012
+        SHOWS = {e: ("joint_torque",) for e in ("ID.3-static", "ID.3-dynamic")}  # noqa: RUF012
+
+        a: Float[Array, ""]
+
+        def torque(self, x, memory, h):
+            i, j = self.index
+            return h.at[i].add(self.a * jnp.sin(6.0 * (x.q[i] + x.q[j])))
+
+    session = session_with((SumOfAngles, ("PIP", "DIP"), {"a": 3e-3}))
+    found = diagnose(session, without=WITHOUT)
+    assert found.verdict.status == "unexplained"
+    assert found.proposal is not None
+    assert found.proposal.site == "PIP"
+    assert found.proposal.share > 0.5
+    assert "A proposal, unproven" in found.verdict.summary

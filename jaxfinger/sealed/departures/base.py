@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -71,21 +72,22 @@ class Departure:
 
 
 @dataclass(frozen=True, eq=False)
-class Memory(Departure):
+class Memory(Departure, ABC):
     """A departure with a state that is driven along the motion by `inputs`."""
 
     states: ClassVar[int] = 1
 
+    @abstractmethod
     def inputs(self, finger: Finger, s: State) -> np.ndarray:
         """(..., i), what drives the state; must not use the state itself."""
-        raise NotImplementedError
 
     def start(self, u: np.ndarray) -> np.ndarray:
         """(..., k) at a trial's first sample; u holds all of the trial that is known, time first."""
         return np.zeros((*u.shape[1:-1], self.states))
 
+    @abstractmethod
     def step(self, z: np.ndarray, before: np.ndarray, now: np.ndarray, dt: float) -> np.ndarray:
-        raise NotImplementedError
+        """(..., k) one sample later."""
 
     def state(self, s: State) -> np.ndarray:
         return s.memory[id(self)]

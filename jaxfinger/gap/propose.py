@@ -1,0 +1,124 @@
+"""A closed form for what no known effect explains: a few terms of a physical library, found by sparse regression.
+
+Orthogonal matching pursuit (Pati, Rezaiifar & Krishnaprasad 1993) on whitened rows, the nominal parameters and the
+chosen effects projected out. It is a proposal for a person to look at, never a verdict: the library holds what laws of
+friction, elasticity and transmission are made of, and the truth may be none of it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxfinger.experiments import UNITS
+from jaxfinger.gap.evidence import Projector
+from jaxfinger.gap.problem import Problem
+from jaxfinger.gap.signatures import whitened
+from jaxfinger.gap.standin import Explained, since_reversal
+from jaxfinger.gap.where import site
+
+TERMS = 3
+WORTH = 0.1  # share of what a smooth law could explain, that a further term must explain
+SPEEDS, LENGTHS, PERIODS = (0.05, 0.2, 0.8), (0.02, 0.1, 0.4), (1, 2, 3, 4, 5, 6, 8, 10, 12, 16)
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Σ aₖ termₖ for one column of one channel, `share` of what a smooth law could explain there."""
+
+    experiment: str
+    channel: str
+    site: str
+    terms: tuple[tuple[float, str], ...]  # coefficient in the channel's unit (angles rad, forces N), and formula
+    share: float
+
+    @property
+    def formula(self) -> str:
+        """For people: with the unit that each coefficient has where the term has none of its own."""
+        unit = UNITS[self.channel]
+        body = " ".join(f"{a:+.3g} {unit} · {text}" for a, text in self.terms)
+        return f"{self.channel} {self.site} of {self.experiment} ≈ {body.lstrip('+')}"
+
+
+def propose(problem: Problem, residual: np.ndarray, left: Explained, chosen: np.ndarray) -> Proposal | None:
+    """The shortest sum of terms for the column that has most left; None where no term explains a fair part.
+
+    `residual` (N,) is what the chosen effects leave, `chosen` (k, N) their columns.
+    """
+    rows = problem.rows[left.experiment]
+    number = problem.stacks[left.experiment].experiment.channels.index(left.channel)
+    pick = np.flatnonzero((rows.channel == number) & (rows.column == left.column))
+    library = terms(problem, left.experiment, left.channel, left.column)
+    raw = np.zeros((len(library), len(problem.stacks[left.experiment].batch.y[left.channel]), *library[0][1].shape))
+    raw[:, left.column] = np.stack([values for _, values in library])
+    columns = np.zeros((len(library), problem.r.size))
+    columns[:, rows.start + pick] = whitened(raw, problem, rows, pick, left.channel)
+
+    project = Projector(problem, chosen)
+    Z, r = project(columns), project.residual(problem, residual)
+    norm = np.linalg.norm(Z, axis=1)
+    usable = norm > 0.05 * np.linalg.norm(columns, axis=1)
+    found: list[int] = []
+    rest, energy = r, 0.0
+    while len(found) < TERMS:
+        gain = np.where(usable, (Z @ rest) ** 2 / np.maximum(norm, 1e-300) ** 2, 0.0)
+        gain[found] = 0.0
+        trial = [*found, int(np.argmax(gain))]
+        a = np.linalg.lstsq(Z[trial].T, r, rcond=1e-10)[0]
+        explained = float(r @ r - np.sum((r - a @ Z[trial]) ** 2))
+        if explained - energy < WORTH * left.energy:
+            break
+        found, rest, energy = trial, r - a @ Z[trial], explained
+    if not found:
+        return None
+    a = np.linalg.lstsq(Z[found].T, r, rcond=1e-10)[0]
+    named = tuple((float(v), library[i][0]) for v, i in zip(a, found, strict=True))
+    name = site(problem, left.channel, left.column)
+    return Proposal(left.experiment, left.channel, name, named, min(1.0, energy / left.energy))
+
+
+def terms(problem: Problem, experiment: str, channel: str, column: int) -> list[tuple[str, np.ndarray]]:
+    """The library of one column: formulas and their values (B, T)."""
+    x, finger = problem.stacks[experiment].batch.x, problem.nominal.finger
+    q, qd, f, s = (np.asarray(a) for a in (x.q, x.qd, x.tension, x.joint_direction))
+    time = np.asarray(x.time)
+    names, tendons = finger.joint_names, finger.tendon_names
+    if channel == "joint_torque":
+        own, taut = [column], [k for k in range(finger.n) if finger.crosses[k][column]]
+    elif channel == "tendon_excursion":
+        own, taut = [i for i in range(finger.m) if finger.crosses[column][i]], [column]
+    else:
+        own, taut = list(range(finger.m)), list(range(finger.n))
+    out: list[tuple[str, np.ndarray]] = [("t", time)]
+    out += [(f"exp(−t/{tau:g} s)", np.exp(-time / tau)) for tau in (1.0, 5.0)]
+    for i in own:
+        a, v, d = f"q_{names[i]}", f"q̇_{names[i]}", f"sign q̇_{names[i]}"
+        out += [(f"{a}^{p}" if p > 1 else a, q[i] ** p) for p in (1, 2, 3, 4)]
+        out += [(f"{v}|{v}|", qd[i] * np.abs(qd[i])), (f"{v}³", qd[i] ** 3), (f"{a} {v}", q[i] * qd[i])]
+        out += [(d, s[i]), (f"{a} {d}", q[i] * s[i])]
+        out += [(f"exp(−|{v}|/{w:g}) {d}", np.exp(-np.abs(qd[i]) / w) * s[i]) for w in SPEEDS]
+        travelled = since_reversal(q[i])
+        out += [(f"exp(−|Δ{a}|/{w:g}) {d}", np.exp(-np.abs(travelled) / w) * s[i]) for w in LENGTHS]
+        out += [(f"{g}({p} {a})", fun(p * q[i])) for p in PERIODS for g, fun in (("sin", np.sin), ("cos", np.cos))]
+        for j in range(finger.m):
+            if j != i:
+                b = f"q_{names[j]}"
+                out += [(f"{a} {b}", q[i] * q[j]), (f"{a} {b}²", q[i] * q[j] ** 2), (b, q[j]), (f"{b}²", q[j] ** 2)]
+                out += [(f"q̇_{names[j]}", qd[j])]
+                for sign, name in ((1, "+"), (-1, "−")):
+                    for p in PERIODS:
+                        angle = p * (q[i] + sign * q[j])
+                        out += [
+                            (f"sin({p} ({a} {name} {b}))", np.sin(angle)),
+                            (f"cos({p} ({a} {name} {b}))", np.cos(angle)),
+                        ]
+    for k in taut:
+        if f[k].any():
+            b = f"f_{tendons[k]}"
+            pulled = since_reversal(f[k])
+            out += [(b, f[k]), (f"{b}²", f[k] ** 2), (f"√{b}", np.sqrt(np.maximum(f[k], 0.0)))]
+            out += [(f"exp(−|Δ{b}|/1 N) sign Δ{b}", np.exp(-np.abs(pulled)) * np.sign(pulled))]
+            for i in own:
+                a = f"q_{names[i]}"
+                out += [(f"{b} {a}", f[k] * q[i]), (f"{b} {a}²", f[k] * q[i] ** 2), (f"{b}² {a}", f[k] ** 2 * q[i])]
+                out += [(f"{b} sign q̇_{names[i]}", f[k] * s[i])]
+    return [(text, np.broadcast_to(values, time.shape)) for text, values in out]

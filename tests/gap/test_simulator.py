@@ -1,0 +1,61 @@
+"""Another simulator's predictions: what it lacks is named, what it has wrong is retuned."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfinger.errors import UserError
+from jaxfinger.gap import diagnose
+from jaxfinger.identify.predictions import predict_session
+from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger
+
+from .conftest import TRUTH, WITHOUT, session_with
+
+
+@pytest.fixture(scope="module")
+def session():
+    return session_with((*TRUTH, {"a": 1.0, "x0": 0.1}))
+
+
+def simulator(session, **factors):
+    """Predictions of a finger without the effect, some of its parameters off by factors."""
+    model = nominal_model(polynomial_finger(paper_finger()))
+    torque = model.joint_torque
+    for name, factor in factors.items():
+        torque = eqx.tree_at(lambda t, name=name: getattr(t, name), torque, factor * getattr(torque, name))
+    return predict_session(eqx.tree_at(lambda m: m.joint_torque, model, torque), session)
+
+
+def test_the_missing_effect_is_named_and_the_wrong_parameters_retuned(session):
+    found = diagnose(session, without=WITHOUT, predictions=simulator(session, damping=3.0), quick=True)
+    assert found.verdict.status == "explained"
+    assert found.verdict.effects[0] == TRUTH
+    assert "retuned" in found.verdict.summary
+    assert "damping" in found.verdict.summary
+    # Before is the simulator as it is, after the finger's own parameters with the effect.
+    line = next(x for x in found.shrinkage if x.experiment == "ID.3-dynamic")
+    own = next(x for x in diagnose(session, without=WITHOUT, quick=True).shrinkage if x.experiment == "ID.3-dynamic")
+    assert line.before > 1.2 * own.before
+    assert line.after == pytest.approx(own.after, rel=0.1)
+
+
+def test_a_term_that_the_simulator_lacks_is_a_candidate(session):
+    found = diagnose(session, without=(*WITHOUT, "gravity"), predictions=simulator(session, friction=0.0), quick=True)
+    assert "joint_coulomb" not in found.problem.fit.recipe.model.terms
+    assert any(c.key[0] == "joint_coulomb" for c in found.search.candidates[:4])
+
+
+def test_predictions_of_other_trials_are_refused(session):
+    other = {"somebody": {"time": np.arange(3.0), "joint_torque": np.zeros((3, 3))}}
+    with pytest.raises(UserError, match="none of its trials is in the predictions"):
+        diagnose(replace(session, file="s.h5"), predictions=other)
+
+
+def test_a_perfect_simulator_leaves_no_gap():
+    session = session_with()
+    found = diagnose(session, without=WITHOUT, predictions=simulator(session), quick=True)
+    assert found.verdict.status == "no_gap"
+    assert jnp.isfinite(found.problem.r).all()
