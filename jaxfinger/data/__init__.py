@@ -3,6 +3,7 @@
 from jaxfinger.data.check import check_file as check_file
 from jaxfinger.data.filtering import decimate as decimate
 from jaxfinger.data.filtering import outlier_mask as outlier_mask
+from jaxfinger.data.filtering import shrink as shrink
 from jaxfinger.data.filtering import smooth as smooth
 from jaxfinger.data.findings import Finding as Finding
 from jaxfinger.data.hdf5 import data_hash as data_hash

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
-from jaxfinger.data import Session, Trial, find_holds, outlier_mask, smooth
+from jaxfinger.data import Session, Trial, find_holds, outlier_mask, shrink, smooth
 from jaxfinger.errors import UserError
 from jaxfinger.experiments.table import (
     CLEAR,
@@ -82,7 +82,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
 
     cutoff = min(spec.cutoff * (1.0 if reduced else EVERY_SAMPLE), 0.2 / step)
     q, qd, qdd = smooth(trial.time, trial.q, cutoff)
-    if reduced:
+    if reduced and spec.samples != "sliding":
         q = trial.q  # averaged over the same blocks as what it predicts, and not filtered where that is not
     if spec.samples == "holds":
         # Only holds count in a fit, and there nothing moves; at the full rate joints also move between them.
@@ -101,13 +101,16 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     if trial.joint is not None and "joint_torque" in spec.channels:
         motorised[:, session.finger.joint_names.index(trial.joint)] = 1.0
 
-    y, mask = _measured(spec, trial, session, holds, qd, minus)
+    y, mask = _measured(spec, trial, session, minus)
+    slides = _sliding(spec, trial, session, qd) if spec.samples == "sliding" else None
     if reduced and spec.samples == "sliding":
-        # q̈ is low-passed, so every other term of (1) is too: else a fit would find too little inertia.
+        # q̈ is low-passed, so all else is too. What noise it keeps would still tell a fit of less inertia
+        # (errors in variables): where q̈ does not rise above it, its mean over a tenth of a second takes its place.
+        qdd = shrink(qdd, round(0.1 / step))
         joint_direction, tendon_direction, tension = (
             smooth(trial.time, a, cutoff)[0] for a in (joint_direction, tendon_direction, tension)
         )
-        y["joint_torque"] = smooth(trial.time, y["joint_torque"], cutoff)[0]
+        y = {c: smooth(trial.time, values, cutoff)[0] for c, values in y.items()}
     M = N // block
 
     def mean(a):
@@ -134,18 +137,19 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     }
     y_mean, mask_mean = {}, {}
     for c in y:
-        counts = mean(mask[c])
-        y_mean[c] = np.where(counts > 0, mean(y[c] * mask[c]) / np.maximum(counts, 1e-9), 0.0).T
-        mask_mean[c] = (counts > 0.5).astype(float).T
+        y_mean[c] = mean(y[c]).T  # of all samples, as everything else that the model reads
+        mask_mean[c] = (mean(mask[c]) > 0.5).astype(float).T
+        if spec.samples == "sliding" and c == "joint_torque":
+            mask_mean[c] *= mean(slides).T > 1.0 - 1e-9
         if spec.samples == "holds":
             mask_mean[c] *= hold >= 0
         y_mean[c] *= mask_mean[c]
     return _Row(motion, y_mean, mask_mean, block * step)
 
 
-def _measured(spec, trial, session, holds, qd, minus: Predictions | None):
-    """The channels to be predicted, and which samples of them count: measured, no spike, holding or sliding."""
-    N, m = qd.shape
+def _measured(spec, trial, session, minus: Predictions | None):
+    """The channels to be predicted, spikes bridged, and which samples of them are measured and no spike."""
+    N, m = trial.q.shape
     width = {"tendon_excursion": session.finger.n, "joint_torque": m, "fingertip_force": 3}
     y, mask = {}, {}
     for c in spec.channels:
@@ -163,10 +167,6 @@ def _measured(spec, trial, session, holds, qd, minus: Predictions | None):
             counts[:, measured] = ~spikes
             values = values.copy()
             values[:, measured] = _bridged(values[:, measured], spikes)
-        if spec.samples == "holds":
-            counts *= (holds >= 0)[:, None]
-        if spec.samples == "sliding" and c == "joint_torque":
-            counts *= _sliding(spec, trial, session, qd)
         y[c], mask[c] = np.nan_to_num(values), counts
     return y, mask
 

@@ -24,7 +24,7 @@ from jaxfinger.gap.standin import REACH, Explained, energy_left, explained
 
 Progress = Callable[[str], None]
 
-DETECT = 35.0  # log evidence that an effect needs before anything is called a gap
+DETECT = 15.0  # log evidence that an effect needs before anything is called a gap
 LOOKS = 25.0  # ν: independent looks that evidence counts
 FORM = 0.1  # share of what an effect explains in a column, that the form of its law may miss
 ADD = 0.3  # share of what is left, that a further effect must explain
