@@ -55,7 +55,8 @@ def smooth(
         for order in range(3):
             out[order][:, usable] = spline.derivative(order)(time) if order <= spline.k else 0.0
         out[:, ~np.isfinite(columns)] = np.nan
-    return tuple(out.reshape(3, *x.shape))  # type: ignore[return-value]
+    value, rate, acceleration = out.reshape(3, *x.shape)
+    return value, rate, acceleration
 
 
 def uniform_grid(time: Float[np.ndarray, " N"]) -> Float[np.ndarray, " K"]:

@@ -139,6 +139,6 @@ def _refuse_misshapen(trial: Trial, finger: FingerDescription, path) -> None:
     channels = {field.name for field in fields(Trial)} & CHANNELS.keys()
     for name in sorted(channels):
         value = getattr(trial, name)
-        wanted = tuple(sizes.get(axis, axis) for axis in CHANNELS[name].shape)  # type: ignore[call-overload]
+        wanted = tuple(sizes[axis] if isinstance(axis, str) else axis for axis in CHANNELS[name].shape)
         if value is not None and np.shape(value) != wanted:
             raise UserError(f"{path}: /trials/{trial.name}/{name}: has shape {np.shape(value)}; it must be {wanted}")

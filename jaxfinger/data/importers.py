@@ -164,7 +164,7 @@ def _trial(
     if "span" in table:
         begin, end = where.numbers(table, "span", (2,))
         keep = slice(*np.searchsorted(time, (begin, end)))
-    values: dict[str, np.ndarray] = {}
+    values: dict[str, Any] = {}
     for channel, columns in channels.items():
         place = where / f"channels.{channel}"
         if channel not in CHANNELS:
@@ -175,7 +175,7 @@ def _trial(
     time = time[keep]
     if len(time) == 0:
         where.fail("holds no sample; widen its `span`")
-    attributes = {key: table.get(key) for key in ("joint", "tendon", "motion", "session_start")}
+    attributes: dict[str, Any] = {key: table.get(key) for key in ("joint", "tendon", "motion", "session_start")}
     return Trial(
         name=name,
         experiment=where.text(table, "experiment"),

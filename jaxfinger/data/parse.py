@@ -84,10 +84,10 @@ def parse_finger(file: h5py.File, report: Report) -> FingerDescription | None:
             "/finger/tendons", "is absent, so the finger is read as one without tendons; list them if it has any"
         )
         tendons = {"name": (), "active": np.zeros(0, bool), "crosses": np.zeros((0, m or 0), bool)}
-    if any(f.severity == "error" for f in report[before:]):
+    if gravity is None or any(f.severity == "error" for f in report[before:]):
         return None
     return FingerDescription(
-        gravity=gravity,  # type: ignore[arg-type]
+        gravity=gravity,
         joint_names=joints["name"],
         axis=joints["axis"],
         origin=joints["origin"],
@@ -95,7 +95,7 @@ def parse_finger(file: h5py.File, report: Report) -> FingerDescription | None:
         mass=links["mass"],
         com=links["com"],
         inertia=links["inertia"],
-        fingertip=fingertip,  # type: ignore[arg-type]
+        fingertip=fingertip,
         tendon_names=tendons["name"],
         active=tendons["active"],
         crosses=tendons["crosses"],
@@ -255,7 +255,7 @@ def dataset(group, entry: Entry, place: str, sizes: Mapping[str, int | None], pr
     if entry.kind == "text":
         return value
     _check_units(item, entry, place, prismatic, report)
-    return _as_kind(value, entry, place, report)
+    return _as_kind(np.asarray(value), entry, place, report)
 
 
 def _plausible_size(item: h5py.Dataset) -> bool:

@@ -53,7 +53,7 @@ def write_predictions(
                     raise UserError(
                         f"{path}: /trials/{name}/{channel}: is no channel; it must be one of {', '.join(CHANNELS)}"
                     )
-                wanted = tuple(sizes.get(axis, axis) for axis in CHANNELS[channel].shape)  # type: ignore[call-overload]
+                wanted = tuple(sizes[axis] if isinstance(axis, str) else axis for axis in CHANNELS[channel].shape)
                 if np.shape(value) != wanted:
                     raise UserError(
                         f"{path}: /trials/{name}/{channel}: has shape {np.shape(value)}; it must be {wanted}"
@@ -90,8 +90,7 @@ def _parse(file: h5py.File, report: Report) -> dict[str, dict[str, np.ndarray]]:
     for name in trials:
         place = f"/trials/{name}"
         group = child(trials, name, place, report, h5py.Group)
-        time = None if group is None else dataset(group, TIME, place, {}, finger.prismatic, report)
-        if time is None:
+        if group is None or (time := dataset(group, TIME, place, {}, finger.prismatic, report)) is None:
             continue
         sizes = {"N": len(time), "m": finger.m, "n": finger.n}
         values = {

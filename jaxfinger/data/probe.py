@@ -13,6 +13,7 @@ import warnings
 from pathlib import Path
 
 import h5py
+from h5py import h5o
 
 _PATIENCE = 5  # s
 _SMALL = 10_000  # elements
@@ -45,8 +46,8 @@ def _walk(path: Path) -> None:
             _attempt(lambda item=group: dict(item.attrs))
             for name in group:
                 item = _attempt(lambda name=name, group=group: group.get(name))
-                if isinstance(item, h5py.Group) and h5py.h5o.get_info(item.id).addr not in seen:
-                    seen.add(h5py.h5o.get_info(item.id).addr)
+                if isinstance(item, h5py.Group) and h5o.get_info(item.id).addr not in seen:
+                    seen.add(h5o.get_info(item.id).addr)
                     waiting.append(item)
                 elif isinstance(item, h5py.Dataset):
                     _attempt(lambda item=item: dict(item.attrs))

@@ -2,6 +2,7 @@
 
 import importlib.util
 import inspect
+import os
 from pathlib import Path
 
 from jaxfinger.effects import body, joint, nominal, sensors, tendon, transmission
@@ -24,7 +25,7 @@ for _module in (joint, tendon, transmission, body, sensors):
 NOMINAL_TERMS = _effects_in(nominal)  # candidates only where a recipe leaves the term out
 
 
-def load(path: str | Path) -> dict[str, type[CatalogueEffect]]:
+def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
     """The effects that a user's Python file defines, by id. UserError where it cannot be loaded or defines none."""
     path = Path(path)
     spec = importlib.util.spec_from_file_location(f"jaxfinger_user_{path.stem}", path)

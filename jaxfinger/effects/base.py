@@ -106,7 +106,7 @@ def dahl(z: Float[Array, "*T"], dx: Float[Array, "*T"], length: Float[Array, ""]
 
 def rate(y: Float[Array, "*T"], time: Float[Array, "*T"]) -> Float[Array, "*T"]:
     """Time derivative along the last axis by central differences; zero where time stands still."""
-    dy, dt = jnp.gradient(y, axis=-1), jnp.gradient(time, axis=-1)
+    dy, dt = (jnp.asarray(jnp.gradient(a, axis=-1)) for a in (y, time))
     return jnp.where(dt > 0, dy / jnp.where(dt > 0, dt, 1.0), 0.0)
 
 

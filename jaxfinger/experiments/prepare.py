@@ -197,7 +197,7 @@ def _direction(commanded: np.ndarray | None, rate: np.ndarray, still: float) -> 
 
 def _rates(trial: Trial, spec: Experiment) -> np.ndarray:
     """Tendon speeds, m/s; zero where the excursion was not measured."""
-    return smooth(trial.time, np.nan_to_num(trial.tendon_excursion), spec.cutoff / 2)[1]
+    return smooth(trial.time, np.nan_to_num(np.asarray(trial.tendon_excursion)), spec.cutoff / 2)[1]
 
 
 def _sliding(spec: Experiment, trial: Trial, session: Session, qd) -> np.ndarray:
@@ -259,8 +259,8 @@ def _stack(spec: Experiment, trials: list[Trial], rows: list[_Row], reduced: boo
 
     def pad(arrays, constant=False):
         width = [T - a.shape[-1] for a in arrays]
-        mode = {"mode": "constant"} if constant else {"mode": "edge"}
-        padded = [np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, w)], **mode) for a, w in zip(arrays, width, strict=True)]
+        mode = "constant" if constant else "edge"
+        padded = [np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, w)], mode=mode) for a, w in zip(arrays, width, strict=True)]
         return jnp.asarray(np.stack(padded, axis=-2))
 
     x = Motion(**{k: pad([r.motion[k] for r in rows]) for k in rows[0].motion}, held=spec.held)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import equinox as eqx
 import numpy as np
 
+from jaxfinger.effects import CatalogueEffect
 from jaxfinger.gap.problem import Problem, assemble
 from jaxfinger.gap.refine import FIXED, Refined
 from jaxfinger.identify import Fit
@@ -86,6 +87,7 @@ def _fit(problem: Problem, model: Model, free, information, what: str, solution:
 def parameter_values(fit: Fit, index: int) -> dict[str, dict]:
     """Value, std and units of every parameter of the fit's effect number `index`."""
     effect = fit.model.effects[index]
+    assert isinstance(effect, CatalogueEffect)
     label = f"{effect.ID} {'-'.join(effect.site)} "
     std = {p.name: s for p, s in zip(describe(fit.model), fit.std, strict=True)}
     units = effect.units()

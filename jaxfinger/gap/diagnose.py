@@ -137,14 +137,14 @@ def _retuned(problem: Problem, fit: Fit) -> str:
 def _rivals(problem: Problem, found: Search):
     """The strongest candidates with their signatures."""
     signatures = Signatures(problem, problem.nominal)
-    top = [c for c in found.candidates if c.refined][:6]
+    top = [(c.evidence, c.refined) for c in found.candidates if c.refined][:6]
     out = []
-    for c in top:
-        effect = c.refined.effects[0]
+    for evidence, refined in top:
+        effect = refined.effects[0]
         variant = Variant(
-            type(effect), c.refined.variants[0].site, tuple((n, float(getattr(effect, n))) for n in effect.SHAPES)
+            type(effect), refined.variants[0].site, tuple((n, float(getattr(effect, n))) for n in effect.SHAPES)
         )
-        out.append((c.evidence, signatures.columns([variant])[0]))
+        out.append((evidence, signatures.columns([variant])[0]))
     return out
 
 
@@ -227,7 +227,9 @@ def _unchanged(problem: Problem, nominal: Fit, forward: bool) -> list[Shrinkage]
 def as_gap_json(d: Diagnosis) -> dict:
     """`gap.json`, to the letter."""
     by_effect = {
-        e.ID + "".join(e.site): parameter_values(d.augmented, i) for i, e in enumerate(d.augmented.model.effects)
+        e.ID + "".join(e.site): parameter_values(d.augmented, i)
+        for i, e in enumerate(d.augmented.model.effects)
+        if isinstance(e, CatalogueEffect)
     }
     candidates = []
     for c in d.search.candidates:

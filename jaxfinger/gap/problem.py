@@ -127,10 +127,7 @@ def build(
     for e, stack in stacks.items():
         missing = [c for c in stack.experiment.channels if (e, c) not in noise]
         if missing:
-            flat = _first_filters(stack, missing)
-            source = sources[e]._replace(
-                filters={c: flat.get(c, _filters(noise, e, c)) for c in stack.experiment.channels}
-            )
+            source = sources[e]
             lin = linearise(
                 fit.model, Free.at(fit.model, source.positions), source.batch, source.filters, _ones(source)
             )
@@ -197,19 +194,13 @@ def _cad_prior(session: Session, recipe: Recipe, free, parameters) -> Prior:
     return Prior(np.asarray(ravel(nominal_model(session, recipe)))[free], root)
 
 
-def _filters(noise, e: str, c: str):
-    return jnp.asarray(noise[e, c].coefficients) if (e, c) in noise else None
-
-
-def _first_filters(stack: Stack, channels) -> dict:
-    return {c: jnp.asarray(first_noise(stack, c).coefficients) for c in channels}
-
-
-def _source(stack: Stack, noise, parameters) -> Source:
+def _source(stack: Stack, noise: dict[tuple[str, str], Noise], parameters) -> Source:
+    """Whitened by a first guess where the noise of a channel is not known yet."""
     e, channels = stack.experiment.name, stack.experiment.channels
     groups = set().union(*(DEPENDS[e, c] for c in channels))
     positions = np.array([i for i, p in enumerate(parameters) if p.group in groups and p.determinable])
-    return Source(stack.batch, {c: _filters(noise, e, c) for c in channels}, positions)
+    known = {c: noise[e, c] if (e, c) in noise else first_noise(stack, c) for c in channels}
+    return Source(stack.batch, {c: jnp.asarray(n.coefficients) for c, n in known.items()}, positions)
 
 
 def _ones(source: Source):

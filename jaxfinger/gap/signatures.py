@@ -60,7 +60,7 @@ def variants(effects: dict[str, type[CatalogueEffect]], finger) -> list[Variant]
     ]
 
 
-@eqx.filter_jit(compiler_options=QUICK)
+@eqx.filter_jit(compiler_options=QUICK)  # type: ignore[call-overload]  # its stub leaves jax.jit's options out
 def _change(
     channel: str,
     effects: CatalogueEffect,
@@ -70,7 +70,7 @@ def _change(
     contact: Array | None,
 ) -> Float[Array, "variants columns B T"]:
     """Change of one channel's prediction, one row a member of `effects` (arrays stacked along their first axis)."""
-    base = None if channel == "tendon_excursion" else resisting_torque(nominal, x)
+    base = 0.0 if channel == "tendon_excursion" else resisting_torque(nominal, x)
 
     def one(effect):
         model = eqx.tree_at(lambda m: m.effects, nominal, (effect,), is_leaf=lambda v: isinstance(v, tuple))
@@ -82,7 +82,7 @@ def _change(
             y = y0 + full(model, true) - full(nominal, x)
         else:
             change = resisting_torque(model, true) - base
-            y = y0 + (change if channel == "joint_torque" else jnp.sum(contact * change[None], axis=1))
+            y = y0 + (change if contact is None else jnp.sum(contact * change[None], axis=1))
         return effect.reading(channel, true, y) - y0
 
     return jax.lax.map(one, effects)
@@ -179,7 +179,8 @@ def whitened(
     """The rows that count, whitened as the residuals are (`noise.whiten`): each has its filter's whole history."""
     coefficients = problem.noise[rows.experiment, channel].coefficients
     column, trial, time = rows.column[of_channel], rows.trial[of_channel], rows.time[of_channel]
-    white = sum(coefficients[column, k] * raw[:, column, trial, time - k] for k in range(coefficients.shape[1]))
+    lags = range(coefficients.shape[1])
+    white = np.asarray(sum(coefficients[column, k] * raw[:, column, trial, time - k] for k in lags))
     if channel == "tendon_excursion":
         constant = coefficients.sum(axis=1)[column]
         series = trial * raw.shape[1] + column

@@ -102,7 +102,7 @@ def _padded(batch: Batch, T: int) -> Batch:
     more = T - batch.x.time.shape[-1]
 
     def pad(a, mode):
-        return np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, more)], mode=mode)
+        return jnp.asarray(np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, more)], mode=mode))
 
     x = jax.tree.map(lambda a: pad(a, "edge"), batch.x)
     return Batch(x, *({c: pad(v, "constant") for c, v in d.items()} for d in (batch.y, batch.mask)))

@@ -108,7 +108,7 @@ def _arrays(module) -> dict[str, list]:
     return {k: np.asarray(v).tolist() for k, v in vars(module).items()}
 
 
-def _without_infinities(value):
+def _without_infinities(value: Any) -> Any:
     """JSON has no infinity and no NaN: null."""
     match value:
         case dict():
@@ -176,7 +176,7 @@ def _array(values: list, shape: tuple[int, ...], name: str) -> jnp.ndarray:
     return jnp.asarray(array)
 
 
-def _tuple(value):
+def _tuple(value: Any) -> Any:
     return tuple(_tuple(v) for v in value) if isinstance(value, list) else value
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxfinger.effects import CatalogueEffect
 from jaxfinger.model import Model
 
 
@@ -122,6 +123,7 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
             )
         case ["effects", int(i), field]:
             effect = model.effects[i]
+            assert isinstance(effect, CatalogueEffect)
             label = f"{effect.ID} {'-'.join(effect.site)} {field}"
             if index:  # a constant of the finger that the effect carries
                 return Parameter(f"{label} {index}", "constant", "", determinable=False)

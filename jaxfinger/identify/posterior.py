@@ -73,11 +73,12 @@ def posterior(session: Session, fit: Fit, draws: int = 500, warmup: int = 300, s
     def sample(key):
         adapt, walk = jax.random.split(key)
         adaptation = blackjax.window_adaptation(blackjax.nuts, log_density)
-        (state, parameters), _ = adaptation.run(adapt, jnp.zeros(basis.shape[1]), warmup)
-        kernel = blackjax.nuts(log_density, **parameters)
+        start = jnp.zeros(basis.shape[1])
+        (state, parameters), _ = adaptation.run(adapt, start, warmup)  # type: ignore[call-arg]  # blackjax's stub lacks it
+        kernel = blackjax.nuts.build_kernel()
 
         def step(state, key):
-            state, info = kernel.step(key, state)
+            state, info = kernel(key, state, log_density, **parameters)
             return state, (state.position, info.is_divergent)
 
         return jax.lax.scan(step, state, jax.random.split(walk, draws))[1]

@@ -101,7 +101,7 @@ def simulate_trials(model: Model, session: Session, stack: Stack) -> dict[str, d
     even = np.stack(
         [[np.interp(g, t, f) for f in tension[:, b]] for b, (g, t) in enumerate(zip(grid, _times(stack), strict=True))]
     ).reshape(len(steps), session.finger.n, -1)
-    starts = np.asarray(x.session_time - x.time)[:, 0]
+    starts = (x.session_time - x.time)[:, 0]
     substeps = max(1, int(np.ceil(steps.max() / STEP - 1e-6)))
     q = np.asarray(
         _simulate(model, jnp.asarray(grid), jnp.asarray(even), x.q[..., 0].T, x.qd[..., 0].T, starts, substeps)

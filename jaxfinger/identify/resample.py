@@ -27,7 +27,7 @@ from jaxfinger.identify.joint import STAGE as JOINT
 from jaxfinger.identify.joint import cad_prior, channels_of
 from jaxfinger.identify.linearise import linearise
 from jaxfinger.identify.parameters import Free, describe, ravel
-from jaxfinger.identify.solve import huber_weights, unit_weights, visible
+from jaxfinger.identify.solve import huber_weights, triangular, unit_weights, visible
 from jaxfinger.identify.stages import STAGES, cad_covariance, sources_of, stage_free, touched_by
 
 Batching = Literal["map", "vmap"]
@@ -87,7 +87,7 @@ def compress(session: Session, fit: Fit) -> Compressed:
         A = np.concatenate([b[:, free] for b, w in zip(blocks, reads[k], strict=True) if w])
         basis = np.zeros((P, 0))
         if A.size:
-            small, _, _ = visible(np.linalg.qr(A, mode="r"))
+            small, _, _ = visible(triangular(A))
             basis = np.zeros((P, small.shape[1]))
             basis[free] = small
         bases.append(basis)

@@ -144,10 +144,15 @@ def _stacked(linearised: dict[str, Linearised], sources: dict[str, Source], size
         blocks.append(block)
     used = np.flatnonzero(np.any(np.concatenate(blocks) != 0, axis=0))
     used = np.union1d(used, [size])
-    small = np.linalg.qr(np.concatenate(blocks)[:, used], mode="r")
+    small = triangular(np.concatenate(blocks)[:, used])
     out = np.zeros((small.shape[0], size + 1))
     out[:, used] = small
     return out
+
+
+def triangular(A: np.ndarray) -> np.ndarray:
+    """R of A = Q R."""
+    return np.asarray(np.linalg.qr(A, mode="r"))
 
 
 def visible(A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -162,7 +167,7 @@ def visible(A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _bounded(A: np.ndarray, b: np.ndarray, lower: np.ndarray) -> np.ndarray:
     """argmin ‖A δ + b‖ over δ ≥ lower: optimistix has no bounds, so the few problems that need them go to scipy."""
-    R = np.linalg.qr(np.column_stack([A, b]), mode="r")
+    R = triangular(np.column_stack([A, b]))
     norm = np.linalg.norm(A, axis=0)
     scale = 1.0 / np.where(norm > 0, norm, 1.0)
     lower = np.minimum(lower, 0.0) / scale
@@ -183,7 +188,7 @@ def _dogleg(A: Float[Array, "k k"], b: Float[Array, " k"]):
 def _minimise(A: np.ndarray, b: np.ndarray) -> np.ndarray:
     """argmin ‖A z + b‖ by optimistix, on the triangular factor, padded to a common size."""
     k = A.shape[1]
-    R = np.linalg.qr(np.column_stack([A, b]), mode="r")[:k]
+    R = triangular(np.column_stack([A, b]))[:k]
     size = -(-max(k, 1) // PAD) * PAD
     square, right = np.eye(size), np.zeros(size)
     square[:k, :k], right[:k] = 0.0, 0.0

@@ -238,7 +238,7 @@ def _cad_prior(fit: Fit, free, parameters, groups) -> Prior | None:
     root = np.zeros((len(rows), free.size))
     for r, k in enumerate(rows):
         root[r, k] = fit.covariance[free[k], free[k]] ** -0.5
-    return Prior(ravel(fit.model)[free], jnp.asarray(root))
+    return Prior(np.asarray(ravel(fit.model))[free], root)
 
 
 def first_noise(stack: Stack, channel: str) -> Noise:

@@ -5,25 +5,51 @@ from typing import Protocol
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 
 class Description(Protocol):
     """The arrays of ID.1, however they were read."""
 
-    gravity: Array
-    axis: Array
-    origin: Array
-    mass: Array
-    com: Array
-    inertia: Array
-    fingertip: Array
-    limits: Array
-    prismatic: tuple[bool, ...]
-    joint_names: tuple[str, ...]
-    tendon_names: tuple[str, ...]
-    active: Array
-    crosses: Array
+    @property
+    def gravity(self) -> Float[Array | np.ndarray, "3"]: ...
+
+    @property
+    def axis(self) -> Float[Array | np.ndarray, "m 3"]: ...
+
+    @property
+    def origin(self) -> Float[Array | np.ndarray, "m 3"]: ...
+
+    @property
+    def mass(self) -> Float[Array | np.ndarray, " m"]: ...
+
+    @property
+    def com(self) -> Float[Array | np.ndarray, "m 3"]: ...
+
+    @property
+    def inertia(self) -> Float[Array | np.ndarray, "m 3 3"]: ...
+
+    @property
+    def fingertip(self) -> Float[Array | np.ndarray, "3"]: ...
+
+    @property
+    def limits(self) -> Float[Array | np.ndarray, "m 2"]: ...
+
+    @property
+    def prismatic(self) -> tuple[bool, ...]: ...
+
+    @property
+    def joint_names(self) -> tuple[str, ...]: ...
+
+    @property
+    def tendon_names(self) -> tuple[str, ...]: ...
+
+    @property
+    def active(self) -> Bool[Array | np.ndarray, " n"]: ...
+
+    @property
+    def crosses(self) -> Bool[Array | np.ndarray, "n m"]: ...
 
 
 class Finger(eqx.Module):

@@ -1,9 +1,11 @@
 """Rigid-body terms of equation (1) by recursive Newton–Euler (Luh, Walker, Paul 1980; Featherstone 2008, ch. 5).
 
 Every function takes joint arrays `(m, *T)` with the batch last and broadcasts over it. The recursion is a scan over the
-joints of a few products of 3-vectors, each a loop along the long axis: quick to compile for any m, and to run.
+joints of a few products of 3-vectors, each a loop along the long axis: quick to compile for any m, and to run. A long
+batch goes through in blocks that stay in the processor's cache.
 """
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -42,6 +44,9 @@ def _rotation(axis: Vector, angle: Float[Array, "*T"]) -> Rotation:
     return c * identity + s * skew + (1.0 - c) * axis[:, None] * axis[None]
 
 
+BLOCK = 2048  # samples
+
+
 class _Joint(NamedTuple):
     """One joint and its link, ready to broadcast against the batch."""
 
@@ -67,6 +72,19 @@ def inverse_dynamics(
     finger: Finger, q: Float[Array, "m *T"], qd: Float[Array, "m *T"], qdd: Float[Array, "m *T"]
 ) -> Float[Array, "m *T"]:
     """M(q) q̈ + N(q, q̇) + G(q), in N m (N for a prismatic joint)."""
+    samples = math.prod(q.shape[1:])
+    if samples <= 4 * BLOCK:
+        return _newton_euler(finger, q, qd, qdd, unroll=False)
+
+    def blocks(a):
+        flat = jnp.pad(a.reshape(finger.m, samples), [(0, 0), (0, -samples % BLOCK)])
+        return jnp.moveaxis(flat.reshape(finger.m, -1, BLOCK), 1, 0)
+
+    torques = jax.lax.map(lambda x: _newton_euler(finger, *x, unroll=True), (blocks(q), blocks(qd), blocks(qdd)))
+    return jnp.moveaxis(torques, 0, 1).reshape(finger.m, -1)[:, :samples].reshape(q.shape)
+
+
+def _newton_euler(finger: Finger, q, qd, qdd, unroll: bool) -> Float[Array, "m *T"]:
     joints = _joints(finger, q)
     zero = jnp.zeros((3, *q.shape[1:]))
     gravity = finger.gravity.reshape(3, *(1,) * (q.ndim - 1))
@@ -85,7 +103,7 @@ def inverse_dynamics(
         return (omega, alpha, a), (force, moment)
 
     # Gravity enters as an upward acceleration of the base.
-    _, (forces, moments) = jax.lax.scan(outward, (zero, zero, zero - gravity), (joints, qd, qdd))
+    _, (forces, moments) = jax.lax.scan(outward, (zero, zero, zero - gravity), (joints, qd, qdd), unroll=unroll)
 
     def inward(wrench, link):
         """Force and moment that the parent applies to the link, at its joint; then both in the parent's frame."""
@@ -95,7 +113,7 @@ def inverse_dynamics(
         force, moment = _mul(j.R, force), _mul(j.R, moment)
         return (force, moment + _cross(j.p, force)), torque
 
-    _, torques = jax.lax.scan(inward, (zero, zero), (joints, forces, moments), reverse=True)
+    _, torques = jax.lax.scan(inward, (zero, zero), (joints, forces, moments), reverse=True, unroll=unroll)
     return torques
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -14,7 +15,7 @@ from matplotlib.figure import Figure
 from jaxfinger.data.atomic import atomic_path
 
 COLOURS = ("#1f5fbf", "#2a8f4f", "#c8342b", "#222222", "#d98a00", "#7b4fb0", "#00908f", "#8c564b")
-LOOK = {
+LOOK: dict[Any, Any] = {
     "font.size": 8.5,
     "axes.titlesize": 9.0,
     "legend.fontsize": 8.0,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxfinger.identify import Fit
 from jaxfinger.model import Model, rigid_body
@@ -57,7 +57,7 @@ def curves(fit: Fit) -> Curves:
     m, S = finger.m, SAMPLES
     q = np.tile(limits.mean(axis=1)[:, None, None], (1, m, S))
     for i in range(m):
-        q[i, i] = np.linspace(*limits[i], S)
+        q[i, i] = np.linspace(limits[i, 0], limits[i, 1], S)
     f = np.linspace(0.0, TENSION, S)
     values, std = fit.function(_evaluate(jnp.asarray(q), jnp.asarray(np.tile(f, (finger.n, 1)))))
     cuts = np.cumsum((finger.n * m * S, m * S, m * S, m))
@@ -110,7 +110,7 @@ def _estimated(fit: Fit) -> set:
     return found
 
 
-def _evaluate(q: Float[np.ndarray, "m m S"], tension: Float[np.ndarray, "n S"]):
+def _evaluate(q: Float[Array, "m m S"], tension: Float[Array, "n S"]):
     """All curves of a model as one flat vector, so that one derivative gives every standard deviation."""
     m = q.shape[0]
     own = jnp.arange(m)

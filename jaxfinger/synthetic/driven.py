@@ -43,7 +43,8 @@ class Simulator:
         """q, rad, q̇, rad/s, and tension, N, every `dt` s, from rest; the tension is constant between two samples."""
         targets = Targets(*(jnp.asarray(x.T) for x in controller.targets))
         outputs = self._run(jnp.asarray(q0), dt, controller._replace(targets=targets))
-        return tuple(np.asarray(x).T for x in outputs)  # type: ignore[return-value]
+        q, v, tension = (np.asarray(x).T for x in outputs)
+        return q, v, tension
 
     def _simulate(self, q0, dt, controller: Controller):
         def sample(carry, target):

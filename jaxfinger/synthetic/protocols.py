@@ -262,7 +262,8 @@ def _row(rows: int, row: int, values: Array) -> Array:
 
 
 def _stacked(paths: Sequence[motions.Path]) -> tuple[Array, Array, Array]:
-    return tuple(np.stack(parts) for parts in zip(*paths, strict=True))  # type: ignore[return-value]
+    q, qd, qdd = (np.stack(parts) for parts in zip(*paths, strict=True))
+    return q, qd, qdd
 
 
 def _inset(limits: Array) -> tuple[float, float]:

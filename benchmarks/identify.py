@@ -1,0 +1,180 @@
+"""The staged identification: seconds, memory, and ratios to other libraries, from one run.
+
+    python benchmarks/identify.py [--samples 1000000]
+
+1. `jaxfinger identify` on a session of 30 trials, 20 minutes at 1 kHz, as a user runs it: with an empty compile cache
+   and with a full one; peak memory there and on half the session.
+2. Inverse dynamics of many samples against Pinocchio's batch call.
+3. Each stage's least squares against `scipy.optimize.least_squares` on the same rows, with the same derivatives.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pinocchio as pin
+import scipy.optimize
+
+from jaxfinger.data import Session, read_session, write_session
+from jaxfinger.experiments import prepare
+from jaxfinger.identify import identify
+from jaxfinger.identify.linearise import linearise
+from jaxfinger.identify.parameters import Free, describe
+from jaxfinger.identify.solve import solve
+from jaxfinger.identify.stages import STAGES, sources_of, start_values
+from jaxfinger.model import Finger, rigid_body
+from jaxfinger.synthetic import ModelPlant, paper_finger, polynomial_finger, recipe_from, simulate
+from jaxfinger.synthetic import nominal_model as true_model
+
+TWENTY_MINUTES = {
+    "specimen": {"kind": "polynomial"},
+    "cad": {"mass": 0.02, "com": 3e-4},
+    "trials": {
+        "experiments": ["ID.2", "ID.3-static", "ID.3-dynamic", "ID.4"],
+        "id2": {"strokes": 6, "stroke_time": 8.0},
+        "id3_static": {"step": 6.0},
+        "id3_dynamic": {"cycles": 8},
+        "id4": {"dwell": 1.6},
+    },
+}
+
+
+def session_file(folder: Path) -> Path:
+    """A simulated session of about 30 trials and 20 minutes at 1 kHz."""
+    plant = ModelPlant(true_model(polynomial_finger(paper_finger())))
+    session = simulate(recipe_from(TWENTY_MINUTES), seed=0, plant=plant)
+    write_session(session, folder / "session.h5")
+    half = list(session.trials)[::2]
+    write_session(Session(session.specimen, session.finger, {n: session[n] for n in half}), folder / "half.h5")
+    minutes = sum(t.duration for t in session) / 60
+    print(f"session: {len(session)} trials, {minutes:.1f} min, {sum(len(t.time) for t in session):,} samples")
+    return folder / "session.h5"
+
+
+MEASURED = """
+import resource, subprocess, sys, time
+begun = time.perf_counter()
+subprocess.run(sys.argv[1:], check=True, capture_output=True)
+print(time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024)
+"""
+
+
+def measured(session: Path, cache: Path) -> tuple[float, float]:
+    """Wall seconds and peak MiB of one `jaxfinger identify`."""
+    command = [
+        sys.executable,
+        "-m",
+        "jaxfinger",
+        "identify",
+        str(session),
+        "-o",
+        str(cache / "fit.json"),
+        "--overwrite",
+    ]
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache / "compiled")}
+    line = subprocess.run(
+        [sys.executable, "-c", MEASURED, *command], check=True, capture_output=True, text=True, env=environment
+    )
+    seconds, memory = map(float, line.stdout.split())
+    return seconds, memory
+
+
+def best(work, repeats: int = 3) -> float:
+    """Shortest time of a few runs, s, compiled before."""
+    work()
+    times = []
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - begun)
+    return min(times)
+
+
+def whole(folder: Path) -> None:
+    """1. The command."""
+    path = session_file(folder)
+    cold, memory = measured(path, folder)
+    warm, _ = measured(path, folder)
+    half, less = measured(folder / "half.h5", folder)
+    print(f"identify, empty compile cache: {cold:.1f} s; full cache: {warm:.1f} s; peak memory {memory:.0f} MiB")
+    print(f"identify, half the session:    {half:.1f} s; peak memory {less:.0f} MiB")
+
+
+def inverse_dynamics(samples: int) -> None:
+    """2. One call for all samples."""
+    d = paper_finger().description
+    finger, m = Finger.from_description(d), d.m
+    rng = np.random.default_rng(0)
+    q, qd, qdd = rng.uniform(-1, 1, (3, m, samples))
+    ours = eqx.filter_jit(rigid_body.inverse_dynamics)
+    begun = time.perf_counter()
+    ours.lower(finger, q, qd, qdd).compile()
+    compiling = time.perf_counter() - begun
+    mine = best(lambda: jax.block_until_ready(ours(finger, jnp.asarray(q), jnp.asarray(qd), jnp.asarray(qdd))))
+    model = pin.Model()
+    for i in range(m):
+        joint = pin.JointModelRevoluteUnaligned(d.axis[i])
+        k = model.addJoint(i, joint, pin.SE3(np.eye(3), d.origin[i]), d.joint_names[i])
+        model.appendBodyToJoint(k, pin.Inertia(float(d.mass[i]), d.com[i], d.inertia[i]), pin.SE3.Identity())
+    model.gravity.linear = d.gravity
+    pool = pin.ModelPool(model, 2)
+    a, b, c = (np.asfortranarray(x) for x in (q, qd, qdd))
+    tau = np.zeros_like(a)
+    theirs = best(lambda: pin.rneaInParallel(2, pool, a, b, c, tau))
+    error = float(np.abs(np.asarray(ours(finger, q, qd, qdd)) - tau).max())
+    print(f"inverse dynamics, {samples:,} samples of {m} joints: {mine:.2f} s (compiled in {compiling:.1f} s)")
+    print(
+        f"  Pinocchio's batch call, two threads: {theirs:.2f} s, {theirs / mine:.1f} times ours; difference {error:.1g}"
+    )
+
+
+def stages(path: Path) -> None:
+    """3. The least squares of every stage, all else equal."""
+    session = read_session(path)
+    fit, stacks = identify(session), prepare(session)
+    parameters = describe(fit.model)
+    for name, stage in STAGES.items():
+        reads = {e: c for e, c in stage.reads.items() if e in stacks}
+        groups = set(stage.frees)
+        free = np.array([i for i in fit.estimated if parameters[i].group in groups], dtype=int)
+        sources = sources_of(stacks, reads, fit.noise, parameters)
+        zero = Free.at(fit.model, free).set(fit.model, jnp.zeros(free.size))
+        start = start_values(zero, free, parameters)
+        ours = best(lambda s=start, f=free, src=sources: solve(s, f, src)[0], 1)
+        free_of = Free.at(start, free)
+
+        def rows(theta, s=start, f=free_of, src=sources):
+            lin = [linearise(f.set(s, jnp.asarray(theta)), f, x.batch, x.filters) for x in src.values()]
+            r = np.concatenate([np.asarray(x.white).ravel() for x in lin])
+            return r, np.concatenate([np.asarray(x.jacobian).reshape(-1, theta.size) for x in lin])
+
+        def theirs(run=rows, s=start, f=free_of):
+            return scipy.optimize.least_squares(
+                lambda x: run(x)[0], np.asarray(f.get(s)), jac=lambda x: run(x)[1], method="trf", x_scale="jac"
+            )
+
+        scipy_time = best(theirs, 1)
+        print(f"{name:13} ours {ours:6.2f} s, SciPy {scipy_time:6.2f} s: {scipy_time / ours:.1f} times")
+
+
+def main() -> None:
+    """Print all three."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--samples", type=int, default=1_000_000)
+    samples = parser.parse_args().samples
+    with tempfile.TemporaryDirectory() as folder:
+        whole(Path(folder))
+        inverse_dynamics(samples)
+        stages(Path(folder) / "session.h5")
+
+
+if __name__ == "__main__":
+    main()
