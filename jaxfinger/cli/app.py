@@ -33,6 +33,7 @@ STAGES = {
 SEALED = {
     "make": "Make cases and hide their truth.",
     "run": "Diagnose every case.",
+    "close": "Predict the fresh trials before and after each diagnosis.",
     "score": "Score the diagnoses against the truth.",
     "rivals": "Work out what is distinguishable in principle, for the ceiling of the score.",
 }

@@ -13,6 +13,7 @@ from typing import Literal
 
 from jaxfinger.errors import UserError
 
+PREDICT = f"{shlex.quote(sys.executable)} -m jaxfinger predict {{fit}} {{session}} -o {{out}}"
 DIAGNOSE = f"{shlex.quote(sys.executable)} -m jaxfinger diagnose {{fit}} -o {{out}}"
 
 
@@ -91,6 +92,26 @@ def run(
         f"{out}: {len(results) - len(failed)} diagnosed"
         + (f"; failed, see run.json: {', '.join(failed)}" if failed else "")
     )
+
+
+def close(
+    folder: Path, *, diagnoses: Path | None = None, command: str = PREDICT, workers: int | None = None
+) -> None:
+    """Predict every diagnosed case's fresh trials before and after, for the score of how far the gap closes.
+
+    Args:
+        folder: the cases.
+        diagnoses: what `run` wrote; by default FOLDER-diagnoses.
+        command: what predicts; {fit}, {session} and {out} stand for the fit, the fresh trials and the file to write.
+        workers: cases at a time; by default as many as there are cores.
+    """
+    from jaxfinger.sealed.run import close_cases
+
+    out = diagnoses or _beside(folder, "diagnoses")
+    with _bar("closing") as progress:
+        results = close_cases(folder, out, command, workers or os.cpu_count() or 1, progress)
+    failed = sorted(name for name, what in results.items() if what == "failed")
+    print(f"{out}: {len(results)} cases" + (f"; failed: {', '.join(failed)}" if failed else ""))
 
 
 def score(

@@ -13,7 +13,7 @@ import warnings
 from pathlib import Path
 
 import h5py
-from h5py import h5o
+import h5py.h5o as h5o
 
 _PATIENCE = 5  # s
 _SMALL = 10_000  # elements

@@ -64,6 +64,49 @@ def run_case(diagnose: Diagnose, folder: Path, out: Path) -> str:
     return "failed" if "error" in record else "done"
 
 
+def close_case(predict: str, folder: Path, diagnosed: Path) -> str:
+    """Predict a case's fresh trials before and after its diagnosis into `diagnosed/fresh.json`; "skipped" where it is
+    there, or where the diagnosis leaves the model as it is.
+    """
+    from .closure import fresh_rows
+
+    fits = [diagnosed / "nominal.json", diagnosed / "augmented.json"]
+    if (diagnosed / "fresh.json").exists() or not all(f.exists() for f in fits):
+        return "skipped"
+    if not json.loads((diagnosed / "gap.json").read_text())["verdict"]["effects"]:
+        return "skipped"
+    with tempfile.TemporaryDirectory() as scratch:
+        outs = [Path(scratch) / f"{f.stem}.h5" for f in fits]
+        for fit, out in zip(fits, outs, strict=True):
+            words = [w.format(fit=fit, session=folder / "fresh.h5", out=out) for w in shlex.split(predict)]
+            if subprocess.run(words, capture_output=True, text=True, check=False).returncode:
+                return "failed"
+        rows = fresh_rows(folder / "fresh.h5", *outs)
+    part = diagnosed / "fresh.json.part"
+    part.write_text(json.dumps({"rows": rows}, indent=1))
+    os.replace(part, diagnosed / "fresh.json")
+    return "done"
+
+
+def close_cases(
+    cases: Path,
+    out: Path,
+    predict: str,
+    workers: int = 1,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> dict[str, str]:
+    """`close_case` for every diagnosed case; returns what became of each."""
+    folders = [f.parent for f in sorted(cases.glob("*/fit.h5")) if (out / f.parent.name / "gap.json").exists()]
+    results: dict[str, str] = {}
+    with ThreadPoolExecutor(workers) as pool:
+        jobs = {pool.submit(close_case, predict, f, out / f.name): f.name for f in folders}
+        for job in as_completed(jobs):
+            results[jobs[job]] = job.result()
+            if progress:
+                progress(len(results), len(folders), f"{jobs[job]} {job.result()}")
+    return results
+
+
 def run_cases(
     cases: Path,
     out: Path,
