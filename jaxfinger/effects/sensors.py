@@ -27,21 +27,29 @@ class TorqueSensorScale(CatalogueEffect):
 
 
 class TorqueSensorDrift(CatalogueEffect):
-    """b (1 − exp(−t/T)) T: offset that grows with the time since the sensor was tared, before each trial."""
+    """Offset that moves after the sensor was tared, before each trial: b T (1 − exp(−t/T)), and a wandering over minutes.
+
+    It wanders with the session's time s: A cos(2π s/P) + B sin(2π s/P), less its value at the tare.
+    """
 
     ID: ClassVar = "torque_sensor_drift"
     PLACE: ClassVar = "torque_sensor"
-    AMPLITUDES: ClassVar = {"slope": ("N m/s", 4e-5, True)}
-    SHAPES: ClassVar = {"T": ("s", (1e4, 30.0, 10.0, 3.0))}
+    AMPLITUDES: ClassVar = {"slope": ("N m/s", 4e-5, True), "A": ("N m", 3e-4, True), "B": ("N m", 3e-4, True)}
+    SHAPES: ClassVar = {"T": ("s", (1e4, 30.0, 10.0, 3.0)), "P": ("s", (60.0, 90.0, 140.0, 250.0, 600.0, 1500.0))}
     SHOWS: ClassVar = TORQUE_SENSOR
 
     slope: Float[Array, ""]
+    A: Float[Array, ""]
+    B: Float[Array, ""]
     T: Float[Array, ""]
+    P: Float[Array, ""]
 
     def reading(self, channel, x, y):
         if channel != "joint_torque":
             return y
-        return y + self.slope * self.T * -jnp.expm1(-x.time / self.T) * x.motorised
+        now, tare = (2.0 * jnp.pi * s / self.P for s in (x.session_time, x.session_time - x.time))
+        wander = self.A * (jnp.cos(now) - jnp.cos(tare)) + self.B * (jnp.sin(now) - jnp.sin(tare))
+        return y + (self.slope * self.T * -jnp.expm1(-x.time / self.T) + wander) * x.motorised
 
 
 class TensionSensorScale(CatalogueEffect):

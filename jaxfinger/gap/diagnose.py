@@ -189,7 +189,7 @@ def _verdict(found: Search, lines: list[Shrinkage]) -> Verdict:
             f"The gap is explained about equally well by {rivals}; these trials cannot tell them apart. "
             f"The most probable is {effects[0][0]} at {'-'.join(effects[0][1])}.",
         )
-    best = max((x.closed for x in lines if x.resolvable), default=0.0)
+    best = max((x.closed for x in lines if x.resolvable and x.channel != "q"), default=0.0)
     return Verdict(
         "explained",
         effects,
