@@ -60,7 +60,7 @@ def variants(effects: dict[str, type[CatalogueEffect]], finger) -> list[Variant]
     ]
 
 
-@eqx.filter_jit(compiler_options=QUICK)  # type: ignore[call-overload]  # its stub leaves jax.jit's options out
+@eqx.filter_jit(compiler_options=QUICK)  # type: ignore[call-overload]  # its overloads leave the options of jit out
 def _change(
     channel: str,
     effects: CatalogueEffect,

@@ -73,8 +73,8 @@ def posterior(session: Session, fit: Fit, draws: int = 500, warmup: int = 300, s
     def sample(key):
         adapt, walk = jax.random.split(key)
         adaptation = blackjax.window_adaptation(blackjax.nuts, log_density)
-        centre = jnp.zeros(basis.shape[1])
-        (state, parameters), _ = adaptation.run(adapt, centre, warmup)  # type: ignore[call-arg]  # the protocol has no num_steps
+        run = adaptation.run  # its protocol leaves num_steps out
+        (state, parameters), _ = run(adapt, jnp.zeros(basis.shape[1]), warmup)  # type: ignore[call-arg]
         kernel = blackjax.nuts.build_kernel()
 
         def step(state, key):
