@@ -27,7 +27,7 @@ class TorqueSensorScale(CatalogueEffect):
 
 
 class TorqueSensorDrift(CatalogueEffect):
-    """Offset that moves after the sensor was tared, before each trial: b T (1 − exp(−t/T)), and a wandering over minutes.
+    """Offset that moves after the sensor was tared, before each trial: b T (1 − exp(−t/T)), and a slow wandering.
 
     It wanders with the session's time s: A cos(2π s/P) + B sin(2π s/P), less its value at the tare.
     """
