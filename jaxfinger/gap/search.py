@@ -24,7 +24,7 @@ from jaxfinger.gap.standin import REACH, Explained, energy_left, explained
 
 Progress = Callable[[str], None]
 
-DETECT = 15.0  # log evidence that an effect needs before anything is called a gap
+DETECT = 30.0  # log evidence that an effect needs before anything is called a gap
 LOOKS = 25.0  # ν: independent looks that evidence counts
 FORM = 0.1  # share of what an effect explains in a column, that the form of its law may miss
 ADD = 0.3  # share of what is left, that a further effect must explain
@@ -33,6 +33,7 @@ LOOKED_AT = 12  # candidates for a further effect
 LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for
 OPEN = 0.25  # share of the gap left to the stand-in at which «unlisted» is as likely as the catalogue
 OPEN_WIDTH = 0.06
+UNLISTED = 300.0  # energy left to the stand-in below which «unlisted» is no verdict
 
 
 @dataclass(frozen=True)
@@ -189,7 +190,7 @@ def _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, stro
     log_l = {k: -0.5 * LOOKS * np.log1p(max(u, 0.0) / LOOKS) for k, u in unexplained.items()}
     total = logsumexp(list(log_l.values()))
     share_left = beyond / gap
-    unlisted = float(expit((share_left - OPEN) / OPEN_WIDTH)) if beyond > 60.0 else 0.01
+    unlisted = float(expit((share_left - OPEN) / OPEN_WIDTH)) if beyond > UNLISTED else 0.01
     probability = {k: float(np.exp(v - total)) * (1 - unlisted) for k, v in log_l.items()}
     if len(chosen.variants) > 1:
         # Several effects: each carries its part of what the catalogue explains.
