@@ -94,9 +94,7 @@ def run(
     )
 
 
-def close(
-    folder: Path, *, diagnoses: Path | None = None, command: str = PREDICT, workers: int | None = None
-) -> None:
+def close(folder: Path, *, diagnoses: Path | None = None, command: str = PREDICT, workers: int | None = None) -> None:
     """Predict every diagnosed case's fresh trials before and after, for the score of how far the gap closes.
 
     Args:

@@ -95,7 +95,7 @@ def diagnose(
     verdict, proposal = _verdict(found, lines), None
     if verdict.status == "unexplained" and found.left:
         progress("looking for a closed form of what remains")
-        proposal = propose(problem, found.chosen.residual, found.left[0], found.chosen.columns)
+        proposal = propose(problem, found.chosen.residual, found.left, found.chosen.columns)
         if proposal:
             text = f" A proposal, unproven, for {100 * proposal.share:.0f} % of that: {proposal.formula}."
             verdict = replace(verdict, summary=verdict.summary + text)

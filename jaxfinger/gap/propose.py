@@ -23,9 +23,8 @@ SPEEDS, LENGTHS, PERIODS = (0.05, 0.2, 0.8), (0.02, 0.1, 0.4), (1, 2, 3, 4, 5, 6
 
 @dataclass(frozen=True)
 class Proposal:
-    """Σ aₖ termₖ for one column of one channel, `share` of what a smooth law could explain there."""
+    """Σ aₖ termₖ for one column of one channel in all experiments, `share` of what a smooth law could explain there."""
 
-    experiment: str
     channel: str
     site: str
     terms: tuple[tuple[float, str], ...]  # coefficient in the channel's unit (angles rad, forces N), and formula
@@ -36,22 +35,20 @@ class Proposal:
         """For people: with the unit that each coefficient has where the term has none of its own."""
         unit = UNITS[self.channel]
         body = " ".join(f"{a:+.3g} {unit} · {text}" for a, text in self.terms)
-        return f"{self.channel} {self.site} of {self.experiment} ≈ {body.lstrip('+')}"
+        return f"{self.channel} {self.site} ≈ {body.lstrip('+')}"
 
 
-def propose(problem: Problem, residual: np.ndarray, left: Explained, chosen: np.ndarray) -> Proposal | None:
+def propose(problem: Problem, residual: np.ndarray, left: list[Explained], chosen: np.ndarray) -> Proposal | None:
     """The shortest sum of terms for the column that has most left; None where no term explains a fair part.
 
-    `residual` (N,) is what the chosen effects leave, `chosen` (k, N) their columns.
+    `residual` (N,) is what the chosen effects leave, `left` what a smooth law explains of it, `chosen` (k, N) their
+    columns.
     """
-    rows = problem.rows[left.experiment]
-    number = problem.stacks[left.experiment].experiment.channels.index(left.channel)
-    pick = np.flatnonzero((rows.channel == number) & (rows.column == left.column))
-    library = terms(problem, left.experiment, left.channel, left.column)
-    raw = np.zeros((len(library), len(problem.stacks[left.experiment].batch.y[left.channel]), *library[0][1].shape))
-    raw[:, left.column] = np.stack([values for _, values in library])
-    columns = np.zeros((len(library), problem.r.size))
-    columns[:, rows.start + pick] = whitened(raw, problem, rows, pick, left.channel)
+    by_column: dict[tuple[str, int], float] = {}
+    for x in left:
+        by_column[x.channel, x.column] = by_column.get((x.channel, x.column), 0.0) + max(x.energy, 0.0)
+    (channel, column), most = max(by_column.items(), key=lambda kv: kv[1])
+    names, columns = _columns(problem, channel, column)
 
     project = Projector(problem, chosen)
     Z, r = project(columns), project.residual(problem, residual)
@@ -65,15 +62,30 @@ def propose(problem: Problem, residual: np.ndarray, left: Explained, chosen: np.
         trial = [*found, int(np.argmax(gain))]
         a = np.linalg.lstsq(Z[trial].T, r, rcond=1e-10)[0]
         explained = float(r @ r - np.sum((r - a @ Z[trial]) ** 2))
-        if explained - energy < WORTH * left.energy:
+        if explained - energy < WORTH * most:
             break
         found, rest, energy = trial, r - a @ Z[trial], explained
     if not found:
         return None
     a = np.linalg.lstsq(Z[found].T, r, rcond=1e-10)[0]
-    named = tuple((float(v), library[i][0]) for v, i in zip(a, found, strict=True))
-    name = site(problem, left.channel, left.column)
-    return Proposal(left.experiment, left.channel, name, named, min(1.0, energy / left.energy))
+    named = tuple((float(v), names[i]) for v, i in zip(a, found, strict=True))
+    return Proposal(channel, site(problem, channel, column), named, min(1.0, energy / most))
+
+
+def _columns(problem: Problem, channel: str, column: int) -> tuple[list[str], np.ndarray]:
+    """Formulas of the library, and their whitened rows in every experiment that reads the channel."""
+    found: dict[str, np.ndarray] = {}
+    for e, rows in problem.rows.items():
+        channels = problem.stacks[e].experiment.channels
+        if channel not in channels:
+            continue
+        pick = np.flatnonzero((rows.channel == channels.index(channel)) & (rows.column == column))
+        library = terms(problem, e, channel, column)
+        raw = np.zeros((len(library), len(problem.stacks[e].batch.y[channel]), *library[0][1].shape))
+        raw[:, column] = np.stack([values for _, values in library])
+        for (name, _), white in zip(library, whitened(raw, problem, rows, pick, channel), strict=True):
+            found.setdefault(name, np.zeros(problem.r.size))[rows.start + pick] = white
+    return list(found), np.stack(list(found.values()))
 
 
 def terms(problem: Problem, experiment: str, channel: str, column: int) -> list[tuple[str, np.ndarray]]:
