@@ -9,10 +9,13 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
 
 from jaxfinger.errors import UserError
 
+Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 PREDICT = f"{shlex.quote(sys.executable)} -m jaxfinger predict {{fit}} {{session}} -o {{out}}"
 DIAGNOSE = f"{shlex.quote(sys.executable)} -m jaxfinger diagnose {{fit}} -o {{out}}"
 
@@ -69,7 +72,7 @@ def rivals(folder: Path, *, truth: Path | None = None, workers: int | None = Non
 
 
 def run(
-    folder: Path, *, output: Path | None = None, command: str = DIAGNOSE, workers: int | None = None, share: str = "1/1"
+    folder: Path, *, output: Output = None, command: str = DIAGNOSE, workers: int | None = None, share: str = "1/1"
 ) -> None:
     """Diagnose every case of FOLDER, each from a lone copy of its fit.h5. Cases that are done are skipped.
 
@@ -112,9 +115,7 @@ def close(folder: Path, *, diagnoses: Path | None = None, command: str = PREDICT
     print(f"{out}: {len(results)} cases" + (f"; failed: {', '.join(failed)}" if failed else ""))
 
 
-def score(
-    folder: Path, *, diagnoses: Path | None = None, truth: Path | None = None, output: Path | None = None
-) -> None:
+def score(folder: Path, *, diagnoses: Path | None = None, truth: Path | None = None, output: Output = None) -> None:
     """Print every score of the diagnosis on FOLDER's cases, with intervals, confusions and reliability.
 
     Args:

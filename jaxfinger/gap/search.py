@@ -132,20 +132,22 @@ def _add(problem, groups, columns, best: Refined, chi2: float, projector, progre
     chosen, without = best, projector.residual(problem)[: problem.r.size]
     cell = problem.column_of_row
     while len(chosen.variants) < 3:
-        theirs = FORM * np.maximum(np.bincount(cell, without**2 - chosen.residual**2), 0.0)
-        left = explained(problem, chosen.residual)
-        owed = {problem.columns[i]: energy for i, energy in enumerate(theirs)}
-        still = sum(max(x.energy - owed[x.experiment, x.channel, x.column], 0.0) for x in left if x.energy > REACH)
+        theirs = FORM * np.maximum(np.bincount(cell, without**2 - chosen.residual**2, len(problem.columns)), 0.0)
+        energies = {(x.experiment, x.channel, x.column): x.energy for x in explained(problem, chosen.residual)}
+        left = np.array([energies.get(k, 0.0) for k in problem.columns])
+        still = float(np.maximum(left - theirs, 0.0)[left > REACH].sum())
         if still < LEAST:
             break
         on_top = Projector(problem, chosen.columns)
         rt = on_top.residual(problem, problem.r - chosen.change)
         ranked = [e for e in by_site(screen(groups, columns, on_top, rt)).values() if e.variant.key not in chosen.keys]
-        e = max(ranked[:LOOKED_AT], key=lambda e: _credit(e, groups, columns, on_top, rt, cell, theirs))
+        drops = [_drop(e, groups, columns, on_top, rt, cell, len(problem.columns)) for e in ranked[:LOOKED_AT]]
+        first = int(np.argmax([_fits(drop, left) for drop in drops]))
+        e, credit = ranked[first], float(np.maximum(drops[first] - theirs, 0.0).sum())
         # At the site of an effect that is there already, another form of it is likelier than a second cause.
         same = any(set(e.variant.site) & set(v.site) for v in chosen.variants)
         need = max(ADD * still, 2 * DETECT, SAME_SITE * (chi2 - chosen.chi2) if same else 0.0)
-        if e.log_bf < DETECT or _credit(e, groups, columns, on_top, rt, cell, theirs) < need:
+        if e.log_bf < DETECT or credit < need:
             break
         progress(f"adding {e.variant.effect.ID} at {', '.join(e.variant.site)}")
         items, starts = _at_optimum(chosen)
@@ -156,12 +158,17 @@ def _add(problem, groups, columns, best: Refined, chi2: float, projector, progre
     return chosen
 
 
-def _credit(e: Evidence, groups, columns, projector: Projector, rt, cell, theirs) -> float:
-    """What a candidate explains in every column, beyond what may belong to the effects that are there already."""
+def _drop(e: Evidence, groups, columns, projector: Projector, rt, cell, count: int) -> np.ndarray:
+    """What a candidate explains in every column."""
     name = e.variant.effect.ID
     change = e.amplitudes @ projector(columns[name][groups[name].index(e.variant)])
-    drop = np.bincount(cell, (rt**2 - (rt - change) ** 2)[: cell.size])
-    return float(np.maximum(drop - theirs, 0.0).sum())
+    return np.bincount(cell, (rt**2 - (rt - change) ** 2)[: cell.size], count)
+
+
+def _fits(drop: np.ndarray, left: np.ndarray) -> float:
+    """Gain in log L of all columns: a true cause explains a column to the noise, an imitator a part of many."""
+    before, after = np.maximum(left, 0.0), np.maximum(left - drop, 0.0)
+    return float(0.5 * LOOKS * np.sum(np.log1p(before / LOOKS) - np.log1p(after / LOOKS)))
 
 
 def _shares(problem, chosen: Refined, chi2: float, projector, gap: float) -> tuple[float, ...]:
