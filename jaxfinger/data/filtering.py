@@ -90,8 +90,8 @@ def shrink(x: Float[np.ndarray, "N k"], window: int) -> Float[np.ndarray, "N k"]
     """The local Wiener filter: of each column's deviation from its running mean, the share that is more than noise.
 
     x̂ = x̄ + max(0, 1 − σ²/s²) (x − x̄), s² the variance within the window, σ from the median of |x − x̄|: the noise of
-    most of the trial. As a regressor x̂ does not bias its coefficient towards zero (regression calibration; Carroll et
-    al., Measurement Error in Nonlinear Models, 2nd ed., ch. 4).
+    most of the trial. As a regressor x̂ is rid of most of the bias of its coefficient towards zero (regression
+    calibration; Carroll et al., Measurement Error in Nonlinear Models, 2nd ed., ch. 4).
     """
     out = np.array(x, np.float64)
     window = 2 * (max(window, 2) // 2) + 1

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter1d
 
-from jaxfinger.data.filtering import decimate, outlier_mask, smooth
+from jaxfinger.data.filtering import decimate, outlier_mask, shrink, smooth
 from jaxfinger.errors import UserError
 
 
@@ -129,3 +130,27 @@ def test_a_quantised_channel_has_no_spikes():
     assert not outlier_mask(np.round(noisy / step) * step).any()
     assert not outlier_mask(np.round(2e-4 * np.random.default_rng(1).standard_normal(10_000) / step) * step).any()
     assert not outlier_mask(np.full((100, 2), np.nan)).any()
+
+
+def test_a_shrunk_regressor_is_rid_of_most_of_its_bias():
+    """Bursts of acceleration between long quiet stretches, seen through noise: least squares with weights that favour
+    fast changes, as whitening does, finds too little inertia from the noisy one."""
+    rng = np.random.default_rng(0)
+    n = np.arange(40_000)
+    burst = np.exp(-0.5 * (((n % 1000) - 500) / 30.0) ** 2) * np.sign((n // 1000) % 2 - 0.5)
+    noise = gaussian_filter1d(rng.standard_normal(n.size), 10.0)
+    seen = (burst + 0.03 * noise / noise.std())[:, None]
+    y = 2.0 * burst + 0.01 * rng.standard_normal(n.size)
+
+    def slope(x):
+        x, v = x[20:, 0] - x[:-20, 0], y[20:] - y[:-20]
+        return (x @ v) / (x @ x)
+
+    assert slope(seen) < 1.85
+    assert slope(shrink(seen, 100)) == pytest.approx(2.0, abs=(2.0 - slope(seen)) / 3)
+
+
+def test_shrinking_leaves_a_smooth_motion_and_a_constant_alone():
+    slow = np.sin(2 * np.pi * np.arange(5000) / 5000)[:, None]
+    np.testing.assert_allclose(shrink(slow, 100)[200:-200], slow[200:-200], atol=1e-3)
+    np.testing.assert_array_equal(shrink(np.ones((500, 2)), 100), np.ones((500, 2)))

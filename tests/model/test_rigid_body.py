@@ -56,3 +56,13 @@ def test_the_batch_is_any_number_of_last_axes():
     mapped = jax.vmap(inverse_dynamics, (None, 1, 1, 1), 1)(finger, q, qd, qdd)
     np.testing.assert_allclose(whole[:, 1, 2], one, rtol=1e-13)
     np.testing.assert_allclose(mapped, whole, rtol=1e-13)
+
+
+def test_blocks_of_a_long_batch_join_seamlessly():
+    finger = Finger.from_description(description(3, 3))
+    n = 5 * rigid_body.BLOCK + 17
+    q, qd, qdd = np.random.default_rng(4).uniform(-1, 1, (3, 3, 2, n))
+    whole = rigid_body.inverse_dynamics(finger, q, qd, qdd)
+    for k in (0, rigid_body.BLOCK - 1, rigid_body.BLOCK, n - 1):
+        one = rigid_body.inverse_dynamics(finger, q[..., k], qd[..., k], qdd[..., k])
+        np.testing.assert_allclose(whole[..., k], one, rtol=1e-12, atol=1e-15)

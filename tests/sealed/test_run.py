@@ -7,7 +7,7 @@ import pytest
 
 from jaxfinger.cli import sealed as cli
 from jaxfinger.errors import UserError
-from jaxfinger.sealed.run import Command, run_case, run_cases
+from jaxfinger.sealed.run import Command, close_cases, run_case, run_cases
 
 READ = "import sys, json, pathlib; o = pathlib.Path(sys.argv[2]); o.mkdir(); "
 
@@ -96,3 +96,23 @@ def test_the_commands_say_what_to_do(folder, tmp_path, capsys):
         {"value": 0.0, "low": 0.0, "high": 0.434, "count": 5}, abs=1e-3
     )
     assert (tmp_path / "scores" / "reliability.svg").exists()
+
+
+def test_fresh_trials_are_predicted_only_for_a_verdict_that_names_an_effect(folder, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr("jaxfinger.sealed.closure.fresh_rows", lambda *paths: seen.append(paths) or [{"before": 1.0}])
+    for name, effects in (("case-001", [{"effect": "payload", "site": ["DIP"]}]), ("case-002", [])):
+        out = tmp_path / "out" / name
+        out.mkdir(parents=True)
+        (out / "gap.json").write_text(json.dumps({"verdict": {"effects": effects}}))
+        (out / "nominal.json").write_text("{}")
+        (out / "augmented.json").write_text("{}")
+    predict = f"{sys.executable} -c 'import sys; open(sys.argv[3], \"w\")' {{fit}} {{session}} {{out}}"
+    assert close_cases(folder, tmp_path / "out", predict) == {"case-001": "done", "case-002": "skipped"}
+    ((fresh, before, after),) = seen
+    assert fresh == folder / "case-001" / "fresh.h5"
+    assert (before.name, after.name) == ("nominal.h5", "augmented.h5")
+    assert json.loads((tmp_path / "out" / "case-001" / "fresh.json").read_text()) == {"rows": [{"before": 1.0}]}
+    assert close_cases(folder, tmp_path / "out", predict)["case-001"] == "skipped"
+    (tmp_path / "out" / "case-001" / "fresh.json").unlink()
+    assert close_cases(folder, tmp_path / "out", f"{sys.executable} -c 'exit(1)'")["case-001"] == "failed"
