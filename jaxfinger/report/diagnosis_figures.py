@@ -144,12 +144,15 @@ def traces(d: Diagnosis):
     x = stack.batch.x
     time = np.asarray(x.time)[b]
     seen = np.arange(time.size) <= np.flatnonzero(mask).max()  # the rest is padding
-    figure, axes = grid(3, 1, 9.0, 1.6, sharex=True)
-    (missed,), (angle,), (pull,) = axes
+    tension = np.asarray(x.tension)[:, b][:, seen]
+    taut = [k for k in range(len(tension)) if np.ptp(tension[k]) > 0]
+    figure, axes = grid(3 if taut else 2, 1, 9.0, 1.6, sharex=True)
+    missed, angle, *pull = (row[0] for row in axes)
     y = np.asarray(stack.batch.y[channel])[column, b]
     factor, unit = people({"joint_torque": "N m", "tendon_excursion": "m"}.get(channel, "N"))
-    for fit, colour, label in ((d.nominal, BEFORE, "before"), (d.augmented, AFTER, "after")):
-        residual = np.asarray(_residuals(fit.model, stack.batch, (channel,))[channel])[column, b]
+    first = d.problem.simulator or d.nominal.model
+    for model, colour, label in ((first, BEFORE, "before"), (d.augmented.model, AFTER, "after")):
+        residual = np.asarray(_residuals(model, stack.batch, (channel,))[channel])[column, b]
         if channel == "tendon_excursion":  # its zero is free in every trial
             residual = residual - residual[mask].mean()
         missed.plot(
@@ -169,13 +172,14 @@ def traces(d: Diagnosis):
     missed.set(ylabel=f"missed ({unit})", title=what + spans)
     for i, name in enumerate(d.problem.nominal.finger.joint_names):
         angle.plot(time[seen], np.degrees(np.asarray(x.q)[i, b][seen]), color=COLOURS[i % len(COLOURS)], label=name)
-    for k, name in enumerate(d.problem.nominal.finger.tendon_names):
-        f = np.asarray(x.tension)[k, b][seen]
-        if np.ptp(f) > 0:
-            pull.plot(time[seen], f, color=COLOURS[k % len(COLOURS)], label=name)
     angle.set(ylabel="q (°)")
-    pull.set(ylabel="tension (N)", xlabel="time (s)")
-    for ax in (missed, angle, pull):
+    for ax in pull:
+        for k in taut:
+            name = d.problem.nominal.finger.tendon_names[k]
+            ax.plot(time[seen], tension[k], color=COLOURS[k % len(COLOURS)], label=name)
+        ax.set(ylabel="tension (N)")
+    axes[-1][0].set(xlabel="time (s)")
+    for ax in (missed, angle, *pull):
         if ax.get_legend_handles_labels()[0]:
             ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
