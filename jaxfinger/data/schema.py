@@ -76,8 +76,18 @@ MEASURES = {
 }
 
 
+# Of a finger whose joints all slide, the format's axes of a linear drive.
+_SLIDING = {
+    "rad": "m", "rad/s": "m/s", "1/rad": "1/m", "N m": "N", "N m/s": "N/s", "N m/rad": "N/m", "N m s/rad": "N s/m",
+    "kg m2": "kg",
+}  # fmt: skip
+
+
+def units_where(units: str, prismatic: Sequence[bool]) -> str:
+    """Units, where every joint is prismatic those of lengths and forces in place of angles and torques."""
+    return _SLIDING.get(units, units) if prismatic and all(prismatic) else units
+
+
 def units_of(entry: Entry, prismatic: Sequence[bool]) -> str | None:
     """The units of a dataset: where every joint is prismatic, angles are lengths and torques forces."""
-    if prismatic and all(prismatic):
-        return {"rad": "m", "N m": "N"}.get(entry.units or "", entry.units)
-    return entry.units
+    return None if entry.units is None else units_where(entry.units, prismatic)

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxfinger.data import Session
 from jaxfinger.data.atomic import atomic_path
+from jaxfinger.data.schema import units_where
 from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, CatalogueEffect
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Predictions
@@ -226,6 +227,7 @@ def _unchanged(problem: Problem, nominal: Fit, forward: bool) -> list[Shrinkage]
 
 def as_gap_json(d: Diagnosis) -> dict:
     """`gap.json`, to the letter."""
+    sliding = d.problem.session.finger.prismatic
     by_effect = {
         e.ID + "".join(e.site): parameter_values(d.augmented, i)
         for i, e in enumerate(d.augmented.model.effects)
@@ -242,6 +244,7 @@ def as_gap_json(d: Diagnosis) -> dict:
                 n: {"value": float(a * s), "std": float(min(u, UNSEEN) * s), "units": units[n]}
                 for n, a, u, s in zip(units, c.evidence.amplitudes, c.evidence.std, sizes, strict=True)
             }
+        values = {n: v | {"units": units_where(v["units"], sliding)} for n, v in values.items()}
         candidates.append(
             {
                 "effect": c.key[0],
@@ -283,7 +286,7 @@ def as_gap_json(d: Diagnosis) -> dict:
             {
                 "experiment": x.experiment,
                 "channel": x.channel,
-                "units": x.units,
+                "units": units_where(x.units, sliding),
                 "noise": x.noise,
                 "before": x.before,
                 "after": x.after,

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxfinger.data.schema import units_where
 from jaxfinger.experiments import UNITS
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.problem import Problem
@@ -28,13 +29,13 @@ class Proposal:
     channel: str
     site: str
     terms: tuple[tuple[float, str], ...]  # coefficient in the channel's unit (angles rad, forces N), and formula
+    units: str
     share: float
 
     @property
     def formula(self) -> str:
         """For people: with the unit that each coefficient has where the term has none of its own."""
-        unit = UNITS[self.channel]
-        body = " ".join(f"{a:+.3g} {unit} · {text}" for a, text in self.terms)
+        body = " ".join(f"{a:+.3g} {self.units} · {text}" for a, text in self.terms)
         return f"{self.channel} {self.site} ≈ {body.lstrip('+')}"
 
 
@@ -69,7 +70,8 @@ def propose(problem: Problem, residual: np.ndarray, left: list[Explained], chose
         return None
     a = np.linalg.lstsq(Z[found].T, r, rcond=1e-10)[0]
     named = tuple((float(v), names[i]) for v, i in zip(a, found, strict=True))
-    return Proposal(channel, site(problem, channel, column), named, min(1.0, energy / most))
+    units = units_where(UNITS[channel], problem.session.finger.prismatic)
+    return Proposal(channel, site(problem, channel, column), named, units, min(1.0, energy / most))
 
 
 def _columns(problem: Problem, channel: str, column: int) -> tuple[list[str], np.ndarray]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import numpy as np
 
+from jaxfinger.data.schema import units_where
 from jaxfinger.experiments import Batch, predict
 from jaxfinger.gap import Diagnosis
 from jaxfinger.gap.where import site
@@ -149,7 +150,9 @@ def traces(d: Diagnosis):
     figure, axes = grid(3 if taut else 2, 1, 9.0, 1.6, sharex=True)
     missed, angle, *pull = (row[0] for row in axes)
     y = np.asarray(stack.batch.y[channel])[column, b]
-    factor, unit = people({"joint_torque": "N m", "tendon_excursion": "m"}.get(channel, "N"))
+    prismatic = d.problem.session.finger.prismatic
+    factor, unit = people(units_where({"joint_torque": "N m", "tendon_excursion": "m"}.get(channel, "N"), prismatic))
+    turn, angular = people(units_where("rad", prismatic))
     first = d.problem.simulator or d.nominal.model
     for model, colour, label in ((first, BEFORE, "before"), (d.augmented.model, AFTER, "after")):
         residual = np.asarray(_residuals(model, stack.batch, (channel,))[channel])[column, b]
@@ -171,8 +174,8 @@ def traces(d: Diagnosis):
     spans = f" (the signal spans {span:.3g} {unit})" if span else ""  # the free finger's external torque is zero
     missed.set(ylabel=f"missed ({unit})", title=what + spans)
     for i, name in enumerate(d.problem.nominal.finger.joint_names):
-        angle.plot(time[seen], np.degrees(np.asarray(x.q)[i, b][seen]), color=COLOURS[i % len(COLOURS)], label=name)
-    angle.set(ylabel="q (°)")
+        angle.plot(time[seen], turn * np.asarray(x.q)[i, b][seen], color=COLOURS[i % len(COLOURS)], label=name)
+    angle.set(ylabel=f"q ({angular})")
     for ax in pull:
         for k in taut:
             name = d.problem.nominal.finger.tendon_names[k]

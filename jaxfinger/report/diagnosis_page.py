@@ -12,6 +12,7 @@ from markupsafe import Markup
 from matplotlib import rc_context
 
 from jaxfinger.data.atomic import atomic_path
+from jaxfinger.data.schema import units_where
 from jaxfinger.gap import Diagnosis, as_gap_json
 from jaxfinger.gap.where import site
 from jaxfinger.report.canvas import look
@@ -50,6 +51,7 @@ def write_page(d: Diagnosis, path: str | Path, overwrite: bool = False) -> None:
 
 def _content(d: Diagnosis) -> dict:
     gap = as_gap_json(d)
+    sliding = d.problem.session.finger.prismatic
     named = {name for name, _, is_named in probabilities(gap, len(gap["candidates"])) if is_named}
     rest = gap["candidates"][ROWS:]
     together = _percent(sum(c["probability"] for c in rest))
@@ -59,7 +61,7 @@ def _content(d: Diagnosis) -> dict:
         "colour": ACCENTS[gap["verdict"]["status"]],
         "glance": _inline(glance(gap), "glance"),
         "traces": _inline(traces(d), "traces"),
-        "places": [p | {"region": _region(p["region"]), "share": _percent(p["share"])} for p in gap["where"]],
+        "places": [p | {"region": _region(p["region"], sliding), "share": _percent(p["share"])} for p in gap["where"]],
         "candidates": [
             {
                 "effect": c["effect"],
@@ -105,8 +107,8 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %" if share >= 0.01 or share <= 0 else "< 1 %"
 
 
-def _region(region: dict) -> str:
-    factor, unit = people(VARIABLES[region["variable"]])
+def _region(region: dict, prismatic: tuple[bool, ...]) -> str:
+    factor, unit = people(units_where(VARIABLES[region["variable"]], prismatic))
     return f"{region['variable']} from {factor * region['low']:.3g} to {factor * region['high']:.3g} {unit}"
 
 
@@ -150,7 +152,7 @@ def _absorbed(d: Diagnosis) -> str:
 
 def _noise(d: Diagnosis, experiment: str, channel: str, noise) -> dict:
     units = {"tendon_excursion": "m", "joint_torque": "N m"}.get(channel, "N")
-    factor, unit = people(units)
+    factor, unit = people(units_where(units, d.problem.session.finger.prismatic))
     names = [site(d.problem, channel, i) for i in range(len(noise.std))]
     std = ", ".join(
         f"{n} {factor * s:.3g}" for n, s in zip(names, noise.std, strict=True) if math.isfinite(s) and s > 0
@@ -160,7 +162,7 @@ def _noise(d: Diagnosis, experiment: str, channel: str, noise) -> dict:
 
 def summary(d: Diagnosis) -> str:
     """The diagnosis on one screen of a terminal, 100 columns."""
-    gap = as_gap_json(d)
+    gap, sliding = as_gap_json(d), d.problem.session.finger.prismatic
     counts = Counter(d.problem.session[name].experiment for name in d.problem.trial_names)
     trials = ", ".join(f"{n} {e}" for e, n in counts.items())
     out = [f"{gap['specimen']} · {gap['data']} · {trials}", "", headline(gap), gap["verdict"]["summary"], ""]
@@ -168,7 +170,7 @@ def summary(d: Diagnosis) -> str:
         out.append("WHERE      share of the gap")
         regions = {}
         for p in gap["where"]:
-            regions.setdefault((p["experiment"], p["channel"], p["site"]), _region(p["region"]))
+            regions.setdefault((p["experiment"], p["channel"], p["site"]), _region(p["region"], sliding))
         for key, share in list(shares.items())[:5]:
             out.append(f"  {_bar(share)} {100 * share:3.0f} %  {' · '.join(key)}, {regions[key]}")
         out.append("")
