@@ -14,7 +14,7 @@ from jaxfinger.experiments import UNITS
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signatures import whitened
-from jaxfinger.gap.standin import Explained, since_reversal
+from jaxfinger.gap.standin import Explained, concerned, since_reversal
 from jaxfinger.gap.where import site
 
 TERMS = 3
@@ -96,12 +96,7 @@ def terms(problem: Problem, experiment: str, channel: str, column: int) -> list[
     q, qd, f, s = (np.asarray(a) for a in (x.q, x.qd, x.tension, x.joint_direction))
     time = np.asarray(x.time)
     names, tendons = finger.joint_names, finger.tendon_names
-    if channel == "joint_torque":
-        own, taut = [column], [k for k in range(finger.n) if finger.crosses[k][column]]
-    elif channel == "tendon_excursion":
-        own, taut = [i for i in range(finger.m) if finger.crosses[column][i]], [column]
-    else:
-        own, taut = list(range(finger.m)), list(range(finger.n))
+    own, taut = concerned(finger, channel, column)
     out: list[tuple[str, np.ndarray]] = [("t", time)]
     out += [(f"exp(−t/{tau:g} s)", np.exp(-time / tau)) for tau in (1.0, 5.0)]
     for i in own:

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signatures import whitened
+from jaxfinger.model import Finger
 
 REACH = 60.0  # energy of a column that coloured noise, estimated from few repeats, can still give
 
@@ -33,12 +34,7 @@ def features(problem: Problem, experiment: str, channel: str, column: int) -> di
     finger = problem.nominal.finger
     q, qd, f = np.asarray(x.q), np.asarray(x.qd), np.asarray(x.tension)
     direction, time = np.asarray(x.joint_direction), np.asarray(x.time)
-    if channel == "joint_torque":
-        own, taut = [column], [k for k in range(finger.n) if finger.crosses[k][column]]
-    elif channel == "tendon_excursion":
-        own, taut = [i for i in range(finger.m) if finger.crosses[column][i]], [column]
-    else:
-        own, taut = list(range(finger.m)), list(range(finger.n))
+    own, taut = concerned(finger, channel, column)
     out: dict[str, list[np.ndarray]] = {
         "q": [],
         "qd": [],
@@ -73,6 +69,15 @@ def features(problem: Problem, experiment: str, channel: str, column: int) -> di
     out["time"] += [(time / span) ** p for p in (1, 2)] + [np.exp(-time / s) for s in (1.0, 5.0)]
     out["time"] += [np.asarray(x.session_time) / max(float(np.asarray(x.session_time).max()), 1e-9)]
     return out
+
+
+def concerned(finger: Finger, channel: str, column: int) -> tuple[list[int], list[int]]:
+    """Joints and tendons that bear on a column: a joint and what crosses it, a tendon and what it crosses, or all."""
+    if channel == "joint_torque":
+        return [column], [k for k in range(finger.n) if finger.crosses[k][column]]
+    if channel == "tendon_excursion":
+        return [i for i in range(finger.m) if finger.crosses[column][i]], [column]
+    return list(range(finger.m)), list(range(finger.n))
 
 
 def energy_left(left: list[Explained]) -> float:
