@@ -14,18 +14,11 @@ import scipy.optimize
 from jaxfinger.identify import compress, fit_many, identify, refit
 from jaxfinger.identify.parameters import ravel
 from jaxfinger.identify.uncertainty import draw_weights
-from jaxfinger.synthetic import clean_session, measure, recipe_from
+from jaxfinger.synthetic import SHORT, clean_session, measure, recipe_from
 
 RECIPE = {
     "specimen": {"kind": "polynomial"},
-    "trials": {
-        "experiments": ["ID.2", "ID.3-static", "ID.3-dynamic", "ID.4"],
-        "rate": 200.0,
-        "id2": {"strokes": 2, "stroke_time": 3.0},
-        "id3_static": {"step": 20.0},
-        "id3_dynamic": {"cycles": 1, "speeds": [1.0, 2.0]},
-        "id4": {"tensions": [4.0, 7.0, 10.0]},
-    },
+    "trials": SHORT,
 }
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from jaxfinger.identify import identify, refine
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.synthetic import (
+    SHORT,
     SpecimenPlant,
     clean_session,
     measure,
@@ -23,15 +24,6 @@ from jaxfinger.synthetic import (
     random_finger,
     recipe_from,
 )
-
-SHORT = {
-    "experiments": ["ID.2", "ID.3-static", "ID.3-dynamic", "ID.4"],
-    "rate": 200.0,
-    "id2": {"strokes": 2, "stroke_time": 3.0},
-    "id3_static": {"step": 20.0},
-    "id3_dynamic": {"cycles": 1, "speeds": [1.0, 2.0]},
-    "id4": {"tensions": [4.0, 7.0, 10.0]},
-}
 
 
 def study(sessions: int, joints: int = 1, joint: bool = False):

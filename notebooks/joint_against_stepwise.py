@@ -17,6 +17,7 @@ import numpy as np
 from jaxfinger.identify import identify, refine
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.synthetic import (
+    SHORT,
     SpecimenPlant,
     clean_session,
     measure,
@@ -30,14 +31,7 @@ specimen = polynomial_finger(random_finger(0, 1, "planar", "antagonists"))
 recipe = recipe_from(
     {
         "cad": {"mass": 0.05, "com": 2e-3},  # a finger that was measured badly
-        "trials": {
-            "experiments": ["ID.2", "ID.3-static", "ID.3-dynamic", "ID.4"],
-            "rate": 200.0,
-            "id2": {"strokes": 2, "stroke_time": 3.0},
-            "id3_static": {"step": 20.0},
-            "id3_dynamic": {"cycles": 1, "speeds": [1.0, 2.0]},
-            "id4": {"tensions": [4.0, 7.0, 10.0]},
-        },
+        "trials": SHORT,
     }
 )
 clean = clean_session(recipe, SpecimenPlant(specimen), specimen.description)

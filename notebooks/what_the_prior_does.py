@@ -18,21 +18,18 @@ import numpy as np
 
 from jaxfinger.identify import identify, refine
 from jaxfinger.identify.parameters import describe
-from jaxfinger.synthetic import SpecimenPlant, clean_session, measure, polynomial_finger, random_finger, recipe_from
+from jaxfinger.synthetic import (
+    SHORT,
+    SpecimenPlant,
+    clean_session,
+    measure,
+    polynomial_finger,
+    random_finger,
+    recipe_from,
+)
 
 specimen = polynomial_finger(random_finger(0, 1, "planar", "antagonists"))
-recipe = recipe_from(
-    {
-        "trials": {
-            "experiments": ["ID.2", "ID.3-static", "ID.3-dynamic", "ID.4"],
-            "rate": 200.0,
-            "id2": {"strokes": 2, "stroke_time": 3.0},
-            "id3_static": {"step": 20.0},
-            "id3_dynamic": {"cycles": 1, "speeds": [1.0, 2.0]},
-            "id4": {"tensions": [4.0, 7.0, 10.0]},
-        }
-    }
-)
+recipe = recipe_from({"trials": SHORT})
 clean = clean_session(recipe, SpecimenPlant(specimen), specimen.description)
 session = measure(clean, 0)
 

@@ -15,6 +15,7 @@ from jaxfinger.data.motion import directions as directions
 from jaxfinger.data.motion import find_holds as find_holds
 from jaxfinger.data.motion import joint_directions as joint_directions
 from jaxfinger.data.motion import tendon_directions as tendon_directions
+from jaxfinger.data.predictions import Predictions as Predictions
 from jaxfinger.data.predictions import read_predictions as read_predictions
 from jaxfinger.data.predictions import write_predictions as write_predictions
 from jaxfinger.data.session import EXPERIMENTS as EXPERIMENTS

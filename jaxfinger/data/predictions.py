@@ -17,7 +17,7 @@ from jaxfinger.data.schema import CHANNELS, TIME
 from jaxfinger.data.session import Session
 from jaxfinger.errors import UserError
 
-Predictions = Mapping[str, Mapping[str, np.ndarray]]
+Predictions = Mapping[str, Mapping[str, np.ndarray]]  # {trial: {channel: (N, columns)}}, SI units
 
 
 def write_predictions(

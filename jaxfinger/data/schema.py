@@ -88,6 +88,11 @@ def units_where(units: str, prismatic: Sequence[bool]) -> str:
     return _SLIDING.get(units, units) if prismatic and all(prismatic) else units
 
 
+def channel_units(channel: str, prismatic: Sequence[bool]) -> str:
+    """The units of a channel of a trial."""
+    return units_where(CHANNELS[channel].units or "1", prismatic)
+
+
 def units_of(entry: Entry, prismatic: Sequence[bool]) -> str | None:
     """The units of a dataset: where every joint is prismatic, angles are lengths and torques forces."""
     return None if entry.units is None else units_where(entry.units, prismatic)

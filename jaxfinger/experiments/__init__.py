@@ -1,7 +1,7 @@
 """The only place that joins data to model: which trials an experiment takes, and what it predicts from what."""
 
 from jaxfinger.experiments.predict import demean, predict
-from jaxfinger.experiments.prepare import Batch, Predictions, Stack, prepare
-from jaxfinger.experiments.table import EXPERIMENTS, UNITS, Experiment
+from jaxfinger.experiments.prepare import Batch, Stack, prepare
+from jaxfinger.experiments.table import EXPERIMENTS, Experiment
 
-__all__ = ["EXPERIMENTS", "UNITS", "Batch", "Experiment", "Predictions", "Stack", "demean", "predict", "prepare"]
+__all__ = ["EXPERIMENTS", "Batch", "Experiment", "Stack", "demean", "predict", "prepare"]

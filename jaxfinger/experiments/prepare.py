@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
-from jaxfinger.data import Session, Trial, find_holds, outlier_mask, shrink, smooth
+from jaxfinger.data import Predictions, Session, Trial, find_holds, outlier_mask, shrink, smooth
 from jaxfinger.errors import UserError
 from jaxfinger.experiments.table import (
     CLEAR,
@@ -41,9 +41,6 @@ class Stack:
     trials: tuple[str, ...]
     motions: tuple[str | None, ...]  # trials with the same motion repeat one another
     dt: float  # s
-
-
-Predictions = Mapping[str, Mapping[str, np.ndarray]]  # {trial: {channel: (N, columns)}}, as in a predictions file
 
 
 def prepare(

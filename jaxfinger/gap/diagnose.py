@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxfinger.data import Session
+from jaxfinger.data import Predictions, Session
 from jaxfinger.data.atomic import atomic_path
 from jaxfinger.data.schema import units_where
 from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, CatalogueEffect
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import Predictions
 from jaxfinger.gap.augment import augmented_fit, nominal_fit, parameter_values
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.next_experiment import NextExperiment, next_experiment
@@ -286,7 +285,7 @@ def as_gap_json(d: Diagnosis) -> dict:
             {
                 "experiment": x.experiment,
                 "channel": x.channel,
-                "units": units_where(x.units, sliding),
+                "units": x.units,
                 "noise": x.noise,
                 "before": x.before,
                 "after": x.after,

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.data import Session
-from jaxfinger.experiments import Predictions, Stack, prepare
+from jaxfinger.data import Predictions, Session
+from jaxfinger.experiments import Stack, prepare
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.linearise import linearise
@@ -111,11 +111,13 @@ def build(
 
     With `predictions` another simulator takes the nominal model's place (see `simulator`).
     """
-    stacks, simulator = prepare(session), None
+    progress("reading the recordings")
+    measured = stacks = prepare(session)
+    simulator = None
     if predictions is not None:
         progress("imitating the simulator")
         simulator, recipe, stacks = emulate(session, recipe, stacks, predictions)
-    fit = identify(session, recipe, progress=progress)
+    fit = identify(session, recipe, progress=progress, stacks=measured)
     parameters = describe(fit.model)
     progress("refitting the nominal model to all trials")
     cad = [i for i, p in enumerate(parameters) if p.group in ("mass", "com") and fit.covariance[i, i] > 0]

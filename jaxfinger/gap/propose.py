@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxfinger.data.schema import units_where
-from jaxfinger.experiments import UNITS
+from jaxfinger.data.schema import channel_units
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signatures import whitened
@@ -70,7 +69,7 @@ def propose(problem: Problem, residual: np.ndarray, left: list[Explained], chose
         return None
     a = np.linalg.lstsq(Z[found].T, r, rcond=1e-10)[0]
     named = tuple((float(v), names[i]) for v, i in zip(a, found, strict=True))
-    units = units_where(UNITS[channel], problem.session.finger.prismatic)
+    units = channel_units(channel, problem.session.finger.prismatic)
     return Proposal(channel, site(problem, channel, column), named, units, min(1.0, energy / most))
 
 

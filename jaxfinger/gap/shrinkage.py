@@ -10,7 +10,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfinger.experiments import UNITS, Batch, predict, prepare
+from jaxfinger.data.schema import channel_units
+from jaxfinger.experiments import Batch, predict, prepare
 from jaxfinger.gap.evidence import Evidence
 from jaxfinger.gap.problem import Problem
 from jaxfinger.identify import Fit
@@ -105,9 +106,10 @@ def shrinkage(
                             float(count),
                         )
                     )
+    prismatic = problem.session.finger.prismatic
     if forward and "VD.3" in problem.stacks:
         energies["VD.3", "q"] = _forward(problem, fold["VD.3"], models)
-    return [_line(e, c, np.array(values)) for (e, c), values in energies.items()]
+    return [_line(e, c, channel_units(c, prismatic), np.array(values)) for (e, c), values in energies.items()]
 
 
 def _forward(problem: Problem, fold: np.ndarray, models: list[tuple[Model, Model]]):
@@ -176,7 +178,7 @@ def _mean_square(residual, mask, b, channel) -> float:
     return float((x**2).sum() / m.sum())
 
 
-def _line(e: str, c: str, values: np.ndarray) -> Shrinkage:
+def _line(e: str, c: str, units: str, values: np.ndarray) -> Shrinkage:
     """rms over the held-out trials, and the interval of `closed` from a bootstrap over trials."""
     rng = np.random.default_rng(0)
     weight = values[:, 3]
@@ -195,7 +197,7 @@ def _line(e: str, c: str, values: np.ndarray) -> Shrinkage:
     return Shrinkage(
         e,
         c,
-        UNITS[c],
+        units,
         noise**0.5,
         before**0.5,
         after**0.5,

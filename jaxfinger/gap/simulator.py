@@ -14,9 +14,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfinger.data import Session
+from jaxfinger.data import Predictions, Session
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import Predictions, Stack, predict, prepare
+from jaxfinger.experiments import Stack, predict, prepare
 from jaxfinger.identify import Recipe
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.solve import Prior, solve

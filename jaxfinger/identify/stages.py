@@ -113,17 +113,19 @@ def identify(
     stages: tuple[str, ...] | None = None,
     start: Fit | None = None,
     progress: Progress = lambda message: None,
+    stacks: dict[str, Stack] | None = None,
 ) -> Fit:
     """Run the staged fits on a session; a stage whose data are missing is skipped and named.
 
-    `stages` limits the run to some of them; `start` gives the parameters of earlier ones.
+    `stages` limits the run to some of them; `start` gives the parameters of earlier ones; `stacks` are the session's
+    trials where they are prepared already.
     """
     recipe = recipe or (start.recipe if start else Recipe())
     wanted = stages or recipe.fit.stages
-    experiments = {e for s in wanted for e in STAGES[s].reads}
-    names = [t.name for t in session if t.experiment in experiments]
-    progress("reading the recordings")
-    stacks = prepare(session, names)
+    if stacks is None:
+        progress("reading the recordings")
+        experiments = {e for s in wanted for e in STAGES[s].reads}
+        stacks = prepare(session, [t.name for t in session if t.experiment in experiments])
     fit = start or Fit.before(session, recipe, nominal_model(session, recipe))
     if start is None:
         fit = replace(fit, covariance=cad_covariance(session, describe(fit.model)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import numpy as np
 
-from jaxfinger.data.schema import units_where
+from jaxfinger.data.schema import channel_units, units_where
 from jaxfinger.experiments import Batch, predict
 from jaxfinger.gap import Diagnosis
 from jaxfinger.gap.where import site
@@ -151,7 +151,7 @@ def traces(d: Diagnosis):
     missed, angle, *pull = (row[0] for row in axes)
     y = np.asarray(stack.batch.y[channel])[column, b]
     prismatic = d.problem.session.finger.prismatic
-    factor, unit = people(units_where({"joint_torque": "N m", "tendon_excursion": "m"}.get(channel, "N"), prismatic))
+    factor, unit = people(channel_units(channel, prismatic))
     turn, angular = people(units_where("rad", prismatic))
     first = d.problem.simulator or d.nominal.model
     for model, colour, label in ((first, BEFORE, "before"), (d.augmented.model, AFTER, "after")):

@@ -12,7 +12,7 @@ from markupsafe import Markup
 from matplotlib import rc_context
 
 from jaxfinger.data.atomic import atomic_path
-from jaxfinger.data.schema import units_where
+from jaxfinger.data.schema import channel_units, units_where
 from jaxfinger.gap import Diagnosis, as_gap_json
 from jaxfinger.gap.where import site
 from jaxfinger.report.canvas import look
@@ -151,8 +151,7 @@ def _absorbed(d: Diagnosis) -> str:
 
 
 def _noise(d: Diagnosis, experiment: str, channel: str, noise) -> dict:
-    units = {"tendon_excursion": "m", "joint_torque": "N m"}.get(channel, "N")
-    factor, unit = people(units_where(units, d.problem.session.finger.prismatic))
+    factor, unit = people(channel_units(channel, d.problem.session.finger.prismatic))
     names = [site(d.problem, channel, i) for i in range(len(noise.std))]
     std = ", ".join(
         f"{n} {factor * s:.3g}" for n, s in zip(names, noise.std, strict=True) if math.isfinite(s) and s > 0

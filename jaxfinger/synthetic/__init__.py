@@ -10,6 +10,7 @@ from jaxfinger.synthetic.plant import SpecimenPlant as SpecimenPlant
 from jaxfinger.synthetic.protocols import TrialPlan as TrialPlan
 from jaxfinger.synthetic.protocols import session_plan as session_plan
 from jaxfinger.synthetic.random_finger import random_finger as random_finger
+from jaxfinger.synthetic.recipe import SHORT as SHORT
 from jaxfinger.synthetic.recipe import Recipe as Recipe
 from jaxfinger.synthetic.recipe import read_recipe as read_recipe
 from jaxfinger.synthetic.recipe import recipe_from as recipe_from

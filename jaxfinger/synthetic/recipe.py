@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -13,6 +13,16 @@ import numpy as np
 
 from jaxfinger.data import EXPERIMENTS
 from jaxfinger.errors import UserError
+
+# A quick session of one joint or a few, for studies over many of them.
+SHORT: Mapping[str, Any] = {
+    "experiments": ["ID.2", "ID.3-static", "ID.3-dynamic", "ID.4"],
+    "rate": 200.0,
+    "id2": {"strokes": 2, "stroke_time": 3.0},
+    "id3_static": {"step": 20.0},
+    "id3_dynamic": {"cycles": 1, "speeds": [1.0, 2.0]},
+    "id4": {"tensions": [4.0, 7.0, 10.0]},
+}
 
 Postures = tuple[tuple[float, ...], ...]  # degrees, one angle a joint; empty: taken from the finger's limits
 

@@ -3,9 +3,17 @@
 import numpy as np
 import pytest
 
-from jaxfinger.identify import identify, refine
+from jaxfinger.identify import Fit, Recipe, identify, refine
 from jaxfinger.identify.parameters import ravel
-from jaxfinger.synthetic import clean_session, measure, nominal_model, paper_finger, polynomial_finger, recipe_from
+from jaxfinger.synthetic import (
+    clean_session,
+    measure,
+    nominal_model,
+    paper_finger,
+    polynomial_finger,
+    recipe_from,
+    simulate,
+)
 
 RECIPE = {
     "specimen": {"kind": "polynomial"},
@@ -20,6 +28,23 @@ RECIPE = {
     },
     "sensors": {"clock_jitter": 0.0},
 }
+# Every experiment, a quarter of a minute each.
+SHORT_RECIPE = recipe_from(
+    {
+        "specimen": {"kind": "polynomial"},
+        "trials": {
+            "rate": 100.0,
+            "id2": {"postures": [[25, 35, 40]], "stroke_time": 2.0, "strokes": 1, "repeats": 1},
+            "id3_static": {"postures": [[25, 30, 45]], "step": 20.0, "move": 0.4, "dwell": 0.5, "repeats": 1},
+            "id3_dynamic": {"postures": [[25, 30, 45]], "speeds": [1.0], "cycles": 1, "repeats": 1},
+            "id4": {"postures": [[50, 30, 30]], "tensions": [4.0, 8.0], "move": 0.3, "dwell": 0.5, "repeats": 1},
+            "vd1": {"motions": 1, "duration": 6.0},
+            "vd2": {"postures": [[10, 40, 35]], "tensions": [4.0, 7.0, 10.0, 13.0], "dwell": 0.5, "repeats": 1},
+            "vd3": {"motions": 1, "duration": 2.0, "rate": 500.0},
+        },
+        "sensors": {"clock_jitter": 0.0},
+    }
+)
 
 
 @pytest.fixture(scope="session")
@@ -46,3 +71,15 @@ def staged(session):
 @pytest.fixture(scope="session")
 def joint(session, staged):
     return refine(session, staged)
+
+
+@pytest.fixture(scope="session")
+def short():
+    """A session of every experiment whose truth the nominal model can express."""
+    return simulate(SHORT_RECIPE, seed=5)
+
+
+@pytest.fixture(scope="session")
+def short_truth(short):
+    """The parameters that made it, as a fit."""
+    return Fit.before(short, Recipe(), nominal_model(polynomial_finger(paper_finger())))

@@ -10,8 +10,6 @@ from jaxfinger.errors import UserError
 from jaxfinger.identify.predictions import predict_session
 from jaxfinger.synthetic import recipe_from
 
-from .short import short_session, truth_of_short_session
-
 NOISE = recipe_from({}).sensors
 CHANNELS = {
     "ID.2": {"tendon_excursion"},
@@ -25,25 +23,15 @@ CHANNELS = {
 
 
 @pytest.fixture(scope="module")
-def session():
-    return short_session()
+def predicted(short_truth, short):
+    return predict_session(short_truth, short)
 
 
-@pytest.fixture(scope="module")
-def true():
-    return truth_of_short_session()
-
-
-@pytest.fixture(scope="module")
-def predicted(true, session):
-    return predict_session(true, session)
-
-
-def test_every_trial_has_the_channels_and_shapes_of_the_format(predicted, session, tmp_path):
-    assert list(predicted) == list(session.trials)
-    for trial in session:
+def test_every_trial_has_the_channels_and_shapes_of_the_format(predicted, short, tmp_path):
+    assert list(predicted) == list(short.trials)
+    for trial in short:
         assert predicted[trial.name].keys() == CHANNELS[trial.experiment]
-    write_predictions(tmp_path / "p.h5", session, predicted)  # refuses any other shape
+    write_predictions(tmp_path / "p.h5", short, predicted)  # refuses any other shape
     read = read_predictions(tmp_path / "p.h5")
     for name, channels in predicted.items():
         for channel, values in channels.items():
@@ -51,8 +39,8 @@ def test_every_trial_has_the_channels_and_shapes_of_the_format(predicted, sessio
 
 
 @pytest.mark.parametrize("experiment", [e for e in CHANNELS if e != "VD.3"])
-def test_the_truth_predicts_to_the_noise(predicted, session, experiment):
-    for trial in session.select(experiment):
+def test_the_truth_predicts_to_the_noise(predicted, short, experiment):
+    for trial in short.select(experiment):
         for channel in CHANNELS[experiment]:
             measured = getattr(trial, channel)
             error = measured - predicted[trial.name][channel]
@@ -66,16 +54,16 @@ def test_the_truth_predicts_to_the_noise(predicted, session, experiment):
             assert share > (0.9 if experiment == "ID.3-dynamic" else 0.97), (trial.name, channel)
 
 
-def test_tension_at_a_hold_does_not_creep_up_with_the_noise(predicted, session):
-    for trial in session.select("ID.4"):
+def test_tension_at_a_hold_does_not_creep_up_with_the_noise(predicted, short):
+    for trial in short.select("ID.4"):
         error = (trial.joint_torque - predicted[trial.name]["joint_torque"])[trial.hold >= 0]
         error = error[np.isfinite(error)]
         assert abs(error.mean()) < 1e-4  # N m: a hundredth of the torque, a third of the noise of one sample
 
 
-def test_what_the_rig_does_not_measure_stays_nan(predicted, session):
-    finger = session.finger
-    for trial in session:
+def test_what_the_rig_does_not_measure_stays_nan(predicted, short):
+    finger = short.finger
+    for trial in short:
         torque = predicted[trial.name].get("joint_torque")
         if torque is not None and trial.experiment != "VD.3":
             others = [i for i, name in enumerate(finger.joint_names) if name != trial.joint]
@@ -86,41 +74,41 @@ def test_what_the_rig_does_not_measure_stays_nan(predicted, session):
             assert np.isfinite(excursion[:, finger.active]).all()
 
 
-def test_a_torque_that_was_not_recorded_is_predicted_at_the_trial_s_joint(true, session, predicted):
-    trial = next(iter(session.select("ID.4")))
-    blind = replace(session, trials={trial.name: replace(trial, joint_torque=None)})
+def test_a_torque_that_was_not_recorded_is_predicted_at_the_trial_s_joint(short_truth, short, predicted):
+    trial = next(iter(short.select("ID.4")))
+    blind = replace(short, trials={trial.name: replace(trial, joint_torque=None)})
     np.testing.assert_array_equal(
-        predict_session(true, blind)[trial.name]["joint_torque"], predicted[trial.name]["joint_torque"]
+        predict_session(short_truth, blind)[trial.name]["joint_torque"], predicted[trial.name]["joint_torque"]
     )
 
 
-def test_simulation_starts_at_the_first_sample_and_stays_near(predicted, session):
-    for trial in session.select("VD.3"):
+def test_simulation_starts_at_the_first_sample_and_stays_near(predicted, short):
+    for trial in short.select("VD.3"):
         error = np.abs(trial.q - predicted[trial.name]["q"])
         assert error[0].max() < 2e-3
         assert np.degrees(error.max()) < 6.0
 
 
-def test_gravity_is_the_session_s(true, session):
-    trial = next(iter(session.select("ID.3-static", joint="MCP")))
-    turned = replace(session.finger, gravity=-session.finger.gravity)
+def test_gravity_is_the_session_s(short_truth, short):
+    trial = next(iter(short.select("ID.3-static", joint="MCP")))
+    turned = replace(short.finger, gravity=-short.finger.gravity)
     up, down = (
-        predict_session(true, replace(session, finger=f, trials={trial.name: trial}))[trial.name]
-        for f in (session.finger, turned)
+        predict_session(short_truth, replace(short, finger=f, trials={trial.name: trial}))[trial.name]
+        for f in (short.finger, turned)
     )
     difference = (up["joint_torque"] - down["joint_torque"])[:, 0]
     assert 2e-3 < np.abs(difference).max() < 5e-2
 
 
-def test_a_trial_of_one_sample_is_left_out(true, session):
-    trial = next(iter(session.select("ID.2")))
+def test_a_trial_of_one_sample_is_left_out(short_truth, short):
+    trial = next(iter(short.select("ID.2")))
     cut = replace(trial, time=trial.time[:1], q=trial.q[:1], tendon_force=None, tendon_excursion=None)
-    other = next(iter(session.select("VD.1")))
-    cut_session = replace(session, trials={cut.name: cut, other.name: other})
-    assert list(predict_session(true, cut_session)) == [other.name]
+    other = next(iter(short.select("VD.1")))
+    cut_session = replace(short, trials={cut.name: cut, other.name: other})
+    assert list(predict_session(short_truth, cut_session)) == [other.name]
 
 
-def test_another_finger_is_refused(true, session):
-    finger = replace(session.finger, joint_names=("MCP", "PIP", "thumb"))
+def test_another_finger_is_refused(short_truth, short):
+    finger = replace(short.finger, joint_names=("MCP", "PIP", "thumb"))
     with pytest.raises(UserError, match="has MCP, PIP, thumb where the fit has MCP, PIP, DIP"):
-        predict_session(true, replace(session, finger=finger))
+        predict_session(short_truth, replace(short, finger=finger))

@@ -11,30 +11,18 @@ from jaxfinger.errors import UserError
 from jaxfinger.identify.validate import excursion_path, validate
 from jaxfinger.model import Model
 
-from .short import short_session, truth_of_short_session
-
 
 @pytest.fixture(scope="module")
-def session():
-    return short_session()
-
-
-@pytest.fixture(scope="module")
-def true():
-    return truth_of_short_session()
-
-
-@pytest.fixture(scope="module")
-def scored(true, session):
-    return validate(true, session)
+def scored(short_truth, short):
+    return validate(short_truth, short)
 
 
 def pick(result, experiment, channel, method=""):
     return [s for s in result.scores if (s.experiment, s.channel) == (experiment, channel) and method in s.method]
 
 
-def test_every_validation_experiment_and_channel_is_scored(scored, session):
-    finger = session.finger
+def test_every_validation_experiment_and_channel_is_scored(scored, short):
+    finger = short.finger
     active = [t for t, a in zip(finger.tendon_names, finger.active, strict=True) if a]
     assert [s.column for s in pick(scored, "VD.1", "tendon_excursion", "f(q)")] == active
     assert [s.column for s in pick(scored, "VD.1", "tendon_excursion", "∫")] == active
@@ -55,58 +43,58 @@ def test_units_are_those_that_people_read(scored):
     assert units == {"tendon_excursion": "mm", "fingertip_force": "N", "joint_torque": "N mm", "q": "degrees"}
 
 
-def test_the_integral_drifts_and_the_difference_does_not(true, session):
-    trial = next(iter(session.select("VD.1")))
-    path, active = excursion_path(true.model, trial), session.finger.active
+def test_the_integral_drifts_and_the_difference_does_not(short_truth, short):
+    trial = next(iter(short.select("VD.1")))
+    path, active = excursion_path(short_truth.model, trial), short.finger.active
     drift, direct = (np.abs(p[:, active] - path.measured[:, active]).max() for p in (path.integral, path.direct))
     assert direct < 1e-4 < drift
 
 
-def test_the_integral_of_a_slow_motion_is_the_difference(true, session):
+def test_the_integral_of_a_slow_motion_is_the_difference(short_truth, short):
     """∫ C q̇ dt = f(q) − f(q₀) where filter and sampling cost nothing."""
-    trial = next(iter(session.select("VD.1")))
+    trial = next(iter(short.select("VD.1")))
     time = np.linspace(0.0, 20.0, 20001)
     sweep = 0.5 - 0.4 * np.cos(0.3 * time)
     slow = replace(trial, time=time, q=np.stack([sweep, 0.5 * sweep, 0.3 * sweep], axis=1), tendon_excursion=None)
-    path = excursion_path(true.model, slow)
+    path = excursion_path(short_truth.model, slow)
     np.testing.assert_allclose(path.integral, path.direct, atol=1e-4)
 
 
-def test_a_wrong_moment_arm_is_found_in_size_and_place(true, scored, session):
+def test_a_wrong_moment_arm_is_found_in_size_and_place(short_truth, scored, short):
     k = 2  # T3 crosses the MCP alone
-    arms = true.model.moment_arm.coefficients
-    wrong: Model = eqx.tree_at(lambda m: m.moment_arm.coefficients, true.model, arms.at[k].multiply(1.05))
-    result = validate(replace(true, model=wrong), session, ("VD.1",))
+    arms = short_truth.model.moment_arm.coefficients
+    wrong: Model = eqx.tree_at(lambda m: m.moment_arm.coefficients, short_truth.model, arms.at[k].multiply(1.05))
+    result = validate(replace(short_truth, model=wrong), short, ("VD.1",))
     before, after = ({s.column: s.rms for s in pick(r, "VD.1", "tendon_excursion", "f(q)")} for r in (scored, result))
     assert after["T1"] == pytest.approx(before["T1"])
-    trial = next(iter(session.select("VD.1")))
-    spread = 1e3 * 0.05 * np.std(excursion_path(true.model, trial).direct[:, k])
+    trial = next(iter(short.select("VD.1")))
+    spread = 1e3 * 0.05 * np.std(excursion_path(short_truth.model, trial).direct[:, k])
     assert after["T3"] == pytest.approx(np.hypot(spread, before["T3"]), rel=0.1)
 
 
-def test_slope_of_the_force_and_its_error_from_the_fit(true, session):
+def test_slope_of_the_force_and_its_error_from_the_fit(short_truth, short):
     """δ(slope) from the covariance equals the change of the slope under a change of the parameter."""
     from jaxfinger.identify.parameters import describe
 
-    i = [p.name for p in describe(true.model)].index("tendon friction T2 a1")
+    i = [p.name for p in describe(short_truth.model)].index("tendon friction T2 a1")
     std = 0.01
-    covariance = np.zeros_like(true.covariance)
+    covariance = np.zeros_like(short_truth.covariance)
     covariance[i, i] = std**2
-    trial = next(iter(session.select("VD.2")))
-    fit, session = replace(true, covariance=covariance), session.with_trials([trial.name])
-    slope = next(s for s in validate(fit, session, ("VD.2",)).slopes if s.axis == "x")
+    trial = next(iter(short.select("VD.2")))
+    fit, short = replace(short_truth, covariance=covariance), short.with_trials([trial.name])
+    slope = next(s for s in validate(fit, short, ("VD.2",)).slopes if s.axis == "x")
     assert trial.tendon == slope.tendon == "T2"
     assert slope.measured == pytest.approx(slope.predicted, abs=4 * slope.measured_std)
-    friction = true.model.tendon_friction.proportional
+    friction = short_truth.model.tendon_friction.proportional
     moved = eqx.tree_at(
-        lambda m: m.tendon_friction.proportional, true.model, friction + std * jnp.eye(len(friction))[1]
+        lambda m: m.tendon_friction.proportional, short_truth.model, friction + std * jnp.eye(len(friction))[1]
     )
-    other = next(s for s in validate(replace(fit, model=moved), session, ("VD.2",)).slopes if s.axis == "x")
+    other = next(s for s in validate(replace(fit, model=moved), short, ("VD.2",)).slopes if s.axis == "x")
     assert slope.predicted_std == pytest.approx(abs(other.predicted - slope.predicted), rel=0.05)
 
 
-def test_what_is_missing_is_said(true, session):
-    result = validate(true, session.select("VD.1"))
+def test_what_is_missing_is_said(short_truth, short):
+    result = validate(short_truth, short.select("VD.1"))
     assert result.messages == ("the session has no VD.2 trial", "the session has no VD.3 trial")
     with pytest.raises(UserError, match=r"has no trial of VD\.1, VD\.2, VD\.3 to validate with, it has ID\.4"):
-        validate(true, session.select("ID.4"))
+        validate(short_truth, short.select("ID.4"))
