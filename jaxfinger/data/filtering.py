@@ -15,9 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.interpolate import make_interp_spline
 from scipy.ndimage import gaussian_filter1d, median_filter, uniform_filter1d
-from scipy.signal import wiener
 
 from jaxfinger.errors import UserError
 
@@ -35,6 +33,8 @@ def smooth(
     Raises:
         UserError: the cut-off is not between zero and half the sampling rate.
     """
+    from scipy.interpolate import make_interp_spline  # here, since it takes a recorder half a second to import
+
     time, x = np.asarray(time, np.float64), np.asarray(x, np.float64)
     count = len(time)
     if count < 3:
@@ -93,6 +93,8 @@ def shrink(x: Float[np.ndarray, "N k"], window: int) -> Float[np.ndarray, "N k"]
     most of the trial. As a regressor x̂ is rid of most of the bias of its coefficient towards zero (regression
     calibration; Carroll et al., Measurement Error in Nonlinear Models, 2nd ed., ch. 4).
     """
+    from scipy.signal import wiener  # as in `smooth`
+
     out = np.array(x, np.float64)
     window = 2 * (max(window, 2) // 2) + 1
     for column in out.T:
