@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from jaxfinger.errors import UserError
 
+Output = Annotated[Path, Parameter(name=["--output", "-o"])]
+
 
 def record(
-    plan: Path, *, rig: Path, output: Path, dry_run: bool = False, resume: bool = False, yes: bool = False
+    plan: Path, *, rig: Path, output: Output, dry_run: bool = False, resume: bool = False, yes: bool = False
 ) -> None:
     """Run the experiments of a plan on the rig and leave a session that `identify` takes as it is.
 
@@ -49,7 +54,7 @@ def record(
     print(f"{output}: {len(outcome.complete)} trials, all complete")
 
 
-def recover(log: Path, *, output: Path, overwrite: bool = False) -> None:
+def recover(log: Path, *, output: Output, overwrite: bool = False) -> None:
     """Turn the log of a recording that was killed into a session.
 
     Parameters

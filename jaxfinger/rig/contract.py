@@ -83,6 +83,7 @@ BENCH = np.dtype(
         ("fault", "<u4"),
         ("fault_slot", "<i4"),
         ("fault_seq", "<u8"),
+        ("amount", "<f8"),  # what a spike adds to its slot
         ("mode", "<i4", TARGETS),
         ("pose", "<f8", TARGETS),
     ]

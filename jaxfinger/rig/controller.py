@@ -62,10 +62,11 @@ class Controller:
         self.limits = limits or HardLimits()
         self.sensors = sensors or Sensors()
         self.slots = Slots(self.plant.n, self.plant.m)
+        self._stops = self.plant.truth.finger.limits.tolist()
         self.ring = ring
         self.place = contract.layout(ring)
         self.memory = bytearray(sum(self.place["stBench"]))
-        self.faults: dict[str, tuple[int, int]] = {}  # kind: (slot, first seq)
+        self.faults: dict[str, tuple[int, int, float]] = {}  # kind: (slot, first seq, amount)
         self.filtered = filtered
         self.cut = False  # the server is asked to drop its connections
         self.rng = np.random.default_rng(seed)
@@ -118,7 +119,7 @@ class Controller:
     def cycle(self) -> None:
         """Read the command, advance ramps and finger by 1 ms, measure, check, write the sample."""
         self._bench()
-        fault = {kind: slot for kind, (slot, first) in self.faults.items() if self.seq >= first}
+        fault = {kind: (slot, amount) for kind, (slot, first, amount) in self.faults.items() if self.seq >= first}
         if "restart" in fault:
             self.faults.clear()
             self.start()
@@ -274,7 +275,7 @@ class Controller:
         return True
 
     # measuring --------------------------------------------------------------------------------------------------
-    def _measure(self, fault: dict[str, int]) -> int:
+    def _measure(self, fault: dict[str, tuple[int, float]]) -> int:
         plant, s, slots = self.plant, self.sensors, self.slots
         noise = self._noise[self.seq % 4096].tolist()
         fresh = self._values[:]
@@ -288,13 +289,13 @@ class Controller:
         for axis, slot in enumerate(slots.force):
             fresh[slot] = plant.tip_force[axis] + s.force_offset[axis] + s.force_noise * noise[slot]
         flags = 0
-        for kind, slot in fault.items():
+        for kind, (slot, amount) in fault.items():
             if kind == "nan":
                 fresh[slot] = math.nan
             elif kind == "freeze":
                 fresh[slot] = self._values[slot]
             elif kind == "spike":
-                fresh[slot] += 60.0
+                fresh[slot] += amount
             elif kind == "flag":
                 flags |= Flag.ANALOG
         self._before, self._values = self._values, fresh
@@ -320,6 +321,11 @@ class Controller:
             (Trip.SLACK, i, values[i])
             for i, wanted in zip(slots.tension, self.setpoint, strict=True)
             if wanted > 1.5 and values[i] < 0.2
+        ]
+        found += [
+            (Trip.POSITION, slot, values[slot])
+            for slot, (low, high) in zip(slots.angle, self._stops, strict=True)
+            if not low <= values[slot] <= high
         ]
         found += [
             (Trip.VELOCITY, slot, velocity)
@@ -360,7 +366,8 @@ class Controller:
         order = np.frombuffer(self.memory[offset : offset + size], contract.BENCH)[0]
         self.bench = number
         if kind := int(order["fault"]):
-            self.faults[contract.FAULTS[kind]] = (int(order["fault_slot"]), int(order["fault_seq"]))
+            where = int(order["fault_slot"]), int(order["fault_seq"]), float(order["amount"])
+            self.faults[contract.FAULTS[kind]] = where
             return
         m = self.plant.m
         self.faults.clear()  # who prepares the finger has mended the rig

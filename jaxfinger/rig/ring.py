@@ -271,11 +271,14 @@ class RingRig(Rig):
         self._order(order)
         return True
 
-    def inject(self, fault: str, slot: int = 0, after: int = 0) -> None:
-        """Let the stand-in fail: `fault` of contract.FAULTS, from `after` samples from now on. For tests and drills."""
+    def inject(self, fault: str, slot: int = 0, after: int = 0, amount: float = 60.0) -> None:
+        """Let the stand-in fail: `fault` of contract.FAULTS, from `after` samples from now on. For tests and drills.
+
+        `amount` is what a spike adds to the slot's raw value.
+        """
         order = np.zeros((), contract.BENCH)
         order["fault"], order["fault_slot"] = contract.FAULTS.index(fault), slot
-        order["fault_seq"] = int(self._status()["head"]) + after
+        order["fault_seq"], order["amount"] = int(self._status()["head"]) + after, amount
         self._order(order)
 
     def _order(self, order: np.ndarray) -> None:

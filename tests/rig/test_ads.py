@@ -1,18 +1,20 @@
 """The adapter over the wire: real AMS/TCP from another process. Judged by sequence numbers, never by the wall clock."""
 
 import contextlib
+import json
 import os
 import socket
 import threading
 import time
 
+import h5py
 import numpy as np
 import pyads
 import pytest
 
 from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
-from jaxfinger.rig import standin
+from jaxfinger.rig import parse_rig, standin
 from jaxfinger.rig.ams import AmsServer
 from jaxfinger.rig.backend import (
     CommandRefused,
@@ -140,6 +142,29 @@ def test_commands_states_and_the_latch(real_time):
         assert "tension T1 = " in status.cause
 
 
+def test_a_joint_that_runs_beyond_its_stop_is_let_go_in_the_right_order(lockstep):
+    """A free MCP that one tendon pulls past 92°: the controller's own limit, with no supervisor on this side."""
+    with ads_rig(lockstep) as rig:
+        rig.prepare(Setup("", fixed={"PIP": 0.3, "DIP": 0.3}))
+        rig.arm()
+        rig.command(TensionRamp({"T1": 3.0, "T2": 3.0, "T3": 15.0, "T4": 3.0}, 10.0))
+        blocks = [rig.read_block(20.0)]
+        while (status := rig.status()).state is not State.TRIPPED or blocks[-1].seq[-1] < status.trip_seq + 1000:
+            blocks.append(rig.read_block(20.0))
+        assert status.trip is Trip.POSITION
+        assert status.trip_channel == "joint_position MCP"
+        assert "joint beyond its limits (joint_position MCP = 1.6" in status.cause
+        with pytest.raises(CommandRefused, match="in state TRIPPED"):
+            rig.arm()
+        columns = rig.description.columns("tension", rig.description.finger.tendon_names)
+    at = int(status.trip_seq) - int(blocks[0].seq[0])
+    tension = np.concatenate([b.x for b in blocks])[at:, columns]
+    share = tension[:300] / tension[0]
+    np.testing.assert_allclose(share, share[:, [2]] * np.ones(4), atol=0.05)  # together; sensors' noise is 0.02 N
+    assert tension[250:].max() < 2.1  # at most 2 N after 0.2 s, and the drives' lag
+    assert np.abs(tension[900:]).max() < 0.1  # off
+
+
 def test_heartbeat_loss_releases_the_finger():
     """A host that dies while armed: the controller lets go by itself."""
     with standin.running(speed=1.0, heartbeat=0.5) as where:
@@ -235,6 +260,24 @@ def test_faults_over_the_wire_end_the_trial_and_keep_it(lockstep, record, fault)
     cut = read_session(outcome.session)["02-ID.4-T3-MCP"]
     assert not cut.complete
     assert len(cut.time) > 100
+
+
+def test_the_controllers_own_trip_ends_the_trial_with_its_cause(lockstep, record):
+    """A rig file that knows no stop before 140°: the host sees nothing wrong, the controller does."""
+    rig = ads_rig(lockstep)
+    wide = rig.description.text.replace("limits_deg = [-8.0, 102.0]", "limits_deg = [-8.0, 140.0]")
+    wide = wide.replace("joint_velocity_max_deg_s = 600.0", "joint_velocity_max_deg_s = 5000.0")
+    rig.description = parse_rig(wide)
+    slot = rig.description.channels[rig.description.index("joint_position", "PIP")].slot
+    outcome = record(rig, lambda r: r.inject("spike", slot, amount=1.5))
+    assert "the controller stopped: joint beyond its limits (joint_position PIP = 1.8" in outcome.cause
+    assert outcome.complete == ("01-ID.2-DIP",)
+    with h5py.File(outcome.session) as file:
+        attributes = file["trials/02-ID.4-T3-MCP"].attrs
+        assert attributes["trip"] == Trip.POSITION
+        assert attributes["cause"] in outcome.cause
+        events = [json.loads(e) for e in file["rig/events"].asstr()[()]]
+    assert [(e["kind"], "joint beyond its limits" in e["text"]) for e in events] == [("trip", True)]
 
 
 def test_a_connection_that_stays_cut_ends_the_trial(lockstep, record):

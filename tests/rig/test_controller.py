@@ -35,11 +35,11 @@ class Bench:
         at = self.c.place[symbol][0]
         self.c.memory[at : at + record.nbytes] = record.tobytes()
 
-    def bench(self, mode=(1, 1, 1), pose=(0.3, 0.3, 0.3), contact=False, fault=0, slot=0):
+    def bench(self, mode=(1, 1, 1), pose=(0.3, 0.3, 0.3), contact=False, fault=0, slot=0, amount=60.0):
         order = np.zeros((), contract.BENCH)
         order["id"] = self.c.bench + 1
         order["mode"][:3], order["pose"][:3], order["contact"] = mode, pose, contact
-        order["fault"], order["fault_slot"] = fault, slot
+        order["fault"], order["fault_slot"], order["amount"] = fault, slot, amount
         self.put("stBench", order)
 
     def run(self, count, beat=True):
@@ -105,6 +105,20 @@ def test_over_tension_drops_all_at_once(loaded):
     assert loaded.c.trip is Trip.TENSION
     assert np.all(ramp[-1] == 0)
     assert loaded.c.trip_slot == 1
+
+
+def test_a_joint_beyond_its_stops_is_let_go_after_three_cycles(loaded):
+    """Against a stop of 92°; the motor of the joint goes first, then the tendons together."""
+    loaded.bench(fault=contract.FAULTS.index("spike"), slot=loaded.c.slots.angle[0], amount=1.4)
+    before, held = loaded.c.seq, list(loaded.c.setpoint)
+    ramp = loaded.run(4)
+    assert (loaded.c.state, loaded.c.trip) == (State.TRIPPED, Trip.POSITION)
+    assert loaded.c.trip_seq - before == 2
+    assert (loaded.c.trip_slot, loaded.c.motor) == (loaded.c.slots.angle[0], None)
+    np.testing.assert_allclose(ramp[-1] / held, ramp[-1, 0] / held[0])  # in proportion
+    loaded.run(800)
+    assert max(loaded.c.setpoint) == 0
+    assert loaded.send(Kind.ARM) == Refusal.STATE
 
 
 @pytest.mark.parametrize(("fault", "slot"), [("nan", 9), ("flag", 0)])
