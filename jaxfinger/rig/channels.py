@@ -22,8 +22,15 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "joint_position": {"rad": 1.0, "deg": np.pi / 180},
     "external_torque": {"N m": 1.0, "N mm": 1e-3},
     "fingertip_force": {"N": 1.0},
+    "tension_setpoint": {"N": 1.0},
+    "motor_temperature": {"degC": 1.0},
 }
+WATCHED = (
+    "tension_setpoint",
+    "motor_temperature",
+)  # for safety alone: a rig may have them, a session does not need them
 SI = {kind: next(iter(units)) for kind, units in UNITS.items()}
+NOISY = ("tension", "external_torque", "fingertip_force")  # analog: a value that repeats for long is a fault
 DYNAMIC_BANDWIDTH = 100.0  # Hz: below it, a channel is refused for dynamic experiments
 
 
@@ -74,6 +81,9 @@ class Limits:
     joint_velocity_max: float  # measured
     joint_torque_max: float
     fingertip_force_max: float
+    tension_error_max: float  # set-point minus measured; infinite on a rig whose set-points are no channel
+    tension_error_s: float  # that it may last
+    temperature_max: float  # of motors, °C; infinite on a rig that does not measure it
 
 
 @dataclass(frozen=True)
@@ -156,7 +166,7 @@ def _rig(file: Table) -> RigDescription:
         specimen=head.text_of("specimen"),
         finger=finger,
         channels=channels,
-        limits=_limits(file, finger),
+        limits=_limits(file, finger, {c.kind for c in channels}),
         rate_hz=head.number("rate_hz", 1000.0, 1.0, 20000.0, "Hz"),
         stale_s=head.number("stale_s", 0.2, 0.01, 60.0, "s"),
         poll_s=head.number("poll_s", 0.05, 0.001, 1.0, "s"),
@@ -178,6 +188,8 @@ def _channels(file: Table, finger: FingerDescription) -> tuple[Channel, ...]:
         "joint_position": finger.joint_names,
         "external_torque": ("",),
         "fingertip_force": ("x", "y", "z"),
+        "tension_setpoint": tuple(np.array(finger.tendon_names)[finger.active]),
+        "motor_temperature": (*finger.tendon_names, "external"),
     }
     channels: list[Channel] = []
     for table in file.tables("channel"):
@@ -200,7 +212,7 @@ def _channels(file: Table, finger: FingerDescription) -> tuple[Channel, ...]:
             scale=table.number("scale"),
             offset=table.number("offset", 0.0),
             source=table.text_of("source", ""),
-            frozen=table.number("frozen_s", 0.0 if kind in ("joint_position", "excursion") else 1.0, 0.0, 60.0, "s"),
+            frozen=table.number("frozen_s", 1.0 if kind in NOISY else 0.0, 0.0, 60.0, "s"),
         )
         if channel.scale == 0:
             table.fail("scale", f"'scale' of '{name}' is zero; give {unit} per raw unit.")
@@ -230,9 +242,18 @@ def _channels(file: Table, finger: FingerDescription) -> tuple[Channel, ...]:
     return tuple(channels)
 
 
-def _limits(file: Table, finger: FingerDescription) -> Limits:
+def _limits(file: Table, finger: FingerDescription, kinds: set[str]) -> Limits:
     table = file.table("limits")
     assert table is not None
+
+    def watched(kind: str, key: str, low: float, high: float, unit: str) -> float:
+        """A limit on a kind of channel that a rig may lack: it must be there with the channel, and only then."""
+        if kind in kinds:
+            return table.number(key, low=low, high=high, unit=unit)
+        if key in table.values:
+            table.fail(key, f"'{key}' watches nothing without a [[channel]] of kind \"{kind}\"; add one, or remove it.")
+        return np.inf
+
     limits = Limits(
         tension_max=table.number("tension_max", low=0.1, high=100.0, unit="N"),
         tension_rate=table.number("tension_rate", low=0.1, high=1000.0, unit="N/s"),
@@ -242,6 +263,9 @@ def _limits(file: Table, finger: FingerDescription) -> Limits:
         joint_velocity_max=np.radians(table.number("joint_velocity_max_deg_s", low=1.0, high=5000.0, unit="deg/s")),
         joint_torque_max=table.number("joint_torque_max", low=1e-3, high=10.0, unit="N m"),
         fingertip_force_max=table.number("fingertip_force_max", low=0.1, high=100.0, unit="N"),
+        tension_error_max=watched("tension_setpoint", "tension_error_max", 0.1, 100.0, "N"),
+        tension_error_s=watched("tension_setpoint", "tension_error_s", 0.01, 10.0, "s"),
+        temperature_max=watched("motor_temperature", "temperature_max", 30.0, 200.0, "degC"),
     )
     if limits.tension_rate > limits.tension_rate_max:
         table.fail(

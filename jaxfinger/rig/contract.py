@@ -146,6 +146,8 @@ class Trip(IntEnum):
     OPERATOR = 23
     RECORDER = 24
     HOST = 25
+    TRACKING = 26
+    TEMPERATURE = 27
 
     @property
     def sentence(self) -> str:
@@ -170,6 +172,8 @@ _SENTENCES = {
     Trip.OPERATOR: "the operator pressed the stop key",
     Trip.RECORDER: "the recorder can no longer write",
     Trip.HOST: "the host gave up",
+    Trip.TRACKING: "tendon tension does not follow its set-point",
+    Trip.TEMPERATURE: "motor temperature above its limit",
 }
 
 

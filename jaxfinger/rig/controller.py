@@ -19,6 +19,7 @@ from jaxfinger.rig.plant import DT, Mode, Plant, Sensors
 _SAMPLE = struct.Struct(f"<QQII{contract.VALUES}dQ")
 _COMMAND = struct.Struct(f"<IIiIdd{contract.TARGETS}d")
 _STATUS = struct.Struct("<QQIIQdiIII")
+TEMPERATURE = 30.0  # °C, of the simulated motors, which stay cool
 _EPOCH_NS = 820_000_000 * 1_000_000_000  # the simulated distributed clock starts in the year 2025
 
 
@@ -35,7 +36,7 @@ class HardLimits:
 
 
 class Slots:
-    """Where the simulated rig puts its channels: tensions, excursions, angles, external torque, fingertip force."""
+    """Where the simulated rig puts its channels: `noisy` of a sensor each, then set-points and motor temperatures."""
 
     def __init__(self, n: int, m: int):
         self.tension = list(range(n))
@@ -43,7 +44,9 @@ class Slots:
         self.angle = list(range(2 * n, 2 * n + m))
         self.torque = 2 * n + m
         self.force = list(range(2 * n + m + 1, 2 * n + m + 4))
-        self.used = 2 * n + m + 4
+        self.noisy = 2 * n + m + 4
+        self.setpoint = list(range(self.noisy, self.noisy + n))
+        self.temperature = list(range(self.noisy + n, self.noisy + 2 * n))
 
 
 class Controller:
@@ -106,7 +109,7 @@ class Controller:
             filters["enabled"][[*self.slots.tension, self.slots.torque, *self.slots.force]] = 1
             filters["bandwidth"][filters["enabled"] == 1] = 22.0
         self._put("aFilter", filters.tobytes())
-        self._noise = self.rng.standard_normal((4096, self.slots.used))
+        self._noise = self.rng.standard_normal((4096, self.slots.noisy))
         self._values = self._before = [0.0] * contract.VALUES
         self._status()
 
@@ -288,6 +291,8 @@ class Controller:
         fresh[slots.torque] = plant.external_torque + s.torque_offset + s.torque_noise * noise[slots.torque]
         for axis, slot in enumerate(slots.force):
             fresh[slot] = plant.tip_force[axis] + s.force_offset[axis] + s.force_noise * noise[slot]
+        fresh[slots.setpoint[0] : slots.setpoint[-1] + 1] = self.setpoint
+        fresh[slots.temperature[0] : slots.temperature[-1] + 1] = [TEMPERATURE] * plant.n
         flags = 0
         for kind, (slot, amount) in fault.items():
             if kind == "nan":

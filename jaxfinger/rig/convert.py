@@ -18,7 +18,7 @@ from jaxfinger.data.session import FingerDescription
 from jaxfinger.errors import UserError
 from jaxfinger.rig import wal
 from jaxfinger.rig.backend import Block
-from jaxfinger.rig.channels import Filter, RigDescription
+from jaxfinger.rig.channels import SI, WATCHED, Filter, RigDescription
 
 
 @dataclass
@@ -261,6 +261,12 @@ def _beside(group: h5py.Group, log: Log, extras: dict[str, tuple[Recording, Samp
     table.create_dataset("trial", data=[g[0] for g in gaps] or np.empty(0, object), dtype=text)
     table.create_dataset("seq", data=np.array([g[1] for g in gaps], np.int64))
     table.create_dataset("lost", data=np.array([g[2] for g in gaps], np.int64))
+    watched = group.create_group("watched")  # channels that safety alone needs, sample for sample beside the trial
+    for i, channel in enumerate(log.header["channels"]):
+        if channel["kind"] in WATCHED:
+            for name, (_, samples) in extras.items():
+                place = watched.create_dataset(f"{name}/{channel['name']}", data=samples.x[samples.kept, i])
+                place.attrs["units"] = SI[channel["kind"]]
     dropped = group.create_group("dropped")  # samples after a trip, or not a number
     dropped.create_dataset("channel", data=[c["name"] for c in log.header["channels"]], dtype=text)
     for name, (_, samples) in extras.items():

@@ -16,6 +16,9 @@ joint_velocity_deg_s = 120.0    # of set-points
 joint_velocity_max_deg_s = 600.0
 joint_torque_max = 0.3          # N m, of the external motor
 fingertip_force_max = 20.0      # N
+tension_error_max = 3.0         # N, set-point minus measured …
+tension_error_s = 0.2           # … for so many seconds
+temperature_max = 70.0          # degC, of the motors
 """
 
 
@@ -41,6 +44,14 @@ def rig_toml(
     rows += [("joint_position", j, s, "rad", "AA5048B") for j, s in zip(finger.joint_names, slots.angle, strict=True)]
     rows += [("external_torque", "", slots.torque, "N m", "torque sensor of the external motor")]
     rows += [("fingertip_force", axis, s, "N", "K3D40") for axis, s in zip("xyz", slots.force, strict=True)]
+    rows += [
+        ("tension_setpoint", t, s, "N", "the controller's ramp")
+        for t, s in zip(finger.tendon_names, slots.setpoint, strict=True)
+    ]
+    rows += [
+        ("motor_temperature", t, s, "degC", "drive")
+        for t, s in zip(finger.tendon_names, slots.temperature, strict=True)
+    ]
     for kind, of, slot, unit, source in rows:
         lines += ["[[channel]]", f'kind = "{kind}"', *([f'of = "{of}"'] if of else []), f"slot = {slot}"]
         lines += [f'unit = "{unit}"', "scale = 1.0", "offset = 0.0", f'source = "{source}"', ""]

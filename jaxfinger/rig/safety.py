@@ -77,11 +77,14 @@ class Supervisor:
         self._high[self._tension] = rig.limits.tension_max
         self._high[kind == "external_torque"] = rig.limits.joint_torque_max
         self._high[kind == "fingertip_force"] = rig.limits.fingertip_force_max
+        self._high[kind == "motor_temperature"] = rig.limits.temperature_max
         symmetric = (kind == "external_torque") | (kind == "fingertip_force")
         self._low[symmetric] = -self._high[symmetric]
         self._high[self._angle] = finger.limits[:, 1]
         self._low[self._angle] = finger.limits[:, 0]
         self._partner = [rig.index("tension", rig.channels[int(i)].of) for i in self._excursion]
+        self._setpoint = np.flatnonzero(kind == "tension_setpoint")
+        self._follower = np.array(rig.columns("tension", (rig.channels[int(i)].of for i in self._setpoint)), int)
         self._trip = [_TRIPS[k] for k in kind]
         self._patience = np.array([c.frozen for c in rig.channels]) * rig.rate_hz
         self.tripped: tuple[Violation, ...] = ()
@@ -94,6 +97,7 @@ class Supervisor:
         self._tail = np.empty((0, n))
         self._run = np.zeros(n, int)  # consecutive samples out of limits
         self._same = np.zeros(n, int)  # consecutive samples with an identical value
+        self._astray = np.zeros(len(self._setpoint), int)  # consecutive samples away from the set-point
         self._moved: np.ndarray | None = None  # values when an encoder last moved
         self._last: np.ndarray | None = None
         self._driven: tuple[int, float, float] | None = None  # channel, angle at the command, speed
@@ -110,6 +114,7 @@ class Supervisor:
             *self._values(block),
             *self._frozen(block),
             *self._rates(block),
+            *self._tracking(block),
             *self._still(block),
         ]
         found.sort(key=lambda v: v.seq)
@@ -187,6 +192,21 @@ class Supervisor:
                     found.append(Violation(trip, self._name(int(channel)), int(seq[at]), float(rate[at, channel])))
         return found
 
+    def _tracking(self, block: Block) -> list[Violation]:
+        """Tensions that stay away from their set-points while the drives are on."""
+        limits, on = self.rig.limits, np.isin(block.state, (State.ARMED, State.MOVING))
+        error = block.x[:, self._setpoint] - block.x[:, self._follower]
+        found = []
+        for k, channel in enumerate(self._follower):
+            runs = _runs(on & (np.abs(error[:, k]) > limits.tension_error_max), int(self._astray[k]))
+            self._astray[k] = runs[-1]
+            late = runs > limits.tension_error_s * self.rig.rate_hz
+            if late.any():
+                at = int(np.argmax(late))
+                name = f"set-point minus {self._name(channel)}"
+                found.append(Violation(Trip.TRACKING, name, int(block.seq[at]), float(error[at, k])))
+        return found
+
     def _still(self, block: Block) -> list[Violation]:
         """A frozen encoder: a tendon under steady load runs, or the external motor drives, but no encoder moves."""
         end = block.x[-1]
@@ -241,4 +261,6 @@ _TRIPS = {
     "joint_position": Trip.POSITION,
     "external_torque": Trip.TORQUE,
     "fingertip_force": Trip.FORCE,
+    "tension_setpoint": Trip.INVALID,
+    "motor_temperature": Trip.TEMPERATURE,
 }

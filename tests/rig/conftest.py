@@ -64,6 +64,8 @@ def quiet_block(rig) -> Callable[..., Block]:
         x[:, rig.columns("excursion", rig.finger.tendon_names)] *= 1e-3
         x[:, rig.columns("tension", rig.finger.tendon_names)] += 2.0
         x[:, rig.columns("joint_position", rig.finger.joint_names)] = 0.35
+        x[:, rig.columns("tension_setpoint", rig.finger.tendon_names)] = 2.0
+        x[:, rig.columns("motor_temperature", rig.finger.tendon_names)] = 30.0
         seq = np.arange(first, first + count, dtype=np.uint64)
         return Block(seq, seq * 1_000_000 + 10**15, x, np.full(count, state, np.uint32), np.zeros(count, np.uint32))
 

@@ -280,6 +280,30 @@ def test_the_controllers_own_trip_ends_the_trial_with_its_cause(lockstep, record
     assert [(e["kind"], "joint beyond its limits" in e["text"]) for e in events] == [("trip", True)]
 
 
+@pytest.mark.parametrize(
+    ("channel", "amount", "trip"),
+    [(("tension", "T1"), 4.0, Trip.TRACKING), (("motor_temperature", "T2"), 45.0, Trip.TEMPERATURE)],
+    ids=["tracking", "temperature"],
+)
+def test_a_limit_that_only_the_host_has_latches_the_controller_over_the_wire(lockstep, record, channel, amount, trip):
+    rig = ads_rig(lockstep)
+    slot = rig.description.channels[rig.description.index(*channel)].slot
+    outcome = record(rig, lambda r: r.inject("spike", slot, amount=amount))
+    assert trip.sentence in outcome.cause
+    with h5py.File(outcome.session) as file:
+        assert file["trials/02-ID.4-T3-MCP"].attrs["trip"] == trip
+        events = [json.loads(e) for e in file["rig/events"].asstr()[()]]
+        assert [e["kind"] for e in events] == ["stop"]
+        assert events[0]["text"] in outcome.cause
+        held = file["rig/dropped/02-ID.4-T3-MCP/value"][-1, rig.description.columns("tension_setpoint", ["T3"])]
+    assert held == 0.0  # released, and still recorded
+    with ads_rig(lockstep) as rig:
+        status = rig.status()
+        assert (status.state, status.trip) == (State.TRIPPED, trip)
+        with pytest.raises(CommandRefused, match="in state TRIPPED"):
+            rig.arm()
+
+
 def test_a_connection_that_stays_cut_ends_the_trial(lockstep, record):
     rig = ads_rig(lockstep)
     rig.description.address["reconnect_s"] = 1

@@ -1,5 +1,7 @@
 """A rig file with an error is refused with the line to mend; calibration turns raw values into SI."""
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 
@@ -54,11 +56,28 @@ def test_the_line_is_the_very_line():
         parse_rig(text, "bench.toml")
 
 
-@pytest.mark.parametrize("name", ["tension_max", "joint_torque_max", "fingertip_force_max", "joint_velocity_max_deg_s"])
+@pytest.mark.parametrize("name", asdict(parse_rig(GOOD).limits))
 def test_a_missing_limit_is_refused(name):
+    name = next(n for n in (name, f"{name}_deg", f"{name}_deg_s") if f"{n} =" in GOOD)
     text = "\n".join(row for row in GOOD.splitlines() if not row.startswith(f"{name} ="))
     with pytest.raises(UserError, match=f"'{name}' is missing in \\[limits\\]"):
         parse_rig(text)
+
+
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [("tension_setpoint", ("tension_error_max", "tension_error_s")), ("motor_temperature", ("temperature_max",))],
+)
+def test_a_rig_may_lack_set_points_and_temperatures_and_then_has_no_limit_on_them(kind, names):
+    """With such a channel its limit is demanded; a limit without the channel would watch nothing, and is refused."""
+    without = "[[channel]]".join(b for b in GOOD.split("[[channel]]") if f'kind = "{kind}"' not in b)
+    for name in names:
+        line = line_of(without, f"{name} =")
+        with pytest.raises(UserError, match=f"line {line}: '{name}' watches nothing without .* \"{kind}\""):
+            parse_rig(without)
+        without = "\n".join(row for row in without.splitlines() if not row.startswith(f"{name} ="))
+    limits = parse_rig(without).limits
+    assert all(np.isinf(v) == (n in names) for n, v in asdict(limits).items())
 
 
 def test_a_joint_without_a_channel_is_refused():

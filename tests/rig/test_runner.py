@@ -60,6 +60,10 @@ def test_the_file_opens_in_old_tools_and_says_how_it_was_made(simulated, record)
         assert not file["rig/filters/enabled"][()].any()
         assert file["rig/gaps/seq"].shape == (0,)
         trial = file["trials/02-ID.4-T3-MCP"]
+        watched = file["rig/watched/02-ID.4-T3-MCP"]
+        assert watched["tension_setpoint T3"].shape == trial["time"].shape
+        assert watched["tension_setpoint T3"][()].max() == 6.0
+        assert watched["motor_temperature T1"].attrs["units"] == "degC"
         assert json.loads(trial.attrs["parameters"])["levels"] == [3.0, 6.0]
         assert trial.attrs["lost_samples"] == 0
 
@@ -74,22 +78,26 @@ def test_the_same_seed_gives_the_same_session(rig, record, tmp_path):
 
 
 FAULTS = [
-    ("nan", ("external_torque", ""), Trip.INVALID, 20),
-    ("spike", ("tension", "T3"), Trip.TENSION, 20),
-    ("freeze", ("tension", "T1"), Trip.FROZEN, 1300),
-    ("clock", ("tension", "T1"), Trip.CLOCK, 20),
-    ("flag", ("tension", "T1"), Trip.INVALID, 20),
+    ("nan", ("external_torque", ""), 0.0, Trip.INVALID, 20),
+    ("spike", ("tension", "T3"), 60.0, Trip.TENSION, 20),
+    ("spike", ("tension", "T1"), 4.0, Trip.TRACKING, 220),
+    ("spike", ("motor_temperature", "T2"), 45.0, Trip.TEMPERATURE, 20),
+    ("freeze", ("tension", "T1"), 0.0, Trip.FROZEN, 1300),
+    ("clock", ("tension", "T1"), 0.0, Trip.CLOCK, 20),
+    ("flag", ("tension", "T1"), 0.0, Trip.INVALID, 20),
 ]
 
 
-@pytest.mark.parametrize(("fault", "channel", "trip", "within"), FAULTS, ids=[f[0] for f in FAULTS])
-def test_a_fault_ends_the_trial_safely_with_cause_and_data(rig, record, fault, channel, trip, within):
+@pytest.mark.parametrize(
+    ("fault", "channel", "amount", "trip", "within"), FAULTS, ids=[f"{f[0]}-{f[3].name}" for f in FAULTS]
+)
+def test_a_fault_ends_the_trial_safely_with_cause_and_data(rig, record, fault, channel, amount, trip, within):
     machine = SimulatedRig(rig)
     at = []
 
     def strike(machine):
         at.append(machine.controller.seq)
-        machine.inject(fault, slot(machine, *channel))
+        machine.inject(fault, slot(machine, *channel), amount=amount)
 
     outcome = record(machine, strike)
     assert trip.sentence in outcome.cause

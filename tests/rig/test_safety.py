@@ -44,6 +44,9 @@ def spoil(block: Block, change) -> Block:
         ("joint_position", "DIP", -0.5, Trip.POSITION),
         ("external_torque", "", -0.4, Trip.TORQUE),
         ("fingertip_force", "z", -25.0, Trip.FORCE),
+        ("motor_temperature", "T4", 71.0, Trip.TEMPERATURE),
+        ("motor_temperature", "T4", np.nan, Trip.INVALID),
+        ("tension_setpoint", "T1", np.nan, Trip.INVALID),
     ],
 )
 def test_a_limit_trips_after_three_samples_and_not_before(rig, quiet_block, kind, of, value, trip):
@@ -120,6 +123,25 @@ def test_speed_and_tension_rate(rig, quiet_block):
     assert found.trip is Trip.TENSION_RATE
 
 
+@pytest.mark.parametrize("tension", [-1.5, 5.5])
+@pytest.mark.parametrize("pieces", [1, 7, 400])
+def test_a_tension_that_stays_away_from_its_set_point(rig, quiet_block, tension, pieces):
+    """2 N are wanted; 3 N of error may last 0.2 s, however the samples are cut into blocks."""
+
+    def astray(x):
+        x[20:220, column(rig, "tension", "T3")] = tension  # 200 samples are allowed
+        x[240:, column(rig, "tension", "T3")] = tension
+        x[:, column(rig, "tension", "T3")] += np.random.default_rng(1).normal(0, 1e-3, 600)
+
+    block, supervisor = spoil(quiet_block(600), astray), Supervisor(rig)
+    edges = np.linspace(0, 600, pieces + 1).astype(int)
+    found = [v for a, b in pairwise(edges) for v in supervisor.check(part(block, a, b)) if v.trip is Trip.TRACKING]
+    assert (found[0].seq, found[0].channel) == (440, "set-point minus tension T3")
+    assert found[0].value == pytest.approx(2.0 - tension, abs=0.01)
+    off = replace(block, state=np.full(600, State.IDLE, np.uint32))
+    assert not [v for v in Supervisor(rig).check(off) if v.trip is Trip.TRACKING]  # drives off: nothing to follow
+
+
 def test_time_that_jumps_back(rig, quiet_block):
     block = quiet_block()
     t = block.t_ns.copy()
@@ -145,7 +167,7 @@ def part(block: Block, start: int, stop: int) -> Block:
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
-    st.lists(st.integers(1, 399), max_size=8, unique=True), st.integers(0, 380), st.integers(1, 10), st.integers(0, 14)
+    st.lists(st.integers(1, 399), max_size=8, unique=True), st.integers(0, 380), st.integers(1, 10), st.integers(0, 22)
 )
 def test_online_is_offline(rig, quiet_block, cuts, start, length, channel):
     """The first violation does not depend on how the samples were cut into blocks."""

@@ -101,7 +101,7 @@ def _column(trial: Trial, channel: Channel, joints: tuple[str, ...], tendons: tu
         "joint_position": (trial.q, joints),
         "fingertip_force": (trial.fingertip_force, ("x", "y", "z")),
         "external_torque": (trial.joint_torque, joints),
-    }[channel.kind]
+    }.get(channel.kind, (None, ()))  # what is watched for safety alone is in no session
     of = channel.of or (trial.joint or "")
     return array[:, names.index(of)] if array is not None and of in names else None
 
