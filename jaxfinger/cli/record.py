@@ -49,7 +49,8 @@ def record(
         outcome = run(checked, open_rig(description), output, resume=resume, operator=operator, observe=view)
     if outcome.cause:
         raise UserError(
-            f"{outcome.cause} {output} holds what was recorded; go on with --resume, the log is {outcome.log}."
+            f"{outcome.cause.rstrip('.')}; {output} holds what was recorded, go on with --resume "
+            f"(the log is {outcome.log})."
         )
     print(f"{output}: {len(outcome.complete)} trials, all complete")
 

@@ -120,8 +120,12 @@ class Runner:
         except UserError as error:
             return self._ended(error)
         except KeyboardInterrupt:
-            self.reader.stop(Violation(Trip.OPERATOR, "interrupt", self.reader.latest_seq, float("nan")))
-            return self._ended(TrialEnded("the run was interrupted", Trip.OPERATOR))
+            return self.interrupted()
+
+    def interrupted(self) -> str:
+        """Stop the rig after Ctrl-C; returns why the run ended."""
+        self.reader.stop(Violation(Trip.OPERATOR, "interrupt", self.reader.latest_seq, float("nan")))
+        return self._ended(TrialEnded("the run was interrupted", Trip.OPERATOR))
 
     def _ended(self, error: UserError) -> str:
         trip = error.trip if isinstance(error, TrialEnded) else Trip.HOST
@@ -420,6 +424,8 @@ def _trials(plan, rig: Rig, recorder: Recorder, operator: Operator, observe, log
             if cause := runner.trial(trial, name, plan.trials.index(trial) + 1, len(plan.trials), begun):
                 return f"{name}: {cause}"
         return ""
+    except KeyboardInterrupt:
+        return runner.interrupted()
     finally:
         reader.close()
 

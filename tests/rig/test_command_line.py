@@ -1,0 +1,176 @@
+"""The commands as a person types them, in processes of their own: exit codes, sentences, what lies in the folder."""
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from jaxfinger.data import read_session
+from jaxfinger.rig import standin
+from jaxfinger.rig.examples import rig_toml
+from jaxfinger.rig.runner import log_path
+from tests.rig.conftest import SHORT
+
+LONG = '[plan]\nname = "long"\noperator = "tester"\n[[trial]]\nexperiment = "VD.1"\nseconds = 5000.0\n'
+
+
+@pytest.fixture(scope="module")
+def controller():
+    with standin.running(speed=0, heartbeat=1e6) as where:
+        yield where
+
+
+@pytest.fixture
+def bench(controller, tmp_path):
+    """A folder with a plan and a rig file for the stand-in."""
+    address = {"net_id": standin.NET_ID, "ip": controller, "port": 851}
+    (tmp_path / "rig.toml").write_text(rig_toml("ads", address, stale_s=30.0, poll_s=0.002))
+    (tmp_path / "plan.toml").write_text(SHORT)
+    return tmp_path
+
+
+def said(errors: str) -> str:
+    """What jaxfinger says: AdsLib writes a dated line of its own when a connection closes."""
+    return "".join(line for line in errors.splitlines(keepends=True) if "connection closed by remote" not in line)
+
+
+def command(*words) -> list[str]:
+    return [sys.executable, "-m", "jaxfinger", *map(str, words)]
+
+
+def jaxfinger(*words) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command(*words), capture_output=True, text=True, timeout=120, check=False)
+
+
+def record_in(folder: Path, *more) -> list[str]:
+    rig, output = folder / "rig.toml", folder / "session.h5"
+    return command("record", folder / "plan.toml", "--rig", rig, "-o", output, *more)
+
+
+def wait_for_log(process: subprocess.Popen, folder: Path, size: int) -> Path:
+    path = log_path(folder / "session.h5")
+    while not (path.exists() and path.stat().st_size > size):
+        assert process.poll() is None, "the recorder ended by itself"
+        time.sleep(0.01)
+    return path
+
+
+def test_record_leaves_a_session_that_check_finds_sound(bench):
+    done = subprocess.run(record_in(bench, "--yes"), capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, said(done.stderr)) == (0, "")
+    output = bench / "session.h5"
+    steps = ["0/2 reference", "1/2 01-ID.2-DIP", "2/2 02-ID.4-T3-MCP"]
+    assert done.stdout.splitlines() == [*steps, f"{output}: 2 trials, all complete"]
+    assert sorted(p.name for p in bench.iterdir()) == ["plan.toml", "rig.toml", "session.h5"]
+    assert jaxfinger("check", output).returncode == 0
+    again = subprocess.run(record_in(bench, "--yes"), capture_output=True, text=True, timeout=120, check=False)
+    assert again.returncode == 2
+    assert again.stderr == f"jaxfinger: {output}: exists already and is not overwritten; choose another name.\n"
+
+
+def test_recover_after_a_kill(bench):
+    (bench / "plan.toml").write_text(LONG)
+    with subprocess.Popen(record_in(bench, "--yes"), stdout=subprocess.DEVNULL) as process:
+        log = wait_for_log(process, bench, 300_000)
+        process.kill()
+    done = jaxfinger("recover", log, "--output", bench / "rescued.h5")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith(f"{bench / 'rescued.h5'}: 1 trials, cut short: 01-VD.1")
+    assert len(read_session(bench / "rescued.h5")["01-VD.1"].time) > 1000
+    twice = jaxfinger("recover", log, "--output", bench / "rescued.h5")
+    assert twice.returncode == 2
+    assert "exists already" in twice.stderr
+    none = jaxfinger("recover", bench / "plan.toml", "--output", bench / "none.h5")
+    assert none.returncode == 2
+    assert none.stderr.endswith("plan.toml: not a recording log of jaxfinger; give the file that ends in .wal.\n")
+
+
+@pytest.mark.parametrize("moment", ["trial", "reference"])
+def test_control_c_ends_the_run_with_a_sentence(bench, moment):
+    """Also before the first trial, while tendons are pre-tensioned for the encoders' zero."""
+    (bench / "plan.toml").write_text(LONG)
+    with subprocess.Popen(record_in(bench, "--yes"), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        wait_for_log(process, bench, 300_000 if moment == "trial" else 100)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=120)
+    output, sentence = bench / "session.h5", said(errors.decode())
+    assert process.returncode == 2
+    assert sentence.count("\n") == 1
+    assert f"the run was interrupted; {output} holds what was recorded, go on with --resume" in sentence
+    session = read_session(output)
+    assert [t.complete for t in session] == ([False] if moment == "trial" else [])
+
+
+def test_the_stop_key_at_the_terminal(bench):
+    (bench / "plan.toml").write_text(LONG)
+    ours, theirs = pty.openpty()
+    with subprocess.Popen(record_in(bench), stdin=theirs, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+        wait_for_log(process, bench, 100_000)
+        os.write(ours, b"q")
+        _, errors = process.communicate(timeout=120)
+    os.close(ours)
+    os.close(theirs)
+    assert process.returncode == 2
+    assert "01-VD.1: the operator pressed the stop key" in errors.decode()
+    assert not read_session(bench / "session.h5")["01-VD.1"].complete
+
+
+MISTAKES = {
+    "unknown channel": (
+        "rig.toml",
+        'kind = "external_torque"',
+        'kind = "torque"',
+        "'kind' is 'torque'; choose one of ",
+    ),
+    "wrong unit": (
+        "rig.toml",
+        'unit = "N m"',
+        'unit = "kg"',
+        "'kg' is no unit for external_torque ('external_torque')",
+    ),
+    "missing limit": ("rig.toml", "temperature_max = 70.0", "", "'temperature_max' is missing in [limits]; add a line"),
+    "too high": ("plan.toml", "levels = [3.0, 6.0]", "levels = [3.0, 19.0]", "02-ID.4-T3-MCP: 19 N for T3 is outside"),
+    "unknown joint": ("plan.toml", 'joint = "DIP"', 'joint = "DPI"', "'joint' is 'DPI'; choose one of MCP, PIP, DIP."),
+}
+HEADERS = {"missing limit": "[limits]", "too high": "[[trial]]"}  # where the line itself is not there, or not to blame
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_sentence_with_its_line_and_nothing_moves(bench, mistake):
+    """The stand-in is not even asked: its address is taken out of the rig file's reach first."""
+    name, good, bad, says = MISTAKES[mistake]
+    rig = bench / "rig.toml"
+    rig.write_text(rig.read_text().replace("127.0.0.1:", "127.0.0.2:"))
+    text = (bench / name).read_text()
+    assert good in text
+    (bench / name).write_text(text.replace(good, bad, 1))
+    done = subprocess.run(record_in(bench, "--yes"), capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"jaxfinger: {name}, line ")
+    assert done.stderr.count("\n") == 1
+    assert says in done.stderr
+    line = (bench / name).read_text().splitlines()[int(done.stderr.split("line ")[1].split(":")[0]) - 1]
+    assert line.startswith(HEADERS.get(mistake, bad))
+    assert sorted(p.name for p in bench.iterdir()) == ["plan.toml", "rig.toml"]
+
+
+def test_what_is_missing_on_the_command_line_is_said():
+    done = jaxfinger("record", "plan.toml")
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr + done.stdout
+    assert "--rig" in done.stderr + done.stdout
+    absent = jaxfinger("record", "none.toml", "--rig", "none.toml", "-o", "x.h5")
+    assert absent.returncode == 2
+    assert absent.stderr.startswith("jaxfinger: none.toml: cannot be read")
+
+
+def test_the_recorder_starts_without_jax_and_the_heavy_parts_of_scipy():
+    heavy = "{'jax', 'matplotlib', 'scipy.signal', 'scipy.stats', 'scipy.interpolate'}"
+    script = f"import sys, jaxfinger.rig; print({heavy} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"
