@@ -237,6 +237,8 @@ def _annotate(attributes: h5py.AttributeManager, recording: Recording, samples: 
     last = int((recording.end or {}).get("seq", 2**62))
     if broken := int((~samples.kept & (samples.seq < last)).sum()):
         attributes["dropped_samples"] = broken  # not a number in some channel; they lie in /rig/dropped
+    if clocks := (recording.end or {}).get("clocks"):
+        attributes["host_minus_device_s"], attributes["device_time_s"] = np.array(clocks) * 1e-9
     if not recording.complete:
         attributes["cause"] = recording.cause
         attributes["trip"] = int((recording.end or {}).get("trip", 0))

@@ -15,6 +15,7 @@ from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.safety import Supervisor, Violation, armed
 
 BACKLOG = 100  # samples in a block from which on the controller is ahead
+EPOCH_NS = 946_684_800 * 10**9  # 2000-01-01 in Unix time: where a controller's clock starts
 KEEP = 3000  # blocks that a busy runner may lag behind
 
 
@@ -31,6 +32,7 @@ class Reader:
         self.error: Exception | None = None
         self.samples = self.lost = 0
         self.latest: Block | None = None
+        self._clocks: tuple[int, int] | None = None  # host minus device, and device time (ns), of the quickest block
         self._recording = False
         self._blocks: deque[Block] = deque(maxlen=KEEP)
         self._news = threading.Condition()
@@ -62,10 +64,14 @@ class Reader:
     def _step(self) -> int:
         try:
             block = self.rig.read_block(self.rig.description.stale_s)
+            arrived = time.time_ns() - EPOCH_NS
             found = self.supervisor.check(block)
             with self._news:
                 if self._recording:
                     self.recorder.block(block)
+                    # every delay on the way adds to the difference of the clocks, so the smallest is the truest
+                    clocks = arrived - int(block.t_ns[-1]), int(block.t_ns[-1])
+                    self._clocks = min(self._clocks or clocks, clocks)
                 self.latest, self.latest_seq, self.latest_t = block, int(block.seq[-1]), int(block.t_ns[-1])
                 self.samples += len(block)
                 self.lost += block.lost_before
@@ -100,7 +106,7 @@ class Reader:
         """Record from the next sample on."""
         with self._news:
             self.recorder.put(wal.TRIAL, {**start, "seq": self.latest_seq + 1})
-            self._recording = True
+            self._recording, self._clocks = True, None
 
     def mark(self, mark: dict[str, Any]) -> None:
         """Log a mark that counts from the next sample on."""
@@ -110,7 +116,8 @@ class Reader:
     def end(self, end: dict[str, Any]) -> None:
         """Stop recording; without a `seq`, every sample so far belongs to the trial."""
         with self._news:
-            self.recorder.put(wal.END, {"seq": self.latest_seq + 1, **end})
+            clocks = {"clocks": self._clocks} if self._clocks and not self.rig.synchronous else {}
+            self.recorder.put(wal.END, {"seq": self.latest_seq + 1, **clocks, **end})
             self._recording = False
 
     @property

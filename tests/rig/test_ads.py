@@ -247,6 +247,10 @@ def test_a_session_over_the_wire(lockstep, record):
     assert outcome.cause == ""
     session = read_session(outcome.session)
     assert [t.complete for t in session] == [True, True]
+    with h5py.File(outcome.session) as file:
+        clocks = [file[f"trials/{t.name}"].attrs for t in session]
+        assert np.isfinite([c["host_minus_device_s"] for c in clocks]).all()
+        assert clocks[1]["device_time_s"] > clocks[0]["device_time_s"] + session["01-ID.2-DIP"].duration
     for trial in session:
         np.testing.assert_allclose(np.diff(trial.time), 1e-3, atol=1e-9)
 

@@ -1,0 +1,44 @@
+"""The reader: how far the host's clock leads the controller's goes into the log, trial by trial."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from jaxfinger.rig import reader as module
+from jaxfinger.rig import wal
+from jaxfinger.rig.reader import EPOCH_NS, Reader
+from jaxfinger.rig.recorder import Recorder
+from jaxfinger.rig.safety import Supervisor
+
+
+@pytest.mark.parametrize(("lead_s", "drift"), [(3.0, 5e-3), (-0.5, -1e-3)])
+def test_the_drift_between_two_clocks_shows_from_trial_to_trial(simulated, tmp_path, monkeypatch, lead_s, drift):
+    """Blocks are up to 40 ms on their way; 10 s lie between the trials."""
+    rng, born = np.random.default_rng(5), simulated.controller
+    start = None
+
+    def host() -> int:
+        nonlocal start
+        device = 820_000_000 * 10**9 + (born.seq - 1) * 10**6
+        start = device if start is None else start
+        on_its_way = rng.exponential(4e6) if rng.random() < 0.9 else 40e6
+        return EPOCH_NS + device + int(lead_s * 1e9 + drift * (device - start) + on_its_way)
+
+    monkeypatch.setattr(module, "time", SimpleNamespace(time_ns=host))
+    simulated.synchronous = False  # as a rig with a clock of its own; here its samples are still made when read
+    recorder = Recorder(tmp_path / "a.wal", {})
+    with simulated:
+        reader = Reader(simulated, recorder, Supervisor(simulated.description))
+        for _ in range(2):
+            reader.begin({})
+            for _ in range(50):
+                reader._step()
+            reader.end({"complete": True})
+            simulated._wait(10.0)
+            simulated.rewind(born.seq)
+    recorder.close()
+    first, second = (f.json["clocks"] for f in wal.read_log(recorder.path) if f.tag == wal.END)
+    for ahead, at in (first, second):
+        assert ahead * 1e-9 == pytest.approx(lead_s + drift * (at - start) * 1e-9, abs=1e-3)
+    assert (second[0] - first[0]) / (second[1] - first[1]) == pytest.approx(drift, abs=2e-4)
