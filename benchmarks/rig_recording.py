@@ -60,11 +60,12 @@ def stream(minutes: float, busy: bool) -> dict:
     samples = round(minutes * 60_000)
     with standin.running(speed=1.0, heartbeat=5.0) as where, tempfile.TemporaryDirectory() as folder:
         description = all_slots(where, stale_s=5.0)
-        stop = threading.Event()
+        stop, spun = threading.Event(), []
 
         def spin() -> None:
             while not stop.is_set():
                 sum(range(2000))
+            spun.append(time.thread_time())
 
         with AdsRig(description) as rig:
             recorder = Recorder(
@@ -72,8 +73,9 @@ def stream(minutes: float, busy: bool) -> dict:
             )
             reader = Reader(rig, recorder, Supervisor(description))
             start = {"name": "t", "tare": {}, "loaded": [], "motor": None, "contact": False}
+            spinner = threading.Thread(target=spin, daemon=True)
             if busy:
-                threading.Thread(target=spin, daemon=True).start()
+                spinner.start()
             reader.begin(start)
             wall = time.monotonic()
             cpu_all = time.process_time()
@@ -84,8 +86,10 @@ def stream(minutes: float, busy: bool) -> dict:
                 if block is not None:
                     arrivals.append((time.monotonic_ns(), block.t_ns.astype(np.int64)))
             stop.set()
+            if busy:
+                spinner.join()
             reader.close()
-            wall, cpu_all = time.monotonic() - wall, time.process_time() - cpu_all
+            wall, cpu = time.monotonic() - wall, time.process_time() - cpu_all - sum(spun)
             recorder.close()
         offsets = np.array(
             [arrived - t[-1] for arrived, t in arrivals]
@@ -102,8 +106,7 @@ def stream(minutes: float, busy: bool) -> dict:
             "error": None if reader.error is None else str(reader.error),
             "latency_ms": {f"p{p}": round(float(np.percentile(ages, p)) / 1e6, 1) for p in (50, 99, 99.9, 100)},
             "poll_ms": description.poll_s * 1e3,
-            "cores_used": round(cpu_all / wall, 3),
-            "cores_note": "includes the busy thread" if busy else "reader, supervisor, writer, everything",
+            "cores_used": round(cpu / wall, 3),  # reader, supervisor, writer: everything but the busy thread
             "log_MB": round(recorder_size(blocks) / 1e6, 1),
             "load_average": os.getloadavg()[0],
         }

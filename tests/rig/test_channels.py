@@ -1,13 +1,14 @@
 """A rig file with an error is refused with the line to mend; calibration turns raw values into SI."""
 
 from dataclasses import asdict
+from pkgutil import iter_modules
 
 import numpy as np
 import pytest
 
 from jaxfinger.data import Session, write_session
 from jaxfinger.errors import UserError
-from jaxfinger.rig import parse_rig, read_rig
+from jaxfinger.rig import backends, open_rig, parse_rig, read_rig
 from jaxfinger.rig.examples import rig_toml
 from jaxfinger.rig.plant import default_truth
 
@@ -127,6 +128,22 @@ def test_the_finger_may_come_from_an_earlier_session(tmp_path):
     channels = rest[rest.index("[[channel]]") :]
     (tmp_path / "rig.toml").write_text(f'{head}[finger]\nfrom = "old.h5"\n\n{channels}')
     np.testing.assert_allclose(read_rig(tmp_path / "rig.toml").finger.mass, truth.mass)
+
+
+def test_a_backend_is_one_file(tmp_path, monkeypatch):
+    """A module put into the folder of backends is all it takes: rig files may name it, and it reads its own address."""
+    (tmp_path / "bench_of_mine.py").write_text(
+        "from jaxfinger.rig.backends.simulated import SimulatedRig as make\n"
+        "def address(table): return {'seed': table.integer('lucky_number')}\n"
+    )
+    monkeypatch.setattr(backends, "__path__", [*backends.__path__, str(tmp_path)])
+    monkeypatch.setattr(backends, "NAMES", (*backends.NAMES, "bench_of_mine"))  # as importing the package would find
+    assert {module.name for module in iter_modules(backends.__path__)} == set(backends.NAMES)
+    rig = parse_rig(rig_toml("bench_of_mine", {"lucky_number": 7}))
+    with open_rig(rig) as machine:
+        assert len(machine.read_block(1.0)) > 0
+    with pytest.raises(UserError, match=r"line \d+: 'seed' is unknown in \[address\]; known are lucky_number"):
+        parse_rig(rig_toml("bench_of_mine", {"lucky_number": 7, "seed": 7}))
 
 
 def test_a_file_that_is_not_there_or_not_toml(tmp_path):

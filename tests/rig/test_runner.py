@@ -2,6 +2,7 @@
 
 import json
 import resource
+import time
 from dataclasses import replace
 
 import h5py
@@ -10,7 +11,7 @@ import pytest
 
 from jaxfinger.data import check_file, read_session
 from jaxfinger.errors import UserError
-from jaxfinger.rig import parse_plan, parse_rig, recover
+from jaxfinger.rig import parse_plan, parse_rig, recorder, recover, wal
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.controller import Controller, HardLimits
@@ -250,6 +251,49 @@ def test_a_full_disk_ends_the_trial_and_keeps_what_was_written(rig, record):
     session = recover(log_path(path), path.with_name("again.h5"))
     assert session.incomplete == ("02-ID.4-T3-MCP",)
     assert read_session(path)["01-ID.2-DIP"].complete
+
+
+def test_a_disk_that_stays_too_slow_ends_the_trial_and_keeps_what_was_written(rig, record, monkeypatch):
+    machine, write = SimulatedRig(rig), wal.LogWriter.write
+    monkeypatch.setattr(recorder, "QUEUE_LIMIT", 2000)
+
+    def slow(log, tag, payload):
+        time.sleep(0.2 if tag == wal.DATA else 0.0)
+        write(log, tag, payload)
+
+    outcome = record(machine, lambda m: monkeypatch.setattr(wal.LogWriter, "write", slow))
+    assert "the disk is too slow" in outcome.cause
+    assert machine.controller.trip is Trip.RECORDER
+    assert outcome.complete == ("01-ID.2-DIP",)
+    cut = read_session(outcome.session)["02-ID.4-T3-MCP"]
+    assert not cut.complete
+    np.testing.assert_allclose(np.diff(cut.time), 1e-3, atol=1e-9)
+
+
+def test_a_person_at_a_bench_that_prepares_nothing_itself(rig, record):
+    """Every setup of the plan becomes a prompt; the run goes on when it is answered."""
+    machine, prompts, wanted = SimulatedRig(rig), [], []
+    by_itself = machine.prepare
+    machine.prepare = lambda setup: bool(wanted.append(setup))
+
+    class Person:
+        def ask(self, text, alive):
+            assert alive()
+            prompts.append(text)
+            by_itself(wanted[-1])
+            machine._wait(1.0)
+
+        def stop_requested(self):
+            return False
+
+    outcome = record(machine, operator=Person())
+    assert outcome.cause == ""
+    assert len(outcome.complete) == 2
+    hands_off, straight, *rest = prompts
+    assert hands_off.startswith("Hands off: the drives are about to be switched on.")
+    assert straight.startswith("Fix the finger straight")
+    assert any("Free DIP and move it slowly by hand" in text for text in rest)
+    assert rest[-1].startswith("Couple the external motor to MCP")
 
 
 def test_filtered_terminals_are_refused_for_dynamic_experiments(rig, tmp_path):
