@@ -68,7 +68,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits that the host watches (SI); the controller's own are never looser.
+    """Limits that the host watches (SI), never looser than the controller's own.
 
     `joint_margin` is the distance in rad that a joint keeps from its mechanical limits.
     """

@@ -99,16 +99,18 @@ class RingRig(Rig):
 
     def _compare_limits(self) -> None:
         hard, soft = self._record("stLimits", contract.LIMITS), self.description.limits
-        for name, wanted in (
-            ("tension_max", soft.tension_max),
-            ("tension_rate_max", soft.tension_rate_max),
-            ("joint_torque_max", soft.joint_torque_max),
-            ("fingertip_force_max", soft.fingertip_force_max),
+        for name, suffix, unit in (  # rig files give velocities in degrees
+            ("tension_max", "", 1.0),
+            ("tension_rate_max", "", 1.0),
+            ("joint_velocity_max", "_deg_s", 180 / np.pi),
+            ("joint_torque_max", "", 1.0),
+            ("fingertip_force_max", "", 1.0),
         ):
-            if not float(hard[name]) >= wanted - 1e-9:
+            allowed, wanted = float(hard[name]), getattr(soft, name)
+            if not allowed >= wanted - 1e-9:
                 raise UserError(
-                    f"the rig file's '{name}' = {wanted:g} is looser than the controller's {float(hard[name]):g}; "
-                    f"lower it in [limits]."
+                    f"the rig file's '{name}{suffix}' = {wanted * unit:g} is looser than the controller's "
+                    f"{allowed * unit:g}; lower it in [limits]."
                 )
 
     # samples ----------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import socket
 import threading
 import time
@@ -14,7 +15,7 @@ import pytest
 
 from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
-from jaxfinger.rig import parse_rig, standin
+from jaxfinger.rig import parse_plan, parse_rig, standin
 from jaxfinger.rig.ams import AmsServer
 from jaxfinger.rig.backend import (
     CommandRefused,
@@ -267,20 +268,19 @@ def test_faults_over_the_wire_end_the_trial_and_keep_it(lockstep, record, fault)
 
 
 def test_the_controllers_own_trip_ends_the_trial_with_its_cause(lockstep, record):
-    """A rig file that knows no stop before 140°: the host sees nothing wrong, the controller does."""
+    """A rig file that knows no stop before 170°: the host sees nothing wrong when a tendon pulls the MCP past 92°."""
     rig = ads_rig(lockstep)
-    wide = rig.description.text.replace("limits_deg = [-8.0, 102.0]", "limits_deg = [-8.0, 140.0]")
-    wide = wide.replace("joint_velocity_max_deg_s = 600.0", "joint_velocity_max_deg_s = 5000.0")
-    rig.description = parse_rig(wide)
-    slot = rig.description.channels[rig.description.index("joint_position", "PIP")].slot
-    outcome = record(rig, lambda r: r.inject("spike", slot, amount=1.5))
-    assert "the controller stopped: joint beyond its limits (joint_position PIP = 1.8" in outcome.cause
-    assert outcome.complete == ("01-ID.2-DIP",)
+    rig.description = parse_rig(re.sub("limits_deg = .*", "limits_deg = [-90.0, 170.0]", rig.description.text))
+    trial = 'experiment = "VD.3"\nmean = [3.0, 3.0, 11.0, 3.0]\namplitude = 2.0\nposture_deg = [75.0, 20.0, 20.0]'
+    plan = parse_plan(f'[plan]\nname = "into the stop"\n[[trial]]\n{trial}\nseconds = 20.0\n', rig.description)
+    outcome = record(rig, plan=plan)
+    assert "01-VD.3: the controller stopped: joint beyond its limits (joint_position MCP = 1.6" in outcome.cause
     with h5py.File(outcome.session) as file:
-        attributes = file["trials/02-ID.4-T3-MCP"].attrs
+        attributes, angle = file["trials/01-VD.3"].attrs, file["trials/01-VD.3/q"][:, 0]
         assert attributes["trip"] == Trip.POSITION
         assert attributes["cause"] in outcome.cause
         events = [json.loads(e) for e in file["rig/events"].asstr()[()]]
+    assert np.degrees(angle[-1]) == pytest.approx(92.0, abs=0.5)
     assert [(e["kind"], "joint beyond its limits" in e["text"]) for e in events] == [("trip", True)]
 
 

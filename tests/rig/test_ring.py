@@ -100,9 +100,20 @@ def test_another_program_is_refused(rig, field, value, says):
         machine.connect()
 
 
-def test_limits_looser_than_the_controllers_are_refused():
-    machine = SimulatedRig(parse_rig(rig_toml().replace("tension_max = 18.0", "tension_max = 25.0")))
-    with pytest.raises(UserError, match=r"'tension_max' = 25 is looser than the controller's 20"):
+@pytest.mark.parametrize(
+    ("limit", "loose", "says"),
+    [
+        ("tension_max = 18.0", "tension_max = 25.0", "'tension_max' = 25 is looser than the controller's 20"),
+        (
+            "max_deg_s = 600.0",
+            "max_deg_s = 700.0",
+            "'joint_velocity_max_deg_s' = 700 is looser than the controller's 601",
+        ),
+    ],
+)
+def test_limits_looser_than_the_controllers_are_refused(limit, loose, says):
+    machine = SimulatedRig(parse_rig(rig_toml().replace(limit, loose)))
+    with pytest.raises(UserError, match=says):
         machine.connect()
 
 
