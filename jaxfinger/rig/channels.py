@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from jaxtyping import Float
@@ -104,6 +105,10 @@ class RigDescription:
     allow_filtered: bool
     text: str
     path: str = ""
+
+    def fail(self, table: str, key: str, message: str) -> NoReturn:
+        """Raise UserError at the line of a key of the rig file."""
+        Table(Path(self.path), self.text, {}, table).fail(key, message)
 
     @property
     def slots(self) -> list[int]:

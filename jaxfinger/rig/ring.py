@@ -88,9 +88,11 @@ class RingRig(Rig):
                 )
         cycle = 1e9 / self.description.rate_hz
         if abs(int(info["cycle_ns"]) - cycle) > 1e-3 * cycle:
-            raise UserError(
-                f"the controller samples every {int(info['cycle_ns'])} ns, but the rig file says rate_hz = "
-                f"{self.description.rate_hz:g}; mend 'rate_hz' or the task's cycle."
+            self.description.fail(
+                "rig",
+                "rate_hz",
+                f"the controller samples every {int(info['cycle_ns'])} ns, which is not rate_hz = "
+                f"{self.description.rate_hz:g}; mend 'rate_hz' or the task's cycle.",
             )
         self.ring, self._program = int(info["ring_length"]), bytes(info["program"]).decode(errors="replace")
         self._compare_limits()
@@ -108,10 +110,9 @@ class RingRig(Rig):
         ):
             allowed, wanted = float(hard[name]), getattr(soft, name)
             if not allowed >= wanted - 1e-9:
-                raise UserError(
-                    f"the rig file's '{name}{suffix}' = {wanted * unit:g} is looser than the controller's "
-                    f"{allowed * unit:g}; lower it in [limits]."
-                )
+                key = f"{name}{suffix}"
+                looser = f"'{key}' = {wanted * unit:g} is looser than the controller's {allowed * unit:g}; lower it."
+                self.description.fail("limits", key, looser)
 
     # samples ----------------------------------------------------------------------------------------------------
     def read_block(self, timeout: float) -> Block:

@@ -113,7 +113,8 @@ def test_another_program_is_refused(rig, field, value, says):
 )
 def test_limits_looser_than_the_controllers_are_refused(limit, loose, says):
     machine = SimulatedRig(parse_rig(rig_toml().replace(limit, loose)))
-    with pytest.raises(UserError, match=says):
+    line = 1 + rig_toml().splitlines().index(next(row for row in rig_toml().splitlines() if limit in row))
+    with pytest.raises(UserError, match=rf"rig\.toml, line {line}: {says}"):
         machine.connect()
 
 
