@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxfinger.data.filtering import block_mean, blocks, smooth
+from jaxfinger.data.filtering import block_mean, blocks, low_pass, smooth
 from jaxfinger.data.schema import MEASURED
 from jaxfinger.data.session import Trial
 
@@ -30,7 +30,7 @@ def directions(
     last direction. Travel and not speed decides, because a slow sweep is no faster than a still sensor's noise.
     Before the first motion, and in columns that are NaN, the direction is 0.
     """
-    filtered = smooth(time, x, cutoff_hz)[0]
+    filtered = low_pass(time, x, cutoff_hz)
     return np.stack([_zigzag(column, threshold) for column in filtered.T], axis=1)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
-from jaxfinger.data import Predictions, Session, Trial, find_holds, outlier_mask, shrink, smooth
+from jaxfinger.data import Predictions, Session, Trial, find_holds, low_pass, outlier_mask, shrink, smooth
 from jaxfinger.errors import UserError
 from jaxfinger.experiments.table import (
     CLEAR,
@@ -105,9 +105,9 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         # (errors in variables): where q̈ does not rise above it, its mean over a tenth of a second takes its place.
         qdd = shrink(qdd, round(0.1 / step))
         joint_direction, tendon_direction, tension = (
-            smooth(trial.time, a, cutoff)[0] for a in (joint_direction, tendon_direction, tension)
+            low_pass(trial.time, a, cutoff) for a in (joint_direction, tendon_direction, tension)
         )
-        y = {c: smooth(trial.time, values, cutoff)[0] for c, values in y.items()}
+        y = {c: low_pass(trial.time, values, cutoff) for c, values in y.items()}
     M = N // block
 
     def mean(a):

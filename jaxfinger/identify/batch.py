@@ -7,6 +7,7 @@ A member that fails or does not converge is named and leaves the rest as they ar
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
@@ -27,6 +28,7 @@ from jaxfinger.identify.solve import SMALL
 from jaxfinger.model import Model
 
 STEPS = 12
+AT_ONCE = 10  # sessions in one call: while the device fits them, the next are read and filtered
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,8 @@ class _Source(NamedTuple):
 
     batch: Batch  # every array with the members first
     filters: Filters
-    basis: Float[Array, "k q"]  # rows of the basis for the parameters that the experiment depends on
+    basis: Float[Array, "k c"]  # rows of the basis for the parameters that the experiment depends on
+    columns: Int[Array, " c"]  # coordinates that move any of them
     free: Free
     reads: Float[Array, " S"]
 
@@ -61,12 +64,17 @@ def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: 
         UserError: a session has another protocol, another finger or other links than the template's.
     """
     compressed = compress(of, template)
-    sources = _stack_sessions(sessions, template, compressed)
     prior = (compressed.grams.H[-1], compressed.grams.reads[:, -1])
-    members = _fit_all(
-        template.model, sources, jnp.asarray(compressed.basis), compressed.sizes, prior, batching_here(batching)
-    )
-    values, std, sound, steps = (np.array(a) for a in members)
+    basis, how = jnp.asarray(compressed.basis), batching_here(batching)
+    at_once = min(len(sessions), AT_ONCE)
+    with ThreadPoolExecutor(1) as device:
+        shares = []
+        for k in range(0, len(sessions), at_once):
+            share = [*sessions[k : k + at_once], *sessions[: max(0, k + at_once - len(sessions))]]  # all of one length
+            sources = _stack_sessions(share, template, compressed)
+            shares.append(device.submit(_fit_all, template.model, sources, basis, compressed.sizes, prior, how))
+    columns = zip(*(s.result() for s in shares), strict=True)
+    values, std, sound, steps = (np.concatenate(a)[: len(sessions)] for a in columns)
     values[~sound], std[~sound] = np.nan, np.nan
     return Members(values, std, ~sound, steps, template)
 
@@ -84,12 +92,14 @@ def _stack_sessions(sessions: Sequence[Session], template: Fit, compressed: Comp
             batches.append(stacks[e].batch)
         T = max(b.x.time.shape[-1] for b in batches)
         whole = jax.tree.map(lambda *a: jnp.stack(a), *(_padded(b, T) for b in batches))
+        columns = np.flatnonzero(np.any(compressed.basis[positions] != 0.0, axis=0))
         filters = {c: jnp.asarray(template.noise[e, c].coefficients) for c in reads[e]}
         out.append(
             _Source(
                 whole,
                 filters,
-                jnp.asarray(compressed.basis[positions]),
+                jnp.asarray(compressed.basis[np.ix_(positions, columns)]),
+                jnp.asarray(columns),
                 Free.at(template.model, positions),
                 jnp.array([float(e in r) for r, _ in plan]),
             )
@@ -128,26 +138,27 @@ def _fit(model: Model, sources: list[_Source], basis, sizes, prior):
         H = prior_reads[:, None, None] * (shift.T @ prior_gram @ shift)
         at = with_flat(model, start + basis @ z)
         for s in sources:
-            H = H + s.reads[:, None, None] * _gram(at, s)
+            own = jnp.append(s.columns, q)
+            H = H.at[:, own[:, None], own].add(s.reads[:, None, None] * _gram(at, s))
         return H
 
     def step(state):
-        z, _, k, _ = state
-        dz, _, sound = staged_step(stages(z), sizes, jnp.zeros(sizes[0]))
-        return z + dz, jnp.max(jnp.abs(dz)), k + 1, sound & jnp.all(jnp.isfinite(dz))
+        z, _, _, k, _ = state
+        dz, covariance, sound = staged_step(stages(z), sizes, jnp.zeros(sizes[0]))
+        return z + dz, covariance, jnp.max(jnp.abs(dz)), k + 1, sound & jnp.all(jnp.isfinite(dz))
 
     def going(state):
-        _, size, k, sound = state
+        _, _, size, k, sound = state
         return sound & (size > SMALL) & (k < STEPS)
 
-    z, size, k, sound = jax.lax.while_loop(going, step, (jnp.zeros(q), jnp.inf, 0, jnp.array(True)))
-    _, covariance, _ = staged_step(stages(z), sizes, jnp.zeros(sizes[0]))
+    start_state = (jnp.zeros(q), jnp.zeros((q, q)), jnp.inf, 0, jnp.array(True))
+    z, covariance, size, k, sound = jax.lax.while_loop(going, step, start_state)
     variance = jnp.sum((basis @ covariance) * basis, axis=1)
     return start + basis @ z, jnp.sqrt(jnp.maximum(variance, 0.0)), sound & (size <= SMALL), k
 
 
-def _gram(model: Model, source: _Source) -> Float[Array, "q+1 q+1"]:
-    """[J r]ᵀ[J r] of one experiment, J in the coordinates of the stages."""
+def _gram(model: Model, source: _Source) -> Float[Array, "c+1 c+1"]:
+    """[J r]ᵀ[J r] of one experiment, J in the coordinates that bear on it."""
     theta = source.free.get(model)
 
     def rows(dz):

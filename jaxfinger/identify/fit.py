@@ -100,8 +100,14 @@ class Fit:
         seen = np.isfinite(np.diag(self.covariance))
         covariance = np.where(np.outer(seen, seen), self.covariance, 0.0)
         positions = np.flatnonzero(np.diag(covariance) > 0)
-        value = f(self.model)
-        J = jax.jacfwd(lambda t: f(with_flat(self.model, flat.at[positions].set(t))))(flat[positions])
-        J = np.asarray(J)
+
+        @jax.jit
+        def value_and_jacobian(theta):
+            def of(t):
+                return f(with_flat(self.model, flat.at[positions].set(t)))
+
+            return of(theta), jax.jacfwd(of)(theta)
+
+        value, J = map(np.asarray, value_and_jacobian(flat[positions]))
         variance = np.einsum("...i,ij,...j->...", J, covariance[np.ix_(positions, positions)], J)
-        return np.asarray(value), np.sqrt(np.maximum(variance, 0.0))
+        return value, np.sqrt(np.maximum(variance, 0.0))

@@ -16,6 +16,7 @@ from jaxfinger.effects import CatalogueEffect
 from jaxfinger.model import Model
 
 
+@eqx.filter_jit
 def ravel(model: Model) -> Float[Array, " P"]:
     """Every floating-point leaf of the model, flat."""
     return jnp.concatenate([jnp.ravel(leaf) for leaf in _leaves(model)])
@@ -49,11 +50,13 @@ class Free(eqx.Module):
             tuple(jnp.asarray(e) for e in within.values() if e.size),
         )
 
+    @eqx.filter_jit
     def get(self, model: Model) -> Float[Array, " p"]:
         """The free parameters of a model."""
         leaves = _leaves(model)
         return jnp.concatenate([leaves[i].ravel()[e] for i, e in zip(self.leaves, self.entries, strict=True)])
 
+    @eqx.filter_jit
     def set(self, model: Model, theta: Float[Array, " p"]) -> Model:
         """The model with its free parameters set to `theta`."""
         arrays, rest = eqx.partition(model, eqx.is_inexact_array)

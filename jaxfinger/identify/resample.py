@@ -188,7 +188,8 @@ def staged_step(
         L = jnp.linalg.cholesky(stage[own, own])
         sound &= jnp.all(jnp.diagonal(L) > PIVOT)  # false for NaN too
         # K of the earlier stages' errors, and the step
-        solved = jax.scipy.linalg.cho_solve((L, True), stage[own])
+        right = jnp.concatenate([stage[own, :start], stage[own, -1:]], axis=1)
+        solved = jax.scipy.linalg.cho_solve((L, True), right)
         K = solved[:, :start]
         z = jnp.concatenate([z, -solved[:, -1] - K @ z])
         cross = K @ covariance

@@ -10,6 +10,7 @@ parameters and J_O of the others, whose covariance is Σ_OO,
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -86,8 +87,6 @@ def nominal_model(session: Session, recipe: Recipe) -> Model:
         friction_degree=r.friction_degree,
     )
     if "gravity" not in r.terms:
-        import equinox as eqx
-
         model = eqx.tree_at(lambda m: m.finger.gravity, model, jnp.zeros(3))
     return model
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.signal import butter, sosfilt, sosfilt_zi
 
-from jaxfinger.data import Session, Trial, smooth
+from jaxfinger.data import Session, Trial, low_pass
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Stack, predict, prepare
 from jaxfinger.identify.fit import Fit
@@ -335,4 +335,4 @@ def _encoder(trial: Trial, k: int) -> float:
     """Scatter of an encoder about its own smooth motion, rad."""
     step = float(np.median(np.diff(trial.time)))
     q = trial.q[:, k]
-    return float(np.std(q - smooth(trial.time, q, min(20.0, 0.2 / step))[0]))
+    return float(np.std(q - low_pass(trial.time, q, min(20.0, 0.2 / step))))
