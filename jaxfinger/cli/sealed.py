@@ -8,6 +8,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -72,24 +73,43 @@ def rivals(folder: Path, *, truth: Path | None = None, workers: int | None = Non
 
 
 def run(
-    folder: Path, *, output: Output = None, command: str = DIAGNOSE, workers: int | None = None, share: str = "1/1"
+    folder: Path,
+    *,
+    output: Output = None,
+    command: str = DIAGNOSE,
+    withheld: bool = False,
+    truth: Path | None = None,
+    workers: int | None = None,
+    share: str = "1/1",
 ) -> None:
     """Diagnose every case of FOLDER, each from a lone copy of its fit.h5. Cases that are done are skipped.
 
     Args:
         folder: the cases.
-        output: where each case's gap.json goes; by default a folder beside it, named FOLDER-diagnoses.
+        output: where each case's gap.json goes; by default a folder beside it, named FOLDER-diagnoses, or
+            FOLDER-withheld.
+        withheld: diagnose the cases with one effect, with that effect taken out of the catalogue: what is said then?
+        truth: what `make` hid, by default FOLDER-truth; read with --withheld only, by this command and not by what
+            diagnoses.
         command: what diagnoses; {fit} and {out} stand for the session and the folder to write.
         workers: cases at a time; by default as many as there are cores.
         share: this machine's part of the work, for example 2/8.
     """
     from jaxfinger.sealed.run import Command, run_cases
+    from jaxfinger.sealed.truth import read_truth
 
     if "{fit}" not in command or "{out}" not in command:
         raise UserError(f"--command {command!r}: it must hold {{fit}} and {{out}}, as in {DIAGNOSE!r}")
-    out = output or _beside(folder, "diagnoses")
+    out, diagnose, one_by_one = (
+        output or _beside(folder, "withheld" if withheld else "diagnoses"),
+        Command(command),
+        None,
+    )
+    if withheld:
+        truths = [read_truth(f.parent, truth or _beside(folder, "truth")) for f in sorted(folder.glob("*/fit.h5"))]
+        one_by_one = {t.name: diagnose.without([t.causes[0][0]]) for t in truths if t.kind == "listed"}
     with _bar("diagnosing") as progress:
-        results = run_cases(folder, out, Command(command), workers or os.cpu_count() or 1, _share(share), progress)
+        results = run_cases(folder, out, diagnose, workers or os.cpu_count() or 1, _share(share), progress, one_by_one)
     failed = sorted(name for name, what in results.items() if what == "failed")
     print(
         f"{out}: {len(results) - len(failed)} diagnosed"
@@ -116,7 +136,8 @@ def close(folder: Path, *, diagnoses: Path | None = None, command: str = PREDICT
 
 
 def score(folder: Path, *, diagnoses: Path | None = None, truth: Path | None = None, output: Output = None) -> None:
-    """Print every score of the diagnosis on FOLDER's cases, with intervals, confusions and reliability.
+    """Print every score of the diagnosis on FOLDER's cases, with intervals, confusions and reliability; and what stands
+    in for effects that were withheld, where `run --withheld` has been.
 
     Args:
         folder: the cases.
@@ -127,8 +148,8 @@ def score(folder: Path, *, diagnoses: Path | None = None, truth: Path | None = N
     from rich.console import Console
 
     from jaxfinger.sealed.figures import reliability_diagram
-    from jaxfinger.sealed.score import score_folder
-    from jaxfinger.sealed.tables import render
+    from jaxfinger.sealed.score import imitators, score_folder
+    from jaxfinger.sealed.tables import render, render_imitators
 
     results = diagnoses or _beside(folder, "diagnoses")
     if not results.is_dir():
@@ -139,9 +160,13 @@ def score(folder: Path, *, diagnoses: Path | None = None, truth: Path | None = N
             f"{results}: holds no diagnosis of a case in {folder}; run them first with: jaxfinger sealed run {folder}"
         )
     Console().print(render(scores))
+    stand_ins = imitators(folder, _beside(folder, "withheld"), truth or _beside(folder, "truth"))
+    if stand_ins:
+        Console().print(render_imitators(stand_ins))
     if output:
         output.mkdir(parents=True, exist_ok=True)
-        (output / "scores.json").write_text(json.dumps(scores.to_json(), indent=1))
+        both = scores.to_json() | {"withheld": [asdict(r) for r in stand_ins]}
+        (output / "scores.json").write_text(json.dumps(both, indent=1))
         reliability_diagram(scores.reliability, output / "reliability.svg")
         print(f"{output}: scores.json, reliability.svg")
 

@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +28,10 @@ class Command:
     """A shell command line with {fit} and {out}, for example `jaxfinger diagnose {fit} -o {out}`."""
 
     line: str
+
+    def without(self, effects: Sequence[str]) -> Command:
+        """The same with effects taken out of the catalogue."""
+        return Command(" ".join([self.line, *(f"--without {shlex.quote(e)}" for e in effects)]))
 
     def __call__(self, fit: Path, out: Path) -> None:
         words = [w.format(fit=fit, out=out) for w in shlex.split(self.line)]
@@ -114,9 +118,12 @@ def run_cases(
     workers: int = 1,
     share: tuple[int, int] = (1, 1),
     progress: Callable[[int, int, str], None] | None = None,
-    names: Sequence[str] | None = None,
+    diagnose_of: Mapping[str, Diagnose] | None = None,
 ) -> dict[str, str]:
-    """Diagnose every case of a folder, or share i of n of them; returns what became of each."""
+    """Diagnose every case of a folder, or share i of n of them; returns what became of each.
+
+    With `diagnose_of` only the cases that it names, each in its own way.
+    """
     folders = sorted(f.parent for f in cases.glob("*/fit.h5"))
     if not folders:
         raise UserError(
@@ -125,18 +132,19 @@ def run_cases(
     mine = [
         f
         for k, f in enumerate(folders, start=1)
-        if k % share[1] == share[0] % share[1] and (names is None or f.name in names)
+        if k % share[1] == share[0] % share[1] and (diagnose_of is None or f.name in diagnose_of)
     ]
+    how = {f: diagnose_of[f.name] if diagnose_of else diagnose for f in mine}
     results: dict[str, str] = {}
     if workers == 1:
         for f in mine:
-            results[f.name] = run_case(diagnose, f, out)
+            results[f.name] = run_case(how[f], f, out)
             if progress:
                 progress(len(results), len(mine), f"{f.name} {results[f.name]}")
         return results
     pool = ThreadPoolExecutor(workers) if isinstance(diagnose, Command) else ProcessPoolExecutor(workers)
     with pool:
-        jobs = {pool.submit(run_case, diagnose, f, out): f.name for f in mine}
+        jobs = {pool.submit(run_case, how[f], f, out): f.name for f in mine}
         for job in as_completed(jobs):
             results[jobs[job]] = job.result()
             if progress:

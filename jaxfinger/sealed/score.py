@@ -218,6 +218,32 @@ def score_folder(cases: Path, diagnoses: Path, truth_root: Path | None) -> Score
     )
 
 
+@dataclass(frozen=True)
+class Imitators:
+    """What is answered in place of an effect that the catalogue was made to lack."""
+
+    effect: str
+    unexplained: Figure  # share of the cases called unexplained, or a set
+    no_gap: int  # of the same cases: called no gap
+    answers: list[tuple[str, int]]  # what was named instead, most often first
+
+
+def imitators(cases: Path, withheld: Path, truth_root: Path | None) -> list[Imitators]:
+    """By effect, what the diagnosis says of cases whose own effect was taken out of its catalogue."""
+    by_effect: dict[str, list[Diagnosis]] = {}
+    for folder in sorted(f.parent for f in cases.glob("*/fit.h5")):
+        truth, diagnosis = read_truth(folder, truth_root), read_diagnosis(withheld / folder.name)
+        if truth.kind == "listed" and diagnosis.status != "failed":
+            by_effect.setdefault(truth.causes[0][0], []).append(diagnosis)
+    out = []
+    for effect, found in sorted(by_effect.items()):
+        open_ended = sum(d.status in ("unexplained", "ambiguous") for d in found)
+        answers = Counter(_answer_name(d) for d in found if d.answer)
+        none = sum(d.status == "no_gap" for d in found)
+        out.append(Imitators(effect, wilson(open_ended, len(found)), none, answers.most_common()))
+    return out
+
+
 def _shares(pairs: Sequence[tuple[Truth, Diagnosis]]) -> dict[str, Figure]:
     out = {}
     for name, (concerns, right) in FIGURES.items():

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from rich.console import Group
 from rich.table import Table
 
-from .score import Figure, Scores
+from .score import Figure, Imitators, Scores
 
 SHARES = (
     "cause",
@@ -61,6 +61,18 @@ def render(scores: Scores) -> Group:
             )
         parts.append(table)
     return Group(*parts)
+
+
+def render_imitators(rows: Sequence[Imitators]) -> Table:
+    """What is named in place of every effect that was withheld."""
+    table = Table(title="withheld from the catalogue", title_justify="left")
+    for column in ("effect", "cases", "unexplained, or a set", "no gap", "named instead"):
+        table.add_column(column, overflow="fold")
+    for r in rows:
+        named = "; ".join(f"{a} × {k}" if k > 1 else a for a, k in r.answers)
+        share = f"{100 * r.unexplained.value:.0f} % ({100 * r.unexplained.low:.0f} … {100 * r.unexplained.high:.0f})"
+        table.add_row(r.effect, str(r.unexplained.count), share, str(r.no_gap), named)
+    return table
 
 
 def _split_table(title: str, split: Mapping[str, Mapping[str, Figure]]) -> Table:

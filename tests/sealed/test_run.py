@@ -8,6 +8,7 @@ import pytest
 from jaxfinger.cli import sealed as cli
 from jaxfinger.errors import UserError
 from jaxfinger.sealed.run import Command, close_cases, run_case, run_cases
+from jaxfinger.sealed.score import imitators
 
 READ = "import sys, json, pathlib; o = pathlib.Path(sys.argv[2]); o.mkdir(); "
 
@@ -96,6 +97,28 @@ def test_the_commands_say_what_to_do(folder, tmp_path, capsys):
         {"value": 0.0, "low": 0.0, "high": 0.434, "count": 5}, abs=1e-3
     )
     assert (tmp_path / "scores" / "reliability.svg").exists()
+
+
+def test_withheld_effects_are_taken_out_one_by_one(folder, capsys):
+    effects = {"case-001": ["payload"], "case-002": ["payload"], "case-003": ["channel_delay"], "case-004": []}
+    effects["case-005"] = ["payload", "channel_delay"]
+    for name, found in effects.items():
+        truth = {"effects": [{"effect": e, "site": ["DIP"], "listed": True} for e in found]}
+        (folder / name / "truth.json").write_text(json.dumps(truth))
+    # Stands in for a diagnosis: names a drive inertia where the payload is lacking, and else nothing that is known.
+    says = "lacks = sys.argv[sys.argv.index('--without') + 1]; named = [dict(effect='drive_inertia', site=['DIP'])]; "
+    verdict = (
+        "dict(status='explained', effects=named) if lacks == 'payload' else dict(status='unexplained', effects=[])"
+    )
+    rest = "none=0.0, unlisted=0.0, candidates=[], ambiguous_sets=[]"
+    script = f"{READ}{says}(o / 'gap.json').write_text(json.dumps(dict(verdict={verdict}, {rest})))"
+    line = f'{sys.executable} -c "{script}" {{fit}} {{out}}'
+    cli.run(folder, command=line, withheld=True, workers=1)
+    assert "3 diagnosed" in capsys.readouterr().out
+    delay, payload = imitators(folder, folder.with_name("cases-withheld"), None)
+    assert (delay.effect, delay.unexplained.value, delay.answers) == ("channel_delay", 1.0, [])
+    assert (payload.effect, payload.unexplained.value, payload.no_gap) == ("payload", 0.0, 0)
+    assert payload.answers == [("drive_inertia (DIP)", 2)]
 
 
 def test_fresh_trials_are_predicted_only_for_a_verdict_that_names_an_effect(folder, tmp_path, monkeypatch):
