@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from jaxfinger.data import check_file, import_file, read_session
 from jaxfinger.data.sources import load_variables
 from jaxfinger.errors import UserError
 
@@ -44,7 +45,7 @@ def test_mcap_cut_short_is_read_to_the_cut(tmp_path):
     np.testing.assert_array_equal(position, np.arange(len(position))[:, None] * [0.1, -0.2])
 
 
-def test_rosbag2_with_joint_states(tmp_path):
+def write_rosbag2(path):
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -53,21 +54,68 @@ def test_rosbag2_with_joint_states(tmp_path):
         store.types[name]
         for name in ("sensor_msgs/msg/JointState", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
     )
-    with Writer(tmp_path / "bag", version=9) as writer:
+    with Writer(path, version=9) as writer:
         connection = writer.add_connection("/joint_states", state.__msgtype__, typestore=store)
         for i in range(COUNT):
             message = state(
                 header=header(stamp=clock(sec=100 + i, nanosec=500), frame_id=""),
                 name=["MCP", "PIP"],
-                position=np.array([0.1 * i, 0.2 * i]),
+                position=np.array([0.1 * i, -0.2 * i]),
                 velocity=np.zeros(2),
-                effort=np.zeros(0),
+                effort=np.array([20.0 + i]),
             )
             writer.write(connection, 2_000_000 * i, store.serialize_cdr(message, state.__msgtype__))
+
+
+def test_rosbag2_with_joint_states(tmp_path):
+    write_rosbag2(tmp_path / "bag")
     found = load_variables(tmp_path / "bag")
-    np.testing.assert_array_equal(found["/joint_states.position"], np.arange(COUNT)[:, None] * [0.1, 0.2])
+    np.testing.assert_array_equal(found["/joint_states.position"], np.arange(COUNT)[:, None] * [0.1, -0.2])
     np.testing.assert_allclose(found["/joint_states.time"], 2e-3 * np.arange(COUNT), atol=1e-9)
     np.testing.assert_allclose(np.diff(found["/joint_states.stamp"]), 1.0, atol=1e-6)
+
+
+MAPPING = """
+specimen = "bag"
+[finger]
+gravity = [0.0, 0.0, -9.81]
+fingertip = [0.03, 0.0, 0.0]
+[[finger.joints]]
+name = "MCP"
+axis = [0.0, 1.0, 0.0]
+origin = [0.0, 0.0, 0.0]
+limits = [-0.3, 1.6]
+mass = 0.02
+com = [0.02, 0.0, 0.0]
+inertia = [[1e-6, 0.0, 0.0], [0.0, 4e-6, 0.0], [0.0, 0.0, 4e-6]]
+[[finger.tendons]]
+name = "T1"
+crosses = ["MCP"]
+[trials.01-ID2]
+experiment = "ID.2"
+joint = "MCP"
+time = "TOPIC.time"
+[trials.01-ID2.channels]
+q.MCP = { from = "TOPIC.position", column = 0, units = "deg" }
+tendon_force.T1 = { from = "TOPIC.FORCE", scale = 0.1, units = "N" }
+tendon_excursion.T1 = { from = "TOPIC.position", column = 1, units = "mm" }
+"""
+
+
+@pytest.mark.parametrize(
+    ("write", "name", "topic", "force", "period"),
+    [(write_mcap, "log.mcap", "/state", "temperature", 1e-3), (write_rosbag2, "bag", "/joint_states", "effort", 2e-3)],
+)
+def test_a_bag_becomes_a_session_by_a_mapping_file(tmp_path, write, name, topic, force, period):
+    write(tmp_path / name)
+    (tmp_path / "map.toml").write_text(MAPPING.replace("TOPIC", topic).replace("FORCE", force))
+    import_file([tmp_path / name], tmp_path / "map.toml", tmp_path / "out.h5")
+    assert [f for f in check_file(tmp_path / "out.h5") if f.severity == "error"] == []
+    trial, i = read_session(tmp_path / "out.h5")["01-ID2"], np.arange(COUNT)
+    np.testing.assert_allclose(trial.time, period * i, atol=1e-9)
+    np.testing.assert_allclose(trial.q[:, 0], np.deg2rad(0.1 * i), atol=1e-12)
+    np.testing.assert_allclose(trial.tendon_force[:, 0], 2.0 + 0.1 * i, atol=1e-12)
+    np.testing.assert_allclose(trial.tendon_excursion[:, 0], -2e-4 * i, atol=1e-12)
 
 
 def test_a_damaged_bag_is_refused(tmp_path):
