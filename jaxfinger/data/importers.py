@@ -273,7 +273,7 @@ def _variable(spec: Any, variables: Variables, where: Where) -> np.ndarray:
         where.fail(f"reads the variable {name!r}, which the recording has not; it has {listed(sorted(variables), 30)}")
     values = variables[name]
     if values.ndim == 2:
-        column = spec.get("column")
+        column = spec.get("column", 0 if values.shape[1] == 1 else None)
         if not isinstance(column, int) or not 0 <= column < values.shape[1]:
             where.fail(f"reads {name!r}, which has {values.shape[1]} columns; choose one by `column`, from 0")
         values = values[:, column]
