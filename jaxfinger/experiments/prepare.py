@@ -117,13 +117,14 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     slack = np.percentile(tension_mean, 95, axis=0) < SLACK
     tension_mean[:, slack | spec.slack] = 0.0
     hold = _whole(holds, M, block)
+    q_mean = mean(q)
     if spec.held:
-        tension_mean = _in_steps(tension_mean, hold)
+        tension_mean, q_mean = _in_steps(tension_mean, hold), _at_rest(q_mean, hold)
     start = trial.session_start if trial.session_start is not None else 0.0
     time = mean(trial.time)
     motion = {
         "time": time,
-        "q": mean(q).T,
+        "q": q_mean.T,
         "qd": mean(qd).T,
         "qdd": mean(qdd).T,
         "tension": tension_mean.T,
@@ -234,6 +235,14 @@ def _in_steps(tension: np.ndarray, hold: np.ndarray) -> np.ndarray:
     out = kept + np.sign(beyond) * np.maximum(np.abs(beyond) - 4.0 * noise, 0.0)
     for mean, (_, run) in zip(means[1:], runs, strict=False):
         out[run] = mean
+    return out
+
+
+def _at_rest(q: np.ndarray, hold: np.ndarray) -> np.ndarray:
+    """(N, m): at a hold of a held joint its mean: what moves there is the encoder's noise, and f(q) has none of it."""
+    out = q.copy()
+    for h in np.unique(hold[hold >= 0]):
+        out[hold == h] = q[hold == h].mean(axis=0)
     return out
 
 
