@@ -21,7 +21,7 @@ from jaxfinger.identify.linearise import linearise
 from jaxfinger.identify.noise import Noise, estimate
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.solve import Prior, Solution, Source, solve
-from jaxfinger.identify.stages import DEPENDS, cad_covariance, first_noise, nominal_model
+from jaxfinger.identify.stages import DEPENDS, cad_covariance, first_noise, free_groups, nominal_model, start_values
 from jaxfinger.model import Model
 
 Progress = Callable[[str], None]
@@ -123,7 +123,6 @@ def build(
     cad = [i for i, p in enumerate(parameters) if p.group in ("mass", "com") and fit.covariance[i, i] > 0]
     cad = np.setdiff1d(cad, fit.estimated)
     free = np.union1d(fit.estimated, cad).astype(int)
-    prior = _cad_prior(session, recipe, free, parameters)
     noise = dict(fit.noise)
     sources = {e: _source(stacks[e], noise, parameters) for e in stacks}
     for e, stack in stacks.items():
@@ -135,7 +134,9 @@ def build(
             )
             noise |= {(e, c): estimate(stack, c, np.asarray(lin.residuals[c])) for c in missing}
     sources = {e: _source(stacks[e], noise, parameters) for e in stacks}
-    nominal, solution = solve(fit.model, free, sources, prior)
+    start, free = _with_missing_stages(fit, free, sources, parameters)
+    prior = _cad_prior(session, recipe, free, parameters)
+    nominal, solution = solve(start, free, sources, prior)
 
     rows = layouts(stacks, sources)
     r, J = assemble(solution, sources, rows, free, ravel(nominal).size)
@@ -185,6 +186,27 @@ def assemble(
         full[:, sources[e].positions] = -np.asarray(lin.jacobian).reshape(-1, lin.jacobian.shape[-1])[keep]
         J.append(full[:, free])
     return np.concatenate(r), np.concatenate(J)
+
+
+def _with_missing_stages(
+    fit: Fit, free: np.ndarray, sources: dict[str, Source], parameters
+) -> tuple[Model, np.ndarray]:
+    """A start and the free parameters, with those terms of the recipe whose experiment is missing but which others see.
+
+    Without ID.3-dynamic nobody estimates damping; VD.3 shows it all the same, and its lack is no gap.
+    """
+    groups = free_groups(fit.recipe)
+    open_ = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in set(free)]
+    start = start_values(fit.model, np.array(open_, dtype=int), parameters) if open_ else fit.model
+    seen = set()
+    for source in sources.values() if open_ else ():
+        lin = linearise(start, Free.at(start, source.positions), source.batch, source.filters, _ones(source))
+        seen |= set(source.positions[np.any(np.asarray(lin.factor)[..., :-1] != 0.0, axis=(0, 1))])
+    added = np.array([i for i in open_ if i in seen], dtype=int)
+    unseen = np.setdiff1d(open_, added).astype(int)
+    if unseen.size:
+        start = Free.at(start, unseen).set(start, Free.at(fit.model, unseen).get(fit.model))
+    return start, np.union1d(free, added).astype(int)
 
 
 def _cad_prior(session: Session, recipe: Recipe, free, parameters) -> Prior:

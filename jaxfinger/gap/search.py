@@ -24,7 +24,8 @@ from jaxfinger.gap.standin import REACH, Explained, energy_left, explained
 
 Progress = Callable[[str], None]
 
-DETECT = 30.0  # log evidence that an effect needs before anything is called a gap
+DETECT = 12.0  # log evidence that an effect needs before anything is called a gap: without one, the best has 2 to 5
+FURTHER = 30.0  # and a further effect, which must not stand in for the first one's form
 LOOKS = 25.0  # ν: independent looks that evidence counts
 FORM = 0.1  # share of what an effect explains in a column, that the form of its law may miss
 ADD = 0.3  # share of what is left, that a further effect must explain
@@ -146,8 +147,8 @@ def _add(problem, groups, columns, best: Refined, chi2: float, projector, progre
         e, credit = ranked[first], float(np.maximum(drops[first] - theirs, 0.0).sum())
         # At the site of an effect that is there already, another form of it is likelier than a second cause.
         same = any(set(e.variant.site) & set(v.site) for v in chosen.variants)
-        need = max(ADD * still, 2 * DETECT, SAME_SITE * (chi2 - chosen.chi2) if same else 0.0)
-        if e.log_bf < DETECT or credit < need:
+        need = max(ADD * still, 2 * FURTHER, SAME_SITE * (chi2 - chosen.chi2) if same else 0.0)
+        if e.log_bf < FURTHER or credit < need:
             break
         progress(f"adding {e.variant.effect.ID} at {', '.join(e.variant.site)}")
         items, starts = _at_optimum(chosen)
@@ -247,7 +248,7 @@ def _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, stro
 def _nothing(ranked: list[Evidence], strongest: float, absorbed) -> Search:
     """No effect is seen above the noise: the weak evidence that there is shares what «none» leaves."""
     logs = np.array([max(e.log_bf, -5.0) for e in ranked])
-    none = float(np.clip(expit((DETECT - strongest) / 3.0), 0.5, 0.995))
+    none = float(np.clip(expit((DETECT - strongest) / 2.0), 0.5, 0.995))
     weights = np.exp(0.2 * (logs - logs.max()))
     weights *= (1 - none) * 0.7 / weights.sum()
     candidates = [Candidate(e.variant.key, float(w), 0.0, None, e) for e, w in zip(ranked, weights, strict=True)]
