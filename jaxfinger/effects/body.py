@@ -10,7 +10,11 @@ from jaxfinger.effects.base import ELASTIC, CatalogueEffect
 
 
 class Payload(CatalogueEffect):
-    """A link's mass and first moment differ from CAD by Δm and Δ(m c)."""
+    """A link's mass, first moment and inertia about its joint differ from CAD by Δm, Δ(m c) and ΔI.
+
+    A body of mass Δm at p adds Δm p and Δm |p|². Torques are linear in these three, and in these alone (Atkeson, An and
+    Hollerbach 1986): near a mass of nothing a centre of mass would not be.
+    """
 
     ID: ClassVar = "payload"
     PLACE: ClassVar = "joint"  # a link goes by its joint's name
@@ -18,6 +22,7 @@ class Payload(CatalogueEffect):
         "mass": ("kg", 3e-3, True),
         "moment_x": ("kg m", 5e-5, True),
         "moment_z": ("kg m", 2e-5, True),
+        "inertia": ("kg m2", 2e-6, True),
     }
     SHOWS: ClassVar = ELASTIC
     MOVES_RIGID_BODY: ClassVar = True
@@ -25,18 +30,33 @@ class Payload(CatalogueEffect):
     mass: Float[Array, ""]
     moment_x: Float[Array, ""]
     moment_z: Float[Array, ""]
+    inertia: Float[Array, ""]
 
     def finger(self, finger):
         i = self.index[0]
+        axis = finger.axis[i]
         mass = finger.mass[i] + self.mass
         moment = (
             finger.mass[i] * finger.com[i]
             + jnp.array([1.0, 0, 0]) * self.moment_x
             + jnp.array([0, 0, 1.0]) * self.moment_z
         )
+        about_joint = finger.inertia[i] + _steiner(finger.mass[i], finger.com[i]) + self.inertia * jnp.outer(axis, axis)
+        com = moment / mass
         return eqx.tree_at(
-            lambda f: (f.mass, f.com), finger, (finger.mass.at[i].set(mass), finger.com.at[i].set(moment / mass))
+            lambda f: (f.mass, f.com, f.inertia),
+            finger,
+            (
+                finger.mass.at[i].set(mass),
+                finger.com.at[i].set(com),
+                finger.inertia.at[i].set(about_joint - _steiner(mass, com)),
+            ),
         )
+
+
+def _steiner(mass, com):
+    """Inertia of a point mass about the frame's origin."""
+    return mass * (com @ com * jnp.eye(3) - jnp.outer(com, com))
 
 
 class GravityTilt(CatalogueEffect):

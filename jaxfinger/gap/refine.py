@@ -17,7 +17,8 @@ from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signatures import Signatures, Variant
 
 STEPS = 6
-LARGE = 3.0  # plausible sizes: the width of the prior on an amplitude
+LARGE = 3.0  # plausible sizes: the width of the prior on an amplitude in the evidence, which has Cauchy's tails
+WIDE = 10.0  # plausible sizes: the width of the prior that keeps amplitudes that no trial sees near nothing
 ADDITIVE = {"phi", "place", "p", "toe"}  # shapes that move by differences; the others by factors
 FIXED = {"curvature", "end", "side", "joint_a", "joint_b", "delta", "damping"}  # shapes that are choices
 
@@ -63,19 +64,21 @@ def refine(
     signatures, projector = Signatures(problem, problem.nominal), projector or Projector(problem)
     base, slopes = _evaluate(signatures, effects, coordinates)
     r = problem.r - base
-    cost = _cost(projector, problem, r)
+    sizes = _sizes(effects, coordinates)
+    cost = _cost(projector, problem, r) + float(sizes @ sizes)
+    prior = np.array([WIDE**-2 if c.amplitude else 1.0 for c in coordinates])
     for _ in range(STEPS):
         rt = projector.residual(problem, r)
         St = projector(slopes)
-        prior = np.array([LARGE**-2 if c.amplitude else 1.0 for c in coordinates])
         G = St @ St.T
-        delta = np.linalg.solve(G + np.diag(prior), St @ rt)
+        delta = np.linalg.solve(G + np.diag(prior), St @ rt - sizes / WIDE)
         moved = False
         for _ in range(4):
             trial_effects = _moved(effects, coordinates, delta)
             trial_base, trial_slopes = _evaluate(signatures, trial_effects, coordinates)
             trial_r = problem.r - trial_base
-            trial_cost = _cost(projector, problem, trial_r)
+            trial_sizes = _sizes(trial_effects, coordinates)
+            trial_cost = _cost(projector, problem, trial_r) + float(trial_sizes @ trial_sizes)
             if trial_cost < cost:
                 moved = True
                 break
@@ -83,7 +86,7 @@ def refine(
         if not moved:
             break
         gain = cost - trial_cost
-        effects, slopes, r, cost = trial_effects, trial_slopes, trial_r, trial_cost
+        effects, slopes, r, sizes, cost = trial_effects, trial_slopes, trial_r, trial_sizes, trial_cost
         if gain < 0.1 + 1e-4 * max(chi2_null - cost, 0.0):
             break
     St = projector(slopes)
@@ -93,24 +96,34 @@ def refine(
     for c, v in zip(coordinates, np.sqrt(np.maximum(np.diag(covariance), 0.0)), strict=True):
         value = float(getattr(effects[c.effect], c.name))
         std[c.effect][c.name] = float(v * c.unit if c.amplitude or c.name in ADDITIVE else v * value)
-    # A term that the recipe left out has the size of what it was; an effect beside the nominal terms is not much larger
-    # than plausible.
-    sizes = [
-        float(getattr(effects[c.effect], c.name)) / c.unit
-        for c in coordinates
-        if c.amplitude and effects[c.effect].ID not in NOMINAL_TERMS
-    ]
-    occam = 0.5 * np.linalg.slogdet(np.eye(len(G)) + G)[1] + 0.5 * float(np.sum(np.square(sizes))) / LARGE**2
+    chi2 = cost - float(sizes @ sizes)
+    tails = float(np.sum(np.log1p(np.square(sizes * WIDE / LARGE))))
+    occam = 0.5 * np.linalg.slogdet(np.eye(len(G)) + G)[1] + tails
     residual = projector.residual(problem, r)[: r.size]
     return Refined(
         tuple(variants),
         tuple(effects),
         tuple(std),
-        cost,
-        float(0.5 * (chi2_null - cost) - occam),
+        chi2,
+        float(0.5 * (chi2_null - chi2) - occam),
         residual,
         problem.r - r,
         slopes,
+    )
+
+
+def _sizes(effects, coordinates: list[_Coordinate]) -> Float[np.ndarray, " k"]:
+    """Amplitudes in units of WIDE plausible sizes; zero for shapes.
+
+    Zero too for a term that the recipe left out: it has the size of what it was.
+    """
+    return np.array(
+        [
+            float(getattr(effects[c.effect], c.name)) / (WIDE * c.unit)
+            if c.amplitude and effects[c.effect].ID not in NOMINAL_TERMS
+            else 0.0
+            for c in coordinates
+        ]
     )
 
 

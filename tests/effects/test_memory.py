@@ -1,5 +1,6 @@
 """Memory operators against loops that integrate the differential equations of their docstrings in tiny steps."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +12,7 @@ from jaxfinger.effects import CATALOGUE
 from jaxfinger.effects.base import dahl, rate
 from jaxfinger.model import excursion, memories
 from jaxfinger.model.dynamics import terms
+from jaxfinger.model.rigid_body import inverse_dynamics
 from tests.effects.motion import MODEL, motion, with_effects
 
 FINGER = MODEL.finger
@@ -134,11 +136,32 @@ def test_rate_is_zero_where_time_stands_still():
     np.testing.assert_allclose(rate(jnp.array([0.0, 1, 2, 2, 2]), time)[-1], 0.0)
 
 
-def test_payload_is_the_finger_with_another_mass():
-    i = 2
-    effect = CATALOGUE["payload"].at(FINGER, (FINGER.joint_names[i],), mass=2e-3, moment_x=3e-5, moment_z=-1e-5)
-    loaded = effect.finger(FINGER)
-    assert float(loaded.mass[i] - FINGER.mass[i]) == pytest.approx(2e-3)
-    added = loaded.mass[:, None] * loaded.com - FINGER.mass[:, None] * FINGER.com
-    np.testing.assert_allclose(added[i], [3e-5, 0, -1e-5], atol=1e-17)
-    np.testing.assert_allclose(np.delete(added, i, 0), 0, atol=1e-17)
+def test_payload_is_a_body_screwed_to_a_link():
+    """A small body at p on the link: composite mass, centre of mass, and inertia by the parallel axes."""
+    i, m, p = 1, 2e-3, np.array([0.012, 0.0, -0.004])
+    effect = CATALOGUE["payload"].at(
+        FINGER, (FINGER.joint_names[i],), mass=m, moment_x=m * p[0], moment_z=m * p[2], inertia=m * p @ p
+    )
+    M, c = float(FINGER.mass[i]), np.asarray(FINGER.com[i])
+    com = (M * c + m * p) / (M + m)
+
+    def point(mass, at):
+        return mass * (at @ at * np.eye(3) - np.outer(at, at))
+
+    composite = eqx.tree_at(
+        lambda f: (f.mass, f.com, f.inertia),
+        FINGER,
+        (
+            FINGER.mass.at[i].set(M + m),
+            FINGER.com.at[i].set(com),
+            FINGER.inertia.at[i].add(point(M, c - com) + point(m, p - com)),
+        ),
+    )
+    found = inverse_dynamics(effect.finger(FINGER), X.q, X.qd, X.qdd)
+    bare = inverse_dynamics(FINGER, X.q, X.qd, X.qdd)
+    np.testing.assert_allclose(found, inverse_dynamics(composite, X.q, X.qd, X.qdd), atol=1e-12)
+    half = effect.at(
+        FINGER, effect.site, **{n: 0.5 * float(getattr(effect, n)) for n in ("mass", "moment_x", "moment_z", "inertia")}
+    )
+    linear = inverse_dynamics(half.finger(FINGER), X.q, X.qd, X.qdd)
+    np.testing.assert_allclose(linear, 0.5 * (found + bare), atol=1e-12)

@@ -46,7 +46,7 @@ def test_prior_rows_weigh_like_measurements(problem):
 
 
 def test_evidence_of_signed_amplitudes_is_the_gaussian_marginal_likelihood(problem):
-    variant = Variant(CATALOGUE["payload"], ("MCP",), ())
+    variant = Variant(CATALOGUE["gravity_tilt"], ("base",), ())
     Z = np.random.default_rng(2).standard_normal((3, ROWS))
     projector, U = Projector(problem), complement(problem)
     found = evidence(variant, Z, projector(Z), projector.residual(problem))
@@ -79,7 +79,7 @@ def test_evidence_of_a_one_sided_amplitude_is_the_half_normal_marginal_likelihoo
 
 
 def test_what_the_nominal_parameters_imitate_is_no_evidence(problem):
-    variant = Variant(CATALOGUE["payload"], ("MCP",), ())
+    variant = Variant(CATALOGUE["gravity_tilt"], ("base",), ())
     Z = (problem.J[:, :3] @ np.random.default_rng(4).standard_normal((3, 3))).T
     projector = Projector(problem)
     found = evidence(variant, Z, projector(Z), projector.residual(problem))
