@@ -126,15 +126,14 @@ def inverse_dynamics(samples: int) -> None:
         k = model.addJoint(i, joint, pin.SE3(np.eye(3), d.origin[i]), d.joint_names[i])
         model.appendBodyToJoint(k, pin.Inertia(float(d.mass[i]), d.com[i], d.inertia[i]), pin.SE3.Identity())
     model.gravity.linear = d.gravity
-    pool = pin.ModelPool(model, 2)
     a, b, c = (np.asfortranarray(x) for x in (q, qd, qdd))
     tau = np.zeros_like(a)
-    theirs = best(lambda: pin.rneaInParallel(2, pool, a, b, c, tau))
-    error = float(np.abs(np.asarray(ours(finger, q, qd, qdd)) - tau).max())
     print(f"inverse dynamics, {samples:,} samples of {m} joints: {mine:.2f} s (compiled in {compiling:.1f} s)")
-    print(
-        f"  Pinocchio's batch call, two threads: {theirs:.2f} s, {theirs / mine:.1f} times ours; difference {error:.1g}"
-    )
+    for threads in (1, 2):
+        pool = pin.ModelPool(model, threads)
+        theirs = best(lambda n=threads, p=pool: pin.rneaInParallel(n, p, a, b, c, tau))
+        error = float(np.abs(np.asarray(ours(finger, q, qd, qdd)) - tau).max())
+        print(f"  Pinocchio, {threads} threads: {theirs:.2f} s, {theirs / mine:.1f} times ours; difference {error:.1g}")
 
 
 def stages(path: Path) -> None:
