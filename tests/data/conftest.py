@@ -91,3 +91,26 @@ def make_session() -> Session:
 @pytest.fixture(scope="session")
 def session() -> Session:
     return make_session()
+
+
+# A mapping file as far as the finger.
+ONE_JOINT = """
+specimen = "bench finger"
+[finger]
+gravity = [0.0, 0.0, -9.81]
+fingertip = [0.03, 0.0, 0.0]
+[[finger.joints]]
+name = "MCP"
+axis = [0.0, 1.0, 0.0]
+origin = [0.0, 0.0, 0.0]
+limits = [-0.3, 1.6]
+mass = 0.02
+com = [0.02, 0.0, 0.0]
+inertia = [[1e-6, 0.0, 0.0], [0.0, 4e-6, 0.0], [0.0, 0.0, 4e-6]]
+[[finger.tendons]]
+name = "T1"
+crosses = ["MCP"]
+[[finger.tendons]]
+name = "T2"
+crosses = ["MCP"]
+"""

@@ -8,6 +8,7 @@ import pytest
 from jaxfinger.data import check_file, import_file, read_session
 from jaxfinger.data.sources import load_variables
 from jaxfinger.errors import UserError
+from tests.data.conftest import ONE_JOINT
 
 COUNT = 200
 
@@ -75,23 +76,9 @@ def test_rosbag2_with_joint_states(tmp_path):
     np.testing.assert_allclose(np.diff(found["/joint_states.stamp"]), 1.0, atol=1e-6)
 
 
-MAPPING = """
-specimen = "bag"
-[finger]
-gravity = [0.0, 0.0, -9.81]
-fingertip = [0.03, 0.0, 0.0]
-[[finger.joints]]
-name = "MCP"
-axis = [0.0, 1.0, 0.0]
-origin = [0.0, 0.0, 0.0]
-limits = [-0.3, 1.6]
-mass = 0.02
-com = [0.02, 0.0, 0.0]
-inertia = [[1e-6, 0.0, 0.0], [0.0, 4e-6, 0.0], [0.0, 0.0, 4e-6]]
-[[finger.tendons]]
-name = "T1"
-crosses = ["MCP"]
-[trials.01-ID2]
+MAPPING = (
+    ONE_JOINT
+    + """[trials.01-ID2]
 experiment = "ID.2"
 joint = "MCP"
 time = "TOPIC.time"
@@ -100,6 +87,7 @@ q.MCP = { from = "TOPIC.position", column = 0, units = "deg" }
 tendon_force.T1 = { from = "TOPIC.FORCE", scale = 0.1, units = "N" }
 tendon_excursion.T1 = { from = "TOPIC.position", column = 1, units = "mm" }
 """
+)
 
 
 @pytest.mark.parametrize(

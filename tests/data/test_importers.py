@@ -9,29 +9,13 @@ import scipy.io
 
 from jaxfinger.data import check_file, import_file, read_session, smooth
 from jaxfinger.errors import UserError
+from tests.data.conftest import ONE_JOINT
 
 EMPS = Path(__file__).parents[2] / "datasets" / "emps"
 
-MAPPING = """
-specimen = "bench finger"
-[finger]
-gravity = [0.0, 0.0, -9.81]
-fingertip = [0.03, 0.0, 0.0]
-[[finger.joints]]
-name = "MCP"
-axis = [0.0, 1.0, 0.0]
-origin = [0.0, 0.0, 0.0]
-limits = [-0.3, 1.6]
-mass = 0.02
-com = [0.02, 0.0, 0.0]
-inertia = [[1e-6, 0.0, 0.0], [0.0, 4e-6, 0.0], [0.0, 0.0, 4e-6]]
-[[finger.tendons]]
-name = "T1"
-crosses = ["MCP"]
-[[finger.tendons]]
-name = "T2"
-crosses = ["MCP"]
-[trials.01-ID2]
+MAPPING = (
+    ONE_JOINT
+    + """[trials.01-ID2]
 experiment = "ID.2"
 joint = "MCP"
 time = "t"
@@ -40,6 +24,7 @@ q.MCP = { from = "enc", column = 1, units = "deg" }
 tendon_force.T1 = [{ from = "volts", scale = "gain", offset = -0.5, units = "N" }, { from = "extra", units = "mN" }]
 tendon_excursion.T1 = { from = "pull", units = "mm" }
 """
+)
 TIME = np.arange(500) / 100
 ANGLE = 0.6 + 0.5 * np.sin(TIME)
 RECORDED = {
