@@ -109,15 +109,24 @@ class TendonFrictionSaturating(CatalogueEffect):
 
 
 class TendonCrosstalk(CatalogueEffect):
-    """f_k + ε f_j: a pulled tendon j drags its neighbour k."""
+    """f_k + ε f_j: a pulled tendon j drags its neighbour k.
+
+    `behind` 0: at the actuators, so that the neighbour's friction takes its share; 1: past the friction of both.
+    """
 
     ID: ClassVar = "tendon_crosstalk"
     PLACE: ClassVar = "tendon pair"
     AMPLITUDES: ClassVar = {"epsilon": ("1", 0.05, False)}
+    SHAPES: ClassVar = {"behind": ("1", (0.0, 1.0))}
     SHOWS: ClassVar = TENSION
 
     epsilon: Float[Array, ""]
+    behind: Float[Array, ""]
 
     def tension(self, x, memory, f):
         dragged, pulled = self.index
-        return f.at[dragged].add(self.epsilon * x.tension[pulled])
+        return f.at[dragged].add((1.0 - self.behind) * self.epsilon * x.tension[pulled])
+
+    def delivered(self, x, f_j):
+        dragged, pulled = self.index
+        return f_j.at[dragged].add(self.behind * self.epsilon * f_j[pulled])

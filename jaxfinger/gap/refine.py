@@ -20,7 +20,7 @@ STEPS = 6
 LARGE = 3.0  # plausible sizes: the width of the prior on an amplitude in the evidence, which has Cauchy's tails
 WIDE = 10.0  # plausible sizes: the width of the prior that keeps amplitudes that no trial sees near nothing
 ADDITIVE = {"phi", "place", "p", "toe"}  # shapes that move by differences; the others by factors
-FIXED = {"curvature", "end", "side", "joint_a", "joint_b", "delta", "damping"}  # shapes that are choices
+FIXED = {"curvature", "behind", "end", "side", "joint_a", "joint_b", "delta", "damping"}  # shapes that are choices
 
 
 @dataclass(frozen=True)

@@ -52,14 +52,15 @@ def features(problem: Problem, experiment: str, channel: str, column: int) -> di
         travelled = since_reversal(q[i])
         for length in (0.02, 0.1):
             out["distance since reversal"] += [
-                np.exp(-np.abs(travelled) / length) * s for s in (1.0, direction[i], np.sign(travelled))
+                np.exp(-np.abs(travelled) / length) * s
+                for s in (1.0, direction[i], np.tanh(travelled / (0.1 * length)))  # no sign: that of noise is noise
             ]
     for k in taut:
         if f[k].any():
             u = f[k] / max(f[k].max(), 1e-9)
             out["tension"] += [u, u**2, np.sqrt(np.maximum(u, 0))] + [u * _unit(q[i]) for i in own]
             pulled = since_reversal(f[k])
-            out["distance since reversal"] += [np.exp(-np.abs(pulled) / 1.0) * np.sign(pulled)]
+            out["distance since reversal"] += [np.exp(-np.abs(pulled) / 1.0) * np.tanh(pulled / 0.1)]
     for i in range(finger.m):
         if i not in own:
             out["other joints"] += [_unit(q[i]), _unit(q[i]) ** 2] + [_unit(q[i]) * _unit(q[j]) for j in own]

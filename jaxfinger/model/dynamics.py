@@ -73,6 +73,8 @@ def terms(model: Model, x: Motion, memory: tuple[Memory, ...]) -> Terms:
             f_j = effect.held_tension(x, state, f_t, loss, f_j)
     else:
         f_j = f_t - tendon_direction * loss
+    for effect, _ in effects:
+        f_j = effect.delivered(x, f_j)
 
     h = model.joint_torque.elastic_torque(x.q) + model.joint_torque.damping_torque(x.qd)
     friction = model.joint_torque.friction_magnitude(x.q)

@@ -73,6 +73,10 @@ class Effect(eqx.Module):
         """Tension f_j at joints that a fixture holds, N."""
         return f_j
 
+    def delivered(self, x: Motion, f_j: Float[Array, "n *T"]) -> Float[Array, "n *T"]:
+        """Tension f_j past the tendons' friction, N."""
+        return f_j
+
     def joint_friction(
         self, x: Motion, f_j: Float[Array, "n *T"], C: Float[Array, "n m *T"], F: Float[Array, "m *T"]
     ) -> Float[Array, "m *T"]:

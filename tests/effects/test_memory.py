@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.effects.base import dahl, rate
-from jaxfinger.model import excursion, memories
+from jaxfinger.model import excursion, joint_tension, memories
 from jaxfinger.model.dynamics import terms
 from jaxfinger.model.rigid_body import inverse_dynamics
 from tests.effects.motion import MODEL, motion, with_effects
@@ -165,3 +165,14 @@ def test_payload_is_a_body_screwed_to_a_link():
     )
     linear = inverse_dynamics(half.finger(FINGER), X.q, X.qd, X.qdd)
     np.testing.assert_allclose(linear, 0.5 * (found + bare), atol=1e-12)
+
+
+@pytest.mark.parametrize("behind", [0.0, 1.0])
+def test_crosstalk_adds_to_the_neighbour_before_or_past_its_friction(behind):
+    names = FINGER.tendon_names
+    effect = CATALOGUE["tendon_crosstalk"].at(FINGER, (names[0], names[1]), epsilon=0.1, behind=behind)
+    found, bare = (joint_tension(m, X) for m in (with_effects(effect), MODEL))
+    np.testing.assert_allclose(found[1:], bare[1:], atol=1e-15)
+    f = X.tension.at[0].add((1.0 - behind) * 0.1 * X.tension[1])
+    entered = joint_tension(MODEL, eqx.tree_at(lambda x: x.tension, X, f))
+    np.testing.assert_allclose(found[0], entered[0] + behind * 0.1 * bare[1], atol=1e-12)
