@@ -7,11 +7,13 @@ time in the trial. It is the yardstick for «none of these», never the answer.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signatures import whitened
 from jaxfinger.model import Finger
 
+SMOOTHED = 15  # samples over which an angle or a tension is averaged before its reversals are looked for
 REACH = 60.0  # energy of a column that coloured noise, estimated from few repeats, can still give
 
 
@@ -49,17 +51,17 @@ def features(problem: Problem, experiment: str, channel: str, column: int) -> di
         out["q"] += [np.cos(k * np.arccos(u)) for k in range(1, 7)]
         out["qd"] += [_unit(qd[i]) ** p for p in (1, 2, 3)] + [np.exp(-np.abs(qd[i]) / 0.1)]
         out["direction"] += [direction[i] * u**p for p in range(3)]
-        travelled = since_reversal(q[i])
+        travelled = since_reversal(_calm(q[i]))
         for length in (0.02, 0.1):
             out["distance since reversal"] += [
                 np.exp(-np.abs(travelled) / length) * s
-                for s in (1.0, direction[i], np.tanh(travelled / (0.1 * length)))  # no sign: that of noise is noise
+                for s in (1.0, direction[i], np.tanh(travelled / (0.1 * length)))
             ]
     for k in taut:
         if f[k].any():
             u = f[k] / max(f[k].max(), 1e-9)
             out["tension"] += [u, u**2, np.sqrt(np.maximum(u, 0))] + [u * _unit(q[i]) for i in own]
-            pulled = since_reversal(f[k])
+            pulled = since_reversal(_calm(f[k]))
             out["distance since reversal"] += [np.exp(-np.abs(pulled) / 1.0) * np.tanh(pulled / 0.1)]
     for i in range(finger.m):
         if i not in own:
@@ -123,6 +125,13 @@ def _unit(u: np.ndarray) -> np.ndarray:
     """Onto [−1, 1]."""
     low, high = float(u.min()), float(u.max())
     return np.zeros_like(u) if high - low < 1e-9 else np.clip(2 * (u - low) / (high - low) - 1, -1, 1)
+
+
+def _calm(u: np.ndarray) -> np.ndarray:
+    """Without the noise of single samples: the residual has its share of a reading's noise, and a whitened feature that
+    turned with it would look like a law.
+    """
+    return uniform_filter1d(u, SMOOTHED, axis=-1, mode="nearest")
 
 
 def since_reversal(u: np.ndarray) -> np.ndarray:
