@@ -99,7 +99,7 @@ def solve(
             factor = _stacked(linearised, sources, size)
             offset = prior.root @ (theta - prior.mean)
             cost = 0.5 * float(factor[:, -1] @ factor[:, -1] + offset @ offset)
-            if cost > best * (1 + 1e-9) and np.any(step):
+            if not cost <= best * (1 + 1e-9) and np.any(step):  # higher, or outside of where the model is defined
                 step = 0.5 * step
                 theta = theta - step
                 model = moved.set(model, jnp.asarray(theta))
