@@ -28,6 +28,7 @@ DETECT = 12.0  # log evidence that an effect needs before anything is called a g
 FURTHER = 30.0  # and a further effect, which must not stand in for the first one's form
 LOOKS = 25.0  # ν: independent looks that evidence counts
 FORM = 0.1  # share of what an effect explains in a column, that the form of its law may miss
+MOST = 2  # effects that a verdict names: three known ones together imitate most that is not known
 ADD = 0.3  # share of what is left, that a further effect must explain
 SAME_SITE = 0.1  # share of what is explained, that a further effect at the same site must explain
 LOOKED_AT = 12  # candidates for a further effect
@@ -132,7 +133,7 @@ def _add(problem, groups, columns, best: Refined, chi2: float, projector, progre
     """
     chosen, without = best, projector.residual(problem)[: problem.r.size]
     cell = problem.column_of_row
-    while len(chosen.variants) < 3:
+    while len(chosen.variants) < MOST:
         theirs = FORM * np.maximum(np.bincount(cell, without**2 - chosen.residual**2, len(problem.columns)), 0.0)
         energies = {(x.experiment, x.channel, x.column): x.energy for x in explained(problem, chosen.residual)}
         left = np.array([energies.get(k, 0.0) for k in problem.columns])
