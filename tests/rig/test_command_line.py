@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,21 @@ def record_in(folder: Path, *more) -> list[str]:
     return command("record", folder / "plan.toml", "--rig", rig, "-o", output, *more)
 
 
+@contextmanager
+def recording(*words, **streams):
+    """A recorder that takes Ctrl-C, also where this run was started to ignore it, and that never outlives its test."""
+
+    def takes_interrupts():
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    process = subprocess.Popen(record_in(*words), preexec_fn=takes_interrupts, **streams)
+    with process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
 def wait_for_log(process: subprocess.Popen, folder: Path, size: int) -> Path:
     path = log_path(folder / "session.h5")
     while not (path.exists() and path.stat().st_size > size):
@@ -75,7 +91,7 @@ def test_record_leaves_a_session_that_check_finds_sound(bench):
 
 def test_recover_after_a_kill(bench):
     (bench / "plan.toml").write_text(LONG)
-    with subprocess.Popen(record_in(bench, "--yes"), stdout=subprocess.DEVNULL) as process:
+    with recording(bench, "--yes", stdout=subprocess.DEVNULL) as process:
         log = wait_for_log(process, bench, 300_000)
         process.kill()
     done = jaxfinger("recover", log, "--output", bench / "rescued.h5")
@@ -94,7 +110,7 @@ def test_recover_after_a_kill(bench):
 def test_control_c_ends_the_run_with_a_sentence(bench, moment):
     """Also before the first trial, while tendons are pre-tensioned for the encoders' zero."""
     (bench / "plan.toml").write_text(LONG)
-    with subprocess.Popen(record_in(bench, "--yes"), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    with recording(bench, "--yes", stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         wait_for_log(process, bench, 300_000 if moment == "trial" else 100)
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=120)
@@ -109,7 +125,7 @@ def test_control_c_ends_the_run_with_a_sentence(bench, moment):
 def test_the_stop_key_at_the_terminal(bench):
     (bench / "plan.toml").write_text(LONG)
     ours, theirs = pty.openpty()
-    with subprocess.Popen(record_in(bench), stdin=theirs, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+    with recording(bench, stdin=theirs, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
         wait_for_log(process, bench, 100_000)
         os.write(ours, b"q")
         _, errors = process.communicate(timeout=120)
