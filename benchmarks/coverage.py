@@ -19,16 +19,14 @@ from jaxfinger.synthetic import (
     clean_session,
     measure,
     nominal_model,
-    paper_finger,
-    polynomial_finger,
-    random_finger,
     recipe_from,
+    study_finger,
 )
 
 
 def study(sessions: int, joints: int = 1, joint: bool = False):
     """`(z (sessions, p), ratio of spread to stated (p,), names)` over seeded sessions of a polynomial specimen."""
-    specimen = polynomial_finger(paper_finger() if joints == 3 else random_finger(0, joints, "planar", "antagonists"))
+    specimen = study_finger(joints)
     recipe = recipe_from({"trials": SHORT, "cad": {"mass": 0.02, "com": 3e-4}})
     clean = clean_session(recipe, SpecimenPlant(specimen), specimen.description)
     model = nominal_model(specimen)

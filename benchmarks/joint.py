@@ -23,10 +23,8 @@ from jaxfinger.synthetic import (
     clean_session,
     measure,
     nominal_model,
-    paper_finger,
-    polynomial_finger,
-    random_finger,
     recipe_from,
+    study_finger,
 )
 
 HELD_OUT = {
@@ -63,7 +61,7 @@ def main() -> None:
     parser.add_argument("--joints", type=int, default=1, choices=(1, 3))
     options = parser.parse_args()
     joints = options.joints
-    specimen = polynomial_finger(paper_finger() if joints == 3 else random_finger(0, joints, "planar", "antagonists"))
+    specimen = study_finger(joints)
     plant, truth = SpecimenPlant(specimen), nominal_model(specimen)
     cad = {"mass": 0.05, "com": 2e-3}
     clean = clean_session(recipe_from({"cad": cad, "trials": SHORT}), plant, specimen.description)

@@ -22,12 +22,11 @@ from jaxfinger.synthetic import (
     clean_session,
     measure,
     nominal_model,
-    polynomial_finger,
-    random_finger,
     recipe_from,
+    study_finger,
 )
 
-specimen = polynomial_finger(random_finger(0, 1, "planar", "antagonists"))
+specimen = study_finger()
 recipe = recipe_from(
     {
         "cad": {"mass": 0.05, "com": 2e-3},  # a finger that was measured badly

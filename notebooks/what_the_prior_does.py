@@ -23,12 +23,11 @@ from jaxfinger.synthetic import (
     SpecimenPlant,
     clean_session,
     measure,
-    polynomial_finger,
-    random_finger,
     recipe_from,
+    study_finger,
 )
 
-specimen = polynomial_finger(random_finger(0, 1, "planar", "antagonists"))
+specimen = study_finger()
 recipe = recipe_from({"trials": SHORT})
 clean = clean_session(recipe, SpecimenPlant(specimen), specimen.description)
 session = measure(clean, 0)

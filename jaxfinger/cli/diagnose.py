@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import console, progress, refuse_existing
+from jaxfinger.cli.output import Output, console, progress, refuse_existing
 from jaxfinger.errors import UserError
 
 FILES = ("gap.json", "nominal.json", "augmented.json", "report.html")
@@ -16,7 +16,7 @@ FILES = ("gap.json", "nominal.json", "augmented.json", "report.html")
 def diagnose(
     session: Path,
     *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])],
+    output: Output,
     recipe: str | None = None,
     predictions: Path | None = None,
     effects: Path | None = None,

@@ -8,10 +8,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import console, print_json, progress, refuse_existing
+from jaxfinger.cli.output import Output, console, print_json, progress, refuse_existing
 from jaxfinger.errors import UserError
-
-Output = Annotated[Path, Parameter(name=["--output", "-o"])]
 
 
 def check(file: Path, *, json: bool = False) -> None:

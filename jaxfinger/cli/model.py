@@ -7,10 +7,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import print_json, progress, refuse_existing
+from jaxfinger.cli.output import Output, print_json, progress, refuse_existing
 from jaxfinger.errors import UserError
 
-Output = Annotated[Path, Parameter(name=["--output", "-o"])]
 Experiments = Annotated[list[str] | None, Parameter(name=["--experiments", "-e"], consume_multiple=True)]
 
 

@@ -8,12 +8,15 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 
 from jaxfinger.errors import UserError
+
+Output = Annotated[Path, Parameter(name=["--output", "-o"])]
 
 
 @contextmanager

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
 
-from cyclopts import Parameter
-
+from jaxfinger.cli.output import Output
 from jaxfinger.errors import UserError
-
-Output = Annotated[Path, Parameter(name=["--output", "-o"])]
 
 
 def record(

@@ -100,16 +100,13 @@ def run(
 
     if "{fit}" not in command or "{out}" not in command:
         raise UserError(f"--command {command!r}: it must hold {{fit}} and {{out}}, as in {DIAGNOSE!r}")
-    out, diagnose, one_by_one = (
-        output or _beside(folder, "withheld" if withheld else "diagnoses"),
-        Command(command),
-        None,
-    )
+    out = output or _beside(folder, "withheld" if withheld else "diagnoses")
+    diagnose = Command(command)
     if withheld:
         truths = [read_truth(f.parent, truth or _beside(folder, "truth")) for f in sorted(folder.glob("*/fit.h5"))]
-        one_by_one = {t.name: diagnose.without([t.causes[0][0]]) for t in truths if t.kind == "listed"}
+        diagnose = {t.name: diagnose.without(t.causes[0][0]) for t in truths if t.kind == "listed"}
     with _bar("diagnosing") as progress:
-        results = run_cases(folder, out, diagnose, workers or os.cpu_count() or 1, _share(share), progress, one_by_one)
+        results = run_cases(folder, out, diagnose, workers or os.cpu_count() or 1, _share(share), progress)
     failed = sorted(name for name, what in results.items() if what == "failed")
     print(
         f"{out}: {len(results) - len(failed)} diagnosed"

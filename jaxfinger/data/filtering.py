@@ -33,44 +33,42 @@ def smooth(
     Raises:
         UserError: the cut-off is not between zero and half the sampling rate.
     """
-    from scipy.interpolate import make_interp_spline  # here, since it takes a recorder half a second to import
-
-    time, x = np.asarray(time, np.float64), np.asarray(x, np.float64)
-    if len(time) < 3:
-        return x.copy(), np.zeros_like(x), np.zeros_like(x)
-    columns = x.reshape(len(time), -1)
-    out = np.full((3, *columns.shape), np.nan)
-    grid, usable, filtered = _filtered(time, columns, cutoff_hz)
-    if usable:
-        spline = make_interp_spline(grid, filtered, k=min(5, _odd(len(grid) - 1)))
-        for order in range(3):
-            out[order][:, usable] = spline.derivative(order)(time) if order <= spline.k else 0.0
-        out[:, ~np.isfinite(columns)] = np.nan
-    value, rate, acceleration = out.reshape(3, *x.shape)
+    value, rate, acceleration = _smoothed(time, x, cutoff_hz, 2)
     return value, rate, acceleration
 
 
 def low_pass(time: Float[np.ndarray, " N"], x: Float[np.ndarray, N * k], cutoff_hz: float) -> Float[np.ndarray, N * k]:
     """x below `cutoff_hz` as `smooth` gives it, without its derivatives."""
-    if uniform_grid(np.asarray(time, np.float64)) is not time or len(time) < 3:
-        return smooth(time, x, cutoff_hz)[0]
-    columns = np.asarray(x, np.float64).reshape(len(time), -1)
-    out = np.full(columns.shape, np.nan)
-    _, usable, out[:, usable] = _filtered(time, columns, cutoff_hz)
-    return out.reshape(np.shape(x))
+    return _smoothed(time, x, cutoff_hz, 0)[0]
 
 
-def _filtered(time: np.ndarray, columns: np.ndarray, cutoff_hz: float) -> tuple[np.ndarray, list[int], np.ndarray]:
-    """Evenly spaced times, the columns that hold three samples or more, and these low-passed at those times."""
+def _smoothed(time: np.ndarray, x: np.ndarray, cutoff_hz: float, highest: int) -> np.ndarray:
+    """x and its derivatives up to the highest, stacked."""
+    from scipy.interpolate import make_interp_spline  # here, since it takes a recorder half a second to import
+
+    time, x = np.asarray(time, np.float64), np.asarray(x, np.float64)
+    if len(time) < 3:
+        return np.stack([x, *[np.zeros_like(x)] * highest])
     grid = uniform_grid(time)
     rate = (len(grid) - 1) / (grid[-1] - grid[0])
     if not 0.0 < cutoff_hz < 0.5 * rate:
         raise UserError(
             f"a cut-off of {cutoff_hz:g} Hz must lie between 0 and half the sampling rate, {0.5 * rate:.4g} Hz"
         )
+    columns = x.reshape(len(time), -1)
+    out = np.full((highest + 1, *columns.shape), np.nan)
     usable = [k for k in range(columns.shape[1]) if np.isfinite(columns[:, k]).sum() >= 3]
-    even = np.stack([_on_grid(time, columns[:, k], grid) for k in usable], axis=1) if usable else columns[:, :0]
-    return grid, usable, _low_pass(even, rate, cutoff_hz) if usable else even
+    if usable:
+        even = np.stack([_on_grid(time, columns[:, k], grid) for k in usable], axis=1)
+        filtered = _low_pass(even, rate, cutoff_hz)
+        if highest == 0 and grid is time:
+            out[0][:, usable] = filtered
+        else:
+            spline = make_interp_spline(grid, filtered, k=min(5, _odd(len(grid) - 1)))
+            for order in range(highest + 1):
+                out[order][:, usable] = spline.derivative(order)(time) if order <= spline.k else 0.0
+        out[:, ~np.isfinite(columns)] = np.nan
+    return out.reshape(highest + 1, *x.shape)
 
 
 def uniform_grid(time: Float[np.ndarray, " N"]) -> Float[np.ndarray, " K"]:

@@ -196,17 +196,14 @@ def _with_missing_stages(
     Without ID.3-dynamic nobody estimates damping; VD.3 shows it all the same, and its lack is no gap.
     """
     groups = free_groups(fit.recipe)
-    open_ = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in set(free)]
-    start = start_values(fit.model, np.array(open_, dtype=int), parameters) if open_ else fit.model
+    unknown = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in set(free)]
+    start = start_values(fit.model, np.array(unknown, dtype=int), parameters)
     seen = set()
-    for source in sources.values() if open_ else ():
+    for source in sources.values() if unknown else ():
         lin = linearise(start, Free.at(start, source.positions), source.batch, source.filters, _ones(source))
         seen |= set(source.positions[np.any(np.asarray(lin.factor)[..., :-1] != 0.0, axis=(0, 1))])
-    added = np.array([i for i in open_ if i in seen], dtype=int)
-    unseen = np.setdiff1d(open_, added).astype(int)
-    if unseen.size:
-        start = Free.at(start, unseen).set(start, Free.at(fit.model, unseen).get(fit.model))
-    return start, np.union1d(free, added).astype(int)
+    added = np.array([i for i in unknown if i in seen], dtype=int)
+    return start_values(fit.model, added, parameters), np.union1d(free, added).astype(int)
 
 
 def _cad_prior(session: Session, recipe: Recipe, free, parameters) -> Prior:

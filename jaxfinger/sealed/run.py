@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,9 +29,9 @@ class Command:
 
     line: str
 
-    def without(self, effects: Sequence[str]) -> Command:
-        """The same with effects taken out of the catalogue."""
-        return Command(" ".join([self.line, *(f"--without {shlex.quote(e)}" for e in effects)]))
+    def without(self, effect: str) -> Command:
+        """The same with one effect taken out of the catalogue."""
+        return Command(f"{self.line} --without {shlex.quote(effect)}")
 
     def __call__(self, fit: Path, out: Path) -> None:
         words = [w.format(fit=fit, out=out) for w in shlex.split(self.line)]
@@ -114,37 +114,33 @@ def close_cases(
 def run_cases(
     cases: Path,
     out: Path,
-    diagnose: Diagnose,
+    diagnose: Diagnose | Mapping[str, Diagnose],
     workers: int = 1,
     share: tuple[int, int] = (1, 1),
     progress: Callable[[int, int, str], None] | None = None,
-    diagnose_of: Mapping[str, Diagnose] | None = None,
 ) -> dict[str, str]:
     """Diagnose every case of a folder, or share i of n of them; returns what became of each.
 
-    With `diagnose_of` only the cases that it names, each in its own way.
+    With a mapping only the cases that it names, each in its own way.
     """
     folders = sorted(f.parent for f in cases.glob("*/fit.h5"))
     if not folders:
         raise UserError(
             f"{cases}: no case here; each case is a folder with a fit.h5 (make them with: jaxfinger sealed make)"
         )
-    mine = [
-        f
-        for k, f in enumerate(folders, start=1)
-        if k % share[1] == share[0] % share[1] and (diagnose_of is None or f.name in diagnose_of)
-    ]
-    how = {f: diagnose_of[f.name] if diagnose_of else diagnose for f in mine}
+    how = diagnose if isinstance(diagnose, Mapping) else {f.name: diagnose for f in folders}
+    mine = [f for k, f in enumerate(folders, start=1) if k % share[1] == share[0] % share[1] and f.name in how]
     results: dict[str, str] = {}
     if workers == 1:
         for f in mine:
-            results[f.name] = run_case(how[f], f, out)
+            results[f.name] = run_case(how[f.name], f, out)
             if progress:
                 progress(len(results), len(mine), f"{f.name} {results[f.name]}")
         return results
-    pool = ThreadPoolExecutor(workers) if isinstance(diagnose, Command) else ProcessPoolExecutor(workers)
+    commands = all(isinstance(d, Command) for d in how.values())  # which are processes of their own
+    pool = ThreadPoolExecutor(workers) if commands else ProcessPoolExecutor(workers)
     with pool:
-        jobs = {pool.submit(run_case, how[f], f, out): f.name for f in mine}
+        jobs = {pool.submit(run_case, how[f.name], f, out): f.name for f in mine}
         for job in as_completed(jobs):
             results[jobs[job]] = job.result()
             if progress:

@@ -3,6 +3,7 @@
 from jaxfinger.synthetic.fingers import nominal_model as nominal_model
 from jaxfinger.synthetic.fingers import polynomial_finger as polynomial_finger
 from jaxfinger.synthetic.fingers import specimen_of as specimen_of
+from jaxfinger.synthetic.fingers import study_finger as study_finger
 from jaxfinger.synthetic.model_plant import ModelPlant as ModelPlant
 from jaxfinger.synthetic.paper_finger import paper_finger as paper_finger
 from jaxfinger.synthetic.plant import Plant as Plant

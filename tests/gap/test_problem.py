@@ -6,11 +6,11 @@ from jaxfinger.gap.augment import nominal_fit
 from jaxfinger.gap.problem import build
 from jaxfinger.identify import Recipe
 from jaxfinger.identify.parameters import describe, ravel
-from jaxfinger.synthetic import SpecimenPlant, nominal_model, polynomial_finger, random_finger, recipe_from, simulate
+from jaxfinger.synthetic import SpecimenPlant, nominal_model, recipe_from, simulate, study_finger
 
 
 def test_damping_without_its_own_experiment_is_refitted_on_driven_motion():
-    specimen = polynomial_finger(random_finger(0, 1, "planar", "antagonists"))
+    specimen = study_finger()
     recipe = recipe_from(
         {
             "specimen": {"kind": "random", "joints": 1},

@@ -9,9 +9,8 @@ from jaxfinger.synthetic import (
     clean_session,
     measure,
     nominal_model,
-    polynomial_finger,
-    random_finger,
     recipe_from,
+    study_finger,
 )
 
 SESSIONS = 200
@@ -28,7 +27,7 @@ RECIPE = {
 
 
 def test_intervals_cover_the_truth_and_estimates_are_unbiased_and_efficient():
-    specimen = polynomial_finger(random_finger(0, 1, "planar", "antagonists"))
+    specimen = study_finger()
     clean = clean_session(recipe_from(RECIPE), SpecimenPlant(specimen), specimen.description)
     truth = np.asarray(ravel(nominal_model(specimen)))
     sessions = [measure(clean, seed) for seed in range(SESSIONS)]
