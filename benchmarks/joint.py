@@ -1,21 +1,24 @@
 """Does the joint refinement predict better than the stages, on trials that neither has seen?
 
-    python benchmarks/joint.py [--sessions 100] [--joints 1|3]
+    python benchmarks/joint.py [--sessions 100] [--joints 1|3] [--identification-only]
 
-Every session has new noise, new offsets and a finger that was measured badly. Held out: VD.1, VD.2 and VD.3 in other
-postures and motions. An error is the root mean square over all channels, each in units of the noise of one
-sample: on the held-out trials of what the model predicts less what the true one does, so that a fit wins or loses by
-its parameters alone; on the fitted trials of the residuals, averaged over blocks.
+Every session has new noise, new offsets and a finger that was measured badly. It holds all experiments of the protocol:
+the stages read ID.2 to ID.4, and the joint refinement reads all of it, or with `--identification-only` what the stages
+read. Held out: VD.1, VD.2 and VD.3 in other postures and motions, which neither reads. An error is the root mean square
+over all channels, each in units of the noise of one sample: on the held-out trials of what the model predicts less what
+the true one does, so that a fit wins or loses by its parameters alone; on the fitted trials of the residuals, averaged
+over blocks.
 """
 
 import argparse
 import time
+from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
 
-from jaxfinger.experiments import Stack, predict, prepare
-from jaxfinger.identify import identify, refine
+from jaxfinger.experiments import EXPERIMENTS, Stack, predict, prepare
+from jaxfinger.identify import STAGES, Recipe, identify, refine
 from jaxfinger.model import Model
 from jaxfinger.synthetic import (
     SHORT,
@@ -34,6 +37,7 @@ HELD_OUT = {
     "vd1": {"duration": 10.0},
     "vd3": {"duration": 4.0},
 }
+VALIDATION = {k: HELD_OUT[k] for k in ("vd1", "vd3")}
 SENSORS = recipe_from({}).sensors
 predicted = eqx.filter_jit(predict)
 
@@ -59,19 +63,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sessions", type=int, default=100)
     parser.add_argument("--joints", type=int, default=1, choices=(1, 3))
+    parser.add_argument("--identification-only", action="store_true")
     options = parser.parse_args()
-    joints = options.joints
-    specimen = study_finger(joints)
+    specimen = study_finger(options.joints)
     plant, truth = SpecimenPlant(specimen), nominal_model(specimen)
     cad = {"mass": 0.05, "com": 2e-3}
-    clean = clean_session(recipe_from({"cad": cad, "trials": SHORT}), plant, specimen.description)
+    read = tuple(STAGES) if options.identification_only else tuple(EXPERIMENTS)
+    trials = {**SHORT, **VALIDATION, "experiments": read}
+    recipe = replace(Recipe(), fit=replace(Recipe().fit, joint_experiments=read))
+    clean = clean_session(recipe_from({"cad": cad, "trials": trials}), plant, specimen.description)
     unseen = clean_session(recipe_from({"trials": HELD_OUT}), plant, specimen.description)
     held_out = prepare(measure(unseen, 0))
     rows, seconds = [], []
     for seed in range(options.sessions):
         session = measure(clean, seed)
         stacks = prepare(session)
-        staged = identify(session, stacks=stacks)
+        staged = identify(session, recipe, stacks=stacks)
         begun = time.perf_counter()
         joint = refine(session, staged)
         seconds.append(time.perf_counter() - begun)

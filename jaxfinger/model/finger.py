@@ -3,7 +3,6 @@
 from typing import Protocol
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -99,7 +98,3 @@ class Finger(eqx.Module):
     def n(self) -> int:
         """Number of tendons, passive ones included."""
         return len(self.tendon_names)
-
-    def expand(self, dims: int) -> "Finger":
-        """The same finger with `dims` trailing axes of length one, to broadcast against a batch."""
-        return jax.tree.map(lambda x: x.reshape(x.shape + (1,) * dims), self)

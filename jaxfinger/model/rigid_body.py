@@ -1,11 +1,13 @@
 """Rigid-body terms of equation (1) by recursive Newton–Euler (Luh, Walker, Paul 1980; Featherstone 2008, ch. 5).
 
-Every function takes joint arrays `(m, *T)` with the batch last and broadcasts over it. The recursion is a scan over the
-joints of a few products of 3-vectors, each a loop along the long axis: quick to compile for any m, and to run. A long
-batch goes through in blocks that stay in the processor's cache.
+Every function takes joint arrays `(m, *T)` with the batch last and broadcasts over it. A 3-vector is a tuple of three
+arrays, so that every product is one loop along the long axis. A long batch goes through in blocks that stay in the
+processor's cache.
 """
 
+import functools
 import math
+import operator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -15,57 +17,93 @@ from jaxtyping import Array, Float
 
 from jaxfinger.model.finger import Finger
 
-Vector = Float[Array, "3 *T"]
-Rotation = Float[Array, "3 3 *T"]
+Scalar = Float[Array, "*T"]
+Vector = tuple[Scalar, Scalar, Scalar]
+Matrix = tuple[Vector, Vector, Vector]  # rows
+
+
+def _add(*vectors: Vector) -> Vector:
+    x, y, z = (functools.reduce(operator.add, components) for components in zip(*vectors, strict=True))
+    return x, y, z
+
+
+def _scale(s: Scalar, v: Vector) -> Vector:
+    return s * v[0], s * v[1], s * v[2]
+
+
+def _dot(a: Vector, b: Vector) -> Scalar:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
-    def roll(v, k):
-        return jnp.concatenate([v[k:], v[:k]])
-
-    return roll(a, 1) * roll(b, 2) - roll(a, 2) * roll(b, 1)
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def _mul(R: Rotation, v: Vector) -> Vector:
-    return jnp.sum(R * v[None], axis=1)
+def _mul(R: Matrix, v: Vector) -> Vector:
+    return _dot(R[0], v), _dot(R[1], v), _dot(R[2], v)
 
 
-def _mul_transposed(R: Rotation, v: Vector) -> Vector:
-    return jnp.sum(R * v[:, None], axis=0)
+def _transposed(R: Matrix) -> Matrix:
+    x, y, z = zip(*R, strict=True)
+    return x, y, z
 
 
-def _rotation(axis: Vector, angle: Float[Array, "*T"]) -> Rotation:
+def _vector(a: Float[Array, "3 *T"]) -> Vector:
+    x, y, z = a
+    return x, y, z
+
+
+def _rotation(axis: Vector, angle: Scalar) -> Matrix:
     """Rodrigues: R = cos θ I + sin θ [a]ₓ + (1 − cos θ) a aᵀ."""
     c, s = jnp.cos(angle), jnp.sin(angle)
-    x, y, z = axis
-    o = jnp.zeros_like(x)
-    skew = jnp.stack([jnp.stack([o, -z, y]), jnp.stack([z, o, -x]), jnp.stack([-y, x, o])])
-    identity = jnp.eye(3).reshape(3, 3, *(1,) * angle.ndim)
-    return c * identity + s * skew + (1.0 - c) * axis[:, None] * axis[None]
+    (x, y, z), (u, v, w) = _scale(s, axis), _scale(1.0 - c, axis)
+    return (
+        (c + u * axis[0], v * axis[0] - z, w * axis[0] + y),
+        (u * axis[1] + z, c + v * axis[1], w * axis[1] - x),
+        (u * axis[2] - y, v * axis[2] + x, c + w * axis[2]),
+    )
 
 
-BLOCK = 2048  # samples
+BLOCK = 8192  # samples
 
 
 class _Joint(NamedTuple):
-    """One joint and its link, ready to broadcast against the batch."""
+    """One joint and its link, or all of them, base to tip along the first axis of every array."""
 
     axis: Vector
+    origin: Vector
     com: Vector
-    mass: Float[Array, "*T"]
-    inertia: Rotation
-    slides: Float[Array, "*T"]  # 1 for a prismatic joint
-    R: Rotation  # the link's frame in its parent's
-    p: Vector
+    mass: Scalar
+    inertia: Matrix
+    q: Scalar
+    qd: Scalar
+    qdd: Scalar
 
 
-def _joints(finger: Finger, q: Float[Array, "m *T"]) -> _Joint:
-    """Stacked along the first axis, base to tip."""
-    f = finger.expand(q.ndim - 1)
-    slides = jnp.array(finger.prismatic, dtype=float).reshape(-1, *(1,) * (q.ndim - 1))
-    R = jax.vmap(_rotation)(f.axis, q * (1.0 - slides))
-    p = f.origin + f.axis * (q * slides)[:, None]
-    return _Joint(f.axis, f.com, f.mass, f.inertia, slides, R, p)
+def _joints(finger: Finger, q, qd, qdd) -> _Joint:
+    axis, origin, com, Ix, Iy, Iz = (
+        _vector(a.T) for a in (finger.axis, finger.origin, finger.com, *jnp.moveaxis(finger.inertia, 1, 0))
+    )
+    return _Joint(axis, origin, com, finger.mass, (Ix, Iy, Iz), q, qd, qdd)
+
+
+def _frame(j: _Joint, slides: bool) -> tuple[Matrix, Vector]:
+    """The link's frame in its parent's."""
+    if slides:
+        return _rotation(j.axis, jnp.zeros_like(j.q)), _add(j.origin, _scale(j.q, j.axis))
+    return _rotation(j.axis, j.q), _add(j.origin, _vector(jnp.zeros((3, *j.q.shape))))
+
+
+def _recursion(step, state, links, finger: Finger, unroll: bool, reverse: bool = False):
+    """Link by link, `step(state, link, slides)`: a scan where all joints are of one kind, since it compiles faster."""
+    slides = finger.prismatic
+    if len(set(slides)) == 1:
+        whole = functools.partial(step, slides=slides[0])
+        return jax.lax.scan(whole, state, links, reverse=reverse, unroll=unroll)
+    out = {}
+    for i in reversed(range(finger.m)) if reverse else range(finger.m):
+        state, out[i] = step(state, jax.tree.map(lambda a, i=i: a[i], links), slides[i])
+    return state, jax.tree.map(lambda *a: jnp.stack(a), *(out[i] for i in range(finger.m)))
 
 
 def inverse_dynamics(
@@ -73,7 +111,7 @@ def inverse_dynamics(
 ) -> Float[Array, "m *T"]:
     """M(q) q̈ + N(q, q̇) + G(q), in N m (N for a prismatic joint)."""
     samples = math.prod(q.shape[1:])
-    if samples <= 4 * BLOCK:
+    if samples <= BLOCK:
         return _newton_euler(finger, q, qd, qdd, unroll=False)
 
     def blocks(a):
@@ -85,35 +123,36 @@ def inverse_dynamics(
 
 
 def _newton_euler(finger: Finger, q, qd, qdd, unroll: bool) -> Float[Array, "m *T"]:
-    joints = _joints(finger, q)
-    zero = jnp.zeros((3, *q.shape[1:]))
-    gravity = finger.gravity.reshape(3, *(1,) * (q.ndim - 1))
-
-    def outward(state, joint_and_rates):
+    def outward(state, j: _Joint, slides: bool):
         """Angular velocity ω, angular and linear acceleration α, a of the link's frame, in that frame."""
-        (omega, alpha, a), (j, qd, qdd) = state, joint_and_rates
-        a = _mul_transposed(j.R, a + _cross(alpha, j.p) + _cross(omega, _cross(omega, j.p)))
-        omega, alpha = _mul_transposed(j.R, omega), _mul_transposed(j.R, alpha)
-        rate, change = j.axis * qd, j.axis * qdd + _cross(omega, j.axis * qd)
-        a = a + j.slides * (change + _cross(omega, rate))
-        alpha = alpha + (1.0 - j.slides) * change
-        omega = omega + (1.0 - j.slides) * rate
-        force = j.mass * (a + _cross(alpha, j.com) + _cross(omega, _cross(omega, j.com)))
-        moment = _mul(j.inertia, alpha) + _cross(omega, _mul(j.inertia, omega)) + _cross(j.com + zero, force)
-        return (omega, alpha, a), (force, moment)
+        omega, alpha, a = state
+        R, p = _frame(j, slides)
+        back = _transposed(R)
+        a = _mul(back, _add(a, _cross(alpha, p), _cross(omega, _cross(omega, p))))
+        omega, alpha = _mul(back, omega), _mul(back, alpha)
+        rate = _scale(j.qd, j.axis)
+        change = _add(_scale(j.qdd, j.axis), _cross(omega, rate))
+        if slides:
+            a = _add(a, change, _cross(omega, rate))
+        else:
+            omega, alpha = _add(omega, rate), _add(alpha, change)
+        force = _scale(j.mass, _add(a, _cross(alpha, j.com), _cross(omega, _cross(omega, j.com))))
+        moment = _add(_mul(j.inertia, alpha), _cross(omega, _mul(j.inertia, omega)), _cross(j.com, force))
+        return (omega, alpha, a), (j.axis, R, p, force, moment)
 
-    # Gravity enters as an upward acceleration of the base.
-    _, (forces, moments) = jax.lax.scan(outward, (zero, zero, zero - gravity), (joints, qd, qdd), unroll=unroll)
-
-    def inward(wrench, link):
+    def inward(wrench, link, slides: bool):
         """Force and moment that the parent applies to the link, at its joint; then both in the parent's frame."""
-        (force, moment), (j, f, n) = wrench, link
-        force, moment = f + force, n + moment
-        torque = jnp.sum(j.axis * (j.slides * force + (1.0 - j.slides) * moment), axis=0)
-        force, moment = _mul(j.R, force), _mul(j.R, moment)
-        return (force, moment + _cross(j.p, force)), torque
+        (force, moment), (axis, R, p, f, n) = wrench, link
+        force, moment = _add(f, force), _add(n, moment)
+        torque = _dot(axis, force if slides else moment)
+        force, moment = _mul(R, force), _mul(R, moment)
+        return (force, _add(moment, _cross(p, force))), torque
 
-    _, torques = jax.lax.scan(inward, (zero, zero), (joints, forces, moments), reverse=True, unroll=unroll)
+    zero = _vector(jnp.zeros((3, *q.shape[1:])))
+    upward = _add(zero, _scale(-1.0, _vector(finger.gravity)))  # gravity enters as an acceleration of the base
+    joints = _joints(finger, q, qd, qdd)
+    _, links = _recursion(outward, (zero, zero, upward), joints, finger, unroll)
+    _, torques = _recursion(inward, (zero, zero), links, finger, unroll, reverse=True)
     return torques
 
 
@@ -140,20 +179,22 @@ def _weightless(finger: Finger) -> Finger:
     return eqx.tree_at(lambda f: f.gravity, finger, jnp.zeros(3))
 
 
-def fingertip(finger: Finger, q: Float[Array, "m *T"]) -> tuple[Vector, Float[Array, "3 m *T"]]:
+def fingertip(finger: Finger, q: Float[Array, "m *T"]) -> tuple[Float[Array, "3 *T"], Float[Array, "3 m *T"]]:
     """Position of the fingertip, m, and its Jacobian J, m/rad, in the base frame."""
-    joints = _joints(finger, q)
-    zero = jnp.zeros((3, *q.shape[1:]))
 
-    def outward(pose, j):
-        R, p = pose
-        p = p + _mul(R, j.p)
-        R = jax.vmap(_mul, in_axes=(None, 1), out_axes=1)(R, j.R)
-        return (R, p), (_mul(R, j.axis + zero), p)
+    def outward(pose, j: _Joint, slides: bool):
+        """The link's frame in the base frame; the joint's axis there, and where the joint is."""
+        (R, p), (turn, shift) = pose, _frame(j, slides)
+        p = _add(p, _mul(R, shift))
+        x, y, z = (_mul(R, column) for column in _transposed(turn))
+        R = _transposed((x, y, z))
+        return (R, p), (_mul(R, j.axis), p)
 
-    start = (jnp.eye(3).reshape(3, 3, *(1,) * (q.ndim - 1)) + zero[None], zero)
-    (R, p), (axes, places) = jax.lax.scan(outward, start, joints)
-    tip = p + _mul(R, finger.fingertip.reshape(3, *(1,) * (q.ndim - 1)) + zero)
-    slides = joints.slides[:, None]
-    columns = slides * axes + (1.0 - slides) * jax.vmap(_cross)(axes, tip - places)
-    return tip, jnp.moveaxis(columns, 0, 1)
+    o, e = jnp.zeros(q.shape[1:]), jnp.ones(q.shape[1:])
+    base = (((e, o, o), (o, e, o), (o, o, e)), (o, o, o))
+    (R, p), (axes, places) = _recursion(outward, base, _joints(finger, q, q, q), finger, unroll=False)
+    tip = _add(p, _mul(R, _vector(finger.fingertip)))
+    slides = jnp.array(finger.prismatic, dtype=float).reshape(-1, *(1,) * (q.ndim - 1))
+    turning = _cross(axes, _add(tip, _scale(-1.0, places)))
+    J = _add(_scale(slides, axes), _scale(1.0 - slides, turning))
+    return jnp.stack(tip), jnp.stack(J)
