@@ -138,6 +138,8 @@ def inverse_dynamics(samples: int) -> None:
 
 def stages(path: Path) -> None:
     """3. The least squares of every stage, all else equal."""
+    warm = best(lambda: identify(read_session(path)), 1)
+    print(f"identify, in a process that has compiled: {warm:.1f} s, reading included")
     session = read_session(path)
     fit, stacks = identify(session), prepare(session)
     parameters = describe(fit.model)

@@ -1,6 +1,7 @@
 """From recordings to arrays that a fit can take: derivatives, directions, block means, padded stacks of trials."""
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -54,7 +55,8 @@ def prepare(
     for spec in EXPERIMENTS.values():
         chosen = [t for t in session if t.experiment == spec.name and (names is None or t.name in names)]
         trials = [t for t in chosen if len(t.time) > 1]
-        rows = [_reduce(spec, t, session, reduced, minus) for t in trials]
+        with ThreadPoolExecutor() as pool:  # filters let go of the interpreter
+            rows = list(pool.map(lambda t, spec=spec: _reduce(spec, t, session, reduced, minus), trials))
         if rows:
             stacks[spec.name] = _stack(spec, trials, rows, reduced)
     return stacks

@@ -8,6 +8,7 @@ parameters and J_O of the others, whose covariance is Σ_OO,
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -121,16 +122,19 @@ def identify(
     """
     recipe = recipe or (start.recipe if start else Recipe())
     wanted = stages or recipe.fit.stages
-    if stacks is None:
-        progress("reading the recordings")
-        experiments = {e for s in wanted for e in STAGES[s].reads}
-        stacks = prepare(session, [t.name for t in session if t.experiment in experiments])
     fit = start or Fit.before(session, recipe, nominal_model(session, recipe))
     if start is None:
         fit = replace(fit, covariance=cad_covariance(session, describe(fit.model)))
-    for name in wanted:
-        progress(f"fitting {name}")
-        fit = run_stage(fit, STAGES[name], stacks, session)
+    with ThreadPoolExecutor(1) as pool:  # a stage compiles while the recordings of the next are filtered
+        pending = {}
+        for experiment in dict.fromkeys(e for s in wanted for e in STAGES[s].reads) if stacks is None else ():
+            pending[experiment] = pool.submit(prepare, session, [t.name for t in session if t.experiment == experiment])
+        stacks = dict(stacks or {})
+        for name in wanted:
+            progress(f"fitting {name}")
+            for experiment in STAGES[name].reads.keys() & pending.keys():
+                stacks |= pending.pop(experiment).result()
+            fit = run_stage(fit, STAGES[name], stacks, session)
     return fit
 
 
