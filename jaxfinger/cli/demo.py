@@ -110,12 +110,12 @@ def comparison(fit, result) -> list[tuple[str, str, str, str]]:
 
 
 def _gravity(fit) -> str:
-    """At the MCP, the other joints in the posture in which the session holds them."""
+    """At the MCP, the other joints straight: the paper does not say how it held them."""
     import jax.numpy as jnp
 
     from jaxfinger.model import rigid_body
 
-    q = jnp.radians(jnp.stack([jnp.linspace(10.0, 70.0, 61), jnp.full(61, 30.0), jnp.full(61, 45.0)]))
+    q = jnp.radians(jnp.stack([jnp.linspace(10.0, 70.0, 61), jnp.zeros(61), jnp.zeros(61)]))
     torque = 1e3 * rigid_body.inverse_dynamics(fit.model.finger, q, jnp.zeros_like(q), jnp.zeros_like(q))[0]
     return f"{float(torque.min()):.1f} to {float(torque.max()):.1f}"
 

@@ -23,11 +23,11 @@ def _mm(along: float, above: float) -> Point:
 
 
 # Flexors pass on the palm's side and leave their pulley halfway: the moment arm rises beyond the pulley's radius.
-# Table I is of fourth-order polynomials fitted to excursions, and so are these: the fit spans the table's range.
+# Table I is of fourth-order polynomials fitted to the strokes of ID.2; of these points it is the fit that spans it.
 T1_MCP = WrappedRoute(_mm(-8.72, 1.07), _mm(4.86, 0.80))  # between two eyes, from extensor to flexor
 T1_PIP = WrappedRoute(_mm(-12.69, -1.41), _mm(9.91, -1.09), _mm(0.39, -0.15), 4.34e-3)
-T3_MCP = WrappedRoute(_mm(-15.77, -0.45), _mm(12.53, 0.48), _mm(-1.03, -0.75), 5.84e-3)
-T4_MCP = WrappedRoute(_mm(-15.64, -0.62), _mm(12.21, 0.35), _mm(-0.67, -0.39), 5.38e-3)
+T3_MCP = WrappedRoute(_mm(-15.82, -0.51), _mm(12.64, 0.42), _mm(-1.12, -0.73), 5.82e-3)
+T4_MCP = WrappedRoute(_mm(-15.82, -0.73), _mm(12.64, 0.24), _mm(-1.28, -0.52), 5.49e-3)
 # The extensor wraps heads that are not concentric with the joints, and gains leverage as they flex.
 T2_MCP = WrappedRoute(_mm(-18.0, 5.0), _mm(16.0, 5.0), _mm(1.60, -0.27), 6.08e-3, dorsal=True)
 T2_PIP = WrappedRoute(_mm(-13.0, 4.5), _mm(11.0, 4.5), _mm(-2.08, -0.74), 5.49e-3, dorsal=True, on_distal=True)

@@ -26,13 +26,16 @@ def _over_range(specimen):
 
 @pytest.mark.parametrize(("tendon", "joint"), RANGES)
 def test_moment_arms_span_table_1(tendon, joint):
-    """As the table was made: the derivative of the fourth-order polynomial that fits the excursion."""
+    """As the table was made: the derivative of the fourth-order polynomial that fits the excursion in ID.2."""
     specimen = paper_finger()
     d = specimen.description
     i, j = d.tendon_names.index(tendon), d.joint_names.index(joint)
-    q = _over_range(specimen)[j]
-    powers, slopes = (np.stack(x, axis=1) for x in ([q**p for p in ORDER], [p * q ** (p - 1) for p in ORDER]))
-    arm = slopes @ np.linalg.lstsq(powers, specimen.routes[i][j].excursion(q))[0] * MM
+    plans = session_plan(d, recipe_from({"trials": {"rate": 50.0, "experiments": ["ID.2"]}}).trials)
+    q = next(p.q[j] for p in plans if p.joint == j)
+    powers = np.stack([np.ones_like(q), *(q**p for p in ORDER)], axis=1)
+    coefficients = np.linalg.lstsq(powers, specimen.routes[i][j].excursion(q))[0][1:]
+    slopes = np.stack([p * _over_range(specimen)[j] ** (p - 1) for p in ORDER], axis=1)
+    arm = slopes @ coefficients * MM
     assert (arm.max(), arm.min()) == pytest.approx(RANGES[tendon, joint], abs=0.04)
 
 
