@@ -1,6 +1,6 @@
 """Does the joint refinement predict better than the stages, on trials that neither has seen?
 
-    python benchmarks/joint.py [--sessions 100] [--joints 1|3] [--identification-only]
+    python benchmarks/joint.py [--sessions 100] [--joints 3|1] [--identification-only]
 
 Every session has new noise, new offsets and a finger that was measured badly. It holds all experiments of the protocol:
 the stages read ID.2 to ID.4, and the joint refinement reads all of it, or with `--identification-only` what the stages
@@ -62,7 +62,7 @@ def main() -> None:
     """Print both errors of both fits, and how often joint wins."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sessions", type=int, default=100)
-    parser.add_argument("--joints", type=int, default=1, choices=(1, 3))
+    parser.add_argument("--joints", type=int, default=3, choices=(1, 3))
     parser.add_argument("--identification-only", action="store_true")
     options = parser.parse_args()
     specimen = study_finger(options.joints)

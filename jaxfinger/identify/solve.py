@@ -23,6 +23,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 from scipy.optimize import lsq_linear
 
+from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch
 from jaxfinger.identify.linearise import Filters, Linearised, linearise
 from jaxfinger.identify.parameters import Free, describe, ravel
@@ -76,7 +77,11 @@ def solve(
     prior: Prior | None = None,
     huber: float = 0.0,
 ) -> tuple[Model, Solution]:
-    """The model with its free parameters (positions in the flat vector) at the optimum, and what is known of it."""
+    """The model with its free parameters (positions in the flat vector) at the optimum, and what is known of it.
+
+    Raises:
+        UserError: the model is not defined at its start.
+    """
     size = ravel(model).size
     frees = {name: Free.at(model, s.positions) for name, s in sources.items()}
     moved = Free.at(model, free)
@@ -107,6 +112,8 @@ def solve(
                     break
                 small /= 2
                 continue
+            if not np.isfinite(cost):
+                raise UserError("the model predicts nothing finite where the fit starts: start from other parameters")
             best = cost
             A = np.concatenate([factor[:, free], prior.root])
             b = np.concatenate([factor[:, -1], offset])
