@@ -126,15 +126,14 @@ def identify(
     if start is None:
         fit = replace(fit, covariance=cad_covariance(session, describe(fit.model)))
     with ThreadPoolExecutor(1) as pool:  # a stage compiles while the recordings of the next are filtered
-        pending = {}
+        ready, pending = dict(stacks or {}), {}
         for experiment in dict.fromkeys(e for s in wanted for e in STAGES[s].reads) if stacks is None else ():
             pending[experiment] = pool.submit(prepare, session, [t.name for t in session if t.experiment == experiment])
-        stacks = dict(stacks or {})
         for name in wanted:
             progress(f"fitting {name}")
             for experiment in STAGES[name].reads.keys() & pending.keys():
-                stacks |= pending.pop(experiment).result()
-            fit = run_stage(fit, STAGES[name], stacks, session)
+                ready |= pending.pop(experiment).result()
+            fit = run_stage(fit, STAGES[name], ready, session)
     return fit
 
 

@@ -27,7 +27,7 @@ def _add(*vectors: Vector) -> Vector:
     return x, y, z
 
 
-def _scale(s: Scalar, v: Vector) -> Vector:
+def _scale(s: Scalar | float, v: Vector) -> Vector:
     return s * v[0], s * v[1], s * v[2]
 
 
