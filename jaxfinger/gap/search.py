@@ -33,9 +33,10 @@ ADD = 0.3  # share of what is left, that a further effect must explain
 SAME_SITE = 0.1  # share of what is explained, that a further effect at the same site must explain
 LOOKED_AT = 12  # candidates for a further effect
 LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for
-OPEN = 0.25  # share of the gap left to the stand-in at which «unlisted» is as likely as the catalogue
-OPEN_WIDTH = 0.06
-UNLISTED = 300.0  # energy left to the stand-in below which «unlisted» is no verdict
+# After one chosen effect and after two, since two known ones together imitate more than one does:
+OPEN = (0.25, 0.17)  # share of the gap left to the stand-in at which «unlisted» is as likely as the catalogue
+OPEN_WIDTH = (0.06, 0.04)
+UNLISTED = (300.0, 100.0)  # energy left to the stand-in below which «unlisted» is no verdict
 
 
 @dataclass(frozen=True)
@@ -199,7 +200,9 @@ def _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, stro
     log_l = {k: -0.5 * LOOKS * np.log1p(max(u, 0.0) / LOOKS) for k, u in unexplained.items()}
     total = logsumexp(list(log_l.values()))
     share_left = beyond / gap
-    unlisted = float(expit((share_left - OPEN) / OPEN_WIDTH)) if beyond > UNLISTED else 0.01
+    at_work = len(chosen.variants) - 1
+    seen = beyond > UNLISTED[at_work]
+    unlisted = float(expit((share_left - OPEN[at_work]) / OPEN_WIDTH[at_work])) if seen else 0.01
     probability = {k: float(np.exp(v - total)) * (1 - unlisted) for k, v in log_l.items()}
     if len(chosen.variants) > 1:
         # Several effects: each carries its part of what the catalogue explains.
