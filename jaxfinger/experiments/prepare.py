@@ -16,6 +16,7 @@ from jaxfinger.experiments.table import (
     CLEAR,
     EVERY_SAMPLE,
     EXPERIMENTS,
+    MIN_DRIVEN_SPEED,
     MIN_JOINT_SPEED,
     MIN_TENDON_SPEED,
     SLACK,
@@ -121,7 +122,9 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     hold = _whole(holds, M, block)
     q_mean = mean(q)
     if spec.held:
-        tension_mean, q_mean = _in_steps(tension_mean, hold), _at_rest(q_mean, hold)
+        tension_mean = _in_steps(tension_mean, hold)
+    if spec.samples == "holds":
+        q_mean = _at_rest(q_mean, hold)
     start = trial.session_start if trial.session_start is not None else 0.0
     time = mean(trial.time)
     motion = {
@@ -203,7 +206,9 @@ def _rates(trial: Trial, spec: Experiment) -> np.ndarray:
 def _sliding(spec: Experiment, trial: Trial, session: Session, qd) -> np.ndarray:
     """(N, m): 1 where a joint and every taut tendon across it slide, so that the directions of friction are known."""
     fast = np.percentile(np.abs(qd), 95, axis=0)
-    slides = np.abs(qd) > np.minimum(MIN_JOINT_SPEED, 0.05 * fast)
+    driven = np.array([joint == trial.joint for joint in session.finger.joint_names])
+    slides = np.abs(qd) > np.minimum(np.where(driven, MIN_DRIVEN_SPEED, MIN_JOINT_SPEED), 0.05 * fast)
+    slides[1:] &= np.sign(qd[1:]) == np.sign(qd[:-1])  # a quick reversal has no slow sample
     if not spec.slack and trial.tendon_excursion is not None and trial.tendon_force is not None:
         taut = np.nan_to_num(trial.tendon_force) > SLACK
         measured = np.isfinite(trial.tendon_excursion).all(axis=0)
@@ -241,7 +246,7 @@ def _in_steps(tension: np.ndarray, hold: np.ndarray) -> np.ndarray:
 
 
 def _at_rest(q: np.ndarray, hold: np.ndarray) -> np.ndarray:
-    """(N, m): at a hold of a held joint its mean: what moves there is the encoder's noise, and f(q) has none of it."""
+    """(N, m): at a hold its mean: what moves there is the encoder's noise, which neither f(q) nor friction follows."""
     out = q.copy()
     for h in np.unique(hold[hold >= 0]):
         out[hold == h] = q[hold == h].mean(axis=0)
