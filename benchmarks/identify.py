@@ -4,7 +4,7 @@
 
 1. `jaxfinger identify` on a session of 30 trials, 20 minutes at 1 kHz, as a user runs it: with an empty compile cache
    and with a full one; peak memory there and on half the session.
-2. Inverse dynamics of many samples against Pinocchio's batch call.
+2. Inverse dynamics of many samples against Pinocchio's batch call, on as many threads.
 3. Each stage's least squares against `scipy.optimize.least_squares` on the same rows, with the same derivatives; and
    with the derivatives by the parameters of earlier stages too, which the errors that are passed on need.
 """
@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import equinox as eqx
@@ -119,7 +120,6 @@ def inverse_dynamics(samples: int) -> None:
     begun = time.perf_counter()
     ours.lower(finger, q, qd, qdd).compile()
     compiling = time.perf_counter() - begun
-    mine = best(lambda: jax.block_until_ready(ours(finger, jnp.asarray(q), jnp.asarray(qd), jnp.asarray(qdd))))
     model = pin.Model()
     for i in range(m):
         joint = pin.JointModelRevoluteUnaligned(d.axis[i])
@@ -128,12 +128,18 @@ def inverse_dynamics(samples: int) -> None:
     model.gravity.linear = d.gravity
     a, b, c = (np.asfortranarray(x) for x in (q, qd, qdd))
     tau = np.zeros_like(a)
-    print(f"inverse dynamics, {samples:,} samples of {m} joints: {mine:.2f} s (compiled in {compiling:.1f} s)")
+    print(f"inverse dynamics, {samples:,} samples of {m} joints (compiled in {compiling:.1f} s)")
     for threads in (1, 2):
+        shares = [jnp.asarray(np.array_split(np.stack([q, qd, qdd]), threads, axis=2)[k]) for k in range(threads)]
+        with ThreadPoolExecutor(threads) as workers:
+            mine = best(lambda w=workers, s=shares: [*w.map(lambda x: jax.block_until_ready(ours(finger, *x)), s)])
         pool = pin.ModelPool(model, threads)
         theirs = best(lambda n=threads, p=pool: pin.rneaInParallel(n, p, a, b, c, tau))
         error = float(np.abs(np.asarray(ours(finger, q, qd, qdd)) - tau).max())
-        print(f"  Pinocchio, {threads} threads: {theirs:.2f} s, {theirs / mine:.1f} times ours; difference {error:.1g}")
+        print(
+            f"  {threads} threads: ours {mine:.2f} s, Pinocchio {theirs:.2f} s: {theirs / mine:.1f} times; "
+            f"difference {error:.1g}"
+        )
 
 
 def stages(path: Path) -> None:

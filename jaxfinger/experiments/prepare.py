@@ -25,6 +25,8 @@ from jaxfinger.experiments.table import (
 )
 from jaxfinger.model import Motion
 
+LONG = 10_000  # samples of a trial from which on its filters, which let go of the interpreter, are worth a thread
+
 
 class Batch(eqx.Module):
     """All trials of one experiment, reduced, padded to one length: B trials of T samples."""
@@ -56,7 +58,8 @@ def prepare(
     for spec in EXPERIMENTS.values():
         chosen = [t for t in session if t.experiment == spec.name and (names is None or t.name in names)]
         trials = [t for t in chosen if len(t.time) > 1]
-        with ThreadPoolExecutor() as pool:  # filters let go of the interpreter
+        long = bool(trials) and max(len(t.time) for t in trials) > LONG
+        with ThreadPoolExecutor(None if long else 1) as pool:
             rows = list(pool.map(lambda t, spec=spec: _reduce(spec, t, session, reduced, minus), trials))
         if rows:
             stacks[spec.name] = _stack(spec, trials, rows, reduced)
