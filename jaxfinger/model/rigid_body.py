@@ -1,13 +1,13 @@
 """Rigid-body terms of equation (1) by recursive Newton–Euler (Luh, Walker, Paul 1980; Featherstone 2008, ch. 5).
 
-Every function takes joint arrays `(m, *T)` with the batch last and broadcasts over it. A 3-vector is a tuple of three
-arrays, so that every product is one loop along the long axis. A long batch goes through in blocks that stay in the
-processor's cache.
+Every function takes joint arrays `(m, *T)` with the batch last and broadcasts over it. A 3-vector is one array
+`(3, *T)`, which compiles quickly, or a tuple of its three components, which runs quickly: every product is then one
+loop along the long axis. The recursion is the same for both. A long batch goes through by components, in blocks that
+stay in the processor's cache.
 """
 
 import functools
 import math
-import operator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,53 +18,65 @@ from jaxtyping import Array, Float
 from jaxfinger.model.finger import Finger
 
 Scalar = Float[Array, "*T"]
-Vector = tuple[Scalar, Scalar, Scalar]
-Matrix = tuple[Vector, Vector, Vector]  # rows
+Vector = Float[Array, "3 *T"] | tuple[Scalar, ...]
+Matrix = Float[Array, "3 3 *T"] | tuple[tuple[Scalar, ...], ...]  # rows
 
 
 def _add(*vectors: Vector) -> Vector:
-    x, y, z = (functools.reduce(operator.add, components) for components in zip(*vectors, strict=True))
-    return x, y, z
+    if isinstance(vectors[0], tuple):
+        return tuple(functools.reduce(jnp.add, components) for components in zip(*vectors, strict=True))
+    return functools.reduce(jnp.add, (jnp.asarray(v) for v in vectors))
 
 
 def _scale(s: Scalar | float, v: Vector) -> Vector:
-    return s * v[0], s * v[1], s * v[2]
+    return tuple(s * x for x in v) if isinstance(v, tuple) else s * v
 
 
 def _dot(a: Vector, b: Vector) -> Scalar:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    if isinstance(a, tuple):
+        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return jnp.sum(a * jnp.asarray(b), axis=0)
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    if isinstance(a, tuple):
+        return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+    def roll(v, k):
+        return jnp.concatenate([v[k:], v[:k]])
+
+    return roll(a, 1) * roll(b, 2) - roll(a, 2) * roll(b, 1)
 
 
 def _mul(R: Matrix, v: Vector) -> Vector:
-    return _dot(R[0], v), _dot(R[1], v), _dot(R[2], v)
+    if isinstance(R, tuple):
+        return tuple(_dot(row, v) for row in R)
+    return jnp.sum(R * jnp.asarray(v)[None], axis=1)
 
 
 def _transposed(R: Matrix) -> Matrix:
-    x, y, z = zip(*R, strict=True)
-    return x, y, z
-
-
-def _vector(a: Float[Array, "3 *T"]) -> Vector:
-    x, y, z = a
-    return x, y, z
+    return tuple(zip(*R, strict=True)) if isinstance(R, tuple) else jnp.swapaxes(R, 0, 1)
 
 
 def _rotation(axis: Vector, angle: Scalar) -> Matrix:
     """Rodrigues: R = cos θ I + sin θ [a]ₓ + (1 − cos θ) a aᵀ."""
     c, s = jnp.cos(angle), jnp.sin(angle)
-    (x, y, z), (u, v, w) = _scale(s, axis), _scale(1.0 - c, axis)
-    return (
-        (c + u * axis[0], v * axis[0] - z, w * axis[0] + y),
-        (u * axis[1] + z, c + v * axis[1], w * axis[1] - x),
-        (u * axis[2] - y, v * axis[2] + x, c + w * axis[2]),
-    )
+    if isinstance(axis, tuple):
+        (x, y, z), (u, v, w) = (s * a for a in axis), ((1.0 - c) * a for a in axis)
+        return (
+            (c + u * axis[0], v * axis[0] - z, w * axis[0] + y),
+            (u * axis[1] + z, c + v * axis[1], w * axis[1] - x),
+            (u * axis[2] - y, v * axis[2] + x, c + w * axis[2]),
+        )
+    x, y, z = axis
+    o = jnp.zeros_like(x)
+    skew = jnp.stack([jnp.stack([o, -z, y]), jnp.stack([z, o, -x]), jnp.stack([-y, x, o])])
+    identity = jnp.eye(3).reshape(3, 3, *(1,) * angle.ndim)
+    return c * identity + s * skew + (1.0 - c) * axis[:, None] * axis[None]
 
 
 BLOCK = 8192  # samples
+LONG = 32 * BLOCK  # from which on running takes longer than compiling
 
 
 class _Joint(NamedTuple):
@@ -80,18 +92,20 @@ class _Joint(NamedTuple):
     qdd: Scalar
 
 
-def _joints(finger: Finger, q, qd, qdd) -> _Joint:
-    axis, origin, com, Ix, Iy, Iz = (
-        _vector(a.T) for a in (finger.axis, finger.origin, finger.com, *jnp.moveaxis(finger.inertia, 1, 0))
-    )
-    return _Joint(axis, origin, com, finger.mass, (Ix, Iy, Iz), q, qd, qdd)
+def _joints(finger: Finger, q, qd, qdd, by_components: bool) -> _Joint:
+    f = jax.tree.map(lambda a: a.reshape(a.shape + (1,) * (q.ndim - 1)), finger)
+    axis, origin, com, inertia = f.axis, f.origin, f.com, f.inertia
+    if by_components:
+        axis, origin, com = (tuple(jnp.unstack(a, axis=1)) for a in (axis, origin, com))
+        inertia = tuple(tuple(jnp.unstack(row, axis=1)) for row in jnp.unstack(inertia, axis=1))
+    return _Joint(axis, origin, com, f.mass, inertia, q, qd, qdd)
 
 
 def _frame(j: _Joint, slides: bool) -> tuple[Matrix, Vector]:
     """The link's frame in its parent's."""
     if slides:
         return _rotation(j.axis, jnp.zeros_like(j.q)), _add(j.origin, _scale(j.q, j.axis))
-    return _rotation(j.axis, j.q), _add(j.origin, _vector(jnp.zeros((3, *j.q.shape))))
+    return _rotation(j.axis, j.q), jax.tree.map(lambda a: a + jnp.zeros_like(j.q), j.origin)
 
 
 def _recursion(step, state, links, finger: Finger, unroll: bool, reverse: bool = False):
@@ -111,18 +125,18 @@ def inverse_dynamics(
 ) -> Float[Array, "m *T"]:
     """M(q) q̈ + N(q, q̇) + G(q), in N m (N for a prismatic joint)."""
     samples = math.prod(q.shape[1:])
-    if samples <= BLOCK:
-        return _newton_euler(finger, q, qd, qdd, unroll=False)
+    if samples <= LONG:
+        return _newton_euler(finger, q, qd, qdd, by_components=False)
 
     def blocks(a):
         flat = jnp.pad(a.reshape(finger.m, samples), [(0, 0), (0, -samples % BLOCK)])
         return jnp.moveaxis(flat.reshape(finger.m, -1, BLOCK), 1, 0)
 
-    torques = jax.lax.map(lambda x: _newton_euler(finger, *x, unroll=True), (blocks(q), blocks(qd), blocks(qdd)))
+    torques = jax.lax.map(lambda x: _newton_euler(finger, *x, by_components=True), (blocks(q), blocks(qd), blocks(qdd)))
     return jnp.moveaxis(torques, 0, 1).reshape(finger.m, -1)[:, :samples].reshape(q.shape)
 
 
-def _newton_euler(finger: Finger, q, qd, qdd, unroll: bool) -> Float[Array, "m *T"]:
+def _newton_euler(finger: Finger, q, qd, qdd, by_components: bool) -> Float[Array, "m *T"]:
     def outward(state, j: _Joint, slides: bool):
         """Angular velocity ω, angular and linear acceleration α, a of the link's frame, in that frame."""
         omega, alpha, a = state
@@ -148,11 +162,13 @@ def _newton_euler(finger: Finger, q, qd, qdd, unroll: bool) -> Float[Array, "m *
         force, moment = _mul(R, force), _mul(R, moment)
         return (force, _add(moment, _cross(p, force))), torque
 
-    zero = _vector(jnp.zeros((3, *q.shape[1:])))
-    upward = _add(zero, _scale(-1.0, _vector(finger.gravity)))  # gravity enters as an acceleration of the base
-    joints = _joints(finger, q, qd, qdd)
-    _, links = _recursion(outward, (zero, zero, upward), joints, finger, unroll)
-    _, torques = _recursion(inward, (zero, zero), links, finger, unroll, reverse=True)
+    zero = jnp.zeros((3, *q.shape[1:]))
+    upward = zero - finger.gravity.reshape(3, *(1,) * (q.ndim - 1))  # gravity enters as an acceleration of the base
+    if by_components:
+        zero, upward = tuple(zero), tuple(upward)
+    joints = _joints(finger, q, qd, qdd, by_components)
+    _, links = _recursion(outward, (zero, zero, upward), joints, finger, unroll=by_components)
+    _, torques = _recursion(inward, (zero, zero), links, finger, unroll=by_components, reverse=True)
     return torques
 
 
@@ -186,15 +202,15 @@ def fingertip(finger: Finger, q: Float[Array, "m *T"]) -> tuple[Float[Array, "3 
         """The link's frame in the base frame; the joint's axis there, and where the joint is."""
         (R, p), (turn, shift) = pose, _frame(j, slides)
         p = _add(p, _mul(R, shift))
-        x, y, z = (_mul(R, column) for column in _transposed(turn))
-        R = _transposed((x, y, z))
+        R = jnp.sum(R[:, :, None] * jnp.asarray(turn)[None], axis=1)
         return (R, p), (_mul(R, j.axis), p)
 
-    o, e = jnp.zeros(q.shape[1:]), jnp.ones(q.shape[1:])
-    base = (((e, o, o), (o, e, o), (o, o, e)), (o, o, o))
-    (R, p), (axes, places) = _recursion(outward, base, _joints(finger, q, q, q), finger, unroll=False)
-    tip = _add(p, _mul(R, _vector(finger.fingertip)))
-    slides = jnp.array(finger.prismatic, dtype=float).reshape(-1, *(1,) * (q.ndim - 1))
-    turning = _cross(axes, _add(tip, _scale(-1.0, places)))
-    J = _add(_scale(slides, axes), _scale(1.0 - slides, turning))
-    return jnp.stack(tip), jnp.stack(J)
+    zero = jnp.zeros((3, *q.shape[1:]))
+    base = (jnp.eye(3).reshape(3, 3, *(1,) * (q.ndim - 1)) + zero[None], zero)
+    joints = _joints(finger, q, q, q, by_components=False)
+    (R, p), links = _recursion(outward, base, joints, finger, unroll=False)
+    axes, places = (jnp.asarray(a) for a in links)
+    tip = jnp.asarray(_add(p, _mul(R, finger.fingertip.reshape(3, *(1,) * (q.ndim - 1)))))
+    slides = jnp.array(finger.prismatic, dtype=float).reshape(-1, *(1,) * q.ndim)
+    columns = slides * axes + (1.0 - slides) * jnp.asarray(jax.vmap(_cross)(axes, tip - places))
+    return tip, jnp.moveaxis(columns, 0, 1)
