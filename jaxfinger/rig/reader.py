@@ -85,9 +85,10 @@ class Reader:
                 elif self.recorder.failure is not None:
                     self.stop(Violation(Trip.RECORDER, "recorder", self.latest_seq, float("nan")))
             return len(block)
-        except UserError as error:
+        except Exception as error:  # whatever it is, nobody would watch the rig any more: the trial must end
             with self._news:
-                self.error = error
+                known = isinstance(error, UserError)
+                self.error = error if known else UserError(f"the rig cannot be read: {type(error).__name__}: {error}")
                 self._news.notify_all()
             return 0
 

@@ -42,3 +42,18 @@ def test_the_drift_between_two_clocks_shows_from_trial_to_trial(simulated, tmp_p
     for ahead, at in (first, second):
         assert ahead * 1e-9 == pytest.approx(lead_s + drift * (at - start) * 1e-9, abs=1e-3)
     assert (second[0] - first[0]) / (second[1] - first[1]) == pytest.approx(drift, abs=2e-4)
+
+
+def test_whatever_goes_wrong_in_a_read_is_an_error_that_ends_the_trial(simulated, tmp_path, monkeypatch):
+    """An exception that nobody expected must not leave a run waiting for samples that never come."""
+
+    def broken(timeout):
+        raise ValueError("half a header")
+
+    recorder = Recorder(tmp_path / "a.wal", {})
+    with simulated:
+        reader = Reader(simulated, recorder, Supervisor(simulated.description))
+        monkeypatch.setattr(simulated, "read_block", broken)
+        assert reader.next() is None
+    recorder.close()
+    assert str(reader.error) == "the rig cannot be read: ValueError: half a header"
