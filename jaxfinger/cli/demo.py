@@ -93,7 +93,7 @@ def comparison(fit, result) -> list[tuple[str, str, str, str]]:
         here = f"{ours_high:.2f}; {ours_low:.2f} ± {1.96 * std:.2f}"
         rows.append((f"moment arm {tendon} {joint}, max; min", f"{high}; {low}", here, "mm"))
     mcp = found.joints["MCP"]
-    rows.append(("gravity torque at the MCP, 10° to 70°", "5 to 15", _gravity(fit), "N mm"))
+    rows.append(("gravity torque at the MCP, 10° to 70°, others straight", "5 to 15", _gravity(fit), "N mm"))
     rows.append(("elastic torque at the MCP, 45°", "30", _at(mcp.elastic, 45), "N mm"))
     rows.append(("friction torque at the MCP, 70°", "9", _at(mcp.friction, 70), "N mm"))
     rows.append(("damping at the MCP", "close to none", with_error(*mcp.damping), "N mm s/rad"))

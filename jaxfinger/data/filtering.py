@@ -44,8 +44,6 @@ def low_pass(time: Float[np.ndarray, " N"], x: Float[np.ndarray, N * k], cutoff_
 
 def _smoothed(time: np.ndarray, x: np.ndarray, cutoff_hz: float, highest: int) -> np.ndarray:
     """x and its derivatives up to the highest, stacked."""
-    from scipy.interpolate import make_interp_spline  # here, since it takes a recorder half a second to import
-
     time, x = np.asarray(time, np.float64), np.asarray(x, np.float64)
     if len(time) < 3:
         return np.stack([x, *[np.zeros_like(x)] * highest])
@@ -64,6 +62,8 @@ def _smoothed(time: np.ndarray, x: np.ndarray, cutoff_hz: float, highest: int) -
         if highest == 0 and grid is time:
             out[0][:, usable] = filtered
         else:
+            from scipy.interpolate import make_interp_spline  # here, since it takes a recorder half a second to import
+
             spline = make_interp_spline(grid, filtered, k=min(5, _odd(len(grid) - 1)))
             for order in range(highest + 1):
                 out[order][:, usable] = spline.derivative(order)(time) if order <= spline.k else 0.0
@@ -103,7 +103,8 @@ def shrink(x: Float[np.ndarray, "N k"], window: int) -> Float[np.ndarray, "N k"]
 
     x̂ = x̄ + max(0, 1 − σ²/s²) (x − x̄), s² the variance within the window, σ from the median of |x − x̄|: the noise of
     most of the trial. As a regressor x̂ is rid of most of the bias of its coefficient towards zero (regression
-    calibration; Carroll et al., Measurement Error in Nonlinear Models, 2nd ed., ch. 4).
+    calibration; Carroll et al., Measurement Error in Nonlinear Models, 2nd ed., ch. 4). `scipy.signal.wiener` takes the
+    signal to be zero beyond its ends, and would pull the mean there towards it.
     """
     out = np.array(x, np.float64)
     window = 2 * (max(window, 2) // 2) + 1

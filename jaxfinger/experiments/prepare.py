@@ -1,7 +1,6 @@
 """From recordings to arrays that a fit can take: derivatives, directions, block means, padded stacks of trials."""
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -24,8 +23,6 @@ from jaxfinger.experiments.table import (
     Experiment,
 )
 from jaxfinger.model import Motion
-
-LONG = 10_000  # samples of a trial from which on its filters, which let go of the interpreter, are worth a thread
 
 
 class Batch(eqx.Module):
@@ -58,9 +55,7 @@ def prepare(
     for spec in EXPERIMENTS.values():
         chosen = [t for t in session if t.experiment == spec.name and (names is None or t.name in names)]
         trials = [t for t in chosen if len(t.time) > 1]
-        long = bool(trials) and max(len(t.time) for t in trials) > LONG
-        with ThreadPoolExecutor(None if long else 1) as pool:
-            rows = list(pool.map(lambda t, spec=spec: _reduce(spec, t, session, reduced, minus), trials))
+        rows = [_reduce(spec, t, session, reduced, minus) for t in trials]
         if rows:
             stacks[spec.name] = _stack(spec, trials, rows, reduced)
     return stacks
@@ -105,7 +100,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         motorised[:, session.finger.joint_names.index(trial.joint)] = 1.0
 
     y, mask = _measured(spec, trial, session, minus)
-    slides = _sliding(spec, trial, session, qd) if spec.samples == "sliding" else None
+    slides = _sliding(spec, trial, session, qd, motorised) if spec.samples == "sliding" else None
     if reduced and spec.samples == "sliding":
         # q̈ is low-passed, so all else is too. What noise it keeps would still tell a fit of less inertia
         # (errors in variables): where q̈ does not rise above it, its mean over a tenth of a second takes its place.
@@ -206,11 +201,11 @@ def _rates(trial: Trial, spec: Experiment) -> np.ndarray:
     return smooth(trial.time, np.nan_to_num(np.asarray(trial.tendon_excursion)), spec.cutoff / 2)[1]
 
 
-def _sliding(spec: Experiment, trial: Trial, session: Session, qd) -> np.ndarray:
+def _sliding(spec: Experiment, trial: Trial, session: Session, qd, motorised) -> np.ndarray:
     """(N, m): 1 where a joint and every taut tendon across it slide, so that the directions of friction are known."""
     fast = np.percentile(np.abs(qd), 95, axis=0)
-    driven = np.array([joint == trial.joint for joint in session.finger.joint_names])
-    slides = np.abs(qd) > np.minimum(np.where(driven, MIN_DRIVEN_SPEED, MIN_JOINT_SPEED), 0.05 * fast)
+    slow = np.where(motorised, MIN_DRIVEN_SPEED, MIN_JOINT_SPEED)
+    slides = np.abs(qd) > np.minimum(slow, 0.05 * fast)
     slides[1:] &= np.sign(qd[1:]) == np.sign(qd[:-1])  # a quick reversal has no slow sample
     if not spec.slack and trial.tendon_excursion is not None and trial.tendon_force is not None:
         taut = np.nan_to_num(trial.tendon_force) > SLACK

@@ -38,9 +38,7 @@ EXPERIMENTS = {
 
 SLACK = 0.2  # N: a tendon whose tension stays below this is slack, and carries neither tension nor friction
 STILL = 0.05  # rad/s (or a tenth of the motion's speed): below this a joint keeps the direction that it had
-MIN_JOINT_SPEED = (
-    0.1  # rad/s (or a twentieth of the motion's speed): below this a joint may stick, its friction unknown
-)
+MIN_JOINT_SPEED = 0.1  # rad/s (or a twentieth of the motion's): below it a joint may stick, its friction unknown
 MIN_DRIVEN_SPEED = 0.02  # rad/s: likewise a joint that a motor moves, which does not stick: above the encoder's noise
 MIN_TENDON_SPEED = 5e-4  # m/s: likewise a tendon
 CLEAR = 0.03  # s: kept clear on either side of where a joint or tendon may stick: over two widths of the filter

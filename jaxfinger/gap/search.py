@@ -33,10 +33,9 @@ ADD = 0.3  # share of what is left, that a further effect must explain
 SAME_SITE = 0.1  # share of what is explained, that a further effect at the same site must explain
 LOOKED_AT = 12  # candidates for a further effect
 LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for
-# After one chosen effect and after two, since two known ones together imitate more than one does:
-OPEN = (0.25, 0.17)  # share of the gap left to the stand-in at which «unlisted» is as likely as the catalogue
-OPEN_WIDTH = (0.06, 0.04)
-UNLISTED = (300.0, 100.0)  # energy left to the stand-in below which «unlisted» is no verdict
+# «Unlisted», by how many effects were chosen, since two known ones together imitate more than one does: the share of
+# the gap left to the stand-in at which it is as likely as the catalogue, how sharply, and the least energy that counts.
+OPEN = {1: (0.25, 0.06, 300.0), 2: (0.17, 0.04, 100.0)}
 
 
 @dataclass(frozen=True)
@@ -200,9 +199,8 @@ def _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, stro
     log_l = {k: -0.5 * LOOKS * np.log1p(max(u, 0.0) / LOOKS) for k, u in unexplained.items()}
     total = logsumexp(list(log_l.values()))
     share_left = beyond / gap
-    at_work = len(chosen.variants) - 1
-    seen = beyond > UNLISTED[at_work]
-    unlisted = float(expit((share_left - OPEN[at_work]) / OPEN_WIDTH[at_work])) if seen else 0.01
+    even, width, least = OPEN[len(chosen.variants)]
+    unlisted = float(expit((share_left - even) / width)) if beyond > least else 0.01
     probability = {k: float(np.exp(v - total)) * (1 - unlisted) for k, v in log_l.items()}
     if len(chosen.variants) > 1:
         # Several effects: each carries its part of what the catalogue explains.

@@ -125,10 +125,11 @@ def identify(
     fit = start or Fit.before(session, recipe, nominal_model(session, recipe))
     if start is None:
         fit = replace(fit, covariance=cad_covariance(session, describe(fit.model)))
-    with ThreadPoolExecutor(1) as pool:  # a stage compiles while the recordings of the next are filtered
-        ready, pending = dict(stacks or {}), {}
-        for experiment in dict.fromkeys(e for s in wanted for e in STAGES[s].reads) if stacks is None else ():
-            pending[experiment] = pool.submit(prepare, session, [t.name for t in session if t.experiment == experiment])
+    with ThreadPoolExecutor(2) as pool:  # a stage compiles while the recordings of the next are filtered
+        experiments = dict.fromkeys(e for s in wanted for e in STAGES[s].reads) if stacks is None else ()
+        named = {e: [t.name for t in session if t.experiment == e] for e in experiments}
+        pending = {e: pool.submit(prepare, session, names) for e, names in named.items()}
+        ready = dict(stacks or {})
         for name in wanted:
             progress(f"fitting {name}")
             for experiment in STAGES[name].reads.keys() & pending.keys():

@@ -23,13 +23,11 @@ Matrix = Float[Array, "3 3 *T"] | tuple[tuple[Scalar, ...], ...]  # rows
 
 
 def _add(*vectors: Vector) -> Vector:
-    if isinstance(vectors[0], tuple):
-        return tuple(functools.reduce(jnp.add, components) for components in zip(*vectors, strict=True))
-    return functools.reduce(jnp.add, (jnp.asarray(v) for v in vectors))
+    return jax.tree.map(lambda *components: functools.reduce(jnp.add, components), *vectors)
 
 
 def _scale(s: Scalar | float, v: Vector) -> Vector:
-    return tuple(s * x for x in v) if isinstance(v, tuple) else s * v
+    return jax.tree.map(lambda component: s * component, v)
 
 
 def _dot(a: Vector, b: Vector) -> Scalar:
@@ -76,7 +74,7 @@ def _rotation(axis: Vector, angle: Scalar) -> Matrix:
 
 
 BLOCK = 8192  # samples
-LONG = 32 * BLOCK  # from which on running takes longer than compiling
+LONG = 32 * BLOCK  # samples from which on a faster run is worth a slower compilation
 
 
 class _Joint(NamedTuple):
@@ -152,13 +150,13 @@ def _newton_euler(finger: Finger, q, qd, qdd, by_components: bool) -> Float[Arra
             omega, alpha = _add(omega, rate), _add(alpha, change)
         force = _scale(j.mass, _add(a, _cross(alpha, j.com), _cross(omega, _cross(omega, j.com))))
         moment = _add(_mul(j.inertia, alpha), _cross(omega, _mul(j.inertia, omega)), _cross(j.com, force))
-        return (omega, alpha, a), (j.axis, R, p, force, moment)
+        return (omega, alpha, a), (R, p, force, moment)
 
     def inward(wrench, link, slides: bool):
         """Force and moment that the parent applies to the link, at its joint; then both in the parent's frame."""
-        (force, moment), (axis, R, p, f, n) = wrench, link
+        (force, moment), (j, (R, p, f, n)) = wrench, link
         force, moment = _add(f, force), _add(n, moment)
-        torque = _dot(axis, force if slides else moment)
+        torque = _dot(j.axis, force if slides else moment)
         force, moment = _mul(R, force), _mul(R, moment)
         return (force, _add(moment, _cross(p, force))), torque
 
@@ -168,7 +166,7 @@ def _newton_euler(finger: Finger, q, qd, qdd, by_components: bool) -> Float[Arra
         zero, upward = tuple(zero), tuple(upward)
     joints = _joints(finger, q, qd, qdd, by_components)
     _, links = _recursion(outward, (zero, zero, upward), joints, finger, unroll=by_components)
-    _, torques = _recursion(inward, (zero, zero), links, finger, unroll=by_components, reverse=True)
+    _, torques = _recursion(inward, (zero, zero), (joints, links), finger, unroll=by_components, reverse=True)
     return torques
 
 

@@ -30,7 +30,7 @@ T3_MCP = WrappedRoute(_mm(-15.82, -0.51), _mm(12.64, 0.42), _mm(-1.12, -0.73), 5
 T4_MCP = WrappedRoute(_mm(-15.82, -0.73), _mm(12.64, 0.24), _mm(-1.28, -0.52), 5.49e-3)
 # The extensor wraps heads that are not concentric with the joints, and gains leverage as they flex.
 T2_MCP = WrappedRoute(_mm(-18.0, 5.0), _mm(16.0, 5.0), _mm(1.60, -0.27), 6.08e-3, dorsal=True)
-T2_PIP = WrappedRoute(_mm(-13.0, 4.5), _mm(11.0, 4.5), _mm(-2.08, -0.74), 5.49e-3, dorsal=True, on_distal=True)
+T2_PIP = WrappedRoute(_mm(-13.0, 4.5), _mm(11.0, 4.5), _mm(-2.09, -0.73), 5.51e-3, dorsal=True, on_distal=True)
 T2_DIP = WrappedRoute(_mm(-11.0, 6.0), _mm(9.0, 5.5), _mm(1.99, 1.85), 3.89e-3, dorsal=True)
 # The passive tendon: taut when the PIP is flexed far more than the DIP, which it then flexes.
 T5_PIP = PolynomialRoute((-4e-3,))

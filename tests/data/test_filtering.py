@@ -152,5 +152,5 @@ def test_a_shrunk_regressor_is_rid_of_most_of_its_bias():
 
 def test_shrinking_leaves_a_smooth_motion_and_a_constant_alone():
     slow = np.sin(2 * np.pi * np.arange(5000) / 5000)[:, None]
-    np.testing.assert_allclose(shrink(slow, 100)[200:-200], slow[200:-200], atol=1e-3)
+    np.testing.assert_allclose(shrink(slow, 100), slow, atol=3e-3)  # the ends too
     np.testing.assert_array_equal(shrink(np.ones((500, 2)), 100), np.ones((500, 2)))

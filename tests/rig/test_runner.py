@@ -27,6 +27,14 @@ def slot(rig, kind, of=""):
     return rig.description.channels[rig.description.index(kind, of)].slot
 
 
+def wait_until_written(log, trial):
+    """The writer may be a whole sync behind a simulated rig, which runs as fast as it is read."""
+    deadline = time.monotonic() + 30.0
+    while trial.encode() not in log.read_bytes():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
 def test_a_session_is_recorded_and_the_finger_released(simulated, record, tmp_path):
     outcome = record(simulated)
     assert outcome.cause == ""
@@ -230,18 +238,17 @@ def test_ctrl_c_stops_the_rig_and_keeps_the_trial(rig, record):
     assert not read_session(outcome.session)["02-ID.4-T3-MCP"].complete
 
 
-def test_a_full_disk_ends_the_trial_and_keeps_what_was_written(rig, record):
+def test_a_full_disk_ends_the_trial_and_keeps_what_was_written(rig, record, tmp_path):
     machine = SimulatedRig(rig)
     old = resource.getrlimit(resource.RLIMIT_FSIZE)
 
+    path = tmp_path / "session.h5"
+
     def fill(m):
+        wait_until_written(log_path(path), "02-ID.4-T3-MCP")
         size = log_path(path).stat().st_size
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size + 30_000, old[1]))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size + 100_000, old[1]))
 
-    import pathlib
-    import tempfile
-
-    path = pathlib.Path(tempfile.mkdtemp()) / "session.h5"
     try:
         outcome = record(machine, fill, output=path)
     finally:
@@ -253,15 +260,19 @@ def test_a_full_disk_ends_the_trial_and_keeps_what_was_written(rig, record):
     assert read_session(path)["01-ID.2-DIP"].complete
 
 
-def test_a_disk_that_stays_too_slow_ends_the_trial_and_keeps_what_was_written(rig, record, monkeypatch):
-    machine, write = SimulatedRig(rig), wal.LogWriter.write
+def test_a_disk_that_stays_too_slow_ends_the_trial_and_keeps_what_was_written(rig, record, tmp_path, monkeypatch):
+    machine, write, path = SimulatedRig(rig), wal.LogWriter.write, tmp_path / "session.h5"
     monkeypatch.setattr(recorder, "QUEUE_LIMIT", 2000)
 
     def slow(log, tag, payload):
         time.sleep(0.2 if tag == wal.DATA else 0.0)
         write(log, tag, payload)
 
-    outcome = record(machine, lambda m: monkeypatch.setattr(wal.LogWriter, "write", slow))
+    def brake(m):
+        wait_until_written(log_path(path), "02-ID.4-T3-MCP")
+        monkeypatch.setattr(wal.LogWriter, "write", slow)
+
+    outcome = record(machine, brake, output=path)
     assert "the disk is too slow" in outcome.cause
     assert machine.controller.trip is Trip.RECORDER
     assert outcome.complete == ("01-ID.2-DIP",)
