@@ -1,9 +1,9 @@
 """Many sessions fitted in one compiled call: forty specimens of a lab, or hundreds of simulated sessions.
 
 All members share the protocol, the recipe and the rig's noise with one session that was identified by itself (the
-template). Each is then a Gauss–Newton iteration of the whole staged fit in the coordinates of the template, in which
-every stage's matrix is near the identity: a handful of products of small matrices an iteration (see `resample`).
-A member that fails or does not converge is named and leaves the rest as they are.
+template); the links of each are its own. Each is then a Gauss–Newton iteration of the whole staged fit in the
+coordinates of the template, in which every stage's matrix is near the identity: a handful of products of small matrices
+an iteration (see `resample`). A member that fails or does not converge is named and leaves the rest as they are.
 """
 
 from collections.abc import Sequence
@@ -25,6 +25,7 @@ from jaxfinger.identify.linearise import Filters, white_rows
 from jaxfinger.identify.parameters import Free, ravel, with_flat
 from jaxfinger.identify.resample import Batching, Compressed, batching_here, compress, plan_of, staged_step
 from jaxfinger.identify.solve import SMALL
+from jaxfinger.identify.stages import nominal_model
 from jaxfinger.model import Model
 
 STEPS = 12
@@ -42,7 +43,7 @@ class Members:
     template: Fit
 
     def model(self, k: int) -> Model:
-        """The model of one member, with the template's links."""
+        """The model of one member."""
         return with_flat(self.template.model, jnp.asarray(self.values[k]))
 
 
@@ -61,22 +62,34 @@ def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: 
     """Fit every session as the template was fitted to the session `of`.
 
     Raises:
-        UserError: a session has another protocol, another finger or other links than the template's.
+        UserError: a session has another protocol than the template's, or other joints or tendons.
     """
     compressed = compress(of, template)
     prior = (compressed.grams.H[-1], compressed.grams.reads[:, -1])
     basis, how = jnp.asarray(compressed.basis), batching_here(batching)
+    starts = [_start(s, template, of) for s in sessions]
     at_once = min(len(sessions), AT_ONCE)
     with ThreadPoolExecutor(1) as device:
         shares = []
-        for k in range(0, len(sessions), at_once):
-            share = [*sessions[k : k + at_once], *sessions[: max(0, k + at_once - len(sessions))]]  # all of one length
-            sources = _stack_sessions(share, template, compressed)
-            shares.append(device.submit(_fit_all, template.model, sources, basis, compressed.sizes, prior, how))
+        for first in range(0, len(sessions), at_once):
+            members = [k % len(sessions) for k in range(first, first + at_once)]  # every share has one length
+            sources = _stack_sessions([sessions[k] for k in members], template, compressed)
+            start = jnp.stack([starts[k] for k in members])
+            shares.append(device.submit(_fit_all, template.model, start, sources, basis, compressed.sizes, prior, how))
     columns = zip(*(s.result() for s in shares), strict=True)
     values, std, sound, steps = (np.concatenate(a)[: len(sessions)] for a in columns)
     values[~sound], std[~sound] = np.nan, np.nan
     return Members(values, std, ~sound, steps, template)
+
+
+def _start(session: Session, template: Fit, of: Session) -> Float[Array, " P"]:
+    """The template's flat vector with the session's own links, which CAD's prior then moves with."""
+    own, shared = nominal_model(session, template.recipe), nominal_model(of, template.recipe)
+    if jax.tree.structure(own) != jax.tree.structure(shared):
+        raise UserError(
+            f"{session.file or session.specimen}: has not the joints and tendons of the other sessions; fit it alone"
+        )
+    return ravel(template.model) + ravel(own) - ravel(shared)
 
 
 def _stack_sessions(sessions: Sequence[Session], template: Fit, compressed: Compressed) -> tuple[_Source, ...]:
@@ -119,17 +132,18 @@ def _padded(batch: Batch, T: int) -> Batch:
 
 
 @eqx.filter_jit
-def _fit_all(model, sources, basis, sizes, prior, batching):
-    def one(batches):
-        return _fit(model, [s._replace(batch=b) for s, b in zip(sources, batches, strict=True)], basis, sizes, prior)
+def _fit_all(model, starts, sources, basis, sizes, prior, batching):
+    def one(member):
+        start, batches = member
+        own = [s._replace(batch=b) for s, b in zip(sources, batches, strict=True)]
+        return _fit(model, start, own, basis, sizes, prior)
 
-    batches = [s.batch for s in sources]
-    return jax.lax.map(one, batches) if batching == "map" else jax.vmap(one)(batches)
+    members = (starts, [s.batch for s in sources])
+    return jax.lax.map(one, members) if batching == "map" else jax.vmap(one)(members)
 
 
-def _fit(model: Model, sources: list[_Source], basis, sizes, prior):
-    """Gauss–Newton on all stages at once, θ = θ_template + basis z, until nothing moves by more than SMALL."""
-    start = ravel(model)
+def _fit(model: Model, start: Float[Array, " P"], sources: list[_Source], basis, sizes, prior):
+    """Gauss–Newton on all stages at once, θ = θ_start + basis z, until nothing moves by more than SMALL."""
     (prior_gram, prior_reads), q = prior, basis.shape[1]
 
     def stages(z):

@@ -39,7 +39,7 @@ def test_members_that_fail_are_named_and_spoil_nothing(members):
 def test_members_are_the_fits_of_each_session_alone(members, sessions, staged):
     free = staged.estimated
     for k, session in enumerate(sessions[:2]):
-        alone = identify(replace(session, finger=sessions[0].finger))
+        alone = identify(session)
         difference = (members.values[k] - np.asarray(ravel(alone.model)))[free] / alone.std[free]
         # Alone it estimates its own noise, and so weighs its samples a little differently.
         assert np.abs(difference).max() < 0.5
@@ -52,6 +52,25 @@ def test_the_template_itself_comes_back(members, staged):
     difference = (members.values[0] - np.asarray(ravel(staged.model)))[free] / staged.std[free]
     assert np.abs(difference).max() < 0.05
     np.testing.assert_allclose(members.std[0][free], staged.std[free], rtol=0.02)
+
+
+def test_members_keep_their_own_links(clean, sessions, session, staged):
+    """Specimens of a lab differ: heavier links change gravity, and so what is left to the elastic torques."""
+    finger = replace(sessions[1].finger, mass=1.2 * sessions[1].finger.mass)
+    heavy = replace(sessions[1], finger=finger)
+    found = fit_many([sessions[0], heavy], staged, session)
+    alone = identify(heavy)
+    free = staged.estimated
+    np.testing.assert_allclose(found.model(1).finger.mass, finger.mass)
+    difference = (found.values[1] - np.asarray(ravel(alone.model)))[free] / alone.std[free]
+    assert np.abs(difference).max() < 0.5
+    assert np.abs((found.values[1] - found.values[0])[free] / staged.std[free]).max() > 3.0
+
+
+def test_a_session_of_another_finger_is_refused(session, staged):
+    other = replace(session, finger=replace(session.finger, joint_names=("A", "B", "C")))
+    with pytest.raises(UserError, match="has not the joints and tendons"):
+        fit_many([session, other], staged, session)
 
 
 def test_a_session_of_another_protocol_is_refused(session, staged):
