@@ -40,7 +40,7 @@ def augmented_fit(problem: Problem, chosen: Refined) -> tuple[Fit, np.ndarray, n
     root[len(problem.root) :, problem.free.size :] = np.diag(1.0 / (3.0 * scale))
     fitted, solution = solve(model, free, sources, Prior(mean, root))
     information = solution.information[np.ix_(free, free)] + root.T @ root
-    r, J = assemble(solution, sources, problem.rows, free, ravel(model).size)
+    r, J = assemble(solution.linearised, sources, problem.rows, free, ravel(model).size)
     return _fit(problem, fitted, free, information, "with the effects of the diagnosis", solution), r, J
 
 

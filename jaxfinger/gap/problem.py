@@ -6,8 +6,9 @@ Q spans the whitened Jacobian of the nominal parameters: what they can absorb is
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,10 +18,10 @@ from jaxfinger.data import Predictions, Session
 from jaxfinger.experiments import Stack, prepare
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
-from jaxfinger.identify.linearise import linearise
+from jaxfinger.identify.linearise import Linearised, linearise
 from jaxfinger.identify.noise import Noise, estimate
 from jaxfinger.identify.parameters import Free, describe, ravel
-from jaxfinger.identify.solve import Prior, Solution, Source, solve
+from jaxfinger.identify.solve import Prior, Source, solve, unit_weights
 from jaxfinger.identify.stages import DEPENDS, cad_covariance, first_noise, free_groups, nominal_model, start_values
 from jaxfinger.model import Model
 
@@ -130,7 +131,7 @@ def build(
         if missing:
             source = sources[e]
             lin = linearise(
-                fit.model, Free.at(fit.model, source.positions), source.batch, source.filters, _ones(source)
+                fit.model, Free.at(fit.model, source.positions), source.batch, source.filters, unit_weights(source)
             )
             noise |= {(e, c): estimate(stack, c, np.asarray(lin.residuals[c])) for c in missing}
     sources = {e: _source(stacks[e], noise, parameters) for e in stacks}
@@ -139,30 +140,46 @@ def build(
     nominal, solution = solve(start, free, sources, prior)
 
     rows = layouts(stacks, sources)
-    r, J = assemble(solution, sources, rows, free, ravel(nominal).size)
-    predicted = {
-        (e, c): np.asarray(stacks[e].batch.y[c]) - np.asarray(solution.linearised[e].residuals[c])
-        for e in stacks
-        for c in stacks[e].experiment.channels
-    }
-    theta = np.asarray(ravel(nominal))[free]
     return Problem(
-        session,
-        stacks,
-        noise,
-        nominal,
-        free,
-        rows,
-        r,
-        J,
-        np.asarray(prior.root),
-        np.asarray(prior.root) @ (theta - np.asarray(prior.mean)),
-        predicted,
-        fit,
-        sources,
-        prior,
-        simulator,
+        session=session,
+        stacks=stacks,
+        noise=noise,
+        free=free,
+        rows=rows,
+        root=np.asarray(prior.root),
+        fit=fit,
+        sources=sources,
+        prior=prior,
+        simulator=simulator,
+        **_at(nominal, solution.linearised, sources, rows, free, prior),
     )
+
+
+def moved(problem: Problem, by: Float[np.ndarray, " p"]) -> Problem:
+    """The same rows at another nominal model: its free parameters moved, residuals and Jacobian exact there."""
+    at = Free.at(problem.nominal, problem.free)
+    nominal = at.set(problem.nominal, at.get(problem.nominal) + by)
+    linearised = {
+        e: linearise(nominal, Free.at(nominal, s.positions), s.batch, s.filters, unit_weights(s))
+        for e, s in problem.sources.items()
+    }
+    return replace(problem, **_at(nominal, linearised, problem.sources, problem.rows, problem.free, problem.prior))
+
+
+def _at(nominal: Model, linearised: dict[str, Linearised], sources, rows, free, prior: Prior) -> dict[str, Any]:
+    """What of a problem depends on its nominal model."""
+    r, J = assemble(linearised, sources, rows, free, ravel(nominal).size)
+    return {
+        "nominal": nominal,
+        "r": r,
+        "J": J,
+        "offset": np.asarray(prior.root) @ (np.asarray(ravel(nominal))[free] - np.asarray(prior.mean)),
+        "predicted": {
+            (e, c): np.asarray(sources[e].batch.y[c]) - np.asarray(residuals)
+            for e, lin in linearised.items()
+            for c, residuals in lin.residuals.items()
+        },
+    }
 
 
 def layouts(stacks: dict[str, Stack], sources: dict[str, Source]) -> dict[str, Rows]:
@@ -175,11 +192,11 @@ def layouts(stacks: dict[str, Stack], sources: dict[str, Source]) -> dict[str, R
 
 
 def assemble(
-    solution: Solution, sources: dict[str, Source], rows: dict[str, Rows], free: np.ndarray, size: int
+    linearised: dict[str, Linearised], sources: dict[str, Source], rows: dict[str, Rows], free: np.ndarray, size: int
 ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N p"]]:
-    """White residuals at an optimum and the derivatives of the white predictions by the free parameters."""
+    """White residuals and the derivatives of the white predictions by the free parameters."""
     r, J = [], []
-    for e, lin in solution.linearised.items():
+    for e, lin in linearised.items():
         keep = rows[e].keep
         r.append(np.asarray(lin.white).reshape(-1)[keep])
         full = np.zeros((keep.size, size))
@@ -200,7 +217,7 @@ def _with_missing_stages(
     start = start_values(fit.model, np.array(unknown, dtype=int), parameters)
     seen = set()
     for source in sources.values() if unknown else ():
-        lin = linearise(start, Free.at(start, source.positions), source.batch, source.filters, _ones(source))
+        lin = linearise(start, Free.at(start, source.positions), source.batch, source.filters, unit_weights(source))
         seen |= set(source.positions[np.any(np.asarray(lin.factor)[..., :-1] != 0.0, axis=(0, 1))])
     added = np.array([i for i in unknown if i in seen], dtype=int)
     return start_values(fit.model, added, parameters), np.union1d(free, added).astype(int)
@@ -222,11 +239,6 @@ def _source(stack: Stack, noise: dict[tuple[str, str], Noise], parameters) -> So
     positions = np.array([i for i, p in enumerate(parameters) if p.group in groups and p.determinable])
     known = {c: noise[e, c] if (e, c) in noise else first_noise(stack, c) for c in channels}
     return Source(stack.batch, {c: jnp.asarray(n.coefficients) for c, n in known.items()}, positions)
-
-
-def _ones(source: Source):
-    B, T = source.batch.x.time.shape
-    return jnp.ones((B, T * sum(f.shape[0] for f in source.filters.values())))
 
 
 def _layout(stack: Stack, filters, start: int) -> Rows:

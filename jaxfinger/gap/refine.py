@@ -1,8 +1,9 @@
 """Refit of a few candidates: amplitudes and shapes move, the nominal parameters with them.
 
 Gauss–Newton on [nominal parameters, amplitudes, shapes] with signatures re-evaluated at each step and the nominal
-parameters eliminated by projection: equation (1) is linear in them to a good approximation, but for slip. Signatures
-are read at the nominal model of the problem; the exact fit of the effects that a verdict names comes last (`augment`).
+parameters eliminated by projection: equation (1) is linear in them to a good approximation, but for slip and for large
+effects. Signatures are read at the nominal model of the problem; the strongest rivals are then refitted at the nominal
+model that each leads to (`relinearised`). The exact fit of the effects that a verdict names comes last (`augment`).
 """
 
 from dataclasses import dataclass, replace
@@ -13,10 +14,12 @@ from jaxtyping import Float
 
 from jaxfinger.effects import NOMINAL_TERMS, CatalogueEffect
 from jaxfinger.gap.evidence import Projector
-from jaxfinger.gap.problem import Problem
+from jaxfinger.gap.problem import Problem, moved
 from jaxfinger.gap.signatures import Signatures, Variant
 
 STEPS = 6
+ROUNDS = 8  # of moving the nominal model and refitting there
+SETTLED = 1.0  # change of the sum of squares below which it stays
 LARGE = 3.0  # plausible sizes: the width of the prior on an amplitude in the evidence, which has Cauchy's tails
 WIDE = 10.0  # plausible sizes: the width of the prior that keeps amplitudes that no trial sees near nothing
 ADDITIVE = {"phi", "place", "p", "toe"}  # shapes that move by differences; the others by factors
@@ -112,6 +115,40 @@ def refine(
     )
 
 
+def relinearised(problem: Problem, refined: Refined, chi2_null: float) -> tuple[Problem, Refined]:
+    """The same effects with the nominal model where they lead it, and the problem there: what is left is then exact.
+
+    A sensor's gain multiplies torques that are refitted with it, an encoder's offset shifts every polynomial of its
+    joint: where effects are large, their products with the nominal parameters count.
+    """
+    for _ in range(ROUNDS):
+        here = moved(problem, _nominal_step(problem, problem.r - refined.change))
+        left = here.r - _evaluate(Signatures(here, here.nominal), refined.effects, [])[0]
+        exact = float(left @ left + here.offset @ here.offset)
+        if not abs(exact - refined.chi2) > SETTLED:
+            break
+        problem, (items, starts) = here, at_optimum(refined)
+        refined = refine(problem, items, starts, chi2_null, Projector(problem))
+    return problem, refined
+
+
+def _nominal_step(problem: Problem, r: np.ndarray) -> Float[np.ndarray, " p"]:
+    """What the nominal parameters move by to absorb r."""
+    A, b = np.vstack([problem.J, problem.root]), np.concatenate([r, -problem.offset])
+    scale = np.linalg.norm(A, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    return np.linalg.lstsq(A / scale, b, rcond=1e-7)[0] / scale
+
+
+def at_optimum(refined: Refined) -> tuple[list[Variant], list[dict[str, float]]]:
+    """Variants with the shapes that a refit found, and the amplitudes to start from."""
+    items = [
+        Variant(type(x), v.site, tuple((n, float(getattr(x, n))) for n in x.SHAPES))
+        for v, x in zip(refined.variants, refined.effects, strict=True)
+    ]
+    return items, [{n: float(getattr(x, n)) for n in x.AMPLITUDES} for x in refined.effects]
+
+
 def _sizes(effects, coordinates: list[_Coordinate]) -> Float[np.ndarray, " k"]:
     """Amplitudes in units of WIDE plausible sizes; zero for shapes.
 
@@ -143,13 +180,17 @@ def _shifted(effect: CatalogueEffect, c: _Coordinate, by: float) -> CatalogueEff
         value += by * c.unit
     else:
         value *= float(np.exp(np.clip(by, -0.7, 0.7)))
-    if c.amplitude and not effect.AMPLITUDES[c.name][2]:
-        value = max(value, 0.0)
-    if not c.amplitude:
-        grid = effect.SHAPES[c.name][1]
-        wide = 0.0 if c.name in ADDITIVE else 2.0
-        value = float(np.clip(value, min(grid) / wide if wide else min(grid), max(grid) * wide if wide else max(grid)))
-    return replace(effect, **{c.name: jnp.asarray(value)})
+    return within_bounds(replace(effect, **{c.name: jnp.asarray(value)}))
+
+
+def within_bounds(effect: CatalogueEffect) -> CatalogueEffect:
+    """The effect with one-sided amplitudes not below zero, and shapes no further out than those worth trying."""
+    bounds = {n: (0.0, np.inf) for n, (_, _, signed) in effect.AMPLITUDES.items() if not signed}
+    for n, (_, grid) in effect.SHAPES.items():
+        if n not in FIXED and len(grid) > 1:
+            wide = 1.0 if n in ADDITIVE else 2.0
+            bounds[n] = (min(grid) / wide, max(grid) * wide)
+    return replace(effect, **{n: jnp.clip(getattr(effect, n), *ends) for n, ends in bounds.items()})
 
 
 def _moved(effects, coordinates, delta):

@@ -18,8 +18,8 @@ from scipy.special import expit, logsumexp
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.gap.evidence import Evidence, Projector, by_site, screen
 from jaxfinger.gap.problem import Problem
-from jaxfinger.gap.refine import Refined, refine
-from jaxfinger.gap.signatures import Signatures, Variant, all_columns, variants
+from jaxfinger.gap.refine import Refined, at_optimum, refine, relinearised
+from jaxfinger.gap.signatures import Signatures, all_columns, variants
 from jaxfinger.gap.standin import REACH, Explained, energy_left, explained
 
 Progress = Callable[[str], None]
@@ -31,6 +31,9 @@ FORM = 0.1  # share of what an effect explains in a column, that the form of its
 MOST = 2  # effects that a verdict names: three known ones together imitate most that is not known
 ADD = 0.3  # share of what is left, that a further effect must explain
 SAME_SITE = 0.1  # share of what is explained, that a further effect at the same site must explain
+CLOSE = 0.5  # share of what the best explains, from which on a rival is refitted where it leads
+COVERED = 0.97  # probability of a set of rivals, among the catalogue, up to which it takes in further ones
+RIVALS = 3  # at most in a set
 LOOKED_AT = 12  # candidates for a further effect
 LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for
 # «Unlisted», by how many effects were chosen, since two known ones together imitate more than one does: the share of
@@ -92,13 +95,27 @@ def search(
         return _nothing(ranked, strongest, absorbed)
 
     best = max(refined.values(), key=lambda r: r.log_evidence)
-    chosen = best if quick else _add(problem, groups, columns, best, chi2, projector, progress)
+    there = {}
+    for k in _rivals(refined, best, chi2, 1 if quick else RIVALS):
+        progress(f"refitting with {k[0]} at {', '.join(k[1])} where it leads")
+        there[k], refined[k] = relinearised(problem, refined[k], chi2)
+    best = max((refined[k] for k in there), key=lambda r: r.log_evidence)
+    problem = there[best.keys[0]]
+    chosen = best if quick else _add(problem, groups, columns, best, chi2, rt[: problem.r.size], progress)
+    if len(chosen.variants) > 1:
+        problem, chosen = relinearised(problem, chosen, chi2)
     left = explained(problem, chosen.residual)
     beyond = energy_left(left)
     gap = chi2 - chosen.chi2 + beyond
-    shares = _shares(problem, chosen, chi2, projector, gap)
+    shares = _shares(problem, chosen, chi2, gap)
     order = np.argsort(-np.asarray(shares))
     return _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, strongest, absorbed)
+
+
+def _rivals(refined: dict[tuple, Refined], best: Refined, chi2: float, most: int) -> list[tuple]:
+    """The strongest candidates, the best first: those that explain about as much as it does."""
+    close = [k for k, r in refined.items() if chi2 - r.chi2 > CLOSE * (chi2 - best.chi2)]
+    return sorted(close, key=lambda k: -refined[k].log_evidence)[:most]
 
 
 def _worth(ranked: list[Evidence], most: int) -> list[Evidence]:
@@ -112,26 +129,14 @@ def _start(e: Evidence) -> dict[str, float]:
     return {n: float(a) * unit for (n, (_, unit, _)), a in zip(names.items(), e.amplitudes, strict=True)}
 
 
-def _values(effect: CatalogueEffect) -> dict[str, float]:
-    return {n: float(getattr(effect, n)) for n in effect.AMPLITUDES}
-
-
-def _at_optimum(refined: Refined):
-    """Variants with the shapes that a refit found, and the amplitudes to start from."""
-    items = [
-        Variant(type(x), v.site, tuple((n, float(getattr(x, n))) for n in x.SHAPES))
-        for v, x in zip(refined.variants, refined.effects, strict=True)
-    ]
-    return items, [_values(x) for x in refined.effects]
-
-
-def _add(problem, groups, columns, best: Refined, chi2: float, projector, progress) -> Refined:
+def _add(problem, groups, columns, best: Refined, chi2: float, without, progress) -> Refined:
     """Further effects on top of the best, while each explains a fair part of what is left.
 
     Real effects do not follow a textbook form to the letter: in a column that the chosen effects changed, the share
-    FORM of what they explain there may be theirs still, and counts for no other.
+    FORM of what they explain there may be theirs still, and counts for no other. `without`: white residuals of the
+    nominal model alone.
     """
-    chosen, without = best, projector.residual(problem)[: problem.r.size]
+    chosen, projector = best, Projector(problem)
     cell = problem.column_of_row
     while len(chosen.variants) < MOST:
         theirs = FORM * np.maximum(np.bincount(cell, without**2 - chosen.residual**2, len(problem.columns)), 0.0)
@@ -152,7 +157,7 @@ def _add(problem, groups, columns, best: Refined, chi2: float, projector, progre
         if e.log_bf < FURTHER or credit < need:
             break
         progress(f"adding {e.variant.effect.ID} at {', '.join(e.variant.site)}")
-        items, starts = _at_optimum(chosen)
+        items, starts = at_optimum(chosen)
         together = refine(problem, [*items, e.variant], [*starts, _start(e)], chi2, projector)
         if chosen.chi2 - together.chi2 < need:
             break
@@ -173,12 +178,12 @@ def _fits(drop: np.ndarray, left: np.ndarray) -> float:
     return float(0.5 * LOOKS * np.sum(np.log1p(before / LOOKS) - np.log1p(after / LOOKS)))
 
 
-def _shares(problem, chosen: Refined, chi2: float, projector, gap: float) -> tuple[float, ...]:
+def _shares(problem, chosen: Refined, chi2: float, gap: float) -> tuple[float, ...]:
     """What is lost when one effect alone is dropped, as a share of the gap."""
     if len(chosen.variants) == 1:
         return ((chi2 - chosen.chi2) / gap,)
-    items, starts = _at_optimum(chosen)
-    out = []
+    items, starts = at_optimum(chosen)
+    projector, out = Projector(problem), []
     for i in range(len(items)):
         rest = refine(problem, items[:i] + items[i + 1 :], starts[:i] + starts[i + 1 :], chi2, projector)
         out.append((rest.chi2 - chosen.chi2) / gap)
@@ -227,7 +232,7 @@ def _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, stro
     rivals = [first]
     mass = np.exp(log_l[first] - total)
     for k in sorted(keys, key=lambda k: -log_l[k]):
-        if mass >= 0.9:
+        if mass >= COVERED or len(rivals) == RIVALS:
             break
         if k != first and log_l[k] > log_l[first] - 4.0:
             rivals.append(k)

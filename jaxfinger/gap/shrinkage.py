@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfinger.data.schema import channel_units
+from jaxfinger.effects import CatalogueEffect
 from jaxfinger.experiments import Batch, predict, prepare
 from jaxfinger.gap.evidence import Evidence
 from jaxfinger.gap.problem import Problem
+from jaxfinger.gap.refine import within_bounds
 from jaxfinger.identify import Fit
 from jaxfinger.identify.parameters import Free, ravel
 from jaxfinger.identify.predictions import simulate_trials
@@ -91,6 +93,8 @@ def shrinkage(
         for e, stack in problem.stacks.items():
             channels = stack.experiment.channels
             old, new = _residuals(before, stack.batch, channels), _residuals(after, stack.batch, channels)
+            if not all(np.all(np.isfinite(x)) for x in new.values()):
+                new = old  # a model that does not hold up without these trials has closed nothing
             for c in channels:
                 mask = np.asarray(stack.batch.mask[c]) * (fold[e] == k)
                 std = problem.noise[e, c].std[:, None]
@@ -125,7 +129,8 @@ def _forward(problem: Problem, fold: np.ndarray, models: list[tuple[Model, Model
         paths = [simulate_trials(model, session, stack) for model in pair]
         for name in held_out:
             q = session[name].q
-            errors = [float(np.nanmean((q - p[name]["q"]) ** 2)) for p in paths]
+            missed = [np.fmin(np.abs(q - np.nan_to_num(p[name]["q"], nan=np.inf)), np.pi) for p in paths]
+            errors = [float(np.nanmean(x**2)) for x in missed]
             out.append((*errors, _spread(problem, name), float(len(q))))
     return out
 
@@ -150,7 +155,10 @@ def _refit(model: Model, free, J, r, training) -> Model:
     A = np.vstack([J[training] * scale, 0.05 * np.eye(len(free))])
     delta = np.linalg.lstsq(A, np.concatenate([r[training], np.zeros(len(free))]), rcond=1e-12)[0] * scale
     theta = np.asarray(ravel(model))[free] + delta
-    return Free.at(model, free).set(model, jnp.asarray(theta))
+    moved = Free.at(model, free).set(model, jnp.asarray(theta))
+    # One linear step may lead an effect beyond its bounds.
+    effects = tuple(within_bounds(e) if isinstance(e, CatalogueEffect) else e for e in moved.effects)
+    return eqx.tree_at(lambda m: m.effects, moved, effects, is_leaf=lambda v: isinstance(v, tuple))
 
 
 def _choice(problem: Problem, rivals, training):

@@ -68,11 +68,9 @@ def _region(problem: Problem, e, c, column, b, time, energy):
     else:
         joint = column if c == "joint_torque" else 0
         tendon = int(np.argmax(np.asarray(x.tension)[:, b].max(axis=-1))) if finger.n else None
-    variables = {
-        "q": np.asarray(x.q)[joint, b],
-        "qd": np.asarray(x.qd)[joint, b],
-        "time": np.asarray(x.time)[b],
-    }
+    variables = {"time": np.asarray(x.time)[b]}
+    if not problem.stacks[e].experiment.held:  # else only noise moves the joint
+        variables |= {"q": np.asarray(x.q)[joint, b], "qd": np.asarray(x.qd)[joint, b]}
     if tendon is not None:
         variables["tendon_force"] = np.asarray(x.tension)[tendon, b]
     best = ("time", float(variables["time"][time].min()), float(variables["time"][time].max()), 1.0, 0.0)

@@ -1,16 +1,31 @@
-"""The gap is what the nominal model misses, not what nobody recorded an experiment for."""
+"""The gap is what the nominal model misses, not what nobody recorded; and it is linear only nearby."""
+
+from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from jaxfinger.gap.augment import nominal_fit
-from jaxfinger.gap.problem import build
+from jaxfinger.effects import CATALOGUE
+from jaxfinger.gap.augment import augmented_fit, nominal_fit
+from jaxfinger.gap.evidence import Projector
+from jaxfinger.gap.problem import build, moved
+from jaxfinger.gap.refine import refine, relinearised
+from jaxfinger.gap.signatures import Variant
+from jaxfinger.gap.where import where
 from jaxfinger.identify import Recipe
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.synthetic import SpecimenPlant, nominal_model, recipe_from, simulate, study_finger
 
+GAIN = 0.2
 
-def test_damping_without_its_own_experiment_is_refitted_on_driven_motion():
-    specimen = study_finger()
+
+@pytest.fixture(scope="module")
+def specimen():
+    return study_finger()
+
+
+@pytest.fixture(scope="module")
+def session(specimen):
     recipe = recipe_from(
         {
             "specimen": {"kind": "random", "joints": 1},
@@ -23,8 +38,24 @@ def test_damping_without_its_own_experiment_is_refitted_on_driven_motion():
             },
         }
     )
-    session = simulate(recipe, seed=0, plant=SpecimenPlant(specimen))
-    problem = build(session, Recipe())
+    return simulate(recipe, seed=0, plant=SpecimenPlant(specimen))
+
+
+@pytest.fixture(scope="module")
+def problem(session):
+    return build(session, Recipe())
+
+
+@pytest.fixture(scope="module")
+def scaled(session):
+    """The same session from a torque sensor whose gain is far off."""
+    trials = {
+        t.name: t if t.joint_torque is None else replace(t, joint_torque=(1.0 + GAIN) * t.joint_torque) for t in session
+    }
+    return build(replace(session, trials=trials), Recipe())
+
+
+def test_damping_without_its_own_experiment_is_refitted_on_driven_motion(problem, specimen):
     damping = [i for i, p in enumerate(describe(problem.nominal)) if p.group == "damping"]
     assert not set(damping) & set(problem.fit.estimated)  # the stages say so, and leave it at zero
     assert set(damping) <= set(problem.free)
@@ -32,3 +63,39 @@ def test_damping_without_its_own_experiment_is_refitted_on_driven_motion():
     error = np.asarray(ravel(fit.model))[damping] - truth[damping]
     assert np.all(np.abs(error) < 4.0 * fit.std[damping])
     assert np.all(truth[damping] > 3.0 * fit.std[damping])  # it shows clearly
+
+
+def test_a_problem_moves_along_its_own_jacobian(problem):
+    """A thousandth of a standard deviation in every parameter: exact residuals move as the linear ones say."""
+    step = 1e-3 / np.linalg.norm(np.vstack([problem.J, problem.root]), axis=0)
+    there = moved(problem, step)
+    np.testing.assert_allclose(there.r - problem.r, -problem.J @ step, atol=1e-6)
+    np.testing.assert_allclose(there.offset - problem.offset, problem.root @ step, atol=1e-12)
+
+
+def test_a_large_effect_is_judged_by_what_it_leaves_exactly(scaled):
+    """A sensor's gain multiplies the torques refitted with it: where it leads, an exact fit finds no better."""
+    variant = Variant(CATALOGUE["torque_sensor_scale"], ("torque_sensor",), ())
+    projector = Projector(scaled)
+    null = float(np.sum(projector.residual(scaled) ** 2))
+    linear = refine(scaled, [variant], [{"gain": 0.05}], null, projector)
+    there, near = relinearised(scaled, linear, null)
+    _, r, _ = augmented_fit(scaled, near)
+    exact = float(r @ r)
+    assert linear.chi2 > 2.0 * exact  # twenty per cent are too much for one linearisation
+    assert near.chi2 == pytest.approx(exact, abs=3.0)
+    assert exact < 1.1 * scaled.r.size
+    assert near.effects[0].values()["gain"] == pytest.approx(GAIN, abs=4.0 * near.std[0]["gain"])
+    left = Projector(there).residual(there, there.r - near.change)
+    assert float(left @ left) == pytest.approx(near.chi2, abs=0.1)  # what the search for further effects starts from
+
+
+def test_where_a_joint_is_held_it_is_no_variable(problem):
+    """A fixture holds the joint of ID.4, so that only noise moves it: a gap at high tension lies at high tension."""
+    rows = problem.rows["ID.4"]
+    r = np.random.default_rng(1).standard_normal(problem.r.size)
+    mine = (rows.trial == rows.trial[-1]) & (rows.channel == rows.channel[-1]) & (rows.column == rows.column[-1])
+    tension = np.asarray(problem.stacks["ID.4"].batch.x.tension)[:, rows.trial[-1], rows.time].max(axis=0)
+    r[rows.start : rows.start + rows.size][mine & (tension > np.quantile(tension[mine], 2 / 3))] += 5.0
+    place = where(replace(problem, r=r))[0]
+    assert (place.experiment, place.variable) == ("ID.4", "tendon_force")
