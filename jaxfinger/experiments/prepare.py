@@ -86,7 +86,9 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         # Only holds count in a fit, and there nothing moves; at the full rate joints also move between them.
         moves = (holds < 0)[:, None] & (not reduced and not spec.held)
         q, qd, qdd = trial.q, qd * moves, qdd * moves
-    joint_direction = np.zeros((N, m)) if spec.held else _direction(trial.joint_direction, qd, STILL)
+    # When a joint turns back shows best in the slower filter: there noise of q̇ is noise in time.
+    turning = qd if reduced or spec.held else smooth(trial.time, trial.q, spec.cutoff)[1]
+    joint_direction = np.zeros((N, m)) if spec.held else _direction(trial.joint_direction, turning, STILL)
     tension = np.zeros((N, n)) if trial.tendon_force is None else np.nan_to_num(trial.tendon_force)
     if spec.held and not reduced:
         # As smooth as the blocks of a fit: what slips at a noise peak would stay there until the next step.

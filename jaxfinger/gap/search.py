@@ -38,7 +38,7 @@ LOOKED_AT = 12  # candidates for a further effect
 LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for
 # «Unlisted», by how many effects were chosen, since two known ones together imitate more than one does: the share of
 # the gap left to the stand-in at which it is as likely as the catalogue, how sharply, and the least energy that counts.
-OPEN = {1: (0.25, 0.06, 300.0), 2: (0.17, 0.04, 100.0)}
+OPEN = {1: (0.19, 0.03, 300.0), 2: (0.17, 0.04, 100.0)}
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,115 @@
+"""What a fit reads of a recording: directions, which samples count, what is averaged."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaxfinger.data import Session, Trial
+from jaxfinger.errors import UserError
+from jaxfinger.experiments import prepare
+from jaxfinger.experiments.table import CLEAR, SLACK
+from jaxfinger.synthetic import paper_finger
+
+RATE, ENCODER = 1000.0, 2e-4  # Hz, rad
+CYCLE = 3.0  # s
+FINGER = paper_finger().description
+MCP = FINGER.joint_names[0]
+
+
+def sweep(duration=9.0, noise=ENCODER, seed=0, **fields) -> Trial:
+    """The external motor sweeps the MCP: it turns back every half cycle, at rest for no sample."""
+    time = np.arange(round(duration * RATE)) / RATE
+    q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
+    q[:, 0] += 0.5 * np.cos(2 * np.pi * time / CYCLE + 0.3)
+    q += noise * np.random.default_rng(seed).standard_normal(q.shape)
+    torque = np.full(q.shape, np.nan)
+    torque[:, 0] = 1e-2 * np.sign(-np.sin(2 * np.pi * time / CYCLE + 0.3))
+    return Trial("sweep", "ID.3-dynamic", time, q, joint_torque=torque, joint=MCP, **fields)
+
+
+def stack(*trials: Trial, **options):
+    session = Session("a finger", FINGER, {t.name: t for t in trials})
+    (found,) = prepare(session, **options).values()
+    return found
+
+
+def turning_points(duration=9.0):
+    k = np.arange(1, 20)
+    times = (np.pi * k - 0.3) * CYCLE / (2 * np.pi)
+    return times[times < duration]
+
+
+def test_at_every_sample_a_joint_turns_back_once_and_always_as_late():
+    """Friction changes its sign where it moves for sure; the encoder's noise does not shift that by a millisecond."""
+    x = stack(sweep(), reduced=False).batch.x
+    time, direction = np.asarray(x.time)[0], np.asarray(x.joint_direction)[0, 0]
+    turned = time[1:][(np.diff(direction) != 0) & (time[1:] > 0.5)]
+    late = turned - turning_points()
+    assert np.all((late > 0.0) & (late < CLEAR))
+    assert np.std(late) < 1e-3
+    assert set(direction[time > 0.5]) == {-1.0, 1.0}
+
+
+def test_samples_around_a_reversal_do_not_count_and_the_others_do():
+    batch = stack(sweep()).batch
+    time, counts = np.asarray(batch.x.time)[0], np.asarray(batch.mask["joint_torque"])[0, 0] > 0
+    time, counts = time[: round(9.0 * 50)], counts[: round(9.0 * 50)]
+    apart = np.abs(time[:, None] - turning_points()[None]).min(axis=1)
+    assert not counts[apart < CLEAR].any()
+    inside = (time > 0.2) & (time < 8.8)
+    assert counts[inside & (apart > 2 * CLEAR)].all()
+
+
+def test_a_slow_sweep_of_the_motor_slides_and_a_finger_as_slow_may_stick():
+    time = np.arange(4000) / RATE
+    q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
+    q[:, 0] += 0.05 * time
+    q += 0.1 * ENCODER * np.random.default_rng(1).standard_normal(q.shape)
+    fast = q + np.where(time[:, None] > 3.0, 3.0 * (time[:, None] - 3.0), 0.0)  # so that slow is slow beside it
+    torque = np.where(np.arange(3) == 0, 1e-2, np.nan) * np.ones_like(q)
+    driven = stack(Trial("slow", "ID.3-dynamic", time, fast, joint_torque=torque, joint=MCP))
+    free = stack(Trial("free", "VD.3", time, fast, tendon_force=np.zeros((time.size, FINGER.n))))
+    middle = slice(25, 125)  # 0.5 to 2.5 s
+    assert np.asarray(driven.batch.mask["joint_torque"])[0, 0, middle].all()
+    assert not np.asarray(free.batch.mask["joint_torque"])[0, 0, middle].any()
+
+
+def test_the_protocols_directions_are_taken_as_they_are():
+    commanded = np.tile([1, 0, 0], (9000, 1)).astype(np.int8)
+    x = stack(sweep(joint_direction=commanded), reduced=False).batch.x
+    np.testing.assert_array_equal(np.asarray(x.joint_direction)[:, 0, :9000].T, commanded)
+
+
+def test_a_slack_tendon_pulls_with_nothing():
+    tension = np.full((9000, FINGER.n), 0.5 * SLACK)
+    tension[:, 0] = 5.0
+    trial = replace(sweep(tendon_force=tension), experiment="VD.3", joint_torque=None, joint=None)
+    found = np.asarray(stack(trial).batch.x.tension)[:, 0]
+    np.testing.assert_allclose(found[0], 5.0)
+    np.testing.assert_array_equal(found[1:], 0.0)
+
+
+def test_spikes_do_not_count_and_do_not_spread():
+    trial = sweep(noise=0.0)
+    spiked = trial.joint_torque.copy()
+    spiked[1000::500, 0] += 1.0
+    with_spikes = stack(replace(trial, joint_torque=spiked)).batch
+    without = stack(trial).batch
+    np.testing.assert_allclose(with_spikes.y["joint_torque"], without.y["joint_torque"], atol=2e-5)
+
+
+def test_predictions_are_subtracted_where_there_are_some():
+    trial = sweep()
+    known = {"sweep": {"time": trial.time, "joint_torque": trial.joint_torque}}
+    batch = stack(trial, minus=known).batch
+    assert np.asarray(batch.mask["joint_torque"])[0].sum() > 100
+    np.testing.assert_allclose(batch.y["joint_torque"], 0.0, atol=1e-12)
+    assert not np.asarray(stack(trial, minus={}).batch.mask["joint_torque"]).any()
+
+
+def test_trials_of_other_rates_are_refused_by_name():
+    slow = sweep()
+    slow = replace(slow, name="slow", time=slow.time * 40.0)
+    with pytest.raises(UserError, match="resample trial slow to at least 50 Hz"):
+        stack(sweep(), slow)
