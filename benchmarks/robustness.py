@@ -53,7 +53,7 @@ def spiked(share: float) -> Callable[[Session], Session]:
 
     def change(trial, rng):
         def throw(x):
-            far = 0.5 * np.nanmax(np.abs(x), axis=0) * rng.choice([-1.0, 1.0], x.shape)
+            far = 0.5 * np.fmax.reduce(np.abs(x), axis=0) * rng.choice([-1.0, 1.0], x.shape)
             return np.where(rng.random(x.shape) < share, x + far, x)
 
         return measured(trial, throw)
@@ -66,7 +66,7 @@ def noisier(factor: float, channel: str) -> Callable[[Session], Session]:
 
     def change(trial, rng):
         def add(x):
-            own = 1.4826 * np.nanmedian(np.abs(np.diff(x, axis=0)), axis=0) / np.sqrt(2.0)
+            own = 1.4826 * np.median(np.abs(np.diff(x, axis=0)), axis=0) / np.sqrt(2.0)  # NaN where not measured
             return x + np.sqrt(factor**2 - 1.0) * own * rng.standard_normal(x.shape)
 
         return measured(trial, add, (channel,))

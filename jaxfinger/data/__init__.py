@@ -1,11 +1,13 @@
 """Sessions: read, write and check the HDF5 format; filtering, derivatives, directions, holds, decimation; importers."""
 
 from jaxfinger.data.check import check_file as check_file
+from jaxfinger.data.filtering import bridged as bridged
 from jaxfinger.data.filtering import decimate as decimate
 from jaxfinger.data.filtering import low_pass as low_pass
 from jaxfinger.data.filtering import outlier_mask as outlier_mask
 from jaxfinger.data.filtering import shrink as shrink
 from jaxfinger.data.filtering import smooth as smooth
+from jaxfinger.data.filtering import without_spikes as without_spikes
 from jaxfinger.data.findings import Finding as Finding
 from jaxfinger.data.hdf5 import data_hash as data_hash
 from jaxfinger.data.hdf5 import read_session as read_session

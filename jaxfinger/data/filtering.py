@@ -19,6 +19,7 @@ from scipy.ndimage import gaussian_filter1d, median_filter, uniform_filter1d
 
 from jaxfinger.errors import UserError
 
+JUMP = 12.0  # times their mean: the largest second difference that noise makes, with room
 _EVEN = 1e-3  # intervals this equal (relative) need no resampling
 _SMALL = 1e-4  # of a column's travel: what bends away from its running median by less is no spike
 
@@ -165,6 +166,25 @@ def outlier_mask(x: Float[np.ndarray, N * k], threshold: float = 8.0, longest: i
         if len(values) > 2 * longest:
             mask[good, k] = _spikes(values, threshold, longest)
     return mask.reshape(x.shape)
+
+
+def without_spikes(x: Float[np.ndarray, "N k"]) -> Float[np.ndarray, "N k"]:
+    """x with straight lines across spikes of one sample or two, so that a filter does not spread them."""
+    out = np.array(x, np.float64)
+    if len(out) > 2:
+        bend = np.abs(np.diff(out, 2, axis=0))
+        rough = ~(bend.max(axis=0) < JUMP * bend.mean(axis=0))  # else as noise is: nothing to look for
+        out[:, rough] = bridged(out[:, rough], outlier_mask(out[:, rough], longest=2))
+    return out
+
+
+def bridged(x: Float[np.ndarray, "N k"], spikes: Bool[np.ndarray, "N k"]) -> Float[np.ndarray, "N k"]:
+    """x with straight lines where `spikes` is true."""
+    n, out = np.arange(len(x)), np.array(x, np.float64)
+    for column, bad in zip(out.T, spikes.T, strict=True):
+        if bad.any() and not bad.all():
+            column[bad] = np.interp(n[bad], n[~bad], column[~bad])
+    return out
 
 
 def _spikes(values: Float[np.ndarray, " N"], threshold: float, longest: int) -> Bool[np.ndarray, " N"]:

@@ -1,7 +1,7 @@
 """From recordings to arrays that a fit can take: derivatives, directions, block means, padded stacks of trials."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,18 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
-from jaxfinger.data import Predictions, Session, Trial, find_holds, low_pass, outlier_mask, shrink, smooth
+from jaxfinger.data import (
+    Predictions,
+    Session,
+    Trial,
+    bridged,
+    find_holds,
+    low_pass,
+    outlier_mask,
+    shrink,
+    smooth,
+    without_spikes,
+)
 from jaxfinger.errors import UserError
 from jaxfinger.experiments.table import (
     CLEAR,
@@ -74,6 +85,7 @@ class _Row:
 def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, minus: Predictions | None) -> _Row:
     m, n = session.finger.m, session.finger.n
     N = len(trial.time)
+    trial = _despiked(trial)
     step = float(np.median(np.diff(trial.time)))
     block = max(1, round(1.0 / (spec.rate * step))) if reduced else 1
     holds = find_holds(trial) if spec.samples == "holds" else np.full(N, -1)
@@ -150,6 +162,12 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     return _Row(motion, y_mean, mask_mean, block * step)
 
 
+def _despiked(trial: Trial) -> Trial:
+    """The channels that drive the model; a predicted one keeps its spikes, which then do not count."""
+    tension = None if trial.tendon_force is None else without_spikes(trial.tendon_force)
+    return replace(trial, q=without_spikes(trial.q), tendon_force=tension)
+
+
 def _measured(spec, trial, session, minus: Predictions | None):
     """The channels to be predicted, spikes bridged, and which samples of them are measured and no spike."""
     N, m = trial.q.shape
@@ -169,7 +187,7 @@ def _measured(spec, trial, session, minus: Predictions | None):
             spikes = outlier_mask(values[:, measured])
             counts[:, measured] = ~spikes
             values = values.copy()
-            values[:, measured] = _bridged(values[:, measured], spikes)
+            values[:, measured] = bridged(values[:, measured], spikes)
         y[c], mask[c] = np.nan_to_num(values), counts
     return y, mask
 
@@ -180,13 +198,6 @@ def _predicted(prediction: Mapping[str, np.ndarray], channel: str, trial: Trial,
         return np.full(like.shape, np.nan)
     columns = prediction[channel].T
     return np.stack([np.interp(trial.time, prediction.get("time", trial.time), a) for a in columns], axis=1)
-
-
-def _bridged(values: np.ndarray, spikes: np.ndarray) -> np.ndarray:
-    """Straight lines across the spikes, so that a filter does not spread them."""
-    n = np.arange(len(values))
-    columns = zip(values.T, ~spikes.T, strict=True)
-    return np.stack([np.interp(n, n[good], v[good]) if good.any() else v for v, good in columns], axis=1)
 
 
 def _direction(commanded: np.ndarray | None, rate: np.ndarray, still: float) -> np.ndarray:
@@ -200,7 +211,7 @@ def _direction(commanded: np.ndarray | None, rate: np.ndarray, still: float) -> 
 
 def _rates(trial: Trial, spec: Experiment) -> np.ndarray:
     """Tendon speeds, m/s; zero where the excursion was not measured."""
-    return smooth(trial.time, np.nan_to_num(np.asarray(trial.tendon_excursion)), spec.cutoff / 2)[1]
+    return smooth(trial.time, without_spikes(np.nan_to_num(np.asarray(trial.tendon_excursion))), spec.cutoff / 2)[1]
 
 
 def _sliding(spec: Experiment, trial: Trial, session: Session, qd, motorised) -> np.ndarray:

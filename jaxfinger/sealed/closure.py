@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import minimum_filter1d
 
 from jaxfinger.data import Session, Trial, read_predictions, read_session
 
@@ -23,6 +24,7 @@ CHANNELS = {
     "VD.3": ("tendon_excursion", "joint_torque"),
 }
 MOVING = 0.05  # rad/s, and that speed times 5 mm for a tendon: VD.3's torque is judged where both slide
+CLEAR = 0.03  # s on either side of where one may stick: nobody knows its friction there
 
 
 def gap_by_channel(
@@ -58,16 +60,15 @@ def gap_by_channel(
 
 
 def _sliding(trial: Trial, session: Session) -> np.ndarray:
-    """(N, m) where a joint moves and so does every tendon across it."""
+    """(N, m) where a joint moves and so does every tendon across it, clear of where they stop."""
     rate = float(1.0 / np.median(np.diff(trial.time)))
     width = max(int(0.05 * rate), 3)
     speed = _slope(trial.q, trial.time, width)
-    joint = np.abs(speed) > MOVING
-    if trial.tendon_excursion is None:
-        return joint
-    tendon = np.abs(_slope(trial.tendon_excursion, trial.time, width)) > MOVING * 5e-3
-    blocked = ~tendon @ (session.finger.crosses & session.finger.active[:, None])
-    return joint & ~blocked
+    slides = np.abs(speed) > MOVING
+    if trial.tendon_excursion is not None:
+        tendon = np.abs(_slope(trial.tendon_excursion, trial.time, width)) > MOVING * 5e-3
+        slides &= ~(~tendon @ (session.finger.crosses & session.finger.active[:, None]))
+    return minimum_filter1d(slides, 2 * round(CLEAR * rate) + 1, axis=0)
 
 
 def _slope(values: np.ndarray, time: np.ndarray, width: int) -> np.ndarray:

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter1d
 
-from jaxfinger.data.filtering import decimate, outlier_mask, shrink, smooth
+from jaxfinger.data.filtering import decimate, outlier_mask, shrink, smooth, without_spikes
 from jaxfinger.errors import UserError
 
 
@@ -154,3 +154,24 @@ def test_shrinking_leaves_a_smooth_motion_and_a_constant_alone():
     slow = np.sin(2 * np.pi * np.arange(5000) / 5000)[:, None]
     np.testing.assert_allclose(shrink(slow, 100), slow, atol=3e-3)  # the ends too
     np.testing.assert_array_equal(shrink(np.ones((500, 2)), 100), np.ones((500, 2)))
+
+
+def test_spikes_are_bridged_and_everything_else_is_left_alone():
+    rng = np.random.default_rng(0)
+    time = np.arange(5000) / 1000
+    clean = np.stack([np.sin(2 * np.pi * time), np.full(5000, 3.0), np.full(5000, np.nan)], axis=1)
+    x = clean + 2e-4 * rng.standard_normal(clean.shape)
+    thrown = rng.random(x.shape) < 0.005
+    spiked = np.where(thrown, x + 0.5, x)
+    found = without_spikes(spiked)
+    np.testing.assert_allclose(found[:, :2], clean[:, :2], atol=1.6e-3)
+    np.testing.assert_array_equal(found[~thrown & np.isfinite(x)], x[~thrown & np.isfinite(x)])
+    np.testing.assert_array_equal(without_spikes(x), x)
+
+
+@pytest.mark.parametrize("rate", [100.0, 250.0, 1000.0])
+def test_a_reversal_without_noise_is_no_spike_that_matters(rate):
+    """Coarse samples bend at a reversal; a line across one or two of them is as good."""
+    time = np.arange(0.0, 10.0, 1.0 / rate)
+    q = 1.0 - np.cos(np.pi * np.maximum(time - 2.0, 0.0))[:, None]  # rests, then turns back every second
+    np.testing.assert_allclose(without_spikes(q), q, atol=(np.pi / rate) ** 2)
