@@ -86,7 +86,11 @@ def _bars(ax, labels, values, colours) -> None:
 
 
 def _how_far(ax, lines: list[dict]) -> None:
-    """A log axis in units of the noise, since the channels have different units; the numbers stand beside it."""
+    """A log axis in units of the noise, since the channels have different units; the numbers stand beside it.
+
+    A channel whose noise nothing shows, as that of a forward simulation without repeats, is in the page's table alone.
+    """
+    lines = [x for x in lines if x["noise"] > 0]
     ax.set_title("How far: rms on held-out trials", loc="left", fontweight="bold")
     for y, x in enumerate(lines):
         factor, unit = people(x["units"])

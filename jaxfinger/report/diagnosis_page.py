@@ -125,6 +125,8 @@ def _line(x: dict) -> dict:
     shown = x["before"] > 1.05 * x["noise"]
     closed = f"{_signed(x['closed'])} ({_signed(low)} … {_signed(high)})" if shown else "no gap to close"
     scaled = {k: f"{factor * x[k]:.3g}" for k in ("noise", "before", "after")}
+    if not x["noise"]:
+        scaled["noise"] = "unknown"
     return x | scaled | {"unit": unit, "closed": closed}
 
 

@@ -106,6 +106,15 @@ def test_page_and_screen(diagnosis, gap, tmp_path):
     assert any("joint_presliding · PIP" in line for line in screen)
 
 
+def test_a_noise_that_nothing_shows_is_said_to_be_unknown(diagnosis, tmp_path):
+    """Without repeats nobody knows how far two runs of VD.3 fall apart."""
+    first, *rest = diagnosis.shrinkage
+    lone = replace(diagnosis, shrinkage=[replace(first, noise=0.0), *rest])
+    write_page(lone, tmp_path / "report.html")
+    assert "unknown" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert any(first.channel in line and "unknown" in line for line in summary(lone).splitlines())
+
+
 def test_signatures_are_whitened_as_the_residuals_are(diagnosis):
     problem = diagnosis.problem
     rng = np.random.default_rng(0)
