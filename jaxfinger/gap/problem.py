@@ -124,18 +124,14 @@ def build(
     cad = [i for i, p in enumerate(parameters) if p.group in ("mass", "com") and fit.covariance[i, i] > 0]
     cad = np.setdiff1d(cad, fit.estimated)
     free = np.union1d(fit.estimated, cad).astype(int)
-    noise = dict(fit.noise)
+    sources = {e: _source(stacks[e], fit.noise, parameters) for e in stacks}
+    noise = _with_unknown(fit.noise, stacks, sources, fit.model)
     sources = {e: _source(stacks[e], noise, parameters) for e in stacks}
-    for e, stack in stacks.items():
-        missing = [c for c in stack.experiment.channels if (e, c) not in noise]
-        if missing:
-            source = sources[e]
-            lin = linearise(
-                fit.model, Free.at(fit.model, source.positions), source.batch, source.filters, unit_weights(source)
-            )
-            noise |= {(e, c): estimate(stack, c, np.asarray(lin.residuals[c])) for c in missing}
-    sources = {e: _source(stacks[e], noise, parameters) for e in stacks}
-    start, free = _with_missing_stages(fit, free, sources, parameters)
+    start, more = _with_missing_stages(fit, free, sources, parameters)
+    if more.size > free.size:  # what no stage had fitted was no noise
+        start, _ = solve(start, more, sources, _cad_prior(session, recipe, more, parameters))
+        noise = _with_unknown(fit.noise, stacks, sources, start)
+        sources, free = {e: _source(stacks[e], noise, parameters) for e in stacks}, more
     prior = _cad_prior(session, recipe, free, parameters)
     nominal, solution = solve(start, free, sources, prior)
 
@@ -203,6 +199,18 @@ def assemble(
         full[:, sources[e].positions] = -np.asarray(lin.jacobian).reshape(-1, lin.jacobian.shape[-1])[keep]
         J.append(full[:, free])
     return np.concatenate(r), np.concatenate(J)
+
+
+def _with_unknown(known: dict[tuple[str, str], Noise], stacks: dict[str, Stack], sources, model: Model):
+    """The noise of every channel: where no stage has read it, of what the model leaves of it."""
+    noise = dict(known)
+    for e, stack in stacks.items():
+        missing = [c for c in stack.experiment.channels if (e, c) not in known]
+        if missing:
+            s = sources[e]
+            lin = linearise(model, Free.at(model, s.positions), s.batch, s.filters, unit_weights(s))
+            noise |= {(e, c): estimate(stack, c, np.asarray(lin.residuals[c])) for c in missing}
+    return noise
 
 
 def _with_missing_stages(

@@ -99,3 +99,12 @@ def test_where_a_joint_is_held_it_is_no_variable(problem):
     r[rows.start : rows.start + rows.size][mine & (tension > np.quantile(tension[mine], 2 / 3))] += 5.0
     place = where(replace(problem, r=r))[0]
     assert (place.experiment, place.variable) == ("ID.4", "tendon_force")
+
+
+def test_without_id2_the_other_experiments_show_the_moment_arms(session):
+    """What ID.2 would have fitted is first in the residuals of the other experiments, and must not pass for noise."""
+    problem = build(session.with_trials([t.name for t in session if t.experiment != "ID.2"]), Recipe())
+    energy = np.bincount(problem.column_of_row, problem.r**2) / np.maximum(np.bincount(problem.column_of_row), 1)
+    count = np.bincount(problem.column_of_row)
+    assert np.all(energy[count > 100] < 1.5)
+    assert np.all(energy[count > 100] > 0.5)
