@@ -92,14 +92,14 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
 
     cutoff = min(spec.cutoff * (1.0 if reduced else EVERY_SAMPLE), 0.2 / step)
     q, qd, qdd = smooth(trial.time, trial.q, cutoff)
+    # When a joint turns back shows best in the slower filter: there noise of q̇ is noise in time.
+    turning = qd if reduced or spec.held else smooth(trial.time, trial.q, spec.cutoff)[1]
     if reduced and spec.samples != "sliding":
         q = trial.q  # averaged over the same blocks as what it predicts, and not filtered where that is not
     if spec.samples == "holds":
         # Only holds count in a fit, and there nothing moves; at the full rate joints also move between them.
         moves = (holds < 0)[:, None] & (not reduced and not spec.held)
         q, qd, qdd = trial.q, qd * moves, qdd * moves
-    # When a joint turns back shows best in the slower filter: there noise of q̇ is noise in time.
-    turning = qd if reduced or spec.held else smooth(trial.time, trial.q, spec.cutoff)[1]
     joint_direction = np.zeros((N, m)) if spec.held else _direction(trial.joint_direction, turning, STILL)
     tension = np.zeros((N, n)) if trial.tendon_force is None else np.nan_to_num(trial.tendon_force)
     if spec.held and not reduced:

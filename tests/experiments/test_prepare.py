@@ -81,6 +81,21 @@ def test_the_protocols_directions_are_taken_as_they_are():
     np.testing.assert_array_equal(np.asarray(x.joint_direction)[:, 0, :9000].T, commanded)
 
 
+def test_a_hold_keeps_the_direction_that_led_to_it_though_nothing_says_so():
+    """Up in two steps and down in one: at each hold friction has the sign of the step before it."""
+    time = np.arange(8000) / RATE
+    corners = ([0.0, 2.0, 2.5, 4.0, 4.5, 6.0, 6.5, 8.0], [0.2, 0.2, 0.5, 0.5, 0.8, 0.8, 0.5, 0.5])
+    q = np.tile(np.interp(time, *corners)[:, None], (1, 3)) + ENCODER * np.random.default_rng(2).normal(size=(8000, 3))
+    torque = np.where(np.arange(3) == 0, 1e-2, np.nan) * np.ones_like(q)
+    batch = stack(Trial("steps", "ID.3-static", time, q, joint_torque=torque, joint=MCP)).batch
+    at, counts = np.asarray(batch.x.time)[0], np.asarray(batch.mask["joint_torque"])[0, 0] > 0
+    direction = np.asarray(batch.x.joint_direction)[0, 0]
+    for begin, end, sign in ((2.6, 3.9, 1.0), (4.6, 5.9, 1.0), (6.6, 7.9, -1.0)):
+        held = counts & (at > begin) & (at < end)
+        assert held.sum() > 10
+        assert np.all(direction[held] == sign)
+
+
 def test_a_slack_tendon_pulls_with_nothing():
     tension = np.full((9000, FINGER.n), 0.5 * SLACK)
     tension[:, 0] = 5.0
