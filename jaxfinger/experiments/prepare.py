@@ -1,6 +1,7 @@
 """From recordings to arrays that a fit can take: derivatives, directions, block means, padded stacks of trials."""
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -35,6 +36,8 @@ from jaxfinger.experiments.table import (
 )
 from jaxfinger.model import Motion
 
+LONG = 10_000  # samples of a trial from which on its filters, which let go of the interpreter, are worth a thread
+
 
 class Batch(eqx.Module):
     """All trials of one experiment, reduced, padded to one length: B trials of T samples."""
@@ -66,7 +69,9 @@ def prepare(
     for spec in EXPERIMENTS.values():
         chosen = [t for t in session if t.experiment == spec.name and (names is None or t.name in names)]
         trials = [t for t in chosen if len(t.time) > 1]
-        rows = [_reduce(spec, t, session, reduced, minus) for t in trials]
+        long = any(len(t.time) > LONG for t in trials)
+        with ThreadPoolExecutor(None if long else 1) as pool:
+            rows = list(pool.map(lambda t, spec=spec: _reduce(spec, t, session, reduced, minus), trials))
         if rows:
             stacks[spec.name] = _stack(spec, trials, rows, reduced)
     return stacks

@@ -125,7 +125,7 @@ def identify(
     fit = start or Fit.before(session, recipe, nominal_model(session, recipe))
     if start is None:
         fit = replace(fit, covariance=cad_covariance(session, describe(fit.model)))
-    with ThreadPoolExecutor(2) as pool:  # a stage compiles while the recordings of the next are filtered
+    with ThreadPoolExecutor(1) as pool:  # a stage compiles while the recordings of the next are filtered
         experiments = dict.fromkeys(e for s in wanted for e in STAGES[s].reads) if stacks is None else ()
         named = {e: [t.name for t in session if t.experiment == e] for e in experiments}
         pending = {e: pool.submit(prepare, session, names) for e, names in named.items()}
