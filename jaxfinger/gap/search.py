@@ -1,6 +1,7 @@
 """Which effects: every candidate on its own, then further ones on top, against «none» and «unlisted».
 
-1. Screen every effect at every site and shape linearly; refit the strongest few with their shapes free.
+1. Screen every effect at every site and shape linearly; refit the strongest few with their shapes free, and the best of
+   these again at the nominal model that each leads to.
 2. Take the best. What is left of the gap is screened again on top of it; a further effect joins while it explains a
    fair part of what is left beyond the first one's own error of form, and all are refitted together.
 3. «Unlisted» competes through the flexible stand-in: the part of the gap that it explains beyond the chosen effects.
