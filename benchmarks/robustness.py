@@ -9,7 +9,6 @@ is the expected one, and where nothing is expected, where nothing is named.
 
 import argparse
 import json
-import subprocess
 import sys
 import tempfile
 import time
@@ -20,10 +19,12 @@ from pathlib import Path
 import numpy as np
 
 from jaxfinger.data import Session, Trial, read_session, write_session
+from jaxfinger.sealed.run import Command
 
 CHANNELS = ("q", "tendon_force", "tendon_excursion", "joint_torque", "fingertip_force")
 SAMPLED = ("time", *CHANNELS, "joint_direction", "tendon_direction", "hold")
 SEED = 0
+DIAGNOSE = Command(f"{sys.executable} -m jaxfinger diagnose {{fit}} -o {{out}}")
 
 
 def each(session: Session, change: Callable[[Trial, np.random.Generator], Trial]) -> Session:
@@ -175,10 +176,10 @@ MISHAPS: dict[str, Callable[[Session], Session]] = {
 def verdict(session: Session, folder: Path) -> dict:
     """The verdict of `jaxfinger diagnose`, in a process of its own; what it said where it failed."""
     write_session(session, folder / "session.h5")
-    command = [sys.executable, "-m", "jaxfinger", "diagnose", str(folder / "session.h5"), "-o", str(folder / "out")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        return {"status": "failed", "effects": [], "summary": done.stderr.strip().splitlines()[-1]}
+    try:
+        DIAGNOSE(folder / "session.h5", folder / "out")
+    except RuntimeError as error:
+        return {"status": "failed", "effects": [], "summary": str(error).splitlines()[-1]}
     return json.loads((folder / "out" / "gap.json").read_text(encoding="utf-8"))["verdict"]
 
 

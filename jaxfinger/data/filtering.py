@@ -19,7 +19,7 @@ from scipy.ndimage import gaussian_filter1d, median_filter, uniform_filter1d
 
 from jaxfinger.errors import UserError
 
-JUMP = 12.0  # times their mean: the largest second difference that noise makes, with room
+_JUMP = 12.0  # times their mean: the largest second difference that noise makes, with room
 _EVEN = 1e-3  # intervals this equal (relative) need no resampling
 _SMALL = 1e-4  # of a column's travel: what bends away from its running median by less is no spike
 
@@ -173,7 +173,7 @@ def without_spikes(x: Float[np.ndarray, "N k"]) -> Float[np.ndarray, "N k"]:
     out = np.array(x, np.float64)
     if len(out) > 2:
         bend = np.abs(np.diff(out, 2, axis=0))
-        rough = ~(bend.max(axis=0) < JUMP * bend.mean(axis=0))  # else as noise is: nothing to look for
+        rough = ~(bend.max(axis=0) < _JUMP * bend.mean(axis=0))  # else as noise is: nothing to look for
         out[:, rough] = bridged(out[:, rough], outlier_mask(out[:, rough], longest=2))
     return out
 

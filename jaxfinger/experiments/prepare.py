@@ -110,7 +110,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     if spec.held and not reduced:
         # As smooth as the blocks of a fit: what slips at a noise peak would stay there until the next step.
         tension = uniform_filter1d(tension, max(1, round(1.0 / (spec.rate * step))), axis=0, mode="nearest")
-    tendon_direction = np.zeros((N, n))
+    tendon_direction, rate = np.zeros((N, n)), None
     if not spec.slack and spec.samples == "sliding":
         rate = np.zeros((N, n)) if trial.tendon_excursion is None else _rates(trial, spec)
         tendon_direction = _direction(trial.tendon_direction, rate, 0.1 * MIN_TENDON_SPEED)
@@ -119,7 +119,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         motorised[:, session.finger.joint_names.index(trial.joint)] = 1.0
 
     y, mask = _measured(spec, trial, session, minus)
-    slides = _sliding(spec, trial, session, qd, motorised) if spec.samples == "sliding" else None
+    slides = _sliding(trial, session, qd, rate, motorised) if spec.samples == "sliding" else None
     if reduced and spec.samples == "sliding":
         # q̈ is low-passed, so all else is too. What noise it keeps would still tell a fit of less inertia
         # (errors in variables): where q̈ does not rise above it, its mean over a tenth of a second takes its place.
@@ -219,16 +219,19 @@ def _rates(trial: Trial, spec: Experiment) -> np.ndarray:
     return smooth(trial.time, without_spikes(np.nan_to_num(np.asarray(trial.tendon_excursion))), spec.cutoff / 2)[1]
 
 
-def _sliding(spec: Experiment, trial: Trial, session: Session, qd, motorised) -> np.ndarray:
-    """(N, m): 1 where a joint and every taut tendon across it slide, so that the directions of friction are known."""
+def _sliding(trial: Trial, session: Session, qd, rate: np.ndarray | None, motorised) -> np.ndarray:
+    """(N, m): 1 where a joint and every taut tendon across it slide, so that the directions of friction are known.
+
+    `rate`: speeds of the tendons, none where all are slack.
+    """
     fast = np.percentile(np.abs(qd), 95, axis=0)
     slow = np.where(motorised, MIN_DRIVEN_SPEED, MIN_JOINT_SPEED)
     slides = np.abs(qd) > np.minimum(slow, 0.05 * fast)
     slides[1:] &= np.sign(qd[1:]) == np.sign(qd[:-1])  # a quick reversal has no slow sample
-    if not spec.slack and trial.tendon_excursion is not None and trial.tendon_force is not None:
+    if rate is not None and trial.tendon_excursion is not None and trial.tendon_force is not None:
         taut = np.nan_to_num(trial.tendon_force) > SLACK
         measured = np.isfinite(trial.tendon_excursion).all(axis=0)
-        known = ~taut | ((np.abs(_rates(trial, spec)) > MIN_TENDON_SPEED) & measured)
+        known = ~taut | ((np.abs(rate) > MIN_TENDON_SPEED) & measured)
         for i in range(session.finger.m):
             slides[:, i] &= known[:, session.finger.crosses[:, i] & session.finger.active].all(axis=1)
     # The filter spreads the jump of friction at a reversal, and friction before it slides is not known.

@@ -67,7 +67,8 @@ def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: 
     compressed = compress(of, template)
     prior = (compressed.grams.H[-1], compressed.grams.reads[:, -1])
     basis, how = jnp.asarray(compressed.basis), batching_here(batching)
-    starts = [_start(s, template, of) for s in sessions]
+    shared = nominal_model(of, template.recipe)
+    starts = [_start(s, template, shared) for s in sessions]
     at_once = min(len(sessions), AT_ONCE)
     with ThreadPoolExecutor(1) as device:
         shares = []
@@ -82,9 +83,9 @@ def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: 
     return Members(values, std, ~sound, steps, template)
 
 
-def _start(session: Session, template: Fit, of: Session) -> Float[Array, " P"]:
-    """The template's flat vector with the session's own links, which CAD's prior then moves with."""
-    own, shared = nominal_model(session, template.recipe), nominal_model(of, template.recipe)
+def _start(session: Session, template: Fit, shared: Model) -> Float[Array, " P"]:
+    """The template's flat vector with the session's own links for the shared ones; CAD's prior then moves with them."""
+    own = nominal_model(session, template.recipe)
     if jax.tree.structure(own) != jax.tree.structure(shared):
         raise UserError(
             f"{session.file or session.specimen}: has not the joints and tendons of the other sessions; fit it alone"
