@@ -160,9 +160,7 @@ class RingRig(Rig):
                     records["seq"].copy(), records["t_ns"].copy(), self.description.calibrate(records["value"]),
                     records["state"].copy(), records["flags"].copy(), lost,
                 )  # fmt: skip
-            head = int(
-                self._status()["head"]
-            )  # torn, or overtaken by the writer: look again from where the ring now starts
+            head = self._head()  # torn, or overtaken by the writer: look again from where the ring now starts
         raise ConnectionLost(
             "ten reads of the controller's ring were torn; its task writes records in the wrong order."
         )

@@ -76,6 +76,26 @@ def test_a_restart_is_never_spliced(rig):
             machine.read_block(1.0)
 
 
+def test_a_restart_while_the_ring_is_read_is_noticed(rig, monkeypatch):
+    machine = small(rig)
+    with machine:
+        for _ in range(50):
+            machine.controller.cycle()
+        machine.read_block(1.0)
+        for _ in range(20):
+            machine.controller.cycle()
+        read = machine._read
+
+        def restarted_before(symbol, offset, size):
+            if symbol == "aRing":
+                machine.controller.start()
+            return read(symbol, offset, size)
+
+        monkeypatch.setattr(machine, "_read", restarted_before)
+        with pytest.raises(ControllerRestarted):
+            machine.read_block(1.0)
+
+
 def test_a_controller_that_stands_still_is_stale(rig):
     machine = small(rig)
     with machine:
