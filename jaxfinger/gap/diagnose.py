@@ -17,8 +17,8 @@ from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.next_experiment import NextExperiment, next_experiment
 from jaxfinger.gap.problem import Problem, build
 from jaxfinger.gap.propose import Proposal, propose
-from jaxfinger.gap.refine import Refined, refine
-from jaxfinger.gap.search import Search, search
+from jaxfinger.gap.refine import Refined, at_optimum, refine
+from jaxfinger.gap.search import Search, search, start_of
 from jaxfinger.gap.shrinkage import Shrinkage, shrinkage
 from jaxfinger.gap.signatures import Signatures, Variant
 from jaxfinger.gap.standin import energy_left
@@ -159,10 +159,8 @@ def _members(problem: Problem, found: Search) -> list[Refined]:
     out = []
     for key in found.rival_sets[0][:MOST_IN_A_SET]:
         c = by_key[key]
-        e = c.evidence
-        units = [u for _, u, _ in e.variant.effect.AMPLITUDES.values()]
-        start = dict(zip(e.variant.effect.AMPLITUDES, (e.amplitudes * units).tolist(), strict=True))
-        out.append(c.refined or refine(problem, [e.variant], [start], chi2, projector))
+        items, starts = at_optimum(c.refined) if c.refined else ([c.evidence.variant], [start_of(c.evidence)])
+        out.append(refine(problem, items, starts, chi2, projector))
     return out
 
 

@@ -1,36 +1,40 @@
-"""What next: the trial of the format that would separate the members of an ambiguous set best.
+"""What next: the trial of the format that would best separate the members of an ambiguous set.
 
-Expected discrimination of i from j in a trial: half the energy of i's signature there that j and the nominal
-parameters, refitted to the whole file, cannot imitate, at the sizes that the file suggests (T-optimality, Atkinson &
-Fedorov 1975).
-The file's own trials are the short list; a repeat of the best one, further out where the difference lies,
-is the suggestion.
+Every trial of the session is imagined again: other joints elsewhere, tendons pulled further and let go again, slower
+and faster; and where an experiment is missing, its trials are imagined with the motion of one that resembles it. All
+members, as fitted to the file, predict the trial. Its expected log evidence for i against j is
+
+    D_ij = ½ min_η ( ‖δ − A η‖² + ηᵀ P η ),   δ = ŷ_i − ŷ_j,
+
+δ white, A the derivatives of j's prediction by the nominal parameters and its own, and P the information on them that
+the file holds already: what j can imitate without contradicting the file separates nothing (T-optimality; Atkinson &
+Fedorov, Biometrika 62 (1975) 57). The trial that separates the worst pair best is the suggestion.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import permutations
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
-from jaxfinger.gap.evidence import Projector
-from jaxfinger.gap.problem import Problem
-from jaxfinger.gap.refine import Refined
+from jaxfinger.experiments import EXPERIMENTS, Batch, Stack
+from jaxfinger.experiments.table import SLACK
+from jaxfinger.gap.problem import Problem, imagined
+from jaxfinger.gap.refine import Refined, derivatives, information, nominal_step
+from jaxfinger.gap.signatures import Signatures
+from jaxfinger.model import Finger
 
-# Separating trials that no trial of the file resembles, by pairs that imitate each other exactly in the usual protocol.
-KNOWN = {
-    frozenset({"tension_sensor_scale", "tendon_friction_saturating"}): (
-        "ID.4",
-        "pull the tendon in steps up and down again: a gain is the same both ways, friction is not",
-    ),
-    frozenset({"payload", "gravity_tilt"}): (
-        "ID.3-static",
-        "mount the finger at another angle and step all joints again",
-    ),
-    frozenset({"torque_sensor_scale", "payload"}): (
-        "ID.3-static",
-        "hang a known weight on the link and step the joint again",
-    ),
-}
+SETTLES = 3.5  # log evidence at which one member has 97 %
+REPEATS = 10  # a trial that must be repeated more often than this is no suggestion
+REST = 0.05  # rad (or, of a joint that slides, a twentieth of its range): a joint that moves by less is at rest
+PLACES = (0.2, 0.8)  # of their ranges, where joints at rest are imagined too
+HIGHEST = 15.0  # N: as far as the format's protocols pull a tendon
+LOOSE = 3.0  # times: how much further tendons are pulled that a protocol keeps at about 2 N
+FASTEST, SLOWER = 1.5, 0.25  # rad/s, times the speed
+# Whose motion an experiment that the session lacks would have. VD.1 and VD.3 have motions of their own.
+LIKE = {"VD.2": "ID.4", "ID.4": "VD.2", "ID.3-static": "ID.2", "ID.3-dynamic": "ID.2"}
 
 
 @dataclass(frozen=True)
@@ -43,41 +47,173 @@ class NextExperiment:
 
 
 def next_experiment(problem: Problem, members: list[Refined]) -> NextExperiment | None:
-    """For the refitted members of an ambiguous set."""
+    """For the refitted members of an ambiguous set; none where no trial is expected to separate them."""
     if len(members) < 2:
         return None
+    shown = {e for m in members for v in m.variants for e in v.effect.SHOWS}
+    steps = [nominal_step(problem, problem.r - m.change) for m in members]
+    known = [information(problem, m) for m in members]
+    best, place = 0.0, None
+    for stacks in _short_list(problem, shown):
+        there = imagined(problem, stacks)
+        signatures = Signatures(there, there.nominal)
+        read = [derivatives(signatures, m) for m in members]
+        predicted = [there.J @ step + change for step, (change, _) in zip(steps, read, strict=True)]
+        slopes = [np.vstack([there.J.T, of_member]) for _, of_member in read]
+        trials = [(stack, b) for stack in stacks.values() for b in range(len(stack.trials))]
+        for number, trial in enumerate(trials):
+            rows = np.flatnonzero(there.trial_of_row == number)
+            worst = min(
+                expected_evidence(predicted[i][rows] - predicted[j][rows], slopes[j][:, rows], known[j])
+                for i, j in permutations(range(len(members)), 2)
+            )
+            if worst > best:
+                best, place = worst, trial
+    if place is None or best * REPEATS < SETTLES:
+        return None
     ids = tuple(dict.fromkeys(m.keys[0][0] for m in members))
-    power = np.zeros(problem.r.size)
-    for a, b in permutations(members, 2):
-        imitator = Projector(problem, b.columns)
-        power += 0.5 * imitator(a.change[None])[0, : problem.r.size] ** 2
-    if len(ids) > 1 and (known := KNOWN.get(frozenset(ids[:2]))):
-        return NextExperiment(known[0], known[1], ids)
-    trials = np.bincount(problem.trial_of_row, power, len(problem.trial_names))
-    name = problem.trial_names[int(np.argmax(trials))]
-    trial = problem.session[name]
-    what = trial.experiment
-    place = f" of joint {trial.joint}" if trial.joint else f" of tendon {trial.tendon}" if trial.tendon else ""
-    rows = problem.trial_of_row == int(np.argmax(trials))
-    e = problem.rows[what]
-    inside = np.flatnonzero(rows[e.start : e.start + e.size])
-    x = problem.stacks[what].batch.x
-    b, time = int(e.trial[inside[0]]), e.time[inside]
-    weight = power[e.start : e.start + e.size][inside] + 1e-12
-    posture = ", ".join(
-        f"{n} {np.degrees(np.average(np.asarray(x.q)[i, b, time], weights=weight)):.0f}°"
-        for i, n in enumerate(problem.nominal.finger.joint_names)
+    return NextExperiment(place[0].experiment.name, _description(problem, *place, best), ids)
+
+
+def expected_evidence(
+    delta: Float[np.ndarray, " N"], slopes: Float[np.ndarray, "k N"], information: Float[np.ndarray, "k k"]
+) -> float:
+    """½ min over η of ‖δ − slopesᵀ η‖² + ηᵀ P η."""
+    scale = np.sqrt(np.diag(information) + np.sum(slopes**2, axis=1))
+    scale = np.where(scale > 0, scale, 1.0)
+    H = (information + slopes @ slopes.T) / np.outer(scale, scale)
+    b = slopes @ delta / scale
+    return 0.5 * float(delta @ delta - b @ np.linalg.pinv(H, rcond=1e-10, hermitian=True) @ b)
+
+
+# The short list -------------------------------------------------------------------------------------------------------
+def _short_list(problem: Problem, shown: set[str]) -> Iterator[dict[str, Stack]]:
+    """The session's trials as they are and otherwise, then those of the experiments that it lacks.
+
+    All experiments change together, since stacks of the shapes of the session's own are compiled already.
+    """
+    own = problem.stacks
+    lacks = {
+        name: _borrowed(problem, name, own[like])
+        for name, like in LIKE.items()
+        if name in shown and name not in own and like in own
+    }
+    for stacks in (own, lacks):
+        if shown & set(stacks):
+            for share in (None, *PLACES):
+                there = {e: _at(s, problem.nominal.finger, share) for e, s in stacks.items()}
+                yield there
+                yield {e: _harder(s) for e, s in there.items()}
+                yield {e: _slower(s) for e, s in there.items()}
+
+
+def _borrowed(problem: Problem, name: str, like: Stack) -> Stack:
+    """An experiment that the session lacks, with the motion of another."""
+    spec, x, finger = EXPERIMENTS[name], like.batch.x, problem.nominal.finger
+    if spec.slack:
+        x = replace(x, tension=jnp.zeros_like(x.tension), tendon_direction=jnp.zeros_like(x.tendon_direction))
+    joints = [problem.session[t].joint for t in like.trials]
+    motor = np.zeros(x.q.shape)
+    if name != "VD.2":
+        for b, joint in enumerate(joints):
+            crossed = finger.crosses[int(np.argmax(np.ptp(np.asarray(x.tension)[:, b], axis=-1)))]
+            own = [finger.joint_names.index(joint)] if joint else np.flatnonzero(crossed)[:1]
+            motor[own, b] = 1.0
+    counts = np.stack([np.asarray(m) for m in like.batch.mask.values() for m in m]).max(axis=0)
+    mask, y = {}, {}
+    for c in spec.channels:
+        columns = {"joint_torque": finger.m, "tendon_excursion": finger.n, "fingertip_force": 3}[c]
+        mask[c] = jnp.asarray(motor if c == "joint_torque" else np.ones((columns, *counts.shape))) * counts
+        if c == "tendon_excursion":
+            mask[c] *= jnp.asarray((np.asarray(x.tension).max(axis=-1) > 0)[..., None])
+        y[c] = jnp.zeros_like(mask[c])
+    x = replace(x, motorised=jnp.asarray(motor), held=spec.held)
+    return Stack(spec, Batch(x, y, mask), like.trials, like.motions, like.dt)
+
+
+def _at(stack: Stack, finger: Finger, share: float | None) -> Stack:
+    """With the joints that rest so far up their ranges."""
+    if share is None:
+        return stack
+    q = np.asarray(stack.batch.x.q)
+    low, high = (np.asarray(finger.limits)[:, k, None, None] for k in (0, 1))
+    return _with(stack, q=np.where(_moves(finger, q)[..., None], q, low + share * (high - low)))
+
+
+def _harder(stack: Stack) -> Stack:
+    """With tendons pulled further, and at held joints let go again in the same steps; without tension, faster."""
+    x, spec = stack.batch.x, stack.experiment
+    if spec.name == "VD.3":  # its motion follows from its tension
+        return stack
+    if spec.slack:
+        speed = float(np.percentile(np.abs(np.asarray(x.qd)).max(axis=0), 99))
+        return stack if spec.samples == "holds" else _at_speed(stack, max(1.0, FASTEST / max(speed, 1e-3)))
+    f = np.asarray(x.tension)
+    top = np.maximum(f.max(axis=(0, -1), keepdims=True), SLACK)
+    f = f * np.clip(HIGHEST / top, 1.0, np.inf if spec.held else LOOSE)
+    falls = f[..., -1].max(axis=0) < 0.5 * f.max(axis=(0, -1))
+    if not spec.held or falls.all():
+        return _with(stack, tension=f)
+    T = f.shape[-1]
+    there_and_back = np.r_[0:T:2, T - 1 - T % 2 : 0 : -2]
+    mask = {c: m[..., there_and_back] for c, m in stack.batch.mask.items()}
+    pulled = _with(stack, tension=f[..., there_and_back])
+    return replace(pulled, batch=replace(pulled.batch, mask=mask))
+
+
+def _slower(stack: Stack) -> Stack:
+    """Where joints move and the speed is free."""
+    spec = stack.experiment
+    return stack if spec.samples == "holds" or spec.name == "VD.3" else _at_speed(stack, SLOWER)
+
+
+def _at_speed(stack: Stack, times: float) -> Stack:
+    x = stack.batch.x
+    return _with(stack, time=x.time / times, qd=x.qd * times, qdd=x.qdd * times**2)
+
+
+def _with(stack: Stack, **motion) -> Stack:
+    x = replace(stack.batch.x, **{k: jnp.asarray(v) for k, v in motion.items()})
+    return replace(stack, batch=replace(stack.batch, x=x))
+
+
+def _moves(finger: Finger, q: Float[np.ndarray, "m *T"]) -> np.ndarray:
+    """Which joints move in a trial."""
+    slides = np.array(finger.prismatic)
+    low, high = np.asarray(finger.limits).T
+    rest = np.where(slides, 0.05 * (high - low), REST)
+    return np.ptp(q, axis=-1) > rest.reshape(-1, *[1] * (q.ndim - 2))
+
+
+# In words -------------------------------------------------------------------------------------------------------------
+def _description(problem: Problem, stack: Stack, b: int, evidence: float) -> str:
+    finger, spec = problem.nominal.finger, stack.experiment
+    trial = problem.session[stack.trials[b]]
+    x = stack.batch.x
+    counts = np.stack([np.asarray(m)[b] for mask in stack.batch.mask.values() for m in mask]).max(axis=0) > 0
+    q, f = np.asarray(x.q)[:, b][:, counts], np.asarray(x.tension)[:, b][:, counts]
+    moves = _moves(finger, q)
+    where = ", ".join(
+        f"{name} {_angle(finger, i, q[i].min())} to {_angle(finger, i, q[i].max())}"
+        if moves[i]
+        else f"{name} at {_angle(finger, i, q[i].mean())}"
+        for i, name in enumerate(finger.joint_names)
     )
-    speed = np.average(np.abs(np.asarray(x.qd)[:, b, time]).max(axis=0), weights=weight)
-    tension = np.average(np.asarray(x.tension)[:, b, time].max(axis=0), weights=weight)
-    detail = {
-        "ID.3-dynamic": f"at speeds from {0.3 * speed:.2g} to {3 * max(speed, 0.1):.2g} rad/s",
-        "VD.3": f"at speeds around {max(speed, 0.1):.2g} rad/s and tensions around {tension:.1f} N",
-        "ID.4": f"with steps up to {1.5 * tension:.0f} N and down again",
-        "VD.2": f"with steps up to {1.5 * tension:.0f} N",
-    }.get(what, "over the whole range, both ways")
-    return NextExperiment(
-        what,
-        f"repeat {what}{place} near {posture}, {detail}; there the fitted models differ most (as in trial {name})",
-        ids,
-    )
+    parts = [] if spec.name in problem.stacks else ["the session lacks it"]
+    parts += [f"joint {trial.joint}"] if trial.joint and spec.name.startswith("ID") else []
+    parts += [f"tendon {trial.tendon}"] if trial.tendon and spec.held else []
+    parts.append(where)
+    if spec.held:
+        back = " and down again" if f[:, -1].max() < 0.5 * f.max() else ""
+        parts.append(f"in steps to {f.max():.0f} N{back}")
+    elif not spec.slack:
+        parts.append(f"tension up to {f.max():.0f} N")
+    if spec.samples != "holds":
+        parts.append(f"up to {np.percentile(np.abs(np.asarray(x.qd)[:, b]).max(axis=0), 99):.2g} rad/s")
+    often = int(np.ceil(SETTLES / evidence))
+    parts += [f"{often} times"] if often > 1 else []
+    return f"{', '.join(parts)}; expected log evidence {often * evidence:.1f} ({SETTLES:g} leaves the wrong one 3 %)"
+
+
+def _angle(finger: Finger, i: int, value: float) -> str:
+    return f"{1e3 * value:.0f} mm" if finger.prismatic[i] else f"{np.degrees(value):.0f}°"

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -22,7 +21,7 @@ from jaxfinger.identify.linearise import Linearised, linearise
 from jaxfinger.identify.noise import Noise, estimate
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.solve import Prior, Source, solve, unit_weights
-from jaxfinger.identify.stages import DEPENDS, cad_covariance, first_noise, free_groups, nominal_model, start_values
+from jaxfinger.identify.stages import cad_covariance, first_noise, free_groups, nominal_model, sources_of, start_values
 from jaxfinger.model import Model
 
 Progress = Callable[[str], None]
@@ -124,14 +123,13 @@ def build(
     cad = [i for i, p in enumerate(parameters) if p.group in ("mass", "com") and fit.covariance[i, i] > 0]
     cad = np.setdiff1d(cad, fit.estimated)
     free = np.union1d(fit.estimated, cad).astype(int)
-    sources = {e: _source(stacks[e], fit.noise, parameters) for e in stacks}
-    noise = _with_unknown(fit.noise, stacks, sources, fit.model)
-    sources = {e: _source(stacks[e], noise, parameters) for e in stacks}
+    noise = _with_unknown(fit.noise, stacks, _sources(stacks, fit.noise, parameters), fit.model)
+    sources = _sources(stacks, noise, parameters)
     start, more = _with_missing_stages(fit, free, sources, parameters)
     if more.size > free.size:  # what no stage had fitted was no noise
         start, _ = solve(start, more, sources, _cad_prior(session, recipe, more, parameters))
         noise = _with_unknown(fit.noise, stacks, sources, start)
-        sources, free = {e: _source(stacks[e], noise, parameters) for e in stacks}, more
+        sources, free = _sources(stacks, noise, parameters), more
     prior = _cad_prior(session, recipe, free, parameters)
     nominal, solution = solve(start, free, sources, prior)
 
@@ -155,11 +153,47 @@ def moved(problem: Problem, by: Float[np.ndarray, " p"]) -> Problem:
     """The same rows at another nominal model: its free parameters moved, residuals and Jacobian exact there."""
     at = Free.at(problem.nominal, problem.free)
     nominal = at.set(problem.nominal, at.get(problem.nominal) + by)
-    linearised = {
-        e: linearise(nominal, Free.at(nominal, s.positions), s.batch, s.filters, unit_weights(s))
-        for e, s in problem.sources.items()
-    }
+    linearised = _linearised(nominal, problem.sources)
     return replace(problem, **_at(nominal, linearised, problem.sources, problem.rows, problem.free, problem.prior))
+
+
+def imagined(problem: Problem, stacks: dict[str, Stack]) -> Problem:
+    """Trials that nobody has run, as the nominal model sees them; their measured channels mean nothing.
+
+    Noise of an experiment that the session lacks is that of the channel elsewhere. The force sensor is then taken to be
+    as good as the torque sensor at the length of the finger.
+    """
+    known = dict(problem.noise)
+    for e, stack in stacks.items():
+        for c in stack.experiment.channels:
+            if (e, c) not in known:
+                known[e, c] = _noise_elsewhere(problem, c, len(stack.batch.y[c]))
+    sources = {
+        e: problem.sources[e]._replace(batch=stack.batch)
+        if e in problem.sources
+        else _sources({e: stack}, known, describe(problem.nominal))[e]
+        for e, stack in stacks.items()
+    }
+    rows, linearised = layouts(stacks, sources), _linearised(problem.nominal, sources)
+    at = _at(problem.nominal, linearised, sources, rows, problem.free, problem.prior)
+    return replace(problem, stacks=stacks, sources=sources, rows=rows, noise=known, **at)
+
+
+def _noise_elsewhere(problem: Problem, channel: str, columns: int) -> Noise:
+    """White, of the largest size that the channel has in any experiment."""
+    sizes = {c: max(n.std.max() for (_, k), n in problem.noise.items() if k == c) for _, c in problem.noise}
+    length = float(np.linalg.norm(np.asarray(problem.session.finger.origin)[1:], axis=1).sum()) + float(
+        np.linalg.norm(problem.session.finger.fingertip)
+    )
+    std = np.full(columns, sizes.get(channel, sizes.get("joint_torque", 1e-3) / length))
+    return Noise(std, std, np.zeros((columns, 1)), "elsewhere")
+
+
+def _linearised(model: Model, sources: dict[str, Source]) -> dict[str, Linearised]:
+    return {
+        e: linearise(model, Free.at(model, s.positions), s.batch, s.filters, unit_weights(s))
+        for e, s in sources.items()
+    }
 
 
 def _at(nominal: Model, linearised: dict[str, Linearised], sources, rows, free, prior: Prior) -> dict[str, Any]:
@@ -240,13 +274,11 @@ def _cad_prior(session: Session, recipe: Recipe, free, parameters) -> Prior:
     return Prior(np.asarray(ravel(nominal_model(session, recipe)))[free], root)
 
 
-def _source(stack: Stack, noise: dict[tuple[str, str], Noise], parameters) -> Source:
+def _sources(stacks: dict[str, Stack], noise: dict[tuple[str, str], Noise], parameters) -> dict[str, Source]:
     """Whitened by a first guess where the noise of a channel is not known yet."""
-    e, channels = stack.experiment.name, stack.experiment.channels
-    groups = set().union(*(DEPENDS[e, c] for c in channels))
-    positions = np.array([i for i, p in enumerate(parameters) if p.group in groups and p.determinable])
-    known = {c: noise[e, c] if (e, c) in noise else first_noise(stack, c) for c in channels}
-    return Source(stack.batch, {c: jnp.asarray(n.coefficients) for c, n in known.items()}, positions)
+    reads = {e: stack.experiment.channels for e, stack in stacks.items()}
+    guesses = {(e, c): first_noise(stacks[e], c) for e in reads for c in reads[e] if (e, c) not in noise}
+    return sources_of(stacks, reads, noise | guesses, parameters)
 
 
 def _layout(stack: Stack, filters, start: int) -> Rows:

@@ -6,6 +6,7 @@ effects. Signatures are read at the nominal model of the problem; the strongest 
 model that each leads to (`relinearised`). The exact fit of the effects that a verdict names comes last (`augment`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
@@ -63,13 +64,13 @@ def refine(
     """The variants together, from amplitudes `start` (in their own units)."""
     finger = problem.nominal.finger
     effects = [v.at(finger, s) for v, s in zip(variants, start, strict=True)]
-    coordinates = [c for i, v in enumerate(variants) for c in _coordinates(i, v)]
+    coordinates = _coordinates(variants)
     signatures, projector = Signatures(problem, problem.nominal), projector or Projector(problem)
     base, slopes = _evaluate(signatures, effects, coordinates)
     r = problem.r - base
     sizes = _sizes(effects, coordinates)
     cost = _cost(projector, problem, r) + float(sizes @ sizes)
-    prior = np.array([WIDE**-2 if c.amplitude else 1.0 for c in coordinates])
+    prior = _prior(coordinates)
     for _ in range(STEPS):
         rt = projector.residual(problem, r)
         St = projector(slopes)
@@ -122,7 +123,7 @@ def relinearised(problem: Problem, refined: Refined, chi2_null: float) -> tuple[
     joint: where effects are large, their products with the nominal parameters count.
     """
     for _ in range(ROUNDS):
-        here = moved(problem, _nominal_step(problem, problem.r - refined.change))
+        here = moved(problem, nominal_step(problem, problem.r - refined.change))
         left = here.r - _evaluate(Signatures(here, here.nominal), refined.effects, [])[0]
         exact = float(left @ left + here.offset @ here.offset)
         if not abs(exact - refined.chi2) > SETTLED:
@@ -132,7 +133,7 @@ def relinearised(problem: Problem, refined: Refined, chi2_null: float) -> tuple[
     return problem, refined
 
 
-def _nominal_step(problem: Problem, r: np.ndarray) -> Float[np.ndarray, " p"]:
+def nominal_step(problem: Problem, r: np.ndarray) -> Float[np.ndarray, " p"]:
     """What the nominal parameters move by to absorb r."""
     A, b = np.vstack([problem.J, problem.root]), np.concatenate([r, -problem.offset])
     scale = np.linalg.norm(A, axis=0)
@@ -147,6 +148,20 @@ def at_optimum(refined: Refined) -> tuple[list[Variant], list[dict[str, float]]]
         for v, x in zip(refined.variants, refined.effects, strict=True)
     ]
     return items, [{n: float(getattr(x, n)) for n in x.AMPLITUDES} for x in refined.effects]
+
+
+def derivatives(signatures: Signatures, refined: Refined) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "k N"]]:
+    """White change of other rows by the refitted effects, and its derivatives by amplitudes and moving shapes."""
+    return _evaluate(signatures, refined.effects, _coordinates(refined.variants))
+
+
+def information(problem: Problem, refined: Refined) -> Float[np.ndarray, "p+k p+k"]:
+    """What the trials and priors say of the nominal parameters and of the amplitudes and moving shapes together."""
+    A, p = np.vstack([problem.J.T, refined.columns]), problem.J.shape[1]
+    P = A @ A.T
+    P[:p, :p] += problem.root.T @ problem.root
+    P[p:, p:] += np.diag(_prior(_coordinates(refined.variants)))
+    return P
 
 
 def _sizes(effects, coordinates: list[_Coordinate]) -> Float[np.ndarray, " k"]:
@@ -164,14 +179,20 @@ def _sizes(effects, coordinates: list[_Coordinate]) -> Float[np.ndarray, " k"]:
     )
 
 
-def _coordinates(i: int, variant: Variant) -> list[_Coordinate]:
-    kind = variant.effect
-    out = [_Coordinate(i, n, True, unit) for n, (_, unit, _) in kind.AMPLITUDES.items()]
-    for n, (_, values) in kind.SHAPES.items():
-        if n not in FIXED and len(values) > 1:
-            unit = float(np.mean(np.diff(values))) / 2 if n in ADDITIVE else 1.0
-            out.append(_Coordinate(i, n, False, unit))
+def _coordinates(variants: Sequence[Variant]) -> list[_Coordinate]:
+    out = []
+    for i, kind in enumerate(v.effect for v in variants):
+        out += [_Coordinate(i, n, True, unit) for n, (_, unit, _) in kind.AMPLITUDES.items()]
+        for n, (_, values) in kind.SHAPES.items():
+            if n not in FIXED and len(values) > 1:
+                unit = float(np.mean(np.diff(values))) / 2 if n in ADDITIVE else 1.0
+                out.append(_Coordinate(i, n, False, unit))
     return out
+
+
+def _prior(coordinates: list[_Coordinate]) -> Float[np.ndarray, " k"]:
+    """Precision of amplitudes and shapes before any trial."""
+    return np.array([WIDE**-2 if c.amplitude else 1.0 for c in coordinates])
 
 
 def _shifted(effect: CatalogueEffect, c: _Coordinate, by: float) -> CatalogueEffect:

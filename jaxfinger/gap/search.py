@@ -90,7 +90,7 @@ def search(
     refined: dict[tuple, Refined] = {}
     for e in _worth(ranked, 3 if quick else 8):
         progress(f"refitting with {e.variant.effect.ID} at {', '.join(e.variant.site)}")
-        refined[e.variant.key] = refine(problem, [e.variant], [_start(e)], chi2, projector)
+        refined[e.variant.key] = refine(problem, [e.variant], [start_of(e)], chi2, projector)
     if not refined or max(r.log_evidence for r in refined.values()) < DETECT:
         strongest = max((r.log_evidence for r in refined.values()), default=strongest)
         return _nothing(ranked, strongest, absorbed)
@@ -125,7 +125,8 @@ def _worth(ranked: list[Evidence], most: int) -> list[Evidence]:
     return [e for e in ranked[:most] if e.log_bf > 5.0 and e.explained > 0.2 * best]
 
 
-def _start(e: Evidence) -> dict[str, float]:
+def start_of(e: Evidence) -> dict[str, float]:
+    """Amplitudes to start a refit from, in their own units."""
     names = e.variant.effect.AMPLITUDES
     return {n: float(a) * unit for (n, (_, unit, _)), a in zip(names.items(), e.amplitudes, strict=True)}
 
@@ -137,8 +138,7 @@ def _add(problem, groups, columns, best: Refined, chi2: float, without, progress
     FORM of what they explain there may be theirs still, and counts for no other. `without`: white residuals of the
     nominal model alone.
     """
-    chosen, projector = best, Projector(problem)
-    cell = problem.column_of_row
+    chosen, cell = best, problem.column_of_row
     while len(chosen.variants) < MOST:
         theirs = FORM * np.maximum(np.bincount(cell, without**2 - chosen.residual**2, len(problem.columns)), 0.0)
         energies = {(x.experiment, x.channel, x.column): x.energy for x in explained(problem, chosen.residual)}
@@ -159,7 +159,7 @@ def _add(problem, groups, columns, best: Refined, chi2: float, without, progress
             break
         progress(f"adding {e.variant.effect.ID} at {', '.join(e.variant.site)}")
         items, starts = at_optimum(chosen)
-        together = refine(problem, [*items, e.variant], [*starts, _start(e)], chi2, projector)
+        together = refine(problem, [*items, e.variant], [*starts, start_of(e)], chi2)
         if chosen.chi2 - together.chi2 < need:
             break
         chosen = together
