@@ -105,9 +105,26 @@ def dahl(z: Float[Array, "*T"], dx: Float[Array, "*T"], length: Float[Array, ""]
 
 
 def rate(y: Float[Array, "*T"], time: Float[Array, "*T"]) -> Float[Array, "*T"]:
-    """Time derivative along the last axis by central differences; zero where time stands still."""
+    """Time derivative along the last axis; zero where time stands still.
+
+    Central differences of the sixth order where samples are evenly spaced (Fornberg, Math. Comp. 51 (1988) 699), since
+    reduced channels change by much from sample to sample; of the second order elsewhere.
+    """
     dy, dt = (jnp.asarray(jnp.gradient(a, axis=-1)) for a in (y, time))
-    return jnp.where(dt > 0, dy / jnp.where(dt > 0, dt, 1.0), 0.0)
+    slope = jnp.where(dt > 0, dy / jnp.where(dt > 0, dt, 1.0), 0.0)
+    if y.shape[-1] < 7:
+        return slope
+
+    def wide(a):
+        return sum(w * (a[..., 3 + k : a.shape[-1] - 3 + k] - a[..., 3 - k : a.shape[-1] - 3 - k]) for k, w in STENCIL)
+
+    inner, step = wide(time), dt[..., 3:-3]
+    even = (step > 0) & (jnp.abs(time[..., 6:] - time[..., :-6] - 6.0 * step) < 0.01 * step)
+    smooth = jnp.where(even, wide(y) / jnp.where(even, inner, 1.0), slope[..., 3:-3])
+    return slope.at[..., 3:-3].set(smooth)
+
+
+STENCIL = ((1, 0.75), (2, -0.15), (3, 1 / 60))
 
 
 TORQUE = {"ID.3-static": ("joint_torque",), "ID.3-dynamic": ("joint_torque",), "VD.3": ("joint_torque",)}

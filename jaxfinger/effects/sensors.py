@@ -135,12 +135,12 @@ CHANNELS = ("q", "tendon_force", "tendon_excursion", "joint_torque", "fingertip_
 
 
 class ChannelDelay(CatalogueEffect):
-    """y(t − d): one channel lags the others (first order in d)."""
+    """y(t − d): one channel lags the others (first order in d). Where a fixture holds the joints all is at rest."""
 
     ID: ClassVar = "channel_delay"
     PLACE: ClassVar = "channel"
     AMPLITUDES: ClassVar = {"delay": ("s", 5e-3, False)}
-    SHOWS: ClassVar = EVERYWHERE
+    SHOWS: ClassVar = {e: channels for e, channels in EVERYWHERE.items() if e not in ("ID.4", "VD.2")}
     MOVES_RIGID_BODY: ClassVar = True
 
     delay: Float[Array, ""]
@@ -157,15 +157,20 @@ class ChannelDelay(CatalogueEffect):
         return jnp.where(self.index[0] == CHANNELS.index(channel), self.delay, 0.0)
 
     def true_motion(self, x):
-        moving, d_q, d_f = (0.0 if x.held else 1.0), self._of("q"), self._of("tendon_force")
+        if x.held:
+            return x
+        d_q, d_f = self._of("q"), self._of("tendon_force")
         return eqx.tree_at(
             lambda x: (x.q, x.qd, x.tension),
             x,
-            (x.q + moving * d_q * x.qd, x.qd + moving * d_q * x.qdd, x.tension + d_f * rate(x.tension, x.time)),
+            (x.q + d_q * x.qd, x.qd + d_q * x.qdd, x.tension + d_f * rate(x.tension, x.time)),
         )
 
     def reading(self, channel, x, y):
+        if x.held:
+            return y
         if channel == "joint_torque":
-            # The free finger's external torque is zero by construction, not by a sensor.
-            return y - self._of(channel) * rate(y, x.time) * x.motorised
+            # The free finger's external torque is zero by construction, not by a sensor. A hold has no rate, though
+            # the differences of its first and last sample reach over its edges.
+            return y - self._of(channel) * rate(y, x.time) * x.motorised * (x.qd != 0.0)
         return y - self._of(channel) * rate(y, x.time)

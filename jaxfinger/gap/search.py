@@ -36,10 +36,10 @@ CLOSE = 0.5  # share of what the best explains, from which on a rival is refitte
 COVERED = 0.97  # probability of a set of rivals, among the catalogue, up to which it takes in further ones
 RIVALS = 3  # at most in a set
 LOOKED_AT = 12  # candidates for a further effect
-LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for
+LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for, and nothing is unlisted
 # «Unlisted», by how many effects were chosen, since two known ones together imitate more than one does: the share of
-# the gap left to the stand-in at which it is as likely as the catalogue, how sharply, and the least energy that counts.
-OPEN = {1: (0.19, 0.03, 300.0), 2: (0.17, 0.04, 100.0)}
+# the gap left to the stand-in at which it is as likely as the catalogue, and how sharply.
+OPEN = {1: (0.19, 0.03), 2: (0.17, 0.04)}
 
 
 @dataclass(frozen=True)
@@ -205,8 +205,8 @@ def _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, stro
     log_l = {k: -0.5 * LOOKS * np.log1p(max(u, 0.0) / LOOKS) for k, u in unexplained.items()}
     total = logsumexp(list(log_l.values()))
     share_left = beyond / gap
-    even, width, least = OPEN[len(chosen.variants)]
-    unlisted = float(expit((share_left - even) / width)) if beyond > least else 0.01
+    even, width = OPEN[len(chosen.variants)]
+    unlisted = float(expit((share_left - even) / width)) if beyond > LEAST else 0.01
     probability = {k: float(np.exp(v - total)) * (1 - unlisted) for k, v in log_l.items()}
     if len(chosen.variants) > 1:
         # Several effects: each carries its part of what the catalogue explains.
