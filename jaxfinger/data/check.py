@@ -21,6 +21,7 @@ from jaxfinger.data.schema import MEASURED
 from jaxfinger.data.session import EXPERIMENTS, Session, Trial
 
 _MANY_SPIKES = 0.05
+_START = 100  # samples by which most pairs of trials are told apart
 
 
 def check_file(path: str | os.PathLike) -> list[Finding]:
@@ -61,6 +62,7 @@ def check_session(session: Session, report: Report) -> None:
             check_trial(trial, session.finger, report)
     _check_order(session, report)
     _check_motions(session, report)
+    _check_copies(session, report)
     if session.created:
         _check_created(session.created, report)
 
@@ -114,6 +116,21 @@ def _check_motions(session: Session, report: Report) -> None:
                 f"the motion {motion!r} is shared by trials that differ in experiment, joint or tendon; "
                 "their differences are no pure noise: name the motions apart",
             )
+
+
+def _check_copies(session: Session, report: Report) -> None:
+    """A recording counts once: a copy would pass for a repeat without noise."""
+    alike: dict[tuple, list[Trial]] = defaultdict(list)
+    for trial in session:
+        measured = {name: values for name in MEASURED if (values := getattr(trial, name)) is not None}
+        start = tuple((name, np.ascontiguousarray(values[:_START]).tobytes()) for name, values in measured.items())
+        earlier = alike[(trial.experiment, len(trial.time), start)]
+        for other in earlier if len(trial.time) > 1 else ():
+            if all(np.array_equal(values, getattr(other, name), equal_nan=True) for name, values in measured.items()):
+                message = f"is the same recording as trial {other.name}, sample for sample; remove one of them"
+                report.error(f"/trials/{trial.name}", message)
+                break
+        earlier.append(trial)
 
 
 def _check_created(created: str, report: Report) -> None:

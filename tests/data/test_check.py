@@ -126,6 +126,11 @@ ERRORS = {
         f"/{VD3}/time",
         "no sample",
     ),
+    "the same recording twice": (
+        lambda f: f.copy(f[ID2], f["trials"], "99-again"),
+        "/trials/99-again",
+        "the same recording as trial 01-ID.2-MCP",
+    ),
     "trial is a dataset": (lambda f: f.create_dataset("trials/x", data=1.0), "/trials/x", "must be a group"),
 }
 

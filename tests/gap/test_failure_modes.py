@@ -1,0 +1,46 @@
+"""Ways in which a diagnosis could fool its user, each as a session with a known answer."""
+
+import json
+
+import numpy as np
+
+from jaxfinger.effects import CATALOGUE
+from jaxfinger.effects.joint import JointPresliding
+from jaxfinger.gap import as_gap_json, diagnose
+from jaxfinger.synthetic import recipe_from
+
+from .conftest import RIVALS, TABLE, TRUTH, WITHOUT, session_with
+
+PLANTED = (*TRUTH, {"a": 1.0, "x0": 0.1})
+
+
+def test_the_same_file_twice_is_the_same_diagnosis(diagnosis):
+    again = diagnose(session_with(PLANTED), without=WITHOUT)
+    first, second = (json.dumps(as_gap_json(d), sort_keys=True) for d in (diagnosis, again))
+    assert first == second
+
+
+def test_a_users_copy_of_a_listed_effect_is_its_rival_and_not_its_better():
+    class Twin(JointPresliding):
+        ID = "my_presliding"
+
+    found = diagnose(session_with(PLANTED), without=WITHOUT, effects={"my_presliding": Twin})
+    assert found.verdict.status == "ambiguous"
+    assert set(found.search.rival_sets[0]) == {TRUTH, ("my_presliding", TRUTH[1])}
+    probability = {c.key: c.probability for c in found.search.candidates}
+    np.testing.assert_allclose([probability[TRUTH], probability["my_presliding", TRUTH[1]]], 0.5, atol=0.05)
+    assert found.next is None  # no trial tells an effect from its copy
+
+
+def test_a_gain_that_friction_absorbs_is_not_named():
+    """A tendon that is only ever pulled further: its sensor's gain and its affine friction are one thing."""
+    trials = TABLE["trials"] | {
+        "experiments": ["ID.2", "ID.3-static", "ID.4"],
+        "id4": {"repeats": 2, "postures": [[25, 30, 45]], "release": False, "dwell": 0.4},
+    }
+    keep = {*RIVALS, "tension_sensor_scale", "tendon_friction_saturating"}
+    truth = ("tension_sensor_scale", ("T1",), {"gain": 0.05})
+    session = session_with(truth, recipe=recipe_from(TABLE | {"trials": trials}))
+    found = diagnose(session, without=tuple(sorted(set(CATALOGUE) - keep)))
+    assert found.verdict.status == "no_gap"
+    assert dict(found.search.absorbed)[truth[:2]] > 0.99
