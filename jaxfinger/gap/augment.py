@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.gap.problem import Problem, assemble
-from jaxfinger.gap.refine import FIXED, Refined
+from jaxfinger.gap.refine import ADDITIVE, FIXED, Refined
 from jaxfinger.identify import Fit
 from jaxfinger.identify.fit import StageReport
 from jaxfinger.identify.parameters import describe, ravel
@@ -32,16 +32,25 @@ def augmented_fit(problem: Problem, chosen: Refined) -> tuple[Fit, np.ndarray, n
     free = np.concatenate([problem.free, moving]).astype(int)
     sources = {e: _with_effects(s, chosen, moving, first, len(parameters), e) for e, s in problem.sources.items()}
     values = np.asarray(ravel(model))
-    # A weak prior of three times their own size on amplitudes and shapes, so that a flat direction stays put.
+    # A weak prior on amplitudes and shapes, so that a flat direction stays put.
     mean = np.concatenate([problem.prior.mean, values[moving]])
     root = np.zeros((len(problem.root) + len(moving), free.size))
     root[: len(problem.root), : problem.free.size] = problem.root
-    scale = np.maximum(np.abs(values[moving]), 1e-12)
-    root[len(problem.root) :, problem.free.size :] = np.diag(1.0 / (3.0 * scale))
+    width = [_width(chosen, parameters[i].name, abs(values[i])) for i in moving]
+    root[len(problem.root) :, problem.free.size :] = np.diag(1.0 / np.array(width))
     fitted, solution = solve(model, free, sources, Prior(mean, root))
     information = solution.information[np.ix_(free, free)] + root.T @ root
     r, J = assemble(solution.linearised, sources, problem.rows, free, ravel(model).size)
     return _fit(problem, fitted, free, information, "with the effects of the diagnosis", solution), r, J
+
+
+def _width(chosen: Refined, label: str, size: float) -> float:
+    """Of the prior: three times an amplitude's own or plausible size, three times a factor, the range of a place."""
+    site, name = label.rsplit(" ", 1)
+    (effect,) = (e for e in chosen.effects if site == f"{e.ID} {'-'.join(e.site)}")
+    if name in effect.AMPLITUDES:
+        return 3.0 * max(size, effect.AMPLITUDES[name][1])
+    return float(np.ptp(effect.SHAPES[name][1])) if name in ADDITIVE else 3.0 * max(size, 1e-12)
 
 
 def _moves(model: Model, name: str) -> bool:

@@ -101,14 +101,17 @@ def diagnose(
             verdict = replace(verdict, summary=verdict.summary + text)
     verdict = replace(verdict, summary=verdict.summary + _retuned(problem, fit))
     places = where(problem)
-    members = _members(problem, found)
+    step = None
+    if verdict.status == "ambiguous":
+        progress("looking for the trial that would tell them apart")
+        step = next_experiment(problem, _members(problem, found))
     return Diagnosis(
         problem,
         verdict,
         places,
         found,
         lines,
-        next_experiment(problem, members) if verdict.status == "ambiguous" else None,
+        step,
         nominal,
         fit,
         proposal,

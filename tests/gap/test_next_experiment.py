@@ -50,6 +50,14 @@ def test_the_suggestion_says_how_much_it_would_tell(ambiguous):
     assert evidence > SETTLES
 
 
+def test_a_shape_that_no_trial_tells_is_said_to_be_open(ambiguous):
+    """With the DIP in one posture only φ + ρ q_DIP shows: neither ρ nor φ is known, and the stiffness is."""
+    best = as_gap_json(ambiguous)["candidates"][0]["parameters"]
+    assert best["rho"]["std"] > 0.5
+    assert best["phi"]["std"] > 0.5
+    assert best["kappa"]["std"] < 0.1 * best["kappa"]["value"]
+
+
 def test_joints_that_no_trial_moved_leave_every_number_finite(ambiguous):
     json.dumps(as_gap_json(ambiguous), allow_nan=False)
 
