@@ -98,7 +98,7 @@ class EncoderOffset(_Encoder):
 
 
 class EncoderEccentricity(_Encoder):
-    """q_measured = q + A sin q + B cos q − B: once-per-turn error of an off-axis magnet."""
+    """q_measured = q + A sin q + B cos q: once-per-turn error of an off-axis magnet, a sin(q + φ)."""
 
     ID: ClassVar = "encoder_eccentricity"
     PLACE: ClassVar = "joint"
@@ -109,7 +109,7 @@ class EncoderEccentricity(_Encoder):
     B: Float[Array, ""]
 
     def error(self, q):
-        return self.A * jnp.sin(q) + self.B * (jnp.cos(q) - 1.0)
+        return self.A * jnp.sin(q) + self.B * jnp.cos(q)
 
 
 class ForceSensorRotation(CatalogueEffect):
