@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxfinger.experiments import Batch, Stack
 
 ORDER = 3  # of the autoregression
+FEW, MANY = 50, 1000  # samples by which a column tells its size, and its colour
 SLOW = 15  # samples of the moving average that is taken for signal where nothing is repeated
 
 
@@ -73,12 +74,19 @@ def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B 
         series = [a + b for a, b in zip(series, holds, strict=True)]
     if not _enough(series):
         series, source = _fast_part(residual, mask), "residuals"
-    pooled = _autoregression([s for column in series for s in column])
+    # A column with few samples of its own borrows the channel's size, and one with not many its colour, which the
+    # filters give to all columns alike.
+    sizes = [_autoregression(c)[0] if _count(c) > FEW else None for c in series]
+    size, *_ = _autoregression([s for column in series for s in column])
+    colour = _autoregression(
+        [(e / (std or size), m, lost) for c, std in zip(series, sizes, strict=True) for e, m, lost in c]
+    )
     rows = []
-    for column in series:
-        count = sum(int(m.sum()) for _, m, _ in column)
-        # A column with few samples of its own borrows the channel's.
-        rows.append(_autoregression(column) if count > 100 else pooled)
+    for column, std in zip(series, sizes, strict=True):
+        of_size = std or size
+        rows.append(
+            _autoregression(column) if _count(column) > MANY else (of_size, of_size * colour[1] / colour[0], colour[2])
+        )
     std, innovation, ar = (np.array(x) for x in zip(*rows, strict=True))
     if stack.experiment.held:
         scale = _between_holds(_repeats(stack, residual, mask, demean), ar, innovation)
@@ -90,8 +98,12 @@ def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B 
 Series = list[tuple[np.ndarray, np.ndarray, float]]
 
 
+def _count(column: Series) -> int:
+    return sum(int(m.sum()) for _, m, _ in column)
+
+
 def _enough(series: list[Series]) -> bool:
-    return sum(int(m.sum()) for column in series for _, m, _ in column) > 100
+    return sum(map(_count, series)) > 100
 
 
 def _centred(e: np.ndarray, mask: np.ndarray, demean: bool) -> np.ndarray:

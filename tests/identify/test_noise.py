@@ -1,0 +1,61 @@
+"""The noise of a channel from trials that repeat a motion, in columns of which some count for little."""
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfinger.experiments import EXPERIMENTS
+from jaxfinger.identify.noise import FEW, estimate, whiten
+
+SIZES, COUNTS, LENGTH = np.array([1.0, 5.0, 0.2]), (2000, 150, 20), 2400
+COLOUR = np.array([1.1, -0.6, 0.15])  # as a filter at a fifth of the sampling rate leaves white noise
+
+
+def coloured(rng, shape):
+    """Stationary autoregressive noise of unit innovation along the last axis."""
+    e = rng.standard_normal((*shape, LENGTH + 200))
+    for t in range(3, e.shape[-1]):
+        e[..., t] += e[..., t - 3 : t] @ COLOUR[::-1]
+    return e[..., 200:]
+
+
+def repeated(seed):
+    """Two trials of one motion; a column counts in one run of COUNTS samples."""
+    residual = SIZES[:, None, None] * coloured(np.random.default_rng(seed), (3, 2))
+    mask = np.zeros_like(residual)
+    for column, count in zip(mask, COUNTS, strict=True):
+        column[:, 100 : 100 + count] = 1.0
+    batch = SimpleNamespace(mask={"joint_torque": mask})
+    stack = SimpleNamespace(experiment=EXPERIMENTS["VD.3"], batch=batch, motions=("a", "a"))
+    return stack, residual, mask
+
+
+@pytest.fixture(scope="module")
+def estimates():
+    out = []
+    for seed in range(12):
+        stack, residual, mask = repeated(seed)
+        noise = estimate(stack, "joint_torque", residual)
+        white = np.asarray(whiten(jnp.asarray(residual), jnp.asarray(mask), jnp.asarray(noise.coefficients), False))
+        out.append((noise, (white**2).sum(axis=(1, 2)) / (white != 0).sum(axis=(1, 2))))
+    return out
+
+
+def test_every_column_with_samples_of_its_own_comes_out_white(estimates):
+    energy = np.array([white for _, white in estimates])
+    assert COUNTS[2] < FEW < COUNTS[1]
+    np.testing.assert_allclose(energy.mean(axis=0)[:2], 1.0, atol=0.08)
+    assert np.abs(energy[:, :2] - 1.0).max() < 0.35  # of 300 rows, in a single estimate
+
+
+def test_a_column_with_few_samples_borrows_the_colour_of_all(estimates):
+    for noise, _ in estimates:
+        assert noise.source == "repeats"
+        np.testing.assert_array_equal(noise.ar[1], noise.ar[2])
+        np.testing.assert_allclose(noise.ar[1], COLOUR, atol=0.12)
+
+
+def test_a_column_that_hardly_counts_borrows_the_size_of_the_channel(estimates):
+    assert all(0.2 * SIZES[0] < noise.innovation[2] < SIZES[1] for noise, _ in estimates)
