@@ -10,7 +10,7 @@ from jaxfinger.gap.problem import Problem, assemble
 from jaxfinger.gap.refine import ADDITIVE, FIXED, Refined
 from jaxfinger.identify import Fit
 from jaxfinger.identify.fit import StageReport
-from jaxfinger.identify.parameters import describe, ravel
+from jaxfinger.identify.parameters import Parameter, describe, ravel
 from jaxfinger.identify.solve import Prior, Solution, Source, solve
 from jaxfinger.model import Model
 
@@ -28,7 +28,7 @@ def augmented_fit(problem: Problem, chosen: Refined) -> tuple[Fit, np.ndarray, n
     model = eqx.tree_at(lambda m: m.effects, problem.nominal, chosen.effects, is_leaf=lambda v: isinstance(v, tuple))
     parameters = describe(model)
     first = ravel(problem.nominal).size
-    moving = [i for i in range(first, len(parameters)) if _moves(model, parameters[i].name)]
+    moving = [i for i in range(first, len(parameters)) if _moves(parameters[i])]
     free = np.concatenate([problem.free, moving]).astype(int)
     sources = {e: _with_effects(s, chosen, moving, first, len(parameters), e) for e, s in problem.sources.items()}
     values = np.asarray(ravel(model))
@@ -53,8 +53,9 @@ def _width(chosen: Refined, label: str, size: float) -> float:
     return float(np.ptp(effect.SHAPES[name][1])) if name in ADDITIVE else 3.0 * max(size, 1e-12)
 
 
-def _moves(model: Model, name: str) -> bool:
-    return name.rsplit(" ", 1)[-1] not in FIXED | {"limits", "crossed"} and "[" not in name
+def _moves(parameter: Parameter) -> bool:
+    """Not so for a choice among shapes, nor for what the finger decides."""
+    return parameter.determinable and parameter.name.rsplit(" ", 1)[-1] not in FIXED
 
 
 def _with_effects(source: Source, chosen: Refined, moving, first: int, size: int, experiment: str) -> Source:

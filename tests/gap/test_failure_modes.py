@@ -7,6 +7,7 @@ import numpy as np
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.effects.joint import JointPresliding
 from jaxfinger.gap import as_gap_json, diagnose
+from jaxfinger.identify.parameters import describe
 from jaxfinger.synthetic import recipe_from
 
 from .conftest import RIVALS, TABLE, TRUTH, WITHOUT, session_with
@@ -44,3 +45,20 @@ def test_a_gain_that_friction_absorbs_is_not_named():
     found = diagnose(session, without=tuple(sorted(set(CATALOGUE) - keep)))
     assert found.verdict.status == "no_gap"
     assert dict(found.search.absorbed)[truth[:2]] > 0.99
+
+
+def test_what_the_finger_decides_of_an_effect_is_not_fitted():
+    """A stop sits in a range that the file states: its place moves, and the range does not."""
+    keep = {"joint_stop", "torque_ripple"}
+    truth = ("joint_stop", ("PIP",), {"stiffness": 0.05, "place": 0.7, "end": 1.0})
+    found = diagnose(session_with(truth), without=tuple(sorted(set(CATALOGUE) - keep)))
+    assert found.verdict.effects == (truth[:2],)
+    (stop,) = found.augmented.model.effects
+    joint = found.problem.nominal.finger.joint_names.index("PIP")
+    np.testing.assert_array_equal(stop.limits, found.problem.nominal.finger.limits[joint])
+    np.testing.assert_allclose(float(stop.place), 0.7, atol=0.01)
+    np.testing.assert_allclose(float(stop.stiffness), 0.05, rtol=0.1)
+    fitted = [describe(found.augmented.model)[i].name for i in found.augmented.estimated]
+    assert [name for name in fitted if name.startswith("joint_stop")] == [
+        f"joint_stop PIP {n}" for n in ("stiffness", "place")
+    ]
