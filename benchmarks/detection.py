@@ -22,7 +22,7 @@ FIRST = 10_000  # numbers of the `develop` split that no block of cases uses
 DIAGNOSE = Command(f"{sys.executable} -m jaxfinger diagnose {{fit}} -o {{out}}")
 
 
-def answers(effect: str, number: int, severity: float, specimen: str, folder: Path) -> Path:
+def made(effect: str, number: int, severity: float, specimen: str, folder: Path) -> Path:
     """A case with one effect of one size; the seed is the finger's, so that sizes differ in nothing else."""
     root = folder / f"{effect}-{number}-{severity:g}"
     make_case(number, "develop", CaseSpec("listed", specimen, (effect,), (severity,)), root, root / "truth")
@@ -32,6 +32,8 @@ def answers(effect: str, number: int, severity: float, specimen: str, folder: Pa
 def judged(root: Path, out: Path) -> tuple[float, bool, float, str]:
     """Severity reached, whether the first effect named is the true one, its probability, and what was said."""
     truth = json.loads(next((root / "truth").glob("*.json")).read_text(encoding="utf-8"))["effects"][0]
+    if not list(out.glob("*/gap.json")):
+        return truth["reached"], False, 0.0, "failed"
     gap = json.loads(next(out.glob("*/gap.json")).read_text(encoding="utf-8"))
     key = {"effect": truth["effect"], "site": truth["site"]}
     probability = sum(c["probability"] for c in gap["candidates"] if {k: c[k] for k in key} == key)
@@ -52,7 +54,7 @@ def main() -> None:
             for severity in options.severities:
                 rows = []
                 for number in range(FIRST, FIRST + options.fingers):
-                    root = answers(effect, number, severity, options.specimen, Path(scratch))
+                    root = made(effect, number, severity, options.specimen, Path(scratch))
                     run_cases(root, root / "diagnoses", DIAGNOSE)
                     rows.append(judged(root, root / "diagnoses"))
                 reached, named, probability, said = zip(*rows, strict=True)

@@ -104,6 +104,9 @@ def dahl(z: Float[Array, "*T"], dx: Float[Array, "*T"], length: Float[Array, ""]
     return target + (z - target) * jnp.exp(-jnp.abs(dx) / length)
 
 
+_SIXTH_ORDER = ((1, 0.75), (2, -0.15), (3, 1 / 60))  # how far off on either side, and weight
+
+
 def rate(y: Float[Array, "*T"], time: Float[Array, "*T"]) -> Float[Array, "*T"]:
     """Time derivative along the last axis; zero where time stands still.
 
@@ -116,15 +119,14 @@ def rate(y: Float[Array, "*T"], time: Float[Array, "*T"]) -> Float[Array, "*T"]:
         return slope
 
     def wide(a):
-        return sum(w * (a[..., 3 + k : a.shape[-1] - 3 + k] - a[..., 3 - k : a.shape[-1] - 3 - k]) for k, w in STENCIL)
+        return sum(
+            w * (a[..., 3 + k : a.shape[-1] - 3 + k] - a[..., 3 - k : a.shape[-1] - 3 - k]) for k, w in _SIXTH_ORDER
+        )
 
     inner, step = wide(time), dt[..., 3:-3]
     even = (step > 0) & (jnp.abs(time[..., 6:] - time[..., :-6] - 6.0 * step) < 0.01 * step)
     smooth = jnp.where(even, wide(y) / jnp.where(even, inner, 1.0), slope[..., 3:-3])
     return slope.at[..., 3:-3].set(smooth)
-
-
-STENCIL = ((1, 0.75), (2, -0.15), (3, 1 / 60))
 
 
 TORQUE = {"ID.3-static": ("joint_torque",), "ID.3-dynamic": ("joint_torque",), "VD.3": ("joint_torque",)}

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from jaxfinger.effects import CatalogueEffect
@@ -36,21 +37,22 @@ def augmented_fit(problem: Problem, chosen: Refined) -> tuple[Fit, np.ndarray, n
     mean = np.concatenate([problem.prior.mean, values[moving]])
     root = np.zeros((len(problem.root) + len(moving), free.size))
     root[: len(problem.root), : problem.free.size] = problem.root
-    width = [_width(chosen, parameters[i].name, abs(values[i])) for i in moving]
-    root[len(problem.root) :, problem.free.size :] = np.diag(1.0 / np.array(width))
+    wide = eqx.tree_at(
+        lambda m: m.effects, model, tuple(map(_widths, chosen.effects)), is_leaf=lambda v: isinstance(v, tuple)
+    )
+    root[len(problem.root) :, problem.free.size :] = np.diag(1.0 / np.asarray(ravel(wide))[moving])
     fitted, solution = solve(model, free, sources, Prior(mean, root))
     information = solution.information[np.ix_(free, free)] + root.T @ root
     r, J = assemble(solution.linearised, sources, problem.rows, free, ravel(model).size)
     return _fit(problem, fitted, free, information, "with the effects of the diagnosis", solution), r, J
 
 
-def _width(chosen: Refined, label: str, size: float) -> float:
+def _widths(effect: CatalogueEffect) -> CatalogueEffect:
     """Of the prior: three times an amplitude's own or plausible size, three times a factor, the range of a place."""
-    site, name = label.rsplit(" ", 1)
-    (effect,) = (e for e in chosen.effects if site == f"{e.ID} {'-'.join(e.site)}")
-    if name in effect.AMPLITUDES:
-        return 3.0 * max(size, effect.AMPLITUDES[name][1])
-    return float(np.ptp(effect.SHAPES[name][1])) if name in ADDITIVE else 3.0 * max(size, 1e-12)
+    size = {n: abs(v) for n, v in effect.values().items()}
+    amplitudes = {n: 3.0 * max(size[n], unit) for n, (_, unit, _) in effect.AMPLITUDES.items()}
+    shapes = {n: np.ptp(grid) if n in ADDITIVE else 3.0 * max(size[n], 1e-12) for n, (_, grid) in effect.SHAPES.items()}
+    return replace(effect, **{n: jnp.asarray(w, dtype=float) for n, w in (amplitudes | shapes).items()})
 
 
 def _moves(parameter: Parameter) -> bool:

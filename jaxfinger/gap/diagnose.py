@@ -101,17 +101,17 @@ def diagnose(
             verdict = replace(verdict, summary=verdict.summary + text)
     verdict = replace(verdict, summary=verdict.summary + _retuned(problem, fit))
     places = where(problem)
-    step = None
+    suggestion = None
     if verdict.status == "ambiguous":
         progress("looking for the trial that would tell them apart")
-        step = next_experiment(problem, _members(problem, found))
+        suggestion = next_experiment(problem, _members(problem, found))
     return Diagnosis(
         problem,
         verdict,
         places,
         found,
         lines,
-        step,
+        suggestion,
         nominal,
         fit,
         proposal,

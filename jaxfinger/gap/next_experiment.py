@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxfinger.data.schema import units_where
 from jaxfinger.experiments import EXPERIMENTS, Batch, Stack
 from jaxfinger.experiments.table import SLACK
 from jaxfinger.gap.problem import Problem, imagined
@@ -209,7 +210,8 @@ def _description(problem: Problem, stack: Stack, b: int, evidence: float) -> str
     elif not spec.slack:
         parts.append(f"tension up to {f.max():.0f} N")
     if spec.samples != "holds":
-        parts.append(f"up to {np.percentile(np.abs(np.asarray(x.qd)[:, b]).max(axis=0), 99):.2g} rad/s")
+        speed = np.percentile(np.abs(np.asarray(x.qd)[:, b]).max(axis=0), 99)
+        parts.append(f"up to {speed:.2g} {units_where('rad/s', finger.prismatic)}")
     often = int(np.ceil(SETTLES / evidence))
     parts += [f"{often} times"] if often > 1 else []
     return f"{', '.join(parts)}; expected log evidence {often * evidence:.1f} ({SETTLES:g} leaves the wrong one 3 %)"

@@ -181,11 +181,13 @@ def imagined(problem: Problem, stacks: dict[str, Stack]) -> Problem:
 
 def _noise_elsewhere(problem: Problem, channel: str, columns: int) -> Noise:
     """White, of the largest size that the channel has in any experiment."""
-    sizes = {c: max(n.std.max() for (_, k), n in problem.noise.items() if k == c) for _, c in problem.noise}
-    length = float(np.linalg.norm(np.asarray(problem.session.finger.origin)[1:], axis=1).sum()) + float(
-        np.linalg.norm(problem.session.finger.fingertip)
-    )
-    std = np.full(columns, sizes.get(channel, sizes.get("joint_torque", 1e-3) / length))
+
+    def largest(c: str) -> float | None:
+        return max((float(n.std.max()) for (_, k), n in problem.noise.items() if k == c), default=None)
+
+    finger = problem.session.finger
+    length = float(np.linalg.norm([*finger.origin[1:], finger.fingertip], axis=1).sum())
+    std = np.full(columns, largest(channel) or (largest("joint_torque") or 1e-3) / length)
     return Noise(std, std, np.zeros((columns, 1)), "elsewhere")
 
 

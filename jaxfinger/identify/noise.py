@@ -76,17 +76,14 @@ def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B 
         series, source = _fast_part(residual, mask), "residuals"
     # A column with few samples of its own borrows the channel's size, and one with not many its colour, which the
     # filters give to all columns alike.
-    sizes = [_autoregression(c)[0] if _count(c) > FEW else None for c in series]
-    size, *_ = _autoregression([s for column in series for s in column])
-    colour = _autoregression(
-        [(e / (std or size), m, lost) for c, std in zip(series, sizes, strict=True) for e, m, lost in c]
-    )
-    rows = []
-    for column, std in zip(series, sizes, strict=True):
-        of_size = std or size
-        rows.append(
-            _autoregression(column) if _count(column) > MANY else (of_size, of_size * colour[1] / colour[0], colour[2])
-        )
+    own, whole = [_autoregression(c) for c in series], _autoregression([s for column in series for s in column])
+    sizes = [row[0] if _count(c) > FEW else whole[0] for c, row in zip(series, own, strict=True)]
+    scaled = [(e / size, m, lost) for c, size in zip(series, sizes, strict=True) for e, m, lost in c]
+    unit, spread, colour = _autoregression(scaled)
+    rows = [
+        row if _count(c) > MANY else (size, size * spread / unit, colour)
+        for c, row, size in zip(series, own, sizes, strict=True)
+    ]
     std, innovation, ar = (np.array(x) for x in zip(*rows, strict=True))
     if stack.experiment.held:
         scale = _between_holds(_repeats(stack, residual, mask, demean), ar, innovation)
