@@ -52,10 +52,10 @@ class JointPresliding(CatalogueEffect):
         return dahl(memory, x.q[i] - before.q[i], self.x0)
 
     def directions(self, x, memory, joint, tendon):
+        if x.held:
+            return joint, tendon  # the fixture carries it
         i = self.index[0]
-        sign = jnp.where(jnp.isnan(joint[i]), memory, joint[i])
-        built = jnp.where(joint[i] == 0, 0.0, (1 - self.a) * sign + self.a * memory)  # 0: a fixture carries it
-        return joint.at[i].set(built), tendon
+        return joint.at[i].set((1 - self.a) * joint[i] + self.a * memory), tendon
 
 
 class JointLoadFriction(CatalogueEffect):

@@ -82,8 +82,7 @@ class TendonFrictionPresliding(CatalogueEffect):
 
     def directions(self, x, memory, joint, tendon):
         k = self.index[0]
-        sign = jnp.where(jnp.isnan(tendon[k]), memory[0], tendon[k])
-        return joint, tendon.at[k].set((1 - self.a) * sign + self.a * memory[0])
+        return joint, tendon.at[k].set((1 - self.a) * tendon[k] + self.a * memory[0])
 
     def held_tension(self, x, memory, f, loss, f_j):
         k = self.index[0]

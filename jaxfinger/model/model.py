@@ -54,7 +54,9 @@ class Effect(eqx.Module):
     def directions(
         self, x: Motion, memory: Memory, joint: Float[Array, "m *T"], tendon: Float[Array, "n *T"]
     ) -> tuple[Float[Array, "m *T"], Float[Array, "n *T"]]:
-        """Share of the friction that is built up, in [−1, 1], in place of the sign of the motion."""
+        """Share of the friction that is built up, in [−1, 1], in place of the sign of the motion; affine in that sign,
+        which the forward simulation solves for.
+        """
         return joint, tendon
 
     def coupling(self, x: Motion, f: Float[Array, "n *T"], C: Float[Array, "n m *T"]) -> Float[Array, "n m *T"]:

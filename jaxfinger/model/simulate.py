@@ -7,7 +7,6 @@ for the friction impulses of a step instead, so that joints and tendons stick an
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -30,7 +29,9 @@ def forward_dynamics(
 
 
 class _State(NamedTuple):
-    x: Motion
+    q: Float[Array, " m"]
+    qd: Float[Array, " m"]
+    seen: Motion  # the middle of the last step, at which the memories stand
     memory: tuple[Memory, ...]
     friction: Float[Array, " m+n"]  # torques and tensions of friction, N m and N
 
@@ -49,14 +50,14 @@ def simulate(
     dt = (time[1] - time[0]) / substeps
     if tau_ext is None:
         tau_ext = jnp.zeros((model.finger.m, time.size))
-    unknown_m, unknown_n = jnp.full(model.finger.m, jnp.nan), jnp.full(model.finger.n, jnp.nan)
 
     def motion(t, q, qd, f):
-        return Motion(t, q, qd, jnp.zeros_like(q), f, unknown_m, unknown_n, t + session_start, jnp.zeros_like(q))
+        unresolved = jnp.zeros_like(q), jnp.zeros_like(f)  # directions: their friction is solved for
+        return Motion(t, q, qd, jnp.zeros_like(q), f, *unresolved, t + session_start, jnp.zeros_like(q))
 
     x0 = motion(time[0], q0, qd0, tension[:, 0])
     memory0 = tuple(effect.initial_memory(model, x0) for effect in model.effects)
-    state0 = _State(x0, memory0, jnp.zeros(model.finger.m + model.finger.n))
+    state0 = _State(q0, qd0, x0, memory0, jnp.zeros(model.finger.m + model.finger.n))
 
     def sample(state, inputs):
         t, f0, f1, tau0, tau1 = inputs
@@ -66,7 +67,7 @@ def simulate(
             return _step(model, state, motion, t + share * dt * substeps, f, tau, dt), None
 
         state, _ = jax.lax.scan(substep, state, (jnp.arange(substeps) + 0.5) / substeps)
-        return state, (state.x.q, state.x.qd)
+        return state, (state.q, state.qd)
 
     inputs = (time[:-1], tension.T[:-1], tension.T[1:], tau_ext.T[:-1], tau_ext.T[1:])
     _, (q, qd) = jax.lax.scan(sample, state0, inputs)
@@ -75,34 +76,36 @@ def simulate(
 
 def _step(model: Model, state: _State, motion, t, f, tau, dt) -> _State:
     """One midpoint step: forces at the middle position, friction from the velocity that it leads to."""
-    qd = state.x.qd
-    x = motion(t, state.x.q + 0.5 * dt * qd, qd, f)
+    qd = state.qd
+    x = motion(t, state.q + 0.5 * dt * qd, qd, f)
     memory = tuple(
-        effect.next_memory(model, m, state.x, x) for effect, m in zip(model.effects, state.memory, strict=True)
+        effect.next_memory(model, m, state.seen, x) for effect, m in zip(model.effects, state.memory, strict=True)
     )
-    # A direction that no effect has resolved is NaN: its friction is solved for below.
-    known = eqx.tree_at(lambda x: (x.joint_direction, x.tendon_direction), x, (jnp.zeros_like(qd), jnp.zeros_like(f)))
-    e = terms(model, known, memory)
-    open_joint, open_tendon = _unresolved(model, x, memory)
+    e = terms(model, x, memory)  # with the friction that the effects' memories have built up, and no other
+    at_once = _at_once(model, x, memory)
     M = rigid_body.mass_matrix(e.finger, x.q)
     resisting = rigid_body.inverse_dynamics(e.finger, x.q, qd, jnp.zeros_like(qd)) + e.h + e.direction * e.friction
     M_inv = jnp.linalg.inv(M)
     free = qd + dt * M_inv @ (e.C.T @ e.f_j + tau - resisting)
 
     D = jnp.concatenate([jnp.eye(qd.size), e.C])  # rates of joints and tendons: D q̇
-    limit = jnp.concatenate([jnp.where(open_joint, e.friction, 0.0), jnp.where(open_tendon, e.loss, 0.0)])
+    limit = at_once * jnp.concatenate([e.friction, e.loss])
     A = dt * D @ M_inv @ D.T
     friction = _gauss_seidel(A, D @ free, limit, state.friction)
     qd = free - dt * M_inv @ (D.T @ friction)
-    x = eqx.tree_at(lambda x: (x.q, x.qd), x, (x.q + 0.5 * dt * qd, qd))
-    return _State(x, memory, friction)
+    return _State(x.q + 0.5 * dt * qd, qd, x, memory, friction)
 
 
-def _unresolved(model: Model, x: Motion, memory):
-    joint, tendon = x.joint_direction, x.tendon_direction
-    for effect, m in zip(model.effects, memory, strict=True):
-        joint, tendon = effect.directions(x, m, joint, tendon)
-    return jnp.isnan(joint), jnp.isnan(tendon)
+def _at_once(model: Model, x: Motion, memory) -> Float[Array, " m+n"]:
+    """Share of each joint's and tendon's friction that follows the sign of the velocity without delay."""
+
+    def built(sign):
+        joint, tendon = jnp.full_like(x.joint_direction, sign), jnp.full_like(x.tendon_direction, sign)
+        for effect, m in zip(model.effects, memory, strict=True):
+            joint, tendon = effect.directions(x, m, joint, tendon)
+        return jnp.concatenate([joint, tendon])
+
+    return built(1.0) - built(0.0)
 
 
 def _gauss_seidel(A, rates, limit, start):
