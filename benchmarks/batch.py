@@ -1,17 +1,23 @@
 """Batch fits against one after another, and bootstrap refits against SciPy: ratios from one run.
 
-    python benchmarks/batch.py [--resamples 1000] [--sessions 100]
+    python benchmarks/batch.py [--resamples 1000] [--sessions 100] [--processes 2]
 
-Every count of resamples and sessions is compiled once, and its compile time stated apart.
+Every count of resamples and sessions is compiled once, and its compile time stated apart. The batch runs in one process
+and, as `identify.distributed` spreads it, in one process a core; `identify` one after another has all cores too.
 """
 
 import argparse
+import os
+import socket
 import time
+from collections.abc import Sequence
+from multiprocessing import get_context
 
 import numpy as np
 import scipy.optimize
 
 from jaxfinger.identify import compress, fit_many, identify, refit
+from jaxfinger.identify.distributed import fit_many_distributed, initialise, share
 from jaxfinger.identify.parameters import ravel
 from jaxfinger.identify.uncertainty import draw_weights
 from jaxfinger.synthetic import SHORT, clean_session, measure, recipe_from
@@ -71,8 +77,23 @@ def bootstrap_table(session, fit, resamples: int) -> None:
     print(f"cost of {resamples} over 10: {cost[resamples] / cost[10]:.1f} for {resamples / 10:.0f} times the members")
 
 
-def session_table(clean, session, fit, count: int) -> None:
-    """Sessions in one batch against `identify` one after another, reading and filtering included in both."""
+class Simulated(Sequence):
+    """Sessions of one protocol, made when they are asked for and kept."""
+
+    def __init__(self, clean, count: int) -> None:
+        self.clean, self.count, self.made = clean, count, {}
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, k):
+        if k not in self.made:
+            self.made[k] = measure(self.clean, k)
+        return self.made[k]
+
+
+def session_table(clean, session, fit, count: int, processes: int) -> None:
+    """Sessions in one batch against `identify` one after another, filtering included in both."""
     sessions = [measure(clean, seed) for seed in range(count)]
     members, first, batch = timed(lambda: fit_many(sessions, fit, session))
     few = min(count, 10)
@@ -83,9 +104,47 @@ def session_table(clean, session, fit, count: int) -> None:
         np.abs((members.values[k] - np.asarray(ravel(a.model)))[fit.estimated] / a.std[fit.estimated]).max()
         for k, a in enumerate(alone)
     )
+    print(f"one after another: {each * count:.2f} s ({few} run)")
     print(f"{count} sessions in one batch: {batch:.2f} s, compile {first - batch:.2f} s, failed {members.failed.sum()}")
-    print(f"one after another: {each * count:.2f} s ({few} run); ratio {each * count / batch:.1f}")
-    print(f"largest difference {difference:.2f} standard deviations (the batch takes the template's noise)")
+    print(
+        f"  ratio {each * count / batch:.1f}; largest difference {difference:.2f} standard deviations (the batch takes"
+    )
+    print("  the template's noise)")
+    del sessions
+    first, spread = spread_over(processes, count)
+    print(f"  spread over {processes} processes: {spread:.2f} s, compile {first - spread:.2f} s; ", end="")
+    print(f"ratio {each * count / spread:.1f}")
+
+
+def spread_over(processes: int, count: int) -> tuple[float, float]:
+    """Seconds of a first and a second batch in as many processes, until the last has gathered all members."""
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{s.getsockname()[1]}"
+    context = get_context("spawn")
+    results = context.SimpleQueue()
+    running = [
+        context.Process(target=one_process, args=(address, processes, k, count, results)) for k in range(processes)
+    ]
+    for p in running:
+        p.start()
+    times = [results.get() for _ in running]
+    for p in running:
+        p.join()
+    return max(t[0] for t in times), max(t[1] for t in times)
+
+
+def one_process(address: str, processes: int, process: int, count: int, results) -> None:
+    """What a launch command starts on every machine of a cluster."""
+    initialise(address, processes, process)
+    clean = clean_session(recipe_from(RECIPE))
+    session = measure(clean, 0)
+    fit, sessions = identify(session), Simulated(clean, count)
+    mine = share(count)
+    for k in range(mine.start, mine.stop):
+        sessions[k]
+    _, first, again = timed(lambda: fit_many_distributed(sessions, fit, session))
+    results.put((first, again))
 
 
 def main() -> None:
@@ -93,12 +152,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--resamples", type=int, default=1000)
     parser.add_argument("--sessions", type=int, default=100)
+    parser.add_argument("--processes", type=int, default=os.cpu_count())
     options = parser.parse_args()
     clean = clean_session(recipe_from(RECIPE))
     session = measure(clean, 0)
     fit = identify(session)
     bootstrap_table(session, fit, options.resamples)
-    session_table(clean, session, fit, options.sessions)
+    session_table(clean, session, fit, options.sessions, options.processes)
 
 
 if __name__ == "__main__":

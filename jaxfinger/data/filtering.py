@@ -67,7 +67,7 @@ def _smoothed(time: np.ndarray, x: np.ndarray, cutoff_hz: float, highest: int) -
 
             spline = make_interp_spline(grid, filtered, k=min(5, _odd(len(grid) - 1)))
             for order in range(highest + 1):
-                out[order][:, usable] = spline.derivative(order)(time) if order <= spline.k else 0.0
+                out[order][:, usable] = spline(time, nu=order) if order <= spline.k else 0.0
         out[:, ~np.isfinite(columns)] = np.nan
     return out.reshape(highest + 1, *x.shape)
 

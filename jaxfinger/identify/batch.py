@@ -19,16 +19,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import Batch, prepare
+from jaxfinger.experiments import EXPERIMENTS, Batch, prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.linearise import Filters, white_rows
-from jaxfinger.identify.parameters import Free, ravel, with_flat
+from jaxfinger.identify.parameters import Free, describe, ravel, with_flat
 from jaxfinger.identify.resample import Batching, Compressed, batching_here, compress, plan_of, staged_step
 from jaxfinger.identify.solve import SMALL
 from jaxfinger.identify.stages import nominal_model
 from jaxfinger.model import Model
 
 STEPS = 12
+TANGENTS = 8  # columns of a Jacobian at a time: more do not fit into the processor's cache
 AT_ONCE = 10  # sessions in one call: while the device fits them, the next are read and filtered
 
 
@@ -56,6 +57,8 @@ class _Source(NamedTuple):
     columns: Int[Array, " c"]  # coordinates that move any of them
     free: Free
     reads: Float[Array, " S"]
+    counts: Int[Array, " r"]  # rows of the trials' measured columns
+    affine: bool  # in the parameters, so that one linearisation is exact
 
 
 def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: Batching | None = None) -> Members:
@@ -64,6 +67,9 @@ def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: 
     Raises:
         UserError: a session has another protocol than the template's, or other joints or tendons.
     """
+    if not sessions:
+        empty = np.zeros((0, ravel(template.model).size))
+        return Members(empty, empty, np.zeros(0, bool), np.zeros(0, int), template)
     compressed = compress(of, template)
     prior = (compressed.grams.H[-1], compressed.grams.reads[:, -1])
     basis, how = jnp.asarray(compressed.basis), batching_here(batching)
@@ -116,9 +122,26 @@ def _stack_sessions(sessions: Sequence[Session], template: Fit, compressed: Comp
                 jnp.asarray(columns),
                 Free.at(template.model, positions),
                 jnp.array([float(e in r) for r, _ in plan]),
+                jnp.asarray(_measured_rows([whole.mask[c] for c in filters])),
+                _is_affine(e, reads[e], template, positions),
             )
         )
     return tuple(out)
+
+
+def _measured_rows(masks: list[Float[Array, "S columns B T"]]) -> Int[np.ndarray, " r"]:
+    """Positions, in the order of `white_rows`, of the columns that a trial of any session has measured."""
+    some = np.concatenate([np.asarray(m).any(axis=(0, 3)) for m in masks])  # (columns of all channels, B)
+    return np.flatnonzero(np.repeat(some.T[..., None], masks[0].shape[-1], axis=-1))
+
+
+def _is_affine(experiment: str, channels: tuple[str, ...], template: Fit, positions: np.ndarray) -> bool:
+    """Excursions and the torques of slack tendons are, where no link (m times c) and no effect moves."""
+    parameters = describe(template.model)
+    products = {"mass", "com"} & {parameters[i].group for i in np.intersect1d(positions, template.estimated)}
+    return not (products or template.model.effects) and (
+        EXPERIMENTS[experiment].slack or channels == ("tendon_excursion",)
+    )
 
 
 def _padded(batch: Batch, T: int) -> Batch:
@@ -147,15 +170,21 @@ def _fit(model: Model, start: Float[Array, " P"], sources: list[_Source], basis,
     """Gauss–Newton on all stages at once, θ = θ_start + basis z, until nothing moves by more than SMALL."""
     (prior_gram, prior_reads), q = prior, basis.shape[1]
 
-    def stages(z):
-        """H of every stage at z; the prior's residual has moved with z."""
-        shift = jnp.eye(q + 1).at[:-1, -1].set(z)
-        H = prior_reads[:, None, None] * (shift.T @ prior_gram @ shift)
+    def grams(z, of: list[_Source]):
+        """H of every stage at z, from some of the experiments."""
+        H = jnp.zeros((prior_reads.size, q + 1, q + 1))
         at = with_flat(model, start + basis @ z)
-        for s in sources:
+        for s in of:
             own = jnp.append(s.columns, q)
             H = H.at[:, own[:, None], own].add(s.reads[:, None, None] * _gram(at, s))
         return H
+
+    affine = prior_reads[:, None, None] * prior_gram + grams(jnp.zeros(q), [s for s in sources if s.affine])
+
+    def stages(z):
+        """H of every stage at z; residuals that are affine in z have moved with it."""
+        shift = jnp.eye(q + 1).at[:-1, -1].set(z)
+        return shift.T @ affine @ shift + grams(z, [s for s in sources if not s.affine])
 
     def step(state):
         z, _, _, k, _ = state
@@ -177,8 +206,10 @@ def _gram(model: Model, source: _Source) -> Float[Array, "c+1 c+1"]:
     theta = source.free.get(model)
 
     def rows(dz):
-        return white_rows(source.free.set(model, theta + source.basis @ dz), source.batch, source.filters)[1].ravel()
+        return white_rows(source.free.set(model, theta + source.basis @ dz), source.batch, source.filters)[1].ravel()[
+            source.counts
+        ]
 
     r, push = jax.linearize(rows, jnp.zeros(source.basis.shape[1]))
-    A = jnp.concatenate([jax.lax.map(push, jnp.eye(source.basis.shape[1])), r[None]])
+    A = jnp.concatenate([jax.lax.map(push, jnp.eye(source.basis.shape[1]), batch_size=TANGENTS), r[None]])
     return A @ A.T

@@ -4,14 +4,20 @@ A cluster job is a launch command: start one process a machine with the same arg
 
     initialise("host:port", processes=4, process=k)
     theta, failed = refit_distributed(compressed, weights)
+    members = fit_many_distributed(sessions, fit, session)
 
 or leave the arguments of `initialise` out where the scheduler is one that JAX knows (Slurm, Open MPI, a TPU pod).
 """
+
+from collections.abc import Sequence
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxfinger.data import Session
+from jaxfinger.identify.batch import Members, fit_many
+from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.resample import Batching, Compressed, refit
 
 
@@ -23,7 +29,7 @@ def initialise(address: str | None = None, processes: int | None = None, process
 def share(count: int) -> slice:
     """The members of this process: equal shares in order, the last one may be shorter."""
     size = -(-count // jax.process_count())
-    return slice(jax.process_index() * size, min(count, (jax.process_index() + 1) * size))
+    return slice(min(count, jax.process_index() * size), min(count, (jax.process_index() + 1) * size))
 
 
 def refit_distributed(
@@ -36,6 +42,20 @@ def refit_distributed(
     mine = share(len(weights))
     theta, failed = refit(compressed, weights[mine], None if given is None else given[mine], batching)
     return gather(theta, len(weights)), gather(failed, len(weights)).astype(bool)
+
+
+def fit_many_distributed(
+    sessions: Sequence[Session], template: Fit, of: Session, batching: Batching | None = None
+) -> Members:
+    """`fit_many`, every process its share; all of them return all members. No process reads another's sessions, so
+    `sessions` may be a sequence that reads its files when asked for them.
+    """
+    mine = share(len(sessions))
+    found = fit_many([sessions[k] for k in range(mine.start, mine.stop)], template, of, batching)
+    values, std, failed, steps = (
+        gather(a, len(sessions)) for a in (found.values, found.std, found.failed, found.steps)
+    )
+    return Members(values, std, failed.astype(bool), steps.astype(int), template)
 
 
 def gather(mine: np.ndarray, count: int) -> np.ndarray:

@@ -21,13 +21,17 @@ def sessions(clean):
     return [measure(clean, seed) for seed in range(3)]
 
 
-@pytest.fixture(scope="module")
-def members(sessions, session, staged):
+def without_excursion(session):
     lost = {
         t.name: replace(t, tendon_excursion=np.full_like(t.tendon_excursion, np.nan))
-        for t in sessions[2].select("ID.2", joint="MCP")
+        for t in session.select("ID.2", joint="MCP")
     }
-    return fit_many([*sessions[:2], replace(sessions[2], trials={**sessions[2].trials, **lost})], staged, session)
+    return replace(session, trials={**session.trials, **lost})
+
+
+@pytest.fixture(scope="module")
+def members(sessions, session, staged):
+    return fit_many([*sessions[:2], without_excursion(sessions[2])], staged, session)
 
 
 def test_members_that_fail_are_named_and_spoil_nothing(members):
@@ -81,21 +85,25 @@ def test_a_session_of_another_protocol_is_refused(session, staged):
 PROCESS = """
 import pickle, sys
 import numpy as np
-from jaxfinger.identify.distributed import initialise, refit_distributed
+from jaxfinger.identify.distributed import fit_many_distributed, initialise, refit_distributed
 address, process, source, target = sys.argv[1:]
 initialise(address, 2, int(process))
-compressed, weights = pickle.load(open(source, "rb"))
+compressed, weights, sessions, fit, session = pickle.load(open(source, "rb"))
 theta, failed = refit_distributed(compressed, weights)
-np.savez(target + process, theta=theta, failed=failed)
+found = fit_many_distributed(sessions, fit, session)
+np.savez(target + process, theta=theta, failed=failed, values=found.values, std=found.std, spoilt=found.failed)
 """
 
 
-def test_two_processes_share_the_refits(session, staged, tmp_path):
+def test_two_processes_share_refits_and_sessions(sessions, session, staged, members, tmp_path):
+    """Three sessions: two for the first process, one for the second."""
     compressed = compress(session, staged)
     weights = draw_weights(compressed.strata, 5, np.random.default_rng(0))
     weights[3] = np.nan
     source, target = tmp_path / "work", str(tmp_path / "result")
-    source.write_bytes(pickle.dumps((compressed, weights)))
+    source.write_bytes(
+        pickle.dumps((compressed, weights, [*sessions[:2], without_excursion(sessions[2])], staged, session))
+    )
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{s.getsockname()[1]}"
@@ -111,3 +119,10 @@ def test_two_processes_share_the_refits(session, staged, tmp_path):
         result = np.load(f"{target}{k}.npz")
         np.testing.assert_array_equal(result["failed"], failed)
         np.testing.assert_allclose(result["theta"], theta, rtol=1e-9)
+        np.testing.assert_array_equal(result["spoilt"], members.failed)
+        np.testing.assert_allclose(result["values"], members.values, rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(result["std"], members.std, rtol=1e-6, atol=1e-12)
+
+
+def test_no_session_gives_no_member(session, staged):
+    assert fit_many([], staged, session).values.shape == (0, ravel(staged.model).size)
