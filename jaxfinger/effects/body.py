@@ -44,12 +44,12 @@ class Payload(CatalogueEffect):
         about_joint = finger.inertia[i] + _steiner(finger.mass[i], finger.com[i]) + self.inertia * jnp.outer(axis, axis)
         com = moment / mass
         return eqx.tree_at(
-            lambda f: (f.mass, f.com, f.inertia),
+            lambda f: (f.mass, f.com, f.gyration),
             finger,
             (
                 finger.mass.at[i].set(mass),
                 finger.com.at[i].set(com),
-                finger.inertia.at[i].set(about_joint - _steiner(mass, com)),
+                finger.gyration.at[i].set((about_joint - _steiner(mass, com)) / mass),
             ),
         )
 

@@ -26,7 +26,7 @@ FINGER: dict[str, tuple] = {
     "origin": ("m", 3),
     "mass": ("m",),
     "com": ("m", 3),
-    "inertia": ("m", 3, 3),
+    "gyration": ("m", 3, 3),
     "fingertip": (3,),
 }
 FINGER_STATIC = ("limits", "prismatic", "joint_names", "tendon_names", "active", "crosses")

@@ -118,21 +118,21 @@ def base_parameters(
     torque = jax.jit(rigid_body.inverse_dynamics)
     rows = slice(None) if instrumented is None else instrumented
 
-    def column(i: int, mass: float, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-        """Torques of the chain with nothing but these on link i."""
-        values = [np.zeros_like(v) for v in (finger.mass, finger.com, finger.inertia)]
-        for array, value in zip(values, (mass, com, inertia), strict=True):
+    def column(i: int, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
+        """Torques of the chain with 1 kg on link i and nothing else."""
+        values = [np.zeros_like(v) for v in (finger.mass, finger.com, finger.gyration)]
+        for array, value in zip(values, (1.0, com, inertia), strict=True):
             array[i] = value
-        lone = eqx.tree_at(lambda f: (f.mass, f.com, f.inertia), finger, tuple(jnp.asarray(v) for v in values))
+        lone = eqx.tree_at(lambda f: (f.mass, f.com, f.gyration), finger, tuple(jnp.asarray(v) for v in values))
         return np.asarray(torque(lone, q, qd, qdd))[rows].ravel()
 
     names, columns, axes, none = [], [], np.eye(3), np.zeros((3, 3))
     for i, joint in enumerate(finger.joint_names):
-        mass = column(i, 1.0, np.zeros(3), none)
+        mass = column(i, np.zeros(3), none)
         # A mass at a unit distance, its inertia about the joint taken away, less one at the joint: m c alone.
-        first = [column(i, 1.0, e, np.outer(e, e) - np.eye(3)) - mass for e in axes]
+        first = [column(i, e, np.outer(e, e) - np.eye(3)) - mass for e in axes]
         pairs = [(a, b) for a in range(3) for b in range(a, 3)]
-        second = [column(i, 0.0, np.zeros(3), _symmetric(a, b)) for a, b in pairs]
+        second = [column(i, np.zeros(3), _symmetric(a, b)) - mass for a, b in pairs]
         columns += [mass, *first, *second]
         labels = ["m", *(f"m c{a}" for a in "xyz"), *(f"I{'xyz'[a]}{'xyz'[b]}" for a, b in pairs)]
         names += [f"{label} {joint}" for label in labels]

@@ -4,7 +4,7 @@
 
 (μ, Σ) is a fit of other recordings, with all that it knew. A fit of these very recordings is no more than the start:
 then the prior is what CAD and scale say, and nothing is counted twice. Masses and centres of mass are free wherever
-CAD states how well it knows them; masses stay positive, and the links' inertias are CAD's.
+CAD states how well it knows them; masses stay positive, and a link's inertia follows its mass: CAD knows its shape.
 """
 
 from dataclasses import replace

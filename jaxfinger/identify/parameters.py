@@ -106,7 +106,7 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
         case ["finger", "com"]:
             return Parameter(f"centre of mass {joints[index[0]]} {'xyz'[index[1]]}", "com", "m", joints[index[0]])
         case ["finger", field]:
-            return Parameter(f"{field} {index}", field, {"inertia": "kg m2", "gravity": "m s-2"}.get(field, "m"))
+            return Parameter(f"{field} {index}", field, {"gyration": "m2", "gravity": "m s-2"}.get(field, "m"))
         case ["moment_arm", _]:
             return _moment_arm(model, *index)
         case ["joint_torque", "damping"]:

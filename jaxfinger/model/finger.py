@@ -63,7 +63,7 @@ class Finger(eqx.Module):
     origin: Float[Array, "m 3"]  # m, in the parent link's frame
     mass: Float[Array, " m"]  # kg
     com: Float[Array, "m 3"]  # m, in the link frame
-    inertia: Float[Array, "m 3 3"]  # kg m², about the centre of mass
+    gyration: Float[Array, "m 3 3"]  # m², inertia about the centre of mass over the mass
     fingertip: Float[Array, "3"]  # m, in the last link's frame
     limits: tuple[tuple[float, float], ...] = eqx.field(static=True)  # rad
     prismatic: tuple[bool, ...] = eqx.field(static=True)
@@ -79,8 +79,10 @@ class Finger(eqx.Module):
             k: jnp.asarray(getattr(d, k), dtype=float)
             for k in ("gravity", "axis", "origin", "mass", "com", "inertia", "fingertip")
         }
+        gyration = arrays.pop("inertia") / arrays["mass"][:, None, None]
         return cls(
             **arrays,
+            gyration=gyration,
             limits=tuple((float(a), float(b)) for a, b in d.limits),
             prismatic=tuple(bool(p) for p in d.prismatic),
             joint_names=tuple(d.joint_names),
@@ -88,6 +90,13 @@ class Finger(eqx.Module):
             active=tuple(bool(a) for a in d.active),
             crosses=tuple(tuple(bool(c) for c in row) for row in d.crosses),
         )
+
+    @property
+    def inertia(self) -> Float[Array, "m 3 3"]:
+        """kg m², about the centre of mass: a link that weighs more than CAD says is denser, and its inertia grows with
+        its mass, so that it stays the inertia of a body.
+        """
+        return self.mass[:, None, None] * self.gyration
 
     @property
     def m(self) -> int:

@@ -173,12 +173,12 @@ def test_payload_is_a_body_screwed_to_a_link():
         return mass * (at @ at * np.eye(3) - np.outer(at, at))
 
     composite = eqx.tree_at(
-        lambda f: (f.mass, f.com, f.inertia),
+        lambda f: (f.mass, f.com, f.gyration),
         FINGER,
         (
             FINGER.mass.at[i].set(M + m),
             FINGER.com.at[i].set(com),
-            FINGER.inertia.at[i].add(point(M, c - com) + point(m, p - com)),
+            FINGER.gyration.at[i].set((FINGER.inertia[i] + point(M, c - com) + point(m, p - com)) / (M + m)),
         ),
     )
     found = inverse_dynamics(effect.finger(FINGER), X.q, X.qd, X.qdd)

@@ -1,5 +1,8 @@
 """M, N, G, the fingertip and its Jacobian against Pinocchio, on random chains of revolute and prismatic joints."""
 
+from dataclasses import replace
+
+import equinox as eqx
 import jax
 import numpy as np
 import pinocchio as pin
@@ -45,6 +48,19 @@ def test_agrees_with_pinocchio(m):
         b = np.moveaxis(np.array(b), 0, -1)
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-10 * max(1.0, np.abs(b).max()), err_msg=name)
     assert np.linalg.eigvalsh(np.moveaxis(got[3], -1, 0)).min() > 0
+
+
+def test_a_heavier_link_is_denser():
+    """A fit moves the mass; the inertia about the centre of mass goes with it, and stays that of a body."""
+    d = description(3, 3)
+    factor = np.array([0.5, 1.0, 3.0])
+    finger = Finger.from_description(d)
+    moved = eqx.tree_at(lambda f: f.mass, finger, finger.mass * factor)
+    dense = replace(d, mass=d.mass * factor, inertia=d.inertia * factor[:, None, None])
+    q, qd, qdd = np.random.default_rng(0).standard_normal((3, 3, SAMPLES))
+    chain, _ = in_pinocchio(dense)
+    expected = [pin.rnea(chain, chain.createData(), *s) for s in zip(q.T, qd.T, qdd.T, strict=True)]
+    np.testing.assert_allclose(rigid_body.inverse_dynamics(moved, q, qd, qdd).T, expected, atol=1e-10)
 
 
 def test_the_batch_is_any_number_of_last_axes():
