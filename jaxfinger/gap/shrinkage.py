@@ -118,20 +118,24 @@ def shrinkage(
 
 def _forward(problem: Problem, fold: np.ndarray, models: list[tuple[Model, Model]]):
     """Mean squares of q, simulated forward by the models that have not seen (the start of) a trial; the noise is the
-    spread between repeats of its motion."""
+    spread between repeats of its motion.
+    """
     session, trials = problem.session, problem.stacks["VD.3"].trials
     stack = prepare(session, list(trials), reduced=False)["VD.3"]
+    pairs = [models[k] for k in fold[:, 0]]
+    old = simulate_trials([before for before, _ in pairs], session, stack)
+    new = dict(old)
+    changed = [after is not before for before, after in pairs]
+    if any(changed):
+        # All in one call: another trial's model stands in where the fold's choice has changed nothing.
+        some = pairs[changed.index(True)][1]
+        paths = simulate_trials([a if c else some for (_, a), c in zip(pairs, changed, strict=True)], session, stack)
+        new |= {name: paths[name] for name, c in zip(trials, changed, strict=True) if c}
     out = []
-    for k, pair in enumerate(models):
-        held_out = [name for b, name in enumerate(trials) if fold[b, 0] == k]
-        if not held_out:
-            continue
-        paths = [simulate_trials(model, session, stack) for model in pair]
-        for name in held_out:
-            q = session[name].q
-            missed = [np.fmin(np.abs(q - np.nan_to_num(p[name]["q"], nan=np.inf)), np.pi) for p in paths]
-            errors = [float(np.nanmean(x**2)) for x in missed]
-            out.append((*errors, _spread(problem, name), float(len(q))))
+    for name in trials:
+        q = session[name].q
+        missed = [np.fmin(np.abs(q - np.nan_to_num(p[name]["q"], nan=np.inf)), np.pi) for p in (old, new)]
+        out.append((*(float(np.nanmean(x**2)) for x in missed), _spread(problem, name), float(len(q))))
     return out
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -39,7 +39,7 @@ def predict_session(
     out: Predictions = {}
     for experiment, stack in prepare(session, names, reduced=False).items():
         progress(f"predicting {len(stack.trials)} trials of {experiment}")
-        free = simulate_trials(model, session, stack) if experiment == "VD.3" else {}
+        free = simulate_trials([model] * len(stack.trials), session, stack) if experiment == "VD.3" else {}
         for b, name in enumerate(stack.trials):
             N = len(session[name].time)
             x = jax.tree.map(lambda a, b=b: a[..., b : b + 1, :], stack.batch.x)
@@ -90,9 +90,13 @@ def _only_measurable(channels: dict[str, np.ndarray], trial: Trial, session: Ses
     return channels
 
 
-def simulate_trials(model: Model, session: Session, stack: Stack) -> dict[str, dict[str, np.ndarray]]:
-    """q of each VD.3 trial of a full-rate stack, simulated from its first sample under the measured tension."""
-    x = model.true_motion(stack.batch.x)
+def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> dict[str, dict[str, np.ndarray]]:
+    """q of each VD.3 trial of a full-rate stack, simulated from its first sample under the measured tension.
+
+    `models`: one a trial, alike but for their numbers.
+    """
+    model = jax.tree.map(lambda *a: jnp.stack(a), *models)
+    x = jax.vmap(lambda model, x: model.true_motion(x), in_axes=(0, -2), out_axes=-2)(model, stack.batch.x)
     steps = np.array([np.median(np.diff(session[name].time)) for name in stack.trials])
     # Moreau's rule wants even steps: each trial gets its own uniform clock, all the same number of samples.
     longest = max(session[name].duration / step for name, step in zip(stack.trials, steps, strict=True))
@@ -116,7 +120,7 @@ def simulate_trials(model: Model, session: Session, stack: Stack) -> dict[str, d
         path = jnp.asarray(np.stack([np.interp(time, grid[b], row) for row in q[b]]))
         N = len(time)
         moved = jax.tree.map(lambda a, b=b, N=N: a[..., b, :N], x)
-        out[name] = {"q": np.array(model.reading("q", moved, path)).T}
+        out[name] = {"q": np.array(models[b].reading("q", moved, path)).T}
     return out
 
 
@@ -128,7 +132,7 @@ def _times(stack: Stack) -> list[np.ndarray]:
 
 @eqx.filter_jit
 def _simulate(
-    model: Model,
+    model: Model,  # every leaf with the trials first
     time: Float[Array, "B T"],
     tension: Float[Array, "B n T"],
     q0: Float[Array, "B m"],
@@ -136,7 +140,7 @@ def _simulate(
     start: Float[Array, " B"],
     substeps: int,
 ) -> Float[Array, "B m T"]:
-    def one(t, f, q, qd, s):
+    def one(model, t, f, q, qd, s):
         return simulate(model, t, f, q, qd, session_start=s, substeps=substeps)[0]
 
-    return jax.vmap(one)(time, tension, q0, qd0, start)
+    return jax.vmap(one)(model, time, tension, q0, qd0, start)

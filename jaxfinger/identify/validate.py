@@ -320,7 +320,7 @@ def _slope_std(f: np.ndarray, errors: np.ndarray, weights: np.ndarray) -> float:
 def _simulation_scores(model: Model, session: Session, names: list[str]) -> list[Score]:
     """q simulated from the first sample under the measured tension, against q, at every sample."""
     stack = prepare(session, names, reduced=False)["VD.3"]
-    paths = simulate_trials(model, session, stack)
+    paths = simulate_trials([model] * len(stack.trials), session, stack)
     scores = []
     for k, column in enumerate(session.finger.joint_names):
         series = [session[name].q[:, k] - paths[name]["q"][:, k] for name in stack.trials]
