@@ -28,6 +28,7 @@ from jaxfinger.experiments.table import (
     CLEAR,
     EVERY_SAMPLE,
     EXPERIMENTS,
+    LOST,
     MIN_DRIVEN_SPEED,
     MIN_JOINT_SPEED,
     MIN_TENDON_SPEED,
@@ -97,15 +98,15 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     holds = find_holds(trial) if spec.samples == "holds" else np.full(N, -1)
 
     cutoff = min(spec.cutoff * (1.0 if reduced else EVERY_SAMPLE), 0.2 / step)
-    q, qd, qdd = smooth(trial.time, trial.q, cutoff)
+    filtered, qd, qdd = smooth(trial.time, trial.q, cutoff)
     # When a joint turns back shows best in the slower filter: there noise of q̇ is noise in time.
     turning = qd if reduced or spec.held else smooth(trial.time, trial.q, spec.cutoff)[1]
-    if reduced and spec.samples != "sliding":
-        q = trial.q  # averaged over the same blocks as what it predicts, and not filtered where that is not
+    # Otherwise averaged over the same blocks as what it predicts, and not filtered where that is not.
+    q = filtered if spec.samples == "sliding" or (spec.samples == "all" and not reduced) else trial.q
     if spec.samples == "holds":
-        # Only holds count in a fit, and there nothing moves; at the full rate joints also move between them.
+        # What counts in a fit are holds and fixtures, where nothing moves; at the full rate joints move between holds.
         moves = (holds < 0)[:, None] & (not reduced and not spec.held)
-        q, qd, qdd = trial.q, qd * moves, qdd * moves
+        qd, qdd = qd * moves, qdd * moves
     joint_direction = np.zeros((N, m)) if spec.held else _direction(trial.joint_direction, turning, STILL)
     tension = np.zeros((N, n)) if trial.tendon_force is None else np.nan_to_num(trial.tendon_force)
     if spec.held and not reduced:
@@ -120,7 +121,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         motorised[:, session.finger.joint_names.index(trial.joint)] = 1.0
 
     y, mask = _measured(spec, trial, session, minus)
-    slides = _sliding(trial, session, qd, rate, motorised) if spec.samples == "sliding" else None
+    slides = _sliding(trial, session, filtered, qd, rate, motorised) if spec.samples == "sliding" else None
     if reduced and spec.samples == "sliding":
         # q̈ is low-passed, so all else is too. What noise it keeps would still tell a fit of less inertia
         # (errors in variables): where q̈ does not rise above it, its mean over a tenth of a second takes its place.
@@ -167,7 +168,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         if spec.samples == "sliding" and c == "joint_torque":
             mask_mean[c] *= mean(slides).T > 1.0 - 1e-9
         if spec.samples == "holds":
-            mask_mean[c] *= hold >= 0
+            mask_mean[c] *= (hold >= 0) | spec.held  # joints that are held have no inertia, at ramps of the tension too
         y_mean[c] *= mask_mean[c]
     return _Row(motion, y_mean, mask_mean, block * step)
 
@@ -224,10 +225,10 @@ def _rates(trial: Trial, spec: Experiment) -> np.ndarray:
     return smooth(trial.time, without_spikes(np.nan_to_num(np.asarray(trial.tendon_excursion))), spec.cutoff / 2)[1]
 
 
-def _sliding(trial: Trial, session: Session, qd, rate: np.ndarray | None, motorised) -> np.ndarray:
+def _sliding(trial: Trial, session: Session, filtered, qd, rate: np.ndarray | None, motorised) -> np.ndarray:
     """(N, m): 1 where a joint and every taut tendon across it slide, so that the directions of friction are known.
 
-    `rate`: speeds of the tendons, none where all are slack.
+    `filtered`: q below the cut-off; `rate`: speeds of the tendons, none where all are slack.
     """
     fast = np.percentile(np.abs(qd), 95, axis=0)
     slow = np.where(motorised, MIN_DRIVEN_SPEED, MIN_JOINT_SPEED)
@@ -239,6 +240,11 @@ def _sliding(trial: Trial, session: Session, qd, rate: np.ndarray | None, motori
         known = ~taut | ((np.abs(rate) > MIN_TENDON_SPEED) & measured)
         for i in range(session.finger.m):
             slides[:, i] &= known[:, session.finger.crosses[:, i] & session.finger.active].all(axis=1)
+    # A slip of a few milliseconds is too fast for the filter, and moves every joint.
+    lost = np.abs(trial.q - filtered)
+    slides &= ~np.any(lost > np.maximum(LOST * np.ptp(trial.q, axis=0), 15.0 * np.median(lost, axis=0)), axis=1)[
+        :, None
+    ]
     # The filter spreads the jump of friction at a reversal, and friction before it slides is not known.
     samples = 2 * round(CLEAR / float(np.median(np.diff(trial.time)))) + 1
     return minimum_filter1d(slides.astype(float), samples, axis=0)
