@@ -132,12 +132,11 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         y = {c: low_pass(trial.time, values, cutoff) for c, values in y.items()}
     M = N // block
 
-    weight = np.full(block, 1.0 / block)
+    ones = np.ones(block)
 
     def mean(a):
-        return weight @ a[: M * block].reshape(
-            M, block, math.prod(a.shape[1:])
-        )  # ten times as fast as `mean` over an axis in the middle
+        # A product is ten times as fast as `mean` along an axis in the middle.
+        return ones @ a[: M * block].reshape(M, block, math.prod(a.shape[1:])) / block
 
     tension_mean = mean(tension)
     slack = np.percentile(tension_mean, 95, axis=0) < SLACK
