@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
 from jaxfinger.data import (
@@ -57,6 +57,7 @@ class Stack:
     batch: Batch
     trials: tuple[str, ...]
     motions: tuple[str | None, ...]  # trials with the same motion repeat one another
+    holds: Int[np.ndarray, "B T"]  # index of the static hold, −1 between holds
     dt: float  # s
 
 
@@ -86,6 +87,7 @@ class _Row:
     motion: dict[str, np.ndarray]
     y: dict[str, np.ndarray]
     mask: dict[str, np.ndarray]
+    hold: np.ndarray
     dt: float
 
 
@@ -169,7 +171,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         if spec.samples == "holds":
             mask_mean[c] *= (hold >= 0) | spec.held  # joints that are held have no inertia, at ramps of the tension too
         y_mean[c] *= mask_mean[c]
-    return _Row(motion, y_mean, mask_mean, block * step)
+    return _Row(motion, y_mean, mask_mean, hold, block * step)
 
 
 def _despiked(trial: Trial) -> Trial:
@@ -315,5 +317,6 @@ def _stack(spec: Experiment, trials: list[Trial], rows: list[_Row], reduced: boo
         Batch(x, y, mask),
         tuple(t.name for t in trials),
         tuple(t.motion for t in trials),
+        np.stack([np.pad(r.hold, (0, T - r.hold.size), constant_values=-1) for r in rows]),
         float(np.median([r.dt for r in rows])),
     )

@@ -129,7 +129,7 @@ def _borrowed(problem: Problem, name: str, like: Stack) -> Stack:
             mask[c] *= jnp.asarray((np.asarray(x.tension).max(axis=-1) > 0)[..., None])
         y[c] = jnp.zeros_like(mask[c])
     x = replace(x, motorised=jnp.asarray(motor), held=spec.held)
-    return Stack(spec, Batch(x, y, mask), like.trials, like.motions, like.dt)
+    return Stack(spec, Batch(x, y, mask), like.trials, like.motions, like.holds, like.dt)
 
 
 def _at(stack: Stack, finger: Finger, share: float | None) -> Stack:

@@ -69,7 +69,7 @@ def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B 
     demean = channel == "tendon_excursion"
     series, source = _repeats(stack, residual, mask, demean), "repeats"
     if stack.experiment.samples == "holds":
-        holds = _within_holds(residual, mask)
+        holds = _within_holds(residual, mask, stack.holds)
         source = "repeats and holds" if _enough(series) else "holds"
         series = [a + b for a, b in zip(series, holds, strict=True)]
     if not _enough(series):
@@ -86,7 +86,7 @@ def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B 
     ]
     std, innovation, ar = (np.array(x) for x in zip(*rows, strict=True))
     if stack.experiment.held:
-        scale = _between_holds(_repeats(stack, residual, mask, demean), ar, innovation)
+        scale = _between_holds(_repeats(stack, residual, mask & (stack.holds >= 0), demean), ar, innovation)
         std, innovation = std * scale, innovation * scale
     return Noise(std, innovation, ar, source)
 
@@ -123,16 +123,16 @@ def _repeats(stack: Stack, residual, mask, demean) -> list[Series]:
     return series
 
 
-def _within_holds(residual, mask) -> list[Series]:
+def _within_holds(residual, mask, holds) -> list[Series]:
     """Scatter about a straight line through each hold: what creeps or relaxes in it is no noise."""
     series: list[Series] = [[] for _ in range(len(residual))]
     for c, b in np.ndindex(residual.shape[:2]):
         e, counts, lost = np.zeros(residual.shape[2]), np.zeros(residual.shape[2], bool), []
-        for hold in np.ma.clump_unmasked(np.ma.masked_array(residual[c, b], ~mask[c, b])):
-            n = hold.stop - hold.start
+        for k in np.unique(holds[b][holds[b] >= 0]):
+            hold = np.flatnonzero((holds[b] == k) & mask[c, b])
+            n = len(hold)
             if n > 5:
-                t = np.arange(n)
-                line = np.polyval(np.polyfit(t, residual[c, b, hold], 1), t)
+                line = np.polyval(np.polyfit(hold, residual[c, b, hold], 1), hold)
                 e[hold], counts[hold] = residual[c, b, hold] - line, True
                 lost.append(2 / n)
         if counts.any():
