@@ -39,6 +39,6 @@ STILL = 0.05  # rad/s (or a tenth of the motion's speed): below this a joint kee
 MIN_JOINT_SPEED = 0.1  # rad/s (or a twentieth of the motion's): below it a joint may stick, its friction unknown
 MIN_DRIVEN_SPEED = 0.02  # rad/s: likewise a joint that a motor moves, which does not stick: above the encoder's noise
 MIN_TENDON_SPEED = 5e-4  # m/s: likewise a tendon
-LOST = 0.05  # of a joint's travel: what the filter may lose of its angle; a smooth motion loses 0.01 to 0.03
+LOST = 0.025  # of a joint's travel: what the filter may lose of its angle; a smooth motion loses 0.01 to 0.02
 CLEAR = 0.03  # s: kept clear on either side of where a joint or tendon may stick: over two widths of the filter
 EVERY_SAMPLE = 4.0  # times the cut-off where every sample is predicted: noise of q̈ biases nothing there
