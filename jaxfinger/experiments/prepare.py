@@ -60,6 +60,11 @@ class Stack:
     holds: Int[np.ndarray, "B T"]  # index of the static hold, −1 between holds
     dt: float  # s
 
+    def samples_of_holds(self, trial: int, counts: np.ndarray) -> list[np.ndarray]:
+        """Which samples of each static hold of a trial count, hold by hold; `counts`: (T,), not zero where one does."""
+        holds = np.where(counts, self.holds[trial], -1)
+        return [np.flatnonzero(holds == k) for k in np.unique(holds[holds >= 0])]
+
 
 def prepare(
     session: Session, names: list[str] | None = None, reduced: bool = True, minus: Predictions | None = None

@@ -69,7 +69,7 @@ def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B 
     demean = channel == "tendon_excursion"
     series, source = _repeats(stack, residual, mask, demean), "repeats"
     if stack.experiment.samples == "holds":
-        holds = _within_holds(residual, mask, stack.holds)
+        holds = _within_holds(stack, residual, mask)
         source = "repeats and holds" if _enough(series) else "holds"
         series = [a + b for a, b in zip(series, holds, strict=True)]
     if not _enough(series):
@@ -123,13 +123,12 @@ def _repeats(stack: Stack, residual, mask, demean) -> list[Series]:
     return series
 
 
-def _within_holds(residual, mask, holds) -> list[Series]:
+def _within_holds(stack: Stack, residual, mask) -> list[Series]:
     """Scatter about a straight line through each hold: what creeps or relaxes in it is no noise."""
     series: list[Series] = [[] for _ in range(len(residual))]
     for c, b in np.ndindex(residual.shape[:2]):
         e, counts, lost = np.zeros(residual.shape[2]), np.zeros(residual.shape[2], bool), []
-        for k in np.unique(holds[b][holds[b] >= 0]):
-            hold = np.flatnonzero((holds[b] == k) & mask[c, b])
+        for hold in stack.samples_of_holds(b, mask[c, b]):
             n = len(hold)
             if n > 5:
                 line = np.polyval(np.polyfit(hold, residual[c, b, hold], 1), hold)

@@ -275,7 +275,7 @@ def _slopes(fit: Fit, model: Model, session: Session, stack: Stack) -> list[Slop
             continue
         f = tension[session.finger.tendon_names.index(tendon), b]  # N
         for axis in range(3):
-            counts = mask[axis, b] > 0
+            counts = (mask[axis, b] > 0) & (stack.holds[b] >= 0)
             if counts.any() and np.ptp(f[counts]) > 0:
                 centred = np.where(counts, f - f[counts].mean(), 0.0)
                 lines.append((name, tendon, axis, b, f, centred / (centred @ f)))  # slope = weights · force

@@ -91,7 +91,7 @@ def _holds(model: Model, stack) -> dict[int, list[tuple[float, float, float, flo
     q, way = np.asarray(x.q), np.asarray(x.joint_direction)
     points: dict[int, list] = {}
     for i, b in np.ndindex(y.shape[:2]):
-        for run in np.ma.clump_unmasked(np.ma.masked_array(h[i, b], mask[i, b] == 0)):
+        for run in stack.samples_of_holds(b, mask[i, b]):
             row = (q[i, b, run].mean(), h[i, b, run].mean(), h[i, b, run].std(), np.sign(way[i, b, run].mean()))
             points.setdefault(i, []).append(row)
     return points
@@ -127,7 +127,7 @@ def _losses(model: Model, session: Session, stack) -> dict[str, list[tuple[float
         k, i = session.finger.tendon_names.index(trial.tendon), session.finger.joint_names.index(trial.joint)
         f = np.asarray(x.tension)[k, b]
         highest = 0.0
-        for run in np.ma.clump_unmasked(np.ma.masked_array(f, mask[i, b] == 0)):
+        for run in stack.samples_of_holds(b, mask[i, b]):
             arm = C[k, i, b, run].mean()
             if f[run].mean() > highest + 0.1 and abs(arm) > SHORT_ARM:
                 lost = (y[i, b, run] - without[i, b, run]).mean() / arm

@@ -78,7 +78,7 @@ def _vd2(model: Model, session: Session, stack: Stack):
         k = session.finger.tendon_names.index(tendon) if tendon else int(np.argmax(np.ptp(stack.batch.x.tension, 2)))
         f = np.asarray(stack.batch.x.tension)[k, b]
         for a, axis in enumerate("xyz"):
-            runs = np.ma.clump_unmasked(np.ma.masked_array(f, mask[a, b] == 0))
+            runs = stack.samples_of_holds(b, mask[a, b])
             at = [f[r].mean() for r in runs]
             ax.plot(
                 at, [measured[a, b, r].mean() for r in runs], "o", color=_colour(a), markersize=4, label=f"f_{axis}"
