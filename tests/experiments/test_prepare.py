@@ -61,6 +61,47 @@ def test_samples_around_a_reversal_do_not_count_and_the_others_do():
     assert counts[inside & (apart > 2 * CLEAR)].all()
 
 
+def test_around_a_slip_faster_than_the_filter_no_joint_counts():
+    """The DIP jumps by 0.2 rad within 15 ms, twice, while the PIP sweeps on: what is spread moves every joint."""
+    time = np.arange(4000) / RATE
+    q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
+    q[:, 1] += 0.3 * time
+    smooth = q + ENCODER * np.random.default_rng(2).standard_normal(q.shape)
+    jumps = (1.2, 2.6)
+    slips = smooth.copy()
+    for at in jumps:
+        slips[:, 2] += 0.2 * np.clip((time - at) / 0.015, 0.0, 1.0)
+    batches = [
+        stack(Trial("free", "VD.3", time, x, tendon_force=np.zeros((time.size, FINGER.n)))).batch
+        for x in (smooth, slips)
+    ]
+    at = np.asarray(batches[0].x.time)[0]
+    before, after = (np.asarray(b.mask["joint_torque"])[1, 0] > 0 for b in batches)
+    near = np.abs(at[:, None] - jumps).min(axis=1)
+    assert before[near < 0.5].all()
+    assert not after[near < CLEAR].any()
+    assert after[(near > 0.1) & (near < 0.5)].all()
+
+
+def test_between_holds_counts_what_a_fixture_holds_and_nothing_else():
+    """Ramps of the tension are as good as holds; ramps of a joint have an inertia and a speed."""
+    time = np.arange(6000) / RATE
+    level = np.floor(time)
+    step = level + np.clip((time - level) / 0.3, 0.0, 1.0)  # up in 0.3 s, then still
+    hold = np.where(time - level > 0.33, level, -1).astype(np.int32)
+    q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
+    torque = np.where(np.arange(3) == 0, 1e-2, np.nan) * np.ones_like(q)
+    tension = np.zeros((time.size, FINGER.n))
+    tension[:, 0] = 2.0 * step
+    fixed = Trial("pull", "ID.4", time, q, tension, joint_torque=torque, joint=MCP, tendon="T1", hold=hold)
+    moved = q + 0.05 * step[:, None] * (np.arange(3) == 0)
+    stepped = Trial("steps", "ID.3-static", time, moved, joint_torque=torque, joint=MCP, hold=hold)
+    held, static = (stack(t) for t in (fixed, stepped))
+    assert np.asarray(held.batch.mask["joint_torque"])[0, 0, :120].all()
+    np.testing.assert_array_equal(np.asarray(static.batch.mask["joint_torque"])[0, 0] > 0, static.holds[0] >= 0)
+    assert [len(k) for k in held.samples_of_holds(0, np.ones(held.holds.shape[1]))] == [13] * 6
+
+
 def test_a_slow_sweep_of_the_motor_slides_and_a_finger_as_slow_may_stick():
     time = np.arange(4000) / RATE
     q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
