@@ -174,7 +174,8 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         if spec.samples == "sliding" and c == "joint_torque":
             mask_mean[c] *= mean(slides).T > 1.0 - 1e-9
         if spec.samples == "holds":
-            mask_mean[c] *= (hold >= 0) | spec.held  # joints that are held have no inertia, at ramps of the tension too
+            # Joints that are held have no inertia: ramps of the tension count as well as holds.
+            mask_mean[c] *= (hold >= 0) | (spec.held & _goes_on(tension_mean, hold))
         y_mean[c] *= mask_mean[c]
     return _Row(motion, y_mean, mask_mean, hold, block * step)
 
@@ -278,6 +279,25 @@ def _in_steps(tension: np.ndarray, hold: np.ndarray) -> np.ndarray:
     out = kept + np.sign(beyond) * np.maximum(np.abs(beyond) - 4.0 * noise, 0.0)
     for mean, (_, run) in zip(means[1:], runs, strict=False):
         out[run] = mean
+    return out
+
+
+def _goes_on(tension: np.ndarray, hold: np.ndarray) -> np.ndarray:
+    """(N,): between which holds every tendon goes on as it went before.
+
+    Where it turns back, or leaves slack, it sticks and then slips within one block, whose mean tension does not tell
+    when.
+    """
+    out = np.zeros(len(hold), bool)
+    runs = [np.flatnonzero(hold == k) for k in dict.fromkeys(hold[hold >= 0].tolist())]
+    means = [tension[run].mean(axis=0) for run in runs]
+    for k in range(2, len(runs)):
+        ways = [
+            np.sign(b - a) * (np.abs(b - a) > SLACK)
+            for a, b in zip(means[k - 2 : k], means[k - 1 : k + 1], strict=True)
+        ]
+        if np.all((ways[0] == ways[1]) | (ways[1] == 0)):
+            out[runs[k - 1][-1] + 1 : runs[k][0]] = True
     return out
 
 

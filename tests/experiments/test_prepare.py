@@ -83,23 +83,27 @@ def test_around_a_slip_faster_than_the_filter_no_joint_counts():
     assert after[(near > 0.1) & (near < 0.5)].all()
 
 
-def test_between_holds_counts_what_a_fixture_holds_and_nothing_else():
-    """Ramps of the tension are as good as holds; ramps of a joint have an inertia and a speed."""
-    time = np.arange(6000) / RATE
-    level = np.floor(time)
-    step = level + np.clip((time - level) / 0.3, 0.0, 1.0)  # up in 0.3 s, then still
-    hold = np.where(time - level > 0.33, level, -1).astype(np.int32)
+def test_between_holds_counts_a_tension_that_goes_on_and_nothing_else():
+    """Where it turns back a tendon sticks; where a joint moves there is inertia and a speed."""
+    time = np.arange(7000) / RATE
+    heights = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 3.0, 2.0, 1.0])
+    second = np.floor(time).astype(int)
+    step = np.interp(time - second, [0.0, 0.3], [0.0, 1.0])  # in 0.3 s to the next height, then still
+    level = heights[second] + step * (heights[second + 1] - heights[second])
+    hold = np.where(time - second > 0.33, second, -1).astype(np.int32)
     q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
     torque = np.where(np.arange(3) == 0, 1e-2, np.nan) * np.ones_like(q)
-    tension = np.zeros((time.size, FINGER.n))
-    tension[:, 0] = 2.0 * step
+    tension = 2.0 * level[:, None] * (np.arange(FINGER.n) == 0)
     fixed = Trial("pull", "ID.4", time, q, tension, joint_torque=torque, joint=MCP, tendon="T1", hold=hold)
-    moved = q + 0.05 * step[:, None] * (np.arange(3) == 0)
+    moved = q + 0.05 * level[:, None] * (np.arange(3) == 0)
     stepped = Trial("steps", "ID.3-static", time, moved, joint_torque=torque, joint=MCP, hold=hold)
     held, static = (stack(t) for t in (fixed, stepped))
-    assert np.asarray(held.batch.mask["joint_torque"])[0, 0, :120].all()
+    counts = np.asarray(held.batch.mask["joint_torque"])[0, 0] > 0
+    between = {k: counts[20 * k : 20 * k + 6] for k in range(7)}  # the 0.3 s before the hold number k
+    assert [bool(x.all()) for x in between.values()] == [False, False, True, True, False, True, True]
+    assert not between[4].any()
     np.testing.assert_array_equal(np.asarray(static.batch.mask["joint_torque"])[0, 0] > 0, static.holds[0] >= 0)
-    assert [len(k) for k in held.samples_of_holds(0, np.ones(held.holds.shape[1]))] == [13] * 6
+    assert [len(k) for k in held.samples_of_holds(0, counts)] == [13] * 7
 
 
 def test_a_slow_sweep_of_the_motor_slides_and_a_finger_as_slow_may_stick():
