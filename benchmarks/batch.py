@@ -10,7 +10,6 @@ import argparse
 import os
 import socket
 import time
-from collections.abc import Sequence
 from multiprocessing import get_context
 
 import numpy as np
@@ -77,21 +76,6 @@ def bootstrap_table(session, fit, resamples: int) -> None:
     print(f"cost of {resamples} over 10: {cost[resamples] / cost[10]:.1f} for {resamples / 10:.0f} times the members")
 
 
-class Simulated(Sequence):
-    """Sessions of one protocol, made when they are asked for and kept."""
-
-    def __init__(self, clean, count: int) -> None:
-        self.clean, self.count, self.made = clean, count, {}
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, k):
-        if k not in self.made:
-            self.made[k] = measure(self.clean, k)
-        return self.made[k]
-
-
 def session_table(clean, session, fit, count: int, processes: int) -> None:
     """Sessions in one batch against `identify` one after another, filtering included in both."""
     sessions = [measure(clean, seed) for seed in range(count)]
@@ -106,14 +90,12 @@ def session_table(clean, session, fit, count: int, processes: int) -> None:
     )
     print(f"one after another: {each * count:.2f} s ({few} run)")
     print(f"{count} sessions in one batch: {batch:.2f} s, compile {first - batch:.2f} s, failed {members.failed.sum()}")
-    print(
-        f"  ratio {each * count / batch:.1f}; largest difference {difference:.2f} standard deviations (the batch takes"
-    )
-    print("  the template's noise)")
-    del sessions
+    print(f"  ratio {each * count / batch:.1f}")
+    print(f"  largest difference {difference:.2f} standard deviations (the batch takes the template's noise)")
+    del sessions  # the processes make their own
     first, spread = spread_over(processes, count)
-    print(f"  spread over {processes} processes: {spread:.2f} s, compile {first - spread:.2f} s; ", end="")
-    print(f"ratio {each * count / spread:.1f}")
+    print(f"the same spread over {processes} processes: {spread:.2f} s, compile {first - spread:.2f} s")
+    print(f"  ratio {each * count / spread:.1f}")
 
 
 def spread_over(processes: int, count: int) -> tuple[float, float]:
@@ -139,10 +121,8 @@ def one_process(address: str, processes: int, process: int, count: int, results)
     initialise(address, processes, process)
     clean = clean_session(recipe_from(RECIPE))
     session = measure(clean, 0)
-    fit, sessions = identify(session), Simulated(clean, count)
-    mine = share(count)
-    for k in range(mine.start, mine.stop):
-        sessions[k]
+    fit, mine = identify(session), share(count)
+    sessions = [measure(clean, k) if mine.start <= k < mine.stop else session for k in range(count)]
     _, first, again = timed(lambda: fit_many_distributed(sessions, fit, session))
     results.put((first, again))
 

@@ -13,6 +13,7 @@ from jaxfinger.data.hdf5 import data_hash as data_hash
 from jaxfinger.data.hdf5 import read_session as read_session
 from jaxfinger.data.hdf5 import write_session as write_session
 from jaxfinger.data.importers import import_file as import_file
+from jaxfinger.data.motion import TENSION_TRAVEL as TENSION_TRAVEL
 from jaxfinger.data.motion import decimate_trial as decimate_trial
 from jaxfinger.data.motion import directions as directions
 from jaxfinger.data.motion import find_holds as find_holds

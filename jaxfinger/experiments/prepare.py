@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
 from jaxfinger.data import (
+    TENSION_TRAVEL,
     Predictions,
     Session,
     Trial,
@@ -25,6 +26,7 @@ from jaxfinger.data import (
 )
 from jaxfinger.errors import UserError
 from jaxfinger.experiments.table import (
+    ABOVE_NOISE,
     CLEAR,
     EVERY_SAMPLE,
     EXPERIMENTS,
@@ -62,8 +64,7 @@ class Stack:
 
     def samples_of_holds(self, trial: int, counts: np.ndarray) -> list[np.ndarray]:
         """Which samples of each static hold of a trial count, hold by hold; `counts`: (T,), not zero where one does."""
-        holds = np.where(counts, self.holds[trial], -1)
-        return [np.flatnonzero(holds == k) for k in np.unique(holds[holds >= 0])]
+        return _runs(np.where(counts, self.holds[trial], -1))
 
 
 def prepare(
@@ -109,7 +110,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     # When a joint turns back shows best in the slower filter: there noise of q̇ is noise in time.
     turning = qd if reduced or spec.held else smooth(trial.time, trial.q, spec.cutoff)[1]
     # Otherwise averaged over the same blocks as what it predicts, and not filtered where that is not.
-    q = filtered if spec.samples == "sliding" or (spec.samples == "all" and not reduced) else trial.q
+    q = trial.q if spec.samples == "holds" or (spec.samples == "all" and reduced) else filtered
     if spec.samples == "holds":
         # What counts in a fit are holds and fixtures, where nothing moves; at the full rate joints move between holds.
         moves = (holds < 0)[:, None] & (not reduced and not spec.held)
@@ -167,15 +168,16 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         "session_time": time + start,
         "motorised": mean(motorised).T,
     }
+    counts = (hold >= 0) if spec.samples == "holds" else np.ones(M, bool)
+    if spec.held:
+        # Joints that are held have no inertia: ramps of the tension count as well as holds.
+        counts |= _goes_on(tension_mean, hold)
     y_mean, mask_mean = {}, {}
     for c in y:
         y_mean[c] = mean(y[c]).T  # of all samples, as everything else that the model reads
-        mask_mean[c] = (mean(mask[c]) > 0.5).astype(float).T
+        mask_mean[c] = (mean(mask[c]) > 0.5).astype(float).T * counts
         if spec.samples == "sliding" and c == "joint_torque":
             mask_mean[c] *= mean(slides).T > 1.0 - 1e-9
-        if spec.samples == "holds":
-            # Joints that are held have no inertia: ramps of the tension count as well as holds.
-            mask_mean[c] *= (hold >= 0) | (spec.held & _goes_on(tension_mean, hold))
         y_mean[c] *= mask_mean[c]
     return _Row(motion, y_mean, mask_mean, hold, block * step)
 
@@ -249,9 +251,8 @@ def _sliding(trial: Trial, session: Session, filtered, qd, rate: np.ndarray | No
             slides[:, i] &= known[:, session.finger.crosses[:, i] & session.finger.active].all(axis=1)
     # A slip of a few milliseconds is too fast for the filter, and moves every joint.
     lost = np.abs(trial.q - filtered)
-    slides &= ~np.any(lost > np.maximum(LOST * np.ptp(trial.q, axis=0), 15.0 * np.median(lost, axis=0)), axis=1)[
-        :, None
-    ]
+    most = np.maximum(LOST * np.ptp(trial.q, axis=0), ABOVE_NOISE * np.median(lost, axis=0))
+    slides &= np.all(lost < most, axis=1)[:, None]
     # The filter spreads the jump of friction at a reversal, and friction before it slides is not known.
     samples = 2 * round(CLEAR / float(np.median(np.diff(trial.time)))) + 1
     return minimum_filter1d(slides.astype(float), samples, axis=0)
@@ -263,21 +264,18 @@ def _in_steps(tension: np.ndarray, hold: np.ndarray) -> np.ndarray:
     A held tendon keeps the highest tension that it has seen, so a running maximum over noise would drift upwards. What
     lies beyond the two means by more than four standard deviations is a real overshoot, and stays but for those four.
     """
-    starts, stops = (np.flatnonzero(np.diff(hold, **edge)) for edge in ({"prepend": -1}, {"append": -1}))
-    runs = [(a, np.flatnonzero(hold == hold[a])) for a in starts if hold[a] >= 0]
+    runs = _runs(hold)
     if not runs:
         return tension
-    out, rest = tension.copy(), np.zeros(tension.shape[1])
-    means = np.stack([rest, *(tension[run].mean(axis=0) for _, run in runs), rest])
-    noise = np.sqrt(np.mean([tension[run].var(axis=0) for _, run in runs], axis=0))
-    ends = [b for b in stops if hold[b] >= 0]
-    before = np.searchsorted(ends, np.arange(len(tension)))
-    after = np.searchsorted([a for a, _ in runs], np.arange(len(tension)), side="right") + 1
-    after = np.minimum(after, len(means) - 1)
+    out, rest, at = tension.copy(), np.zeros(tension.shape[1]), np.arange(len(tension))
+    means = np.stack([rest, *(tension[run].mean(axis=0) for run in runs), rest])
+    noise = np.sqrt(np.mean([tension[run].var(axis=0) for run in runs], axis=0))
+    before = np.searchsorted([run[-1] for run in runs], at)
+    after = np.minimum(np.searchsorted([run[0] for run in runs], at, side="right") + 1, len(means) - 1)
     kept = np.clip(out, np.minimum(means[before], means[after]), np.maximum(means[before], means[after]))
     beyond = out - kept
     out = kept + np.sign(beyond) * np.maximum(np.abs(beyond) - 4.0 * noise, 0.0)
-    for mean, (_, run) in zip(means[1:], runs, strict=False):
+    for mean, run in zip(means[1:], runs, strict=False):
         out[run] = mean
     return out
 
@@ -289,24 +287,26 @@ def _goes_on(tension: np.ndarray, hold: np.ndarray) -> np.ndarray:
     when.
     """
     out = np.zeros(len(hold), bool)
-    runs = [np.flatnonzero(hold == k) for k in dict.fromkeys(hold[hold >= 0].tolist())]
-    means = [tension[run].mean(axis=0) for run in runs]
-    for k in range(2, len(runs)):
-        ways = [
-            np.sign(b - a) * (np.abs(b - a) > SLACK)
-            for a, b in zip(means[k - 2 : k], means[k - 1 : k + 1], strict=True)
-        ]
-        if np.all((ways[0] == ways[1]) | (ways[1] == 0)):
-            out[runs[k - 1][-1] + 1 : runs[k][0]] = True
+    runs = _runs(hold)
+    steps = np.diff([tension[run].mean(axis=0) for run in runs], axis=0)
+    ways = np.where(np.abs(steps) > TENSION_TRAVEL, np.sign(steps), 0.0)
+    for k in range(1, len(ways)):
+        if np.all((ways[k] == ways[k - 1]) | (ways[k] == 0)):
+            out[runs[k][-1] + 1 : runs[k + 1][0]] = True
     return out
 
 
 def _at_rest(q: np.ndarray, hold: np.ndarray) -> np.ndarray:
     """(N, m): at a hold its mean: what moves there is the encoder's noise, which neither f(q) nor friction follows."""
     out = q.copy()
-    for h in np.unique(hold[hold >= 0]):
-        out[hold == h] = q[hold == h].mean(axis=0)
+    for run in _runs(hold):
+        out[run] = q[run].mean(axis=0)
     return out
+
+
+def _runs(hold: np.ndarray) -> list[np.ndarray]:
+    """The samples of each hold, hold by hold in the order of time."""
+    return [np.flatnonzero(hold == k) for k in dict.fromkeys(hold[hold >= 0].tolist())]
 
 
 def _whole(holds: np.ndarray, M: int, block: int) -> np.ndarray:

@@ -40,5 +40,6 @@ MIN_JOINT_SPEED = 0.1  # rad/s (or a twentieth of the motion's): below it a join
 MIN_DRIVEN_SPEED = 0.02  # rad/s: likewise a joint that a motor moves, which does not stick: above the encoder's noise
 MIN_TENDON_SPEED = 5e-4  # m/s: likewise a tendon
 LOST = 0.025  # of a joint's travel: what the filter may lose of its angle; a smooth motion loses 0.01 to 0.02
+ABOVE_NOISE = 15.0  # times the median loss, which is the encoder's noise: what it loses must be more to be a slip
 CLEAR = 0.03  # s: kept clear on either side of where a joint or tendon may stick: over two widths of the filter
 EVERY_SAMPLE = 4.0  # times the cut-off where every sample is predicted: noise of q̈ biases nothing there

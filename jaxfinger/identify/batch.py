@@ -103,6 +103,8 @@ def _stack_sessions(sessions: Sequence[Session], template: Fit, compressed: Comp
     plan = plan_of(sessions[0], template)
     reads = {e: c for r, _ in plan for e, c in r.items()}
     prepared = [prepare(s, [t.name for t in s if t.experiment in reads]) for s in sessions]
+    products = [i for i, p in enumerate(describe(template.model)) if p.group in {"mass", "com"}]
+    moving = set(products) & set(template.estimated.tolist())
     out = []
     for e, positions in compressed.positions.items():
         batches = []
@@ -123,7 +125,7 @@ def _stack_sessions(sessions: Sequence[Session], template: Fit, compressed: Comp
                 Free.at(template.model, positions),
                 jnp.array([float(e in r) for r, _ in plan]),
                 jnp.asarray(_measured_rows([whole.mask[c] for c in filters])),
-                _is_affine(e, reads[e], template, positions),
+                not moving & set(positions.tolist()) and _is_affine(e, reads[e], template),
             )
         )
     return tuple(out)
@@ -135,13 +137,9 @@ def _measured_rows(masks: list[Float[Array, "S columns B T"]]) -> Int[np.ndarray
     return np.flatnonzero(np.repeat(some.T[..., None], masks[0].shape[-1], axis=-1))
 
 
-def _is_affine(experiment: str, channels: tuple[str, ...], template: Fit, positions: np.ndarray) -> bool:
+def _is_affine(experiment: str, channels: tuple[str, ...], template: Fit) -> bool:
     """Excursions and the torques of slack tendons are, where no link (m times c) and no effect moves."""
-    parameters = describe(template.model)
-    products = {"mass", "com"} & {parameters[i].group for i in np.intersect1d(positions, template.estimated)}
-    return not (products or template.model.effects) and (
-        EXPERIMENTS[experiment].slack or channels == ("tendon_excursion",)
-    )
+    return not template.model.effects and (EXPERIMENTS[experiment].slack or channels == ("tendon_excursion",))
 
 
 def _padded(batch: Batch, T: int) -> Batch:

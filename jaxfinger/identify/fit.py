@@ -13,7 +13,7 @@ from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.identify.recipe import Recipe
 from jaxfinger.model import Effect, Model
 
-SCHEMA = "jaxfinger-fit/1"
+SCHEMA = "jaxfinger-fit/2"
 
 
 @dataclass(frozen=True)

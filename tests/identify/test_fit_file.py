@@ -58,7 +58,7 @@ def test_is_strict_json_that_a_person_can_read(fit, tmp_path):
     path = tmp_path / "fit.json"
     save_fit(fit, path)
     content = json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
-    assert content["schema"] == "jaxfinger-fit/1"
+    assert content["schema"] == "jaxfinger-fit/2"
     assert "excursion T1 PIP^4" in content["covariance"]["names"]
 
 
