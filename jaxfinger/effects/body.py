@@ -83,7 +83,7 @@ class DriveInertia(CatalogueEffect):
     ID: ClassVar = "drive_inertia"
     PLACE: ClassVar = "joint"
     AMPLITUDES: ClassVar = {"inertia": ("kg m2", 2e-5, False)}
-    SHOWS: ClassVar = {"ID.3-dynamic": ("joint_torque",)}
+    SHOWS: ClassVar = {e: ("joint_torque",) for e in ("ID.3-static", "ID.3-dynamic")}
 
     inertia: Float[Array, ""]
 

@@ -48,7 +48,7 @@ class JointDamping(CatalogueEffect):
     ID: ClassVar = "joint_damping"
     PLACE: ClassVar = "joint"
     AMPLITUDES: ClassVar = {"d": ("N m s/rad", 1e-3, False)}
-    SHOWS: ClassVar = {e: ("joint_torque",) for e in ("ID.3-dynamic", "VD.3")}
+    SHOWS: ClassVar = TORQUE
 
     d: Float[Array, ""]
 

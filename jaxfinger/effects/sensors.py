@@ -29,26 +29,39 @@ class TorqueSensorScale(CatalogueEffect):
 class TorqueSensorDrift(CatalogueEffect):
     """Offset that moves after the sensor was tared, before each trial: b T (1 − exp(−t/T)), and a slow wandering.
 
-    It wanders with the session's time s: A cos(2π s/P) + B sin(2π s/P), less its value at the tare.
+    It wanders with the session's time s: A cos(2π s/P) + B sin(2π s/P) and as much with the period P/ρ, less its value
+    at the tare.
     """
 
     ID: ClassVar = "torque_sensor_drift"
     PLACE: ClassVar = "torque_sensor"
-    AMPLITUDES: ClassVar = {"slope": ("N m/s", 4e-5, True), "A": ("N m", 3e-4, True), "B": ("N m", 3e-4, True)}
-    SHAPES: ClassVar = {"T": ("s", (1e4, 30.0, 10.0, 3.0)), "P": ("s", (60.0, 90.0, 140.0, 250.0, 600.0, 1500.0))}
+    AMPLITUDES: ClassVar = {
+        "slope": ("N m/s", 4e-5, True),
+        **{n: ("N m", 3e-4, True) for n in ("A", "B", "A_2", "B_2")},
+    }
+    SHAPES: ClassVar = {
+        "T": ("s", (1e4, 30.0, 10.0, 3.0)),
+        "P": ("s", (60.0, 90.0, 140.0, 250.0, 600.0, 1500.0)),
+        "rho": ("1", (1.6, 2.5)),
+    }
     SHOWS: ClassVar = TORQUE_SENSOR
 
     slope: Float[Array, ""]
     A: Float[Array, ""]
     B: Float[Array, ""]
+    A_2: Float[Array, ""]
+    B_2: Float[Array, ""]
     T: Float[Array, ""]
     P: Float[Array, ""]
+    rho: Float[Array, ""]
 
     def reading(self, channel, x, y):
         if channel != "joint_torque":
             return y
-        now, tare = (2.0 * jnp.pi * s / self.P for s in (x.session_time, x.session_time - x.time))
-        wander = self.A * (jnp.cos(now) - jnp.cos(tare)) + self.B * (jnp.sin(now) - jnp.sin(tare))
+        wander = 0.0
+        for a, b, period in ((self.A, self.B, self.P), (self.A_2, self.B_2, self.P / self.rho)):
+            now, tare = (2.0 * jnp.pi * s / period for s in (x.session_time, x.session_time - x.time))
+            wander += a * (jnp.cos(now) - jnp.cos(tare)) + b * (jnp.sin(now) - jnp.sin(tare))
         return y + (self.slope * self.T * -jnp.expm1(-x.time / self.T) + wander) * x.motorised
 
 

@@ -17,6 +17,7 @@ class TendonFrictionCapstan(CatalogueEffect):
     ID: ClassVar = "tendon_friction_capstan"
     PLACE: ClassVar = "tendon"
     AMPLITUDES: ClassVar = {"mu": ("1/rad", 0.1, False)}
+    SIZES: ClassVar = (1.0, 0.05)
     SHAPES: ClassVar = {"curvature": ("1", (1.0, 0.0))}
     SHOWS: ClassVar = TENSION
 
@@ -116,6 +117,7 @@ class TendonCrosstalk(CatalogueEffect):
     ID: ClassVar = "tendon_crosstalk"
     PLACE: ClassVar = "tendon pair"
     AMPLITUDES: ClassVar = {"epsilon": ("1", 0.05, False)}
+    SIZES: ClassVar = (1.0, 0.05)
     SHAPES: ClassVar = {"behind": ("1", (0.0, 1.0))}
     SHOWS: ClassVar = TENSION
 

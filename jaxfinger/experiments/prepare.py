@@ -28,12 +28,14 @@ from jaxfinger.errors import UserError
 from jaxfinger.experiments.table import (
     ABOVE_NOISE,
     CLEAR,
+    CLEAR_STEP,
     EVERY_SAMPLE,
     EXPERIMENTS,
     LOST,
     MIN_DRIVEN_SPEED,
     MIN_JOINT_SPEED,
     MIN_TENDON_SPEED,
+    ROUNDING,
     SLACK,
     STILL,
     Experiment,
@@ -105,15 +107,18 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     block = max(1, round(1.0 / (spec.rate * step))) if reduced else 1
     holds = find_holds(trial) if spec.samples == "holds" else np.full(N, -1)
 
-    cutoff = min(spec.cutoff * (1.0 if reduced else EVERY_SAMPLE), 0.2 / step)
+    stepped = spec.samples == "holds" and not spec.held  # a motor moves the joint from hold to hold
+    # Where the measured channel is not low-passed, q̇ and q̈ must not lose what is in it.
+    cutoff = min(spec.cutoff * (EVERY_SAMPLE if stepped or not reduced else 1.0), 0.2 / step)
     filtered, qd, qdd = smooth(trial.time, trial.q, cutoff)
     # When a joint turns back shows best in the slower filter: there noise of q̇ is noise in time.
-    turning = qd if reduced or spec.held else smooth(trial.time, trial.q, spec.cutoff)[1]
+    slow = spec.held or (reduced and not stepped)
+    turning = qd if slow else smooth(trial.time, trial.q, spec.cutoff)[1]
     # Otherwise averaged over the same blocks as what it predicts, and not filtered where that is not.
     q = trial.q if spec.samples == "holds" or (spec.samples == "all" and reduced) else filtered
     if spec.samples == "holds":
-        # What counts in a fit are holds and fixtures, where nothing moves; at the full rate joints move between holds.
-        moves = (holds < 0)[:, None] & (not reduced and not spec.held)
+        # At holds and in fixtures nothing moves.
+        moves = (holds < 0)[:, None] & stepped
         qd, qdd = qd * moves, qdd * moves
     joint_direction = np.zeros((N, m)) if spec.held else _direction(trial.joint_direction, turning, STILL)
     tension = np.zeros((N, n)) if trial.tendon_force is None else np.nan_to_num(trial.tendon_force)
@@ -129,7 +134,9 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         motorised[:, session.finger.joint_names.index(trial.joint)] = 1.0
 
     y, mask = _measured(spec, trial, session, minus)
-    slides = _sliding(trial, session, filtered, qd, rate, motorised) if spec.samples == "sliding" else None
+    slides = np.zeros((N, m))
+    if spec.samples == "sliding" or stepped:
+        slides = _sliding(trial, session, filtered, qd, rate, motorised, CLEAR_STEP if stepped else CLEAR)
     if reduced and spec.samples == "sliding":
         # q̈ is low-passed, so all else is too. What noise it keeps would still tell a fit of less inertia
         # (errors in variables): where q̈ does not rise above it, its mean over a tenth of a second takes its place.
@@ -168,16 +175,19 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         "session_time": time + start,
         "motorised": mean(motorised).T,
     }
-    counts = (hold >= 0) if spec.samples == "holds" else np.ones(M, bool)
+    still = (hold >= 0) if spec.samples == "holds" else np.ones(M, bool)
     if spec.held:
         # Joints that are held have no inertia: ramps of the tension count as well as holds.
-        counts |= _goes_on(tension_mean, hold)
+        still |= _goes_on(tension_mean, hold)
     y_mean, mask_mean = {}, {}
     for c in y:
         y_mean[c] = mean(y[c]).T  # of all samples, as everything else that the model reads
-        mask_mean[c] = (mean(mask[c]) > 0.5).astype(float).T * counts
-        if spec.samples == "sliding" and c == "joint_torque":
-            mask_mean[c] *= mean(slides).T > 1.0 - 1e-9
+        mask_mean[c] = (mean(mask[c]) > 0.5).astype(float).T
+        if c == "joint_torque" and (spec.samples == "sliding" or stepped):
+            sliding = mean(slides).T > 1.0 - 1e-9
+            mask_mean[c] *= sliding | still if stepped else sliding
+        else:
+            mask_mean[c] *= still
         y_mean[c] *= mask_mean[c]
     return _Row(motion, y_mean, mask_mean, hold, block * step)
 
@@ -234,10 +244,13 @@ def _rates(trial: Trial, spec: Experiment) -> np.ndarray:
     return smooth(trial.time, without_spikes(np.nan_to_num(np.asarray(trial.tendon_excursion))), spec.cutoff / 2)[1]
 
 
-def _sliding(trial: Trial, session: Session, filtered, qd, rate: np.ndarray | None, motorised) -> np.ndarray:
+def _sliding(
+    trial: Trial, session: Session, filtered, qd, rate: np.ndarray | None, motorised, clear: float
+) -> np.ndarray:
     """(N, m): 1 where a joint and every taut tendon across it slide, so that the directions of friction are known.
 
-    `filtered`: q below the cut-off; `rate`: speeds of the tendons, none where all are slack.
+    `filtered`: q below the cut-off; `rate`: speeds of the tendons, none where all are slack; `clear`: s, kept clear of
+    where anything may stick.
     """
     fast = np.percentile(np.abs(qd), 95, axis=0)
     slow = np.where(motorised, MIN_DRIVEN_SPEED, MIN_JOINT_SPEED)
@@ -251,10 +264,10 @@ def _sliding(trial: Trial, session: Session, filtered, qd, rate: np.ndarray | No
             slides[:, i] &= known[:, session.finger.crosses[:, i] & session.finger.active].all(axis=1)
     # A slip of a few milliseconds is too fast for the filter, and moves every joint.
     lost = np.abs(trial.q - filtered)
-    most = np.maximum(LOST * np.ptp(trial.q, axis=0), ABOVE_NOISE * np.median(lost, axis=0))
-    slides &= np.all(lost < most, axis=1)[:, None]
+    most = np.maximum(LOST * np.ptp(trial.q, axis=0), ABOVE_NOISE * np.median(lost, axis=0)) + ROUNDING
+    slides &= np.all(lost <= most, axis=1)[:, None]
     # The filter spreads the jump of friction at a reversal, and friction before it slides is not known.
-    samples = 2 * round(CLEAR / float(np.median(np.diff(trial.time)))) + 1
+    samples = 2 * round(clear / float(np.median(np.diff(trial.time)))) + 1
     return minimum_filter1d(slides.astype(float), samples, axis=0)
 
 

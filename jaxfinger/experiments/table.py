@@ -16,7 +16,8 @@ class Experiment:
     channels: tuple[str, ...]  # what the model predicts
     rate: float  # Hz
     cutoff: float  # Hz
-    samples: str = "all"  # which ones count: `all`, `holds` (`held`: and between), or `sliding` (friction is known)
+    samples: str = "all"  # which ones count: `all`, `sliding` (friction is known), or `holds` and, between them, what
+    # slides or, where a fixture holds the joints (`held`), what the tensions tell
     held: bool = False  # a fixture holds the joints: they carry no friction, and tendons slip only past their loss
     slack: bool = False  # the tendons are slack by protocol
 
@@ -41,5 +42,7 @@ MIN_DRIVEN_SPEED = 0.02  # rad/s: likewise a joint that a motor moves, which doe
 MIN_TENDON_SPEED = 5e-4  # m/s: likewise a tendon
 LOST = 0.025  # of a joint's travel: what the filter may lose of its angle; a smooth motion loses 0.01 to 0.02
 ABOVE_NOISE = 15.0  # times the median loss, which is the encoder's noise: what it loses must be more to be a slip
+ROUNDING = 1e-9  # rad: what it loses of a joint that stands still in a simulated file
 CLEAR = 0.03  # s: kept clear on either side of where a joint or tendon may stick: over two widths of the filter
+CLEAR_STEP = 0.01  # s: likewise where the measured torque is not filtered and the joint moves from hold to hold
 EVERY_SAMPLE = 4.0  # times the cut-off where every sample is predicted: noise of q̈ biases nothing there

@@ -38,6 +38,7 @@ class Rows:
     column: np.ndarray  # (rows,) joint, tendon or axis
     trial: np.ndarray  # (rows,) index of the trial in the stack
     time: np.ndarray  # (rows,) index of the sample
+    before: np.ndarray  # (rows,) samples before it that the whitening reads
 
     @property
     def size(self) -> int:
@@ -284,18 +285,22 @@ def _sources(stacks: dict[str, Stack], noise: dict[tuple[str, str], Noise], para
 
 
 def _layout(stack: Stack, filters, start: int) -> Rows:
-    """Rows whose whitening has its full history, in the order of `white_rows`: trial, channel's column, time."""
-    complete, channel, column = [], [], []
+    """Rows that count, in the order of `white_rows`: trial, channel's column, time."""
+    counts, before, channel, column = [], [], [], []
     for number, c in enumerate(filters):
         mask = np.asarray(stack.batch.mask[c]) > 0
-        whole = mask.copy()
+        unbroken, history = mask.copy(), np.zeros(mask.shape, int)
         for k in range(1, filters[c].shape[1]):
-            whole[..., k:] &= mask[..., :-k]
-            whole[..., :k] = False
-        complete.append(np.moveaxis(whole, 1, 0))
+            unbroken[..., k:] &= mask[..., :-k]
+            unbroken[..., :k] = False
+            history += unbroken
+        counts.append(np.moveaxis(mask, 1, 0))
+        before.append(np.moveaxis(history, 1, 0))
         channel += [number] * len(mask)
         column += list(range(len(mask)))
-    block = np.concatenate(complete, axis=1)  # (B, columns of all channels, T)
+    block = np.concatenate(counts, axis=1)  # (B, columns of all channels, T)
     keep = np.flatnonzero(block.reshape(-1))
     trial, wide, time = np.unravel_index(keep, block.shape)
-    return Rows(stack.experiment.name, start, keep, np.array(channel)[wide], np.array(column)[wide], trial, time)
+    history = np.concatenate(before, axis=1).reshape(-1)[keep]
+    name = stack.experiment.name
+    return Rows(name, start, keep, np.array(channel)[wide], np.array(column)[wide], trial, time, history)

@@ -21,6 +21,8 @@ from jaxfinger.gap.signatures import Signatures, Variant
 STEPS = 6
 ROUNDS = 8  # of moving the nominal model and refitting there
 SETTLED = 1.0  # change of the sum of squares below which it stays
+PARTS = (0.5, 0.25)  # of a step of the nominal model, where the whole one loses more than
+LOST = 0.1  # of what was explained
 LARGE = 3.0  # plausible sizes: the width of the prior on an amplitude in the evidence, which has Cauchy's tails
 WIDE = 10.0  # plausible sizes: the width of the prior that keeps amplitudes that no trial sees near nothing
 ADDITIVE = {"phi", "place", "p", "toe"}  # shapes that move by differences; the others by factors
@@ -120,17 +122,43 @@ def relinearised(problem: Problem, refined: Refined, chi2_null: float) -> tuple[
     """The same effects with the nominal model where they lead it, and the problem there: what is left is then exact.
 
     A sensor's gain multiplies torques that are refitted with it, an encoder's offset shifts every polynomial of its
-    joint: where effects are large, their products with the nominal parameters count.
+    joint: where effects are large, their products with the nominal parameters count. A share of a friction that its own
+    refit takes to nothing grows without end: where a whole step loses what was explained, a part of it is taken, and
+    where nothing settles, the best is kept.
     """
+    least, best = np.inf, (problem, refined)
     for _ in range(ROUNDS):
-        here = moved(problem, nominal_step(problem, problem.r - refined.change))
-        left = here.r - _evaluate(Signatures(here, here.nominal), refined.effects, [])[0]
+        step = nominal_step(problem, problem.r - refined.change)
+        here = moved(problem, step)
+        items, starts, change = _brought_along(here, refined)
+        left = here.r - change
         exact = float(left @ left + here.offset @ here.offset)
         if not abs(exact - refined.chi2) > SETTLED:
+            return problem, refined
+        found = [(here, refine(here, items, starts, chi2_null, Projector(here)))]
+        for part in PARTS:
+            if found[-1][1].chi2 - refined.chi2 < LOST * (chi2_null - refined.chi2) + SETTLED:
+                break
+            here = moved(problem, part * step)
+            items, starts, _ = _brought_along(here, refined)
+            found.append((here, refine(here, items, starts, chi2_null, Projector(here))))
+        if exact > least:
             break
-        problem, (items, starts) = here, at_optimum(refined)
-        refined = refine(problem, items, starts, chi2_null, Projector(problem))
-    return problem, refined
+        least, best = exact, found[0]
+        problem, refined = min(found, key=lambda x: x[1].chi2)
+    return best
+
+
+def _brought_along(here: Problem, refined: Refined):
+    """Variants, amplitudes and white change of refitted effects at another nominal model, where they are to change the
+    rows as they did: a share of a friction grows as that friction shrinks.
+    """
+    items, starts = at_optimum(refined)
+    signatures = Signatures(here, here.nominal)
+    changes = np.concatenate([signatures.of([e]) for e in refined.effects])
+    scale = np.linalg.lstsq(changes.T, refined.change, rcond=1e-9)[0]
+    scale = np.where(scale > 0.0, scale, 1.0)
+    return items, [{n: a * s for n, a in x.items()} for x, s in zip(starts, scale, strict=True)], scale @ changes
 
 
 def nominal_step(problem: Problem, r: np.ndarray) -> Float[np.ndarray, " p"]:

@@ -34,11 +34,12 @@ QUICK = {"xla_backend_optimization_level": 0}  # a signature runs a few times: c
 
 @dataclass(frozen=True)
 class Variant:
-    """One effect at one site with one shape."""
+    """One effect at one site with one shape, and the amplitude at which its signature is read."""
 
     effect: type[CatalogueEffect]
     site: Site
     shape: tuple[tuple[str, float], ...]
+    size: float = 1.0  # plausible sizes
 
     @property
     def key(self) -> tuple[str, Site]:
@@ -51,12 +52,13 @@ class Variant:
 
 
 def variants(effects: dict[str, type[CatalogueEffect]], finger) -> list[Variant]:
-    """Every effect at every site with every shape worth trying."""
+    """Every effect at every site with every shape and size worth trying."""
     return [
-        Variant(effect, site, tuple(shape.items()))
+        Variant(effect, site, tuple(shape.items()), size)
         for effect in effects.values()
         for site in effect.sites(finger)
         for shape in effect.shapes(finger, site)
+        for size in effect.SIZES
     ]
 
 
@@ -166,23 +168,24 @@ class Signatures:
         return out
 
     def columns(self, items: list[Variant]) -> Float[np.ndarray, "variants amplitudes N"]:
-        """Signatures at plausible sizes, one amplitude at a time, for variants of one class."""
+        """Signatures per plausible size, one amplitude at a time, for variants of one class."""
         effect, finger = items[0].effect, self.nominal.finger
         names = list(effect.AMPLITUDES)
-        members = [v.at(finger, {n: effect.AMPLITUDES[n][1]}) for v, n in product(items, names)]
-        return self.of(members).reshape(len(items), len(names), -1)
+        members = [v.at(finger, {n: v.size * effect.AMPLITUDES[n][1]}) for v, n in product(items, names)]
+        sizes = np.array([v.size for v in items])[:, None, None]
+        return self.of(members).reshape(len(items), len(names), -1) / sizes
 
 
 def whitened(
     raw: Float[np.ndarray, "members columns B T"], problem: Problem, rows: Rows, of_channel: np.ndarray, channel: str
 ) -> Float[np.ndarray, "members rows"]:
-    """The rows that count, whitened as the residuals are (`noise.whiten`): each has its filter's whole history."""
-    coefficients = problem.noise[rows.experiment, channel].coefficients
+    """The rows that count, whitened as the residuals are (`noise.whiten`)."""
     column, trial, time = rows.column[of_channel], rows.trial[of_channel], rows.time[of_channel]
-    lags = range(coefficients.shape[1])
-    white = np.asarray(sum(coefficients[column, k] * raw[:, column, trial, time - k] for k in lags))
+    filters = problem.noise[rows.experiment, channel].coefficients[column, rows.before[of_channel]]
+    lags = range(filters.shape[1])
+    white = np.asarray(sum(filters[:, k] * raw[:, column, trial, time - k] for k in lags))
     if channel == "tendon_excursion":
-        constant = coefficients.sum(axis=1)[column]
+        constant = filters.sum(axis=1)
         series = trial * raw.shape[1] + column
         count = int(series.max(initial=0)) + 1
         energy = np.bincount(series, constant**2, count)

@@ -17,7 +17,7 @@ from jaxfinger.identify.noise import whiten
 from jaxfinger.identify.parameters import Free
 from jaxfinger.model import Model
 
-Filters = dict[str, Float[Array, "columns order+1"]]
+Filters = dict[str, Float[Array, "columns order+1 order+1"]]
 
 
 class Linearised(NamedTuple):

@@ -30,33 +30,48 @@ class Noise:
     source: str  # `repeats`, `holds`, both, or `residuals`
 
     @property
-    def coefficients(self) -> Float[np.ndarray, "columns order+1"]:
-        """The whitening filter [1, −a₁, …] / σ."""
-        return np.concatenate([np.ones((len(self.std), 1)), -self.ar], axis=1) / self.innovation[:, None]
+    def coefficients(self) -> Float[np.ndarray, "columns order+1 order+1"]:
+        """The whitening filters [1, −a₁, …] / σ; row j predicts from j samples before, as after a gap.
+
+        Levinson's recursion, downwards: a_k ← (a_k + a_j a_{j−k})/(1 − a_j²), σ² ← σ²/(1 − a_j²).
+        """
+        order = self.ar.shape[1]
+        out = np.zeros((len(self.std), order + 1, order + 1))
+        a, sigma = self.ar, self.innovation
+        for j in range(order, -1, -1):
+            out[:, j, : j + 1] = np.concatenate([np.ones((len(a), 1)), -a], axis=1) / sigma[:, None]
+            if j:
+                last = np.clip(a[:, -1:], -0.99, 0.99)
+                a = (a[:, :-1] + last * a[:, -2::-1]) / (1.0 - last**2)
+                sigma = sigma / np.sqrt(1.0 - last[:, 0] ** 2)
+        return out
 
 
 def whiten(
     r: Float[Array, "columns B T"],
     mask: Float[Array, "columns B T"],
-    coefficients: Float[Array, "columns order+1"],
+    coefficients: Float[Array, "columns order+1 order+1"],
     demean: bool,
 ) -> Float[Array, "columns B T"]:
-    """White residuals of unit variance, zero where the filter has no full history of samples that count.
+    """White residuals of unit variance, zero where a sample does not count.
 
     With `demean`, what a constant per trial and column could explain is projected out (the encoders' arbitrary zero).
     """
-    lags = coefficients.shape[1]
+    lags = range(coefficients.shape[1])
     r = r * mask
 
     def lag(a, k):
         return a if k == 0 else jnp.pad(a[..., :-k], ((0, 0), (0, 0), (k, 0)))
 
-    complete = mask
-    for k in range(1, lags):
-        complete = complete * lag(mask, k)
-    white = sum(coefficients[:, k, None, None] * lag(r, k) for k in range(lags)) * complete
+    before = [mask]  # 1 where that many samples before count without a gap
+    for k in lags[1:]:
+        before.append(before[-1] * lag(mask, k))
+    number = sum(before[1:], jnp.zeros_like(mask)).astype(int)
+    filters = [jnp.take_along_axis(coefficients[:, :, k, None], number.reshape(len(r), 1, -1), 1) for k in lags]
+    filters = [f.reshape(r.shape) * mask for f in filters]
+    white = sum((f * lag(r, k) for k, f in enumerate(filters)), jnp.zeros_like(r))
     if demean:
-        constant = coefficients.sum(axis=1)[:, None, None] * complete
+        constant = sum(filters, jnp.zeros_like(r))
         energy = jnp.maximum(jnp.sum(constant * constant, axis=-1, keepdims=True), 1e-300)
         white = white - constant * jnp.sum(constant * white, axis=-1, keepdims=True) / energy
     return white

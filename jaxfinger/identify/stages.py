@@ -41,7 +41,8 @@ STAGES = {
     s.name: s
     for s in (
         Stage("ID.2", {"ID.2": ("tendon_excursion",)}, ("moment_arm",)),
-        Stage("ID.3-static", {"ID.3-static": ("joint_torque",)}, ("elastic", "friction")),
+        # From hold to hold the joint moves, slowly: that shows damping, too, if less well.
+        Stage("ID.3-static", {"ID.3-static": ("joint_torque",)}, ("elastic", "friction", "damping")),
         # The dynamic phase augments the static one: both are read, so that a sweep refines what the holds gave.
         Stage(
             "ID.3-dynamic",

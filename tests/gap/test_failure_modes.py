@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.effects.joint import JointPresliding
@@ -47,6 +48,38 @@ def test_a_gain_that_friction_absorbs_is_not_named():
     gain = next(c.evidence for c in found.search.candidates if c.key == truth[:2])
     assert gain.std[0] > 5.0  # plausible sizes: these trials cannot tell it
     assert gain.absorbed > 0.95
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [
+        ("joint_stribeck", ("PIP",), {"a": 3.0, "v_s": 0.5, "delta": 1.0}),
+        ("drive_inertia", ("PIP",), {"inertia": 1e-4}),
+    ],
+    ids=lambda t: t[0],
+)
+def test_without_sweeps_the_moves_between_holds_show_what_depends_on_speed(truth):
+    """A friction of which three quarters fall with speed is a negative damping at first: one linearisation errs."""
+    trials = TABLE["trials"] | {"experiments": ["ID.2", "ID.3-static"]}
+    keep = {*RIVALS, "drive_inertia", "torque_ripple"}
+    session = session_with(truth, recipe=recipe_from(TABLE | {"trials": trials}))
+    found = diagnose(session, without=tuple(sorted(set(CATALOGUE) - keep)))
+    assert found.verdict.status == "explained"
+    assert found.verdict.effects == (truth[:2],)
+
+
+def test_a_little_friction_of_the_wrap_is_seen_though_a_lot_would_slip_elsewhere():
+    trials = TABLE["trials"] | {
+        "experiments": ["ID.2", "ID.3-static", "ID.4"],
+        "id4": {"repeats": 2, "postures": [[25, 30, 45], [70, 60, 60]], "dwell": 0.4},
+    }
+    keep = {*RIVALS, "tendon_friction_capstan", "tendon_friction_presliding", "tendon_friction_saturating"}
+    truth = ("tendon_friction_capstan", ("T1",), {"mu": 0.01})
+    session = session_with(truth, recipe=recipe_from(TABLE | {"trials": trials}))
+    found = diagnose(session, without=tuple(sorted(set(CATALOGUE) - keep)))
+    assert found.verdict.effects == (truth[:2],)
+    (capstan,) = found.augmented.model.effects
+    np.testing.assert_allclose(float(capstan.mu), 0.01, rtol=0.2)
 
 
 def test_what_the_finger_decides_of_an_effect_is_not_fitted():

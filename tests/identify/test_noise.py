@@ -5,9 +5,10 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 
 from jaxfinger.experiments import EXPERIMENTS
-from jaxfinger.identify.noise import FEW, estimate, whiten
+from jaxfinger.identify.noise import FEW, Noise, estimate, whiten
 
 SIZES, COUNTS, LENGTH = np.array([1.0, 5.0, 0.2]), (2000, 150, 20), 2400
 COLOUR = np.array([1.1, -0.6, 0.15])  # as a filter at a fifth of the sampling rate leaves white noise
@@ -48,6 +49,21 @@ def test_every_column_with_samples_of_its_own_comes_out_white(estimates):
     assert COUNTS[2] < FEW < COUNTS[1]
     np.testing.assert_allclose(energy.mean(axis=0)[:2], 1.0, atol=0.08)
     assert np.abs(energy[:, :2] - 1.0).max() < 0.35  # of 300 rows, in a single estimate
+
+
+def test_after_a_gap_the_whitening_is_that_of_what_is_left():
+    """Two runs with a gap of two samples between: white energy is eᵀC⁻¹e of each run, C from the spectrum."""
+    noise = Noise(np.ones(1), np.array([0.7]), COLOUR[None], "given")
+    spectrum = np.abs(0.7 / np.fft.rfft(np.r_[1.0, -COLOUR], 4096)) ** 2
+    covariance = scipy.linalg.toeplitz(np.fft.irfft(spectrum)[:5])
+    e, mask = np.random.default_rng(3).standard_normal(10), np.ones(10)
+    mask[[5, 6]] = 0.0
+    white = np.asarray(whiten(*map(jnp.asarray, (e[None, None], mask[None, None], noise.coefficients)), False))[0, 0]
+    for run in (slice(0, 5), slice(7, 10)):
+        n = run.stop - run.start
+        exact = e[run] @ np.linalg.solve(covariance[:n, :n], e[run])
+        assert white[run] @ white[run] == pytest.approx(exact, rel=1e-9)
+    assert not white[5:7].any()
 
 
 def test_a_column_with_few_samples_borrows_the_colour_of_all(estimates):
