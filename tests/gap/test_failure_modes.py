@@ -1,6 +1,7 @@
 """Ways in which a diagnosis could fool its user, each as a session with a known answer."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.effects.joint import JointPresliding
 from jaxfinger.gap import as_gap_json, diagnose
+from jaxfinger.identify import Recipe
 from jaxfinger.identify.parameters import describe
 from jaxfinger.synthetic import recipe_from
 
@@ -80,6 +82,37 @@ def test_a_little_friction_of_the_wrap_is_seen_though_a_lot_would_slip_elsewhere
     assert found.verdict.effects == (truth[:2],)
     (capstan,) = found.augmented.model.effects
     np.testing.assert_allclose(float(capstan.mu), 0.01, rtol=0.2)
+
+
+def test_the_order_of_the_trials_in_a_file_says_nothing():
+    """A sensor that drifts over the session does so by the clock."""
+    keep = {*RIVALS, "torque_sensor_drift"}
+    session = session_with(("torque_sensor_drift", ("torque_sensor",), {"slope": 1e-4, "A": 1e-3, "P": 250.0}))
+    backwards = replace(session, trials=dict(reversed(session.trials.items())))
+    found = [diagnose(s, without=tuple(sorted(set(CATALOGUE) - keep))) for s in (session, backwards)]
+    assert {f.verdict.effects for f in found} == {(("torque_sensor_drift", ("torque_sensor",)),)}
+    probabilities = [{c.key: c.probability for c in f.search.candidates} for f in found]
+    assert probabilities[0] == pytest.approx(probabilities[1], abs=1e-3)
+
+
+@pytest.mark.parametrize("degrees", [{"elastic_degree": 5, "moment_arm_degree": 6}, {"friction_degree": 4}], ids=str)
+def test_a_nominal_model_more_flexible_than_needed_hides_no_cause(degrees):
+    recipe = Recipe(model=replace(Recipe().model, **degrees))
+    assert diagnose(session_with(PLANTED), recipe, without=WITHOUT).verdict.effects == (TRUTH,)
+    assert diagnose(session_with(), recipe, without=WITHOUT).verdict.status == "no_gap"
+
+
+def test_many_repeats_of_what_no_candidate_explains_make_none_right():
+    """Repeats tell noise and nothing of the form: a law of the wrong sign stays unexplained however often it is seen,
+    and no amplitude comes out with a sign that it cannot have.
+    """
+    trials = TABLE["trials"] | {k: TABLE["trials"][k] | {"repeats": 4} for k in ("id2", "id3_static", "id3_dynamic")}
+    upside_down = ("joint_stribeck", ("PIP",), {"a": -0.8, "v_s": 0.2, "delta": 2.0})
+    found = diagnose(session_with(upside_down, recipe=recipe_from(TABLE | {"trials": trials})), without=WITHOUT)
+    assert found.verdict.status == "unexplained"
+    for candidate in found.search.candidates:
+        signs = [signed for _, _, signed in CATALOGUE[candidate.key[0]].AMPLITUDES.values()]
+        assert all(signed or a >= 0.0 for signed, a in zip(signs, candidate.evidence.amplitudes, strict=True))
 
 
 def test_what_the_finger_decides_of_an_effect_is_not_fitted():
