@@ -27,6 +27,7 @@ from jaxfinger.data import (
 from jaxfinger.errors import UserError
 from jaxfinger.experiments.table import (
     ABOVE_NOISE,
+    BREAKAWAY,
     CLEAR,
     CLEAR_STEP,
     EVERY_SAMPLE,
@@ -267,8 +268,12 @@ def _sliding(
     most = np.maximum(LOST * np.ptp(trial.q, axis=0), ABOVE_NOISE * np.median(lost, axis=0)) + ROUNDING
     slides &= np.all(lost <= most, axis=1)[:, None]
     # The filter spreads the jump of friction at a reversal, and friction before it slides is not known.
-    samples = 2 * round(clear / float(np.median(np.diff(trial.time)))) + 1
-    return minimum_filter1d(slides.astype(float), samples, axis=0)
+    step = float(np.median(np.diff(trial.time)))
+    near, after = round(clear / step), round(BREAKAWAY / step)
+    out = minimum_filter1d(slides.astype(float), 2 * near + 1, axis=0)
+    # Reaches back only: a free joint that breaks away does so at once, and takes the others with it.
+    free = minimum_filter1d(out, 2 * (after // 2) + 1, axis=0, origin=after // 2)
+    return np.where(motorised, out, free)
 
 
 def _in_steps(tension: np.ndarray, hold: np.ndarray) -> np.ndarray:

@@ -44,5 +44,6 @@ LOST = 0.025  # of a joint's travel: what the filter may lose of its angle; a sm
 ABOVE_NOISE = 15.0  # times the median loss, which is the encoder's noise: what it loses must be more to be a slip
 ROUNDING = 1e-9  # rad: what it loses of a joint that stands still in a simulated file
 CLEAR = 0.03  # s: kept clear on either side of where a joint or tendon may stick: over two widths of the filter
+BREAKAWAY = 0.06  # s: kept clear beside it after a joint that no motor moves has broken away
 CLEAR_STEP = 0.01  # s: likewise where the measured torque is not filtered and the joint moves from hold to hold
 EVERY_SAMPLE = 4.0  # times the cut-off where every sample is predicted: noise of q̈ biases nothing there
