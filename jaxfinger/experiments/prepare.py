@@ -147,7 +147,6 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         )
         y = {c: low_pass(trial.time, values, cutoff) for c, values in y.items()}
     M = N // block
-
     ones = np.ones(block)
 
     def mean(a):
@@ -176,21 +175,21 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         "session_time": time + start,
         "motorised": mean(motorised).T,
     }
-    still = (hold >= 0) if spec.samples == "holds" else np.ones(M, bool)
-    if spec.held:
-        # Joints that are held have no inertia: ramps of the tension count as well as holds.
-        still |= _goes_on(tension_mean, hold)
+    # Joints that are held have no inertia: ramps of the tension count as well as holds.
+    between = _goes_on(tension_mean, hold)[:, None] if spec.held else mean(slides) > 1.0 - 1e-9
     y_mean, mask_mean = {}, {}
     for c in y:
-        y_mean[c] = mean(y[c]).T  # of all samples, as everything else that the model reads
-        mask_mean[c] = (mean(mask[c]) > 0.5).astype(float).T
-        if c == "joint_torque" and (spec.samples == "sliding" or stepped):
-            sliding = mean(slides).T > 1.0 - 1e-9
-            mask_mean[c] *= sliding | still if stepped else sliding
-        else:
-            mask_mean[c] *= still
-        y_mean[c] *= mask_mean[c]
+        counts = (mean(mask[c]) > 0.5) & _counting(spec, c, hold, between)
+        mask_mean[c] = counts.astype(float).T
+        y_mean[c] = mean(y[c]).T * mask_mean[c]  # of all samples, as everything else that the model reads
     return _Row(motion, y_mean, mask_mean, hold, block * step)
+
+
+def _counting(spec: Experiment, channel: str, hold: np.ndarray, between: np.ndarray) -> np.ndarray:
+    """(M, columns or 1): which blocks of a channel count, where it is measured. `between`: where friction is known."""
+    if spec.samples == "holds":
+        return (hold >= 0)[:, None] | between
+    return between if spec.samples == "sliding" and channel == "joint_torque" else np.ones((len(hold), 1), bool)
 
 
 def _despiked(trial: Trial) -> Trial:
