@@ -55,13 +55,14 @@ class TendonCreep(CatalogueEffect):
 class TendonBacklash(CatalogueEffect):
     """Excursion lags by a dead zone: p = clip(p before, f(q) − b/2, f(q) + b/2), the play operator.
 
-    `a` is the share of the excursion that goes through the dead zone `width`; 1 where all of it does.
+    `a` is the share of the excursion that goes through the dead zone `width`; 1 where all of it does. A zone narrower
+    than 10 µm, an encoder's noise, is not looked for: there the noise of the angles decides when it is crossed.
     """
 
     ID: ClassVar = "tendon_backlash"
     PLACE: ClassVar = "tendon"
     AMPLITUDES: ClassVar = {"a": ("1", 1.0, False)}
-    SHAPES: ClassVar = {"width": ("m", (1e-5, 2e-5, 4e-5, 8e-5, 1.6e-4, 3.2e-4, 6.4e-4))}
+    SHAPES: ClassVar = {"width": ("m", (2e-5, 4e-5, 8e-5, 1.6e-4, 3.2e-4, 6.4e-4))}
     SHOWS: ClassVar = EXCURSION
     has_memory: ClassVar = True
 
