@@ -108,18 +108,17 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     block = max(1, round(1.0 / (spec.rate * step))) if reduced else 1
     holds = find_holds(trial) if spec.samples == "holds" else np.full(N, -1)
 
-    stepped = spec.samples == "holds" and not spec.held  # a motor moves the joint from hold to hold
     # Where the measured channel is not low-passed, q̇ and q̈ must not lose what is in it.
-    cutoff = min(spec.cutoff * (EVERY_SAMPLE if stepped or not reduced else 1.0), 0.2 / step)
+    cutoff = min(spec.cutoff * (EVERY_SAMPLE if spec.stepped or not reduced else 1.0), 0.2 / step)
     filtered, qd, qdd = smooth(trial.time, trial.q, cutoff)
     # When a joint turns back shows best in the slower filter: there noise of q̇ is noise in time.
-    slow = spec.held or (reduced and not stepped)
+    slow = spec.held or (reduced and not spec.stepped)
     turning = qd if slow else smooth(trial.time, trial.q, spec.cutoff)[1]
     # Otherwise averaged over the same blocks as what it predicts, and not filtered where that is not.
     q = trial.q if spec.samples == "holds" or (spec.samples == "all" and reduced) else filtered
     if spec.samples == "holds":
         # At holds and in fixtures nothing moves.
-        moves = (holds < 0)[:, None] & stepped
+        moves = (holds < 0)[:, None] & spec.stepped
         qd, qdd = qd * moves, qdd * moves
     joint_direction = np.zeros((N, m)) if spec.held else _direction(trial.joint_direction, turning, STILL)
     tension = np.zeros((N, n)) if trial.tendon_force is None else np.nan_to_num(trial.tendon_force)
@@ -136,8 +135,8 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
 
     y, mask = _measured(spec, trial, session, minus)
     slides = np.zeros((N, m))
-    if spec.samples == "sliding" or stepped:
-        slides = _sliding(trial, session, filtered, qd, rate, motorised, CLEAR_STEP if stepped else CLEAR)
+    if spec.samples == "sliding" or spec.stepped:
+        slides = _sliding(spec, trial, session, filtered, qd, rate, motorised)
     if reduced and spec.samples == "sliding":
         # q̈ is low-passed, so all else is too. What noise it keeps would still tell a fit of less inertia
         # (errors in variables): where q̈ does not rise above it, its mean over a tenth of a second takes its place.
@@ -245,12 +244,11 @@ def _rates(trial: Trial, spec: Experiment) -> np.ndarray:
 
 
 def _sliding(
-    trial: Trial, session: Session, filtered, qd, rate: np.ndarray | None, motorised, clear: float
+    spec: Experiment, trial: Trial, session: Session, filtered, qd, rate: np.ndarray | None, motorised
 ) -> np.ndarray:
     """(N, m): 1 where a joint and every taut tendon across it slide, so that the directions of friction are known.
 
-    `filtered`: q below the cut-off; `rate`: speeds of the tendons, none where all are slack; `clear`: s, kept clear of
-    where anything may stick.
+    `filtered`: q below the cut-off; `rate`: speeds of the tendons, none where all are slack.
     """
     fast = np.percentile(np.abs(qd), 95, axis=0)
     slow = np.where(motorised, MIN_DRIVEN_SPEED, MIN_JOINT_SPEED)
@@ -268,11 +266,12 @@ def _sliding(
     slides &= np.all(lost <= most, axis=1)[:, None]
     # The filter spreads the jump of friction at a reversal, and friction before it slides is not known.
     step = float(np.median(np.diff(trial.time)))
-    near, after = round(clear / step), round(BREAKAWAY / step)
-    out = minimum_filter1d(slides.astype(float), 2 * near + 1, axis=0)
+    clear = minimum_filter1d(
+        slides.astype(float), 2 * round((CLEAR_STEP if spec.stepped else CLEAR) / step) + 1, axis=0
+    )
     # Reaches back only: a free joint that breaks away does so at once, and takes the others with it.
-    free = minimum_filter1d(out, 2 * (after // 2) + 1, axis=0, origin=after // 2)
-    return np.where(motorised, out, free)
+    half = round(0.5 * BREAKAWAY / step)
+    return np.where(motorised, clear, minimum_filter1d(clear, 2 * half + 1, axis=0, origin=half))
 
 
 def _in_steps(tension: np.ndarray, hold: np.ndarray) -> np.ndarray:

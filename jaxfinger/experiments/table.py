@@ -16,10 +16,14 @@ class Experiment:
     channels: tuple[str, ...]  # what the model predicts
     rate: float  # Hz
     cutoff: float  # Hz
-    samples: str = "all"  # which ones count: `all`, `sliding` (friction is known), or `holds` and, between them, what
-    # slides or, where a fixture holds the joints (`held`), what the tensions tell
+    samples: str = "all"  # which ones count: `all`, `sliding` (friction is known), `holds` (and what is known between)
     held: bool = False  # a fixture holds the joints: they carry no friction, and tendons slip only past their loss
     slack: bool = False  # the tendons are slack by protocol
+
+    @property
+    def stepped(self) -> bool:
+        """A motor moves a joint from hold to hold."""
+        return self.samples == "holds" and not self.held
 
 
 EXPERIMENTS = {
@@ -45,5 +49,5 @@ ABOVE_NOISE = 15.0  # times the median loss, which is the encoder's noise: what 
 ROUNDING = 1e-9  # rad: what it loses of a joint that stands still in a simulated file
 CLEAR = 0.03  # s: kept clear on either side of where a joint or tendon may stick: over two widths of the filter
 BREAKAWAY = 0.06  # s: kept clear beside it after a joint that no motor moves has broken away
-CLEAR_STEP = 0.01  # s: likewise where the measured torque is not filtered and the joint moves from hold to hold
+CLEAR_STEP = 0.01  # s: CLEAR where a motor moves the joint from hold to hold, and nothing measured is filtered
 EVERY_SAMPLE = 4.0  # times the cut-off where every sample is predicted: noise of q̈ biases nothing there

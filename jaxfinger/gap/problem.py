@@ -18,7 +18,7 @@ from jaxfinger.experiments import Stack, prepare
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.linearise import Linearised, linearise
-from jaxfinger.identify.noise import Noise, estimate
+from jaxfinger.identify.noise import Noise, estimate, history
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.solve import Prior, Source, solve, unit_weights
 from jaxfinger.identify.stages import cad_covariance, first_noise, free_groups, nominal_model, sources_of, start_values
@@ -38,7 +38,7 @@ class Rows:
     column: np.ndarray  # (rows,) joint, tendon or axis
     trial: np.ndarray  # (rows,) index of the trial in the stack
     time: np.ndarray  # (rows,) index of the sample
-    before: np.ndarray  # (rows,) samples before it that the whitening reads
+    history: np.ndarray  # (rows,) samples before it that the whitening reads
 
     @property
     def size(self) -> int:
@@ -288,19 +288,21 @@ def _layout(stack: Stack, filters, start: int) -> Rows:
     """Rows that count, in the order of `white_rows`: trial, channel's column, time."""
     counts, before, channel, column = [], [], [], []
     for number, c in enumerate(filters):
-        mask = np.asarray(stack.batch.mask[c]) > 0
-        unbroken, history = mask.copy(), np.zeros(mask.shape, int)
-        for k in range(1, filters[c].shape[1]):
-            unbroken[..., k:] &= mask[..., :-k]
-            unbroken[..., :k] = False
-            history += unbroken
+        mask = (np.asarray(stack.batch.mask[c]) > 0).astype(int)
         counts.append(np.moveaxis(mask, 1, 0))
-        before.append(np.moveaxis(history, 1, 0))
+        before.append(np.moveaxis(history(mask, filters[c].shape[1] - 1), 1, 0))
         channel += [number] * len(mask)
         column += list(range(len(mask)))
     block = np.concatenate(counts, axis=1)  # (B, columns of all channels, T)
-    keep = np.flatnonzero(block.reshape(-1))
+    keep = np.flatnonzero(block)
     trial, wide, time = np.unravel_index(keep, block.shape)
-    history = np.concatenate(before, axis=1).reshape(-1)[keep]
-    name = stack.experiment.name
-    return Rows(name, start, keep, np.array(channel)[wide], np.array(column)[wide], trial, time, history)
+    return Rows(
+        stack.experiment.name,
+        start,
+        keep,
+        np.array(channel)[wide],
+        np.array(column)[wide],
+        trial,
+        time,
+        np.concatenate(before, axis=1).reshape(-1)[keep],
+    )

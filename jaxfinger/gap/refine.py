@@ -21,8 +21,8 @@ from jaxfinger.gap.signatures import Signatures, Variant
 STEPS = 6
 ROUNDS = 8  # of moving the nominal model and refitting there
 SETTLED = 1.0  # change of the sum of squares below which it stays
-PARTS = (0.5, 0.25)  # of a step of the nominal model, where the whole one loses more than
-LOST = 0.1  # of what was explained
+MAY_LOSE = 0.1  # share of what is explained, that a step of the nominal model may lose; beyond it the step is halved
+HALVINGS = 2
 LARGE = 3.0  # plausible sizes: the width of the prior on an amplitude in the evidence, which has Cauchy's tails
 WIDE = 10.0  # plausible sizes: the width of the prior that keeps amplitudes that no trial sees near nothing
 ADDITIVE = {"phi", "place", "p", "toe"}  # shapes that move by differences; the others by factors
@@ -123,42 +123,41 @@ def relinearised(problem: Problem, refined: Refined, chi2_null: float) -> tuple[
 
     A sensor's gain multiplies torques that are refitted with it, an encoder's offset shifts every polynomial of its
     joint: where effects are large, their products with the nominal parameters count. A share of a friction that its own
-    refit takes to nothing grows without end: where a whole step loses what was explained, a part of it is taken, and
-    where nothing settles, the best is kept.
+    refit takes to nothing grows without end: where a whole step loses what was explained, a part of it is taken. The
+    best is kept where nothing settles.
     """
     least, best = np.inf, (problem, refined)
     for _ in range(ROUNDS):
         step = nominal_step(problem, problem.r - refined.change)
-        here = moved(problem, step)
-        items, starts, change = _brought_along(here, refined)
-        left = here.r - change
-        exact = float(left @ left + here.offset @ here.offset)
+        here, effects, exact = _brought_along(problem, step, refined)
         if not abs(exact - refined.chi2) > SETTLED:
             return problem, refined
-        found = [(here, refine(here, items, starts, chi2_null, Projector(here)))]
-        for part in PARTS:
-            if found[-1][1].chi2 - refined.chi2 < LOST * (chi2_null - refined.chi2) + SETTLED:
-                break
-            here = moved(problem, part * step)
-            items, starts, _ = _brought_along(here, refined)
-            found.append((here, refine(here, items, starts, chi2_null, Projector(here))))
         if exact > least:
             break
+        found = [(here, refine(here, *effects, chi2_null, Projector(here)))]
         least, best = exact, found[0]
+        most = refined.chi2 + MAY_LOSE * (chi2_null - refined.chi2) + SETTLED
+        while found[-1][1].chi2 > most and len(found) <= HALVINGS:
+            step = step / 2
+            here, effects, _ = _brought_along(problem, step, refined)
+            found.append((here, refine(here, *effects, chi2_null, Projector(here))))
         problem, refined = min(found, key=lambda x: x[1].chi2)
     return best
 
 
-def _brought_along(here: Problem, refined: Refined):
-    """Variants, amplitudes and white change of refitted effects at another nominal model, where they are to change the
-    rows as they did: a share of a friction grows as that friction shrinks.
+def _brought_along(problem: Problem, step: Float[np.ndarray, " p"], refined: Refined):
+    """The problem a step of the nominal model away; variants and amplitudes there, which change the rows as they did
+    here (a share of a friction grows as that friction shrinks); and what they leave of the sum of squares.
     """
-    items, starts = at_optimum(refined)
+    here = moved(problem, step)
     signatures = Signatures(here, here.nominal)
     changes = np.concatenate([signatures.of([e]) for e in refined.effects])
     scale = np.linalg.lstsq(changes.T, refined.change, rcond=1e-9)[0]
     scale = np.where(scale > 0.0, scale, 1.0)
-    return items, [{n: a * s for n, a in x.items()} for x, s in zip(starts, scale, strict=True)], scale @ changes
+    left = here.r - scale @ changes
+    items, starts = at_optimum(refined)
+    starts = [{n: a * s for n, a in x.items()} for x, s in zip(starts, scale, strict=True)]
+    return here, (items, starts), float(left @ left + here.offset @ here.offset)
 
 
 def nominal_step(problem: Problem, r: np.ndarray) -> Float[np.ndarray, " p"]:

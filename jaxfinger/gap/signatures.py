@@ -181,7 +181,7 @@ def whitened(
 ) -> Float[np.ndarray, "members rows"]:
     """The rows that count, whitened as the residuals are (`noise.whiten`)."""
     column, trial, time = rows.column[of_channel], rows.trial[of_channel], rows.time[of_channel]
-    filters = problem.noise[rows.experiment, channel].coefficients[column, rows.before[of_channel]]
+    filters = problem.noise[rows.experiment, channel].coefficients[column, rows.history[of_channel]]
     lags = range(filters.shape[1])
     white = np.asarray(sum(filters[:, k] * raw[:, column, trial, time - k] for k in lags))
     if channel == "tendon_excursion":

@@ -103,8 +103,8 @@ def _stack_sessions(sessions: Sequence[Session], template: Fit, compressed: Comp
     plan = plan_of(sessions[0], template)
     reads = {e: c for r, _ in plan for e, c in r.items()}
     prepared = [prepare(s, [t.name for t in s if t.experiment in reads]) for s in sessions]
-    products = [i for i, p in enumerate(describe(template.model)) if p.group in {"mass", "com"}]
-    moving = set(products) & set(template.estimated.tolist())
+    parameters = describe(template.model)
+    links = {int(i) for i in template.estimated if parameters[i].group in ("mass", "com")}
     out = []
     for e, positions in compressed.positions.items():
         batches = []
@@ -125,7 +125,7 @@ def _stack_sessions(sessions: Sequence[Session], template: Fit, compressed: Comp
                 Free.at(template.model, positions),
                 jnp.array([float(e in r) for r, _ in plan]),
                 jnp.asarray(_measured_rows([whole.mask[c] for c in filters])),
-                not moving & set(positions.tolist()) and _is_affine(e, reads[e], template),
+                not links.intersection(positions.tolist()) and _is_affine(e, reads[e], template.model),
             )
         )
     return tuple(out)
@@ -137,9 +137,9 @@ def _measured_rows(masks: list[Float[Array, "S columns B T"]]) -> Int[np.ndarray
     return np.flatnonzero(np.repeat(some.T[..., None], masks[0].shape[-1], axis=-1))
 
 
-def _is_affine(experiment: str, channels: tuple[str, ...], template: Fit) -> bool:
-    """Excursions and the torques of slack tendons are, where no link (m times c) and no effect moves."""
-    return not template.model.effects and (EXPERIMENTS[experiment].slack or channels == ("tendon_excursion",))
+def _is_affine(experiment: str, channels: tuple[str, ...], model: Model) -> bool:
+    """Excursions and the torques of slack tendons are in the parameters, where no link (m times c) is free."""
+    return not model.effects and (EXPERIMENTS[experiment].slack or channels == ("tendon_excursion",))
 
 
 def _padded(batch: Batch, T: int) -> Batch:

@@ -57,24 +57,32 @@ def whiten(
 
     With `demean`, what a constant per trial and column could explain is projected out (the encoders' arbitrary zero).
     """
-    lags = range(coefficients.shape[1])
+    order = coefficients.shape[1] - 1
+    column = jnp.arange(len(r))[:, None, None]
+    filters = coefficients[column, history(mask, order).astype(int)] * mask[..., None]  # (columns, B, T, lags)
     r = r * mask
-
-    def lag(a, k):
-        return a if k == 0 else jnp.pad(a[..., :-k], ((0, 0), (0, 0), (k, 0)))
-
-    before = [mask]  # 1 where that many samples before count without a gap
-    for k in lags[1:]:
-        before.append(before[-1] * lag(mask, k))
-    number = sum(before[1:], jnp.zeros_like(mask)).astype(int)
-    filters = [jnp.take_along_axis(coefficients[:, :, k, None], number.reshape(len(r), 1, -1), 1) for k in lags]
-    filters = [f.reshape(r.shape) * mask for f in filters]
-    white = sum((f * lag(r, k) for k, f in enumerate(filters)), jnp.zeros_like(r))
+    white = filters[..., 0] * r
+    for k in range(1, order + 1):
+        white = white + filters[..., k] * _lag(r, k)
     if demean:
-        constant = sum(filters, jnp.zeros_like(r))
+        constant = filters.sum(axis=-1)
         energy = jnp.maximum(jnp.sum(constant * constant, axis=-1, keepdims=True), 1e-300)
         white = white - constant * jnp.sum(constant * white, axis=-1, keepdims=True) / energy
     return white
+
+
+def history(mask, order: int):
+    """How many samples before each count without a gap, at most `order`; for arrays of NumPy and of JAX."""
+    unbroken, total = mask, mask * 0
+    for k in range(1, order + 1):
+        unbroken = unbroken * _lag(mask, k)
+        total = total + unbroken
+    return total
+
+
+def _lag(a, k: int):
+    """a, k samples later."""
+    return a.__array_namespace__().pad(a[..., :-k], ((0, 0), (0, 0), (k, 0)))
 
 
 def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B T"]) -> Noise:
