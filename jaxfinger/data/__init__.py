@@ -7,6 +7,7 @@ from jaxfinger.data.filtering import low_pass as low_pass
 from jaxfinger.data.filtering import outlier_mask as outlier_mask
 from jaxfinger.data.filtering import shrink as shrink
 from jaxfinger.data.filtering import smooth as smooth
+from jaxfinger.data.filtering import width as width
 from jaxfinger.data.filtering import without_spikes as without_spikes
 from jaxfinger.data.findings import Finding as Finding
 from jaxfinger.data.hdf5 import data_hash as data_hash

@@ -40,6 +40,7 @@ class JointPresliding(CatalogueEffect):
     SHAPES: ClassVar = {"x0": ("rad", (0.002, 0.004, 0.008, 0.016, 0.03, 0.06, 0.12, 0.24))}
     SHOWS: ClassVar = TORQUE
     has_memory: ClassVar = True
+    sharp: ClassVar = True
 
     a: Float[Array, ""]
     x0: Float[Array, ""]

@@ -27,10 +27,10 @@ class TorqueSensorScale(CatalogueEffect):
 
 
 class TorqueSensorDrift(CatalogueEffect):
-    """Offset that moves after the sensor was tared, before each trial: b T (1 − exp(−t/T)), and a slow wandering.
+    """Offset that moves after the sensor was tared: b T (1 − exp(−t/T)), and a slow wandering.
 
-    It wanders with the session's time s: A cos(2π s/P) + B sin(2π s/P) and as much with the period P/ρ, less its value
-    at the tare.
+    t counts from the tare, `tare` seconds before the trial. It wanders with the session's time s:
+    A cos(2π s/P) + B sin(2π s/P) and as much with the period P/ρ, less its value at the tare.
     """
 
     ID: ClassVar = "torque_sensor_drift"
@@ -40,9 +40,10 @@ class TorqueSensorDrift(CatalogueEffect):
         **{n: ("N m", 3e-4, True) for n in ("A", "B", "A_2", "B_2")},
     }
     SHAPES: ClassVar = {
-        "T": ("s", (1e4, 30.0, 10.0, 3.0)),
+        "T": ("s", (1e4, 6.0)),
         "P": ("s", (60.0, 90.0, 140.0, 250.0, 600.0, 1500.0)),
         "rho": ("1", (1.6, 2.5)),
+        "tare": ("s", (1.0, 6.0)),
     }
     SHOWS: ClassVar = TORQUE_SENSOR
 
@@ -54,15 +55,16 @@ class TorqueSensorDrift(CatalogueEffect):
     T: Float[Array, ""]
     P: Float[Array, ""]
     rho: Float[Array, ""]
+    tare: Float[Array, ""]
 
     def reading(self, channel, x, y):
         if channel != "joint_torque":
             return y
-        wander = 0.0
+        since, wander = x.time + self.tare, 0.0
         for a, b, period in ((self.A, self.B, self.P), (self.A_2, self.B_2, self.P / self.rho)):
-            now, tare = (2.0 * jnp.pi * s / period for s in (x.session_time, x.session_time - x.time))
+            now, tare = (2.0 * jnp.pi * s / period for s in (x.session_time, x.session_time - since))
             wander += a * (jnp.cos(now) - jnp.cos(tare)) + b * (jnp.sin(now) - jnp.sin(tare))
-        return y + (self.slope * self.T * -jnp.expm1(-x.time / self.T) + wander) * x.motorised
+        return y + (self.slope * self.T * -jnp.expm1(-since / self.T) + wander) * x.motorised
 
 
 class TensionSensorScale(CatalogueEffect):

@@ -65,6 +65,7 @@ class TendonBacklash(CatalogueEffect):
     SHAPES: ClassVar = {"width": ("m", (2e-5, 4e-5, 8e-5, 1.6e-4, 3.2e-4, 6.4e-4))}
     SHOWS: ClassVar = EXCURSION
     has_memory: ClassVar = True
+    sharp: ClassVar = True
 
     a: Float[Array, ""]
     width: Float[Array, ""]

@@ -64,6 +64,7 @@ class TendonFrictionPresliding(CatalogueEffect):
     SHAPES: ClassVar = {"x0": ("m", (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)), "f0": ("N", (0.3, 1.0, 3.0))}
     SHOWS: ClassVar = TENSION
     has_memory: ClassVar = True
+    sharp: ClassVar = True
 
     a: Float[Array, ""]
     x0: Float[Array, ""]

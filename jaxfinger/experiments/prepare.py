@@ -22,6 +22,7 @@ from jaxfinger.data import (
     outlier_mask,
     shrink,
     smooth,
+    width,
     without_spikes,
 )
 from jaxfinger.errors import UserError
@@ -174,6 +175,11 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         "session_time": time + start,
         "motorised": mean(motorised).T,
     }
+    # What noise of single samples spans, and of means over a block: an angle that turns back by less is at rest.
+    jitter = (4.0 if reduced else 8.0) * 1.4826 * np.median(np.abs(trial.q - filtered), axis=0)
+    motion["jitter"] = np.broadcast_to(jitter[:, None], (m, M))
+    if reduced:
+        motion["blur"] = np.full(M, width(cutoff) if spec.samples == "sliding" else 0.0)
     # Joints that are held have no inertia: ramps of the tension count as well as holds.
     between = _goes_on(tension_mean, hold)[:, None] if spec.held else mean(slides) > 1.0 - 1e-9
     y_mean, mask_mean = {}, {}

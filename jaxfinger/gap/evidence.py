@@ -76,7 +76,7 @@ def evidence(variant: Variant, Z: np.ndarray, Zt: np.ndarray, rt: np.ndarray) ->
     floor = max(1e-12 * np.trace(G), 1e-20)
     information = G + floor * np.eye(k)
     a = np.linalg.lstsq(information, b, rcond=1e-10)[0]
-    std = np.sqrt(np.diag(np.linalg.pinv(information, rcond=1e-10)))
+    std = np.sqrt(np.diag(np.linalg.pinv(information, rcond=1e-10, hermitian=True)))
     if k == 1 and a[0] < 0 and not next(iter(variant.effect.AMPLITUDES.values()))[2]:
         return Evidence(variant, np.zeros(1), std, 0.0, float(logsumexp(logs) - np.log(len(logs))), absorbed)
     return Evidence(variant, a, std, float(b @ a), float(logsumexp(logs) - np.log(len(logs))), absorbed)

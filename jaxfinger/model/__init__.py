@@ -11,12 +11,12 @@ from jaxfinger.model.dynamics import (  # noqa: E402
     external_torque,
     fingertip_force,
     joint_tension,
-    memories,
     resisting_torque,
     rigid_body_torque,
 )
 from jaxfinger.model.finger import Finger  # noqa: E402
 from jaxfinger.model.joint_torque import JointTorque  # noqa: E402
+from jaxfinger.model.memory import memories  # noqa: E402
 from jaxfinger.model.model import Effect, Model  # noqa: E402
 from jaxfinger.model.moment_arm import MomentArm  # noqa: E402
 from jaxfinger.model.motion import Motion  # noqa: E402

@@ -7,12 +7,12 @@ Every experiment reads one of its unknowns from the others; all functions broadc
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfinger.model import rigid_body
 from jaxfinger.model.finger import Finger
+from jaxfinger.model.memory import memories
 from jaxfinger.model.model import Memory, Model
 from jaxfinger.model.motion import Motion
 from jaxfinger.model.tendon_friction import bounded, held
@@ -30,24 +30,6 @@ class Terms(NamedTuple):
     friction: Float[Array, "m *T"]  # |τ_f|, N m
     direction: Float[Array, "m *T"]  # share of it that is built up
     tendon_direction: Float[Array, "n *T"]
-
-
-def memories(model: Model, x: Motion) -> tuple[Memory, ...]:
-    """State of every effect with memory at each sample, driven along the motion's last axis."""
-    return tuple(_along(model, effect, x) if effect.has_memory else () for effect in model.effects)
-
-
-def _along(model: Model, effect, x: Motion) -> Memory:
-    samples = jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), x)
-    first = jax.tree.map(lambda a: a[0], samples)
-
-    def step(carry, sample):
-        memory, before = carry
-        memory = effect.next_memory(model, memory, before, sample)
-        return (memory, sample), memory
-
-    _, memory = jax.lax.scan(step, (effect.initial_memory(model, first), first), samples)
-    return jax.tree.map(lambda a: jnp.moveaxis(a, 0, -1), memory)
 
 
 def terms(model: Model, x: Motion, memory: tuple[Memory, ...]) -> Terms:

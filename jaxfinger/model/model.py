@@ -23,6 +23,8 @@ class Effect(eqx.Module):
     """
 
     has_memory: ClassVar[bool] = False
+    # Whether the memory turns corners within a sample of a fit, as friction does at a reversal.
+    sharp: ClassVar[bool] = False
 
     # Sensors: what the finger did, from what the sensors said; and what a sensor says of what the finger does.
     def true_motion(self, x: Motion) -> Motion:

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxfinger.data import low_pass, smooth, width
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.effects.base import dahl, rate
 from jaxfinger.model import excursion, joint_tension, memories
@@ -42,6 +43,58 @@ def test_dahl_friction_builds_up_over_its_angle():
     found = state(CATALOGUE["joint_presliding"].at(FINGER, (FINGER.joint_names[1],), x0=0.06))
     # Between samples the operator sees a straight line: a reversal inside a step is seen at its end.
     np.testing.assert_allclose(found, z[::FINE], atol=2e-3)
+
+
+RECORDED = 1000.0  # Hz
+CUTOFF = 10.0
+
+
+@pytest.mark.parametrize(
+    ("name", "site", "values"),
+    [
+        ("joint_presliding", FINGER.joint_names[1], {"x0": 0.006}),
+        ("tendon_friction_presliding", "T1", {"x0": 6e-5}),
+        ("tendon_backlash", "T1", {"width": 1e-4}),
+    ],
+)
+def test_a_sharp_memory_is_what_the_low_pass_and_the_mean_leave_of_it(name, site, values):
+    """Driven at 50 Hz by angles below 10 Hz, against the memory at 1 kHz, filtered and averaged."""
+    effect = CATALOGUE[name].at(FINGER, (site,), **values)
+    x = motion(int(RECORDED), RECORDED)
+    truth = jax.tree.leaves(memories(with_effects(effect), x))[-1 if name == "tendon_backlash" else 0]
+    expected = low_pass(np.asarray(x.time), np.asarray(truth), CUTOFF).reshape(-1, 20).mean(axis=1)
+
+    def block(a):
+        return jnp.asarray(np.asarray(a).reshape(*a.shape[:-1], -1, 20).mean(axis=-1))
+
+    q, qd, qdd = smooth(np.asarray(x.time), np.asarray(x.q).T, CUTOFF)
+    seen = jax.tree.map(block, replace(x, q=q.T, qd=qd.T, qdd=qdd.T))
+    at_samples, shown = (
+        np.asarray(jax.tree.leaves(memories(with_effects(effect), y))[-1 if name == "tendon_backlash" else 0])
+        for y in (seen, replace(seen, blur=jnp.full_like(seen.time, width(CUTOFF))))
+    )
+    inner = slice(5, -5)
+    error, before = (np.abs(z - expected)[inner].max() / np.ptp(truth) for z in (shown, at_samples))
+    assert error < 0.02
+    assert error < 0.1 * before
+
+
+def test_noise_of_an_encoder_at_rest_does_not_undo_friction():
+    """A joint goes forward, rests, and goes back: what has built up stays until then."""
+    rng, std = np.random.default_rng(0), 2e-4
+    q = np.concatenate([np.linspace(0, 0.3, 50), np.full(400, 0.3), np.linspace(0.3, 0, 50)])
+    noisy = jnp.asarray(X.q[:, :1] + q + rng.normal(0, std, q.size))
+    time = jnp.arange(q.size) / 250.0
+    x = jax.tree.map(lambda a: jnp.repeat(a[..., :1], q.size, axis=-1), X)
+    x = replace(x, time=time, q=noisy)
+    effect = CATALOGUE["joint_presliding"].at(FINGER, (FINGER.joint_names[1],), x0=0.002)
+    expected = memories(with_effects(effect), replace(x, q=X.q[:, :1] + jnp.asarray(q)))[0]
+    naive = memories(with_effects(effect), x)[0]
+    shown = memories(with_effects(effect), replace(x, jitter=jnp.full_like(noisy, 8 * std)))[0]
+    resting = slice(55, 445)
+    assert np.abs(naive - expected)[resting].max() > 0.5
+    np.testing.assert_allclose(shown[resting], expected[resting], atol=1e-3)
+    np.testing.assert_allclose(shown[-1], expected[-1], atol=0.1)
 
 
 @given(st.lists(st.floats(-0.2, 0.2), min_size=1, max_size=20), st.floats(-1, 1))
