@@ -54,14 +54,14 @@ class TendonFrictionViscous(CatalogueEffect):
 class TendonFrictionPresliding(CatalogueEffect):
     """Friction builds up over a small excursion x₀ after each reversal: dz = (dl − |dl| z)/x₀ (Dahl, LuGre).
 
-    At a held joint the tendon slides by its own stretch, in proportion to tension: there the length is f₀ of tension.
-    `a` is the share of the loss that behaves so.
+    At a held joint the tendon slides by its own stretch, in proportion to tension: there the length is f₀ of tension,
+    0 for a tendon that does not stretch, whose friction there is the nominal one. `a` is the share of the loss that behaves so.
     """
 
     ID: ClassVar = "tendon_friction_presliding"
     PLACE: ClassVar = "tendon"
     AMPLITUDES: ClassVar = {"a": ("1", 1.0, False)}
-    SHAPES: ClassVar = {"x0": ("m", (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)), "f0": ("N", (0.3, 1.0, 3.0))}
+    SHAPES: ClassVar = {"x0": ("m", (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)), "f0": ("N", (0.0, 0.3, 1.0, 3.0))}
     SHOWS: ClassVar = TENSION
     has_memory: ClassVar = True
     sharp: ClassVar = True
@@ -79,7 +79,7 @@ class TendonFrictionPresliding(CatalogueEffect):
         k, (z, l_before) = self.index[0], memory
         l = model.moment_arm.excursion(x.q)[k]
         if x.held:
-            return dahl(z, x.tension[k] - before.tension[k], self.f0), l
+            return dahl(z, x.tension[k] - before.tension[k], jnp.maximum(self.f0, 1e-6)), l
         return dahl(z, l - l_before, self.x0), l
 
     def directions(self, x, memory, joint, tendon):
@@ -88,7 +88,8 @@ class TendonFrictionPresliding(CatalogueEffect):
 
     def held_tension(self, x, memory, f, loss, f_j):
         k = self.index[0]
-        return f_j.at[k].set((1 - self.a) * f_j[k] + self.a * (f[k] - memory[0] * loss[k]))
+        built_up = f[k] - memory[0] * loss[k]
+        return f_j.at[k].add(jnp.where(self.f0 > 0.0, self.a, 0.0) * (built_up - f_j[k]))
 
 
 class TendonFrictionSaturating(CatalogueEffect):

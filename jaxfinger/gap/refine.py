@@ -266,7 +266,9 @@ def _evaluate(signatures: Signatures, effects, coordinates):
 
 def _step_taken(before, after, c: _Coordinate) -> float:
     a, b = float(getattr(before, c.name)), float(getattr(after, c.name))
-    return (b - a) / c.unit if c.amplitude or c.name in ADDITIVE else float(np.log(b / a))
+    if c.amplitude or c.name in ADDITIVE:
+        return (b - a) / c.unit
+    return float(np.log(b / a)) if a else 0.0
 
 
 def _cost(projector, problem, r) -> float:

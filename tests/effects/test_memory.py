@@ -97,6 +97,20 @@ def test_noise_of_an_encoder_at_rest_does_not_undo_friction():
     np.testing.assert_allclose(shown[-1], expected[-1], atol=0.1)
 
 
+def test_a_tendon_that_does_not_stretch_keeps_the_nominal_friction_at_held_joints():
+    x = motion(held=True)
+    k = FINGER.tendon_names.index("T1")
+    nominal = np.asarray(joint_tension(MODEL, x))
+    stiff, stretching = (
+        np.asarray(
+            joint_tension(with_effects(CATALOGUE["tendon_friction_presliding"].at(FINGER, ("T1",), a=1.0, f0=f0)), x)
+        )
+        for f0 in (0.0, 1.0)
+    )
+    np.testing.assert_array_equal(stiff, nominal)
+    assert np.abs(stretching - nominal)[k].max() > 0.01
+
+
 @given(st.lists(st.floats(-0.2, 0.2), min_size=1, max_size=20), st.floats(-1, 1))
 @settings(max_examples=40, deadline=None)
 def test_dahl_state_stays_within_the_friction(steps, z):
