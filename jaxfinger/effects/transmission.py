@@ -55,7 +55,8 @@ class TendonFrictionPresliding(CatalogueEffect):
     """Friction builds up over a small excursion x₀ after each reversal: dz = (dl − |dl| z)/x₀ (Dahl, LuGre).
 
     At a held joint the tendon slides by its own stretch, in proportion to tension: there the length is f₀ of tension,
-    0 for a tendon that does not stretch, whose friction there is the nominal one. `a` is the share of the loss that behaves so.
+    0 for a tendon that does not stretch, whose friction there is the nominal one. `a` is the share of the loss that
+    behaves so.
     """
 
     ID: ClassVar = "tendon_friction_presliding"
