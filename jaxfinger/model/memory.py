@@ -61,7 +61,7 @@ def _finer(x: Motion) -> Motion:
 
     def between(a, bend):
         inner = a[..., :-1, None] + s * jnp.diff(a)[..., None] + bend
-        return jnp.concatenate([inner.reshape(*a.shape[:-1], -1), a[..., -1:]], axis=-1)
+        return jnp.concatenate([inner.reshape(*a.shape[:-1], FINER * (a.shape[-1] - 1)), a[..., -1:]], axis=-1)
 
     step, rise = jnp.diff(x.time), jnp.diff(x.q)
     leaving, arriving = (jnp.where(step > 0.0, step * qd - rise, 0.0) for qd in (x.qd[..., :-1], x.qd[..., 1:]))

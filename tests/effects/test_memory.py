@@ -79,6 +79,13 @@ def test_a_sharp_memory_is_what_the_low_pass_and_the_mean_leave_of_it(name, site
     assert error < 0.1 * before
 
 
+def test_an_axis_without_tendons_has_a_memory_too():
+    effect = CATALOGUE["joint_presliding"].at(FINGER, (FINGER.joint_names[1],), x0=0.006)
+    x = replace(X, blur=jnp.full_like(X.time, width(CUTOFF)))
+    bare = replace(x, tension=x.tension[:0], tendon_direction=x.tendon_direction[:0])
+    np.testing.assert_array_equal(*(memories(with_effects(effect), y)[0] for y in (x, bare)))
+
+
 def test_noise_of_an_encoder_at_rest_does_not_undo_friction():
     """A joint goes forward, rests, and goes back: what has built up stays until then."""
     rng, std = np.random.default_rng(0), 2e-4
