@@ -27,7 +27,7 @@ from jaxfinger.model import (
     resisting_torque,
 )
 
-CHUNK = 8  # members of one call
+CHUNK = 8  # members of one call, at most
 LENGTH, COUNT = 512, 8  # stacks are padded to multiples of these, so that sessions share compilations
 QUICK = {"xla_backend_optimization_level": 0}  # a signature runs a few times: compiling it must be cheap
 
@@ -70,8 +70,9 @@ def _change(
     x: Motion,
     y0: Float[Array, "columns B T"],
     contact: Array | None,
+    count: Array,
 ) -> Float[Array, "variants columns B T"]:
-    """Change of one channel's prediction, one row a member of `effects` (arrays stacked along their first axis)."""
+    """Change of one channel's prediction by the first `count` of `effects` (arrays stacked along their first axis)."""
     base = 0.0 if channel == "tendon_excursion" else resisting_torque(nominal, x)
 
     def one(effect):
@@ -87,7 +88,10 @@ def _change(
             y = y0 + (change if contact is None else jnp.sum(contact * change[None], axis=1))
         return effect.reading(channel, true, y) - y0
 
-    return jax.lax.map(one, effects)
+    def put(k, out):
+        return out.at[k].set(one(jax.tree.map(lambda a: a[k], effects)))
+
+    return jax.lax.fori_loop(0, count, put, jnp.zeros((CHUNK, *y0.shape)))
 
 
 _contact = eqx.filter_jit(contact_map)
@@ -143,20 +147,21 @@ class Signatures:
 
     def of(self, members: list[CatalogueEffect]) -> Float[np.ndarray, "members N"]:
         """Whitened change of every row, for effects of one class."""
-        padded = members + [members[0]] * (-len(members) % CHUNK)
-        chunks = [self._chunk(padded[k : k + CHUNK]) for k in range(0, len(padded), CHUNK)]
-        return np.concatenate(chunks)[: len(members)]
+        return np.concatenate([self._chunk(members[k : k + CHUNK]) for k in range(0, len(members), CHUNK)])
 
     def _chunk(self, members: list[CatalogueEffect]) -> Float[np.ndarray, "members N"]:
         out = np.zeros((len(members), self.problem.r.size))
         kind = type(members[0])
-        stacked = jax.tree.map(lambda *a: np.stack(a), *[replace(m, site=()) for m in members])
+        padded = members + members[:1] * (CHUNK - len(members))
+        stacked = jax.tree.map(lambda *a: np.stack(a), *[replace(m, site=()) for m in padded])
         for group in self._groups:
             shown = [e for e in group.first if group.channel in kind.SHOWS.get(e, ())]
             if not shown:
                 continue
             contact = _contact(self.nominal, group.x) if group.channel == "fingertip_force" else None
-            raw = np.asarray(_change(group.channel, stacked, self.nominal, group.x, group.y0, contact))
+            count = jnp.asarray(len(members))
+            raw = np.asarray(_change(group.channel, stacked, self.nominal, group.x, group.y0, contact, count))
+            raw = raw[: len(members)]
             for e in shown:
                 rows = self.problem.rows[e]
                 B = len(self.problem.stacks[e].trials)
