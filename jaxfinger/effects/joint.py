@@ -15,7 +15,7 @@ class JointStribeck(CatalogueEffect):
     ID: ClassVar = "joint_stribeck"
     PLACE: ClassVar = "joint"
     AMPLITUDES: ClassVar = {"a": ("1", 0.5, False)}
-    SHAPES: ClassVar = {"v_s": ("rad/s", (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)), "delta": ("1", (1.0, 2.0))}
+    SHAPES: ClassVar = {"v_s": ("rad/s", (0.02, 0.05, 0.1, 0.2, 0.4)), "delta": ("1", (1.0, 2.0))}
     SHOWS: ClassVar = TORQUE
 
     a: Float[Array, ""]

@@ -112,25 +112,28 @@ class TendonFrictionSaturating(CatalogueEffect):
 
 
 class TendonCrosstalk(CatalogueEffect):
-    """f_k + ε f_j: a pulled tendon j drags its neighbour k.
+    """f_k + ε max(f_j − f₀, 0): a pulled tendon j drags its neighbour k, from the tension on at which they touch.
 
     `behind` 0: at the actuators, so that the neighbour's friction takes its share; 1: past the friction of both.
+    `onset` is f₀.
     """
 
     ID: ClassVar = "tendon_crosstalk"
     PLACE: ClassVar = "tendon pair"
     AMPLITUDES: ClassVar = {"epsilon": ("1", 0.05, False)}
     SIZES: ClassVar = (1.0, 0.05)
-    SHAPES: ClassVar = {"behind": ("1", (0.0, 1.0))}
+    SHAPES: ClassVar = {"behind": ("1", (0.0, 1.0)), "onset": ("N", (0.0, 3.0))}
     SHOWS: ClassVar = TENSION
 
     epsilon: Float[Array, ""]
     behind: Float[Array, ""]
+    onset: Float[Array, ""]
+
+    def _drag(self, f):
+        return self.epsilon * jnp.maximum(f[self.index[1]] - self.onset, 0.0)
 
     def tension(self, x, memory, f):
-        dragged, pulled = self.index
-        return f.at[dragged].add((1.0 - self.behind) * self.epsilon * x.tension[pulled])
+        return f.at[self.index[0]].add((1.0 - self.behind) * self._drag(x.tension))
 
     def delivered(self, x, f_j):
-        dragged, pulled = self.index
-        return f_j.at[dragged].add(self.behind * self.epsilon * f_j[pulled])
+        return f_j.at[self.index[0]].add(self.behind * self._drag(f_j))
