@@ -265,12 +265,14 @@ def test_payload_is_a_body_screwed_to_a_link():
     np.testing.assert_allclose(linear, 0.5 * (found + bare), atol=1e-12)
 
 
+@pytest.mark.parametrize("onset", [0.0, 5.0])
 @pytest.mark.parametrize("behind", [0.0, 1.0])
-def test_crosstalk_adds_to_the_neighbour_before_or_past_its_friction(behind):
+def test_crosstalk_adds_to_the_neighbour_before_or_past_its_friction(behind, onset):
     names = FINGER.tendon_names
-    effect = CATALOGUE["tendon_crosstalk"].at(FINGER, (names[0], names[1]), epsilon=0.1, behind=behind)
+    effect = CATALOGUE["tendon_crosstalk"].at(FINGER, (names[0], names[1]), epsilon=0.1, behind=behind, onset=onset)
     found, bare = (joint_tension(m, X) for m in (with_effects(effect), MODEL))
     np.testing.assert_allclose(found[1:], bare[1:], atol=1e-15)
-    f = X.tension.at[0].add((1.0 - behind) * 0.1 * X.tension[1])
+    drag = 0.1 * np.maximum(np.stack([X.tension[1], bare[1]]) - onset, 0.0)
+    f = X.tension.at[0].add((1.0 - behind) * drag[0])
     entered = joint_tension(MODEL, eqx.tree_at(lambda x: x.tension, X, f))
-    np.testing.assert_allclose(found[0], entered[0] + behind * 0.1 * bare[1], atol=1e-12)
+    np.testing.assert_allclose(found[0], entered[0] + behind * drag[1], atol=1e-12)
