@@ -25,6 +25,8 @@ class CatalogueEffect(Effect):
     PLACE: ClassVar[str]  # joint, tendon, joint pair, tendon pair, channel, or the site's own name
     AMPLITUDES: ClassVar[dict[str, tuple[str, float, bool]]]
     SHAPES: ClassVar[dict[str, tuple[str, tuple[float, ...]]]] = {}
+    # Amplitudes that are the share of something: at most one.
+    SHARES: ClassVar[tuple[str, ...]] = ()
     # Plausible sizes at which its signature is read: several where it decides whether a held tendon slips.
     SIZES: ClassVar[tuple[float, ...]] = (1.0,)
     # Experiments and channels that can show the effect; everywhere else it is silent.

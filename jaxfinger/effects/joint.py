@@ -37,6 +37,7 @@ class JointPresliding(CatalogueEffect):
     ID: ClassVar = "joint_presliding"
     PLACE: ClassVar = "joint"
     AMPLITUDES: ClassVar = {"a": ("1", 1.0, False)}
+    SHARES: ClassVar = ("a",)
     SHAPES: ClassVar = {"x0": ("rad", (0.002, 0.004, 0.008, 0.016, 0.03, 0.06, 0.12, 0.24))}
     SHOWS: ClassVar = TORQUE
     has_memory: ClassVar = True

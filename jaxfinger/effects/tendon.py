@@ -62,6 +62,7 @@ class TendonBacklash(CatalogueEffect):
     ID: ClassVar = "tendon_backlash"
     PLACE: ClassVar = "tendon"
     AMPLITUDES: ClassVar = {"a": ("1", 1.0, False)}
+    SHARES: ClassVar = ("a",)
     SHAPES: ClassVar = {"width": ("m", (2e-5, 4e-5, 8e-5, 1.6e-4, 3.2e-4, 6.4e-4))}
     SHOWS: ClassVar = EXCURSION
     has_memory: ClassVar = True

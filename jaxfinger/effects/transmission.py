@@ -62,6 +62,7 @@ class TendonFrictionPresliding(CatalogueEffect):
     ID: ClassVar = "tendon_friction_presliding"
     PLACE: ClassVar = "tendon"
     AMPLITUDES: ClassVar = {"a": ("1", 1.0, False)}
+    SHARES: ClassVar = ("a",)
     SHAPES: ClassVar = {"x0": ("m", (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)), "f0": ("N", (0.0, 0.3, 1.0, 3.0))}
     SHOWS: ClassVar = TENSION
     has_memory: ClassVar = True

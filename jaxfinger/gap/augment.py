@@ -1,5 +1,6 @@
 """The augmented model: the effects of the verdict and every nominal parameter, fitted exactly and together."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
@@ -29,22 +30,30 @@ def augmented_fit(problem: Problem, chosen: Refined) -> tuple[Fit, np.ndarray, n
     model = eqx.tree_at(lambda m: m.effects, problem.nominal, chosen.effects, is_leaf=lambda v: isinstance(v, tuple))
     parameters = describe(model)
     first = ravel(problem.nominal).size
-    moving = [i for i in range(first, len(parameters)) if _moves(parameters[i])]
+    values, most = (np.asarray(ravel(m)) for m in (model, _on_effects(_most, model)))
+    moving = [i for i in range(first, len(parameters)) if _moves(parameters[i]) and values[i] < most[i]]
     free = np.concatenate([problem.free, moving]).astype(int)
     sources = {e: _with_effects(s, chosen, moving, first, len(parameters), e) for e, s in problem.sources.items()}
-    values = np.asarray(ravel(model))
     # A weak prior on amplitudes and shapes, so that a flat direction stays put.
     mean = np.concatenate([problem.prior.mean, values[moving]])
     root = np.zeros((len(problem.root) + len(moving), free.size))
     root[: len(problem.root), : problem.free.size] = problem.root
-    wide = eqx.tree_at(
-        lambda m: m.effects, model, tuple(map(_widths, chosen.effects)), is_leaf=lambda v: isinstance(v, tuple)
-    )
-    root[len(problem.root) :, problem.free.size :] = np.diag(1.0 / np.asarray(ravel(wide))[moving])
+    wide = np.asarray(ravel(_on_effects(_widths, model)))
+    root[len(problem.root) :, problem.free.size :] = np.diag(1.0 / wide[moving])
     fitted, solution = solve(model, free, sources, Prior(mean, root))
     information = solution.information[np.ix_(free, free)] + root.T @ root
     r, J = assemble(solution.linearised, sources, problem.rows, free, ravel(model).size)
     return _fit(problem, fitted, free, information, "with the effects of the diagnosis", solution), r, J
+
+
+def _on_effects(change: Callable[[CatalogueEffect], CatalogueEffect], model: Model) -> Model:
+    changed = tuple(change(e) for e in model.effects if isinstance(e, CatalogueEffect))
+    return eqx.tree_at(lambda m: m.effects, model, changed, is_leaf=lambda v: isinstance(v, tuple))
+
+
+def _most(effect: CatalogueEffect) -> CatalogueEffect:
+    """Of every parameter the most that it can be; one that is there stays."""
+    return replace(effect, **{n: jnp.asarray(1.0 if n in effect.SHARES else jnp.inf) for n in effect.values()})
 
 
 def _widths(effect: CatalogueEffect) -> CatalogueEffect:

@@ -65,7 +65,7 @@ def refine(
 ) -> Refined:
     """The variants together, from amplitudes `start` (in their own units)."""
     finger = problem.nominal.finger
-    effects = [v.at(finger, s) for v, s in zip(variants, start, strict=True)]
+    effects = [within_bounds(v.at(finger, s)) for v, s in zip(variants, start, strict=True)]
     coordinates = _coordinates(variants)
     signatures, projector = Signatures(problem, problem.nominal), projector or Projector(problem)
     base, slopes = _evaluate(signatures, effects, coordinates)
@@ -232,8 +232,11 @@ def _shifted(effect: CatalogueEffect, c: _Coordinate, by: float) -> CatalogueEff
 
 
 def within_bounds(effect: CatalogueEffect) -> CatalogueEffect:
-    """The effect with one-sided amplitudes not below zero, and shapes no further out than those worth trying."""
-    bounds = {n: (0.0, np.inf) for n, (_, _, signed) in effect.AMPLITUDES.items() if not signed}
+    """The effect with one-sided amplitudes not below zero, shares not above one, and shapes no further out than those
+    worth trying.
+    """
+    signed = {n: s for n, (_, _, s) in effect.AMPLITUDES.items()}
+    bounds = {n: (-np.inf if signed[n] else 0.0, 1.0 if n in effect.SHARES else np.inf) for n in signed}
     for n, (_, grid) in effect.SHAPES.items():
         if n not in FIXED and len(grid) > 1:
             wide = 1.0 if n in ADDITIVE else 2.0
@@ -254,14 +257,19 @@ def _evaluate(signatures: Signatures, effects, coordinates):
     base, slopes = np.zeros(size), np.zeros((len(coordinates), size))
     for i, effect in enumerate(effects):
         mine = [k for k, c in enumerate(coordinates) if c.effect == i]
-        h = 0.05
-        members = [effect] + [_shifted(effect, coordinates[k], h) for k in mine]
+        members = [effect] + [_beside(effect, coordinates[k]) for k in mine]
         flat = signatures.of(members)
         base += flat[0]
         for row, k in enumerate(mine, start=1):
             step = _step_taken(effect, members[row], coordinates[k])
             slopes[k] = (flat[row] - flat[0]) / step if step else 0.0
     return base, slopes
+
+
+def _beside(effect: CatalogueEffect, c: _Coordinate, h: float = 0.05) -> CatalogueEffect:
+    """A step for a difference: back where a bound leaves no way forward."""
+    ahead = _shifted(effect, c, h)
+    return ahead if getattr(ahead, c.name) != getattr(effect, c.name) else _shifted(effect, c, -h)
 
 
 def _step_taken(before, after, c: _Coordinate) -> float:
