@@ -52,8 +52,10 @@ def _on_effects(change: Callable[[CatalogueEffect], CatalogueEffect], model: Mod
 
 
 def _most(effect: CatalogueEffect) -> CatalogueEffect:
-    """Of every parameter the most that it can be; one that is there stays."""
-    return replace(effect, **{n: jnp.asarray(1.0 if n in effect.SHARES else jnp.inf) for n in effect.values()})
+    """Of every parameter the most that it can be: one that is there stays, and so does a factor of nothing."""
+    most = {n: 1.0 if n in effect.SHARES else np.inf for n in effect.values()}
+    none = {n: 0.0 for n, v in effect.values().items() if n in effect.SHAPES and n not in ADDITIVE and v == 0.0}
+    return replace(effect, **{n: jnp.asarray(v) for n, v in (most | none).items()})
 
 
 def _widths(effect: CatalogueEffect) -> CatalogueEffect:
