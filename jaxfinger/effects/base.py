@@ -27,6 +27,9 @@ class CatalogueEffect(Effect):
     SHAPES: ClassVar[dict[str, tuple[str, tuple[float, ...]]]] = {}
     # Amplitudes that are the share of something: at most one.
     SHARES: ClassVar[tuple[str, ...]] = ()
+    # Shapes that a refit leaves as they are, and shapes that it moves by differences; it moves the others by factors.
+    CHOICES: ClassVar[tuple[str, ...]] = ()
+    SHIFTS: ClassVar[tuple[str, ...]] = ()
     # Plausible sizes at which its signature is read: several where it decides whether a held tendon slips.
     SIZES: ClassVar[tuple[float, ...]] = (1.0,)
     # Experiments and channels that can show the effect; everywhere else it is silent.

@@ -101,6 +101,7 @@ class TorqueRipple(CatalogueEffect):
     SHAPES: ClassVar = {
         "p": ("1", (4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 14.0, 16.0, 18.0, 20.0, 24.0, 28.0, 32.0))
     }
+    SHIFTS: ClassVar = ("p",)
     SHOWS: ClassVar = {e: ("joint_torque",) for e in ("ID.3-static", "ID.3-dynamic", "ID.4")}
 
     A: Float[Array, ""]

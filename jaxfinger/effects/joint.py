@@ -10,12 +10,16 @@ from jaxfinger.effects.base import ELASTIC, TORQUE, CatalogueEffect, dahl, step
 
 
 class JointStribeck(CatalogueEffect):
-    """τ_f (1 + a exp(−(|q̇|/v_s)^δ)): friction falls with speed after breakaway (Armstrong-Hélouvry 1994)."""
+    """τ_f (1 + a exp(−(|q̇|/v_s)^δ)): friction falls with speed after breakaway (Armstrong-Hélouvry 1994).
+
+    From about 1 rad/s on v_s is not told from a damping.
+    """
 
     ID: ClassVar = "joint_stribeck"
     PLACE: ClassVar = "joint"
     AMPLITUDES: ClassVar = {"a": ("1", 0.5, False)}
     SHAPES: ClassVar = {"v_s": ("rad/s", (0.02, 0.05, 0.1, 0.2, 0.4)), "delta": ("1", (1.0, 2.0))}
+    CHOICES: ClassVar = ("delta",)
     SHOWS: ClassVar = TORQUE
 
     a: Float[Array, ""]
@@ -90,6 +94,7 @@ class ElasticHardening(_TowardsAnEnd):
     PLACE: ClassVar = "joint"
     AMPLITUDES: ClassVar = {"tau_end": ("N m", 0.02, False)}
     SHAPES: ClassVar = {"width": ("rad", (0.1, 0.2, 0.4, 0.7)), "end": ("1", (1.0, -1.0))}
+    CHOICES: ClassVar = ("end",)
     SHOWS: ClassVar = ELASTIC
 
     tau_end: Float[Array, ""]
@@ -114,6 +119,8 @@ class JointStop(_TowardsAnEnd):
         "end": ("1", (1.0, -1.0)),
         "damping": ("s/rad", (0.0,)),
     }
+    CHOICES: ClassVar = ("end", "damping")
+    SHIFTS: ClassVar = ("place",)
     SHOWS: ClassVar = ELASTIC
 
     stiffness: Float[Array, ""]
@@ -169,6 +176,8 @@ class PassiveTendon(CatalogueEffect):
         "phi": ("rad", (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5)),
         "side": ("1", (1.0, -1.0)),
     }
+    CHOICES: ClassVar = ("side",)
+    SHIFTS: ClassVar = ("phi",)
     SHOWS: ClassVar = ELASTIC
 
     kappa: Float[Array, ""]

@@ -16,6 +16,7 @@ class TendonStretch(CatalogueEffect):
     PLACE: ClassVar = "tendon"
     AMPLITUDES: ClassVar = {"compliance": ("m/N", 5e-5, False)}
     SHAPES: ClassVar = {"toe": ("1", (0.0, 2.0)), "f0": ("N", (1.0, 3.0))}
+    SHIFTS: ClassVar = ("toe",)
     SHOWS: ClassVar = EXCURSION
 
     compliance: Float[Array, ""]
@@ -55,8 +56,8 @@ class TendonCreep(CatalogueEffect):
 class TendonBacklash(CatalogueEffect):
     """Excursion lags by a dead zone: p = clip(p before, f(q) − b/2, f(q) + b/2), the play operator.
 
-    `a` is the share of the excursion that goes through the dead zone `width`; 1 where all of it does. A zone narrower
-    than 10 µm, an encoder's noise, is not looked for: there the noise of the angles decides when it is crossed.
+    `a` is the share of the excursion that goes through the dead zone `width`; 1 where all of it does. None
+    narrower than 10 µm, an encoder's noise, is looked for.
     """
 
     ID: ClassVar = "tendon_backlash"
@@ -91,6 +92,7 @@ class MomentArmCoupling(CatalogueEffect):
     PLACE: ClassVar = "tendon"
     AMPLITUDES: ClassVar = {"A": ("m", 5e-4, True), "B": ("m", 3e-4, True), "D": ("m", 3e-4, True)}
     SHAPES: ClassVar = {"joint_a": ("1", (0.0,)), "joint_b": ("1", (1.0,))}
+    CHOICES: ClassVar = ("joint_a", "joint_b")
     SHOWS: ClassVar = BOTH
 
     A: Float[Array, ""]

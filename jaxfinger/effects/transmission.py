@@ -19,6 +19,7 @@ class TendonFrictionCapstan(CatalogueEffect):
     AMPLITUDES: ClassVar = {"mu": ("1/rad", 0.1, False)}
     SIZES: ClassVar = (1.0, 0.05)
     SHAPES: ClassVar = {"curvature": ("1", (1.0, 0.0))}
+    CHOICES: ClassVar = ("curvature",)
     SHOWS: ClassVar = TENSION
 
     mu: Float[Array, ""]
@@ -54,16 +55,21 @@ class TendonFrictionViscous(CatalogueEffect):
 class TendonFrictionPresliding(CatalogueEffect):
     """Friction builds up over a small excursion x₀ after each reversal: dz = (dl − |dl| z)/x₀ (Dahl, LuGre).
 
-    At a held joint the tendon slides by its own stretch, in proportion to tension: there the length is f₀ of tension,
-    0 for a tendon that does not stretch, whose friction there is the nominal one. `a` is the share of the loss that
-    behaves so.
+    At a held joint a tendon that `stretches` (1) slides by its own stretch, in proportion to tension: there the length
+    is f₀ of tension. One that does not (0) has the nominal friction there. `a` is the share of the loss that behaves
+    so.
     """
 
     ID: ClassVar = "tendon_friction_presliding"
     PLACE: ClassVar = "tendon"
     AMPLITUDES: ClassVar = {"a": ("1", 1.0, False)}
     SHARES: ClassVar = ("a",)
-    SHAPES: ClassVar = {"x0": ("m", (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)), "f0": ("N", (0.0, 0.3, 1.0, 3.0))}
+    SHAPES: ClassVar = {
+        "x0": ("m", (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)),
+        "f0": ("N", (0.3, 1.0, 3.0)),
+        "stretches": ("1", (1.0, 0.0)),
+    }
+    CHOICES: ClassVar = ("stretches",)
     SHOWS: ClassVar = TENSION
     has_memory: ClassVar = True
     sharp: ClassVar = True
@@ -71,6 +77,12 @@ class TendonFrictionPresliding(CatalogueEffect):
     a: Float[Array, ""]
     x0: Float[Array, ""]
     f0: Float[Array, ""]
+    stretches: Float[Array, ""]
+
+    @classmethod
+    def shapes(cls, finger, site):
+        first = cls.SHAPES["f0"][1][0]
+        return [s for s in super().shapes(finger, site) if s["stretches"] or s["f0"] == first]
 
     def initial_memory(self, model, x):
         k = self.index[0]
@@ -81,7 +93,7 @@ class TendonFrictionPresliding(CatalogueEffect):
         k, (z, l_before) = self.index[0], memory
         l = model.moment_arm.excursion(x.q)[k]
         if x.held:
-            return dahl(z, x.tension[k] - before.tension[k], jnp.maximum(self.f0, 1e-6)), l
+            return dahl(z, x.tension[k] - before.tension[k], self.f0), l
         return dahl(z, l - l_before, self.x0), l
 
     def directions(self, x, memory, joint, tendon):
@@ -91,7 +103,7 @@ class TendonFrictionPresliding(CatalogueEffect):
     def held_tension(self, x, memory, f, loss, f_j):
         k = self.index[0]
         built_up = f[k] - memory[0] * loss[k]
-        return f_j.at[k].add(jnp.where(self.f0 > 0.0, self.a, 0.0) * (built_up - f_j[k]))
+        return f_j.at[k].add(self.stretches * self.a * (built_up - f_j[k]))
 
 
 class TendonFrictionSaturating(CatalogueEffect):
@@ -101,6 +113,7 @@ class TendonFrictionSaturating(CatalogueEffect):
     PLACE: ClassVar = "tendon"
     AMPLITUDES: ClassVar = {"c": ("1", 0.15, True)}
     SHAPES: ClassVar = {"p": ("1", (0.5, 2.0))}
+    SHIFTS: ClassVar = ("p",)
     SHOWS: ClassVar = TENSION
 
     c: Float[Array, ""]
@@ -123,7 +136,9 @@ class TendonCrosstalk(CatalogueEffect):
     PLACE: ClassVar = "tendon pair"
     AMPLITUDES: ClassVar = {"epsilon": ("1", 0.05, False)}
     SIZES: ClassVar = (1.0, 0.05)
-    SHAPES: ClassVar = {"behind": ("1", (0.0, 1.0)), "onset": ("N", (0.0, 3.0))}
+    SHAPES: ClassVar = {"behind": ("1", (0.0, 1.0)), "onset": ("N", (0.0, 4.0))}
+    CHOICES: ClassVar = ("behind",)
+    SHIFTS: ClassVar = ("onset",)
     SHOWS: ClassVar = TENSION
 
     epsilon: Float[Array, ""]

@@ -28,6 +28,7 @@ from jaxfinger.data import (
 from jaxfinger.errors import UserError
 from jaxfinger.experiments.table import (
     ABOVE_NOISE,
+    AT_REST,
     BREAKAWAY,
     CLEAR,
     CLEAR_STEP,
@@ -112,6 +113,8 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     # Where the measured channel is not low-passed, q̇ and q̈ must not lose what is in it.
     cutoff = min(spec.cutoff * (EVERY_SAMPLE if spec.stepped or not reduced else 1.0), 0.2 / step)
     filtered, qd, qdd = smooth(trial.time, trial.q, cutoff)
+    lost = np.abs(trial.q - filtered)
+    noise = np.median(lost, axis=0)
     # When a joint turns back shows best in the slower filter: there noise of q̇ is noise in time.
     slow = spec.held or (reduced and not spec.stepped)
     turning = qd if slow else smooth(trial.time, trial.q, spec.cutoff)[1]
@@ -137,7 +140,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     y, mask = _measured(spec, trial, session, minus)
     slides = np.zeros((N, m))
     if spec.samples == "sliding" or spec.stepped:
-        slides = _sliding(spec, trial, session, filtered, qd, rate, motorised)
+        slides = _sliding(spec, trial, session, lost, noise, qd, rate, motorised)
     if reduced and spec.samples == "sliding":
         # q̈ is low-passed, so all else is too. What noise it keeps would still tell a fit of less inertia
         # (errors in variables): where q̈ does not rise above it, its mean over a tenth of a second takes its place.
@@ -175,9 +178,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         "session_time": time + start,
         "motorised": mean(motorised).T,
     }
-    # What noise of single samples spans, and of means over a block: an angle that turns back by less is at rest.
-    jitter = (4.0 if reduced else 8.0) * 1.4826 * np.median(np.abs(trial.q - filtered), axis=0)
-    motion["jitter"] = np.broadcast_to(jitter[:, None], (m, M))
+    motion["jitter"] = np.repeat(AT_REST * (1.0 if reduced else 2.0) * noise[:, None], M, axis=1)
     if reduced:
         motion["blur"] = np.full(M, width(cutoff) if spec.samples == "sliding" else 0.0)
     # Joints that are held have no inertia: ramps of the tension count as well as holds.
@@ -250,11 +251,12 @@ def _rates(trial: Trial, spec: Experiment) -> np.ndarray:
 
 
 def _sliding(
-    spec: Experiment, trial: Trial, session: Session, filtered, qd, rate: np.ndarray | None, motorised
+    spec: Experiment, trial: Trial, session: Session, lost, noise, qd, rate: np.ndarray | None, motorised
 ) -> np.ndarray:
     """(N, m): 1 where a joint and every taut tendon across it slide, so that the directions of friction are known.
 
-    `filtered`: q below the cut-off; `rate`: speeds of the tendons, none where all are slack.
+    `lost`: of q in the filter, (N, m), and its median, the `noise`; `rate`: speeds of the tendons, none where all are
+    slack.
     """
     fast = np.percentile(np.abs(qd), 95, axis=0)
     slow = np.where(motorised, MIN_DRIVEN_SPEED, MIN_JOINT_SPEED)
@@ -267,8 +269,7 @@ def _sliding(
         for i in range(session.finger.m):
             slides[:, i] &= known[:, session.finger.crosses[:, i] & session.finger.active].all(axis=1)
     # A slip of a few milliseconds is too fast for the filter, and moves every joint.
-    lost = np.abs(trial.q - filtered)
-    most = np.maximum(LOST * np.ptp(trial.q, axis=0), ABOVE_NOISE * np.median(lost, axis=0)) + ROUNDING
+    most = np.maximum(LOST * np.ptp(trial.q, axis=0), ABOVE_NOISE * noise) + ROUNDING
     slides &= np.all(lost <= most, axis=1)[:, None]
     # The filter spreads the jump of friction at a reversal, and friction before it slides is not known.
     step = float(np.median(np.diff(trial.time)))

@@ -46,6 +46,7 @@ MIN_DRIVEN_SPEED = 0.02  # rad/s: likewise a joint that a motor moves, which doe
 MIN_TENDON_SPEED = 5e-4  # m/s: likewise a tendon
 LOST = 0.025  # of a joint's travel: what the filter may lose of its angle; a smooth motion loses 0.01 to 0.02
 ABOVE_NOISE = 15.0  # times the median loss, which is the encoder's noise: what it loses must be more to be a slip
+AT_REST = 6.0  # times the median loss: an angle that turns back by less has not moved; twice that for single samples
 ROUNDING = 1e-9  # rad: what it loses of a joint that stands still in a simulated file
 CLEAR = 0.03  # s: kept clear on either side of where a joint or tendon may stick: over two widths of the filter
 BREAKAWAY = 0.06  # s: kept clear beside it after a joint that no motor moves has broken away

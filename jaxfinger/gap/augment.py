@@ -9,10 +9,10 @@ import numpy as np
 
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.gap.problem import Problem, assemble
-from jaxfinger.gap.refine import ADDITIVE, FIXED, Refined
+from jaxfinger.gap.refine import Refined
 from jaxfinger.identify import Fit
 from jaxfinger.identify.fit import StageReport
-from jaxfinger.identify.parameters import Parameter, describe, ravel
+from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.identify.solve import Prior, Solution, Source, solve
 from jaxfinger.model import Model
 
@@ -30,8 +30,8 @@ def augmented_fit(problem: Problem, chosen: Refined) -> tuple[Fit, np.ndarray, n
     model = eqx.tree_at(lambda m: m.effects, problem.nominal, chosen.effects, is_leaf=lambda v: isinstance(v, tuple))
     parameters = describe(model)
     first = ravel(problem.nominal).size
-    values, most = (np.asarray(ravel(m)) for m in (model, _on_effects(_most, model)))
-    moving = [i for i in range(first, len(parameters)) if _moves(parameters[i]) and values[i] < most[i]]
+    values, moves = (np.asarray(ravel(m)) for m in (model, _on_effects(_moves, model)))
+    moving = [i for i in range(first, len(parameters)) if parameters[i].determinable and moves[i]]
     free = np.concatenate([problem.free, moving]).astype(int)
     sources = {e: _with_effects(s, chosen, moving, first, len(parameters), e) for e, s in problem.sources.items()}
     # A weak prior on amplitudes and shapes, so that a flat direction stays put.
@@ -51,24 +51,19 @@ def _on_effects(change: Callable[[CatalogueEffect], CatalogueEffect], model: Mod
     return eqx.tree_at(lambda m: m.effects, model, changed, is_leaf=lambda v: isinstance(v, tuple))
 
 
-def _most(effect: CatalogueEffect) -> CatalogueEffect:
-    """Of every parameter the most that it can be: one that is there stays, and so does a factor of nothing."""
-    most = {n: 1.0 if n in effect.SHARES else np.inf for n in effect.values()}
-    none = {n: 0.0 for n, v in effect.values().items() if n in effect.SHAPES and n not in ADDITIVE and v == 0.0}
-    return replace(effect, **{n: jnp.asarray(v) for n, v in (most | none).items()})
+def _moves(effect: CatalogueEffect) -> CatalogueEffect:
+    """Of every parameter 1 where a fit may move it: not a choice, nor a share that is at its most."""
+    stays = {*effect.CHOICES, *(n for n in effect.SHARES if getattr(effect, n) >= 1.0)}
+    return replace(effect, **{n: jnp.asarray(float(n not in stays)) for n in effect.values()})
 
 
 def _widths(effect: CatalogueEffect) -> CatalogueEffect:
     """Of the prior: three times an amplitude's own or plausible size, three times a factor, the range of a place."""
     size = {n: abs(v) for n, v in effect.values().items()}
     amplitudes = {n: 3.0 * max(size[n], unit) for n, (_, unit, _) in effect.AMPLITUDES.items()}
-    shapes = {n: np.ptp(grid) if n in ADDITIVE else 3.0 * max(size[n], 1e-12) for n, (_, grid) in effect.SHAPES.items()}
-    return replace(effect, **{n: jnp.asarray(w, dtype=float) for n, w in (amplitudes | shapes).items()})
-
-
-def _moves(parameter: Parameter) -> bool:
-    """Not so for a choice among shapes, nor for what the finger decides."""
-    return parameter.determinable and parameter.name.rsplit(" ", 1)[-1] not in FIXED
+    factors = {n: 3.0 * max(size[n], 1e-12) for n in effect.SHAPES}
+    places = {n: np.ptp(effect.SHAPES[n][1]) for n in effect.SHIFTS}
+    return replace(effect, **{n: jnp.asarray(w, dtype=float) for n, w in (amplitudes | factors | places).items()})
 
 
 def _with_effects(source: Source, chosen: Refined, moving, first: int, size: int, experiment: str) -> Source:

@@ -288,9 +288,9 @@ def _layout(stack: Stack, filters, start: int) -> Rows:
     """Rows that count, in the order of `white_rows`: trial, channel's column, time."""
     counts, before, channel, column = [], [], [], []
     for number, c in enumerate(filters):
-        mask = (np.asarray(stack.batch.mask[c]) > 0).astype(int)
-        counts.append(np.moveaxis(mask, 1, 0))
-        before.append(np.moveaxis(history(mask, filters[c].shape[1] - 1), 1, 0))
+        mask = stack.batch.mask[c]
+        counts.append(np.moveaxis(np.asarray(mask), 1, 0))
+        before.append(np.moveaxis(np.asarray(history(mask, filters[c].shape[1] - 1), int), 1, 0))
         channel += [number] * len(mask)
         column += list(range(len(mask)))
     block = np.concatenate(counts, axis=1)  # (B, columns of all channels, T)

@@ -25,8 +25,6 @@ MAY_LOSE = 0.1  # share of what is explained, that a step of the nominal model m
 HALVINGS = 2
 LARGE = 3.0  # plausible sizes: the width of the prior on an amplitude in the evidence, which has Cauchy's tails
 WIDE = 10.0  # plausible sizes: the width of the prior that keeps amplitudes that no trial sees near nothing
-ADDITIVE = {"phi", "place", "p", "toe"}  # shapes that move by differences; the others by factors
-FIXED = {"curvature", "behind", "end", "side", "joint_a", "joint_b", "delta", "damping"}  # shapes that are choices
 
 
 @dataclass(frozen=True)
@@ -54,6 +52,7 @@ class _Coordinate:
     name: str
     amplitude: bool
     unit: float  # plausible size, or step of the shape
+    shifts: bool  # moves by differences, not by factors
 
 
 def refine(
@@ -101,7 +100,7 @@ def refine(
     std: list[dict[str, float]] = [{} for _ in variants]
     for c, v in zip(coordinates, np.sqrt(np.maximum(np.diag(covariance), 0.0)), strict=True):
         value = float(getattr(effects[c.effect], c.name))
-        std[c.effect][c.name] = float(v * c.unit if c.amplitude or c.name in ADDITIVE else v * value)
+        std[c.effect][c.name] = float(v * c.unit if c.shifts else v * value)
     chi2 = cost - float(sizes @ sizes)
     tails = float(np.sum(np.log1p(np.square(sizes * WIDE / LARGE))))
     occam = 0.5 * np.linalg.slogdet(np.eye(len(G)) + G)[1] + tails
@@ -209,11 +208,12 @@ def _sizes(effects, coordinates: list[_Coordinate]) -> Float[np.ndarray, " k"]:
 def _coordinates(variants: Sequence[Variant]) -> list[_Coordinate]:
     out = []
     for i, kind in enumerate(v.effect for v in variants):
-        out += [_Coordinate(i, n, True, unit) for n, (_, unit, _) in kind.AMPLITUDES.items()]
+        out += [_Coordinate(i, n, True, unit, True) for n, (_, unit, _) in kind.AMPLITUDES.items()]
         for n, (_, values) in kind.SHAPES.items():
-            if n not in FIXED and len(values) > 1:
-                unit = float(np.mean(np.diff(values))) / 2 if n in ADDITIVE else 1.0
-                out.append(_Coordinate(i, n, False, unit))
+            if n not in kind.CHOICES and len(values) > 1:
+                shifts = n in kind.SHIFTS
+                unit = float(np.mean(np.diff(values))) / 2 if shifts else 1.0
+                out.append(_Coordinate(i, n, False, unit, shifts))
     return out
 
 
@@ -224,7 +224,7 @@ def _prior(coordinates: list[_Coordinate]) -> Float[np.ndarray, " k"]:
 
 def _shifted(effect: CatalogueEffect, c: _Coordinate, by: float) -> CatalogueEffect:
     value = float(getattr(effect, c.name))
-    if c.amplitude or c.name in ADDITIVE:
+    if c.shifts:
         value += by * c.unit
     else:
         value *= float(np.exp(np.clip(by, -0.7, 0.7)))
@@ -238,8 +238,8 @@ def within_bounds(effect: CatalogueEffect) -> CatalogueEffect:
     signed = {n: s for n, (_, _, s) in effect.AMPLITUDES.items()}
     bounds = {n: (-np.inf if signed[n] else 0.0, 1.0 if n in effect.SHARES else np.inf) for n in signed}
     for n, (_, grid) in effect.SHAPES.items():
-        if n not in FIXED and len(grid) > 1:
-            wide = 1.0 if n in ADDITIVE else 2.0
+        if n not in effect.CHOICES and len(grid) > 1:
+            wide = 1.0 if n in effect.SHIFTS else 2.0
             bounds[n] = (min(grid) / wide, max(grid) * wide)
     return replace(effect, **{n: jnp.clip(getattr(effect, n), *ends) for n, ends in bounds.items()})
 
@@ -274,9 +274,7 @@ def _beside(effect: CatalogueEffect, c: _Coordinate, h: float = 0.05) -> Catalog
 
 def _step_taken(before, after, c: _Coordinate) -> float:
     a, b = float(getattr(before, c.name)), float(getattr(after, c.name))
-    if c.amplitude or c.name in ADDITIVE:
-        return (b - a) / c.unit
-    return float(np.log(b / a)) if a else 0.0
+    return (b - a) / c.unit if c.shifts else float(np.log(b / a))
 
 
 def _cost(projector, problem, r) -> float:

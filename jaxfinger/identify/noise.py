@@ -71,18 +71,18 @@ def whiten(
     return white
 
 
-def history(mask, order: int):
-    """How many samples before each count without a gap, at most `order`; for arrays of NumPy and of JAX."""
-    unbroken, total = mask, mask * 0
+def history(mask: Float[Array, "columns B T"], order: int) -> Float[Array, "columns B T"]:
+    """How many samples before each count without a gap, at most `order`."""
+    unbroken, total = mask, jnp.zeros_like(mask)
     for k in range(1, order + 1):
         unbroken = unbroken * _lag(mask, k)
         total = total + unbroken
     return total
 
 
-def _lag(a, k: int):
+def _lag(a: Float[Array, "columns B T"], k: int) -> Float[Array, "columns B T"]:
     """a, k samples later."""
-    return a.__array_namespace__().pad(a[..., :-k], ((0, 0), (0, 0), (k, 0)))
+    return jnp.pad(a[..., :-k], ((0, 0), (0, 0), (k, 0)))
 
 
 def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B T"]) -> Noise:

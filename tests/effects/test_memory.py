@@ -50,29 +50,30 @@ CUTOFF = 10.0
 
 
 @pytest.mark.parametrize(
-    ("name", "site", "values"),
+    ("name", "site", "values", "leaf"),
     [
-        ("joint_presliding", FINGER.joint_names[1], {"x0": 0.006}),
-        ("tendon_friction_presliding", "T1", {"x0": 6e-5}),
-        ("tendon_backlash", "T1", {"width": 1e-4}),
+        ("joint_presliding", FINGER.joint_names[1], {"x0": 0.006}, 0),
+        ("tendon_friction_presliding", "T1", {"x0": 6e-5}, 0),
+        ("tendon_backlash", "T1", {"width": 1e-4}, 1),
     ],
 )
-def test_a_sharp_memory_is_what_the_low_pass_and_the_mean_leave_of_it(name, site, values):
+def test_a_sharp_memory_is_what_the_low_pass_and_the_mean_leave_of_it(name, site, values, leaf):
     """Driven at 50 Hz by angles below 10 Hz, against the memory at 1 kHz, filtered and averaged."""
     effect = CATALOGUE[name].at(FINGER, (site,), **values)
     x = motion(int(RECORDED), RECORDED)
-    truth = jax.tree.leaves(memories(with_effects(effect), x))[-1 if name == "tendon_backlash" else 0]
-    expected = low_pass(np.asarray(x.time), np.asarray(truth), CUTOFF).reshape(-1, 20).mean(axis=1)
+
+    def memory(x):
+        return np.asarray(jax.tree.leaves(memories(with_effects(effect), x))[leaf])
+
+    truth = memory(x)
+    expected = low_pass(np.asarray(x.time), truth, CUTOFF).reshape(-1, 20).mean(axis=1)
 
     def block(a):
         return jnp.asarray(np.asarray(a).reshape(*a.shape[:-1], -1, 20).mean(axis=-1))
 
     q, qd, qdd = smooth(np.asarray(x.time), np.asarray(x.q).T, CUTOFF)
     seen = jax.tree.map(block, replace(x, q=q.T, qd=qd.T, qdd=qdd.T))
-    at_samples, shown = (
-        np.asarray(jax.tree.leaves(memories(with_effects(effect), y))[-1 if name == "tendon_backlash" else 0])
-        for y in (seen, replace(seen, blur=jnp.full_like(seen.time, width(CUTOFF))))
-    )
+    at_samples, shown = memory(seen), memory(replace(seen, blur=jnp.full_like(seen.time, width(CUTOFF))))
     inner = slice(5, -5)
     error, before = (np.abs(z - expected)[inner].max() / np.ptp(truth) for z in (shown, at_samples))
     assert error < 0.02
@@ -108,11 +109,10 @@ def test_a_tendon_that_does_not_stretch_keeps_the_nominal_friction_at_held_joint
     x = motion(held=True)
     k = FINGER.tendon_names.index("T1")
     nominal = np.asarray(joint_tension(MODEL, x))
+    kind = CATALOGUE["tendon_friction_presliding"]
     stiff, stretching = (
-        np.asarray(
-            joint_tension(with_effects(CATALOGUE["tendon_friction_presliding"].at(FINGER, ("T1",), a=1.0, f0=f0)), x)
-        )
-        for f0 in (0.0, 1.0)
+        np.asarray(joint_tension(with_effects(kind.at(FINGER, ("T1",), a=1.0, f0=1.0, stretches=s)), x))
+        for s in (0.0, 1.0)
     )
     np.testing.assert_array_equal(stiff, nominal)
     assert np.abs(stretching - nominal)[k].max() > 0.01

@@ -10,7 +10,7 @@ from jaxfinger.gap.augment import augmented_fit, nominal_fit
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.problem import build, moved
 from jaxfinger.gap.refine import refine, relinearised
-from jaxfinger.gap.signatures import Variant
+from jaxfinger.gap.signatures import Signatures, Variant
 from jaxfinger.gap.where import where
 from jaxfinger.identify import Recipe
 from jaxfinger.identify.parameters import describe, ravel
@@ -75,6 +75,20 @@ def test_a_problem_moves_along_its_own_jacobian(problem):
     there = moved(problem, step)
     np.testing.assert_allclose(there.r - problem.r, -problem.J @ step, atol=1e-6)
     np.testing.assert_allclose(there.offset - problem.offset, problem.root @ step, atol=1e-12)
+
+
+@pytest.mark.parametrize(("share", "start"), [(0.5, 1.0), (3.0, 0.5), (3.0, 2.0)])
+def test_a_share_is_at_most_one_and_leaves_that_bound_where_it_is_less(problem, share, start):
+    """Residuals of a friction of which so much builds up over 20 mrad."""
+    kind, site = CATALOGUE["joint_presliding"], (problem.nominal.finger.joint_names[0],)
+    effect = kind.at(problem.nominal.finger, site, a=share, x0=0.02)
+    there = replace(problem, r=problem.r + Signatures(problem, problem.nominal).of([effect])[0])
+    rt = Projector(there).residual(there, there.r)
+    found = refine(there, [Variant(kind, site, (("x0", 0.016),))], [{"a": start}], float(rt @ rt))
+    if share < 1.0:
+        assert abs(found.effects[0].a - share) < 4.0 * found.std[0]["a"] < 1.0
+    else:
+        assert found.effects[0].a == 1.0
 
 
 def test_a_large_effect_is_judged_by_what_it_leaves_exactly(scaled):
