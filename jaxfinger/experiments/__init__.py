@@ -2,6 +2,7 @@
 
 from jaxfinger.experiments.predict import demean, predict
 from jaxfinger.experiments.prepare import Batch, Stack, prepare
+from jaxfinger.experiments.shapes import roomy, widened
 from jaxfinger.experiments.table import EXPERIMENTS, Experiment
 
-__all__ = ["EXPERIMENTS", "Batch", "Experiment", "Stack", "demean", "predict", "prepare"]
+__all__ = ["EXPERIMENTS", "Batch", "Experiment", "Stack", "demean", "predict", "prepare", "roomy", "widened"]

@@ -20,7 +20,7 @@ from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.linearise import Linearised, linearise
 from jaxfinger.identify.noise import Noise, estimate, history
 from jaxfinger.identify.parameters import Free, describe, ravel
-from jaxfinger.identify.solve import Prior, Source, solve, unit_weights
+from jaxfinger.identify.solve import Prior, Source, solve
 from jaxfinger.identify.stages import cad_covariance, first_noise, free_groups, nominal_model, sources_of, start_values
 from jaxfinger.model import Model
 
@@ -193,10 +193,7 @@ def _noise_elsewhere(problem: Problem, channel: str, columns: int) -> Noise:
 
 
 def _linearised(model: Model, sources: dict[str, Source]) -> dict[str, Linearised]:
-    return {
-        e: linearise(model, Free.at(model, s.positions), s.batch, s.filters, unit_weights(s))
-        for e, s in sources.items()
-    }
+    return {e: linearise(model, Free.at(model, s.positions), s.batch, s.filters) for e, s in sources.items()}
 
 
 def _at(nominal: Model, linearised: dict[str, Linearised], sources, rows, free, prior: Prior) -> dict[str, Any]:
@@ -245,7 +242,7 @@ def _with_unknown(known: dict[tuple[str, str], Noise], stacks: dict[str, Stack],
         missing = [c for c in stack.experiment.channels if (e, c) not in known]
         if missing:
             s = sources[e]
-            lin = linearise(model, Free.at(model, s.positions), s.batch, s.filters, unit_weights(s))
+            lin = linearise(model, Free.at(model, s.positions), s.batch, s.filters)
             noise |= {(e, c): estimate(stack, c, np.asarray(lin.residuals[c])) for c in missing}
     return noise
 
@@ -262,7 +259,7 @@ def _with_missing_stages(
     start = start_values(fit.model, np.array(unknown, dtype=int), parameters)
     seen = set()
     for source in sources.values() if unknown else ():
-        lin = linearise(start, Free.at(start, source.positions), source.batch, source.filters, unit_weights(source))
+        lin = linearise(start, Free.at(start, source.positions), source.batch, source.filters)
         seen |= set(source.positions[np.any(np.asarray(lin.factor)[..., :-1] != 0.0, axis=(0, 1))])
     added = np.array([i for i in unknown if i in seen], dtype=int)
     return start_values(fit.model, added, parameters), np.union1d(free, added).astype(int)
@@ -288,8 +285,8 @@ def _layout(stack: Stack, filters, start: int) -> Rows:
     """Rows that count, in the order of `white_rows`: trial, channel's column, time."""
     counts, before, channel, column = [], [], [], []
     for number, c in enumerate(filters):
-        mask = stack.batch.mask[c]
-        counts.append(np.moveaxis(np.asarray(mask), 1, 0))
+        mask = np.asarray(stack.batch.mask[c])
+        counts.append(np.moveaxis(mask, 1, 0))
         before.append(np.moveaxis(np.asarray(history(mask, filters[c].shape[1] - 1), int), 1, 0))
         channel += [number] * len(mask)
         column += list(range(len(mask)))

@@ -12,11 +12,12 @@ import numpy as np
 
 from jaxfinger.data.schema import channel_units
 from jaxfinger.effects import CatalogueEffect
-from jaxfinger.experiments import Batch, predict, prepare
+from jaxfinger.experiments import prepare
 from jaxfinger.gap.evidence import Evidence
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.refine import within_bounds
 from jaxfinger.identify import Fit
+from jaxfinger.identify.linearise import residuals_of
 from jaxfinger.identify.parameters import Free, ravel
 from jaxfinger.identify.predictions import simulate_trials
 from jaxfinger.model import Model
@@ -58,12 +59,6 @@ def folds(problem: Problem) -> dict[str, np.ndarray]:
     return out
 
 
-@eqx.filter_jit
-def _residuals(model: Model, batch: Batch, channels: tuple[str, ...]):
-    predicted = predict(model, batch.x, channels)
-    return {c: batch.y[c] - predicted[c] for c in channels}
-
-
 def shrinkage(
     problem: Problem,
     nominal: Fit,
@@ -92,7 +87,7 @@ def shrinkage(
         models.append((before, after))
         for e, stack in problem.stacks.items():
             channels = stack.experiment.channels
-            old, new = _residuals(before, stack.batch, channels), _residuals(after, stack.batch, channels)
+            old, new = residuals_of(before, stack.batch, channels), residuals_of(after, stack.batch, channels)
             if not all(np.all(np.isfinite(x)) for x in new.values()):
                 new = old  # a model that does not hold up without these trials has closed nothing
             for c in channels:

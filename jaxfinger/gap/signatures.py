@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.effects import CatalogueEffect, Site
+from jaxfinger.experiments import roomy
 from jaxfinger.gap.problem import Problem, Rows
 from jaxfinger.model import (
     Model,
@@ -28,7 +29,7 @@ from jaxfinger.model import (
 )
 
 CHUNK = 8  # members of one call, at most
-LENGTH, COUNT = 512, 8  # stacks are padded to multiples of these, so that sessions share compilations
+LENGTH, COUNT = 512, 8  # samples and trials of the smallest stack that is compiled for
 QUICK = {"xla_backend_optimization_level": 0}  # a signature runs a few times: compiling it must be cheap
 
 
@@ -126,9 +127,9 @@ class Signatures:
 
     def _group(self, channel: str, held: bool, experiments: list[str]) -> _Group:
         batches = [self.problem.stacks[e].batch for e in experiments]
-        T = -(-max(b.x.time.shape[-1] for b in batches) // LENGTH) * LENGTH
+        T = roomy(max(b.x.time.shape[-1] for b in batches), LENGTH)
         count = sum(b.x.time.shape[0] for b in batches)
-        B = -(-count // COUNT) * COUNT
+        B = roomy(count, COUNT)
 
         def merge(*arrays):
             padded = [

@@ -10,9 +10,10 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfinger.experiments import Batch, predict
+from jaxfinger.experiments import Batch, predict, widened
 from jaxfinger.identify.noise import whiten
 from jaxfinger.identify.parameters import Free
 from jaxfinger.model import Model
@@ -23,10 +24,10 @@ Filters = dict[str, Float[Array, "columns order+1 order+1"]]
 class Linearised(NamedTuple):
     """One experiment's residuals and compressed Jacobian at a model."""
 
-    residuals: dict[str, Float[Array, "columns B T"]]  # measured − predicted, by channel, in the channel's unit
-    white: Float[Array, "B rows"]  # the same, whitened and flat, before weights
-    jacobian: Float[Array, "B rows p"]  # J, before weights
-    factor: Float[Array, "B p+1 p+1"]  # triangular, of [J r] with weights
+    residuals: dict[str, Float[np.ndarray, "columns B T"]]  # measured − predicted, by channel, in the channel's unit
+    white: Float[np.ndarray, "B rows"]  # the same, whitened and flat, before weights
+    jacobian: Float[np.ndarray, "B rows p"]  # J, before weights
+    factor: Float[np.ndarray, "B p+1 p+1"]  # triangular, of [J r] with weights
 
 
 def white_rows(model: Model, batch: Batch, filters: Filters) -> tuple[dict, Float[Array, "B rows"]]:
@@ -37,11 +38,42 @@ def white_rows(model: Model, batch: Batch, filters: Filters) -> tuple[dict, Floa
     return residuals, jnp.concatenate([jnp.moveaxis(w, 1, 0).reshape(w.shape[1], -1) for w in white], axis=1)
 
 
-@eqx.filter_jit
+def residuals_of(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[str, Float[np.ndarray, "columns B T"]]:
+    """Measured − predicted, by channel, in the channel's unit; also where a sample does not count."""
+    B, T = batch.x.time.shape
+    return {c: np.asarray(a)[:, :B, :T] for c, a in _residuals(model, widened(batch), channels).items()}
+
+
 def linearise(
-    model: Model, free: Free, batch: Batch, filters: Filters, weights: Float[Array, "B rows"] | None = None
+    model: Model, free: Free, batch: Batch, filters: Filters, weights: Float[np.ndarray, "B rows"] | None = None
 ) -> Linearised:
-    """Residuals and per-trial factors at `model`, with respect to the parameters in `free`."""
+    """Residuals and per-trial factors at `model`, with respect to the parameters in `free`; all weights one by default.
+
+    Compiled for the batch `widened`, whose additions are cut off again.
+    """
+    (B, T), wide = batch.x.time.shape, widened(batch)
+    shape = len(wide.x.time), sum(len(f) for f in filters.values()), wide.x.time.shape[-1]
+    weight = np.ones(shape)
+    if weights is not None:
+        weight[:B, :, :T] = weights.reshape(B, -1, T)
+    residuals, white, J, factor = _linearise(model, free, wide, filters, jnp.asarray(weight.reshape(shape[0], -1)))
+
+    def cut(rows):
+        each = np.asarray(rows).reshape(*shape, *rows.shape[2:])
+        return each[:B, :, :T].reshape(B, -1, *rows.shape[2:])
+
+    residuals = {c: np.asarray(a)[:, :B, :T] for c, a in residuals.items()}
+    return Linearised(residuals, cut(white), cut(J), np.asarray(factor)[:B])
+
+
+@eqx.filter_jit
+def _residuals(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[str, Array]:
+    predicted = predict(model, batch.x, channels)
+    return {c: batch.y[c] - predicted[c] for c in channels}
+
+
+@eqx.filter_jit
+def _linearise(model: Model, free: Free, batch: Batch, filters: Filters, weights: Float[Array, "B rows"]):
     theta = free.get(model)
 
     def f(theta):
@@ -50,7 +82,5 @@ def linearise(
 
     white, pushforward, residuals = jax.linearize(f, theta, has_aux=True)
     J = jnp.moveaxis(jax.lax.map(pushforward, jnp.eye(theta.size)), 0, -1)
-    columns = jnp.concatenate([J, white[..., None]], axis=-1)
-    if weights is not None:
-        columns = columns * weights[..., None]
-    return Linearised(residuals, white, J, jnp.linalg.qr(columns, mode="r"))
+    columns = jnp.concatenate([J, white[..., None]], axis=-1) * weights[..., None]
+    return residuals, white, J, jnp.linalg.qr(columns, mode="r")

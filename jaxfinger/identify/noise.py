@@ -71,18 +71,19 @@ def whiten(
     return white
 
 
-def history(mask: Float[Array, "columns B T"], order: int) -> Float[Array, "columns B T"]:
+def history(mask: Float[Array | np.ndarray, "columns B T"], order: int) -> Float[Array | np.ndarray, "columns B T"]:
     """How many samples before each count without a gap, at most `order`."""
-    unbroken, total = mask, jnp.zeros_like(mask)
+    unbroken, total = mask, 0.0 * mask
     for k in range(1, order + 1):
         unbroken = unbroken * _lag(mask, k)
         total = total + unbroken
     return total
 
 
-def _lag(a: Float[Array, "columns B T"], k: int) -> Float[Array, "columns B T"]:
+def _lag(a: Float[Array | np.ndarray, "columns B T"], k: int) -> Float[Array | np.ndarray, "columns B T"]:
     """a, k samples later."""
-    return jnp.pad(a[..., :-k], ((0, 0), (0, 0), (k, 0)))
+    xp = a.__array_namespace__()
+    return xp.concat([xp.zeros_like(a[..., :k]), a[..., :-k]], axis=-1)
 
 
 def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B T"]) -> Noise:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxfinger.data import Session, Trial
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import Stack, predict, prepare
+from jaxfinger.experiments import Stack, predict, prepare, roomy
 from jaxfinger.identify.fit import Fit
 from jaxfinger.model import Model, Motion, simulate
 
@@ -100,16 +100,16 @@ def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> 
     steps = np.array([np.median(np.diff(session[name].time)) for name in stack.trials])
     # Moreau's rule wants even steps: each trial gets its own uniform clock, all the same number of samples.
     longest = max(session[name].duration / step for name, step in zip(stack.trials, steps, strict=True))
-    grid = steps[:, None] * np.arange(-(-int(np.ceil(longest) + 1) // 512) * 512)
+    grid = steps[:, None] * np.arange(roomy(int(np.ceil(longest)) + 1, 512))
     tension = np.asarray(x.tension)
     even = np.stack(
         [[np.interp(g, t, f) for f in tension[:, b]] for b, (g, t) in enumerate(zip(grid, _times(stack), strict=True))]
     ).reshape(len(steps), session.finger.n, -1)
     starts = (x.session_time - x.time)[:, 0]
     substeps = max(1, int(np.ceil(steps.max() / STEP - 1e-6)))
-    q = np.asarray(
-        _simulate(model, jnp.asarray(grid), jnp.asarray(even), x.q[..., 0].T, x.qd[..., 0].T, starts, substeps)
-    )
+    each = model, grid, even, x.q[..., 0].T, x.qd[..., 0].T, starts
+    wide = np.minimum(np.arange(roomy(len(models), 2)), len(models) - 1)  # for a common shape the last is repeated
+    q = np.asarray(_simulate(jax.tree.map(lambda a: np.asarray(a)[wide], each), substeps))[: len(models)]
     # Whatever has left the finger's range by its whole width has no more to say, and may grow beyond all numbers.
     low, high = session.finger.limits.T[:, :, None]
     span = np.where(np.isfinite(high - low), high - low, 2 * np.pi)
@@ -131,16 +131,10 @@ def _times(stack: Stack) -> list[np.ndarray]:
 
 
 @eqx.filter_jit
-def _simulate(
-    model: Model,  # every leaf with the trials first
-    time: Float[Array, "B T"],
-    tension: Float[Array, "B n T"],
-    q0: Float[Array, "B m"],
-    qd0: Float[Array, "B m"],
-    start: Float[Array, " B"],
-    substeps: int,
-) -> Float[Array, "B m T"]:
-    def one(model, t, f, q, qd, s):
-        return simulate(model, t, f, q, qd, session_start=s, substeps=substeps)[0]
+def _simulate(each, substeps: int) -> Float[Array, "B m T"]:
+    """`each`: model, time, tension, q and q̇ at the start, start in the session; every array with the trials first."""
 
-    return jax.vmap(one)(model, time, tension, q0, qd0, start)
+    def one(model, time, tension, q0, qd0, start):
+        return simulate(model, time, tension, q0, qd0, session_start=start, substeps=substeps)[0]
+
+    return jax.vmap(one)(*each)

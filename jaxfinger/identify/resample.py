@@ -27,7 +27,7 @@ from jaxfinger.identify.joint import STAGE as JOINT
 from jaxfinger.identify.joint import cad_prior, channels_of
 from jaxfinger.identify.linearise import linearise
 from jaxfinger.identify.parameters import Free, describe, ravel
-from jaxfinger.identify.solve import huber_weights, triangular, unit_weights, visible
+from jaxfinger.identify.solve import huber_weights, triangular, visible
 from jaxfinger.identify.stages import STAGES, cad_covariance, sources_of, stage_free, touched_by
 
 Batching = Literal["map", "vmap"]
@@ -68,7 +68,7 @@ def compress(session: Session, fit: Fit) -> Compressed:
     blocks, trials = [], []
     for e, source in sources.items():
         at = Free.at(fit.model, source.positions)
-        lin = linearise(fit.model, at, source.batch, source.filters, unit_weights(source))
+        lin = linearise(fit.model, at, source.batch, source.filters)
         weights, share = huber_weights({e: lin}, fit.recipe.fit.huber) if fit.recipe.fit.huber else ({}, 0.0)
         if share > 0.005:
             lin = linearise(fit.model, at, source.batch, source.filters, weights[e])

@@ -8,7 +8,8 @@
 3. optimistix solves in coordinates z along the visible singular vectors, θ = θ_k + B z, in which the Gauss–Newton
    matrix is the identity. Most of equation (1) is linear in its parameters: one step, whatever the conditioning of θ.
 4. Where it is not (slip of held tendons, products of moment arms and losses) the model is linearised again at the new
-   point, and a step that did not lower the cost is halved, until a step is a small part of a standard deviation.
+   point, and a step that did not lower the cost is halved, until a step is a small part of a standard deviation, or
+   a whole one that is a tenth of it leads no further down.
 5. A mass that would fall to nothing stays on its floor while the others are minimised with it there.
 6. Outliers: Huber's weights from the white residuals at the optimum, then again from 1.
 """
@@ -31,6 +32,7 @@ from jaxfinger.model import Model
 
 VISIBLE = 1e-7  # relative singular value of the column-scaled Jacobian below which a combination is not seen
 SMALL = 0.02  # a step this small, in standard deviations of the estimate, ends the iteration
+KINK = 0.1  # likewise one that does not lower the cost: what is left is a kink, where a tendon slips or a joint turns
 STEPS = 40
 LIGHTEST = 0.02  # share of its starting value below which no mass is let to fall
 PAD = 16  # compressed problems are padded to multiples of this, to share compilations
@@ -90,7 +92,7 @@ def solve(
     floor = np.where(masses, LIGHTEST * theta, -np.inf)
     if prior is None:
         prior = Prior(theta, np.zeros((0, theta.size)))
-    weights = {n: unit_weights(s) for n, s in sources.items()}
+    weights: dict[str, np.ndarray | None] = dict.fromkeys(sources)
     share = 0.0
     for robust in (False, True) if huber else (False,):
         if robust:
@@ -98,14 +100,17 @@ def solve(
             # Gaussian residuals pass a limit of 3 in 0.3 % of cases: half as many again are outliers.
             if share < 0.005:
                 break
-        best, step, converged = np.inf, np.zeros_like(theta), False
+        best, step, before, converged = np.inf, np.zeros_like(theta), None, False
         for _ in range(STEPS):
             linearised = {n: linearise(model, frees[n], s.batch, s.filters, weights[n]) for n, s in sources.items()}
             factor = _stacked(linearised, sources, size)
             offset = prior.root @ (theta - prior.mean)
             cost = 0.5 * float(factor[:, -1] @ factor[:, -1] + offset @ offset)
             if not cost <= best * (1 + 1e-9) and np.any(step):  # higher, or outside of where the model is defined
-                step = 0.5 * step
+                if before and small < KINK:
+                    theta, (model, linearised), converged = theta - step, before, True
+                    break
+                step, before = 0.5 * step, None
                 theta = theta - step
                 model = moved.set(model, jnp.asarray(theta))
                 if small / 2 < SMALL * 0.1:
@@ -127,6 +132,7 @@ def solve(
             if small < SMALL:
                 converged = True
                 break
+            before = model, linearised  # a whole step away
             theta = theta + step
             model = moved.set(model, jnp.asarray(theta))
     message = (
@@ -203,18 +209,12 @@ def _minimise(A: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray(_dogleg(jnp.asarray(square), jnp.asarray(right)))[:k]
 
 
-def huber_weights(linearised: dict[str, Linearised], limit: float) -> tuple[dict[str, Array | None], float]:
+def huber_weights(linearised: dict[str, Linearised], limit: float) -> tuple[dict[str, np.ndarray | None], float]:
     """Square roots of Huber's weights, and the share of residuals beyond the limit."""
     beyond = count = 0
-    weights: dict[str, Array | None] = {}
+    weights: dict[str, np.ndarray | None] = {}
     for name, lin in linearised.items():
         r = np.abs(np.asarray(lin.white))
         beyond, count = beyond + int((r > limit).sum()), count + int((r > 0).sum())
-        weights[name] = jnp.asarray(np.sqrt(np.where(r > limit, limit / np.maximum(r, limit), 1.0)))
+        weights[name] = np.sqrt(np.where(r > limit, limit / np.maximum(r, limit), 1.0))
     return weights, beyond / max(1, count)
-
-
-def unit_weights(source: Source) -> Array:
-    """Weights of plain least squares."""
-    B, T = source.batch.x.time.shape
-    return jnp.ones((B, T * sum(f.shape[0] for f in source.filters.values())))

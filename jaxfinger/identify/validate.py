@@ -21,6 +21,7 @@ from jaxfinger.data import Session, Trial, low_pass
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Stack, predict, prepare
 from jaxfinger.identify.fit import Fit
+from jaxfinger.identify.linearise import residuals_of
 from jaxfinger.identify.noise import estimate
 from jaxfinger.identify.predictions import model_for, simulate_trials
 from jaxfinger.model import Model
@@ -121,12 +122,9 @@ def validate(
 
 def _residuals(model: Model, fit: Fit, stack: Stack) -> tuple[dict, dict[str, tuple[np.ndarray, str]]]:
     """Measured less predicted, NaN where a sample does not count, and the noise floor by channel."""
-    channels = stack.experiment.channels
-    predicted = _predict(model, stack.batch.x, channels)
     residuals, floors = {}, {}
-    for c in channels:
+    for c, raw in residuals_of(model, stack.batch, stack.experiment.channels).items():
         mask = np.asarray(stack.batch.mask[c]) > 0
-        raw = np.asarray(stack.batch.y[c]) - np.asarray(predicted[c])
         residuals[c] = np.where(mask, raw, np.nan)
         floors[c] = _floor(fit, stack, c, raw)
     return residuals, floors

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import numpy as np
 
 from jaxfinger.data.schema import channel_units, units_where
-from jaxfinger.experiments import Batch, predict
 from jaxfinger.gap import Diagnosis
 from jaxfinger.gap.where import site
-from jaxfinger.model import Model
+from jaxfinger.identify.linearise import residuals_of
 from jaxfinger.report.canvas import COLOURS, grid, look
 
 BLAME, QUIET, BEFORE, AFTER = COLOURS[2], "#b8c4d6", COLOURS[4], COLOURS[0]
@@ -116,12 +114,6 @@ def _how_far(ax, lines: list[dict]) -> None:
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3)
 
 
-@eqx.filter_jit
-def _residuals(model: Model, batch: Batch, channels: tuple[str, ...]):
-    predicted = predict(model, batch.x, channels)
-    return {c: batch.y[c] - predicted[c] for c in channels}
-
-
 def worst(d: Diagnosis) -> tuple[str, str, int, int]:
     """Experiment, channel, column and trial (its index in the stack) with the most energy above noise."""
     best, most = None, -np.inf
@@ -159,7 +151,7 @@ def traces(d: Diagnosis):
     turn, angular = people(units_where("rad", prismatic))
     first = d.problem.simulator or d.nominal.model
     for model, colour, label in ((first, BEFORE, "before"), (d.augmented.model, AFTER, "after")):
-        residual = np.asarray(_residuals(model, stack.batch, (channel,))[channel])[column, b]
+        residual = residuals_of(model, stack.batch, (channel,))[channel][column, b]
         if channel == "tendon_excursion":  # its zero is free in every trial
             residual = residual - residual[mask].mean()
         missed.plot(

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import predict, prepare
+from jaxfinger.identify import solve as solve_module
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.identify.solve import solve
 from jaxfinger.identify.stages import first_noise, sources_of
@@ -32,21 +33,27 @@ class Logarithm(CatalogueEffect):
         return h.at[self.index[0]].add(1e-2 * jnp.log1p(self.a))
 
 
-@pytest.fixture(scope="module")
-def problem(short, short_truth):
-    """A model with the effect at a = 0, its position in the flat vector, and data of a = −0.95 without noise."""
+def _problem_of(kind, short, short_truth, start, true, shift=0.0):
+    """A model with the effect at its start, its position in the flat vector, and data of its truth without noise,
+    moved by `shift` N m at the effect's joint.
+    """
     stack = prepare(short, [t.name for t in short if t.experiment == EXPERIMENT])[EXPERIMENT]
-    effect = Logarithm.at(short_truth.model.finger, ("MCP",), a=0.0)
+    effect = kind.at(short_truth.model.finger, ("MCP",), a=start)
     model = eqx.tree_at(lambda m: m.effects, short_truth.model, (effect,), is_leaf=lambda v: isinstance(v, tuple))
     parameters = describe(model)
     (position,) = (i for i, p in enumerate(parameters) if p.group == "effects")
-    true = eqx.tree_at(lambda m: m.effects[0].a, model, jnp.asarray(-0.95))
-    y = predict(true, stack.batch.x, (CHANNEL,))[CHANNEL] * stack.batch.mask[CHANNEL]
+    at_truth = eqx.tree_at(lambda m: m.effects[0].a, model, jnp.asarray(true))
+    y = predict(at_truth, stack.batch.x, (CHANNEL,))[CHANNEL].at[effect.index[0]].add(shift)
     noise = {(EXPERIMENT, CHANNEL): first_noise(stack, CHANNEL)}
-    batch = eqx.tree_at(lambda b: b.y[CHANNEL], stack.batch, y)
+    batch = eqx.tree_at(lambda b: b.y[CHANNEL], stack.batch, y * stack.batch.mask[CHANNEL])
     reads = {EXPERIMENT: (CHANNEL,)}
     source = sources_of({EXPERIMENT: stack}, reads, noise, parameters)[EXPERIMENT]
     return model, position, source._replace(batch=batch)
+
+
+@pytest.fixture(scope="module")
+def problem(short, short_truth):
+    return _problem_of(Logarithm, short, short_truth, start=0.0, true=-0.95)
 
 
 def test_a_step_to_where_the_model_is_not_defined_is_halved(problem):
@@ -61,3 +68,32 @@ def test_a_start_where_the_model_is_not_defined_is_refused(problem):
     astray = eqx.tree_at(lambda m: m.effects[0].a, model, jnp.asarray(-2.0))
     with pytest.raises(UserError, match="nothing finite where the fit starts"):
         solve(astray, np.array([position]), {EXPERIMENT: source})
+
+
+class Kink(CatalogueEffect):
+    """10 N mm · a above zero, −8 N mm · a below: no step leads below what a = 0 predicts."""
+
+    ID: ClassVar = "kink"
+    PLACE: ClassVar = "joint"
+    AMPLITUDES: ClassVar = {"a": ("1", 0.5, True)}
+    SHOWS: ClassVar = {EXPERIMENT: (CHANNEL,)}
+
+    a: Float[Array, ""]
+
+    def torque(self, x, memory, h):
+        return h.at[self.index[0]].add(1e-2 * jnp.maximum(self.a, -0.8 * self.a))
+
+
+def test_a_kink_within_a_tenth_of_a_standard_deviation_ends_the_search(short, short_truth, monkeypatch):
+    model, position, source = _problem_of(Kink, short, short_truth, start=1.0, true=0.0)
+    _, smooth = solve(model, np.array([position]), {EXPERIMENT: source})
+    std = smooth.information[position, position] ** -0.5
+    unreachable = _problem_of(Kink, short, short_truth, start=1.0, true=0.0, shift=-3e-4 * std)
+    calls = []
+    plain = solve_module.linearise
+    monkeypatch.setattr(solve_module, "linearise", lambda *a: calls.append(1) or plain(*a))
+    found, solution = solve(unreachable[0], np.array([position]), {EXPERIMENT: unreachable[2]})
+    assert solution.converged
+    assert len(calls) <= 4
+    assert abs(float(ravel(found)[position])) < 0.1 * std
+    assert float(jnp.sum(solution.linearised[EXPERIMENT].white ** 2)) == pytest.approx(2.0 * solution.cost)
