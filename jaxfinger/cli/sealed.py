@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -18,7 +20,7 @@ from jaxfinger.errors import UserError
 
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 PREDICT = f"{shlex.quote(sys.executable)} -m jaxfinger predict {{fit}} {{session}} -o {{out}}"
-DIAGNOSE = f"{shlex.quote(sys.executable)} -m jaxfinger diagnose {{fit}} -o {{out}}"
+DIAGNOSE = "jaxfinger diagnose {fit} -o {out}"
 
 
 def make(
@@ -76,7 +78,7 @@ def run(
     folder: Path,
     *,
     output: Output = None,
-    command: str = DIAGNOSE,
+    command: str | None = None,
     withheld: bool = False,
     truth: Path | None = None,
     workers: int | None = None,
@@ -91,20 +93,24 @@ def run(
         withheld: diagnose the cases with one effect, with that effect taken out of the catalogue: what is said then?
         truth: what `make` hid, by default FOLDER-truth; read with --withheld only, by this command and not by what
             diagnoses.
-        command: what diagnoses; {fit} and {out} stand for the session and the folder to write.
+        command: another diagnosis than this program's; {fit} and {out} stand for the session and the folder to write.
         workers: cases at a time; by default as many as there are cores.
         share: this machine's part of the work, for example 2/8.
     """
     from jaxfinger.sealed.run import Command, run_cases
     from jaxfinger.sealed.truth import read_truth
 
-    if "{fit}" not in command or "{out}" not in command:
+    if command and not ("{fit}" in command and "{out}" in command):
         raise UserError(f"--command {command!r}: it must hold {{fit}} and {{out}}, as in {DIAGNOSE!r}")
     out = output or _beside(folder, "withheld" if withheld else "diagnoses")
-    diagnose = Command(command)
+    diagnose = Command(command) if command else _diagnose
     if withheld:
         truths = [read_truth(f.parent, truth or _beside(folder, "truth")) for f in sorted(folder.glob("*/fit.h5"))]
-        diagnose = {t.name: diagnose.without(t.causes[0][0]) for t in truths if t.kind == "listed"}
+        causes = {t.name: t.causes[0][0] for t in truths if t.kind == "listed"}
+        diagnose = {
+            name: Command(command).without(effect) if command else partial(_diagnose, without=(effect,))
+            for name, effect in causes.items()
+        }
     with _bar("diagnosing") as progress:
         results = run_cases(folder, out, diagnose, workers or os.cpu_count() or 1, _share(share), progress)
     failed = sorted(name for name, what in results.items() if what == "failed")
@@ -112,6 +118,14 @@ def run(
         f"{out}: {len(results) - len(failed)} diagnosed"
         + (f"; failed, see run.json: {', '.join(failed)}" if failed else "")
     )
+
+
+def _diagnose(fit: Path, out: Path, without: tuple[str, ...] = ()) -> None:
+    """`jaxfinger diagnose`, silently, in a process that keeps what it has compiled for the cases that follow."""
+    from jaxfinger.cli.diagnose import diagnose
+
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+        diagnose(fit, output=out, without=list(without))
 
 
 def close(folder: Path, *, diagnoses: Path | None = None, command: str = PREDICT, workers: int | None = None) -> None:

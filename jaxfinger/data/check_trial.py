@@ -86,7 +86,7 @@ def _time(trial: Trial, report: Report) -> None:
         what = "runs backwards" if (steps < 0.0).any() else "repeats"
         count = int((steps <= 0.0).sum())
         report.error(
-            place, f"{what} after sample {at} ({time[at]:.6g} s), {count} times in all; sort or drop these samples"
+            place, f"{what} after sample {at} ({time[at]:.6g} s), at {count} of {len(time)}; sort or drop these samples"
         )
         return
     usual = float(np.median(steps))

@@ -105,10 +105,22 @@ def step(before: Motion, x: Motion) -> Float[Array, "*T"]:
     return x.time - before.time
 
 
-def dahl(z: Float[Array, "*T"], dx: Float[Array, "*T"], length: Float[Array, ""]) -> Float[Array, "*T"]:
-    """Share of the friction that is built up after a displacement: dz = (dx − |dx| z)/length, exactly (Dahl 1968)."""
-    target = jnp.sign(dx)
-    return target + (z - target) * jnp.exp(-jnp.abs(dx) / length)
+def dahl(
+    z: Float[Array, "*T"], dx: Float[Array, "*T"], length: Float[Array, ""], delta: Float[Array, ""]
+) -> Float[Array, "*T"]:
+    """Share of the friction that is built up after a displacement: dz = (1 − z sgn dx)^δ dx/length (Dahl 1968).
+
+    δ = 1 builds up exponentially. δ = ½ has built up after 2√2 lengths, as many elements in parallel have that slip one
+    after the other (Maxwell slip, evenly spread).
+    """
+    way = jnp.sign(dx)
+    lacking, share = 1.0 - z * way, jnp.abs(dx) / length
+    root = jnp.sqrt(jnp.maximum(lacking, 1e-12))  # whose slope at nothing is infinite
+    left = jnp.where(delta > 0.75, lacking * jnp.exp(-share), jnp.square(jnp.maximum(root - 0.5 * share, 0.0)))
+    return jnp.where(dx == 0.0, z, way * (1.0 - left))
+
+
+DELTA = ("1", (1.0, 0.5))  # both forms of `dahl`
 
 
 _SIXTH_ORDER = ((1, 0.75), (2, -0.15), (3, 1 / 60))  # how far off on either side, and weight

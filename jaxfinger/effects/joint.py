@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfinger.effects.base import ELASTIC, TORQUE, CatalogueEffect, dahl, step
+from jaxfinger.effects.base import DELTA, ELASTIC, TORQUE, CatalogueEffect, dahl, step
 
 
 class JointStribeck(CatalogueEffect):
@@ -33,7 +33,7 @@ class JointStribeck(CatalogueEffect):
 
 
 class JointPresliding(CatalogueEffect):
-    """After a reversal friction builds up over an angle x₀ instead of at once: dz = (dq − |dq| z)/x₀ (Dahl 1968).
+    """After a reversal friction builds up over an angle x₀ instead of at once: dz = (1 − z sgn dq)^δ dq/x₀ (Dahl 1968).
 
     `a` is the share of the friction that behaves so; 1 where all of it does.
     """
@@ -42,20 +42,22 @@ class JointPresliding(CatalogueEffect):
     PLACE: ClassVar = "joint"
     AMPLITUDES: ClassVar = {"a": ("1", 1.0, False)}
     SHARES: ClassVar = ("a",)
-    SHAPES: ClassVar = {"x0": ("rad", (0.002, 0.004, 0.008, 0.016, 0.03, 0.06, 0.12, 0.24))}
+    SHAPES: ClassVar = {"x0": ("rad", (0.002, 0.004, 0.008, 0.016, 0.03, 0.06, 0.12, 0.24)), "delta": DELTA}
+    CHOICES: ClassVar = ("delta",)
     SHOWS: ClassVar = TORQUE
     has_memory: ClassVar = True
     sharp: ClassVar = True
 
     a: Float[Array, ""]
     x0: Float[Array, ""]
+    delta: Float[Array, ""]
 
     def initial_memory(self, model, x):
         return jnp.zeros_like(x.q[self.index[0]])
 
     def next_memory(self, model, memory, before, x):
         i = self.index[0]
-        return dahl(memory, x.q[i] - before.q[i], self.x0)
+        return dahl(memory, x.q[i] - before.q[i], self.x0, self.delta)
 
     def directions(self, x, memory, joint, tendon):
         if x.held:

@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfinger.effects.base import TENSION, CatalogueEffect, dahl
+from jaxfinger.effects.base import DELTA, TENSION, CatalogueEffect, dahl
 
 
 class TendonFrictionCapstan(CatalogueEffect):
@@ -53,7 +53,7 @@ class TendonFrictionViscous(CatalogueEffect):
 
 
 class TendonFrictionPresliding(CatalogueEffect):
-    """Friction builds up over a small excursion x₀ after each reversal: dz = (dl − |dl| z)/x₀ (Dahl, LuGre).
+    """Friction builds up over a small excursion x₀ after each reversal: dz = (1 − z sgn dl)^δ dl/x₀ (Dahl, LuGre).
 
     At a held joint a tendon that `stretches` (1) slides by its own stretch, in proportion to tension: there the length
     is f₀ of tension. One that does not (0) has the nominal friction there. `a` is the share of the loss that behaves
@@ -68,8 +68,9 @@ class TendonFrictionPresliding(CatalogueEffect):
         "x0": ("m", (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)),
         "f0": ("N", (0.3, 1.0, 3.0)),
         "stretches": ("1", (1.0, 0.0)),
+        "delta": DELTA,
     }
-    CHOICES: ClassVar = ("stretches",)
+    CHOICES: ClassVar = ("stretches", "delta")
     SHOWS: ClassVar = TENSION
     has_memory: ClassVar = True
     sharp: ClassVar = True
@@ -78,11 +79,12 @@ class TendonFrictionPresliding(CatalogueEffect):
     x0: Float[Array, ""]
     f0: Float[Array, ""]
     stretches: Float[Array, ""]
+    delta: Float[Array, ""]
 
     @classmethod
     def shapes(cls, finger, site):
         first = cls.SHAPES["f0"][1][0]
-        return [s for s in super().shapes(finger, site) if s["stretches"] or s["f0"] == first]
+        return [s for s in super().shapes(finger, site) if (s["stretches"] and s["delta"] == 1) or s["f0"] == first]
 
     def initial_memory(self, model, x):
         k = self.index[0]
@@ -93,8 +95,8 @@ class TendonFrictionPresliding(CatalogueEffect):
         k, (z, l_before) = self.index[0], memory
         l = model.moment_arm.excursion(x.q)[k]
         if x.held:
-            return dahl(z, x.tension[k] - before.tension[k], self.f0), l
-        return dahl(z, l - l_before, self.x0), l
+            return dahl(z, x.tension[k] - before.tension[k], self.f0, self.delta), l
+        return dahl(z, l - l_before, self.x0, self.delta), l
 
     def directions(self, x, memory, joint, tendon):
         k = self.index[0]

@@ -4,7 +4,7 @@ With r̃ and Z̃ projected off the nominal parameters, amplitudes a ~ N(0, s²) 
 
     log BF = ½ bᵀ (G + s⁻² I)⁻¹ b − ½ log det(I + s² G),   G = Z̃ᵀ Z̃,   b = Z̃ᵀ r̃,
 
-averaged over s. An amplitude of the wrong sign is no evidence.
+averaged over s. An amplitude of the wrong sign is no evidence, and a share counts as one at most.
 """
 
 from dataclasses import dataclass
@@ -61,7 +61,7 @@ class Evidence:
 
 def evidence(variant: Variant, Z: np.ndarray, Zt: np.ndarray, rt: np.ndarray) -> Evidence:
     """Evidence of a variant from its signatures (amplitudes, N), raw and projected."""
-    G, b = Zt @ Zt.T, Zt @ rt
+    G, b, kind = Zt @ Zt.T, Zt @ rt, variant.effect
     raw = float(np.sum(Z * Z))
     absorbed = 1.0 - float(np.trace(G)) / raw if raw > 0 else 1.0
     logs, k = [], len(b)
@@ -69,7 +69,7 @@ def evidence(variant: Variant, Z: np.ndarray, Zt: np.ndarray, rt: np.ndarray) ->
         precision = G + np.eye(k) / s**2
         a = np.linalg.solve(precision, b)
         log_bf = 0.5 * b @ a - 0.5 * np.linalg.slogdet(np.eye(k) + s**2 * G)[1]
-        if k == 1 and not next(iter(variant.effect.AMPLITUDES.values()))[2]:
+        if k == 1 and not next(iter(kind.AMPLITUDES.values()))[2]:
             # half-normal prior: twice the mass of the right sign
             log_bf += np.log(2.0) + log_ndtr(a[0] * np.sqrt(precision[0, 0]))
         logs.append(log_bf)
@@ -77,9 +77,14 @@ def evidence(variant: Variant, Z: np.ndarray, Zt: np.ndarray, rt: np.ndarray) ->
     information = G + floor * np.eye(k)
     a = np.linalg.lstsq(information, b, rcond=1e-10)[0]
     std = np.sqrt(np.diag(np.linalg.pinv(information, rcond=1e-10, hermitian=True)))
-    if k == 1 and a[0] < 0 and not next(iter(variant.effect.AMPLITUDES.values()))[2]:
+    if k == 1 and a[0] < 0 and not next(iter(kind.AMPLITUDES.values()))[2]:
         return Evidence(variant, np.zeros(1), std, 0.0, float(logsumexp(logs) - np.log(len(logs))), absorbed)
-    return Evidence(variant, a, std, float(b @ a), float(logsumexp(logs) - np.log(len(logs))), absorbed)
+    most = np.array([1.0 / unit if n in kind.SHARES else np.inf for n, (_, unit, _) in kind.AMPLITUDES.items()])
+    beyond = np.maximum(a - most, 0.0)
+    lost = float(beyond @ G @ beyond)
+    return Evidence(
+        variant, a - beyond, std, float(b @ a) - lost, float(logsumexp(logs) - np.log(len(logs))) - 0.5 * lost, absorbed
+    )
 
 
 def screen(groups, columns, projector: Projector, rt: np.ndarray) -> list[Evidence]:

@@ -12,13 +12,16 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import lsq_linear
 
 from jaxfinger.effects import NOMINAL_TERMS, CatalogueEffect
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.problem import Problem, moved
 from jaxfinger.gap.signatures import Signatures, Variant
 
-STEPS = 6
+STEPS = 10
+STEP = 0.05  # of a difference, in units of a coordinate
+FACTOR = 0.7  # logarithm of the most by which a step changes a shape
 ROUNDS = 8  # of moving the nominal model and refitting there
 SETTLED = 1.0  # change of the sum of squares below which it stays
 MAY_LOSE = 0.1  # share of what is explained, that a step of the nominal model may lose; beyond it the step is halved
@@ -67,7 +70,8 @@ def refine(
     effects = [within_bounds(v.at(finger, s)) for v, s in zip(variants, start, strict=True)]
     coordinates = _coordinates(variants)
     signatures, projector = Signatures(problem, problem.nominal), projector or Projector(problem)
-    base, slopes = _evaluate(signatures, effects, coordinates)
+    reach = np.full(len(coordinates), STEP)
+    base, slopes = _evaluate(signatures, effects, coordinates, reach)
     r = problem.r - base
     sizes = _sizes(effects, coordinates)
     cost = _cost(projector, problem, r) + float(sizes @ sizes)
@@ -76,11 +80,13 @@ def refine(
         rt = projector.residual(problem, r)
         St = projector(slopes)
         G = St @ St.T
-        delta = np.linalg.solve(G + np.diag(prior), St @ rt - sizes / WIDE)
+        delta = _bounded(G + np.diag(prior), St @ rt - sizes / WIDE, *_room(effects, coordinates))
+        # No further than the trials resolve, where a sum of squares bends within a few per cent of a length.
+        reach = np.clip(1.0 / np.sqrt(np.maximum(np.diag(G), 1e-300)), STEP / 20.0, STEP)
         moved = False
         for _ in range(4):
             trial_effects = _moved(effects, coordinates, delta)
-            trial_base, trial_slopes = _evaluate(signatures, trial_effects, coordinates)
+            trial_base, trial_slopes = _evaluate(signatures, trial_effects, coordinates, reach)
             trial_r = problem.r - trial_base
             trial_sizes = _sizes(trial_effects, coordinates)
             trial_cost = _cost(projector, problem, trial_r) + float(trial_sizes @ trial_sizes)
@@ -178,7 +184,8 @@ def at_optimum(refined: Refined) -> tuple[list[Variant], list[dict[str, float]]]
 
 def derivatives(signatures: Signatures, refined: Refined) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "k N"]]:
     """White change of other rows by the refitted effects, and its derivatives by amplitudes and moving shapes."""
-    return _evaluate(signatures, refined.effects, _coordinates(refined.variants))
+    coordinates = _coordinates(refined.variants)
+    return _evaluate(signatures, refined.effects, coordinates, np.full(len(coordinates), STEP))
 
 
 def information(problem: Problem, refined: Refined) -> Float[np.ndarray, "p+k p+k"]:
@@ -227,7 +234,7 @@ def _shifted(effect: CatalogueEffect, c: _Coordinate, by: float) -> CatalogueEff
     if c.shifts:
         value += by * c.unit
     else:
-        value *= float(np.exp(np.clip(by, -0.7, 0.7)))
+        value *= float(np.exp(np.clip(by, -FACTOR, FACTOR)))
     return within_bounds(replace(effect, **{c.name: jnp.asarray(value)}))
 
 
@@ -235,13 +242,35 @@ def within_bounds(effect: CatalogueEffect) -> CatalogueEffect:
     """The effect with one-sided amplitudes not below zero, shares not above one, and shapes no further out than those
     worth trying.
     """
+    return replace(effect, **{n: jnp.clip(getattr(effect, n), *ends) for n, ends in _bounds(type(effect)).items()})
+
+
+def _bounds(effect: type[CatalogueEffect]) -> dict[str, tuple[float, float]]:
     signed = {n: s for n, (_, _, s) in effect.AMPLITUDES.items()}
     bounds = {n: (-np.inf if signed[n] else 0.0, 1.0 if n in effect.SHARES else np.inf) for n in signed}
     for n, (_, grid) in effect.SHAPES.items():
         if n not in effect.CHOICES and len(grid) > 1:
             wide = 1.0 if n in effect.SHIFTS else 2.0
             bounds[n] = (min(grid) / wide, max(grid) * wide)
-    return replace(effect, **{n: jnp.clip(getattr(effect, n), *ends) for n, ends in bounds.items()})
+    return bounds
+
+
+def _room(effects, coordinates: list[_Coordinate]) -> tuple[np.ndarray, np.ndarray]:
+    """How far each coordinate may move, back and forth."""
+    out = []
+    for c in coordinates:
+        value, ends = float(getattr(effects[c.effect], c.name)), _bounds(type(effects[c.effect]))[c.name]
+        ways = [(end - value) / c.unit if c.shifts else np.log(end / value) for end in ends]
+        most = np.inf if c.shifts else FACTOR
+        out.append((max(min(ways[0], 0.0), -most), min(max(ways[1], 0.0), most)))
+    low, high = np.array(out).T
+    return low, high
+
+
+def _bounded(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """argmin ½ xᵀ A x − bᵀ x within bounds: what stays at one moves no other along as if it did not."""
+    L = np.linalg.cholesky(A)
+    return lsq_linear(L.T, np.linalg.solve(L, b), (low, high + 1e-12), method="bvls").x
 
 
 def _moved(effects, coordinates, delta):
@@ -251,13 +280,13 @@ def _moved(effects, coordinates, delta):
     return out
 
 
-def _evaluate(signatures: Signatures, effects, coordinates):
-    """White change by all effects, and its derivatives by every coordinate."""
+def _evaluate(signatures: Signatures, effects, coordinates, reach: Float[np.ndarray, " k"]):
+    """White change by all effects, and its derivatives by every coordinate, as differences over its `reach`."""
     size = signatures.problem.r.size
     base, slopes = np.zeros(size), np.zeros((len(coordinates), size))
     for i, effect in enumerate(effects):
         mine = [k for k, c in enumerate(coordinates) if c.effect == i]
-        members = [effect] + [_beside(effect, coordinates[k]) for k in mine]
+        members = [effect] + [_beside(effect, coordinates[k], reach[k]) for k in mine]
         flat = signatures.of(members)
         base += flat[0]
         for row, k in enumerate(mine, start=1):
@@ -266,7 +295,7 @@ def _evaluate(signatures: Signatures, effects, coordinates):
     return base, slopes
 
 
-def _beside(effect: CatalogueEffect, c: _Coordinate, h: float = 0.05) -> CatalogueEffect:
+def _beside(effect: CatalogueEffect, c: _Coordinate, h: float) -> CatalogueEffect:
     """A step for a difference: back where a bound leaves no way forward."""
     ahead = _shifted(effect, c, h)
     return ahead if getattr(ahead, c.name) != getattr(effect, c.name) else _shifted(effect, c, -h)

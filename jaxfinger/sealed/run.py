@@ -16,9 +16,15 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 
+import h5py
+import numpy as np
+
 from jaxfinger.errors import UserError
+
+CASES_PER_PROCESS = 6  # compiled code of a case takes some 8,000 memory maps, and Linux gives a process 65,530
 
 Diagnose = Callable[[Path, Path], None]  # (session file, folder to write gap.json into)
 
@@ -121,7 +127,8 @@ def run_cases(
 ) -> dict[str, str]:
     """Diagnose every case of a folder, or share i of n of them; returns what became of each.
 
-    With a mapping only the cases that it names, each in its own way.
+    With a mapping only the cases that it names, each in its own way. Cases of like fingers follow one another, so that
+    a process that diagnoses several compiles once for them.
     """
     folders = sorted(f.parent for f in cases.glob("*/fit.h5"))
     if not folders:
@@ -130,6 +137,7 @@ def run_cases(
         )
     how = diagnose if isinstance(diagnose, Mapping) else {f.name: diagnose for f in folders}
     mine = [f for k, f in enumerate(folders, start=1) if k % share[1] == share[0] % share[1] and f.name in how]
+    mine.sort(key=lambda f: (_finger(f / "fit.h5"), f.name))
     results: dict[str, str] = {}
     if workers == 1:
         for f in mine:
@@ -138,11 +146,24 @@ def run_cases(
                 progress(len(results), len(mine), f"{f.name} {results[f.name]}")
         return results
     commands = all(isinstance(d, Command) for d in how.values())  # which are processes of their own
-    pool = ThreadPoolExecutor(workers) if commands else ProcessPoolExecutor(workers)
-    with pool:
-        jobs = {pool.submit(run_case, how[f.name], f, out): f.name for f in mine}
-        for job in as_completed(jobs):
-            results[jobs[job]] = job.result()
-            if progress:
-                progress(len(results), len(mine), f"{jobs[job]} {job.result()}")
+    at_once = len(mine) if commands else workers * CASES_PER_PROCESS
+    for first in range(0, len(mine), max(1, at_once)):
+        # Spawned, since JAX's threads do not outlive a fork, and anew after some cases, since compiled code stays.
+        pool = ThreadPoolExecutor(workers) if commands else ProcessPoolExecutor(workers, get_context("spawn"))
+        with pool:
+            jobs = {pool.submit(run_case, how[f.name], f, out): f.name for f in mine[first : first + at_once]}
+            for job in as_completed(jobs):
+                results[jobs[job]] = job.result()
+                if progress:
+                    progress(len(results), len(mine), f"{jobs[job]} {job.result()}")
     return results
+
+
+def _finger(fit: Path) -> bytes:
+    """Which tendon crosses which joint; nothing where the file does not say."""
+    try:
+        with h5py.File(fit) as file:
+            crosses = np.asarray(file["finger/tendons/crosses"])
+            return str(crosses.shape).encode() + crosses.tobytes()
+    except (OSError, KeyError):
+        return b""

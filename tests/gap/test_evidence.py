@@ -85,3 +85,16 @@ def test_what_the_nominal_parameters_imitate_is_no_evidence(problem):
     found = evidence(variant, Z, projector(Z), projector.residual(problem))
     assert found.absorbed == pytest.approx(1.0)
     assert abs(found.log_bf) < 1e-6
+
+
+def test_a_share_counts_as_one_at_most(problem):
+    """Three times a friction is no evidence that it builds up: what the whole of it explains is."""
+    variant = Variant(CATALOGUE["joint_presliding"], ("PIP",), (("x0", 0.03),))
+    Z, projector = np.random.default_rng(3).standard_normal((1, ROWS)), Projector(problem)
+    Zt = projector(Z)
+    rt = projector.residual(problem)
+    rt = rt + (3.0 - Zt[0] @ rt / (Zt[0] @ Zt[0])) * Zt[0]
+    found = evidence(variant, Z, Zt, rt)
+    assert found.amplitudes == pytest.approx([1.0])
+    assert found.explained == pytest.approx(rt @ rt - np.sum((rt - Zt[0]) ** 2))
+    assert found.log_bf < 0.5 * found.explained

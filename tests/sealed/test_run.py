@@ -3,10 +3,13 @@
 import json
 import sys
 
+import h5py
+import numpy as np
 import pytest
 
 from jaxfinger.cli import sealed as cli
 from jaxfinger.errors import UserError
+from jaxfinger.sealed import run as run_module
 from jaxfinger.sealed.run import Command, close_cases, run_case, run_cases
 from jaxfinger.sealed.score import imitators
 
@@ -139,3 +142,29 @@ def test_fresh_trials_are_predicted_only_for_a_verdict_that_names_an_effect(fold
     assert close_cases(folder, tmp_path / "out", predict)["case-001"] == "skipped"
     (tmp_path / "out" / "case-001" / "fresh.json").unlink()
     assert close_cases(folder, tmp_path / "out", f"{sys.executable} -c 'exit(1)'")["case-001"] == "failed"
+
+
+def test_cases_of_like_fingers_follow_one_another(tmp_path):
+    crosses = {1: [[True, False]], 2: [[True, True]], 3: [[True, False]], 4: [[True, False], [True, True]]}
+    for i, matrix in crosses.items():
+        case = tmp_path / "cases" / f"case-{i:03d}"
+        case.mkdir(parents=True)
+        with h5py.File(case / "fit.h5", "w") as f:
+            f["finger/tendons/crosses"] = np.array(matrix)
+    order = []
+
+    def note(fit, out):
+        with h5py.File(fit) as f:
+            order.append(f["finger/tendons/crosses"][()].tolist())
+        out.mkdir()
+        (out / "gap.json").write_text("{}")
+
+    run_cases(tmp_path / "cases", tmp_path / "out", note)
+    assert order.index(crosses[1]) + 1 == len(order) - 1 - order[::-1].index(crosses[1])
+
+
+def test_processes_serve_several_cases_and_end(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(run_module, "CASES_PER_PROCESS", 1)
+    results = run_cases(folder, tmp_path / "out", diagnose, workers=2)
+    assert results["case-004"] == "failed"
+    assert sorted(results) == [f.name for f in sorted(folder.iterdir())]
