@@ -20,6 +20,7 @@ from jaxfinger.errors import UserError
 
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 PREDICT = f"{shlex.quote(sys.executable)} -m jaxfinger predict {{fit}} {{session}} -o {{out}}"
+MAPS = 30_000  # of memory, half as many as Linux gives a process: compiled code takes 10,000 a case
 DIAGNOSE = "jaxfinger diagnose {fit} -o {out}"
 
 
@@ -122,10 +123,15 @@ def run(
 
 def _diagnose(fit: Path, out: Path, without: tuple[str, ...] = ()) -> None:
     """`jaxfinger diagnose`, silently, in a process that keeps what it has compiled for the cases that follow."""
+    import equinox as eqx
+
     from jaxfinger.cli.diagnose import diagnose
 
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
         diagnose(fit, output=out, without=list(without))
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > MAPS:
+        eqx.clear_caches()
 
 
 def close(folder: Path, *, diagnoses: Path | None = None, command: str = PREDICT, workers: int | None = None) -> None:

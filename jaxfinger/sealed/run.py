@@ -24,7 +24,7 @@ import numpy as np
 
 from jaxfinger.errors import UserError
 
-CASES_PER_PROCESS = 6  # compiled code of a case takes some 8,000 memory maps, and Linux gives a process 65,530
+CASES_PER_PROCESS = 12  # memory that a process has once taken it keeps
 
 Diagnose = Callable[[Path, Path], None]  # (session file, folder to write gap.json into)
 
