@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import json
 import os
@@ -124,6 +125,7 @@ def run(
 def _diagnose(fit: Path, out: Path, without: tuple[str, ...] = ()) -> None:
     """`jaxfinger diagnose`, silently, in a process that keeps what it has compiled for the cases that follow."""
     import equinox as eqx
+    import jax
 
     from jaxfinger.cli.diagnose import diagnose
 
@@ -132,6 +134,8 @@ def _diagnose(fit: Path, out: Path, without: tuple[str, ...] = ()) -> None:
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MAPS:
         eqx.clear_caches()
+        jax.clear_caches()
+        gc.collect()
 
 
 def close(folder: Path, *, diagnoses: Path | None = None, command: str = PREDICT, workers: int | None = None) -> None:

@@ -2,8 +2,10 @@
 
 import json
 import sys
+from pathlib import Path
 
 import h5py
+import jax
 import numpy as np
 import pytest
 
@@ -168,3 +170,23 @@ def test_processes_serve_several_cases_and_end(folder, tmp_path, monkeypatch):
     results = run_cases(folder, tmp_path / "out", diagnose, workers=2)
     assert results["case-004"] == "failed"
     assert sorted(results) == [f.name for f in sorted(folder.iterdir())]
+
+
+def test_this_programs_own_diagnosis_runs_in_processes_of_their_own_and_says_what_it_refused(folder, tmp_path, capsys):
+    cli.run(folder, workers=2)
+    said = capsys.readouterr().out
+    assert "0 diagnosed; failed, see run.json: case-001" in said.replace("\n", "")
+    record = json.loads((tmp_path / "cases-diagnoses" / "case-001" / "run.json").read_text())
+    assert record["error"].startswith("UserError: ")
+    assert "not an HDF5 file" in record["error"]
+
+
+def test_a_process_lets_go_of_compiled_code_before_memory_maps_run_out(tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxfinger.cli.diagnose.diagnose", lambda fit, output, without: None)
+    double = jax.jit(lambda x: 2 * x)
+    double(1.0)
+    cli._diagnose(tmp_path / "fit.h5", tmp_path / "out")
+    assert double._cache_size() == 1
+    monkeypatch.setattr(cli, "MAPS", 0)
+    cli._diagnose(tmp_path / "fit.h5", tmp_path / "out")
+    assert double._cache_size() == (0 if Path("/proc/self/maps").exists() else 1)
