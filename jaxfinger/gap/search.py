@@ -83,7 +83,8 @@ def search(
     rt = projector.residual(problem)
     chi2 = float(rt @ rt)
     progress("weighing the evidence")
-    found = by_site(screen(groups, columns, projector, rt))
+    screened = screen(groups, columns, projector, rt)
+    found = by_site(screened)
     ranked = list(found.values())
     absorbed = [(e.variant.key, e.absorbed) for e in ranked if e.absorbed > 0.99]
     strongest = ranked[0].log_bf
@@ -99,7 +100,9 @@ def search(
     there = {}
     for k in _rivals(refined, best, chi2, 1 if quick else RIVALS):
         progress(f"refitting with {k[0]} at {', '.join(k[1])} where it leads")
-        there[k], refined[k] = relinearised(problem, refined[k], chi2)
+        forms = [refine(problem, [e.variant], [start_of(e)], chi2, projector) for e in _other_forms(screened, found[k])]
+        led = [relinearised(problem, r, chi2) for r in (refined[k], *forms)]
+        there[k], refined[k] = max(led, key=lambda x: x[1].log_evidence)
     best = max((refined[k] for k in there), key=lambda r: r.log_evidence)
     problem = there[best.keys[0]]
     chosen = best if quick else _add(problem, groups, columns, best, chi2, rt[: problem.r.size], progress)
@@ -117,6 +120,22 @@ def _rivals(refined: dict[tuple, Refined], best: Refined, chi2: float, most: int
     """The strongest candidates, the best first: those that explain about as much as it does."""
     close = [k for k, r in refined.items() if chi2 - r.chi2 > CLOSE * (chi2 - best.chi2)]
     return sorted(close, key=lambda k: -refined[k].log_evidence)[:most]
+
+
+def _other_forms(screened: list[Evidence], first: Evidence) -> list[Evidence]:
+    """The strongest variant of every other choice, which no refit moves, of the same effect and site: a coarse grid of
+    the other shapes, or a friction that is refitted with it, may have put the wrong one first.
+    """
+    chosen = [first]
+    for e in screened:
+        close = e.variant.key == first.variant.key and e.explained > CLOSE * first.explained
+        if close and not any(_choices(e) == _choices(x) for x in chosen):
+            chosen.append(e)
+    return chosen[1:]
+
+
+def _choices(e: Evidence) -> list[float]:
+    return [v for n, v in e.variant.shape if n in e.variant.effect.CHOICES]
 
 
 def _worth(ranked: list[Evidence], most: int) -> list[Evidence]:
