@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import io
 import json
 import os
@@ -10,8 +9,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import asdict
-from functools import partial
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -21,8 +19,6 @@ from jaxfinger.errors import UserError
 
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 PREDICT = f"{shlex.quote(sys.executable)} -m jaxfinger predict {{fit}} {{session}} -o {{out}}"
-MAPS = 30_000  # of memory, half as many as Linux gives a process: compiled code takes 10,000 a case
-DIAGNOSE = "jaxfinger diagnose {fit} -o {out}"
 
 
 def make(
@@ -103,16 +99,14 @@ def run(
     from jaxfinger.sealed.truth import read_truth
 
     if command and not ("{fit}" in command and "{out}" in command):
-        raise UserError(f"--command {command!r}: it must hold {{fit}} and {{out}}, as in {DIAGNOSE!r}")
+        raise UserError(
+            f"--command {command!r}: it must hold {{fit}} and {{out}}, as in 'jaxfinger diagnose {{fit}} -o {{out}}'"
+        )
     out = output or _beside(folder, "withheld" if withheld else "diagnoses")
-    diagnose = Command(command) if command else _diagnose
+    diagnose = Command(command) if command else Diagnosis()
     if withheld:
         truths = [read_truth(f.parent, truth or _beside(folder, "truth")) for f in sorted(folder.glob("*/fit.h5"))]
-        causes = {t.name: t.causes[0][0] for t in truths if t.kind == "listed"}
-        diagnose = {
-            name: Command(command).without(effect) if command else partial(_diagnose, without=(effect,))
-            for name, effect in causes.items()
-        }
+        diagnose = {t.name: diagnose.without(t.causes[0][0]) for t in truths if t.kind == "listed"}
     with _bar("diagnosing") as progress:
         results = run_cases(folder, out, diagnose, workers or os.cpu_count() or 1, _share(share), progress)
     failed = sorted(name for name, what in results.items() if what == "failed")
@@ -122,20 +116,21 @@ def run(
     )
 
 
-def _diagnose(fit: Path, out: Path, without: tuple[str, ...] = ()) -> None:
+@dataclass(frozen=True)
+class Diagnosis:
     """`jaxfinger diagnose`, silently, in a process that keeps what it has compiled for the cases that follow."""
-    import equinox as eqx
-    import jax
 
-    from jaxfinger.cli.diagnose import diagnose
+    left_out: tuple[str, ...] = ()
 
-    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-        diagnose(fit, output=out, without=list(without))
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > MAPS:
-        eqx.clear_caches()
-        jax.clear_caches()
-        gc.collect()
+    def without(self, effect: str) -> Diagnosis:
+        """The same with one effect taken out of the catalogue."""
+        return Diagnosis((effect,))
+
+    def __call__(self, fit: Path, out: Path) -> None:
+        from jaxfinger.cli.diagnose import diagnose
+
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            diagnose(fit, output=out, without=list(self.left_out))
 
 
 def close(folder: Path, *, diagnoses: Path | None = None, command: str = PREDICT, workers: int | None = None) -> None:

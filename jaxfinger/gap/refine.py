@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import lsq_linear
 
 from jaxfinger.effects import NOMINAL_TERMS, CatalogueEffect
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.problem import Problem, moved
 from jaxfinger.gap.signatures import Signatures, Variant
+from jaxfinger.identify.solve import bounded
 
 STEPS = 10
 STEP = 0.05  # of a difference, in units of a coordinate
@@ -79,10 +79,11 @@ def refine(
     for _ in range(STEPS):
         rt = projector.residual(problem, r)
         St = projector(slopes)
-        G = St @ St.T
-        delta = _bounded(G + np.diag(prior), St @ rt - sizes / WIDE, *_room(effects, coordinates))
+        # Within bounds: what stays at one moves no other along as if it did not.
+        A, b = np.vstack([St.T, np.diag(np.sqrt(prior))]), np.concatenate([-rt, sizes])
+        delta = bounded(A, b, *_room(effects, coordinates))
         # No further than the trials resolve, where a sum of squares bends within a few per cent of a length.
-        reach = np.clip(1.0 / np.sqrt(np.maximum(np.diag(G), 1e-300)), STEP / 20.0, STEP)
+        reach = np.clip(1.0 / np.maximum(np.linalg.norm(St, axis=1), 1e-300), STEP / 20.0, STEP)
         moved = False
         for _ in range(4):
             trial_effects = _moved(effects, coordinates, delta)
@@ -265,12 +266,6 @@ def _room(effects, coordinates: list[_Coordinate]) -> tuple[np.ndarray, np.ndarr
         out.append((max(min(ways[0], 0.0), -most), min(max(ways[1], 0.0), most)))
     low, high = np.array(out).T
     return low, high
-
-
-def _bounded(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """argmin ½ xᵀ A x − bᵀ x within bounds: what stays at one moves no other along as if it did not."""
-    L = np.linalg.cholesky(A)
-    return lsq_linear(L.T, np.linalg.solve(L, b), (low, high + 1e-12), method="bvls").x
 
 
 def _moved(effects, coordinates, delta):

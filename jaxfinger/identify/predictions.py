@@ -107,9 +107,9 @@ def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> 
     ).reshape(len(steps), session.finger.n, -1)
     starts = (x.session_time - x.time)[:, 0]
     substeps = max(1, int(np.ceil(steps.max() / STEP - 1e-6)))
-    each = model, grid, even, x.q[..., 0].T, x.qd[..., 0].T, starts
     wide = np.minimum(np.arange(roomy(len(models), 2)), len(models) - 1)  # for a common shape the last is repeated
-    q = np.asarray(_simulate(jax.tree.map(lambda a: np.asarray(a)[wide], each), substeps))[: len(models)]
+    each = jax.tree.map(lambda a: jnp.asarray(a)[wide], (model, grid, even, x.q[..., 0].T, x.qd[..., 0].T, starts))
+    q = np.asarray(_simulate(*each, substeps=substeps))[: len(models)]
     # Whatever has left the finger's range by its whole width has no more to say, and may grow beyond all numbers.
     low, high = session.finger.limits.T[:, :, None]
     span = np.where(np.isfinite(high - low), high - low, 2 * np.pi)
@@ -131,10 +131,17 @@ def _times(stack: Stack) -> list[np.ndarray]:
 
 
 @eqx.filter_jit
-def _simulate(each, substeps: int) -> Float[Array, "B m T"]:
-    """`each`: model, time, tension, q and q̇ at the start, start in the session; every array with the trials first."""
+def _simulate(
+    model: Model,  # every leaf with the trials first
+    time: Float[Array, "B T"],
+    tension: Float[Array, "B n T"],
+    q0: Float[Array, "B m"],
+    qd0: Float[Array, "B m"],
+    start: Float[Array, " B"],
+    *,
+    substeps: int,
+) -> Float[Array, "B m T"]:
+    def one(model, t, f, q, qd, s):
+        return simulate(model, t, f, q, qd, session_start=s, substeps=substeps)[0]
 
-    def one(model, time, tension, q0, qd0, start):
-        return simulate(model, time, tension, q0, qd0, session_start=start, substeps=substeps)[0]
-
-    return jax.vmap(one)(*each)
+    return jax.vmap(one)(model, time, tension, q0, qd0, start)

@@ -14,6 +14,7 @@
 6. Outliers: Huber's weights from the white residuals at the optimum, then again from 1.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -92,7 +93,7 @@ def solve(
     floor = np.where(masses, LIGHTEST * theta, -np.inf)
     if prior is None:
         prior = Prior(theta, np.zeros((0, theta.size)))
-    weights: dict[str, np.ndarray | None] = dict.fromkeys(sources)
+    weights: Mapping[str, np.ndarray | None] = dict.fromkeys(sources)
     share = 0.0
     for robust in (False, True) if huber else (False,):
         if robust:
@@ -126,7 +127,7 @@ def solve(
             z = _minimise(A @ basis, b)
             step = basis @ z
             if np.any((theta + step)[masses] < floor[masses]):
-                step = _bounded(A, b, np.where(masses, floor - theta, -np.inf))
+                step = bounded(A, b, np.where(masses, floor - theta, -np.inf))
                 z = np.linalg.lstsq(basis, step, rcond=None)[0]
             small = float(np.max(np.abs(z), initial=0.0))
             if small < SMALL:
@@ -178,13 +179,15 @@ def visible(A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return scale[:, None] * Vt[seen].T / s[seen], Vt[~seen], scale
 
 
-def _bounded(A: np.ndarray, b: np.ndarray, lower: np.ndarray) -> np.ndarray:
-    """argmin ‖A δ + b‖ over δ ≥ lower: optimistix has no bounds, so the few problems that need them go to scipy."""
+def bounded(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray | float = np.inf) -> np.ndarray:
+    """argmin ‖A δ + b‖ over low ≤ δ ≤ high, where δ = 0 is allowed: optimistix has no bounds, so the few problems that
+    need them go to scipy.
+    """
     R = triangular(np.column_stack([A, b]))
     norm = np.linalg.norm(A, axis=0)
     scale = 1.0 / np.where(norm > 0, norm, 1.0)
-    lower = np.minimum(lower, 0.0) / scale
-    return scale * lsq_linear(R[:, :-1] * scale, -R[:, -1], (lower, np.inf), method="bvls").x
+    bounds = np.minimum(low, 0.0) / scale, np.maximum(high, 0.0) / scale
+    return scale * lsq_linear(R[:, :-1] * scale, -R[:, -1], bounds, method="bvls").x
 
 
 def _compressed(z: Float[Array, " k"], problem: tuple[Array, Array]) -> Float[Array, " rows"]:
@@ -209,10 +212,10 @@ def _minimise(A: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray(_dogleg(jnp.asarray(square), jnp.asarray(right)))[:k]
 
 
-def huber_weights(linearised: dict[str, Linearised], limit: float) -> tuple[dict[str, np.ndarray | None], float]:
+def huber_weights(linearised: dict[str, Linearised], limit: float) -> tuple[dict[str, np.ndarray], float]:
     """Square roots of Huber's weights, and the share of residuals beyond the limit."""
     beyond = count = 0
-    weights: dict[str, np.ndarray | None] = {}
+    weights = {}
     for name, lin in linearised.items():
         r = np.abs(np.asarray(lin.white))
         beyond, count = beyond + int((r > limit).sum()), count + int((r > 0).sum())

@@ -24,7 +24,7 @@ import numpy as np
 
 from jaxfinger.errors import UserError
 
-CASES_PER_PROCESS = 12  # memory that a process has once taken it keeps
+CASES_PER_PROCESS = 3  # compiled code of a case takes up to 18,000 memory maps; Linux gives a process 65,530
 
 Diagnose = Callable[[Path, Path], None]  # (session file, folder to write gap.json into)
 
@@ -139,12 +139,6 @@ def run_cases(
     mine = [f for k, f in enumerate(folders, start=1) if k % share[1] == share[0] % share[1] and f.name in how]
     mine.sort(key=lambda f: (_finger(f / "fit.h5"), f.name))
     results: dict[str, str] = {}
-    if workers == 1:
-        for f in mine:
-            results[f.name] = run_case(how[f.name], f, out)
-            if progress:
-                progress(len(results), len(mine), f"{f.name} {results[f.name]}")
-        return results
     commands = all(isinstance(d, Command) for d in how.values())  # which are processes of their own
     at_once = len(mine) if commands else workers * CASES_PER_PROCESS
     for first in range(0, len(mine), max(1, at_once)):

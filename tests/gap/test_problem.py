@@ -4,14 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap.augment import augmented_fit, nominal_fit
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.problem import build, moved
-from jaxfinger.gap.refine import _bounded, refine, relinearised
+from jaxfinger.gap.refine import refine, relinearised
 from jaxfinger.gap.signatures import Signatures, Variant
 from jaxfinger.gap.where import where
 from jaxfinger.identify import Recipe
@@ -104,24 +102,6 @@ def test_a_length_is_found_while_the_share_stays_at_its_most(problem, start):
     found = refine(there, [Variant(kind, site, (("x0", x0), ("delta", 0.5)))], [{"a": a}], float(rt @ rt))
     assert abs(float(found.effects[0].x0) - 0.02) < 4.0 * found.std[0]["x0"] < 0.004
     assert found.effects[0].delta == 0.5
-
-
-@given(st.integers(0, 10_000))
-@settings(max_examples=50, deadline=None)
-def test_a_bounded_step_is_the_lowest_within_its_bounds(seed):
-    rng = np.random.default_rng(seed)
-    A, b = rng.standard_normal((5, 3)), rng.standard_normal(3)
-    A = A.T @ A + 0.1 * np.eye(3)
-    low, high = -rng.uniform(0.0, 1.0, 3), rng.uniform(0.0, 1.0, 3)
-    low[0], high[1] = 0.0, 0.0  # at a bound
-    x = _bounded(A, b, low, high)
-    assert np.all((low - 1e-9 <= x) & (x <= high + 1e-9))
-
-    def cost(x):
-        return 0.5 * x @ A @ x - b @ x
-
-    others = rng.uniform(low, high, (200, 3))
-    assert cost(x) <= min(cost(y) for y in others) + 1e-9
 
 
 def test_a_large_effect_is_judged_by_what_it_leaves_exactly(scaled):

@@ -6,6 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from jaxtyping import Array, Float
 
 from jaxfinger.effects import CatalogueEffect
@@ -13,16 +15,15 @@ from jaxfinger.errors import UserError
 from jaxfinger.experiments import predict, prepare
 from jaxfinger.identify import solve as solve_module
 from jaxfinger.identify.parameters import describe, ravel
-from jaxfinger.identify.solve import solve
+from jaxfinger.identify.solve import bounded, solve
 from jaxfinger.identify.stages import first_noise, sources_of
 
 EXPERIMENT, CHANNEL = "ID.3-static", "joint_torque"
 
 
-class Logarithm(CatalogueEffect):
-    """10 N mm · log(1 + a): from a = 0, a Newton step towards a = −0.95 lands where no logarithm is."""
+class Bend(CatalogueEffect):
+    """10 N mm · law(a) at a joint."""
 
-    ID: ClassVar = "logarithm"
     PLACE: ClassVar = "joint"
     AMPLITUDES: ClassVar = {"a": ("1", 0.5, True)}
     SHOWS: ClassVar = {EXPERIMENT: (CHANNEL,)}
@@ -30,7 +31,24 @@ class Logarithm(CatalogueEffect):
     a: Float[Array, ""]
 
     def torque(self, x, memory, h):
-        return h.at[self.index[0]].add(1e-2 * jnp.log1p(self.a))
+        return h.at[self.index[0]].add(1e-2 * self.law(self.a))
+
+
+class Logarithm(Bend):
+    """log(1 + a): from a = 0, a Newton step towards a = −0.95 lands where no logarithm is."""
+
+    ID: ClassVar = "logarithm"
+    law = staticmethod(jnp.log1p)
+
+
+class Kink(Bend):
+    """a above zero, −0.8 a below: no step leads below what a = 0 predicts."""
+
+    ID: ClassVar = "kink"
+
+    @staticmethod
+    def law(a):
+        return jnp.maximum(a, -0.8 * a)
 
 
 def _problem_of(kind, short, short_truth, start, true, shift=0.0):
@@ -70,20 +88,6 @@ def test_a_start_where_the_model_is_not_defined_is_refused(problem):
         solve(astray, np.array([position]), {EXPERIMENT: source})
 
 
-class Kink(CatalogueEffect):
-    """10 N mm · a above zero, −8 N mm · a below: no step leads below what a = 0 predicts."""
-
-    ID: ClassVar = "kink"
-    PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"a": ("1", 0.5, True)}
-    SHOWS: ClassVar = {EXPERIMENT: (CHANNEL,)}
-
-    a: Float[Array, ""]
-
-    def torque(self, x, memory, h):
-        return h.at[self.index[0]].add(1e-2 * jnp.maximum(self.a, -0.8 * self.a))
-
-
 def test_a_kink_within_a_tenth_of_a_standard_deviation_ends_the_search(short, short_truth, monkeypatch):
     model, position, source = _problem_of(Kink, short, short_truth, start=1.0, true=0.0)
     _, smooth = solve(model, np.array([position]), {EXPERIMENT: source})
@@ -97,3 +101,16 @@ def test_a_kink_within_a_tenth_of_a_standard_deviation_ends_the_search(short, sh
     assert len(calls) <= 4
     assert abs(float(ravel(found)[position])) < 0.1 * std
     assert float(jnp.sum(solution.linearised[EXPERIMENT].white ** 2)) == pytest.approx(2.0 * solution.cost)
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=50, deadline=None)
+def test_a_bounded_step_is_the_lowest_within_its_bounds(seed):
+    rng = np.random.default_rng(seed)
+    A, b = rng.standard_normal((5, 3)) * [1.0, 1e-3, 1e3], rng.standard_normal(5)
+    low, high = -rng.uniform(0.0, 1.0, 3), rng.uniform(0.0, 1.0, 3)
+    low[0], high[1] = 0.0, 0.0  # at a bound
+    x = bounded(A, b, low, high)
+    assert np.all((low - 1e-9 <= x) & (x <= high + 1e-9))
+    others = rng.uniform(low, high, (200, 3))
+    assert np.linalg.norm(A @ x + b) <= np.linalg.norm(others @ A.T + b, axis=1).min() + 1e-9
