@@ -53,7 +53,7 @@ def make(
 
 def rivals(folder: Path, *, truth: Path | None = None, workers: int | None = None, share: str = "1/1") -> None:
     """Compute the ceiling: which other causes no method could tell from the true one. Written into the truth;
-    takes minutes a case.
+    takes half a minute a case.
 
     Args:
         folder: the cases.

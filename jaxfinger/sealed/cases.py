@@ -162,13 +162,14 @@ def _draw(number: int, split: str, spec: CaseSpec) -> _Case:
 
 
 def rebuild(truth: dict) -> tuple[Session, list[Departure]]:
-    """The noise-free session and the departures of a case, from its truth file alone."""
+    """The noise-free session and the departures of a case, from its truth file alone; no slack tendon counts."""
     effects = truth["effects"]
     spec = CaseSpec(
         truth["kind"], truth["specimen"], tuple(e["effect"] for e in effects), tuple(e["severity"] for e in effects)
     )
     case = _draw(truth["seed"][1], truth["split"], spec)
-    return case.quiet, case.departures
+    quiet = Session(case.quiet.specimen, case.plans, case.quiet.sensors, slack_counts=False)
+    return quiet, case.departures
 
 
 def _with_trajectories(nominal: Finger, plans: Sequence[Plan], rng: np.random.Generator) -> list[Plan]:

@@ -127,7 +127,8 @@ FIGURES: dict[str, tuple[Callable[[Truth], bool], Callable[[Truth, Diagnosis], b
     "cause, where distinguishable": (lambda t: t.kind == "listed" and t.rivals == 0, cause_right),
     "covered": (lambda t: t.kind == "listed", covered),
     "false alarm": (lambda t: t.kind == "none", lambda t, d: bool(d.answer)),
-    "open set": (lambda t: t.kind == "unlisted", lambda t, d: d.status == "unexplained"),
+    "open set": (lambda t: t.kind == "unlisted", covered),
+    "open set, where distinguishable": (lambda t: t.kind == "unlisted" and t.rivals == 0, covered),
     "double, one right": (lambda t: t.kind == "double", cause_right),
     "double, both right": (lambda t: t.kind == "double", both_right),
 }
@@ -137,7 +138,8 @@ def score_cases(pairs: Sequence[tuple[Truth, Diagnosis]]) -> Scores:
     """All scores of a set of cases.
 
     cause, covered: single listed effects; «where distinguishable»: of these, where no other cause fits as well
-    (see `rivals`). false alarm: cases without an effect. open set: effects that the catalogue lacks.
+    (see `rivals`). false alarm: cases without an effect. open set: effects that the catalogue lacks, and of these those
+    that no listed one imitates.
     Brier, probability on the truth: every case that was diagnosed. set size: verdicts that name something. closed:
     cases with predictions on the fresh trials. seconds: cost of a case.
     """

@@ -29,6 +29,7 @@ from .specimens import Specimen
 COARSE = {250.0: 25.0, 1000.0: 60.0}  # Hz: enough for what survives in the mean
 UNSEEN = 1e-9  # severity of what leaves no trace at all, so that its logarithm exists
 SLIDING = 0.03  # rad/s: what counts as a sliding joint
+TAUT = 0.3  # N
 
 
 @dataclass(frozen=True)
@@ -43,10 +44,12 @@ class Look:
 
 
 class Session:
-    """The noise-free session of one specimen, with the directions that a nominal fit can absorb."""
+    """The noise-free session of one specimen, with the directions that a nominal fit can absorb. The length of a
+    tendon that is slack for a while may count, as it does in a case's severity, or not.
+    """
 
-    def __init__(self, specimen: Specimen, plans: Sequence[Plan], sensors: Sensors):
-        self.specimen, self.sensors = specimen, sensors
+    def __init__(self, specimen: Specimen, plans: Sequence[Plan], sensors: Sensors, slack_counts: bool = True):
+        self.specimen, self.sensors, self.slack_counts = specimen, sensors, slack_counts
         self.nominal = Finger(specimen)
         # Repeats say nothing new without noise.
         unique = {plan.motion: plan for plan in reversed(plans)}
@@ -91,10 +94,12 @@ class Session:
         plan, e = look.plan, look.plan.experiment
         finger = self.specimen.finger
         if channels.excursion is not None:
-            taut = finger.active & (look.motion.tension.max(axis=0) > 0.3)
-            for k in np.flatnonzero(taut if e != "ID.4" else np.arange(finger.n) == plan.tendon):
+            taut = look.motion.tension > TAUT
+            pulled = finger.active & taut.any(axis=0)
+            for k in np.flatnonzero(pulled if e != "ID.4" else np.arange(finger.n) == plan.tendon):
                 x = channels.excursion[:, k] / self.sensors.hold_std("tendon_excursion")
-                yield e, "tendon_excursion", int(k), x - x.mean()
+                counts = taut[:, k] if not self.slack_counts else np.ones(len(x), bool)
+                yield e, "tendon_excursion", int(k), (x - x[counts].mean() if counts.any() else x) * counts
         if channels.torque is not None:
             slides = self._sliding(look.motion) if e == "VD.3" else np.ones(look.motion.q.shape)
             scale = self.sensors.hold_std("joint_torque")

@@ -15,6 +15,7 @@ SHARES = (
     "covered",
     "false alarm",
     "open set",
+    "open set, where distinguishable",
     "double, one right",
     "double, both right",
 )

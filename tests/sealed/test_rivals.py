@@ -1,17 +1,19 @@
 """The ceiling: what no method could tell apart."""
 
+import json
+
 import numpy as np
 import pytest
 
 from jaxfinger.sealed import rivals
 from jaxfinger.sealed.departures import draw_at
-from jaxfinger.sealed.rivals import distances
+from jaxfinger.sealed.rivals import add_rivals, distances
 from jaxfinger.sealed.severity import COARSE, Session, calibrate
 
 
 @pytest.fixture
 def session(specimen, plans, sensors):
-    return Session(specimen, plans, sensors)
+    return Session(specimen, plans, sensors, slack_counts=False)
 
 
 def test_the_same_cause_is_no_distance_away_and_a_foreign_one_all_of_it(session, specimen, monkeypatch):
@@ -26,3 +28,23 @@ def test_the_same_cause_is_no_distance_away_and_a_foreign_one_all_of_it(session,
     assert ("drive_inertia", truth.site) not in {
         (r.effect, r.site) for r in distances(session, left, ("drive_inertia", truth.site), seed=1)
     }
+
+
+def test_an_effect_that_nobody_lists_has_listed_imitators(session, specimen, monkeypatch, tmp_path):
+    """A tendon's sag at low tension lengthens it as a stretch with a toe does; no drive's inertia does."""
+    monkeypatch.setattr(rivals, "LISTED", ["drive_inertia", "tendon_stretch"])
+    effect = "sag of a tendon at low tension"
+    sag = draw_at(effect, (("T1",), (0,)), specimen.finger, np.random.default_rng(0), (1.0,))
+    truth, _, _ = calibrate(session, sag, 2.0)
+    monkeypatch.setattr(rivals, "rebuild", lambda _: (session, [truth]))
+    file = tmp_path / "case-001.json"
+    file.write_text(json.dumps({"kind": "unlisted", "seed": [1, 1]}))
+    near = add_rivals(file)
+    said = json.loads(file.read_text())
+    assert said["energy"] > 0
+    assert [(r["effect"], r["site"]) for r in said["rivals"]] == [(r.effect, list(r.site)) for r in near]
+    left = session.left(session.trace([truth])[0])
+    all_of_them = distances(session, left, ("unnamed", ()), seed=1)
+    assert (all_of_them[0].effect, all_of_them[0].site) == ("tendon_stretch", ("T1",))
+    assert all_of_them[0].distance < 0.8 * said["energy"]
+    assert all(r.distance > 0.95 * said["energy"] for r in all_of_them if r.effect == "drive_inertia")
