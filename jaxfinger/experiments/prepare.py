@@ -140,7 +140,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     y, mask = _measured(spec, trial, session, minus)
     slides = np.zeros((N, m))
     if spec.samples == "sliding" or spec.stepped:
-        slides = _sliding(spec, trial, session, lost, noise, qd, rate, motorised)
+        slides = _sliding(spec, trial, session, lost, noise, qd, joint_direction, rate, motorised)
     if reduced and spec.samples == "sliding":
         # q̈ is low-passed, so all else is too. What noise it keeps would still tell a fit of less inertia
         # (errors in variables): where q̈ does not rise above it, its mean over a tenth of a second takes its place.
@@ -251,7 +251,7 @@ def _rates(trial: Trial, spec: Experiment) -> np.ndarray:
 
 
 def _sliding(
-    spec: Experiment, trial: Trial, session: Session, lost, noise, qd, rate: np.ndarray | None, motorised
+    spec: Experiment, trial: Trial, session: Session, lost, noise, qd, direction, rate: np.ndarray | None, motorised
 ) -> np.ndarray:
     """(N, m): 1 where a joint and every taut tendon across it slide, so that the directions of friction are known.
 
@@ -260,7 +260,7 @@ def _sliding(
     """
     fast = np.percentile(np.abs(qd), 95, axis=0)
     slow = np.where(motorised, MIN_DRIVEN_SPEED, MIN_JOINT_SPEED)
-    slides = np.abs(qd) > np.minimum(slow, 0.05 * fast)
+    slides = (np.abs(qd) > np.minimum(slow, 0.05 * fast)) & (np.sign(qd) == np.sign(direction))
     slides[1:] &= np.sign(qd[1:]) == np.sign(qd[:-1])  # a quick reversal has no slow sample
     if rate is not None and trial.tendon_excursion is not None and trial.tendon_force is not None:
         taut = np.nan_to_num(trial.tendon_force) > SLACK

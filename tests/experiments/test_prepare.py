@@ -61,6 +61,22 @@ def test_samples_around_a_reversal_do_not_count_and_the_others_do():
     assert counts[inside & (apart > 2 * CLEAR)].all()
 
 
+@pytest.mark.parametrize("creep", [-0.035, 0.035])
+def test_a_creep_whose_direction_is_not_known_does_not_count(creep):
+    """Slower than what tells a direction, before the first motion or after one that went the other way."""
+    time = np.arange(6000) / RATE
+    rate = np.select([time < 1.0, time < 2.0, time < 4.0, time < 5.0], [0.0, creep, 0.6, creep], 0.6)
+    q = np.tile(np.radians([-40.0, 30.0, 20.0]), (time.size, 1))
+    q[:, 0] += np.cumsum(rate) / RATE
+    q += ENCODER * np.random.default_rng(3).standard_normal(q.shape)
+    batch = stack(Trial("free", "VD.3", time, q, tendon_force=np.zeros((time.size, FINGER.n)))).batch
+    at, counts = np.asarray(batch.x.time)[0], np.asarray(batch.mask["joint_torque"])[0, 0] > 0
+    direction = np.asarray(batch.x.joint_direction)[0, 0]
+    assert not counts[at < 2.0].any()
+    assert counts[(at > 2.3) & (at < 3.8)].all()
+    assert np.all(direction[counts] * np.interp(at[counts], time, rate) > 0.0)
+
+
 def test_around_a_slip_faster_than_the_filter_no_joint_counts():
     """The DIP jumps by 0.2 rad within 15 ms, twice, while the PIP sweeps on: what is spread moves every joint."""
     time = np.arange(4000) / RATE
