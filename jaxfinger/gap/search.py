@@ -38,9 +38,10 @@ RIVALS = 3  # at most in a set
 LOOKED_AT = 12  # candidates for a further effect
 LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for, and nothing is unlisted
 HINT = 20.0  # of it in a column, that a known effect may claim though noise could give it: its law asks for more
-# «Unlisted»: the share of the gap left to the stand-in at which it is as likely as the catalogue, and how sharply.
-# Known effects in textbook forms other than ours leave 0.14 at most, unknown ones that a known one imitates 0.17.
-OPEN = (0.155, 0.015)
+# «Unlisted», by how many effects were chosen, since two known ones together imitate more than one does: the share of
+# the gap left to the stand-in at which it is as likely as the catalogue, and how sharply. One known effect in another
+# textbook form leaves 0.14 at most, and an unknown one that it imitates 0.17; two leave 0.02, and 0.11.
+OPEN = {1: (0.155, 0.015), 2: (0.07, 0.015)}
 
 
 @dataclass(frozen=True)
@@ -230,7 +231,7 @@ def _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, stro
     log_l = {k: -0.5 * LOOKS * np.log1p(max(u, 0.0) / LOOKS) for k, u in unexplained.items()}
     total = logsumexp(list(log_l.values()))
     share_left = beyond / gap
-    even, width = OPEN
+    even, width = OPEN[len(chosen.variants)]
     unlisted = float(expit((share_left - even) / width)) if beyond > LEAST else 0.01
     probability = {k: float(np.exp(v - total)) * (1 - unlisted) for k, v in log_l.items()}
     if len(chosen.variants) > 1:
