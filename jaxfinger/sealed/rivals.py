@@ -19,6 +19,7 @@ import numpy as np
 
 from .cases import rebuild
 from .departures import LISTED, draw_at, sites
+from .departures.draw import Index, Names
 from .severity import COARSE, Session
 from .truth import TELLING
 
@@ -45,7 +46,7 @@ def distances(
     finger = session.specimen.finger
     energy = float(left @ left) / COARSE[250.0]
 
-    def imitated(effect: str, site, draws: int) -> float:
+    def imitated(effect: str, site: tuple[Names, Index], draws: int) -> float:
         """Energy of the truth's trace along the rival's, of the drawn shape that fits best."""
         best = 0.0
         for _ in range(draws):
@@ -56,14 +57,13 @@ def distances(
         return best
 
     found = {
-        (effect, *site): imitated(effect, site, draws)
+        (effect, names, index): imitated(effect, (names, index), draws)
         for effect in LISTED
-        for site in sites(effect, finger)
-        if (effect, site[0]) != truth
+        for names, index in sites(effect, finger)
+        if (effect, names) != truth
     }
-    for effect, *site in sorted(found, key=lambda k: -found[k])[:NEAREST]:
-        key = (effect, *site)
-        found[key] = max(found[key], imitated(effect, tuple(site), MORE))
+    for key in sorted(found, key=lambda k: -found[k])[:NEAREST]:
+        found[key] = max(found[key], imitated(key[0], key[1:], MORE))
     return sorted(
         (Rival(effect, names, 0.5 * max(energy - best, 0.0)) for (effect, names, _), best in found.items()),
         key=lambda r: r.distance,
