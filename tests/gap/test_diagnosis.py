@@ -38,6 +38,18 @@ def test_the_planted_cause_and_its_site_are_named(gap):
     assert best["parameters"]["a"]["value"] == pytest.approx(1.0, abs=0.15)
 
 
+def test_two_effects_are_both_named_and_keep_their_sizes():
+    relaxation = "elastic_relaxation", ("MCP",)
+    session = session_with((*TRUTH, {"a": 1.0, "x0": 0.1}), (*relaxation, {"stiffness": 0.02, "T": 1.0}))
+    found = diagnose(session, without=WITHOUT)
+    assert found.verdict.status == "explained"
+    assert set(found.verdict.effects) == {TRUTH, relaxation}
+    at = {tuple(x["site"]): x["parameters"] for x in as_gap_json(found)["candidates"][:2]}
+    assert at["PIP",]["x0"]["value"] == pytest.approx(0.1, rel=0.2)
+    assert at["MCP",]["stiffness"]["value"] == pytest.approx(0.02, rel=0.2)
+    assert at["MCP",]["T"]["value"] == pytest.approx(1.0, rel=0.3)
+
+
 def test_the_gap_lies_at_the_joint_and_closes_on_held_out_trials(gap):
     assert gap["where"][0]["channel"] == "joint_torque"
     assert gap["where"][0]["site"] == "PIP"
