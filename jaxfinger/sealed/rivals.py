@@ -46,24 +46,24 @@ def distances(
     finger = session.specimen.finger
     energy = float(left @ left) / COARSE[250.0]
 
-    def imitated(effect: str, site: tuple[Names, Index], draws: int) -> float:
+    def imitated(effect: str, names: Names, index: Index, draws: int) -> float:
         """Energy of the truth's trace along the rival's, of the drawn shape that fits best."""
         best = 0.0
         for _ in range(draws):
-            rival = draw_at(effect, site, finger, rng, (0.5, 1.0))
+            rival = draw_at(effect, (names, index), finger, rng, (0.5, 1.0))
             z = session.left(session.trace([rival])[0])
             # Sizes are positive where physics says so, but signs of gains and offsets are free: take either.
             best = max(best, float(left @ z) ** 2 / max(float(z @ z), 1e-30) / COARSE[250.0])
         return best
 
     found = {
-        (effect, names, index): imitated(effect, (names, index), draws)
+        (effect, names, index): imitated(effect, names, index, draws)
         for effect in LISTED
         for names, index in sites(effect, finger)
         if (effect, names) != truth
     }
     for key in sorted(found, key=lambda k: -found[k])[:NEAREST]:
-        found[key] = max(found[key], imitated(key[0], key[1:], MORE))
+        found[key] = max(found[key], imitated(*key, MORE))
     return sorted(
         (Rival(effect, names, 0.5 * max(energy - best, 0.0)) for (effect, names, _), best in found.items()),
         key=lambda r: r.distance,

@@ -142,30 +142,15 @@ def run_cases(
     commands = all(isinstance(d, Command) for d in how.values())  # which are processes of their own
     at_once = len(mine) if commands else workers * CASES_PER_PROCESS
     for first in range(0, len(mine), max(1, at_once)):
-        with ThreadPoolExecutor(workers) if commands else _processes(workers) as pool:
+        # Spawned, since JAX's threads do not outlive a fork, and anew after some cases, since compiled code stays.
+        pool = ThreadPoolExecutor(workers) if commands else ProcessPoolExecutor(workers, get_context("spawn"))
+        with pool:
             jobs = {pool.submit(run_case, how[f.name], f, out): f.name for f in mine[first : first + at_once]}
             for job in as_completed(jobs):
                 results[jobs[job]] = job.result()
                 if progress:
                     progress(len(results), len(mine), f"{jobs[job]} {job.result()}")
     return results
-
-
-def _processes(workers: int) -> ProcessPoolExecutor:
-    """Spawned, since JAX's threads do not outlive a fork, and anew after some cases, since compiled code stays.
-
-    Each has cores of its own where the system allows: waiting threads of one would take the time of the others.
-    """
-    spawn = get_context("spawn")
-    cores = spawn.SimpleQueue()
-    for own in np.array_split(sorted(getattr(os, "sched_getaffinity", lambda _: ())(0)), workers):
-        cores.put([int(c) for c in own])
-    return ProcessPoolExecutor(workers, spawn, _take_cores, (cores,))
-
-
-def _take_cores(cores) -> None:
-    if own := cores.get():
-        os.sched_setaffinity(0, own)
 
 
 def _finger(fit: Path) -> bytes:

@@ -98,8 +98,8 @@ class Session:
             pulled = finger.active & taut.any(axis=0)
             for k in np.flatnonzero(pulled if e != "ID.4" else np.arange(finger.n) == plan.tendon):
                 x = channels.excursion[:, k] / self.sensors.hold_std("tendon_excursion")
-                counts = taut[:, k] if not self.slack_counts else np.ones(len(x), bool)
-                yield e, "tendon_excursion", int(k), (x - x[counts].mean() if counts.any() else x) * counts
+                counts = taut[:, k] | self.slack_counts
+                yield e, "tendon_excursion", int(k), (x - x.mean(where=counts) if counts.any() else x) * counts
         if channels.torque is not None:
             slides = self._sliding(look.motion) if e == "VD.3" else np.ones(look.motion.q.shape)
             scale = self.sensors.hold_std("joint_torque")
