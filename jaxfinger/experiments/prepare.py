@@ -183,9 +183,12 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         motion["blur"] = np.full(M, width(cutoff) if spec.samples == "sliding" else 0.0)
     # Joints that are held have no inertia: ramps of the tension count as well as holds.
     between = _goes_on(tension_mean, hold)[:, None] if spec.held else mean(slides) > 1.0 - 1e-9
+    # How far a tendon is pulled in no friction decides: where it is taut, all of a ramp counts.
+    taut = tension[: M * block].reshape(M, block, n).min(axis=1) > SLACK
     y_mean, mask_mean = {}, {}
     for c in y:
-        counts = (mean(mask[c]) > 0.5) & _counting(spec, c, hold, between)
+        known = taut | between if spec.held and c == "tendon_excursion" else between
+        counts = (mean(mask[c]) > 0.5) & _counting(spec, c, hold, known)
         mask_mean[c] = counts.astype(float).T
         y_mean[c] = mean(y[c]).T * mask_mean[c]  # of all samples, as everything else that the model reads
     return _Row(motion, y_mean, mask_mean, hold, block * step)

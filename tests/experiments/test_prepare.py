@@ -131,6 +131,21 @@ def test_between_holds_counts_a_tension_that_goes_on_or_a_joint_that_slides():
     assert [len(k) for k in held.samples_of_holds(0, counts)] == [13] * 7
 
 
+def test_the_excursion_of_a_taut_tendon_counts_on_every_ramp():
+    """No friction decides it; a slack tendon's length is not that of its path."""
+    time = np.arange(5000) / RATE
+    level = np.interp(time, [0.5, 1.0, 2.0, 2.5, 3.5, 4.0], [0.0, 4.0, 4.0, 8.0, 8.0, 2.0])
+    hold = np.where((time > 1.05) & (time < 2.0), 0, np.where((time > 2.55) & (time < 3.5), 1, -1)).astype(np.int32)
+    tension = level[:, None] * (np.arange(FINGER.n) == 0)
+    q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
+    trial = Trial("pull", "VD.2", time, q, tension, tendon_excursion=0.0 * tension, tendon="T1", hold=hold)
+    found = stack(trial)
+    pulled, slack = (np.asarray(found.batch.mask["tendon_excursion"])[k, 0, :100] > 0 for k in (0, 1))
+    at = found.batch.x.time[0, :100]
+    np.testing.assert_array_equal(pulled, level.reshape(100, 50).min(axis=1) > SLACK)
+    assert not slack[(at < 1.0) | (at > 3.5)].any()
+
+
 def test_a_slow_sweep_of_the_motor_slides_and_a_finger_as_slow_may_stick():
     time = np.arange(4000) / RATE
     q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
