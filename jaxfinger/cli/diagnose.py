@@ -59,7 +59,9 @@ def diagnose(
         own = load(effects) if effects is not None else {}
         say("reading the file")
         simulated = read_predictions(predictions) if predictions is not None else None
-        found = run(read_session(session), wanted, quick, own, tuple(without or ()), say, simulated)
+        measured = read_session(session)
+        _make(output)
+        found = run(measured, wanted, quick, own, tuple(without or ()), say, simulated)
         say("writing the report")
         write(found, output, overwrite)
         write_page(found, output / "report.html", overwrite)
@@ -68,12 +70,16 @@ def diagnose(
 
 
 def _refuse(output: Path, overwrite: bool) -> None:
-    """Before any work: all that will be written can be."""
+    """Before anything is read: no file is overwritten unasked."""
     if output.exists() and not output.is_dir():
         raise UserError(f"{output}: is a file; name a folder")
+    for name in FILES if output.is_dir() else ():
+        refuse_existing(output / name, overwrite)
+
+
+def _make(output: Path) -> None:
+    """Before the long work: what will be written can be."""
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{output}: cannot be made ({error.strerror}); choose another folder") from None
-    for name in FILES:
-        refuse_existing(output / name, overwrite)

@@ -15,7 +15,7 @@ class TendonStretch(CatalogueEffect):
     ID: ClassVar = "tendon_stretch"
     PLACE: ClassVar = "tendon"
     AMPLITUDES: ClassVar = {"compliance": ("m/N", 5e-5, False)}
-    SHAPES: ClassVar = {"toe": ("1", (0.0, 2.0)), "f0": ("N", (1.0, 3.0))}
+    SHAPES: ClassVar = {"toe": ("1", (0.0, 2.0, 6.0)), "f0": ("N", (1.0, 3.0))}
     SHIFTS: ClassVar = ("toe",)
     SHOWS: ClassVar = EXCURSION
 

@@ -23,6 +23,7 @@ from jaxfinger.identify.predictions import simulate_trials
 from jaxfinger.model import Model
 
 FOLDS = 3
+RESOLVABLE = 1.1  # mean square before over that of the noise, from which on a gap can be said to close
 
 
 @dataclass(frozen=True)
@@ -193,11 +194,12 @@ def _line(e: str, c: str, units: str, values: np.ndarray) -> Shrinkage:
 
     def closed(rows):
         before, after, noise = (np.average(values[rows, k], weights=weight[rows]) for k in range(3))
-        return 1.0 - (after - noise) / (before - noise) if before > noise else np.nan
+        # What has no gap, as a draw without the trials that show it, says nothing of how far it closes.
+        return 1.0 - (after - noise) / (before - noise) if before > RESOLVABLE * noise else np.nan
 
     rows = np.arange(len(values))
     before, after, noise = (float(np.average(values[:, k], weights=weight)) for k in range(3))
-    resolvable = before > 1.1 * noise
+    resolvable = before > RESOLVABLE * noise
     draws = np.array([closed(rng.choice(rows, len(rows))) for _ in range(400)])
     draws = draws[np.isfinite(draws)]
     low, high = np.quantile(draws, (0.025, 0.975)) if resolvable and len(draws) else (0.0, 0.0)

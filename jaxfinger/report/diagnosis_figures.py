@@ -96,7 +96,7 @@ def _how_far(ax, lines: list[dict]) -> None:
         ax.plot([before, after], [y, y], color="#999999", linewidth=1.2, zorder=1)
         ax.plot(before, y, "o", color="white", markeredgecolor=BEFORE, markeredgewidth=1.6, markersize=7)
         ax.plot(after, y, "o", color=AFTER, markersize=5)
-        text = f"{factor * x['before']:.2g} → {factor * x['after']:.2g} {unit}"
+        text = f"{factor * x['before']:.3g} → {factor * x['after']:.3g} {unit}"
         ax.text(1.02, y, text, transform=ax.get_yaxis_transform(), va="center", fontsize=8)
     ax.axvline(1.0, color="#444444", linewidth=0.9, linestyle="--")
     ax.set(

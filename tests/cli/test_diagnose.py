@@ -27,6 +27,7 @@ def test_a_missing_session_is_said(tmp_path, capsys):
         main(["diagnose", str(tmp_path / "none.h5"), "-o", str(tmp_path / "out")])
     assert stop.value.code == 2
     assert "none.h5" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_file_of_effects_is_loaded_before_the_session(tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""What a fold's linear refit may not do: lead an effect beyond its bounds."""
+"""A fold's linear refit leads no effect beyond its bounds; the interval of how far a gap closes."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,6 +6,7 @@ import pytest
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap.refine import within_bounds
+from jaxfinger.gap.shrinkage import _line
 from jaxfinger.model import Finger
 from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger
 
@@ -33,3 +34,17 @@ def test_a_length_that_a_linear_step_turned_negative_comes_back(finger):
     effect = kind.at(finger, ("PIP",), a=1.0, x0=-0.3)
     assert 0.0 < within_bounds(effect).values()["x0"] <= min(kind.SHAPES["x0"][1])
     assert np.isfinite(jnp.asarray(within_bounds(effect).values()["x0"]))
+
+
+def test_trials_without_a_gap_say_nothing_of_how_far_it_closes():
+    """Two tendons of ten show it: a draw of the bootstrap that has neither would say that nothing closes."""
+    rng = np.random.default_rng(1)
+    noise = 1.0 + 0.02 * rng.standard_normal((20, 2))
+    before = np.where(np.arange(20) < 2, 400.0, 1.0) * noise[:, 0]
+    after = np.where(np.arange(20) < 2, 5.0, 1.0) * noise[:, 1]
+    rows = np.stack([before, after, np.ones(20), np.full(20, 100.0)], axis=1)
+    line = _line("ID.4", "tendon_excursion", "m", rows)
+    assert line.closed == pytest.approx(1 - 4.0 / 399.0, abs=2e-3)
+    assert 0.95 < line.closed_ci95[0] <= line.closed <= line.closed_ci95[1] <= 1.0
+    nothing = _line("ID.4", "tendon_excursion", "m", rows[2:])
+    assert (nothing.closed, nothing.closed_ci95, nothing.resolvable) == (0.0, (0.0, 0.0), False)
