@@ -51,4 +51,5 @@ ROUNDING = 1e-9  # rad: what it loses of a joint that stands still in a simulate
 CLEAR = 0.03  # s: kept clear on either side of where a joint or tendon may stick: over two widths of the filter
 BREAKAWAY = 0.06  # s: kept clear beside it after a joint that no motor moves has broken away
 CLEAR_STEP = 0.01  # s: CLEAR where a motor moves the joint from hold to hold, and nothing measured is filtered
-EVERY_SAMPLE = 4.0  # times the cut-off where every sample is predicted: noise of q̈ biases nothing there
+EVERY_SAMPLE = 2.0  # times the cut-off where every sample is predicted: noise of q̈ biases nothing there
+STEPPED = 4.0  # likewise where a motor moves the joint from hold to hold, in moves as short as a third of a second

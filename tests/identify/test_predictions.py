@@ -54,6 +54,20 @@ def test_the_truth_predicts_to_the_noise(predicted, short, experiment):
             assert share > (0.9 if experiment == "ID.3-dynamic" else 0.97), (trial.name, channel)
 
 
+def test_the_torque_that_a_free_finger_lacks_keeps_little_of_the_noise_of_tension(predicted, short_truth, short):
+    """It stands beside no measured torque: below 10 Hz is a fifth of what lies below 250."""
+    (name,) = (t.name for t in short.select("VD.3"))
+    trial = short[name]
+    noise = 0.02 * np.random.default_rng(3).standard_normal(trial.tendon_force.shape)
+    taut = trial.tendon_force > 1.0
+    noisy = replace(trial, tendon_force=trial.tendon_force + noise * taut)
+    session = replace(short, trials={**short.trials, name: noisy})
+    change = predict_session(short_truth, session, [name])[name]["joint_torque"] - predicted[name]["joint_torque"]
+    C = np.asarray(short_truth.model.moment_arm.coupling(trial.q.T))
+    unfiltered = 0.02 * np.sqrt(np.sum(np.square(C) * taut.T[:, None], axis=0)).T
+    assert np.sqrt(np.mean(change**2)) < 0.3 * np.sqrt(np.mean(unfiltered**2))
+
+
 def test_tension_at_a_hold_does_not_creep_up_with_the_noise(predicted, short):
     for trial in short.select("ID.4"):
         error = (trial.joint_torque - predicted[trial.name]["joint_torque"])[trial.hold >= 0]
