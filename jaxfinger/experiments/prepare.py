@@ -32,7 +32,6 @@ from jaxfinger.experiments.table import (
     BREAKAWAY,
     CLEAR,
     CLEAR_STEP,
-    EVERY_SAMPLE,
     EXPERIMENTS,
     LOST,
     MIN_DRIVEN_SPEED,
@@ -40,7 +39,6 @@ from jaxfinger.experiments.table import (
     MIN_TENDON_SPEED,
     ROUNDING,
     SLACK,
-    STEPPED,
     STILL,
     Experiment,
 )
@@ -112,7 +110,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     holds = find_holds(trial) if spec.samples == "holds" else np.full(N, -1)
 
     # Where the measured channel is not low-passed, q̇ and q̈ must not lose what is in it.
-    cutoff = min(spec.cutoff * (STEPPED if spec.stepped else 1.0 if reduced else EVERY_SAMPLE), 0.2 / step)
+    cutoff = min(spec.cutoff * (spec.sharp if spec.stepped or not reduced else 1.0), 0.2 / step)
     filtered, qd, qdd = smooth(trial.time, trial.q, cutoff)
     lost = np.abs(trial.q - filtered)
     noise = np.median(lost, axis=0)

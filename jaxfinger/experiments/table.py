@@ -9,13 +9,15 @@ class Experiment:
 
     `rate` and `cutoff` say how a trial is reduced before a fit: slow experiments are averaged over blocks of 1/rate s,
     q̇ and q̈ come from a zero-phase low-pass at `cutoff`. Both sides of (1) are averaged and filtered alike. A higher
-    cut-off lets the encoder's noise into q̈, and a fit takes that for less inertia.
+    cut-off lets the encoder's noise into q̈, and a fit takes that for less inertia. Where what is measured is not
+    filtered, the cut-off is `sharp` times as high: noise biases nothing there, and shows where a sweep's q̈ counts.
     """
 
     name: str
     channels: tuple[str, ...]  # what the model predicts
     rate: float  # Hz
     cutoff: float  # Hz
+    sharp: float = 4.0
     samples: str = "all"  # which ones count: `all`, `sliding` (friction is known), `holds` (and what is known between)
     held: bool = False  # a fixture holds the joints: they carry no friction, and tendons slip only past their loss
     slack: bool = False  # the tendons are slack by protocol
@@ -31,7 +33,7 @@ EXPERIMENTS = {
     for e in (
         Experiment("ID.2", ("tendon_excursion",), 20.0, 5.0),
         Experiment("ID.3-static", ("joint_torque",), 20.0, 5.0, samples="holds", slack=True),
-        Experiment("ID.3-dynamic", ("joint_torque",), 50.0, 10.0, samples="sliding", slack=True),
+        Experiment("ID.3-dynamic", ("joint_torque",), 50.0, 10.0, sharp=2.0, samples="sliding", slack=True),
         Experiment("ID.4", ("joint_torque", "tendon_excursion"), 20.0, 5.0, samples="holds", held=True),
         Experiment("VD.1", ("tendon_excursion",), 20.0, 5.0),
         Experiment("VD.2", ("fingertip_force", "tendon_excursion"), 20.0, 5.0, samples="holds", held=True),
@@ -51,5 +53,3 @@ ROUNDING = 1e-9  # rad: what it loses of a joint that stands still in a simulate
 CLEAR = 0.03  # s: kept clear on either side of where a joint or tendon may stick: over two widths of the filter
 BREAKAWAY = 0.06  # s: kept clear beside it after a joint that no motor moves has broken away
 CLEAR_STEP = 0.01  # s: CLEAR where a motor moves the joint from hold to hold, and nothing measured is filtered
-EVERY_SAMPLE = 2.0  # times the cut-off where every sample is predicted: noise of q̈ biases nothing there
-STEPPED = 4.0  # likewise where a motor moves the joint from hold to hold, in moves as short as a third of a second

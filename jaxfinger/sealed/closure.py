@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import minimum_filter1d
 
-from jaxfinger.data import Session, Trial, read_predictions, read_session
+from jaxfinger.data import Session, Trial, find_holds, read_predictions, read_session
 
 CHANNELS = {
     "ID.2": ("tendon_excursion",),
@@ -23,7 +23,7 @@ CHANNELS = {
     "VD.2": ("fingertip_force", "tendon_excursion"),
     "VD.3": ("tendon_excursion", "joint_torque"),
 }
-MOVING = 0.05  # rad/s, and that speed times 5 mm for a tendon: VD.3's torque is judged where both slide
+MOVING = 0.05  # rad/s, and that speed times 5 mm for a tendon: torque in motion is judged where both slide
 CLEAR = 0.03  # s on either side of where one may stick: nobody knows its friction there
 
 
@@ -31,7 +31,7 @@ def gap_by_channel(
     measured: Session, predicted: Mapping[str, Mapping[str, np.ndarray]]
 ) -> dict[tuple[str, str], float]:
     """rms of measured minus predicted over all samples that both have, SI units; excursions less one constant a
-    trial and tendon.
+    trial and tendon, torque of ID.3 and VD.3 where friction is known: in holds, and where joint and tendons slide.
     """
     squares: dict[tuple[str, str], list[np.ndarray]] = defaultdict(list)
     for trial in measured:
@@ -43,13 +43,12 @@ def gap_by_channel(
             if said is None:
                 continue
             if trial.experiment == "VD.3" and channel == "joint_torque":
-                difference = np.where(
-                    _sliding(trial, measured), -np.asarray(said, dtype=float), np.nan
-                )  # the truth is zero
-            elif seen is None:
+                seen = np.zeros_like(said)  # nothing acts from outside on the free finger
+            if seen is None:
                 continue
-            else:
-                difference = np.asarray(seen, dtype=float) - said
+            difference = np.asarray(seen, dtype=float) - said
+            if channel == "joint_torque":
+                difference = np.where(_friction_known(trial, measured), difference, np.nan)
             for column in difference.T:
                 rest = column[np.isfinite(column)]
                 if len(rest):
@@ -59,13 +58,22 @@ def gap_by_channel(
     return {key: float(np.sqrt(np.concatenate(parts).mean())) for key, parts in sorted(squares.items())}
 
 
+def _friction_known(trial: Trial, session: Session) -> np.ndarray:
+    """(N, 1 or m) where the direction of friction is known to the sample."""
+    if trial.experiment == "ID.3-static":
+        return find_holds(trial)[:, None] >= 0
+    if trial.experiment in ("ID.3-dynamic", "VD.3"):
+        return _sliding(trial, session)
+    return np.ones((len(trial.time), 1), bool)
+
+
 def _sliding(trial: Trial, session: Session) -> np.ndarray:
-    """(N, m) where a joint moves and so does every tendon across it, clear of where they stop."""
+    """(N, m) where a joint moves and so does every taut tendon across it, clear of where they stop."""
     rate = float(1.0 / np.median(np.diff(trial.time)))
     width = max(int(0.05 * rate), 3)
     speed = _slope(trial.q, trial.time, width)
     slides = np.abs(speed) > MOVING
-    if trial.tendon_excursion is not None:
+    if trial.experiment == "VD.3" and trial.tendon_excursion is not None:
         tendon = np.abs(_slope(trial.tendon_excursion, trial.time, width)) > MOVING * 5e-3
         slides &= ~(~tendon @ (session.finger.crosses & session.finger.active[:, None]))
     return minimum_filter1d(slides, 2 * round(CLEAR * rate) + 1, axis=0)

@@ -46,3 +46,19 @@ def test_torque_of_vd3_counts_only_where_joint_and_tendons_slide(specimen):
     torque[:, 1:] = 1.0
     gap = gap_by_channel(Session("s", specimen.cad, {"v": trial}), {"v": {"time": t, "joint_torque": torque}})
     assert gap["VD.3", "joint_torque"] == pytest.approx(2e-3, rel=0.05)
+
+
+def test_torque_of_the_driven_joint_counts_in_holds_and_clear_of_reversals(specimen):
+    t = np.arange(4000) * 1e-3
+    q = np.full((4000, 3), 0.4)
+    q[:, 0] += 0.3 * np.abs(t - 2.0)  # turns back at 2 s
+    torque = np.full((4000, 3), np.nan)
+    torque[:, 0] = np.where(np.abs(t - 2.0) < 0.02, 1.0, 2e-3)
+    sweep = Trial("d", "ID.3-dynamic", t, q, joint_torque=torque, joint=specimen.cad.joint_names[0])
+    hold = np.where(t < 1.0, 0, -1).astype(np.int32)
+    torque = np.where(hold[:, None] >= 0, torque, torque + 1.0)
+    steps = Trial("s", "ID.3-static", t, q, joint_torque=torque, joint=specimen.cad.joint_names[0], hold=hold)
+    said = {"time": t, "joint_torque": 0.0 * torque}
+    gap = gap_by_channel(Session("s", specimen.cad, {"d": sweep, "s": steps}), {"d": said, "s": said})
+    assert gap["ID.3-dynamic", "joint_torque"] == pytest.approx(2e-3)
+    assert gap["ID.3-static", "joint_torque"] == pytest.approx(2e-3)

@@ -112,6 +112,9 @@ def test_closed_is_a_share_of_what_the_true_effect_closes():
     assert closed_share([row], ceiling) == pytest.approx((25 - 17) / (25 - 9))
     assert closed_share([row | {"after": 3.0}], ceiling) == pytest.approx(1.0)
     assert closed_share([row | {"after": 6.0}], ceiling) < 0
+    ours = row | {"before": 7.0}  # of a nominal model that another refit gives
+    assert closed_share([ours], ceiling) == pytest.approx((49 - 17) / (49 - 9))
+    assert closed_share([ours], [ceiling[0] | {"gap": 4.0}]) == pytest.approx((49 - 17) / (25 - 9))
     assert np.isnan(closed_share([], ceiling))
 
 
