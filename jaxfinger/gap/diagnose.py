@@ -225,6 +225,12 @@ def _unchanged(problem: Problem, nominal: Fit, forward: bool) -> list[Shrinkage]
     return shrinkage(problem, nominal, nominal, problem.r, problem.J, [], ("none", ()), forward)
 
 
+def _with_prior(amplitude: float, std: float, size: float) -> dict[str, float]:
+    """Value and std of an amplitude that was found in plausible sizes, with a prior of UNSEEN of them."""
+    seen = 1.0 / (1.0 + (std / UNSEEN) ** 2)
+    return {"value": amplitude * seen * size, "std": std * seen**0.5 * size}
+
+
 def as_gap_json(d: Diagnosis) -> dict:
     """`gap.json`, to the letter."""
     sliding = d.problem.session.finger.prismatic
@@ -241,7 +247,7 @@ def as_gap_json(d: Diagnosis) -> dict:
             units = {k: v[0] for k, v in effect.AMPLITUDES.items()}
             sizes = [v[1] for v in effect.AMPLITUDES.values()]
             values = {
-                n: {"value": float(a * s), "std": float(min(u, UNSEEN) * s), "units": units[n]}
+                n: _with_prior(float(a), float(u), s) | {"units": units[n]}
                 for n, a, u, s in zip(units, c.evidence.amplitudes, c.evidence.std, sizes, strict=True)
             }
         values = {n: v | {"units": units_where(v["units"], sliding)} for n, v in values.items()}
