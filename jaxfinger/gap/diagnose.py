@@ -225,10 +225,10 @@ def _unchanged(problem: Problem, nominal: Fit, forward: bool) -> list[Shrinkage]
     return shrinkage(problem, nominal, nominal, problem.r, problem.J, [], ("none", ()), forward)
 
 
-def _with_prior(amplitude: float, std: float, size: float) -> dict[str, float]:
+def _with_prior(amplitude: float, std: float, size: float) -> tuple[float, float]:
     """Value and std of an amplitude that was found in plausible sizes, with a prior of UNSEEN of them."""
     seen = 1.0 / (1.0 + (std / UNSEEN) ** 2)
-    return {"value": amplitude * seen * size, "std": std * seen**0.5 * size}
+    return amplitude * seen * size, std * seen**0.5 * size
 
 
 def as_gap_json(d: Diagnosis) -> dict:
@@ -246,10 +246,9 @@ def as_gap_json(d: Diagnosis) -> dict:
             effect = c.evidence.variant.effect
             units = {k: v[0] for k, v in effect.AMPLITUDES.items()}
             sizes = [v[1] for v in effect.AMPLITUDES.values()]
-            values = {
-                n: _with_prior(float(a), float(u), s) | {"units": units[n]}
-                for n, a, u, s in zip(units, c.evidence.amplitudes, c.evidence.std, sizes, strict=True)
-            }
+            found = zip(units, c.evidence.amplitudes, c.evidence.std, sizes, strict=True)
+            stated = {n: _with_prior(float(a), float(u), s) for n, a, u, s in found}
+            values = {n: {"value": v, "std": std, "units": units[n]} for n, (v, std) in stated.items()}
         values = {n: v | {"units": units_where(v["units"], sliding)} for n, v in values.items()}
         candidates.append(
             {
@@ -257,7 +256,7 @@ def as_gap_json(d: Diagnosis) -> dict:
                 "site": list(c.key[1]),
                 "probability": c.probability,
                 "parameters": values,
-                "held_out_gain": float(np.clip(c.explained, 0.0, 1.0)),
+                "held_out_gain": c.held_out,
             }
         )
     return {

@@ -18,6 +18,7 @@ from scipy.special import expit, logsumexp
 
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.gap.evidence import Evidence, Projector, by_site, screen
+from jaxfinger.gap.held_out import held_out_energies
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.refine import Refined, at_optimum, refine, relinearised
 from jaxfinger.gap.signatures import Signatures, all_columns, variants
@@ -35,6 +36,7 @@ SAME_SITE = 0.1  # share of what is explained, that a further effect at the same
 CLOSE = 0.5  # share of what the best explains, from which on a rival is refitted where it leads
 COVERED = 0.97  # probability of a set of rivals, among the catalogue, up to which it takes in further ones
 RIVALS = 3  # at most in a set
+SOME = 0.01  # share of the gap that a candidate must explain where it is fitted, to be tried where it is not
 LOOKED_AT = 12  # candidates for a further effect
 LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for, and nothing is unlisted
 HINT = 20.0  # of it in a column, that a known effect may claim though noise could give it: its law asks for more
@@ -50,7 +52,7 @@ class Candidate:
 
     key: tuple[str, tuple[str, ...]]
     probability: float
-    explained: float  # share of the gap
+    held_out: float  # share of the gap that it explains alone, on trials that its refit has not seen
     refined: Refined | None
     evidence: Evidence
 
@@ -99,7 +101,7 @@ def search(
         return _nothing(ranked, strongest, absorbed)
 
     best = max(refined.values(), key=lambda r: r.log_evidence)
-    there = {}
+    start, there = problem, {}
     for k in _rivals(refined, best, chi2, 1 if quick else RIVALS):
         progress(f"refitting with {k[0]} at {', '.join(k[1])} where it leads")
         forms = [refine(problem, [e.variant], [start_of(e)], chi2, projector) for e in _other_forms(screened, found[k])]
@@ -120,7 +122,8 @@ def search(
     gap = chi2 - chosen.chi2 + beyond
     shares = _shares(problem, chosen, chi2, gap)
     order = np.argsort(-np.asarray(shares))
-    return _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, strongest, absorbed)
+    held_out = _held_out(start, there, ranked, refined, groups, columns, chi2, gap)
+    return _judge(ranked, refined, held_out, chosen, shares, order, chi2, gap, beyond, left, strongest, absorbed)
 
 
 def _rivals(refined: dict[tuple, Refined], best: Refined, chi2: float, most: int) -> list[tuple]:
@@ -205,6 +208,25 @@ def _fits(drop: np.ndarray, left: np.ndarray) -> float:
     return float(0.5 * LOOKS * np.sum(np.log1p(before / LOOKS) - np.log1p(after / LOOKS)))
 
 
+def _held_out(start, there, ranked, refined, groups, columns, chi2: float, gap: float) -> dict[tuple, float]:
+    """Share of the gap that each candidate explains alone on held-out trials: the strongest where they have led, others
+    at the nominal model; of those that explain any of what they have seen.
+    """
+    some = {e.variant.key: e for e in ranked if e.explained > SOME * gap}
+    members = {
+        k: refined[k].change[None]
+        if k in refined
+        else columns[e.variant.effect.ID][groups[e.variant.effect.ID].index(e.variant)]
+        for k, e in some.items()
+        if k not in there
+    }
+    alone, with_member = held_out_energies(start, list(members.values()))
+    left = dict(zip(members, with_member.tolist(), strict=True))
+    left |= {k: float(held_out_energies(problem, [refined[k].change[None]])[1][0]) for k, problem in there.items()}
+    seen = max(alone - (chi2 - gap), 1e-9)
+    return {k: float(np.clip((alone - x) / seen, 0.0, 1.0)) for k, x in left.items()}
+
+
 def _shares(problem, chosen: Refined, chi2: float, gap: float) -> tuple[float, ...]:
     """What is lost when one effect alone is dropped, as a share of the gap."""
     if len(chosen.variants) == 1:
@@ -217,7 +239,7 @@ def _shares(problem, chosen: Refined, chi2: float, gap: float) -> tuple[float, .
     return tuple(out)
 
 
-def _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, strongest, absorbed) -> Search:
+def _judge(ranked, refined, held_out, chosen, shares, order, chi2, gap, beyond, left, strongest, absorbed) -> Search:
     """Probabilities: rivals of the first effect by what they leave unexplained, «unlisted» by what all leave."""
     first = chosen.keys[order[0]]
     floor = min(r.chi2 for r in refined.values())
@@ -249,7 +271,7 @@ def _judge(ranked, refined, chosen, shares, order, chi2, gap, beyond, left, stro
         Candidate(
             e.variant.key,
             probability[e.variant.key] * scale,
-            max(0.0, (chi2 - (refined[e.variant.key].chi2 if e.variant.key in refined else chi2 - e.explained)) / gap),
+            held_out.get(e.variant.key, 0.0),
             refined.get(e.variant.key),
             e,
         )

@@ -14,6 +14,7 @@ from jaxfinger.data.schema import channel_units
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.experiments import prepare
 from jaxfinger.gap.evidence import Evidence
+from jaxfinger.gap.held_out import FOLDS, KEPT, fold_of_row, folds
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.refine import within_bounds
 from jaxfinger.identify import Fit
@@ -22,7 +23,6 @@ from jaxfinger.identify.parameters import Free, ravel
 from jaxfinger.identify.predictions import simulate_trials
 from jaxfinger.model import Model
 
-FOLDS = 3
 RESOLVABLE = 1.1  # mean square before over that of the noise, from which on a gap can be said to close
 
 
@@ -41,25 +41,6 @@ class Shrinkage:
     resolvable: bool  # whether the gap before stands out of the noise
 
 
-def folds(problem: Problem) -> dict[str, np.ndarray]:
-    """(B, T) fold of every sample, by experiment: whole trials, or contiguous blocks of one that stands alone."""
-    strata = {n: (t.experiment, t.joint, t.tendon) for n in problem.trial_names for t in [problem.session[n]]}
-    count = {s: list(strata.values()).count(s) for s in strata.values()}
-    seen: dict[tuple, int] = {}
-    out = {}
-    for e, stack in problem.stacks.items():
-        out[e] = np.zeros(stack.batch.x.time.shape, dtype=int)
-        for b, name in enumerate(stack.trials):
-            stratum = strata[name]
-            if count[stratum] == 1:
-                time = np.asarray(stack.batch.x.time)[b]
-                out[e][b] = np.minimum(2 * FOLDS * time / max(time.max(), 1e-9), 2 * FOLDS - 1).astype(int) % FOLDS
-                continue
-            out[e][b] = seen.get(stratum, len(seen) % FOLDS)
-            seen[stratum] = (out[e][b, 0] + 1) % FOLDS
-    return out
-
-
 def shrinkage(
     problem: Problem,
     nominal: Fit,
@@ -76,7 +57,7 @@ def shrinkage(
     with their signatures, among which each fold chooses again.
     """
     fold = folds(problem)
-    of_row = np.concatenate([fold[e][rows.trial, rows.time] for e, rows in problem.rows.items()])
+    of_row = fold_of_row(problem)
     energies: dict[tuple[str, str], list[tuple[float, float, float, float]]] = {}
     models = []
     for k in range(FOLDS):
@@ -153,7 +134,7 @@ def _refit(model: Model, free, J, r, training) -> Model:
     """The model refitted to the training rows; what they do not see stays within a few deviations of the whole fit."""
     size = np.linalg.norm(J, axis=0)
     scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)  # what no trial sees stays
-    A = np.vstack([J[training] * scale, 0.05 * np.eye(len(free))])
+    A = np.vstack([J[training] * scale, KEPT * np.eye(len(free))])
     delta = np.linalg.lstsq(A, np.concatenate([r[training], np.zeros(len(free))]), rcond=1e-12)[0] * scale
     theta = np.asarray(ravel(model))[free] + delta
     moved = Free.at(model, free).set(model, jnp.asarray(theta))

@@ -103,8 +103,7 @@ def test_a_share_counts_as_one_at_most(problem):
 
 def test_an_amplitude_that_no_trial_shows_is_said_to_be_nothing_within_its_prior():
     """A lag of a channel that does not move came back as a month."""
-    seen, unseen = _with_prior(3.0, 0.1, 1e-3), _with_prior(2.7e9, 1e10, 1e-3)
-    assert seen["value"] == pytest.approx(3e-3, rel=1e-3)
-    assert seen["std"] == pytest.approx(1e-4, rel=1e-3)
-    assert abs(unseen["value"]) < 1e-6
-    assert unseen["std"] == pytest.approx(UNSEEN * 1e-3)
+    assert _with_prior(3.0, 0.1, 1e-3) == pytest.approx((3e-3, 1e-4), rel=1e-3)
+    value, std = _with_prior(2.7e9, 1e10, 1e-3)
+    assert abs(value) < 1e-6
+    assert std == pytest.approx(UNSEEN * 1e-3)

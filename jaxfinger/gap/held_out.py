@@ -1,0 +1,62 @@
+"""Each third of a session held out in turn, and what a candidate explains of trials that its refit has not seen."""
+
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxfinger.gap.problem import Problem
+
+FOLDS = 3
+KEPT = 0.05  # precision, in deviations of the whole fit, that keeps near it what the other folds do not see
+
+
+def folds(problem: Problem) -> dict[str, np.ndarray]:
+    """(B, T) fold of every sample, by experiment: whole trials, or contiguous blocks of one that stands alone."""
+    strata = {n: (t.experiment, t.joint, t.tendon) for n in problem.trial_names for t in [problem.session[n]]}
+    count = {s: list(strata.values()).count(s) for s in strata.values()}
+    seen: dict[tuple, int] = {}
+    out = {}
+    for e, stack in problem.stacks.items():
+        out[e] = np.zeros(stack.batch.x.time.shape, dtype=int)
+        for b, name in enumerate(stack.trials):
+            stratum = strata[name]
+            if count[stratum] == 1:
+                time = np.asarray(stack.batch.x.time)[b]
+                out[e][b] = np.minimum(2 * FOLDS * time / max(time.max(), 1e-9), 2 * FOLDS - 1).astype(int) % FOLDS
+                continue
+            out[e][b] = seen.get(stratum, len(seen) % FOLDS)
+            seen[stratum] = (out[e][b, 0] + 1) % FOLDS
+    return out
+
+
+def fold_of_row(problem: Problem) -> Int[np.ndarray, " N"]:
+    """Fold of every white row."""
+    fold = folds(problem)
+    return np.concatenate([fold[e][rows.trial, rows.time] for e, rows in problem.rows.items()])
+
+
+def held_out_energies(
+    problem: Problem, members: list[Float[np.ndarray, "k N"]]
+) -> tuple[float, Float[np.ndarray, " members"]]:
+    """Sum of squared white residuals of trials for which neither the nominal parameters nor amplitudes were refitted:
+    of the nominal model alone, and with each member's signatures.
+    """
+    of_row = fold_of_row(problem)
+    size = np.linalg.norm(problem.J, axis=0)
+    J = problem.J * np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
+    targets = np.column_stack([problem.r, *(z.T for z in members)])
+    ends = np.cumsum([1, *(len(z) for z in members)])
+    alone, with_member = 0.0, np.zeros(len(members))
+    for k in range(FOLDS):
+        seen = of_row != k
+        Q, R = np.linalg.qr(np.vstack([J[seen], KEPT * np.eye(J.shape[1])]))
+        Q = Q[: seen.sum()]
+        inner = Q.T @ targets[seen]
+        fitted = targets[seen] - Q @ inner
+        left = targets[~seen] - J[~seen] @ np.linalg.solve(R, inner)
+        alone += float(left[:, 0] @ left[:, 0])
+        for i, (a, b) in enumerate(pairwise(ends)):
+            amplitudes = np.linalg.lstsq(fitted[:, a:b], fitted[:, 0], rcond=1e-10)[0]
+            with_member[i] += float(np.sum((left[:, 0] - left[:, a:b] @ amplitudes) ** 2))
+    return alone, with_member
