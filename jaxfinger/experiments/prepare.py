@@ -161,8 +161,9 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     hold = _whole(holds, M, block)
     q_mean = mean(q)
     if spec.held:
-        tension_mean = _in_steps(tension_mean, hold)
-    if spec.samples == "holds":
+        tension_mean = _in_steps(tension_mean, hold, slack=True)
+        q_mean = _in_steps(q_mean, hold)
+    elif spec.stepped:
         q_mean = _at_rest(q_mean, hold)
     start = trial.session_start if trial.session_start is not None else 0.0
     time = mean(trial.time)[:, 0]
@@ -283,18 +284,22 @@ def _sliding(
     return np.where(motorised, clear, minimum_filter1d(clear, 2 * half + 1, axis=0, origin=half))
 
 
-def _in_steps(tension: np.ndarray, hold: np.ndarray) -> np.ndarray:
-    """(N, n): at a hold its mean, and between holds nothing beyond the two means, or slack before and after all.
+def _in_steps(values: np.ndarray, hold: np.ndarray, slack: bool = False) -> np.ndarray:
+    """(N, k): at a hold its mean, and between holds nothing beyond the two means; before and after all as in the first
+    and last, or down to nothing where it is `slack` there.
 
-    A held tendon keeps the highest tension that it has seen, so a running maximum over noise would drift upwards. What
-    lies beyond the two means by more than four standard deviations is a real overshoot, and stays but for those four.
+    A held tendon keeps the highest tension that it has seen, so a running maximum over noise would drift upwards; and
+    noise of a held joint's angle would look like a law of that angle. What lies beyond the two means by more than four
+    standard deviations is a real overshoot, and stays but for those four.
     """
     runs = _runs(hold)
     if not runs:
-        return tension
-    out, rest, at = tension.copy(), np.zeros(tension.shape[1]), np.arange(len(tension))
-    means = np.stack([rest, *(tension[run].mean(axis=0) for run in runs), rest])
-    noise = np.sqrt(np.mean([tension[run].var(axis=0) for run in runs], axis=0))
+        return values
+    out, at = values.copy(), np.arange(len(values))
+    means = [values[run].mean(axis=0) for run in runs]
+    ends = [0.0 * means[0]] * 2 if slack else [means[0], means[-1]]
+    means = np.stack([ends[0], *means, ends[1]])
+    noise = np.sqrt(np.mean([values[run].var(axis=0) for run in runs], axis=0))
     before = np.searchsorted([run[-1] for run in runs], at)
     after = np.minimum(np.searchsorted([run[0] for run in runs], at, side="right") + 1, len(means) - 1)
     kept = np.clip(out, np.minimum(means[before], means[after]), np.maximum(means[before], means[after]))

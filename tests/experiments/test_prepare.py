@@ -146,6 +146,23 @@ def test_the_excursion_of_a_taut_tendon_counts_on_every_ramp():
     assert not slack[(at < 1.0) | (at > 3.5)].any()
 
 
+def test_a_held_joint_does_not_follow_its_encoders_noise_between_holds():
+    """f(q) of that noise would be a law of the angle in what remains of the excursion."""
+    time = np.arange(5000) / RATE
+    level = np.interp(time, [0.5, 1.0, 2.0, 2.5], [0.0, 4.0, 4.0, 8.0])
+    hold = np.where((time > 1.05) & (time < 2.0), 0, np.where(time > 2.55, 1, -1)).astype(np.int32)
+    yields = np.radians([40.0, 30.0, 20.0]) + 0.02 * level[:, None] * np.array([1.0, 0.0, 0.0])
+    q = yields + ENCODER * np.random.default_rng(2).standard_normal(yields.shape)
+    tension = level[:, None] * (np.arange(FINGER.n) == 0)
+    trial = Trial("pull", "VD.2", time, q, tension, tendon_excursion=0.0 * tension, tendon="T1", hold=hold)
+    found = np.asarray(stack(trial).batch.x.q)[:, 0, :100].T
+    blocks = q.reshape(100, 50, 3).mean(axis=1)
+    rigid = np.std(found[:, 1:] - blocks[:, 1:].mean(axis=0), axis=0)
+    assert (rigid < 0.25 * np.std(blocks[:, 1:], axis=0)).all()
+    ramp = slice(42, 49)  # what the fixture yields stays
+    np.testing.assert_allclose(found[ramp, 0], blocks[ramp, 0], atol=5 * ENCODER / np.sqrt(50))
+
+
 def test_a_slow_sweep_of_the_motor_slides_and_a_finger_as_slow_may_stick():
     time = np.arange(4000) / RATE
     q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
