@@ -15,6 +15,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from jaxfinger.cli.output import console
 from jaxfinger.errors import UserError
 
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
@@ -161,8 +162,6 @@ def score(folder: Path, *, diagnoses: Path | None = None, truth: Path | None = N
         truth: what `make` hid; by default FOLDER-truth, or truth.json beside each fit.h5.
         output: a folder for scores.json and reliability.svg.
     """
-    from rich.console import Console
-
     from jaxfinger.sealed.figures import reliability_diagram
     from jaxfinger.sealed.score import imitators, score_folder
     from jaxfinger.sealed.tables import render, render_imitators
@@ -175,10 +174,10 @@ def score(folder: Path, *, diagnoses: Path | None = None, truth: Path | None = N
         raise UserError(
             f"{results}: holds no diagnosis of a case in {folder}; run them first with: jaxfinger sealed run {folder}"
         )
-    Console().print(render(scores))
+    console().print(render(scores))
     stand_ins = imitators(folder, _beside(folder, "withheld"), truth or _beside(folder, "truth"))
     if stand_ins:
-        Console().print(render_imitators(stand_ins))
+        console().print(render_imitators(stand_ins))
     if output:
         output.mkdir(parents=True, exist_ok=True)
         both = scores.to_json() | {"withheld": [asdict(r) for r in stand_ins]}

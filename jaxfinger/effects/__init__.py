@@ -25,6 +25,12 @@ for _module in (joint, tendon, transmission, body, sensors):
 NOMINAL_TERMS = _effects_in(nominal)  # candidates only where a recipe leaves the term out
 
 
+def nominal_terms(elastic_degree: int, friction_degree: int) -> dict[str, type[CatalogueEffect]]:
+    """The terms that a recipe of these degrees may leave out, by id."""
+    degrees = {"joint_elastic": elastic_degree, "joint_coulomb": friction_degree}
+    return {n: nominal.of_degree(c, degrees[n]) if n in degrees else c for n, c in NOMINAL_TERMS.items()}
+
+
 def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
     """The effects that a user's Python file defines, by id. UserError where it cannot be loaded or defines none."""
     path = Path(path)
@@ -62,4 +68,4 @@ def from_dict(finger: Finger, content: dict, extra: dict[str, type[CatalogueEffe
     return known[content["effect"]].at(finger, tuple(content["site"]), **values)
 
 
-__all__ = ["CATALOGUE", "NOMINAL_TERMS", "CatalogueEffect", "Site", "from_dict", "load", "to_dict"]
+__all__ = ["CATALOGUE", "NOMINAL_TERMS", "CatalogueEffect", "Site", "from_dict", "load", "nominal_terms", "to_dict"]

@@ -1,5 +1,6 @@
 """Terms of the nominal model that a recipe may leave out: they are candidates like any other."""
 
+from functools import cache
 from typing import ClassVar
 
 import equinox as eqx
@@ -27,19 +28,24 @@ class JointElastic(CatalogueEffect):
 
 
 class JointCoulomb(CatalogueEffect):
-    """s(q̇) (c₀ + c₁ q): Coulomb friction of a joint."""
+    """s(q̇) (c₀ + c₁ q + c₂ q²): Coulomb friction of a joint."""
 
     ID: ClassVar = "joint_coulomb"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"c0": ("N m", 0.005, False), "c1": ("N m/rad", 0.003, True)}
+    AMPLITUDES: ClassVar = {
+        "c0": ("N m", 0.005, False),
+        "c1": ("N m/rad", 0.003, True),
+        "c2": ("N m/rad^2", 0.002, True),
+    }
     SHOWS: ClassVar = TORQUE
 
     c0: Float[Array, ""]
     c1: Float[Array, ""]
+    c2: Float[Array, ""]
 
     def joint_friction(self, x, f_j, C, F):
         i = self.index[0]
-        return F.at[i].add(self.c0 + self.c1 * x.q[i])
+        return F.at[i].add(self.c0 + self.c1 * x.q[i] + self.c2 * x.q[i] ** 2)
 
 
 class JointDamping(CatalogueEffect):
@@ -88,3 +94,20 @@ class Gravity(CatalogueEffect):
 
     def finger(self, finger):
         return eqx.tree_at(lambda f: f.gravity, finger, finger.gravity + jnp.stack([self.x, self.y, self.z]))
+
+
+@cache
+def of_degree(term: type[CatalogueEffect], degree: int) -> type[CatalogueEffect]:
+    """A polynomial term as a recipe of this degree has it: higher coefficients are nothing, and not looked for."""
+    names = list(term.AMPLITUDES)
+    if degree + 1 >= len(names):
+        return term
+
+    class OfDegree(term):
+        AMPLITUDES: ClassVar = {n: term.AMPLITUDES[n] for n in names[: degree + 1]}
+
+        @classmethod
+        def constants(cls, finger, site):
+            return {n: jnp.zeros(()) for n in names[degree + 1 :]}
+
+    return OfDegree

@@ -10,7 +10,7 @@ import numpy as np
 from jaxfinger.data import Predictions, Session
 from jaxfinger.data.atomic import atomic_path
 from jaxfinger.data.schema import units_where
-from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, CatalogueEffect
+from jaxfinger.effects import CATALOGUE, CatalogueEffect, nominal_terms
 from jaxfinger.errors import UserError
 from jaxfinger.gap.augment import augmented_fit, nominal_fit, parameter_values
 from jaxfinger.gap.evidence import Projector
@@ -69,13 +69,15 @@ def diagnose(
 
     With `predictions` the gap is that between the measurements and another simulator's predictions.
     """
-    catalogue = CATALOGUE | NOMINAL_TERMS | (effects or {})
+    recipe = recipe or Recipe()
+    terms = nominal_terms(recipe.model.elastic_degree, recipe.model.friction_degree)
+    catalogue = CATALOGUE | terms | (effects or {})
     if unknown := set(without) - set(catalogue):
         raise UserError(
             f"the catalogue has no effect {', '.join(sorted(unknown))} to leave out; "
             f"it has {', '.join(sorted(catalogue))}"
         )
-    problem = build(session, recipe or Recipe(), progress, predictions)
+    problem = build(session, recipe, progress, predictions)
     kept = set(problem.fit.recipe.model.terms) | set(without)
     catalogue = {k: c for k, c in catalogue.items() if k not in kept}
     progress("reading the signatures of all effects")

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, from_dict, load, to_dict
+from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, from_dict, load, nominal_terms, to_dict
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, predict
+from jaxfinger.identify.parameters import describe
 from jaxfinger.model import simulate
 from tests.effects.motion import MODEL, MOTIONS, with_effects
 
@@ -80,6 +81,18 @@ def test_the_catalogue_is_the_published_one():
         tension_sensor_scale encoder_offset encoder_eccentricity force_sensor_rotation channel_delay"""
     assert set(CATALOGUE) == set(published.split())
     assert set(NOMINAL_TERMS) == {"joint_elastic", "joint_coulomb", "joint_damping", "tendon_friction", "gravity"}
+
+
+def test_a_term_that_a_recipe_left_out_has_the_recipes_degree():
+    constant = nominal_terms(0, 0)["joint_coulomb"]
+    site = constant.sites(FINGER)[0]
+    effect = constant.at(FINGER, site, c0=0.01)
+    assert effect.values() == {"c0": pytest.approx(0.01)}
+    assert from_dict(FINGER, to_dict(effect)).values() == {"c0": pytest.approx(0.01), "c1": 0.0, "c2": 0.0}
+    moving = [p for p in describe(with_effects(effect)) if p.group == "effects" and p.determinable]
+    assert [p.name.split()[-1] for p in moving] == ["c0"]
+    assert nominal_terms(2, 2) == NOMINAL_TERMS
+    assert nominal_terms(0, 1)["joint_coulomb"] is nominal_terms(2, 1)["joint_coulomb"]  # compiled once
 
 
 def test_all_effects_together_simulate_forward():
