@@ -44,6 +44,7 @@ from jaxfinger.experiments.table import (
 )
 from jaxfinger.model import Motion
 
+PARTS = 6  # of a hold, whose means say how well its own is known; longer than an encoder's noise is correlated
 LONG = 10_000  # samples of a trial from which on its filters, which let go of the interpreter, are worth a thread
 
 
@@ -162,7 +163,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     q_mean = mean(q)
     if spec.held:
         tension_mean = _in_steps(tension_mean, hold, slack=True)
-        q_mean = _in_steps(q_mean, hold)
+        q_mean = _in_fixture(q_mean, hold)
     elif spec.stepped:
         q_mean = _at_rest(q_mean, hold)
     start = trial.session_start if trial.session_start is not None else 0.0
@@ -284,13 +285,29 @@ def _sliding(
     return np.where(motorised, clear, minimum_filter1d(clear, 2 * half + 1, axis=0, origin=half))
 
 
+def _in_fixture(q: np.ndarray, hold: np.ndarray) -> np.ndarray:
+    """(N, m): the mean of all holds, and of what holds differ by, the share that is not the noise of their means.
+
+    A fixture yields, or does not; noise of the angle would look like a law of it, and near a singular posture a
+    contact force amplifies it a thousandfold (James and Stein's estimator).
+    """
+    runs = _runs(hold)
+    if len(runs) < 3:
+        return _in_steps(q, hold)
+    means = np.stack([q[run].mean(axis=0) for run in runs])
+    parts = [np.stack([x.mean(axis=0) for x in np.array_split(q[run], PARTS)]) for run in runs if len(run) >= PARTS]
+    noise = np.mean([x.var(axis=0, ddof=1) / PARTS for x in parts], axis=0) if parts else np.zeros(q.shape[1])
+    spread = means.var(axis=0, ddof=1)
+    share = 1.0 - np.minimum(noise / np.where(spread > 0.0, spread, 1.0), 1.0)
+    return means.mean(axis=0) + share * (_in_steps(q, hold) - means.mean(axis=0))
+
+
 def _in_steps(values: np.ndarray, hold: np.ndarray, slack: bool = False) -> np.ndarray:
     """(N, k): at a hold its mean, and between holds nothing beyond the two means; before and after all as in the first
     and last, or down to nothing where it is `slack` there.
 
-    A held tendon keeps the highest tension that it has seen, so a running maximum over noise would drift upwards; and
-    noise of a held joint's angle would look like a law of that angle. What lies beyond the two means by more than four
-    standard deviations is a real overshoot, and stays but for those four.
+    A held tendon keeps the highest tension that it has seen, so a running maximum over noise would drift upwards. What
+    lies beyond the two means by more than four standard deviations is a real overshoot, and stays but for those four.
     """
     runs = _runs(hold)
     if not runs:
