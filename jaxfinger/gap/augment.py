@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.gap.problem import Problem, assemble
-from jaxfinger.gap.refine import Refined
+from jaxfinger.gap.refine import Refined, bounds
 from jaxfinger.identify import Fit
 from jaxfinger.identify.fit import StageReport
 from jaxfinger.identify.parameters import describe, ravel
@@ -40,7 +41,7 @@ def augmented_fit(problem: Problem, chosen: Refined) -> tuple[Fit, np.ndarray, n
     root[: len(problem.root), : problem.free.size] = problem.root
     wide = np.asarray(ravel(_on_effects(_widths, model)))
     root[len(problem.root) :, problem.free.size :] = np.diag(1.0 / wide[moving])
-    fitted, solution = solve(model, free, sources, Prior(mean, root))
+    fitted, solution = solve(model, free, sources, Prior(mean, root), limits=limits(model, free))
     information = solution.information[np.ix_(free, free)] + root.T @ root
     r, J = assemble(solution.linearised, sources, problem.rows, free, ravel(model).size)
     return _fit(problem, fitted, free, information, "with the effects of the diagnosis", solution), r, J
@@ -55,6 +56,20 @@ def _moves(effect: CatalogueEffect) -> CatalogueEffect:
     """Of every parameter 1 where a fit may move it: not a choice, nor a share that is at its most."""
     stays = {*effect.CHOICES, *(n for n in effect.SHARES if getattr(effect, n) >= 1.0)}
     return replace(effect, **{n: jnp.asarray(float(n not in stays)) for n in effect.values()})
+
+
+def limits(model: Model, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and most of every free parameter: those of effects keep within bounds."""
+    of_effect = np.array([p.group == "effects" for p in describe(model)])[free]
+    low, high = (np.asarray(ravel(_on_effects(partial(_limit, side), model)))[free] for side in (0, 1))
+    return np.where(of_effect, low, -np.inf), np.where(of_effect, high, np.inf)
+
+
+def _limit(side: int, effect: CatalogueEffect) -> CatalogueEffect:
+    """Of every parameter, the bound below or above (`side` 0 or 1) that refits keep to."""
+    ends = bounds(type(effect))
+    free = (-np.inf, np.inf)
+    return replace(effect, **{n: jnp.asarray(ends.get(n, free)[side], dtype=float) for n in effect.values()})
 
 
 def _widths(effect: CatalogueEffect) -> CatalogueEffect:

@@ -243,10 +243,11 @@ def within_bounds(effect: CatalogueEffect) -> CatalogueEffect:
     """The effect with one-sided amplitudes not below zero, shares not above one, and shapes no further out than those
     worth trying.
     """
-    return replace(effect, **{n: jnp.clip(getattr(effect, n), *ends) for n, ends in _bounds(type(effect)).items()})
+    return replace(effect, **{n: jnp.clip(getattr(effect, n), *ends) for n, ends in bounds(type(effect)).items()})
 
 
-def _bounds(effect: type[CatalogueEffect]) -> dict[str, tuple[float, float]]:
+def bounds(effect: type[CatalogueEffect]) -> dict[str, tuple[float, float]]:
+    """Least and most of every amplitude and moving shape."""
     signed = {n: s for n, (_, _, s) in effect.AMPLITUDES.items()}
     bounds = {n: (-np.inf if signed[n] else 0.0, 1.0 if n in effect.SHARES else np.inf) for n in signed}
     for n, (_, grid) in effect.SHAPES.items():
@@ -260,7 +261,7 @@ def _room(effects, coordinates: list[_Coordinate]) -> tuple[np.ndarray, np.ndarr
     """How far each coordinate may move, back and forth."""
     out = []
     for c in coordinates:
-        value, ends = float(getattr(effects[c.effect], c.name)), _bounds(type(effects[c.effect]))[c.name]
+        value, ends = float(getattr(effects[c.effect], c.name)), bounds(type(effects[c.effect]))[c.name]
         ways = [(end - value) / c.unit if c.shifts else np.log(end / value) for end in ends]
         most = np.inf if c.shifts else FACTOR
         out.append((max(min(ways[0], 0.0), -most), min(max(ways[1], 0.0), most)))

@@ -6,21 +6,20 @@ differs from the verdict, the held-out trials count as not improved.
 
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from jaxfinger.data.schema import channel_units
-from jaxfinger.effects import CatalogueEffect
 from jaxfinger.experiments import prepare
+from jaxfinger.gap.augment import limits
 from jaxfinger.gap.evidence import Evidence
 from jaxfinger.gap.held_out import FOLDS, KEPT, fold_of_row, folds
 from jaxfinger.gap.problem import Problem
-from jaxfinger.gap.refine import within_bounds
 from jaxfinger.identify import Fit
 from jaxfinger.identify.linearise import residuals_of
 from jaxfinger.identify.parameters import Free, ravel
 from jaxfinger.identify.predictions import simulate_trials
+from jaxfinger.identify.solve import bounded
 from jaxfinger.model import Model
 
 RESOLVABLE = 1.1  # mean square before over that of the noise, from which on a gap can be said to close
@@ -135,12 +134,10 @@ def _refit(model: Model, free, J, r, training) -> Model:
     size = np.linalg.norm(J, axis=0)
     scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)  # what no trial sees stays
     A = np.vstack([J[training] * scale, KEPT * np.eye(len(free))])
-    delta = np.linalg.lstsq(A, np.concatenate([r[training], np.zeros(len(free))]), rcond=1e-12)[0] * scale
-    theta = np.asarray(ravel(model))[free] + delta
-    moved = Free.at(model, free).set(model, jnp.asarray(theta))
-    # One linear step may lead an effect beyond its bounds.
-    effects = tuple(within_bounds(e) if isinstance(e, CatalogueEffect) else e for e in moved.effects)
-    return eqx.tree_at(lambda m: m.effects, moved, effects, is_leaf=lambda v: isinstance(v, tuple))
+    theta, unit = np.asarray(ravel(model))[free], np.where(scale > 0.0, scale, 1.0)
+    room = [(end - theta) / unit for end in limits(model, free)]
+    delta = bounded(A, -np.concatenate([r[training], np.zeros(len(free))]), *room) * scale
+    return Free.at(model, free).set(model, jnp.asarray(theta + delta))
 
 
 def _choice(problem: Problem, rivals, training):

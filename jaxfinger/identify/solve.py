@@ -10,7 +10,8 @@
 4. Where it is not (slip of held tendons, products of moment arms and losses) the model is linearised again at the new
    point, and a step that did not lower the cost is halved, until a step is a small part of a standard deviation, or
    a whole one that is a tenth of it leads no further down.
-5. A mass that would fall to nothing stays on its floor while the others are minimised with it there.
+5. A mass that would fall to nothing stays on its floor, and what has limits within them, while the others are
+   minimised with it there.
 6. Outliers: Huber's weights from the white residuals at the optimum, then again from 1.
 """
 
@@ -79,8 +80,11 @@ def solve(
     sources: dict[str, Source],
     prior: Prior | None = None,
     huber: float = 0.0,
+    limits: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]] | None = None,
 ) -> tuple[Model, Solution]:
     """The model with its free parameters (positions in the flat vector) at the optimum, and what is known of it.
+
+    `limits`: of each free parameter, below and above; what starts outside of them stays until a step leads back.
 
     Raises:
         UserError: the model is not defined at its start.
@@ -90,7 +94,8 @@ def solve(
     moved = Free.at(model, free)
     theta = np.asarray(moved.get(model))
     masses = np.array([p.group == "mass" for p in describe(model)])[free]
-    floor = np.where(masses, LIGHTEST * theta, -np.inf)
+    low, high = limits or (np.full(theta.size, -np.inf), np.full(theta.size, np.inf))
+    low = np.where(masses, np.maximum(low, LIGHTEST * theta), low)
     if prior is None:
         prior = Prior(theta, np.zeros((0, theta.size)))
     weights: Mapping[str, np.ndarray | None] = dict.fromkeys(sources)
@@ -126,8 +131,8 @@ def solve(
             basis, invisible, scale = visible(A)
             z = _minimise(A @ basis, b)
             step = basis @ z
-            if np.any((theta + step)[masses] < floor[masses]):
-                step = bounded(A, b, np.where(masses, floor - theta, -np.inf))
+            if np.any(theta + step < low) or np.any(theta + step > high):
+                step = bounded(A, b, low - theta, high - theta)
                 z = np.linalg.lstsq(basis, step, rcond=None)[0]
             small = float(np.max(np.abs(z), initial=0.0))
             if small < SMALL:

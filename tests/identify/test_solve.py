@@ -81,6 +81,15 @@ def test_a_step_to_where_the_model_is_not_defined_is_halved(problem):
     assert float(ravel(found)[position]) == pytest.approx(-0.95, abs=1e-3)
 
 
+@pytest.mark.parametrize(("low", "high", "end"), [(-0.5, 2.0, -0.5), (0.0, 2.0, 0.0), (-2.0, 2.0, -0.95)])
+def test_what_has_limits_ends_within_them(problem, low, high, end):
+    model, position, source = problem
+    limits = np.array([low]), np.array([high])
+    found, solution = solve(model, np.array([position]), {EXPERIMENT: source}, limits=limits)
+    assert solution.converged
+    assert float(ravel(found)[position]) == pytest.approx(end, abs=1e-3)
+
+
 def test_a_start_where_the_model_is_not_defined_is_refused(problem):
     model, position, source = problem
     astray = eqx.tree_at(lambda m: m.effects[0].a, model, jnp.asarray(-2.0))
