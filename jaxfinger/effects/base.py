@@ -5,6 +5,7 @@ from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxfinger.model import Effect, Finger, Motion
@@ -90,6 +91,18 @@ class CatalogueEffect(Effect):
         """Every combination of shapes worth trying at a site."""
         names = list(cls.SHAPES)
         return [dict(zip(names, v, strict=True)) for v in product(*(cls.SHAPES[n][1] for n in names))]
+
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Least and most of every amplitude and of every shape that a refit moves: one-sided amplitudes not below zero,
+        shares not above one, and shapes no further out than those worth trying.
+        """
+        signed = {n: s for n, (_, _, s) in self.AMPLITUDES.items()}
+        ends = {n: (-np.inf if signed[n] else 0.0, 1.0 if n in self.SHARES else np.inf) for n in signed}
+        for n, (_, grid) in self.SHAPES.items():
+            if n not in self.CHOICES and len(grid) > 1:
+                wide = 1.0 if n in self.SHIFTS else 2.0
+                ends[n] = (min(grid) / wide, max(grid) * wide)
+        return ends
 
     def units(self) -> dict[str, str]:
         """Units of every parameter, amplitudes and shapes."""

@@ -12,19 +12,29 @@ from jaxfinger.effects.base import DELTA, ELASTIC, TORQUE, CatalogueEffect, dahl
 class JointStribeck(CatalogueEffect):
     """τ_f (1 + a exp(−(|q̇|/v_s)^δ)): friction falls with speed after breakaway (Armstrong-Hélouvry 1994).
 
-    From about 1 rad/s on v_s is not told from a damping.
+    With δ = 1, v_s is not told from a damping from about 1 rad/s on; with δ = 2, whose friction holds first and then
+    falls, it is.
     """
 
     ID: ClassVar = "joint_stribeck"
     PLACE: ClassVar = "joint"
     AMPLITUDES: ClassVar = {"a": ("1", 0.5, False)}
-    SHAPES: ClassVar = {"v_s": ("rad/s", (0.02, 0.05, 0.1, 0.2, 0.4)), "delta": ("1", (1.0, 2.0))}
+    SHAPES: ClassVar = {"v_s": ("rad/s", (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)), "delta": ("1", (1.0, 2.0))}
     CHOICES: ClassVar = ("delta",)
+    SLOW: ClassVar = 0.4  # rad/s, the largest v_s worth trying with δ = 1
     SHOWS: ClassVar = TORQUE
 
     a: Float[Array, ""]
     v_s: Float[Array, ""]
     delta: Float[Array, ""]
+
+    @classmethod
+    def shapes(cls, finger, site):
+        return [s for s in super().shapes(finger, site) if s["delta"] == 2.0 or s["v_s"] <= cls.SLOW]
+
+    def bounds(self):
+        ends = super().bounds()
+        return ends | {"v_s": (ends["v_s"][0], 2.0 * self.SLOW)} if self.delta == 1.0 else ends
 
     def joint_friction(self, x, f_j, C, F):
         i = self.index[0]

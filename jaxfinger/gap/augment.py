@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.gap.problem import Problem, assemble
-from jaxfinger.gap.refine import Refined, bounds
+from jaxfinger.gap.refine import Refined
 from jaxfinger.identify import Fit
 from jaxfinger.identify.fit import StageReport
 from jaxfinger.identify.parameters import describe, ravel
@@ -67,7 +67,7 @@ def limits(model: Model, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _limit(side: int, effect: CatalogueEffect) -> CatalogueEffect:
     """Of every parameter, the bound below or above (`side` 0 or 1) that refits keep to."""
-    ends = bounds(type(effect))
+    ends = effect.bounds()
     free = (-np.inf, np.inf)
     return replace(effect, **{n: jnp.asarray(ends.get(n, free)[side], dtype=float) for n in effect.values()})
 

@@ -240,28 +240,15 @@ def _shifted(effect: CatalogueEffect, c: _Coordinate, by: float) -> CatalogueEff
 
 
 def within_bounds(effect: CatalogueEffect) -> CatalogueEffect:
-    """The effect with one-sided amplitudes not below zero, shares not above one, and shapes no further out than those
-    worth trying.
-    """
-    return replace(effect, **{n: jnp.clip(getattr(effect, n), *ends) for n, ends in bounds(type(effect)).items()})
-
-
-def bounds(effect: type[CatalogueEffect]) -> dict[str, tuple[float, float]]:
-    """Least and most of every amplitude and moving shape."""
-    signed = {n: s for n, (_, _, s) in effect.AMPLITUDES.items()}
-    bounds = {n: (-np.inf if signed[n] else 0.0, 1.0 if n in effect.SHARES else np.inf) for n in signed}
-    for n, (_, grid) in effect.SHAPES.items():
-        if n not in effect.CHOICES and len(grid) > 1:
-            wide = 1.0 if n in effect.SHIFTS else 2.0
-            bounds[n] = (min(grid) / wide, max(grid) * wide)
-    return bounds
+    """The effect with every number within its bounds."""
+    return replace(effect, **{n: jnp.clip(getattr(effect, n), *ends) for n, ends in effect.bounds().items()})
 
 
 def _room(effects, coordinates: list[_Coordinate]) -> tuple[np.ndarray, np.ndarray]:
     """How far each coordinate may move, back and forth."""
     out = []
     for c in coordinates:
-        value, ends = float(getattr(effects[c.effect], c.name)), bounds(type(effects[c.effect]))[c.name]
+        value, ends = float(getattr(effects[c.effect], c.name)), effects[c.effect].bounds()[c.name]
         ways = [(end - value) / c.unit if c.shifts else np.log(end / value) for end in ends]
         most = np.inf if c.shifts else FACTOR
         out.append((max(min(ways[0], 0.0), -most), min(max(ways[1], 0.0), most)))
