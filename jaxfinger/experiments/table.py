@@ -33,7 +33,7 @@ EXPERIMENTS = {
     for e in (
         Experiment("ID.2", ("tendon_excursion",), 20.0, 5.0),
         Experiment("ID.3-static", ("joint_torque",), 20.0, 5.0, samples="holds", slack=True),
-        Experiment("ID.3-dynamic", ("joint_torque",), 50.0, 10.0, sharp=2.0, samples="sliding", slack=True),
+        Experiment("ID.3-dynamic", ("joint_torque",), 50.0, 10.0, sharp=3.0, samples="sliding", slack=True),
         Experiment("ID.4", ("joint_torque", "tendon_excursion"), 20.0, 5.0, samples="holds", held=True),
         Experiment("VD.1", ("tendon_excursion",), 20.0, 5.0),
         Experiment("VD.2", ("fingertip_force", "tendon_excursion"), 20.0, 5.0, samples="holds", held=True),

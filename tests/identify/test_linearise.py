@@ -46,9 +46,12 @@ def test_the_common_shape_changes_no_derivative(stack, short_truth):
     np.testing.assert_allclose(found.jacobian, J, rtol=1e-7, atol=1e-7 * np.abs(J).max())
     whole = np.concatenate([J, r[..., None]], axis=-1) * weights[..., None]
     expected = np.einsum("brp,brq->bpq", whole, whole)
-    scale = np.sqrt(np.einsum("bpp->bp", expected)).max(axis=0) + 1e-300
+    scale = np.sqrt(np.einsum("bpp->bp", expected)).max(axis=0)
+    seen = scale > 1e-10 * scale.max()  # f(q) of joints that are held leaves nothing but rounding
+    assert seen.sum() > 20
     gram = np.einsum("bkp,bkq->bpq", found.factor, found.factor)
-    np.testing.assert_allclose(gram / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-9)
+    gram, expected = ((x / (scale + 1e-300) / (scale + 1e-300)[:, None])[:, seen][:, :, seen] for x in (gram, expected))
+    np.testing.assert_allclose(gram, expected, atol=1e-9)
 
 
 def test_the_common_shape_changes_no_residual(stack, short_truth):
