@@ -111,7 +111,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     holds = find_holds(trial) if spec.samples == "holds" else np.full(N, -1)
 
     # Where the measured channel is not low-passed, q̇ and q̈ must not lose what is in it.
-    cutoff = min(spec.cutoff * (spec.sharp if spec.stepped or not reduced else 1.0), 0.2 / step)
+    cutoff = spec.cutoff_at(step, sharp=spec.stepped or not reduced)
     filtered, qd, qdd = smooth(trial.time, trial.q, cutoff)
     lost = np.abs(trial.q - filtered)
     noise = np.median(lost, axis=0)
@@ -184,21 +184,21 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         motion["blur"] = np.full(M, width(cutoff) if spec.samples == "sliding" else 0.0)
     # Joints that are held have no inertia: ramps of the tension count as well as holds.
     between = _goes_on(tension_mean, hold)[:, None] if spec.held else mean(slides) > 1.0 - 1e-9
-    # How far a tendon is pulled in no friction decides: where it is taut, all of a ramp counts.
     taut = tension[: M * block].reshape(M, block, n).min(axis=1) > SLACK
     y_mean, mask_mean = {}, {}
     for c in y:
-        known = taut | between if spec.held and c == "tendon_excursion" else between
-        counts = (mean(mask[c]) > 0.5) & _counting(spec, c, hold, known)
+        counts = (mean(mask[c]) > 0.5) & _counting(spec, c, hold, between, taut)
         mask_mean[c] = counts.astype(float).T
         y_mean[c] = mean(y[c]).T * mask_mean[c]  # of all samples, as everything else that the model reads
     return _Row(motion, y_mean, mask_mean, hold, block * step)
 
 
-def _counting(spec: Experiment, channel: str, hold: np.ndarray, between: np.ndarray) -> np.ndarray:
-    """(M, columns or 1): which blocks of a channel count, where it is measured. `between`: where friction is known."""
+def _counting(spec: Experiment, channel: str, hold: np.ndarray, between: np.ndarray, taut: np.ndarray) -> np.ndarray:
+    """(M, columns or 1): which blocks of a channel count, where it is measured. `between`: where friction is known,
+    which does not decide how far a taut tendon is pulled in.
+    """
     if spec.samples == "holds":
-        return (hold >= 0)[:, None] | between
+        return (hold >= 0)[:, None] | between | (taut if channel == "tendon_excursion" else False)
     return between if spec.samples == "sliding" and channel == "joint_torque" else np.ones((len(hold), 1), bool)
 
 
@@ -286,10 +286,11 @@ def _sliding(
 
 
 def _in_fixture(q: np.ndarray, hold: np.ndarray) -> np.ndarray:
-    """(N, m): the mean of all holds, and of what holds differ by, the share that is not the noise of their means.
+    """(N, m): the mean of all holds, and of what they differ by, the share that is not the noise of their means (James
+    and Stein's estimator).
 
-    A fixture yields, or does not; noise of the angle would look like a law of it, and near a singular posture a
-    contact force amplifies it a thousandfold (James and Stein's estimator).
+    A fixture may yield. Noise of the angle would look like a law of it, and near a singular posture a contact force
+    amplifies it a thousandfold.
     """
     runs = _runs(hold)
     if len(runs) < 3:

@@ -9,15 +9,14 @@ class Experiment:
 
     `rate` and `cutoff` say how a trial is reduced before a fit: slow experiments are averaged over blocks of 1/rate s,
     q̇ and q̈ come from a zero-phase low-pass at `cutoff`. Both sides of (1) are averaged and filtered alike. A higher
-    cut-off lets the encoder's noise into q̈, and a fit takes that for less inertia. Where what is measured is not
-    filtered, the cut-off is `sharp` times as high: noise biases nothing there, and shows where a sweep's q̈ counts.
+    cut-off lets the encoder's noise into q̈, and a fit takes that for less inertia.
     """
 
     name: str
     channels: tuple[str, ...]  # what the model predicts
     rate: float  # Hz
     cutoff: float  # Hz
-    sharp: float = 4.0
+    sharp: float = 4.0  # times the cut-off beside a measurement that is not filtered, where noise of q̈ biases nothing
     samples: str = "all"  # which ones count: `all`, `sliding` (friction is known), `holds` (and what is known between)
     held: bool = False  # a fixture holds the joints: they carry no friction, and tendons slip only past their loss
     slack: bool = False  # the tendons are slack by protocol
@@ -26,6 +25,10 @@ class Experiment:
     def stepped(self) -> bool:
         """A motor moves a joint from hold to hold."""
         return self.samples == "holds" and not self.held
+
+    def cutoff_at(self, step: float, sharp: bool = False) -> float:
+        """Hz, of a trial with a sample every `step` s: a fifth of its rate at most."""
+        return min(self.cutoff * (self.sharp if sharp else 1.0), 0.2 / step)
 
 
 EXPERIMENTS = {

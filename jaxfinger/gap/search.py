@@ -36,7 +36,7 @@ SAME_SITE = 0.1  # share of what is explained, that a further effect at the same
 CLOSE = 0.5  # share of what the best explains, from which on a rival is refitted where it leads
 COVERED = 0.97  # probability of a set of rivals, among the catalogue, up to which it takes in further ones
 RIVALS = 3  # at most in a set
-SOME = 0.01  # share of the gap that a candidate must explain where it is fitted, to be tried where it is not
+TRIED = 0.01  # share of the gap that a candidate must explain in the fit, to be tried on held-out trials
 LOOKED_AT = 12  # candidates for a further effect
 LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for, and nothing is unlisted
 HINT = 20.0  # of it in a column, that a known effect may claim though noise could give it: its law asks for more
@@ -90,15 +90,12 @@ def search(
     screened = screen(groups, columns, projector, rt)
     found = by_site(screened)
     ranked = list(found.values())
-    absorbed = [(e.variant.key, e.absorbed) for e in ranked if e.absorbed > 0.99]
-    strongest = ranked[0].log_bf
     refined: dict[tuple, Refined] = {}
     for e in _worth(ranked, 3 if quick else 8):
         progress(f"refitting with {e.variant.effect.ID} at {', '.join(e.variant.site)}")
         refined[e.variant.key] = refine(problem, [e.variant], [start_of(e)], chi2, projector)
     if not refined or max(r.log_evidence for r in refined.values()) < DETECT:
-        strongest = max((r.log_evidence for r in refined.values()), default=strongest)
-        return _nothing(ranked, strongest, absorbed)
+        return _nothing(ranked, max((r.log_evidence for r in refined.values()), default=ranked[0].log_bf))
 
     best = max(refined.values(), key=lambda r: r.log_evidence)
     start, there = problem, {}
@@ -118,12 +115,10 @@ def search(
         led = [relinearised(there[r.keys[0]], r, chi2) for r in (chosen, *pairs) if len(r.variants) > 1]
         problem, chosen = max(led, key=lambda x: x[1].log_evidence)
     left = explained(problem, chosen.residual)
-    beyond = energy_left(left)
-    gap = chi2 - chosen.chi2 + beyond
+    gap = chi2 - chosen.chi2 + energy_left(left)
     shares = _shares(problem, chosen, chi2, gap)
-    order = np.argsort(-np.asarray(shares))
     held_out = _held_out(start, there, ranked, refined, groups, columns, chi2, gap)
-    return _judge(ranked, refined, held_out, chosen, shares, order, chi2, gap, beyond, left, strongest, absorbed)
+    return _judge(ranked, refined, held_out, chosen, shares, chi2, gap, left)
 
 
 def _rivals(refined: dict[tuple, Refined], best: Refined, chi2: float, most: int) -> list[tuple]:
@@ -197,9 +192,14 @@ def _add(problem, groups, columns, best: Refined, chi2: float, without, progress
 
 def _drop(e: Evidence, groups, columns, projector: Projector, rt, cell, count: int) -> np.ndarray:
     """What a candidate explains in every column."""
-    name = e.variant.effect.ID
-    change = e.amplitudes @ projector(columns[name][groups[name].index(e.variant)])
+    change = e.amplitudes @ projector(_signatures_of(e, groups, columns))
     return np.bincount(cell, (rt**2 - (rt - change) ** 2)[: cell.size], count)
+
+
+def _signatures_of(e: Evidence, groups, columns) -> np.ndarray:
+    """(amplitudes, N) of a candidate's variant."""
+    name = e.variant.effect.ID
+    return columns[name][groups[name].index(e.variant)]
 
 
 def _fits(drop: np.ndarray, left: np.ndarray) -> float:
@@ -212,11 +212,9 @@ def _held_out(start, there, ranked, refined, groups, columns, chi2: float, gap: 
     """Share of the gap that each candidate explains alone on held-out trials: the strongest where they have led, others
     at the nominal model; of those that explain any of what they have seen.
     """
-    some = {e.variant.key: e for e in ranked if e.explained > SOME * gap}
+    some = {e.variant.key: e for e in ranked if e.explained > TRIED * gap}
     members = {
-        k: refined[k].change[None]
-        if k in refined
-        else columns[e.variant.effect.ID][groups[e.variant.effect.ID].index(e.variant)]
+        k: refined[k].change[None] if k in refined else _signatures_of(e, groups, columns)
         for k, e in some.items()
         if k not in there
     }
@@ -239,9 +237,9 @@ def _shares(problem, chosen: Refined, chi2: float, gap: float) -> tuple[float, .
     return tuple(out)
 
 
-def _judge(ranked, refined, held_out, chosen, shares, order, chi2, gap, beyond, left, strongest, absorbed) -> Search:
+def _judge(ranked, refined, held_out, chosen, shares, chi2, gap, left) -> Search:
     """Probabilities: rivals of the first effect by what they leave unexplained, «unlisted» by what all leave."""
-    first = chosen.keys[order[0]]
+    first, beyond = chosen.keys[int(np.argmax(shares))], energy_left(left)
     floor = min(r.chi2 for r in refined.values())
     keys = [e.variant.key for e in ranked]
     unexplained = {}
@@ -296,16 +294,21 @@ def _judge(ranked, refined, held_out, chosen, shares, order, chi2, gap, beyond, 
         unlisted * scale,
         [rivals] if len(rivals) > 1 else [],
         left,
-        strongest,
-        absorbed,
+        ranked[0].log_bf,
+        _absorbed(ranked),
     )
 
 
-def _nothing(ranked: list[Evidence], strongest: float, absorbed) -> Search:
+def _absorbed(ranked: list[Evidence]) -> list[tuple]:
+    """What the nominal parameters imitate with this file's trials, and to which share."""
+    return [(e.variant.key, e.absorbed) for e in ranked if e.absorbed > 0.99]
+
+
+def _nothing(ranked: list[Evidence], strongest: float) -> Search:
     """No effect is seen above the noise: the weak evidence that there is shares what «none» leaves."""
     logs = np.array([max(e.log_bf, -5.0) for e in ranked])
     none = float(np.clip(expit((DETECT - strongest) / 2.0), 0.5, 0.995))
     weights = np.exp(0.2 * (logs - logs.max()))
     weights *= (1 - none) * 0.7 / weights.sum()
     candidates = [Candidate(e.variant.key, float(w), 0.0, None, e) for e, w in zip(ranked, weights, strict=True)]
-    return Search(0.0, False, None, (), candidates, none, (1 - none) * 0.3, [], [], strongest, absorbed)
+    return Search(0.0, False, None, (), candidates, none, (1 - none) * 0.3, [], [], strongest, _absorbed(ranked))

@@ -177,11 +177,11 @@ def _line(e: str, c: str, units: str, values: np.ndarray) -> Shrinkage:
 
     rows = np.arange(len(values))
     before, after, noise = (float(np.average(values[:, k], weights=weight)) for k in range(3))
-    resolvable = before > RESOLVABLE * noise
+    value = closed(rows)
+    resolvable = bool(np.isfinite(value))
     draws = np.array([closed(rng.choice(rows, len(rows))) for _ in range(400)])
     draws = draws[np.isfinite(draws)]
     low, high = np.quantile(draws, (0.025, 0.975)) if resolvable and len(draws) else (0.0, 0.0)
-    value = closed(rows) if resolvable else 0.0
     return Shrinkage(
         e,
         c,
@@ -189,7 +189,7 @@ def _line(e: str, c: str, units: str, values: np.ndarray) -> Shrinkage:
         noise**0.5,
         before**0.5,
         after**0.5,
-        float(np.clip(value, -1.0, 1.0)),
+        float(np.clip(np.nan_to_num(value), -1.0, 1.0)),
         (float(np.clip(low, -1, 1)), float(np.clip(high, -1, 1))),
         resolvable,
     )

@@ -129,7 +129,7 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
             assert isinstance(effect, CatalogueEffect)
             label = f"{effect.ID} {'-'.join(effect.site)} {field}"
             if index or field not in effect.units():  # a constant that the effect carries
-                return Parameter(f"{label} {index}", "constant", "", determinable=False)
+                return Parameter(f"{label} {index}" if index else label, "constant", "", determinable=False)
             return Parameter(label, "effects", effect.units()[field])
     raise AssertionError(keys)
 

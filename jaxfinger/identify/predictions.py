@@ -46,7 +46,10 @@ def predict_session(
             values = _predict(model, x, stack.experiment.channels)
             channels = {c: np.array(v[:, 0, :N]).T for c, v in values.items()}
             if experiment == "VD.3":
-                channels["joint_torque"] = _below(stack.experiment.cutoff, channels["joint_torque"], session[name])
+                # It stands beside no measured channel: above the cut-off is the noise of q̈ and of tension alone.
+                time = session[name].time
+                cutoff = stack.experiment.cutoff_at(float(np.median(np.diff(time))))
+                channels["joint_torque"] = low_pass(time, channels["joint_torque"], cutoff)
             out[name] = _only_measurable(channels, session[name], session) | free.get(name, {})
     return {t.name: out[t.name] for t in session if t.name in out}
 
@@ -76,14 +79,6 @@ def model_for(fit: Fit | Model, session: Session) -> Model:
 @eqx.filter_jit
 def _predict(model: Model, x: Motion, channels: tuple[str, ...]) -> dict[str, Float[Array, "columns 1 T"]]:
     return predict(model, x, channels)
-
-
-def _below(cutoff: float, torque: Float[np.ndarray, "N m"], trial: Trial) -> Float[np.ndarray, "N m"]:
-    """What a free finger's motion needs of torque from outside, below the cut-off of the experiment.
-
-    It stands beside no measured channel: what lies above is the noise of q̈ and of tension.
-    """
-    return low_pass(trial.time, torque, min(cutoff, 0.2 / float(np.median(np.diff(trial.time)))))
 
 
 def _only_measurable(channels: dict[str, np.ndarray], trial: Trial, session: Session) -> dict[str, np.ndarray]:

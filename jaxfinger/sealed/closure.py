@@ -68,7 +68,7 @@ def _friction_known(trial: Trial, session: Session) -> np.ndarray:
 
 
 def _sliding(trial: Trial, session: Session) -> np.ndarray:
-    """(N, m) where a joint moves and so does every taut tendon across it, clear of where they stop."""
+    """(N, m) where a joint moves, and every tendon across it where tendons drive it, clear of where they stop."""
     rate = float(1.0 / np.median(np.diff(trial.time)))
     width = max(int(0.05 * rate), 3)
     speed = _slope(trial.q, trial.time, width)
