@@ -29,6 +29,8 @@ from jaxfinger.identify.parameters import describe, ravel
 
 Progress = Callable[[str], None]
 MOST_IN_A_SET = 3
+RISE = 0.5  # of the mean square of held-out trials over that of their noise, beyond which a cause that adds it is none
+DOUBTED = 0.8  # probability of «unlisted» then
 UNSEEN = 10.0  # plausible sizes: the stated deviation of an amplitude that the trials do not see at all
 
 
@@ -94,8 +96,9 @@ def diagnose(
     first = found.chosen.keys[order[0]]
     progress("refitting without each third of the trials")
     lines = shrinkage(problem, nominal, fit, r, J, _rivals(problem, found), first, not quick)
+    found = doubted(found, lines)
     verdict, proposal = _verdict(found, lines), None
-    if verdict.status == "unexplained" and found.left:
+    if verdict.status == "unexplained" and _left_share(found) > 0.0:
         progress("looking for a closed form of what remains")
         proposal = propose(problem, found.chosen.residual, found.left, found.chosen.columns)
         if proposal:
@@ -169,6 +172,16 @@ def _members(problem: Problem, found: Search) -> list[Refined]:
     return out
 
 
+def doubted(found: Search, lines: list[Shrinkage]) -> Search:
+    """The search, with «unlisted» ahead where the verdict's effects make trials worse that their fit has not seen."""
+    rise = sum((x.after**2 - x.before**2) / x.noise**2 for x in lines if x.channel != "q")
+    if rise < RISE or found.unlisted > DOUBTED:
+        return found
+    rest = (1.0 - DOUBTED) / (1.0 - found.unlisted)
+    candidates = [replace(c, probability=c.probability * rest) for c in found.candidates]
+    return replace(found, candidates=candidates, none=found.none * rest, unlisted=DOUBTED)
+
+
 def _verdict(found: Search, lines: list[Shrinkage]) -> Verdict:
     chosen = found.chosen
     assert chosen is not None
@@ -176,6 +189,13 @@ def _verdict(found: Search, lines: list[Shrinkage]) -> Verdict:
     effects = tuple(chosen.keys[i] for i in order)
     names = " and ".join(f"{e} at {'-'.join(s)}" for e, s in effects)
     share = sum(found.shares) if len(effects) == 1 else 1.0 - _left_share(found)
+    if found.unlisted > 0.5 and _left_share(found) == 0.0:
+        return Verdict(
+            "unexplained",
+            (),
+            f"There is a gap, and none of the known effects explains it: the nearest, {names}, fits the trials that it "
+            "has seen, and makes those that it has not seen worse.",
+        )
     if found.unlisted > 0.5:
         depends = _depends(found)
         return Verdict(

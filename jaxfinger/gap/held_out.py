@@ -44,16 +44,19 @@ def held_out_energies(
     """
     of_row = fold_of_row(problem)
     size = np.linalg.norm(problem.J, axis=0)
-    J = problem.J * np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
+    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
+    J, root = problem.J * scale, np.vstack([problem.root * scale, KEPT * np.eye(len(size))])
     targets = np.column_stack([problem.r, *(z.T for z in members)])
+    prior = np.zeros((len(root), targets.shape[1]))
+    prior[: len(problem.root), 0] = -problem.offset
     ends = np.cumsum([1, *(len(z) for z in members)])
     alone, with_member = 0.0, np.zeros(len(members))
     for k in range(FOLDS):
         seen = of_row != k
-        Q, R = np.linalg.qr(np.vstack([J[seen], KEPT * np.eye(J.shape[1])]))
-        Q = Q[: seen.sum()]
-        inner = Q.T @ targets[seen]
-        fitted = targets[seen] - Q @ inner
+        Q, R = np.linalg.qr(np.vstack([J[seen], root]))
+        known = np.vstack([targets[seen], prior])
+        inner = Q.T @ known
+        fitted = known - Q @ inner
         left = targets[~seen] - J[~seen] @ np.linalg.solve(R, inner)
         alone += float(left[:, 0] @ left[:, 0])
         for i, (a, b) in enumerate(pairwise(ends)):

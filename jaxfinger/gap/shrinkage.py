@@ -12,14 +12,14 @@ import numpy as np
 from jaxfinger.data.schema import channel_units
 from jaxfinger.experiments import prepare
 from jaxfinger.gap.augment import limits
-from jaxfinger.gap.evidence import Evidence
+from jaxfinger.gap.evidence import Evidence, evidence
 from jaxfinger.gap.held_out import FOLDS, KEPT, fold_of_row, folds
 from jaxfinger.gap.problem import Problem
 from jaxfinger.identify import Fit
 from jaxfinger.identify.linearise import residuals_of
 from jaxfinger.identify.parameters import Free, ravel
 from jaxfinger.identify.predictions import simulate_trials
-from jaxfinger.identify.solve import bounded
+from jaxfinger.identify.solve import Prior, bounded
 from jaxfinger.model import Model
 
 RESOLVABLE = 1.1  # mean square before over that of the noise, from which on a gap can be said to close
@@ -61,10 +61,10 @@ def shrinkage(
     models = []
     for k in range(FOLDS):
         training = of_row != k
-        refitted = _refit(problem.nominal, problem.free, problem.J, problem.r, training)
+        refitted = _refit(problem.nominal, problem.free, problem.J, problem.r, training, problem.prior)
         before = problem.simulator or refitted
         same = _choice(problem, rivals, training) == first
-        after = _refit(augmented.model, augmented.estimated, J, r, training) if same else refitted
+        after = _refit(augmented.model, augmented.estimated, J, r, training, problem.prior) if same else refitted
         models.append((before, after))
         for e, stack in problem.stacks.items():
             channels = stack.experiment.channels
@@ -129,31 +129,36 @@ def _spread(problem: Problem, name: str) -> float:
     return float(0.5 * np.mean(squares)) if squares else 0.0
 
 
-def _refit(model: Model, free, J, r, training) -> Model:
-    """The model refitted to the training rows; what they do not see stays within a few deviations of the whole fit."""
+def _refit(model: Model, free, J, r, training, prior: Prior) -> Model:
+    """The model refitted to the training rows and the prior on its first parameters; what neither sees stays within a
+    few deviations of the whole fit.
+    """
     size = np.linalg.norm(J, axis=0)
     scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)  # what no trial sees stays
-    A = np.vstack([J[training] * scale, KEPT * np.eye(len(free))])
     theta, unit = np.asarray(ravel(model))[free], np.where(scale > 0.0, scale, 1.0)
+    mean, root = np.asarray(prior.mean), np.asarray(prior.root)
+    pull = root @ (theta[: len(mean)] - mean)
+    root = np.pad(root, ((0, 0), (0, len(free) - len(mean))))
+    A = np.vstack([J[training] * scale, root * scale, KEPT * np.eye(len(free))])
     room = [(end - theta) / unit for end in limits(model, free)]
-    delta = bounded(A, -np.concatenate([r[training], np.zeros(len(free))]), *room) * scale
+    delta = bounded(A, np.concatenate([-r[training], pull, np.zeros(len(free))]), *room) * scale
     return Free.at(model, free).set(model, jnp.asarray(theta + delta))
 
 
-def _choice(problem: Problem, rivals, training):
-    """The candidate that explains most of the training rows."""
+def _choice(problem: Problem, rivals: list[tuple[Evidence, np.ndarray]], training: np.ndarray) -> tuple | None:
+    """The candidate of most evidence in the training rows: what it explains there, and of the prior's surprise at what
+    the nominal parameters became to imitate it.
+    """
     A = np.vstack([problem.J[training], problem.root])
     Q, _ = np.linalg.qr(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300))
-    r = np.concatenate([problem.r[training], np.zeros(len(problem.root))])
+    r = np.concatenate([problem.r[training], -problem.offset])
     r = r - Q @ (Q.T @ r)
-    best, gain = None, -np.inf
+    best, most = None, -np.inf
     for e, Z in rivals:
-        z = np.pad(Z[:, training], ((0, 0), (0, len(problem.root))))
-        z = z - (z @ Q) @ Q.T
-        a = np.linalg.lstsq(z.T, r, rcond=1e-10)[0]
-        explained = float(a @ (z @ r))
-        if explained > gain:
-            best, gain = e.variant.key, explained
+        raw = np.pad(Z[:, training], ((0, 0), (0, len(problem.root))))
+        found = evidence(e.variant, raw, raw - (raw @ Q) @ Q.T, r)
+        if found.log_bf > most:
+            best, most = e.variant.key, found.log_bf
     return best
 
 

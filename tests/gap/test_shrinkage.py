@@ -1,4 +1,6 @@
-"""A fold's linear refit leads no effect beyond its bounds; the interval of how far a gap closes."""
+"""What a fold chooses and refits, and the interval of how far a gap closes."""
+
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,7 +8,7 @@ import pytest
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap.refine import within_bounds
-from jaxfinger.gap.shrinkage import _line
+from jaxfinger.gap.shrinkage import _choice, _line
 from jaxfinger.model import Finger
 from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger
 
@@ -34,6 +36,24 @@ def test_a_length_that_a_linear_step_turned_negative_comes_back(finger):
     effect = kind.at(finger, ("PIP",), a=1.0, x0=-0.3)
     assert 0.0 < within_bounds(effect).values()["x0"] <= min(kind.SHAPES["x0"][1])
     assert np.isfinite(jnp.asarray(within_bounds(effect).values()["x0"]))
+
+
+def test_a_fold_sees_what_the_nominal_parameters_became_to_imitate_a_cause(diagnosis):
+    """As masses that moved away from CAD to look like a tilt: of that gap, only the prior knows."""
+    rng = np.random.default_rng(5)
+    noise, moved = rng.standard_normal(5000), np.array([2.0, 0.0, 0.0])
+    J, root = rng.standard_normal((noise.size, 3)), np.array([[10.0, 0.0, 0.0]])
+    cause = J @ moved
+    problem = replace(diagnosis.problem, r=noise, J=J, root=root, offset=root @ moved)
+    at = {c.key: c.evidence for c in diagnosis.search.candidates}
+    tilt, luck = (at["elastic_relaxation", (site,)] for site in ("MCP", "PIP"))
+    # the signature of what was moved: the trials alone say nothing of it, but its size follows from the prior
+    lucky = noise + (noise.size / 60.0) ** 0.5 * rng.standard_normal(noise.size)  # explains about 60 of the noise
+    rivals = [(tilt, cause[None]), (luck, lucky[None])]
+    training = rng.random(cause.size) < 0.7
+    assert _choice(problem, rivals, training) == tilt.variant.key
+    at_cad = replace(problem, offset=np.zeros_like(problem.offset))
+    assert _choice(at_cad, rivals, training) == luck.variant.key
 
 
 def test_trials_without_a_gap_say_nothing_of_how_far_it_closes():
