@@ -85,22 +85,23 @@ def diagnose(
     progress("reading the signatures of all effects")
     found = search(problem, catalogue, quick, progress)
     nominal = nominal_fit(problem)
-    if found.chosen is None or not found.detected:
+    chosen = found.chosen
+    if chosen is None or not found.detected:
         lines = _unchanged(problem, nominal, not quick)
         verdict = Verdict("no_gap", (), _no_gap_summary(found) + _retuned(problem, nominal))
         return Diagnosis(problem, verdict, [], found, lines, None, nominal, nominal)
 
     progress("fitting the effects and all nominal parameters together")
-    fit, r, J = augmented_fit(problem, found.chosen)
+    fit, r, J = augmented_fit(problem, chosen)
     order = np.argsort(-np.asarray(found.shares))
-    first = found.chosen.keys[order[0]]
+    first = chosen.keys[order[0]]
     progress("refitting without each third of the trials")
     lines = shrinkage(problem, nominal, fit, r, J, _rivals(problem, found), first, not quick)
     found = doubted(found, lines)
     verdict, proposal = _verdict(found, lines), None
     if verdict.status == "unexplained" and _left_share(found) > 0.0:
         progress("looking for a closed form of what remains")
-        proposal = propose(problem, found.chosen.residual, found.left, found.chosen.columns)
+        proposal = propose(problem, chosen.residual, found.left, chosen.columns)
         if proposal:
             text = f" A proposal, unproven, for {100 * proposal.share:.0f} % of that: {proposal.formula}."
             verdict = replace(verdict, summary=verdict.summary + text)
