@@ -38,7 +38,7 @@ COVERED = 0.97  # probability of a set of rivals, among the catalogue, up to whi
 RIVALS = 3  # at most in a set
 TRIED = 0.01  # share of the gap that a candidate must explain in the fit, to be tried on held-out trials
 LOOKED_AT = 12  # candidates for a further effect
-LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for, and nothing is unlisted
+LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for
 HINT = 20.0  # of it in a column, that a known effect may claim though noise could give it: its law asks for more
 # «Unlisted», by how many effects were chosen, since two known ones together imitate more than one does: the share of
 # the gap left to the stand-in at which it is as likely as the catalogue, and how sharply. One known effect in another
@@ -252,7 +252,7 @@ def _judge(ranked, refined, held_out, chosen, shares, chi2, gap, left) -> Search
     total = logsumexp(list(log_l.values()))
     share_left = beyond / gap
     even, width = OPEN[len(chosen.variants)]
-    unlisted = float(expit((share_left - even) / width)) if beyond > LEAST else 0.01
+    unlisted = max(float(expit((share_left - even) / width)), 0.01)
     probability = {k: float(np.exp(v - total)) * (1 - unlisted) for k, v in log_l.items()}
     if len(chosen.variants) > 1:
         # Several effects: each carries its part of what the catalogue explains.
