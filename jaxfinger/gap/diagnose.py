@@ -86,10 +86,15 @@ def diagnose(
     found = search(problem, catalogue, quick, progress)
     nominal = nominal_fit(problem)
     chosen = found.chosen
-    if chosen is None or not found.detected:
-        lines = _unchanged(problem, nominal, not quick)
-        verdict = Verdict("no_gap", (), _no_gap_summary(found) + _retuned(problem, nominal))
-        return Diagnosis(problem, verdict, [], found, lines, None, nominal, nominal)
+    if chosen is None:
+        lines, proposal, places = _unchanged(problem, nominal, not quick), None, []
+        verdict = Verdict("no_gap", (), _no_gap_summary(found))
+        if found.detected:
+            proposal, places = propose(problem, problem.r, found.left, np.empty((0, problem.r.size))), where(problem)
+            text = f"There is a gap, and none of the known effects explains any of it. {_depends(found)}"
+            verdict = Verdict("unexplained", (), text + _proposed(proposal))
+        verdict = replace(verdict, summary=verdict.summary + _retuned(problem, nominal))
+        return Diagnosis(problem, verdict, places, found, lines, None, nominal, nominal, proposal)
 
     progress("fitting the effects and all nominal parameters together")
     fit, r, J = augmented_fit(problem, chosen)
@@ -102,9 +107,7 @@ def diagnose(
     if verdict.status == "unexplained" and _left_share(found) > 0.0:
         progress("looking for a closed form of what remains")
         proposal = propose(problem, chosen.residual, found.left, chosen.columns)
-        if proposal:
-            text = f" A proposal, unproven, for {100 * proposal.share:.0f} % of that: {proposal.formula}."
-            verdict = replace(verdict, summary=verdict.summary + text)
+        verdict = replace(verdict, summary=verdict.summary + _proposed(proposal))
     verdict = replace(verdict, summary=verdict.summary + _retuned(problem, fit))
     places = where(problem)
     suggestion = None
@@ -122,6 +125,12 @@ def diagnose(
         fit,
         proposal,
     )
+
+
+def _proposed(proposal: Proposal | None) -> str:
+    if proposal is None:
+        return ""
+    return f" A proposal, unproven, for {100 * proposal.share:.0f} % of that: {proposal.formula}."
 
 
 def _retuned(problem: Problem, fit: Fit) -> str:

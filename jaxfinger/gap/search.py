@@ -39,6 +39,7 @@ RIVALS = 3  # at most in a set
 TRIED = 0.01  # share of the gap that a candidate must explain in the fit, to be tried on held-out trials
 LOOKED_AT = 12  # candidates for a further effect
 LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for
+ALONE = 80.0  # of it in a column, that is a gap though no known effect explains any: without one, it has up to 48
 HINT = 20.0  # of it in a column, that a known effect may claim though noise could give it: its law asks for more
 # «Unlisted», by how many effects were chosen, since two known ones together imitate more than one does: the share of
 # the gap left to the stand-in at which it is as likely as the catalogue, and how sharply. One known effect in another
@@ -62,8 +63,8 @@ class Search:
     """What the search found."""
 
     gap: float  # energy of the gap that can be explained at all, in squared standard deviations
-    detected: bool
-    chosen: Refined | None  # the effects of the verdict, refitted together, in order of what they explain
+    detected: bool  # whether there is a gap
+    chosen: Refined | None  # the effects of the verdict, refitted together, in order; None where none is seen
     shares: tuple[float, ...]  # of the gap, one a chosen effect: what is lost when it alone is dropped
     candidates: list[Candidate]
     none: float
@@ -95,7 +96,8 @@ def search(
         progress(f"refitting with {e.variant.effect.ID} at {', '.join(e.variant.site)}")
         refined[e.variant.key] = refine(problem, [e.variant], [start_of(e)], chi2, projector)
     if not refined or max(r.log_evidence for r in refined.values()) < DETECT:
-        return _nothing(ranked, max((r.log_evidence for r in refined.values()), default=ranked[0].log_bf))
+        strongest = max((r.log_evidence for r in refined.values()), default=ranked[0].log_bf)
+        return _none_named(ranked, strongest, explained(problem, problem.r))
 
     best = max(refined.values(), key=lambda r: r.log_evidence)
     start, there = problem, {}
@@ -304,11 +306,16 @@ def _absorbed(ranked: list[Evidence]) -> list[tuple]:
     return [(e.variant.key, e.absorbed) for e in ranked if e.absorbed > 0.99]
 
 
-def _nothing(ranked: list[Evidence], strongest: float) -> Search:
-    """No effect is seen above the noise: the weak evidence that there is shares what «none» leaves."""
+def _none_named(ranked: list[Evidence], strongest: float, left: list[Explained]) -> Search:
+    """No effect is seen above the noise: the weak evidence that there is shares what «none» leaves, or «unlisted» where
+    some other smooth law is seen.
+    """
+    gap = sum(x.energy for x in left if x.energy > ALONE)
+    none = 1e-6 if gap else float(np.clip(expit((DETECT - strongest) / 2.0), 0.5, 0.995))
+    known = 0.1 if gap else 0.7 * (1 - none)
     logs = np.array([max(e.log_bf, -5.0) for e in ranked])
-    none = float(np.clip(expit((DETECT - strongest) / 2.0), 0.5, 0.995))
     weights = np.exp(0.2 * (logs - logs.max()))
-    weights *= (1 - none) * 0.7 / weights.sum()
+    weights *= known / weights.sum()
     candidates = [Candidate(e.variant.key, float(w), 0.0, None, e) for e, w in zip(ranked, weights, strict=True)]
-    return Search(0.0, False, None, (), candidates, none, (1 - none) * 0.3, [], [], strongest, _absorbed(ranked))
+    unlisted = 1 - none - known
+    return Search(gap, gap > 0, None, (), candidates, none, unlisted, [], left, strongest, _absorbed(ranked))

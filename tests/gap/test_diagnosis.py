@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 
-from jaxfinger.effects import CatalogueEffect
+from jaxfinger.effects import CATALOGUE, CatalogueEffect
 from jaxfinger.errors import UserError
 from jaxfinger.gap import as_gap_json, diagnose, write
 from jaxfinger.gap.diagnose import doubted
@@ -18,7 +18,7 @@ from jaxfinger.identify import load_fit
 from jaxfinger.identify.noise import whiten
 from jaxfinger.report.diagnosis_page import summary, write_page
 
-from .conftest import TRUTH, WITHOUT, session_with
+from .conftest import RIVALS, TRUTH, WITHOUT, session_with
 
 
 @pytest.fixture(scope="module")
@@ -198,25 +198,34 @@ def test_an_unknown_effect_to_leave_out_is_refused():
         diagnose(session_with(), without=("joint_magic",))
 
 
-def test_a_law_that_nobody_listed_gets_a_proposal_in_closed_form():
-    """A torque periodic in the sum of two angles, seen by a catalogue that has nothing like it."""
+class SumOfAngles(CatalogueEffect):
+    """A torque periodic in the sum of two angles."""
 
-    class SumOfAngles(CatalogueEffect):
-        ID = "sum_of_angles"
-        PLACE = "joint pair"
-        AMPLITUDES = {"a": ("N m", 1e-3, True)}  # noqa: RUF012
-        SHOWS = {e: ("joint_torque",) for e in ("ID.3-static", "ID.3-dynamic")}  # noqa: RUF012
+    ID = "sum_of_angles"
+    PLACE = "joint pair"
+    AMPLITUDES = {"a": ("N m", 1e-3, True)}  # noqa: RUF012
+    SHOWS = {e: ("joint_torque",) for e in ("ID.3-static", "ID.3-dynamic")}  # noqa: RUF012
 
-        a: Float[Array, ""]
+    a: Float[Array, ""]
 
-        def torque(self, x, memory, h):
-            i, j = self.index
-            return h.at[i].add(self.a * jnp.sin(6.0 * (x.q[i] + x.q[j])))
+    def torque(self, x, memory, h):
+        i, j = self.index
+        return h.at[i].add(self.a * jnp.sin(6.0 * (x.q[i] + x.q[j])))
 
+
+@pytest.mark.parametrize("known", [RIVALS, ("tendon_backlash", "tendon_stretch")])
+def test_a_law_that_nobody_listed_gets_a_proposal_in_closed_form(known, tmp_path):
+    """Whether the catalogue has effects of that joint, which explain some of it, or none that explains any."""
     session = session_with((SumOfAngles, ("PIP", "DIP"), {"a": 3e-3}))
-    found = diagnose(session, without=WITHOUT)
+    found = diagnose(session, without=tuple(set(CATALOGUE) - set(known)))
     assert found.verdict.status == "unexplained"
+    assert found.search.unlisted > 0.5
     assert found.proposal is not None
     assert found.proposal.site == "PIP"
     assert found.proposal.share > 0.5
     assert "A proposal, unproven" in found.verdict.summary
+    gap = as_gap_json(found)
+    total = sum(c["probability"] for c in gap["candidates"])
+    assert total + gap["none"] + gap["unlisted"] == pytest.approx(1.0, abs=1e-9)
+    assert gap["where"][0]["site"] == "PIP"
+    write_page(found, tmp_path / "page.html")
