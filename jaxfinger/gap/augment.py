@@ -65,6 +65,18 @@ def limits(model: Model, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(of_effect, low, -np.inf), np.where(of_effect, high, np.inf)
 
 
+def without_shapes(model: Model, free: np.ndarray) -> np.ndarray:
+    """The free parameters but those of effects that are no amplitudes."""
+    shapes = np.asarray(ravel(_on_effects(_shapes, model))) > 0.0
+    of_effect = np.array([p.group == "effects" for p in describe(model)])
+    return free[~(of_effect & shapes)[free]]
+
+
+def _shapes(effect: CatalogueEffect) -> CatalogueEffect:
+    """Of every parameter 1 where it is no amplitude."""
+    return replace(effect, **{n: jnp.asarray(float(n not in effect.AMPLITUDES)) for n in effect.values()})
+
+
 def _limit(side: int, effect: CatalogueEffect) -> CatalogueEffect:
     """Of every parameter, the bound below or above (`side` 0 or 1) that refits keep to."""
     ends = effect.bounds()

@@ -29,8 +29,6 @@ from jaxfinger.identify.parameters import describe, ravel
 
 Progress = Callable[[str], None]
 MOST_IN_A_SET = 3
-RISE = 0.5  # of the mean square of held-out trials over that of their noise, beyond which a cause that adds it is none
-DOUBTED = 0.8  # probability of «unlisted» then
 UNSEEN = 10.0  # plausible sizes: the stated deviation of an amplitude that the trials do not see at all
 
 
@@ -98,13 +96,11 @@ def diagnose(
 
     progress("fitting the effects and all nominal parameters together")
     fit, r, J = augmented_fit(problem, chosen)
-    order = np.argsort(-np.asarray(found.shares))
-    first = chosen.keys[order[0]]
+    named = {*chosen.keys, *(k for members in found.rival_sets for k in members)}
     progress("refitting without each third of the trials")
-    lines = shrinkage(problem, nominal, fit, r, J, _rivals(problem, found), first, not quick)
-    found = doubted(found, lines)
+    lines = shrinkage(problem, nominal, fit, r, J, _rivals(problem, found), named, not quick)
     verdict, proposal = _verdict(found, lines), None
-    if verdict.status == "unexplained" and _left_share(found) > 0.0:
+    if verdict.status == "unexplained" and found.left:
         progress("looking for a closed form of what remains")
         proposal = propose(problem, chosen.residual, found.left, chosen.columns)
         verdict = replace(verdict, summary=verdict.summary + _proposed(proposal))
@@ -182,16 +178,6 @@ def _members(problem: Problem, found: Search) -> list[Refined]:
     return out
 
 
-def doubted(found: Search, lines: list[Shrinkage]) -> Search:
-    """The search, with «unlisted» ahead where the verdict's effects make trials worse that their fit has not seen."""
-    rise = sum((x.after**2 - x.before**2) / x.noise**2 for x in lines if x.channel != "q")
-    if rise < RISE or found.unlisted > DOUBTED:
-        return found
-    rest = (1.0 - DOUBTED) / (1.0 - found.unlisted)
-    candidates = [replace(c, probability=c.probability * rest) for c in found.candidates]
-    return replace(found, candidates=candidates, none=found.none * rest, unlisted=DOUBTED)
-
-
 def _verdict(found: Search, lines: list[Shrinkage]) -> Verdict:
     chosen = found.chosen
     assert chosen is not None
@@ -199,13 +185,6 @@ def _verdict(found: Search, lines: list[Shrinkage]) -> Verdict:
     effects = tuple(chosen.keys[i] for i in order)
     names = " and ".join(f"{e} at {'-'.join(s)}" for e, s in effects)
     share = sum(found.shares) if len(effects) == 1 else 1.0 - _left_share(found)
-    if found.unlisted > 0.5 and _left_share(found) == 0.0:
-        return Verdict(
-            "unexplained",
-            (),
-            f"There is a gap, and none of the known effects explains it: the nearest, {names}, fits the trials that it "
-            "has seen, and makes those that it has not seen worse.",
-        )
     if found.unlisted > 0.5:
         depends = _depends(found)
         return Verdict(
@@ -254,7 +233,7 @@ def _no_gap_summary(found: Search) -> str:
 
 def _unchanged(problem: Problem, nominal: Fit, forward: bool) -> list[Shrinkage]:
     """The lines of `gap` where there is nothing to close."""
-    return shrinkage(problem, nominal, nominal, problem.r, problem.J, [], ("none", ()), forward)
+    return shrinkage(problem, nominal, nominal, problem.r, problem.J, [], set(), forward)
 
 
 def _with_prior(amplitude: float, std: float, size: float) -> tuple[float, float]:

@@ -1,17 +1,18 @@
 """How far the gap shrinks: before, after and noise on trials that neither fit nor choice of the effect has seen.
 
 Trials are held out in turn, stratified by experiment, joint and tendon. The choice is made again without them; where it
-differs from the verdict, the held-out trials count as not improved.
+is nothing that the verdict names, the held-out trials count as not improved.
 """
 
 from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxfinger.data.schema import channel_units
 from jaxfinger.experiments import prepare
-from jaxfinger.gap.augment import limits
+from jaxfinger.gap.augment import limits, without_shapes
 from jaxfinger.gap.evidence import Evidence, evidence
 from jaxfinger.gap.held_out import FOLDS, KEPT, fold_of_row, folds
 from jaxfinger.gap.problem import Problem
@@ -47,45 +48,42 @@ def shrinkage(
     r: np.ndarray,
     J: np.ndarray,
     rivals: list[tuple[Evidence, np.ndarray]],
-    first: tuple,
+    named: set[tuple],
     forward: bool = True,
 ) -> list[Shrinkage]:
     """One line an experiment and channel, and one for q of VD.3, simulated forward, unless `forward` is false.
 
     `r`, `J`: white residuals and Jacobian of the augmented model at its optimum; `rivals`: the strongest candidates
-    with their signatures, among which each fold chooses again.
+    with their signatures, among which each fold chooses again; `named`: what the verdict names.
     """
-    fold = folds(problem)
-    of_row = fold_of_row(problem)
-    energies: dict[tuple[str, str], list[tuple[float, float, float, float]]] = {}
+    fold, of_row = folds(problem), fold_of_row(problem)
+    every, shapeless = augmented.estimated, without_shapes(augmented.model, augmented.estimated)
+    tried = [every, shapeless] if len(shapeless) < len(every) else [every]
+    energies: dict[tuple[str, str], list[np.ndarray]] = {}  # of each trial: before, after, noise, samples
     models = []
     for k in range(FOLDS):
-        training = of_row != k
+        training, seen = of_row != k, {e: f != k for e, f in fold.items()}
         refitted = _refit(problem.nominal, problem.free, problem.J, problem.r, training, problem.prior)
-        before = problem.simulator or refitted
-        same = _choice(problem, rivals, training) == first
-        after = _refit(augmented.model, augmented.estimated, J, r, training, problem.prior) if same else refitted
+        before = after = problem.simulator or refitted
+        old = new = _missed(problem, before)
+        if _choice(problem, rivals, training) in named:
+            # A linear step may lead a shape too far: of refits with shapes and without, that which fits its own trials
+            # better; a model that does not hold up without the others has closed nothing.
+            for free in tried:
+                columns = J[:, np.isin(every, free)]
+                model = _refit(augmented.model, free, columns, r, training, problem.prior)
+                missed = _missed(problem, model)
+                if _misfit(problem, missed, seen) < _misfit(problem, new, seen):
+                    after, new = model, missed
         models.append((before, after))
-        for e, stack in problem.stacks.items():
-            channels = stack.experiment.channels
-            old, new = residuals_of(before, stack.batch, channels), residuals_of(after, stack.batch, channels)
-            if not all(np.all(np.isfinite(x)) for x in new.values()):
-                new = old  # a model that does not hold up without these trials has closed nothing
-            for c in channels:
-                mask = np.asarray(stack.batch.mask[c]) * (fold[e] == k)
-                std = problem.noise[e, c].std[:, None]
-                for b in range(len(stack.trials)):
-                    count = mask[:, b].sum()
-                    if count < 10:
-                        continue
-                    energies.setdefault((e, c), []).append(
-                        (
-                            _mean_square(old[c], mask, b, c),
-                            _mean_square(new[c], mask, b, c),
-                            float((mask[:, b] * std**2).sum() / count),
-                            float(count),
-                        )
-                    )
+        for e, c in old:
+            mask = np.asarray(problem.stacks[e].batch.mask[c]) * ~seen[e]
+            count = mask.sum(axis=(0, 2))
+            energy = [_squares(m[e, c], mask, c) for m in (old, new)]
+            noise = (mask * problem.noise[e, c].std[:, None, None] ** 2).sum(axis=(0, 2))
+            values = np.stack([*(x / np.maximum(count, 1.0) for x in (*energy, noise)), count], axis=1)
+            if np.any(count >= 10):
+                energies.setdefault((e, c), []).extend(values[count >= 10])
     prismatic = problem.session.finger.prismatic
     if forward and "VD.3" in problem.stacks:
         energies["VD.3", "q"] = _forward(problem, fold["VD.3"], models)
@@ -162,12 +160,30 @@ def _choice(problem: Problem, rivals: list[tuple[Evidence, np.ndarray]], trainin
     return best
 
 
-def _mean_square(residual, mask, b, channel) -> float:
-    m = mask[:, b]
-    x = np.asarray(residual[:, b]) * m
+def _missed(problem: Problem, model: Model) -> dict[tuple[str, str], Float[np.ndarray, "columns B T"]]:
+    """Measured − predicted of every experiment's channels."""
+    out = {}
+    for e, stack in problem.stacks.items():
+        residuals = residuals_of(model, stack.batch, stack.experiment.channels)
+        out |= {(e, c): np.asarray(x) for c, x in residuals.items()}
+    return out
+
+
+def _misfit(problem: Problem, missed: dict[tuple[str, str], np.ndarray], keep: dict[str, np.ndarray]) -> float:
+    """Sum of squares over the samples to keep, (B, T) of every experiment, in the noise of a sample."""
+    total = 0.0
+    for (e, c), x in missed.items():
+        mask = np.asarray(problem.stacks[e].batch.mask[c]) * keep[e]
+        total += float(_squares(x / problem.noise[e, c].std[:, None, None], mask, c).sum())
+    return total
+
+
+def _squares(missed: Float[np.ndarray, "columns B T"], mask, channel: str) -> Float[np.ndarray, " B"]:
+    """Sum of squares by trial; of excursions, which start anywhere, about their mean."""
+    x = missed * mask
     if channel == "tendon_excursion":
-        x = (x - x.sum(axis=-1, keepdims=True) / np.maximum(m.sum(axis=-1, keepdims=True), 1.0)) * m
-    return float((x**2).sum() / m.sum())
+        x = (x - x.sum(axis=-1, keepdims=True) / np.maximum(mask.sum(axis=-1, keepdims=True), 1.0)) * mask
+    return (x**2).sum(axis=(0, 2))
 
 
 def _line(e: str, c: str, units: str, values: np.ndarray) -> Shrinkage:

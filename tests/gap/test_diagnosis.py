@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 from jaxfinger.effects import CATALOGUE, CatalogueEffect
 from jaxfinger.errors import UserError
 from jaxfinger.gap import as_gap_json, diagnose, write
-from jaxfinger.gap.diagnose import doubted
 from jaxfinger.gap.signatures import whitened
 from jaxfinger.gap.where import where
 from jaxfinger.identify import load_fit
@@ -58,17 +57,6 @@ def test_the_gap_lies_at_the_joint_and_closes_on_held_out_trials(gap):
     assert line["channel"] == "joint_torque"
     assert line["closed"] > 0.9
     assert line["after"] < line["before"]
-
-
-def test_a_cause_that_makes_unseen_trials_worse_is_doubted(diagnosis):
-    found, lines = diagnosis.search, diagnosis.shrinkage
-    assert doubted(found, lines) is found
-    worse = doubted(found, [replace(x, after=2.0 * x.before) for x in lines])
-    assert worse.unlisted > 0.5
-    total = worse.none + worse.unlisted + sum(c.probability for c in worse.candidates)
-    assert total == pytest.approx(1.0)
-    forward = [replace(x, after=2.0 * x.before) if x.channel == "q" else x for x in lines]
-    assert doubted(found, forward) is found  # a simulation forward amplifies small errors
 
 
 def test_gap_json_is_to_the_letter(gap, diagnosis):

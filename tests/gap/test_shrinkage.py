@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from jaxfinger.effects import CATALOGUE
+from jaxfinger.gap.augment import augmented_fit, without_shapes
+from jaxfinger.gap.diagnose import _rivals
 from jaxfinger.gap.refine import within_bounds
-from jaxfinger.gap.shrinkage import _choice, _line
+from jaxfinger.gap.shrinkage import _choice, _line, shrinkage
 from jaxfinger.model import Finger
 from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger
 
@@ -54,6 +56,23 @@ def test_a_fold_sees_what_the_nominal_parameters_became_to_imitate_a_cause(diagn
     assert _choice(problem, rivals, training) == tilt.variant.key
     at_cad = replace(problem, offset=np.zeros_like(problem.offset))
     assert _choice(at_cad, rivals, training) == luck.variant.key
+
+
+def test_a_shape_that_a_linear_step_leads_astray_is_held(diagnosis):
+    """A Jacobian that belittles a length a thousand times sends it to its bounds; amplitudes alone still close."""
+    problem, (key,) = diagnosis.problem, diagnosis.verdict.effects
+    fit, r, J = augmented_fit(problem, diagnosis.search.chosen)
+    shape = ~np.isin(fit.estimated, without_shapes(fit.model, fit.estimated))
+    assert shape.sum() == 1
+    rivals = _rivals(problem, diagnosis.search)
+    good, astray = (
+        shrinkage(problem, diagnosis.nominal, fit, r, jacobian, rivals, {key}, forward=False)
+        for jacobian in (J, np.where(shape, 1e-3 * J, J))
+    )
+    for line, other in zip(good, astray, strict=True):
+        if line.resolvable:
+            assert line.closed > 0.9
+            assert other.closed == pytest.approx(line.closed, abs=0.05)
 
 
 def test_trials_without_a_gap_say_nothing_of_how_far_it_closes():
