@@ -18,7 +18,7 @@ from jaxfinger.gap.next_experiment import NextExperiment, next_experiment
 from jaxfinger.gap.problem import Problem, build
 from jaxfinger.gap.propose import Proposal, propose
 from jaxfinger.gap.refine import Refined, at_optimum, refine
-from jaxfinger.gap.search import Search, search, start_of
+from jaxfinger.gap.search import DETECT, Search, search, start_of
 from jaxfinger.gap.shrinkage import Shrinkage, shrinkage
 from jaxfinger.gap.signatures import Signatures, Variant
 from jaxfinger.gap.standin import energy_left
@@ -225,9 +225,12 @@ def _depends(found: Search) -> str:
 
 def _no_gap_summary(found: Search) -> str:
     strongest = found.candidates[0]
+    says = "which the noise of such a file also gives"
+    if found.strongest > DETECT:
+        says = f"but explains {100 * strongest.held_out:.0f} % of what it fitted on trials that its fit has not seen"
     return (
         f"No gap beyond the noise: the strongest candidate, {strongest.key[0]} at {'-'.join(strongest.key[1])}, has a "
-        f"log evidence of {found.strongest:.1f}, which the noise of such a file also gives."
+        f"log evidence of {found.strongest:.1f}, {says}."
     )
 
 

@@ -27,6 +27,7 @@ from jaxfinger.gap.standin import REACH, Explained, energy_left, explained
 Progress = Callable[[str], None]
 
 DETECT = 12.0  # log evidence that an effect needs before anything is called a gap: without one, the best has 2 to 5
+CARRIES = 0.15  # share of the gap that a single one must explain on held-out trials; true ones have 0.23 and more
 FURTHER = 30.0  # and a further effect, which must not stand in for the first one's form
 LOOKS = 25.0  # ν: independent looks that evidence counts
 FORM = 0.1  # share of what an effect explains in a column, that the form of its law may miss
@@ -120,6 +121,8 @@ def search(
     gap = chi2 - chosen.chi2 + energy_left(left)
     shares = _shares(problem, chosen, chi2, gap)
     held_out = _held_out(start, there, ranked, refined, groups, columns, chi2, gap)
+    if len(chosen.variants) == 1 and held_out[chosen.keys[0]] < CARRIES:
+        return _none_named(ranked, best.log_evidence, explained(start, start.r), held_out)
     return _judge(ranked, refined, held_out, chosen, shares, chi2, gap, left)
 
 
@@ -306,9 +309,11 @@ def _absorbed(ranked: list[Evidence]) -> list[tuple]:
     return [(e.variant.key, e.absorbed) for e in ranked if e.absorbed > 0.99]
 
 
-def _none_named(ranked: list[Evidence], strongest: float, left: list[Explained]) -> Search:
-    """No effect is seen above the noise: the weak evidence that there is shares what «none» leaves, or «unlisted» where
-    some other smooth law is seen.
+def _none_named(
+    ranked: list[Evidence], strongest: float, left: list[Explained], held_out: dict[tuple, float] | None = None
+) -> Search:
+    """No effect is seen above the noise, or none that held-out trials know: the weak evidence that there is shares what
+    «none» leaves, or «unlisted» where some other smooth law is seen.
     """
     gap = sum(x.energy for x in left if x.energy > ALONE)
     none = 1e-6 if gap else float(np.clip(expit((DETECT - strongest) / 2.0), 0.5, 0.995))
@@ -316,6 +321,10 @@ def _none_named(ranked: list[Evidence], strongest: float, left: list[Explained])
     logs = np.array([max(e.log_bf, -5.0) for e in ranked])
     weights = np.exp(0.2 * (logs - logs.max()))
     weights *= known / weights.sum()
-    candidates = [Candidate(e.variant.key, float(w), 0.0, None, e) for e, w in zip(ranked, weights, strict=True)]
+    gains = held_out or {}
+    candidates = [
+        Candidate(e.variant.key, float(w), gains.get(e.variant.key, 0.0), None, e)
+        for e, w in zip(ranked, weights, strict=True)
+    ]
     unlisted = 1 - none - known
     return Search(gap, gap > 0, None, (), candidates, none, unlisted, [], left, strongest, _absorbed(ranked))

@@ -181,6 +181,21 @@ def test_nothing_is_named_where_nothing_is():
     assert "No gap beyond the noise" in summary(found)
 
 
+def test_a_cause_that_held_out_trials_do_not_know_is_not_named(monkeypatch):
+    def none_of_it(problem, members):
+        alone = float(problem.r @ problem.r)
+        return alone, np.full(len(members), alone)
+
+    monkeypatch.setattr("jaxfinger.gap.search.held_out_energies", none_of_it)
+    found = diagnose(session_with((*TRUTH, {"a": 1.0, "x0": 0.1})), without=WITHOUT)
+    assert not found.verdict.effects
+    assert found.verdict.status == "unexplained"  # it is large: some smooth law sees it
+    monkeypatch.setattr("jaxfinger.gap.search.ALONE", np.inf)
+    found = diagnose(session_with((*TRUTH, {"a": 1.0, "x0": 0.1})), without=WITHOUT)
+    assert found.verdict.status == "no_gap"
+    assert "explains 0 % of what it fitted on trials that its fit has not seen" in found.verdict.summary
+
+
 def test_an_unknown_effect_to_leave_out_is_refused():
     with pytest.raises(UserError, match="no effect joint_magic"):
         diagnose(session_with(), without=("joint_magic",))
