@@ -85,15 +85,7 @@ def diagnose(
     nominal = nominal_fit(problem)
     chosen = found.chosen
     if chosen is None:
-        lines, proposal, places = _unchanged(problem, nominal, not quick), None, []
-        verdict = Verdict("no_gap", (), _no_gap_summary(found))
-        if found.detected:
-            proposal, places = propose(problem, problem.r, found.left, np.empty((0, problem.r.size))), where(problem)
-            text = f"There is a gap, and none of the known effects explains any of it. {_depends(found)}"
-            verdict = Verdict("unexplained", (), text + _proposed(proposal))
-        verdict = replace(verdict, summary=verdict.summary + _retuned(problem, nominal))
-        return Diagnosis(problem, verdict, places, found, lines, None, nominal, nominal, proposal)
-
+        return _nothing_named(problem, found, nominal, not quick)
     progress("fitting the effects and all nominal parameters together")
     fit, r, J = augmented_fit(problem, chosen)
     named = {*chosen.keys, *(k for members in found.rival_sets for k in members)}
@@ -110,17 +102,19 @@ def diagnose(
     if verdict.status == "ambiguous":
         progress("looking for the trial that would tell them apart")
         suggestion = next_experiment(problem, _members(problem, found))
-    return Diagnosis(
-        problem,
-        verdict,
-        places,
-        found,
-        lines,
-        suggestion,
-        nominal,
-        fit,
-        proposal,
-    )
+    return Diagnosis(problem, verdict, places, found, lines, suggestion, nominal, fit, proposal)
+
+
+def _nothing_named(problem: Problem, found: Search, nominal: Fit, forward: bool) -> Diagnosis:
+    """No gap, or one of which no known effect explains any."""
+    verdict, places, proposal = Verdict("no_gap", (), _no_gap_summary(found)), [], None
+    if found.detected:
+        places, proposal = where(problem), propose(problem, problem.r, found.left, np.empty((0, problem.r.size)))
+        text = f"There is a gap, and none of the known effects explains any of it. {_depends(found)}"
+        verdict = Verdict("unexplained", (), text + _proposed(proposal))
+    verdict = replace(verdict, summary=verdict.summary + _retuned(problem, nominal))
+    lines = shrinkage(problem, nominal, nominal, problem.r, problem.J, [], set(), forward)
+    return Diagnosis(problem, verdict, places, found, lines, None, nominal, nominal, proposal)
 
 
 def _proposed(proposal: Proposal | None) -> str:
@@ -224,19 +218,15 @@ def _depends(found: Search) -> str:
 
 
 def _no_gap_summary(found: Search) -> str:
-    strongest = found.candidates[0]
+    refitted = [c for c in found.candidates if c.refined] or found.candidates[:1]
+    strongest = max(refitted, key=lambda c: c.log_evidence)
     says = "which the noise of such a file also gives"
-    if found.strongest > DETECT:
+    if strongest.log_evidence > DETECT:
         says = f"but explains {100 * strongest.held_out:.0f} % of what it fitted on trials that its fit has not seen"
     return (
         f"No gap beyond the noise: the strongest candidate, {strongest.key[0]} at {'-'.join(strongest.key[1])}, has a "
-        f"log evidence of {found.strongest:.1f}, {says}."
+        f"log evidence of {strongest.log_evidence:.1f}, {says}."
     )
-
-
-def _unchanged(problem: Problem, nominal: Fit, forward: bool) -> list[Shrinkage]:
-    """The lines of `gap` where there is nothing to close."""
-    return shrinkage(problem, nominal, nominal, problem.r, problem.J, [], set(), forward)
 
 
 def _with_prior(amplitude: float, std: float, size: float) -> tuple[float, float]:

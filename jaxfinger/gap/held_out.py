@@ -36,6 +36,15 @@ def fold_of_row(problem: Problem) -> Int[np.ndarray, " N"]:
     return np.concatenate([fold[e][rows.trial, rows.time] for e, rows in problem.rows.items()])
 
 
+def equilibrated(J: Float[np.ndarray, "N p"], root: Float[np.ndarray, "k p"]):
+    """J in columns of length one, the prior's rows in the same units with those that keep near the whole fit what no
+    trial shows, and the scale (p,): zero where J has nothing.
+    """
+    size = np.linalg.norm(J, axis=0)
+    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
+    return J * scale, np.vstack([root * scale, KEPT * np.eye(len(size))]), scale
+
+
 def held_out_energies(
     problem: Problem, members: list[Float[np.ndarray, "k N"]]
 ) -> tuple[float, Float[np.ndarray, " members"]]:
@@ -43,17 +52,15 @@ def held_out_energies(
     of the nominal model alone, and with each member's signatures.
     """
     of_row = fold_of_row(problem)
-    size = np.linalg.norm(problem.J, axis=0)
-    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
-    J, root = problem.J * scale, np.vstack([problem.root * scale, KEPT * np.eye(len(size))])
+    J, rest, _ = equilibrated(problem.J, problem.root)
     targets = np.column_stack([problem.r, *(z.T for z in members)])
-    prior = np.zeros((len(root), targets.shape[1]))
+    prior = np.zeros((len(rest), targets.shape[1]))
     prior[: len(problem.root), 0] = -problem.offset
     ends = np.cumsum([1, *(len(z) for z in members)])
     alone, with_member = 0.0, np.zeros(len(members))
     for k in range(FOLDS):
         seen = of_row != k
-        Q, R = np.linalg.qr(np.vstack([J[seen], root]))
+        Q, R = np.linalg.qr(np.vstack([J[seen], rest]))
         known = np.vstack([targets[seen], prior])
         inner = Q.T @ known
         fitted = known - Q @ inner

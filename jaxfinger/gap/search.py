@@ -61,6 +61,11 @@ class Candidate:
     refined: Refined | None
     evidence: Evidence
 
+    @property
+    def log_evidence(self) -> float:
+        """Against the nominal model; of the refit where there is one."""
+        return self.refined.log_evidence if self.refined else self.evidence.log_bf
+
 
 @dataclass(frozen=True)
 class Search:
@@ -75,7 +80,6 @@ class Search:
     unlisted: float
     rival_sets: list[list[tuple]]  # effects that explain as much as the chosen first one
     left: list[Explained]  # what the stand-in explains beyond the chosen effects
-    strongest: float  # log evidence of the strongest candidate
     absorbed: list[tuple] = field(default_factory=list)  # (key, share) of effects that the file cannot show
 
 
@@ -100,8 +104,7 @@ def search(
         progress(f"refitting with {e.variant.effect.ID} at {', '.join(e.variant.site)}")
         refined[e.variant.key] = refine(problem, [e.variant], [start_of(e)], chi2, projector)
     if not refined or max(r.log_evidence for r in refined.values()) < DETECT:
-        strongest = max((r.log_evidence for r in refined.values()), default=ranked[0].log_bf)
-        return _none_named(ranked, strongest, explained(problem, problem.r))
+        return _none_named(ranked, refined, {}, explained(problem, problem.r))
 
     best = max(refined.values(), key=lambda r: r.log_evidence)
     start, there = problem, {}
@@ -126,7 +129,7 @@ def search(
     held_out = _held_out(start, there, ranked, refined, groups, columns, chi2, gap)
     alone = len(chosen.variants) == 1 and energy_left(left) < OPEN[1][0] * gap
     if alone and held_out[chosen.keys[0]] < CARRIES:
-        return _none_named(ranked, best.log_evidence, explained(start, start.r), held_out)
+        return _none_named(ranked, refined, held_out, explained(start, start.r))
     return _judge(ranked, refined, held_out, chosen, shares, chi2, gap, left)
 
 
@@ -250,7 +253,6 @@ def _judge(ranked, refined, held_out, chosen, shares, chi2, gap, left) -> Search
     """Probabilities: rivals of the first effect by what they leave unexplained, «unlisted» by what all leave."""
     first, beyond = chosen.keys[int(np.argmax(shares))], energy_left(left)
     floor = min(r.chi2 for r in refined.values())
-    keys = [e.variant.key for e in ranked]
     unexplained = {}
     for e in ranked:
         r = refined.get(e.variant.key)
@@ -264,30 +266,16 @@ def _judge(ranked, refined, held_out, chosen, shares, chi2, gap, left) -> Search
     unlisted = max(float(expit((share_left - even) / width)), 0.01)
     probability = {k: float(np.exp(v - total)) * (1 - unlisted) for k, v in log_l.items()}
     if len(chosen.variants) > 1:
-        # Several effects: each carries its part of what the catalogue explains.
-        rest = 1 - unlisted
-        named = {chosen.keys[i]: shares[i] / sum(shares) for i in range(len(shares))}
-        weight = 0.9
-        probability = {k: p * (1 - weight) for k, p in probability.items()}
-        # each effect at work counts alike: a double is scored one half for each of its effects
-        for k in named:
-            probability[k] += weight * rest / len(named)
+        # Each effect at work counts alike: a double is scored one half for each of its effects.
+        probability = {k: 0.1 * p for k, p in probability.items()}
+        for k in chosen.keys:
+            probability[k] += 0.9 * (1 - unlisted) / len(chosen.keys)
     none = 1e-6
     scale = (1 - none) / (sum(probability.values()) + unlisted)
-    candidates = [
-        Candidate(
-            e.variant.key,
-            probability[e.variant.key] * scale,
-            held_out.get(e.variant.key, 0.0),
-            refined.get(e.variant.key),
-            e,
-        )
-        for e in ranked
-    ]
-    candidates.sort(key=lambda c: -c.probability)
+    probability = {k: p * scale for k, p in probability.items()}
     rivals = [first]
     mass = np.exp(log_l[first] - total)
-    for k in sorted(keys, key=lambda k: -log_l[k]):
+    for k in sorted(log_l, key=lambda k: -log_l[k]):
         if mass >= COVERED or len(rivals) == RIVALS:
             break
         if k != first and log_l[k] > log_l[first] - 4.0:
@@ -298,14 +286,20 @@ def _judge(ranked, refined, held_out, chosen, shares, chi2, gap, left) -> Search
         True,
         chosen,
         shares,
-        candidates,
+        _candidates(ranked, probability, held_out, refined),
         none,
         unlisted * scale,
         [rivals] if len(rivals) > 1 else [],
         left,
-        ranked[0].log_bf,
         _absorbed(ranked),
     )
+
+
+def _candidates(ranked: list[Evidence], probability, held_out, refined) -> list[Candidate]:
+    """All of them, the likeliest first."""
+    keyed = [(e.variant.key, e) for e in ranked]
+    judged = [Candidate(k, probability[k], held_out.get(k, 0.0), refined.get(k), e) for k, e in keyed]
+    return sorted(judged, key=lambda c: -c.probability)
 
 
 def _absorbed(ranked: list[Evidence]) -> list[tuple]:
@@ -313,22 +307,16 @@ def _absorbed(ranked: list[Evidence]) -> list[tuple]:
     return [(e.variant.key, e.absorbed) for e in ranked if e.absorbed > 0.99]
 
 
-def _none_named(
-    ranked: list[Evidence], strongest: float, left: list[Explained], held_out: dict[tuple, float] | None = None
-) -> Search:
+def _none_named(ranked: list[Evidence], refined, held_out: dict[tuple, float], left: list[Explained]) -> Search:
     """No effect is seen above the noise, or none that held-out trials know: the weak evidence that there is shares what
     «none» leaves, or «unlisted» where some other smooth law is seen.
     """
     gap = sum(x.energy for x in left if x.energy > ALONE and x.experiment != REVERSALS)
+    strongest = max((r.log_evidence for r in refined.values()), default=ranked[0].log_bf)
     none = 1e-6 if gap else float(np.clip(expit((DETECT - strongest) / 2.0), 0.5, 0.995))
     known = 0.1 if gap else 0.7 * (1 - none)
-    logs = np.array([max(e.log_bf, -5.0) for e in ranked])
-    weights = np.exp(0.2 * (logs - logs.max()))
-    weights *= known / weights.sum()
-    gains = held_out or {}
-    candidates = [
-        Candidate(e.variant.key, float(w), gains.get(e.variant.key, 0.0), None, e)
-        for e, w in zip(ranked, weights, strict=True)
-    ]
-    unlisted = 1 - none - known
-    return Search(gap, gap > 0, None, (), candidates, none, unlisted, [], left, strongest, _absorbed(ranked))
+    logs = {e.variant.key: e.log_bf for e in ranked} | {k: r.log_evidence for k, r in refined.items()}
+    weights = {k: np.exp(0.2 * (np.clip(v, -5.0, strongest) - strongest)) for k, v in logs.items()}
+    probability = {k: float(w * known / sum(weights.values())) for k, w in weights.items()}
+    candidates = _candidates(ranked, probability, held_out, refined)
+    return Search(gap, gap > 0, None, (), candidates, none, 1 - none - known, [], left, _absorbed(ranked))

@@ -4,7 +4,7 @@ Trials are held out in turn, stratified by experiment, joint and tendon. The cho
 is nothing that the verdict names, the held-out trials count as not improved.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,8 +13,8 @@ from jaxtyping import Float
 from jaxfinger.data.schema import channel_units
 from jaxfinger.experiments import prepare
 from jaxfinger.gap.augment import limits, without_shapes
-from jaxfinger.gap.evidence import Evidence, evidence
-from jaxfinger.gap.held_out import FOLDS, KEPT, fold_of_row, folds
+from jaxfinger.gap.evidence import Evidence, Projector, evidence
+from jaxfinger.gap.held_out import FOLDS, equilibrated, fold_of_row, folds
 from jaxfinger.gap.problem import Problem
 from jaxfinger.identify import Fit
 from jaxfinger.identify.linearise import residuals_of
@@ -131,15 +131,12 @@ def _refit(model: Model, free, J, r, training, prior: Prior) -> Model:
     """The model refitted to the training rows and the prior on its first parameters; what neither sees stays within a
     few deviations of the whole fit.
     """
-    size = np.linalg.norm(J, axis=0)
-    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)  # what no trial sees stays
-    theta, unit = np.asarray(ravel(model))[free], np.where(scale > 0.0, scale, 1.0)
-    mean, root = np.asarray(prior.mean), np.asarray(prior.root)
+    theta, mean, root = np.asarray(ravel(model))[free], np.asarray(prior.mean), np.asarray(prior.root)
     pull = root @ (theta[: len(mean)] - mean)
-    root = np.pad(root, ((0, 0), (0, len(free) - len(mean))))
-    A = np.vstack([J[training] * scale, root * scale, KEPT * np.eye(len(free))])
-    room = [(end - theta) / unit for end in limits(model, free)]
-    delta = bounded(A, np.concatenate([-r[training], pull, np.zeros(len(free))]), *room) * scale
+    J, rest, scale = equilibrated(J, np.pad(root, ((0, 0), (0, len(free) - len(mean)))))
+    room = [(end - theta) / np.where(scale > 0.0, scale, 1.0) for end in limits(model, free)]
+    b = np.concatenate([-r[training], pull, np.zeros(len(free))])
+    delta = bounded(np.vstack([J[training], rest]), b, *room) * scale
     return Free.at(model, free).set(model, jnp.asarray(theta + delta))
 
 
@@ -147,17 +144,11 @@ def _choice(problem: Problem, rivals: list[tuple[Evidence, np.ndarray]], trainin
     """The candidate of most evidence in the training rows: what it explains there, and of the prior's surprise at what
     the nominal parameters became to imitate it.
     """
-    A = np.vstack([problem.J[training], problem.root])
-    Q, _ = np.linalg.qr(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300))
-    r = np.concatenate([problem.r[training], -problem.offset])
-    r = r - Q @ (Q.T @ r)
-    best, most = None, -np.inf
-    for e, Z in rivals:
-        raw = np.pad(Z[:, training], ((0, 0), (0, len(problem.root))))
-        found = evidence(e.variant, raw, raw - (raw @ Q) @ Q.T, r)
-        if found.log_bf > most:
-            best, most = e.variant.key, found.log_bf
-    return best
+    part = replace(problem, r=problem.r[training], J=problem.J[training])
+    projector = Projector(part)
+    rt, seen = projector.residual(part), [(e.variant, Z[:, training]) for e, Z in rivals]
+    found = [evidence(variant, Z, projector(Z), rt) for variant, Z in seen]
+    return max(found, key=lambda e: e.log_bf).variant.key if found else None
 
 
 def _missed(problem: Problem, model: Model) -> dict[tuple[str, str], Float[np.ndarray, "columns B T"]]:
