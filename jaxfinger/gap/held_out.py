@@ -51,22 +51,23 @@ def held_out_energies(
     """Sum of squared white residuals of trials for which neither the nominal parameters nor amplitudes were refitted:
     of the nominal model alone, and with each member's signatures.
     """
-    of_row = fold_of_row(problem)
     J, rest, _ = equilibrated(problem.J, problem.root)
-    targets = np.column_stack([problem.r, *(z.T for z in members)])
-    prior = np.zeros((len(rest), targets.shape[1]))
-    prior[: len(problem.root), 0] = -problem.offset
+    p, of_row = J.shape[1], fold_of_row(problem)
+    columns = np.column_stack([J, problem.r, *(z.T for z in members)])
+    prior = np.zeros((len(rest), columns.shape[1]))
+    prior[:, :p], prior[: len(problem.root), p] = rest, -problem.offset
+    # The rows that keep near the whole fit bound the condition of J, so that products of columns are all it takes.
+    inner = [columns[of_row == k].T @ columns[of_row == k] for k in range(FOLDS)]
     ends = np.cumsum([1, *(len(z) for z in members)])
     alone, with_member = 0.0, np.zeros(len(members))
-    for k in range(FOLDS):
-        seen = of_row != k
-        Q, R = np.linalg.qr(np.vstack([J[seen], rest]))
-        known = np.vstack([targets[seen], prior])
-        inner = Q.T @ known
-        fitted = known - Q @ inner
-        left = targets[~seen] - J[~seen] @ np.linalg.solve(R, inner)
-        alone += float(left[:, 0] @ left[:, 0])
+    for k, held in enumerate(inner):
+        seen = prior.T @ prior + sum(x for i, x in enumerate(inner) if i != k)
+        nominal = np.linalg.solve(seen[:p, :p], seen[:p, p:])
+        rest_of = np.vstack([-nominal, np.eye(nominal.shape[1])])  # what the refitted parameters leave of each target
+        fitted, left = (rest_of.T @ x @ rest_of for x in (seen, held))
+        alone += float(left[0, 0])
         for i, (a, b) in enumerate(pairwise(ends)):
-            amplitudes = np.linalg.lstsq(fitted[:, a:b], fitted[:, 0], rcond=1e-10)[0]
-            with_member[i] += float(np.sum((left[:, 0] - left[:, a:b] @ amplitudes) ** 2))
+            amplitudes = np.linalg.lstsq(fitted[a:b, a:b], fitted[a:b, 0], rcond=1e-10)[0]
+            both, parts = np.concatenate([[1.0], -amplitudes]), [0, *range(a, b)]
+            with_member[i] += float(both @ left[np.ix_(parts, parts)] @ both)
     return alone, with_member
