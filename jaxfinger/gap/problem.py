@@ -17,10 +17,10 @@ from jaxfinger.data import Predictions, Session
 from jaxfinger.experiments import Stack, prepare
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
-from jaxfinger.identify.linearise import Linearised, linearise
+from jaxfinger.identify.linearise import Linearised
 from jaxfinger.identify.noise import Noise, estimate, history
 from jaxfinger.identify.parameters import Free, describe, ravel
-from jaxfinger.identify.solve import Prior, Source, solve
+from jaxfinger.identify.solve import Prior, Source, linearise_each, solve
 from jaxfinger.identify.stages import cad_covariance, first_noise, free_groups, nominal_model, sources_of, start_values
 from jaxfinger.model import Model
 
@@ -154,7 +154,7 @@ def moved(problem: Problem, by: Float[np.ndarray, " p"]) -> Problem:
     """The same rows at another nominal model: its free parameters moved, residuals and Jacobian exact there."""
     at = Free.at(problem.nominal, problem.free)
     nominal = at.set(problem.nominal, at.get(problem.nominal) + by)
-    linearised = _linearised(nominal, problem.sources)
+    linearised = linearise_each(nominal, problem.sources)
     return replace(problem, **_at(nominal, linearised, problem.sources, problem.rows, problem.free, problem.prior))
 
 
@@ -175,7 +175,7 @@ def imagined(problem: Problem, stacks: dict[str, Stack]) -> Problem:
         else _sources({e: stack}, known, describe(problem.nominal))[e]
         for e, stack in stacks.items()
     }
-    rows, linearised = layouts(stacks, sources), _linearised(problem.nominal, sources)
+    rows, linearised = layouts(stacks, sources), linearise_each(problem.nominal, sources)
     at = _at(problem.nominal, linearised, sources, rows, problem.free, problem.prior)
     return replace(problem, stacks=stacks, sources=sources, rows=rows, noise=known, **at)
 
@@ -190,10 +190,6 @@ def _noise_elsewhere(problem: Problem, channel: str, columns: int) -> Noise:
     length = float(np.linalg.norm([*finger.origin[1:], finger.fingertip], axis=1).sum())
     std = np.full(columns, largest(channel) or (largest("joint_torque") or 1e-3) / length)
     return Noise(std, std, np.zeros((columns, 1)), "elsewhere")
-
-
-def _linearised(model: Model, sources: dict[str, Source]) -> dict[str, Linearised]:
-    return {e: linearise(model, Free.at(model, s.positions), s.batch, s.filters) for e, s in sources.items()}
 
 
 def _at(nominal: Model, linearised: dict[str, Linearised], sources, rows, free, prior: Prior) -> dict[str, Any]:
@@ -237,14 +233,10 @@ def assemble(
 
 def _with_unknown(known: dict[tuple[str, str], Noise], stacks: dict[str, Stack], sources, model: Model):
     """The noise of every channel: where no stage has read it, of what the model leaves of it."""
-    noise = dict(known)
-    for e, stack in stacks.items():
-        missing = [c for c in stack.experiment.channels if (e, c) not in known]
-        if missing:
-            s = sources[e]
-            lin = linearise(model, Free.at(model, s.positions), s.batch, s.filters)
-            noise |= {(e, c): estimate(stack, c, np.asarray(lin.residuals[c])) for c in missing}
-    return noise
+    missing = {e: [c for c in stack.experiment.channels if (e, c) not in known] for e, stack in stacks.items()}
+    linearised = linearise_each(model, {e: sources[e] for e, channels in missing.items() if channels})
+    found = {(e, c): estimate(stacks[e], c, lin.residuals[c]) for e, lin in linearised.items() for c in missing[e]}
+    return known | found
 
 
 def _with_missing_stages(
@@ -258,9 +250,8 @@ def _with_missing_stages(
     unknown = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in set(free)]
     start = start_values(fit.model, np.array(unknown, dtype=int), parameters)
     seen = set()
-    for source in sources.values() if unknown else ():
-        lin = linearise(start, Free.at(start, source.positions), source.batch, source.filters)
-        seen |= set(source.positions[np.any(np.asarray(lin.factor)[..., :-1] != 0.0, axis=(0, 1))])
+    for e, lin in linearise_each(start, sources if unknown else {}).items():
+        seen |= set(sources[e].positions[np.any(lin.factor[..., :-1] != 0.0, axis=(0, 1))])
     added = np.array([i for i in unknown if i in seen], dtype=int)
     return start_values(fit.model, added, parameters), np.union1d(free, added).astype(int)
 

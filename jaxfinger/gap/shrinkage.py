@@ -153,11 +153,8 @@ def _choice(problem: Problem, rivals: list[tuple[Evidence, np.ndarray]], trainin
 
 def _missed(problem: Problem, model: Model) -> dict[tuple[str, str], Float[np.ndarray, "columns B T"]]:
     """Measured − predicted of every experiment's channels."""
-    out = {}
-    for e, stack in problem.stacks.items():
-        residuals = residuals_of(model, stack.batch, stack.experiment.channels)
-        out |= {(e, c): np.asarray(x) for c, x in residuals.items()}
-    return out
+    found = {e: residuals_of(model, s.batch, s.experiment.channels) for e, s in problem.stacks.items()}
+    return {(e, c): x for e, residuals in found.items() for c, x in residuals.items()}
 
 
 def _misfit(problem: Problem, missed: dict[tuple[str, str], np.ndarray], keep: dict[str, np.ndarray]) -> float:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfinger.compilation import once_jit
 from jaxfinger.effects import CatalogueEffect, Site
 from jaxfinger.experiments import roomy
 from jaxfinger.gap.problem import Problem, Rows
@@ -30,7 +31,6 @@ from jaxfinger.model import (
 
 CHUNK = 8  # members of one call, at most
 LENGTH, COUNT = 512, 8  # samples and trials of the smallest stack that is compiled for
-QUICK = {"xla_backend_optimization_level": 0}  # a signature runs a few times: compiling it must be cheap
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def variants(effects: dict[str, type[CatalogueEffect]], finger) -> list[Variant]
     ]
 
 
-@eqx.filter_jit(compiler_options=QUICK)  # type: ignore[call-overload]  # its overloads leave the options of jit out
+@once_jit
 def _change(
     channel: str,
     effects: CatalogueEffect,
@@ -106,6 +106,7 @@ class _Group:
     x: Motion
     y0: Float[Array, "columns B T"]
     first: dict[str, int]  # first trial of each experiment
+    contact: Array | None  # of the fingertip's force: the nominal model's `contact_map`
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,8 @@ class Signatures:
         x = jax.tree.map(merge, *motions)
         y0 = merge(*(self.problem.predicted[e, channel] for e in experiments))
         starts = np.cumsum([0] + [b.x.time.shape[0] for b in batches])
-        return _Group(channel, x, y0, dict(zip(experiments, starts.tolist(), strict=False)))
+        contact = _contact(self.nominal, x) if channel == "fingertip_force" else None
+        return _Group(channel, x, y0, dict(zip(experiments, starts.tolist(), strict=False)), contact)
 
     def of(self, members: list[CatalogueEffect]) -> Float[np.ndarray, "members N"]:
         """Whitened change of every row, for effects of one class."""
@@ -159,9 +161,8 @@ class Signatures:
             shown = [e for e in group.first if group.channel in kind.SHOWS.get(e, ())]
             if not shown:
                 continue
-            contact = _contact(self.nominal, group.x) if group.channel == "fingertip_force" else None
             count = jnp.asarray(len(members))
-            raw = np.asarray(_change(group.channel, stacked, self.nominal, group.x, group.y0, contact, count))
+            raw = np.asarray(_change(group.channel, stacked, self.nominal, group.x, group.y0, group.contact, count))
             raw = raw[: len(members)]
             for e in shown:
                 rows = self.problem.rows[e]

@@ -7,12 +7,12 @@ refit are sums over these small factors; their cost no longer depends on the num
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfinger.compilation import quick_jit
 from jaxfinger.experiments import Batch, predict, widened
 from jaxfinger.identify.noise import whiten
 from jaxfinger.identify.parameters import Free
@@ -66,13 +66,13 @@ def linearise(
     return Linearised(residuals, cut(white), cut(J), np.asarray(factor)[:B])
 
 
-@eqx.filter_jit
+@quick_jit
 def _residuals(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[str, Array]:
     predicted = predict(model, batch.x, channels)
     return {c: batch.y[c] - predicted[c] for c in channels}
 
 
-@eqx.filter_jit
+@quick_jit
 def _linearise(model: Model, free: Free, batch: Batch, filters: Filters, weights: Float[Array, "B rows"]):
     theta = free.get(model)
 

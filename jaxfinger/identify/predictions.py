@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session, Trial, low_pass
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Stack, predict, prepare, roomy
@@ -135,7 +136,7 @@ def _times(stack: Stack) -> list[np.ndarray]:
     return [row - row[0] for row in time]
 
 
-@eqx.filter_jit
+@quick_jit
 def _simulate(
     model: Model,  # every leaf with the trials first
     time: Float[Array, "B T"],

@@ -90,7 +90,6 @@ def solve(
         UserError: the model is not defined at its start.
     """
     size = ravel(model).size
-    frees = {name: Free.at(model, s.positions) for name, s in sources.items()}
     moved = Free.at(model, free)
     theta = np.asarray(moved.get(model))
     masses = np.array([p.group == "mass" for p in describe(model)])[free]
@@ -98,7 +97,7 @@ def solve(
     low = np.where(masses, np.maximum(low, LIGHTEST * theta), low)
     if prior is None:
         prior = Prior(theta, np.zeros((0, theta.size)))
-    weights: Mapping[str, np.ndarray | None] = dict.fromkeys(sources)
+    weights: dict[str, np.ndarray] = {}
     share = 0.0
     for robust in (False, True) if huber else (False,):
         if robust:
@@ -108,7 +107,7 @@ def solve(
                 break
         best, step, before, converged = np.inf, np.zeros_like(theta), None, False
         for _ in range(STEPS):
-            linearised = {n: linearise(model, frees[n], s.batch, s.filters, weights[n]) for n, s in sources.items()}
+            linearised = linearise_each(model, sources, weights)
             factor = _stacked(linearised, sources, size)
             offset = prior.root @ (theta - prior.mean)
             cost = 0.5 * float(factor[:, -1] @ factor[:, -1] + offset @ offset)
@@ -151,6 +150,18 @@ def solve(
     information = factor[:, :-1].T @ factor[:, :-1]
     cost = 0.5 * float(factor[:, -1] @ factor[:, -1])
     return model, Solution(converged, message, cost, rows, information, invisible, scale, share, linearised)
+
+
+def linearise_each(
+    model: Model, sources: dict[str, Source], weights: Mapping[str, np.ndarray] | None = None
+) -> dict[str, Linearised]:
+    """Every experiment at the model; one after another, since XLA's processor threads can lock one another out where
+    two factorisations run at once.
+    """
+    weights = weights or {}
+    return {
+        n: linearise(model, Free.at(model, s.positions), s.batch, s.filters, weights.get(n)) for n, s in sources.items()
+    }
 
 
 def _stacked(linearised: dict[str, Linearised], sources: dict[str, Source], size: int) -> Float[np.ndarray, "k P+1"]:

@@ -17,14 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxfinger.compilation import QUICK
 from jaxfinger.model import rigid_body
 from jaxfinger.model.finger import Finger
 from jaxfinger.synthetic.controller import Controller, Targets
 from jaxfinger.synthetic.specimen import Specimen
 
 Array = Any  # NumPy or JAX
-# XLA's fusion emitters take three times as long to compile these scalar formulas, and run no faster.
-QUICK = {"xla_cpu_use_fusion_emitters": False}
 SUBSTEPS = 2  # a sample of the rig's clock
 SWEEPS = 200  # at most
 TOLERANCE = 1e-9  # of the impulses' change, relative to their limits

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxfinger.compilation import QUICK
 from jaxfinger.errors import UserError
 from jaxfinger.model import rigid_body
 from jaxfinger.model.finger import Finger
 from jaxfinger.synthetic.controller import Controller, feedforward
-from jaxfinger.synthetic.driven import QUICK, Simulator
+from jaxfinger.synthetic.driven import Simulator
 from jaxfinger.synthetic.protocols import TrialPlan
 from jaxfinger.synthetic.specimen import Specimen
 
