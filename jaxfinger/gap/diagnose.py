@@ -218,8 +218,7 @@ def _depends(found: Search) -> str:
 
 
 def _no_gap_summary(found: Search) -> str:
-    refitted = [c for c in found.candidates if c.refined] or found.candidates[:1]
-    strongest = max(refitted, key=lambda c: c.log_evidence)
+    strongest = max(found.candidates, key=lambda c: (c.refined is not None, c.log_evidence))
     says = "which the noise of such a file also gives"
     if strongest.log_evidence > DETECT:
         says = f"but explains {100 * strongest.held_out:.0f} % of what it fitted on trials that its fit has not seen"

@@ -36,9 +36,11 @@ def fold_of_row(problem: Problem) -> Int[np.ndarray, " N"]:
     return np.concatenate([fold[e][rows.trial, rows.time] for e, rows in problem.rows.items()])
 
 
-def equilibrated(J: Float[np.ndarray, "N p"], root: Float[np.ndarray, "k p"]):
+def equilibrated(
+    J: Float[np.ndarray, "N p"], root: Float[np.ndarray, "k p"]
+) -> tuple[Float[np.ndarray, "N p"], Float[np.ndarray, "k+p p"], Float[np.ndarray, " p"]]:
     """J in columns of length one, the prior's rows in the same units with those that keep near the whole fit what no
-    trial shows, and the scale (p,): zero where J has nothing.
+    trial shows, and the scale: zero where J has nothing.
     """
     size = np.linalg.norm(J, axis=0)
     scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
@@ -51,20 +53,20 @@ def held_out_energies(
     """Sum of squared white residuals of trials for which neither the nominal parameters nor amplitudes were refitted:
     of the nominal model alone, and with each member's signatures.
     """
-    J, rest, _ = equilibrated(problem.J, problem.root)
+    J, kept, _ = equilibrated(problem.J, problem.root)
     p, of_row = J.shape[1], fold_of_row(problem)
     columns = np.column_stack([J, problem.r, *(z.T for z in members)])
-    prior = np.zeros((len(rest), columns.shape[1]))
-    prior[:, :p], prior[: len(problem.root), p] = rest, -problem.offset
+    prior = np.zeros((len(kept), columns.shape[1]))
+    prior[:, :p], prior[: len(problem.root), p] = kept, -problem.offset
     # The rows that keep near the whole fit bound the condition of J, so that products of columns are all it takes.
-    inner = [columns[of_row == k].T @ columns[of_row == k] for k in range(FOLDS)]
+    products, of_prior = [rows.T @ rows for rows in (columns[of_row == k] for k in range(FOLDS))], prior.T @ prior
     ends = np.cumsum([1, *(len(z) for z in members)])
     alone, with_member = 0.0, np.zeros(len(members))
-    for k, held in enumerate(inner):
-        seen = prior.T @ prior + sum(x for i, x in enumerate(inner) if i != k)
+    for k in range(FOLDS):
+        seen = of_prior + sum(products[i] for i in range(FOLDS) if i != k)
         nominal = np.linalg.solve(seen[:p, :p], seen[:p, p:])
-        rest_of = np.vstack([-nominal, np.eye(nominal.shape[1])])  # what the refitted parameters leave of each target
-        fitted, left = (rest_of.T @ x @ rest_of for x in (seen, held))
+        off = np.vstack([-nominal, np.eye(nominal.shape[1])])  # targets, less what the refitted parameters take of them
+        fitted, left = (off.T @ x @ off for x in (seen, products[k]))
         alone += float(left[0, 0])
         for i, (a, b) in enumerate(pairwise(ends)):
             amplitudes = np.linalg.lstsq(fitted[a:b, a:b], fitted[a:b, 0], rcond=1e-10)[0]

@@ -41,9 +41,8 @@ RIVALS = 3  # at most in a set
 TRIED = 0.01  # share of the gap that a candidate must explain in the fit, to be tried on held-out trials
 LOOKED_AT = 12  # candidates for a further effect
 LEAST = 100.0  # energy left to the stand-in below which nothing further is looked for
-# Energy of a column that is a gap though no known effect explains any: without one, it has up to 48. In ID.3-dynamic it
-# has up to 239, where a reversal's time is off by a part of a sample: that does not count here.
-ALONE, REVERSALS = 100.0, "ID.3-dynamic"
+ALONE = 100.0  # energy of a column that is a gap though no known effect explains any: without one, it has up to 48
+REVERSALS = "ID.3-dynamic"  # where it has up to 239, since a reversal's time is off by a part of a sample: no such gap
 HINT = 20.0  # of it in a column, that a known effect may claim though noise could give it: its law asks for more
 # «Unlisted», by how many effects were chosen, since two known ones together imitate more than one does: the share of
 # the gap left to the stand-in at which it is as likely as the catalogue, and how sharply. One known effect in another
@@ -297,8 +296,8 @@ def _judge(ranked, refined, held_out, chosen, shares, chi2, gap, left) -> Search
 
 def _candidates(ranked: list[Evidence], probability, held_out, refined) -> list[Candidate]:
     """All of them, the likeliest first."""
-    keyed = [(e.variant.key, e) for e in ranked]
-    judged = [Candidate(k, probability[k], held_out.get(k, 0.0), refined.get(k), e) for k, e in keyed]
+    keyed = {e.variant.key: e for e in ranked}
+    judged = [Candidate(k, probability[k], held_out.get(k, 0.0), refined.get(k), e) for k, e in keyed.items()]
     return sorted(judged, key=lambda c: -c.probability)
 
 
@@ -317,6 +316,7 @@ def _none_named(ranked: list[Evidence], refined, held_out: dict[tuple, float], l
     known = 0.1 if gap else 0.7 * (1 - none)
     logs = {e.variant.key: e.log_bf for e in ranked} | {k: r.log_evidence for k, r in refined.items()}
     weights = {k: np.exp(0.2 * (np.clip(v, -5.0, strongest) - strongest)) for k, v in logs.items()}
-    probability = {k: float(w * known / sum(weights.values())) for k, w in weights.items()}
+    total = sum(weights.values())
+    probability = {k: float(w * known / total) for k, w in weights.items()}
     candidates = _candidates(ranked, probability, held_out, refined)
     return Search(gap, gap > 0, None, (), candidates, none, 1 - none - known, [], left, _absorbed(ranked))

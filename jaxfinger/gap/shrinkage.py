@@ -133,10 +133,10 @@ def _refit(model: Model, free, J, r, training, prior: Prior) -> Model:
     """
     theta, mean, root = np.asarray(ravel(model))[free], np.asarray(prior.mean), np.asarray(prior.root)
     pull = root @ (theta[: len(mean)] - mean)
-    J, rest, scale = equilibrated(J, np.pad(root, ((0, 0), (0, len(free) - len(mean)))))
+    J, kept, scale = equilibrated(J, np.pad(root, ((0, 0), (0, len(free) - len(mean)))))
     room = [(end - theta) / np.where(scale > 0.0, scale, 1.0) for end in limits(model, free)]
     b = np.concatenate([-r[training], pull, np.zeros(len(free))])
-    delta = bounded(np.vstack([J[training], rest]), b, *room) * scale
+    delta = bounded(np.vstack([J[training], kept]), b, *room) * scale
     return Free.at(model, free).set(model, jnp.asarray(theta + delta))
 
 
@@ -144,10 +144,10 @@ def _choice(problem: Problem, rivals: list[tuple[Evidence, np.ndarray]], trainin
     """The candidate of most evidence in the training rows: what it explains there, and of the prior's surprise at what
     the nominal parameters became to imitate it.
     """
-    part = replace(problem, r=problem.r[training], J=problem.J[training])
+    part = replace(problem, r=problem.r[training], J=problem.J[training])  # all of it that a projector reads
     projector = Projector(part)
-    rt, seen = projector.residual(part), [(e.variant, Z[:, training]) for e, Z in rivals]
-    found = [evidence(variant, Z, projector(Z), rt) for variant, Z in seen]
+    rt = projector.residual(part)
+    found = [evidence(e.variant, Z[:, training], projector(Z[:, training]), rt) for e, Z in rivals]
     return max(found, key=lambda e: e.log_bf).variant.key if found else None
 
 

@@ -155,8 +155,8 @@ def solve(
 def linearise_each(
     model: Model, sources: dict[str, Source], weights: Mapping[str, np.ndarray] | None = None
 ) -> dict[str, Linearised]:
-    """Every experiment at the model; one after another, since XLA's processor threads can lock one another out where
-    two factorisations run at once.
+    """Every experiment at the model. Not in threads: two programs with a factorisation, dispatched at once, can hold
+    all of XLA's processor threads and wait for ever.
     """
     weights = weights or {}
     return {
