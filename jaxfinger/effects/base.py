@@ -31,6 +31,10 @@ class CatalogueEffect(Effect):
     # Shapes that a refit leaves as they are, and shapes that it moves by differences; it moves the others by factors.
     CHOICES: ClassVar[tuple[str, ...]] = ()
     SHIFTS: ClassVar[tuple[str, ...]] = ()
+    # Shapes that are periods in the session's time, and the two amplitudes of each, alike but for the period. A fine
+    # scan finds them, since a refit would stop in the nearest of many valleys; it sets the shape `middle`, from which
+    # phases count, to the middle of the session.
+    PERIODS: ClassVar[dict[str, tuple[str, str]]] = {}
     # Plausible sizes at which its signature is read: several where it decides whether a held tendon slips.
     SIZES: ClassVar[tuple[float, ...]] = (1.0,)
     # Experiments and channels that can show the effect; everywhere else it is silent.
@@ -88,9 +92,9 @@ class CatalogueEffect(Effect):
 
     @classmethod
     def shapes(cls, finger: Finger, site: Site) -> list[dict[str, float]]:
-        """Every combination of shapes worth trying at a site."""
-        names = list(cls.SHAPES)
-        return [dict(zip(names, v, strict=True)) for v in product(*(cls.SHAPES[n][1] for n in names))]
+        """Every combination of shapes worth trying at a site; periods are scanned for instead."""
+        grids = {n: values[:1] if n in cls.PERIODS else values for n, (_, values) in cls.SHAPES.items()}
+        return [dict(zip(grids, v, strict=True)) for v in product(*grids.values())]
 
     def bounds(self) -> dict[str, tuple[float, float]]:
         """Least and most of every amplitude and of every shape that a refit moves: one-sided amplitudes not below zero,

@@ -29,8 +29,8 @@ class TorqueSensorScale(CatalogueEffect):
 class TorqueSensorDrift(CatalogueEffect):
     """Offset that moves after the sensor was tared: b T (1 − exp(−t/T)), and a slow wandering.
 
-    t counts from the tare, `tare` seconds before the trial. It wanders with the session's time s:
-    A cos(2π s/P) + B sin(2π s/P) and as much with the period P/ρ, less its value at the tare.
+    t counts from the tare, `tare` seconds before the trial. It wanders with the session's time s, of which m is the
+    middle: A cos(2π (s − m)/P) + B sin(2π (s − m)/P) and as much with the period P₂, less its value at the tare.
     """
 
     ID: ClassVar = "torque_sensor_drift"
@@ -41,10 +41,13 @@ class TorqueSensorDrift(CatalogueEffect):
     }
     SHAPES: ClassVar = {
         "T": ("s", (1e4, 6.0)),
-        "P": ("s", (60.0, 90.0, 140.0, 250.0, 600.0, 1500.0)),
-        "rho": ("1", (1.6, 2.5)),
+        "P": ("s", (250.0, 30.0, 2000.0)),
+        "P_2": ("s", (60.0, 30.0, 2000.0)),
         "tare": ("s", (1.0, 6.0)),
+        "middle": ("s", (0.0,)),
     }
+    CHOICES: ClassVar = ("middle",)
+    PERIODS: ClassVar = {"P": ("A", "B"), "P_2": ("A_2", "B_2")}
     SHOWS: ClassVar = TORQUE_SENSOR
 
     slope: Float[Array, ""]
@@ -54,15 +57,16 @@ class TorqueSensorDrift(CatalogueEffect):
     B_2: Float[Array, ""]
     T: Float[Array, ""]
     P: Float[Array, ""]
-    rho: Float[Array, ""]
+    P_2: Float[Array, ""]
     tare: Float[Array, ""]
+    middle: Float[Array, ""]
 
     def reading(self, channel, x, y):
         if channel != "joint_torque":
             return y
-        since, wander = x.time + self.tare, 0.0
-        for a, b, period in ((self.A, self.B, self.P), (self.A_2, self.B_2, self.P / self.rho)):
-            now, tare = (2.0 * jnp.pi * s / period for s in (x.session_time, x.session_time - since))
+        since, s, wander = x.time + self.tare, x.session_time - self.middle, 0.0
+        for a, b, period in ((self.A, self.B, self.P), (self.A_2, self.B_2, self.P_2)):
+            now, tare = 2.0 * jnp.pi * s / period, 2.0 * jnp.pi * (s - since) / period
             wander += a * (jnp.cos(now) - jnp.cos(tare)) + b * (jnp.sin(now) - jnp.sin(tare))
         return y + (self.slope * self.T * -jnp.expm1(-since / self.T) + wander) * x.motorised
 

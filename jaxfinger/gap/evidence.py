@@ -85,21 +85,3 @@ def evidence(variant: Variant, Z: np.ndarray, Zt: np.ndarray, rt: np.ndarray) ->
     return Evidence(
         variant, a - beyond, std, float(b @ a) - lost, float(logsumexp(logs) - np.log(len(logs))) - 0.5 * lost, absorbed
     )
-
-
-def screen(groups, columns, projector: Projector, rt: np.ndarray) -> list[Evidence]:
-    """Evidence of every variant, strongest first."""
-    found = []
-    for name, items in groups.items():
-        Z = columns[name]
-        Zt = projector(Z.reshape(-1, Z.shape[-1])).reshape(*Z.shape[:2], -1)
-        found += [evidence(v, Z[i], Zt[i], rt) for i, v in enumerate(items)]
-    return sorted(found, key=lambda e: -e.log_bf)
-
-
-def by_site(found: list[Evidence]) -> dict[tuple, Evidence]:
-    """The strongest variant of each effect and site, strongest first."""
-    best: dict[tuple, Evidence] = {}
-    for e in found:
-        best.setdefault(e.variant.key, e)
-    return best

@@ -17,11 +17,12 @@ import numpy as np
 from scipy.special import expit, logsumexp
 
 from jaxfinger.effects import CatalogueEffect
-from jaxfinger.gap.evidence import Evidence, Projector, by_site, screen
+from jaxfinger.gap.evidence import Evidence, Projector
 from jaxfinger.gap.held_out import held_out_energies
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.refine import Refined, at_optimum, refine, relinearised
-from jaxfinger.gap.signatures import Signatures, all_columns, variants
+from jaxfinger.gap.screening import Screening, by_site
+from jaxfinger.gap.signatures import variants
 from jaxfinger.gap.standin import REACH, Explained, energy_left, explained
 
 Progress = Callable[[str], None]
@@ -89,13 +90,12 @@ def search(
     progress: Progress = lambda message: None,
 ) -> Search:
     """Judge every effect of the catalogue at every site of the finger."""
-    signatures = Signatures(problem, problem.nominal)
-    groups, columns = all_columns(signatures, variants(catalogue, problem.nominal.finger), progress)
+    screen = Screening.of(problem, variants(catalogue, problem.nominal.finger), progress)
     projector = Projector(problem)
     rt = projector.residual(problem)
     chi2 = float(rt @ rt)
     progress("weighing the evidence")
-    screened = screen(groups, columns, projector, rt)
+    screened = screen(projector, rt)
     found = by_site(screened)
     ranked = list(found.values())
     refined: dict[tuple, Refined] = {}
@@ -115,17 +115,17 @@ def search(
     best = max((refined[k] for k in there), key=lambda r: r.log_evidence)
     problem, chosen = there[best.keys[0]], best
     if not quick:
-        chosen = _add(problem, groups, columns, best, chi2, rt[: problem.r.size], progress)
+        chosen = _add(problem, screen, best, chi2, rt[: problem.r.size], progress)
     if len(chosen.variants) > 1:
         # Of two effects, neither need be the one that explains most alone: its rivals are taken as the first too.
         rivals = [k for k in there if k != best.keys[0]]
-        pairs = [_add(there[k], groups, columns, refined[k], chi2, rt[: problem.r.size], progress) for k in rivals]
+        pairs = [_add(there[k], screen, refined[k], chi2, rt[: problem.r.size], progress) for k in rivals]
         led = [relinearised(there[r.keys[0]], r, chi2) for r in (chosen, *pairs) if len(r.variants) > 1]
         problem, chosen = max(led, key=lambda x: x[1].log_evidence)
     left = explained(problem, chosen.residual)
     gap = chi2 - chosen.chi2 + energy_left(left)
     shares = _shares(problem, chosen, chi2, gap)
-    held_out = _held_out(start, there, ranked, refined, groups, columns, chi2, gap)
+    held_out = _held_out(start, there, ranked, refined, screen, chi2, gap)
     alone = len(chosen.variants) == 1 and energy_left(left) < OPEN[1][0] * gap
     if alone and held_out[chosen.keys[0]] < CARRIES:
         return _none_named(ranked, refined, held_out, explained(start, start.r))
@@ -166,7 +166,7 @@ def start_of(e: Evidence) -> dict[str, float]:
     return {n: float(a) * unit for (n, (_, unit, _)), a in zip(names.items(), e.amplitudes, strict=True)}
 
 
-def _add(problem, groups, columns, best: Refined, chi2: float, without, progress) -> Refined:
+def _add(problem, screen, best: Refined, chi2: float, without, progress) -> Refined:
     """Further effects on top of the best, while each explains a fair part of what is left.
 
     Real effects do not follow a textbook form to the letter: in a column that the chosen effects changed, the share
@@ -183,8 +183,8 @@ def _add(problem, groups, columns, best: Refined, chi2: float, without, progress
             break
         on_top = Projector(problem, chosen.columns)
         rt = on_top.residual(problem, problem.r - chosen.change)
-        ranked = [e for e in by_site(screen(groups, columns, on_top, rt)).values() if e.variant.key not in chosen.keys]
-        drops = [_drop(e, groups, columns, on_top, rt, cell, len(problem.columns)) for e in ranked[:LOOKED_AT]]
+        ranked = [e for e in by_site(screen(on_top, rt)).values() if e.variant.key not in chosen.keys]
+        drops = [_drop(screen.of_candidate(e), e, on_top, rt, cell, len(problem.columns)) for e in ranked[:LOOKED_AT]]
         first = int(np.argmax([_fits(drop, left) for drop in drops]))
         e, credit = ranked[first], float(np.maximum(drops[first] - theirs, 0.0).sum())
         # At the site of an effect that is there already, another form of it is likelier than a second cause.
@@ -201,16 +201,10 @@ def _add(problem, groups, columns, best: Refined, chi2: float, without, progress
     return chosen
 
 
-def _drop(e: Evidence, groups, columns, projector: Projector, rt, cell, count: int) -> np.ndarray:
-    """What a candidate explains in every column."""
-    change = e.amplitudes @ projector(_signatures_of(e, groups, columns))
+def _drop(Z, e: Evidence, projector: Projector, rt, cell, count: int) -> np.ndarray:
+    """What a candidate with the signatures Z explains in every column."""
+    change = e.amplitudes @ projector(Z)
     return np.bincount(cell, (rt**2 - (rt - change) ** 2)[: cell.size], count)
-
-
-def _signatures_of(e: Evidence, groups, columns) -> np.ndarray:
-    """(amplitudes, N) of a candidate's variant."""
-    name = e.variant.effect.ID
-    return columns[name][groups[name].index(e.variant)]
 
 
 def _fits(drop: np.ndarray, left: np.ndarray) -> float:
@@ -219,13 +213,13 @@ def _fits(drop: np.ndarray, left: np.ndarray) -> float:
     return float(0.5 * LOOKS * np.sum(np.log1p(before / LOOKS) - np.log1p(after / LOOKS)))
 
 
-def _held_out(start, there, ranked, refined, groups, columns, chi2: float, gap: float) -> dict[tuple, float]:
+def _held_out(start, there, ranked, refined, screen: Screening, chi2: float, gap: float) -> dict[tuple, float]:
     """Share of the gap that each candidate explains alone on held-out trials: the strongest where they have led, others
     at the nominal model; of those that explain any of what they have seen.
     """
     some = {e.variant.key: e for e in ranked if e.explained > TRIED * gap}
     members = {
-        k: refined[k].change[None] if k in refined else _signatures_of(e, groups, columns)
+        k: refined[k].change[None] if k in refined else screen.of_candidate(e)
         for k, e in some.items()
         if k not in there
     }

@@ -4,7 +4,6 @@ Site, shape and amplitude of an effect are arrays, and trials of one kind are st
 compiled function a class of effects and kind of prediction serves them all. Only what the effect changes is evaluated.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -207,15 +206,3 @@ def by_class(items: list[Variant]) -> dict[str, list[Variant]]:
     for v in items:
         groups.setdefault(v.effect.ID, []).append(v)
     return groups
-
-
-def all_columns(signatures: Signatures, items: list[Variant], progress=lambda message: None, threads: int = 2):
-    """Signatures of every variant by effect; classes are compiled side by side."""
-    groups = by_class(items)
-    out = {}
-    _ = signatures._groups
-    with ThreadPoolExecutor(threads) as pool:
-        for name, columns in zip(groups, pool.map(lambda n: signatures.columns(groups[n]), groups), strict=True):
-            out[name] = columns
-            progress(f"signatures of {name} ({len(out)} of {len(groups)} effects)")
-    return groups, out

@@ -30,6 +30,7 @@ class ModelPlant:
     def __init__(self, model: Model, driver: Plant | None = None):
         self.model = model
         self.driver = driver
+        self.by_the_clock = bool(model.effects)
 
     def prescribed(self, plan: TrialPlan) -> Channels:
         """All channels of the plan's experiment."""

@@ -28,6 +28,8 @@ BLOCK = 4096  # samples: one compiled rigid-body call serves trials of any lengt
 class Plant(Protocol):
     """Anything that can stand in for the finger on the rig: a specimen, or a fitted model."""
 
+    by_the_clock: bool  # whether the session's time tells repeats of one motion apart
+
     def prescribed(self, plan: TrialPlan) -> Channels:
         """Motion and tension as planned: `q`, `tendon_force`, and the channels that they cause."""
         ...
@@ -39,6 +41,8 @@ class Plant(Protocol):
 
 class SpecimenPlant:
     """The finger as it really is: equation (1) with the specimen's terms."""
+
+    by_the_clock = False
 
     def __init__(self, specimen: Specimen):
         self.specimen = specimen

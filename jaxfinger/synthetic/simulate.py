@@ -42,14 +42,15 @@ def clean_session(
     finger = finger or specimen.description
     plant = plant or SpecimenPlant(specimen)
     plans = session_plan(finger, recipe.trials)
-    done: dict[str, Channels] = {}  # by motion: repeats command the same, and a plant repeats itself
+    done: dict[tuple, Channels] = {}  # by motion: repeats command the same, and most plants repeat themselves
     trials = []
     for k, plan in enumerate(plans):
         if progress:
             progress(k, len(plans), plan.name)
-        if plan.motion not in done:
-            done[plan.motion] = plant.driven(plan) if plan.experiment == "VD.3" else plant.prescribed(plan)
-        trials.append((plan, done[plan.motion]))
+        key = (plan.motion, plan.session_start if plant.by_the_clock else 0.0)
+        if key not in done:
+            done[key] = plant.driven(plan) if plan.experiment == "VD.3" else plant.prescribed(plan)
+        trials.append((plan, done[key]))
     return CleanSession(recipe, recipe.specimen.name or specimen.name, finger, tuple(trials))
 
 

@@ -1,13 +1,16 @@
 """A model behind the rig's sensors agrees with the specimen whose parameters it has."""
 
+import equinox as eqx
 import numpy as np
 import pytest
 
 from jaxfinger.data import EXPERIMENTS
+from jaxfinger.effects import CATALOGUE
 from jaxfinger.errors import UserError
 from jaxfinger.synthetic import (
     ModelPlant,
     SpecimenPlant,
+    clean_session,
     nominal_model,
     paper_finger,
     polynomial_finger,
@@ -56,3 +59,22 @@ def test_session_of_a_model():
     session = simulate(recipe, seed=2, plant=ModelPlant(nominal_model(SPECIMEN)))
     assert {t.experiment for t in session} == {"ID.4"}
     assert all(np.isfinite(t.joint_torque).any() for t in session)
+
+
+def test_a_sensor_drifts_on_between_repeats_of_one_motion():
+    """Repeats differ by the drift between them, in closed form, and by nothing else."""
+    recipe = recipe_from({"trials": TRIALS | {"experiments": ["ID.3-static"], "id3_static": {"repeats": 2}}})
+    model = nominal_model(SPECIMEN)
+    drift = CATALOGUE["torque_sensor_drift"].at(model.finger, ("torque_sensor",), A=1e-3, P=71.0, tare=3.0)
+    model = eqx.tree_at(lambda m: m.effects, model, (drift,), is_leaf=lambda v: isinstance(v, tuple))
+    clean = clean_session(recipe, ModelPlant(model), SPECIMEN.description)
+    (first, a), (again, b) = clean.trials[:2]
+    assert first.motion == again.motion
+
+    def drifted(plan):
+        now, tare = 2 * np.pi * (plan.session_start + plan.time) / 71.0, 2 * np.pi * (plan.session_start - 3.0) / 71.0
+        return 1e-3 * (np.cos(now) - np.cos(tare))
+
+    difference = (b["joint_torque"] - a["joint_torque"])[first.joint]
+    np.testing.assert_allclose(difference, drifted(again) - drifted(first), atol=1e-9)
+    assert np.ptp(difference) > 1e-4

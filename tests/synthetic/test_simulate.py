@@ -106,6 +106,8 @@ def test_any_model_can_stand_in_for_the_finger():
     """A plant that predicts prescribed channels is recorded by the same rig."""
 
     class Rope:
+        by_the_clock = False
+
         def prescribed(self, plan):
             return {
                 "q": plan.q,
