@@ -1,7 +1,6 @@
 """Diagnose the sim-to-real gap of a session: where, which effect, how far it shrinks, what next; and write it down."""
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -20,14 +19,14 @@ from jaxfinger.gap.propose import Proposal, propose
 from jaxfinger.gap.refine import Refined, at_optimum, refine
 from jaxfinger.gap.search import DETECT, Search, search, start_of
 from jaxfinger.gap.shrinkage import Shrinkage, shrinkage
-from jaxfinger.gap.signatures import Signatures, Variant
+from jaxfinger.gap.signatures import Signatures
 from jaxfinger.gap.standin import energy_left
 from jaxfinger.gap.where import Place, where
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.fit_file import save_fit
 from jaxfinger.identify.parameters import describe, ravel
+from jaxfinger.identify.stages import Progress
 
-Progress = Callable[[str], None]
 MOST_IN_A_SET = 3
 UNSEEN = 10.0  # plausible sizes: the stated deviation of an amplitude that the trials do not see at all
 
@@ -146,14 +145,7 @@ def _rivals(problem: Problem, found: Search):
     """The strongest candidates with their signatures."""
     signatures = Signatures(problem, problem.nominal)
     top = [(c.evidence, c.refined) for c in found.candidates if c.refined][:6]
-    out = []
-    for evidence, refined in top:
-        effect = refined.effects[0]
-        variant = Variant(
-            type(effect), refined.variants[0].site, tuple((n, float(getattr(effect, n))) for n in effect.SHAPES)
-        )
-        out.append((evidence, signatures.columns([variant])[0]))
-    return out
+    return [(evidence, signatures.columns(at_optimum(refined)[0])[0]) for evidence, refined in top]
 
 
 def _members(problem: Problem, found: Search) -> list[Refined]:

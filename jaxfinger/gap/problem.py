@@ -5,7 +5,6 @@
 Q spans the whitened Jacobian of the nominal parameters: what they can absorb is no evidence (Frisch–Waugh–Lovell).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -21,10 +20,16 @@ from jaxfinger.identify.linearise import Linearised
 from jaxfinger.identify.noise import Noise, estimate, history
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.solve import Prior, Source, linearise_each, solve
-from jaxfinger.identify.stages import cad_covariance, first_noise, free_groups, nominal_model, sources_of, start_values
+from jaxfinger.identify.stages import (
+    Progress,
+    cad_covariance,
+    first_noise,
+    free_groups,
+    nominal_model,
+    sources_of,
+    start_values,
+)
 from jaxfinger.model import Model
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """Screening: the evidence of every candidate, linearly, against what is left to explain."""
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import combinations
@@ -10,21 +9,42 @@ from jaxtyping import Float
 
 from jaxfinger.gap.evidence import Evidence, Projector, evidence
 from jaxfinger.gap.problem import Problem
-from jaxfinger.gap.signatures import Signatures, Variant, by_class
-
-Progress = Callable[[str], None]
+from jaxfinger.gap.signatures import Signatures, Variant
+from jaxfinger.identify.stages import Progress
 
 THREADS = 2
 SHORTEST = 20.0  # s: the shortest period that is looked for
+MOST = 300  # periods: beyond 50 minutes the shortest grows with the session, for memory's sake
+RIDGE = 1e-9  # relative, of products of columns
+
+Offer = tuple[list[Variant], Float[np.ndarray, "variants amplitudes N"]]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Variants whose shapes are fixed, with their signatures."""
+
+    items: list[Variant]
+    columns: Float[np.ndarray, "variants amplitudes N"]
+
+    def offer(self, projector: Projector, rt: Float[np.ndarray, " N+prior"]) -> Offer:
+        """All of them, whatever is left."""
+        return self.items, self.columns
+
+    def signatures_of(self, variant: Variant) -> Float[np.ndarray, "amplitudes N"]:
+        """Of one that was offered."""
+        return self.columns[self.items.index(variant)]
 
 
 @dataclass(frozen=True)
 class Scan:
-    """Finds the periods in the session's time that variants of one effect and site leave open.
+    """Variants of one effect and site whose periods in the session's time are open.
 
-    As in a periodogram (Lomb 1976, Scargle 1982): where a session lasts L, valleys of a sum of squares lie 1/L apart.
+    As in a periodogram (Lomb 1976, Scargle 1982): where a session lasts L, valleys of a sum of squares lie 1/L apart in
+    frequency, and the scan takes half of that.
     """
 
+    signatures: Signatures
     items: list[Variant]
     periods: Float[np.ndarray, " n"]  # s
     middle: float  # s
@@ -33,89 +53,90 @@ class Scan:
     @classmethod
     def of(cls, signatures: Signatures, items: list[Variant]) -> "Scan":
         """All signatures, read once."""
-        effect = items[0].effect
-        problem, finger = signatures.problem, signatures.nominal.finger
-        times = [problem.stacks[e].batch.x.session_time for e in effect.SHOWS if e in problem.stacks]
-        start, end = min(map(np.min, times)), max(map(np.max, times))
-        half = 0.5 / (end - start)
-        fewest, middle = len(effect.PERIODS) + 0.5, float(start + end) / 2.0
-        periods = 1.0 / np.arange(half, max(1.0 / SHORTEST, fewest * half), half)
-        name, pair = next(iter(effect.PERIODS.items()))
+        effect, site = items[0].effect, items[0].site
+        stacks = signatures.problem.stacks
+        times = np.concatenate([np.ravel(stacks[e].batch.x.session_time) for e in effect.SHOWS if e in stacks])
+        start, end = float(times.min()), float(times.max())
+        longest, middle = 2.0 * max(end - start, SHORTEST), (start + end) / 2.0
+        periods = longest / np.arange(1, int(np.clip(longest / SHORTEST, len(effect.PERIODS), MOST)) + 1)
         shape = dict(items[0].shape) | {"middle": middle}
-        paired = {a for names in effect.PERIODS.values() for a in names}
-        one = [({}, a) for a in effect.AMPLITUDES if a not in paired] + [({name: p}, a) for p in periods for a in pair]
-        members = [
-            effect.at(finger, items[0].site, **shape | period, **{a: effect.AMPLITUDES[a][1]}) for period, a in one
-        ]
-        return cls(items, periods, middle, signatures.of(members))
+        size = {a: unit for a, (_, unit, _) in effect.AMPLITUDES.items()}
+        name, pair = next(iter(effect.PERIODS.items()))
+        without = set(size).difference(*effect.PERIODS.values())
+        members = [shape | {a: size[a]} for a in size if a in without]
+        members += [shape | {name: period, a: size[a]} for period in periods for a in pair]
+        finger = signatures.nominal.finger
+        columns = signatures.of([effect.at(finger, site, **values) for values in members])
+        return cls(signatures, items, periods, middle, columns)
 
-    def best(self, projector: Projector, rt: Float[np.ndarray, " N+prior"]) -> list[Variant]:
-        """The variants with the periods that explain most together."""
-        names = list(self.items[0].effect.PERIODS)
+    def offer(self, projector: Projector, rt: Float[np.ndarray, " N+prior"]) -> Offer:
+        """Every variant with those periods that explain most together."""
+        shape = {"middle": self.middle} | self.best(projector, rt)
+        items = [v.with_shape(**shape) for v in self.items]
+        return items, self.signatures.columns(items)
+
+    def best(self, projector: Projector, rt: Float[np.ndarray, " N+prior"]) -> dict[str, float]:
+        """The periods, s, by least squares over all sets of them."""
+        names, n = list(self.items[0].effect.PERIODS), len(self.periods)
         A = projector(self.columns)
         A = A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300)
-        G, b, first = A @ A.T + 1e-9 * np.eye(len(A)), A @ rt, len(A) - 2 * len(self.periods)
-        sets = np.array(list(combinations(range(len(self.periods)), len(names))))
-        pairs = (first + 2 * sets[:, :, None] + np.arange(2)).reshape(len(sets), -1)
-        kept = np.column_stack([np.tile(np.arange(first), (len(sets), 1)), pairs])
-        solved = np.linalg.solve(G[kept[:, :, None], kept[:, None, :]], b[kept][:, :, None])
-        best = sets[np.argmax(np.sum(b[kept] * solved[:, :, 0], axis=1))]
-        shape = dict(zip(names, self.periods[best].tolist(), strict=True)) | {"middle": self.middle}
-        return [Variant(v.effect, v.site, tuple((dict(v.shape) | shape).items()), v.size) for v in self.items]
+        G, b, k = A @ A.T + RIDGE * np.eye(len(A)), A @ rt, len(A) - 2 * n
+        sets = np.array(list(combinations(range(n), len(names))))
+        pairs = (k + 2 * sets[:, :, None] + np.arange(2)).reshape(len(sets), -1)
+        rows = np.column_stack([np.tile(np.arange(k), (len(sets), 1)), pairs])
+        amplitudes = np.linalg.solve(G[rows[:, :, None], rows[:, None, :]], b[rows][:, :, None])[:, :, 0]
+        most = np.argmax(np.sum(b[rows] * amplitudes, axis=1))
+        return dict(zip(names, self.periods[sets[most]].tolist(), strict=True))
+
+    def signatures_of(self, variant: Variant) -> Float[np.ndarray, "amplitudes N"]:
+        """Of one that was offered."""
+        return self.signatures.columns([variant])[0]
 
 
 @dataclass(frozen=True)
 class Screening:
-    """Signatures of every variant, read once and weighed against whatever is left."""
+    """Signatures of every candidate, read once and weighed against whatever is left."""
 
-    signatures: Signatures
-    groups: dict[str, list[Variant]]  # by effect
-    columns: dict[str, Float[np.ndarray, "variants amplitudes N"]]
-    scans: list[Scan]
+    parts: dict[tuple, Table | Scan]
 
     @classmethod
     def of(cls, problem: Problem, items: list[Variant], progress: Progress = lambda message: None) -> "Screening":
         """Signatures at the problem's nominal model; classes are compiled side by side."""
-        signatures = Signatures(problem, problem.nominal)
-        groups, columns, scans = by_class(items), {}, {}
+        signatures, groups = Signatures(problem, problem.nominal), {}
+        for v in items:
+            groups.setdefault(_part(v), []).append(v)
 
-        def read(name: str):
-            effect = groups[name][0].effect
+        def read(group: list[Variant]) -> Table | Scan:
+            effect = group[0].effect
             if effect.PERIODS and any(e in problem.stacks for e in effect.SHOWS):
-                return scans, [Scan.of(signatures, open_ones) for open_ones in _by_site(groups[name])]
-            return columns, signatures.columns(groups[name])
+                return Scan.of(signatures, group)
+            return Table(group, signatures.columns(group))
 
-        _ = signatures._groups
+        parts = {}
+        _ = signatures.groups  # before two threads ask for them
         with ThreadPoolExecutor(THREADS) as pool:
-            for name, (into, what) in zip(groups, pool.map(read, groups), strict=True):
-                into[name] = what
-                progress(f"signatures of {name} ({len(columns) + len(scans)} of {len(groups)} effects)")
-        return cls(signatures, groups, columns, [scan for found in scans.values() for scan in found])
+            for key, part in zip(groups, pool.map(read, groups.values()), strict=True):
+                parts[key] = part
+                progress(f"signatures of {key[0]} ({len(parts)} of {len(groups)} effects)")
+        return cls(parts)
 
     def __call__(self, projector: Projector, rt: Float[np.ndarray, " N+prior"]) -> list[Evidence]:
         """Evidence of every variant, strongest first."""
-        found = [self._weighed(self.groups[name], Z, projector, rt) for name, Z in self.columns.items()]
-        for scan in self.scans:
-            items = scan.best(projector, rt)
-            found.append(self._weighed(items, self.signatures.columns(items), projector, rt))
-        return sorted((e for group in found for e in group), key=lambda e: -e.log_bf)
+        found = []
+        for part in self.parts.values():
+            items, Z = part.offer(projector, rt)
+            Zt = projector(Z.reshape(-1, Z.shape[-1])).reshape(*Z.shape[:2], -1)
+            found += [evidence(v, z, zt, rt) for v, z, zt in zip(items, Z, Zt, strict=True)]
+        return sorted(found, key=lambda e: -e.log_bf)
 
-    def of_candidate(self, e: Evidence) -> Float[np.ndarray, "amplitudes N"]:
-        """Signatures of its variant."""
-        v = e.variant
-        if v.effect.ID in self.columns:
-            return self.columns[v.effect.ID][self.groups[v.effect.ID].index(v)]
-        return self.signatures.columns([v])[0]
-
-    @staticmethod
-    def _weighed(items, Z, projector: Projector, rt) -> list[Evidence]:
-        Zt = projector(Z.reshape(-1, Z.shape[-1])).reshape(*Z.shape[:2], -1)
-        return [evidence(v, z, zt, rt) for v, z, zt in zip(items, Z, Zt, strict=True)]
+    def signatures_of(self, e: Evidence) -> Float[np.ndarray, "amplitudes N"]:
+        """Of a candidate's variant."""
+        return self.parts[_part(e.variant)].signatures_of(e.variant)
 
 
-def _by_site(items: list[Variant]) -> list[list[Variant]]:
-    sites = dict.fromkeys(v.site for v in items)
-    return [[v for v in items if v.site == site] for site in sites]
+def _part(v: Variant) -> tuple:
+    """What is read together: a class of effects, and one site where its periods are open."""
+    return (v.effect.ID, v.site) if v.effect.PERIODS else (v.effect.ID,)
 
 
 def by_site(found: list[Evidence]) -> dict[tuple, Evidence]:

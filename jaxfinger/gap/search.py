@@ -10,7 +10,6 @@
    where all forms are a little wrong, as textbook forms are.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,8 +23,7 @@ from jaxfinger.gap.refine import Refined, at_optimum, refine, relinearised
 from jaxfinger.gap.screening import Screening, by_site
 from jaxfinger.gap.signatures import variants
 from jaxfinger.gap.standin import REACH, Explained, energy_left, explained
-
-Progress = Callable[[str], None]
+from jaxfinger.identify.stages import Progress
 
 DETECT = 12.0  # log evidence that an effect needs before anything is called a gap: without one, the best has 2 to 5
 # Share of the gap that an effect which explains it alone must explain on held-out trials; true ones: 0.23 and more.
@@ -184,7 +182,7 @@ def _add(problem, screen, best: Refined, chi2: float, without, progress) -> Refi
         on_top = Projector(problem, chosen.columns)
         rt = on_top.residual(problem, problem.r - chosen.change)
         ranked = [e for e in by_site(screen(on_top, rt)).values() if e.variant.key not in chosen.keys]
-        drops = [_drop(screen.of_candidate(e), e, on_top, rt, cell, len(problem.columns)) for e in ranked[:LOOKED_AT]]
+        drops = [_drop(screen.signatures_of(e), e, on_top, rt, cell, len(problem.columns)) for e in ranked[:LOOKED_AT]]
         first = int(np.argmax([_fits(drop, left) for drop in drops]))
         e, credit = ranked[first], float(np.maximum(drops[first] - theirs, 0.0).sum())
         # At the site of an effect that is there already, another form of it is likelier than a second cause.
@@ -219,7 +217,7 @@ def _held_out(start, there, ranked, refined, screen: Screening, chi2: float, gap
     """
     some = {e.variant.key: e for e in ranked if e.explained > TRIED * gap}
     members = {
-        k: refined[k].change[None] if k in refined else screen.of_candidate(e)
+        k: refined[k].change[None] if k in refined else screen.signatures_of(e)
         for k, e in some.items()
         if k not in there
     }

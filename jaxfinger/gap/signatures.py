@@ -46,6 +46,10 @@ class Variant:
         """What a verdict names."""
         return self.effect.ID, self.site
 
+    def with_shape(self, **values: float) -> "Variant":
+        """The same with other values of some shapes."""
+        return replace(self, shape=tuple((dict(self.shape) | values).items()))
+
     def at(self, finger, amplitudes: dict[str, float]) -> CatalogueEffect:
         """The effect itself."""
         return self.effect.at(finger, self.site, **dict(self.shape), **amplitudes)
@@ -116,7 +120,8 @@ class Signatures:
     nominal: Model
 
     @cached_property
-    def _groups(self) -> list[_Group]:
+    def groups(self) -> list[_Group]:
+        """Trials that are predicted alike."""
         kinds: dict[tuple, list[str]] = {}
         for e, stack in self.problem.stacks.items():
             if self.problem.rows[e].size:
@@ -156,7 +161,7 @@ class Signatures:
         kind = type(members[0])
         padded = members + members[:1] * (CHUNK - len(members))
         stacked = jax.tree.map(lambda *a: np.stack(a), *[replace(m, site=()) for m in padded])
-        for group in self._groups:
+        for group in self.groups:
             shown = [e for e in group.first if group.channel in kind.SHOWS.get(e, ())]
             if not shown:
                 continue
@@ -198,11 +203,3 @@ def whitened(
         share = np.stack([np.bincount(series, constant * w, count) for w in white]) / np.maximum(energy, 1e-300)
         white = white - constant * share[:, series]
     return white
-
-
-def by_class(items: list[Variant]) -> dict[str, list[Variant]]:
-    """Variants in groups of one class."""
-    groups: dict[str, list[Variant]] = {}
-    for v in items:
-        groups.setdefault(v.effect.ID, []).append(v)
-    return groups

@@ -1,15 +1,18 @@
 """The scan for periods in the session's time, against all pairs of periods and against a planted drift."""
 
+from dataclasses import replace
 from itertools import combinations
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap import diagnose
-from jaxfinger.gap.screening import Scan
-from jaxfinger.gap.signatures import Variant
-from tests.gap.conftest import RIVALS, session_with
+from jaxfinger.gap.screening import MOST, Scan
+from jaxfinger.gap.signatures import Signatures, Variant
+
+from .conftest import RIVALS, session_with
 
 DRIFT = CATALOGUE["torque_sensor_drift"]
 SITE = ("torque_sensor",)
@@ -23,20 +26,42 @@ def left(rows, r):
     return float(np.sum((r - rows.T @ np.linalg.lstsq(rows.T, r, rcond=None)[0]) ** 2))
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_the_scan_leaves_as_little_as_the_best_of_all_pairs_of_periods(seed):
+class OnePeriod(DRIFT):
+    """As a user's effect with one period would be."""
+
+    PERIODS: ClassVar = {"P": ("A", "B")}
+
+
+@pytest.mark.parametrize("effect", [DRIFT, OnePeriod])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_scan_leaves_as_little_as_the_best_of_all_sets_of_periods(effect, seed):
     rng = np.random.default_rng(seed)
     time = np.sort(rng.uniform(0.0, 1000.0, 300))
-    periods = 1.0 / np.arange(5e-4, 0.03, 5e-4)
+    periods = 2000.0 / np.arange(1, 60)
     r = rng.standard_normal(4) @ columns(time, rng.uniform(40.0, 300.0, 2)) + 0.1 * rng.standard_normal(time.size)
     slope = (time / 1000.0)[None]
-    shape = tuple((n, grid[0]) for n, (_, grid) in DRIFT.SHAPES.items())
-    items = [Variant(DRIFT, SITE, shape)]
-    (found,) = Scan(items, periods, 500.0, np.vstack([slope, columns(time, periods)])).best(lambda rows: rows, r)
-    expected = min(left(np.vstack([slope, columns(time, p)]), r) for p in combinations(periods, 2))
-    shape = dict(found.shape)
-    assert left(np.vstack([slope, columns(time, (shape["P"], shape["P_2"]))]), r) == pytest.approx(expected, rel=1e-6)
-    assert shape["middle"] == 500.0
+    items = [Variant(effect, SITE, ())]
+    scan = Scan(None, items, periods, 500.0, np.vstack([slope, columns(time, periods)]))
+    found = scan.best(lambda rows: rows, r)
+    sets = combinations(periods, len(effect.PERIODS))
+    expected = min(left(np.vstack([slope, columns(time, p)]), r) for p in sets)
+    assert found.keys() == effect.PERIODS.keys()
+    assert left(np.vstack([slope, columns(time, found.values())]), r) == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_long_session_is_scanned_down_to_a_longer_period(diagnosis, monkeypatch):
+    """A session over a day does not ask for memory in proportion, nor one of an instant for no period at all."""
+    monkeypatch.setattr(Signatures, "of", lambda self, members: np.zeros((len(members), 1)))
+    problem, days = diagnosis.problem, {}
+    for length in (0.0, 100.0, 86400.0):
+        for e, stack in problem.stacks.items():
+            x = stack.batch.x
+            clock = np.linspace(0.0, length, x.session_time.size).reshape(x.session_time.shape)
+            days[e] = replace(stack, batch=replace(stack.batch, x=replace(x, session_time=clock)))
+        there = Signatures(replace(problem, stacks=days), problem.nominal)
+        scan = Scan.of(there, [Variant(DRIFT, SITE, ())])
+        assert len(DRIFT.PERIODS) <= len(scan.periods) <= MOST
+        assert np.all(scan.periods > 0.0)
 
 
 def test_a_wandering_sensor_is_named_with_its_periods():
