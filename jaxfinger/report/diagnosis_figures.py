@@ -103,9 +103,10 @@ def _how_far(ax, lines: list[dict]) -> None:
         yticks=range(len(lines)),
         yticklabels=[f"{x['experiment']} · {SHORT.get(x['channel'], x['channel'])}" for x in lines],
     )
-    most = max((max(x["before"], x["after"]) / x["noise"] for x in lines), default=1.0)
-    ax.set(xscale="log", xlim=(0.5, max(3.0, 1.3 * most)), ylim=(max(len(lines), 1) - 0.4, -0.6), xlabel="rms / noise")
-    ticks = [t for t in (0.5, 1, 2, 5, 10, 20, 50, 100, 200) if t <= max(3.0, 1.3 * most)]
+    ratios = [x[k] / x["noise"] for x in lines for k in ("before", "after")]
+    low, high = min([0.5, *(0.8 * r for r in ratios if r > 0)]), max([3.0, *(1.3 * r for r in ratios)])
+    ax.set(xscale="log", xlim=(low, high), ylim=(max(len(lines), 1) - 0.4, -0.6), xlabel="rms / noise")
+    ticks = [t for t in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200) if low <= t <= high]
     ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
     ax.set_xticks([], minor=True)
     ax.plot([], [], "o", color="white", markeredgecolor=BEFORE, label="before")

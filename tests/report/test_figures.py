@@ -9,6 +9,7 @@ from jaxfinger.errors import UserError
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.report.curves import curves
+from jaxfinger.report.diagnosis_figures import glance
 from jaxfinger.report.identification import draw_identification
 from jaxfinger.report.validation import draw_validation
 from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger, recipe_from, simulate
@@ -105,3 +106,17 @@ def test_dots_of_the_holds_lie_on_the_lines(fit, session):
         for q, h, _, way in points:
             line = np.interp(np.degrees(q), c.elastic.x, c.elastic.y + way * c.friction.y)
             assert 1e3 * h == pytest.approx(line, abs=0.6)
+
+
+@pytest.mark.parametrize("after", [0.05, 0.3, 1.0, 40.0])
+def test_every_rms_lies_within_its_panel(after):
+    line = {"experiment": "ID.4", "channel": "joint_torque", "units": "N m", "noise": 1e-3, "before": 2e-3}
+    gap = {
+        "verdict": {"status": "no_gap", "effects": []},
+        **{"where": [], "candidates": [], "ambiguous_sets": [], "none": 1.0, "unlisted": 0.0},
+        "gap": [line | {"after": after * 1e-3}],
+    }
+    far = glance(gap).axes[2]
+    low, high = far.get_xlim()
+    assert low < min(after, 2.0)
+    assert max(after, 2.0) < high
