@@ -32,11 +32,13 @@ from jaxfinger.experiments.table import (
     BREAKAWAY,
     CLEAR,
     CLEAR_STEP,
+    COMPLIANCE,
     EXPERIMENTS,
     LOST,
     MIN_DRIVEN_SPEED,
     MIN_JOINT_SPEED,
     MIN_TENDON_SPEED,
+    QUICK,
     ROUNDING,
     SLACK,
     STILL,
@@ -113,8 +115,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     # Where the measured channel is not low-passed, q̇ and q̈ must not lose what is in it.
     cutoff = spec.cutoff_at(step, sharp=spec.stepped or not reduced)
     filtered, qd, qdd = smooth(trial.time, trial.q, cutoff)
-    lost = np.abs(trial.q - filtered)
-    noise = np.median(lost, axis=0)
+    noise = np.median(np.abs(trial.q - filtered), axis=0)
     # When a joint turns back shows best in the slower filter: there noise of q̇ is noise in time.
     slow = spec.held or (reduced and not spec.stepped)
     turning = qd if slow else smooth(trial.time, trial.q, spec.cutoff)[1]
@@ -140,7 +141,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     y, mask = _measured(spec, trial, session, minus)
     slides = np.zeros((N, m))
     if spec.samples == "sliding" or spec.stepped:
-        slides = _sliding(spec, trial, session, lost, noise, qd, joint_direction, rate, motorised)
+        slides = _sliding(spec, trial, session, qd, joint_direction, rate, motorised)
     if reduced and spec.samples == "sliding":
         # q̈ is low-passed, so all else is too. What noise it keeps would still tell a fit of less inertia
         # (errors in variables): where q̈ does not rise above it, its mean over a tenth of a second takes its place.
@@ -255,28 +256,32 @@ def _rates(trial: Trial, spec: Experiment) -> np.ndarray:
 
 
 def _sliding(
-    spec: Experiment, trial: Trial, session: Session, lost, noise, qd, direction, rate: np.ndarray | None, motorised
+    spec: Experiment, trial: Trial, session: Session, qd, direction, rate: np.ndarray | None, motorised
 ) -> np.ndarray:
     """(N, m): 1 where a joint and every taut tendon across it slide, so that the directions of friction are known.
 
-    `lost`: of q in the filter, (N, m), and its median, the `noise`; `rate`: speeds of the tendons, none where all are
-    slack.
+    `rate`: speeds of the tendons, none where all are slack.
     """
+    step = float(np.median(np.diff(trial.time)))
     fast = np.percentile(np.abs(qd), 95, axis=0)
-    slow = np.where(motorised, MIN_DRIVEN_SPEED, MIN_JOINT_SPEED)
-    slides = (np.abs(qd) > np.minimum(slow, 0.05 * fast)) & (np.sign(qd) == np.sign(direction))
+    least = np.where(motorised, MIN_DRIVEN_SPEED, MIN_JOINT_SPEED)
+    slides = (np.abs(qd) > np.minimum(least, 0.05 * fast)) & (np.sign(qd) == np.sign(direction))
     slides[1:] &= np.sign(qd[1:]) == np.sign(qd[:-1])  # a quick reversal has no slow sample
     if rate is not None and trial.tendon_excursion is not None and trial.tendon_force is not None:
         taut = np.nan_to_num(trial.tendon_force) > SLACK
         measured = np.isfinite(trial.tendon_excursion).all(axis=0)
-        known = ~taut | ((np.abs(rate) > MIN_TENDON_SPEED) & measured)
+        stretching = np.abs(smooth(trial.time, np.nan_to_num(trial.tendon_force), spec.cutoff / 2)[1]) * COMPLIANCE
+        known = ~taut | ((np.abs(rate) > MIN_TENDON_SPEED + stretching) & measured)
         for i in range(session.finger.m):
             slides[:, i] &= known[:, session.finger.crosses[:, i] & session.finger.active].all(axis=1)
-    # A slip of a few milliseconds is too fast for the filter, and moves every joint.
-    most = np.maximum(LOST * np.ptp(trial.q, axis=0), ABOVE_NOISE * noise) + ROUNDING
-    slides &= np.all(lost <= most, axis=1)[:, None]
+    if not spec.stepped:
+        # A slip between two stops is too fast for the filter, and moves every joint.
+        cutoff = spec.cutoff_at(step)
+        slow, quick = (smooth(trial.time, trial.q, c)[1] for c in (cutoff, min(QUICK * cutoff, 0.4 / step)))
+        lost = np.abs(quick - slow)
+        most = np.maximum(LOST * np.percentile(np.abs(slow), 95, axis=0), ABOVE_NOISE * np.median(lost, axis=0))
+        slides &= np.all(lost <= most + ROUNDING, axis=1)[:, None]
     # The filter spreads the jump of friction at a reversal, and friction before it slides is not known.
-    step = float(np.median(np.diff(trial.time)))
     clear = minimum_filter1d(
         slides.astype(float), 2 * round((CLEAR_STEP if spec.stepped else CLEAR) / step) + 1, axis=0
     )

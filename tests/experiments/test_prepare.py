@@ -101,6 +101,40 @@ def test_around_a_slip_faster_than_the_filter_no_joint_counts():
     assert after[(since > -0.15) & (since < -0.1)].all()
 
 
+def test_where_a_joint_sticks_and_slips_no_joint_counts():
+    """Steps of 40 mrad, fourteen a second, are a small part of the travel, and smooth motion to a filter of 10 Hz."""
+    time = np.arange(4000) / RATE
+    steps = np.interp(time % 0.07, [0.0, 0.05, 0.07], [0.0, 0.0, 0.04]) + 0.04 * np.floor(time / 0.07)
+    smooth = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1)) + 0.3 * time[:, None] * [0.0, 1.0, 1.0]
+    smooth += ENCODER * np.random.default_rng(2).standard_normal(smooth.shape)
+    jerky = smooth.copy()
+    middle = (time > 1.4) & (time < 2.8)
+    jerky[middle, 2] += (steps - 0.04 / 0.07 * time)[middle]
+    batches = [
+        stack(Trial("free", "VD.3", time, q, tendon_force=np.zeros((time.size, FINGER.n)))).batch
+        for q in (smooth, jerky)
+    ]
+    at = np.asarray(batches[0].x.time)[0]
+    before, after = (np.asarray(b.mask["joint_torque"])[1:, 0] > 0 for b in batches)
+    assert before[:, (at > 0.2) & (at < 3.8)].all()
+    assert not after[:, (at > 1.4) & (at < 2.8)].any()
+    assert after[:, (at > 0.2) & (at < 1.3)].all()
+
+
+def test_a_tendon_that_may_only_stretch_has_no_known_friction():
+    """Let go by 50 N/s, a tendon of 40 µm/N shortens by 2 mm/s: a motor as slow says nothing of its other end."""
+    time = np.arange(4000) / RATE
+    q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1)) + 0.3 * time[:, None]
+    q += ENCODER * np.random.default_rng(2).standard_normal(q.shape)
+    tension = np.interp(time, [0.0, 1.9, 2.1, 4.0], [12.0, 12.0, 2.0, 2.0])[:, None] * np.ones(FINGER.n)
+    excursion = -1.5e-3 * time[:, None] * np.ones(FINGER.n)
+    batch = stack(Trial("free", "VD.3", time, q, tension, excursion)).batch
+    at, counts = np.asarray(batch.x.time)[0], np.asarray(batch.mask["joint_torque"])[0, 0] > 0
+    assert not counts[(at > 1.9) & (at < 2.1)].any()
+    assert counts[(at > 0.2) & (at < 1.7)].all()
+    assert counts[(at > 2.3) & (at < 3.8)].all()
+
+
 def test_between_holds_counts_a_tension_that_goes_on_or_a_joint_that_slides():
     """Where it turns back a tendon sticks; at the ends of a move a joint may."""
     time = np.arange(7000) / RATE
