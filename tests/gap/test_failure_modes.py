@@ -24,6 +24,14 @@ def test_the_same_file_twice_is_the_same_diagnosis(diagnosis):
     assert first == second
 
 
+@pytest.mark.parametrize("experiment", ["ID.3-static", "ID.3-dynamic"])
+def test_without_any_one_trial_the_verdict_is_the_same(experiment):
+    session = session_with(PLANTED)
+    gone = next(t.name for t in session if t.experiment == experiment and t.joint == TRUTH[1][0])
+    less = session.with_trials([t.name for t in session if t.name != gone])
+    assert diagnose(less, without=WITHOUT).verdict.effects == (TRUTH,)
+
+
 def test_a_users_copy_of_a_listed_effect_is_its_rival_and_not_its_better():
     class Twin(JointPresliding):
         ID = "my_presliding"
