@@ -79,7 +79,7 @@ MEASURES = {
 # Of a finger whose joints all slide, the format's axes of a linear drive.
 _SLIDING = {
     "rad": "m", "rad/s": "m/s", "1/rad": "1/m", "N m": "N", "N m/s": "N/s", "N m/rad": "N/m", "N m s/rad": "N s/m",
-    "kg m2": "kg",
+    "s/rad": "s/m", "N m/rad^2": "N/m^2", "kg m2": "kg",
 }  # fmt: skip
 
 

@@ -48,11 +48,11 @@ def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
     return found
 
 
-def to_dict(effect: Effect) -> dict:
+def to_dict(finger: Finger, effect: Effect) -> dict:
     """An effect as a result file holds it."""
     if not isinstance(effect, CatalogueEffect):
         raise TypeError(f"{type(effect).__name__} is no effect of the catalogue")
-    units = effect.units()
+    units = effect.units(finger, effect.site)
     parameters = {k: {"value": v, "units": units[k]} for k, v in effect.values().items()}
     return {"effect": effect.ID, "site": list(effect.site), "parameters": parameters}
 

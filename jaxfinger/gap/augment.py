@@ -135,7 +135,7 @@ def parameter_values(fit: Fit, index: int) -> dict[str, dict]:
     assert isinstance(effect, CatalogueEffect)
     label = f"{effect.ID} {'-'.join(effect.site)} "
     std = {p.name: s for p, s in zip(describe(fit.model), fit.std, strict=True)}
-    units = effect.units()
+    units = effect.units(fit.model.finger, effect.site)
     return {
         n: {"value": v, "std": float(std.get(label + n, 0.0)), "units": units[n]} for n, v in effect.values().items()
     }

@@ -8,7 +8,6 @@ import numpy as np
 
 from jaxfinger.data import Predictions, Session
 from jaxfinger.data.atomic import atomic_path
-from jaxfinger.data.schema import units_where
 from jaxfinger.effects import CATALOGUE, CatalogueEffect, nominal_terms
 from jaxfinger.errors import UserError
 from jaxfinger.gap.augment import augmented_fit, nominal_fit, parameter_values
@@ -228,7 +227,6 @@ def _with_prior(amplitude: float, std: float, size: float) -> tuple[float, float
 
 def as_gap_json(d: Diagnosis) -> dict:
     """`gap.json`, to the letter."""
-    sliding = d.problem.session.finger.prismatic
     by_effect = {
         e.ID + "".join(e.site): parameter_values(d.augmented, i)
         for i, e in enumerate(d.augmented.model.effects)
@@ -239,12 +237,11 @@ def as_gap_json(d: Diagnosis) -> dict:
         values = by_effect.get(c.key[0] + "".join(c.key[1]))
         if values is None:
             effect = c.evidence.variant.effect
-            units = {k: v[0] for k, v in effect.AMPLITUDES.items()}
+            units = effect.units(d.problem.nominal.finger, c.key[1])
             sizes = [v[1] for v in effect.AMPLITUDES.values()]
-            found = zip(units, c.evidence.amplitudes, c.evidence.std, sizes, strict=True)
+            found = zip(effect.AMPLITUDES, c.evidence.amplitudes, c.evidence.std, sizes, strict=True)
             stated = {n: _with_prior(float(a), float(u), s) for n, a, u, s in found}
             values = {n: {"value": v, "std": std, "units": units[n]} for n, (v, std) in stated.items()}
-        values = {n: v | {"units": units_where(v["units"], sliding)} for n, v in values.items()}
         candidates.append(
             {
                 "effect": c.key[0],

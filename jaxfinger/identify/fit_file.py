@@ -75,7 +75,7 @@ def _to_dict(fit: Fit) -> dict[str, Any]:
     if model.effects:
         from jaxfinger.effects import to_dict
 
-        effects = [to_dict(e) for e in model.effects]
+        effects = [to_dict(model.finger, e) for e in model.effects]
     content = {
         "schema": SCHEMA,
         "specimen": fit.specimen,

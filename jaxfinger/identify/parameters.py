@@ -128,9 +128,10 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
             effect = model.effects[i]
             assert isinstance(effect, CatalogueEffect)
             label = f"{effect.ID} {'-'.join(effect.site)} {field}"
-            if index or field not in effect.units():  # a constant that the effect carries
+            units = effect.units(model.finger, effect.site)
+            if index or field not in units:  # a constant that the effect carries
                 return Parameter(f"{label} {index}" if index else label, "constant", "", determinable=False)
-            return Parameter(label, "effects", effect.units()[field])
+            return Parameter(label, "effects", units[field])
     raise AssertionError(keys)
 
 

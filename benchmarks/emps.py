@@ -1,0 +1,85 @@
+"""Real measurements with a known answer: Coulomb friction of the EMPS axis withheld, found, and judged on another
+recording; then, with nothing withheld, whether what remains is real.
+
+    python benchmarks/emps.py
+
+What remains is a formula that one recording proposed. On the other, with its own nominal parameters refitted, the
+formula's gain is 1 where it is real, and 0 where it was noise.
+"""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from jaxfinger.data import Session, import_file, read_session
+from jaxfinger.gap import diagnose
+from jaxfinger.gap.evidence import Projector
+from jaxfinger.gap.problem import Problem, build
+from jaxfinger.gap.propose import Proposal, terms
+from jaxfinger.gap.signatures import whitened
+from jaxfinger.identify import Fit, read_recipe
+from jaxfinger.identify.validate import validate
+
+ROOT = Path(__file__).parents[1]
+DATA = ROOT / "datasets/emps"
+PUBLISHED = 20.39  # N, Coulomb friction (NOTICE.md)
+
+
+def recordings(folder: Path) -> tuple[Session, Session]:
+    """The one for estimation, and the one disturbed by pulses, as session files in the folder."""
+    found = []
+    for recording, mapping in (("DATA_EMPS.mat", "emps.toml"), ("DATA_EMPS_PULSES.mat", "emps-pulses.toml")):
+        file = folder / f"{Path(mapping).stem}.h5"
+        import_file([DATA / recording], DATA / mapping, file)
+        found.append(read_session(file))
+    return found[0], found[1]
+
+
+def rms(fit: Fit, session: Session) -> float:
+    """N, of the motor's force at every sample."""
+    (score,) = validate(fit, session).scores
+    return score.rms
+
+
+def gain(proposal: Proposal, problem: Problem) -> tuple[float, float]:
+    """By how much the proposal must be multiplied to fit another recording, and the standard deviation of that."""
+    ((experiment, rows),) = problem.rows.items()
+    library = dict(terms(problem, experiment, proposal.channel, 0))
+    raw = sum(a * library[text] for a, text in proposal.terms)
+    z = np.zeros((1, problem.r.size))
+    z[0] = whitened(raw[None, None], problem, rows, np.arange(rows.size), proposal.channel)[0]
+    projector = Projector(problem)
+    z, r = projector(z)[0], projector.residual(problem)
+    fitted = float(z @ r / (z @ z))
+    scale = np.sqrt(np.sum((r - fitted * z) ** 2) / r.size)  # what else remains is no white noise
+    return fitted, float(scale / np.linalg.norm(z))
+
+
+def main() -> None:
+    """In a folder that is gone afterwards."""
+    with tempfile.TemporaryDirectory() as folder:
+        report(*recordings(Path(folder)))
+
+
+def report(estimation: Session, pulses: Session) -> None:
+    """Print what is named, its value, the shrinkage on the pulses, and the gain of what remains there."""
+    withheld = diagnose(estimation, read_recipe(ROOT / "fits/emps-no-coulomb.toml"))
+    (key,) = withheld.verdict.effects
+    lines = [line for line in withheld.augmented.table() if str(line["name"]).startswith(key[0])]
+    print(withheld.verdict.summary)
+    for line in lines:
+        print(f"{line['name']}: {line['value']:.2f} ± {line['std']:.2f} {line['units']} (published {PUBLISHED})")
+    full = read_recipe(ROOT / "fits/emps.toml")
+    known = diagnose(estimation, full)
+    before, after, best = (rms(f, pulses) for f in (withheld.nominal, withheld.augmented, known.nominal))
+    print(f"pulses: {before:.2f} N before, {after:.2f} N with {key[0]}, {best:.2f} N where nothing was withheld")
+    print(f"closed on the pulses: {100 * (before**2 - after**2) / (before**2 - best**2):.1f} % of what it can close")
+    print(known.verdict.summary)
+    if known.proposal:
+        value, std = gain(known.proposal, build(pulses, full))
+        print(f"on the pulses the proposal has a gain of {value:.2f} ± {std:.2f}")
+
+
+if __name__ == "__main__":
+    main()
