@@ -132,7 +132,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         tension = uniform_filter1d(tension, max(1, round(1.0 / (spec.rate * step))), axis=0, mode="nearest")
     tendon_direction, rate = np.zeros((N, n)), None
     if not spec.slack and spec.samples == "sliding":
-        rate = np.zeros((N, n)) if trial.tendon_excursion is None else _rates(trial, spec)
+        rate = np.zeros((N, n)) if trial.tendon_excursion is None else _rates(trial, spec.cutoff / 2)
         tendon_direction = _direction(trial.tendon_direction, rate, 0.1 * MIN_TENDON_SPEED)
     motorised = np.zeros((N, m))
     if trial.joint is not None and "joint_torque" in spec.channels:
@@ -250,9 +250,9 @@ def _direction(commanded: np.ndarray | None, rate: np.ndarray, still: float) -> 
     return np.where(known < 0, 0.0, np.sign(np.take_along_axis(rate, np.maximum(known, 0), axis=0)))
 
 
-def _rates(trial: Trial, spec: Experiment) -> np.ndarray:
+def _rates(trial: Trial, cutoff: float) -> np.ndarray:
     """Tendon speeds, m/s; zero where the excursion was not measured."""
-    return smooth(trial.time, without_spikes(np.nan_to_num(np.asarray(trial.tendon_excursion))), spec.cutoff / 2)[1]
+    return smooth(trial.time, without_spikes(np.nan_to_num(np.asarray(trial.tendon_excursion))), cutoff)[1]
 
 
 def _sliding(
@@ -268,16 +268,13 @@ def _sliding(
     slides = (np.abs(qd) > np.minimum(least, 0.05 * fast)) & (np.sign(qd) == np.sign(direction))
     slides[1:] &= np.sign(qd[1:]) == np.sign(qd[:-1])  # a quick reversal has no slow sample
     if rate is not None and trial.tendon_excursion is not None and trial.tendon_force is not None:
-        taut = np.nan_to_num(trial.tendon_force) > SLACK
-        measured = np.isfinite(trial.tendon_excursion).all(axis=0)
-        stretching = np.abs(smooth(trial.time, np.nan_to_num(trial.tendon_force), spec.cutoff / 2)[1]) * COMPLIANCE
-        known = ~taut | ((np.abs(rate) > MIN_TENDON_SPEED + stretching) & measured)
+        known = _friction_known(spec, trial, rate, step)
         for i in range(session.finger.m):
             slides[:, i] &= known[:, session.finger.crosses[:, i] & session.finger.active].all(axis=1)
     if not spec.stepped:
         # A slip between two stops is too fast for the filter, and moves every joint.
         cutoff = spec.cutoff_at(step)
-        slow, quick = (smooth(trial.time, trial.q, c)[1] for c in (cutoff, min(QUICK * cutoff, 0.4 / step)))
+        slow, quick = (smooth(trial.time, trial.q, c)[1] for c in (cutoff, _quicker(cutoff, step)))
         lost = np.abs(quick - slow)
         most = np.maximum(LOST * np.percentile(np.abs(slow), 95, axis=0), ABOVE_NOISE * np.median(lost, axis=0))
         slides &= np.all(lost <= most + ROUNDING, axis=1)[:, None]
@@ -288,6 +285,21 @@ def _sliding(
     # Reaches back only: a free joint that breaks away does so at once, and takes the others with it.
     half = round(0.5 * BREAKAWAY / step)
     return np.where(motorised, clear, minimum_filter1d(clear, 2 * half + 1, axis=0, origin=half))
+
+
+def _friction_known(spec: Experiment, trial: Trial, rate: np.ndarray, step: float) -> np.ndarray:
+    """(N, n): where a tendon is slack, or slides for certain: faster than it stretches, and in a quicker filter too."""
+    tension = np.nan_to_num(np.asarray(trial.tendon_force))
+    stretches = COMPLIANCE * np.abs(smooth(trial.time, tension, spec.cutoff / 2)[1])
+    quick = np.sign(rate) * _rates(trial, _quicker(spec.cutoff / 2, step))
+    measured = np.isfinite(np.asarray(trial.tendon_excursion)).all(axis=0)
+    moves = (np.abs(rate) > MIN_TENDON_SPEED + stretches) & (quick > 0.5 * MIN_TENDON_SPEED)
+    return (tension <= SLACK) | (moves & measured)
+
+
+def _quicker(cutoff: float, step: float) -> float:
+    """Hz, of a filter that still sees a joint or tendon stand still between two slips."""
+    return min(QUICK * cutoff, 0.4 / step)
 
 
 def _in_fixture(q: np.ndarray, hold: np.ndarray) -> np.ndarray:

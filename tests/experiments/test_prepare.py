@@ -135,6 +135,21 @@ def test_a_tendon_that_may_only_stretch_has_no_known_friction():
     assert counts[(at > 2.3) & (at < 3.8)].all()
 
 
+def test_a_tendon_that_stands_still_for_a_moment_has_no_known_friction():
+    """For 60 ms, which a filter of 5 Hz takes for half the speed."""
+    time = np.arange(4000) / RATE
+    q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1)) + 0.3 * time[:, None]
+    q += ENCODER * np.random.default_rng(2).standard_normal(q.shape)
+    speed = np.where((time > 2.0) & (time < 2.06), 0.0, 3e-3)
+    excursion = np.cumsum(speed)[:, None] / RATE * np.ones(FINGER.n)
+    excursion += 1e-5 * np.random.default_rng(3).standard_normal(excursion.shape)
+    batch = stack(Trial("free", "VD.3", time, q, np.full_like(excursion, 5.0), excursion)).batch
+    at, counts = np.asarray(batch.x.time)[0], np.asarray(batch.mask["joint_torque"])[0, 0] > 0
+    assert not counts[(at > 2.0) & (at < 2.06 + BREAKAWAY)].any()
+    assert counts[(at > 0.2) & (at < 1.9)].all()
+    assert counts[(at > 2.3) & (at < 3.8)].all()
+
+
 def test_between_holds_counts_a_tension_that_goes_on_or_a_joint_that_slides():
     """Where it turns back a tendon sticks; at the ends of a move a joint may."""
     time = np.arange(7000) / RATE
