@@ -10,7 +10,7 @@
    where all forms are a little wrong, as textbook forms are.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import expit, logsumexp
@@ -47,6 +47,7 @@ HINT = 20.0  # of it in a column, that a known effect may claim though noise cou
 # the gap left to the stand-in at which it is as likely as the catalogue, and how sharply. One known effect in another
 # textbook form leaves 0.14 at most, and an unknown one that it imitates 0.17; two leave 0.02, and 0.11.
 OPEN = {1: (0.155, 0.015), 2: (0.07, 0.015)}
+DOUBT = 0.9  # probability of «unlisted» where held-out trials contradict the effects chosen
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,12 @@ class Search:
     rival_sets: list[list[tuple]]  # effects that explain as much as the chosen first one
     left: list[Explained]  # what the stand-in explains beyond the chosen effects
     absorbed: list[tuple] = field(default_factory=list)  # (key, share) of effects that the file cannot show
+
+    def doubted(self) -> "Search":
+        """The same where held-out trials contradict what was chosen: «unlisted» takes all but a tenth."""
+        rest = (1.0 - DOUBT - self.none) / sum(c.probability for c in self.candidates)
+        candidates = [replace(c, probability=c.probability * rest) for c in self.candidates]
+        return replace(self, candidates=candidates, unlisted=DOUBT, rival_sets=[])
 
 
 def search(

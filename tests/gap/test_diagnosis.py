@@ -196,6 +196,19 @@ def test_a_cause_that_held_out_trials_do_not_know_is_not_named(monkeypatch):
     assert "explains 0 % of what it fitted on trials that its fit has not seen" in found.verdict.summary
 
 
+def test_what_closes_nothing_of_a_plain_gap_is_no_explanation(monkeypatch):
+    monkeypatch.setattr("jaxfinger.gap.shrinkage._choice", lambda *_: ("joint_magic", ("PIP",)))
+    found = diagnose(session_with((*TRUTH, {"a": 1.0, "x0": 0.1})), without=WITHOUT)
+    assert found.verdict.status == "unexplained"
+    assert not found.verdict.effects
+    says = "the nearest, joint_presliding at PIP, closes 0 % of the gap in joint_torque of ID.3-"
+    assert says in found.verdict.summary
+    gap = as_gap_json(found)
+    assert gap["unlisted"] == pytest.approx(0.9)
+    assert sum(c["probability"] for c in gap["candidates"]) + gap["none"] + gap["unlisted"] == pytest.approx(1.0)
+    assert not gap["ambiguous_sets"]
+
+
 def test_an_unknown_effect_to_leave_out_is_refused():
     with pytest.raises(UserError, match="no effect joint_magic"):
         diagnose(session_with(), without=("joint_magic",))
