@@ -28,7 +28,7 @@ from jaxfinger.identify.stages import Progress
 
 MOST_IN_A_SET = 3
 PLAIN = 1.3  # rms before, in that of the noise, from which on held-out trials must know the effects that are named
-CLOSES = 0.3  # share of such a gap that is to be within the interval of what closes; true effects: 0.6 and more
+CLOSES = 0.3  # share of one such gap that is to be within the interval of what closes; true effects: 0.6 and more
 UNSEEN = 10.0  # plausible sizes: the stated deviation of an amplitude that the trials do not see at all
 
 
@@ -91,10 +91,10 @@ def diagnose(
     named = {*chosen.keys, *(k for members in found.rival_sets for k in members)}
     progress("refitting without each third of the trials")
     lines = shrinkage(problem, nominal, fit, r, J, _rivals(problem, found), named, not quick)
-    contradicted = _left_open(lines)
-    if contradicted and found.unlisted <= 0.5:
+    left_open, every = _left_open(lines)
+    if every and found.unlisted <= 0.5:
         found = found.doubted()
-    verdict, proposal = _verdict(found, lines, contradicted), None
+    verdict, proposal = _verdict(found, lines, left_open, every), None
     if verdict.status == "unexplained" and found.left:
         progress("looking for a closed form of what remains")
         proposal = propose(problem, chosen.residual, found.left, chosen.columns)
@@ -168,14 +168,17 @@ def _members(problem: Problem, found: Search) -> list[Refined]:
     return out
 
 
-def _left_open(lines: list[Shrinkage]) -> Shrinkage | None:
-    """The channel that shows the gap best, where held-out trials know nothing of what was to explain it."""
-    measured = [x for x in lines if x.resolvable and x.channel != "q"]
-    best = max(measured, key=lambda x: x.before / x.noise, default=None)
-    return best if best and best.before > PLAIN * best.noise and best.closed_ci95[1] < CLOSES else None
+def _left_open(lines: list[Shrinkage]) -> tuple[list[Shrinkage], bool]:
+    """Channels with a plain gap of which held-out trials close nothing, the plainest first, and whether all are such.
+
+    Where one closes, another may have a cause of its own; where none does, nothing is explained.
+    """
+    plain = [x for x in lines if x.resolvable and x.channel != "q" and x.before > PLAIN * x.noise]
+    left = [x for x in plain if x.closed_ci95[1] < CLOSES]
+    return sorted(left, key=lambda x: -x.before / x.noise), bool(plain) and len(left) == len(plain)
 
 
-def _verdict(found: Search, lines: list[Shrinkage], contradicted: Shrinkage | None) -> Verdict:
+def _verdict(found: Search, lines: list[Shrinkage], left_open: list[Shrinkage], every: bool) -> Verdict:
     chosen = found.chosen
     assert chosen is not None
     order = np.argsort(-np.asarray(found.shares))
@@ -184,9 +187,9 @@ def _verdict(found: Search, lines: list[Shrinkage], contradicted: Shrinkage | No
     share = sum(found.shares) if len(effects) == 1 else 1.0 - _left_share(found)
     if found.unlisted > 0.5:
         fails = f"leaves {100 * _left_share(found):.0f} % of what a smooth law could explain"
-        if contradicted:
-            where_to = f"{contradicted.channel} of {contradicted.experiment}"
-            fails = f"closes {100 * contradicted.closed:.0f} % of the gap in {where_to} on held-out trials"
+        if every:
+            worst = left_open[0]
+            fails = f"closes {100 * worst.closed:.0f} % of the gap in {_channel(worst)} on held-out trials"
         text = f"There is a gap, and none of the known effects explains it: the nearest, {names}, {fails}."
         return Verdict("unexplained", (), f"{text} {_depends(found)}")
     if found.rival_sets:
@@ -202,8 +205,13 @@ def _verdict(found: Search, lines: list[Shrinkage], contradicted: Shrinkage | No
         "explained",
         effects,
         f"The gap is explained by {names}: {100 * share:.0f} % of what can be explained. "
-        f"On held-out trials it closes up to {100 * best:.0f} % of the gap in the channel that shows it best.",
+        f"On held-out trials it closes up to {100 * best:.0f} % of the gap in the channel that shows it best."
+        + "".join(f" {_channel(x)} stays at {x.after / x.noise:.1f} times its noise." for x in left_open),
     )
+
+
+def _channel(line: Shrinkage) -> str:
+    return f"{line.channel} of {line.experiment}"
 
 
 def _left_share(found: Search) -> float:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from importlib import import_module
 
 import jax.numpy as jnp
 import numpy as np
@@ -245,3 +246,19 @@ def test_a_law_that_nobody_listed_gets_a_proposal_in_closed_form(known, tmp_path
     assert total + gap["none"] + gap["unlisted"] == pytest.approx(1.0, abs=1e-9)
     assert gap["where"][0]["site"] == "PIP"
     write_page(found, tmp_path / "page.html")
+
+
+def test_a_gap_with_a_second_cause_stays_open_and_is_said(monkeypatch):
+    """One channel closes and another does not: the cause is named, and what it leaves too."""
+    module = import_module("jaxfinger.gap.diagnose")  # the package names the function
+    real = module.shrinkage
+
+    def with_another(*arguments):
+        (closing, *rest) = sorted(real(*arguments), key=lambda x: -x.before / x.noise)
+        other = replace(closing, experiment="VD.3", after=closing.before, closed=0.0, closed_ci95=(0.0, 0.0))
+        return [closing, *rest, replace(other, before=2 * other.before, after=2 * other.after)]
+
+    monkeypatch.setattr(module, "shrinkage", with_another)
+    found = diagnose(session_with((*TRUTH, {"a": 1.0, "x0": 0.1})), without=WITHOUT)
+    assert found.verdict.effects == (TRUTH,)
+    assert "joint_torque of VD.3 stays at" in found.verdict.summary
