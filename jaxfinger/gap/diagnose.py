@@ -186,10 +186,11 @@ def _verdict(found: Search, lines: list[Shrinkage], left_open: list[Shrinkage], 
     names = " and ".join(f"{e} at {'-'.join(s)}" for e, s in effects)
     share = sum(found.shares) if len(effects) == 1 else 1.0 - _left_share(found)
     if found.unlisted > 0.5:
-        fails = f"leaves {100 * _left_share(found):.0f} % of what a smooth law could explain"
+        end = "s" if len(effects) == 1 else ""
+        fails = f"leave{end} {100 * _left_share(found):.0f} % of what a smooth law could explain"
         if every:
             worst = left_open[0]
-            fails = f"closes {100 * worst.closed:.0f} % of the gap in {_channel(worst)} on held-out trials"
+            fails = f"close{end} {100 * worst.closed:.0f} % of the gap in {_channel(worst)} on held-out trials"
         text = f"There is a gap, and none of the known effects explains it: the nearest, {names}, {fails}."
         return Verdict("unexplained", (), f"{text} {_depends(found)}")
     if found.rival_sets:
