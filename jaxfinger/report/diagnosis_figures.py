@@ -106,7 +106,8 @@ def _how_far(ax, lines: list[dict]) -> None:
     ratios = [x[k] / x["noise"] for x in lines for k in ("before", "after")]
     low, high = min([0.5, *(0.8 * r for r in ratios if r > 0)]), max([3.0, *(1.3 * r for r in ratios)])
     ax.set(xscale="log", xlim=(low, high), ylim=(max(len(lines), 1) - 0.4, -0.6), xlabel="rms / noise")
-    ticks = [t for t in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200) if low <= t <= high]
+    steps = (1, 2, 5) if high < 50 * low else (1,)  # no room for more
+    ticks = [t for k in range(-2, 6) for t in (s * 10.0**k for s in steps) if low <= t <= high]
     ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
     ax.set_xticks([], minor=True)
     ax.plot([], [], "o", color="white", markeredgecolor=BEFORE, label="before")
