@@ -47,10 +47,9 @@ def gain(proposal: Proposal, problem: Problem) -> tuple[float, float]:
     ((experiment, rows),) = problem.rows.items()
     library = dict(terms(problem, experiment, proposal.channel, 0))
     raw = sum(a * library[text] for a, text in proposal.terms)
-    z = np.zeros((1, problem.r.size))
-    z[0] = whitened(raw[None, None], problem, rows, np.arange(rows.size), proposal.channel)[0]
     projector = Projector(problem)
-    z, r = projector(z)[0], projector.residual(problem)
+    z = projector(whitened(raw[None, None], problem, rows, np.arange(rows.size), proposal.channel))[0]
+    r = projector.residual(problem)
     fitted = float(z @ r / (z @ z))
     scale = np.sqrt(np.sum((r - fitted * z) ** 2) / r.size)  # what else remains is no white noise
     return fitted, float(scale / np.linalg.norm(z))

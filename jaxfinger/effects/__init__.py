@@ -8,7 +8,7 @@ from pathlib import Path
 from jaxfinger.effects import body, joint, nominal, sensors, tendon, transmission
 from jaxfinger.effects.base import CatalogueEffect, Site
 from jaxfinger.errors import UserError
-from jaxfinger.model import Effect, Finger
+from jaxfinger.model import Finger
 
 
 def _effects_in(module) -> dict[str, type[CatalogueEffect]]:
@@ -48,11 +48,8 @@ def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
     return found
 
 
-def to_dict(finger: Finger, effect: Effect) -> dict:
-    """An effect as a result file holds it."""
-    if not isinstance(effect, CatalogueEffect):
-        raise TypeError(f"{type(effect).__name__} is no effect of the catalogue")
-    units = effect.units(finger, effect.site)
+def to_dict(effect: CatalogueEffect, units: dict[str, str]) -> dict:
+    """An effect as a result file holds it, with the units that its parameters have at its site."""
     parameters = {k: {"value": v, "units": units[k]} for k, v in effect.values().items()}
     return {"effect": effect.ID, "site": list(effect.site), "parameters": parameters}
 

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxfinger.data.schema import units_where
 from jaxfinger.model import Effect, Finger, Motion
 
 Site = tuple[str, ...]
@@ -110,14 +109,9 @@ class CatalogueEffect(Effect):
         return ends
 
     @classmethod
-    def units(cls, finger: Finger, site: Site) -> dict[str, str]:
-        """Units of every parameter, amplitudes and shapes: those of lengths and forces where the joints slide."""
-        units = {k: v[0] for k, v in (cls.AMPLITUDES | cls.SHAPES).items()}
-        own = [slides for joint, slides in zip(finger.joint_names, finger.prismatic, strict=True) if joint in site]
-        if own:
-            return {k: units_where(u, own) for k, u in units.items()}
-        # A base or a sensor that is turned is turned by an angle.
-        return {k: u if u == "rad" else units_where(u, finger.prismatic) for k, u in units.items()}
+    def units(cls) -> dict[str, str]:
+        """Units of every parameter, amplitudes and shapes, where joints turn."""
+        return {k: v[0] for k, v in (cls.AMPLITUDES | cls.SHAPES).items()}
 
     def values(self) -> dict[str, float]:
         """Every parameter by name."""

@@ -130,10 +130,11 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     if spec.held and not reduced:
         # As smooth as the blocks of a fit: what slips at a noise peak would stay there until the next step.
         tension = uniform_filter1d(tension, max(1, round(1.0 / (spec.rate * step))), axis=0, mode="nearest")
-    tendon_direction, rate = np.zeros((N, n)), None
+    tendon_direction, rates = np.zeros((N, n)), None
     if not spec.slack and spec.samples == "sliding":
-        rate = np.zeros((N, n)) if trial.tendon_excursion is None else _rates(trial, spec.cutoff / 2)
-        tendon_direction = _direction(trial.tendon_direction, rate, 0.1 * MIN_TENDON_SPEED)
+        rates = _rates(trial, spec, step)
+        slow_rate = np.zeros((N, n)) if rates is None else rates[0]
+        tendon_direction = _direction(trial.tendon_direction, slow_rate, 0.1 * MIN_TENDON_SPEED)
     motorised = np.zeros((N, m))
     if trial.joint is not None and "joint_torque" in spec.channels:
         motorised[:, session.finger.joint_names.index(trial.joint)] = 1.0
@@ -141,7 +142,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     y, mask = _measured(spec, trial, session, minus)
     slides = np.zeros((N, m))
     if spec.samples == "sliding" or spec.stepped:
-        slides = _sliding(spec, trial, session, qd, joint_direction, rate, motorised)
+        slides = _sliding(spec, trial, session, step, qd, turning, joint_direction, rates, motorised)
     if reduced and spec.samples == "sliding":
         # q̈ is low-passed, so all else is too. What noise it keeps would still tell a fit of less inertia
         # (errors in variables): where q̈ does not rise above it, its mean over a tenth of a second takes its place.
@@ -250,32 +251,33 @@ def _direction(commanded: np.ndarray | None, rate: np.ndarray, still: float) -> 
     return np.where(known < 0, 0.0, np.sign(np.take_along_axis(rate, np.maximum(known, 0), axis=0)))
 
 
-def _rates(trial: Trial, cutoff: float) -> np.ndarray:
-    """Tendon speeds, m/s; zero where the excursion was not measured."""
-    return smooth(trial.time, without_spikes(np.nan_to_num(np.asarray(trial.tendon_excursion))), cutoff)[1]
+def _rates(trial: Trial, spec: Experiment, step: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Tendon speeds, m/s, in a slow filter and in a quicker one; none where excursions were not measured."""
+    if trial.tendon_excursion is None:
+        return None
+    excursion = without_spikes(np.nan_to_num(trial.tendon_excursion))
+    slow, quick = (smooth(trial.time, excursion, c)[1] for c in (spec.cutoff / 2, _quicker(spec.cutoff / 2, step)))
+    return slow, quick
 
 
 def _sliding(
-    spec: Experiment, trial: Trial, session: Session, qd, direction, rate: np.ndarray | None, motorised
+    spec: Experiment, trial: Trial, session: Session, step: float, qd, slow, direction, rates, motorised
 ) -> np.ndarray:
     """(N, m): 1 where a joint and every taut tendon across it slide, so that the directions of friction are known.
 
-    `rate`: speeds of the tendons, none where all are slack.
+    `slow`: speeds in the slower filter; `rates`: of the tendons, none where all are slack or not measured.
     """
-    step = float(np.median(np.diff(trial.time)))
     fast = np.percentile(np.abs(qd), 95, axis=0)
     least = np.where(motorised, MIN_DRIVEN_SPEED, MIN_JOINT_SPEED)
     slides = (np.abs(qd) > np.minimum(least, 0.05 * fast)) & (np.sign(qd) == np.sign(direction))
     slides[1:] &= np.sign(qd[1:]) == np.sign(qd[:-1])  # a quick reversal has no slow sample
-    if rate is not None and trial.tendon_excursion is not None and trial.tendon_force is not None:
-        known = _friction_known(spec, trial, rate, step)
+    if rates is not None and trial.tendon_force is not None:
+        known = _friction_known(spec, trial, *rates)
         for i in range(session.finger.m):
             slides[:, i] &= known[:, session.finger.crosses[:, i] & session.finger.active].all(axis=1)
     if not spec.stepped:
         # A slip between two stops is too fast for the filter, and moves every joint.
-        cutoff = spec.cutoff_at(step)
-        slow, quick = (smooth(trial.time, trial.q, c)[1] for c in (cutoff, _quicker(cutoff, step)))
-        lost = np.abs(quick - slow)
+        lost = np.abs(smooth(trial.time, trial.q, _quicker(spec.cutoff_at(step), step))[1] - slow)
         most = np.maximum(LOST * np.percentile(np.abs(slow), 95, axis=0), ABOVE_NOISE * np.median(lost, axis=0))
         slides &= np.all(lost <= most + ROUNDING, axis=1)[:, None]
     # The filter spreads the jump of friction at a reversal, and friction before it slides is not known.
@@ -287,13 +289,12 @@ def _sliding(
     return np.where(motorised, clear, minimum_filter1d(clear, 2 * half + 1, axis=0, origin=half))
 
 
-def _friction_known(spec: Experiment, trial: Trial, rate: np.ndarray, step: float) -> np.ndarray:
+def _friction_known(spec: Experiment, trial: Trial, slow: np.ndarray, quick: np.ndarray) -> np.ndarray:
     """(N, n): where a tendon is slack, or slides for certain: faster than it stretches, and in a quicker filter too."""
     tension = np.nan_to_num(np.asarray(trial.tendon_force))
     stretches = COMPLIANCE * np.abs(smooth(trial.time, tension, spec.cutoff / 2)[1])
-    quick = np.sign(rate) * _rates(trial, _quicker(spec.cutoff / 2, step))
     measured = np.isfinite(np.asarray(trial.tendon_excursion)).all(axis=0)
-    moves = (np.abs(rate) > MIN_TENDON_SPEED + stretches) & (quick > 0.5 * MIN_TENDON_SPEED)
+    moves = (np.abs(slow) > MIN_TENDON_SPEED + stretches) & (np.sign(slow) * quick > 0.5 * MIN_TENDON_SPEED)
     return (tension <= SLACK) | (moves & measured)
 
 

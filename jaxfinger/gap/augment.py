@@ -13,7 +13,7 @@ from jaxfinger.gap.problem import Problem, assemble
 from jaxfinger.gap.refine import Refined
 from jaxfinger.identify import Fit
 from jaxfinger.identify.fit import StageReport
-from jaxfinger.identify.parameters import describe, ravel
+from jaxfinger.identify.parameters import describe, ravel, units_at
 from jaxfinger.identify.solve import Prior, Solution, Source, solve
 from jaxfinger.model import Model
 
@@ -135,7 +135,7 @@ def parameter_values(fit: Fit, index: int) -> dict[str, dict]:
     assert isinstance(effect, CatalogueEffect)
     label = f"{effect.ID} {'-'.join(effect.site)} "
     std = {p.name: s for p, s in zip(describe(fit.model), fit.std, strict=True)}
-    units = effect.units(fit.model.finger, effect.site)
+    units = units_at(fit.model.finger, type(effect), effect.site)
     return {
         n: {"value": v, "std": float(std.get(label + n, 0.0)), "units": units[n]} for n, v in effect.values().items()
     }

@@ -17,18 +17,16 @@ from jaxfinger.gap.problem import Problem, build
 from jaxfinger.gap.propose import Proposal, propose
 from jaxfinger.gap.refine import Refined, at_optimum, refine
 from jaxfinger.gap.search import DETECT, Search, search, start_of
-from jaxfinger.gap.shrinkage import Shrinkage, shrinkage
+from jaxfinger.gap.shrinkage import Shrinkage, contradicts, shrinkage
 from jaxfinger.gap.signatures import Signatures
 from jaxfinger.gap.standin import energy_left
 from jaxfinger.gap.where import Place, where
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.fit_file import save_fit
-from jaxfinger.identify.parameters import describe, ravel
+from jaxfinger.identify.parameters import describe, ravel, units_at
 from jaxfinger.identify.stages import Progress
 
 MOST_IN_A_SET = 3
-PLAIN = 1.3  # rms before, in that of the noise, from which on held-out trials must know the effects that are named
-CLOSES = 0.3  # share of one such gap that is to be within the interval of what closes; true effects: 0.6 and more
 UNSEEN = 10.0  # plausible sizes: the stated deviation of an amplitude that the trials do not see at all
 
 
@@ -91,10 +89,9 @@ def diagnose(
     named = {*chosen.keys, *(k for members in found.rival_sets for k in members)}
     progress("refitting without each third of the trials")
     lines = shrinkage(problem, nominal, fit, r, J, _rivals(problem, found), named, not quick)
-    left_open, every = _left_open(lines)
-    if every and found.unlisted <= 0.5:
+    if contradicts(lines) and found.unlisted <= 0.5:
         found = found.doubted()
-    verdict, proposal = _verdict(found, lines, left_open, every), None
+    verdict, proposal = _verdict(found, lines), None
     if verdict.status == "unexplained" and found.left:
         progress("looking for a closed form of what remains")
         proposal = propose(problem, chosen.residual, found.left, chosen.columns)
@@ -168,17 +165,7 @@ def _members(problem: Problem, found: Search) -> list[Refined]:
     return out
 
 
-def _left_open(lines: list[Shrinkage]) -> tuple[list[Shrinkage], bool]:
-    """Channels with a plain gap of which held-out trials close nothing, the plainest first, and whether all are such.
-
-    Where one closes, another may have a cause of its own; where none does, nothing is explained.
-    """
-    plain = [x for x in lines if x.resolvable and x.channel != "q" and x.before > PLAIN * x.noise]
-    left = [x for x in plain if x.closed_ci95[1] < CLOSES]
-    return sorted(left, key=lambda x: -x.before / x.noise), bool(plain) and len(left) == len(plain)
-
-
-def _verdict(found: Search, lines: list[Shrinkage], left_open: list[Shrinkage], every: bool) -> Verdict:
+def _verdict(found: Search, lines: list[Shrinkage]) -> Verdict:
     chosen = found.chosen
     assert chosen is not None
     order = np.argsort(-np.asarray(found.shares))
@@ -188,8 +175,8 @@ def _verdict(found: Search, lines: list[Shrinkage], left_open: list[Shrinkage], 
     if found.unlisted > 0.5:
         end = "s" if len(effects) == 1 else ""
         fails = f"leave{end} {100 * _left_share(found):.0f} % of what a smooth law could explain"
-        if every:
-            worst = left_open[0]
+        if contradicts(lines):
+            worst = max((x for x in lines if x.plain), key=lambda x: x.before / x.noise)
             fails = f"close{end} {100 * worst.closed:.0f} % of the gap in {_channel(worst)} on held-out trials"
         text = f"There is a gap, and none of the known effects explains it: the nearest, {names}, {fails}."
         return Verdict("unexplained", (), f"{text} {_depends(found)}")
@@ -207,7 +194,7 @@ def _verdict(found: Search, lines: list[Shrinkage], left_open: list[Shrinkage], 
         effects,
         f"The gap is explained by {names}: {100 * share:.0f} % of what can be explained. "
         f"On held-out trials it closes up to {100 * best:.0f} % of the gap in the channel that shows it best."
-        + "".join(f" {_channel(x)} stays at {x.after / x.noise:.1f} times its noise." for x in left_open),
+        + "".join(f" {_channel(x)} stays at {x.after / x.noise:.1f} times its noise." for x in lines if x.stays_open),
     )
 
 
@@ -257,7 +244,7 @@ def as_gap_json(d: Diagnosis) -> dict:
         values = by_effect.get(c.key[0] + "".join(c.key[1]))
         if values is None:
             effect = c.evidence.variant.effect
-            units = effect.units(d.problem.nominal.finger, c.key[1])
+            units = units_at(d.problem.nominal.finger, effect, c.key[1])
             sizes = [v[1] for v in effect.AMPLITUDES.values()]
             found = zip(effect.AMPLITUDES, c.evidence.amplitudes, c.evidence.std, sizes, strict=True)
             stated = {n: _with_prior(float(a), float(u), s) for n, a, u, s in found}

@@ -24,6 +24,8 @@ from jaxfinger.identify.solve import Prior, bounded
 from jaxfinger.model import Model
 
 RESOLVABLE = 1.1  # mean square before over that of the noise, from which on a gap can be said to close
+PLAIN = 1.3  # rms before, in that of the noise, from which on held-out trials must know the effects that are named
+CLOSES = 0.3  # share of one such gap that is to be within the interval of what closes; true effects: 0.6 and more
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,24 @@ class Shrinkage:
     closed: float
     closed_ci95: tuple[float, float]
     resolvable: bool  # whether the gap before stands out of the noise
+
+    @property
+    def plain(self) -> bool:
+        """Whether a measured channel misses so much that held-out trials must know what explains it."""
+        return self.resolvable and self.channel != "q" and self.before > PLAIN * self.noise
+
+    @property
+    def stays_open(self) -> bool:
+        """Whether nothing closes of a plain gap."""
+        return self.plain and self.closed_ci95[1] < CLOSES
+
+
+def contradicts(lines: list[Shrinkage]) -> bool:
+    """Whether held-out trials know nothing of what is named: where one channel closes, another may have a cause of its
+    own; where no plain gap does, nothing is explained.
+    """
+    plain = [x for x in lines if x.plain]
+    return bool(plain) and all(x.stays_open for x in plain)
 
 
 def shrinkage(

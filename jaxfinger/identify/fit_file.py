@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfinger.data.atomic import atomic_path
+from jaxfinger.effects import CatalogueEffect, from_dict, load, to_dict
 from jaxfinger.errors import UserError
 from jaxfinger.identify.fit import SCHEMA, Fit, StageReport
 from jaxfinger.identify.noise import Noise
-from jaxfinger.identify.parameters import describe
+from jaxfinger.identify.parameters import describe, units_at
 from jaxfinger.identify.recipe import as_dict, structure
 from jaxfinger.model import Finger, JointTorque, Model, MomentArm, TendonFriction
 
@@ -71,11 +72,8 @@ def _to_dict(fit: Fit) -> dict[str, Any]:
     model, names = fit.model, [p.name for p in describe(fit.model)]
     rows = np.flatnonzero(np.diag(fit.covariance) != 0)
     covariance = np.where(np.isfinite(fit.covariance), fit.covariance, np.inf)[np.ix_(rows, rows)]
-    effects = []
-    if model.effects:
-        from jaxfinger.effects import to_dict
-
-        effects = [to_dict(model.finger, e) for e in model.effects]
+    catalogued = [e for e in model.effects if isinstance(e, CatalogueEffect)]  # as `describe` has made sure
+    effects = [to_dict(e, units_at(model.finger, type(e), e.site)) for e in catalogued]
     content = {
         "schema": SCHEMA,
         "specimen": fit.specimen,
@@ -153,8 +151,6 @@ def _model(content: dict[str, Any], effects: str | os.PathLike | None) -> Model:
         TendonFriction(**_fields(content, "tendon_friction", constant=(n,), proportional=(n,))),
     )
     if content["effects"]:
-        from jaxfinger.effects import from_dict, load
-
         own = load(effects) if effects is not None else {}
         known = tuple(from_dict(finger, e, own) for e in content["effects"])
         model = Model(finger, model.moment_arm, model.joint_torque, model.tendon_friction, known)

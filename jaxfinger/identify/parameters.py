@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxfinger.effects import CatalogueEffect
-from jaxfinger.model import Model
+from jaxfinger.data.schema import units_where
+from jaxfinger.effects import CatalogueEffect, Site
+from jaxfinger.model import Finger, Model
 
 
 @eqx.filter_jit
@@ -73,6 +74,15 @@ def _leaves(model: Model):
     return jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
 
 
+def units_at(finger: Finger, effect: type[CatalogueEffect], site: Site) -> dict[str, str]:
+    """Units of an effect's parameters at a site: those of lengths and forces where its joints slide."""
+    own = [slides for joint, slides in zip(finger.joint_names, finger.prismatic, strict=True) if joint in site]
+    if own:
+        return {k: units_where(u, own) for k, u in effect.units().items()}
+    # A base or a sensor that is turned is turned by an angle.
+    return {k: u if u == "rad" else units_where(u, finger.prismatic) for k, u in effect.units().items()}
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One entry of the flat vector."""
@@ -128,7 +138,7 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
             effect = model.effects[i]
             assert isinstance(effect, CatalogueEffect)
             label = f"{effect.ID} {'-'.join(effect.site)} {field}"
-            units = effect.units(model.finger, effect.site)
+            units = units_at(model.finger, type(effect), effect.site)
             if index or field not in units:  # a constant that the effect carries
                 return Parameter(f"{label} {index}" if index else label, "constant", "", determinable=False)
             return Parameter(label, "effects", units[field])
