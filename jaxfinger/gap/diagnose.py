@@ -144,7 +144,7 @@ def _retuned(problem: Problem, fit: Fit) -> str:
 
 def _rivals(problem: Problem, found: Search):
     """The strongest candidates with their signatures."""
-    signatures = Signatures(problem, problem.nominal)
+    signatures = Signatures(problem)
     top = [(c.evidence, c.refined) for c in found.candidates if c.refined][:6]
     return [(evidence, signatures.columns(at_optimum(refined)[0])[0]) for evidence, refined in top]
 

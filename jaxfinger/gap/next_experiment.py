@@ -57,7 +57,7 @@ def next_experiment(problem: Problem, members: list[Refined]) -> NextExperiment 
     best, place = 0.0, None
     for stacks in _short_list(problem, shown):
         there = imagined(problem, stacks)
-        signatures = Signatures(there, there.nominal)
+        signatures = Signatures(there)
         read = [derivatives(signatures, m) for m in members]
         predicted = [there.J @ step + change for step, (change, _) in zip(steps, read, strict=True)]
         slopes = [np.vstack([there.J.T, of_member]) for _, of_member in read]

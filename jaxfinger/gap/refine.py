@@ -69,7 +69,7 @@ def refine(
     finger = problem.nominal.finger
     effects = [within_bounds(v.at(finger, s)) for v, s in zip(variants, start, strict=True)]
     coordinates = _coordinates(variants)
-    signatures, projector = Signatures(problem, problem.nominal), projector or Projector(problem)
+    signatures, projector = Signatures(problem), projector or Projector(problem)
     reach = np.full(len(coordinates), STEP)
     base, slopes = _evaluate(signatures, effects, coordinates, reach)
     r = problem.r - base
@@ -156,7 +156,7 @@ def _brought_along(problem: Problem, step: Float[np.ndarray, " p"], refined: Ref
     here (a share of a friction grows as that friction shrinks); and what they leave of the sum of squares.
     """
     here = moved(problem, step)
-    signatures = Signatures(here, here.nominal)
+    signatures = Signatures(here)
     changes = np.concatenate([signatures.of([e]) for e in refined.effects])
     scale = np.linalg.lstsq(changes.T, refined.change, rcond=1e-9)[0]
     scale = np.where(scale > 0.0, scale, 1.0)

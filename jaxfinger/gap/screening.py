@@ -65,7 +65,7 @@ class Scan:
         without = set(size).difference(*effect.PERIODS.values())
         members = [shape | {a: size[a]} for a in size if a in without]
         members += [shape | {name: period, a: size[a]} for period in periods for a in pair]
-        finger = signatures.nominal.finger
+        finger = signatures.problem.nominal.finger
         columns = signatures.of([effect.at(finger, site, **values) for values in members])
         return cls(signatures, items, periods, middle, columns)
 
@@ -102,7 +102,7 @@ class Screening:
     @classmethod
     def of(cls, problem: Problem, items: list[Variant], progress: Progress = lambda message: None) -> "Screening":
         """Signatures at the problem's nominal model; classes are compiled side by side."""
-        signatures, groups = Signatures(problem, problem.nominal), {}
+        signatures, groups = Signatures(problem), {}
         for v in items:
             groups.setdefault(_part(v), []).append(v)
 

@@ -235,7 +235,7 @@ def _held_out(
     left |= {k: float(held_out_energies(problem, [refined[k].change[None]])[1][0]) for k, problem in there.items()}
     gains = {k: alone - x for k, x in left.items()}
     if len(chosen.effects) > 1:
-        signatures = Signatures(problem, problem.nominal)
+        signatures = Signatures(problem)
         changes = np.concatenate([signatures.of([e]) for e in chosen.effects])
         without_one = [np.delete(changes, i, axis=0) for i in range(len(changes))]
         together, *less = held_out_energies(problem, [changes, *without_one])[1]

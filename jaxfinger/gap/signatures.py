@@ -86,7 +86,7 @@ def _change(
             y = y0 + excursion(model, true) - excursion(nominal, x)
         elif effect.MOVES_RIGID_BODY:
             full = external_torque if channel == "joint_torque" else fingertip_force
-            y = y0 + full(model, true) - full(nominal, x)
+            y = full(model, true)
         else:
             change = resisting_torque(model, true) - base
             y = y0 + (change if contact is None else jnp.sum(contact * change[None], axis=1))
@@ -114,10 +114,9 @@ class _Group:
 
 @dataclass(frozen=True)
 class Signatures:
-    """Reads signatures off a problem; `nominal` may be another point than the problem's own."""
+    """Reads signatures off a problem."""
 
     problem: Problem
-    nominal: Model
 
     @cached_property
     def groups(self) -> list[_Group]:
@@ -149,7 +148,7 @@ class Signatures:
         x = jax.tree.map(merge, *motions)
         y0 = merge(*(self.problem.predicted[e, channel] for e in experiments))
         starts = np.cumsum([0] + [b.x.time.shape[0] for b in batches])
-        contact = _contact(self.nominal, x) if channel == "fingertip_force" else None
+        contact = _contact(self.problem.nominal, x) if channel == "fingertip_force" else None
         return _Group(channel, x, y0, dict(zip(experiments, starts.tolist(), strict=False)), contact)
 
     def of(self, members: list[CatalogueEffect]) -> Float[np.ndarray, "members N"]:
@@ -158,16 +157,15 @@ class Signatures:
 
     def _chunk(self, members: list[CatalogueEffect]) -> Float[np.ndarray, "members N"]:
         out = np.zeros((len(members), self.problem.r.size))
-        kind = type(members[0])
+        kind, nominal = type(members[0]), self.problem.nominal
         padded = members + members[:1] * (CHUNK - len(members))
         stacked = jax.tree.map(lambda *a: np.stack(a), *[replace(m, site=()) for m in padded])
         for group in self.groups:
             shown = [e for e in group.first if group.channel in kind.SHOWS.get(e, ())]
             if not shown:
                 continue
-            count = jnp.asarray(len(members))
-            raw = np.asarray(_change(group.channel, stacked, self.nominal, group.x, group.y0, group.contact, count))
-            raw = raw[: len(members)]
+            raw = _change(group.channel, stacked, nominal, group.x, group.y0, group.contact, jnp.asarray(len(members)))
+            raw = np.asarray(raw)[: len(members)]
             for e in shown:
                 rows = self.problem.rows[e]
                 B = len(self.problem.stacks[e].trials)
@@ -180,7 +178,7 @@ class Signatures:
 
     def columns(self, items: list[Variant]) -> Float[np.ndarray, "variants amplitudes N"]:
         """Signatures per plausible size, one amplitude at a time, for variants of one class."""
-        effect, finger = items[0].effect, self.nominal.finger
+        effect, finger = items[0].effect, self.problem.nominal.finger
         names = list(effect.AMPLITUDES)
         members = [v.at(finger, {n: v.size * effect.AMPLITUDES[n][1]}) for v, n in product(items, names)]
         sizes = np.array([v.size for v in items])[:, None, None]

@@ -82,7 +82,7 @@ def test_a_share_is_at_most_one_and_leaves_that_bound_where_it_is_less(problem, 
     """Residuals of a friction of which so much builds up over 20 mrad."""
     kind, site = CATALOGUE["joint_presliding"], (problem.nominal.finger.joint_names[0],)
     effect = kind.at(problem.nominal.finger, site, a=share, x0=0.02)
-    there = replace(problem, r=problem.r + Signatures(problem, problem.nominal).of([effect])[0])
+    there = replace(problem, r=problem.r + Signatures(problem).of([effect])[0])
     rt = Projector(there).residual(there, there.r)
     found = refine(there, [Variant(kind, site, (("x0", 0.016),))], [{"a": start}], float(rt @ rt))
     if share < 1.0:
@@ -96,7 +96,7 @@ def test_a_length_is_found_while_the_share_stays_at_its_most(problem, start):
     """Which trials tell of a friction and its length is nearly their product: from any start the same optimum."""
     kind, site = CATALOGUE["joint_presliding"], (problem.nominal.finger.joint_names[0],)
     effect = kind.at(problem.nominal.finger, site, a=1.0, x0=0.02, delta=0.5)
-    there = replace(problem, r=problem.r + Signatures(problem, problem.nominal).of([effect])[0])
+    there = replace(problem, r=problem.r + Signatures(problem).of([effect])[0])
     rt = Projector(there).residual(there, there.r)
     a, x0 = start
     found = refine(there, [Variant(kind, site, (("x0", x0), ("delta", 0.5)))], [{"a": a}], float(rt @ rt))

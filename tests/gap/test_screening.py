@@ -58,7 +58,7 @@ def test_a_long_session_is_scanned_down_to_a_longer_period(diagnosis, monkeypatc
             x = stack.batch.x
             clock = np.linspace(0.0, length, x.session_time.size).reshape(x.session_time.shape)
             days[e] = replace(stack, batch=replace(stack.batch, x=replace(x, session_time=clock)))
-        there = Signatures(replace(problem, stacks=days), problem.nominal)
+        there = Signatures(replace(problem, stacks=days))
         scan = Scan.of(there, [Variant(DRIFT, SITE, ())])
         assert len(DRIFT.PERIODS) <= len(scan.periods) <= MOST
         assert np.all(scan.periods > 0.0)
