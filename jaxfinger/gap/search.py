@@ -5,7 +5,7 @@
 2. Take the best. What is left of the gap is screened again on top of it; a further effect joins while it explains a
    fair part of what is left beyond the first one's own error of form, and all are refitted together.
 3. «Unlisted» competes through the flexible stand-in: the part of the gap that it explains beyond the chosen effects.
-4. Evidence counts a limited number of independent looks. A candidate that leaves the energy U unexplained has
+4. Evidence counts a limited number of independent looks. A candidate whose log evidence is ½ U below the best one's has
    log L = −½ ν log(1 + U/ν), Student's t with ν looks: Gaussian for a candidate that fits to the noise, and tolerant
    where all forms are a little wrong, as textbook forms are.
 """
@@ -134,7 +134,7 @@ def search(
     alone = len(chosen.variants) == 1 and energy_left(left) < OPEN[1][0] * gap
     if alone and held_out[chosen.keys[0]] < CARRIES:
         return _none_named(ranked, refined, held_out, explained(start, start.r))
-    return _judge(ranked, refined, held_out, chosen, shares, chi2, gap, left)
+    return _judge(ranked, refined, held_out, chosen, shares, gap, left)
 
 
 def _rivals(refined: dict[tuple, Refined], best: Refined, chi2: float, most: int) -> list[tuple]:
@@ -256,17 +256,12 @@ def _shares(problem, chosen: Refined, chi2: float, gap: float) -> tuple[float, .
     return tuple(out)
 
 
-def _judge(ranked, refined, held_out, chosen, shares, chi2, gap, left) -> Search:
-    """Probabilities: rivals of the first effect by what they leave unexplained, «unlisted» by what all leave."""
+def _judge(ranked, refined, held_out, chosen, shares, gap, left) -> Search:
+    """Probabilities: rivals of the first effect by their evidence, «unlisted» by what all leave unexplained."""
     first, beyond = chosen.keys[int(np.argmax(shares))], energy_left(left)
-    floor = min(r.chi2 for r in refined.values())
-    unexplained = {}
-    for e in ranked:
-        r = refined.get(e.variant.key)
-        unexplained[e.variant.key] = (r.chi2 if r else chi2 - e.explained) - floor
-        if r is None and e.log_bf <= 0:
-            unexplained[e.variant.key] = chi2 - floor
-    log_l = {k: -0.5 * LOOKS * np.log1p(max(u, 0.0) / LOOKS) for k, u in unexplained.items()}
+    logs = _log_evidences(ranked, refined)
+    most = max(r.log_evidence for r in refined.values())
+    log_l = {k: -0.5 * LOOKS * np.log1p(2.0 * (most - np.clip(v, 0.0, most)) / LOOKS) for k, v in logs.items()}
     total = logsumexp(list(log_l.values()))
     share_left = beyond / gap
     even, width = OPEN[len(chosen.variants)]
@@ -302,6 +297,11 @@ def _judge(ranked, refined, held_out, chosen, shares, chi2, gap, left) -> Search
     )
 
 
+def _log_evidences(ranked: list[Evidence], refined: dict[tuple, Refined]) -> dict[tuple, float]:
+    """Of every candidate alone, against the nominal model: of its refit where there is one."""
+    return {e.variant.key: e.log_bf for e in ranked} | {k: r.log_evidence for k, r in refined.items()}
+
+
 def _candidates(ranked: list[Evidence], probability, held_out, refined) -> list[Candidate]:
     """All of them, the likeliest first."""
     keyed = {e.variant.key: e for e in ranked}
@@ -322,7 +322,7 @@ def _none_named(ranked: list[Evidence], refined, held_out: dict[tuple, float], l
     strongest = max((r.log_evidence for r in refined.values()), default=ranked[0].log_bf)
     none = 1e-6 if gap else float(np.clip(expit((DETECT - strongest) / 2.0), 0.5, 0.995))
     known = 0.1 if gap else 0.7 * (1 - none)
-    logs = {e.variant.key: e.log_bf for e in ranked} | {k: r.log_evidence for k, r in refined.items()}
+    logs = _log_evidences(ranked, refined)
     weights = {k: np.exp(0.2 * (np.clip(v, -5.0, strongest) - strongest)) for k, v in logs.items()}
     total = sum(weights.values())
     probability = {k: float(w * known / total) for k, w in weights.items()}
