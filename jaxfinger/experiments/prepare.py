@@ -118,7 +118,7 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     noise = np.median(np.abs(trial.q - filtered), axis=0)
     # When a joint turns back shows best in the slower filter: there noise of q̇ is noise in time.
     slow = spec.held or (reduced and not spec.stepped)
-    turning = qd if slow else smooth(trial.time, trial.q, spec.cutoff)[1]
+    turning = qd if slow else smooth(trial.time, trial.q, spec.cutoff_at(step))[1]
     # Otherwise averaged over the same blocks as what it predicts, and not filtered where that is not.
     q = trial.q if spec.samples == "holds" or (spec.samples == "all" and reduced) else filtered
     if spec.samples == "holds":
@@ -261,11 +261,11 @@ def _rates(trial: Trial, spec: Experiment, step: float) -> tuple[np.ndarray, np.
 
 
 def _sliding(
-    spec: Experiment, trial: Trial, session: Session, step: float, qd, slow, direction, rates, motorised
+    spec: Experiment, trial: Trial, session: Session, step: float, qd, turning, direction, rates, motorised
 ) -> np.ndarray:
     """(N, m): 1 where a joint and every taut tendon across it slide, so that the directions of friction are known.
 
-    `slow`: speeds in the slower filter; `rates`: of the tendons, none where all are slack or not measured.
+    `turning`: speeds in the slower filter; `rates`: of the tendons, none where all are slack or not measured.
     """
     fast = np.percentile(np.abs(qd), 95, axis=0)
     least = np.where(motorised, MIN_DRIVEN_SPEED, MIN_JOINT_SPEED)
@@ -277,8 +277,8 @@ def _sliding(
             slides[:, i] &= known[:, session.finger.crosses[:, i] & session.finger.active].all(axis=1)
     if not spec.stepped:
         # A slip between two stops is too fast for the filter, and moves every joint.
-        lost = np.abs(smooth(trial.time, trial.q, _quicker(spec.cutoff_at(step), step))[1] - slow)
-        most = np.maximum(LOST * np.percentile(np.abs(slow), 95, axis=0), ABOVE_NOISE * np.median(lost, axis=0))
+        lost = np.abs(smooth(trial.time, trial.q, _quicker(spec.cutoff_at(step), step))[1] - turning)
+        most = np.maximum(LOST * np.percentile(np.abs(turning), 95, axis=0), ABOVE_NOISE * np.median(lost, axis=0))
         slides &= np.all(lost <= most + ROUNDING, axis=1)[:, None]
     # The filter spreads the jump of friction at a reversal, and friction before it slides is not known.
     clear = minimum_filter1d(

@@ -130,7 +130,9 @@ def search(
     left = explained(problem, chosen.residual)
     gap = chi2 - chosen.chi2 + energy_left(left)
     shares = _shares(problem, chosen, chi2, gap)
-    held_out = _held_out(start, there, problem, chosen, ranked, refined, screen, chi2, gap)
+    held_out = _held_out(start, there, ranked, refined, screen, chi2, gap)
+    if len(chosen.variants) > 1:
+        held_out |= _beside(problem, chosen, chi2, gap)
     alone = len(chosen.variants) == 1 and energy_left(left) < OPEN[1][0] * gap
     if alone and held_out[chosen.keys[0]] < CARRIES:
         return _none_named(ranked, refined, held_out, explained(start, start.r))
@@ -218,11 +220,9 @@ def _fits(drop: np.ndarray, left: np.ndarray) -> float:
     return float(0.5 * LOOKS * np.sum(np.log1p(before / LOOKS) - np.log1p(after / LOOKS)))
 
 
-def _held_out(
-    start: Problem, there: dict[tuple, Problem], problem: Problem, chosen: Refined, ranked, refined, screen, chi2, gap
-) -> dict[tuple, float]:
+def _held_out(start, there, ranked, refined, screen: Screening, chi2: float, gap: float) -> dict[tuple, float]:
     """Share of the gap that each candidate explains alone on held-out trials: the strongest where they have led, others
-    at the nominal model; of those that explain any of what they have seen. Effects chosen together: beside each other.
+    at the nominal model; of those that explain any of what they have seen.
     """
     some = {e.variant.key: e for e in ranked if e.explained > TRIED * gap}
     members = {
@@ -233,15 +233,21 @@ def _held_out(
     alone, with_member = held_out_energies(start, list(members.values()))
     left = dict(zip(members, with_member.tolist(), strict=True))
     left |= {k: float(held_out_energies(problem, [refined[k].change[None]])[1][0]) for k, problem in there.items()}
-    gains = {k: alone - x for k, x in left.items()}
-    if len(chosen.effects) > 1:
-        signatures = Signatures(problem)
-        changes = np.concatenate([signatures.of([e]) for e in chosen.effects])
-        without_one = [np.delete(changes, i, axis=0) for i in range(len(changes))]
-        together, *less = held_out_energies(problem, [changes, *without_one])[1]
-        gains |= {k: x - together for k, x in zip(chosen.keys, less, strict=True)}
-    seen = max(alone - (chi2 - gap), 1e-9)
-    return {k: float(np.clip(gain / seen, 0.0, 1.0)) for k, gain in gains.items()}
+    return {k: _share(alone - x, alone, chi2 - gap) for k, x in left.items()}
+
+
+def _beside(problem: Problem, chosen: Refined, chi2: float, gap: float) -> dict[tuple, float]:
+    """Share of the gap that each of the effects chosen together explains on held-out trials beside the others."""
+    signatures = Signatures(problem)
+    changes = np.concatenate([signatures.of([e]) for e in chosen.effects])
+    less_one = [np.delete(changes, i, axis=0) for i in range(len(changes))]
+    alone, (together, *left) = held_out_energies(problem, [changes, *less_one])
+    return {k: _share(x - together, alone, chi2 - gap) for k, x in zip(chosen.keys, left, strict=True)}
+
+
+def _share(gain: float, alone: float, noise: float) -> float:
+    """Of what the nominal model alone misses beyond the noise."""
+    return float(np.clip(gain / max(alone - noise, 1e-9), 0.0, 1.0))
 
 
 def _shares(problem, chosen: Refined, chi2: float, gap: float) -> tuple[float, ...]:

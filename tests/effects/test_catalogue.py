@@ -106,11 +106,7 @@ def test_a_term_that_a_recipe_left_out_has_the_recipes_degree():
     site = constant.sites(FINGER)[0]
     effect = constant.at(FINGER, site, c0=0.01)
     assert effect.values() == {"c0": pytest.approx(0.01)}
-    assert from_dict(FINGER, written(effect)).values() == {
-        "c0": pytest.approx(0.01),
-        "c1": 0.0,
-        "c2": 0.0,
-    }
+    assert from_dict(FINGER, written(effect)).values() == {"c0": pytest.approx(0.01), "c1": 0.0, "c2": 0.0}
     moving = [p for p in describe(with_effects(effect)) if p.group == "effects" and p.determinable]
     assert [p.name.split()[-1] for p in moving] == ["c0"]
     assert nominal_terms(2, 2) == NOMINAL_TERMS
