@@ -1,6 +1,13 @@
-"""How functions are compiled: what runs a few times only must compile cheaply."""
+"""How functions are compiled and run: what runs a few times only must compile cheaply."""
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import equinox as eqx
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 # XLA's fusion emitters take half as long again, or more, to compile these scalar formulas, which then run no faster.
 QUICK = {"xla_cpu_use_fusion_emitters": False}
@@ -8,3 +15,13 @@ QUICK = {"xla_cpu_use_fusion_emitters": False}
 # For a fit's iterations, and for a handful of calls. The overloads of equinox leave the options of jit out.
 quick_jit = eqx.filter_jit(compiler_options=QUICK)  # type: ignore[call-overload]
 once_jit = eqx.filter_jit(compiler_options=QUICK | {"xla_backend_optimization_level": 0})  # type: ignore[call-overload]
+
+
+def side_by_side(f: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """f of each item, in order, two at a time: while one is traced by Python, another compiles or runs.
+
+    No program among them may call LAPACK, as QR and `solve` do: two that do, dispatched at once, can hold all of XLA's
+    processor threads and wait for ever (20,000 systems of three equations do). NumPy has no such trap.
+    """
+    with ThreadPoolExecutor(2) as pool:
+        yield from pool.map(f, items)

@@ -1,18 +1,17 @@
 """Screening: the evidence of every candidate, linearly, against what is left to explain."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxfinger.compilation import side_by_side
 from jaxfinger.gap.evidence import Evidence, Projector, evidence
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signatures import Signatures, Variant
 from jaxfinger.identify.stages import Progress
 
-THREADS = 2
 SHORTEST = 20.0  # s: the shortest period that is looked for
 MOST = 300  # periods: beyond 50 minutes the shortest grows with the session, for memory's sake
 RIDGE = 1e-9  # relative, of products of columns
@@ -114,10 +113,9 @@ class Screening:
 
         parts = {}
         _ = signatures.groups  # before two threads ask for them
-        with ThreadPoolExecutor(THREADS) as pool:
-            for key, part in zip(groups, pool.map(read, groups.values()), strict=True):
-                parts[key] = part
-                progress(f"signatures of {key[0]} ({len(parts)} of {len(groups)} effects)")
+        for key, part in zip(groups, side_by_side(read, groups.values()), strict=True):
+            parts[key] = part
+            progress(f"signatures of {key[0]} ({len(parts)} of {len(groups)} effects)")
         return cls(parts)
 
     def __call__(self, projector: Projector, rt: Float[np.ndarray, " N+prior"]) -> list[Evidence]:

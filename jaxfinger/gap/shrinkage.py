@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxfinger.compilation import side_by_side
 from jaxfinger.data.schema import channel_units
 from jaxfinger.experiments import prepare
 from jaxfinger.gap.augment import limits, without_shapes
@@ -173,8 +174,8 @@ def _choice(problem: Problem, rivals: list[tuple[Evidence, np.ndarray]], trainin
 
 def _missed(problem: Problem, model: Model) -> dict[tuple[str, str], Float[np.ndarray, "columns B T"]]:
     """Measured − predicted of every experiment's channels."""
-    found = {e: residuals_of(model, s.batch, s.experiment.channels) for e, s in problem.stacks.items()}
-    return {(e, c): x for e, residuals in found.items() for c, x in residuals.items()}
+    found = side_by_side(lambda s: residuals_of(model, s.batch, s.experiment.channels), problem.stacks.values())
+    return {(e, c): x for e, residuals in zip(problem.stacks, found, strict=True) for c, x in residuals.items()}
 
 
 def _misfit(problem: Problem, missed: dict[tuple[str, str], np.ndarray], keep: dict[str, np.ndarray]) -> float:

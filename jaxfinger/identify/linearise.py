@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
@@ -27,7 +28,7 @@ class Linearised(NamedTuple):
     residuals: dict[str, Float[np.ndarray, "columns B T"]]  # measured − predicted, by channel, in the channel's unit
     white: Float[np.ndarray, "B rows"]  # the same, whitened and flat, before weights
     jacobian: Float[np.ndarray, "B rows p"]  # J, before weights
-    factor: Float[np.ndarray, "B p+1 p+1"]  # triangular, of [J r] with weights
+    factor: Float[np.ndarray, "B k p+1"]  # triangular, of [J r] with weights
 
 
 def white_rows(model: Model, batch: Batch, filters: Filters) -> tuple[dict, Float[Array, "B rows"]]:
@@ -52,18 +53,17 @@ def linearise(
     Compiled for the batch `widened`, whose additions are cut off again.
     """
     (B, T), wide = batch.x.time.shape, widened(batch)
-    shape = len(wide.x.time), sum(len(f) for f in filters.values()), wide.x.time.shape[-1]
-    weight = np.ones(shape)
-    if weights is not None:
-        weight[:B, :, :T] = weights.reshape(B, -1, T)
-    residuals, white, J, factor = _linearise(model, free, wide, filters, jnp.asarray(weight.reshape(shape[0], -1)))
+    residuals, white, J = _linearise(model, free, wide, filters)
 
     def cut(rows):
-        each = np.asarray(rows).reshape(*shape, *rows.shape[2:])
-        return each[:B, :, :T].reshape(B, -1, *rows.shape[2:])
+        each = np.asarray(rows)[:B].reshape(B, -1, wide.x.time.shape[-1], *rows.shape[2:])
+        return each[:, :, :T].reshape(B, -1, *rows.shape[2:])
 
-    residuals = {c: np.asarray(a)[:, :B, :T] for c, a in residuals.items()}
-    return Linearised(residuals, cut(white), cut(J), np.asarray(factor)[:B])
+    residuals, white, J = {c: np.asarray(a)[:, :B, :T] for c, a in residuals.items()}, cut(white), cut(J)
+    columns = np.concatenate([J, white[..., None]], axis=-1)
+    if weights is not None:
+        columns *= weights[..., None]
+    return Linearised(residuals, white, J, np.asarray(np.linalg.qr(columns, mode="r")))
 
 
 @quick_jit
@@ -73,14 +73,27 @@ def _residuals(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[st
 
 
 @quick_jit
-def _linearise(model: Model, free: Free, batch: Batch, filters: Filters, weights: Float[Array, "B rows"]):
-    theta = free.get(model)
-
-    def f(theta):
-        residuals, white = white_rows(free.set(model, theta), batch, filters)
+def _linearise(model: Model, free: Free, batch: Batch, filters: Filters):
+    def f(values):
+        residuals, white = white_rows(free.put(model, values), batch, filters)
         return white, residuals
 
-    white, pushforward, residuals = jax.linearize(f, theta, has_aux=True)
-    J = jnp.moveaxis(jax.lax.map(pushforward, jnp.eye(theta.size)), 0, -1)
-    columns = jnp.concatenate([J, white[..., None]], axis=-1) * weights[..., None]
-    return residuals, white, J, jnp.linalg.qr(columns, mode="r")
+    values = free.values(model)
+    white, pushforward, residuals = jax.linearize(f, values, has_aux=True)
+    still = jax.tree.map(jnp.zeros_like, values)
+
+    def columns(part: str) -> Float[Array, "k B rows"]:
+        """Derivatives by the parameters of one part of the model. The derivative of a linear function is itself, but
+        for what the zeros of the other parts pass through: most of it.
+        """
+        mine = [k for k, p in enumerate(free.parts) if p == part]
+        zero, split = ravel_pytree([still[k] for k in mine])
+
+        def alone(step):
+            moved = dict(zip(mine, split(step), strict=True))
+            return pushforward([moved.get(k, z) for k, z in enumerate(still)])
+
+        return jax.lax.map(lambda unit: jax.jvp(alone, (zero,), (unit,))[1], jnp.eye(zero.size))
+
+    J = jnp.concatenate([columns(part) for part in dict.fromkeys(free.parts)])
+    return residuals, white, jnp.moveaxis(J, 0, -1)

@@ -36,38 +36,45 @@ class Free(eqx.Module):
     """Which entries of the flat vector are free: per leaf, so that the derivative of the rest is known to vanish."""
 
     leaves: tuple[int, ...] = eqx.field(static=True)
+    parts: tuple[str, ...] = eqx.field(static=True)  # field of the model that each of those leaves is of
     entries: tuple[Int[Array, " k"], ...]  # positions within each of those leaves
 
     @classmethod
     def at(cls, model: Model, positions: Int[np.ndarray, " p"]) -> "Free":
         """The entries at these positions of the flat vector, in ascending order."""
-        starts = np.cumsum([0] + [leaf.size for leaf in _leaves(model)])
+        paths, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(model, eqx.is_inexact_array))
+        starts = np.cumsum([0] + [leaf.size for _, leaf in paths])
         positions = np.asarray(positions)
         if np.any(np.diff(positions) <= 0):
             raise ValueError("positions must ascend")
         within = {i: positions[(positions >= a) & (positions < b)] - a for i, (a, b) in enumerate(pairwise(starts))}
-        return cls(
-            tuple(i for i, e in within.items() if e.size),
-            tuple(jnp.asarray(e) for e in within.values() if e.size),
-        )
+        leaves = tuple(i for i, e in within.items() if e.size)
+        parts = tuple(str(getattr(paths[i][0][0], "name", "")) for i in leaves)
+        return cls(leaves, parts, tuple(jnp.asarray(within[i]) for i in leaves))
+
+    def values(self, model: Model) -> list[Float[Array, " k"]]:
+        """The free parameters of a model, leaf by leaf."""
+        leaves = _leaves(model)
+        return [leaves[i].ravel()[e] for i, e in zip(self.leaves, self.entries, strict=True)]
+
+    def put(self, model: Model, values: list[Float[Array, " k"]]) -> Model:
+        """The model with other free parameters, leaf by leaf."""
+        arrays, rest = eqx.partition(model, eqx.is_inexact_array)
+        leaves, treedef = jax.tree.flatten(arrays)
+        for i, e, value in zip(self.leaves, self.entries, values, strict=True):
+            leaves[i] = leaves[i].ravel().at[e].set(value).reshape(leaves[i].shape)
+        return eqx.combine(jax.tree.unflatten(treedef, leaves), rest)
 
     @eqx.filter_jit
     def get(self, model: Model) -> Float[Array, " p"]:
         """The free parameters of a model."""
-        leaves = _leaves(model)
-        return jnp.concatenate([leaves[i].ravel()[e] for i, e in zip(self.leaves, self.entries, strict=True)])
+        return jnp.concatenate(self.values(model))
 
     @eqx.filter_jit
     def set(self, model: Model, theta: Float[Array, " p"]) -> Model:
         """The model with its free parameters set to `theta`."""
-        arrays, rest = eqx.partition(model, eqx.is_inexact_array)
-        leaves, treedef = jax.tree.flatten(arrays)
-        start = 0
-        for i, e in zip(self.leaves, self.entries, strict=True):
-            part = theta[start : start + e.size]
-            leaves[i] = leaves[i].ravel().at[e].set(part).reshape(leaves[i].shape)
-            start += e.size
-        return eqx.combine(jax.tree.unflatten(treedef, leaves), rest)
+        ends = np.cumsum([0] + [e.size for e in self.entries])
+        return self.put(model, [theta[a:b] for a, b in pairwise(ends)])
 
 
 def _leaves(model: Model):

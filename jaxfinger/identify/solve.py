@@ -8,7 +8,7 @@
 3. optimistix solves in coordinates z along the visible singular vectors, θ = θ_k + B z, in which the Gauss–Newton
    matrix is the identity. Most of equation (1) is linear in its parameters: one step, whatever the conditioning of θ.
 4. Where it is not (slip of held tendons, products of moment arms and losses) the model is linearised again at the new
-   point, and a step that did not lower the cost is halved, until a step is a small part of a standard deviation, or
+   point, and a step that did not lower the cost is cut, until a step is a small part of a standard deviation, or
    a whole one that is a tenth of it leads no further down.
 5. A mass that would fall to nothing stays on its floor, and what has limits within them, while the others are
    minimised with it there.
@@ -26,6 +26,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 from scipy.optimize import lsq_linear
 
+from jaxfinger.compilation import side_by_side
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch
 from jaxfinger.identify.linearise import Filters, Linearised, linearise
@@ -106,6 +107,7 @@ def solve(
             if share < 0.005:
                 break
         best, step, before, converged = np.inf, np.zeros_like(theta), None, False
+        gradient = step
         for _ in range(STEPS):
             linearised = linearise_each(model, sources, weights)
             factor = _stacked(linearised, sources, size)
@@ -115,18 +117,19 @@ def solve(
                 if before and small < KINK:
                     theta, (model, linearised), converged = theta - step, before, True
                     break
-                step, before = 0.5 * step, None
-                theta = theta - step
+                shorter = _shorter(best, float(gradient @ step), cost)
+                theta = theta - (1.0 - shorter) * step
+                step, small, before = shorter * step, shorter * small, None
                 model = moved.set(model, jnp.asarray(theta))
-                if small / 2 < SMALL * 0.1:
+                if small < SMALL * 0.1:
                     break
-                small /= 2
                 continue
             if not np.isfinite(cost):
                 raise UserError("the model predicts nothing finite where the fit starts: start from other parameters")
             best = cost
             A = np.concatenate([factor[:, free], prior.root])
             b = np.concatenate([factor[:, -1], offset])
+            gradient = A.T @ b
             basis, invisible, scale = visible(A)
             z = _minimise(A @ basis, b)
             step = basis @ z
@@ -152,16 +155,24 @@ def solve(
     return model, Solution(converged, message, cost, rows, information, invisible, scale, share, linearised)
 
 
+def _shorter(start: float, slope: float, end: float) -> float:
+    """The share of a step at which the parabola with this start, slope there and end is least, a tenth to a half
+    (Nocedal and Wright 2006, §3.5); a half where the end is nothing finite.
+    """
+    return float(np.clip(slope / (2.0 * (start + slope - end)), 0.1, 0.5)) if np.isfinite(end) else 0.5
+
+
 def linearise_each(
     model: Model, sources: dict[str, Source], weights: Mapping[str, np.ndarray] | None = None
 ) -> dict[str, Linearised]:
-    """Every experiment at the model. Not in threads: two programs with a factorisation, dispatched at once, can hold
-    all of XLA's processor threads and wait for ever.
-    """
+    """Every experiment at the model."""
     weights = weights or {}
-    return {
-        n: linearise(model, Free.at(model, s.positions), s.batch, s.filters, weights.get(n)) for n, s in sources.items()
-    }
+
+    def one(name: str) -> Linearised:
+        s = sources[name]
+        return linearise(model, Free.at(model, s.positions), s.batch, s.filters, weights.get(name))
+
+    return dict(zip(sources, side_by_side(one, sources), strict=True))
 
 
 def _stacked(linearised: dict[str, Linearised], sources: dict[str, Source], size: int) -> Float[np.ndarray, "k P+1"]:

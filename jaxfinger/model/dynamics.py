@@ -104,8 +104,23 @@ def contact_map(model: Model, x: Motion) -> Float[Array, "3 m *T"]:
     # (J Jᵀ + ε I) f = J τ, the minimum-norm solution as ε → 0.
     gram = jnp.sum(J[:, None] * J[None], axis=2)
     eps = 1e-10 * (gram[0, 0] + gram[1, 1] + gram[2, 2])
-    matrix = jnp.moveaxis(gram, (0, 1), (-2, -1)) + eps[..., None, None] * jnp.eye(3)
-    return jnp.moveaxis(jnp.linalg.solve(matrix, jnp.moveaxis(J, (0, 1), (-2, -1))), (-2, -1), (0, 1))
+    return _solved(gram + eps * jnp.eye(3).reshape(3, 3, *(1,) * eps.ndim), J)
+
+
+def _solved(A: Float[Array, "3 3 *T"], B: Float[Array, "3 m *T"]) -> Float[Array, "3 m *T"]:
+    """A⁻¹ B for positive definite A = L D Lᵀ, sample by sample.
+
+    A formula, since two programs that call LAPACK for thousands of samples at once can hold all of XLA's processor
+    threads and wait for ever.
+    """
+    d0, l1, l2 = A[0, 0], A[1, 0] / A[0, 0], A[2, 0] / A[0, 0]
+    d1, c = A[1, 1] - l1 * A[1, 0], A[2, 1] - l2 * A[1, 0]
+    l3 = c / d1
+    d2 = A[2, 2] - l2 * A[2, 0] - l3 * c
+    y1 = B[1] - l1 * B[0]
+    z = (B[2] - l2 * B[0] - l3 * y1) / d2
+    y = y1 / d1 - l3 * z
+    return jnp.stack([B[0] / d0 - l1 * y - l2 * z, y, z])
 
 
 def excursion(model: Model, x: Motion) -> Float[Array, "n *T"]:

@@ -1,8 +1,10 @@
 """Tendon excursion l = f(q), equation (2): polynomials of the joints' angles, and C = ∂f/∂q, never fitted apart."""
 
-from itertools import combinations
+from functools import reduce
+from itertools import accumulate, combinations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -29,26 +31,31 @@ class MomentArm(eqx.Module):
             ]
         return cls(jnp.zeros((n, len(exponents))), tuple(exponents))
 
+    @jax.jit
     def excursion(self, q: Float[Array, "m *T"]) -> Float[Array, "n *T"]:
         """f(q), m."""
-        return jnp.tensordot(self.coefficients, jnp.stack([_monomial(q, e) for e in self.exponents]), 1)
+        powers = self._powers(q)
+        return jnp.tensordot(self.coefficients, jnp.stack([_monomial(powers, e) for e in self.exponents]), 1)
 
+    @jax.jit
     def coupling(self, q: Float[Array, "m *T"]) -> Float[Array, "n m *T"]:
         """C(q) = ∂f/∂q, m/rad: the moment arm of tendon k about joint i at [k, i]."""
-        gradient = jnp.stack([jnp.stack([_derivative(q, e, i) for i in range(len(q))]) for e in self.exponents])
+        powers = self._powers(q)
+        gradient = jnp.stack([jnp.stack([_derivative(powers, e, i) for i in range(len(q))]) for e in self.exponents])
         return jnp.tensordot(self.coefficients, gradient, 1)
 
-
-def _monomial(q: Float[Array, "m *T"], exponents: tuple[int, ...]) -> Float[Array, "*T"]:
-    value = jnp.ones_like(q[0])
-    for q_i, p in zip(q, exponents, strict=True):
-        for _ in range(p):
-            value = value * q_i
-    return value
+    def _powers(self, q: Float[Array, "m *T"]) -> list[Float[Array, "m *T"]]:
+        """1, q, q², …"""
+        return list(accumulate([q] * max(map(max, self.exponents)), jnp.multiply, initial=jnp.ones_like(q)))
 
 
-def _derivative(q: Float[Array, "m *T"], exponents: tuple[int, ...], i: int) -> Float[Array, "*T"]:
+def _monomial(powers: list[Float[Array, "m *T"]], exponents: tuple[int, ...]) -> Float[Array, "*T"]:
+    factors = [powers[p][i] for i, p in enumerate(exponents) if p]
+    return reduce(jnp.multiply, factors) if factors else powers[0][0]
+
+
+def _derivative(powers: list[Float[Array, "m *T"]], exponents: tuple[int, ...], i: int) -> Float[Array, "*T"]:
     p = exponents[i]
     if p == 0:
-        return jnp.zeros_like(q[0])
-    return p * _monomial(q, tuple(e - (j == i) for j, e in enumerate(exponents)))
+        return jnp.zeros_like(powers[0][0])
+    return p * _monomial(powers, tuple(e - (j == i) for j, e in enumerate(exponents)))

@@ -118,6 +118,7 @@ def _recursion(step, state, links, finger: Finger, unroll: bool, reverse: bool =
     return state, jax.tree.map(lambda *a: jnp.stack(a), *(out[i] for i in range(finger.m)))
 
 
+@jax.jit
 def inverse_dynamics(
     finger: Finger, q: Float[Array, "m *T"], qd: Float[Array, "m *T"], qdd: Float[Array, "m *T"]
 ) -> Float[Array, "m *T"]:
@@ -193,6 +194,7 @@ def _weightless(finger: Finger) -> Finger:
     return eqx.tree_at(lambda f: f.gravity, finger, jnp.zeros(3))
 
 
+@jax.jit
 def fingertip(finger: Finger, q: Float[Array, "m *T"]) -> tuple[Float[Array, "3 *T"], Float[Array, "3 m *T"]]:
     """Position of the fingertip, m, and its Jacobian J, m/rad, in the base frame."""
 

@@ -1,5 +1,6 @@
 """What is compiled for a common shape says of the trials what the plain equations say."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jaxfinger.effects import CATALOGUE
 from jaxfinger.experiments import predict, prepare, roomy, widened
-from jaxfinger.identify.linearise import linearise, residuals_of, white_rows
+from jaxfinger.identify.linearise import _linearise, linearise, residuals_of, white_rows
 from jaxfinger.identify.parameters import Free, describe
 from jaxfinger.identify.stages import first_noise, sources_of
 
@@ -27,11 +29,19 @@ def stack(short):
     return prepare(short, [t.name for t in short if t.experiment == EXPERIMENT])[EXPERIMENT]
 
 
-def test_the_common_shape_changes_no_derivative(stack, short_truth):
-    model, parameters = short_truth.model, describe(short_truth.model)
+EFFECTS = (("tendon_stretch", {"compliance": 2e-5}), ("tendon_friction_presliding", {"a": 0.5}))
+
+
+@pytest.mark.parametrize("effects", [(), EFFECTS], ids=["nominal", "with effects"])
+def test_the_common_shape_changes_no_derivative(stack, short_truth, effects):
+    """Nor do derivatives part by part, with what the other parts' zeros pass through left out."""
+    members = tuple(CATALOGUE[e].at(short_truth.model.finger, ("T1",), **values) for e, values in effects)
+    model = eqx.tree_at(lambda m: m.effects, short_truth.model, members, is_leaf=lambda v: isinstance(v, tuple))
+    parameters = describe(model)
     noise = {(EXPERIMENT, c): first_noise(stack, c) for c in CHANNELS}
     source = sources_of({EXPERIMENT: stack}, {EXPERIMENT: CHANNELS}, noise, parameters)[EXPERIMENT]
-    free = Free.at(model, source.positions)
+    of_effects = [i for i, p in enumerate(parameters) if p.group == "effects"]
+    free = Free.at(model, np.union1d(source.positions, of_effects).astype(int))
     B, T = stack.batch.x.time.shape
     assert widened(stack.batch).x.time.shape != (B, T)
     weights = np.random.default_rng(0).uniform(0.5, 1.0, (B, T * sum(len(f) for f in source.filters.values())))
@@ -58,3 +68,16 @@ def test_the_common_shape_changes_no_residual(stack, short_truth):
     predicted = predict(short_truth.model, stack.batch.x, CHANNELS)
     for c, residual in residuals_of(short_truth.model, stack.batch, CHANNELS).items():
         np.testing.assert_allclose(residual, stack.batch.y[c] - predicted[c], atol=1e-12)
+
+
+def test_no_program_that_runs_beside_another_calls_lapack(short, short_truth):
+    """Two that do can wait for each other for ever."""
+    model, parameters = short_truth.model, describe(short_truth.model)
+    stacks = prepare(short)
+    reads = {e: stack.experiment.channels for e, stack in stacks.items()}
+    assert "fingertip_force" in reads["VD.2"]
+    noise = {(e, c): first_noise(stacks[e], c) for e in reads for c in reads[e]}
+    for source in sources_of(stacks, reads, noise, parameters).values():
+        free = Free.at(model, source.positions)
+        program = _linearise.lower(model, free, widened(source.batch), source.filters).as_text()
+        assert "lapack" not in program

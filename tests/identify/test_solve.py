@@ -74,7 +74,7 @@ def problem(short, short_truth):
     return _problem_of(Logarithm, short, short_truth, start=0.0, true=-0.95)
 
 
-def test_a_step_to_where_the_model_is_not_defined_is_halved(problem):
+def test_a_step_to_where_the_model_is_not_defined_is_cut(problem):
     model, position, source = problem
     found, solution = solve(model, np.array([position]), {EXPERIMENT: source})
     assert solution.converged
@@ -110,6 +110,14 @@ def test_a_kink_within_a_tenth_of_a_standard_deviation_ends_the_search(short, sh
     assert len(calls) <= 4
     assert abs(float(ravel(found)[position])) < 0.1 * std
     assert float(jnp.sum(solution.linearised[EXPERIMENT].white ** 2)) == pytest.approx(2.0 * solution.cost)
+
+
+@given(st.floats(-5.0, 5.0), st.floats(-1e6, -1e-3), st.floats(0.01, 0.5))
+def test_a_step_is_cut_to_where_its_parabola_is_least(start, slope, least):
+    """c(t) = start + slope t − slope t²/(2 least): its end at t = 1 is no lower than its start."""
+    end = start + slope - slope / (2.0 * least)
+    assert solve_module._shorter(start, slope, end) == pytest.approx(max(least, 0.1), rel=1e-3)
+    assert solve_module._shorter(start, slope, np.inf) == 0.5
 
 
 @given(st.integers(0, 10_000))
