@@ -78,6 +78,16 @@ def test_every_site_and_shape(name):
     assert len(seen) == sum(len(kind.shapes(FINGER, s)) for s in sites)
 
 
+@pytest.mark.parametrize("name", EVERY)
+def test_no_prediction_calls_lapack(name):
+    """Predictions run side by side, and two that call it can wait for each other for ever."""
+    kind = EVERY[name]
+    model = with_effects(plausible(kind, kind.sites(FINGER)[0], {}))
+    for x, nominal in MOTIONS:
+        lowered = jax.jit(lambda model, x=x, channels=tuple(nominal): predict(model, x, channels)).lower(model)
+        assert "lapack" not in lowered.as_text()
+
+
 def test_where_a_joint_slides_its_effects_have_units_of_lengths_and_forces():
     first, *others = FINGER.joint_names
     finger = replace(FINGER, prismatic=(True, *(False for _ in others)))
