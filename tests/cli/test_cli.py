@@ -11,6 +11,7 @@ import pytest
 
 from jaxfinger.cli import main
 from jaxfinger.cli.app import COMMANDS, SEALED, STAGES
+from jaxfinger.cli.output import number
 
 ROOT = Path(__file__).parents[2]
 EMPS = ROOT / "datasets" / "emps"
@@ -54,6 +55,14 @@ def test_help_needs_neither_jax_nor_numpy():
 def test_every_command_explains_itself(tokens, capsys):
     assert run(*tokens, "--help") == 0
     assert "Usage" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [(190.4, 2, "190"), (0.01234, 3, "0.0123"), (99.6, 2, "100"), (2.5e7, 3, "2.5e+07"), (None, 3, "–")],
+)
+def test_a_number_for_people(value, digits, text):
+    assert number(value, digits) == text
 
 
 def test_check_of_a_sound_file(folder, capsys):
