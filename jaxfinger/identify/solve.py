@@ -8,8 +8,8 @@
 3. optimistix solves in coordinates z along the visible singular vectors, θ = θ_k + B z, in which the Gauss–Newton
    matrix is the identity. Most of equation (1) is linear in its parameters: one step, whatever the conditioning of θ.
 4. Where it is not (slip of held tendons, products of moment arms and losses) the model is linearised again at the new
-   point, and a step that did not lower the cost is cut, until a step is a small part of a standard deviation, or
-   a whole one that is a tenth of it leads no further down.
+   point, and a step that did not lower the cost is cut to where a parabola through both ends is lowest, until a
+   step is a small part of a standard deviation, or a whole one that is a tenth of it leads no further down.
 5. A mass that would fall to nothing stays on its floor, and what has limits within them, while the others are
    minimised with it there.
 6. Outliers: Huber's weights from the white residuals at the optimum, then again from 1.
