@@ -21,7 +21,7 @@ def side_by_side(f: Callable[[Item], Result], items: Iterable[Item]) -> Iterator
     """f of each item, in order, two at a time: while one is traced by Python, another compiles or runs.
 
     No program among them may call LAPACK, as QR and `solve` do: two that do, dispatched at once, can hold all of XLA's
-    processor threads and wait for ever (20,000 systems of three equations do). NumPy has no such trap.
+    processor threads and wait for ever (8,192 systems of three equations do). NumPy has no such trap.
     """
     with ThreadPoolExecutor(2) as pool:
         yield from pool.map(f, items)

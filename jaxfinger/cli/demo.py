@@ -116,7 +116,7 @@ def _gravity(fit) -> str:
     from jaxfinger.model import rigid_body
 
     q = jnp.radians(jnp.stack([jnp.linspace(10.0, 70.0, 61), jnp.zeros(61), jnp.zeros(61)]))
-    torque = 1e3 * rigid_body.inverse_dynamics(fit.model.finger, q, jnp.zeros_like(q), jnp.zeros_like(q))[0]
+    torque = 1e3 * rigid_body.gravity_torque(fit.model.finger, q)[0]
     return f"{float(torque.min()):.1f} to {float(torque.max()):.1f}"
 
 

@@ -70,7 +70,7 @@ def _finite(value: Any) -> Any:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number for people; a dash where there is none."""
+    """A number for people, its whole part written out up to a million; a dash where there is none."""
     if value is None or not math.isfinite(value):
         return "–"
     return f"{value:.0f}" if 10**digits - 0.5 <= abs(value) < 1e6 else f"{value:.{digits}g}"

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -115,7 +114,6 @@ def base_parameters(
     """
     rng = np.random.default_rng(seed)
     q, qd, qdd = rng.uniform(-1.5, 1.5, (3, finger.m, samples))
-    torque = jax.jit(rigid_body.inverse_dynamics)
     rows = slice(None) if instrumented is None else instrumented
 
     def column(i: int, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
@@ -124,7 +122,7 @@ def base_parameters(
         for array, value in zip(values, (1.0, com, inertia), strict=True):
             array[i] = value
         lone = eqx.tree_at(lambda f: (f.mass, f.com, f.gyration), finger, tuple(jnp.asarray(v) for v in values))
-        return np.asarray(torque(lone, q, qd, qdd))[rows].ravel()
+        return np.asarray(rigid_body.inverse_dynamics(lone, q, qd, qdd))[rows].ravel()
 
     names, columns, axes, none = [], [], np.eye(3), np.zeros((3, 3))
     for i, joint in enumerate(finger.joint_names):

@@ -106,8 +106,8 @@ def solve(
             # Gaussian residuals pass a limit of 3 in 0.3 % of cases: half as many again are outliers.
             if share < 0.005:
                 break
-        best, step, before, converged = np.inf, np.zeros_like(theta), None, False
-        gradient = step
+        best, before, converged = np.inf, None, False
+        step = gradient = np.zeros_like(theta)
         for _ in range(STEPS):
             linearised = linearise_each(model, sources, weights)
             factor = _stacked(linearised, sources, size)

@@ -225,22 +225,12 @@ def excursion_path(model: Model, trial: Trial) -> ExcursionPath:
     sos = butter(2, min(0.9, 2.0 * ONLINE_CUTOFF * step), output="sos")
     filtered = sosfilt(sos, q, axis=0, zi=sosfilt_zi(sos)[:, :, None] * q[0])[0]
     qd = np.diff(filtered, axis=0, prepend=filtered[:1]) / np.diff(trial.time, prepend=trial.time[0] - step)[:, None]
-    C = np.asarray(_coupling(model, jnp.asarray(q.T)))
+    C = np.asarray(model.moment_arm.coupling(jnp.asarray(q.T)))
     rate = np.einsum("nmt,tm->tn", C, qd)
     integral = np.cumsum(rate * np.diff(trial.time, prepend=trial.time[0])[:, None], axis=0)
-    direct = np.asarray(_excursion(model, jnp.asarray(q.T))).T
+    direct = np.asarray(model.moment_arm.excursion(jnp.asarray(q.T))).T
     measured = np.full(direct.shape, np.nan) if trial.tendon_excursion is None else trial.tendon_excursion
     return ExcursionPath(trial.time, measured - measured[0], integral, direct - direct[0])
-
-
-@eqx.filter_jit
-def _coupling(model: Model, q):
-    return model.moment_arm.coupling(q)
-
-
-@eqx.filter_jit
-def _excursion(model: Model, q):
-    return model.moment_arm.excursion(q)
 
 
 def _integral_scores(model: Model, session: Session, stack: Stack, floor) -> list[Score]:

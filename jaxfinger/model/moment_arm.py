@@ -31,6 +31,7 @@ class MomentArm(eqx.Module):
             ]
         return cls(jnp.zeros((n, len(exponents))), tuple(exponents))
 
+    # Compiled on their own, so that Python traces them once, however many effects and experiments read them.
     @jax.jit
     def excursion(self, q: Float[Array, "m *T"]) -> Float[Array, "n *T"]:
         """f(q), m."""

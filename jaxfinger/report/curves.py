@@ -62,7 +62,7 @@ def curves(fit: Fit) -> Curves:
     values, std = fit.function(_evaluate(jnp.asarray(q), jnp.asarray(np.tile(f, (finger.n, 1)))))
     cuts = np.cumsum((finger.n * m * S, m * S, m * S, m))
     arms, elastic, friction, damping, loss = zip(np.split(values, cuts), np.split(std, cuts), strict=True)
-    gravity = np.asarray(_gravity(model, jnp.asarray(q)))
+    gravity = np.asarray(rigid_body.gravity_torque(model.finger, jnp.asarray(q)))
 
     def shaped(pair, shape):
         return tuple(a.reshape(shape) for a in pair)
@@ -129,8 +129,3 @@ def _evaluate(q: Float[Array, "m m S"], tension: Float[Array, "n S"]):
         return jnp.concatenate([jnp.ravel(p) for p in parts])
 
     return evaluate
-
-
-@eqx.filter_jit
-def _gravity(model: Model, q):
-    return rigid_body.inverse_dynamics(model.finger, q, jnp.zeros_like(q), jnp.zeros_like(q))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from jaxfinger.data import Session
@@ -87,7 +86,7 @@ def _joint_torque(fit: Fit, found: Curves, stack):
 def _holds(model: Model, stack) -> dict[int, list[tuple[float, float, float, float]]]:
     """By joint: angle, τ_ext − G and its spread, direction of approach, of every hold."""
     x, y, mask = stack.batch.x, np.asarray(stack.batch.y["joint_torque"]), np.asarray(stack.batch.mask["joint_torque"])
-    h = y - np.asarray(_gravity(model, x))
+    h = y - np.asarray(rigid_body.gravity_torque(model.finger, x.q))
     q, way = np.asarray(x.q), np.asarray(x.joint_direction)
     points: dict[int, list] = {}
     for i, b in np.ndindex(y.shape[:2]):
@@ -118,7 +117,7 @@ def _losses(model: Model, session: Session, stack) -> dict[str, list[tuple[float
     x = stack.batch.x
     y, mask = np.asarray(stack.batch.y["joint_torque"]), np.asarray(stack.batch.mask["joint_torque"])
     without = np.asarray(_torque(frictionless, x))
-    C = np.asarray(_coupling(model, x.q))
+    C = np.asarray(model.moment_arm.coupling(x.q))
     points: dict[str, list] = {}
     for b, name in enumerate(stack.trials):
         trial = session[name]
@@ -137,15 +136,5 @@ def _losses(model: Model, session: Session, stack) -> dict[str, list[tuple[float
 
 
 @eqx.filter_jit
-def _gravity(model: Model, x):
-    return rigid_body.inverse_dynamics(model.finger, x.q, jnp.zeros_like(x.q), jnp.zeros_like(x.q))
-
-
-@eqx.filter_jit
 def _torque(model: Model, x):
     return predict(model, x, ("joint_torque",))["joint_torque"]
-
-
-@eqx.filter_jit
-def _coupling(model: Model, q):
-    return model.moment_arm.coupling(q)

@@ -75,7 +75,7 @@ class ModelPlant:
         q, tension = plan.q if q is None else q, plan.tension if tension is None else tension
         qd, qdd = (plan.qd, plan.qdd) if q is plan.q else _derivatives(plan.time, q)
         joint = np.sign(qd) if plan.joint_direction is None else 1.0 * plan.joint_direction
-        sliding = np.sign(np.einsum("nmt,mt->nt", np.asarray(_coupling(self.model, jnp.asarray(q))), qd))
+        sliding = np.sign(np.einsum("nmt,mt->nt", np.asarray(self.model.moment_arm.coupling(jnp.asarray(q))), qd))
         tendon = sliding if plan.tendon_direction is None else 1.0 * plan.tendon_direction
         motorised = np.zeros_like(q)
         if plan.joint is not None and plan.experiment != "ID.2":
@@ -101,11 +101,6 @@ class ModelPlant:
 
 _predict = eqx.filter_jit(predict)
 _simulate = eqx.filter_jit(simulate_forward)
-
-
-@eqx.filter_jit
-def _coupling(model: Model, q):
-    return model.moment_arm.coupling(q)
 
 
 def _derivatives(time: Float[Array, " N"], q: Float[Array, "m N"]) -> tuple[Float[Array, "m N"], Float[Array, "m N"]]:
