@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxfinger.model import Effect, Finger, Motion
+from jaxfinger.model import Effect, Finger
 
 Site = tuple[str, ...]
 
@@ -118,21 +118,14 @@ class CatalogueEffect(Effect):
         return {k: float(getattr(self, k)) for k in (*self.AMPLITUDES, *self.SHAPES)}
 
 
-def step(before: Motion, x: Motion) -> Float[Array, "*T"]:
-    """Time between two samples, s."""
-    return x.time - before.time
-
-
-def dahl(
-    z: Float[Array, "*T"], dx: Float[Array, "*T"], length: Float[Array, ""], delta: Float[Array, ""]
-) -> Float[Array, "*T"]:
-    """Share of the friction that is built up after a displacement: dz = (1 − z sgn dx)^δ dx/length (Dahl 1968).
+def dahl(z: Float[Array, "*T"], dx: Float[Array, "*T"], delta: Float[Array, ""]) -> Float[Array, "*T"]:
+    """Share of the friction that is built up after a displacement, in lengths: dz = (1 − z sgn dx)^δ dx (Dahl 1968).
 
     δ = 1 builds up exponentially. δ = ½ has built up after 2√2 lengths, as many elements in parallel have that slip one
     after the other (Maxwell slip, evenly spread).
     """
     way = jnp.sign(dx)
-    lacking, share = 1.0 - z * way, jnp.abs(dx) / length
+    lacking, share = 1.0 - z * way, jnp.abs(dx)
     root = jnp.sqrt(jnp.maximum(lacking, 1e-12))  # whose slope at nothing is infinite
     left = jnp.where(delta > 0.75, lacking * jnp.exp(-share), jnp.square(jnp.maximum(root - 0.5 * share, 0.0)))
     return jnp.where(dx == 0.0, z, way * (1.0 - left))

@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfinger.effects.base import DELTA, ELASTIC, TORQUE, CatalogueEffect, dahl, step
+from jaxfinger.effects.base import DELTA, ELASTIC, TORQUE, CatalogueEffect, dahl
 
 
 class JointStribeck(CatalogueEffect):
@@ -62,12 +62,14 @@ class JointPresliding(CatalogueEffect):
     x0: Float[Array, ""]
     delta: Float[Array, ""]
 
-    def initial_memory(self, model, x):
-        return jnp.zeros_like(x.q[self.index[0]])
+    def drive(self, model, x):
+        return x.q[self.index[0]] / self.x0
 
-    def next_memory(self, model, memory, before, x):
-        i = self.index[0]
-        return dahl(memory, x.q[i] - before.q[i], self.x0, self.delta)
+    def initial_memory(self, drive):
+        return jnp.zeros_like(drive)
+
+    def next_memory(self, memory, before, drive):
+        return dahl(memory, drive - before, self.delta)
 
     def directions(self, x, memory, joint, tendon):
         if x.held:
@@ -163,12 +165,15 @@ class ElasticRelaxation(CatalogueEffect):
     stiffness: Float[Array, ""]
     T: Float[Array, ""]
 
-    def initial_memory(self, model, x):
-        return jnp.zeros_like(x.q[self.index[0]])
+    def drive(self, model, x):
+        return x.time, x.q[self.index[0]]
 
-    def next_memory(self, model, memory, before, x):
-        i, dt = self.index[0], step(before, x)
-        return memory * jnp.exp(-dt / self.T) + (x.q[i] - before.q[i]) * jnp.exp(-0.5 * dt / self.T)
+    def initial_memory(self, drive):
+        return jnp.zeros_like(drive[1])
+
+    def next_memory(self, memory, before, drive):
+        (t0, q0), (t, q) = before, drive
+        return memory * jnp.exp(-(t - t0) / self.T) + (q - q0) * jnp.exp(-0.5 * (t - t0) / self.T)
 
     def torque(self, x, memory, h):
         return h.at[self.index[0]].add(self.stiffness * memory)

@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfinger.effects.base import BOTH, EXCURSION, CatalogueEffect, step
+from jaxfinger.effects.base import BOTH, EXCURSION, CatalogueEffect
 
 
 class TendonStretch(CatalogueEffect):
@@ -42,12 +42,15 @@ class TendonCreep(CatalogueEffect):
     compliance: Float[Array, ""]
     T: Float[Array, ""]
 
-    def initial_memory(self, model, x):
-        return jnp.zeros_like(x.tension[self.index[0]])
+    def drive(self, model, x):
+        return x.time, x.tension[self.index[0]]
 
-    def next_memory(self, model, memory, before, x):
-        f = x.tension[self.index[0]]
-        return f + (memory - f) * jnp.exp(-step(before, x) / self.T)
+    def initial_memory(self, drive):
+        return jnp.zeros_like(drive[1])
+
+    def next_memory(self, memory, before, drive):
+        (t0, _), (t, f) = before, drive
+        return f + (memory - f) * jnp.exp(-(t - t0) / self.T)
 
     def excursion(self, x, memory, f, l):
         return l.at[self.index[0]].add(self.compliance * memory)
@@ -72,14 +75,15 @@ class TendonBacklash(CatalogueEffect):
     a: Float[Array, ""]
     width: Float[Array, ""]
 
-    def initial_memory(self, model, x):
-        l = model.moment_arm.excursion(x.q)[self.index[0]]
-        return l, jnp.zeros_like(l)
+    def drive(self, model, x):
+        return model.moment_arm.excursion(x.q)[self.index[0]]
 
-    def next_memory(self, model, memory, before, x):
-        l = model.moment_arm.excursion(x.q)[self.index[0]]
-        played = jnp.clip(memory[0], l - 0.5 * self.width, l + 0.5 * self.width)
-        return played, played - l
+    def initial_memory(self, drive):
+        return drive, jnp.zeros_like(drive)
+
+    def next_memory(self, memory, before, drive):
+        played = jnp.clip(memory[0], drive - 0.5 * self.width, drive + 0.5 * self.width)
+        return played, played - drive
 
     def excursion(self, x, memory, f, l):
         return l.at[self.index[0]].add(self.a * memory[1])
@@ -132,19 +136,12 @@ class MomentArmBowstring(CatalogueEffect):
     PLACE: ClassVar = "tendon"
     AMPLITUDES: ClassVar = {"b": ("1/N", 0.01, False)}
     SHOWS: ClassVar = BOTH
-    has_memory: ClassVar = True
 
     b: Float[Array, ""]
 
-    def initial_memory(self, model, x):
-        return model.moment_arm.excursion(x.q)[self.index[0]]
-
-    def next_memory(self, model, memory, before, x):
-        return model.moment_arm.excursion(x.q)[self.index[0]]
-
     def excursion(self, x, memory, f, l):
         k = self.index[0]
-        return l.at[k].add(self.b * f[k] * memory)
+        return l.at[k].multiply(1.0 + self.b * f[k])
 
     def coupling(self, x, f, C):
         k = self.index[0]

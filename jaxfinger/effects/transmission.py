@@ -86,25 +86,23 @@ class TendonFrictionPresliding(CatalogueEffect):
         first = cls.SHAPES["f0"][1][0]
         return [s for s in super().shapes(finger, site) if (s["stretches"] and s["delta"] == 1) or s["f0"] == first]
 
-    def initial_memory(self, model, x):
+    def drive(self, model, x):
         k = self.index[0]
-        zero = jnp.zeros_like(x.tension[k])
-        return zero, model.moment_arm.excursion(x.q)[k]
+        return x.tension[k] / self.f0 if x.held else model.moment_arm.excursion(x.q)[k] / self.x0
 
-    def next_memory(self, model, memory, before, x):
-        k, (z, l_before) = self.index[0], memory
-        l = model.moment_arm.excursion(x.q)[k]
-        if x.held:
-            return dahl(z, x.tension[k] - before.tension[k], self.f0, self.delta), l
-        return dahl(z, l - l_before, self.x0, self.delta), l
+    def initial_memory(self, drive):
+        return jnp.zeros_like(drive)
+
+    def next_memory(self, memory, before, drive):
+        return dahl(memory, drive - before, self.delta)
 
     def directions(self, x, memory, joint, tendon):
         k = self.index[0]
-        return joint, tendon.at[k].set((1 - self.a) * tendon[k] + self.a * memory[0])
+        return joint, tendon.at[k].set((1 - self.a) * tendon[k] + self.a * memory)
 
     def held_tension(self, x, memory, f, loss, f_j):
         k = self.index[0]
-        built_up = f[k] - memory[0] * loss[k]
+        built_up = f[k] - memory * loss[k]
         return f_j.at[k].add(self.stretches * self.a * (built_up - f_j[k]))
 
 

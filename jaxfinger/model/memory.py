@@ -27,15 +27,15 @@ def _seen(model: Model, effect: Effect, x: Motion) -> Memory:
 
 
 def _along(model: Model, effect: Effect, x: Motion) -> Memory:
-    samples = jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), x)
-    first = jax.tree.map(lambda a: a[0], samples)
+    drives = jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), effect.drive(model, x))
+    first = jax.tree.map(lambda a: a[0], drives)
 
-    def step(carry, sample):
+    def step(carry, drive):
         memory, before = carry
-        memory = effect.next_memory(model, memory, before, sample)
-        return (memory, sample), memory
+        memory = effect.next_memory(memory, before, drive)
+        return (memory, drive), memory
 
-    _, memory = jax.lax.scan(step, (effect.initial_memory(model, first), first), samples)
+    _, memory = jax.lax.scan(step, (effect.initial_memory(first), first), drives)
     return jax.tree.map(lambda a: jnp.moveaxis(a, 0, -1), memory)
 
 

@@ -11,6 +11,7 @@ from jaxfinger.model.moment_arm import MomentArm
 from jaxfinger.model.motion import Motion
 from jaxfinger.model.tendon_friction import TendonFriction
 
+Drive = Any
 Memory = Any
 
 
@@ -18,8 +19,8 @@ class Effect(eqx.Module):
     """A physical effect that equation (1) leaves out: exactly absent at its zero value.
 
     A subclass overrides the hooks that it acts through and leaves the rest as they are. Every hook broadcasts over the
-    batch axes at the end. An effect with memory gives the state at the first sample and how it goes on to the next one;
-    the states are driven along the motion, measured or simulated.
+    batch axes at the end. An effect with memory says what drives it, its state at the first sample, and how that goes
+    on to the next one; the states are driven along the motion, measured or simulated.
     """
 
     has_memory: ClassVar[bool] = False
@@ -36,12 +37,16 @@ class Effect(eqx.Module):
         return y
 
     # Memory.
-    def initial_memory(self, model: "Model", x: Motion) -> Memory:
-        """State at the first sample `x`."""
+    def drive(self, model: "Model", x: Motion) -> Drive:
+        """What drives the state, at every sample of `x` at once."""
         return ()
 
-    def next_memory(self, model: "Model", memory: Memory, before: Motion, x: Motion) -> Memory:
-        """State at the sample `x`, one step after `before`."""
+    def initial_memory(self, drive: Drive) -> Memory:
+        """State at the first sample."""
+        return ()
+
+    def next_memory(self, memory: Memory, before: Drive, drive: Drive) -> Memory:
+        """State one sample on, where the drive goes from `before` to `drive`."""
         return memory
 
     # Terms of equation (1), in the order in which they are evaluated.

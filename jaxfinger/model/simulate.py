@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxfinger.model import rigid_body
 from jaxfinger.model.dynamics import terms
-from jaxfinger.model.model import Memory, Model
+from jaxfinger.model.model import Drive, Memory, Model
 from jaxfinger.model.motion import Motion
 
 SWEEPS = 12  # of projected Gauss–Seidel over the frictions of a step, warm-started from the last step
@@ -31,7 +31,7 @@ def forward_dynamics(
 class _State(NamedTuple):
     q: Float[Array, " m"]
     qd: Float[Array, " m"]
-    seen: Motion  # the middle of the last step, at which the memories stand
+    drive: tuple[Drive, ...]  # of the memories, in the middle of the last step
     memory: tuple[Memory, ...]
     friction: Float[Array, " m+n"]  # torques and tensions of friction, N m and N
 
@@ -56,8 +56,9 @@ def simulate(
         return Motion(t, q, qd, jnp.zeros_like(q), f, *unresolved, t + session_start, jnp.zeros_like(q))
 
     x0 = motion(time[0], q0, qd0, tension[:, 0])
-    memory0 = tuple(effect.initial_memory(model, x0) for effect in model.effects)
-    state0 = _State(q0, qd0, x0, memory0, jnp.zeros(model.finger.m + model.finger.n))
+    drive0 = tuple(effect.drive(model, x0) for effect in model.effects)
+    memory0 = tuple(effect.initial_memory(d) for effect, d in zip(model.effects, drive0, strict=True))
+    state0 = _State(q0, qd0, drive0, memory0, jnp.zeros(model.finger.m + model.finger.n))
 
     def sample(state, inputs):
         t, f0, f1, tau0, tau1 = inputs
@@ -78,8 +79,9 @@ def _step(model: Model, state: _State, motion, t, f, tau, dt) -> _State:
     """One midpoint step: forces at the middle position, friction from the velocity that it leads to."""
     qd = state.qd
     x = motion(t, state.q + 0.5 * dt * qd, qd, f)
+    drive = tuple(effect.drive(model, x) for effect in model.effects)
     memory = tuple(
-        effect.next_memory(model, m, state.seen, x) for effect, m in zip(model.effects, state.memory, strict=True)
+        effect.next_memory(*now) for effect, *now in zip(model.effects, state.memory, state.drive, drive, strict=True)
     )
     e = terms(model, x, memory)  # with the friction that the effects' memories have built up, and no other
     at_once = _at_once(model, x, memory)
@@ -93,7 +95,7 @@ def _step(model: Model, state: _State, motion, t, f, tau, dt) -> _State:
     A = dt * D @ M_inv @ D.T
     friction = _gauss_seidel(A, D @ free, limit, state.friction)
     qd = free - dt * M_inv @ (D.T @ friction)
-    return _State(x.q + 0.5 * dt * qd, qd, x, memory, friction)
+    return _State(x.q + 0.5 * dt * qd, qd, drive, memory, friction)
 
 
 def _at_once(model: Model, x: Motion, memory) -> Float[Array, " m+n"]:
