@@ -10,10 +10,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxfinger.data import Predictions, Session
 from jaxfinger.experiments import Stack, prepare
+from jaxfinger.gap.groups import Group, grouped
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.linearise import Linearised
@@ -61,6 +62,7 @@ class Problem:
     nominal: Model
     free: np.ndarray  # positions of the nominal parameters in the flat vector
     rows: dict[str, Rows]
+    groups: list[Group]  # the trials of the rows, merged
     r: Float[np.ndarray, " N"]  # whitened residuals of the nominal model
     J: Float[np.ndarray, "N p"]  # their Jacobian, whitened
     root: Float[np.ndarray, "k p"]  # prior rows on the nominal parameters
@@ -100,6 +102,11 @@ class Problem:
             keys = zip(rows.channel, rows.column, strict=True)
             out[rows.start : rows.start + rows.size] = [position[e, channels[c], int(k)] for c, k in keys]
         return out
+
+    @cached_property
+    def merged_predictions(self) -> dict[tuple[str, bool], Float[Array, "columns B T"]]:
+        """`predicted` as the groups have it, by channel and whether joints are held."""
+        return {(g.channel, g.x.held): g.merged(self.predicted) for g in self.groups}
 
     @property
     def trial_names(self) -> list[str]:
@@ -146,6 +153,7 @@ def build(
         noise=noise,
         free=free,
         rows=rows,
+        groups=_groups(stacks, rows, nominal),
         root=np.asarray(prior.root),
         fit=fit,
         sources=sources,
@@ -182,7 +190,8 @@ def imagined(problem: Problem, stacks: dict[str, Stack]) -> Problem:
     }
     rows, linearised = layouts(stacks, sources), linearise_each(problem.nominal, sources)
     at = _at(problem.nominal, linearised, sources, rows, problem.free, problem.prior)
-    return replace(problem, stacks=stacks, sources=sources, rows=rows, noise=known, **at)
+    groups = _groups(stacks, rows, problem.nominal)
+    return replace(problem, stacks=stacks, sources=sources, rows=rows, groups=groups, noise=known, **at)
 
 
 def _noise_elsewhere(problem: Problem, channel: str, columns: int) -> Noise:
@@ -211,6 +220,10 @@ def _at(nominal: Model, linearised: dict[str, Linearised], sources, rows, free, 
             for c, residuals in lin.residuals.items()
         },
     }
+
+
+def _groups(stacks: dict[str, Stack], rows: dict[str, Rows], nominal: Model) -> list[Group]:
+    return grouped({e: stack for e, stack in stacks.items() if rows[e].size}, nominal)
 
 
 def layouts(stacks: dict[str, Stack], sources: dict[str, Source]) -> dict[str, Rows]:

@@ -112,7 +112,6 @@ class Screening:
             return Table(group, signatures.columns(group))
 
         parts = {}
-        _ = signatures.groups  # before two threads ask for them
         for key, part in zip(groups, side_by_side(read, groups.values()), strict=True):
             parts[key] = part
             progress(f"signatures of {key[0]} ({len(parts)} of {len(groups)} effects)")

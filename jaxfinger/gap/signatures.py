@@ -5,7 +5,6 @@ compiled function a class of effects and kind of prediction serves them all. Onl
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import product
 
 import equinox as eqx
@@ -16,12 +15,10 @@ from jaxtyping import Array, Float
 
 from jaxfinger.compilation import once_jit
 from jaxfinger.effects import CatalogueEffect, Site
-from jaxfinger.experiments import roomy
 from jaxfinger.gap.problem import Problem, Rows
 from jaxfinger.model import (
     Model,
     Motion,
-    contact_map,
     excursion,
     external_torque,
     fingertip_force,
@@ -29,7 +26,6 @@ from jaxfinger.model import (
 )
 
 CHUNK = 8  # members of one call, at most
-LENGTH, COUNT = 512, 8  # samples and trials of the smallest stack that is compiled for
 
 
 @dataclass(frozen=True)
@@ -98,58 +94,11 @@ def _change(
     return jax.lax.fori_loop(0, count, put, jnp.zeros((CHUNK, *y0.shape)))
 
 
-_contact = eqx.filter_jit(contact_map)
-
-
-@dataclass(frozen=True)
-class _Group:
-    """Trials of several experiments that are predicted alike."""
-
-    channel: str
-    x: Motion
-    y0: Float[Array, "columns B T"]
-    first: dict[str, int]  # first trial of each experiment
-    contact: Array | None  # of the fingertip's force: the nominal model's `contact_map`
-
-
 @dataclass(frozen=True)
 class Signatures:
     """Reads signatures off a problem."""
 
     problem: Problem
-
-    @cached_property
-    def groups(self) -> list[_Group]:
-        """Trials that are predicted alike."""
-        kinds: dict[tuple, list[str]] = {}
-        for e, stack in self.problem.stacks.items():
-            if self.problem.rows[e].size:
-                for c in stack.experiment.channels:
-                    held = stack.experiment.held and c != "tendon_excursion"
-                    kinds.setdefault((c, held), []).append(e)
-        return [self._group(c, held, experiments) for (c, held), experiments in kinds.items()]
-
-    def _group(self, channel: str, held: bool, experiments: list[str]) -> _Group:
-        batches = [self.problem.stacks[e].batch for e in experiments]
-        T = roomy(max(b.x.time.shape[-1] for b in batches), LENGTH)
-        count = sum(b.x.time.shape[0] for b in batches)
-        B = roomy(count, COUNT)
-
-        def merge(*arrays):
-            padded = [
-                np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, T - a.shape[-1])], mode="edge")
-                for a in map(np.asarray, arrays)
-            ]
-            whole = np.concatenate(padded, axis=-2)
-            extra = [(0, 0)] * (whole.ndim - 2) + [(0, B - count), (0, 0)]
-            return jnp.asarray(np.pad(whole, extra, mode="edge"))
-
-        motions = [replace(b.x, held=held) for b in batches]
-        x = jax.tree.map(merge, *motions)
-        y0 = merge(*(self.problem.predicted[e, channel] for e in experiments))
-        starts = np.cumsum([0] + [b.x.time.shape[0] for b in batches])
-        contact = _contact(self.problem.nominal, x) if channel == "fingertip_force" else None
-        return _Group(channel, x, y0, dict(zip(experiments, starts.tolist(), strict=False)), contact)
 
     def of(self, members: list[CatalogueEffect]) -> Float[np.ndarray, "members N"]:
         """Whitened change of every row, for effects of one class."""
@@ -160,11 +109,12 @@ class Signatures:
         kind, nominal = type(members[0]), self.problem.nominal
         padded = members + members[:1] * (CHUNK - len(members))
         stacked = jax.tree.map(lambda *a: np.stack(a), *[replace(m, site=()) for m in padded])
-        for group in self.groups:
+        for group in self.problem.groups:
             shown = [e for e in group.first if group.channel in kind.SHOWS.get(e, ())]
             if not shown:
                 continue
-            raw = _change(group.channel, stacked, nominal, group.x, group.y0, group.contact, jnp.asarray(len(members)))
+            y0, count = self.problem.merged_predictions[group.channel, group.x.held], jnp.asarray(len(members))
+            raw = _change(group.channel, stacked, nominal, group.x, y0, group.contact, count)
             raw = np.asarray(raw)[: len(members)]
             for e in shown:
                 rows = self.problem.rows[e]
