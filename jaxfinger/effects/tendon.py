@@ -76,7 +76,7 @@ class TendonBacklash(CatalogueEffect):
     width: Float[Array, ""]
 
     def drive(self, model, x):
-        return model.moment_arm.excursion(x.q)[self.index[0]]
+        return model.moment_arm.of(self.index[0]).excursion(x.q)[0]
 
     def initial_memory(self, drive):
         return drive, jnp.zeros_like(drive)

@@ -88,7 +88,7 @@ class TendonFrictionPresliding(CatalogueEffect):
 
     def drive(self, model, x):
         k = self.index[0]
-        return x.tension[k] / self.f0 if x.held else model.moment_arm.excursion(x.q)[k] / self.x0
+        return x.tension[k] / self.f0 if x.held else model.moment_arm.of(k).excursion(x.q)[0] / self.x0
 
     def initial_memory(self, drive):
         return jnp.zeros_like(drive)

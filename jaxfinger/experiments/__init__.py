@@ -2,7 +2,21 @@
 
 from jaxfinger.experiments.predict import demean, predict
 from jaxfinger.experiments.prepare import Batch, Stack, prepare
-from jaxfinger.experiments.shapes import roomy, widened
+from jaxfinger.experiments.shapes import SAMPLES, TRIALS, blocks, padded, roomy, split
 from jaxfinger.experiments.table import EXPERIMENTS, Experiment
 
-__all__ = ["EXPERIMENTS", "Batch", "Experiment", "Stack", "demean", "predict", "prepare", "roomy", "widened"]
+__all__ = [
+    "EXPERIMENTS",
+    "SAMPLES",
+    "TRIALS",
+    "Batch",
+    "Experiment",
+    "Stack",
+    "blocks",
+    "demean",
+    "padded",
+    "predict",
+    "prepare",
+    "roomy",
+    "split",
+]

@@ -1,35 +1,41 @@
 """Few distinct shapes, few compilations: sessions of like fingers share what was compiled for the first of them."""
 
 from dataclasses import replace
+from typing import TypeVar
 
 import jax
 import numpy as np
 
 from jaxfinger.experiments.prepare import Batch
 
-TRIALS, SAMPLES = 8, 256  # of the smallest stack that anything is compiled for
+TRIALS, SAMPLES = 8, 256  # of a block; samples are doubled until the longest trial fits
+
+Tree = TypeVar("Tree")
 
 
 def roomy(size: int, least: int) -> int:
-    """The first of least · (1, 3/2, 2, 3, 4, 6, 8, …) that holds `size`; `least` is even."""
-    double = least
-    while double < size:
-        double *= 2
-    between = 3 * double // 4
-    return between if least < between and size <= between else double
+    """The first of least · (1, 2, 4, 8, …) that holds `size`."""
+    room = least
+    while room < size:
+        room *= 2
+    return room
 
 
-def widened(batch: Batch) -> Batch:
-    """The batch in a stack of a common shape; what is added holds the last values, and does not count."""
+def blocks(batch: Batch) -> list[Batch]:
+    """The batch in stacks of TRIALS trials of a common length; what is added holds the last values, and counts not."""
     B, T = batch.x.time.shape
-    more = (0, roomy(B, TRIALS) - B), (0, roomy(T, SAMPLES) - T)
+    ends = (-B % TRIALS, roomy(T, SAMPLES) - T)
+    counting = {c: np.pad(a, [(0, 0), (0, ends[0]), (0, ends[1])]) for c, a in batch.mask.items()}
+    return split(replace(padded(batch, *ends), mask=counting))
 
-    def pad(a, mode):
-        return np.pad(np.asarray(a), [(0, 0)] * (a.ndim - 2) + [*more], mode)
 
-    return replace(
-        batch,
-        x=jax.tree.map(lambda a: pad(a, "edge"), batch.x),
-        y={c: pad(a, "constant") for c, a in batch.y.items()},
-        mask={c: pad(a, "constant") for c, a in batch.mask.items()},
-    )
+def padded(tree: Tree, trials: int, samples: int) -> Tree:
+    """Every array, (…, B, T), with so many more trials and samples that hold the last values."""
+    ends = (0, trials), (0, samples)
+    return jax.tree.map(lambda a: np.pad(a, [(0, 0)] * (np.ndim(a) - 2) + [*ends], "edge"), tree)
+
+
+def split(tree: Tree) -> list[Tree]:
+    """Every array, (…, B, T), in parts of TRIALS trials."""
+    count = jax.tree.leaves(tree)[0].shape[-2]
+    return [jax.tree.map(lambda a, b=b: a[..., b : b + TRIALS, :], tree) for b in range(0, count, TRIALS)]

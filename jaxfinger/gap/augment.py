@@ -3,10 +3,12 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.gap.problem import Problem, assemble
@@ -18,16 +20,23 @@ from jaxfinger.identify.solve import Prior, Solution, Source, solve
 from jaxfinger.model import Model
 
 
-def nominal_fit(problem: Problem) -> Fit:
-    """The nominal model refitted to all trials."""
-    return _fit(problem, problem.nominal, problem.free, _information(problem.J, problem.root), "all trials")
+class Augmented(NamedTuple):
+    """The augmented model at its optimum."""
+
+    fit: Fit
+    r: Float[np.ndarray, " N"]  # white residuals
+    J: Float[np.ndarray, "N p"]  # their Jacobian by the fit's estimated parameters
+    sources: dict[str, Source]
 
 
-def augmented_fit(problem: Problem, chosen: Refined) -> tuple[Fit, np.ndarray, np.ndarray]:
-    """Nominal parameters, amplitudes and moving shapes at the common optimum, with their covariance.
+def nominal_fit(problem: Problem) -> Augmented:
+    """The nominal model refitted to all trials, with no effect."""
+    fit = _fit(problem, problem.nominal, problem.free, _information(problem.J, problem.root), "all trials")
+    return Augmented(fit, problem.r, problem.J, problem.sources)
 
-    Also the white residuals there, and their Jacobian by the fit's estimated parameters.
-    """
+
+def augmented_fit(problem: Problem, chosen: Refined) -> Augmented:
+    """Nominal parameters, amplitudes and moving shapes at the common optimum, with their covariance."""
     model = eqx.tree_at(lambda m: m.effects, problem.nominal, chosen.effects, is_leaf=lambda v: isinstance(v, tuple))
     parameters = describe(model)
     first = ravel(problem.nominal).size
@@ -44,7 +53,8 @@ def augmented_fit(problem: Problem, chosen: Refined) -> tuple[Fit, np.ndarray, n
     fitted, solution = solve(model, free, sources, Prior(mean, root), limits=limits(model, free))
     information = solution.information[np.ix_(free, free)] + root.T @ root
     r, J = assemble(solution.linearised, sources, problem.rows, free, ravel(model).size)
-    return _fit(problem, fitted, free, information, "with the effects of the diagnosis", solution), r, J
+    fit = _fit(problem, fitted, free, information, "with the effects of the diagnosis", solution)
+    return Augmented(fit, r, J, sources)
 
 
 def _on_effects(change: Callable[[CatalogueEffect], CatalogueEffect], model: Model) -> Model:
@@ -96,7 +106,7 @@ def _widths(effect: CatalogueEffect) -> CatalogueEffect:
 def _with_effects(source: Source, chosen: Refined, moving, first: int, size: int, experiment: str) -> Source:
     """The source, reading the effects' parameters too where one of them shows."""
     if not any(experiment in type(e).SHOWS for e in chosen.effects):
-        return source
+        return source._replace(effects=False)
     return source._replace(positions=np.union1d(source.positions, moving).astype(int))
 
 

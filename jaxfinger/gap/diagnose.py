@@ -10,7 +10,7 @@ from jaxfinger.data import Predictions, Session
 from jaxfinger.data.atomic import atomic_path
 from jaxfinger.effects import CATALOGUE, CatalogueEffect, nominal_terms
 from jaxfinger.errors import UserError
-from jaxfinger.gap.augment import augmented_fit, nominal_fit, parameter_values
+from jaxfinger.gap.augment import Augmented, augmented_fit, nominal_fit, parameter_values
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.next_experiment import NextExperiment, next_experiment
 from jaxfinger.gap.problem import Problem, build
@@ -85,10 +85,10 @@ def diagnose(
     if chosen is None:
         return _nothing_named(problem, found, nominal, not quick)
     progress("fitting the effects and all nominal parameters together")
-    fit, r, J = augmented_fit(problem, chosen)
+    augmented = augmented_fit(problem, chosen)
     named = {*chosen.keys, *(k for members in found.rival_sets for k in members)}
     progress("refitting without each third of the trials")
-    lines = shrinkage(problem, nominal, fit, r, J, _rivals(problem, found), named, not quick)
+    lines = shrinkage(problem, augmented, _rivals(problem, found), named, not quick)
     if contradicts(lines) and found.unlisted <= 0.5:
         found = found.doubted()
     verdict, proposal = _verdict(found, lines), None
@@ -96,25 +96,25 @@ def diagnose(
         progress("looking for a closed form of what remains")
         proposal = propose(problem, chosen.residual, found.left, chosen.columns)
         verdict = replace(verdict, summary=verdict.summary + _proposed(proposal))
-    verdict = replace(verdict, summary=verdict.summary + _retuned(problem, fit))
+    verdict = replace(verdict, summary=verdict.summary + _retuned(problem, augmented.fit))
     places = where(problem)
     suggestion = None
     if verdict.status == "ambiguous":
         progress("looking for the trial that would tell them apart")
         suggestion = next_experiment(problem, _members(problem, found))
-    return Diagnosis(problem, verdict, places, found, lines, suggestion, nominal, fit, proposal)
+    return Diagnosis(problem, verdict, places, found, lines, suggestion, nominal.fit, augmented.fit, proposal)
 
 
-def _nothing_named(problem: Problem, found: Search, nominal: Fit, forward: bool) -> Diagnosis:
+def _nothing_named(problem: Problem, found: Search, nominal: Augmented, forward: bool) -> Diagnosis:
     """No gap, or one of which no known effect explains any."""
     verdict, places, proposal = Verdict("no_gap", (), _no_gap_summary(found)), [], None
     if found.detected:
         places, proposal = where(problem), propose(problem, problem.r, found.left, np.empty((0, problem.r.size)))
         text = f"There is a gap, and none of the known effects explains any of it. {_depends(found)}"
         verdict = Verdict("unexplained", (), text + _proposed(proposal))
-    verdict = replace(verdict, summary=verdict.summary + _retuned(problem, nominal))
-    lines = shrinkage(problem, nominal, nominal, problem.r, problem.J, [], set(), forward)
-    return Diagnosis(problem, verdict, places, found, lines, None, nominal, nominal, proposal)
+    verdict = replace(verdict, summary=verdict.summary + _retuned(problem, nominal.fit))
+    lines = shrinkage(problem, nominal, [], set(), forward)
+    return Diagnosis(problem, verdict, places, found, lines, None, nominal.fit, nominal.fit, proposal)
 
 
 def _proposed(proposal: Proposal | None) -> str:

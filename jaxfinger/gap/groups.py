@@ -2,31 +2,34 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfinger.experiments import Stack, roomy
+from jaxfinger.experiments import SAMPLES, TRIALS, Stack, padded, roomy, split
 from jaxfinger.model import Model, Motion, contact_map
-
-LENGTH, COUNT = 512, 8  # samples and trials of the smallest stack that is compiled for
 
 
 @dataclass(frozen=True)
 class Group:
-    """One channel of the experiments in `first`, whose trials follow one another, padded to a common length."""
+    """One channel of several experiments, whose trials follow one another, padded to a common length, in blocks."""
 
     channel: str
-    first: dict[str, int]  # first trial of each experiment
-    x: Motion
-    contact: Array | None  # of the fingertip's force: `contact_map`
+    held: bool  # whether a fixture holds the joints
+    trials: dict[str, range]  # of each experiment
+    x: list[Motion]
+    contact: list[Array | None]  # of the fingertip's force: `contact_map`
 
-    def merged(self, arrays: Mapping[tuple[str, str], np.ndarray]) -> Float[Array, "columns B T"]:
-        """Arrays of the experiments and channels, (columns, trials, time), as `x` has its own."""
-        return _merged([arrays[e, self.channel] for e in self.first], *self.x.time.shape)
+    def merged(self, arrays: Mapping[tuple[str, str], np.ndarray]) -> list[Float[Array, "columns B T"]]:
+        """Arrays of the experiments and channels, (columns, trials, time), in the blocks of `x`."""
+        return _merged([arrays[e, self.channel] for e in self.trials])
+
+    def of(self, experiments: Sequence[str]) -> list[int]:
+        """The blocks in which trials of these experiments are."""
+        return sorted({t // TRIALS for e in experiments for t in self.trials[e]})
 
 
 def grouped(stacks: dict[str, Stack], nominal: Model) -> list[Group]:
@@ -41,24 +44,19 @@ def grouped(stacks: dict[str, Stack], nominal: Model) -> list[Group]:
 
 def _group(channel: str, held: bool, stacks: dict[str, Stack], nominal: Model) -> Group:
     motions = [replace(s.batch.x, held=held) for s in stacks.values()]
-    counts, lengths = zip(*(x.time.shape for x in motions), strict=True)
-    B, T = roomy(sum(counts), COUNT), roomy(max(lengths), LENGTH)
-    x = jax.tree.map(lambda *parts: _merged(parts, B, T), *motions)
-    starts = np.cumsum([0, *counts[:-1]])
-    contact = _contact(nominal, x) if channel == "fingertip_force" else None
-    return Group(channel, dict(zip(stacks, starts.tolist(), strict=True)), x, contact)
+    x = _merged(motions)
+    ends = np.cumsum([0, *(m.time.shape[0] for m in motions)]).tolist()
+    trials = {e: range(*ends) for e, ends in zip(stacks, pairwise(ends), strict=True)}
+    contact = [_contact(nominal, block) if channel == "fingertip_force" else None for block in x]
+    return Group(channel, held, trials, x, contact)
 
 
 _contact = eqx.filter_jit(contact_map)
 
 
-def _merged(parts: Sequence, B: int, T: int) -> Float[Array, "*columns B T"]:
-    """One after the other along their trials, padded to B trials of T samples by repeating the last."""
-
-    def wide(a, axis, size):
-        widths = [(0, 0)] * a.ndim
-        widths[axis] = (0, size - a.shape[axis])
-        return np.pad(a, widths, mode="edge")
-
-    whole = np.concatenate([wide(np.asarray(a), -1, T) for a in parts], axis=-2)
-    return jnp.asarray(wide(whole, -2, B))
+def _merged(parts: Sequence) -> list:
+    """Arrays (…, B, T) one after the other along their trials, in blocks of a common length."""
+    T = roomy(max(jax.tree.leaves(p)[0].shape[-1] for p in parts), SAMPLES)
+    wide = [padded(p, 0, T - jax.tree.leaves(p)[0].shape[-1]) for p in parts]
+    whole = jax.tree.map(lambda *a: np.concatenate(a, axis=-2), *wide)
+    return jax.device_put(split(padded(whole, -jax.tree.leaves(whole)[0].shape[-2] % TRIALS, 0)))

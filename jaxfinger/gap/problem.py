@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxfinger.data import Predictions, Session
 from jaxfinger.experiments import Stack, prepare
@@ -30,7 +31,7 @@ from jaxfinger.identify.stages import (
     sources_of,
     start_values,
 )
-from jaxfinger.model import Model
+from jaxfinger.model import Model, plain_terms
 
 
 @dataclass(frozen=True)
@@ -104,14 +105,23 @@ class Problem:
         return out
 
     @cached_property
-    def merged_predictions(self) -> dict[tuple[str, bool], Float[Array, "columns B T"]]:
-        """`predicted` as the groups have it, by channel and whether joints are held."""
-        return {(g.channel, g.x.held): g.merged(self.predicted) for g in self.groups}
+    def without_effects(self) -> dict[tuple[str, bool], tuple[list, list]]:
+        """What the nominal model says of every block of the groups, by channel and whether joints are held:
+        `predicted`, (columns, B, T), and the terms of (1) behind a torque or a force.
+        """
+        terms = {
+            (g.channel, g.held): [None if g.channel == "tendon_excursion" else _plain(self.nominal, x) for x in g.x]
+            for g in self.groups
+        }
+        return {(g.channel, g.held): (g.merged(self.predicted), terms[g.channel, g.held]) for g in self.groups}
 
     @property
     def trial_names(self) -> list[str]:
         """Names in the order of `trial_of_row`."""
         return [t for e in self.rows for t in self.stacks[e].trials]
+
+
+_plain = eqx.filter_jit(plain_terms)
 
 
 def build(

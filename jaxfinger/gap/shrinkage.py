@@ -10,18 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.compilation import side_by_side
 from jaxfinger.data.schema import channel_units
 from jaxfinger.experiments import prepare
-from jaxfinger.gap.augment import limits, without_shapes
+from jaxfinger.gap.augment import Augmented, limits, without_shapes
 from jaxfinger.gap.evidence import Evidence, Projector, evidence
 from jaxfinger.gap.held_out import FOLDS, equilibrated, fold_of_row, folds
 from jaxfinger.gap.problem import Problem
-from jaxfinger.identify import Fit
-from jaxfinger.identify.linearise import residuals_of
 from jaxfinger.identify.parameters import Free, ravel
 from jaxfinger.identify.predictions import simulate_trials
-from jaxfinger.identify.solve import Prior, bounded
+from jaxfinger.identify.solve import Prior, Source, bounded, missed_each
 from jaxfinger.model import Model
 
 RESOLVABLE = 1.1  # mean square before over that of the noise, from which on a gap can be said to close
@@ -64,21 +61,19 @@ def contradicts(lines: list[Shrinkage]) -> bool:
 
 def shrinkage(
     problem: Problem,
-    nominal: Fit,
-    augmented: Fit,
-    r: np.ndarray,
-    J: np.ndarray,
+    augmented: Augmented,
     rivals: list[tuple[Evidence, np.ndarray]],
     named: set[tuple],
     forward: bool = True,
 ) -> list[Shrinkage]:
     """One line an experiment and channel, and one for q of VD.3, simulated forward, unless `forward` is false.
 
-    `r`, `J`: white residuals and Jacobian of the augmented model at its optimum; `rivals`: the strongest candidates
-    with their signatures, among which each fold chooses again; `named`: what the verdict names.
+    `rivals`: the strongest candidates with their signatures, among which each fold chooses again; `named`: what the
+    verdict names.
     """
     fold, of_row = folds(problem), fold_of_row(problem)
-    every, shapeless = augmented.estimated, without_shapes(augmented.model, augmented.estimated)
+    whole, every = augmented.fit.model, augmented.fit.estimated
+    shapeless = without_shapes(whole, every)
     tried = [every, shapeless] if len(shapeless) < len(every) else [every]
     energies: dict[tuple[str, str], list[np.ndarray]] = {}  # of each trial: before, after, noise, samples
     models = []
@@ -86,14 +81,14 @@ def shrinkage(
         training, seen = of_row != k, {e: f != k for e, f in fold.items()}
         refitted = _refit(problem.nominal, problem.free, problem.J, problem.r, training, problem.prior)
         before = after = problem.simulator or refitted
-        old = new = _missed(problem, before)
+        old = new = _missed(before, problem.sources)
         if _choice(problem, rivals, training) in named:
             # A linear step may lead a shape too far: of refits with shapes and without, that which fits its own trials
             # better; a model that does not hold up without the others has closed nothing.
             for free in tried:
-                columns = J[:, np.isin(every, free)]
-                model = _refit(augmented.model, free, columns, r, training, problem.prior)
-                missed = _missed(problem, model)
+                columns = augmented.J[:, np.isin(every, free)]
+                model = _refit(whole, free, columns, augmented.r, training, problem.prior)
+                missed = _missed(model, augmented.sources)
                 if _misfit(problem, missed, seen) < _misfit(problem, new, seen):
                     after, new = model, missed
         models.append((before, after))
@@ -172,10 +167,9 @@ def _choice(problem: Problem, rivals: list[tuple[Evidence, np.ndarray]], trainin
     return max(found, key=lambda e: e.log_bf).variant.key if found else None
 
 
-def _missed(problem: Problem, model: Model) -> dict[tuple[str, str], Float[np.ndarray, "columns B T"]]:
-    """Measured − predicted of every experiment's channels."""
-    found = side_by_side(lambda s: residuals_of(model, s.batch, s.experiment.channels), problem.stacks.values())
-    return {(e, c): x for e, residuals in zip(problem.stacks, found, strict=True) for c, x in residuals.items()}
+def _missed(model: Model, sources: dict[str, Source]) -> dict[tuple[str, str], Float[np.ndarray, "columns B T"]]:
+    """Measured − predicted by experiment and channel."""
+    return {(e, c): x for e, channels in missed_each(model, sources).items() for c, x in channels.items()}
 
 
 def _misfit(problem: Problem, missed: dict[tuple[str, str], np.ndarray], keep: dict[str, np.ndarray]) -> float:

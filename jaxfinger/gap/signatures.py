@@ -13,15 +13,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfinger.compilation import once_jit
+from jaxfinger.compilation import quick_jit
 from jaxfinger.effects import CatalogueEffect, Site
+from jaxfinger.experiments import TRIALS
 from jaxfinger.gap.problem import Problem, Rows
 from jaxfinger.model import (
     Model,
     Motion,
+    Terms,
     excursion,
     external_torque,
     fingertip_force,
+    resisting,
+    resisting_change,
     resisting_torque,
 )
 
@@ -62,29 +66,32 @@ def variants(effects: dict[str, type[CatalogueEffect]], finger) -> list[Variant]
     ]
 
 
-@once_jit
+@quick_jit
 def _change(
     channel: str,
     effects: CatalogueEffect,
     nominal: Model,
     x: Motion,
     y0: Float[Array, "columns B T"],
+    plain: Terms | None,
     contact: Array | None,
     count: Array,
 ) -> Float[Array, "variants columns B T"]:
     """Change of one channel's prediction by the first `count` of `effects` (arrays stacked along their first axis)."""
-    base = 0.0 if channel == "tendon_excursion" else resisting_torque(nominal, x)
 
     def one(effect):
         model = eqx.tree_at(lambda m: m.effects, nominal, (effect,), is_leaf=lambda v: isinstance(v, tuple))
         true = model.true_motion(x)
+        same = true is x  # but for a sensor's effect
         if channel == "tendon_excursion":
-            y = y0 + excursion(model, true) - excursion(nominal, x)
+            y = excursion(model, true, y0 if same else None)
+        elif effect.MOVES_RIGID_BODY and contact is not None:
+            y = fingertip_force(model, true)
         elif effect.MOVES_RIGID_BODY:
-            full = external_torque if channel == "joint_torque" else fingertip_force
-            y = full(model, true)
+            y = external_torque(model, true, plain=plain if same else None)
         else:
-            change = resisting_torque(model, true) - base
+            assert plain is not None
+            change = resisting_change(model, x, plain) if same else resisting_torque(model, true) - resisting(plain)
             y = y0 + (change if contact is None else jnp.sum(contact * change[None], axis=1))
         return effect.reading(channel, true, y) - y0
 
@@ -102,37 +109,43 @@ class Signatures:
 
     def of(self, members: list[CatalogueEffect]) -> Float[np.ndarray, "members N"]:
         """Whitened change of every row, for effects of one class."""
-        return np.concatenate([self._chunk(members[k : k + CHUNK]) for k in range(0, len(members), CHUNK)])
-
-    def _chunk(self, members: list[CatalogueEffect]) -> Float[np.ndarray, "members N"]:
         out = np.zeros((len(members), self.problem.r.size))
+        for k in range(0, len(members), CHUNK):
+            self._read(members[k : k + CHUNK], out[k : k + CHUNK])
+        return out
+
+    def _read(self, members: list[CatalogueEffect], out: Float[np.ndarray, "members N"]) -> None:
+        """The changes by as many members as one call takes, written into the rows that show them."""
         kind, nominal = type(members[0]), self.problem.nominal
         padded = members + members[:1] * (CHUNK - len(members))
         stacked = jax.tree.map(lambda *a: np.stack(a), *[replace(m, site=()) for m in padded])
+        count = jnp.asarray(len(members))
         for group in self.problem.groups:
-            shown = [e for e in group.first if group.channel in kind.SHOWS.get(e, ())]
+            shown = [e for e in group.trials if group.channel in kind.SHOWS.get(e, ())]
             if not shown:
                 continue
-            y0, count = self.problem.merged_predictions[group.channel, group.x.held], jnp.asarray(len(members))
-            raw = _change(group.channel, stacked, nominal, group.x, y0, group.contact, count)
-            raw = np.asarray(raw)[: len(members)]
+            y0, plain = self.problem.without_effects[group.channel, group.held]
+            columns, _, T = y0[0].shape
+            raw = np.empty((len(members), columns, len(y0), TRIALS, T))
+            for b in group.of(shown):
+                block = group.x[b], y0[b], plain[b], group.contact[b]
+                raw[:, :, b] = np.asarray(_change(group.channel, stacked, nominal, *block, count))[: len(members)]
+            raw = raw.reshape(len(members), columns, -1, T)
             for e in shown:
-                rows = self.problem.rows[e]
-                B = len(self.problem.stacks[e].trials)
-                mine = raw[:, :, group.first[e] : group.first[e] + B]
+                rows, mine = self.problem.rows[e], group.trials[e]
                 number = self.problem.stacks[e].experiment.channels.index(group.channel)
                 of_channel = np.flatnonzero(rows.channel == number)
-                white = whitened(mine, self.problem, rows, of_channel, group.channel)
-                out[:, rows.start + of_channel] = white
-        return out
+                change = raw[:, :, mine.start : mine.stop]
+                out[:, rows.start + of_channel] = whitened(change, self.problem, rows, of_channel, group.channel)
 
     def columns(self, items: list[Variant]) -> Float[np.ndarray, "variants amplitudes N"]:
         """Signatures per plausible size, one amplitude at a time, for variants of one class."""
         effect, finger = items[0].effect, self.problem.nominal.finger
         names = list(effect.AMPLITUDES)
         members = [v.at(finger, {n: v.size * effect.AMPLITUDES[n][1]}) for v, n in product(items, names)]
-        sizes = np.array([v.size for v in items])[:, None, None]
-        return self.of(members).reshape(len(items), len(names), -1) / sizes
+        found = self.of(members).reshape(len(items), len(names), -1)
+        found /= np.array([v.size for v in items])[:, None, None]
+        return found
 
 
 def whitened(

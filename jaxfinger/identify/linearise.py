@@ -5,6 +5,7 @@ squares needs: ‖r + J δ‖² = ‖d + R δ‖² + ρ². A stage, the joint re
 refit are sums over these small factors; their cost no longer depends on the number of samples.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
-from jaxfinger.experiments import Batch, predict, widened
+from jaxfinger.experiments import Batch, blocks, predict
 from jaxfinger.identify.noise import whiten
 from jaxfinger.identify.parameters import Free
 from jaxfinger.model import Model
@@ -41,8 +42,7 @@ def white_rows(model: Model, batch: Batch, filters: Filters) -> tuple[dict, Floa
 
 def residuals_of(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[str, Float[np.ndarray, "columns B T"]]:
     """Measured − predicted, by channel, in the channel's unit; also where a sample does not count."""
-    B, T = batch.x.time.shape
-    return {c: np.asarray(a)[:, :B, :T] for c, a in _residuals(model, widened(batch), channels).items()}
+    return _cut([_residuals(model, block, channels) for block in blocks(batch)], batch)
 
 
 def linearise(
@@ -50,20 +50,33 @@ def linearise(
 ) -> Linearised:
     """Residuals and per-trial factors at `model`, with respect to the parameters in `free`; all weights one by default.
 
-    Compiled for the batch `widened`, whose additions are cut off again.
+    Compiled for a block of trials (`blocks`), whose additions are cut off again.
     """
-    (B, T), wide = batch.x.time.shape, widened(batch)
-    residuals, white, J = _linearise(model, free, wide, filters)
+    B, T = batch.x.time.shape
+    parts = [_linearise(model, free, block, filters, jnp.asarray(True)) for block in blocks(batch)]
+    residuals, *rows = zip(*parts, strict=True)
 
-    def cut(rows):
-        each = np.asarray(rows)[:B].reshape(B, -1, wide.x.time.shape[-1], *rows.shape[2:])
-        return each[:, :, :T].reshape(B, -1, *rows.shape[2:])
+    def cut(parts):
+        each = np.concatenate([np.asarray(a) for a in parts])[:B]
+        wide = each.reshape(B, -1, residuals[0][next(iter(filters))].shape[-1], *each.shape[2:])
+        return wide[:, :, :T].reshape(B, -1, *each.shape[2:])
 
-    residuals, white, J = {c: np.asarray(a)[:, :B, :T] for c, a in residuals.items()}, cut(white), cut(J)
+    white, J = map(cut, rows)
     columns = np.concatenate([J, white[..., None]], axis=-1)
     if weights is not None:
         columns *= weights[..., None]
-    return Linearised(residuals, white, J, np.asarray(np.linalg.qr(columns, mode="r")))
+    return Linearised(_cut(residuals, batch), white, J, np.asarray(np.linalg.qr(columns, mode="r")))
+
+
+def missed(model: Model, free: Free, batch: Batch, filters: Filters) -> dict[str, Float[np.ndarray, "columns B T"]]:
+    """`residuals_of`, by the program of `linearise`: where that is compiled, it costs no compilation."""
+    return _cut([_linearise(model, free, block, filters, jnp.asarray(False))[0] for block in blocks(batch)], batch)
+
+
+def _cut(parts: Sequence[dict[str, Array]], batch: Batch) -> dict[str, Float[np.ndarray, "columns B T"]]:
+    """Blocks of residuals put together again."""
+    B, T = batch.x.time.shape
+    return {c: np.concatenate([np.asarray(x[c]) for x in parts], axis=1)[:, :B, :T] for c in parts[0]}
 
 
 @quick_jit
@@ -73,7 +86,9 @@ def _residuals(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[st
 
 
 @quick_jit
-def _linearise(model: Model, free: Free, batch: Batch, filters: Filters):
+def _linearise(model: Model, free: Free, batch: Batch, filters: Filters, slopes: Array):
+    """Residuals, white rows, and their Jacobian: zero unless `slopes`."""
+
     def f(values):
         residuals, white = white_rows(free.put(model, values), batch, filters)
         return white, residuals
@@ -95,5 +110,9 @@ def _linearise(model: Model, free: Free, batch: Batch, filters: Filters):
 
         return jax.lax.map(lambda unit: jax.jvp(alone, (zero,), (unit,))[1], jnp.eye(zero.size))
 
-    J = jnp.concatenate([columns(part) for part in dict.fromkeys(free.parts)])
+    def jacobian():
+        return jnp.concatenate([columns(part) for part in dict.fromkeys(free.parts)])
+
+    count = sum(v.size for v in values)
+    J = jax.lax.cond(slopes, jacobian, lambda: jnp.zeros((count, *white.shape)))
     return residuals, white, jnp.moveaxis(J, 0, -1)

@@ -29,7 +29,7 @@ from scipy.optimize import lsq_linear
 from jaxfinger.compilation import side_by_side
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch
-from jaxfinger.identify.linearise import Filters, Linearised, linearise
+from jaxfinger.identify.linearise import Filters, Linearised, linearise, missed
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.model import Model
 
@@ -54,6 +54,11 @@ class Source(NamedTuple):
     batch: Batch
     filters: Filters
     positions: Int[np.ndarray, " k"]  # in the flat vector, ascending
+    effects: bool = True  # whether the model's effects show in it, if it has any
+
+    def seen(self, model: Model) -> Model:
+        """The model as the experiment shows it: what does not show is not compiled."""
+        return model if self.effects or not model.effects else eqx.tree_at(lambda m: m.effects, model, ())
 
 
 @dataclass(frozen=True)
@@ -170,9 +175,20 @@ def linearise_each(
 
     def one(name: str) -> Linearised:
         s = sources[name]
-        return linearise(model, Free.at(model, s.positions), s.batch, s.filters, weights.get(name))
+        seen = s.seen(model)
+        return linearise(seen, Free.at(seen, s.positions), s.batch, s.filters, weights.get(name))
 
     return dict(zip(sources, side_by_side(one, sources), strict=True))
+
+
+def missed_each(model: Model, sources: dict[str, Source]) -> dict[str, dict[str, Float[np.ndarray, "columns B T"]]]:
+    """Measured − predicted of every experiment's channels; also where a sample does not count."""
+
+    def one(s: Source):
+        seen = s.seen(model)
+        return missed(seen, Free.at(seen, s.positions), s.batch, s.filters)
+
+    return dict(zip(sources, side_by_side(one, sources.values()), strict=True))
 
 
 def _stacked(linearised: dict[str, Linearised], sources: dict[str, Source], size: int) -> Float[np.ndarray, "k P+1"]:

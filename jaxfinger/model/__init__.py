@@ -5,12 +5,16 @@ import jax
 jax.config.update("jax_enable_x64", True)
 
 from jaxfinger.model.dynamics import (  # noqa: E402
+    Terms,
     contact_map,
     elastic_and_friction,
     excursion,
     external_torque,
     fingertip_force,
     joint_tension,
+    plain_terms,
+    resisting,
+    resisting_change,
     resisting_torque,
     rigid_body_torque,
 )
@@ -31,6 +35,7 @@ __all__ = [
     "MomentArm",
     "Motion",
     "TendonFriction",
+    "Terms",
     "contact_map",
     "elastic_and_friction",
     "excursion",
@@ -39,6 +44,9 @@ __all__ = [
     "forward_dynamics",
     "joint_tension",
     "memories",
+    "plain_terms",
+    "resisting",
+    "resisting_change",
     "resisting_torque",
     "rigid_body_torque",
     "simulate",

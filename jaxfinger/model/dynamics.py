@@ -32,8 +32,12 @@ class Terms(NamedTuple):
     tendon_direction: Float[Array, "n *T"]
 
 
-def terms(model: Model, x: Motion, memory: tuple[Memory, ...]) -> Terms:
-    """Each term as the nominal model has it, then as the effects change it."""
+def terms(model: Model, x: Motion, memory: tuple[Memory, ...], plain: Terms | None = None) -> Terms:
+    """Each term as the nominal model has it, then as the effects change it.
+
+    `plain`: the terms of the same motion without effects, where they are known. What no effect changes is taken from
+    there: a hook that is not overridden returns the very array that it was given.
+    """
     effects = list(zip(model.effects, memory, strict=True))
     finger, f_t = model.finger, x.tension
     direction, tendon_direction = x.joint_direction, x.tendon_direction
@@ -42,34 +46,61 @@ def terms(model: Model, x: Motion, memory: tuple[Memory, ...]) -> Terms:
         f_t = effect.tension(x, state, f_t)
         direction, tendon_direction = effect.directions(x, state, direction, tendon_direction)
 
-    C = model.moment_arm.coupling(x.q)
+    C = model.moment_arm.coupling(x.q) if plain is None else plain.C
     for effect, _ in effects:
         C = effect.coupling(x, f_t, C)
-    loss = model.tendon_friction.loss(f_t)
+    affine = loss = model.tendon_friction.loss(f_t)
     for effect, _ in effects:
         loss = effect.loss(x, f_t, C, loss)
+    as_before = f_t is x.tension and loss is affine and (x.held or tendon_direction is x.tendon_direction)
     loss = bounded(loss, f_t)
-    if x.held:
+    if plain is not None and as_before:
+        f_j = plain.f_j
+    elif x.held:
         f_j = held(f_t, loss)
-        for effect, state in effects:
-            f_j = effect.held_tension(x, state, f_t, loss, f_j)
     else:
         f_j = f_t - tendon_direction * loss
+    if x.held:
+        for effect, state in effects:
+            f_j = effect.held_tension(x, state, f_t, loss, f_j)
     for effect, _ in effects:
         f_j = effect.delivered(x, f_j)
 
-    h = model.joint_torque.elastic_torque(x.q) + model.joint_torque.damping_torque(x.qd)
-    friction = model.joint_torque.friction_magnitude(x.q)
+    if plain is None:
+        h = model.joint_torque.elastic_torque(x.q) + model.joint_torque.damping_torque(x.qd)
+        friction = model.joint_torque.friction_magnitude(x.q)
+    else:
+        h, friction = plain.h, plain.friction
     for effect, state in effects:
         h = effect.torque(x, state, h)
         friction = effect.joint_friction(x, f_j, C, friction)
     return Terms(finger, f_t, C, loss, f_j, h, friction, direction, tendon_direction)
 
 
-def resisting_torque(model: Model, x: Motion) -> Float[Array, "m *T"]:
+def plain_terms(model: Model, x: Motion) -> Terms:
+    """The terms of a model without effects."""
+    return terms(model, x, memories(model, x))
+
+
+def resisting_torque(model: Model, x: Motion, plain: Terms | None = None) -> Float[Array, "m *T"]:
     """h − Cᵀ(f_t − f_f): all of (1) but the rigid body and the surroundings, N m."""
-    e = terms(model, x, memories(model, x))
+    return resisting(terms(model, x, memories(model, x), plain))
+
+
+def resisting(e: Terms) -> Float[Array, "m *T"]:
+    """`resisting_torque` of its terms, N m."""
     return e.h + e.direction * e.friction - jnp.sum(e.C * e.f_j[:, None], axis=0)
+
+
+def resisting_change(model: Model, x: Motion, plain: Terms) -> Float[Array, "m *T"]:
+    """What the effects add to `resisting_torque`, N m: of the terms that they change."""
+    e = terms(model, x, memories(model, x), plain)
+    change = e.h - plain.h if e.h is not plain.h else jnp.zeros_like(plain.h)
+    if e.friction is not plain.friction or e.direction is not x.joint_direction:
+        change += e.direction * e.friction - plain.direction * plain.friction
+    if e.C is not plain.C or e.f_j is not plain.f_j:
+        change -= jnp.sum(e.C * e.f_j[:, None] - plain.C * plain.f_j[:, None], axis=0)
+    return change
 
 
 def rigid_body_torque(model: Model, x: Motion) -> Float[Array, "m *T"]:
@@ -80,9 +111,11 @@ def rigid_body_torque(model: Model, x: Motion) -> Float[Array, "m *T"]:
     return rigid_body.inverse_dynamics(finger, x.q, x.qd, x.qdd)
 
 
-def external_torque(model: Model, x: Motion, f_ext: Float[Array, "3 *T"] | None = None) -> Float[Array, "m *T"]:
+def external_torque(
+    model: Model, x: Motion, f_ext: Float[Array, "3 *T"] | None = None, plain: Terms | None = None
+) -> Float[Array, "m *T"]:
     """τ_ext of (1): the torque that must act on the joints from outside for the motion to be as it is, N m."""
-    tau = rigid_body_torque(model, x) + resisting_torque(model, x)
+    tau = rigid_body_torque(model, x) + resisting_torque(model, x, plain)
     if f_ext is not None:
         _, J = rigid_body.fingertip(model.finger, x.q)
         tau = tau - jnp.sum(J * f_ext[:, None], axis=0)
@@ -123,9 +156,9 @@ def _solved(A: Float[Array, "3 3 *T"], B: Float[Array, "3 m *T"]) -> Float[Array
     return jnp.stack([B[0] / d0 - l1 * y - l2 * z, y, z])
 
 
-def excursion(model: Model, x: Motion) -> Float[Array, "n *T"]:
-    """l, m: f(q), and what the effects add."""
-    l = model.moment_arm.excursion(x.q)
+def excursion(model: Model, x: Motion, plain: Float[Array, "n *T"] | None = None) -> Float[Array, "n *T"]:
+    """l, m: f(q), which is `plain` where it is known, and what the effects add."""
+    l = model.moment_arm.excursion(x.q) if plain is None else plain
     f = x.tension
     states = memories(model, x)
     for effect, state in zip(model.effects, states, strict=True):

@@ -6,7 +6,7 @@ from itertools import accumulate, combinations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 
 class MomentArm(eqx.Module):
@@ -30,6 +30,10 @@ class MomentArm(eqx.Module):
                 for p, r in ((1, 1), (2, 1), (1, 2))
             ]
         return cls(jnp.zeros((n, len(exponents))), tuple(exponents))
+
+    def of(self, tendon: Int[Array, ""]) -> "MomentArm":
+        """One tendon's row."""
+        return MomentArm(self.coefficients[tendon][None], self.exponents)
 
     # Compiled on their own, so that Python traces them once, however many effects and experiments read them.
     @jax.jit

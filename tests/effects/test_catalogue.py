@@ -13,7 +13,14 @@ from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, from_dict, load, nominal
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, predict
 from jaxfinger.identify.parameters import describe, units_at
-from jaxfinger.model import simulate
+from jaxfinger.model import (
+    excursion,
+    external_torque,
+    plain_terms,
+    resisting_change,
+    resisting_torque,
+    simulate,
+)
 from tests.effects.motion import MODEL, MOTIONS, with_effects
 
 EVERY = CATALOGUE | NOMINAL_TERMS
@@ -86,6 +93,22 @@ def test_no_prediction_calls_lapack(name):
     for x, nominal in MOTIONS:
         lowered = jax.jit(lambda model, x=x, channels=tuple(nominal): predict(model, x, channels)).lower(model)
         assert "lapack" not in lowered.as_text()
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_what_an_effect_leaves_alone_need_not_be_computed_again(name):
+    """Beside the terms without it, an effect changes the torque and the excursion as it does alone."""
+    kind = EVERY[name]
+    effect = plausible(kind, kind.sites(FINGER)[0], kind.shapes(FINGER, kind.sites(FINGER)[0])[0])
+    model = with_effects(effect)
+    for x, _ in MOTIONS:
+        if model.true_motion(x) is not x:
+            continue
+        plain = plain_terms(MODEL, x)
+        expected = resisting_torque(model, x) - resisting_torque(MODEL, x)
+        np.testing.assert_allclose(resisting_change(model, x, plain), expected, atol=1e-14)
+        np.testing.assert_allclose(external_torque(model, x, plain=plain), external_torque(model, x), atol=1e-14)
+        np.testing.assert_array_equal(excursion(model, x, excursion(MODEL, x)), excursion(model, x))
 
 
 def test_where_a_joint_slides_its_effects_have_units_of_lengths_and_forces():

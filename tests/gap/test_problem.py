@@ -63,7 +63,7 @@ def test_damping_without_its_own_experiment_is_fitted_where_else_it_shows(sessio
     damping = [i for i, p in enumerate(describe(problem.nominal)) if p.group == "damping"]
     assert bool(set(damping) & set(problem.fit.estimated)) == (not missing)
     assert set(damping) <= set(problem.free)
-    fit, truth = nominal_fit(problem), np.asarray(ravel(nominal_model(specimen)))
+    fit, truth = nominal_fit(problem).fit, np.asarray(ravel(nominal_model(specimen)))
     error = np.asarray(ravel(fit.model))[damping] - truth[damping]
     assert np.all(np.abs(error) < 4.0 * fit.std[damping])
     assert np.all(truth[damping] > 3.0 * fit.std[damping])  # it shows clearly
@@ -111,8 +111,7 @@ def test_a_large_effect_is_judged_by_what_it_leaves_exactly(scaled):
     null = float(np.sum(projector.residual(scaled) ** 2))
     linear = refine(scaled, [variant], [{"gain": 0.05}], null, projector)
     there, near = relinearised(scaled, linear, null)
-    _, r, _ = augmented_fit(scaled, near)
-    exact = float(r @ r)
+    exact = float(np.sum(augmented_fit(scaled, near).r ** 2))
     assert linear.chi2 > 2.0 * exact  # twenty per cent are too much for one linearisation
     assert near.chi2 == pytest.approx(exact, abs=3.0)
     assert exact < 1.1 * scaled.r.size

@@ -61,12 +61,13 @@ def test_a_fold_sees_what_the_nominal_parameters_became_to_imitate_a_cause(diagn
 def test_a_shape_that_a_linear_step_leads_astray_is_held(diagnosis):
     """A Jacobian that belittles a length a thousand times sends it to its bounds; amplitudes alone still close."""
     problem, (key,) = diagnosis.problem, diagnosis.verdict.effects
-    fit, r, J = augmented_fit(problem, diagnosis.search.chosen)
+    augmented = augmented_fit(problem, diagnosis.search.chosen)
+    fit, J = augmented.fit, augmented.J
     shape = ~np.isin(fit.estimated, without_shapes(fit.model, fit.estimated))
     assert shape.sum() == 1
     rivals = _rivals(problem, diagnosis.search)
     good, astray = (
-        shrinkage(problem, diagnosis.nominal, fit, r, jacobian, rivals, {key}, forward=False)
+        shrinkage(problem, augmented._replace(J=jacobian), rivals, {key}, forward=False)
         for jacobian in (J, np.where(shape, 1e-3 * J, J))
     )
     for line, other in zip(good, astray, strict=True):
