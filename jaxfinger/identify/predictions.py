@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session, Trial, low_pass
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import Stack, predict, prepare, roomy
+from jaxfinger.experiments import SAMPLES, Stack, padded, predict, prepare, roomy
 from jaxfinger.identify.fit import Fit
 from jaxfinger.model import Model, Motion, simulate
 
@@ -41,9 +41,11 @@ def predict_session(
     for experiment, stack in prepare(session, names, reduced=False).items():
         progress(f"predicting {len(stack.trials)} trials of {experiment}")
         free = simulate_trials([model] * len(stack.trials), session, stack) if experiment == "VD.3" else {}
+        T = stack.batch.x.time.shape[-1]
+        wide = padded(stack.batch.x, 0, roomy(T, SAMPLES) - T)  # for a common shape
         for b, name in enumerate(stack.trials):
             N = len(session[name].time)
-            x = jax.tree.map(lambda a, b=b: a[..., b : b + 1, :], stack.batch.x)
+            x = jax.tree.map(lambda a, b=b: a[..., b : b + 1, :], wide)
             values = _predict(model, x, stack.experiment.channels)
             channels = {c: np.array(v[:, 0, :N]).T for c, v in values.items()}
             if experiment == "VD.3":
@@ -77,7 +79,7 @@ def model_for(fit: Fit | Model, session: Session) -> Model:
     return eqx.tree_at(lambda m: m.finger.gravity, model, jnp.asarray(finger.gravity, dtype=float))
 
 
-@eqx.filter_jit
+@quick_jit
 def _predict(model: Model, x: Motion, channels: tuple[str, ...]) -> dict[str, Float[Array, "columns 1 T"]]:
     return predict(model, x, channels)
 
