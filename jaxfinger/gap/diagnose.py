@@ -188,13 +188,19 @@ def _verdict(found: Search, lines: list[Shrinkage]) -> Verdict:
             f"The gap is explained about equally well by {rivals}; these trials cannot tell them apart. "
             f"The most probable is {effects[0][0]} at {'-'.join(effects[0][1])}.",
         )
-    best = max((x.closed for x in lines if x.resolvable and x.channel != "q"), default=0.0)
-    return Verdict(
-        "explained",
-        effects,
-        f"The gap is explained by {names}: {100 * share:.0f} % of what can be explained. "
+    text = f"The gap is explained by {names}: {100 * share:.0f} % of what can be explained. {_closing(lines)}"
+    return Verdict("explained", effects, text)
+
+
+def _closing(lines: list[Shrinkage]) -> str:
+    """How far the gap closes on held-out trials, and where it stays open."""
+    shown = [x for x in lines if x.resolvable and x.channel != "q"]
+    if not shown:
+        return "No channel of the held-out trials stands out of its noise, so that they cannot say how far it closes."
+    best = max(x.closed for x in shown)
+    return (
         f"On held-out trials it closes up to {100 * best:.0f} % of the gap in the channel that shows it best."
-        + "".join(f" {_channel(x)} stays at {x.after / x.noise:.1f} times its noise." for x in lines if x.stays_open),
+        + "".join(f" {_channel(x)} stays at {x.after / x.noise:.1f} times its noise." for x in lines if x.stays_open)
     )
 
 

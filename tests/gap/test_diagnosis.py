@@ -12,6 +12,8 @@ from jaxtyping import Array, Float
 from jaxfinger.effects import CATALOGUE, CatalogueEffect
 from jaxfinger.errors import UserError
 from jaxfinger.gap import as_gap_json, diagnose, write
+from jaxfinger.gap.diagnose import _closing
+from jaxfinger.gap.shrinkage import Shrinkage
 from jaxfinger.gap.signatures import whitened
 from jaxfinger.gap.where import where
 from jaxfinger.identify import load_fit
@@ -265,3 +267,9 @@ def test_a_gap_with_a_second_cause_stays_open_and_is_said(monkeypatch):
     found = diagnose(session_with((*TRUTH, {"a": 1.0, "x0": 0.1})), without=WITHOUT)
     assert found.verdict.effects == (TRUTH,)
     assert "joint_torque of VD.3 stays at" in found.verdict.summary
+
+
+def test_how_far_a_gap_closes_is_not_said_where_no_channel_shows_it():
+    line = Shrinkage("VD.3", "joint_torque", "N m", 1e-4, 1.03e-4, 1.01e-4, 0.0, (0.0, 0.0), resolvable=False)
+    assert "cannot say how far" in _closing([line])
+    assert "up to 80 %" in _closing([line, replace(line, before=3e-4, closed=0.8, resolvable=True)])
