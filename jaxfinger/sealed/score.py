@@ -55,14 +55,16 @@ def wilson(hits: int, count: int, z: float = 1.959964) -> Figure:
     return Figure(p, float(max(centre - half, 0.0)), float(min(centre + half, 1.0)), count)
 
 
-def bootstrap(values: Sequence[float], draws: int = 2000) -> Figure:
-    """Mean with a percentile interval over resampled cases (fixed seed: scoring twice gives the same figures)."""
+def bootstrap(values: Sequence[float], draws: int = 2000, of: Callable[..., np.ndarray] = np.mean) -> Figure:
+    """Mean, or median, with a percentile interval over resampled cases (fixed seed: scoring twice gives the same
+    figures).
+    """
     x = np.asarray(values, dtype=float)
     if not len(x):
         return Figure(float("nan"), float("nan"), float("nan"), 0)
-    means = x[np.random.default_rng(0).integers(len(x), size=(draws, len(x)))].mean(axis=1)
-    low, high = np.percentile(means, [2.5, 97.5])
-    return Figure(float(x.mean()), float(low), float(high), len(x))
+    drawn = of(x[np.random.default_rng(0).integers(len(x), size=(draws, len(x)))], axis=1)
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    return Figure(float(of(x)), float(low), float(high), len(x))
 
 
 def cause_right(truth: Truth, diagnosis: Diagnosis) -> bool:
@@ -143,7 +145,7 @@ def score_cases(pairs: Sequence[tuple[Truth, Diagnosis]]) -> Scores:
     (see `rivals`). false alarm: cases without an effect. open set: effects that the catalogue lacks, and of these those
     that no listed one imitates.
     Brier, probability on the truth: every case that was diagnosed. set size: verdicts that name something. closed:
-    cases with predictions on the fresh trials. seconds: cost of a case.
+    cases with predictions on the fresh trials, their mean and their median. seconds: cost of a case.
     """
     done = [(t, d) for t, d in pairs if d.status != "failed"]
     figures = _shares(pairs)
@@ -153,7 +155,10 @@ def score_cases(pairs: Sequence[tuple[Truth, Diagnosis]]) -> Scores:
         [float(len(d.answer)) if d.status == "ambiguous" else 1.0 for _, d in done if d.answer]
     )
     closed = [closed_share(d.fresh, t.fresh) for t, d in done if d.fresh and t.kind in ("listed", "double")]
-    figures["closed"] = bootstrap([x for x in closed if np.isfinite(x)])
+    closed = [x for x in closed if np.isfinite(x)]
+    figures["closed"] = bootstrap(closed)
+    # Where hardly anything is to close, a share of it is any number.
+    figures["closed, median"] = bootstrap(closed, of=np.median)
     figures["seconds"] = bootstrap([d.seconds for _, d in pairs if d.seconds is not None])
     wrong = Counter((_truth_name(t), _answer_name(d)) for t, d in pairs if not _right(t, d))
     return Scores(

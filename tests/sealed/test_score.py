@@ -11,7 +11,7 @@ from rich.console import Console
 
 from jaxfinger.errors import UserError
 from jaxfinger.sealed.figures import reliability_diagram
-from jaxfinger.sealed.score import brier, closed_share, score_cases, score_folder, wilson
+from jaxfinger.sealed.score import bootstrap, brier, closed_share, score_cases, score_folder, wilson
 from jaxfinger.sealed.tables import render
 from jaxfinger.sealed.truth import NONE, UNLISTED, Diagnosis, Truth, read_diagnosis, read_truth
 
@@ -182,3 +182,11 @@ def test_what_is_missing_is_said_in_one_sentence(tmp_path):
     (tmp_path / "gap.json").write_text("{")
     with pytest.raises(UserError, match="cannot be read as JSON"):
         read_diagnosis(tmp_path)
+
+
+def test_a_case_with_hardly_anything_to_close_moves_the_mean_and_not_the_median():
+    shares = [0.9, 1.0, 1.1, 0.95, 1.05]
+    assert bootstrap([*shares, -1000.0]).value < -100.0
+    median = bootstrap([*shares, -1000.0], of=np.median)
+    assert median.value == pytest.approx(0.975)
+    assert median.low <= median.value <= median.high
