@@ -20,8 +20,8 @@ from jaxfinger.identify.solve import Prior, Solution, Source, solve
 from jaxfinger.model import Model
 
 
-class Augmented(NamedTuple):
-    """The augmented model at its optimum."""
+class Fitted(NamedTuple):
+    """A model fitted to all trials of a problem, at its optimum."""
 
     fit: Fit
     r: Float[np.ndarray, " N"]  # white residuals
@@ -29,13 +29,13 @@ class Augmented(NamedTuple):
     sources: dict[str, Source]
 
 
-def nominal_fit(problem: Problem) -> Augmented:
+def nominal_fit(problem: Problem) -> Fitted:
     """The nominal model refitted to all trials, with no effect."""
     fit = _fit(problem, problem.nominal, problem.free, _information(problem.J, problem.root), "all trials")
-    return Augmented(fit, problem.r, problem.J, problem.sources)
+    return Fitted(fit, problem.r, problem.J, problem.sources)
 
 
-def augmented_fit(problem: Problem, chosen: Refined) -> Augmented:
+def augmented_fit(problem: Problem, chosen: Refined) -> Fitted:
     """Nominal parameters, amplitudes and moving shapes at the common optimum, with their covariance."""
     model = eqx.tree_at(lambda m: m.effects, problem.nominal, chosen.effects, is_leaf=lambda v: isinstance(v, tuple))
     parameters = describe(model)
@@ -43,7 +43,7 @@ def augmented_fit(problem: Problem, chosen: Refined) -> Augmented:
     values, moves = (np.asarray(ravel(m)) for m in (model, _on_effects(_moves, model)))
     moving = [i for i in range(first, len(parameters)) if parameters[i].determinable and moves[i]]
     free = np.concatenate([problem.free, moving]).astype(int)
-    sources = {e: _with_effects(s, chosen, moving, first, len(parameters), e) for e, s in problem.sources.items()}
+    sources = {e: _with_effects(s, chosen, moving, e) for e, s in problem.sources.items()}
     # A weak prior on amplitudes and shapes, so that a flat direction stays put.
     mean = np.concatenate([problem.prior.mean, values[moving]])
     root = np.zeros((len(problem.root) + len(moving), free.size))
@@ -54,7 +54,7 @@ def augmented_fit(problem: Problem, chosen: Refined) -> Augmented:
     information = solution.information[np.ix_(free, free)] + root.T @ root
     r, J = assemble(solution.linearised, sources, problem.rows, free, ravel(model).size)
     fit = _fit(problem, fitted, free, information, "with the effects of the diagnosis", solution)
-    return Augmented(fit, r, J, sources)
+    return Fitted(fit, r, J, sources)
 
 
 def _on_effects(change: Callable[[CatalogueEffect], CatalogueEffect], model: Model) -> Model:
@@ -103,7 +103,7 @@ def _widths(effect: CatalogueEffect) -> CatalogueEffect:
     return replace(effect, **{n: jnp.asarray(w, dtype=float) for n, w in (amplitudes | factors | places).items()})
 
 
-def _with_effects(source: Source, chosen: Refined, moving, first: int, size: int, experiment: str) -> Source:
+def _with_effects(source: Source, chosen: Refined, moving, experiment: str) -> Source:
     """The source, reading the effects' parameters too where one of them shows."""
     if not any(experiment in type(e).SHOWS for e in chosen.effects):
         return source._replace(effects=False)

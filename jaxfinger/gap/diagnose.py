@@ -10,7 +10,7 @@ from jaxfinger.data import Predictions, Session
 from jaxfinger.data.atomic import atomic_path
 from jaxfinger.effects import CATALOGUE, CatalogueEffect, nominal_terms
 from jaxfinger.errors import UserError
-from jaxfinger.gap.augment import Augmented, augmented_fit, nominal_fit, parameter_values
+from jaxfinger.gap.augment import Fitted, augmented_fit, nominal_fit, parameter_values
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.next_experiment import NextExperiment, next_experiment
 from jaxfinger.gap.problem import Problem, build
@@ -105,7 +105,7 @@ def diagnose(
     return Diagnosis(problem, verdict, places, found, lines, suggestion, nominal.fit, augmented.fit, proposal)
 
 
-def _nothing_named(problem: Problem, found: Search, nominal: Augmented, forward: bool) -> Diagnosis:
+def _nothing_named(problem: Problem, found: Search, nominal: Fitted, forward: bool) -> Diagnosis:
     """No gap, or one of which no known effect explains any."""
     verdict, places, proposal = Verdict("no_gap", (), _no_gap_summary(found)), [], None
     if found.detected:

@@ -31,7 +31,7 @@ from jaxfinger.identify.stages import (
     sources_of,
     start_values,
 )
-from jaxfinger.model import Model, plain_terms
+from jaxfinger.model import Model, Terms, plain_terms
 
 
 @dataclass(frozen=True)
@@ -105,15 +105,15 @@ class Problem:
         return out
 
     @cached_property
-    def without_effects(self) -> dict[tuple[str, bool], tuple[list, list]]:
+    def without_effects(self) -> dict[tuple[str, bool], tuple[list, list[Terms | None]]]:
         """What the nominal model says of every block of the groups, by channel and whether joints are held:
         `predicted`, (columns, B, T), and the terms of (1) behind a torque or a force.
         """
-        terms = {
-            (g.channel, g.held): [None if g.channel == "tendon_excursion" else _plain(self.nominal, x) for x in g.x]
-            for g in self.groups
-        }
-        return {(g.channel, g.held): (g.merged(self.predicted), terms[g.channel, g.held]) for g in self.groups}
+
+        def behind(group: Group) -> list[Terms | None]:
+            return [None if group.channel == "tendon_excursion" else _plain(self.nominal, x) for x in group.x]
+
+        return {(g.channel, g.held): (g.merged(self.predicted), behind(g)) for g in self.groups}
 
     @property
     def trial_names(self) -> list[str]:

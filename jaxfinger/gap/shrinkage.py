@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from jaxfinger.data.schema import channel_units
 from jaxfinger.experiments import prepare
-from jaxfinger.gap.augment import Augmented, limits, without_shapes
+from jaxfinger.gap.augment import Fitted, limits, without_shapes
 from jaxfinger.gap.evidence import Evidence, Projector, evidence
 from jaxfinger.gap.held_out import FOLDS, equilibrated, fold_of_row, folds
 from jaxfinger.gap.problem import Problem
@@ -61,7 +61,7 @@ def contradicts(lines: list[Shrinkage]) -> bool:
 
 def shrinkage(
     problem: Problem,
-    augmented: Augmented,
+    augmented: Fitted,
     rivals: list[tuple[Evidence, np.ndarray]],
     named: set[tuple],
     forward: bool = True,

@@ -79,7 +79,7 @@ def terms(model: Model, x: Motion, memory: tuple[Memory, ...], plain: Terms | No
 
 def plain_terms(model: Model, x: Motion) -> Terms:
     """The terms of a model without effects."""
-    return terms(model, x, memories(model, x))
+    return terms(model, x, ())
 
 
 def resisting_torque(model: Model, x: Motion, plain: Terms | None = None) -> Float[Array, "m *T"]:
