@@ -10,7 +10,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 # XLA's fusion emitters take half as long again, or more, to compile these scalar formulas, which then run no faster.
-QUICK = {"xla_cpu_use_fusion_emitters": False}
+QUICK = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 
 # The overloads of equinox leave the options of jit out.
 quick_jit = eqx.filter_jit(compiler_options=QUICK)  # type: ignore[call-overload]

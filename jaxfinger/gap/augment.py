@@ -15,6 +15,7 @@ from jaxfinger.gap.problem import Problem, assemble
 from jaxfinger.gap.refine import Refined
 from jaxfinger.identify import Fit
 from jaxfinger.identify.fit import StageReport
+from jaxfinger.identify.misfit import growth, pulls
 from jaxfinger.identify.parameters import describe, ravel, units_at
 from jaxfinger.identify.solve import Prior, Solution, Source, solve
 from jaxfinger.model import Model
@@ -31,7 +32,8 @@ class Fitted(NamedTuple):
 
 def nominal_fit(problem: Problem) -> Fitted:
     """The nominal model refitted to all trials, with no effect."""
-    fit = _fit(problem, problem.nominal, problem.free, _information(problem.J, problem.root), "all trials")
+    covariance = _covariance(problem, problem.r, problem.J, problem.root)
+    fit = _fit(problem, problem.nominal, problem.free, covariance, "all trials")
     return Fitted(fit, problem.r, problem.J, problem.sources)
 
 
@@ -51,9 +53,9 @@ def augmented_fit(problem: Problem, chosen: Refined) -> Fitted:
     wide = np.asarray(ravel(_on_effects(_widths, model)))
     root[len(problem.root) :, problem.free.size :] = np.diag(1.0 / wide[moving])
     fitted, solution = solve(model, free, sources, Prior(mean, root), limits=limits(model, free))
-    information = solution.information[np.ix_(free, free)] + root.T @ root
     r, J = assemble(solution.linearised, sources, problem.rows, free, ravel(model).size)
-    fit = _fit(problem, fitted, free, information, "with the effects of the diagnosis", solution)
+    covariance = _covariance(problem, r, J, root)
+    fit = _fit(problem, fitted, free, covariance, "with the effects of the diagnosis", solution)
     return Fitted(fit, r, J, sources)
 
 
@@ -110,16 +112,19 @@ def _with_effects(source: Source, chosen: Refined, moving, experiment: str) -> S
     return source._replace(positions=np.union1d(source.positions, moving).astype(int))
 
 
-def _information(J: np.ndarray, root: np.ndarray) -> np.ndarray:
-    return J.T @ J + root.T @ root
-
-
-def _fit(problem: Problem, model: Model, free, information, what: str, solution: Solution | None = None) -> Fit:
+def _covariance(problem: Problem, r: np.ndarray, J: np.ndarray, root: np.ndarray) -> Float[np.ndarray, "p p"]:
+    """Laplace's, wider where the residuals pull a parameter to and fro by more than the noise explains."""
+    information = J.T @ J + root.T @ root
     diagonal = np.diag(information)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    covariance = np.zeros((ravel(model).size,) * 2)
     inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-13, hermitian=True) * np.outer(scale, scale)
-    covariance[np.ix_(free, free)] = inverse
+    grow = growth(inverse, pulls(r, J, problem.block_of_row), root)
+    return inverse * np.outer(grow, grow)
+
+
+def _fit(problem: Problem, model: Model, free, block, what: str, solution: Solution | None = None) -> Fit:
+    covariance = np.zeros((ravel(model).size,) * 2)
+    covariance[np.ix_(free, free)] = block
     chi2 = 2 * solution.cost if solution else float(problem.r @ problem.r)
     report = StageReport(
         what,

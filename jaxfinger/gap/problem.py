@@ -19,6 +19,7 @@ from jaxfinger.gap.groups import Group, grouped
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.linearise import Linearised
+from jaxfinger.identify.misfit import stretches
 from jaxfinger.identify.noise import Noise, estimate, history
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.solve import Prior, Source, linearise_each, solve
@@ -82,6 +83,12 @@ class Problem:
             out[rows.start : rows.start + rows.size] = rows.trial + first
             first += len(self.stacks[rows.experiment].trials)
         return out
+
+    @property
+    def block_of_row(self) -> np.ndarray:
+        """(N,) running number of the stretch of a trial that a row lies in (`misfit.stretches`)."""
+        times = [np.asarray(self.sources[e].batch.x.time)[rows.trial, rows.time] for e, rows in self.rows.items()]
+        return stretches(self.trial_of_row, np.concatenate(times))
 
     @cached_property
     def columns(self) -> list[tuple[str, str, int]]:

@@ -30,6 +30,7 @@ from jaxfinger.compilation import side_by_side
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch
 from jaxfinger.identify.linearise import Filters, Linearised, linearise, missed
+from jaxfinger.identify.misfit import pulls, stretches
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.model import Model
 
@@ -38,6 +39,7 @@ SMALL = 0.02  # a step this small, in standard deviations of the estimate, ends 
 KINK = 0.1  # likewise one that does not lower the cost: what is left is a kink, where a tendon slips or a joint turns
 STEPS = 40
 LIGHTEST = 0.02  # share of its starting value below which no mass is let to fall
+REMEMBERED = 5  # steps that the next one is mixed with
 PAD = 16  # compressed problems are padded to multiples of this, to share compilations
 
 
@@ -73,6 +75,7 @@ class Solution:
     invisible: Float[np.ndarray, "k p"]  # unit combinations of scaled parameters that neither trials nor prior see
     scale: Float[np.ndarray, " p"]
     outliers: float  # share of white residuals beyond the robust limit
+    pulls: Float[np.ndarray, "b P"]  # of every stretch of the trials on the flat vector (`misfit`), clipped
     linearised: dict[str, Linearised]
 
     def chi2_per_row(self, estimated: int) -> float:
@@ -113,6 +116,7 @@ def solve(
                 break
         best, before, converged = np.inf, None, False
         step = gradient = np.zeros_like(theta)
+        steps: list[tuple[np.ndarray, np.ndarray]] = []  # whole ones, and where they started
         for _ in range(STEPS):
             linearised = linearise_each(model, sources, weights)
             factor = _stacked(linearised, sources, size)
@@ -141,11 +145,15 @@ def solve(
             if np.any(theta + step < low) or np.any(theta + step > high):
                 step = bounded(A, b, low - theta, high - theta)
                 z = np.linalg.lstsq(basis, step, rcond=None)[0]
+            steps = [*steps[-REMEMBERED:], (theta, step)]
             small = float(np.max(np.abs(z), initial=0.0))
             if small < SMALL:
                 converged = True
                 break
             before = model, linearised  # a whole step away
+            mixed = _mixed(A, steps)
+            if gradient @ mixed < 0 and np.all(theta + mixed >= low) and np.all(theta + mixed <= high):
+                step = mixed
             theta = theta + step
             model = moved.set(model, jnp.asarray(theta))
     message = (
@@ -157,7 +165,20 @@ def solve(
     rows = sum(int(np.count_nonzero(lin.white)) for lin in linearised.values())
     information = factor[:, :-1].T @ factor[:, :-1]
     cost = 0.5 * float(factor[:, -1] @ factor[:, -1])
-    return model, Solution(converged, message, cost, rows, information, invisible, scale, share, linearised)
+    found = _pulls(linearised, sources, size, huber or np.inf)
+    return model, Solution(converged, message, cost, rows, information, invisible, scale, share, found, linearised)
+
+
+def _mixed(A: np.ndarray, steps: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """The latest step, in the light of those before it: of their affine combinations the one whose own step is
+    shortest, and on from there (Anderson 1965; Walker and Ni 2011).
+    """
+    theta, step = steps[-1]
+    if len(steps) == 1:
+        return step
+    moves, changes = (np.stack(d, axis=1) for d in zip(*((theta - x, step - s) for x, s in steps[:-1]), strict=True))
+    share = np.linalg.lstsq(A @ changes, A @ step, rcond=1e-6)[0]
+    return step - (moves + changes) @ share
 
 
 def _shorter(start: float, slope: float, end: float) -> float:
@@ -205,6 +226,23 @@ def _stacked(linearised: dict[str, Linearised], sources: dict[str, Source], size
     out = np.zeros((small.shape[0], size + 1))
     out[:, used] = small
     return out
+
+
+def _pulls(
+    linearised: dict[str, Linearised], sources: dict[str, Source], size: int, limit: float
+) -> Float[np.ndarray, "b P"]:
+    out = []
+    for name, lin in linearised.items():
+        B, wide, k = lin.jacobian.shape
+        time = np.asarray(sources[name].batch.x.time)
+        time = np.broadcast_to(time[:, None], (B, wide // time.shape[1], time.shape[1])).reshape(B, wide)
+        counts = np.flatnonzero(lin.white)
+        stretch = stretches(np.repeat(np.arange(B), wide)[counts], time.reshape(-1)[counts])
+        r, J = lin.white.reshape(-1)[counts], lin.jacobian.reshape(-1, k)[counts]
+        block = np.zeros((stretch.max(initial=-1) + 1, size))
+        block[:, sources[name].positions] = pulls(np.clip(r, -limit, limit), J, stretch)
+        out.append(block)
+    return np.concatenate(out)
 
 
 def triangular(A: np.ndarray) -> np.ndarray:

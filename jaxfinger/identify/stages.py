@@ -19,6 +19,7 @@ from jaxfinger.data import Session
 from jaxfinger.experiments import Stack, prepare
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible
+from jaxfinger.identify.misfit import growth
 from jaxfinger.identify.noise import ORDER, Noise, estimate
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.recipe import Recipe
@@ -288,7 +289,8 @@ def propagate(covariance, solution: Solution, free, linked, prior) -> np.ndarray
     """Covariance of the flat vector after a stage (see the module's equation); infinite where nothing is seen.
 
     Residuals larger than the noise say that the model misses something: intervals then widen with them (Birge's ratio,
-    as the Particle Data Group's scale factor S; Review of Particle Physics, §5.2.2).
+    as the Particle Data Group's scale factor S; Review of Particle Physics, §5.2.2), and by as much more as the
+    residuals pull a parameter to and fro from one stretch of the trials to the next (`misfit`).
     """
     information = solution.information / max(1.0, solution.chi2_per_row(free.size))
     scale = solution.scale
@@ -298,11 +300,13 @@ def propagate(covariance, solution: Solution, free, linked, prior) -> np.ndarray
         N = N + np.asarray(prior.root).T @ np.asarray(prior.root)
     scaled = N * np.outer(scale, scale)
     inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True) * np.outer(scale, scale)
+    root = np.zeros((0, free.size)) if prior is None else np.asarray(prior.root)
+    grow = growth(inverse, solution.pulls[:, free] / max(1.0, solution.chi2_per_row(free.size)), root)
     out = covariance.copy()
     out[free, :] = out[:, free] = 0.0
     cross = inverse @ information[np.ix_(free, others)]
     inherited = covariance[np.ix_(others, others)]
-    out[np.ix_(free, free)] = inverse + cross @ inherited @ cross.T
+    out[np.ix_(free, free)] = inverse * np.outer(grow, grow) + cross @ inherited @ cross.T
     out[np.ix_(free, others)] = -cross @ inherited
     out[np.ix_(others, free)] = out[np.ix_(free, others)].T
     for combination in solution.invisible:

@@ -16,10 +16,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 
 from jaxfinger.data import Session as Recording
 from jaxfinger.data import Trial, write_session
 
+from .closure import friction_known
 from .departures import LISTED, UNLISTED, draw
 from .departures.base import Departure
 from .drive import simulate, wish
@@ -27,7 +29,7 @@ from .laws import Finger
 from .protocols import Plan, draw_style, session_plans
 from .record import Motion, commanded, driven, read, record
 from .sensors import STD, UNITS, Sensors, draw_sensors, measure
-from .severity import Session, by_channel, calibrate
+from .severity import Look, Session, by_channel, calibrate
 from .specimens import LAYOUTS, Specimen, make_specimen
 
 SCHEMA = "jaxfinger-sealed/1"
@@ -231,14 +233,15 @@ def _trials(
 
 def _fresh_gap(departures: Sequence[Departure], quiet: Session, plans: Sequence[Plan]):
     """rms on the fresh trials by experiment and channel, of the nominal model refitted (before) and with the
-    true effects (after).
+    true effects (after), over the samples that predictions are judged by.
     """
     sensors = quiet.sensors
     later = Session(quiet.specimen, plans, sensors)
     rows, labels = later.trace(departures)
     if departures:
         rows = rows - later.absorbed[0] @ quiet.absorb(quiet.trace(departures)[0])
-    gap = by_channel(rows, [(e, c, 0) for e, c, _ in labels])
+    counts = np.concatenate([_judged(later, look) for look in later.looks])
+    gap = by_channel(rows[counts], [(e, c, 0) for (e, c, _), judged in zip(labels, counts, strict=True) if judged])
     out = []
     for (experiment, channel, _), value in sorted(gap.items()):
         noise = sensors.std[channel]
@@ -255,6 +258,21 @@ def _fresh_gap(departures: Sequence[Departure], quiet: Session, plans: Sequence[
             }
         )
     return out
+
+
+def _judged(session: Session, look: Look) -> Bool[np.ndarray, " R"]:
+    """Which of a trial's rows lie where a prediction of the like recording is judged."""
+    plan, motion, cad = look.plan, look.motion, session.specimen.finger
+    held = sum(((motion.time >= begin) & (motion.time < end) for begin, end, _ in plan.holds), np.zeros(1, bool))
+    excursion = session.nominal.geometry(motion.q)[0]
+    trial = Trial(
+        plan.name, plan.experiment, motion.time, motion.q, motion.tension,
+        tendon_excursion=excursion, hold=np.where(held, 0, -1),
+    )  # fmt: skip
+    known = np.broadcast_to(friction_known(trial, cad), motion.q.shape)
+    every = np.ones(len(motion.time), bool)
+    rows = session.rows(session.nominal, look, motion, True)
+    return np.concatenate([known[:, k] if c == "joint_torque" else every for _, c, k, _ in rows])
 
 
 def make_cases(

@@ -10,9 +10,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 from scipy.ndimage import minimum_filter1d
 
-from jaxfinger.data import Session, Trial, find_holds, read_predictions, read_session
+from jaxfinger.data import FingerDescription, Session, Trial, find_holds, read_predictions, read_session
 
 CHANNELS = {
     "ID.2": ("tendon_excursion",),
@@ -48,7 +49,7 @@ def gap_by_channel(
                 continue
             difference = np.asarray(seen, dtype=float) - said
             if channel == "joint_torque":
-                difference = np.where(_friction_known(trial, measured), difference, np.nan)
+                difference = np.where(friction_known(trial, measured.finger), difference, np.nan)
             for column in difference.T:
                 rest = column[np.isfinite(column)]
                 if len(rest):
@@ -58,24 +59,24 @@ def gap_by_channel(
     return {key: float(np.sqrt(np.concatenate(parts).mean())) for key, parts in sorted(squares.items())}
 
 
-def _friction_known(trial: Trial, session: Session) -> np.ndarray:
-    """(N, 1 or m) where the direction of friction is known to the sample."""
+def friction_known(trial: Trial, finger: FingerDescription) -> Bool[np.ndarray, "N m"] | Bool[np.ndarray, "N 1"]:
+    """Where the direction of friction is known to the sample: the torque counts there."""
     if trial.experiment == "ID.3-static":
         return find_holds(trial)[:, None] >= 0
     if trial.experiment in ("ID.3-dynamic", "VD.3"):
-        return _sliding(trial, session)
+        return _sliding(trial, finger)
     return np.ones((len(trial.time), 1), bool)
 
 
-def _sliding(trial: Trial, session: Session) -> np.ndarray:
-    """(N, m) where a joint moves, and every tendon across it where tendons drive it, clear of where they stop."""
+def _sliding(trial: Trial, finger: FingerDescription) -> Bool[np.ndarray, "N m"]:
+    """Where a joint moves, and every tendon across it where tendons drive it, clear of where they stop."""
     rate = float(1.0 / np.median(np.diff(trial.time)))
     width = max(int(0.05 * rate), 3)
     speed = _slope(trial.q, trial.time, width)
     slides = np.abs(speed) > MOVING
     if trial.experiment == "VD.3" and trial.tendon_excursion is not None:
         tendon = np.abs(_slope(trial.tendon_excursion, trial.time, width)) > MOVING * 5e-3
-        slides &= ~(~tendon @ (session.finger.crosses & session.finger.active[:, None]))
+        slides &= ~(~tendon @ (finger.crosses & finger.active[:, None]))
     return minimum_filter1d(slides, 2 * round(CLEAR * rate) + 1, axis=0)
 
 

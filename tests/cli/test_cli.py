@@ -92,6 +92,7 @@ def test_the_published_axis_comes_back(folder, capsys):
         ("elastic torque axis^0", -3.16, 0.12, "N"),
     ):
         assert values[name]["value"] == pytest.approx(published, rel=tolerance)
+        assert abs(values[name]["value"] - published) < 1.96 * values[name]["std"]
         assert values[name]["units"] == units
 
 
