@@ -29,6 +29,7 @@ STAGES = {
     "id3": "Elastic torque, friction and damping of the joints alone.",
     "id4": "Tendon friction alone.",
     "joint": "All trials at once, with the staged estimates as the start.",
+    "effects": "All trials at once, with effects beyond the nominal model that are known to be there.",
 }
 SEALED = {
     "make": "Make cases and hide their truth.",
@@ -41,7 +42,7 @@ SEALED = {
 for name, (place, text) in COMMANDS.items():
     app.command(f"jaxfinger.cli.{place}", name=name, help=text)
 
-fit = App(name="fit", help="One stage of the identification at a time.")
+fit = App(name="fit", help="One stage of the identification at a time, or all trials at once.")
 for name, text in STAGES.items():
     fit.command(f"jaxfinger.cli.model:fit_{name}", name=name, help=text)
 app.command(fit)

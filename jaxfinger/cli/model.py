@@ -183,6 +183,58 @@ def fit_joint(file: Path, *, output: Output, start: Path, json: bool = False, ov
     _report(fit, json)
 
 
+def fit_effects(
+    file: Path,
+    *,
+    effect: Annotated[list[str], Parameter(consume_multiple=True)],
+    output: Output,
+    recipe: str | None = None,
+    effects: Path | None = None,
+    json: bool = False,
+    overwrite: bool = False,
+) -> None:
+    """Fit every nominal parameter on all trials at once, together with effects that are known to be there.
+
+    Parameters
+    ----------
+    file
+        Session (HDF5).
+    effect
+        An effect and where it sits: tendon_stretch:T3, or tendon_crosstalk:T3-T4 at a pair. Several may be named.
+    output
+        Fit to write (JSON).
+    recipe
+        The nominal model (TOML), or the name of a shipped recipe.
+    effects
+        A Python file with effects of your own, beside those of the catalogue.
+    json
+        Print the parameters as JSON.
+    overwrite
+        Replace a file that is already there.
+    """
+    refuse_existing(output, overwrite)
+    keys = [_key(text) for text in effect]
+    from jaxfinger.data import read_session
+    from jaxfinger.effects import load
+    from jaxfinger.gap import fit_with
+    from jaxfinger.identify import read_recipe, save_fit
+
+    with progress("fit") as say:
+        wanted = read_recipe(recipe)
+        own = load(effects) if effects is not None else {}
+        say("reading the file")
+        fit = fit_with(read_session(file), keys, wanted, own, say)
+        save_fit(fit, output, overwrite)
+    _report(fit, json)
+
+
+def _key(text: str) -> tuple[str, tuple[str, ...]]:
+    name, _, site = text.partition(":")
+    if not (name and site):
+        raise UserError(f"--effect {text}: say the effect and where it sits, for example tendon_stretch:T3")
+    return name, (site,)
+
+
 def validate(
     fit: Path,
     file: Path,

@@ -20,6 +20,7 @@ from jaxfinger.errors import UserError
 
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 PREDICT = f"{shlex.quote(sys.executable)} -m jaxfinger predict {{fit}} {{session}} -o {{out}}"
+REFIT = f"{shlex.quote(sys.executable)} -m jaxfinger fit effects {{session}} --effect {{effects}} -o {{out}}"
 
 
 def make(
@@ -134,22 +135,35 @@ class Diagnosis:
             diagnose(fit, output=out, without=list(self.left_out))
 
 
-def close(folder: Path, *, diagnoses: Path | None = None, command: str = PREDICT, workers: int | None = None) -> None:
-    """Predict every diagnosed case's fresh trials before and after, for the score of how far the gap closes.
+def close(
+    folder: Path,
+    *,
+    diagnoses: Path | None = None,
+    truth: Path | None = None,
+    command: str = PREDICT,
+    refit: str = REFIT,
+    workers: int | None = None,
+) -> None:
+    """Predict the fresh trials of every diagnosed case with a known effect before and after, and by a refit with the
+    true effects, for the score of how far the gap closes.
 
     Args:
         folder: the cases.
         diagnoses: what `run` wrote; by default FOLDER-diagnoses.
+        truth: what `make` hid; by default FOLDER-truth, or truth.json beside each fit.h5.
         command: what predicts; {fit}, {session} and {out} stand for the fit, the fresh trials and the file to write.
+        refit: what fits with the true effects; {session}, {effects} and {out} stand for the session that was
+            diagnosed, the effects as effect:site, and the fit to write. An empty one for none.
         workers: cases at a time; by default as many as there are cores.
     """
-    from jaxfinger.sealed.run import close_cases
+    from jaxfinger.sealed.run import Predict, close_cases
 
     out = diagnoses or _beside(folder, "diagnoses")
+    truths = truth or _beside(folder, "truth")
     with _bar("closing") as progress:
-        results = close_cases(folder, out, command, workers or os.cpu_count() or 1, progress)
+        results = close_cases(folder, out, Predict(command, refit), truths, workers or os.cpu_count() or 1, progress)
     failed = sorted(name for name, what in results.items() if what == "failed")
-    print(f"{out}: {len(results)} cases" + (f"; failed: {', '.join(failed)}" if failed else ""))
+    print(f"{out}: {len(results)} cases" + (f"; failed, see close.log: {', '.join(failed)}" if failed else ""))
 
 
 def score(folder: Path, *, diagnoses: Path | None = None, truth: Path | None = None, output: Output = None) -> None:

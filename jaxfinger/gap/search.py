@@ -114,7 +114,7 @@ def search(
     start, there = problem, {}
     for k in _rivals(refined, best, chi2, 1 if quick else RIVALS):
         progress(f"refitting with {k[0]} at {', '.join(k[1])} where it leads")
-        forms = [refine(problem, [e.variant], [start_of(e)], chi2, projector) for e in _other_forms(screened, found[k])]
+        forms = [refine(problem, [e.variant], [start_of(e)], chi2, projector) for e in other_forms(screened, found[k])]
         led = [relinearised(problem, r, chi2) for r in (refined[k], *forms)]
         there[k], refined[k] = max(led, key=lambda x: x[1].log_evidence)
     best = max((refined[k] for k in there), key=lambda r: r.log_evidence)
@@ -145,7 +145,7 @@ def _rivals(refined: dict[tuple, Refined], best: Refined, chi2: float, most: int
     return sorted(close, key=lambda k: -refined[k].log_evidence)[:most]
 
 
-def _other_forms(screened: list[Evidence], first: Evidence) -> list[Evidence]:
+def other_forms(screened: list[Evidence], first: Evidence) -> list[Evidence]:
     """The strongest variant of every other choice, which no refit moves, of the same effect and site: a coarse grid of
     the other shapes, or a friction that is refitted with it, may have put the wrong one first.
     """

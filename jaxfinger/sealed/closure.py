@@ -88,12 +88,13 @@ def _slope(values: np.ndarray, time: np.ndarray, width: int) -> np.ndarray:
     return out
 
 
-def fresh_rows(fresh: Path, before: Path, after: Path) -> list[dict]:
-    """Rows for `fresh.json`: rms on the fresh trials of the nominal fit's and the augmented fit's predictions."""
+def fresh_rows(fresh: Path, predictions: Mapping[str, Path]) -> list[dict]:
+    """Rows for `fresh.json`: rms on the fresh trials of each named prediction (before, after, best)."""
     measured = read_session(fresh)
-    first, second = (gap_by_channel(measured, read_predictions(p)) for p in (before, after))
+    gaps = {name: gap_by_channel(measured, read_predictions(file)) for name, file in predictions.items()}
+    first, *others = gaps.values()
     return [
-        {"experiment": e, "channel": c, "before": first[e, c], "after": second[e, c]}
+        {"experiment": e, "channel": c} | {name: gap[e, c] for name, gap in gaps.items()}
         for e, c in first
-        if (e, c) in second
+        if all((e, c) in gap for gap in others)
     ]

@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -23,6 +23,8 @@ import h5py
 import numpy as np
 
 from jaxfinger.errors import UserError
+
+from .truth import Cause, Truth, read_diagnosis, read_truth
 
 CASES_PER_PROCESS = 3  # compiled code of a case takes up to 18,000 memory maps; Linux gives a process 65,530
 
@@ -40,10 +42,7 @@ class Command:
         return Command(f"{self.line} --without {shlex.quote(effect)}")
 
     def __call__(self, fit: Path, out: Path) -> None:
-        words = [w.format(fit=fit, out=out) for w in shlex.split(self.line)]
-        done = subprocess.run(words, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise RuntimeError((done.stderr or done.stdout).strip()[-2000:] or f"exit status {done.returncode}")
+        _run([w.format(fit=fit, out=out) for w in shlex.split(self.line)])
 
 
 def run_case(diagnose: Diagnose, folder: Path, out: Path) -> str:
@@ -74,24 +73,62 @@ def run_case(diagnose: Diagnose, folder: Path, out: Path) -> str:
     return "failed" if "error" in record else "done"
 
 
-def close_case(predict: str, folder: Path, diagnosed: Path) -> str:
-    """Predict a case's fresh trials before and after its diagnosis into `diagnosed/fresh.json`; "skipped" where it is
-    there, or where the diagnosis leaves the model as it is.
+@dataclass(frozen=True)
+class Predict:
+    """Shell command lines: `line` predicts a session by a fit, with {fit}, {session} and {out}; `refit` fits a session
+    with the effects that are truly there, with {session}, {effects} and {out}. Without it there is no best to compare
+    with.
+    """
+
+    line: str
+    refit: str = ""
+
+    def __call__(self, fit: Path, session: Path, out: Path) -> None:
+        _run([w.format(fit=fit, session=session, out=out) for w in shlex.split(self.line)])
+
+    def best(self, session: Path, causes: Sequence[Cause], out: Path) -> None:
+        """A fit with the true effects."""
+        words = []
+        for w in shlex.split(self.refit):
+            named = [f"{effect}:{'-'.join(site)}" for effect, site in causes]
+            words += named if w == "{effects}" else [w.format(session=session, out=out)]
+        _run(words)
+
+
+def _run(words: list[str]) -> None:
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError((done.stderr or done.stdout).strip()[-2000:] or f"exit status {done.returncode}")
+
+
+def close_case(predict: Predict, folder: Path, diagnosed: Path, truth: Truth) -> str:
+    """Predict a case's fresh trials into `diagnosed/fresh.json`: by the nominal model (before), with the verdict's
+    effects (after), and with the true ones (best), which are the verdict's where it is right. "skipped" where it is
+    done, or where no known effect is there; "failed" where a command fails, which `close.log` tells.
     """
     from .closure import fresh_rows
 
-    fits = [diagnosed / "nominal.json", diagnosed / "augmented.json"]
-    if (diagnosed / "fresh.json").exists() or not all(f.exists() for f in fits):
+    fits = {"before": diagnosed / "nominal.json", "after": diagnosed / "augmented.json"}
+    if (diagnosed / "fresh.json").exists() or not all(f.exists() for f in fits.values()):
         return "skipped"
-    if not json.loads((diagnosed / "gap.json").read_text())["verdict"]["effects"]:
+    if truth.kind not in ("listed", "double"):
         return "skipped"
+    named = set(read_diagnosis(diagnosed).named)
     with tempfile.TemporaryDirectory() as scratch:
-        outs = [Path(scratch) / f"{f.stem}.h5" for f in fits]
-        for fit, out in zip(fits, outs, strict=True):
-            words = [w.format(fit=fit, session=folder / "fresh.h5", out=out) for w in shlex.split(predict)]
-            if subprocess.run(words, capture_output=True, text=True, check=False).returncode:
-                return "failed"
-        rows = fresh_rows(folder / "fresh.h5", *outs)
+        outs = {name: Path(scratch) / f"{name}.h5" for name in fits}
+        try:
+            if named != set(truth.causes) and predict.refit:
+                fits["best"] = Path(scratch) / "best.json"
+                outs["best"] = Path(scratch) / "best.h5"
+                predict.best(folder / "fit.h5", truth.causes, fits["best"])
+            for name, fit in fits.items():
+                predict(fit, folder / "fresh.h5", outs[name])
+        except RuntimeError as error:
+            (diagnosed / "close.log").write_text(str(error))
+            return "failed"
+        if named == set(truth.causes):
+            outs["best"] = outs["after"]
+        rows = fresh_rows(folder / "fresh.h5", outs)
     part = diagnosed / "fresh.json.part"
     part.write_text(json.dumps({"rows": rows}, indent=1))
     os.replace(part, diagnosed / "fresh.json")
@@ -101,15 +138,17 @@ def close_case(predict: str, folder: Path, diagnosed: Path) -> str:
 def close_cases(
     cases: Path,
     out: Path,
-    predict: str,
+    predict: Predict,
+    truth_root: Path | None,
     workers: int = 1,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> dict[str, str]:
     """`close_case` for every diagnosed case; returns what became of each."""
     folders = [f.parent for f in sorted(cases.glob("*/fit.h5")) if (out / f.parent.name / "gap.json").exists()]
+    truths = {f.name: read_truth(f, truth_root) for f in folders}
     results: dict[str, str] = {}
     with ThreadPoolExecutor(workers) as pool:
-        jobs = {pool.submit(close_case, predict, f, out / f.name): f.name for f in folders}
+        jobs = {pool.submit(close_case, predict, f, out / f.name, truths[f.name]): f.name for f in folders}
         for job in as_completed(jobs):
             results[jobs[job]] = job.result()
             if progress:

@@ -1,4 +1,4 @@
-"""Reading verdicts and truths. Only scoring comes here; nothing that diagnoses does."""
+"""Reading verdicts and truths. Only closing and scoring come here; nothing that diagnoses does."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxfinger.effects import CATALOGUE, CatalogueEffect
 from jaxfinger.errors import UserError
-from jaxfinger.gap import as_gap_json, diagnose, write
+from jaxfinger.gap import as_gap_json, diagnose, fit_with, write
 from jaxfinger.gap.diagnose import _closing
 from jaxfinger.gap.shrinkage import Shrinkage
 from jaxfinger.gap.signatures import whitened
@@ -54,6 +54,17 @@ def test_two_effects_are_both_named_and_keep_their_sizes():
     assert at["PIP",]["x0"]["value"] == pytest.approx(0.1, rel=0.2)
     assert at["MCP",]["stiffness"]["value"] == pytest.approx(0.1, rel=0.2)
     assert at["MCP",]["T"]["value"] == pytest.approx(1.0, rel=0.3)
+
+
+def test_a_fit_with_the_effect_that_is_known_to_be_there_is_that_of_the_diagnosis(diagnosis):
+    session = session_with((*TRUTH, {"a": 1.0, "x0": 0.1}))
+    known = fit_with(session, [TRUTH])
+    for ours, theirs in zip(known.model.effects, diagnosis.augmented.model.effects, strict=True):
+        assert ours.values() == pytest.approx(theirs.values(), rel=1e-3)
+    with pytest.raises(UserError, match="joint_presliding is not at T1; it has MCP, PIP, DIP"):
+        fit_with(session, [("joint_presliding", ("T1",))])
+    with pytest.raises(UserError, match="no effect stiction"):
+        fit_with(session, [("stiction", ("PIP",))])
 
 
 def test_the_gap_lies_at_the_joint_and_closes_on_held_out_trials(gap):

@@ -10,7 +10,7 @@ import pytest
 from jaxfinger.cli import sealed as cli
 from jaxfinger.errors import UserError
 from jaxfinger.sealed import run as run_module
-from jaxfinger.sealed.run import Command, close_cases, run_case, run_cases
+from jaxfinger.sealed.run import Command, Predict, close_cases, run_case, run_cases
 from jaxfinger.sealed.score import imitators
 
 READ = "import sys, json, pathlib; o = pathlib.Path(sys.argv[2]); o.mkdir(); "
@@ -124,24 +124,41 @@ def test_withheld_effects_are_taken_out_one_by_one(folder, capsys):
     assert payload.answers == [("drive_inertia (DIP)", 2)]
 
 
-def test_fresh_trials_are_predicted_only_for_a_verdict_that_names_an_effect(folder, tmp_path, monkeypatch):
-    seen = []
-    monkeypatch.setattr("jaxfinger.sealed.closure.fresh_rows", lambda *paths: seen.append(paths) or [{"before": 1.0}])
-    for name, effects in (("case-001", [{"effect": "payload", "site": ["DIP"]}]), ("case-002", [])):
+def test_fresh_trials_are_predicted_where_a_known_effect_is_there_and_by_a_refit_with_it(folder, tmp_path, monkeypatch):
+    seen = {}
+
+    def rows(fresh, predictions):
+        seen[fresh.parent.name] = {name: file.read_text() for name, file in predictions.items()}
+        return [{"before": 1.0}]
+
+    monkeypatch.setattr("jaxfinger.sealed.closure.fresh_rows", rows)
+    payload, delay = {"effect": "payload", "site": ["DIP"]}, {"effect": "channel_delay", "site": ["q"]}
+    says = {"case-001": (payload, payload), "case-002": (delay, payload), "case-003": (None, payload)}
+    says |= {"case-004": (payload, None)}
+    for name, (named, true) in says.items():
+        truth = {"effects": [true | {"listed": True}] if true else []}
+        (folder / name / "truth.json").write_text(json.dumps(truth))
         out = tmp_path / "out" / name
         out.mkdir(parents=True)
-        (out / "gap.json").write_text(json.dumps({"verdict": {"effects": effects}}))
-        (out / "nominal.json").write_text("{}")
-        (out / "augmented.json").write_text("{}")
-    predict = f"{sys.executable} -c 'import sys; open(sys.argv[3], \"w\")' {{fit}} {{session}} {{out}}"
-    assert close_cases(folder, tmp_path / "out", predict) == {"case-001": "done", "case-002": "skipped"}
-    ((fresh, before, after),) = seen
-    assert fresh == folder / "case-001" / "fresh.h5"
-    assert (before.name, after.name) == ("nominal.h5", "augmented.h5")
+        verdict = {"status": "explained" if named else "no_gap", "effects": [named] if named else []}
+        gap = {"verdict": verdict, "candidates": [], "none": 0.0, "unlisted": 0.0, "ambiguous_sets": []}
+        (out / "gap.json").write_text(json.dumps(gap))
+        (out / "nominal.json").write_text("nominal")
+        (out / "augmented.json").write_text("augmented")
+    copies = f"{sys.executable} -c 'import sys; a = sys.argv; open(a[3], \"w\").write(open(a[1]).read())'"
+    writes = f"{sys.executable} -c 'import sys; a = sys.argv; open(a[-1], \"w\").write(str(a[2:-1]))'"
+    predict = Predict(f"{copies} {{fit}} {{session}} {{out}}", f"{writes} {{session}} {{effects}} {{out}}")
+    done = close_cases(folder, tmp_path / "out", predict, None)
+    assert done == {"case-001": "done", "case-002": "done", "case-003": "done", "case-004": "skipped"}
+    assert seen["case-001"] == {"before": "nominal", "after": "augmented", "best": "augmented"}
+    assert seen["case-002"] == {"before": "nominal", "after": "augmented", "best": "['payload:DIP']"}
+    assert seen["case-003"]["best"] == "['payload:DIP']"  # what is there and is not named counts
     assert json.loads((tmp_path / "out" / "case-001" / "fresh.json").read_text()) == {"rows": [{"before": 1.0}]}
-    assert close_cases(folder, tmp_path / "out", predict)["case-001"] == "skipped"
+    assert close_cases(folder, tmp_path / "out", predict, None)["case-001"] == "skipped"
     (tmp_path / "out" / "case-001" / "fresh.json").unlink()
-    assert close_cases(folder, tmp_path / "out", f"{sys.executable} -c 'exit(1)'")["case-001"] == "failed"
+    broken = Predict(f"{sys.executable} -c 'exit(1)'")
+    assert close_cases(folder, tmp_path / "out", broken, None)["case-001"] == "failed"
+    assert "exit status 1" in (tmp_path / "out" / "case-001" / "close.log").read_text()
 
 
 def test_cases_of_like_fingers_follow_one_another(tmp_path):

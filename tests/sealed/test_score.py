@@ -116,6 +116,10 @@ def test_closed_is_a_share_of_what_the_true_effect_closes():
     assert closed_share([ours], ceiling) == pytest.approx((49 - 17) / (49 - 9))
     assert closed_share([ours], [ceiling[0] | {"gap": 4.0}]) == pytest.approx((49 - 17) / (25 - 9))
     assert np.isnan(closed_share([], ceiling))
+    refitted = row | {"best": np.sqrt(15.0)}  # what a refit with the true effect leaves, in place of the law itself
+    assert closed_share([refitted], ceiling) == pytest.approx((25 - 17) / (25 - 15))
+    assert closed_share([refitted], ceiling, by_law=True) == pytest.approx((25 - 17) / (25 - 9))
+    assert np.isnan(closed_share([row | {"best": 4.9999}], ceiling))
 
 
 def test_reliability_of_a_calibrated_forecaster():
