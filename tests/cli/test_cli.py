@@ -96,6 +96,22 @@ def test_the_published_axis_comes_back(folder, capsys):
         assert values[name]["units"] == units
 
 
+def test_a_term_that_the_recipe_left_out_is_fitted_as_an_effect_that_is_known(folder, tmp_path, capsys):
+    recipe, fit = ROOT / "fits" / "emps-no-coulomb.toml", tmp_path / "fit.json"
+    named = ("--effect", "joint_coulomb:axis", "--recipe", recipe, "-o", fit, "--json")
+    assert run("fit", "effects", folder / "emps.h5", *named) == 0
+    values = {p["name"]: p for p in json.loads(capsys.readouterr().out)["parameters"]}
+    c0 = values["joint_coulomb axis c0"]
+    assert c0["units"] == "N"
+    assert abs(c0["value"] - 20.39) < 1.96 * c0["std"]
+    assert c0["std"] < 2.0
+    assert run("validate", fit, folder / "emps-pulses.h5", "--json") == 0
+    (score,) = json.loads(capsys.readouterr().out)["scores"]
+    assert score["rms"] < 6.0  # N; 10.7 without Coulomb friction
+    assert run("fit", "effects", folder / "emps.h5", "--effect", "joint_coulomb", "-o", tmp_path / "other.json") == 2
+    assert "for example tendon_stretch:T3" in capsys.readouterr().err
+
+
 def test_show_prints_tables_and_what_to_do_about_a_misfit(folder, capsys):
     assert run("show", folder / "fit.json") == 0
     out = capsys.readouterr().out
