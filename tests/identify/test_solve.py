@@ -51,6 +51,18 @@ class Kink(Bend):
         return jnp.maximum(a, -0.8 * a)
 
 
+class Overshoot(Bend):
+    """a at first, a − 0.95 a² later (Dennis and Schnabel 1996, §10.2): where the data are −1 and 1, every Gauss–Newton
+    step goes nearly as far beyond the minimum as it started before it.
+    """
+
+    ID: ClassVar = "overshoot"
+
+    def torque(self, x, memory, h):
+        law = jnp.where(jnp.sin(3.0 * x.time) > 0.0, self.a, self.a - 0.95 * self.a**2)
+        return h.at[self.index[0]].add(1e-2 * law)
+
+
 def _problem_of(kind, short, short_truth, start, true, shift=0.0):
     """A model with the effect at its start, its position in the flat vector, and data of its truth without noise,
     moved by `shift` N m at the effect's joint.
@@ -79,6 +91,23 @@ def test_a_step_to_where_the_model_is_not_defined_is_cut(problem):
     found, solution = solve(model, np.array([position]), {EXPERIMENT: source})
     assert solution.converged
     assert float(ravel(found)[position]) == pytest.approx(-0.95, abs=1e-3)
+
+
+def test_steps_that_overshoot_settle_in_the_light_of_those_before(short, short_truth, monkeypatch):
+    model, position, source = _problem_of(Overshoot, short, short_truth, start=0.3, true=0.0)
+    joint = source.batch.y[CHANNEL][model.effects[0].index[0]]
+    side = jnp.where(jnp.sin(3.0 * source.batch.x.time) > 0.0, -1e-2, 1e-2)
+    shifted = source.batch.y[CHANNEL].at[model.effects[0].index[0]].set(joint + side) * source.batch.mask[CHANNEL]
+    source = source._replace(batch=eqx.tree_at(lambda b: b.y[CHANNEL], source.batch, shifted))
+    count, each = [], solve_module.linearise_each
+    monkeypatch.setattr(solve_module, "linearise_each", lambda *a: count.append(1) or each(*a))
+    _, alone = solve(model, np.array([position]), {EXPERIMENT: source})
+    mixed = len(count)
+    monkeypatch.setattr(solve_module, "_mixed", lambda A, steps: steps[-1][1])
+    solve(model, np.array([position]), {EXPERIMENT: source})
+    assert alone.converged
+    assert mixed <= 10
+    assert len(count) - mixed > 2 * mixed
 
 
 @pytest.mark.parametrize(("low", "high", "end"), [(-0.5, 2.0, -0.5), (0.0, 2.0, 0.0), (-2.0, 2.0, -0.95)])
