@@ -71,7 +71,7 @@ def _warnings(fit: Fit) -> None:
         if s.status == "fitted" and s.chi2_per_row > MISFIT:
             out.print(
                 f"{s.name}: the residuals are {s.chi2_per_row**0.5:.1f} times the noise, so the model misses something "
-                "and the intervals are at least that much wider: run `jaxfinger diagnose`, or give the recipe more terms",
+                "and the intervals are wider by that or more: run `jaxfinger diagnose`, or give the recipe more terms",
                 markup=False,
                 soft_wrap=True,
             )
