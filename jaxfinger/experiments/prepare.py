@@ -126,6 +126,8 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         moves = (holds < 0)[:, None] & spec.stepped
         qd, qdd = qd * moves, qdd * moves
     joint_direction = np.zeros((N, m)) if spec.held else _direction(trial.joint_direction, turning, STILL)
+    if trial.joint_direction is None and not reduced:
+        joint_direction = _from_the_turn(joint_direction, turning)
     tension = np.zeros((N, n)) if trial.tendon_force is None else np.nan_to_num(trial.tendon_force)
     if spec.held and not reduced:
         # As smooth as the blocks of a fit: what slips at a noise peak would stay there until the next step.
@@ -143,10 +145,13 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
     slides = np.zeros((N, m))
     if spec.samples == "sliding" or spec.stepped:
         slides = _sliding(spec, trial, session, step, qd, turning, joint_direction, rates, motorised)
-    if reduced and spec.samples == "sliding":
-        # q̈ is low-passed, so all else is too. What noise it keeps would still tell a fit of less inertia
-        # (errors in variables): where q̈ does not rise above it, its mean over a tenth of a second takes its place.
+    if spec.samples == "sliding" and (reduced or spec.slack):
+        # Noise of q̈ would tell a fit of less inertia (errors in variables), and a prediction that stands beside a
+        # measured torque of one that is not there: where q̈ does not rise above it, its mean over a tenth of a second
+        # takes its place.
         qdd = shrink(qdd, round(0.1 / step))
+    if reduced and spec.samples == "sliding":
+        # q̈ is low-passed, so all else is too.
         joint_direction, tendon_direction, tension = (
             low_pass(trial.time, a, cutoff) for a in (joint_direction, tendon_direction, tension)
         )
@@ -249,6 +254,16 @@ def _direction(commanded: np.ndarray | None, rate: np.ndarray, still: float) -> 
     moves = np.abs(rate) > np.minimum(still, 0.1 * np.percentile(np.abs(rate), 95, axis=0))
     known = np.maximum.accumulate(np.where(moves, np.arange(len(rate))[:, None], -1), axis=0)
     return np.where(known < 0, 0.0, np.sign(np.take_along_axis(rate, np.maximum(known, 0), axis=0)))
+
+
+def _from_the_turn(direction: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """The directions of `_direction`, which are sure of a motion some time after it began: from where it did."""
+    out = direction.copy()
+    for was, now, column in zip(direction.T, out.T, np.sign(rate).T, strict=True):
+        for i in np.flatnonzero(np.diff(was)) + 1:
+            before = np.flatnonzero(column[:i] != was[i])
+            now[before[-1] + 1 if before.size else 0 : i] = was[i]
+    return out
 
 
 def _rates(trial: Trial, spec: Experiment, step: float) -> tuple[np.ndarray, np.ndarray] | None:
