@@ -257,10 +257,10 @@ def _direction(commanded: np.ndarray | None, rate: np.ndarray, still: float) -> 
 
 
 def _from_the_turn(direction: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """The directions of `_direction`, which are sure of a motion some time after it began: from where it did."""
+    """The directions of `_direction`, which are sure of a reversal some time after it: from where it was."""
     out = direction.copy()
     for was, now, column in zip(direction.T, out.T, np.sign(rate).T, strict=True):
-        for i in np.flatnonzero(np.diff(was)) + 1:
+        for i in np.flatnonzero((np.diff(was) != 0) & (was[:-1] != 0)) + 1:
             before = np.flatnonzero(column[:i] != was[i])
             now[before[-1] + 1 if before.size else 0 : i] = was[i]
     return out
