@@ -31,9 +31,11 @@ def fit_with(
     The effects join in order of what they explain, each in the form that suits the trials best.
 
     Raises:
-        UserError: no effect of that name, or not at that site.
+        UserError: no effect of that name, not at that site, in the recipe's model already, or shown by no trial.
     """
-    recipe = recipe or Recipe()
+    recipe, keys = recipe or Recipe(), list(dict.fromkeys(keys))
+    if there := [effect for effect, _ in keys if effect in recipe.model.terms]:
+        raise UserError(f"{there[0]} is a term of the recipe's own model; leave it out here, or there")
     catalogue = CATALOGUE | nominal_terms(recipe.model.elastic_degree, recipe.model.friction_degree) | (effects or {})
     problem = build(session, recipe, progress)
     screen = Screening.of(problem, _offered(catalogue, keys, problem.nominal.finger), progress)
@@ -48,6 +50,12 @@ def fit_with(
         screened = screen(projector, rt)
         taken = chosen.keys if chosen else ()
         first = next(e for e in by_site(screened).values() if e.variant.key not in taken)
+        if not screen.signatures_of(first).any():
+            effect, site = first.variant.effect, "-".join(first.variant.site)
+            shown = ", ".join(effect.SHOWS)
+            raise UserError(
+                f"{session.file or 'the session'}: no trial shows {effect.ID} at {site}; record {shown}, or leave it out"
+            )
         progress(f"fitting {first.variant.effect.ID} at {', '.join(first.variant.site)}")
         items, starts = at_optimum(chosen) if chosen else ([], [])
         forms = [first, *other_forms(screened, first)]

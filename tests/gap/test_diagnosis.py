@@ -63,6 +63,10 @@ def test_a_fit_with_the_effect_that_is_known_to_be_there_is_that_of_the_diagnosi
         assert ours.values() == pytest.approx(theirs.values(), rel=1e-3)
     with pytest.raises(UserError, match="joint_presliding is not at T1; it has MCP, PIP, DIP"):
         fit_with(session, [("joint_presliding", ("T1",))])
+    with pytest.raises(UserError, match=r"joint_coulomb is a term of the recipe.s own model"):
+        fit_with(session, [("joint_coulomb", ("PIP",))])
+    with pytest.raises(UserError, match=r"no trial shows force_sensor_rotation at fingertip; record VD\.2"):
+        fit_with(session, [("force_sensor_rotation", ("fingertip",))])
     with pytest.raises(UserError, match="no effect stiction"):
         fit_with(session, [("stiction", ("PIP",))])
 
