@@ -53,9 +53,8 @@ def fit_with(
         if not screen.signatures_of(first).any():
             effect, site = first.variant.effect, "-".join(first.variant.site)
             shown = ", ".join(effect.SHOWS)
-            raise UserError(
-                f"{session.file or 'the session'}: no trial shows {effect.ID} at {site}; record {shown}, or leave it out"
-            )
+            file = session.file or "the session"
+            raise UserError(f"{file}: no trial shows {effect.ID} at {site}; record {shown}, or leave it out")
         progress(f"fitting {first.variant.effect.ID} at {', '.join(first.variant.site)}")
         items, starts = at_optimum(chosen) if chosen else ([], [])
         forms = [first, *other_forms(screened, first)]
