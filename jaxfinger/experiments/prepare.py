@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -125,9 +126,9 @@ def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, min
         # At holds and in fixtures nothing moves.
         moves = (holds < 0)[:, None] & spec.stepped
         qd, qdd = qd * moves, qdd * moves
-    joint_direction = np.zeros((N, m)) if spec.held else _direction(trial.joint_direction, turning, STILL)
-    if trial.joint_direction is None and not reduced:
-        joint_direction = _from_the_turn(joint_direction, turning)
+    joint_direction = (
+        np.zeros((N, m)) if spec.held else _direction(trial.joint_direction, turning, STILL, on_time=not reduced)
+    )
     tension = np.zeros((N, n)) if trial.tendon_force is None else np.nan_to_num(trial.tendon_force)
     if spec.held and not reduced:
         # As smooth as the blocks of a fit: what slips at a noise peak would stay there until the next step.
@@ -247,23 +248,22 @@ def _predicted(prediction: Mapping[str, np.ndarray], channel: str, trial: Trial,
     return np.stack([np.interp(trial.time, prediction.get("time", trial.time), a) for a in columns], axis=1)
 
 
-def _direction(commanded: np.ndarray | None, rate: np.ndarray, still: float) -> np.ndarray:
-    """The protocol's directions, else the sign of the filtered rate: 0 before the first motion, the last in a stop."""
+def _direction(commanded: np.ndarray | None, rate: np.ndarray, still: float, on_time: bool = False) -> np.ndarray:
+    """The protocol's directions, else the sign of the filtered rate: 0 before the first motion, the last in a stop.
+
+    It turns where a motion back is sure; `on_time` where that motion began.
+    """
     if commanded is not None:
         return commanded.astype(float)
     moves = np.abs(rate) > np.minimum(still, 0.1 * np.percentile(np.abs(rate), 95, axis=0))
     known = np.maximum.accumulate(np.where(moves, np.arange(len(rate))[:, None], -1), axis=0)
-    return np.where(known < 0, 0.0, np.sign(np.take_along_axis(rate, np.maximum(known, 0), axis=0)))
-
-
-def _from_the_turn(direction: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """The directions of `_direction`, which are sure of a reversal some time after it: from where it was."""
-    out = direction.copy()
-    for was, now, column in zip(direction.T, out.T, np.sign(rate).T, strict=True):
-        for i in np.flatnonzero((np.diff(was) != 0) & (was[:-1] != 0)) + 1:
-            before = np.flatnonzero(column[:i] != was[i])
-            now[before[-1] + 1 if before.size else 0 : i] = was[i]
-    return out
+    sure = np.where(known < 0, 0.0, np.sign(np.take_along_axis(rate, np.maximum(known, 0), axis=0)))
+    for direction, sign in zip(sure.T, np.sign(rate).T, strict=True) if on_time else ():
+        turns = np.flatnonzero((np.diff(direction) != 0) & (direction[:-1] != 0)) + 1
+        for last, turn in pairwise([0, *turns]):
+            began = last + np.flatnonzero(sign[last:turn] == direction[turn - 1])[-1] + 1
+            direction[began:turn] = direction[turn]
+    return sure
 
 
 def _rates(trial: Trial, spec: Experiment, step: float) -> tuple[np.ndarray, np.ndarray] | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxfinger.data import Predictions, Session
 from jaxfinger.data.atomic import atomic_path
-from jaxfinger.effects import CATALOGUE, CatalogueEffect, nominal_terms
+from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError
 from jaxfinger.gap.augment import Fitted, augmented_fit, nominal_fit, parameter_values
 from jaxfinger.gap.evidence import Projector
@@ -18,7 +18,7 @@ from jaxfinger.gap.propose import Proposal, propose
 from jaxfinger.gap.refine import Refined, at_optimum, refine
 from jaxfinger.gap.search import DETECT, Search, search, start_of
 from jaxfinger.gap.shrinkage import Shrinkage, contradicts, shrinkage
-from jaxfinger.gap.signatures import Signatures
+from jaxfinger.gap.signatures import Signatures, catalogue_for
 from jaxfinger.gap.standin import energy_left
 from jaxfinger.gap.where import Place, where
 from jaxfinger.identify import Fit, Recipe
@@ -68,8 +68,7 @@ def diagnose(
     With `predictions` the gap is that between the measurements and another simulator's predictions.
     """
     recipe = recipe or Recipe()
-    terms = nominal_terms(recipe.model.elastic_degree, recipe.model.friction_degree)
-    catalogue = CATALOGUE | terms | (effects or {})
+    catalogue = catalogue_for(recipe, effects)
     if unknown := set(without) - set(catalogue):
         raise UserError(
             f"the catalogue has no effect {', '.join(sorted(unknown))} to leave out; "

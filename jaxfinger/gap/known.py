@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from jaxfinger.data import Session
-from jaxfinger.effects import CATALOGUE, CatalogueEffect, nominal_terms
+from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError
 from jaxfinger.gap.augment import augmented_fit
 from jaxfinger.gap.evidence import Projector
@@ -11,12 +11,12 @@ from jaxfinger.gap.problem import build
 from jaxfinger.gap.refine import Refined, at_optimum, refine, relinearised
 from jaxfinger.gap.screening import Screening, by_site
 from jaxfinger.gap.search import other_forms, start_of
-from jaxfinger.gap.signatures import Variant, variants
+from jaxfinger.gap.signatures import Variant, catalogue_for, variants
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.stages import Progress
 from jaxfinger.model import Finger
 
-Key = tuple[str, tuple[str, ...]]  # effect, site
+Key = tuple[str, tuple[str, ...]]  # effect, site; a pair may be joined by a hyphen
 
 
 def fit_with(
@@ -36,7 +36,7 @@ def fit_with(
     recipe, keys = recipe or Recipe(), list(dict.fromkeys(keys))
     if there := [effect for effect, _ in keys if effect in recipe.model.terms]:
         raise UserError(f"{there[0]} is a term of the recipe's own model; leave it out here, or there")
-    catalogue = CATALOGUE | nominal_terms(recipe.model.elastic_degree, recipe.model.friction_degree) | (effects or {})
+    catalogue = catalogue_for(recipe, effects)
     problem = build(session, recipe, progress)
     screen = Screening.of(problem, _offered(catalogue, keys, problem.nominal.finger), progress)
     projector = Projector(problem)

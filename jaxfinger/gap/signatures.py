@@ -14,9 +14,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
-from jaxfinger.effects import CatalogueEffect, Site
+from jaxfinger.effects import CATALOGUE, CatalogueEffect, Site, nominal_terms
 from jaxfinger.experiments import TRIALS
 from jaxfinger.gap.problem import Problem, Rows
+from jaxfinger.identify import Recipe
 from jaxfinger.model import (
     Model,
     Motion,
@@ -53,6 +54,11 @@ class Variant:
     def at(self, finger, amplitudes: dict[str, float]) -> CatalogueEffect:
         """The effect itself."""
         return self.effect.at(finger, self.site, **dict(self.shape), **amplitudes)
+
+
+def catalogue_for(recipe: Recipe, own: dict[str, type[CatalogueEffect]] | None) -> dict[str, type[CatalogueEffect]]:
+    """All that may be at work by id: the catalogue, the terms that a recipe may leave out, and a user's own."""
+    return CATALOGUE | nominal_terms(recipe.model.elastic_degree, recipe.model.friction_degree) | (own or {})
 
 
 def variants(effects: dict[str, type[CatalogueEffect]], finger) -> list[Variant]:

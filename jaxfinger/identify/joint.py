@@ -73,11 +73,11 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         prior,
         recipe.fit.huber,
     )
+    sources = sources_of(stacks, reads, noise, parameters)
     warnings = name_invisible(parameters, free, solution.invisible)
     if not solution.converged or warnings or solution.chi2_per_row(free.size) > MISFIT:
         progress("refining from a neutral start")
         neutral = start_values(_neutral(model, free, parameters), free, parameters)
-        sources = sources_of(stacks, reads, noise, parameters)
         other, second = solve(neutral, free, sources, prior, recipe.fit.huber)
         if _total(second, other, free, prior) < _total(solution, model, free, prior) * (1 - 1e-6):
             model, solution = other, second
@@ -87,7 +87,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
             ]
 
     linked = np.flatnonzero(np.diag(fit.covariance) > 0)
-    covariance = propagate(fit.covariance, solution, free, linked, prior)
+    covariance = propagate(fit.covariance, solution, sources, free, linked, prior, recipe.fit.huber)
     refined = replace(
         fit,
         model=model,

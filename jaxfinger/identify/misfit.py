@@ -13,7 +13,7 @@ move with another record of the like motions. It takes Laplace's place where it 
 import numpy as np
 from jaxtyping import Float, Int
 
-STRETCH = 1.0  # s: about one movement; the intervals of the EMPS axis are the same to a quarter for 0.25 to 2 s
+STRETCH = 1.0  # s: about one movement
 SURE = 4.0  # standard deviations of V by which it must exceed Laplace's
 
 

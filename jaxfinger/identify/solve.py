@@ -30,7 +30,6 @@ from jaxfinger.compilation import side_by_side
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch
 from jaxfinger.identify.linearise import Filters, Linearised, linearise, missed
-from jaxfinger.identify.misfit import pulls, stretches
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.model import Model
 
@@ -75,7 +74,6 @@ class Solution:
     invisible: Float[np.ndarray, "k p"]  # unit combinations of scaled parameters that neither trials nor prior see
     scale: Float[np.ndarray, " p"]
     outliers: float  # share of white residuals beyond the robust limit
-    pulls: Float[np.ndarray, "b P"]  # of every stretch of the trials on the flat vector (`misfit`), clipped
     linearised: dict[str, Linearised]
 
     def chi2_per_row(self, estimated: int) -> float:
@@ -165,8 +163,7 @@ def solve(
     rows = sum(int(np.count_nonzero(lin.white)) for lin in linearised.values())
     information = factor[:, :-1].T @ factor[:, :-1]
     cost = 0.5 * float(factor[:, -1] @ factor[:, -1])
-    found = _pulls(linearised, sources, size, huber or np.inf)
-    return model, Solution(converged, message, cost, rows, information, invisible, scale, share, found, linearised)
+    return model, Solution(converged, message, cost, rows, information, invisible, scale, share, linearised)
 
 
 def _mixed(A: np.ndarray, steps: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
@@ -226,23 +223,6 @@ def _stacked(linearised: dict[str, Linearised], sources: dict[str, Source], size
     out = np.zeros((small.shape[0], size + 1))
     out[:, used] = small
     return out
-
-
-def _pulls(
-    linearised: dict[str, Linearised], sources: dict[str, Source], size: int, limit: float
-) -> Float[np.ndarray, "b P"]:
-    out = []
-    for name, lin in linearised.items():
-        B, wide, k = lin.jacobian.shape
-        time = np.asarray(sources[name].batch.x.time)
-        time = np.broadcast_to(time[:, None], (B, wide // time.shape[1], time.shape[1])).reshape(B, wide)
-        counts = np.flatnonzero(lin.white)
-        stretch = stretches(np.repeat(np.arange(B), wide)[counts], time.reshape(-1)[counts])
-        r, J = lin.white.reshape(-1)[counts], lin.jacobian.reshape(-1, k)[counts]
-        block = np.zeros((stretch.max(initial=-1) + 1, size))
-        block[:, sources[name].positions] = pulls(np.clip(r, -limit, limit), J, stretch)
-        out.append(block)
-    return np.concatenate(out)
 
 
 def triangular(A: np.ndarray) -> np.ndarray:

@@ -14,12 +14,13 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxfinger.data import Session
 from jaxfinger.experiments import Stack, prepare
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible
-from jaxfinger.identify.misfit import growth
+from jaxfinger.identify.misfit import growth, pulls, stretches
 from jaxfinger.identify.noise import ORDER, Noise, estimate
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.recipe import Recipe
@@ -163,7 +164,8 @@ def run_stage(fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session
     )
 
     linked = np.flatnonzero(np.diag(fit.covariance) > 0)
-    covariance = propagate(fit.covariance, solution, free, linked, prior)
+    sources = sources_of(stacks, reads, noise, parameters)
+    covariance = propagate(fit.covariance, solution, sources, free, linked, prior, recipe.fit.huber)
     warnings = name_invisible(parameters, free, solution.invisible)
     warnings += _unseen(parameters, groups, free, touched)
     report = StageReport(
@@ -285,7 +287,7 @@ def start_values(model: Model, free: np.ndarray, parameters: list[Parameter]) ->
     return Free.at(model, free).set(model, jnp.asarray(flat[free]))
 
 
-def propagate(covariance, solution: Solution, free, linked, prior) -> np.ndarray:
+def propagate(covariance, solution: Solution, sources: dict[str, Source], free, linked, prior, huber) -> np.ndarray:
     """Covariance of the flat vector after a stage (see the module's equation); infinite where nothing is seen.
 
     Residuals larger than the noise say that the model misses something: intervals then widen with them (Birge's ratio,
@@ -301,7 +303,8 @@ def propagate(covariance, solution: Solution, free, linked, prior) -> np.ndarray
     scaled = N * np.outer(scale, scale)
     inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True) * np.outer(scale, scale)
     root = np.zeros((0, free.size)) if prior is None else np.asarray(prior.root)
-    grow = growth(inverse, solution.pulls[:, free] / max(1.0, solution.chi2_per_row(free.size)), root)
+    found = _pulls(solution, sources, len(covariance), huber or np.inf)[:, free]
+    grow = growth(inverse, found / max(1.0, solution.chi2_per_row(free.size)), root)
     out = covariance.copy()
     out[free, :] = out[:, free] = 0.0
     cross = inverse @ information[np.ix_(free, others)]
@@ -313,3 +316,19 @@ def propagate(covariance, solution: Solution, free, linked, prior) -> np.ndarray
         blind = free[np.abs(combination) > 1e-3]
         out[blind, blind] = np.inf
     return out
+
+
+def _pulls(solution: Solution, sources: dict[str, Source], size: int, limit: float) -> Float[np.ndarray, "b P"]:
+    """Of every stretch of the trials on the flat vector (`misfit`); outliers pull with the limit."""
+    out = []
+    for name, lin in solution.linearised.items():
+        B, wide, k = lin.jacobian.shape
+        time = np.asarray(sources[name].batch.x.time)
+        time = np.broadcast_to(time[:, None], (B, wide // time.shape[1], time.shape[1])).reshape(B, wide)
+        counts = np.flatnonzero(lin.white)
+        stretch = stretches(np.repeat(np.arange(B), wide)[counts], time.reshape(-1)[counts])
+        r, J = lin.white.reshape(-1)[counts], lin.jacobian.reshape(-1, k)[counts]
+        block = np.zeros((stretch.max(initial=-1) + 1, size))
+        block[:, sources[name].positions] = pulls(np.clip(r, -limit, limit), J, stretch)
+        out.append(block)
+    return np.concatenate(out)

@@ -113,11 +113,11 @@ def close_case(predict: Predict, folder: Path, diagnosed: Path, truth: Truth) ->
         return "skipped"
     if truth.kind not in ("listed", "double"):
         return "skipped"
-    named = set(read_diagnosis(diagnosed).named)
+    right = set(read_diagnosis(diagnosed).named) == set(truth.causes)
     with tempfile.TemporaryDirectory() as scratch:
         outs = {name: Path(scratch) / f"{name}.h5" for name in fits}
         try:
-            if named != set(truth.causes) and predict.refit:
+            if predict.refit and not right:
                 fits["best"] = Path(scratch) / "best.json"
                 outs["best"] = Path(scratch) / "best.h5"
                 predict.best(folder / "fit.h5", truth.causes, fits["best"])
@@ -126,7 +126,7 @@ def close_case(predict: Predict, folder: Path, diagnosed: Path, truth: Truth) ->
         except RuntimeError as error:
             (diagnosed / "close.log").write_text(str(error))
             return "failed"
-        if named == set(truth.causes):
+        if right:
             outs["best"] = outs["after"]
         rows = fresh_rows(folder / "fresh.h5", outs)
     part = diagnosed / "fresh.json.part"
