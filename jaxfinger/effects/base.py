@@ -4,6 +4,7 @@ from itertools import combinations, permutations, product
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -51,10 +52,10 @@ class CatalogueEffect(Effect):
         defaults = dict.fromkeys(cls.AMPLITUDES, 0.0) | {k: grid[0] for k, (_, grid) in cls.SHAPES.items()}
         if unknown := set(values) - set(defaults):
             raise TypeError(f"{cls.ID} has no parameter {sorted(unknown)}; it has {sorted(defaults)}")
-        fields = {k: jnp.asarray(v, dtype=float) for k, v in (defaults | values).items()}
+        fields = {k: jax.device_put(np.asarray(v, dtype=float)) for k, v in (defaults | values).items()}
         return cls(
             tuple(site),
-            jnp.asarray(cls.indices(finger, tuple(site)), dtype=int),
+            jax.device_put(np.array(cls.indices(finger, tuple(site)), dtype=int)),
             **fields,
             **cls.constants(finger, site),
         )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
@@ -76,10 +76,15 @@ class Stack:
 
 
 def prepare(
-    session: Session, names: list[str] | None = None, reduced: bool = True, minus: Predictions | None = None
+    session: Session,
+    names: list[str] | None = None,
+    reduced: bool = True,
+    minus: Predictions | None = None,
+    coarse: int = 1,
 ) -> dict[str, Stack]:
     """One stack an experiment, of the named trials (default all), averaged to the experiment's rate unless told.
 
+    `coarse`: averaged over so many times as long.
     With `minus` the channels are measurement minus prediction, and what is not predicted does not count.
     """
     stacks = {}
@@ -88,7 +93,7 @@ def prepare(
         trials = [t for t in chosen if len(t.time) > 1]
         long = any(len(t.time) > LONG for t in trials)
         with ThreadPoolExecutor(None if long else 1) as pool:
-            rows = list(pool.map(lambda t, spec=spec: _reduce(spec, t, session, reduced, minus), trials))
+            rows = list(pool.map(lambda t, spec=spec: _reduce(spec, t, session, reduced, minus, coarse), trials))
         if rows:
             stacks[spec.name] = _stack(spec, trials, rows, reduced)
     return stacks
@@ -105,12 +110,14 @@ class _Row:
     dt: float
 
 
-def _reduce(spec: Experiment, trial: Trial, session: Session, reduced: bool, minus: Predictions | None) -> _Row:
+def _reduce(
+    spec: Experiment, trial: Trial, session: Session, reduced: bool, minus: Predictions | None, coarse: int
+) -> _Row:
     m, n = session.finger.m, session.finger.n
     N = len(trial.time)
     trial = _despiked(trial)
     step = float(np.median(np.diff(trial.time)))
-    block = max(1, round(1.0 / (spec.rate * step))) if reduced else 1
+    block = max(1, round(coarse / (spec.rate * step))) if reduced else 1
     holds = find_holds(trial) if spec.samples == "holds" else np.full(N, -1)
 
     # Where the measured channel is not low-passed, q̇ and q̈ must not lose what is in it.
@@ -413,7 +420,7 @@ def _stack(spec: Experiment, trials: list[Trial], rows: list[_Row], reduced: boo
             out[..., b, : a.shape[-1]] = a
             if not constant:
                 out[..., b, a.shape[-1] :] = a[..., -1:]
-        return jnp.asarray(out)
+        return jax.device_put(out)
 
     x = Motion(**{k: pad([r.motion[k] for r in rows]) for k in rows[0].motion}, held=spec.held)
     y = {c: pad([r.y[c] for r in rows], constant=True) for c in spec.channels}

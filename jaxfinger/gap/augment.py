@@ -8,17 +8,21 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxfinger.effects import CatalogueEffect
-from jaxfinger.gap.problem import Problem, assemble
-from jaxfinger.gap.refine import Refined
+from jaxfinger.gap.problem import Problem, assemble, moved
+from jaxfinger.gap.refine import Refined, derivatives_by_name, nominal_step
+from jaxfinger.gap.signatures import Signatures
 from jaxfinger.identify import Fit
 from jaxfinger.identify.fit import StageReport
 from jaxfinger.identify.misfit import growth, pulls
 from jaxfinger.identify.parameters import describe, ravel, units_at
-from jaxfinger.identify.solve import Prior, Solution, Source, solve
+from jaxfinger.identify.solve import Prior, Solution, Source, missed_each, solve
 from jaxfinger.model import Model
+
+WITH_EFFECTS = "with the effects of the diagnosis"
+Missed = dict[tuple[str, str], Float[np.ndarray, "columns B T"]]  # measured − predicted, by experiment and channel
 
 
 class Fitted(NamedTuple):
@@ -27,36 +31,77 @@ class Fitted(NamedTuple):
     fit: Fit
     r: Float[np.ndarray, " N"]  # white residuals
     J: Float[np.ndarray, "N p"]  # their Jacobian by the fit's estimated parameters
-    sources: dict[str, Source]
+    missed: Callable[[Model], Missed]  # of a model with the same effects
 
 
 def nominal_fit(problem: Problem) -> Fitted:
     """The nominal model refitted to all trials, with no effect."""
     covariance = _covariance(problem, problem.r, problem.J, problem.root)
-    fit = _fit(problem, problem.nominal, problem.free, covariance, "all trials")
-    return Fitted(fit, problem.r, problem.J, problem.sources)
+    fit = _fit(problem, problem.nominal, problem.free, covariance, problem.r, "all trials")
+    return Fitted(fit, problem.r, problem.J, partial(missed_by, problem.sources))
 
 
 def augmented_fit(problem: Problem, chosen: Refined) -> Fitted:
     """Nominal parameters, amplitudes and moving shapes at the common optimum, with their covariance."""
-    model = eqx.tree_at(lambda m: m.effects, problem.nominal, chosen.effects, is_leaf=lambda v: isinstance(v, tuple))
-    parameters = describe(model)
-    first = ravel(problem.nominal).size
-    values, moves = (np.asarray(ravel(m)) for m in (model, _on_effects(_moves, model)))
-    moving = [i for i in range(first, len(parameters)) if parameters[i].determinable and moves[i]]
-    free = np.concatenate([problem.free, moving]).astype(int)
-    sources = {e: _with_effects(s, chosen, moving, e) for e, s in problem.sources.items()}
-    # A weak prior on amplitudes and shapes, so that a flat direction stays put.
-    mean = np.concatenate([problem.prior.mean, values[moving]])
-    root = np.zeros((len(problem.root) + len(moving), free.size))
-    root[: len(problem.root), : problem.free.size] = problem.root
-    wide = np.asarray(ravel(_on_effects(_widths, model)))
-    root[len(problem.root) :, problem.free.size :] = np.diag(1.0 / wide[moving])
-    fitted, solution = solve(model, free, sources, Prior(mean, root), limits=limits(model, free))
+    model, moving = _with_effects(problem.nominal, chosen)
+    free, prior = np.concatenate([problem.free, moving]), _prior(problem, model, moving)
+    sources = {e: _seeing_effects(s, chosen, moving, e) for e, s in problem.sources.items()}
+    fitted, solution = solve(model, free, sources, prior, limits=limits(model, free))
     r, J = assemble(solution.linearised, sources, problem.rows, free, ravel(model).size)
-    covariance = _covariance(problem, r, J, root)
-    fit = _fit(problem, fitted, free, covariance, "with the effects of the diagnosis", solution)
-    return Fitted(fit, r, J, sources)
+    fit = _fit(problem, fitted, free, _covariance(problem, r, J, prior.root), r, WITH_EFFECTS, solution)
+    return Fitted(fit, r, J, partial(missed_by, sources))
+
+
+def as_refitted(problem: Problem, chosen: Refined) -> Fitted:
+    """The same for one effect where its refit has led (`relinearised`): with no fit of its own, and by the programs of
+    the nominal model and of signatures, which are compiled already. Its intervals leave out the products of the effect
+    with the nominal parameters.
+    """
+    there = moved(problem, nominal_step(problem, problem.r - chosen.change))
+    r = there.r - chosen.change
+    model, moving = _with_effects(there.nominal, chosen)
+    by_name = derivatives_by_name(chosen)
+    names = {i: describe(model)[i].name.split()[-1] for i in moving}
+    moving = np.array([i for i in moving if names[i] in by_name])
+    J = np.column_stack([there.J, *(by_name[names[i]] for i in moving)])
+    free, prior = np.concatenate([problem.free, moving]), _prior(problem, model, moving)
+    fit = _fit(problem, model, free, _covariance(problem, r, J, prior.root), r, WITH_EFFECTS)
+    return Fitted(fit, r, J, partial(_missed_apart, problem))
+
+
+def missed_by(sources: dict[str, Source], model: Model) -> Missed:
+    """Of a model, by the programs of fits."""
+    return {(e, c): x for e, channels in missed_each(model, sources).items() for c, x in channels.items()}
+
+
+def _missed_apart(problem: Problem, model: Model) -> Missed:
+    """Of a model with one effect, by the programs of its nominal part and of the effect's signature."""
+    nominal = eqx.tree_at(lambda m: m.effects, model, (), is_leaf=lambda v: isinstance(v, tuple))
+    missed = missed_by(problem.sources, nominal)
+    predicted = {(e, c): np.asarray(problem.sources[e].batch.y[c]) - x for (e, c), x in missed.items()}
+    there = replace(problem, nominal=nominal, predicted=predicted)
+    effects = [e for e in model.effects if isinstance(e, CatalogueEffect)]
+    for e, c, change in Signatures(there).changes(effects):
+        missed[e, c] = missed[e, c] - change[0]
+    return missed
+
+
+def _with_effects(nominal: Model, chosen: Refined) -> tuple[Model, Int[np.ndarray, " k"]]:
+    """The model, and which of its effects' parameters a fit moves."""
+    model = eqx.tree_at(lambda m: m.effects, nominal, chosen.effects, is_leaf=lambda v: isinstance(v, tuple))
+    parameters, moves = describe(model), np.asarray(ravel(_on_effects(_moves, model)))
+    first = ravel(nominal).size
+    moving = [i for i in range(first, len(parameters)) if parameters[i].determinable and moves[i]]
+    return model, np.array(moving, dtype=int)
+
+
+def _prior(problem: Problem, model: Model, moving: Int[np.ndarray, " k"]) -> Prior:
+    """The problem's, and a weak one on amplitudes and shapes, so that a flat direction stays put."""
+    mean = np.concatenate([problem.prior.mean, np.asarray(ravel(model))[moving]])
+    (rows, p), wide = problem.root.shape, np.asarray(ravel(_on_effects(_widths, model)))
+    root = np.zeros((rows + len(moving), p + len(moving)))
+    root[:rows, :p], root[rows:, p:] = problem.root, np.diag(1.0 / wide[moving])
+    return Prior(mean, root)
 
 
 def _on_effects(change: Callable[[CatalogueEffect], CatalogueEffect], model: Model) -> Model:
@@ -105,7 +150,7 @@ def _widths(effect: CatalogueEffect) -> CatalogueEffect:
     return replace(effect, **{n: jnp.asarray(w, dtype=float) for n, w in (amplitudes | factors | places).items()})
 
 
-def _with_effects(source: Source, chosen: Refined, moving, experiment: str) -> Source:
+def _seeing_effects(source: Source, chosen: Refined, moving, experiment: str) -> Source:
     """The source, reading the effects' parameters too where one of them shows."""
     if not any(experiment in type(e).SHOWS for e in chosen.effects):
         return source._replace(effects=False)
@@ -122,17 +167,16 @@ def _covariance(problem: Problem, r: np.ndarray, J: np.ndarray, root: np.ndarray
     return inverse * np.outer(grow, grow)
 
 
-def _fit(problem: Problem, model: Model, free, block, what: str, solution: Solution | None = None) -> Fit:
+def _fit(problem: Problem, model: Model, free, block, r, what: str, solution: Solution | None = None) -> Fit:
     covariance = np.zeros((ravel(model).size,) * 2)
     covariance[np.ix_(free, free)] = block
-    chi2 = 2 * solution.cost if solution else float(problem.r @ problem.r)
     report = StageReport(
         what,
         "fitted" if solution is None or solution.converged else "not converged",
         solution.message if solution else "",
         tuple(problem.trial_names),
-        problem.r.size,
-        chi2 / max(1, problem.r.size - len(free)),
+        r.size,
+        float(r @ r) / max(1, r.size - len(free)),
     )
     return replace(
         problem.fit,

@@ -10,7 +10,7 @@ from jaxfinger.data import Predictions, Session
 from jaxfinger.data.atomic import atomic_path
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError
-from jaxfinger.gap.augment import Fitted, augmented_fit, nominal_fit, parameter_values
+from jaxfinger.gap.augment import Fitted, as_refitted, augmented_fit, nominal_fit, parameter_values
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.next_experiment import NextExperiment, next_experiment
 from jaxfinger.gap.problem import Problem, build
@@ -27,6 +27,7 @@ from jaxfinger.identify.parameters import describe, ravel, units_at
 from jaxfinger.identify.stages import Progress
 
 MOST_IN_A_SET = 3
+COARSE = 2  # times as long averages in a first look
 UNSEEN = 10.0  # plausible sizes: the stated deviation of an amplitude that the trials do not see at all
 
 
@@ -74,7 +75,7 @@ def diagnose(
             f"the catalogue has no effect {', '.join(sorted(unknown))} to leave out; "
             f"it has {', '.join(sorted(catalogue))}"
         )
-    problem = build(session, recipe, progress, predictions)
+    problem = build(session, recipe, progress, predictions, COARSE if quick else 1)
     kept = set(problem.fit.recipe.model.terms) | set(without)
     catalogue = {k: c for k, c in catalogue.items() if k not in kept}
     progress("reading the signatures of all effects")
@@ -83,8 +84,11 @@ def diagnose(
     chosen = found.chosen
     if chosen is None:
         return _nothing_named(problem, found, nominal, not quick)
-    progress("fitting the effects and all nominal parameters together")
-    augmented = augmented_fit(problem, chosen)
+    if quick and found.there:
+        augmented = as_refitted(found.there, chosen)
+    else:
+        progress("fitting the effects and all nominal parameters together")
+        augmented = augmented_fit(problem, chosen)
     named = {*chosen.keys, *(k for members in found.rival_sets for k in members)}
     progress("refitting without each third of the trials")
     lines = shrinkage(problem, augmented, _rivals(problem, found), named, not quick)

@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -136,17 +137,18 @@ def build(
     recipe: Recipe,
     progress: Progress = lambda message: None,
     predictions: Predictions | None = None,
+    coarse: int = 1,
 ) -> Problem:
     """Identify the nominal model, refit it to all trials together, and stack the whitened residuals.
 
-    With `predictions` another simulator takes the nominal model's place (see `simulator`).
+    With `predictions` another simulator takes the nominal model's place (see `simulator`); `coarse` as in `prepare`.
     """
     progress("reading the recordings")
-    measured = stacks = prepare(session)
+    measured = stacks = prepare(session, coarse=coarse)
     simulator = None
     if predictions is not None:
         progress("imitating the simulator")
-        simulator, recipe, stacks = emulate(session, recipe, stacks, predictions)
+        simulator, recipe, stacks = emulate(session, recipe, stacks, predictions, coarse)
     fit = identify(session, recipe, progress=progress, stacks=measured)
     parameters = describe(fit.model)
     progress("refitting the nominal model to all trials")
@@ -183,7 +185,7 @@ def build(
 def moved(problem: Problem, by: Float[np.ndarray, " p"]) -> Problem:
     """The same rows at another nominal model: its free parameters moved, residuals and Jacobian exact there."""
     at = Free.at(problem.nominal, problem.free)
-    nominal = at.set(problem.nominal, at.get(problem.nominal) + by)
+    nominal = at.set(problem.nominal, jax.device_put(np.asarray(at.get(problem.nominal)) + by))
     linearised = linearise_each(nominal, problem.sources)
     return replace(problem, **_at(nominal, linearised, problem.sources, problem.rows, problem.free, problem.prior))
 

@@ -9,7 +9,7 @@ model that each leads to (`relinearised`). The exact fit of the effects that a v
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -189,6 +189,14 @@ def derivatives(signatures: Signatures, refined: Refined) -> tuple[Float[np.ndar
     return _evaluate(signatures, refined.effects, coordinates, np.full(len(coordinates), STEP))
 
 
+def derivatives_by_name(refined: Refined) -> dict[str, Float[np.ndarray, " N"]]:
+    """`columns` of one effect by the name of the parameter, in its own units."""
+    (effect,), out = refined.effects, {}
+    for c, column in zip(_coordinates(refined.variants), refined.columns, strict=True):
+        out[c.name] = column / (c.unit if c.shifts else float(getattr(effect, c.name)))
+    return out
+
+
 def information(problem: Problem, refined: Refined) -> Float[np.ndarray, "p+k p+k"]:
     """What the trials and priors say of the nominal parameters and of the amplitudes and moving shapes together."""
     A, p = np.vstack([problem.J.T, refined.columns]), problem.J.shape[1]
@@ -236,12 +244,13 @@ def _shifted(effect: CatalogueEffect, c: _Coordinate, by: float) -> CatalogueEff
         value += by * c.unit
     else:
         value *= float(np.exp(np.clip(by, -FACTOR, FACTOR)))
-    return within_bounds(replace(effect, **{c.name: jnp.asarray(value)}))
+    return within_bounds(replace(effect, **{c.name: jax.device_put(value)}))
 
 
 def within_bounds(effect: CatalogueEffect) -> CatalogueEffect:
     """The effect with every number within its bounds."""
-    return replace(effect, **{n: jnp.clip(getattr(effect, n), *ends) for n, ends in effect.bounds().items()})
+    values = {n: np.clip(float(getattr(effect, n)), *ends) for n, ends in effect.bounds().items()}
+    return replace(effect, **jax.device_put(values))
 
 
 def _room(effects, coordinates: list[_Coordinate]) -> tuple[np.ndarray, np.ndarray]:
@@ -281,7 +290,7 @@ def _evaluate(signatures: Signatures, effects, coordinates, reach: Float[np.ndar
 def _beside(effect: CatalogueEffect, c: _Coordinate, h: float) -> CatalogueEffect:
     """A step for a difference: back where a bound leaves no way forward."""
     ahead = _shifted(effect, c, h)
-    return ahead if getattr(ahead, c.name) != getattr(effect, c.name) else _shifted(effect, c, -h)
+    return ahead if float(getattr(ahead, c.name)) != float(getattr(effect, c.name)) else _shifted(effect, c, -h)
 
 
 def _step_taken(before, after, c: _Coordinate) -> float:

@@ -80,6 +80,7 @@ class Search:
     rival_sets: list[list[tuple]]  # effects that explain as much as the chosen first one
     left: list[Explained]  # what the stand-in explains beyond the chosen effects
     absorbed: list[tuple] = field(default_factory=list)  # (key, share) of effects that the file cannot show
+    there: Problem | None = None  # at the nominal model that the chosen effects lead to
 
     def doubted(self) -> "Search":
         """The same where held-out trials contradict what was chosen: «unlisted» takes all but a tenth."""
@@ -136,7 +137,7 @@ def search(
     alone = len(chosen.variants) == 1 and energy_left(left) < OPEN[1][0] * gap
     if alone and held_out[chosen.keys[0]] < CARRIES:
         return _none_named(ranked, refined, held_out, explained(start, start.r))
-    return _judge(ranked, refined, held_out, chosen, shares, gap, left)
+    return replace(_judge(ranked, refined, held_out, chosen, shares, gap, left), there=problem)
 
 
 def _rivals(refined: dict[tuple, Refined], best: Refined, chi2: float, most: int) -> list[tuple]:

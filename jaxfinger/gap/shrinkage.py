@@ -6,19 +6,19 @@ is nothing that the verdict names, the held-out trials count as not improved.
 
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.data.schema import channel_units
 from jaxfinger.experiments import prepare
-from jaxfinger.gap.augment import Fitted, limits, without_shapes
+from jaxfinger.gap.augment import Fitted, Missed, limits, missed_by, without_shapes
 from jaxfinger.gap.evidence import Evidence, Projector, evidence
 from jaxfinger.gap.held_out import FOLDS, equilibrated, fold_of_row, folds
 from jaxfinger.gap.problem import Problem
 from jaxfinger.identify.parameters import Free, ravel
 from jaxfinger.identify.predictions import simulate_trials
-from jaxfinger.identify.solve import Prior, Source, bounded, missed_each
+from jaxfinger.identify.solve import Prior, bounded
 from jaxfinger.model import Model
 
 RESOLVABLE = 1.1  # mean square before over that of the noise, from which on a gap can be said to close
@@ -81,14 +81,14 @@ def shrinkage(
         training, seen = of_row != k, {e: f != k for e, f in fold.items()}
         refitted = _refit(problem.nominal, problem.free, problem.J, problem.r, training, problem.prior)
         before = after = problem.simulator or refitted
-        old = new = _missed(before, problem.sources)
+        old = new = missed_by(problem.sources, before)
         if _choice(problem, rivals, training) in named:
             # A linear step may lead a shape too far: of refits with shapes and without, that which fits its own trials
             # better; a model that does not hold up without the others has closed nothing.
             for free in tried:
                 columns = augmented.J[:, np.isin(every, free)]
                 model = _refit(whole, free, columns, augmented.r, training, problem.prior)
-                missed = _missed(model, augmented.sources)
+                missed = augmented.missed(model)
                 if _misfit(problem, missed, seen) < _misfit(problem, new, seen):
                     after, new = model, missed
         models.append((before, after))
@@ -153,7 +153,7 @@ def _refit(model: Model, free, J, r, training, prior: Prior) -> Model:
     room = [(end - theta) / np.where(scale > 0.0, scale, 1.0) for end in limits(model, free)]
     b = np.concatenate([-r[training], pull, np.zeros(len(free))])
     delta = bounded(np.vstack([J[training], kept]), b, *room) * scale
-    return Free.at(model, free).set(model, jnp.asarray(theta + delta))
+    return Free.at(model, free).set(model, jax.device_put(theta + delta))
 
 
 def _choice(problem: Problem, rivals: list[tuple[Evidence, np.ndarray]], training: np.ndarray) -> tuple | None:
@@ -167,12 +167,7 @@ def _choice(problem: Problem, rivals: list[tuple[Evidence, np.ndarray]], trainin
     return max(found, key=lambda e: e.log_bf).variant.key if found else None
 
 
-def _missed(model: Model, sources: dict[str, Source]) -> dict[tuple[str, str], Float[np.ndarray, "columns B T"]]:
-    """Measured − predicted by experiment and channel."""
-    return {(e, c): x for e, channels in missed_each(model, sources).items() for c, x in channels.items()}
-
-
-def _misfit(problem: Problem, missed: dict[tuple[str, str], np.ndarray], keep: dict[str, np.ndarray]) -> float:
+def _misfit(problem: Problem, missed: Missed, keep: dict[str, np.ndarray]) -> float:
     """Sum of squares over the samples to keep, (B, T) of every experiment, in the noise of a sample."""
     total = 0.0
     for (e, c), x in missed.items():

@@ -4,6 +4,7 @@ Site, shape and amplitude of an effect are arrays, and trials of one kind are st
 compiled function a class of effects and kind of prediction serves them all. Only what the effect changes is evaluated.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -102,7 +103,8 @@ def _change(
         return effect.reading(channel, true, y) - y0
 
     def put(k, out):
-        return out.at[k].set(one(jax.tree.map(lambda a: a[k], effects)))
+        change = one(jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, k, keepdims=False), effects))
+        return jax.lax.dynamic_update_index_in_dim(out, change, k, 0)
 
     return jax.lax.fori_loop(0, count, put, jnp.zeros((CHUNK, *y0.shape)))
 
@@ -117,15 +119,20 @@ class Signatures:
         """Whitened change of every row, for effects of one class."""
         out = np.zeros((len(members), self.problem.r.size))
         for k in range(0, len(members), CHUNK):
-            self._read(members[k : k + CHUNK], out[k : k + CHUNK])
+            for e, channel, change in self.changes(members[k : k + CHUNK]):
+                rows = self.problem.rows[e]
+                number = self.problem.stacks[e].experiment.channels.index(channel)
+                of_channel = np.flatnonzero(rows.channel == number)
+                white = whitened(change, self.problem, rows, of_channel, channel)
+                out[k : k + CHUNK, rows.start + of_channel] = white
         return out
 
-    def _read(self, members: list[CatalogueEffect], out: Float[np.ndarray, "members N"]) -> None:
-        """The changes by as many members as one call takes, written into the rows that show them."""
+    def changes(self, members: list[CatalogueEffect]) -> Iterator[tuple[str, str, Float[np.ndarray, "members c B T"]]]:
+        """Change of every channel of an experiment that shows effects of one class, at most CHUNK of them."""
         kind, nominal = type(members[0]), self.problem.nominal
         padded = members + members[:1] * (CHUNK - len(members))
         stacked = jax.tree.map(lambda *a: np.stack(a), *[replace(m, site=()) for m in padded])
-        count = jnp.asarray(len(members))
+        count = jax.device_put(len(members))
         for group in self.problem.groups:
             shown = [e for e in group.trials if group.channel in kind.SHOWS.get(e, ())]
             if not shown:
@@ -138,11 +145,8 @@ class Signatures:
                 raw[:, :, b] = np.asarray(_change(group.channel, stacked, nominal, *block, count))[: len(members)]
             raw = raw.reshape(len(members), columns, -1, T)
             for e in shown:
-                rows, mine = self.problem.rows[e], group.trials[e]
-                number = self.problem.stacks[e].experiment.channels.index(group.channel)
-                of_channel = np.flatnonzero(rows.channel == number)
-                change = raw[:, :, mine.start : mine.stop]
-                out[:, rows.start + of_channel] = whitened(change, self.problem, rows, of_channel, group.channel)
+                mine, length = group.trials[e], self.problem.stacks[e].batch.x.time.shape[-1]
+                yield e, group.channel, raw[:, :, mine.start : mine.stop, :length]
 
     def columns(self, items: list[Variant]) -> Float[np.ndarray, "variants amplitudes N"]:
         """Signatures per plausible size, one amplitude at a time, for variants of one class."""

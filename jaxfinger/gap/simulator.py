@@ -34,14 +34,14 @@ ABSENT = 0.003  # of a channel's range: a term of the emulator that moves nothin
 
 
 def emulate(
-    session: Session, recipe: Recipe, stacks: dict[str, Stack], predictions: Predictions
+    session: Session, recipe: Recipe, stacks: dict[str, Stack], predictions: Predictions, coarse: int = 1
 ) -> tuple[Model, Recipe, dict[str, Stack]]:
     """The emulator, the recipe without the terms that the simulator lacks, and the stacks of y'.
 
     Raises:
         UserError: the file predicts no channel of the session's trials.
     """
-    rest = prepare(session, minus=predictions)
+    rest = prepare(session, minus=predictions, coarse=coarse)
     rest = {e: s for e, s in rest.items() if any(np.any(m) for m in s.batch.mask.values())}
     if not rest:
         raise UserError(

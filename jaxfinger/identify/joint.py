@@ -9,7 +9,7 @@ CAD states how well it knows them; masses stay positive, and a link's inertia fo
 
 from dataclasses import replace
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from jaxfinger.data import Session, data_hash
@@ -148,7 +148,7 @@ def _neutral(model: Model, free, parameters) -> Model:
     flat = np.array(ravel(model))
     linear = [i for i in free if parameters[i].group not in ("mass", "com")]
     flat[linear] = 0.0
-    return Free.at(model, free).set(model, jnp.asarray(flat[free]))
+    return Free.at(model, free).set(model, jax.device_put(flat[free]))
 
 
 def _gain(before: Fit, after: Fit, same: bool) -> str:

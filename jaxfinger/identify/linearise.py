@@ -53,7 +53,7 @@ def linearise(
     Compiled for a block of trials (`blocks`), whose additions are cut off again.
     """
     B, T = batch.x.time.shape
-    parts = [_linearise(model, free, block, filters, jnp.asarray(True)) for block in blocks(batch)]
+    parts = [_linearise(model, free, block, filters, jax.device_put(True)) for block in blocks(batch)]
     residuals, *rows = zip(*parts, strict=True)
 
     def cut(parts):
@@ -70,7 +70,7 @@ def linearise(
 
 def missed(model: Model, free: Free, batch: Batch, filters: Filters) -> dict[str, Float[np.ndarray, "columns B T"]]:
     """`residuals_of`, by the program of `linearise`: where that is compiled, it costs no compilation."""
-    return _cut([_linearise(model, free, block, filters, jnp.asarray(False))[0] for block in blocks(batch)], batch)
+    return _cut([_linearise(model, free, block, filters, jax.device_put(False))[0] for block in blocks(batch)], batch)
 
 
 def _cut(parts: Sequence[dict[str, Array]], batch: Batch) -> dict[str, Float[np.ndarray, "columns B T"]]:

@@ -50,7 +50,7 @@ class Free(eqx.Module):
         within = {i: positions[(positions >= a) & (positions < b)] - a for i, (a, b) in enumerate(pairwise(starts))}
         leaves = tuple(i for i, e in within.items() if e.size)
         parts = tuple(str(getattr(paths[i][0][0], "name", "")) for i in leaves)
-        return cls(leaves, parts, tuple(jnp.asarray(within[i]) for i in leaves))
+        return cls(leaves, parts, tuple(within[i] for i in leaves))
 
     def values(self, model: Model) -> list[Float[Array, " k"]]:
         """The free parameters of a model, leaf by leaf."""

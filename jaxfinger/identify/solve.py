@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -39,7 +40,7 @@ KINK = 0.1  # likewise one that does not lower the cost: what is left is a kink,
 STEPS = 40
 LIGHTEST = 0.02  # share of its starting value below which no mass is let to fall
 REMEMBERED = 5  # steps that the next one is mixed with
-PAD = 16  # compressed problems are padded to multiples of this, to share compilations
+PAD = 48  # compressed problems are padded to multiples of this, to share compilations
 
 
 class Prior(NamedTuple):
@@ -127,7 +128,7 @@ def solve(
                 shorter = _shorter(best, float(gradient @ step), cost)
                 theta = theta - (1.0 - shorter) * step
                 step, small, before = shorter * step, shorter * small, None
-                model = moved.set(model, jnp.asarray(theta))
+                model = moved.set(model, jax.device_put(theta))
                 if small < SMALL * 0.1:
                     break
                 continue
@@ -153,7 +154,7 @@ def solve(
             if gradient @ mixed < 0 and np.all(theta + mixed >= low) and np.all(theta + mixed <= high):
                 step = mixed
             theta = theta + step
-            model = moved.set(model, jnp.asarray(theta))
+            model = moved.set(model, jax.device_put(theta))
     message = (
         ""
         if converged
@@ -270,7 +271,7 @@ def _minimise(A: np.ndarray, b: np.ndarray) -> np.ndarray:
     square, right = np.eye(size), np.zeros(size)
     square[:k, :k], right[:k] = 0.0, 0.0
     square[: len(R), :k], right[: len(R)] = R[:, :k], R[:, k]
-    return np.asarray(_dogleg(jnp.asarray(square), jnp.asarray(right)))[:k]
+    return np.asarray(_dogleg(*jax.device_put((square, right))))[:k]
 
 
 def huber_weights(linearised: dict[str, Linearised], limit: float) -> tuple[dict[str, np.ndarray], float]:

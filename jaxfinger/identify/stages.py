@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -273,7 +274,7 @@ def sources_of(stacks, reads, noise, parameters) -> dict[str, Source]:
     for e, channels in reads.items():
         groups = set().union(*(DEPENDS[e, c] for c in channels), {"effects"})
         positions = np.array([i for i, p in enumerate(parameters) if p.group in groups and p.determinable])
-        filters = {c: jnp.asarray(noise[e, c].coefficients) for c in channels}
+        filters = {c: jax.device_put(noise[e, c].coefficients) for c in channels}
         out[e] = Source(stacks[e].batch, filters, positions)
     return out
 
@@ -284,7 +285,7 @@ def start_values(model: Model, free: np.ndarray, parameters: list[Parameter]) ->
     for i in free:
         if parameters[i].group == "tendon_friction" and flat[i] == 0.0:
             flat[i] = {"N": 0.2, "1": 0.2}[parameters[i].units]
-    return Free.at(model, free).set(model, jnp.asarray(flat[free]))
+    return Free.at(model, free).set(model, jax.device_put(flat[free]))
 
 
 def propagate(covariance, solution: Solution, sources: dict[str, Source], free, linked, prior, huber) -> np.ndarray:

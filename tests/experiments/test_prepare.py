@@ -34,6 +34,16 @@ def stack(*trials: Trial, **options):
     return found
 
 
+def test_averages_twice_as_long_are_those_of_two():
+    """Of what the model reads and of what it predicts, but for blocks that a reversal touches."""
+    fine, coarse = (stack(sweep(), coarse=c) for c in (1, 2))
+    assert coarse.dt == pytest.approx(2.0 * fine.dt)
+    for name in ("q", "qd", "qdd", "time"):
+        each, pair = (np.asarray(getattr(s.batch.x, name))[..., :220] for s in (fine, coarse))
+        M = each.shape[-1] // 2
+        np.testing.assert_allclose(pair[..., :M], each.reshape(*each.shape[:-1], M, 2).mean(axis=-1), atol=1e-12)
+
+
 def turning_points(duration=9.0):
     k = np.arange(1, 20)
     times = (np.pi * k - 0.3) * CYCLE / (2 * np.pi)

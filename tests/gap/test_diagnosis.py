@@ -41,6 +41,23 @@ def test_the_planted_cause_and_its_site_are_named(gap):
     assert best["parameters"]["a"]["value"] == pytest.approx(1.0, abs=0.15)
 
 
+def test_a_first_look_names_and_closes_what_the_whole_one_does(gap):
+    """From half the samples, with no fit but the refits."""
+    session = session_with((*TRUTH, {"a": 1.0, "x0": 0.1}))
+    look = as_gap_json(diagnose(session, without=WITHOUT, quick=True))
+    assert look["verdict"]["effects"] == gap["verdict"]["effects"]
+    assert look["verdict"]["status"] == "explained"
+    ours, theirs = (g["candidates"][0]["parameters"] for g in (look, gap))
+    for name in ours:
+        std = np.hypot(ours[name]["std"], theirs[name]["std"])
+        assert ours[name]["value"] == pytest.approx(theirs[name]["value"], abs=3.0 * std)
+    lines = {(x["experiment"], x["channel"]): x["closed"] for x in gap["gap"] if x["before"] > 1.5 * x["noise"]}
+    assert lines
+    for x in look["gap"]:
+        if (x["experiment"], x["channel"]) in lines:
+            assert x["closed"] == pytest.approx(lines[x["experiment"], x["channel"]], abs=0.05)
+
+
 def test_two_effects_are_both_named_and_keep_their_sizes():
     relaxation = "elastic_relaxation", ("MCP",)
     session = session_with((*TRUTH, {"a": 1.0, "x0": 0.1}), (*relaxation, {"stiffness": 0.1, "T": 1.0}))

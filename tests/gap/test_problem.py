@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.effects import CATALOGUE
-from jaxfinger.gap.augment import augmented_fit, nominal_fit
+from jaxfinger.gap.augment import as_refitted, augmented_fit, nominal_fit
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.problem import build, moved
 from jaxfinger.gap.refine import refine, relinearised
@@ -118,6 +118,22 @@ def test_a_large_effect_is_judged_by_what_it_leaves_exactly(scaled):
     assert near.effects[0].values()["gain"] == pytest.approx(GAIN, abs=4.0 * near.std[0]["gain"])
     left = Projector(there).residual(there, there.r - near.change)
     assert float(left @ left) == pytest.approx(near.chi2, abs=0.1)  # what the search for further effects starts from
+
+
+def test_where_a_refit_has_led_is_the_exact_fit(scaled):
+    """To one squared deviation in all, intervals to the effect's size; its two parts miss what the model misses."""
+    variant = Variant(CATALOGUE["torque_sensor_scale"], ("torque_sensor",), ())
+    null = float(np.sum(Projector(scaled).residual(scaled) ** 2))
+    led = relinearised(scaled, refine(scaled, [variant], [{"gain": 0.05}], null), null)
+    quick, exact = as_refitted(*led), augmented_fit(scaled, led[1])
+    np.testing.assert_array_equal(quick.fit.estimated, exact.fit.estimated)
+    i, std = exact.fit.estimated, exact.fit.std[exact.fit.estimated]
+    shift = np.asarray(ravel(quick.fit.model) - ravel(exact.fit.model))[i]
+    assert float(np.sum(quick.r**2) - np.sum(exact.r**2)) < 1.0
+    assert np.all(np.abs(shift) < 0.6 * std)
+    np.testing.assert_allclose(quick.fit.std[i], std, rtol=GAIN)
+    for key, missed in exact.missed(quick.fit.model).items():
+        np.testing.assert_allclose(quick.missed(quick.fit.model)[key], missed, atol=1e-12)
 
 
 def test_where_a_joint_is_held_it_is_no_variable(problem):
