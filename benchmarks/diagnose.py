@@ -1,0 +1,52 @@
+"""Seconds of a diagnosis as a user runs it: a first look and the whole one, compile cache empty and full.
+
+    python benchmarks/diagnose.py [SESSION.h5 ...]      # default: the shipped session
+
+The first look with an empty cache comes first, so that each of the other three finds what ran before it.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from jaxfinger.data import read_session
+
+SHIPPED = Path(__file__).parents[1] / "datasets" / "paper-finger" / "session.h5"
+
+
+def seconds(session: Path, folder: Path, *options: str) -> float:
+    """Wall time of one `jaxfinger diagnose`."""
+    command = [sys.executable, "-m", "jaxfinger", "diagnose", str(session), "-o", str(folder / "gap"), "--overwrite"]
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(folder / "compiled")}
+    begun = time.perf_counter()
+    subprocess.run([*command, *options], check=True, capture_output=True, env=environment)
+    return time.perf_counter() - begun
+
+
+def verdict(folder: Path) -> str:
+    """What the last diagnosis said."""
+    said = json.loads((folder / "gap" / "gap.json").read_text(encoding="utf-8"))["verdict"]
+    return ", ".join([said["status"], *("-".join([e["effect"], *e["site"]]) for e in said["effects"])])
+
+
+def main() -> None:
+    """Both, twice, of every file."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sessions", nargs="*", type=Path, default=[SHIPPED])
+    for path in parser.parse_args().sessions:
+        session = read_session(path)
+        minutes, samples = sum(t.duration for t in session) / 60, sum(len(t.time) for t in session)
+        print(f"{path}: {len(session)} trials, {minutes:.1f} min, {samples:,} samples")
+        with tempfile.TemporaryDirectory() as name:
+            for what, options in (("first look", ("--quick",)), ("whole", ())):
+                cold, warm = (seconds(path, Path(name), *options) for _ in range(2))
+                print(f"  {what + ':':12s} {cold:3.0f} s, again {warm:3.0f} s  ({verdict(Path(name))})", flush=True)
+
+
+if __name__ == "__main__":
+    main()
