@@ -42,7 +42,7 @@ def diagnose(
     without
         Effects of the catalogue to leave out, by id.
     quick
-        A first look: fewer refits, one effect.
+        A first look: half the samples, few refits, one effect.
     overwrite
         Replace an earlier diagnosis in the folder.
     """
