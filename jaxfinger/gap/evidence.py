@@ -4,7 +4,8 @@ With r̃ and Z̃ projected off the nominal parameters, amplitudes a ~ N(0, s²) 
 
     log BF = ½ bᵀ (G + s⁻² I)⁻¹ b − ½ log det(I + s² G),   G = Z̃ᵀ Z̃,   b = Z̃ᵀ r̃,
 
-averaged over s. An amplitude of the wrong sign is no evidence, and a share counts as one at most.
+averaged over s. An amplitude of the wrong sign is no evidence, and a share counts as one at most. A term that a recipe
+leaves out has the size of what it was: its own is one of the s.
 """
 
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import log_ndtr, logsumexp
 
+from jaxfinger.effects import NOMINAL_TERMS
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signatures import Variant
 
@@ -65,23 +67,23 @@ def evidence(variant: Variant, Z: np.ndarray, Zt: np.ndarray, rt: np.ndarray) ->
     raw = float(np.sum(Z * Z))
     absorbed = 1.0 - float(np.trace(G)) / raw if raw > 0 else 1.0
     logs, k = [], len(b)
-    for s in SCALES:
-        precision = G + np.eye(k) / s**2
-        a = np.linalg.solve(precision, b)
-        log_bf = 0.5 * b @ a - 0.5 * np.linalg.slogdet(np.eye(k) + s**2 * G)[1]
-        if k == 1 and not next(iter(kind.AMPLITUDES.values()))[2]:
-            # half-normal prior: twice the mass of the right sign
-            log_bf += np.log(2.0) + log_ndtr(a[0] * np.sqrt(precision[0, 0]))
-        logs.append(log_bf)
     floor = max(1e-12 * np.trace(G), 1e-20)
     information = G + floor * np.eye(k)
     a = np.linalg.lstsq(information, b, rcond=1e-10)[0]
     std = np.sqrt(np.diag(np.linalg.pinv(information, rcond=1e-10, hermitian=True)))
+    own = (float(np.abs(a).max()),) if kind.ID in NOMINAL_TERMS and a.any() else ()
+    for s in (*SCALES, *own):
+        precision = G + np.eye(k) / s**2
+        mean = np.linalg.solve(precision, b)
+        log_bf = 0.5 * b @ mean - 0.5 * np.linalg.slogdet(np.eye(k) + s**2 * G)[1]
+        if k == 1 and not next(iter(kind.AMPLITUDES.values()))[2]:
+            # half-normal prior: twice the mass of the right sign
+            log_bf += np.log(2.0) + log_ndtr(mean[0] * np.sqrt(precision[0, 0]))
+        logs.append(log_bf)
+    averaged = float(logsumexp(logs) - np.log(len(logs)))
     if k == 1 and a[0] < 0 and not next(iter(kind.AMPLITUDES.values()))[2]:
-        return Evidence(variant, np.zeros(1), std, 0.0, float(logsumexp(logs) - np.log(len(logs))), absorbed)
+        return Evidence(variant, np.zeros(1), std, 0.0, averaged, absorbed)
     most = np.array([1.0 / unit if n in kind.SHARES else np.inf for n, (_, unit, _) in kind.AMPLITUDES.items()])
     beyond = np.maximum(a - most, 0.0)
     lost = float(beyond @ G @ beyond)
-    return Evidence(
-        variant, a - beyond, std, float(b @ a) - lost, float(logsumexp(logs) - np.log(len(logs))) - 0.5 * lost, absorbed
-    )
+    return Evidence(variant, a - beyond, std, float(b @ a) - lost, averaged - 0.5 * lost, absorbed)

@@ -8,7 +8,7 @@ from scipy.integrate import quad
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from jaxfinger.effects import CATALOGUE
+from jaxfinger.effects import CATALOGUE, nominal_terms
 from jaxfinger.gap.diagnose import UNSEEN, _with_prior
 from jaxfinger.gap.evidence import SCALES, Projector, evidence
 from jaxfinger.gap.signatures import Variant
@@ -21,7 +21,8 @@ def problem():
     rng = np.random.default_rng(1)
     J = rng.standard_normal((ROWS, NOMINAL))
     r = J @ rng.standard_normal(NOMINAL) + rng.standard_normal(ROWS)
-    return SimpleNamespace(J=J, r=r, root=np.zeros((0, NOMINAL)), offset=np.zeros(0))
+    direction = rng.standard_normal(ROWS)
+    return SimpleNamespace(J=J, r=r, direction=direction, root=np.zeros((0, NOMINAL)), offset=np.zeros(0))
 
 
 def complement(problem):
@@ -44,6 +45,20 @@ def test_prior_rows_weigh_like_measurements(problem):
     A, b = np.vstack([problem.J, root]), np.concatenate([problem.r, -offset])
     residual = b - A @ np.linalg.lstsq(A, b, rcond=None)[0]
     assert rt @ rt == pytest.approx(residual @ residual)
+
+
+def test_a_term_left_out_has_whatever_size_it_was(problem):
+    """Ten thousand plausible sizes, as on a rig's heavy axis: it counts for nearly all that it explains."""
+    problem.r = problem.r + 30.0 * problem.direction
+    Z, projector = 1e-4 * problem.direction[None], Projector(problem)
+    rt = projector.residual(problem)
+    term, effect = (
+        evidence(Variant(kind, ("MCP",), ()), Z, projector(Z), rt)
+        for kind in (nominal_terms(2, 2)["joint_damping"], CATALOGUE["drive_inertia"])
+    )
+    assert term.explained > 100.0
+    assert term.log_bf > 0.9 * 0.5 * term.explained
+    assert effect.log_bf < 5.0
 
 
 def test_evidence_of_signed_amplitudes_is_the_gaussian_marginal_likelihood(problem):
