@@ -28,6 +28,7 @@ from jaxfinger.identify.stages import Progress
 
 MOST_IN_A_SET = 3
 COARSE = 2  # times as long averages in a first look
+FIRST_LOOK = " This is a first look, for one effect, at half the samples."
 UNSEEN = 10.0  # plausible sizes: the stated deviation of an amplitude that the trials do not see at all
 
 
@@ -83,7 +84,7 @@ def diagnose(
     nominal = nominal_fit(problem)
     chosen = found.chosen
     if chosen is None:
-        return _nothing_named(problem, found, nominal, not quick)
+        return _nothing_named(problem, found, nominal, quick)
     if quick and found.there:
         augmented = as_refitted(found.there, chosen)
     else:
@@ -99,7 +100,7 @@ def diagnose(
         progress("looking for a closed form of what remains")
         proposal = propose(problem, chosen.residual, found.left, chosen.columns)
         verdict = replace(verdict, summary=verdict.summary + _proposed(proposal))
-    verdict = replace(verdict, summary=verdict.summary + _retuned(problem, augmented.fit))
+    verdict = replace(verdict, summary=verdict.summary + _retuned(problem, augmented.fit) + FIRST_LOOK * quick)
     places = where(problem)
     suggestion = None
     if verdict.status == "ambiguous":
@@ -108,15 +109,15 @@ def diagnose(
     return Diagnosis(problem, verdict, places, found, lines, suggestion, nominal.fit, augmented.fit, proposal)
 
 
-def _nothing_named(problem: Problem, found: Search, nominal: Fitted, forward: bool) -> Diagnosis:
+def _nothing_named(problem: Problem, found: Search, nominal: Fitted, quick: bool) -> Diagnosis:
     """No gap, or one of which no known effect explains any."""
     verdict, places, proposal = Verdict("no_gap", (), _no_gap_summary(found)), [], None
     if found.detected:
         places, proposal = where(problem), propose(problem, problem.r, found.left, np.empty((0, problem.r.size)))
         text = f"There is a gap, and none of the known effects explains any of it. {_depends(found)}"
         verdict = Verdict("unexplained", (), text + _proposed(proposal))
-    verdict = replace(verdict, summary=verdict.summary + _retuned(problem, nominal.fit))
-    lines = shrinkage(problem, nominal, [], set(), forward)
+    verdict = replace(verdict, summary=verdict.summary + _retuned(problem, nominal.fit) + FIRST_LOOK * quick)
+    lines = shrinkage(problem, nominal, [], set(), not quick)
     return Diagnosis(problem, verdict, places, found, lines, None, nominal.fit, nominal.fit, proposal)
 
 

@@ -118,6 +118,7 @@ def test_a_first_look_at_the_axis_names_the_friction_that_its_recipe_leaves_out(
     verdict = json.loads((tmp_path / "gap.json").read_text())["verdict"]
     assert verdict["status"] == "explained"
     assert verdict["effects"] == [{"effect": "joint_coulomb", "site": ["axis"]}]
+    assert "a first look" in verdict["summary"]
 
 
 def test_show_prints_tables_and_what_to_do_about_a_misfit(folder, capsys):
