@@ -52,7 +52,7 @@ class CatalogueEffect(Effect):
         defaults = dict.fromkeys(cls.AMPLITUDES, 0.0) | {k: grid[0] for k, (_, grid) in cls.SHAPES.items()}
         if unknown := set(values) - set(defaults):
             raise TypeError(f"{cls.ID} has no parameter {sorted(unknown)}; it has {sorted(defaults)}")
-        fields = {k: jax.device_put(np.asarray(v, dtype=float)) for k, v in (defaults | values).items()}
+        fields = {k: jnp.asarray(v, dtype=float) for k, v in (defaults | values).items()}
         return cls(
             tuple(site),
             jax.device_put(np.array(cls.indices(finger, tuple(site)), dtype=int)),

@@ -1,4 +1,4 @@
-"""The augmented model: the effects of the verdict and every nominal parameter, fitted exactly and together."""
+"""The augmented model: the effects of the verdict and every nominal parameter, together."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -42,7 +42,7 @@ def nominal_fit(problem: Problem) -> Fitted:
 
 
 def augmented_fit(problem: Problem, chosen: Refined) -> Fitted:
-    """Nominal parameters, amplitudes and moving shapes at the common optimum, with their covariance."""
+    """Nominal parameters, amplitudes and moving shapes, fitted exactly, with their covariance."""
     model, moving = _with_effects(problem.nominal, chosen)
     free, prior = np.concatenate([problem.free, moving]), _prior(problem, model, moving)
     sources = {e: _seeing_effects(s, chosen, moving, e) for e, s in problem.sources.items()}
@@ -60,10 +60,9 @@ def as_refitted(problem: Problem, chosen: Refined) -> Fitted:
     there = moved(problem, nominal_step(problem, problem.r - chosen.change))
     r = there.r - chosen.change
     model, moving = _with_effects(there.nominal, chosen)
-    by_name = derivatives_by_name(chosen)
-    names = {i: describe(model)[i].name.split()[-1] for i in moving}
-    moving = np.array([i for i in moving if names[i] in by_name])
-    J = np.column_stack([there.J, *(by_name[names[i]] for i in moving)])
+    columns, fields = derivatives_by_name(chosen), [p.name.split()[-1] for p in describe(model)]
+    moving = np.array([i for i in moving if fields[i] in columns])
+    J = np.column_stack([there.J, *(columns[fields[i]] for i in moving)])
     free, prior = np.concatenate([problem.free, moving]), _prior(problem, model, moving)
     fit = _fit(problem, model, free, _covariance(problem, r, J, prior.root), r, WITH_EFFECTS)
     return Fitted(fit, r, J, partial(_missed_apart, problem))

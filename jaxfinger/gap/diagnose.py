@@ -85,7 +85,7 @@ def diagnose(
     chosen = found.chosen
     if chosen is None:
         return _nothing_named(problem, found, nominal, quick)
-    if quick and found.there:
+    if quick:
         augmented = as_refitted(found.there, chosen)
     else:
         progress("fitting the effects and all nominal parameters together")
@@ -100,7 +100,7 @@ def diagnose(
         progress("looking for a closed form of what remains")
         proposal = propose(problem, chosen.residual, found.left, chosen.columns)
         verdict = replace(verdict, summary=verdict.summary + _proposed(proposal))
-    verdict = replace(verdict, summary=verdict.summary + _retuned(problem, augmented.fit) + FIRST_LOOK * quick)
+    verdict = replace(verdict, summary=verdict.summary + _remarks(problem, augmented.fit, quick))
     places = where(problem)
     suggestion = None
     if verdict.status == "ambiguous":
@@ -116,7 +116,7 @@ def _nothing_named(problem: Problem, found: Search, nominal: Fitted, quick: bool
         places, proposal = where(problem), propose(problem, problem.r, found.left, np.empty((0, problem.r.size)))
         text = f"There is a gap, and none of the known effects explains any of it. {_depends(found)}"
         verdict = Verdict("unexplained", (), text + _proposed(proposal))
-    verdict = replace(verdict, summary=verdict.summary + _retuned(problem, nominal.fit) + FIRST_LOOK * quick)
+    verdict = replace(verdict, summary=verdict.summary + _remarks(problem, nominal.fit, quick))
     lines = shrinkage(problem, nominal, [], set(), not quick)
     return Diagnosis(problem, verdict, places, found, lines, None, nominal.fit, nominal.fit, proposal)
 
@@ -125,6 +125,11 @@ def _proposed(proposal: Proposal | None) -> str:
     if proposal is None:
         return ""
     return f" A proposal, unproven, for {100 * proposal.share:.0f} % of that: {proposal.formula}."
+
+
+def _remarks(problem: Problem, fit: Fit, quick: bool) -> str:
+    """What holds whatever the verdict."""
+    return _retuned(problem, fit) + (FIRST_LOOK if quick else "")
 
 
 def _retuned(problem: Problem, fit: Fit) -> str:

@@ -10,7 +10,7 @@
    where all forms are a little wrong, as textbook forms are.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import expit, logsumexp
@@ -79,8 +79,8 @@ class Search:
     unlisted: float
     rival_sets: list[list[tuple]]  # effects that explain as much as the chosen first one
     left: list[Explained]  # what the stand-in explains beyond the chosen effects
-    absorbed: list[tuple] = field(default_factory=list)  # (key, share) of effects that the file cannot show
-    there: Problem | None = None  # at the nominal model that the chosen effects lead to
+    absorbed: list[tuple]  # (key, share) of effects that the file cannot show
+    there: Problem  # at the nominal model that the chosen effects lead to
 
     def doubted(self) -> "Search":
         """The same where held-out trials contradict what was chosen: «unlisted» takes all but a tenth."""
@@ -109,7 +109,7 @@ def search(
         progress(f"refitting with {e.variant.effect.ID} at {', '.join(e.variant.site)}")
         refined[e.variant.key] = refine(problem, [e.variant], [start_of(e)], chi2, projector)
     if not refined or max(r.log_evidence for r in refined.values()) < DETECT:
-        return _none_named(ranked, refined, {}, explained(problem, problem.r))
+        return _none_named(problem, ranked, refined, {}, explained(problem, problem.r))
 
     best = max(refined.values(), key=lambda r: r.log_evidence)
     start, there = problem, {}
@@ -136,8 +136,8 @@ def search(
         held_out |= _beside(problem, chosen, chi2, gap)
     alone = len(chosen.variants) == 1 and energy_left(left) < OPEN[1][0] * gap
     if alone and held_out[chosen.keys[0]] < CARRIES:
-        return _none_named(ranked, refined, held_out, explained(start, start.r))
-    return replace(_judge(ranked, refined, held_out, chosen, shares, gap, left), there=problem)
+        return _none_named(start, ranked, refined, held_out, explained(start, start.r))
+    return _judge(problem, ranked, refined, held_out, chosen, shares, gap, left)
 
 
 def _rivals(refined: dict[tuple, Refined], best: Refined, chi2: float, most: int) -> list[tuple]:
@@ -263,7 +263,7 @@ def _shares(problem, chosen: Refined, chi2: float, gap: float) -> tuple[float, .
     return tuple(out)
 
 
-def _judge(ranked, refined, held_out, chosen, shares, gap, left) -> Search:
+def _judge(there: Problem, ranked, refined, held_out, chosen, shares, gap, left) -> Search:
     """Probabilities: rivals of the first effect by their evidence, «unlisted» by what all leave unexplained."""
     first, beyond = chosen.keys[int(np.argmax(shares))], energy_left(left)
     logs = _log_evidences(ranked, refined)
@@ -301,6 +301,7 @@ def _judge(ranked, refined, held_out, chosen, shares, gap, left) -> Search:
         [rivals] if len(rivals) > 1 else [],
         left,
         _absorbed(ranked),
+        there,
     )
 
 
@@ -321,7 +322,9 @@ def _absorbed(ranked: list[Evidence]) -> list[tuple]:
     return [(e.variant.key, e.absorbed) for e in ranked if e.absorbed > 0.99]
 
 
-def _none_named(ranked: list[Evidence], refined, held_out: dict[tuple, float], left: list[Explained]) -> Search:
+def _none_named(
+    problem: Problem, ranked: list[Evidence], refined, held_out: dict[tuple, float], left: list[Explained]
+) -> Search:
     """No effect is seen above the noise, or none that held-out trials know: the weak evidence that there is shares what
     «none» leaves, or «unlisted» where some other smooth law is seen.
     """
@@ -334,4 +337,5 @@ def _none_named(ranked: list[Evidence], refined, held_out: dict[tuple, float], l
     total = sum(weights.values())
     probability = {k: float(w * known / total) for k, w in weights.items()}
     candidates = _candidates(ranked, probability, held_out, refined)
-    return Search(gap, gap > 0, None, (), candidates, none, 1 - none - known, [], left, _absorbed(ranked))
+    unlisted, absorbed = 1 - none - known, _absorbed(ranked)
+    return Search(gap, gap > 0, None, (), candidates, none, unlisted, [], left, absorbed, problem)

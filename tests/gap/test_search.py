@@ -20,7 +20,7 @@ def test_the_effect_that_is_named_is_the_most_probable(behind, together):
     first, seen, refit = candidate("offset", 60.0)
     rival, seen_too, wider = candidate("rotation", 60.0 - behind)
     refit.chi2, wider.chi2 = 110.0, 100.0  # the sums of squares are no part of it
-    found = _judge([seen_too, seen], {rival: wider, first: refit}, {}, refit, (1.0,), 1000.0, [])
+    found = _judge(SimpleNamespace(), [seen_too, seen], {rival: wider, first: refit}, {}, refit, (1.0,), 1000.0, [])
     assert [c.key for c in found.candidates] == [first, rival]
     assert found.rival_sets == ([[first, rival]] if together else [])
     odds = found.candidates[1].probability / found.candidates[0].probability
