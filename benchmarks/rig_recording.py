@@ -24,18 +24,18 @@ from pathlib import Path
 import numpy as np
 
 from jaxfinger.data import check_file, read_session
-from jaxfinger.rig import parse_rig, recover, standin, wal
+from jaxfinger.rig import parse_rig, recover, wal
 from jaxfinger.rig.backends.ads import AdsRig
 from jaxfinger.rig.channels import RigDescription
-from jaxfinger.rig.contract import VALUES
-from jaxfinger.rig.controller import Controller
+from jaxfinger.rig.contract import VALUES, Mode
 from jaxfinger.rig.convert import header
-from jaxfinger.rig.examples import rig_toml
-from jaxfinger.rig.plant import Mode
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.runner import log_path
 from jaxfinger.rig.safety import Supervisor
+from jaxfinger.rig.simulated import standin
+from jaxfinger.rig.simulated.controller import Controller
+from jaxfinger.rig.simulated.examples import rig_toml
 
 
 def all_slots(where: str, **rig) -> RigDescription:

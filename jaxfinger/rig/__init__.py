@@ -6,13 +6,13 @@ from jaxfinger.rig.backend import RigError as RigError
 from jaxfinger.rig.backend import Status as Status
 from jaxfinger.rig.backends import open_rig as open_rig
 from jaxfinger.rig.channels import RigDescription as RigDescription
-from jaxfinger.rig.channels import parse_rig as parse_rig
-from jaxfinger.rig.channels import read_rig as read_rig
 from jaxfinger.rig.plan import Plan as Plan
 from jaxfinger.rig.plan import estimate as estimate
 from jaxfinger.rig.plan import parse_plan as parse_plan
 from jaxfinger.rig.plan import read_plan as read_plan
 from jaxfinger.rig.recover import recover as recover
+from jaxfinger.rig.rig_file import parse_rig as parse_rig
+from jaxfinger.rig.rig_file import read_rig as read_rig
 from jaxfinger.rig.runner import Outcome as Outcome
 from jaxfinger.rig.runner import run as run
 from jaxfinger.rig.safety import Supervisor as Supervisor

@@ -113,6 +113,15 @@ class State(IntEnum):
     TRIPPED = 5  # latched: drives are off until RESET
 
 
+class Mode(IntEnum):
+    """What holds a joint of the stand-in's finger."""
+
+    FREE = 0
+    FIXED = 1
+    MOTOR = 2
+    HAND = 3
+
+
 class Kind(IntEnum):
     """Commands of the host."""
 

@@ -28,8 +28,7 @@ from jaxfinger.rig.backend import (
     TensionRamp,
 )
 from jaxfinger.rig.channels import Filter, RigDescription
-from jaxfinger.rig.contract import Kind, Refusal, State, Trip
-from jaxfinger.rig.plant import Mode
+from jaxfinger.rig.contract import Kind, Mode, Refusal, State, Trip
 from jaxfinger.rig.safety import admit
 
 MARGIN = 64  # records that the controller may overwrite while a block is on its way

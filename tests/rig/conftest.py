@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxfinger.rig import parse_plan, parse_rig, run, standin
+from jaxfinger.rig import parse_plan, parse_rig, run
 from jaxfinger.rig.backend import Block
 from jaxfinger.rig.backends.ads import AdsRig
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.contract import State
-from jaxfinger.rig.examples import rig_toml
+from jaxfinger.rig.simulated import standin
+from jaxfinger.rig.simulated.examples import rig_toml
 
 SHORT = """
 [plan]

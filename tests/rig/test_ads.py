@@ -15,8 +15,7 @@ import pytest
 
 from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
-from jaxfinger.rig import parse_plan, parse_rig, standin
-from jaxfinger.rig.ams import AmsServer
+from jaxfinger.rig import parse_plan, parse_rig
 from jaxfinger.rig.backend import (
     CommandRefused,
     ConnectionLost,
@@ -27,6 +26,8 @@ from jaxfinger.rig.backend import (
     TensionRamp,
 )
 from jaxfinger.rig.contract import State, Trip
+from jaxfinger.rig.simulated import standin
+from jaxfinger.rig.simulated.ams import AmsServer
 from tests.rig.conftest import ads_rig
 
 

@@ -6,9 +6,10 @@ import pytest
 from jaxfinger.data import check_file, read_session
 from jaxfinger.identify import identify
 from jaxfinger.identify.validate import validate
-from jaxfinger.rig import parse_plan, run, standin
-from jaxfinger.rig.examples import plan_toml
-from jaxfinger.rig.plant import Plant, default_truth
+from jaxfinger.rig import parse_plan, run
+from jaxfinger.rig.simulated import standin
+from jaxfinger.rig.simulated.examples import plan_toml
+from jaxfinger.rig.simulated.plant import Plant, default_truth
 from tests.rig.conftest import ads_rig
 
 

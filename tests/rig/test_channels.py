@@ -9,8 +9,8 @@ import pytest
 from jaxfinger.data import Session, write_session
 from jaxfinger.errors import UserError
 from jaxfinger.rig import backends, open_rig, parse_rig, read_rig
-from jaxfinger.rig.examples import rig_toml
-from jaxfinger.rig.plant import default_truth
+from jaxfinger.rig.simulated.examples import rig_toml
+from jaxfinger.rig.simulated.plant import default_truth
 
 GOOD = rig_toml()
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from jaxfinger.data import read_session
-from jaxfinger.rig import standin
-from jaxfinger.rig.examples import rig_toml
 from jaxfinger.rig.runner import log_path
+from jaxfinger.rig.simulated import standin
+from jaxfinger.rig.simulated.examples import rig_toml
 from tests.rig.conftest import SHORT
 
 LONG = '[plan]\nname = "long"\noperator = "tester"\n[[trial]]\nexperiment = "VD.1"\nseconds = 5000.0\n'

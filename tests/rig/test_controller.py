@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from jaxfinger.rig import contract
 from jaxfinger.rig.contract import Kind, Refusal, State, Trip
-from jaxfinger.rig.controller import Controller, HardLimits
+from jaxfinger.rig.simulated.controller import Controller, HardLimits
 
 
 class Bench:

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import check_file, read_session
-from jaxfinger.rig import recover, standin, wal
-from jaxfinger.rig.examples import rig_toml
+from jaxfinger.rig import recover, wal
 from jaxfinger.rig.runner import log_path
+from jaxfinger.rig.simulated import standin
+from jaxfinger.rig.simulated.examples import rig_toml
 
 PLAN = '[plan]\nname = "p"\noperator = "t"\n[[trial]]\nexperiment = "VD.1"\nseconds = 2000.0\n'
 RECORD = """

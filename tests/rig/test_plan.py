@@ -6,8 +6,8 @@ import pytest
 from jaxfinger.errors import UserError
 from jaxfinger.rig import estimate, parse_plan
 from jaxfinger.rig.backend import JointMove, Setup, TensionRamp
-from jaxfinger.rig.examples import plan_toml
 from jaxfinger.rig.protocols import EXPERIMENTS, Mark, Start
+from jaxfinger.rig.simulated.examples import plan_toml
 
 HEAD = '[plan]\nname = "p"\n[[trial]]\n'
 

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxfinger.rig.plant import DT, Mode, Plant, default_truth
+from jaxfinger.rig.contract import Mode
+from jaxfinger.rig.simulated.plant import DT, Plant, default_truth
 
 angles = st.lists(st.floats(-0.1, 1.3), min_size=3, max_size=3)
 

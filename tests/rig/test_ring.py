@@ -12,9 +12,9 @@ from jaxfinger.rig import contract, parse_rig
 from jaxfinger.rig.backend import CommandRefused, ControllerRestarted, StaleRig
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import State, Trip
-from jaxfinger.rig.controller import Controller, HardLimits
-from jaxfinger.rig.examples import rig_toml
 from jaxfinger.rig.ring import LARGEST, MARGIN
+from jaxfinger.rig.simulated.controller import Controller, HardLimits
+from jaxfinger.rig.simulated.examples import rig_toml
 
 
 def small(rig, ring=512) -> SimulatedRig:

@@ -14,9 +14,9 @@ from jaxfinger.errors import UserError
 from jaxfinger.rig import parse_plan, parse_rig, recorder, recover, wal
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import State, Trip
-from jaxfinger.rig.controller import Controller, HardLimits
-from jaxfinger.rig.examples import rig_toml
 from jaxfinger.rig.runner import log_path, run
+from jaxfinger.rig.simulated.controller import Controller, HardLimits
+from jaxfinger.rig.simulated.examples import rig_toml
 
 
 def serious(path):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from jaxfinger.rig.channels import RigDescription
-from jaxfinger.rig.controller import Controller, HardLimits
 from jaxfinger.rig.ring import RingRig
+from jaxfinger.rig.simulated.controller import Controller, HardLimits
 from jaxfinger.rig.toml_file import Table
 
 

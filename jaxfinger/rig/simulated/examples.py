@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from jaxfinger.data.session import FingerDescription
-from jaxfinger.rig.controller import Slots
 from jaxfinger.rig.finger_file import finger_toml
-from jaxfinger.rig.plant import default_truth
+from jaxfinger.rig.simulated.controller import Slots
+from jaxfinger.rig.simulated.plant import default_truth
 
 LIMITS = """[limits]
 tension_max = 18.0              # N

@@ -9,23 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from enum import IntEnum
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.data.session import FingerDescription
+from jaxfinger.rig.contract import Mode
 
 DT = 1e-3
-
-
-class Mode(IntEnum):
-    """What holds a joint."""
-
-    FREE = 0
-    FIXED = 1
-    MOTOR = 2
-    HAND = 3
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxfinger.rig import contract
-from jaxfinger.rig.contract import Flag, Kind, Refusal, State, Trip
-from jaxfinger.rig.plant import DT, Mode, Plant, Sensors
+from jaxfinger.rig.contract import Flag, Kind, Mode, Refusal, State, Trip
+from jaxfinger.rig.simulated.plant import DT, Plant, Sensors
 
 _SAMPLE = struct.Struct(f"<QQII{contract.VALUES}dQ")
 _COMMAND = struct.Struct(f"<IIiIdd{contract.TARGETS}d")
