@@ -4,31 +4,43 @@ from __future__ import annotations
 
 import os
 import tempfile
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from jaxfinger.errors import UserError
+
+try:
+    import fcntl
+except ImportError:  # no such locks on Windows: what a killed process leaves stays there
+    fcntl = None
+
+YOUNG_S = 60.0  # an empty part may be a moment old and not locked yet
 
 
 @contextmanager
 def atomic_path(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Path]:
     """A temporary path beside `path` to write to; on success it is synced to disk and takes the place of `path`.
 
+    What a killed process left half-written for the same `path` is removed: a part that is being written is locked.
+
     Raises:
         UserError: the file exists and `overwrite` is false, or its folder cannot be written.
     """
     path = Path(path)
     _refuse_existing(path, overwrite)
+    prefix, suffix = f".{path.name}.", ".part"
+    _remove_orphans(path.parent, prefix, suffix)
     try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=suffix)
     except OSError as error:
         raise UserError(
             f"{path}: cannot be written ({error.strerror}); choose a folder that exists and is yours"
         ) from None
-    os.close(handle)
     part = Path(name)
     try:
+        _lock(handle)
         yield part
         _sync(part)
         part.chmod(0o666 & ~_umask())  # mkstemp makes it private
@@ -40,7 +52,34 @@ def atomic_path(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Pa
             f"{path}: cannot be written ({error.strerror or error}); free space or choose another place"
         ) from None
     finally:
+        os.close(handle)
         part.unlink(missing_ok=True)
+
+
+def _lock(handle: int) -> bool:
+    """Mark an open file as being written, until it is closed or its process dies; False where another does so."""
+    if fcntl is None:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:  # locked by another, or a file system without locks
+        return False
+    return True
+
+
+def _remove_orphans(folder: Path, prefix: str, suffix: str) -> None:
+    with suppress(OSError):
+        for entry in os.scandir(folder):
+            if not (entry.name.startswith(prefix) and entry.name.endswith(suffix)):
+                continue
+            with suppress(OSError):
+                young = not entry.stat().st_size and time.time() - entry.stat().st_mtime < YOUNG_S
+                handle = os.open(entry.path, os.O_RDONLY)
+                try:
+                    if not young and _lock(handle):
+                        os.unlink(entry.path)
+                finally:
+                    os.close(handle)
 
 
 def _refuse_existing(path: Path, overwrite: bool) -> None:

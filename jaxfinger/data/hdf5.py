@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
 from datetime import UTC, datetime
 
@@ -55,11 +56,33 @@ def write_session(session: Session, path: str | os.PathLike, overwrite: bool = F
     """
     for trial in session:
         _refuse_misshapen(trial, session.finger, path)
-    with atomic_path(path, overwrite) as part, h5py.File(part, "w", libver=LIBVER) as file:
-        write_header(file, session)
-        trials = file.create_group("trials")
-        for name, trial in session.trials.items():
-            _write_trial(trials.create_group(name), trial, session.finger)
+    with new_file(path, overwrite) as file:
+        write_into(file, session)
+
+
+@contextmanager
+def new_file(path: str | os.PathLike, overwrite: bool = False) -> Iterator[h5py.File]:
+    """The one way in which HDF5 files are written: made in memory, then written whole as `atomic_path` does.
+
+    The HDF5 library crashes the interpreter where a disk fills up while it closes a file, so it never sees the disk.
+
+    Raises:
+        UserError: the file exists and `overwrite` is false, or it cannot be written.
+    """
+    with atomic_path(path, overwrite) as part:
+        with h5py.File(part.name, "w", driver="core", backing_store=False, libver=LIBVER) as file:
+            yield file
+            file.flush()
+            image = file.id.get_file_image()
+        part.write_bytes(image)
+
+
+def write_into(file: h5py.File, session: Session) -> None:
+    """Write a session into a file of `new_file`, which may hold more beside it."""
+    write_header(file, session)
+    trials = file.create_group("trials")
+    for name, trial in session.trials.items():
+        _write_trial(trials.create_group(name), trial, session.finger)
 
 
 def data_hash(path: str | os.PathLike) -> str:

@@ -8,10 +8,9 @@ from collections.abc import Mapping
 import h5py
 import numpy as np
 
-from jaxfinger.data.atomic import atomic_path
 from jaxfinger.data.check import open_file
 from jaxfinger.data.findings import Report
-from jaxfinger.data.hdf5 import LIBVER, write_dataset, write_header
+from jaxfinger.data.hdf5 import new_file, write_dataset, write_header
 from jaxfinger.data.parse import child, dataset, parse_finger, parse_version
 from jaxfinger.data.schema import CHANNELS, TIME
 from jaxfinger.data.session import Session
@@ -31,7 +30,7 @@ def write_predictions(
         UserError: the file exists and `overwrite` is false, or a trial, channel or shape does not fit the session.
     """
     finger = session.finger
-    with atomic_path(path, overwrite) as part, h5py.File(part, "w", libver=LIBVER) as file:
+    with new_file(path, overwrite) as file:
         write_header(file, session)
         file.attrs["content"] = "predictions"
         trials = file.create_group("trials")

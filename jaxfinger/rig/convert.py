@@ -11,9 +11,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from jaxfinger.data import Session, Trial, write_session
-from jaxfinger.data.atomic import atomic_path
-from jaxfinger.data.hdf5 import LIBVER
+from jaxfinger.data import Session, Trial
+from jaxfinger.data.hdf5 import new_file, write_into
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.errors import UserError
 from jaxfinger.rig import wal
@@ -220,12 +219,11 @@ def publish(log: Log, output: str | Path, overwrite: bool = False) -> Session:
         specimen=log.header["specimen"], finger=finger, trials=trials, source=log.header["source"],
         created=log.header["created"],
     )  # fmt: skip
-    with atomic_path(output, overwrite) as part:
-        write_session(session, part, overwrite=True)
-        with h5py.File(part, "r+", libver=LIBVER) as file:
-            for name, (recording, samples) in extras.items():
-                _annotate(file.require_group(f"trials/{name}").attrs, recording, samples)
-            _beside(file.create_group("rig"), log, extras)
+    with new_file(output, overwrite) as file:
+        write_into(file, session)
+        for name, (recording, samples) in extras.items():
+            _annotate(file.require_group(f"trials/{name}").attrs, recording, samples)
+        _beside(file.create_group("rig"), log, extras)
     return session
 
 

@@ -1,0 +1,87 @@
+"""A file appears whole or not at all, whatever happens to the disk or to the process that writes it."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from jaxfinger.data import read_session, write_session
+from jaxfinger.data.atomic import YOUNG_S, atomic_path
+from jaxfinger.data.predictions import write_predictions
+from jaxfinger.errors import UserError
+
+
+@contextmanager
+def room_for(size: int):
+    """No file may grow beyond `size` bytes: writing fails within a file, as on a disk that fills up."""
+    old = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, old[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
+
+
+WRITERS = {
+    "session": lambda path, session: write_session(session, path, overwrite=True),
+    "predictions": lambda path, session: write_predictions(
+        path, session, {t.name: {"q": np.array(t.q)} for t in session}, overwrite=True
+    ),
+}
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize("size", [0, 1000, 6000])
+def test_a_disk_that_fills_up_is_a_sentence_and_the_file_before_stays(session, tmp_path, writer, size):
+    file = tmp_path / "a.h5"
+    write_session(session, file)
+    before = file.read_bytes()
+    assert len(before) > 6000
+    with room_for(size), pytest.raises(UserError, match=r"a\.h5: cannot be written .*free space"):
+        WRITERS[writer](file, session)
+    assert file.read_bytes() == before
+    assert os.listdir(tmp_path) == ["a.h5"]
+    assert list(read_session(file).trials) == list(session.trials)
+
+
+KILLED = """
+import os, signal, sys, time
+from jaxfinger.data.atomic import atomic_path
+with atomic_path(sys.argv[1]) as part:
+    part.write_text("half")
+    if sys.argv[2] == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    print("writing", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_what_a_killed_process_left_is_removed_and_what_another_writes_is_not(tmp_path):
+    file = tmp_path / "a.txt"
+    dead = subprocess.run([sys.executable, "-c", KILLED, file, "die"], check=False)
+    assert dead.returncode == -signal.SIGKILL
+    (orphan,) = tmp_path.iterdir()
+    (tmp_path / ".b.txt.x.part").write_text("of another file")
+    young = tmp_path / ".a.txt.young.part"
+    young.touch()
+    old = tmp_path / ".a.txt.old.part"
+    old.touch()
+    os.utime(old, (0, time.time() - 2 * YOUNG_S))
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", KILLED, file, "live"], **pipes) as living:
+        assert living.stdout.readline() == "writing\n"
+        with atomic_path(file) as part:
+            part.write_text("whole")
+            names = {p.name for p in tmp_path.iterdir()}
+            assert orphan.name not in names
+            assert old.name not in names
+            assert {young.name, ".b.txt.x.part"} <= names
+            assert len(names) == 4  # and the parts of the two that are writing
+        living.stdin.close()
+    assert file.read_text() == "whole"
