@@ -3,6 +3,7 @@
 from jaxfinger.data.check import check_file as check_file
 from jaxfinger.data.filtering import bridged as bridged
 from jaxfinger.data.filtering import decimate as decimate
+from jaxfinger.data.filtering import longest_spike as longest_spike
 from jaxfinger.data.filtering import low_pass as low_pass
 from jaxfinger.data.filtering import outlier_mask as outlier_mask
 from jaxfinger.data.filtering import shrink as shrink

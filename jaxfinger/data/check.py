@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxfinger.data.check_finger import check_finger
 from jaxfinger.data.check_trial import check_trial
-from jaxfinger.data.filtering import outlier_mask
+from jaxfinger.data.filtering import longest_spike, outlier_mask
 from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.parse import listed, parse_file
 from jaxfinger.data.probe import survives
@@ -143,11 +143,12 @@ def _check_created(created: str, report: Report) -> None:
 
 
 def _check_spikes(trial: Trial, report: Report) -> None:
+    longest = longest_spike(float(np.median(np.diff(trial.time))) if len(trial.time) > 1 else 0.0)
     for name in MEASURED:
         values = getattr(trial, name)
         if values is None:
             continue
-        share = float(outlier_mask(values).mean(axis=0).max(initial=0.0))
+        share = float(outlier_mask(values, longest=longest).mean(axis=0).max(initial=0.0))
         if share > 0.0:
             say = report.warning if share > _MANY_SPIKES else report.note
             say(

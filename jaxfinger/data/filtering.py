@@ -15,13 +15,14 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import gaussian_filter1d, median_filter, uniform_filter1d
+from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 
 from jaxfinger.errors import UserError
 
 _JUMP = 12.0  # times their mean: the largest second difference that noise makes, with room
 _EVEN = 1e-3  # intervals this equal (relative) need no resampling
-_SMALL = 1e-4  # of a column's travel: what bends away from its running median by less is no spike
+_PASSES = 4  # spikes that are found, and those that they hid
+_SMALL = 1e-4  # of a column's travel: what lies beyond its surroundings by less is no spike
 
 
 def smooth(
@@ -151,11 +152,13 @@ def block_mean(x: Float[np.ndarray, N * k], starts: np.ndarray) -> Float[np.ndar
 
 
 def outlier_mask(x: Float[np.ndarray, N * k], threshold: float = 8.0, longest: int = 5) -> Bool[np.ndarray, N * k]:
-    """True where a sample is a spike: far from the running median of its neighbours, against the usual distance.
+    """True where a sample is a spike: no motion that is seen before and after it leads there.
 
-    Finds spikes of up to `longest` samples, up to about one sample in ten. The usual distance is a robust standard
-    deviation (1.4826 times the median absolute deviation), and at least a sensor's step, so that a quantised channel at
-    rest is not full of spikes. NaN is no spike.
+    What motion allows, at whatever rate it is sampled, lies between the straight lines through the two samples on
+    either side, and those samples themselves: a smooth turn, a corner and a step stay between them, a spike does not.
+    Finds spikes of up to `longest` samples, up to about one sample in ten; `threshold` times the noise, a robust
+    standard deviation, and at least a sensor's step, so that a quantised channel at rest is not full of spikes. NaN is
+    no spike.
     """
     x = np.asarray(x, np.float64)
     columns = x.reshape(len(x), -1)
@@ -166,6 +169,11 @@ def outlier_mask(x: Float[np.ndarray, N * k], threshold: float = 8.0, longest: i
         if len(values) > 2 * longest:
             mask[good, k] = _spikes(values, threshold, longest)
     return mask.reshape(x.shape)
+
+
+def longest_spike(step: float) -> int:
+    """Samples, `step` s apart, of the longest spike: 5 ms, as a bus or a power stage disturbs, but 2 to 25."""
+    return round(min(max(5e-3 / step, 2.0), 25.0)) if step > 0.0 else 2
 
 
 def without_spikes(x: Float[np.ndarray, "N k"]) -> Float[np.ndarray, "N k"]:
@@ -188,18 +196,44 @@ def bridged(x: Float[np.ndarray, "N k"], spikes: Bool[np.ndarray, "N k"]) -> Flo
 
 
 def _spikes(values: Float[np.ndarray, " N"], threshold: float, longest: int) -> Bool[np.ndarray, " N"]:
-    rough = values - median_filter(values, size=2 * longest + 1, mode="nearest")
-    # A steady motion is its own running median: there the second difference, of variance 6 sigma^2, shows the noise.
-    noise = max(
-        _robust_std(rough), _robust_std(np.diff(values, 2)) / np.sqrt(6.0), _step(values), _SMALL * np.ptp(values)
-    )
-    suspect = np.abs(rough) > threshold * noise
-    if not suspect.any() or suspect.all():
-        return suspect
-    # Two spikes in one window shift its median, and a fast motion then looks far from it: judge again without them.
-    samples = np.arange(len(values))
-    bridged = np.interp(samples, samples[~suspect], values[~suspect])
-    return np.abs(values - median_filter(bridged, size=2 * longest + 1, mode="nearest")) > threshold * noise
+    # A second difference, of variance 6 σ², shows the noise in motion and at rest.
+    noise = max(_robust_std(np.diff(values, 2)) / np.sqrt(6.0), _step(values), _SMALL * np.ptp(values))
+    spikes, least = np.zeros(len(values), bool), threshold * noise
+    for _ in range(_PASSES):  # one spike beside another bends its lines: judge again with a line across what was found
+        found = _beyond(bridged(values[:, None], spikes[:, None])[:, 0], least, longest) & ~spikes
+        if not found.any():
+            break
+        spikes |= found
+    if not spikes.any():
+        return spikes
+    # A sound sample between two spikes lies beyond both, and not beyond what is left without them.
+    x = np.pad(bridged(values[:, None], spikes[:, None])[:, 0], 2, mode="edge")
+    k = np.arange(len(values)) + 2
+    lines = 2.0 * x[k - 1] - x[k - 2], 2.0 * x[k + 1] - x[k + 2]
+    allowed = np.stack([*lines, x[k - 1], x[k], x[k + 1]])
+    return spikes & ((values > allowed.max(axis=0) + least) | (values < allowed.min(axis=0) - least))
+
+
+def _beyond(values: Float[np.ndarray, " N"], least: float, longest: int) -> Bool[np.ndarray, " N"]:
+    """Where samples lie by more than `least` beyond all that their surroundings allow."""
+    ends = np.median(values[:5]), np.median(values[-5:])
+    x = np.concatenate([[ends[0]] * 2, values, [ends[1]] * 2])
+    spikes = np.zeros(len(x), bool)
+    bend = np.abs(np.diff(x, 2)) > least  # at the sample before a spike's first, and after its last
+    first, last = np.flatnonzero(bend[:-2]) + 2, np.zeros(len(x), bool)
+    last[1:-2] = bend[1:]
+    for size in range(1, longest + 1):
+        a = first[first + size - 1 < len(x) - 2]
+        a = a[last[a + size - 1]]
+        z = a + size
+        i = np.arange(size)[:, None]
+        lines = x[a - 1] + (i + 1) * (x[a - 1] - x[a - 2]), x[z] + (size - i) * (x[z] - x[z + 1])
+        allowed = np.stack([*np.broadcast_arrays(*lines, x[a - 1], x[z])])
+        inside = a + i
+        out = (x[inside] > allowed.max(axis=0) + least) | (x[inside] < allowed.min(axis=0) - least)
+        out &= out[0] & out[-1]
+        spikes[inside[out]] = True
+    return spikes[2:-2]
 
 
 def _robust_std(values: Float[np.ndarray, " N"]) -> float:

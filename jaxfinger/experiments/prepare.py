@@ -19,6 +19,7 @@ from jaxfinger.data import (
     Trial,
     bridged,
     find_holds,
+    longest_spike,
     low_pass,
     outlier_mask,
     shrink,
@@ -239,7 +240,7 @@ def _measured(spec, trial, session, minus: Predictions | None):
         measured = np.isfinite(values).all(axis=0)
         counts = np.zeros(values.shape)
         if measured.any():
-            spikes = outlier_mask(values[:, measured])
+            spikes = outlier_mask(values[:, measured], longest=longest_spike(float(np.median(np.diff(trial.time)))))
             counts[:, measured] = ~spikes
             values = values.copy()
             values[:, measured] = bridged(values[:, measured], spikes)

@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter1d
 
-from jaxfinger.data.filtering import decimate, outlier_mask, shrink, smooth, without_spikes
+from jaxfinger.data.filtering import decimate, longest_spike, outlier_mask, shrink, smooth, without_spikes
 from jaxfinger.errors import UserError
+from jaxfinger.synthetic import motions
 
 
 def jittered(count, rate, seed=0):
@@ -175,3 +176,25 @@ def test_a_reversal_without_noise_is_no_spike_that_matters(rate):
     time = np.arange(0.0, 10.0, 1.0 / rate)
     q = 1.0 - np.cos(np.pi * np.maximum(time - 2.0, 0.0))[:, None]  # rests, then turns back every second
     np.testing.assert_allclose(without_spikes(q), q, atol=(np.pi / rate) ** 2)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    rate=st.sampled_from([20.0, 50.0, 100.0, 333.0, 1000.0]),
+    stroke=st.floats(0.4, 3.0),
+    noise=st.sampled_from([0.0, 1e-4, 1e-3]),
+    seed=st.integers(0, 99),
+)
+def test_a_motion_is_no_spike_at_any_rate_and_spikes_in_it_are(rate, stroke, noise, seed):
+    """A hand's strokes, from 20 to 1000 Hz."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(round(20 * rate)) / rate
+    x = motions.wander(time, 0.0, 1.0, rng, (stroke, 1.5 * stroke)).x + noise * rng.standard_normal(time.size)
+    longest = longest_spike(1.0 / rate)
+    assert not outlier_mask(x, longest=longest).any()
+    hit = rng.choice(time.size // 8, time.size // 80, replace=False) * 8 + 4
+    steepest = np.abs(np.diff(x)).max()
+    x[hit] += rng.choice([-1, 1], hit.size) * (0.05 + 20.0 * noise + 4.0 * steepest)
+    found = outlier_mask(x, longest=longest)
+    assert found[hit].all()
+    assert not np.delete(found, hit).any()
