@@ -5,7 +5,7 @@ import inspect
 import os
 from pathlib import Path
 
-from jaxfinger.effects import body, joint, nominal, sensors, tendon, transmission
+from jaxfinger.effects import body, drive, joint, nominal, sensors, tendon, transmission
 from jaxfinger.effects.base import CatalogueEffect, Site
 from jaxfinger.errors import UserError
 from jaxfinger.model import Finger
@@ -20,7 +20,7 @@ def _effects_in(module) -> dict[str, type[CatalogueEffect]]:
 
 
 CATALOGUE: dict[str, type[CatalogueEffect]] = {}
-for _module in (joint, tendon, transmission, body, sensors):
+for _module in (joint, drive, tendon, transmission, body, sensors):
     CATALOGUE |= _effects_in(_module)
 NOMINAL_TERMS = _effects_in(nominal)  # candidates only where a recipe leaves the term out
 

@@ -28,8 +28,18 @@ FINGER: dict[str, tuple] = {
     "mass": ("m",),
     "com": ("m", 3),
     "gyration": ("m", 3, 3),
+    "rotor_inertia": ("m", "m"),
     "fingertip": (3,),
 }
+JOINT_TORQUE: dict[str, tuple] = {
+    "elastic": ("m", -1),
+    "damping": ("m",),
+    "friction": ("m", -1),
+    "friction_by_direction": ("m",),
+    "damping_by_direction": ("m",),
+    "torque_friction": ("m",),
+}
+TENDON_FRICTION: dict[str, tuple] = {"constant": ("n",), "proportional": ("n",)}
 FINGER_STATIC = ("limits", "prismatic", "joint_names", "tendon_names", "active", "crosses")
 
 
@@ -139,26 +149,25 @@ def _from_dict(content: dict[str, Any], path: str, effects: str | os.PathLike | 
 def _model(content: dict[str, Any], effects: str | os.PathLike | None) -> Model:
     f, arm = content["finger"], content["moment_arm"]
     m, n = len(f["joint_names"]), len(f["tendon_names"])
-    finger = Finger(
-        **{k: _array(f[k], tuple(m if s == "m" else s for s in shape), f"finger.{k}") for k, shape in FINGER.items()},
-        **{k: _tuple(f[k]) for k in FINGER_STATIC},
-    )
+    size: dict[Any, Any] = {"m": m, "n": n}
+
+    def arrays(group: str, shapes: dict[str, tuple]) -> dict[str, jnp.ndarray]:
+        sizes = {k: tuple(size.get(s, s) for s in shape) for k, shape in shapes.items()}
+        return {k: _array(content[group][k], shape, f"{group}.{k}") for k, shape in sizes.items()}
+
+    finger = Finger(**arrays("finger", FINGER), **{k: _tuple(f[k]) for k in FINGER_STATIC})
     exponents = _tuple(arm["exponents"])
     model = Model(
         finger,
         MomentArm(_array(arm["coefficients"], (n, len(exponents)), "moment_arm.coefficients"), exponents),
-        JointTorque(**_fields(content, "joint_torque", elastic=(m, -1), damping=(m,), friction=(m, -1))),
-        TendonFriction(**_fields(content, "tendon_friction", constant=(n,), proportional=(n,))),
+        JointTorque(**arrays("joint_torque", JOINT_TORQUE)),
+        TendonFriction(**arrays("tendon_friction", TENDON_FRICTION)),
     )
     if content["effects"]:
         own = load(effects) if effects is not None else {}
         known = tuple(from_dict(finger, e, own) for e in content["effects"])
         model = Model(finger, model.moment_arm, model.joint_torque, model.tendon_friction, known)
     return model
-
-
-def _fields(content, group: str, **shapes: tuple[int, ...]) -> dict[str, jnp.ndarray]:
-    return {k: _array(content[group][k], shape, f"{group}.{k}") for k, shape in shapes.items()}
 
 
 def _array(values: list, shape: tuple[int, ...], name: str) -> jnp.ndarray:

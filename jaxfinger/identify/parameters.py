@@ -122,6 +122,11 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
             return Parameter(f"mass {joints[index[0]]}", "mass", "kg", joints[index[0]])
         case ["finger", "com"]:
             return Parameter(f"centre of mass {joints[index[0]]} {'xyz'[index[1]]}", "com", "m", joints[index[0]])
+        case ["finger", "rotor_inertia"]:
+            a, b = index
+            units = "kg" if model.finger.prismatic[a] and model.finger.prismatic[b] else "kg m2"
+            label = f"rotor inertia {joints[a]}" if a == b else f"rotor inertia {joints[a]}-{joints[b]}"
+            return Parameter(label, "rotor_inertia", units, joints[a], determinable=a == b)
         case ["finger", field]:
             return Parameter(f"{field} {index}", field, {"gyration": "m2", "gravity": "m s-2"}.get(field, "m"))
         case ["moment_arm", _]:
@@ -129,6 +134,15 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
         case ["joint_torque", "damping"]:
             units = "N s/m" if model.finger.prismatic[index[0]] else "N m s/rad"
             return Parameter(f"damping {joints[index[0]]}", "damping", units, joints[index[0]])
+        case ["joint_torque", "torque_friction"]:
+            label = f"friction of its own torque {joints[index[0]]}"
+            return Parameter(label, "torque_friction", "1", joints[index[0]])
+        case ["joint_torque", ("friction_by_direction" | "damping_by_direction") as field]:
+            units, viscous = ("N" if model.finger.prismatic[index[0]] else "N m"), field.startswith("damping")
+            if viscous:
+                units = "N s/m" if model.finger.prismatic[index[0]] else "N m s/rad"
+            label = f"{'damping' if viscous else 'friction torque'} by direction {joints[index[0]]}"
+            return Parameter(label, "friction_by_direction", units, joints[index[0]])
         case ["joint_torque", field]:
             joint, power = joints[index[0]], index[1]
             slides = model.finger.prismatic[index[0]]

@@ -10,7 +10,10 @@ from cattrs.errors import ClassValidationError
 
 from jaxfinger.errors import UserError
 
-TERMS = ("joint_elastic", "joint_coulomb", "joint_damping", "tendon_friction", "gravity")
+PAPER = ("joint_elastic", "joint_coulomb", "joint_damping", "tendon_friction", "gravity")
+# Terms that real machines need: a constant torque, friction by direction, friction that grows with the torque of the
+# joint's own drive, and the reflected inertia of a geared rotor.
+TERMS = (*PAPER, "joint_offset", "joint_friction_asymmetric", "joint_torque_friction", "rotor_inertia")
 STAGES = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4")
 
 
@@ -22,7 +25,7 @@ class ModelRecipe:
     cross_terms: bool = False  # q_a q_b, q_a² q_b, q_a q_b² in f(q); they need a trial that moves two joints
     elastic_degree: int = 2
     friction_degree: int = 2
-    terms: tuple[str, ...] = TERMS  # a term left out is a candidate of the diagnosis
+    terms: tuple[str, ...] = PAPER  # a term left out is a candidate of the diagnosis
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,10 @@ def structure(content: dict, where: str) -> Recipe:
     ):
         if unknown := set(value) - set(known):
             raise UserError(f"{where}: {key} has {sorted(unknown)}; it takes some of {list(known)}")
+    if {"joint_offset", "joint_elastic"} <= set(recipe.model.terms):
+        raise UserError(
+            f"{where}: model.terms has joint_offset beside joint_elastic, which starts with a constant: leave one out"
+        )
     degrees = (recipe.model.moment_arm_degree, recipe.model.elastic_degree + 1, recipe.model.friction_degree + 1)
     if not all(1 <= d <= 10 for d in degrees):
         raise UserError(f"{where}: the degrees in [model] must lie between 1 (moment arm) or 0 (torques) and 10")

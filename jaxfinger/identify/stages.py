@@ -40,24 +40,27 @@ class Stage:
     frees: tuple[str, ...]
 
 
+# What a motor that moves a joint shows of its torque.
+_DRIVEN = ("elastic", "friction", "damping", "friction_by_direction", "torque_friction", "rotor_inertia")
+
 STAGES = {
     s.name: s
     for s in (
         Stage("ID.2", {"ID.2": ("tendon_excursion",)}, ("moment_arm",)),
         # From hold to hold the joint moves, slowly: that shows damping, too, if less well.
-        Stage("ID.3-static", {"ID.3-static": ("joint_torque",)}, ("elastic", "friction", "damping")),
+        Stage("ID.3-static", {"ID.3-static": ("joint_torque",)}, _DRIVEN),
         # The dynamic phase augments the static one: both are read, so that a sweep refines what the holds gave.
         Stage(
             "ID.3-dynamic",
             {"ID.3-static": ("joint_torque",), "ID.3-dynamic": ("joint_torque",)},
-            ("elastic", "friction", "damping"),
+            _DRIVEN,
         ),
         Stage("ID.4", {"ID.4": ("joint_torque",)}, ("tendon_friction",)),
     )
 }
 
 # Groups of parameters on which each channel of each experiment depends.
-_TORQUE = {"elastic", "friction", "damping", "mass", "com"}
+_TORQUE = {*_DRIVEN, "mass", "com"}
 _HELD_TORQUE = {"elastic", "mass", "com", "moment_arm", "tendon_friction"}
 DEPENDS = {
     ("ID.2", "tendon_excursion"): {"moment_arm"},
@@ -77,6 +80,10 @@ GROUP_OF_TERM = {
     "joint_coulomb": "friction",
     "joint_damping": "damping",
     "tendon_friction": "tendon_friction",
+    "joint_offset": "elastic",  # a polynomial of degree zero
+    "joint_friction_asymmetric": "friction_by_direction",
+    "joint_torque_friction": "torque_friction",
+    "rotor_inertia": "rotor_inertia",
 }
 
 
@@ -88,7 +95,7 @@ def nominal_model(session: Session, recipe: Recipe) -> Model:
         finger,
         moment_arm_degree=r.moment_arm_degree,
         cross=r.cross_terms,
-        elastic_degree=r.elastic_degree,
+        elastic_degree=0 if "joint_offset" in r.terms else r.elastic_degree,
         friction_degree=r.friction_degree,
     )
     if "gravity" not in r.terms:

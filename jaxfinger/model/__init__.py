@@ -16,12 +16,11 @@ from jaxfinger.model.dynamics import (  # noqa: E402
     resisting,
     resisting_change,
     resisting_torque,
-    rigid_body_torque,
 )
 from jaxfinger.model.finger import Finger  # noqa: E402
 from jaxfinger.model.joint_torque import JointTorque  # noqa: E402
 from jaxfinger.model.memory import memories  # noqa: E402
-from jaxfinger.model.model import Effect, Model  # noqa: E402
+from jaxfinger.model.model import Effect, Model, SharedFriction  # noqa: E402
 from jaxfinger.model.moment_arm import MomentArm  # noqa: E402
 from jaxfinger.model.motion import Motion  # noqa: E402
 from jaxfinger.model.simulate import forward_dynamics, simulate  # noqa: E402
@@ -34,6 +33,7 @@ __all__ = [
     "Model",
     "MomentArm",
     "Motion",
+    "SharedFriction",
     "TendonFriction",
     "Terms",
     "contact_map",
@@ -48,6 +48,5 @@ __all__ = [
     "resisting",
     "resisting_change",
     "resisting_torque",
-    "rigid_body_torque",
     "simulate",
 ]

@@ -1,7 +1,8 @@
 """Equation (1), once:
 
-    M(q) q̈ + N(q, q̇) + G(q) + h(q, q̇) = Cᵀ(q) (f_t − f_f) + Jᵀ(q) f_ext + τ_ext
+    M(q) q̈ + N(q, q̇) + G(q) + h(q, q̇) = Cᵀ(q) (f_t − f_f) + Jᵀ(q) f_ext + τ_ext − s(q̇) μ |τ_ext|
 
+The last term is what the joints' own drives lose of their torque; the paper has none, μ = 0.
 Every experiment reads one of its unknowns from the others; all functions broadcast over the batch, which is last.
 """
 
@@ -12,8 +13,9 @@ from jaxtyping import Array, Float
 
 from jaxfinger.model import rigid_body
 from jaxfinger.model.finger import Finger
+from jaxfinger.model.joint_torque import drive_torque
 from jaxfinger.model.memory import memories
-from jaxfinger.model.model import Memory, Model
+from jaxfinger.model.model import Memory, Model, SharedFriction
 from jaxfinger.model.motion import Motion
 from jaxfinger.model.tendon_friction import bounded, held
 
@@ -30,6 +32,8 @@ class Terms(NamedTuple):
     friction: Float[Array, "m *T"]  # |τ_f|, N m
     direction: Float[Array, "m *T"]  # share of it that is built up
     tendon_direction: Float[Array, "n *T"]
+    torque_friction: Float[Array, "m *T"]  # μ
+    shared: tuple[SharedFriction, ...]  # friction of what turns with several joints
 
 
 def terms(model: Model, x: Motion, memory: tuple[Memory, ...], plain: Terms | None = None) -> Terms:
@@ -68,13 +72,23 @@ def terms(model: Model, x: Motion, memory: tuple[Memory, ...], plain: Terms | No
 
     if plain is None:
         h = model.joint_torque.elastic_torque(x.q) + model.joint_torque.damping_torque(x.qd)
+        h = h + model.joint_torque.directional_torque(x.qd, slides=not x.held)
         friction = model.joint_torque.friction_magnitude(x.q)
     else:
         h, friction = plain.h, plain.friction
     for effect, state in effects:
         h = effect.torque(x, state, h)
         friction = effect.joint_friction(x, f_j, C, friction)
-    return Terms(finger, f_t, C, loss, f_j, h, friction, direction, tendon_direction)
+    shared = tuple(s for effect, state in effects for s in effect.shared_friction(x, state))
+    mu = _torque_friction(model, x)
+    return Terms(finger, f_t, C, loss, f_j, h, friction, direction, tendon_direction, mu, shared)
+
+
+def _torque_friction(model: Model, x: Motion) -> Float[Array, "m *T"]:
+    mu = model.joint_torque.torque_friction
+    for effect in model.effects:
+        mu = effect.torque_friction(mu)
+    return mu.reshape(-1, *(1,) * (x.q.ndim - 1))
 
 
 def plain_terms(model: Model, x: Motion) -> Terms:
@@ -89,7 +103,12 @@ def resisting_torque(model: Model, x: Motion, plain: Terms | None = None) -> Flo
 
 def resisting(e: Terms) -> Float[Array, "m *T"]:
     """`resisting_torque` of its terms, N m."""
-    return e.h + e.direction * e.friction - jnp.sum(e.C * e.f_j[:, None], axis=0)
+    return e.h + e.direction * e.friction + _shared(e) - jnp.sum(e.C * e.f_j[:, None], axis=0)
+
+
+def _shared(e: Terms) -> Float[Array, "m *T"] | float:
+    """Torque of the friction of what turns with several joints, N m."""
+    return sum(jnp.multiply.outer(s.ways, s.magnitude * s.direction) for s in e.shared)
 
 
 def resisting_change(model: Model, x: Motion, plain: Terms) -> Float[Array, "m *T"]:
@@ -98,28 +117,23 @@ def resisting_change(model: Model, x: Motion, plain: Terms) -> Float[Array, "m *
     change = e.h - plain.h if e.h is not plain.h else jnp.zeros_like(plain.h)
     if e.friction is not plain.friction or e.direction is not x.joint_direction:
         change += e.direction * e.friction - plain.direction * plain.friction
+    if e.shared:
+        change += _shared(e)
     if e.C is not plain.C or e.f_j is not plain.f_j:
         change -= jnp.sum(e.C * e.f_j[:, None] - plain.C * plain.f_j[:, None], axis=0)
     return change
-
-
-def rigid_body_torque(model: Model, x: Motion) -> Float[Array, "m *T"]:
-    """M q̈ + N + G of the finger as the effects have it, N m."""
-    finger = model.finger
-    for effect in model.effects:
-        finger = effect.finger(finger)
-    return rigid_body.inverse_dynamics(finger, x.q, x.qd, x.qdd)
 
 
 def external_torque(
     model: Model, x: Motion, f_ext: Float[Array, "3 *T"] | None = None, plain: Terms | None = None
 ) -> Float[Array, "m *T"]:
     """τ_ext of (1): the torque that must act on the joints from outside for the motion to be as it is, N m."""
-    tau = rigid_body_torque(model, x) + resisting_torque(model, x, plain)
+    e = terms(model, x, memories(model, x), plain)
+    tau = rigid_body.inverse_dynamics(e.finger, x.q, x.qd, x.qdd) + resisting(e)
     if f_ext is not None:
         _, J = rigid_body.fingertip(model.finger, x.q)
         tau = tau - jnp.sum(J * f_ext[:, None], axis=0)
-    return tau
+    return drive_torque(tau, e.direction, e.torque_friction)
 
 
 def fingertip_force(model: Model, x: Motion) -> Float[Array, "3 *T"]:
@@ -176,4 +190,4 @@ def joint_tension(model: Model, x: Motion) -> Float[Array, "n *T"]:
 def elastic_and_friction(model: Model, x: Motion) -> Float[Array, "m *T"]:
     """h of (1), N m."""
     e = terms(model, x, memories(model, x))
-    return e.h + e.direction * e.friction
+    return e.h + e.direction * e.friction + _shared(e)

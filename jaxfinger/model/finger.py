@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 
 class Description(Protocol):
-    """The arrays of ID.1, however they were read."""
+    """The arrays of ID.1, however they were read; `rotor_inertia` (m,), kg m², may be missing or None."""
 
     @property
     def gravity(self) -> Float[Array | np.ndarray, "3"]: ...
@@ -55,7 +55,9 @@ class Finger(eqx.Module):
     """A serial chain of m joints, base to tip, moved by n tendons.
 
     Link i moves with joint i; its frame sits on the joint and is parallel to its parent's frame at q = 0. A positive
-    angle about `axis` is flexion or abduction. A prismatic joint moves along its axis.
+    angle about `axis` is flexion or abduction. A prismatic joint moves along its axis. A rotor that is geared to joint
+    i adds to `rotor_inertia[i, i]`; one that turns with several joints to their cross terms, too. Its own gyroscopic
+    torque is left out (Featherstone 2008, §9.6).
     """
 
     gravity: Float[Array, "3"]  # m/s², base frame
@@ -64,6 +66,7 @@ class Finger(eqx.Module):
     mass: Float[Array, " m"]  # kg
     com: Float[Array, "m 3"]  # m, in the link frame
     gyration: Float[Array, "m 3 3"]  # m², inertia about the centre of mass over the mass
+    rotor_inertia: Float[Array, "m m"]  # kg m², of geared rotors, reflected to the joints that they turn with
     fingertip: Float[Array, "3"]  # m, in the last link's frame
     limits: tuple[tuple[float, float], ...] = eqx.field(static=True)  # rad
     prismatic: tuple[bool, ...] = eqx.field(static=True)
@@ -80,9 +83,11 @@ class Finger(eqx.Module):
             for k in ("gravity", "axis", "origin", "mass", "com", "inertia", "fingertip")
         }
         gyration = arrays.pop("inertia") / arrays["mass"][:, None, None]
+        rotors = getattr(d, "rotor_inertia", None)
         return cls(
             **arrays,
             gyration=gyration,
+            rotor_inertia=jnp.diag(jnp.zeros(len(d.joint_names)) if rotors is None else jnp.asarray(rotors, float)),
             limits=tuple((float(a), float(b)) for a, b in d.limits),
             prismatic=tuple(bool(p) for p in d.prismatic),
             joint_names=tuple(d.joint_names),

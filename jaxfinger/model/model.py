@@ -1,6 +1,6 @@
 """The parameters of equation (1) in one pytree, and what an effect may change in it."""
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -13,6 +13,14 @@ from jaxfinger.model.tendon_friction import TendonFriction
 
 Drive = Any
 Memory = Any
+
+
+class SharedFriction(NamedTuple):
+    """Friction of something that turns with several joints: magnitude · direction · ways, on their torques."""
+
+    ways: Float[Array, " m"]  # its speed is ways · q̇
+    magnitude: Float[Array, "*T"]  # N m
+    direction: Float[Array, "*T"]  # sign of its speed
 
 
 class Effect(eqx.Module):
@@ -91,6 +99,14 @@ class Effect(eqx.Module):
     ) -> Float[Array, "m *T"]:
         """Magnitude of the joints' friction torque, N m."""
         return F
+
+    def torque_friction(self, mu: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
+        """Share of its own torque that each joint's drive loses to friction."""
+        return mu
+
+    def shared_friction(self, x: Motion, memory: Memory) -> tuple[SharedFriction, ...]:
+        """Friction that acts on several joints at once."""
+        return ()
 
     def torque(self, x: Motion, memory: Memory, h: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
         """Torque h that resists the motion, on the left of (1), friction apart, N m."""

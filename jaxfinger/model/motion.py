@@ -22,6 +22,7 @@ class Motion(eqx.Module):
     session_time: Float[Array, "*T"]  # s, from the session's start
     motorised: Float[Array, "m *T"]  # 1 where the external motor is coupled to the joint
     held: bool = eqx.field(static=True, default=False)
+    temperature: Float[Array, "m *T"] | None = None  # K, of each joint, where it is measured
     # Of a recording: rad, what the encoder's noise turns an angle back by at rest; and s, the standard deviation of the
     # low-pass that all of it went through, 0 for none, where a sample is the mean of its interval.
     jitter: Float[Array, "m *T"] | None = None

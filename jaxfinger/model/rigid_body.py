@@ -122,7 +122,12 @@ def _recursion(step, state, links, finger: Finger, unroll: bool, reverse: bool =
 def inverse_dynamics(
     finger: Finger, q: Float[Array, "m *T"], qd: Float[Array, "m *T"], qdd: Float[Array, "m *T"]
 ) -> Float[Array, "m *T"]:
-    """M(q) q̈ + N(q, q̇) + G(q), in N m (N for a prismatic joint)."""
+    """M(q) q̈ + N(q, q̇) + G(q), in N m (N for a prismatic joint), the rotors' inertia in M."""
+    return _chain_dynamics(finger, q, qd, qdd) + jnp.tensordot(finger.rotor_inertia, qdd, 1)
+
+
+def _chain_dynamics(finger: Finger, q, qd, qdd) -> Float[Array, "m *T"]:
+    """The same of the links alone."""
     samples = math.prod(q.shape[1:])
     if samples <= LONG:
         return _newton_euler(finger, q, qd, qdd, by_components=False)

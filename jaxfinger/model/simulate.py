@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfinger.model import rigid_body
-from jaxfinger.model.dynamics import terms
+from jaxfinger.model.dynamics import resisting, terms
 from jaxfinger.model.model import Drive, Memory, Model
 from jaxfinger.model.motion import Motion
 
@@ -24,8 +24,9 @@ def forward_dynamics(
 ) -> Float[Array, " m"]:
     """q̈ of (1) at one sample, rad/s², friction in the directions that `x` states."""
     e = terms(model, x, memory)
-    resisting = rigid_body.inverse_dynamics(e.finger, x.q, x.qd, jnp.zeros_like(x.q)) + e.h + e.direction * e.friction
-    return jnp.linalg.solve(rigid_body.mass_matrix(e.finger, x.q), e.C.T @ e.f_j + tau_ext - resisting)
+    bias = rigid_body.inverse_dynamics(e.finger, x.q, x.qd, jnp.zeros_like(x.q))
+    drive = tau_ext - e.direction * e.torque_friction * jnp.abs(tau_ext)
+    return jnp.linalg.solve(rigid_body.mass_matrix(e.finger, x.q), drive - bias - resisting(e))
 
 
 class _State(NamedTuple):
@@ -33,7 +34,7 @@ class _State(NamedTuple):
     qd: Float[Array, " m"]
     drive: tuple[Drive, ...]  # of the memories, in the middle of the last step
     memory: tuple[Memory, ...]
-    friction: Float[Array, " m+n"]  # torques and tensions of friction, N m and N
+    friction: Float[Array, " m+n+s"]  # torques and tensions of friction, N m and N; s of what turns with several joints
 
 
 def simulate(
@@ -58,7 +59,8 @@ def simulate(
     x0 = motion(time[0], q0, qd0, tension[:, 0])
     drive0 = tuple(effect.drive(model, x0) for effect in model.effects)
     memory0 = tuple(effect.initial_memory(d) for effect, d in zip(model.effects, drive0, strict=True))
-    state0 = _State(q0, qd0, drive0, memory0, jnp.zeros(model.finger.m + model.finger.n))
+    shared = [s for e, z in zip(model.effects, memory0, strict=True) for s in e.shared_friction(x0, z)]
+    state0 = _State(q0, qd0, drive0, memory0, jnp.zeros(model.finger.m + model.finger.n + len(shared)))
 
     def sample(state, inputs):
         t, f0, f1, tau0, tau1 = inputs
@@ -86,12 +88,15 @@ def _step(model: Model, state: _State, motion, t, f, tau, dt) -> _State:
     e = terms(model, x, memory)  # with the friction that the effects' memories have built up, and no other
     at_once = _at_once(model, x, memory)
     M = rigid_body.mass_matrix(e.finger, x.q)
-    resisting = rigid_body.inverse_dynamics(e.finger, x.q, qd, jnp.zeros_like(qd)) + e.h + e.direction * e.friction
+    bias = rigid_body.inverse_dynamics(e.finger, x.q, qd, jnp.zeros_like(qd))
     M_inv = jnp.linalg.inv(M)
-    free = qd + dt * M_inv @ (e.C.T @ e.f_j + tau - resisting)
+    # What turns with several joints sticks and slides as they do: its friction is solved for.
+    free = qd + dt * M_inv @ (tau - bias - resisting(e._replace(shared=())))
 
-    D = jnp.concatenate([jnp.eye(qd.size), e.C])  # rates of joints and tendons: D q̇
-    limit = at_once * jnp.concatenate([e.friction, e.loss])
+    # Rates of joints, tendons and what turns with several joints: D q̇.
+    D = jnp.concatenate([jnp.eye(qd.size), e.C, *(s.ways[None] for s in e.shared)])
+    joint = at_once[: qd.size] * (e.friction + e.torque_friction * jnp.abs(tau))
+    limit = jnp.concatenate([joint, at_once[qd.size :] * e.loss, *(s.magnitude[None] for s in e.shared)])
     A = dt * D @ M_inv @ D.T
     friction = _gauss_seidel(A, D @ free, limit, state.friction)
     qd = free - dt * M_inv @ (D.T @ friction)

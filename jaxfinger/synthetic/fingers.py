@@ -75,7 +75,7 @@ def nominal_model(specimen: Specimen) -> Model:
     return Model(
         finger,
         MomentArm(jnp.asarray(coefficients.reshape(finger.n, -1)), moment_arm.exponents),
-        JointTorque(*(jnp.asarray(x) for x in (spring.coefficients, specimen.damping, friction.coefficients))),
+        JointTorque.of(*(jnp.asarray(x) for x in (spring.coefficients, specimen.damping, friction.coefficients))),
         TendonFriction(jnp.asarray(specimen.loss_constant), jnp.asarray(specimen.loss_proportional)),
     )
 

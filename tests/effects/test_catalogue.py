@@ -129,7 +129,9 @@ def test_the_catalogue_is_the_published_one():
         passive_tendon tendon_stretch tendon_creep tendon_backlash moment_arm_coupling moment_arm_bowstring
         tendon_friction_capstan tendon_friction_viscous tendon_friction_presliding tendon_friction_saturating
         tendon_crosstalk payload gravity_tilt drive_inertia torque_sensor_scale torque_sensor_drift torque_ripple
-        tension_sensor_scale encoder_offset encoder_eccentricity force_sensor_rotation channel_delay"""
+        tension_sensor_scale encoder_offset encoder_eccentricity force_sensor_rotation channel_delay
+        joint_offset joint_friction_asymmetric joint_torque_friction joint_friction_warmup joint_coupling
+        joint_backlash"""
     assert set(CATALOGUE) == set(published.split())
     assert set(NOMINAL_TERMS) == {"joint_elastic", "joint_coulomb", "joint_damping", "tendon_friction", "gravity"}
 

@@ -40,7 +40,7 @@ def model(d: FingerDescription, seed: int = 0, **sizes) -> Model:
     return Model(
         zeros.finger,
         MomentArm(draw(zeros.moment_arm.coefficients), zeros.moment_arm.exponents),
-        JointTorque(draw(torque.elastic), jnp.abs(draw(torque.damping)), friction),
+        JointTorque.of(draw(torque.elastic), jnp.abs(draw(torque.damping)), friction),
         TendonFriction(jnp.abs(draw(zeros.tendon_friction.constant)), jnp.full(zeros.finger.n, 0.2)),
     )
 

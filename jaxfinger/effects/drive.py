@@ -1,0 +1,200 @@
+"""What the drive of a joint brings with it: friction by direction, with its own torque and with warmth; a constant
+torque, a dead zone, and a motor that turns with two joints."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxfinger.effects.base import ELASTIC, TORQUE, CatalogueEffect
+from jaxfinger.model import SharedFriction
+
+EXCURSION = ("tendon_excursion",)
+
+
+class JointOffset(CatalogueEffect):
+    """τ₀: a constant torque on a joint, from a spring, a counterweight or an amplifier's offset."""
+
+    ID: ClassVar = "joint_offset"
+    PLACE: ClassVar = "joint"
+    AMPLITUDES: ClassVar = {"tau": ("N m", 0.005, True)}
+    SHOWS: ClassVar = ELASTIC
+
+    tau: Float[Array, ""]
+
+    def torque(self, x, memory, h):
+        return h.at[self.index[0]].add(self.tau)
+
+
+class JointFrictionAsymmetric(CatalogueEffect):
+    """±(F ± Δ) and d|q̇|: Coulomb friction and damping are larger one way than the other, each by twice its amplitude.
+
+    Coulomb friction of F + Δ forwards and F − Δ back is F to either side of Δ: a constant torque wherever the joint is
+    free, and none where a fixture holds it.
+    """
+
+    ID: ClassVar = "joint_friction_asymmetric"
+    PLACE: ClassVar = "joint"
+    AMPLITUDES: ClassVar = {"coulomb": ("N m", 0.003, True), "damping": ("N m s/rad", 1e-3, True)}
+    SHOWS: ClassVar = TORQUE
+
+    coulomb: Float[Array, ""]
+    damping: Float[Array, ""]
+
+    def torque(self, x, memory, h):
+        i = self.index[0]
+        constant = 0.0 if x.held else self.coulomb
+        return h.at[i].add(constant + self.damping * jnp.abs(x.qd[i]))
+
+
+class JointTorqueFriction(CatalogueEffect):
+    """μ |τ| s(q̇): a drive loses a share of the torque τ that it gives, as gears do (Rhoban's BAM, model M3)."""
+
+    ID: ClassVar = "joint_torque_friction"
+    PLACE: ClassVar = "joint"
+    AMPLITUDES: ClassVar = {"mu": ("1", 0.1, False)}
+    SHARES: ClassVar = ("mu",)
+    SHOWS: ClassVar = TORQUE
+    MOVES_RIGID_BODY: ClassVar = True  # τ holds all of (1)
+
+    mu: Float[Array, ""]
+
+    def bounds(self):
+        return {"mu": (0.0, 0.95)}  # from 1 on a gear locks itself
+
+    def torque_friction(self, mu):
+        return mu.at[self.index[0]].add(self.mu)
+
+
+WARM = 303.15  # K, at which friction is the nominal one; any other would only move the nominal friction
+
+
+class JointFrictionWarmup(CatalogueEffect):
+    """(F + d|q̇|) s(q̇) w, w = exp(−t/T) of the session's time, or (303 K − ϑ)/10 K of a temperature ϑ (`by` 1).
+
+    Grease that is cold is stiff. `a` is the share by which Coulomb friction is larger at the session's start, or 10 K
+    colder, and d the damping that comes on top.
+    """
+
+    ID: ClassVar = "joint_friction_warmup"
+    PLACE: ClassVar = "joint"
+    AMPLITUDES: ClassVar = {"a": ("1", 0.3, True), "d": ("N m s/rad", 1e-3, True)}
+    SHAPES: ClassVar = {"T": ("s", (60.0, 240.0, 960.0, 3840.0)), "by": ("1", (0.0, 1.0))}
+    CHOICES: ClassVar = ("by",)
+    SHOWS: ClassVar = TORQUE
+
+    a: Float[Array, ""]
+    d: Float[Array, ""]
+    T: Float[Array, ""]
+    by: Float[Array, ""]
+
+    @classmethod
+    def shapes(cls, finger, site):
+        first = cls.SHAPES["T"][1][0]
+        return [s for s in super().shapes(finger, site) if s["by"] == 0.0 or s["T"] == first]
+
+    def _cold(self, x) -> Float[Array, "*T"]:
+        by_time = jnp.exp(-x.session_time / self.T)
+        if x.temperature is None:
+            return jnp.where(self.by > 0.5, 0.0, by_time)
+        return jnp.where(self.by > 0.5, (WARM - x.temperature[self.index[0]]) / 10.0, by_time)
+
+    def joint_friction(self, x, f_j, C, F):
+        i = self.index[0]
+        return F.at[i].multiply(jnp.maximum(1.0 + self.a * self._cold(x), 0.0))
+
+    def torque(self, x, memory, h):
+        i = self.index[0]
+        return h.at[i].add(self.d * x.qd[i] * self._cold(x))
+
+
+class JointCoupling(CatalogueEffect):
+    """f(q̇_a + ρ q̇_b), on a, and ρ f, on b: friction and inertia of a motor that turns with two joints.
+
+    A belt or a differential leads one motor past a joint to the next. Its Coulomb friction knows its direction once it
+    has turned.
+    """
+
+    ID: ClassVar = "joint_coupling"
+    PLACE: ClassVar = "joint pair"
+    AMPLITUDES: ClassVar = {
+        "coulomb": ("N m", 0.005, False),
+        "damping": ("N m s/rad", 1e-3, False),
+        "inertia": ("kg m2", 2e-5, False),
+    }
+    SHAPES: ClassVar = {"ratio": ("1", (1.0, -1.0))}
+    CHOICES: ClassVar = ("ratio",)
+    SHOWS: ClassVar = TORQUE
+    MOVES_RIGID_BODY: ClassVar = True
+    has_memory: ClassVar = True
+    sharp: ClassVar = True
+
+    coulomb: Float[Array, ""]
+    damping: Float[Array, ""]
+    inertia: Float[Array, ""]
+    ratio: Float[Array, ""]
+
+    def _ways(self, finger_m: int) -> Float[Array, " m"]:
+        a, b = self.index
+        return jnp.zeros(finger_m).at[a].add(1.0).at[b].add(self.ratio)
+
+    def drive(self, model, x):
+        a, b = self.index
+        return x.q[a] + self.ratio * x.q[b]
+
+    def initial_memory(self, drive):
+        return jnp.zeros_like(drive)
+
+    def next_memory(self, memory, before, drive):
+        return jnp.where(drive != before, jnp.sign(drive - before), memory)
+
+    def finger(self, finger):
+        ways = self._ways(finger.m)
+        return eqx.tree_at(
+            lambda f: f.rotor_inertia, finger, finger.rotor_inertia + self.inertia * jnp.outer(ways, ways)
+        )
+
+    def torque(self, x, memory, h):
+        ways = self._ways(len(x.qd))
+        return h + jnp.multiply.outer(ways, self.damping * jnp.tensordot(ways, x.qd, 1))
+
+    def shared_friction(self, x, memory):
+        if x.held:
+            return ()  # the fixture carries it
+        return (SharedFriction(self._ways(len(x.qd)), self.coulomb * jnp.ones_like(memory), memory),)
+
+
+class JointBacklash(CatalogueEffect):
+    """q_link = p, p = clip(p before, q − b/2, q + b/2): a dead zone between the drive, whose angle q is measured, and
+    the link, which stays where it is while the drive crosses it (play operator).
+
+    `a` is the share of the angle that goes through the dead zone `width`; 1 where all of it does. A trial starts in the
+    middle of it.
+    """
+
+    ID: ClassVar = "joint_backlash"
+    PLACE: ClassVar = "joint"
+    AMPLITUDES: ClassVar = {"a": ("1", 1.0, False)}
+    SHARES: ClassVar = ("a",)
+    SHAPES: ClassVar = {"width": ("rad", (0.005, 0.01, 0.02, 0.04, 0.08))}
+    SHOWS: ClassVar = TORQUE | {"ID.2": EXCURSION, "VD.1": EXCURSION, "VD.3": ("joint_torque", *EXCURSION)}
+    MOVES_RIGID_BODY: ClassVar = True
+
+    a: Float[Array, ""]
+    width: Float[Array, ""]
+
+    def true_motion(self, x):
+        if x.held:
+            return x
+        i = self.index[0]
+
+        def follow(p, q):
+            p = jnp.clip(p, q - 0.5 * self.width, q + 0.5 * self.width)
+            return p, p
+
+        q = jnp.moveaxis(x.q[i], -1, 0)
+        _, link = jax.lax.scan(follow, q[0], q)
+        behind = jnp.moveaxis(link - q, 0, -1)
+        return eqx.tree_at(lambda x: x.q, x, x.q.at[i].add(self.a * behind))
