@@ -8,8 +8,9 @@ from typing import Annotated
 import numpy as np
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import print_json, progress, refuse_existing, table, with_error
+from jaxfinger.cli.output import print_json, progress, refuse_existing, table
 from jaxfinger.errors import UserError
+from jaxfinger.report.numbers import with_error
 
 # Li et al. 2024, Table I: largest and smallest moment arm in mm.
 PAPER_ARMS = {

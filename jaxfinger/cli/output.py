@@ -69,24 +69,6 @@ def _finite(value: Any) -> Any:
     return value
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    """A number for people, its whole part written out up to a million; a dash where there is none."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    return f"{value:.0f}" if 10**digits - 0.5 <= abs(value) < 1e6 else f"{value:.{digits}g}"
-
-
-def with_error(value: float, std: float | None) -> str:
-    """`value ± 1.96 std`, to two digits of the error."""
-    if std is None or not math.isfinite(std):
-        return f"{value:.4g} ± ?"
-    if std == 0:
-        return f"{value:.4g}"
-    half = 1.96 * std
-    decimals = max(0, 1 - math.floor(math.log10(half)))
-    return f"{value:.{decimals}f} ± {half:.{decimals}f}" if decimals < 9 else f"{value:.4g} ± {half:.2g}"
-
-
 def refuse_existing(path: Path, overwrite: bool) -> None:
     """Before any work: an output file that exists is only replaced when asked."""
     if path.is_dir():

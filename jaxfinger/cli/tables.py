@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from jaxfinger.cli.output import console, number, table, with_error
+from jaxfinger.cli.output import console, table
+from jaxfinger.report.numbers import number, with_error
 
 if TYPE_CHECKING:
     from jaxfinger.identify import Fit

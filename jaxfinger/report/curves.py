@@ -1,17 +1,20 @@
-"""The curves of the paper's figures, from a fit: values with standard deviations, in the units that people read."""
+"""The curves of the paper's figures, from a fit, and what was measured beside them, in the units that people read."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfinger.data import Session
+from jaxfinger.experiments import prepare
 from jaxfinger.identify import Fit
 from jaxfinger.model import Model, rigid_body
 from jaxfinger.model.tendon_friction import bounded
+from jaxfinger.report.measured import Points, arm_points, hold_points, loss_points
 
 SAMPLES = 61
 TENSION = 12.0  # N: the paper's protocol goes to 10 N, its validation to 15 N
@@ -39,19 +42,46 @@ class JointCurves:
     gravity: Float[np.ndarray, " S"]
     damping: tuple[float, float]  # N mm s/rad (N s/m), its standard deviation
     prismatic: bool
+    flexing: Points | None = None  # torque of the holds reached in the positive direction, and in the other one
+    extending: Points | None = None
 
 
 @dataclass(frozen=True)
 class Curves:
-    """Everything that the paper draws of a model."""
+    """Everything that the paper draws of a model, with what was measured where a session was given."""
 
     moment_arm: dict[tuple[str, str], Curve]  # (tendon, joint): mm against degrees
     joints: dict[str, JointCurves]
     tendon_friction: dict[str, Curve]  # loss of a sliding tendon, N against N of tension
+    arm_points: dict[tuple[str, str], Points] = field(default_factory=dict)
+    loss_points: dict[str, Points] = field(default_factory=dict)
 
 
-def curves(fit: Fit) -> Curves:
-    """One joint over its range, the others in the middle of theirs; pairs that the finger has and the fit estimated."""
+def curves(fit: Fit, session: Session | None = None) -> Curves:
+    """One joint over its range, the others in the middle of theirs; pairs that the finger has and the fit estimated.
+
+    With a session, what was measured goes along: slopes of the excursions of ID.2, torques of the holds of ID.3-static,
+    losses of the holds of ID.4.
+    """
+    found = _curves(fit)
+    return found if session is None else _with_points(found, fit, session)
+
+
+def _with_points(found: Curves, fit: Fit, session: Session) -> Curves:
+    stacks = prepare(session, [t.name for t in session if t.experiment in ("ID.2", "ID.3-static", "ID.4")])
+    arms = arm_points(session, stacks["ID.2"]) if "ID.2" in stacks else {}
+    holds = hold_points(fit.model, stacks["ID.3-static"]) if "ID.3-static" in stacks else {}
+    losses = loss_points(fit.model, session, stacks["ID.4"]) if "ID.4" in stacks else {}
+    joints = {j: replace(c, flexing=holds.get((j, 1)), extending=holds.get((j, -1))) for j, c in found.joints.items()}
+    return replace(
+        found,
+        joints=joints,
+        arm_points={k: p for k, p in arms.items() if k in found.moment_arm},
+        loss_points={t: p for t, p in losses.items() if t in found.tendon_friction},
+    )
+
+
+def _curves(fit: Fit) -> Curves:
     model, finger = fit.model, fit.model.finger
     limits = np.asarray(finger.limits)
     m, S = finger.m, SAMPLES

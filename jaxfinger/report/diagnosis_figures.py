@@ -8,7 +8,7 @@ from jaxfinger.data.schema import channel_units, units_where
 from jaxfinger.gap import Diagnosis
 from jaxfinger.gap.where import site
 from jaxfinger.identify.linearise import residuals_of
-from jaxfinger.report.canvas import COLOURS, grid, look
+from jaxfinger.report.theme import COLOURS, grid, look
 
 BLAME, QUIET, BEFORE, AFTER = COLOURS[2], "#b8c4d6", COLOURS[4], COLOURS[0]
 LEADING = 6  # candidates in the picture

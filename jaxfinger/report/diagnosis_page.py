@@ -15,8 +15,8 @@ from jaxfinger.data.atomic import atomic_path
 from jaxfinger.data.schema import channel_units, units_where
 from jaxfinger.gap import Diagnosis, as_gap_json
 from jaxfinger.gap.where import site
-from jaxfinger.report.canvas import look
 from jaxfinger.report.diagnosis_figures import VARIABLES, glance, people, places, probabilities, traces
+from jaxfinger.report.theme import look
 
 HEADLINES = {
     "no_gap": "No gap beyond the noise",

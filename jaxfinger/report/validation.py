@@ -13,7 +13,7 @@ from jaxfinger.identify import Fit
 from jaxfinger.identify.predictions import model_for, predict_session
 from jaxfinger.identify.validate import display, excursion_path
 from jaxfinger.model import Model
-from jaxfinger.report.canvas import COLOURS, grid, look, save
+from jaxfinger.report.theme import COLOURS, grid, look, save
 
 PANELS = 3  # VD.2 trials in one figure
 

@@ -11,7 +11,7 @@ import pytest
 
 from jaxfinger.cli import main
 from jaxfinger.cli.app import COMMANDS, SEALED, STAGES
-from jaxfinger.cli.output import number
+from jaxfinger.report.numbers import number
 
 ROOT = Path(__file__).parents[2]
 EMPS = ROOT / "datasets" / "emps"

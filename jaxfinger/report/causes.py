@@ -1,0 +1,42 @@
+"""What a cause is, in the words of its effect: what happens, what it looks like in the data, what to change."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass
+
+from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS
+from jaxfinger.gap.result import Diagnosis
+
+CHANGED = "changed_"
+
+
+@dataclass(frozen=True)
+class Words:
+    """Three short texts; empty where the effect says nothing."""
+
+    happens: str
+    looks: str = ""
+    change: str = ""
+
+
+def words(effect: str, d: Diagnosis) -> Words:
+    """Of an effect of the catalogue, a term of the nominal model, a user's effect, or a parameter that has changed."""
+    if effect.startswith(CHANGED):
+        group = effect.removeprefix(CHANGED).replace("_", " ")
+        return Words(
+            f"The {group} is another than when the fit was made.",
+            "Every trial that depends on it is off in the same way; none before the change was.",
+            "Find out what was changed on the finger in between, or identify it anew.",
+        )
+    of_model = {getattr(e, "ID", ""): type(e) for e in d.augmented.model.effects}
+    known = of_model | NOMINAL_TERMS | CATALOGUE
+    if effect not in known:
+        return Words("")
+    return Words(first_sentence(known[effect]))
+
+
+def first_sentence(cls: type) -> str:
+    """The first sentence of a class's docstring."""
+    text = " ".join((inspect.getdoc(cls) or "").split("\n\n")[0].split())
+    return text if text.endswith(".") or not text else f"{text}."

@@ -1,0 +1,145 @@
+"""`gap.json`, schema jaxfinger-gap/2: SI units, angles rad; no NaN; a probability says the same as the words."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from jaxfinger.data.atomic import atomic_path
+from jaxfinger.effects import Site
+from jaxfinger.gap.result import Cause, Diagnosis, Key, Value
+from jaxfinger.identify.fit_file import save_fit
+from jaxfinger.report import sentences
+
+SCHEMA = "jaxfinger-gap/2"
+
+
+def as_gap_json(d: Diagnosis) -> dict:
+    """What `gap.json` holds."""
+    step = d.next_experiment
+    return {
+        "schema": SCHEMA,
+        "data": d.data,
+        "specimen": d.specimen,
+        "against": d.against,
+        "verdict": {
+            "status": str(d.status),
+            "effects": [_key(k) for k in d.named],
+            "summary": sentences.summary(d),
+        },
+        "budget": [
+            {
+                "effect": c.effect,
+                "site": _sites(c),
+                "probability": c.probability,
+                "share": c.share,
+                "share_ci95": list(c.share_ci95),
+                "channels": {f"{k.experiment}/{k.name}": share for k, share in c.channels.items()},
+                "parameters": _parameters(c.values, c.sites),
+            }
+            for c in d.budget
+        ],
+        "unexplained": {
+            "share": d.unexplained.share,
+            "share_ci95": list(d.unexplained.share_ci95),
+            "depends_on": list(d.unexplained.depends_on),
+            "proposal": d.unexplained.proposal.formula if d.unexplained.proposal else None,
+        },
+        "relevance": [
+            {
+                "experiment": x.experiment,
+                "channel": x.channel,
+                "units": x.units,
+                "gap": x.gap,
+                "signal": x.signal,
+                "relative": x.relative,
+            }
+            for x in d.relevance
+        ],
+        "not_judged": [
+            {"experiment": x.experiment, "channel": x.channel, "reason": sentences.reason(x)} for x in d.not_judged
+        ],
+        "where": [
+            {
+                "experiment": p.experiment,
+                "trial": p.trial,
+                "channel": p.channel,
+                "site": p.site,
+                "region": {"variable": p.variable, "low": p.low, "high": p.high},
+                "share": p.share,
+            }
+            for p in d.where
+        ],
+        "candidates": [
+            _key(c.key)
+            | {
+                "probability": c.probability,
+                "parameters": _parameters(c.values, (c.key.site,)),
+                "held_out_gain": c.held_out,
+            }
+            for c in d.candidates
+        ],
+        "none": d.none,
+        "unlisted": d.unlisted,
+        "ambiguous_sets": [[_key(k) for k in members] for members in d.ambiguous_sets],
+        "next_experiment": None
+        if step is None
+        else {
+            "experiment": step.experiment,
+            "description": sentences.next_trial(step),
+            "separates": list(step.separates),
+        },
+        "gap": [
+            {
+                "experiment": x.experiment,
+                "channel": x.channel,
+                "units": x.units,
+                "noise": x.noise,
+                "before": x.before,
+                "after": x.after,
+                "closed": x.closed,
+                "closed_ci95": list(x.closed_ci95),
+            }
+            for x in d.closures
+        ],
+    }
+
+
+def text(d: Diagnosis) -> str:
+    """The file's content."""
+    return json.dumps(as_gap_json(d), indent=1, allow_nan=False, ensure_ascii=False)
+
+
+def write(d: Diagnosis, folder: str | Path, overwrite: bool = False) -> None:
+    """`gap.json`, `nominal.json` and `augmented.json` in a folder, which is made where there is none.
+
+    Raises:
+        UserError: one of them exists and `overwrite` is false, or the folder cannot be written.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_path(folder / "gap.json", overwrite) as part:
+        part.write_text(text(d), encoding="utf-8")
+    save_fit(d.nominal, folder / "nominal.json", overwrite)
+    save_fit(d.augmented, folder / "augmented.json", overwrite)
+
+
+def _key(key: Key) -> dict:
+    return {"effect": key.effect, "site": list(key.site)}
+
+
+def _sites(cause: Cause) -> list[str]:
+    """The one site's names, or every site's name."""
+    return list(cause.sites[0]) if len(cause.sites) == 1 else ["-".join(s) for s in cause.sites]
+
+
+def _parameters(values: tuple[Value, ...], sites: tuple[Site, ...]) -> dict:
+    """By name, and at several sites by name and site."""
+    return {
+        v.name if len(sites) == 1 else f"{v.name} {'-'.join(v.site)}": {
+            "value": v.value,
+            "std": v.std,
+            "units": v.units,
+        }
+        for v in values
+    }

@@ -1,0 +1,108 @@
+"""What the trials show of a model's curves without a fit: slopes of excursions, torques of holds, losses of tendons."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxfinger.data import Session
+from jaxfinger.experiments import Stack, predict
+from jaxfinger.model import Model, TendonFriction, rigid_body
+
+SHORT_ARM = 1e-3  # m: a shorter moment arm says nothing of the tension behind a torque
+PARTS = 6  # of a joint's stroke in ID.2, one slope each: the powers of a moment arm of degree 4 still show
+LEAST = 8  # samples from which a slope is taken
+
+
+@dataclass(frozen=True)
+class Points:
+    """Measured values y at x; their scatter is all that they say of their error."""
+
+    x: Float[np.ndarray, " P"]
+    y: Float[np.ndarray, " P"]
+
+
+def arm_points(session: Session, stack: Stack) -> dict[tuple[str, str], Points]:
+    """By (tendon, joint): moment arm in mm against degrees (a number against mm where the joint slides).
+
+    A trial of ID.2 moves one joint, so that the slope of a tendon's excursion over its angle is the moment arm; taken
+    over every sixth of the stroke, forth and back together, so that friction of the pulled tendon cancels.
+    """
+    finger = session.finger
+    q, time = np.asarray(stack.batch.x.q), np.asarray(stack.batch.x.time)
+    y, mask = (np.asarray(a["tendon_excursion"]) for a in (stack.batch.y, stack.batch.mask))
+    found: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for b, name in enumerate(stack.trials):
+        joint = session[name].joint
+        if joint is None:
+            continue
+        i = finger.joint_names.index(joint)
+        angle, arm = (1e3, 1.0) if finger.prismatic[i] else (180 / np.pi, 1e3)
+        for k, tendon in enumerate(finger.tendon_names):
+            seen = mask[k, b] > 0
+            if not (finger.crosses[k][i] and seen.any()):
+                continue
+            x, length, t = q[i, b][seen], y[k, b][seen], time[b][seen]
+            edges = np.linspace(x.min(), x.max(), PARTS + 1)
+            for low, high in pairwise(edges):
+                part = (x >= low) & (x <= high)
+                if part.sum() >= LEAST and np.ptp(x[part]) > 0.5 * (high - low):
+                    slope = _slope(x[part], length[part], t[part])
+                    found.setdefault((tendon, joint), []).append((x[part].mean() * angle, slope * arm))
+    return {key: Points(*np.array(rows).T) for key, rows in found.items()}
+
+
+def _slope(x, y, time) -> float:
+    """Slope of y over x at its mean, of a parabola beside a drift in time."""
+    x = x - x.mean()
+    columns = np.stack([np.ones_like(x), x, x**2, time - time.mean()], axis=1)
+    norm = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    return float(np.linalg.lstsq(columns / norm, y, rcond=1e-6)[0][1] / norm[1])
+
+
+def hold_points(model: Model, stack: Stack) -> dict[tuple[str, int], Points]:
+    """By joint and direction of approach (±1): τ_ext − G of every hold in N mm against degrees (N, mm)."""
+    finger, x = model.finger, stack.batch.x
+    y, mask = np.asarray(stack.batch.y["joint_torque"]), np.asarray(stack.batch.mask["joint_torque"])
+    h = y - np.asarray(rigid_body.gravity_torque(finger, x.q))
+    q, way = np.asarray(x.q), np.asarray(x.joint_direction)
+    found: dict[tuple[str, int], list[tuple[float, float]]] = {}
+    for i, b in np.ndindex(y.shape[:2]):
+        angle, torque = (1e3, 1.0) if finger.prismatic[i] else (180 / np.pi, 1e3)
+        for run in stack.samples_of_holds(b, mask[i, b]):
+            key = finger.joint_names[i], int(np.sign(way[i, b, run].mean()))
+            found.setdefault(key, []).append((q[i, b, run].mean() * angle, h[i, b, run].mean() * torque))
+    return {key: Points(*np.array(rows).T) for key, rows in found.items()}
+
+
+def loss_points(model: Model, session: Session, stack: Stack) -> dict[str, Points]:
+    """By tendon: loss in N against tension in N of each hold of rising tension, from the joint's torque, eq. (1)."""
+    frictionless = eqx.tree_at(lambda m: m.tendon_friction, model, TendonFriction.zeros(model.finger.n))
+    x = stack.batch.x
+    y, mask = np.asarray(stack.batch.y["joint_torque"]), np.asarray(stack.batch.mask["joint_torque"])
+    without = np.asarray(_torque(frictionless, x))
+    C = np.asarray(model.moment_arm.coupling(x.q))
+    found: dict[str, list[tuple[float, float]]] = {}
+    for b, name in enumerate(stack.trials):
+        trial = session[name]
+        if trial.tendon is None or trial.joint is None:
+            continue
+        k, i = session.finger.tendon_names.index(trial.tendon), session.finger.joint_names.index(trial.joint)
+        f = np.asarray(x.tension)[k, b]
+        highest = 0.0
+        for run in stack.samples_of_holds(b, mask[i, b]):
+            arm = C[k, i, b, run].mean()
+            if f[run].mean() > highest + 0.1 and abs(arm) > SHORT_ARM:
+                lost = (y[i, b, run] - without[i, b, run]).mean() / arm
+                found.setdefault(trial.tendon, []).append((f[run].mean(), lost))
+            highest = max(highest, f[run].mean())
+    return {tendon: Points(*np.array(rows).T) for tendon, rows in found.items()}
+
+
+@eqx.filter_jit
+def _torque(model: Model, x):
+    return predict(model, x, ("joint_torque",))["joint_torque"]

@@ -1,0 +1,272 @@
+"""A diagnosis for people: one page that carries all it needs, readable on a phone, in light and in dark."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader
+from markupsafe import Markup
+from matplotlib.axes import Axes
+
+from jaxfinger.data.atomic import atomic_path
+from jaxfinger.data.schema import channel_units, units_where
+from jaxfinger.gap.result import Absorbed, Candidate, Cause, Closure, Diagnosis, Key, Left, Place, Status, Value
+from jaxfinger.report import plots, sentences
+from jaxfinger.report.causes import words
+from jaxfinger.report.curves import curves
+from jaxfinger.report.numbers import HALF_95, measured, percent, percent_range, quantity
+from jaxfinger.report.plots import gap as gap_plots
+from jaxfinger.report.plots.fit import INTERVAL_ROWS, interval_size
+from jaxfinger.report.theme import PALETTE, css, grid, inline, look
+from jaxfinger.report.traces import Trace, worst_trial
+
+ACCENTS = {
+    Status.NO_GAP: "green",
+    Status.EXPLAINED: "blue",
+    Status.PARTLY: "orange",
+    Status.AMBIGUOUS: "purple",
+    Status.UNEXPLAINED: "open",
+    Status.NOT_JUDGED: "wrong",
+}
+NARROW, WIDE = 3.35, 7.4  # inches: a phone of 360 px with its margins, and a reading column
+WORTH_A_LINE = 0.01  # probability of a further cause below which nobody wants to read of it
+WORTH_A_PLACE = 0.02  # share of the gap, likewise
+LARGEST = 24  # parameters in the picture of intervals: those known worst, beside all of the causes
+VARIABLES = {"q": "rad", "qd": "rad/s", "tendon_force": "N", "time": "s"}
+
+
+def write_page(d: Diagnosis, path: str | Path, overwrite: bool = False) -> None:
+    """Write the page (HTML, no network).
+
+    Raises:
+        UserError: the file exists and `overwrite` is false, or its folder cannot be written.
+    """
+    some = d.status is not Status.NOT_JUDGED
+    html = render(d, worst_trial(d) if some else None, _arms(d) if some and not d.quick else ())
+    with atomic_path(path, overwrite) as part:
+        part.write_text(html, encoding="utf-8")
+
+
+@look()
+def render(d: Diagnosis, trace: Trace | None = None, arms: Sequence[Markup] = ()) -> str:
+    """The page as text.
+
+    Args:
+        d: the diagnosis.
+        trace: the trial to show, measured beside predicted.
+        arms: further pictures of the model.
+    """
+    template = Environment(loader=PackageLoader("jaxfinger.report", "."), autoescape=True).get_template("page.html.j2")
+    prismatic = d.nominal.model.finger.prismatic
+    named = set(d.named).union(*d.ambiguous_sets) if d.status is Status.AMBIGUOUS else set(d.named)
+    rest = [c for c in d.candidates if c.key not in named and c.probability >= WORTH_A_LINE]
+    return template.render(
+        d=d,
+        css=css(),
+        accent=ACCENTS[d.status],
+        headline=sentences.headline(d),
+        summary=sentences.summary(d),
+        budget=_budget(d) if d.channels else "",
+        hidden_bars=max(len(d.channels) - gap_plots.MOST, 0),
+        relevance=[_relevance(x) for x in d.relevance],
+        cards=_cards(d),
+        changes=[sentences.change(x) for x in d.changes],
+        others=[{"name": sentences.key_name(c.key), "probability": percent(c.probability)} for c in rest],
+        places=[_place(p, prismatic) for p in d.where if p.share >= WORTH_A_PLACE],
+        trace=_trace(trace) if trace else "",
+        trace_name=f"{trace.trial}: {trace.name}" if trace else "",
+        closure=_closure(d) if gap_plots.shown(d.closures) else "",
+        lines=[_line(x) for x in d.closures],
+        runaways=[sentences.sentence(sentences.diverged(x)) for x in d.closures if x.diverged],
+        left=[_left(x) for x in d.left[:5]] if d.status in (Status.PARTLY, Status.UNEXPLAINED) else [],
+        proposal=sentences.proposal(d),
+        next=sentences.next_trial(d.next_experiment) if d.next_experiment else "",
+        not_judged=[sentences.reason(x) for x in d.not_judged],
+        parameters=_parameters(d),
+        arms=arms,
+        absorbed=_absorbed(d.absorbed),
+        trials=sorted({t for s in d.nominal.stages for t in s.trials}),
+        noise=_noise(d, prismatic),
+        versions=", ".join(f"{k} {v}" for k, v in d.nominal.versions.items()),
+    )
+
+
+# Pictures -------------------------------------------------------------------------------------------------------------
+def _both(draw: Callable[[Axes], object], name: str, says: str, size: Callable[[float], tuple[float, float]]) -> Markup:
+    """A picture twice, for a phone and for a wider screen; one of them is shown."""
+    parts = []
+    for kind, width in (("narrow", NARROW), ("wide", WIDE)):
+        parts.append(f'<div class="{kind}">{_picture(draw, f"{name}-{kind}", says, *size(width))}</div>')
+    return Markup("".join(parts))
+
+
+def _picture(draw: Callable[[Axes], object], name: str, says: str, width: float, height: float) -> Markup:
+    figure, ((ax,),) = grid(1, 1, width, height)
+    draw(ax)
+    return inline(figure, name, says)
+
+
+def _budget(d: Diagnosis) -> Markup:
+    says = "Budget of the gap, a bar a channel: " + "; ".join(
+        f"{sentences.cause_name(c)} {percent(c.share)}" for c in d.budget
+    )
+    return _both(
+        lambda ax: plots.budget(d, ax), "budget", f"{says}; unexplained {percent(d.unexplained.share)}",
+        lambda width: gap_plots.budget_size(d, width),
+    )  # fmt: skip
+
+
+def _closure(d: Diagnosis) -> Markup:
+    says = "rms of every channel in units of its noise, before and after"
+    return _picture(
+        lambda ax: plots.closure(d.closures, ax), "closure", says, *gap_plots.closure_size(d.closures, NARROW)
+    )
+
+
+def _trace(trace: Trace) -> Markup:
+    parts = []
+    for kind, width in (("narrow", NARROW), ("wide", WIDE)):
+        figure, axes = grid(2, 1, width, 1.9, sharex=True)
+        plots.signal(trace, axes[0][0])
+        plots.residuals(trace, axes[1][0])
+        says = f"{trace.name} in {trace.trial}, measured and predicted, and what is missed"
+        parts.append(f'<div class="{kind}">{inline(figure, f"trace-{kind}", says)}</div>')
+    return Markup("".join(parts))
+
+
+def _parameters(d: Diagnosis) -> list[Markup]:
+    """Intervals of the causes' parameters and of the nominal ones that are known worst, and who depends on whom."""
+    fit = d.augmented
+    table = fit.table()
+    own = {r["name"] for r in table} - {r["name"] for r in d.nominal.table()}
+    vague = sorted(table, key=lambda r: -(r["std"] or math.inf) / max(abs(r["value"]), 1e-300))
+    chosen = own | {r["name"] for r in vague[: max(LARGEST - len(own), 0)]}
+    names = sorted((r["name"] for r in table if r["name"] in chosen), key=lambda n: n not in own)
+    before = d.nominal if fit is not d.nominal else None
+    out = []
+    for k, start in enumerate(range(0, len(names), INTERVAL_ROWS)):
+        some = names[start : start + INTERVAL_ROWS]
+        out.append(
+            _picture(lambda ax, some=some: plots.intervals(fit, some, before, ax), f"intervals-{k}",
+                     "95 % intervals of " + ", ".join(some), *interval_size(len(some), NARROW))
+        )  # fmt: skip
+    if len(table) > 1:
+        size = NARROW, 3.0
+        out.append(
+            _picture(lambda ax: plots.correlation(fit, 10, ax), "correlation", "correlations of parameters", *size)
+        )
+    return out
+
+
+def _arms(d: Diagnosis) -> list[Markup]:
+    """One panel a joint."""
+    found = curves(d.augmented, d.problem.session)
+    joints = list(dict.fromkeys(j for _, j in found.moment_arm))
+    return [
+        _picture(lambda ax, j=j: plots.moment_arms(found, j, ax), f"arms-{k}", f"moment arms about {j}", NARROW, 2.9)
+        for k, j in enumerate(joints)
+    ]
+
+
+# Words and tables -----------------------------------------------------------------------------------------------------
+def _name(experiment: str, channel: str, column: str | None = None) -> str:
+    return f"{experiment} · {sentences.channel_name(channel)}{f' {column}' if column else ''}"
+
+
+def _relevance(x) -> dict:
+    return {
+        "name": _name(x.experiment, x.channel),
+        "gap": quantity(x.gap, x.units),
+        "signal": quantity(x.signal, x.units) if x.signal > 0 else "none",
+        "relative": percent(x.relative) if x.signal > 0 else "",
+        "matters": "tolerated" if x.tolerated else "matters",
+    }
+
+
+def _cards(d: Diagnosis) -> list[dict]:
+    if d.status is Status.AMBIGUOUS and d.ambiguous_sets:
+        by_key = {c.key: c for c in d.candidates}
+        return [_rival(d, k, by_key.get(key), key) for k, key in enumerate(d.ambiguous_sets[0])]
+    return [_card(d, k, c) for k, c in enumerate(d.budget)]
+
+
+def _card(d: Diagnosis, k: int, c: Cause) -> dict:
+    says = f"{percent(c.share)} of the gap ({percent_range(*c.share_ci95)}); probability {percent(c.probability)}."
+    return _texts(d, k, c.effect) | {
+        "name": sentences.sentence(sentences.cause_name(c)).rstrip("."),
+        "says": says,
+        "sizes": [_value(v, len(c.sites) > 1) for v in c.values],
+    }
+
+
+def _rival(d: Diagnosis, k: int, c: Candidate | None, key: Key) -> dict:
+    return _texts(d, k, key.effect) | {
+        "name": sentences.sentence(sentences.key_name(key)).rstrip("."),
+        "says": f"Probability {percent(c.probability)}." if c else "",
+        "sizes": [_value(v, False) for v in c.values] if c else [],
+    }
+
+
+def _texts(d: Diagnosis, k: int, effect: str) -> dict:
+    text = words(effect, d)
+    return {
+        "colour": PALETTE[k % len(PALETTE)].name,
+        "happens": text.happens,
+        "looks": text.looks,
+        "change": text.change,
+    }
+
+
+def _value(v: Value, sites: bool) -> str:
+    where = f" {'-'.join(v.site)}" if sites else ""
+    return f"{v.name}{where}: {measured(v.value, v.std, v.units)}"
+
+
+def _place(p: Place, prismatic: tuple[bool, ...]) -> dict:
+    units = units_where(VARIABLES.get(p.variable, "1"), prismatic)
+    variable = sentences.VARIABLES.get(p.variable, p.variable)
+    return {
+        "name": _name(p.experiment, p.channel, p.site),
+        "trial": p.trial,
+        "share": percent(p.share),
+        "region": f"{variable} from {quantity(p.low, units)} to {quantity(p.high, units)}",
+    }
+
+
+def _line(x: Closure) -> dict:
+    noise = quantity(x.noise, x.units) if x.noise else "unknown"
+    closed = f"{percent(x.closed)} ({percent_range(*x.closed_ci95)})" if x.resolvable else "no gap to close"
+    return {
+        "name": _name(x.experiment, x.channel),
+        "noise": noise,
+        "before": quantity(x.before, x.units),
+        "after": "diverges" if x.diverged else quantity(x.after, x.units),
+        "closed": "nothing" if x.diverged else closed,
+        "wrong": x.diverged,
+    }
+
+
+def _left(x: Left) -> str:
+    most = sorted(x.by_variable.items(), key=lambda kv: -kv[1])[:2]
+    named = [sentences.VARIABLES.get(k, k) for k, v in most if v > 0.2 * x.energy]
+    return f"{_name(x.experiment, x.channel, x.column)}" + (f": goes with {sentences.joined(named)}" if named else "")
+
+
+def _absorbed(found: Sequence[Absorbed]) -> list[str]:
+    """A line an effect and site: how much could hide, as the half-width of its 95 % interval."""
+    return [
+        sentences.key_name(x.key)
+        + "".join(f", up to {quantity(HALF_95 * v.std, v.units)} of {v.name}" for v in x.hidden if math.isfinite(v.std))
+        for x in found
+    ]
+
+
+def _noise(d: Diagnosis, prismatic: tuple[bool, ...]) -> list[dict]:
+    out = []
+    for (experiment, channel), n in d.nominal.noise.items():
+        units = channel_units(channel, prismatic)
+        std = sorted({quantity(float(s), units) for s in n.std if math.isfinite(s) and s > 0})
+        out.append({"name": _name(experiment, channel), "std": ", ".join(std), "source": n.source})
+    return out

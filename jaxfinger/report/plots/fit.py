@@ -1,0 +1,138 @@
+"""What a fit knows and how it knows it: intervals, correlations, and what holds each parameter where it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+
+from jaxfinger.identify import Fit
+from jaxfinger.identify.parameters import describe
+from jaxfinger.report.numbers import HALF_95, measured
+from jaxfinger.report.theme import AFTER, BEFORE, CLEAR, COLOURS, MUTED, axes_or_new, legend_below, look
+
+LARGEST_MARK = 90.0  # pt²
+EDGE = 2.1  # of the axis of intervals: a value and a half-width of its size
+
+
+INTERVAL_ROWS = 10  # in one panel of a page
+ROW = 0.36  # inches of height that a parameter and its name take
+
+
+def interval_size(rows: int, width: float) -> tuple[float, float]:
+    """Width and height in inches that `intervals` fills."""
+    return width, 0.95 + ROW * max(rows, 1)
+
+
+@look()
+def intervals(
+    fit: Fit, parameters: Sequence[str] | None = None, before: Fit | None = None, ax: Axes | None = None
+) -> Axes:
+    """Parameters with their 95 % intervals, one row each, in shares of the value, or of the half-width if that is more.
+
+    So a row says at a glance how well a parameter is known and whether its interval holds zero; the value with its unit
+    stands above it.
+
+    Args:
+        fit: with what it estimated.
+        parameters: names to show, in this order; by default all that were estimated.
+        before: another fit, whose values of the same parameters are marked.
+        ax: the axes to draw on; new ones without.
+    """
+    table = {r["name"]: r for r in fit.table()}
+    rows = [table[n] for n in (table if parameters is None else parameters)]
+    ax = axes_or_new(ax, *interval_size(len(rows), 4.6))
+    old = {} if before is None else {r["name"]: r["value"] for r in before.table()}
+    at = ax.get_yaxis_transform()
+    for y, row in enumerate(rows):
+        value, std = row["value"], row["std"]
+        half = HALF_95 * std if std is not None else 0.0
+        scale = max(abs(value), half, 1e-300)
+        ax.plot(
+            [(value - half) / scale, (value + half) / scale], [y, y], color=AFTER, linewidth=2.4, solid_capstyle="butt"
+        )
+        ax.plot(value / scale, y, "o", color=AFTER, markersize=4)
+        if row["name"] in old and abs(old[row["name"]] / scale) < EDGE:
+            ax.plot(old[row["name"]] / scale, y, "D", color="none", markeredgecolor=BEFORE, markersize=5)
+        ax.text(0.0, y - 0.2, row["name"], transform=at, va="bottom", ha="left", bbox=CLEAR)
+        text = measured(value, std, row["units"]) if std is not None else "not seen by these trials"
+        ax.text(1.0, y - 0.2, text, transform=at, va="bottom", ha="right", bbox=CLEAR)
+    ax.axvline(0.0, color=MUTED, linewidth=0.8)
+    ax.set(yticks=[], ylim=(len(rows) - 0.5, -0.8), xlim=(-EDGE, EDGE), xticks=[-2, -1, 0, 1, 2])
+    ax.set_xlabel("value and interval, relative to the larger")
+    ax.grid(axis="y", visible=False)
+    ax.spines["left"].set_visible(False)
+    if old:
+        ax.plot([], [], "o-", color=AFTER, label="this fit")
+        ax.plot([], [], "D", color="none", markeredgecolor=BEFORE, label="before")
+        legend_below(ax, 2)
+    return ax
+
+
+def correlations(fit: Fit) -> tuple[list[str], Float[np.ndarray, "p p"]]:
+    """Names of the estimated parameters that the trials see, and their correlation."""
+    seen = [i for i in fit.estimated if np.isfinite(fit.covariance[i, i]) and fit.covariance[i, i] > 0]
+    C = fit.covariance[np.ix_(seen, seen)]
+    std = np.sqrt(np.diag(C))
+    described = describe(fit.model)
+    return [described[i].name for i in seen], C / np.outer(std, std)
+
+
+@look()
+def correlation(fit: Fit, most: int = 16, ax: Axes | None = None) -> Axes:
+    """Correlations of the parameters that depend on each other most: a square's area is |ρ|, its colour the sign.
+
+    Where |ρ| nears 1, only a combination of the two is known well, whatever each one's interval says.
+
+    Args:
+        fit: with its covariance.
+        most: at most so many parameters, those whose largest |ρ| with another is largest.
+        ax: the axes to draw on; new ones without.
+    """
+    names, R = correlations(fit)
+    strongest = np.abs(R - np.diag(np.diag(R))).max(axis=0, initial=0.0)
+    chosen = np.sort(np.argsort(-strongest)[:most])
+    names, R = [names[i] for i in chosen], R[np.ix_(chosen, chosen)]
+    ax = axes_or_new(ax, 2.0 + 0.2 * len(names), 1.0 + 0.2 * len(names))
+    numbers = [str(k + 1) for k in range(len(names))]
+    rows = [f"{name}  {k}" for name, k in zip(names, numbers, strict=True)]
+    _squares(ax, np.tril(R, -1), rows, numbers, "ρ = 1", "ρ = −1")
+    return ax
+
+
+@look()
+def influence(
+    values: Float[np.ndarray, "rows columns"],
+    rows: Sequence[str],
+    columns: Sequence[str],
+    ax: Axes | None = None,
+) -> Axes:
+    """What holds each parameter where it is: a square's area is how far a row moves a column, its colour the way.
+
+    Args:
+        values: shift of every parameter in its standard deviations, one row a trial, channel or CAD value.
+        rows: names of what holds.
+        columns: names of the parameters.
+        ax: the axes to draw on; new ones without.
+    """
+    ax = axes_or_new(ax, 1.8 + 0.2 * len(columns), 1.4 + 0.2 * len(rows))
+    largest = float(np.abs(values).max(initial=0.0)) or 1.0
+    _squares(ax, np.asarray(values) / largest, rows, columns, f"up {largest:.2g} σ", f"down {largest:.2g} σ")
+    ax.tick_params(axis="x", labelrotation=90)
+    return ax
+
+
+def _squares(ax: Axes, values, rows: Sequence[str], columns: Sequence[str], up: str, down: str) -> None:
+    """Values of −1 to 1 as squares whose area is their size."""
+    size = min(LARGEST_MARK, LARGEST_MARK * (16 / max(len(columns), len(rows), 1)) ** 2)
+    for sign, colour, label in ((1, COLOURS[0], up), (-1, COLOURS[1], down)):
+        i, j = np.nonzero(sign * values > 0.02)
+        ax.scatter(j, i, s=size * np.abs(values[i, j]), marker="s", color=colour, linewidths=0, label=label)
+    ax.set(xticks=range(len(columns)), yticks=range(len(rows)), xticklabels=columns, yticklabels=rows)
+    ax.set(xlim=(-0.6, len(columns) - 0.4), ylim=(len(rows) - 0.4, -0.6))
+    ax.xaxis.tick_top()
+    ax.spines[["left", "bottom"]].set_visible(False)
+    ax.tick_params(length=0)
+    legend_below(ax, 2)

@@ -1,0 +1,83 @@
+"""The curves of a model, one panel a call: each takes axes or makes them, and returns them."""
+
+from __future__ import annotations
+
+from matplotlib.axes import Axes
+
+from jaxfinger.identify import Fit
+from jaxfinger.report.curves import Curves, JointCurves, curves
+from jaxfinger.report.measured import Points
+from jaxfinger.report.theme import COLOURS, INK, MUTED, axes_or_new, band, colour, legend_below, line, look
+
+
+def _curves(of: Fit | Curves) -> Curves:
+    return of if isinstance(of, Curves) else curves(of)
+
+
+def _points(ax: Axes, points: Points, colour: str, marker: str = "o", label: str | None = None) -> None:
+    ax.plot(points.x, points.y, marker, color=colour, markersize=3.2, markeredgewidth=0, alpha=0.75, label=label)
+
+
+@look()
+def moment_arms(of: Fit | Curves, joint: str, ax: Axes | None = None) -> Axes:
+    """Moment arms about one joint over its angle, mm (paper, Fig. 4); flexion positive.
+
+    Lines and bands are the fit and its 95 % interval; points, where `curves` was given a session, are slopes of the
+    measured excursion.
+
+    Args:
+        of: a fit, or its `curves`, which are computed once for many panels.
+        joint: its name.
+        ax: the axes to draw on; new ones without.
+    """
+    found, ax = _curves(of), axes_or_new(ax)
+    tendons = list(dict.fromkeys(t for t, _ in found.moment_arm))
+    for k, tendon in enumerate(tendons):
+        if (tendon, joint) in found.moment_arm:
+            c = found.moment_arm[tendon, joint]
+            band(ax, c.x, c.y, c.std, colour(k), tendon, linestyle=line(k))
+            if (tendon, joint) in found.arm_points:
+                _points(ax, found.arm_points[tendon, joint], colour(k))
+    ax.axhline(0, color=MUTED, linewidth=0.6)
+    slides = joint in found.joints and found.joints[joint].prismatic
+    ax.set(title=joint, xlabel="position (mm)" if slides else "joint angle (°)")
+    ax.set_ylabel("moment arm" if slides else "moment arm (mm)")
+    legend_below(ax)
+    return ax
+
+
+@look()
+def joint_torque(of: Fit | Curves, joint: str, ax: Axes | None = None) -> Axes:
+    """Resisting torque of one joint over its angle, N mm (paper, Fig. 6): elastic, and with friction either way.
+
+    Arguments as of `moment_arms`; points are holds, by the direction in which they were reached.
+    """
+    c: JointCurves = _curves(of).joints[joint]
+    ax = axes_or_new(ax)
+    band(ax, c.elastic.x, c.elastic.y, c.elastic.std, COLOURS[0], "elastic")
+    for sign, label in ((1, "with friction"), (-1, None)):
+        std = (c.elastic.std**2 + c.friction.std**2) ** 0.5
+        band(ax, c.elastic.x, c.elastic.y + sign * c.friction.y, std, COLOURS[1], label, linestyle="--")
+    for points, marker, label in ((c.flexing, "^", "held, flexing"), (c.extending, "v", "held, extending")):
+        if points is not None:
+            _points(ax, points, INK, marker, label)
+    ax.set(title=joint, xlabel="position (mm)" if c.prismatic else "joint angle (°)")
+    ax.set_ylabel("resisting force (N)" if c.prismatic else "resisting torque (N mm)")
+    legend_below(ax, 2)
+    return ax
+
+
+@look()
+def tendon_friction(of: Fit | Curves, ax: Axes | None = None) -> Axes:
+    """Tension lost on the way to the finger against tension at the actuator, N, while it rises (paper, Fig. 8).
+
+    Arguments as of `moment_arms`; points are holds of ID.4.
+    """
+    found, ax = _curves(of), axes_or_new(ax)
+    for k, (tendon, c) in enumerate(found.tendon_friction.items()):
+        band(ax, c.x, c.y, c.std, colour(k), tendon, linestyle=line(k))
+        if tendon in found.loss_points:
+            _points(ax, found.loss_points[tendon], colour(k))
+    ax.set(xlabel="tension at the actuator (N)", ylabel="tension lost (N)", xlim=(0, None), ylim=(0, None))
+    legend_below(ax)
+    return ax

@@ -1,0 +1,344 @@
+"""A diagnosis in words. Every sentence about a verdict, a cause, a size or a trial is made here, from data and enums.
+
+Whoever reads aloud what `summary` returns should have told a colleague what is the matter: how large the gap is in the
+world, what causes it and how sure that is, what is left and what to do about it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from jaxfinger.effects import Site
+from jaxfinger.gap.result import (
+    Cause,
+    Change,
+    Closure,
+    Diagnosis,
+    Key,
+    NextExperiment,
+    NotJudged,
+    Posture,
+    Reason,
+    Relevance,
+    Status,
+)
+from jaxfinger.report.numbers import measured, number, percent, percent_range, quantity
+
+NAMED_AT_MOST = 4  # causes in one sentence
+LIKELY, SURE = 0.9, 0.99  # probabilities from which on a person says «very probably» and «almost certainly»
+
+HEADLINES = {
+    Status.NO_GAP: "No gap beyond the noise",
+    Status.EXPLAINED: "Explained",
+    Status.PARTLY: "Partly explained",
+    Status.AMBIGUOUS: "Cannot be told apart yet",
+    Status.UNEXPLAINED: "Unexplained by any known cause",
+    Status.NOT_JUDGED: "Nothing could be judged",
+}
+CHANNELS = {
+    "joint_torque": "joint torque",
+    "tendon_excursion": "tendon excursion",
+    "fingertip_force": "fingertip force",
+    "tendon_force": "tendon force",
+    "q": "simulated angle",
+}
+VARIABLES = {
+    "q": "the joint's own position",
+    "qd": "speed",
+    "direction": "the direction of motion",
+    "tension": "tension",
+    "tendon_force": "tension",
+    "distance since reversal": "the distance since the last reversal",
+    "time": "time",
+    "other joints": "the other joints' positions",
+}
+REASONS = {
+    Reason.NOTHING_COUNTS: "no sample of it counts: record it with holds or at a speed at which friction is known",
+    Reason.FEW_SAMPLES: "too few of its samples count to tell a law from noise: record it longer or more often",
+    Reason.NOT_PREDICTED: "the other simulator says nothing of it: let its file hold this channel too",
+}
+
+
+# Names ----------------------------------------------------------------------------------------------------------------
+def effect_name(effect: str) -> str:
+    """An effect's id as words: `tendon_stretch` is «tendon stretch», `changed_damping` «a change of damping»."""
+    return effect.replace("changed_", "a change of ").replace("_", " ").replace("stribeck", "Stribeck")
+
+
+def channel_name(channel: str) -> str:
+    """A channel as people say it."""
+    return CHANNELS.get(channel, channel.replace("_", " "))
+
+
+def site_names(sites: Iterable[Site]) -> str:
+    """Where: «T3», «T3 and T4», «MCP-PIP»."""
+    return joined(["-".join(s) for s in sites])
+
+
+def key_name(key: Key) -> str:
+    """A cause and its site."""
+    return f"{effect_name(key.effect)} at {site_names([key.site])}"
+
+
+def cause_name(cause: Cause) -> str:
+    """A cause and all its sites."""
+    return f"{effect_name(cause.effect)} at {site_names(cause.sites)}"
+
+
+def joined(parts: Sequence[str], word: str = "and") -> str:
+    """«a», «a and b», «a, b and c»."""
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} {word} {parts[-1]}" if parts else ""
+
+
+def sentence(text: str) -> str:
+    """With a capital and a full stop."""
+    return text[0].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
+
+
+def certainty(probability: float) -> str:
+    """How a person says a probability of 50 % or more."""
+    return "almost certainly" if probability >= SURE else "very probably" if probability >= LIKELY else "probably"
+
+
+# The verdict ----------------------------------------------------------------------------------------------------------
+def headline(d: Diagnosis) -> str:
+    """The verdict in one line, the whole of it."""
+    text = HEADLINES[d.status]
+    if not d.named and d.status in (Status.NO_GAP, Status.EXPLAINED) and any(x.tolerated for x in d.relevance):
+        return "No gap beyond your tolerance"
+    if d.status in (Status.EXPLAINED, Status.PARTLY):
+        text = f"{text}: {_listed([cause_name(c) for c in named_causes(d)])}"
+        if d.status is Status.PARTLY:
+            text += f"; {percent(d.unexplained.share)} is left"
+    elif d.status is Status.AMBIGUOUS and d.ambiguous_sets:
+        text = f"{text}: {joined([key_name(k) for k in d.ambiguous_sets[0]], 'or')}"
+    return text
+
+
+def summary(d: Diagnosis) -> str:
+    """Two or three sentences: how large, why, what is left; and one more for what was not judged."""
+    parts = {
+        Status.NO_GAP: _no_gap,
+        Status.EXPLAINED: _explained,
+        Status.PARTLY: _partly,
+        Status.AMBIGUOUS: _ambiguous,
+        Status.UNEXPLAINED: _unexplained,
+        Status.NOT_JUDGED: _nothing_judged,
+    }[d.status](d)
+    return " ".join(sentence(p) for p in (*parts, *_caveats(d)))
+
+
+def named_causes(d: Diagnosis) -> list[Cause]:
+    """The lines of the budget that the verdict names, in order of their share."""
+    return [c for c in d.budget if set(c.keys) & set(d.named)]
+
+
+def size(d: Diagnosis) -> str:
+    """How large the gap is in the world: of each channel the line that matters most."""
+    largest: dict[str, Relevance] = {}
+    for x in sorted(d.relevance, key=lambda x: (x.tolerated, -x.relative)):
+        largest.setdefault(x.channel, x)
+    lines = list(largest.values())[:2]
+    if not lines:
+        return f"{_subject(d)} misses the measurements by more than their noise"
+    return f"{_subject(d)} misses {joined([how_large(x, d.tolerance) for x in lines])}"
+
+
+def how_large(x: Relevance, tolerance: dict[str, float]) -> str:
+    """«the tendon excursion by 6 µm in 20 mm (0.03 %, VD.1)»."""
+    text = f"the {channel_name(x.channel)} by {quantity(x.gap, x.units)}"
+    inside = f", within your tolerance of {percent(tolerance[x.channel])}" if x.tolerated else ""
+    if not x.signal > 0:
+        return f"{text} ({x.experiment}{inside})"
+    return f"{text} in {quantity(x.signal, x.units)} ({percent(x.relative)}, {x.experiment}{inside})"
+
+
+def _subject(d: Diagnosis) -> str:
+    model = "the simulator" if _is_simulator(d) else f"the model of {d.against}" if d.against else "the model"
+    return f"at a first look {model}" if d.quick else model
+
+
+def _is_simulator(d: Diagnosis) -> bool:
+    return d.problem is not None and d.problem.simulator is not None
+
+
+def _no_gap(d: Diagnosis) -> list[str]:
+    chance = f"the probability that nothing is at work beyond it is {percent(d.none)}"
+    if d.relevance:  # a gap that the user tolerates
+        return [size(d), f"nothing else stands out of the noise; {chance}"]
+    channels = len({(x.experiment, x.channel) for x in d.closures})
+    return [f"{_subject(d)} predicts {_counted(channels)} to within the noise", chance]
+
+
+def _counted(channels: int) -> str:
+    count = {1: "the one channel", 2: "both channels"}.get(channels, f"all {channels} channels")
+    return f"{count} that could be judged"
+
+
+def _explained(d: Diagnosis) -> list[str]:
+    end = "its noise, or to what you tolerate," if any(x.tolerated for x in d.relevance) else "its noise"
+    if not d.named:
+        return [size(d), "nothing is missed by more than you tolerate"]
+    it = "it" if len(named_causes(d)) < 2 else "them"
+    return [
+        size(d),
+        f"{_blamed(d)}; with {it} in the model every channel comes down to {end} on trials that no fit has seen",
+    ]
+
+
+def _partly(d: Diagnosis) -> list[str]:
+    return [size(d), _blamed(d), _left(d)]
+
+
+def _ambiguous(d: Diagnosis) -> list[str]:
+    names = [key_name(k) for k in (d.ambiguous_sets[0] if d.ambiguous_sets else d.named)]
+    if len(names) == 2:
+        text = f"these trials cannot tell {names[0]} from {names[1]}"
+    else:
+        text = f"these trials cannot tell {joined(names)} apart"
+    likeliest = _probability(d, d.named[0]) if d.named else None
+    if likeliest is not None:
+        text += f"; {key_name(d.named[0])} is the likelier with {percent(likeliest)}"
+    step = d.next_experiment
+    if step is None:
+        return [size(d), text, "no trial of the format is expected to tell them apart"]
+    return [size(d), text, f"a trial of {step.experiment} would: {next_trial(step)}"]
+
+
+def _unexplained(d: Diagnosis) -> list[str]:
+    lies = _lies(d)
+    return [size(d), "none of the known causes explains it" + (f": it{lies}" if lies else "")]
+
+
+def _nothing_judged(d: Diagnosis) -> list[str]:
+    parts = ["this file says nothing about the gap: no channel has samples that count"]
+    if d.not_judged:
+        x = d.not_judged[0]
+        more = len(d.not_judged) - 1
+        parts.append(f"{_of(x.experiment, x.channel)}: {REASONS[x.reason]}" + _and_more(more, "channel"))
+    return parts
+
+
+def _blamed(d: Diagnosis) -> str:
+    """«tendon stretch at T3 makes 96 % of it (94 to 98 %), almost certainly»; of several, each with its share."""
+    causes = named_causes(d)
+    if not causes:
+        return f"the cause is {_listed([key_name(k) for k in d.named])}"
+    sure = certainty(min(c.probability for c in causes))
+    if len(causes) == 1:
+        c = causes[0]
+        return f"{cause_name(c)} {sure} causes {percent(c.share)} of it (95 % interval {percent_range(*c.share_ci95)})"
+    first, *rest = causes
+    parts = [
+        f"{cause_name(first)} ({percent(first.share)} of it)",
+        *(f"{cause_name(c)} ({percent(c.share)})" for c in rest),
+    ]
+    return f"the causes are {sure} {_listed(parts)}"
+
+
+def _left(d: Diagnosis) -> str:
+    u = d.unexplained
+    return (
+        f"what is left, {percent(u.share)} of the gap ({percent_range(*u.share_ci95)}),{_lies(d) or ' has no pattern'}"
+    )
+
+
+def _lies(d: Diagnosis) -> str:
+    """Where what no cause explains is, and what it depends on."""
+    u = d.unexplained
+    parts = [f"lies mostly in {_of(u.where.experiment, u.where.name, u.where.column)}"] if u.where else []
+    parts += [f"goes with {joined([VARIABLES.get(v, v) for v in u.depends_on])}"] if u.depends_on else []
+    return f" {joined(parts)}" if parts else ""
+
+
+def proposal(d: Diagnosis) -> str | None:
+    """A closed form of what is left, and that nobody has proven it."""
+    p = d.unexplained.proposal
+    return None if p is None else (f"A formula that fits {percent(p.share)} of what is left, unproven: {p.formula}.")
+
+
+def _of(experiment: str, channel: str, column: str | None = None) -> str:
+    return f"{channel_name(channel)}{f' {column}' if column else ''} of {experiment}"
+
+
+def _listed(parts: Sequence[str]) -> str:
+    """All of them, or the first few and how many more."""
+    if len(parts) <= NAMED_AT_MOST:
+        return joined(parts)
+    return ", ".join(parts[:NAMED_AT_MOST]) + _and_more(len(parts) - NAMED_AT_MOST, "cause")
+
+
+def _and_more(count: int, what: str) -> str:
+    return f", and {count} more {what}{'s' * (count > 1)}" if count else ""
+
+
+def _probability(d: Diagnosis, key: Key) -> float | None:
+    return next((c.probability for c in d.candidates if c.key == key), None)
+
+
+def _caveats(d: Diagnosis) -> list[str]:
+    """What a reader must know beside the verdict: a simulator's own values, simulations that ran away, channels that
+    were not judged.
+    """
+    out = [diverged(x) for x in d.closures if x.diverged]
+    if _is_simulator(d):
+        out.append(retuned(d.changes))
+    elif d.against:
+        out += [change(x) for x in d.changes if x.probability >= 0.5][:2]
+    if d.not_judged and d.status is not Status.NOT_JUDGED:
+        names = [_of(x.experiment, x.channel) for x in d.not_judged[:2]]
+        out.append(f"not judged: {joined(names) if len(d.not_judged) <= 2 else ', '.join(names)}"
+                   f"{_and_more(max(len(d.not_judged) - 2, 0), 'channel')}")  # fmt: skip
+    return out
+
+
+# Single things --------------------------------------------------------------------------------------------------------
+def diverged(x: Closure) -> str:
+    """Of a forward simulation that ran away."""
+    return (
+        f"simulated forward, {x.experiment} diverges, so that its angles close nothing and say nothing; judge by "
+        f"its torques and by the motion a fraction of a second ahead"
+    )
+
+
+def retuned(changes: Sequence[Change]) -> str:
+    """Of another simulator: which of its parameters the measurements contradict."""
+    if not changes:
+        return "the simulator's parameters agree with the measurements"
+    most = [
+        f"{x.name}, {measured(x.before, None, x.units)} to {measured(x.after, x.after_std, x.units)}" for x in changes
+    ]
+    return f"all this is with the simulator's parameters retuned, most of all {'; '.join(most[:2])}"
+
+
+def reason(x: NotJudged) -> str:
+    """Why a channel was not judged, and the mend."""
+    return sentence(f"{_of(x.experiment, x.channel)}: {REASONS[x.reason]}")
+
+
+def change(x: Change) -> str:
+    """A nominal parameter that is another than it was."""
+    return sentence(
+        f"{x.name} was {measured(x.before, x.before_std, x.units)} and is {measured(x.after, x.after_std, x.units)}: "
+        f"{certainty(x.probability) if x.probability >= 0.5 else 'perhaps'} changed ({percent(x.probability)})"
+    )
+
+
+def next_trial(step: NextExperiment) -> str:
+    """What to record: which joint or tendon, where, how far, how fast, how often."""
+    parts = ["the session lacks this experiment"] if step.lacking else []
+    parts += [f"joint {step.joint}"] if step.joint else []
+    parts += [f"tendon {step.tendon}"] if step.tendon else []
+    parts.append(joined([_posture(p) for p in step.postures]))
+    if step.tension is not None:
+        steps = "in steps to" if step.steps else "tension up to"
+        parts.append(f"{steps} {step.tension:.0f} N{' and down again' if step.released else ''}")
+    if step.speed is not None:
+        parts.append(f"up to {number(step.speed, 2)} {'m/s' if step.slides else 'rad/s'}")
+    parts += ["twice" if step.times == 2 else f"{step.times} times"] if step.times > 1 else []
+    return ", ".join(p for p in parts if p)
+
+
+def _posture(p: Posture) -> str:
+    low, high = (f"{1e3 * v:.0f} mm" if p.slides else f"{v * 57.29577951308232:.0f}°" for v in (p.low, p.high))
+    return f"{p.joint} from {low} to {high}" if p.moves else f"{p.joint} at {low}"

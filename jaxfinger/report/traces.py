@@ -1,0 +1,87 @@
+"""The trial in which the model misses most, measured and predicted before and after."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxfinger.data.schema import channel_units
+from jaxfinger.gap.problem import Problem
+from jaxfinger.gap.result import Diagnosis
+from jaxfinger.identify.linearise import residuals_of
+from jaxfinger.report.numbers import HALF_95, scaled
+from jaxfinger.report.sentences import channel_name
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One column of one channel of one trial, in units for people; NaN where no sample counts."""
+
+    experiment: str
+    trial: str
+    name: str  # of the channel and its column
+    units: str
+    time: Float[np.ndarray, " T"]
+    measured: Float[np.ndarray, " T"]
+    before: Float[np.ndarray, " T"]
+    after: Float[np.ndarray, " T"]
+    half: float  # of the noise's 95 % interval
+    changed: bool  # whether there is an «after»
+
+
+def worst_trial(d: Diagnosis) -> Trace:
+    """The column and trial with the most energy above noise."""
+    problem = d.problem
+    e, channel, column, b = _worst(problem)
+    stack = problem.stacks[e]
+    mask = np.asarray(stack.batch.mask[channel])[column, b] > 0
+    seen = np.arange(mask.size) <= np.flatnonzero(mask).max()  # the rest is padding
+    y = np.where(mask, np.asarray(stack.batch.y[channel])[column, b], np.nan)
+    free_zero = channel == "tendon_excursion"
+    missed = []
+    for model in (problem.simulator or d.nominal.model, d.augmented.model):
+        residual = np.where(mask, residuals_of(model, stack.batch, (channel,))[channel][column, b], np.nan)
+        missed.append(residual - np.nanmean(residual) if free_zero else residual)
+    y = y - np.nanmean(y) if free_zero else y
+    std = float(problem.noise[e, channel].std[column])
+    units = channel_units(channel, problem.session.finger.prismatic)
+    factor, unit = scaled(max(float(np.nanmax(np.abs(y))), float(np.nanmax(np.abs(missed[0])))), units)
+    before, after = (factor * (y - m)[seen] for m in missed)
+    return Trace(
+        e,
+        stack.trials[b],
+        f"{channel_name(channel)} {_column(problem, channel, column)}",
+        unit,
+        np.asarray(stack.batch.x.time)[b][seen],
+        factor * y[seen],
+        before,
+        after,
+        HALF_95 * factor * std,
+        d.augmented is not d.nominal,
+    )
+
+
+def _worst(problem: Problem) -> tuple[str, str, int, int]:
+    """Experiment, channel, column and trial (its index in the stack)."""
+    best, most = None, -np.inf
+    for e, rows in problem.rows.items():
+        excess = problem.r[rows.start : rows.start + rows.size] ** 2 - 1.0
+        kinds, which = np.unique(np.stack([rows.channel, rows.column, rows.trial]), axis=1, return_inverse=True)
+        if not kinds.size:
+            continue
+        energy = np.bincount(which.ravel(), excess)
+        if energy.max() > most:
+            most = energy.max()
+            number, column, trial = kinds[:, energy.argmax()]
+            best = e, problem.stacks[e].experiment.channels[number], int(column), int(trial)
+    if best is None:
+        raise ValueError("no sample of any channel counts")
+    return best
+
+
+def _column(problem: Problem, channel: str, column: int) -> str:
+    finger = problem.session.finger
+    names = {"joint_torque": finger.joint_names, "tendon_excursion": finger.tendon_names}
+    return names.get(channel, ("x", "y", "z"))[column]

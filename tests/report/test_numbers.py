@@ -1,0 +1,58 @@
+"""A number is read in a unit of its size, and no finer than its interval."""
+
+import pytest
+
+from jaxfinger.report.numbers import measured, percent, quantity, with_error
+
+
+@pytest.mark.parametrize(
+    ("value", "units", "text"),
+    [
+        (6.1e-6, "m", "6.1 µm"),
+        (0.02, "m", "20 mm"),
+        (0.9997e-3, "m", "1 mm"),
+        (1.2e-3, "N m", "1.2 N mm"),
+        (36.9, "N", "37 N"),
+        (4e-7, "N m", "400 nN m"),
+        (0.0025, "kg", "2.5 g"),
+        (7.2, "kg", "7.2 kg"),
+        (3e-6, "kg m2", "3 mg m²"),
+        (0.5, "rad", "29°"),
+        (0.1, "rad/s", "5.7°/s"),
+        (1.1e4, "N/m", "11 kN/m"),
+        (0.52, "1", "0.52"),
+        (0.0, "m", "0 m"),
+        (2150.0, "m", "2150 m"),
+        (float("nan"), "m", "–"),
+    ],
+)
+def test_units_follow_the_size(value, units, text):
+    assert quantity(value, units) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "units", "text"),
+    [
+        (1.29e-12, 1e-9, "kg", "0.0 ± 2.0 µg"),
+        (-1e-12, 1e-9, "kg", "0.0 ± 2.0 µg"),
+        (9.1e-5, 3e-6, "m/N", "91.0 ± 5.9 µm/N"),
+        (0.012, 0.001, "N m s/rad", "12.0 ± 2.0 N mm s/rad"),
+        (20.4, 0.2, "N", "20.40 ± 0.39 N"),
+        (1e-3, 0.0, "m", "1 mm"),
+        (1e-3, None, "m", "1 mm"),
+    ],
+)
+def test_digits_follow_the_interval(value, std, units, text):
+    assert measured(value, std, units) == text
+
+
+def test_a_value_without_an_interval_says_so():
+    assert with_error(2.0, None) == "2 ± ?"
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [(0.41, "41 %"), (3e-4, "0.03 %"), (0.0, "0 %"), (1.0, "100 %"), (0.9996, "over 99 %"), (1e-7, "under 0.001 %")],
+)
+def test_shares(share, text):
+    assert percent(share) == text

@@ -1,0 +1,70 @@
+"""Figures as functions: they draw on the axes that they are given, and show what they are told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaxfinger.report import plots
+from jaxfinger.report.plots.gap import segments
+from jaxfinger.report.theme import LOOK, axes_or_new
+
+from .fabricated import BARS, LINES, every, fits, trace
+
+DRAWN = {
+    "budget": lambda ax: plots.budget(every()["two"], ax),
+    "closure": lambda ax: plots.closure(LINES, ax),
+    "signal": lambda ax: plots.signal(trace(), ax),
+    "residuals": lambda ax: plots.residuals(trace(), ax),
+    "intervals": lambda ax: plots.intervals(fits()[1], None, fits()[0], ax),
+    "correlation": lambda ax: plots.correlation(fits()[1], 8, ax),
+    "influence": lambda ax: plots.influence(np.array([[1.0, -0.5], [0.0, 2.0]]), ["a", "b"], ["p", "q"], ax),
+}
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_axes_are_taken_and_returned(name):
+    ax = axes_or_new(None)
+    before = set(map(id, ax.figure.axes))
+    assert DRAWN[name](ax) is ax
+    assert set(map(id, ax.figure.axes)) == before
+    assert DRAWN[name](None) is not ax
+    sizes = {t.get_fontsize() for t in ax.findobj(lambda a: hasattr(a, "get_fontsize")) if t.get_text()}
+    assert min(sizes) >= LOOK["font.size"]
+
+
+@pytest.mark.parametrize("bar", [*BARS, replace(BARS[0], by_cause=(), unexplained=1.0), replace(BARS[0], gap=0.0)])
+def test_a_bar_is_whole(bar):
+    noise, causes, together, left = segments(bar)
+    assert noise + sum(causes) + together + left == pytest.approx(1.0)
+    assert min([noise, together, left, *causes]) >= 0.0
+    assert noise == pytest.approx(bar.noise**2 / (bar.noise**2 + bar.gap**2))
+    assert left == pytest.approx(bar.unexplained * (1 - noise))
+
+
+def test_a_bar_keeps_the_proportion_of_its_causes():
+    """Where what each cause alone closes sums to more than all of them close."""
+    _, causes, together, _ = segments(replace(BARS[2], by_cause=(0.6, 0.3), unexplained=0.4))
+    assert causes[0] == pytest.approx(2 * causes[1])
+    assert together == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("after", [0.05, 0.3, 1.0, 40.0])
+def test_every_rms_lies_within_its_panel(after):
+    ax = plots.closure([replace(LINES[0], before=2.0 * LINES[0].noise, after=after * LINES[0].noise)])
+    low, high = ax.get_xlim()
+    assert low < min(after, 2.0)
+    assert max(after, 2.0) < high
+
+
+def test_what_ran_away_and_what_has_no_noise_is_not_drawn():
+    ax = plots.closure([replace(LINES[0], diverged=True), LINES[2], LINES[1]])
+    texts = [t.get_text() for t in ax.texts]
+    assert "VD.1 · tendon excursion" in texts
+    assert not any(t.startswith(("ID.4", "VD.3")) for t in texts)
+
+
+def test_correlated_neighbours_are_shown():
+    ax = plots.correlation(fits()[0], 6)
+    assert len(ax.get_yticklabels()) == 6
+    assert sum(len(c.get_offsets()) for c in ax.collections) >= 5

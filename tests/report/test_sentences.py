@@ -1,0 +1,92 @@
+"""What a person reads: how large first, then why, then what is left; never more sure than the numbers."""
+
+from dataclasses import replace
+
+import pytest
+
+from jaxfinger.gap.result import Key
+from jaxfinger.report import sentences
+
+from .fabricated import COUPLED, LARGE, SMALL, every, explained
+
+ALL = every()
+SIZE = "The model misses the joint torque by 1.2 N mm in 30 N mm (4 %, ID.4) and the tendon excursion by 6 µm in 20 mm"
+SAYS = {
+    "no_gap": ("No gap beyond the noise", ["predicts both channels", "within the noise", "97 %"]),
+    "tolerated": ("No gap beyond your tolerance", ["6 µm in 20 mm (0.03 %", "within your tolerance of 2 %"]),
+    "explained": (
+        "Explained: tendon stretch at T3",
+        [
+            SIZE,
+            "almost certainly causes 96 % of it (95 % interval 94 to 98 %)",
+            "every channel comes down to its noise",
+        ],
+    ),
+    "two": (
+        "Explained: tendon stretch at T3 and joint Stribeck at PIP",
+        [SIZE, "very probably tendon stretch at T3 (52 % of it) and joint Stribeck at PIP (41 %)", "with them"],
+    ),
+    "coupled": ("Explained: moment arm coupling at T1, T2, T3, T4 and T5", [SIZE, "97 % of it"]),
+    "partly": (
+        "Partly explained: tendon stretch at T3 and joint Stribeck at PIP; 30 % is left",
+        [SIZE, "What is left, 30 % of the gap (20 to 40 %), lies mostly in joint torque PIP of ID.4", "tension"],
+    ),
+    "ambiguous": (
+        "Cannot be told apart yet: tendon stretch at T3 or tendon creep at T3",
+        [SIZE, "cannot tell tendon stretch at T3 from tendon creep at T3", "62 %", "MCP at 23° and PIP from 6° to 57°"],
+    ),
+    "unexplained": (
+        "Unexplained by any known cause",
+        [SIZE, "None of the known causes explains it: it lies mostly in"],
+    ),
+    "not_judged": ("Nothing could be judged", ["says nothing about the gap", "record it with holds"]),
+    "some_not_judged": (
+        "Explained: tendon stretch at T3",
+        [SIZE, "Not judged: joint torque of ID.4 and joint torque of ID.3-static."],
+    ),
+    "diverged": ("Explained: tendon stretch at T3", [SIZE, "VD.3 diverges, so that its angles close nothing"]),
+    "against": (
+        "Explained: a change of damping at MCP",
+        ["The model of A-fit.json misses", "Damping MCP was 12.0 ± 2.0 N mm s/rad and is 16.00 ± 0.98 N mm s/rad"],
+    ),
+    "first_look": ("Explained: tendon stretch at T3", ["At a first look the model misses"]),
+}
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_headline_and_summary(name):
+    headline, parts = SAYS[name]
+    assert sentences.headline(ALL[name]) == headline
+    text = sentences.summary(ALL[name])
+    for part in parts:
+        assert part in text
+    assert "_" not in text
+    assert "nan" not in text.lower()
+    extra = name in ("some_not_judged", "diverged", "against")
+    assert 2 <= text.count(". ") + 1 <= 3 + extra
+    assert all(s[0].isupper() for s in text.split(". "))
+
+
+def test_what_matters_leads_whatever_comes_first_in_the_file():
+    d = replace(explained(), relevance=(replace(LARGE, tolerated=True), SMALL), tolerance={"joint_torque": 0.05})
+    text = sentences.size(d)
+    assert text.index("6 µm") < text.index("1.2 N mm")
+    assert "within your tolerance of 5 %" in text
+
+
+def test_a_signal_of_nothing_has_no_relative_size():
+    d = replace(explained(), relevance=(replace(LARGE, signal=0.0, relative=0.0),))
+    assert sentences.size(d) == "the model misses the joint torque by 1.2 N mm (ID.4)"
+
+
+@pytest.mark.parametrize(("chance", "word"), [(0.55, "probably"), (0.93, "very probably"), (0.995, "almost certainly")])
+def test_words_of_certainty_follow_the_probability(chance, word):
+    d = explained()
+    d = replace(d, budget=(replace(d.budget[0], probability=chance),))
+    assert f"tendon stretch at T3 {word} causes".lower() in sentences.summary(d).lower()
+
+
+def test_a_long_list_of_causes_is_cut_and_counted():
+    causes = tuple(replace(COUPLED, effect=f"effect_{c}", sites=((f"T{k}",),)) for k, c in enumerate("abcdef"))
+    d = replace(explained(), budget=causes, named=tuple(Key(c.effect, c.sites[0]) for c in causes))
+    assert sentences.headline(d).endswith("effect d at T3, and 2 more causes")
