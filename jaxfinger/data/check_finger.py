@@ -13,6 +13,7 @@ from jaxfinger.data.session import FingerDescription
 _UNIT_AXIS = 1e-3
 _ROUNDING = 1e-5  # of float32 tables
 _LARGEST_FINGER = 2.0  # m; lengths beyond it are taken for mm
+_LARGEST_ARM = 0.5  # m; as an excursion a turn
 
 
 def check_finger(finger: FingerDescription, report: Report) -> None:
@@ -25,6 +26,7 @@ def check_finger(finger: FingerDescription, report: Report) -> None:
         _links(finger, report)
         _lengths(finger, report)
     _tendons(finger, report)
+    _excursion(finger, report)
 
 
 def _names(names: tuple[str, ...], place: str, what: str, report: Report) -> None:
@@ -98,6 +100,12 @@ def _links(finger: FingerDescription, report: Report) -> None:
         value = getattr(finger, key)
         if value is not None and np.any(value < 0.0):
             report.error(f"/finger/links/{key}", "holds a negative standard deviation; write its size")
+    for key in ("rotor_inertia", "rotor_inertia_std"):
+        value = getattr(finger, key)
+        if value is not None and np.any(value < 0.0):
+            report.error(f"/finger/joints/{key}", "holds a negative number; write its size, 0 where there is no rotor")
+    if finger.rotor_inertia is None and finger.rotor_inertia_std is not None:
+        report.error("/finger/joints/rotor_inertia", "is missing beside its standard deviation; write both or neither")
 
 
 def _inertia(inertia: np.ndarray, mass: float, name: str, report: Report) -> None:
@@ -140,3 +148,30 @@ def _tendons(finger: FingerDescription, report: Report) -> None:
                 place,
                 f"{'active' if active else 'passive'} tendon {name} crosses no joint; mark the joints that it spans",
             )
+
+
+def _excursion(finger: FingerDescription, report: Report) -> None:
+    """A tendon's known excursion is finite, or NaN throughout where it is not known; at joints not crossed it is 0."""
+    place = "/finger/tendons/excursion"
+    if finger.excursion is None:
+        if finger.excursion_std is not None:
+            report.error(place, "is missing beside its standard deviation; write both or neither")
+        return
+    std = finger.excursion_std
+    if std is not None and std.shape != finger.excursion.shape:
+        report.error(f"{place}_std", f"has shape {std.shape}; it must be that of `excursion`, {finger.excursion.shape}")
+        return
+    for k, name in enumerate(finger.tendon_names):
+        known = finger.excursion[k]
+        if np.isnan(known).all():
+            continue
+        spread = np.zeros_like(known) if std is None else std[k]
+        if not (np.isfinite(known).all() and np.isfinite(spread).all()):
+            report.error(place, f"tendon {name} has values that are not finite; write all of them, or NaN throughout")
+        elif np.any(spread < 0.0):
+            report.error(f"{place}_std", f"tendon {name} has a negative standard deviation; write its size")
+        elif np.any(known[~finger.crosses[k]] != 0.0):
+            joint = finger.joint_names[int(np.argmax((known != 0.0).any(axis=1) & ~finger.crosses[k]))]
+            report.error(place, f"tendon {name} is pulled in by joint {joint}, which it does not cross; correct one")
+        elif np.abs(known[:, 0]).max(initial=0.0) > _LARGEST_ARM and not any(finger.prismatic):
+            report.error(place, f"tendon {name} has a moment arm of {np.abs(known[:, 0]).max():.4g} m; convert mm to m")

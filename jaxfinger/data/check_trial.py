@@ -45,7 +45,7 @@ def _named(trial: Trial, finger: FingerDescription, report: Report) -> None:
         ("joint", trial.joint, finger.joint_names, trial.experiment in NEEDS_JOINT),
         ("tendon", trial.tendon, finger.tendon_names, trial.experiment in NEEDS_TENDON),
     ):
-        if value is None and needed:
+        if value is None and needed and not (kind == "joint" and _several(trial, finger)):
             report.error(
                 place, f"is {trial.experiment} and has no attribute `{kind}`; write which one of {listed(names)}"
             )
@@ -64,6 +64,13 @@ def _named(trial: Trial, finger: FingerDescription, report: Report) -> None:
     if trial.experiment == "ID.4" and joint is not None and not finger.crosses[tendon, joint]:
         message = f"pulls {trial.tendon} at joint {trial.joint}, which it does not cross"
         report.error(place, f"{message}; correct the trial or /finger/tendons/crosses")
+
+
+def _several(trial: Trial, finger: FingerDescription) -> bool:
+    """Whether the trial moves, or measures the torque of, more than one joint."""
+    if trial.experiment == "ID.2":
+        return sum(bool(span >= still) for span, still in zip(_spans(trial), _still(finger), strict=True)) > 1
+    return len(trial.motorised(finger)) > 1
 
 
 def _index(names: tuple[str, ...], name: str | None) -> int | None:
@@ -172,24 +179,33 @@ def _span(values: np.ndarray) -> float:
     return float(high - low)
 
 
+def _spans(trial: Trial) -> np.ndarray:
+    return np.array([_span(column) for column in trial.q.T])
+
+
+def _still(finger: FingerDescription) -> np.ndarray:
+    return np.where(finger.prismatic, STILL_AXIS, STILL_JOINT)
+
+
 def _motion(trial: Trial, finger: FingerDescription, report: Report) -> None:
     """Does what the experiment moves move, and what it holds stand still?"""
-    spans = np.array([_span(trial.q[:, k]) for k in range(finger.m)])
-    still = np.where(finger.prismatic, STILL_AXIS, STILL_JOINT)
+    spans, still = _spans(trial), _still(finger)
     say = report.error if trial.complete else report.warning
     place = _place(trial, "q")
     moved = _index(finger.joint_names, trial.joint) if trial.experiment in _MOVES_JOINT else None
     if moved is not None and spans[moved] < still[moved]:
         message = f"joint {trial.joint} never moves (it spans {spans[moved]:.2g}), though {trial.experiment} moves it"
         say(place, f"{message}; correct the attribute `joint`, or record the trial again")
-    elif trial.experiment in ("VD.1", "VD.3") and np.all(spans < still):
+    elif (
+        trial.experiment in ("VD.1", "VD.3") or (trial.joint is None and trial.experiment in _MOVES_JOINT)
+    ) and np.all(spans < still):
         say(place, f"no joint moves, though {trial.experiment} moves them; record it again")
     held = [
         (name, span)
         for name, span, slides in zip(finger.joint_names, spans, finger.prismatic, strict=True)
         if not slides
         and span > 0.1
-        and (trial.experiment in ("ID.4", "VD.2") or (trial.experiment == "ID.2" and name != trial.joint))
+        and (trial.experiment in ("ID.4", "VD.2") or (trial.experiment == "ID.2" and trial.joint not in (None, name)))
     ]
     for name, span in held:
         report.warning(

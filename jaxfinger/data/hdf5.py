@@ -1,4 +1,4 @@
-"""Sessions as files: read, write, hash (dataset format, version 1)."""
+"""Sessions as files: read, write, hash (dataset format, version 1.1)."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from jaxfinger.data.schema import (
     FORMAT,
     JOINTS,
     LINKS,
+    TEMPERATURE,
     TENDONS,
     TIME,
     VERSION,
@@ -111,9 +112,17 @@ def write_header(file: h5py.File, session: Session) -> None:
         "type": types if any(finger.prismatic) else None,
         "origin": finger.origin,
         "limits": finger.limits,
+        "rotor_inertia": finger.rotor_inertia,
+        "rotor_inertia_std": finger.rotor_inertia_std,
     }
     links = {entry.name: getattr(finger, entry.name) for entry in LINKS}
-    tendons = {"name": finger.tendon_names, "active": finger.active, "crosses": finger.crosses}
+    tendons = {
+        "name": finger.tendon_names,
+        "active": finger.active,
+        "crosses": finger.crosses,
+        "excursion": finger.excursion,
+        "excursion_std": finger.excursion_std,
+    }
     for name, entries, values in (("joints", JOINTS, joints), ("links", LINKS, links), ("tendons", TENDONS, tendons)):
         table = group.create_group(name)
         for entry in entries:
@@ -132,6 +141,10 @@ def _write_trial(group: h5py.Group, trial: Trial, finger: FingerDescription) -> 
         value = getattr(trial, name)
         if value is not None:
             write_dataset(group, entry, value, finger.prismatic)
+    if trial.temperature is not None:
+        write_dataset(group, TEMPERATURE, trial.temperature, finger.prismatic)
+        names = np.array(trial.temperature_names, _TEXT)
+        group[TEMPERATURE.name].attrs.create("names", names, dtype=_TEXT)
 
 
 def write_dataset(group: h5py.Group, entry: Entry, value, prismatic: Sequence[bool]) -> None:
@@ -165,3 +178,8 @@ def _refuse_misshapen(trial: Trial, finger: FingerDescription, path) -> None:
         wanted = tuple(sizes[axis] if isinstance(axis, str) else axis for axis in CHANNELS[name].shape)
         if value is not None and np.shape(value) != wanted:
             raise UserError(f"{path}: /trials/{trial.name}/{name}: has shape {np.shape(value)}; it must be {wanted}")
+    if trial.temperature is not None:
+        wanted = (sizes["N"], len(trial.temperature_names))
+        if np.shape(trial.temperature) != wanted:
+            shape = np.shape(trial.temperature)
+            raise UserError(f"{path}: /trials/{trial.name}/temperature: has shape {shape}; it must be {wanted}")

@@ -140,7 +140,7 @@ def fitting_cutoff(time: Float[np.ndarray, " N"], cutoff_hz: float) -> float:
 def decimate_trial(trial: Trial, rate_hz: float) -> Trial:
     """The trial in block means at about `rate_hz`. No block mixes two holds; directions are its first sample's."""
     starts = blocks(trial.time, rate_hz, trial.hold)
-    channels = {name: getattr(trial, name) for name in MEASURED}
+    channels = {name: getattr(trial, name) for name in (*MEASURED, "temperature")}
     means = {name: block_mean(x, starts) for name, x in channels.items() if x is not None}
     labels = {name: getattr(trial, name) for name in ("joint_direction", "tendon_direction", "hold")}
     firsts = {name: x[starts] for name, x in labels.items() if x is not None}

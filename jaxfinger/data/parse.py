@@ -16,6 +16,7 @@ from jaxfinger.data.schema import (
     JOINTS,
     LINKS,
     MAJOR,
+    TEMPERATURE,
     TENDONS,
     TIME,
     VERSION,
@@ -102,6 +103,10 @@ def parse_finger(file: h5py.File, report: Report) -> FingerDescription | None:
         prismatic=prismatic,
         mass_std=links.get("mass_std"),
         com_std=links.get("com_std"),
+        rotor_inertia=joints.get("rotor_inertia"),
+        rotor_inertia_std=joints.get("rotor_inertia_std"),
+        excursion=tendons.get("excursion"),
+        excursion_std=tendons.get("excursion_std"),
     )
 
 
@@ -189,7 +194,30 @@ def parse_trial(trials: h5py.Group, name: str, finger: FingerDescription, report
         motion=text_attribute(group, "motion", place, report),
         session_start=_session_start(group, place, report),
         **channels,
+        **_temperature(group, place, sizes, report),
     )
+
+
+def _temperature(group: h5py.Group, place: str, sizes: Mapping[str, int], report: Report) -> dict[str, Any]:
+    """Temperatures and their names, where they fit: a file of 1.0 may hold a dataset of this name that is its own."""
+    if TEMPERATURE.name not in group:
+        return {}
+    found = Report()
+    values = dataset(group, TEMPERATURE, place, sizes, (), found)
+    names: tuple[str, ...] = ()
+    if values is not None:
+        try:
+            names = tuple(_decode(name) for name in np.atleast_1d(group[TEMPERATURE.name].attrs["names"]))
+        except Exception:  # absent, or no strings
+            names = ()
+        if len(names) != values.shape[1]:
+            message = f"has {values.shape[1]} columns and {len(names)} names; name each in its attribute `names`"
+            found.error(f"{place}/{TEMPERATURE.name}", message)
+    if found.fatal is None:
+        report.extend(found)
+        return {"temperature": values, "temperature_names": names}
+    report.warning(found.fatal.place, f"{found.fatal.message}; it is left out")
+    return {}
 
 
 def _complete(group: h5py.Group, place: str, report: Report) -> bool:

@@ -1,4 +1,4 @@
-"""The dataset format, version 1, as tables: reader, writer and checker go by these."""
+"""The dataset format, version 1.1, as tables: reader, writer and checker go by these."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 FORMAT = "jaxfinger-dataset"
-VERSION = "1.0"
+VERSION = "1.1"
 MAJOR = "1"
 
 Kind = Literal["float", "bool", "text", "int8", "int32"]
@@ -15,7 +15,10 @@ Kind = Literal["float", "bool", "text", "int8", "int32"]
 
 @dataclass(frozen=True)
 class Entry:
-    """One dataset: its name, its shape (N samples, m joints, n tendons), its units, and whether it may be absent."""
+    """One dataset: its name, its shape (N samples, m joints, n tendons), its units, and whether it may be absent.
+
+    An axis whose letter has no size yet (k powers of an excursion, c temperatures) may have any length.
+    """
 
     name: str
     shape: tuple[str | int, ...]
@@ -30,6 +33,8 @@ JOINTS = (
     Entry("type", ("m",), None, "text", optional=True),
     Entry("origin", ("m", 3), "m"),
     Entry("limits", ("m", 2), "rad"),
+    Entry("rotor_inertia", ("m",), "kg m2", optional=True),
+    Entry("rotor_inertia_std", ("m",), "kg m2", optional=True),
 )
 LINKS = (
     Entry("mass", ("m",), "kg"),
@@ -42,10 +47,13 @@ TENDONS = (
     Entry("name", ("n",), None, "text"),
     Entry("active", ("n",), None, "bool"),
     Entry("crosses", ("n", "m"), None, "bool"),
+    Entry("excursion", ("n", "m", "k"), "m/rad^p", optional=True),
+    Entry("excursion_std", ("n", "m", "k"), "m/rad^p", optional=True),
 )
 FINGERTIP = Entry("fingertip", (3,), "m")
 
 TIME = Entry("time", ("N",), "s")
+TEMPERATURE = Entry("temperature", ("N", "c"), "K", optional=True)
 CHANNELS = {
     entry.name: entry
     for entry in (
@@ -80,6 +88,7 @@ MEASURES = {
 _SLIDING = {
     "rad": "m", "rad/s": "m/s", "1/rad": "1/m", "N m": "N", "N m/s": "N/s", "N m/rad": "N/m", "N m s/rad": "N s/m",
     "s/rad": "s/m", "N m/rad^2": "N/m^2", "kg m2": "kg",
+    "m/rad^p": "m/m^p",
 }  # fmt: skip
 
 

@@ -17,6 +17,10 @@ class FingerDescription:
 
     Lengths m, masses kg, inertia kg m² about the centre of mass, gravity m/s² in the base frame.
     `mass_std` and `com_std` are None where CAD and scale gave none.
+
+    `rotor_inertia` (kg m²) is that of a geared rotor, reflected to the joint: it adds to the joint's own equation and
+    to no link. `excursion` is what CAD or a model says of the tendons: tendon k pulls in Σ_p c[k, i, p-1] q_i^p at
+    joint i, in m/rad^p for p = 1, 2, …; NaN throughout for a tendon of which it is not known. None: nothing is known.
     """
 
     gravity: Float[np.ndarray, 3]
@@ -34,6 +38,10 @@ class FingerDescription:
     prismatic: tuple[bool, ...] = ()
     mass_std: Float[np.ndarray, " m"] | None = None
     com_std: Float[np.ndarray, "m 3"] | None = None
+    rotor_inertia: Float[np.ndarray, " m"] | None = None
+    rotor_inertia_std: Float[np.ndarray, " m"] | None = None
+    excursion: Float[np.ndarray, "n m k"] | None = None
+    excursion_std: Float[np.ndarray, "n m k"] | None = None
 
     def __post_init__(self):
         if not self.prismatic:
@@ -52,7 +60,11 @@ class FingerDescription:
 
 @dataclass(frozen=True)
 class Trial:
-    """`/trials/<name>`: one recording of N samples. Channels that the trial did not measure are None; columns NaN."""
+    """`/trials/<name>`: one recording of N samples. Channels that the trial did not measure are None; columns NaN.
+
+    `joint` is the one that is moved or instrumented; None where there is none, or where several are at once.
+    `temperature` is in K, of what the rig measures (`temperature_names`).
+    """
 
     name: str
     experiment: str
@@ -70,6 +82,17 @@ class Trial:
     complete: bool = True
     motion: str | None = None
     session_start: float | None = None
+    temperature: Float[np.ndarray, "N c"] | None = None
+    temperature_names: tuple[str, ...] = ()
+
+    def motorised(self, finger: FingerDescription) -> tuple[str, ...]:
+        """Joints whose external torque is measured: the one that the trial names, else those with a torque channel."""
+        if self.joint is not None:
+            return (self.joint,)
+        if self.joint_torque is None:
+            return ()
+        measured = ~np.isnan(self.joint_torque).all(axis=0)
+        return tuple(name for name, there in zip(finger.joint_names, measured, strict=True) if there)
 
     @property
     def duration(self) -> float:

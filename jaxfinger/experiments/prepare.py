@@ -27,6 +27,7 @@ from jaxfinger.data import (
     width,
     without_spikes,
 )
+from jaxfinger.data.schema import NEEDS_JOINT
 from jaxfinger.errors import UserError
 from jaxfinger.experiments.table import (
     ABOVE_NOISE,
@@ -147,8 +148,8 @@ def _reduce(
         slow_rate = np.zeros((N, n)) if rates is None else rates[0]
         tendon_direction = _direction(trial.tendon_direction, slow_rate, 0.1 * MIN_TENDON_SPEED)
     motorised = np.zeros((N, m))
-    if trial.joint is not None and "joint_torque" in spec.channels:
-        motorised[:, session.finger.joint_names.index(trial.joint)] = 1.0
+    if "joint_torque" in spec.channels and spec.name in NEEDS_JOINT:
+        motorised[:, [session.finger.joint_names.index(name) for name in trial.motorised(session.finger)]] = 1.0
 
     y, mask = _measured(spec, trial, session, minus)
     slides = np.zeros((N, m))

@@ -23,6 +23,10 @@ def make_finger() -> FingerDescription:
         active=np.array([True, True, False]),
         crosses=np.array([[True, True], [True, False], [False, True]]),
         mass_std=np.array([1e-3, 5e-4]),
+        rotor_inertia=np.array([2e-6, 0.0]),
+        rotor_inertia_std=np.array([1e-7, 0.0]),
+        excursion=np.array([[[0.008, 1e-3], [0.005, 0.0]], [[0.01, 0.0], [0.0, 0.0]], np.full((2, 2), np.nan)]),
+        excursion_std=np.array([[[5e-4, 1e-4], [5e-4, 0.0]], [[5e-4, 0.0], [0.0, 0.0]], np.full((2, 2), np.nan)]),
     )
 
 
@@ -84,7 +88,10 @@ def make_session() -> Session:
     q = np.column_stack([still, still])
     trials.append(Trial("06-VD.2-T1", "VD.2", time, q, force, None, None, tip, hold=hold, tendon="T1", complete=False))
     q = np.column_stack([sweep, 0.5 * sweep])
-    trials.append(Trial("07-VD.3", "VD.3", time, q, tension(), excursion, session_start=None))
+    warm = {"temperature": 300.0 + np.outer(time, [0.1, 0.2]), "temperature_names": ("motor T1", "motor T2")}
+    trials.append(Trial("07-VD.3", "VD.3", time, q, tension(), excursion, **warm))
+    q = np.column_stack([sweep, 0.5 * sweep])  # both joints at once: no attribute `joint`
+    trials.append(Trial("08-ID.3-dynamic", "ID.3-dynamic", time, q, joint_torque=0.01 * q))
     return Session("test finger", make_finger(), {t.name: t for t in trials}, "tests", "2026-01-01T00:00:00+00:00")
 
 

@@ -45,7 +45,7 @@ def test_a_good_file_has_no_fault(file):
 def test_the_format_to_the_letter(file):
     with h5py.File(file) as opened:
         assert opened.attrs["format"] == "jaxfinger-dataset"
-        assert opened.attrs["format_version"] == "1.0"
+        assert opened.attrs["format_version"] == "1.1"
         units = {"q": "rad", "tendon_force": "N", "tendon_excursion": "m", "joint_torque": "N m", "hold": "1"}
         trial = opened["trials/04-ID.4-T1-MCP"]
         assert {name: trial[name].attrs["units"] for name in units} == units
@@ -54,6 +54,11 @@ def test_the_format_to_the_letter(file):
         assert opened["finger/links/inertia"].attrs["units"] == "kg m2"
         assert opened["finger/tendons/active"].dtype == bool
         assert trial.attrs["complete"].dtype == bool
+        assert opened["finger/joints/rotor_inertia"].attrs["units"] == "kg m2"
+        assert opened["finger/tendons/excursion"].attrs["units"] == "m/rad^p"
+        warm = opened["trials/07-VD.3/temperature"]
+        assert (warm.attrs["units"], list(warm.attrs["names"])) == ("K", ["motor T1", "motor T2"])
+        assert "joint" not in opened["trials/08-ID.3-dynamic"].attrs
         # Superblock 0 and object headers of version 1: what MATLAB before R2021b reads.
         assert opened.id.get_create_plist().get_version()[0] == 0
 
@@ -100,7 +105,9 @@ def test_what_other_writers_do_is_read(session, file):
         opened.attrs["made_with"] = "something"
         opened.create_group("video/frames")
         trial = opened["trials/07-VD.3"]
-        trial["temperature"] = np.zeros(3)
+        del trial["temperature"]
+        trial["temperature"] = np.zeros(3)  # of 1.0, where it may be anything
+        opened.attrs["format_version"] = "1.0"
         single = trial["q"][()].astype(np.float32)
         del trial["q"]
         trial["q"] = single
@@ -117,6 +124,7 @@ def test_what_other_writers_do_is_read(session, file):
     assert back.specimen == "fingers"
     assert back["07-VD.3"].q.dtype == np.float64
     assert back.finger.mass_std is None
+    assert back["07-VD.3"].temperature is None
     assert back.finger.tendon_names == session.finger.tendon_names
     np.testing.assert_array_equal(back.finger.active, session.finger.active)
 
@@ -126,13 +134,18 @@ def test_a_prismatic_axis_has_units_of_length_and_force(session, tmp_path):
     time = np.arange(count) / 100
     finger = replace(
         session.finger,
-        **{name: getattr(session.finger, name)[:1] for name in ("axis", "origin", "limits", "mass", "com", "inertia")},
+        **{
+            name: getattr(session.finger, name)[:1]
+            for name in ("axis", "origin", "limits", "rotor_inertia", "rotor_inertia_std", "mass", "com", "inertia")
+        },
         joint_names=("axis",),
         tendon_names=(),
         active=np.zeros(0, bool),
         crosses=np.zeros((0, 1), bool),
         prismatic=(True,),
         mass_std=None,
+        excursion=None,
+        excursion_std=None,
     )
     sweep = 0.1 * np.sin(time)[:, None]
     trial = replace(
@@ -143,6 +156,7 @@ def test_a_prismatic_axis_has_units_of_length_and_force(session, tmp_path):
         assert opened[f"trials/{trial.name}/q"].attrs["units"] == "m"
         assert opened[f"trials/{trial.name}/joint_torque"].attrs["units"] == "N"
         assert opened["finger/joints/limits"].attrs["units"] == "m"
+        assert opened["finger/joints/rotor_inertia"].attrs["units"] == "kg"
     back = read_session(tmp_path / "a.h5")
     assert back.finger.prismatic == (True,)
     assert back.finger.n == 0
