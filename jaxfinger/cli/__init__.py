@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import logging
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +14,7 @@ from pathlib import Path
 def main(tokens: Sequence[str] | None = None) -> None:
     """Entry point of `jaxfinger`. Exits 2 with one sentence where the user can mend something."""
     _environment()
+    _streams()
     from cyclopts import CycloptsError
 
     from jaxfinger.cli.app import app
@@ -28,9 +32,24 @@ def main(tokens: Sequence[str] | None = None) -> None:
         raise SystemExit(1) from None
 
 
+def _streams() -> None:
+    """What the terminal cannot encode is replaced; what libraries warn their callers of is not for a user."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+    if not sys.warnoptions:  # `python -W` and PYTHONWARNINGS ask for them
+        warnings.showwarning = _unsaid
+    logging.getLogger().addHandler(logging.NullHandler())  # else what nobody handles goes to stderr
+
+
+def _unsaid(message, category, filename, lineno, file=None, line=None) -> None:
+    """In the place of `warnings.showwarning`; a filter that makes warnings errors still does."""
+
+
 def _environment() -> None:
     """Before any import of NumPy or JAX: small factorisations on one thread, compilations kept between runs."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA writes past Python to stderr
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         from platformdirs import user_cache_path
 

@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from jaxfinger.cli.output import Output, console, print_json, progress, refuse_existing
 from jaxfinger.errors import UserError
+from jaxfinger.progress import Step
 
 
 def check(file: Path, *, json: bool = False) -> None:
@@ -75,7 +76,7 @@ def simulate(
     with progress("simulate") as say:
 
         def count(done: int, total: int, name: str) -> None:
-            say(f"trial {done + 1} of {total}, {name}")
+            say(Step(f"trial {done + 1} of {total}, {name}", done / max(total, 1)))
 
         if source.suffix == ".json":
             from jaxfinger.identify import load_fit

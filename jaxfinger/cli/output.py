@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,23 +16,52 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxfinger.errors import UserError
+from jaxfinger.progress import Step
 
 Output = Annotated[Path, Parameter(name=["--output", "-o"])]
 
 
 @contextmanager
 def progress(title: str) -> Iterator[Callable[[str], None]]:
-    """A line on stderr that says what is being done and since when; one line a step where it is no terminal."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda message: print(f"{title}: {message}", file=sys.stderr, flush=True)
-        return
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    """What is being done, on stderr: a line that renews itself, or one line a step where it is no terminal.
 
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    Where the work says how much of it is done (`Step`), a bar and the time that is left stand beside it.
+    """
+    console, begun = Console(stderr=True), time.monotonic()
+    if not console.is_terminal:
+
+        def say(message: str) -> None:
+            about = f" ({_so_far(message, time.monotonic() - begun)})" if isinstance(message, Step) else ""
+            print(f"{title}: {message}{about}", file=sys.stderr, flush=True)
+
+        yield say
+        return
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(20), TextColumn("{task.fields[about]}"),
+               TimeElapsedColumn())  # fmt: skip
     with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(title)
-        yield lambda message: bar.update(task, description=f"{title}: {message}")
+        task = bar.add_task(title, total=None, about="")
+
+        def tell(message: str) -> None:
+            bar.update(task, description=f"{title}: {message}")
+            if isinstance(message, Step):
+                about = _so_far(message, time.monotonic() - begun)
+                bar.update(task, total=1.0, completed=message.done, about=about)
+
+        yield tell
+
+
+EARLY = 0.1  # share done before which the time so far says nothing of the time that is left
+
+
+def _so_far(step: Step, seconds: float) -> str:
+    """Share done, and about how long the rest takes if it goes on as so far."""
+    text = f"{100 * step.done:.0f} %"
+    if not EARLY <= step.done < 1.0:
+        return text
+    left = seconds * (1.0 - step.done) / step.done
+    return f"{text}, about {f'{left / 60:.0f} min' if left > 90 else f'{max(left, 1.0):.0f} s'} left"
 
 
 def table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> None:

@@ -33,7 +33,12 @@ def words(effect: str, d: Diagnosis) -> Words:
     known = of_model | NOMINAL_TERMS | CATALOGUE
     if effect not in known:
         return Words("")
-    return Words(first_sentence(known[effect]))
+    cls = known[effect]
+    return (
+        Words(cls.HAPPENS or first_sentence(cls), cls.LOOKS, cls.CHANGE)
+        if hasattr(cls, "HAPPENS")
+        else Words(first_sentence(cls))
+    )
 
 
 def first_sentence(cls: type) -> str:

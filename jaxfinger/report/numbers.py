@@ -6,6 +6,7 @@ There is one ± in all that is printed or drawn: half of a 95 % interval, 1.96 s
 from __future__ import annotations
 
 import math
+import re
 
 HALF_95 = 1.96  # standard deviations to either end of a 95 % interval
 DASH = "–"
@@ -79,6 +80,14 @@ def measured(value: float, std: float | None, units: str) -> str:
     if not std:
         return _joined(number(value * factor), unit)
     return _joined(with_error(value * factor, std * factor), unit)
+
+
+_UNIT = re.compile(r"(?<=\d) (?=%|[nµmkMG]?(?:m|N|g|s)\b)")
+
+
+def unbroken(text: str) -> str:
+    """With no-break spaces between numbers and their units."""
+    return _UNIT.sub("\u00a0", text)
 
 
 def _joined(text: str, unit: str) -> str:

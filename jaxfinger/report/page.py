@@ -16,7 +16,7 @@ from jaxfinger.gap.result import Absorbed, Candidate, Cause, Closure, Diagnosis,
 from jaxfinger.report import plots, sentences
 from jaxfinger.report.causes import words
 from jaxfinger.report.curves import curves
-from jaxfinger.report.numbers import HALF_95, measured, percent, percent_range, quantity
+from jaxfinger.report.numbers import HALF_95, measured, percent, percent_range, quantity, unbroken
 from jaxfinger.report.plots import gap as gap_plots
 from jaxfinger.report.plots.fit import INTERVAL_ROWS, interval_size
 from jaxfinger.report.theme import PALETTE, css, grid, inline, look
@@ -67,7 +67,7 @@ def render(d: Diagnosis, trace: Trace | None = None, arms: Sequence[Markup] = ()
         css=css(),
         accent=ACCENTS[d.status],
         headline=sentences.headline(d),
-        summary=sentences.summary(d),
+        summary=unbroken(sentences.summary(d)),
         budget=_budget(d) if d.channels else "",
         hidden_bars=max(len(d.channels) - gap_plots.MOST, 0),
         relevance=[_relevance(x) for x in d.relevance],

@@ -1,6 +1,7 @@
 """The command line, in this process: what it prints, where it writes, how it refuses."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -189,3 +190,38 @@ def test_overwriting_when_asked(folder, tmp_path):
     out.write_text("old")
     assert run("predict", folder / "fit.json", folder / "emps.h5", "-o", out, "--overwrite") == 0
     assert h5py.is_hdf5(out)
+
+
+def test_long_work_says_how_much_is_done_and_about_how_long_the_rest_takes(capsys, monkeypatch):
+    from jaxfinger.cli import output
+    from jaxfinger.progress import Step
+
+    clock = iter([0.0, 5.0, 30.0, 400.0, 401.0])
+    monkeypatch.setattr(output.time, "monotonic", lambda: next(clock))
+    with output.progress("diagnose") as say:
+        say("reading the file")
+        say(Step("identifying", 0.05))
+        say(Step("searching", 0.5))
+        say(Step("refitting", 0.6))
+        say(Step("writing", 1.0))
+    assert capsys.readouterr().err.splitlines() == [
+        "diagnose: reading the file",
+        "diagnose: identifying (5 %)",
+        "diagnose: searching (50 %, about 30 s left)",
+        "diagnose: refitting (60 %, about 4 min left)",
+        "diagnose: writing (100 %)",
+    ]
+
+
+def test_a_terminal_of_ascii_and_a_library_that_warns():
+    """Greek letters are replaced, and nothing of a library reaches stderr."""
+    code = (
+        "import warnings, logging, sys; from jaxfinger.cli import main\n"
+        "try: main(['show', '--help'])\n"
+        "except SystemExit: pass\n"
+        "warnings.warn('a library says'); logging.getLogger('matplotlib').warning('a font'); print('τ = 1 µN')"
+    )
+    run_it = [sys.executable, "-c", code]
+    done = subprocess.run(run_it, capture_output=True, env=os.environ | {"PYTHONIOENCODING": "ascii"}, check=True)
+    assert done.stdout.rstrip().endswith(b"? = 1 ?N")
+    assert done.stderr == b""

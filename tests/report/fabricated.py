@@ -58,8 +58,7 @@ def fits() -> tuple[Fit, Fit]:
         data_hash="0" * 64,
     )
     stretch = CATALOGUE["tendon_stretch"].at(model.finger, ("T3",), compliance=9.1e-5)
-    names = tuple(CATALOGUE["tendon_stretch"].units())
-    augmented = nominal.with_effect(stretch, names)
+    augmented = nominal.with_effect(stretch, ("compliance",))
     covariance = augmented.covariance.copy()
     for i in augmented.estimated[len(chosen) :]:
         covariance[i, i] = 1e-10

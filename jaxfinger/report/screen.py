@@ -1,0 +1,77 @@
+"""A diagnosis on one screen of a terminal, 100 columns."""
+
+from __future__ import annotations
+
+import textwrap
+
+from jaxfinger.gap.result import Cause, ChannelBudget, Closure, Diagnosis
+from jaxfinger.report import sentences
+from jaxfinger.report.numbers import measured, percent, percent_range, quantity, unbroken
+from jaxfinger.report.plots.gap import rows_of, segments, shown
+
+WIDTH, BAR, MOST = 100, 30, 6
+SIGNS = "█▓▒░▚▞"  # a cause each
+NOISE, TOGETHER, OPEN = "·", "+", "?"
+
+
+def summary(d: Diagnosis) -> str:
+    """Verdict, budget, causes, how far it closes, what next."""
+    out = [f"{d.specimen} · {d.data}{f' · beside {d.against}' if d.against else ''}", "", sentences.headline(d)]
+    out += [*_wrapped(sentences.summary(d)), ""]
+    if d.channels:
+        out += ["BUDGET     what the model misses in each channel, as mean square"]
+        out += [_bar(x) for x in rows_of(d, MOST)]
+        out += [f"  {_legend(d)}", ""]
+    if d.budget:
+        out += ["CAUSES     share of the gap (95 % interval), probability, parameters (± half of a 95 % interval)"]
+        out += [line for k, c in enumerate(d.budget) for line in _cause(k, c)] + [""]
+    if lines := shown(d.closures):
+        out += ["HOW FAR    rms on held-out trials: noise, before → after, share closed (95 % interval)"]
+        out += [_line(x) for x in lines] + [""]
+    if step := d.next_experiment:
+        out += ["NEXT       " + f"{step.experiment}: {sentences.next_trial(step)}", ""]
+    return "\n".join(out).rstrip()
+
+
+def _wrapped(text: str, indent: str = "") -> list[str]:
+    """In lines, no number apart from its unit."""
+    lines = textwrap.wrap(unbroken(text), WIDTH, initial_indent=indent, subsequent_indent=indent)
+    return [line.replace("\u00a0", " ") for line in lines]
+
+
+def _bar(x: ChannelBudget) -> str:
+    noise, causes, together, left = segments(x)
+    parts = [
+        (noise, NOISE),
+        *((s, SIGNS[k % len(SIGNS)]) for k, s in enumerate(causes)),
+        (together, TOGETHER),
+        (left, OPEN),
+    ]
+    text, end = "", 0.0
+    for share, sign in parts:
+        end += share
+        text += sign * (round(BAR * end) - len(text))
+    name = f"{x.experiment} {sentences.channel_name(x.channel)} {x.column}"
+    return f"  {text}  {name}, {quantity(x.gap, x.units)}"
+
+
+def _legend(d: Diagnosis) -> str:
+    parts = [f"{NOISE} noise", *(f"{SIGNS[k % len(SIGNS)]} {sentences.cause_name(c)}" for k, c in enumerate(d.budget))]
+    seen = [segments(x) for x in rows_of(d, MOST)]
+    parts += [f"{TOGETHER} several together"] if any(s[2] > 0.5 / BAR for s in seen) else []
+    parts += [f"{OPEN} unexplained"] if any(s[3] > 0.5 / BAR for s in seen) else []
+    return "  ".join(parts)
+
+
+def _cause(k: int, c: Cause) -> list[str]:
+    says = f"{percent(c.share)} ({percent_range(*c.share_ci95)}), probability {percent(c.probability)}"
+    at = [f" {'-'.join(v.site)}" if len(c.sites) > 1 else "" for v in c.values]
+    values = [f"{v.name}{where} {measured(v.value, v.std, v.units)}" for v, where in zip(c.values, at, strict=True)]
+    return [f"  {SIGNS[k % len(SIGNS)]} {sentences.cause_name(c)}: {says}", *_wrapped("; ".join(values), " " * 6)]
+
+
+def _line(x: Closure) -> str:
+    name = f"{x.experiment} {sentences.channel_name(x.channel)}"
+    before, after, noise = (quantity(v, x.units) for v in (x.before, x.after, x.noise))
+    closed = f"{percent(x.closed)} ({percent_range(*x.closed_ci95)})" if x.resolvable else "no gap to close"
+    return f"  {name:<26} {noise:>9}  {before:>9} → {after:<9}  {closed}"
