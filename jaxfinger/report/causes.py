@@ -34,11 +34,8 @@ def words(effect: str, d: Diagnosis) -> Words:
     if effect not in known:
         return Words("")
     cls = known[effect]
-    return (
-        Words(cls.HAPPENS or first_sentence(cls), cls.LOOKS, cls.CHANGE)
-        if hasattr(cls, "HAPPENS")
-        else Words(first_sentence(cls))
-    )
+    happens, looks, change = (getattr(cls, name, "") for name in ("HAPPENS", "LOOKS", "CHANGE"))
+    return Words(happens or first_sentence(cls), looks, change)
 
 
 def first_sentence(cls: type) -> str:

@@ -34,9 +34,9 @@ def draw_identification(
     if found.joints:
         figures["joint-torque"] = _panels(plots.joint_torque, found, list(found.joints))
     if found.tendon_friction:
-        ax = plots.tendon_friction(found)
-        ax.set_title("line and band: fit with 95 % interval; points: holds")
-        figures["tendon-friction"] = ax.figure
+        figure, ((ax,),) = grid(1, 1, 4.6, 3.2)
+        plots.tendon_friction(found, ax)
+        figures["tendon-friction"] = figure
     return [save(f, folder / f"{name}{suffix}", overwrite) for name, f in figures.items()]
 
 

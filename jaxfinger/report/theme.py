@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from markupsafe import Markup, escape
 from matplotlib import rc_context
@@ -57,7 +57,7 @@ THEME = (*PALETTE, BACKGROUND, PANEL, INK_, MUTED_, RULE, NOISE_, OPEN_, WRONG_,
 COLOURS = tuple(c.light for c in PALETTE)
 INK, MUTED, NOISE, OPEN, WRONG = (c.light for c in (INK_, MUTED_, NOISE_, OPEN_, WRONG_))
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
-LINES = ("-", "--", "-.", ":")  # a second sign beside colour
+LINES: tuple[Literal["-", "--", "-.", ":"], ...] = ("-", "--", "-.", ":")  # a second sign beside colour
 
 CLEAR: dict[str, Any] = {"facecolor": BACKGROUND.light, "edgecolor": "none", "pad": 0.6}  # behind text on a line
 FONT = 9.0  # pt, which is 12 px on a page
@@ -101,7 +101,7 @@ def colour(k: int) -> str:
     return COLOURS[k % len(COLOURS)]
 
 
-def line(k: int) -> str:
+def line(k: int) -> Literal["-", "--", "-.", ":"]:
     """The line style that goes with the k-th colour."""
     return LINES[k // len(COLOURS) % len(LINES)]
 
@@ -148,6 +148,13 @@ def legend_below(ax: Axes, columns: int = 3, labelled: bool = True, handles: Seq
         down = ScaledTranslation(0.0, -(TICKS + LABEL * labelled) / 72, ax.figure.dpi_scale_trans)
         ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.0, 0.0), bbox_transform=ax.transAxes + down,
                   ncols=columns, borderpad=0, borderaxespad=0, handlelength=1.4, columnspacing=1.2)  # fmt: skip
+
+
+def legend_beside(ax: Axes, handles: Sequence[Artist] | None = None) -> None:
+    """A legend right of the axes."""
+    handles = ax.get_legend_handles_labels()[0] if handles is None else handles
+    if handles:
+        ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderpad=0, handlelength=1.4)
 
 
 def save(figure: Figure, path: Path, overwrite: bool) -> Path:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import equinox as eqx
 import numpy as np
+from matplotlib.figure import Figure
 
 from jaxfinger.data import Session, Trial
 from jaxfinger.experiments import Stack, predict, prepare
@@ -13,7 +14,8 @@ from jaxfinger.identify import Fit
 from jaxfinger.identify.predictions import model_for, predict_session
 from jaxfinger.identify.validate import display, excursion_path
 from jaxfinger.model import Model
-from jaxfinger.report.theme import COLOURS, grid, look, save
+from jaxfinger.report import plots
+from jaxfinger.report.theme import grid, legend_beside, look, save
 
 PANELS = 3  # VD.2 trials in one figure
 
@@ -41,34 +43,26 @@ def draw_validation(
     return [save(f, folder / f"{name}{suffix}", overwrite) for name, f in figures.items()]
 
 
-def _colour(k: int) -> str:
-    return COLOURS[k % len(COLOURS)]
-
-
-def _vd1(model: Model, session: Session, trial: Trial):
+def _vd1(model: Model, session: Session, trial: Trial) -> Figure:
     """Paper, Fig. 5: the path by hand, the excursions measured and predicted, and their errors."""
     path = excursion_path(model, trial)
-    figure, axes = grid(4, 1, 6.4, 1.6, sharex=True)
+    joints, tendons = session.finger.joint_names, session.finger.tendon_names
+    turn = np.array([display(session, "q", i)[0] for i in range(len(joints))])
+    figure, axes = grid(4, 1, 6.4, 1.7, sharex=True)
     angles, lengths, errors, drifts = (row[0] for row in axes)
-    for i, joint in enumerate(session.finger.joint_names):
-        angles.plot(trial.time, trial.q[:, i] * display(session, "q", i)[0], color=_colour(i), label=joint)
-    for k, tendon in enumerate(session.finger.tendon_names):
-        measured = path.measured[:, k] * 1e3
-        if np.isfinite(measured).any():
-            lengths.plot(path.time, measured, color=_colour(k), label=tendon)
-            lengths.plot(path.time, path.direct[:, k] * 1e3, color=_colour(k), linestyle="--", linewidth=0.9)
-            errors.plot(path.time, measured - path.direct[:, k] * 1e3, color=_colour(k), linewidth=0.7)
-            drifts.plot(path.time, measured - path.integral[:, k] * 1e3, color=_colour(k), linewidth=0.9)
-    angles.set(ylabel="q (°)", title=trial.name)
-    lengths.set(ylabel="excursion (mm)\ndashed: model")
-    errors.set(ylabel="error (mm)\nf(q) − f(q₀)")
-    drifts.set(ylabel="error (mm)\n∫ C q̇ dt", xlabel="time (s)")
-    for ax in (angles, lengths):
-        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    plots.over_time(trial.time, joints, trial.q * turn, ax=angles)
+    seen = np.where(np.isfinite(path.measured).any(axis=0), 1e3, np.nan)
+    plots.over_time(path.time, tendons, path.measured * seen, path.direct * seen, ax=lengths)
+    plots.missed(path.time, tendons, (path.measured - path.direct) * 1e3, ax=errors)
+    plots.missed(path.time, tendons, (path.measured - path.integral) * 1e3, ax=drifts)
+    angles.set(ylabel=f"q ({_unit(session, 'q')})", title=trial.name)
+    lengths.set(ylabel="excursion (mm)")
+    errors.set(ylabel="missed by\nf(q) − f(q₀) (mm)")
+    drifts.set(ylabel="missed by\n∫ C q̇ dt (mm)", xlabel="time (s)")
     return figure
 
 
-def _vd2(model: Model, session: Session, stack: Stack):
+def _vd2(model: Model, session: Session, stack: Stack) -> Figure:
     """Paper, Fig. 9: force at the fingertip against tension, holds measured and predicted."""
     forces = np.asarray(_predict(model, stack.batch.x, ("fingertip_force",))["fingertip_force"])
     measured, mask = (np.asarray(a["fingertip_force"]) for a in (stack.batch.y, stack.batch.mask))
@@ -76,40 +70,38 @@ def _vd2(model: Model, session: Session, stack: Stack):
     for b, (ax, name) in enumerate(zip(axes, stack.trials, strict=True)):
         tendon = session[name].tendon
         k = session.finger.tendon_names.index(tendon) if tendon else int(np.argmax(np.ptp(stack.batch.x.tension, 2)))
-        f = np.asarray(stack.batch.x.tension)[k, b]
-        for a, axis in enumerate("xyz"):
-            runs = stack.samples_of_holds(b, mask[a, b])
-            at = [f[r].mean() for r in runs]
-            ax.plot(
-                at, [measured[a, b, r].mean() for r in runs], "o", color=_colour(a), markersize=4, label=f"f_{axis}"
-            )
-            ax.plot(at, [forces[a, b, r].mean() for r in runs], "x", color=_colour(a), markersize=5)
+        runs = stack.samples_of_holds(b, mask[:, b].max(axis=0))
+        at = np.array([np.asarray(stack.batch.x.tension)[k, b, r].mean() for r in runs])
+        seen, said = (np.array([[y[a, b, r].mean() for r in runs] for a in range(3)]) for y in (measured, forces))
+        plots.against_tension(at, seen, said, ax)
         ax.set(title=name, xlabel=f"tension of {session.finger.tendon_names[k]} (N)")
-    axes[0].set_ylabel("force at the fingertip (N)\no measured, × model")
-    axes[0].legend(loc="best")
+    axes[0].set_ylabel("force at the fingertip (N)\n○ measured, × model")
+    legend_beside(axes[-1])
     return figure
 
 
-def _vd3(model: Model, session: Session, trial: Trial):
+def _vd3(model: Model, session: Session, trial: Trial) -> Figure:
     """The whole model: motion simulated forward from the first sample, and the torque it lacks where all slide."""
-    channels = predict_session(model, session, [trial.name])[trial.name]
+    simulated = predict_session(model, session, [trial.name])[trial.name]["q"]
     stack = prepare(session, [trial.name])["VD.3"]
     time, slides = np.asarray(stack.batch.x.time)[0], np.asarray(stack.batch.mask["joint_torque"])[:, 0] > 0
-    lacking = np.asarray(_predict(model, stack.batch.x, ("joint_torque",))["joint_torque"])
+    lacking = np.asarray(_predict(model, stack.batch.x, ("joint_torque",))["joint_torque"])[:, 0]
+    joints = session.finger.joint_names
+    turn, torque = (np.array([display(session, c, i)[0] for i in range(len(joints))]) for c in ("q", "joint_torque"))
     figure, axes = grid(3, 1, 6.4, 1.8, sharex=True)
-    motion, error, torque = (row[0] for row in axes)
-    for i, joint in enumerate(session.finger.joint_names):
-        factor = display(session, "q", i)[0]
-        motion.plot(trial.time, trial.q[:, i] * factor, color=_colour(i), label=joint)
-        motion.plot(trial.time, channels["q"][:, i] * factor, color=_colour(i), linestyle="--", linewidth=0.9)
-        error.plot(trial.time, (trial.q[:, i] - channels["q"][:, i]) * factor, color=_colour(i), linewidth=0.9)
-        where = np.where(slides[i], lacking[i, 0] * display(session, "joint_torque", i)[0], np.nan)
-        torque.plot(time, where, ".", color=_colour(i), markersize=2)
-    motion.set(ylabel="q (°)\ndashed: simulated", title=trial.name)
-    motion.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
-    error.set(ylabel="error (°)")
-    torque.set(ylabel="torque not\nexplained (N mm)", xlabel="time (s)")
+    motion, error, lacks = (row[0] for row in axes)
+    plots.over_time(trial.time, joints, trial.q * turn, simulated * turn, motion)
+    plots.missed(trial.time, joints, (trial.q - simulated) * turn, error)
+    plots.missed(time, joints, np.where(slides, lacking, np.nan).T * torque, lacks)
+    motion.set(ylabel=f"q ({_unit(session, 'q')})", title=trial.name)
+    error.set(ylabel=f"missed ({_unit(session, 'q')})")
+    lacks.set(ylabel=f"torque that the\nmodel lacks ({_unit(session, 'joint_torque')})", xlabel="time (s)")
     return figure
+
+
+def _unit(session: Session, channel: str) -> str:
+    """Of a channel's first column, for people."""
+    return display(session, channel, 0)[1].replace("degrees", "°")
 
 
 _predict = eqx.filter_jit(predict)

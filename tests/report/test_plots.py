@@ -68,3 +68,13 @@ def test_correlated_neighbours_are_shown():
     ax = plots.correlation(fits()[0], 6)
     assert len(ax.get_yticklabels()) == 6
     assert sum(len(c.get_offsets()) for c in ax.collections) >= 5
+
+
+def test_measured_in_points_and_the_model_as_lines():
+    time, y = np.linspace(0.0, 1.0, 5000), np.ones((5000, 3)) * [1.0, 2.0, np.nan]
+    ax = plots.over_time(time, ["a", "b", "c"], y, y + 0.1)
+    styles = [(line.get_marker(), line.get_linestyle()) for line in ax.lines]
+    assert styles == [(".", "None"), ("None", "-")] * 2
+    assert max(len(line.get_xdata()) for line in ax.lines) < 1300
+    texts = [t.get_text() for t in ax.get_legend().get_texts()]
+    assert texts == ["a", "b", "measured", "model"]

@@ -14,6 +14,11 @@ def _curves(of: Fit | Curves) -> Curves:
     return of if isinstance(of, Curves) else curves(of)
 
 
+def _measured(ax: Axes) -> None:
+    """What the points are, in a legend."""
+    ax.plot([], [], "o", color=INK, markersize=3.2, markeredgewidth=0, label="measured")
+
+
 def _points(ax: Axes, points: Points, colour: str, marker: str = "o", label: str | None = None) -> None:
     ax.plot(points.x, points.y, marker, color=colour, markersize=3.2, markeredgewidth=0, alpha=0.75, label=label)
 
@@ -38,11 +43,13 @@ def moment_arms(of: Fit | Curves, joint: str, ax: Axes | None = None) -> Axes:
             band(ax, c.x, c.y, c.std, colour(k), tendon, linestyle=line(k))
             if (tendon, joint) in found.arm_points:
                 _points(ax, found.arm_points[tendon, joint], colour(k))
+    if any(j == joint for _, j in found.arm_points):
+        _measured(ax)
     ax.axhline(0, color=MUTED, linewidth=0.6)
     slides = joint in found.joints and found.joints[joint].prismatic
     ax.set(title=joint, xlabel="position (mm)" if slides else "joint angle (°)")
     ax.set_ylabel("moment arm" if slides else "moment arm (mm)")
-    legend_below(ax)
+    legend_below(ax, 5)
     return ax
 
 
@@ -78,6 +85,8 @@ def tendon_friction(of: Fit | Curves, ax: Axes | None = None) -> Axes:
         band(ax, c.x, c.y, c.std, colour(k), tendon, linestyle=line(k))
         if tendon in found.loss_points:
             _points(ax, found.loss_points[tendon], colour(k))
+    if found.loss_points:
+        _measured(ax)
     ax.set(xlabel="tension at the actuator (N)", ylabel="tension lost (N)", xlim=(0, None), ylim=(0, None))
-    legend_below(ax)
+    legend_below(ax, 5)
     return ax
