@@ -1,14 +1,13 @@
 """A recipe: what a researcher edits to move from one finger to another. TOML, strict about unknown keys."""
 
-import tomllib
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Annotated
 
-import cattrs
-from cattrs import transform_error
-from cattrs.errors import ClassValidationError
-
-from jaxfinger.errors import UserError
+from jaxfinger.data.session import EXPERIMENTS
+from jaxfinger.data.toml import Fault, OneOf, Place, Within, read_toml
+from jaxfinger.data.toml import structure as from_tables
+from jaxfinger.errors import UserError, did_you_mean
 
 PAPER = ("joint_elastic", "joint_coulomb", "joint_damping", "tendon_friction", "gravity")
 # Terms that real machines need: a constant torque, friction by direction, friction that grows with the torque of the
@@ -21,28 +20,32 @@ STAGES = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4")
 class ModelRecipe:
     """Which terms the nominal model has, and their degrees."""
 
-    moment_arm_degree: int = 4
+    moment_arm_degree: Annotated[int, Within(1, 10)] = 4
     cross_terms: bool = False  # q_a q_b, q_a² q_b, q_a q_b² in f(q); they need a trial that moves two joints
-    elastic_degree: int = 2
-    friction_degree: int = 2
-    terms: tuple[str, ...] = PAPER  # a term left out is a candidate of the diagnosis
+    elastic_degree: Annotated[int, Within(0, 9)] = 2
+    friction_degree: Annotated[int, Within(0, 9)] = 2
+    terms: Annotated[tuple[str, ...], OneOf(TERMS)] = PAPER  # a term left out is a candidate of the diagnosis
+
+    def __post_init__(self):
+        if {"joint_offset", "joint_elastic"} <= set(self.terms):
+            raise Fault("has joint_offset beside joint_elastic, which starts with a constant: leave one out", "terms")
 
 
 @dataclass(frozen=True)
 class FitRecipe:
     """How the fits are done."""
 
-    stages: tuple[str, ...] = STAGES
-    huber: float = 3.0  # robust limit in standard deviations; 0 for plain least squares
+    stages: Annotated[tuple[str, ...], OneOf(STAGES)] = STAGES
+    huber: Annotated[float, Within(0.0)] = 3.0  # robust limit in standard deviations; 0 for plain least squares
     free_inertia: bool = False  # estimate masses and centres of mass too, with CAD as the prior
-    joint_experiments: tuple[str, ...] = STAGES  # what the joint refinement reads
+    joint_experiments: Annotated[tuple[str, ...], OneOf(EXPERIMENTS)] = STAGES  # what the joint refinement reads
 
 
 @dataclass(frozen=True)
 class ValidationRecipe:
     """What validation reads."""
 
-    experiments: tuple[str, ...] = ("VD.1", "VD.2", "VD.3")
+    experiments: Annotated[tuple[str, ...], OneOf(EXPERIMENTS)] = ("VD.1", "VD.2", "VD.3")
 
 
 @dataclass(frozen=True)
@@ -60,38 +63,19 @@ def read_recipe(path: str | Path | None) -> Recipe:
     if path is None:
         return Recipe()
     path = Path(path)
-    if not path.exists() and (shipped := _shipped(path.name)) is not None:
-        path = shipped
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as e:
-        raise UserError(f"{path}: cannot be read ({e.strerror}); give a recipe file, or none for the paper's") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
-        raise UserError(f"{path}: is not TOML: {e}") from None
-    return structure(content, str(path))
+    if not path.exists():
+        path = _shipped(path.name) or path
+    if not path.exists():
+        raise UserError(
+            f"{path}: does not exist{did_you_mean(path.stem, _shipped_names())}; give a file, or the name of a "
+            f"shipped recipe: {', '.join(_shipped_names())}"
+        )
+    return read_toml(path, "give a recipe file, or none for the paper's").read(Recipe)
 
 
 def structure(content: dict, where: str) -> Recipe:
     """A recipe from nested dictionaries, strictly."""
-    converter = cattrs.Converter(forbid_extra_keys=True)
-    try:
-        recipe = converter.structure(content, Recipe)
-    except ClassValidationError as e:
-        raise UserError(f"{where}: {'; '.join(transform_error(e))}") from None
-    for value, known, key in (
-        (recipe.model.terms, TERMS, "model.terms"),
-        (recipe.fit.stages, STAGES, "fit.stages"),
-    ):
-        if unknown := set(value) - set(known):
-            raise UserError(f"{where}: {key} has {sorted(unknown)}; it takes some of {list(known)}")
-    if {"joint_offset", "joint_elastic"} <= set(recipe.model.terms):
-        raise UserError(
-            f"{where}: model.terms has joint_offset beside joint_elastic, which starts with a constant: leave one out"
-        )
-    degrees = (recipe.model.moment_arm_degree, recipe.model.elastic_degree + 1, recipe.model.friction_degree + 1)
-    if not all(1 <= d <= 10 for d in degrees):
-        raise UserError(f"{where}: the degrees in [model] must lie between 1 (moment arm) or 0 (torques) and 10")
-    return recipe
+    return from_tables(content, Recipe, Place(where))
 
 
 def as_dict(recipe: Recipe) -> dict:
@@ -99,11 +83,17 @@ def as_dict(recipe: Recipe) -> dict:
     return asdict(recipe)
 
 
+def _folders() -> list[Path]:
+    """Where the shipped recipes lie: in an installed package, or in a checkout."""
+    here = Path(__file__).resolve().parents[1]
+    return [folder for folder in (here / "fits", here.parent / "fits") if folder.is_dir()]
+
+
 def _shipped(name: str) -> Path | None:
     """A recipe that comes with the package, by its name with or without `.toml`."""
-    here = Path(__file__).resolve().parents[1]
-    for folder in (here / "fits", here.parent / "fits"):
-        candidate = folder / (name if name.endswith(".toml") else f"{name}.toml")
-        if candidate.exists():
-            return candidate
-    return None
+    candidates = (folder / (name if name.endswith(".toml") else f"{name}.toml") for folder in _folders())
+    return next((path for path in candidates if path.exists()), None)
+
+
+def _shipped_names() -> list[str]:
+    return sorted(path.stem for folder in _folders() for path in folder.glob("*.toml"))
