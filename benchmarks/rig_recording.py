@@ -29,6 +29,7 @@ from jaxfinger.rig.backends.ads import AdsRig
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.contract import VALUES, Mode
 from jaxfinger.rig.convert import header
+from jaxfinger.rig.operator import Nobody
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.runner import log_path
@@ -36,11 +37,16 @@ from jaxfinger.rig.safety import Supervisor
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.controller import Controller
 from jaxfinger.rig.simulated.examples import rig_toml
+from jaxfinger.rig.watch import Watch
+
+# this machine is busy on purpose: what is measured must not end because of it
+SLOW = {"stale_s": 5.0, "lag_s": 5.0, "thread_s": 5.0, "disk_s": 5.0, "clock_offset_s": 5.0}
+PATIENT = "[controller]\nheartbeat_s = 5.0\n"
 
 
 def all_slots(where: str, **rig) -> RigDescription:
     """A rig file with 60 channels: the finger's 15, and the slots that the stand-in leaves at zero."""
-    description = parse_rig(rig_toml("ads", {"net_id": standin.NET_ID, "ip": where, "port": 851}, **rig))
+    description = parse_rig(rig_toml("ads", {"net_id": standin.NET_ID, "ip": where, "port": 851}, **rig) + PATIENT)
     used = {c.slot for c in description.channels}
     spare = [s for s in range(VALUES) if s not in used]
     first = description.channels[0]
@@ -59,7 +65,7 @@ def stream(minutes: float, busy: bool) -> dict:
     """Record for so long; count what was lost; latency is from the sample's own time to its arrival in Python."""
     samples = round(minutes * 60_000)
     with standin.running(speed=1.0, heartbeat=5.0) as where, tempfile.TemporaryDirectory() as folder:
-        description = all_slots(where, stale_s=5.0)
+        description = all_slots(where, **SLOW)
         stop, spun = threading.Event(), []
 
         def spin() -> None:
@@ -72,6 +78,7 @@ def stream(minutes: float, busy: bool) -> dict:
                 Path(folder) / "s.wal", {**header(description, "", rig.filters(), rig.fingerprint()), "created": ""}
             )
             reader = Reader(rig, recorder, Supervisor(description))
+            watch = Watch(rig, reader, Nobody())
             start = {"name": "t", "tare": {}, "loaded": [], "motor": None, "contact": False}
             spinner = threading.Thread(target=spin, daemon=True)
             if busy:
@@ -79,7 +86,8 @@ def stream(minutes: float, busy: bool) -> dict:
             reader.begin(start)
             wall = time.monotonic()
             cpu_all = time.process_time()
-            reader.start()
+            watch.start()
+            reader.start(lambda: watch.join("reader"))
             arrivals = []
             while reader.samples < samples and reader.error is None:
                 block = reader.next(1.0)
@@ -88,6 +96,7 @@ def stream(minutes: float, busy: bool) -> dict:
             stop.set()
             if busy:
                 spinner.join()
+            watch.close()
             reader.close()
             wall, cpu = time.monotonic() - wall, time.process_time() - cpu_all - sum(spun)
             recorder.close()
@@ -155,7 +164,7 @@ def kill(count: int, seed: int) -> dict:
             folder = Path(root) / str(k)
             folder.mkdir()
             address = {"net_id": standin.NET_ID, "ip": where, "port": 851}
-            (folder / "rig.toml").write_text(rig_toml("ads", address, stale_s=5.0))
+            (folder / "rig.toml").write_text(rig_toml("ads", address, **SLOW) + PATIENT)
             (folder / "plan.toml").write_text(PLAN)
             files = [str(folder / name) for name in ("plan.toml", "rig.toml", "session.h5")]
             nursery.stdin.write(" ".join(files) + "\n")
@@ -168,7 +177,7 @@ def kill(count: int, seed: int) -> dict:
                 time.sleep(0.005)
             time.sleep(rng.uniform(0.0, 1.5))
             os.kill(recorder, signal.SIGKILL)
-            with AdsRig(parse_rig(rig_toml("ads", address))) as rig:
+            with AdsRig(parse_rig(rig_toml("ads", address) + PATIENT)) as rig:
                 head = rig.status().head
             try:
                 found = recover(path, folder / "rescued.h5")

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import NoReturn
 
 from jaxfinger.cli.output import Output
 from jaxfinger.errors import UserError
@@ -38,17 +44,46 @@ def record(
     if dry_run:
         _print_plan(checked, description)
         return
-    with ExitStack() as stack:
-        view = LiveView(description)
-        operator = Nobody() if yes else stack.enter_context(AtTerminal(view.say))
-        stack.enter_context(view)
-        outcome = run(checked, open_rig(description), output, resume=resume, operator=operator, observe=view)
-    if outcome.cause:
-        raise UserError(
-            f"{outcome.cause.rstrip('.')}; {output} holds what was recorded, go on with --resume "
-            f"(the log is {outcome.log})."
-        )
-    print(f"{output}: {len(outcome.complete)} trials, all complete")
+    view = LiveView(description)
+    try:
+        with ExitStack() as stack:
+            stack.enter_context(_ends_as_interrupts())
+            operator = Nobody() if yes else stack.enter_context(AtTerminal(view.say))
+            stack.enter_context(view)
+            outcome = run(checked, open_rig(description), output, resume=resume, operator=operator, observe=view)
+        if outcome.cause:
+            kept = f"{output} holds what was recorded, go on with --resume (the log is {outcome.log})"
+            if not output.exists():
+                kept = f"rescue what reached the disk with jaxfinger recover {outcome.log}"
+            raise UserError(f"{outcome.cause.rstrip('.')}; {kept}.")
+        said = f"{output}: {len(outcome.complete)} trials, all complete"
+    except UserError as error:
+        if view.stalled:
+            _leave(f"jaxfinger: {error}", 2)
+        raise
+    if view.stalled:
+        _leave(said, 0)
+    print(said)
+
+
+@contextmanager
+def _ends_as_interrupts() -> Iterator[None]:
+    """A terminal that closes, or a request to end, is as Ctrl-C: let go, and keep what was recorded."""
+    ends = (signal.SIGTERM, signal.SIGHUP) if threading.current_thread() is threading.main_thread() else ()
+    before = [signal.signal(end, signal.default_int_handler) for end in ends]
+    try:
+        yield
+    finally:
+        for end, handler in zip(ends, before, strict=True):
+            signal.signal(end, handler)
+
+
+def _leave(sentence: str, code: int) -> NoReturn:
+    """End beside a terminal that takes no output: say it on stderr where that is another, and wait for nothing."""
+    saying = threading.Thread(target=print, args=(sentence,), kwargs={"file": sys.stderr, "flush": True}, daemon=True)
+    saying.start()
+    saying.join(1.0)
+    os._exit(code)
 
 
 def recover(log: Path, *, output: Output, overwrite: bool = False) -> None:

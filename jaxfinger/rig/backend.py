@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Self
@@ -60,6 +62,18 @@ class Block:
     def acknowledged(self) -> Int[np.ndarray, " N"]:
         """Id, modulo 65536, of the last command that the controller had seen at each sample."""
         return (self.flags >> 16).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Look:
+    """A look at the head of the controller's ring: `head` samples were written at some time from `asked` to `answered`.
+
+    Times are of the host's monotonic clock, in s.
+    """
+
+    asked: float
+    answered: float
+    head: int
 
 
 @dataclass(frozen=True)
@@ -123,11 +137,15 @@ class Setup:
 class Rig(ABC):
     """A rig, connected inside a `with`. It is never armed by connecting, and releases the finger on leaving.
 
-    `synchronous` rigs make samples when they are read and need no thread of their own.
+    `synchronous` rigs make samples when they are read and need no thread of their own. Where time is simulated, reading
+    makes it pass, and the host's clock has nothing to do with the controller's.
     """
 
     description: RigDescription
     synchronous: bool = False
+    simulated_time: bool = False
+    look: Look | None = None  # the newest, where the rig has a ring
+    alive: Callable[[], None] = staticmethod(lambda: None)  # called while a call waits: its thread is well
 
     @abstractmethod
     def connect(self) -> None:
@@ -138,11 +156,34 @@ class Rig(ABC):
         """Disconnect; safe to call twice."""
 
     @abstractmethod
-    def read_block(self, timeout: float) -> Block:
-        """The samples since the last call, at least one.
+    def poll(self) -> Block | None:
+        """The samples since the last call, or the first of them; None where there is no new one.
 
-        Raises StaleRig after `timeout` s without a new one, ConnectionLost, ControllerRestarted.
+        Raises ConnectionLost, ControllerRestarted.
         """
+
+    @abstractmethod
+    def beat(self) -> None:
+        """Tell the controller that the whole host is well; without it, it lets go."""
+
+    def _pause(self, seconds: float) -> None:
+        """Let time pass until the next look."""
+        time.sleep(seconds)
+
+    def read_block(self, timeout: float) -> Block:
+        """The samples since the last call, at least one; whoever waits here is well, and the controller is told so.
+
+        Raises StaleRig after `timeout` s without a new one, and what `poll` raises.
+        """
+        deadline = time.monotonic() + timeout
+        while True:
+            with suppress(ConnectionLost):  # `poll` mends it, or says so
+                self.beat()
+            if (block := self.poll()) is not None:
+                return block
+            if time.monotonic() > deadline:
+                raise StaleRig(stale(timeout))
+            self._pause(self.description.poll_s)
 
     @abstractmethod
     def rewind(self, seq: int) -> None:
@@ -197,3 +238,8 @@ class Rig(ABC):
             if self.status().state in (State.ARMED, State.MOVING):
                 self.release()
         self.close()
+
+
+def stale(seconds: float) -> str:
+    """What is wrong where no sample comes."""
+    return f"the controller answers but wrote no sample for {seconds:g} s; see whether its task runs."

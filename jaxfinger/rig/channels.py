@@ -85,6 +85,37 @@ class Limits:
 
 
 @dataclass(frozen=True)
+class HardLimits:
+    """The loosest limits that the controller itself may have (SI): a backstop far beyond the host's own is none.
+
+    `heartbeat_s` is how long it may hold tension without a sign of life from the host.
+    """
+
+    tension_max: float
+    tension_rate_max: float
+    joint_velocity_max: float
+    joint_torque_max: float
+    fingertip_force_max: float
+    heartbeat_s: float
+
+
+@dataclass(frozen=True)
+class Deadlines:
+    """How long, in s, anything may take before tension is let go; `clock_rate` is a ratio.
+
+    stale: no new sample · lag: a sample's way to the supervisor · thread: a thread of the host without a sign of life ·
+    disk: a frame's way to the disk · clock_offset, clock_rate: the controller's clock against samples and host.
+    """
+
+    stale_s: float
+    lag_s: float
+    thread_s: float
+    disk_s: float
+    clock_offset_s: float
+    clock_rate: float
+
+
+@dataclass(frozen=True)
 class RigDescription:
     """A rig file, read: `text` is the file itself, which goes into every session."""
 
@@ -94,8 +125,9 @@ class RigDescription:
     finger: FingerDescription
     channels: tuple[Channel, ...]
     limits: Limits
+    hard: HardLimits
+    deadlines: Deadlines
     rate_hz: float
-    stale_s: float
     poll_s: float
     address: Mapping[str, str | int]
     sensor_rotation: Float[np.ndarray, "3 3"]

@@ -83,12 +83,17 @@ BENCH = np.dtype(
         ("fault", "<u4"),
         ("fault_slot", "<i4"),
         ("fault_seq", "<u8"),
-        ("amount", "<f8"),  # what a spike adds to its slot
+        ("amount", "<f8"),  # what a spike adds to its slot, or the size of another fault
+        ("lockstep", "<u4"),  # 1: time goes as fast as the host reads, so that its clock means nothing
+        ("spare", "<u4"),
         ("mode", "<i4", TARGETS),
         ("pose", "<f8", TARGETS),
     ]
 )
-FAULTS = ("none", "nan", "freeze", "spike", "clock", "flag", "stall", "restart", "cut")
+FAULTS = (  # what the stand-in can do wrong on request; `simulated.faults` says what each means
+    "none", "nan", "freeze", "spike", "flag", "flicker", "clock-back", "clock-frozen", "clock-rate", "clock-jump",
+    "slow", "stall", "restart", "cut", "delay", "deaf", "state",
+)  # fmt: skip
 
 SYMBOLS: dict[str, tuple[np.dtype, int]] = {
     "stInfo": (INFO, 1),
@@ -157,6 +162,8 @@ class Trip(IntEnum):
     HOST = 25
     TRACKING = 26
     TEMPERATURE = 27
+    LAG = 28
+    CONTRACT = 29
 
     @property
     def sentence(self) -> str:
@@ -177,12 +184,14 @@ _SENTENCES = {
     Trip.HEARTBEAT: "the host's heartbeat stopped",
     Trip.FROZEN: "a channel is frozen",
     Trip.STALE: "the controller writes no new samples",
-    Trip.CLOCK: "the controller's clock jumped back",
+    Trip.CLOCK: "the controller's clock jumps or runs at another rate than it should",
     Trip.OPERATOR: "the operator pressed the stop key",
     Trip.RECORDER: "the recorder can no longer write",
     Trip.HOST: "the host gave up",
     Trip.TRACKING: "tendon tension does not follow its set-point",
     Trip.TEMPERATURE: "motor temperature above its limit",
+    Trip.LAG: "the host is too far behind the rig",
+    Trip.CONTRACT: "the controller says what the contract does not know",
 }
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import time
-from contextlib import AbstractContextManager
+import queue
+import threading
+from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
 from rich.console import Console, Group
@@ -16,38 +17,59 @@ from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.runner import View
 
 REFRESH_S = 0.1
+STALLED_S = 2.0  # after which a terminal that takes no output is left alone
 
 
 class LiveView(AbstractContextManager):
-    """Call it with every View; it draws ten times a second. Outside a terminal it prints one line a trial."""
+    """Call it with every View; a thread of its own draws the newest ten times a second, and prints what is said.
+
+    Whoever calls never waits: a terminal that takes no output stalls that thread alone. Outside a terminal it is a line
+    a trial.
+    """
 
     def __init__(self, rig: RigDescription, console: Console | None = None):
         self._rig = rig
         self._console = console or Console()
         self._live = Live(console=self._console, auto_refresh=False) if self._console.is_terminal else None
-        self._drawn, self._trial = 0.0, ""
+        self._trial = ""
+        self._view: View | None = None
+        self._said: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="jaxfinger-view", daemon=True)
+        self.stalled = False  # at the end: something was not printed, since the terminal takes no output
 
     def __enter__(self) -> LiveView:
-        if self._live is not None:
-            self._live.start()
+        self._thread.start()
         return self
 
     def __exit__(self, *_) -> None:
-        if self._live is not None:
-            self._live.stop()
+        self._closing.set()
+        self._thread.join(STALLED_S)
+        self.stalled = self._thread.is_alive()
 
     def say(self, text: str) -> None:
         """Print above the view."""
-        self._console.print(text, markup=False)
+        self._said.put(text)
 
     def __call__(self, view: View) -> None:
         """Show a View."""
-        if self._live is None:
-            if view.trial != self._trial:
-                self._trial = view.trial
-                self._console.print(f"{view.number}/{view.count} {view.trial}", markup=False)
-        elif time.monotonic() - self._drawn > REFRESH_S:
-            self._drawn = time.monotonic()
+        if self._live is not None:
+            self._view = view
+        elif view.trial != self._trial:
+            self._trial = view.trial
+            self.say(f"{view.number}/{view.count} {view.trial}")
+
+    def _work(self) -> None:
+        with self._live if self._live is not None else nullcontext():
+            while not self._closing.wait(REFRESH_S):
+                self._print()
+            self._print()
+
+    def _print(self) -> None:
+        while not self._said.empty():
+            self._console.print(self._said.get(), markup=False)
+        view, self._view = self._view, None
+        if view is not None and self._live is not None:
             self._live.update(self.draw(view), refresh=True)
 
     def draw(self, view: View) -> Group:
@@ -70,6 +92,7 @@ class LiveView(AbstractContextManager):
                 elif channel.kind == "external_torque":
                     table.add_row("motor", f"{value * 1e3:6.1f} N mm", "")
         lost = f", {view.lost} samples lost" if view.lost else ""
+        lag = f", {view.lag_s * 1e3:.0f} ms behind the rig" if view.lag_s else ""
         dot = "● " if view.recording else "  "
-        head = Text(f"{dot}{view.number}/{view.count} {view.trial}: {view.doing}{lost}   (q, space or Esc stops)")
+        head = Text(f"{dot}{view.number}/{view.count} {view.trial}: {view.doing}{lost}{lag}   (q, space or Esc stops)")
         return Group(head, table)

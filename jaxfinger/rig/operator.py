@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import select
 import sys
 import threading
@@ -37,15 +38,18 @@ class Nobody:
 
 
 class AtTerminal:
-    """A person at the terminal: Enter answers a prompt, q, space or Escape stops the rig at any time."""
+    """A person at the terminal: Enter answers a prompt, q, space or Escape stops the rig at any time.
+
+    Keys are read by whoever asks for them, and nothing is printed: a terminal that takes no output still gives keys.
+    """
 
     def __init__(self, say: Callable[[str], None] = print):
         self._say = say
         self._stop = threading.Event()
         self._enter = threading.Event()
-        self._closing = threading.Event()
+        self._reading = threading.Lock()
         self._settings: list = []
-        self._thread: threading.Thread | None = None
+        self._keys: int | None = None  # file descriptor
 
     def __enter__(self) -> AtTerminal:
         import termios
@@ -53,25 +57,34 @@ class AtTerminal:
 
         if not sys.stdin.isatty():
             raise UserError("the operator's stop key needs a terminal; run in one, or use --yes on a simulated rig.")
-        self._settings = termios.tcgetattr(sys.stdin)
-        tty.setcbreak(sys.stdin)
-        self._thread = threading.Thread(target=self._listen, name="jaxfinger-keys", daemon=True)
-        self._thread.start()
+        keys = self._keys = sys.stdin.fileno()
+        self._settings = termios.tcgetattr(keys)
+        tty.setcbreak(keys, termios.TCSANOW)  # any other waits for output that nobody may be reading
         return self
 
     def __exit__(self, *_) -> None:
         import termios
 
-        self._closing.set()
-        if self._thread is not None:
-            self._thread.join()
         with suppress(termios.error):
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._settings)
+            termios.tcsetattr(sys.stdin, termios.TCSANOW, self._settings)
+        self._keys = None
 
-    def _listen(self) -> None:
-        while not self._closing.is_set():
-            if select.select([sys.stdin], [], [], 0.05)[0]:
-                self.key(sys.stdin.read(1))
+    def _poll(self) -> None:
+        """Take the keys that were pressed; never waits."""
+        if self._keys is None or not self._reading.acquire(blocking=False):
+            return
+        try:
+            while select.select([self._keys], [], [], 0)[0]:
+                pressed = os.read(self._keys, 64)
+                if not pressed:  # the terminal is gone, and the stop key with it
+                    self._stop.set()
+                    return
+                for key in pressed.decode(errors="replace"):
+                    self.key(key)
+        except OSError:
+            self._stop.set()
+        finally:
+            self._reading.release()
 
     def key(self, key: str) -> None:
         """A key was pressed."""
@@ -84,9 +97,10 @@ class AtTerminal:
         """Show the prompt and wait for Enter; the rig is watched meanwhile."""
         self._enter.clear()
         self._say(f"{text}\n  Enter when done; q, space or Escape stops the rig.")
-        while not self._enter.wait(0.05) and not self._stop.is_set() and alive():
+        while not self._enter.wait(0.05) and not self.stop_requested() and alive():
             pass
 
     def stop_requested(self) -> bool:
         """Whether q, space or Escape was pressed."""
+        self._poll()
         return self._stop.is_set()

@@ -6,6 +6,7 @@ import queue
 import shutil
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -30,9 +31,11 @@ class Recorder:
             )
         self._log = opener(path) if opener else wal.LogWriter.append(path) if resume else wal.LogWriter.create(path)
         self._queue: queue.SimpleQueue[tuple[bytes, Any] | None] = queue.SimpleQueue()
+        self._since: deque[float] = deque()  # when each frame that waits for the disk was handed over
         self._waiting = 0
         self._lock = threading.Lock()
         self.failure: str | None = None
+        self.hangs = False  # the disk did not answer until the end
         self.unwritten: list[tuple[bytes, dict[str, Any]]] = []  # frames of JSON that found no room
         self._thread = threading.Thread(target=self._work, name="jaxfinger-writer", daemon=True)
         self._thread.start()
@@ -41,6 +44,10 @@ class Recorder:
 
     def put(self, tag: bytes, value: dict[str, Any]) -> None:
         """Queue a frame of JSON."""
+        self._put(tag, value)
+
+    def _put(self, tag: bytes, value: Any) -> None:
+        self._since.append(time.monotonic())
         self._queue.put((tag, value))
 
     def block(self, block: Block) -> None:
@@ -49,7 +56,15 @@ class Recorder:
             self._waiting += len(block)
             if self._waiting > QUEUE_LIMIT and self.failure is None:
                 self.failure = f"the disk is too slow: {self._waiting} samples wait to be written to {self.path.name}"
-        self._queue.put((wal.DATA, block))
+        self._put(wal.DATA, block)
+
+    @property
+    def waiting_s(self) -> float:
+        """How long the oldest frame has waited for the disk."""
+        try:
+            return time.monotonic() - self._since[0]
+        except IndexError:
+            return 0.0
 
     @property
     def waiting(self) -> int:
@@ -59,36 +74,45 @@ class Recorder:
     def flush(self, timeout: float = 60.0) -> None:
         """Wait until all that was queued is written (or has failed)."""
         done = threading.Event()
-        self._queue.put((b"", done))
+        self._put(b"", done)
         done.wait(timeout)
 
-    def close(self) -> None:
-        """Write the rest, force it to the disk, and stop the thread."""
+    def close(self, timeout: float = 5.0) -> None:
+        """Write the rest, force it to the disk, and stop the thread; a disk that answers no more is left behind."""
         self._queue.put(None)
-        self._thread.join()
+        self._thread.join(timeout)
+        self.hangs = self._thread.is_alive()
+        if self.hangs:
+            self.failure = self.failure or f"the disk does not answer: {self.path.name} is not whole"
 
     def _work(self) -> None:
-        synced = time.monotonic()
+        self._synced = time.monotonic()
         while (item := self._queue.get()) is not None:
-            tag, value = item
-            if tag == b"":
-                value.set()
-                continue
-            try:
-                if self.failure is None or tag != wal.DATA:
-                    self._log.write(tag, wal.pack_block(value) if tag == wal.DATA else wal.pack_json(value))
-                    if time.monotonic() - synced > SYNC_S:
-                        self._log.sync()
-                        synced = time.monotonic()
-            except OSError as error:
-                self.failure = self.failure or f"{self.path.name} cannot be written: {error.strerror or error}"
-                if tag != wal.DATA:
-                    self.unwritten.append((tag, value))
-            if tag == wal.DATA:
-                with self._lock:
-                    self._waiting -= len(value)
+            self._write(*item)
+            self._since.popleft()
         try:
             self._log.sync()
         except OSError as error:
-            self.failure = self.failure or f"{self.path.name} cannot be written: {error.strerror or error}"
+            self._fail(error)
         self._log.close()
+
+    def _write(self, tag: bytes, value: Any) -> None:
+        if tag == b"":
+            value.set()
+            return
+        try:
+            if self.failure is None or tag != wal.DATA:
+                self._log.write(tag, wal.pack_block(value) if tag == wal.DATA else wal.pack_json(value))
+                if time.monotonic() - self._synced > SYNC_S:
+                    self._log.sync()
+                    self._synced = time.monotonic()
+        except OSError as error:
+            self._fail(error)
+            if tag != wal.DATA:
+                self.unwritten.append((tag, value))
+        if tag == wal.DATA:
+            with self._lock:
+                self._waiting -= len(value)
+
+    def _fail(self, error: OSError) -> None:
+        self.failure = self.failure or f"{self.path.name} cannot be written: {error.strerror or error}"

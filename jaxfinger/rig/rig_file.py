@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.rig import backends, contract
-from jaxfinger.rig.channels import NOISY, UNITS, Channel, Limits, RigDescription
+from jaxfinger.rig.channels import NOISY, UNITS, Channel, Deadlines, HardLimits, Limits, RigDescription
 from jaxfinger.rig.finger_file import read_finger
 from jaxfinger.rig.toml_file import Table, parse_toml, read_toml
 
@@ -42,15 +42,24 @@ def _rig(file: Table) -> RigDescription:
                 "rotation", "'rotation' must be a rotation matrix (9 numbers, row by row, sensor to base frame)."
             )
         sensor.finish()
+    limits = _limits(file, finger, {c.kind for c in channels})
     description = RigDescription(
         name=head.text_of("name"),
         backend=backend,
         specimen=head.text_of("specimen"),
         finger=finger,
         channels=channels,
-        limits=_limits(file, finger, {c.kind for c in channels}),
+        limits=limits,
+        hard=_hard_limits(file, limits),
+        deadlines=Deadlines(
+            stale_s=head.number("stale_s", 0.2, 0.01, 60.0, "s"),
+            lag_s=head.number("lag_s", 0.25, 0.01, 60.0, "s"),
+            thread_s=head.number("thread_s", 0.2, 0.05, 60.0, "s"),
+            disk_s=head.number("disk_s", 1.0, 0.1, 60.0, "s"),  # fdatasync took up to 0.29 s on a busy disk
+            clock_offset_s=head.number("clock_offset_s", 0.1, 0.001, 60.0, "s"),
+            clock_rate=head.number("clock_rate", 1e-3, 1e-6, 0.1),  # quartz and network time are good to 5e-4
+        ),
         rate_hz=head.number("rate_hz", 1000.0, 1.0, 20000.0, "Hz"),
-        stale_s=head.number("stale_s", 0.2, 0.01, 60.0, "s"),
         poll_s=head.number("poll_s", 0.05, 0.001, 1.0, "s"),
         address=address,
         sensor_rotation=rotation,
@@ -162,3 +171,21 @@ def _limits(file: Table, finger: FingerDescription, kinds: set[str]) -> Limits:
         table.fail("joint_margin_deg", "'joint_margin_deg' leaves no range between the joint limits.")
     table.finish()
     return limits
+
+
+def _hard_limits(file: Table, limits: Limits) -> HardLimits:
+    """`[controller]`: where a key is missing, twice the host's own limit, and a heartbeat of 0.25 s."""
+    if (table := file.table("controller", required=False)) is None:
+        table = Table(file.path, file.text, {}, "controller")
+    unit = np.pi / 180
+    hard = HardLimits(
+        tension_max=table.number("tension_max", 2 * limits.tension_max, low=0.1, unit="N"),
+        tension_rate_max=table.number("tension_rate_max", 2 * limits.tension_rate_max, low=1.0, unit="N/s"),
+        joint_velocity_max=unit
+        * table.number("joint_velocity_max_deg_s", 2 * limits.joint_velocity_max / unit, low=1.0, unit="deg/s"),
+        joint_torque_max=table.number("joint_torque_max", 2 * limits.joint_torque_max, low=1e-3, unit="N m"),
+        fingertip_force_max=table.number("fingertip_force_max", 2 * limits.fingertip_force_max, low=0.1, unit="N"),
+        heartbeat_s=table.number("heartbeat_s", 0.25, 0.02, 60.0, "s"),
+    )
+    table.finish()
+    return hard

@@ -5,9 +5,12 @@ A subclass only says how bytes of a symbol are read and written: over ADS, or in
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from abc import abstractmethod
+from enum import IntEnum
+from typing import TypeVar
 
 import numpy as np
 
@@ -21,18 +24,22 @@ from jaxfinger.rig.backend import (
     ControllerRestarted,
     Hold,
     JointMove,
+    Look,
     Rig,
+    RigError,
     Setup,
-    StaleRig,
     Status,
     TensionRamp,
 )
 from jaxfinger.rig.channels import Filter, RigDescription
-from jaxfinger.rig.contract import Kind, Mode, Refusal, State, Trip
+from jaxfinger.rig.contract import Kind, Mode, State, Trip
 from jaxfinger.rig.safety import admit
 
 MARGIN = 64  # records that the controller may overwrite while a block is on its way
 LARGEST = 100  # records in one request: 50 KiB keep the controller's task short
+STOP_S = 0.05  # that a STOP waits for a command under way, which it then overwrites
+LOAD = "load the program of docs/plc-contract.md"
+Code = TypeVar("Code", bound=IntEnum)
 
 
 class RingRig(Rig):
@@ -46,7 +53,7 @@ class RingRig(Rig):
         self.ring = contract.RING
         self.boot = 0
         self._id = 0
-        self._sending = threading.Lock()  # runner and reader may both command
+        self._sending = threading.Lock()  # runner, reader and watch may command
         self._beat = 0
         self._program = ""
 
@@ -60,12 +67,12 @@ class RingRig(Rig):
         """`size` bytes of a symbol from `offset` on."""
 
     @abstractmethod
-    def _write(self, symbol: str, data: bytes) -> None:
-        """Write a symbol whole."""
+    def _write(self, symbol: str, data: bytes, mend: bool = True) -> None:
+        """Write a symbol whole; only where `mend` is true, a broken way is mended first."""
 
     @abstractmethod
-    def _wait(self, seconds: float) -> None:
-        """Let time pass on the controller."""
+    def _sizes(self) -> dict[str, int]:
+        """Size in bytes of every symbol that the controller has."""
 
     def _has_bench(self) -> bool:
         """Whether the controller is a stand-in that has its own operator."""
@@ -74,6 +81,7 @@ class RingRig(Rig):
     # connect ----------------------------------------------------------------------------------------------------
     def connect(self) -> None:
         self._open()
+        self._compare_sizes()
         info = self._record("stInfo", contract.INFO)
         for what, found, wanted in (
             ("contract version", int(info["version"]), contract.VERSION),
@@ -81,10 +89,7 @@ class RingRig(Rig):
             ("number of values in ST_Sample", int(info["values"]), contract.VALUES),
         ):
             if found != wanted:
-                raise UserError(
-                    f"the controller's {what} is {found}, the adapter's is {wanted}; "
-                    "load the program of docs/plc-contract.md."
-                )
+                raise UserError(f"the controller's {what} is {found}, the adapter's is {wanted}; {LOAD}.")
         cycle = 1e9 / self.description.rate_hz
         if abs(int(info["cycle_ns"]) - cycle) > 1e-3 * cycle:
             self.description.fail(
@@ -94,48 +99,76 @@ class RingRig(Rig):
                 f"{self.description.rate_hz:g}; mend 'rate_hz' or the task's cycle.",
             )
         self.ring, self._program = int(info["ring_length"]), bytes(info["program"]).decode(errors="replace")
+        least = math.ceil(self.description.deadlines.lag_s * self.description.rate_hz) + MARGIN + LARGEST
+        if self.ring < least:
+            raise UserError(
+                f"the controller's ring holds {self.ring} samples, but a host that may lag by "
+                f"{self.description.deadlines.lag_s:g} s needs {least}; {LOAD}."
+            )
         self._compare_limits()
+        if self._has_bench():
+            self.simulated_time = type(self).simulated_time or bool(self._record("stBench", contract.BENCH)["lockstep"])
+        self.status()  # refuses what the contract does not know
         status = self._status()
         self.boot, self.next_seq, self._id = int(status["boot"]), int(status["head"]), int(status["acknowledged"])
+        self.look = None
+
+    def _compare_sizes(self) -> None:
+        """SIZEOF of all that the contract lists: where one differs, fields lie elsewhere than the host thinks."""
+        sizes = self._sizes()
+        for symbol, (dtype, count) in contract.SYMBOLS.items():
+            size = sizes.get(symbol, 0)
+            fits = size % dtype.itemsize == 0 if symbol == "aRing" else size == dtype.itemsize * count
+            if not fits and not (symbol == "stBench" and symbol not in sizes):
+                wanted = f"a multiple of {dtype.itemsize}" if symbol == "aRing" else f"{dtype.itemsize * count}"
+                raise UserError(
+                    f"{contract.PREFIX}{symbol} has {size} bytes on the controller, the contract has {wanted}; {LOAD}."
+                )
+        (length,) = np.frombuffer(self._read("stInfo", 0, contract.INFO.itemsize), contract.INFO)["ring_length"]
+        if (held := sizes["aRing"] // contract.SAMPLE.itemsize) != length:
+            raise UserError(f"the controller's ring holds {held} samples, but stInfo says {length}; {LOAD}.")
 
     def _compare_limits(self) -> None:
-        hard, soft = self._record("stLimits", contract.LIMITS), self.description.limits
+        """Host and controller share these limits: the host's is never the looser one, the controller's not by far."""
+        found, soft, hard = self._record("stLimits", contract.LIMITS), self.description.limits, self.description.hard
         for name, suffix, unit in (  # rig files give velocities in degrees
             ("tension_max", "", 1.0),
             ("tension_rate_max", "", 1.0),
             ("joint_velocity_max", "_deg_s", 180 / np.pi),
             ("joint_torque_max", "", 1.0),
             ("fingertip_force_max", "", 1.0),
+            ("heartbeat_s", "", 1.0),
         ):
-            allowed, wanted = float(hard[name]), getattr(soft, name)
-            if not allowed >= wanted - 1e-9:
-                key = f"{name}{suffix}"
-                looser = f"'{key}' = {wanted * unit:g} is looser than the controller's {allowed * unit:g}; lower it."
+            key, theirs, most = f"{name}{suffix}", float(found[name]), getattr(hard, name)
+            ours = getattr(soft, name, 0.0)
+            if not theirs >= ours - 1e-9:
+                looser = f"'{key}' = {ours * unit:g} is looser than the controller's {theirs * unit:g}; lower it."
                 self.description.fail("limits", key, looser)
+            if not 0 < theirs <= most + 1e-9:
+                looser = f"'{key}' may be {most * unit:g} on the controller, which runs {theirs * unit:g}"
+                self.description.fail("controller", key, f"{looser}; mend stLimits there, or say here that it may.")
 
     # samples ----------------------------------------------------------------------------------------------------
-    def read_block(self, timeout: float) -> Block:
-        deadline = time.monotonic() + timeout
-        while True:
-            self._beat += 1
-            self._write("nHostBeat", np.uint64(self._beat).tobytes())
-            head = self._head()
-            if head > self.next_seq:
-                return self._pull(head)
-            if time.monotonic() > deadline:
-                raise StaleRig(
-                    f"the controller answers but wrote no sample for {timeout:g} s; see whether its task runs."
-                )
-            self._wait(self.description.poll_s)
+    def beat(self) -> None:
+        self._beat += 1
+        self._write("nHostBeat", np.uint64(self._beat).tobytes(), mend=False)
+
+    def poll(self) -> Block | None:
+        if self.look is None or self.look.head <= self.next_seq:
+            self._head()
+        assert self.look is not None
+        return self._pull(self.look.head) if self.look.head > self.next_seq else None
 
     def _head(self) -> int:
         """Samples that the controller has written, if it is still the same run of its program."""
+        asked = time.monotonic()
         status = self._status()
-        if int(status["boot"]) != self.boot or int(status["head"]) < self.next_seq:
+        self.look = Look(asked, time.monotonic(), int(status["head"]))
+        if int(status["boot"]) != self.boot or self.look.head < self.next_seq:
             raise ControllerRestarted(
                 "the controller's program was restarted, so this recording cannot go on; start again with --resume."
             )
-        return int(status["head"])
+        return self.look.head
 
     def _pull(self, head: int) -> Block:
         lost = 0
@@ -165,7 +198,7 @@ class RingRig(Rig):
         )
 
     def rewind(self, seq: int) -> None:
-        self.next_seq = min(seq, int(self._status()["head"]))
+        self.next_seq, self.look = min(seq, int(self._status()["head"])), None
 
     # commands ---------------------------------------------------------------------------------------------------
     def command(self, command: Command) -> int:
@@ -201,28 +234,39 @@ class RingRig(Rig):
         return self._send(Kind.RESET)
 
     def _send(self, kind: Kind, index: int = 0, rate: float = 0.0, acceleration: float = 0.0, target=None) -> int:
-        with self._sending:
+        """Send a command and wait for its acknowledgement; a STOP waits for no other command."""
+        patience = time.monotonic() + (STOP_S if kind is Kind.STOP else self.answer_s)
+        while not (mine := self._sending.acquire(timeout=0.02)) and time.monotonic() < patience:
+            self.alive()
+        try:
             return self._send_alone(kind, index, rate, acceleration, target)
+        finally:
+            if mine:
+                self._sending.release()
 
     def _send_alone(self, kind: Kind, index: int, rate: float, acceleration: float, target) -> int:
-        self._id += 1
+        self._id = number = (self._id + 1) % 2**32
         order = np.zeros((), contract.COMMAND)
-        order["id"], order["kind"], order["index"] = self._id, kind, index
+        order["id"], order["kind"], order["index"] = number, kind, index
         order["rate"], order["acceleration"] = rate, acceleration
         order["target"] = np.nan if target is None else target
         self._write("stCommand", order.tobytes())
         deadline = time.monotonic() + self.answer_s
-        while int((status := self._status())["acknowledged"]) != self._id:
+        while int((status := self._status())["acknowledged"]) != number:
+            self.alive()
+            if self._id != number and kind is not Kind.STOP:
+                raise CommandRefused(f"{kind.name} gave way to a stop.")
             if time.monotonic() > deadline:
                 if kind not in (Kind.RELEASE, Kind.STOP, Kind.DISARM):  # must not take effect when nobody expects it
                     order["kind"] = Kind.NONE
                     self._write("stCommand", order.tobytes())
                 raise ConnectionLost(f"the controller did not acknowledge {kind.name} within {self.answer_s:g} s.")
-            self._wait(0.002)
+            self._pause(0.002)
         if reason := int(status["refused"]):
-            why = {1: f"not in state {State(int(status['state'])).name}", 2: "beyond its limits", 3: "unknown to it"}
-            raise CommandRefused(f"the controller refused {kind.name}: {why.get(reason, Refusal(reason).name)}.")
-        return self._id
+            state = _known(State, int(status["state"]), "state").name
+            why = {1: f"not in state {state}", 2: "beyond its limits", 3: "unknown to it"}
+            raise CommandRefused(f"the controller refused {kind.name}: {why.get(reason, f'reason {reason}')}.")
+        return number
 
     # states -----------------------------------------------------------------------------------------------------
     def _record(self, symbol: str, dtype: np.dtype) -> np.void:
@@ -237,8 +281,8 @@ class RingRig(Rig):
         channel = next((c for c in self.description.channels if c.slot == slot), None)
         value = float(record["trip_value"])
         return Status(
-            state=State(int(record["state"])),
-            trip=Trip(int(record["trip"])),
+            state=_known(State, int(record["state"]), "state"),
+            trip=_known(Trip, int(record["trip"]), "trip"),
             trip_seq=int(record["trip_seq"]),
             trip_value=(value * channel.scale + channel.offset) * channel.factor if channel else value,
             trip_channel=channel.name if channel else "",
@@ -249,7 +293,7 @@ class RingRig(Rig):
     def filters(self) -> dict[str, Filter]:
         table = np.frombuffer(self._read("aFilter", 0, contract.FILTER.itemsize * contract.VALUES), contract.FILTER)
         return {
-            c.name: Filter(bool(row["enabled"]), int(row["setting"]), float(row["bandwidth"]) or None)
+            c.name: Filter(bool(row["enabled"]), int(row["setting"]), _bandwidth(float(row["bandwidth"])))
             for c in self.description.channels
             for row in [table[c.slot]]
         }
@@ -271,10 +315,10 @@ class RingRig(Rig):
         self._order(order)
         return True
 
-    def inject(self, fault: str, slot: int = 0, after: int = 0, amount: float = 60.0) -> None:
+    def inject(self, fault: str, slot: int = 0, after: int = 0, amount: float = math.nan) -> None:
         """Let the stand-in fail: `fault` of contract.FAULTS, from `after` samples from now on. For tests and drills.
 
-        `amount` is what a spike adds to the slot's raw value.
+        What `amount` means, and what it is where none is given, `simulated.faults` says.
         """
         order = np.zeros((), contract.BENCH)
         order["fault"], order["fault_slot"] = contract.FAULTS.index(fault), slot
@@ -282,5 +326,18 @@ class RingRig(Rig):
         self._order(order)
 
     def _order(self, order: np.ndarray) -> None:
-        order["id"] = self._record("stBench", contract.BENCH)["id"] + 1
+        present = self._record("stBench", contract.BENCH)
+        order["id"], order["lockstep"] = present["id"] + 1, present["lockstep"]
         self._write("stBench", order.tobytes())
+
+
+def _known(codes: type[Code], code: int, what: str) -> Code:
+    """A code of the contract; raises RigError for any other."""
+    try:
+        return codes(code)
+    except ValueError:
+        raise RigError(f"the controller's {what} is {code}, which the contract does not know; {LOAD}.") from None
+
+
+def _bandwidth(hertz: float) -> float | None:
+    return hertz if 0 < hertz < math.inf else None

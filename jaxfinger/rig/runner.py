@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -14,7 +15,6 @@ from jaxfinger.errors import UserError
 from jaxfinger.rig import convert, wal
 from jaxfinger.rig.backend import (
     Block,
-    CommandRefused,
     Hold,
     JointMove,
     Rig,
@@ -26,13 +26,18 @@ from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.operator import Nobody, Operator
 from jaxfinger.rig.plan import Plan, PlannedTrial
 from jaxfinger.rig.protocols import DYNAMIC, Covered, Dwell, Mark, Protocol, Reached, Settled, Start, Tare
-from jaxfinger.rig.reader import Reader
+from jaxfinger.rig.reader import Reader, tripped
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.recover import read_log
-from jaxfinger.rig.safety import PERSIST, Supervisor, Violation
+from jaxfinger.rig.safety import Supervisor, Violation
+from jaxfinger.rig.trips import PERSIST
+from jaxfinger.rig.watch import Watch
 
-AFTER_TRIP_S = 1.0  # device time that is still recorded after a trip
-LET_GO_S = 1.0  # device time in which the controller has released all tension
+AFTER_TRIP_S = 1.0  # that is still recorded after a trip, and in which the controller has released all tension
+QUIET_S = 0.3  # without a fault before anything is armed: a clock that runs wrong shows within 0.1 s
+PATIENCE_S = 5.0  # of the host for that
+SLACK_S = 5.0  # that a wait of known length may take longer
+HELD = "tension was not seen to fall, so switch the drives off and see that it is off"
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,7 @@ class View:
     block: Block | None
     lost: int
     recording: bool
+    lag_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -91,6 +97,7 @@ class Runner:
 
     def __init__(self, rig: Rig, reader: Reader, operator: Operator, observe: Callable[[View], None] | None = None):
         self.rig, self.reader, self.operator = rig, reader, operator
+        self.watch = Watch(rig, reader, operator)
         self.observe = observe or (lambda view: None)
         self.tare: dict[str, float] = {}
         self.t0: int | None = None
@@ -118,28 +125,93 @@ class Runner:
             self.reader.end({"complete": True})
             return ""
         except UserError as error:
-            return self._ended(error)
+            return self.ended(error)
         except KeyboardInterrupt:
             return self.interrupted()
 
     def interrupted(self) -> str:
         """Stop the rig after Ctrl-C; returns why the run ended."""
         self.reader.stop(Violation(Trip.OPERATOR, "interrupt", self.reader.latest_seq, float("nan")))
-        return self._ended(TrialEnded("the run was interrupted", Trip.OPERATOR))
+        return self.ended(TrialEnded("the run was interrupted", Trip.OPERATOR))
 
-    def _ended(self, error: UserError) -> str:
-        trip = error.trip if isinstance(error, TrialEnded) else Trip.HOST
-        seq = error.seq if isinstance(error, TrialEnded) else None
-        if not isinstance(error, TrialEnded) and self.reader.violation is None and self.reader.error is None:
-            self.reader.stop(Violation(Trip.HOST, "host", self.reader.latest_seq, float("nan")))
-        until = self.reader.latest_t + int(AFTER_TRIP_S * 1e9)
-        while self.reader.error is None and self.reader.latest_t < until and not isinstance(error, CommandRefused):
-            if self.reader.next(1.0) is None:
-                break
-        if self.reader.recording:
+    def ended(self, error: UserError) -> str:
+        """Let go, record what follows, close the trial; returns why it ended."""
+        reader = self.reader
+        trip, seq = (error.trip, error.seq) if isinstance(error, TrialEnded) else (Trip.HOST, None)
+        if not tripped(reader.latest):
+            reader.stop(Violation(trip, "host", reader.latest_seq, float("nan")))
+        self._pass(AFTER_TRIP_S)
+        cause = str(error).rstrip(".")
+        if reader.latest is not None and not (tripped(reader.latest) or int(reader.latest.state[-1]) == State.IDLE):
+            cause = f"{cause}; {HELD}"
+        if reader.recording:
             place = {} if seq is None else {"seq": seq}
-            self.reader.end({"complete": False, "cause": str(error), "trip": int(trip), **place})
-        return str(error)
+            reader.end({"complete": False, "cause": cause, "trip": int(trip), **place})
+        return cause
+
+    def ready(self, name: str) -> None:
+        """Let go what an earlier host left loaded, clear a latched stop with the operator's consent, and arm.
+
+        Raises UserError where anything is wrong before that; then nothing was armed.
+        """
+        rig, status = self.rig, self.rig.status()
+        if status.state in (State.ARMED, State.MOVING):
+            rig.release()
+        if status.state is State.TRIPPED and not rig.prepare(Setup("")):
+            self._ask(f"The controller is stopped: {status.cause}. See that finger and hands are safe.")
+        if status.state is not State.IDLE:
+            self._pass(AFTER_TRIP_S)
+        if status.state is State.TRIPPED:
+            rig.reset(name or "operator")
+        if not rig.prepare(Setup("", fixed=dict.fromkeys(rig.description.finger.joint_names, 0.0))):
+            self._ask("Hands off: the drives are about to be switched on.")
+        latest = time.monotonic() + PATIENCE_S
+        while not self.reader.quiet(round(QUIET_S * rig.description.rate_hz)):
+            self.reader.next()
+            self._look(None)
+            if time.monotonic() > latest:
+                trouble = self.reader.trouble
+                what = trouble.sentence if trouble is not None else "too few samples came"
+                raise UserError(f"nothing was armed: {what}.")
+        self.watch.guard()
+        rig.arm()
+
+    def let_go(self) -> str:
+        """Release the finger after the last trial; returns what went wrong."""
+        try:
+            self.rig.release()
+            self._pass(
+                AFTER_TRIP_S, lambda: self.rig.status().state not in (State.ARMED, State.MOVING, State.RELEASING)
+            )
+        except UserError as error:
+            return self.ended(error)
+        return ""
+
+    def _pass(self, seconds: float, done: Callable[[], bool] = lambda: False) -> None:
+        """Let so much time pass, by samples and by the host's clock, or less where it is done."""
+        reader, rate = self.reader, self.rig.description.rate_hz
+        latest = time.monotonic() + self._longest(seconds)
+        start: int | None = None
+        while reader.error is None and time.monotonic() < latest and not done():
+            self.rig.alive()
+            reader.next()
+            start = reader.latest_seq if start is None and reader.latest_seq >= 0 else start
+            if start is not None and reader.latest_seq - start >= seconds * rate:
+                break
+
+    def _longest(self, seconds: float) -> float:
+        """On the host's clock, for something that may take so long on the controller's."""
+        if self.rig.simulated_time:  # a simulation may be slow
+            return 60.0 + 10.0 * seconds
+        return 0.5 + (1.0 + self.rig.description.deadlines.clock_rate) * seconds
+
+    def _ask(self, text: str) -> None:
+        def alive() -> bool:
+            self.rig.alive()
+            return self.reader.error is None and self.reader.violation is None
+
+        self.operator.ask(text, alive)
+        self._look(None)
 
     def carry_out(self, protocol: Protocol) -> None:
         """Carry out the steps of a protocol."""
@@ -158,7 +230,7 @@ class Runner:
             elif isinstance(step, Reached):
                 self._wait("moving", lambda b: _reached(b, self._id), step.timeout)
             elif isinstance(step, Dwell):
-                self._wait("waiting", _Elapsed(self.reader, step.seconds), step.seconds + 60.0)
+                self._wait("waiting", _Elapsed(self.reader, step.seconds), step.seconds + SLACK_S)
             elif isinstance(step, Settled):
                 self._wait("tensions settling", _Steady(self.rig.description, step), step.timeout)
             else:
@@ -182,8 +254,7 @@ class Runner:
     def _prepare(self, setup: Setup) -> None:
         self._setup = setup
         if not self.rig.prepare(setup):
-            self.operator.ask(setup.text, lambda: self.reader.error is None and self.reader.violation is None)
-            self._check(None)
+            self._ask(setup.text)
             return
         self._wait("finger being prepared", _AtPose(self.rig.description, setup), 60.0)
 
@@ -197,7 +268,7 @@ class Runner:
             rows.append(block.x[:, columns])
             return elapsed(block)
 
-        self._wait("taring", enough, step.seconds + 60.0)
+        self._wait("taring", enough, step.seconds + SLACK_S)
         values = np.concatenate(rows)
         tops = {"external_torque": rig.limits.joint_torque_max, "fingertip_force": rig.limits.fingertip_force_max}
         for i, mean, spread in zip(columns, values.mean(0), values.std(0), strict=True):
@@ -211,29 +282,32 @@ class Runner:
 
     # waiting ----------------------------------------------------------------------------------------------------
     def _wait(self, doing: str, done: Callable[[Block], bool], timeout: float) -> None:
+        """Wait for blocks until it is done; ends on the device's clock and on the host's, and at the stop key."""
         self.reader.forget()
-        start = self.reader.latest_t
+        start, latest = self.reader.latest_t, time.monotonic() + self._longest(timeout)
         while True:
             block = self.reader.next()
-            self._check(block)
-            if block is None:
-                continue
-            self.observe(View(*self._place, doing, block, self.reader.lost, self.reader.recording))
-            if done(block):
-                return
-            if (int(block.t_ns[-1]) - start) * 1e-9 > timeout:
+            self._look(block)
+            if block is not None:
+                self.observe(
+                    View(*self._place, doing, block, self.reader.lost, self.reader.recording, self.reader.lag_s)
+                )
+                if done(block):
+                    return
+            if time.monotonic() > latest or (block is not None and (int(block.t_ns[-1]) - start) * 1e-9 > timeout):
                 raise TrialEnded(f"{doing} took longer than {timeout:g} s", Trip.HOST)
 
-    def _check(self, block: Block | None) -> None:
-        """Raise TrialEnded where the run must end."""
+    def _look(self, block: Block | None) -> None:
+        """A sign of life; raises TrialEnded where the run must end."""
         reader = self.reader
-        if self.operator.stop_requested():
-            reader.stop(Violation(Trip.OPERATOR, "stop key", reader.latest_seq, float("nan")))
+        self.rig.alive()
+        if self.rig.synchronous:
+            self.watch.look()
         if reader.violation is not None:
-            trip, seq = reader.violation.trip, reader.violation.seq
-            cause = self.reader.recorder.failure if trip is Trip.RECORDER else None
-            raise TrialEnded(cause or reader.violation.sentence, trip, seq - PERSIST + 1)
-        if block is not None and int(block.state[-1]) == State.TRIPPED:
+            trip, since = reader.violation.trip, reader.violation.since
+            cause = reader.recorder.failure if trip is Trip.RECORDER else None
+            raise TrialEnded(cause or reader.violation.sentence, trip, since)
+        if tripped(block):
             status = self.rig.status()
             reader.note("trip", status.cause)
             raise TrialEnded(f"the controller stopped: {status.cause}", status.trip, status.trip_seq - PERSIST + 1)
@@ -328,8 +402,17 @@ def run(
             if log is not None:
                 _backlog(log, rig, recorder)
             cause = _trials(plan, rig, recorder, operator, observe, log)
-        finally:
+        except UserError:
             recorder.close()
+            if log is None:  # nothing moved, so there is nothing to resume
+                path.unlink(missing_ok=True)
+            raise
+        except BaseException:
+            recorder.close()
+            raise
+    recorder.close()
+    if recorder.hangs:
+        return Outcome(output, (), cause or recorder.failure or "", path)
     cause = cause or recorder.failure or ""
     log = read_log(path)
     for tag, value in recorder.unwritten:
@@ -377,7 +460,7 @@ def _backlog(log: convert.Log, rig: Rig, recorder: Recorder) -> None:
         until = status.trip_seq if status.state is State.TRIPPED else status.head
         rig.rewind(last + 1)
         while last < until - 1:
-            block = rig.read_block(rig.description.stale_s)
+            block = rig.read_block(rig.description.deadlines.stale_s)
             recorder.block(block)
             last = int(block.seq[-1])
         end["seq"] = max(until, log.last_seq + 1) if log.last_seq is not None else until
@@ -407,15 +490,16 @@ def _trials(plan, rig: Rig, recorder: Recorder, operator: Operator, observe, log
     reader = Reader(rig, recorder, Supervisor(rig.description))
     runner = Runner(rig, reader, operator, observe)
     try:
-        _ready(plan, rig, operator)
-        reader.start()
-        while reader.latest is None and reader.error is None:
-            reader.next(1.0)
-        runner._place = ("reference", 0, len(plan.trials))
+        runner.watch.start()
+        reader.start(lambda: runner.watch.join("reader"))
         try:
+            runner.ready(plan.operator)
+            runner._place = ("reference", 0, len(plan.trials))
             runner.carry_out(_reference(rig.description))
         except UserError as error:
-            return runner._ended(error)
+            if not runner.watch.guards and not isinstance(error, TrialEnded):
+                raise  # before anything was armed
+            return runner.ended(error)
         for trial in left:
             name, again = trial.name, 1
             while name in names:
@@ -423,33 +507,9 @@ def _trials(plan, rig: Rig, recorder: Recorder, operator: Operator, observe, log
                 name = f"{trial.name}-{again}"
             if cause := runner.trial(trial, name, plan.trials.index(trial) + 1, len(plan.trials), begun):
                 return f"{name}: {cause}"
-        return ""
+        return runner.let_go()
     except KeyboardInterrupt:
         return runner.interrupted()
     finally:
+        runner.watch.close()
         reader.close()
-
-
-def _ready(plan: Plan, rig: Rig, operator: Operator) -> None:
-    """Let go what an earlier host left loaded, clear a latched stop with the operator's consent, and arm."""
-    status = rig.status()
-    if status.state in (State.ARMED, State.MOVING):
-        rig.release()
-    if status.state is State.TRIPPED and not rig.prepare(Setup("")):
-        operator.ask(f"The controller is stopped: {status.cause}. See that finger and hands are safe.", lambda: True)
-    if status.state is not State.IDLE:
-        _pass(rig, LET_GO_S)
-    if status.state is State.TRIPPED:
-        rig.reset(plan.operator or "operator")
-    if not rig.prepare(Setup("", fixed=dict.fromkeys(rig.description.finger.joint_names, 0.0))):
-        operator.ask("Hands off: the drives are about to be switched on.", lambda: True)
-    if not operator.stop_requested():
-        rig.arm()
-
-
-def _pass(rig: Rig, seconds: float) -> None:
-    """Let so much device time pass."""
-    start = None
-    while start is None or (int(block.t_ns[-1]) - start) * 1e-9 < seconds:
-        block = rig.read_block(rig.description.stale_s)
-        start = int(block.t_ns[0]) if start is None else start

@@ -12,21 +12,27 @@ import numpy as np
 from jaxfinger.rig.backend import Block, Command, CommandRefused, JointMove, TensionRamp
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.contract import Flag, State, Trip
+from jaxfinger.rig.trips import Count, Drift, Driven, Excursion, Run
 
-PERSIST = 3  # consecutive samples: one odd sample must not drop the finger
 VELOCITY_SPAN = 20  # samples over which host-side velocity and tension rate are taken: encoder steps must not trip
-UNEXPLAINED = 1.5e-3  # m of tendon excursion while no joint encoder moves
-STILL = 0.02  # rad, an encoder that counts as not moving
 
 
 @dataclass(frozen=True)
 class Violation:
-    """A limit that was broken: which, by which channel, at which sample, with what value (SI)."""
+    """A limit that was broken: which, by which channel, at which sample, with what value (SI).
+
+    From sample `since` on samples are not to be trusted.
+    """
 
     trip: Trip
     channel: str
     seq: int
     value: float
+    since: int = -1
+
+    def __post_init__(self):
+        if self.since < 0:
+            object.__setattr__(self, "since", max(self.seq, 0))
 
     @property
     def sentence(self) -> str:
@@ -67,192 +73,178 @@ class Supervisor:
 
     def __init__(self, rig: RigDescription):
         self.rig = rig
-        finger, n = rig.finger, len(rig.channels)
+        finger, limits, n = rig.finger, rig.limits, len(rig.channels)
         kind = np.array([c.kind for c in rig.channels])
         self._tension = np.flatnonzero(kind == "tension")
-        self._excursion = np.flatnonzero(kind == "excursion")
         self._angle = np.array(rig.columns("joint_position", finger.joint_names))
         self._high = np.full(n, np.inf)
         self._low = np.full(n, -np.inf)
-        self._high[self._tension] = rig.limits.tension_max
-        self._high[kind == "external_torque"] = rig.limits.joint_torque_max
-        self._high[kind == "fingertip_force"] = rig.limits.fingertip_force_max
-        self._high[kind == "motor_temperature"] = rig.limits.temperature_max
+        self._high[self._tension] = limits.tension_max
+        self._high[kind == "external_torque"] = limits.joint_torque_max
+        self._high[kind == "fingertip_force"] = limits.fingertip_force_max
+        self._high[kind == "motor_temperature"] = limits.temperature_max
         symmetric = (kind == "external_torque") | (kind == "fingertip_force")
         self._low[symmetric] = -self._high[symmetric]
         self._high[self._angle] = finger.limits[:, 1]
         self._low[self._angle] = finger.limits[:, 0]
-        self._partner = [rig.index("tension", rig.channels[int(i)].of) for i in self._excursion]
-        self._setpoint = np.flatnonzero(kind == "tension_setpoint")
-        self._follower = np.array(rig.columns("tension", (rig.channels[int(i)].of for i in self._setpoint)), int)
         self._trip = [_TRIPS[k] for k in kind]
         self._patience = np.array([c.frozen for c in rig.channels]) * rig.rate_hz
-        self.tripped: tuple[Violation, ...] = ()
-        self.start()
+        self._patience[self._patience == 0] = np.inf
+        # tendons whose excursion and tension are both measured
+        pairs = [(int(i), rig.index("tension", rig.channels[int(i)].of)) for i in np.flatnonzero(kind == "excursion")]
+        self._excursion = np.array([(i, j) for i, j in pairs if j is not None], int).reshape(-1, 2)
+        self._setpoint = np.flatnonzero(kind == "tension_setpoint")
+        self._follower = np.array(rig.columns("tension", (rig.channels[int(i)].of for i in self._setpoint)), int)
 
-    def start(self) -> None:
-        """Forget the past: after a reset, a restart of the controller, or a gap."""
-        n = len(self.rig.channels)
-        self._last_t: int | None = None
-        self._tail = np.empty((0, n))
-        self._run = np.zeros(n, int)  # consecutive samples out of limits
-        self._same = np.zeros(n, int)  # consecutive samples with an identical value
-        self._astray = np.zeros(len(self._setpoint), int)  # consecutive samples away from the set-point
-        self._moved: np.ndarray | None = None  # values when an encoder last moved
+        self._bad = Count(n)
+        self._flagged = Count(1)
+        self._fast = Count(len(self._angle))
+        self._steep = Count(len(self._tension))
+        astray = int(limits.tension_error_s * rig.rate_hz) + 1 if len(self._setpoint) else 1
+        self._astray = Count(len(self._setpoint), astray)
+        self._same = Run(n)
+        self._clock_drift = Drift(rig.deadlines.clock_rate)
+        self._unexplained = Excursion(len(self._excursion))
+        self._ran = Count(len(self._excursion))
+        self._driven: Driven | None = None
+        self._first: tuple[int, int] | None = None  # number and time (ns) of the first sample
+        self._before: tuple[int, int] | None = None  # of the sample before
+        self._tail = np.empty((0, n))  # the VELOCITY_SPAN samples before, and their numbers
+        self._tail_seq = np.empty(0, np.int64)
         self._last: np.ndarray | None = None
-        self._driven: tuple[int, float, float] | None = None  # channel, angle at the command, speed
-        self._driving = 0  # samples under way without the encoder moving
+        self.tripped: tuple[Violation, ...] = ()
 
     def check(self, block: Block) -> list[Violation]:
         """Violations in this block, first ones first; they also latch in `tripped`."""
         if not len(block):
             return []
-        if block.lost_before:
-            self.start()
+        seq = block.seq.astype(np.int64)
         found = [
-            *self._clock(block),
-            *self._values(block),
-            *self._frozen(block),
-            *self._rates(block),
-            *self._tracking(block),
-            *self._still(block),
+            *self._codes(block, seq),
+            *self._clock(block, seq),
+            *self._values(block, seq),
+            *self._frozen(block, seq),
+            *self._rates(block, seq),
+            *self._tracking(block, seq),
+            *self._still(block, seq),
         ]
         found.sort(key=lambda v: v.seq)
         if found and not self.tripped:
             self.tripped = tuple(found)
-        keep = np.concatenate([self._tail, block.x])
-        self._tail = keep[-VELOCITY_SPAN - PERSIST :]
+        self._tail = np.concatenate([self._tail, block.x])[-VELOCITY_SPAN:]
+        self._tail_seq = np.concatenate([self._tail_seq, seq])[-VELOCITY_SPAN:]
         self._last = block.x[-1]
         return found
 
     def _name(self, channel: int | np.intp) -> str:
         return self.rig.channels[int(channel)].name
 
-    def _clock(self, block: Block) -> list[Violation]:
-        t = block.t_ns.astype(np.int64)
-        before = np.concatenate([[self._last_t if self._last_t is not None else t[0] - 1], t[:-1]])
-        self._last_t = int(t[-1])
-        back = np.flatnonzero(t <= before)
+    def _codes(self, block: Block, seq: np.ndarray) -> list[Violation]:
+        odd = np.flatnonzero(block.state > max(State))
+        return [Violation(Trip.CONTRACT, "state", int(seq[i]), float(block.state[i])) for i in odd[:1]]
+
+    def _clock(self, block: Block, seq: np.ndarray) -> list[Violation]:
+        """The device's time never stands or runs back, and passes as its samples do."""
+        t, allowed = block.t_ns.astype(np.int64), self.rig.deadlines.clock_offset_s
+        if self._first is None:
+            self._first = int(seq[0]), int(t[0])
+            self._before = int(seq[0]) - 1, int(t[0]) - round(1e9 / self.rig.rate_hz)
+        assert self._before is not None
+        found = []
+        rows = zip(seq.tolist(), t.tolist(), strict=True)
+        for number, time in rows:
+            step, self._before = (number - self._before[0], time - self._before[1]), (number, time)
+            passed = (number - self._first[0]) / self.rig.rate_hz
+            ahead = (time - self._first[1]) * 1e-9 - passed
+            away = self._clock_drift(ahead, ahead, step[0] / self.rig.rate_hz)
+            if not found and (step[1] <= 0 or abs(away) > allowed):
+                what = "device time since the sample before, in s" if step[1] <= 0 else "device time ahead, in s"
+                found.append(Violation(Trip.CLOCK, what, number, step[1] * 1e-9 if step[1] <= 0 else away))
+        return found
+
+    def _values(self, block: Block, seq: np.ndarray) -> list[Violation]:
+        bad = ~np.isfinite(block.x) | (block.x > self._high) | (block.x < self._low)
+        found = []
+        for channel, row, since in self._bad(bad, seq):
+            value = float(block.x[row, channel])
+            trip = self._trip[channel] if np.isfinite(value) else Trip.INVALID
+            found.append(Violation(trip, self._name(channel), int(seq[row]), value, since))
+        flagged = (block.flags & int(Flag.BUS | Flag.ENCODER | Flag.ANALOG)) != 0
+        for _, row, since in self._flagged(flagged[:, None], seq):
+            value = float(block.flags[row] & 0xFFFF)
+            found.append(Violation(Trip.INVALID, "terminal flags", int(seq[row]), value, since))
+        return found
+
+    def _frozen(self, block: Block, seq: np.ndarray) -> list[Violation]:
+        last = self._last if self._last is not None else np.full(block.x.shape[1], np.nan)
+        late = self._same(block.x == np.concatenate([last[None], block.x[:-1]])) >= self._patience
+        found = []
+        for channel in np.flatnonzero(late.any(0)):
+            row = int(np.argmax(late[:, channel]))
+            value = float(block.x[row, channel])
+            found.append(Violation(Trip.FROZEN, self._name(channel), int(seq[row]), value))
+        return found
+
+    def _rates(self, block: Block, seq: np.ndarray) -> list[Violation]:
+        """Joint velocity and tension rate over VELOCITY_SPAN samples."""
+        x, number = np.concatenate([self._tail, block.x]), np.concatenate([self._tail_seq, seq])
+        rows = len(x) - VELOCITY_SPAN  # samples of this block with so many before them
+        if rows <= 0:
+            return []
+        seconds = (number[VELOCITY_SPAN:] - number[:-VELOCITY_SPAN]) / self.rig.rate_hz
+        x = np.where(np.isfinite(x), x, np.nan)
+        rate = (x[VELOCITY_SPAN:] - x[:-VELOCITY_SPAN]) / seconds[:, None]
+        limits, found = self.rig.limits, []
+        for count, channels, limit, trip in (
+            (self._fast, self._angle, limits.joint_velocity_max, Trip.VELOCITY),
+            (self._steep, self._tension, limits.tension_rate_max, Trip.TENSION_RATE),
+        ):
+            for k, row, since in count(np.abs(rate[:, channels]) > limit, seq[-rows:]):
+                value = float(rate[row, channels[k]])
+                found.append(Violation(trip, self._name(channels[k]), int(seq[len(seq) - rows + row]), value, since))
+        return found
+
+    def _tracking(self, block: Block, seq: np.ndarray) -> list[Violation]:
+        """Tensions that stay away from their set-points while the drives are on."""
+        on = np.isin(block.state, (State.ARMED, State.MOVING))
+        error = block.x[:, self._setpoint] - block.x[:, self._follower]
+        astray = on[:, None] & (np.abs(error) > self.rig.limits.tension_error_max)
         return [
-            Violation(Trip.CLOCK, "device time in s", int(block.seq[i]), float(t[i] - before[i]) * 1e-9)
-            for i in back[:1]
+            Violation(
+                Trip.TRACKING, f"set-point minus {self._name(self._follower[k])}", int(seq[row]), float(error[row, k])
+            )
+            for k, row, _ in self._astray(astray, seq)
         ]
 
-    def _values(self, block: Block) -> list[Violation]:
-        finite = np.isfinite(block.x)
-        flagged = (block.flags & int(Flag.BUS | Flag.ENCODER | Flag.ANALOG)) != 0
-        bad = ~finite | (block.x > self._high) | (block.x < self._low)
-        found = []
-        for channel in np.flatnonzero(bad.any(0) | (self._run > 0)):
-            runs = _runs(bad[:, channel], int(self._run[channel]))
-            self._run[channel] = runs[-1]
-            if (runs >= PERSIST).any():
-                at = int(np.argmax(runs >= PERSIST))
-                value = float(block.x[at, channel])
-                trip = self._trip[channel] if np.isfinite(value) else Trip.INVALID
-                found.append(Violation(trip, self._name(channel), int(block.seq[at]), value))
-        if flagged.sum() >= PERSIST:
-            at = int(np.flatnonzero(flagged)[PERSIST - 1])
-            found.append(Violation(Trip.INVALID, "terminal flags", int(block.seq[at]), float(block.flags[at] & 0xFFFF)))
-        return found
-
-    def _frozen(self, block: Block) -> list[Violation]:
-        last = self._tail[-1:] if len(self._tail) else block.x[:1] + np.nan
-        x = np.concatenate([last, block.x])
-        same = x[1:] == x[:-1]
-        found = []
-        for channel in np.flatnonzero(self._patience > 0):
-            runs = _runs(same[:, channel], int(self._same[channel]))
-            self._same[channel] = runs[-1]
-            late = runs >= self._patience[channel]
-            if late.any():
-                at = int(np.argmax(late))
-                found.append(
-                    Violation(Trip.FROZEN, self._name(channel), int(block.seq[at]), float(block.x[at, channel]))
-                )
-        return found
-
-    def _rates(self, block: Block) -> list[Violation]:
-        """Joint velocity and tension rate over VELOCITY_SPAN samples."""
-        x = np.concatenate([self._tail[-VELOCITY_SPAN:], block.x])
-        if len(x) <= VELOCITY_SPAN:
-            return []
-        x = np.where(np.isfinite(x), x, np.nan)
-        rate = (x[VELOCITY_SPAN:] - x[:-VELOCITY_SPAN]) * self.rig.rate_hz / VELOCITY_SPAN
-        seq = block.seq[len(block) - len(rate) :]
-        found = []
-        for channels, limit, trip in (
-            (self._angle, self.rig.limits.joint_velocity_max, Trip.VELOCITY),
-            (self._tension, self.rig.limits.tension_rate_max, Trip.TENSION_RATE),
-        ):
-            for channel in channels:
-                over = np.abs(rate[:, channel]) > limit
-                if over.sum() >= PERSIST:
-                    at = int(np.flatnonzero(over)[PERSIST - 1])
-                    found.append(Violation(trip, self._name(int(channel)), int(seq[at]), float(rate[at, channel])))
-        return found
-
-    def _tracking(self, block: Block) -> list[Violation]:
-        """Tensions that stay away from their set-points while the drives are on."""
-        limits, on = self.rig.limits, np.isin(block.state, (State.ARMED, State.MOVING))
-        error = block.x[:, self._setpoint] - block.x[:, self._follower]
-        found = []
-        for k, channel in enumerate(self._follower):
-            runs = _runs(on & (np.abs(error[:, k]) > limits.tension_error_max), int(self._astray[k]))
-            self._astray[k] = runs[-1]
-            late = runs > limits.tension_error_s * self.rig.rate_hz
-            if late.any():
-                at = int(np.argmax(late))
-                name = f"set-point minus {self._name(channel)}"
-                found.append(Violation(Trip.TRACKING, name, int(block.seq[at]), float(error[at, k])))
-        return found
-
-    def _still(self, block: Block) -> list[Violation]:
+    def _still(self, block: Block, seq: np.ndarray) -> list[Violation]:
         """A frozen encoder: a tendon under steady load runs, or the external motor drives, but no encoder moves."""
-        end = block.x[-1]
-        angles = end[self._angle]
-        if self._driven is not None:
-            channel, start, speed = self._driven
-            self._driving += int((block.state == State.MOVING).sum()) if abs(end[channel] - start) < STILL else 0
-            if self._driving / self.rig.rate_hz * speed > 5 * STILL:
+        found = []
+        if (driven := self._driven) is not None:
+            angle = block.x[:, driven.column]
+            if (row := driven(angle, block.state == State.MOVING)) is not None:
                 self._driven = None
-                return [Violation(Trip.FROZEN, self._name(channel), int(block.seq[-1]), float(end[channel]))]
-        moved = self._moved
-        if moved is None or np.nanmax(np.abs(angles - moved[self._angle]), initial=0.0) > STILL:
-            self._moved = end.copy()
-            return []
-        for channel, tension in zip(self._excursion, self._partner, strict=True):
-            load = block.x[:, tension] if tension is not None else np.zeros(len(block))
-            if tension is None:
-                continue
-            if load.min() < 1.0 or np.abs(load - moved[tension]).max() > 0.5:
-                moved[channel], moved[tension] = end[channel], end[tension]  # slack, or stretched by a change of load
-            elif abs(end[channel] - moved[channel]) > UNEXPLAINED:
-                run, self._moved = abs(end[channel] - moved[channel]), end.copy()
-                name = f"joint encoders, while {self._name(int(channel))} ran by m"
-                return [Violation(Trip.FROZEN, name, int(block.seq[-1]), float(run))]
-        return []
+                name = self._name(driven.column)
+                found.append(Violation(Trip.FROZEN, name, int(seq[row]), float(angle[row])))
+        channels, tensions = self._excursion.T
+        ran = self._unexplained(block.x[:, self._angle], block.x[:, channels], block.x[:, tensions])
+        for k, row, since in self._ran(ran > Excursion.UNEXPLAINED, seq):
+            name = f"joint encoders, while {self._name(channels[k])} ran by m"
+            found.append(Violation(Trip.FROZEN, name, int(seq[row]), float(ran[row, k]), since))
+        return found
 
     def commanded(self, command: Command) -> None:
         """Tell which move was commanded, so that an encoder that does not follow is found."""
         if isinstance(command, JointMove) and self._last is not None:
-            channel = self.rig.index("joint_position", command.joint)
-            if channel is not None and abs(command.target - self._last[channel]) > 5 * STILL:
-                self._driven, self._driving = (channel, float(self._last[channel]), command.speed), 0
+            column = self.rig.index("joint_position", command.joint)
+            if column is not None and abs(command.target - self._last[column]) > 5 * Excursion.STILL:
+                self._driven = Driven(column, float(self._last[column]), command.speed, self.rig.rate_hz)
         elif not isinstance(command, TensionRamp):
             self._driven = None
 
 
 def armed(block: Block) -> bool:
-    """Whether the controller holds or moves the finger anywhere in the block."""
-    return bool(np.isin(block.state, (State.ARMED, State.MOVING)).any())
-
-
-def _runs(bad: np.ndarray, before: int) -> np.ndarray:
-    """Length of the run of True that ends at each sample, continuing a run of `before`."""
-    index = np.arange(len(bad))
-    last_good = np.maximum.accumulate(np.where(~bad, index, -1))
-    return np.where(last_good >= 0, index - last_good, index + 1 + before) * bad
+    """Whether the controller holds or moves the finger anywhere in the block, or may: its state is unknown."""
+    return bool((np.isin(block.state, (State.ARMED, State.MOVING)) | (block.state > max(State))).any())
 
 
 _TRIPS = {

@@ -31,6 +31,9 @@ levels = [3.0, 6.0]
 """
 
 
+PATIENT = "[controller]\nheartbeat_s = 5.0\n"
+
+
 @pytest.fixture(scope="session")
 def rig() -> RigDescription:
     """The example rig file, read."""
@@ -50,9 +53,8 @@ def short(rig):
 
 def ads_rig(where: str, **rig) -> AdsRig:
     """An ADS rig for a stand-in at host:port, patient with a loaded machine."""
-    keys = {"stale_s": 20.0, "poll_s": 0.002, **rig}
     address = {"net_id": standin.NET_ID, "ip": where, "port": 851, "reconnect_s": 20}
-    return AdsRig(parse_rig(rig_toml("ads", address, **keys)))
+    return AdsRig(parse_rig(rig_toml("ads", address, **{"stale_s": 20.0, "poll_s": 0.002, **rig}) + PATIENT))
 
 
 @pytest.fixture

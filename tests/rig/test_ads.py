@@ -33,13 +33,13 @@ from tests.rig.conftest import ads_rig
 
 @pytest.fixture(scope="module")
 def process():
-    with standin.running(speed=1.0, heartbeat=60.0) as where:
+    with standin.running(speed=1.0, heartbeat=5.0) as where:
         yield where
 
 
 @pytest.fixture(scope="module")
 def fast_process():
-    with standin.running(speed=0, heartbeat=1e6) as where:
+    with standin.running(speed=0) as where:
         yield where
 
 

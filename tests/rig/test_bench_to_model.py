@@ -16,7 +16,7 @@ from tests.rig.conftest import ads_rig
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     path = tmp_path_factory.mktemp("bench") / "session.h5"
-    with standin.running(speed=0, heartbeat=1e6) as where:
+    with standin.running(speed=0) as where:
         rig = ads_rig(where)
         outcome = run(parse_plan(plan_toml(postures=1), rig.description), rig, path)
     assert outcome.cause == ""

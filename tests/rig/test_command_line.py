@@ -22,7 +22,7 @@ LONG = '[plan]\nname = "long"\noperator = "tester"\n[[trial]]\nexperiment = "VD.
 
 @pytest.fixture(scope="module")
 def controller():
-    with standin.running(speed=0, heartbeat=1e6) as where:
+    with standin.running(speed=0) as where:
         yield where
 
 

@@ -27,7 +27,7 @@ record(Path(sys.argv[1]), rig=Path(sys.argv[2]), output=Path(sys.argv[3]), yes=T
 
 @pytest.fixture(scope="module")
 def controller():
-    with standin.running(speed=0, heartbeat=1e6) as where:
+    with standin.running(speed=0) as where:
         yield where
 
 

@@ -13,12 +13,12 @@ from jaxfinger.rig.backend import CommandRefused, ControllerRestarted, StaleRig
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.ring import LARGEST, MARGIN
-from jaxfinger.rig.simulated.controller import Controller, HardLimits
+from jaxfinger.rig.simulated.controller import Controller
 from jaxfinger.rig.simulated.examples import rig_toml
 
 
 def small(rig, ring=512) -> SimulatedRig:
-    return SimulatedRig(rig, Controller(limits=HardLimits(heartbeat_s=1e9), ring=ring))
+    return SimulatedRig(rig, Controller(ring=ring))
 
 
 @settings(max_examples=20, deadline=None)
@@ -100,7 +100,7 @@ def test_a_controller_that_stands_still_is_stale(rig):
     machine = small(rig)
     with machine:
         machine.inject("stall")
-        machine._wait(0.001)
+        machine._pause(0.001)
         while machine.next_seq < machine.controller.seq:
             machine.read_block(1.0)
         with pytest.raises(StaleRig):
@@ -169,7 +169,7 @@ def test_a_latched_stop_needs_a_name_and_a_reset(rig):
             machine.arm()
         with pytest.raises(CommandRefused, match="give the name"):
             machine.reset(" ")
-        machine._wait(1.0)
+        machine._pause(1.0)
         machine.reset("tester")
         machine.arm()
 

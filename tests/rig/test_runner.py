@@ -15,7 +15,7 @@ from jaxfinger.rig import parse_plan, parse_rig, recorder, recover, wal
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.runner import log_path, run
-from jaxfinger.rig.simulated.controller import Controller, HardLimits
+from jaxfinger.rig.simulated.controller import Controller
 from jaxfinger.rig.simulated.examples import rig_toml
 
 
@@ -92,7 +92,7 @@ FAULTS = [
     ("spike", ("tension", "T1"), 4.0, Trip.TRACKING, 220),
     ("spike", ("motor_temperature", "T2"), 45.0, Trip.TEMPERATURE, 20),
     ("freeze", ("tension", "T1"), 0.0, Trip.FROZEN, 1300),
-    ("clock", ("tension", "T1"), 0.0, Trip.CLOCK, 20),
+    ("clock-back", ("tension", "T1"), 0.5, Trip.CLOCK, 20),
     ("flag", ("tension", "T1"), 0.0, Trip.INVALID, 20),
 ]
 
@@ -292,7 +292,7 @@ def test_a_person_at_a_bench_that_prepares_nothing_itself(rig, record):
             assert alive()
             prompts.append(text)
             by_itself(wanted[-1])
-            machine._wait(1.0)
+            machine._pause(1.0)
 
         def stop_requested(self):
             return False
@@ -308,14 +308,14 @@ def test_a_person_at_a_bench_that_prepares_nothing_itself(rig, record):
 
 
 def test_filtered_terminals_are_refused_for_dynamic_experiments(rig, tmp_path):
-    filtered = Controller(limits=HardLimits(heartbeat_s=1e9), filtered=True)
+    filtered = Controller(filtered=True)
     plan = parse_plan('[plan]\nname = "p"\n[[trial]]\nexperiment = "ID.3-dynamic"\njoint = "DIP"\n', rig)
     with pytest.raises(UserError, match=r"filters at 22 Hz .* spoils 01-ID.3-dynamic-DIP"):
         run(plan, SimulatedRig(rig, filtered), tmp_path / "s.h5")
     assert filtered.state is State.IDLE
     assert list(tmp_path.iterdir()) == []
     allowed = parse_rig(rig_toml(allow_filtered=True))
-    machine = SimulatedRig(allowed, Controller(limits=HardLimits(heartbeat_s=1e9), filtered=True))
+    machine = SimulatedRig(allowed, Controller(filtered=True))
     outcome = run(plan, machine, tmp_path / "s.h5")
     with h5py.File(outcome.session) as file:
         bandwidth = dict(zip(file["rig/filters/channel"].asstr()[()], file["rig/filters/bandwidth"][()], strict=True))
@@ -323,7 +323,7 @@ def test_filtered_terminals_are_refused_for_dynamic_experiments(rig, tmp_path):
 
 
 def test_static_experiments_may_be_filtered(rig, record):
-    machine = SimulatedRig(rig, Controller(limits=HardLimits(heartbeat_s=1e9), filtered=True))
+    machine = SimulatedRig(rig, Controller(filtered=True))
     assert record(machine).cause == ""
 
 
@@ -338,11 +338,10 @@ def test_a_loaded_torque_sensor_cannot_be_tared(rig, record):
 
 def test_a_gap_is_counted_and_written(rig, record, tmp_path):
     """A host that sleeps longer than the ring lasts: the samples are lost, and the file says how many."""
-    machine = SimulatedRig(rig, Controller(limits=HardLimits(heartbeat_s=1e9), ring=1024))
+    machine = SimulatedRig(rig, Controller(ring=1024))
 
     def sleep(m):
-        for _ in range(3000):
-            m.controller.cycle()
+        m._pause(3.0)
 
     outcome = record(machine, sleep, at=("01-ID.2-DIP", "moved by hand"))
     assert outcome.cause == ""

@@ -26,6 +26,7 @@ class ReplayRig(Rig):
     """Blocks of a recorded trial; its channels are those that the trial measured, and nothing can be commanded."""
 
     synchronous = True
+    simulated_time = True
 
     def __init__(self, description: RigDescription):
         self.description = description
@@ -52,7 +53,7 @@ class ReplayRig(Rig):
     def close(self) -> None:
         pass
 
-    def read_block(self, timeout: float) -> Block:
+    def poll(self) -> Block:
         part = slice(self._at, self._at + BLOCK)
         t_ns, x = self._time[part], self._x[part]
         if not len(x):
@@ -61,6 +62,9 @@ class ReplayRig(Rig):
         self._at += len(x)
         state = np.full(len(x), State.ARMED, np.uint32)
         return Block(seq, t_ns, x.copy(), state, np.zeros(len(x), np.uint32))
+
+    def beat(self) -> None:
+        pass
 
     def rewind(self, seq: int) -> None:
         self._at = min(max(seq, 0), len(self._x))

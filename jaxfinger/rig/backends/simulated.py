@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.ring import RingRig
-from jaxfinger.rig.simulated.controller import Controller, HardLimits
+from jaxfinger.rig.simulated.controller import Controller
 from jaxfinger.rig.toml_file import Table
 
 
@@ -13,15 +13,19 @@ def address(table: Table) -> dict[str, str | int]:
     return {"seed": table.integer("seed", 0), "filtered": table.integer("filtered", 0, high=1)}
 
 
+BEAT = 50  # cycles
+
+
 class SimulatedRig(RingRig):
     """Samples are made when they are read, so a session takes no longer than its computation and repeats exactly."""
 
     synchronous = True
+    simulated_time = True
 
     def __init__(self, description: RigDescription, controller: Controller | None = None):
         super().__init__(description)
         seed, filtered = int(description.address.get("seed", 0)), bool(description.address.get("filtered", 0))
-        self.controller = controller or Controller(limits=HardLimits(heartbeat_s=1e9), seed=seed, filtered=filtered)
+        self.controller = controller or Controller(seed=seed, filtered=filtered)
 
     def _open(self) -> None:
         pass
@@ -33,13 +37,19 @@ class SimulatedRig(RingRig):
         at = self.controller.place[symbol][0] + offset
         return bytes(self.controller.memory[at : at + size])
 
-    def _write(self, symbol: str, data: bytes) -> None:
+    def _write(self, symbol: str, data: bytes, mend: bool = True) -> None:
         at = self.controller.place[symbol][0]
         self.controller.memory[at : at + len(data)] = data
 
-    def _wait(self, seconds: float) -> None:
-        for _ in range(max(1, round(seconds * self.description.rate_hz))):
+    def _pause(self, seconds: float) -> None:
+        """Who makes time pass is well meanwhile."""
+        for k in range(max(1, round(seconds * self.description.rate_hz))):
+            if k % BEAT == 0:
+                self.beat()
             self.controller.cycle()
+
+    def _sizes(self) -> dict[str, int]:
+        return {symbol: size for symbol, (_, size) in self.controller.place.items()}
 
     def _has_bench(self) -> bool:
         return True

@@ -11,7 +11,8 @@ import socket
 import socketserver
 import struct
 import threading
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 
 _TCP = struct.Struct("<HI")
 _AMS = struct.Struct("<6sH6sHHHIII")
@@ -24,10 +25,20 @@ OK, UNKNOWN_SERVICE, INVALID_GROUP, INVALID_OFFSET, INVALID_SIZE, NO_SYMBOL = 0,
 
 
 class AmsServer:
-    """Serves `memory` with `places` (symbol -> offset, size); `lock` is held while it is touched."""
+    """Serves `memory` with `places` (symbol -> offset, size); `lock` is held while it is touched.
 
-    def __init__(self, memory: bytearray, places: Mapping[str, tuple[int, int]], lock: threading.Lock, port: int = 0):
-        self.memory, self.places, self.lock = memory, dict(places), lock
+    Every answer comes `delay()` s late.
+    """
+
+    def __init__(
+        self,
+        memory: bytearray,
+        places: Mapping[str, tuple[int, int]],
+        lock: threading.Lock,
+        port: int = 0,
+        delay: Callable[[], float] = lambda: 0.0,
+    ):
+        self.memory, self.places, self.lock, self.delay = memory, dict(places), lock, delay
         self.requests = 0
         self._clients: dict[str, socket.socket] = {}
         self._clients_lock = threading.Lock()
@@ -68,7 +79,10 @@ class AmsServer:
         try:
             while True:
                 _, length = _TCP.unpack(_exactly(client, _TCP.size))
-                client.sendall(self._answer(_exactly(client, length)))
+                answer = self._answer(_exactly(client, length))
+                if late := self.delay():
+                    time.sleep(late)
+                client.sendall(answer)
         except (ConnectionError, OSError, struct.error):
             return
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxfinger.rig import contract
 from jaxfinger.rig.contract import Flag, Kind, Mode, Refusal, State, Trip
+from jaxfinger.rig.simulated.faults import CATALOGUE
 from jaxfinger.rig.simulated.plant import DT, Plant, Sensors
 
 _SAMPLE = struct.Struct(f"<QQII{contract.VALUES}dQ")
@@ -60,6 +61,7 @@ class Controller:
         ring: int = contract.RING,
         sensors: Sensors | None = None,
         filtered: bool = False,
+        lockstep: bool = False,
     ):
         self.plant = plant or Plant()
         self.limits = limits or HardLimits()
@@ -70,7 +72,8 @@ class Controller:
         self.place = contract.layout(ring)
         self.memory = bytearray(sum(self.place["stBench"]))
         self.faults: dict[str, tuple[int, int, float]] = {}  # kind: (slot, first seq, amount)
-        self.filtered = filtered
+        self.filtered, self.lockstep = filtered, lockstep
+        self.struck: int | None = None  # number of the sample at which a fault first showed
         self.cut = False  # the server is asked to drop its connections
         self.rng = np.random.default_rng(seed)
         self.boot = 0
@@ -82,6 +85,7 @@ class Controller:
         self.boot += 1
         self.seq = 0
         self.state = State.IDLE
+        self._code = int(self.state)  # as it is told
         self.trip, self.trip_seq, self.trip_value, self.trip_slot = Trip.NONE, 0, 0.0, -1
         self.acknowledged, self.refused = 0, Refusal.NONE
         self.target, self.setpoint, self.tension = [0.0] * n, [0.0] * n, [0.0] * n
@@ -91,7 +95,7 @@ class Controller:
         self.beat, self.beat_age = 0, 0
         self.ramps: list[tuple[float, float]] = []  # of a release: (tension, seconds)
         self.bench = 0
-        self.over: dict[tuple[Trip, int], int] = {}
+        self.over: dict[tuple[Trip, int], float] = {}
         self.memory[:] = bytes(len(self.memory))
         info = np.zeros((), contract.INFO)
         info["version"], info["sample_size"], info["ring_length"] = (
@@ -109,9 +113,20 @@ class Controller:
             filters["enabled"][[*self.slots.tension, self.slots.torque, *self.slots.force]] = 1
             filters["bandwidth"][filters["enabled"] == 1] = 22.0
         self._put("aFilter", filters.tobytes())
+        bench = np.zeros((), contract.BENCH)
+        bench["lockstep"] = self.lockstep
+        self._put("stBench", bench.tobytes())
+        self.off = 0  # number of the sample since which no tendon is to be pulled; -1: one is
+        self._frozen_t, self._struck_t = 0, 0
         self._noise = self.rng.standard_normal((4096, self.slots.noisy))
         self._values = self._before = [0.0] * contract.VALUES
         self._status()
+
+    def tell_ring(self, length: int) -> None:
+        """Say that the ring has another length than it has."""
+        self.place["aRing"] = self.place["aRing"][0], length * contract.SAMPLE.itemsize
+        at = self.place["stInfo"][0] + contract.INFO.fields["ring_length"][1]  # type: ignore[index]
+        struct.pack_into("<I", self.memory, at, length)
 
     def _put(self, symbol: str, data: bytes) -> None:
         offset, size = self.place[symbol]
@@ -123,6 +138,8 @@ class Controller:
         """Read the command, advance ramps and finger by 1 ms, measure, check, write the sample."""
         self._bench()
         fault = {kind: (slot, amount) for kind, (slot, first, amount) in self.faults.items() if self.seq >= first}
+        if fault and self.struck is None:
+            self.struck, self._struck_t = self.seq, self._time({})
         if "restart" in fault:
             self.faults.clear()
             self.start()
@@ -131,21 +148,38 @@ class Controller:
             del self.faults["cut"]
         if "stall" in fault:
             return
-        self._commands()
+        self._commands("deaf" in fault)
         self._heartbeat()
         self._ramps()
         self.plant.step(self.tension, self.motor)
         flags = self._measure(fault)
         self._check(flags)
-        self._sample(flags, 500 * contract.CYCLE_NS if "clock" in fault else 0)
+        self.off = -1 if any(self.setpoint) else self.seq if self.off < 0 else self.off
+        self._sample(flags, fault)
 
-    def _commands(self) -> None:
+    def strike(self, kind: str, slot: int = 0, first: int = 0, amount: float = math.nan) -> None:
+        """A fault of `faults.CATALOGUE` from sample `first` on."""
+        self.struck = None
+        self.faults[kind] = slot, first, CATALOGUE[kind].amount if math.isnan(amount) else amount
+
+    def amount(self, kind: str) -> float | None:
+        """The amount of a fault that is there, for those that strike outside of the program."""
+        _, first, amount = self.faults.get(kind, (0, math.inf, 0.0))
+        return amount if self.seq >= first else None
+
+    def report(self) -> dict[str, int | None]:
+        """What happened, in numbers of samples: where the fault showed, where it stopped, since when tension is off."""
+        return {"head": self.seq, "state": int(self.state), "trip": int(self.trip), "boot": self.boot,
+                "trip_seq": self.trip_seq, "fault_seq": self.struck, "off_seq": self.off}  # fmt: skip
+
+    def _commands(self, deaf: bool) -> None:
         offset, _ = self.place["stCommand"]
         number, kind, index, _, rate, acceleration, *target = _COMMAND.unpack_from(self.memory, offset)
         if number == self.acknowledged:
             return
         self.acknowledged = number
-        self.refused = self._obey(kind, index, rate, acceleration, target)
+        ignored = deaf and kind in (Kind.STOP, Kind.RELEASE)
+        self.refused = Refusal.NONE if ignored else self._obey(kind, index, rate, acceleration, target)
 
     def _obey(self, kind: int, index: int, rate: float, acceleration: float, target: list[float]) -> Refusal:
         on = self.state in (State.ARMED, State.MOVING)
@@ -295,7 +329,7 @@ class Controller:
         fresh[slots.temperature[0] : slots.temperature[-1] + 1] = [TEMPERATURE] * plant.n
         flags = 0
         for kind, (slot, amount) in fault.items():
-            if kind == "nan":
+            if kind == "nan" or (kind == "flicker" and self.seq % 3):
                 fresh[slot] = math.nan
             elif kind == "freeze":
                 fresh[slot] = self._values[slot]
@@ -307,7 +341,9 @@ class Controller:
         return flags
 
     def _check(self, flags: int) -> None:
-        """Hard limits, each after three cycles: one odd sample must not drop the finger."""
+        """Hard limits, each after three bad cycles, off which a good one takes a quarter: one odd sample must not drop
+        the finger, and a value that is bad every other time must.
+        """
         if self.state not in (State.ARMED, State.MOVING):
             self.over.clear()
             return
@@ -340,25 +376,37 @@ class Controller:
         if abs(values[slots.torque]) > limits.joint_torque_max:
             found.append((Trip.TORQUE, slots.torque, values[slots.torque]))
         found += [(Trip.FORCE, i, values[i]) for i in slots.force if abs(values[i]) > limits.fingertip_force_max]
-        self.over = {(trip, slot): self.over.get((trip, slot), 0) + 1 for trip, slot, _ in found}
+        bad = {(trip, slot) for trip, slot, _ in found}
+        self.over = {key: level - 0.25 for key, level in self.over.items() if level > 0.25 or key in bad}
+        self.over |= {key: self.over.get(key, -0.25) + 1.25 for key in bad}
         for trip, slot, value in found:
             if self.over[trip, slot] >= 3:
                 self._stop(trip, slot, value)
                 return
 
-    def _sample(self, flags: int, back_ns: int) -> None:
+    def _time(self, fault: dict[str, tuple[int, float]]) -> int:
+        """The device's time, ns; `fault` makes it wrong."""
+        t = _EPOCH_NS + self.seq * contract.CYCLE_NS
+        if "clock-frozen" in fault:
+            return self._struck_t
+        if "clock-rate" in fault:
+            t = self._struck_t + round((t - self._struck_t) * fault["clock-rate"][1])
+        t += round(fault.get("clock-jump", (0, 0.0))[1] * 1e9)
+        return t - round(fault.get("clock-back", (0, 0.0))[1] * 1e9)
+
+    def _sample(self, flags: int, fault: dict[str, tuple[int, float]]) -> None:
         offset, _ = self.place["aRing"]
         at = offset + (self.seq % self.ring) * _SAMPLE.size
-        t_ns = _EPOCH_NS + self.seq * contract.CYCLE_NS - back_ns
+        self._code = round(fault["state"][1]) if "state" in fault else int(self.state)
         flags |= (self.acknowledged & 0xFFFF) << 16
-        _SAMPLE.pack_into(self.memory, at, self.seq, t_ns, self.state, flags, *self._values, self.seq)
+        _SAMPLE.pack_into(self.memory, at, self.seq, self._time(fault), self._code, flags, *self._values, self.seq)
         self.seq += 1
         self._status()
 
     def _status(self) -> None:
         offset, _ = self.place["stStatus"]
         _STATUS.pack_into(
-            self.memory, offset, self.seq, self.boot, self.state, self.trip, self.trip_seq, self.trip_value,
+            self.memory, offset, self.seq, self.boot, self._code, self.trip, self.trip_seq, self.trip_value,
             self.trip_slot, self.acknowledged, self.refused, 0,
         )  # fmt: skip
 
@@ -372,7 +420,7 @@ class Controller:
         self.bench = number
         if kind := int(order["fault"]):
             where = int(order["fault_slot"]), int(order["fault_seq"]), float(order["amount"])
-            self.faults[contract.FAULTS[kind]] = where
+            self.strike(contract.FAULTS[kind], *where)
             return
         m = self.plant.m
         self.faults.clear()  # who prepares the finger has mended the rig

@@ -8,32 +8,35 @@ It prints `listening 127.0.0.1:PORT` and runs until it is stopped.
 from __future__ import annotations
 
 import argparse
+import json
 import struct
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from typing import Any
 
 from jaxfinger.rig import contract
 from jaxfinger.rig.simulated.ams import AmsServer
 from jaxfinger.rig.simulated.controller import Controller, HardLimits
+from jaxfinger.rig.simulated.faults import AT_START, CATALOGUE, Fault, parse
 
 NET_ID = "127.0.0.1.1.1"
 BURST = 100  # cycles in a row before others get the memory
 
 
-def serve(controller: Controller, speed: float, port: int, stop: threading.Event) -> None:
+def serve(controller: Controller, speed: float, port: int, stop: threading.Event, say: Callable[[str], None]) -> None:
     """Run the controller at `speed` times real time until `stop`; a slow machine stretches time, it loses no sample.
 
     At speed 0 time goes as fast as the host reads: each heartbeat buys BURST cycles, so that no machine is too slow.
     """
     lock = threading.Lock()
     places = {contract.PREFIX + name: place for name, place in controller.place.items()}
-    server = AmsServer(controller.memory, places, lock, port)
-    print(f"listening 127.0.0.1:{server.port}", flush=True)
-    pace = Lockstep(controller) if speed == 0 else RealTime(speed)
+    server = AmsServer(controller.memory, places, lock, port, lambda: controller.amount("delay") or 0.0)
+    say(f"listening 127.0.0.1:{server.port}")
+    pace = Lockstep(controller) if speed == 0 else RealTime(controller, speed)
     try:
         while not stop.is_set():
             count = pace.due()
@@ -53,16 +56,17 @@ def serve(controller: Controller, speed: float, port: int, stop: threading.Event
 class RealTime:
     """As many cycles as the clock says, in bursts, so that requests are answered in between."""
 
-    def __init__(self, speed: float):
-        self._period = contract.CYCLE_NS * 1e-9 / speed
+    def __init__(self, controller: Controller, speed: float):
+        self._controller, self._period = controller, contract.CYCLE_NS * 1e-9 / speed
         self._next = time.monotonic()
         self.rest = min(self._period, 1e-3)
 
     def due(self) -> int:
         """Cycles to run now."""
-        behind = int((time.monotonic() - self._next) / self._period)
+        period = self._period / (self._controller.amount("slow") or 1.0)
+        behind = int((time.monotonic() - self._next) / period)
         count = min(behind, BURST)
-        self._next += count * self._period
+        self._next += count * period
         if behind > 20 * BURST:  # the machine stood still: stretch time rather than race after it
             self._next = time.monotonic()
         return count
@@ -85,26 +89,49 @@ class Lockstep:
         return BURST if fresh else int(command != self._controller.acknowledged)
 
 
+class StandIn:
+    """A stand-in in a process of its own: where it listens, and a way to it that is no connection of the rig."""
+
+    def __init__(self, process: subprocess.Popen[str]):
+        self._process = process
+        word = self._line().split()
+        if word[:1] != ["listening"]:
+            raise RuntimeError("the stand-in did not start")
+        self.where = word[1]
+        self.pid = process.pid
+
+    def _line(self) -> str:
+        assert self._process.stdout is not None
+        return self._process.stdout.readline()
+
+    def _ask(self, line: str) -> dict[str, Any]:
+        assert self._process.stdin is not None
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
+        return json.loads(self._line())
+
+    def report(self) -> dict[str, Any]:
+        """`Controller.report` now."""
+        return self._ask("report")
+
+    def strike(self, fault: str) -> dict[str, Any]:
+        """A fault as on the command line, from the next sample on; returns the report."""
+        return self._ask(f"fault {fault}")
+
+
 @contextmanager
-def running(speed: float = 1.0, heartbeat: float = 0.25, seed: int = 0, filtered: bool = False) -> Iterator[str]:
-    """A stand-in in a process of its own; yields host:port for the rig file's `ip`."""
+def started(
+    speed: float = 1.0, heartbeat: float = 0.25, seed: int = 0, filtered: bool = False, faults: Sequence[str] = ()
+) -> Iterator[StandIn]:
+    """A stand-in in a process of its own, which ends with this one."""
     arguments = ["--speed", str(speed), "--heartbeat", str(heartbeat), "--seed", str(seed)]
-    command = [
-        sys.executable,
-        "-m",
-        "jaxfinger.rig.standin",
-        "--with-parent",
-        *arguments,
-        *(["--filtered"] if filtered else []),
-    ]
+    arguments += [word for fault in faults for word in ("--fault", fault)] + (["--filtered"] if filtered else [])
+    command = [sys.executable, "-m", "jaxfinger.rig.standin", "--with-parent", *arguments]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stdin is not None
     try:
-        word = process.stdout.readline().split()
-        if word[:1] != ["listening"]:
-            raise RuntimeError("the stand-in did not start")
-        yield word[1]
+        yield StandIn(process)
     finally:
         process.stdin.close()
         try:
@@ -113,6 +140,28 @@ def running(speed: float = 1.0, heartbeat: float = 0.25, seed: int = 0, filtered
             process.kill()
             process.wait()
         process.stdout.close()
+
+
+@contextmanager
+def running(speed: float = 1.0, heartbeat: float = 0.25, seed: int = 0, filtered: bool = False) -> Iterator[str]:
+    """As `started`; yields host:port for the rig file's `ip`."""
+    with started(speed, heartbeat, seed, filtered) as bench:
+        yield bench.where
+
+
+def make(speed: float, heartbeat: float, seed: int, filtered: bool, faults: Sequence[Fault]) -> Controller:
+    """The controller that the command line asks for."""
+    at_start = {fault.name: fault.amount for fault in faults if fault.name in AT_START}
+    limits = HardLimits(heartbeat_s=at_start.get("watchdog", heartbeat * (speed or 1.0)))
+    controller = Controller(limits=limits, seed=seed, filtered=filtered, lockstep=speed == 0)
+    if "size" in at_start:
+        controller.place["stCommand"] = controller.place["stCommand"][0], round(at_start["size"])
+    if "ring" in at_start:
+        controller.tell_ring(round(at_start["ring"]))
+    for fault in faults:
+        if fault.name not in AT_START:
+            controller.strike(fault.name, fault.slot, round(fault.after_s * 1e9 / contract.CYCLE_NS), fault.amount)
+    return controller
 
 
 def main() -> None:
@@ -125,22 +174,35 @@ def main() -> None:
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the sensors' noise")
     parser.add_argument("--filtered", action="store_true", help="terminals at their factory filter of 22 Hz")
-    parser.add_argument("--with-parent", action="store_true", help="end when standard input closes")
+    parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="NAME[:SLOT][=AMOUNT][@SECONDS]",
+        help="; ".join(f"{name}: {fault.says}" for name, fault in (CATALOGUE | AT_START).items()),
+    )
+    parser.add_argument("--with-parent", action="store_true", help="obey lines on standard input; end when it closes")
     options = parser.parse_args()
-    limits = HardLimits(heartbeat_s=options.heartbeat * (options.speed or 1000.0))
+    try:
+        faults = [parse(text) for text in options.fault]
+    except ValueError as error:
+        parser.error(str(error))
+    controller = make(options.speed, options.heartbeat, options.seed, options.filtered, faults)
     stop = threading.Event()
 
-    def parent_is_gone() -> None:
-        sys.stdin.read()
+    def say(line: str) -> None:
+        print(line, flush=True)
+
+    def obey_parent() -> None:
+        for line in sys.stdin:
+            word, _, rest = line.strip().partition(" ")
+            if word == "fault":
+                fault = parse(rest)
+                controller.strike(fault.name, fault.slot, controller.seq, fault.amount)
+            say(json.dumps(controller.report()))
         stop.set()
 
     if options.with_parent:
-        threading.Thread(target=parent_is_gone, daemon=True).start()
+        threading.Thread(target=obey_parent, daemon=True).start()
     with suppress(KeyboardInterrupt):
-        serve(
-            Controller(limits=limits, seed=options.seed, filtered=options.filtered), options.speed, options.port, stop
-        )
-
-
-if __name__ == "__main__":
-    main()
+        serve(controller, options.speed, options.port, stop, say)

@@ -1,0 +1,62 @@
+"""What the stand-in does wrong on request: `python -m jaxfinger.rig.standin --fault NAME[:SLOT][=AMOUNT][@SECONDS]`."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from jaxfinger.rig import contract
+
+
+@dataclass(frozen=True)
+class Misbehaviour:
+    """One fault: what it does, what its amount means (`…` in the sentence), and the amount where none is given."""
+
+    says: str
+    amount: float = 0.0
+
+
+CATALOGUE = {
+    "nan": Misbehaviour("the slot is not a number"),
+    "flicker": Misbehaviour("the slot is not a number in two samples of three"),
+    "freeze": Misbehaviour("the slot repeats its value"),
+    "spike": Misbehaviour("the slot reads … too much", 60.0),
+    "flag": Misbehaviour("a terminal flags its samples"),
+    "clock-back": Misbehaviour("the device's time jumps back by … s, again and again", 0.5),
+    "clock-frozen": Misbehaviour("the device's time stands still"),
+    "clock-rate": Misbehaviour("the device's time runs … times as fast", 0.01),
+    "clock-jump": Misbehaviour("the device's time jumps ahead by … s", 3600.0),
+    "slow": Misbehaviour("the task runs … times as fast", 0.01),
+    "stall": Misbehaviour("the task stands still"),
+    "restart": Misbehaviour("the program restarts"),
+    "cut": Misbehaviour("every connection is cut"),
+    "delay": Misbehaviour("every answer comes … s late", 0.04),
+    "deaf": Misbehaviour("STOP and RELEASE are acknowledged and ignored"),
+    "state": Misbehaviour("the state is …", 42.0),
+}
+AT_START = {
+    "watchdog": Misbehaviour("the controller holds tension for … s without a heartbeat", 3600.0),
+    "size": Misbehaviour("ST_Command has … bytes", 168.0),
+    "ring": Misbehaviour("the ring holds … samples", 1.0),
+}
+assert set(CATALOGUE) == set(contract.FAULTS) - {"none"}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault, the slot that it strikes, its amount, and when it begins, s after the start."""
+
+    name: str
+    slot: int
+    amount: float
+    after_s: float
+
+
+def parse(text: str) -> Fault:
+    """A fault as it stands on the command line; raises ValueError with the names that there are."""
+    found = re.fullmatch(r"([a-z-]+)(?::(\d+))?(?:=([-+.\deE]+))?(?:@([.\d]+))?", text)
+    known = CATALOGUE | AT_START
+    if found is None or found[1] not in known:
+        raise ValueError(f"{text!r} is no fault; give NAME[:SLOT][=AMOUNT][@SECONDS] with one of {', '.join(known)}")
+    amount = float(found[3]) if found[3] else known[found[1]].amount
+    return Fault(found[1], int(found[2] or 0), amount, float(found[4] or 0.0))
