@@ -75,7 +75,9 @@ class Joint:
     @property
     def range(self) -> tuple[float, float]:
         """Lower and upper limit in rad, or m."""
-        lower, upper = np.radians(self.limits_deg) if self.limits is None else self.limits
+        if self.limits is not None:
+            return self.limits
+        lower, upper = np.radians(np.array(self.limits_deg, np.float64))
         return float(lower), float(upper)
 
 

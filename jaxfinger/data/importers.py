@@ -1,20 +1,4 @@
-"""Recordings of other tools as sessions, by a small mapping file (TOML).
-
-    specimen = "finger 3"
-    [finger]                        # inline, or: finger = "other.h5" / "finger.toml"
-    gravity = [0, 0, -9.81]
-    fingertip = [0.02, 0, 0]
-    [[finger.joints]]
-    name = "MCP" ; axis = [0, 1, 0] ; origin = [0, 0, 0] ; limits = [-0.2, 1.6]
-    mass = 0.02 ; com = [0.02, 0, 0] ; inertia = [[...], [...], [...]]
-    [[finger.tendons]]
-    name = "T1" ; active = true ; crosses = ["MCP"]
-    [trials.01-ID.2-MCP]
-    file = "log1.mat" ; experiment = "ID.2" ; joint = "MCP"
-    time = "t"                      # or rate_hz = 1000
-    [trials.01-ID.2-MCP.channels]   # or [channels], shared by all trials
-    q = { MCP = { from = "enc", column = 0, units = "deg" } }
-    tendon_force = { T1 = { from = "u", scale = 12.5, offset = -0.3, units = "N" } }
+"""Recordings of other tools as sessions, by a small mapping file (TOML), as `mapping` has it.
 
 A column is (variable · scale + offset) in `units`; a list of such tables is their sum; `scale` may name a variable;
 `time` beside `from` names the variable's own clock, from which it is interpolated to the trial's.
@@ -25,7 +9,6 @@ from __future__ import annotations
 
 import math
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -34,13 +17,15 @@ from typing import Any
 import numpy as np
 
 from jaxfinger.data.check import check_session
-from jaxfinger.data.findings import Report
-from jaxfinger.data.hdf5 import read_session, write_session
-from jaxfinger.data.mapping import COLUMN_KEYS, ROOT_KEYS, TRIAL_KEYS, Where, finger_from
+from jaxfinger.data.findings import Finding, Report
+from jaxfinger.data.finger_file import finger_from
+from jaxfinger.data.hdf5 import write_session
+from jaxfinger.data.mapping import COLUMN_KEYS, TRIAL_KEYS, MappingFile, Where
 from jaxfinger.data.parse import in_order, listed
 from jaxfinger.data.schema import CHANNELS, units_of
 from jaxfinger.data.session import FingerDescription, Session, Trial
 from jaxfinger.data.sources import Variables, load_variables
+from jaxfinger.data.toml import read_toml
 from jaxfinger.errors import UserError
 
 # What one unit is in SI: (SI unit, factor).
@@ -86,10 +71,10 @@ def import_file(
 def import_session(sources: Sequence[str | os.PathLike], mapping_path: str | os.PathLike) -> Session:
     """The session that a mapping makes of recordings, in memory; refused where the checker finds an error."""
     path = Path(mapping_path)
-    mapping = load_mapping(path)
-    where = Where(str(path))
-    where.known(mapping, ROOT_KEYS)
-    finger = _finger(mapping, path, where)
+    document = read_toml(path, "name a mapping file")
+    said, mapping = document.read(MappingFile), document.content
+    where = Where(str(path), document.place.lines)
+    finger = finger_from(said.finger, where / "finger")
     files = {Path(source).name: Path(source) for source in sources}
     if not files:
         raise UserError(f"{path}: no recording was given; name at least one")
@@ -108,37 +93,23 @@ def import_session(sources: Sequence[str | os.PathLike], mapping_path: str | os.
         finger=finger,
         trials=in_order(trials),
         source=mapping.get("source", f"imported from {', '.join(sorted(files))}"),
-        created=mapping.get("created", datetime.now(UTC).isoformat(timespec="seconds")),
+        created=said.created_text or (datetime.now(UTC).isoformat(timespec="seconds")),
     )
     report = Report()
     check_session(session, report)
     if report.fatal is not None:
-        raise UserError(f"{path}: {report.fatal.place}: {report.fatal.message}")
+        _where_of(report.fatal, where).fail(report.fatal.message)
     return session
 
 
-def load_mapping(path: Path) -> dict[str, Any]:
-    """A TOML file as tables."""
-    try:
-        with path.open("rb") as file:
-            return tomllib.load(file)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); name a mapping file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: is not valid TOML ({error}); mend that line") from None
-
-
-def _finger(mapping: Mapping[str, Any], path: Path, where: Where) -> FingerDescription:
-    """Inline, or from a dataset file or another TOML beside the mapping."""
-    finger = where.need(mapping, "finger")
-    if isinstance(finger, Mapping):
-        return finger_from(finger, where / "finger")
-    other = path.parent / str(finger)
-    if other.suffix in (".h5", ".hdf5"):
-        return read_session(other, trials=()).finger
-    tables = load_mapping(other)
-    place = Where(str(other))
-    return finger_from(place.table(tables, "finger"), place / "finger")
+def _where_of(fault: Finding, where: Where) -> Where:
+    """The key of a mapping that a place in the session comes from."""
+    _, room, *names = fault.place.split("/")
+    for key in (
+        ("trials", names[0], *(("channels", *names[1:]) if len(names) > 1 else ())) if room == "trials" else (room,)
+    ):
+        where = where / key
+    return where
 
 
 def _file_of(table: Mapping[str, Any], files: Mapping[str, Path], where: Where) -> Path:

@@ -1,122 +1,205 @@
-"""Tables of a mapping file: keys that are known, values of the right kind, and the finger inline."""
+"""What a mapping file may say, as records; docs/your-own-data.md says it in words.
+
+specimen = "finger 3"
+finger = "finger.toml"              # or a session, or a table [finger] as in `finger_file`
+[trials.01-ID.2-MCP]
+file = "log1.mat"
+experiment = "ID.2"
+joint = "MCP"
+time = "t"                          # or rate_hz = 1000
+[trials.01-ID.2-MCP.channels]       # or [channels], shared by all trials
+q.MCP = { from = "enc", column = 0, units = "deg" }
+tendon_force.T1 = { from = "u", scale = 12.5, offset = -0.3, units = "N" }
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
-from typing import Any, NoReturn
+from dataclasses import dataclass, field, fields, replace
+from datetime import date, datetime
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
-from jaxfinger.data.parse import listed
-from jaxfinger.data.session import FingerDescription
-from jaxfinger.errors import UserError
+from jaxfinger.data.finger_file import Finger
+from jaxfinger.data.session import EXPERIMENTS
+from jaxfinger.data.toml import Fault, OneOf, Place, Positive, Within, read_toml
 
-ROOT_KEYS = ("specimen", "source", "created", "finger", "trials", "channels")
-TRIAL_KEYS = (
-    *("file", "experiment", "joint", "tendon", "complete", "motion", "session_start"),
-    *("time", "rate_hz", "span", "channels"),
-)
-COLUMN_KEYS = ("from", "column", "scale", "offset", "units", "time")
-_FINGER_KEYS = ("gravity", "fingertip", "joints", "tendons")
-_JOINT_KEYS = ("name", "axis", "type", "origin", "limits", "mass", "com", "inertia", "mass_std", "com_std")
-_TENDON_KEYS = ("name", "active", "crosses")
+_Place = Annotated[int, Within(0)] | str  # of a column: from 0, or its name
+
+
+class _Numbers:
+    """Annotation of a number, a list or a matrix of numbers."""
+
+    def check(self, value: Any) -> None:
+        """Raise Fault where the value is anything else."""
+        try:
+            numbers = np.asarray(value)
+        except ValueError:  # rows of different lengths
+            numbers = np.asarray("")
+        if numbers.dtype.kind not in "iuf" or not np.isfinite(numbers).all() or numbers.size == 0:
+            raise Fault("must be a number, a list or a matrix of numbers")
 
 
 @dataclass(frozen=True)
-class Where:
-    """A place in a mapping file, for sentences about it."""
+class Clock:
+    """A variable that holds times: (variable · scale + offset) in `units`."""
 
-    file: str
-    key: str = ""
+    from_: str
+    column: _Place | None = None
+    scale: float | str = 1.0  # or the name of a variable that holds one number
+    offset: float = 0.0
+    units: str | None = None
 
-    def __truediv__(self, key: str) -> Where:
-        return Where(self.file, f"{self.key}.{key}" if self.key else key)
 
-    def fail(self, message: str) -> NoReturn:
-        raise UserError(f"{self.file}: {self.key + ': ' if self.key else ''}{message}")
+@dataclass(frozen=True)
+class Column(Clock):
+    """A variable of a recording: (variable · scale + offset) in `units`."""
+
+    time: str | Clock | None = None  # the variable's own clock
+    file: str | None = None  # where it is not the trial's
+    unwrap: bool | Positive = False  # true: of whole turns; else the period of the variable
+
+
+Said = str | Column | tuple[str | Column, ...]  # of a list, the sum
+Columns = Mapping[str, Said]
+
+
+@dataclass(frozen=True)
+class Channels:
+    """`[channels]`: of each channel the columns that were measured, by joint, tendon, axis or name."""
+
+    q: Columns = field(default_factory=dict)
+    tendon_force: Columns = field(default_factory=dict)
+    tendon_excursion: Columns = field(default_factory=dict)
+    joint_torque: Columns = field(default_factory=dict)
+    fingertip_force: Columns = field(default_factory=dict)
+    joint_direction: Columns = field(default_factory=dict)
+    tendon_direction: Columns = field(default_factory=dict)
+    temperature: Columns = field(default_factory=dict)
+    hold: Said | None = None
+
+    def over(self, shared: Channels) -> Channels:
+        """These channels, and the shared ones of which these say nothing."""
+        own = {f.name: value for f in fields(self) if (value := getattr(self, f.name))}
+        return replace(shared, **own)
+
+    def said(self) -> dict[str, Any]:
+        """The channels of which something is said."""
+        return {f.name: value for f in fields(self) if (value := getattr(self, f.name))}
+
+
+@dataclass(frozen=True)
+class MappedTrial:
+    """`[trials.<name>]`: which part of which recording a trial is."""
+
+    experiment: Annotated[str, OneOf(EXPERIMENTS)]
+    file: str | None = None  # may be left out where one recording is given
+    joint: str | None = None
+    tendon: str | None = None
+    complete: bool = True
+    motion: str | None = None
+    session_start: float | None = None  # s
+    time: str | Clock | None = None
+    rate_hz: Positive | None = None
+    span: tuple[float, float] | None = None  # s from the recording's start
+    where: str | None = None  # a condition on the recording's rows
+    sort: bool = False
+    channels: Channels = field(default_factory=Channels)
+    derived: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self):
+        if (self.time is None) == (self.rate_hz is None):
+            raise Fault("has both `time` and `rate_hz`" if self.time else "has neither `time` nor `rate_hz`; name the "
+                        "variable that holds the time, or the sampling rate")  # fmt: skip
+        if self.span is not None and self.span[0] >= self.span[1]:
+            raise Fault("must be [begin, end] in s, the earlier first", "span")
+
+
+@dataclass(frozen=True)
+class MappingFile:
+    """A mapping file. `derived` are expressions of variables, `constants` numbers for them."""
+
+    specimen: str
+    finger: str | Finger
+    trials: Mapping[str, MappedTrial]
+    source: str | None = None
+    created: str | datetime | date | None = None
+    channels: Channels = field(default_factory=Channels)
+    constants: Mapping[str, Annotated[Any, _Numbers()]] = field(default_factory=dict)
+    derived: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self):
+        for name in self.trials:
+            if "/" in name or name.strip() in ("", ".", ".."):
+                raise Fault("is no name for a trial; leave out slashes, which make groups of a file", "trials", name)
+        if isinstance(self.created, str):
+            try:
+                datetime.fromisoformat(self.created)
+            except ValueError:
+                raise Fault(f"is {self.created!r}; write a date and time as 2026-01-31T12:00:00Z", "created") from None
+
+    @property
+    def created_text(self) -> str | None:
+        """When the recordings were made, as the format has it (ISO 8601)."""
+        return self.created if self.created is None or isinstance(self.created, str) else self.created.isoformat()
+
+
+def read_mapping(path: str | Path) -> tuple[MappingFile, Place]:
+    """A mapping file, and the place of its keys for what is found wrong with them later.
+
+    Raises:
+        UserError: it cannot be read, or a key is unknown, of the wrong type or missing.
+    """
+    document = read_toml(path, "name a mapping file")
+    return document.read(MappingFile), document.place
+
+
+ROOT_KEYS, TRIAL_KEYS, CLOCK_KEYS, COLUMN_KEYS = (
+    tuple(f.name.rstrip("_") for f in fields(kind)) for kind in (MappingFile, MappedTrial, Clock, Column)
+)
+
+
+class Where(Place):
+    """A place of a mapping, with what reads plain tables."""
+
+    def __truediv__(self, key: str | int) -> Where:
+        room, dot, rest = str(key).partition(".")
+        parts = (room, rest) if dot and room in ("trials", "channels", "derived") else (key,)
+        return Where(self.file, self.lines, (*self.keys, *parts))
 
     def known(self, table: Any, keys: Collection[str]) -> None:
-        """Refuse keys that nobody reads: they are misspelt more often than not."""
+        """Refuse keys that nobody reads."""
         if not isinstance(table, Mapping):
             self.fail("must be a table")
         for key in table:
             if key not in keys:
-                self.fail(f"has the unknown key {key!r}; it may have {listed(tuple(keys), 20)}")
+                self.fail(f"has the unknown key {key!r}; it may have {', '.join(keys)}")
 
     def need(self, table: Mapping[str, Any], key: str) -> Any:
+        """The value of a key."""
         if key not in table:
             self.fail(f"has no `{key}`; write it")
         return table[key]
 
     def text(self, table: Mapping[str, Any], key: str) -> str:
+        """The string of a key."""
         value = self.need(table, key)
         if not isinstance(value, str):
             self.fail(f"has {key} = {value!r}; it must be a string")
         return value
 
     def table(self, table: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+        """The table of a key."""
         value = self.need(table, key)
         if not isinstance(value, Mapping):
             self.fail(f"has a `{key}` that is no table; write it as one")
         return value
 
-    def rows(self, table: Mapping[str, Any], key: str, keys: Collection[str]) -> list[Mapping[str, Any]]:
-        value = table.get(key, [])
-        if not isinstance(value, list):
-            self.fail(f"has a `{key}` that is no list of tables; write [[{key}]] for each")
-        for i, row in enumerate(value):
-            (self / f"{key}[{i}]").known(row, keys)
-        return value
-
     def numbers(self, table: Mapping[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:
+        """The numbers of a key."""
         try:
             return np.asarray(self.need(table, key), np.float64).reshape(shape)
         except (TypeError, ValueError):
             self.fail(f"has a `{key}` that is not {'×'.join(map(str, shape)) or 'one'} numbers; correct it")
-
-
-def finger_from(table: Mapping[str, Any], where: Where) -> FingerDescription:
-    """The finger from tables `[[joints]]` and `[[tendons]]`, in the units of the format (SI)."""
-    where.known(table, _FINGER_KEYS)
-    joints = where.rows(table, "joints", _JOINT_KEYS)
-    tendons = where.rows(table, "tendons", _TENDON_KEYS)
-    if not joints:
-        where.fail("has no joint; write [[finger.joints]] for each, base to tip")
-    names = tuple((where / f"joints[{i}]").text(joint, "name") for i, joint in enumerate(joints))
-
-    def stack(key: str, shape: tuple[int, ...]) -> np.ndarray:
-        return np.stack(
-            [(where / f"joints.{name}").numbers(joint, key, shape) for name, joint in zip(names, joints, strict=True)]
-        )
-
-    def optional(key: str, shape: tuple[int, ...]) -> np.ndarray | None:
-        return stack(key, shape) if any(key in joint for joint in joints) else None
-
-    crosses = np.zeros((len(tendons), len(names)), bool)
-    for i, tendon in enumerate(tendons):
-        for joint in (where / f"tendons[{i}]").need(tendon, "crosses"):
-            if joint not in names:
-                (where / f"tendons[{i}]").fail(f"crosses {joint!r}, which is no joint; there are {listed(names)}")
-            crosses[i, names.index(joint)] = True
-    kinds = [joint.get("type", "revolute") for joint in joints]
-    for name, kind in zip(names, kinds, strict=True):
-        if kind not in ("revolute", "prismatic"):
-            (where / f"joints.{name}").fail(f"has type {kind!r}; it must be 'revolute' or 'prismatic'")
-    return FingerDescription(
-        gravity=where.numbers(table, "gravity", (3,)),
-        joint_names=names,
-        axis=stack("axis", (3,)),
-        origin=stack("origin", (3,)),
-        limits=stack("limits", (2,)),
-        mass=stack("mass", ()),
-        com=stack("com", (3,)),
-        inertia=stack("inertia", (3, 3)),
-        fingertip=where.numbers(table, "fingertip", (3,)),
-        tendon_names=tuple((where / f"tendons[{i}]").text(tendon, "name") for i, tendon in enumerate(tendons)),
-        active=np.array([bool(tendon.get("active", True)) for tendon in tendons], bool),
-        crosses=crosses,
-        prismatic=tuple(kind == "prismatic" for kind in kinds),
-        mass_std=optional("mass_std", ()),
-        com_std=optional("com_std", (3,)),
-    )

@@ -15,6 +15,7 @@ import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from datetime import date, datetime
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -292,12 +293,13 @@ def one_of(value: Any, known: Sequence[str]) -> str:
 def _annotated(kind: Any) -> Callable[[Any, Any], Any]:
     base, *notes = get_args(kind)
     hook = _CONVERTER.get_structure_hook(base)
+    checks = [note for note in notes if hasattr(note, "check")]
 
     def read(value: Any, _: Any) -> Any:
         result = hook(value, base)
         if not result and any(isinstance(note, NotEmpty) for note in notes):
             raise Fault("is empty; give at least one")
-        for note in (note for note in notes if isinstance(note, Within | OneOf)):
+        for note in checks:
             if not isinstance(result, tuple):
                 note.check(result)
                 continue
@@ -355,7 +357,7 @@ def _union(kind: Any) -> Callable[[Any, Any], Any]:
 
     def name(member: Any) -> str:
         base = get_args(member)[0] if get_origin(member) is Annotated else member
-        plain = {str: "a string", float: "a number", int: "a whole number", bool: "true or false"}
+        plain = {str: "a string", float: "a number", int: "a whole number", bool: "true or false", datetime: "a date"}
         return plain.get(base, "a list" if get_origin(base) is tuple else "a table")
 
     def read(value: Any, _: Any) -> Any:
@@ -366,7 +368,7 @@ def _union(kind: Any) -> Callable[[Any, Any], Any]:
         for hook, member in hooks:
             if fits(value, member):
                 return hook(value, member)
-        raise Fault(f"must be {' or '.join(map(name, members))}, not {shown(value)}")
+        raise Fault(f"must be {' or '.join(dict.fromkeys(map(name, members)))}, not {shown(value)}")
 
     return read
 
@@ -400,7 +402,8 @@ def _converter() -> cattrs.Converter:
     converter = cattrs.Converter()
     for kind, hook in ((float, _number), (int, _whole), (bool, _flag), (str, _text)):
         converter.register_structure_hook(kind, hook)
-    converter.register_structure_hook(Any, lambda value, _: value)
+    for kind in (Any, datetime, date):
+        converter.register_structure_hook(kind, lambda value, _: value)
     for predicate, factory in (
         (lambda kind: isinstance(kind, type) and is_dataclass(kind), _table),
         (lambda kind: get_origin(kind) is tuple, _tuple),

@@ -32,6 +32,6 @@ def test_mistakes_are_named_with_their_line(tmp_path, text, says):
 
 def test_a_name_that_is_nearly_a_shipped_one():
     with pytest.raises(
-        UserError, match=r"human-lik: does not exist \(did you mean 'human-like'\?\); .*emps, human-like"
+        UserError, match=r"human-lik: does not exist \(did you mean 'human-like'\?\); .*emps-no-coulomb, human-like"
     ):
         read_recipe("human-lik")
