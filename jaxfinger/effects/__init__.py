@@ -6,7 +6,8 @@ import os
 from pathlib import Path
 
 from jaxfinger.effects import body, drive, joint, nominal, sensors, tendon, transmission
-from jaxfinger.effects.base import CatalogueEffect, Site
+from jaxfinger.effects.base import Amplitude, CatalogueEffect, Shape, Site, amplitude, shape
+from jaxfinger.effects.scales import Scales
 from jaxfinger.errors import UserError
 from jaxfinger.model import Finger
 
@@ -65,4 +66,18 @@ def from_dict(finger: Finger, content: dict, extra: dict[str, type[CatalogueEffe
     return known[content["effect"]].at(finger, tuple(content["site"]), **values)
 
 
-__all__ = ["CATALOGUE", "NOMINAL_TERMS", "CatalogueEffect", "Site", "from_dict", "load", "nominal_terms", "to_dict"]
+__all__ = [
+    "CATALOGUE",
+    "NOMINAL_TERMS",
+    "Amplitude",
+    "CatalogueEffect",
+    "Scales",
+    "Shape",
+    "Site",
+    "amplitude",
+    "from_dict",
+    "load",
+    "nominal_terms",
+    "shape",
+    "to_dict",
+]

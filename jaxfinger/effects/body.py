@@ -6,43 +6,31 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfinger.effects.base import ELASTIC, CatalogueEffect
+from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
 
 
 class Payload(CatalogueEffect):
-    """A link's mass, first moment and inertia about its joint differ from CAD by Δm, Δ(m c) and ΔI.
+    """A point mass m at p in a link's frame: added to the link or, where it is `moved` (1), taken evenly from it.
 
-    A body of mass Δm at p adds Δm p and Δm |p|². Torques are linear in these three, and in these alone (Atkeson, An and
-    Hollerbach 1986): near a mass of nothing a centre of mass would not be.
+    Either way the link stays a body, its mass, first moment and inertia being those of a body and a point (parallel
+    axes): torques are linear in m.
     """
 
     ID: ClassVar = "payload"
     PLACE: ClassVar = "joint"  # a link goes by its joint's name
-    AMPLITUDES: ClassVar = {
-        "mass": ("kg", 3e-3, True),
-        "moment_x": ("kg m", 5e-5, True),
-        "moment_z": ("kg m", 2e-5, True),
-        "inertia": ("kg m2", 2e-6, True),
-    }
-    SHOWS: ClassVar = ELASTIC
-    MOVES_RIGID_BODY: ClassVar = True
 
-    mass: Float[Array, ""]
-    moment_x: Float[Array, ""]
-    moment_z: Float[Array, ""]
-    inertia: Float[Array, ""]
+    mass: Float[Array, ""] = amplitude("kg", 0.3, "mass")
+    x: Float[Array, ""] = shape("m", (0.3, 0.0, 0.6), "length", moves="by differences")
+    y: Float[Array, ""] = shape("m", (0.0,), "length", moves="by differences")
+    z: Float[Array, ""] = shape("m", (0.0, 0.15, -0.15), "length", moves="by differences")
+    moved: Float[Array, ""] = shape("1", (0.0, 1.0), moves="not")
 
     def finger(self, finger):
-        i = self.index[0]
-        axis = finger.axis[i]
-        mass = finger.mass[i] + self.mass
-        moment = (
-            finger.mass[i] * finger.com[i]
-            + jnp.array([1.0, 0, 0]) * self.moment_x
-            + jnp.array([0, 0, 1.0]) * self.moment_z
-        )
-        about_joint = finger.inertia[i] + _steiner(finger.mass[i], finger.com[i]) + self.inertia * jnp.outer(axis, axis)
-        com = moment / mass
+        i, p = self.index[0], jnp.stack([self.x, self.y, self.z])
+        own = finger.mass[i] - self.moved * self.mass
+        mass = own + self.mass
+        com = (own * finger.com[i] + self.mass * p) / mass
+        about_joint = own * (finger.gyration[i] + _steiner(1.0, finger.com[i])) + _steiner(self.mass, p)
         return eqx.tree_at(
             lambda f: (f.mass, f.com, f.gyration),
             finger,
@@ -64,13 +52,10 @@ class GravityTilt(CatalogueEffect):
 
     ID: ClassVar = "gravity_tilt"
     PLACE: ClassVar = "base"
-    AMPLITUDES: ClassVar = {"x": ("rad", 0.06, True), "y": ("rad", 0.06, True), "z": ("rad", 0.06, True)}
-    SHOWS: ClassVar = ELASTIC
-    MOVES_RIGID_BODY: ClassVar = True
 
-    x: Float[Array, ""]
-    y: Float[Array, ""]
-    z: Float[Array, ""]
+    x: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
+    y: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
+    z: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
 
     def finger(self, finger):
         tilt = jnp.stack([self.x, self.y, self.z])
@@ -82,14 +67,15 @@ class DriveInertia(CatalogueEffect):
 
     ID: ClassVar = "drive_inertia"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"inertia": ("kg m2", 2e-5, False)}
-    SHOWS: ClassVar = {e: ("joint_torque",) for e in ("ID.3-static", "ID.3-dynamic")}
 
-    inertia: Float[Array, ""]
+    inertia: Float[Array, ""] = amplitude("kg m2", 0.2, "mass*length*length")
 
     def torque(self, x, memory, h):
         i = self.index[0]
         return h.at[i].add(self.inertia * x.qdd[i] * x.motorised[i])
+
+
+RIPPLES = (4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 14.0, 16.0, 18.0, 20.0, 24.0, 28.0, 32.0)  # in a turn
 
 
 class TorqueRipple(CatalogueEffect):
@@ -97,16 +83,10 @@ class TorqueRipple(CatalogueEffect):
 
     ID: ClassVar = "torque_ripple"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"A": ("N m", 1e-3, True), "B": ("N m", 1e-3, True)}
-    SHAPES: ClassVar = {
-        "p": ("1", (4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 14.0, 16.0, 18.0, 20.0, 24.0, 28.0, 32.0))
-    }
-    SHIFTS: ClassVar = ("p",)
-    SHOWS: ClassVar = {e: ("joint_torque",) for e in ("ID.3-static", "ID.3-dynamic", "ID.4")}
 
-    A: Float[Array, ""]
-    B: Float[Array, ""]
-    p: Float[Array, ""]
+    A: Float[Array, ""] = amplitude("N m", 0.02, "torque", signed=True)
+    B: Float[Array, ""] = amplitude("N m", 0.02, "torque", signed=True)
+    p: Float[Array, ""] = shape("1", RIPPLES, moves="by differences")
 
     def torque(self, x, memory, h):
         i = self.index[0]

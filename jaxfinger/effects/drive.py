@@ -8,10 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfinger.effects.base import ELASTIC, TORQUE, CatalogueEffect
+from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
 from jaxfinger.model import SharedFriction
-
-EXCURSION = ("tendon_excursion",)
 
 
 class JointOffset(CatalogueEffect):
@@ -19,10 +17,8 @@ class JointOffset(CatalogueEffect):
 
     ID: ClassVar = "joint_offset"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"tau": ("N m", 0.005, True)}
-    SHOWS: ClassVar = ELASTIC
 
-    tau: Float[Array, ""]
+    tau: Float[Array, ""] = amplitude("N m", 0.1, "torque", signed=True)
 
     def torque(self, x, memory, h):
         return h.at[self.index[0]].add(self.tau)
@@ -37,11 +33,9 @@ class JointFrictionAsymmetric(CatalogueEffect):
 
     ID: ClassVar = "joint_friction_asymmetric"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"coulomb": ("N m", 0.003, True), "damping": ("N m s/rad", 1e-3, True)}
-    SHOWS: ClassVar = TORQUE
 
-    coulomb: Float[Array, ""]
-    damping: Float[Array, ""]
+    coulomb: Float[Array, ""] = amplitude("N m", 0.06, "torque", signed=True)
+    damping: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed", signed=True)
 
     def torque(self, x, memory, h):
         i = self.index[0]
@@ -54,15 +48,8 @@ class JointTorqueFriction(CatalogueEffect):
 
     ID: ClassVar = "joint_torque_friction"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"mu": ("1", 0.1, False)}
-    SHARES: ClassVar = ("mu",)
-    SHOWS: ClassVar = TORQUE
-    MOVES_RIGID_BODY: ClassVar = True  # τ holds all of (1)
 
-    mu: Float[Array, ""]
-
-    def bounds(self):
-        return {"mu": (0.0, 0.95)}  # from 1 on a gear locks itself
+    mu: Float[Array, ""] = amplitude("1", 0.1, most=0.95)  # from 1 on a gear locks itself
 
     def torque_friction(self, mu):
         return mu.at[self.index[0]].add(self.mu)
@@ -80,20 +67,15 @@ class JointFrictionWarmup(CatalogueEffect):
 
     ID: ClassVar = "joint_friction_warmup"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"a": ("1", 0.3, True), "d": ("N m s/rad", 1e-3, True)}
-    SHAPES: ClassVar = {"T": ("s", (60.0, 240.0, 960.0, 3840.0)), "by": ("1", (0.0, 1.0))}
-    CHOICES: ClassVar = ("by",)
-    SHOWS: ClassVar = TORQUE
 
-    a: Float[Array, ""]
-    d: Float[Array, ""]
-    T: Float[Array, ""]
-    by: Float[Array, ""]
+    a: Float[Array, ""] = amplitude("1", 0.3, signed=True)
+    d: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed", signed=True)
+    T: Float[Array, ""] = shape("s", (0.2, 0.05, 0.8, 3.0), "session")
+    by: Float[Array, ""] = shape("1", (0.0, 1.0), moves="not")
 
     @classmethod
-    def shapes(cls, finger, site):
-        first = cls.SHAPES["T"][1][0]
-        return [s for s in super().shapes(finger, site) if s["by"] == 0.0 or s["T"] == first]
+    def sensible(cls, scales, site, shapes):
+        return shapes["by"] == 0.0 or shapes["T"] == cls.worth_trying(scales, site)["T"][0]
 
     def _cold(self, x) -> Float[Array, "*T"]:
         by_time = jnp.exp(-x.session_time / self.T)
@@ -119,22 +101,12 @@ class JointCoupling(CatalogueEffect):
 
     ID: ClassVar = "joint_coupling"
     PLACE: ClassVar = "joint pair"
-    AMPLITUDES: ClassVar = {
-        "coulomb": ("N m", 0.005, False),
-        "damping": ("N m s/rad", 1e-3, False),
-        "inertia": ("kg m2", 2e-5, False),
-    }
-    SHAPES: ClassVar = {"ratio": ("1", (1.0, -1.0))}
-    CHOICES: ClassVar = ("ratio",)
-    SHOWS: ClassVar = TORQUE
-    MOVES_RIGID_BODY: ClassVar = True
-    has_memory: ClassVar = True
     sharp: ClassVar = True
 
-    coulomb: Float[Array, ""]
-    damping: Float[Array, ""]
-    inertia: Float[Array, ""]
-    ratio: Float[Array, ""]
+    coulomb: Float[Array, ""] = amplitude("N m", 0.1, "torque")
+    damping: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed")
+    inertia: Float[Array, ""] = amplitude("kg m2", 0.2, "mass*length*length")
+    ratio: Float[Array, ""] = shape("1", (1.0, -1.0), moves="not")
 
     def _ways(self, finger_m: int) -> Float[Array, " m"]:
         a, b = self.index
@@ -176,14 +148,9 @@ class JointBacklash(CatalogueEffect):
 
     ID: ClassVar = "joint_backlash"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"a": ("1", 1.0, False)}
-    SHARES: ClassVar = ("a",)
-    SHAPES: ClassVar = {"width": ("rad", (0.005, 0.01, 0.02, 0.04, 0.08))}
-    SHOWS: ClassVar = TORQUE | {"ID.2": EXCURSION, "VD.1": EXCURSION, "VD.3": ("joint_torque", *EXCURSION)}
-    MOVES_RIGID_BODY: ClassVar = True
 
-    a: Float[Array, ""]
-    width: Float[Array, ""]
+    a: Float[Array, ""] = amplitude("1", 1.0, most=1.0)
+    width: Float[Array, ""] = shape("rad", (0.004, 0.007, 0.014, 0.03, 0.06), "angle")
 
     def true_motion(self, x):
         if x.held:

@@ -6,35 +6,31 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfinger.effects.base import DELTA, ELASTIC, TORQUE, CatalogueEffect, dahl
+from jaxfinger.effects.base import CatalogueEffect, amplitude, dahl, delta, shape
 
 
 class JointStribeck(CatalogueEffect):
     """τ_f (1 + a exp(−(|q̇|/v_s)^δ)): friction falls with speed after breakaway (Armstrong-Hélouvry 1994).
 
-    With δ = 1, v_s is not told from a damping from about 1 rad/s on; with δ = 2, whose friction holds first and then
-    falls, it is.
+    With δ = 1, a v_s near the joint's own speed is not told from a damping; with δ = 2, whose friction holds first
+    and then falls, it is.
     """
 
     ID: ClassVar = "joint_stribeck"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"a": ("1", 0.5, False)}
-    SHAPES: ClassVar = {"v_s": ("rad/s", (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)), "delta": ("1", (1.0, 2.0))}
-    CHOICES: ClassVar = ("delta",)
-    SLOW: ClassVar = 0.4  # rad/s, the largest v_s worth trying with δ = 1
-    SHOWS: ClassVar = TORQUE
+    SLOW: ClassVar = 0.4  # of the joint's speed, the largest v_s worth trying with δ = 1
 
-    a: Float[Array, ""]
-    v_s: Float[Array, ""]
-    delta: Float[Array, ""]
+    a: Float[Array, ""] = amplitude("1", 0.5)
+    v_s: Float[Array, ""] = shape("rad/s", (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.5), "speed")
+    delta: Float[Array, ""] = shape("1", (1.0, 2.0), moves="not")
 
     @classmethod
-    def shapes(cls, finger, site):
-        return [s for s in super().shapes(finger, site) if s["delta"] == 2.0 or s["v_s"] <= cls.SLOW]
+    def sensible(cls, scales, site, shapes):
+        return shapes["delta"] == 2.0 or shapes["v_s"] <= 1.001 * cls.SLOW * scales("speed", site)
 
-    def bounds(self):
-        ends = super().bounds()
-        return ends | {"v_s": (ends["v_s"][0], 2.0 * self.SLOW)} if self.delta == 1.0 else ends
+    def bounds(self, scales):
+        ends, slow = super().bounds(scales), self.SLOW * scales("speed", self.site)
+        return ends | {"v_s": (ends["v_s"][0], 2.0 * slow)} if self.delta == 1.0 else ends
 
     def joint_friction(self, x, f_j, C, F):
         i = self.index[0]
@@ -50,17 +46,11 @@ class JointPresliding(CatalogueEffect):
 
     ID: ClassVar = "joint_presliding"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"a": ("1", 1.0, False)}
-    SHARES: ClassVar = ("a",)
-    SHAPES: ClassVar = {"x0": ("rad", (0.002, 0.004, 0.008, 0.016, 0.03, 0.06, 0.12, 0.24)), "delta": DELTA}
-    CHOICES: ClassVar = ("delta",)
-    SHOWS: ClassVar = TORQUE
-    has_memory: ClassVar = True
     sharp: ClassVar = True
 
-    a: Float[Array, ""]
-    x0: Float[Array, ""]
-    delta: Float[Array, ""]
+    a: Float[Array, ""] = amplitude("1", 1.0, most=1.0)
+    x0: Float[Array, ""] = shape("rad", (0.0015, 0.003, 0.006, 0.012, 0.022, 0.045, 0.09, 0.18), "angle")
+    delta: Float[Array, ""] = delta()
 
     def drive(self, model, x):
         return x.q[self.index[0]] / self.x0
@@ -83,10 +73,8 @@ class JointLoadFriction(CatalogueEffect):
 
     ID: ClassVar = "joint_load_friction"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"mu": ("1", 0.1, False)}
-    SHOWS: ClassVar = {"VD.3": ("joint_torque",)}
 
-    mu: Float[Array, ""]
+    mu: Float[Array, ""] = amplitude("1", 0.1)
 
     def joint_friction(self, x, f_j, C, F):
         i = self.index[0]
@@ -95,6 +83,8 @@ class JointLoadFriction(CatalogueEffect):
 
 class _TowardsAnEnd(CatalogueEffect):
     """Shared by what happens near one end of a joint's range: `end` is +1 for the upper one, −1 for the lower."""
+
+    limits: Float[Array, "2"]
 
     @classmethod
     def constants(cls, finger, site):
@@ -106,15 +96,10 @@ class ElasticHardening(_TowardsAnEnd):
 
     ID: ClassVar = "elastic_hardening"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"tau_end": ("N m", 0.02, False)}
-    SHAPES: ClassVar = {"width": ("rad", (0.1, 0.2, 0.4, 0.7)), "end": ("1", (1.0, -1.0))}
-    CHOICES: ClassVar = ("end",)
-    SHOWS: ClassVar = ELASTIC
 
-    tau_end: Float[Array, ""]
-    width: Float[Array, ""]
-    end: Float[Array, ""]
-    limits: Float[Array, "2"]
+    tau_end: Float[Array, ""] = amplitude("N m", 0.4, "torque")
+    width: Float[Array, ""] = shape("rad", (0.07, 0.15, 0.3, 0.5), "angle")
+    end: Float[Array, ""] = shape("1", (1.0, -1.0), moves="not")
 
     def torque(self, x, memory, h):
         i = self.index[0]
@@ -127,21 +112,11 @@ class JointStop(_TowardsAnEnd):
 
     ID: ClassVar = "joint_stop"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"stiffness": ("N m/rad", 0.1, False)}
-    SHAPES: ClassVar = {
-        "place": ("1", (0.55, 0.62, 0.69, 0.76, 0.82, 0.88, 0.94)),
-        "end": ("1", (1.0, -1.0)),
-        "damping": ("s/rad", (0.0,)),
-    }
-    CHOICES: ClassVar = ("end", "damping")
-    SHIFTS: ClassVar = ("place",)
-    SHOWS: ClassVar = ELASTIC
 
-    stiffness: Float[Array, ""]
-    place: Float[Array, ""]
-    end: Float[Array, ""]
-    damping: Float[Array, ""]
-    limits: Float[Array, "2"]
+    stiffness: Float[Array, ""] = amplitude("N m/rad", 3.0, "torque/angle")
+    place: Float[Array, ""] = shape("1", (0.55, 0.62, 0.69, 0.76, 0.82, 0.88, 0.94), moves="by differences")
+    end: Float[Array, ""] = shape("1", (1.0, -1.0), moves="not")
+    damping: Float[Array, ""] = shape("s/rad", (0.0,), moves="not")
 
     def torque(self, x, memory, h):
         i = self.index[0]
@@ -157,13 +132,9 @@ class ElasticRelaxation(CatalogueEffect):
 
     ID: ClassVar = "elastic_relaxation"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"stiffness": ("N m/rad", 0.01, False)}
-    SHAPES: ClassVar = {"T": ("s", (0.1, 0.3, 1.0, 3.0, 10.0, 30.0))}
-    SHOWS: ClassVar = ELASTIC
-    has_memory: ClassVar = True
 
-    stiffness: Float[Array, ""]
-    T: Float[Array, ""]
+    stiffness: Float[Array, ""] = amplitude("N m/rad", 0.3, "torque/angle")
+    T: Float[Array, ""] = shape("s", (0.003, 0.01, 0.03, 0.1, 0.3, 1.0), "trial")
 
     def drive(self, model, x):
         return x.time, x.q[self.index[0]]
@@ -187,20 +158,11 @@ class PassiveTendon(CatalogueEffect):
 
     ID: ClassVar = "passive_tendon"
     PLACE: ClassVar = "joint pair"
-    AMPLITUDES: ClassVar = {"kappa": ("N m/rad", 0.05, False)}
-    SHAPES: ClassVar = {
-        "rho": ("1", (0.5, 0.8, 1.0, 1.3, 2.0)),
-        "phi": ("rad", (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5)),
-        "side": ("1", (1.0, -1.0)),
-    }
-    CHOICES: ClassVar = ("side",)
-    SHIFTS: ClassVar = ("phi",)
-    SHOWS: ClassVar = ELASTIC
 
-    kappa: Float[Array, ""]
-    rho: Float[Array, ""]
-    phi: Float[Array, ""]
-    side: Float[Array, ""]
+    kappa: Float[Array, ""] = amplitude("N m/rad", 1.5, "torque/angle")
+    rho: Float[Array, ""] = shape("1", (0.5, 0.8, 1.0, 1.3, 2.0))
+    phi: Float[Array, ""] = shape("rad", (-0.7, -0.35, -0.18, 0.0, 0.18, 0.35), "angle", moves="by differences")
+    side: Float[Array, ""] = shape("1", (1.0, -1.0), moves="not")
 
     def torque(self, x, memory, h):
         a, b = self.index

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfinger.effects.base import ELASTIC, TENSION, TORQUE, CatalogueEffect
+from jaxfinger.effects.base import CatalogueEffect, amplitude
 
 
 class JointElastic(CatalogueEffect):
@@ -15,12 +15,10 @@ class JointElastic(CatalogueEffect):
 
     ID: ClassVar = "joint_elastic"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"k0": ("N m", 0.01, True), "k1": ("N m/rad", 0.03, True), "k2": ("N m/rad^2", 0.02, True)}
-    SHOWS: ClassVar = ELASTIC
 
-    k0: Float[Array, ""]
-    k1: Float[Array, ""]
-    k2: Float[Array, ""]
+    k0: Float[Array, ""] = amplitude("N m", 0.2, "torque", signed=True)
+    k1: Float[Array, ""] = amplitude("N m/rad", 0.8, "torque/angle", signed=True)
+    k2: Float[Array, ""] = amplitude("N m/rad^2", 0.8, "torque/angle/angle", signed=True)
 
     def torque(self, x, memory, h):
         i = self.index[0]
@@ -32,16 +30,10 @@ class JointCoulomb(CatalogueEffect):
 
     ID: ClassVar = "joint_coulomb"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {
-        "c0": ("N m", 0.005, False),
-        "c1": ("N m/rad", 0.003, True),
-        "c2": ("N m/rad^2", 0.002, True),
-    }
-    SHOWS: ClassVar = TORQUE
 
-    c0: Float[Array, ""]
-    c1: Float[Array, ""]
-    c2: Float[Array, ""]
+    c0: Float[Array, ""] = amplitude("N m", 0.1, "torque")
+    c1: Float[Array, ""] = amplitude("N m/rad", 0.1, "torque/angle", signed=True)
+    c2: Float[Array, ""] = amplitude("N m/rad^2", 0.1, "torque/angle/angle", signed=True)
 
     def joint_friction(self, x, f_j, C, F):
         i = self.index[0]
@@ -53,10 +45,8 @@ class JointDamping(CatalogueEffect):
 
     ID: ClassVar = "joint_damping"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"d": ("N m s/rad", 1e-3, False)}
-    SHOWS: ClassVar = TORQUE
 
-    d: Float[Array, ""]
+    d: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed")
 
     def torque(self, x, memory, h):
         i = self.index[0]
@@ -68,11 +58,9 @@ class TendonFrictionTerm(CatalogueEffect):
 
     ID: ClassVar = "tendon_friction"
     PLACE: ClassVar = "tendon"
-    AMPLITUDES: ClassVar = {"a0": ("N", 0.5, True), "a1": ("1", 0.3, True)}
-    SHOWS: ClassVar = TENSION
 
-    a0: Float[Array, ""]
-    a1: Float[Array, ""]
+    a0: Float[Array, ""] = amplitude("N", 0.05, "tension", signed=True)
+    a1: Float[Array, ""] = amplitude("1", 0.3, signed=True)
 
     def loss(self, x, f, C, loss):
         k = self.index[0]
@@ -84,13 +72,10 @@ class Gravity(CatalogueEffect):
 
     ID: ClassVar = "gravity"
     PLACE: ClassVar = "base"
-    AMPLITUDES: ClassVar = {"x": ("m s-2", 9.8, True), "y": ("m s-2", 9.8, True), "z": ("m s-2", 9.8, True)}
-    SHOWS: ClassVar = ELASTIC
-    MOVES_RIGID_BODY: ClassVar = True
 
-    x: Float[Array, ""]
-    y: Float[Array, ""]
-    z: Float[Array, ""]
+    x: Float[Array, ""] = amplitude("m s-2", 0.2, "torque/mass/length", signed=True)
+    y: Float[Array, ""] = amplitude("m s-2", 0.2, "torque/mass/length", signed=True)
+    z: Float[Array, ""] = amplitude("m s-2", 0.2, "torque/mass/length", signed=True)
 
     def finger(self, finger):
         return eqx.tree_at(lambda f: f.gravity, finger, finger.gravity + jnp.stack([self.x, self.y, self.z]))
@@ -99,12 +84,15 @@ class Gravity(CatalogueEffect):
 @cache
 def of_degree(term: type[CatalogueEffect], degree: int) -> type[CatalogueEffect]:
     """A polynomial term as a recipe of this degree has it: higher coefficients are nothing, and not looked for."""
-    names = list(term.AMPLITUDES)
+    names = list(term.parameters())
     if degree + 1 >= len(names):
         return term
 
     class OfDegree(term):
-        AMPLITUDES: ClassVar = {n: term.AMPLITUDES[n] for n in names[: degree + 1]}
+        @classmethod
+        def parameters(cls):
+            declared = term.parameters()
+            return {n: declared[n] for n in names[: degree + 1]}
 
         @classmethod
         def constants(cls, finger, site):

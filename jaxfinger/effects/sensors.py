@@ -6,10 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfinger.effects.base import ALL, BOTH, ELASTIC, TENSION, CatalogueEffect, rate
-
-TORQUE_SENSOR = {e: ("joint_torque",) for e in ("ID.3-static", "ID.3-dynamic", "ID.4")}
-EVERYWHERE = {e: tuple(dict.fromkeys((*ELASTIC.get(e, ()), *BOTH.get(e, ())))) for e in ALL}
+from jaxfinger.effects.base import CatalogueEffect, amplitude, rate, shape
 
 
 class TorqueSensorScale(CatalogueEffect):
@@ -17,58 +14,42 @@ class TorqueSensorScale(CatalogueEffect):
 
     ID: ClassVar = "torque_sensor_scale"
     PLACE: ClassVar = "torque_sensor"
-    AMPLITUDES: ClassVar = {"gain": ("1", 0.06, True)}
-    SHOWS: ClassVar = TORQUE_SENSOR
 
-    gain: Float[Array, ""]
+    gain: Float[Array, ""] = amplitude("1", 0.06, signed=True)
 
     def reading(self, channel, x, y):
         return y * (1.0 + self.gain * x.motorised) if channel == "joint_torque" else y
 
 
 class TorqueSensorDrift(CatalogueEffect):
-    """Offset that moves after the sensor was tared: b T (1 − exp(−t/T)), and a slow wandering.
+    """o(s) − o(tare), o = −b T exp(−s/T) + A cos(2π (s − m)/P) + B sin(2π (s − m)/P): an offset follows a temperature.
 
-    t counts from the tare, `tare` seconds before the trial. It wanders with the session's time s, of which m is the
-    middle: A cos(2π (s − m)/P) + B sin(2π (s − m)/P) and as much with the period P₂, less its value at the tare.
+    A strain gauge warms up from the session's start on, s = 0, at first by b a second, and goes with the room, which
+    heats and cools with a period P. The tare, `tare` seconds before the trial, takes away what the offset was then; m
+    is the middle of the session.
     """
 
     ID: ClassVar = "torque_sensor_drift"
     PLACE: ClassVar = "torque_sensor"
-    AMPLITUDES: ClassVar = {
-        "slope": ("N m/s", 4e-5, True),
-        **{n: ("N m", 3e-4, True) for n in ("A", "B", "A_2", "B_2")},
-    }
-    SHAPES: ClassVar = {
-        "T": ("s", (1e4, 6.0)),
-        "P": ("s", (250.0, 40.0, 1e4)),
-        "P_2": ("s", (60.0, 40.0, 1e4)),
-        "tare": ("s", (1.0, 6.0)),
-        "middle": ("s", (0.0,)),
-    }
-    CHOICES: ClassVar = ("middle",)
-    PERIODS: ClassVar = {"P": ("A", "B"), "P_2": ("A_2", "B_2")}
-    SHOWS: ClassVar = TORQUE_SENSOR
 
-    slope: Float[Array, ""]
-    A: Float[Array, ""]
-    B: Float[Array, ""]
-    A_2: Float[Array, ""]
-    B_2: Float[Array, ""]
-    T: Float[Array, ""]
-    P: Float[Array, ""]
-    P_2: Float[Array, ""]
-    tare: Float[Array, ""]
-    middle: Float[Array, ""]
+    slope: Float[Array, ""] = amplitude("N m/s", 0.02, "torque/trial", signed=True)
+    A: Float[Array, ""] = amplitude("N m", 0.006, "torque", signed=True)
+    B: Float[Array, ""] = amplitude("N m", 0.006, "torque", signed=True)
+    T: Float[Array, ""] = shape("s", (30.0, 0.3), "session")
+    P: Float[Array, ""] = shape("s", (0.25, 0.04, 10.0), "session", period_of=("A", "B"))
+    tare: Float[Array, ""] = shape("s", (0.1, 0.03), "trial")
+    middle: Float[Array, ""] = shape("s", (0.0,), "session", moves="not")
+
+    def _offset(self, s):
+        phase = 2.0 * jnp.pi * (s - self.middle) / self.P
+        warm = -self.slope * self.T * jnp.expm1(-s / self.T)
+        return warm + self.A * jnp.cos(phase) + self.B * jnp.sin(phase)
 
     def reading(self, channel, x, y):
         if channel != "joint_torque":
             return y
-        since, s, wander = x.time + self.tare, x.session_time - self.middle, 0.0
-        for a, b, period in ((self.A, self.B, self.P), (self.A_2, self.B_2, self.P_2)):
-            now, tare = 2.0 * jnp.pi * s / period, 2.0 * jnp.pi * (s - since) / period
-            wander += a * (jnp.cos(now) - jnp.cos(tare)) + b * (jnp.sin(now) - jnp.sin(tare))
-        return y + (self.slope * self.T * -jnp.expm1(-since / self.T) + wander) * x.motorised
+        tared = x.session_time - x.time - self.tare
+        return y + (self._offset(x.session_time) - self._offset(tared)) * x.motorised
 
 
 class TensionSensorScale(CatalogueEffect):
@@ -76,11 +57,9 @@ class TensionSensorScale(CatalogueEffect):
 
     ID: ClassVar = "tension_sensor_scale"
     PLACE: ClassVar = "tendon"
-    AMPLITUDES: ClassVar = {"gain": ("1", 0.05, True), "offset": ("N", 0.3, True)}
-    SHOWS: ClassVar = TENSION
 
-    gain: Float[Array, ""]
-    offset: Float[Array, ""]
+    gain: Float[Array, ""] = amplitude("1", 0.05, signed=True)
+    offset: Float[Array, ""] = amplitude("N", 0.03, "tension", signed=True)
 
     def true_motion(self, x):
         k = self.index[0]
@@ -91,8 +70,6 @@ class TensionSensorScale(CatalogueEffect):
 
 class _Encoder(CatalogueEffect):
     """Shared by errors of a joint's encoder: q = q_measured − error(q_measured)."""
-
-    MOVES_RIGID_BODY: ClassVar = True
 
     def error(self, q: Float[Array, "*T"]) -> Float[Array, "*T"]:
         return jnp.zeros_like(q)
@@ -107,10 +84,8 @@ class EncoderOffset(_Encoder):
 
     ID: ClassVar = "encoder_offset"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"offset": ("rad", 0.03, True)}
-    SHOWS: ClassVar = EVERYWHERE
 
-    offset: Float[Array, ""]
+    offset: Float[Array, ""] = amplitude("rad", 0.02, "angle", signed=True)
 
     def error(self, q):
         return self.offset + 0.0 * q
@@ -121,11 +96,9 @@ class EncoderEccentricity(_Encoder):
 
     ID: ClassVar = "encoder_eccentricity"
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"A": ("rad", 0.015, True), "B": ("rad", 0.015, True)}
-    SHOWS: ClassVar = EVERYWHERE
 
-    A: Float[Array, ""]
-    B: Float[Array, ""]
+    A: Float[Array, ""] = amplitude("rad", 0.01, "angle", signed=True)
+    B: Float[Array, ""] = amplitude("rad", 0.01, "angle", signed=True)
 
     def error(self, q):
         return self.A * jnp.sin(q) + self.B * jnp.cos(q)
@@ -136,12 +109,10 @@ class ForceSensorRotation(CatalogueEffect):
 
     ID: ClassVar = "force_sensor_rotation"
     PLACE: ClassVar = "fingertip"
-    AMPLITUDES: ClassVar = {"x": ("rad", 0.06, True), "y": ("rad", 0.06, True), "z": ("rad", 0.06, True)}
-    SHOWS: ClassVar = {"VD.2": ("fingertip_force",)}
 
-    x: Float[Array, ""]
-    y: Float[Array, ""]
-    z: Float[Array, ""]
+    x: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
+    y: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
+    z: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
 
     def reading(self, channel, x, y):
         if channel != "fingertip_force":
@@ -158,11 +129,8 @@ class ChannelDelay(CatalogueEffect):
 
     ID: ClassVar = "channel_delay"
     PLACE: ClassVar = "channel"
-    AMPLITUDES: ClassVar = {"delay": ("s", 5e-3, False)}
-    SHOWS: ClassVar = {e: channels for e, channels in EVERYWHERE.items() if e not in ("ID.4", "VD.2")}
-    MOVES_RIGID_BODY: ClassVar = True
 
-    delay: Float[Array, ""]
+    delay: Float[Array, ""] = amplitude("s", 0.004, "angle/speed")
 
     @classmethod
     def sites(cls, finger):

@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfinger.effects.base import BOTH, EXCURSION, CatalogueEffect
+from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
 
 
 class TendonStretch(CatalogueEffect):
@@ -14,14 +14,10 @@ class TendonStretch(CatalogueEffect):
 
     ID: ClassVar = "tendon_stretch"
     PLACE: ClassVar = "tendon"
-    AMPLITUDES: ClassVar = {"compliance": ("m/N", 5e-5, False)}
-    SHAPES: ClassVar = {"toe": ("1", (0.0, 2.0, 6.0)), "f0": ("N", (1.0, 3.0))}
-    SHIFTS: ClassVar = ("toe",)
-    SHOWS: ClassVar = EXCURSION
 
-    compliance: Float[Array, ""]
-    toe: Float[Array, ""]
-    f0: Float[Array, ""]
+    compliance: Float[Array, ""] = amplitude("m/N", 0.04, "excursion/tension")
+    toe: Float[Array, ""] = shape("1", (0.0, 2.0, 6.0), moves="by differences")
+    f0: Float[Array, ""] = shape("N", (0.1, 0.3), "tension")
 
     def excursion(self, x, memory, f, l):
         k = self.index[0]
@@ -34,13 +30,9 @@ class TendonCreep(CatalogueEffect):
 
     ID: ClassVar = "tendon_creep"
     PLACE: ClassVar = "tendon"
-    AMPLITUDES: ClassVar = {"compliance": ("m/N", 1e-5, False)}
-    SHAPES: ClassVar = {"T": ("s", (0.5, 1.5, 5.0, 15.0, 50.0))}
-    SHOWS: ClassVar = EXCURSION
-    has_memory: ClassVar = True
 
-    compliance: Float[Array, ""]
-    T: Float[Array, ""]
+    compliance: Float[Array, ""] = amplitude("m/N", 0.01, "excursion/tension")
+    T: Float[Array, ""] = shape("s", (0.015, 0.05, 0.15, 0.5, 1.5), "trial")
 
     def drive(self, model, x):
         return x.time, x.tension[self.index[0]]
@@ -59,21 +51,15 @@ class TendonCreep(CatalogueEffect):
 class TendonBacklash(CatalogueEffect):
     """Excursion lags by a dead zone: p = clip(p before, f(q) − b/2, f(q) + b/2), the play operator.
 
-    `a` is the share of the excursion that goes through the dead zone `width`; 1 where all of it does. None
-    narrower than 10 µm, an encoder's noise, is looked for.
+    `a` is the share of the excursion that goes through the dead zone `width`; 1 where all of it does.
     """
 
     ID: ClassVar = "tendon_backlash"
     PLACE: ClassVar = "tendon"
-    AMPLITUDES: ClassVar = {"a": ("1", 1.0, False)}
-    SHARES: ClassVar = ("a",)
-    SHAPES: ClassVar = {"width": ("m", (2e-5, 4e-5, 8e-5, 1.6e-4, 3.2e-4, 6.4e-4))}
-    SHOWS: ClassVar = EXCURSION
-    has_memory: ClassVar = True
     sharp: ClassVar = True
 
-    a: Float[Array, ""]
-    width: Float[Array, ""]
+    a: Float[Array, ""] = amplitude("1", 1.0, most=1.0)
+    width: Float[Array, ""] = shape("m", (0.0017, 0.0033, 0.0067, 0.013, 0.027, 0.053), "excursion")
 
     def drive(self, model, x):
         return model.moment_arm.of(self.index[0]).excursion(x.q)[0]
@@ -94,23 +80,19 @@ class MomentArmCoupling(CatalogueEffect):
 
     ID: ClassVar = "moment_arm_coupling"
     PLACE: ClassVar = "tendon"
-    AMPLITUDES: ClassVar = {"A": ("m", 5e-4, True), "B": ("m", 3e-4, True), "D": ("m", 3e-4, True)}
-    SHAPES: ClassVar = {"joint_a": ("1", (0.0,)), "joint_b": ("1", (1.0,))}
-    CHOICES: ClassVar = ("joint_a", "joint_b")
-    SHOWS: ClassVar = BOTH
 
-    A: Float[Array, ""]
-    B: Float[Array, ""]
-    D: Float[Array, ""]
-    joint_a: Float[Array, ""]
-    joint_b: Float[Array, ""]
+    A: Float[Array, ""] = amplitude("m", 0.08, "excursion/angle/angle", signed=True)
+    B: Float[Array, ""] = amplitude("m", 0.07, "excursion/angle/angle/angle", signed=True)
+    D: Float[Array, ""] = amplitude("m", 0.07, "excursion/angle/angle/angle", signed=True)
+    joint_a: Float[Array, ""] = shape("1", (0.0,), moves="not")
+    joint_b: Float[Array, ""] = shape("1", (1.0,), moves="not")
 
     @classmethod
     def sites(cls, finger):
         return [s for s in super().sites(finger) if sum(finger.crosses[finger.tendon_names.index(s[0])]) > 1]
 
     @classmethod
-    def shapes(cls, finger, site):
+    def shapes(cls, finger, site, scales):
         crossed = [i for i, c in enumerate(finger.crosses[finger.tendon_names.index(site[0])]) if c]
         return [{"joint_a": float(a), "joint_b": float(b)} for a, b in combinations(crossed, 2)]
 
@@ -134,10 +116,8 @@ class MomentArmBowstring(CatalogueEffect):
 
     ID: ClassVar = "moment_arm_bowstring"
     PLACE: ClassVar = "tendon"
-    AMPLITUDES: ClassVar = {"b": ("1/N", 0.01, False)}
-    SHOWS: ClassVar = BOTH
 
-    b: Float[Array, ""]
+    b: Float[Array, ""] = amplitude("1/N", 0.1, "1/tension")
 
     def excursion(self, x, memory, f, l):
         k = self.index[0]

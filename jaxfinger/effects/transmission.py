@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfinger.effects.base import DELTA, TENSION, CatalogueEffect, dahl
+from jaxfinger.effects.base import CatalogueEffect, amplitude, dahl, delta, shape
 
 
 class TendonFrictionCapstan(CatalogueEffect):
@@ -16,15 +16,11 @@ class TendonFrictionCapstan(CatalogueEffect):
 
     ID: ClassVar = "tendon_friction_capstan"
     PLACE: ClassVar = "tendon"
-    AMPLITUDES: ClassVar = {"mu": ("1/rad", 0.1, False)}
     SIZES: ClassVar = (1.0, 0.05)
-    SHAPES: ClassVar = {"curvature": ("1", (1.0, 0.0))}
-    CHOICES: ClassVar = ("curvature",)
-    SHOWS: ClassVar = TENSION
 
-    mu: Float[Array, ""]
-    curvature: Float[Array, ""]
     crossed: Float[Array, " m"]
+    mu: Float[Array, ""] = amplitude("1/rad", 0.1)
+    curvature: Float[Array, ""] = shape("1", (1.0, 0.0), moves="not")
 
     @classmethod
     def constants(cls, finger, site):
@@ -42,10 +38,8 @@ class TendonFrictionViscous(CatalogueEffect):
 
     ID: ClassVar = "tendon_friction_viscous"
     PLACE: ClassVar = "tendon"
-    AMPLITUDES: ClassVar = {"b": ("N s/m", 30.0, False)}
-    SHOWS: ClassVar = {"VD.3": ("joint_torque",)}
 
-    b: Float[Array, ""]
+    b: Float[Array, ""] = amplitude("N s/m", 0.04, "tension/pull")
 
     def loss(self, x, f, C, loss):
         k = self.index[0]
@@ -62,29 +56,18 @@ class TendonFrictionPresliding(CatalogueEffect):
 
     ID: ClassVar = "tendon_friction_presliding"
     PLACE: ClassVar = "tendon"
-    AMPLITUDES: ClassVar = {"a": ("1", 1.0, False)}
-    SHARES: ClassVar = ("a",)
-    SHAPES: ClassVar = {
-        "x0": ("m", (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)),
-        "f0": ("N", (0.3, 1.0, 3.0)),
-        "stretches": ("1", (1.0, 0.0)),
-        "delta": DELTA,
-    }
-    CHOICES: ClassVar = ("stretches", "delta")
-    SHOWS: ClassVar = TENSION
-    has_memory: ClassVar = True
     sharp: ClassVar = True
 
-    a: Float[Array, ""]
-    x0: Float[Array, ""]
-    f0: Float[Array, ""]
-    stretches: Float[Array, ""]
-    delta: Float[Array, ""]
+    a: Float[Array, ""] = amplitude("1", 1.0, most=1.0)
+    x0: Float[Array, ""] = shape("m", (0.0025, 0.008, 0.025, 0.08, 0.25), "excursion")
+    f0: Float[Array, ""] = shape("N", (0.03, 0.1, 0.3), "tension")
+    stretches: Float[Array, ""] = shape("1", (1.0, 0.0), moves="not")
+    delta: Float[Array, ""] = delta()
 
     @classmethod
-    def shapes(cls, finger, site):
-        first = cls.SHAPES["f0"][1][0]
-        return [s for s in super().shapes(finger, site) if (s["stretches"] and s["delta"] == 1) or s["f0"] == first]
+    def sensible(cls, scales, site, shapes):
+        first = cls.worth_trying(scales, site)["f0"][0]
+        return bool(shapes["stretches"] and shapes["delta"] == 1) or shapes["f0"] == first
 
     def drive(self, model, x):
         k = self.index[0]
@@ -107,22 +90,19 @@ class TendonFrictionPresliding(CatalogueEffect):
 
 
 class TendonFrictionSaturating(CatalogueEffect):
-    """c f* ((f/f*)^p − f/f*), f* = 10 N: the loss is not affine in tension."""
+    """c f* ((f/f*)^p − f/f*), f* a large tension: the loss is not affine in tension."""
 
     ID: ClassVar = "tendon_friction_saturating"
     PLACE: ClassVar = "tendon"
-    AMPLITUDES: ClassVar = {"c": ("1", 0.15, True)}
-    SHAPES: ClassVar = {"p": ("1", (0.5, 2.0))}
-    SHIFTS: ClassVar = ("p",)
-    SHOWS: ClassVar = TENSION
 
-    c: Float[Array, ""]
-    p: Float[Array, ""]
+    c: Float[Array, ""] = amplitude("1", 0.15, signed=True)
+    p: Float[Array, ""] = shape("1", (0.5, 2.0), moves="by differences")
+    large: Float[Array, ""] = shape("N", (1.0,), "tension", moves="not")
 
     def loss(self, x, f, C, loss):
         k = self.index[0]
-        u = jnp.maximum(f[k], 1e-6) / 10.0
-        return loss.at[k].add(10.0 * self.c * (u**self.p - u))
+        u = jnp.maximum(f[k] / self.large, 1e-7)
+        return loss.at[k].add(self.c * self.large * (u**self.p - u))
 
 
 class TendonCrosstalk(CatalogueEffect):
@@ -134,16 +114,11 @@ class TendonCrosstalk(CatalogueEffect):
 
     ID: ClassVar = "tendon_crosstalk"
     PLACE: ClassVar = "tendon pair"
-    AMPLITUDES: ClassVar = {"epsilon": ("1", 0.05, False)}
     SIZES: ClassVar = (1.0, 0.05)
-    SHAPES: ClassVar = {"behind": ("1", (0.0, 1.0)), "onset": ("N", (0.0, 4.0))}
-    CHOICES: ClassVar = ("behind",)
-    SHIFTS: ClassVar = ("onset",)
-    SHOWS: ClassVar = TENSION
 
-    epsilon: Float[Array, ""]
-    behind: Float[Array, ""]
-    onset: Float[Array, ""]
+    epsilon: Float[Array, ""] = amplitude("1", 0.05)
+    behind: Float[Array, ""] = shape("1", (0.0, 1.0), moves="not")
+    onset: Float[Array, ""] = shape("N", (0.0, 0.4), "tension", moves="by differences")
 
     def _drag(self, f):
         return self.epsilon * jnp.maximum(f[self.index[1]] - self.onset, 0.0)

@@ -3,6 +3,7 @@
 from jaxfinger.experiments.predict import demean, predict
 from jaxfinger.experiments.prepare import Batch, Stack, prepare
 from jaxfinger.experiments.shapes import SAMPLES, TRIALS, blocks, padded, roomy, split
+from jaxfinger.experiments.shows import shows
 from jaxfinger.experiments.table import EXPERIMENTS, Experiment
 
 __all__ = [
@@ -18,5 +19,6 @@ __all__ = [
     "predict",
     "prepare",
     "roomy",
+    "shows",
     "split",
 ]

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxfinger.effects import CatalogueEffect
+from jaxfinger.effects import CatalogueEffect, Scales
+from jaxfinger.experiments import shows
 from jaxfinger.gap.problem import Problem, assemble, moved
 from jaxfinger.gap.refine import Refined, derivatives_by_name, nominal_step
 from jaxfinger.gap.signatures import Signatures
@@ -45,8 +46,8 @@ def augmented_fit(problem: Problem, chosen: Refined) -> Fitted:
     """Nominal parameters, amplitudes and moving shapes, fitted exactly, with their covariance."""
     model, moving = _with_effects(problem.nominal, chosen)
     free, prior = np.concatenate([problem.free, moving]), _prior(problem, model, moving)
-    sources = {e: _seeing_effects(s, chosen, moving, e) for e, s in problem.sources.items()}
-    fitted, solution = solve(model, free, sources, prior, limits=limits(model, free))
+    sources = {e: _seeing_effects(problem, s, chosen, moving, e) for e, s in problem.sources.items()}
+    fitted, solution = solve(model, free, sources, prior, limits=limits(model, free, problem.scales))
     r, J = assemble(solution.linearised, sources, problem.rows, free, ravel(model).size)
     fit = _fit(problem, fitted, free, _covariance(problem, r, J, prior.root), r, WITH_EFFECTS, solution)
     return Fitted(fit, r, J, partial(missed_by, sources))
@@ -97,7 +98,7 @@ def _with_effects(nominal: Model, chosen: Refined) -> tuple[Model, Int[np.ndarra
 def _prior(problem: Problem, model: Model, moving: Int[np.ndarray, " k"]) -> Prior:
     """The problem's, and a weak one on amplitudes and shapes, so that a flat direction stays put."""
     mean = np.concatenate([problem.prior.mean, np.asarray(ravel(model))[moving]])
-    (rows, p), wide = problem.root.shape, np.asarray(ravel(_on_effects(_widths, model)))
+    (rows, p), wide = problem.root.shape, np.asarray(ravel(_on_effects(partial(_widths, problem.scales), model)))
     root = np.zeros((rows + len(moving), p + len(moving)))
     root[:rows, :p], root[rows:, p:] = problem.root, np.diag(1.0 / wide[moving])
     return Prior(mean, root)
@@ -110,14 +111,15 @@ def _on_effects(change: Callable[[CatalogueEffect], CatalogueEffect], model: Mod
 
 def _moves(effect: CatalogueEffect) -> CatalogueEffect:
     """Of every parameter 1 where a fit may move it: not a choice, nor a share that is at its most."""
-    stays = {*effect.CHOICES, *(n for n in effect.SHARES if getattr(effect, n) >= 1.0)}
+    stays = {n for n, p in effect.shape_parameters().items() if p.moves == "not" or len(p.values) == 1}
+    stays |= {n for n, p in effect.amplitudes().items() if getattr(effect, n) >= p.most}
     return replace(effect, **{n: jnp.asarray(float(n not in stays)) for n in effect.values()})
 
 
-def limits(model: Model, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def limits(model: Model, free: np.ndarray, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
     """Least and most of every free parameter: those of effects keep within bounds."""
     of_effect = np.array([p.group == "effects" for p in describe(model)])[free]
-    low, high = (np.asarray(ravel(_on_effects(partial(_limit, side), model)))[free] for side in (0, 1))
+    low, high = (np.asarray(ravel(_on_effects(partial(_limit, side, scales), model)))[free] for side in (0, 1))
     return np.where(of_effect, low, -np.inf), np.where(of_effect, high, np.inf)
 
 
@@ -130,28 +132,29 @@ def without_shapes(model: Model, free: np.ndarray) -> np.ndarray:
 
 def _shapes(effect: CatalogueEffect) -> CatalogueEffect:
     """Of every parameter 1 where it is no amplitude."""
-    return replace(effect, **{n: jnp.asarray(float(n not in effect.AMPLITUDES)) for n in effect.values()})
+    return replace(effect, **{n: jnp.asarray(float(n in effect.shape_parameters())) for n in effect.values()})
 
 
-def _limit(side: int, effect: CatalogueEffect) -> CatalogueEffect:
+def _limit(side: int, scales: Scales, effect: CatalogueEffect) -> CatalogueEffect:
     """Of every parameter, the bound below or above (`side` 0 or 1) that refits keep to."""
-    ends = effect.bounds()
+    ends = effect.bounds(scales)
     free = (-np.inf, np.inf)
     return replace(effect, **{n: jnp.asarray(ends.get(n, free)[side], dtype=float) for n in effect.values()})
 
 
-def _widths(effect: CatalogueEffect) -> CatalogueEffect:
+def _widths(scales: Scales, effect: CatalogueEffect) -> CatalogueEffect:
     """Of the prior: three times an amplitude's own or plausible size, three times a factor, the range of a place."""
     size = {n: abs(v) for n, v in effect.values().items()}
-    amplitudes = {n: 3.0 * max(size[n], unit) for n, (_, unit, _) in effect.AMPLITUDES.items()}
-    factors = {n: 3.0 * max(size[n], 1e-12) for n in effect.SHAPES}
-    places = {n: np.ptp(effect.SHAPES[n][1]) for n in effect.SHIFTS}
+    amplitudes = {n: 3.0 * max(size[n], unit) for n, unit in effect.sizes(scales, effect.site).items()}
+    grids, shapes = effect.worth_trying(scales, effect.site), effect.shape_parameters()
+    factors = {n: 3.0 * max(size[n], 1e-12) for n in shapes}
+    places = {n: np.ptp(v) or factors[n] for n, v in grids.items() if shapes[n].moves == "by differences"}
     return replace(effect, **{n: jnp.asarray(w, dtype=float) for n, w in (amplitudes | factors | places).items()})
 
 
-def _seeing_effects(source: Source, chosen: Refined, moving, experiment: str) -> Source:
+def _seeing_effects(problem: Problem, source: Source, chosen: Refined, moving, experiment: str) -> Source:
     """The source, reading the effects' parameters too where one of them shows."""
-    if not any(experiment in type(e).SHOWS for e in chosen.effects):
+    if not any(experiment in shows(type(e), problem.nominal.finger) for e in chosen.effects):
         return source._replace(effects=False)
     return source._replace(positions=np.union1d(source.positions, moving).astype(int))
 

@@ -260,9 +260,8 @@ def as_gap_json(d: Diagnosis) -> dict:
         if values is None:
             effect = c.evidence.variant.effect
             units = units_at(d.problem.nominal.finger, effect, c.key[1])
-            sizes = [v[1] for v in effect.AMPLITUDES.values()]
-            found = zip(effect.AMPLITUDES, c.evidence.amplitudes, c.evidence.std, sizes, strict=True)
-            stated = {n: _with_prior(float(a), float(u), s) for n, a, u, s in found}
+            found = zip(c.evidence.variant.sizes.items(), c.evidence.amplitudes, c.evidence.std, strict=True)
+            stated = {n: _with_prior(float(a), float(u), s) for (n, s), a, u in found}
             values = {n: {"value": v, "std": std, "units": units[n]} for n, (v, std) in stated.items()}
         candidates.append(
             {

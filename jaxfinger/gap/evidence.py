@@ -64,6 +64,8 @@ class Evidence:
 def evidence(variant: Variant, Z: np.ndarray, Zt: np.ndarray, rt: np.ndarray) -> Evidence:
     """Evidence of a variant from its signatures (amplitudes, N), raw and projected."""
     G, b, kind = Zt @ Zt.T, Zt @ rt, variant.effect
+    amplitudes = kind.amplitudes()
+    one_sided = len(b) == 1 and not next(iter(amplitudes.values())).signed
     raw = float(np.sum(Z * Z))
     absorbed = 1.0 - float(np.trace(G)) / raw if raw > 0 else 1.0
     logs, k = [], len(b)
@@ -76,14 +78,14 @@ def evidence(variant: Variant, Z: np.ndarray, Zt: np.ndarray, rt: np.ndarray) ->
         precision = G + np.eye(k) / s**2
         mean = np.linalg.solve(precision, b)
         log_bf = 0.5 * b @ mean - 0.5 * np.linalg.slogdet(np.eye(k) + s**2 * G)[1]
-        if k == 1 and not next(iter(kind.AMPLITUDES.values()))[2]:
+        if one_sided:
             # half-normal prior: twice the mass of the right sign
             log_bf += np.log(2.0) + log_ndtr(mean[0] * np.sqrt(precision[0, 0]))
         logs.append(log_bf)
     averaged = float(logsumexp(logs) - np.log(len(logs)))
-    if k == 1 and a[0] < 0 and not next(iter(kind.AMPLITUDES.values()))[2]:
+    if one_sided and a[0] < 0:
         return Evidence(variant, np.zeros(1), std, 0.0, averaged, absorbed)
-    most = np.array([1.0 / unit if n in kind.SHARES else np.inf for n, (_, unit, _) in kind.AMPLITUDES.items()])
+    most = np.array([amplitudes[n].most / unit for n, unit in variant.sizes.items()])
     beyond = np.maximum(a - most, 0.0)
     lost = float(beyond @ G @ beyond)
     return Evidence(variant, a - beyond, std, float(b @ a) - lost, averaged - 0.5 * lost, absorbed)

@@ -5,16 +5,16 @@ from collections.abc import Sequence
 from jaxfinger.data import Session
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError
+from jaxfinger.experiments import shows
 from jaxfinger.gap.augment import augmented_fit
 from jaxfinger.gap.evidence import Projector
-from jaxfinger.gap.problem import build
+from jaxfinger.gap.problem import Problem, build
 from jaxfinger.gap.refine import Refined, at_optimum, refine, relinearised
 from jaxfinger.gap.screening import Screening, by_site
 from jaxfinger.gap.search import other_forms, start_of
 from jaxfinger.gap.signatures import Variant, catalogue_for, variants
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.stages import Progress
-from jaxfinger.model import Finger
 
 Key = tuple[str, tuple[str, ...]]  # effect, site; a pair may be joined by a hyphen
 
@@ -38,7 +38,7 @@ def fit_with(
         raise UserError(f"{there[0]} is a term of the recipe's own model; leave it out here, or there")
     catalogue = catalogue_for(recipe, effects)
     problem = build(session, recipe, progress)
-    screen = Screening.of(problem, _offered(catalogue, keys, problem.nominal.finger), progress)
+    screen = Screening.of(problem, _offered(catalogue, keys, problem), progress)
     projector = Projector(problem)
     rt = projector.residual(problem)
     chi2 = float(rt @ rt)
@@ -52,7 +52,7 @@ def fit_with(
         first = next(e for e in by_site(screened).values() if e.variant.key not in taken)
         if not screen.signatures_of(first).any():
             effect, site = first.variant.effect, "-".join(first.variant.site)
-            shown = ", ".join(effect.SHOWS)
+            shown = ", ".join(shows(effect, problem.nominal.finger))
             file = session.file or "the session"
             raise UserError(f"{file}: no trial shows {effect.ID} at {site}; record {shown}, or leave it out")
         progress(f"fitting {first.variant.effect.ID} at {', '.join(first.variant.site)}")
@@ -66,13 +66,14 @@ def fit_with(
     return augmented_fit(problem, chosen).fit
 
 
-def _offered(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[Key], finger: Finger) -> list[Variant]:
+def _offered(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[Key], problem: Problem) -> list[Variant]:
     """Every form of the effects at their sites."""
-    offered = []
+    offered, finger = [], problem.nominal.finger
     for effect, site in keys:
         if effect not in catalogue:
             raise UserError(f"the catalogue has no effect {effect}; it has {', '.join(sorted(catalogue))}")
-        mine = [v for v in variants({effect: catalogue[effect]}, finger) if "-".join(v.site) == "-".join(site)]
+        offers = variants({effect: catalogue[effect]}, finger, problem.scales)
+        mine = [v for v in offers if "-".join(v.site) == "-".join(site)]
         if not mine:
             sites = ", ".join("-".join(s) for s in catalogue[effect].sites(finger)) or "no site on this finger"
             raise UserError(f"{effect} is not at {'-'.join(site)}; it has {sites}")

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.data.schema import units_where
-from jaxfinger.experiments import EXPERIMENTS, Batch, Stack
+from jaxfinger.experiments import EXPERIMENTS, Batch, Stack, shows
 from jaxfinger.experiments.table import SLACK
 from jaxfinger.gap.problem import Problem, imagined
 from jaxfinger.gap.refine import Refined, derivatives, information, nominal_step
@@ -51,7 +51,7 @@ def next_experiment(problem: Problem, members: list[Refined]) -> NextExperiment 
     """For the refitted members of an ambiguous set; none where no trial is expected to separate them."""
     if len(members) < 2:
         return None
-    shown = {e for m in members for v in m.variants for e in v.effect.SHOWS}
+    shown = {e for m in members for v in m.variants for e in shows(v.effect, problem.nominal.finger)}
     steps = [nominal_step(problem, problem.r - m.change) for m in members]
     known = [information(problem, m) for m in members]
     best, place = 0.0, None

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.data import Predictions, Session
+from jaxfinger.effects import Scales
 from jaxfinger.experiments import Stack, prepare
 from jaxfinger.gap.groups import Group, grouped
 from jaxfinger.gap.simulator import emulate
@@ -74,6 +75,7 @@ class Problem:
     fit: Fit  # the staged fit
     sources: dict[str, Source]
     prior: Prior
+    scales: Scales  # of the specimen
     simulator: Model | None = None  # the emulator, where another simulator's predictions are diagnosed
 
     @property
@@ -177,6 +179,7 @@ def build(
         fit=fit,
         sources=sources,
         prior=prior,
+        scales=Scales.of(nominal.finger, [s.batch for s in measured.values()]),
         simulator=simulator,
         **_at(nominal, solution.linearised, sources, rows, free, prior),
     )

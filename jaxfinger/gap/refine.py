@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.effects import NOMINAL_TERMS, CatalogueEffect
+from jaxfinger.effects import NOMINAL_TERMS, CatalogueEffect, Scales
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.problem import Problem, moved
 from jaxfinger.gap.signatures import Signatures, Variant
@@ -56,6 +56,7 @@ class _Coordinate:
     amplitude: bool
     unit: float  # plausible size, or step of the shape
     shifts: bool  # moves by differences, not by factors
+    scales: Scales
 
 
 def refine(
@@ -67,7 +68,7 @@ def refine(
 ) -> Refined:
     """The variants together, from amplitudes `start` (in their own units)."""
     finger = problem.nominal.finger
-    effects = [within_bounds(v.at(finger, s)) for v, s in zip(variants, start, strict=True)]
+    effects = [within_bounds(v.at(finger, s), v.scales) for v, s in zip(variants, start, strict=True)]
     coordinates = _coordinates(variants)
     signatures, projector = Signatures(problem), projector or Projector(problem)
     reach = np.full(len(coordinates), STEP)
@@ -177,10 +178,10 @@ def nominal_step(problem: Problem, r: np.ndarray) -> Float[np.ndarray, " p"]:
 def at_optimum(refined: Refined) -> tuple[list[Variant], list[dict[str, float]]]:
     """Variants with the shapes that a refit found, and the amplitudes to start from."""
     items = [
-        Variant(type(x), v.site, tuple((n, float(getattr(x, n))) for n in x.SHAPES))
+        Variant(type(x), v.site, tuple((n, float(getattr(x, n))) for n in x.shape_parameters()), scales=v.scales)
         for v, x in zip(refined.variants, refined.effects, strict=True)
     ]
-    return items, [{n: float(getattr(x, n)) for n in x.AMPLITUDES} for x in refined.effects]
+    return items, [{n: float(getattr(x, n)) for n in x.amplitudes()} for x in refined.effects]
 
 
 def derivatives(signatures: Signatures, refined: Refined) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "k N"]]:
@@ -223,13 +224,14 @@ def _sizes(effects, coordinates: list[_Coordinate]) -> Float[np.ndarray, " k"]:
 
 def _coordinates(variants: Sequence[Variant]) -> list[_Coordinate]:
     out = []
-    for i, kind in enumerate(v.effect for v in variants):
-        out += [_Coordinate(i, n, True, unit, True) for n, (_, unit, _) in kind.AMPLITUDES.items()]
-        for n, (_, values) in kind.SHAPES.items():
-            if n not in kind.CHOICES and len(values) > 1:
-                shifts = n in kind.SHIFTS
-                unit = float(np.mean(np.diff(values))) / 2 if shifts else 1.0
-                out.append(_Coordinate(i, n, False, unit, shifts))
+    for i, v in enumerate(variants):
+        out += [_Coordinate(i, n, True, unit, True, v.scales) for n, unit in v.sizes.items()]
+        for n, values in v.effect.worth_trying(v.scales, v.site).items():
+            moves = v.effect.shape_parameters()[n].moves
+            if moves != "not" and len(values) > 1:
+                shifts = moves == "by differences"
+                unit = float(np.mean(np.abs(np.diff(np.sort(values))))) / 2 if shifts else 1.0
+                out.append(_Coordinate(i, n, False, unit, shifts, v.scales))
     return out
 
 
@@ -244,12 +246,12 @@ def _shifted(effect: CatalogueEffect, c: _Coordinate, by: float) -> CatalogueEff
         value += by * c.unit
     else:
         value *= float(np.exp(np.clip(by, -FACTOR, FACTOR)))
-    return within_bounds(replace(effect, **{c.name: jax.device_put(value)}))
+    return within_bounds(replace(effect, **{c.name: jax.device_put(value)}), c.scales)
 
 
-def within_bounds(effect: CatalogueEffect) -> CatalogueEffect:
+def within_bounds(effect: CatalogueEffect, scales: Scales) -> CatalogueEffect:
     """The effect with every number within its bounds."""
-    values = {n: np.clip(float(getattr(effect, n)), *ends) for n, ends in effect.bounds().items()}
+    values = {n: np.clip(float(getattr(effect, n)), *ends) for n, ends in effect.bounds(scales).items()}
     return replace(effect, **jax.device_put(values))
 
 
@@ -257,7 +259,7 @@ def _room(effects, coordinates: list[_Coordinate]) -> tuple[np.ndarray, np.ndarr
     """How far each coordinate may move, back and forth."""
     out = []
     for c in coordinates:
-        value, ends = float(getattr(effects[c.effect], c.name)), effects[c.effect].bounds()[c.name]
+        value, ends = float(getattr(effects[c.effect], c.name)), effects[c.effect].bounds(c.scales)[c.name]
         ways = [(end - value) / c.unit if c.shifts else np.log(end / value) for end in ends]
         most = np.inf if c.shifts else FACTOR
         out.append((max(min(ways[0], 0.0), -most), min(max(ways[1], 0.0), most)))

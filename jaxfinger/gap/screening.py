@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.compilation import side_by_side
+from jaxfinger.experiments import shows
 from jaxfinger.gap.evidence import Evidence, Projector, evidence
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signatures import Signatures, Variant
@@ -53,18 +54,18 @@ class Scan:
     def of(cls, signatures: Signatures, items: list[Variant]) -> "Scan":
         """All signatures, read once."""
         effect, site = items[0].effect, items[0].site
-        stacks = signatures.problem.stacks
-        times = np.concatenate([np.ravel(stacks[e].batch.x.session_time) for e in effect.SHOWS if e in stacks])
+        stacks, finger = signatures.problem.stacks, signatures.problem.nominal.finger
+        where = shows(effect, finger)
+        times = np.concatenate([np.ravel(stacks[e].batch.x.session_time) for e in where if e in stacks])
         start, end = float(times.min()), float(times.max())
         longest, middle = 2.0 * max(end - start, SHORTEST), (start + end) / 2.0
-        periods = longest / np.arange(1, int(np.clip(longest / SHORTEST, len(effect.PERIODS), MOST)) + 1)
+        periods = longest / np.arange(1, int(np.clip(longest / SHORTEST, len(effect.periods()), MOST)) + 1)
         shape = dict(items[0].shape) | {"middle": middle}
-        size = {a: unit for a, (_, unit, _) in effect.AMPLITUDES.items()}
-        name, pair = next(iter(effect.PERIODS.items()))
-        without = set(size).difference(*effect.PERIODS.values())
+        size = items[0].sizes
+        name, pair = next(iter(effect.periods().items()))
+        without = set(size).difference(*effect.periods().values())
         members = [shape | {a: size[a]} for a in size if a in without]
         members += [shape | {name: period, a: size[a]} for period in periods for a in pair]
-        finger = signatures.problem.nominal.finger
         columns = signatures.of([effect.at(finger, site, **values) for values in members])
         return cls(signatures, items, periods, middle, columns)
 
@@ -76,7 +77,7 @@ class Scan:
 
     def best(self, projector: Projector, rt: Float[np.ndarray, " N+prior"]) -> dict[str, float]:
         """The periods, s, by least squares over all sets of them."""
-        names, n = list(self.items[0].effect.PERIODS), len(self.periods)
+        names, n = list(self.items[0].effect.periods()), len(self.periods)
         A = projector(self.columns)
         A = A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300)
         G, b, k = A @ A.T + RIDGE * np.eye(len(A)), A @ rt, len(A) - 2 * n
@@ -107,7 +108,7 @@ class Screening:
 
         def read(group: list[Variant]) -> Table | Scan:
             effect = group[0].effect
-            if effect.PERIODS and any(e in problem.stacks for e in effect.SHOWS):
+            if effect.periods() and any(e in problem.stacks for e in shows(effect, problem.nominal.finger)):
                 return Scan.of(signatures, group)
             return Table(group, signatures.columns(group))
 
@@ -133,7 +134,7 @@ class Screening:
 
 def _part(v: Variant) -> tuple:
     """What is read together: a class of effects, and one site where its periods are open."""
-    return (v.effect.ID, v.site) if v.effect.PERIODS else (v.effect.ID,)
+    return (v.effect.ID, v.site) if v.effect.periods() else (v.effect.ID,)
 
 
 def by_site(found: list[Evidence]) -> dict[tuple, Evidence]:

@@ -96,7 +96,7 @@ def search(
     progress: Progress = lambda message: None,
 ) -> Search:
     """Judge every effect of the catalogue at every site of the finger."""
-    screen = Screening.of(problem, variants(catalogue, problem.nominal.finger), progress)
+    screen = Screening.of(problem, variants(catalogue, problem.nominal.finger, problem.scales), progress)
     projector = Projector(problem)
     rt = projector.residual(problem)
     chi2 = float(rt @ rt)
@@ -159,7 +159,8 @@ def other_forms(screened: list[Evidence], first: Evidence) -> list[Evidence]:
 
 
 def _choices(e: Evidence) -> list[float]:
-    return [v for n, v in e.variant.shape if n in e.variant.effect.CHOICES]
+    shapes = e.variant.effect.shape_parameters()
+    return [v for n, v in e.variant.shape if shapes[n].moves == "not"]
 
 
 def _worth(ranked: list[Evidence], most: int) -> list[Evidence]:
@@ -170,8 +171,7 @@ def _worth(ranked: list[Evidence], most: int) -> list[Evidence]:
 
 def start_of(e: Evidence) -> dict[str, float]:
     """Amplitudes to start a refit from, in their own units."""
-    names = e.variant.effect.AMPLITUDES
-    return {n: float(a) * unit for (n, (_, unit, _)), a in zip(names.items(), e.amplitudes, strict=True)}
+    return {n: float(a) * unit for (n, unit), a in zip(e.variant.sizes.items(), e.amplitudes, strict=True)}
 
 
 def _add(problem, screen, best: Refined, chi2: float, without, progress) -> Refined:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.data.schema import channel_units
+from jaxfinger.effects import Scales
 from jaxfinger.experiments import prepare
 from jaxfinger.gap.augment import Fitted, Missed, limits, missed_by, without_shapes
 from jaxfinger.gap.evidence import Evidence, Projector, evidence
@@ -79,7 +80,7 @@ def shrinkage(
     models = []
     for k in range(FOLDS):
         training, seen = of_row != k, {e: f != k for e, f in fold.items()}
-        refitted = _refit(problem.nominal, problem.free, problem.J, problem.r, training, problem.prior)
+        refitted = _refit(problem.nominal, problem.free, problem.J, problem.r, training, problem.prior, problem.scales)
         before = after = problem.simulator or refitted
         old = new = missed_by(problem.sources, before)
         if _choice(problem, rivals, training) in named:
@@ -87,7 +88,7 @@ def shrinkage(
             # better; a model that does not hold up without the others has closed nothing.
             for free in tried:
                 columns = augmented.J[:, np.isin(every, free)]
-                model = _refit(whole, free, columns, augmented.r, training, problem.prior)
+                model = _refit(whole, free, columns, augmented.r, training, problem.prior, problem.scales)
                 missed = augmented.missed(model)
                 if _misfit(problem, missed, seen) < _misfit(problem, new, seen):
                     after, new = model, missed
@@ -143,14 +144,14 @@ def _spread(problem: Problem, name: str) -> float:
     return float(0.5 * np.mean(squares)) if squares else 0.0
 
 
-def _refit(model: Model, free, J, r, training, prior: Prior) -> Model:
+def _refit(model: Model, free, J, r, training, prior: Prior, scales: Scales) -> Model:
     """The model refitted to the training rows and the prior on its first parameters; what neither sees stays within a
     few deviations of the whole fit.
     """
     theta, mean, root = np.asarray(ravel(model))[free], np.asarray(prior.mean), np.asarray(prior.root)
     pull = root @ (theta[: len(mean)] - mean)
     J, kept, scale = equilibrated(J, np.pad(root, ((0, 0), (0, len(free) - len(mean)))))
-    room = [(end - theta) / np.where(scale > 0.0, scale, 1.0) for end in limits(model, free)]
+    room = [(end - theta) / np.where(scale > 0.0, scale, 1.0) for end in limits(model, free, scales)]
     b = np.concatenate([-r[training], pull, np.zeros(len(free))])
     delta = bounded(np.vstack([J[training], kept]), b, *room) * scale
     return Free.at(model, free).set(model, jax.device_put(theta + delta))

@@ -5,7 +5,7 @@ compiled function a class of effects and kind of prediction serves them all. Onl
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import equinox as eqx
@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
-from jaxfinger.effects import CATALOGUE, CatalogueEffect, Site, nominal_terms
-from jaxfinger.experiments import TRIALS
+from jaxfinger.effects import CATALOGUE, CatalogueEffect, Scales, Site, nominal_terms
+from jaxfinger.experiments import TRIALS, shows
 from jaxfinger.gap.problem import Problem, Rows
 from jaxfinger.identify import Recipe
 from jaxfinger.model import (
@@ -42,11 +42,17 @@ class Variant:
     site: Site
     shape: tuple[tuple[str, float], ...]
     size: float = 1.0  # plausible sizes
+    scales: Scales = field(kw_only=True, compare=False)  # of the specimen
 
     @property
     def key(self) -> tuple[str, Site]:
         """What a verdict names."""
         return self.effect.ID, self.site
+
+    @property
+    def sizes(self) -> dict[str, float]:
+        """The plausible size of every amplitude, in its own unit."""
+        return self.effect.sizes(self.scales, self.site)
 
     def with_shape(self, **values: float) -> "Variant":
         """The same with other values of some shapes."""
@@ -62,13 +68,13 @@ def catalogue_for(recipe: Recipe, own: dict[str, type[CatalogueEffect]] | None) 
     return CATALOGUE | nominal_terms(recipe.model.elastic_degree, recipe.model.friction_degree) | (own or {})
 
 
-def variants(effects: dict[str, type[CatalogueEffect]], finger) -> list[Variant]:
+def variants(effects: dict[str, type[CatalogueEffect]], finger, scales: Scales) -> list[Variant]:
     """Every effect at every site with every shape and size worth trying."""
     return [
-        Variant(effect, site, tuple(shape.items()), size)
+        Variant(effect, site, tuple(shape.items()), size, scales=scales)
         for effect in effects.values()
         for site in effect.sites(finger)
-        for shape in effect.shapes(finger, site)
+        for shape in effect.shapes(finger, site, scales)
         for size in effect.SIZES
     ]
 
@@ -92,9 +98,9 @@ def _change(
         same = true is x  # but for a sensor's effect
         if channel == "tendon_excursion":
             y = excursion(model, true, y0 if same else None)
-        elif effect.MOVES_RIGID_BODY and contact is not None:
+        elif effect.moves_rigid_body() and contact is not None:
             y = fingertip_force(model, true)
-        elif effect.MOVES_RIGID_BODY:
+        elif effect.moves_rigid_body():
             y = external_torque(model, true, plain=plain if same else None)
         else:
             assert plain is not None
@@ -133,8 +139,9 @@ class Signatures:
         padded = members + members[:1] * (CHUNK - len(members))
         stacked = jax.tree.map(lambda *a: np.stack(a), *[replace(m, site=()) for m in padded])
         count = jax.device_put(len(members))
+        where = shows(kind, nominal.finger)
         for group in self.problem.groups:
-            shown = [e for e in group.trials if group.channel in kind.SHOWS.get(e, ())]
+            shown = [e for e in group.trials if group.channel in where.get(e, ())]
             if not shown:
                 continue
             y0, plain = self.problem.without_effects[group.channel, group.held]
@@ -151,8 +158,8 @@ class Signatures:
     def columns(self, items: list[Variant]) -> Float[np.ndarray, "variants amplitudes N"]:
         """Signatures per plausible size, one amplitude at a time, for variants of one class."""
         effect, finger = items[0].effect, self.problem.nominal.finger
-        names = list(effect.AMPLITUDES)
-        members = [v.at(finger, {n: v.size * effect.AMPLITUDES[n][1]}) for v, n in product(items, names)]
+        names = list(effect.amplitudes())
+        members = [v.at(finger, {n: v.size * v.sizes[n]}) for v, n in product(items, names)]
         found = self.of(members).reshape(len(items), len(names), -1)
         found /= np.array([v.size for v in items])[:, None, None]
         return found

@@ -78,7 +78,8 @@ def terms(model: Model, x: Motion, memory: tuple[Memory, ...], plain: Terms | No
         h, friction = plain.h, plain.friction
     for effect, state in effects:
         h = effect.torque(x, state, h)
-        friction = effect.joint_friction(x, f_j, C, friction)
+        if not x.held:  # else a fixture carries it
+            friction = effect.joint_friction(x, f_j, C, friction)
     shared = tuple(s for effect, state in effects for s in effect.shared_friction(x, state))
     mu = _torque_friction(model, x)
     return Terms(finger, f_t, C, loss, f_j, h, friction, direction, tendon_direction, mu, shared)
@@ -133,7 +134,7 @@ def external_torque(
     if f_ext is not None:
         _, J = rigid_body.fingertip(model.finger, x.q)
         tau = tau - jnp.sum(J * f_ext[:, None], axis=0)
-    return drive_torque(tau, e.direction, e.torque_friction)
+    return tau if x.held else drive_torque(tau, e.direction, e.torque_friction)
 
 
 def fingertip_force(model: Model, x: Motion) -> Float[Array, "3 *T"]:

@@ -31,9 +31,13 @@ class Effect(eqx.Module):
     on to the next one; the states are driven along the motion, measured or simulated.
     """
 
-    has_memory: ClassVar[bool] = False
     # Whether the memory turns corners within a sample of a fit, as friction does at a reversal.
     sharp: ClassVar[bool] = False
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether it has a state."""
+        return type(self).next_memory is not Effect.next_memory
 
     # Sensors: what the finger did, from what the sensors said; and what a sensor says of what the finger does.
     def true_motion(self, x: Motion) -> Motion:

@@ -3,11 +3,12 @@
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfinger.effects import CatalogueEffect
-from jaxfinger.experiments import predict
+from jaxfinger.effects import CatalogueEffect, Scales
+from jaxfinger.experiments import Batch, predict
 from jaxfinger.model import Model, Motion
 from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger
 
@@ -46,3 +47,5 @@ MOTIONS = [
     (x, predict(MODEL, x, channels))
     for x, channels in ((motion(), ("joint_torque", "tendon_excursion")), (motion(held=True), ("fingertip_force",)))
 ]
+
+SCALES = Scales.of(MODEL.finger, [Batch(x, y, jax.tree.map(jnp.ones_like, y)) for x, y in MOTIONS])

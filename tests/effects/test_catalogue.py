@@ -11,7 +11,7 @@ import pytest
 
 from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, from_dict, load, nominal_terms, to_dict
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import EXPERIMENTS, predict
+from jaxfinger.experiments import EXPERIMENTS, predict, shows
 from jaxfinger.identify.parameters import describe, units_at
 from jaxfinger.model import (
     excursion,
@@ -21,7 +21,7 @@ from jaxfinger.model import (
     resisting_torque,
     simulate,
 )
-from tests.effects.motion import MODEL, MOTIONS, with_effects
+from tests.effects.motion import MODEL, MOTIONS, SCALES, with_effects
 
 EVERY = CATALOGUE | NOMINAL_TERMS
 FINGER = MODEL.finger
@@ -30,7 +30,7 @@ CHEAP = {"xla_backend_optimization_level": 0}
 
 
 def plausible(kind, site, shape, size=1.0):
-    return kind.at(FINGER, site, **shape, **{n: size * unit for n, (_, unit, _) in kind.AMPLITUDES.items()})
+    return kind.at(FINGER, site, **shape, **{n: size * unit for n, unit in kind.sizes(SCALES, site).items()})
 
 
 def written(effect):
@@ -42,7 +42,8 @@ def value_and_slope(effect, x, channels):
 
     One operation at a time, so that the effects share compilations.
     """
-    amplitudes = {n: (getattr(effect, n), jnp.asarray(unit)) for n, (_, unit, _) in effect.AMPLITUDES.items()}
+    sizes = effect.sizes(SCALES, effect.site)
+    amplitudes = {n: (getattr(effect, n), jnp.asarray(unit)) for n, unit in sizes.items()}
 
     def along(*values):
         here = eqx.tree_at(lambda e: [getattr(e, n) for n in amplitudes], effect, list(values))
@@ -55,15 +56,16 @@ def value_and_slope(effect, x, channels):
 def test_absent_at_zero_and_differentiable_there(name):
     kind = EVERY[name]
     site = kind.sites(FINGER)[0]
-    shown = {c for channels in kind.SHOWS.values() for c in channels}
+    shown = {c for channels in shows(kind, FINGER).values() for c in channels}
     largest = 0.0
     for x, nominal in MOTIONS:
-        y, slope = value_and_slope(kind.at(FINGER, site, **kind.shapes(FINGER, site)[0]), x, tuple(nominal))
+        y, slope = value_and_slope(kind.at(FINGER, site, **kind.shapes(FINGER, site, SCALES)[0]), x, tuple(nominal))
         for channel in nominal:
             np.testing.assert_allclose(y[channel], nominal[channel], rtol=1e-11, atol=1e-14, err_msg=channel)
             assert np.isfinite(slope[channel]).all(), channel
-            if channel in shown:
-                largest = max(largest, float(np.abs(slope[channel]).max()))
+            changes = float(np.abs(slope[channel]).max())
+            assert channel in shown or changes == 0.0
+            largest = max(largest, changes)
     assert largest > 1e-6  # N m, m or N, at a plausible size
 
 
@@ -72,17 +74,17 @@ def test_every_site_and_shape(name):
     kind = EVERY[name]
     sites = kind.sites(FINGER)
     assert sites
-    for experiment, channels in kind.SHOWS.items():
+    for experiment, channels in shows(kind, FINGER).items():
         assert set(channels) <= set(EXPERIMENTS[experiment].channels)
     seen = set()
     for site in sites:
-        for shape in kind.shapes(FINGER, site):
+        for shape in kind.shapes(FINGER, site, SCALES):
             effect = plausible(kind, site, shape)
             seen.add((effect.site, *effect.values().items()))
-            assert set(effect.values()) == set(kind.AMPLITUDES) | set(kind.SHAPES) == set(kind.units())
+            assert set(effect.values()) == set(kind.parameters()) == set(kind.units())
             read = from_dict(FINGER, written(effect))
             assert eqx.tree_equal(read, effect)
-    assert len(seen) == sum(len(kind.shapes(FINGER, s)) for s in sites)
+    assert len(seen) == sum(len(kind.shapes(FINGER, s, SCALES)) for s in sites)
 
 
 @pytest.mark.parametrize("name", EVERY)
@@ -99,7 +101,7 @@ def test_no_prediction_calls_lapack(name):
 def test_what_an_effect_leaves_alone_need_not_be_computed_again(name):
     """Beside the terms without it, an effect changes the torque and the excursion as it does alone."""
     kind = EVERY[name]
-    effect = plausible(kind, kind.sites(FINGER)[0], kind.shapes(FINGER, kind.sites(FINGER)[0])[0])
+    effect = plausible(kind, kind.sites(FINGER)[0], kind.shapes(FINGER, kind.sites(FINGER)[0], SCALES)[0])
     model = with_effects(effect)
     for x, _ in MOTIONS:
         if model.true_motion(x) is not x:
@@ -153,7 +155,7 @@ def test_all_effects_together_simulate_forward():
     effects = []
     for kind in CATALOGUE.values():
         site = kind.sites(FINGER)[-1]
-        effects.append(plausible(kind, site, kind.shapes(FINGER, site)[0], 0.5))
+        effects.append(plausible(kind, site, kind.shapes(FINGER, site, SCALES)[0], 0.5))
     T = 60
     time = jnp.arange(T) * 1e-3
     tension = jnp.zeros((FINGER.n, T)).at[:].set(jnp.asarray(FINGER.active, float)[:, None] * (2 + 40 * time))

@@ -258,10 +258,9 @@ def test_rate_is_zero_where_time_stands_still():
 
 def test_payload_is_a_body_screwed_to_a_link():
     """A small body at p on the link: composite mass, centre of mass, and inertia by the parallel axes."""
-    i, m, p = 1, 2e-3, np.array([0.012, 0.0, -0.004])
-    effect = CATALOGUE["payload"].at(
-        FINGER, (FINGER.joint_names[i],), mass=m, moment_x=m * p[0], moment_z=m * p[2], inertia=m * p @ p
-    )
+    i, m, p = 1, 2e-3, np.array([0.012, 0.003, -0.004])
+    place = {"x": p[0], "y": p[1], "z": p[2]}
+    effect = CATALOGUE["payload"].at(FINGER, (FINGER.joint_names[i],), mass=m, **place)
     M, c = float(FINGER.mass[i]), np.asarray(FINGER.com[i])
     com = (M * c + m * p) / (M + m)
 
@@ -280,11 +279,21 @@ def test_payload_is_a_body_screwed_to_a_link():
     found = inverse_dynamics(effect.finger(FINGER), X.q, X.qd, X.qdd)
     bare = inverse_dynamics(FINGER, X.q, X.qd, X.qdd)
     np.testing.assert_allclose(found, inverse_dynamics(composite, X.q, X.qd, X.qdd), atol=1e-12)
-    half = effect.at(
-        FINGER, effect.site, **{n: 0.5 * float(getattr(effect, n)) for n in ("mass", "moment_x", "moment_z", "inertia")}
-    )
+    half = effect.at(FINGER, effect.site, mass=0.5 * m, **place)
     linear = inverse_dynamics(half.finger(FINGER), X.q, X.qd, X.qdd)
     np.testing.assert_allclose(linear, 0.5 * (found + bare), atol=1e-12)
+
+
+def test_mass_that_is_moved_within_a_link_leaves_its_mass_as_it_is_and_a_body():
+    i, m, p = 1, 2e-3, np.array([0.012, 0.0, -0.004])
+    effect = CATALOGUE["payload"].at(FINGER, (FINGER.joint_names[i],), mass=m, x=p[0], y=p[1], z=p[2], moved=1.0)
+    moved = effect.finger(FINGER)
+    M, c = float(FINGER.mass[i]), np.asarray(FINGER.com[i])
+    np.testing.assert_allclose(moved.mass, FINGER.mass, rtol=1e-14)
+    np.testing.assert_allclose(moved.com[i], ((M - m) * c + m * p) / M, atol=1e-15)
+    about_it = np.linalg.eigvalsh(np.asarray(moved.inertia[i]))
+    assert about_it[0] > 0.0
+    assert about_it[2] <= about_it[0] + about_it[1] + 1e-15  # the triangle inequality of a body
 
 
 @pytest.mark.parametrize("onset", [0.0, 5.0])

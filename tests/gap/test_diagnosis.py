@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 
-from jaxfinger.effects import CATALOGUE, CatalogueEffect
+from jaxfinger.effects import CATALOGUE, CatalogueEffect, amplitude
 from jaxfinger.errors import UserError
 from jaxfinger.gap import as_gap_json, diagnose, fit_with, write
 from jaxfinger.gap.diagnose import _closing
@@ -257,10 +257,8 @@ class SumOfAngles(CatalogueEffect):
 
     ID = "sum_of_angles"
     PLACE = "joint pair"
-    AMPLITUDES = {"a": ("N m", 1e-3, True)}  # noqa: RUF012
-    SHOWS = {e: ("joint_torque",) for e in ("ID.3-static", "ID.3-dynamic")}  # noqa: RUF012
 
-    a: Float[Array, ""]
+    a: Float[Array, ""] = amplitude("N m", 0.02, "torque", signed=True)
 
     def torque(self, x, memory, h):
         i, j = self.index

@@ -8,10 +8,14 @@ from scipy.integrate import quad
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from jaxfinger.effects import CATALOGUE, nominal_terms
+from jaxfinger.effects import CATALOGUE, Scales, nominal_terms
 from jaxfinger.gap.diagnose import UNSEEN, _with_prior
 from jaxfinger.gap.evidence import SCALES, Projector, evidence
 from jaxfinger.gap.signatures import Variant
+from jaxfinger.model import Finger
+from jaxfinger.synthetic import paper_finger
+
+SPECIMEN = Scales.of(Finger.from_description(paper_finger().description))
 
 ROWS, NOMINAL = 40, 4
 
@@ -53,7 +57,7 @@ def test_a_term_left_out_has_whatever_size_it_was(problem):
     Z, projector = 1e-4 * problem.direction[None], Projector(problem)
     rt = projector.residual(problem)
     term, effect = (
-        evidence(Variant(kind, ("MCP",), ()), Z, projector(Z), rt)
+        evidence(Variant(kind, ("MCP",), (), scales=SPECIMEN), Z, projector(Z), rt)
         for kind in (nominal_terms(2, 2)["joint_damping"], CATALOGUE["drive_inertia"])
     )
     assert term.explained > 100.0
@@ -62,7 +66,7 @@ def test_a_term_left_out_has_whatever_size_it_was(problem):
 
 
 def test_evidence_of_signed_amplitudes_is_the_gaussian_marginal_likelihood(problem):
-    variant = Variant(CATALOGUE["gravity_tilt"], ("base",), ())
+    variant = Variant(CATALOGUE["gravity_tilt"], ("base",), (), scales=SPECIMEN)
     Z = np.random.default_rng(2).standard_normal((3, ROWS))
     projector, U = Projector(problem), complement(problem)
     found = evidence(variant, Z, projector(Z), projector.residual(problem))
@@ -76,7 +80,7 @@ def test_evidence_of_signed_amplitudes_is_the_gaussian_marginal_likelihood(probl
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_evidence_of_a_one_sided_amplitude_is_the_half_normal_marginal_likelihood(problem, sign):
-    variant = Variant(CATALOGUE["tendon_creep"], ("T1",), (("T", 1.5),))
+    variant = Variant(CATALOGUE["tendon_creep"], ("T1",), (("T", 1.5),), scales=SPECIMEN)
     rng = np.random.default_rng(3)
     z = rng.standard_normal(ROWS)
     problem.r = problem.r + sign * 0.6 * z
@@ -95,7 +99,7 @@ def test_evidence_of_a_one_sided_amplitude_is_the_half_normal_marginal_likelihoo
 
 
 def test_what_the_nominal_parameters_imitate_is_no_evidence(problem):
-    variant = Variant(CATALOGUE["gravity_tilt"], ("base",), ())
+    variant = Variant(CATALOGUE["gravity_tilt"], ("base",), (), scales=SPECIMEN)
     Z = (problem.J[:, :3] @ np.random.default_rng(4).standard_normal((3, 3))).T
     projector = Projector(problem)
     found = evidence(variant, Z, projector(Z), projector.residual(problem))
@@ -105,7 +109,7 @@ def test_what_the_nominal_parameters_imitate_is_no_evidence(problem):
 
 def test_a_share_counts_as_one_at_most(problem):
     """Three times a friction is no evidence that it builds up: what the whole of it explains is."""
-    variant = Variant(CATALOGUE["joint_presliding"], ("PIP",), (("x0", 0.03),))
+    variant = Variant(CATALOGUE["joint_presliding"], ("PIP",), (("x0", 0.03),), scales=SPECIMEN)
     Z, projector = np.random.default_rng(3).standard_normal((1, ROWS)), Projector(problem)
     Zt = projector(Z)
     rt = projector.residual(problem)

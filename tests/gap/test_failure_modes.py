@@ -119,7 +119,7 @@ def test_many_repeats_of_what_no_candidate_explains_make_none_right():
     found = diagnose(session_with(upside_down, recipe=recipe_from(TABLE | {"trials": trials})), without=WITHOUT)
     assert found.verdict.status == "unexplained"
     for candidate in found.search.candidates:
-        signs = [signed for _, _, signed in CATALOGUE[candidate.key[0]].AMPLITUDES.values()]
+        signs = [p.signed for p in CATALOGUE[candidate.key[0]].amplitudes().values()]
         assert all(signed or a >= 0.0 for signed, a in zip(signs, candidate.evidence.amplitudes, strict=True))
 
 

@@ -84,7 +84,7 @@ def test_a_share_is_at_most_one_and_leaves_that_bound_where_it_is_less(problem, 
     effect = kind.at(problem.nominal.finger, site, a=share, x0=0.02)
     there = replace(problem, r=problem.r + Signatures(problem).of([effect])[0])
     rt = Projector(there).residual(there, there.r)
-    found = refine(there, [Variant(kind, site, (("x0", 0.016),))], [{"a": start}], float(rt @ rt))
+    found = refine(there, [Variant(kind, site, (("x0", 0.016),), scales=there.scales)], [{"a": start}], float(rt @ rt))
     if share < 1.0:
         assert abs(found.effects[0].a - share) < 4.0 * found.std[0]["a"] < 1.0
     else:
@@ -99,14 +99,16 @@ def test_a_length_is_found_while_the_share_stays_at_its_most(problem, start):
     there = replace(problem, r=problem.r + Signatures(problem).of([effect])[0])
     rt = Projector(there).residual(there, there.r)
     a, x0 = start
-    found = refine(there, [Variant(kind, site, (("x0", x0), ("delta", 0.5)))], [{"a": a}], float(rt @ rt))
+    found = refine(
+        there, [Variant(kind, site, (("x0", x0), ("delta", 0.5)), scales=there.scales)], [{"a": a}], float(rt @ rt)
+    )
     assert abs(float(found.effects[0].x0) - 0.02) < 4.0 * found.std[0]["x0"] < 0.004
     assert found.effects[0].delta == 0.5
 
 
 def test_a_large_effect_is_judged_by_what_it_leaves_exactly(scaled):
     """A sensor's gain multiplies the torques refitted with it: where it leads, an exact fit finds no better."""
-    variant = Variant(CATALOGUE["torque_sensor_scale"], ("torque_sensor",), ())
+    variant = Variant(CATALOGUE["torque_sensor_scale"], ("torque_sensor",), (), scales=scaled.scales)
     projector = Projector(scaled)
     null = float(np.sum(projector.residual(scaled) ** 2))
     linear = refine(scaled, [variant], [{"gain": 0.05}], null, projector)
@@ -122,7 +124,7 @@ def test_a_large_effect_is_judged_by_what_it_leaves_exactly(scaled):
 
 def test_where_a_refit_has_led_is_the_exact_fit(scaled):
     """To one squared deviation in all, intervals to the effect's size; its two parts miss what the model misses."""
-    variant = Variant(CATALOGUE["torque_sensor_scale"], ("torque_sensor",), ())
+    variant = Variant(CATALOGUE["torque_sensor_scale"], ("torque_sensor",), (), scales=scaled.scales)
     null = float(np.sum(Projector(scaled).residual(scaled) ** 2))
     led = relinearised(scaled, refine(scaled, [variant], [{"gain": 0.05}], null), null)
     quick, exact = as_refitted(*led), augmented_fit(scaled, led[1])

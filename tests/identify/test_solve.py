@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import Array, Float
 
-from jaxfinger.effects import CatalogueEffect
+from jaxfinger.effects import CatalogueEffect, amplitude
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import predict, prepare
 from jaxfinger.identify import solve as solve_module
@@ -25,10 +25,8 @@ class Bend(CatalogueEffect):
     """10 N mm · law(a) at a joint."""
 
     PLACE: ClassVar = "joint"
-    AMPLITUDES: ClassVar = {"a": ("1", 0.5, True)}
-    SHOWS: ClassVar = {EXPERIMENT: (CHANNEL,)}
 
-    a: Float[Array, ""]
+    a: Float[Array, ""] = amplitude("1", 0.5, signed=True)
 
     def torque(self, x, memory, h):
         return h.at[self.index[0]].add(1e-2 * self.law(self.a))

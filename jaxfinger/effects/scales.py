@@ -1,0 +1,125 @@
+"""Sizes of a specimen, by which an effect's are plausible: the same physics in other units has the same catalogue."""
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxfinger.model import Finger, Motion
+
+MOST = 95.0  # percentile that counts as the most: some samples are spikes
+
+
+class Recorded(Protocol):
+    """Trials of one experiment: motion, measured channels, and where they count (not zero)."""
+
+    @property
+    def x(self) -> Motion: ...
+
+    @property
+    def y(self) -> Mapping[str, Float[Array, "columns *T"]]: ...
+
+    @property
+    def mask(self) -> Mapping[str, Float[Array, "columns *T"]]: ...
+
+
+@dataclass(frozen=True)
+class Scales:
+    """How large a specimen's signals are, joint by joint and tendon by tendon (SI; N and m where a joint slides)."""
+
+    torque: Float[np.ndarray, " m"]  # N m, of its torque sensor or drive; where none was measured, that of the tendons
+    angle: Float[np.ndarray, " m"]  # rad, that the joint goes through
+    speed: Float[np.ndarray, " m"]  # rad/s
+    acceleration: Float[np.ndarray, " m"]  # rad/s²
+    mass: Float[np.ndarray, " m"]  # kg, of the link
+    tension: Float[np.ndarray, " n"]  # N
+    excursion: Float[np.ndarray, " n"]  # m
+    pull: Float[np.ndarray, " n"]  # m/s, speed of the excursion
+    length: float  # m, of the whole chain
+    trial: float  # s, of the longest trial
+    session: float  # s, from its start to the end of the last trial
+    joints: tuple[str, ...]
+    tendons: tuple[str, ...]
+
+    @classmethod
+    def of(cls, finger: Finger, recorded: Iterable[Recorded] = ()) -> "Scales":
+        """What the trials show; where they show nothing, what the description lets expect."""
+        recorded = list(recorded)
+        m, n = finger.m, finger.n
+        low, high = np.asarray(finger.limits).reshape(m, 2).T
+        length = float(np.linalg.norm([*np.asarray(finger.origin)[1:], np.asarray(finger.fingertip)], axis=1).sum())
+        length = length or 1.0
+        time = [np.asarray(r.x.time) for r in recorded]
+        trial = max((float(t.max()) for t in time if t.size), default=0.0) or 1.0
+        session = max((float(np.max(r.x.session_time)) for r in recorded), default=0.0)
+        session = max(session, trial)
+
+        def each(count: int, values) -> Float[np.ndarray, " count"]:
+            """The largest that any experiment shows, column by column."""
+            found = [np.asarray(v) for v in values]
+            return np.max(found, axis=0) if found else np.zeros(count)
+
+        travel = each(m, (_range(r.x.q) for r in recorded))
+        angle = _filled(travel, high - low)
+        speed = _filled(each(m, (_most(r.x.qd) for r in recorded)), angle / min(trial, 1.0))
+        acceleration = _filled(each(m, (_most(r.x.qdd) for r in recorded)), speed**2 / angle)
+        mass = _filled(np.asarray(finger.mass), np.ones(m))
+        weight = float(mass.sum() * (np.linalg.norm(np.asarray(finger.gravity)) or length / trial**2) * length)
+        measured = each(m, (_counted(r, "joint_torque", m) for r in recorded))
+        torque = _filled(measured, np.full(m, weight))
+        tension = _filled(each(n, (_most(r.x.tension) for r in recorded)), np.full(n, torque.max(initial=0.0) / length))
+        pulled = each(n, (_counted(r, "tendon_excursion", n, _range) for r in recorded))
+        excursion = _filled(pulled, np.full(n, 0.1 * length))
+        pull = excursion * float(np.max(speed / angle, initial=0.0))
+        return cls(
+            torque, angle, speed, acceleration, mass, tension, excursion, pull,
+            length, trial, session, finger.joint_names, finger.tendon_names,
+        )  # fmt: skip
+
+    def __call__(self, of: str, site: tuple[str, ...] = ()) -> float:
+        """A product of scales at a site, such as `torque/speed` or `mass*length`; the largest of all at a site that is
+        no joint or tendon, and the smallest of a pair, which has to matter at both.
+        """
+        value = 1.0
+        for sign, name in re.findall(r"([*/]?)([a-z]+)", "" if of == "1" else of):
+            value *= self._at(name, site) ** (-1 if sign == "/" else 1)
+        return value
+
+    def _at(self, name: str, site: tuple[str, ...]) -> float:
+        values = getattr(self, name)
+        if isinstance(values, float):
+            return values
+        names = self.joints if len(values) == len(self.joints) and name in _OF_JOINTS else self.tendons
+        here = [float(v) for k, v in zip(names, values, strict=True) if k in site]
+        return min(here) if here else float(np.max(values, initial=0.0)) or 1.0
+
+
+_OF_JOINTS = ("torque", "angle", "speed", "acceleration", "mass")
+
+
+def _filled(found: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """Where nothing was found (zero, or a thousandth of the others), the median of the others, or `otherwise`."""
+    shows = found > 1e-3 * found.max(initial=0.0)
+    return np.where(shows, found, np.median(found[shows]) if shows.any() else otherwise).astype(float)
+
+
+def _most(values) -> np.ndarray:
+    flat = np.abs(np.asarray(values)).reshape(len(values), math.prod(np.shape(values)[1:]))
+    return np.percentile(flat, MOST, axis=1) if flat.size else np.zeros(len(flat))
+
+
+def _range(values) -> np.ndarray:
+    flat = np.asarray(values).reshape(len(values), math.prod(np.shape(values)[1:]))
+    return np.ptp(np.percentile(flat, [100.0 - MOST, MOST], axis=1), axis=0) if flat.size else np.zeros(len(flat))
+
+
+def _counted(r: Recorded, channel: str, columns: int, size=_most) -> np.ndarray:
+    """Of the samples of a channel that count, column by column."""
+    if channel not in r.y:
+        return np.zeros(columns)
+    y, mask = np.asarray(r.y[channel]), np.asarray(r.mask[channel]) > 0
+    return np.array([size(a[k][None])[0] if k.any() else 0.0 for a, k in zip(y, mask, strict=True)])

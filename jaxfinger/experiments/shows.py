@@ -1,0 +1,72 @@
+"""Where an effect can show: which predicted channels depend on its amplitudes, found by following these through the
+operations of a prediction.
+"""
+
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Literal
+
+from jaxfinger.effects import CatalogueEffect
+from jaxfinger.experiments.predict import predict
+from jaxfinger.experiments.table import EXPERIMENTS
+from jaxfinger.model import Finger, Model, Motion
+
+
+def shows(kind: type[CatalogueEffect], finger: Finger) -> dict[str, tuple[str, ...]]:
+    """Channels of each experiment that an effect can change; an experiment without one is left out.
+
+    A channel that is not among them is as it is without the effect, in any trial. One that is may be so in a trial of
+    no use: friction that grows with tension shows nothing where all tendons are slack.
+    """
+    names = finger.joint_names, finger.tendon_names
+    return _shows(kind, *names, finger.prismatic, finger.active, finger.crosses)
+
+
+@cache
+def _shows(kind, joint_names, tendon_names, prismatic, active, crosses) -> dict[str, tuple[str, ...]]:
+    m, n = len(joint_names), len(tendon_names)
+    described: Any = SimpleNamespace(
+        gravity=np.array([0.0, 0.0, -9.8]), axis=np.tile([0.0, 1.0, 0.0], (m, 1)), origin=np.ones((m, 3)),
+        mass=np.ones(m), com=np.ones((m, 3)), inertia=np.tile(np.eye(3), (m, 1, 1)), fingertip=np.ones(3),
+        limits=np.tile([-1.0, 1.0], (m, 1)), prismatic=prismatic, joint_names=joint_names,
+        tendon_names=tendon_names, active=active, crosses=crosses,
+    )  # fmt: skip
+    finger = Finger.from_description(described)
+    sites = kind.sites(finger)
+    if not sites:
+        return {}
+    model, template, T = Model.zeros(finger), kind.at(finger, sites[0]), 2
+    joints, tendons, time = jnp.zeros((m, T)), jnp.zeros((n, T)), jnp.zeros(T)
+    amplitudes = {k: getattr(template, k) for k in kind.amplitudes()}
+
+    def depends(held: bool, channel: str) -> bool:
+        x = Motion(time, joints, joints, joints, tendons, joints, tendons, time, joints, held, temperature=joints)
+
+        def of(amplitudes):
+            return predict(replace(model, effects=(replace(template, **amplitudes),)), x, (channel,))
+
+        return any(_reached(jax.make_jaxpr(of)(amplitudes).jaxpr))
+
+    kinds = {(e.held, c) for e in EXPERIMENTS.values() for c in e.channels}
+    shown = {key for key in kinds if depends(*key)}
+    found = {e.name: tuple(c for c in e.channels if (e.held, c) in shown) for e in EXPERIMENTS.values()}
+    return {e: channels for e, channels in found.items() if channels}
+
+
+def _reached(jaxpr) -> list[bool]:
+    """Which results depend on the arguments: an operation hands on what it takes."""
+    dependent = set(jaxpr.invars)
+
+    def tainted(v) -> bool:
+        return not isinstance(v, Literal) and v in dependent
+
+    for equation in jaxpr.eqns:
+        if any(map(tainted, equation.invars)):
+            dependent.update(equation.outvars)
+    return [tainted(v) for v in jaxpr.outvars]
