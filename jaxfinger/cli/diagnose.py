@@ -22,6 +22,7 @@ def diagnose(
     effects: Path | None = None,
     without: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
     quick: bool = False,
+    json: bool = False,
     overwrite: bool = False,
 ) -> None:
     """Diagnose the gap between a session and the nominal model that is identified from it.
@@ -43,6 +44,8 @@ def diagnose(
         Effects of the catalogue to leave out, by id.
     quick
         A first look: half the samples, few refits, one effect.
+    json
+        Print gap.json, and nothing else, on stdout.
     overwrite
         Replace an earlier diagnosis in the folder.
     """
@@ -65,6 +68,9 @@ def diagnose(
         say("writing the report")
         write(found, output, overwrite)
         write_page(found, output / "report.html", overwrite)
+    if json:
+        print((output / "gap.json").read_text(encoding="utf-8"))
+        return
     console().print(summary(found), markup=False, soft_wrap=True)
     print(f"\n{output / 'report.html'}: the evidence")
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 
 HALF_95 = 1.96  # standard deviations to either end of a 95 % interval
 DASH = "–"
@@ -71,6 +72,13 @@ def quantity(value: float, units: str, digits: int = 2) -> str:
         return DASH
     factor, unit = scaled(float(f"{value:.{digits}g}"), units)
     return _joined(number(value * factor, digits), unit)
+
+
+def alike(values: Sequence[float], units: str, digits: int = 2) -> tuple[list[str], str]:
+    """SI quantities to a few digits in the one unit that suits the largest, and that unit."""
+    largest = max((abs(v) for v in values if math.isfinite(v)), default=0.0)
+    factor, unit = scaled(float(f"{largest:.{digits}g}"), units)
+    return [number(v * factor, digits) for v in values], _joined("", unit).strip()
 
 
 def measured(value: float, std: float | None, units: str) -> str:

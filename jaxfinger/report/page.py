@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader
@@ -16,7 +17,8 @@ from jaxfinger.gap.result import Absorbed, Candidate, Cause, Closure, Diagnosis,
 from jaxfinger.report import plots, sentences
 from jaxfinger.report.causes import words
 from jaxfinger.report.curves import curves
-from jaxfinger.report.numbers import HALF_95, measured, percent, percent_range, quantity, unbroken
+from jaxfinger.report.measured import arm_points
+from jaxfinger.report.numbers import HALF_95, alike, measured, percent, percent_range, quantity, unbroken
 from jaxfinger.report.plots import gap as gap_plots
 from jaxfinger.report.plots.fit import INTERVAL_ROWS, interval_size
 from jaxfinger.report.theme import PALETTE, css, grid, inline, look
@@ -87,6 +89,8 @@ def render(d: Diagnosis, trace: Trace | None = None, arms: Sequence[Markup] = ()
         parameters=_parameters(d),
         arms=arms,
         absorbed=_absorbed(d.absorbed),
+        hides=any(x.hidden for x in d.absorbed),
+        gap=d.status is not Status.NO_GAP,
         trials=sorted({t for s in d.nominal.stages for t in s.trials}),
         noise=_noise(d, prismatic),
         versions=", ".join(f"{k} {v}" for k, v in d.nominal.versions.items()),
@@ -120,8 +124,8 @@ def _budget(d: Diagnosis) -> Markup:
 
 def _closure(d: Diagnosis) -> Markup:
     says = "rms of every channel in units of its noise, before and after"
-    return _picture(
-        lambda ax: plots.closure(d.closures, ax), "closure", says, *gap_plots.closure_size(d.closures, NARROW)
+    return _both(
+        lambda ax: plots.closure(d.closures, ax), "closure", says, lambda w: gap_plots.closure_size(d.closures, w)
     )
 
 
@@ -162,7 +166,9 @@ def _parameters(d: Diagnosis) -> list[Markup]:
 
 def _arms(d: Diagnosis) -> list[Markup]:
     """One panel a joint."""
-    found = curves(d.augmented, d.problem.session)
+    found = curves(d.augmented)
+    if "ID.2" in d.problem.stacks:
+        found = replace(found, arm_points=arm_points(d.problem.session, d.problem.stacks["ID.2"]))
     joints = list(dict.fromkeys(j for _, j in found.moment_arm))
     return [
         _picture(lambda ax, j=j: plots.moment_arms(found, j, ax), f"arms-{k}", f"moment arms about {j}", NARROW, 2.9)
@@ -236,13 +242,14 @@ def _place(p: Place, prismatic: tuple[bool, ...]) -> dict:
 
 
 def _line(x: Closure) -> dict:
-    noise = quantity(x.noise, x.units) if x.noise else "unknown"
+    (noise, before, after), unit = alike((x.noise, x.before, x.after), x.units)
     closed = f"{percent(x.closed)} ({percent_range(*x.closed_ci95)})" if x.resolvable else "no gap to close"
     return {
         "name": _name(x.experiment, x.channel),
-        "noise": noise,
-        "before": quantity(x.before, x.units),
-        "after": "diverges" if x.diverged else quantity(x.after, x.units),
+        "noise": noise if x.noise else "unknown",
+        "before": before,
+        "after": "diverges" if x.diverged else after,
+        "unit": unit,
         "closed": "nothing" if x.diverged else closed,
         "wrong": x.diverged,
     }
@@ -255,12 +262,18 @@ def _left(x: Left) -> str:
 
 
 def _absorbed(found: Sequence[Absorbed]) -> list[str]:
-    """A line an effect and site: how much could hide, as the half-width of its 95 % interval."""
-    return [
-        sentences.key_name(x.key)
-        + "".join(f", up to {quantity(HALF_95 * v.std, v.units)} of {v.name}" for v in x.hidden if math.isfinite(v.std))
-        for x in found
-    ]
+    """A line an effect: its sites, and how much could hide there at most, as the half-width of its 95 % interval."""
+    by_effect: dict[str, list[Absorbed]] = {}
+    for x in found:
+        by_effect.setdefault(x.key.effect, []).append(x)
+    lines = []
+    for effect, some in by_effect.items():
+        hidden: dict[tuple[str, str], float] = {}
+        for v in (v for x in some for v in x.hidden if math.isfinite(v.std)):
+            hidden[v.name, v.units] = max(hidden.get((v.name, v.units), 0.0), HALF_95 * v.std)
+        much = "".join(f", up to {quantity(half, units)} of {name}" for (name, units), half in hidden.items())
+        lines.append(f"{sentences.effect_name(effect)} at {sentences.site_names([x.key.site for x in some])}{much}")
+    return lines
 
 
 def _noise(d: Diagnosis, prismatic: tuple[bool, ...]) -> list[dict]:

@@ -11,6 +11,7 @@ from jaxfinger.data.schema import channel_units
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.result import Diagnosis
 from jaxfinger.identify.linearise import residuals_of
+from jaxfinger.model import Model
 from jaxfinger.report.numbers import HALF_95, scaled
 from jaxfinger.report.sentences import channel_name
 
@@ -40,10 +41,13 @@ def worst_trial(d: Diagnosis) -> Trace:
     seen = np.arange(mask.size) <= np.flatnonzero(mask).max()  # the rest is padding
     y = np.where(mask, np.asarray(stack.batch.y[channel])[column, b], np.nan)
     free_zero = channel == "tendon_excursion"
-    missed = []
-    for model in (problem.simulator or d.nominal.model, d.augmented.model):
-        residual = np.where(mask, residuals_of(model, stack.batch, (channel,))[channel][column, b], np.nan)
-        missed.append(residual - np.nanmean(residual) if free_zero else residual)
+    residuals = [_residual(problem, e, channel, problem.simulator), _residual(problem, e, channel, None)]
+    changed = d.augmented is not d.nominal
+    if changed:
+        residuals[1] = _residual(problem, e, channel, d.augmented.model)
+    missed = [np.where(mask, r[column, b], np.nan) for r in residuals]
+    if free_zero:
+        missed = [m - np.nanmean(m) for m in missed]
     y = y - np.nanmean(y) if free_zero else y
     std = float(problem.noise[e, channel].std[column])
     units = channel_units(channel, problem.session.finger.prismatic)
@@ -59,8 +63,16 @@ def worst_trial(d: Diagnosis) -> Trace:
         before,
         after,
         HALF_95 * factor * std,
-        d.augmented is not d.nominal,
+        changed or problem.simulator is not None,
     )
+
+
+def _residual(problem: Problem, experiment: str, channel: str, model: Model | None) -> np.ndarray:
+    """(columns, B, T) measured less predicted, by the nominal model where no other is given."""
+    batch = problem.stacks[experiment].batch
+    if model is None:
+        return np.asarray(batch.y[channel]) - problem.predicted[experiment, channel]
+    return np.asarray(residuals_of(model, batch, (channel,))[channel])
 
 
 def _worst(problem: Problem) -> tuple[str, str, int, int]:

@@ -113,10 +113,12 @@ def test_a_term_that_the_recipe_left_out_is_fitted_as_an_effect_that_is_known(fo
     assert "for example tendon_stretch:T3" in capsys.readouterr().err
 
 
-def test_a_first_look_at_the_axis_names_the_friction_that_its_recipe_leaves_out(folder, tmp_path):
+def test_a_first_look_at_the_axis_names_the_friction_that_its_recipe_leaves_out(folder, tmp_path, capsys):
     recipe = ROOT / "fits" / "emps-no-coulomb.toml"
-    assert run("diagnose", folder / "emps.h5", "--recipe", recipe, "--quick", "-o", tmp_path) == 0
-    verdict = json.loads((tmp_path / "gap.json").read_text())["verdict"]
+    assert run("diagnose", folder / "emps.h5", "--recipe", recipe, "--quick", "--json", "-o", tmp_path) == 0
+    gap = json.loads(capsys.readouterr().out)  # and nothing else
+    assert gap == json.loads((tmp_path / "gap.json").read_text(encoding="utf-8"))
+    verdict = gap["verdict"]
     assert verdict["status"] == "explained"
     assert verdict["effects"] == [{"effect": "joint_coulomb", "site": ["axis"]}]
     assert "a first look" in verdict["summary"]

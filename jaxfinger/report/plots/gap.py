@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
 from jaxfinger.gap.result import ChannelBudget, Closure, Diagnosis
-from jaxfinger.report.numbers import quantity
+from jaxfinger.report.numbers import alike, quantity
 from jaxfinger.report.sentences import cause_name, channel_name
 from jaxfinger.report.theme import (
     AFTER,
@@ -122,17 +122,20 @@ def closure(lines: Sequence[Closure], ax: Axes | None = None) -> Axes:
         ax: the axes to draw on; new ones without.
     """
     rows = shown(lines)
+    changed = any(x.before != x.after for x in rows)
     ax = axes_or_new(ax, *closure_size(rows, 5.0))
     for y, x in enumerate(rows):
         before, after = x.before / x.noise, x.after / x.noise
         stays = after > STAYS_OPEN
         ax.plot([before, after], [y, y], color=MUTED, linewidth=1.2, zorder=1)
-        ax.plot(before, y, "o", color="none", markeredgecolor=BEFORE, markeredgewidth=1.6, markersize=6)
+        if changed:
+            ax.plot(before, y, "o", color="none", markeredgecolor=BEFORE, markeredgewidth=1.6, markersize=6)
         ax.plot(after, y, "s" if stays else "o", color=WRONG if stays else AFTER, markersize=5)
         name = f"{x.experiment} · {channel_name(x.channel)}"
         at = ax.get_yaxis_transform()
         ax.text(0.0, y - 0.22, name, transform=at, va="bottom", ha="left", bbox=CLEAR)
-        text = f"{quantity(x.before, x.units)} → {quantity(x.after, x.units)}"
+        (old, new), unit = alike((x.before, x.after), x.units)
+        text = f"{old} → {new} {unit}" if changed else f"{old} {unit}"
         ax.text(1.0, y - 0.22, text, transform=at, va="bottom", ha="right", bbox=CLEAR)
     ratios = [r for x in rows for r in (x.before / x.noise, x.after / x.noise) if r > 0]
     low, high = min([0.6, *(0.8 * r for r in ratios)]), max([3.0, *(1.3 * r for r in ratios)])
@@ -144,8 +147,9 @@ def closure(lines: Sequence[Closure], ax: Axes | None = None) -> Axes:
     ax.set_xticks([], minor=True)
     ax.grid(axis="y", visible=False)
     ax.spines["left"].set_visible(False)
-    ax.plot([], [], "o", color="none", markeredgecolor=BEFORE, markeredgewidth=1.6, label="before")
-    ax.plot([], [], "o", color=AFTER, label="after")
+    if changed:
+        ax.plot([], [], "o", color="none", markeredgecolor=BEFORE, markeredgewidth=1.6, label="before")
+    ax.plot([], [], "o", color=AFTER, label="after" if changed else "the model")
     if any(x.after > STAYS_OPEN * x.noise for x in rows):
         ax.plot([], [], "s", color=WRONG, label="stays open")
     legend_below(ax, 2)
