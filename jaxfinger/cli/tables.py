@@ -6,7 +6,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from jaxfinger.cli.output import console, table
-from jaxfinger.report.numbers import number, with_error
+from jaxfinger.report.numbers import HALF_95, number, scaled, with_error
 
 if TYPE_CHECKING:
     from jaxfinger.identify import Fit
@@ -118,18 +118,14 @@ def _joints(found) -> None:
     table("Torque of the joints over their range (max; min)", header, rows)
 
 
-SCALE = {"m": (1e3, "mm"), "N m": (1e3, "N mm"), "N m s": (1e3, "N mm s")}
-
-
 def _parameters(fit: Fit) -> list[tuple[str, str, str]]:
+    """Name, value with its 95 % interval, and the unit that suits their size."""
     rows = []
     for p in fit.table():
-        base, slash, per = p["units"].partition("/")
-        factor, unit = SCALE.get(base, (1.0, base)) if per != "m" else (1.0, base)
-        if p["group"] == "mass":
-            factor, unit = (1e3, "g") if abs(p["value"]) < 1 else (1.0, "kg")
+        half = HALF_95 * (p["std"] or 0.0)
+        factor, unit = scaled(max(abs(p["value"]), half), p["units"])
         std = None if p["std"] is None else p["std"] * factor
-        rows.append((p["name"], with_error(p["value"] * factor, std), unit + slash + per))
+        rows.append((p["name"], with_error(p["value"] * factor, std), unit))
     return rows
 
 

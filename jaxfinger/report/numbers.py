@@ -16,12 +16,16 @@ _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, 
 
 
 def scaled(size: float, units: str) -> tuple[float, str]:
-    """Factor and name of the unit in which an SI quantity of this size is read.
+    """Factor and name of the unit in which an SI quantity of this size is read: 1e3 and «N mm/rad²».
 
     Angles in degrees; masses in grams; torques of a finger in N mm; else the SI prefix that leaves one to three digits
     before the point. The factor multiplies the SI value.
     """
-    size = abs(size)
+    factor, unit = _scaled(abs(size), units)
+    return factor, unit.replace("^", "").translate(_POWERS) if "^" in unit or "m2" in unit else unit
+
+
+def _scaled(size: float, units: str) -> tuple[float, str]:
     base, slash, per = units.partition("/")
     if base in ("1", "") and not slash:
         return 1.0, ""
@@ -99,7 +103,6 @@ def unbroken(text: str) -> str:
 
 
 def _joined(text: str, unit: str) -> str:
-    unit = unit.replace("^", "").translate(_POWERS) if "^" in unit or "m2" in unit else unit
     return text + unit if unit.startswith("°") else f"{text} {unit}".rstrip()
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from markupsafe import Markup, escape
 from matplotlib import rc_context
 from matplotlib.artist import Artist
@@ -136,7 +137,8 @@ def across(ax: Axes) -> int:
 
 
 def band(ax: Axes, x, y, std, colour: str, label: str | None = None, **line) -> None:
-    """A curve with its 95 % interval."""
+    """A curve with its 95 % interval; without where that is unknown."""
+    std = np.where(np.isfinite(std), std, np.nan)
     ax.plot(x, y, color=colour, label=label, **line)
     ax.fill_between(x, y - 1.96 * std, y + 1.96 * std, color=colour, alpha=0.22, linewidth=0)
 
