@@ -23,13 +23,34 @@ def main(tokens: Sequence[str] | None = None) -> None:
     try:
         app(tokens, exit_on_error=False, result_action="return_none")
     except UserError as error:
-        print(f"jaxfinger: {error}", file=sys.stderr)
+        from jaxfinger.cli.output import plain
+
+        print(plain(f"jaxfinger: {error}"), file=sys.stderr)
         raise SystemExit(2) from None
     except CycloptsError:
         raise SystemExit(2) from None  # cyclopts has said what is wrong
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
+    except Exception:
+        platform = os.environ.get("JAX_PLATFORMS")
+        if not platform or _computes():
+            raise
+        print(
+            f"jaxfinger: JAX_PLATFORMS names {platform}, which is not there; unset it, or set it to cpu",
+            file=sys.stderr,
+        )
+        raise SystemExit(2) from None
+
+
+def _computes() -> bool:
+    """Whether JAX has a device to compute on."""
+    import jax
+
+    try:
+        return bool(jax.devices())
+    except Exception:  # of whatever kind its backends raise
+        return False
 
 
 def _streams() -> None:

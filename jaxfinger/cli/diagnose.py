@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import Output, console, progress, refuse_existing
+from jaxfinger.cli.output import Output, console, plain, progress, read, refuse_existing
 from jaxfinger.errors import UserError
 
 FILES = ("gap.json", "nominal.json", "augmented.json", "report.html")
@@ -50,7 +50,7 @@ def diagnose(
         Replace an earlier diagnosis in the folder.
     """
     _refuse(output, overwrite)
-    from jaxfinger.data import read_predictions, read_session
+    from jaxfinger.data import read_predictions
     from jaxfinger.effects import load
     from jaxfinger.gap import diagnose as run
     from jaxfinger.gap import write
@@ -62,7 +62,7 @@ def diagnose(
         own = load(effects) if effects is not None else {}
         say("reading the file")
         simulated = read_predictions(predictions) if predictions is not None else None
-        measured = read_session(session)
+        measured = read(session)
         _make(output)
         found = run(measured, wanted, quick, own, tuple(without or ()), say, simulated)
         say("writing the report")
@@ -71,7 +71,7 @@ def diagnose(
     if json:
         print((output / "gap.json").read_text(encoding="utf-8"))
         return
-    console().print(summary(found), markup=False, soft_wrap=True)
+    console().print(plain(summary(found)), markup=False, soft_wrap=True)
     print(f"\n{output / 'report.html'}: the evidence")
 
 

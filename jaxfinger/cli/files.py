@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import Output, console, print_json, progress, refuse_existing
+from jaxfinger.cli.output import Output, console, plain, print_json, progress, refuse_existing, remark
 from jaxfinger.errors import UserError
 from jaxfinger.progress import Step
 
@@ -33,7 +33,7 @@ def check(file: Path, *, json: bool = False) -> None:
         print_json({"file": file, "ok": not errors, "findings": [asdict(f) for f in findings]})
     else:
         for finding in findings:
-            console().print(str(finding), markup=False, soft_wrap=True)
+            console().print(plain(finding), markup=False, soft_wrap=True)
         rest = len(findings) - errors
         print(f"{file}: " + (f"{errors} errors, {rest} remarks" if findings else "nothing to complain about"))
     if errors:
@@ -89,7 +89,7 @@ def simulate(
             session = run(read_recipe(source), seed, progress=count)
         say("writing")
         write_session(session, output, overwrite)
-    print(f"{output}: {len(session)} trials of {session.specimen}")
+    print(plain(f"{output}: {len(session)} trials of {session.specimen}"))
 
 
 def import_(
@@ -115,8 +115,13 @@ def import_(
         raise UserError(f"{mapping}: no recording was given; name at least one before --mapping")
     refuse_existing(output, overwrite)
     from jaxfinger.data import import_file
+    from jaxfinger.data.findings import Report
 
-    with progress("import") as say:
-        say(", ".join(s.name for s in sources))
-        session = import_file(sources, mapping, output, overwrite)
-    print(f"{output}: {len(session)} trials of {session.specimen}")
+    report = Report()
+    try:
+        with progress("import") as say:
+            say(", ".join(s.name for s in sources))
+            session = import_file(sources, mapping, output, overwrite, report)
+    finally:
+        remark(report, mapping)
+    print(plain(f"{output}: {len(session)} trials of {session.specimen}"))

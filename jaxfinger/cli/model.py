@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import Output, print_json, progress, refuse_existing
+from jaxfinger.cli.output import Output, print_json, progress, read, refuse_existing
 from jaxfinger.errors import UserError
 
 Experiments = Annotated[list[str] | None, Parameter(name=["--experiments", "-e"], consume_multiple=True)]
@@ -45,14 +45,13 @@ def identify(
         Replace files that are already there.
     """
     refuse_existing(output, overwrite)
-    from jaxfinger.data import read_session
     from jaxfinger.identify import identify as run
     from jaxfinger.identify import read_recipe, save_fit
 
     with progress("identify") as say:
         wanted = read_recipe(recipe)
         say("reading the file")
-        session = read_session(file)
+        session = read(file)
         fit = run(session, wanted, progress=say)
         if joint:
             fit = _refine(fit, session, say)
@@ -68,14 +67,13 @@ def _fit(
     refuse_existing(output, overwrite)
     if start is not None and recipe is not None:
         raise UserError(f"{start}: a fit to start from brings its own recipe; leave out --recipe or --start")
-    from jaxfinger.data import read_session
     from jaxfinger.identify import identify as run
     from jaxfinger.identify import load_fit, read_recipe, save_fit
     from jaxfinger.identify.predictions import model_for
 
     with progress("fit") as say:
         say("reading the file")
-        session = read_session(file)
+        session = read(file)
         first = load_fit(start) if start else None
         if first is not None:
             model_for(first, session)  # refuses the session of another finger
@@ -170,13 +168,12 @@ def fit_joint(file: Path, *, output: Output, start: Path, json: bool = False, ov
         Replace a file that is already there.
     """
     refuse_existing(output, overwrite)
-    from jaxfinger.data import read_session
     from jaxfinger.identify import load_fit, save_fit
     from jaxfinger.identify.predictions import model_for
 
     with progress("fit") as say:
         say("reading the file")
-        session, first = read_session(file), load_fit(start)
+        session, first = read(file), load_fit(start)
         model_for(first, session)
         fit = _refine(first, session, say)
         save_fit(fit, output, overwrite)
@@ -214,7 +211,6 @@ def fit_effects(
     """
     refuse_existing(output, overwrite)
     keys = [_key(text) for text in effect]
-    from jaxfinger.data import read_session
     from jaxfinger.effects import load
     from jaxfinger.gap import fit_with
     from jaxfinger.identify import read_recipe, save_fit
@@ -223,7 +219,7 @@ def fit_effects(
         wanted = read_recipe(recipe)
         own = load(effects) if effects is not None else {}
         say("reading the file")
-        fit = fit_with(read_session(file), keys, wanted, own, say)
+        fit = fit_with(read(file), keys, wanted, own, say)
         save_fit(fit, output, overwrite)
     _report(fit, json)
 
@@ -265,13 +261,12 @@ def validate(
         Replace figures that are already there.
     """
     from jaxfinger.cli.tables import print_validation
-    from jaxfinger.data import read_session
     from jaxfinger.identify import load_fit
     from jaxfinger.identify.validate import validate as run
 
     with progress("validate") as say:
         say("reading the files")
-        loaded, session = load_fit(fit, effects), read_session(file)
+        loaded, session = load_fit(fit, effects), read(file)
         result = run(loaded, session, tuple(experiments) if experiments else None, say)
         if figures is not None:
             from jaxfinger.report.validation import draw_validation
@@ -301,13 +296,13 @@ def predict(fit: Path, file: Path, *, output: Output, effects: Path | None = Non
         Replace a file that is already there.
     """
     refuse_existing(output, overwrite)
-    from jaxfinger.data import read_session, write_predictions
+    from jaxfinger.data import write_predictions
     from jaxfinger.identify import load_fit
     from jaxfinger.identify.predictions import predict_session
 
     with progress("predict") as say:
         say("reading the files")
-        loaded, session = load_fit(fit, effects), read_session(file)
+        loaded, session = load_fit(fit, effects), read(file)
         predictions = predict_session(loaded, session, progress=say)
         write_predictions(output, session, predictions, overwrite)
     print(f"{output}: {len(predictions)} trials predicted")

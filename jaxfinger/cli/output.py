@@ -9,15 +9,21 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from jaxfinger.errors import UserError
 from jaxfinger.progress import Step
 
+if TYPE_CHECKING:
+    from jaxfinger.data import Session
+    from jaxfinger.data.findings import Finding
+
+MOST_REMARKS = 20  # what a person reads before the results scroll away
 Output = Annotated[Path, Parameter(name=["--output", "-o"])]
 
 
@@ -32,19 +38,19 @@ def progress(title: str) -> Iterator[Callable[[str], None]]:
 
         def say(message: str) -> None:
             about = f" ({_so_far(message, time.monotonic() - begun)})" if isinstance(message, Step) else ""
-            print(f"{title}: {message}{about}", file=sys.stderr, flush=True)
+            print(plain(f"{title}: {message}{about}"), file=sys.stderr, flush=True)
 
         yield say
         return
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(20), TextColumn("{task.fields[about]}"),
-               TimeElapsedColumn())  # fmt: skip
+    said, about = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[about]}")
+    columns = (SpinnerColumn(), said, BarColumn(20), about, TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(title, total=None, about="")
 
         def tell(message: str) -> None:
-            bar.update(task, description=f"{title}: {message}")
+            bar.update(task, description=plain(f"{title}: {message}"))
             if isinstance(message, Step):
                 about = _so_far(message, time.monotonic() - begun)
                 bar.update(task, total=1.0, completed=message.done, about=about)
@@ -64,13 +70,41 @@ def _so_far(step: Step, seconds: float) -> str:
     return f"{text}, about {f'{left / 60:.0f} min' if left > 90 else f'{max(left, 1.0):.0f} s'} left"
 
 
+def plain(text: object) -> str:
+    """Text for a terminal: control characters, which would steer it, as their escapes."""
+    return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in str(text))
+
+
+def remark(findings: Iterable[Finding], file: Path) -> None:
+    """What the checker warns of, on stderr, so that no command works on doubtful numbers without a word."""
+    warnings = [finding for finding in findings if finding.severity == "warning" or finding.local]
+    for finding in warnings[:MOST_REMARKS]:
+        print(plain(f"{file}: {finding}"), file=sys.stderr)
+    if len(warnings) > MOST_REMARKS:
+        print(f"{file}: {len(warnings) - MOST_REMARKS} more: run `jaxfinger check`", file=sys.stderr)
+    sys.stderr.flush()
+
+
+def read(path: Path) -> Session:
+    """The session in a file, once what the checker warns of is said."""
+    from jaxfinger.data import read_session
+    from jaxfinger.data.findings import Report
+
+    report = Report()
+    session = read_session(path, report=report)
+    remark(report, path)
+    return session
+
+
 def table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> None:
     """A table whose first `left` columns are text and the rest numbers."""
-    out = Table(title=title, title_justify="left", title_style="bold", header_style="", box=None, pad_edge=False)
+    out = Table(
+        title=Text(plain(title)), title_justify="left", title_style="bold", header_style="", box=None, pad_edge=False
+    )
     for k, name in enumerate(header):
-        out.add_column(name, justify="left" if k < left else "right", overflow="fold")
+        out.add_column(Text(plain(name)), justify="left" if k < left else "right", overflow="fold")
     for row in rows:
-        out.add_row(*row)
+        out.add_row(*(Text(plain(cell)) for cell in row))
     console().print(out)
     console().print()
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from jaxfinger.cli.output import console, table
+from jaxfinger.cli.output import console, plain, table
 from jaxfinger.report.numbers import HALF_95, number, scaled, with_error
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ def print_fit(fit: Fit, parameters: bool = True) -> None:
     from jaxfinger.report.curves import curves
 
     found = curves(fit)
-    print(f"{fit.specimen} · {fit.data} · recipe {fit.recipe.name} · {fit.created}\n")
+    print(plain(f"{fit.specimen} · {fit.data} · recipe {fit.recipe.name} · {fit.created}\n"))
     rows = [
         (s.name, s.status, str(len(s.trials)), number(s.chi2_per_row), f"{100 * s.outliers:.1f} %") for s in fit.stages
     ]
@@ -68,7 +69,7 @@ def _warnings(fit: Fit) -> None:
     for s in fit.stages:
         said = said or bool(s.message or s.warnings)
         for text in ([s.message] if s.message else []) + list(s.warnings):
-            out.print(f"{s.name}: {text}", markup=False, soft_wrap=True)
+            out.print(plain(f"{s.name}: {text}"), markup=False, soft_wrap=True)
         if s.status == "fitted" and s.chi2_per_row > MISFIT:
             out.print(
                 f"{s.name}: the residuals are {s.chi2_per_row**0.5:.1f} times the noise, so the model misses something "
@@ -89,26 +90,29 @@ def _moment_arms(fit: Fit, found) -> None:
         for j in joints:
             if (t, j) in found.moment_arm:
                 high, low, std = found.moment_arm[t, j].range()
-                cells.append(f"{high:.2f}; {low:.2f} ± {1.96 * std:.2f}")
+                cells.append(_range(high, low, std))
             else:
                 cells.append("–")
         rows.append((t, *cells))
     table("Moment arms in mm (max; min)", ("tendon", *joints), rows)
 
 
+def _range(high: float, low: float, std: float) -> str:
+    half = f"{HALF_95 * std:.2f}" if math.isfinite(std) else "?"
+    return f"{high:.2f}; {low:.2f} ± {half}"
+
+
 def _joints(found) -> None:
     rows = []
     for name, c in found.joints.items():
-        high, low, std = c.elastic.range()
-        f_high, f_low, f_std = c.friction.range()
         unit = "N" if c.prismatic else "N mm"
         rate = "N s/m" if c.prismatic else "N mm s/rad"
         rows.append(
             (
                 name,
                 f"{c.gravity.max():.1f}; {c.gravity.min():.1f}",
-                f"{high:.2f}; {low:.2f} ± {1.96 * std:.2f}",
-                f"{f_high:.2f}; {f_low:.2f} ± {1.96 * f_std:.2f}",
+                _range(*c.elastic.range()),
+                _range(*c.friction.range()),
                 unit,
                 with_error(*c.damping),
                 rate,
@@ -131,7 +135,7 @@ def _parameters(fit: Fit) -> list[tuple[str, str, str]]:
 
 def print_validation(result: Validation) -> None:
     """One row a channel's column."""
-    print(f"{result.specimen} · {result.session}\n")
+    print(plain(f"{result.specimen} · {result.session}\n"))
     for experiment in dict.fromkeys(s.experiment for s in result.scores):
         rows = []
         for s in (s for s in result.scores if s.experiment == experiment):
@@ -152,4 +156,4 @@ def print_validation(result: Validation) -> None:
         ]
         table("Fingertip force against tension, slope in N/N", ("trial", "axis", "measured", "model"), rows, left=2)
     for message in result.messages:
-        print(message)
+        print(plain(message))

@@ -1,63 +1,182 @@
-"""rosbag2 and MCAP recordings as named arrays: `/topic.field`, with `/topic.time` in s from the recording's start."""
+"""rosbag2 and MCAP recordings: `/topic.field`, with `/topic.time` in s from the recording's start."""
 
 from __future__ import annotations
 
 import json
 import struct
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jaxfinger.data.opening import plain_reason
+from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.errors import UserError
 
-_SECOND = 1e-9  # stamps are in ns
+_NS = 1e-9  # s: stamps are whole numbers of ns, and stay so until their start is taken off
+_CLOCKS = ("time", "stamp")
 
 
-def load_bag(path: Path) -> dict[str, np.ndarray]:
+@dataclass
+class _Topic:
+    """The messages of one topic, field by field, beside the index of the message that each value is from."""
+
+    log: list[int] = field(default_factory=list)  # ns, when each message was logged
+    stamps: list[int | None] = field(default_factory=list)  # ns, when it was made, by its header
+    names: list[tuple[str, ...] | None] = field(default_factory=list)  # of its columns, as JointState has them
+    values: dict[str, tuple[list[int], list[np.ndarray]]] = field(default_factory=lambda: defaultdict(lambda: ([], [])))
+
+
+def load_bag(path: Path) -> Recording:
     """Every numeric field of every topic: (N,) or, where the field is a list of k numbers, (N, k).
 
     `/topic.time` is when the message was logged; messages with a header also have `/topic.stamp`, when it was made.
+    Where messages carry a list of names (JointState), the columns of their lists go by these. A field that a message
+    lacks is NaN there. Topics that cannot be decoded are left out, with the reason.
+
+    Raises:
+        UserError: a package is missing, or the recording cannot be read at all.
     """
-    messages = _mcap_messages(path) if path.suffix == ".mcap" else _rosbag_messages(path)
-    series: dict[str, list] = defaultdict(list)
+    topics: dict[str, _Topic] = defaultdict(_Topic)
+    unusable: dict[str, str] = {}
     try:
-        for topic, stamp, message in messages:
-            series[f"{topic}.time"].append(stamp * _SECOND)
-            for name, value in _fields(message):
-                series[f"{topic}.{name}"].append(value)
+        for topic, stamp, message in _messages(path):
+            if isinstance(message, Exception | str):
+                unusable.setdefault(topic, message if isinstance(message, str) else _undecoded(message))
+                continue
+            _add(topics[topic], stamp, message)
     except ImportError as error:
         raise UserError(f"{path}: needs the package {error.name}; install jaxfinger[bags]") from None
-    arrays = {name: _array(values) for name, values in series.items()}
-    starts = [array[0] for name, array in arrays.items() if array is not None and name.endswith((".time", ".stamp"))]
-    first = min(starts, default=0.0)
-    return {
-        name: array - first if name.endswith((".time", ".stamp")) else array
-        for name, array in arrays.items()
-        if array is not None
-    }
+    start = _start(topics.values())
+    variables: dict[str, Variable] = {}
+    for name, topic in topics.items():
+        _collect(name, topic, start, variables, unusable)
+    broken = [name for name in unusable if name in topics]
+    remarks = tuple(f"some messages of {name} are left out: the topic {unusable.pop(name)}" for name in broken)
+    return Recording(path, variables, unusable, remarks)
 
 
-def _array(values: list) -> np.ndarray | None:
-    """Messages whose lists change length make no array, and are left out."""
-    lengths = {np.shape(value) for value in values}
-    return np.asarray(values, np.float64) if len(lengths) == 1 else None
+def _undecoded(error: Exception) -> str:
+    said = plain_reason(error)
+    return f"cannot be decoded ({type(error).__name__}: {said}); its message definition is not in the recording"
+
+
+def _start(topics: Iterable[_Topic]) -> int:
+    """The recording's start: when the first message of the busiest topic was logged. A latched message may be logged
+    at any time."""
+    busiest = max(topics, key=lambda topic: len(topic.log), default=None)
+    return min(busiest.log) if busiest is not None else 0
+
+
+def _add(topic: _Topic, stamp: int, message: Any) -> None:
+    index = len(topic.log)
+    topic.log.append(stamp)
+    topic.stamps.append(None)
+    topic.names.append(None)
+    for name, value in _fields(message):
+        if name == "stamp" and isinstance(value, int):
+            topic.stamps[index] = value
+        elif name == "name" and isinstance(value, tuple):
+            topic.names[index] = value
+        else:
+            indices, values = topic.values[name]
+            indices.append(index)
+            values.append(value)
 
 
 def _fields(message: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Numbers as arrays, the header's stamp in ns, and the names that go with lists."""
     items = message.items() if isinstance(message, dict) else vars(message).items()
     for name, value in items:
+        inner = prefix + name
         if name == "stamp" and (hasattr(value, "sec") or isinstance(value, dict)):
             stamp = value if isinstance(value, dict) else vars(value)
-            yield "stamp", stamp.get("sec", 0) + stamp.get("nanosec", stamp.get("nsec", 0)) * _SECOND
+            if not prefix or prefix == "header.":
+                yield "stamp", int(stamp.get("sec", 0)) * 10**9 + int(stamp.get("nanosec", stamp.get("nsec", 0)))
         elif isinstance(value, dict) or hasattr(value, "__msgtype__"):
-            yield from _fields(value, "" if name == "header" else f"{prefix}{name}.")
+            yield from _fields(value, "header." if name == "header" and not prefix else f"{inner}.")
+        elif name == "name" and not prefix and isinstance(value, list) and value and isinstance(value[0], str):
+            yield "name", tuple(map(str, value))
         elif isinstance(value, bool | int | float | np.ndarray | list):
-            array = np.asarray(value)
+            try:
+                array = np.asarray(value)
+            except ValueError:  # lists of lists of several lengths
+                continue
             if array.size and array.dtype.kind in "biuf":
-                yield prefix + name, array.astype(np.float64)
+                yield inner, array.astype(np.float64)
+
+
+def _collect(name: str, topic: _Topic, start: int, variables: dict[str, Variable], unusable: dict[str, str]) -> None:
+    count = len(topic.log)
+    clock = f"{name}.time"
+    variables[clock] = Variable((np.array(topic.log, object) - start).astype(np.float64) * _NS, units="s")
+    if all(stamp is not None for stamp in topic.stamps):
+        variables[f"{name}.stamp"] = Variable(
+            (np.array(topic.stamps, object) - start).astype(np.float64) * _NS, units="s", clock=clock
+        )
+    elif any(stamp is not None for stamp in topic.stamps):
+        unusable[f"{name}.stamp"] = "is missing in some of its messages; take `time`, when they were logged"
+    for key, (indices, values) in topic.values.items():
+        # A field called `time` or `stamp` is not the clock of that name.
+        called = f"{name}.message.{key}" if key in _CLOCKS else f"{name}.{key}"
+        widths = sorted({value.shape for value in values})
+        names = {topic.names[i] for i in indices} - {None}
+        if (
+            names
+            and widths[0]
+            and all(len(topic.names[i] or ()) == len(v) for i, v in zip(indices, values, strict=True))
+        ):
+            fault = _by_name(called, topic, indices, values, clock, variables)
+            if fault:
+                unusable[called] = fault
+        elif len(widths) > 1:
+            lengths = [len(value) if value.ndim else 1 for value in values]
+            turn = next(i for i, length in enumerate(lengths) if length != lengths[0])
+            unusable[called] = (
+                f"changes its length from {lengths[0]} to {lengths[turn]} at message {indices[turn]}; cut the bag "
+                "there, or log the parts on topics of their own"
+            )
+        else:
+            array = np.full((count, *widths[0]), np.nan)
+            array[indices] = values
+            variables[called] = Variable(array.reshape(count, -1) if array.ndim > 2 else array, clock=clock)
+
+
+def _by_name(
+    called: str,
+    topic: _Topic,
+    indices: Sequence[int],
+    values: Sequence[np.ndarray],
+    clock: str,
+    variables: dict[str, Variable],
+) -> str | None:
+    """A list whose entries go by the message's names: a column for each name that occurs. Else, why not."""
+    order: list[str] = []
+    for names in dict.fromkeys(topic.names):
+        if names is not None and len(set(names)) < len(names):
+            double = next(name for name in names if names.count(name) > 1)
+            return f"lists {double!r} twice in one message; give each joint its own name"
+        order += [name for name in names or () if name not in order]
+    place = {name: k for k, name in enumerate(order)}
+    array = np.full((len(topic.log), len(order)), np.nan)
+    present = np.zeros(array.shape, bool)
+    for names in dict.fromkeys(topic.names):
+        columns = [place[name] for name in names or ()]
+        of_these = [i for i, found in enumerate(topic.names) if found == names]
+        present[np.ix_(of_these, columns)] = True
+    for index, value in zip(indices, values, strict=True):
+        array[index, [place[name] for name in topic.names[index] or ()]] = value
+    changing = len({names for names in topic.names if names is not None}) > 1
+    variables[called] = Variable(array, tuple(order), clock, present=present if changing else None)
+    return None
+
+
+def _messages(path: Path) -> Iterator[tuple[str, int, Any]]:
+    """(topic, ns, message), and in place of a message that cannot be decoded the reason."""
+    return _mcap_messages(path) if path.suffix.lower() == ".mcap" else _rosbag_messages(path)
 
 
 def _rosbag_messages(path: Path) -> Iterator[tuple[str, int, Any]]:
@@ -66,7 +185,13 @@ def _rosbag_messages(path: Path) -> Iterator[tuple[str, int, Any]]:
 
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         for connection, stamp, raw in reader.messages():
-            yield connection.topic, stamp, reader.deserialize(raw, connection.msgtype)
+            try:
+                message = reader.deserialize(raw, connection.msgtype)
+            except KeyError:
+                message = f"is of the type {connection.msgtype}, whose definition the recording does not carry"
+            except Exception as error:  # of one topic; the others are read
+                message = error
+            yield connection.topic, stamp, message
 
 
 def _mcap_messages(path: Path) -> Iterator[tuple[str, int, Any]]:
@@ -78,14 +203,24 @@ def _mcap_messages(path: Path) -> Iterator[tuple[str, int, Any]]:
     with path.open("rb") as file:
         try:
             for schema, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
-                if channel.message_encoding == "json":
-                    yield channel.topic, message.log_time, json.loads(message.data)
-                elif channel.message_encoding == "cdr" and schema is not None:
-                    decode = decoders.setdefault(schema.id, None) or _ros_decoder(schema)
-                    decoders[schema.id] = decode
-                    yield channel.topic, message.log_time, decode(message.data)
+                yield channel.topic, message.log_time, _decoded(schema, channel, message, decoders)
         except (EndOfFile, struct.error):  # cut between records, or inside one
             return
+
+
+def _decoded(schema: Any, channel: Any, message: Any, decoders: dict[int, Any]) -> Any:
+    encoding = channel.message_encoding
+    try:
+        if encoding == "json":
+            content = json.loads(message.data)
+            return content if isinstance(content, dict) else {"value": content}
+        if encoding == "cdr" and schema is not None:
+            if channel.id not in decoders:
+                decoders[channel.id] = _ros_decoder(schema)
+            return decoders[channel.id](message.data)
+    except Exception as error:  # of one topic; the others are read
+        return error
+    return f"is in {encoding or 'an unnamed encoding'}, which is not read (JSON and CDR are); convert it"
 
 
 def _ros_decoder(schema: Any) -> Any:

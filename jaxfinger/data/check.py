@@ -6,7 +6,6 @@ import os
 from collections import defaultdict
 from collections.abc import Collection
 from datetime import datetime
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -15,8 +14,8 @@ from jaxfinger.data.check_finger import check_finger
 from jaxfinger.data.check_trial import check_trial
 from jaxfinger.data.filtering import longest_spike, outlier_mask
 from jaxfinger.data.findings import Finding, Report
+from jaxfinger.data.opening import plain_reason, why_closed
 from jaxfinger.data.parse import listed, parse_file
-from jaxfinger.data.probe import survives
 from jaxfinger.data.schema import MEASURED
 from jaxfinger.data.session import EXPERIMENTS, Session, Trial
 
@@ -27,8 +26,8 @@ _START = 100  # samples by which most pairs of trials are told apart
 def check_file(path: str | os.PathLike) -> list[Finding]:
     """All that is wrong with a file; empty where it is as the format wants it. Never raises for what is in the file."""
     session, report = inspect(path)
-    for trial in session or ():
-        _check_spikes(trial, report)
+    if session is not None:
+        check_spikes(session, report)
     return list(report)
 
 
@@ -41,8 +40,9 @@ def inspect(path: str | os.PathLike, trials: Collection[str] | None = None) -> t
     try:
         with file:
             session = parse_file(file, os.fspath(path), report, trials)
-    except Exception:  # h5py raises nearly anything on a damaged file
-        report.error("/", "cannot be read to the end: the file is damaged; record or import it again")
+    except Exception as error:  # h5py raises nearly anything on a damaged file
+        said = plain_reason(error)
+        report.error("/", f"cannot be read to the end ({said}): the file is damaged; record or import it again")
         return None, report
     if session is not None:
         check_session(session, report)
@@ -69,30 +69,11 @@ def check_session(session: Session, report: Report) -> None:
 
 def open_file(path: str | os.PathLike, report: Report) -> h5py.File | None:
     """The open file, or None with the reason reported."""
-    if not Path(path).is_file():
-        what = "is a folder" if Path(path).is_dir() else "does not exist"
-        report.error("/", f"{what}; name a dataset file")
+    reason = why_closed(path)
+    if reason is not None:
+        report.error("/", reason)
         return None
-    if not survives(path):
-        report.error("/", "is damaged in its structure; copy it again, or recover it from the recorder's log")
-        return None
-    try:
-        return h5py.File(path, "r")
-    except (OSError, RuntimeError, ValueError, UnicodeError) as error:
-        report.error("/", _reason(Path(path), str(error)))
-        return None
-
-
-def _reason(path: Path, error: str) -> str:
-    if not os.access(path, os.R_OK):
-        return "may not be read; change its permissions"
-    if path.stat().st_size == 0:
-        return "is empty; record or import it again"
-    if not h5py.is_hdf5(path):
-        return "is not an HDF5 file; give a dataset file, or import the recording first"
-    if "truncated" in error:
-        return "is truncated: its end is missing; copy it again, or recover it from the recorder's log"
-    return "cannot be opened as HDF5: it is damaged; copy it again, or recover it from the recorder's log"
+    return h5py.File(path, "r")
 
 
 def _check_order(session: Session, report: Report) -> None:
@@ -142,9 +123,10 @@ def _check_created(created: str, report: Report) -> None:
         report.warning("/", f"has `created` {created!r}; write ISO 8601 with time zone, as 2026-01-31T12:00:00+00:00")
 
 
-def _check_spikes(trial: Trial, report: Report) -> None:
-    longest = longest_spike(float(np.median(np.diff(trial.time))) if len(trial.time) > 1 else 0.0)
-    for name in MEASURED:
+def check_spikes(session: Session, report: Report) -> None:
+    """Report samples that are far from their neighbours."""
+    for trial, name in ((trial, name) for trial in session for name in MEASURED):
+        longest = longest_spike(float(np.median(np.diff(trial.time))) if len(trial.time) > 1 else 0.0)
         values = getattr(trial, name)
         if values is None:
             continue

@@ -13,6 +13,7 @@ STILL_JOINT = 0.01  # rad: five times the noise of a 14-bit encoder
 STILL_AXIS = 1e-4  # m
 OUTSIDE = 0.35  # rad beyond its limits that a joint is allowed to read
 SLACK = 0.5  # N: below it a tendon may be slack, and its excursion NaN
+_FEW = 20  # samples, fewer than which show no usual step
 _MOVES_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic")
 _STEPPED = ("ID.3-static", "ID.4", "VD.2")
 
@@ -26,6 +27,7 @@ def check_trial(trial: Trial, finger: FingerDescription, report: Report) -> None
             _holes(trial, name, finger, report)
     _present(trial, finger, report)
     _motion(trial, finger, report)
+    _jumps(trial, finger, report)
     _sizes(trial, finger, report)
     _holds(trial, report)
 
@@ -129,8 +131,8 @@ def _holes(trial: Trial, name: str, finger: FingerDescription, report: Report) -
             at = trial.time[int(np.argmax(bad[:, k]))]
             report.error(
                 _place(trial, name),
-                f"column {column} is NaN in {count} of {len(bad)} samples, first at {at:.6g} s; cut these samples out, "
-                "or make the whole column NaN if it was not measured",
+                f"column {column} is NaN in {count} of {len(bad)} samples, first at {at:.6g} s; cut these samples out "
+                "(`span` in a mapping), or make the whole column NaN if it was not measured",
             )
 
 
@@ -214,6 +216,27 @@ def _motion(trial: Trial, finger: FingerDescription, report: Report) -> None:
     if trial.experiment in NEEDS_TENDON and _span(_pulled(trial, finger)) < SLACK:
         message = f"tendon {trial.tendon} is never pulled; check the attribute `tendon`"
         report.warning(_place(trial, "tendon_force"), message)
+
+
+def _jumps(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Does an encoder wrap? Between two samples a joint does not go most of the way that it goes in the whole trial."""
+    for k, name in enumerate(finger.joint_names):
+        x = trial.q[:, k]
+        if len(x) < _FEW or not np.isfinite(x).all():
+            continue
+        steps = np.abs(np.diff(x))
+        jumps = steps > 0.5 * np.ptp(x)
+        still = STILL_AXIS if finger.prismatic[k] else STILL_JOINT
+        if not jumps.any() or np.ptp(x) < still or np.percentile(steps, 90.0) > 0.1 * np.ptp(x):
+            continue
+        size, at = float(np.median(steps[jumps])), trial.time[int(np.argmax(jumps))]
+        turn = not finger.prismatic[k] and abs(size / (2.0 * np.pi) - 1.0) < 0.1
+        what = "a whole turn" if turn else f"{size:.3g}"
+        report.warning(
+            _place(trial, "q"),
+            f"column {name} jumps by {what} between two samples at {int(jumps.sum())} places, first at {at:.6g} s: the "
+            "encoder wraps or loses counts; unwrap it (`unwrap = true` in a mapping), or cut these places out",
+        )
 
 
 def _sizes(trial: Trial, finger: FingerDescription, report: Report) -> None:

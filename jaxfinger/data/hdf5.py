@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxfinger.data.atomic import atomic_path
 from jaxfinger.data.check import inspect
+from jaxfinger.data.findings import Report
 from jaxfinger.data.schema import (
     CHANNELS,
     FINGERTIP,
@@ -35,13 +36,17 @@ LIBVER = ("earliest", "v108")
 _TEXT = h5py.string_dtype("utf-8")
 
 
-def read_session(path: str | os.PathLike, trials: Collection[str] | None = None) -> Session:
-    """The session in a file, in float64, or only the named trials of it.
+def read_session(
+    path: str | os.PathLike, trials: Collection[str] | None = None, report: Report | None = None
+) -> Session:
+    """The session in a file, in float64, or only the named trials of it. `report` takes what the checker finds.
 
     Raises:
         UserError: the first error that `check_file` finds, in one sentence with file, place and mend.
     """
     session, findings = inspect(path, trials)
+    if report is not None:
+        report.extend(findings)
     fault = findings.fatal
     if fault is not None:
         raise UserError(f"{path}: {fault.place}: {fault.message}")

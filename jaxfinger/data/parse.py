@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 
 from jaxfinger.data.findings import Report
+from jaxfinger.data.opening import plain_reason, why_unreadable
 from jaxfinger.data.schema import (
     CHANNELS,
     FINGERTIP,
@@ -27,6 +28,12 @@ from jaxfinger.data.session import EXPERIMENTS, FingerDescription, Session, Tria
 
 # gzip shrinks a constant by at most about 1:1030: a dataset that claims more than this cannot be in the file.
 _LARGEST_COMPRESSION = 1100
+# What whole numbers may be, by kind: lowest, highest, in words.
+RANGES = {
+    "bool": (0, 1, "false or true"),
+    "int8": (-1, 1, "-1, 0 or 1"),
+    "int32": (-1, 2**31 - 1, "-1 or an index of a hold"),
+}
 
 
 def parse_file(file: h5py.File, path: str, report: Report, names: Collection[str] | None = None) -> Session | None:
@@ -248,6 +255,9 @@ def child(parent: h5py.Group, name: str, place: str, report: Report, kind: type)
     """A group or dataset of the parent, or None with the reason reported."""
     what = "group" if kind is h5py.Group else "dataset"
     try:
+        if isinstance(parent.get(name, getlink=True), h5py.ExternalLink):
+            report.error(place, f"lies in another file, to which this one only links; copy the {what} into this one")
+            return None
         item = parent.get(name)
     except Exception:  # a damaged file raises nearly anything
         report.error(
@@ -271,12 +281,16 @@ def dataset(group, entry: Entry, place: str, sizes: Mapping[str, int | None], pr
     if item is None:
         return None
     try:
-        if not _plausible_size(item):
-            report.error(place, f"claims the shape {item.shape}, more than the file can hold; the file is damaged")
+        reason = why_unreadable(item)
+        if reason is None and not _plausible_size(item):
+            reason = f"claims the shape {item.shape}, more than the file can hold; the file is damaged"
+        if reason is not None:
+            report.error(place, reason)
             return None
         value = _names(item) if entry.kind == "text" else item[()]
-    except Exception:  # as above
-        report.error(place, "cannot be read: the file is truncated or damaged; record or import it again")
+    except Exception as error:  # as above
+        said = plain_reason(error)
+        report.error(place, f"cannot be read ({said}): the file is truncated or damaged; record or import it again")
         return None
     if not _right_shape(value, entry, place, sizes, report):
         return None
@@ -288,7 +302,7 @@ def dataset(group, entry: Entry, place: str, sizes: Mapping[str, int | None], pr
 
 def _plausible_size(item: h5py.Dataset) -> bool:
     stored = 2**20 + item.file.id.get_filesize()
-    return item.size is not None and item.size * item.dtype.itemsize <= _LARGEST_COMPRESSION * stored
+    return item.size * item.dtype.itemsize <= _LARGEST_COMPRESSION * stored
 
 
 def _right_shape(value: Any, entry: Entry, place: str, sizes: Mapping[str, int | None], report: Report) -> bool:
@@ -343,9 +357,8 @@ def _as_kind(value: np.ndarray, entry: Entry, place: str, report: Report) -> np.
     ):
         report.error(place, f"holds values that are not whole numbers; write it as {entry.kind}")
         return None
-    lowest, highest = {"bool": (0, 1), "int8": (-1, 1), "int32": (-1, 2**31 - 1)}[entry.kind]
+    lowest, highest, allowed = RANGES[entry.kind]
     if value.size and (value.min() < lowest or value.max() > highest):
-        allowed = {"bool": "false or true", "int8": "-1, 0 or 1", "int32": "-1 or an index of a hold"}[entry.kind]
         report.error(place, f"holds values from {value.min()} to {value.max()}; each must be {allowed}")
         return None
     return np.ascontiguousarray(value, entry.kind)

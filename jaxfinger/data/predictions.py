@@ -80,6 +80,17 @@ def read_predictions(path: str | os.PathLike) -> dict[str, dict[str, np.ndarray]
     return found
 
 
+def _complete(place: str, time: np.ndarray, values: np.ndarray, report: Report) -> None:
+    """A column is predicted at every sample or, all NaN, at none."""
+    bad = ~np.isfinite(values).reshape(len(values), -1)
+    for column in bad.T:
+        if column.any() and not column.all():
+            at = time[int(np.argmax(column))]
+            count = f"is NaN in {int(column.sum())} of {len(column)} samples, first at {at:.6g} s"
+            report.error(place, f"{count}; predict every sample, or leave the column NaN throughout")
+            return
+
+
 def _parse(file: h5py.File, report: Report) -> dict[str, dict[str, np.ndarray]]:
     finger = parse_finger(file, report) if parse_version(file, report) else None
     trials = child(file, "trials", "/trials", report, h5py.Group) if finger is not None else None
@@ -95,5 +106,8 @@ def _parse(file: h5py.File, report: Report) -> dict[str, dict[str, np.ndarray]]:
         values = {
             c: dataset(group, e, place, sizes, finger.prismatic, report) for c, e in CHANNELS.items() if c in group
         }
+        for channel, value in values.items():
+            if value is not None:
+                _complete(f"{place}/{channel}", time, value, report)
         found[name] = {"time": time} | {channel: value for channel, value in values.items() if value is not None}
     return found

@@ -91,7 +91,10 @@ class Fit:
         ]
 
     def function(self, f) -> tuple[np.ndarray, np.ndarray]:
-        """Value and standard deviation of any function of the model, by the delta method."""
+        """Value and standard deviation of any function of the model, by the delta method.
+
+        Where it depends on a parameter that the trials cannot see, the standard deviation is infinite.
+        """
         import jax
 
         from jaxfinger.identify.parameters import with_flat
@@ -99,7 +102,7 @@ class Fit:
         flat = ravel(self.model)
         seen = np.isfinite(np.diag(self.covariance))
         covariance = np.where(np.outer(seen, seen), self.covariance, 0.0)
-        positions = np.flatnonzero(np.diag(covariance) > 0)
+        positions = np.flatnonzero((np.diag(covariance) > 0) | ~seen)
 
         @jax.jit
         def value_and_jacobian(theta):
@@ -110,4 +113,5 @@ class Fit:
 
         value, J = map(np.asarray, value_and_jacobian(flat[positions]))
         variance = np.einsum("...i,ij,...j->...", J, covariance[np.ix_(positions, positions)], J)
-        return value, np.sqrt(np.maximum(variance, 0.0))
+        unseen = np.any(J[..., ~seen[positions]] != 0.0, axis=-1)
+        return value, np.where(unseen, np.inf, np.sqrt(np.maximum(variance, 0.0)))

@@ -90,7 +90,8 @@ def _remedy(parameters, free, v) -> str:
         for p in involved
         if p.group in SHOWN_BY
     ]
-    return " and ".join(dict.fromkeys(wanted)) or "a trial that moves what it acts on"
+    whole = [text for text in dict.fromkeys(wanted) if not any(other.startswith(f"{text},") for other in wanted)]
+    return " and ".join(whole) or "a trial that moves what it acts on"
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import check_file, import_file, read_session
-from jaxfinger.data.sources import load_variables
+from jaxfinger.data.sources import load_recording
 from jaxfinger.errors import UserError
 from tests.data.conftest import ONE_JOINT
 
@@ -30,10 +30,10 @@ def write_mcap(path):
 
 def test_mcap_in_json(tmp_path):
     write_mcap(tmp_path / "log.mcap")
-    found = load_variables(tmp_path / "log.mcap")
-    np.testing.assert_allclose(found["/state.time"], np.arange(COUNT) * 1e-3, atol=1e-9)
-    np.testing.assert_array_equal(found["/state.position"], np.arange(COUNT)[:, None] * [0.1, -0.2])
-    np.testing.assert_array_equal(found["/state.temperature"], 20.0 + np.arange(COUNT))
+    found = load_recording(tmp_path / "log.mcap").variables
+    np.testing.assert_allclose(found["/state.time"].values, np.arange(COUNT) * 1e-3, atol=1e-9)
+    np.testing.assert_array_equal(found["/state.position"].values, np.arange(COUNT)[:, None] * [0.1, -0.2])
+    np.testing.assert_array_equal(found["/state.temperature"].values, 20.0 + np.arange(COUNT))
     assert "/state.note" not in found
 
 
@@ -41,7 +41,7 @@ def test_mcap_cut_short_is_read_to_the_cut(tmp_path):
     path = tmp_path / "log.mcap"
     write_mcap(path)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    position = load_variables(path)["/state.position"]
+    position = load_recording(path).variables["/state.position"].values
     assert 10 < len(position) < COUNT
     np.testing.assert_array_equal(position, np.arange(len(position))[:, None] * [0.1, -0.2])
 
@@ -70,10 +70,10 @@ def write_rosbag2(path):
 
 def test_rosbag2_with_joint_states(tmp_path):
     write_rosbag2(tmp_path / "bag")
-    found = load_variables(tmp_path / "bag")
-    np.testing.assert_array_equal(found["/joint_states.position"], np.arange(COUNT)[:, None] * [0.1, -0.2])
-    np.testing.assert_allclose(found["/joint_states.time"], 2e-3 * np.arange(COUNT), atol=1e-9)
-    np.testing.assert_allclose(np.diff(found["/joint_states.stamp"]), 1.0, atol=1e-6)
+    found = load_recording(tmp_path / "bag").variables
+    np.testing.assert_array_equal(found["/joint_states.position"].values, np.arange(COUNT)[:, None] * [0.1, -0.2])
+    np.testing.assert_allclose(found["/joint_states.time"].values, 2e-3 * np.arange(COUNT), atol=1e-9)
+    np.testing.assert_allclose(np.diff(found["/joint_states.stamp"].values), 1.0, atol=1e-6)
 
 
 MAPPING = (
@@ -109,4 +109,4 @@ def test_a_bag_becomes_a_session_by_a_mapping_file(tmp_path, write, name, topic,
 def test_a_damaged_bag_is_refused(tmp_path):
     (tmp_path / "log.mcap").write_bytes(b"not a recording")
     with pytest.raises(UserError, match="cannot be read"):
-        load_variables(tmp_path / "log.mcap")
+        load_recording(tmp_path / "log.mcap")

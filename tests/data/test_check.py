@@ -151,7 +151,7 @@ ERRORS = {
 
 @pytest.mark.parametrize("fault", ERRORS)
 def test_each_fault_is_named_and_refused(file, fault, monkeypatch):
-    monkeypatch.setattr("jaxfinger.data.check.survives", lambda path: True)  # whole files with wrong content
+    monkeypatch.setattr("jaxfinger.data.opening.survives", lambda path: True)  # whole files with wrong content
     change, place, words = ERRORS[fault]
     with h5py.File(file, "r+") as opened:
         change(opened)

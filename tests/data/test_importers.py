@@ -104,10 +104,14 @@ def test_sampling_rate_span_and_own_clock(mapping, tmp_path):
     ("old", "new", "words"),
     [
         ('time = "t"', 'tyme = "t"', r"line \d+: trials\.01-ID2\.tyme: is unknown \(did you mean 'time'\?\)"),
-        ('from = "enc"', 'from = "encoder"', r"'encoder', which the recording has not; it has enc, extra, gain"),
+        (
+            'from = "enc"',
+            'from = "encoder"',
+            r"'encoder' of log.mat, which the recording has not; it has enc, extra, gain",
+        ),
         (", column = 1", "", "has 2 columns; choose one by `column`"),
         ('from = "pull"', 'from = "gain"', "has 1 samples where the trial's time has 500"),
-        ('units = "deg"', 'units = "mm"', "units 'mm'; it must be one of rad, deg"),
+        ('units = "deg"', 'units = "mm"', "units 'mm'; it must be one of rad, mrad, deg"),
         ('units = "mN"', 'units = "mN"\n', "not valid TOML"),
         ("q.MCP", "q.PIP", "column 'PIP'; it must be one of MCP"),
         ("tendon_excursion.T1", "excursion.T1", r"channels\.excursion: is unknown \(did you mean 'tendon_excursion'"),

@@ -1,0 +1,422 @@
+"""The columns of one trial: a variable of a recording, in SI, on the trial's clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxfinger.data.expressions import ExpressionError, evaluate
+from jaxfinger.data.findings import Report
+from jaxfinger.data.mapping import CLOCK_KEYS, COLUMN_KEYS, Where
+from jaxfinger.data.parse import listed
+from jaxfinger.data.recording import Recording, Variable
+from jaxfinger.data.units import TO_SI, known
+from jaxfinger.errors import UserError
+
+# Two clocks of one recording run about as long and tick about as often. Units are mistaken by a thousand, so thirty,
+# half of it, tells a mistaken unit from a slow sensor.
+_OTHER_UNITS = 30.0
+_COVERED = 0.5  # of a trial that a clock must cover: below it two clocks are taken to share no time
+_FEW = 10  # samples within the trial, fewer than which tell no motion
+_SLOW = 0.2  # s: a clock that ticks more slowly is likely in other units
+
+
+@dataclass(frozen=True)
+class Source:
+    """A recording with the variables that the mapping derives of it."""
+
+    recording: Recording
+    constants: Mapping[str, Any] = field(default_factory=dict)
+    derived: Mapping[str, str] = field(default_factory=dict)
+
+    def variable(self, name: str, where: Where, within: tuple[str, ...] = ()) -> Variable:
+        """The variable of this name: derived, or as the recording has it.
+
+        Raises:
+            UserError: there is none, or it gives no numbers; the reason is said.
+        """
+        if name in self.derived and name not in within:
+            return self._derive(name, where, within)
+        if name in self.recording.variables:
+            return self.recording.variables[name]
+        said = f"reads the variable {name!r} of {self.recording.path.name}"
+        for candidate in (name, *(name[:i] for i in range(len(name) - 1, 0, -1) if name[i] == ".")):
+            if candidate in self.recording.unusable:
+                where.fail(f"{said}, but {candidate} {self.recording.unusable[candidate]}")
+        if name in within:
+            where.fail(f"derives {name!r} from itself, and the recording has no variable of this name; name another")
+        there = sorted([*self.recording.variables, *self.derived])
+        return where.fail(f"{said}, which the recording has not; it has {listed(there, 30)}")
+
+    def _derive(self, name: str, where: Where, within: tuple[str, ...]) -> Variable:
+        where = where / f"derived.{name}"
+        text = self.derived[name]
+        if not isinstance(text, str):
+            where.fail(f"is {text!r}; it must be an expression, as 'kt * current'")
+        clocks: dict[str, str] = {}
+
+        def lookup(inner: str, column: Any) -> np.ndarray:
+            if inner == name and inner in self.recording.variables:
+                variable = self.recording.variables[inner]
+            else:
+                variable = self.variable(inner, where, (*within, name))
+            clocks[inner] = variable.clock
+            if variable.present is not None:
+                where.fail(f"uses {inner!r}, whose names change from message to message; map its columns by name")
+            return variable.values if column is None else _column(variable, inner, column, where)[0]
+
+        try:
+            values = np.asarray(evaluate(text, lookup, self.constants), np.float64)
+        except ExpressionError as error:
+            where.fail(f"{text!r} {error}")
+        if len(set(clocks.values())) > 1:
+            of = ", ".join(f"{inner} on {clock or 'none'}" for inner, clock in clocks.items())
+            where.fail(f"joins variables that have different clocks ({of}); derive one variable for each clock")
+        if values.ndim not in (1, 2):
+            where.fail("gives a single number and no samples; put it into [constants]")
+        return Variable(values, clock=next(iter(clocks.values()), ""))
+
+
+def _column(variable: Variable, name: str, column: Any, where: Where) -> tuple[np.ndarray, int]:
+    """One column by its place or its name, and its place."""
+    values, names = variable.values, variable.columns
+    if values.ndim == 1:
+        if column not in (None, 0):
+            where.fail(f"reads column {column!r} of {name!r}, which has one column; leave `column` out")
+        return np.atleast_1d(values), 0
+    if isinstance(column, str):
+        if column not in names:
+            there = listed(names) if names else "no names of columns"
+            where.fail(f"reads column {column!r} of {name!r}, which has {there}; choose one of them")
+        column = names.index(column)
+    elif variable.present is not None:
+        groups = np.unique(variable.present, axis=0)[::-1]
+        kinds = "; ".join(", ".join(np.array(names)[row]) for row in groups if row.any())
+        where.fail(
+            f"reads {name!r}, whose names change from message to message ({kinds}); choose by name, as column = "
+            f"{names[0]!r}"
+        )
+    elif column is None and values.shape[1] == 1:
+        column = 0
+    if isinstance(column, bool) or not isinstance(column, int) or not 0 <= column < values.shape[1]:
+        called = f" ({listed(names)})" if names else ""
+        where.fail(f"reads {name!r}, which has {values.shape[1]} columns{called}; choose one by `column`, from 0")
+    return values[:, column], column
+
+
+def single(source: Source, name: str, where: Where) -> float:
+    """A number of the recording or of the mapping's constants."""
+    values = np.asarray(source.constants.get(name) if name in source.constants else source.variable(name, where).values)
+    if values.size != 1:
+        where.fail(f"is scaled by {name!r}, which holds {values.size} values; name a single number")
+    return float(values.reshape(-1)[0])
+
+
+@dataclass(frozen=True)
+class Clock:
+    """When the samples of a trial were taken, and which rows of the recording they are."""
+
+    time: Float[np.ndarray, " N"]  # s
+    rows: Int[np.ndarray, " N"]
+    total: int  # rows of the recording
+    source: Source
+    name: str = ""  # of the variable; empty where the sampling rate is given
+    units: str = "s"
+    sort: bool = False
+
+    def keep(self, rows: np.ndarray) -> Clock:
+        """Only these samples, by mask or index."""
+        return Clock(self.time[rows], self.rows[rows], self.total, self.source, self.name, self.units, self.sort)
+
+
+def trial_clock(table: Mapping[str, Any], first: Any, source: Source, where: Where, report: Report) -> Clock:
+    """The clock that `time` or `rate_hz` gives, cut to `span` and `where`; `first` is the column of the first joint."""
+    sort = table.get("sort", False)
+    if not isinstance(sort, bool):
+        where.fail(f"has sort = {sort!r}; it must be true or false")
+    rows_of = _first_rows(first, source, where)
+    if "time" in table:
+        place = where / "time"
+        spec = _spec(table["time"], CLOCK_KEYS, place)
+        variable = source.variable(place.text(spec, "from"), place)
+        values, _ = _column(variable, spec["from"], spec.get("column"), place)
+        time = _converted(values, spec, "s", source, place)
+        rows = np.arange(len(time))
+        if rows_of is not None and len(rows_of) == len(rows):
+            rows = rows[rows_of]
+        order = in_order(time[rows], f"`{spec['from']}`", sort, place, report)
+        clock = Clock(time[rows][order], rows[order], len(time), source, spec["from"], spec.get("units", "s"), sort)
+    elif "rate_hz" in table:
+        (rate,) = where.numbers({"rate_hz": [table["rate_hz"]]}, "rate_hz", (1,))
+        if not (rate > 0.0 and np.isfinite(rate)):
+            where.fail("has a `rate_hz` that is not positive; write samples per second")
+        spec = _spec(first, COLUMN_KEYS, where)
+        count = len(
+            _column(source.variable(where.text(spec, "from"), where), spec["from"], spec.get("column"), where)[0]
+        )
+        clock = Clock(np.arange(count) / rate, np.arange(count), count, source)
+    else:
+        where.fail("has neither `time` nor `rate_hz`; name the variable that holds the time, or the sampling rate")
+    return _cut(clock, table, where)
+
+
+def _first_rows(first: Any, source: Source, where: Where) -> np.ndarray | None:
+    """Of a topic with several publishers, the messages that carry the trial's first joint."""
+    spec = _spec(first, COLUMN_KEYS, where)
+    if spec.get("file") is not None:
+        return None
+    name = where.text(spec, "from")
+    variable = source.variable(name, where)
+    if variable.present is None:
+        return None
+    return variable.present[:, _column(variable, name, spec.get("column"), where)[1]]
+
+
+def _cut(clock: Clock, table: Mapping[str, Any], where: Where) -> Clock:
+    """`span`: seconds from the recording's first sample; `where`: a condition on its rows."""
+    if "where" in table:
+        place, text = where / "where", table["where"]
+        if not isinstance(text, str):
+            place.fail(f"is {text!r}; it must be a condition, as 'phase == 2'")
+
+        def lookup(name: str, column: Any) -> np.ndarray:
+            return _column(clock.source.variable(name, place), name, column, place)[0]
+
+        try:
+            chosen = np.asarray(evaluate(text, lookup, clock.source.constants))
+        except ExpressionError as error:
+            place.fail(f"{text!r} {error}")
+        if chosen.shape != (clock.total,) or chosen.dtype != bool:
+            place.fail(f"{text!r} is no condition on the {clock.total} samples; write one, as 'phase == 2'")
+        clock = clock.keep(chosen[clock.rows])
+    if "span" in table and len(clock.time):
+        begin, end = where.numbers(table, "span", (2,))
+        if not begin < end:
+            where.fail(f"has span = [{begin:g}, {end:g}]; write begin and end in s, the earlier first")
+        clock = clock.keep((clock.time - clock.time[0] >= begin) & (clock.time - clock.time[0] < end))
+    if len(clock.time) == 0:
+        where.fail("holds no sample; widen its `span`" if "span" in table else "holds no sample; correct its `where`")
+    return clock
+
+
+def in_order(time: np.ndarray, name: str, sort: bool, where: Where, report: Report) -> np.ndarray:
+    """The order in which these times increase. Without `sort` they must do so by themselves."""
+    late = np.diff(time) <= 0.0
+    if not late.any():
+        return np.arange(len(time))
+    at, back, twice = int(np.argmax(late)), int((np.diff(time) < 0.0).sum()), int((np.diff(np.sort(time)) == 0.0).sum())
+    if not sort:
+        count = f"does not increase at {int(late.sum())} of {len(time)} samples, first after sample {at}"
+        mend = "the samples must be sorted by their time" + (f", and {twice} stamps occur twice" if twice else "")
+        where.fail(f"the clock {name} {count}: {mend}; have import do so by `sort = true` in the trial")
+    order = np.argsort(time, kind="stable")
+    first = np.concatenate([[True], np.diff(time[order]) > 0.0])
+    report.warning(
+        where.key,
+        f"the clock {name} was sorted, {back} stamps ran back, and {twice} samples at repeated stamps left out",
+    )
+    return order[first]
+
+
+@dataclass
+class Columns:
+    """Reads columns onto a trial's clock, and remembers from when to when all of them are known."""
+
+    clock: Clock
+    sources: Callable[[str, Where], Source]  # other files by name
+    report: Report
+    begin: float = -np.inf
+    end: float = np.inf
+
+    def column(self, spec: Any, units: str, whole: bool, where: Where) -> Float[np.ndarray, " N"]:
+        """One column: a term, or the sum of a list of them. `whole`: labels, which are not interpolated."""
+        terms = spec if isinstance(spec, list) else [spec]
+        if not terms:
+            where.fail("is an empty list; name a variable")
+        return np.sum([self._term(term, units, whole, where) for term in terms], axis=0)
+
+    def _term(self, spec: Any, units: str, whole: bool, where: Where) -> np.ndarray:
+        """variable · scale + offset, in SI, on the trial's clock."""
+        clock = self.clock
+        spec = _spec(spec, COLUMN_KEYS, where)
+        other = spec.get("file")
+        source = clock.source if other is None else self.sources(other, where)
+        name = where.text(spec, "from")
+        variable = source.variable(name, where)
+        values, k = _column(variable, name, spec.get("column"), where)
+        _stated(variable, spec, units, self.report, where)
+        values = _converted(values, spec, units, source, where)
+        here = np.ones(len(values), bool) if variable.present is None else variable.present[:, k]
+        own = self._own_clock(spec, variable, source, here, where)
+        if own is None:
+            if len(values) != clock.total and np.ndim(variable.values) == 2 and variable.values.shape[1] == clock.total:
+                where.fail(
+                    f"{name!r} has {variable.values.shape[1]} columns and {len(variable.values)} rows where the trial "
+                    f"has {clock.total} samples; it is stored joints first: transpose it and save it again"
+                )
+            if len(values) != clock.total:
+                where.fail(
+                    f"has {len(values)} samples where the trial's time has {clock.total}; give it its own `time`"
+                )
+            return values[clock.rows]
+        own_name, time = own
+        if len(time) != len(values):
+            where.fail(f"has {len(values)} samples, and its clock {own_name} has {len(time)}; name its own clock")
+        time, values = time[here], values[here]
+        order = in_order(time, own_name, clock.sort, where, self.report)
+        return self._onto(time[order], values[order], own_name, whole, where)
+
+    def _own_clock(
+        self, spec: Mapping[str, Any], variable: Variable, source: Source, here: np.ndarray, where: Where
+    ) -> tuple[str, np.ndarray] | None:
+        """Name and times, s, of the clock of a variable that does not share the trial's rows."""
+        clock = self.clock
+        if "time" in spec:
+            said = {"from": spec["time"], "units": clock.units} if isinstance(spec["time"], str) else spec["time"]
+            place = where / "time"
+            said = _spec(said, CLOCK_KEYS, place)
+            name = place.text(said, "from")
+            values, _ = _column(source.variable(name, place), name, said.get("column"), place)
+            return f"`{name}`", _converted(values, said, "s", source, place)
+        known_clocks = source.recording.variables
+        main = known_clocks.get(clock.name)
+        shared = source.recording is clock.source.recording
+        same_rows = shared and variable.clock in (clock.name, main.clock if main else "")
+        if not shared and not variable.clock:
+            where.fail(f"is of {source.recording.path.name}, not of the trial's own file; name its clock by `time`")
+        if (not variable.clock or same_rows) and (here.all() or here[clock.rows].all()):
+            return None
+        if not clock.name:
+            where.fail("is on a clock of its own, and `rate_hz` says no time; name the trial's `time`")
+        own = variable.clock or clock.name
+        stamp = own.removesuffix(".time") + ".stamp"
+        if clock.name.endswith(".stamp") and stamp in known_clocks:
+            own = stamp
+        return f"`{own}`", known_clocks[own].values
+
+    def _onto(self, time: np.ndarray, values: np.ndarray, name: str, whole: bool, where: Where) -> np.ndarray:
+        """Values at the trial's times: between two samples of their own clock interpolated, beyond its ends NaN."""
+        trial = self.clock.time
+        good = np.isfinite(time)
+        time, values = time[good], values[good]
+        if len(time) < 2:
+            where.fail(f"the clock {name} holds {len(time)} samples; name a clock that runs through the trial")
+        said = (
+            f"the clock {name} runs from {time[0]:.10g} to {time[-1]:.10g} s, "
+            f"the trial from {trial[0]:.10g} to {trial[-1]:.10g} s"
+        )
+        inside = (trial >= time[0]) & (trial <= time[-1])
+        if not inside.any():
+            where.fail(f"{said}; they do not overlap: name a clock that counts from the same start, in the same units")
+        longer = (time[-1] - time[0]) / max(trial[-1] - trial[0], 1e-12)
+        slower = np.median(np.diff(time)) / max(float(np.median(np.diff(trial))) if len(trial) > 1 else 0.0, 1e-12)
+        few = int(((time >= trial[0]) & (time <= trial[-1])).sum())
+        if min(longer, slower) > _OTHER_UNITS or max(longer, slower) < 1.0 / _OTHER_UNITS or (few < _FEW <= len(time)):
+            where.fail(
+                f"{said}; they do not share their units: write time = {{ from = {name.strip('`')!r}, units = 'ms' }}, "
+                "or so"
+            )
+        if inside.mean() < _COVERED:
+            begin, end = trial[inside][0] - trial[0], trial[inside][-1] - trial[0]
+            where.fail(
+                f"{said}: it covers only a part; name another clock, or cut the trial by span = "
+                f"[{begin:.4g}, {end:.4g}]"
+            )
+        step = float(np.median(np.diff(time)))
+        if step > _SLOW:
+            self.report.warning(
+                where.key, f"the clock {name} ticks every {step:.3g} s; convert ms to s if that is what it is"
+            )
+        gaps = np.diff(time) > max(20.0 * step, 0.1)
+        if gaps.any():
+            longest = float(np.diff(time).max())
+            self.report.warning(
+                where.key,
+                f"the clock {name} has {int(gaps.sum())} gaps, the longest {longest:.3g} s; values there are lines",
+            )
+        self.begin, self.end = max(self.begin, time[0]), min(self.end, time[-1])
+        if max(time[0] - trial[0], trial[-1] - time[-1]) > 2.0 * step:
+            self.report.warning(where.key, f"{said}; the trial is cut to what both cover")
+        if whole:
+            values = values[np.clip(np.searchsorted(time, trial, "right") - 1, 0, len(time) - 1)]
+            return np.where(inside, values, np.nan)
+        return np.interp(trial, time, values, left=np.nan, right=np.nan)
+
+    @property
+    def covered(self) -> np.ndarray:
+        """The samples at which every clock runs."""
+        return (self.clock.time >= self.begin) & (self.clock.time <= self.end)
+
+
+def _spec(spec: Any, keys: tuple[str, ...], where: Where) -> Mapping[str, Any]:
+    spec = {"from": spec} if isinstance(spec, str) else spec
+    if not isinstance(spec, Mapping):
+        where.fail("must name a variable, as 'enc' or { from = 'enc', units = 'deg' }")
+    where.known(spec, keys)
+    return spec
+
+
+def _converted(values: np.ndarray, spec: Mapping[str, Any], units: str, source: Source, where: Where) -> np.ndarray:
+    """variable · scale + offset, unwrapped where asked, in SI."""
+    said = spec.get("units", units)
+    if said not in TO_SI or TO_SI[said][0] != units:
+        fitting = [name for name, (si, _) in TO_SI.items() if si == units]
+        where.fail(f"has units {said!r}; it must be one of {listed(fitting)}, after `scale` and `offset`")
+    unwrap = spec.get("unwrap", False)
+    if unwrap is not False and unwrap is not True:
+        period = where.numbers(spec, "unwrap", ())
+        if not period > 0.0:
+            where.fail(f"has unwrap = {unwrap!r}; write true, or the positive period of the variable")
+        values = _unwrapped(values, float(period))
+    scale = spec.get("scale", 1.0)
+    scale = (
+        single(source, scale, where / "scale")
+        if isinstance(scale, str)
+        else where.numbers({"scale": scale}, "scale", ())
+    )
+    offset = where.numbers({"offset": spec.get("offset", 0.0)}, "offset", ())
+    si = (values * scale + offset) * TO_SI[said][1]
+    if unwrap is True:
+        if units != "rad":
+            where.fail("is no angle, so a whole turn means nothing; write unwrap = the period of the variable")
+        si = _unwrapped(si, 2.0 * np.pi)
+    return si
+
+
+def _unwrapped(values: np.ndarray, period: float) -> np.ndarray:
+    good = np.isfinite(values)
+    out = np.array(values, np.float64)
+    out[good] = np.unwrap(out[good], period=period)
+    return out
+
+
+def _stated(variable: Variable, spec: Mapping[str, Any], units: str, report: Report, where: Where) -> None:
+    """Does the file state other units than the mapping?"""
+    stated, said = known(variable.units), spec.get("units", units)
+    if stated and said in TO_SI and stated != said and "scale" not in spec and TO_SI[stated] != TO_SI[said]:
+        report.warning(
+            where.key, f"the recording states {variable.units}, and the mapping reads {said}; correct one of them"
+        )
+
+
+def find(name: Any, paths: Mapping[Path, Any], where: Where) -> Path:
+    """The given recording that `file` names: by the last parts of its path, as many as it takes."""
+    if not isinstance(name, str) or not name:
+        where.fail(f"has file = {name!r}; it must be the name of a recording")
+    parts = Path(name).parts
+    found = [path for path in paths if path.parts[-len(parts) :] == parts]
+    if not found:
+        where.fail(f"reads the file {name!r}, which was not given; there are {listed([str(path) for path in paths])}")
+    if len(found) > 1:
+        raise UserError(
+            f"{where.file}: {where.key}: {len(found)} of the recordings are called {name} "
+            f"({listed([str(p) for p in found])}); write enough of the folder to tell them apart, as file = '"
+            + "/".join(found[0].parts[-len(parts) - 1 :])
+            + "'"
+        )
+    return found[0]

@@ -1,0 +1,243 @@
+"""CSV as programs write it: the dialect is the one in which the most cells are numbers.
+
+Excel, TwinCAT Scope, oscilloscopes and `numpy.savetxt` differ in separator, decimal mark, quotes, encoding, and in what
+stands above the numbers. The standard library's Sniffer and its successors guess separator and quotes from punctuation,
+and know neither decimal commas nor headers of several lines; numbers tell all of them at once.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import re
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from jaxfinger.data.recording import Recording, Variable
+from jaxfinger.errors import UserError
+
+_COMMENTS = ("#", "%")
+# (separator, decimal mark); None is any run of blanks. Of equals the first is taken.
+_DIALECTS = ((",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("|", "."), (None, "."), (None, ","))
+_SAMPLE = 60  # lines from which the dialect is told
+_TRUTH = {"true": 1.0, "false": 0.0}
+_UNIT = r"%|°|deg|rad|turn|rev|rpm|k?Hz|[mun]?s|[munc]?m|[mk]?N|[mk]?N[ ·*]?[cm]?m|[mu]?A|[mk]?V|°?C|K|[mk]?g|1|-|bool"
+_ALONE = re.compile(rf"^[\[(]?({_UNIT}|{_UNIT}/s2?|)[\])]?$")
+_BEHIND = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
+_STAMP = re.compile(r"^\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
+_SCOPE = "SampleTime[ms]"  # TwinCAT Scope: a column of times in ms beside each channel
+
+
+@dataclass(frozen=True)
+class _Line:
+    number: int  # in the file, from 1
+    text: str
+
+
+def load_csv(path: Path) -> Recording:
+    """Columns by the names above the numbers; without names `column 0`, `column 1` and so on.
+
+    Empty cells are NaN, True and False are 1 and 0, dates with a time of day are seconds since 1970.
+
+    Raises:
+        UserError: no columns of numbers, or a line of another width.
+    """
+    lines = [_Line(number, text) for number, text in enumerate(_lines(_decode(path.read_bytes())), 1) if text.strip()]
+    body = [line for line in lines if not line.text.lstrip().startswith(_COMMENTS)]
+    if not body:
+        raise UserError(f"{path}: holds no samples; it needs a line of names, then one line a sample")
+    sample = body[len(body) // 2 :][:_SAMPLE]
+    split, numeric = _dialect([line.text for line in sample])
+    if not any(numeric):
+        raise UserError(f"{path}: holds no column of numbers; give a table with one line a sample")
+    first = next(i for i, line in enumerate(body) if _is_sample(split(line.text), numeric))
+    above = [line for line in lines if line.number < body[first].number]
+    names, units, scope = _names(above, split, len(numeric))
+    if not names and first > 0 and len(split(body[first - 1].text)) != len(numeric):
+        given = split(body[first - 1].text)
+        raise UserError(f"{path}: names {len(given)} columns and holds {len(numeric)}; give each column one name")
+    body, remarks = body[first:], ()
+    if not names and [_cell(cell) for cell in split(body[0].text)] == list(range(len(numeric))) and len(body) > 1:
+        names, body = tuple(split(body[0].text)), body[1:]  # numbered columns, as pandas names them
+    if len(body) > 1 and len(split(body[-1].text)) < len(numeric):
+        body, remarks = body[:-1], ("its last line is cut short and is left out",)
+    columns, faults = _columns(path, body, split, numeric)
+    if scope:
+        return _pairs(path, columns, faults, names, units)
+    return _named(path, columns, faults, names, units, remarks)
+
+
+def _lines(text: str) -> list[str]:
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+
+
+def _decode(raw: bytes) -> str:
+    """By its mark, as UTF-8, or as Western European, in which every byte is a character."""
+    marks = (codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")
+    for mark, encoding in marks:
+        if raw.startswith(mark):
+            return raw.decode(encoding, errors="replace")
+    if raw[1:200:2].count(0) > 20:
+        return raw.decode("utf-16-le", errors="replace")
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError:
+        return raw.decode("cp1252", errors="replace")
+
+
+Split = Callable[[str], list[str]]
+
+
+def _dialect(sample: Sequence[str]) -> tuple[Split, list[bool]]:
+    """How a line is cut into cells (with points for decimal commas), and which columns hold numbers."""
+    best: tuple[tuple[float, int], Split, list[bool]] | None = None
+    for separator, mark in _DIALECTS:
+        split = _splitter(separator, mark)
+        rows = [split(line) for line in sample]
+        widths = [len(row) for row in rows]
+        width = max(set(widths), key=widths.count)
+        rows = [row for row in rows if len(row) == width]
+        numbers = np.array([[_cell(cell) is not None for cell in row] for row in rows])
+        filled = np.array([[bool(cell) for cell in row] for row in rows])
+        numeric = ((numbers & filled).sum(axis=0) * 2 > filled.sum(axis=0)) | ~filled.any(axis=0)
+        share = float((numbers & filled).sum()) / max(int(filled.sum()), 1) * len(rows) / len(sample)
+        score = (round(share, 2), width)
+        if best is None or score > best[0]:
+            best = score, split, numeric.tolist()
+    assert best is not None
+    return best[1], best[2] if best[0][0] > 0.0 else [False]
+
+
+def _splitter(separator: str | None, mark: str) -> Split:
+    def split(line: str) -> list[str]:
+        cells = line.split() if separator is None else next(csv.reader([line], delimiter=separator), [])
+        cells = [cell.strip() for cell in cells]
+        return [cell.replace(",", ".") if cell.count(",") == 1 else cell for cell in cells] if mark == "," else cells
+
+    split.separator, split.mark = separator, mark  # type: ignore[attr-defined]
+    return split
+
+
+def _cell(cell: str) -> float | None:
+    """A number, or None where it is none."""
+    try:
+        return float(cell) if "_" not in cell else None
+    except ValueError:
+        pass
+    if cell.lower() in _TRUTH:
+        return _TRUTH[cell.lower()]
+    if _STAMP.match(cell):
+        try:
+            return float(np.datetime64(cell.replace(" ", "T").removesuffix("Z"), "ns").astype(np.int64)) * 1e-9
+        except ValueError:
+            return None
+    return np.nan if not cell else None
+
+
+def _is_sample(cells: Sequence[str], numeric: Sequence[bool]) -> bool:
+    values = [_cell(cell) for cell, number in zip(cells, numeric, strict=False) if number]
+    return len(cells) == len(numeric) and None not in values and not all(np.isnan(v) for v in values if v is not None)
+
+
+def _names(above: Sequence[_Line], split: Split, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
+    """Names of the columns, their units, and whether these are the pairs of columns of TwinCAT Scope.
+
+    The line next above the numbers that has a cell for each column is the names, unless it is one of units; behind a
+    comment mark (numpy.savetxt, gnuplot) it counts too.
+    """
+    rows = []
+    for line in reversed(above):
+        text = line.text.strip()
+        plain = text.lstrip("".join(_COMMENTS)).strip()
+        cells = split(line.text if plain == text else plain)
+        if plain != text and len(cells) != width:
+            cells = plain.replace(",", " ").split()
+        if len(cells) == width and any(cells):
+            rows.append(cells)
+    labelled = {row[0]: tuple(row) for row in rows if row[::2] == row[:1] * (width // 2) and width % 2 == 0}
+    if _SCOPE in labelled and "Name" in labelled:
+        return labelled["Name"], labelled.get("Unit", ("",) * width), True
+    words = [row for row in rows if sum(_cell(cell) is None for cell in row) * 2 > width]
+    units = ("",) * width
+    if len(words) > 1 and all(_ALONE.match(cell) for cell in words[0]):
+        units = tuple(cell.strip("[]()") for cell in words.pop(0))
+    return tuple(words[0]) if words else (), units, False
+
+
+def _columns(
+    path: Path, body: Sequence[_Line], split: Split, numeric: Sequence[bool]
+) -> tuple[list[np.ndarray | None], list[str]]:
+    """The columns as numbers; None, with the reason, where a cell is none."""
+    separator, mark = split.separator, split.mark  # type: ignore[attr-defined]
+    width, texts = len(numeric), [line.text for line in body]
+    plain = all(numeric) and separator is not None and not any('"' in text for text in texts)
+    if plain and all(text.count(str(separator)) == width - 1 for text in texts):
+        try:  # at the speed of C, where every cell is a plain number
+            if mark == ",":
+                texts = [text.replace(",", ".") for text in texts]
+            table = np.loadtxt(texts, delimiter=separator, ndmin=2, comments=None)
+            return list(table.T), [""] * width
+        except ValueError:
+            pass
+    rows = []
+    for line in body:
+        rows.append(split(line.text))
+        if len(rows[-1]) != width:
+            raise UserError(
+                f"{path}: line {line.number} has {len(rows[-1])} cells, the others have {width}; correct or drop it"
+            )
+    columns: list[np.ndarray | None] = []
+    faults = []
+    for cells in zip(*rows, strict=True):
+        values = [_cell(cell) for cell in cells]
+        bad = next((k for k, value in enumerate(values) if value is None), None)
+        columns.append(None if bad is not None else np.array(values, np.float64))
+        faults.append(
+            ""
+            if bad is None
+            else f"holds {cells[bad]!r} in line {body[bad].number}, which is no number; correct or drop that line"
+        )
+    return columns, faults
+
+
+def _named(path, columns, faults, names, units, remarks) -> Recording:
+    names = names or ("",) * len(columns)
+    places: dict[str, list[int]] = defaultdict(list)
+    for k, name in enumerate(names):
+        if name or (columns[k] is not None and not np.isnan(columns[k]).all()):
+            places[name or f"column {k}"].append(k)
+    variables, unusable = {}, {}
+    for name, (k, *others) in places.items():
+        if others:
+            numbers = " and ".join(str(place + 1) for place in (k, *others))
+            unusable[name] = f"is the name of the columns {numbers}; give each column its own name"
+        elif columns[k] is None:
+            unusable[name] = faults[k]
+        else:
+            behind = _BEHIND.search(name)
+            variables[name] = Variable(columns[k], units=units[k] or (behind.group(1).strip() if behind else ""))
+    return Recording(path, variables, unusable, remarks)
+
+
+def _pairs(path, columns, faults, names, units) -> Recording:
+    """TwinCAT Scope: beside every channel the times of its own, in ms; each comes out as `name.time`, in s."""
+    variables: dict[str, Variable] = {}
+    unusable: dict[str, str] = {}
+    for k in range(0, len(columns), 2):
+        name = names[k + 1]
+        if name in variables or name in unusable:
+            variables.pop(name, None)
+            unusable[name] = "is the name of two channels; give each channel its own name"
+            continue
+        clock, values = columns[k], columns[k + 1]
+        if clock is None or values is None:
+            unusable[name] = faults[k] or faults[k + 1]
+            continue
+        filled = np.isfinite(clock)  # channels sampled more slowly end earlier
+        variables[f"{name}.time"] = Variable(clock[filled] * 1e-3, units="s")
+        variables[name] = Variable(values[filled], clock=f"{name}.time", units=units[k + 1])
+    return Recording(path, variables, unusable)

@@ -1,0 +1,127 @@
+"""Arithmetic in a mapping: `kt * current`, `M @ motors`. Parsed, never evaluated as Python: what is not listed here is
+refused."""
+
+from __future__ import annotations
+
+import ast
+import operator
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+_OPERATORS: dict[type, Callable] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+    ast.BitAnd: np.logical_and,
+    ast.BitOr: np.logical_or,
+    ast.USub: operator.neg,
+    ast.UAdd: operator.pos,
+    ast.Invert: np.logical_not,
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+    ast.And: np.logical_and,
+    ast.Or: np.logical_or,
+    ast.Not: np.logical_not,
+}
+_FUNCTIONS = {
+    name: getattr(np, name) for name in ("sin", "cos", "tan", "arctan", "sqrt", "exp", "log", "deg2rad", "rad2deg")
+} | {"abs": np.abs, "sign": np.sign}
+_LONGEST = 2000  # characters; deep nesting exhausts the parser before that
+
+
+class ExpressionError(ValueError):
+    """The rest of a sentence that begins with the expression."""
+
+
+def evaluate(text: str, lookup: Callable[[str, Any], Any], constants: Mapping[str, Any]) -> np.ndarray:
+    """The value of an expression over the samples: (N,) or (N, k).
+
+    `name`, `outer.inner` and, for names that are no identifiers, `'q [deg]'` are variables: `lookup(name, column)`;
+    `name[1]` and `name['MCP']` choose a column. `[a, b]` puts variables beside each other. `constants` (numbers and
+    matrices) come first. `M @ x` multiplies every sample by a matrix.
+
+    Raises:
+        ExpressionError: it does not parse, or holds what is not allowed, or the shapes do not fit.
+    """
+    if len(text) > _LONGEST:
+        raise ExpressionError(f"is longer than {_LONGEST} characters; derive it in steps")
+    try:
+        tree = ast.parse(text.strip(), mode="eval")
+        with np.errstate(all="ignore"):
+            return np.asarray(_value(tree.body, lookup, constants))
+    except ExpressionError:
+        raise
+    except SyntaxError as error:
+        raise ExpressionError(f"is no expression ({error.msg} at column {error.offset}); mend it") from None
+    except (RecursionError, MemoryError):
+        raise ExpressionError("is nested too deeply; derive it in steps") from None
+    except (ValueError, TypeError) as error:
+        raise ExpressionError(f"cannot be worked out ({error}); the shapes must fit") from None
+
+
+def _value(node: ast.AST, lookup: Callable[[str, Any], Any], constants: Mapping[str, Any]) -> Any:
+    def inner(child: ast.AST) -> Any:
+        return _value(child, lookup, constants)
+
+    match node:
+        case ast.Constant(value=bool()):
+            pass
+        case ast.Constant(value=int() | float() as number):
+            return np.float64(number)
+        case ast.Name(id="pi"):
+            return np.pi
+        case ast.Name() | ast.Attribute() | ast.Constant(value=str()):
+            name = _name(node)
+            return np.asarray(constants[name], np.float64) if name in constants else lookup(name, None)
+        case ast.Subscript(slice=ast.Constant(value=int() | str() as column)):
+            return lookup(_name(node.value), column)
+        case ast.UnaryOp() if type(node.op) in _OPERATORS:
+            return _OPERATORS[type(node.op)](inner(node.operand))
+        case ast.BinOp(left=ast.Name(id=matrix), op=ast.MatMult()) if np.ndim(constants.get(matrix, 0.0)) == 2:
+            samples = inner(node.right)
+            return samples.reshape(len(samples), -1) @ np.asarray(constants[matrix], np.float64).T
+        case ast.BinOp() if type(node.op) in _OPERATORS:
+            return _aligned(_OPERATORS[type(node.op)], inner(node.left), inner(node.right))
+        case ast.BoolOp():
+            values = [inner(value) for value in node.values]
+            for value in values[1:]:
+                values[0] = _OPERATORS[type(node.op)](values[0], value)
+            return values[0]
+        case ast.Compare(ops=[op], comparators=[right]) if type(op) in _OPERATORS:
+            return _OPERATORS[type(op)](inner(node.left), inner(right))
+        case ast.List() | ast.Tuple() if node.elts:
+            return np.column_stack([inner(item) for item in node.elts])
+        case ast.Call(func=ast.Name(id=function), args=[argument], keywords=[]) if function in _FUNCTIONS:
+            return _FUNCTIONS[function](inner(argument))
+    raise ExpressionError(
+        f"holds {ast.unparse(node)!r}, which is not allowed; it may hold variables, constants, + - * / **, "
+        f"comparisons, MATRIX @ x, and {', '.join(_FUNCTIONS)}"
+    )
+
+
+def _aligned(apply: Callable, left: Any, right: Any) -> Any:
+    """(N,) times (N, k) goes sample by sample."""
+    if {np.ndim(left), np.ndim(right)} == {1, 2}:
+        column, table = (left, right) if np.ndim(left) == 1 else (right, left)
+        if len(column) == len(table):
+            left, right = (value[:, None] if value is column else value for value in (left, right))
+    return apply(left, right)
+
+
+def _name(node: ast.AST) -> str:
+    match node:
+        case ast.Name(id=name):
+            return name
+        case ast.Constant(value=str() as name):
+            return name
+        case ast.Attribute(value=value, attr=inner):
+            return f"{_name(value)}.{inner}"
+    raise ExpressionError(f"holds {ast.unparse(node)!r}, which names no variable")
