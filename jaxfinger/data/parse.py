@@ -214,7 +214,8 @@ def _temperature(group: h5py.Group, place: str, sizes: Mapping[str, int], report
     names: tuple[str, ...] = ()
     if values is not None:
         try:
-            names = tuple(_decode(name) for name in np.atleast_1d(group[TEMPERATURE.name].attrs["names"]))
+            said: Any = group[TEMPERATURE.name].attrs["names"]
+            names = tuple(_decode(name) for name in np.atleast_1d(said))
         except Exception:  # absent, or no strings
             names = ()
         if len(names) != values.shape[1]:

@@ -91,8 +91,8 @@ class Trial:
             return (self.joint,)
         if self.joint_torque is None:
             return ()
-        measured = ~np.isnan(self.joint_torque).all(axis=0)
-        return tuple(name for name, there in zip(finger.joint_names, measured, strict=True) if there)
+        torque = self.joint_torque
+        return tuple(name for i, name in enumerate(finger.joint_names) if not np.isnan(torque[:, i]).all())
 
     @property
     def duration(self) -> float:

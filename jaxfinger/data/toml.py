@@ -314,7 +314,7 @@ def _tuple(kind: Any) -> Callable[[Any, Any], Any]:
     args = get_args(kind)
     any_length = len(args) == 2 and args[1] is Ellipsis
     hooks = [(_CONVERTER.get_structure_hook(arg), arg) for arg in (args[:1] if any_length else args)]
-    tables = is_dataclass(args[0])
+    tables = is_dataclass(args[0]) or get_origin(args[0]) in (dict, Mapping)
     what = "tables" if tables else {float: "numbers", int: "whole numbers", str: "strings"}.get(args[0], "lists")
 
     def read(value: Any, _: Any) -> Any:

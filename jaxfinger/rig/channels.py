@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.data.session import FingerDescription
-from jaxfinger.rig.toml_file import Table
+from jaxfinger.data.toml import parse_toml
 
 # Dimension of each kind of channel, and the units in which a calibration may be written, as factors to SI.
 UNITS: Mapping[str, Mapping[str, float]] = {
@@ -137,7 +136,7 @@ class RigDescription:
 
     def fail(self, table: str, key: str, message: str) -> NoReturn:
         """Raise UserError at the line of a key of the rig file."""
-        Table(Path(self.path), self.text, {}, table).fail(key, message)
+        (parse_toml(self.text, self.path).place / table / key).fail(message)
 
     @property
     def slots(self) -> list[int]:

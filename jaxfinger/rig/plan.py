@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from jaxfinger.data.toml import Document, Fault, NotEmpty, Place, one_of, parse_toml, read_toml, structure
 from jaxfinger.errors import UserError
 from jaxfinger.rig.backend import JointMove, Setup, TensionRamp
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.protocols import EXPERIMENTS, Common, Covered, Dwell, Protocol, Settled, Start, Tare
 from jaxfinger.rig.safety import admit
-from jaxfinger.rig.toml_file import Table, parse_toml, read_toml
 
 
 @dataclass(frozen=True)
@@ -63,92 +63,92 @@ class Estimate:
     highest_tension: float
 
 
+@dataclass(frozen=True)
+class Head:
+    """`[plan]`."""
+
+    name: str
+    operator: str = ""
+
+
+@dataclass(frozen=True)
+class PlanFile:
+    """A plan file; which keys a trial takes depends on its experiment."""
+
+    plan: Head
+    trial: Annotated[tuple[Mapping[str, Any], ...], NotEmpty()]
+
+
 def read_plan(path: str | Path, rig: RigDescription) -> Plan:
     """Read a plan and check every command that it will give against the rig; raises UserError with the line."""
-    return _plan(read_toml(path), rig)
+    return _plan(read_toml(path, "give the path of a plan file"), rig)
 
 
 def parse_plan(text: str, rig: RigDescription, path: str | Path = "plan.toml") -> Plan:
     """A plan that is already in memory."""
-    return _plan(parse_toml(text, Path(path)), rig)
+    return _plan(parse_toml(text, path), rig)
 
 
-def _plan(file: Table, rig: RigDescription) -> Plan:
-    head = file.table("plan")
-    assert head is not None
-    trials = [trial for table in file.tables("trial") for trial in _trials(table, rig)]
+def _plan(document: Document, rig: RigDescription) -> Plan:
+    file, place = document.read(PlanFile), document.place
+    trials = [t for i, table in enumerate(file.trial) for t in _trials(i, table, rig, place / "trial" / i)]
     named = tuple(
         PlannedTrial(f"{i:02d}-{t.motion.rsplit('-', 1)[0]}", t.experiment, t.motion, t.parameters, t.line)
         for i, t in enumerate(trials, 1)
     )
-    plan = Plan(head.text_of("name"), head.text_of("operator", ""), named, file.text, str(file.path))
-    head.finish()
-    file.finish()
     for trial in named:
         try:
             for _ in commands(trial, rig):
                 pass
         except UserError as error:
-            raise UserError(f"{file.path.name}, line {trial.line}: {trial.name}: {error}") from error
-    return plan
+            raise UserError(f"{document.path}, line {trial.line}: {trial.name}: {error}") from error
+    return Plan(file.plan.name, file.plan.operator, named, document.text, str(document.path))
 
 
-def _trials(table: Table, rig: RigDescription) -> Iterator[PlannedTrial]:
-    experiment = table.text_of("experiment", choices=tuple(EXPERIMENTS))
-    kind = EXPERIMENTS[experiment][1]
-    values: dict[str, Any] = {}
-    for item in fields(kind):
-        default = item.default
-        if item.name in ("joint", "tendon"):
-            known = rig.finger.joint_names if item.name == "joint" else rig.finger.tendon_names
-            values[item.name] = table.text_of(item.name, choices=known)
-        elif item.name not in table.values:
-            continue
-        elif isinstance(default, tuple):
-            length = len(default) if item.name == "range_deg" else rig.finger.m if item.name == "posture_deg" else None
-            values[item.name] = tuple(table.vector(item.name, length=length))
-        elif isinstance(default, bool):
-            values[item.name] = table.flag(item.name)
-        elif isinstance(default, int):
-            values[item.name] = table.integer(item.name, low=0 if item.name == "seed" else 1)
-        else:
-            values[item.name] = table.number(item.name, low=0.0)
-    table.finish()
-    _sensible(table, experiment, values, rig)
-    parameters = kind(**values)
-    what = [experiment, *(values[k] for k in ("tendon", "joint") if k in values)]
+def _trials(index: int, table: Mapping[str, Any], rig: RigDescription, place: Place) -> Iterator[PlannedTrial]:
+    if "experiment" not in table:
+        place.fail("has no `experiment`; add a line 'experiment = …'")
+    try:
+        experiment = one_of(table["experiment"], tuple(EXPERIMENTS))
+    except Fault as fault:
+        (place / "experiment").fail(fault.message)
+    keys = {key: value for key, value in table.items() if key != "experiment"}
+    parameters = structure(keys, EXPERIMENTS[experiment][1], place)
+    _sensible(experiment, parameters, rig, place)
+    what = [experiment, *(str(getattr(parameters, key)) for key in ("tendon", "joint") if hasattr(parameters, key))]
     for _ in range(parameters.repeats):
-        yield PlannedTrial("", experiment, f"{'-'.join(what)}-{table.index + 1}", parameters, table.line())
+        yield PlannedTrial("", experiment, f"{'-'.join(what)}-{index + 1}", parameters, place.line or 1)
 
 
-def _sensible(table: Table, experiment: str, values: dict[str, Any], rig: RigDescription) -> None:
-    finger = rig.finger
-    if "levels" in values and (
-        len(values["levels"]) < 2 or np.any(np.diff(values["levels"]) <= 0) or values["levels"][0] <= 0
-    ):
-        table.fail("levels", "'levels' must be two or more rising tensions in N, above zero.")
+def _sensible(experiment: str, parameters: Common, rig: RigDescription, place: Place) -> None:
+    finger, values = rig.finger, vars(parameters)
+    for key, names in (("joint", finger.joint_names), ("tendon", finger.tendon_names)):
+        if key in values:
+            try:
+                one_of(values[key], names)
+            except Fault as fault:
+                (place / key).fail(fault.message)
+    if "levels" in values and (len(values["levels"]) < 2 or np.any(np.diff(values["levels"]) <= 0)):
+        (place / "levels").fail("must be two or more rising tensions in N")
     if "range_deg" in values and values["range_deg"][0] >= values["range_deg"][1]:
-        table.fail("range_deg", "'range_deg' must be [lower, upper] with lower below upper.")
-    if "share" in values and not 0.1 <= values["share"] <= 0.85:
-        table.fail(
-            "share", "'share' of the range must lie between 0.1 and 0.85: hands must not run the joint into its stops."
-        )
-    if "mean" in values and len(values["mean"]) != int(finger.active.sum()):
-        table.fail("mean", f"'mean' must give one tension for each of the {int(finger.active.sum())} active tendons.")
-    for joint, angle in zip(finger.joint_names, values.get("posture_deg", ()), strict=False):
-        low, high = np.degrees(finger.limits[finger.joint_names.index(joint)])
+        (place / "range_deg").fail("must be [lower, upper] with lower below upper")
+    if values.get("mean") and len(values["mean"]) != int(finger.active.sum()):
+        (place / "mean").fail(f"must give one tension for each of the {int(finger.active.sum())} active tendons")
+    posture = parameters.posture_deg
+    if posture and len(posture) != finger.m:
+        (place / "posture_deg").fail(f"has {len(posture)} angles; give one for each of the {finger.m} joints")
+    for joint, angle, (low, high) in zip(finger.joint_names, posture, np.degrees(finger.limits), strict=False):
         if not low <= angle <= high:
-            table.fail("posture_deg", f"{angle:g}° for {joint} is outside its limits {low:.0f}° to {high:.0f}°.")
+            (place / "posture_deg").fail(f"{angle:g}° for {joint} is outside its limits {low:.0f}° to {high:.0f}°")
     tendon, joint = values.get("tendon"), values.get("joint")
     if experiment == "ID.4" and not finger.crosses[finger.tendon_names.index(tendon), finger.joint_names.index(joint)]:
-        table.fail("joint", f"{tendon} does not cross {joint}, so it gives no torque there; choose another joint.")
+        (place / "joint").fail(f"{tendon} does not cross {joint}, so it gives no torque there; choose another joint")
     if experiment.startswith("ID.3") or experiment == "ID.4":
         needed = ("external_torque", "")
     else:
         needed = {"VD.2": ("fingertip_force", "x")}.get(experiment, ("excursion", finger.tendon_names[0]))
-    kinds = {c.kind for c in rig.channels}
-    if needed[0] not in kinds:
-        table.fail("experiment", f"{experiment} needs a channel of kind '{needed[0]}', which the rig file has not.")
+    if needed[0] not in {c.kind for c in rig.channels}:
+        (place / "experiment").fail(f"{experiment} needs a channel of kind '{needed[0]}', which the rig file has not")
 
 
 def commands(trial: PlannedTrial, rig: RigDescription) -> Iterator[Any]:

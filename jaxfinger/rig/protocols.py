@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from jaxfinger.data.session import FingerDescription
+from jaxfinger.data.toml import Fault, Within
 from jaxfinger.rig.backend import Command, JointMove, Setup, TensionRamp
 
 
@@ -73,6 +75,8 @@ class Start:
     loaded: tuple[str, ...] = ()
 
 
+Count = Annotated[int, Within(1)]
+NotNegative = Annotated[float, Within(0.0)]
 Step = Command | Setup | Reached | Dwell | Settled | Covered | Tare | Mark | Start
 Protocol = Iterator[Step]
 
@@ -82,8 +86,8 @@ class Common:
     """What every experiment takes from the plan."""
 
     posture_deg: tuple[float, ...] = ()  # of the joints that are fixed; empty: all at 20°
-    tension_rate: float = 10.0  # N/s
-    repeats: int = 1
+    tension_rate: NotNegative = 10.0  # N/s
+    repeats: Count = 1
 
     def posture(self, finger: FingerDescription) -> dict[str, float]:
         """Angle of every joint in rad."""
@@ -95,64 +99,82 @@ class Common:
 class MomentArms(Common):
     """ID.2: `passes` times through `share` of the joint's range by hand, all tendons at `pretension` N."""
 
-    joint: str = ""
-    pretension: float = 2.0
+    joint: str = field(kw_only=True)
+    pretension: NotNegative = 2.0
     share: float = 0.8
-    passes: int = 3
-    timeout: float = 120.0
+    passes: Count = 3
+    timeout: NotNegative = 120.0
+
+    def __post_init__(self):
+        if not 0.1 <= self.share <= 0.85:
+            said = "of the range must lie between 0.1 and 0.85: hands must not run the joint into its stops"
+            raise Fault(said, "share")
 
 
 @dataclass(frozen=True)
 class StaticTorque(Common):
     """ID.3-static: every `step_deg` of `range_deg`, up and back; holds last `dwell` s, after `settle` s."""
 
-    joint: str = ""
+    joint: str = field(kw_only=True)
     range_deg: tuple[float, float] = (0.0, 70.0)
-    step_deg: float = 10.0
-    speed_deg_s: float = 30.0
-    settle: float = 0.2
-    dwell: float = 0.5
+    step_deg: NotNegative = 10.0
+    speed_deg_s: NotNegative = 30.0
+    settle: NotNegative = 0.2
+    dwell: NotNegative = 0.5
 
 
 @dataclass(frozen=True)
 class DynamicTorque(Common):
     """ID.3-dynamic: to and fro through `range_deg` at each of `speeds_deg_s`, `passes` times."""
 
-    joint: str = ""
+    joint: str = field(kw_only=True)
     range_deg: tuple[float, float] = (10.0, 65.0)
     speeds_deg_s: tuple[float, ...] = (28.6, 57.3, 85.9)  # 0.5, 1, 1.5 rad/s
-    acceleration_deg_s2: float = 600.0
-    passes: int = 2
+    acceleration_deg_s2: NotNegative = 600.0
+    passes: Count = 2
 
 
 @dataclass(frozen=True)
 class TendonFriction(Common):
     """ID.4: one tendon in `levels` N, up and, where `down`, back; the joint is held by the torque sensor."""
 
-    joint: str = ""
-    tendon: str = ""
-    levels: tuple[float, ...] = (2.0, 4.0, 6.0, 8.0, 10.0)
+    joint: str = field(kw_only=True)
+    tendon: str = field(kw_only=True)
+    levels: Annotated[tuple[float, ...], Within(0.0, unit="N", above=True)] = (2.0, 4.0, 6.0, 8.0, 10.0)
     down: bool = True
-    settle: float = 0.3
-    dwell: float = 0.5
+    settle: NotNegative = 0.3
+    dwell: NotNegative = 0.5
 
 
 @dataclass(frozen=True)
 class FreeExcursion(Common):
     """VD.1: all joints moved by hand for `seconds`, all tendons at `pretension` N."""
 
-    pretension: float = 2.0
-    seconds: float = 20.0
+    pretension: NotNegative = 2.0
+    seconds: NotNegative = 20.0
 
 
 @dataclass(frozen=True)
 class FingertipForce(Common):
     """VD.2: fingertip on its sensor, one tendon in `levels` N, the others slack."""
 
-    tendon: str = ""
-    levels: tuple[float, ...] = (4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0)
-    settle: float = 0.3
-    dwell: float = 0.5
+    tendon: str = field(kw_only=True)
+    levels: Annotated[tuple[float, ...], Within(0.0, unit="N", above=True)] = (
+        4.0,
+        5.0,
+        6.0,
+        7.0,
+        8.0,
+        9.0,
+        10.0,
+        11.0,
+        12.0,
+        13.0,
+        14.0,
+        15.0,
+    )
+    settle: NotNegative = 0.3
+    dwell: NotNegative = 0.5
 
 
 @dataclass(frozen=True)
@@ -160,10 +182,10 @@ class Trajectory(Common):
     """VD.3: the free finger along a random path of tensions about `mean` N, a new target every `interval` s."""
 
     mean: tuple[float, ...] = ()  # N per active tendon; empty: 2 N each
-    amplitude: float = 0.8  # N
-    interval: float = 0.5
-    seconds: float = 10.0
-    seed: int = 0
+    amplitude: NotNegative = 0.8  # N
+    interval: NotNegative = 0.5
+    seconds: NotNegative = 10.0
+    seed: Annotated[int, Within(0)] = 0
 
 
 def _all(finger: FingerDescription, tension: float) -> dict[str, float]:

@@ -2,77 +2,185 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
+from jaxfinger.data.finger_file import Finger, finger_from
 from jaxfinger.data.session import FingerDescription
+from jaxfinger.data.toml import Document, Fault, OneOf, Place, Within, one_of, parse_toml, read_toml, structure
 from jaxfinger.rig import backends, contract
 from jaxfinger.rig.channels import NOISY, UNITS, Channel, Deadlines, HardLimits, Limits, RigDescription
-from jaxfinger.rig.finger_file import read_finger
-from jaxfinger.rig.toml_file import Table, parse_toml, read_toml
+
+
+@dataclass(frozen=True)
+class Head:
+    """`[rig]`."""
+
+    name: str
+    backend: str
+    specimen: str
+    rate_hz: Annotated[float, Within(1.0, 20000.0, "Hz")] = 1000.0
+    poll_s: Annotated[float, Within(0.001, 1.0, "s")] = 0.05
+    allow_filtered: bool = False
+    stale_s: Annotated[float, Within(0.01, 60.0, "s")] = 0.2
+    lag_s: Annotated[float, Within(0.01, 60.0, "s")] = 0.25
+    thread_s: Annotated[float, Within(0.05, 60.0, "s")] = 0.2
+    disk_s: Annotated[float, Within(0.1, 60.0, "s")] = 1.0  # fdatasync took up to 0.29 s on a busy disk
+    clock_offset_s: Annotated[float, Within(0.001, 60.0, "s")] = 0.1
+    clock_rate: Annotated[float, Within(1e-6, 0.1)] = 1e-3  # quartz and network time are good to 5e-4
+
+
+@dataclass(frozen=True)
+class ChannelTable:
+    """`[[channel]]`: value in SI = (raw · scale + offset) in `unit`."""
+
+    kind: Annotated[str, OneOf(tuple(UNITS))]
+    slot: Annotated[int, Within(0, contract.VALUES - 1)]
+    unit: str
+    scale: float
+    of: str = ""
+    name: str = ""
+    offset: float = 0.0
+    source: str = ""
+    frozen_s: Annotated[float, Within(0.0, 60.0, "s")] | None = None
+
+    def __post_init__(self):
+        if self.unit not in UNITS[self.kind]:
+            known = ", ".join(UNITS[self.kind])
+            raise Fault(f"is {self.unit!r}, no unit for {self.kind} ({self.title!r}); choose one of {known}", "unit")
+        if self.scale == 0:
+            raise Fault(f"of {self.title!r} is zero; give {self.unit} per raw unit", "scale")
+
+    @property
+    def title(self) -> str:
+        """The channel's name, or what it measures."""
+        return self.name or f"{self.kind} {self.of}".strip()
+
+
+@dataclass(frozen=True)
+class LimitsTable:
+    """`[limits]`, as people write them; None: on a kind of channel that a rig may lack."""
+
+    tension_max: Annotated[float, Within(0.1, 100.0, "N")]
+    tension_rate: Annotated[float, Within(0.1, 1000.0, "N/s")]
+    tension_rate_max: Annotated[float, Within(1.0, 1e5, "N/s")]
+    joint_margin_deg: Annotated[float, Within(0.0, 45.0, "deg")]
+    joint_velocity_deg_s: Annotated[float, Within(1.0, 2000.0, "deg/s")]
+    joint_velocity_max_deg_s: Annotated[float, Within(1.0, 5000.0, "deg/s")]
+    joint_torque_max: Annotated[float, Within(1e-3, 10.0, "N m")]
+    fingertip_force_max: Annotated[float, Within(0.1, 100.0, "N")]
+    tension_error_max: Annotated[float, Within(0.1, 100.0, "N")] | None = None
+    tension_error_s: Annotated[float, Within(0.01, 10.0, "s")] | None = None
+    temperature_max: Annotated[float, Within(30.0, 200.0, "degC")] | None = None
+
+    def __post_init__(self):
+        if self.tension_rate > self.tension_rate_max:
+            raise Fault("of set-points is above `tension_rate_max`, so every ramp would trip", "tension_rate")
+        if self.joint_velocity_deg_s > self.joint_velocity_max_deg_s:
+            raise Fault("is above `joint_velocity_max_deg_s`, so every move would trip", "joint_velocity_deg_s")
+
+
+# The kinds of channel that a rig may lack, and the limits that watch them.
+_WATCHED = {
+    "tension_setpoint": ("tension_error_max", "tension_error_s"),
+    "motor_temperature": ("temperature_max",),
+}
+
+
+@dataclass(frozen=True)
+class ControllerTable:
+    """`[controller]`: what its own limits may be; None: twice the host's own."""
+
+    tension_max: Annotated[float, Within(0.1, unit="N")] | None = None
+    tension_rate_max: Annotated[float, Within(1.0, unit="N/s")] | None = None
+    joint_velocity_max_deg_s: Annotated[float, Within(1.0, unit="deg/s")] | None = None
+    joint_torque_max: Annotated[float, Within(1e-3, unit="N m")] | None = None
+    fingertip_force_max: Annotated[float, Within(0.1, unit="N")] | None = None
+    heartbeat_s: Annotated[float, Within(0.02, 60.0, "s")] = 0.25
+
+
+@dataclass(frozen=True)
+class FingertipSensor:
+    """`[fingertip_sensor]`: its rotation to the base frame, row by row."""
+
+    rotation: tuple[float, float, float, float, float, float, float, float, float]
+
+    def __post_init__(self):
+        if not np.allclose(self.matrix @ self.matrix.T, np.eye(3), atol=1e-3):
+            raise Fault("must be a rotation matrix (9 numbers, row by row, sensor to base frame)", "rotation")
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The rotation (3, 3)."""
+        return np.array(self.rotation).reshape(3, 3)
+
+
+@dataclass(frozen=True)
+class RigFile:
+    """A rig file; `address` is read by its backend."""
+
+    rig: Head
+    limits: LimitsTable
+    finger: str | Finger
+    channel: tuple[ChannelTable, ...]
+    address: Mapping[str, Any] = field(default_factory=dict)
+    controller: ControllerTable = field(default_factory=ControllerTable)
+    fingertip_sensor: FingertipSensor | None = None
 
 
 def read_rig(path: str | Path) -> RigDescription:
     """Read and check a rig file; raises UserError with the line to mend. Nothing is connected."""
-    return _rig(read_toml(path))
+    return _rig(read_toml(path, "give the path of a rig file"))
 
 
 def parse_rig(text: str, path: str | Path = "rig.toml") -> RigDescription:
     """A rig file that is already in memory, as a session or a log carries it."""
-    return _rig(parse_toml(text, Path(path)))
+    return _rig(parse_toml(text, path))
 
 
-def _rig(file: Table) -> RigDescription:
-    head = file.table("rig")
-    assert head is not None
-    backend = head.text_of("backend", choices=backends.NAMES)
-    if (where := file.table("address", required=False)) is None:
-        where = Table(file.path, file.text, {}, "address")
-    address = import_module(f"jaxfinger.rig.backends.{backend}").address(where)
-    where.finish()
-    finger = read_finger(file)
-    channels = _channels(file, finger)
-    rotation = np.eye(3)
-    if sensor := file.table("fingertip_sensor", required=False):
-        rotation = np.array(sensor.vector("rotation", length=9)).reshape(3, 3)
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
-            sensor.fail(
-                "rotation", "'rotation' must be a rotation matrix (9 numbers, row by row, sensor to base frame)."
-            )
-        sensor.finish()
-    limits = _limits(file, finger, {c.kind for c in channels})
-    description = RigDescription(
-        name=head.text_of("name"),
-        backend=backend,
-        specimen=head.text_of("specimen"),
+def _rig(document: Document) -> RigDescription:
+    file, place = document.read(RigFile), document.place
+    head = file.rig
+    try:
+        one_of(head.backend, backends.NAMES)
+    except Fault as fault:
+        (place / "rig" / "backend").fail(fault.message)
+    backend = import_module(f"jaxfinger.rig.backends.{head.backend}")
+    finger = finger_from(file.finger, place / "finger")
+    channels = _channels(file.channel, finger, place)
+    limits = _limits(file.limits, finger, {c.kind for c in channels}, place / "limits")
+    return RigDescription(
+        name=head.name,
+        backend=head.backend,
+        specimen=head.specimen,
         finger=finger,
         channels=channels,
         limits=limits,
-        hard=_hard_limits(file, limits),
+        hard=_hard_limits(file.controller, limits),
         deadlines=Deadlines(
-            stale_s=head.number("stale_s", 0.2, 0.01, 60.0, "s"),
-            lag_s=head.number("lag_s", 0.25, 0.01, 60.0, "s"),
-            thread_s=head.number("thread_s", 0.2, 0.05, 60.0, "s"),
-            disk_s=head.number("disk_s", 1.0, 0.1, 60.0, "s"),  # fdatasync took up to 0.29 s on a busy disk
-            clock_offset_s=head.number("clock_offset_s", 0.1, 0.001, 60.0, "s"),
-            clock_rate=head.number("clock_rate", 1e-3, 1e-6, 0.1),  # quartz and network time are good to 5e-4
+            stale_s=head.stale_s,
+            lag_s=head.lag_s,
+            thread_s=head.thread_s,
+            disk_s=head.disk_s,
+            clock_offset_s=head.clock_offset_s,
+            clock_rate=head.clock_rate,
         ),
-        rate_hz=head.number("rate_hz", 1000.0, 1.0, 20000.0, "Hz"),
-        poll_s=head.number("poll_s", 0.05, 0.001, 1.0, "s"),
-        address=address,
-        sensor_rotation=rotation,
-        allow_filtered=head.flag("allow_filtered", False),
-        text=file.text,
-        path=str(file.path),
+        rate_hz=head.rate_hz,
+        poll_s=head.poll_s,
+        address=asdict(structure(file.address, backend.Address, place / "address")),
+        sensor_rotation=np.eye(3) if file.fingertip_sensor is None else file.fingertip_sensor.matrix,
+        allow_filtered=head.allow_filtered,
+        text=document.text,
+        path=str(document.path),
     )
-    head.finish()
-    file.finish()
-    return description
 
 
-def _channels(file: Table, finger: FingerDescription) -> tuple[Channel, ...]:
+def _channels(tables: tuple[ChannelTable, ...], finger: FingerDescription, place: Place) -> tuple[Channel, ...]:
     owners = {
         "tension": finger.tendon_names,
         "excursion": finger.tendon_names,
@@ -83,109 +191,81 @@ def _channels(file: Table, finger: FingerDescription) -> tuple[Channel, ...]:
         "motor_temperature": (*finger.tendon_names, "external"),
     }
     channels: list[Channel] = []
-    for table in file.tables("channel"):
-        kind = table.text_of("kind", choices=tuple(UNITS))
-        of = table.text_of("of", "" if kind == "external_torque" else ..., choices=None)
-        if of not in owners[kind]:
-            table.fail(
-                "of", f"a channel of kind '{kind}' cannot be of '{of}'; the finger has {', '.join(owners[kind])}."
-            )
-        name = table.text_of("name", f"{kind} {of}".strip())
-        unit = table.text_of("unit")
-        if unit not in UNITS[kind]:
-            table.fail("unit", f"'{unit}' is no unit for {kind} ('{name}'); choose one of {', '.join(UNITS[kind])}.")
-        channel = Channel(
-            name=name,
-            kind=kind,
-            of=of,
-            slot=table.integer("slot", high=contract.VALUES - 1),
-            unit=unit,
-            scale=table.number("scale"),
-            offset=table.number("offset", 0.0),
-            source=table.text_of("source", ""),
-            frozen=table.number("frozen_s", 1.0 if kind in NOISY else 0.0, 0.0, 60.0, "s"),
-        )
-        if channel.scale == 0:
-            table.fail("scale", f"'scale' of '{name}' is zero; give {unit} per raw unit.")
+    for i, table in enumerate(tables):
+        here = place / "channel" / i
+        if table.of not in owners[table.kind]:
+            has = ", ".join(owners[table.kind])
+            (here / "of").fail(f"a channel of kind '{table.kind}' cannot be of '{table.of}'; the finger has {has}")
         for other in channels:
-            if other.slot == channel.slot:
-                table.fail(
-                    "slot", f"slot {channel.slot} already holds '{other.name}'; every channel has a slot of its own."
-                )
-            if (other.kind, other.of) == (kind, of):
-                table.fail("of", f"'{other.name}' already measures the {kind} of '{of}'; remove one of the two.")
-        table.finish()
-        channels.append(channel)
+            if other.slot == table.slot:
+                (here / "slot").fail(f"slot {table.slot} already holds '{other.name}'; give each channel its own slot")
+            if (other.kind, other.of) == (table.kind, table.of):
+                (here / "of").fail(f"'{other.name}' already measures the {table.kind} of '{table.of}'; remove one")
+        frozen = table.frozen_s if table.frozen_s is not None else 1.0 if table.kind in NOISY else 0.0
+        channels.append(
+            Channel(
+                name=table.title,
+                kind=table.kind,
+                of=table.of,
+                slot=table.slot,
+                unit=table.unit,
+                scale=table.scale,
+                offset=table.offset,
+                source=table.source,
+                frozen=frozen,
+            )
+        )
     present = {(c.kind, c.of) for c in channels}
-    for joint in finger.joint_names:
-        if ("joint_position", joint) not in present:
-            file.fail(
-                None,
-                f'joint \'{joint}\' has no channel; add a [[channel]] of kind "joint_position" with of = "{joint}".',
-            )
-    for tendon in np.array(finger.tendon_names)[finger.active]:
-        if ("tension", tendon) not in present:
-            file.fail(
-                None, f'tendon \'{tendon}\' has no channel; add a [[channel]] of kind "tension" with of = "{tendon}".'
-            )
-    if len(finger.tendon_names) > contract.TARGETS:
-        file.fail(None, f"{finger.n} tendons, but the controller has {contract.TARGETS} actuation modules.")
+    for what, kind, names in (
+        ("joint", "joint_position", finger.joint_names),
+        ("tendon", "tension", tuple(np.array(finger.tendon_names)[finger.active])),
+    ):
+        for name in names:
+            if (kind, name) not in present:
+                place.fail(f'{what} \'{name}\' has no channel; add a [[channel]] of kind "{kind}" with of = "{name}"')
+    if finger.n > contract.TARGETS:
+        place.fail(f"{finger.n} tendons, but the controller has {contract.TARGETS} actuation modules")
     return tuple(channels)
 
 
-def _limits(file: Table, finger: FingerDescription, kinds: set[str]) -> Limits:
-    table = file.table("limits")
-    assert table is not None
-
-    def watched(kind: str, key: str, low: float, high: float, unit: str) -> float:
-        """A limit on a kind of channel that a rig may lack: it must be there with the channel, and only then."""
-        if kind in kinds:
-            return table.number(key, low=low, high=high, unit=unit)
-        if key in table.values:
-            table.fail(key, f"'{key}' watches nothing without a [[channel]] of kind \"{kind}\"; add one, or remove it.")
-        return np.inf
-
-    limits = Limits(
-        tension_max=table.number("tension_max", low=0.1, high=100.0, unit="N"),
-        tension_rate=table.number("tension_rate", low=0.1, high=1000.0, unit="N/s"),
-        tension_rate_max=table.number("tension_rate_max", low=1.0, high=1e5, unit="N/s"),
-        joint_margin=np.radians(table.number("joint_margin_deg", low=0.0, high=45.0, unit="deg")),
-        joint_velocity=np.radians(table.number("joint_velocity_deg_s", low=1.0, high=2000.0, unit="deg/s")),
-        joint_velocity_max=np.radians(table.number("joint_velocity_max_deg_s", low=1.0, high=5000.0, unit="deg/s")),
-        joint_torque_max=table.number("joint_torque_max", low=1e-3, high=10.0, unit="N m"),
-        fingertip_force_max=table.number("fingertip_force_max", low=0.1, high=100.0, unit="N"),
-        tension_error_max=watched("tension_setpoint", "tension_error_max", 0.1, 100.0, "N"),
-        tension_error_s=watched("tension_setpoint", "tension_error_s", 0.01, 10.0, "s"),
-        temperature_max=watched("motor_temperature", "temperature_max", 30.0, 200.0, "degC"),
+def _limits(table: LimitsTable, finger: FingerDescription, kinds: set[str], place: Place) -> Limits:
+    for kind, keys in _WATCHED.items():  # such a limit must be there with the channel, and only then
+        for key in keys:
+            given = getattr(table, key) is not None
+            if given and kind not in kinds:
+                (place / key).fail(f'watches nothing without a [[channel]] of kind "{kind}"; add one, or remove it')
+            if not given and kind in kinds:
+                (place / key).fail(f"is missing; add a line '{key} = …'")
+    margin = float(np.radians(table.joint_margin_deg))
+    if np.any(finger.limits[:, 1] - finger.limits[:, 0] <= 2 * margin):
+        (place / "joint_margin_deg").fail("leaves no range between the joint limits")
+    return Limits(
+        tension_max=table.tension_max,
+        tension_rate=table.tension_rate,
+        tension_rate_max=table.tension_rate_max,
+        joint_margin=margin,
+        joint_velocity=float(np.radians(table.joint_velocity_deg_s)),
+        joint_velocity_max=float(np.radians(table.joint_velocity_max_deg_s)),
+        joint_torque_max=table.joint_torque_max,
+        fingertip_force_max=table.fingertip_force_max,
+        tension_error_max=np.inf if table.tension_error_max is None else table.tension_error_max,
+        tension_error_s=np.inf if table.tension_error_s is None else table.tension_error_s,
+        temperature_max=np.inf if table.temperature_max is None else table.temperature_max,
     )
-    if limits.tension_rate > limits.tension_rate_max:
-        table.fail(
-            "tension_rate", "'tension_rate' of set-points is above 'tension_rate_max', so every ramp would trip."
-        )
-    if limits.joint_velocity > limits.joint_velocity_max:
-        table.fail(
-            "joint_velocity_deg_s",
-            "'joint_velocity_deg_s' is above 'joint_velocity_max_deg_s', so every move would trip.",
-        )
-    if np.any(finger.limits[:, 1] - finger.limits[:, 0] <= 2 * limits.joint_margin):
-        table.fail("joint_margin_deg", "'joint_margin_deg' leaves no range between the joint limits.")
-    table.finish()
-    return limits
 
 
-def _hard_limits(file: Table, limits: Limits) -> HardLimits:
-    """`[controller]`: where a key is missing, twice the host's own limit, and a heartbeat of 0.25 s."""
-    if (table := file.table("controller", required=False)) is None:
-        table = Table(file.path, file.text, {}, "controller")
-    unit = np.pi / 180
-    hard = HardLimits(
-        tension_max=table.number("tension_max", 2 * limits.tension_max, low=0.1, unit="N"),
-        tension_rate_max=table.number("tension_rate_max", 2 * limits.tension_rate_max, low=1.0, unit="N/s"),
-        joint_velocity_max=unit
-        * table.number("joint_velocity_max_deg_s", 2 * limits.joint_velocity_max / unit, low=1.0, unit="deg/s"),
-        joint_torque_max=table.number("joint_torque_max", 2 * limits.joint_torque_max, low=1e-3, unit="N m"),
-        fingertip_force_max=table.number("fingertip_force_max", 2 * limits.fingertip_force_max, low=0.1, unit="N"),
-        heartbeat_s=table.number("heartbeat_s", 0.25, 0.02, 60.0, "s"),
+def _hard_limits(table: ControllerTable, limits: Limits) -> HardLimits:
+    def or_twice(value: float | None, host: float) -> float:
+        return 2 * host if value is None else value
+
+    velocity = table.joint_velocity_max_deg_s
+    return HardLimits(
+        tension_max=or_twice(table.tension_max, limits.tension_max),
+        tension_rate_max=or_twice(table.tension_rate_max, limits.tension_rate_max),
+        joint_velocity_max=or_twice(
+            None if velocity is None else float(np.radians(velocity)), limits.joint_velocity_max
+        ),
+        joint_torque_max=or_twice(table.joint_torque_max, limits.joint_torque_max),
+        fingertip_force_max=or_twice(table.fingertip_force_max, limits.fingertip_force_max),
+        heartbeat_s=table.heartbeat_s,
     )
-    table.finish()
-    return hard

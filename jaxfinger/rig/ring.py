@@ -95,8 +95,8 @@ class RingRig(Rig):
             self.description.fail(
                 "rig",
                 "rate_hz",
-                f"the controller samples every {int(info['cycle_ns'])} ns, which is not rate_hz = "
-                f"{self.description.rate_hz:g}; mend 'rate_hz' or the task's cycle.",
+                f"the controller samples every {int(info['cycle_ns'])} ns, which is not "
+                f"{self.description.rate_hz:g} Hz; mend `rate_hz` or the task's cycle",
             )
         self.ring, self._program = int(info["ring_length"]), bytes(info["program"]).decode(errors="replace")
         least = math.ceil(self.description.deadlines.lag_s * self.description.rate_hz) + MARGIN + LARGEST
@@ -142,11 +142,11 @@ class RingRig(Rig):
             key, theirs, most = f"{name}{suffix}", float(found[name]), getattr(hard, name)
             ours = getattr(soft, name, 0.0)
             if not theirs >= ours - 1e-9:
-                looser = f"'{key}' = {ours * unit:g} is looser than the controller's {theirs * unit:g}; lower it."
+                looser = f"is {ours * unit:g}, looser than the controller's {theirs * unit:g}; lower it"
                 self.description.fail("limits", key, looser)
             if not 0 < theirs <= most + 1e-9:
-                looser = f"'{key}' may be {most * unit:g} on the controller, which runs {theirs * unit:g}"
-                self.description.fail("controller", key, f"{looser}; mend stLimits there, or say here that it may.")
+                looser = f"may be {most * unit:g} on the controller, which runs {theirs * unit:g}"
+                self.description.fail("controller", key, f"{looser}; mend stLimits there, or say here that it may")
 
     # samples ----------------------------------------------------------------------------------------------------
     def beat(self) -> None:

@@ -271,7 +271,7 @@ def test_faults_over_the_wire_end_the_trial_and_keep_it(lockstep, record, fault)
 def test_the_controllers_own_trip_ends_the_trial_with_its_cause(lockstep, record):
     """A rig file that knows no stop before 170°: the host sees nothing wrong when a tendon pulls the MCP past 92°."""
     rig = ads_rig(lockstep)
-    rig.description = parse_rig(re.sub("limits_deg = .*", "limits_deg = [-90.0, 170.0]", rig.description.text))
+    rig.description = parse_rig(re.sub("limits = .*", "limits_deg = [-90.0, 170.0]", rig.description.text))
     trial = 'experiment = "VD.3"\nmean = [3.0, 3.0, 11.0, 3.0]\namplitude = 2.0\nposture_deg = [75.0, 20.0, 20.0]'
     plan = parse_plan(f'[plan]\nname = "into the stop"\n[[trial]]\n{trial}\nseconds = 20.0\n', rig.description)
     outcome = record(rig, plan=plan)

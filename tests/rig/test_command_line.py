@@ -141,17 +141,22 @@ MISTAKES = {
         "rig.toml",
         'kind = "external_torque"',
         'kind = "torque"',
-        "'kind' is 'torque'; choose one of ",
+        "].kind: is 'torque'; choose one of ",
     ),
     "wrong unit": (
         "rig.toml",
         'unit = "N m"',
         'unit = "kg"',
-        "'kg' is no unit for external_torque ('external_torque')",
+        "is 'kg', no unit for external_torque ('external_torque')",
     ),
-    "missing limit": ("rig.toml", "temperature_max = 70.0", "", "'temperature_max' is missing in [limits]; add a line"),
+    "missing limit": ("rig.toml", "temperature_max = 70.0", "", "limits.temperature_max: is missing; add a line"),
     "too high": ("plan.toml", "levels = [3.0, 6.0]", "levels = [3.0, 19.0]", "02-ID.4-T3-MCP: 19 N for T3 is outside"),
-    "unknown joint": ("plan.toml", 'joint = "DIP"', 'joint = "DPI"', "'joint' is 'DPI'; choose one of MCP, PIP, DIP."),
+    "unknown joint": (
+        "plan.toml",
+        'joint = "DIP"',
+        'joint = "DPI"',
+        "joint: is 'DPI' (did you mean 'DIP'?); choose one of MCP, PIP, DIP",
+    ),
 }
 HEADERS = {"missing limit": "[limits]", "too high": "[[trial]]"}  # where the line itself is not there, or not to blame
 
@@ -167,7 +172,7 @@ def test_a_mistake_is_one_sentence_with_its_line_and_nothing_moves(bench, mistak
     (bench / name).write_text(text.replace(good, bad, 1))
     done = subprocess.run(record_in(bench, "--yes"), capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith(f"jaxfinger: {name}, line ")
+    assert done.stderr.startswith(f"jaxfinger: {bench / name}, line ")
     assert done.stderr.count("\n") == 1
     assert says in done.stderr
     line = (bench / name).read_text().splitlines()[int(done.stderr.split("line ")[1].split(":")[0]) - 1]

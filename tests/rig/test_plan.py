@@ -22,8 +22,12 @@ def steps(text, rig):
     [
         ('experiment = "ID.5"', 4, "choose one of"),
         ('experiment = "ID.2"\njoint = "XIP"', 5, "choose one of MCP, PIP, DIP"),
-        ('experiment = "ID.2"', 3, "'joint' is missing"),
-        ('experiment = "ID.2"\njoint = "MCP"\npretention = 2.0', 6, "'pretention' is unknown"),
+        ('experiment = "ID.2"', 3, "trial[0].joint: is missing"),
+        (
+            'experiment = "ID.2"\njoint = "MCP"\npretention = 2.0',
+            6,
+            "trial[0].pretention: is unknown (did you mean 'pretension'?)",
+        ),
         ('experiment = "ID.2"\njoint = "MCP"\nshare = 0.99', 6, "into its stops"),
         ('experiment = "ID.4"\njoint = "PIP"\ntendon = "T3"', 5, "T3 does not cross PIP"),
         ('experiment = "VD.2"\ntendon = "T2"\nlevels = [15.0, 4.0]', 6, "rising"),

@@ -123,11 +123,11 @@ def test_another_program_is_refused(rig, field, value, says):
 @pytest.mark.parametrize(
     ("limit", "loose", "says"),
     [
-        ("tension_max = 18.0", "tension_max = 25.0", "'tension_max' = 25 is looser than the controller's 20"),
+        ("tension_max = 18.0", "tension_max = 25.0", "limits.tension_max: is 25, looser than the controller's 20"),
         (
             "max_deg_s = 600.0",
             "max_deg_s = 700.0",
-            "'joint_velocity_max_deg_s' = 700 is looser than the controller's 601",
+            "limits.joint_velocity_max_deg_s: is 700, looser than the controller's 601",
         ),
     ],
 )

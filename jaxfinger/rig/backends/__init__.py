@@ -1,4 +1,4 @@
-"""One file a backend: `address(table)` reads its keys of [address] in the rig file, `make(description)` its Rig."""
+"""One file a backend: its `Address` is what [address] holds in the rig file, `make(description)` its Rig."""
 
 from __future__ import annotations
 

@@ -11,30 +11,34 @@ import ctypes
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated
 
+from jaxfinger.data.toml import Fault, Within
 from jaxfinger.errors import UserError
 from jaxfinger.rig import contract
 from jaxfinger.rig.backend import ConnectionLost
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.ring import RingRig
-from jaxfinger.rig.toml_file import Table
 
 TIMEOUT_MS = 500
 ATTEMPTS = 4  # to connect: a router may still hang up on the connection of a program that was killed a moment ago
 PAUSE_S = 0.1  # between attempts
 
 
-def address(table: Table) -> dict[str, str | int]:
+@dataclass(frozen=True)
+class Address:
     """`net_id`, `ip` (host, or host:port) and ADS `port` of the controller; `reconnect_s` to mend a cut connection."""
-    net_id = table.text_of("net_id")
-    if net_id.count(".") != 5 or not all(part.isdigit() for part in net_id.split(".")):
-        table.fail("net_id", f"'net_id' must be six numbers such as \"5.12.82.20.1.1\", not {net_id!r}.")
-    return {
-        "net_id": net_id,
-        "ip": table.text_of("ip"),
-        "port": table.integer("port", 851, 1, 65535),
-        "reconnect_s": table.integer("reconnect_s", 5, 0, 60),
-    }
+
+    net_id: str
+    ip: str
+    port: Annotated[int, Within(1, 65535)] = 851
+    reconnect_s: Annotated[int, Within(0, 60, "s")] = 5
+
+    def __post_init__(self):
+        parts = self.net_id.split(".")
+        if len(parts) != 6 or not all(part.isdigit() for part in parts):
+            raise Fault(f'must be six numbers such as "5.12.82.20.1.1", not {self.net_id!r}', "net_id")
 
 
 class AdsRig(RingRig):

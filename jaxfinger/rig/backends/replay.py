@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +12,16 @@ from jaxfinger.errors import UserError
 from jaxfinger.rig.backend import Block, Command, CommandRefused, EndOfReplay, Rig, Status
 from jaxfinger.rig.channels import Channel, Filter, RigDescription
 from jaxfinger.rig.contract import State, Trip
-from jaxfinger.rig.toml_file import Table
 
 BLOCK = 50
 
 
-def address(table: Table) -> dict[str, str | int]:
+@dataclass(frozen=True)
+class Address:
     """`file`, a session beside the rig file, and the name of a `trial` in it."""
-    return {"file": str((table.path.parent / table.text_of("file")).resolve()), "trial": table.text_of("trial")}
+
+    file: str
+    trial: str
 
 
 class ReplayRig(Rig):
@@ -30,10 +32,11 @@ class ReplayRig(Rig):
 
     def __init__(self, description: RigDescription):
         self.description = description
+        self._path = (Path(description.path).parent / str(description.address["file"])).resolve()
         self._at = 0
 
     def connect(self) -> None:
-        path, name = Path(str(self.description.address["file"])), str(self.description.address["trial"])
+        path, name = self._path, str(self.description.address["trial"])
         session = read_session(path)
         if name not in session.trials:
             raise UserError(f"{path}: has no trial '{name}'; choose one of {', '.join(session.trials)}.")
@@ -94,7 +97,7 @@ class ReplayRig(Rig):
         return {}
 
     def fingerprint(self) -> dict[str, str]:
-        return {"replay": str(self.description.address["file"])}
+        return {"replay": str(self._path)}
 
 
 def _column(trial: Trial, channel: Channel, joints: tuple[str, ...], tendons: tuple[str, ...]) -> np.ndarray | None:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Annotated
+
+from jaxfinger.data.toml import Within
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.ring import RingRig
 from jaxfinger.rig.simulated.controller import Controller
-from jaxfinger.rig.toml_file import Table
-
-
-def address(table: Table) -> dict[str, str | int]:
-    """`seed` of the sensors' noise; `filtered = 1` for terminals at their factory filter."""
-    return {"seed": table.integer("seed", 0), "filtered": table.integer("filtered", 0, high=1)}
-
 
 BEAT = 50  # cycles
+
+
+@dataclass(frozen=True)
+class Address:
+    """`seed` of the sensors' noise; `filtered = 1` for terminals at their factory filter."""
+
+    seed: Annotated[int, Within(0)] = 0
+    filtered: Annotated[int, Within(0, 1)] = 0
 
 
 class SimulatedRig(RingRig):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from jaxfinger.data.finger_file import finger_toml
 from jaxfinger.data.session import FingerDescription
-from jaxfinger.rig.finger_file import finger_toml
 from jaxfinger.rig.simulated.controller import Slots
 from jaxfinger.rig.simulated.plant import default_truth
 
