@@ -1,12 +1,15 @@
 """The curves are those of the model, with the spread that its covariance makes; the figures are written whole."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from jaxfinger.data import write_session
 from jaxfinger.errors import UserError
 from jaxfinger.identify import Fit, Recipe
+from jaxfinger.identify.fit_file import save_fit
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.report.curves import curves
 from jaxfinger.report.identification import draw_identification
@@ -106,3 +109,13 @@ def test_what_was_measured_lies_on_the_lines(fit, session):
     for c, way, points in ways:
         line = np.interp(points.x, c.elastic.x, c.elastic.y + way * c.friction.y)
         np.testing.assert_allclose(points.y, line, atol=0.6)
+
+
+def test_the_example_of_the_docs_runs(fit, session, tmp_path, monkeypatch):
+    text = (Path(__file__).parents[2] / "docs" / "reading-the-page.md").read_text(encoding="utf-8")
+    code = text.split("```python\n")[1].split("```")[0]
+    write_session(session, tmp_path / "session.h5")
+    save_fit(fit, tmp_path / "fit.json")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "reading-the-page.md", "exec"), {})
+    assert (tmp_path / "moment-arms.png").stat().st_size > 5000
