@@ -10,6 +10,7 @@ app = App(
 
 COMMANDS = {
     "demo": ("demo:demo", "Identify and validate the shipped session, and compare it with the paper."),
+    "new": ("new:new", "Write a finger and a mapping to fill in, for recordings of your own."),
     "check": ("files:check", "Say what is wrong with a session file."),
     "identify": ("model:identify", "The complete dynamic model of a session, with error bars."),
     "validate": ("model:validate", "How well a fit predicts the trials of a session."),

@@ -32,7 +32,7 @@ import numpy as np
 from jaxfinger.data.check_finger import check_finger
 from jaxfinger.data.findings import Report
 from jaxfinger.data.session import FingerDescription
-from jaxfinger.data.toml import Fault, Place, Within, one_of, read_toml, structure
+from jaxfinger.data.toml import Fault, Place, Within, as_key, one_of, quoted, read_toml, structure
 
 Vector = tuple[float, float, float]
 NotNegative = Annotated[float, Within(0.0)]
@@ -219,7 +219,7 @@ def finger_toml(finger: FingerDescription) -> str:
     """The finger as text of a TOML file, the inverse of `finger_from`."""
     lines = ["[finger]", f"gravity = {_numbers(finger.gravity)}", f"fingertip = {_numbers(finger.fingertip)}"]
     for i, name in enumerate(finger.joint_names):
-        lines += ["", "[[finger.joints]]", f"name = {_quoted(name)}"]
+        lines += ["", "[[finger.joints]]", f"name = {quoted(name)}"]
         if finger.prismatic[i]:
             lines.append('type = "prismatic"')
         for key in ("axis", "origin", "limits", "mass", "com", "inertia"):
@@ -232,14 +232,14 @@ def finger_toml(finger: FingerDescription) -> str:
         lines += [
             "",
             "[[finger.tendons]]",
-            f"name = {_quoted(name)}",
+            f"name = {quoted(name)}",
             f"active = {str(bool(finger.active[k])).lower()}",
         ]
-        lines.append(f"crosses = [{', '.join(_quoted(finger.joint_names[i]) for i in crossed)}]")
+        lines.append(f"crosses = [{', '.join(quoted(finger.joint_names[i]) for i in crossed)}]")
         for key in ("excursion", "excursion_std"):
             values = getattr(finger, key)
             if values is not None and not np.isnan(values[k]).all():
-                by_joint = (f"{_quoted(finger.joint_names[i])} = {_numbers(values[k, i])}" for i in crossed)
+                by_joint = (f"{as_key(finger.joint_names[i])} = {_numbers(values[k, i])}" for i in crossed)
                 lines.append(f"{key} = {{ {', '.join(by_joint)} }}")
     return "\n".join(lines) + "\n"
 
@@ -247,9 +247,3 @@ def finger_toml(finger: FingerDescription) -> str:
 def _numbers(value: np.ndarray | float) -> str:
     """Numbers in as few digits as read back as the same."""
     return str(np.asarray(value, np.float64).tolist())
-
-
-def _quoted(text: str) -> str:
-    """A string, or a key, in the quotes of TOML."""
-    escaped = "".join(f"\\u{ord(c):04x}" if c < " " or c == "\x7f" else c for c in text.replace("\\", "\\\\"))
-    return '"' + escaped.replace('"', '\\"') + '"'

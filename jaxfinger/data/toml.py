@@ -168,6 +168,17 @@ def structure(content: Any, kind: type[T], place: Place) -> T:
         place.fail(fault.message)
 
 
+def quoted(text: str) -> str:
+    """A string in the quotes of TOML."""
+    escaped = "".join(f"\\u{ord(c):04x}" if c < " " or c == "\x7f" else c for c in text.replace("\\", "\\\\"))
+    return '"' + escaped.replace('"', '\\"') + '"'
+
+
+def as_key(text: str) -> str:
+    """A key as TOML writes it: bare where it may be."""
+    return text if re.fullmatch(r"[A-Za-z0-9_-]+", text) else quoted(text)
+
+
 # --- Lines ------------------------------------------------------------------------------------------------------------
 
 

@@ -55,6 +55,9 @@ def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None
         part.write_text("{\n" + lines + "\n}\n", encoding="utf-8")
 
 
+HDF5 = b"\x89HDF\r\n\x1a\n"  # how such a file, as a session is one, begins
+
+
 def load_fit(path: str | os.PathLike, effects: str | os.PathLike | None = None) -> Fit:
     """Read a fit that `save_fit` wrote; `effects` is the Python file of a user's own effects in its model.
 
@@ -62,7 +65,10 @@ def load_fit(path: str | os.PathLike, effects: str | os.PathLike | None = None) 
         UserError: the file cannot be read, is no fit, or has been damaged.
     """
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        raw = Path(path).read_bytes()
+        if raw.startswith(HDF5):
+            raise UserError(f"{path}: is an HDF5 file and no fit; `check` a session, or `identify` it first")
+        content = json.loads(raw.decode("utf-8"))
     except OSError as e:
         raise UserError(f"{path}: cannot be read ({e.strerror}); give a file that `identify` wrote") from None
     except ValueError as e:

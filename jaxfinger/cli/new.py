@@ -1,0 +1,90 @@
+"""`jaxfinger new`: a finger and a mapping to fill in."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from jaxfinger.cli.output import refuse_existing
+from jaxfinger.errors import UserError
+
+
+def new(
+    finger: Path,
+    mapping: Path,
+    *recordings: Path,
+    specimen: str | None = None,
+    joints: str | None = None,
+    tendons: str | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write a finger and a mapping to fill in: TOML with comments, which is read as it stands.
+
+    On a terminal, asks for what is not given.
+
+    Parameters
+    ----------
+    finger
+        The finger to write (TOML).
+    mapping
+        The mapping to write (TOML): which column of which recording is what.
+    recordings
+        The recordings that it is to name, one a trial.
+    specimen
+        Name of the finger.
+    joints
+        Names of the joints, base to tip, with commas between.
+    tendons
+        Names of the tendons, with commas between; `none` for a finger without.
+    overwrite
+        Replace files that are already there.
+    """
+    for path in (finger, mapping):
+        if path.suffix.lower() != ".toml":
+            raise UserError(f"{path}: is to be a TOML file; give a name that ends in .toml")
+        refuse_existing(path, overwrite)
+    if finger.resolve() == mapping.resolve():
+        raise UserError(f"{finger}: is named twice; give one file for the finger, another for the mapping")
+    from jaxfinger.data.atomic import atomic_path
+    from jaxfinger.data.templates import finger_template, mapping_template
+
+    specimen = _asked("Name of the finger", specimen, "finger 1")
+    named = _names("joint", _asked("Joints, base to tip", joints, "MCP, PIP, DIP"))
+    if not named:
+        raise UserError("new: no joint is named; give --joints MCP,PIP,DIP, or so")
+    answer = _asked("Tendons, or none", tendons, "T1, T2, T3, T4")
+    pulled = [] if answer.strip() == "none" else _names("tendon", answer)
+    beside = _from(finger, mapping.parent)
+    for path, text in (
+        (finger, finger_template(named, pulled)),
+        (mapping, mapping_template(specimen, beside, named, pulled, [path.name for path in recordings])),
+    ):
+        with atomic_path(path, overwrite) as part:
+            part.write_text(text, encoding="utf-8")
+    print(f"{finger}: {len(named)} joints, {len(pulled)} tendons; replace its numbers by those of your finger")
+    print(f"{mapping}: name your recordings and their columns, then: jaxfinger import … --mapping {mapping}")
+
+
+def _asked(question: str, given: str | None, default: str) -> str:
+    """What was given, else what is answered on a terminal, else the default."""
+    if given is not None or not (sys.stdin.isatty() and sys.stdout.isatty()):
+        return default if given is None else given
+    from rich.prompt import Prompt
+
+    return Prompt.ask(question, default=default)
+
+
+def _names(what: str, said: str) -> list[str]:
+    names = [name.strip() for name in said.split(",") if name.strip()]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise UserError(f"new: the {what} {name} is named twice; give each its own name")
+    return names
+
+
+def _from(path: Path, folder: Path) -> str:
+    """The path as a file in the folder names it."""
+    try:
+        return path.resolve().relative_to(folder.resolve()).as_posix()
+    except ValueError:
+        return str(path.resolve())

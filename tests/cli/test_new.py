@@ -1,0 +1,67 @@
+"""`jaxfinger new` writes a finger and a mapping that are read as they stand."""
+
+import numpy as np
+import pytest
+
+from jaxfinger.cli import main
+from jaxfinger.data import check_file, read_session
+
+NAMES = ("MCP", "P.IP")  # one that TOML must quote
+
+
+@pytest.fixture
+def written(tmp_path):
+    main(["new", f"{tmp_path}/finger.toml", f"{tmp_path}/mapping.toml", "--joints", "MCP,P.IP", "--tendons", "T1"])
+    return tmp_path
+
+
+def log(path, moved, pulled=False):
+    """A recording by a rig of one's own: columns as the template names them, angles in degrees, lengths in mm."""
+    rng, time = np.random.default_rng(len(str(path))), np.arange(600) / 50
+    sweep = 40 - 30 * np.cos(time)
+    angle = {name: sweep if name == moved and not pulled else 20 + 0.01 * rng.standard_normal(600) for name in NAMES}
+    force = 2 + 4 * np.floor(time / 3) if pulled else np.full(600, 2.0)
+    columns = {"time": time} | {f"angle {name}": values for name, values in angle.items()}
+    columns |= {"force T1": force + 0.01 * rng.standard_normal(600), "torque": -0.005 * force + 1e-4 * sweep}
+    columns |= {"length T1": 0.14 * angle["MCP"] + 0.1 * angle["P.IP"]}
+    np.savetxt(path, np.column_stack(list(columns.values())), delimiter=",", header=",".join(columns), comments="")
+
+
+def test_templates_import_once_the_files_are_there(written, capsys):
+    trials = ("01-ID.2-MCP", "02-ID.2-P.IP", "03-ID.3-dynamic-MCP", "04-ID.3-dynamic-P.IP", "05-ID.4-T1-P.IP")
+    for name in trials:
+        log(written / f"{name}.csv", name.rsplit("-", 1)[1], pulled="ID.4" in name)
+    files = [f"{written}/{name}.csv" for name in trials]
+    main(["import", *files, "--mapping", f"{written}/mapping.toml", "-o", f"{written}/session.h5"])
+    session = read_session(written / "session.h5")
+    assert tuple(session.trials) == trials
+    assert session.finger.joint_names == NAMES
+    assert session.finger.tendon_names == ("T1",)
+    assert not [f for f in check_file(written / "session.h5") if f.severity == "error"]
+    np.testing.assert_allclose(session["01-ID.2-MCP"].q[:, 0].max(), np.radians(70), rtol=1e-3)
+
+
+def test_nothing_is_overwritten_unless_asked_and_names_differ(written, capsys):
+    before = (written / "finger.toml").read_text()
+    files = ["new", f"{written}/finger.toml", f"{written}/other.toml"]
+    for more, says in (([], "exists already"), (["--overwrite", "--joints", "A,A"], "the joint A is named twice")):
+        with pytest.raises(SystemExit) as stopped:
+            main(files + more)
+        assert stopped.value.code == 2
+        assert says in capsys.readouterr().err
+        assert (written / "finger.toml").read_text() == before
+        assert not (written / "other.toml").exists()
+
+
+def test_recordings_are_named_and_a_finger_may_lack_tendons(tmp_path):
+    main(["new", f"{tmp_path}/f.toml", f"{tmp_path}/m.toml", "a.mat", "b.mat", "--joints", "J", "--tendons", "none"])
+    assert 'file = "a.mat"' in (tmp_path / "m.toml").read_text()
+    assert "tendons" not in (tmp_path / "f.toml").read_text()
+
+
+def test_show_of_a_session_says_that_it_is_no_fit(tmp_path, capsys):
+    (tmp_path / "session.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
+    with pytest.raises(SystemExit) as stopped:
+        main(["show", f"{tmp_path}/session.h5"])
+    assert stopped.value.code == 2
+    assert "is an HDF5 file and no fit" in capsys.readouterr().err
