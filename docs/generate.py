@@ -41,14 +41,16 @@ def draw(name: str, moving: tuple, held: tuple, tendon: str, motor: bool, force:
         axes.plot(*finger(other).T, color="0.78", lw=7, solid_capstyle="round", zorder=1)
     axes.plot(*places.T, color="0.45", lw=9, solid_capstyle="round", zorder=2)
     below = places + np.array([-0.1, -0.62])
-    axes.plot([-2.2, *below[:-1, 0], places[-1, 0]], [-0.62, *below[:-1, 1], places[-1, 1]], color="C0", lw=1.6, zorder=3)
+    path = np.vstack([(-2.2, -0.62), below[:-1], places[-1]])
+    axes.plot(*path.T, color="C0", lw=1.6, zorder=3)
     axes.annotate(f"tendon: {tendon}", (-2.2, -0.62), (-2.4, -2.1), color="C0", fontsize=10)
     for j, place in enumerate(places[:-1]):
         axes.plot(*place, "o", ms=11, mec="k", mfc="w" if j in held else "k", zorder=4)
         axes.annotate(("MCP", "PIP", "DIP")[j], place, (-10, 13), textcoords="offset points", fontsize=10)
     if motor:
         axes.plot(*places[0], "s", ms=24, mec="C1", mfc="none", mew=2, zorder=5)
-        axes.annotate("motor with torque sensor", places[0], (-60, 34), textcoords="offset points", color="C1", fontsize=10)
+        label = dict(textcoords="offset points", color="C1", fontsize=10)
+        axes.annotate("motor with torque sensor", places[0], (-60, 34), **label)
     if force:
         tip = places[-1]
         axes.annotate("", tip, tip + np.array([0.4, -1.7]), arrowprops=dict(arrowstyle="->", color="C2", lw=2))

@@ -1,5 +1,8 @@
 """Staged fits, joint refinement, their uncertainty, and the file that holds a result."""
 
+import sys
+from types import ModuleType
+
 from jaxfinger.identify.batch import Members, fit_many
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.fit_file import load_fit, save_fit
@@ -32,3 +35,13 @@ __all__ = [
     "sandwich",
     "save_fit",
 ]
+
+
+class _Room(ModuleType):
+    """The room is called as its function: `jaxfinger.identify(session)`."""
+
+    def __call__(self, *args, **keywords) -> Fit:
+        return identify(*args, **keywords)
+
+
+sys.modules[__name__].__class__ = _Room

@@ -1,0 +1,28 @@
+"""`import jaxfinger as jf`: what a notebook sees."""
+
+import subprocess
+import sys
+
+import pytest
+
+import jaxfinger as jf
+from jaxfinger.table import Table
+
+
+def test_every_name_of_the_package_is_there_and_nothing_loads_jax_before_it_is_needed():
+    code = "import sys, jaxfinger as jf; jf.read; jf.check; print('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
+    assert all(getattr(jf, name) is not None for name in jf.__all__)
+    assert callable(jf.identify)
+    with pytest.raises(AttributeError, match=r"has no 'fit'; it has .*identify"):
+        jf.fit  # noqa: B018
+
+
+def test_a_table_prints_and_says_which_columns_there_are():
+    rows = Table([{"name": "q¹ <MCP>", "value": 0.012345678, "std": None}, {"name": "q²", "value": 2, "std": 0.5}])
+    assert repr(rows).splitlines()[0].split() == ["name", "value", "std"]
+    assert "0.01235" in repr(rows)
+    assert "q¹ &lt;MCP&gt;" in rows._repr_html_()
+    assert rows.column("std") == [None, 0.5]
+    with pytest.raises(KeyError, match=r"no column 'sd'; there are name, value, std"):
+        rows.column("sd")
