@@ -9,8 +9,8 @@
 # %% [markdown]
 # # Joint against stepwise
 # The staged fits pass their errors on: what ID.3 makes of the links' masses, ID.4 takes for granted. The joint
-# refinement reads all trials at once. Both fit the same session here; `benchmarks/joint.py` repeats it on a hundred, and
-# `benchmarks/coverage.py` on two hundred, with the truth beside them.
+# refinement reads all trials at once. Both fit the same session here; `benchmarks/joint.py`
+# repeats it on a hundred, and `benchmarks/coverage.py` on two hundred, with the truth beside them.
 
 # %%
 from pathlib import Path

@@ -17,7 +17,7 @@ from pathlib import Path
 import jaxfinger as jf
 
 session = jf.read(Path("datasets/demo-finger/session.h5"))
-session
+print(session)
 
 # %% [markdown]
 # ## Identify

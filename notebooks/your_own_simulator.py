@@ -8,8 +8,8 @@
 
 # %% [markdown]
 # # Diagnose your own simulator
-# Any simulator is diagnosed by its predictions of a session's trials: an HDF5 file in the layout that `jf.predict` writes.
-# Here the «simulator» is the fitted model with the friction of its tendons left out.
+# Any simulator is diagnosed by its predictions of a session's trials: an HDF5 file in the layout that
+# `jaxfinger predict` writes. Here the «simulator» is the fitted model with the friction of its tendons left out.
 
 # %%
 from pathlib import Path
