@@ -62,7 +62,7 @@ def render(d: Diagnosis, trace: Trace | None = None, arms: Sequence[Markup] = ()
     """
     template = Environment(loader=PackageLoader("jaxfinger.report", "."), autoescape=True).get_template("page.html.j2")
     prismatic = d.nominal.model.finger.prismatic
-    named = set(d.named).union(*d.ambiguous_sets) if d.status is Status.AMBIGUOUS else set(d.named)
+    named = set(d.named).union(*d.ambiguous_sets)
     rest = [c for c in d.candidates if c.key not in named and c.probability >= WORTH_A_LINE]
     return template.render(
         d=d,
@@ -72,8 +72,9 @@ def render(d: Diagnosis, trace: Trace | None = None, arms: Sequence[Markup] = ()
         summary=unbroken(sentences.summary(d)),
         budget=_budget(d) if d.channels else "",
         hidden_bars=max(len(d.channels) - gap_plots.MOST, 0),
-        relevance=[_relevance(x) for x in d.relevance],
+        relevance=[_relevance(x) for x in d.relevance if x.tolerated or d.status is not Status.NO_GAP],
         cards=_cards(d),
+        rivals=[sentences.sentence(sentences.cannot_tell(s)) for s in d.ambiguous_sets if d.status is Status.PARTLY],
         changes=[sentences.change(x) for x in d.changes],
         others=[{"name": sentences.key_name(c.key), "probability": percent(c.probability)} for c in rest],
         places=[_place(p, prismatic) for p in d.where if p.share >= WORTH_A_PLACE],
@@ -195,7 +196,10 @@ def _cards(d: Diagnosis) -> list[dict]:
     if d.status is Status.AMBIGUOUS and d.ambiguous_sets:
         by_key = {c.key: c for c in d.candidates}
         return [_rival(d, k, by_key.get(key), key) for k, key in enumerate(d.ambiguous_sets[0])]
-    return [_card(d, k, c) for k, c in enumerate(d.budget)]
+    cards, inside = [_card(d, k, c) for k, c in enumerate(d.budget)], {key for c in d.budget for key in c.keys}
+    rivals = [key for members in d.ambiguous_sets for key in members if key not in inside]
+    by_key = {c.key: c for c in d.candidates}
+    return cards + [_rival(d, len(cards) + k, by_key.get(key), key) for k, key in enumerate(rivals)]
 
 
 def _card(d: Diagnosis, k: int, c: Cause) -> dict:

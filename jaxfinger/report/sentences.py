@@ -25,6 +25,7 @@ from jaxfinger.gap.result import (
 from jaxfinger.report.numbers import measured, number, percent, percent_range, quantity
 
 NAMED_AT_MOST = 4  # causes in one sentence
+OPEN = 1.3  # rms after, in that of the noise, which is itself known to a fifth
 LIKELY, SURE = 0.9, 0.99  # probabilities from which on a person says «very probably» and «almost certainly»
 
 HEADLINES = {
@@ -104,12 +105,15 @@ def certainty(probability: float) -> str:
 def headline(d: Diagnosis) -> str:
     """The verdict in one line, the whole of it."""
     text = HEADLINES[d.status]
-    if not d.named and d.status in (Status.NO_GAP, Status.EXPLAINED) and any(x.tolerated for x in d.relevance):
+    if not d.named and d.status in (Status.NO_GAP, Status.EXPLAINED) and tolerated(d):
         return "No gap beyond your tolerance"
     if d.status in (Status.EXPLAINED, Status.PARTLY):
         text = f"{text}: {_listed([cause_name(c) for c in named_causes(d)])}"
         if d.status is Status.PARTLY:
             text += f"; {percent(d.unexplained.share)} is left"
+        elif left := still_open(d):
+            names = [_of(x.experiment, x.channel) for x in left]
+            text += f"; {names[0]} stays open" if len(names) == 1 else f"; {len(names)} channels stay open"
     elif d.status is Status.AMBIGUOUS and d.ambiguous_sets:
         text = f"{text}: {joined([key_name(k) for k in d.ambiguous_sets[0]], 'or')}"
     return text
@@ -126,6 +130,24 @@ def summary(d: Diagnosis) -> str:
         Status.NOT_JUDGED: _nothing_judged,
     }[d.status](d)
     return " ".join(sentence(p) for p in (*parts, *_caveats(d)))
+
+
+def stays_open(x: Closure) -> bool:
+    """Whether a channel with a gap misses more than its noise after all. Angles simulated forward are not judged by
+    that, since they amplify what is small.
+    """
+    return x.resolvable and not x.diverged and x.channel != "q" and x.noise > 0 and x.after > OPEN * x.noise
+
+
+def still_open(d: Diagnosis) -> list[Closure]:
+    """Channels with a gap that matters, which stay open with all causes in the model."""
+    covered = {(x.experiment, x.channel) for x in d.relevance if x.tolerated}
+    return [x for x in d.closures if stays_open(x) and (x.experiment, x.channel) not in covered]
+
+
+def tolerated(d: Diagnosis) -> bool:
+    """Whether there are gaps, all of which the user tolerates."""
+    return bool(d.relevance) and all(x.tolerated for x in d.relevance)
 
 
 def named_causes(d: Diagnosis) -> list[Cause]:
@@ -164,8 +186,8 @@ def _is_simulator(d: Diagnosis) -> bool:
 
 def _no_gap(d: Diagnosis) -> list[str]:
     chance = f"the probability that nothing is at work beyond it is {percent(d.none)}"
-    if d.relevance:  # a gap that the user tolerates
-        return [size(d), f"nothing else stands out of the noise; {chance}"]
+    if tolerated(d):
+        return [size(d), chance if d.none >= 0.5 else "nothing is missed by more than you tolerate"]
     channels = len({(x.experiment, x.channel) for x in d.closures})
     return [f"{_subject(d)} predicts {_counted(channels)} to within the noise", chance]
 
@@ -176,26 +198,32 @@ def _counted(channels: int) -> str:
 
 
 def _explained(d: Diagnosis) -> list[str]:
-    end = "its noise, or to what you tolerate," if any(x.tolerated for x in d.relevance) else "its noise"
     if not d.named:
         return [size(d), "nothing is missed by more than you tolerate"]
     it = "it" if len(named_causes(d)) < 2 else "them"
-    return [
-        size(d),
-        f"{_blamed(d)}; with {it} in the model every channel comes down to {end} on trials that no fit has seen",
-    ]
+    end = "its noise, or to what you tolerate," if any(x.tolerated for x in d.relevance) else "its noise"
+    closes = f"every channel comes down to {end} on trials that no fit has seen"
+    if left := still_open(d):
+        names = [f"{_of(x.experiment, x.channel)}, {number(x.after / x.noise, 2)} times its noise" for x in left]
+        closes = f"what stays open on trials that no fit has seen is {_listed(names)}"
+    return [size(d), f"{_blamed(d)}; with {it} in the model {closes}"]
 
 
 def _partly(d: Diagnosis) -> list[str]:
-    return [size(d), _blamed(d), _left(d)]
+    unknown = [cannot_tell(members) for members in d.ambiguous_sets[:1]]
+    return [size(d), "; ".join([_blamed(d), *unknown]), _left(d)]
+
+
+def cannot_tell(members: Sequence[Key]) -> str:
+    """Of rivals that these trials leave."""
+    names = [key_name(k) for k in members]
+    if len(names) == 2:
+        return f"these trials cannot tell {names[0]} from {names[1]}"
+    return f"these trials cannot tell {joined(names)} apart"
 
 
 def _ambiguous(d: Diagnosis) -> list[str]:
-    names = [key_name(k) for k in (d.ambiguous_sets[0] if d.ambiguous_sets else d.named)]
-    if len(names) == 2:
-        text = f"these trials cannot tell {names[0]} from {names[1]}"
-    else:
-        text = f"these trials cannot tell {joined(names)} apart"
+    text = cannot_tell(d.ambiguous_sets[0] if d.ambiguous_sets else d.named)
     likeliest = _probability(d, d.named[0]) if d.named else None
     if likeliest is not None:
         text += f"; {key_name(d.named[0])} is the likelier with {percent(likeliest)}"

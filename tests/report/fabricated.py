@@ -96,7 +96,7 @@ SMALL = Relevance("VD.1", "tendon_excursion", "m", 6e-6, 0.02, 3e-4, False)
 LARGE = Relevance("ID.4", "joint_torque", "N m", 1.2e-3, 0.03, 0.04, False)
 LINES = (
     Closure("ID.4", "joint_torque", "N m", 2e-4, 1.2e-3, 2.1e-4, 0.99, (0.97, 1.0), True),
-    Closure("VD.1", "tendon_excursion", "m", 2e-5, 4.1e-4, 3e-5, 0.97, (0.94, 0.99), True),
+    Closure("VD.1", "tendon_excursion", "m", 2e-5, 4.1e-4, 2.1e-5, 0.97, (0.94, 0.99), True),
     Closure("VD.3", "q", "rad", 0.0, 0.05, 0.01, 0.9, (0.8, 0.95), True),
 )
 BARS = (
@@ -232,7 +232,19 @@ def every() -> dict[str, Diagnosis]:
             budget=(replace(STRETCHES, share=0.32, share_ci95=(0.3, 0.34)), replace(RUBS, share=0.36)),
             unexplained=OPEN,
             unlisted=0.8,
+            closures=(LINES[0], replace(LINES[1], after=3e-5), LINES[2]),
         ),
+        "partly_ambiguous": replace(
+            one,
+            status=Status.PARTLY,
+            named=(STRIBECK,),
+            budget=(RUBS,),
+            ambiguous_sets=(rivals,),
+            unexplained=replace(OPEN, share=0.55, share_ci95=(0.5, 0.6), proposal=None),
+            unlisted=0.02,
+            candidates=(_candidate(STRIBECK, 0.93), _candidate(rivals[0], 0.5), _candidate(rivals[1], 0.47)),
+        ),
+        "still_open": replace(one, closures=(LINES[0], replace(LINES[1], after=3.1e-5), LINES[2])),
         "ambiguous": replace(
             one,
             status=Status.AMBIGUOUS,

@@ -31,6 +31,14 @@ SAYS = {
         "Partly explained: tendon stretch at T3 and joint Stribeck at PIP; 30 % is left",
         [SIZE, "What is left, 30 % of the gap (20 to 40 %), lies mostly in joint torque PIP of ID.4", "tension"],
     ),
+    "partly_ambiguous": (
+        "Partly explained: joint Stribeck at PIP; 55 % is left",
+        [SIZE, "(95 % interval 35 to 47 %); these trials cannot tell tendon stretch at T3 from tendon creep at T3."],
+    ),
+    "still_open": (
+        "Explained: tendon stretch at T3; tendon excursion of VD.1 stays open",
+        ["what stays open on trials that no fit has seen is tendon excursion of VD.1, 1.6 times its noise."],
+    ),
     "ambiguous": (
         "Cannot be told apart yet: tendon stretch at T3 or tendon creep at T3",
         [SIZE, "cannot tell tendon stretch at T3 from tendon creep at T3", "62 %", "MCP at 23° and PIP from 6° to 57°"],
@@ -72,6 +80,18 @@ def test_what_matters_leads_whatever_comes_first_in_the_file():
     text = sentences.size(d)
     assert text.index("6 µm") < text.index("1.2 N mm")
     assert "within your tolerance of 5 %" in text
+
+
+def test_what_noise_also_gives_is_no_gap_in_the_world():
+    d = replace(ALL["no_gap"], relevance=(SMALL,))
+    assert sentences.headline(d) == "No gap beyond the noise"
+    assert "misses" not in sentences.summary(d)
+
+
+def test_a_tolerated_gap_of_unknown_cause_is_not_said_to_be_nothing():
+    text = sentences.summary(replace(ALL["tolerated"], none=0.01))
+    assert "within your tolerance" in text
+    assert "probability" not in text
 
 
 def test_a_signal_of_nothing_has_no_relative_size():

@@ -11,7 +11,7 @@ from matplotlib.patches import Patch
 
 from jaxfinger.gap.result import ChannelBudget, Closure, Diagnosis
 from jaxfinger.report.numbers import alike, quantity
-from jaxfinger.report.sentences import cause_name, channel_name
+from jaxfinger.report.sentences import cause_name, channel_name, stays_open
 from jaxfinger.report.theme import (
     AFTER,
     BEFORE,
@@ -32,7 +32,6 @@ from jaxfinger.report.traces import Trace
 MOST = 12  # bars in one picture
 ROW = 0.42  # inches of height that a bar and its label take
 HATCH = "////"
-STAYS_OPEN = 1.3  # rms after, in that of the noise, which is itself known to a fifth
 SEEN = 0.004  # share of a bar below which a segment is not drawn
 
 
@@ -115,7 +114,7 @@ def shown(lines: Sequence[Closure]) -> list[Closure]:
 def closure(lines: Sequence[Closure], ax: Axes | None = None) -> Axes:
     """How far each channel closes on held-out trials: rms in units of its noise, before and after, on a log axis.
 
-    What stays above 1.3 times its noise is drawn in the colour of what is wrong.
+    What `stays_open` is drawn in the colour of what is wrong.
 
     Args:
         lines: the diagnosis's `closures`.
@@ -126,7 +125,7 @@ def closure(lines: Sequence[Closure], ax: Axes | None = None) -> Axes:
     ax = axes_or_new(ax, *closure_size(rows, 5.0))
     for y, x in enumerate(rows):
         before, after = x.before / x.noise, x.after / x.noise
-        stays = after > STAYS_OPEN
+        stays = stays_open(x)
         ax.plot([before, after], [y, y], color=MUTED, linewidth=1.2, zorder=1)
         if changed:
             ax.plot(before, y, "o", color="none", markeredgecolor=BEFORE, markeredgewidth=1.6, markersize=6)
@@ -150,7 +149,7 @@ def closure(lines: Sequence[Closure], ax: Axes | None = None) -> Axes:
     if changed:
         ax.plot([], [], "o", color="none", markeredgecolor=BEFORE, markeredgewidth=1.6, label="before")
     ax.plot([], [], "o", color=AFTER, label="after" if changed else "the model")
-    if any(x.after > STAYS_OPEN * x.noise for x in rows):
+    if any(map(stays_open, rows)):
         ax.plot([], [], "s", color=WRONG, label="stays open")
     legend_below(ax, 2)
     return ax
