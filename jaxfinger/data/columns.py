@@ -12,9 +12,10 @@ from jaxtyping import Float, Int
 
 from jaxfinger.data.expressions import ExpressionError, evaluate
 from jaxfinger.data.findings import Report
-from jaxfinger.data.mapping import CLOCK_KEYS, COLUMN_KEYS, Where
+from jaxfinger.data.mapping import Column, MappedTrial, Reading, Said, terms
 from jaxfinger.data.parse import listed
 from jaxfinger.data.recording import Recording, Variable
+from jaxfinger.data.toml import Place
 from jaxfinger.data.units import TO_SI, known
 from jaxfinger.errors import UserError
 
@@ -34,7 +35,7 @@ class Source:
     constants: Mapping[str, Any] = field(default_factory=dict)
     derived: Mapping[str, str] = field(default_factory=dict)
 
-    def variable(self, name: str, where: Where, within: tuple[str, ...] = ()) -> Variable:
+    def variable(self, name: str, where: Place, within: tuple[str, ...] = ()) -> Variable:
         """The variable of this name: derived, or as the recording has it.
 
         Raises:
@@ -53,11 +54,9 @@ class Source:
         there = sorted([*self.recording.variables, *self.derived])
         return where.fail(f"{said}, which the recording has not; it has {listed(there, 30)}")
 
-    def _derive(self, name: str, where: Where, within: tuple[str, ...]) -> Variable:
-        where = where / f"derived.{name}"
+    def _derive(self, name: str, where: Place, within: tuple[str, ...]) -> Variable:
+        where = where / "derived" / name
         text = self.derived[name]
-        if not isinstance(text, str):
-            where.fail(f"is {text!r}; it must be an expression, as 'kt * current'")
         clocks: dict[str, str] = {}
 
         def lookup(inner: str, column: Any) -> np.ndarray:
@@ -82,7 +81,7 @@ class Source:
         return Variable(values, clock=next(iter(clocks.values()), ""))
 
 
-def _column(variable: Variable, name: str, column: Any, where: Where) -> tuple[np.ndarray, int]:
+def _column(variable: Variable, name: str, column: Any, where: Place) -> tuple[np.ndarray, int]:
     """One column by its place or its name, and its place."""
     values, names = variable.values, variable.columns
     if values.ndim == 1:
@@ -109,7 +108,7 @@ def _column(variable: Variable, name: str, column: Any, where: Where) -> tuple[n
     return values[:, column], column
 
 
-def single(source: Source, name: str, where: Where) -> float:
+def single(source: Source, name: str, where: Place) -> float:
     """A number of the recording or of the mapping's constants."""
     values = np.asarray(source.constants.get(name) if name in source.constants else source.variable(name, where).values)
     if values.size != 1:
@@ -134,55 +133,40 @@ class Clock:
         return Clock(self.time[rows], self.rows[rows], self.total, self.source, self.name, self.units, self.sort)
 
 
-def trial_clock(table: Mapping[str, Any], first: Any, source: Source, where: Where, report: Report) -> Clock:
+def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place, report: Report) -> Clock:
     """The clock that `time` or `rate_hz` gives, cut to `span` and `where`; `first` is the column of the first joint."""
-    sort = table.get("sort", False)
-    if not isinstance(sort, bool):
-        where.fail(f"has sort = {sort!r}; it must be true or false")
+    if trial.time is None:
+        assert trial.rate_hz is not None
+        count = len(_column(source.variable(first.from_, where), first.from_, first.column, where)[0])
+        clock = Clock(np.arange(count) / trial.rate_hz, np.arange(count), count, source)
+        return _cut(clock, trial, where)
     rows_of = _first_rows(first, source, where)
-    if "time" in table:
-        place = where / "time"
-        spec = _spec(table["time"], CLOCK_KEYS, place)
-        variable = source.variable(place.text(spec, "from"), place)
-        values, _ = _column(variable, spec["from"], spec.get("column"), place)
-        time = _converted(values, spec, "s", source, place)
-        rows = np.arange(len(time))
-        if rows_of is not None and len(rows_of) == len(rows):
-            rows = rows[rows_of]
-        order = in_order(time[rows], f"`{spec['from']}`", sort, place, report)
-        clock = Clock(time[rows][order], rows[order], len(time), source, spec["from"], spec.get("units", "s"), sort)
-    elif "rate_hz" in table:
-        (rate,) = where.numbers({"rate_hz": [table["rate_hz"]]}, "rate_hz", (1,))
-        if not (rate > 0.0 and np.isfinite(rate)):
-            where.fail("has a `rate_hz` that is not positive; write samples per second")
-        spec = _spec(first, COLUMN_KEYS, where)
-        count = len(
-            _column(source.variable(where.text(spec, "from"), where), spec["from"], spec.get("column"), where)[0]
-        )
-        clock = Clock(np.arange(count) / rate, np.arange(count), count, source)
-    else:
-        where.fail("has neither `time` nor `rate_hz`; name the variable that holds the time, or the sampling rate")
-    return _cut(clock, table, where)
+    place = where / "time"
+    said = Reading(trial.time) if isinstance(trial.time, str) else trial.time
+    values, _ = _column(source.variable(said.from_, place), said.from_, said.column, place)
+    time = _converted(values, said, "s", source, place)
+    rows = np.arange(len(time))
+    if rows_of is not None and len(rows_of) == len(rows):
+        rows = rows[rows_of]
+    order = in_order(time[rows], f"`{said.from_}`", trial.sort, place, report)
+    clock = Clock(time[rows][order], rows[order], len(time), source, said.from_, said.units or "s", trial.sort)
+    return _cut(clock, trial, where)
 
 
-def _first_rows(first: Any, source: Source, where: Where) -> np.ndarray | None:
+def _first_rows(first: Column, source: Source, where: Place) -> np.ndarray | None:
     """Of a topic with several publishers, the messages that carry the trial's first joint."""
-    spec = _spec(first, COLUMN_KEYS, where)
-    if spec.get("file") is not None:
+    if first.file is not None:
         return None
-    name = where.text(spec, "from")
-    variable = source.variable(name, where)
+    variable = source.variable(first.from_, where)
     if variable.present is None:
         return None
-    return variable.present[:, _column(variable, name, spec.get("column"), where)[1]]
+    return variable.present[:, _column(variable, first.from_, first.column, where)[1]]
 
 
-def _cut(clock: Clock, table: Mapping[str, Any], where: Where) -> Clock:
+def _cut(clock: Clock, trial: MappedTrial, where: Place) -> Clock:
     """`span`: seconds from the recording's first sample; `where`: a condition on its rows."""
-    if "where" in table:
-        place, text = where / "where", table["where"]
-        if not isinstance(text, str):
-            place.fail(f"is {text!r}; it must be a condition, as 'phase == 2'")
+    if trial.where is not None:
+        place, text = where / "where", trial.where
 
         def lookup(name: str, column: Any) -> np.ndarray:
             return _column(clock.source.variable(name, place), name, column, place)[0]
@@ -194,17 +178,15 @@ def _cut(clock: Clock, table: Mapping[str, Any], where: Where) -> Clock:
         if chosen.shape != (clock.total,) or chosen.dtype != bool:
             place.fail(f"{text!r} is no condition on the {clock.total} samples; write one, as 'phase == 2'")
         clock = clock.keep(chosen[clock.rows])
-    if "span" in table and len(clock.time):
-        begin, end = where.numbers(table, "span", (2,))
-        if not begin < end:
-            where.fail(f"has span = [{begin:g}, {end:g}]; write begin and end in s, the earlier first")
+    if trial.span is not None and len(clock.time):
+        begin, end = trial.span
         clock = clock.keep((clock.time - clock.time[0] >= begin) & (clock.time - clock.time[0] < end))
     if len(clock.time) == 0:
-        where.fail("holds no sample; widen its `span`" if "span" in table else "holds no sample; correct its `where`")
+        where.fail("holds no sample; " + ("correct its `where`" if trial.span is None else "widen its `span`"))
     return clock
 
 
-def in_order(time: np.ndarray, name: str, sort: bool, where: Where, report: Report) -> np.ndarray:
+def in_order(time: np.ndarray, name: str, sort: bool, where: Place, report: Report) -> np.ndarray:
     """The order in which these times increase. Without `sort` they must do so by themselves."""
     late = np.diff(time) <= 0.0
     if not late.any():
@@ -228,27 +210,22 @@ class Columns:
     """Reads columns onto a trial's clock, and remembers from when to when all of them are known."""
 
     clock: Clock
-    sources: Callable[[str, Where], Source]  # other files by name
+    sources: Callable[[str, Place], Source]  # other files by name
     report: Report
     begin: float = -np.inf
     end: float = np.inf
 
-    def column(self, spec: Any, units: str, whole: bool, where: Where) -> Float[np.ndarray, " N"]:
+    def column(self, said: Said, units: str, whole: bool, where: Place) -> Float[np.ndarray, " N"]:
         """One column: a term, or the sum of a list of them. `whole`: labels, which are not interpolated."""
-        terms = spec if isinstance(spec, list) else [spec]
-        if not terms:
-            where.fail("is an empty list; name a variable")
-        return np.sum([self._term(term, units, whole, where) for term in terms], axis=0)
+        return np.sum([self._term(term, units, whole, where) for term in terms(said)], axis=0)
 
-    def _term(self, spec: Any, units: str, whole: bool, where: Where) -> np.ndarray:
+    def _term(self, spec: Column, units: str, whole: bool, where: Place) -> np.ndarray:
         """variable · scale + offset, in SI, on the trial's clock."""
         clock = self.clock
-        spec = _spec(spec, COLUMN_KEYS, where)
-        other = spec.get("file")
-        source = clock.source if other is None else self.sources(other, where)
-        name = where.text(spec, "from")
+        source = clock.source if spec.file is None else self.sources(spec.file, where)
+        name = spec.from_
         variable = source.variable(name, where)
-        values, k = _column(variable, name, spec.get("column"), where)
+        values, k = _column(variable, name, spec.column, where)
         _stated(variable, spec, units, self.report, where)
         values = _converted(values, spec, units, source, where)
         here = np.ones(len(values), bool) if variable.present is None else variable.present[:, k]
@@ -272,17 +249,15 @@ class Columns:
         return self._onto(time[order], values[order], own_name, whole, where)
 
     def _own_clock(
-        self, spec: Mapping[str, Any], variable: Variable, source: Source, here: np.ndarray, where: Where
+        self, spec: Column, variable: Variable, source: Source, here: np.ndarray, where: Place
     ) -> tuple[str, np.ndarray] | None:
         """Name and times, s, of the clock of a variable that does not share the trial's rows."""
         clock = self.clock
-        if "time" in spec:
-            said = {"from": spec["time"], "units": clock.units} if isinstance(spec["time"], str) else spec["time"]
+        if spec.time is not None:
             place = where / "time"
-            said = _spec(said, CLOCK_KEYS, place)
-            name = place.text(said, "from")
-            values, _ = _column(source.variable(name, place), name, said.get("column"), place)
-            return f"`{name}`", _converted(values, said, "s", source, place)
+            said = Reading(spec.time, units=clock.units) if isinstance(spec.time, str) else spec.time
+            values, _ = _column(source.variable(said.from_, place), said.from_, said.column, place)
+            return f"`{said.from_}`", _converted(values, said, "s", source, place)
         known_clocks = source.recording.variables
         main = known_clocks.get(clock.name)
         shared = source.recording is clock.source.recording
@@ -299,7 +274,7 @@ class Columns:
             own = stamp
         return f"`{own}`", known_clocks[own].values
 
-    def _onto(self, time: np.ndarray, values: np.ndarray, name: str, whole: bool, where: Where) -> np.ndarray:
+    def _onto(self, time: np.ndarray, values: np.ndarray, name: str, whole: bool, where: Place) -> np.ndarray:
         """Values at the trial's times: between two samples of their own clock interpolated, beyond its ends NaN."""
         trial = self.clock.time
         good = np.isfinite(time)
@@ -353,34 +328,17 @@ class Columns:
         return (self.clock.time >= self.begin) & (self.clock.time <= self.end)
 
 
-def _spec(spec: Any, keys: tuple[str, ...], where: Where) -> Mapping[str, Any]:
-    spec = {"from": spec} if isinstance(spec, str) else spec
-    if not isinstance(spec, Mapping):
-        where.fail("must name a variable, as 'enc' or { from = 'enc', units = 'deg' }")
-    where.known(spec, keys)
-    return spec
-
-
-def _converted(values: np.ndarray, spec: Mapping[str, Any], units: str, source: Source, where: Where) -> np.ndarray:
+def _converted(values: np.ndarray, spec: Reading, units: str, source: Source, where: Place) -> np.ndarray:
     """variable · scale + offset, unwrapped where asked, in SI."""
-    said = spec.get("units", units)
+    said = spec.units or units
     if said not in TO_SI or TO_SI[said][0] != units:
         fitting = [name for name, (si, _) in TO_SI.items() if si == units]
         where.fail(f"has units {said!r}; it must be one of {listed(fitting)}, after `scale` and `offset`")
-    unwrap = spec.get("unwrap", False)
-    if unwrap is not False and unwrap is not True:
-        period = where.numbers(spec, "unwrap", ())
-        if not period > 0.0:
-            where.fail(f"has unwrap = {unwrap!r}; write true, or the positive period of the variable")
-        values = _unwrapped(values, float(period))
-    scale = spec.get("scale", 1.0)
-    scale = (
-        single(source, scale, where / "scale")
-        if isinstance(scale, str)
-        else where.numbers({"scale": scale}, "scale", ())
-    )
-    offset = where.numbers({"offset": spec.get("offset", 0.0)}, "offset", ())
-    si = (values * scale + offset) * TO_SI[said][1]
+    unwrap = spec.unwrap if isinstance(spec, Column) else False
+    if not isinstance(unwrap, bool):
+        values = _unwrapped(values, unwrap)
+    scale = single(source, spec.scale, where / "scale") if isinstance(spec.scale, str) else spec.scale
+    si = (values * scale + spec.offset) * TO_SI[said][1]
     if unwrap is True:
         if units != "rad":
             where.fail("is no angle, so a whole turn means nothing; write unwrap = the period of the variable")
@@ -395,19 +353,19 @@ def _unwrapped(values: np.ndarray, period: float) -> np.ndarray:
     return out
 
 
-def _stated(variable: Variable, spec: Mapping[str, Any], units: str, report: Report, where: Where) -> None:
+def _stated(variable: Variable, spec: Column, units: str, report: Report, where: Place) -> None:
     """Does the file state other units than the mapping?"""
-    stated, said = known(variable.units), spec.get("units", units)
-    if stated and said in TO_SI and stated != said and "scale" not in spec and TO_SI[stated] != TO_SI[said]:
+    stated, said = known(variable.units), spec.units or units
+    if stated and said in TO_SI and stated != said and spec.scale == 1.0 and TO_SI[stated] != TO_SI[said]:
         report.warning(
             where.key, f"the recording states {variable.units}, and the mapping reads {said}; correct one of them"
         )
 
 
-def find(name: Any, paths: Mapping[Path, Any], where: Where) -> Path:
+def find(name: str, paths: Mapping[Path, Any], where: Place) -> Path:
     """The given recording that `file` names: by the last parts of its path, as many as it takes."""
-    if not isinstance(name, str) or not name:
-        where.fail(f"has file = {name!r}; it must be the name of a recording")
+    if not name:
+        where.fail("has a `file` without a name; write that of a recording")
     parts = Path(name).parts
     found = [path for path in paths if path.parts[-len(parts) :] == parts]
     if not found:

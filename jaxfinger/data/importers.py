@@ -19,13 +19,13 @@ from jaxfinger.data.columns import Columns, Source, find, trial_clock
 from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.finger_file import finger_from
 from jaxfinger.data.hdf5 import write_session
-from jaxfinger.data.mapping import MappingFile, Where
+from jaxfinger.data.mapping import Channels, MappedTrial, MappingFile, read_mapping, terms
 from jaxfinger.data.parse import RANGES, in_order, listed
 from jaxfinger.data.recording import Recording
 from jaxfinger.data.schema import CHANNELS, TEMPERATURE, Entry, units_of
 from jaxfinger.data.session import FingerDescription, Session, Trial
 from jaxfinger.data.sources import load_recording
-from jaxfinger.data.toml import read_toml
+from jaxfinger.data.toml import Place
 
 
 def import_file(
@@ -52,23 +52,20 @@ def import_session(
 ) -> Session:
     """The session that a mapping makes of recordings, in memory; refused where the checker finds an error."""
     report = Report() if report is None else report
-    path = Path(mapping_path)
-    document = read_toml(path, "name a mapping file")
-    said, mapping = document.read(MappingFile), document.content
-    where = Where(str(path), document.place.lines)
-    finger = finger_from(said.finger, where / "finger")
+    mapping, where = read_mapping(Path(mapping_path))
+    finger = finger_from(mapping.finger, where / "finger")
     recordings = _Recordings(sources, mapping, where, report)
-    trials = {}
-    for name, table in where.table(mapping, "trials").items():
-        place = where / f"trials.{name}"
-        trials[name] = _trial(name, table, mapping.get("channels", {}), recordings, finger, place, report)
+    trials = {
+        name: _trial(name, trial, mapping.channels, recordings, finger, where / "trials" / name, report)
+        for name, trial in mapping.trials.items()
+    }
     recordings.unread()
     session = Session(
-        specimen=where.text(mapping, "specimen"),
+        specimen=mapping.specimen,
         finger=finger,
         trials=in_order(trials),
-        source=mapping.get("source", f"imported from {', '.join(sorted({p.name for p in recordings.paths}))}"),
-        created=said.created_text or datetime.now(UTC).isoformat(timespec="seconds"),
+        source=mapping.source or f"imported from {', '.join(sorted({p.name for p in recordings.paths}))}",
+        created=mapping.created_text or datetime.now(UTC).isoformat(timespec="seconds"),
     )
     check_session(session, report)
     check_spikes(session, report)
@@ -80,22 +77,20 @@ def import_session(
 class _Recordings:
     """The given files, each read once and when it is first needed."""
 
-    def __init__(self, sources: Sequence[str | os.PathLike], mapping: Mapping[str, Any], where: Where, report: Report):
+    def __init__(self, sources: Sequence[str | os.PathLike], mapping: MappingFile, where: Place, report: Report):
         self.paths = list({Path(source).resolve(): Path(source) for source in sources}.values())
         if not self.paths:
             where.fail("no recording was given; name at least one")
-        self._constants = where.table(mapping, "constants") if "constants" in mapping else {}
-        self._derived = where.table(mapping, "derived") if "derived" in mapping else {}
+        self._constants, self._derived = mapping.constants, mapping.derived
         self._report = report
         self._loaded: dict[Path, Recording] = {}
         self._sources: dict[tuple[Path, str], Source] = {}
 
-    def source(self, name: Any, derived: Mapping[str, Any], where: Where) -> Source:
+    def source(self, name: str | None, derived: Mapping[str, str], where: Place) -> Source:
         """The recording called `name`, or the only one, with what the mapping and the trial derive of it."""
-        only = name is None and len(self.paths) == 1
-        if name is None and not only:
+        if name is None and len(self.paths) > 1:
             where.fail(f"has no `file`; name one of {listed([str(path) for path in self.paths])}")
-        path = self.paths[0] if only else find(name, dict.fromkeys(self.paths), where)
+        path = self.paths[0] if name is None else find(name, dict.fromkeys(self.paths), where)
         if path not in self._loaded:
             self._loaded[path] = load_recording(path)
             for remark in self._loaded[path].remarks:
@@ -112,7 +107,7 @@ class _Recordings:
                 self._report.warning(str(path), "is read by no trial; name it as `file` of one, or leave it out")
 
 
-def _where_of(fault: Finding, where: Where) -> Where:
+def _where_of(fault: Finding, where: Place) -> Place:
     """The key of a mapping that a place in the session comes from."""
     _, room, *names = fault.place.split("/")
     for key in (
@@ -124,46 +119,41 @@ def _where_of(fault: Finding, where: Where) -> Where:
 
 def _trial(
     name: str,
-    table: Mapping[str, Any],
-    shared: Mapping[str, Any],
+    trial: MappedTrial,
+    shared: Channels,
     recordings: _Recordings,
     finger: FingerDescription,
-    where: Where,
+    where: Place,
     report: Report,
 ) -> Trial:
-    own = where.table(table, "channels") if "channels" in table else {}
-    channels = {**shared, **own}
-    derived = where.table(table, "derived") if "derived" in table else {}
-    source = recordings.source(table.get("file"), derived, where)
+    channels = trial.channels.over(shared).said()
+    source = recordings.source(trial.file, trial.derived, where)
     if "q" not in channels:
         where.fail("maps no channel `q`; name the joint positions")
-    first = next(iter((where / "channels").table(channels, "q").values()), None)
-    if first is None:
-        (where / "channels.q").fail("maps no joint; name at least one")
-    clock = trial_clock(table, first[0] if isinstance(first, list) and first else first, source, where, report)
-    columns = Columns(clock, lambda file, place: recordings.source(file, derived, place), report)
-    values: dict[str, np.ndarray] = {
-        channel: _channel(channel, spec, columns, finger, where / f"channels.{channel}")
-        for channel, spec in channels.items()
-    }
-    temperatures = tuple((where / "channels").table(channels, "temperature")) if "temperature" in channels else ()
+    clock = trial_clock(trial, terms(next(iter(channels["q"].values())))[0], source, where, report)
+    columns = Columns(clock, lambda file, place: recordings.source(file, trial.derived, place), report)
+    own = trial.channels.said()
+    places = {c: (where if c in own else Place(where.file, where.lines)) / "channels" / c for c in channels}
+    values = {channel: _channel(channel, said, columns, finger, places[channel]) for channel, said in channels.items()}
     keep = columns.covered
     if keep.sum() == 0:
         where.fail("holds no sample at which all of its clocks run; name clocks that count from the same start")
     time = clock.time[keep]
     whole = {channel for channel in values if _entry(channel).kind != "float"}
     arrays: dict[str, Any] = {
-        channel: _labels(channel, x[keep], where / f"channels.{channel}") if channel in whole else x[keep]
+        channel: _labels(channel, x[keep], places[channel]) if channel in whole else x[keep]
         for channel, x in values.items()
     }
-    attributes: dict[str, Any] = {key: table.get(key) for key in ("joint", "tendon", "motion", "session_start")}
     return Trial(
         name=name,
-        experiment=where.text(table, "experiment"),
+        experiment=trial.experiment,
         time=time - time[0],
-        complete=table.get("complete", True),
-        temperature_names=temperatures,
-        **attributes,
+        joint=trial.joint,
+        tendon=trial.tendon,
+        complete=trial.complete,
+        motion=trial.motion,
+        session_start=trial.session_start,
+        temperature_names=tuple(channels.get("temperature", ())),
         **arrays,
     )
 
@@ -172,15 +162,13 @@ def _entry(channel: str) -> Entry:
     return TEMPERATURE if channel == "temperature" else CHANNELS[channel]
 
 
-def _channel(channel: str, spec: Any, columns: Columns, finger: FingerDescription, where: Where) -> np.ndarray:
+def _channel(channel: str, spec: Any, columns: Columns, finger: FingerDescription, where: Place) -> np.ndarray:
     """One channel (N, columns): those that are named, the others NaN (directions 0)."""
     entry = _entry(channel)
     units = units_of(entry, finger.prismatic) or "1"
     if channel == "hold":
         return columns.column(spec, units, True, where)
     axis, whole = entry.shape[1], entry.kind != "float"
-    if not isinstance(spec, Mapping):
-        where.fail("must be a table with a column for each joint, tendon or axis")
     names = {"m": finger.joint_names, "n": finger.tendon_names, "c": tuple(spec)}.get(str(axis), ("x", "y", "z"))
     values = np.full((len(columns.clock.time), len(names)), 0.0 if whole else np.nan)
     for name, column in spec.items():
@@ -192,7 +180,7 @@ def _channel(channel: str, spec: Any, columns: Columns, finger: FingerDescriptio
     return values
 
 
-def _labels(channel: str, values: np.ndarray, where: Where) -> np.ndarray:
+def _labels(channel: str, values: np.ndarray, where: Place) -> np.ndarray:
     """Directions and holds as the whole numbers that they must be: never wrapped or cut to fit."""
     kind = CHANNELS[channel].kind
     lowest, highest, allowed = RANGES[kind]

@@ -14,7 +14,7 @@ tendon_force.T1 = { from = "u", scale = 12.5, offset = -0.3, units = "N" }
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from datetime import date, datetime
 from pathlib import Path
@@ -24,7 +24,7 @@ import numpy as np
 
 from jaxfinger.data.finger_file import Finger
 from jaxfinger.data.session import EXPERIMENTS
-from jaxfinger.data.toml import Fault, OneOf, Place, Positive, Within, read_toml
+from jaxfinger.data.toml import Fault, NotEmpty, OneOf, Place, Positive, Within, read_toml
 
 _Place = Annotated[int, Within(0)] | str  # of a column: from 0, or its name
 
@@ -43,8 +43,8 @@ class _Numbers:
 
 
 @dataclass(frozen=True)
-class Clock:
-    """A variable that holds times: (variable · scale + offset) in `units`."""
+class Reading:
+    """A variable of a recording: (variable · scale + offset) in `units`."""
 
     from_: str
     column: _Place | None = None
@@ -54,16 +54,22 @@ class Clock:
 
 
 @dataclass(frozen=True)
-class Column(Clock):
-    """A variable of a recording: (variable · scale + offset) in `units`."""
+class Column(Reading):
+    """A variable that is a column of a channel, or one of those whose sum is."""
 
-    time: str | Clock | None = None  # the variable's own clock
+    time: str | Reading | None = None  # the variable's own clock
     file: str | None = None  # where it is not the trial's
     unwrap: bool | Positive = False  # true: of whole turns; else the period of the variable
 
 
-Said = str | Column | tuple[str | Column, ...]  # of a list, the sum
+Said = str | Column | Annotated[tuple[str | Column, ...], NotEmpty()]  # of a list, the sum
 Columns = Mapping[str, Said]
+
+
+def terms(said: Said) -> tuple[Column, ...]:
+    """The variables whose sum a column is."""
+    each = said if isinstance(said, tuple) else (said,)
+    return tuple(Column(term) if isinstance(term, str) else term for term in each)
 
 
 @dataclass(frozen=True)
@@ -101,7 +107,7 @@ class MappedTrial:
     complete: bool = True
     motion: str | None = None
     session_start: float | None = None  # s
-    time: str | Clock | None = None
+    time: str | Reading | None = None
     rate_hz: Positive | None = None
     span: tuple[float, float] | None = None  # s from the recording's start
     where: str | None = None  # a condition on the recording's rows
@@ -154,52 +160,3 @@ def read_mapping(path: str | Path) -> tuple[MappingFile, Place]:
     """
     document = read_toml(path, "name a mapping file")
     return document.read(MappingFile), document.place
-
-
-ROOT_KEYS, TRIAL_KEYS, CLOCK_KEYS, COLUMN_KEYS = (
-    tuple(f.name.rstrip("_") for f in fields(kind)) for kind in (MappingFile, MappedTrial, Clock, Column)
-)
-
-
-class Where(Place):
-    """A place of a mapping, with what reads plain tables."""
-
-    def __truediv__(self, key: str | int) -> Where:
-        room, dot, rest = str(key).partition(".")
-        parts = (room, rest) if dot and room in ("trials", "channels", "derived") else (key,)
-        return Where(self.file, self.lines, (*self.keys, *parts))
-
-    def known(self, table: Any, keys: Collection[str]) -> None:
-        """Refuse keys that nobody reads."""
-        if not isinstance(table, Mapping):
-            self.fail("must be a table")
-        for key in table:
-            if key not in keys:
-                self.fail(f"has the unknown key {key!r}; it may have {', '.join(keys)}")
-
-    def need(self, table: Mapping[str, Any], key: str) -> Any:
-        """The value of a key."""
-        if key not in table:
-            self.fail(f"has no `{key}`; write it")
-        return table[key]
-
-    def text(self, table: Mapping[str, Any], key: str) -> str:
-        """The string of a key."""
-        value = self.need(table, key)
-        if not isinstance(value, str):
-            self.fail(f"has {key} = {value!r}; it must be a string")
-        return value
-
-    def table(self, table: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-        """The table of a key."""
-        value = self.need(table, key)
-        if not isinstance(value, Mapping):
-            self.fail(f"has a `{key}` that is no table; write it as one")
-        return value
-
-    def numbers(self, table: Mapping[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:
-        """The numbers of a key."""
-        try:
-            return np.asarray(self.need(table, key), np.float64).reshape(shape)
-        except (TypeError, ValueError):
-            self.fail(f"has a `{key}` that is not {'×'.join(map(str, shape)) or 'one'} numbers; correct it")
