@@ -63,7 +63,8 @@ def render(d: Diagnosis, trace: Trace | None = None, arms: Sequence[Markup] = ()
     template = Environment(loader=PackageLoader("jaxfinger.report", "."), autoescape=True).get_template("page.html.j2")
     prismatic = d.nominal.model.finger.prismatic
     named = set(d.named).union(*d.ambiguous_sets)
-    rest = [c for c in d.candidates if c.key not in named and c.probability >= WORTH_A_LINE]
+    judged = d.candidates if d.status is not Status.NOT_JUDGED else ()
+    rest = [c for c in judged if c.key not in named and c.probability >= WORTH_A_LINE]
     return template.render(
         d=d,
         css=css(),
@@ -84,6 +85,7 @@ def render(d: Diagnosis, trace: Trace | None = None, arms: Sequence[Markup] = ()
         lines=[_line(x) for x in d.closures],
         runaways=[sentences.sentence(sentences.diverged(x)) for x in d.closures if x.diverged],
         left=[_left(x) for x in d.left[:5]] if d.status in (Status.PARTLY, Status.UNEXPLAINED) else [],
+        unlisted=sentences.unlisted(d) if d.status in (Status.PARTLY, Status.UNEXPLAINED) else "",
         proposal=sentences.proposal(d),
         next=sentences.next_trial(d.next_experiment) if d.next_experiment else "",
         not_judged=[sentences.reason(x) for x in d.not_judged],

@@ -279,6 +279,11 @@ def _lies(d: Diagnosis) -> str:
     return f" {joined(parts)}" if parts else ""
 
 
+def unlisted(d: Diagnosis) -> str:
+    """How probable it is that a cause is at work which nobody has listed."""
+    return f"Something that the catalogue lacks is at work with a probability of {percent(d.unlisted)}."
+
+
 def proposal(d: Diagnosis) -> str | None:
     """A closed form of what is left, and that nobody has proven it."""
     p = d.unexplained.proposal

@@ -33,13 +33,24 @@ def test_axes_are_taken_and_returned(name):
     assert min(sizes) >= LOOK["font.size"]
 
 
-@pytest.mark.parametrize("bar", [*BARS, replace(BARS[0], by_cause=(), unexplained=1.0), replace(BARS[0], gap=0.0)])
+@pytest.mark.parametrize(
+    "bar",
+    [
+        *BARS,
+        replace(BARS[0], by_cause=(), unexplained=0.9),
+        replace(BARS[1], by_cause=(0.9,)),
+        replace(BARS[0], gap=0.0),
+    ],
+)
 def test_a_bar_is_whole(bar):
     noise, causes, together, left = segments(bar)
     assert noise + sum(causes) + together + left == pytest.approx(1.0)
     assert min([noise, together, left, *causes]) >= 0.0
     assert noise == pytest.approx(bar.noise**2 / (bar.noise**2 + bar.gap**2))
-    assert left == pytest.approx(bar.unexplained * (1 - noise))
+    if bar.by_cause:
+        assert left == pytest.approx(bar.unexplained * (1 - noise))
+    if len(bar.by_cause) < 2:
+        assert together == 0.0
 
 
 def test_a_bar_keeps_the_proportion_of_its_causes():

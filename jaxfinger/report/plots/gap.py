@@ -50,8 +50,10 @@ def segments(x: ChannelBudget) -> tuple[float, list[float], float, float]:
     room = 1.0 - left
     over = max(sum(causes) / room, 1.0) if room > 0 else math.inf
     causes = [(s / over) * (1.0 - noise) for s in causes]
-    together = max(room * (1.0 - noise) - sum(causes), 0.0)
-    return noise, causes, together, left * (1.0 - noise)
+    together, left = max(room * (1.0 - noise) - sum(causes), 0.0), left * (1.0 - noise)
+    if len(causes) < 2:  # nothing to close with others
+        causes, left, together = [c + together for c in causes], left + together * (not causes), 0.0
+    return noise, causes, together, left
 
 
 def budget_size(d: Diagnosis, width: float) -> tuple[float, float]:
