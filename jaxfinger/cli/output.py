@@ -88,10 +88,12 @@ def remark(findings: Iterable[Finding], file: Path) -> None:
 def read(path: Path) -> Session:
     """The session in a file, once what the checker warns of is said."""
     from jaxfinger.data import read_session
+    from jaxfinger.data.check import examine
     from jaxfinger.data.findings import Report
 
     report = Report()
     session = read_session(path, report=report)
+    examine(session, report)
     remark(report, path)
     return session
 

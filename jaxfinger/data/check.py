@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxfinger.data.check_finger import check_finger
 from jaxfinger.data.check_trial import check_trial
+from jaxfinger.data.check_work import check_work
 from jaxfinger.data.filtering import longest_spike, outlier_mask
 from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.opening import plain_reason, why_closed
@@ -27,7 +28,7 @@ def check_file(path: str | os.PathLike) -> list[Finding]:
     """All that is wrong with a file; empty where it is as the format wants it. Never raises for what is in the file."""
     session, report = inspect(path)
     if session is not None:
-        check_spikes(session, report)
+        examine(session, report)
     return list(report)
 
 
@@ -121,6 +122,14 @@ def _check_created(created: str, report: Report) -> None:
         zoned = False
     if not zoned:
         report.warning("/", f"has `created` {created!r}; write ISO 8601 with time zone, as 2026-01-31T12:00:00+00:00")
+
+
+def examine(session: Session, report: Report) -> None:
+    """Report what takes a look at every sample: spikes, and channels that contradict each other."""
+    with np.errstate(all="ignore"):
+        check_spikes(session, report)
+        if report.fatal is None:
+            check_work(session, report)
 
 
 def check_spikes(session: Session, report: Report) -> None:

@@ -13,6 +13,7 @@ STILL_JOINT = 0.01  # rad: five times the noise of a 14-bit encoder
 STILL_AXIS = 1e-4  # m
 OUTSIDE = 0.35  # rad beyond its limits that a joint is allowed to read
 SLACK = 0.5  # N: below it a tendon may be slack, and its excursion NaN
+_TAUT = ("ID.2", "VD.1", "VD.3")  # experiments through which tendons are held at some tension
 _FEW = 20  # samples, fewer than which show no usual step
 _MOVES_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic")
 _STEPPED = ("ID.3-static", "ID.4", "VD.2")
@@ -27,6 +28,7 @@ def check_trial(trial: Trial, finger: FingerDescription, report: Report) -> None
             _holes(trial, name, finger, report)
     _present(trial, finger, report)
     _motion(trial, finger, report)
+    _dead(trial, finger, report)
     _jumps(trial, finger, report)
     _sizes(trial, finger, report)
     _holds(trial, report)
@@ -216,6 +218,35 @@ def _motion(trial: Trial, finger: FingerDescription, report: Report) -> None:
     if trial.experiment in NEEDS_TENDON and _span(_pulled(trial, finger)) < SLACK:
         message = f"tendon {trial.tendon} is never pulled; check the attribute `tendon`"
         report.warning(_place(trial, "tendon_force"), message)
+
+
+def _dead(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Does what the experiment measures vary at all? A sensor has noise; a channel without any is not connected."""
+    if len(trial.time) < _FEW:
+        return
+    moved = _index(finger.joint_names, trial.joint)
+    crossing = finger.active & (finger.crosses[:, moved] if moved is not None else finger.crosses.any(axis=1))
+    looked_at = {
+        "joint_torque": np.ones(finger.m, bool) if moved is None else np.arange(finger.m) == moved,
+        "tendon_excursion": crossing if trial.experiment != "ID.4" else np.zeros(finger.n, bool),
+        "fingertip_force": np.ones(3, bool),
+        "tendon_force": finger.active if trial.experiment in _TAUT else np.zeros(finger.n, bool),
+    }
+    for name, columns in looked_at.items():
+        values = getattr(trial, name)
+        if values is None:
+            continue
+        still = columns & (np.ptp(values, axis=0) == 0.0)  # NaN is not still
+        if name == "tendon_force":
+            still &= values[0] == 0.0
+        if name == "fingertip_force" and not still[columns].all():
+            continue  # the planar finger presses along one axis
+        for k in np.flatnonzero(still):
+            report.warning(
+                _place(trial, name),
+                f"column {_columns(finger, name)[k]} is {values[0, k]:.4g} at every sample, as no sensor is; check its "
+                "cable and its column, or leave it out",
+            )
 
 
 def _jumps(trial: Trial, finger: FingerDescription, report: Report) -> None:

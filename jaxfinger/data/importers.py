@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxfinger.data.check import check_session, check_spikes
+from jaxfinger.data.check import check_session, examine
 from jaxfinger.data.columns import Columns, Source, find, trial_clock
 from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.finger_file import finger_from
@@ -68,7 +68,7 @@ def import_session(
         created=mapping.created_text or datetime.now(UTC).isoformat(timespec="seconds"),
     )
     check_session(session, report)
-    check_spikes(session, report)
+    examine(session, report)
     if report.fatal is not None:
         _where_of(report.fatal, where).fail(report.fatal.message)
     return session

@@ -140,6 +140,7 @@ def band(ax: Axes, x, y, std, colour: str, label: str | None = None, **line) -> 
     """A curve with its 95 % interval; without where that is unknown."""
     std = np.where(np.isfinite(std), std, np.nan)
     ax.plot(x, y, color=colour, label=label, **line)
+    std = np.where(np.isfinite(std), std, np.nan)  # no band where nothing is known
     ax.fill_between(x, y - 1.96 * std, y + 1.96 * std, color=colour, alpha=0.22, linewidth=0)
 
 

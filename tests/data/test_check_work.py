@@ -1,0 +1,61 @@
+"""Channels that contradict each other are said, and a sound session has no contradiction."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.bad_input import mistakes, said
+from jaxfinger.data import Trial
+
+FRICTION = 0.004  # N m
+
+
+@pytest.fixture(scope="module")
+def sound(session):
+    """With friction in the joint that moves, so that its cycles take work."""
+    trial = session["03-ID.3-dynamic-MCP"]
+    way = np.sign(np.gradient(trial.q[:, 0]))
+    torque = trial.joint_torque + FRICTION * way[:, None]
+    return replace(session, trials={**session.trials, trial.name: replace(trial, joint_torque=torque)})
+
+
+def test_a_sound_session_has_no_contradiction(sound):
+    assert not any("contradict" in text or "work" in text or "excursions along" in text for text in said(sound))
+
+
+@pytest.mark.parametrize(
+    ("experiment", "channel", "change", "words"),
+    [
+        ("ID.4", "joint_torque", lambda x: -x, "T1 at MCP (8 against -5 mm); check the sign"),
+        ("ID.2", "tendon_excursion", lambda x: -x, "T1 at MCP (-8 against 5 mm); check the sign"),
+        ("ID.4", "joint_torque", lambda x: 10 * x, "T1 at MCP (8 against 50 mm); check the units"),
+        ("ID.4", "tendon_force", lambda x: 9.81 * x, "check the units or the column"),
+        ("VD.1", "tendon_excursion", lambda x: -x, "not those that ID.2 shows"),
+        ("ID.3-dynamic", "joint_torque", lambda x: -x, "takes work out of the joint in every cycle: MCP"),
+        ("ID.2", "tendon_excursion", lambda x: 1e-3 * x, "moment arms of 0.0"),
+        ("ID.3-dynamic", "joint_torque", lambda x: 0 * x, "is 0 at every sample, as no sensor is"),
+        ("ID.2", "tendon_excursion", lambda x: 0 * x, "is 0 at every sample, as no sensor is"),
+        ("VD.2", "fingertip_force", lambda x: 1e3 * x, "the fingertip presses with"),
+    ],
+)
+def test_what_contradicts_is_said(sound, experiment, channel, change, words):
+    def wrong(trial: Trial) -> Trial:
+        values = getattr(trial, channel)
+        return trial if trial.experiment != experiment else replace(trial, **{channel: change(values)})
+
+    found = said(replace(sound, trials={t.name: wrong(t) for t in sound})) - said(sound)
+    assert any(words in text for text in found), found
+
+
+def test_most_mistakes_of_a_mapping_are_said(sound):
+    """Made in every trial alike, as a mapping makes them."""
+    before = said(sound)
+    silent = [
+        name
+        for name, mistake in mistakes(sound)
+        if said(replace(sound, trials={t.name: mistake(t) for t in sound})) <= before
+    ]
+    assert len(silent) <= 16, (
+        silent
+    )  # the small session has one ID.4 trial, and no VD.3 with excursions of a third joint
