@@ -18,7 +18,7 @@ DRAWN = {
     "residuals": lambda ax: plots.residuals(trace(), ax),
     "intervals": lambda ax: plots.intervals(fits()[1], None, fits()[0], ax),
     "correlation": lambda ax: plots.correlation(fits()[1], 8, ax),
-    "influence": lambda ax: plots.influence(np.array([[1.0, -0.5], [0.0, 2.0]]), ["a", "b"], ["p", "q"], ax),
+    "influence": lambda ax: plots.influence(np.array([[1.0, -0.5], [0.0, 2.0]]), ["a", "b"], ["p", "q"], ax=ax),
 }
 
 
@@ -79,6 +79,18 @@ def test_correlated_neighbours_are_shown():
     ax = plots.correlation(fits()[0], 6)
     assert len(ax.get_yticklabels()) == 6
     assert sum(len(c.get_offsets()) for c in ax.collections) >= 5
+
+
+def test_of_many_influences_the_largest_are_shown():
+    shifts = np.zeros((30, 40))
+    shifts[7, 3], shifts[21, 33] = 2.0, -1.0
+    names = [[f"{letter}{k}" for k in range(n)] for letter, n in (("t", 30), ("p", 40))]
+    ax = plots.influence(shifts, *names, most=2)
+    assert [t.get_text() for t in ax.get_yticklabels()] == ["t7", "t21"]
+    assert [t.get_text() for t in ax.get_xticklabels()] == ["p3", "p33"]
+    up, down = (c.get_sizes()[0] for c in ax.collections)
+    assert up == pytest.approx(2.0 * down)
+    assert [t.get_text() for t in ax.get_legend().get_texts()] == ["up 2 σ", "down 2 σ"]
 
 
 def test_measured_in_points_and_the_model_as_lines():

@@ -104,22 +104,28 @@ def correlation(fit: Fit, most: int = 16, ax: Axes | None = None) -> Axes:
 
 @look()
 def influence(
-    values: Float[np.ndarray, "rows columns"],
+    shifts: Float[np.ndarray, "rows columns"],
     rows: Sequence[str],
     columns: Sequence[str],
+    most: int = 16,
     ax: Axes | None = None,
 ) -> Axes:
     """What holds each parameter where it is: a square's area is how far a row moves a column, its colour the way.
 
     Args:
-        values: shift of every parameter in its standard deviations, one row a trial, channel or CAD value.
-        rows: names of what holds.
+        shifts: of every parameter in its standard deviations, one row a trial, a sensor or a value of CAD.
+        rows: their names.
         columns: names of the parameters.
+        most: at most so many rows and columns, those with the largest shifts.
         ax: the axes to draw on; new ones without.
     """
-    ax = axes_or_new(ax, 1.8 + 0.2 * len(columns), 1.4 + 0.2 * len(rows))
-    largest = float(np.abs(values).max(initial=0.0)) or 1.0
-    _squares(ax, np.asarray(values) / largest, rows, columns, f"up {largest:.2g} σ", f"down {largest:.2g} σ")
+    shifts = np.asarray(shifts)
+    sizes = np.abs(shifts)
+    i, j = (np.sort(np.argsort(-sizes.max(axis=k, initial=0.0), kind="stable")[:most]) for k in (1, 0))
+    rows, columns, shifts = [rows[k] for k in i], [columns[k] for k in j], shifts[np.ix_(i, j)]
+    ax = axes_or_new(ax, 2.2 + 0.22 * len(columns), 2.0 + 0.22 * len(rows))
+    largest = float(np.abs(shifts).max(initial=0.0)) or 1.0
+    _squares(ax, shifts / largest, rows, columns, f"up {largest:.2g} σ", f"down {largest:.2g} σ")
     ax.tick_params(axis="x", labelrotation=90)
     return ax
 
