@@ -2,7 +2,6 @@
 
 from jaxfinger.data.check import check_file as check_file
 from jaxfinger.data.filtering import bridged as bridged
-from jaxfinger.data.filtering import decimate as decimate
 from jaxfinger.data.filtering import longest_spike as longest_spike
 from jaxfinger.data.filtering import low_pass as low_pass
 from jaxfinger.data.filtering import outlier_mask as outlier_mask
@@ -15,12 +14,9 @@ from jaxfinger.data.hdf5 import data_hash as data_hash
 from jaxfinger.data.hdf5 import read_session as read_session
 from jaxfinger.data.hdf5 import write_session as write_session
 from jaxfinger.data.importers import import_file as import_file
-from jaxfinger.data.motion import TENSION_TRAVEL as TENSION_TRAVEL
-from jaxfinger.data.motion import decimate_trial as decimate_trial
 from jaxfinger.data.motion import directions as directions
 from jaxfinger.data.motion import find_holds as find_holds
-from jaxfinger.data.motion import joint_directions as joint_directions
-from jaxfinger.data.motion import tendon_directions as tendon_directions
+from jaxfinger.data.motion import turned_on_time as turned_on_time
 from jaxfinger.data.predictions import Predictions as Predictions
 from jaxfinger.data.predictions import read_predictions as read_predictions
 from jaxfinger.data.predictions import write_predictions as write_predictions
@@ -28,3 +24,4 @@ from jaxfinger.data.session import EXPERIMENTS as EXPERIMENTS
 from jaxfinger.data.session import FingerDescription as FingerDescription
 from jaxfinger.data.session import Session as Session
 from jaxfinger.data.session import Trial as Trial
+from jaxfinger.data.session import joints_of as joints_of

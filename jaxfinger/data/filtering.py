@@ -22,6 +22,7 @@ from jaxfinger.errors import UserError
 _JUMP = 12.0  # times their mean: the largest second difference that noise makes, with room
 _EVEN = 1e-3  # intervals this equal (relative) need no resampling
 _PASSES = 4  # spikes that are found, and those that they hid
+_AT_END = 10  # samples that tell how fast a motion starts or ends
 _SMALL = 1e-4  # of a column's travel: what lies beyond its surroundings by less is no spike
 
 
@@ -122,35 +123,6 @@ def _odd(degree: int) -> int:
     return degree if degree % 2 else degree - 1
 
 
-def blocks(time: Float[np.ndarray, " N"], rate_hz: float, hold: np.ndarray | None = None) -> np.ndarray:
-    """Index of the first sample of each block of 1/rate_hz; a new hold (or the end of one) starts a new block."""
-    number = np.floor((time - time[0]) * rate_hz + 1e-6).astype(np.int64)
-    starts = np.diff(number, prepend=-1) != 0
-    if hold is not None:
-        starts |= np.diff(hold, prepend=hold[0]) != 0
-    return np.flatnonzero(starts)
-
-
-def decimate(
-    time: Float[np.ndarray, " N"], x: Float[np.ndarray, N * k], rate_hz: float, hold: np.ndarray | None = None
-) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, K * k]]:
-    """Block means of time and x at about `rate_hz`: unbiased, without ringing, and neighbours share no sample.
-
-    NaN columns stay NaN. With `hold` (N,), the index of the static holds, no block mixes samples of two of them.
-    """
-    starts = blocks(time, rate_hz, hold)
-    return block_mean(time, starts), block_mean(x, starts)
-
-
-def block_mean(x: Float[np.ndarray, N * k], starts: np.ndarray) -> Float[np.ndarray, K * k]:
-    """Means over the blocks that begin at `starts`, along the first axis."""
-    if len(starts) == len(x):
-        return np.array(x, np.float64)
-    sizes = np.diff(starts, append=len(x))
-    sums = np.add.reduceat(np.asarray(x, np.float64), starts, axis=0)
-    return sums / sizes.reshape(-1, *(1,) * (sums.ndim - 1))
-
-
 def outlier_mask(x: Float[np.ndarray, N * k], threshold: float = 8.0, longest: int = 5) -> Bool[np.ndarray, N * k]:
     """True where a sample is a spike: no motion that is seen before and after it leads there.
 
@@ -218,6 +190,8 @@ def _beyond(values: Float[np.ndarray, " N"], least: float, longest: int) -> Bool
     """Where samples lie by more than `least` beyond all that their surroundings allow."""
     ends = np.median(values[:5]), np.median(values[-5:])
     x = np.concatenate([[ends[0]] * 2, values, [ends[1]] * 2])
+    # At an end one side tells less: there a spike is what lies beyond five of the steps that follow it.
+    reach = [5.0 * np.abs(np.diff(part)).max() for part in (values[2:_AT_END], values[-_AT_END:-2])]
     spikes = np.zeros(len(x), bool)
     bend = np.abs(np.diff(x, 2)) > least  # at the sample before a spike's first, and after its last
     first, last = np.flatnonzero(bend[:-2]) + 2, np.zeros(len(x), bool)
@@ -231,6 +205,8 @@ def _beyond(values: Float[np.ndarray, " N"], least: float, longest: int) -> Bool
         allowed = np.stack([*np.broadcast_arrays(*lines, x[a - 1], x[z])])
         inside = a + i
         out = (x[inside] > allowed.max(axis=0) + least) | (x[inside] < allowed.min(axis=0) - least)
+        for near, end, steps in zip((a < 4, z > len(x) - 5), ends, reach, strict=True):
+            out &= ~near | (np.abs(x[inside] - end) > least + steps)
         out &= out[0] & out[-1]
         spikes[inside[out]] = True
     return spikes[2:-2]

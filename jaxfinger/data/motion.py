@@ -2,97 +2,47 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxfinger.data.filtering import block_mean, blocks, low_pass, smooth
-from jaxfinger.data.schema import MEASURED
+from jaxfinger.data.filtering import smooth
 from jaxfinger.data.session import Trial
 
-CUTOFF_HZ = 10.0  # faster than any commanded motion of the protocol, slower than most of the sensors' noise
 HOLD_CUTOFF_HZ = 5.0
-JOINT_TRAVEL = 0.004  # rad: ten steps of a 14-bit encoder
-TENDON_TRAVEL = 1e-4  # m: that travel and more on a moment arm of 7 mm, several times the noise
-TENSION_TRAVEL = 0.3  # N: ten times the noise of a tension sensor, a third of the protocol's smallest step
 STILL = 0.1  # of the fastest motion of the trial
 SHORTEST_HOLD = 0.2  # s
-_HELD = ("ID.4", "VD.2")  # experiments in which a fixture holds the joints
 
 
-def directions(
-    time: Float[np.ndarray, " N"], x: Float[np.ndarray, "N k"], cutoff_hz: float, threshold: float
-) -> Int[np.ndarray, "N k"]:
-    """−1, 0, +1: which way each column of the filtered x travels.
+def directions(rate: Float[np.ndarray, "N k"], still: Float[np.ndarray, " k"]) -> Float[np.ndarray, "N k"]:
+    """−1, 0, 1: the sign of each rate where it is more than `still`, and in between the last one.
 
-    A reversal counts once x has come back by more than `threshold` (units of x); less is noise, and a stop keeps the
-    last direction. Travel and not speed decides, because a slow sweep is no faster than a still sensor's noise.
-    Before the first motion, and in columns that are NaN, the direction is 0.
+    Before the first motion the direction is not known, and 0.
     """
-    filtered = low_pass(time, x, cutoff_hz)
-    return np.stack([_zigzag(column, threshold) for column in filtered.T], axis=1)
+    moves = np.abs(rate) > still
+    known = np.maximum.accumulate(np.where(moves, np.arange(len(rate))[:, None], -1), axis=0)
+    return np.where(known < 0, 0.0, np.sign(np.take_along_axis(rate, np.maximum(known, 0), axis=0)))
 
 
-def _zigzag(x: Float[np.ndarray, " N"], threshold: float) -> Int[np.ndarray, " N"]:
-    sign = np.zeros(len(x), np.int8)
-    good = np.flatnonzero(np.isfinite(x))
-    if len(good) < 2:
-        return sign
-    sign[good] = _zigzag_finite(x[good], threshold)
-    return sign
+def turned_on_time(
+    sure: Float[np.ndarray, "N k"], x: Float[np.ndarray, "N k"], way: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "N k"]:
+    """Directions that are sure, from the turning points of x on: there the old one gives way to the new.
 
-
-def _zigzag_finite(x: Float[np.ndarray, " N"], threshold: float) -> Int[np.ndarray, " N"]:
-    slope = np.sign(np.diff(x))
-    turns = np.flatnonzero(slope[1:] != slope[:-1]) + 1  # only the extrema can start a new direction
-    sign = np.zeros(len(x), np.int8)
-    direction, low, high, begin = 0, 0, 0, 0
-    for i in (*turns.tolist(), len(x) - 1):
-        low, high = (i if x[i] < x[low] else low), (i if x[i] > x[high] else high)
-        rises, falls = x[i] - x[low] > threshold, x[high] - x[i] > threshold
-        if (rises and direction <= 0) or (falls and direction >= 0):
-            turned, now = (low, 1) if rises and direction <= 0 else (high, -1)
-            # Through a stop the last direction holds: the new one begins where x leaves the turning point for good.
-            near = np.abs(x[turned : i + 1] - x[turned]) <= 0.5 * threshold
-            start = turned + int(np.flatnonzero(near)[-1])
-            sign[begin:start] = direction
-            direction, begin, low, high = now, start, i, i
-    sign[begin:] = direction
-    return sign
-
-
-def joint_directions(
-    trial: Trial, cutoff_hz: float = CUTOFF_HZ, threshold: float = JOINT_TRAVEL
-) -> Int[np.ndarray, "N m"]:
-    """Direction of each joint's motion: the file's channel, or derived (`threshold` in the units of q).
-
-    Where a fixture holds the joints (ID.4, VD.2) it is 0.
+    It does so over the first `way` back for good, as straight as x goes: what lies at rest against one another gives
+    before it slides, and no encoder tells by how much less than its own noise.
     """
-    if trial.joint_direction is not None:
-        return trial.joint_direction
-    if trial.experiment in _HELD:
-        return np.zeros(trial.q.shape, np.int8)
-    return directions(trial.time, trial.q, fitting_cutoff(trial.time, cutoff_hz), threshold)
-
-
-def tendon_directions(
-    trial: Trial, cutoff_hz: float = CUTOFF_HZ, threshold: float | None = None
-) -> Int[np.ndarray, "N n"] | None:
-    """Direction of each tendon's motion: the file's channel, or derived; None where nothing was measured.
-
-    It is read off the excursion (`threshold` in m). Where the joints are held the excursion hardly moves, and the
-    tension tells which way the motor went (`threshold` in N).
-    """
-    if trial.tendon_direction is not None:
-        return trial.tendon_direction
-    held = trial.experiment in _HELD
-    x = trial.tendon_force if held else trial.tendon_excursion
-    if x is None:
-        return None
-    if threshold is None:
-        threshold = TENSION_TRAVEL if held else TENDON_TRAVEL
-    return directions(trial.time, x, fitting_cutoff(trial.time, cutoff_hz), threshold)
+    out = sure.copy()
+    for direction, column, least in zip(out.T, x.T, way, strict=True):
+        turns = np.flatnonzero((np.diff(direction) != 0) & (direction[:-1] != 0)) + 1
+        for last, turn in pairwise([0, *turns]):
+            new = direction[turn]
+            began = last + int(np.argmin(new * column[last : turn + 1]))
+            back = np.minimum.accumulate(new * (column[began:turn] - column[began])[::-1])[::-1]
+            share = np.minimum(back / least, 1.0) if least > 0.0 else back > 0.0
+            direction[began:turn] = new * (2.0 * share - 1.0)
+    return out
 
 
 def find_holds(trial: Trial, cutoff_hz: float = HOLD_CUTOFF_HZ) -> Int[np.ndarray, " N"]:
@@ -135,13 +85,3 @@ def fitting_cutoff(time: Float[np.ndarray, " N"], cutoff_hz: float) -> float:
     if len(time) < 3:
         return cutoff_hz
     return min(cutoff_hz, 0.25 / float(np.median(np.diff(time))))
-
-
-def decimate_trial(trial: Trial, rate_hz: float) -> Trial:
-    """The trial in block means at about `rate_hz`. No block mixes two holds; directions are its first sample's."""
-    starts = blocks(trial.time, rate_hz, trial.hold)
-    channels = {name: getattr(trial, name) for name in (*MEASURED, "temperature")}
-    means = {name: block_mean(x, starts) for name, x in channels.items() if x is not None}
-    labels = {name: getattr(trial, name) for name in ("joint_direction", "tendon_direction", "hold")}
-    firsts = {name: x[starts] for name, x in labels.items() if x is not None}
-    return replace(trial, time=block_mean(trial.time, starts), **means, **firsts)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+_MOVED = 0.1  # of the way of the joint that moves most: another that goes less far is held
 EXPERIMENTS = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4", "VD.1", "VD.2", "VD.3")
 
 
@@ -137,3 +138,13 @@ class Session:
     def with_trials(self, names) -> Session:
         """The session with only the named trials."""
         return replace(self, trials={name: self.trials[name] for name in names})
+
+
+def joints_of(trial: Trial, finger: FingerDescription) -> tuple[str, ...]:
+    """The joints that a trial of ID.2, ID.3 or ID.4 moves or instruments; none of VD.1, VD.2 and VD.3."""
+    if not trial.experiment.startswith("ID."):
+        return ()
+    if trial.joint is not None or trial.experiment != "ID.2" or not len(trial.time):
+        return trial.motorised(finger)
+    span = np.ptp(np.nan_to_num(trial.q), axis=0)
+    return tuple(name for name, s in zip(finger.joint_names, span, strict=True) if s > _MOVED * span.max())

@@ -1,7 +1,7 @@
 """The only place that joins data to model: which trials an experiment takes, and what it predicts from what."""
 
 from jaxfinger.experiments.predict import demean, predict
-from jaxfinger.experiments.prepare import Batch, Stack, prepare
+from jaxfinger.experiments.prepare import Batch, NotJudged, Stack, not_judged, prepare
 from jaxfinger.experiments.shapes import SAMPLES, TRIALS, blocks, padded, roomy, split
 from jaxfinger.experiments.shows import shows
 from jaxfinger.experiments.table import EXPERIMENTS, Experiment
@@ -12,9 +12,11 @@ __all__ = [
     "TRIALS",
     "Batch",
     "Experiment",
+    "NotJudged",
     "Stack",
     "blocks",
     "demean",
+    "not_judged",
     "padded",
     "predict",
     "prepare",

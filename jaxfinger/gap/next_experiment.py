@@ -21,7 +21,6 @@ from jaxtyping import Float
 
 from jaxfinger.data.schema import units_where
 from jaxfinger.experiments import EXPERIMENTS, Batch, Stack, shows
-from jaxfinger.experiments.table import SLACK
 from jaxfinger.gap.problem import Problem, imagined
 from jaxfinger.gap.refine import Refined, derivatives, information, nominal_step
 from jaxfinger.gap.signatures import Signatures
@@ -129,7 +128,8 @@ def _borrowed(problem: Problem, name: str, like: Stack) -> Stack:
             mask[c] *= jnp.asarray((np.asarray(x.tension).max(axis=-1) > 0)[..., None])
         y[c] = jnp.zeros_like(mask[c])
     x = replace(x, motorised=jnp.asarray(motor), held=spec.held)
-    return Stack(spec, Batch(x, y, mask), like.trials, like.motions, like.holds, like.dt)
+    measured = dict.fromkeys(spec.channels, True)
+    return Stack(spec, Batch(x, y, mask), like.trials, like.motions, like.holds, like.dt, measured)
 
 
 def _at(stack: Stack, finger: Finger, share: float | None) -> Stack:
@@ -148,9 +148,10 @@ def _harder(stack: Stack) -> Stack:
         return stack
     if spec.slack:
         speed = float(np.percentile(np.abs(np.asarray(x.qd)).max(axis=0), 99))
-        return stack if spec.samples == "holds" else _at_speed(stack, max(1.0, FASTEST / max(speed, 1e-3)))
+        return stack if spec.rests else _at_speed(stack, max(1.0, FASTEST / max(speed, 1e-3)))
     f = np.asarray(x.tension)
-    top = np.maximum(f.max(axis=(0, -1), keepdims=True), SLACK)
+    top = f.max(axis=(0, -1), keepdims=True)
+    top = np.where(top > 0.0, top, HIGHEST)
     f = f * np.clip(HIGHEST / top, 1.0, np.inf if spec.held else LOOSE)
     falls = f[..., -1].max(axis=0) < 0.5 * f.max(axis=(0, -1))
     if not spec.held or falls.all():
@@ -165,7 +166,7 @@ def _harder(stack: Stack) -> Stack:
 def _slower(stack: Stack) -> Stack:
     """Where joints move and the speed is free."""
     spec = stack.experiment
-    return stack if spec.samples == "holds" or spec.name == "VD.3" else _at_speed(stack, SLOWER)
+    return stack if spec.rests or spec.name == "VD.3" else _at_speed(stack, SLOWER)
 
 
 def _at_speed(stack: Stack, times: float) -> Stack:
@@ -209,7 +210,7 @@ def _description(problem: Problem, stack: Stack, b: int, evidence: float) -> str
         parts.append(f"in steps to {f.max():.0f} N{back}")
     elif not spec.slack:
         parts.append(f"tension up to {f.max():.0f} N")
-    if spec.samples != "holds":
+    if not spec.rests:
         speed = np.percentile(np.abs(np.asarray(x.qd)[:, b]).max(axis=0), 99)
         parts.append(f"up to {speed:.2g} {units_where('rad/s', finger.prismatic)}")
     often = int(np.ceil(SETTLES / evidence))

@@ -92,7 +92,7 @@ def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B 
     mask = np.asarray(batch.mask[channel]) > 0
     demean = channel == "tendon_excursion"
     series, source = _repeats(stack, residual, mask, demean), "repeats"
-    if stack.experiment.samples == "holds":
+    if stack.experiment.rests:
         holds = _within_holds(stack, residual, mask)
         source = "repeats and holds" if _enough(series) else "holds"
         series = [a + b for a, b in zip(series, holds, strict=True)]

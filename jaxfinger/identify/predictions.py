@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
-from jaxfinger.data import Session, Trial, low_pass
+from jaxfinger.data import Session, Trial, joints_of, low_pass
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import SAMPLES, Stack, padded, predict, prepare, roomy
 from jaxfinger.identify.fit import Fit
@@ -93,7 +93,7 @@ def _only_measurable(channels: dict[str, np.ndarray], trial: Trial, session: Ses
         if trial.joint_torque is not None and np.isfinite(trial.joint_torque).any():
             measured = np.isfinite(trial.joint_torque).any(axis=0)
         else:
-            measured = np.array([name == trial.joint for name in finger.joint_names])
+            measured = np.array([name in joints_of(trial, finger) for name in finger.joint_names])
         channels["joint_torque"][:, ~measured] = np.nan
     return channels
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.data import Session
+from jaxfinger.data import Session, joints_of
 from jaxfinger.experiments import Stack, prepare
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible
@@ -229,8 +229,8 @@ def estimate_with_noise(
 def touched_by(reads, session: Session) -> tuple[set[str], set[tuple[str, str]], set[str]]:
     """Joints instrumented or moved, (tendon, joint) pairs recorded together, tendons pulled, by the trials read."""
     trials = [t for t in session if t.experiment in reads and len(t.time) > 1]
-    joints = {t.joint for t in trials if t.joint}
-    moved = {(k, t.joint) for t in trials if t.joint for k in session.finger.tendon_names}
+    joints = {joint for t in trials for joint in joints_of(t, session.finger)}
+    moved = {(k, joint) for joint in joints for k in session.finger.tendon_names}
     return joints, moved, {t.tendon for t in trials if t.tendon}
 
 

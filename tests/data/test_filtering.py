@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter1d
 
-from jaxfinger.data.filtering import decimate, longest_spike, outlier_mask, shrink, smooth, without_spikes
+from jaxfinger.data.filtering import longest_spike, outlier_mask, shrink, smooth, without_spikes
 from jaxfinger.errors import UserError
 from jaxfinger.synthetic import motions
 
@@ -80,35 +80,6 @@ def test_short_recordings_give_finite_derivatives(count):
     for x in smooth(time, np.cos(time)[:, None], 20.0):
         assert x.shape == (count, 1)
         assert np.isfinite(x).all()
-
-
-def test_decimation_is_the_mean_of_blocks():
-    time = np.arange(1000) / 1000
-    x = np.random.default_rng(0).standard_normal((1000, 2))
-    slow, mean = decimate(time, x, 100.0)
-    np.testing.assert_allclose(mean, x.reshape(100, 10, 2).mean(axis=1), rtol=1e-12, atol=1e-15)
-    np.testing.assert_allclose(slow, time.reshape(100, 10).mean(axis=1))
-
-
-def test_decimation_does_not_mix_holds_and_keeps_nan_columns():
-    time = np.arange(1000) / 1000
-    hold = np.where(time < 0.333, 0, np.where(time < 0.5, -1, 1))
-    x = np.column_stack([hold.astype(float), np.full(1000, np.nan)])
-    _, mean = decimate(time, x, 50.0, hold)
-    assert set(np.unique(mean[:, 0])) == {-1.0, 0.0, 1.0}
-    assert np.isnan(mean[:, 1]).all()
-
-
-@given(rate=st.floats(1.0, 5000.0), seed=st.integers(0, 9))
-@settings(max_examples=30, deadline=None)
-def test_decimation_keeps_the_weighted_mean(rate, seed):
-    time = jittered(500, 1000, seed)
-    x = np.random.default_rng(seed).standard_normal(500)
-    slow, mean = decimate(time, x, rate)
-    number = np.floor((time - time[0]) * rate + 1e-6)
-    sizes = np.unique(number, return_counts=True)[1]
-    assert np.all(np.diff(slow) > 0)
-    assert np.sum(mean * sizes) == pytest.approx(x.sum(), abs=1e-9)
 
 
 def test_spikes_are_found_and_motion_is_not():

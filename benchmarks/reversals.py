@@ -1,0 +1,57 @@
+"""How far `predict` misses the torque of swept joints (ID.3-dynamic) near their reversals, and elsewhere.
+
+    python benchmarks/reversals.py FOLDER [FOLDER ...]
+
+Each folder holds `fit.h5`, from which the model is identified, and `fresh.h5`, whose trials are predicted. A reversal
+is where the joint's angle, in a slow filter, turns back.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from jaxfinger.data import Session, Trial, read_session, smooth
+from jaxfinger.identify import Fit, identify
+from jaxfinger.identify.predictions import predict_session
+
+NEAR = 0.06  # s from a reversal
+SLOW = 5.0  # Hz, of the filter in which a joint's speed crosses zero once
+
+
+def turning_times(trial: Trial, joint: int) -> np.ndarray:
+    """Instants, s, at which a joint that moves turns back."""
+    rate = smooth(trial.time, trial.q[:, joint], SLOW)[1]
+    turns = np.flatnonzero(np.diff(np.sign(rate)) != 0)
+    slope = np.abs(rate[np.minimum(turns + 50, len(rate) - 1)])
+    return trial.time[turns[slope > 0.02 * np.abs(rate).max()]]
+
+
+def errors(fit: Fit, session: Session) -> tuple[np.ndarray, np.ndarray]:
+    """Measured less predicted torque, N mm: near reversals, and elsewhere."""
+    names = [t.name for t in session if t.experiment == "ID.3-dynamic"]
+    near, far = [], []
+    for name, channels in predict_session(fit, session, names).items():
+        trial = session[name]
+        joint = session.finger.joint_names.index(trial.joint or "")
+        assert trial.joint_torque is not None
+        error = 1e3 * (trial.joint_torque - channels["joint_torque"])[:, joint]
+        beside = np.abs(trial.time[:, None] - turning_times(trial, joint)).min(axis=1) < NEAR
+        near.append(error[beside])
+        far.append(error[~beside])
+    return np.concatenate(near), np.concatenate(far)
+
+
+def main() -> None:
+    """One line a folder."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folders", nargs="+", type=Path)
+    print(f"{'':24s} rms error, N mm: within {1e3 * NEAR:.0f} ms of a reversal, elsewhere")
+    for folder in parser.parse_args().folders:
+        fit = identify(read_session(folder / "fit.h5"))
+        near, far = (np.sqrt(np.mean(e**2)) for e in errors(fit, read_session(folder / "fresh.h5")))
+        print(f"{folder.name:24s} {near:6.2f} {far:6.2f}")
+
+
+if __name__ == "__main__":
+    main()

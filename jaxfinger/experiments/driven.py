@@ -1,0 +1,151 @@
+"""Joints that a motor or tendons drive (ID.3-dynamic, VD.3): torque counts where they slide, so that friction is known.
+
+Both sides of (1) go through one low-pass before a fit; a prediction of every sample does without.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import minimum_filter1d
+
+from jaxfinger.data import directions, low_pass, shrink, smooth, turned_on_time, width, without_spikes
+from jaxfinger.experiments.recording import Joints, Recording, Row, joints, row
+
+NOTHING = "nowhere do a joint and its tendons slide for long enough that the direction of their friction is known"
+
+# Speeds are compared with their own noise: the median of what a slow filter loses of a quicker one's, mostly noise.
+STILL = 6.0  # times the noise: a slower joint keeps the direction that it had
+BOUNDS = 1e-3, 0.1  # of the motion's speed: at least, beside a filter's tails, and at most, in a slow trial
+FREE = 0.05  # of the motion's speed: a slower joint that tendons drive may stick and slip, its friction unknown
+DRIVEN = 3.0  # times the noise, or FREE if that is less: likewise a joint that a motor moves, which does not stick
+TENDON = 2.5  # times the noise: likewise a tendon
+LOST = 0.5  # of a joint's speed: what the slower filter may lose of it; stick and slip lose 1 to 3 times it
+ABOVE_NOISE = 15.0  # times the noise: what it loses must be more to be a slip
+ROUNDING = 1e-6  # of the motion's speed: what it loses of a joint that stands still in a simulated file
+CLEAR = 2.3  # widths of the filter kept clear on either side of where friction is not known: 1 % of a jump is left
+BREAKAWAY = 4.5  # widths kept clear after a joint that no motor moves has broken away: it does so at once
+ENCODER = 2.2  # times the median loss: 1.5 standard deviations of the encoder, the way over which friction turns
+CALM = 0.1  # s: over which q̈ is averaged where it does not rise above its noise
+
+
+def reduce(r: Recording) -> Row:
+    """What slides counts for torque, everything for excursion."""
+    j = joints(r, sharp=not r.reduced)
+    # When a joint turns back shows best in the slower filter: there noise of q̇ is noise in time.
+    slow = j.qd if r.reduced else smooth(r.trial.time, r.trial.q, r.spec.cutoff_at(r.step))[1]
+    joint = joint_directions(r, j, slow)
+    rates = None if r.spec.slack else tendon_rates(r)
+    tendon = tendon_directions(r, rates)
+    slides = sliding(r, j.qd, slow, joint, rates, CLEAR * width(r.spec.cutoff))
+
+    qdd, tension, y = j.qdd, r.tension(), r.y
+    if r.reduced or r.spec.slack:
+        # Noise of q̈ would tell a fit of less inertia (errors in variables), and a prediction that stands beside a
+        # measured torque of one that is not there: where q̈ does not rise above it, its mean takes its place.
+        qdd = shrink(qdd, round(CALM / r.step))
+    if r.reduced:
+        # q̈ is low-passed, so all else is too.
+        joint, tendon, tension = (low_pass(r.trial.time, a, j.cutoff) for a in (joint, tendon, tension))
+        y = {c: low_pass(r.trial.time, values, j.cutoff) for c, values in y.items()}
+    known = r.mean(slides.astype(float)) > 1.0 - 1e-9
+    counting = {c: known if c == "joint_torque" else np.ones((len(known), 1), bool) for c in y}
+    return row(
+        r,
+        r.mean(j.q),
+        (j.qd, qdd),
+        r.taut(r.mean(tension)),
+        counting,
+        j.noise,
+        directions=(joint, tendon),
+        blur=width(j.cutoff),
+        y=y,
+    )
+
+
+def still(r: Recording, rate: Float[np.ndarray, "N m"]) -> Float[np.ndarray, " m"]:
+    """rad/s: a joint that is slower keeps the direction that it had."""
+    quick = smooth(r.trial.time, r.trial.q, r.quick)[1]
+    pace = np.percentile(np.abs(rate), 95, axis=0)
+    return np.clip(STILL * noise_of(rate, quick), *(share * pace for share in BOUNDS))
+
+
+def noise_of(slow: Float[np.ndarray, "N k"], quick: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"]:
+    """Of a speed: the median of what the slower filter loses of it."""
+    return np.median(np.abs(quick - slow), axis=0)
+
+
+def joint_directions(r: Recording, j: Joints, slow: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
+    """The protocol's directions, else those of the filtered motion: for a fit they turn where a motion back is sure
+    (samples beside do not count), for a prediction where it began.
+    """
+    if r.trial.joint_direction is not None:
+        return r.trial.joint_direction.astype(float)
+    sure = directions(slow, still(r, slow))
+    return sure if r.reduced else turned_on_time(sure, j.q, ENCODER * j.noise)
+
+
+def tendon_rates(r: Recording) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]] | None:
+    """Tendon speeds, m/s, in a slow filter and in a quicker one; none where excursions were not measured."""
+    if r.trial.tendon_excursion is None:
+        return None
+    excursion = without_spikes(np.nan_to_num(r.trial.tendon_excursion))
+    cutoff = min(r.spec.cutoff / 2.0, 0.2 / r.step)
+    slow, quick = (smooth(r.trial.time, excursion, c)[1] for c in (cutoff, r.quicker(cutoff)))
+    return slow, quick
+
+
+def tendon_directions(r: Recording, rates) -> Float[np.ndarray, "N n"]:
+    """The protocol's, else those of the measured excursions; 0 of tendons that are slack."""
+    if r.spec.slack:
+        return np.zeros((len(r.trial.time), r.finger.n))
+    if r.trial.tendon_direction is not None:
+        return r.trial.tendon_direction.astype(float)
+    if rates is None:
+        return np.zeros((len(r.trial.time), r.finger.n))
+    slow, quick = rates
+    least = np.minimum(0.1 * TENDON * noise_of(slow, quick), 0.1 * np.percentile(np.abs(slow), 95, axis=0))
+    return directions(slow, least)
+
+
+def sliding(
+    r: Recording,
+    qd: Float[np.ndarray, "N m"],
+    slow: Float[np.ndarray, "N m"],
+    direction: Float[np.ndarray, "N m"],
+    rates: tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]] | None,
+    clear: float,
+) -> Bool[np.ndarray, "N m"]:
+    """Where a joint and every taut tendon across it slide, so that the directions of friction are known.
+
+    `slow`: speeds in the slower filter; `rates`: of the tendons, none where all are slack or not measured; `clear`: s,
+    kept clear on either side of where they are not.
+    """
+    quick = smooth(r.trial.time, r.trial.q, r.quick)[1]
+    lost, fast = np.abs(quick - slow), np.percentile(np.abs(qd), 95, axis=0)
+    noise = np.median(lost, axis=0)
+    least = np.where(r.motorised, np.minimum(DRIVEN * noise, FREE * fast), FREE * fast)
+    slides = (np.abs(qd) > least) & (np.sign(qd) == np.sign(direction))
+    slides[1:] &= np.sign(qd[1:]) == np.sign(qd[:-1])  # a quick reversal has no slow sample
+    if rates is not None and r.trial.tendon_force is not None:
+        known = _friction_known(r, *rates)
+        for i in range(r.finger.m):
+            slides[:, i] &= known[:, r.finger.crosses[:, i] & r.finger.active].all(axis=1)
+    if not r.spec.stepped:
+        # A slip between two stops is too fast for the filter, and moves every joint.
+        pace = np.percentile(np.abs(slow), 95, axis=0)
+        most = np.maximum(LOST * pace, ABOVE_NOISE * noise) + ROUNDING * pace.max(initial=0.0)
+        slides &= np.all(lost <= most, axis=1)[:, None]
+    # The filter spreads the jump of friction at a reversal, and friction before it slides is not known.
+    apart = minimum_filter1d(slides, 2 * round(clear / r.step) + 1, axis=0)
+    # Reaches back only: a free joint that breaks away does so at once, and takes the others with it.
+    half = round(0.5 * BREAKAWAY * width(r.spec.cutoff) / r.step)
+    return np.where(r.motorised, apart, minimum_filter1d(apart, 2 * half + 1, axis=0, origin=half))
+
+
+def _friction_known(r: Recording, slow, quick) -> Bool[np.ndarray, "N n"]:
+    """Where a tendon is slack, or slides for certain: faster than it stretches, and in a quicker filter too."""
+    tension, cutoff = r.tension(), min(r.spec.cutoff / 2.0, 0.2 / r.step)
+    stretches = r.scales.compliance * np.abs(smooth(r.trial.time, tension, cutoff)[1])
+    measured = np.isfinite(np.asarray(r.trial.tendon_excursion)).all(axis=0)
+    least = TENDON * noise_of(slow, quick)
+    moves = (np.abs(slow) > least + stretches) & (np.sign(slow) * quick > 0.5 * least)
+    return (tension <= r.scales.slack) | (moves & measured)

@@ -1,0 +1,23 @@
+"""Joints along a path, by a hand or a motor (ID.2, VD.1): the tendons' excursions follow their angles."""
+
+import numpy as np
+
+from jaxfinger.data import directions
+from jaxfinger.experiments.driven import still
+from jaxfinger.experiments.recording import Recording, Row, joints, row
+
+NOTHING = "no sample is measured"
+
+
+def reduce(r: Recording) -> Row:
+    """Every sample counts where it is measured."""
+    j = joints(r, sharp=not r.reduced)
+    # Averaged over the same blocks as what it predicts, and not filtered where that is not.
+    q = r.mean(r.trial.q if r.reduced else j.q)
+    joint = r.trial.joint_direction
+    joint = directions(j.qd, still(r, j.qd)) if joint is None else joint.astype(float)
+    tension = r.taut(r.mean(r.tension()))
+    everywhere = {c: np.ones((len(q), 1), bool) for c in r.y}
+    return row(
+        r, q, (j.qd, j.qdd), tension, everywhere, j.noise, directions=(joint, np.zeros((len(joint), r.finger.n)))
+    )
