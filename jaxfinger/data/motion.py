@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -36,12 +34,13 @@ def turned_on_time(
     out = sure.copy()
     for direction, column, least in zip(out.T, x.T, way, strict=True):
         turns = np.flatnonzero((np.diff(direction) != 0) & (direction[:-1] != 0)) + 1
-        for last, turn in pairwise([0, *turns]):
+        for last, turn, end in zip([0, *turns[:-1]], turns, [*turns[1:], len(direction)], strict=True):
             new = direction[turn]
             began = last + int(np.argmin(new * column[last : turn + 1]))
-            back = np.minimum.accumulate(new * (column[began:turn] - column[began])[::-1])[::-1]
+            stroke = new * (column[began : turn + int(np.argmax(new * column[turn:end])) + 1] - column[began])
+            back = np.minimum.accumulate(stroke[::-1])[::-1]
             share = np.minimum(back / least, 1.0) if least > 0.0 else back > 0.0
-            direction[began:turn] = new * (2.0 * share - 1.0)
+            direction[began : began + len(share)] = new * (2.0 * share - 1.0)
     return out
 
 
