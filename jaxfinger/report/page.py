@@ -16,7 +16,7 @@ from jaxfinger.data.schema import channel_units, units_where
 from jaxfinger.gap.result import Absorbed, Candidate, Cause, Closure, Diagnosis, Key, Left, Place, Status, Value
 from jaxfinger.report import plots, sentences
 from jaxfinger.report.causes import words
-from jaxfinger.report.curves import curves
+from jaxfinger.report.curves import Curves, curves
 from jaxfinger.report.measured import arm_points
 from jaxfinger.report.numbers import HALF_95, alike, measured, percent, percent_range, quantity, unbroken
 from jaxfinger.report.plots import gap as gap_plots
@@ -46,19 +46,19 @@ def write_page(d: Diagnosis, path: str | Path, overwrite: bool = False) -> None:
         UserError: the file exists and `overwrite` is false, or its folder cannot be written.
     """
     some = d.status is not Status.NOT_JUDGED
-    html = render(d, worst_trial(d) if some else None, _arms(d) if some and not d.quick else ())
+    html = render(d, worst_trial(d) if some else None, _curves(d) if some and not d.quick else None)
     with atomic_path(path, overwrite) as part:
         part.write_text(html, encoding="utf-8")
 
 
 @look()
-def render(d: Diagnosis, trace: Trace | None = None, arms: Sequence[Markup] = ()) -> str:
+def render(d: Diagnosis, trace: Trace | None = None, found: Curves | None = None) -> str:
     """The page as text.
 
     Args:
         d: the diagnosis.
         trace: the trial to show, measured beside predicted.
-        arms: further pictures of the model.
+        found: the model's curves, whose moment arms are shown.
     """
     template = Environment(loader=PackageLoader("jaxfinger.report", "."), autoescape=True).get_template("page.html.j2")
     prismatic = d.nominal.model.finger.prismatic
@@ -90,7 +90,7 @@ def render(d: Diagnosis, trace: Trace | None = None, arms: Sequence[Markup] = ()
         next=sentences.next_trial(d.next_experiment) if d.next_experiment else "",
         not_judged=[sentences.reason(x) for x in d.not_judged],
         parameters=_parameters(d),
-        arms=arms,
+        arms=_arms(found) if found else [],
         absorbed=_absorbed(d.absorbed),
         hides=any(x.hidden for x in d.absorbed),
         gap=d.status is not Status.NO_GAP,
@@ -167,11 +167,16 @@ def _parameters(d: Diagnosis) -> list[Markup]:
     return out
 
 
-def _arms(d: Diagnosis) -> list[Markup]:
-    """One panel a joint."""
+def _curves(d: Diagnosis) -> Curves:
+    """Of the model with its causes, with the slopes of the measured excursions."""
     found = curves(d.augmented)
-    if "ID.2" in d.problem.stacks:
-        found = replace(found, arm_points=arm_points(d.problem.session, d.problem.stacks["ID.2"]))
+    if "ID.2" not in d.problem.stacks:
+        return found
+    return replace(found, arm_points=arm_points(d.problem.session, d.problem.stacks["ID.2"]))
+
+
+def _arms(found: Curves) -> list[Markup]:
+    """One panel a joint."""
     joints = list(dict.fromkeys(j for _, j in found.moment_arm))
     return [
         _picture(lambda ax, j=j: plots.moment_arms(found, j, ax), f"arms-{k}", f"moment arms about {j}", NARROW, 2.9)

@@ -7,7 +7,7 @@ from playwright.sync_api import sync_playwright
 
 from jaxfinger.report.page import render
 
-from .fabricated import every, trace
+from .fabricated import arms, every, trace
 
 QUIET = (
     "--no-sandbox",
@@ -37,5 +37,6 @@ def pages(tmp_path_factory):
     for name in ("partly", "ambiguous", "no_gap", "diverged", "not_judged"):
         d = every()[name]
         out[name] = folder / f"{name}.html"
-        out[name].write_text(render(d, trace() if d.channels else None), encoding="utf-8")
+        found = arms() if name == "partly" else None
+        out[name].write_text(render(d, trace() if d.channels else None, found), encoding="utf-8")
     return out

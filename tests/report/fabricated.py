@@ -30,6 +30,8 @@ from jaxfinger.gap.result import (
 )
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.parameters import describe, ravel
+from jaxfinger.report.curves import Curve, Curves
+from jaxfinger.report.measured import Points
 from jaxfinger.report.traces import Trace
 from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger
 
@@ -296,3 +298,10 @@ def trace() -> Trace:
         0.6,
         True,
     )
+
+
+def arms() -> Curves:
+    """Moment arms about one joint that four tendons cross."""
+    q = np.linspace(0.0, 90.0, 20)
+    lines = {(f"T{k}", "MCP"): Curve(q, k + 0.05 * q, np.full(20, 0.2)) for k in range(1, 5)}
+    return Curves(lines, {}, {}, {key: Points(c.x[::5], c.y[::5] + 0.1) for key, c in lines.items()})

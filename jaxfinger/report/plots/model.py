@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from jaxfinger.identify import Fit
 from jaxfinger.report.curves import Curves, JointCurves, curves
 from jaxfinger.report.measured import Points
-from jaxfinger.report.theme import COLOURS, INK, MUTED, axes_or_new, band, colour, legend_below, line, look
+from jaxfinger.report.theme import COLOURS, INK, MUTED, across, axes_or_new, band, colour, legend_below, line, look
 
 
 def _curves(of: Fit | Curves) -> Curves:
@@ -49,7 +49,7 @@ def moment_arms(of: Fit | Curves, joint: str, ax: Axes | None = None) -> Axes:
     slides = joint in found.joints and found.joints[joint].prismatic
     ax.set(title=joint, xlabel="position (mm)" if slides else "joint angle (°)")
     ax.set_ylabel("moment arm" if slides else "moment arm (mm)")
-    legend_below(ax, 5)
+    legend_below(ax, 3 if across(ax) < 3 else 5)
     return ax
 
 
@@ -88,5 +88,5 @@ def tendon_friction(of: Fit | Curves, ax: Axes | None = None) -> Axes:
     if found.loss_points:
         _measured(ax)
     ax.set(xlabel="tension at the actuator (N)", ylabel="tension lost (N)", xlim=(0, None), ylim=(0, None))
-    legend_below(ax, 5)
+    legend_below(ax, 3 if across(ax) < 3 else 5)
     return ax
