@@ -15,9 +15,9 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from jaxfinger.data.filtering import low_pass
+from jaxfinger.data.filtering import low_pass, smooth
 from jaxfinger.data.findings import Report
-from jaxfinger.data.motion import CUTOFF_HZ, fitting_cutoff, joint_directions
+from jaxfinger.data.motion import STILL, directions, fitting_cutoff
 from jaxfinger.data.session import FingerDescription, Session, Trial
 
 _DEGREE = 3  # of l(q) over a joint's range
@@ -30,6 +30,7 @@ _APART = 3.0  # of two measurements of one excursion, without friction between t
 _TIP = (0.002, 1.0)  # N at the fingertip for each N of tension: a moment arm over a finger's length, with room
 _LONGEST_ARM = 0.4  # of the finger's length
 _SHORTEST_ARM = 0.004
+CUTOFF_HZ = 10.0  # faster than any commanded motion of the protocol, slower than most of the noise of sensors
 _TAKEN = 0.05  # of the torque's spread that a motor may seem to take out, by a delay between the channels
 
 Arms = Mapping[tuple[int, int], float]  # (tendon, joint): m
@@ -202,12 +203,20 @@ def _friction_share(trial: Trial, joint: int) -> float:
     if not (np.isfinite(q).all() and np.isfinite(torque).all() and np.ptp(torque) > 0.0):
         return np.nan
     cutoff = fitting_cutoff(trial.time, CUTOFF_HZ)
-    way = joint_directions(trial)[:, joint].astype(float)
+    way = _way(trial, joint, cutoff)
     q, torque = (low_pass(trial.time, x, cutoff)[:, 0] for x in (q, torque))
     columns = np.column_stack([way, np.polynomial.polynomial.polyvander((q - q.mean()) / np.ptp(q), 5)])[way != 0.0]
     if len(columns) < 50 or np.ptp(columns[:, 0]) == 0.0:
         return np.nan  # only ever one way: friction and elastic torque trade off
     return float(np.linalg.lstsq(columns, torque[way != 0.0])[0][0] / np.std(torque))
+
+
+def _way(trial: Trial, joint: int, cutoff: float) -> np.ndarray:
+    """(N,) direction of a joint's motion: the file's channel, or where it moves by its filtered speed."""
+    if trial.joint_direction is not None:
+        return trial.joint_direction[:, joint].astype(float)
+    rate = smooth(trial.time, trial.q[:, [joint]], cutoff)[1]
+    return directions(rate, STILL * np.percentile(np.abs(rate), 99, axis=0))[:, 0]
 
 
 def _some(found: Iterable[str], most: int = 3) -> str:

@@ -122,10 +122,10 @@ def influence(
     shifts = np.asarray(shifts)
     sizes = np.abs(shifts)
     i, j = (np.sort(np.argsort(-sizes.max(axis=k, initial=0.0), kind="stable")[:most]) for k in (1, 0))
-    rows, columns, shifts = [rows[k] for k in i], [columns[k] for k in j], shifts[np.ix_(i, j)]
-    ax = axes_or_new(ax, 2.2 + 0.22 * len(columns), 2.0 + 0.22 * len(rows))
+    names, shifts = ([rows[k] for k in i], [columns[k] for k in j]), shifts[np.ix_(i, j)]
+    ax = axes_or_new(ax, 2.2 + 0.22 * len(j), 2.0 + 0.22 * len(i))
     largest = float(np.abs(shifts).max(initial=0.0)) or 1.0
-    _squares(ax, shifts / largest, rows, columns, f"up {largest:.2g} σ", f"down {largest:.2g} σ")
+    _squares(ax, shifts / largest, *names, f"up {largest:.2g} σ", f"down {largest:.2g} σ")
     ax.tick_params(axis="x", labelrotation=90)
     return ax
 
