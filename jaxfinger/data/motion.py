@@ -8,9 +8,40 @@ from jaxtyping import Float, Int
 from jaxfinger.data.filtering import smooth
 from jaxfinger.data.session import Trial
 
+CUTOFF_HZ = 10.0  # faster than any commanded motion of the protocol, slower than most of the sensors' noise
 HOLD_CUTOFF_HZ = 5.0
+QUICK, NYQUIST = 3.0, 0.4  # times a cut-off, or of the sampling rate, above which a filter passes everything
+# A speed's noise is the median of what a slow filter loses of a quicker one's.
+SLOWEST = 6.0  # times its noise: a slower joint keeps the direction that it had
+BOUNDS = 1e-3, 0.1  # of the motion's speed: at least, beside a filter's tails, and at most, in a slow trial
 STILL = 0.1  # of the fastest motion of the trial
 SHORTEST_HOLD = 0.2  # s
+
+
+def joint_directions(trial: Trial) -> Float[np.ndarray, "N m"]:
+    """Direction of each joint's motion: the file's channel, or derived from the filtered motion."""
+    if trial.joint_direction is not None:
+        return trial.joint_direction.astype(float)
+    cutoff = fitting_cutoff(trial.time, CUTOFF_HZ)
+    step = float(np.median(np.diff(trial.time))) if len(trial.time) > 1 else 1.0
+    slow, quick = (smooth(trial.time, trial.q, c)[1] for c in (cutoff, quicker(cutoff, step)))
+    return directions(slow, still(slow, quick))
+
+
+def quicker(cutoff_hz: float, step: float) -> float:
+    """Hz, of a filter in which a slip shows that one at `cutoff_hz` spreads; `step`: s between samples."""
+    return min(QUICK * cutoff_hz, NYQUIST / step)
+
+
+def noise_of(slow: Float[np.ndarray, "N k"], quick: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"]:
+    """Of a speed: the median of what the slower filter loses of it."""
+    return np.median(np.abs(quick - slow), axis=0)
+
+
+def still(slow: Float[np.ndarray, "N k"], quick: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"]:
+    """The speed below which a joint keeps the direction that it had."""
+    pace = np.percentile(np.abs(slow), 95, axis=0)
+    return np.clip(SLOWEST * noise_of(slow, quick), *(share * pace for share in BOUNDS))
 
 
 def directions(rate: Float[np.ndarray, "N k"], still: Float[np.ndarray, " k"]) -> Float[np.ndarray, "N k"]:

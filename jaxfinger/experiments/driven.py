@@ -8,13 +8,12 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import minimum_filter1d
 
 from jaxfinger.data import directions, low_pass, shrink, smooth, turned_on_time, width, without_spikes
+from jaxfinger.data.motion import noise_of, quicker, still
 from jaxfinger.experiments.recording import Joints, Recording, Row, joints, row
 
 NOTHING = "nowhere do a joint and its tendons slide for long enough that the direction of their friction is known"
 
-# Speeds are compared with their own noise: the median of what a slow filter loses of a quicker one's, mostly noise.
-STILL = 6.0  # times the noise: a slower joint keeps the direction that it had
-BOUNDS = 1e-3, 0.1  # of the motion's speed: at least, beside a filter's tails, and at most, in a slow trial
+# Speeds are compared with their own noise (`data.motion`).
 FREE = 0.05  # of the motion's speed: a slower joint that tendons drive may stick and slip, its friction unknown
 DRIVEN = 3.0  # times the noise, or FREE if that is less: likewise a joint that a motor moves, which does not stick
 TENDON = 2.5  # times the noise: likewise a tendon
@@ -61,25 +60,13 @@ def reduce(r: Recording) -> Row:
     )
 
 
-def still(r: Recording, rate: Float[np.ndarray, "N m"]) -> Float[np.ndarray, " m"]:
-    """rad/s: a joint that is slower keeps the direction that it had."""
-    quick = smooth(r.trial.time, r.trial.q, r.quick)[1]
-    pace = np.percentile(np.abs(rate), 95, axis=0)
-    return np.clip(STILL * noise_of(rate, quick), *(share * pace for share in BOUNDS))
-
-
-def noise_of(slow: Float[np.ndarray, "N k"], quick: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"]:
-    """Of a speed: the median of what the slower filter loses of it."""
-    return np.median(np.abs(quick - slow), axis=0)
-
-
 def joint_directions(r: Recording, j: Joints, slow: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
     """The protocol's directions, else those of the filtered motion: for a fit they turn where a motion back is sure
     (samples beside do not count), for a prediction where it began.
     """
     if r.trial.joint_direction is not None:
         return r.trial.joint_direction.astype(float)
-    sure = directions(slow, still(r, slow))
+    sure = directions(slow, still(slow, r.quick_rates))
     return sure if r.reduced else turned_on_time(sure, j.q, ENCODER * j.noise)
 
 
@@ -89,7 +76,7 @@ def tendon_rates(r: Recording) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarr
         return None
     excursion = without_spikes(np.nan_to_num(r.trial.tendon_excursion))
     cutoff = min(r.spec.cutoff / 2.0, 0.2 / r.step)
-    slow, quick = (smooth(r.trial.time, excursion, c)[1] for c in (cutoff, r.quicker(cutoff)))
+    slow, quick = (smooth(r.trial.time, excursion, c)[1] for c in (cutoff, quicker(cutoff, r.step)))
     return slow, quick
 
 
@@ -119,8 +106,7 @@ def sliding(
     `slow`: speeds in the slower filter; `rates`: of the tendons, none where all are slack or not measured; `clear`: s,
     kept clear on either side of where they are not.
     """
-    quick = smooth(r.trial.time, r.trial.q, r.quick)[1]
-    lost, fast = np.abs(quick - slow), np.percentile(np.abs(qd), 95, axis=0)
+    lost, fast = np.abs(r.quick_rates - slow), np.percentile(np.abs(qd), 95, axis=0)
     noise = np.median(lost, axis=0)
     least = np.where(r.motorised, np.minimum(DRIVEN * noise, FREE * fast), FREE * fast)
     slides = (np.abs(qd) > least) & (np.sign(qd) == np.sign(direction))

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -19,11 +20,10 @@ from jaxfinger.data import (
     smooth,
     without_spikes,
 )
+from jaxfinger.data.motion import quicker
 from jaxfinger.experiments.scales import Scales
 from jaxfinger.experiments.table import Experiment
 
-QUICK = 3.0  # times the cut-off: the filter in which a slip shows that the slower one spreads
-NYQUIST = 0.4  # of the sampling rate: above it a filter passes everything
 AT_REST = 6.0  # times the median loss: an angle that turns back by less has not moved; twice that for single samples
 
 
@@ -41,14 +41,10 @@ class Recording:
     y: dict[str, Float[np.ndarray, "N columns"]]  # what is to be predicted, spikes bridged
     sound: dict[str, Bool[np.ndarray, "N columns"]]  # measured, and no spike
 
-    @property
-    def quick(self) -> float:
-        """Hz, of a filter that still sees a joint stand still between two slips."""
-        return self.quicker(self.spec.cutoff_at(self.step))
-
-    def quicker(self, cutoff: float) -> float:
-        """Hz, of a filter that is quicker than another one."""
-        return min(QUICK * cutoff, NYQUIST / self.step)
+    @cached_property
+    def quick_rates(self) -> Float[np.ndarray, "N m"]:
+        """rad/s, in a filter that still sees a joint stand still between two slips."""
+        return smooth(self.trial.time, self.trial.q, quicker(self.spec.cutoff_at(self.step), self.step))[1]
 
     @property
     def motorised(self) -> Bool[np.ndarray, " m"]:

@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfinger.data import directions, find_holds, smooth
-from jaxfinger.experiments.driven import sliding, still
+from jaxfinger.data.motion import still
+from jaxfinger.experiments.driven import sliding
 from jaxfinger.experiments.recording import Recording, Row, joints, row, stretches
 
 NOTHING = "there is no hold whose direction of approach is known, and no motion in which the joint slides"
@@ -22,7 +23,7 @@ def reduce(r: Recording) -> Row:
     if r.trial.joint_direction is not None:
         joint = r.trial.joint_direction.astype(float)
     else:
-        joint = directions(slow, still(r, slow))
+        joint = directions(slow, still(slow, r.quick_rates))
         for samples in stretches(hold):  # a filter without phase sees the next step before it starts
             joint[samples] = joint[samples[len(samples) // 2]]
     moves = (hold < 0)[:, None]  # at a hold nothing does
