@@ -38,10 +38,6 @@ def _place(trial: Trial, channel: str = "") -> str:
     return f"/trials/{trial.name}/{channel}".rstrip("/")
 
 
-def _columns(finger: FingerDescription, channel: str) -> tuple[str, ...]:
-    return {"m": finger.joint_names, "n": finger.tendon_names}.get(str(CHANNELS[channel].shape[1]), ("x", "y", "z"))
-
-
 def _named(trial: Trial, finger: FingerDescription, report: Report) -> None:
     """Do the attributes `joint` and `tendon` fit the experiment and the finger's tables?"""
     place = _place(trial)
@@ -118,7 +114,7 @@ def _holes(trial: Trial, name: str, finger: FingerDescription, report: Report) -
     bad = ~np.isfinite(values)
     if not bad.any():
         return
-    for k, column in enumerate(_columns(finger, name)):
+    for k, column in enumerate(CHANNELS[name].columns(finger)):
         count = int(bad[:, k].sum())
         if count == 0 or np.isnan(values[:, k]).all():
             continue
@@ -244,8 +240,8 @@ def _dead(trial: Trial, finger: FingerDescription, report: Report) -> None:
         for k in np.flatnonzero(still):
             report.warning(
                 _place(trial, name),
-                f"column {_columns(finger, name)[k]} is {values[0, k]:.4g} at every sample, as no sensor is; check its "
-                "cable and its column, or leave it out",
+                f"column {CHANNELS[name].columns(finger)[k]} is {values[0, k]:.4g} at every sample, as no sensor is; "
+                "check its cable and its column, or leave it out",
             )
 
 
@@ -293,7 +289,7 @@ def _sizes(trial: Trial, finger: FingerDescription, report: Report) -> None:
         values = getattr(trial, name)
         if values is None or not small:
             continue
-        for column, x in zip(_columns(finger, name), values.T, strict=True):
+        for column, x in zip(CHANNELS[name].columns(finger), values.T, strict=True):
             if np.isfinite(x).all() and np.percentile(np.abs(x), 90.0) > most:
                 size = np.percentile(np.abs(x), 90.0)
                 report.error(

@@ -22,7 +22,7 @@ from jaxfinger.data.hdf5 import write_session
 from jaxfinger.data.mapping import Channels, MappedTrial, MappingFile, read_mapping, terms
 from jaxfinger.data.parse import RANGES, in_order, listed
 from jaxfinger.data.recording import Recording
-from jaxfinger.data.schema import CHANNELS, TEMPERATURE, Entry, units_of
+from jaxfinger.data.schema import CHANNELS, TEMPERATURE, Channel, Entry, units_of
 from jaxfinger.data.session import FingerDescription, Session, Trial
 from jaxfinger.data.sources import load_recording
 from jaxfinger.data.toml import Place
@@ -168,14 +168,14 @@ def _channel(channel: str, spec: Any, columns: Columns, finger: FingerDescriptio
     units = units_of(entry, finger.prismatic) or "1"
     if channel == "hold":
         return columns.column(spec, units, True, where)
-    axis, whole = entry.shape[1], entry.kind != "float"
-    names = {"m": finger.joint_names, "n": finger.tendon_names, "c": tuple(spec)}.get(str(axis), ("x", "y", "z"))
+    whole = entry.kind != "float"
+    names = entry.columns(finger) if isinstance(entry, Channel) else tuple(spec)
     values = np.full((len(columns.clock.time), len(names)), 0.0 if whole else np.nan)
     for name, column in spec.items():
         if name not in names:
             where.fail(f"has a column {name!r}; it must be one of {listed(names)}")
         k = names.index(name)
-        here = {"rad": "m", "N m": "N"}.get(units, units) if axis == "m" and finger.prismatic[k] else units
+        here = {"rad": "m", "N m": "N"}.get(units, units) if entry.shape[1] == "m" and finger.prismatic[k] else units
         values[:, k] = columns.column(column, here, whole, where / name)
     return values
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
+
+from jaxfinger.data.session import FingerDescription
 
 FORMAT = "jaxfinger-dataset"
 VERSION = "1.1"
@@ -27,6 +30,23 @@ class Entry:
     optional: bool = False
 
 
+@dataclass(frozen=True)
+class Channel(Entry):
+    """What a trial measures: a dataset, its columns, and how people read it.
+
+    `people` is the factor from SI to the unit that people read, and that unit, of revolute joints. `free_zero`: each
+    trial sets the channel's zero anew, so that it is compared after removing one constant a trial.
+    """
+
+    people: tuple[float, str] = (1.0, "")
+    free_zero: bool = False
+
+    def columns(self, finger: FingerDescription) -> tuple[str, ...]:
+        """Names of its columns: joints, tendons, or the axes of a force."""
+        return {"m": finger.joint_names, "n": finger.tendon_names}.get(str(self.shape[1]), AXES)
+
+
+AXES = ("x", "y", "z")
 JOINTS = (
     Entry("name", ("m",), None, "text"),
     Entry("axis", ("m", 3), "1"),
@@ -55,16 +75,16 @@ FINGERTIP = Entry("fingertip", (3,), "m")
 TIME = Entry("time", ("N",), "s")
 TEMPERATURE = Entry("temperature", ("N", "c"), "K", optional=True)
 CHANNELS = {
-    entry.name: entry
-    for entry in (
-        Entry("q", ("N", "m"), "rad"),
-        Entry("tendon_force", ("N", "n"), "N", optional=True),
-        Entry("tendon_excursion", ("N", "n"), "m", optional=True),
-        Entry("joint_torque", ("N", "m"), "N m", optional=True),
-        Entry("fingertip_force", ("N", 3), "N", optional=True),
-        Entry("joint_direction", ("N", "m"), "1", "int8", optional=True),
-        Entry("tendon_direction", ("N", "n"), "1", "int8", optional=True),
-        Entry("hold", ("N",), "1", "int32", optional=True),
+    channel.name: channel
+    for channel in (
+        Channel("q", ("N", "m"), "rad", people=(180.0 / math.pi, "degrees")),
+        Channel("tendon_force", ("N", "n"), "N", optional=True, people=(1.0, "N")),
+        Channel("tendon_excursion", ("N", "n"), "m", optional=True, people=(1e3, "mm"), free_zero=True),
+        Channel("joint_torque", ("N", "m"), "N m", optional=True, people=(1e3, "N mm")),
+        Channel("fingertip_force", ("N", 3), "N", optional=True, people=(1.0, "N")),
+        Channel("joint_direction", ("N", "m"), "1", "int8", optional=True),
+        Channel("tendon_direction", ("N", "n"), "1", "int8", optional=True),
+        Channel("hold", ("N",), "1", "int32", optional=True),
     )
 }
 MEASURED = tuple(name for name, entry in CHANNELS.items() if entry.kind == "float")

@@ -15,6 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
+from jaxfinger.data.schema import CHANNELS
 from jaxfinger.experiments import Batch, blocks, predict
 from jaxfinger.identify.noise import whiten
 from jaxfinger.identify.parameters import Free
@@ -36,7 +37,7 @@ def white_rows(model: Model, batch: Batch, filters: Filters) -> tuple[dict, Floa
     """Residuals by channel, and the same white, one row a trial: unit variance where model and noise are right."""
     predicted = predict(model, batch.x, tuple(filters))
     residuals = {c: batch.y[c] - predicted[c] for c in filters}
-    white = [whiten(residuals[c], batch.mask[c], filters[c], demean=c == "tendon_excursion") for c in filters]
+    white = [whiten(residuals[c], batch.mask[c], filters[c], demean=CHANNELS[c].free_zero) for c in filters]
     return residuals, jnp.concatenate([jnp.moveaxis(w, 1, 0).reshape(w.shape[1], -1) for w in white], axis=1)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 
+from jaxfinger.data.schema import CHANNELS
 from jaxfinger.experiments import Batch, Stack
 
 ORDER = 3  # of the autoregression
@@ -90,7 +91,7 @@ def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B 
     """Noise of a channel from the residuals of a model, by the best source that the stack offers."""
     batch: Batch = stack.batch
     mask = np.asarray(batch.mask[channel]) > 0
-    demean = channel == "tendon_excursion"
+    demean = CHANNELS[channel].free_zero
     series, source = _repeats(stack, residual, mask, demean), "repeats"
     if stack.experiment.rests:
         holds = _within_holds(stack, residual, mask)

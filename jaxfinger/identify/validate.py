@@ -18,6 +18,7 @@ from jaxtyping import Float
 from scipy.signal import butter, sosfilt, sosfilt_zi
 
 from jaxfinger.data import Session, Trial, low_pass
+from jaxfinger.data.schema import CHANNELS
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Stack, predict, prepare
 from jaxfinger.identify.fit import Fit
@@ -27,12 +28,6 @@ from jaxfinger.identify.predictions import model_for, simulate_trials
 from jaxfinger.model import Model
 
 ONLINE_CUTOFF = 10.0  # Hz, of the causal filter that a controller would differentiate
-DISPLAY = {  # channel: factor and unit for people, revolute joints
-    "tendon_excursion": (1e3, "mm"),
-    "joint_torque": (1e3, "N mm"),
-    "fingertip_force": (1.0, "N"),
-    "q": (180.0 / np.pi, "degrees"),
-}
 
 
 @dataclass(frozen=True)
@@ -158,7 +153,7 @@ def _channel_scores(session: Session, stack: Stack, channel: str, residual, floo
         series = [r[np.isfinite(r)] for r in residual[k]]
         series = [r for r in series if r.size]
         if series:
-            found = _score(series, channel == "tendon_excursion")
+            found = _score(series, CHANNELS[channel].free_zero)
             scores.append(
                 _make(session, stack.experiment.name, channel, k, column, *found, (floor[0][k], floor[1]), method)
             )
@@ -192,17 +187,14 @@ def _make(session, experiment, channel, k, column, rms, mean, samples, trials, f
 
 def columns(session: Session, channel: str) -> tuple[str, ...]:
     """Names of a channel's columns."""
-    return {
-        "tendon_excursion": session.finger.tendon_names,
-        "fingertip_force": ("x", "y", "z"),
-    }.get(channel, session.finger.joint_names)
+    return CHANNELS[channel].columns(session.finger)
 
 
 def display(session: Session, channel: str, k: int) -> tuple[float, str]:
     """Factor and unit in which people read a column: mm, N mm, N and degrees; mm and N for a prismatic joint."""
     if channel in ("q", "joint_torque") and session.finger.prismatic[k]:
         return (1e3, "mm") if channel == "q" else (1.0, "N")
-    return DISPLAY[channel]
+    return CHANNELS[channel].people
 
 
 # -- VD.1: the paper's integral ---------------------------------------------------------------------------------------

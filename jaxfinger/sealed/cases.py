@@ -20,6 +20,7 @@ from jaxtyping import Bool
 
 from jaxfinger.data import Session as Recording
 from jaxfinger.data import Trial, write_session
+from jaxfinger.data.schema import CHANNELS
 
 from .closure import friction_known
 from .departures import LISTED, UNLISTED, draw
@@ -209,12 +210,7 @@ def _withheld(spec: CaseSpec, specimen: Specimen, quiet: Session, speeds: Sequen
 
 
 def _column(specimen: Specimen, label: tuple[str, str, int]) -> str:
-    names = {
-        "tendon_excursion": specimen.finger.tendon_names,
-        "joint_torque": specimen.finger.joint_names,
-        "fingertip_force": "xyz",
-    }
-    return names[label[1]][label[2]]
+    return CHANNELS[label[1]].columns(specimen.finger)[label[2]]
 
 
 def _trials(
