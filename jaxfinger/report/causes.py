@@ -13,11 +13,12 @@ CHANGED = "changed_"
 
 @dataclass(frozen=True)
 class Words:
-    """Three short texts; empty where the effect says nothing."""
+    """Short texts; empty where the effect says nothing."""
 
     happens: str
     looks: str = ""
     change: str = ""
+    form: str = ""  # the law, with the names of its parameters
 
 
 def words(effect: str, d: Diagnosis) -> Words:
@@ -35,7 +36,7 @@ def words(effect: str, d: Diagnosis) -> Words:
         return Words("")
     cls = known[effect]
     happens, looks, change = (getattr(cls, name, "") for name in ("HAPPENS", "LOOKS", "CHANGE"))
-    return Words(happens or first_sentence(cls), looks, change)
+    return Words(happens, looks, change, first_sentence(cls))
 
 
 def first_sentence(cls: type) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader
@@ -227,13 +227,7 @@ def _rival(d: Diagnosis, k: int, c: Candidate | None, key: Key) -> dict:
 
 
 def _texts(d: Diagnosis, k: int, effect: str) -> dict:
-    text = words(effect, d)
-    return {
-        "colour": PALETTE[k % len(PALETTE)].name,
-        "happens": text.happens,
-        "looks": text.looks,
-        "change": text.change,
-    }
+    return {"colour": PALETTE[k % len(PALETTE)].name} | asdict(words(effect, d))
 
 
 def _value(v: Value, sites: bool) -> str:

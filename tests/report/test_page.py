@@ -6,6 +6,7 @@ from itertools import product
 
 import pytest
 
+from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap.result import Key
 from jaxfinger.report.page import render
 
@@ -129,6 +130,22 @@ def test_what_is_improbable_or_too_long_is_left_out():
     assert "joint Stribeck" not in text  # of 2e-4
     assert "tendon creep at T3" in text  # of 4 %
     assert "&lt; 1" not in text
+
+
+def test_a_cause_says_what_to_do(monkeypatch):
+    cls = CATALOGUE["tendon_stretch"]
+    for name, text in (("HAPPENS", "It gives."), ("LOOKS", "A slope over tension."), ("CHANGE", "Stiffen it.")):
+        monkeypatch.setattr(cls, name, text)
+    page = render(explained())
+    card = page.split('<article class="card"')[1].split("</article>")[0]
+    for head, text in (
+        ("What happens", "It gives."),
+        ("What it looks like", "A slope over"),
+        ("What to change", "Stiff"),
+    ):
+        assert text in card.split(f"<dt>{head}</dt>")[1].split("</dd>")[0]
+    assert "The law" in card
+    assert "compliance: 91.0 ± 5.9 µm/N" in card
 
 
 def test_names_of_a_user_are_text_and_no_markup():
