@@ -21,6 +21,7 @@ COMMANDS = {
         "Where the model misses the finger, what is to blame, how far it shrinks.",
     ),
     "simulate": ("files:simulate", "A simulated session, from a recipe or from a fit."),
+    "look": ("files:look", "Say what a recording holds, and propose a mapping for it."),
     "import": ("files:import_", "Turn MATLAB, CSV or bag recordings into a session."),
     "record": ("record:record", "Run a plan on the rig."),
     "recover": ("record:recover", "Rescue a recording that was killed."),

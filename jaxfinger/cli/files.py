@@ -1,16 +1,19 @@
-"""`jaxfinger check`, `simulate`, `import`: session files in and out."""
+"""`jaxfinger check`, `look`, `simulate`, `import`: session files in and out."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import Output, console, plain, print_json, progress, refuse_existing, remark
+from jaxfinger.cli.output import Output, console, plain, print_json, progress, refuse_existing, remark, table
 from jaxfinger.errors import UserError
 from jaxfinger.progress import Step
+
+if TYPE_CHECKING:
+    from jaxfinger.data.recording import Recording
 
 
 def check(file: Path, *, json: bool = False) -> None:
@@ -38,6 +41,70 @@ def check(file: Path, *, json: bool = False) -> None:
         print(f"{file}: " + (f"{errors} errors, {rest} remarks" if findings else "nothing to complain about"))
     if errors:
         raise SystemExit(2)
+
+
+def _as_dict(recording: Recording) -> dict:
+    from jaxfinger.data.look import clocks_of, columns_of
+
+    seen = columns_of(recording)
+    return {
+        "file": recording.path,
+        "columns": [asdict(s) for s in seen],
+        "clocks": [asdict(clock) for clock in clocks_of(recording, seen)],
+        "unusable": dict(recording.unusable),
+        "remarks": list(recording.remarks),
+    }
+
+
+def look(*recordings: Path, finger: Path | None = None, json: bool = False) -> None:
+    """Say what recordings hold: names, sizes, units, rates and gaps; and propose a mapping for `import`.
+
+    Parameters
+    ----------
+    recordings
+        MATLAB, CSV, rosbag2 or MCAP.
+    finger
+        The finger's description (TOML) or a session: the mapping then names its joints and tendons.
+    json
+        Print what is seen as JSON.
+    """
+    if not recordings:
+        raise UserError("no recording was given; name at least one")
+    from jaxfinger.data.finger_file import finger_from
+    from jaxfinger.data.look import clocks_of, columns_of, proposal
+    from jaxfinger.data.sources import load_recording
+    from jaxfinger.data.toml import Place
+
+    described = finger_from(str(finger.resolve()), Place(str(finger))) if finger is not None else None
+    loaded = [load_recording(path) for path in recordings]
+    if json:
+        print_json([_as_dict(recording) for recording in loaded])
+        return
+    for recording in loaded:
+        seen = columns_of(recording)
+        rows = [
+            (
+                s.name + ("" if s.column is None else f"[{s.column}]"),
+                s.meaning or "–",
+                (s.units or "?") + ("" if s.stated or not s.units else " ?"),
+                str(s.samples),
+                f"{s.low:.5g}",
+                f"{s.high:.5g}",
+                str(s.missing or "–"),
+            )
+            for s in seen
+        ]
+        table(str(recording.path), ("variable", "may be", "units", "samples", "from", "to", "missing"), rows, left=3)
+        for clock in clocks_of(recording, seen):
+            gaps = f"{clock.gaps} gaps, the longest {clock.longest:.3g} s" if clock.gaps else "no gaps"
+            order = f"; {clock.disordered} stamps do not increase" if clock.disordered else ""
+            print(plain(f"{clock.name}: {clock.duration:.4g} s at {clock.rate:.4g} Hz, {gaps}{order}"))
+        for name, reason in recording.unusable.items():
+            print(plain(f"{name} {reason}"))
+        for text in recording.remarks:
+            print(plain(f"{recording.path} {text}"))
+    print("\n# a mapping to correct: what each trial is, its joint, signs and units\n")
+    print(plain(proposal(loaded, described)))
 
 
 def simulate(

@@ -1,4 +1,4 @@
-"""The dataset format, version 1.1, as tables: reader, writer and checker go by these."""
+"""The dataset format, version 1.1 (docs/dataset-format.md), as tables: reader, writer and checker go by these."""
 
 from __future__ import annotations
 

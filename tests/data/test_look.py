@@ -1,0 +1,99 @@
+"""`look` says what a recording holds; what it proposes is a mapping that imports."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from jaxfinger.cli import main
+from jaxfinger.data.look import clocks_of, columns_of, proposal
+from jaxfinger.data.mapping import read_mapping
+from jaxfinger.data.sources import load_recording
+from tests.data.conftest import ONE_JOINT, make_finger
+
+CASES = Path(__file__).parent / "cases"
+TIME = np.delete(np.arange(1000), [500, 501, 502, 503, 504, 505, 506]) * 5.0
+
+
+@pytest.fixture
+def log(tmp_path):
+    """Degrees, N mm and ms, as ranges tell, and a gap."""
+    columns = [TIME, 40 + 30 * np.sin(TIME / 1e3), 80 * np.cos(TIME / 1e3), 300 * np.sin(TIME / 1e2)]
+    path = tmp_path / "log.csv"
+    np.savetxt(path, np.column_stack(columns), "%.6f", ",", header="t,enc,dq,tau", comments="")
+    return path
+
+
+def test_units_rates_and_gaps(log):
+    recording = load_recording(log)
+    seen = columns_of(recording)
+    assert [(s.name, s.meaning, s.units) for s in seen] == [
+        ("t", "time", "ms"),
+        ("enc", "q", "deg"),
+        ("dq", "", ""),
+        ("tau", "joint_torque", "N mm"),
+    ]
+    (clock,) = clocks_of(recording, seen)
+    assert (clock.rate, clock.gaps, clock.longest) == (pytest.approx(200.0), 1, pytest.approx(0.04))
+
+
+def test_units_that_a_file_states_come_first():
+    recording = load_recording(CASES / "csv-as-other-programs-write-it" / "scope.csv")
+    assert {s.name: (s.units, s.stated) for s in columns_of(recording)}["tau"] == ("N m", True)
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        "csv-as-other-programs-write-it/latin1.csv",
+        "csv-as-other-programs-write-it/scope.csv",
+        "csv-as-other-programs-write-it/heads.csv",
+        "joint-states-of-two-publishers/log",
+        "one-message-at-time-zero/log.mcap",
+        "simulink-signal-of-two-columns/log.mat",
+        "own-clock-in-ms/log.mat",
+    ],
+)
+@pytest.mark.parametrize("finger", [None, make_finger()])
+def test_what_is_proposed_parses(file, finger, tmp_path):
+    (tmp_path / "m.toml").write_text(proposal([load_recording(CASES / file)], finger))
+    mapping, _ = read_mapping(tmp_path / "m.toml")
+    assert mapping.trials
+
+
+def test_what_is_proposed_imports(log, tmp_path, capsys):
+    (tmp_path / "finger.toml").write_text(ONE_JOINT[ONE_JOINT.index("[finger]") :])
+    main(["look", str(log), "--finger", str(tmp_path / "finger.toml")])
+    said = capsys.readouterr().out
+    (tmp_path / "m.toml").write_text(said[said.index("# a mapping") :])
+    main(["import", str(log), "--mapping", str(tmp_path / "m.toml"), "--output", str(tmp_path / "s.h5")])
+    main(["look", str(log), "--json"])
+    assert json.loads(capsys.readouterr().out.split("\n", 1)[1])[0]["columns"][1]["high"] == pytest.approx(70, abs=0.1)
+
+
+def test_names_do_not_steer_the_terminal(tmp_path, capsys):
+    path = tmp_path / "log.mcap"
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("s", "jsonschema", b"{}")
+        channel = writer.register_channel("/[/]\x1b[31m", "json", schema)
+        for i in range(5):
+            writer.add_message(channel, log_time=i, publish_time=i, data=json.dumps({"[/]q": i}).encode())
+        writer.finish()
+    main(["look", str(path)])
+    said = capsys.readouterr().out
+    assert "\x1b" not in said
+    assert "[/]q" in said
+
+
+def test_variables_that_give_no_numbers_are_named(tmp_path, capsys):
+    scipy.io.savemat(tmp_path / "log.mat", {"t": TIME, "note": "text", "z": 1j * TIME})
+    main(["look", str(tmp_path / "log.mat")])
+    said = capsys.readouterr().out
+    assert "z is complex" in said
+    assert "note is text" in said
