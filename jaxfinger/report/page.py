@@ -35,6 +35,7 @@ ACCENTS = {
 NARROW, WIDE = 3.35, 7.4  # inches: a phone of 360 px with its margins, and a reading column
 WORTH_A_LINE = 0.01  # probability of a further cause below which nobody wants to read of it
 WORTH_A_PLACE = 0.02  # share of the gap, likewise
+CHANGES = 8  # parameters at most, the plainest, of which the page says that they have changed
 LARGEST = 24  # parameters in the picture of intervals: those known worst, beside all of the causes
 VARIABLES = {"q": "rad", "qd": "rad/s", "tendon_force": "N", "time": "s"}
 
@@ -63,6 +64,8 @@ def render(d: Diagnosis, trace: Trace | None = None, found: Curves | None = None
     template = Environment(loader=PackageLoader("jaxfinger.report", "."), autoescape=True).get_template("page.html.j2")
     prismatic = d.nominal.model.finger.prismatic
     named = set(d.named).union(*d.ambiguous_sets)
+    simulator = sentences.is_simulator(d)
+    say = sentences.contradicted if simulator else sentences.change
     judged = d.candidates if d.status is not Status.NOT_JUDGED else ()
     rest = [c for c in judged if c.key not in named and c.probability >= WORTH_A_LINE]
     return template.render(
@@ -76,7 +79,8 @@ def render(d: Diagnosis, trace: Trace | None = None, found: Curves | None = None
         relevance=[_relevance(x) for x in d.relevance if x.tolerated or d.status is not Status.NO_GAP],
         cards=_cards(d),
         rivals=[sentences.sentence(sentences.cannot_tell(s)) for s in d.ambiguous_sets if d.status is Status.PARTLY],
-        changes=[sentences.change(x) for x in d.changes],
+        changes=[say(x) for x in d.changes[:CHANGES]],
+        changed="What the measurements say of the simulator's parameters" if simulator else "What has changed",
         others=[{"name": sentences.key_name(c.key), "probability": percent(c.probability)} for c in rest],
         places=[_place(p, prismatic) for p in d.where if p.share >= WORTH_A_PLACE],
         trace=_trace(trace) if trace else "",

@@ -176,11 +176,12 @@ def how_large(x: Relevance, tolerance: dict[str, float]) -> str:
 
 
 def _subject(d: Diagnosis) -> str:
-    model = "the simulator" if _is_simulator(d) else f"the model of {d.against}" if d.against else "the model"
+    model = "the simulator" if is_simulator(d) else f"the model of {d.against}" if d.against else "the model"
     return f"at a first look {model}" if d.quick else model
 
 
-def _is_simulator(d: Diagnosis) -> bool:
+def is_simulator(d: Diagnosis) -> bool:
+    """Whether another simulator is diagnosed, and not the model that is identified."""
     return d.problem is not None and d.problem.simulator is not None
 
 
@@ -314,7 +315,7 @@ def _caveats(d: Diagnosis) -> list[str]:
     were not judged.
     """
     out = [diverged(x) for x in d.closures if x.diverged]
-    if _is_simulator(d):
+    if is_simulator(d):
         out.append(retuned(d.changes))
     elif d.against:
         out += [change(x) for x in d.changes if x.probability >= 0.5][:2]
@@ -355,6 +356,12 @@ def change(x: Change) -> str:
         f"{x.name} was {measured(x.before, x.before_std, x.units)} and is {measured(x.after, x.after_std, x.units)}: "
         f"{certainty(x.probability) if x.probability >= 0.5 else 'perhaps'} changed ({percent(x.probability)})"
     )
+
+
+def contradicted(x: Change) -> str:
+    """A parameter of another simulator that the measurements contradict."""
+    old, new = measured(x.before, None, x.units), measured(x.after, x.after_std, x.units)
+    return sentence(f"{x.name} is {old} in the simulator, and {new} by the measurements")
 
 
 def next_trial(step: NextExperiment) -> str:

@@ -94,6 +94,16 @@ def test_a_tolerated_gap_of_unknown_cause_is_not_said_to_be_nothing():
     assert "probability" not in text
 
 
+def test_another_simulator_is_told_which_of_its_parameters_are_off():
+    (x,) = ALL["against"].changes
+    says = "Damping MCP is 12 N mm s/rad in the simulator, and 16.00 ± 0.98 N mm s/rad by the measurements."
+    assert sentences.contradicted(x) == says
+    assert sentences.retuned((x,)).endswith(
+        "retuned, most of all damping MCP, 12 N mm s/rad to 16.00 ± 0.98 N mm s/rad"
+    )
+    assert "agree" in sentences.retuned(())
+
+
 def test_a_signal_of_nothing_has_no_relative_size():
     d = replace(explained(), relevance=(replace(LARGE, signal=0.0, relative=0.0),))
     assert sentences.size(d) == "the model misses the joint torque by 1.2 N mm (ID.4)"
