@@ -9,7 +9,7 @@ import numpy as np
 from jaxfinger.data import Predictions, Session
 from jaxfinger.data.atomic import atomic_path
 from jaxfinger.effects import CatalogueEffect
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, did_you_mean
 from jaxfinger.gap.augment import Fitted, as_refitted, augmented_fit, nominal_fit, parameter_values
 from jaxfinger.gap.evidence import Projector
 from jaxfinger.gap.next_experiment import NextExperiment, next_experiment
@@ -73,7 +73,8 @@ def diagnose(
     catalogue = catalogue_for(recipe, effects)
     if unknown := set(without) - set(catalogue):
         raise UserError(
-            f"the catalogue has no effect {', '.join(sorted(unknown))} to leave out; "
+            f"the catalogue has no effect {', '.join(sorted(unknown))} to leave out"
+            f"{did_you_mean(min(unknown), catalogue)}; "
             f"it has {', '.join(sorted(catalogue))}"
         )
     problem = build(session, recipe, progress, predictions, COARSE if quick else 1)

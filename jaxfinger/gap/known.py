@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from jaxfinger.data import Session
 from jaxfinger.effects import CatalogueEffect
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, did_you_mean
 from jaxfinger.experiments import shows
 from jaxfinger.gap.augment import augmented_fit
 from jaxfinger.gap.evidence import Projector
@@ -37,6 +37,10 @@ def fit_with(
     if there := [effect for effect, _ in keys if effect in recipe.model.terms]:
         raise UserError(f"{there[0]} is a term of the recipe's own model; leave it out here, or there")
     catalogue = catalogue_for(recipe, effects)
+    for effect, _ in keys:
+        if effect not in catalogue:
+            near = did_you_mean(effect, catalogue)
+            raise UserError(f"the catalogue has no effect {effect}{near}; it has {', '.join(sorted(catalogue))}")
     problem = build(session, recipe, progress)
     screen = Screening.of(problem, _offered(catalogue, keys, problem), progress)
     projector = Projector(problem)
@@ -70,8 +74,6 @@ def _offered(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[Key], p
     """Every form of the effects at their sites."""
     offered, finger = [], problem.nominal.finger
     for effect, site in keys:
-        if effect not in catalogue:
-            raise UserError(f"the catalogue has no effect {effect}; it has {', '.join(sorted(catalogue))}")
         offers = variants({effect: catalogue[effect]}, finger, problem.scales)
         mine = [v for v in offers if "-".join(v.site) == "-".join(site)]
         if not mine:
