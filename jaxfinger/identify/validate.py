@@ -20,7 +20,8 @@ from scipy.signal import butter, sosfilt, sosfilt_zi
 from jaxfinger.data import Session, Trial, low_pass
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import Stack, predict, prepare
+from jaxfinger.experiments import Stack, not_judged, predict, prepare
+from jaxfinger.identify.ahead import ahead, diverges, noise_of_simulation
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.linearise import residuals_of
 from jaxfinger.identify.noise import estimate
@@ -95,7 +96,7 @@ def validate(
             f"{session.file or 'the session'}: has no trial of {', '.join(wanted)} to validate with, it has {has}; "
             "name its experiments with --experiments"
         )
-    scores, slopes = [], []
+    scores, slopes, messages = [], [], []
     for name, stack in stacks.items():
         progress(f"validating {name}")
         residuals, floors = _residuals(model, fit, stack)
@@ -107,9 +108,11 @@ def validate(
             slopes += _slopes(fit, model, session, stack)
         if name == "VD.3":
             progress("simulating VD.3 forward in time")
-            scores += _simulation_scores(model, session, list(stack.trials))
-    missing = tuple(f"the session has no {e} trial" for e in wanted if e not in stacks)
-    return Validation(session.specimen, session.file, tuple(scores), tuple(slopes), missing)
+            simulated, diverging = _simulation_scores(model, session, list(stack.trials))
+            scores, messages = scores + simulated, messages + diverging
+    messages += [f"the session has no {e} trial" for e in wanted if e not in stacks]
+    messages += [f"{experiment}: no {c} sample is judged: {why}" for experiment, c, why in not_judged(stacks)]
+    return Validation(session.specimen, session.file, tuple(scores), tuple(slopes), tuple(messages))
 
 
 # -- channels ---------------------------------------------------------------------------------------------------------
@@ -147,7 +150,9 @@ def _rate(experiment: str) -> float:
 
 def _channel_scores(session: Session, stack: Stack, channel: str, residual, floor) -> list[Score]:
     """One score a column that was measured; residual (columns, B, T), NaN where it does not count."""
-    method = {"VD.1": "f(q) − f(q(0))", "VD.3": "inverse dynamics where it slides" if channel == "joint_torque" else ""}
+    share = _share(session, stack, channel)
+    sliding = f"inverse dynamics where it slides, {share:.0%} of the samples"
+    method = {"VD.1": "f(q) − f(q(0))", "VD.3": sliding if channel == "joint_torque" else ""}
     scores = []
     for k, column in enumerate(columns(session, channel)):
         series = [r[np.isfinite(r)] for r in residual[k]]
@@ -158,6 +163,13 @@ def _channel_scores(session: Session, stack: Stack, channel: str, residual, floo
                 _make(session, stack.experiment.name, channel, k, column, *found, (floor[0][k], floor[1]), method)
             )
     return scores
+
+
+def _share(session: Session, stack: Stack, channel: str) -> float:
+    """Of all samples of the trials, averaged over the columns, how many count."""
+    whole = sum(session[name].duration for name in stack.trials) / stack.dt
+    mask = np.asarray(stack.batch.mask[channel])
+    return float(mask.sum() / (len(mask) * max(whole, 1.0)))
 
 
 def _score(series: list[np.ndarray], zeroed: bool) -> tuple[float, float, int, int]:
@@ -297,18 +309,43 @@ def _slope_std(f: np.ndarray, errors: np.ndarray, weights: np.ndarray) -> float:
 # -- VD.3: forward simulation -----------------------------------------------------------------------------------------
 
 
-def _simulation_scores(model: Model, session: Session, names: list[str]) -> list[Score]:
-    """q simulated from the first sample under the measured tension, against q, at every sample."""
+def _simulation_scores(model: Model, session: Session, names: list[str]) -> tuple[list[Score], list[str]]:
+    """q under the measured tension, against q: from states all along the trials, and from the first sample on."""
     stack = prepare(session, names, reduced=False)["VD.3"]
     paths = simulate_trials([model] * len(stack.trials), session, stack)
     scores = []
+    for moment in ahead(model, session, stack):
+        for k, column in enumerate(session.finger.joint_names):
+            errors = [moment.error[np.isfinite(moment.error[:, k]), k]]
+            if errors[0].size:
+                rms, mean, samples, _ = _score(errors, False)
+                found = rms, mean, samples, len(stack.trials)
+                noise = (moment.noise[k], "sensors' noise in state and tension")
+                method = f"{1e3 * moment.horizon:.0f} ms ahead of the measured state"
+                scores.append(_make(session, "VD.3", "q", k, column, *found, noise, method))
+    through = noise_of_simulation(model, session, stack)
     for k, column in enumerate(session.finger.joint_names):
         series = [session[name].q[:, k] - paths[name]["q"][:, k] for name in stack.trials]
         found = _score([e[np.isfinite(e)] for e in series], False)
         encoder = float(np.sqrt(np.mean([_encoder(session[name], k) ** 2 for name in stack.trials])))
         method = "simulated forward from the first sample"
-        scores.append(_make(session, "VD.3", "q", k, column, *found, (encoder, "fast part of the reading"), method))
-    return scores
+        noise = (float(np.hypot(encoder, through[k])), "sensors' noise in start, tension and reading")
+        scores.append(_make(session, "VD.3", "q", k, column, *found, noise, method))
+    return scores, _divergence(session, paths)
+
+
+def _divergence(session: Session, paths: dict[str, dict[str, np.ndarray]]) -> list[str]:
+    """Which whole simulations left the finger's range."""
+    out = []
+    for name, path in paths.items():
+        away = diverges(path["q"], session.finger.limits)
+        if away.any():
+            joints = ", ".join(j for j, yes in zip(session.finger.joint_names, away, strict=True) if yes)
+            out.append(
+                f"{name}: simulated from its first sample, {joints} diverges, and its angles say nothing; "
+                "judge VD.3 by the errors a moment ahead"
+            )
+    return out
 
 
 def _encoder(trial: Trial, k: int) -> float:

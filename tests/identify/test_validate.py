@@ -27,7 +27,8 @@ def test_every_validation_experiment_and_channel_is_scored(scored, short):
     assert [s.column for s in pick(scored, "VD.1", "tendon_excursion", "f(q)")] == active
     assert [s.column for s in pick(scored, "VD.1", "tendon_excursion", "∫")] == active
     assert [s.column for s in pick(scored, "VD.2", "fingertip_force")] == ["x", "y", "z"]
-    assert [s.column for s in pick(scored, "VD.3", "q")] == list(finger.joint_names)
+    for method in ("from the first sample", *(f"{ms} ms ahead" for ms in (50, 100, 200, 500))):
+        assert [s.column for s in pick(scored, "VD.3", "q", method)] == list(finger.joint_names)
     assert scored.messages == ()
 
 
@@ -36,6 +37,28 @@ def test_the_truth_is_at_the_noise_floor(scored):
         if s.channel in ("tendon_excursion", "fingertip_force") and "∫" not in s.method and s.experiment != "VD.3":
             # Forces also carry the noise of the tension, at its own hold and through friction at earlier ones.
             assert 0.6 < s.rms / s.noise < 1.5, s
+
+
+def test_a_moment_ahead_the_truth_departs_by_the_noise_of_the_sensors(scored):
+    """Sticking included: friction that is solved for hides none of it."""
+    for ms in (50, 100, 200, 500):
+        for s in pick(scored, "VD.3", "q", f"{ms} ms ahead"):
+            assert s.rms < 2.0 * s.noise, s
+    errors = [np.mean([s.rms for s in pick(scored, "VD.3", "q", f"{ms} ms ahead")]) for ms in (50, 500)]
+    assert errors[0] < errors[1]
+    (share,) = {s.method for s in pick(scored, "VD.3", "joint_torque")}
+    assert "% of the samples" in share
+
+
+def test_a_weak_spring_shows_a_moment_ahead(short_truth, scored, short):
+    """Of twice the elastic torque, and a joint pushed out of its range is said to diverge."""
+    elastic = short_truth.model.joint_torque.elastic
+    wrong = eqx.tree_at(lambda m: m.joint_torque.elastic, short_truth.model, 3.0 * elastic)
+    result = validate(replace(short_truth, model=wrong), short, ("VD.3",))
+    for s, true in zip(pick(result, "VD.3", "q", "100 ms"), pick(scored, "VD.3", "q", "100 ms"), strict=True):
+        assert s.rms > true.rms
+    away: Model = eqx.tree_at(lambda m: m.joint_torque.elastic, short_truth.model, elastic.at[:, 0].add(-1.0))
+    assert any("diverges" in m for m in validate(replace(short_truth, model=away), short, ("VD.3",)).messages)
 
 
 def test_units_are_those_that_people_read(scored):
