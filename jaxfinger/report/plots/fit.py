@@ -121,8 +121,9 @@ def influence(
     """
     shifts = np.asarray(shifts)
     sizes = np.abs(shifts)
-    i, j = (np.sort(np.argsort(-sizes.max(axis=k, initial=0.0), kind="stable")[:most]) for k in (1, 0))
-    names, shifts = ([rows[k] for k in i], [columns[k] for k in j]), shifts[np.ix_(i, j)]
+    i, j = (np.sort(np.argsort(-sizes.max(axis=k, initial=0.0), kind="stable")[:most]).astype(int) for k in (1, 0))
+    names = [str(rows[int(k)]) for k in i], [str(columns[int(k)]) for k in j]
+    shifts = shifts[np.ix_(i, j)]
     ax = axes_or_new(ax, 2.2 + 0.22 * len(j), 2.0 + 0.22 * len(i))
     largest = float(np.abs(shifts).max(initial=0.0)) or 1.0
     _squares(ax, shifts / largest, *names, f"up {largest:.2g} σ", f"down {largest:.2g} σ")
