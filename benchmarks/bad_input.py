@@ -1,7 +1,7 @@
 """How bad input is met: mistakes of unit, sign and column that pass without a word, and files that are damaged.
 
     python benchmarks/bad_input.py mistakes SESSION.h5 … [--sound SESSION.h5 …]
-    python benchmarks/bad_input.py mutations [--count N] [--session SESSION.h5]
+    python benchmarks/bad_input.py mutations [--count N]
 
 `mistakes` makes every mistake of a mapping in a sound session, and counts those that the checker does not warn of;
 sound files must have no warning. `mutations` mutates mappings, recordings and sessions, and counts tracebacks, crashes,
@@ -11,15 +11,28 @@ hangs and files written where none should be.
 from __future__ import annotations
 
 import argparse
+import os
+import re
+import shutil
+import signal
+import sys
+import tempfile
+import traceback
+import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
+import h5py
 import numpy as np
 
-from jaxfinger.data import Session, Trial, read_session
+from jaxfinger.cli import main as main_of_jaxfinger
+from jaxfinger.data import Session, Trial, check_file, read_session, write_session
 from jaxfinger.data.check import check_session, examine
 from jaxfinger.data.findings import Report
 
+ROOT = Path(__file__).parents[1]
 Mistake = Callable[[Trial], Trial]
 
 # Numbers taken for SI that are in other units: how many times too large they come out.
@@ -123,14 +136,321 @@ def run_mistakes(paths: list[str], sound: list[str]) -> None:
             print(f"  {path}: {text}")
 
 
+# A value of a mapping in the place of another.
+VALUES = (
+    "3",
+    "-1",
+    "0",
+    "1e308",
+    "nan",
+    "true",
+    '"text"',
+    '""',
+    "[]",
+    "[1, 2]",
+    "{}",
+    "[[1]]",
+    "2024-03-01",
+    '"t"',
+    '"../x"',
+)
+PATIENCE = 20.0  # s of processor time before a command counts as hung
+
+
+def mutated_text(text: str, rng: np.random.Generator) -> str:
+    """A mapping as a slip leaves it: a value, a line, a key or a character changed."""
+    lines = text.splitlines()
+    k = int(rng.integers(len(lines)))
+    line = lines[k]
+    match rng.integers(7):
+        case 0:
+            del lines[k]
+        case 1:
+            lines.insert(int(rng.integers(len(lines))), line)
+        case 2 | 3:
+            key, equals, _ = line.partition(" = ")
+            lines[k] = f"{key} = {rng.choice(VALUES)}" if equals else line
+        case 4:
+            words = list(re.finditer(r'"[^"]*"|[\w.]+', line))
+            if words:
+                word = words[int(rng.integers(len(words)))]
+                lines[k] = line[: word.start()] + str(rng.choice(VALUES)) + line[word.end() :]
+        case 5:
+            at = int(rng.integers(len(line) + 1))
+            lines[k] = line[:at] + chr(rng.integers(32, 127)) + line[at + int(rng.integers(2)) :]
+        case _:
+            other = int(rng.integers(len(lines)))
+            lines[k], lines[other] = lines[other], lines[k]
+    return "\n".join(lines)
+
+
+def mutated_bytes(raw: bytes, rng: np.random.Generator) -> bytes:
+    """A file as a fault of memory, disk or editor leaves it: bytes changed, lost, doubled, or its end missing."""
+    out = bytearray(raw)
+    for _ in range(int(rng.integers(1, 9))):
+        at, size = int(rng.integers(len(out))), int(rng.integers(1, 17))
+        match rng.integers(6):
+            case 0 | 1:
+                out[at] = int(rng.integers(256))
+            case 2:
+                out[at : at + size] = rng.bytes(size)
+            case 3:
+                del out[at : at + size]
+            case 4:
+                out[at:at] = out[at : at + size]
+            case _:
+                if rng.integers(8) == 0:
+                    del out[at:]
+        if not out:
+            break
+    return bytes(out)
+
+
+def mutated_table(raw: bytes, rng: np.random.Generator) -> bytes:
+    """A CSV with a cell, a line or a separator changed."""
+    lines = raw.decode().splitlines()
+    k = int(rng.choice([0, 1, int(rng.integers(len(lines)))]))
+    cells = lines[k].split(",")
+    at = int(rng.integers(len(cells)))
+    match rng.integers(6):
+        case 0:
+            cells[at] = str(rng.choice(["", "x", "1,5", "1e999", "nan", '"', "#", "True", "1_000", "\x00", "é"]))
+        case 1:
+            cells.insert(at, cells[at])
+        case 2:
+            del cells[at]
+        case 3:
+            lines.insert(int(rng.integers(len(lines))), lines[k])
+        case 4:
+            lines = [line.replace(",", str(rng.choice([";", "\t", " ", "|", ", "]))) for line in lines]
+            return "\n".join(lines).encode(str(rng.choice(["utf-8", "utf-16", "utf-8-sig"])))
+        case _:
+            return mutated_bytes(raw, rng)
+    lines[k] = ",".join(cells)
+    return "\n".join(lines).encode()
+
+
+def mutate_structure(path: Path, rng: np.random.Generator) -> None:
+    """One object of an HDF5 file removed, or in another shape, type or place; or an attribute changed."""
+    with h5py.File(path, "r+") as file:
+        names: list[str] = []
+        file.visit(names.append)
+        name = str(rng.choice(names))
+        item = file[name]
+        values = (np.nan, -1, 3, "text", "", b"\xff\xfe", [1.0, 2.0], True, 1e308, np.zeros((2, 2)), h5py.Empty("f8"))
+        value = values[int(rng.integers(len(values)))]
+        if item.attrs and rng.integers(2):
+            key = str(rng.choice(list(item.attrs)))
+            if rng.integers(3):
+                item.attrs[key] = value
+            else:
+                del item.attrs[key]
+            return
+        match rng.integers(7):
+            case 0:
+                del file[name]
+            case 1:
+                del file[name]
+                file[name] = value
+            case 2:
+                del file[name]
+                file.create_group(name)
+            case 3:
+                file[str(rng.choice(names)) + "/" + "x" if isinstance(item, h5py.Group) else name + "2"] = value
+            case 4:
+                del file[name]
+                file[name] = h5py.SoftLink(str(rng.choice(["/nowhere", "/", "/trials", f"/{name}"])))
+            case 5 if isinstance(item, h5py.Dataset):
+                x, attributes = item[()], dict(item.attrs)
+                del file[name]
+                changes = (
+                    np.transpose,
+                    np.ravel,
+                    lambda x: x[:0],
+                    lambda x: x[:-1],
+                    lambda x: x[::-1],
+                    lambda x: x[None],
+                )
+                file[name] = changes[int(rng.integers(len(changes)))](np.atleast_1d(x))
+                file[name].attrs.update(attributes)
+            case _ if isinstance(item, h5py.Dataset) and item.dtype.kind == "f":
+                x, attributes = item[()], dict(item.attrs)
+                del file[name]
+                x = (
+                    np.array(x, str(rng.choice(["f2", "f4", "i1", "u8", "c16", "S8"])))
+                    if rng.integers(2)
+                    else x * rng.choice([np.nan, np.inf, -1.0, 0.0, 1e300, 1e-300])
+                )
+                file[name] = x
+                file[name].attrs.update(attributes)
+
+
+@dataclass
+class Counts:
+    """What happened to the mutated inputs of one kind."""
+
+    tried: int = 0
+    taken: int = 0
+    refused: int = 0
+    tracebacks: list[str] = field(default_factory=list)
+    crashes: int = 0
+    hangs: int = 0
+    written: int = 0  # at the final path by a command that failed, or refused by `check` afterwards
+
+
+def outcome(command: Callable[[], None], out: Path | None) -> str:
+    """In a child process: 0 or 2, with what was written; a traceback's last line; or how it died."""
+    read, write = os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        child = os.fork()
+    if child == 0:
+        os.close(read)
+        silence = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(silence, 1)
+        os.dup2(silence, 2)
+        signal.signal(signal.SIGPROF, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_PROF, PATIENCE)
+        said = "0"
+        try:
+            command()
+        except SystemExit as end:
+            said = str(end.code or 0)
+        except BaseException as error:  # what is counted
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            said = f"{type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})"
+        os.write(write, said.encode()[:4000])
+        os._exit(0)
+    os.close(write)
+    with os.fdopen(read, "rb") as pipe:
+        said = pipe.read().decode()
+    _, status = os.waitpid(child, 0)
+    if os.WIFSIGNALED(status):
+        return "hang" if os.WTERMSIG(status) == signal.SIGPROF else "crash"
+    if said == "2" and out is not None and out.exists():
+        return "written"
+    if said == "0" and out is not None and any(f.severity == "error" and not f.local for f in check_file(out)):
+        return "written"
+    return said
+
+
+def count(kind: str, number: int, prepare: Callable[[np.random.Generator], tuple[list[str], Path | None]]) -> None:
+    """Run a command on so many mutated inputs, and print what happened."""
+    counts = Counts()
+    for k in range(number):
+        tokens, out = prepare(np.random.default_rng(k))
+        said = outcome(lambda tokens=tokens: main_of_jaxfinger(tokens), out)
+        counts.tried += 1
+        match said:
+            case "0":
+                counts.taken += 1
+            case "2":
+                counts.refused += 1
+            case "hang":
+                counts.hangs += 1
+            case "crash":
+                counts.crashes += 1
+            case "written":
+                counts.written += 1
+            case _:
+                counts.tracebacks.append(f"{k}: {said}")
+        if out is not None:
+            out.unlink(missing_ok=True)
+    print(
+        f"{kind}: {counts.tried} tried, {counts.taken} taken, {counts.refused} refused, {len(counts.tracebacks)} "
+        f"tracebacks, {counts.crashes} crashes, {counts.hangs} hangs, {counts.written} wrongly written",
+        flush=True,
+    )
+    for text in sorted(set(counts.tracebacks))[:10]:
+        print(f"  {text}")
+
+
+def run_mutations(number: int) -> None:
+    """Mutated mappings and recordings through `import`, mutated sessions through `check`."""
+    sys.path.insert(0, str(ROOT))
+    from docs.own_data_logs import main as write_own_data_logs
+    from tests.data.conftest import make_session
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        out = folder / "out.h5"
+        write_own_data_logs(folder)
+        guide = (ROOT / "docs" / "your-own-data.md").read_text(encoding="utf-8")
+        for block, text in re.findall(r"^```toml (\S+)\n(.*?)^```", guide, re.M | re.S):
+            (folder / block).write_text(text)
+        logs = [str(path) for path in sorted(folder.glob("*.csv"))]
+        mapping = (folder / "mapping.toml").read_text()
+
+        def of_mapping(rng: np.random.Generator):
+            (folder / "mutated.toml").write_text(mutated_text(mapping, rng))
+            return ["import", *logs, "--mapping", str(folder / "mutated.toml"), "-o", str(out)], out
+
+        def of_finger(rng: np.random.Generator):
+            (folder / "finger.toml").write_text(mutated_text(finger, rng))
+            return ["import", *logs, "--mapping", str(folder / "mapping.toml"), "-o", str(out)], out
+
+        count("mappings", number, of_mapping)
+        finger = (folder / "finger.toml").read_text()
+        count("fingers", number // 4, of_finger)
+        cases = ROOT / "tests" / "data" / "cases"
+        for kind, recording, mapped, mutate in (
+            ("CSV", cases / "csv-as-other-programs-write-it/quoted.csv", "quoted.toml", mutated_table),
+            ("CSV of Scope", cases / "csv-as-other-programs-write-it/scope.csv", "scope.toml", mutated_bytes),
+            ("MAT", cases / "simulink-signal-of-two-columns/log.mat", "m.toml", mutated_bytes),
+            ("MAT 7.3", cases / "matlab-object-read-as-six-numbers/log.mat", "m.toml", mutated_bytes),
+            ("MCAP", cases / "one-message-at-time-zero/log.mcap", "m.toml", mutated_bytes),
+            ("bag", cases / "joint-states-of-two-publishers/log", "m.toml", mutated_bytes),
+        ):
+            target = folder / "mutated" / recording.name
+            shutil.rmtree(folder / "mutated", ignore_errors=True)
+            (folder / "mutated").mkdir()
+            if recording.is_dir():
+                shutil.copytree(recording, target, copy_function=shutil.copyfile)
+                target.chmod(0o755)
+            inner = next(target.glob("*.db3")) if recording.is_dir() else target
+            raw = (next(recording.glob("*.db3")) if recording.is_dir() else recording).read_bytes()
+            text = (recording.parent / mapped).read_text()
+            text = text.replace('time = "t"', 'time = "q.time"') if kind == "CSV of Scope" else text
+            text = text.replace("column = 0", 'column = "J"') if kind == "bag" else text
+            (folder / "case.toml").write_text(text)
+
+            def of_recording(rng: np.random.Generator, inner=inner, raw=raw, mutate=mutate, target=target):
+                inner.write_bytes(mutate(raw, rng))
+                return ["import", str(target), "--mapping", str(folder / "case.toml"), "-o", str(out)], out
+
+            count(kind, number // 4, of_recording)
+        sound = folder / "sound.h5"
+        write_session(make_session(), sound)
+        raw = sound.read_bytes()
+        session = folder / "session.h5"
+
+        def of_structure(rng: np.random.Generator):
+            session.write_bytes(raw)
+            with suppress(OSError, ValueError, TypeError, KeyError, RuntimeError, OverflowError):  # not to be written
+                mutate_structure(session, rng)
+            return ["check", str(session)], None
+
+        def of_bytes(rng: np.random.Generator):
+            session.write_bytes(mutated_bytes(raw, rng))
+            return ["check", str(session)], None
+
+        count("structure of a session", number // 2, of_structure)
+        count("bytes of a session", number * 5, of_bytes)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser("mistakes")
     command.add_argument("sessions", nargs="+")
     command.add_argument("--sound", nargs="*", default=[])
+    command = commands.add_parser("mutations")
+    command.add_argument("--count", type=int, default=2000, help="of mappings; the other kinds in proportion")
     chosen = parser.parse_args()
-    run_mistakes(chosen.sessions, chosen.sound)
+    if chosen.command == "mistakes":
+        run_mistakes(chosen.sessions, chosen.sound)
+    else:
+        run_mutations(chosen.count)
 
 
 if __name__ == "__main__":
