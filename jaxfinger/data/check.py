@@ -20,7 +20,9 @@ from jaxfinger.data.parse import listed, parse_file
 from jaxfinger.data.schema import MEASURED
 from jaxfinger.data.session import EXPERIMENTS, Session, Trial
 
-_MANY_SPIKES = 0.05
+_MANY_SPIKES = (
+    0.1  # of a column: as many as the mask finds with certainty; motors driven by a coarse encoder reach 0.09
+)
 _START = 100  # samples by which most pairs of trials are told apart
 
 

@@ -12,6 +12,7 @@ from jaxfinger.data.session import FingerDescription
 
 _UNIT_AXIS = 1e-3
 _ROUNDING = 1e-5  # of float32 tables
+_LEAD = 11_300.0  # kg/m³
 _LARGEST_FINGER = 2.0  # m; lengths beyond it are taken for mm
 _LARGEST_ARM = 0.5  # m; as an excursion a turn
 
@@ -25,6 +26,7 @@ def check_finger(finger: FingerDescription, report: Report) -> None:
         _joints(finger, report)
         _links(finger, report)
         _lengths(finger, report)
+        _weight(finger, report)
     _tendons(finger, report)
     _excursion(finger, report)
 
@@ -91,10 +93,6 @@ def _links(finger: FingerDescription, report: Report) -> None:
             report.error(
                 "/finger/links/mass", f"the link of joint {name} weighs {mass:.4g} kg; a mass must be positive"
             )
-        elif mass > 10.0 and not finger.prismatic[i]:
-            report.warning(
-                "/finger/links/mass", f"the link of joint {name} weighs {mass:.4g} kg; check that these are no grams"
-            )
         _inertia(finger.inertia[i], mass, name, report)
     for key in ("mass_std", "com_std"):
         value = getattr(finger, key)
@@ -106,6 +104,16 @@ def _links(finger: FingerDescription, report: Report) -> None:
             report.error(f"/finger/joints/{key}", "holds a negative number; write its size, 0 where there is no rotor")
     if finger.rotor_inertia is None and finger.rotor_inertia_std is not None:
         report.error("/finger/joints/rotor_inertia", "is missing beside its standard deviation; write both or neither")
+
+
+def _weight(finger: FingerDescription, report: Report) -> None:
+    """Grams taken for kg: no machine is heavier than a cube of lead as long as it is."""
+    length = float(np.linalg.norm(finger.origin, axis=1).sum() + np.linalg.norm(finger.fingertip))
+    if not any(finger.prismatic) and length > 0.0 and finger.mass.sum() > _LEAD * length**3:
+        report.warning(
+            "/finger/links/mass",
+            f"the links weigh {finger.mass.sum():.4g} kg at {length:.3g} m of length; check that these are no grams",
+        )
 
 
 def _inertia(inertia: np.ndarray, mass: float, name: str, report: Report) -> None:

@@ -13,6 +13,7 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -132,7 +133,8 @@ def _cell(cell: str) -> float | None:
         return _TRUTH[cell.lower()]
     if _STAMP.match(cell):
         try:
-            return float(np.datetime64(cell.replace(" ", "T").removesuffix("Z"), "ns").astype(np.int64)) * 1e-9
+            stamp = datetime.fromisoformat(cell)
+            return (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp()
         except ValueError:
             return None
     return np.nan if not cell else None

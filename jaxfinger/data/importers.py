@@ -22,7 +22,7 @@ from jaxfinger.data.hdf5 import write_session
 from jaxfinger.data.mapping import Channels, MappedTrial, MappingFile, read_mapping, terms
 from jaxfinger.data.parse import RANGES, in_order, listed
 from jaxfinger.data.recording import Recording
-from jaxfinger.data.schema import CHANNELS, TEMPERATURE, Channel, Entry, units_of
+from jaxfinger.data.schema import CHANNELS, DRIVES, TEMPERATURE, Channel, Entry, units_of
 from jaxfinger.data.session import FingerDescription, Session, Trial
 from jaxfinger.data.sources import load_recording
 from jaxfinger.data.toml import Place
@@ -144,6 +144,8 @@ def _trial(
         channel: _labels(channel, x[keep], places[channel]) if channel in whole else x[keep]
         for channel, x in values.items()
     }
+    if not finger.n and "tendon_force" in DRIVES.get(trial.experiment, ()):
+        arrays.setdefault("tendon_force", np.zeros((len(time), 0)))  # of a machine without tendons
     return Trial(
         name=name,
         experiment=trial.experiment,

@@ -1,0 +1,130 @@
+"""Columns on clocks of their own, of other files, unwrapped, sorted, chosen by a condition."""
+
+import numpy as np
+import pytest
+import scipy.io
+
+from jaxfinger.data import import_file
+from jaxfinger.data.findings import Report
+from jaxfinger.errors import UserError
+from tests.data.conftest import ONE_JOINT
+
+TIME = np.arange(600) / 100
+Q = 0.6 + 0.5 * np.sin(TIME)
+SLOW = np.arange(120) / 20
+MAPPING = (
+    ONE_JOINT
+    + """[trials.a]
+file = "log.mat"
+experiment = "ID.3-dynamic"
+joint = "MCP"
+time = "t"
+EXTRA
+channels.q.MCP = "q"
+channels.joint_torque.MCP = TORQUE
+"""
+)
+
+
+def bring_in(tmp_path, torque, extra="", others=(), root="", **changes):
+    recorded = {"t": TIME, "q": Q, "slow": SLOW, "tau": 0.01 * np.sin(SLOW), "now": 0.01 * np.cos(TIME)} | changes
+    scipy.io.savemat(tmp_path / "log.mat", recorded)
+    text = MAPPING.replace("EXTRA", extra).replace("TORQUE", torque)
+    (tmp_path / "m.toml").write_text(text + root)
+    report = Report()
+    session = import_file([tmp_path / "log.mat", *others], tmp_path / "m.toml", tmp_path / "s.h5", True, report)
+    return session["a"], [str(f) for f in report if f.severity == "warning"]
+
+
+OWN = '{ from = "tau", time = "slow" }'
+
+
+def test_a_slower_clock_is_interpolated_and_the_trial_cut_to_it(tmp_path):
+    trial, said = bring_in(tmp_path, OWN)
+    assert trial.time[-1] == pytest.approx(SLOW[-1])
+    np.testing.assert_allclose(trial.joint_torque[:, 0], 0.01 * np.sin(trial.time), atol=1e-5)
+    assert not any("cut" in text for text in said)  # by less than two ticks
+
+
+def test_a_clock_that_covers_a_part(tmp_path):
+    trial, said = bring_in(tmp_path, OWN, slow=SLOW[:100], tau=0.01 * np.sin(SLOW[:100]))
+    assert trial.time[-1] == pytest.approx(SLOW[99])
+    assert any("the trial is cut to what both cover" in text for text in said)
+    with pytest.raises(UserError, match=r"covers only a part; name another clock, or cut the trial by span = \[0, "):
+        bring_in(tmp_path, OWN, slow=SLOW[:40], tau=SLOW[:40])
+
+
+@pytest.mark.parametrize(
+    ("clock", "words"),
+    [
+        (1e3 * SLOW, "do not share their units"),
+        (1e-3 * SLOW, "covers only a part|do not share their units"),
+        (SLOW + 100, "do not overlap"),
+        (SLOW[::-1].copy(), "does not increase at 119 of 120 samples, first after sample 0"),
+        (SLOW[:100], "has 120 samples, and its clock `slow` has 100"),
+        (np.full(120, np.nan), "holds 0 samples"),
+    ],
+)
+def test_a_clock_of_its_own_that_cannot_be(tmp_path, clock, words):
+    with pytest.raises(UserError, match=words):
+        bring_in(tmp_path, OWN, slow=clock)
+
+
+def test_gaps_of_a_clock_are_said(tmp_path):
+    keep = (SLOW < 2) | (SLOW > 4)
+    _, said = bring_in(tmp_path, OWN, slow=SLOW[keep], tau=0.01 * np.sin(SLOW[keep]))
+    assert any("1 gaps, the longest 2" in text for text in said)
+
+
+def test_samples_are_sorted_on_request(tmp_path):
+    order = np.random.default_rng(0).permutation(len(TIME))
+    with pytest.raises(UserError, match="sort = true"):
+        bring_in(tmp_path, '"now"', t=TIME[order], q=Q[order], now=0.01 * np.cos(TIME[order]))
+    trial, said = bring_in(tmp_path, '"now"', "sort = true", t=TIME[order], q=Q[order], now=0.01 * np.cos(TIME[order]))
+    np.testing.assert_allclose(trial.joint_torque[:, 0], 0.01 * np.cos(TIME))
+    assert any("was sorted" in text for text in said)
+
+
+def test_a_column_of_another_file(tmp_path):
+    (tmp_path / "day").mkdir()
+    other = tmp_path / "day" / "torque.csv"
+    other.write_text("t,tau\n" + "\n".join(f"{1e3 * t:.3f},{0.01 * np.sin(t):.8f}" for t in SLOW))
+    spec = '{ from = "tau", file = "day/torque.csv", time = { from = "t", units = "ms" } }'
+    trial, _ = bring_in(tmp_path, spec, others=[other])
+    np.testing.assert_allclose(trial.joint_torque[:, 0], 0.01 * np.sin(trial.time), atol=1e-5)
+    with pytest.raises(UserError, match=r"not of the trial's own file; name its clock by `time`"):
+        bring_in(tmp_path, '{ from = "tau", file = "torque.csv" }', others=[other])
+
+
+def test_a_recording_that_no_trial_reads_is_said(tmp_path):
+    (tmp_path / "rest.csv").write_text("t,a\n0,1\n1,2\n")
+    _, said = bring_in(tmp_path, '"now"', others=[tmp_path / "rest.csv"])
+    assert any("is read by no trial" in text for text in said)
+
+
+def test_derived_variables_and_rows_by_a_condition(tmp_path):
+    root = "[constants]\nkt = 0.05\nM = [[1.0, 1.0], [1.0, -1.0]]\n"
+    root += '[derived]\ntau2 = "kt * now"\nboth = "M @ [now, tau2]"\n'
+    trial, _ = bring_in(tmp_path, '{ from = "both", column = 1 }', 'where = "t >= 2 and t < 4"', root=root)
+    assert trial.duration == pytest.approx(1.99)
+    np.testing.assert_allclose(trial.joint_torque[:, 0], 0.95 * 0.01 * np.cos(trial.time + 2.0), atol=1e-12)
+
+
+def test_an_encoder_in_counts_is_unwrapped(tmp_path):
+    counts = np.round(Q * 4096 / (2 * np.pi) * 10) % 4096  # behind a gear of ten
+    text = '{ from = "counts", unwrap = 4096, scale = 0.00015339807878856412, units = "rad" }'
+    recorded = {"t": TIME, "counts": counts, "now": 0.01 * np.cos(TIME)}
+    scipy.io.savemat(tmp_path / "log.mat", recorded)
+    mapping = (
+        MAPPING.replace("EXTRA", "")
+        .replace("TORQUE", '"now"')
+        .replace('channels.q.MCP = "q"', f"channels.q.MCP = {text}")
+    )
+    (tmp_path / "m.toml").write_text(mapping)
+    q = import_file([tmp_path / "log.mat"], tmp_path / "m.toml", tmp_path / "s.h5")["a"].q[:, 0]
+    np.testing.assert_allclose(np.diff(q), np.diff(Q), atol=2e-3 / 10 + 2e-4)
+
+
+def test_the_start_of_a_span_is_the_first_sample(tmp_path):
+    trial, _ = bring_in(tmp_path, '"now"', "span = [1.0, 3.0]", t=TIME + 1.7e9)
+    np.testing.assert_allclose(trial.q[:, 0], Q[100:300])

@@ -1,0 +1,82 @@
+"""CSV as programs write it, and lines that are wrong."""
+
+import numpy as np
+import pytest
+
+from jaxfinger.data.csv_file import load_csv
+from jaxfinger.errors import UserError
+
+NUMBERS = "0.00,1.5,-3\n0.01,1.6,-4\n0.02,1.7,-5\n"
+
+
+def load(tmp_path, content, name="log.csv"):
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return load_csv(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "names"),
+    [
+        ("t,a,b\n" + NUMBERS, ["t", "a", "b"]),
+        ("# made by X\n# t a b\n" + NUMBERS.replace(",", " "), ["t", "a", "b"]),
+        ("t,a,b\ns,deg,N\n" + NUMBERS, ["t", "a", "b"]),
+        (NUMBERS, ["column 0", "column 1", "column 2"]),
+        ("0,1,2\n" + NUMBERS, ["0", "1", "2"]),
+        (",a,b\n" + NUMBERS, ["column 0", "a", "b"]),
+        ("t,a,b\r\n" + NUMBERS.replace("\n", "\r\n"), ["t", "a", "b"]),
+        ('"t"\t"a"\t"b"\n' + NUMBERS.replace(",", "\t"), ["t", "a", "b"]),
+        ("t;a;b\n" + NUMBERS.replace(",", ";").replace(".", ","), ["t", "a", "b"]),
+        ("Instrument X\nRun 7, of Monday\n\nt,a,b\n" + NUMBERS, ["t", "a", "b"]),
+    ],
+)
+def test_names_and_numbers(tmp_path, content, names):
+    found = load(tmp_path, content)
+    assert list(found.variables) == names
+    assert found.unusable == {}
+    values = [v.values for v in found.variables.values()]
+    np.testing.assert_array_equal(values, [[0.0, 0.01, 0.02], [1.5, 1.6, 1.7], [-3, -4, -5]])
+
+
+def test_units_below_the_names_or_in_them(tmp_path):
+    found = load(tmp_path, "t,a [deg],b\ns,,N\n" + NUMBERS).variables
+    assert [v.units for v in found.values()] == ["s", "deg", "N"]
+
+
+def test_truth_dates_and_empty_cells(tmp_path):
+    text = "when,on,x\n2024-03-01 12:00:00.000,True,1\n2024-03-01 12:00:00.005,False,\n2024-03-01T12:00:00.010,True,3\n"
+    found = load(tmp_path, text).variables
+    np.testing.assert_allclose(np.diff(found["when"].values), 0.005, atol=1e-6)
+    np.testing.assert_array_equal(found["on"].values, [1, 0, 1])
+    np.testing.assert_array_equal(found["x"].values, [1, np.nan, 3])
+
+
+def test_a_text_column_leaves_the_others_usable(tmp_path):
+    found = load(tmp_path, "t,what\n0,idle\n1,moves\n2,moves\n")
+    assert list(found.variables) == ["t"]
+    assert "'idle' in line 2" in found.unusable["what"]
+
+
+def test_a_word_among_numbers_is_named_with_its_line(tmp_path):
+    found = load(tmp_path, "# made\n\nt,a\n0,1\n1,err\n2,3\n3,3\n4,5\n5,1\n")
+    assert "holds 'err' in line 5" in found.unusable["a"]
+
+
+def test_a_line_of_another_width(tmp_path):
+    with pytest.raises(UserError, match=r"line 3 has 2 cells, the others have 3"):
+        load(tmp_path, "t,a,b\n0,1,2\n1,2\n2,3,4\n3,4,5\n")
+    found = load(tmp_path, "t,a,b\n" + NUMBERS + "0.03,1.")
+    assert len(found.variables["t"].values) == 3
+    assert found.remarks == ("its last line is cut short and is left out",)
+
+
+def test_columns_of_one_name(tmp_path):
+    found = load(tmp_path, "t,a,a\n" + NUMBERS)
+    assert list(found.variables) == ["t"]
+    assert "columns 2 and 3" in found.unusable["a"]
+
+
+@pytest.mark.parametrize("content", ["", "t,a\n", "only words\nand words\n", b"\x00\x01\x02"])
+def test_what_is_no_table(tmp_path, content):
+    with pytest.raises(UserError):
+        load(tmp_path, content)

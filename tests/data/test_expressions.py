@@ -1,0 +1,68 @@
+"""Arithmetic of a mapping: what it computes, and that nothing else runs."""
+
+import numpy as np
+import pytest
+
+from jaxfinger.data.expressions import ExpressionError, evaluate
+
+X = np.arange(4.0)
+TABLE = np.column_stack([X, 10 * X])
+VALUES = {"x": X, "q [deg]": 2 * X, "log.y": X + 1, "table": TABLE}
+CONSTANTS = {"k": 3.0, "M": [[1, 1], [0, 2], [1, 0]], "gains": [1.0, 0.5]}
+
+
+def lookup(name, column):
+    if name not in VALUES:
+        raise ExpressionError(f"no {name}")
+    return VALUES[name] if column is None else VALUES[name][:, column]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("k * x - 1", 3 * X - 1),
+        ("'q [deg]' / 2 + log.y ** 2", X + (X + 1) ** 2),
+        ("table[1] + x", 11 * X),
+        ("gains * table", TABLE * [1.0, 0.5]),
+        ("x * table", X[:, None] * TABLE),
+        ("M @ table", TABLE @ np.array([[1, 1], [0, 2], [1, 0]]).T),
+        ("M @ [x, 10 * x]", TABLE @ np.array([[1, 1], [0, 2], [1, 0]]).T),
+        ("deg2rad(180 * sin(x) / pi)", np.sin(X)),
+        ("x > 1 and not x == 3", [False, False, True, False]),
+        ("-abs(-x)", -X),
+    ],
+)
+def test_values(text, expected):
+    np.testing.assert_allclose(evaluate(text, lookup, CONSTANTS), expected)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(
+            "__import__('os').system('true')",
+            "x.__class__",
+            "open('f')",
+            "lambda: 1",
+            "[i for i in x]",
+            "x if x else x",
+        ),
+        *(
+            "x @ M",
+            "nothing + 1",
+            "k *",
+            "9 ** 9 ** 9 ** x[",
+            "x" + "+x" * 2000,
+            "(" * 300 + "x" + ")" * 300,
+            "table[5:]",
+        ),
+        *("exec('1')", "f'{x}'", "x := 3", "sin(x, out=x)", "True", "gains + x"),
+    ],
+)
+def test_what_is_refused(text):
+    with pytest.raises(ExpressionError):
+        evaluate(text, lookup, CONSTANTS)
+
+
+def test_powers_of_powers_come_to_an_end():
+    assert evaluate("9 ** 9 ** 9 ** 9", lookup, CONSTANTS) == np.inf
