@@ -1,10 +1,11 @@
 """The staged identification: seconds, memory, and ratios to other libraries, from one run.
 
-    python benchmarks/identify.py [--samples 1000000]
+    python benchmarks/identify.py [--only-inverse-dynamics]
 
 1. `jaxfinger identify` on a session of 30 trials, 20 minutes at 1 kHz, as a user runs it: with an empty compile cache
    and with a full one; peak memory there and on half the session.
-2. Inverse dynamics of many samples against Pinocchio's batch call, on as many threads.
+2. Inverse dynamics of 10,000, 100,000 and a million samples, 3 and 7 joints, against Pinocchio's batch call and
+   MuJoCo, in processor seconds of one thread: median and spread of five runs.
 3. Each stage's least squares against `scipy.optimize.least_squares` on the same rows, with the same derivatives; and
    with the derivatives by the parameters of earlier stages too, which the errors that are passed on need.
 """
@@ -15,17 +16,17 @@ import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pinocchio as pin
 import scipy.optimize
 
-from jaxfinger.data import Session, read_session, write_session
+from jaxfinger.data import FingerDescription, Session, read_session, write_session
 from jaxfinger.experiments import prepare
 from jaxfinger.identify import identify
 from jaxfinger.identify.linearise import linearise
@@ -110,36 +111,93 @@ def whole(folder: Path) -> None:
     print(f"identify, half the session:    {half:.1f} s; peak memory {less:.0f} MiB")
 
 
-def inverse_dynamics(samples: int) -> None:
-    """2. One call for all samples."""
-    d = paper_finger().description
-    finger, m = Finger.from_description(d), d.m
-    rng = np.random.default_rng(0)
-    q, qd, qdd = rng.uniform(-1, 1, (3, m, samples))
-    ours = eqx.filter_jit(rigid_body.inverse_dynamics)
-    begun = time.perf_counter()
-    ours.lower(finger, q, qd, qdd).compile()
-    compiling = time.perf_counter() - begun
+def processor(work, runs: int = 5) -> tuple[float, float, float]:
+    """Median, least and most processor seconds of a few runs, compiled before."""
+    work()
+    times = []
+    for _ in range(runs):
+        begun = time.process_time()
+        work()
+        times.append(time.process_time() - begun)
+    return float(np.median(times)), min(times), max(times)
+
+
+def chain(m: int) -> FingerDescription:
+    """m revolute joints with any axes, links with full inertia tensors."""
+    rng = np.random.default_rng(m)
+    axis, root = rng.standard_normal((m, 3)), rng.standard_normal((m, 3, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    return FingerDescription(
+        gravity=np.array([0.0, 0.0, -9.81]), joint_names=tuple(f"J{i}" for i in range(m)), axis=axis,
+        origin=rng.standard_normal((m, 3)), limits=np.tile([-3.0, 3.0], (m, 1)), mass=rng.uniform(0.1, 2.0, m),
+        com=rng.standard_normal((m, 3)), inertia=root @ root.transpose(0, 2, 1), fingertip=np.ones(3),
+        tendon_names=(), active=np.zeros(0, bool), crosses=np.zeros((0, m), bool),
+    )  # fmt: skip
+
+
+def in_pinocchio(d: FingerDescription) -> pin.Model:
+    """The chain."""
     model = pin.Model()
-    for i in range(m):
+    for i in range(d.m):
         joint = pin.JointModelRevoluteUnaligned(d.axis[i])
         k = model.addJoint(i, joint, pin.SE3(np.eye(3), d.origin[i]), d.joint_names[i])
         model.appendBodyToJoint(k, pin.Inertia(float(d.mass[i]), d.com[i], d.inertia[i]), pin.SE3.Identity())
     model.gravity.linear = d.gravity
-    a, b, c = (np.asfortranarray(x) for x in (q, qd, qdd))
-    tau = np.zeros_like(a)
-    print(f"inverse dynamics, {samples:,} samples of {m} joints (compiled in {compiling:.1f} s)")
-    for threads in (1, 2):
-        shares = [jnp.asarray(np.array_split(np.stack([q, qd, qdd]), threads, axis=2)[k]) for k in range(threads)]
-        with ThreadPoolExecutor(threads) as workers:
-            mine = best(lambda w=workers, s=shares: [*w.map(lambda x: jax.block_until_ready(ours(finger, *x)), s)])
-        pool = pin.ModelPool(model, threads)
-        theirs = best(lambda n=threads, p=pool: pin.rneaInParallel(n, p, a, b, c, tau))
-        error = float(np.abs(np.asarray(ours(finger, q, qd, qdd)) - tau).max())
-        print(
-            f"  {threads} threads: ours {mine:.2f} s, Pinocchio {theirs:.2f} s: {theirs / mine:.1f} times; "
-            f"difference {error:.1g}"
+    return model
+
+
+def in_mujoco(d: FingerDescription) -> mujoco.MjModel:
+    """The chain."""
+    spec = mujoco.MjSpec()
+    spec.option.gravity = d.gravity
+    body = spec.worldbody
+    for i in range(d.m):
+        values, turn = np.linalg.eigh(d.inertia[i])
+        turn[:, 0] *= np.linalg.det(turn)
+        quat = np.zeros(4)
+        mujoco.mju_mat2Quat(quat, turn.ravel())
+        body = body.add_body(
+            pos=d.origin[i], mass=d.mass[i], ipos=d.com[i], inertia=values, iquat=quat, explicitinertial=True
         )
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=d.axis[i])
+    spec.compiler.balanceinertia = True
+    return spec.compile()
+
+
+def inverse_dynamics(joints: int, samples: int) -> None:
+    """2. One call for all samples, on one thread; repeated until a run takes some tenths of a second."""
+    d = chain(joints)
+    finger = Finger.from_description(d)
+    q, qd, qdd = np.random.default_rng(0).uniform(-1, 1, (3, joints, samples))
+    x = [jnp.asarray(a) for a in (q, qd, qdd)]
+    repeats = max(1, 200_000 // samples)
+    begun = time.process_time()
+    ours = eqx.filter_jit(rigid_body.inverse_dynamics).lower(finger, *x).compile()
+    compiling = time.process_time() - begun
+    mine = processor(lambda: [jax.block_until_ready(ours(finger, *x)) for _ in range(repeats)])
+    pool = pin.ModelPool(in_pinocchio(d), 1)
+    a, b, c = (np.asfortranarray(v) for v in (q, qd, qdd))
+    tau = np.zeros_like(a)
+    theirs = processor(lambda: [pin.rneaInParallel(1, pool, a, b, c, tau) for _ in range(repeats)])
+    error = float(np.abs(np.asarray(ours(finger, *x)) - tau).max() / np.abs(tau).max())
+    model = in_mujoco(d)
+    data, few = mujoco.MjData(model), min(samples, 20_000)
+
+    def by_mujoco():
+        for k in range(few):
+            data.qpos[:], data.qvel[:], data.qacc[:] = q[:, k], qd[:, k], qdd[:, k]
+            mujoco.mj_inverse(model, data)
+
+    third = processor(by_mujoco)
+    print(f"inverse dynamics, {joints} joints, {samples:,} samples (compiled in {compiling:.1f} s)")
+    for name, seconds, count in (
+        ("ours", mine, samples * repeats),
+        ("Pinocchio, batch call", theirs, samples * repeats),
+        ("MuJoCo, from Python", third, few),
+    ):
+        each, low, high = (1e6 * s / count for s in seconds)
+        print(f"  {name:22s} {each:6.3f} µs a sample ({low:.3f} to {high:.3f})")
+    print(f"  Pinocchio / ours {theirs[0] / mine[0]:.2f}; largest difference {error:.0e} of the largest torque")
 
 
 def stages(path: Path) -> None:
@@ -181,11 +239,15 @@ def stages(path: Path) -> None:
 def main() -> None:
     """Print all three."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--samples", type=int, default=1_000_000)
-    samples = parser.parse_args().samples
+    parser.add_argument("--only-inverse-dynamics", action="store_true")
+    only = parser.parse_args().only_inverse_dynamics
+    for joints in (3, 7):
+        for samples in (10_000, 100_000, 1_000_000):
+            inverse_dynamics(joints, samples)
+    if only:
+        return
     with tempfile.TemporaryDirectory() as folder:
         whole(Path(folder))
-        inverse_dynamics(samples)
         stages(Path(folder) / "session.h5")
 
 

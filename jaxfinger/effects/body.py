@@ -18,6 +18,9 @@ class Payload(CatalogueEffect):
 
     ID: ClassVar = "payload"
     PLACE: ClassVar = "joint"  # a link goes by its joint's name
+    HAPPENS: ClassVar = "A link carries a mass that CAD does not know of, or its mass sits elsewhere."
+    LOOKS: ClassVar = "Torque is off as a weight would have it: by posture, at this joint and all before it."
+    CHANGE: ClassVar = "Weigh the link again, with cables and screws, and correct its mass and centre of mass."
 
     mass: Float[Array, ""] = amplitude("kg", 0.3, "mass")
     x: Float[Array, ""] = shape("m", (0.3, 0.0, 0.6), "length", moves="by differences")
@@ -52,6 +55,9 @@ class GravityTilt(CatalogueEffect):
 
     ID: ClassVar = "gravity_tilt"
     PLACE: ClassVar = "base"
+    HAPPENS: ClassVar = "The finger is mounted at another angle than believed."
+    LOOKS: ClassVar = "All joints miss their weights together, as one turned gravity would have it."
+    CHANGE: ClassVar = "Measure the mounting with a level, and correct `gravity` of the finger."
 
     x: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
     y: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
@@ -67,6 +73,9 @@ class DriveInertia(CatalogueEffect):
 
     ID: ClassVar = "drive_inertia"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "Shaft and coupler of the external motor add inertia."
+    LOOKS: ClassVar = "Torque is off in proportion to acceleration, only where the motor is coupled."
+    CHANGE: ClassVar = "Add the inertia to the recipe (`rotor_inertia`), or take it off the measured torque."
 
     inertia: Float[Array, ""] = amplitude("kg m2", 0.2, "mass*length*length")
 
@@ -83,6 +92,9 @@ class TorqueRipple(CatalogueEffect):
 
     ID: ClassVar = "torque_ripple"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "The drive's torque is periodic in the angle."
+    LOOKS: ClassVar = "The residual repeats over the angle, the same both ways."
+    CHANGE: ClassVar = "Align the coupler, or add the ripple to the motor; it is none of the finger's."
 
     A: Float[Array, ""] = amplitude("N m", 0.02, "torque", signed=True)
     B: Float[Array, ""] = amplitude("N m", 0.02, "torque", signed=True)

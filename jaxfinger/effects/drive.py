@@ -17,6 +17,9 @@ class JointOffset(CatalogueEffect):
 
     ID: ClassVar = "joint_offset"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "A constant torque acts on the joint."
+    LOOKS: ClassVar = "Torque is off by the same amount at every angle, speed and direction."
+    CHANGE: ClassVar = "Balance the joint, zero its amplifier, or add a constant torque."
 
     tau: Float[Array, ""] = amplitude("N m", 0.1, "torque", signed=True)
 
@@ -33,6 +36,9 @@ class JointFrictionAsymmetric(CatalogueEffect):
 
     ID: ClassVar = "joint_friction_asymmetric"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "Friction one way is larger than the other way."
+    LOOKS: ClassVar = "The two branches of the loop are not the same distance from its middle, the more so at speed."
+    CHANGE: ClassVar = "Give the joint two frictions, one a direction; look for a preloaded gear or seal."
 
     coulomb: Float[Array, ""] = amplitude("N m", 0.06, "torque", signed=True)
     damping: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed", signed=True)
@@ -48,6 +54,9 @@ class JointTorqueFriction(CatalogueEffect):
 
     ID: ClassVar = "joint_torque_friction"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "The drive loses a share of the torque that it gives, as gears do."
+    LOOKS: ClassVar = "The loop of torque widens with the load: driving takes more, being driven gives less back."
+    CHANGE: ClassVar = "Give the drive an efficiency, or use a gear with less loss."
 
     mu: Float[Array, ""] = amplitude("1", 0.1, most=0.95)  # from 1 on a gear locks itself
 
@@ -67,6 +76,9 @@ class JointFrictionWarmup(CatalogueEffect):
 
     ID: ClassVar = "joint_friction_warmup"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "Cold grease is stiff: friction falls while the session goes on or the joint warms up."
+    LOOKS: ClassVar = "The same motion needs less torque in later trials; the loops shrink."
+    CHANGE: ClassVar = "Warm the joint up before recording, measure its temperature, or let friction depend on it."
 
     a: Float[Array, ""] = amplitude("1", 0.3, signed=True)
     d: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed", signed=True)
@@ -101,6 +113,9 @@ class JointCoupling(CatalogueEffect):
 
     ID: ClassVar = "joint_coupling"
     PLACE: ClassVar = "joint pair"
+    HAPPENS: ClassVar = "One motor turns with two joints, and its friction and inertia act on both."
+    LOOKS: ClassVar = "Torque at a joint that stands still follows the speed of the other one."
+    CHANGE: ClassVar = "Add the motor as a rotor on the sum of both angles, with its own friction."
     sharp: ClassVar = True
 
     coulomb: Float[Array, ""] = amplitude("N m", 0.1, "torque")
@@ -148,6 +163,9 @@ class JointBacklash(CatalogueEffect):
 
     ID: ClassVar = "joint_backlash"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "A dead zone lies between the drive, whose angle is measured, and the link."
+    LOOKS: ClassVar = "After each reversal the link lags: torque against angle is shifted between the two ways."
+    CHANGE: ClassVar = "Preload or replace the gear, measure the link's angle, or add a play of this width."
 
     a: Float[Array, ""] = amplitude("1", 1.0, most=1.0)
     width: Float[Array, ""] = shape("rad", (0.004, 0.007, 0.014, 0.03, 0.06), "angle")

@@ -18,6 +18,9 @@ class JointStribeck(CatalogueEffect):
 
     ID: ClassVar = "joint_stribeck"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "Friction is largest just after the joint breaks away and falls as it speeds up."
+    LOOKS: ClassVar = "Slow sweeps need more torque than fast ones; torque against speed dips before it rises."
+    CHANGE: ClassVar = "Lubricate or reseat the bearing, or add a Stribeck term to the joint's friction."
     SLOW: ClassVar = 0.4  # of the joint's speed, the largest v_s worth trying with δ = 1
 
     a: Float[Array, ""] = amplitude("1", 0.5)
@@ -46,6 +49,9 @@ class JointPresliding(CatalogueEffect):
 
     ID: ClassVar = "joint_presliding"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "After each reversal friction builds up over a small angle instead of at once."
+    LOOKS: ClassVar = "Torque rounds the corners of its loop against the angle at every reversal."
+    CHANGE: ClassVar = "Give the joint a Dahl or LuGre friction with this length; stiffer bearings shorten it."
     sharp: ClassVar = True
 
     a: Float[Array, ""] = amplitude("1", 1.0, most=1.0)
@@ -73,6 +79,9 @@ class JointLoadFriction(CatalogueEffect):
 
     ID: ClassVar = "joint_load_friction"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "The tendons press the joint's bearing, and its friction grows with that load."
+    LOOKS: ClassVar = "The torque that is missing grows with tension and turns its sign with the motion."
+    CHANGE: ClassVar = "Use a better bearing, or make the joint's friction grow with the tendons' load."
 
     mu: Float[Array, ""] = amplitude("1", 0.1)
 
@@ -96,6 +105,9 @@ class ElasticHardening(_TowardsAnEnd):
 
     ID: ClassVar = "elastic_hardening"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "The joint's elastic torque stiffens towards an end of its range."
+    LOOKS: ClassVar = "Torque against angle bends upwards near one end, the same both ways."
+    CHANGE: ClassVar = "Add an exponential spring at that end, or free what is compressed there."
 
     tau_end: Float[Array, ""] = amplitude("N m", 0.4, "torque")
     width: Float[Array, ""] = shape("rad", (0.07, 0.15, 0.3, 0.5), "angle")
@@ -112,6 +124,9 @@ class JointStop(_TowardsAnEnd):
 
     ID: ClassVar = "joint_stop"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "The joint meets a stop inside the range that was recorded."
+    LOOKS: ClassVar = "Torque rises steeply beyond one angle and nowhere else."
+    CHANGE: ClassVar = "Record short of the stop, move it, or add it as a contact."
 
     stiffness: Float[Array, ""] = amplitude("N m/rad", 3.0, "torque/angle")
     place: Float[Array, ""] = shape("1", (0.55, 0.62, 0.69, 0.76, 0.82, 0.88, 0.94), moves="by differences")
@@ -132,6 +147,9 @@ class ElasticRelaxation(CatalogueEffect):
 
     ID: ClassVar = "elastic_relaxation"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "The elastic torque relaxes while the joint is held, and lags while it moves."
+    LOOKS: ClassVar = "Torque creeps at each hold, and the loop against the angle widens at a certain speed."
+    CHANGE: ClassVar = "Add a spring and damper in series beside the joint's spring; wait longer at holds."
 
     stiffness: Float[Array, ""] = amplitude("N m/rad", 0.3, "torque/angle")
     T: Float[Array, ""] = shape("s", (0.003, 0.01, 0.03, 0.1, 0.3, 1.0), "trial")
@@ -158,6 +176,9 @@ class PassiveTendon(CatalogueEffect):
 
     ID: ClassVar = "passive_tendon"
     PLACE: ClassVar = "joint pair"
+    HAPPENS: ClassVar = "An elastic tendon that is not measured couples two joints."
+    LOOKS: ClassVar = "Torque at one joint depends on the angle of the other, on one side of a line only."
+    CHANGE: ClassVar = "Add a passive tendon with this stiffness, ratio and slack, or slacken it."
 
     kappa: Float[Array, ""] = amplitude("N m/rad", 1.5, "torque/angle")
     rho: Float[Array, ""] = shape("1", (0.5, 0.8, 1.0, 1.3, 2.0))

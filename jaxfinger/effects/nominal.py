@@ -15,6 +15,9 @@ class JointElastic(CatalogueEffect):
 
     ID: ClassVar = "joint_elastic"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "The joint has a spring that the recipe leaves out."
+    LOOKS: ClassVar = "Torque depends on the angle, the same both ways."
+    CHANGE: ClassVar = "Add `joint_elastic` to `model.terms` of the recipe."
 
     k0: Float[Array, ""] = amplitude("N m", 0.2, "torque", signed=True)
     k1: Float[Array, ""] = amplitude("N m/rad", 0.8, "torque/angle", signed=True)
@@ -30,6 +33,9 @@ class JointCoulomb(CatalogueEffect):
 
     ID: ClassVar = "joint_coulomb"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "The joint has dry friction that the recipe leaves out."
+    LOOKS: ClassVar = "Torque jumps at each reversal, by as much at any speed."
+    CHANGE: ClassVar = "Add `joint_coulomb` to `model.terms` of the recipe."
 
     c0: Float[Array, ""] = amplitude("N m", 0.1, "torque")
     c1: Float[Array, ""] = amplitude("N m/rad", 0.1, "torque/angle", signed=True)
@@ -45,6 +51,9 @@ class JointDamping(CatalogueEffect):
 
     ID: ClassVar = "joint_damping"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "The joint has damping that the recipe leaves out."
+    LOOKS: ClassVar = "Torque is in proportion to speed."
+    CHANGE: ClassVar = "Add `joint_damping` to `model.terms` of the recipe."
 
     d: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed")
 
@@ -58,6 +67,9 @@ class TendonFrictionTerm(CatalogueEffect):
 
     ID: ClassVar = "tendon_friction"
     PLACE: ClassVar = "tendon"
+    HAPPENS: ClassVar = "The tendon loses tension on its way, which the recipe leaves out."
+    LOOKS: ClassVar = "Torque is less than tension times moment arm while it is pulled, more while it is let go."
+    CHANGE: ClassVar = "Add `tendon_friction` to `model.terms` of the recipe."
 
     a0: Float[Array, ""] = amplitude("N", 0.05, "tension", signed=True)
     a1: Float[Array, ""] = amplitude("1", 0.3, signed=True)
@@ -72,6 +84,9 @@ class Gravity(CatalogueEffect):
 
     ID: ClassVar = "gravity"
     PLACE: ClassVar = "base"
+    HAPPENS: ClassVar = "The links have weight, which the recipe leaves out."
+    LOOKS: ClassVar = "Torque goes with posture as a weight would have it."
+    CHANGE: ClassVar = "Add `gravity` to `model.terms` of the recipe."
 
     x: Float[Array, ""] = amplitude("m s-2", 0.2, "torque/mass/length", signed=True)
     y: Float[Array, ""] = amplitude("m s-2", 0.2, "torque/mass/length", signed=True)

@@ -14,6 +14,9 @@ class TorqueSensorScale(CatalogueEffect):
 
     ID: ClassVar = "torque_sensor_scale"
     PLACE: ClassVar = "torque_sensor"
+    HAPPENS: ClassVar = "The joint torque sensor has a wrong gain."
+    LOOKS: ClassVar = "Every torque it measures is off by the same share."
+    CHANGE: ClassVar = "Calibrate the sensor with a known weight on a lever."
 
     gain: Float[Array, ""] = amplitude("1", 0.06, signed=True)
 
@@ -31,6 +34,9 @@ class TorqueSensorDrift(CatalogueEffect):
 
     ID: ClassVar = "torque_sensor_drift"
     PLACE: ClassVar = "torque_sensor"
+    HAPPENS: ClassVar = "The torque sensor's offset follows its temperature after it was tared."
+    LOOKS: ClassVar = "Torque drifts with the session's time, whatever the joint does."
+    CHANGE: ClassVar = "Let the sensor warm up, tare before each trial, or record its temperature."
 
     slope: Float[Array, ""] = amplitude("N m/s", 0.02, "torque/trial", signed=True)
     A: Float[Array, ""] = amplitude("N m", 0.006, "torque", signed=True)
@@ -57,6 +63,9 @@ class TensionSensorScale(CatalogueEffect):
 
     ID: ClassVar = "tension_sensor_scale"
     PLACE: ClassVar = "tendon"
+    HAPPENS: ClassVar = "A tendon's force sensor has a wrong gain or offset."
+    LOOKS: ClassVar = "All that its tension causes is off by the same share, both ways."
+    CHANGE: ClassVar = "Calibrate the sensor with hanging weights."
 
     gain: Float[Array, ""] = amplitude("1", 0.05, signed=True)
     offset: Float[Array, ""] = amplitude("N", 0.03, "tension", signed=True)
@@ -84,6 +93,9 @@ class EncoderOffset(_Encoder):
 
     ID: ClassVar = "encoder_offset"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "A joint's encoder does not read zero at zero."
+    LOOKS: ClassVar = "Weights and moment arms are those of another angle, everywhere by the same one."
+    CHANGE: ClassVar = "Zero the encoder in a jig of known posture."
 
     offset: Float[Array, ""] = amplitude("rad", 0.02, "angle", signed=True)
 
@@ -96,6 +108,9 @@ class EncoderEccentricity(_Encoder):
 
     ID: ClassVar = "encoder_eccentricity"
     PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "A joint's magnet is off its axis, and its angle errs once a turn."
+    LOOKS: ClassVar = "Excursion and torque bend as a sine of the angle would have it."
+    CHANGE: ClassVar = "Centre the magnet, or correct the angle by this sine."
 
     A: Float[Array, ""] = amplitude("rad", 0.01, "angle", signed=True)
     B: Float[Array, ""] = amplitude("rad", 0.01, "angle", signed=True)
@@ -109,6 +124,9 @@ class ForceSensorRotation(CatalogueEffect):
 
     ID: ClassVar = "force_sensor_rotation"
     PLACE: ClassVar = "fingertip"
+    HAPPENS: ClassVar = "The fingertip's force sensor is turned against the base."
+    LOOKS: ClassVar = "A force in one direction shows in another, in proportion."
+    CHANGE: ClassVar = "Measure how the sensor is mounted, and turn its readings."
 
     x: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
     y: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
@@ -129,6 +147,9 @@ class ChannelDelay(CatalogueEffect):
 
     ID: ClassVar = "channel_delay"
     PLACE: ClassVar = "channel"
+    HAPPENS: ClassVar = "One channel lags the others."
+    LOOKS: ClassVar = "The residual goes with the rate of that channel: nothing at rest, most at speed."
+    CHANGE: ClassVar = "Take the channel's time stamps at its source, or shift it by the delay."
 
     delay: Float[Array, ""] = amplitude("s", 0.004, "angle/speed")
 

@@ -14,6 +14,9 @@ class TendonStretch(CatalogueEffect):
 
     ID: ClassVar = "tendon_stretch"
     PLACE: ClassVar = "tendon"
+    HAPPENS: ClassVar = "The tendon lengthens under tension."
+    LOOKS: ClassVar = "Excursion goes with tension at a joint that does not move."
+    CHANGE: ClassVar = "Use a stiffer tendon, or give it this compliance."
 
     compliance: Float[Array, ""] = amplitude("m/N", 0.04, "excursion/tension")
     toe: Float[Array, ""] = shape("1", (0.0, 2.0, 6.0), moves="by differences")
@@ -30,6 +33,9 @@ class TendonCreep(CatalogueEffect):
 
     ID: ClassVar = "tendon_creep"
     PLACE: ClassVar = "tendon"
+    HAPPENS: ClassVar = "The tendon goes on lengthening while its tension is held."
+    LOOKS: ClassVar = "Excursion drifts at each hold, the slower the longer it lasts."
+    CHANGE: ClassVar = "Pre-stretch the tendon, wait at holds, or add a Kelvin-Voigt element."
 
     compliance: Float[Array, ""] = amplitude("m/N", 0.01, "excursion/tension")
     T: Float[Array, ""] = shape("s", (0.015, 0.05, 0.15, 0.5, 1.5), "trial")
@@ -56,6 +62,9 @@ class TendonBacklash(CatalogueEffect):
 
     ID: ClassVar = "tendon_backlash"
     PLACE: ClassVar = "tendon"
+    HAPPENS: ClassVar = "The excursion lags by a dead zone at each reversal."
+    LOOKS: ClassVar = "Excursion against angle is a loop whose branches are a fixed distance apart."
+    CHANGE: ClassVar = "Remove play between spool and tendon, or add a play of this width."
     sharp: ClassVar = True
 
     a: Float[Array, ""] = amplitude("1", 1.0, most=1.0)
@@ -80,6 +89,11 @@ class MomentArmCoupling(CatalogueEffect):
 
     ID: ClassVar = "moment_arm_coupling"
     PLACE: ClassVar = "tendon"
+    HAPPENS: ClassVar = "A tendon's excursion depends on two joints together."
+    LOOKS: ClassVar = "Its moment arm at one joint changes with the angle of the other."
+    CHANGE: ClassVar = (
+        "Record a trial that moves both, and turn on `cross_terms` in the recipe; or route the tendon apart."
+    )
 
     A: Float[Array, ""] = amplitude("m", 0.08, "excursion/angle/angle", signed=True)
     B: Float[Array, ""] = amplitude("m", 0.07, "excursion/angle/angle/angle", signed=True)
@@ -116,6 +130,9 @@ class MomentArmBowstring(CatalogueEffect):
 
     ID: ClassVar = "moment_arm_bowstring"
     PLACE: ClassVar = "tendon"
+    HAPPENS: ClassVar = "The tendon lifts off under load and its moment arm grows."
+    LOOKS: ClassVar = "Excursion and torque grow faster than the tension."
+    CHANGE: ClassVar = "Add a pulley or a sheath, or let the moment arm grow with tension."
 
     b: Float[Array, ""] = amplitude("1/N", 0.1, "1/tension")
 

@@ -16,6 +16,9 @@ class TendonFrictionCapstan(CatalogueEffect):
 
     ID: ClassVar = "tendon_friction_capstan"
     PLACE: ClassVar = "tendon"
+    HAPPENS: ClassVar = "The tendon's friction grows with the angle that it is wrapped by, so with posture."
+    LOOKS: ClassVar = "The share of tension that is lost rises as the finger flexes."
+    CHANGE: ClassVar = "Use Euler and Eytelwein's law of the wrap, or larger pulleys."
     SIZES: ClassVar = (1.0, 0.05)
 
     crossed: Float[Array, " m"]
@@ -38,6 +41,9 @@ class TendonFrictionViscous(CatalogueEffect):
 
     ID: ClassVar = "tendon_friction_viscous"
     PLACE: ClassVar = "tendon"
+    HAPPENS: ClassVar = "The tendon's friction grows with its speed."
+    LOOKS: ClassVar = "Tension is lost in fast motions, and not in slow ones."
+    CHANGE: ClassVar = "Add damping to the tendon, or another lubricant to its sheath."
 
     b: Float[Array, ""] = amplitude("N s/m", 0.04, "tension/pull")
 
@@ -56,6 +62,9 @@ class TendonFrictionPresliding(CatalogueEffect):
 
     ID: ClassVar = "tendon_friction_presliding"
     PLACE: ClassVar = "tendon"
+    HAPPENS: ClassVar = "The tendon's friction builds up over a small excursion after each reversal."
+    LOOKS: ClassVar = "Torque follows tension with rounded corners after each step back."
+    CHANGE: ClassVar = "Give the tendon a Dahl or LuGre friction with this length."
     sharp: ClassVar = True
 
     a: Float[Array, ""] = amplitude("1", 1.0, most=1.0)
@@ -94,6 +103,9 @@ class TendonFrictionSaturating(CatalogueEffect):
 
     ID: ClassVar = "tendon_friction_saturating"
     PLACE: ClassVar = "tendon"
+    HAPPENS: ClassVar = "What the tendon loses is not a straight line in its tension."
+    LOOKS: ClassVar = "The lost share falls, or rises, from low tension to high."
+    CHANGE: ClassVar = "Use a power law for the tendon's friction; record more tensions in ID.4."
 
     c: Float[Array, ""] = amplitude("1", 0.15, signed=True)
     p: Float[Array, ""] = shape("1", (0.5, 2.0), moves="by differences")
@@ -114,6 +126,9 @@ class TendonCrosstalk(CatalogueEffect):
 
     ID: ClassVar = "tendon_crosstalk"
     PLACE: ClassVar = "tendon pair"
+    HAPPENS: ClassVar = "A tendon that is pulled drags its neighbour along."
+    LOOKS: ClassVar = "A joint feels a tendon that does not cross it, in proportion to that one's tension."
+    CHANGE: ClassVar = "Separate the two paths, or add the drag to the neighbour's tension."
     SIZES: ClassVar = (1.0, 0.05)
 
     epsilon: Float[Array, ""] = amplitude("1", 0.05)

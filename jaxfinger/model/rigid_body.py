@@ -1,9 +1,9 @@
 """Rigid-body terms of equation (1) by recursive Newton–Euler (Luh, Walker, Paul 1980; Featherstone 2008, ch. 5).
 
 Every function takes joint arrays `(m, *T)` with the batch last and broadcasts over it. A 3-vector is one array
-`(3, *T)`, which compiles quickly, or a tuple of its three components, which runs quickly: every product is then one
-loop along the long axis. The recursion is the same for both. A long batch goes through by components, in blocks that
-stay in the processor's cache.
+`(3, *T)`, which compiles quickly, or a tuple of its three components, which runs quickly:
+every product is then one loop along the long axis. The recursion is the same for both. A long batch goes through by
+components, in blocks that stay in the processor's cache.
 """
 
 import functools
@@ -73,8 +73,17 @@ def _rotation(axis: Vector, angle: Scalar) -> Matrix:
     return c * identity + s * skew + (1.0 - c) * axis[:, None] * axis[None]
 
 
-BLOCK = 8192  # samples
-LONG = 32 * BLOCK  # samples from which on a faster run is worth a slower compilation
+def _spin(omega: Vector, alpha: Vector) -> Matrix:
+    """[α]ₓ + [ω]ₓ[ω]ₓ = [α]ₓ + ω ωᵀ − ω² I: what a point of a turning body accelerates by, times where it is."""
+    (x, y, z), (u, v, w) = omega, alpha
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    rows = ((-yy - zz, xy - w, xz + v), (xy + w, -xx - zz, yz - u), (xz - v, yz + u, -xx - yy))
+    return rows if isinstance(omega, tuple) else jnp.stack([jnp.stack(row) for row in rows])
+
+
+BLOCK = 1024  # samples, 8 KiB an array
+LONG = 8192  # samples from which on a run of a tenth of the time is worth half a second more to compile
+CHAIN = 3  # links that XLA may take in one loop; with each further one it computes more of them again
 
 
 class _Joint(NamedTuple):
@@ -106,16 +115,26 @@ def _frame(j: _Joint, slides: bool) -> tuple[Matrix, Vector]:
     return _rotation(j.axis, j.q), jax.tree.map(lambda a: a + jnp.zeros_like(j.q), j.origin)
 
 
-def _recursion(step, state, links, finger: Finger, unroll: bool, reverse: bool = False):
+def _recursion(step, state, links, finger: Finger, reverse: bool = False):
     """Link by link, `step(state, link, slides)`: a scan where all joints are of one kind, since it compiles faster."""
     slides = finger.prismatic
     if len(set(slides)) == 1:
-        whole = functools.partial(step, slides=slides[0])
-        return jax.lax.scan(whole, state, links, reverse=reverse, unroll=unroll)
+        return jax.lax.scan(functools.partial(step, slides=slides[0]), state, links, reverse=reverse)
+    each = [jax.tree.map(lambda a, i=i: a[i], links) for i in range(finger.m)]
+    state, out = _unrolled(step, state, each, finger, reverse)
+    return state, jax.tree.map(lambda *a: jnp.stack(a), *out)
+
+
+def _unrolled(step, state, links: list, finger: Finger, reverse: bool = False) -> tuple:
+    """Link by link, one after the other in the program."""
     out = {}
     for i in reversed(range(finger.m)) if reverse else range(finger.m):
-        state, out[i] = step(state, jax.tree.map(lambda a, i=i: a[i], links), slides[i])
-    return state, jax.tree.map(lambda *a: jnp.stack(a), *(out[i] for i in range(finger.m)))
+        if out and finger.m > CHAIN:
+            # A choice ends a loop: what a link hands on is written down, and not computed again where it is read.
+            never = finger.mass[0] < 0.0
+            state = jax.lax.cond(never, lambda s: jax.tree.map(jnp.negative, s), lambda s: s, state)
+        state, out[i] = step(state, links[i], finger.prismatic[i])
+    return state, [out[i] for i in range(finger.m)]
 
 
 @jax.jit
@@ -131,22 +150,27 @@ def _chain_dynamics(finger: Finger, q, qd, qdd) -> Float[Array, "m *T"]:
     samples = math.prod(q.shape[1:])
     if samples <= LONG:
         return _newton_euler(finger, q, qd, qdd, by_components=False)
+    count = -(-samples // BLOCK)
+    size = -(-samples // count)
 
     def blocks(a):
-        flat = jnp.pad(a.reshape(finger.m, samples), [(0, 0), (0, -samples % BLOCK)])
-        return jnp.moveaxis(flat.reshape(finger.m, -1, BLOCK), 1, 0)
+        flat = jnp.pad(a.reshape(finger.m, samples), [(0, 0), (0, count * size - samples)])
+        return jnp.moveaxis(flat.reshape(finger.m, count, size), 1, 0)
 
-    torques = jax.lax.map(lambda x: _newton_euler(finger, *x, by_components=True), (blocks(q), blocks(qd), blocks(qdd)))
-    return jnp.moveaxis(torques, 0, 1).reshape(finger.m, -1)[:, :samples].reshape(q.shape)
+    parts = (blocks(q), blocks(qd), blocks(qdd))
+    torques = jax.lax.map(lambda x: tuple(_newton_euler(finger, *x, by_components=True)), parts)
+    return jnp.stack([t.reshape(-1)[:samples] for t in torques]).reshape(q.shape)
 
 
-def _newton_euler(finger: Finger, q, qd, qdd, by_components: bool) -> Float[Array, "m *T"]:
+def _newton_euler(finger: Finger, q, qd, qdd, by_components: bool) -> Float[Array, "m *T"] | list[Scalar]:
+    """`_chain_dynamics`, joint by joint where it goes by components."""
+
     def outward(state, j: _Joint, slides: bool):
         """Angular velocity ω, angular and linear acceleration α, a of the link's frame, in that frame."""
         omega, alpha, a = state
         R, p = _frame(j, slides)
         back = _transposed(R)
-        a = _mul(back, _add(a, _cross(alpha, p), _cross(omega, _cross(omega, p))))
+        a = _mul(back, _add(a, _mul(_spin(omega, alpha), p)))
         omega, alpha = _mul(back, omega), _mul(back, alpha)
         rate = _scale(j.qd, j.axis)
         change = _add(_scale(j.qdd, j.axis), _cross(omega, rate))
@@ -154,7 +178,7 @@ def _newton_euler(finger: Finger, q, qd, qdd, by_components: bool) -> Float[Arra
             a = _add(a, change, _cross(omega, rate))
         else:
             omega, alpha = _add(omega, rate), _add(alpha, change)
-        force = _scale(j.mass, _add(a, _cross(alpha, j.com), _cross(omega, _cross(omega, j.com))))
+        force = _scale(j.mass, _add(a, _mul(_spin(omega, alpha), j.com)))
         moment = _add(_mul(j.inertia, alpha), _cross(omega, _mul(j.inertia, omega)), _cross(j.com, force))
         return (omega, alpha, a), (R, p, force, moment)
 
@@ -171,9 +195,12 @@ def _newton_euler(finger: Finger, q, qd, qdd, by_components: bool) -> Float[Arra
     if by_components:
         zero, upward = tuple(zero), tuple(upward)
     joints = _joints(finger, q, qd, qdd, by_components)
-    _, links = _recursion(outward, (zero, zero, upward), joints, finger, unroll=by_components)
-    _, torques = _recursion(inward, (zero, zero), (joints, links), finger, unroll=by_components, reverse=True)
-    return torques
+    if by_components:
+        each = [jax.tree.map(lambda a, i=i: a[i], joints) for i in range(finger.m)]
+        _, links = _unrolled(outward, (zero, zero, upward), each, finger)
+        return _unrolled(inward, (zero, zero), list(zip(each, links, strict=True)), finger, reverse=True)[1]
+    _, links = _recursion(outward, (zero, zero, upward), joints, finger)
+    return _recursion(inward, (zero, zero), (joints, links), finger, reverse=True)[1]
 
 
 def gravity_torque(finger: Finger, q: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
@@ -213,7 +240,7 @@ def fingertip(finger: Finger, q: Float[Array, "m *T"]) -> tuple[Float[Array, "3 
     zero = jnp.zeros((3, *q.shape[1:]))
     base = (jnp.eye(3).reshape(3, 3, *(1,) * (q.ndim - 1)) + zero[None], zero)
     joints = _joints(finger, q, q, q, by_components=False)
-    (R, p), links = _recursion(outward, base, joints, finger, unroll=False)
+    (R, p), links = _recursion(outward, base, joints, finger)
     axes, places = (jnp.asarray(a) for a in links)
     tip = jnp.asarray(_add(p, _mul(R, finger.fingertip.reshape(3, *(1,) * (q.ndim - 1)))))
     slides = jnp.array(finger.prismatic, dtype=float).reshape(-1, *(1,) * q.ndim)

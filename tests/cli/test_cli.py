@@ -227,3 +227,14 @@ def test_a_terminal_of_ascii_and_a_library_that_warns():
     done = subprocess.run(run_it, capture_output=True, env=os.environ | {"PYTHONIOENCODING": "ascii"}, check=True)
     assert done.stdout.rstrip().endswith(b"? = 1 ?N")
     assert done.stderr == b""
+
+
+def test_effects_lists_the_catalogue_and_prints_one_in_full(capsys):
+    assert run("effects") == 0
+    assert "joint_backlash" in capsys.readouterr().out
+    assert run("effects", "joint_backlash") == 0
+    said = capsys.readouterr().out
+    assert "dead zone" in said
+    assert "width" in said
+    assert run("effects", "joint_backlas") == 2
+    assert "did you mean 'joint_backlash'" in capsys.readouterr().err

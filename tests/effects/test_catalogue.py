@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, from_dict, load, nominal_terms, to_dict
+from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, Scales, from_dict, load, nominal_terms, to_dict
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import EXPERIMENTS, predict, shows
+from jaxfinger.experiments import EXPERIMENTS, Batch, predict, shows
 from jaxfinger.identify.parameters import describe, units_at
 from jaxfinger.model import (
     excursion,
@@ -205,3 +205,48 @@ def test_a_file_without_effects_is_refused(tmp_path, content, complaint):
 def test_an_unknown_parameter_is_refused():
     with pytest.raises(TypeError, match="no parameter"):
         CATALOGUE["payload"].at(FINGER, ("MCP",), weight=1.0)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_effect_says_what_happens_what_it_looks_like_and_what_to_change(name):
+    kind = EVERY[name]
+    said = [kind.HAPPENS, kind.LOOKS, kind.CHANGE, kind.__doc__]
+    assert all(len(text.split()) > 4 for text in said)
+    assert len(set(said)) == 4
+
+
+def test_the_same_machine_in_other_units_has_the_same_catalogue():
+    """Masses and torques a thousandth, lengths ten times, times twice: sizes and shapes go with them."""
+    x, y = MOTIONS[0]
+    force = 1e-3 / 10.0
+    unit = {"mass": 1e-3, "torque": 1e-3, "length": 10.0, "time": 2.0}
+    other = replace(
+        x,
+        time=2.0 * x.time,
+        session_time=2.0 * x.session_time,
+        qd=x.qd / 2.0,
+        qdd=x.qdd / 4.0,
+        tension=force * x.tension,
+    )
+    torques = {"joint_torque": 1e-3 * y["joint_torque"], "tendon_excursion": 10.0 * y["tendon_excursion"]}
+    lengths = {n: 10.0 * getattr(FINGER, n) for n in ("origin", "com", "fingertip")}
+    finger = replace(FINGER, mass=1e-3 * FINGER.mass, **lengths)
+    ones = jax.tree.map(jnp.ones_like, torques)
+    before, after = Scales.of(FINGER, [Batch(x, y, ones)]), Scales.of(finger, [Batch(other, torques, ones)])
+    exponents = {
+        "torque": {"torque": 1}, "angle": {}, "speed": {"time": -1}, "acceleration": {"time": -2}, "mass": {"mass": 1},
+        "tension": {"torque": 1, "length": -1}, "excursion": {"length": 1}, "pull": {"length": 1, "time": -1},
+        "length": {"length": 1}, "trial": {"time": 1}, "session": {"time": 1},
+    }  # fmt: skip
+    for name, powers in exponents.items():
+        factor = np.prod([unit[u] ** p for u, p in powers.items()])
+        np.testing.assert_allclose(getattr(after, name), factor * getattr(before, name), rtol=1e-12, err_msg=name)
+
+
+def test_a_scale_is_a_product_at_its_site():
+    first, second = FINGER.joint_names[:2]
+    assert SCALES("torque/speed", (first,)) == pytest.approx(SCALES.torque[0] / SCALES.speed[0])
+    assert SCALES("1/tension", (FINGER.tendon_names[1],)) == pytest.approx(1.0 / SCALES.tension[1])
+    assert SCALES("torque", (first, second)) == pytest.approx(SCALES.torque[:2].min())
+    assert SCALES("torque", ("base",)) == pytest.approx(SCALES.torque.max())
+    assert SCALES("1", (first,)) == 1.0

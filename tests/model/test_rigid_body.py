@@ -74,11 +74,12 @@ def test_the_batch_is_any_number_of_last_axes():
     np.testing.assert_allclose(mapped, whole, rtol=1e-13)
 
 
-def test_blocks_of_a_long_batch_join_seamlessly():
-    finger = Finger.from_description(description(3, 3))
-    n = 5 * rigid_body.BLOCK + 17
-    q, qd, qdd = np.random.default_rng(4).uniform(-1, 1, (3, 3, 2, n))
+@pytest.mark.parametrize("m", [3, rigid_body.CHAIN + 1])
+def test_blocks_of_a_long_batch_join_seamlessly(m):
+    finger = Finger.from_description(description(3, m))
+    n = rigid_body.LONG + 17
+    q, qd, qdd = np.random.default_rng(4).uniform(-1, 1, (3, m, 2, n))
     whole = rigid_body.inverse_dynamics(finger, q, qd, qdd)
-    for k in (0, rigid_body.BLOCK - 1, rigid_body.BLOCK, n - 1):
+    for k in (0, 1, n // 2, n - 1):
         one = rigid_body.inverse_dynamics(finger, q[..., k], qd[..., k], qdd[..., k])
         np.testing.assert_allclose(whole[..., k], one, rtol=1e-12, atol=1e-15)
