@@ -57,7 +57,7 @@ def diagnose(
     from jaxfinger.identify import read_recipe
     from jaxfinger.report.diagnosis_page import summary, write_page
 
-    with progress("diagnose") as say:
+    with progress("first look" if quick else "diagnose") as say:
         wanted = read_recipe(recipe)
         own = load(effects) if effects is not None else {}
         say("reading the file")
