@@ -18,7 +18,7 @@ from jaxfinger.rig.trips import Drift
 
 EPOCH_NS = 946_684_800 * 10**9  # 2000-01-01 in Unix time: where a controller's clock starts
 KEEP = 3000  # blocks that a busy runner may lag behind
-JOIN_S = 3.0  # that a reader which hangs in a call is waited for
+JOIN_S = 1.0  # that a reader which hangs in a call is waited for
 
 
 class Reader:
