@@ -167,19 +167,6 @@ def test_a_joint_that_runs_beyond_its_stop_is_let_go_in_the_right_order(lockstep
     assert np.abs(tension[900:]).max() < 0.1  # off
 
 
-def test_heartbeat_loss_releases_the_finger():
-    """A host that dies while armed: the controller lets go by itself."""
-    with standin.running(speed=1.0, heartbeat=0.5) as where:
-        rig = ads_rig(where)
-        rig.connect()
-        rig.arm()
-        until = rig.status().head + 60_000
-        while rig.status().state is not State.TRIPPED:  # status alone is no heartbeat
-            assert rig.status().head < until
-        assert rig.status().trip is Trip.HEARTBEAT
-        rig.close()
-
-
 def test_nobody_there(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -257,17 +244,6 @@ def test_a_session_over_the_wire(lockstep, record):
         np.testing.assert_allclose(np.diff(trial.time), 1e-3, atol=1e-9)
 
 
-@pytest.mark.parametrize("fault", ["stall", "restart", "nan"])
-def test_faults_over_the_wire_end_the_trial_and_keep_it(lockstep, record, fault):
-    rig = ads_rig(lockstep, stale_s=1.0)
-    outcome = record(rig, lambda r: r.inject(fault, 8))
-    assert outcome.cause
-    assert outcome.complete == ("01-ID.2-DIP",)
-    cut = read_session(outcome.session)["02-ID.4-T3-MCP"]
-    assert not cut.complete
-    assert len(cut.time) > 100
-
-
 def test_the_controllers_own_trip_ends_the_trial_with_its_cause(lockstep, record):
     """A rig file that knows no stop before 170°: the host sees nothing wrong when a tendon pulls the MCP past 92°."""
     rig = ads_rig(lockstep)
@@ -285,18 +261,13 @@ def test_the_controllers_own_trip_ends_the_trial_with_its_cause(lockstep, record
     assert [(e["kind"], "joint beyond its limits" in e["text"]) for e in events] == [("trip", True)]
 
 
-@pytest.mark.parametrize(
-    ("channel", "amount", "trip"),
-    [(("tension", "T1"), 4.0, Trip.TRACKING), (("motor_temperature", "T2"), 45.0, Trip.TEMPERATURE)],
-    ids=["tracking", "temperature"],
-)
-def test_a_limit_that_only_the_host_has_latches_the_controller_over_the_wire(lockstep, record, channel, amount, trip):
+def test_a_limit_that_only_the_host_has_latches_the_controller_over_the_wire(lockstep, record):
     rig = ads_rig(lockstep)
-    slot = rig.description.channels[rig.description.index(*channel)].slot
-    outcome = record(rig, lambda r: r.inject("spike", slot, amount=amount))
-    assert trip.sentence in outcome.cause
+    slot = rig.description.channels[rig.description.index("tension", "T1")].slot
+    outcome = record(rig, lambda r: r.inject("spike", slot, amount=4.0))
+    assert Trip.TRACKING.sentence in outcome.cause
     with h5py.File(outcome.session) as file:
-        assert file["trials/02-ID.4-T3-MCP"].attrs["trip"] == trip
+        assert file["trials/02-ID.4-T3-MCP"].attrs["trip"] == Trip.TRACKING
         events = [json.loads(e) for e in file["rig/events"].asstr()[()]]
         assert [e["kind"] for e in events] == ["stop"]
         assert events[0]["text"] in outcome.cause
@@ -304,7 +275,7 @@ def test_a_limit_that_only_the_host_has_latches_the_controller_over_the_wire(loc
     assert held == 0.0  # released, and still recorded
     with ads_rig(lockstep) as rig:
         status = rig.status()
-        assert (status.state, status.trip) == (State.TRIPPED, trip)
+        assert (status.state, status.trip) == (State.TRIPPED, Trip.TRACKING)
         with pytest.raises(CommandRefused, match="in state TRIPPED"):
             rig.arm()
 
