@@ -28,6 +28,7 @@ from jaxfinger.rig.backend import (
 from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.ams import AmsServer
+from jaxfinger.rig.simulated.controller import Controller
 from tests.rig.conftest import ads_rig
 
 
@@ -173,6 +174,29 @@ def test_nobody_there(tmp_path):
         port = free.getsockname()[1]
     with pytest.raises(ConnectionLost, match="route back"):
         ads_rig(f"127.0.0.1:{port}").connect()
+
+
+def test_a_connection_that_is_closed_while_it_opens_is_opened_again(monkeypatch):
+    """As by a router that still hangs up on the program that was killed a moment ago."""
+    controller, lock, serve, hung_up = Controller(), threading.Lock(), AmsServer._serve, []
+
+    def hang_up(self, client):
+        if len(hung_up) < 2:
+            hung_up.append(client)
+            client.recv(1)
+            client.close()
+        else:
+            serve(self, client)
+
+    monkeypatch.setattr(AmsServer, "_serve", hang_up)
+    places = {f"GVL_Jaxfinger.{name}": place for name, place in controller.place.items()}
+    server = AmsServer(controller.memory, places, lock)
+    try:
+        with ads_rig(f"127.0.0.1:{server.port}") as rig:
+            assert rig.status().state is State.IDLE
+        assert len(hung_up) == 2
+    finally:
+        server.close()
 
 
 def test_a_program_without_the_symbols_is_refused():

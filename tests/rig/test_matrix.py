@@ -50,12 +50,11 @@ def test_the_documents_table_is_the_matrix(rig, results):
     assert table(rig, results) in RECORDING.read_text(encoding="utf-8")
 
 
-CELLS = [  # each row once, in one of the phases, at one of the sizes: poll_s of 1 ms is a sample or two a block
+CELLS = [  # kinds of rows, in one of the phases, at one of the sizes: poll_s of 1 ms is a sample or two a block
     Cell("disk"), Cell("stall"), Cell("call"), Cell("reader"), Cell("runner"), Cell("watch"), Cell("cut"),
     Cell("deaf"), Cell("lag"), Cell("slow"), Cell("full"), Cell("restart"), Cell("nan", "letting go"),
-    Cell("key", "ramp"), Cell("flicker", "ramp", 0.001), Cell("temperature", "hold", 0.01, ("delay=0.04",)),
+    Cell("key", "ramp"), Cell("flicker", "ramp", 0.001), Cell("temperature", "hold", 0.01, ("delay=0.01",)),
     Cell("clock frozen", "hold", 0.002), Cell("clock slow", "ramp", 0.01), Cell("clock fast", "arming"),
-    Cell("clock jump", "hold", 0.002), Cell("state", "hold"),
 ]  # fmt: skip
 LANES = 3  # at a time: each sleeps most of the time
 
