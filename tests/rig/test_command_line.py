@@ -300,7 +300,7 @@ def test_a_host_that_is_stopped_or_killed_holds_no_tension(tmp_path, end):
 @pytest.mark.parametrize(
     ("fault", "says"),
     [
-        ("watchdog=3600", "line 1: 'heartbeat_s' may be 0.25 on the controller, which runs 3600; mend stLimits there"),
+        ("watchdog=3600", "controller.heartbeat_s: may be 0.25 on the controller, which runs 3600; mend stLimits"),
         ("clock-rate=0.01", "nothing was armed: the controller's clock"),
     ],
 )
