@@ -165,7 +165,7 @@ def test_a_stage_at_a_time(folder, tmp_path, capsys):
         (("identify", "{f}/emps.h5", "-o", "{t}/x.json", "--recipe", "none.toml"), "none.toml"),
         (("identify", "{f}/emps.h5", "-o", "{f}/fit.json"), "--overwrite"),
         (("identify", "{f}/emps.h5", "-o", "{t}/no/x.json"), "is no folder"),
-        (("show", "{f}/emps.h5"), "is not a fit"),
+        (("show", "{f}/emps.h5"), "no fit"),
         (("validate", "{f}/fit.json", "{f}/emps.h5", "-e", "VD.1"), "has no trial of VD.1"),
         (("predict", "{f}/fit.json", "{f}/emps.h5", "-o", "{f}/emps.h5"), "not overwritten"),
         (("fit", "id3", "{f}/emps.h5", "-o", "{t}/x.json", "--start", "{f}/fit.json", "--recipe", "emps"), "--start"),
