@@ -14,12 +14,15 @@ import numpy as np
 
 from jaxfinger.data import Session, import_file, read_session
 from jaxfinger.gap import diagnose
-from jaxfinger.gap.evidence import Projector
+from jaxfinger.gap.columns import Columns
+from jaxfinger.gap.exact import Whitened
+from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem, build
 from jaxfinger.gap.propose import Proposal, terms
 from jaxfinger.gap.signatures import whitened
 from jaxfinger.identify import Fit, read_recipe
 from jaxfinger.identify.validate import validate
+from jaxfinger.report.sentences import summary
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "datasets/emps"
@@ -46,10 +49,11 @@ def gain(proposal: Proposal, problem: Problem) -> tuple[float, float]:
     """By how much the proposal must be multiplied to fit another recording, and the standard deviation of that."""
     ((experiment, rows),) = problem.rows.items()
     library = dict(terms(problem, experiment, proposal.channel, 0))
-    raw = sum(a * library[text] for a, text in proposal.terms)
-    projector = Projector(problem)
+    raw = np.sum([a * library[text] for a, text in proposal.terms], axis=0)
+    columns = Columns.of(problem)
+    projector = Whitened(problem, columns, Weights(*np.ones((3, len(columns.items)))))
     z = projector(whitened(raw[None, None], problem, rows, np.arange(rows.size), proposal.channel))[0]
-    r = projector.residual(problem)
+    r = projector.residual(problem.r)
     fitted = float(z @ r / (z @ z))
     scale = np.sqrt(np.sum((r - fitted * z) ** 2) / r.size)  # what else remains is no white noise
     return fitted, float(scale / np.linalg.norm(z))
@@ -64,19 +68,19 @@ def main() -> None:
 def report(estimation: Session, pulses: Session) -> None:
     """Print what is named, its value, the shrinkage on the pulses, and the gain of what remains there."""
     withheld = diagnose(estimation, read_recipe(ROOT / "fits/emps-no-coulomb.toml"))
-    (key,) = withheld.verdict.effects
-    lines = [line for line in withheld.augmented.table() if str(line["name"]).startswith(key[0])]
-    print(withheld.verdict.summary)
+    (key,) = withheld.named
+    lines = [line for line in withheld.augmented.table() if str(line["name"]).startswith(key.effect)]
+    print(summary(withheld))
     for line in lines:
         print(f"{line['name']}: {line['value']:.2f} ± {line['std']:.2f} {line['units']} (published {PUBLISHED})")
     full = read_recipe(ROOT / "fits/emps.toml")
     known = diagnose(estimation, full)
     before, after, best = (rms(f, pulses) for f in (withheld.nominal, withheld.augmented, known.nominal))
-    print(f"pulses: {before:.2f} N before, {after:.2f} N with {key[0]}, {best:.2f} N where nothing was withheld")
+    print(f"pulses: {before:.2f} N before, {after:.2f} N with {key.effect}, {best:.2f} N where nothing was withheld")
     print(f"closed on the pulses: {100 * (before**2 - after**2) / (before**2 - best**2):.1f} % of what it can close")
-    print(known.verdict.summary)
-    if known.proposal:
-        value, std = gain(known.proposal, build(pulses, full))
+    print(summary(known))
+    if proposal := known.unexplained.proposal:
+        value, std = gain(proposal, build(pulses, full))
         print(f"on the pulses the proposal has a gain of {value:.2f} ± {std:.2f}")
 
 

@@ -44,7 +44,7 @@ def errors(fit: Fit, session: Session) -> tuple[np.ndarray, np.ndarray]:
 
 def main() -> None:
     """One line a folder."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folders", nargs="+", type=Path)
     print(f"{'':24s} rms error, N mm: within {1e3 * NEAR:.0f} ms of a reversal, elsewhere")
     for folder in parser.parse_args().folders:

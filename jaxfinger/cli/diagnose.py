@@ -21,6 +21,7 @@ def diagnose(
     predictions: Path | None = None,
     effects: Path | None = None,
     without: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
+    tolerance: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
     quick: bool = False,
     json: bool = False,
     overwrite: bool = False,
@@ -42,29 +43,33 @@ def diagnose(
         A Python file with effects of your own, beside those of the catalogue.
     without
         Effects of the catalogue to leave out, by id.
+    tolerance
+        Gaps that do not matter: a share of the channel's signal, for all channels (`2%`) or one (`joint_torque=5%`).
     quick
-        A first look: half the samples, few refits, one effect.
+        A first look: half the samples, and no fit of causes and model together.
     json
         Print gap.json, and nothing else, on stdout.
     overwrite
         Replace an earlier diagnosis in the folder.
     """
     _refuse(output, overwrite)
+    tolerated = _tolerance(tolerance or [])
     from jaxfinger.data import read_predictions
     from jaxfinger.effects import load
     from jaxfinger.gap import diagnose as run
-    from jaxfinger.gap import write
     from jaxfinger.identify import read_recipe
-    from jaxfinger.report.diagnosis_page import summary, write_page
+    from jaxfinger.report.gap_json import write
+    from jaxfinger.report.page import write_page
+    from jaxfinger.report.screen import summary
 
-    with progress("first look" if quick else "diagnose") as say:
+    with progress("diagnose") as say:
         wanted = read_recipe(recipe)
         own = load(effects) if effects is not None else {}
         say("reading the file")
         simulated = read_predictions(predictions) if predictions is not None else None
         measured = read(session)
         _make(output)
-        found = run(measured, wanted, quick, own, tuple(without or ()), say, simulated)
+        found = run(measured, wanted, quick, own, tuple(without or ()), say, simulated, tolerated)
         say("writing the report")
         write(found, output, overwrite)
         write_page(found, output / "report.html", overwrite)
@@ -73,6 +78,22 @@ def diagnose(
         return
     console().print(plain(summary(found)), markup=False, soft_wrap=True)
     print(f"\n{output / 'report.html'}: the evidence")
+
+
+def _tolerance(texts: list[str]) -> dict[str, float]:
+    """Shares of a signal by channel."""
+    channels, out = ("joint_torque", "tendon_excursion", "fingertip_force"), {}
+    for text in texts:
+        channel, _, share = text.rpartition("=")
+        try:
+            value = float(share.removesuffix("%")) / (100.0 if share.endswith("%") else 1.0)
+        except ValueError:
+            value = -1.0
+        if not 0.0 <= value < 1.0 or (channel and channel not in channels):
+            known = ", ".join(channels)
+            raise UserError(f"--tolerance {text}: say a share such as 2%, or joint_torque=5%; channels: {known}")
+        out |= dict.fromkeys([channel] if channel else channels, value)
+    return out
 
 
 def _refuse(output: Path, overwrite: bool) -> None:

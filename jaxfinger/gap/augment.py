@@ -12,14 +12,16 @@ from jaxtyping import Float, Int
 
 from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.experiments import shows
+from jaxfinger.gap.exact import State, Whitened
+from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem, assemble, moved
-from jaxfinger.gap.refine import Refined, derivatives_by_name, nominal_step
+from jaxfinger.gap.result import Value
 from jaxfinger.gap.signatures import Signatures
 from jaxfinger.identify import Fit
 from jaxfinger.identify.fit import StageReport
 from jaxfinger.identify.misfit import growth, pulls
 from jaxfinger.identify.parameters import describe, ravel, units_at
-from jaxfinger.identify.solve import Prior, Solution, Source, missed_each, solve
+from jaxfinger.identify.solve import Prior, Solution, Source, linearise_each, missed_each, solve
 from jaxfinger.model import Model
 
 WITH_EFFECTS = "with the effects of the diagnosis"
@@ -42,30 +44,44 @@ def nominal_fit(problem: Problem) -> Fitted:
     return Fitted(fit, problem.r, problem.J, partial(missed_by, problem.sources))
 
 
-def augmented_fit(problem: Problem, chosen: Refined) -> Fitted:
-    """Nominal parameters, amplitudes and moving shapes, fitted exactly, with their covariance."""
-    model, moving = _with_effects(problem.nominal, chosen)
+def augmented_fit(problem: Problem, chosen: State, hold: bool = False) -> Fitted:
+    """Nominal parameters, amplitudes and moving shapes, fitted exactly, with their covariance.
+
+    With `hold` the causes stay where the formula has put them, since what is open would pull at them; the nominal
+    parameters alone are refitted.
+    """
+    model, moving = _with_effects(chosen.problem.nominal, chosen.effects)
     free, prior = np.concatenate([problem.free, moving]), _prior(problem, model, moving)
-    sources = {e: _seeing_effects(problem, s, chosen, moving, e) for e, s in problem.sources.items()}
-    fitted, solution = solve(model, free, sources, prior, limits=limits(model, free, problem.scales))
-    r, J = assemble(solution.linearised, sources, problem.rows, free, ravel(model).size)
-    fit = _fit(problem, fitted, free, _covariance(problem, r, J, prior.root), r, WITH_EFFECTS, solution)
+    sources = {e: _seeing_effects(problem, s, chosen.effects, moving, e) for e, s in problem.sources.items()}
+    if hold:
+        fitted, solution = solve(model, problem.free, sources, problem.prior)
+        linearised = linearise_each(fitted, sources)
+    else:
+        fitted, solution = solve(model, free, sources, prior, limits=limits(model, free, problem.scales))
+        linearised = solution.linearised
+    r, J = assemble(linearised, sources, problem.rows, free, ravel(model).size)
+    fit = _fit(problem, fitted, free, _covariance(problem, r, J, prior.root, chosen), r, WITH_EFFECTS, solution)
     return Fitted(fit, r, J, partial(missed_by, sources))
 
 
-def as_refitted(problem: Problem, chosen: Refined) -> Fitted:
-    """The same for one effect where its refit has led (`relinearised`): with no fit of its own, and by the programs of
-    the nominal model and of signatures, which are compiled already. Its intervals leave out the products of the effect
-    with the nominal parameters.
+def as_refitted(problem: Problem, chosen: State) -> Fitted:
+    """The same where the search has led, with no fit of its own, and by the programs of the nominal model and of
+    signatures, which are compiled already. Its intervals leave out the products of effects with the nominal parameters.
     """
-    there = moved(problem, nominal_step(problem, problem.r - chosen.change))
-    r = there.r - chosen.change
-    model, moving = _with_effects(there.nominal, chosen)
-    columns, fields = derivatives_by_name(chosen), [p.name.split()[-1] for p in describe(model)]
-    moving = np.array([i for i in moving if fields[i] in columns])
-    J = np.column_stack([there.J, *(columns[fields[i]] for i in moving)])
+    ones = Weights(*np.ones((3, len(chosen.columns.items))))
+    there = moved(chosen.problem, Whitened(chosen.problem, chosen.columns, ones).nominal_step(chosen.r))
+    model, moving = _with_effects(there.nominal, chosen.effects)
+    labels = [p.name for p in describe(model)]
+    columns = {}
+    for c, column in zip(chosen.coordinates, chosen.slopes, strict=True):
+        effect = chosen.effects[c.effect]
+        unit = c.unit if c.shifts else float(getattr(effect, c.name))
+        columns[f"{effect.ID} {'-'.join(effect.site)} {c.name}"] = column / unit
+    moving = np.array([i for i in moving if labels[i] in columns], int)
+    r = there.r - chosen.changes.sum(axis=0)
+    J = np.column_stack([there.J, *(columns[labels[i]] for i in moving)])
     free, prior = np.concatenate([problem.free, moving]), _prior(problem, model, moving)
-    fit = _fit(problem, model, free, _covariance(problem, r, J, prior.root), r, WITH_EFFECTS)
+    fit = _fit(problem, model, free, _covariance(problem, r, J, prior.root, chosen), r, WITH_EFFECTS)
     return Fitted(fit, r, J, partial(_missed_apart, problem))
 
 
@@ -75,20 +91,21 @@ def missed_by(sources: dict[str, Source], model: Model) -> Missed:
 
 
 def _missed_apart(problem: Problem, model: Model) -> Missed:
-    """Of a model with one effect, by the programs of its nominal part and of the effect's signature."""
+    """Of a model with effects, by the programs of its nominal part and of their signatures."""
     nominal = eqx.tree_at(lambda m: m.effects, model, (), is_leaf=lambda v: isinstance(v, tuple))
     missed = missed_by(problem.sources, nominal)
     predicted = {(e, c): np.asarray(problem.sources[e].batch.y[c]) - x for (e, c), x in missed.items()}
     there = replace(problem, nominal=nominal, predicted=predicted)
     effects = [e for e in model.effects if isinstance(e, CatalogueEffect)]
-    for e, c, change in Signatures(there).changes(effects):
-        missed[e, c] = missed[e, c] - change[0]
+    for effect in effects:
+        for e, c, change in Signatures(there).changes([effect]):
+            missed[e, c] = missed[e, c] - change[0]
     return missed
 
 
-def _with_effects(nominal: Model, chosen: Refined) -> tuple[Model, Int[np.ndarray, " k"]]:
+def _with_effects(nominal: Model, effects: tuple[CatalogueEffect, ...]) -> tuple[Model, Int[np.ndarray, " k"]]:
     """The model, and which of its effects' parameters a fit moves."""
-    model = eqx.tree_at(lambda m: m.effects, nominal, chosen.effects, is_leaf=lambda v: isinstance(v, tuple))
+    model = eqx.tree_at(lambda m: m.effects, nominal, effects, is_leaf=lambda v: isinstance(v, tuple))
     parameters, moves = describe(model), np.asarray(ravel(_on_effects(_moves, model)))
     first = ravel(nominal).size
     moving = [i for i in range(first, len(parameters)) if parameters[i].determinable and moves[i]]
@@ -152,15 +169,22 @@ def _widths(scales: Scales, effect: CatalogueEffect) -> CatalogueEffect:
     return replace(effect, **{n: jnp.asarray(w, dtype=float) for n, w in (amplitudes | factors | places).items()})
 
 
-def _seeing_effects(problem: Problem, source: Source, chosen: Refined, moving, experiment: str) -> Source:
+def _seeing_effects(problem: Problem, source: Source, effects: tuple[CatalogueEffect, ...], moving, experiment: str):
     """The source, reading the effects' parameters too where one of them shows."""
-    if not any(experiment in shows(type(e), problem.nominal.finger) for e in chosen.effects):
+    if not any(experiment in shows(type(e), problem.nominal.finger) for e in effects):
         return source._replace(effects=False)
     return source._replace(positions=np.union1d(source.positions, moving).astype(int))
 
 
-def _covariance(problem: Problem, r: np.ndarray, J: np.ndarray, root: np.ndarray) -> Float[np.ndarray, "p p"]:
-    """Laplace's, wider where the residuals pull a parameter to and fro by more than the noise explains."""
+def _covariance(
+    problem: Problem, r: np.ndarray, J: np.ndarray, root: np.ndarray, chosen: State | None = None
+) -> Float[np.ndarray, "p p"]:
+    """Laplace's, in the weights of the formula where there are causes, and wider where the residuals pull a parameter
+    to and fro by more than the noise explains.
+    """
+    if chosen is not None:
+        project = Whitened(problem, chosen.columns, chosen.judged.weights)
+        r, J = project.white(r[None])[0], project.white(J.T).T
     information = J.T @ J + root.T @ root
     diagonal = np.diag(information)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
@@ -190,13 +214,11 @@ def _fit(problem: Problem, model: Model, free, block, r, what: str, solution: So
     )
 
 
-def parameter_values(fit: Fit, index: int) -> dict[str, dict]:
-    """Value, std and units of every parameter of the fit's effect number `index`."""
+def values_of(fit: Fit, index: int) -> tuple[Value, ...]:
+    """Every parameter of the fit's effect number `index`."""
     effect = fit.model.effects[index]
     assert isinstance(effect, CatalogueEffect)
     label = f"{effect.ID} {'-'.join(effect.site)} "
     std = {p.name: s for p, s in zip(describe(fit.model), fit.std, strict=True)}
     units = units_at(fit.model.finger, type(effect), effect.site)
-    return {
-        n: {"value": v, "std": float(std.get(label + n, 0.0)), "units": units[n]} for n, v in effect.values().items()
-    }
+    return tuple(Value(effect.site, n, v, float(std.get(label + n, 0.0)), units[n]) for n, v in effect.values().items())

@@ -1,59 +1,66 @@
-"""Diagnose the sim-to-real gap of a session: where, which effect, how far it shrinks, what next; and write it down."""
+"""Diagnose the sim-to-real gap of a session: where, which causes, how far it shrinks, what next; as data."""
 
-import json
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxfinger.data import Predictions, Session
-from jaxfinger.data.atomic import atomic_path
+from jaxfinger.data.schema import channel_units
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError, did_you_mean
-from jaxfinger.gap.augment import Fitted, as_refitted, augmented_fit, nominal_fit, parameter_values
-from jaxfinger.gap.evidence import Projector
-from jaxfinger.gap.next_experiment import NextExperiment, next_experiment
-from jaxfinger.gap.problem import Problem, build
-from jaxfinger.gap.propose import Proposal, propose
-from jaxfinger.gap.refine import Refined, at_optimum, refine
-from jaxfinger.gap.search import DETECT, Search, search, start_of
-from jaxfinger.gap.shrinkage import Shrinkage, contradicts, shrinkage
-from jaxfinger.gap.signatures import Signatures, catalogue_for
-from jaxfinger.gap.standin import energy_left
-from jaxfinger.gap.where import Place, where
+from jaxfinger.experiments import not_judged
+from jaxfinger.gap.augment import Fitted, as_refitted, augmented_fit, nominal_fit, values_of
+from jaxfinger.gap.budget import A_GAP, Budget, budget, held_out_gains
+from jaxfinger.gap.closure import closures
+from jaxfinger.gap.exact import Bench, State, Whitened
+from jaxfinger.gap.formula import Parameters, Weights, unexplained
+from jaxfinger.gap.next_experiment import next_experiment
+from jaxfinger.gap.posterior import Posterior, posterior
+from jaxfinger.gap.problem import Problem, build, site
+from jaxfinger.gap.propose import propose
+from jaxfinger.gap.result import (
+    Absorbed,
+    Candidate,
+    Cause,
+    Change,
+    Channel,
+    ChannelBudget,
+    Diagnosis,
+    Key,
+    Left,
+    NextExperiment,
+    NotJudged,
+    Reason,
+    Relevance,
+    Status,
+    Unexplained,
+    Value,
+)
+from jaxfinger.gap.screening import Screening
+from jaxfinger.gap.sets import Offered, Search, Table, table_of
+from jaxfinger.gap.signatures import catalogue_for, variants
+from jaxfinger.gap.standin import Explained, explained
+from jaxfinger.gap.where import where
 from jaxfinger.identify import Fit, Recipe
-from jaxfinger.identify.fit_file import save_fit
 from jaxfinger.identify.parameters import describe, ravel, units_at
 from jaxfinger.identify.stages import Progress
 
-MOST_IN_A_SET = 3
 COARSE = 2  # times as long averages in a first look
-FIRST_LOOK = " This is a first look, for one effect, at half the samples."
-UNSEEN = 10.0  # plausible sizes: the stated deviation of an amplitude that the trials do not see at all
+NEARLY = 0.99  # of a signature that the nominal parameters imitate, from which on a cause is called absorbed
+DEPENDS = 0.2  # share of what is left that a variable must carry to be named
+HELD_OUT = 12  # candidates beside the named ones, the likeliest, that are tried on held-out trials
+CONTRADICTED = 3.0  # standard deviations by which a simulator's parameter must be off
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is the matter."""
+    """What the posterior says in a word, and whom it names."""
 
-    status: str  # no_gap, explained, ambiguous, unexplained
-    effects: tuple[tuple[str, tuple[str, ...]], ...]
-    summary: str
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """Everything that a report shows."""
-
-    problem: Problem
-    verdict: Verdict
-    where: list[Place]
-    search: Search
-    shrinkage: list[Shrinkage]
-    next: NextExperiment | None
-    nominal: Fit
-    augmented: Fit
-    proposal: Proposal | None = None  # a closed form for what no known effect explains
+    status: Status
+    named: tuple[tuple[str, tuple[str, ...]], ...]
 
 
 def diagnose(
@@ -64,12 +71,14 @@ def diagnose(
     without: tuple[str, ...] = (),
     progress: Progress = lambda message: None,
     predictions: Predictions | None = None,
+    tolerance: Mapping[str, float] | None = None,
 ) -> Diagnosis:
     """Diagnose a session. `effects` adds a user's own, `without` withholds some of the catalogue by id.
 
-    With `predictions` the gap is that between the measurements and another simulator's predictions.
+    With `predictions` the gap is that between the measurements and another simulator's predictions. `tolerance`: by
+    channel, the share of its signal up to which a gap does not matter.
     """
-    recipe = recipe or Recipe()
+    recipe, tolerance = recipe or Recipe(), dict(tolerance or {})
     catalogue = catalogue_for(recipe, effects)
     if unknown := set(without) - set(catalogue):
         raise UserError(
@@ -78,250 +87,266 @@ def diagnose(
             f"it has {', '.join(sorted(catalogue))}"
         )
     problem = build(session, recipe, progress, predictions, COARSE if quick else 1)
+    bench = Bench.of(problem, Parameters())
     kept = set(problem.fit.recipe.model.terms) | set(without)
     catalogue = {k: c for k, c in catalogue.items() if k not in kept}
     progress("reading the signatures of all effects")
-    found = search(problem, catalogue, quick, progress)
+    screening = Screening.of(problem, variants(catalogue, problem.nominal.finger, problem.scales), progress)
+    table = table_of(problem, bench, screening)
+    progress("weighing the evidence")
+    search = Search(bench, table, progress)
+    state = search.run()
+    found = posterior(search, state)
+    relevance = _relevance(problem, bench, tolerance)
+    verdict = _verdict(bench, state, found, relevance)
     nominal = nominal_fit(problem)
-    chosen = found.chosen
-    if chosen is None:
-        return _nothing_named(problem, found, nominal, quick)
-    if quick:
-        augmented = as_refitted(found.there, chosen)
-    else:
+    chosen = bench.null
+    if verdict.status in (Status.EXPLAINED, Status.PARTLY, Status.AMBIGUOUS):
+        chosen = search.only(state, (*verdict.named, *(k for s in found.ambiguous for k in s)))
+    augmented: Fitted | None = None
+    if chosen.effects:
         progress("fitting the effects and all nominal parameters together")
-        augmented = augmented_fit(problem, chosen)
-    named = {*chosen.keys, *(k for members in found.rival_sets for k in members)}
+        whole = found.unlisted <= 0.5
+        augmented = as_refitted(problem, chosen) if quick else augmented_fit(problem, chosen, not whole)
     progress("refitting without each third of the trials")
-    lines = shrinkage(problem, augmented, _rivals(problem, found), named, not quick)
-    if contradicts(lines) and found.unlisted <= 0.5:
-        found = found.doubted()
-    verdict, proposal = _verdict(found, lines), None
-    if verdict.status == "unexplained" and found.left:
-        progress("looking for a closed form of what remains")
-        proposal = propose(problem, chosen.residual, found.left, chosen.columns)
-        verdict = replace(verdict, summary=verdict.summary + _proposed(proposal))
-    verdict = replace(verdict, summary=verdict.summary + _remarks(problem, augmented.fit, quick))
-    places = where(problem)
-    suggestion = None
-    if verdict.status == "ambiguous":
+    lines = closures(problem, augmented, not quick)
+    shares = budget(bench, chosen, problem, _open(bench))
+    suggestion: NextExperiment | None = None
+    if verdict.status is Status.AMBIGUOUS and not quick:
         progress("looking for the trial that would tell them apart")
-        suggestion = next_experiment(problem, _members(problem, found))
-    return Diagnosis(problem, verdict, places, found, lines, suggestion, nominal.fit, augmented.fit, proposal)
+        suggestion = next_experiment(problem, search.rivals(state, found.ambiguous[0]))
+    fit = augmented.fit if augmented else nominal.fit
+    causes = _causes(chosen, found, shares, fit)
+    left = explained(chosen.problem, chosen.r)
+    return Diagnosis(
+        status=verdict.status,
+        named=tuple(Key(*k) for k in _by_share(verdict.named, chosen, shares)),
+        data=Path(session.file).name if session.file else "",
+        specimen=session.specimen,
+        against=None,
+        quick=quick,
+        tolerance=tolerance,
+        budget=causes,
+        unexplained=_unexplained(chosen, shares, left, verdict.status, progress),
+        channels=_channels(problem, bench, chosen, causes, shares),
+        relevance=relevance,
+        not_judged=_not_judged(problem),
+        closures=lines,
+        where=tuple(where(problem)) if verdict.status is not Status.NO_GAP else (),
+        candidates=_candidates(problem, search, chosen, found, shares, fit),
+        none=found.none,
+        unlisted=found.unlisted,
+        ambiguous_sets=tuple(tuple(Key(*k) for k in s) for s in found.ambiguous),
+        next_experiment=suggestion,
+        absorbed=_absorbed(problem, table),
+        changes=_retuned(problem, fit),
+        left=tuple(
+            Left(x.experiment, x.channel, site(problem, x.channel, x.column), x.energy, x.by_variable) for x in left
+        ),
+        nominal=nominal.fit,
+        augmented=fit,
+        problem=problem,
+    )
 
 
-def _nothing_named(problem: Problem, found: Search, nominal: Fitted, quick: bool) -> Diagnosis:
-    """No gap, or one of which no known effect explains any."""
-    verdict, places, proposal = Verdict("no_gap", (), _no_gap_summary(found)), [], None
-    if found.detected:
-        places, proposal = where(problem), propose(problem, problem.r, found.left, np.empty((0, problem.r.size)))
-        text = f"There is a gap, and none of the known effects explains any of it. {_depends(found)}"
-        verdict = Verdict("unexplained", (), text + _proposed(proposal))
-    verdict = replace(verdict, summary=verdict.summary + _remarks(problem, nominal.fit, quick))
-    lines = shrinkage(problem, nominal, [], set(), not quick)
-    return Diagnosis(problem, verdict, places, found, lines, None, nominal.fit, nominal.fit, proposal)
+def _verdict(bench: Bench, state: State, found: Posterior, relevance: tuple[Relevance, ...]) -> Verdict:
+    """The word for the posterior."""
+    if not bench.columns.items:
+        return Verdict(Status.NOT_JUDGED, ())
+    if found.named:
+        open_still = found.unlisted > 0.5 or found.ambiguous
+        return Verdict(Status.PARTLY if open_still else Status.EXPLAINED, found.named)
+    if found.ambiguous:
+        return Verdict(Status.AMBIGUOUS, found.ambiguous[0][:1])
+    matters = [x for x in relevance if not x.tolerated]
+    if found.unlisted <= 0.5 or not matters:
+        return Verdict(Status.NO_GAP, ())
+    return Verdict(Status.UNEXPLAINED, ())
 
 
-def _proposed(proposal: Proposal | None) -> str:
-    if proposal is None:
-        return ""
-    return f" A proposal, unproven, for {100 * proposal.share:.0f} % of that: {proposal.formula}."
+def _open(bench: Bench) -> frozenset[int]:
+    """Columns in which the nominal model alone leaves a gap."""
+    null = bench.null.judged
+    return frozenset(np.flatnonzero(unexplained(bench.columns, null, null, bench.parameters) > A_GAP).tolist())
 
 
-def _remarks(problem: Problem, fit: Fit, quick: bool) -> str:
-    """What holds whatever the verdict."""
-    return _retuned(problem, fit) + (FIRST_LOOK if quick else "")
+def _by_share(named, chosen: State, shares: Budget) -> list:
+    value, _, _, _ = shares.overall()
+    order = {k: v for k, v in zip(chosen.keys, value, strict=True)}
+    return sorted(named, key=lambda k: -order.get(k, 0.0))
 
 
-def _retuned(problem: Problem, fit: Fit) -> str:
-    """For another simulator: which of its parameters the measurements contradict most."""
+def _causes(chosen: State, found: Posterior, shares: Budget, fit: Fit) -> tuple[Cause, ...]:
+    """One line an effect, with all of its sites that are in."""
+    value, ends, _, _ = shares.overall()
+    by_channel: dict[tuple[str, str], set[int]] = {}
+    for c in sorted(shares.open):
+        by_channel.setdefault(shares.channels[c], set()).add(c)
+    of_channel = {k: shares.of(cs)[1] for k, cs in by_channel.items()}
+    out = []
+    for effect in dict.fromkeys(e for e, _ in chosen.keys):
+        at = [i for i, (e, _) in enumerate(chosen.keys) if e == effect]
+        out.append(
+            Cause(
+                effect,
+                tuple(chosen.keys[i][1] for i in at),
+                min(found.causes.get(chosen.keys[i], 0.0) for i in at),
+                float(np.clip(value[at].sum(), 0.0, 1.0)),
+                (float(min(ends[at, 0].sum(), 1.0)), float(min(ends[at, 1].sum(), 1.0))),
+                {
+                    Channel(e, c): float(min(lost[at].sum(), 1.0))
+                    for (e, c), lost in of_channel.items()
+                    if lost[at].sum() > 0.005
+                },
+                tuple(v for i in at for v in values_of(fit, i)),
+            )
+        )
+    return tuple(sorted(out, key=lambda c: -c.share))
+
+
+def _unexplained(chosen: State, shares: Budget, left: list[Explained], status: Status, progress) -> Unexplained:
+    _, _, share, ends = shares.overall()
+    if status in (Status.NO_GAP, Status.NOT_JUDGED) or not left or left[0].energy <= 0:
+        return Unexplained(share, ends, (), None, None)
+    worst = left[0]
+    variables = sorted(worst.by_variable.items(), key=lambda kv: -kv[1])[:2]
+    depends = tuple(k for k, v in variables if v > DEPENDS * worst.energy)
+    proposal = None
+    if status in (Status.PARTLY, Status.UNEXPLAINED):
+        progress("looking for a closed form of what remains")
+        ones = Weights(*np.ones((3, len(chosen.columns.items))))
+        proposal = propose(chosen.problem, Whitened(chosen.problem, chosen.columns, ones), chosen.r, left)
+    there = Channel(worst.experiment, worst.channel, site(chosen.problem, worst.channel, worst.column))
+    return Unexplained(share, ends, depends, there, proposal)
+
+
+def _channels(
+    problem: Problem, bench: Bench, chosen: State, causes: tuple[Cause, ...], shares: Budget
+) -> tuple[ChannelBudget, ...]:
+    """One line a column with a gap. Its gap in physical units is what is missed beyond the noise at the fit's rate."""
+    found = []
+    lines = [[i for i, (e, _) in enumerate(chosen.keys) if e == cause.effect] for cause in causes]
+    for c in sorted(shares.open):
+        column = bench.columns.items[c]
+        missed, noise = _mean_squares(problem, column.experiment, column.channel, column.column)
+        _, lost, after = shares.of({c})
+        found.append(
+            ChannelBudget(
+                column.experiment,
+                column.channel,
+                site(problem, column.channel, column.column),
+                channel_units(column.channel, problem.session.finger.prismatic),
+                noise**0.5,
+                max(missed - noise, 0.0) ** 0.5,
+                tuple(float(lost[at].sum()) for at in lines),
+                after,
+            )
+        )
+    return tuple(found)
+
+
+def _mean_squares(problem: Problem, e: str, c: str, column: int | None = None) -> tuple[float, float]:
+    """Of what the nominal model misses and of the noise, over the samples that count."""
+    stack, noise = problem.stacks[e], problem.noise[e, c]
+    mask, y = (np.asarray(a[c]) for a in (stack.batch.mask, stack.batch.y))
+    pick = slice(None) if column is None else slice(column, column + 1)
+    missed = _about_start((y - problem.predicted[e, c])[pick], mask[pick], c)
+    count = max(float(mask[pick].sum()), 1.0)
+    of_noise = float((mask[pick] * noise.std[pick, None, None] ** 2).sum()) / count
+    return float((missed**2).sum()) / count, of_noise
+
+
+def _about_start(x: Float[np.ndarray, "columns B T"], mask, channel: str) -> Float[np.ndarray, "columns B T"]:
+    """Of excursions, which start anywhere, what is about their mean."""
+    x = np.where(mask > 0, x, 0.0)
+    if channel == "tendon_excursion":
+        x = (x - x.sum(axis=-1, keepdims=True) / np.maximum(mask.sum(axis=-1, keepdims=True), 1.0)) * (mask > 0)
+    return x
+
+
+def _relevance(problem: Problem, bench: Bench, tolerance: Mapping[str, float]) -> tuple[Relevance, ...]:
+    """Every channel with a gap, in the world: beside what the channel shows in the experiment that moves it most."""
+    channels = dict.fromkeys((bench.columns.items[c].experiment, bench.columns.items[c].channel) for c in _open(bench))
+    out = []
+    for e, c in channels:
+        missed, noise = _mean_squares(problem, e, c)
+        signal = max(_signal(problem, other, c) for other, s in problem.stacks.items() if c in s.experiment.channels)
+        gap = max(missed - noise, 0.0) ** 0.5
+        relative = gap / max(signal, 1e-300)
+        units = channel_units(c, problem.session.finger.prismatic)
+        out.append(Relevance(e, c, units, gap, signal, relative, c in tolerance and relative <= tolerance[c]))
+    return tuple(sorted(out, key=lambda x: -x.relative))
+
+
+def _signal(problem: Problem, e: str, c: str) -> float:
+    """rms of a channel about each column's mean, over the samples that count."""
+    batch = problem.stacks[e].batch
+    mask, y = np.asarray(batch.mask[c]), np.asarray(batch.y[c])
+    x = np.where(mask > 0, y, 0.0)
+    x = (x - x.sum(axis=(1, 2), keepdims=True) / np.maximum(mask.sum(axis=(1, 2), keepdims=True), 1.0)) * (mask > 0)
+    return float(np.sqrt((_about_start(x, mask, c) ** 2).sum() / max(float(mask.sum()), 1.0)))
+
+
+def _not_judged(problem: Problem) -> tuple[NotJudged, ...]:
+    why = Reason.NOTHING_COUNTS if problem.simulator is None else Reason.NOT_PREDICTED
+    return tuple(NotJudged(x.experiment, x.channel, why) for x in not_judged(problem.stacks))
+
+
+def _candidates(problem: Problem, search: Search, chosen: State, found: Posterior, shares: Budget, fit: Fit):
+    """Every candidate tried, most probable first: as it is in the set, or alone on top of the nominal model."""
+    order = sorted(found.causes, key=lambda k: (-found.causes[k], -found.gains[k]))
+    inside = {k: values_of(fit, i) for i, k in enumerate(chosen.keys)}
+    gain = dict(zip(chosen.keys, shares.overall()[0].tolist(), strict=True))
+    others = search.alone(k for k in order if k not in inside)
+    likely = [k for k in order if k in others][:HELD_OUT]
+    gain |= dict(
+        zip(likely, held_out_gains(problem, [search.table.Z[others[k][0].columns] for k in likely]), strict=True)
+    )
+    values = inside | {k: _alone(problem, search.table, *x) for k, x in others.items()}
+    return tuple(
+        Candidate(Key(*k), found.causes[k], found.gains[k], gain.get(k, 0.0), values.get(k, ())) for k in order
+    )
+
+
+def _alone(
+    problem: Problem, table: Table, offer: Offered, amplitudes: np.ndarray, std: np.ndarray
+) -> tuple[Value, ...]:
+    """Amplitudes of a cause on top of the nominal model, linearly, and the shape that suits best."""
+    (variant,), names = offer.variants, list(offer.variants[0].sizes)
+    units = units_at(problem.nominal.finger, variant.effect, variant.site)
+    found = dict.fromkeys(names, (0.0, 0.0))
+    of_row = dict(zip(table.rows[variant].tolist(), names, strict=True))
+    for row, a, s in zip(offer.columns.tolist(), amplitudes, std, strict=True):
+        unit = table.units[row] * variant.sizes[of_row[row]]
+        found[of_row[row]] = (float(a * unit), float(s * unit))
+    values = [Value(variant.site, n, a, s, units[n]) for n, (a, s) in found.items()]
+    return tuple([*values, *(Value(variant.site, n, v, 0.0, units[n]) for n, v in variant.shape)])
+
+
+def _absorbed(problem: Problem, table: Table) -> tuple[Absorbed, ...]:
+    out = []
+    for key, share in table.absorbed.items():
+        if share > NEARLY:
+            hidden = table.hidden.get(key, {})
+            effect = next(v.effect for v in table.rows if v.key == key)
+            units = units_at(problem.nominal.finger, effect, key[1])
+            values = tuple(Value(key[1], n, 0.0, s, units[n]) for n, s in hidden.items())
+            out.append(Absorbed(Key(*key), share, values))
+    return tuple(out)
+
+
+def _retuned(problem: Problem, fit: Fit) -> tuple[Change, ...]:
+    """For another simulator: the parameters that the measurements contradict most."""
     if problem.simulator is None:
-        return ""
+        return ()
     old, new = (np.asarray(ravel(model))[problem.free] for model in (problem.simulator, fit.model))
     std = fit.std[problem.free]
-    weight = np.abs(new - old) * np.linalg.norm(problem.J, axis=0) * (np.abs(new - old) > 3.0 * std)
-    worst = [i for i in np.argsort(-weight)[:3] if weight[i] > 0]
-    if not worst:
-        return " The simulator's parameters agree with the measurements."
+    off = np.abs(new - old)
+    weight = off * np.linalg.norm(problem.J, axis=0) * (off > CONTRADICTED * std)
     parameters = describe(problem.nominal)
-    named = [
-        f"{p.name} ({old[i]:.3g} to {new[i]:.3g} ± {std[i]:.1g} {p.units})"
-        for i in worst
+    return tuple(
+        Change(p.name, p.group, p.units, float(old[i]), 0.0, float(new[i]), float(std[i]), 1.0)
+        for i in np.argsort(-weight)
+        if weight[i] > 0
         for p in [parameters[problem.free[i]]]
-    ]
-    return f" All this is with the simulator's parameters retuned, most of all {', '.join(named)}."
-
-
-def _rivals(problem: Problem, found: Search):
-    """The strongest candidates with their signatures."""
-    signatures = Signatures(problem)
-    top = [(c.evidence, c.refined) for c in found.candidates if c.refined][:6]
-    return [(evidence, signatures.columns(at_optimum(refined)[0])[0]) for evidence, refined in top]
-
-
-def _members(problem: Problem, found: Search) -> list[Refined]:
-    """Refits of the members of the first ambiguous set."""
-    if not found.rival_sets:
-        return []
-    projector = Projector(problem)
-    rt = projector.residual(problem)
-    chi2 = float(rt @ rt)
-    by_key = {c.key: c for c in found.candidates}
-    out = []
-    for key in found.rival_sets[0][:MOST_IN_A_SET]:
-        c = by_key[key]
-        items, starts = at_optimum(c.refined) if c.refined else ([c.evidence.variant], [start_of(c.evidence)])
-        out.append(refine(problem, items, starts, chi2, projector))
-    return out
-
-
-def _verdict(found: Search, lines: list[Shrinkage]) -> Verdict:
-    chosen = found.chosen
-    assert chosen is not None
-    order = np.argsort(-np.asarray(found.shares))
-    effects = tuple(chosen.keys[i] for i in order)
-    names = " and ".join(f"{e} at {'-'.join(s)}" for e, s in effects)
-    share = sum(found.shares) if len(effects) == 1 else 1.0 - _left_share(found)
-    if found.unlisted > 0.5:
-        end = "s" if len(effects) == 1 else ""
-        fails = f"leave{end} {100 * _left_share(found):.0f} % of what a smooth law could explain"
-        if contradicts(lines):
-            worst = max((x for x in lines if x.plain), key=lambda x: x.before / x.noise)
-            fails = f"close{end} {100 * worst.closed:.0f} % of the gap in {_channel(worst)} on held-out trials"
-        text = f"There is a gap, and none of the known effects explains it: the nearest, {names}, {fails}."
-        return Verdict("unexplained", (), f"{text} {_depends(found)}")
-    if found.rival_sets:
-        rivals = "; ".join(f"{e} at {'-'.join(s)}" for e, s in found.rival_sets[0][:MOST_IN_A_SET])
-        return Verdict(
-            "ambiguous",
-            effects[:1],
-            f"The gap is explained about equally well by {rivals}; these trials cannot tell them apart. "
-            f"The most probable is {effects[0][0]} at {'-'.join(effects[0][1])}.",
-        )
-    text = f"The gap is explained by {names}: {100 * share:.0f} % of what can be explained. {_closing(lines)}"
-    return Verdict("explained", effects, text)
-
-
-def _closing(lines: list[Shrinkage]) -> str:
-    """How far the gap closes on held-out trials, and where it stays open."""
-    shown = [x for x in lines if x.resolvable and x.channel != "q"]
-    if not shown:
-        return "No channel of the held-out trials stands out of its noise, so that they cannot say how far it closes."
-    best = max(x.closed for x in shown)
-    return (
-        f"On held-out trials it closes up to {100 * best:.0f} % of the gap in the channel that shows it best."
-        + "".join(f" {_channel(x)} stays at {x.after / x.noise:.1f} times its noise." for x in lines if x.stays_open)
     )
-
-
-def _channel(line: Shrinkage) -> str:
-    return f"{line.channel} of {line.experiment}"
-
-
-def _left_share(found: Search) -> float:
-    return energy_left(found.left) / max(found.gap, 1e-9)
-
-
-def _depends(found: Search) -> str:
-    if not found.left:
-        return ""
-    worst = found.left[0]
-    variables = sorted(worst.by_variable.items(), key=lambda kv: -kv[1])[:2]
-    named = " and ".join(k for k, v in variables if v > 0.2 * max(worst.energy, 1e-9)) or "no single variable"
-    return f"What remains lies mostly in {worst.channel} of {worst.experiment} and depends on {named}."
-
-
-def _no_gap_summary(found: Search) -> str:
-    strongest = max(found.candidates, key=lambda c: (c.refined is not None, c.log_evidence))
-    says = "which the noise of such a file also gives"
-    if strongest.log_evidence > DETECT:
-        says = f"but explains {100 * strongest.held_out:.0f} % of what it fitted on trials that its fit has not seen"
-    return (
-        f"No gap beyond the noise: the strongest candidate, {strongest.key[0]} at {'-'.join(strongest.key[1])}, has a "
-        f"log evidence of {strongest.log_evidence:.1f}, {says}."
-    )
-
-
-def _with_prior(amplitude: float, std: float, size: float) -> tuple[float, float]:
-    """Value and std of an amplitude that was found in plausible sizes, with a prior of UNSEEN of them."""
-    seen = 1.0 / (1.0 + (std / UNSEEN) ** 2)
-    return amplitude * seen * size, std * seen**0.5 * size
-
-
-def as_gap_json(d: Diagnosis) -> dict:
-    """`gap.json`, to the letter."""
-    by_effect = {
-        e.ID + "".join(e.site): parameter_values(d.augmented, i)
-        for i, e in enumerate(d.augmented.model.effects)
-        if isinstance(e, CatalogueEffect)
-    }
-    candidates = []
-    for c in d.search.candidates:
-        values = by_effect.get(c.key[0] + "".join(c.key[1]))
-        if values is None:
-            effect = c.evidence.variant.effect
-            units = units_at(d.problem.nominal.finger, effect, c.key[1])
-            found = zip(c.evidence.variant.sizes.items(), c.evidence.amplitudes, c.evidence.std, strict=True)
-            stated = {n: _with_prior(float(a), float(u), s) for (n, s), a, u in found}
-            values = {n: {"value": v, "std": std, "units": units[n]} for n, (v, std) in stated.items()}
-        candidates.append(
-            {
-                "effect": c.key[0],
-                "site": list(c.key[1]),
-                "probability": c.probability,
-                "parameters": values,
-                "held_out_gain": c.held_out,
-            }
-        )
-    return {
-        "schema": "jaxfinger-gap/1",
-        "data": Path(d.problem.session.file).name,
-        "specimen": d.problem.session.specimen,
-        "verdict": {
-            "status": d.verdict.status,
-            "effects": [{"effect": e, "site": list(s)} for e, s in d.verdict.effects],
-            "summary": d.verdict.summary,
-        },
-        "where": [
-            {
-                "experiment": p.experiment,
-                "trial": p.trial,
-                "channel": p.channel,
-                "site": p.site,
-                "region": {"variable": p.variable, "low": p.low, "high": p.high},
-                "share": p.share,
-            }
-            for p in d.where
-        ],
-        "candidates": candidates,
-        "none": d.search.none,
-        "unlisted": d.search.unlisted,
-        "ambiguous_sets": [
-            [{"effect": e, "site": list(s)} for e, s in members[:MOST_IN_A_SET]]
-            for members in (d.search.rival_sets if d.verdict.status == "ambiguous" else [])
-        ],
-        "next_experiment": asdict(d.next) | {"separates": list(d.next.separates)} if d.next else None,
-        "gap": [
-            {
-                "experiment": x.experiment,
-                "channel": x.channel,
-                "units": x.units,
-                "noise": x.noise,
-                "before": x.before,
-                "after": x.after,
-                "closed": x.closed,
-                "closed_ci95": list(x.closed_ci95),
-            }
-            for x in d.shrinkage
-        ],
-    }
-
-
-def write(d: Diagnosis, folder: str | Path, overwrite: bool = False) -> None:
-    """`gap.json`, `nominal.json` and `augmented.json` in a folder."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    with atomic_path(folder / "gap.json", overwrite) as part:
-        part.write_text(json.dumps(as_gap_json(d), indent=1, allow_nan=False), encoding="utf-8")
-    save_fit(d.nominal, folder / "nominal.json", overwrite)
-    save_fit(d.augmented, folder / "augmented.json", overwrite)

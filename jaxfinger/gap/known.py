@@ -7,21 +7,22 @@ from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError, did_you_mean
 from jaxfinger.experiments import shows
 from jaxfinger.gap.augment import augmented_fit
-from jaxfinger.gap.evidence import Projector
+from jaxfinger.gap.exact import Bench
+from jaxfinger.gap.formula import Parameters
 from jaxfinger.gap.problem import Problem, build
-from jaxfinger.gap.refine import Refined, at_optimum, refine, relinearised
-from jaxfinger.gap.screening import Screening, by_site
-from jaxfinger.gap.search import other_forms, start_of
+from jaxfinger.gap.screening import Screening
+from jaxfinger.gap.sets import Search, table_of
 from jaxfinger.gap.signatures import Variant, catalogue_for, variants
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.stages import Progress
 
-Key = tuple[str, tuple[str, ...]]  # effect, site; a pair may be joined by a hyphen
+Named = tuple[str, tuple[str, ...]]  # effect, site; a pair may be joined by a hyphen
+FORMS = 3  # of an effect, that are fitted where the next ones fit nearly as well
 
 
 def fit_with(
     session: Session,
-    keys: Sequence[Key],
+    keys: Sequence[Named],
     recipe: Recipe | None = None,
     effects: dict[str, type[CatalogueEffect]] | None = None,
     progress: Progress = lambda message: None,
@@ -42,35 +43,25 @@ def fit_with(
             near = did_you_mean(effect, catalogue)
             raise UserError(f"the catalogue has no effect {effect}{near}; it has {', '.join(sorted(catalogue))}")
     problem = build(session, recipe, progress)
-    screen = Screening.of(problem, _offered(catalogue, keys, problem), progress)
-    projector = Projector(problem)
-    rt = projector.residual(problem)
-    chi2 = float(rt @ rt)
-    chosen: Refined | None = None
-    for _ in keys:
-        if chosen is not None:
-            projector = Projector(problem, chosen.columns)
-            rt = projector.residual(problem, problem.r - chosen.change)
-        screened = screen(projector, rt)
-        taken = chosen.keys if chosen else ()
-        first = next(e for e in by_site(screened).values() if e.variant.key not in taken)
-        if not screen.signatures_of(first).any():
-            effect, site = first.variant.effect, "-".join(first.variant.site)
-            shown = ", ".join(shows(effect, problem.nominal.finger))
-            file = session.file or "the session"
-            raise UserError(f"{file}: no trial shows {effect.ID} at {site}; record {shown}, or leave it out")
-        progress(f"fitting {first.variant.effect.ID} at {', '.join(first.variant.site)}")
-        items, starts = at_optimum(chosen) if chosen else ([], [])
-        forms = [first, *other_forms(screened, first)]
-        found = [refine(problem, [*items, e.variant], [*starts, start_of(e)], chi2) for e in forms]
-        led = [relinearised(problem, r, chi2) for r in found]
-        problem, chosen = max(led, key=lambda x: x[1].log_evidence)
-    assert chosen is not None
+    offered = _offered(catalogue, keys, problem)
+    bench = Bench.of(problem, Parameters())
+    table = table_of(problem, bench, Screening.of(problem, offered, progress), together=False)
+    wanted = list(dict.fromkeys(v.key for v in offered))
+    if unseen := [k for k in wanted if k not in table.keys]:
+        (effect, site), file = unseen[0], session.file or "the session"
+        shown = ", ".join(shows(catalogue[effect], problem.nominal.finger))
+        raise UserError(f"{file}: no trial shows {effect} at {'-'.join(site)}; record {shown}, or leave it out")
+    search, state = Search(bench, table, progress), bench.null
+    for _ in wanted:
+        screened = search.screened(state)
+        found = search.best_offers(screened, FORMS, same=True)
+        forms = [(o, a) for _, o, a in found if o.keys == found[0][1].keys]
+        state = max((search.exactly(state, None, o, a, screened[1]) for o, a in forms), key=lambda s: s.score)
     progress("fitting the effects and all nominal parameters together")
-    return augmented_fit(problem, chosen).fit
+    return augmented_fit(problem, state).fit
 
 
-def _offered(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[Key], problem: Problem) -> list[Variant]:
+def _offered(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[Named], problem: Problem) -> list[Variant]:
     """Every form of the effects at their sites."""
     offered, finger = [], problem.nominal.finger
     for effect, site in keys:

@@ -11,18 +11,19 @@ the file holds already: what j can imitate without contradicting the file separa
 Fedorov, Biometrika 62 (1975) 57). The trial that separates the worst pair best is the suggestion.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import permutations
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.data.schema import units_where
 from jaxfinger.experiments import EXPERIMENTS, Batch, Stack, shows
+from jaxfinger.gap.exact import State, Whitened, derivatives
+from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem, imagined
-from jaxfinger.gap.refine import Refined, derivatives, information, nominal_step
+from jaxfinger.gap.result import NextExperiment, Posture
 from jaxfinger.gap.signatures import Signatures
 from jaxfinger.model import Finger
 
@@ -37,22 +38,18 @@ FASTEST, SLOWER = 1.5, 0.25  # rad/s, times the speed
 LIKE = {"VD.2": "ID.4", "ID.4": "VD.2", "ID.3-static": "ID.2", "ID.3-dynamic": "ID.2"}
 
 
-@dataclass(frozen=True)
-class NextExperiment:
-    """`next_experiment` of gap.json."""
-
-    experiment: str
-    description: str
-    separates: tuple[str, ...]
-
-
-def next_experiment(problem: Problem, members: list[Refined]) -> NextExperiment | None:
-    """For the refitted members of an ambiguous set; none where no trial is expected to separate them."""
+def next_experiment(problem: Problem, members: Sequence[State]) -> NextExperiment | None:
+    """For the fitted sets that rivals belong to; none where no trial is expected to separate them."""
     if len(members) < 2:
         return None
-    shown = {e for m in members for v in m.variants for e in shows(v.effect, problem.nominal.finger)}
-    steps = [nominal_step(problem, problem.r - m.change) for m in members]
-    known = [information(problem, m) for m in members]
+    shown = {e for m in members for x in m.effects for e in shows(type(x), problem.nominal.finger)}
+    ones = Weights(*np.ones((3, len(members[0].columns.items))))
+    project, own = Whitened(problem, members[0].columns, ones), Signatures(problem)
+    steps, known = [], []
+    for m in members:
+        change, slopes = derivatives(own, m)
+        steps.append(project.nominal_step(problem.r - change))
+        known.append(_information(problem, slopes))
     best, place = 0.0, None
     for stacks in _short_list(problem, shown):
         there = imagined(problem, stacks)
@@ -71,8 +68,18 @@ def next_experiment(problem: Problem, members: list[Refined]) -> NextExperiment 
                 best, place = worst, trial
     if place is None or best * REPEATS < SETTLES:
         return None
-    ids = tuple(dict.fromkeys(m.keys[0][0] for m in members))
-    return NextExperiment(place[0].experiment.name, _description(problem, *place, best), ids)
+    alike = set.intersection(*(set(m.keys) for m in members))
+    ids = tuple(dict.fromkeys(e for m in members for e, site in m.keys if (e, site) not in alike))
+    return _described(problem, *place, best, ids)
+
+
+def _information(problem: Problem, slopes: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "p+k p+k"]:
+    """What the trials and priors say of the nominal parameters and of a set's coordinates together."""
+    A, p = np.vstack([problem.J.T, slopes]), problem.J.shape[1]
+    P = A @ A.T
+    P[:p, :p] += problem.root.T @ problem.root
+    P[p:, p:] += np.eye(len(slopes))
+    return P
 
 
 def expected_evidence(
@@ -187,36 +194,34 @@ def _moves(finger: Finger, q: Float[np.ndarray, "m *T"]) -> np.ndarray:
     return np.ptp(q, axis=-1) > rest.reshape(-1, *[1] * (q.ndim - 2))
 
 
-# In words -------------------------------------------------------------------------------------------------------------
-def _description(problem: Problem, stack: Stack, b: int, evidence: float) -> str:
+# As data --------------------------------------------------------------------------------------------------------------
+def _described(problem: Problem, stack: Stack, b: int, evidence: float, ids: tuple[str, ...]) -> NextExperiment:
     finger, spec = problem.nominal.finger, stack.experiment
     trial = problem.session[stack.trials[b]]
     x = stack.batch.x
     counts = np.stack([np.asarray(m)[b] for mask in stack.batch.mask.values() for m in mask]).max(axis=0) > 0
     q, f = np.asarray(x.q)[:, b][:, counts], np.asarray(x.tension)[:, b][:, counts]
     moves = _moves(finger, q)
-    where = ", ".join(
-        f"{name} {_angle(finger, i, q[i].min())} to {_angle(finger, i, q[i].max())}"
-        if moves[i]
-        else f"{name} at {_angle(finger, i, q[i].mean())}"
+    postures = tuple(
+        Posture(name, float(q[i].min()), float(q[i].max()), bool(moves[i]), finger.prismatic[i])
         for i, name in enumerate(finger.joint_names)
     )
-    parts = [] if spec.name in problem.stacks else ["the session lacks it"]
-    parts += [f"joint {trial.joint}"] if trial.joint and spec.name.startswith("ID") else []
-    parts += [f"tendon {trial.tendon}"] if trial.tendon and spec.held else []
-    parts.append(where)
-    if spec.held:
-        back = " and down again" if f[:, -1].max() < 0.5 * f.max() else ""
-        parts.append(f"in steps to {f.max():.0f} N{back}")
-    elif not spec.slack:
-        parts.append(f"tension up to {f.max():.0f} N")
+    speed = None
     if not spec.rests:
-        speed = np.percentile(np.abs(np.asarray(x.qd)[:, b]).max(axis=0), 99)
-        parts.append(f"up to {speed:.2g} {units_where('rad/s', finger.prismatic)}")
+        speed = float(np.percentile(np.abs(np.asarray(x.qd)[:, b]).max(axis=0), 99))
     often = int(np.ceil(SETTLES / evidence))
-    parts += [f"{often} times"] if often > 1 else []
-    return f"{', '.join(parts)}; expected log evidence {often * evidence:.1f} ({SETTLES:g} leaves the wrong one 3 %)"
-
-
-def _angle(finger: Finger, i: int, value: float) -> str:
-    return f"{1e3 * value:.0f} mm" if finger.prismatic[i] else f"{np.degrees(value):.0f}°"
+    return NextExperiment(
+        spec.name,
+        spec.name not in problem.stacks,
+        trial.joint if trial.joint and spec.name.startswith("ID") else None,
+        trial.tendon if trial.tendon and spec.held else None,
+        postures,
+        None if spec.slack else float(f.max()),
+        spec.held,
+        spec.held and bool(f[:, -1].max() < 0.5 * f.max()),
+        speed,
+        any(finger.prismatic),
+        often,
+        often * evidence,
+        ids,
+    )

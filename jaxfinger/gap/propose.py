@@ -5,16 +5,16 @@ chosen effects projected out. It is a proposal for a person to look at, never a 
 friction, elasticity and transmission are made of, and the truth may be none of it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from jaxfinger.data.schema import channel_units
-from jaxfinger.gap.evidence import Projector
-from jaxfinger.gap.problem import Problem
+from jaxfinger.gap.exact import Whitened
+from jaxfinger.gap.problem import Problem, site
 from jaxfinger.gap.signatures import whitened
 from jaxfinger.gap.standin import Explained, concerned, since_reversal
-from jaxfinger.gap.where import site
 
 TERMS = 3
 WORTH = 0.1  # share of what a smooth law could explain, that a further term must explain
@@ -38,11 +38,10 @@ class Proposal:
         return f"{self.channel} {self.site} ≈ {body.lstrip('+')}"
 
 
-def propose(problem: Problem, residual: np.ndarray, left: list[Explained], chosen: np.ndarray) -> Proposal | None:
+def propose(problem: Problem, project: Whitened, residual: np.ndarray, left: Sequence[Explained]) -> Proposal | None:
     """The shortest sum of terms for the column that has most left; None where no term explains a fair part.
 
-    `residual` (N,) is what the chosen effects leave, `left` what a smooth law explains of it, `chosen` (k, N) their
-    columns.
+    `residual` (N,) is what the causes leave, `left` what a smooth law explains of it.
     """
     by_column: dict[tuple[str, int], float] = {}
     for x in left:
@@ -50,8 +49,7 @@ def propose(problem: Problem, residual: np.ndarray, left: list[Explained], chose
     (channel, column), most = max(by_column.items(), key=lambda kv: kv[1])
     names, columns = _columns(problem, channel, column)
 
-    project = Projector(problem, chosen)
-    Z, r = project(columns), project.residual(problem, residual)
+    Z, r = project(columns), project.residual(residual)
     norm = np.linalg.norm(Z, axis=1)
     usable = norm > 0.05 * np.linalg.norm(columns, axis=1)
     found: list[int] = []

@@ -1,14 +1,14 @@
-"""Screening: the evidence of every candidate, linearly, against what is left to explain."""
+"""Screening: the signatures of every candidate, read once."""
 
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.compilation import side_by_side
 from jaxfinger.experiments import shows
-from jaxfinger.gap.evidence import Evidence, Projector, evidence
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signatures import Signatures, Variant
 from jaxfinger.identify.stages import Progress
@@ -16,6 +16,15 @@ from jaxfinger.identify.stages import Progress
 SHORTEST = 20.0  # s: the shortest period that is looked for
 MOST = 300  # periods: beyond 50 minutes the shortest grows with the session, for memory's sake
 RIDGE = 1e-9  # relative, of products of columns
+
+
+class Projector(Protocol):
+    """Rows off what the nominal parameters can absorb."""
+
+    def __call__(self, x: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "k N+prior"]:
+        """Of signatures."""
+        ...
+
 
 Offer = tuple[list[Variant], Float[np.ndarray, "variants amplitudes N"]]
 
@@ -30,10 +39,6 @@ class Table:
     def offer(self, projector: Projector, rt: Float[np.ndarray, " N+prior"]) -> Offer:
         """All of them, whatever is left."""
         return self.items, self.columns
-
-    def signatures_of(self, variant: Variant) -> Float[np.ndarray, "amplitudes N"]:
-        """Of one that was offered."""
-        return self.columns[self.items.index(variant)]
 
 
 @dataclass(frozen=True)
@@ -88,14 +93,10 @@ class Scan:
         most = np.argmax(np.sum(b[rows] * amplitudes, axis=1))
         return dict(zip(names, self.periods[sets[most]].tolist(), strict=True))
 
-    def signatures_of(self, variant: Variant) -> Float[np.ndarray, "amplitudes N"]:
-        """Of one that was offered."""
-        return self.signatures.columns([variant])[0]
-
 
 @dataclass(frozen=True)
 class Screening:
-    """Signatures of every candidate, read once and weighed against whatever is left."""
+    """Signatures of every candidate."""
 
     parts: dict[tuple, Table | Scan]
 
@@ -118,28 +119,7 @@ class Screening:
             progress(f"signatures of {key[0]} ({len(parts)} of {len(groups)} effects)")
         return cls(parts)
 
-    def __call__(self, projector: Projector, rt: Float[np.ndarray, " N+prior"]) -> list[Evidence]:
-        """Evidence of every variant, strongest first."""
-        found = []
-        for part in self.parts.values():
-            items, Z = part.offer(projector, rt)
-            Zt = projector(Z.reshape(-1, Z.shape[-1])).reshape(*Z.shape[:2], -1)
-            found += [evidence(v, z, zt, rt) for v, z, zt in zip(items, Z, Zt, strict=True)]
-        return sorted(found, key=lambda e: -e.log_bf)
-
-    def signatures_of(self, e: Evidence) -> Float[np.ndarray, "amplitudes N"]:
-        """Of a candidate's variant."""
-        return self.parts[_part(e.variant)].signatures_of(e.variant)
-
 
 def _part(v: Variant) -> tuple:
     """What is read together: a class of effects, and one site where its periods are open."""
     return (v.effect.ID, v.site) if v.effect.periods() else (v.effect.ID,)
-
-
-def by_site(found: list[Evidence]) -> dict[tuple, Evidence]:
-    """The strongest variant of each effect and site, strongest first."""
-    best: dict[tuple, Evidence] = {}
-    for e in found:
-        best.setdefault(e.variant.key, e)
-    return best

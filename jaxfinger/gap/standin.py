@@ -14,7 +14,6 @@ from jaxfinger.gap.signatures import whitened
 from jaxfinger.model import Finger
 
 SMOOTHED = 15  # samples over which an angle or a tension is averaged before its reversals are looked for
-REACH = 60.0  # energy of a column that coloured noise, estimated from few repeats, can still give
 
 
 @dataclass(frozen=True)
@@ -81,11 +80,6 @@ def concerned(finger: Finger, channel: str, column: int) -> tuple[list[int], lis
     if channel == "tendon_excursion":
         return [i for i in range(finger.m) if finger.crosses[column][i]], [column]
     return list(range(finger.m)), list(range(finger.n))
-
-
-def energy_left(left: list[Explained]) -> float:
-    """What the stand-in explains in all, columns within reach of the noise apart."""
-    return sum(x.energy for x in left if x.energy > REACH)
 
 
 def explained(problem: Problem, residual: np.ndarray) -> list[Explained]:

@@ -1,26 +1,11 @@
 """Where the gap lies: energy of the white residuals above noise, by trial, channel, site, and region of the motion."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from jaxfinger.gap.problem import Problem
+from jaxfinger.gap.problem import Problem, site
+from jaxfinger.gap.result import Place
 
 BINS = 6
-
-
-@dataclass(frozen=True)
-class Place:
-    """One line of `where` in gap.json."""
-
-    experiment: str
-    trial: str
-    channel: str
-    site: str
-    variable: str
-    low: float
-    high: float
-    share: float  # of the gap's energy above noise, in the whole file
 
 
 def where(problem: Problem, most: int = 12) -> list[Place]:
@@ -49,13 +34,6 @@ def where(problem: Problem, most: int = 12) -> list[Place]:
             )
         )
     return sorted(places, key=lambda p: -p.share)
-
-
-def site(problem: Problem, channel: str, column: int) -> str:
-    """Name of a channel's column."""
-    finger = problem.nominal.finger
-    names = {"joint_torque": finger.joint_names, "tendon_excursion": finger.tendon_names}.get(channel, ("x", "y", "z"))
-    return names[column]
 
 
 def _region(problem: Problem, e, c, column, b, time, energy):

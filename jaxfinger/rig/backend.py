@@ -230,11 +230,7 @@ class Rig(ABC):
         return False
 
     def __enter__(self) -> Self:
-        try:
-            self.connect()
-        except BaseException:
-            self.close()
-            raise
+        self.connect()
         return self
 
     def __exit__(self, kind, error, trace) -> None:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxfinger.effects import CATALOGUE, Scales, amplitude, shape
 from jaxfinger.gap import diagnose
+from jaxfinger.gap.result import Key
 from jaxfinger.gap.screening import MOST, Scan
 from jaxfinger.gap.signatures import Signatures, Variant
 from jaxfinger.model import Finger
@@ -74,6 +75,6 @@ def test_a_wandering_sensor_is_named_with_its_period():
     truth = {"A": 1e-3, "B": -5e-4, "P": 71.0, "T": 1e4, "tare": 3.0}
     keep = {*RIVALS, "torque_sensor_drift"}
     found = diagnose(session_with(("torque_sensor_drift", SITE, truth)), without=tuple(sorted(set(CATALOGUE) - keep)))
-    assert found.verdict.effects == (("torque_sensor_drift", SITE),)
+    assert found.named == (Key("torque_sensor_drift", SITE),)
     (drift,) = found.augmented.model.effects
     assert float(drift.P) == pytest.approx(71.0, rel=0.05)

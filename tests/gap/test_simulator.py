@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from jaxfinger.errors import UserError
-from jaxfinger.gap import diagnose
+from jaxfinger.gap import Status, diagnose
+from jaxfinger.gap.result import Key
 from jaxfinger.identify.predictions import predict_session
 from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger
 
@@ -31,13 +32,12 @@ def simulator(session, **factors):
 
 def test_the_missing_effect_is_named_and_the_wrong_parameters_retuned(session):
     found = diagnose(session, without=WITHOUT, predictions=simulator(session, damping=3.0), quick=True)
-    assert found.verdict.status == "explained"
-    assert found.verdict.effects[0] == TRUTH
-    assert "retuned" in found.verdict.summary
-    assert "damping" in found.verdict.summary
+    assert found.status is Status.EXPLAINED
+    assert found.named == (Key(*TRUTH),)
+    assert any(c.group == "damping" and c.before > 2.0 * c.after for c in found.changes)
     # Before is the simulator as it is, after the finger's own parameters with the effect.
-    line = next(x for x in found.shrinkage if x.experiment == "ID.3-dynamic")
-    own = next(x for x in diagnose(session, without=WITHOUT, quick=True).shrinkage if x.experiment == "ID.3-dynamic")
+    line = next(x for x in found.closures if x.experiment == "ID.3-dynamic")
+    own = next(x for x in diagnose(session, without=WITHOUT, quick=True).closures if x.experiment == "ID.3-dynamic")
     assert line.before > 1.2 * own.before
     assert line.after == pytest.approx(own.after, rel=0.1)
 
@@ -45,7 +45,7 @@ def test_the_missing_effect_is_named_and_the_wrong_parameters_retuned(session):
 def test_a_term_that_the_simulator_lacks_is_a_candidate(session):
     found = diagnose(session, without=(*WITHOUT, "gravity"), predictions=simulator(session, friction=0.0), quick=True)
     assert "joint_coulomb" not in found.problem.fit.recipe.model.terms
-    assert any(c.key[0] == "joint_coulomb" for c in found.search.candidates[:4])
+    assert any(c.key.effect == "joint_coulomb" for c in found.candidates[:4])
 
 
 def test_predictions_of_other_trials_are_refused(session):
@@ -57,5 +57,5 @@ def test_predictions_of_other_trials_are_refused(session):
 def test_a_perfect_simulator_leaves_no_gap():
     session = session_with()
     found = diagnose(session, without=WITHOUT, predictions=simulator(session), quick=True)
-    assert found.verdict.status == "no_gap"
+    assert found.status is Status.NO_GAP
     assert jnp.isfinite(found.problem.r).all()

@@ -1,10 +1,7 @@
-"""How far the gap shrinks: before, after and noise on trials that neither fit nor choice of the effect has seen.
+"""How far the gap shrinks: before, after and noise on trials that no fit has seen, in physical units.
 
-Trials are held out in turn, stratified by experiment, joint and tendon. The choice is made again without them; where it
-is nothing that the verdict names, the held-out trials count as not improved.
+Trials are held out in turn, stratified by experiment, joint and tendon.
 """
-
-from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -14,68 +11,28 @@ from jaxfinger.data.schema import channel_units
 from jaxfinger.effects import Scales
 from jaxfinger.experiments import prepare
 from jaxfinger.gap.augment import Fitted, Missed, limits, missed_by, without_shapes
-from jaxfinger.gap.evidence import Evidence, Projector, evidence
-from jaxfinger.gap.held_out import FOLDS, equilibrated, fold_of_row, folds
+from jaxfinger.gap.folds import FOLDS, equilibrated, fold_of_row, folds
 from jaxfinger.gap.problem import Problem
+from jaxfinger.gap.result import Closure
 from jaxfinger.identify.parameters import Free, ravel
 from jaxfinger.identify.predictions import simulate_trials
 from jaxfinger.identify.solve import Prior, bounded
 from jaxfinger.model import Model
 
 RESOLVABLE = 1.1  # mean square before over that of the noise, from which on a gap can be said to close
-PLAIN = 1.3  # rms before, in that of the noise, from which on held-out trials must know the effects that are named
-CLOSES = 0.3  # share of one such gap that is to be within the interval of what closes; true effects: 0.6 and more
 
 
-@dataclass(frozen=True)
-class Shrinkage:
-    """One line of `gap` in gap.json: rms in the channel's unit, at the rate of the fit."""
-
-    experiment: str
-    channel: str
-    units: str
-    noise: float
-    before: float
-    after: float
-    closed: float
-    closed_ci95: tuple[float, float]
-    resolvable: bool  # whether the gap before stands out of the noise
-
-    @property
-    def plain(self) -> bool:
-        """Whether a measured channel misses so much that held-out trials must know what explains it."""
-        return self.resolvable and self.channel != "q" and self.before > PLAIN * self.noise
-
-    @property
-    def stays_open(self) -> bool:
-        """Whether nothing closes of a plain gap."""
-        return self.plain and self.closed_ci95[1] < CLOSES
-
-
-def contradicts(lines: list[Shrinkage]) -> bool:
-    """Whether held-out trials know nothing of what is named: where one channel closes, another may have a cause of its
-    own; where no plain gap does, nothing is explained.
-    """
-    plain = [x for x in lines if x.plain]
-    return bool(plain) and all(x.stays_open for x in plain)
-
-
-def shrinkage(
-    problem: Problem,
-    augmented: Fitted,
-    rivals: list[tuple[Evidence, np.ndarray]],
-    named: set[tuple],
-    forward: bool = True,
-) -> list[Shrinkage]:
+def closures(problem: Problem, augmented: Fitted | None, forward: bool = True) -> tuple[Closure, ...]:
     """One line an experiment and channel, and one for q of VD.3, simulated forward, unless `forward` is false.
 
-    `rivals`: the strongest candidates with their signatures, among which each fold chooses again; `named`: what the
-    verdict names.
+    Without `augmented` nothing closes.
     """
     fold, of_row = folds(problem), fold_of_row(problem)
-    whole, every = augmented.fit.model, augmented.fit.estimated
-    shapeless = without_shapes(whole, every)
-    tried = [every, shapeless] if len(shapeless) < len(every) else [every]
+    tried: list[np.ndarray] = []
+    if augmented is not None:
+        whole, every = augmented.fit.model, augmented.fit.estimated
+        shapeless = without_shapes(whole, every)
+        tried = [every, shapeless] if len(shapeless) < len(every) else [every]
     energies: dict[tuple[str, str], list[np.ndarray]] = {}  # of each trial: before, after, noise, samples
     models = []
     for k in range(FOLDS):
@@ -83,15 +40,15 @@ def shrinkage(
         refitted = _refit(problem.nominal, problem.free, problem.J, problem.r, training, problem.prior, problem.scales)
         before = after = problem.simulator or refitted
         old = new = missed_by(problem.sources, before)
-        if _choice(problem, rivals, training) in named:
-            # A linear step may lead a shape too far: of refits with shapes and without, that which fits its own trials
-            # better; a model that does not hold up without the others has closed nothing.
-            for free in tried:
-                columns = augmented.J[:, np.isin(every, free)]
-                model = _refit(whole, free, columns, augmented.r, training, problem.prior, problem.scales)
-                missed = augmented.missed(model)
-                if _misfit(problem, missed, seen) < _misfit(problem, new, seen):
-                    after, new = model, missed
+        # A linear step may lead a shape too far: of refits with shapes and without, that which fits its own trials
+        # better; a model that does not hold up without the others has closed nothing.
+        for free in tried:
+            assert augmented is not None
+            columns = augmented.J[:, np.isin(every, free)]
+            model = _refit(whole, free, columns, augmented.r, training, problem.prior, problem.scales)
+            missed = augmented.missed(model)
+            if _misfit(problem, missed, seen) < _misfit(problem, new, seen):
+                after, new = model, missed
         models.append((before, after))
         for e, c in old:
             mask = np.asarray(problem.stacks[e].batch.mask[c]) * ~seen[e]
@@ -102,9 +59,11 @@ def shrinkage(
             if np.any(count >= 10):
                 energies.setdefault((e, c), []).extend(values[count >= 10])
     prismatic = problem.session.finger.prismatic
+    lines = [_line(e, c, channel_units(c, prismatic), np.array(values)) for (e, c), values in energies.items()]
     if forward and "VD.3" in problem.stacks:
-        energies["VD.3", "q"] = _forward(problem, fold["VD.3"], models)
-    return [_line(e, c, channel_units(c, prismatic), np.array(values)) for (e, c), values in energies.items()]
+        values, runs_away = _forward(problem, fold["VD.3"], models)
+        lines.append(_line("VD.3", "q", channel_units("q", prismatic), np.array(values), runs_away))
+    return tuple(lines)
 
 
 def _forward(problem: Problem, fold: np.ndarray, models: list[tuple[Model, Model]]):
@@ -122,12 +81,15 @@ def _forward(problem: Problem, fold: np.ndarray, models: list[tuple[Model, Model
         some = pairs[changed.index(True)][1]
         paths = simulate_trials([a if c else some for (_, a), c in zip(pairs, changed, strict=True)], session, stack)
         new |= {name: paths[name] for name, c in zip(trials, changed, strict=True) if c}
-    out = []
+    out, runs_away = [], False
     for name in trials:
         q = session[name].q
+        moves = float(np.mean((q - q.mean(axis=0)) ** 2))
         missed = [np.fmin(np.abs(q - np.nan_to_num(p[name]["q"], nan=np.inf)), np.pi) for p in (old, new)]
-        out.append((*(float(np.nanmean(x**2)) for x in missed), _spread(problem, name), float(len(q))))
-    return out
+        squares = [float(np.nanmean(x**2)) for x in missed]
+        runs_away |= squares[1] > moves  # worse than a finger that stands still
+        out.append((*squares, _spread(problem, name), float(len(q))))
+    return out, runs_away
 
 
 def _spread(problem: Problem, name: str) -> float:
@@ -157,17 +119,6 @@ def _refit(model: Model, free, J, r, training, prior: Prior, scales: Scales) -> 
     return Free.at(model, free).set(model, jax.device_put(theta + delta))
 
 
-def _choice(problem: Problem, rivals: list[tuple[Evidence, np.ndarray]], training: np.ndarray) -> tuple | None:
-    """The candidate of most evidence in the training rows: what it explains there, and of the prior's surprise at what
-    the nominal parameters became to imitate it.
-    """
-    part = replace(problem, r=problem.r[training], J=problem.J[training])  # all of it that a projector reads
-    projector = Projector(part)
-    rt = projector.residual(part)
-    found = [evidence(e.variant, Z[:, training], projector(Z[:, training]), rt) for e, Z in rivals]
-    return max(found, key=lambda e: e.log_bf).variant.key if found else None
-
-
 def _misfit(problem: Problem, missed: Missed, keep: dict[str, np.ndarray]) -> float:
     """Sum of squares over the samples to keep, (B, T) of every experiment, in the noise of a sample."""
     total = 0.0
@@ -185,7 +136,7 @@ def _squares(missed: Float[np.ndarray, "columns B T"], mask, channel: str) -> Fl
     return (x**2).sum(axis=(0, 2))
 
 
-def _line(e: str, c: str, units: str, values: np.ndarray) -> Shrinkage:
+def _line(e: str, c: str, units: str, values: np.ndarray, runs_away: bool = False) -> Closure:
     """rms over the held-out trials, and the interval of `closed` from a bootstrap over trials."""
     rng = np.random.default_rng(0)
     weight = values[:, 3]
@@ -202,7 +153,9 @@ def _line(e: str, c: str, units: str, values: np.ndarray) -> Shrinkage:
     draws = np.array([closed(rng.choice(rows, len(rows))) for _ in range(400)])
     draws = draws[np.isfinite(draws)]
     low, high = np.quantile(draws, (0.025, 0.975)) if resolvable and len(draws) else (0.0, 0.0)
-    return Shrinkage(
+    if runs_away:
+        value, low, high = 0.0, 0.0, 0.0
+    return Closure(
         e,
         c,
         units,
@@ -211,5 +164,6 @@ def _line(e: str, c: str, units: str, values: np.ndarray) -> Shrinkage:
         after**0.5,
         float(np.clip(np.nan_to_num(value), -1.0, 1.0)),
         (float(np.clip(low, -1, 1)), float(np.clip(high, -1, 1))),
-        resolvable,
+        resolvable and not runs_away,
+        runs_away,
     )

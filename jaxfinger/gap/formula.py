@@ -1,0 +1,258 @@
+"""The formula that every decision comes from: how well a set of causes explains the residual.
+
+    r̃ ~ N(0, σ²(I + Σ_i s_i² (z_i z_iᵀ + ρ² K_i) + s_u² K_u))
+
+column by column, in the basis of the stand-in's features (`columns`). With e_c the energy of the residual on the K_c
+features of column c, and o_c that outside of them over m_c rows, both in squared noise,
+
+    log L = −½ Σ_c [ K_c log v_c + e_c / v_c + ν log(1 + max(o_c − m_c, 0) / ν) ],
+    v_c   = max(e_c / K_c, floor, ρ² E_c / K_c).
+
+v_c is the variance of what nobody knows, at its likeliest: so a column's unexplained energy costs ½ K_c log(e_c / K_c),
+and a loud column drowns no quiet one. It is no less than what the form of the causes' laws may miss, a share ρ² of the
+energy E_c that they explain there, and than `floor`, what coloured noise that is known from a few repeats may leave.
+Outside of the features, ν looks count: the noise is known to a fifth, and misfits there come in bursts.
+
+A cause's amplitudes have a Gaussian prior of the gap's own size: one standard deviation changes as much as is missed in
+all. Nominal parameters are refitted with every set, in the weights that follow from v_c.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxfinger.gap.columns import Columns
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """All that the formula does not take from the file at hand; `jaxfinger.gap.tune` fits them by log score."""
+
+    floor: float = 2.0  # v_c that noise alone may leave, since its colour is known from a few repeats
+    form: float = 0.02  # ρ²: share of what causes explain in a column that the forms of their laws may miss
+    looks: float = 25.0  # ν: independent looks outside of the features
+    worse: float = 1.0  # times as much that unknown costs which a column has with causes, and has not without
+    prior: float = 20.0  # log evidence that a cause must bring: what an imitator of something unknown gains
+    further: float = 4.0  # likewise, one more site of a cause that is in
+    trust: float = 0.25  # β: of all log evidence, since neighbouring features and columns are no independent looks
+    open: float = 30.0  # log evidence of what the causes leave, from which on something else is as likely as not
+    sharp: float = 0.15  # and how fast that grows
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What the likeliest unknown makes of the columns."""
+
+    feature: Float[np.ndarray, " C"]  # 1 / v_c
+    outside: Float[np.ndarray, " C"]
+    variance: Float[np.ndarray, " C"]  # v_c
+
+
+def log_likelihood(
+    columns: Columns,
+    e: Float[np.ndarray, "*n C"],
+    o: Float[np.ndarray, "*n C"],
+    explained: Float[np.ndarray, "*n C"],
+    p: Parameters,
+    before: Float[np.ndarray, " C"] | None = None,
+) -> tuple[Float[np.ndarray, " *n"], Weights]:
+    """log L and the weights that belong to it."""
+    K, nu = columns.K, p.looks
+    scale = (nu + o) / (nu + columns.outside)
+    floor = p.floor * np.maximum(scale, 1.0)
+    v = np.maximum(np.maximum(e / K, floor), p.form * explained / K)
+    excess = np.maximum(o - columns.outside, 0.0) / nu
+    more = np.zeros_like(v) if before is None else np.maximum(np.log(v / before), 0.0)
+    value = -0.5 * np.sum(K * (np.log(v) + p.worse * more) + e / v + nu * np.log1p(excess), axis=-1)
+    return value, Weights((1.0 + p.worse * (more > 0.0)) / v, 1.0 / (1.0 + excess), v)
+
+
+def unexplained(columns: Columns, judged: "Judged", null: "Judged", p: Parameters) -> Float[np.ndarray, " C"]:
+    """Log evidence, column by column, that something is at work beyond noise and what the causes' forms may miss."""
+    scale = np.maximum((p.looks + judged.o) / (p.looks + columns.outside), 1.0)
+    explained = columns.sums((judged.b - null.b) ** 2)
+    floor = np.maximum(p.floor * scale, p.form * explained / columns.K)
+    return 0.5 * columns.K * np.log(np.maximum(judged.e / columns.K / floor, 1.0))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One set of causes on top of what is refitted with every set."""
+
+    score: float  # log L less Occam's factor: comparable between sets over the same rows
+    log_l: float
+    amplitudes: Float[np.ndarray, " k"]  # of the further rows, in units of their prior
+    solution: Float[np.ndarray, " base+k"]  # coefficients of all rows in the residual: 1, −δ, −a
+    b: Float[np.ndarray, " features"]  # of what is left, on the features
+    weights: Weights
+    e: Float[np.ndarray, " C"]
+    o: Float[np.ndarray, " C"]
+
+
+ROUNDS = 6  # of reweighting; scores then change by less than one
+RIDGE = 1e-10  # relative, of the base's products
+
+
+class Linear:
+    """Sets of further rows Z on top of a base X: the residual, and all that is refitted with every set."""
+
+    def __init__(
+        self,
+        columns: Columns,
+        base: Float[np.ndarray, "k N"],
+        prior: Float[np.ndarray, "k k"],
+        further: Float[np.ndarray, "M N"],
+        parameters: Parameters,
+        null: Judged | None = None,
+    ):
+        self.columns, self.parameters, self.prior = columns, parameters, prior
+        self.X, self.Z = base, further
+        self.BX, self.TX = columns.coefficients(base), columns.products(base, base)
+        self.BZ, self.TXZ = columns.coefficients(further), columns.products(base, further)
+        self.null = null
+        if null is None:
+            self.null = self.judge(np.empty(0, int))
+
+    def _weighted(self, w: Weights, B, B2, T):
+        """Products in the weights, summed over columns."""
+        inside = np.repeat(w.feature - w.outside, self.columns.K)
+        return np.tensordot(w.outside, T, 1) + (B * inside[:, None]).T @ B2
+
+    def judge(
+        self, picks: Int[np.ndarray, " k"], low=None, high=None, start: Weights | None = None, middle=None
+    ) -> Judged:
+        """The likeliest amplitudes of the rows `picks` within `low` and `high`, in units of their prior."""
+        k, n = self.X.shape[0], len(picks)
+        low = np.full(n, -np.inf) if low is None else low
+        high = np.full(n, np.inf) if high is None else high
+        T = np.empty((len(self.columns.items), k + n, k + n))
+        T[:, :k, :k], T[:, :k, k:] = self.TX, self.TXZ[:, :, picks]
+        T[:, k:, :k], T[:, k:, k:] = (
+            np.swapaxes(T[:, :k, k:], 1, 2),
+            self.columns.products(self.Z[picks], self.Z[picks]),
+        )
+        B = np.concatenate([self.BX, self.BZ[:, picks]], axis=1)
+        prior = np.zeros((k + n, k + n))
+        prior[:k, :k] = self.prior
+        prior[k:, k:] = np.eye(n)
+        if middle is not None:  # amplitudes count from where they are
+            prior[0, k:] = prior[k:, 0] = middle
+            prior[0, 0] += float(middle @ middle)
+        before = self.null.b if self.null else None
+        weights = start or (self.null.weights if self.null else self._white())
+        for _ in range(ROUNDS):
+            H = self._weighted(weights, B, B, T) + prior
+            x = self._solve(H, low, high)
+            b = B @ x
+            e = self.columns.sums(b**2)
+            o = np.maximum(np.einsum("i,cij,j->c", x, T, x) - e, 0.0)
+            explained = self.columns.sums((b - before) ** 2) if before is not None else np.zeros_like(e)
+            log_l, weights = log_likelihood(self.columns, e, o, explained, self.parameters, self._before)
+        log_l = float(log_l) - 0.5 * float(x[:k] @ self.prior @ x[:k])
+        H = self._weighted(weights, B, B, T) + prior
+        sizes = -x[k:] if middle is None else -x[k:] - middle
+        occam = 0.5 * _further_information(H, k) + 0.5 * float(sizes @ sizes) if n else 0.0
+        return Judged(log_l - occam, log_l, -x[k:], x, b, weights, e, o)
+
+    def _white(self) -> Weights:
+        ones = np.ones(len(self.columns.items))
+        return Weights(ones, ones, ones)
+
+    @property
+    def _before(self):
+        return None if self.null is None else self.null.weights.variance
+
+    def _solve(self, H, low, high):
+        """Coefficients (1, −δ, −a); amplitudes that leave their bounds stay at them."""
+        d = H.shape[0]
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+        M = H * np.outer(scale, scale) + RIDGE * np.eye(d)
+        first = d - len(low)
+        free, x = np.ones(d, bool), np.zeros(d)
+        free[0], x[0] = False, 1.0
+        for _ in range(3):
+            at = np.flatnonzero(free)
+            fixed = np.flatnonzero(~free)
+            y = np.linalg.solve(M[np.ix_(at, at)], -M[np.ix_(at, fixed)] @ (x[fixed] / scale[fixed]))
+            x[at] = y * scale[at]
+            a = -x[first:]
+            out = (a < low) | (a > high)
+            out &= free[first:]
+            if not out.any():
+                break
+            x[first:][out] = -np.clip(a, low, high)[out]
+            free[first:][out] = False
+        return x
+
+    def screen(self, now: Judged, candidates: list[Int[np.ndarray, " k"]], bounds) -> Float[np.ndarray, " candidates"]:
+        """Gain in log L less Occam's factor of each candidate alone on top of the base, by one step in the weights."""
+        w, k = now.weights, self.X.shape[0]
+        x = now.solution[:k]
+        HXX = self._weighted(w, self.BX, self.BX, self.TX) + self.prior
+        HXZ = self._weighted(w, self.BX, self.BZ, self.TXZ)
+        A = HXX[1:, 1:]
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-300))
+        absorbed = np.linalg.solve(A * np.outer(scale, scale) + RIDGE * np.eye(k - 1), HXZ[1:] * scale[:, None])
+        absorbed *= scale[:, None]  # of every further row, by the base
+        BZ = self.BZ - self.BX[:, 1:] @ absorbed
+        b = x @ HXZ  # residual is optimal in the base, so that projecting Z is all it takes
+        assert self.null is not None
+        r, null = self.BX @ x, self.null.b
+        Tr = np.einsum("i,cij->cj", x, self.TX)  # (C, k)
+        rZ = np.einsum("i,cij->cj", x, self.TXZ) - Tr[:, 1:] @ absorbed
+        # Products of projected further rows by column, for the candidates' blocks alone.
+        JZ = np.einsum("cij,jm->cim", self.TX[:, 1:, 1:], absorbed)
+        out = np.full(len(candidates), -np.inf)
+        for n, (at, (low, high)) in enumerate(zip(candidates, bounds, strict=True)):
+            Q = absorbed[:, at]
+            TZ = self._own(tuple(at))
+            XQ = np.einsum("im,cin->cmn", Q, self.TXZ[:, 1:, at])
+            TZ = TZ - XQ - np.swapaxes(XQ, 1, 2) + np.einsum("im,cin->cmn", Q, JZ[:, :, at])
+            inside = np.repeat(w.feature - w.outside, self.columns.K)
+            G = np.tensordot(w.outside, TZ, 1) + (BZ[:, at] * inside[:, None]).T @ BZ[:, at]
+            a = np.clip(np.linalg.solve(G + np.eye(len(at)), b[at]), low, high)
+            if not a.any():
+                continue
+            change = BZ[:, at] @ a
+            e = self.columns.sums((r - change) ** 2)
+            total = now.e + now.o - 2.0 * rZ[:, at] @ a + np.einsum("m,cmn,n->c", a, TZ, a)
+            log_l, _ = log_likelihood(
+                self.columns,
+                e,
+                np.maximum(total - e, 0.0),
+                self.columns.sums((r - change - null) ** 2),
+                self.parameters,
+                self._before,
+            )
+            occam = 0.5 * np.linalg.slogdet(np.eye(len(at)) + G)[1] + 0.5 * float(a @ a)
+            out[n] = log_l - now.log_l - occam
+        return out
+
+    def std(self, at: Int[np.ndarray, " k"], w: Weights) -> Float[np.ndarray, " k"]:
+        """Of the amplitudes of further rows, refitted with the base and with one another, without their prior."""
+        k, base = self.X.shape[0], self.prior
+        H = np.zeros((k + len(at),) * 2)
+        H[:k, :k] = self._weighted(w, self.BX, self.BX, self.TX) + base
+        H[:k, k:] = self._weighted(w, self.BX, self.BZ[:, at], self.TXZ[:, :, at])
+        H[k:, :k] = H[:k, k:].T
+        H[k:, k:] = self._weighted(w, self.BZ[:, at], self.BZ[:, at], self._own(tuple(at)))
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(H)[1:], 1e-300))
+        inverse = np.linalg.pinv(H[1:, 1:] * np.outer(scale, scale), rcond=1e-12, hermitian=True)
+        return (np.sqrt(np.maximum(np.diag(inverse), 0.0)) * scale)[k - 1 :]
+
+    def _own(self, at: tuple[int, ...]) -> Float[np.ndarray, "C k k"]:
+        if not hasattr(self, "_blocks"):
+            self._blocks: dict = {}
+        if at not in self._blocks:
+            z = self.Z[list(at)]
+            self._blocks[at] = self.columns.products(z, z)
+        return self._blocks[at]
+
+
+def _further_information(H: Float[np.ndarray, "d d"], k: int) -> float:
+    """log det of the information on what follows the first k, the base but the residual refitted."""
+    A, C, D = H[1:k, 1:k], H[1:k, k:], H[k:, k:]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-300))
+    inner = np.linalg.solve(A * np.outer(scale, scale) + RIDGE * np.eye(k - 1), C * scale[:, None])
+    return float(np.linalg.slogdet(D - (C * scale[:, None]).T @ inner)[1])

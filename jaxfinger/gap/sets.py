@@ -1,0 +1,362 @@
+"""Which causes: sets grown, pruned and swapped by their evidence, each fitted exactly; and what all visited sets say.
+
+A cause costs the evidence that an imitator would bring, and the log of the number of its rivals. Further sites of an
+effect that is in cost less and the log of its sites alone: one cause that acts at many sites is one cause.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxfinger.effects import CatalogueEffect, Scales, Site
+from jaxfinger.gap.exact import Bench, State, Whitened, base, fitted, prior_of
+from jaxfinger.gap.formula import Linear, Weights
+from jaxfinger.gap.problem import Problem
+from jaxfinger.gap.screening import Screening
+from jaxfinger.gap.signatures import Variant
+from jaxfinger.identify.stages import Progress
+
+SEEN = 0.01  # of a signature that the nominal parameters leave: with less, products with them are larger
+SHORT_LIST = 12  # candidates whose amplitudes are weighed until the weights settle
+EXACT = 3  # of them that are fitted exactly
+MOST = 12  # changes of the set
+CLOSE = 8.0  # score within which a candidate may overtake another once it is fitted exactly
+Key = tuple[str, Site]
+
+
+@dataclass(frozen=True)
+class Offered:
+    """One way to add a cause: an effect at one site, or at all of its sites, in one shape."""
+
+    variants: tuple[Variant, ...]
+    columns: Int[np.ndarray, " k"]  # rows of its signatures in the table
+    low: Float[np.ndarray, " k"]
+    high: Float[np.ndarray, " k"]
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        """What a verdict would name."""
+        return tuple(v.key for v in self.variants)
+
+    @property
+    def choices(self) -> tuple[float, ...]:
+        """Shapes that no refit moves."""
+        shapes = self.variants[0].effect.shape_parameters()
+        return tuple(v for n, v in self.variants[0].shape if shapes[n].moves == "not")
+
+    @property
+    def effect(self) -> str:
+        """Its id."""
+        return self.variants[0].effect.ID
+
+
+@dataclass(frozen=True)
+class Table:
+    """All signatures at the nominal model, each in units of its prior, and what is made of them."""
+
+    Z: Float[np.ndarray, "M N"]
+    rows: dict[Variant, Int[np.ndarray, " k"]]  # of every variant: all of its amplitudes'
+    units: Float[np.ndarray, " M"]
+    absorbed: dict[Key, float]
+    hidden: dict[Key, dict[str, float]]  # std of amplitudes, each alone, in their own units: what could hide
+    offers: list[Offered]
+
+    def rows_of(self, offer: Offered) -> list[Int[np.ndarray, " k"]]:
+        """Of every variant of an offer, those that no trial shows too."""
+        return [self.rows[v] for v in offer.variants]
+
+    @property
+    def keys(self) -> list[Key]:
+        """All that the trials can see."""
+        return list(dict.fromkeys(k for o in self.offers for k in o.keys))
+
+
+def table_of(problem: Problem, bench: Bench, screening: Screening, together: bool = True) -> Table:
+    """Every candidate that the trials can see."""
+    plain = Whitened(problem, bench.columns, Weights(*np.ones((3, len(bench.columns.items)))))
+    rt = plain.residual(problem.r)
+    items: list[Variant] = []
+    blocks = []
+    for part in screening.parts.values():
+        variants, Z = part.offer(plain, rt)
+        items += variants
+        blocks += list(Z)
+    Z = np.concatenate(blocks)
+    raw, seen = np.linalg.norm(Z, axis=1), np.linalg.norm(plain(Z), axis=1)
+    kept = seen > SEEN * raw
+    units = np.where(kept, bench.gap / np.maximum(seen, 1e-300), 0.0)
+    Z *= units[:, None]
+    absorbed: dict[Key, float] = {}
+    hidden: dict[Key, dict[str, float]] = {}
+    offers, rows, start = [], {}, 0
+    for v, block in zip(items, blocks, strict=True):
+        at = np.arange(start, start + len(block))
+        start += len(block)
+        rows[v] = at
+        share = 1.0 - float(np.sum(seen[at] ** 2) / max(np.sum(raw[at] ** 2), 1e-300))
+        if share < absorbed.get(v.key, np.inf):
+            absorbed[v.key] = share
+            hidden[v.key] = {
+                n: size / max(seen[i], 1e-12 * raw[i], 1e-300)
+                for i, (n, size) in zip(at, v.sizes.items(), strict=True)
+                if raw[i] > 0
+            }
+        ends = [_ends(v, n, units[i]) for i, n in zip(at, v.sizes, strict=True) if kept[i]]
+        if ends:
+            low, high = np.array(ends).T
+            offers.append(Offered((v,), at[kept[at]], low, high))
+    return Table(Z, rows, units, absorbed, hidden, offers + (_together(offers) if together else []))
+
+
+def _ends(v: Variant, name: str, unit: float) -> tuple[float, float]:
+    amplitude = v.effect.amplitudes()[name]
+    return -np.inf if amplitude.signed else 0.0, amplitude.most / (v.sizes[name] * unit)
+
+
+def _together(offers: list[Offered]) -> list[Offered]:
+    """One cause at all of its sites."""
+    alike: dict[tuple, list[Offered]] = {}
+    for o in offers:
+        (v,) = o.variants
+        alike.setdefault((v.effect.ID, v.size, v.shape), []).append(o)
+    out = []
+    for group in alike.values():
+        if len({o.keys for o in group}) == len(group) > 1:
+            parts = ([*o.variants] for o in group)
+            columns, low, high = (np.concatenate([getattr(o, n) for o in group]) for n in ("columns", "low", "high"))
+            out.append(Offered(tuple(v for p in parts for v in p), columns, low, high))
+    return out
+
+
+@dataclass
+class Visited:
+    """Scores of the sets that were weighed, costs not taken off."""
+
+    scores: dict[frozenset[Key], float] = field(default_factory=dict)
+
+    def add(self, keys, score: float) -> None:
+        """The best of those that it was given."""
+        key = frozenset(keys)
+        self.scores[key] = max(score, self.scores.get(key, -np.inf))
+
+
+class Search:
+    """Sets of causes of one file."""
+
+    def __init__(self, bench: Bench, table: Table, progress: Progress = lambda message: None):
+        self.bench, self.table, self.progress = bench, table, progress
+        self.visited = Visited()
+        sites: dict[str, set] = {}
+        for effect, site in table.keys:
+            sites.setdefault(effect, set()).add(site)
+        self.sites = {e: len(s) for e, s in sites.items()}
+        self.visited.add((), bench.null.score)
+
+    def cost(self, keys: Iterable[Key]) -> float:
+        """What a set must explain, in log evidence."""
+        return self.odds(keys) + sum(self.evidence_needed(keys))
+
+    def odds(self, keys: Iterable[Key]) -> float:
+        """Log odds against just these effects and sites, of all that there are."""
+        keys = list(keys)
+        effects = {e for e, _ in keys}
+        return len(effects) * np.log(len(self.sites)) + sum(np.log(max(self.sites.get(e, 1), 1)) for e, _ in keys)
+
+    def evidence_needed(self, keys: Iterable[Key]) -> list[float]:
+        """Of every cause, the first site of an effect and further ones."""
+        p, seen, out = self.bench.parameters, set(), []
+        for effect, _ in sorted(keys):
+            out.append(p.further if effect in seen else p.prior)
+            seen.add(effect)
+        return out
+
+    def value(self, state: State) -> float:
+        """Score less costs."""
+        return state.score - self.cost(state.keys)
+
+    def linear(self, state: State, r: np.ndarray, slopes: np.ndarray) -> Linear:
+        """The table's rows on top of a state's base."""
+        problem = state.problem
+        return Linear(
+            self.bench.columns,
+            base(problem, slopes, r),
+            prior_of(problem, len(slopes)),
+            self.table.Z,
+            self.bench.parameters,
+            self.bench.null.judged,
+        )
+
+    def screened(self, state: State, without: int | None = None):
+        """The state, or what is left of it without one cause, linearly: its value, its weights, and of every offer the
+        value of the set with it.
+        """
+        kept = [i for i in range(len(state.effects)) if i != without]
+        at = [k for k, c in enumerate(state.coordinates) if c.effect in kept]
+        r = state.problem.r - state.changes[kept].sum(axis=0)
+        slopes = state.slopes[at]
+        keys = [state.keys[i] for i in kept]
+        score = state.score
+        if without is not None:
+            sizes = state.sizes()[at]
+            score = self.bench.judge(state.problem, r, slopes, sizes).score
+        value = score - self.cost(keys)
+        self.visited.add(keys, score)
+        linear = self.linear(state, r, slopes)
+        now = linear.judge(np.empty(0, int), start=state.judged.weights)
+        offers = self.table.offers
+        gains = linear.screen(now, [o.columns for o in offers], [(o.low, o.high) for o in offers])
+        values = np.full(len(offers), -np.inf)
+        for n, o in enumerate(offers):
+            if not set(o.keys) & set(keys):
+                values[n] = score + gains[n] - self.cost([*keys, *o.keys])
+                self.visited.add([*keys, *o.keys], score + gains[n])
+        return value, now.weights, values, linear, now, keys, score
+
+    def best_offers(self, screened, most: int = EXACT, same: bool = False) -> list[tuple[float, Offered, np.ndarray]]:
+        """The offers whose sets are worth most once the weights settle, with amplitudes: one an effect, site and
+        choice, unless all forms of the `same` are wanted.
+        """
+        _, _, values, linear, now, keys, score = screened
+        found, taken = [], {}
+        for n in np.argsort(-values)[: 4 * SHORT_LIST]:
+            o = self.table.offers[n]
+            form = o.keys, o.choices
+            if not np.isfinite(values[n]) or taken.get(form, 0) >= 2 or len(found) >= SHORT_LIST:
+                continue
+            taken[form] = taken.get(form, 0) + 1
+            judged = linear.judge(o.columns, o.low, o.high, start=now.weights)
+            together = score + judged.score - now.score
+            self.visited.add([*keys, *o.keys], together)
+            found.append((together - self.cost([*keys, *o.keys]), o, judged.amplitudes))
+        found.sort(key=lambda x: -x[0])
+        seen, out = set(), []
+        for x in found:
+            form = x[1].keys, x[1].choices
+            if same or form not in seen:
+                seen.add(form)
+                out.append(x)
+        return [x for x in out[:most] if x[0] > out[0][0] - CLOSE]
+
+    def exactly(
+        self,
+        state: State,
+        without: int | None,
+        offer: Offered | None = None,
+        amplitudes: Sequence[float] | np.ndarray = (),
+        weights: Weights | None = None,
+    ) -> State:
+        """The state with an offer, or without a cause, or both, fitted exactly."""
+        kept = [i for i in range(len(state.effects)) if i != without]
+        variants = [_as_variant(state.effects[i], state.problem.scales) for i in kept]
+        starts = [{n: float(getattr(state.effects[i], n)) for n in type(state.effects[i]).amplitudes()} for i in kept]
+        if offer is not None:
+            self.progress(f"fitting with {offer.effect} at {', '.join('-'.join(s) for _, s in offer.keys)}")
+            mine = {i: float(a) for i, a in zip(offer.columns.tolist(), amplitudes, strict=True)}
+            for v, rows in zip(offer.variants, self.table.rows_of(offer), strict=True):
+                variants.append(v)
+                starts.append(
+                    {
+                        n: mine.get(int(i), 0.0) * float(self.table.units[i]) * size
+                        for i, (n, size) in zip(rows, v.sizes.items(), strict=True)
+                    }
+                )
+        found = fitted(self.bench, state.problem, variants, starts, weights or state.judged.weights)
+        self.visited.add(found.keys, found.score)
+        return found
+
+    def run(self) -> State:
+        """The best set that additions, drops and swaps lead to."""
+        state = self.bench.null
+        if not self.table.offers:
+            return state
+        for _ in range(MOST):
+            grown = self._grown(state)
+            if grown is None:
+                changed = self._swapped(state)
+                if changed is None:
+                    break
+                state = self._pruned(changed)
+                continue
+            state = self._pruned(grown)
+        for i in range(len(state.effects)):  # what each could be replaced by
+            self.screened(state, i)
+        return state
+
+    def _grown(self, state: State) -> State | None:
+        screened = self.screened(state)
+        now, best = self.value(state), None
+        for value, offer, amplitudes in self.best_offers(screened):
+            if value < now - CLOSE:
+                continue
+            found = self.exactly(state, None, offer, amplitudes, screened[1])
+            if best is None or self.value(found) > self.value(best):
+                best = found
+        return best if best is not None and self.value(best) > now else None
+
+    def _pruned(self, state: State) -> State:
+        """Without those causes that explain too little beside the others."""
+        while len(state.effects) > 1:
+            now = self.value(state)
+            left = [self.screened(state, i)[0] for i in range(len(state.effects))]
+            worst = int(np.argmax(left))
+            if left[worst] < now - CLOSE:
+                return state
+            found = self.exactly(state, worst, None)
+            if max(self.value(found), left[worst]) < now:
+                return state
+            state = found
+        return state
+
+    def _swapped(self, state: State) -> State | None:
+        now, best = self.value(state), None
+        for i in range(len(state.effects)):
+            screened = self.screened(state, i)
+            for value, offer, amplitudes in self.best_offers(screened, 1):
+                if value < now - 0.5 * CLOSE or offer.keys == (state.keys[i],):
+                    continue
+                found = self.exactly(state, i, offer, amplitudes, screened[1])
+                if self.value(found) > max(now + 1.0, self.value(best) if best else -np.inf):
+                    best = found
+        return best
+
+    def only(self, state: State, keys: Iterable[Key]) -> State:
+        """The state with no other causes than these."""
+        keys = set(keys)
+        while others := [i for i, k in enumerate(state.keys) if k not in keys]:
+            if len(others) == len(state.keys):
+                return self.bench.null
+            state = self.exactly(state, others[0], None)
+        return state
+
+    def rivals(self, state: State, members: Iterable[Key]) -> list[State]:
+        """The state with each member of an ambiguous set in the place of the one that it holds."""
+        members, out = list(members), [state]
+        own = next(i for i, k in enumerate(state.keys) if k in members)
+        screened = self.screened(state, own)
+        for key in members:
+            if key != state.keys[own] and (best := self._best_of(screened, key)) is not None:
+                out.append(self.exactly(state, own, *best, screened[1]))
+        return out
+
+    def _best_of(self, screened, key: Key) -> tuple[Offered, np.ndarray] | None:
+        _, weights, values, linear, *_ = screened
+        mine = [n for n, o in enumerate(self.table.offers) if o.keys == (key,) and np.isfinite(values[n])]
+        if not mine:
+            return None
+        offer = self.table.offers[max(mine, key=lambda n: values[n])]
+        return offer, linear.judge(offer.columns, offer.low, offer.high, start=weights).amplitudes
+
+    def alone(self, keys: Iterable[Key]) -> dict[Key, tuple[Offered, np.ndarray, np.ndarray]]:
+        """Of causes alone on top of the nominal model, linearly: the shape that suits best, amplitudes, their std."""
+        screened, out = self.screened(self.bench.null), {}
+        for key in keys:
+            if (best := self._best_of(screened, key)) is not None:
+                out[key] = (*best, screened[3].std(best[0].columns, screened[1]))
+        return out
+
+
+def _as_variant(effect: CatalogueEffect, scales: Scales) -> Variant:
+    shapes = tuple((n, float(getattr(effect, n))) for n in effect.shape_parameters())
+    return Variant(type(effect), effect.site, shapes, scales=scales)

@@ -1,0 +1,58 @@
+"""Bounds of a refit, and the interval of how far a gap closes."""
+
+import numpy as np
+import pytest
+
+from jaxfinger.effects import CATALOGUE, Scales
+from jaxfinger.gap.closure import _line
+from jaxfinger.gap.exact import within_bounds
+from jaxfinger.model import Finger
+from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger
+
+
+@pytest.fixture(scope="module")
+def finger() -> Finger:
+    return nominal_model(polynomial_finger(paper_finger())).finger
+
+
+@pytest.mark.parametrize("effect", sorted(CATALOGUE))
+def test_bounds_hold_every_number_and_leave_a_plausible_effect_alone(effect, finger):
+    kind = CATALOGUE[effect]
+    site = kind.sites(finger)[0]
+    scales = Scales.of(finger)
+    shape, sizes = kind.shapes(finger, site, scales)[0], kind.sizes(scales, site)
+    plausible = kind.at(finger, site, **shape, **sizes)
+    for name, value in within_bounds(plausible, scales).values().items():
+        assert value == pytest.approx(plausible.values()[name])
+    far = kind.at(finger, site, **shape, **{n: -size for n, size in sizes.items()})
+    for name, p in kind.amplitudes().items():
+        assert (within_bounds(far, scales).values()[name] < 0.0) == p.signed
+
+
+def test_a_length_that_a_linear_step_turned_negative_comes_back(finger):
+    kind = CATALOGUE["joint_presliding"]
+    effect = kind.at(finger, ("PIP",), a=1.0, x0=-0.3)
+    scales = Scales.of(finger)
+    least = min(kind.worth_trying(scales, ("PIP",))["x0"])
+    assert 0.0 < within_bounds(effect, scales).values()["x0"] <= least
+
+
+def test_trials_without_a_gap_say_nothing_of_how_far_it_closes():
+    """Two tendons of ten show it: a draw of the bootstrap that has neither would say that nothing closes."""
+    rng = np.random.default_rng(1)
+    noise = 1.0 + 0.02 * rng.standard_normal((20, 2))
+    before = np.where(np.arange(20) < 2, 400.0, 1.0) * noise[:, 0]
+    after = np.where(np.arange(20) < 2, 5.0, 1.0) * noise[:, 1]
+    rows = np.stack([before, after, np.ones(20), np.full(20, 100.0)], axis=1)
+    line = _line("ID.4", "tendon_excursion", "m", rows)
+    assert line.closed == pytest.approx(1 - 4.0 / 399.0, abs=2e-3)
+    assert 0.95 < line.closed_ci95[0] <= line.closed <= line.closed_ci95[1] <= 1.0
+    nothing = _line("ID.4", "tendon_excursion", "m", rows[2:])
+    assert (nothing.closed, nothing.closed_ci95, nothing.resolvable) == (0.0, (0.0, 0.0), False)
+
+
+def test_a_simulation_that_runs_away_closes_nothing():
+    rows = np.stack([np.full(6, 4.0), np.full(6, 0.1), np.full(6, 0.01), np.full(6, 100.0)], axis=1)
+    assert _line("VD.3", "q", "rad", rows).closed > 0.9
+    line = _line("VD.3", "q", "rad", rows, runs_away=True)
+    assert (line.closed, line.closed_ci95, line.diverged, line.resolvable) == (0.0, (0.0, 0.0), True, False)

@@ -1,0 +1,100 @@
+"""The formula on rows that no recording made."""
+
+import numpy as np
+import pytest
+
+from jaxfinger.gap.columns import Column, Columns
+from jaxfinger.gap.formula import Linear, Parameters, unexplained
+
+ROWS, FEATURES, COLUMNS = 400, 20, 6
+
+
+@pytest.fixture(scope="module")
+def columns():
+    rng = np.random.default_rng(0)
+    basis = [np.linalg.qr(rng.standard_normal((ROWS, FEATURES)))[0] for _ in range(COLUMNS)]
+    return Columns(tuple(Column("E", "c", i, np.arange(ROWS) + i * ROWS, U) for i, U in enumerate(basis)))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(1)
+
+
+def smooth(columns, rng, *where):
+    """A direction in the features of some columns, of length one in each."""
+    x = np.zeros(ROWS * COLUMNS)
+    for c in where:
+        a = rng.standard_normal(FEATURES)
+        x[columns.items[c].rows] = columns.items[c].basis @ (a / np.linalg.norm(a))
+    return x
+
+
+def linear(columns, r, Z, J=None):
+    J = np.empty((0, r.size)) if J is None else J
+    return Linear(columns, np.vstack([r[None], J]), np.zeros((1 + len(J),) * 2), Z, Parameters())
+
+
+def test_a_quiet_cause_counts_beside_a_loud_error(columns, rng):
+    """Something unknown a hundred times as large in one column changes nothing of what a cause of another is worth."""
+    z, loud = smooth(columns, rng, 0), smooth(columns, rng, 3)
+    noise = rng.standard_normal(ROWS * COLUMNS)
+    gains = []
+    for size in (0.0, 3000.0):
+        bench = linear(columns, noise + 60.0 * z + size * loud, 60.0 * z[None])
+        gains.append(bench.judge(np.array([0])).score - bench.null.score)
+    assert gains[0] > 20.0
+    assert gains[1] == pytest.approx(gains[0], abs=0.5)
+
+
+def test_an_imitator_gains_a_part_of_many_columns_and_a_cause_all_of_its_own(columns, rng):
+    everywhere = np.stack([smooth(columns, rng, c) for c in range(COLUMNS)])
+    noise = rng.standard_normal(ROWS * COLUMNS)
+    r = noise + 100.0 * everywhere.sum(axis=0)
+    half = everywhere.sum(axis=0) + np.stack([smooth(columns, rng, c) for c in range(COLUMNS)]).sum(axis=0)
+    bench = linear(columns, r, 100.0 * np.stack([everywhere.sum(axis=0), half]))
+    true, imitator = (bench.judge(np.array([k])).score - bench.null.score for k in (0, 1))
+    assert true > 3.0 * imitator
+
+
+def test_the_size_of_the_gap_is_no_prior_on_what_noise_gives(columns, rng):
+    r = rng.standard_normal(ROWS * COLUMNS)
+    Z = 20.0 * np.stack([smooth(columns, rng, *range(COLUMNS)) for _ in range(200)])
+    bench = linear(columns, r, Z)
+    found = [bench.judge(np.array([k])).score - bench.null.score for k in range(len(Z))]
+    assert max(found) < 6.0
+    assert unexplained(columns, bench.null, bench.null, Parameters()).sum() == 0.0
+
+
+def test_a_noise_that_is_larger_than_believed_is_no_gap(columns, rng):
+    r = 1.4 * rng.standard_normal(ROWS * COLUMNS)
+    null = linear(columns, r, np.empty((0, r.size))).null
+    assert unexplained(columns, null, null, Parameters()).sum() < 3.0
+
+
+def test_what_the_nominal_parameters_absorb_is_no_evidence(columns, rng):
+    z = smooth(columns, rng, 0, 1)
+    r = rng.standard_normal(ROWS * COLUMNS) + 200.0 * z
+    bench = linear(columns, r, 200.0 * z[None], J=z[None])
+    assert bench.judge(np.array([0])).score - bench.null.score < 0.5
+
+
+def test_a_step_of_the_screen_is_close_to_the_likeliest_amplitude(columns, rng):
+    z = np.stack([smooth(columns, rng, 0, 2), smooth(columns, rng, 1)])
+    J = rng.standard_normal((3, ROWS * COLUMNS))
+    r = rng.standard_normal(ROWS * COLUMNS) + 30.0 * z[0]
+    bench = linear(columns, r, 30.0 * z, J=J)
+    ends = (np.array([0.0]), np.array([np.inf]))
+    screened = bench.screen(bench.null, [np.array([0]), np.array([1])], [ends, ends])
+    for k, gain in enumerate(screened):
+        judged = bench.judge(np.array([k]), *ends).score - bench.null.score
+        assert max(gain, 0.0) == pytest.approx(max(judged, 0.0), abs=0.1 * abs(judged) + 1.0)
+
+
+def test_an_amplitude_keeps_to_its_bounds(columns, rng):
+    z = smooth(columns, rng, 0)
+    r = rng.standard_normal(ROWS * COLUMNS) - 50.0 * z
+    bench = linear(columns, r, 50.0 * z[None])
+    judged = bench.judge(np.array([0]), np.array([0.0]), np.array([np.inf]))
+    assert judged.amplitudes[0] == 0.0
+    assert judged.score <= bench.null.score
