@@ -230,7 +230,11 @@ class Rig(ABC):
         return False
 
     def __enter__(self) -> Self:
-        self.connect()
+        try:
+            self.connect()
+        except BaseException:
+            self.close()
+            raise
         return self
 
     def __exit__(self, kind, error, trace) -> None:

@@ -30,7 +30,9 @@ class LiveView(AbstractContextManager):
     def __init__(self, rig: RigDescription, console: Console | None = None):
         self._rig = rig
         self._console = console or Console()
-        self._live = Live(console=self._console, auto_refresh=False) if self._console.is_terminal else None
+        self._live: Live | None = None
+        if self._console.is_terminal:  # what others print is not sent through the view, to wait for the terminal
+            self._live = Live(console=self._console, auto_refresh=False, redirect_stdout=False, redirect_stderr=False)
         self._trial = ""
         self._view: View | None = None
         self._said: queue.SimpleQueue[str] = queue.SimpleQueue()

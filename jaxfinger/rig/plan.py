@@ -16,6 +16,8 @@ from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.protocols import EXPERIMENTS, Common, Covered, Dwell, Protocol, Settled, Start, Tare
 from jaxfinger.rig.safety import admit
 
+STEPS = 100_000  # of one trial: commands, marks and waits; the longest of the paper's has a hundred
+
 
 @dataclass(frozen=True)
 class PlannedTrial:
@@ -96,10 +98,11 @@ def _plan(document: Document, rig: RigDescription) -> Plan:
         PlannedTrial(f"{i:02d}-{t.motion.rsplit('-', 1)[0]}", t.experiment, t.motion, t.parameters, t.line)
         for i, t in enumerate(trials, 1)
     )
-    for trial in named:
+    for trial in {trial.line: trial for trial in reversed(named)}.values():  # repeats do the same
         try:
-            for _ in commands(trial, rig):
-                pass
+            for number, _ in enumerate(commands(trial, rig)):
+                if number == STEPS:
+                    raise UserError(f"takes more than {STEPS} steps; shorten it")
         except UserError as error:
             raise UserError(f"{document.path}, line {trial.line}: {trial.name}: {error}") from error
     return Plan(file.plan.name, file.plan.operator, named, document.text, str(document.path))

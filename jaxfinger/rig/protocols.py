@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 
 from jaxfinger.data.session import FingerDescription
-from jaxfinger.data.toml import Fault, Within
+from jaxfinger.data.toml import Fault, Positive, Within
 from jaxfinger.rig.backend import Command, JointMove, Setup, TensionRamp
 
 
@@ -75,7 +75,7 @@ class Start:
     loaded: tuple[str, ...] = ()
 
 
-Count = Annotated[int, Within(1)]
+Count = Annotated[int, Within(1, 1000)]  # repeats or passes: noise is known to 2 % from as many
 NotNegative = Annotated[float, Within(0.0)]
 Step = Command | Setup | Reached | Dwell | Settled | Covered | Tare | Mark | Start
 Protocol = Iterator[Step]
@@ -117,7 +117,7 @@ class StaticTorque(Common):
 
     joint: str = field(kw_only=True)
     range_deg: tuple[float, float] = (0.0, 70.0)
-    step_deg: NotNegative = 10.0
+    step_deg: Annotated[float, Within(0.01, unit="deg")] = 10.0  # AA5048B resolves 0.02°
     speed_deg_s: NotNegative = 30.0
     settle: NotNegative = 0.2
     dwell: NotNegative = 0.5
@@ -183,7 +183,7 @@ class Trajectory(Common):
 
     mean: tuple[float, ...] = ()  # N per active tendon; empty: 2 N each
     amplitude: NotNegative = 0.8  # N
-    interval: NotNegative = 0.5
+    interval: Positive = 0.5
     seconds: NotNegative = 10.0
     seed: Annotated[int, Within(0)] = 0
 

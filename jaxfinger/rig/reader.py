@@ -18,7 +18,7 @@ from jaxfinger.rig.trips import Drift
 
 EPOCH_NS = 946_684_800 * 10**9  # 2000-01-01 in Unix time: where a controller's clock starts
 KEEP = 3000  # blocks that a busy runner may lag behind
-JOIN_S = 3.0  # that a reader which hangs in a call is waited for
+JOIN_S = 1.0  # that a reader which hangs in a call is waited for
 
 
 class Reader:
@@ -186,7 +186,7 @@ class HostClock:
         self.lag_s = 0.0
 
     def check(self, block: Block) -> list[Violation]:
-        """Violations once a block has been supervised; `lag_s` is the greatest age that its last sample may have."""
+        """Violations once a block has been supervised; `lag_s` is the greatest age that its first sample may have."""
         look, rate = self._rig.look, self._rig.description.rate_hz
         if look is None or self._rig.simulated_time:
             return []
@@ -198,7 +198,7 @@ class HostClock:
             self._look = look
             if abs(away) > self._deadlines.clock_offset_s:
                 found.append(Violation(Trip.CLOCK, "samples ahead of the host's clock, in s", seq, away))
-        self.lag_s = (look.head - 1 - seq) / rate + time.monotonic() - look.asked
+        self.lag_s = (look.head - int(block.seq[0])) / rate + time.monotonic() - look.asked
         if self.lag_s > self._deadlines.lag_s:
             found.append(Violation(Trip.LAG, "s from a sample to its supervision", seq, self.lag_s))
         return found

@@ -140,8 +140,8 @@ class RingRig(Rig):
             ("heartbeat_s", "", 1.0),
         ):
             key, theirs, most = f"{name}{suffix}", float(found[name]), getattr(hard, name)
-            ours = getattr(soft, name, 0.0)
-            if not theirs >= ours - 1e-9:
+            ours = getattr(soft, name, None)  # the host has no heartbeat to watch
+            if ours is not None and not theirs >= ours - 1e-9:
                 looser = f"is {ours * unit:g}, looser than the controller's {theirs * unit:g}; lower it"
                 self.description.fail("limits", key, looser)
             if not 0 < theirs <= most + 1e-9:

@@ -180,9 +180,9 @@ class Runner:
         """Release the finger after the last trial; returns what went wrong."""
         try:
             self.rig.release()
-            self._pass(
-                AFTER_TRIP_S, lambda: self.rig.status().state not in (State.ARMED, State.MOVING, State.RELEASING)
-            )
+            self._pass(AFTER_TRIP_S, lambda: self.rig.status().state in (State.IDLE, State.TRIPPED))
+            if self.rig.status().state is not State.IDLE:
+                raise TrialEnded("the controller did not release the finger after the last trial", Trip.HOST)
         except UserError as error:
             return self.ended(error)
         return ""
@@ -418,7 +418,13 @@ def run(
     for tag, value in recorder.unwritten:
         if tag == wal.END and log.recordings and log.recordings[-1].end is None:
             log.recordings[-1].end = value
-    convert.publish(log, output, overwrite=resume)
+    try:
+        convert.publish(log, output, overwrite=resume)
+    except UserError as error:
+        ended = f"{cause}; " if cause else ""
+        raise UserError(
+            f"{ended}{str(error).rstrip('.')}; jaxfinger recover {path} makes it once there is room."
+        ) from error
     if not cause:
         path.unlink()
     done = tuple(r.name for r in log.recordings if r.complete)
@@ -497,8 +503,8 @@ def _trials(plan, rig: Rig, recorder: Recorder, operator: Operator, observe, log
             runner._place = ("reference", 0, len(plan.trials))
             runner.carry_out(_reference(rig.description))
         except UserError as error:
-            if not runner.watch.guards and not isinstance(error, TrialEnded):
-                raise  # before anything was armed
+            if not runner.watch.guards and reader.violation is None:  # nothing was armed
+                raise UserError(str(error)) from error
             return runner.ended(error)
         for trial in left:
             name, again = trial.name, 1

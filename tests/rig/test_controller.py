@@ -163,7 +163,7 @@ def test_no_sequence_of_commands_breaks_the_limits(sequence):
             before = row
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.floats(-0.1, 1.5), st.floats(0.05, 10.0), st.floats(1.0, 50.0))
 def test_the_motor_reaches_its_goal_without_passing_it(goal, speed, acceleration):
     """Friction at a hold remembers the direction of approach, so a goal must not be overrun."""

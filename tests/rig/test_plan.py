@@ -36,6 +36,11 @@ def steps(text, rig):
         ('experiment = "ID.3-dynamic"\njoint = "MCP"\nspeeds_deg_s = [400.0]', 3, "°/s for MCP is outside"),
         ('experiment = "ID.2"\njoint = "MCP"\nposture_deg = [0.0, 190.0, 0.0]', 6, "outside its limits"),
         ('experiment = "VD.3"\nmean = [1.0]', 5, "4 active tendons"),
+        ('experiment = "ID.2"\njoint = "MCP"\nrepeats = 1000000000', 6, "outside 1 to 1000"),
+        ('experiment = "ID.3-dynamic"\njoint = "MCP"\npasses = 1000000000', 6, "outside 1 to 1000"),
+        ('experiment = "ID.3-static"\njoint = "MCP"\nstep_deg = 1e-9', 6, "it must be at least 0.01 deg"),
+        ('experiment = "VD.3"\nseconds = 1e9', 3, "more than 100000 steps"),
+        ('experiment = "VD.3"\ninterval = 0.0', 5, "must be above 0"),
     ],
 )
 def test_a_mistake_names_its_line(rig, text, line, says):

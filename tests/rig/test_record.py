@@ -1,6 +1,7 @@
 """What a person meets: the commands, the live view, the keys, a recording played back."""
 
 import io
+import os
 import threading
 from pathlib import Path
 
@@ -89,9 +90,10 @@ def test_the_live_view_shows_tension_and_angle(rig, quiet_block):
     text = io.StringIO()
     view = LiveView(rig, Console(file=text, force_terminal=True, width=100, color_system=None))
     with view:
-        view(View("02-ID.4-T3-MCP", 2, 9, "moving", quiet_block(), 7, True))
+        view(View("02-ID.4-T3-MCP", 2, 9, "moving", quiet_block(), 7, True, 0.04))
     shown = text.getvalue()
-    for part in ("● 2/9 02-ID.4-T3-MCP: moving, 7 samples lost", "T3", "2.00 N", "MCP", "20.1 °", "N mm"):
+    head = "● 2/9 02-ID.4-T3-MCP: moving, 7 samples lost, 40 ms behind the rig"
+    for part in (head, "T3", "2.00 N", "MCP", "20.1 °", "N mm"):
         assert part in shown
 
 
@@ -122,6 +124,29 @@ def test_keys_at_the_terminal(key):
     assert person.stop_requested()
     person.ask("again", lambda: True)  # returns at once: the rig is being stopped
     AtTerminal(said.append).ask("dead", lambda: False)
+
+
+def test_a_terminal_that_is_gone_is_a_stop():
+    """Its stop key is gone with it."""
+    ours, theirs = os.pipe()
+    person = AtTerminal()
+    person._keys = ours
+    assert not person.stop_requested()
+    os.close(theirs)
+    assert person.stop_requested()
+    os.close(ours)
+
+
+def test_a_session_that_cannot_be_written_stays_in_its_log(files, rig, monkeypatch):
+    def full(log, output, overwrite):
+        raise UserError(f"{output}: cannot be written (No space left on device)")
+
+    monkeypatch.setattr("jaxfinger.rig.convert.publish", full)
+    with pytest.raises(UserError, match=r"No space left.*; jaxfinger recover .*s\.h5\.wal makes it"):
+        run(parse_plan(SHORT, rig), SimulatedRig(rig), files / "s.h5")
+    monkeypatch.undo()
+    recover(files / "s.h5.wal", output=files / "s.h5")
+    assert all(trial.complete for trial in read_session(files / "s.h5"))
 
 
 def test_a_bench_cannot_prepare_itself(rig, tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Pulling the ring: no sample lost, none twice, overruns counted, torn records read again, restarts never spliced."""
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -9,11 +10,11 @@ from hypothesis import strategies as st
 
 from jaxfinger.errors import UserError
 from jaxfinger.rig import contract, parse_rig
-from jaxfinger.rig.backend import CommandRefused, ControllerRestarted, StaleRig
+from jaxfinger.rig.backend import CommandRefused, ControllerRestarted, StaleRig, TensionRamp
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.ring import LARGEST, MARGIN
-from jaxfinger.rig.simulated.controller import Controller
+from jaxfinger.rig.simulated.controller import Controller, HardLimits
 from jaxfinger.rig.simulated.examples import rig_toml
 
 
@@ -191,3 +192,76 @@ def test_two_threads_may_command(rig):
         for t in threads:
             t.join()
         assert sorted(numbers) == list(range(2, 102))
+
+
+def test_a_stop_waits_for_no_other_command(rig):
+    """A controller that acknowledges nothing, with a command under way: the STOP is written over it at once."""
+    machine = small(rig)
+    with machine:
+        machine.arm()
+        machine.inject("stall")
+        machine._pause(0.01)
+        machine.answer_s = 20.0
+        said = []
+
+        def ramp():
+            try:
+                machine.command(TensionRamp({"T1": 5.0}, 5.0))
+            except CommandRefused as error:
+                said.append(str(error))
+
+        waiting = threading.Thread(target=ramp)
+        waiting.start()
+        while kind_of(machine) != contract.Kind.TENSION:
+            time.sleep(0.001)
+        stopping = threading.Thread(target=machine.stop, args=(Trip.OPERATOR,))
+        stopping.start()
+        waiting.join(10.0)
+        assert said == ["TENSION gave way to a stop."]
+        assert kind_of(machine) == contract.Kind.STOP
+        machine.controller.faults.clear()
+        stopping.join(10.0)
+        assert machine.status().trip is Trip.OPERATOR
+
+
+def kind_of(machine) -> int:
+    record = machine._read("stCommand", 0, contract.COMMAND.itemsize)
+    return int(np.frombuffer(record, contract.COMMAND)["kind"][0])
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [
+        ("tension_max", 50.0, "tension_max: may be 36 on the controller, which runs 50"),
+        ("joint_velocity_max", 1e3, "joint_velocity_max_deg_s: may be 1200 on the controller, which runs 57295.8"),
+        ("heartbeat_s", 0.3, "heartbeat_s: may be 0.25 on the controller, which runs 0.3"),
+        ("heartbeat_s", 0.0, "which runs 0;"),
+        ("heartbeat_s", np.nan, "which runs nan"),
+        ("fingertip_force_max", np.inf, "which runs inf"),
+    ],
+)
+def test_a_controller_whose_limits_are_looser_than_the_rig_file_allows_is_refused(rig, field, value, says):
+    machine = SimulatedRig(rig, Controller(limits=HardLimits(**{field: value})))
+    with pytest.raises(UserError, match=r"rig\.toml, line \d+: ") as error:
+        machine.connect()
+    assert says in str(error.value)
+    text = rig_toml() + f"\n[controller]\n{field.replace('velocity_max', 'velocity_max_deg_s')} = {value}\n"
+    if 0 < value < np.inf and field != "joint_velocity_max":
+        SimulatedRig(parse_rig(text), machine.controller).connect()
+
+
+@pytest.mark.parametrize(("symbol", "size"), [("stStatus", 48), ("aFilter", 944), ("nHostBeat", 4), ("aRing", 1000)])
+def test_every_symbols_size_is_compared(rig, symbol, size):
+    machine = small(rig)
+    machine.controller.place[symbol] = machine.controller.place[symbol][0], size
+    with pytest.raises(UserError, match=rf"GVL_Jaxfinger\.{symbol} has {size} bytes on the controller"):
+        machine.connect()
+
+
+@pytest.mark.parametrize(("field", "says"), [("state", "state is 77"), ("trip", "trip is 77")])
+def test_a_code_that_the_contract_does_not_know_is_a_sentence(rig, field, says):
+    machine = small(rig)
+    at = machine.controller.place["stStatus"][0] + contract.STATUS.fields[field][1]
+    machine.controller.memory[at : at + 4] = np.uint32(77).tobytes()
+    with pytest.raises(UserError, match=f"the controller's {says}, which the contract does not know"):
+        machine.connect()

@@ -11,7 +11,7 @@ import pytest
 
 from jaxfinger.data import check_file, read_session
 from jaxfinger.errors import UserError
-from jaxfinger.rig import parse_plan, parse_rig, recorder, recover, wal
+from jaxfinger.rig import parse_plan, parse_rig, recorder, recover, runner, wal
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.runner import log_path, run
@@ -351,3 +351,37 @@ def test_a_gap_is_counted_and_written(rig, record, tmp_path):
         assert file["rig/gaps/lost"][()].tolist() == [lost]
         time = file["trials/01-ID.2-DIP/time"][()]
         assert np.diff(time).max() == pytest.approx((lost + 1) * 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        ("nan", "nothing was armed: a channel is not a number or was flagged by its terminal (tension T1 = nan"),
+        ("clock-frozen", "nothing was armed: the controller's clock jumps or runs at another rate than it should"),
+        ("clock-rate", "nothing was armed: the controller's clock"),
+        ("flag", "nothing was armed: a channel is not a number or was flagged"),
+        ("stall", "wrote no sample"),
+        ("ring", "the controller's ring holds 1 samples, but a host that may lag by 0.25 s needs 414"),
+    ],
+)
+def test_what_is_wrong_before_arming_is_a_sentence_and_nothing_moves(rig, record, tmp_path, monkeypatch, fault, says):
+    monkeypatch.setattr(runner, "PATIENCE_S", 0.3)
+    controller = Controller()
+    if fault == "ring":
+        controller.tell_ring(1)
+    else:
+        controller.strike(fault, standing=True)
+    with pytest.raises(UserError) as error:
+        record(SimulatedRig(rig, controller))
+    assert says in str(error.value)
+    assert controller.state is State.IDLE
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_controller_that_does_not_release_is_said(rig, record):
+    """RELEASE after the last trial and STOP are both ignored: the watchdog lets go, and the run says what happened."""
+    machine = SimulatedRig(rig)
+    outcome = record(machine, lambda m: m.controller.strike("deaf"))
+    assert "did not release the finger after the last trial" in outcome.cause
+    assert "switch the drives off" in outcome.cause
+    assert len(outcome.complete) == 2

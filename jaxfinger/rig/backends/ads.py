@@ -22,6 +22,8 @@ from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.ring import RingRig
 
 TIMEOUT_MS = 500
+CALL_S = 0.7  # longer than the time-out of any call
+BUSY_S = 0.1  # that a heartbeat waits for another call
 ATTEMPTS = 4  # to connect: a router may still hang up on the connection of a program that was killed a moment ago
 PAUSE_S = 0.1  # between attempts
 
@@ -56,10 +58,10 @@ class AdsRig(RingRig):
         self._lock = threading.Lock()
         self._places: dict[str, tuple[int, int, int]] = {}  # symbol: group, offset, size in bytes
         self.reconnects = 0
-        self._given_up = False
+        self._given_up = self._mending = self._closed = False
 
     def _open(self) -> None:
-        where, self._given_up = self.description.address, False
+        where, self._given_up, self._closed = self.description.address, False, False
         for attempt in range(ATTEMPTS):
             try:
                 self._attach()
@@ -97,7 +99,8 @@ class AdsRig(RingRig):
         self._places = places  # as a whole: an earlier set stays where the controller is lost halfway
 
     def close(self) -> None:
-        if self._lock.acquire(timeout=1.0):  # else another thread hangs in a call, which must not be disturbed
+        self._closed = self._given_up = True  # a thread that was left behind must not open it again
+        if self._lock.acquire(timeout=CALL_S):  # else another thread hangs in a call, and closes when it comes back
             try:
                 self._detach()
             finally:
@@ -112,10 +115,11 @@ class AdsRig(RingRig):
     def _call(self, request: Callable[[], bytes], mend: bool = True) -> bytes:
         """Do a request; after a cut, close, open and do it again until `reconnect_s` is over."""
         patience = float(self.description.address["reconnect_s"])
-        self._take(patience + 1.0)
+        self._take(mend)
         try:
             return request()
         except self._failures as first:
+            self._mending = mend
             deadline = time.monotonic() + patience
             while mend and not self._given_up and time.monotonic() < deadline:
                 self.alive()
@@ -130,15 +134,18 @@ class AdsRig(RingRig):
             self._given_up |= mend
             raise ConnectionLost(f"the connection to the controller is lost ({first}).") from first
         finally:
+            self._mending = False
+            if self._closed:
+                self._detach()
             self._lock.release()
 
-    def _take(self, seconds: float) -> None:
-        """Wait for the connection, which another thread may be using or mending."""
-        deadline = time.monotonic() + seconds
+    def _take(self, patient: bool) -> None:
+        """Wait for the connection, which another thread may be using, or mending for so long as that may take."""
+        began = time.monotonic()
         while not self._lock.acquire(timeout=0.02):
             self.alive()
-            if time.monotonic() > deadline:
-                raise ConnectionLost(f"the connection to the controller hangs for {seconds:g} s.")
+            if time.monotonic() - began > (CALL_S if patient else BUSY_S) and not (patient and self._mending):
+                raise ConnectionLost("a call to the controller hangs.")
 
     def _read(self, symbol: str, offset: int, size: int) -> bytes:
         def request() -> bytes:

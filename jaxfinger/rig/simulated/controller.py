@@ -72,6 +72,7 @@ class Controller:
         self.place = contract.layout(ring)
         self.memory = bytearray(sum(self.place["stBench"]))
         self.faults: dict[str, tuple[int, int, float]] = {}  # kind: (slot, first seq, amount)
+        self.standing: dict[str, tuple[int, int, float]] = {}  # those that nobody can mend
         self.filtered, self.lockstep = filtered, lockstep
         self.struck: int | None = None  # number of the sample at which a fault first showed
         self.cut = False  # the server is asked to drop its connections
@@ -157,10 +158,14 @@ class Controller:
         self.off = -1 if any(self.setpoint) else self.seq if self.off < 0 else self.off
         self._sample(flags, fault)
 
-    def strike(self, kind: str, slot: int = 0, first: int = 0, amount: float = math.nan) -> None:
-        """A fault of `faults.CATALOGUE` from sample `first` on."""
+    def strike(
+        self, kind: str, slot: int = 0, first: int = 0, amount: float = math.nan, standing: bool = False
+    ) -> None:
+        """A fault of `faults.CATALOGUE` from sample `first` on, until somebody prepares the finger, or for ever."""
         self.struck = None
         self.faults[kind] = slot, first, CATALOGUE[kind].amount if math.isnan(amount) else amount
+        if standing:
+            self.standing[kind] = self.faults[kind]
 
     def amount(self, kind: str) -> float | None:
         """The amount of a fault that is there, for those that strike outside of the program."""
@@ -423,6 +428,6 @@ class Controller:
             self.strike(contract.FAULTS[kind], *where)
             return
         m = self.plant.m
-        self.faults.clear()  # who prepares the finger has mended the rig
+        self.faults = dict(self.standing)  # who prepares the finger has mended the rest
         self.plant.prepare([Mode(v) for v in order["mode"][:m]], order["pose"][:m].tolist(), bool(order["contact"]))
         self.motor = None

@@ -160,7 +160,8 @@ def make(speed: float, heartbeat: float, seed: int, filtered: bool, faults: Sequ
         controller.tell_ring(round(at_start["ring"]))
     for fault in faults:
         if fault.name not in AT_START:
-            controller.strike(fault.name, fault.slot, round(fault.after_s * 1e9 / contract.CYCLE_NS), fault.amount)
+            first = round(fault.after_s * 1e9 / contract.CYCLE_NS)
+            controller.strike(fault.name, fault.slot, first, fault.amount, standing=True)
     return controller
 
 

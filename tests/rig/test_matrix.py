@@ -1,0 +1,79 @@
+"""Every cell of the fault matrix: the supervisor alone on a virtual clock, and the recorder against the stand-in."""
+
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from jaxfinger.rig.matrix import BEGIN, BLOCKS, MATRIX, OFF_S, PHASES, STOP_S, blocks, run, stopped_s, stream, table
+from jaxfinger.rig.safety import Supervisor
+from tests.rig.wire import Cell, try_cell
+
+RECORDING = Path(__file__).parents[2] / "docs" / "recording.md"
+STREAMS = [row for row in MATRIX if row.spoil is not None]
+
+
+@pytest.fixture(scope="module")
+def results(rig):
+    return run(rig)
+
+
+@pytest.mark.parametrize("row", STREAMS, ids=lambda row: row.name)
+def test_the_supervisor_finds_each_fault_at_the_same_sample_in_blocks_of_any_size(rig, results, row):
+    assert {size for name, _, size in results if name == row.name} == set(BLOCKS)
+    for phase in row.phases:
+        hits = [results[row.name, phase, size] for size in BLOCKS]
+        assert all(hits), phase
+        violations, arrived = zip(*hits, strict=True)
+        assert violations[0].trip in row.causes, (phase, violations[0])
+        assert {v.seq for v in violations} == {violations[0].seq}
+        since = (violations[0].seq - BEGIN) / rig.rate_hz
+        assert 0 <= since <= row.shows(rig) + 0.1
+        assert max(arrived) - violations[0].seq < max(BLOCKS)
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_a_sound_finger_trips_nothing_in_any_phase(rig, phase):
+    supervisor = Supervisor(rig)
+    assert [v for block in blocks(stream(rig, phase), 50) for v in supervisor.check(block)] == []
+
+
+def test_every_row_keeps_the_limits(rig, results):
+    for row in MATRIX:
+        stop = stopped_s(rig, row, results)
+        assert stop <= STOP_S, row.name
+        assert stop + (0.0 if row.at_once else 0.7) <= OFF_S, row.name
+
+
+def test_the_documents_table_is_the_matrix(rig, results):
+    assert table(rig, results) in RECORDING.read_text(encoding="utf-8")
+
+
+CELLS = [  # kinds of rows, in one of the phases, at one of the sizes: poll_s of 1 ms is a sample or two a block
+    Cell("disk"), Cell("stall"), Cell("call"), Cell("reader"), Cell("runner"), Cell("watch"), Cell("cut"),
+    Cell("deaf"), Cell("lag"), Cell("slow"), Cell("full"), Cell("restart"), Cell("nan", "letting go"),
+    Cell("key", "ramp"), Cell("flicker", "ramp", 0.001), Cell("temperature", "hold", 0.01, ("delay=0.01",)),
+    Cell("clock fast", "arming"),
+]  # fmt: skip
+LANES = 3  # at a time: each sleeps most of the time
+
+
+@pytest.fixture(scope="module")
+def over_the_wire():
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(LANES - 1, context) as pool, ProcessPoolExecutor(1, context) as other:
+        # a call that hangs keeps its connection for as long as its process lives
+        yield {cell: (other if cell.row == "call" else pool).submit(try_cell, cell) for cell in CELLS}
+
+
+@pytest.mark.parametrize("cell", CELLS, ids=lambda cell: f"{cell.row}-{cell.phase}")
+def test_the_recorder_lets_go_over_the_wire(over_the_wire, cell):
+    """Stopped, tension off, data kept, the cause named, and ended by itself, each within its time."""
+    found, faults = over_the_wire[cell].result()
+    assert not faults, (faults, found)
+
+
+def test_every_row_is_tested_over_the_wire_or_as_a_stream():
+    hosts = {"host"}  # killed and stopped in test_command_line
+    assert {row.name for row in MATRIX} == {c.row for c in CELLS} | {row.name for row in STREAMS} | hosts
