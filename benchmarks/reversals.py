@@ -1,12 +1,14 @@
 """How far `predict` misses the torque of swept joints (ID.3-dynamic) near their reversals, and elsewhere.
 
-    python benchmarks/reversals.py FOLDER [FOLDER ...]
+    python benchmarks/reversals.py [FOLDER ...]
 
 Each folder holds `fit.h5`, from which the model is identified, and `fresh.h5`, whose trials are predicted. A reversal
-is where the joint's angle, in a slow filter, turns back.
+is where the joint's angle, in a slow filter, turns back. The last line is a simulated finger and its true model: its
+friction turns at once, where a real contact gives before it slides.
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,8 @@ import numpy as np
 from jaxfinger.data import Session, Trial, read_session, smooth
 from jaxfinger.identify import Fit, identify
 from jaxfinger.identify.predictions import predict_session
+from jaxfinger.model import Model
+from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger, recipe_from, simulate
 
 NEAR = 0.06  # s from a reversal
 SLOW = 5.0  # Hz, of the filter in which a joint's speed crosses zero once
@@ -27,7 +31,7 @@ def turning_times(trial: Trial, joint: int) -> np.ndarray:
     return trial.time[turns[slope > 0.02 * np.abs(rate).max()]]
 
 
-def errors(fit: Fit, session: Session) -> tuple[np.ndarray, np.ndarray]:
+def errors(fit: Fit | Model, session: Session) -> tuple[np.ndarray, np.ndarray]:
     """Measured less predicted torque, N mm: near reversals, and elsewhere."""
     names = [t.name for t in session if t.experiment == "ID.3-dynamic"]
     near, far = [], []
@@ -42,15 +46,26 @@ def errors(fit: Fit, session: Session) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(near), np.concatenate(far)
 
 
+def simulated() -> tuple[Model, Session]:
+    """A finger of the nominal model's own form, whose directions are derived, and its true model."""
+    sweep = {"repeats": 1, "postures": [[25, 30, 45]], "cycles": 1}
+    trials = {"experiments": ["ID.3-dynamic"], "rate": 1000.0, "id3_dynamic": sweep}
+    session = simulate(recipe_from({"specimen": {"kind": "polynomial"}, "trials": trials}), seed=5)
+    session = replace(session, trials={t.name: replace(t, joint_direction=None) for t in session})
+    return nominal_model(polynomial_finger(paper_finger())), session
+
+
 def main() -> None:
     """One line a folder."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folders", nargs="+", type=Path)
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folders", nargs="*", type=Path)
     print(f"{'':24s} rms error, N mm: within {1e3 * NEAR:.0f} ms of a reversal, elsewhere")
     for folder in parser.parse_args().folders:
         fit = identify(read_session(folder / "fit.h5"))
         near, far = (np.sqrt(np.mean(e**2)) for e in errors(fit, read_session(folder / "fresh.h5")))
         print(f"{folder.name:24s} {near:6.2f} {far:6.2f}")
+    near, far = (np.sqrt(np.mean(e**2)) for e in errors(*simulated()))
+    print(f"{'contacts that do not give':24s} {near:6.2f} {far:6.2f}")
 
 
 if __name__ == "__main__":

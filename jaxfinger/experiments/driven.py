@@ -22,7 +22,9 @@ ABOVE_NOISE = 15.0  # times the noise: what it loses must be more to be a slip
 ROUNDING = 1e-6  # of the motion's speed: what it loses of a joint that stands still in a simulated file
 CLEAR = 2.3  # widths of the filter kept clear on either side of where friction is not known: 1 % of a jump is left
 BREAKAWAY = 4.5  # widths kept clear after a joint that no motor moves has broken away: it does so at once
-ENCODER = 2.2  # times the median loss: 1.5 standard deviations of the encoder, the way over which friction turns
+# Times the median loss: 1.5 standard deviations of the encoder, the way over which friction turns. Longer ways serve
+# contacts that give, shorter ones those that do not (benchmarks/reversals.py).
+ENCODER = 2.2
 CALM = 0.1  # s: over which q̈ is averaged where it does not rise above its noise
 
 

@@ -49,7 +49,7 @@ def _from_slack(r: Recording, tension: Float[np.ndarray, "M n"]) -> Bool[np.ndar
     if r.trial.tendon_direction is not None:
         known |= r.mean(r.trial.tendon_direction.astype(float)) != 0.0
     known |= tension[0] <= r.scales.slack
-    return np.logical_or.accumulate(known, axis=0).all(axis=1)
+    return np.asarray(np.all(np.logical_or.accumulate(known, axis=0), axis=1))
 
 
 def _ramps(tension: Float[np.ndarray, "M n"], hold: Int[np.ndarray, " M"], least: int, travel: float):
