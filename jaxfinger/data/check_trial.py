@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaxfinger.data.findings import Report
+from jaxfinger.data.motion import pulled_slowly
 from jaxfinger.data.parse import listed
 from jaxfinger.data.schema import CHANNELS, DRIVES, MEASURED, MEASURES, NEEDS_JOINT, NEEDS_TENDON
 from jaxfinger.data.session import FingerDescription, Trial
@@ -214,6 +215,9 @@ def _motion(trial: Trial, finger: FingerDescription, report: Report) -> None:
     if trial.experiment in NEEDS_TENDON and _span(_pulled(trial, finger)) < SLACK:
         message = f"tendon {trial.tendon} is never pulled; check the attribute `tendon`"
         report.warning(_place(trial, "tendon_force"), message)
+    elif trial.experiment in NEEDS_TENDON and not pulled_slowly(trial, _pulled(trial, finger)):
+        message = f"tendon {trial.tendon} is pulled neither in holds of 0.2 s nor in ramps of a second"
+        report.warning(_place(trial, "tendon_force"), f"{message}: nothing of the trial is judged; pull it slower")
 
 
 def _dead(trial: Trial, finger: FingerDescription, report: Report) -> None:

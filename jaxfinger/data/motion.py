@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxfinger.data.filtering import smooth
 from jaxfinger.data.session import Trial
@@ -16,6 +16,7 @@ SLOWEST = 6.0  # times its noise: a slower joint keeps the direction that it had
 BOUNDS = 1e-3, 0.1  # of the motion's speed: at least, beside a filter's tails, and at most, in a slow trial
 STILL = 0.1  # of the fastest motion of the trial
 SHORTEST_HOLD = 0.2  # s
+RAMP = 20  # averages of 1/20 s without a hold: the one in which a held tendon slips is a twentieth, and says little
 
 
 def joint_directions(trial: Trial) -> Float[np.ndarray, "N m"]:
@@ -115,3 +116,40 @@ def fitting_cutoff(time: Float[np.ndarray, " N"], cutoff_hz: float) -> float:
     if len(time) < 3:
         return cutoff_hz
     return min(cutoff_hz, 0.25 / float(np.median(np.diff(time))))
+
+
+def slow_ramps(
+    tension: Float[np.ndarray, "M n"], hold: Int[np.ndarray, " M"], least: int, travel: float
+) -> Bool[np.ndarray, " M"]:
+    """Stretches of at least so many samples without a hold, in which no tendon needs less for its way.
+
+    `travel`: N, below which a tendon has not moved.
+    """
+    out, every = np.zeros(len(hold), bool), max(1, least // RAMP)
+    for begin, end in stretches_of(hold < 0):
+        way = np.ptp(tension[begin:end], axis=0)
+        fastest = np.abs(np.diff(tension[begin:end:every], axis=0)).max(axis=0, initial=0.0)
+        slow = (fastest <= 1.2 * every / least * way + 0.1 * travel)[way > travel]
+        out[begin:end] = end - begin >= least and slow.size > 0 and slow.all()
+    return out
+
+
+def stretches_of(inside: Bool[np.ndarray, " M"]) -> list[tuple[int, int]]:
+    """First sample of every stretch, and the first after it."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8))).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
+
+
+def pulled_slowly(trial: Trial, pulled: Float[np.ndarray, " N"]) -> bool:
+    """Whether a held joint's tendon is pulled in holds, or in ramps so slow that its friction can be told; of what is
+    not measured, or too short, nothing is said.
+    """
+    if len(pulled) < 3 or not np.isfinite(pulled).all():
+        return True
+    hold, step = find_holds(trial), float(np.median(np.diff(trial.time)))
+    if (hold >= 0).any():
+        return True
+    size = max(1, round(1.0 / (RAMP * step)))
+    means = pulled[: len(pulled) // size * size].reshape(-1, size).mean(axis=1)[:, None]
+    least = max(1, round(1.0 / (size * step)))
+    return bool(slow_ramps(means, np.full(len(means), -1), least, 0.02 * float(np.ptp(means))).any())

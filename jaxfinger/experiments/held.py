@@ -13,12 +13,12 @@ from scipy.ndimage import uniform_filter1d
 from scipy.optimize import isotonic_regression
 
 from jaxfinger.data import find_holds, shrink
+from jaxfinger.data.motion import RAMP, slow_ramps, stretches_of
 from jaxfinger.experiments.recording import Recording, Row, joints, row, stretches
 
 NOTHING = "no tendon is pulled from slack in holds of 0.2 s or in ramps of a second"
 PARTS = 6  # of a hold, whose means say how well its own is known; longer than an encoder's noise is correlated
 OVERSHOOT = 4.0  # standard deviations: tension beyond that of both holds by more was really there
-RAMP = 20  # blocks without a hold: a ramp in which the block where a tendon slips is a twentieth, and says little
 FEW = 3  # holds from which on their spread tells whether a fixture yields
 
 
@@ -31,7 +31,7 @@ def reduce(r: Recording) -> Row:
         # As smooth as the blocks of a fit: what slips at a noise peak would stay there until the next step.
         tension = uniform_filter1d(tension, max(1, round(1.0 / (r.spec.rate * r.step))), axis=0, mode="nearest")
     pulled = r.taut(r.mean(tension))
-    ramps = _ramps(pulled, hold, round(RAMP / (r.spec.rate * r.step * r.size)), r.scales.travel)
+    ramps = slow_ramps(pulled, hold, round(RAMP / (r.spec.rate * r.step * r.size)), r.scales.travel)
     pulled = _in_steps(_in_ramps(pulled, ramps, r.scales.travel), np.where(ramps, -2, hold), slack=True)
     counts = (hold >= 0) | _goes_on(pulled, hold, r.scales.travel)
     taut = r.lowest(measured) > r.scales.slack
@@ -52,29 +52,12 @@ def _from_slack(r: Recording, tension: Float[np.ndarray, "M n"]) -> Bool[np.ndar
     return np.asarray(np.all(np.logical_or.accumulate(known, axis=0), axis=1))
 
 
-def _ramps(tension: Float[np.ndarray, "M n"], hold: Int[np.ndarray, " M"], least: int, travel: float):
-    """(M,): stretches of at least so many samples without a hold, in which no tendon needs less for its way."""
-    out, every = np.zeros(len(hold), bool), max(1, least // RAMP)
-    for begin, end in _edges(hold < 0):
-        way = np.ptp(tension[begin:end], axis=0)
-        fastest = np.abs(np.diff(tension[begin:end:every], axis=0)).max(axis=0, initial=0.0)
-        slow = (fastest <= 1.2 * every / least * way + 0.1 * travel)[way > travel]
-        out[begin:end] = end - begin >= least and slow.size > 0 and slow.all()
-    return out
-
-
-def _edges(inside: Bool[np.ndarray, " M"]) -> list[tuple[int, int]]:
-    """First sample of every stretch, and the first after it."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8))).tolist()
-    return list(zip(edges[::2], edges[1::2], strict=True))
-
-
 def _in_ramps(tension: Float[np.ndarray, "M n"], ramps: Bool[np.ndarray, " M"], travel: float):
     """Tension that only rises or only falls between two turning points: a held tendon keeps the highest that it has
     seen, so a running maximum over noise would drift upwards.
     """
     out = tension.copy()
-    for begin, end in _edges(ramps):
+    for begin, end in stretches_of(ramps):
         for k in range(tension.shape[1]):
             turns = [begin, *(begin + t for t in _turning_points(tension[begin:end, k], travel)), end]
             for a, b in pairwise(turns):

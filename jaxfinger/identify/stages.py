@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.data import Session, joints_of
-from jaxfinger.experiments import Stack, prepare
+from jaxfinger.experiments import Stack, not_judged, prepare
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible
 from jaxfinger.identify.misfit import growth, pulls, stretches
@@ -156,6 +156,10 @@ def run_stage(fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session
         report = StageReport(stage.name, "skipped", message=f"the session has no {stage.name} trial")
         return replace(fit, stages=(*fit.stages, report))
     reads = {e: c for e, c in stage.reads.items() if e in stacks}
+    lost = [x for x in not_judged({stage.name: stacks[stage.name]}) if x.channel in stage.reads[stage.name]]
+    if lost:
+        report = StageReport(stage.name, "skipped", message=f"no sample of {lost[0].channel} counts: {lost[0].reason}")
+        return replace(fit, stages=(*fit.stages, report))
     parameters = describe(fit.model)
     groups = set(stage.frees) & free_groups(recipe)
     prior_groups = {"mass", "com"} if recipe.fit.free_inertia and stage.name.startswith("ID.3") else set()

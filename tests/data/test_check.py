@@ -1,6 +1,7 @@
 """Every fault that users make is found, named with its place, and refused by the reader without a traceback."""
 
 import shutil
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -241,3 +242,14 @@ def test_a_damaged_file_is_a_session_or_one_sentence(good, tmp_path, seed):
     except UserError as error:
         outcome = error
     assert isinstance(outcome, Session) or "\n" not in str(outcome)
+
+
+@pytest.mark.parametrize(("seconds", "said"), [(0.3, True), (3.0, False)])
+def test_a_tendon_that_is_pulled_too_fast_for_its_friction_is_said(session, tmp_path, seconds, said):
+    trial = session["04-ID.4-T1-MCP"]
+    force = trial.tendon_force.copy()
+    force[:, 0] = 5.0 + 4.0 * np.abs((trial.time / seconds + 1.0) % 2.0 - 1.0)
+    ramped = replace(trial, tendon_force=force, hold=None, tendon_direction=None)
+    write_session(replace(session, trials={trial.name: ramped}), tmp_path / "s.h5")
+    messages = [str(f) for f in check_file(tmp_path / "s.h5")]
+    assert any("nothing of the trial is judged" in m for m in messages) == said
