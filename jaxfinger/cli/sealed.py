@@ -26,7 +26,8 @@ REFIT = f"{shlex.quote(sys.executable)} -m jaxfinger fit effects {{session}} --e
 def make(
     folder: Path,
     *,
-    split: Literal["develop", "fresh"] = "develop",
+    split: Literal["develop", "fresh", "foreign"] = "develop",
+    mix: Literal["natural", "several"] = "natural",
     count: int = 60,
     truth: Path | None = None,
     workers: int | None = None,
@@ -37,7 +38,10 @@ def make(
 
     Args:
         folder: where the cases go.
-        split: `develop` to work with; `fresh` has other seeds, and is for a published table only.
+        split: `develop` to work with; `fresh` has other seeds, and is for a published table only; `foreign` has forms
+            and protocols that neither the catalogue nor the other splits have.
+        mix: `natural`: mostly one effect, sometimes none, two, or one that the catalogue lacks; `several`: three to
+            five effects at once, every other case with a small one beside them that the catalogue lacks.
         count: how many cases; a larger count adds to a smaller one.
         truth: where the truth goes; by default a folder beside it, named FOLDER-truth.
         workers: processes; by default as many as there are cores.
@@ -49,7 +53,7 @@ def make(
         raise UserError(f"--count {count}: ask for at least one case")
     truth_root = truth or _beside(folder, "truth")
     with _bar("making cases") as progress:
-        make_cases(split, count, folder, truth_root, workers or os.cpu_count() or 1, _share(share), progress)
+        make_cases(split, count, folder, truth_root, workers or os.cpu_count() or 1, _share(share), progress, mix=mix)
     print(f"{folder}: cases; {truth_root}: truth. Diagnose them with: jaxfinger sealed run {folder}")
 
 
@@ -174,11 +178,11 @@ def score(folder: Path, *, diagnoses: Path | None = None, truth: Path | None = N
         folder: the cases.
         diagnoses: what `run` wrote; by default FOLDER-diagnoses.
         truth: what `make` hid; by default FOLDER-truth, or truth.json beside each fit.h5.
-        output: a folder for scores.json and reliability.svg.
+        output: a folder for scores.json, table.md and reliability.svg.
     """
     from jaxfinger.sealed.figures import reliability_diagram
     from jaxfinger.sealed.score import imitators, score_folder
-    from jaxfinger.sealed.tables import render, render_imitators
+    from jaxfinger.sealed.tables import markdown, render, render_imitators
 
     results = diagnoses or _beside(folder, "diagnoses")
     if not results.is_dir():
@@ -196,8 +200,9 @@ def score(folder: Path, *, diagnoses: Path | None = None, truth: Path | None = N
         output.mkdir(parents=True, exist_ok=True)
         both = scores.to_json() | {"withheld": [asdict(r) for r in stand_ins]}
         (output / "scores.json").write_text(json.dumps(both, indent=1))
+        (output / "table.md").write_text(markdown({folder.name: scores}))
         reliability_diagram(scores.reliability, output / "reliability.svg")
-        print(f"{output}: scores.json, reliability.svg")
+        print(f"{output}: scores.json, table.md, reliability.svg")
 
 
 def _beside(folder: Path, what: str) -> Path:

@@ -33,10 +33,13 @@ from .sensors import STD, UNITS, Sensors, draw_sensors, measure
 from .severity import Look, Session, by_channel, calibrate
 from .specimens import LAYOUTS, Specimen, make_specimen
 
-SCHEMA = "jaxfinger-sealed/1"
-SPLITS = {"develop": 1, "fresh": 2}
+SCHEMA = "jaxfinger-sealed/2"
+SPLITS = {"develop": 1, "fresh": 2, "foreign": 3}
+MIXES = {"natural": (), "several": (1,)}  # and what they add to a case's seed
 SEVERITIES = (2.0, 5.0, 10.0)
 TEN = ("listed", "listed", "double", "listed", "none", "listed", "listed", "unlisted", "listed", "unlisted")
+LIKE_SIZE = (5.0, 10.0)  # severities of several causes at once, drawn between these
+SMALL = 2.5  # severity of an unlisted cause beside several listed ones
 CREATED = "2026-01-15T10:00:00+00:00"
 
 
@@ -44,20 +47,25 @@ CREATED = "2026-01-15T10:00:00+00:00"
 class CaseSpec:
     """What a case is about. Effects by id; a severity each, in units of a hold's noise."""
 
-    kind: str  # none, listed, unlisted, double
+    kind: str  # none, listed, unlisted, double, several
     specimen: str
     effects: tuple[str, ...] = ()
     severities: tuple[float, ...] = ()
 
 
-def case_specs(split: str, count: int) -> list[CaseSpec]:
-    """The first `count` cases of a split. In every ten: six listed effects, one or two without any, one or two
-    unlisted, one double.
+def case_specs(split: str, count: int, mix: str = "natural") -> list[CaseSpec]:
+    """The first `count` cases of a split.
 
-    Listed effects come in turn, each severity equally often, on specimens that differ from round to round.
+    `natural`: in every ten six listed effects, one or two without any, one or two unlisted, one double. Listed effects
+    come in turn, each severity equally often, on specimens that differ from round to round. Of `foreign` the listed
+    ones are those that have a form which no other split has.
+    `several`: three to five listed effects of like size, every other case with a small unlisted one beside them.
     """
+    if mix == "several":
+        return _several(split, count)
     rng = np.random.default_rng([SPLITS[split], 7])
-    listed, unlisted = _rounds(list(LISTED), SEVERITIES, rng), _rounds(list(UNLISTED), SEVERITIES[1:], rng)
+    effects = [e for e, kind in LISTED.items() if split != "foreign" or kind.foreign]
+    listed, unlisted = _rounds(effects, SEVERITIES, rng), _rounds(list(UNLISTED), SEVERITIES[1:], rng)
     specimens = _rounds(["planar", *LAYOUTS], [1.0], rng)
     specs = []
     for i in range(count):
@@ -66,13 +74,30 @@ def case_specs(split: str, count: int) -> list[CaseSpec]:
         if kind == "none":
             specs.append(CaseSpec(kind, specimen))
         elif kind == "double":
-            first, second = (str(e) for e in rng.choice([e for e in LISTED if e != "passive_tendon"], 2, replace=False))
+            first, second = (
+                str(e) for e in rng.choice([e for e in effects if e != "passive_tendon"], 2, replace=False)
+            )
             specs.append(CaseSpec(kind, specimen, (first, second), (10.0, 5.0)))
         else:
             effect, severity = next(unlisted if kind == "unlisted" else listed)
             if effect == "passive_tendon" and not LAYOUTS[specimen].passive:
                 specimen = "planar"
             specs.append(CaseSpec(kind, specimen, (effect,), (severity,)))
+    return specs
+
+
+def _several(split: str, count: int) -> list[CaseSpec]:
+    rng = np.random.default_rng([SPLITS[split], 7, *MIXES["several"]])
+    specimens = _rounds(["planar", *LAYOUTS], [1.0], rng)
+    anywhere = [e for e in LISTED if e != "passive_tendon"]
+    specs = []
+    for i in range(count):
+        specimen, _ = next(specimens)
+        effects = [str(e) for e in rng.choice(anywhere, int(rng.integers(3, 6)), replace=False)]
+        sizes = np.exp(rng.uniform(*np.log(LIKE_SIZE), len(effects))).tolist()
+        if i % 2:
+            effects, sizes = [*effects, str(rng.choice(list(UNLISTED)))], [*sizes, SMALL]
+        specs.append(CaseSpec("several", specimen, tuple(effects), tuple(sizes)))
     return specs
 
 
@@ -85,13 +110,14 @@ def _rounds(items: list[str], severities: Sequence[float], rng: np.random.Genera
         turn += 1
 
 
-def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: Path) -> Path:
+def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: Path, mix: str = "natural") -> Path:
     """Write one case; a finished one is left alone. The truth is written last, so that its file means «finished»."""
     name = f"case-{number:03d}"
     folder, truth_file = root / name, truth_root / f"{name}.json"
     if truth_file.exists() and (folder / "fit.h5").exists() and (folder / "fresh.h5").exists():
         return folder
-    case = _draw(number, split, spec)
+    seed = [SPLITS[split], number, *MIXES[mix]]
+    case = _draw(seed, split, spec)
     departures = case.departures
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -101,7 +127,9 @@ def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: P
     zero = rng.normal(0, 1e-4, finger.n)
     # Side by side the simulations cost little more than one.
     together = [p for p in (*case.plans, *case.later) if p.experiment == "VD.3"]
-    motions = {p.seed: driven(r) for p, r in zip(together, simulate(finger, case.quiet.nominal, together), strict=True)}
+    motions = {
+        p.seed: driven(r, p.rate) for p, r in zip(together, simulate(finger, case.quiet.nominal, together), strict=True)
+    }
     for file, plans in (("fit.h5", case.plans), ("fresh.h5", case.later)):
         trials = _trials(finger, plans, motions, sensors, zero, rng)
         session = Recording(
@@ -116,7 +144,7 @@ def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: P
         "schema": SCHEMA,
         "case": name,
         "split": split,
-        "seed": [SPLITS[split], number],
+        "seed": seed,
         "kind": spec.kind,
         "specimen": spec.specimen,
         "effects": [
@@ -128,9 +156,13 @@ def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: P
                 "severity": wanted,
                 "reached": reached,
                 "seen_in": list(seen),
+                "closes": closes,
                 "parameters": {"size": d.size, "units": d.units, **d.shape},
+                "known": d.known(),
             }
-            for d, wanted, reached, seen in zip(departures, spec.severities, case.reached, case.where, strict=True)
+            for d, wanted, reached, seen, closes in zip(
+                departures, spec.severities, case.reached, case.where, case.quiet.closed_by(departures), strict=True
+            )
         ],
         "noise": {c: {"std": sensors.std[c], "hold": sensors.hold_std(c), "units": UNITS[c]} for c in STD},
         "fresh": _fresh_gap(departures, case.quiet, case.later),
@@ -154,14 +186,14 @@ class _Case:
     rng: np.random.Generator
 
 
-def _draw(number: int, split: str, spec: CaseSpec) -> _Case:
-    rng = np.random.default_rng([SPLITS[split], number])
+def _draw(seed: Sequence[int], split: str, spec: CaseSpec) -> _Case:
+    rng, foreign = np.random.default_rng(seed), split == "foreign"
     specimen = make_specimen(spec.specimen, rng)
-    nominal, sensors, style = Finger(specimen), draw_sensors(rng), draw_style(rng)
+    nominal, sensors, style = Finger(specimen), draw_sensors(rng), draw_style(rng, foreign)
     plans = _with_trajectories(nominal, session_plans(specimen, style, rng), rng)
     later = _with_trajectories(nominal, session_plans(specimen, style, rng, fresh=True), rng)
     quiet = Session(specimen, plans, sensors)
-    return _Case(quiet, plans, later, *_withheld(spec, specimen, quiet, style.speeds, rng), rng)
+    return _Case(quiet, plans, later, *_withheld(spec, specimen, quiet, style.speeds, foreign, rng), rng)
 
 
 def rebuild(truth: dict) -> tuple[Session, list[Departure]]:
@@ -170,7 +202,7 @@ def rebuild(truth: dict) -> tuple[Session, list[Departure]]:
     spec = CaseSpec(
         truth["kind"], truth["specimen"], tuple(e["effect"] for e in effects), tuple(e["severity"] for e in effects)
     )
-    case = _draw(truth["seed"][1], truth["split"], spec)
+    case = _draw(truth["seed"], truth["split"], spec)
     quiet = Session(case.quiet.specimen, case.plans, case.quiet.sensors, slack_counts=False)
     return quiet, case.departures
 
@@ -188,14 +220,21 @@ def _with_trajectories(nominal: Finger, plans: Sequence[Plan], rng: np.random.Ge
     return out
 
 
-def _withheld(spec: CaseSpec, specimen: Specimen, quiet: Session, speeds: Sequence[float], rng: np.random.Generator):
+def _withheld(
+    spec: CaseSpec,
+    specimen: Specimen,
+    quiet: Session,
+    speeds: Sequence[float],
+    foreign: bool,
+    rng: np.random.Generator,
+):
     """The case's departures, sized; a site where the effect cannot be seen is drawn again, three times."""
     chosen: list[Departure] = []
     reached, where = [], []
     for effect, target in zip(spec.effects, spec.severities, strict=True):
         best = None
         for _ in range(4):
-            departure = draw(effect, specimen.finger, rng, speeds)
+            departure = draw(effect, specimen.finger, rng, speeds, foreign)
             assert departure is not None, f"{effect} has no site on {spec.specimen}"
             candidate = calibrate(quiet, departure, target)
             if best is None or abs(np.log(candidate[1] / target)) < abs(np.log(best[1] / target)):
@@ -280,24 +319,25 @@ def make_cases(
     share: tuple[int, int] = (1, 1),
     progress: Callable[[int, int, str], None] | None = None,
     only: Iterable[int] | None = None,
+    mix: str = "natural",
 ) -> list[int]:
     """Make the cases 1 … count of a split (or share i of n of them) on several cores; returns their numbers.
 
     Finished cases are skipped, so a stopped run is taken up by calling again.
     """
-    specs = case_specs(split, count)
+    specs = case_specs(split, count, mix)
     wanted = set(only) if only is not None else None
     numbers = [
         i for i in range(1, count + 1) if i % share[1] == share[0] % share[1] and (wanted is None or i in wanted)
     ]
     if workers == 1:
         for done, i in enumerate(numbers, start=1):
-            make_case(i, split, specs[i - 1], root, truth_root)
+            make_case(i, split, specs[i - 1], root, truth_root, mix)
             if progress:
                 progress(done, len(numbers), f"case-{i:03d}")
         return numbers
     with ProcessPoolExecutor(workers) as pool:
-        jobs = {pool.submit(make_case, i, split, specs[i - 1], root, truth_root): i for i in numbers}
+        jobs = {pool.submit(make_case, i, split, specs[i - 1], root, truth_root, mix): i for i in numbers}
         for done, job in enumerate(as_completed(jobs), start=1):
             job.result()
             if progress:

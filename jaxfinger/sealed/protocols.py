@@ -15,6 +15,7 @@ from .profiles import Builder, Profile
 from .specimens import Specimen
 
 SLOW, FAST = 250.0, 1000.0  # samples per second
+LOGGED = 200.0  # of a bench whose logger has one rate for all
 
 
 @dataclass(frozen=True)
@@ -51,10 +52,13 @@ class Style:
     missing: str  # an experiment that this session lacks, or nothing
     postures: int
     base_tension: float
+    slow: float = SLOW  # samples per second of what is slow, and of what is fast
+    fast: float = FAST
+    together: bool = False  # ID.3-dynamic moves all joints at once
 
 
-def draw_style(rng: np.random.Generator) -> Style:
-    """Habits of one bench."""
+def draw_style(rng: np.random.Generator, foreign: bool = False) -> Style:
+    """Habits of one bench; `foreign`: one that logs at one rate, and drives all joints at once."""
     speeds = np.sort(rng.choice([0.3, 0.5, 0.7, 1.0, 1.4, 1.8, 2.3], size=int(rng.integers(3, 5)), replace=False))
     return Style(
         holds=int(rng.integers(7, 11)),
@@ -67,6 +71,9 @@ def draw_style(rng: np.random.Generator) -> Style:
         missing=str(rng.choice(["", "", "", "", "", "VD.1", "VD.2", "ID.3-dynamic"])),
         postures=2,
         base_tension=float(rng.uniform(1.9, 2.2)),
+        slow=LOGGED if foreign else SLOW,
+        fast=LOGGED if foreign else FAST,
+        together=foreign,
     )
 
 
@@ -114,7 +121,10 @@ class _Protocol:
         for j in range(self.m):
             for letter in "ab" if j < 2 and not self.fresh else "a":
                 yield "ID.3-static", self.static(j, letter)
-        for j in range(self.m):
+        if self.style.together:
+            for letter in "a" if self.fresh else "abcd":
+                yield "ID.3-dynamic", self.dynamic_together(letter)
+        for j in range(0 if self.style.together else self.m):
             for letter in "ab" if j < 1 and not self.fresh else "a":
                 yield "ID.3-dynamic", self.dynamic(j, letter)
         for k in self.active:
@@ -161,7 +171,16 @@ class _Protocol:
         q[j] = b.profile()
         name = f"ID.2-{self.finger.joint_names[j]}-{letter}"
         return Plan(
-            name, name, "ID.2", 0, b.now, SLOW, tuple(q), self._tensions(self.style.base_tension), j, wander=0.15
+            name,
+            name,
+            "ID.2",
+            0,
+            b.now,
+            self.style.slow,
+            tuple(q),
+            self._tensions(self.style.base_tension),
+            j,
+            wander=0.15,
         )
 
     def vd1(self, letter: str) -> Plan:
@@ -177,7 +196,15 @@ class _Protocol:
             q.append(b.profile())
         name = f"VD.1-{letter}"
         return Plan(
-            name, name, "VD.1", 0, duration, SLOW, tuple(q), self._tensions(self.style.base_tension), wander=0.2
+            name,
+            name,
+            "VD.1",
+            0,
+            duration,
+            self.style.slow,
+            tuple(q),
+            self._tensions(self.style.base_tension),
+            wander=0.2,
         )
 
     def static(self, j: int, letter: str) -> Plan:
@@ -194,7 +221,9 @@ class _Protocol:
         q = self._rest(self.posture())
         q[j] = b.profile()
         name = f"ID.3-static-{self.finger.joint_names[j]}-{letter}"
-        return Plan(name, name, "ID.3-static", 0, b.now, SLOW, tuple(q), self._tensions(0.0), j, holds=tuple(holds))
+        return Plan(
+            name, name, "ID.3-static", 0, b.now, self.style.slow, tuple(q), self._tensions(0.0), j, holds=tuple(holds)
+        )
 
     def dynamic(self, j: int, letter: str) -> Plan:
         """Tendons slack; sweeps there and back at several speeds, and a small loop inside the range."""
@@ -213,7 +242,23 @@ class _Protocol:
         q = self._rest(self.posture())
         q[j] = b.profile()
         name = f"ID.3-dynamic-{self.finger.joint_names[j]}-{letter}"
-        return Plan(name, name, "ID.3-dynamic", 0, b.now + 0.2, FAST, tuple(q), self._tensions(0.0), j)
+        return Plan(name, name, "ID.3-dynamic", 0, b.now + 0.2, self.style.fast, tuple(q), self._tensions(0.0), j)
+
+    def dynamic_together(self, letter: str) -> Plan:
+        """Tendons slack; all joints sweep at once, each to its own ends at its own speeds."""
+        pace = 0.8 if self.fresh else 1.0
+        q, duration = [], self.rng.uniform(14.0, 18.0)
+        for j in range(self.m):
+            low, high = self._ends(j)
+            b, ends = Builder(low).rest(self.rng.uniform(0.2, 0.6)), (high, low)
+            for turn in range(1000):
+                speed = pace * float(self.rng.choice(self.style.speeds))
+                if b.now + abs(ends[turn % 2] - b.here) / speed > duration - 0.3:
+                    break
+                b = b.sweep(ends[turn % 2], speed, float(np.clip(0.06 / speed, 0.04, 0.15)))
+            q.append(b.profile())
+        name = f"ID.3-dynamic-{letter}"
+        return Plan(name, name, "ID.3-dynamic", 0, duration, self.style.fast, tuple(q), self._tensions(0.0))
 
     def _steps(self, levels, hold: float) -> tuple[Builder, list[tuple[float, float, int]]]:
         b, holds = Builder(0.0).rest(0.15), []
@@ -234,7 +279,19 @@ class _Protocol:
         tension = self._rest(np.zeros(self.n))
         tension[k] = b.profile()
         name = f"ID.4-{self.finger.tendon_names[k]}-{self.finger.joint_names[j]}-{letter}"
-        return Plan(name, name, "ID.4", 0, b.now, SLOW, tuple(self._rest(posture)), tuple(tension), j, k, tuple(holds))
+        return Plan(
+            name,
+            name,
+            "ID.4",
+            0,
+            b.now,
+            self.style.slow,
+            tuple(self._rest(posture)),
+            tuple(tension),
+            j,
+            k,
+            tuple(holds),
+        )
 
     def vd2(self, k: int) -> Plan:
         """Fingertip against the force sensor; one tendon up to 15 N, others at a constant tension or slack."""
@@ -249,13 +306,31 @@ class _Protocol:
         name = f"VD.2-{self.finger.tendon_names[k]}"
         posture = self.posture(0.3, 0.75)
         return Plan(
-            name, name, "VD.2", 0, b.now, SLOW, tuple(self._rest(posture)), tuple(tension), None, k, tuple(holds)
+            name,
+            name,
+            "VD.2",
+            0,
+            b.now,
+            self.style.slow,
+            tuple(self._rest(posture)),
+            tuple(tension),
+            None,
+            k,
+            tuple(holds),
         )
 
     def vd3(self, letter: str) -> Plan:
         """A wish of the free finger's trajectory; `drive` finds postures and tensions that the finger can follow."""
         return Plan(
-            f"VD.3-{letter}", f"VD.3-{letter}", "VD.3", 0, 8.0, FAST, (), (), least=float(self.rng.uniform(1.2, 2.2))
+            f"VD.3-{letter}",
+            f"VD.3-{letter}",
+            "VD.3",
+            0,
+            8.0,
+            self.style.fast,
+            (),
+            (),
+            least=float(self.rng.uniform(1.2, 2.2)),
         )
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from .drive import Run
 from .laws import Finger, State
 from .profiles import Profile
-from .protocols import Plan, sample_times
+from .protocols import FAST, Plan, sample_times
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,9 @@ def commanded(plan: Plan, rate: float | None = None) -> Motion:
     """
     rng = np.random.default_rng(plan.seed)
     t = sample_times(plan, rate)
-    if rate is not None and plan.joint is not None:  # a coarse look still sees every reversal
-        t = np.union1d(t, _reversals(plan.q[plan.joint], plan))
+    if rate is not None and plan.experiment.startswith(("ID.2", "ID.3")):  # a coarse look still sees every reversal
+        for profile in plan.q if plan.joint is None else [plan.q[plan.joint]]:
+            t = np.union1d(t, _reversals(profile, plan))
     warped = t * (1 + 2e-5 * rng.normal())
     q, qd, qdd = (np.stack(x, axis=1) for x in zip(*(p(warped) for p in plan.q), strict=True))
     q = q + 1e-4 * rng.normal(size=q.shape[1]) * (1 if plan.experiment != "VD.1" else 2)
@@ -74,9 +75,11 @@ def _reversals(profile: Profile, plan: Plan) -> Float[np.ndarray, " r"]:
     return t[1:][np.diff(sign) != 0] - 2e-3
 
 
-def driven(run: Run) -> Motion:
-    """The motion of a simulated VD.3 trial; acceleration is not needed to measure it."""
-    return Motion(run.time, run.q, run.qd, np.zeros_like(run.q), run.tension, last_direction(run.qd, 1e-3))
+def driven(run: Run, rate: float = FAST) -> Motion:
+    """The motion of a simulated VD.3 trial, as often as it is logged; acceleration is not needed to measure it."""
+    direction, every = last_direction(run.qd, 1e-3), slice(None, None, round(FAST / rate))
+    time, q, qd, tension, direction = (a[every] for a in (run.time, run.q, run.qd, run.tension, direction))
+    return Motion(time, q, qd, np.zeros_like(q), tension, direction)
 
 
 def last_direction(rate: Float[np.ndarray, "N k"], still: float = 1e-9) -> Float[np.ndarray, "N k"]:

@@ -111,16 +111,16 @@ def close_case(predict: Predict, folder: Path, diagnosed: Path, truth: Truth) ->
     fits = {"before": diagnosed / "nominal.json", "after": diagnosed / "augmented.json"}
     if (diagnosed / "fresh.json").exists() or not all(f.exists() for f in fits.values()):
         return "skipped"
-    if truth.kind not in ("listed", "double"):
+    if not truth.listed:
         return "skipped"
-    right = set(read_diagnosis(diagnosed).named) == set(truth.causes)
+    right = set(read_diagnosis(diagnosed).named) == set(truth.listed)
     with tempfile.TemporaryDirectory() as scratch:
         outs = {name: Path(scratch) / f"{name}.h5" for name in fits}
         try:
             if predict.refit and not right:
                 fits["best"] = Path(scratch) / "best.json"
                 outs["best"] = Path(scratch) / "best.h5"
-                predict.best(folder / "fit.h5", truth.causes, fits["best"])
+                predict.best(folder / "fit.h5", truth.listed, fits["best"])
             for name, fit in fits.items():
                 predict(fit, folder / "fresh.h5", outs[name])
         except RuntimeError as error:

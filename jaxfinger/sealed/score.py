@@ -14,6 +14,7 @@ from .truth import NONE, UNLISTED, Cause, Diagnosis, Truth, read_diagnosis, read
 
 LARGEST_SET = 3
 TO_CLOSE = 0.01  # of a sample's noise variance, over all channels: a share of less than that is any number
+Z95 = 1.959964
 BINS = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0)
 
 
@@ -46,7 +47,7 @@ class Scores:
         return asdict(self)
 
 
-def wilson(hits: int, count: int, z: float = 1.959964) -> Figure:
+def wilson(hits: int, count: int, z: float = Z95) -> Figure:
     """Share with Wilson's score interval (Wilson 1927), which stays within [0, 1] and is honest at 0 and at 1."""
     if count == 0:
         return Figure(float("nan"), float("nan"), float("nan"), 0)
@@ -73,9 +74,9 @@ def cause_right(truth: Truth, diagnosis: Diagnosis) -> bool:
     return bool(diagnosis.named) and bool(diagnosis.answer) and diagnosis.named[0] in truth.causes
 
 
-def both_right(truth: Truth, diagnosis: Diagnosis) -> bool:
-    """Both effects of a double are named, and nothing else."""
-    return set(diagnosis.named) == set(truth.causes)
+def all_right(truth: Truth, diagnosis: Diagnosis) -> bool:
+    """All listed effects of several that matter are named, and nothing that is not at work."""
+    return set(truth.matters) <= set(diagnosis.named) <= set(truth.listed)
 
 
 def covered(truth: Truth, diagnosis: Diagnosis) -> bool:
@@ -93,16 +94,26 @@ def covered(truth: Truth, diagnosis: Diagnosis) -> bool:
 
 
 def brier(truth: Truth, diagnosis: Diagnosis) -> float:
-    """Σ (p − y)² over all candidates, «none» and «unlisted»; a truth that is no candidate has probability zero."""
-    wanted = truth.shares()
-    return float(
-        sum((diagnosis.probability.get(c, 0.0) - wanted.get(c, 0.0)) ** 2 for c in {*diagnosis.probability, *wanted})
-    )
+    """Σ (p − y)² over all candidates, «none» and «unlisted», of the probabilities p that each is at work; a truth that
+    is no candidate has probability zero.
+    """
+    concerned = {*diagnosis.probability, *truth.at_work}
+    return float(sum((diagnosis.probability.get(c, 0.0) - (c in truth.at_work)) ** 2 for c in concerned))
 
 
 def on_truth(truth: Truth, diagnosis: Diagnosis) -> float:
-    """Probability given to what is true."""
-    return float(sum(diagnosis.probability.get(c, 0.0) for c in truth.shares()))
+    """Mean of the probabilities given to what is at work."""
+    return float(np.mean([diagnosis.probability.get(c, 0.0) for c in truth.at_work]))
+
+
+def inside(truth: Truth, diagnosis: Diagnosis) -> list[bool]:
+    """Of named causes in the catalogue's own form, whether each true value lies in its 95 % interval."""
+    return [
+        abs(said[0] - truth.known[cause][name]) <= Z95 * said[1]
+        for cause, values in diagnosis.values.items()
+        for name, said in values.items()
+        if cause in diagnosis.named and name in truth.known.get(cause, {})
+    ]
 
 
 def closed_share(rows: Sequence[Mapping], truth: Sequence[Mapping], by_law: bool = False) -> float:
@@ -136,10 +147,16 @@ FIGURES: dict[str, tuple[Callable[[Truth], bool], Callable[[Truth, Diagnosis], b
     "cause, where distinguishable": (lambda t: t.kind == "listed" and t.rivals == 0, cause_right),
     "covered": (lambda t: t.kind == "listed", covered),
     "false alarm": (lambda t: t.kind == "none", lambda t, d: bool(d.answer)),
+    "false gap": (lambda t: t.kind == "none", lambda t, d: d.status not in ("no_gap", "failed")),
     "open set": (lambda t: t.kind == "unlisted", covered),
     "open set, where distinguishable": (lambda t: t.kind == "unlisted" and t.rivals == 0, covered),
     "double, one right": (lambda t: t.kind == "double", cause_right),
-    "double, both right": (lambda t: t.kind == "double", both_right),
+    "double, both right": (lambda t: t.kind == "double", all_right),
+    "several, all right": (lambda t: t.kind == "several", all_right),
+    "several, called explained that is not": (
+        lambda t: UNLISTED in t.at_work and len(t.causes) > 1,
+        lambda t, d: d.status == "explained",
+    ),
 }
 
 
@@ -147,20 +164,30 @@ def score_cases(pairs: Sequence[tuple[Truth, Diagnosis]]) -> Scores:
     """All scores of a set of cases.
 
     cause, covered: single listed effects; «where distinguishable»: of these, where no other cause fits as well
-    (see `rivals`). false alarm: cases without an effect. open set: effects that the catalogue lacks, and of these those
-    that no listed one imitates.
+    (see `rivals`). false alarm: cases without an effect for which one is named; false gap: or called anything but «no
+    gap». open set: effects that the catalogue lacks, and of these those that no listed one imitates. double, several:
+    cases with two listed effects, and with more, or with an unlisted one beside them; named, of those that matter: of
+    their listed effects that close more than a tenth of some channel's gap; at work, of those named. values inside:
+    of all named effects in the catalogue's own form.
     Brier, probability on the truth: every case that was diagnosed. set size: verdicts that name something. closed:
     cases with predictions on the fresh trials, as a share of what a refit with the true effects closes (mean), and of
     what the plant's own law would (median: its rows are those of a linearised plant). seconds: cost of a case.
     """
     done = [(t, d) for t, d in pairs if d.status != "failed"]
     figures = _shares(pairs)
+    many = [(t, d) for t, d in pairs if t.kind in ("double", "several")]
+    named = [c in d.named for t, d in many for c in t.matters]
+    true = [c in t.listed for t, d in many for c in d.answer]
+    values = [x for t, d in done for x in inside(t, d)]
+    figures["several, named, of those that matter"] = wilson(sum(named), len(named))
+    figures["several, at work, of those named"] = wilson(sum(true), len(true))
+    figures["values inside 95 % intervals"] = wilson(sum(values), len(values))
     figures["Brier"] = bootstrap([brier(t, d) for t, d in done])
     figures["probability on the truth"] = bootstrap([on_truth(t, d) for t, d in done])
     figures["set size"] = bootstrap(
         [float(len(d.answer)) if d.status == "ambiguous" else 1.0 for _, d in done if d.answer]
     )
-    known = [(t, d) for t, d in done if d.fresh and t.kind in ("listed", "double")]
+    known = [(t, d) for t, d in done if d.fresh and t.listed]
     closed, by_law = ([closed_share(d.fresh, t.fresh, law) for t, d in known] for law in (False, True))
     figures["closed"] = bootstrap([x for x in closed if np.isfinite(x)])
     figures["closed, of what the true law closes"] = bootstrap([x for x in by_law if np.isfinite(x)], of=np.median)
@@ -196,10 +223,9 @@ def reliability(pairs: Sequence[tuple[Truth, Diagnosis]]) -> list[dict[str, floa
     """Probabilities said against how often they came true, over all candidates, «none» and «unlisted» of all cases."""
     said, came = [], []
     for t, d in pairs:
-        wanted = t.shares()
         for c, p in d.probability.items():
             said.append(p)
-            came.append(wanted.get(c, 0.0))
+            came.append(float(c in t.at_work))
     p, y = np.array(said), np.array(came)
     rows = []
     for low, high in pairwise(BINS):
@@ -280,7 +306,7 @@ def _split(pairs: Sequence[tuple[Truth, Diagnosis]], key: Callable[[Truth], str]
 def _right(truth: Truth, diagnosis: Diagnosis) -> bool:
     if truth.kind in ("none", "unlisted"):
         return covered(truth, diagnosis)
-    return both_right(truth, diagnosis) if truth.kind == "double" else cause_right(truth, diagnosis)
+    return all_right(truth, diagnosis) if truth.kind in ("double", "several") else cause_right(truth, diagnosis)
 
 
 def _name(cause: Cause) -> str:

@@ -81,7 +81,8 @@ def measure(
         excursion = sense("tendon_excursion", np.where(lost, np.nan, values))
     if channels.torque is not None:
         tare = rng.normal(0, sensors.hold_std("joint_torque", duration=10.0))
-        torque = sense("joint_torque", np.where(np.arange(finger.m) == plan.joint, channels.torque - tare, np.nan))
+        motorised = (np.arange(finger.m) == plan.joint) | (plan.joint is None)
+        torque = sense("joint_torque", np.where(motorised, channels.torque - tare, np.nan))
     if channels.force is not None:
         force = sense("fingertip_force", channels.force)
     hold, joint_direction, tendon_direction = _protocol_channels(channels, finger.active)

@@ -26,7 +26,7 @@ from .record import Channels, Motion, commanded, last_direction, needed_torque, 
 from .sensors import Sensors
 from .specimens import Specimen
 
-COARSE = {250.0: 25.0, 1000.0: 60.0}  # Hz: enough for what survives in the mean
+COARSE = {250.0: 25.0, 1000.0: 60.0, 200.0: 40.0}  # Hz: enough for what survives in the mean
 UNSEEN = 1e-9  # severity of what leaves no trace at all, so that its logarithm exists
 SLIDING = 0.03  # rad/s: what counts as a sliding joint
 TAUT = 0.3  # N
@@ -221,6 +221,21 @@ class Session:
     def left(self, trace: Float[np.ndarray, " R"]) -> Float[np.ndarray, " R"]:
         """What a refit of the nominal parameters leaves of a trace."""
         return trace - self.absorbed[0] @ self.absorb(trace)
+
+    def closed_by(self, departures: Sequence[Departure]) -> list[float]:
+        """Of each departure, the share of a channel's gap that it closes, added alone to a refitted nominal model, in
+        the channel (experiment, quantity, joint or tendon) where that is most, among those that stand out of the noise.
+        """
+        if not departures:
+            return []
+        whole, labels = self.trace(departures)
+        before = by_channel(self.left(whole), labels)
+        gaps = [c for c, size in before.items() if size > 1.0]
+        out = []
+        for i in range(len(departures)):
+            after = by_channel(self.left(self.trace([*departures[:i], *departures[i + 1 :]])[0]), labels)
+            out.append(max((1.0 - (after[c] / before[c]) ** 2 for c in gaps), default=0.0))
+        return out
 
 
 def _concern(parameter: str, index: int) -> Callable[[Plan], bool]:

@@ -9,16 +9,7 @@ from rich.table import Table
 
 from .score import Figure, Imitators, Scores
 
-SHARES = (
-    "cause",
-    "cause, where distinguishable",
-    "covered",
-    "false alarm",
-    "open set",
-    "open set, where distinguishable",
-    "double, one right",
-    "double, both right",
-)
+PLAIN = ("Brier", "probability on the truth", "set size", "closed", "closed, of what the true law closes", "seconds")
 
 
 def render(scores: Scores) -> Group:
@@ -64,6 +55,20 @@ def render(scores: Scores) -> Group:
     return Group(*parts)
 
 
+def markdown(blocks: Mapping[str, Scores]) -> str:
+    """One table for a page: a row a score, a column a block of cases, each value with its 95 % interval and count."""
+    names = list(dict.fromkeys(n for s in blocks.values() for n, f in s.figures.items() if f.count))
+    lines = [f"| | {' | '.join(blocks)} |", "| --- |" + " --- |" * len(blocks)]
+    for n in names:
+        found = [s.figures.get(n) for s in blocks.values()]
+        lines.append(f"| {n} | " + " | ".join(_cell(n, f) if f and f.count else "" for f in found) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(name: str, f: Figure) -> str:
+    return f"{_value(name, f.value)} ({_value(name, f.low)} … {_value(name, f.high)}), {f.count}"
+
+
 def render_imitators(rows: Sequence[Imitators]) -> Table:
     """What is named in place of every effect that was withheld."""
     table = Table(title="withheld from the catalogue", title_justify="left")
@@ -77,7 +82,7 @@ def render_imitators(rows: Sequence[Imitators]) -> Table:
 
 
 def _split_table(title: str, split: Mapping[str, Mapping[str, Figure]]) -> Table:
-    columns = [c for c in (*SHARES, "probability on the truth") if any(c in figures for figures in split.values())]
+    columns = list(dict.fromkeys(name for figures in split.values() for name in figures))
     table = Table(title=title, title_justify="left")
     table.add_column("", overflow="fold")
     for column in columns:
@@ -92,8 +97,6 @@ def _split_table(title: str, split: Mapping[str, Mapping[str, Figure]]) -> Table
 
 
 def _value(name: str, value: float) -> str:
-    if name in SHARES:
-        return f"{100 * value:.0f} %"
     if name == "seconds":
         return f"{value:.1f} s"
-    return f"{value:.2f}"
+    return f"{value:.2f}" if name in PLAIN else f"{100 * value:.0f} %"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from jaxfinger.errors import UserError
@@ -13,6 +13,7 @@ Cause = tuple[str, tuple[str, ...]]  # effect, site
 NONE: Cause = ("none", ())
 UNLISTED: Cause = ("unlisted", ())
 TELLING = 3.0  # nats: below, two causes look alike, or a cause looks like none
+MATTERS = 0.1  # share of some channel's gap that a cause closes, from which on it ought to be named
 
 
 @dataclass(frozen=True)
@@ -20,40 +21,44 @@ class Truth:
     """What is the matter with a case; effects in order of size."""
 
     name: str
-    kind: str  # none, listed, unlisted, double
-    causes: tuple[Cause, ...]
+    kind: str  # none, listed, unlisted, double, several
+    causes: tuple[Cause, ...]  # of the catalogue first
+    listed: tuple[Cause, ...] = ()  # those of the catalogue
+    matters: tuple[Cause, ...] = ()  # of these, those that close more than MATTERS of some channel's gap
+    known: Mapping[Cause, Mapping[str, float]] = field(
+        default_factory=dict
+    )  # true values of the catalogue's parameters
     severity: float | str | None = None
     reached: float | None = None  # severity that the calibration reached; None where the source does not say
     specimen: str = ""
     fresh: tuple[Mapping, ...] = ()
     rivals: int | None = None  # causes that no method could tell from the truth with this session; None: not computed
 
-    def shares(self) -> dict[Cause, float]:
-        """Where the probability should lie: one half on each effect of a double."""
-        if self.kind == "none":
-            return {NONE: 1.0}
-        if self.kind == "unlisted":
-            return {UNLISTED: 1.0}
-        return {cause: 1.0 / len(self.causes) for cause in self.causes}
+    @property
+    def at_work(self) -> frozenset[Cause]:
+        """Everything whose probability should be one: the listed causes, «unlisted» for all others, or «none»."""
+        strange = {UNLISTED} if set(self.causes) - set(self.listed) else set()
+        return frozenset({*self.listed, *strange} or {NONE})
 
 
 @dataclass(frozen=True)
 class Diagnosis:
     """What a `gap.json` says, and what it cost."""
 
-    status: str  # no_gap, explained, ambiguous, unexplained, or failed
+    status: str  # no_gap, explained, partly, ambiguous, unexplained, not_judged, or failed
     named: tuple[Cause, ...]
     sets: tuple[tuple[Cause, ...], ...]
     probability: dict[Cause, float]
     seconds: float | None = None
     fresh: tuple[Mapping, ...] = ()  # rms on the fresh trials, before and after
+    values: Mapping[Cause, Mapping[str, tuple[float, float]]] = field(default_factory=dict)  # named causes': value, std
 
     @property
     def answer(self) -> tuple[Cause, ...]:
         """The set that the verdict stands for: the first ambiguous set, or what it names."""
         if self.status == "ambiguous" and self.sets:
             return self.sets[0]
-        return self.named if self.status in ("explained", "ambiguous") else ()
+        return self.named if self.status in ("explained", "partly", "ambiguous") else ()
 
 
 FAILED = Diagnosis("failed", (), (), {})
@@ -71,13 +76,15 @@ def read_truth(folder: Path, truth_root: Path | None) -> Truth:
     data = _load(file)
     effects = sorted(data["effects"], key=lambda e: -float(e.get("reached", 0.0)))
     listed = [e for e in effects if e["listed"]]
-    kind = data.get("kind") or (
-        "none" if not effects else "unlisted" if not listed else "double" if len(effects) > 1 else "listed"
-    )
+    kinds = {0: "none", 1: "listed" if listed else "unlisted", 2: "double"}
+    causes = {_cause(e): e for e in [*listed, *(e for e in effects if not e["listed"])]}
     return Truth(
         name,
-        kind,
-        tuple((e["effect"], tuple(e["site"])) for e in effects),
+        data.get("kind") or kinds.get(len(effects), "several"),
+        tuple(causes),
+        tuple(map(_cause, listed)),
+        tuple(_cause(e) for e in listed if e.get("closes", 1.0) > MATTERS),
+        {c: e.get("known", {}) for c, e in causes.items()},
         effects[0].get("severity") if effects else None,
         effects[0].get("reached") if effects else None,
         data.get("specimen", ""),
@@ -105,10 +112,11 @@ def read_diagnosis(folder: Path) -> Diagnosis:
             probability,
             cost.get("seconds"),
             tuple(fresh),
+            {_cause(c): {n: (p["value"], p["std"]) for n, p in c["parameters"].items()} for c in data["budget"]},
         )
     except (KeyError, TypeError) as error:
         raise UserError(
-            f"{file}: not a gap.json of schema jaxfinger-gap/1 (missing {error}); diagnose the case again"
+            f"{file}: not a gap.json of schema jaxfinger-gap/2 (missing {error}); diagnose the case again"
         ) from None
 
 

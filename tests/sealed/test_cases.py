@@ -86,3 +86,32 @@ def test_the_mix_holds_every_effect_every_kind_and_every_specimen():
     assert {x for s in specs if s.kind == "listed" for x in s.severities} == {2.0, 5.0, 10.0}
     assert len({s.effects[0] for s in specs[:100] if s.kind == "listed"}) == len(LISTED)
     assert len(UNLISTED) >= 6
+
+
+def test_several_causes_come_by_threes_to_fives_every_other_time_with_an_unlisted_one():
+    specs = case_specs("fresh", 40, "several")
+    for i, spec in enumerate(specs):
+        listed = [e for e in spec.effects if e in LISTED]
+        assert 3 <= len(set(listed)) == len(listed) <= 5
+        assert len(spec.effects) - len(listed) == i % 2
+        assert max(spec.severities[: len(listed)]) <= 2 * min(spec.severities[: len(listed)])
+    assert specs != case_specs("develop", 40, "several")
+
+
+def test_foreign_cases_have_forms_and_protocols_that_no_other_split_has(quick, tmp_path):
+    kinds = LISTED.values()
+    assert all(not set(k.foreign) & set(k.forms) for k in kinds)
+    specs = case_specs("foreign", 60)
+    assert all(LISTED[e].foreign for s in specs if s.kind in ("listed", "double") for e in s.effects)
+    spec = CaseSpec("listed", "planar", ("tendon_stretch",), (10.0,))
+    folder = make_case(1, "foreign", spec, tmp_path / "c", tmp_path / "t")
+    (effect,) = json.loads((tmp_path / "t" / "case-001.json").read_text())["effects"]
+    assert effect["form"] in LISTED["tendon_stretch"].foreign
+    assert effect["known"] == {}
+    session = read_session(folder / "fit.h5")
+    assert {round(1 / np.median(np.diff(t.time))) for t in session} == {200}
+    sweeps = [t for t in session if t.experiment == "ID.3-dynamic"]
+    for trial in sweeps:
+        assert trial.joint is None
+        assert np.isfinite(trial.joint_torque).all()
+        assert (np.ptp(trial.q, axis=0) > 0.5).all()

@@ -19,17 +19,26 @@ STRETCH, CREEP = ("tendon_stretch", ("T3",)), ("tendon_creep", ("T3",))
 STRETCH_T1 = ("tendon_stretch", ("T1",))
 
 
-def said(status, named=(), sets=(), **probability):
+def said(status, named=(), sets=(), values=None, **probability):
     p = {STRETCH: 0.0, CREEP: 0.0, STRETCH_T1: 0.0, NONE: 0.0, UNLISTED: 0.0}
     for key, value in probability.items():
         p[{"stretch": STRETCH, "creep": CREEP, "t1": STRETCH_T1, "none": NONE, "unlisted": UNLISTED}[key]] = value
-    return Diagnosis(status, tuple(named), tuple(tuple(s) for s in sets), p, seconds=10.0)
+    return Diagnosis(status, tuple(named), tuple(tuple(s) for s in sets), p, seconds=10.0, values=values or {})
 
 
-LISTED = Truth("a", "listed", (STRETCH,), 5.0, 5.0, "planar")
-DOUBLE = Truth("b", "double", (STRETCH, CREEP), 10.0, 10.0, "planar")
-SOUND = Truth("c", "none", ())
-STRANGE = Truth("d", "unlisted", (("stick-slip", ("fingertip",)),), 5.0, 5.0, "chain")
+UNKNOWN = ("stick-slip", ("fingertip",))
+
+
+def truth(name, kind, listed=(), others=(), matters=None, known=None, severity=5.0, specimen="planar"):
+    matters = listed if matters is None else matters
+    return Truth(name, kind, (*listed, *others), listed, matters, known or {}, severity, severity, specimen)
+
+
+LISTED = truth("a", "listed", (STRETCH,), known={STRETCH: {"compliance": 2e-5}})
+DOUBLE = truth("b", "double", (STRETCH, CREEP), severity=10.0)
+SOUND = truth("c", "none", severity=None)
+STRANGE = truth("d", "unlisted", (), (UNKNOWN,), specimen="chain")
+MANY = truth("e", "several", (STRETCH, CREEP, STRETCH_T1), (UNKNOWN,), matters=(STRETCH, CREEP))
 
 
 def test_every_figure_of_a_set_made_by_hand():
@@ -55,9 +64,10 @@ def test_every_figure_of_a_set_made_by_hand():
     assert value["open set"] == 1.0
     assert value["double, one right"] == 1.0
     assert value["double, both right"] == pytest.approx(1 / 2)
-    expected = [0.02, 0.72, 2.0, 0.0, 0.0, 0.98, 0.08, 0.0, 0.5]
+    assert value["false gap"] == pytest.approx(1 / 2)
+    expected = [0.02, 0.72, 2.0, 0.0, 0.0, 0.98, 0.08, 0.5, 1.0]
     assert value["Brier"] == pytest.approx(np.mean(expected))
-    assert value["probability on the truth"] == pytest.approx(np.mean([0.9, 0.4, 0, 1, 1, 0.3, 0.8, 1, 1]))
+    assert value["probability on the truth"] == pytest.approx(np.mean([0.9, 0.4, 0, 1, 1, 0.3, 0.8, 0.5, 0.5]))
     assert value["set size"] == pytest.approx(np.mean([1, 2, 1, 4, 1, 1, 1]))
     assert value["seconds"] == 10.0
     assert s.by_effect["tendon_stretch"]["cause"].count == 4
@@ -66,6 +76,32 @@ def test_every_figure_of_a_set_made_by_hand():
     assert ("none", "tendon_creep (T3)", 1) in s.confusions
     assert len(s.missed) == 4
     json.dumps(s.to_json())
+
+
+def test_several_causes_are_scored_by_those_that_matter_and_those_that_are_named():
+    pairs = [
+        (MANY, said("partly", [STRETCH, CREEP], stretch=0.9, creep=0.9, t1=0.2, unlisted=0.8)),  # all that matters
+        (MANY, said("partly", [STRETCH, STRETCH_T1], stretch=0.9, t1=0.9)),  # one that matters, one that does not
+        (MANY, said("explained", [STRETCH, ("payload", ("MCP",))], stretch=1.0)),  # one that is not there
+    ]
+    value = {name: f.value for name, f in score_cases(pairs).figures.items()}
+    assert value["several, named, of those that matter"] == pytest.approx(4 / 6)
+    assert value["several, at work, of those named"] == pytest.approx(5 / 6)
+    assert value["several, all right"] == pytest.approx(1 / 3)
+    assert value["several, called explained that is not"] == pytest.approx(1 / 3)
+    assert brier(MANY, pairs[0][1]) == pytest.approx(0.1**2 + 0.1**2 + 0.8**2 + 0.2**2)
+
+
+def test_values_count_where_the_form_is_the_catalogues_own_and_the_cause_is_named():
+    close = {STRETCH: {"compliance": (2.1e-5, 1e-6), "toe": (0.1, 0.1)}}
+    far = {STRETCH: {"compliance": (3e-5, 1e-6)}}
+    pairs = [
+        (LISTED, said("explained", [STRETCH], values=close)),
+        (LISTED, said("explained", [STRETCH], values=far)),
+        (LISTED, said("explained", [CREEP], values=far)),
+    ]
+    figure = score_cases(pairs).figures["values inside 95 % intervals"]
+    assert (figure.value, figure.count) == (0.5, 2)
 
 
 def test_a_failed_diagnosis_counts_as_wrong(tmp_path):
@@ -79,7 +115,7 @@ def test_a_failed_diagnosis_counts_as_wrong(tmp_path):
 
 
 def test_brier_of_a_truth_that_is_no_candidate():
-    outside = Truth("e", "listed", (("payload", ("MCP",)),))
+    outside = truth("e", "listed", (("payload", ("MCP",)),))
     assert brier(outside, said("explained", [CREEP], creep=1.0)) == pytest.approx(2.0)
 
 
@@ -127,8 +163,8 @@ def test_reliability_of_a_calibrated_forecaster():
     pairs = []
     for _ in range(3000):
         p = rng.uniform()
-        truth = LISTED if rng.uniform() < p else Truth("x", "listed", (CREEP,))
-        pairs.append((truth, said("explained", [STRETCH], stretch=p, creep=1 - p)))
+        true = LISTED if rng.uniform() < p else truth("x", "listed", (CREEP,))
+        pairs.append((true, said("explained", [STRETCH], stretch=p, creep=1 - p)))
     for row in score_cases(pairs).reliability:
         assert row["said"] == pytest.approx(row["came true"], abs=0.05)
 
@@ -153,6 +189,7 @@ def test_a_folder_with_truth_beside_the_data_or_apart(tmp_path):
         "unlisted": 0.0,
         "candidates": [{"effect": "tendon_stretch", "site": ["T3"], "probability": 0.9}],
         "ambiguous_sets": [],
+        "budget": [{"effect": "tendon_stretch", "site": ["T3"], "parameters": {"f0": {"value": 1.0, "std": 0.1}}}],
     }
     for name in ("case-01", "case-02", "case-03"):
         (tmp_path / "cases" / name).mkdir(parents=True)

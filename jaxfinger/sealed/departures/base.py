@@ -35,6 +35,11 @@ class Departure:
     largest: ClassVar[float]  # not physical beyond
     smallest: ClassVar[float] = 1e-12  # nor below
     forms: ClassVar[tuple[str, ...]]
+    foreign: ClassVar[tuple[str, ...]] = ()  # forms of the split `foreign` alone
+
+    def known(self) -> dict[str, float]:
+        """Parameters of the catalogue with their true values, where the form is the catalogue's own; else none."""
+        return {}
 
     def resized(self, size: float) -> Departure:
         """The same departure with another size."""

@@ -41,6 +41,9 @@ LISTED: dict[str, type[Departure]] = {
         sensor.TorqueScale,
         sensor.TorqueDrift,
         joint.TorqueRipple,
+        joint.AsymmetricFriction,
+        joint.TorqueFriction,
+        joint.WarmingFriction,
         sensor.TensionScale,
         sensor.EncoderOffset,
         sensor.Eccentricity,
@@ -52,7 +55,6 @@ UNLISTED: dict[str, type[Departure]] = {
     kind.effect: kind
     for kind in (
         unlisted.MotorCogging,
-        unlisted.WarmingGrease,
         unlisted.SlackSag,
         unlisted.SidewaysYield,
         unlisted.StickSlip,
@@ -73,10 +75,12 @@ AT_JOINT = (
     joint.Stop,
     joint.DriveInertia,
     joint.TorqueRipple,
+    joint.AsymmetricFriction,
+    joint.TorqueFriction,
+    joint.WarmingFriction,
     sensor.Payload,
     sensor.EncoderOffset,
     sensor.Eccentricity,
-    unlisted.WarmingGrease,
     unlisted.QuadraticDrag,
 )
 AT_TENDON = (
@@ -106,21 +110,33 @@ AT_SENSOR = {
 
 
 def draw(
-    effect: str, finger: FingerDescription, rng: np.random.Generator, speeds: Sequence[float] = (0.5, 1.0)
+    effect: str,
+    finger: FingerDescription,
+    rng: np.random.Generator,
+    speeds: Sequence[float] = (0.5, 1.0),
+    foreign: bool = False,
 ) -> Departure | None:
     """A departure of its start size, or None where this finger has no site for it. `speeds`: of the dynamic
-    sweeps, rad/s.
+    sweeps, rad/s. `foreign`: in a form that no other split has, where there is one.
     """
     possible = sites(effect, finger)
-    return draw_at(effect, possible[int(rng.integers(len(possible)))], finger, rng, speeds) if possible else None
+    if not possible:
+        return None
+    return draw_at(effect, possible[int(rng.integers(len(possible)))], finger, rng, speeds, foreign)
 
 
 def draw_at(
-    effect: str, site: tuple[Names, Index], finger: FingerDescription, rng: np.random.Generator, speeds: Sequence[float]
+    effect: str,
+    site: tuple[Names, Index],
+    finger: FingerDescription,
+    rng: np.random.Generator,
+    speeds: Sequence[float],
+    foreign: bool = False,
 ) -> Departure:
     """A departure of its start size at a given site, its form and shape drawn."""
     kind = {**LISTED, **UNLISTED}[effect]
-    return kind(kind.start_size, *site, str(rng.choice(kind.forms)), _shape(kind, finger, site[1], rng, speeds))
+    forms = kind.foreign if foreign and kind.foreign else kind.forms
+    return kind(kind.start_size, *site, str(rng.choice(forms)), _shape(kind, finger, site[1], rng, speeds))
 
 
 def sites(effect: str, finger: FingerDescription) -> list[tuple[Names, Index]]:
@@ -187,7 +203,7 @@ def _shape(
         return {"x": float(last * rng.uniform(0.5, 1.0)), "z": float(rng.uniform(-5e-3, 5e-3))}
     if kind is unlisted.MotorCogging:
         return {"pitch": float(rng.uniform(1e-3, 2.5e-3)), "phase": phase}
-    if kind is unlisted.WarmingGrease:
+    if kind is joint.WarmingFriction:
         return {"tau": float(rng.uniform(250, 600))}
     if kind is unlisted.StickSlip:
         return {"pitch": float(rng.uniform(1.3, 2.7))}

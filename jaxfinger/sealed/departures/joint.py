@@ -13,18 +13,26 @@ from .base import Departure, Memory, add_at, put_at
 
 @dataclass(frozen=True, eq=False)
 class Stribeck(Departure):
-    """Breakaway above Coulomb: limit · (1 + a g(|q̇|/v_s)), g Gaussian, exponential or Lorentzian."""
+    """Breakaway above Coulomb: limit · (1 + a g(|q̇|/v_s)), g Gaussian, exponential, Lorentzian or a stretched
+    exponential.
+    """
 
     effect: ClassVar[str] = "joint_stribeck"
     units: ClassVar[str] = "1"
     start_size: ClassVar[float] = 0.5
     largest: ClassVar[float] = 3.0
     forms: ClassVar[tuple[str, ...]] = ("gaussian", "exponential", "lorentzian")
+    foreign: ClassVar[tuple[str, ...]] = ("stretched_exponential",)
 
     def coulomb(self, finger, s, limit, decided):
         j = self.index[0]
         x = np.abs(s.qd[..., j]) / self.shape["v_s"]
-        g = {"gaussian": np.exp(-(x**2)), "exponential": np.exp(-x), "lorentzian": 1 / (1 + x**2)}[self.form]
+        g = {
+            "gaussian": np.exp(-(x**2)),
+            "exponential": np.exp(-x),
+            "lorentzian": 1 / (1 + x**2),
+            "stretched_exponential": np.exp(-np.sqrt(x)),
+        }[self.form]
         return put_at(limit, j, limit[..., j] * (1 + self.size * g)), decided
 
 
@@ -38,6 +46,7 @@ class JointPresliding(Memory):
     largest: ClassVar[float] = 0.15
     smallest: ClassVar[float] = 2e-3
     forms: ClassVar[tuple[str, ...]] = ("dahl", "lugre", "maxwell_slip")
+    foreign: ClassVar[tuple[str, ...]] = ("bouc_wen",)
     states: ClassVar[int] = presliding.ELEMENTS
 
     def inputs(self, finger, s):
@@ -57,31 +66,40 @@ class JointPresliding(Memory):
 
 @dataclass(frozen=True, eq=False)
 class LoadFriction(Departure):
-    """The bearing's friction grows with its load from tension, μ Σ |c_k f_k|; linear or as a power (Palli 2014)."""
+    """The bearing's friction grows with its load from tension, μ Σ |c_k f_k|; linear, as a power (Palli 2014), or
+    from a preload on.
+    """
 
     effect: ClassVar[str] = "joint_load_friction"
     units: ClassVar[str] = "1"
     start_size: ClassVar[float] = 0.08
     largest: ClassVar[float] = 0.6
     forms: ClassVar[tuple[str, ...]] = ("linear", "power")
+    foreign: ClassVar[tuple[str, ...]] = ("preloaded",)
+
+    def known(self):
+        return {"mu": self.size} if self.form == "linear" else {}
 
     def coulomb(self, finger, s, limit, decided):
         j = self.index[0]
         load = np.sum(np.abs(finger.geometry(s.q)[1][..., j] * s.f), axis=-1)
         if self.form == "power":
             load = 0.05 * (load / 0.05) ** 0.8
+        elif self.form == "preloaded":
+            load = np.hypot(load, 0.02) - 0.02
         return add_at(limit, j, self.size * load), decided
 
 
 @dataclass(frozen=True, eq=False)
 class Hardening(Departure):
-    """Elastic torque that stiffens towards an end: exponential, cubic beyond an onset, or tangent."""
+    """Elastic torque that stiffens towards an end: exponential, cubic beyond an onset, tangent, or a sixth power."""
 
     effect: ClassVar[str] = "elastic_hardening"
     units: ClassVar[str] = "N m"
     start_size: ClassVar[float] = 2e-3
     largest: ClassVar[float] = 0.08
     forms: ClassVar[tuple[str, ...]] = ("exponential", "cubic", "tangent")
+    foreign: ClassVar[tuple[str, ...]] = ("sixth_power",)
 
     def passive(self, finger, s, torque):
         j, side = self.index[0], self.shape["side"]
@@ -92,6 +110,8 @@ class Hardening(Departure):
             rise = (np.exp(self.shape["b"] * x) - 1) / (np.exp(self.shape["b"]) - 1)
         elif self.form == "cubic":
             rise = np.maximum((x - self.shape["onset"]) / (1 - self.shape["onset"]), 0.0) ** 3
+        elif self.form == "sixth_power":
+            rise = np.maximum(x, 0.0) ** 6
         else:
             rise = np.tan(0.42 * np.pi * np.maximum(x, 0.0)) / np.tan(0.42 * np.pi) - 0.4 * np.maximum(x, 0.0)
         return add_at(torque, j, side * self.size * rise)
@@ -99,17 +119,24 @@ class Hardening(Departure):
 
 @dataclass(frozen=True, eq=False)
 class Relaxation(Memory):
-    """Viscoelastic torque: one Maxwell branch, or three over two decades (a power law in time)."""
+    """Viscoelastic torque: one Maxwell branch, three over two decades (a power law in time), or three over three."""
 
     effect: ClassVar[str] = "elastic_relaxation"
     units: ClassVar[str] = "N m/rad"
     start_size: ClassVar[float] = 2e-3
     largest: ClassVar[float] = 0.03
     forms: ClassVar[tuple[str, ...]] = ("maxwell", "three_maxwell_branches")
+    foreign: ClassVar[tuple[str, ...]] = ("wide_spectrum",)
     states: ClassVar[int] = 3
 
+    SPECTRA: ClassVar = {
+        "maxwell": (1.0, 1.0, 1.0),
+        "three_maxwell_branches": (0.15, 1.0, 6.0),
+        "wide_spectrum": (0.04, 1.0, 25.0),
+    }
+
     def _times(self):
-        return self.shape["tau"] * (np.array([1.0, 1.0, 1.0]) if self.form == "maxwell" else np.array([0.15, 1.0, 6.0]))
+        return self.shape["tau"] * np.array(self.SPECTRA[self.form])
 
     def inputs(self, finger, s):
         return s.q[..., self.index[0], None]
@@ -174,6 +201,9 @@ class DriveInertia(Departure):
     largest: ClassVar[float] = 4e-4
     forms: ClassVar[tuple[str, ...]] = ("rigid",)
 
+    def known(self):
+        return {"inertia": self.size}
+
     def at_motor(self, finger, s, torque):
         j = self.index[0]
         return add_at(torque, j, self.size * s.qdd[..., j])
@@ -182,7 +212,7 @@ class DriveInertia(Departure):
 @dataclass(frozen=True, eq=False)
 class TorqueRipple(Departure):
     """Torque periodic in the joint's angle: cogging of the external motor or a misaligned coupler; with a
-    second harmonic or not.
+    second harmonic or not, or the flat tops of a slotted motor.
     """
 
     effect: ClassVar[str] = "torque_ripple"
@@ -190,9 +220,71 @@ class TorqueRipple(Departure):
     start_size: ClassVar[float] = 1e-3
     largest: ClassVar[float] = 0.01
     forms: ClassVar[tuple[str, ...]] = ("sine", "two_harmonics")
+    foreign: ClassVar[tuple[str, ...]] = ("slots",)
 
     def at_motor(self, finger, s, torque):
         j = self.index[0]
         angle = self.shape["p"] * s.q[..., j] + self.shape["phase"]
-        wave = np.sin(angle) + (0.3 * np.sin(2 * angle + 1.0) if self.form == "two_harmonics" else 0.0)
+        wave = {
+            "sine": np.sin(angle),
+            "two_harmonics": np.sin(angle) + 0.3 * np.sin(2 * angle + 1.0),
+            "slots": np.tanh(2.0 * np.sin(angle)),
+        }[self.form]
         return add_at(torque, j, self.size * wave)
+
+
+@dataclass(frozen=True, eq=False)
+class AsymmetricFriction(Departure):
+    """Viscous friction that differs between the two directions, Δd |q̇|."""
+
+    effect: ClassVar[str] = "joint_friction_asymmetric"
+    units: ClassVar[str] = "N m s/rad"
+    start_size: ClassVar[float] = 5e-4
+    largest: ClassVar[float] = 0.05
+    forms: ClassVar[tuple[str, ...]] = ("viscous",)
+    foreign: ClassVar[tuple[str, ...]] = ("shear_thinning",)
+
+    def passive(self, finger, s, torque):
+        j = self.index[0]
+        speed = np.abs(s.qd[..., j])
+        return add_at(torque, j, self.shape["sign"] * self.size * (speed if self.form == "viscous" else speed**0.6))
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueFriction(Departure):
+    """A gear's friction grows with the torque that the external motor sends through it, μ |G + τ_k|."""
+
+    effect: ClassVar[str] = "joint_torque_friction"
+    units: ClassVar[str] = "1"
+    start_size: ClassVar[float] = 0.05
+    largest: ClassVar[float] = 0.9
+    forms: ClassVar[tuple[str, ...]] = ("linear",)
+    foreign: ClassVar[tuple[str, ...]] = ("power",)
+
+    def coulomb(self, finger, s, limit, decided):
+        if not s.motor:
+            return limit, decided
+        j = self.index[0]
+        c = finger.specimen.elastic[j]
+        through = np.abs(finger.plant.gravity_torque(s.q)[..., j] + c[0] + c[1] * s.q[..., j] + c[2] * s.q[..., j] ** 2)
+        if self.form == "power":
+            through = 0.01 * (through / 0.01) ** 0.7
+        return add_at(limit, j, self.size * through), decided
+
+
+@dataclass(frozen=True, eq=False)
+class WarmingFriction(Departure):
+    """Dry friction that falls as the session warms the bearing: limit · (1 + a g(t)), g exponential or rational."""
+
+    effect: ClassVar[str] = "joint_friction_warmup"
+    units: ClassVar[str] = "1"
+    start_size: ClassVar[float] = 0.4
+    largest: ClassVar[float] = 3.0
+    forms: ClassVar[tuple[str, ...]] = ("exponential",)
+    foreign: ClassVar[tuple[str, ...]] = ("rational",)
+
+    def coulomb(self, finger, s, limit, decided):
+        j = self.index[0]
+        t = np.asarray(s.session) / self.shape["tau"]
+        g = np.exp(-t) if self.form == "exponential" else 1.0 / (1.0 + t) ** 2
+        return put_at(limit, j, limit[..., j] * (1 + self.size * g)), decided

@@ -62,6 +62,9 @@ class TorqueScale(Departure):
     largest: ClassVar[float] = 0.4
     forms: ClassVar[tuple[str, ...]] = ("gain", "bending_gain")
 
+    def known(self):
+        return {"gain": self.size * self.shape["sign"]} if self.form == "gain" else {}
+
     def read(self, channels):
         tau = channels.torque
         if tau is None:
@@ -74,18 +77,25 @@ class TorqueScale(Departure):
 
 @dataclass(frozen=True, eq=False)
 class TorqueDrift(Departure):
-    """Offset of the torque sensor that moves after its tare: with time, warming up, or wandering over minutes."""
+    """Offset of the torque sensor that moves after its tare: with time, as the session warms it, wandering over
+    minutes, or anew after every tare, when current flows.
+    """
 
     effect: ClassVar[str] = "torque_sensor_drift"
     units: ClassVar[str] = "N m"
     start_size: ClassVar[float] = 5e-4
     largest: ClassVar[float] = 0.02
     forms: ClassVar[tuple[str, ...]] = ("linear", "warm_up", "wandering")
+    foreign: ClassVar[tuple[str, ...]] = ("after_each_tare",)
 
     def read(self, channels):
         if channels.torque is None:
             return channels
         now, tare = channels.session, channels.session[0] - 3.0
+        if self.form == "after_each_tare":
+            since = channels.time + 1.0
+            rise = 3.0 * self.shape["sign"] * (1.0 - (1.0 + since / 8.0) ** -1.0)
+            return replace(channels, torque=channels.torque + self.size * rise[:, None])
         offset = self._offset(now) - self._offset(tare)
         return replace(channels, torque=channels.torque + self.size * offset[:, None])
 
@@ -107,6 +117,10 @@ class TensionScale(Departure):
     largest: ClassVar[float] = 0.5
     forms: ClassVar[tuple[str, ...]] = ("gain", "gain_and_offset")
 
+    def known(self):
+        gain = self.size * self.shape["sign"]
+        return {"gain": gain, "offset": 0.0 if self.form == "gain" else 2.0 * gain}
+
     def read(self, channels):
         k = self.index[0]
         f = channels.tension[:, k]
@@ -124,19 +138,25 @@ class EncoderOffset(Departure):
     largest: ClassVar[float] = 0.4
     forms: ClassVar[tuple[str, ...]] = ("offset",)
 
+    def known(self):
+        return {"offset": self.size * self.shape["sign"]}
+
     def read(self, channels):
         return replace(channels, q=add_at(channels.q, self.index[0], self.size * self.shape["sign"]))
 
 
 @dataclass(frozen=True, eq=False)
 class Eccentricity(Departure):
-    """Once-per-turn error of an off-axis magnet, alone or with the second harmonic of a field that is not uniform."""
+    """Once-per-turn error of an off-axis magnet, alone, with the second harmonic of a field that is not uniform, or
+    as far off as the angle of the sum of two fields says.
+    """
 
     effect: ClassVar[str] = "encoder_eccentricity"
     units: ClassVar[str] = "rad"
     start_size: ClassVar[float] = 0.01
     largest: ClassVar[float] = 0.3
     forms: ClassVar[tuple[str, ...]] = ("once_per_turn", "with_second_harmonic")
+    foreign: ClassVar[tuple[str, ...]] = ("two_fields",)
 
     def read(self, channels):
         j = self.index[0]
@@ -144,6 +164,8 @@ class Eccentricity(Departure):
         error = np.sin(q + self.shape["phase"])
         if self.form == "with_second_harmonic":
             error = error + 0.3 * np.sin(2 * q - self.shape["phase"])
+        elif self.form == "two_fields":
+            error = np.arctan2(np.sin(q + self.shape["phase"]), 1.6 + np.cos(q + self.shape["phase"]))
         return replace(channels, q=add_at(channels.q, j, self.size * error))
 
 

@@ -13,14 +13,19 @@ from .base import Departure, Memory, add_at, put_at
 
 @dataclass(frozen=True, eq=False)
 class Stretch(Departure):
-    """Lengthening under tension; the size is the compliance. Linear, a toe that stiffens, or under the mean
-    tension along the path, which friction makes smaller than the actuator's."""
+    """Lengthening under tension; the size is the compliance. Linear, a toe that stiffens, under the mean tension
+    along the path, which friction makes smaller than the actuator's, or a power law.
+    """
 
     effect: ClassVar[str] = "tendon_stretch"
     units: ClassVar[str] = "m/N"
     start_size: ClassVar[float] = 4e-5
     largest: ClassVar[float] = 3e-4
     forms: ClassVar[tuple[str, ...]] = ("linear", "toe_hardening", "friction_averaged")
+    foreign: ClassVar[tuple[str, ...]] = ("power_law",)
+
+    def known(self):
+        return {"compliance": self.size} if self.form == "linear" else {}
 
     def path(self, finger, s, length, arm):
         k = self.index[0]
@@ -31,6 +36,8 @@ class Stretch(Departure):
         elif self.form == "friction_averaged" and (s.held or s.st is not None):
             reaching = finger.reaching_held(s) if s.held else finger.reaching_sliding(s)
             f = 0.5 * (f + np.maximum(reaching[..., k], 0.0))
+        elif self.form == "power_law":
+            f = 5.0 * (f / 5.0) ** 0.55
         return add_at(length, k, self.size * f), arm
 
 
@@ -84,13 +91,16 @@ class Backlash(Memory):
 
 @dataclass(frozen=True, eq=False)
 class Coupling(Departure):
-    """Excursion that depends on two joints together: product of sines, of angles, or of an angle and a square."""
+    """Excursion that depends on two joints together: product of sines, of angles, or of an angle and a square; or the
+    straight run between two eyelets, one before and one behind both joints.
+    """
 
     effect: ClassVar[str] = "moment_arm_coupling"
     units: ClassVar[str] = "m"
     start_size: ClassVar[float] = 1e-4
     largest: ClassVar[float] = 2e-3
     forms: ClassVar[tuple[str, ...]] = ("sines", "product", "sin_square")
+    foreign: ClassVar[tuple[str, ...]] = ("straight_run",)
 
     def path(self, finger, s, length, arm):
         k, (a, b) = self.index[0], self.index[1:]
@@ -99,6 +109,9 @@ class Coupling(Departure):
             value, by_a, by_b = np.sin(x) * np.sin(y), np.cos(x) * np.sin(y), np.sin(x) * np.cos(y)
         elif self.form == "product":
             value, by_a, by_b = x * y, y, x
+        elif self.form == "straight_run":
+            run = np.sqrt(1.3 + np.cos(x + y))
+            value, by_a, by_b = run, -0.5 * np.sin(x + y) / run, -0.5 * np.sin(x + y) / run
         else:
             value, by_a, by_b = np.sin(x) * y**2, np.cos(x) * y**2, 2 * np.sin(x) * y
         arm = np.array(arm)
@@ -109,20 +122,27 @@ class Coupling(Departure):
 
 @dataclass(frozen=True, eq=False)
 class Bowstring(Departure):
-    """The tendon lifts off under tension: c(q) (1 + b g(f)), g linear, saturating, or beyond a threshold."""
+    """The tendon lifts off under tension: c(q) (1 + b g(f)), g linear, saturating, beyond a threshold, or a root."""
 
     effect: ClassVar[str] = "moment_arm_bowstring"
     units: ClassVar[str] = "1/N"
     start_size: ClassVar[float] = 0.01
     largest: ClassVar[float] = 0.15
     forms: ClassVar[tuple[str, ...]] = ("linear", "saturating", "threshold")
+    foreign: ClassVar[tuple[str, ...]] = ("root",)
+
+    def known(self):
+        return {"b": self.size} if self.form == "linear" else {}
 
     def path(self, finger, s, length, arm):
         k = self.index[0]
         f = np.maximum(s.f[..., k], 0.0)
-        g = {"linear": f, "saturating": f / (1 + f / 12.0), "threshold": np.logaddexp(0.0, (f - 4.0) / 0.7) * 0.7}[
-            self.form
-        ]
+        g = {
+            "linear": f,
+            "saturating": f / (1 + f / 12.0),
+            "threshold": np.logaddexp(0.0, (f - 4.0) / 0.7) * 0.7,
+            "root": 3.0 * (np.sqrt(1.0 + f / 1.5) - 1.0),
+        }[self.form]
         nominal, nominal_arm = finger.geometry(s.q)
         arm = np.array(arm)
         arm[..., k, :] += self.size * g[..., None] * nominal_arm[..., k, :]
@@ -131,13 +151,19 @@ class Bowstring(Departure):
 
 @dataclass(frozen=True, eq=False)
 class Capstan(Departure):
-    """Friction that grows with the wrap angle: Euler–Eytelwein, its first order, or weighted by the pulleys' radii."""
+    """Friction that grows with the wrap angle: Euler–Eytelwein, its first order, weighted by the pulleys' radii, or
+    once a joint is bent so far that the tendon touches its pulley.
+    """
 
     effect: ClassVar[str] = "tendon_friction_capstan"
     units: ClassVar[str] = "1"
     start_size: ClassVar[float] = 0.1
     largest: ClassVar[float] = 0.9
     forms: ClassVar[tuple[str, ...]] = ("exponential", "linear_wrap", "pulley_radii")
+    foreign: ClassVar[tuple[str, ...]] = ("late_contact",)
+
+    def known(self):
+        return {"mu": self.size} if self.form in ("exponential", "linear_wrap") else {}
 
     def loss(self, finger, s, limit, decided):
         k = self.index[0]
@@ -146,6 +172,8 @@ class Capstan(Departure):
         if self.form == "pulley_radii":
             arm = np.abs(finger.geometry(np.zeros(finger.m))[1][k, crossed])
             angle = angle * arm / arm.mean()
+        elif self.form == "late_contact":
+            angle = np.maximum(angle - 0.25, 0.0)
         wrap = self.size * angle.sum(axis=-1)
         share = wrap if self.form == "linear_wrap" else 1 - np.exp(-wrap)
         return add_at(limit, k, np.maximum(s.f[..., k], 0.0) * share), decided
@@ -160,6 +188,9 @@ class ViscousTendon(Departure):
     start_size: ClassVar[float] = 10.0
     largest: ClassVar[float] = 600.0
     forms: ClassVar[tuple[str, ...]] = ("linear", "shear_thinning")
+
+    def known(self):
+        return {"b": self.size} if self.form == "linear" else {}
 
     def loss(self, finger, s, limit, decided):
         k = self.index[0]
@@ -183,6 +214,7 @@ class TendonPresliding(Memory):
     largest: ClassVar[float] = 2e-3
     smallest: ClassVar[float] = 5e-5
     forms: ClassVar[tuple[str, ...]] = ("dahl", "lugre", "maxwell_slip")
+    foreign: ClassVar[tuple[str, ...]] = ("bouc_wen",)
     states: ClassVar[int] = presliding.ELEMENTS
 
     def inputs(self, finger, s):
@@ -204,13 +236,14 @@ class TendonPresliding(Memory):
 
 @dataclass(frozen=True, eq=False)
 class Saturating(Departure):
-    """Friction that is not affine in tension: −b f², a power law, or a₁ f/(1 + f/f₀)."""
+    """Friction that is not affine in tension: −b f², a power law, a₁ f/(1 + f/f₀), or a logarithm."""
 
     effect: ClassVar[str] = "tendon_friction_saturating"
     units: ClassVar[str] = "1"
     start_size: ClassVar[float] = 0.05
     largest: ClassVar[float] = 0.6
     forms: ClassVar[tuple[str, ...]] = ("quadratic", "power_law", "hyperbolic")
+    foreign: ClassVar[tuple[str, ...]] = ("logarithmic",)
 
     def loss(self, finger, s, limit, decided):
         k = self.index[0]
@@ -219,6 +252,7 @@ class Saturating(Departure):
             "quadratic": f * (1 - f / 12.0),
             "power_law": 12.0 * (f / 12.0) ** 0.6,
             "hyperbolic": f / (1 + f / 4.0) * 2,
+            "logarithmic": 4.0 * np.log1p(f / 2.0),
         }[self.form]
         return add_at(limit, k, self.size * bend), decided
 

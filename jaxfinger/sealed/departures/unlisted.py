@@ -31,24 +31,6 @@ class MotorCogging(Departure):
 
 
 @dataclass(frozen=True, eq=False)
-class WarmingGrease(Departure):
-    """Viscosity that falls as the session warms the bearing."""
-
-    effect: ClassVar[str] = "viscosity of a joint's grease that changes with temperature over the session"
-    listed: ClassVar[bool] = False
-    units: ClassVar[str] = "N m s/rad"
-    start_size: ClassVar[float] = 1e-3
-    largest: ClassVar[float] = 0.05
-    forms: ClassVar[tuple[str, ...]] = ("arrhenius",)
-
-    def passive(self, finger, s, torque):
-        j = self.index[0]
-        rate = s.qd[..., j]
-        warm = np.exp(-np.asarray(s.session) / self.shape["tau"])
-        return add_at(torque, j, self.size * warm * np.sign(rate) * np.abs(rate) ** 0.6)
-
-
-@dataclass(frozen=True, eq=False)
 class SlackSag(Departure):
     """At low tension the tendon sags between its eyelets: a catenary's shortening w²/f²."""
 
