@@ -88,7 +88,9 @@ def test_the_commands_say_what_to_do(folder, tmp_path, capsys):
         cli.score(folder)
     with pytest.raises(UserError, match="i/n"):
         cli.make(tmp_path / "new", share="half")
-    verdict = "verdict=dict(status='no_gap', effects=[]), none=1.0, unlisted=0.0, candidates=[], ambiguous_sets=[]"
+    verdict = (
+        "verdict=dict(status='no_gap', effects=[]), none=1.0, unlisted=0.0, candidates=[], ambiguous_sets=[], budget=[]"
+    )
     script = f"{READ}(o / 'gap.json').write_text(json.dumps(dict({verdict})))"
     cli.run(folder, command=f'{sys.executable} -c "{script}" {{fit}} {{out}}', workers=1)
     for case in folder.iterdir():
@@ -113,7 +115,7 @@ def test_withheld_effects_are_taken_out_one_by_one(folder, capsys):
     verdict = (
         "dict(status='explained', effects=named) if lacks == 'payload' else dict(status='unexplained', effects=[])"
     )
-    rest = "none=0.0, unlisted=0.0, candidates=[], ambiguous_sets=[]"
+    rest = "none=0.0, unlisted=0.0, candidates=[], ambiguous_sets=[], budget=[]"
     script = f"{READ}{says}(o / 'gap.json').write_text(json.dumps(dict(verdict={verdict}, {rest})))"
     line = f'{sys.executable} -c "{script}" {{fit}} {{out}}'
     cli.run(folder, command=line, withheld=True, workers=1)
@@ -141,7 +143,7 @@ def test_fresh_trials_are_predicted_where_a_known_effect_is_there_and_by_a_refit
         out = tmp_path / "out" / name
         out.mkdir(parents=True)
         verdict = {"status": "explained" if named else "no_gap", "effects": [named] if named else []}
-        gap = {"verdict": verdict, "candidates": [], "none": 0.0, "unlisted": 0.0, "ambiguous_sets": []}
+        gap = {"verdict": verdict, "candidates": [], "none": 0.0, "unlisted": 0.0, "ambiguous_sets": [], "budget": []}
         (out / "gap.json").write_text(json.dumps(gap))
         (out / "nominal.json").write_text("nominal")
         (out / "augmented.json").write_text("augmented")
