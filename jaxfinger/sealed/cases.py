@@ -131,7 +131,7 @@ def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: P
         p.seed: driven(r, p.rate) for p, r in zip(together, simulate(finger, case.quiet.nominal, together), strict=True)
     }
     for file, plans in (("fit.h5", case.plans), ("fresh.h5", case.later)):
-        trials = _trials(finger, plans, motions, sensors, zero, rng)
+        trials = record_trials(finger, plans, motions, sensors, zero, rng)
         session = Recording(
             specimen=f"sealed-{split}-{number:03d}",
             finger=specimen.cad,
@@ -190,8 +190,8 @@ def _draw(seed: Sequence[int], split: str, spec: CaseSpec) -> _Case:
     rng, foreign = np.random.default_rng(seed), split == "foreign"
     specimen = make_specimen(spec.specimen, rng)
     nominal, sensors, style = Finger(specimen), draw_sensors(rng), draw_style(rng, foreign)
-    plans = _with_trajectories(nominal, session_plans(specimen, style, rng), rng)
-    later = _with_trajectories(nominal, session_plans(specimen, style, rng, fresh=True), rng)
+    plans = with_trajectories(nominal, session_plans(specimen, style, rng), rng)
+    later = with_trajectories(nominal, session_plans(specimen, style, rng, fresh=True), rng)
     quiet = Session(specimen, plans, sensors)
     return _Case(quiet, plans, later, *_withheld(spec, specimen, quiet, style.speeds, foreign, rng), rng)
 
@@ -207,7 +207,7 @@ def rebuild(truth: dict) -> tuple[Session, list[Departure]]:
     return quiet, case.departures
 
 
-def _with_trajectories(nominal: Finger, plans: Sequence[Plan], rng: np.random.Generator) -> list[Plan]:
+def with_trajectories(nominal: Finger, plans: Sequence[Plan], rng: np.random.Generator) -> list[Plan]:
     """VD.3 plans get a trajectory; repeats of a motion share it."""
     profiles = {}
     out = []
@@ -252,7 +252,7 @@ def _column(specimen: Specimen, label: tuple[str, str, int]) -> str:
     return CHANNELS[label[1]].columns(specimen.finger)[label[2]]
 
 
-def _trials(
+def record_trials(
     finger: Finger,
     plans: Sequence[Plan],
     motions: Mapping[int, Motion],

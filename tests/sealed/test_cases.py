@@ -15,9 +15,9 @@ from tests.sealed.conftest import short
 @pytest.fixture
 def quick(monkeypatch):
     """Short sessions, so that a case takes seconds."""
-    whole = cases._with_trajectories
+    whole = cases.with_trajectories
     monkeypatch.setattr(
-        cases, "_with_trajectories", lambda nominal, plans, rng: whole(nominal, short(plans, nominal, rng), rng)
+        cases, "with_trajectories", lambda nominal, plans, rng: whole(nominal, short(plans, nominal, rng), rng)
     )
 
 
