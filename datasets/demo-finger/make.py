@@ -1,5 +1,6 @@
-"""Makes `session.h5` and `fresh.h5` beside this file: a planar finger on the independent plant of the sealed cases, with two
-causes that the nominal model lacks. `python datasets/demo-finger/make.py`
+"""Makes `session.h5` and `fresh.h5` beside this file: `python datasets/demo-finger/make.py`.
+
+A planar finger on the independent plant of the sealed cases, with two causes that the nominal model lacks.
 """
 
 from dataclasses import replace
