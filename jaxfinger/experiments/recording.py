@@ -21,6 +21,7 @@ from jaxfinger.data import (
     without_spikes,
 )
 from jaxfinger.data.motion import quicker
+from jaxfinger.effects.drive import WARM
 from jaxfinger.experiments.scales import Scales
 from jaxfinger.experiments.table import Experiment
 
@@ -198,6 +199,7 @@ def row(
         "tendon_direction": tendon.T,
         "session_time": time + start,
         "motorised": np.repeat(r.motorised.astype(float)[:, None], M, axis=1),
+        "temperature": _temperatures(r).T,
         "jitter": np.repeat(AT_REST * (1.0 if r.reduced else 2.0) * noise[:, None], M, axis=1),
     }
     if r.reduced:
@@ -208,6 +210,20 @@ def row(
         mask[c] = counts.astype(float).T
         values[c] = r.mean(y[c]).T * mask[c]  # of all samples, as everything else that the model reads
     return Row(motion, values, mask, np.full(M, -1) if hold is None else hold, r.size * r.step)
+
+
+def _temperatures(r: Recording) -> Float[np.ndarray, "M m"]:
+    """K, of each joint: of the channels named after it, else of all; `WARM` where none was measured."""
+    M, trial = len(r.trial.time) // r.size, r.trial
+    if trial.temperature is None:
+        return np.full((M, r.finger.m), WARM)
+    of = [
+        [k for k, name in enumerate(trial.temperature_names) if joint in name]
+        or list(range(trial.temperature.shape[1]))
+        for joint in r.finger.joint_names
+    ]
+    known = np.where(np.isfinite(trial.temperature), trial.temperature, WARM)
+    return np.stack([r.mean(known[:, k]).mean(axis=1) for k in of], axis=1)
 
 
 def stretches(hold: Int[np.ndarray, " M"]) -> list[Int[np.ndarray, " k"]]:

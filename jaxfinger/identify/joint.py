@@ -23,6 +23,7 @@ from jaxfinger.identify.solve import Prior, Solution, solve
 from jaxfinger.identify.stages import (
     Progress,
     cad_covariance,
+    cad_prior,
     estimate_with_noise,
     free_groups,
     propagate,
@@ -61,7 +62,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
     free = np.union1d(np.union1d(fit.estimated, np.flatnonzero(cad)), seen).astype(int)
 
     same = fit.data_hash == (data_hash(session.file) if session.file else "")
-    prior = cad_prior(session, cad, free, parameters, model) if same else _prior(fit, free)
+    prior = cad_prior(session, recipe, parameters, free) if same else _prior(fit, free)
     progress("refining on all trials at once")
     model, solution, noise = estimate_with_noise(
         start_values(model, free, parameters),
@@ -118,17 +119,6 @@ def channels_of(experiment: str) -> tuple[str, ...]:
 def _total(solution: Solution, model: Model, free, prior: Prior) -> float:
     offset = prior.root @ (np.asarray(ravel(model))[free] - prior.mean)
     return solution.cost + 0.5 * float(offset @ offset)
-
-
-def cad_prior(session: Session, cad: np.ndarray, free, parameters, model: Model) -> Prior:
-    """Masses and centres of mass as the file gives them."""
-    given = np.asarray(ravel(model)).copy()
-    for group in ("mass", "com"):
-        given[[i for i, p in enumerate(parameters) if p.group == group]] = np.ravel(getattr(session.finger, group))
-    rows = np.flatnonzero(cad[free] > 0)
-    root = np.zeros((rows.size, free.size))
-    root[np.arange(rows.size), rows] = cad[free[rows]] ** -0.5
-    return Prior(given[free], root)
 
 
 def _prior(fit: Fit, free) -> Prior:

@@ -102,6 +102,8 @@ def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B 
     # A column with few samples of its own borrows the channel's size, and one with not many its colour, which the
     # filters give to all columns alike.
     own, whole = [_autoregression(c) for c in series], _autoregression([s for column in series for s in column])
+    if not own:  # tendons of a machine that has none
+        return Noise(np.zeros(0), np.zeros(0), np.zeros((0, *np.shape(whole[2]))), source)
     sizes = [row[0] if _count(c) > FEW else whole[0] for c, row in zip(series, own, strict=True)]
     scaled = [(e / size, m, lost) for c, size in zip(series, sizes, strict=True) for e, m, lost in c]
     unit, spread, colour = _autoregression(scaled)

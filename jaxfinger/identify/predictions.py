@@ -40,7 +40,8 @@ def predict_session(
     out: Predictions = {}
     for experiment, stack in prepare(session, names, reduced=False).items():
         progress(f"predicting {len(stack.trials)} trials of {experiment}")
-        free = simulate_trials([model] * len(stack.trials), session, stack) if experiment == "VD.3" else {}
+        driven = experiment == "VD.3" and session.finger.n > 0
+        free = simulate_trials([model] * len(stack.trials), session, stack) if driven else {}
         T = stack.batch.x.time.shape[-1]
         wide = padded(stack.batch.x, 0, roomy(T, SAMPLES) - T)  # for a common shape
         for b, name in enumerate(stack.trials):
@@ -102,7 +103,15 @@ def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> 
     """q of each VD.3 trial of a full-rate stack, simulated from its first sample under the measured tension.
 
     `models`: one a trial, alike but for their numbers.
+
+    Raises:
+        UserError: the finger has no tendons, so nothing drives it.
     """
+    if not session.finger.n:
+        raise UserError(
+            f"{session.file}: /finger/tendons: is empty, so nothing drives a simulation of VD.3; call these trials "
+            "ID.3-dynamic, of which the torques are judged"
+        )
     model = jax.tree.map(lambda *a: jnp.stack(a), *models)
     x = jax.vmap(lambda model, x: model.true_motion(x), in_axes=(0, -2), out_axes=-2)(model, stack.batch.x)
     steps = np.array([np.median(np.diff(session[name].time)) for name in stack.trials])

@@ -24,11 +24,11 @@ from jaxfinger.data import Session
 from jaxfinger.experiments import prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.joint import STAGE as JOINT
-from jaxfinger.identify.joint import cad_prior, channels_of
+from jaxfinger.identify.joint import channels_of
 from jaxfinger.identify.linearise import linearise
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.solve import huber_weights, triangular, visible
-from jaxfinger.identify.stages import STAGES, cad_covariance, sources_of, stage_free, touched_by
+from jaxfinger.identify.stages import STAGES, cad_covariance, cad_prior, sources_of, stage_free, touched_by
 
 Batching = Literal["map", "vmap"]
 PIVOT = 1e-4  # smallest pivot of a Cholesky factor of H_s[s, s], which is the identity for the trials as they are
@@ -120,8 +120,7 @@ def plan_of(session: Session, fit: Fit) -> list[tuple[dict[str, tuple[str, ...]]
 def _prior_block(session: Session, fit: Fit, plan, parameters) -> Float[np.ndarray, "rows P+1"]:
     """CAD's rows on the masses and centres of mass that the fit estimated, at the fit."""
     free = np.unique(np.concatenate([f for _, f in plan]))
-    cad = np.diag(cad_covariance(session, parameters))
-    prior = cad_prior(session, cad, free, parameters, fit.model)
+    prior = cad_prior(session, fit.recipe, parameters, free)
     rows = np.zeros((len(prior.root), len(parameters) + 1))
     rows[:, free] = prior.root
     rows[:, -1] = prior.root @ (np.asarray(ravel(fit.model))[free] - prior.mean)

@@ -88,19 +88,32 @@ GROUP_OF_TERM = {
 
 
 def nominal_model(session: Session, recipe: Recipe) -> Model:
-    """The recipe's nominal model of the session's finger, all fitted terms zero."""
+    """The recipe's nominal model of the session's finger: what its description gives, all other fitted terms zero."""
     finger = Finger.from_description(session.finger)
-    r = recipe.model
+    r, known = recipe.model, session.finger.excursion
     model = Model.zeros(
         finger,
-        moment_arm_degree=r.moment_arm_degree,
+        moment_arm_degree=max(r.moment_arm_degree, 0 if known is None else known.shape[2]),
         cross=r.cross_terms,
         elastic_degree=0 if "joint_offset" in r.terms else r.elastic_degree,
         friction_degree=r.friction_degree,
     )
     if "gravity" not in r.terms:
         model = eqx.tree_at(lambda m: m.finger.gravity, model, jnp.zeros(3))
+    if known is not None:
+        given = jnp.asarray(_by_exponents(model, known, describe(model)))
+        model = eqx.tree_at(lambda m: m.moment_arm.coefficients, model, given.reshape(finger.n, -1))
     return model
+
+
+def _by_exponents(model: Model, known: np.ndarray, parameters: list[Parameter]) -> np.ndarray:
+    """(n, m, k) polynomials of the joints as the moment arm's coefficients in order, zero beyond the power k."""
+    joints, tendons = model.finger.joint_names, model.finger.tendon_names
+    values = np.zeros(model.moment_arm.coefficients.size)
+    for at, p in enumerate(p for p in parameters if p.group == "moment_arm"):
+        if p.joint is not None and p.power is not None and p.power <= known.shape[2]:
+            values[at] = known[tendons.index(p.tendon), joints.index(p.joint), p.power - 1]
+    return np.nan_to_num(values)
 
 
 def free_groups(recipe: Recipe) -> set[str]:
@@ -109,13 +122,30 @@ def free_groups(recipe: Recipe) -> set[str]:
 
 
 def cad_covariance(session: Session, parameters: list[Parameter]) -> np.ndarray:
-    """Covariance of the flat vector before any fit: what CAD and scale say of masses and centres of mass."""
-    variance = np.zeros(len(parameters))
+    """Covariance of the flat vector before any fit: what CAD and scale say of masses, centres of mass, rotors and
+    excursions.
+    """
+    variance, finger = np.zeros(len(parameters)), session.finger
     position = {g: [i for i, p in enumerate(parameters) if p.group == g] for g in ("mass", "com")}
     for group, std in (("mass", session.finger.mass_std), ("com", session.finger.com_std)):
         if std is not None:
             variance[position[group]] = np.ravel(std) ** 2
+    for i, p in enumerate(parameters):
+        if p.group == "rotor_inertia" and p.determinable and finger.rotor_inertia_std is not None:
+            variance[i] = finger.rotor_inertia_std[finger.joint_names.index(p.joint)] ** 2
+        if p.group == "moment_arm" and p.determinable and p.joint is not None and finger.excursion_std is not None:
+            std = finger.excursion_std[finger.tendon_names.index(p.tendon), finger.joint_names.index(p.joint)]
+            variance[i] = 0.0 if p.power is None or p.power > len(std) else np.nan_to_num(std[p.power - 1]) ** 2
     return np.diag(variance)
+
+
+def cad_prior(session: Session, recipe: Recipe, parameters: list[Parameter], free: np.ndarray) -> Prior:
+    """What the finger's description says of the free parameters: a row each that it gives a standard deviation of."""
+    variance = np.diag(cad_covariance(session, parameters))[free]
+    rows = np.flatnonzero(variance > 0)
+    root = np.zeros((rows.size, free.size))
+    root[np.arange(rows.size), rows] = variance[rows] ** -0.5
+    return Prior(np.asarray(ravel(nominal_model(session, recipe)))[free], root)
 
 
 def identify(
@@ -162,13 +192,12 @@ def run_stage(fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session
         return replace(fit, stages=(*fit.stages, report))
     parameters = describe(fit.model)
     groups = set(stage.frees) & free_groups(recipe)
-    prior_groups = {"mass", "com"} if recipe.fit.free_inertia and stage.name.startswith("ID.3") else set()
     touched = touched_by(reads, session)
     free = stage_free(fit, stage, parameters, touched)
     if not free.size:
         report = StageReport(stage.name, "skipped", message="the recipe leaves its terms out of the nominal model")
         return replace(fit, stages=(*fit.stages, report))
-    prior = _cad_prior(fit, free, parameters, prior_groups)
+    prior = cad_prior(session, recipe, parameters, free)
 
     model = start_values(fit.model, free, parameters)
     model, solution, noise = estimate_with_noise(
@@ -249,17 +278,7 @@ def seen_by(p: Parameter, touched) -> bool:
 
 def _unseen(parameters, groups, free, touched) -> list[str]:
     names = [p.name for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in set(free)]
-    return [f"no trial shows {', '.join(names)}: left at zero"] if names else []
-
-
-def _cad_prior(fit: Fit, free, parameters, groups) -> Prior | None:
-    rows = [k for k, i in enumerate(free) if parameters[i].group in groups]
-    if not rows:
-        return None
-    root = np.zeros((len(rows), free.size))
-    for r, k in enumerate(rows):
-        root[r, k] = fit.covariance[free[k], free[k]] ** -0.5
-    return Prior(np.asarray(ravel(fit.model))[free], root)
+    return [f"no trial shows {', '.join(names)}: left as given, or at zero"] if names else []
 
 
 def first_noise(stack: Stack, channel: str) -> Noise:

@@ -106,7 +106,9 @@ def validate(
             scores += _channel_scores(session, stack, channel, residual, floors[channel])
         if name == "VD.2":
             slopes += _slopes(fit, model, session, stack)
-        if name == "VD.3":
+        if name == "VD.3" and not session.finger.n:
+            messages.append("VD.3: without tendons nothing drives a simulation; its torques alone are judged")
+        elif name == "VD.3":
             progress("simulating VD.3 forward in time")
             simulated, diverging = _simulation_scores(model, session, list(stack.trials))
             scores, messages = scores + simulated, messages + diverging

@@ -149,7 +149,7 @@ def _chain_dynamics(finger: Finger, q, qd, qdd) -> Float[Array, "m *T"]:
     """The same of the links alone."""
     samples = math.prod(q.shape[1:])
     if samples <= LONG:
-        return _newton_euler(finger, q, qd, qdd, by_components=False)
+        return jnp.asarray(_newton_euler(finger, q, qd, qdd, by_components=False))
     count = -(-samples // BLOCK)
     size = -(-samples // count)
 
