@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NoReturn
 
 import h5py
 import numpy as np
@@ -15,10 +16,12 @@ from jaxfinger.errors import UserError
 from jaxfinger.rig import convert, wal
 from jaxfinger.rig.backend import (
     Block,
+    CommandRefused,
     Hold,
     JointMove,
     Rig,
     Setup,
+    Status,
     TensionRamp,
 )
 from jaxfinger.rig.channels import DYNAMIC_BANDWIDTH, Filter, RigDescription
@@ -218,7 +221,7 @@ class Runner:
         for step in protocol:
             if isinstance(step, TensionRamp | JointMove | Hold):
                 self.reader.supervisor.commanded(step)
-                self._id = self.rig.command(step)
+                self._command(step)
             elif isinstance(step, Setup):
                 self._prepare(step)
             elif isinstance(step, Tare):
@@ -236,6 +239,15 @@ class Runner:
             else:
                 assert isinstance(step, Covered)
                 self._wait("moved by hand", _Passes(self.rig.description, step), step.timeout)
+
+    def _command(self, step: TensionRamp | JointMove | Hold) -> None:
+        try:
+            self._id = self.rig.command(step)
+        except CommandRefused:  # where the rig has just been stopped, that is the cause
+            self._look(None)
+            if (status := self.rig.status()).state is State.TRIPPED:
+                self._stopped(status)
+            raise
 
     def _begin(self, step: Start) -> None:
         if self.t0 is None:
@@ -308,11 +320,14 @@ class Runner:
             cause = reader.recorder.failure if trip is Trip.RECORDER else None
             raise TrialEnded(cause or reader.violation.sentence, trip, since)
         if tripped(block):
-            status = self.rig.status()
-            reader.note("trip", status.cause)
-            raise TrialEnded(f"the controller stopped: {status.cause}", status.trip, status.trip_seq - PERSIST + 1)
+            self._stopped(self.rig.status())
         if reader.error is not None:
             raise TrialEnded(str(reader.error), Trip.STALE)
+
+    def _stopped(self, status: Status) -> NoReturn:
+        """Raise TrialEnded with the controller's own cause."""
+        self.reader.note("trip", status.cause)
+        raise TrialEnded(f"the controller stopped: {status.cause}", status.trip, status.trip_seq - PERSIST + 1)
 
 
 class _Elapsed:
