@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.gap.columns import Columns
-from jaxfinger.gap.formula import Judged, Linear, Parameters, Weights
+from jaxfinger.gap.formula import Judged, Linear, Parameters, Weights, unexplained
 from jaxfinger.gap.problem import Problem, moved
 from jaxfinger.gap.signatures import Signatures, Variant
 from jaxfinger.identify.solve import bounded
@@ -78,6 +78,7 @@ class Bench:
     columns: Columns
     parameters: Parameters
     null: State  # no cause, the nominal model refitted in the weights of the formula
+    unknown: float  # log evidence that something is at work
     gap: float  # norm of what the nominal model misses: the size of the amplitudes' prior
 
     @classmethod
@@ -87,7 +88,8 @@ class Bench:
         judged = Linear(columns, base(problem, empty), prior_of(problem, 0), empty, parameters).null
         assert judged is not None
         null = State(problem, columns, (), (), empty, empty, judged)
-        return cls(columns, parameters, null, float(np.sqrt(np.sum(judged.e) + np.sum(judged.o))))
+        unknown = float(unexplained(columns, judged, judged, parameters).sum())
+        return cls(columns, parameters, null, unknown, float(np.sqrt(np.sum(judged.e) + np.sum(judged.o))))
 
     def judge(self, problem: Problem, r: np.ndarray, slopes: np.ndarray, sizes: np.ndarray) -> Judged:
         """A set at its optimum: `sizes`, how far its coordinates are from the middle of their priors."""

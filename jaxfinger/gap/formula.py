@@ -27,17 +27,18 @@ from jaxfinger.gap.columns import Columns
 
 @dataclass(frozen=True)
 class Parameters:
-    """All that the formula does not take from the file at hand; `jaxfinger.gap.tune` fits them by log score."""
+    """All that the formula does not take from the file at hand."""
 
     floor: float = 2.0  # v_c that noise alone may leave, since its colour is known from a few repeats
     form: float = 0.02  # ρ²: share of what causes explain in a column that the forms of their laws may miss
     looks: float = 25.0  # ν: independent looks outside of the features
     worse: float = 1.0  # times as much that unknown costs which a column has with causes, and has not without
-    prior: float = 20.0  # log evidence that a cause must bring: what an imitator of something unknown gains
-    further: float = 4.0  # likewise, one more site of a cause that is in
-    trust: float = 0.25  # β: of all log evidence, since neighbouring features and columns are no independent looks
-    open: float = 30.0  # log evidence of what the causes leave, from which on something else is as likely as not
-    sharp: float = 0.15  # and how fast that grows
+    prior: float = 6.0  # log evidence that a cause must bring,
+    alike: float = 0.07  # and as a share of what the nominal model leaves unexplained: what an imitator gains of it
+    trust: float = 1.0  # β: of all log evidence, since neighbouring features and columns are no independent looks
+    open: float = 8.0  # log evidence left, from which on something unlisted is as likely as not,
+    left: float = 0.12  # and as a share of what the causes take away: forms leave some of it
+    sharp: float = 0.4  # and how fast that grows
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,8 @@ def posterior(search: Search, state: State) -> Posterior:
         causes[key] = float(w[inside].sum())
         gains[key] = float(net[inside].max(initial=-np.inf) - net[~inside].max()) if inside.any() else -np.inf
     left = float(unexplained(search.bench.columns, state.judged, search.bench.null.judged, p).sum())
-    unlisted = float(expit(p.sharp * (left - p.open)))
+    taken = max(search.bench.unknown - left, 0.0)
+    unlisted = float(expit(p.sharp * (left - p.open - p.left * taken)))
     nothing = float(w[[not keys for keys, _ in sets]].sum())
     ambiguous = _ambiguous(dict(zip((k for k, _ in sets), w.tolist(), strict=True)), state, causes)
     named = tuple(k for k in state.keys if causes[k] >= IS_NAMED and not any(k in s for s in ambiguous))

@@ -168,7 +168,7 @@ class Search:
         """Of every cause, the first site of an effect and further ones."""
         p, seen, out = self.bench.parameters, set(), []
         for effect, _ in sorted(keys):
-            out.append(p.further if effect in seen else p.prior)
+            out.append(p.prior + (0.0 if effect in seen else p.alike * self.bench.unknown))
             seen.add(effect)
         return out
 
