@@ -62,7 +62,7 @@ def diagnose(
     from jaxfinger.report.page import write_page
     from jaxfinger.report.screen import summary
 
-    with progress("diagnose") as say:
+    with progress("first look" if quick else "diagnose") as say:
         wanted = read_recipe(recipe)
         own = load(effects) if effects is not None else {}
         say("reading the file")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -31,33 +32,75 @@ Output = Annotated[Path, Parameter(name=["--output", "-o"])]
 def progress(title: str) -> Iterator[Callable[[str], None]]:
     """What is being done, on stderr: a line that renews itself, or one line a step where it is no terminal.
 
-    Where the work says how much of it is done (`Step`), a bar and the time that is left stand beside it.
+    Beside it stand the share done and about how long the rest takes: as the work says itself (`Step`), or by when each
+    step began the last time that the same command came to its end.
     """
     console, begun = Console(stderr=True), time.monotonic()
+    earlier = Earlier(title)
     if not console.is_terminal:
 
         def say(message: str) -> None:
-            about = f" ({_so_far(message, time.monotonic() - begun)})" if isinstance(message, Step) else ""
+            seconds = time.monotonic() - begun
+            step = earlier.step(message, seconds)
+            about = f" ({_so_far(step, seconds)})" if step else ""
             print(plain(f"{title}: {message}{about}"), file=sys.stderr, flush=True)
 
         yield say
-        return
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    else:
+        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    said, about = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[about]}")
-    columns = (SpinnerColumn(), said, BarColumn(20), about, TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(title, total=None, about="")
+        said, about = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[about]}")
+        columns = (SpinnerColumn(), said, BarColumn(20), about, TimeElapsedColumn())
+        with Progress(*columns, console=console, transient=True) as bar:
+            task = bar.add_task(title, total=None, about="")
 
-        def tell(message: str) -> None:
-            bar.update(task, description=plain(f"{title}: {message}"))
-            if isinstance(message, Step):
-                about = _so_far(message, time.monotonic() - begun)
-                bar.update(task, total=1.0, completed=message.done, about=about)
+            def tell(message: str) -> None:
+                seconds = time.monotonic() - begun
+                bar.update(task, description=plain(f"{title}: {message}"))
+                if step := earlier.step(message, seconds):
+                    bar.update(task, total=1.0, completed=step.done, about=_so_far(step, seconds))
 
-        yield tell
+            yield tell
+    earlier.keep(time.monotonic() - begun)
 
 
+class Earlier:
+    """When each step of a command began the last time, as a share of the whole; kept beside the compiled programs."""
+
+    def __init__(self, title: str):
+        folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+        self.file = Path(folder, "progress.json") if folder else None
+        self.title, self.began = title, {}
+        self.shares: dict[str, float] = self._all().get(title, {})
+
+    def _all(self) -> dict:
+        try:
+            found = json.loads(self.file.read_text(encoding="utf-8")) if self.file else {}
+            return {t: {str(k): float(v) for k, v in shares.items()} for t, shares in found.items()}
+        except (OSError, ValueError, AttributeError, TypeError):
+            return {}  # none yet, or none that can be read: an estimate is no reason to stop
+
+    def step(self, message: str, seconds: float) -> Step | None:
+        """The message with the share that is done, where it is known."""
+        self.began.setdefault(str(message), seconds)
+        if isinstance(message, Step):
+            return message
+        return Step(message, self.shares[message]) if message in self.shares else None
+
+    def keep(self, seconds: float) -> None:
+        """For the next time, of work that took long."""
+        if self.file is None or seconds < LONG:
+            return
+        told = self._all() | {self.title: {m: round(s / seconds, 3) for m, s in self.began.items()}}
+        part = self.file.with_suffix(f".{os.getpid()}")
+        try:
+            part.write_text(json.dumps(told, indent=1), encoding="utf-8")
+            os.replace(part, self.file)
+        except OSError:
+            part.unlink(missing_ok=True)
+
+
+LONG = 3.0  # s of work from which on people look at the time
 EARLY = 0.1  # share done before which the time so far says nothing of the time that is left
 
 

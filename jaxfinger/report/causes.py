@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from dataclasses import dataclass
 
-from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS
+from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, CatalogueEffect
 from jaxfinger.gap.result import Diagnosis
 
 CHANGED = "changed_"
@@ -30,13 +30,12 @@ def words(effect: str, d: Diagnosis) -> Words:
             "Every trial that depends on it is off in the same way; none before the change was.",
             "Find out what was changed on the finger in between, or identify it anew.",
         )
-    of_model = {getattr(e, "ID", ""): type(e) for e in d.augmented.model.effects}
+    of_model = {e.ID: type(e) for e in d.augmented.model.effects if isinstance(e, CatalogueEffect)}
     known = of_model | NOMINAL_TERMS | CATALOGUE
     if effect not in known:
         return Words("")
     cls = known[effect]
-    happens, looks, change = (getattr(cls, name, "") for name in ("HAPPENS", "LOOKS", "CHANGE"))
-    return Words(happens, looks, change, first_sentence(cls))
+    return Words(cls.HAPPENS, cls.LOOKS, cls.CHANGE, first_sentence(cls))
 
 
 def first_sentence(cls: type) -> str:

@@ -205,7 +205,7 @@ def _explained(d: Diagnosis) -> list[str]:
     end = "its noise, or to what you tolerate," if any(x.tolerated for x in d.relevance) else "its noise"
     closes = f"every channel comes down to {end} on trials that no fit has seen"
     if left := still_open(d):
-        names = [f"{_of(x.experiment, x.channel)}, {number(x.after / x.noise, 2)} times its noise" for x in left]
+        names = [f"{_of(x.experiment, x.channel)} ({number(x.after / x.noise, 2)} times its noise)" for x in left]
         closes = f"what stays open on trials that no fit has seen is {_listed(names)}"
     return [size(d), f"{_blamed(d)}; with {it} in the model {closes}"]
 

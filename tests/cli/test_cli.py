@@ -165,7 +165,7 @@ def test_a_stage_at_a_time(folder, tmp_path, capsys):
         (("identify", "{f}/emps.h5", "-o", "{t}/x.json", "--recipe", "none.toml"), "none.toml"),
         (("identify", "{f}/emps.h5", "-o", "{f}/fit.json"), "--overwrite"),
         (("identify", "{f}/emps.h5", "-o", "{t}/no/x.json"), "is no folder"),
-        (("show", "{f}/emps.h5"), "is not a fit"),
+        (("show", "{f}/emps.h5"), "no fit"),
         (("validate", "{f}/fit.json", "{f}/emps.h5", "-e", "VD.1"), "has no trial of VD.1"),
         (("predict", "{f}/fit.json", "{f}/emps.h5", "-o", "{f}/emps.h5"), "not overwritten"),
         (("fit", "id3", "{f}/emps.h5", "-o", "{t}/x.json", "--start", "{f}/fit.json", "--recipe", "emps"), "--start"),
@@ -198,8 +198,8 @@ def test_long_work_says_how_much_is_done_and_about_how_long_the_rest_takes(capsy
     from jaxfinger.cli import output
     from jaxfinger.progress import Step
 
-    clock = iter([0.0, 5.0, 30.0, 400.0, 401.0])
-    monkeypatch.setattr(output.time, "monotonic", lambda: next(clock))
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    _clock(monkeypatch, 0.0, 1.0, 5.0, 30.0, 400.0, 401.0, 402.0)
     with output.progress("diagnose") as say:
         say("reading the file")
         say(Step("identifying", 0.05))
@@ -213,6 +213,42 @@ def test_long_work_says_how_much_is_done_and_about_how_long_the_rest_takes(capsy
         "diagnose: refitting (60 %, about 4 min left)",
         "diagnose: writing (100 %)",
     ]
+
+
+def _clock(monkeypatch, *seconds):
+    from jaxfinger.cli import output
+
+    ticks = iter(seconds)
+    monkeypatch.setattr(output.time, "monotonic", lambda: next(ticks))
+
+
+def test_the_time_left_is_learned_from_the_last_run(capsys, monkeypatch, tmp_path):
+    """Of work that came to its end, whatever it took this time."""
+    from jaxfinger.cli import output
+
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
+
+    def run_once(*seconds, title="diagnose", fails=False):
+        _clock(monkeypatch, *seconds)
+        try:
+            with output.progress(title) as say:
+                say("searching")
+                say("refitting")
+                if fails:
+                    raise ValueError
+        except ValueError:
+            pass
+        return capsys.readouterr().err.splitlines()
+
+    assert run_once(0.0, 10.0, 80.0, 90.0, fails=True) == ["diagnose: searching", "diagnose: refitting"]
+    assert run_once(0.0, 25.0, 50.0, 100.0) == ["diagnose: searching", "diagnose: refitting"]
+    assert run_once(0.0, 20.0, 40.0, 80.0) == [
+        "diagnose: searching (25 %, about 60 s left)",
+        "diagnose: refitting (50 %, about 40 s left)",
+    ]
+    assert run_once(0.0, 1.0, 2.0, 3.0, title="another") == ["another: searching", "another: refitting"]
+    (tmp_path / "progress.json").write_text("[1, 2")
+    assert run_once(0.0, 20.0, 40.0, 80.0)[0] == "diagnose: searching"
 
 
 def test_a_terminal_of_ascii_and_a_library_that_warns():

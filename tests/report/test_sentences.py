@@ -37,7 +37,7 @@ SAYS = {
     ),
     "still_open": (
         "Explained: tendon stretch at T3; tendon excursion of VD.1 stays open",
-        ["what stays open on trials that no fit has seen is tendon excursion of VD.1, 1.6 times its noise."],
+        ["what stays open on trials that no fit has seen is tendon excursion of VD.1 (1.6 times its noise)."],
     ),
     "ambiguous": (
         "Cannot be told apart yet: tendon stretch at T3 or tendon creep at T3",
