@@ -32,7 +32,8 @@ from jaxfinger.identify import identify
 from jaxfinger.identify.linearise import linearise
 from jaxfinger.identify.parameters import Free, describe
 from jaxfinger.identify.solve import solve
-from jaxfinger.identify.stages import STAGES, sources_of, start_values
+from jaxfinger.identify.stages import STAGES, sources_of
+from jaxfinger.identify.start import start_values
 from jaxfinger.model import Finger, rigid_body
 from jaxfinger.synthetic import ModelPlant, paper_finger, polynomial_finger, recipe_from, simulate
 from jaxfinger.synthetic import nominal_model as true_model
@@ -213,7 +214,7 @@ def stages(path: Path) -> None:
         free = np.array([i for i in fit.estimated if parameters[i].group in groups], dtype=int)
         sources = sources_of(stacks, reads, fit.noise, parameters)
         zero = Free.at(fit.model, free).set(fit.model, jnp.zeros(free.size))
-        start = start_values(zero, free, parameters)
+        start = start_values(zero, free, parameters, sources)
         alone = {n: s._replace(positions=np.intersect1d(s.positions, free)) for n, s in sources.items()}
         ours = best(lambda s=start, f=free, src=alone: solve(s, f, src)[0], 1)
         passing = best(lambda s=start, f=free, src=sources: solve(s, f, src)[0], 1)

@@ -21,7 +21,8 @@ from jaxfinger.identify import Fit
 from jaxfinger.identify.fit import StageReport
 from jaxfinger.identify.misfit import growth, pulls
 from jaxfinger.identify.parameters import describe, ravel, units_at
-from jaxfinger.identify.solve import Prior, Solution, Source, linearise_each, missed_each, solve
+from jaxfinger.identify.prior import Prior
+from jaxfinger.identify.solve import Solution, Source, linearise_each, missed_each, solve
 from jaxfinger.model import Model
 
 WITH_EFFECTS = "with the effects of the diagnosis"

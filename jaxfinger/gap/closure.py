@@ -16,7 +16,8 @@ from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.result import Closure
 from jaxfinger.identify.parameters import Free, ravel
 from jaxfinger.identify.predictions import simulate_trials
-from jaxfinger.identify.solve import Prior, bounded
+from jaxfinger.identify.prior import Prior
+from jaxfinger.identify.solve import bounded
 from jaxfinger.model import Model
 
 RESOLVABLE = 1.1  # mean square before over that of the noise, from which on a gap can be said to close

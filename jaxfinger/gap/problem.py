@@ -24,7 +24,8 @@ from jaxfinger.identify.linearise import Linearised
 from jaxfinger.identify.misfit import stretches
 from jaxfinger.identify.noise import Noise, estimate, history
 from jaxfinger.identify.parameters import Free, describe, ravel
-from jaxfinger.identify.solve import Prior, Source, linearise_each, solve
+from jaxfinger.identify.prior import Prior
+from jaxfinger.identify.solve import Source, linearise_each, solve
 from jaxfinger.identify.stages import (
     Progress,
     cad_covariance,
@@ -32,8 +33,8 @@ from jaxfinger.identify.stages import (
     free_groups,
     nominal_model,
     sources_of,
-    start_values,
 )
+from jaxfinger.identify.start import start_values
 from jaxfinger.model import Model, Terms, plain_terms
 
 
@@ -295,12 +296,12 @@ def _with_missing_stages(
     """
     groups = free_groups(fit.recipe)
     unknown = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in set(free)]
-    start = start_values(fit.model, np.array(unknown, dtype=int), parameters)
+    start = start_values(fit.model, np.array(unknown, dtype=int), parameters, sources)
     seen = set()
     for e, lin in linearise_each(start, sources if unknown else {}).items():
         seen |= set(sources[e].positions[np.any(lin.factor[..., :-1] != 0.0, axis=(0, 1))])
     added = np.array([i for i in unknown if i in seen], dtype=int)
-    return start_values(fit.model, added, parameters), np.union1d(free, added).astype(int)
+    return start_values(fit.model, added, parameters, sources), np.union1d(free, added).astype(int)
 
 
 def _cad_prior(session: Session, recipe: Recipe, free, parameters) -> Prior:

@@ -18,16 +18,16 @@ from jaxfinger.data import Predictions, Session
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Stack, predict, prepare
 from jaxfinger.identify import Recipe
-from jaxfinger.identify.parameters import Free, describe, ravel
-from jaxfinger.identify.solve import Prior, solve
+from jaxfinger.identify.parameters import Free, describe
+from jaxfinger.identify.solve import solve
 from jaxfinger.identify.stages import (
     GROUP_OF_TERM,
     first_noise,
     free_groups,
     nominal_model,
     sources_of,
-    start_values,
 )
+from jaxfinger.identify.start import start_values
 from jaxfinger.model import Model
 
 ABSENT = 0.003  # of a channel's range: a term of the emulator that moves nothing by more is not in the simulator
@@ -81,10 +81,8 @@ def _imitate(session: Session, recipe: Recipe, told: dict[str, Stack]) -> Model:
     noise = {(e, c): first_noise(told[e], c) for e in told for c in reads[e]}
     groups = free_groups(recipe)
     free = np.array([i for i, p in enumerate(parameters) if p.group in groups and p.determinable], dtype=int)
-    start = start_values(model, free, parameters)
     sources = sources_of(told, reads, noise, parameters)
-    prior = Prior(np.asarray(ravel(start))[free], np.zeros((0, free.size)))
-    return solve(start, free, sources, prior)[0]
+    return solve(start_values(model, free, parameters, sources), free, sources)[0]
 
 
 def _absent(emulator: Model, group: str, told: dict[str, Stack]) -> bool:

@@ -1,36 +1,36 @@
 """Many sessions fitted in one compiled call: forty specimens of a lab, or hundreds of simulated sessions.
 
 All members share the protocol, the recipe and the rig's noise with one session that was identified by itself (the
-template); the links of each are its own. Each is then a Gauss–Newton iteration of the whole staged fit in the
-coordinates of the template, in which every stage's matrix is near the identity: a handful of products of small matrices
-an iteration (see `resample`). A member that fails or does not converge is named and leaves the rest as they are.
+template), and start where it ended; the links of each are its own. Each then runs the stages of `identify` in order, by
+the same solver on the same rows, as `optimistix.least_squares` does it in one program. A member that fails or does not
+converge is named and leaves the rest as they are.
 """
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import EXPERIMENTS, Batch, prepare
+from jaxfinger.experiments import Batch, prepare
 from jaxfinger.identify.fit import Fit
-from jaxfinger.identify.linearise import Filters, white_rows
+from jaxfinger.identify.gauss_newton import TANGENTS, VisibleGaussNewton
+from jaxfinger.identify.linearise import Filters, huber, white_rows
 from jaxfinger.identify.parameters import Free, describe, ravel, with_flat
 from jaxfinger.identify.resample import Batching, Compressed, batching_here, compress, plan_of, staged_step
-from jaxfinger.identify.solve import SMALL
-from jaxfinger.identify.stages import nominal_model
+from jaxfinger.identify.solve import KINK, SMALL, STEPS, within
+from jaxfinger.identify.stages import cad_prior, nominal_model, sources_of
 from jaxfinger.model import Model
 
-STEPS = 12
-TANGENTS = 8  # columns of a Jacobian at a time: more do not fit into the processor's cache
 AT_ONCE = 10  # sessions in one call: while the device fits them, the next are read and filtered
+SOLVER = VisibleGaussNewton(atol=SMALL, kink=KINK)
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Members:
     values: Float[np.ndarray, "S P"]  # flat vectors; NaN where a member failed
     std: Float[np.ndarray, "S P"]
     failed: Bool[np.ndarray, " S"]  # did not converge, or holds data that no fit can take
-    steps: np.ndarray  # Gauss–Newton steps of each
+    steps: np.ndarray  # linearisations of each, all stages together
     template: Fit
 
     def model(self, k: int) -> Model:
@@ -48,17 +48,33 @@ class Members:
         return with_flat(self.template.model, jnp.asarray(self.values[k]))
 
 
-class _Source(NamedTuple):
+class _Source(eqx.Module):
     """One experiment of all members, and how it is read."""
 
     batch: Batch  # every array with the members first
     filters: Filters
-    basis: Float[Array, "k c"]  # rows of the basis for the parameters that the experiment depends on
-    columns: Int[Array, " c"]  # coordinates that move any of them
-    free: Free
-    reads: Float[Array, " S"]
+    free: Free  # what it depends on
+    columns: Int[Array, " k"]  # likewise, positions in the flat vector
     counts: Int[Array, " r"]  # rows of the trials' measured columns
-    affine: bool  # in the parameters, so that one linearisation is exact
+    basis: Float[Array, "k c"]  # rows of the coordinates of `resample` for them
+    coordinates: Int[Array, " c"]  # those that move any of them
+
+    def rows(self, model: Model, flat: Float[Array, " P"], limit: float) -> Float[Array, " r"]:
+        """White residuals as Huber's cost sees them."""
+        at = self.free.set(model, flat[self.columns])
+        return huber(white_rows(at, self.batch, self.filters)[1].ravel()[self.counts], limit)
+
+
+class _Stage(eqx.Module):
+    """What a stage estimates, from which experiments, and what is known of it before."""
+
+    reads: tuple[int, ...] = eqx.field(static=True)  # numbers of experiments
+    linear: tuple[bool, ...] = eqx.field(static=True)  # whether each of them is affine in what is free
+    free: Int[Array, " p"]  # positions in the flat vector
+    mean: Float[Array, "S p"]  # of the prior
+    root: Float[Array, "k p"]
+    low: Float[Array, "S p"]
+    high: Float[Array, "S p"]
 
 
 def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: Batching | None = None) -> Members:
@@ -70,9 +86,8 @@ def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: 
     if not sessions:
         empty = np.zeros((0, ravel(template.model).size))
         return Members(empty, empty, np.zeros(0, bool), np.zeros(0, int), template)
-    compressed = compress(of, template)
-    prior = (compressed.grams.H[-1], compressed.grams.reads[:, -1])
-    basis, how = jnp.asarray(compressed.basis), batching_here(batching)
+    compressed, how = compress(of, template), batching_here(batching)
+    coordinates = jnp.asarray(compressed.basis), compressed.sizes, compressed.grams.H[-1], compressed.grams.reads
     shared = nominal_model(of, template.recipe)
     starts = [_start(s, template, shared) for s in sessions]
     at_once = min(len(sessions), AT_ONCE)
@@ -80,9 +95,11 @@ def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: 
         shares = []
         for first in range(0, len(sessions), at_once):
             members = [k % len(sessions) for k in range(first, first + at_once)]  # every share has one length
-            sources = _stack_sessions([sessions[k] for k in members], template, compressed)
             start = jnp.stack([starts[k] for k in members])
-            shares.append(device.submit(_fit_all, template.model, start, sources, basis, compressed.sizes, prior, how))
+            chosen = [sessions[k] for k in members]
+            work = _stack_sessions(chosen, template, compressed, start)
+            limit = jnp.asarray(template.recipe.fit.huber)
+            shares.append(device.submit(_fit_all, template.model, start, *work, coordinates, limit, how))
     columns = zip(*(s.result() for s in shares), strict=True)
     values, std, sound, steps = (np.concatenate(a)[: len(sessions)] for a in columns)
     values[~sound], std[~sound] = np.nan, np.nan
@@ -90,7 +107,7 @@ def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: 
 
 
 def _start(session: Session, template: Fit, shared: Model) -> Float[Array, " P"]:
-    """The template's flat vector with the session's own links for the shared ones; CAD's prior then moves with them."""
+    """The template's flat vector with the session's own links for the shared ones."""
     own = nominal_model(session, template.recipe)
     if jax.tree.structure(own) != jax.tree.structure(shared):
         raise UserError(
@@ -99,47 +116,59 @@ def _start(session: Session, template: Fit, shared: Model) -> Float[Array, " P"]
     return ravel(template.model) + ravel(own) - ravel(shared)
 
 
-def _stack_sessions(sessions: Sequence[Session], template: Fit, compressed: Compressed) -> tuple[_Source, ...]:
-    plan = plan_of(sessions[0], template)
+def _stack_sessions(
+    sessions: Sequence[Session], template: Fit, compressed: Compressed, starts: Float[Array, "S P"]
+) -> tuple[tuple[_Source, ...], tuple[_Stage, ...]]:
+    plan, parameters = plan_of(sessions[0], template), describe(template.model)
     reads = {e: c for r, _ in plan for e, c in r.items()}
     prepared = [prepare(s, [t.name for t in s if t.experiment in reads]) for s in sessions]
-    parameters = describe(template.model)
-    links = {int(i) for i in template.estimated if parameters[i].group in ("mass", "com")}
-    out = []
-    for e, positions in compressed.positions.items():
-        batches = []
-        for s, stacks in zip(sessions, prepared, strict=True):
+    reads = {e: c for e, c in reads.items() if e in compressed.positions}
+    for s, stacks in zip(sessions, prepared, strict=True):
+        for e in reads:
             if e not in stacks or len(stacks[e].trials) != len(prepared[0][e].trials):
                 raise UserError(f"{s.file or s.specimen}: has not the {e} trials of the other sessions; fit it alone")
-            batches.append(stacks[e].batch)
+    single = sources_of(prepared[0], reads, template.noise, parameters)
+    sources = []
+    for e, source in single.items():
+        batches = [stacks[e].batch for stacks in prepared]
         T = max(b.x.time.shape[-1] for b in batches)
         whole = jax.tree.map(lambda *a: jnp.stack(a), *(_padded(b, T) for b in batches))
-        columns = np.flatnonzero(np.any(compressed.basis[positions] != 0.0, axis=0))
-        filters = {c: jnp.asarray(template.noise[e, c].coefficients) for c in reads[e]}
-        out.append(
+        moving = np.flatnonzero(np.any(compressed.basis[source.positions] != 0.0, axis=0))
+        sources.append(
             _Source(
                 whole,
-                filters,
-                jnp.asarray(compressed.basis[np.ix_(positions, columns)]),
-                jnp.asarray(columns),
-                Free.at(template.model, positions),
-                jnp.array([float(e in r) for r, _ in plan]),
-                jnp.asarray(_measured_rows([whole.mask[c] for c in filters])),
-                not links.intersection(positions.tolist()) and _is_affine(e, reads[e], template.model),
+                source.filters,
+                Free.at(template.model, source.positions),
+                jnp.asarray(source.positions),
+                jnp.asarray(_measured_rows([whole.mask[c] for c in source.filters])),
+                jnp.asarray(compressed.basis[np.ix_(source.positions, moving)]),
+                jnp.asarray(moving),
             )
         )
-    return tuple(out)
+    stages, names = [], list(single)
+    for of_stage, free in plan:
+        mine = [e for e in names if e in of_stage]
+        priors = [cad_prior(s, template.recipe, parameters, free) for s in sessions]
+        ends = [within(with_flat(template.model, start), free) for start in starts]
+        low, high = (jnp.asarray(np.stack(side)) for side in zip(*ends, strict=True))
+        stages.append(
+            _Stage(
+                tuple(names.index(e) for e in mine),
+                tuple(single[e].linear(template.model, free) for e in mine),
+                jnp.asarray(free),
+                jnp.asarray(np.stack([p.mean for p in priors])),
+                jnp.asarray(priors[0].root),
+                low,
+                high,
+            )
+        )
+    return tuple(sources), tuple(stages)
 
 
 def _measured_rows(masks: list[Float[Array, "S columns B T"]]) -> Int[np.ndarray, " r"]:
     """Positions, in the order of `white_rows`, of the columns that a trial of any session has measured."""
     some = np.concatenate([np.asarray(m).any(axis=(0, 3)) for m in masks])  # (columns of all channels, B)
     return np.flatnonzero(np.repeat(some.T[..., None], masks[0].shape[-1], axis=-1))
-
-
-def _is_affine(experiment: str, channels: tuple[str, ...], model: Model) -> bool:
-    """Excursions and the torques of slack tendons are in the parameters, where no link (m times c) is free."""
-    return not model.effects and (EXPERIMENTS[experiment].slack or channels == ("tendon_excursion",))
 
 
 def _padded(batch: Batch, T: int) -> Batch:
@@ -154,59 +183,74 @@ def _padded(batch: Batch, T: int) -> Batch:
 
 
 @eqx.filter_jit
-def _fit_all(model, starts, sources, basis, sizes, prior, batching):
+def _fit_all(model, starts, sources, stages, coordinates, limit, batching):
     def one(member):
-        start, batches = member
-        own = [s._replace(batch=b) for s, b in zip(sources, batches, strict=True)]
-        return _fit(model, start, own, basis, sizes, prior)
+        start, batches, known = member
+        own = [eqx.tree_at(lambda s: s.batch, s, b) for s, b in zip(sources, batches, strict=True)]
+        theirs = [eqx.tree_at(lambda s: (s.mean, s.low, s.high), s, k) for s, k in zip(stages, known, strict=True)]
+        return _fit(model, start, own, theirs, coordinates, limit)
 
-    members = (starts, [s.batch for s in sources])
+    members = (starts, [s.batch for s in sources], [(s.mean, s.low, s.high) for s in stages])
     return jax.lax.map(one, members) if batching == "map" else jax.vmap(one)(members)
 
 
-def _fit(model: Model, start: Float[Array, " P"], sources: list[_Source], basis, sizes, prior):
-    """Gauss–Newton on all stages at once, θ = θ_start + basis z, until nothing moves by more than SMALL."""
-    (prior_gram, prior_reads), q = prior, basis.shape[1]
-
-    def grams(z, of: list[_Source]):
-        """H of every stage at z, from some of the experiments."""
-        H = jnp.zeros((prior_reads.size, q + 1, q + 1))
-        at = with_flat(model, start + basis @ z)
-        for s in of:
-            own = jnp.append(s.columns, q)
-            H = H.at[:, own[:, None], own].add(s.reads[:, None, None] * _gram(at, s))
-        return H
-
-    affine = prior_reads[:, None, None] * prior_gram + grams(jnp.zeros(q), [s for s in sources if s.affine])
-
-    def stages(z):
-        """H of every stage at z; residuals that are affine in z have moved with it."""
-        shift = jnp.eye(q + 1).at[:-1, -1].set(z)
-        return shift.T @ affine @ shift + grams(z, [s for s in sources if not s.affine])
-
-    def step(state):
-        z, _, _, k, _ = state
-        dz, covariance, sound = staged_step(stages(z), sizes, jnp.zeros(sizes[0]))
-        return z + dz, covariance, jnp.max(jnp.abs(dz)), k + 1, sound & jnp.all(jnp.isfinite(dz))
-
-    def going(state):
-        _, _, size, k, sound = state
-        return sound & (size > SMALL) & (k < STEPS)
-
-    start_state = (jnp.zeros(q), jnp.zeros((q, q)), jnp.inf, 0, jnp.array(True))
-    z, covariance, size, k, sound = jax.lax.while_loop(going, step, start_state)
-    variance = jnp.sum((basis @ covariance) * basis, axis=1)
-    return start + basis @ z, jnp.sqrt(jnp.maximum(variance, 0.0)), sound & (size <= SMALL), k
+def _fit(model: Model, start: Float[Array, " P"], sources: list[_Source], stages: list[_Stage], coordinates, limit):
+    """The stages of one member, one after another; then its covariance."""
+    model = with_flat(model, start)  # with links of its own
+    flat, sound, steps = start, jnp.array(True), jnp.array(0)
+    for stage in stages:
+        found = _fit_stage(model, flat, sources, stage, limit)
+        flat = flat.at[stage.free].set(found.value)
+        sound &= found.result == optx.RESULTS.successful
+        steps += found.stats["linearisations"]
+    covariance, seen = _covariance(model, flat, sources, stages, coordinates, limit)
+    variance = jnp.sum((coordinates[0] @ covariance) * coordinates[0], axis=1)
+    return flat, jnp.sqrt(jnp.maximum(variance, 0.0)), sound & seen & jnp.all(jnp.isfinite(flat)), steps
 
 
-def _gram(model: Model, source: _Source) -> Float[Array, "c+1 c+1"]:
+def _fit_stage(model: Model, flat: Float[Array, " P"], sources: list[_Source], stage: _Stage, limit):
+    """What is affine in the free parameters is linearised once: white residuals r + J δ."""
+    start, mine = flat[stage.free], [sources[k] for k in stage.reads]
+
+    def white(y, of: list[_Source]):
+        return [s.rows(model, flat.at[stage.free].set(y), 0.0) for s in of]
+
+    affine = [s for s, linear in zip(mine, stage.linear, strict=True) if linear]
+    curved = [s for s, linear in zip(mine, stage.linear, strict=True) if not linear]
+    along = []  # r and J of the rest
+    if affine:
+        r, push = jax.linearize(lambda y: jnp.concatenate(white(y, affine)), start)
+        along = [(r, jax.lax.map(push, jnp.eye(start.size), batch_size=TANGENTS).T)]
+
+    def rows(y, _):
+        moved = [r + J @ (y - start) for r, J in along]
+        return huber(jnp.concatenate([*moved, *white(y, curved)]), limit), stage.root @ (y - stage.mean)
+
+    options = {"lower": stage.low, "upper": stage.high}
+    return optx.least_squares(rows, SOLVER, start, None, options, max_steps=STEPS, throw=False)
+
+
+def _covariance(
+    model: Model, flat: Float[Array, " P"], sources: list[_Source], stages: list[_Stage], coordinates, limit
+):
+    """Of the coordinates of `resample` at the optimum, and whether all of it is seen."""
+    basis, sizes, prior, reads = coordinates
+    q, last = basis.shape[1], reads[:, -1]
+    H = last[:, None, None] * prior
+    for k, s in enumerate(sources):
+        gram = _gram(model, flat, s, limit)
+        own = jnp.append(s.coordinates, q)
+        of_stage = jnp.array([float(k in stage.reads) for stage in stages])
+        H = H.at[:, own[:, None], own].add(of_stage[:, None, None] * gram)
+    _, covariance, sound = staged_step(H, sizes, jnp.zeros(sizes[0]))
+    return covariance, sound
+
+
+def _gram(model: Model, flat: Float[Array, " P"], source: _Source, limit) -> Float[Array, "c+1 c+1"]:
     """[J r]ᵀ[J r] of one experiment, J in the coordinates that bear on it."""
-    theta = source.free.get(model)
 
     def rows(dz):
-        return white_rows(source.free.set(model, theta + source.basis @ dz), source.batch, source.filters)[1].ravel()[
-            source.counts
-        ]
+        return source.rows(model, flat.at[source.columns].add(source.basis @ dz), limit)
 
     r, push = jax.linearize(rows, jnp.zeros(source.basis.shape[1]))
     A = jnp.concatenate([jax.lax.map(push, jnp.eye(source.basis.shape[1]), batch_size=TANGENTS), r[None]])

@@ -15,23 +15,26 @@ import numpy as np
 from jaxfinger.data import Session, data_hash
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, prepare
-from jaxfinger.identify.fit import Fit, StageReport
+from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.identifiability import name_invisible
 from jaxfinger.identify.parameters import Free, describe, ravel
+from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.predictions import model_for
-from jaxfinger.identify.solve import Prior, Solution, solve
+from jaxfinger.identify.prior import prior_of
+from jaxfinger.identify.propagate import propagate
+from jaxfinger.identify.solve import solve, within
 from jaxfinger.identify.stages import (
     Progress,
     cad_covariance,
     cad_prior,
     estimate_with_noise,
     free_groups,
-    propagate,
+    report_of,
     seen_by,
-    sources_of,
-    start_values,
+    total_cost,
     touched_by,
 )
+from jaxfinger.identify.start import start_values
 from jaxfinger.model import Model
 
 STAGE = "joint"
@@ -45,7 +48,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         UserError: the session has none of these trials, or its finger is another one.
     """
     recipe = fit.recipe
-    model = model_for(fit, session)
+    model = start = model_for(fit, session)
     progress("reading the recordings")
     stacks = prepare(session, [t.name for t in session if t.experiment in recipe.fit.joint_experiments])
     reads = {e: channels_of(e) for e in stacks}
@@ -55,40 +58,34 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
             "name others in fit.joint_experiments of the recipe"
         )
     parameters = describe(model)
-    cad = np.diag(cad_covariance(session, parameters))
+    cad = np.flatnonzero(np.diag(cad_covariance(session, parameters)))
     touched = touched_by(reads, session)
     groups = free_groups(recipe)
     seen = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and seen_by(p, touched)]
-    free = np.union1d(np.union1d(fit.estimated, np.flatnonzero(cad)), seen).astype(int)
+    free = np.union1d(np.union1d(fit.estimated, cad), seen).astype(int)
 
     same = fit.data_hash == (data_hash(session.file) if session.file else "")
-    prior = cad_prior(session, recipe, parameters, free) if same else _prior(fit, free)
+    if same:
+        prior = cad_prior(session, recipe, parameters, free)
+    else:
+        prior = prior_of(np.asarray(ravel(fit.model)), fit.covariance, free)
     progress("refining on all trials at once")
-    model, solution, noise = estimate_with_noise(
-        start_values(model, free, parameters),
-        free,
-        stacks,
-        reads,
-        fit.noise if same else {},
-        parameters,
-        prior,
-        recipe.fit.huber,
-    )
-    sources = sources_of(stacks, reads, noise, parameters)
+    known, huber = (fit.noise if same else {}), recipe.fit.huber
+    model, solution, sources, noise = estimate_with_noise(model, free, stacks, reads, known, prior, huber)
     warnings = name_invisible(parameters, free, solution.invisible)
     if not solution.converged or warnings or solution.chi2_per_row(free.size) > MISFIT:
         progress("refining from a neutral start")
-        neutral = start_values(_neutral(model, free, parameters), free, parameters)
-        other, second = solve(neutral, free, sources, prior, recipe.fit.huber)
-        if _total(second, other, free, prior) < _total(solution, model, free, prior) * (1 - 1e-6):
+        neutral = start_values(_neutral(model, free, parameters), free, parameters, sources)
+        other, second = solve(neutral, free, sources, prior, huber)
+        if total_cost(other, second, free, prior) < total_cost(model, solution, free, prior) * (1 - 1e-6):
             model, solution = other, second
             warnings = [
                 *name_invisible(parameters, free, solution.invisible),
                 "the earlier fit led to a poorer optimum",
             ]
 
-    linked = np.flatnonzero(np.diag(fit.covariance) > 0)
-    covariance = propagate(fit.covariance, solution, sources, free, linked, prior, recipe.fit.huber)
+    covariance = propagate(fit.covariance, solution, sources, free, prior, huber)
+    warnings += implausible(model, covariance, free, within(start, free)[0])
     refined = replace(
         fit,
         model=model,
@@ -97,16 +94,8 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         noise=noise if same else fit.noise | noise,
         specimen=session.specimen,
     )
-    report = StageReport(
-        STAGE,
-        "fitted" if solution.converged else "not converged",
-        solution.message or _gain(fit, refined, same),
-        trials=tuple(t for s in stacks.values() for t in s.trials),
-        rows=solution.rows,
-        chi2_per_row=solution.chi2_per_row(free.size),
-        outliers=solution.outliers,
-        warnings=tuple(warnings),
-    )
+    trials = tuple(t for s in stacks.values() for t in s.trials)
+    report = report_of(STAGE, solution, free, trials, warnings, _gain(fit, refined, same))
     return replace(refined, stages=(*fit.stages, report))
 
 
@@ -114,23 +103,6 @@ def channels_of(experiment: str) -> tuple[str, ...]:
     """What a held joint's tendons show of their excursion is stretch, not moment arm."""
     e = EXPERIMENTS[experiment]
     return tuple(c for c in e.channels if not (e.held and c == "tendon_excursion"))
-
-
-def _total(solution: Solution, model: Model, free, prior: Prior) -> float:
-    offset = prior.root @ (np.asarray(ravel(model))[free] - prior.mean)
-    return solution.cost + 0.5 * float(offset @ offset)
-
-
-def _prior(fit: Fit, free) -> Prior:
-    """The whole covariance of an earlier fit, where it is finite."""
-    variance = np.diag(fit.covariance)[free]
-    known = np.flatnonzero(np.isfinite(variance) & (variance > 0))
-    std = np.sqrt(variance[known])
-    correlation = fit.covariance[np.ix_(free[known], free[known])] / np.outer(std, std)
-    values, vectors = np.linalg.eigh(correlation)
-    root = np.zeros((known.size, free.size))
-    root[:, known] = (vectors / np.sqrt(np.maximum(values, 1e-12))).T / std
-    return Prior(np.asarray(ravel(fit.model))[free], root)
 
 
 def _neutral(model: Model, free, parameters) -> Model:

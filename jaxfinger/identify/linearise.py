@@ -3,6 +3,12 @@
 With J the Jacobian of a trial's white residuals r, one QR factorisation [J r] = Q [R d; 0 ρ] keeps all that least
 squares needs: ‖r + J δ‖² = ‖d + R δ‖² + ρ². A stage, the joint refinement, a bootstrap resample and a leave-one-out
 refit are sums over these small factors; their cost no longer depends on the number of samples.
+
+Outliers: with Huber's cost ρ(r) = r²/2 for |r| ≤ k and k|r| − k²/2 beyond (Huber 1964), least squares reads
+
+    s(r) = sign(r) √(2 ρ(r)),   ∂s/∂r = ψ(r)/s(r),
+
+whose sum of squares is that cost, and whose gradient Σ J ψ(r) is that of the M-estimate.
 """
 
 from collections.abc import Sequence
@@ -24,81 +30,157 @@ from jaxfinger.model import Model
 Filters = dict[str, Float[Array, "columns order+1 order+1"]]
 
 
+class Tangent(NamedTuple):
+    """One experiment's residuals at a model, and how they change with its parameters: in each channel's own unit."""
+
+    residuals: dict[str, Float[np.ndarray, "columns B T"]]  # measured − predicted
+    slopes: dict[str, Float[np.ndarray, "p columns B T"]]
+
+    def moved(self, by: Float[np.ndarray, " p"]) -> "Tangent":
+        """On along the tangent: exact where the residuals are affine in what moves."""
+        return Tangent({c: r + np.tensordot(by, self.slopes[c], 1) for c, r in self.residuals.items()}, self.slopes)
+
+
 class Linearised(NamedTuple):
     """One experiment's residuals and compressed Jacobian at a model."""
 
     residuals: dict[str, Float[np.ndarray, "columns B T"]]  # measured − predicted, by channel, in the channel's unit
-    white: Float[np.ndarray, "B rows"]  # the same, whitened and flat, before weights
-    jacobian: Float[np.ndarray, "B rows p"]  # J, before weights
-    factor: Float[np.ndarray, "B k p+1"]  # triangular, of [J r] with weights
+    white: Float[np.ndarray, "B rows"]  # the same, whitened and flat, before Huber
+    jacobian: Float[np.ndarray, "B rows p"]  # J, likewise
+    factor: Float[np.ndarray, "B k p+1"]  # triangular, of [J r] as Huber's cost sees them
 
 
 def white_rows(model: Model, batch: Batch, filters: Filters) -> tuple[dict, Float[Array, "B rows"]]:
     """Residuals by channel, and the same white, one row a trial: unit variance where model and noise are right."""
-    predicted = predict(model, batch.x, tuple(filters))
-    residuals = {c: batch.y[c] - predicted[c] for c in filters}
-    white = [whiten(residuals[c], batch.mask[c], filters[c], demean=CHANNELS[c].free_zero) for c in filters]
-    return residuals, jnp.concatenate([jnp.moveaxis(w, 1, 0).reshape(w.shape[1], -1) for w in white], axis=1)
+    residuals = _residuals(model, batch, tuple(filters))
+    return residuals, white_of(residuals, batch, filters)
 
 
-def residuals_of(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[str, Float[np.ndarray, "columns B T"]]:
-    """Measured − predicted, by channel, in the channel's unit; also where a sample does not count."""
-    return _cut([_residuals(model, block, channels) for block in blocks(batch)], batch)
+def white_of(residuals: dict, batch: Batch, filters: Filters):
+    """Residuals by channel, (…, columns, B, T), white: (…, B, rows); nothing finite where they are not."""
+    with np.errstate(invalid="ignore"):
+        return _flat({c: _white(residuals[c], batch, filters, c) for c in filters})
 
 
-def linearise(
-    model: Model, free: Free, batch: Batch, filters: Filters, weights: Float[np.ndarray, "B rows"] | None = None
-) -> Linearised:
-    """Residuals and per-trial factors at `model`, with respect to the parameters in `free`; all weights one by default.
-
-    Compiled for a block of trials (`blocks`), whose additions are cut off again.
-    """
-    B, T = batch.x.time.shape
-    parts = [_linearise(model, free, block, filters, jax.device_put(True)) for block in blocks(batch)]
-    residuals, *rows = zip(*parts, strict=True)
-
-    def cut(parts):
-        each = np.concatenate([np.asarray(a) for a in parts])[:B]
-        wide = each.reshape(B, -1, residuals[0][next(iter(filters))].shape[-1], *each.shape[2:])
-        return wide[:, :, :T].reshape(B, -1, *each.shape[2:])
-
-    white, J = map(cut, rows)
-    columns = np.concatenate([J, white[..., None]], axis=-1)
-    if weights is not None:
-        columns *= weights[..., None]
-    return Linearised(_cut(residuals, batch), white, J, np.asarray(np.linalg.qr(columns, mode="r")))
-
-
-def missed(model: Model, free: Free, batch: Batch, filters: Filters) -> dict[str, Float[np.ndarray, "columns B T"]]:
-    """`residuals_of`, by the program of `linearise`: where that is compiled, it costs no compilation."""
-    return _cut([_linearise(model, free, block, filters, jax.device_put(False))[0] for block in blocks(batch)], batch)
-
-
-def _cut(parts: Sequence[dict[str, Array]], batch: Batch) -> dict[str, Float[np.ndarray, "columns B T"]]:
-    """Blocks of residuals put together again."""
-    B, T = batch.x.time.shape
-    return {c: np.concatenate([np.asarray(x[c]) for x in parts], axis=1)[:, :B, :T] for c in parts[0]}
-
-
-@quick_jit
 def _residuals(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[str, Array]:
     predicted = predict(model, batch.x, channels)
     return {c: batch.y[c] - predicted[c] for c in channels}
 
 
+def _white(r, batch: Batch, filters: Filters, channel: str):
+    return whiten(r, batch.mask[channel], filters[channel], demean=CHANNELS[channel].free_zero)
+
+
+def _flat(white: dict):
+    """(…, columns, B, T) of every channel as (…, B, rows)."""
+    values = list(white.values())
+    xp = values[0].__array_namespace__()
+    wide = xp.moveaxis(xp.concat(values, axis=-3), -2, -3)
+    return wide.reshape(*wide.shape[:-2], -1)
+
+
+def huber(r: Float[Array, "*N"], limit: float | Float[Array, ""]) -> Float[Array, "*N"]:
+    """s(r), which least squares makes Huber's cost of; a limit of 0 is none."""
+    a = jnp.abs(r)
+    beyond = (limit > 0.0) & (a > limit)
+    root = jnp.sqrt(jnp.where(beyond, limit * (2.0 * a - limit), 1.0))
+    return jnp.where(beyond, jnp.sign(r) * root, r)
+
+
+def robust_share(r: Float[np.ndarray, "*N"], limit: float) -> Float[np.ndarray, "*N"]:
+    """∂s/∂r on the host: the share of a row that Huber's cost lets through."""
+    a = np.maximum(np.abs(r), limit)
+    return limit / np.sqrt(limit * (2.0 * a - limit)) if limit else np.ones_like(a)
+
+
+def residuals_of(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[str, Float[np.ndarray, "columns B T"]]:
+    """Measured − predicted of every trial; also where a sample does not count."""
+    return _cut([_residuals_jit(model, block, channels) for block in blocks(batch)], batch)
+
+
+def tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> Tangent:
+    """Residuals and their derivatives by the parameters in `free`.
+
+    Compiled for a block of trials (`blocks`), whose additions are cut off again.
+    """
+    parts = [_tangent(model, free, block, channels, jax.device_put(True)) for block in blocks(batch)]
+    residuals, slopes = zip(*parts, strict=True)
+    return Tangent(_cut(residuals, batch), _cut(slopes, batch))
+
+
+def missed(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """`residuals_of`, by the program of `tangent`: where that is compiled, it costs no compilation."""
+    return _cut([_tangent(model, free, block, channels, jax.device_put(False))[0] for block in blocks(batch)], batch)
+
+
+def linearise(model: Model, free: Free, batch: Batch, filters: Filters, limit: float = 0.0) -> Linearised:
+    """Residuals and per-trial factors at `model`, with respect to the parameters in `free`."""
+    return whitened(tangent(model, free, batch, tuple(filters)), batch, filters, limit)
+
+
+def whitened(
+    along: Tangent,
+    batch: Batch,
+    filters: Filters,
+    limit: float = 0.0,
+    weights: Float[np.ndarray, " B"] | None = None,
+) -> Linearised:
+    """White rows of a tangent and their factors; residuals beyond the `limit` count as Huber has it, 0 for none, and
+    every trial with its weight, 1 by default.
+    """
+    white = white_of(along.residuals, batch, filters)
+    J = np.moveaxis(white_of(along.slopes, batch, filters), 0, -1)
+    factor = factored(white, J, limit)
+    return Linearised(
+        along.residuals, white, J, factor if weights is None else np.sqrt(weights)[:, None, None] * factor
+    )
+
+
+def factored(white: Float[np.ndarray, "B rows"], J: Float[np.ndarray, "B rows p"], limit: float):
+    """(B, k, p+1): triangular factors of every trial, from the rows that count and the columns that it depends on."""
+    B, _, p = J.shape
+    share = robust_share(white, limit)
+    s = np.sign(white) * np.sqrt(np.maximum(limit * (2.0 * np.abs(white) - limit), 0.0)) if limit else white
+    s = np.where(np.abs(white) > limit, s, white) if limit else white
+    out = np.zeros((B, p + 1, p + 1))
+    for b in range(B):
+        touched = J[b] != 0.0
+        rows = np.flatnonzero(touched.any(axis=1) | (white[b] != 0.0))
+        columns = np.append(np.flatnonzero(touched.any(axis=0)), p)
+        A = np.empty((rows.size, columns.size))
+        A[:, :-1] = J[b][np.ix_(rows, columns[:-1])] * share[b, rows, None]
+        A[:, -1] = s[b, rows]
+        R = triangular(A)
+        out[b, : len(R)][:, columns] = R
+    return out
+
+
+def triangular(A: Float[np.ndarray, "N p"]) -> Float[np.ndarray, "k p"]:
+    """R of A = Q R."""
+    return np.asarray(np.linalg.qr(A, mode="r"))
+
+
+def _cut(parts: Sequence[dict[str, Array]], batch: Batch) -> dict[str, np.ndarray]:
+    """Blocks of (…, B, T) put together again."""
+    B, T = batch.x.time.shape
+    return {c: np.concatenate([np.asarray(x[c]) for x in parts], axis=-2)[..., :B, :T] for c in parts[0]}
+
+
+_residuals_jit = quick_jit(_residuals)
+
+
 @quick_jit
-def _linearise(model: Model, free: Free, batch: Batch, filters: Filters, slopes: Array):
-    """Residuals, white rows, and their Jacobian: zero unless `slopes`."""
+def _tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...], slopes: Array):
+    """Residuals and their derivatives: zero unless `slopes`."""
 
     def f(values):
-        residuals, white = white_rows(free.put(model, values), batch, filters)
-        return white, residuals
+        return _residuals(free.put(model, values), batch, channels)
 
     values = free.values(model)
-    white, pushforward, residuals = jax.linearize(f, values, has_aux=True)
+    residuals, pushforward = jax.linearize(f, values)
     still = jax.tree.map(jnp.zeros_like, values)
 
-    def columns(part: str) -> Float[Array, "k B rows"]:
+    def columns(part: str) -> dict[str, Array]:
         """Derivatives by the parameters of one part of the model. The derivative of a linear function is itself, but
         for what the zeros of the other parts pass through: most of it.
         """
@@ -112,8 +194,10 @@ def _linearise(model: Model, free: Free, batch: Batch, filters: Filters, slopes:
         return jax.lax.map(lambda unit: jax.jvp(alone, (zero,), (unit,))[1], jnp.eye(zero.size))
 
     def jacobian():
-        return jnp.concatenate([columns(part) for part in dict.fromkeys(free.parts)])
+        parts = [columns(part) for part in dict.fromkeys(free.parts)]
+        return jax.tree.map(lambda *a: jnp.concatenate(a), *parts)
 
     count = sum(v.size for v in values)
-    J = jax.lax.cond(slopes, jacobian, lambda: jnp.zeros((count, *white.shape)))
-    return residuals, white, jnp.moveaxis(J, 0, -1)
+    nothing = {c: (count, *r.shape) for c, r in residuals.items()}
+    J = jax.lax.cond(slopes, jacobian, lambda: {c: jnp.zeros(shape) for c, shape in nothing.items()})
+    return residuals, J

@@ -8,7 +8,6 @@ noise included), scatter within holds, the residuals themselves (which hide part
 
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
@@ -49,17 +48,19 @@ class Noise:
 
 
 def whiten(
-    r: Float[Array, "columns B T"],
-    mask: Float[Array, "columns B T"],
-    coefficients: Float[Array, "columns order+1 order+1"],
+    r: Float[Array | np.ndarray, "*more columns B T"],
+    mask: Float[Array | np.ndarray, "columns B T"],
+    coefficients: Float[Array | np.ndarray, "columns order+1 order+1"],
     demean: bool,
-) -> Float[Array, "columns B T"]:
-    """White residuals of unit variance, zero where a sample does not count.
+) -> Float[Array | np.ndarray, "*more columns B T"]:
+    """White residuals of unit variance, zero where a sample does not count; NumPy's of NumPy's, JAX's of JAX's.
 
     With `demean`, what a constant per trial and column could explain is projected out (the encoders' arbitrary zero).
     """
+    xp = r.__array_namespace__()
+    mask, coefficients = xp.asarray(mask), xp.asarray(coefficients)
     order = coefficients.shape[1] - 1
-    column = jnp.arange(len(r))[:, None, None]
+    column = np.arange(len(mask))[:, None, None]
     filters = coefficients[column, history(mask, order).astype(int)] * mask[..., None]  # (columns, B, T, lags)
     r = r * mask
     white = filters[..., 0] * r
@@ -67,8 +68,8 @@ def whiten(
         white = white + filters[..., k] * _lag(r, k)
     if demean:
         constant = filters.sum(axis=-1)
-        energy = jnp.maximum(jnp.sum(constant * constant, axis=-1, keepdims=True), 1e-300)
-        white = white - constant * jnp.sum(constant * white, axis=-1, keepdims=True) / energy
+        energy = xp.maximum(xp.sum(constant * constant, axis=-1, keepdims=True), 1e-300)
+        white = white - constant * xp.sum(constant * white, axis=-1, keepdims=True) / energy
     return white
 
 

@@ -25,9 +25,9 @@ from jaxfinger.experiments import prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.joint import STAGE as JOINT
 from jaxfinger.identify.joint import channels_of
-from jaxfinger.identify.linearise import linearise
+from jaxfinger.identify.linearise import linearise, triangular
 from jaxfinger.identify.parameters import Free, describe, ravel
-from jaxfinger.identify.solve import huber_weights, triangular, visible
+from jaxfinger.identify.solve import visible
 from jaxfinger.identify.stages import STAGES, cad_covariance, cad_prior, sources_of, stage_free, touched_by
 
 Batching = Literal["map", "vmap"]
@@ -68,11 +68,7 @@ def compress(session: Session, fit: Fit) -> Compressed:
     blocks, trials = [], []
     for e, source in sources.items():
         at = Free.at(fit.model, source.positions)
-        lin = linearise(fit.model, at, source.batch, source.filters)
-        weights, share = huber_weights({e: lin}, fit.recipe.fit.huber) if fit.recipe.fit.huber else ({}, 0.0)
-        if share > 0.005:
-            lin = linearise(fit.model, at, source.batch, source.filters, weights[e])
-        factor = np.asarray(lin.factor)
+        factor = linearise(fit.model, at, source.batch, source.filters, fit.recipe.fit.huber).factor
         block = np.zeros((*factor.shape[:2], P + 1))
         block[..., [*source.positions, P]] = factor
         blocks += list(block)

@@ -1,53 +1,38 @@
-"""The one seam to optimistix: least squares on compressed trials.
+"""Every fit's way to its optimum: `VisibleGaussNewton`, an optimistix solver, on compressed trials.
 
-    min_θ  Σ_trials ‖white residuals‖² + ‖W (θ − μ)‖²
+    min_θ  Σ_trials Huber(white residuals) + ½ ‖W (θ − μ)‖²
 
-1. Each experiment is linearised and compressed at the current model (`linearise`).
-2. The stacked factors are scaled by columns; their singular vectors say which combinations of parameters the trials
-   can see. The rest stays where it was, and is named.
-3. optimistix solves in coordinates z along the visible singular vectors, θ = θ_k + B z, in which the Gauss–Newton
-   matrix is the identity. Most of equation (1) is linear in its parameters: one step, whatever the conditioning of θ.
-4. Where it is not (slip of held tendons, products of moment arms and losses) the model is linearised again at the new
-   point, and a step that did not lower the cost is cut to where a parabola through both ends is lowest, until a
-   step is a small part of a standard deviation, or a whole one that is a tenth of it leads no further down.
-5. A mass that would fall to nothing stays on its floor, and what has limits within them, while the others are
-   minimised with it there.
-6. Outliers: Huber's weights from the white residuals at the optimum, then again from 1.
+One step of the solver reads the trials compressed at its trial point. Here they are linearised by one program an
+experiment, which all sessions of like fingers share, and the solver is stepped from outside
+(`optimistix` calls that interactive stepping); `batch` puts the same solver and the same rows through
+`optimistix.least_squares` in one program, which compiles for minutes where a session differs from all before.
+An experiment whose residuals are affine in what is free is linearised once and moved along its tangent: exact.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float, Int
-from scipy.optimize import lsq_linear
 
 from jaxfinger.compilation import side_by_side
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch
-from jaxfinger.identify.linearise import Filters, Linearised, linearise, missed
+from jaxfinger.identify.gauss_newton import Compressed, Outcome, State, VisibleGaussNewton, begin, bounded_step
+from jaxfinger.identify.gauss_newton import visible as scaled_directions
+from jaxfinger.identify.linearise import Filters, Linearised, Tangent, missed, tangent, triangular, whitened
 from jaxfinger.identify.parameters import Free, describe, ravel
+from jaxfinger.identify.prior import Prior
 from jaxfinger.model import Model
 
-VISIBLE = 1e-7  # relative singular value of the column-scaled Jacobian below which a combination is not seen
-SMALL = 0.02  # a step this small, in standard deviations of the estimate, ends the iteration
+SMALL = 1e-6  # a step this small, in standard deviations of the estimate, ends the search
+ROUGH = 0.02  # likewise where no more than residuals are wanted, as for their noise
 KINK = 0.1  # likewise one that does not lower the cost: what is left is a kink, where a tendon slips or a joint turns
-STEPS = 40
+STEPS = 60
 LIGHTEST = 0.02  # share of its starting value below which no mass is let to fall
-REMEMBERED = 5  # steps that the next one is mixed with
 PAD = 48  # compressed problems are padded to multiples of this, to share compilations
-
-
-class Prior(NamedTuple):
-    """Gaussian prior rows `root (θ − mean)` on the free parameters; `root` is a square root of the precision."""
-
-    mean: Float[np.ndarray, " p"]
-    root: Float[np.ndarray, "rows p"]
 
 
 class Source(NamedTuple):
@@ -57,19 +42,28 @@ class Source(NamedTuple):
     filters: Filters
     positions: Int[np.ndarray, " k"]  # in the flat vector, ascending
     effects: bool = True  # whether the model's effects show in it, if it has any
+    affine: Int[np.ndarray, " a"] = np.zeros(0, int)  # those in which its residuals are affine together
+    weights: Float[np.ndarray, " B"] | None = None  # of its trials, 1 by default
 
     def seen(self, model: Model) -> Model:
         """The model as the experiment shows it: what does not show is not compiled."""
         return model if self.effects or not model.effects else eqx.tree_at(lambda m: m.effects, model, ())
+
+    def linear(self, model: Model, free: Int[np.ndarray, " p"]) -> bool:
+        """Whether one linearisation says it all of the free parameters."""
+        mine = np.intersect1d(self.positions, free)
+        drives = np.any(np.asarray(model.joint_torque.torque_friction))  # they turn the sum of (1) into a share of it
+        return not self.seen(model).effects and not drives and bool(np.isin(mine, self.affine).all())
 
 
 @dataclass(frozen=True)
 class Solution:
     """A least-squares estimate at its optimum."""
 
-    converged: bool
-    message: str
-    cost: float  # half the sum of squared white residuals, weights included, priors apart
+    outcome: Outcome
+    message: str  # empty where the search converged
+    linearisations: int
+    cost: float  # half the sum of squared white residuals, as Huber has it, priors apart
     rows: int  # white residuals that count
     information: Float[np.ndarray, "P P"]  # JᵀJ over the whole flat vector, priors apart
     invisible: Float[np.ndarray, "k p"]  # unit combinations of scaled parameters that neither trials nor prior see
@@ -77,9 +71,35 @@ class Solution:
     outliers: float  # share of white residuals beyond the robust limit
     linearised: dict[str, Linearised]
 
+    @property
+    def converged(self) -> bool:
+        """At an optimum, or in a kink a tenth of a standard deviation wide."""
+        return not self.message
+
     def chi2_per_row(self, estimated: int) -> float:
         """1 where model and noise are right, with so many parameters estimated."""
         return 2.0 * self.cost / max(1, self.rows - estimated)
+
+
+class Tangents:
+    """What is known of experiments along their tangents: kept as long as nothing moves in which they are not affine."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, tuple[np.ndarray, Tangent]] = {}
+
+    def at(self, name: str, model: Model, source: Source, limit: float, linear: bool) -> Linearised:
+        """The experiment linearised at the model."""
+        seen = source.seen(model)
+        free = Free.at(seen, source.positions)
+        values = np.asarray(free.get(seen))
+        known, along = self._known.get(name, (values, None)) if linear else (values, None)
+        by = values - known
+        if along is None or np.any(by[~np.isin(source.positions, source.affine)]):
+            along, by = tangent(seen, free, source.batch, tuple(source.filters)), np.zeros_like(values)
+            if linear:
+                self._known[name] = values, along
+        along = along.moved(by) if by.any() else along
+        return whitened(along, source.batch, source.filters, limit, source.weights)
 
 
 def solve(
@@ -89,113 +109,114 @@ def solve(
     prior: Prior | None = None,
     huber: float = 0.0,
     limits: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]] | None = None,
+    tangents: Tangents | None = None,
+    small: float = SMALL,
 ) -> tuple[Model, Solution]:
     """The model with its free parameters (positions in the flat vector) at the optimum, and what is known of it.
 
     `limits`: of each free parameter, below and above; what starts outside of them stays until a step leads back.
+    `huber`: robust limit in standard deviations, 0 for none. `tangents`: of earlier fits of the same trials.
+    `small`: standard deviations by which a step ends the search.
 
     Raises:
         UserError: the model is not defined at its start.
     """
-    size = ravel(model).size
+    size, p, tangents = ravel(model).size, free.size, tangents or Tangents()
     moved = Free.at(model, free)
     theta = np.asarray(moved.get(model))
-    masses = np.array([p.group == "mass" for p in describe(model)])[free]
-    low, high = limits or (np.full(theta.size, -np.inf), np.full(theta.size, np.inf))
-    low = np.where(masses, np.maximum(low, LIGHTEST * theta), low)
-    if prior is None:
-        prior = Prior(theta, np.zeros((0, theta.size)))
-    weights: dict[str, np.ndarray] = {}
-    share = 0.0
-    for robust in (False, True) if huber else (False,):
-        if robust:
-            weights, share = huber_weights(linearised, huber)
-            # Gaussian residuals pass a limit of 3 in 0.3 % of cases: half as many again are outliers.
-            if share < 0.005:
-                break
-        best, before, converged = np.inf, None, False
-        step = gradient = np.zeros_like(theta)
-        steps: list[tuple[np.ndarray, np.ndarray]] = []  # whole ones, and where they started
-        for _ in range(STEPS):
-            linearised = linearise_each(model, sources, weights)
-            factor = _stacked(linearised, sources, size)
-            offset = prior.root @ (theta - prior.mean)
-            cost = 0.5 * float(factor[:, -1] @ factor[:, -1] + offset @ offset)
-            if not cost <= best * (1 + 1e-9) and np.any(step):  # higher, or outside of where the model is defined
-                if before and small < KINK:
-                    theta, (model, linearised), converged = theta - step, before, True
-                    break
-                shorter = _shorter(best, float(gradient @ step), cost)
-                theta = theta - (1.0 - shorter) * step
-                step, small, before = shorter * step, shorter * small, None
-                model = moved.set(model, jax.device_put(theta))
-                if small < SMALL * 0.1:
-                    break
-                continue
-            if not np.isfinite(cost):
-                raise UserError("the model predicts nothing finite where the fit starts: start from other parameters")
-            best = cost
-            A = np.concatenate([factor[:, free], prior.root])
-            b = np.concatenate([factor[:, -1], offset])
-            gradient = A.T @ b
-            basis, invisible, scale = visible(A)
-            z = _minimise(A @ basis, b)
-            step = basis @ z
-            if np.any(theta + step < low) or np.any(theta + step > high):
-                step = bounded(A, b, low - theta, high - theta)
-                z = np.linalg.lstsq(basis, step, rcond=None)[0]
-            steps = [*steps[-REMEMBERED:], (theta, step)]
-            small = float(np.max(np.abs(z), initial=0.0))
-            if small < SMALL:
-                converged = True
-                break
-            before = model, linearised  # a whole step away
-            mixed = _mixed(A, steps)
-            if gradient @ mixed < 0 and np.all(theta + mixed >= low) and np.all(theta + mixed <= high):
-                step = mixed
-            theta = theta + step
-            model = moved.set(model, jax.device_put(theta))
-    message = (
-        ""
-        if converged
-        else f"no further descent after {STEPS} linearisations; the last step was {small:.2g} standard deviations"
+    low, high = within(model, free, limits)
+    prior = prior or Prior.none(theta)
+    solver = VisibleGaussNewton(atol=small, kink=KINK)
+    room = -(-max(p, 1) // PAD) * PAD
+    y, state = _wide(theta, room), begin(_wide(theta, room))
+    ends = _wide(low, room), _wide(high, room)
+    for _ in range(STEPS):
+        at = moved.set(model, jax.device_put(np.asarray(state.trial)[:p]))
+        linearised = linearise_each(at, sources, huber, tangents, free)
+        factor = _stacked(linearised, sources, size)
+        offset = prior.root @ (np.asarray(state.trial)[:p] - prior.mean)
+        rows = np.concatenate([factor[:, [*free, size]], np.column_stack([prior.root, offset])])
+        trial = state.trial
+        y, state = _advance(solver, y, state, _compressed(rows, room), *ends)
+        if np.array_equal(np.asarray(y), np.asarray(trial)):
+            best = at, linearised, factor, rows
+        if state.outcome == Outcome.nowhere:
+            raise UserError(f"{Outcome[state.outcome]}: start from other parameters")
+        if not bool(state.outcome == Outcome.going):
+            break
+    model, linearised, factor, rows = best
+    _, invisible, scale = visible(rows[:, :-1])
+    white = np.concatenate([lin.white.ravel() for lin in linearised.values()])
+    count = int(np.count_nonzero(white))
+    return model, Solution(
+        state.outcome,
+        _sentence(state),
+        int(state.evaluations),
+        0.5 * float(factor[:, -1] @ factor[:, -1]),
+        count,
+        factor[:, :-1].T @ factor[:, :-1],
+        invisible,
+        scale,
+        float(np.count_nonzero(np.abs(white) > huber)) / max(1, count) if huber else 0.0,
+        linearised,
     )
-    factor = _stacked(linearised, sources, size)
-    rows = sum(int(np.count_nonzero(lin.white)) for lin in linearised.values())
-    information = factor[:, :-1].T @ factor[:, :-1]
-    cost = 0.5 * float(factor[:, -1] @ factor[:, -1])
-    return model, Solution(converged, message, cost, rows, information, invisible, scale, share, linearised)
 
 
-def _mixed(A: np.ndarray, steps: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """The latest step, in the light of those before it: of their affine combinations the one whose own step is
-    shortest, and on from there (Anderson 1965; Walker and Ni 2011).
-    """
-    theta, step = steps[-1]
-    if len(steps) == 1:
-        return step
-    moves, changes = (np.stack(d, axis=1) for d in zip(*((theta - x, step - s) for x, s in steps[:-1]), strict=True))
-    share = np.linalg.lstsq(A @ changes, A @ step, rcond=1e-6)[0]
-    return step - (moves + changes) @ share
+def within(
+    model: Model,
+    free: Int[np.ndarray, " p"],
+    limits: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]] | None = None,
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    """Limits of every free parameter of a fit that starts from the model; no mass falls to nothing."""
+    theta = np.asarray(ravel(model))[free]
+    masses = np.array([q.group == "mass" for q in describe(model)])[free]
+    low, high = limits or (np.full(theta.size, -np.inf), np.full(theta.size, np.inf))
+    return np.where(masses, np.maximum(low, LIGHTEST * theta), low), high
 
 
-def _shorter(start: float, slope: float, end: float) -> float:
-    """The share of a step at which the parabola with this start, slope there and end is least, a tenth to a half
-    (Nocedal and Wright 2006, §3.5); a half where the end is nothing finite.
-    """
-    return float(np.clip(slope / (2.0 * (start + slope - end)), 0.1, 0.5)) if np.isfinite(end) else 0.5
+def _sentence(state: State) -> str:
+    """What a user reads of a search that did not converge; nothing of one that did."""
+    if bool(state.outcome == Outcome.converged) or bool(state.outcome == Outcome.kink):
+        return ""
+    last = f"the last step was {float(state.length * state.size):.2g} standard deviations"
+    if bool(state.outcome == Outcome.going):
+        return f"no end after {STEPS} linearisations; {last}"
+    return f"{Outcome[state.outcome]}; {last}"
+
+
+def _wide(values: np.ndarray, room: int) -> Float[Array, " room"]:
+    return jax.device_put(np.pad(values, (0, room - values.size)))
+
+
+def _compressed(rows: Float[np.ndarray, "N p+1"], room: int) -> Compressed:
+    """Of [J r] on the host, with room for more parameters, which show nowhere."""
+    p = rows.shape[1] - 1
+    T = np.zeros((p + 1, p + 1))
+    small = triangular(rows)
+    T[: len(small)] = small
+    R, d = np.zeros((room, room)), np.zeros(room)
+    R[:p, :p], d[:p] = T[:p, :p], T[:p, p]
+    return Compressed(*jax.device_put((R, d, np.asarray(T[p, p] ** 2))))
+
+
+@eqx.filter_jit
+def _advance(solver: VisibleGaussNewton, y, state: State, here: Compressed, low, high):
+    return solver.advance(y, state, here, low, high)
 
 
 def linearise_each(
-    model: Model, sources: dict[str, Source], weights: Mapping[str, np.ndarray] | None = None
+    model: Model,
+    sources: dict[str, Source],
+    huber: float = 0.0,
+    tangents: Tangents | None = None,
+    free: Int[np.ndarray, " p"] | None = None,
 ) -> dict[str, Linearised]:
-    """Every experiment at the model."""
-    weights = weights or {}
+    """Every experiment at the model; along the tangents of before where it is affine in what is free."""
+    known = tangents or Tangents()
 
     def one(name: str) -> Linearised:
         s = sources[name]
-        seen = s.seen(model)
-        return linearise(seen, Free.at(seen, s.positions), s.batch, s.filters, weights.get(name))
+        return known.at(name, model, s, huber, free is not None and s.linear(model, free))
 
     return dict(zip(sources, side_by_side(one, sources), strict=True))
 
@@ -205,7 +226,7 @@ def missed_each(model: Model, sources: dict[str, Source]) -> dict[str, dict[str,
 
     def one(s: Source):
         seen = s.seen(model)
-        return missed(seen, Free.at(seen, s.positions), s.batch, s.filters)
+        return missed(seen, Free.at(seen, s.positions), s.batch, tuple(s.filters))
 
     return dict(zip(sources, side_by_side(one, sources.values()), strict=True))
 
@@ -214,10 +235,9 @@ def _stacked(linearised: dict[str, Linearised], sources: dict[str, Source], size
     """One triangular factor of all trials, its columns those of the flat vector, then the residual."""
     blocks = []
     for name, lin in linearised.items():
-        factor = np.asarray(lin.factor)
-        block = np.zeros((factor.shape[0] * factor.shape[1], size + 1))
-        block[:, [*sources[name].positions, size]] = factor.reshape(-1, factor.shape[-1])
-        blocks.append(block)
+        block = np.zeros((lin.factor.shape[0] * lin.factor.shape[1], size + 1))
+        block[:, [*sources[name].positions, size]] = lin.factor.reshape(-1, lin.factor.shape[-1])
+        blocks.append(block[np.any(block != 0.0, axis=1)])
     used = np.flatnonzero(np.any(np.concatenate(blocks) != 0, axis=0))
     used = np.union1d(used, [size])
     small = triangular(np.concatenate(blocks)[:, used])
@@ -226,60 +246,23 @@ def _stacked(linearised: dict[str, Linearised], sources: dict[str, Source], size
     return out
 
 
-def triangular(A: np.ndarray) -> np.ndarray:
-    """R of A = Q R."""
-    return np.asarray(np.linalg.qr(A, mode="r"))
-
-
-def visible(A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def visible(A: Float[np.ndarray, "k p"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Basis B of the combinations that data or prior see, the others, and the scale of each parameter."""
-    norm = np.linalg.norm(A, axis=0)
-    scale = 1.0 / np.where(norm > 0, norm, 1.0)
-    _, s, Vt = np.linalg.svd(A * scale, full_matrices=True)
-    s = np.concatenate([s, np.zeros(len(Vt) - len(s))])
-    seen = s > VISIBLE * max(s[0], 1e-300)
-    return scale[:, None] * Vt[seen].T / s[seen], Vt[~seen], scale
+    p = A.shape[1]
+    basis, _, seen, V, scale = map(
+        np.asarray, scaled_directions(np.concatenate([A, np.zeros((max(0, p - len(A)), p))]))
+    )
+    return basis[:, seen], V[:, ~seen].T, scale
 
 
 def bounded(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray | float = np.inf) -> np.ndarray:
-    """argmin ‖A δ + b‖ over low ≤ δ ≤ high, where δ = 0 is allowed: optimistix has no bounds, so the few problems that
-    need them go to scipy.
-    """
-    R = triangular(np.column_stack([A, b]))
-    norm = np.linalg.norm(A, axis=0)
-    scale = 1.0 / np.where(norm > 0, norm, 1.0)
-    bounds = np.minimum(low, 0.0) / scale, np.maximum(high, 0.0) / scale
-    return scale * lsq_linear(R[:, :-1] * scale, -R[:, -1], bounds, method="bvls").x
-
-
-def _compressed(z: Float[Array, " k"], problem: tuple[Array, Array]) -> Float[Array, " rows"]:
-    A, b = problem
-    return A @ z + b
+    """argmin ‖A δ + b‖ over low ≤ δ ≤ high, where δ = 0 is allowed: a step of the solver, by itself."""
+    p = A.shape[1]
+    room = -(-max(p, 1) // PAD) * PAD
+    ends = (_wide(np.broadcast_to(e, p), room) for e in (low, high))
+    return np.asarray(_bounded(_compressed(np.column_stack([A, b]), room), *ends))[:p]
 
 
 @eqx.filter_jit
-def _dogleg(A: Float[Array, "k k"], b: Float[Array, " k"]):
-    solver = optx.Dogleg(rtol=1e-6, atol=1e-6, norm=optx.rms_norm)
-    return optx.least_squares(_compressed, solver, jnp.zeros(A.shape[1]), (A, b), max_steps=64, throw=False).value
-
-
-def _minimise(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """argmin ‖A z + b‖ by optimistix, on the triangular factor, padded to a common size."""
-    k = A.shape[1]
-    R = triangular(np.column_stack([A, b]))[:k]
-    size = -(-max(k, 1) // PAD) * PAD
-    square, right = np.eye(size), np.zeros(size)
-    square[:k, :k], right[:k] = 0.0, 0.0
-    square[: len(R), :k], right[: len(R)] = R[:, :k], R[:, k]
-    return np.asarray(_dogleg(*jax.device_put((square, right))))[:k]
-
-
-def huber_weights(linearised: dict[str, Linearised], limit: float) -> tuple[dict[str, np.ndarray], float]:
-    """Square roots of Huber's weights, and the share of residuals beyond the limit."""
-    beyond = count = 0
-    weights = {}
-    for name, lin in linearised.items():
-        r = np.abs(np.asarray(lin.white))
-        beyond, count = beyond + int((r > limit).sum()), count + int((r > 0).sum())
-        weights[name] = np.sqrt(np.where(r > limit, limit / np.maximum(r, limit), 1.0))
-    return weights, beyond / max(1, count)
+def _bounded(here: Compressed, low: Float[Array, " p"], high: Float[Array, " p"]) -> Float[Array, " p"]:
+    return bounded_step(here, low, high)[0]

@@ -1,10 +1,7 @@
 """The paper's staged identification, ID.2 → ID.3-static → ID.3-dynamic → ID.4.
 
 Each stage is equation (1) with the terms that its experiment makes vanish, and frees the parameters that it shows. The
-parameters of earlier stages stay fixed, and their errors go on: with J_F the whitened Jacobian of a stage's own
-parameters and J_O of the others, whose covariance is Σ_OO,
-
-    K = (J_Fᵀ J_F)⁻¹ J_Fᵀ J_O,   Σ_FF = (J_Fᵀ J_F)⁻¹ + K Σ_OO Kᵀ,   Σ_FO = −K Σ_OO.
+parameters of earlier stages stay fixed, and their errors go on (`propagate`).
 """
 
 from collections.abc import Callable
@@ -15,17 +12,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from jaxfinger.data import Session, joints_of
-from jaxfinger.experiments import Stack, not_judged, prepare
+from jaxfinger.experiments import Experiment, Stack, not_judged, prepare
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible
-from jaxfinger.identify.misfit import growth, pulls, stretches
 from jaxfinger.identify.noise import ORDER, Noise, estimate
-from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
+from jaxfinger.identify.parameters import Parameter, describe, ravel
+from jaxfinger.identify.plausible import implausible
+from jaxfinger.identify.prior import Prior
+from jaxfinger.identify.propagate import propagate
 from jaxfinger.identify.recipe import Recipe
-from jaxfinger.identify.solve import Prior, Solution, Source, solve
+from jaxfinger.identify.solve import ROUGH, Solution, Source, Tangents, solve, within
+from jaxfinger.identify.start import start_values
 from jaxfinger.model import Finger, Model
 
 Progress = Callable[[str], None]
@@ -170,16 +169,18 @@ def identify(
         experiments = dict.fromkeys(e for s in wanted for e in STAGES[s].reads) if stacks is None else ()
         named = {e: [t.name for t in session if t.experiment == e] for e in experiments}
         pending = {e: pool.submit(prepare, session, names) for e, names in named.items()}
-        ready = dict(stacks or {})
+        ready, tangents = dict(stacks or {}), Tangents()
         for name in wanted:
             progress(f"fitting {name}")
             for experiment in STAGES[name].reads.keys() & pending.keys():
                 ready |= pending.pop(experiment).result()
-            fit = run_stage(fit, STAGES[name], ready, session)
+            fit = run_stage(fit, STAGES[name], ready, session, tangents)
     return fit
 
 
-def run_stage(fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session) -> Fit:
+def run_stage(
+    fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session, tangents: Tangents | None = None
+) -> Fit:
     """One stage: noise, estimate, covariance, and what its trials cannot see."""
     recipe = fit.recipe
     if stage.name not in stacks:
@@ -198,30 +199,34 @@ def run_stage(fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session
         report = StageReport(stage.name, "skipped", message="the recipe leaves its terms out of the nominal model")
         return replace(fit, stages=(*fit.stages, report))
     prior = cad_prior(session, recipe, parameters, free)
-
-    model = start_values(fit.model, free, parameters)
-    model, solution, noise = estimate_with_noise(
-        model, free, stacks, reads, fit.noise, parameters, prior, recipe.fit.huber
+    model, solution, sources, noise = estimate_with_noise(
+        fit.model, free, stacks, reads, fit.noise, prior, recipe.fit.huber, tangents
     )
-
-    linked = np.flatnonzero(np.diag(fit.covariance) > 0)
-    sources = sources_of(stacks, reads, noise, parameters)
-    covariance = propagate(fit.covariance, solution, sources, free, linked, prior, recipe.fit.huber)
+    covariance = propagate(fit.covariance, solution, sources, free, prior, recipe.fit.huber)
     warnings = name_invisible(parameters, free, solution.invisible)
     warnings += _unseen(parameters, groups, free, touched)
-    report = StageReport(
-        stage.name,
+    warnings += implausible(model, covariance, free, within(fit.model, free)[0])
+    trials = tuple(t for e in reads for t in stacks[e].trials)
+    report = report_of(stage.name, solution, free, trials, warnings)
+    estimated = np.union1d(fit.estimated, free).astype(int)
+    return replace(
+        fit, model=model, covariance=covariance, estimated=estimated, noise=noise, stages=(*fit.stages, report)
+    )
+
+
+def report_of(
+    name: str, solution: Solution, free: np.ndarray, trials: tuple[str, ...], warnings: list[str], message: str = ""
+) -> StageReport:
+    """What became of a fit; `message` is said where it converged."""
+    return StageReport(
+        name,
         "fitted" if solution.converged else "not converged",
-        solution.message,
-        trials=tuple(t for e in reads for t in stacks[e].trials),
+        solution.message or message,
+        trials=trials,
         rows=solution.rows,
         chi2_per_row=solution.chi2_per_row(free.size),
         outliers=solution.outliers,
         warnings=tuple(warnings),
-    )
-    estimated = np.union1d(fit.estimated, free).astype(int)
-    return replace(
-        fit, model=model, covariance=covariance, estimated=estimated, noise=noise, stages=(*fit.stages, report)
     )
 
 
@@ -244,19 +249,32 @@ def estimate_with_noise(
     stacks: dict[str, Stack],
     reads: dict[str, tuple[str, ...]],
     known: dict[tuple[str, str], Noise],
-    parameters: list[Parameter],
     prior: Prior | None,
     huber: float,
-) -> tuple[Model, Solution, dict[tuple[str, str], Noise]]:
+    tangents: Tangents | None = None,
+) -> tuple[Model, Solution, dict[str, Source], dict[tuple[str, str], Noise]]:
     """Noise from the residuals of a fit with first guesses of it, where it is not known; then the fit under it."""
-    noise = dict(known)
+    tangents, parameters, noise = tangents or Tangents(), describe(model), dict(known)
     unknown = {(e, c): first_noise(stacks[e], c) for e in reads for c in reads[e] if (e, c) not in noise}
+    model = start_values(model, free, parameters, sources_of(stacks, reads, noise | unknown, parameters))
     for _ in range(2 if unknown else 0):
-        model, solution = solve(model, free, sources_of(stacks, reads, noise | unknown, parameters), prior)
+        sources = sources_of(stacks, reads, noise | unknown, parameters)
+        model, solution = solve(model, free, sources, prior, tangents=tangents, small=ROUGH)
         noise |= _noise(solution, stacks, reads)
         unknown = {}
-    model, solution = solve(model, free, sources_of(stacks, reads, noise, parameters), prior, huber)
-    return model, solution, noise
+    sources = sources_of(stacks, reads, noise, parameters)
+    model, solution = solve(model, free, sources, prior, huber, tangents=tangents)
+    again = start_values(model, free, parameters, sources)
+    if again is not model:  # a tendon's friction has slid into its dead zone
+        other, second = solve(again, free, sources, prior, huber, tangents=tangents)
+        if total_cost(other, second, free, prior) < total_cost(model, solution, free, prior):
+            model, solution = other, second
+    return model, solution, sources, noise
+
+
+def total_cost(model: Model, solution: Solution, free: np.ndarray, prior: Prior | None) -> float:
+    """What a fit minimises, the prior included."""
+    return solution.cost + (prior.cost(np.asarray(ravel(model))[free]) if prior else 0.0)
 
 
 def touched_by(reads, session: Session) -> tuple[set[str], set[tuple[str, str]], set[str]]:
@@ -299,67 +317,28 @@ def _noise(solution: Solution, stacks, reads) -> dict[tuple[str, str], Noise]:
     }
 
 
-def sources_of(stacks, reads, noise, parameters) -> dict[str, Source]:
+def sources_of(
+    stacks: dict[str, Stack],
+    reads: dict[str, tuple[str, ...]],
+    noise: dict[tuple[str, str], Noise],
+    parameters: list[Parameter],
+) -> dict[str, Source]:
+    """Every experiment as a fit reads it."""
     out = {}
     for e, channels in reads.items():
         groups = set().union(*(DEPENDS[e, c] for c in channels), {"effects"})
         positions = np.array([i for i, p in enumerate(parameters) if p.group in groups and p.determinable])
+        linear = set.intersection(*(_linear(stacks[e].experiment, c) for c in channels))
+        affine = np.array([i for i in positions if parameters[i].group in linear], dtype=int)
         filters = {c: jax.device_put(noise[e, c].coefficients) for c in channels}
-        out[e] = Source(stacks[e].batch, filters, positions)
+        out[e] = Source(stacks[e].batch, filters, positions, affine=affine)
     return out
 
 
-def start_values(model: Model, free: np.ndarray, parameters: list[Parameter]) -> Model:
-    """A tendon that loses nothing cannot show in which direction its loss would change: start from a plausible one."""
-    flat = np.array(ravel(model))
-    for i in free:
-        if parameters[i].group == "tendon_friction" and flat[i] == 0.0:
-            flat[i] = {"N": 0.2, "1": 0.2}[parameters[i].units]
-    return Free.at(model, free).set(model, jax.device_put(flat[free]))
-
-
-def propagate(covariance, solution: Solution, sources: dict[str, Source], free, linked, prior, huber) -> np.ndarray:
-    """Covariance of the flat vector after a stage (see the module's equation); infinite where nothing is seen.
-
-    Residuals larger than the noise say that the model misses something: intervals then widen with them (Birge's ratio,
-    as the Particle Data Group's scale factor S; Review of Particle Physics, §5.2.2), and by as much more as the
-    residuals pull a parameter to and fro from one stretch of the trials to the next (`misfit`).
+def _linear(experiment: Experiment, channel: str) -> set[str]:
+    """Groups of parameters in which a channel is affine, the others as they are: the sum of (1), where no tendon slips
+    and no drive loses a share of its torque.
     """
-    information = solution.information / max(1.0, solution.chi2_per_row(free.size))
-    scale = solution.scale
-    others = np.setdiff1d(linked, free)
-    N = information[np.ix_(free, free)]
-    if prior is not None:
-        N = N + np.asarray(prior.root).T @ np.asarray(prior.root)
-    scaled = N * np.outer(scale, scale)
-    inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True) * np.outer(scale, scale)
-    root = np.zeros((0, free.size)) if prior is None else np.asarray(prior.root)
-    found = _pulls(solution, sources, len(covariance), huber or np.inf)[:, free]
-    grow = growth(inverse, found / max(1.0, solution.chi2_per_row(free.size)), root)
-    out = covariance.copy()
-    out[free, :] = out[:, free] = 0.0
-    cross = inverse @ information[np.ix_(free, others)]
-    inherited = covariance[np.ix_(others, others)]
-    out[np.ix_(free, free)] = inverse * np.outer(grow, grow) + cross @ inherited @ cross.T
-    out[np.ix_(free, others)] = -cross @ inherited
-    out[np.ix_(others, free)] = out[np.ix_(free, others)].T
-    for combination in solution.invisible:
-        blind = free[np.abs(combination) > 1e-3]
-        out[blind, blind] = np.inf
-    return out
-
-
-def _pulls(solution: Solution, sources: dict[str, Source], size: int, limit: float) -> Float[np.ndarray, "b P"]:
-    """Of every stretch of the trials on the flat vector (`misfit`); outliers pull with the limit."""
-    out = []
-    for name, lin in solution.linearised.items():
-        B, wide, k = lin.jacobian.shape
-        time = np.asarray(sources[name].batch.x.time)
-        time = np.broadcast_to(time[:, None], (B, wide // time.shape[1], time.shape[1])).reshape(B, wide)
-        counts = np.flatnonzero(lin.white)
-        stretch = stretches(np.repeat(np.arange(B), wide)[counts], time.reshape(-1)[counts])
-        r, J = lin.white.reshape(-1)[counts], lin.jacobian.reshape(-1, k)[counts]
-        block = np.zeros((stretch.max(initial=-1) + 1, size))
-        block[:, sources[name].positions] = pulls(np.clip(r, -limit, limit), J, stretch)
-        out.append(block)
-    return np.concatenate(out)
+    if channel == "tendon_excursion":
+        return {"moment_arm"}
+    return {"elastic", "friction", "damping", "friction_by_direction", "rotor_inertia"} if experiment.slack else set()

@@ -12,6 +12,7 @@ import pytest
 from jaxfinger.errors import UserError
 from jaxfinger.identify import compress, fit_many, identify, refit
 from jaxfinger.identify.parameters import ravel
+from jaxfinger.identify.stages import nominal_model
 from jaxfinger.identify.uncertainty import draw_weights
 from jaxfinger.synthetic import measure
 
@@ -49,6 +50,34 @@ def test_members_are_the_fits_of_each_session_alone(members, sessions, staged):
         assert np.abs(difference).max() < 0.5
         assert np.median(np.abs(difference)) < 0.1
         np.testing.assert_allclose(members.std[k][free], alone.std[free], rtol=0.25)
+
+
+def with_bursts(session):
+    """Three newton millimetres too many in every fiftieth sample of a torque, in bursts of five."""
+    rng = np.random.default_rng(0)
+
+    def hit(trial):
+        torque = trial.joint_torque.copy()
+        for first in rng.choice(len(torque) - 5, len(torque) // 250, replace=False):
+            torque[first : first + 5] += 3e-3
+        return replace(trial, joint_torque=torque)
+
+    trials = {t.name: hit(t) if t.experiment == "ID.3-dynamic" else t for t in session}
+    return replace(session, trials=trials)
+
+
+def test_members_are_what_identify_finds_from_the_same_start_outliers_included(sessions, session, staged):
+    """By the same solver on the same rows, with the same weights."""
+    spoilt = with_bursts(sessions[1])
+    members = fit_many([spoilt, sessions[1]], staged, session)
+    own = replace(staged.model, finger=nominal_model(sessions[1], staged.recipe).finger)
+    again, free = replace(staged, model=own, stages=()), staged.estimated
+    for k, member in enumerate((spoilt, sessions[1])):
+        alone = np.asarray(ravel(identify(member, start=again, stages=("ID.2", "ID.3-dynamic", "ID.4")).model))
+        scale = np.maximum(np.abs(alone), staged.std)[free]
+        assert np.abs((members.values[k] - alone)[free] / scale).max() < 1e-8
+    # Bursts that least squares without weights would move by several standard deviations.
+    assert np.abs((members.values[0] - members.values[1])[free] / staged.std[free]).max() < 1.5
 
 
 def test_the_template_itself_comes_back(members, staged):

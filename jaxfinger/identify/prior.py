@@ -1,0 +1,37 @@
+"""What is known before the trials are read: what CAD and scale say, or an earlier fit."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+class Prior(NamedTuple):
+    """Gaussian prior rows `root (θ − mean)` on the free parameters; `root` is a square root of the precision."""
+
+    mean: Float[np.ndarray, " p"]
+    root: Float[np.ndarray, "rows p"]
+
+    @classmethod
+    def none(cls, theta: Float[np.ndarray, " p"]) -> "Prior":
+        """Nothing is known."""
+        return cls(theta, np.zeros((0, theta.size)))
+
+    def cost(self, theta: Float[np.ndarray, " p"]) -> float:
+        """½ ‖root (θ − mean)‖²."""
+        offset = self.root @ (theta - self.mean)
+        return 0.5 * float(offset @ offset)
+
+
+def prior_of(
+    values: Float[np.ndarray, " P"], covariance: Float[np.ndarray, "P P"], free: Int[np.ndarray, " p"]
+) -> Prior:
+    """The whole covariance of an earlier fit of other recordings, where it is finite."""
+    variance = np.diag(covariance)[free]
+    known = np.flatnonzero(np.isfinite(variance) & (variance > 0))
+    std = np.sqrt(variance[known])
+    correlation = covariance[np.ix_(free[known], free[known])] / np.outer(std, std)
+    eigenvalues, vectors = np.linalg.eigh(correlation)
+    root = np.zeros((known.size, free.size))
+    root[:, known] = (vectors / np.sqrt(np.maximum(eigenvalues, 1e-12))).T / std
+    return Prior(values[free], root)

@@ -1,0 +1,215 @@
+"""What holds each parameter where it is: derivatives of estimates by trials, sensors and CAD, without a rerun.
+
+A stage s estimates θ_s where its score, the gradient of what it minimises, is zero: S_s(θ_s, θ_t<s, φ) = 0. By the
+implicit function theorem, whatever φ stands for,
+
+    dθ_s/dφ = −(∂S_s/∂θ_s)⁻¹ (∂S_s/∂φ + Σ_t<s ∂S_s/∂θ_t dθ_t/dφ),
+
+stage after stage, with exact second derivatives: those of the residuals included, and of Huber's cost. The noise model
+is held as it is.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxfinger.compilation import quick_jit
+from jaxfinger.data import Session
+from jaxfinger.errors import UserError
+from jaxfinger.experiments import Batch, Stack, prepare
+from jaxfinger.identify.fit import Fit
+from jaxfinger.identify.gauss_newton import visible
+from jaxfinger.identify.linearise import Filters, huber, white_rows
+from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
+from jaxfinger.identify.resample import plan_of
+from jaxfinger.identify.solve import Source
+from jaxfinger.identify.stages import cad_covariance, cad_prior, sources_of
+from jaxfinger.model import Model
+
+TRIALS, SENSORS, CAD = "trials", "sensors", "cad"
+KINDS = (TRIALS, SENSORS, CAD)
+AT_OPTIMUM = 0.3  # standard deviations that one more step may be long, where a fit is that of the session
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """dθ/dφ of every parameter by every φ of one kind."""
+
+    kind: str  # `trials`: by the weight of each; `sensors`: by each gain, 1 as it is; `cad`: by each value
+    names: tuple[str, ...]
+    values: Float[np.ndarray, "K P"]  # SI units of the parameter, a unit of φ
+    step: Float[np.ndarray, " K"]  # of φ that says something: a trial left out, a gain by 1 %, CAD's standard deviation
+
+    def shifts(self, fit: Fit) -> Float[np.ndarray, "K p"]:
+        """By how many standard deviations each estimated parameter moves with one step; 0 where they are unknown."""
+        std = fit.std[fit.estimated]
+        sure = (std > 0) & np.isfinite(std)
+        moved = self.values[:, fit.estimated] * self.step[:, None]
+        return np.where(sure, moved / np.where(sure, std, 1.0), 0.0)
+
+
+def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> dict[str, Sensitivity]:
+    """Derivatives of the fit's parameters by the weight of each trial, the gain of each sensor, each value of CAD.
+
+    Sensors are those of the joints' torques and of the tendons' forces and excursions. `to`: some of `trials`,
+    `sensors`, `cad`.
+
+    Raises:
+        UserError: the fit was not made from this session.
+    """
+    kinds = (to,) if isinstance(to, str) else tuple(to)
+    if unknown := set(kinds) - set(KINDS):
+        raise UserError(f"sensitivity to {sorted(unknown)}: it takes some of {list(KINDS)}")
+    parameters, plan = describe(fit.model), plan_of(session, fit)
+    stacks = prepare(session, [t.name for t in session if any(t.experiment in reads for reads, _ in plan)])
+    plan = [({e: c for e, c in reads.items() if e in stacks}, free) for reads, free in plan]
+    reads = {e: c for r, _ in plan for e, c in r.items()}
+    if not reads:
+        raise UserError(f"{session.file or 'the session'}: has none of the trials that the fit was made from")
+    sources = sources_of(stacks, reads, fit.noise, parameters)
+    sensors = _sensors(session, stacks, reads) if SENSORS in kinds else {}
+    scores = {e: _score_of(fit, s, [at(e) for at in sensors.values()]) for e, s in sources.items()}
+    given = np.setdiff1d(np.flatnonzero(np.diag(cad_covariance(session, parameters)) > 0), _estimated(plan))
+    cad = np.union1d(given, _with_prior(plan, session, parameters)).astype(int)
+
+    trials = [(e, t) for e in sources for t in stacks[e].trials]
+    P, blocks = len(parameters), {TRIALS: len(trials), SENSORS: len(sensors), CAD: cad.size}
+    moved = np.zeros((P, sum(blocks.values())))
+    last = {k: i for k, i in zip(blocks, np.cumsum(list(blocks.values())), strict=True)}
+    moved[given, last[SENSORS] + np.searchsorted(cad, given)] = 1.0
+    for of_stage, free in plan:
+        H, S, by = np.zeros((P, P)), np.zeros(P), np.zeros((P, moved.shape[1]))
+        for e in of_stage:
+            at, score = sources[e].positions, scores[e]
+            H[np.ix_(at, at)] += score.hessian
+            S[at] += score.by_trial.sum(axis=0)
+            mine = np.array([k for k, (name, _) in enumerate(trials) if name == e])
+            by[np.ix_(at, mine)] += score.by_trial.T
+            by[at, last[TRIALS] : last[SENSORS]] += score.by_sensor.T
+        prior = cad_prior(session, fit.recipe, parameters, free)
+        precision = prior.root.T @ prior.root
+        H[np.ix_(free, free)] += precision
+        S[free] += precision @ (np.asarray(ravel(fit.model))[free] - prior.mean)
+        for k, i in enumerate(free):
+            if precision[k, k] > 0.0:
+                by[free, last[SENSORS] + np.searchsorted(cad, i)] -= precision[:, k]
+        own, others = H[np.ix_(free, free)], np.setdiff1d(np.arange(P), free)
+        basis = _seen(own)
+        _refuse_another(basis.T @ S[free], session)
+        right = by[free] + H[np.ix_(free, others)] @ moved[others]
+        moved[free] = -basis @ np.linalg.solve(basis.T @ own @ basis, basis.T @ right)
+    names = {TRIALS: [t for _, t in trials], SENSORS: list(sensors), CAD: [parameters[i].name for i in cad]}
+    std = np.sqrt(np.diag(cad_covariance(session, parameters)))
+    steps = {TRIALS: -np.ones(len(trials)), SENSORS: np.full(len(sensors), 0.01), CAD: std[cad]}
+    return {
+        k: Sensitivity(k, tuple(names[k]), moved[:, last[k] - blocks[k] : last[k]].T, steps[k])
+        for k in KINDS
+        if k in kinds
+    }
+
+
+def _seen(hessian: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p k"]:
+    """The combinations of the parameters that a stage sees, a column each."""
+    values, vectors = np.linalg.eigh(_scaled(hessian))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    basis, _, seen, *_ = visible(root.T * np.sqrt(np.abs(np.diag(hessian))))
+    return basis[:, seen]
+
+
+def _scaled(H: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+    size = np.sqrt(np.abs(np.diag(H)))
+    size = np.where(size > 0.0, size, 1.0)
+    return H / np.outer(size, size)
+
+
+def _refuse_another(step: Float[np.ndarray, " k"], session: Session) -> None:
+    if not np.all(np.abs(step) < AT_OPTIMUM):
+        raise UserError(
+            f"{session.file or 'the session'}: the fit is not the optimum of these trials, which would move it by "
+            f"{np.abs(step).max():.2g} standard deviations; give the session that it was made from, or fit that again"
+        )
+
+
+def _estimated(plan) -> np.ndarray:
+    return np.unique(np.concatenate([np.zeros(0, int), *(free for _, free in plan)]))
+
+
+def _with_prior(plan, session: Session, parameters: list[Parameter]) -> np.ndarray:
+    cad = np.diag(cad_covariance(session, parameters)) > 0
+    return np.array([i for i in _estimated(plan) if cad[i]], dtype=int)
+
+
+def _sensors(session: Session, stacks: dict[str, Stack], reads) -> dict[str, Callable[[str], Batch]]:
+    """By name, what the data of an experiment change by when a sensor's gain does, per unit of gain."""
+    finger, out = session.finger, {}
+    for i, joint in enumerate(finger.joint_names):
+        out[f"torque {joint}"] = lambda e, i=i: _gain(stacks[e].batch, "joint_torque", i)
+    for k, tendon in enumerate(finger.tendon_names):
+        if finger.active[k]:
+            out[f"tension {tendon}"] = lambda e, k=k: _gain(stacks[e].batch, "tension", k)
+            out[f"excursion {tendon}"] = lambda e, k=k: _gain(stacks[e].batch, "tendon_excursion", k)
+    return {name: at for name, at in out.items() if any(_moves(at(e)) for e in reads)}
+
+
+def _gain(batch: Batch, what: str, column: int) -> Batch:
+    """The batch's derivative by one gain."""
+
+    def only(a):
+        values = np.zeros_like(a)
+        values[column] = np.asarray(a)[column]
+        return jnp.asarray(values)
+
+    none = jax.tree.map(jnp.zeros_like, batch)
+    if what == "tension":
+        return eqx.tree_at(lambda b: b.x.tension, none, only(batch.x.tension))
+    return none if what not in batch.y else eqx.tree_at(lambda b: b.y[what], none, only(batch.y[what]))
+
+
+def _moves(change: Batch) -> bool:
+    return any(np.any(np.asarray(a)) for a in jax.tree.leaves(change))
+
+
+class Score(eqx.Module):
+    """One experiment's part of the gradient of the cost, by the parameters that it depends on."""
+
+    by_trial: Float[Array, "B k"]
+    hessian: Float[Array, "k k"]
+    by_sensor: Float[Array, "K k"]  # its derivative by every gain
+
+
+def _score_of(fit: Fit, source: Source, changes: list[Batch]) -> Score:
+    free = Free.at(fit.model, source.positions)
+    limit = jnp.asarray(fit.recipe.fit.huber)
+    B = source.batch.x.time.shape[0]
+    nothing = jax.tree.map(lambda a: np.zeros((0, *a.shape)), source.batch)
+    stacked = jax.tree.map(lambda *a: np.stack(a), *changes) if changes else nothing
+    return jax.tree.map(np.asarray, _score(fit.model, free, source.batch, source.filters, limit, stacked, B))
+
+
+@quick_jit
+def _score(model: Model, free: Free, batch: Batch, filters: Filters, limit, changes: Batch, B: int) -> Score:
+    theta = free.get(model)
+
+    def cost(theta, data: Batch, weights):
+        rows = huber(white_rows(free.set(model, theta), data, filters)[1], limit)
+        return 0.5 * jnp.sum(weights[:, None] * rows**2)
+
+    whole, gradient = jnp.ones(B), jax.grad(cost)
+    # The transpose of the gradient's derivative by the weights: one trial's gradient after another.
+    by_trial = jax.lax.map(lambda w: jax.jvp(lambda v: gradient(theta, batch, v), (whole,), (w,))[1], jnp.eye(B))
+    hessian = jax.lax.map(
+        lambda v: jax.jvp(lambda t: gradient(t, batch, whole), (theta,), (v,))[1], jnp.eye(theta.size)
+    )
+
+    def moved(tension, y):
+        return gradient(theta, eqx.tree_at(lambda b: (b.x.tension, b.y), batch, (tension, y)), whole)
+
+    # Angles stay out of it: powers of an angle that is zero have no derivative of their own.
+    data = batch.x.tension, batch.y
+    by_sensor = jax.lax.map(lambda c: jax.jvp(moved, data, (c.x.tension, c.y))[1], changes)
+    return Score(by_trial, hessian, by_sensor)

@@ -1,0 +1,81 @@
+"""Where a fit starts, from the data: tendon friction, the one law of (1) that has a dead zone.
+
+The loss max(a₀ + a₁ f, 0) says nothing of a₀ and a₁ where it is zero at every tension, so a search can neither start
+there nor lead out of it. A few plausible losses, as shares of the highest tension that the trials show, are tried on
+every tendon's own trials; the best of them is the start.
+"""
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxfinger.identify.linearise import white_of
+from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
+from jaxfinger.identify.solve import Source, missed_each
+from jaxfinger.model import Model
+
+# a₀ over the highest tension, and a₁: a tenth to a half of the tension lost, in all the forms that the law can have.
+# The first is taken where no trial prefers another.
+PLAUSIBLE = ((0.0, 0.1), (0.0, 0.3), (0.0, 0.03), (0.1, 0.1), (0.1, 0.0), (0.03, 0.0), (-0.1, 0.5))
+
+
+def start_values(
+    model: Model, free: np.ndarray, parameters: list[Parameter], sources: dict[str, Source] | None = None
+) -> Model:
+    """The model, with a loss that the trials prefer for every tendon whose friction is free and in its dead zone."""
+    pulled = {e: s for e, s in (sources or {}).items() if _shows_friction(s, parameters)}
+    highest = _highest(model, pulled)
+    dead = [k for k in _free_tendons(model, free, parameters) if _is_dead(model, k, highest[k])]
+    if not dead:
+        return model
+    tried = [_with_losses(model, dead, highest, shares) for shares in PLAUSIBLE]
+    if not pulled:
+        return tried[0]
+    costs = np.stack([_costs(m, pulled, dead) for m in tried])
+    best = {k: PLAUSIBLE[int(np.argmin(costs[:, j]))] for j, k in enumerate(dead)}
+    for k, shares in best.items():
+        model = _with_losses(model, [k], highest, shares)
+    return model
+
+
+def _shows_friction(source: Source, parameters: list[Parameter]) -> bool:
+    return any(parameters[i].group == "tendon_friction" for i in source.positions)
+
+
+def _free_tendons(model: Model, free: np.ndarray, parameters: list[Parameter]) -> list[int]:
+    names = {parameters[i].tendon for i in free if parameters[i].group == "tendon_friction"}
+    return [k for k, name in enumerate(model.finger.tendon_names) if name in names]
+
+
+def _highest(model: Model, sources: dict[str, Source]) -> Float[np.ndarray, " n"]:
+    """Highest tension of every tendon in these trials, N; none where nothing pulls it."""
+    none = np.zeros(model.finger.n)
+    return np.max([none, *(np.asarray(s.batch.x.tension).max(axis=(1, 2)) for s in sources.values())], axis=0)
+
+
+def _is_dead(model: Model, k: int, highest: float) -> bool:
+    """Whether the tendon loses nothing at any tension up to the highest."""
+    a0, a1 = float(model.tendon_friction.constant[k]), float(model.tendon_friction.proportional[k])
+    return a0 <= 0.0 and a0 + a1 * (highest or 1.0) <= 0.0
+
+
+def _with_losses(model: Model, tendons: list[int], highest: np.ndarray, shares: tuple[float, float]) -> Model:
+    flat, names = np.array(ravel(model)), [model.finger.tendon_names[k] for k in tendons]
+    positions = [i for i, p in enumerate(describe(model)) if p.group == "tendon_friction" and p.tendon in names]
+    for i in positions:
+        p = describe(model)[i]
+        constant = p.name.endswith("a0")
+        flat[i] = shares[0] * highest[model.finger.tendon_names.index(p.tendon)] if constant else shares[1]
+    at = np.array(positions)
+    return Free.at(model, at).set(model, jax.device_put(flat[at]))
+
+
+def _costs(model: Model, sources: dict[str, Source], tendons: list[int]) -> Float[np.ndarray, " k"]:
+    """½ ‖white residuals‖² of the trials that pull each tendon."""
+    out = np.zeros(len(tendons))
+    for e, residuals in missed_each(model, sources).items():
+        s = sources[e]
+        cost = 0.5 * np.sum(white_of(residuals, s.batch, s.filters) ** 2, axis=1)
+        pulls = np.asarray(s.batch.x.tension).max(axis=2) > 0.0  # (n, B)
+        out += np.array([cost[pulls[k]].sum() for k in tendons])
+    return out
