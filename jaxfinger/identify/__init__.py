@@ -11,6 +11,7 @@ from jaxfinger.identify.joint import refine
 from jaxfinger.identify.posterior import posterior
 from jaxfinger.identify.recipe import Recipe, read_recipe
 from jaxfinger.identify.resample import compress, refit
+from jaxfinger.identify.sensitivity import Sensitivity, sensitivity
 from jaxfinger.identify.stages import STAGES, identify
 from jaxfinger.identify.uncertainty import bootstrap, identifiability, robust, sandwich
 
@@ -19,6 +20,7 @@ __all__ = [
     "Fit",
     "Members",
     "Recipe",
+    "Sensitivity",
     "StageReport",
     "base_parameters",
     "bootstrap",
@@ -34,6 +36,7 @@ __all__ = [
     "robust",
     "sandwich",
     "save_fit",
+    "sensitivity",
 ]
 
 

@@ -1,0 +1,73 @@
+"""`jaxfinger influence`: what holds each parameter of a fit where it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from jaxfinger.cli.output import print_json, progress, refuse_existing, table
+
+SHOWN = 3  # of each kind, the strongest
+STEPS = {"trials": "left out", "sensors": "gain + 1 %", "cad": "+ 1 standard deviation"}
+
+
+def influence(
+    fit: Path, file: Path, *, figure: Path | None = None, json: bool = False, overwrite: bool = False
+) -> None:
+    """Say which trials, sensors and CAD values hold each parameter where it is.
+
+    A derivative, not a rerun: by how many of its standard deviations a parameter moves when a trial is left out, a
+    sensor reads one per cent more, or a value of CAD is one standard deviation larger.
+
+    Parameters
+    ----------
+    fit
+        Fit (JSON).
+    file
+        The session (HDF5) that it was made from.
+    figure
+        Picture to write (.svg or .png): parameters against trials, sensors and CAD values.
+    json
+        Print every derivative as JSON.
+    overwrite
+        Replace a figure that is already there.
+    """
+    if figure is not None:
+        refuse_existing(figure, overwrite)
+    from jaxfinger.data import read_session
+    from jaxfinger.identify import load_fit
+    from jaxfinger.identify.parameters import describe
+    from jaxfinger.identify.sensitivity import sensitivity
+
+    with progress("influence") as say:
+        say("reading the files")
+        loaded, session = load_fit(fit), read_session(file)
+        say("differentiating the fit")
+        found = sensitivity(loaded, session)
+        names = [describe(loaded.model)[i].name for i in loaded.estimated]
+        if figure is not None:
+            from jaxfinger.report.influence import draw_influence
+
+            draw_influence(names, {k: (s.names, s.shifts(loaded)) for k, s in found.items()}, figure, overwrite)
+    if json:
+        print_json(
+            {
+                kind: {
+                    "step": STEPS[kind],
+                    "of": list(s.names),
+                    "parameters": names,
+                    "shift_in_std": s.shifts(loaded).tolist(),
+                    "derivative_si": s.values[:, loaded.estimated].tolist(),
+                }
+                for kind, s in found.items()
+            }
+        )
+        return
+    for kind, s in found.items():
+        shifts = s.shifts(loaded)
+        rows = []
+        for j, name in enumerate(names):
+            strongest = sorted(range(len(s.names)), key=lambda k, j=j: -abs(shifts[k, j]))[:SHOWN]
+            rows.append((name, ", ".join(f"{s.names[k]} {shifts[k, j]:+.2f}" for k in strongest if shifts[k, j])))
+        table(
+            f"By {kind}, {STEPS[kind]}: standard deviations that each parameter moves", ("parameter", ""), rows, left=2
+        )
