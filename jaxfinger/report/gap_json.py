@@ -31,7 +31,7 @@ def as_gap_json(d: Diagnosis) -> dict:
             {
                 "effect": c.effect,
                 "site": _sites(c),
-                "probability": c.probability,
+                "probability": _chance(c.probability),
                 "share": c.share,
                 "share_ci95": list(c.share_ci95),
                 "channels": {f"{k.experiment}/{k.name}": share for k, share in c.channels.items()},
@@ -73,14 +73,14 @@ def as_gap_json(d: Diagnosis) -> dict:
         "candidates": [
             _key(c.key)
             | {
-                "probability": c.probability,
+                "probability": _chance(c.probability),
                 "parameters": _parameters(c.values, (c.key.site,)),
                 "held_out_gain": c.held_out,
             }
             for c in d.candidates
         ],
-        "none": d.none,
-        "unlisted": d.unlisted,
+        "none": _chance(d.none),
+        "unlisted": _chance(d.unlisted),
         "ambiguous_sets": [[_key(k) for k in members] for members in d.ambiguous_sets],
         "next_experiment": None
         if step is None
@@ -122,6 +122,11 @@ def write(d: Diagnosis, folder: str | Path, overwrite: bool = False) -> None:
         part.write_text(text(d), encoding="utf-8")
     save_fit(d.nominal, folder / "nominal.json", overwrite)
     save_fit(d.augmented, folder / "augmented.json", overwrite)
+
+
+def _chance(probability: float) -> float:
+    """A sum of weights within 0 and 1, which rounding may leave by a hair."""
+    return min(max(probability, 0.0), 1.0)
 
 
 def _key(key: Key) -> dict:

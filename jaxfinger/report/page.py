@@ -36,6 +36,7 @@ NARROW, WIDE = 3.35, 7.4  # inches: a phone of 360 px with its margins, and a re
 WORTH_A_LINE = 0.01  # probability of a further cause below which nobody wants to read of it
 WORTH_A_PLACE = 0.02  # share of the gap, likewise
 CHANGES = 8  # parameters at most, the plainest, of which the page says that they have changed
+BEYOND = 1e5  # in SI units: a torque, length, mass or gain that no machine has whose trials are diagnosed
 LARGEST = 24  # parameters in the picture of intervals: those known worst, beside all of the causes
 VARIABLES = {"q": "rad", "qd": "rad/s", "tendon_force": "N", "time": "s"}
 
@@ -280,9 +281,15 @@ def _absorbed(found: Sequence[Absorbed]) -> list[str]:
         hidden: dict[tuple[str, str], float] = {}
         for v in (v for x in some for v in x.hidden if math.isfinite(v.std)):
             hidden[v.name, v.units] = max(hidden.get((v.name, v.units), 0.0), HALF_95 * v.std)
-        much = "".join(f", up to {quantity(half, units)} of {name}" for (name, units), half in hidden.items())
+        much = "".join(f", {_at_most(half, units)} of {name}" for (name, units), half in hidden.items())
         lines.append(f"{sentences.effect_name(effect)} at {sentences.site_names([x.key.site for x in some])}{much}")
     return lines
+
+
+def _at_most(half: float, units: str) -> str:
+    """How much could hide; more than half a turn, or than any machine has, is as much as one likes."""
+    without_end = half > math.pi if units == "rad" else half > BEYOND
+    return "any amount" if without_end else f"up to {quantity(half, units)}"
 
 
 def _noise(d: Diagnosis, prismatic: tuple[bool, ...]) -> list[dict]:

@@ -1,6 +1,7 @@
 """`gap.json` is to the letter, and its numbers say what its words say."""
 
 import json
+from dataclasses import replace
 
 import jsonschema
 import pytest
@@ -35,6 +36,12 @@ def test_numbers_and_words_agree(name):
     if status in ("partly", "unexplained"):
         assert gap["unlisted"] >= 0.5 or gap["ambiguous_sets"]
         assert gap["unexplained"]["share"] > 0.1
+
+
+def test_a_probability_that_rounding_lifts_over_one_is_one():
+    d = explained()
+    d = replace(d, none=-1e-15, candidates=(replace(d.candidates[0], probability=1.0 + 1e-14), *d.candidates[1:]))
+    jsonschema.validate(json.loads(text(d)), SCHEMA)
 
 
 def test_one_cause_at_many_sites_is_one_line_and_every_site_is_named():

@@ -7,7 +7,7 @@ from itertools import product
 import pytest
 
 from jaxfinger.effects import CATALOGUE
-from jaxfinger.gap.result import Key
+from jaxfinger.gap.result import Key, Value
 from jaxfinger.report.page import render
 
 from .fabricated import STRETCHES, every, explained, trace
@@ -146,6 +146,14 @@ def test_a_cause_says_what_to_do(monkeypatch):
         assert text in card.split(f"<dt>{head}</dt>")[1].split("</dd>")[0]
     assert "The law" in card
     assert "compliance: 91.0 ± 5.9 µm/N" in card
+
+
+def test_what_could_hide_without_end_is_no_number():
+    d = explained()
+    (absorbed,) = d.absorbed
+    hidden = (Value(("base",), "x", 0.0, 9e10, "rad"), Value(("base",), "y", 0.0, 0.005, "rad"))
+    page = render(replace(d, absorbed=(replace(absorbed, key=Key("gravity_tilt", ("base",)), hidden=hidden),)))
+    assert "gravity tilt at base, any amount of x, up to 0.56° of y" in page
 
 
 def test_names_of_a_user_are_text_and_no_markup():
