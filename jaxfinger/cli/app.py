@@ -9,7 +9,7 @@ app = App(
 )
 
 COMMANDS = {
-    "demo": ("demo:demo", "Identify and validate the shipped session, and compare it with the paper."),
+    "demo": ("demo:demo", "The whole story on a shipped session whose answer is known."),
     "new": ("new:new", "Write a finger and a mapping to fill in, for recordings of your own."),
     "check": ("files:check", "Say what is wrong with a session file."),
     "identify": ("model:identify", "The complete dynamic model of a session, with error bars."),
