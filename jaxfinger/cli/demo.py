@@ -15,11 +15,11 @@ from jaxfinger.errors import UserError
 if TYPE_CHECKING:
     from jaxfinger.identify.validate import Validation
 
-BEFORE = """This finger is simulated, on a plant that shares no code with the model that is fitted (MuJoCo's rigid body and dry
-friction). Two things are the matter with it that the nominal model does not know. What they are is said at the end.
+BEFORE = """This finger is simulated, on a plant that shares no code with the model that is fitted (MuJoCo's rigid body
+and dry friction). Two things are the matter with it that the nominal model does not know; what, is said at the end.
 """
-ANSWER = """What is in fact the matter: tendon T3 stretches by 60 µm/N, and the friction of the MCP joint is 0.9 higher at rest
-than in motion, falling over 0.35 rad/s (Stribeck; datasets/demo-finger)."""
+ANSWER = """What is in fact the matter: tendon T3 stretches by 60 µm/N, and the friction of the MCP joint is 1.9 times as
+high at rest as in motion, falling over 0.35 rad/s (Stribeck; datasets/demo-finger)."""
 NEXT = """Next: open the page; the same for your own finger is
   jaxfinger look LOG                          what a recording holds, and mapping lines for it
   jaxfinger new finger.toml mapping.toml      templates to fill in
@@ -30,8 +30,8 @@ NEXT = """Next: open the page; the same for your own finger is
 def demo(
     *, output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("demo"), overwrite: bool = False
 ) -> None:
-    """The whole story on a shipped session, which is simulated, and whose answer is known: identify the finger, diagnose
-    what the model misses, and see how far that closes on trials that no fit has seen.
+    """The whole story on a shipped session, which is simulated, and whose answer is known: identify the finger,
+    diagnose what the model misses, and see how far that closes on trials that no fit has seen.
 
     Parameters
     ----------
