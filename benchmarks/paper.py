@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxfinger.cli.output import table, with_error
+from jaxfinger.cli.output import table
 from jaxfinger.data import read_session
 from jaxfinger.identify import identify
 from jaxfinger.identify.validate import validate
+from jaxfinger.report.numbers import with_error
 
 SESSION = Path(__file__).parents[1] / "datasets" / "paper-finger" / "session.h5"
 # Li et al. 2024, Table I: largest and smallest moment arm in mm.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import console, number, progress, refuse_existing, table
+from jaxfinger.cli.output import console, plain, progress, refuse_existing, table
 from jaxfinger.errors import UserError
 
 if TYPE_CHECKING:
@@ -50,9 +50,9 @@ def demo(
     from jaxfinger.gap import diagnose
     from jaxfinger.identify import identify
     from jaxfinger.identify.validate import validate
-    from jaxfinger.report import sentences
     from jaxfinger.report.gap_json import write
     from jaxfinger.report.page import write_page
+    from jaxfinger.report.screen import summary
 
     print(BEFORE)
     with progress("demo") as say:
@@ -67,8 +67,7 @@ def demo(
         write_page(found, output / "report.html", overwrite)
         say("predicting fresh trials")
         before, after = (validate(f, fresh) for f in (found.nominal, found.augmented))
-    out = console()
-    out.print(f"{sentences.headline(found)}\n{sentences.summary(found)}\n", markup=False, soft_wrap=True)
+    console().print(plain(summary(found)) + "\n", markup=False, soft_wrap=True)
     table(
         "Fresh trials that no fit has seen: rms error",
         ("", "noise", "nominal model", "with the causes", ""),
@@ -92,6 +91,8 @@ def shipped(name: str) -> Path:
 
 def closing(before: Validation, after: Validation) -> list[tuple[str, ...]]:
     """A row an experiment and channel: noise and rms of both models, over all columns."""
+    from jaxfinger.report.numbers import number
+
     rows: dict[tuple[str, ...], list[tuple[float, float, float]]] = defaultdict(list)
     for a, b in zip(before.scores, after.scores, strict=True):
         rows[a.experiment, a.channel, a.method, a.units].append((a.noise or np.nan, a.rms, b.rms))
