@@ -66,7 +66,8 @@ def turned_on_time(
     out = sure.copy()
     for direction, column, least in zip(out.T, x.T, way, strict=True):
         turns = np.flatnonzero((np.diff(direction) != 0) & (direction[:-1] != 0)) + 1
-        for last, turn, end in zip([0, *turns[:-1]], turns, [*turns[1:], len(direction)], strict=True):
+        edges = [0, *turns, len(direction)]
+        for last, turn, end in zip(edges, edges[1:], edges[2:], strict=False):
             new = direction[turn]
             began = last + int(np.argmin(new * column[last : turn + 1]))
             stroke = new * (column[began : turn + int(np.argmax(new * column[turn:end])) + 1] - column[began])

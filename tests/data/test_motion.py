@@ -36,3 +36,9 @@ def test_derived_holds_lie_inside_the_true_ones(session):
             # The rest before the first hold belongs to it.
             assert np.mean(inside == index) > 0.9 or (index == 0 and set(inside) == {-1, 0})
     assert (find_holds(session["07-VD.3"]) == -1).all()
+
+
+def test_a_column_that_never_turns_keeps_its_direction():
+    x = np.linspace(0.0, 1.0, 50)[:, None] * [1.0, 0.0]
+    sure = np.tile([1.0, 0.0], (50, 1))
+    np.testing.assert_array_equal(turned_on_time(sure, x, np.array([0.01, 0.01])), sure)
