@@ -32,11 +32,11 @@ class Parameters:
     floor: float = 2.0  # v_c that noise alone may leave, since its colour is known from a few repeats
     form: float = 0.02  # ρ²: share of what causes explain in a column that the forms of their laws may miss
     looks: float = 25.0  # ν: independent looks outside of the features
-    worse: float = 1.0  # times as much that unknown costs which a column has with causes, and has not without
+    worse: float = 0.0  # times as much that unknown costs which a column has with causes, and has not without
     prior: float = 6.0  # log evidence that a cause must bring,
     alike: float = 0.07  # and as a share of what the nominal model leaves unexplained: what an imitator gains of it
     trust: float = 1.0  # β: of all log evidence, since neighbouring features and columns are no independent looks
-    open: float = 8.0  # log evidence left, from which on something unlisted is as likely as not,
+    open: float = 12.0  # log evidence left, from which on something unlisted is as likely as not,
     left: float = 0.12  # and as a share of what the causes take away: forms leave some of it
     sharp: float = 0.4  # and how fast that grows
 
