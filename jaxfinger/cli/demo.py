@@ -93,12 +93,16 @@ def closing(before: Validation, after: Validation) -> list[tuple[str, ...]]:
     """A row an experiment and channel: noise and rms of both models, over all columns."""
     from jaxfinger.report.numbers import number
 
-    rows: dict[tuple[str, ...], list[tuple[float, float, float]]] = defaultdict(list)
+    rows: dict[tuple[str, ...], list[tuple[float | None, float, float]]] = defaultdict(list)
     for a, b in zip(before.scores, after.scores, strict=True):
-        rows[a.experiment, a.channel, a.method, a.units].append((a.noise or np.nan, a.rms, b.rms))
+        rows[a.experiment, a.channel, a.method, a.units].append((a.noise, a.rms, b.rms))
     out = []
     for (experiment, channel, method, units), values in rows.items():
-        noise, first, second = np.sqrt(np.nanmean(np.square(values), axis=0))
         what = f"{experiment} {channel}" + (f", {method}" if method else "")
-        out.append((what, number(noise), number(first), number(second), units))
+        cells = [number(_rms([x for x in column if x is not None])) for column in zip(*values, strict=True)]
+        out.append((what, *cells, units))
     return out
+
+
+def _rms(values: list[float]) -> float | None:
+    return float(np.sqrt(np.mean(np.square(values)))) if values else None

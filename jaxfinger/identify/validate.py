@@ -332,6 +332,8 @@ def _simulation_scores(model: Model, session: Session, names: list[str]) -> tupl
         encoder = float(np.sqrt(np.mean([_encoder(session[name], k) ** 2 for name in stack.trials])))
         method = "simulated forward from the first sample"
         noise = (float(np.hypot(encoder, through[k])), "sensors' noise in start, tension and reading")
+        if not noise[0] < np.ptp(session.finger.limits[k]):
+            noise = None, "none: the sensors' noise alone makes the simulation diverge"
         scores.append(_make(session, "VD.3", "q", k, column, *found, noise, method))
     return scores, _divergence(session, paths)
 
