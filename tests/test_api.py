@@ -2,11 +2,14 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import jaxfinger as jf
 from jaxfinger.table import Table
+
+DEMO = Path(__file__).parents[1] / "datasets" / "demo-finger" / "session.h5"
 
 
 def test_every_name_of_the_package_is_there_and_nothing_loads_jax_before_it_is_needed():
@@ -26,3 +29,15 @@ def test_a_table_prints_and_says_which_columns_there_are():
     assert rows.column("std") == [None, 0.5]
     with pytest.raises(KeyError, match=r"no column 'sd'; there are name, value, std"):
         rows.column("sd")
+
+
+def test_a_session_shows_itself_in_a_line_and_says_which_trials_there_are():
+    session = jf.read(DEMO)
+    assert repr(session).startswith("Session('demo finger': 3 joints, 5 tendons; ")
+    assert len(repr(session)) < 200
+    trial = next(iter(session))
+    assert repr(trial).startswith(f"Trial({trial.name!r}: ID.2")
+    assert session.table().column("trial") == list(session.trials)
+    assert "<table>" in session._repr_html_()
+    with pytest.raises(KeyError, match=f"no trial 'x'; there are {trial.name}"):
+        session["x"]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from html import escape
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from jaxfinger.table import Table
 
 _MOVED = 0.1  # of the way of the joint that moves most: another that goes less far is held
 EXPERIMENTS = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4", "VD.1", "VD.2", "VD.3")
@@ -59,7 +63,7 @@ class FingerDescription:
         return len(self.tendon_names)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trial:
     """`/trials/<name>`: one recording of N samples. Channels that the trial did not measure are None; columns NaN.
 
@@ -95,13 +99,17 @@ class Trial:
         torque = self.joint_torque
         return tuple(name for i, name in enumerate(finger.joint_names) if not np.isnan(torque[:, i]).all())
 
+    def __repr__(self) -> str:
+        where = ", ".join(x for x in (self.experiment, self.joint, self.tendon) if x)
+        return f"Trial({self.name!r}: {where}; {len(self.time)} samples, {self.duration:.3g} s)"
+
     @property
     def duration(self) -> float:
         """Length of the recording in s."""
         return float(self.time[-1] - self.time[0]) if len(self.time) else 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Session:
     """One specimen, its finger, and its trials by name (in the order of the session)."""
 
@@ -119,7 +127,31 @@ class Session:
         return len(self.trials)
 
     def __getitem__(self, name: str) -> Trial:
+        if name not in self.trials:
+            raise KeyError(f"no trial {name!r}; there are {', '.join(self.trials) or 'none'}")
         return self.trials[name]
+
+    def table(self) -> Table:
+        """One row a trial: name, experiment, joint, tendon, samples, duration in s."""
+        return Table(
+            {
+                "trial": t.name,
+                "experiment": t.experiment,
+                "joint": t.joint,
+                "tendon": t.tendon,
+                "samples": len(t.time),
+                "duration": t.duration,
+            }
+            for t in self
+        )
+
+    def __repr__(self) -> str:
+        counts = Counter(t.experiment for t in self)
+        trials = ", ".join(f"{k} {e}" for e, k in counts.items()) or "no trials"
+        return f"Session({self.specimen!r}: {self.finger.m} joints, {self.finger.n} tendons; {trials})"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(repr(self))}</p>{self.table()._repr_html_()}"
 
     def select(
         self, *experiments: str, joint: str | None = None, tendon: str | None = None, complete: bool | None = None

@@ -228,7 +228,7 @@ class NextExperiment:
     separates: tuple[str, ...]  # ids of effects
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Diagnosis:
     """Everything that a report shows."""
 
@@ -257,3 +257,7 @@ class Diagnosis:
     nominal: Fit
     augmented: Fit  # the nominal one where nothing is named
     problem: Problem  # the recordings and residuals, for figures
+
+    def __repr__(self) -> str:
+        named = ", ".join(f"{k.effect} at {'-'.join(k.site)}" for k in self.named) or "nothing named"
+        return f"Diagnosis({self.data!r}: {self.status}; {named})"

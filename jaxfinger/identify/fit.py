@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from html import escape
 from importlib.metadata import version
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.identify.recipe import Recipe
 from jaxfinger.model import Effect, Model
+from jaxfinger.table import Table
 
 SCHEMA = "jaxfinger-fit/2"
 
@@ -30,7 +32,7 @@ class StageReport:
     warnings: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Fit:
     """A model with the covariance of its flat vector of parameters (see `parameters`), and what made it."""
 
@@ -76,10 +78,17 @@ class Fit:
         covariance[:old, :old] = self.covariance
         return replace(self, model=model, covariance=covariance, estimated=np.append(self.estimated, added).astype(int))
 
-    def table(self) -> list[dict]:
-        """One row an estimated parameter: name, value, std, units."""
+    def __repr__(self) -> str:
+        stages = ", ".join(f"{s.name} {s.status}" for s in self.stages) or "nothing estimated"
+        return f"Fit({self.specimen!r}, recipe {self.recipe.name!r}: {len(self.estimated)} parameters; {stages})"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(repr(self))}</p>{self.table()._repr_html_()}"
+
+    def table(self) -> Table:
+        """One row an estimated parameter: name, group, value, std (None where the trials do not see it), units (SI)."""
         values, std, parameters = np.asarray(ravel(self.model)), self.std, describe(self.model)
-        return [
+        return Table(
             {
                 "name": parameters[i].name,
                 "group": parameters[i].group,
@@ -88,7 +97,7 @@ class Fit:
                 "units": parameters[i].units,
             }
             for i in self.estimated
-        ]
+        )
 
     def function(self, f) -> tuple[np.ndarray, np.ndarray]:
         """Value and standard deviation of any function of the model, by the delta method.
