@@ -12,7 +12,7 @@ Names are imported when they are first used, so that nothing loads JAX before it
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from jaxfinger.data import Session as Session
