@@ -1,5 +1,6 @@
 """Pages that follow from the code, written while the site is built: commands, causes, drawings of the experiments."""
 
+import inspect
 import io
 
 import matplotlib
@@ -73,4 +74,10 @@ with mkdocs_gen_files.open("commands.md", "w") as file:
 with mkdocs_gen_files.open("causes.md", "w") as file:
     file.write("# The catalogue of causes\n\nWhat the nominal model leaves out, as `jaxfinger effects` prints it.\n")
     for effect in (CATALOGUE | NOMINAL_TERMS).values():
-        file.write(f"\n## `{effect.ID}`\n\nAt a {effect.PLACE.replace('_', ' ')}. {effect.__doc__}\n")
+        file.write(f"\n## `{effect.ID}`\n\nAt a {effect.PLACE.replace('_', ' ')}. {inspect.getdoc(effect)}\n\n")
+        for title, text in (
+            ("What happens", effect.HAPPENS),
+            ("What it looks like", effect.LOOKS),
+            ("What to change", effect.CHANGE),
+        ):
+            file.write(f"- **{title}.** {text}\n")
