@@ -51,7 +51,7 @@ def gain(proposal: Proposal, problem: Problem) -> tuple[float, float]:
     library = dict(terms(problem, experiment, proposal.channel, 0))
     raw = np.sum([a * library[text] for a, text in proposal.terms], axis=0)
     columns = Columns.of(problem)
-    projector = Whitened(problem, columns, Weights(*np.ones((3, len(columns.items)))))
+    projector = Whitened(problem, columns, Weights(*np.ones((2, len(columns.items)))))
     z = projector(whitened(raw[None, None], problem, rows, np.arange(rows.size), proposal.channel))[0]
     r = projector.residual(problem.r)
     fitted = float(z @ r / (z @ z))

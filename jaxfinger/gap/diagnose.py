@@ -28,6 +28,7 @@ from jaxfinger.gap.result import (
     Change,
     Channel,
     ChannelBudget,
+    Closure,
     Diagnosis,
     Key,
     Left,
@@ -38,6 +39,8 @@ from jaxfinger.gap.result import (
     Status,
     Unexplained,
     Value,
+    still_open,
+    tolerated,
 )
 from jaxfinger.gap.screening import Screening
 from jaxfinger.gap.sets import Offered, Search, Table, table_of
@@ -101,7 +104,7 @@ def diagnose(
     verdict = _verdict(bench, state, found, relevance)
     nominal = nominal_fit(problem)
     chosen = bench.null
-    if verdict.status in (Status.EXPLAINED, Status.PARTLY, Status.AMBIGUOUS):
+    if verdict.status in (Status.PARTLY, Status.AMBIGUOUS):
         chosen = search.only(state, (*verdict.named, *(k for s in found.ambiguous for k in s)))
     augmented: Fitted | None = None
     if chosen.effects:
@@ -110,16 +113,17 @@ def diagnose(
         augmented = as_refitted(problem, chosen) if quick else augmented_fit(problem, chosen, not whole)
     progress("refitting without each third of the trials")
     lines = closures(problem, augmented, not quick)
+    status = _closed(verdict.status, found, lines, relevance, tolerance)
     shares = budget(bench, chosen, problem, _open(bench))
     suggestion: NextExperiment | None = None
-    if verdict.status is Status.AMBIGUOUS and not quick:
+    if status is Status.AMBIGUOUS and not quick:
         progress("looking for the trial that would tell them apart")
         suggestion = next_experiment(problem, search.rivals(state, found.ambiguous[0]))
     fit = augmented.fit if augmented else nominal.fit
     causes = _causes(chosen, found, shares, fit)
     left = explained(chosen.problem, chosen.r)
     return Diagnosis(
-        status=verdict.status,
+        status=status,
         named=tuple(Key(*k) for k in _by_share(verdict.named, chosen, shares)),
         data=Path(session.file).name if session.file else "",
         specimen=session.specimen,
@@ -127,12 +131,12 @@ def diagnose(
         quick=quick,
         tolerance=tolerance,
         budget=causes,
-        unexplained=_unexplained(chosen, shares, left, verdict.status, progress),
+        unexplained=_unexplained(chosen, shares, left, status, progress),
         channels=_channels(problem, bench, chosen, causes, shares),
         relevance=relevance,
         not_judged=_not_judged(problem),
         closures=lines,
-        where=tuple(where(problem)) if verdict.status is not Status.NO_GAP else (),
+        where=tuple(where(problem)) if status is not Status.NO_GAP else (),
         candidates=_candidates(problem, search, chosen, found, shares, fit),
         none=found.none,
         unlisted=found.unlisted,
@@ -150,18 +154,34 @@ def diagnose(
 
 
 def _verdict(bench: Bench, state: State, found: Posterior, relevance: tuple[Relevance, ...]) -> Verdict:
-    """The word for the posterior."""
+    """The word for the posterior; whether named causes are all of the gap is for held-out trials to say."""
     if not bench.columns.items:
         return Verdict(Status.NOT_JUDGED, ())
     if found.named:
-        open_still = found.unlisted > 0.5 or found.ambiguous
-        return Verdict(Status.PARTLY if open_still else Status.EXPLAINED, found.named)
+        return Verdict(Status.PARTLY, found.named)
     if found.ambiguous:
         return Verdict(Status.AMBIGUOUS, found.ambiguous[0][:1])
     matters = [x for x in relevance if not x.tolerated]
     if found.unlisted <= 0.5 or not matters:
         return Verdict(Status.NO_GAP, ())
     return Verdict(Status.UNEXPLAINED, ())
+
+
+def _closed(
+    status: Status,
+    found: Posterior,
+    lines: tuple[Closure, ...],
+    relevance: tuple[Relevance, ...],
+    tolerance: Mapping[str, float],
+) -> Status:
+    """Whether the named causes are all: nothing unlisted is likely, and every channel comes down to its noise; or what
+    is left in every channel with a gap is tolerated.
+    """
+    if status is not Status.PARTLY or found.ambiguous or still_open(lines, relevance, tolerance):
+        return status
+    with_gap = {(x.experiment, x.channel) for x in relevance}
+    minded = [x for x in lines if (x.experiment, x.channel) in with_gap and not tolerated(x, relevance, tolerance)]
+    return Status.EXPLAINED if found.unlisted <= 0.5 or not minded else status
 
 
 def _open(bench: Bench) -> frozenset[int]:
@@ -214,7 +234,7 @@ def _unexplained(chosen: State, shares: Budget, left: list[Explained], status: S
     proposal = None
     if status in (Status.PARTLY, Status.UNEXPLAINED):
         progress("looking for a closed form of what remains")
-        ones = Weights(*np.ones((3, len(chosen.columns.items))))
+        ones = Weights(*np.ones((2, len(chosen.columns.items))))
         proposal = propose(chosen.problem, Whitened(chosen.problem, chosen.columns, ones), chosen.r, left)
     there = Channel(worst.experiment, worst.channel, site(chosen.problem, worst.channel, worst.column))
     return Unexplained(share, ends, depends, there, proposal)

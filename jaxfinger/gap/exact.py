@@ -199,7 +199,7 @@ def at_one_model(bench: Bench, problem: Problem, effects: list[CatalogueEffect],
     reach = np.full(len(coordinates), STEP)
     changes, slopes = _evaluate(signatures, effects, coordinates, reach)
     # An amplitude is measured in the gap: one prior standard deviation changes as much as is missed in all.
-    plain = Whitened(problem, bench.columns, Weights(*np.ones((3, len(bench.columns.items)))))
+    plain = Whitened(problem, bench.columns, Weights(*np.ones((2, len(bench.columns.items)))))
     norm = np.linalg.norm(plain(slopes), axis=1)
     grow = np.array(
         [bench.gap / max(n, 1e-300) if c.amplitude else 1.0 for c, n in zip(coordinates, norm, strict=True)]

@@ -32,7 +32,6 @@ class Parameters:
     floor: float = 2.0  # v_c that noise alone may leave, since its colour is known from a few repeats
     form: float = 0.02  # ρ²: share of what causes explain in a column that the forms of their laws may miss
     looks: float = 25.0  # ν: independent looks outside of the features
-    worse: float = 0.0  # times as much that unknown costs which a column has with causes, and has not without
     prior: float = 6.0  # log evidence that a cause must bring,
     alike: float = 0.07  # and as a share of what the nominal model leaves unexplained: what an imitator gains of it
     trust: float = 1.0  # β: of all log evidence, since neighbouring features and columns are no independent looks
@@ -47,7 +46,6 @@ class Weights:
 
     feature: Float[np.ndarray, " C"]  # 1 / v_c
     outside: Float[np.ndarray, " C"]
-    variance: Float[np.ndarray, " C"]  # v_c
 
 
 def log_likelihood(
@@ -56,7 +54,6 @@ def log_likelihood(
     o: Float[np.ndarray, "*n C"],
     explained: Float[np.ndarray, "*n C"],
     p: Parameters,
-    before: Float[np.ndarray, " C"] | None = None,
 ) -> tuple[Float[np.ndarray, " *n"], Weights]:
     """log L and the weights that belong to it."""
     K, nu = columns.K, p.looks
@@ -64,9 +61,8 @@ def log_likelihood(
     floor = p.floor * np.maximum(scale, 1.0)
     v = np.maximum(np.maximum(e / K, floor), p.form * explained / K)
     excess = np.maximum(o - columns.outside, 0.0) / nu
-    more = np.zeros_like(v) if before is None else np.maximum(np.log(v / before), 0.0)
-    value = -0.5 * np.sum(K * (np.log(v) + p.worse * more) + e / v + nu * np.log1p(excess), axis=-1)
-    return value, Weights((1.0 + p.worse * (more > 0.0)) / v, 1.0 / (1.0 + excess), v)
+    value = -0.5 * np.sum(K * np.log(v) + e / v + nu * np.log1p(excess), axis=-1)
+    return value, Weights(1.0 / v, 1.0 / (1.0 + excess))
 
 
 def unexplained(columns: Columns, judged: "Judged", null: "Judged", p: Parameters) -> Float[np.ndarray, " C"]:
@@ -149,7 +145,7 @@ class Linear:
             e = self.columns.sums(b**2)
             o = np.maximum(np.einsum("i,cij,j->c", x, T, x) - e, 0.0)
             explained = self.columns.sums((b - before) ** 2) if before is not None else np.zeros_like(e)
-            log_l, weights = log_likelihood(self.columns, e, o, explained, self.parameters, self._before)
+            log_l, weights = log_likelihood(self.columns, e, o, explained, self.parameters)
         log_l = float(log_l) - 0.5 * float(x[:k] @ self.prior @ x[:k])
         H = self._weighted(weights, B, B, T) + prior
         sizes = -x[k:] if middle is None else -x[k:] - middle
@@ -158,11 +154,7 @@ class Linear:
 
     def _white(self) -> Weights:
         ones = np.ones(len(self.columns.items))
-        return Weights(ones, ones, ones)
-
-    @property
-    def _before(self):
-        return None if self.null is None else self.null.weights.variance
+        return Weights(ones, ones)
 
     def _solve(self, H, low, high):
         """Coefficients (1, −δ, −a); amplitudes that leave their bounds stay at them."""
@@ -224,7 +216,6 @@ class Linear:
                 np.maximum(total - e, 0.0),
                 self.columns.sums((r - change - null) ** 2),
                 self.parameters,
-                self._before,
             )
             occam = 0.5 * np.linalg.slogdet(np.eye(len(at)) + G)[1] + 0.5 * float(a @ a)
             out[n] = log_l - now.log_l - occam

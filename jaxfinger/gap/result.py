@@ -1,5 +1,6 @@
 """What a diagnosis found: numbers, names and kinds, no sentence. `report` turns them into words and a page."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -7,6 +8,8 @@ from jaxfinger.effects import Site
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.propose import Proposal
 from jaxfinger.identify import Fit
+
+OPEN = 1.3  # rms of a channel after, in that of its noise, which is itself known to a fifth
 
 
 class Status(StrEnum):
@@ -157,6 +160,28 @@ class Closure:
     closed_ci95: tuple[float, float]
     resolvable: bool  # whether the gap before stands out of the noise
     diverged: bool = False  # whether a forward simulation ran away: it closes nothing, and says nothing
+
+    @property
+    def stays_open(self) -> bool:
+        """Whether a channel with a gap misses more than its noise after all. Angles simulated forward are not judged by
+        that, since they amplify what is small.
+        """
+        judged = self.resolvable and not self.diverged and self.channel != "q"
+        return judged and self.noise > 0 and self.after > OPEN * self.noise
+
+
+def tolerated(line: Closure, relevance: Sequence[Relevance], tolerance: Mapping[str, float]) -> bool:
+    """Whether what a channel misses beyond its noise after all, beside its signal, is within the user's tolerance."""
+    left = max(line.after**2 - line.noise**2, 0.0) ** 0.5
+    signal = {(x.experiment, x.channel): x.signal for x in relevance}.get((line.experiment, line.channel), 0.0)
+    return left <= tolerance.get(line.channel, -1.0) * signal
+
+
+def still_open(
+    closures: Sequence[Closure], relevance: Sequence[Relevance], tolerance: Mapping[str, float]
+) -> list[Closure]:
+    """Channels that stay open by more than the user tolerates."""
+    return [x for x in closures if x.stays_open and not tolerated(x, relevance, tolerance)]
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ class Table:
 
 def table_of(problem: Problem, bench: Bench, screening: Screening, together: bool = True) -> Table:
     """Every candidate that the trials can see."""
-    plain = Whitened(problem, bench.columns, Weights(*np.ones((3, len(bench.columns.items)))))
+    plain = Whitened(problem, bench.columns, Weights(*np.ones((2, len(bench.columns.items)))))
     rt = plain.residual(problem.r)
     items: list[Variant] = []
     blocks = []

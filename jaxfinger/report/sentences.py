@@ -21,11 +21,11 @@ from jaxfinger.gap.result import (
     Reason,
     Relevance,
     Status,
+    still_open,
 )
 from jaxfinger.report.numbers import measured, number, percent, percent_range, quantity
 
 NAMED_AT_MOST = 4  # causes in one sentence
-OPEN = 1.3  # rms after, in that of the noise, which is itself known to a fifth
 LIKELY, SURE = 0.9, 0.99  # probabilities from which on a person says «very probably» and «almost certainly»
 
 HEADLINES = {
@@ -111,9 +111,6 @@ def headline(d: Diagnosis) -> str:
         text = f"{text}: {_listed([cause_name(c) for c in named_causes(d)])}"
         if d.status is Status.PARTLY:
             text += f"; {percent(d.unexplained.share)} is left"
-        elif left := still_open(d):
-            names = [_of(x.experiment, x.channel) for x in left]
-            text += f"; {names[0]} stays open" if len(names) == 1 else f"; {len(names)} channels stay open"
     elif d.status is Status.AMBIGUOUS and d.ambiguous_sets:
         text = f"{text}: {joined([key_name(k) for k in d.ambiguous_sets[0]], 'or')}"
     return text
@@ -130,19 +127,6 @@ def summary(d: Diagnosis) -> str:
         Status.NOT_JUDGED: _nothing_judged,
     }[d.status](d)
     return " ".join(sentence(p) for p in (*parts, *_caveats(d)))
-
-
-def stays_open(x: Closure) -> bool:
-    """Whether a channel with a gap misses more than its noise after all. Angles simulated forward are not judged by
-    that, since they amplify what is small.
-    """
-    return x.resolvable and not x.diverged and x.channel != "q" and x.noise > 0 and x.after > OPEN * x.noise
-
-
-def still_open(d: Diagnosis) -> list[Closure]:
-    """Channels with a gap that matters, which stay open with all causes in the model."""
-    covered = {(x.experiment, x.channel) for x in d.relevance if x.tolerated}
-    return [x for x in d.closures if stays_open(x) and (x.experiment, x.channel) not in covered]
 
 
 def tolerated(d: Diagnosis) -> bool:
@@ -204,15 +188,16 @@ def _explained(d: Diagnosis) -> list[str]:
     it = "it" if len(named_causes(d)) < 2 else "them"
     end = "its noise, or to what you tolerate," if any(x.tolerated for x in d.relevance) else "its noise"
     closes = f"every channel comes down to {end} on trials that no fit has seen"
-    if left := still_open(d):
-        names = [f"{_of(x.experiment, x.channel)} ({number(x.after / x.noise, 2)} times its noise)" for x in left]
-        closes = f"what stays open on trials that no fit has seen is {_listed(names)}"
     return [size(d), f"{_blamed(d)}; with {it} in the model {closes}"]
 
 
 def _partly(d: Diagnosis) -> list[str]:
     unknown = [cannot_tell(members) for members in d.ambiguous_sets[:1]]
-    return [size(d), "; ".join([_blamed(d), *unknown]), _left(d)]
+    left = [_left(d)]
+    if stay := still_open(d.closures, d.relevance, d.tolerance):
+        names = [f"{_of(x.experiment, x.channel)} ({number(x.after / x.noise, 2)} times its noise)" for x in stay]
+        left.append(f"what stays open on trials that no fit has seen is {_listed(names)}")
+    return [size(d), "; ".join([_blamed(d), *unknown]), "; ".join(left)]
 
 
 def cannot_tell(members: Sequence[Key]) -> str:

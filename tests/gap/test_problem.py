@@ -20,7 +20,7 @@ GAIN = 0.2
 
 
 def white(bench):
-    return Weights(*np.ones((3, len(bench.columns.items))))
+    return Weights(*np.ones((2, len(bench.columns.items))))
 
 
 @pytest.fixture(scope="module")

@@ -246,7 +246,9 @@ def every() -> dict[str, Diagnosis]:
             unlisted=0.02,
             candidates=(_candidate(STRIBECK, 0.93), _candidate(rivals[0], 0.5), _candidate(rivals[1], 0.47)),
         ),
-        "still_open": replace(one, closures=(LINES[0], replace(LINES[1], after=3.1e-5), LINES[2])),
+        "still_open": replace(
+            one, status=Status.PARTLY, closures=(LINES[0], replace(LINES[1], after=3.1e-5), LINES[2])
+        ),
         "ambiguous": replace(
             one,
             status=Status.AMBIGUOUS,

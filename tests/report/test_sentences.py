@@ -36,7 +36,7 @@ SAYS = {
         [SIZE, "(95 % interval 35 to 47 %); these trials cannot tell tendon stretch at T3 from tendon creep at T3."],
     ),
     "still_open": (
-        "Explained: tendon stretch at T3; tendon excursion of VD.1 stays open",
+        "Partly explained: tendon stretch at T3; 3 % is left",
         ["what stays open on trials that no fit has seen is tendon excursion of VD.1 (1.6 times its noise)."],
     ),
     "ambiguous": (

@@ -11,7 +11,7 @@ from matplotlib.patches import Patch
 
 from jaxfinger.gap.result import ChannelBudget, Closure, Diagnosis
 from jaxfinger.report.numbers import alike, quantity
-from jaxfinger.report.sentences import cause_name, channel_name, stays_open
+from jaxfinger.report.sentences import cause_name, channel_name
 from jaxfinger.report.theme import (
     AFTER,
     BEFORE,
@@ -127,7 +127,7 @@ def closure(lines: Sequence[Closure], ax: Axes | None = None) -> Axes:
     ax = axes_or_new(ax, *closure_size(rows, 5.0))
     for y, x in enumerate(rows):
         before, after = x.before / x.noise, x.after / x.noise
-        stays = stays_open(x)
+        stays = x.stays_open
         ax.plot([before, after], [y, y], color=MUTED, linewidth=1.2, zorder=1)
         if changed:
             ax.plot(before, y, "o", color="none", markeredgecolor=BEFORE, markeredgewidth=1.6, markersize=6)
@@ -151,7 +151,7 @@ def closure(lines: Sequence[Closure], ax: Axes | None = None) -> Axes:
     if changed:
         ax.plot([], [], "o", color="none", markeredgecolor=BEFORE, markeredgewidth=1.6, label="before")
     ax.plot([], [], "o", color=AFTER, label="after" if changed else "the model")
-    if any(map(stays_open, rows)):
+    if any(x.stays_open for x in rows):
         ax.plot([], [], "s", color=WRONG, label="stays open")
     legend_below(ax, 2)
     return ax
