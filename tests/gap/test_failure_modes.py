@@ -18,18 +18,11 @@ from .conftest import RIVALS, TABLE, TRUTH, WITHOUT, session_with
 PLANTED = (*TRUTH, {"a": 1.0, "x0": 0.1})
 
 
-def test_the_same_file_twice_is_the_same_diagnosis(diagnosis):
-    again = diagnose(session_with(PLANTED), without=WITHOUT)
-    for name in ("status", "named", "budget", "unexplained", "channels", "closures", "candidates", "none", "unlisted"):
-        assert getattr(diagnosis, name) == getattr(again, name)
-
-
-@pytest.mark.parametrize("experiment", ["ID.3-static", "ID.3-dynamic"])
-def test_without_any_one_trial_the_verdict_is_the_same(experiment):
+def test_without_one_trial_the_verdict_is_the_same():
     session = session_with(PLANTED)
-    gone = next(t.name for t in session if t.experiment == experiment and t.joint == TRUTH[1][0])
+    gone = next(t.name for t in session if t.experiment == "ID.3-dynamic" and t.joint == TRUTH[1][0])
     less = session.with_trials([t.name for t in session if t.name != gone])
-    assert diagnose(less, without=WITHOUT).named == (Key(*TRUTH),)
+    assert diagnose(less, without=WITHOUT, quick=True).named == (Key(*TRUTH),)
 
 
 def test_a_users_copy_of_a_listed_effect_is_its_rival_and_not_its_better():
@@ -54,7 +47,7 @@ def test_a_gain_that_friction_absorbs_is_not_named():
     keep = {*RIVALS, "tension_sensor_scale", "tendon_friction_saturating"}
     truth = ("tension_sensor_scale", ("T1",), {"gain": 0.05})
     session = session_with(truth, recipe=recipe_from(TABLE | {"trials": trials}))
-    found = diagnose(session, without=tuple(sorted(set(CATALOGUE) - keep)))
+    found = diagnose(session, without=tuple(sorted(set(CATALOGUE) - keep)), quick=True)
     assert found.status is Status.NO_GAP
 
 
@@ -71,7 +64,7 @@ def test_without_sweeps_the_moves_between_holds_show_what_depends_on_speed(truth
     trials = TABLE["trials"] | {"experiments": ["ID.2", "ID.3-static"]}
     keep = {*RIVALS, "drive_inertia", "torque_ripple"}
     session = session_with(truth, recipe=recipe_from(TABLE | {"trials": trials}))
-    found = diagnose(session, without=tuple(sorted(set(CATALOGUE) - keep)))
+    found = diagnose(session, without=tuple(sorted(set(CATALOGUE) - keep)), quick=True)
     assert found.status is Status.EXPLAINED
     assert found.named == (Key(*truth[:2]),)
 
@@ -95,17 +88,17 @@ def test_the_order_of_the_trials_in_a_file_says_nothing():
     keep = {*RIVALS, "torque_sensor_drift"}
     session = session_with(("torque_sensor_drift", ("torque_sensor",), {"slope": 1e-4, "A": 1e-3, "P": 250.0}))
     backwards = replace(session, trials=dict(reversed(session.trials.items())))
-    found = [diagnose(s, without=tuple(sorted(set(CATALOGUE) - keep))) for s in (session, backwards)]
+    without = tuple(sorted(set(CATALOGUE) - keep))
+    found = [diagnose(s, without=without, quick=True) for s in (session, backwards)]
     assert {f.named for f in found} == {(Key("torque_sensor_drift", ("torque_sensor",)),)}
     probabilities = [{c.key: c.probability for c in f.candidates} for f in found]
     assert probabilities[0] == pytest.approx(probabilities[1], abs=1e-3)
 
 
-@pytest.mark.parametrize("degrees", [{"elastic_degree": 5, "moment_arm_degree": 6}, {"friction_degree": 4}], ids=str)
-def test_a_nominal_model_more_flexible_than_needed_hides_no_cause(degrees):
-    recipe = Recipe(model=replace(Recipe().model, **degrees))
-    assert diagnose(session_with(PLANTED), recipe, without=WITHOUT).named == (Key(*TRUTH),)
-    assert diagnose(session_with(), recipe, without=WITHOUT).status is Status.NO_GAP
+def test_a_nominal_model_more_flexible_than_needed_hides_no_cause():
+    recipe = Recipe(model=replace(Recipe().model, elastic_degree=5, moment_arm_degree=6, friction_degree=4))
+    assert diagnose(session_with(PLANTED), recipe, without=WITHOUT, quick=True).named == (Key(*TRUTH),)
+    assert diagnose(session_with(), recipe, without=WITHOUT, quick=True).status is Status.NO_GAP
 
 
 def test_many_repeats_of_what_no_candidate_explains_make_none_right():
@@ -114,7 +107,8 @@ def test_many_repeats_of_what_no_candidate_explains_make_none_right():
     """
     trials = TABLE["trials"] | {k: TABLE["trials"][k] | {"repeats": 4} for k in ("id2", "id3_static", "id3_dynamic")}
     upside_down = ("joint_stribeck", ("PIP",), {"a": -0.8, "v_s": 0.2, "delta": 2.0})
-    found = diagnose(session_with(upside_down, recipe=recipe_from(TABLE | {"trials": trials})), without=WITHOUT)
+    session = session_with(upside_down, recipe=recipe_from(TABLE | {"trials": trials}))
+    found = diagnose(session, without=WITHOUT, quick=True)
     assert found.status is Status.UNEXPLAINED
     for candidate in found.candidates:
         signs = {n: p.signed for n, p in CATALOGUE[candidate.key.effect].amplitudes().items()}
