@@ -64,7 +64,7 @@ def test_without_sweeps_the_moves_between_holds_show_what_depends_on_speed(truth
     trials = TABLE["trials"] | {"experiments": ["ID.2", "ID.3-static"]}
     keep = {*RIVALS, "drive_inertia", "torque_ripple"}
     session = session_with(truth, recipe=recipe_from(TABLE | {"trials": trials}))
-    found = diagnose(session, without=tuple(sorted(set(CATALOGUE) - keep)), quick=True)
+    found = diagnose(session, without=tuple(sorted(set(CATALOGUE) - keep)))
     assert found.status is Status.EXPLAINED
     assert found.named == (Key(*truth[:2]),)
 
