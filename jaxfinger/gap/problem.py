@@ -28,10 +28,9 @@ from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.solve import Source, linearise_each, solve
 from jaxfinger.identify.stages import (
     Progress,
-    cad_covariance,
+    cad_prior,
     first_noise,
     free_groups,
-    nominal_model,
     sources_of,
 )
 from jaxfinger.identify.start import start_values
@@ -162,10 +161,10 @@ def build(
     sources = _sources(stacks, noise, parameters)
     start, more = _with_missing_stages(fit, free, sources, parameters)
     if more.size > free.size:  # what no stage had fitted was no noise
-        start, _ = solve(start, more, sources, _cad_prior(session, recipe, more, parameters))
+        start, _ = solve(start, more, sources, cad_prior(session, recipe, parameters, more))
         noise = _with_unknown(fit.noise, stacks, sources, start)
         sources, free = _sources(stacks, noise, parameters), more
-    prior = _cad_prior(session, recipe, free, parameters)
+    prior = cad_prior(session, recipe, parameters, free)
     nominal, solution = solve(start, free, sources, prior)
 
     rows = layouts(stacks, sources)
@@ -302,15 +301,6 @@ def _with_missing_stages(
         seen |= set(sources[e].positions[np.any(lin.factor[..., :-1] != 0.0, axis=(0, 1))])
     added = np.array([i for i in unknown if i in seen], dtype=int)
     return start_values(fit.model, added, parameters, sources), np.union1d(free, added).astype(int)
-
-
-def _cad_prior(session: Session, recipe: Recipe, free, parameters) -> Prior:
-    """What CAD and scale say of masses and centres of mass: the only prior, since all trials are read again."""
-    std = np.sqrt(np.diag(cad_covariance(session, parameters)))
-    rows = [k for k, i in enumerate(free) if std[i] > 0]
-    root = np.zeros((len(rows), free.size))
-    root[np.arange(len(rows)), rows] = 1.0 / std[free[rows]]
-    return Prior(np.asarray(ravel(nominal_model(session, recipe)))[free], root)
 
 
 def _sources(stacks: dict[str, Stack], noise: dict[tuple[str, str], Noise], parameters) -> dict[str, Source]:

@@ -5,7 +5,7 @@
 One step of the solver reads the trials compressed at its trial point. Here they are linearised by one program an
 experiment, which all sessions of like fingers share, and the solver is stepped from outside
 (`optimistix` calls that interactive stepping); `batch` puts the same solver and the same rows through
-`optimistix.least_squares` in one program, which compiles for minutes where a session differs from all before.
+`optimistix.least_squares` in one program, which is compiled anew where a session differs from all before.
 An experiment whose residuals are affine in what is free is linearised once and moved along its tangent: exact.
 """
 
