@@ -72,7 +72,7 @@ def turned_on_time(
             began = last + int(np.argmin(new * column[last : turn + 1]))
             stroke = new * (column[began : turn + int(np.argmax(new * column[turn:end])) + 1] - column[began])
             back = np.minimum.accumulate(stroke[::-1])[::-1]
-            share = np.minimum(back / least, 1.0) if least > 0.0 else back > 0.0
+            share = np.clip(back / least, 0.0, 1.0) if least > 0.0 else back > 0.0
             direction[began : began + len(share)] = new * (2.0 * share - 1.0)
     return out
 

@@ -42,3 +42,12 @@ def test_a_column_that_never_turns_keeps_its_direction():
     x = np.linspace(0.0, 1.0, 50)[:, None] * [1.0, 0.0]
     sure = np.tile([1.0, 0.0], (50, 1))
     np.testing.assert_array_equal(turned_on_time(sure, x, np.array([0.01, 0.01])), sure)
+
+
+def test_no_direction_is_more_than_one_wherever_a_joint_wanders():
+    """Also where it goes further back, after it was sure to have turned, than where it turned."""
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        x = np.cumsum(rng.normal(size=(400, 2)), axis=0)
+        sure = np.sign(np.repeat(rng.normal(size=(20, 2)), 20, axis=0))
+        assert np.abs(turned_on_time(sure, x, np.array([0.01, 1.0]))).max() <= 1.0
