@@ -18,7 +18,7 @@ from jaxfinger.gap.closure import closures
 from jaxfinger.gap.exact import Bench, State, Whitened
 from jaxfinger.gap.formula import Parameters, Weights, unexplained
 from jaxfinger.gap.next_experiment import next_experiment
-from jaxfinger.gap.posterior import Posterior, posterior
+from jaxfinger.gap.posterior import IS_NAMED, Posterior, posterior
 from jaxfinger.gap.problem import Problem, build, site
 from jaxfinger.gap.propose import propose
 from jaxfinger.gap.result import (
@@ -139,7 +139,7 @@ def diagnose(
         where=tuple(where(problem)) if status is not Status.NO_GAP else (),
         candidates=_candidates(problem, search, chosen, found, shares, fit),
         none=found.none,
-        unlisted=found.unlisted,
+        unlisted=unlisted_beside(status, found),
         ambiguous_sets=tuple(tuple(Key(*k) for k in s) for s in found.ambiguous),
         next_experiment=suggestion,
         absorbed=_absorbed(problem, table),
@@ -182,6 +182,13 @@ def _closed(
     with_gap = {(x.experiment, x.channel) for x in relevance}
     minded = [x for x in lines if (x.experiment, x.channel) in with_gap and not tolerated(x, relevance, tolerance)]
     return Status.EXPLAINED if found.unlisted <= 0.5 or not minded else status
+
+
+def unlisted_beside(status: Status, found: Posterior) -> float:
+    """Probability that something is at work which the catalogue lacks. A channel that the named causes leave open on
+    held-out trials says so too, where the search had taken it for the form of their laws: as likely as not, at least.
+    """
+    return max(found.unlisted, IS_NAMED) if status is Status.PARTLY and not found.ambiguous else found.unlisted
 
 
 def _open(bench: Bench) -> frozenset[int]:

@@ -6,6 +6,8 @@ from functools import cache
 import numpy as np
 
 from jaxfinger.effects import CATALOGUE
+from jaxfinger.gap.diagnose import unlisted_beside
+from jaxfinger.gap.posterior import Posterior
 from jaxfinger.gap.propose import Proposal
 from jaxfinger.gap.result import (
     Absorbed,
@@ -247,7 +249,11 @@ def every() -> dict[str, Diagnosis]:
             candidates=(_candidate(STRIBECK, 0.93), _candidate(rivals[0], 0.5), _candidate(rivals[1], 0.47)),
         ),
         "still_open": replace(
-            one, status=Status.PARTLY, closures=(LINES[0], replace(LINES[1], after=3.1e-5), LINES[2])
+            one,
+            status=Status.PARTLY,
+            unlisted=unlisted_beside(Status.PARTLY, Posterior({}, {}, 0.0, 0.02, (), ())),
+            unexplained=replace(one.unexplained, share=0.12, share_ci95=(0.08, 0.17)),
+            closures=(LINES[0], replace(LINES[1], after=3.1e-5), LINES[2]),
         ),
         "ambiguous": replace(
             one,
