@@ -252,7 +252,6 @@ def every() -> dict[str, Diagnosis]:
             one,
             status=Status.PARTLY,
             unlisted=unlisted_beside(Status.PARTLY, Posterior({}, {}, 0.0, 0.02, (), ())),
-            unexplained=replace(one.unexplained, share=0.12, share_ci95=(0.08, 0.17)),
             closures=(LINES[0], replace(LINES[1], after=3.1e-5), LINES[2]),
         ),
         "ambiguous": replace(

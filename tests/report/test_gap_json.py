@@ -35,7 +35,8 @@ def test_numbers_and_words_agree(name):
         assert gap["unlisted"] < 0.5
     if status in ("partly", "unexplained"):
         assert gap["unlisted"] >= 0.5 or gap["ambiguous_sets"]
-        assert gap["unexplained"]["share"] > 0.1
+        stays_open = any(x["after"] > 1.3 * x["noise"] for x in gap["gap"])  # though little of the whole is left
+        assert gap["unexplained"]["share"] > 0.1 or stays_open
 
 
 def test_a_probability_that_rounding_lifts_over_one_is_one():
