@@ -121,6 +121,7 @@ def diagnose(
         suggestion = next_experiment(problem, search.rivals(state, found.ambiguous[0]))
     fit = augmented.fit if augmented else nominal.fit
     causes = _causes(chosen, found, shares, fit)
+    unlisted = unlisted_beside(status, found, bool(relevance))
     left = explained(chosen.problem, chosen.r)
     return Diagnosis(
         status=status,
@@ -138,8 +139,8 @@ def diagnose(
         closures=lines,
         where=tuple(where(problem)) if status is not Status.NO_GAP else (),
         candidates=_candidates(problem, search, chosen, found, shares, fit),
-        none=found.none,
-        unlisted=unlisted_beside(status, found),
+        none=max(found.none, 1.0 - unlisted) if status is Status.NO_GAP and not relevance else found.none,
+        unlisted=unlisted,
         ambiguous_sets=tuple(tuple(Key(*k) for k in s) for s in found.ambiguous),
         next_experiment=suggestion,
         absorbed=_absorbed(problem, table),
@@ -184,10 +185,13 @@ def _closed(
     return Status.EXPLAINED if found.unlisted <= 0.5 or not minded else status
 
 
-def unlisted_beside(status: Status, found: Posterior) -> float:
+def unlisted_beside(status: Status, found: Posterior, gaps: bool) -> float:
     """Probability that something is at work which the catalogue lacks. A channel that the named causes leave open on
     held-out trials says so too, where the search had taken it for the form of their laws: as likely as not, at least.
+    Traces in many columns, none of which has a gap, make it as likely as not at most.
     """
+    if status is Status.NO_GAP and not gaps:
+        return min(found.unlisted, 1.0 - IS_NAMED)
     return max(found.unlisted, IS_NAMED) if status is Status.PARTLY and not found.ambiguous else found.unlisted
 
 

@@ -251,7 +251,7 @@ def every() -> dict[str, Diagnosis]:
         "still_open": replace(
             one,
             status=Status.PARTLY,
-            unlisted=unlisted_beside(Status.PARTLY, Posterior({}, {}, 0.0, 0.02, (), ())),
+            unlisted=unlisted_beside(Status.PARTLY, Posterior({}, {}, 0.0, 0.02, (), ()), gaps=True),
             closures=(LINES[0], replace(LINES[1], after=3.1e-5), LINES[2]),
         ),
         "ambiguous": replace(
