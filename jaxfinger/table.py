@@ -28,7 +28,8 @@ class Table(list[dict[str, Any]]):
 
     def to_dataframe(self):
         """The rows as a pandas DataFrame, where pandas is installed."""
-        import pandas  # not a dependency: whoever asks for a DataFrame has it
+        # Not a dependency: whoever asks for a DataFrame has it.
+        import pandas  # pyright: ignore[reportMissingImports]
 
         return pandas.DataFrame(list(self), columns=self.columns)
 

@@ -94,7 +94,7 @@ def _several(split: str, count: int) -> list[CaseSpec]:
     for i in range(count):
         specimen, _ = next(specimens)
         effects = [str(e) for e in rng.choice(anywhere, int(rng.integers(3, 6)), replace=False)]
-        sizes = np.exp(rng.uniform(*np.log(LIKE_SIZE), len(effects))).tolist()
+        sizes = np.exp(rng.uniform(np.log(LIKE_SIZE[0]), np.log(LIKE_SIZE[1]), len(effects))).tolist()
         if i % 2:
             effects, sizes = [*effects, str(rng.choice(list(UNLISTED)))], [*sizes, SMALL]
         specs.append(CaseSpec("several", specimen, tuple(effects), tuple(sizes)))
