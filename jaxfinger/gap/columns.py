@@ -7,6 +7,7 @@ what lies outside of it. That is some hundreds of numbers where there are tens o
 
 from dataclasses import dataclass
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -55,13 +56,32 @@ class Columns:
         """Of features, column by column."""
         return np.add.reduceat(values, np.r_[0, np.cumsum(self.K)[:-1]], axis=0)
 
-    def coefficients(self, x: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "features k"]:
-        """Of rows, on the features."""
-        return np.concatenate([c.basis.T @ x[:, c.rows].T for c in self.items])
 
-    def products(self, x: Float[np.ndarray, "k N"], y: Float[np.ndarray, "l N"]) -> Float[np.ndarray, "C k l"]:
-        """Of two sets of rows, column by column."""
-        return np.stack([x[:, c.rows] @ y[:, c.rows].T for c in self.items])
+class ByColumn:
+    """Rows, column by column: their coefficients on the features, and their products, each made once."""
+
+    def __init__(self, columns: Columns, x: Float[np.ndarray, "k N"]):
+        self.count = len(x)
+        self.parts = [x[:, c.rows] for c in columns.items]
+        self.B: Float[np.ndarray, "features k"] = np.concatenate(
+            [c.basis.T @ p.T for c, p in zip(columns.items, self.parts, strict=True)]
+        )
+        self._with: WeakKeyDictionary[ByColumn, np.ndarray] = WeakKeyDictionary()
+        self._among: dict[tuple[int, ...], np.ndarray] = {}
+
+    def products(self, other: "ByColumn") -> Float[np.ndarray, "C k l"]:
+        """With other rows."""
+        if other not in self._with:
+            self._with[other] = np.stack([x @ y.T for x, y in zip(self.parts, other.parts, strict=True)])
+        return self._with[other]
+
+    def among(self, at: Int[np.ndarray, " k"]) -> Float[np.ndarray, "C k k"]:
+        """Of some of the rows with one another."""
+        key = tuple(at.tolist())
+        if key not in self._among:
+            some = [x[at] for x in self.parts]
+            self._among[key] = np.stack([x @ x.T for x in some])
+        return self._among[key]
 
 
 def _columns(problem: Problem):

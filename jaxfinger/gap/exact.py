@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.effects import CatalogueEffect, Scales
-from jaxfinger.gap.columns import Columns
+from jaxfinger.gap.columns import ByColumn, Columns
 from jaxfinger.gap.formula import Judged, Linear, Parameters, Weights, unexplained
 from jaxfinger.gap.problem import Problem, moved
 from jaxfinger.gap.signatures import Signatures, Variant
@@ -45,6 +45,7 @@ class State:
 
     problem: Problem
     columns: Columns
+    nominal: ByColumn  # −∂r/∂θ of the nominal parameters
     effects: tuple[CatalogueEffect, ...]
     coordinates: tuple[Coordinate, ...]
     changes: Float[np.ndarray, "effects N"]  # what each effect adds to every white row
@@ -85,32 +86,33 @@ class Bench:
     def of(cls, problem: Problem, parameters: Parameters) -> "Bench":
         columns = Columns.of(problem)
         empty = np.empty((0, problem.r.size))
-        judged = Linear(columns, base(problem, empty), prior_of(problem, 0), empty, parameters).null
+        nominal, none = ByColumn(columns, problem.J.T), ByColumn(columns, empty)
+        residual = ByColumn(columns, problem.r[None])
+        judged = Linear(columns, (residual, nominal), prior_of(problem, 0), none, parameters).null
         assert judged is not None
-        null = State(problem, columns, (), (), empty, empty, judged)
+        null = State(problem, columns, nominal, (), (), empty, empty, judged)
         unknown = float(unexplained(columns, judged, judged, parameters).sum())
         return cls(columns, parameters, null, unknown, float(np.sqrt(np.sum(judged.e) + np.sum(judged.o))))
 
-    def judge(self, problem: Problem, r: np.ndarray, slopes: np.ndarray, sizes: np.ndarray) -> Judged:
+    def judge(
+        self, problem: Problem, nominal: ByColumn, r: np.ndarray, slopes: np.ndarray, sizes: np.ndarray
+    ) -> Judged:
         """A set at its optimum: `sizes`, how far its coordinates are from the middle of their priors."""
         linear = Linear(
             self.columns,
-            base(problem, np.empty((0, r.size)), r),
+            (ByColumn(self.columns, r[None]), nominal),
             prior_of(problem, 0),
-            slopes,
+            ByColumn(self.columns, slopes),
             self.parameters,
             self.null.judged,
         )
         return linear.judge(np.arange(len(slopes)), middle=-sizes)
 
 
-def base(problem: Problem, slopes: np.ndarray, r: np.ndarray | None = None) -> Float[np.ndarray, "k N"]:
-    """Rows that are refitted with every set, after the residual: −∂r/∂θ of the nominal parameters, and slopes."""
-    return np.vstack([(problem.r if r is None else r)[None], problem.J.T, slopes])
-
-
 def prior_of(problem: Problem, k: int) -> Float[np.ndarray, "d d"]:
-    """Products of the prior's rows with themselves, for `base` with k slopes of unit precision."""
+    """Products of the prior's rows with themselves: for a residual, the nominal parameters, and k slopes of unit
+    precision, which are refitted with every set.
+    """
     rows = np.column_stack([-problem.offset, problem.root])
     out = np.zeros((rows.shape[1] + k,) * 2)
     out[: rows.shape[1], : rows.shape[1]] = rows.T @ rows
@@ -229,8 +231,9 @@ def at_one_model(bench: Bench, problem: Problem, effects: list[CatalogueEffect],
         effects, changes, slopes, r, sizes, cost = trial, new, new_slopes, new_r, new_sizes, new_cost
         if gain < 0.1 + 1e-3 * cost:
             break
-    judged = bench.judge(problem, r, slopes, sizes)
-    return State(problem, bench.columns, tuple(effects), tuple(coordinates), changes, slopes, judged)
+    nominal = ByColumn(bench.columns, problem.J.T)
+    judged = bench.judge(problem, nominal, r, slopes, sizes)
+    return State(problem, bench.columns, nominal, tuple(effects), tuple(coordinates), changes, slopes, judged)
 
 
 def derivatives(signatures: Signatures, state: State) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "k N"]]:

@@ -17,12 +17,13 @@ A cause's amplitudes have a Gaussian prior of the gap's own size: one standard d
 all. Nominal parameters are refitted with every set, in the weights that follow from v_c.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxfinger.gap.columns import Columns
+from jaxfinger.gap.columns import ByColumn, Columns
 
 
 @dataclass(frozen=True)
@@ -97,16 +98,18 @@ class Linear:
     def __init__(
         self,
         columns: Columns,
-        base: Float[np.ndarray, "k N"],
+        base: Sequence[ByColumn],
         prior: Float[np.ndarray, "k k"],
-        further: Float[np.ndarray, "M N"],
+        further: ByColumn,
         parameters: Parameters,
         null: Judged | None = None,
     ):
         self.columns, self.parameters, self.prior = columns, parameters, prior
-        self.X, self.Z = base, further
-        self.BX, self.TX = columns.coefficients(base), columns.products(base, base)
-        self.BZ, self.TXZ = columns.coefficients(further), columns.products(base, further)
+        self.further = further
+        self.BX = np.concatenate([x.B for x in base], axis=1)
+        self.TX = np.concatenate([np.concatenate([x.products(y) for y in base], axis=2) for x in base], axis=1)
+        self.BZ = further.B
+        self.TXZ = np.concatenate([x.products(further) for x in base], axis=1)
         self.null = null
         if null is None:
             self.null = self.judge(np.empty(0, int))
@@ -120,15 +123,12 @@ class Linear:
         self, picks: Int[np.ndarray, " k"], low=None, high=None, start: Weights | None = None, middle=None
     ) -> Judged:
         """The likeliest amplitudes of the rows `picks` within `low` and `high`, in units of their prior."""
-        k, n = self.X.shape[0], len(picks)
+        k, n = self.BX.shape[1], len(picks)
         low = np.full(n, -np.inf) if low is None else low
         high = np.full(n, np.inf) if high is None else high
         T = np.empty((len(self.columns.items), k + n, k + n))
         T[:, :k, :k], T[:, :k, k:] = self.TX, self.TXZ[:, :, picks]
-        T[:, k:, :k], T[:, k:, k:] = (
-            np.swapaxes(T[:, :k, k:], 1, 2),
-            self.columns.products(self.Z[picks], self.Z[picks]),
-        )
+        T[:, k:, :k], T[:, k:, k:] = np.swapaxes(T[:, :k, k:], 1, 2), self.further.among(picks)
         B = np.concatenate([self.BX, self.BZ[:, picks]], axis=1)
         prior = np.zeros((k + n, k + n))
         prior[:k, :k] = self.prior
@@ -180,7 +180,7 @@ class Linear:
 
     def screen(self, now: Judged, candidates: list[Int[np.ndarray, " k"]], bounds) -> Float[np.ndarray, " candidates"]:
         """Gain in log L less Occam's factor of each candidate alone on top of the base, by one step in the weights."""
-        w, k = now.weights, self.X.shape[0]
+        w, k = now.weights, self.BX.shape[1]
         x = now.solution[:k]
         HXX = self._weighted(w, self.BX, self.BX, self.TX) + self.prior
         HXZ = self._weighted(w, self.BX, self.BZ, self.TXZ)
@@ -195,13 +195,12 @@ class Linear:
         Tr = np.einsum("i,cij->cj", x, self.TX)  # (C, k)
         rZ = np.einsum("i,cij->cj", x, self.TXZ) - Tr[:, 1:] @ absorbed
         # Products of projected further rows by column, for the candidates' blocks alone.
-        JZ = np.einsum("cij,jm->cim", self.TX[:, 1:, 1:], absorbed)
+        JZ = self.TX[:, 1:, 1:] @ absorbed
         out = np.full(len(candidates), -np.inf)
         for n, (at, (low, high)) in enumerate(zip(candidates, bounds, strict=True)):
             Q = absorbed[:, at]
-            TZ = self._own(tuple(at))
-            XQ = np.einsum("im,cin->cmn", Q, self.TXZ[:, 1:, at])
-            TZ = TZ - XQ - np.swapaxes(XQ, 1, 2) + np.einsum("im,cin->cmn", Q, JZ[:, :, at])
+            XQ = Q.T @ self.TXZ[:, 1:, at]
+            TZ = self.further.among(at) - XQ - np.swapaxes(XQ, 1, 2) + Q.T @ JZ[:, :, at]
             inside = np.repeat(w.feature - w.outside, self.columns.K)
             G = np.tensordot(w.outside, TZ, 1) + (BZ[:, at] * inside[:, None]).T @ BZ[:, at]
             a = np.clip(np.linalg.solve(G + np.eye(len(at)), b[at]), low, high)
@@ -223,23 +222,15 @@ class Linear:
 
     def std(self, at: Int[np.ndarray, " k"], w: Weights) -> Float[np.ndarray, " k"]:
         """Of the amplitudes of further rows, refitted with the base and with one another, without their prior."""
-        k, base = self.X.shape[0], self.prior
+        k, base = self.BX.shape[1], self.prior
         H = np.zeros((k + len(at),) * 2)
         H[:k, :k] = self._weighted(w, self.BX, self.BX, self.TX) + base
         H[:k, k:] = self._weighted(w, self.BX, self.BZ[:, at], self.TXZ[:, :, at])
         H[k:, :k] = H[:k, k:].T
-        H[k:, k:] = self._weighted(w, self.BZ[:, at], self.BZ[:, at], self._own(tuple(at)))
+        H[k:, k:] = self._weighted(w, self.BZ[:, at], self.BZ[:, at], self.further.among(at))
         scale = 1.0 / np.sqrt(np.maximum(np.diag(H)[1:], 1e-300))
         inverse = np.linalg.pinv(H[1:, 1:] * np.outer(scale, scale), rcond=1e-12, hermitian=True)
         return (np.sqrt(np.maximum(np.diag(inverse), 0.0)) * scale)[k - 1 :]
-
-    def _own(self, at: tuple[int, ...]) -> Float[np.ndarray, "C k k"]:
-        if not hasattr(self, "_blocks"):
-            self._blocks: dict = {}
-        if at not in self._blocks:
-            z = self.Z[list(at)]
-            self._blocks[at] = self.columns.products(z, z)
-        return self._blocks[at]
 
 
 def _further_information(H: Float[np.ndarray, "d d"], k: int) -> float:

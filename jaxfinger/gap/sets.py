@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfinger.effects import CatalogueEffect, Scales, Site
-from jaxfinger.gap.exact import Bench, State, Whitened, base, fitted, prior_of
+from jaxfinger.gap.exact import Bench, State, Whitened, fitted, prior_of
+from jaxfinger.gap.columns import ByColumn
 from jaxfinger.gap.formula import Linear, Weights
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.screening import Screening
@@ -57,6 +58,7 @@ class Table:
     """All signatures at the nominal model, each in units of its prior, and what is made of them."""
 
     Z: Float[np.ndarray, "M N"]
+    signatures: ByColumn  # the same
     rows: dict[Variant, Int[np.ndarray, " k"]]  # of every variant: all of its amplitudes'
     units: Float[np.ndarray, " M"]
     absorbed: dict[Key, float]
@@ -107,7 +109,9 @@ def table_of(problem: Problem, bench: Bench, screening: Screening, together: boo
         if ends:
             low, high = np.array(ends).T
             offers.append(Offered((v,), at[kept[at]], low, high))
-    return Table(Z, rows, units, absorbed, hidden, offers + (_together(offers) if together else []))
+    return Table(
+        Z, ByColumn(bench.columns, Z), rows, units, absorbed, hidden, offers + (_together(offers) if together else [])
+    )
 
 
 def _ends(v: Variant, name: str, unit: float) -> tuple[float, float]:
@@ -178,31 +182,33 @@ class Search:
 
     def linear(self, state: State, r: np.ndarray, slopes: np.ndarray) -> Linear:
         """The table's rows on top of a state's base."""
-        problem = state.problem
+        columns = self.bench.columns
         return Linear(
-            self.bench.columns,
-            base(problem, slopes, r),
-            prior_of(problem, len(slopes)),
-            self.table.Z,
+            columns,
+            (ByColumn(columns, r[None]), state.nominal, ByColumn(columns, slopes)),
+            prior_of(state.problem, len(slopes)),
+            self.table.signatures,
             self.bench.parameters,
             self.bench.null.judged,
         )
+
+    def without(self, state: State, cause: int | None) -> tuple[list[Key], np.ndarray, np.ndarray, float]:
+        """What is left of a state without one cause, linearly: keys, residual, slopes and score."""
+        kept = [i for i in range(len(state.effects)) if i != cause]
+        at = [k for k, c in enumerate(state.coordinates) if c.effect in kept]
+        keys, slopes = [state.keys[i] for i in kept], state.slopes[at]
+        r, score = state.problem.r - state.changes[kept].sum(axis=0), state.score
+        if cause is not None:
+            score = self.bench.judge(state.problem, state.nominal, r, slopes, state.sizes()[at]).score
+        self.visited.add(keys, score)
+        return keys, r, slopes, score
 
     def screened(self, state: State, without: int | None = None):
         """The state, or what is left of it without one cause, linearly: its value, its weights, and of every offer the
         value of the set with it.
         """
-        kept = [i for i in range(len(state.effects)) if i != without]
-        at = [k for k, c in enumerate(state.coordinates) if c.effect in kept]
-        r = state.problem.r - state.changes[kept].sum(axis=0)
-        slopes = state.slopes[at]
-        keys = [state.keys[i] for i in kept]
-        score = state.score
-        if without is not None:
-            sizes = state.sizes()[at]
-            score = self.bench.judge(state.problem, r, slopes, sizes).score
+        keys, r, slopes, score = self.without(state, without)
         value = score - self.cost(keys)
-        self.visited.add(keys, score)
         linear = self.linear(state, r, slopes)
         now = linear.judge(np.empty(0, int), start=state.judged.weights)
         offers = self.table.offers
@@ -299,7 +305,8 @@ class Search:
         """Without those causes that explain too little beside the others."""
         while len(state.effects) > 1:
             now = self.value(state)
-            left = [self.screened(state, i)[0] for i in range(len(state.effects))]
+            parts = [self.without(state, i) for i in range(len(state.effects))]
+            left = [score - self.cost(keys) for keys, _, _, score in parts]
             worst = int(np.argmax(left))
             if left[worst] < now - CLOSE:
                 return state

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxfinger.gap.columns import Column, Columns
+from jaxfinger.gap.columns import ByColumn, Column, Columns
 from jaxfinger.gap.formula import Linear, Parameters, unexplained
 
 ROWS, FEATURES, COLUMNS = 400, 20, 6
@@ -32,7 +32,8 @@ def smooth(columns, rng, *where):
 
 def linear(columns, r, Z, J=None):
     J = np.empty((0, r.size)) if J is None else J
-    return Linear(columns, np.vstack([r[None], J]), np.zeros((1 + len(J),) * 2), Z, Parameters())
+    base = ByColumn(columns, np.vstack([r[None], J]))
+    return Linear(columns, [base], np.zeros((1 + len(J),) * 2), ByColumn(columns, Z), Parameters())
 
 
 def test_a_quiet_cause_counts_beside_a_loud_error(columns, rng):
