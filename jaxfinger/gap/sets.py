@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfinger.effects import CatalogueEffect, Scales, Site
-from jaxfinger.gap.exact import Bench, State, Whitened, fitted, prior_of
 from jaxfinger.gap.columns import ByColumn
+from jaxfinger.gap.exact import Bench, State, Whitened, fitted, prior_of
 from jaxfinger.gap.formula import Linear, Weights
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.screening import Screening
