@@ -19,6 +19,7 @@ def diagnose(
     output: Output,
     recipe: str | None = None,
     predictions: Path | None = None,
+    against: Path | None = None,
     effects: Path | None = None,
     without: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
     tolerance: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
@@ -39,6 +40,9 @@ def diagnose(
     predictions
         Another simulator's predictions of the session's trials (HDF5, as `predict` writes them): the gap is then
         that between the measurements and this simulator.
+    against
+        An earlier fit of the same finger (JSON, as `identify` writes it): what has changed since? Its intervals are
+        what is known, its recipe is the nominal model, and each of its parameters is a candidate beside the effects.
     effects
         A Python file with effects of your own, beside those of the catalogue.
     without
@@ -54,22 +58,27 @@ def diagnose(
     """
     _refuse(output, overwrite)
     tolerated = _tolerance(tolerance or [])
+    from dataclasses import replace
+
     from jaxfinger.data import read_predictions
     from jaxfinger.effects import load
     from jaxfinger.gap import diagnose as run
-    from jaxfinger.identify import read_recipe
+    from jaxfinger.identify import load_fit, read_recipe
     from jaxfinger.report.gap_json import write
     from jaxfinger.report.page import write_page
     from jaxfinger.report.screen import summary
 
     with progress("first look" if quick else "diagnose") as say:
-        wanted = read_recipe(recipe)
+        wanted = None if recipe is None and against is not None else read_recipe(recipe)
+        earlier = load_fit(against, effects) if against is not None else None
         own = load(effects) if effects is not None else {}
         say("reading the file")
         simulated = read_predictions(predictions) if predictions is not None else None
         measured = read(session)
         _make(output)
-        found = run(measured, wanted, quick, own, tuple(without or ()), say, simulated, tolerated)
+        found = run(measured, wanted, quick, own, tuple(without or ()), say, simulated, tolerated, earlier)
+        if against is not None:
+            found = replace(found, against=against.name)
         say("writing the report")
         write(found, output, overwrite)
         write_page(found, output / "report.html", overwrite)

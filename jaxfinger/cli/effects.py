@@ -13,10 +13,10 @@ def effects(id: str | None = None, /, *, effects: Path | None = None) -> None:
     effects
         A Python file with effects of your own, beside those of the catalogue.
     """
-    from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, load
+    from jaxfinger.effects import CATALOGUE, CHANGED, NOMINAL_TERMS, load
     from jaxfinger.errors import UserError, did_you_mean
 
-    known = CATALOGUE | NOMINAL_TERMS | (load(effects) if effects is not None else {})
+    known = CATALOGUE | NOMINAL_TERMS | CHANGED | (load(effects) if effects is not None else {})
     if id is None:
         _list(known)
     elif id not in known:

@@ -25,3 +25,4 @@ from jaxfinger.data.session import FingerDescription as FingerDescription
 from jaxfinger.data.session import Session as Session
 from jaxfinger.data.session import Trial as Trial
 from jaxfinger.data.session import joints_of as joints_of
+from jaxfinger.data.session import moving as moving

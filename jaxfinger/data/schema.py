@@ -108,7 +108,7 @@ MEASURES = {
 _SLIDING = {
     "rad": "m", "rad/s": "m/s", "1/rad": "1/m", "N m": "N", "N m/s": "N/s", "N m/rad": "N/m", "N m s/rad": "N s/m",
     "s/rad": "s/m", "N m/rad^2": "N/m^2", "kg m2": "kg",
-    "m/rad^p": "m/m^p",
+    "m/rad": "1", "m/rad^2": "1/m", "m/rad^3": "1/m^2", "m/rad^p": "m/m^p",
 }  # fmt: skip
 
 

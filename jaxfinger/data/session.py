@@ -178,5 +178,10 @@ def joints_of(trial: Trial, finger: FingerDescription) -> tuple[str, ...]:
         return ()
     if trial.joint is not None or trial.experiment != "ID.2" or not len(trial.time):
         return trial.motorised(finger)
+    return moving(trial, finger)
+
+
+def moving(trial: Trial, finger: FingerDescription) -> tuple[str, ...]:
+    """The joints that go a tenth as far as the one that goes furthest, or more."""
     span = np.ptp(np.nan_to_num(trial.q), axis=0)
     return tuple(name for name, s in zip(finger.joint_names, span, strict=True) if s > _MOVED * span.max())

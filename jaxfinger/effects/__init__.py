@@ -5,8 +5,9 @@ import inspect
 import os
 from pathlib import Path
 
-from jaxfinger.effects import body, drive, joint, nominal, sensors, tendon, transmission
+from jaxfinger.effects import body, changed, drive, joint, nominal, sensors, tendon, transmission
 from jaxfinger.effects.base import Amplitude, CatalogueEffect, Shape, Site, amplitude, shape
+from jaxfinger.effects.changed import Changed
 from jaxfinger.effects.scales import Scales
 from jaxfinger.errors import UserError
 from jaxfinger.model import Finger
@@ -24,12 +25,20 @@ CATALOGUE: dict[str, type[CatalogueEffect]] = {}
 for _module in (joint, drive, tendon, transmission, body, sensors):
     CATALOGUE |= _effects_in(_module)
 NOMINAL_TERMS = _effects_in(nominal)  # candidates only where a recipe leaves the term out
+CHANGED = _effects_in(changed)  # candidates only beside an earlier fit
 
 
 def nominal_terms(elastic_degree: int, friction_degree: int) -> dict[str, type[CatalogueEffect]]:
     """The terms that a recipe of these degrees may leave out, by id."""
     degrees = {"joint_elastic": elastic_degree, "joint_coulomb": friction_degree}
     return {n: nominal.of_degree(c, degrees[n]) if n in degrees else c for n, c in NOMINAL_TERMS.items()}
+
+
+def changes(elastic_degree: int, friction_degree: int, moment_arm_degree: int) -> dict[str, type[CatalogueEffect]]:
+    """What the nominal parameters of a recipe of these degrees may have changed by, by id."""
+    degrees = {"changed_elastic": elastic_degree, "changed_friction": friction_degree}
+    degrees["changed_moment_arm"] = moment_arm_degree - 1
+    return {n: nominal.of_degree(c, degrees[n]) if n in degrees else c for n, c in CHANGED.items()}
 
 
 def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
@@ -57,7 +66,7 @@ def to_dict(effect: CatalogueEffect, units: dict[str, str]) -> dict:
 
 def from_dict(finger: Finger, content: dict, extra: dict[str, type[CatalogueEffect]] | None = None) -> CatalogueEffect:
     """The effect that `to_dict` described."""
-    known = CATALOGUE | NOMINAL_TERMS | (extra or {})
+    known = CATALOGUE | NOMINAL_TERMS | CHANGED | (extra or {})
     if content["effect"] not in known:
         raise UserError(
             f"the effect {content['effect']!r} is not in the catalogue; name the file that defines it with --effects"
@@ -68,13 +77,16 @@ def from_dict(finger: Finger, content: dict, extra: dict[str, type[CatalogueEffe
 
 __all__ = [
     "CATALOGUE",
+    "CHANGED",
     "NOMINAL_TERMS",
     "Amplitude",
     "CatalogueEffect",
+    "Changed",
     "Scales",
     "Shape",
     "Site",
     "amplitude",
+    "changes",
     "from_dict",
     "load",
     "nominal_terms",

@@ -8,6 +8,8 @@ from jaxtyping import Array, Float
 
 from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
 
+KEEPS = 0.9  # of a link's mass, the most that may sit elsewhere
+
 
 class Payload(CatalogueEffect):
     """A point mass m at p in a link's frame: added to the link or, where it is `moved` (1), taken evenly from it.
@@ -27,6 +29,11 @@ class Payload(CatalogueEffect):
     y: Float[Array, ""] = shape("m", (0.0,), "length", moves="by differences")
     z: Float[Array, ""] = shape("m", (0.0, 0.15, -0.15), "length", moves="by differences")
     moved: Float[Array, ""] = shape("1", (0.0, 1.0), moves="not")
+
+    def bounds(self, scales):
+        """A link that mass is taken from keeps a tenth of its own: else it is no body."""
+        ends = super().bounds(scales)
+        return ends | ({"mass": (0.0, KEEPS * scales("mass", self.site))} if self.moved > 0.5 else {})
 
     def finger(self, finger):
         i, p = self.index[0], jnp.stack([self.x, self.y, self.z])

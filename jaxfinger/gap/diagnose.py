@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxfinger.data import Predictions, Session
 from jaxfinger.data.schema import channel_units
-from jaxfinger.effects import CatalogueEffect
+from jaxfinger.effects import CatalogueEffect, Changed
 from jaxfinger.errors import UserError, did_you_mean
 from jaxfinger.experiments import not_judged
 from jaxfinger.gap.augment import Fitted, as_refitted, augmented_fit, nominal_fit, values_of
@@ -44,7 +44,7 @@ from jaxfinger.gap.result import (
 )
 from jaxfinger.gap.screening import Screening
 from jaxfinger.gap.sets import Offered, Search, Table, table_of
-from jaxfinger.gap.signatures import catalogue_for, variants
+from jaxfinger.gap.signatures import catalogue_for, changes_of, variants
 from jaxfinger.gap.standin import Explained, explained
 from jaxfinger.gap.where import where
 from jaxfinger.identify import Fit, Recipe
@@ -75,23 +75,32 @@ def diagnose(
     progress: Progress = lambda message: None,
     predictions: Predictions | None = None,
     tolerance: Mapping[str, float] | None = None,
+    against: Fit | None = None,
 ) -> Diagnosis:
     """Diagnose a session. `effects` adds a user's own, `without` withholds some of the catalogue by id.
 
     With `predictions` the gap is that between the measurements and another simulator's predictions. `tolerance`: by
-    channel, the share of its signal up to which a gap does not matter.
+    channel, the share of its signal up to which a gap does not matter. With `against` it is what an earlier fit of the
+    same finger misses: its nominal parameters, each within its interval, are candidates for what has changed.
+
+    Raises:
+        UserError: an effect to leave out is unknown; the earlier fit is of another finger or recipe, or holds effects.
     """
-    recipe, tolerance = recipe or Recipe(), dict(tolerance or {})
-    catalogue = catalogue_for(recipe, effects)
+    if against is not None and (predictions is not None or recipe not in (None, against.recipe)):
+        raise UserError("an earlier fit brings its own recipe and no other simulator; leave the other one out")
+    recipe, tolerance = recipe or (against.recipe if against else Recipe()), dict(tolerance or {})
+    catalogue = catalogue_for(recipe, effects) | (changes_of(against) if against else {})
     if unknown := set(without) - set(catalogue):
         raise UserError(
             f"the catalogue has no effect {', '.join(sorted(unknown))} to leave out"
             f"{did_you_mean(min(unknown), catalogue)}; "
             f"it has {', '.join(sorted(catalogue))}"
         )
-    problem = build(session, recipe, progress, predictions, COARSE if quick else 1)
+    problem = build(session, recipe, progress, predictions, COARSE if quick else 1, against)
     bench = Bench.of(problem, Parameters())
     kept = set(problem.fit.recipe.model.terms) | set(without)
+    if "changed_pretension" in catalogue:
+        kept.add("joint_offset")  # the same law
     catalogue = {k: c for k, c in catalogue.items() if k not in kept}
     progress("reading the signatures of all effects")
     screening = Screening.of(problem, variants(catalogue, problem.nominal.finger, problem.scales), progress)
@@ -128,7 +137,7 @@ def diagnose(
         named=tuple(Key(*k) for k in _by_share(verdict.named, chosen, shares)),
         data=Path(session.file).name if session.file else "",
         specimen=session.specimen,
-        against=None,
+        against=None if against is None else against.data or against.specimen,
         quick=quick,
         tolerance=tolerance,
         budget=causes,
@@ -144,7 +153,7 @@ def diagnose(
         ambiguous_sets=tuple(tuple(Key(*k) for k in s) for s in found.ambiguous),
         next_experiment=suggestion,
         absorbed=_absorbed(problem, table),
-        changes=_retuned(problem, fit),
+        changes=_retuned(problem, fit) if against is None else _changed(against, found, fit),
         left=tuple(
             Left(x.experiment, x.channel, site(problem, x.channel, x.column), x.energy, x.by_variable) for x in left
         ),
@@ -363,6 +372,26 @@ def _absorbed(problem: Problem, table: Table) -> tuple[Absorbed, ...]:
             units = units_at(problem.nominal.finger, effect, key[1])
             values = tuple(Value(key[1], n, 0.0, s, units[n]) for n, s in hidden.items())
             out.append(Absorbed(Key(*key), share, values))
+    return tuple(out)
+
+
+def _changed(against: Fit, found: Posterior, fit: Fit) -> tuple[Change, ...]:
+    """Nominal parameters that are others than an earlier fit found: as that has them, and with what they changed by."""
+    old, new, parameters = np.asarray(ravel(against.model)), np.asarray(ravel(fit.model)), describe(fit.model)
+    at = {p.name: i for i, p in enumerate(parameters)}
+    out = []
+    for effect in fit.model.effects:
+        if not isinstance(effect, Changed):
+            continue
+        mine = [i for i, p in enumerate(parameters) if p.group == effect.GROUP]
+        mine = [i for i in mine if {parameters[i].joint, parameters[i].tendon} - {None} == set(effect.site)]
+        label = f"{effect.ID} {'-'.join(effect.site)} "
+        for i, name in zip(mine, effect.amplitudes(), strict=False):
+            pair = [i, at[label + name]]
+            std = float(np.sqrt(max(fit.covariance[np.ix_(pair, pair)].sum(), 0.0)))
+            p, probability = parameters[i], found.causes[effect.ID, effect.site]
+            after = float(new[pair].sum())
+            out.append(Change(p.name, p.group, p.units, float(old[i]), float(against.std[i]), after, std, probability))
     return tuple(out)
 
 

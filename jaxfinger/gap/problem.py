@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from jaxfinger.data import Predictions, Session
 from jaxfinger.effects import Scales
+from jaxfinger.errors import UserError
 from jaxfinger.experiments import Stack, prepare
 from jaxfinger.gap.groups import Group, grouped
 from jaxfinger.gap.simulator import emulate
@@ -23,15 +24,18 @@ from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.linearise import Linearised
 from jaxfinger.identify.misfit import stretches
 from jaxfinger.identify.noise import Noise, estimate, history
-from jaxfinger.identify.parameters import Free, describe, ravel
-from jaxfinger.identify.prior import Prior
+from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
+from jaxfinger.identify.prior import Prior, prior_of
 from jaxfinger.identify.solve import Source, linearise_each, solve
 from jaxfinger.identify.stages import (
     Progress,
     cad_prior,
     first_noise,
     free_groups,
+    nominal_model,
+    seen_by,
     sources_of,
+    touched_by,
 )
 from jaxfinger.identify.start import start_values
 from jaxfinger.model import Model, Terms, plain_terms
@@ -140,10 +144,12 @@ def build(
     progress: Progress = lambda message: None,
     predictions: Predictions | None = None,
     coarse: int = 1,
+    against: Fit | None = None,
 ) -> Problem:
     """Identify the nominal model, refit it to all trials together, and stack the whitened residuals.
 
     With `predictions` another simulator takes the nominal model's place (see `simulator`); `coarse` as in `prepare`.
+    With `against` an earlier fit is where the search starts, and its covariance the prior: `recipe` is that fit's.
     """
     progress("reading the recordings")
     measured = stacks = prepare(session, coarse=coarse)
@@ -151,20 +157,27 @@ def build(
     if predictions is not None:
         progress("imitating the simulator")
         simulator, recipe, stacks = emulate(session, recipe, stacks, predictions, coarse)
-    fit = identify(session, recipe, progress=progress, stacks=measured)
+    earlier = None if against is None else _as_found(session, against)
+    fit = identify(session, recipe, start=earlier, progress=progress, stacks=measured)
     parameters = describe(fit.model)
     progress("refitting the nominal model to all trials")
     cad = [i for i, p in enumerate(parameters) if p.group in ("mass", "com") and fit.covariance[i, i] > 0]
     cad = np.setdiff1d(cad, fit.estimated)
     free = np.union1d(fit.estimated, cad).astype(int)
+
+    def known(free: np.ndarray) -> Prior:
+        if against is None:
+            return cad_prior(session, recipe, parameters, free)
+        return prior_of(np.asarray(ravel(against.model)), against.covariance, free)
+
     noise = _with_unknown(fit.noise, stacks, _sources(stacks, fit.noise, parameters), fit.model)
     sources = _sources(stacks, noise, parameters)
-    start, more = _with_missing_stages(fit, free, sources, parameters)
+    start, more = _with_missing_stages(fit, free, sources, parameters, touched_by(stacks, session))
     if more.size > free.size:  # what no stage had fitted was no noise
-        start, _ = solve(start, more, sources, cad_prior(session, recipe, parameters, more))
+        start, _ = solve(start, more, sources, known(more))
         noise = _with_unknown(fit.noise, stacks, sources, start)
         sources, free = _sources(stacks, noise, parameters), more
-    prior = cad_prior(session, recipe, parameters, free)
+    prior = known(free)
     nominal, solution = solve(start, free, sources, prior)
 
     rows = layouts(stacks, sources)
@@ -183,6 +196,27 @@ def build(
         simulator=simulator,
         **_at(nominal, solution.linearised, sources, rows, free, prior),
     )
+
+
+def _as_found(session: Session, against: Fit) -> Fit:
+    """The session's own finger, and in it what the earlier fit says of its nominal parameters.
+
+    Raises:
+        UserError: the fit is of another finger, or holds effects.
+    """
+    theirs, file = against.model.finger, session.file or "the session"
+    model = nominal_model(session, against.recipe)
+    ours = model.finger
+    if (theirs.joint_names, theirs.tendon_names) != (ours.joint_names, ours.tendon_names):
+        raise UserError(f"{file}: is of another finger than the fit; both need the same joints and tendons")
+    if against.model.effects:
+        raise UserError(
+            f"{file}: the fit to compare it with holds effects; give one of the nominal model, as `identify` writes it"
+        )
+    known = np.union1d(against.estimated, np.flatnonzero(np.diag(against.covariance))).astype(int)
+    model = Free.at(model, known).set(model, jax.device_put(np.asarray(ravel(against.model))[known]))
+    before = Fit.before(session, against.recipe, model)
+    return replace(before, covariance=against.covariance, estimated=against.estimated)
 
 
 def site(problem: Problem, channel: str, column: int) -> str:
@@ -287,7 +321,7 @@ def _with_unknown(known: dict[tuple[str, str], Noise], stacks: dict[str, Stack],
 
 
 def _with_missing_stages(
-    fit: Fit, free: np.ndarray, sources: dict[str, Source], parameters
+    fit: Fit, free: np.ndarray, sources: dict[str, Source], parameters: list[Parameter], touched
 ) -> tuple[Model, np.ndarray]:
     """A start and the free parameters, with those terms of the recipe whose experiment is missing but which others see.
 
@@ -295,6 +329,7 @@ def _with_missing_stages(
     """
     groups = free_groups(fit.recipe)
     unknown = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in set(free)]
+    unknown = [i for i in unknown if len(parameters[i].spans) < 2 or seen_by(parameters[i], touched)]
     start = start_values(fit.model, np.array(unknown, dtype=int), parameters, sources)
     seen = set()
     for e, lin in linearise_each(start, sources if unknown else {}).items():

@@ -15,10 +15,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
-from jaxfinger.effects import CATALOGUE, CatalogueEffect, Scales, Site, nominal_terms
+from jaxfinger.effects import CATALOGUE, CatalogueEffect, Changed, Scales, Site, changes, nominal_terms
 from jaxfinger.experiments import TRIALS, shows
 from jaxfinger.gap.problem import Problem, Rows
-from jaxfinger.identify import Recipe
+from jaxfinger.identify import Fit, Recipe
+from jaxfinger.identify.parameters import describe
 from jaxfinger.model import (
     Model,
     Motion,
@@ -66,6 +67,17 @@ class Variant:
 def catalogue_for(recipe: Recipe, own: dict[str, type[CatalogueEffect]] | None) -> dict[str, type[CatalogueEffect]]:
     """All that may be at work by id: the catalogue, the terms that a recipe may leave out, and a user's own."""
     return CATALOGUE | nominal_terms(recipe.model.elastic_degree, recipe.model.friction_degree) | (own or {})
+
+
+def changes_of(fit: Fit) -> dict[str, type[CatalogueEffect]]:
+    """What an earlier fit's own parameters may have changed by, by id: those that it gives a standard deviation."""
+    r, parameters = fit.recipe.model, describe(fit.model)
+    known = {p.group for p, s in zip(parameters, fit.std, strict=True) if s > 0.0}
+    return {
+        name: change
+        for name, change in changes(r.elastic_degree, r.friction_degree, r.moment_arm_degree).items()
+        if issubclass(change, Changed) and change.GROUP in known
+    }
 
 
 def variants(effects: dict[str, type[CatalogueEffect]], finger, scales: Scales) -> list[Variant]:

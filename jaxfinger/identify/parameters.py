@@ -100,6 +100,7 @@ class Parameter:
     joint: str | None = None
     tendon: str | None = None
     power: int | None = None
+    spans: tuple[str, ...] = ()  # joints on which a tendon's excursion depends together
     determinable: bool = True  # false where the finger has no such parameter: a tendon that does not cross the joint
 
 
@@ -179,6 +180,7 @@ def _moment_arm(model: Model, k: int, t: int) -> Parameter:
         joints[spanned[0]] if len(spanned) == 1 else None,
         tendon,
         sum(exponents),
+        tuple(joints[i] for i in spanned),
         determinable=crosses and model.finger.active[k],
     )
 

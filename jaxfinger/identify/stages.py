@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfinger.data import Session, joints_of
-from jaxfinger.experiments import Experiment, Stack, not_judged, prepare
+from jaxfinger.data import Session, joints_of, moving
+from jaxfinger.experiments import EXPERIMENTS, Experiment, Stack, not_judged, prepare
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible
 from jaxfinger.identify.noise import ORDER, Noise, estimate
@@ -277,18 +277,24 @@ def total_cost(model: Model, solution: Solution, free: np.ndarray, prior: Prior 
     return solution.cost + (prior.cost(np.asarray(ravel(model))[free]) if prior else 0.0)
 
 
-def touched_by(reads, session: Session) -> tuple[set[str], set[tuple[str, str]], set[str]]:
-    """Joints instrumented or moved, (tendon, joint) pairs recorded together, tendons pulled, by the trials read."""
+def touched_by(reads, session: Session) -> tuple[set[str], set[tuple[str, str]], set[str], list[set[str]]]:
+    """Joints instrumented or moved, (tendon, joint) pairs recorded together, tendons pulled, and the joints that move
+    together, by the trials read.
+    """
     trials = [t for t in session if t.experiment in reads and len(t.time) > 1]
     joints = {joint for t in trials for joint in joints_of(t, session.finger)}
     moved = {(k, joint) for joint in joints for k in session.finger.tendon_names}
-    return joints, moved, {t.tendon for t in trials if t.tendon}
+    free = [set(moving(t, session.finger)) for t in trials if not EXPERIMENTS[t.experiment].held]
+    return joints, moved, {t.tendon for t in trials if t.tendon}, free
 
 
 def seen_by(p: Parameter, touched) -> bool:
-    joints, moved, tendons = touched
+    """Whether trials may tell a parameter, by what `touched_by` says of them."""
+    joints, moved, tendons, together = touched
+    if p.group == "moment_arm" and len(p.spans) > 1:  # one joint at a time never shows what two do together
+        return any(joints.issuperset(p.spans) for joints in together)
     if p.group == "moment_arm":
-        return p.joint is None or (p.tendon, p.joint) in moved
+        return (p.tendon, p.joint) in moved
     if p.group == "tendon_friction":
         return p.tendon in tendons
     return p.joint in joints
@@ -296,7 +302,9 @@ def seen_by(p: Parameter, touched) -> bool:
 
 def _unseen(parameters, groups, free, touched) -> list[str]:
     names = [p.name for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in set(free)]
-    return [f"no trial shows {', '.join(names)}: left as given, or at zero"] if names else []
+    pairs = {" and ".join(p.spans) for p in parameters if p.name in names and len(p.spans) > 1}
+    mend = f"; record a trial that moves {' together, and '.join(sorted(pairs))} together" if pairs else ""
+    return [f"no trial shows {', '.join(names)}: left as given, or at zero{mend}"] if names else []
 
 
 def first_noise(stack: Stack, channel: str) -> Noise:

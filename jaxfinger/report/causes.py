@@ -5,10 +5,8 @@ from __future__ import annotations
 import inspect
 from dataclasses import dataclass
 
-from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, CatalogueEffect
+from jaxfinger.effects import CATALOGUE, CHANGED, NOMINAL_TERMS, CatalogueEffect
 from jaxfinger.gap.result import Diagnosis
-
-CHANGED = "changed_"
 
 
 @dataclass(frozen=True)
@@ -23,15 +21,8 @@ class Words:
 
 def words(effect: str, d: Diagnosis) -> Words:
     """Of an effect of the catalogue, a term of the nominal model, a user's effect, or a parameter that has changed."""
-    if effect.startswith(CHANGED):
-        group = effect.removeprefix(CHANGED).replace("_", " ")
-        return Words(
-            f"The {group} is another than when the fit was made.",
-            "Every trial that depends on it is off in the same way; none before the change was.",
-            "Find out what was changed on the finger in between, or identify it anew.",
-        )
     of_model = {e.ID: type(e) for e in d.augmented.model.effects if isinstance(e, CatalogueEffect)}
-    known = of_model | NOMINAL_TERMS | CATALOGUE
+    known = of_model | NOMINAL_TERMS | CHANGED | CATALOGUE
     if effect not in known:
         return Words("")
     cls = known[effect]

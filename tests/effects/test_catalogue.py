@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS, Scales, from_dict, load, nominal_terms, to_dict
+from jaxfinger.effects import CATALOGUE, CHANGED, NOMINAL_TERMS, Scales, from_dict, load, nominal_terms, to_dict
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, Batch, predict, shows
 from jaxfinger.identify.parameters import describe, units_at
@@ -23,7 +23,7 @@ from jaxfinger.model import (
 )
 from tests.effects.motion import MODEL, MOTIONS, SCALES, with_effects
 
-EVERY = CATALOGUE | NOMINAL_TERMS
+EVERY = CATALOGUE | NOMINAL_TERMS | CHANGED
 FINGER = MODEL.finger
 DOCUMENT = Path(__file__).parents[2] / "docs" / "add-an-effect.md"
 CHEAP = {"xla_backend_optimization_level": 0}
@@ -250,3 +250,17 @@ def test_a_scale_is_a_product_at_its_site():
     assert SCALES("torque", (first, second)) == pytest.approx(SCALES.torque[:2].min())
     assert SCALES("torque", ("base",)) == pytest.approx(SCALES.torque.max())
     assert SCALES("1", (first,)) == 1.0
+
+
+@pytest.mark.parametrize("name", ["payload", "changed_mass", "changed_com"])
+@pytest.mark.parametrize("end", [0, 1])
+def test_an_effect_on_a_link_leaves_it_a_body_at_all_that_its_bounds_allow(name, end):
+    """A mass above zero, and moments of inertia of which no one is larger than the other two together."""
+    kind, site = EVERY[name], FINGER.joint_names[1:2]
+    for shape in kind.shapes(FINGER, site, SCALES):
+        effect = plausible(kind, site, shape, 50.0)
+        most = {n: ends[end] for n, ends in effect.bounds(SCALES).items() if np.isfinite(ends[end])}
+        finger = replace(effect, **{n: jnp.asarray(v) for n, v in most.items()}).finger(FINGER)
+        assert finger.mass[1] > 0.0
+        moments = np.linalg.eigvalsh(finger.gyration[1])
+        assert moments[2] <= moments[:2].sum() * (1.0 + 1e-9)

@@ -1,7 +1,12 @@
 """A stage that no sample informs says so, and estimates nothing."""
 
-from jaxfinger.data import Session
-from jaxfinger.identify import identify
+import numpy as np
+import pytest
+
+from jaxfinger.data import Session, Trial
+from jaxfinger.identify import Recipe, identify
+from jaxfinger.identify.parameters import describe
+from jaxfinger.identify.recipe import ModelRecipe
 from tests.experiments.test_prepare import FINGER, ramps
 
 
@@ -12,3 +17,22 @@ def test_a_stage_of_which_nothing_counts_is_skipped_and_says_why():
     assert report.status == "skipped"
     assert "no sample of joint_torque counts: no tendon is pulled" in report.message
     assert not fit.estimated.size
+
+
+@pytest.mark.parametrize("moved", [1, 2])
+def test_cross_terms_need_a_trial_that_moves_both_joints(moved):
+    """One joint at a time leaves them at zero, and says which joints to move together."""
+    time = np.linspace(0.0, 8.0, 801)
+    q = np.full((time.size, FINGER.m), 0.4)
+    for i in range(moved):
+        q[:, i] += 0.4 * np.sin((1.0 + 0.7 * i) * time)
+    l = 0.01 * q @ FINGER.crosses.T + 1e-5 * np.random.default_rng(0).standard_normal((time.size, FINGER.n))
+    joint = FINGER.joint_names[0] if moved == 1 else None
+    trial = Trial("a", "ID.2", time, q, tendon_excursion=l, joint=joint)
+    recipe = Recipe(model=ModelRecipe(moment_arm_degree=2, cross_terms=True))
+    fit = identify(Session("a finger", FINGER, {"a": trial}), recipe, stages=("ID.2",))
+    parameters, both = describe(fit.model), FINGER.joint_names[:2]
+    crossed = [i for i in fit.estimated if parameters[i].spans == both]
+    said = " ".join(fit.stages[0].warnings)
+    assert bool(crossed) == (moved == 2)
+    assert (f"{' and '.join(both)} together" in said) == (moved == 1)
