@@ -45,7 +45,7 @@ def demo(
     for name in FILES:
         refuse_existing(output / name, overwrite) if output.is_dir() else None
     output.mkdir(parents=True, exist_ok=True)
-    from jaxfinger.cli.tables import print_fit
+    from jaxfinger.cli.tables import fit_to_read, print_fit
     from jaxfinger.data import read_session
     from jaxfinger.gap import diagnose
     from jaxfinger.identify import identify
@@ -59,7 +59,7 @@ def demo(
         say("reading the sessions")
         session, fresh = read_session(shipped("session.h5")), read_session(shipped("fresh.h5"))
         fit = identify(session, progress=say)
-    print_fit(fit, parameters=False)
+    print_fit(fit_to_read(fit), parameters=False)
     with progress("demo") as say:
         found = diagnose(session, progress=say)
         say("writing the page")

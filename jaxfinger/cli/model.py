@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from json import loads
 from pathlib import Path
 from typing import Annotated
 
@@ -46,7 +47,7 @@ def identify(
     """
     refuse_existing(output, overwrite)
     from jaxfinger.identify import identify as run
-    from jaxfinger.identify import read_recipe, save_fit
+    from jaxfinger.identify import read_recipe
 
     with progress("identify") as say:
         wanted = read_recipe(recipe)
@@ -55,10 +56,10 @@ def identify(
         fit = run(session, wanted, progress=say)
         if joint:
             fit = _refine(fit, session, say)
-        save_fit(fit, output, overwrite)
+        content = _keep(fit, output, overwrite)
         if figures is not None:
             _draw(fit, session, figures, overwrite, say)
-    _report(fit, json)
+    _report(content, json)
 
 
 def _fit(
@@ -68,7 +69,7 @@ def _fit(
     if start is not None and recipe is not None:
         raise UserError(f"{start}: a fit to start from brings its own recipe; leave out --recipe or --start")
     from jaxfinger.identify import identify as run
-    from jaxfinger.identify import load_fit, read_recipe, save_fit
+    from jaxfinger.identify import load_fit, read_recipe
     from jaxfinger.identify.predictions import model_for
 
     with progress("fit") as say:
@@ -78,8 +79,8 @@ def _fit(
         if first is not None:
             model_for(first, session)  # refuses the session of another finger
         fit = run(session, None if first else read_recipe(recipe), stages, first, say)
-        save_fit(fit, output, overwrite)
-    _report(fit, json)
+        content = _keep(fit, output, overwrite)
+    _report(content, json)
 
 
 def _of_stages(name: str, stages: tuple[str, ...], summary: str):
@@ -168,7 +169,7 @@ def fit_joint(file: Path, *, output: Output, start: Path, json: bool = False, ov
         Replace a file that is already there.
     """
     refuse_existing(output, overwrite)
-    from jaxfinger.identify import load_fit, save_fit
+    from jaxfinger.identify import load_fit
     from jaxfinger.identify.predictions import model_for
 
     with progress("fit") as say:
@@ -176,8 +177,8 @@ def fit_joint(file: Path, *, output: Output, start: Path, json: bool = False, ov
         session, first = read(file), load_fit(start)
         model_for(first, session)
         fit = _refine(first, session, say)
-        save_fit(fit, output, overwrite)
-    _report(fit, json)
+        content = _keep(fit, output, overwrite)
+    _report(content, json)
 
 
 def fit_effects(
@@ -213,15 +214,15 @@ def fit_effects(
     keys = [_key(text) for text in effect]
     from jaxfinger.effects import load
     from jaxfinger.gap import fit_with
-    from jaxfinger.identify import read_recipe, save_fit
+    from jaxfinger.identify import read_recipe
 
     with progress("fit") as say:
         wanted = read_recipe(recipe)
         own = load(effects) if effects is not None else {}
         say("reading the file")
         fit = fit_with(read(file), keys, wanted, own, say)
-        save_fit(fit, output, overwrite)
-    _report(fit, json)
+        content = _keep(fit, output, overwrite)
+    _report(content, json)
 
 
 def _key(text: str) -> tuple[str, tuple[str, ...]]:
@@ -320,9 +321,35 @@ def show(fit: Path, *, effects: Path | None = None, json: bool = False) -> None:
     json
         Print it as JSON.
     """
-    from jaxfinger.identify import load_fit
+    content = _as_read(fit)
+    if content is None:
+        from jaxfinger.cli.tables import fit_to_read
+        from jaxfinger.identify import load_fit
 
-    _report(load_fit(fit, effects), json)
+        content = fit_to_read(load_fit(fit, effects))
+    try:
+        _report(content, json)
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise UserError(f"{fit}: is damaged ({error!r}); identify the session again") from None
+
+
+def _as_read(path: Path) -> dict | None:
+    """What is in the file of a fit that a command wrote, which needs no computing; None of any other."""
+    try:
+        content = loads(path.read_bytes())
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) and "seen" in content else None
+
+
+def _keep(fit, output: Path, overwrite: bool) -> dict:
+    """What a fit's file holds, once it is written."""
+    from jaxfinger.cli.tables import fit_to_read
+    from jaxfinger.identify.fit_file import write_content
+
+    content = fit_to_read(fit)
+    write_content(content, output, overwrite)
+    return content
 
 
 def _refine(fit, session, say):
@@ -339,10 +366,10 @@ def _draw(fit, session, folder: Path, overwrite: bool, say) -> None:
     draw_identification(fit, session, folder, overwrite)
 
 
-def _report(fit, json: bool) -> None:
+def _report(content: dict, json: bool) -> None:
     from jaxfinger.cli.tables import fit_as_dict, print_fit
 
     if json:
-        print_json(fit_as_dict(fit))
+        print_json(fit_as_dict(content))
     else:
-        print_fit(fit)
+        print_fit(content)

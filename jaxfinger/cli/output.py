@@ -162,15 +162,16 @@ def console() -> Console:
 
 def print_json(content: Any) -> None:
     """JSON for programs: NaN and infinities as null."""
-    print(json.dumps(_finite(content), indent=1, ensure_ascii=False))
+    print(json.dumps(without_infinities(content), indent=1, ensure_ascii=False))
 
 
-def _finite(value: Any) -> Any:
+def without_infinities(value: Any) -> Any:
+    """For JSON, which has no infinity and no NaN: null."""
     match value:
         case dict():
-            return {str(k): _finite(v) for k, v in value.items()}
+            return {str(k): without_infinities(v) for k, v in value.items()}
         case list() | tuple():
-            return [_finite(v) for v in value]
+            return [without_infinities(v) for v in value]
         case float() if not math.isfinite(value):
             return None
         case Path():

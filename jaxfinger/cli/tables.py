@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from jaxfinger.cli.output import console, plain, table
+from jaxfinger.cli.output import console, plain, table, without_infinities
 from jaxfinger.report.numbers import HALF_95, number, scaled, with_error
 
 if TYPE_CHECKING:
@@ -17,62 +15,75 @@ if TYPE_CHECKING:
 MISFIT = 1.5  # χ² per row above which a model or its noise is not right
 
 
-def fit_as_dict(fit: Fit) -> dict:
-    """What made the fit, its stages and its parameters (SI units)."""
-    return {
-        "specimen": fit.specimen,
-        "data": fit.data,
-        "data_hash": fit.data_hash,
-        "recipe": asdict(fit.recipe),
-        "created": fit.created,
-        "versions": fit.versions,
-        "stages": [asdict(s) for s in fit.stages],
-        "parameters": fit.table(),
-        "effects": [{"effect": type(e).__name__, "site": list(getattr(e, "site", ()))} for e in fit.model.effects],
-        "noise": [
-            {"experiment": e, "channel": c, "std": n.std.tolist(), "source": n.source}
-            for (e, c), n in fit.noise.items()
-        ],
-    }
-
-
-def print_fit(fit: Fit, parameters: bool = True) -> None:
-    """Stages, warnings, and the finger as the paper describes it; ± is half of a 95 % interval."""
+def fit_to_read(fit: Fit) -> dict:
+    """A fit as its file holds it, with what people read of it: its parameters, and what its curves reach."""
+    from jaxfinger.identify.fit_file import content_of
     from jaxfinger.report.curves import curves
 
     found = curves(fit)
-    print(plain(f"{fit.specimen} · {fit.data} · recipe {fit.recipe.name} · {fit.created}\n"))
+    seen = {
+        "parameters": list(fit.table()),
+        "moment_arms": [[t, j, *c.range()] for (t, j), c in found.moment_arm.items()],
+        "joints": [
+            {
+                "joint": name,
+                "prismatic": c.prismatic,
+                "gravity": [float(c.gravity.max()), float(c.gravity.min())],
+                "elastic": c.elastic.range(),
+                "friction": c.friction.range(),
+                "damping": c.damping,
+            }
+            for name, c in found.joints.items()
+        ],
+        "tendon_friction": [[t, *map(float, (c.x[-1], c.y[-1], c.std[-1]))] for t, c in found.tendon_friction.items()],
+    }
+    return content_of(fit) | {"seen": without_infinities(seen)}
+
+
+def fit_as_dict(content: dict) -> dict:
+    """What made the fit, its stages and its parameters (SI units)."""
+    kept = ("specimen", "data", "data_hash", "recipe", "created", "versions", "stages")
+    return {k: content[k] for k in kept} | {
+        "parameters": content["seen"]["parameters"],
+        "effects": [{"effect": e["effect"], "site": e["site"]} for e in content["effects"]],
+        "noise": [{k: n[k] for k in ("experiment", "channel", "std", "source")} for n in content["noise"]],
+    }
+
+
+def print_fit(content: dict, parameters: bool = True) -> None:
+    """Stages, warnings, and the finger as the paper describes it; ± is half of a 95 % interval."""
+    seen, stages = content["seen"], content["stages"]
+    about = (content["specimen"], content["data"], f"recipe {content['recipe']['name']}", content["created"])
+    print(plain(" · ".join(about) + "\n"))
     rows = [
-        (s.name, s.status, str(len(s.trials)), number(s.chi2_per_row), f"{100 * s.outliers:.1f} %") for s in fit.stages
+        (s["name"], s["status"], str(len(s["trials"])), number(s["chi2_per_row"]), f"{100 * s['outliers']:.1f} %")
+        for s in stages
     ]
     table("Stages", ("stage", "status", "trials", "χ² per row", "outliers"), rows, left=2)
-    _warnings(fit)
-    if found.moment_arm:
-        _moment_arms(fit, found)
-    if found.joints:
-        _joints(found)
-    if found.tendon_friction:
-        rows = [(t, with_error(c.y[-1], c.std[-1]), f"{100 * (1 - c.y[-1] / c.x[-1]):.0f} %") for t, c in _taut(found)]
-        table(f"Tendon friction at {_taut(found)[0][1].x[-1]:.0f} N", ("tendon", "loss N", "transmitted"), rows)
-    if parameters and (rows := _parameters(fit)):
+    _warnings(stages)
+    if seen["moment_arms"]:
+        _moment_arms(seen["moment_arms"], content["finger"]["joint_names"])
+    if seen["joints"]:
+        _joints(seen["joints"])
+    if losses := seen["tendon_friction"]:
+        rows = [(t, with_error(loss, std), f"{100 * (1 - loss / f):.0f} %") for t, f, loss, std in losses]
+        table(f"Tendon friction at {losses[0][1]:.0f} N", ("tendon", "loss N", "transmitted"), rows)
+    if parameters and (rows := _parameters(seen["parameters"])):
         table("Parameters", ("parameter", "value", "units"), rows)
-    for effect in fit.model.effects:
-        print(f"with {type(effect).__name__} at {'-'.join(getattr(effect, 'site', ()))}")
+    for effect in content["effects"]:
+        print(plain(f"with {effect['effect']} at {'-'.join(effect['site'])}"))
 
 
-def _taut(found):
-    return list(found.tendon_friction.items())
-
-
-def _warnings(fit: Fit) -> None:
+def _warnings(stages: list[dict]) -> None:
     out, said = console(), False
-    for s in fit.stages:
-        said = said or bool(s.message or s.warnings)
-        for text in ([s.message] if s.message else []) + list(s.warnings):
-            out.print(plain(f"{s.name}: {text}"), markup=False, soft_wrap=True)
-        if s.status == "fitted" and s.chi2_per_row > MISFIT:
+    for s in stages:
+        said = said or bool(s["message"] or s["warnings"])
+        for text in ([s["message"]] if s["message"] else []) + list(s["warnings"]):
+            out.print(plain(f"{s['name']}: {text}"), markup=False, soft_wrap=True)
+        chi2 = s["chi2_per_row"]
+        if s["status"] == "fitted" and chi2 is not None and chi2 > MISFIT:
             out.print(
-                f"{s.name}: the residuals are {s.chi2_per_row**0.5:.1f} times the noise, so the model misses something "
+                f"{s['name']}: the residuals are {chi2**0.5:.1f} times the noise, so the model misses something "
                 "and the intervals are wider by that or more: run `jaxfinger diagnose`, or give the recipe more terms",
                 markup=False,
                 soft_wrap=True,
@@ -82,50 +93,37 @@ def _warnings(fit: Fit) -> None:
         out.print()
 
 
-def _moment_arms(fit: Fit, found) -> None:
-    joints = fit.model.finger.joint_names
-    rows = []
-    for t in dict.fromkeys(t for t, _ in found.moment_arm):
-        cells = []
-        for j in joints:
-            if (t, j) in found.moment_arm:
-                high, low, std = found.moment_arm[t, j].range()
-                cells.append(_range(high, low, std))
-            else:
-                cells.append("–")
-        rows.append((t, *cells))
+def _moment_arms(arms: list, joints: list[str]) -> None:
+    found = {(t, j): _range(*reach) for t, j, *reach in arms}
+    rows = [(t, *(found.get((t, j), "–") for j in joints)) for t in dict.fromkeys(t for t, _ in found)]
     table("Moment arms in mm (max; min)", ("tendon", *joints), rows)
 
 
-def _range(high: float, low: float, std: float) -> str:
-    half = f"{HALF_95 * std:.2f}" if math.isfinite(std) else "?"
-    return f"{high:.2f}; {low:.2f} ± {half}"
+def _range(high: float, low: float, std: float | None) -> str:
+    return f"{high:.2f}; {low:.2f} ± {'?' if std is None else f'{HALF_95 * std:.2f}'}"
 
 
-def _joints(found) -> None:
-    rows = []
-    for name, c in found.joints.items():
-        unit = "N" if c.prismatic else "N mm"
-        rate = "N s/m" if c.prismatic else "N mm s/rad"
-        rows.append(
-            (
-                name,
-                f"{c.gravity.max():.1f}; {c.gravity.min():.1f}",
-                _range(*c.elastic.range()),
-                _range(*c.friction.range()),
-                unit,
-                with_error(*c.damping),
-                rate,
-            )
+def _joints(joints: list[dict]) -> None:
+    rows = [
+        (
+            c["joint"],
+            "{:.1f}; {:.1f}".format(*c["gravity"]),
+            _range(*c["elastic"]),
+            _range(*c["friction"]),
+            "N" if c["prismatic"] else "N mm",
+            with_error(*c["damping"]),
+            "N s/m" if c["prismatic"] else "N mm s/rad",
         )
+        for c in joints
+    ]
     header = ("joint", "gravity", "elastic", "friction", "", "damping", "")
     table("Torque of the joints over their range (max; min)", header, rows)
 
 
-def _parameters(fit: Fit) -> list[tuple[str, str, str]]:
+def _parameters(parameters: list[dict]) -> list[tuple[str, str, str]]:
     """Name, value with its 95 % interval, and the unit that suits their size."""
     rows = []
-    for p in fit.table():
+    for p in parameters:
         half = HALF_95 * (p["std"] or 0.0)
         factor, unit = scaled(max(abs(p["value"]), half), p["units"])
         std = None if p["std"] is None else p["std"] * factor

@@ -1,21 +1,22 @@
-"""Derivatives from noisy encoders, without phase: low-pass, then a spline.
+"""Derivatives from noisy encoders, without phase: a Gaussian low-pass, differentiated.
 
 1. The low-pass is a Gaussian: no phase, no ringing, and one number to state, its cut-off, where |H| = 1/√2. Butterworth
    both ways was the other choice: flatter below the cut-off, but it lets more noise into the second derivative, and
    spreads a jump of friction three times as far.
-2. Its standard deviation in time is √(ln 2) / (2π cutoff): 13 ms at 10 Hz.
+2. Its standard deviation in time is σ = √(ln 2) / (2π cutoff): 13 ms at 10 Hz.
 3. Samples that are not evenly spaced are first interpolated to the median interval: the filter knows no other.
-4. Derivatives are those of the quintic spline through the filtered samples, so differencing adds no error of its own.
-
-At both ends the filter sees an odd mirror image of the signal; derivatives within about one `1/cutoff_hz` of an end
-lean on it.
+4. At both ends the signal goes on as its odd mirror image about the end, further than the filter reaches. Without the
+   straight line between the ends of that it is a period, so that filter and derivatives are products of its Fourier
+   series with e^(−σ²ω²/2) and (iω)^k: differencing adds no error of its own. Within about one `1/cutoff_hz` of an end
+   they lean on the image.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 
 from jaxfinger.errors import UserError
 
@@ -23,6 +24,9 @@ _JUMP = 12.0  # times their mean: the largest second difference that noise makes
 _EVEN = 1e-3  # intervals this equal (relative) need no resampling
 _PASSES = 4  # spikes that are found, and those that they hid
 _AT_END = 10  # samples that tell how fast a motion starts or ends
+LEFT_OUT = (
+    1e-5  # of what lies at the cut-off, between samples; their linear interpolation to an even clock costs as much
+)
 _SMALL = 1e-4  # of a column's travel: what lies beyond its surroundings by less is no spike
 
 
@@ -60,18 +64,58 @@ def _smoothed(time: np.ndarray, x: np.ndarray, cutoff_hz: float, highest: int) -
     out = np.full((highest + 1, *columns.shape), np.nan)
     usable = [k for k in range(columns.shape[1]) if np.isfinite(columns[:, k]).sum() >= 3]
     if usable:
-        even = np.stack([_on_grid(time, columns[:, k], grid) for k in usable], axis=1)
-        filtered = _low_pass(even, rate, cutoff_hz)
-        if highest == 0 and grid is time:
-            out[0][:, usable] = filtered
+        even = np.stack([_on_grid(time, columns[:, k], grid) for k in usable])
+        if grid is time:
+            found = _low_passed(even, rate, cutoff_hz, highest)
         else:
-            from scipy.interpolate import make_interp_spline  # here, since it takes a recorder half a second to import
-
-            spline = make_interp_spline(grid, filtered, k=min(5, _odd(len(grid) - 1)))
-            for order in range(highest + 1):
-                out[order][:, usable] = spline(time, nu=order) if order <= spline.k else 0.0
+            terms = _terms(np.pi * cutoff_hz / rate)
+            found = _between(_low_passed(even, rate, cutoff_hz, highest + terms), (time - grid[0]) * rate, rate, terms)
+        out[:, :, usable] = np.moveaxis(found, 1, 2)
         out[:, ~np.isfinite(columns)] = np.nan
     return out.reshape(highest + 1, *x.shape)
+
+
+def _low_passed(x: Float[np.ndarray, "k N"], rate: float, cutoff_hz: float, highest: int) -> Float[np.ndarray, "d k N"]:
+    """x low-passed, and its derivatives up to the highest."""
+    K, reach = x.shape[1], math.ceil(rate / cutoff_hz)  # 7.5 standard deviations of the Gaussian
+    wide = np.pad(x, [(0, 0), (reach, reach)], mode="reflect", reflect_type="odd")
+    N = wide.shape[1]
+    slope = (wide[:, -1:] - wide[:, :1]) / (N - 1)
+    line = wide[:, :1] + slope * np.arange(N)
+    size = _quick_length(N)
+    omega = 2.0 * np.pi * rate / size * np.arange(size // 2 + 1)
+    spectrum = np.fft.rfft(wide - line, size) * np.exp(-0.5 * (width(cutoff_hz) * omega) ** 2)
+    out = np.empty((highest + 1, *x.shape))
+    for k in range(highest + 1):
+        out[k] = np.fft.irfft(spectrum, size)[:, reach : reach + K]
+        spectrum *= 1j * omega
+    out[0] += line[:, reach : reach + K]
+    out[1:2] += rate * slope
+    return out
+
+
+def _quick_length(size: int) -> int:
+    """The least even length of a quick Fourier transform that holds so many samples: a power of two, or 3, 5, 9 or 15
+    times one.
+    """
+    return min(k << max(1, math.ceil(math.log2(size / k))) for k in (1, 3, 5, 9, 15))
+
+
+def _between(derivatives: Float[np.ndarray, "d k K"], at: Float[np.ndarray, " N"], rate: float, terms: int):
+    """Derivatives between samples, at places counted in samples, from those at the nearest one by Taylor's series."""
+    nearest = np.clip(np.round(at).astype(int), 0, derivatives.shape[-1] - 1)
+    away, near, out = (at - nearest) / rate, derivatives[..., nearest], []
+    for k in range(len(derivatives) - terms):
+        value = near[k + terms]
+        for j in range(terms, 0, -1):
+            value = value * (away / j) + near[k + j - 1]
+        out.append(value)
+    return np.stack(out)
+
+
+def _terms(turn: float) -> int:
+    """Terms of Taylor's series beyond the first that say all but LEFT_OUT of a sine that turns so far, rad."""
+    return next(k for k in range(1, 20) if turn ** (k + 1) / math.factorial(k + 1) < LEFT_OUT)
 
 
 def uniform_grid(time: Float[np.ndarray, " N"]) -> Float[np.ndarray, " K"]:
@@ -90,37 +134,9 @@ def _on_grid(time: np.ndarray, column: np.ndarray, grid: np.ndarray) -> np.ndarr
     return np.interp(grid, time[good], column[good])
 
 
-def _low_pass(x: Float[np.ndarray, "N k"], rate: float, cutoff_hz: float) -> Float[np.ndarray, "N k"]:
-    padding = min(len(x) - 1, round(rate / cutoff_hz))
-    padded = np.pad(x, [(padding, padding), (0, 0)], mode="reflect", reflect_type="odd")
-    return gaussian_filter1d(padded, rate * width(cutoff_hz), axis=0, truncate=6.0)[padding : padding + len(x)]
-
-
 def width(cutoff_hz: float) -> float:
     """Standard deviation, s, of the Gaussian whose transfer function is 1/√2 at `cutoff_hz`."""
     return np.sqrt(np.log(2.0)) / (2.0 * np.pi * cutoff_hz)
-
-
-def shrink(x: Float[np.ndarray, "N k"], window: int) -> Float[np.ndarray, "N k"]:
-    """The local Wiener filter: of each column's deviation from its running mean, the share that is more than noise.
-
-    x̂ = x̄ + max(0, 1 − σ²/s²) (x − x̄), s² the variance within the window, σ from the median of |x − x̄|: the noise of
-    most of the trial. As a regressor x̂ is rid of most of the bias of its coefficient towards zero (regression
-    calibration; Carroll et al., Measurement Error in Nonlinear Models, 2nd ed., ch. 4). `scipy.signal.wiener` takes the
-    signal to be zero beyond its ends, and would pull the mean there towards it.
-    """
-    out = np.array(x, np.float64)
-    window = 2 * (max(window, 2) // 2) + 1
-    for column in out.T:
-        mean = uniform_filter1d(column, window)
-        variance = np.maximum(uniform_filter1d(column**2, window) - mean**2, 1e-300)
-        noise = _robust_std(column - mean) ** 2
-        column[:] = mean + np.maximum(0.0, 1.0 - noise / variance) * (column - mean)
-    return out
-
-
-def _odd(degree: int) -> int:
-    return degree if degree % 2 else degree - 1
 
 
 def outlier_mask(x: Float[np.ndarray, N * k], threshold: float = 8.0, longest: int = 5) -> Bool[np.ndarray, N * k]:
@@ -169,7 +185,7 @@ def bridged(x: Float[np.ndarray, "N k"], spikes: Bool[np.ndarray, "N k"]) -> Flo
 
 def _spikes(values: Float[np.ndarray, " N"], threshold: float, longest: int) -> Bool[np.ndarray, " N"]:
     # A second difference, of variance 6 σ², shows the noise in motion and at rest.
-    noise = max(_robust_std(np.diff(values, 2)) / np.sqrt(6.0), _step(values), _SMALL * np.ptp(values))
+    noise = max(robust_std(np.diff(values, 2)) / np.sqrt(6.0), _step(values), _SMALL * np.ptp(values))
     spikes, least = np.zeros(len(values), bool), threshold * noise
     for _ in range(_PASSES):  # one spike beside another bends its lines: judge again with a line across what was found
         found = _beyond(bridged(values[:, None], spikes[:, None])[:, 0], least, longest) & ~spikes
@@ -188,12 +204,14 @@ def _spikes(values: Float[np.ndarray, " N"], threshold: float, longest: int) -> 
 
 def _beyond(values: Float[np.ndarray, " N"], least: float, longest: int) -> Bool[np.ndarray, " N"]:
     """Where samples lie by more than `least` beyond all that their surroundings allow."""
-    ends = np.median(values[:5]), np.median(values[-5:])
-    x = np.concatenate([[ends[0]] * 2, values, [ends[1]] * 2])
-    # At an end one side tells less: there a spike is what lies beyond five of the steps that follow it.
-    reach = [5.0 * np.abs(np.diff(part)).max() for part in (values[2:_AT_END], values[-_AT_END:-2])]
+    x = np.concatenate([[np.median(values[:5])] * 2, values, [np.median(values[-5:])] * 2])
     spikes = np.zeros(len(x), bool)
     bend = np.abs(np.diff(x, 2)) > least  # at the sample before a spike's first, and after its last
+    if not bend.any():
+        return spikes[2:-2]
+    ends = x[0], x[-1]
+    # At an end one side tells less: there a spike is what lies beyond five of the steps that follow it.
+    reach = [5.0 * np.abs(np.diff(part)).max() for part in (values[2:_AT_END], values[-_AT_END:-2])]
     first, last = np.flatnonzero(bend[:-2]) + 2, np.zeros(len(x), bool)
     last[1:-2] = bend[1:]
     for size in range(1, longest + 1):
@@ -212,7 +230,8 @@ def _beyond(values: Float[np.ndarray, " N"], least: float, longest: int) -> Bool
     return spikes[2:-2]
 
 
-def _robust_std(values: Float[np.ndarray, " N"]) -> float:
+def robust_std(values: Float[np.ndarray, " N"]) -> float:
+    """Standard deviation of most of the values."""
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 

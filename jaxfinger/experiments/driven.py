@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import minimum_filter1d
 
-from jaxfinger.data import directions, low_pass, shrink, smooth, turned_on_time, width, without_spikes
+from jaxfinger.data import directions, low_pass, smooth, turned_on_time, width, without_spikes
 from jaxfinger.data.motion import noise_of, quicker, still
 from jaxfinger.experiments.recording import Joints, Recording, Row, joints, row
+from jaxfinger.experiments.shrink import shrink
 
 NOTHING = "nowhere do a joint and its tendons slide for long enough that the direction of their friction is known"
 

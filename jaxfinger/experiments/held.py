@@ -12,9 +12,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import isotonic_regression
 
-from jaxfinger.data import find_holds, shrink
+from jaxfinger.data import find_holds
 from jaxfinger.data.motion import RAMP, slow_ramps, stretches_of
 from jaxfinger.experiments.recording import Recording, Row, joints, row, stretches
+from jaxfinger.experiments.shrink import shrink
 
 NOTHING = "no tendon is pulled from slack in holds of 0.2 s or in ramps of a second"
 PARTS = 6  # of a hold, whose means say how well its own is known; longer than an encoder's noise is correlated

@@ -73,7 +73,7 @@ class Fit:
         """The fit with an effect on top of its model, whose named parameters a joint refinement is to estimate."""
         model = replace(self.model, effects=(*self.model.effects, effect))
         old, new = ravel(self.model).size, ravel(model).size
-        added = [i for i in range(old, new) if describe(model)[i].name.split()[-1] in free]
+        added = [i for i in range(old, new) if describe(model)[i].term in free]
         covariance = np.zeros((new, new))
         covariance[:old, :old] = self.covariance
         return replace(self, model=model, covariance=covariance, estimated=np.append(self.estimated, added).astype(int))

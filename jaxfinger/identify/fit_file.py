@@ -49,7 +49,11 @@ def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None
     Raises:
         UserError: the file exists and `overwrite` is false, or its folder cannot be written.
     """
-    content = _to_dict(fit)
+    write_content(content_of(fit), path, overwrite)
+
+
+def write_content(content: dict[str, Any], path: str | os.PathLike, overwrite: bool = False) -> None:
+    """Write the file of a fit from what is in it."""
     lines = ",\n".join(f" {json.dumps(k)}: {json.dumps(v, allow_nan=False)}" for k, v in content.items())
     with atomic_path(path, overwrite) as part:
         part.write_text("{\n" + lines + "\n}\n", encoding="utf-8")
@@ -84,7 +88,8 @@ def load_fit(path: str | os.PathLike, effects: str | os.PathLike | None = None) 
         raise UserError(f"{path}: is damaged ({e}); identify the session again") from None
 
 
-def _to_dict(fit: Fit) -> dict[str, Any]:
+def content_of(fit: Fit) -> dict[str, Any]:
+    """What the file of a fit holds."""
     model, names = fit.model, [p.name for p in describe(fit.model)]
     rows = np.flatnonzero(np.diag(fit.covariance) != 0)
     covariance = np.where(np.isfinite(fit.covariance), fit.covariance, np.inf)[np.ix_(rows, rows)]

@@ -4,6 +4,7 @@ Flat vectors exist only inside a solver call and in a covariance; a parameter li
 """
 
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 
 import equinox as eqx
@@ -101,19 +102,26 @@ class Parameter:
     tendon: str | None = None
     power: int | None = None
     spans: tuple[str, ...] = ()  # joints on which a tendon's excursion depends together
+    term: str = ""  # field of the module that it is, for example `constant`, where a group has several
     determinable: bool = True  # false where the finger has no such parameter: a tendon that does not cross the joint
 
 
 def describe(model: Model) -> list[Parameter]:
     """The flat vector's entries, in order."""
-    arrays = eqx.filter(model, eqx.is_inexact_array)
-    paths, _ = jax.tree_util.tree_flatten_with_path(arrays)
+    leaves, structure = jax.tree.flatten(eqx.filter(model, eqx.is_inexact_array))
+    return list(_described(structure, tuple(leaf.shape for leaf in leaves)))
+
+
+@cache
+def _described(structure, shapes: tuple[tuple[int, ...], ...]) -> tuple[Parameter, ...]:
+    """Of a model of this structure: names and units do not depend on its numbers."""
+    model = jax.tree.unflatten(structure, [np.zeros(shape) for shape in shapes])
+    paths, _ = jax.tree_util.tree_flatten_with_path(model)
     entries = []
     for path, leaf in paths:
         keys = [getattr(k, "name", getattr(k, "idx", None)) for k in path]
-        for index in np.ndindex(leaf.shape):
-            entries.append(_describe(model, keys, index))
-    return entries
+        entries += [_describe(model, keys, index) for index in np.ndindex(leaf.shape)]
+    return tuple(entries)
 
 
 def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
@@ -154,7 +162,12 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
             active = model.finger.active[index[0]]
             symbol, units = {"constant": ("a0", "N"), "proportional": ("a1", "1")}[field]
             return Parameter(
-                f"tendon friction {tendon} {symbol}", "tendon_friction", units, tendon=tendon, determinable=active
+                f"tendon friction {tendon} {symbol}",
+                "tendon_friction",
+                units,
+                tendon=tendon,
+                term=field,
+                determinable=active,
             )
         case ["effects", int(i), field]:
             effect = model.effects[i]
@@ -163,7 +176,7 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
             units = units_at(model.finger, type(effect), effect.site)
             if index or field not in units:  # a constant that the effect carries
                 return Parameter(f"{label} {index}" if index else label, "constant", "", determinable=False)
-            return Parameter(label, "effects", units[field])
+            return Parameter(label, "effects", units[field], term=field)
     raise AssertionError(keys)
 
 

@@ -70,7 +70,7 @@ def _losses(values: list[float], std: list[float], free, parameters: list[Parame
     return [
         f"{_said(parameters[k], values[k], std[k])}: the tendon would lose more than is pulled"
         for k in free
-        if parameters[k].name.endswith("a1") and values[k] - SURE * std[k] > 1.0
+        if parameters[k].term == "proportional" and values[k] - SURE * std[k] > 1.0
     ]
 
 

@@ -5,14 +5,16 @@ there nor lead out of it. A few plausible losses, as shares of the highest tensi
 every tendon's own trials; the best of them is the start.
 """
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.identify.linearise import white_of
-from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
+from jaxfinger.identify.parameters import Parameter
 from jaxfinger.identify.solve import Source, missed_each
-from jaxfinger.model import Model
+from jaxfinger.model import Model, TendonFriction
 
 # a₀ over the highest tension, and a₁: a tenth to a half of the tension lost, in all the forms that the law can have.
 # The first is taken where no trial prefers another.
@@ -60,14 +62,10 @@ def _is_dead(model: Model, k: int, highest: float) -> bool:
 
 
 def _with_losses(model: Model, tendons: list[int], highest: np.ndarray, shares: tuple[float, float]) -> Model:
-    flat, names = np.array(ravel(model)), [model.finger.tendon_names[k] for k in tendons]
-    positions = [i for i, p in enumerate(describe(model)) if p.group == "tendon_friction" and p.tendon in names]
-    for i in positions:
-        p = describe(model)[i]
-        constant = p.name.endswith("a0")
-        flat[i] = shares[0] * highest[model.finger.tendon_names.index(p.tendon)] if constant else shares[1]
-    at = np.array(positions)
-    return Free.at(model, at).set(model, jax.device_put(flat[at]))
+    friction = model.tendon_friction
+    constant, proportional = np.array(friction.constant), np.array(friction.proportional)
+    constant[tendons], proportional[tendons] = shares[0] * highest[tendons], shares[1]
+    return replace(model, tendon_friction=TendonFriction(*jax.device_put((constant, proportional))))
 
 
 def _costs(model: Model, sources: dict[str, Source], tendons: list[int]) -> Float[np.ndarray, " k"]:

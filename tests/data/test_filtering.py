@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter1d
 
-from jaxfinger.data.filtering import longest_spike, outlier_mask, shrink, smooth, without_spikes
+from jaxfinger.data.filtering import longest_spike, outlier_mask, smooth, without_spikes
 from jaxfinger.errors import UserError
+from jaxfinger.experiments.shrink import shrink
 from jaxfinger.synthetic import motions
 
 
