@@ -206,14 +206,18 @@ def _beyond(values: Float[np.ndarray, " N"], least: float, longest: int) -> Bool
     """Where samples lie by more than `least` beyond all that their surroundings allow."""
     x = np.concatenate([[np.median(values[:5])] * 2, values, [np.median(values[-5:])] * 2])
     spikes = np.zeros(len(x), bool)
-    bend = np.abs(np.diff(x, 2)) > least  # at the sample before a spike's first, and after its last
-    if not bend.any():
+    bend = np.abs(np.diff(x, 2))
+    sharp = bend > least  # at the sample before a spike's first, and after its last
+    if not sharp.any():
         return spikes[2:-2]
     ends = x[0], x[-1]
-    # At an end one side tells less: there a spike is what lies beyond five of the steps that follow it.
-    reach = [5.0 * np.abs(np.diff(part)).max() for part in (values[2:_AT_END], values[-_AT_END:-2])]
-    first, last = np.flatnonzero(bend[:-2]) + 2, np.zeros(len(x), bool)
-    last[1:-2] = bend[1:]
+    # At an end one side tells less: there a spike is what lies beyond five of the steps beside it, and beyond where a
+    # motion leads that sets off or comes to rest within its last four samples, at most by the sharpest bend elsewhere
+    # (less five standard deviations, which are noise's own).
+    sets_off = 6.0 * max(bend[6:-6].max(initial=0.0) - 0.6 * np.sqrt(6.0) * least, 0.0)
+    reach = [5.0 * np.abs(np.diff(part)).max() + sets_off for part in (values[2:_AT_END], values[-_AT_END:-2])]
+    first, last = np.flatnonzero(sharp[:-2]) + 2, np.zeros(len(x), bool)
+    last[1:-2] = sharp[1:]
     for size in range(1, longest + 1):
         a = first[first + size - 1 < len(x) - 2]
         a = a[last[a + size - 1]]
