@@ -148,7 +148,7 @@ def diagnose(
         closures=lines,
         where=tuple(where(problem)) if status is not Status.NO_GAP else (),
         candidates=_candidates(problem, search, chosen, found, shares, fit),
-        none=max(found.none, 1.0 - unlisted) if status is Status.NO_GAP and not relevance else found.none,
+        none=(max if status is Status.NO_GAP and not relevance else min)(found.none, 1.0 - unlisted),
         unlisted=unlisted,
         ambiguous_sets=tuple(tuple(Key(*k) for k in s) for s in found.ambiguous),
         next_experiment=suggestion,
@@ -172,9 +172,7 @@ def _verdict(bench: Bench, state: State, found: Posterior, relevance: tuple[Rele
     if found.ambiguous:
         return Verdict(Status.AMBIGUOUS, found.ambiguous[0][:1])
     matters = [x for x in relevance if not x.tolerated]
-    if found.unlisted <= 0.5 or not matters:
-        return Verdict(Status.NO_GAP, ())
-    return Verdict(Status.UNEXPLAINED, ())
+    return Verdict(Status.UNEXPLAINED if matters else Status.NO_GAP, ())
 
 
 def _closed(
@@ -195,13 +193,15 @@ def _closed(
 
 
 def unlisted_beside(status: Status, found: Posterior, gaps: bool) -> float:
-    """Probability that something is at work which the catalogue lacks. A channel that the named causes leave open on
-    held-out trials says so too, where the search had taken it for the form of their laws: as likely as not, at least.
+    """Probability that something is at work which the catalogue lacks. A channel with a gap of which no cause is named,
+    or that the named causes leave open on held-out trials, says so too: as likely as not, at least.
     Traces in many columns, none of which has a gap, make it as likely as not at most.
     """
     if status is Status.NO_GAP and not gaps:
         return min(found.unlisted, 1.0 - IS_NAMED)
-    return max(found.unlisted, IS_NAMED) if status is Status.PARTLY and not found.ambiguous else found.unlisted
+    if status is Status.UNEXPLAINED or (status is Status.PARTLY and not found.ambiguous):
+        return max(found.unlisted, IS_NAMED)
+    return found.unlisted
 
 
 def _open(bench: Bench) -> frozenset[int]:

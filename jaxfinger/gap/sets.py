@@ -139,11 +139,16 @@ class Visited:
     """Scores of the sets that were weighed, costs not taken off."""
 
     scores: dict[frozenset[Key], float] = field(default_factory=dict)
+    exact: set[frozenset[Key]] = field(default_factory=set)
 
-    def add(self, keys, score: float) -> None:
-        """The best of those that it was given."""
+    def add(self, keys, score: float, exact: bool = False) -> None:
+        """The best of those that it was given. An exact fit replaces what linear ones had promised."""
         key = frozenset(keys)
-        self.scores[key] = max(score, self.scores.get(key, -np.inf))
+        if exact and key not in self.exact:
+            self.exact.add(key)
+            self.scores[key] = score
+        elif exact or key not in self.exact:
+            self.scores[key] = max(score, self.scores.get(key, -np.inf))
 
 
 class Search:
@@ -156,7 +161,7 @@ class Search:
         for effect, site in table.keys:
             sites.setdefault(effect, set()).add(site)
         self.sites = {e: len(s) for e, s in sites.items()}
-        self.visited.add((), bench.null.score)
+        self.visited.add((), bench.null.score, exact=True)
 
     def cost(self, keys: Iterable[Key]) -> float:
         """What a set must explain, in log evidence."""
@@ -269,7 +274,7 @@ class Search:
                     }
                 )
         found = fitted(self.bench, state.problem, variants, starts, weights or state.judged.weights)
-        self.visited.add(found.keys, found.score)
+        self.visited.add(found.keys, found.score, exact=True)
         return found
 
     def run(self) -> State:
