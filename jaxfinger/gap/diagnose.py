@@ -14,7 +14,7 @@ from jaxfinger.errors import UserError, did_you_mean
 from jaxfinger.experiments import not_judged
 from jaxfinger.gap.augment import Fitted, as_refitted, augmented_fit, nominal_fit, values_of
 from jaxfinger.gap.budget import A_GAP, Budget, budget, held_out_gains
-from jaxfinger.gap.closure import closures
+from jaxfinger.gap.closure import RESOLVABLE, closures
 from jaxfinger.gap.exact import Bench, State, Whitened
 from jaxfinger.gap.formula import Parameters, Weights, unexplained
 from jaxfinger.gap.next_experiment import next_experiment
@@ -110,7 +110,7 @@ def diagnose(
     state = search.run()
     found = posterior(search, state)
     relevance = _relevance(problem, bench, tolerance)
-    verdict = _verdict(bench, state, found, relevance)
+    verdict = _verdict(problem, bench, state, found, relevance)
     nominal = nominal_fit(problem)
     chosen = bench.null
     if verdict.status in (Status.PARTLY, Status.AMBIGUOUS):
@@ -163,8 +163,12 @@ def diagnose(
     )
 
 
-def _verdict(bench: Bench, state: State, found: Posterior, relevance: tuple[Relevance, ...]) -> Verdict:
-    """The word for the posterior; whether named causes are all of the gap is for held-out trials to say."""
+def _verdict(
+    problem: Problem, bench: Bench, state: State, found: Posterior, relevance: tuple[Relevance, ...]
+) -> Verdict:
+    """The word for the posterior; whether named causes are all of the gap is for held-out trials to say. A channel
+    whose mean square is surely above its noise's is no «no gap», however few features tell of it.
+    """
     if not bench.columns.items:
         return Verdict(Status.NOT_JUDGED, ())
     if found.named:
@@ -172,7 +176,11 @@ def _verdict(bench: Bench, state: State, found: Posterior, relevance: tuple[Rele
     if found.ambiguous:
         return Verdict(Status.AMBIGUOUS, found.ambiguous[0][:1])
     matters = [x for x in relevance if not x.tolerated]
-    return Verdict(Status.UNEXPLAINED if matters else Status.NO_GAP, ())
+    seen = any(
+        missed > RESOLVABLE * noise
+        for missed, noise in (_mean_squares(problem, x.experiment, x.channel) for x in matters)
+    )
+    return Verdict(Status.UNEXPLAINED if seen or (matters and found.unlisted > 0.5) else Status.NO_GAP, ())
 
 
 def _closed(
