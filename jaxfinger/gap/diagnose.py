@@ -318,6 +318,8 @@ def _relevance(problem: Problem, bench: Bench, tolerance: Mapping[str, float]) -
     out = []
     for e, c in channels:
         missed, noise = _mean_squares(problem, e, c)
+        if missed <= noise:  # what features tell of is too small to be seen beside the noise
+            continue
         signal = max(_signal(problem, other, c) for other, s in problem.stacks.items() if c in s.experiment.channels)
         gap = max(missed - noise, 0.0) ** 0.5
         relative = gap / max(signal, 1e-300)
