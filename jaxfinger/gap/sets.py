@@ -139,16 +139,23 @@ class Visited:
     """Scores of the sets that were weighed, costs not taken off."""
 
     scores: dict[frozenset[Key], float] = field(default_factory=dict)
-    exact: set[frozenset[Key]] = field(default_factory=set)
+    screened: set[frozenset[Key]] = field(default_factory=set)  # those of which `Linear.screen` alone has spoken
 
-    def add(self, keys, score: float, exact: bool = False) -> None:
-        """The best of those that it was given. An exact fit replaces what linear ones had promised."""
+    def screen(self, keys, score: float) -> None:
+        """By one step in the weights, which promises more than they give once they settle: no word against another."""
         key = frozenset(keys)
-        if exact and key not in self.exact:
-            self.exact.add(key)
-            self.scores[key] = score
-        elif exact or key not in self.exact:
+        if key not in self.scores:
+            self.screened.add(key)
+        if key in self.screened:
             self.scores[key] = max(score, self.scores.get(key, -np.inf))
+
+    def add(self, keys, score: float) -> None:
+        """In settled weights: the best of those that it was given."""
+        key = frozenset(keys)
+        if key in self.screened:
+            self.screened.remove(key)
+            self.scores[key] = score
+        self.scores[key] = max(score, self.scores.get(key, -np.inf))
 
 
 class Search:
@@ -161,7 +168,7 @@ class Search:
         for effect, site in table.keys:
             sites.setdefault(effect, set()).add(site)
         self.sites = {e: len(s) for e, s in sites.items()}
-        self.visited.add((), bench.null.score, exact=True)
+        self.visited.add((), bench.null.score)
 
     def cost(self, keys: Iterable[Key]) -> float:
         """What a set must explain, in log evidence."""
@@ -222,7 +229,7 @@ class Search:
         for n, o in enumerate(offers):
             if not set(o.keys) & set(keys):
                 values[n] = score + gains[n] - self.cost([*keys, *o.keys])
-                self.visited.add([*keys, *o.keys], score + gains[n])
+                self.visited.screen([*keys, *o.keys], score + gains[n])
         return value, now.weights, values, linear, now, keys, score
 
     def best_offers(self, screened, most: int = EXACT, same: bool = False) -> list[tuple[float, Offered, np.ndarray]]:
@@ -274,7 +281,7 @@ class Search:
                     }
                 )
         found = fitted(self.bench, state.problem, variants, starts, weights or state.judged.weights)
-        self.visited.add(found.keys, found.score, exact=True)
+        self.visited.add(found.keys, found.score)
         return found
 
     def run(self) -> State:

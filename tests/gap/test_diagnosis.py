@@ -111,8 +111,8 @@ def test_nothing_is_named_where_nothing_is():
     assert found.status is Status.NO_GAP
     assert not found.named
     assert not found.budget
-    assert found.none > 0.8
-    assert found.unlisted < 0.2
+    assert found.none > 0.9
+    assert found.unlisted < 0.1
     assert not found.relevance
     assert max(c.probability for c in found.candidates) < 0.1
     assert found.augmented is found.nominal
