@@ -110,13 +110,17 @@ def _derivative(
 ) -> Float[np.ndarray, "k M"]:
     """Of a spline, per sample to that order: at the samples, or at places counted in samples."""
     last = coefficients.shape[1] - 6
+
+    def at_samples(k: int, before: np.ndarray | slice) -> np.ndarray:
+        near = (coefficients[:, i : i + last + 1][:, before] for i in range(6))
+        return np.sum([w * c for w, c in zip(_B_SPLINE[k], near, strict=True) if w], axis=0)
+
     if at is None:
-        return sum(w * coefficients[:, i : i + last + 1] for i, w in enumerate(_B_SPLINE[order]) if w)
+        return at_samples(order, slice(None))
     before = np.clip(np.floor(at).astype(int), 0, last)
-    away, out = at - before, 0.0
-    for k in range(5, order - 1, -1):  # the interval's polynomial, by Horner's scheme
-        here = sum(w * coefficients[:, before + i] for i, w in enumerate(_B_SPLINE[k]) if w)
-        out = here + out * away / (k - order + 1)
+    away, out = at - before, at_samples(5, before)
+    for k in range(4, order - 1, -1):  # the interval's polynomial, by Horner's scheme
+        out = at_samples(k, before) + out * away / (k - order + 1)
     return out
 
 

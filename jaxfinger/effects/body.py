@@ -8,7 +8,9 @@ from jaxtyping import Array, Float
 
 from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
 
-KEEPS = 0.9  # of a link's mass, the most that may sit elsewhere
+# Of a link's mass, the most that an effect may take from it. A link without mass is no body, and its torques divide by
+# what is left; a tenth is less than any link that CAD describes loses.
+KEEPS = 0.9
 
 
 class Payload(CatalogueEffect):

@@ -1,6 +1,6 @@
 """Nominal parameters that are others than an earlier fit found: candidates where a session is diagnosed against it.
 
-Each is what a term of the nominal model, at one place, has changed by, in the term's own parameters.
+Each is what a term of the nominal model, at one place, has changed by, in the term's own parameters and by its law.
 """
 
 from typing import ClassVar
@@ -12,6 +12,8 @@ from jaxtyping import Array, Float
 
 from jaxfinger.effects.base import CatalogueEffect, amplitude
 from jaxfinger.effects.body import KEEPS
+from jaxfinger.effects.drive import JointOffset
+from jaxfinger.effects.nominal import JointCoulomb, JointDamping, JointElastic, TendonFrictionTerm
 
 
 class Changed(CatalogueEffect):
@@ -22,83 +24,48 @@ class Changed(CatalogueEffect):
     CHANGE: ClassVar = "Find out what was changed on the finger in between, or identify it anew."
 
 
-class ChangedElastic(Changed):
+class ChangedElastic(Changed, JointElastic):
     """k₀ + k₁ q + k₂ q²: what a joint's elastic torque has changed by."""
 
     ID: ClassVar = "changed_elastic"
     GROUP: ClassVar = "elastic"
-    PLACE: ClassVar = "joint"
     HAPPENS: ClassVar = "The joint's elastic torque is another than when the fit was made."
 
-    k0: Float[Array, ""] = amplitude("N m", 0.1, "torque", signed=True)
-    k1: Float[Array, ""] = amplitude("N m/rad", 0.1, "torque/angle", signed=True)
-    k2: Float[Array, ""] = amplitude("N m/rad^2", 0.1, "torque/angle/angle", signed=True)
 
-    def torque(self, x, memory, h):
-        i = self.index[0]
-        return h.at[i].add(self.k0 + self.k1 * x.q[i] + self.k2 * x.q[i] ** 2)
-
-
-class ChangedPretension(Changed):
-    """k₀: what the constant part of a joint's elastic torque has changed by, its stiffness the same."""
+class ChangedPretension(Changed, JointOffset):
+    """τ₀: what the constant part of a joint's elastic torque has changed by, its stiffness the same."""
 
     ID: ClassVar = "changed_pretension"
     GROUP: ClassVar = "elastic"
-    PLACE: ClassVar = "joint"
     HAPPENS: ClassVar = "The pretension of the joint's spring, or a constant torque, is another than before."
 
-    k0: Float[Array, ""] = amplitude("N m", 0.1, "torque", signed=True)
 
-    def torque(self, x, memory, h):
-        return h.at[self.index[0]].add(self.k0)
-
-
-class ChangedFriction(Changed):
-    """s(q̇) (c₀ + c₁ q + c₂ q²): what a joint's Coulomb friction has changed by."""
+class ChangedFriction(Changed, JointCoulomb):
+    """s(q̇) (c₀ + c₁ q + c₂ q²): what a joint's Coulomb friction has changed by, more or less."""
 
     ID: ClassVar = "changed_friction"
     GROUP: ClassVar = "friction"
-    PLACE: ClassVar = "joint"
     HAPPENS: ClassVar = "The joint's dry friction is another than when the fit was made."
 
-    c0: Float[Array, ""] = amplitude("N m", 0.05, "torque", signed=True)
-    c1: Float[Array, ""] = amplitude("N m/rad", 0.05, "torque/angle", signed=True)
-    c2: Float[Array, ""] = amplitude("N m/rad^2", 0.05, "torque/angle/angle", signed=True)
-
-    def joint_friction(self, x, f_j, C, F):
-        i = self.index[0]
-        return F.at[i].add(self.c0 + self.c1 * x.q[i] + self.c2 * x.q[i] ** 2)
+    c0: Float[Array, ""] = amplitude("N m", 0.1, "torque", signed=True)
 
 
-class ChangedDamping(Changed):
-    """d q̇: what a joint's damping has changed by."""
+class ChangedDamping(Changed, JointDamping):
+    """d q̇: what a joint's damping has changed by, more or less."""
 
     ID: ClassVar = "changed_damping"
     GROUP: ClassVar = "damping"
-    PLACE: ClassVar = "joint"
     HAPPENS: ClassVar = "The joint's damping is another than when the fit was made."
 
     d: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed", signed=True)
 
-    def torque(self, x, memory, h):
-        i = self.index[0]
-        return h.at[i].add(self.d * x.qd[i])
 
-
-class ChangedTendonFriction(Changed):
+class ChangedTendonFriction(Changed, TendonFrictionTerm):
     """a₀ + a₁ f: what the affine friction of a tendon's path has changed by."""
 
     ID: ClassVar = "changed_tendon_friction"
     GROUP: ClassVar = "tendon_friction"
-    PLACE: ClassVar = "tendon"
     HAPPENS: ClassVar = "The friction of the tendon's path is another than when the fit was made."
-
-    a0: Float[Array, ""] = amplitude("N", 0.03, "tension", signed=True)
-    a1: Float[Array, ""] = amplitude("1", 0.05, signed=True)
-
-    def loss(self, x, f, C, loss):
-        k = self.index[0]
-        return loss.at[k].add(self.a0 + self.a1 * f[k])
 
 
 class ChangedMomentArm(Changed):

@@ -123,8 +123,8 @@ def sliding(
         pace = np.percentile(np.abs(slow), 95, axis=0)
         most = np.maximum(LOST * pace, ABOVE_NOISE * noise) + ROUNDING * pace.max(initial=0.0)
         slides &= np.all(lost <= most, axis=1)[:, None]
-    # The filter spreads the jump of friction at a reversal, and friction before it slides is not known; nor is what lies
-    # before a recording and after it, on whose image the filter leans.
+    # The filter spreads the jump of friction at a reversal, and friction before it slides is not known; nor is what
+    # lies before a recording and after it, on whose image the filter leans.
     apart = minimum_filter1d(slides, 2 * round(clear / r.step) + 1, axis=0, mode="constant", cval=False)
     # Reaches back only: a free joint that breaks away does so at once, and takes the others with it.
     half = round(0.5 * BREAKAWAY * width(r.spec.cutoff) / r.step)

@@ -89,7 +89,8 @@ def diagnose(
     if against is not None and (predictions is not None or recipe not in (None, against.recipe)):
         raise UserError("an earlier fit brings its own recipe and no other simulator; leave the other one out")
     recipe, tolerance = recipe or (against.recipe if against else Recipe()), dict(tolerance or {})
-    catalogue = catalogue_for(recipe, effects) | (changes_of(against) if against else {})
+    changed = changes_of(against) if against else {}
+    catalogue = catalogue_for(recipe, effects) | changed
     if unknown := set(without) - set(catalogue):
         raise UserError(
             f"the catalogue has no effect {', '.join(sorted(unknown))} to leave out"
@@ -99,9 +100,8 @@ def diagnose(
     problem = build(session, recipe, progress, predictions, COARSE if quick else 1, against)
     bench = Bench.of(problem, Parameters())
     kept = set(problem.fit.recipe.model.terms) | set(without)
-    if "changed_pretension" in catalogue:
-        kept.add("joint_offset")  # the same law
-    catalogue = {k: c for k, c in catalogue.items() if k not in kept}
+    laws = {law for c in changed.values() for law in c.__mro__}  # an effect whose law a change has would be its copy
+    catalogue = {k: c for k, c in catalogue.items() if k not in kept and (k in changed or c not in laws)}
     progress("reading the signatures of all effects")
     screening = Screening.of(problem, variants(catalogue, problem.nominal.finger, problem.scales), progress)
     table = table_of(problem, bench, screening)
@@ -130,7 +130,7 @@ def diagnose(
         suggestion = next_experiment(problem, search.rivals(state, found.ambiguous[0]))
     fit = augmented.fit if augmented else nominal.fit
     causes = _causes(chosen, found, shares, fit)
-    unlisted = unlisted_beside(status, found, bool(relevance))
+    none, unlisted = agreeing(status, found, bool(relevance))
     left = explained(chosen.problem, chosen.r)
     return Diagnosis(
         status=status,
@@ -148,7 +148,7 @@ def diagnose(
         closures=lines,
         where=tuple(where(problem)) if status is not Status.NO_GAP else (),
         candidates=_candidates(problem, search, chosen, found, shares, fit),
-        none=(max if status is Status.NO_GAP and not relevance else min)(found.none, 1.0 - unlisted),
+        none=none,
         unlisted=unlisted,
         ambiguous_sets=tuple(tuple(Key(*k) for k in s) for s in found.ambiguous),
         next_experiment=suggestion,
@@ -200,16 +200,18 @@ def _closed(
     return Status.EXPLAINED if found.unlisted <= 0.5 or not minded else status
 
 
-def unlisted_beside(status: Status, found: Posterior, gaps: bool) -> float:
-    """Probability that something is at work which the catalogue lacks. A channel with a gap of which no cause is named,
-    or that the named causes leave open on held-out trials, says so too: as likely as not, at least.
-    Traces in many columns, none of which has a gap, make it as likely as not at most.
+def agreeing(status: Status, found: Posterior, gaps: bool) -> tuple[float, float]:
+    """Probabilities that nothing is at work, and that something is which the catalogue lacks, as far as the verdict's
+    words allow. A channel with a gap of which no cause is named, or that the named causes leave open on held-out
+    trials, makes the second one half at least. Traces in many columns, none of which has a gap, make it one half at
+    most.
     """
     if status is Status.NO_GAP and not gaps:
-        return min(found.unlisted, 1.0 - IS_NAMED)
-    if status is Status.UNEXPLAINED or (status is Status.PARTLY and not found.ambiguous):
-        return max(found.unlisted, IS_NAMED)
-    return found.unlisted
+        unlisted = min(found.unlisted, 1.0 - IS_NAMED)
+        return max(found.none, 1.0 - unlisted), unlisted
+    left_open = status is Status.UNEXPLAINED or (status is Status.PARTLY and not found.ambiguous)
+    unlisted = max(found.unlisted, IS_NAMED) if left_open else found.unlisted
+    return min(found.none, 1.0 - unlisted), unlisted
 
 
 def _open(bench: Bench) -> frozenset[int]:
@@ -321,7 +323,7 @@ def _relevance(problem: Problem, bench: Bench, tolerance: Mapping[str, float]) -
         if missed <= noise:  # what features tell of is too small to be seen beside the noise
             continue
         signal = max(_signal(problem, other, c) for other, s in problem.stacks.items() if c in s.experiment.channels)
-        gap = max(missed - noise, 0.0) ** 0.5
+        gap = (missed - noise) ** 0.5
         relative = gap / max(signal, 1e-300)
         units = channel_units(c, problem.session.finger.prismatic)
         out.append(Relevance(e, c, units, gap, signal, relative, c in tolerance and relative <= tolerance[c]))

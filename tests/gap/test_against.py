@@ -46,7 +46,7 @@ def test_nothing_has_changed(earlier):
 @pytest.mark.parametrize(
     ("truth", "group"),
     [
-        (changed("changed_pretension", "PIP", k0=1e-3), "elastic"),
+        (changed("changed_pretension", "PIP", tau=1e-3), "elastic"),
         (changed("changed_mass", "DIP", m=1e-3), "mass"),
     ],
     ids=lambda x: x if isinstance(x, str) else "",

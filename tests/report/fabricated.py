@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 from jaxfinger.effects import CATALOGUE
-from jaxfinger.gap.diagnose import unlisted_beside
+from jaxfinger.gap.diagnose import agreeing
 from jaxfinger.gap.posterior import Posterior
 from jaxfinger.gap.propose import Proposal
 from jaxfinger.gap.result import (
@@ -251,7 +251,7 @@ def every() -> dict[str, Diagnosis]:
         "still_open": replace(
             one,
             status=Status.PARTLY,
-            unlisted=unlisted_beside(Status.PARTLY, Posterior({}, {}, 0.0, 0.02, (), ()), gaps=True),
+            unlisted=agreeing(Status.PARTLY, Posterior({}, {}, 0.0, 0.02, (), ()), gaps=True)[1],
             closures=(LINES[0], replace(LINES[1], after=3.1e-5), LINES[2]),
         ),
         "ambiguous": replace(
