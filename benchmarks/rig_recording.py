@@ -32,8 +32,8 @@ from jaxfinger.rig.convert import header
 from jaxfinger.rig.operator import Nobody
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
-from jaxfinger.rig.runner import log_path
 from jaxfinger.rig.safety import Supervisor
+from jaxfinger.rig.session import log_path
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.controller import Controller
 from jaxfinger.rig.simulated.examples import rig_toml

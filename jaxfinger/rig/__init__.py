@@ -13,6 +13,6 @@ from jaxfinger.rig.plan import read_plan as read_plan
 from jaxfinger.rig.recover import recover as recover
 from jaxfinger.rig.rig_file import parse_rig as parse_rig
 from jaxfinger.rig.rig_file import read_rig as read_rig
-from jaxfinger.rig.runner import Outcome as Outcome
-from jaxfinger.rig.runner import run as run
 from jaxfinger.rig.safety import Supervisor as Supervisor
+from jaxfinger.rig.session import Outcome as Outcome
+from jaxfinger.rig.session import run as run

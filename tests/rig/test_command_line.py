@@ -16,7 +16,7 @@ import pytest
 from jaxfinger.data import read_session
 from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.matrix import END_S, OFF_S, STOP_S
-from jaxfinger.rig.runner import log_path
+from jaxfinger.rig.session import log_path
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.examples import rig_toml
 from tests.rig.conftest import SHORT

@@ -12,7 +12,7 @@ import pytest
 
 from jaxfinger.data import check_file, read_session
 from jaxfinger.rig import recover, wal
-from jaxfinger.rig.runner import log_path
+from jaxfinger.rig.session import log_path
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.examples import rig_toml
 

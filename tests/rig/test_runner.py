@@ -14,7 +14,7 @@ from jaxfinger.errors import UserError
 from jaxfinger.rig import parse_plan, parse_rig, recorder, recover, runner, wal
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import State, Trip
-from jaxfinger.rig.runner import log_path, run
+from jaxfinger.rig.session import log_path, run
 from jaxfinger.rig.simulated.controller import Controller
 from jaxfinger.rig.simulated.examples import rig_toml
 

@@ -1,0 +1,206 @@
+"""A whole session: the trials of a plan that its log does not hold yet, one after the other; the log becomes a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import h5py
+
+from jaxfinger.errors import UserError
+from jaxfinger.rig import convert, wal
+from jaxfinger.rig.backend import Rig, Setup, TensionRamp
+from jaxfinger.rig.channels import DYNAMIC_BANDWIDTH, Filter, RigDescription
+from jaxfinger.rig.contract import State, Trip
+from jaxfinger.rig.operator import Nobody, Operator
+from jaxfinger.rig.plan import Plan
+from jaxfinger.rig.protocols import DYNAMIC, Protocol, Reached, Settled, Tare
+from jaxfinger.rig.reader import Reader
+from jaxfinger.rig.recorder import Recorder
+from jaxfinger.rig.recover import read_log
+from jaxfinger.rig.runner import Runner, View
+from jaxfinger.rig.safety import Supervisor
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A run: trials that are complete, why it ended early (empty: it did not), and the log to resume from."""
+
+    session: Path
+    complete: tuple[str, ...]
+    cause: str
+    log: Path | None
+
+
+def log_path(output: Path) -> Path:
+    """Where the log of a session lies."""
+    return output.with_name(output.name + ".wal")
+
+
+def refuse_filtered(plan: Plan, rig: RigDescription, filters: dict[str, Filter]) -> None:
+    """Refuse dynamic experiments on terminals whose filter spoils them: 1 kHz of samples are not 1 kHz of signal."""
+    slow = [
+        name for name, f in filters.items() if f.enabled and (f.bandwidth is None or f.bandwidth < DYNAMIC_BANDWIDTH)
+    ]
+    dynamic = [t.name for t in plan.trials if t.experiment in DYNAMIC]
+    if slow and dynamic and not rig.allow_filtered:
+        width = filters[slow[0]].bandwidth
+        raise UserError(
+            f"the terminal of '{slow[0]}' filters at {'an unknown bandwidth' if width is None else f'{width:g} Hz'} "
+            f"({len(slow)} channels do), which spoils {dynamic[0]}; switch the filter off (CoE 0x8000:06) or set "
+            f"allow_filtered = true in [rig]."
+        )
+
+
+def run(
+    plan: Plan,
+    rig: Rig,
+    output: str | Path,
+    resume: bool = False,
+    operator: Operator | None = None,
+    observe: Callable[[View], None] | None = None,
+) -> Outcome:
+    """Record a session: every trial of the plan that the log does not hold yet.
+
+    Publishes what there is, also when cut short. Raises UserError before anything moves where plan, rig and files do
+    not fit together.
+    """
+    output, operator = Path(output), operator or Nobody()
+    path = log_path(output)
+    log = _earlier(plan, path, output, resume)
+    with rig:
+        filters = rig.filters()
+        refuse_filtered(plan, rig.description, filters)
+        head = convert.header(rig.description, plan.text, filters, rig.fingerprint())
+        head["created"] = log.header["created"] if log else datetime.now(UTC).isoformat(timespec="milliseconds")
+        recorder = Recorder(path, head, resume=log is not None)
+        try:
+            if log is not None:
+                _backlog(log, rig, recorder)
+            cause = _trials(plan, rig, recorder, operator, observe, log)
+        except UserError:
+            recorder.close()
+            if log is None:  # nothing moved, so there is nothing to resume
+                path.unlink(missing_ok=True)
+            raise
+        except BaseException:
+            recorder.close()
+            raise
+    recorder.close()
+    if recorder.hangs:
+        return Outcome(output, (), cause or recorder.failure or "", path)
+    cause = cause or recorder.failure or ""
+    log = read_log(path)
+    for tag, value in recorder.unwritten:
+        if tag == wal.END and log.recordings and log.recordings[-1].end is None:
+            log.recordings[-1].end = value
+    try:
+        convert.publish(log, output, overwrite=resume)
+    except UserError as error:
+        ended = f"{cause}; " if cause else ""
+        raise UserError(
+            f"{ended}{str(error).rstrip('.')}; jaxfinger recover {path} makes it once there is room."
+        ) from error
+    if not cause:
+        path.unlink()
+    done = tuple(r.name for r in log.recordings if r.complete)
+    return Outcome(output, done, cause, path if cause else None)
+
+
+def _earlier(plan: Plan, path: Path, output: Path, resume: bool) -> convert.Log | None:
+    """The log to go on with, or None; refuses to mix sessions or to overwrite one."""
+    if not resume:
+        if output.exists():
+            raise UserError(f"{output}: exists already and is not overwritten; choose another name.")
+        if path.exists():
+            raise UserError(
+                f"{path}: a recording was interrupted here; go on with --resume, or rescue it with jaxfinger recover."
+            )
+        return None
+    if not path.exists():
+        raise UserError(f"{path}: there is no interrupted recording to resume; leave --resume out.")
+    log = read_log(path)
+    if log.header["plan"] != plan.text:
+        raise UserError(
+            f"{path}: was recorded with another plan than {plan.path}; resume with the plan it was begun with."
+        )
+    if output.exists():
+        with h5py.File(output, "r") as file:
+            if file.attrs.get("created") != log.header["created"]:
+                raise UserError(f"{output}: is not the session that {path.name} belongs to; choose another name.")
+    return log
+
+
+def _backlog(log: convert.Log, rig: Rig, recorder: Recorder) -> None:
+    """Close the trial in which the recorder died, with what the controller's ring still holds of it."""
+    if not log.recordings or log.recordings[-1].end is not None:
+        return
+    end = {"complete": False, "cause": "the recorder was killed", "trip": int(Trip.HOST)}
+    last = log.last_seq
+    if last is not None and rig.fingerprint() == log.header["fingerprint"]:
+        status = rig.status()
+        until = status.trip_seq if status.state is State.TRIPPED else status.head
+        rig.rewind(last + 1)
+        while last < until - 1:
+            block = rig.read_block(rig.description.deadlines.stale_s)
+            recorder.block(block)
+            last = int(block.seq[-1])
+        end["seq"] = max(until, log.last_seq + 1) if log.last_seq is not None else until
+    else:
+        end["seq"] = 0 if last is None else last + 1
+    recorder.put(wal.END, end)
+
+
+def _reference(rig: RigDescription) -> Protocol:
+    """Tendon encoders read zero with the finger straight and its tendons under 2 N."""
+    straight = dict.fromkeys(rig.finger.joint_names, 0.0)
+    pretension = {n: 2.0 for n, active in zip(rig.finger.tendon_names, rig.finger.active, strict=True) if active}
+    yield Setup("Fix the finger straight: all joints at 0°.", fixed=straight)
+    yield TensionRamp(pretension, min(10.0, rig.limits.tension_rate))
+    yield Reached()
+    yield Settled(pretension)
+    yield Tare(("excursion",))
+
+
+def _trials(
+    plan: Plan,
+    rig: Rig,
+    recorder: Recorder,
+    operator: Operator,
+    observe: Callable[[View], None] | None,
+    log: convert.Log | None,
+) -> str:
+    """Record the trials that the log does not hold; returns why the run ended early, or an empty string."""
+    earlier = log.recordings if log else []
+    done = {r.start["planned"] for r in earlier if r.complete}
+    names = {r.name for r in earlier}
+    ends = [r.start["session_start"] + sum(map(len, r.blocks)) / rig.description.rate_hz for r in earlier]
+    begun = max(ends, default=0.0)
+    left = [t for t in plan.trials if t.name not in done]
+    reader = Reader(rig, recorder, Supervisor(rig.description))
+    runner = Runner(rig, reader, operator, observe)
+    try:
+        runner.watch.start()
+        reader.start(lambda: runner.watch.join("reader"))
+        try:
+            runner.ready(plan.operator)
+            runner.carry_out(_reference(rig.description), ("reference", 0, len(plan.trials)))
+        except UserError as error:
+            if not runner.watch.guards and reader.violation is None:  # nothing was armed
+                raise UserError(str(error)) from error
+            return runner.ended(error)
+        for trial in left:
+            name, again = trial.name, 1
+            while name in names:
+                again += 1
+                name = f"{trial.name}-{again}"
+            if cause := runner.trial(trial, name, plan.trials.index(trial) + 1, len(plan.trials), begun):
+                return f"{name}: {cause}"
+        return runner.let_go()
+    except KeyboardInterrupt:
+        return runner.interrupted()
+    finally:
+        runner.watch.close()
+        reader.close()

@@ -1,0 +1,71 @@
+"""What a step of a protocol waits for: each is asked with every block, and says whether it has come."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxfinger.rig.backend import Block, Setup
+from jaxfinger.rig.channels import RigDescription
+from jaxfinger.rig.contract import State
+from jaxfinger.rig.protocols import Covered, Settled
+from jaxfinger.rig.reader import Reader
+
+
+class Elapsed:
+    """So many seconds of device time from now on."""
+
+    def __init__(self, reader: Reader, seconds: float):
+        self._until = reader.latest_t + int(seconds * 1e9)
+
+    def __call__(self, block: Block) -> bool:
+        return int(block.t_ns[-1]) >= self._until
+
+
+def reached(block: Block, number: int) -> bool:
+    return bool(np.any((block.acknowledged == number & 0xFFFF) & (block.state == State.ARMED)))
+
+
+class Steady:
+    """Every tension within its band for long enough."""
+
+    def __init__(self, rig: RigDescription, step: Settled):
+        self._columns = rig.columns("tension", step.tensions)
+        self._targets = np.array(list(step.tensions.values()))
+        self._within, self._need = step.within, round(step.seconds * rig.rate_hz)
+        self._good = 0
+
+    def __call__(self, block: Block) -> bool:
+        good = (np.abs(block.x[:, self._columns] - self._targets) < self._within).all(1)
+        bad = np.flatnonzero(~good)
+        self._good = self._good + len(block) if not len(bad) else len(block) - 1 - int(bad[-1])
+        return self._good >= self._need
+
+
+class Passes:
+    """Every joint through its range, to and fro, often enough."""
+
+    def __init__(self, rig: RigDescription, step: Covered):
+        self._columns = rig.columns("joint_position", step.joints)
+        limits = rig.finger.limits[[rig.finger.joint_names.index(name) for name in step.joints]]
+        slack = (1 - step.share) / 2 * (limits[:, 1] - limits[:, 0])
+        self._low, self._high = limits[:, 0] + slack, limits[:, 1] - slack
+        self._side, self._turns, self._need = [0] * len(limits), [0] * len(limits), 2 * step.passes
+
+    def __call__(self, block: Block) -> bool:
+        for j, column in enumerate(self._columns):
+            for side, hit in ((1, block.x[:, column] >= self._high[j]), (-1, block.x[:, column] <= self._low[j])):
+                if self._side[j] != side and hit.any():
+                    self._turns[j] += self._side[j] != 0
+                    self._side[j] = side
+        return min(self._turns) >= self._need
+
+
+class AtPose:
+    """Fixed joints where their fixtures hold them."""
+
+    def __init__(self, rig: RigDescription, setup: Setup):
+        self._columns = rig.columns("joint_position", setup.fixed)
+        self._pose = np.array(list(setup.fixed.values()))
+
+    def __call__(self, block: Block) -> bool:
+        return not self._columns or bool((np.abs(block.x[-1, self._columns] - self._pose) < 0.02).all())
