@@ -61,7 +61,6 @@ class ByColumn:
     """Rows, column by column: their coefficients on the features, and their products, each made once."""
 
     def __init__(self, columns: Columns, x: Float[np.ndarray, "k N"]):
-        self.count = len(x)
         self.parts = [x[:, c.rows] for c in columns.items]
         self.B: Float[np.ndarray, "features k"] = np.concatenate(
             [c.basis.T @ p.T for c, p in zip(columns.items, self.parts, strict=True)]

@@ -56,7 +56,7 @@ def fit_with(
         screened = search.screened(state)
         found = search.best_offers(screened, FORMS, same=True)
         forms = [(o, a) for _, o, a in found if o.keys == found[0][1].keys]
-        state = max((search.exactly(state, None, o, a, screened[1]) for o, a in forms), key=lambda s: s.score)
+        state = max((search.exactly(state, None, o, a, screened.now.weights) for o, a in forms), key=lambda s: s.score)
     progress("fitting the effects and all nominal parameters together")
     return augmented_fit(problem, state).fit
 

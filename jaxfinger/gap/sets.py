@@ -6,6 +6,7 @@ effect that is in cost less and the log of its sites alone: one cause that acts 
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,7 +14,7 @@ from jaxtyping import Float, Int
 from jaxfinger.effects import CatalogueEffect, Scales, Site
 from jaxfinger.gap.columns import ByColumn
 from jaxfinger.gap.exact import Bench, State, Whitened, fitted, prior_of
-from jaxfinger.gap.formula import Linear, Weights
+from jaxfinger.gap.formula import Judged, Linear, Weights
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.screening import Screening
 from jaxfinger.gap.signatures import Variant
@@ -158,6 +159,25 @@ class Visited:
         self.scores[key] = max(score, self.scores.get(key, -np.inf))
 
 
+class Rest(NamedTuple):
+    """What is left of a set without one of its causes, linearly."""
+
+    keys: list[Key]
+    r: Float[np.ndarray, " N"]
+    slopes: Float[np.ndarray, "k N"]
+    score: float
+
+
+class Screened(NamedTuple):
+    """A set, or what is left of it, and the value of every set with one offer more."""
+
+    keys: list[Key]
+    score: float
+    linear: Linear
+    now: Judged
+    values: Float[np.ndarray, " offers"]
+
+
 class Search:
     """Sets of causes of one file."""
 
@@ -204,8 +224,8 @@ class Search:
             self.bench.null.judged,
         )
 
-    def without(self, state: State, cause: int | None) -> tuple[list[Key], np.ndarray, np.ndarray, float]:
-        """What is left of a state without one cause, linearly: keys, residual, slopes and score."""
+    def without(self, state: State, cause: int | None) -> Rest:
+        """What is left of a state without one cause; all of it for None."""
         kept = [i for i in range(len(state.effects)) if i != cause]
         at = [k for k, c in enumerate(state.coordinates) if c.effect in kept]
         keys, slopes = [state.keys[i] for i in kept], state.slopes[at]
@@ -213,14 +233,11 @@ class Search:
         if cause is not None:
             score = self.bench.judge(state.problem, state.nominal, r, slopes, state.sizes()[at]).score
         self.visited.add(keys, score)
-        return keys, r, slopes, score
+        return Rest(keys, r, slopes, score)
 
-    def screened(self, state: State, without: int | None = None):
-        """The state, or what is left of it without one cause, linearly: its value, its weights, and of every offer the
-        value of the set with it.
-        """
+    def screened(self, state: State, without: int | None = None) -> Screened:
+        """Every offer on top of the state, or of what is left of it without one cause."""
         keys, r, slopes, score = self.without(state, without)
-        value = score - self.cost(keys)
         linear = self.linear(state, r, slopes)
         now = linear.judge(np.empty(0, int), start=state.judged.weights)
         offers = self.table.offers
@@ -230,13 +247,15 @@ class Search:
             if not set(o.keys) & set(keys):
                 values[n] = score + gains[n] - self.cost([*keys, *o.keys])
                 self.visited.screen([*keys, *o.keys], score + gains[n])
-        return value, now.weights, values, linear, now, keys, score
+        return Screened(keys, score, linear, now, values)
 
-    def best_offers(self, screened, most: int = EXACT, same: bool = False) -> list[tuple[float, Offered, np.ndarray]]:
+    def best_offers(
+        self, screened: Screened, most: int = EXACT, same: bool = False
+    ) -> list[tuple[float, Offered, np.ndarray]]:
         """The offers whose sets are worth most once the weights settle, with amplitudes: one an effect, site and
         choice, unless all forms of the `same` are wanted.
         """
-        _, _, values, linear, now, keys, score = screened
+        keys, score, linear, now, values = screened
         found, taken = [], {}
         for n in np.argsort(-values)[: 4 * SHORT_LIST]:
             o = self.table.offers[n]
@@ -299,7 +318,7 @@ class Search:
                 continue
             state = self._pruned(grown)
         for i in range(len(state.effects)):  # what each could be replaced by
-            self.screened(state, i)
+            self.best_offers(self.screened(state, i))
         return state
 
     def _grown(self, state: State) -> State | None:
@@ -308,7 +327,7 @@ class Search:
         for value, offer, amplitudes in self.best_offers(screened):
             if value < now - CLOSE:
                 continue
-            found = self.exactly(state, None, offer, amplitudes, screened[1])
+            found = self.exactly(state, None, offer, amplitudes, screened.now.weights)
             if best is None or self.value(found) > self.value(best):
                 best = found
         return best if best is not None and self.value(best) > now else None
@@ -317,8 +336,8 @@ class Search:
         """Without those causes that explain too little beside the others."""
         while len(state.effects) > 1:
             now = self.value(state)
-            parts = [self.without(state, i) for i in range(len(state.effects))]
-            left = [score - self.cost(keys) for keys, _, _, score in parts]
+            rest = [self.without(state, i) for i in range(len(state.effects))]
+            left = [x.score - self.cost(x.keys) for x in rest]
             worst = int(np.argmax(left))
             if left[worst] < now - CLOSE:
                 return state
@@ -335,7 +354,7 @@ class Search:
             for value, offer, amplitudes in self.best_offers(screened, 1):
                 if value < now - 0.5 * CLOSE or offer.keys == (state.keys[i],):
                     continue
-                found = self.exactly(state, i, offer, amplitudes, screened[1])
+                found = self.exactly(state, i, offer, amplitudes, screened.now.weights)
                 if self.value(found) > max(now + 1.0, self.value(best) if best else -np.inf):
                     best = found
         return best
@@ -356,23 +375,23 @@ class Search:
         screened = self.screened(state, own)
         for key in members:
             if key != state.keys[own] and (best := self._best_of(screened, key)) is not None:
-                out.append(self.exactly(state, own, *best, screened[1]))
+                out.append(self.exactly(state, own, *best, screened.now.weights))
         return out
 
-    def _best_of(self, screened, key: Key) -> tuple[Offered, np.ndarray] | None:
-        _, weights, values, linear, *_ = screened
+    def _best_of(self, screened: Screened, key: Key) -> tuple[Offered, np.ndarray] | None:
+        _, _, linear, now, values = screened
         mine = [n for n, o in enumerate(self.table.offers) if o.keys == (key,) and np.isfinite(values[n])]
         if not mine:
             return None
         offer = self.table.offers[max(mine, key=lambda n: values[n])]
-        return offer, linear.judge(offer.columns, offer.low, offer.high, start=weights).amplitudes
+        return offer, linear.judge(offer.columns, offer.low, offer.high, start=now.weights).amplitudes
 
     def alone(self, keys: Iterable[Key]) -> dict[Key, tuple[Offered, np.ndarray, np.ndarray]]:
         """Of causes alone on top of the nominal model, linearly: the shape that suits best, amplitudes, their std."""
         screened, out = self.screened(self.bench.null), {}
         for key in keys:
             if (best := self._best_of(screened, key)) is not None:
-                out[key] = (*best, screened[3].std(best[0].columns, screened[1]))
+                out[key] = (*best, screened.linear.std(best[0].columns, screened.now.weights))
         return out
 
 
