@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,12 @@ import scipy.io
 import scipy.sparse
 
 from jaxfinger.data.opening import why_closed, why_unreadable
+from jaxfinger.data.probe import rest, survives
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.errors import UserError
 
 _NUMBERS = ("double", "single", "logical", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64")
+_SLOWEST = 1e6  # bytes a second: a hundredth of what SciPy reads from a compressed file
 _OBJECT = (
     "is a MATLAB object ({kind}), which only MATLAB can open; save its members as arrays, as `x.Data` and `x.Time`"
 )
@@ -56,7 +59,16 @@ def _on_clock(variable: Variable, variables: Mapping[str, Variable]) -> Variable
     return Variable(values.T if turned else values, clock=variable.clock)
 
 
+def _visit(path: Path) -> None:
+    rest(path.stat().st_size / _SLOWEST)
+    with warnings.catch_warnings(), suppress(Exception):  # what it raises, the reader meets too
+        warnings.simplefilter("ignore")
+        scipy.io.loadmat(path)
+
+
 def _scipy(path: Path) -> Mapping[str, Any]:
+    if not survives(path, _visit):
+        raise UserError(f"{path}: is damaged in its structure; save it in MATLAB again")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.filterwarnings("error", "Duplicate variable name")

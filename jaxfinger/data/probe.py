@@ -1,7 +1,8 @@
-"""Touch every corner of an HDF5 file in a child process first.
+"""Touch every corner of a file in a child process first.
 
-libhdf5 trusts what it reads: a few damaged bytes in the structure of a file can crash it or send it round in circles,
-where no exception handler helps. A child that dies, raises, or spends its processor time says so without harm.
+libhdf5 and SciPy's reader of MATLAB's files trust what they read: a few damaged bytes can crash them or send them round
+in circles, where no exception handler helps. A child that dies, raises, or spends its processor time says so without
+harm.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import faulthandler
 import os
 import signal
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -22,40 +24,41 @@ _LEAST_OBJECT = 16  # bytes: no object of a file takes less, so a walk over more
 _SMALL = 10_000  # elements
 
 
-def survives(path: str | os.PathLike) -> bool:
-    """Whether a child process gets through the structure of the file; True where the system cannot fork.
+def survives(path: str | os.PathLike, visit: Callable[[Path], None] | None = None) -> bool:
+    """Whether a child process gets through a visit of the file, by default a walk through the structure of an HDF5
+    file; True where the system cannot fork.
 
     A file that does not open survives: the reader will meet the reason, and say it.
     """
     if not hasattr(os, "fork"):
         return True
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a fork beside JAX's threads: the child touches HDF5 alone, and leaves at once
+        warnings.simplefilter("ignore")  # a fork beside JAX's threads: the child reads the file, and leaves at once
         child = os.fork()
     if child == 0:
         status = 1
         try:
             faulthandler.disable()
             signal.signal(signal.SIGPROF, signal.SIG_DFL)
-            _rest()
-            status = _visit(Path(path))
+            rest()
+            (visit or _walk_through)(Path(path))
+            status = 0
         finally:
             os._exit(status)
     return os.waitpid(child, 0)[1] == 0
 
 
-def _rest() -> None:
-    """Start the measure of the processor time anew."""
-    signal.setitimer(signal.ITIMER_PROF, _PATIENCE)
+def rest(more: float = 0.0) -> None:
+    """Start the measure of the processor time anew, of a visit that may take `more` seconds than an object does."""
+    signal.setitimer(signal.ITIMER_PROF, _PATIENCE + more)
 
 
-def _visit(path: Path) -> int:
+def _walk_through(path: Path) -> None:
     try:
         file = h5py.File(path, "r")
-    except Exception:
-        return 0
+    except Exception:  # whatever it is, the reader meets it too
+        return
     _walk(file, path.stat().st_size // _LEAST_OBJECT)
-    return 0
 
 
 def _walk(file: h5py.File, most: int) -> None:
@@ -65,7 +68,7 @@ def _walk(file: h5py.File, most: int) -> None:
         group = waiting.pop()
         _attempt(lambda item=group: dict(item.attrs))
         for name in group:
-            _rest()
+            rest()
             most -= 1
             if most < 0:
                 raise RecursionError("more objects than the file can hold")
@@ -90,5 +93,5 @@ def _attempt(action):
     """One object that cannot be read does no harm to the others: the reader names it."""
     try:
         return action()
-    except Exception:
+    except Exception:  # h5py raises whatever libhdf5 met
         return None

@@ -8,6 +8,7 @@ import pytest
 import scipy.io
 
 from jaxfinger.data import check_file, import_file, read_session, smooth
+from jaxfinger.data.matlab import load_mat
 from jaxfinger.errors import UserError
 from tests.data.conftest import ONE_JOINT
 
@@ -62,6 +63,15 @@ def test_matlab_version_5(mapping, tmp_path):
     assert_imported(tmp_path / "out.h5")
     with pytest.raises(UserError, match="exists already"):
         import_file([tmp_path / "log.mat"], mapping, tmp_path / "out.h5")
+
+
+def test_a_byte_that_crashes_the_reader_of_matlab_files_is_said(tmp_path):
+    """One byte of a length is enough."""
+    raw = bytearray((Path(__file__).parent / "cases" / "simulink-signal-of-two-columns" / "log.mat").read_bytes())
+    raw[29337] = 50
+    (tmp_path / "log.mat").write_bytes(raw)
+    with pytest.raises(UserError, match=r"log\.mat: is damaged in its structure; save it in MATLAB again"):
+        load_mat(tmp_path / "log.mat")
 
 
 def test_matlab_version_7_3_with_a_structure(mapping, tmp_path):
