@@ -200,12 +200,11 @@ def at_one_model(bench: Bench, problem: Problem, effects: list[CatalogueEffect],
     coordinates = _coordinates(effects, problem.scales)
     reach = np.full(len(coordinates), STEP)
     changes, slopes = _evaluate(signatures, effects, coordinates, reach)
-    # An amplitude is measured in the gap: one prior standard deviation changes as much as is missed in all.
+    # An amplitude is measured in the gap: one prior standard deviation changes as much as is missed in all. One that
+    # changes nothing here keeps its own unit, as the warmth of a friction that there is none of.
     plain = Whitened(problem, bench.columns, Weights(*np.ones((2, len(bench.columns.items)))))
     norm = np.linalg.norm(plain(slopes), axis=1)
-    grow = np.array(
-        [bench.gap / max(n, 1e-300) if c.amplitude else 1.0 for c, n in zip(coordinates, norm, strict=True)]
-    )
+    grow = np.array([bench.gap / n if c.amplitude and n > 0.0 else 1.0 for c, n in zip(coordinates, norm, strict=True)])
     coordinates = [replace(c, unit=c.unit * g) if c.amplitude else c for c, g in zip(coordinates, grow, strict=True)]
     slopes = slopes * grow[:, None]
     r = problem.r - changes.sum(axis=0)

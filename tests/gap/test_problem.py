@@ -14,6 +14,7 @@ from jaxfinger.gap.signatures import Signatures, Variant
 from jaxfinger.gap.where import where
 from jaxfinger.identify import Recipe
 from jaxfinger.identify.parameters import describe, ravel
+from jaxfinger.identify.recipe import ModelRecipe
 from jaxfinger.synthetic import SpecimenPlant, nominal_model, recipe_from, simulate, study_finger
 
 GAIN = 0.2
@@ -111,6 +112,19 @@ def test_a_length_is_found_while_the_share_stays_at_its_most(problem, start):
     found = at_one_model(bench, there, [variant.with_shape(x0=x0).at(there.nominal.finger, {"a": a})], white(bench))
     assert float(found.effects[0].x0) == pytest.approx(0.02, abs=0.003)
     assert found.effects[0].delta == 0.5
+
+
+def test_an_amplitude_that_changes_nothing_keeps_a_size(session):
+    """The warmth of a Coulomb friction that the model has none of, beside the damping that is warm as well."""
+    terms = tuple(t for t in ModelRecipe().terms if t != "joint_coulomb")
+    problem = build(session, Recipe(model=ModelRecipe(terms=terms)))
+    bench = Bench.of(problem, Parameters())
+    kind, site = CATALOGUE["joint_friction_warmup"], problem.nominal.finger.joint_names[:1]
+    effect = kind.at(problem.nominal.finger, site, a=0.3, d=1e-4, T=100.0, by=0.0)
+    beside = CATALOGUE["joint_torque_friction"].at(problem.nominal.finger, site, mu=0.1)
+    found = at_one_model(bench, problem, [beside, effect], white(bench))
+    assert np.isfinite(found.score)
+    assert abs(float(found.effects[1].a)) <= 0.3
 
 
 def led(scaled):
