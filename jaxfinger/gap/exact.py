@@ -25,6 +25,7 @@ FACTOR = 0.7  # logarithm of the most by which a step changes a shape
 ROUNDS = 5  # of moving the nominal model
 SETTLED = 0.5  # change of the score below which it stays
 HALVINGS = 3
+Room = tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,11 @@ class State:
         """Amplitudes in standard deviations of their prior."""
         return _sizes(self.effects, self.coordinates)
 
+    def room(self, at: list[int]) -> Room:
+        """How far some of the coordinates may move, back and forth."""
+        low, high = _room(self.effects, self.coordinates)
+        return low[at], high[at]
+
     @property
     def r(self) -> Float[np.ndarray, " N"]:
         """White residual."""
@@ -95,9 +101,11 @@ class Bench:
         return cls(columns, parameters, null, unknown, float(np.sqrt(np.sum(judged.e) + np.sum(judged.o))))
 
     def judge(
-        self, problem: Problem, nominal: ByColumn, r: np.ndarray, slopes: np.ndarray, sizes: np.ndarray
+        self, problem: Problem, nominal: ByColumn, r: np.ndarray, slopes: np.ndarray, sizes: np.ndarray, room: Room
     ) -> Judged:
-        """A set at its optimum: `sizes`, how far its coordinates are from the middle of their priors."""
+        """A set at its optimum: `sizes`, how far its coordinates are from the middle of their priors, `room`, how far
+        they may move on.
+        """
         linear = Linear(
             self.columns,
             (ByColumn(self.columns, r[None]), nominal),
@@ -106,7 +114,7 @@ class Bench:
             self.parameters,
             self.null.judged,
         )
-        return linear.judge(np.arange(len(slopes)), middle=-sizes)
+        return linear.judge(np.arange(len(slopes)), *room, middle=-sizes)
 
 
 def prior_of(problem: Problem, k: int) -> Float[np.ndarray, "d d"]:
@@ -231,7 +239,7 @@ def at_one_model(bench: Bench, problem: Problem, effects: list[CatalogueEffect],
         if gain < 0.1 + 1e-3 * cost:
             break
     nominal = ByColumn(bench.columns, problem.J.T)
-    judged = bench.judge(problem, nominal, r, slopes, sizes)
+    judged = bench.judge(problem, nominal, r, slopes, sizes, _room(effects, coordinates))
     return State(problem, bench.columns, nominal, tuple(effects), tuple(coordinates), changes, slopes, judged)
 
 
@@ -272,7 +280,7 @@ def within_bounds(effect: CatalogueEffect, scales: Scales) -> CatalogueEffect:
     return replace(effect, **jax.device_put(values))
 
 
-def _room(effects, coordinates) -> tuple[np.ndarray, np.ndarray]:
+def _room(effects, coordinates) -> Room:
     """How far each coordinate may move, back and forth."""
     out = []
     for c in coordinates:

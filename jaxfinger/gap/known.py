@@ -17,7 +17,6 @@ from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.stages import Progress
 
 Named = tuple[str, tuple[str, ...]]  # effect, site; a pair may be joined by a hyphen
-FORMS = 3  # of an effect, that are fitted where the next ones fit nearly as well
 
 
 def fit_with(
@@ -54,9 +53,9 @@ def fit_with(
     search, state = Search(bench, table, progress), bench.null
     for _ in wanted:
         screened = search.screened(state)
-        found = search.best_offers(screened, FORMS, same=True)
-        forms = [(o, a) for _, o, a in found if o.keys == found[0][1].keys]
-        state = max((search.exactly(state, None, o, a, screened.now.weights) for o, a in forms), key=lambda s: s.score)
+        _, offer, amplitudes = search.best_offers(screened, 1)[0]
+        found = search.exactly(state, None, offer, amplitudes, screened.now.weights)
+        state = search.in_its_best_form(found, len(state.effects))
     progress("fitting the effects and all nominal parameters together")
     return augmented_fit(problem, state).fit
 

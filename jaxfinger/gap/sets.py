@@ -231,7 +231,7 @@ class Search:
         keys, slopes = [state.keys[i] for i in kept], state.slopes[at]
         r, score = state.problem.r - state.changes[kept].sum(axis=0), state.score
         if cause is not None:
-            score = self.bench.judge(state.problem, state.nominal, r, slopes, state.sizes()[at]).score
+            score = self.bench.judge(state.problem, state.nominal, r, slopes, state.sizes()[at], state.room(at)).score
         self.visited.add(keys, score)
         return Rest(keys, r, slopes, score)
 
@@ -249,11 +249,9 @@ class Search:
                 self.visited.screen([*keys, *o.keys], score + gains[n])
         return Screened(keys, score, linear, now, values)
 
-    def best_offers(
-        self, screened: Screened, most: int = EXACT, same: bool = False
-    ) -> list[tuple[float, Offered, np.ndarray]]:
+    def best_offers(self, screened: Screened, most: int = EXACT) -> list[tuple[float, Offered, np.ndarray]]:
         """The offers whose sets are worth most once the weights settle, with amplitudes: one an effect, site and
-        choice, unless all forms of the `same` are wanted.
+        choice.
         """
         keys, score, linear, now, values = screened
         found, taken = [], {}
@@ -271,7 +269,7 @@ class Search:
         seen, out = set(), []
         for x in found:
             form = x[1].keys, x[1].choices
-            if same or form not in seen:
+            if form not in seen:
                 seen.add(form)
                 out.append(x)
         return [x for x in out[:most] if x[0] > out[0][0] - CLOSE]
@@ -299,9 +297,30 @@ class Search:
                         for i, (n, size) in zip(rows, v.sizes.items(), strict=True)
                     }
                 )
-        found = fitted(self.bench, state.problem, variants, starts, weights or state.judged.weights)
+        return self._fitted(state.problem, variants, starts, weights or state.judged.weights)
+
+    def _fitted(self, problem, variants, starts, weights) -> State:
+        found = fitted(self.bench, problem, variants, starts, weights)
         self.visited.add(found.keys, found.score)
         return found
+
+    def in_its_best_form(self, state: State, first: int) -> State:
+        """The state with those shapes of the causes from number `first` on that no refit moves as they suit it best,
+        each tried from where the others have led.
+        """
+        best, scales = state, state.problem.scales
+        for i in range(first, len(state.effects)):
+            effect = type(state.effects[i])
+            grids, shapes = effect.worth_trying(scales, state.effects[i].site), effect.shape_parameters()
+            for name in (n for n, p in shapes.items() if p.moves == "not"):
+                for value in set(grids[name]) - {float(getattr(best.effects[i], name))}:
+                    variants = [_as_variant(e, scales) for e in best.effects]
+                    variants[i] = variants[i].with_shape(**{name: value})
+                    if effect.sensible(scales, variants[i].site, dict(variants[i].shape)):
+                        starts = [{n: float(getattr(e, n)) for n in e.amplitudes()} for e in best.effects]
+                        other = self._fitted(best.problem, variants, starts, best.judged.weights)
+                        best = max(best, other, key=lambda x: x.score)
+        return best
 
     def run(self) -> State:
         """The best set that additions, drops and swaps lead to."""
@@ -317,8 +336,12 @@ class Search:
                 state = self._pruned(changed)
                 continue
             state = self._pruned(grown)
-        for i in range(len(state.effects)):  # what each could be replaced by
-            self.best_offers(self.screened(state, i))
+        for i, key in enumerate(state.keys):  # what each could be replaced by
+            screened = self.screened(state, i)
+            for _, offer, amplitudes in self.best_offers(screened):
+                if key not in offer.keys:
+                    found = self.exactly(state, i, offer, amplitudes, screened.now.weights)
+                    self.in_its_best_form(found, len(state.effects) - 1)
         return state
 
     def _grown(self, state: State) -> State | None:
@@ -330,7 +353,9 @@ class Search:
             found = self.exactly(state, None, offer, amplitudes, screened.now.weights)
             if best is None or self.value(found) > self.value(best):
                 best = found
-        return best if best is not None and self.value(best) > now else None
+        if best is None or self.value(best) <= now:
+            return None
+        return self.in_its_best_form(best, len(state.effects))
 
     def _pruned(self, state: State) -> State:
         """Without those causes that explain too little beside the others."""
@@ -375,7 +400,8 @@ class Search:
         screened = self.screened(state, own)
         for key in members:
             if key != state.keys[own] and (best := self._best_of(screened, key)) is not None:
-                out.append(self.exactly(state, own, *best, screened.now.weights))
+                found = self.exactly(state, own, *best, screened.now.weights)
+                out.append(self.in_its_best_form(found, len(state.effects) - 1))
         return out
 
     def _best_of(self, screened: Screened, key: Key) -> tuple[Offered, np.ndarray] | None:
