@@ -173,15 +173,16 @@ class Rig(ABC):
     def read_block(self, timeout: float) -> Block:
         """The samples since the last call, at least one; whoever waits here is well, and the controller is told so.
 
-        Raises StaleRig after `timeout` s without a new one, and what `poll` raises.
+        Raises StaleRig after `timeout` s without a new one, and what `poll` raises. Who stood still looks again.
         """
         deadline = time.monotonic() + timeout
         while True:
+            late = time.monotonic() > deadline
             with suppress(ConnectionLost):  # `poll` mends it, or says so
                 self.beat()
             if (block := self.poll()) is not None:
                 return block
-            if time.monotonic() > deadline:
+            if late:
                 raise StaleRig(stale(timeout))
             self._pause(self.description.poll_s)
 

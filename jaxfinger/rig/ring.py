@@ -251,12 +251,13 @@ class RingRig(Rig):
         order["rate"], order["acceleration"] = rate, acceleration
         order["target"] = np.nan if target is None else target
         self._write("stCommand", order.tobytes())
-        deadline = time.monotonic() + self.answer_s
+        deadline, asked = time.monotonic() + self.answer_s, 0.0
         while int((status := self._status())["acknowledged"]) != number:
             self.alive()
             if self._id != number and kind is not Kind.STOP:
                 raise CommandRefused(f"{kind.name} gave way to a stop.")
-            if time.monotonic() > deadline:
+            late, asked = asked > deadline, time.monotonic()  # a host that stood still asks once more
+            if late:
                 if kind not in (Kind.RELEASE, Kind.STOP, Kind.DISARM):  # must not take effect when nobody expects it
                     order["kind"] = Kind.NONE
                     self._write("stCommand", order.tobytes())

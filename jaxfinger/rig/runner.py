@@ -32,7 +32,7 @@ from jaxfinger.rig.watch import Watch
 
 AFTER_TRIP_S = 1.0  # that is still recorded after a trip, and in which the controller has released all tension
 QUIET_S = 0.3  # without a fault before anything is armed: a clock that runs wrong shows within 0.1 s
-PATIENCE_S = 5.0  # of the host for that
+PATIENCE_S = 5.0  # that this may take
 SLACK_S = 5.0  # that a wait of known length may take longer
 HELD = "tension was not seen to fall, so switch the drives off and see that it is off"
 
@@ -131,7 +131,7 @@ class Runner:
             rig.reset(name or "operator")
         if not rig.prepare(Setup("", fixed=dict.fromkeys(rig.description.finger.joint_names, 0.0))):
             self._ask("Hands off: the drives are about to be switched on.")
-        latest = time.monotonic() + PATIENCE_S
+        latest = time.monotonic() + self._longest(PATIENCE_S)
         while not self.reader.quiet(round(QUIET_S * rig.description.rate_hz)):
             self.reader.next()
             self._look(None)

@@ -172,8 +172,33 @@ def test_nobody_there(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
+    rig = ads_rig(f"127.0.0.1:{port}")
+    rig.description.address["reconnect_s"] = 0
     with pytest.raises(ConnectionLost, match="route back"):
-        ads_rig(f"127.0.0.1:{port}").connect()
+        rig.connect()
+
+
+@pytest.mark.parametrize("calls", [1, 8])
+def test_one_call_that_never_ends_hangs_and_many_slow_ones_do_not(calls):
+    """Of another thread, while this one waits for the connection."""
+    rig, begun = ads_rig("127.0.0.1:1"), threading.Event()
+
+    def work():
+        begun.set()
+        time.sleep(1.6 / calls)
+        return b""
+
+    other = threading.Thread(target=lambda: [rig._call(work) for _ in range(calls)])
+    other.start()
+    begun.wait()
+    try:
+        if calls == 1:
+            with pytest.raises(ConnectionLost, match="hangs"):
+                rig._call(lambda: b"")
+        else:
+            assert rig._call(lambda: b"mine") == b"mine"
+    finally:
+        other.join()
 
 
 def test_a_connection_that_is_closed_while_it_opens_is_opened_again(monkeypatch):

@@ -16,6 +16,7 @@ from jaxfinger.rig.session import log_path
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.examples import rig_toml
 
+SAYS = "recorder.txt"  # what a recorder prints
 PLAN = '[plan]\nname = "p"\noperator = "t"\n[[trial]]\nexperiment = "VD.1"\nseconds = 2000.0\n'
 RECORD = """
 import sys
@@ -32,16 +33,17 @@ def controller():
 
 
 def recorder(folder, where, *more):
-    address = {"net_id": standin.NET_ID, "ip": where, "port": 851}
+    address = {"net_id": standin.NET_ID, "ip": where, "port": 851, "reconnect_s": 20}
     (folder / "rig.toml").write_text(rig_toml("ads", address, stale_s=30.0, poll_s=0.002))
     (folder / "plan.toml").write_text(PLAN)
     files = [str(folder / name) for name in ("plan.toml", "rig.toml", "session.h5")]
-    return subprocess.Popen([sys.executable, "-c", RECORD, *files, *more], stdout=subprocess.DEVNULL)
+    with open(folder / SAYS, "a") as says:
+        return subprocess.Popen([sys.executable, "-c", RECORD, *files, *more], stdout=says, stderr=says)
 
 
-def wait_for(condition, process):
+def wait_for(condition, process, says):
     while not condition():
-        assert process.poll() is None, "the recorder ended by itself"
+        assert process.poll() is None, f"the recorder ended by itself: {says.read_text()}"
         time.sleep(0.01)
 
 
@@ -55,7 +57,7 @@ def kill_at(folder, where, size, *more, trial="01-VD.1"):
         return at >= 0 and path.stat().st_size >= at + size
 
     try:
-        wait_for(recorded, process)
+        wait_for(recorded, process, folder / SAYS)
     finally:
         os.kill(process.pid, signal.SIGKILL)
         process.wait()

@@ -22,15 +22,15 @@ from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.ring import RingRig
 
 TIMEOUT_MS = 500
+WAIT_S = 0.02  # for a call of another thread, before the wait is looked at
 CALL_S = 0.7  # longer than the time-out of any call
-BUSY_S = 0.1  # that a heartbeat waits for another call
-ATTEMPTS = 4  # to connect: a router may still hang up on the connection of a program that was killed a moment ago
-PAUSE_S = 0.1  # between attempts
+BUSY_S = 0.1  # that a heartbeat waits for other calls
+PAUSE_S = 0.1  # between attempts to connect
 
 
 @dataclass(frozen=True)
 class Address:
-    """`net_id`, `ip` (host, or host:port) and ADS `port` of the controller; `reconnect_s` to mend a cut connection."""
+    """`net_id`, `ip` (host, or host:port) and ADS `port` of the controller; patience to connect, and to mend a cut."""
 
     net_id: str
     ip: str
@@ -58,17 +58,19 @@ class AdsRig(RingRig):
         self._lock = threading.Lock()
         self._places: dict[str, tuple[int, int, int]] = {}  # symbol: group, offset, size in bytes
         self.reconnects = 0
+        self._calls = 0  # that took the connection
         self._given_up = self._mending = self._closed = False
 
     def _open(self) -> None:
         where, self._given_up, self._closed = self.description.address, False, False
-        for attempt in range(ATTEMPTS):
+        deadline = time.monotonic() + float(where["reconnect_s"])
+        while True:  # a router may still hang up on the connection of a program that was killed a moment ago
             try:
                 self._attach()
                 return
             except (*self._failures, ConnectionLost) as error:
                 self._detach()
-                if attempt == ATTEMPTS - 1:
+                if time.monotonic() > deadline:
                     raise ConnectionLost(
                         f"no answer from {where['net_id']} port {where['port']} at {where['ip']} ({error}); check "
                         "cable, NetId, and that the controller has a route back to this computer."
@@ -140,12 +142,20 @@ class AdsRig(RingRig):
             self._lock.release()
 
     def _take(self, patient: bool) -> None:
-        """Wait for the connection, which another thread may be using, or mending for so long as that may take."""
-        began = time.monotonic()
-        while not self._lock.acquire(timeout=0.02):
+        """Wait for the connection, which another thread may be using, or mending for so long as that may take.
+
+        One call hangs, not several in a row. Waits are counted, not clocked: where this thread stood still, so did the
+        other's call.
+        """
+        call, waits = self._calls, 0
+        while not self._lock.acquire(timeout=WAIT_S):
             self.alive()
-            if time.monotonic() - began > (CALL_S if patient else BUSY_S) and not (patient and self._mending):
+            if patient and self._calls != call:
+                call, waits = self._calls, 0
+            waits += 1
+            if waits * WAIT_S > (CALL_S if patient else BUSY_S) and not (patient and self._mending):
                 raise ConnectionLost("a call to the controller hangs.")
+        self._calls += 1
 
     def _read(self, symbol: str, offset: int, size: int) -> bytes:
         def request() -> bytes:
