@@ -22,7 +22,7 @@ COMMANDS = {
         "Where the model misses the finger, what is to blame, how far it shrinks.",
     ),
     "effects": ("effects:effects", "What may make a finger differ from its model: the catalogue of causes, in words."),
-    "simulate": ("files:simulate", "A simulated session, from a recipe or from a fit."),
+    "simulate": ("files:simulate", "A simulated session, of a described finger, a recipe or a fit."),
     "look": ("files:look", "Say what a recording holds, and propose a mapping for it."),
     "import": ("files:import_", "Turn MATLAB, CSV or bag recordings into a session."),
     "record": ("record:record", "Run a plan on the rig."),

@@ -116,12 +116,12 @@ def simulate(
     seed: int | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a simulated session: the specimen and protocol of a recipe, or the finger that a fit describes.
+    """Write a simulated session: the finger and the protocol of a recipe, or the finger that a fit describes.
 
     Parameters
     ----------
     source
-        Recipe of the simulator (TOML), or a fit (JSON): then its model takes the place of the specimen.
+        Finger file or recipe of the simulator (TOML), or a fit (JSON): then its model is the finger.
     output
         Session to write (HDF5).
     protocol

@@ -1,4 +1,4 @@
-"""Specimens by recipe: the paper's, one whose truth the nominal model can express, and random ones."""
+"""Specimens by recipe: described ones, the paper's, one whose truth the nominal model can express, random ones."""
 
 from __future__ import annotations
 
@@ -11,19 +11,21 @@ from jaxfinger.errors import UserError
 from jaxfinger.model import Finger, JointTorque, Model, MomentArm, TendonFriction
 from jaxfinger.synthetic.paper_finger import paper_finger
 from jaxfinger.synthetic.random_finger import random_finger
-from jaxfinger.synthetic.recipe import SpecimenRecipe
+from jaxfinger.synthetic.recipe import DescribedFinger, JointTerms, SpecimenRecipe, TendonTerms
 from jaxfinger.synthetic.routes import PolynomialRoute, Route
 from jaxfinger.synthetic.specimen import PolynomialFriction, PolynomialSpring, Specimen
 
 EXCURSION_DEGREE, TORQUE_DEGREE = 4, 2  # the paper's
 
 
-def specimen_of(recipe: SpecimenRecipe) -> Specimen:
-    """The specimen that `[specimen]` asks for.
+def specimen_of(recipe: SpecimenRecipe | DescribedFinger) -> Specimen:
+    """The specimen that `[specimen]` asks for, or that is described.
 
     Raises:
         UserError: the random finger is to have fewer than 1 or more than 7 joints.
     """
+    if isinstance(recipe, DescribedFinger):
+        return _described(recipe)
     if recipe.kind == "polynomial":
         return polynomial_finger(paper_finger())
     if recipe.kind == "random":
@@ -31,6 +33,27 @@ def specimen_of(recipe: SpecimenRecipe) -> Specimen:
             raise UserError(f"recipe: specimen.joints is {recipe.joints}; choose 1 to 7")
         return random_finger(recipe.seed, recipe.joints, recipe.layout, recipe.tendons)
     return paper_finger(recipe.passive_tendon)
+
+
+def _described(said: DescribedFinger) -> Specimen:
+    """The finger with the moment arms that its file knows, and with its terms."""
+    finger = said.finger
+    joints = [said.terms.joints.get(name, JointTerms()) for name in finger.joint_names]
+    tendons = [said.terms.tendons.get(name, TendonTerms()) for name in finger.tendon_names]
+    arms = np.zeros((finger.n, finger.m, 1)) if finger.excursion is None else np.nan_to_num(finger.excursion)
+    return Specimen(
+        name="described finger",
+        description=finger,
+        routes=tuple(
+            tuple(PolynomialRoute(tuple(c.tolist())) if x else None for c, x in zip(*row, strict=True))
+            for row in zip(arms, finger.crosses, strict=True)
+        ),
+        springs=(PolynomialSpring(tuple(j.elastic for j in joints)),),
+        friction=PolynomialFriction(tuple(j.friction for j in joints)),
+        damping=tuple(j.damping for j in joints),
+        loss_constant=tuple(t.constant for t in tendons),
+        loss_proportional=tuple(t.proportional for t in tendons),
+    )
 
 
 def polynomial_finger(specimen: Specimen) -> Specimen:

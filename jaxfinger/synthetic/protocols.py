@@ -47,7 +47,8 @@ class TrialPlan:
 
 
 def session_plan(finger: FingerDescription, trials: Trials) -> tuple[TrialPlan, ...]:
-    """All trials of a session in the order in which the rig runs them, repeats side by side.
+    """All trials of a session in the order in which the rig runs them, repeats side by side; without tendons, those of
+    them that need none.
 
     Raises:
         UserError: a posture or a tendon of the recipe does not fit the finger.
@@ -64,7 +65,7 @@ def session_plan(finger: FingerDescription, trials: Trials) -> tuple[TrialPlan, 
     plans: list[TrialPlan] = []
     clock = PAUSE
     for experiment, (repeats, planned) in programme.items():
-        if experiment not in trials.experiments:
+        if experiment not in trials.experiments or not (finger.active.any() or experiment.startswith("ID.3")):
             continue
         for plan in planned(finger, trials):
             for _ in range(repeats):

@@ -1,17 +1,22 @@
-"""What is simulated: the specimen, the trials, the sensors. One TOML table each, every key optional."""
+"""What is simulated: the specimen, the trials, the sensors. One TOML table each, every key optional.
+
+In the place of `[specimen]` stands `[finger]`, as mappings and rig files have it, or the name of a file with it; then a
+finger file is a recipe too. What a finger does beside its links' weight and inertia, `[terms]` says.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from jaxfinger.data import EXPERIMENTS
-from jaxfinger.data.toml import NotEmpty, OneOf, Place, Positive, Share, Within, read_toml, structure
+from jaxfinger.data import EXPERIMENTS, FingerDescription
+from jaxfinger.data.finger_file import Finger, finger_from
+from jaxfinger.data.toml import Fault, NotEmpty, OneOf, Place, Positive, Share, Within, one_of, read_toml, structure
 
 # A quick session of one joint or a few, for studies over many of them.
 SHORT: Mapping[str, Any] = {
@@ -41,6 +46,40 @@ class SpecimenRecipe:
     joints: Count = 3  # random
     layout: Literal["planar", "abduction", "spatial"] = "planar"  # random
     tendons: Literal["antagonists", "fewest"] = "antagonists"  # random: 2 m or m + 1 tendons
+
+
+@dataclass(frozen=True)
+class JointTerms:
+    """`[terms.joints.<joint>]`: torque of springs, of friction and of damping."""
+
+    elastic: tuple[float, ...] = (0.0,)  # N m/rad^p of τ_k, p = 0, 1, …
+    friction: tuple[float, ...] = (0.0,)  # N m/rad^p of |τ_f|, p = 0, 1, …
+    damping: NotNegative = 0.0  # N m s/rad
+
+
+@dataclass(frozen=True)
+class TendonTerms:
+    """`[terms.tendons.<tendon>]`: the tension that is lost on the way, a₀ + a₁ f."""
+
+    constant: NotNegative = 0.0  # a₀, N
+    proportional: NotNegative = 0.0  # a₁
+
+
+@dataclass(frozen=True)
+class Terms:
+    """`[terms]`: what is not said of is not there."""
+
+    joints: Mapping[str, JointTerms] = field(default_factory=dict)
+    tendons: Mapping[str, TendonTerms] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class DescribedFinger:
+    """The specimen that a finger's description and its terms make."""
+
+    finger: FingerDescription
+    terms: Terms
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -176,10 +215,25 @@ class Recipe:
     """A simulated session."""
 
     seed: Some = 0
-    specimen: SpecimenRecipe = field(default_factory=SpecimenRecipe)
+    specimen: SpecimenRecipe | DescribedFinger = field(default_factory=SpecimenRecipe)
     trials: Trials = field(default_factory=Trials)
     sensors: Sensors = field(default_factory=Sensors)
     cad: Cad = field(default_factory=Cad)
+
+
+@dataclass(frozen=True)
+class RecipeFile(Recipe):
+    """A recipe as its file has it: `specimen`, or a finger and its terms."""
+
+    specimen: SpecimenRecipe = field(default_factory=SpecimenRecipe)
+    finger: str | Finger | None = None
+    terms: Terms = field(default_factory=Terms)
+
+    def __post_init__(self):
+        if self.finger is None and self.terms != Terms():
+            raise Fault("are those of a finger; write `finger`, or leave them out", "terms")
+        if self.finger is not None and replace(self.specimen, name="") != SpecimenRecipe():
+            raise Fault("says which finger, as `finger` does; leave one of them out", "specimen")
 
 
 def read_recipe(path: str | os.PathLike) -> Recipe:
@@ -189,16 +243,45 @@ def read_recipe(path: str | os.PathLike) -> Recipe:
         UserError: the file cannot be read, or a key is unknown, of the wrong type, or out of its range.
     """
     document = read_toml(Path(path), "check the name")
-    return structure(_merged(asdict(Recipe()), document.content), Recipe, document.place)
+    return _recipe(document.content, document.place)
 
 
-def recipe_from(table: dict[str, Any]) -> Recipe:
+def recipe_from(table: Mapping[str, Any]) -> Recipe:
     """A recipe from nested dictionaries: the defaults, with the given keys replaced.
 
     Raises:
         UserError: a key is unknown or has the wrong type or a value out of its range.
     """
-    return structure(_merged(asdict(Recipe()), table), Recipe, Place("recipe"))
+    return _recipe(table, Place("recipe"))
+
+
+def _recipe(table: Mapping[str, Any], place: Place) -> Recipe:
+    said = structure(_merged(asdict(RecipeFile()), table), RecipeFile, place)
+    specimen: SpecimenRecipe | DescribedFinger = said.specimen
+    if said.finger is not None:
+        finger = finger_from(said.finger, place / "finger")
+        for kind, names, known in (
+            ("joints", said.terms.joints, finger.joint_names),
+            ("tendons", said.terms.tendons, finger.tendon_names),
+        ):
+            for name in names:
+                try:
+                    one_of(name, known)
+                except Fault as fault:
+                    (place / "terms" / kind / name).fail(fault.message)
+        unknown = _unrouted(finger)
+        if unknown is not None:
+            message = f"says no `excursion` of tendon {unknown}, and it cannot be simulated without moment arms"
+            (place / "finger").fail(f"{message}; write what CAD says of them, or simulate a fit")
+        specimen = DescribedFinger(finger, said.terms, said.specimen.name)
+    return Recipe(said.seed, specimen, said.trials, said.sensors, said.cad)
+
+
+def _unrouted(finger: FingerDescription) -> str | None:
+    """The first active tendon whose moment arms the finger does not know."""
+    arms = [None] * finger.n if finger.excursion is None else finger.excursion
+    rows = zip(finger.tendon_names, finger.active, arms, strict=True)
+    return next((name for name, active, c in rows if active and (c is None or np.isnan(c).any())), None)
 
 
 def _merged(default: Any, given: Any) -> Any:

@@ -57,8 +57,8 @@ def drawn_from_cad(finger: FingerDescription, cad: Cad, rng: np.random.Generator
         finger,
         mass=mass,
         com=com,
-        mass_std=mass_std if cad.mass else None,
-        com_std=com_std if cad.com else None,
+        mass_std=mass_std if cad.mass else finger.mass_std,
+        com_std=com_std if cad.com else finger.com_std,
     )
 
 

@@ -145,6 +145,84 @@ def test_mistakes_in_a_recipe_are_named(table, said):
         recipe_from(table)
 
 
+FINGER = """[finger]
+gravity = [0.0, 0.0, -9.81]
+fingertip = [0.03, 0.0, 0.0]
+[[finger.joints]]
+name = "MCP"
+axis = [0.0, 1.0, 0.0]
+origin = [0.0, 0.0, 0.0]
+limits_deg = [0.0, 90.0]
+mass = 0.02
+mass_std = 0.001
+com = [0.02, 0.0, 0.0]
+inertia = [[1e-6, 0.0, 0.0], [0.0, 4e-6, 0.0], [0.0, 0.0, 4e-6]]
+rotor_inertia = 1e-5
+[[finger.tendons]]
+name = "T1"
+crosses = ["MCP"]
+excursion = { MCP = [0.008, 1e-3] }
+[[finger.tendons]]
+name = "T2"
+crosses = ["MCP"]
+excursion = { MCP = [-0.007] }
+"""
+TERMS = """
+[terms.joints.MCP]
+elastic = [-0.01, 0.03]
+friction = [0.002]
+damping = 1e-4
+[terms.tendons.T1]
+constant = 0.1
+proportional = 0.2
+"""
+
+
+def test_a_finger_file_is_a_recipe(tmp_path):
+    """The one form of mappings and rig files: as the recipe itself, and named by one."""
+    quick = '[trials]\nexperiments = ["ID.2", "ID.3-static", "ID.4"]\nrate = 50.0\n'
+    (tmp_path / "finger.toml").write_text(FINGER)
+    (tmp_path / "recipe.toml").write_text(f'finger = "finger.toml"\n{quick}{TERMS}')
+    (tmp_path / "whole.toml").write_text(FINGER + TERMS + quick)
+    session, whole = (simulate(read_recipe(tmp_path / f"{name}.toml")) for name in ("recipe", "whole"))
+    assert _same(session, whole)
+    assert session.finger.rotor_inertia == [1e-5]
+    assert session.finger.mass_std == [0.001]
+    first = next(iter(session.select("ID.2")))
+    pulled = np.polynomial.polynomial.polyval(first.q[:, 0], [0.0, 0.008, 1e-3])
+    assert np.ptp(first.tendon_excursion[:, 0] - pulled) < 2e-4
+    still = next(iter(session.select("ID.3-static")))
+    held = still.hold >= 0
+    # moment of the weight about y is −m g c cos q; the spring's torque and friction in the direction of motion resist
+    torque = -0.02 * 9.81 * 0.02 * np.cos(still.q[:, 0]) - 0.01 + 0.03 * still.q[:, 0]
+    torque += 0.002 * still.joint_direction[:, 0]
+    np.testing.assert_allclose(still.joint_torque[held, 0], torque[held], atol=2e-3)
+    bare = simulate(read_recipe(tmp_path / "finger.toml"))  # no terms, every experiment
+    assert {t.experiment for t in bare} == set(EXPERIMENTS)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("mass = 0.02", "mas = 0.02", r"line 9: finger\.joints\[0\]\.mas: is unknown \(did you mean 'mass'\?\)"),
+        ("com = [", 'com = "', "line 11: is not valid TOML"),
+        ("excursion = { MCP = [-0.007] }", "", "line 1: finger: says no `excursion` of tendon T2"),
+        ("joints.MCP]", "joints.MCPP]", r"line 23: terms\.joints\.MCPP: is 'MCPP' \(did you mean 'MCP'\?\)"),
+        ("[finger]", '[specimen]\nkind = "random"\n[finger]', "line 1: specimen: says which finger, as `finger` does"),
+    ],
+)
+def test_mistakes_in_a_finger_to_simulate_are_named(tmp_path, old, new, said):
+    (tmp_path / "finger.toml").write_text((FINGER + TERMS).replace(old, new))
+    with pytest.raises(UserError, match=rf"finger\.toml, {said}"):
+        read_recipe(tmp_path / "finger.toml")
+
+
+def test_a_finger_without_tendons_is_simulated(tmp_path):
+    (tmp_path / "arm.toml").write_text(FINGER.split("[[finger.tendons]]")[0])
+    session = simulate(read_recipe(tmp_path / "arm.toml"))
+    assert {t.experiment for t in session} == {"ID.3-static", "ID.3-dynamic"}
+
+
 def test_too_many_joints():
     with pytest.raises(UserError, match="choose 1 to 7"):
         simulate(recipe_from({"specimen": {"kind": "random", "joints": 8}}))
