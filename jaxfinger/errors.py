@@ -15,3 +15,8 @@ def did_you_mean(said: object, known: Collection[str]) -> str:
     swapped = [name for name in known if sorted(name) == sorted(said)]  # letters, which difflib counts as two mistakes
     close = swapped or get_close_matches(said, list(known), 1)
     return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def counted(number: int, noun: str) -> str:
+    """`1 error`, `2 errors`."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from jaxfinger.cli.output import Output, console, plain, print_json, progress, refuse_existing, remark, table
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, counted
 from jaxfinger.progress import Step
 
 if TYPE_CHECKING:
@@ -38,7 +38,8 @@ def check(file: Path, *, json: bool = False) -> None:
         for finding in findings:
             console().print(plain(finding), markup=False, soft_wrap=True)
         rest = len(findings) - errors
-        print(f"{file}: " + (f"{errors} errors, {rest} remarks" if findings else "nothing to complain about"))
+        found = f"{counted(errors, 'error')}, {counted(rest, 'remark')}" if findings else "nothing to complain about"
+        print(f"{file}: {found}")
     if errors:
         raise SystemExit(2)
 
@@ -96,8 +97,9 @@ def look(*recordings: Path, finger: Path | None = None, json: bool = False) -> N
         ]
         table(str(recording.path), ("variable", "may be", "units", "samples", "from", "to", "missing"), rows, left=3)
         for clock in clocks_of(recording, seen):
-            gaps = f"{clock.gaps} gaps, the longest {clock.longest:.3g} s" if clock.gaps else "no gaps"
-            order = f"; {clock.disordered} stamps do not increase" if clock.disordered else ""
+            gaps = f"{counted(clock.gaps, 'gap')}, the longest {clock.longest:.3g} s" if clock.gaps else "no gaps"
+            odd = counted(clock.disordered, "stamp")
+            order = f"; {odd} out of order or repeated, the rate is of sorted ones" if clock.disordered else ""
             print(plain(f"{clock.name}: {clock.duration:.4g} s at {clock.rate:.4g} Hz, {gaps}{order}"))
         for name, reason in recording.unusable.items():
             print(plain(f"{name} {reason}"))
@@ -156,7 +158,7 @@ def simulate(
             session = run(read_recipe(source), seed, progress=count)
         say("writing")
         write_session(session, output, overwrite)
-    print(plain(f"{output}: {len(session)} trials of {session.specimen}"))
+    print(plain(f"{output}: {counted(len(session), 'trial')} of {session.specimen}"))
 
 
 def import_(
@@ -191,4 +193,4 @@ def import_(
             session = import_file(sources, mapping, output, overwrite, report)
     finally:
         remark(report, mapping)
-    print(plain(f"{output}: {len(session)} trials of {session.specimen}"))
+    print(plain(f"{output}: {counted(len(session), 'trial')} of {session.specimen}"))

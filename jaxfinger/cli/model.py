@@ -9,7 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from jaxfinger.cli.output import Output, print_json, progress, read, refuse_existing
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, counted
 
 Experiments = Annotated[list[str] | None, Parameter(name=["--experiments", "-e"], consume_multiple=True)]
 
@@ -306,7 +306,7 @@ def predict(fit: Path, file: Path, *, output: Output, effects: Path | None = Non
         loaded, session = load_fit(fit, effects), read(file)
         predictions = predict_session(loaded, session, progress=say)
         write_predictions(output, session, predictions, overwrite)
-    print(f"{output}: {len(predictions)} trials predicted")
+    print(f"{output}: {counted(len(predictions), 'trial')} predicted")
 
 
 def show(fit: Path, *, effects: Path | None = None, json: bool = False) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from jaxfinger.cli.output import Output
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, counted
 
 
 def record(
@@ -56,7 +56,7 @@ def record(
             if not output.exists():
                 kept = f"rescue what reached the disk with jaxfinger recover {outcome.log}"
             raise UserError(f"{outcome.cause.rstrip('.')}; {kept}.")
-        said = f"{output}: {len(outcome.complete)} trials, all complete"
+        said = f"{output}: {counted(len(outcome.complete), 'trial')}, all complete"
     except UserError as error:
         if view.stalled:
             _leave(f"jaxfinger: {error}", 2)
@@ -103,7 +103,7 @@ def recover(log: Path, *, output: Output, overwrite: bool = False) -> None:
     found = rescue(log, output, overwrite)
     cut = f", cut short: {', '.join(found.incomplete)}" if found.incomplete else ""
     torn = f"; {found.torn_bytes} bytes at the log's end were not whole" if found.torn_bytes else ""
-    print(f"{output}: {len(found.trials)} trials{cut}{torn}")
+    print(f"{output}: {counted(len(found.trials), 'trial')}{cut}{torn}")
 
 
 def _print_plan(plan, description) -> None:
@@ -116,4 +116,6 @@ def _print_plan(plan, description) -> None:
         print(f"{found.name}: {found.seconds:.0f} s, up to {found.highest_tension:g} N")
         for prompt in found.prompts:
             print(f"    {prompt}")
-    print(f"{len(plan.trials)} trials, {total / 60:.1f} min without the operator's pauses; nothing was moved")
+    print(
+        f"{counted(len(plan.trials), 'trial')}, {total / 60:.1f} min without the operator's pauses; nothing was moved"
+    )

@@ -19,6 +19,7 @@ from jaxfinger.data.opening import plain_reason, why_closed
 from jaxfinger.data.parse import listed, parse_file
 from jaxfinger.data.schema import MEASURED
 from jaxfinger.data.session import EXPERIMENTS, Session, Trial
+from jaxfinger.data.sizes import sizes_of
 
 _MANY_SPIKES = (
     0.1  # of a column: as many as the mask finds with certainty; motors driven by a coarse encoder reach 0.09
@@ -57,12 +58,13 @@ def check_session(session: Session, report: Report) -> None:
     # Wild numbers overflow here and there; what is wrong with them is said by the checks.
     with np.errstate(all="ignore"):
         check_finger(session.finger, report)
+        sizes = sizes_of(session)
         for trial in session:
             if trial.experiment not in EXPERIMENTS:
                 message = f"has the unknown experiment {trial.experiment!r}; it must be one of {', '.join(EXPERIMENTS)}"
                 report.error(f"/trials/{trial.name}", message)
                 continue
-            check_trial(trial, session.finger, report)
+            check_trial(trial, session.finger, sizes, report)
     _check_order(session, report)
     _check_motions(session, report)
     _check_copies(session, report)

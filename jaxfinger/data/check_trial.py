@@ -9,29 +9,34 @@ from jaxfinger.data.motion import pulled_slowly
 from jaxfinger.data.parse import listed
 from jaxfinger.data.schema import CHANNELS, DRIVES, MEASURED, MEASURES, NEEDS_JOINT, NEEDS_TENDON
 from jaxfinger.data.session import FingerDescription, Trial
+from jaxfinger.data.sizes import Sizes
+from jaxfinger.errors import counted
 
 STILL_JOINT = 0.01  # rad: five times the noise of a 14-bit encoder
 STILL_AXIS = 1e-4  # m
 OUTSIDE = 0.35  # rad beyond its limits that a joint is allowed to read
-SLACK = 0.5  # N: below it a tendon may be slack, and its excursion NaN
+TARE, PUSHES = (
+    0.03,
+    0.1,
+)  # of the highest tension: a good tare is off by a hundredth; a tendon held at little has a fifth
 _TAUT = ("ID.2", "VD.1", "VD.3")  # experiments through which tendons are held at some tension
 _FEW = 20  # samples, fewer than which show no usual step
 _MOVES_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic")
 _STEPPED = ("ID.3-static", "ID.4", "VD.2")
 
 
-def check_trial(trial: Trial, finger: FingerDescription, report: Report) -> None:
-    """Report every fault of one trial that could be read."""
+def check_trial(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
+    """Report every fault of one trial that could be read; `sizes` are those of its session."""
     _named(trial, finger, report)
     _time(trial, report)
     for name in MEASURED:
         if getattr(trial, name) is not None:
-            _holes(trial, name, finger, report)
+            _holes(trial, name, finger, sizes, report)
     _present(trial, finger, report)
-    _motion(trial, finger, report)
+    _motion(trial, finger, sizes, report)
     _dead(trial, finger, report)
     _jumps(trial, finger, report)
-    _sizes(trial, finger, report)
+    _sizes(trial, finger, sizes, report)
     _holds(trial, report)
 
 
@@ -104,12 +109,11 @@ def _time(trial: Trial, report: Report) -> None:
         report.warning(place, f"has a sample every {usual:.3g} s; convert ms to s if that is what it is")
     gaps = steps > max(20.0 * usual, 0.02)
     if gaps.any():
-        report.warning(
-            place, f"has {gaps.sum()} gaps, the longest {steps.max():.3g} s; samples were lost, derivatives bridge them"
-        )
+        lost = f"{counted(int(gaps.sum()), 'gap')}, the longest {steps.max():.3g} s"
+        report.warning(place, f"has {lost}; samples were lost, derivatives bridge them")
 
 
-def _holes(trial: Trial, name: str, finger: FingerDescription, report: Report) -> None:
+def _holes(trial: Trial, name: str, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
     """NaN is a whole column's way to say «not measured»; inside a column only a slack tendon's excursion may be NaN."""
     values = getattr(trial, name)
     bad = ~np.isfinite(values)
@@ -124,8 +128,10 @@ def _holes(trial: Trial, name: str, finger: FingerDescription, report: Report) -
                 _place(trial, name),
                 f"column {column} holds infinite values; write NaN for a column that was not measured",
             )
-        elif name == "tendon_excursion" and _slack(trial, bad[:, k], k):
-            report.note(_place(trial, name), f"column {column} is NaN while the tendon is slack, in {count} samples")
+        elif name == "tendon_excursion" and _slack(trial, bad[:, k], k, sizes):
+            report.note(
+                _place(trial, name), f"column {column} is NaN while the tendon is slack, in {counted(count, 'sample')}"
+            )
         else:
             at = trial.time[int(np.argmax(bad[:, k]))]
             report.error(
@@ -135,8 +141,8 @@ def _holes(trial: Trial, name: str, finger: FingerDescription, report: Report) -
             )
 
 
-def _slack(trial: Trial, where: np.ndarray, tendon: int) -> bool:
-    return trial.tendon_force is not None and bool(np.all(trial.tendon_force[where, tendon] < SLACK))
+def _slack(trial: Trial, where: np.ndarray, tendon: int, sizes: Sizes) -> bool:
+    return trial.tendon_force is not None and bool(np.all(trial.tendon_force[where, tendon] < sizes.slack))
 
 
 def _present(trial: Trial, finger: FingerDescription, report: Report) -> None:
@@ -188,7 +194,7 @@ def _still(finger: FingerDescription) -> np.ndarray:
     return np.where(finger.prismatic, STILL_AXIS, STILL_JOINT)
 
 
-def _motion(trial: Trial, finger: FingerDescription, report: Report) -> None:
+def _motion(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
     """Does what the experiment moves move, and what it holds stand still?"""
     spans, still = _spans(trial), _still(finger)
     say = report.error if trial.complete else report.warning
@@ -212,10 +218,10 @@ def _motion(trial: Trial, finger: FingerDescription, report: Report) -> None:
         report.warning(
             place, f"joint {name} moves by {span:.2g} rad though {trial.experiment} holds it; check the fixture"
         )
-    if trial.experiment in NEEDS_TENDON and _span(_pulled(trial, finger)) < SLACK:
+    if trial.experiment in NEEDS_TENDON and _span(_pulled(trial, finger)) < sizes.travel:
         message = f"tendon {trial.tendon} is never pulled; check the attribute `tendon`"
         report.warning(_place(trial, "tendon_force"), message)
-    elif trial.experiment in NEEDS_TENDON and not pulled_slowly(trial, _pulled(trial, finger)):
+    elif trial.experiment in NEEDS_TENDON and not pulled_slowly(trial, _pulled(trial, finger), sizes.travel):
         message = f"tendon {trial.tendon} is pulled neither in holds of 0.2 s nor in ramps of a second"
         report.warning(_place(trial, "tendon_force"), f"{message}: nothing of the trial is judged; pull it slower")
 
@@ -262,15 +268,15 @@ def _jumps(trial: Trial, finger: FingerDescription, report: Report) -> None:
             continue
         size, at = float(np.median(steps[jumps])), trial.time[int(np.argmax(jumps))]
         turn = not finger.prismatic[k] and abs(size / (2.0 * np.pi) - 1.0) < 0.1
-        what = "a whole turn" if turn else f"{size:.3g}"
+        what, where = "a whole turn" if turn else f"{size:.3g}", counted(int(jumps.sum()), "place")
         report.warning(
             _place(trial, "q"),
-            f"column {name} jumps by {what} between two samples at {int(jumps.sum())} places, first at {at:.6g} s: the "
+            f"column {name} jumps by {what} between two samples at {where}, first at {at:.6g} s: the "
             "encoder wraps or loses counts; unwrap it (`unwrap = true` in a mapping), or cut these places out",
         )
 
 
-def _sizes(trial: Trial, finger: FingerDescription, report: Report) -> None:
+def _sizes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
     """Are the values of the size that SI units give them, and on the right side of zero?"""
     turning = ~np.array(finger.prismatic)
     for k, name in enumerate(finger.joint_names):
@@ -285,7 +291,7 @@ def _sizes(trial: Trial, finger: FingerDescription, report: Report) -> None:
             message = f"{where}, far outside its limits {lower:.3g} to {upper:.3g}; correct one or the other"
             report.warning(_place(trial, "q"), message)
     if trial.tendon_force is not None:
-        _tension(trial, finger, report)
+        _tension(trial, finger, sizes, report)
     if not turning.all():
         return
     small = float(finger.mass.sum()) < 5.0
@@ -302,7 +308,7 @@ def _sizes(trial: Trial, finger: FingerDescription, report: Report) -> None:
                 )
 
 
-def _tension(trial: Trial, finger: FingerDescription, report: Report) -> None:
+def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
     assert trial.tendon_force is not None
     place = _place(trial, "tendon_force")
     for name, active, x in zip(finger.tendon_names, finger.active, trial.tendon_force.T, strict=True):
@@ -312,9 +318,9 @@ def _tension(trial: Trial, finger: FingerDescription, report: Report) -> None:
             report.note(place, f"column {name} is measured though the tendon is passive; it is ignored")
             continue
         low = float(np.percentile(x, 5.0))
-        if low < -1.0:
+        if low < -max(PUSHES * sizes.tension, sizes.slack):
             report.error(place, f"column {name} falls to {low:.3g} N, and a tendon cannot push; check sign and tare")
-        elif low < -0.3:
+        elif low < -max(TARE * sizes.tension, sizes.slack):
             report.warning(place, f"column {name} falls to {low:.3g} N, below zero by more than noise; check the tare")
         if np.percentile(x, 95.0) > 2000.0:
             report.warning(place, f"column {name} exceeds 2000 N; check that it is in N and not in mN")

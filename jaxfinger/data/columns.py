@@ -17,7 +17,7 @@ from jaxfinger.data.parse import listed
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.toml import Place
 from jaxfinger.data.units import TO_SI, known
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, counted
 
 # Two clocks of one recording run about as long and tick about as often. Units are mistaken by a thousand, so thirty,
 # half of it, tells a mistaken unit from a slow sensor.
@@ -194,14 +194,13 @@ def in_order(time: np.ndarray, name: str, sort: bool, where: Place, report: Repo
     at, back, twice = int(np.argmax(late)), int((np.diff(time) < 0.0).sum()), int((np.diff(np.sort(time)) == 0.0).sum())
     if not sort:
         count = f"does not increase at {int(late.sum())} of {len(time)} samples, first after sample {at}"
-        mend = "the samples must be sorted by their time" + (f", and {twice} stamps occur twice" if twice else "")
+        mend = "the samples must be sorted by their time"
+        mend += f", without the {counted(twice, 'sample')} at repeated stamps" if twice else ""
         where.fail(f"the clock {name} {count}: {mend}; have import do so by `sort = true` in the trial")
     order = np.argsort(time, kind="stable")
     first = np.concatenate([[True], np.diff(time[order]) > 0.0])
-    report.warning(
-        where.key,
-        f"the clock {name} was sorted, {back} stamps ran back, and {twice} samples at repeated stamps left out",
-    )
+    left = f"{counted(back, 'stamp')} ran back, and {counted(twice, 'sample')} at repeated stamps left out"
+    report.warning(where.key, f"the clock {name} was sorted, {left}")
     return order[first]
 
 
@@ -310,10 +309,8 @@ class Columns:
         gaps = np.diff(time) > max(20.0 * step, 0.1)
         if gaps.any():
             longest = float(np.diff(time).max())
-            self.report.warning(
-                where.key,
-                f"the clock {name} has {int(gaps.sum())} gaps, the longest {longest:.3g} s; values there are lines",
-            )
+            said = f"{counted(int(gaps.sum()), 'gap')}, the longest {longest:.3g} s"
+            self.report.warning(where.key, f"the clock {name} has {said}; values there are lines")
         self.begin, self.end = max(self.begin, time[0]), min(self.end, time[-1])
         if max(time[0] - trial[0], trial[-1] - time[-1]) > 2.0 * step:
             self.report.warning(where.key, f"{said}; the trial is cut to what both cover")

@@ -91,20 +91,25 @@ def clocks_of(recording: Recording, seen: Sequence[Seen]) -> list[Ticks]:
 
 
 def ticks(name: str, variable: Variable, units: str) -> Ticks:
-    """How a clock runs."""
+    """How a clock runs, once its stamps are in order."""
     time = np.ravel(variable.values) * TO_SI[units][1]
-    steps = np.diff(time)
-    usual = float(np.median(steps))
-    gaps = steps > max(_GAP * usual, 0.0)
+    steps = _steps(time)
+    usual = float(np.median(steps)) if len(steps) else np.nan
+    gaps = steps > _GAP * usual
     return Ticks(
         name,
         units,
-        float(np.nanmax(time) - np.nanmin(time)),
-        1.0 / usual if usual > 0.0 else np.nan,
+        float(steps.sum()),
+        1.0 / usual,
         int(gaps.sum()),
         float(steps[gaps].max()) if gaps.any() else 0.0,
-        int((steps <= 0.0).sum()),
+        int((np.diff(time) <= 0.0).sum()),
     )
+
+
+def _steps(time: np.ndarray) -> np.ndarray:
+    """From stamp to stamp, in the order of time: what the order of the file says of them would be no rate."""
+    return np.diff(np.unique(time[np.isfinite(time)]))
 
 
 def _meaning(name: str, column: str | int | None, x: np.ndarray) -> str:
@@ -115,13 +120,14 @@ def _meaning(name: str, column: str | int | None, x: np.ndarray) -> str:
         return ""
     for meaning, pattern in _MEANINGS:
         if re.search(pattern, word):
-            runs = len(x) > 2 and float(np.mean(np.diff(x) > 0.0)) > 0.5
+            runs = len(x) > 2 and len(np.unique(x)) > 0.5 * len(x)
             return meaning if meaning != "time" or (column is None and runs) else ""
     return ""
 
 
 def _tick(x: np.ndarray) -> str:
-    step = float(np.median(np.diff(x)))
+    steps = _steps(x)
+    step = float(np.median(steps)) if len(steps) else np.nan
     return next((unit for unit, low, high in _TICKS if low <= step < high), "s")
 
 
@@ -161,6 +167,8 @@ def _trial(number: int, recording: Recording, finger: FingerDescription | None) 
         lines.append(f"time = {_quoted(clock.name, True)}")
     else:
         lines.append(f'time = {{ from = {_quoted(clock.name, True)}, units = "{clock.units}" }}')
+    if clock is not None and (np.diff(np.ravel(recording.variables[clock.name].values)) <= 0.0).any():
+        lines.append("sort = true   # its stamps are out of order, or repeated")
     for channel, columns in channels.items():
         for name, s in zip(names[channel], columns, strict=False):
             lines.append(f"channels.{channel}.{_quoted(name)} = {_column(s)}")

@@ -141,9 +141,9 @@ def stretches_of(inside: Bool[np.ndarray, " M"]) -> list[tuple[int, int]]:
     return list(zip(edges[::2], edges[1::2], strict=True))
 
 
-def pulled_slowly(trial: Trial, pulled: Float[np.ndarray, " N"]) -> bool:
+def pulled_slowly(trial: Trial, pulled: Float[np.ndarray, " N"], travel: float) -> bool:
     """Whether a held joint's tendon is pulled in holds, or in ramps so slow that its friction can be told; of what is
-    not measured, or too short, nothing is said.
+    not measured, or too short, nothing is said. `travel`: N, below which it has not moved.
     """
     if len(pulled) < 3 or not np.isfinite(pulled).all():
         return True
@@ -153,4 +153,4 @@ def pulled_slowly(trial: Trial, pulled: Float[np.ndarray, " N"]) -> bool:
     size = max(1, round(1.0 / (RAMP * step)))
     means = pulled[: len(pulled) // size * size].reshape(-1, size).mean(axis=1)[:, None]
     least = max(1, round(1.0 / (size * step)))
-    return bool(slow_ramps(means, np.full(len(means), -1), least, 0.02 * float(np.ptp(means))).any())
+    return bool(slow_ramps(means, np.full(len(means), -1), least, travel).any())

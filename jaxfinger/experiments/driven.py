@@ -134,8 +134,8 @@ def sliding(
 def _friction_known(r: Recording, slow, quick) -> Bool[np.ndarray, "N n"]:
     """Where a tendon is slack, or slides for certain: faster than it stretches, and in a quicker filter too."""
     tension, cutoff = r.tension(), min(r.spec.cutoff / 2.0, 0.2 / r.step)
-    stretches = r.scales.compliance * np.abs(smooth(r.trial.time, tension, cutoff)[1])
+    stretches = r.sizes.compliance * np.abs(smooth(r.trial.time, tension, cutoff)[1])
     measured = np.isfinite(np.asarray(r.trial.tendon_excursion)).all(axis=0)
     least = TENDON * noise_of(slow, quick)
     moves = (np.abs(slow) > least + stretches) & (np.sign(slow) * quick > 0.5 * least)
-    return (tension <= r.scales.slack) | (moves & measured)
+    return (tension <= r.sizes.slack) | (moves & measured)

@@ -32,10 +32,10 @@ def reduce(r: Recording) -> Row:
         # As smooth as the blocks of a fit: what slips at a noise peak would stay there until the next step.
         tension = uniform_filter1d(tension, max(1, round(1.0 / (r.spec.rate * r.step))), axis=0, mode="nearest")
     pulled = r.taut(r.mean(tension))
-    ramps = slow_ramps(pulled, hold, round(RAMP / (r.spec.rate * r.step * r.size)), r.scales.travel)
-    pulled = _in_steps(_in_ramps(pulled, ramps, r.scales.travel), np.where(ramps, -2, hold), slack=True)
-    counts = (hold >= 0) | _goes_on(pulled, hold, r.scales.travel)
-    taut = r.lowest(measured) > r.scales.slack
+    ramps = slow_ramps(pulled, hold, round(RAMP / (r.spec.rate * r.step * r.size)), r.sizes.travel)
+    pulled = _in_steps(_in_ramps(pulled, ramps, r.sizes.travel), np.where(ramps, -2, hold), slack=True)
+    counts = (hold >= 0) | _goes_on(pulled, hold, r.sizes.travel)
+    taut = r.lowest(measured) > r.sizes.slack
     known = ((counts | ramps) & _from_slack(r, pulled))[:, None]
     counting = {c: counts[:, None] | taut if c == "tendon_excursion" else known for c in r.y}
     still = np.zeros_like(j.qd)
@@ -46,10 +46,10 @@ def _from_slack(r: Recording, tension: Float[np.ndarray, "M n"]) -> Bool[np.ndar
     """Where what friction has taken before the trial's first sample no longer matters: a recording that starts with a
     taut tendon counts from that tendon's first change on, or from where the protocol says how it was approached.
     """
-    known = np.abs(tension - tension[0]) > r.scales.travel
+    known = np.abs(tension - tension[0]) > r.sizes.travel
     if r.trial.tendon_direction is not None:
         known |= r.mean(r.trial.tendon_direction.astype(float)) != 0.0
-    known |= tension[0] <= r.scales.slack
+    known |= tension[0] <= r.sizes.slack
     return np.asarray(np.all(np.logical_or.accumulate(known, axis=0), axis=1))
 
 

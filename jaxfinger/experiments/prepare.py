@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxfinger.data import Predictions, Session, Trial
+from jaxfinger.data.sizes import sizes_of
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import driven, held, path, stepped
 from jaxfinger.experiments.recording import Row, recording, stretches
-from jaxfinger.experiments.scales import scales_of
 from jaxfinger.experiments.table import EXPERIMENTS, Experiment
 from jaxfinger.model import Motion
 
@@ -67,13 +67,13 @@ def prepare(
     `coarse`: averaged over so many times as long.
     With `minus` the channels are measurement minus prediction, and what is not predicted does not count.
     """
-    scales, stacks = scales_of(session), {}
+    sizes, stacks = sizes_of(session), {}
     for spec in EXPERIMENTS.values():
         chosen = [t for t in session if t.experiment == spec.name and (names is None or t.name in names)]
         trials = [t for t in chosen if len(t.time) > 1]
 
         def row(trial: Trial, spec: Experiment = spec) -> tuple[Row, dict[str, bool]]:
-            r = recording(spec, trial, session, scales, reduced, minus, coarse)
+            r = recording(spec, trial, session, sizes, reduced, minus, coarse)
             return KINDS[spec.kind].reduce(r), {c: bool(s.any()) for c, s in r.sound.items()}
 
         long = any(len(t.time) > LONG for t in trials)

@@ -21,8 +21,8 @@ from jaxfinger.data import (
     without_spikes,
 )
 from jaxfinger.data.motion import quicker
+from jaxfinger.data.sizes import Sizes
 from jaxfinger.effects.drive import WARM
-from jaxfinger.experiments.scales import Scales
 from jaxfinger.experiments.table import Experiment
 
 AT_REST = 6.0  # times the median loss: an angle that turns back by less has not moved; twice that for single samples
@@ -35,7 +35,7 @@ class Recording:
     spec: Experiment
     trial: Trial  # spikes bridged in what drives the model
     finger: FingerDescription
-    scales: Scales
+    sizes: Sizes
     reduced: bool  # averaged for a fit; else for a prediction of every sample
     step: float  # s
     size: int  # samples of a block
@@ -76,7 +76,7 @@ class Recording:
 
     def taut(self, tension: Float[np.ndarray, "M n"]) -> Float[np.ndarray, "M n"]:
         """Tension without that of tendons that are slack all the time."""
-        slack = np.percentile(tension, 95, axis=0) < self.scales.slack
+        slack = np.percentile(tension, 95, axis=0) < self.sizes.slack
         return np.where(slack | self.spec.slack, 0.0, tension)
 
 
@@ -95,7 +95,7 @@ def recording(
     spec: Experiment,
     trial: Trial,
     session: Session,
-    scales: Scales,
+    sizes: Sizes,
     reduced: bool = True,
     minus: Predictions | None = None,
     coarse: int = 1,
@@ -106,7 +106,7 @@ def recording(
     step = float(np.median(np.diff(trial.time)))
     size = max(1, round(coarse / (spec.rate * step))) if reduced else 1
     y, sound = _measured(spec, trial, session.finger, minus, longest_spike(step))
-    return Recording(spec, _despiked(trial), session.finger, scales, reduced, step, size, y, sound)
+    return Recording(spec, _despiked(trial), session.finger, sizes, reduced, step, size, y, sound)
 
 
 def _despiked(trial: Trial) -> Trial:

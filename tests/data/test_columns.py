@@ -73,7 +73,7 @@ def test_a_clock_of_its_own_that_cannot_be(tmp_path, clock, words):
 def test_gaps_of_a_clock_are_said(tmp_path):
     keep = (SLOW < 2) | (SLOW > 4)
     _, said = bring_in(tmp_path, OWN, slow=SLOW[keep], tau=0.01 * np.sin(SLOW[keep]))
-    assert any("1 gaps, the longest 2" in text for text in said)
+    assert any("1 gap, the longest 2" in text for text in said)
 
 
 def test_samples_are_sorted_on_request(tmp_path):

@@ -39,6 +39,20 @@ def test_units_rates_and_gaps(log):
     assert (clock.rate, clock.gaps, clock.longest) == (pytest.approx(200.0), 1, pytest.approx(0.04))
 
 
+def test_a_shuffled_clock_is_said_and_its_rate_is_that_of_sorted_stamps(tmp_path, capsys):
+    path, order = tmp_path / "log.csv", np.random.default_rng(5).permutation(len(TIME))
+    table = np.column_stack([TIME, 40 + 30 * np.sin(TIME / 1e3)])[order]
+    np.savetxt(path, table, "%.6f", ",", header="t,enc", comments="")
+    recording = load_recording(path)
+    seen = columns_of(recording)
+    (clock,) = clocks_of(recording, seen)
+    assert (seen[0].units, clock.rate, clock.disordered) == ("ms", pytest.approx(200.0), (np.diff(order) < 0).sum())
+    assert main(["look", str(path)]) in (0, None)
+    said = capsys.readouterr().out
+    assert f"{clock.disordered} stamps out of order or repeated, the rate is of sorted ones" in said
+    assert "sort = true" in said
+
+
 def test_units_that_a_file_states_come_first():
     recording = load_recording(CASES / "csv-as-other-programs-write-it" / "scope.csv")
     assert {s.name: (s.units, s.stated) for s in columns_of(recording)}["tau"] == ("N m", True)

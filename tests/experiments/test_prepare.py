@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import Session, Trial, width
+from jaxfinger.data.check_trial import check_trial
+from jaxfinger.data.findings import Report
+from jaxfinger.data.sizes import SLACK, sizes_of
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, driven, not_judged, prepare
-from jaxfinger.experiments.scales import SLACK
 from jaxfinger.synthetic import paper_finger
 
 RATE, ENCODER = 1000.0, 2e-4  # Hz, rad
@@ -384,6 +386,28 @@ def test_quick_ramps_without_holds_are_not_judged_and_said_not_to_be():
     assert torque.channel == "joint_torque"
     assert "no tendon is pulled" in torque.reason
     assert excursion.reason == "no trial measured it"
+
+
+@pytest.mark.parametrize("newton", [1e-2, 1.0, 1e2])
+@pytest.mark.parametrize(
+    ("rise", "pulled", "said"),
+    [(4.0, 1.0, ""), (0.1, 1.0, "nothing of the trial is judged"), (4.0, 0.01, "T1 is never pulled")],
+)
+def test_the_checker_says_what_a_fit_counts(rise, pulled, said, newton):
+    """Whatever a finger's size, beside a trial that tells how much tension is much."""
+    trials = [ramps(rise), replace(ramps(4.0), name="another", tendon="T2")]
+    own, other = (newton * t.tendon_force for t in trials)
+    trials = [
+        replace(trials[0], tendon_force=own * np.where(np.arange(FINGER.n) == 0, pulled, 0.0)),
+        replace(trials[1], tendon_force=np.roll(other, 1, axis=1)),
+    ]
+    session, report = Session("a finger", FINGER, {t.name: t for t in trials}), Report()
+    check_trial(trials[0], FINGER, sizes_of(session), report)
+    told = [f.message for f in report if f.place.endswith("tendon_force") and f.severity != "note"]
+    assert said in " ".join(told)
+    assert len(told) == bool(said)
+    counts = np.asarray(stack(*trials).batch.mask["joint_torque"])[0, 0].any()
+    assert counts == (said == "")
 
 
 def test_a_tendon_that_was_taut_before_the_recording_counts_from_its_first_change_on():

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxfinger.data import Session
+from jaxfinger.data.session import Session
 
 SLACK = 0.02  # of the highest tension: taut is a fifth of it or more in protocols, and a tare is good to a hundredth
 NOISE = 6.0  # times its noise: what a tension sensor reads of a slack tendon is less, but once in a billion samples
@@ -14,7 +14,7 @@ LOOK = 1000  # samples of a trial that tell its sizes
 
 
 @dataclass(frozen=True)
-class Scales:
+class Sizes:
     """What counts as little in a session."""
 
     tension: float  # N, the highest
@@ -37,7 +37,7 @@ class Scales:
         return STRETCH * self.excursion / self.tension if self.tension > 0.0 else 0.0
 
 
-def scales_of(session: Session) -> Scales:
+def sizes_of(session: Session) -> Sizes:
     """The sizes of all trials of a session, so that those of one trial do not depend on which others are read."""
     tensions, excursions, noises = [0.0], [0.0], []
     for trial in session:
@@ -52,4 +52,4 @@ def scales_of(session: Session) -> Scales:
         if trial.tendon_excursion is not None and len(trial.time) > 3:
             l = np.nan_to_num(trial.tendon_excursion[::every])
             excursions.append(float(np.ptp(np.percentile(l, (1, 99), axis=0), axis=0).max(initial=0.0)))
-    return Scales(max(tensions), max(excursions), float(np.median(noises)) if noises else 0.0)
+    return Sizes(max(tensions), max(excursions), float(np.median(noises)) if noises else 0.0)
