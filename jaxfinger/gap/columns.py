@@ -32,6 +32,14 @@ class Column:
 
 
 @dataclass(frozen=True)
+class Counts:
+    """Of every column, its features, and its rows less these."""
+
+    K: Int[np.ndarray, " C"]
+    outside: Int[np.ndarray, " C"]
+
+
+@dataclass(frozen=True)
 class Columns:
     """All columns of a problem."""
 
@@ -43,14 +51,15 @@ class Columns:
         return cls(tuple(_columns(problem)))
 
     @cached_property
+    def counts(self) -> Counts:
+        """Features and rows of every column."""
+        K = np.array([c.basis.shape[1] for c in self.items], int)
+        return Counts(K, np.array([len(c.rows) for c in self.items], int) - K)
+
+    @property
     def K(self) -> Int[np.ndarray, " C"]:
         """Features of every column."""
-        return np.array([c.basis.shape[1] for c in self.items])
-
-    @cached_property
-    def outside(self) -> Int[np.ndarray, " C"]:
-        """Rows of every column less its features."""
-        return np.array([len(c.rows) for c in self.items]) - self.K
+        return self.counts.K
 
     def sums(self, values: Float[np.ndarray, "features *n"]) -> Float[np.ndarray, "C *n"]:
         """Of features, column by column."""

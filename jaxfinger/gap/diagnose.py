@@ -98,17 +98,11 @@ def diagnose(
             f"it has {', '.join(sorted(catalogue))}"
         )
     problem = build(session, recipe, progress, predictions, COARSE if quick else 1, against)
-    bench = Bench.of(problem, Parameters())
     kept = set(problem.fit.recipe.model.terms) | set(without)
     laws = {law for c in changed.values() for law in c.__mro__}  # an effect whose law a change has would be its copy
     catalogue = {k: c for k, c in catalogue.items() if k not in kept and (k in changed or c not in laws)}
-    progress("reading the signatures of all effects")
-    screening = Screening.of(problem, variants(catalogue, problem.nominal.finger, problem.scales), progress)
-    table = table_of(problem, bench, screening)
-    progress("weighing the evidence")
-    search = Search(bench, table, progress)
-    state = search.run()
-    found = posterior(search, state)
+    search, state = searched(problem, catalogue, progress)
+    bench, table, found = search.bench, search.table, posterior(search, state)
     relevance = _relevance(problem, bench, tolerance)
     verdict = _verdict(problem, bench, state, found, relevance)
     nominal = nominal_fit(problem)
@@ -161,6 +155,18 @@ def diagnose(
         augmented=fit,
         problem=problem,
     )
+
+
+def searched(
+    problem: Problem, catalogue: Mapping[str, type[CatalogueEffect]], progress: Progress = lambda message: None
+) -> tuple[Search, State]:
+    """All sets of the catalogue's effects that the evidence led to, and the best of them."""
+    bench = Bench.of(problem, Parameters())
+    progress("reading the signatures of all effects")
+    screening = Screening.of(problem, variants(catalogue, problem.nominal.finger, problem.scales), progress)
+    search = Search(bench, table_of(problem, bench, screening), progress)
+    progress("weighing the evidence")
+    return search, search.run()
 
 
 def _verdict(
@@ -216,8 +222,8 @@ def agreeing(status: Status, found: Posterior, gaps: bool) -> tuple[float, float
 
 def _open(bench: Bench) -> frozenset[int]:
     """Columns in which the nominal model alone leaves a gap."""
-    null = bench.null.judged
-    return frozenset(np.flatnonzero(unexplained(bench.columns, null, null, bench.parameters) > A_GAP).tolist())
+    null = bench.null.judged.evidence
+    return frozenset(np.flatnonzero(unexplained(bench.columns.counts, null, bench.parameters) > A_GAP).tolist())
 
 
 def _by_share(named, chosen: State, shares: Budget) -> list:

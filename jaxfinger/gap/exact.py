@@ -97,8 +97,9 @@ class Bench:
         judged = Linear(columns, (residual, nominal), prior_of(problem, 0), none, parameters).null
         assert judged is not None
         null = State(problem, columns, nominal, (), (), empty, empty, judged)
-        unknown = float(unexplained(columns, judged, judged, parameters).sum())
-        return cls(columns, parameters, null, unknown, float(np.sqrt(np.sum(judged.e) + np.sum(judged.o))))
+        unknown = float(unexplained(columns.counts, judged.evidence, parameters).sum())
+        gap = float(np.sqrt(np.sum(judged.evidence.e + judged.evidence.o)))
+        return cls(columns, parameters, null, unknown, gap)
 
     def judge(
         self, problem: Problem, nominal: ByColumn, r: np.ndarray, slopes: np.ndarray, sizes: np.ndarray, room: Room

@@ -19,11 +19,12 @@ all. Nominal parameters are refitted with every set, in the weights that follow 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxfinger.gap.columns import ByColumn, Columns
+from jaxfinger.gap.columns import ByColumn, Columns, Counts
 
 
 @dataclass(frozen=True)
@@ -49,43 +50,60 @@ class Weights:
     outside: Float[np.ndarray, " C"]
 
 
+class Evidence(NamedTuple):
+    """All that the formula needs to know of one set of causes."""
+
+    e: Float[np.ndarray, " C"]
+    o: Float[np.ndarray, " C"]
+    explained: Float[np.ndarray, " C"]  # energy on the features that the causes have taken away
+    score: float  # log L less Occam's factor: comparable between sets over the same rows
+
+
 def log_likelihood(
-    columns: Columns,
+    counts: Counts,
     e: Float[np.ndarray, "*n C"],
     o: Float[np.ndarray, "*n C"],
     explained: Float[np.ndarray, "*n C"],
     p: Parameters,
 ) -> tuple[Float[np.ndarray, " *n"], Weights]:
     """log L and the weights that belong to it."""
-    K, nu = columns.K, p.looks
-    scale = (nu + o) / (nu + columns.outside)
+    K, nu = counts.K, p.looks
+    scale = (nu + o) / (nu + counts.outside)
     floor = p.floor * np.maximum(scale, 1.0)
     v = np.maximum(np.maximum(e / K, floor), p.form * explained / K)
-    excess = np.maximum(o - columns.outside, 0.0) / nu
+    excess = np.maximum(o - counts.outside, 0.0) / nu
     value = -0.5 * np.sum(K * np.log(v) + e / v + nu * np.log1p(excess), axis=-1)
     return value, Weights(1.0 / v, 1.0 / (1.0 + excess))
 
 
-def unexplained(columns: Columns, judged: "Judged", null: "Judged", p: Parameters) -> Float[np.ndarray, " C"]:
+def unexplained(counts: Counts, x: Evidence, p: Parameters) -> Float[np.ndarray, " C"]:
     """Log evidence, column by column, that something is at work beyond noise and what the causes' forms may miss."""
-    scale = np.maximum((p.looks + judged.o) / (p.looks + columns.outside), 1.0)
-    explained = columns.sums((judged.b - null.b) ** 2)
-    floor = np.maximum(p.floor * scale, p.form * explained / columns.K)
-    return 0.5 * columns.K * np.log(np.maximum(judged.e / columns.K / floor, 1.0))
+    scale = np.maximum((p.looks + x.o) / (p.looks + counts.outside), 1.0)
+    floor = np.maximum(p.floor * scale, p.form * x.explained / counts.K)
+    return 0.5 * counts.K * np.log(np.maximum(x.e / counts.K / floor, 1.0))
+
+
+def rescored(counts: Counts, x: Evidence, before: Parameters, p: Parameters) -> Evidence:
+    """A set's evidence under other parameters, its causes as they are: to first order they are at an optimum."""
+    was, is_now = (log_likelihood(counts, x.e, x.o, x.explained, q)[0] for q in (before, p))
+    return x._replace(score=float(x.score + is_now - was))
 
 
 @dataclass(frozen=True)
 class Judged:
     """One set of causes on top of what is refitted with every set."""
 
-    score: float  # log L less Occam's factor: comparable between sets over the same rows
+    evidence: Evidence
     log_l: float
     amplitudes: Float[np.ndarray, " k"]  # of the further rows, in units of their prior
     solution: Float[np.ndarray, " base+k"]  # coefficients of all rows in the residual: 1, −δ, −a
     b: Float[np.ndarray, " features"]  # of what is left, on the features
     weights: Weights
-    e: Float[np.ndarray, " C"]
-    o: Float[np.ndarray, " C"]
+
+    @property
+    def score(self) -> float:
+        """Log evidence."""
+        return self.evidence.score
 
 
 ROUNDS = 6  # of reweighting; scores then change by less than one
@@ -145,12 +163,12 @@ class Linear:
             e = self.columns.sums(b**2)
             o = np.maximum(np.einsum("i,cij,j->c", x, T, x) - e, 0.0)
             explained = self.columns.sums((b - before) ** 2) if before is not None else np.zeros_like(e)
-            log_l, weights = log_likelihood(self.columns, e, o, explained, self.parameters)
+            log_l, weights = log_likelihood(self.columns.counts, e, o, explained, self.parameters)
         log_l = float(log_l) - 0.5 * float(x[:k] @ self.prior @ x[:k])
         H = self._weighted(weights, B, B, T) + prior
         sizes = -x[k:] if middle is None else -x[k:] - middle
         occam = 0.5 * _further_information(H, k) + 0.5 * float(sizes @ sizes) if n else 0.0
-        return Judged(log_l - occam, log_l, -x[k:], x, b, weights, e, o)
+        return Judged(Evidence(e, o, explained, log_l - occam), log_l, -x[k:], x, b, weights)
 
     def _white(self) -> Weights:
         ones = np.ones(len(self.columns.items))
@@ -178,8 +196,8 @@ class Linear:
             free[first:][out] = False
         return x
 
-    def screen(self, now: Judged, candidates: list[Int[np.ndarray, " k"]], bounds) -> Float[np.ndarray, " candidates"]:
-        """Gain in log L less Occam's factor of each candidate alone on top of the base, by one step in the weights."""
+    def screen(self, now: Judged, candidates: list[Int[np.ndarray, " k"]], bounds) -> list[Evidence | None]:
+        """Of each candidate alone on top of the base, by one step in the weights; the score is its gain."""
         w, k = now.weights, self.BX.shape[1]
         x = now.solution[:k]
         HXX = self._weighted(w, self.BX, self.BX, self.TX) + self.prior
@@ -196,7 +214,7 @@ class Linear:
         rZ = np.einsum("i,cij->cj", x, self.TXZ) - Tr[:, 1:] @ absorbed
         # Products of projected further rows by column, for the candidates' blocks alone.
         JZ = self.TX[:, 1:, 1:] @ absorbed
-        out = np.full(len(candidates), -np.inf)
+        out: list[Evidence | None] = [None] * len(candidates)
         for n, (at, (low, high)) in enumerate(zip(candidates, bounds, strict=True)):
             Q = absorbed[:, at]
             XQ = Q.T @ self.TXZ[:, 1:, at]
@@ -208,16 +226,11 @@ class Linear:
                 continue
             change = BZ[:, at] @ a
             e = self.columns.sums((r - change) ** 2)
-            total = now.e + now.o - 2.0 * rZ[:, at] @ a + np.einsum("m,cmn,n->c", a, TZ, a)
-            log_l, _ = log_likelihood(
-                self.columns,
-                e,
-                np.maximum(total - e, 0.0),
-                self.columns.sums((r - change - null) ** 2),
-                self.parameters,
-            )
+            total = now.evidence.e + now.evidence.o - 2.0 * rZ[:, at] @ a + np.einsum("m,cmn,n->c", a, TZ, a)
+            o, explained = np.maximum(total - e, 0.0), self.columns.sums((r - change - null) ** 2)
+            log_l, _ = log_likelihood(self.columns.counts, e, o, explained, self.parameters)
             occam = 0.5 * np.linalg.slogdet(np.eye(len(at)) + G)[1] + 0.5 * float(a @ a)
-            out[n] = log_l - now.log_l - occam
+            out[n] = Evidence(e, o, explained, float(log_l - now.log_l - occam))
         return out
 
     def std(self, at: Int[np.ndarray, " k"], w: Weights) -> Float[np.ndarray, " k"]:

@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit, logsumexp
 
+from jaxfinger.gap.costs import Key
 from jaxfinger.gap.exact import State
 from jaxfinger.gap.formula import unexplained
-from jaxfinger.gap.sets import Key, Search
+from jaxfinger.gap.sets import Search
 
 IS_NAMED = 0.5  # probability from which on a verdict says that a cause is at work
 SURE = 0.9  # share of a cause's probability, beside its rivals', below which they are an ambiguous set
@@ -27,26 +27,21 @@ class Posterior:
 
 
 def posterior(search: Search, state: State) -> Posterior:
-    """From the sets that a search has weighed. A set's weight is exp(β (score − evidence needed) − log odds)."""
-    p, base = search.bench.parameters, search.bench.null.score
-    sets = list(search.visited.scores.items())
-    log_w = np.array(
-        [p.trust * (score - base - sum(search.evidence_needed(keys))) - search.odds(keys) for keys, score in sets]
-    )
-    w = np.exp(log_w - logsumexp(log_w))
-    net = np.array([score - search.cost(keys) for keys, score in sets])
+    """From the sets that a search has weighed."""
+    costs, scores = search.costs, search.visited.scores
+    w = costs.weights(scores)
+    net = {keys: score - costs.of(keys) for keys, score in scores.items()}
     causes, gains = {}, {}
     for key in search.table.keys:
-        inside = np.array([key in keys for keys, _ in sets])
-        causes[key] = float(w[inside].sum())
-        gains[key] = float(net[inside].max(initial=-np.inf) - net[~inside].max()) if inside.any() else -np.inf
-    left = float(unexplained(search.bench.columns, state.judged, search.bench.null.judged, p).sum())
-    taken = max(search.bench.unknown - left, 0.0)
-    unlisted = float(expit(p.sharp * (left - p.open - p.left * taken)))
-    nothing = float(w[[not keys for keys, _ in sets]].sum())
-    ambiguous = _ambiguous(dict(zip((k for k, _ in sets), w.tolist(), strict=True)), state, causes)
+        inside = [keys for keys in scores if key in keys]
+        causes[key] = sum(w[keys] for keys in inside)
+        without = max(net[keys] for keys in scores if key not in keys)
+        gains[key] = max((net[keys] for keys in inside), default=-np.inf) - without
+    left = float(unexplained(search.bench.columns.counts, state.judged.evidence, search.bench.parameters).sum())
+    unlisted = costs.unlisted(left)
+    ambiguous = _ambiguous(w, state, causes)
     named = tuple(k for k in state.keys if causes[k] >= IS_NAMED and not any(k in s for s in ambiguous))
-    return Posterior(causes, gains, nothing * (1.0 - unlisted), unlisted, named, ambiguous)
+    return Posterior(causes, gains, w[frozenset()] * (1.0 - unlisted), unlisted, named, ambiguous)
 
 
 def _ambiguous(w: dict[frozenset, float], state: State, causes: dict[Key, float]) -> tuple[tuple[Key, ...], ...]:

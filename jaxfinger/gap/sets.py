@@ -1,8 +1,4 @@
-"""Which causes: sets grown, pruned and swapped by their evidence, each fitted exactly; and what all visited sets say.
-
-A cause costs the evidence that an imitator would bring, and the log of the number of its rivals. Further sites of an
-effect that is in cost less and the log of its sites alone: one cause that acts at many sites is one cause.
-"""
+"""Which causes: sets grown, pruned and swapped by their evidence, each fitted exactly; what all visited sets say."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -11,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxfinger.effects import CatalogueEffect, Scales, Site
+from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.gap.columns import ByColumn
+from jaxfinger.gap.costs import Costs, Key
 from jaxfinger.gap.exact import Bench, State, Whitened, fitted, prior_of
-from jaxfinger.gap.formula import Judged, Linear, Weights
+from jaxfinger.gap.formula import Evidence, Judged, Linear, Weights
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.screening import Screening
 from jaxfinger.gap.signatures import Variant
@@ -25,7 +22,6 @@ SHORT_LIST = 12  # candidates whose amplitudes are weighed until the weights set
 EXACT = 3  # of them that are fitted exactly
 MOST = 12  # changes of the set
 CLOSE = 8.0  # score within which a candidate may overtake another once it is fitted exactly
-Key = tuple[str, Site]
 
 
 @dataclass(frozen=True)
@@ -137,26 +133,35 @@ def _together(offers: list[Offered]) -> list[Offered]:
 
 @dataclass
 class Visited:
-    """Scores of the sets that were weighed, costs not taken off."""
+    """What was said of every set that was weighed."""
 
-    scores: dict[frozenset[Key], float] = field(default_factory=dict)
+    evidence: dict[frozenset[Key], Evidence] = field(default_factory=dict)
     screened: set[frozenset[Key]] = field(default_factory=set)  # those of which `Linear.screen` alone has spoken
 
-    def screen(self, keys, score: float) -> None:
+    @property
+    def scores(self) -> dict[frozenset[Key], float]:
+        """Costs not taken off."""
+        return {keys: x.score for keys, x in self.evidence.items()}
+
+    def screen(self, keys: Iterable[Key], evidence: Evidence) -> None:
         """By one step in the weights, which promises more than they give once they settle: no word against another."""
         key = frozenset(keys)
-        if key not in self.scores:
+        if key not in self.evidence:
             self.screened.add(key)
         if key in self.screened:
-            self.scores[key] = max(score, self.scores.get(key, -np.inf))
+            self._better(key, evidence)
 
-    def add(self, keys, score: float) -> None:
+    def add(self, keys: Iterable[Key], evidence: Evidence) -> None:
         """In settled weights: the best of those that it was given."""
         key = frozenset(keys)
         if key in self.screened:
             self.screened.remove(key)
-            self.scores[key] = score
-        self.scores[key] = max(score, self.scores.get(key, -np.inf))
+            del self.evidence[key]
+        self._better(key, evidence)
+
+    def _better(self, key: frozenset[Key], evidence: Evidence) -> None:
+        if key not in self.evidence or evidence.score > self.evidence[key].score:
+            self.evidence[key] = evidence
 
 
 class Rest(NamedTuple):
@@ -187,30 +192,12 @@ class Search:
         sites: dict[str, set] = {}
         for effect, site in table.keys:
             sites.setdefault(effect, set()).add(site)
-        self.sites = {e: len(s) for e, s in sites.items()}
-        self.visited.add((), bench.null.score)
-
-    def cost(self, keys: Iterable[Key]) -> float:
-        """What a set must explain, in log evidence."""
-        return self.odds(keys) + sum(self.evidence_needed(keys))
-
-    def odds(self, keys: Iterable[Key]) -> float:
-        """Log odds against just these effects and sites, of all that there are."""
-        keys = list(keys)
-        effects = {e for e, _ in keys}
-        return len(effects) * np.log(len(self.sites)) + sum(np.log(max(self.sites.get(e, 1), 1)) for e, _ in keys)
-
-    def evidence_needed(self, keys: Iterable[Key]) -> list[float]:
-        """Of every cause, the first site of an effect and further ones."""
-        p, seen, out = self.bench.parameters, set(), []
-        for effect, _ in sorted(keys):
-            out.append(p.prior + (0.0 if effect in seen else p.alike * self.bench.unknown))
-            seen.add(effect)
-        return out
+        self.costs = Costs(bench.parameters, bench.unknown, {e: len(s) for e, s in sites.items()})
+        self.visited.add((), bench.null.judged.evidence)
 
     def value(self, state: State) -> float:
         """Score less costs."""
-        return state.score - self.cost(state.keys)
+        return state.score - self.costs.of(state.keys)
 
     def linear(self, state: State, r: np.ndarray, slopes: np.ndarray) -> Linear:
         """The table's rows on top of a state's base."""
@@ -229,11 +216,11 @@ class Search:
         kept = [i for i in range(len(state.effects)) if i != cause]
         at = [k for k, c in enumerate(state.coordinates) if c.effect in kept]
         keys, slopes = [state.keys[i] for i in kept], state.slopes[at]
-        r, score = state.problem.r - state.changes[kept].sum(axis=0), state.score
+        r, judged = state.problem.r - state.changes[kept].sum(axis=0), state.judged
         if cause is not None:
-            score = self.bench.judge(state.problem, state.nominal, r, slopes, state.sizes()[at], state.room(at)).score
-        self.visited.add(keys, score)
-        return Rest(keys, r, slopes, score)
+            judged = self.bench.judge(state.problem, state.nominal, r, slopes, state.sizes()[at], state.room(at))
+        self.visited.add(keys, judged.evidence)
+        return Rest(keys, r, slopes, judged.score)
 
     def screened(self, state: State, without: int | None = None) -> Screened:
         """Every offer on top of the state, or of what is left of it without one cause."""
@@ -241,12 +228,13 @@ class Search:
         linear = self.linear(state, r, slopes)
         now = linear.judge(np.empty(0, int), start=state.judged.weights)
         offers = self.table.offers
-        gains = linear.screen(now, [o.columns for o in offers], [(o.low, o.high) for o in offers])
+        found = linear.screen(now, [o.columns for o in offers], [(o.low, o.high) for o in offers])
         values = np.full(len(offers), -np.inf)
-        for n, o in enumerate(offers):
-            if not set(o.keys) & set(keys):
-                values[n] = score + gains[n] - self.cost([*keys, *o.keys])
-                self.visited.screen([*keys, *o.keys], score + gains[n])
+        for n, (o, more) in enumerate(zip(offers, found, strict=True)):
+            if more is not None and not set(o.keys) & set(keys):
+                together = [*keys, *o.keys]
+                values[n] = score + more.score - self.costs.of(together)
+                self.visited.screen(together, more._replace(score=score + more.score))
         return Screened(keys, score, linear, now, values)
 
     def best_offers(self, screened: Screened, most: int = EXACT) -> list[tuple[float, Offered, np.ndarray]]:
@@ -262,9 +250,10 @@ class Search:
                 continue
             taken[form] = taken.get(form, 0) + 1
             judged = linear.judge(o.columns, o.low, o.high, start=now.weights)
-            together = score + judged.score - now.score
-            self.visited.add([*keys, *o.keys], together)
-            found.append((together - self.cost([*keys, *o.keys]), o, judged.amplitudes))
+            together = [*keys, *o.keys]
+            evidence = judged.evidence._replace(score=score + judged.score - now.score)
+            self.visited.add(together, evidence)
+            found.append((evidence.score - self.costs.of(together), o, judged.amplitudes))
         found.sort(key=lambda x: -x[0])
         seen, out = set(), []
         for x in found:
@@ -301,7 +290,7 @@ class Search:
 
     def _fitted(self, problem, variants, starts, weights) -> State:
         found = fitted(self.bench, problem, variants, starts, weights)
-        self.visited.add(found.keys, found.score)
+        self.visited.add(found.keys, found.judged.evidence)
         return found
 
     def in_its_best_form(self, state: State, first: int) -> State:
@@ -362,7 +351,7 @@ class Search:
         while len(state.effects) > 1:
             now = self.value(state)
             rest = [self.without(state, i) for i in range(len(state.effects))]
-            left = [x.score - self.cost(x.keys) for x in rest]
+            left = [x.score - self.costs.of(x.keys) for x in rest]
             worst = int(np.argmax(left))
             if left[worst] < now - CLOSE:
                 return state

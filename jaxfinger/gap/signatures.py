@@ -4,7 +4,7 @@ Site, shape and amplitude of an effect are arrays, and trials of one kind are st
 compiled function a class of effects and kind of prediction serves them all. Only what the effect changes is evaluated.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -80,7 +80,7 @@ def changes_of(fit: Fit) -> dict[str, type[CatalogueEffect]]:
     }
 
 
-def variants(effects: dict[str, type[CatalogueEffect]], finger, scales: Scales) -> list[Variant]:
+def variants(effects: Mapping[str, type[CatalogueEffect]], finger, scales: Scales) -> list[Variant]:
     """Every effect at every site with every shape and size worth trying."""
     return [
         Variant(effect, site, tuple(shape.items()), size, scales=scales)

@@ -1,0 +1,149 @@
+"""Fits the nine numbers of the diagnosis's formula (`jaxfinger/gap/formula.py`) by log score on sealed cases.
+
+    jaxfinger sealed make cases --split develop --count 40
+    python benchmarks/formula.py weigh records cases           # a minute a case; goes on where it was stopped
+    python benchmarks/formula.py fit records
+
+`weigh` searches every case and keeps what was said of every set of causes that the search has weighed. `fit` asks how
+probable that evidence makes the truth under other numbers: the mean over cases of Σ log P, over all causes that a
+session's trials can see, at work or not, and «something unlisted». Probabilities are kept within CLIP, since no search
+visits every set. A number is believed within a factor of WITHIN of where it starts, as one standard deviation; four
+fifths of the cases choose, the last fifth scores, five times over.
+"""
+
+import argparse
+import pickle
+import warnings
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, astuple, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import minimize
+
+from jaxfinger.data import read_session
+from jaxfinger.gap.columns import Counts
+from jaxfinger.gap.costs import Costs, Key
+from jaxfinger.gap.diagnose import searched
+from jaxfinger.gap.formula import Evidence, Parameters, rescored, unexplained
+from jaxfinger.gap.problem import build
+from jaxfinger.gap.signatures import catalogue_for
+from jaxfinger.identify import Recipe
+from jaxfinger.sealed.run import CASES_PER_PROCESS
+from jaxfinger.sealed.truth import UNLISTED, read_truth
+
+CLIP = 1e-3
+WITHIN = 3.0
+FOLDS = 5
+
+
+@dataclass(frozen=True)
+class Record:
+    """What one case's search has said."""
+
+    case: str
+    counts: Counts
+    evidence: dict[frozenset[Key], Evidence]
+    screened: frozenset[frozenset[Key]]  # sets that were not weighed in settled weights
+    sites: dict[str, int]
+    seen: tuple[Key, ...]
+    at_work: frozenset[Key]
+    parameters: Parameters
+
+    def costs(self, p: Parameters) -> Costs:
+        """Under other parameters."""
+        null = self.evidence[frozenset()]
+        return Costs(p, float(unexplained(self.counts, null, p).sum()), self.sites)
+
+    def log_score(self, p: Parameters) -> float:
+        """Σ log P of what is true of every cause and of «unlisted»."""
+        costs = self.costs(p)
+        evidence = {k: rescored(self.counts, x, self.parameters, p) for k, x in self.evidence.items()}
+        w = costs.weights({k: x.score for k, x in evidence.items()})
+        best = max((k for k in evidence if k not in self.screened), key=lambda k: evidence[k].score - costs.of(k))
+        probability = {key: sum(v for keys, v in w.items() if key in keys) for key in self.seen}
+        probability[UNLISTED] = costs.unlisted(float(unexplained(self.counts, evidence[best], p).sum()))
+        P = np.clip(np.array(list(probability.values())), CLIP, 1.0 - CLIP)
+        true = np.array([key in self.at_work for key in probability])
+        return float(np.sum(np.log(np.where(true, P, 1.0 - P))))
+
+
+def weigh(folder: Path) -> Record:
+    """Search one case."""
+    warnings.simplefilter("ignore")
+    recipe = Recipe()
+    problem = build(read_session(folder / "fit.h5"), recipe)
+    effects = {k: v for k, v in catalogue_for(recipe, None).items() if k not in recipe.model.terms}
+    search, _ = searched(problem, effects)
+    costs, visited = search.costs, search.visited
+    return Record(
+        folder.name,
+        search.bench.columns.counts,
+        visited.evidence,
+        frozenset(visited.screened),
+        dict(costs.sites),
+        tuple(search.table.keys),
+        read_truth(folder, folder.parent.with_name(f"{folder.parent.name}-truth")).at_work,
+        costs.parameters,
+    )
+
+
+def moved(x: Iterable[float]) -> Parameters:
+    """The formula's numbers, times e to the x."""
+    return Parameters(*(v * float(np.exp(d)) for v, d in zip(astuple(Parameters()), x, strict=True)))
+
+
+def fit(records: list[Record]) -> Parameters:
+    """The numbers that make the truth likeliest."""
+
+    def loss(x: np.ndarray) -> float:
+        p = moved(x)
+        return -sum(r.log_score(p) for r in records) + 0.5 * float(np.sum((x / np.log(WITHIN)) ** 2))
+
+    start = np.zeros(len(astuple(Parameters())))
+    simplex = np.vstack([start, start + 0.5 * np.eye(len(start))])
+    options = {"maxfev": 1500, "xatol": 0.02, "fatol": 0.05, "initial_simplex": simplex}
+    return moved(minimize(loss, start, method="Nelder-Mead", options=options).x)
+
+
+def mean(records: list[Record], p: Parameters) -> float:
+    """Log score a case."""
+    return float(np.mean([r.log_score(p) for r in records]))
+
+
+def main() -> None:
+    """Weigh cases, or print the numbers as they are, as they fit, and what each is worth on cases not seen."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=["weigh", "fit"])
+    parser.add_argument("records", type=Path)
+    parser.add_argument("cases", type=Path, nargs="*")
+    parser.add_argument("--workers", type=int, default=1)
+    options = parser.parse_args()
+    if options.what == "weigh":
+        options.records.mkdir(parents=True, exist_ok=True)
+        folders = sorted(f.parent for cases in options.cases for f in cases.glob("*/fit.h5"))
+        files = {f: options.records / f"{f.parent.name}-{f.name}.pickle" for f in folders}
+        todo = [f for f, file in files.items() if not file.exists()]
+        with ProcessPoolExecutor(options.workers, get_context("spawn"), max_tasks_per_child=CASES_PER_PROCESS) as pool:
+            for folder, record in zip(todo, pool.map(weigh, todo), strict=True):
+                files[folder].write_bytes(pickle.dumps(record))
+                print(f"{folder.name}: log score {record.log_score(record.parameters):.2f}", flush=True)
+        return
+    records = [pickle.loads(f.read_bytes()) for f in sorted(options.records.glob("*.pickle"))]
+    whole = fit(records)
+    print(
+        f"{len(records)} cases; log score a case {mean(records, Parameters()):.2f}, fitted {mean(records, whole):.2f}"
+    )
+    for name, value in asdict(whole).items():
+        print(f"  {name:<7}{getattr(Parameters(), name):8.3g} -> {value:.3g}")
+    parts = [records[i::FOLDS] for i in range(FOLDS)]
+    seen = [fit([r for p in parts if p is not part for r in p]) for part in parts]
+    scores = [[mean(part, Parameters()), mean(part, p)] for part, p in zip(parts, seen, strict=True)]
+    before, after = np.mean(scores, axis=0)
+    print(f"on the fifths that did not choose: {before:.2f} -> {after:.2f}")
+
+
+if __name__ == "__main__":
+    main()

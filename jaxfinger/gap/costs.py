@@ -1,0 +1,55 @@
+"""What a set of causes must explain, in log evidence, before it is believed; and the probabilities that follow.
+
+A cause costs the evidence that an imitator would bring, and the log of the number of its rivals. Further sites of an
+effect that is in cost less and the log of its sites alone: one cause that acts at many sites is one cause.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import expit, logsumexp
+
+from jaxfinger.effects import Site
+from jaxfinger.gap.formula import Parameters
+
+Key = tuple[str, Site]  # effect, site
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Of one file."""
+
+    parameters: Parameters
+    unknown: float  # log evidence that something is at work
+    sites: Mapping[str, int]  # of every effect that the trials can see
+
+    def of(self, keys: Iterable[Key]) -> float:
+        """What a set must explain."""
+        keys = list(keys)
+        return self.odds(keys) + sum(self.evidence_needed(keys))
+
+    def odds(self, keys: Iterable[Key]) -> float:
+        """Log odds against just these effects and sites, of all that there are."""
+        keys = list(keys)
+        effects = {e for e, _ in keys}
+        return len(effects) * np.log(len(self.sites)) + sum(np.log(max(self.sites.get(e, 1), 1)) for e, _ in keys)
+
+    def evidence_needed(self, keys: Iterable[Key]) -> list[float]:
+        """Of every cause, the first site of an effect and further ones."""
+        p, seen, out = self.parameters, set(), []
+        for effect, _ in sorted(keys):
+            out.append(p.prior + (0.0 if effect in seen else p.alike * self.unknown))
+            seen.add(effect)
+        return out
+
+    def weights(self, scores: Mapping[frozenset[Key], float]) -> dict[frozenset[Key], float]:
+        """Posterior probability of every set: ∝ exp(β (score − evidence needed) − log odds)."""
+        trust = self.parameters.trust
+        log_w = [trust * (s - sum(self.evidence_needed(keys))) - self.odds(keys) for keys, s in scores.items()]
+        return dict(zip(scores, np.exp(np.array(log_w) - logsumexp(log_w)).tolist(), strict=True))
+
+    def unlisted(self, left: float) -> float:
+        """Probability that something is at work which the catalogue lacks, from the log evidence that is left."""
+        p, taken = self.parameters, max(self.unknown - left, 0.0)
+        return float(expit(p.sharp * (left - p.open - p.left * taken)))
