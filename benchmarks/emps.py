@@ -1,5 +1,5 @@
-"""Real measurements with a known answer: Coulomb friction of the EMPS axis withheld, found, and judged on another
-recording; then, with nothing withheld, whether what remains is real.
+"""Real measurements with a known answer: terms of the EMPS axis withheld, found, and judged on another recording; then,
+with nothing withheld, whether what remains is real.
 
     python benchmarks/emps.py
 
@@ -8,6 +8,8 @@ formula's gain is 1 where it is real, and 0 where it was noise.
 """
 
 import tempfile
+from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +22,21 @@ from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem, build
 from jaxfinger.gap.propose import Proposal, terms
 from jaxfinger.gap.signatures import whitened
-from jaxfinger.identify import Fit, read_recipe
+from jaxfinger.identify import Fit, Recipe, read_recipe
 from jaxfinger.identify.validate import validate
 from jaxfinger.report.sentences import summary
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "datasets/emps"
 PUBLISHED = 20.39  # N, Coulomb friction (NOTICE.md)
+
+
+TERMS = {
+    "Coulomb": "joint_coulomb",
+    "damping": "joint_damping",
+    "offset": "joint_elastic",
+    "direction": "joint_friction_asymmetric",
+}
 
 
 def recordings(folder: Path) -> tuple[Session, Session]:
@@ -65,6 +75,27 @@ def main() -> None:
         report(*recordings(Path(folder)))
 
 
+def one_to_three_withheld(estimation: Session, pulses: Session) -> None:
+    """A line for each choice of one to three of four terms: what is named, and N missed on the pulses: before, with
+    what is named, and by the model with all four.
+    """
+    full = read_recipe(ROOT / "fits/emps.toml")
+
+    def recipe(left_out: tuple[str, ...]) -> Recipe:
+        terms = tuple(term for name, term in TERMS.items() if name not in left_out)
+        return replace(full, model=replace(full.model, terms=terms))
+
+    best = rms(diagnose(estimation, recipe(()), quick=True).nominal, pulses)
+    for left_out in (x for n in (1, 2, 3) for x in combinations(TERMS, n)):
+        found = diagnose(estimation, recipe(left_out))
+        before, after = rms(found.nominal, pulses), rms(found.augmented, pulses)
+        rivals = [" or ".join(k.effect for k in members) for members in found.ambiguous_sets]
+        values = [f"{v.name} {v.value:.4g} ± {v.std:.2g}" for c in found.budget for v in c.values if v.std > 0.0]
+        said = ", ".join([*(k.effect for k in found.named), *rivals]) or "nothing"
+        print(f"without {', '.join(left_out)}: {found.status.value}, {said} ({'; '.join(values)});")
+        print(f"    pulses {before:.2f} N before, {after:.2f} N after, {best:.2f} N at best")
+
+
 def report(estimation: Session, pulses: Session) -> None:
     """Print what is named, its value, the shrinkage on the pulses, and the gain of what remains there."""
     withheld = diagnose(estimation, read_recipe(ROOT / "fits/emps-no-coulomb.toml"))
@@ -78,6 +109,7 @@ def report(estimation: Session, pulses: Session) -> None:
     before, after, best = (rms(f, pulses) for f in (withheld.nominal, withheld.augmented, known.nominal))
     print(f"pulses: {before:.2f} N before, {after:.2f} N with {key.effect}, {best:.2f} N where nothing was withheld")
     print(f"closed on the pulses: {100 * (before**2 - after**2) / (before**2 - best**2):.1f} % of what it can close")
+    one_to_three_withheld(estimation, pulses)
     print(summary(known))
     if proposal := known.unexplained.proposal:
         value, std = gain(proposal, build(pulses, full))

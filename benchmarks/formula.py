@@ -115,7 +115,7 @@ def mean(records: list[Record], p: Parameters) -> float:
 
 def main() -> None:
     """Weigh cases, or print the numbers as they are, as they fit, and what each is worth on cases not seen."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("what", choices=["weigh", "fit"])
     parser.add_argument("records", type=Path)
     parser.add_argument("cases", type=Path, nargs="*")
@@ -126,10 +126,12 @@ def main() -> None:
         folders = sorted(f.parent for cases in options.cases for f in cases.glob("*/fit.h5"))
         files = {f: options.records / f"{f.parent.name}-{f.name}.pickle" for f in folders}
         todo = [f for f, file in files.items() if not file.exists()]
-        with ProcessPoolExecutor(options.workers, get_context("spawn"), max_tasks_per_child=CASES_PER_PROCESS) as pool:
-            for folder, record in zip(todo, pool.map(weigh, todo), strict=True):
-                files[folder].write_bytes(pickle.dumps(record))
-                print(f"{folder.name}: log score {record.log_score(record.parameters):.2f}", flush=True)
+        at_once = options.workers * CASES_PER_PROCESS
+        for some in (todo[i : i + at_once] for i in range(0, len(todo), at_once)):
+            with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
+                for folder, record in zip(some, pool.map(weigh, some), strict=True):
+                    files[folder].write_bytes(pickle.dumps(record))
+                    print(f"{folder.name}: log score {record.log_score(record.parameters):.2f}", flush=True)
         return
     records = [pickle.loads(f.read_bytes()) for f in sorted(options.records.glob("*.pickle"))]
     whole = fit(records)

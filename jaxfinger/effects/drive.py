@@ -82,7 +82,7 @@ class JointFrictionWarmup(CatalogueEffect):
 
     a: Float[Array, ""] = amplitude("1", 0.3, signed=True)
     d: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed", signed=True)
-    T: Float[Array, ""] = shape("s", (0.2, 0.05, 0.8, 3.0), "session")
+    T: Float[Array, ""] = shape("s", (0.2, 0.05, 0.8), "session")
     by: Float[Array, ""] = shape("1", (0.0, 1.0), moves="not")
 
     @classmethod

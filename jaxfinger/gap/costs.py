@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import expit, logsumexp
 
-from jaxfinger.effects import Site
+from jaxfinger.effects import NOMINAL_TERMS, Site
 from jaxfinger.gap.formula import Parameters
 
 Key = tuple[str, Site]  # effect, site
@@ -30,9 +30,11 @@ class Costs:
         return self.odds(keys) + sum(self.evidence_needed(keys))
 
     def odds(self, keys: Iterable[Key]) -> float:
-        """Log odds against just these effects and sites, of all that there are."""
+        """Log odds against just these effects and sites, of all that there are. A term that the recipe leaves out is no
+        rarity: it is as likely at work as not.
+        """
         keys = list(keys)
-        effects = {e for e, _ in keys}
+        effects = {e for e, _ in keys} - set(NOMINAL_TERMS)
         return len(effects) * np.log(len(self.sites)) + sum(np.log(max(self.sites.get(e, 1), 1)) for e, _ in keys)
 
     def evidence_needed(self, keys: Iterable[Key]) -> list[float]:

@@ -1,6 +1,6 @@
 """Which causes: sets grown, pruned and swapped by their evidence, each fitted exactly; what all visited sets say."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.gap.columns import ByColumn
 from jaxfinger.gap.costs import Costs, Key
 from jaxfinger.gap.exact import Bench, State, Whitened, fitted, prior_of
-from jaxfinger.gap.formula import Evidence, Judged, Linear, Weights
+from jaxfinger.gap.formula import Evidence, Judged, Linear, Weights, unexplained
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.screening import Screening
 from jaxfinger.gap.signatures import Variant
@@ -317,14 +317,11 @@ class Search:
         if not self.table.offers:
             return state
         for _ in range(MOST):
-            grown = self._grown(state)
-            if grown is None:
-                changed = self._swapped(state)
-                if changed is None:
-                    break
-                state = self._pruned(changed)
-                continue
-            state = self._pruned(grown)
+            tried = self._tried(state, state)
+            better = self._best(state, tried) or self._swapped(state) or self._best(state, self._pairs(state, tried))
+            if better is None:
+                break
+            state = self._pruned(better)
         for i, key in enumerate(state.keys):  # what each could be replaced by
             screened = self.screened(state, i)
             for _, offer, amplitudes in self.best_offers(screened):
@@ -333,18 +330,26 @@ class Search:
                     self.in_its_best_form(found, len(state.effects) - 1)
         return state
 
-    def _grown(self, state: State) -> State | None:
+    def _tried(self, state: State, beside: State, most: int = EXACT) -> list[State]:
+        """The state with each of the best offers that may be worth more than the one `beside`."""
         screened = self.screened(state)
-        now, best = self.value(state), None
-        for value, offer, amplitudes in self.best_offers(screened):
-            if value < now - CLOSE:
-                continue
-            found = self.exactly(state, None, offer, amplitudes, screened.now.weights)
-            if best is None or self.value(found) > self.value(best):
-                best = found
-        if best is None or self.value(best) <= now:
-            return None
-        return self.in_its_best_form(best, len(state.effects))
+        return [
+            self.exactly(state, None, offer, amplitudes, screened.now.weights)
+            for value, offer, amplitudes in self.best_offers(screened, most)
+            if value >= self.value(beside) - CLOSE
+        ]
+
+    def _best(self, state: State, tried: Iterable[State]) -> State | None:
+        """That which is worth most, in its best form, if it is worth more than the state."""
+        best = max(tried, key=self.value, default=state)
+        return self.in_its_best_form(best, len(state.effects)) if self.value(best) > self.value(state) else None
+
+    def _pairs(self, state: State, firsts: Sequence[State]) -> Iterator[State]:
+        """Two causes more where neither alone is worth its cost, since each is hidden by what the other leaves open."""
+        left = unexplained(self.bench.columns.counts, state.judged.evidence, self.bench.parameters)
+        if left.sum() > self.bench.parameters.open:
+            for first in firsts:
+                yield from self._tried(first, state, most=1)
 
     def _pruned(self, state: State) -> State:
         """Without those causes that explain too little beside the others."""
