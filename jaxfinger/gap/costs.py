@@ -27,7 +27,7 @@ class Costs:
     def of(self, keys: Iterable[Key]) -> float:
         """What a set must explain."""
         keys = list(keys)
-        return self.odds(keys) + sum(self.evidence_needed(keys))
+        return self.odds(keys) + self.evidence_needed(keys)
 
     def odds(self, keys: Iterable[Key]) -> float:
         """Log odds against just these effects and sites, of all that there are. A term that the recipe leaves out is no
@@ -37,18 +37,15 @@ class Costs:
         effects = {e for e, _ in keys} - set(NOMINAL_TERMS)
         return len(effects) * np.log(len(self.sites)) + sum(np.log(max(self.sites.get(e, 1), 1)) for e, _ in keys)
 
-    def evidence_needed(self, keys: Iterable[Key]) -> list[float]:
-        """Of every cause, the first site of an effect and further ones."""
-        p, seen, out = self.parameters, set(), []
-        for effect, _ in sorted(keys):
-            out.append(p.prior + (0.0 if effect in seen else p.alike * self.unknown))
-            seen.add(effect)
-        return out
+    def evidence_needed(self, keys: Iterable[Key]) -> float:
+        """By every cause and site, and by every effect as a share of all that there is to explain."""
+        keys, p = list(keys), self.parameters
+        return p.prior * len(keys) + p.alike * self.unknown * len({e for e, _ in keys})
 
     def weights(self, scores: Mapping[frozenset[Key], float]) -> dict[frozenset[Key], float]:
         """Posterior probability of every set: ∝ exp(β (score − evidence needed) − log odds)."""
         trust = self.parameters.trust
-        log_w = [trust * (s - sum(self.evidence_needed(keys))) - self.odds(keys) for keys, s in scores.items()]
+        log_w = [trust * (s - self.evidence_needed(keys)) - self.odds(keys) for keys, s in scores.items()]
         return dict(zip(scores, np.exp(np.array(log_w) - logsumexp(log_w)).tolist(), strict=True))
 
     def unlisted(self, left: float) -> float:

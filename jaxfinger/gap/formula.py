@@ -83,12 +83,6 @@ def unexplained(counts: Counts, x: Evidence, p: Parameters) -> Float[np.ndarray,
     return 0.5 * counts.K * np.log(np.maximum(x.e / counts.K / floor, 1.0))
 
 
-def rescored(counts: Counts, x: Evidence, before: Parameters, p: Parameters) -> Evidence:
-    """A set's evidence under other parameters, its causes as they are: to first order they are at an optimum."""
-    was, is_now = (log_likelihood(counts, x.e, x.o, x.explained, q)[0] for q in (before, p))
-    return x._replace(score=float(x.score + is_now - was))
-
-
 @dataclass(frozen=True)
 class Judged:
     """One set of causes on top of what is refitted with every set."""
