@@ -102,7 +102,7 @@ def test_recover_after_a_kill(bench):
         process.kill()
     done = jaxfinger("recover", log, "--output", bench / "rescued.h5")
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith(f"{bench / 'rescued.h5'}: 1 trials, cut short: 01-VD.1")
+    assert done.stdout.startswith(f"{bench / 'rescued.h5'}: 1 trial, cut short: 01-VD.1")
     assert len(read_session(bench / "rescued.h5")["01-VD.1"].time) > 1000
     twice = jaxfinger("recover", log, "--output", bench / "rescued.h5")
     assert twice.returncode == 2
