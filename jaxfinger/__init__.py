@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from jaxfinger.identify import refine as refine
     from jaxfinger.identify import save_fit as save
     from jaxfinger.identify.predictions import predict_session as predict
+    from jaxfinger.identify.sensitivity import sensitivity as sensitivity
     from jaxfinger.identify.validate import validate as validate
     from jaxfinger.report import plots as plot
 
@@ -48,6 +49,7 @@ _PLACES = {
     "recipe": "identify:read_recipe",
     "refine": "identify:refine",
     "save": "identify:save_fit",
+    "sensitivity": "identify.sensitivity:sensitivity",
     "validate": "identify.validate:validate",
     "write": "data:write_session",
     "write_predictions": "data:write_predictions",
@@ -68,6 +70,7 @@ __all__ = [
     "recipe",
     "refine",
     "save",
+    "sensitivity",
     "validate",
     "write",
     "write_predictions",

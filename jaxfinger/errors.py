@@ -12,7 +12,8 @@ def did_you_mean(said: object, known: Collection[str]) -> str:
     """` (did you mean 'time'?)`, to follow a name that is not known; empty where none is near it."""
     if not isinstance(said, str):
         return ""
-    swapped = [name for name in known if sorted(name) == sorted(said)]  # letters, which difflib counts as two mistakes
+    # Letters swapped, which difflib counts as two mistakes, or of another case, which it takes for others.
+    swapped = [name for name in known if sorted(name.casefold()) == sorted(said.casefold())]
     close = swapped or get_close_matches(said, list(known), 1)
     return f" (did you mean {close[0]!r}?)" if close else ""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import logging
 import os
@@ -9,6 +10,8 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def main(tokens: Sequence[str] | None = None) -> None:
@@ -22,6 +25,7 @@ def main(tokens: Sequence[str] | None = None) -> None:
 
     try:
         app(tokens, exit_on_error=False, result_action="return_none")
+        sys.stdout.flush()
     except UserError as error:
         from jaxfinger.cli.output import plain
 
@@ -30,8 +34,14 @@ def main(tokens: Sequence[str] | None = None) -> None:
     except CycloptsError:
         raise SystemExit(2) from None  # cyclopts has said what is wrong
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _say_no_more()
         raise SystemExit(1) from None
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        _say_no_more()
+        print(f"jaxfinger: the disk takes no more ({error.strerror}); free space, or write elsewhere", file=sys.stderr)
+        raise SystemExit(2) from None
     except Exception:
         platform = os.environ.get("JAX_PLATFORMS")
         if not platform or _computes():
@@ -41,6 +51,11 @@ def main(tokens: Sequence[str] | None = None) -> None:
             file=sys.stderr,
         )
         raise SystemExit(2) from None
+
+
+def _say_no_more() -> None:
+    """What still waits to be written to stdout is dropped, so that its flush at the end fails no more."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _computes() -> bool:

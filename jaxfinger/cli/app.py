@@ -2,6 +2,8 @@
 
 from cyclopts import App, Parameter
 
+from jaxfinger.cli import completion
+
 app = App(
     name="jaxfinger",
     help="Identify the dynamic model of a tendon-driven finger, and say why the simulation still differs from it.",
@@ -55,3 +57,27 @@ sealed = App(name="sealed", help="The benchmark of the diagnosis, on cases whose
 for name, text in SEALED.items():
     sealed.command(f"jaxfinger.cli.sealed:{name}", name=name, help=text)
 app.command(sealed)
+
+
+@app.command(name="--install-completion", help="Let your shell complete commands, options and files.")
+def _install_completion(shell: completion.Shell | None = None, /) -> None:
+    """Write a script where the shell looks for it.
+
+    Parameters
+    ----------
+    shell
+        The shell; by default the one that runs this.
+    """
+    print(completion.install(app, shell))
+
+
+@app.command(name="--show-completion", help="Print the script that does so, to install it yourself.")
+def _show_completion(shell: completion.Shell | None = None, /) -> None:
+    """Print the script that lets a shell complete commands, options and files.
+
+    Parameters
+    ----------
+    shell
+        The shell; by default the one that runs this.
+    """
+    print(completion.show(app, shell))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import console, plain, progress, refuse_existing, table
+from jaxfinger.cli.output import console, plain, progress, refuse_output, table
 from jaxfinger.errors import UserError
 
 if TYPE_CHECKING:
@@ -41,10 +41,11 @@ def demo(
         Replace files that are already there.
     """
     from jaxfinger.cli.diagnose import FILES
+    from jaxfinger.data.atomic import make_folder
 
     for name in FILES:
-        refuse_existing(output / name, overwrite) if output.is_dir() else None
-    output.mkdir(parents=True, exist_ok=True)
+        refuse_output(output / name, overwrite) if output.is_dir() else None
+    make_folder(output)
     from jaxfinger.cli.tables import fit_to_read, print_fit
     from jaxfinger.data import read_session
     from jaxfinger.gap import diagnose

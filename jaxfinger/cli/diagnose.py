@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import Output, console, plain, progress, read, refuse_existing
+from jaxfinger.cli.output import Output, console, plain, progress, read, refuse_output
 from jaxfinger.errors import UserError
 
 FILES = ("gap.json", "nominal.json", "augmented.json", "report.html")
@@ -57,10 +57,13 @@ def diagnose(
         Replace an earlier diagnosis in the folder.
     """
     _refuse(output, overwrite)
+    if predictions is not None and predictions.exists() and session.exists() and predictions.samefile(session):
+        raise UserError(f"{predictions}: is the session itself; give the simulator's predictions of its trials")
     tolerated = _tolerance(tolerance or [])
     from dataclasses import replace
 
     from jaxfinger.data import read_predictions
+    from jaxfinger.data.atomic import make_folder
     from jaxfinger.effects import load
     from jaxfinger.gap import diagnose as run
     from jaxfinger.identify import load_fit, read_recipe
@@ -75,7 +78,7 @@ def diagnose(
         say("reading the file")
         simulated = read_predictions(predictions) if predictions is not None else None
         measured = read(session)
-        _make(output)
+        make_folder(output)
         found = run(measured, wanted, quick, own, tuple(without or ()), say, simulated, tolerated, earlier)
         if against is not None:
             found = replace(found, against=against.name)
@@ -110,12 +113,4 @@ def _refuse(output: Path, overwrite: bool) -> None:
     if output.exists() and not output.is_dir():
         raise UserError(f"{output}: is a file; name a folder")
     for name in FILES if output.is_dir() else ():
-        refuse_existing(output / name, overwrite)
-
-
-def _make(output: Path) -> None:
-    """Before the long work: what will be written can be."""
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{output}: cannot be made ({error.strerror}); choose another folder") from None
+        refuse_output(output / name, overwrite)

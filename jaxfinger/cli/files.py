@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import Output, console, plain, print_json, progress, refuse_existing, remark, table
+from jaxfinger.cli.output import Output, console, plain, print_json, progress, refuse_output, remark, table
 from jaxfinger.errors import UserError, counted
 from jaxfinger.progress import Step
 
@@ -135,7 +135,7 @@ def simulate(
     overwrite
         Replace a file that is already there.
     """
-    refuse_existing(output, overwrite)
+    refuse_output(output, overwrite)
     if protocol is not None and source.suffix != ".json":
         raise UserError(f"{source}: a recipe brings its own trials; leave out --protocol, or give a fit")
     from jaxfinger.data import write_session
@@ -182,7 +182,7 @@ def import_(
     """
     if not sources:
         raise UserError(f"{mapping}: no recording was given; name at least one before --mapping")
-    refuse_existing(output, overwrite)
+    refuse_output(output, overwrite)
     from jaxfinger.data import import_file
     from jaxfinger.data.findings import Report
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxfinger.cli.output import print_json, progress, refuse_existing, table
+from jaxfinger.cli.output import print_json, progress, refuse_figure, table
 
 SHOWN = 3  # of each kind, the strongest
+MOST = 40  # trials, sensors and values, and as many parameters, in a picture
 STEPS = {"trials": "left out", "sensors": "gain + 1 %", "cad": "+ 1 standard deviation"}
 
 
@@ -32,7 +33,7 @@ def influence(
         Replace a figure that is already there.
     """
     if figure is not None:
-        refuse_existing(figure, overwrite)
+        refuse_figure(figure, overwrite)
     from jaxfinger.data import read_session
     from jaxfinger.identify import load_fit
     from jaxfinger.identify.parameters import describe
@@ -45,9 +46,10 @@ def influence(
         found = sensitivity(loaded, session)
         names = [describe(loaded.model)[i].name for i in loaded.estimated]
         if figure is not None:
-            from jaxfinger.report.influence import draw_influence
+            from jaxfinger.report.plots import influence as draw
+            from jaxfinger.report.theme import save
 
-            draw_influence(names, {k: (s.names, s.shifts(loaded)) for k, s in found.items()}, figure, overwrite)
+            save(draw(found, loaded, MOST).get_figure(root=True), figure, overwrite)
     if json:
         print_json(
             {

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import Output, print_json, progress, read, refuse_existing
+from jaxfinger.cli.output import Output, print_json, progress, read, refuse_output
 from jaxfinger.errors import UserError, counted
 
 Experiments = Annotated[list[str] | None, Parameter(name=["--experiments", "-e"], consume_multiple=True)]
@@ -45,10 +45,13 @@ def identify(
     overwrite
         Replace files that are already there.
     """
-    refuse_existing(output, overwrite)
+    refuse_output(output, overwrite)
+    from jaxfinger.data.atomic import make_folder
     from jaxfinger.identify import identify as run
     from jaxfinger.identify import read_recipe
 
+    if figures is not None:
+        make_folder(figures)
     with progress("identify") as say:
         wanted = read_recipe(recipe)
         say("reading the file")
@@ -65,7 +68,7 @@ def identify(
 def _fit(
     stages: tuple[str, ...], file: Path, output: Path, start: Path | None, recipe: str | None, json: bool, overwrite
 ):
-    refuse_existing(output, overwrite)
+    refuse_output(output, overwrite)
     if start is not None and recipe is not None:
         raise UserError(f"{start}: a fit to start from brings its own recipe; leave out --recipe or --start")
     from jaxfinger.identify import identify as run
@@ -79,6 +82,10 @@ def _fit(
         if first is not None:
             model_for(first, session)  # refuses the session of another finger
         fit = run(session, None if first else read_recipe(recipe), stages, first, say)
+        if all(s.status == "skipped" for s in fit.stages):
+            raise UserError(
+                f"{file}: {'; '.join(s.message for s in fit.stages)}; nothing is fitted, so nothing written"
+            )
         content = _keep(fit, output, overwrite)
     _report(content, json)
 
@@ -168,7 +175,7 @@ def fit_joint(file: Path, *, output: Output, start: Path, json: bool = False, ov
     overwrite
         Replace a file that is already there.
     """
-    refuse_existing(output, overwrite)
+    refuse_output(output, overwrite)
     from jaxfinger.identify import load_fit
     from jaxfinger.identify.predictions import model_for
 
@@ -210,7 +217,7 @@ def fit_effects(
     overwrite
         Replace a file that is already there.
     """
-    refuse_existing(output, overwrite)
+    refuse_output(output, overwrite)
     keys = [_key(text) for text in effect]
     from jaxfinger.effects import load
     from jaxfinger.gap import fit_with
@@ -262,9 +269,12 @@ def validate(
         Replace figures that are already there.
     """
     from jaxfinger.cli.tables import print_validation
+    from jaxfinger.data.atomic import make_folder
     from jaxfinger.identify import load_fit
     from jaxfinger.identify.validate import validate as run
 
+    if figures is not None:
+        make_folder(figures)
     with progress("validate") as say:
         say("reading the files")
         loaded, session = load_fit(fit, effects), read(file)
@@ -296,7 +306,7 @@ def predict(fit: Path, file: Path, *, output: Output, effects: Path | None = Non
     overwrite
         Replace a file that is already there.
     """
-    refuse_existing(output, overwrite)
+    refuse_output(output, overwrite)
     from jaxfinger.data import write_predictions
     from jaxfinger.identify import load_fit
     from jaxfinger.identify.predictions import predict_session

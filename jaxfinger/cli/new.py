@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from jaxfinger.cli.output import refuse_existing
+from jaxfinger.cli.output import refuse_output
 from jaxfinger.errors import UserError
 
 
@@ -42,7 +42,7 @@ def new(
     for path in (finger, mapping):
         if path.suffix.lower() != ".toml":
             raise UserError(f"{path}: is to be a TOML file; give a name that ends in .toml")
-        refuse_existing(path, overwrite)
+        refuse_output(path, overwrite)
     if finger.resolve() == mapping.resolve():
         raise UserError(f"{finger}: is named twice; give one file for the finger, another for the mapping")
     from jaxfinger.data.atomic import atomic_path

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from jaxfinger.data import Session
     from jaxfinger.data.findings import Finding
 
+FIGURES = (".svg", ".png")
 MOST_REMARKS = 20  # what a person reads before the results scroll away
 Output = Annotated[Path, Parameter(name=["--output", "-o"])]
 
@@ -179,11 +180,17 @@ def without_infinities(value: Any) -> Any:
     return value
 
 
-def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Before any work: an output file that exists is only replaced when asked."""
-    if path.is_dir():
-        raise UserError(f"{path}: is a folder; name a file in it")
-    if path.exists() and not overwrite:
-        raise UserError(f"{path}: exists already and is not overwritten; choose another name, or add --overwrite")
+def refuse_output(path: Path, overwrite: bool) -> None:
+    """Before any work: what will be written can be, and replaces nothing unasked."""
+    from jaxfinger.data.atomic import refuse_existing
+
+    refuse_existing(path, overwrite)
     if not path.parent.is_dir():
         raise UserError(f"{path.parent}: is no folder; make it first")
+
+
+def refuse_figure(path: Path, overwrite: bool) -> None:
+    """The same for a picture, whose kind its name says."""
+    if path.suffix not in FIGURES:
+        raise UserError(f"{path}: is to be a picture; give a name that ends in {' or '.join(FIGURES)}")
+    refuse_output(path, overwrite)

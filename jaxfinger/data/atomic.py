@@ -29,7 +29,7 @@ def atomic_path(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Pa
         UserError: the file exists and `overwrite` is false, or its folder cannot be written.
     """
     path = Path(path)
-    _refuse_existing(path, overwrite)
+    refuse_existing(path, overwrite)
     prefix, suffix = f".{path.name}.", ".part"
     _remove_orphans(path.parent, prefix, suffix)
     try:
@@ -44,7 +44,7 @@ def atomic_path(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Pa
         yield part
         _sync(part)
         part.chmod(0o666 & ~_umask())  # mkstemp makes it private
-        _refuse_existing(path, overwrite)
+        refuse_existing(path, overwrite)
         os.replace(part, path)
         _sync(path.parent)
     except OSError as error:
@@ -82,11 +82,33 @@ def _remove_orphans(folder: Path, prefix: str, suffix: str) -> None:
                     os.close(handle)
 
 
-def _refuse_existing(path: Path, overwrite: bool) -> None:
+def make_folder(path: str | os.PathLike) -> Path:
+    """The folder, made where there is none.
+
+    Raises:
+        UserError: it is a file, or cannot be made.
+    """
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        said = "is a file" if path.is_file() else f"cannot be made ({error.strerror})"
+        raise UserError(f"{path}: {said}; choose another folder") from None
+    return path
+
+
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Before any work: an output file that exists is only replaced when asked.
+
+    Raises:
+        UserError: there is a file and `overwrite` is false, or there is what is no file.
+    """
     if path.is_dir():
         raise UserError(f"{path}: is a folder; name a file in it")
+    if path.exists() and not path.is_file():
+        raise UserError(f"{path}: is a device or a pipe, which no file may replace; choose another name")
     if path.exists() and not overwrite:
-        raise UserError(f"{path}: exists already and is not overwritten; choose another name, or ask to overwrite it")
+        raise UserError(f"{path}: exists already and is not overwritten; choose another name, or add --overwrite")
 
 
 def _sync(path: Path) -> None:

@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -14,6 +14,7 @@ from jaxfinger.model import Finger, Motion
 MOST = 95.0  # percentile that counts as the most: some samples are spikes
 
 
+@runtime_checkable
 class Recorded(Protocol):
     """Trials of one experiment: motion, measured channels, and where they count (not zero)."""
 

@@ -15,6 +15,7 @@ from jaxfinger.gap.sets import Search, table_of
 from jaxfinger.gap.signatures import Variant, catalogue_for, variants
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.stages import Progress
+from jaxfinger.model import Finger
 
 Named = tuple[str, tuple[str, ...]]  # effect, site; a pair may be joined by a hyphen
 
@@ -41,6 +42,7 @@ def fit_with(
         if effect not in catalogue:
             near = did_you_mean(effect, catalogue)
             raise UserError(f"the catalogue has no effect {effect}{near}; it has {', '.join(sorted(catalogue))}")
+    _refuse_elsewhere(catalogue, keys, Finger.from_description(session.finger))
     problem = build(session, recipe, progress)
     offered = _offered(catalogue, keys, problem)
     bench = Bench.of(problem, Parameters())
@@ -65,9 +67,13 @@ def _offered(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[Named],
     offered, finger = [], problem.nominal.finger
     for effect, site in keys:
         offers = variants({effect: catalogue[effect]}, finger, problem.scales)
-        mine = [v for v in offers if "-".join(v.site) == "-".join(site)]
-        if not mine:
-            sites = ", ".join("-".join(s) for s in catalogue[effect].sites(finger)) or "no site on this finger"
-            raise UserError(f"{effect} is not at {'-'.join(site)}; it has {sites}")
-        offered += mine
+        offered += [v for v in offers if "-".join(v.site) == "-".join(site)]
     return offered
+
+
+def _refuse_elsewhere(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[Named], finger: Finger) -> None:
+    for effect, site in keys:
+        sites = ["-".join(s) for s in catalogue[effect].sites(finger)]
+        if (named := "-".join(site)) not in sites:
+            near = did_you_mean(named, sites)
+            raise UserError(f"{effect} is not at {named}{near}; it has {', '.join(sites) or 'no site on this finger'}")

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +18,7 @@ MOST = 300  # periods: beyond 50 minutes the shortest grows with the session, fo
 RIDGE = 1e-9  # relative, of products of columns
 
 
+@runtime_checkable
 class Projector(Protocol):
     """Rows off what the nominal parameters can absorb."""
 

@@ -17,6 +17,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch, prepare
@@ -182,7 +183,7 @@ def _padded(batch: Batch, T: int) -> Batch:
     return Batch(x, *({c: pad(v, "constant") for c, v in d.items()} for d in (batch.y, batch.mask)))
 
 
-@eqx.filter_jit
+@quick_jit
 def _fit_all(model, starts, sources, stages, coordinates, limit, batching):
     def one(member):
         start, batches, known = member

@@ -26,6 +26,7 @@ from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.gauss_newton import visible
 from jaxfinger.identify.linearise import Filters, huber, white_rows
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
+from jaxfinger.identify.predictions import model_for
 from jaxfinger.identify.resample import plan_of
 from jaxfinger.identify.solve import Source
 from jaxfinger.identify.stages import cad_covariance, cad_prior, sources_of
@@ -65,6 +66,7 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
     kinds = (to,) if isinstance(to, str) else tuple(to)
     if unknown := set(kinds) - set(KINDS):
         raise UserError(f"sensitivity to {sorted(unknown)}: it takes some of {list(KINDS)}")
+    model_for(fit, session)  # refuses the session of another finger
     parameters, plan = describe(fit.model), plan_of(session, fit)
     stacks = prepare(session, [t.name for t in session if any(t.experiment in reads for reads, _ in plan)])
     plan = [({e: c for e, c in reads.items() if e in stacks}, free) for reads, free in plan]

@@ -1,6 +1,6 @@
 """What ID.1 gives: the rigid chain, its inertia, how it is mounted, and which tendon crosses which joint."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 
+@runtime_checkable
 class Description(Protocol):
     """The arrays of ID.1, however they were read; `rotor_inertia` (m,), kg m², may be missing or None."""
 
@@ -97,7 +98,7 @@ class Finger(eqx.Module):
         )
 
     @property
-    def inertia(self) -> Float[Array, "m 3 3"]:
+    def inertia(self) -> Float[Array, "m 3 3 *T"]:
         """kg m², about the centre of mass: a link that weighs more than CAD says is denser, and its inertia grows with
         its mass, so that it stays the inertia of a body.
         """

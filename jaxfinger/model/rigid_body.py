@@ -17,9 +17,9 @@ from jaxtyping import Array, Float
 
 from jaxfinger.model.finger import Finger
 
-Scalar = Float[Array, "*T"]
-Vector = Float[Array, "3 *T"] | tuple[Scalar, ...]
-Matrix = Float[Array, "3 3 *T"] | tuple[tuple[Scalar, ...], ...]  # rows
+Scalar = Float[Array, "*#T"]
+Vector = Float[Array, "3 *#T"] | tuple[Scalar, ...]
+Matrix = Float[Array, "3 3 *#T"] | tuple[tuple[Scalar, ...], ...]  # rows
 
 
 def _add(*vectors: Vector) -> Vector:

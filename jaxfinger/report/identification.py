@@ -7,6 +7,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from jaxfinger.data import Session
+from jaxfinger.data.atomic import make_folder
 from jaxfinger.identify import Fit
 from jaxfinger.report import plots
 from jaxfinger.report.curves import curves
@@ -24,8 +25,7 @@ def draw_identification(
     Raises:
         UserError: a figure exists and `overwrite` is false.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = make_folder(folder)
     found = curves(fit, session)
     figures = {}
     if found.moment_arm:

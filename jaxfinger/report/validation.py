@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxfinger.data import Session, Trial
+from jaxfinger.data.atomic import make_folder
 from jaxfinger.experiments import Stack, predict, prepare
 from jaxfinger.identify import Fit
 from jaxfinger.identify.predictions import model_for, predict_session
@@ -29,8 +30,7 @@ def draw_validation(
     Raises:
         UserError: a figure exists and `overwrite` is false, or the session is of another finger.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = make_folder(folder)
     model = model_for(fit, session)
     figures = {}
     if trials := list(session.select("VD.1")):

@@ -8,11 +8,12 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxfinger.errors import UserError
 
 
+@runtime_checkable
 class Operator(Protocol):
     """Answers prompts and may stop the run at any time."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ Channels = dict[str, Float[Array, "channels N"]]
 BLOCK = 4096  # samples: one compiled rigid-body call serves trials of any length
 
 
+@runtime_checkable
 class Plant(Protocol):
     """Anything that can stand in for the finger on the rig: a specimen, or a fitted model."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,7 @@ from jaxtyping import Float
 Point = tuple[float, float]
 
 
+@runtime_checkable
 class Route(Protocol):
     """What a tendon does at one joint: excursion l(q), m, zero at q = 0, and the moment arm dl/dq, m/rad."""
 

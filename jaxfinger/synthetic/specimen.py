@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +19,7 @@ Array = Any  # NumPy or JAX
 Routes = tuple[Route | None, ...]  # one a joint, None where the joint is not crossed
 
 
+@runtime_checkable
 class Spring(Protocol):
     """Something that stores energy in the joints' angles."""
 
@@ -68,6 +69,7 @@ class PolynomialSpring:
         return _polynomials(integral, q).sum(0)
 
 
+@runtime_checkable
 class Friction(Protocol):
     """Coulomb friction of the joints."""
 

@@ -16,6 +16,7 @@ from jaxfinger.report.numbers import number
 
 ROOT = Path(__file__).parents[2]
 EMPS = ROOT / "datasets" / "emps"
+DEMO = ROOT / "datasets" / "demo-finger" / "session.h5"
 
 
 def run(*tokens) -> int:
@@ -184,11 +185,38 @@ def test_a_stage_at_a_time(folder, tmp_path, capsys):
         (("import", "--mapping", "{f}/m.toml", "-o", "{t}/x.h5"), "no recording was given"),
         (("identify", "{f}/emps.h5"), None),
         (("identfy",), None),
+        (("identify", "{f}", "-o", "{t}/x.json"), "is a folder"),
+        (("identify", "{f}/emps.h5", "-o", "/dev/null", "--overwrite"), "is a device"),
+        (("identify", "{f}/emps.h5", "-o", "{t}/x.json", "--recipe", "papper"), "did you mean 'paper'?"),
+        (("identify", "{f}/emps.h5", "-o", "{t}/x.json", "--recipe", "{f}"), "Is a directory"),
+        (("identify", "{f}/emps.h5", "-o", "{t}/x.json", "--figures", "{f}/fit.json"), "choose another folder"),
+        (("fit", "id2", "{f}/emps.h5", "-o", "{t}/x.json", "--recipe", "emps"), "no ID.2 trial"),
+        (("fit", "effects", "{f}/emps.h5", "-o", "{t}/x.json", "--effect", "joint_stribek:axis"), "'joint_stribeck'"),
+        (("fit", "effects", "{f}/emps.h5", "-o", "{t}/x.json", "--effect", "joint_stribeck:Axis"), "mean 'axis'"),
+        (("validate", "{f}/fit.json", "{f}/emps.h5", "--figures", "{f}/fit.json"), "is a file"),
+        (("validate", "{f}/emps.h5", "{f}/fit.json"), "is an HDF5 file and no fit"),
+        (("influence", "{f}/fit.json", DEMO), "where the fit has axis"),
+        (("influence", "{f}/fit.json", "{f}/emps.h5", "--figure", "{t}/x.jpg"), "ends in .svg or .png"),
+        (("diagnose", "{f}/fit.json", "-o", "{t}"), "is not an HDF5 file"),
+        (("diagnose", "{f}/emps.h5", "-o", "{f}/fit.json"), "name a folder"),
+        (("diagnose", "{f}/emps.h5", "-o", "{t}", "--tolerance", "abc"), "say a share such as 2%"),
+        (("diagnose", "{f}/emps.h5", "-o", "{t}", "--predictions", "{f}/emps.h5"), "is the session itself"),
+        (("diagnose", "{f}/emps.h5", "-o", "{t}", "--effects", "{f}"), "is not a Python file with effects"),
+        (("diagnose", "{f}/emps.h5", "-o", "{t}", "--against", "{f}/emps.h5"), "is an HDF5 file and no fit"),
+        (("diagnose", "{f}/emps.h5", "-o", "{t}", "--quik"), None),
+        (("demo", "-o", "{f}/fit.json"), "is a file"),
+        (("look", "{f}/none.csv"), "does not exist"),
+        (("simulate", "{f}/emps.h5", "-o", "{t}/x.h5"), "is not text"),
+        (("record", "{f}/none.toml", "--rig", "{f}/none.toml", "-o", "{t}/x.h5"), "none.toml"),
+        (("recover", "{f}/emps.h5", "-o", "{t}/x.h5"), "not a recording log"),
+        (("sealed", "make", "{f}/fit.json", "--count", "1"), "is a file"),
+        (("sealed", "close", "{f}/none"), "run them first"),
+        (("--show-completion", "tcsh"), None),
     ],
 )
 def test_a_mistake_is_one_sentence_and_exit_code_2(folder, tmp_path, capsys, tokens, sentence):
     before = {p: p.read_bytes() for p in folder.iterdir()}
-    assert run(*(t.format(f=folder, t=tmp_path) for t in tokens)) == 2
+    assert run(*(str(t).format(f=folder, t=tmp_path) for t in tokens)) == 2
     said = capsys.readouterr()
     assert "Traceback" not in said.err + said.out
     if sentence is not None:
@@ -285,3 +313,31 @@ def test_effects_lists_the_catalogue_and_prints_one_in_full(capsys):
     assert "width" in said
     assert run("effects", "joint_backlas") == 2
     assert "did you mean 'joint_backlash'" in capsys.readouterr().err
+
+
+def test_a_disk_that_is_full_is_one_sentence(folder):
+    """What a command says, and what it would have written, cannot be: no traceback, and another exit code than 0."""
+    command = [sys.executable, "-m", "jaxfinger", "show", str(folder / "fit.json")]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 2
+    (sentence,) = done.stderr.splitlines()
+    assert sentence.startswith("jaxfinger: the disk takes no more")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_can_complete_commands_and_options(shell, capsys, tmp_path, monkeypatch):
+    assert run("--show-completion", shell) == 0
+    script = capsys.readouterr().out
+    assert all(word in script for word in ("diagnose", "identify", "tolerance"))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert run("--install-completion", shell) == 0
+    (path,) = capsys.readouterr().out.split(": written")[:1]
+    assert Path(path).read_text(encoding="utf-8").strip() == script.strip()
+
+
+def test_bash_completes_what_was_begun(capsys):
+    assert run("--show-completion", "bash") == 0
+    ask = "COMP_WORDS=(jaxfinger iden); COMP_CWORD=1; _jaxfinger; echo ${COMPREPLY[@]}"
+    script = f"{capsys.readouterr().out}\n{ask}"
+    assert subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True).stdout == "identify\n"

@@ -43,6 +43,7 @@ def test_nothing_has_changed(earlier):
     assert {*CHANGED} - {c.key.effect for c in found.candidates} == {"changed_tendon_friction"}  # no trial of it
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("truth", "group"),
     [
@@ -68,6 +69,7 @@ def test_one_parameter_has_changed(earlier, truth, group):
     assert change.name.lower() in summary(found).lower()
 
 
+@pytest.mark.long
 def test_an_effect_came_and_a_parameter_changed(earlier):
     """Both are named, each with its value; and what is written is `gap.json` 2."""
     found = beside(earlier, EFFECT, changed("changed_damping", "MCP", d=3e-4))

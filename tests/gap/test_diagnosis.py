@@ -66,6 +66,7 @@ def test_the_gap_lies_at_the_joint_and_closes_on_held_out_trials(diagnosis):
     assert line.closed_ci95[0] <= line.closed <= line.closed_ci95[1]
 
 
+@pytest.mark.long
 def test_two_causes_are_both_named_and_keep_their_sizes():
     relaxation = "elastic_relaxation", ("MCP",)
     found = diagnose(session_with(PLANTED, (*relaxation, {"stiffness": 0.1, "T": 1.0})), without=WITHOUT)
@@ -81,6 +82,7 @@ def test_two_causes_are_both_named_and_keep_their_sizes():
         assert np.argmax(x.by_cause) == own
 
 
+@pytest.mark.long
 def test_a_first_look_names_what_the_whole_one_does(diagnosis):
     """From half the samples, with no fit of causes and model together."""
     look = diagnose(session_with(PLANTED), without=WITHOUT, quick=True)
@@ -91,11 +93,15 @@ def test_a_first_look_names_what_the_whole_one_does(diagnosis):
         assert ours[name].value == pytest.approx(theirs[name].value, abs=4.0 * std)
 
 
+@pytest.mark.long
 def test_a_fit_with_the_effect_that_is_known_to_be_there_is_that_of_the_diagnosis(diagnosis):
-    session = session_with(PLANTED)
-    known = fit_with(session, [TRUTH])
+    known = fit_with(session_with(PLANTED), [TRUTH])
     for ours, theirs in zip(known.model.effects, diagnosis.augmented.model.effects, strict=True):
         assert ours.values() == pytest.approx(theirs.values(), rel=1e-2)
+
+
+def test_a_fit_with_an_effect_that_cannot_be_there_is_refused():
+    session = session_with()
     with pytest.raises(UserError, match="joint_presliding is not at T1; it has MCP, PIP, DIP"):
         fit_with(session, [("joint_presliding", ("T1",))])
     with pytest.raises(UserError, match=r"joint_coulomb is a term of the recipe.s own model"):
@@ -180,6 +186,7 @@ class SumOfAngles(CatalogueEffect):
 
 
 @pytest.mark.parametrize("known", [RIVALS, ("tendon_backlash", "tendon_stretch")])
+@pytest.mark.long
 def test_a_law_that_nobody_listed_gets_a_proposal_in_closed_form(known):
     """Whether the catalogue has effects of that joint, which explain some of it, or none that explains any. Nothing is
     named then, and the model that is handed on is the nominal one.

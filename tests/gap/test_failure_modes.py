@@ -15,6 +15,8 @@ from jaxfinger.synthetic import recipe_from
 
 from .conftest import RIVALS, TABLE, TRUTH, WITHOUT, session_with
 
+pytestmark = pytest.mark.long
+
 PLANTED = (*TRUTH, {"a": 1.0, "x0": 0.1})
 
 

@@ -32,6 +32,7 @@ def ambiguous():
     return diagnose(of_one_joint(USUAL), without=WITHOUT)
 
 
+@pytest.mark.long
 def test_the_suggestion_once_run_settles_the_verdict(ambiguous):
     assert ambiguous.status is Status.AMBIGUOUS
     assert set(ambiguous.ambiguous_sets[0]) == {Key(*TRUTH[:2]), Key("passive_tendon", ("MCP", "PIP"))}
@@ -45,6 +46,7 @@ def test_the_suggestion_once_run_settles_the_verdict(ambiguous):
     assert settled.named == (Key(*TRUTH[:2]),)
 
 
+@pytest.mark.long
 def test_a_shape_that_no_trial_tells_is_said_to_be_open(ambiguous):
     """With the DIP in one posture only φ + ρ q_DIP shows: neither ρ nor φ is known."""
     best = {v.name: v for v in ambiguous.candidates[0].values}

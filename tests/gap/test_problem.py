@@ -141,6 +141,7 @@ SLOWLY = pytest.mark.xfail(
 
 
 @SLOWLY
+@pytest.mark.long
 def test_a_large_effect_is_judged_where_it_leads(scaled):
     """A sensor's gain multiplies the torques refitted with it: where it leads, an exact fit finds no better."""
     bench, state = led(scaled)
@@ -152,6 +153,7 @@ def test_a_large_effect_is_judged_where_it_leads(scaled):
 
 
 @SLOWLY
+@pytest.mark.long
 def test_where_a_set_has_led_is_the_exact_fit(scaled):
     """Within the intervals, and what its parts miss is what the model misses."""
     _, state = led(scaled)

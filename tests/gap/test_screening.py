@@ -74,6 +74,7 @@ def test_a_long_session_is_scanned_down_to_a_longer_period(diagnosis, monkeypatc
     strict=True,
     reason="A drift that repeats differ by is taken for their noise, and what lies below the noise is no evidence.",
 )
+@pytest.mark.long
 def test_a_wandering_sensor_is_named_with_its_period():
     """A period that lies between those of the scan, and far from the first value that is tried."""
     truth = {"A": 1e-3, "B": -5e-4, "P": 71.0, "T": 1e4, "tare": 3.0}

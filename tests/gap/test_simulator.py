@@ -30,6 +30,7 @@ def simulator(session, **factors):
     return predict_session(eqx.tree_at(lambda m: m.joint_torque, model, torque), session)
 
 
+@pytest.mark.long
 def test_the_missing_effect_is_named_and_the_wrong_parameters_retuned(session):
     found = diagnose(session, without=WITHOUT, predictions=simulator(session, damping=3.0), quick=True)
     assert found.status is Status.EXPLAINED
@@ -42,6 +43,7 @@ def test_the_missing_effect_is_named_and_the_wrong_parameters_retuned(session):
     assert line.after == pytest.approx(own.after, rel=0.1)
 
 
+@pytest.mark.long
 def test_a_term_that_the_simulator_lacks_is_a_candidate(session):
     found = diagnose(session, without=(*WITHOUT, "gravity"), predictions=simulator(session, friction=0.0), quick=True)
     assert "joint_coulomb" not in found.problem.fit.recipe.model.terms
@@ -54,6 +56,7 @@ def test_predictions_of_other_trials_are_refused(session):
         diagnose(replace(session, file="s.h5"), predictions=other)
 
 
+@pytest.mark.long
 def test_a_perfect_simulator_leaves_no_gap():
     session = session_with()
     found = diagnose(session, without=WITHOUT, predictions=simulator(session), quick=True)

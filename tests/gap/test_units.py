@@ -9,6 +9,8 @@ from jaxfinger.gap import diagnose
 
 from .conftest import TRUTH, WITHOUT, session_with
 
+pytestmark = pytest.mark.long
+
 
 def scaled(session, mass=1.0, length=1.0, time=1.0):
     """The same motions and weights of a machine whose masses, lengths and times are others, by these factors."""

@@ -30,28 +30,6 @@ def without_excursion(session):
     return replace(session, trials={**session.trials, **lost})
 
 
-@pytest.fixture(scope="module")
-def members(sessions, session, staged):
-    return fit_many([*sessions[:2], without_excursion(sessions[2])], staged, session)
-
-
-def test_members_that_fail_are_named_and_spoil_nothing(members):
-    np.testing.assert_array_equal(members.failed, [False, False, True])
-    assert np.isnan(members.values[2]).all()
-    assert np.isfinite(members.values[:2]).all()
-
-
-def test_members_are_the_fits_of_each_session_alone(members, sessions, staged):
-    free = staged.estimated
-    for k, session in enumerate(sessions[:2]):
-        alone = identify(session)
-        difference = (members.values[k] - np.asarray(ravel(alone.model)))[free] / alone.std[free]
-        # Alone it estimates its own noise, and so weighs its samples a little differently.
-        assert np.abs(difference).max() < 0.5
-        assert np.median(np.abs(difference)) < 0.1
-        np.testing.assert_allclose(members.std[k][free], alone.std[free], rtol=0.25)
-
-
 def with_bursts(session):
     """Three newton millimetres too many in every fiftieth sample of a torque, in bursts of five."""
     rng = np.random.default_rng(0)
@@ -66,18 +44,45 @@ def with_bursts(session):
     return replace(session, trials=trials)
 
 
-def test_members_are_what_identify_finds_from_the_same_start_outliers_included(sessions, session, staged):
+def with_heavier_links(session):
+    return replace(session, finger=replace(session.finger, mass=1.2 * session.finger.mass))
+
+
+@pytest.fixture(scope="module")
+def members(sessions, session, staged):
+    """One call for all: two as they are, one that lacks a joint's excursions, and the second spoilt and loaded."""
+    second = sessions[1]
+    odd = [without_excursion(sessions[2]), with_bursts(second), with_heavier_links(second)]
+    return fit_many([*sessions[:2], *odd], staged, session)
+
+
+def test_members_that_fail_are_named_and_spoil_nothing(members):
+    np.testing.assert_array_equal(members.failed, [False, False, True, False, False])
+    assert np.isnan(members.values[2]).all()
+    assert np.isfinite(members.values[[0, 1, 3, 4]]).all()
+
+
+def test_members_are_the_fits_of_each_session_alone(members, sessions, staged):
+    free = staged.estimated
+    for k, session in enumerate(sessions[:2]):
+        alone = identify(session)
+        difference = (members.values[k] - np.asarray(ravel(alone.model)))[free] / alone.std[free]
+        # Alone it estimates its own noise, and so weighs its samples a little differently.
+        assert np.abs(difference).max() < 0.5
+        assert np.median(np.abs(difference)) < 0.1
+        np.testing.assert_allclose(members.std[k][free], alone.std[free], rtol=0.25)
+
+
+def test_members_are_what_identify_finds_from_the_same_start_outliers_included(members, sessions, staged):
     """By the same solver on the same rows, with the same weights."""
-    spoilt = with_bursts(sessions[1])
-    members = fit_many([spoilt, sessions[1]], staged, session)
     own = replace(staged.model, finger=nominal_model(sessions[1], staged.recipe).finger)
     again, free = replace(staged, model=own, stages=()), staged.estimated
-    for k, member in enumerate((spoilt, sessions[1])):
+    for k, member in ((3, with_bursts(sessions[1])), (1, sessions[1])):
         alone = np.asarray(ravel(identify(member, start=again, stages=("ID.2", "ID.3-dynamic", "ID.4")).model))
         scale = np.maximum(np.abs(alone), staged.std)[free]
         assert np.abs((members.values[k] - alone)[free] / scale).max() < 1e-8
     # Bursts that least squares without weights would move by several standard deviations.
-    assert np.abs((members.values[0] - members.values[1])[free] / staged.std[free]).max() < 1.5
+    assert np.abs((members.values[3] - members.values[1])[free] / staged.std[free]).max() < 1.5
 
 
 def test_the_template_itself_comes_back(members, staged):
@@ -87,17 +92,15 @@ def test_the_template_itself_comes_back(members, staged):
     np.testing.assert_allclose(members.std[0][free], staged.std[free], rtol=0.02)
 
 
-def test_members_keep_their_own_links(clean, sessions, session, staged):
+def test_members_keep_their_own_links(members, sessions, staged):
     """Specimens of a lab differ: heavier links change gravity, and so what is left to the elastic torques."""
-    finger = replace(sessions[1].finger, mass=1.2 * sessions[1].finger.mass)
-    heavy = replace(sessions[1], finger=finger)
-    found = fit_many([sessions[0], heavy], staged, session)
+    heavy = with_heavier_links(sessions[1])
     alone = identify(heavy)
     free = staged.estimated
-    np.testing.assert_allclose(found.model(1).finger.mass, finger.mass)
-    difference = (found.values[1] - np.asarray(ravel(alone.model)))[free] / alone.std[free]
+    np.testing.assert_allclose(members.model(4).finger.mass, heavy.finger.mass)
+    difference = (members.values[4] - np.asarray(ravel(alone.model)))[free] / alone.std[free]
     assert np.abs(difference).max() < 0.5
-    assert np.abs((found.values[1] - found.values[0])[free] / staged.std[free]).max() > 3.0
+    assert np.abs((members.values[4] - members.values[0])[free] / staged.std[free]).max() > 3.0
 
 
 def test_a_session_of_another_finger_is_refused(session, staged):
@@ -124,6 +127,7 @@ np.savez(target + process, theta=theta, failed=failed, values=found.values, std=
 """
 
 
+@pytest.mark.long
 def test_two_processes_share_refits_and_sessions(sessions, session, staged, members, tmp_path):
     """Three sessions: two for the first process, one for the second."""
     compressed = compress(session, staged)
@@ -148,9 +152,9 @@ def test_two_processes_share_refits_and_sessions(sessions, session, staged, memb
         result = np.load(f"{target}{k}.npz")
         np.testing.assert_array_equal(result["failed"], failed)
         np.testing.assert_allclose(result["theta"], theta, rtol=1e-9)
-        np.testing.assert_array_equal(result["spoilt"], members.failed)
-        np.testing.assert_allclose(result["values"], members.values, rtol=1e-6, atol=1e-12)
-        np.testing.assert_allclose(result["std"], members.std, rtol=1e-6, atol=1e-12)
+        np.testing.assert_array_equal(result["spoilt"], members.failed[:3])
+        np.testing.assert_allclose(result["values"], members.values[:3], rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(result["std"], members.std[:3], rtol=1e-6, atol=1e-12)
 
 
 def test_no_session_gives_no_member(session, staged):

@@ -1,6 +1,7 @@
 """Are the stated intervals true? Two hundred sessions of a finger whose truth the nominal model can express."""
 
 import numpy as np
+import pytest
 
 from jaxfinger.identify import fit_many, identify
 from jaxfinger.identify.parameters import ravel
@@ -12,6 +13,8 @@ from jaxfinger.synthetic import (
     recipe_from,
     study_finger,
 )
+
+pytestmark = pytest.mark.long
 
 SESSIONS = 200
 RECIPE = {

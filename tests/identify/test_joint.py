@@ -58,14 +58,17 @@ def test_other_data_are_the_prior(clean, staged, joint):
     assert ratio.max() < 0.9
 
 
+GROUPS = ("moment_arm", "elastic", "friction", "damping", "tendon_friction")
+
+
 @pytest.mark.parametrize(
     ("factor", "groups"),
     [
-        (0.0, ("moment_arm",)),
-        (0.0, ("tendon_friction",)),
-        (0.0, ("elastic", "friction")),
-        (3.0, ("moment_arm", "elastic", "friction", "damping", "tendon_friction")),
-        (1 / 3, ("moment_arm", "elastic", "friction", "damping", "tendon_friction")),
+        pytest.param(0.0, ("moment_arm",), marks=pytest.mark.long),
+        pytest.param(0.0, ("tendon_friction",), marks=pytest.mark.long),
+        pytest.param(0.0, ("elastic", "friction"), marks=pytest.mark.long),
+        pytest.param(3.0, GROUPS, marks=pytest.mark.long),
+        (1 / 3, GROUPS),
     ],
 )
 def test_poor_starts_lead_to_the_same_optimum(session, staged, joint, factor, groups):
@@ -75,6 +78,7 @@ def test_poor_starts_lead_to_the_same_optimum(session, staged, joint, factor, gr
     assert np.abs((values(found) - values(joint))[free] / joint.std[free]).max() < 0.1
 
 
+@pytest.mark.long
 def test_a_start_without_a_slope_is_left(session, staged, joint):
     """Losses so negative that every one is bounded at zero have no derivative: the same optimum, or the fit says so."""
     found = refine(session, scaled(staged, -3.0, "tendon_friction"))

@@ -5,6 +5,8 @@ from pathlib import Path
 import jupytext
 import pytest
 
+pytestmark = pytest.mark.long
+
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.py"))
 
 

@@ -8,6 +8,7 @@ from jaxfinger.identify import refine
 from jaxfinger.identify.posterior import posterior
 
 
+@pytest.mark.long
 def test_nuts_agrees_with_laplace_where_the_model_is_linear(session, staged):
     slow = session.select("ID.2")
     fit = refine(slow, staged)

@@ -5,11 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jaxfinger.identify.sensitivity import Sensitivity
 from jaxfinger.report import plots
 from jaxfinger.report.plots.gap import segments
 from jaxfinger.report.theme import LOOK, axes_or_new
 
 from .fabricated import BARS, LINES, every, fits, trace
+
+
+def held(shifts, count=30):
+    """Trials of which some move some of the estimated parameters by so many standard deviations."""
+    fit = fits()[1]
+    values = np.zeros((count, fit.std.size))
+    for (row, column), shift in shifts.items():
+        values[row, fit.estimated[column]] = shift * fit.std[fit.estimated[column]]
+    return Sensitivity("trials", tuple(f"t{k}" for k in range(count)), values, np.ones(count))
+
 
 DRAWN = {
     "budget": lambda ax: plots.budget(every()["two"], ax),
@@ -18,7 +29,7 @@ DRAWN = {
     "residuals": lambda ax: plots.residuals(trace(), ax),
     "intervals": lambda ax: plots.intervals(fits()[1], None, fits()[0], ax),
     "correlation": lambda ax: plots.correlation(fits()[1], 8, ax),
-    "influence": lambda ax: plots.influence(np.array([[1.0, -0.5], [0.0, 2.0]]), ["a", "b"], ["p", "q"], ax=ax),
+    "influence": lambda ax: plots.influence(held({(0, 1): 1.0, (2, 3): -0.5}), fits()[1], ax=ax),
 }
 
 
@@ -82,12 +93,10 @@ def test_correlated_neighbours_are_shown():
 
 
 def test_of_many_influences_the_largest_are_shown():
-    shifts = np.zeros((30, 40))
-    shifts[7, 3], shifts[21, 33] = 2.0, -1.0
-    names = [[f"{letter}{k}" for k in range(n)] for letter, n in (("t", 30), ("p", 40))]
-    ax = plots.influence(shifts, *names, most=2)
+    ax = plots.influence({"trials": held({(7, 3): 2.0, (21, 5): -1.0})}, fits()[1], most=2)
+    names = [row["name"] for row in fits()[1].table()]
     assert [t.get_text() for t in ax.get_yticklabels()] == ["t7", "t21"]
-    assert [t.get_text() for t in ax.get_xticklabels()] == ["p3", "p33"]
+    assert [t.get_text() for t in ax.get_xticklabels()] == [names[3], names[5]]
     up, down = (c.get_sizes()[0] for c in ax.collections)
     assert up == pytest.approx(2.0 * down)
     assert [t.get_text() for t in ax.get_legend().get_texts()] == ["up 2 σ", "down 2 σ"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 
 from jaxfinger.identify import Fit
 from jaxfinger.identify.parameters import describe
+from jaxfinger.identify.sensitivity import Sensitivity
 from jaxfinger.report.numbers import HALF_95, measured
 from jaxfinger.report.theme import AFTER, BEFORE, CLEAR, COLOURS, MUTED, axes_or_new, legend_below, look
 
@@ -103,29 +104,29 @@ def correlation(fit: Fit, most: int = 16, ax: Axes | None = None) -> Axes:
 
 
 @look()
-def influence(
-    shifts: Float[np.ndarray, "rows columns"],
-    rows: Sequence[str],
-    columns: Sequence[str],
-    most: int = 16,
-    ax: Axes | None = None,
-) -> Axes:
+def influence(found: Sensitivity | Mapping[str, Sensitivity], fit: Fit, most: int = 16, ax: Axes | None = None) -> Axes:
     """What holds each parameter where it is: a square's area is how far a row moves a column, its colour the way.
 
+    A row is a trial that is left out, a sensor that reads 1 % more, or a value of CAD that is one standard deviation
+    larger; the parameter moves by that many of its own standard deviations.
+
     Args:
-        shifts: of every parameter in its standard deviations, one row a trial, a sensor or a value of CAD.
-        rows: their names.
-        columns: names of the parameters.
+        found: as `sensitivity` returns it, or one kind of it.
+        fit: that it was made for.
         most: at most so many rows and columns, those with the largest shifts.
         ax: the axes to draw on; new ones without.
     """
-    shifts = np.asarray(shifts)
+    kinds = [found] if isinstance(found, Sensitivity) else list(found.values())
+    shifts = np.concatenate([kind.shifts(fit) for kind in kinds])
+    rows = [name for kind in kinds for name in kind.names]
+    described = describe(fit.model)
+    columns = [described[k].name for k in fit.estimated]
     sizes = np.abs(shifts)
     i, j = (np.sort(np.argsort(-sizes.max(axis=k, initial=0.0), kind="stable")[:most]).astype(int) for k in (1, 0))
-    names = [str(rows[int(k)]) for k in i], [str(columns[int(k)]) for k in j]
     shifts = shifts[np.ix_(i, j)]
     ax = axes_or_new(ax, 2.2 + 0.22 * len(j), 2.0 + 0.22 * len(i))
     largest = float(np.abs(shifts).max(initial=0.0)) or 1.0
+    names = [rows[k] for k in i], [columns[k] for k in j]
     _squares(ax, shifts / largest, *names, f"up {largest:.2g} σ", f"down {largest:.2g} σ")
     ax.tick_params(axis="x", labelrotation=90)
     return ax

@@ -1,0 +1,87 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # What holds a parameter, and which trial comes next
+# A fit is only as good as the trials behind it. Two questions: which trial, sensor or value of CAD holds a parameter
+# where it is; and which trial would settle what the recordings leave open.
+
+# %%
+from pathlib import Path
+
+import equinox as eqx
+import numpy as np
+
+import jaxfinger as jf
+from jaxfinger.effects import CATALOGUE
+from jaxfinger.gap.result import Key
+from jaxfinger.report import sentences
+from jaxfinger.synthetic import ModelPlant, nominal_model, paper_finger, polynomial_finger, recipe_from, simulate
+
+session = jf.read(Path("datasets/demo-finger/session.h5"))
+fit = jf.identify(session)
+
+# %% [markdown]
+# ## Influence
+# Derivatives, not reruns. A row is a trial left out, a sensor that reads 1 % more, or a value of CAD one standard
+# deviation larger; a square's area is how many of its own standard deviations the parameter then moves.
+
+# %%
+found = jf.sensitivity(fit, session)
+jf.plot.influence(found["trials"], fit)
+jf.plot.influence({kind: found[kind] for kind in ("sensors", "cad")}, fit)
+
+# %% [markdown]
+# The trial that moves most, and what a refit without it gives. The derivative says the way and about how far; a refit
+# goes further where few trials carry a parameter.
+
+# %%
+shifts = found["trials"].shifts(fit)
+k, j = np.unravel_index(np.argmax(np.abs(shifts)), shifts.shape)
+trial, row = found["trials"].names[k], fit.table()[j]
+rest = jf.identify(session.with_trials([t.name for t in session if t.name != trial]))
+moved = {r["name"]: r["value"] for r in rest.table()}[row["name"]] - row["value"]
+print(f"{row['name']} without {trial}: {moved / row['std']:+.1f} standard deviations; derivative {shifts[k, j]:+.1f}")
+assert moved * shifts[k, j] > 0
+
+# %% [markdown]
+# ## The next trial
+# A finger whose PIP is coupled to its DIP by a slip of tendon, and of which only the PIP was ever moved, the others at
+# rest in one posture. Which neighbour pulls at it stays open, and the diagnosis says so.
+
+# %%
+model = nominal_model(polynomial_finger(paper_finger()))
+coupling = CATALOGUE["passive_tendon"].at(model.finger, ("PIP", "DIP"), kappa=0.01, rho=1.0, phi=0.0)
+plant = ModelPlant(eqx.tree_at(lambda m: m.effects, model, (coupling,), is_leaf=lambda v: isinstance(v, tuple)))
+
+
+def recorded(*postures):
+    """A session of trials of the PIP, the other joints at rest at these angles of MCP, PIP and DIP, in degrees."""
+    trials = {"rate": 100.0, "experiments": ["ID.2", "ID.3-static", "ID.3-dynamic"]}
+    trials["id2"] = {"repeats": 2, "postures": [[25, 35, 40]], "stroke_time": 2.0, "strokes": 2}
+    trials["id3_static"] = {"repeats": 2, "postures": list(postures), "move": 0.4, "dwell": 0.4}
+    trials["id3_dynamic"] = {"repeats": 2, "postures": list(postures), "cycles": 1}
+    recipe = recipe_from({"specimen": {"kind": "polynomial"}, "cad": {"mass": 0.01, "com": 2e-4}, "trials": trials})
+    whole = simulate(recipe, seed=3, plant=plant)
+    return whole.with_trials([t.name for t in whole if t.joint == "PIP"])
+
+
+others = tuple(set(CATALOGUE) - {"passive_tendon", "elastic_hardening", "joint_stop"})  # left out to be quick
+diagnosis = jf.diagnose(recorded([25, 30, 45]), without=others)
+print(sentences.summary(diagnosis))
+
+# %% [markdown]
+# It names the trial that would tell, and where to hold the other joints. Recorded, that trial settles it.
+
+# %%
+step = diagnosis.next_experiment
+print(f"{step.experiment}: {sentences.next_trial(step)}")
+at = {p.joint: float(np.degrees(p.low)) for p in step.postures if not p.moves}
+settled = jf.diagnose(recorded([25, 30, 45], [at["MCP"], 30, at["DIP"]]), without=others)
+print(sentences.summary(settled))
+assert settled.named == (Key("passive_tendon", ("PIP", "DIP")),)
