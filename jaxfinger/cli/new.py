@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from jaxfinger.cli.output import refuse_output
-from jaxfinger.errors import UserError
+from jaxfinger.cli.output import plain, refuse_output
+from jaxfinger.errors import UserError, counted
 
 
 def new(
@@ -29,7 +29,7 @@ def new(
     mapping
         The mapping to write (TOML): which column of which recording is what.
     recordings
-        The recordings that it is to name, one a trial.
+        The recordings that it is to read, one a trial: then the mapping is what `look` proposes for them.
     specimen
         Name of the finger.
     joints
@@ -46,7 +46,11 @@ def new(
     if finger.resolve() == mapping.resolve():
         raise UserError(f"{finger}: is named twice; give one file for the finger, another for the mapping")
     from jaxfinger.data.atomic import atomic_path
-    from jaxfinger.data.templates import finger_template, mapping_template
+    from jaxfinger.data.finger_file import Finger, finger_from
+    from jaxfinger.data.look import proposal
+    from jaxfinger.data.sources import load_recording
+    from jaxfinger.data.templates import COLUMNS, finger_template, mapping_template
+    from jaxfinger.data.toml import parse_toml, quoted, structure
 
     specimen = _asked("Name of the finger", specimen, "finger 1")
     named = _names("joint", _asked("Joints, base to tip", joints, "MCP, PIP, DIP"))
@@ -55,14 +59,22 @@ def new(
     answer = _asked("Tendons, or none", tendons, "T1, T2, T3, T4")
     pulled = [] if answer.strip() == "none" else _names("tendon", answer)
     beside = _from(finger, mapping.parent)
-    for path, text in (
-        (finger, finger_template(named, pulled)),
-        (mapping, mapping_template(specimen, beside, named, pulled, [path.name for path in recordings])),
-    ):
+    described = finger_template(named, pulled)
+    if recordings:
+        document = parse_toml(described, finger)
+        place = document.place / "finger"
+        known = finger_from(structure(document.content["finger"], Finger, place), place)
+        head = f"{COLUMNS}\nspecimen = {quoted(specimen)}\nfinger = {quoted(beside)}"
+        mapped = proposal([load_recording(path) for path in recordings], known, head)
+    else:
+        mapped = mapping_template(specimen, beside, named, pulled)
+    for path, text in ((finger, described), (mapping, mapped)):
         with atomic_path(path, overwrite) as part:
             part.write_text(text, encoding="utf-8")
-    print(f"{finger}: {len(named)} joints, {len(pulled)} tendons; replace its numbers by those of your finger")
-    print(f"{mapping}: name your recordings and their columns, then: jaxfinger import … --mapping {mapping}")
+    count = f"{counted(len(named), 'joint')}, {counted(len(pulled), 'tendon')}"
+    print(plain(f"{finger}: {count}; replace its numbers by those of your finger"))
+    todo = "correct what was guessed" if recordings else "name your recordings and their columns"
+    print(plain(f"{mapping}: {todo}, then: jaxfinger import … --mapping {mapping}"))
 
 
 def _asked(question: str, given: str | None, default: str) -> str:

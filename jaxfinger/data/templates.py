@@ -58,19 +58,20 @@ def _length(i: int) -> float:
     return _LENGTHS[min(i, len(_LENGTHS) - 1)]
 
 
-def mapping_template(
-    specimen: str, finger: str, joints: Sequence[str], tendons: Sequence[str], files: Sequence[str] = ()
-) -> str:
-    """`mapping.toml`: which column of which recording is what; `files` are the recordings' names, in order."""
+COLUMNS = """# Which column of which recording is what. Import with:
+#     jaxfinger import RECORDING … --mapping THIS_FILE --output session.h5
+# A column is { from = NAME, scale = 1.0, offset = 0.0, units = UNITS }: (column · scale + offset) in these units.
+# Units: rad, mrad, deg, turn; m, cm, mm, um; N, mN, kN; N m, N cm, N mm; s, ms, us, ns.
+# Leave out what was not measured.
+"""
+
+
+def mapping_template(specimen: str, finger: str, joints: Sequence[str], tendons: Sequence[str]) -> str:
+    """`mapping.toml`: which column of which recording is what, before there is a recording."""
     trials = [(f"{joint}", "ID.2", joint, "") for joint in joints] if tendons else []
     trials += [(f"{joint}", "ID.3-dynamic", joint, "") for joint in joints]
     trials += [(f"{tendon}-{joints[-1]}", "ID.4", joints[-1], tendon) for tendon in tendons]
-    text = f"""# Which column of which recording is what. Import with:
-#     jaxfinger import RECORDING … --mapping THIS_FILE --output session.h5
-# A column is {{ from = NAME, scale = 1.0, offset = 0.0, units = UNITS }}: (column · scale + offset) in these units.
-# Units: rad, mrad, deg, turn; m, cm, mm, um; N, mN, kN; N m, N cm, N mm; s, ms, us, ns.
-# Leave out what was not measured.
-
+    text = f"""{COLUMNS}
 specimen = {quoted(specimen)}
 finger = {quoted(finger)}
 
@@ -92,8 +93,7 @@ finger = {quoted(finger)}
 """
     for number, (what, experiment, joint, tendon) in enumerate(trials, 1):
         name = f"{number:02d}-{experiment}-{what}"
-        file = files[number - 1] if number <= len(files) else f"{name}.csv"
-        text += f"\n[trials.{as_key(name)}]\nfile = {quoted(file)}\nexperiment = {quoted(experiment)}\n"
+        text += f"\n[trials.{as_key(name)}]\nfile = {quoted(f'{name}.csv')}\nexperiment = {quoted(experiment)}\n"
         text += f"joint = {quoted(joint)}\n"
         text += f"tendon = {quoted(tendon)}\n" if tendon else ""
         text += 'time = { from = "time", units = "s" }  # or rate_hz = 1000\n'

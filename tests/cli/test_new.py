@@ -53,9 +53,61 @@ def test_nothing_is_overwritten_unless_asked_and_names_differ(written, capsys):
         assert not (written / "other.toml").exists()
 
 
-def test_recordings_are_named_and_a_finger_may_lack_tendons(tmp_path):
-    main(["new", f"{tmp_path}/f.toml", f"{tmp_path}/m.toml", "a.mat", "b.mat", "--joints", "J", "--tendons", "none"])
-    assert 'file = "a.mat"' in (tmp_path / "m.toml").read_text()
+def foreign(path, moves=(), pulls=None, torque=False, stepped=False):
+    """A log of another rig: own names, joints in the wrong order, degrees, mm, ms, N mm."""
+    rng, time = np.random.default_rng(len(str(path))), np.arange(1200) / 50
+    way = np.interp(time % 2.0, [0, 0.6, 2.0], [0.0, 1.0, 1.0]) + time // 2.0 if stepped else 6 - 6 * np.cos(time)
+    angle = {n: 20 + (5 * way if n in moves else 0) + 0.01 * rng.standard_normal(1200) for n in ("middle", "knuckle")}
+    force = {n: (2 + 2 * np.floor(time / 4) if n == pulls else 2.0) + 0.01 * rng.standard_normal(1200) for n in "AB"}
+    columns = {"stamp_ms": 1.7e12 + 1e3 * time} | {f"{n} angle (deg)": x for n, x in angle.items()}
+    columns |= {f"cable {n} force [N]": x for n, x in force.items()}
+    if torque:
+        columns["bridge Nmm"] = 5 + 0.1 * way + 0.01 * rng.standard_normal(1200)
+    else:
+        columns |= {f"cable {n} travel [mm]": k * angle["middle"] for n, k in (("A", 0.1), ("B", -0.1))}
+    np.savetxt(path, np.column_stack(list(columns.values())), delimiter=";", header=";".join(columns), comments="")
+
+
+FOREIGN = {
+    "01-paths": (dict(moves=["middle"]), ("ID.2", "middle", None)),
+    "02-led": (dict(moves=["middle", "knuckle"]), ("VD.1", None, None)),
+    "03-steps": (dict(moves=["knuckle"], torque=True, stepped=True), ("ID.3-static", "knuckle", None)),
+    "04-sweep": (dict(moves=["middle"], torque=True), ("ID.3-dynamic", "middle", None)),
+    "05-pull-Knuckle": (dict(pulls="B", torque=True), ("ID.4", "knuckle", "cable B")),
+}
+
+
+def test_recordings_are_read_and_what_moves_tells_what_they_are(tmp_path, capsys):
+    """One file a trial, and nothing is typed but names: what was guessed imports as it stands."""
+    for name, (how, _) in FOREIGN.items():
+        foreign(tmp_path / f"{name}.csv", **how)
+    files = [f"{tmp_path}/{name}.csv" for name in FOREIGN]
+    written = [f"{tmp_path}/f.toml", f"{tmp_path}/m.toml"]
+    main(["new", *written, *files, "--joints", "knuckle,middle", "--tendons", "cable A,cable B"])
+    assert (tmp_path / "m.toml").read_text().count("knuckle angle (deg)") == 1  # shared
+    main(["import", *files, "--mapping", written[1], "-o", f"{tmp_path}/s.h5"])
+    session = read_session(tmp_path / "s.h5")
+    for name, (_, said) in FOREIGN.items():
+        found = session[name]
+        assert (found.experiment, found.joint, found.tendon) == said
+    np.testing.assert_allclose(session["04-sweep"].q[:, 1].max(), np.radians(80), atol=1e-3)
+    np.testing.assert_allclose(session["04-sweep"].joint_torque[:, 1].max(), 6.2e-3, atol=1e-4)
+    assert np.isnan(session["04-sweep"].joint_torque[:, 0]).all()
+
+
+def test_which_joint_a_sensor_holds_is_not_guessed(tmp_path, capsys):
+    foreign(tmp_path / "pull.csv", pulls="B", torque=True)
+    written = [f"{tmp_path}/f.toml", f"{tmp_path}/m.toml"]
+    main(["new", *written, f"{tmp_path}/pull.csv", "--joints", "knuckle,middle", "--tendons", "cable A,cable B"])
+    with pytest.raises(SystemExit) as stopped:
+        main(["import", f"{tmp_path}/pull.csv", "--mapping", written[1], "-o", f"{tmp_path}/s.h5"])
+    assert stopped.value.code == 2
+    assert "'?'" in capsys.readouterr().err
+    assert not (tmp_path / "s.h5").exists()
+
+
+def test_a_finger_may_lack_tendons(tmp_path):
+    main(["new", f"{tmp_path}/f.toml", f"{tmp_path}/m.toml", "--joints", "J", "--tendons", "none"])
     assert "tendons" not in (tmp_path / "f.toml").read_text()
 
 
