@@ -13,7 +13,6 @@ fifths of the cases choose, the last fifth scores, five times over.
 
 import argparse
 import pickle
-import warnings
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, astuple, dataclass, replace
@@ -86,7 +85,6 @@ class Record:
 
 def weigh(folder: Path) -> Record:
     """Search one case."""
-    warnings.simplefilter("ignore")
     recipe = Recipe()
     problem = build(read_session(folder / "fit.h5"), recipe)
     effects = {k: v for k, v in catalogue_for(recipe, None).items() if k not in recipe.model.terms}

@@ -1,5 +1,7 @@
 """Which commands there are; each is imported when it runs."""
 
+from collections.abc import Callable
+
 from cyclopts import App, Parameter
 
 from jaxfinger.cli import completion
@@ -59,25 +61,22 @@ for name, text in SEALED.items():
 app.command(sealed)
 
 
-@app.command(name="--install-completion", help="Let your shell complete commands, options and files.")
-def _install_completion(shell: completion.Shell | None = None, /) -> None:
-    """Write a script where the shell looks for it.
+def _for_a_shell(act: Callable[[App, completion.Shell | None], str]) -> Callable[..., None]:
+    def command(shell: completion.Shell | None = None, /) -> None:
+        """Let a shell complete commands, options and files.
 
-    Parameters
-    ----------
-    shell
-        The shell; by default the one that runs this.
-    """
-    print(completion.install(app, shell))
+        Parameters
+        ----------
+        shell
+            The shell; by default the one that runs this.
+        """
+        print(act(app, shell))
+
+    return command
 
 
-@app.command(name="--show-completion", help="Print the script that does so, to install it yourself.")
-def _show_completion(shell: completion.Shell | None = None, /) -> None:
-    """Print the script that lets a shell complete commands, options and files.
-
-    Parameters
-    ----------
-    shell
-        The shell; by default the one that runs this.
-    """
-    print(completion.show(app, shell))
+for name, act, text in (
+    ("--install-completion", completion.install, "Let your shell complete commands, options and files."),
+    ("--show-completion", completion.show, "Print the script that does so, to install it yourself."),
+):
+    app.command(_for_a_shell(act), name=name, help=text)

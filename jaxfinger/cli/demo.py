@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import console, plain, progress, refuse_output, table
+from jaxfinger.cli.output import console, plain, progress, table
 from jaxfinger.errors import UserError
 
 if TYPE_CHECKING:
@@ -40,11 +40,10 @@ def demo(
     overwrite
         Replace files that are already there.
     """
-    from jaxfinger.cli.diagnose import FILES
+    from jaxfinger.cli.diagnose import refuse
     from jaxfinger.data.atomic import make_folder
 
-    for name in FILES:
-        refuse_output(output / name, overwrite) if output.is_dir() else None
+    refuse(output, overwrite)
     make_folder(output)
     from jaxfinger.cli.tables import fit_to_read, print_fit
     from jaxfinger.data import read_session

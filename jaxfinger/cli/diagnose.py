@@ -56,7 +56,7 @@ def diagnose(
     overwrite
         Replace an earlier diagnosis in the folder.
     """
-    _refuse(output, overwrite)
+    refuse(output, overwrite)
     if predictions is not None and predictions.exists() and session.exists() and predictions.samefile(session):
         raise UserError(f"{predictions}: is the session itself; give the simulator's predictions of its trials")
     tolerated = _tolerance(tolerance or [])
@@ -108,7 +108,7 @@ def _tolerance(texts: list[str]) -> dict[str, float]:
     return out
 
 
-def _refuse(output: Path, overwrite: bool) -> None:
+def refuse(output: Path, overwrite: bool) -> None:
     """Before anything is read: no file is overwritten unasked."""
     if output.exists() and not output.is_dir():
         raise UserError(f"{output}: is a file; name a folder")

@@ -7,7 +7,7 @@ from pathlib import Path
 from jaxfinger.cli.output import print_json, progress, refuse_figure, table
 
 SHOWN = 3  # of each kind, the strongest
-MOST = 40  # trials, sensors and values, and as many parameters, in a picture
+MOST = 40  # rows, and columns, of the picture: more names than that are too small to read on a page
 STEPS = {"trials": "left out", "sensors": "gain + 1 %", "cad": "+ 1 standard deviation"}
 
 
@@ -49,7 +49,9 @@ def influence(
             from jaxfinger.report.plots import influence as draw
             from jaxfinger.report.theme import save
 
-            save(draw(found, loaded, MOST).get_figure(root=True), figure, overwrite)
+            picture = draw(found, loaded, MOST).get_figure(root=True)
+            assert picture is not None
+            save(picture, figure, overwrite)
     if json:
         print_json(
             {

@@ -116,6 +116,5 @@ def _print_plan(plan, description) -> None:
         print(f"{found.name}: {found.seconds:.0f} s, up to {found.highest_tension:g} N")
         for prompt in found.prompts:
             print(f"    {prompt}")
-    print(
-        f"{counted(len(plan.trials), 'trial')}, {total / 60:.1f} min without the operator's pauses; nothing was moved"
-    )
+    count = counted(len(plan.trials), "trial")
+    print(f"{count}, {total / 60:.1f} min without the operator's pauses; nothing was moved")

@@ -53,7 +53,8 @@ def make(
     if count < 1:
         raise UserError(f"--count {count}: ask for at least one case")
     truth_root = truth or _beside(folder, "truth")
-    make_folder(folder), make_folder(truth_root)
+    make_folder(folder)
+    make_folder(truth_root)
     with _bar("making cases") as progress:
         make_cases(split, count, folder, truth_root, workers or os.cpu_count() or 1, _share(share), progress, mix=mix)
     print(f"{folder}: cases; {truth_root}: truth. Diagnose them with: jaxfinger sealed run {folder}")

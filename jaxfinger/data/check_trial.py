@@ -15,10 +15,9 @@ from jaxfinger.errors import counted
 STILL_JOINT = 0.01  # rad: five times the noise of a 14-bit encoder
 STILL_AXIS = 1e-4  # m
 OUTSIDE = 0.35  # rad beyond its limits that a joint is allowed to read
-TARE, PUSHES = (
-    0.03,
-    0.1,
-)  # of the highest tension: a good tare is off by a hundredth; a tendon held at little has a fifth
+# Of the highest tension. A good tare is off by a hundredth of it; a tendon that is held at little has a fifth.
+TARE = 0.03
+PUSHES = 0.1
 _TAUT = ("ID.2", "VD.1", "VD.3")  # experiments through which tendons are held at some tension
 _FEW = 20  # samples, fewer than which show no usual step
 _MOVES_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic")

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.session import FingerDescription
+from jaxfinger.data.toml import as_key, quoted
 from jaxfinger.data.units import TO_SI, known
 
 _GAP = 5.0  # times the median interval: a sample or more was lost
@@ -45,8 +46,10 @@ _UNITS_OF = {
 _OF_UNITS = {"rad": "q", "N m": "joint_torque", "N": "tendon_force", "m": "tendon_excursion"}
 _MOVES = {"rad": 0.1, "m": 1e-3}  # spans of an angle, or a slide, that moves; less is what a fixture yields
 _TICKS = (("s", 1e-5, 0.5), ("ms", 0.01, 500.0), ("us", 10.0, 5e5), ("ns", 1e4, 5e8))  # of usual intervals
-
-
+_PARTS = 400  # of a recording: a step of a protocol lasts several, and noise is averaged in each
+_STANDS = 0.1  # of the quickest change from part to part, below which a joint stands still
+_MOSTLY = 0.4  # share of the parts in which a stepped joint stands still; one that swings does so in a sixteenth
+_FREE = 0.5  # of the highest tension, by which tension changes where it drives the finger (VD.3), and not along a path
 _HEAD = 'specimen = "my finger"\nfinger = "finger.toml"'
 
 
@@ -175,14 +178,14 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
     lines = [head]
     if shared:
         lines += ["", "[channels]   # of all trials"]
-        lines += [f"{channel}.{_quoted(name)} = {said}" for channel, rows in shared.items() for name, said in rows]
+        lines += [f"{channel}.{as_key(name)} = {said}" for channel, rows in shared.items() for name, said in rows]
     for number, (recording, trial) in enumerate(zip(recordings, looked, strict=True), 1):
         stem = re.sub(r"[^A-Za-z0-9_-]+", "-", recording.path.stem).strip("-") or "log"
         stem = stem if re.match(r"\d", stem) else f"{number:02}-{stem}"
-        lines += ["", f"[trials.{_quoted(stem)}]", f"file = {_quoted(recording.path.name, True)}", *trial.lines]
+        lines += ["", f"[trials.{as_key(stem)}]", f"file = {quoted(recording.path.name)}", *trial.lines]
         for channel, rows in trial.channels.items():
             if channel not in shared:
-                lines += [f"channels.{channel}.{_quoted(name)} = {said}" for name, said in rows]
+                lines += [f"channels.{channel}.{as_key(name)} = {said}" for name, said in rows]
     return "\n".join(lines) + "\n"
 
 
@@ -207,14 +210,14 @@ def _looked(recording: Recording, finger: FingerDescription | None) -> _Looked:
     if joint and len(channels.get("joint_torque", ())) == 1:
         names["joint_torque"] = [joint]  # the one that the motor moves
     lines = [f'experiment = "{experiment}"   # guessed: ID.2, ID.3-static, ID.3-dynamic, ID.4, VD.1, VD.2 or VD.3']
-    lines += [f"joint = {_quoted(joint, True)}   # that is moved, or held by the torque sensor"] if joint else []
-    lines += [f"tendon = {_quoted(tendon, True)}   # that is pulled"] if tendon else []
+    lines += [f"joint = {quoted(joint)}   # that is moved, or held by the torque sensor"] if joint else []
+    lines += [f"tendon = {quoted(tendon)}   # that is pulled"] if tendon else []
     if clock is None:
         lines.append("rate_hz = 1000   # no time was found: write samples per second")
     elif clock.units in ("s", ""):
-        lines.append(f"time = {_quoted(clock.name, True)}")
+        lines.append(f"time = {quoted(clock.name)}")
     else:
-        lines.append(f'time = {{ from = {_quoted(clock.name, True)}, units = "{clock.units}" }}')
+        lines.append(f'time = {{ from = {quoted(clock.name)}, units = "{clock.units}" }}')
     if clock is not None and (np.diff(np.ravel(recording.variables[clock.name].values)) <= 0.0).any():
         lines.append("sort = true   # its stamps are out of order, or repeated")
     rows = {
@@ -252,7 +255,7 @@ def _experiment(
     if len(moved) == 1:
         return "ID.2", joint, ""
     high = max(s.high for s in force)
-    return ("VD.3" if max(pulls) > 0.5 * high else "VD.1"), "", ""
+    return ("VD.3" if max(pulls) > _FREE * high else "VD.1"), "", ""
 
 
 def _stepped(recording: Recording, seen: Seen) -> bool:
@@ -262,8 +265,8 @@ def _stepped(recording: Recording, seen: Seen) -> bool:
     columns = recording.variables[seen.name].columns
     x = table[:, 0 if seen.column is None else columns.index(seen.column) if columns else int(seen.column)]
     x = x[np.isfinite(x)]
-    steps = np.abs(np.diff([part.mean() for part in np.array_split(x, min(len(x), 400))]))
-    return float(np.mean(steps < 0.1 * np.percentile(steps, 95.0))) > 0.4
+    steps = np.abs(np.diff([part.mean() for part in np.array_split(x, min(len(x), _PARTS))]))
+    return float(np.mean(steps < _STANDS * np.percentile(steps, 95.0))) > _MOSTLY
 
 
 def _names(channel: str, columns: Sequence[Seen], finger: FingerDescription | None) -> list[str]:
@@ -281,18 +284,10 @@ def _names(channel: str, columns: Sequence[Seen], finger: FingerDescription | No
 
 
 def _column(seen: Seen) -> str:
-    parts = [f"from = {_quoted(seen.name, True)}"]
+    parts = [f"from = {quoted(seen.name)}"]
     if seen.column is not None:
-        parts.append(f"column = {_quoted(seen.column, True) if isinstance(seen.column, str) else seen.column}")
+        parts.append(f"column = {quoted(seen.column) if isinstance(seen.column, str) else seen.column}")
     fits = {"q": "rad", "joint_torque": "N m", "tendon_force": "N", "fingertip_force": "N", "tendon_excursion": "m"}
     if seen.units and TO_SI[seen.units][0] == fits.get(seen.meaning):
         parts.append(f'units = "{seen.units}"')
     return "{ " + ", ".join(parts) + " }"
-
-
-def _quoted(name: str, always: bool = False) -> str:
-    """A key or a string of TOML."""
-    if not always and re.fullmatch(r"[A-Za-z0-9_-]+", name):
-        return name
-    escaped = name.replace("\\", "\\\\").replace('"', '\\"')
-    return '"' + "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in escaped) + '"'

@@ -67,8 +67,9 @@ def _visit(path: Path) -> None:
 
 
 def _scipy(path: Path) -> Mapping[str, Any]:
+    damaged = UserError(f"{path}: is damaged in its structure; save it in MATLAB again")
     if not survives(path, _visit):
-        raise UserError(f"{path}: is damaged in its structure; save it in MATLAB again")
+        raise damaged
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.filterwarnings("error", "Duplicate variable name")
@@ -76,6 +77,8 @@ def _scipy(path: Path) -> Mapping[str, Any]:
             loaded = scipy.io.loadmat(path, simplify_cells=True)
         except scipy.io.matlab.MatReadWarning as error:
             raise UserError(f"{path}: {error}; give each variable its own name") from None
+        except (ArithmeticError, LookupError, MemoryError, TypeError):  # what damaged lengths and kinds make of SciPy
+            raise damaged from None
     return {name: value for name, value in loaded.items() if not name.startswith("__")}
 
 

@@ -170,8 +170,8 @@ def structure(content: Any, kind: type[T], place: Place) -> T:
 
 def quoted(text: str) -> str:
     """A string in the quotes of TOML."""
-    escaped = "".join(f"\\u{ord(c):04x}" if c < " " or c == "\x7f" else c for c in text.replace("\\", "\\\\"))
-    return '"' + escaped.replace('"', '\\"') + '"'
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
 
 
 def as_key(text: str) -> str:

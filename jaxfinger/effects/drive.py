@@ -71,7 +71,8 @@ class JointFrictionWarmup(CatalogueEffect):
     """(F + d|q̇|) s(q̇) w, w = exp(−t/T) of the session's time, or (303 K − ϑ)/10 K of a temperature ϑ (`by` 1).
 
     Grease that is cold is stiff. `a` is the share by which Coulomb friction is larger at the session's start, or 10 K
-    colder, and d the damping that comes on top.
+    colder, and d the damping that comes on top. T is no longer than the session: friction that falls more slowly than
+    that is as good as constant.
     """
 
     ID: ClassVar = "joint_friction_warmup"

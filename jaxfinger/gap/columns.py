@@ -56,14 +56,9 @@ class Columns:
         K = np.array([c.basis.shape[1] for c in self.items], int)
         return Counts(K, np.array([len(c.rows) for c in self.items], int) - K)
 
-    @property
-    def K(self) -> Int[np.ndarray, " C"]:
-        """Features of every column."""
-        return self.counts.K
-
     def sums(self, values: Float[np.ndarray, "features *n"]) -> Float[np.ndarray, "C *n"]:
         """Of features, column by column."""
-        return np.add.reduceat(values, np.r_[0, np.cumsum(self.K)[:-1]], axis=0)
+        return np.add.reduceat(values, np.r_[0, np.cumsum(self.counts.K)[:-1]], axis=0)
 
 
 class ByColumn:

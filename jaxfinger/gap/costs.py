@@ -18,7 +18,7 @@ Key = tuple[str, Site]  # effect, site
 
 @dataclass(frozen=True)
 class Costs:
-    """Of one file."""
+    """Of all sets of causes that the trials of one file can see."""
 
     parameters: Parameters
     unknown: float  # log evidence that something is at work

@@ -221,8 +221,7 @@ def at_one_model(bench: Bench, problem: Problem, effects: list[CatalogueEffect],
     cost = _cost(project, r) + float(sizes @ sizes)
     for _ in range(STEPS):
         rt, St = project.residual(r), project(slopes)
-        precision = np.array([1.0 for _ in coordinates])
-        A, b = np.vstack([St.T, np.diag(precision)]), np.concatenate([-rt, sizes])
+        A, b = np.vstack([St.T, np.eye(len(coordinates))]), np.concatenate([-rt, sizes])
         delta = bounded(A, b, *_room(effects, coordinates))
         reach = np.clip(1.0 / np.maximum(np.linalg.norm(St, axis=1), 1e-300), STEP / 20.0, STEP)
         for _ in range(HALVINGS):

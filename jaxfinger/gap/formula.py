@@ -53,8 +53,8 @@ class Weights:
 class Evidence(NamedTuple):
     """All that the formula needs to know of one set of causes."""
 
-    e: Float[np.ndarray, " C"]
-    o: Float[np.ndarray, " C"]
+    e: Float[np.ndarray, " C"]  # energy left on the features, in squared noise
+    o: Float[np.ndarray, " C"]  # and outside of them
     explained: Float[np.ndarray, " C"]  # energy on the features that the causes have taken away
     score: float  # log L less Occam's factor: comparable between sets over the same rows
 
@@ -128,7 +128,7 @@ class Linear:
 
     def _weighted(self, w: Weights, B, B2, T):
         """Products in the weights, summed over columns."""
-        inside = np.repeat(w.feature - w.outside, self.columns.K)
+        inside = np.repeat(w.feature - w.outside, self.columns.counts.K)
         return np.tensordot(w.outside, T, 1) + (B * inside[:, None]).T @ B2
 
     def judge(
@@ -213,7 +213,7 @@ class Linear:
             Q = absorbed[:, at]
             XQ = Q.T @ self.TXZ[:, 1:, at]
             TZ = self.further.among(at) - XQ - np.swapaxes(XQ, 1, 2) + Q.T @ JZ[:, :, at]
-            inside = np.repeat(w.feature - w.outside, self.columns.K)
+            inside = np.repeat(w.feature - w.outside, self.columns.counts.K)
             G = np.tensordot(w.outside, TZ, 1) + (BZ[:, at] * inside[:, None]).T @ BZ[:, at]
             a = np.clip(np.linalg.solve(G + np.eye(len(at)), b[at]), low, high)
             if not a.any():

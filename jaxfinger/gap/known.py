@@ -72,6 +72,7 @@ def _offered(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[Named],
 
 
 def _refuse_elsewhere(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[Named], finger: Finger) -> None:
+    """Before any fit: every effect can act at its site."""
     for effect, site in keys:
         sites = ["-".join(s) for s in catalogue[effect].sites(finger)]
         if (named := "-".join(site)) not in sites:

@@ -32,7 +32,7 @@ from jaxfinger.rig.watch import Watch
 
 AFTER_TRIP_S = 1.0  # that is still recorded after a trip, and in which the controller has released all tension
 QUIET_S = 0.3  # without a fault before anything is armed: a clock that runs wrong shows within 0.1 s
-PATIENCE_S = 5.0  # that this may take
+PATIENCE_S = 5.0  # for that quiet: many times as long, since the first samples of a busy host come late
 SLACK_S = 5.0  # that a wait of known length may take longer
 HELD = "tension was not seen to fall, so switch the drives off and see that it is off"
 
@@ -57,6 +57,10 @@ class TrialEnded(UserError):
     def __init__(self, message: str, trip: Trip, seq: int | None = None):
         super().__init__(message)
         self.trip, self.seq = trip, seq
+
+
+class ControllerStopped(TrialEnded):
+    """The controller has stopped the rig, and let go, for a cause of its own."""
 
 
 class Runner:
@@ -104,7 +108,7 @@ class Runner:
         """Let go, record what follows, close the trial; returns why it ended."""
         reader = self.reader
         trip, seq = (error.trip, error.seq) if isinstance(error, TrialEnded) else (Trip.HOST, None)
-        if not tripped(reader.latest):
+        if not (tripped(reader.latest) or isinstance(error, ControllerStopped)):
             reader.stop(Violation(trip, "host", reader.latest_seq, float("nan")))
         self._pass(AFTER_TRIP_S)
         cause = str(error).rstrip(".")
@@ -289,6 +293,6 @@ class Runner:
             raise TrialEnded(str(reader.error), Trip.STALE)
 
     def _stopped(self, status: Status) -> NoReturn:
-        """Raise TrialEnded with the controller's own cause."""
+        """Raise ControllerStopped with its cause."""
         self.reader.note("trip", status.cause)
-        raise TrialEnded(f"the controller stopped: {status.cause}", status.trip, status.trip_seq - PERSIST + 1)
+        raise ControllerStopped(f"the controller stopped: {status.cause}", status.trip, status.trip_seq - PERSIST + 1)

@@ -17,6 +17,7 @@ from jaxfinger.synthetic import (
     simulate,
     simulate_many,
 )
+from tests.data.conftest import ONE_JOINT
 
 QUICK_TRIALS = {
     "rate": 50.0,
@@ -145,28 +146,13 @@ def test_mistakes_in_a_recipe_are_named(table, said):
         recipe_from(table)
 
 
-FINGER = """[finger]
-gravity = [0.0, 0.0, -9.81]
-fingertip = [0.03, 0.0, 0.0]
-[[finger.joints]]
-name = "MCP"
-axis = [0.0, 1.0, 0.0]
-origin = [0.0, 0.0, 0.0]
-limits_deg = [0.0, 90.0]
-mass = 0.02
-mass_std = 0.001
-com = [0.02, 0.0, 0.0]
-inertia = [[1e-6, 0.0, 0.0], [0.0, 4e-6, 0.0], [0.0, 0.0, 4e-6]]
-rotor_inertia = 1e-5
-[[finger.tendons]]
-name = "T1"
-crosses = ["MCP"]
-excursion = { MCP = [0.008, 1e-3] }
-[[finger.tendons]]
-name = "T2"
-crosses = ["MCP"]
-excursion = { MCP = [-0.007] }
-"""
+FINGER = (
+    ONE_JOINT[ONE_JOINT.index("[finger]") :]
+    .replace("mass = 0.02\n", "mass = 0.02\nmass_std = 0.001\n")
+    .replace("4e-6]]\n", "4e-6]]\nrotor_inertia = 1e-5\n")
+    .replace('"T1"\n', '"T1"\nexcursion = { MCP = [0.008, 1e-3] }\n')
+    .replace('"T2"\n', '"T2"\nexcursion = { MCP = [-0.007] }\n')
+)
 TERMS = """
 [terms.joints.MCP]
 elastic = [-0.01, 0.03]

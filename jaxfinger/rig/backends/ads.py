@@ -22,10 +22,10 @@ from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.ring import RingRig
 
 TIMEOUT_MS = 500
-WAIT_S = 0.02  # for a call of another thread, before the wait is looked at
+WAIT_S = 0.02  # between two looks at a wait for another thread's call: a fifth of the shortest, BUSY_S
 CALL_S = 0.7  # longer than the time-out of any call
-BUSY_S = 0.1  # that a heartbeat waits for other calls
-PAUSE_S = 0.1  # between attempts to connect
+BUSY_S = 0.1  # that a heartbeat waits for other calls: two of its periods, `watch.BEAT_S`
+PAUSE_S = 0.1  # between attempts to connect: a router needs some milliseconds to forget a program that was killed
 
 
 @dataclass(frozen=True)
