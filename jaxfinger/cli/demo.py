@@ -22,7 +22,7 @@ ANSWER = """What is in fact the matter: tendon T3 stretches by 60 µm/N, and the
 as high at rest as in motion, falling over 0.35 rad/s (Stribeck; datasets/demo-finger)."""
 NEXT = """Next: open the page; the same for your own finger is
   jaxfinger look LOG                          what a recording holds, and mapping lines for it
-  jaxfinger new finger.toml mapping.toml      templates to fill in
+  jaxfinger new finger.toml mapping.toml LOG  templates, filled in as far as LOG tells
   jaxfinger import LOG --mapping mapping.toml -o session.h5
   jaxfinger diagnose session.h5 -o diagnosis"""
 

@@ -30,7 +30,7 @@ class Ahead:
     """Predictions of angles over a horizon from many starts: rad, NaN beyond the end of a trial."""
 
     horizon: float  # s
-    error: Float[np.ndarray, "starts m"]
+    error: Float[np.ndarray, "starts m"]  # of what has diverged, that of the angle where it did
     noise: Float[np.ndarray, " m"]  # standard deviation of the error where the model is right
 
 
@@ -50,7 +50,7 @@ class _Measured(NamedTuple):
 def ahead(model: Model, session: Session, stack: Stack) -> list[Ahead]:
     """Errors at every horizon from starts all along the VD.3 trials of a full-rate stack."""
     x = model.true_motion(stack.batch.x)
-    parts = [_trial(model, session[name], stack, b, x) for b, name in enumerate(stack.trials)]
+    parts = [_trial(model, session[name], stack, b, x, session.finger.limits) for b, name in enumerate(stack.trials)]
     return [
         Ahead(
             horizon,
@@ -74,18 +74,25 @@ def noise_of_simulation(model: Model, session: Session, stack: Stack) -> Float[n
 
 def diverges(q: Float[np.ndarray, "N m"], limits: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " m"]:
     """Joints whose simulated angle leaves their range by half of it: no measured motion does."""
+    low, high = _ends(limits)
+    return ((q < low) | (q > high)).any(axis=0)
+
+
+def _ends(limits: Float[np.ndarray, "m 2"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Angles beyond which a simulation has diverged."""
     low, high = limits.T
     half = 0.5 * np.where(np.isfinite(high - low), high - low, 2.0 * np.pi)
-    return ((q < low - half) | (q > high + half)).any(axis=0)
+    return low - half, high + half
 
 
-def _trial(model: Model, trial: Trial, stack: Stack, b: int, x):
+def _trial(model: Model, trial: Trial, stack: Stack, b: int, x, limits: Float[np.ndarray, "m 2"]):
     """Error and noise of every horizon: (starts, m)."""
     m = _measured(trial, stack, b, x)
     step = m.time[1] - m.time[0]
     reach = [max(1, round(h / step)) for h in HORIZONS]
     first = np.arange(0, m.time.size - reach[0], max(1, round(EVERY / step)))
     predicted, change = _changed(model, m, _windows(m, first, reach[-1] + 1), np.random.default_rng(b))
+    predicted = np.clip(predicted, *(x[:, None] for x in _ends(limits)))
     errors, noises = [], []
     for k in reach:
         there = first + k < m.time.size

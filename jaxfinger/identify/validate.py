@@ -322,7 +322,7 @@ def _simulation_scores(model: Model, session: Session, names: list[str]) -> tupl
             if errors[0].size:
                 rms, mean, samples, _ = _score(errors, False)
                 found = rms, mean, samples, len(stack.trials)
-                noise = (moment.noise[k], "sensors' noise in state and tension")
+                noise = _unless_it_diverges(moment.noise[k], "sensors' noise in state and tension", session, k)
                 method = f"{1e3 * moment.horizon:.0f} ms ahead of the measured state"
                 scores.append(_make(session, "VD.3", "q", k, column, *found, noise, method))
     through = noise_of_simulation(model, session, stack)
@@ -331,11 +331,17 @@ def _simulation_scores(model: Model, session: Session, names: list[str]) -> tupl
         found = _score([e[np.isfinite(e)] for e in series], False)
         encoder = float(np.sqrt(np.mean([_encoder(session[name], k) ** 2 for name in stack.trials])))
         method = "simulated forward from the first sample"
-        noise = (float(np.hypot(encoder, through[k])), "sensors' noise in start, tension and reading")
-        if not noise[0] < np.ptp(session.finger.limits[k]):
-            noise = None, "none: the sensors' noise alone makes the simulation diverge"
+        source = "sensors' noise in start, tension and reading"
+        noise = _unless_it_diverges(float(np.hypot(encoder, through[k])), source, session, k)
         scores.append(_make(session, "VD.3", "q", k, column, *found, noise, method))
     return scores, _divergence(session, paths)
+
+
+def _unless_it_diverges(noise: float, source: str, session: Session, k: int) -> tuple[float | None, str]:
+    """A simulation's noise and where it is from; none where it is as large as the joint's range."""
+    if noise < np.ptp(session.finger.limits[k]):
+        return noise, source
+    return None, "none: the sensors' noise alone makes the simulation diverge"
 
 
 def _divergence(session: Session, paths: dict[str, dict[str, np.ndarray]]) -> list[str]:
