@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from pathlib import Path
 
 from jaxfinger.cli.output import print_json, progress, refuse_figure, table
@@ -71,7 +72,11 @@ def influence(
         rows = []
         for j, name in enumerate(names):
             strongest = sorted(range(len(s.names)), key=lambda k, j=j: -abs(shifts[k, j]))[:SHOWN]
-            rows.append((name, ", ".join(f"{s.names[k]} {shifts[k, j]:+.2f}" for k in strongest if shifts[k, j])))
+            rows.append((name, ", ".join(_said(s.names[k], shifts[k, j]) for k in strongest if shifts[k, j])))
         table(
             f"By {kind}, {STEPS[kind]}: standard deviations that each parameter moves", ("parameter", ""), rows, left=2
         )
+
+
+def _said(name: str, shift: float) -> str:
+    return f"{name} {shift:+.2f}" if isfinite(shift) else f"{name} alone tells of it"

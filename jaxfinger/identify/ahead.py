@@ -75,7 +75,7 @@ def noise_of_simulation(model: Model, session: Session, stack: Stack) -> Float[n
 def diverges(q: Float[np.ndarray, "N m"], limits: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " m"]:
     """Joints whose simulated angle leaves their range by half of it: no measured motion does."""
     low, high = _ends(limits)
-    return ((q < low) | (q > high)).any(axis=0)
+    return np.any((q < low) | (q > high), axis=0)
 
 
 def _ends(limits: Float[np.ndarray, "m 2"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:

@@ -7,6 +7,11 @@ implicit function theorem, whatever φ stands for,
 
 stage after stage, with exact second derivatives: those of the residuals included, and of Huber's cost. The noise model
 is held as it is.
+
+A derivative by the weight of a trial does not say what the fit is without it: the only trial that tells of a parameter
+holds it at any weight. One Newton step from the whole fit does (Pregibon 1981), with H_k = J_kᵀJ_k of trial k:
+
+    Δθ_s = (∂S_s/∂θ_s − H_k)⁻¹ (S_s,k − Σ_t<s (∂S_s/∂θ_t − H_k,st) Δθ_t).
 """
 
 from collections.abc import Callable, Sequence
@@ -34,6 +39,7 @@ from jaxfinger.model import Model
 
 TRIALS, SENSORS, CAD = "trials", "sensors", "cad"
 KINDS = (TRIALS, SENSORS, CAD)
+ALONE = 1e-6  # of what a parameter's trials tell of it, below which the others tell nothing
 AT_OPTIMUM = 0.3  # standard deviations that one more step may be long, where a fit is that of the session
 
 
@@ -44,14 +50,15 @@ class Sensitivity:
     kind: str  # `trials`: by the weight of each; `sensors`: by each gain, 1 as it is; `cad`: by each value
     names: tuple[str, ...]
     values: Float[np.ndarray, "K P"]  # SI units of the parameter, a unit of φ
-    step: Float[np.ndarray, " K"]  # of φ that says something: a trial left out, a gain by 1 %, CAD's standard deviation
+    moves: Float[np.ndarray, "K P"]  # of the parameter by a step of φ: a trial left out, gain + 1 %, CAD + 1 std
 
     def shifts(self, fit: Fit) -> Float[np.ndarray, "K p"]:
-        """By how many standard deviations each estimated parameter moves with one step; 0 where they are unknown."""
+        """By how many standard deviations each estimated parameter moves with one step; 0 where they are unknown, and
+        infinite where no other trial tells of the parameter.
+        """
         std = fit.std[fit.estimated]
         sure = (std > 0) & np.isfinite(std)
-        moved = self.values[:, fit.estimated] * self.step[:, None]
-        return np.where(sure, moved / np.where(sure, std, 1.0), 0.0)
+        return np.where(sure, self.moves[:, fit.estimated] / np.where(sure, std, 1.0), 0.0)
 
 
 def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> dict[str, Sensitivity]:
@@ -81,7 +88,8 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
 
     trials = [(e, t) for e in sources for t in stacks[e].trials]
     P, blocks = len(parameters), {TRIALS: len(trials), SENSORS: len(sensors), CAD: cad.size}
-    moved = np.zeros((P, sum(blocks.values())))
+    moved, without = np.zeros((P, sum(blocks.values()))), np.zeros((P, len(trials)))
+    alone = np.zeros(without.shape, bool)
     last = {k: i for k, i in zip(blocks, np.cumsum(list(blocks.values())), strict=True)}
     moved[given, last[SENSORS] + np.searchsorted(cad, given)] = 1.0
     for of_stage, free in plan:
@@ -105,14 +113,24 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
         _refuse_another(basis.T @ S[free], session)
         right = by[free] + H[np.ix_(free, others)] @ moved[others]
         moved[free] = -basis @ np.linalg.solve(basis.T @ own @ basis, basis.T @ right)
+        for j, (e, name) in enumerate(trials):
+            mine = np.zeros((P, P))
+            if e in of_stage:
+                at = sources[e].positions
+                mine[np.ix_(at, at)] = scores[e].information[stacks[e].trials.index(name)]
+            rest, told = (H - mine)[free], np.diag(H)[free] - np.diag(precision)
+            alone[free, j] = (np.diag(precision) == 0.0) & (told - np.diag(mine)[free] < ALONE * told)
+            kept = np.flatnonzero(~alone[free, j])
+            basis = _seen(rest[np.ix_(kept, free[kept])])
+            right = by[free, j] - rest[:, others] @ without[others, j]
+            step = np.linalg.solve(basis.T @ rest[np.ix_(kept, free[kept])] @ basis, basis.T @ right[kept])
+            without[free[kept], j] = basis @ step
     names = {TRIALS: [t for _, t in trials], SENSORS: list(sensors), CAD: [parameters[i].name for i in cad]}
     std = np.sqrt(np.diag(cad_covariance(session, parameters)))
-    steps = {TRIALS: -np.ones(len(trials)), SENSORS: np.full(len(sensors), 0.01), CAD: std[cad]}
-    return {
-        k: Sensitivity(k, tuple(names[k]), moved[:, last[k] - blocks[k] : last[k]].T, steps[k])
-        for k in KINDS
-        if k in kinds
-    }
+    values = {k: moved[:, last[k] - blocks[k] : last[k]].T for k in KINDS}
+    moves = {TRIALS: np.where(alone, np.inf, without).T, SENSORS: 0.01 * values[SENSORS]}
+    moves[CAD] = std[cad][:, None] * values[CAD]
+    return {k: Sensitivity(k, tuple(names[k]), values[k], moves[k]) for k in KINDS if k in kinds}
 
 
 def _seen(hessian: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p k"]:
@@ -180,6 +198,7 @@ class Score(eqx.Module):
     """One experiment's part of the gradient of the cost, by the parameters that it depends on."""
 
     by_trial: Float[Array, "B k"]
+    information: Float[Array, "B k k"]  # of each trial: JᵀJ of the rows within Huber's limit
     hessian: Float[Array, "k k"]
     by_sensor: Float[Array, "K k"]  # its derivative by every gain
 
@@ -197,9 +216,16 @@ def _score_of(fit: Fit, source: Source, changes: list[Batch]) -> Score:
 def _score(model: Model, free: Free, batch: Batch, filters: Filters, limit, changes: Batch, B: int) -> Score:
     theta = free.get(model)
 
+    def rows(theta, data: Batch):
+        return white_rows(free.set(model, theta), data, filters)[1]
+
+    def counting(theta):
+        """Rows beyond Huber's limit pull, and tell nothing: their cost is linear."""
+        r = rows(theta, batch)
+        return jnp.where(limit > 0.0, jnp.clip(r, -limit, limit), r)
+
     def cost(theta, data: Batch, weights):
-        rows = huber(white_rows(free.set(model, theta), data, filters)[1], limit)
-        return 0.5 * jnp.sum(weights[:, None] * rows**2)
+        return 0.5 * jnp.sum(weights[:, None] * huber(rows(theta, data), limit) ** 2)
 
     whole, gradient = jnp.ones(B), jax.grad(cost)
     # The transpose of the gradient's derivative by the weights: one trial's gradient after another.
@@ -214,4 +240,5 @@ def _score(model: Model, free: Free, batch: Batch, filters: Filters, limit, chan
     # Angles stay out of it: powers of an angle that is zero have no derivative of their own.
     data = batch.x.tension, batch.y
     by_sensor = jax.lax.map(lambda c: jax.jvp(moved, data, (c.x.tension, c.y))[1], changes)
-    return Score(by_trial, hessian, by_sensor)
+    J = jax.lax.map(lambda v: jax.jvp(counting, (theta,), (v,))[1], jnp.eye(theta.size))
+    return Score(by_trial, jnp.einsum("kbr,lbr->bkl", J, J), hessian, by_sensor)

@@ -19,7 +19,7 @@ def held(shifts, count=30):
     values = np.zeros((count, fit.std.size))
     for (row, column), shift in shifts.items():
         values[row, fit.estimated[column]] = shift * fit.std[fit.estimated[column]]
-    return Sensitivity("trials", tuple(f"t{k}" for k in range(count)), values, np.ones(count))
+    return Sensitivity("trials", tuple(f"t{k}" for k in range(count)), values, values)
 
 
 DRAWN = {
@@ -100,6 +100,12 @@ def test_of_many_influences_the_largest_are_shown():
     up, down = (c.get_sizes()[0] for c in ax.collections)
     assert up == pytest.approx(2.0 * down)
     assert [t.get_text() for t in ax.get_legend().get_texts()] == ["up 2 σ", "down 2 σ"]
+
+
+def test_what_one_trial_alone_tells_of_is_as_large_as_the_largest():
+    ax = plots.influence(held({(7, 3): 2.0, (21, 5): np.inf}), fits()[1], most=2)
+    squares = ax.collections[0]
+    assert len(set(squares.get_sizes())) == 1
 
 
 def test_measured_in_points_and_the_model_as_lines():

@@ -14,7 +14,7 @@ from jaxfinger.identify.sensitivity import Sensitivity
 from jaxfinger.report.numbers import HALF_95, measured
 from jaxfinger.report.theme import AFTER, BEFORE, CLEAR, COLOURS, MUTED, axes_or_new, legend_below, look
 
-LARGEST_MARK = 90.0  # pt²
+FILLED = 0.8  # of a cell, by the side of the largest square
 EDGE = 2.1  # of the axis of intervals: a value and a half-width of its size
 
 
@@ -108,7 +108,8 @@ def influence(found: Sensitivity | Mapping[str, Sensitivity], fit: Fit, most: in
     """What holds each parameter where it is: a square's area is how far a row moves a column, its colour the way.
 
     A row is a trial that is left out, a sensor that reads 1 % more, or a value of CAD that is one standard deviation
-    larger; the parameter moves by that many of its own standard deviations.
+    larger; the parameter moves by that many of its own standard deviations. Where no other trial tells of a parameter,
+    the square is as large as the largest.
 
     Args:
         found: as `sensitivity` returns it, or one kind of it.
@@ -121,6 +122,8 @@ def influence(found: Sensitivity | Mapping[str, Sensitivity], fit: Fit, most: in
     rows = [name for kind in kinds for name in kind.names]
     described = describe(fit.model)
     columns = [described[k].name for k in fit.estimated]
+    finite = shifts[np.isfinite(shifts)]
+    shifts = np.clip(shifts, finite.min(initial=0.0), finite.max(initial=1e-300))
     sizes = np.abs(shifts)
     i, j = (np.sort(np.argsort(-sizes.max(axis=k, initial=0.0), kind="stable")[:most]).astype(int) for k in (1, 0))
     shifts = shifts[np.ix_(i, j)]
@@ -134,7 +137,9 @@ def influence(found: Sensitivity | Mapping[str, Sensitivity], fit: Fit, most: in
 
 def _squares(ax: Axes, values, rows: Sequence[str], columns: Sequence[str], up: str, down: str) -> None:
     """Values of −1 to 1 as squares whose area is their size."""
-    size = min(LARGEST_MARK, LARGEST_MARK * (16 / max(len(columns), len(rows), 1)) ** 2)
+    at = ax.get_window_extent().transformed(ax.figure.dpi_scale_trans.inverted())  # inches
+    cell = 72.0 * min(at.width / max(len(columns), 1), at.height / max(len(rows), 1))
+    size = (FILLED * cell) ** 2
     for sign, colour, label in ((1, COLOURS[0], up), (-1, COLOURS[1], down)):
         i, j = np.nonzero(sign * values > 0.02)
         ax.scatter(j, i, s=size * np.abs(values[i, j]), marker="s", color=colour, linewidths=0, label=label)
