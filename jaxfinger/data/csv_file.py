@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxfinger.data.recording import Recording, Variable
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, counted
 
 _COMMENTS = ("#", "%")
 # (separator, decimal mark); None is any run of blanks. Of equals the first is taken.
@@ -59,8 +59,8 @@ def load_csv(path: Path) -> Recording:
     above = [line for line in lines if line.number < body[first].number]
     names, units, scope = _names(above, split, len(numeric))
     if not names and first > 0 and len(split(body[first - 1].text)) != len(numeric):
-        given = split(body[first - 1].text)
-        raise UserError(f"{path}: names {len(given)} columns and holds {len(numeric)}; give each column one name")
+        given = counted(len(split(body[first - 1].text)), "column")
+        raise UserError(f"{path}: names {given} and holds {len(numeric)}; give each column one name")
     body, remarks = body[first:], ()
     if not names and [_cell(cell) for cell in split(body[0].text)] == list(range(len(numeric))) and len(body) > 1:
         names, body = tuple(split(body[0].text)), body[1:]  # numbered columns, as pandas names them
