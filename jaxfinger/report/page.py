@@ -18,7 +18,7 @@ from jaxfinger.report import plots, sentences
 from jaxfinger.report.causes import words
 from jaxfinger.report.curves import Curves, curves
 from jaxfinger.report.measured import arm_points
-from jaxfinger.report.numbers import HALF_95, alike, measured, percent, percent_range, quantity, unbroken
+from jaxfinger.report.numbers import HALF_95, measured, percent, percent_range, quantity, unbroken
 from jaxfinger.report.plots import gap as gap_plots
 from jaxfinger.report.plots.fit import INTERVAL_ROWS, interval_size
 from jaxfinger.report.theme import PALETTE, css, grid, inline, look
@@ -252,17 +252,7 @@ def _place(p: Place, prismatic: tuple[bool, ...]) -> dict:
 
 
 def _line(x: Closure) -> dict:
-    (noise, before, after), unit = alike((x.noise, x.before, x.after), x.units)
-    closed = f"{percent(x.closed)} ({percent_range(*x.closed_ci95)})" if x.resolvable else "no gap to close"
-    return {
-        "name": _name(x.experiment, x.channel),
-        "noise": noise if x.noise else "unknown",
-        "before": before,
-        "after": "diverges" if x.diverged else after,
-        "unit": unit,
-        "closed": "nothing" if x.diverged else closed,
-        "wrong": x.diverged,
-    }
+    return {"name": _name(x.experiment, x.channel), **sentences.closing(x)._asdict(), "wrong": x.diverged}
 
 
 def _left(x: Left) -> str:

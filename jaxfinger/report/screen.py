@@ -72,6 +72,5 @@ def _cause(k: int, c: Cause) -> list[str]:
 
 def _line(x: Closure) -> str:
     name = f"{x.experiment} {sentences.channel_name(x.channel)}"
-    before, after, noise = (quantity(v, x.units) for v in (x.before, x.after, x.noise))
-    closed = f"{percent(x.closed)} ({percent_range(*x.closed_ci95)})" if x.resolvable else "no gap to close"
-    return f"  {name:<26} {noise:>9}  {before:>9} → {after:<9}  {closed}"
+    said = sentences.closing(x)
+    return f"  {name:<26} {said.noise:>7}  {said.before:>6} → {said.after:<8} {said.unit:<5}  {said.closed}"

@@ -7,6 +7,7 @@ world, what causes it and how sure that is, what is left and what to do about it
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 from jaxfinger.effects import Site
 from jaxfinger.gap.result import (
@@ -23,7 +24,7 @@ from jaxfinger.gap.result import (
     Status,
     still_open,
 )
-from jaxfinger.report.numbers import measured, number, percent, percent_range, quantity
+from jaxfinger.report.numbers import alike, measured, number, percent, percent_range, quantity
 
 NAMED_AT_MOST = 4  # causes in one sentence
 LIKELY, SURE = 0.9, 0.99  # probabilities from which on a person says «very probably» and «almost certainly»
@@ -367,3 +368,22 @@ def next_trial(step: NextExperiment) -> str:
 def _posture(p: Posture) -> str:
     low, high = (f"{1e3 * v:.0f} mm" if p.slides else f"{v * 57.29577951308232:.0f}°" for v in (p.low, p.high))
     return f"{p.joint} from {low} to {high}" if p.moves else f"{p.joint} at {low}"
+
+
+class Closing(NamedTuple):
+    """How far a channel closes, in words and numbers of one unit."""
+
+    noise: str
+    before: str
+    after: str
+    unit: str
+    closed: str
+
+
+def closing(x: Closure) -> Closing:
+    """Of a line of the diagnosis."""
+    (noise, before, after), unit = alike((x.noise, x.before, x.after), x.units)
+    closed = f"{percent(x.closed)} ({percent_range(*x.closed_ci95)})" if x.resolvable else "no gap to close"
+    if x.diverged:
+        after, closed = "diverges", "nothing"
+    return Closing(noise if x.noise else "unknown", before, after, unit, closed)
