@@ -1,5 +1,6 @@
 """`import jaxfinger as jf`: what a notebook sees."""
 
+import doctest
 import subprocess
 import sys
 from pathlib import Path
@@ -7,9 +8,32 @@ from pathlib import Path
 import pytest
 
 import jaxfinger as jf
+from jaxfinger.data import import_file
+from jaxfinger.identify.stages import identify
 from jaxfinger.table import Table
 
-DEMO = Path(__file__).parents[1] / "datasets" / "demo-finger" / "session.h5"
+DATASETS = Path(__file__).parents[1] / "datasets"
+DEMO = DATASETS / "demo-finger" / "session.h5"
+
+
+@pytest.fixture(scope="module")
+def axis(tmp_path_factory):
+    """What the examples of the docstrings start from: a real servo axis in `session.h5`, and its fit in `fit.json`."""
+    folder = tmp_path_factory.mktemp("axis")
+    import_file([DATASETS / "emps" / "DATA_EMPS.mat"], DATASETS / "emps" / "emps.toml", folder / "session.h5")
+    jf.save(jf.identify(jf.read(folder / "session.h5"), jf.recipe("emps")), folder / "fit.json")
+    return folder
+
+
+@pytest.mark.parametrize("name", jf.__all__)
+def test_every_name_of_the_package_has_an_example_that_runs(name, axis, monkeypatch):
+    monkeypatch.chdir(axis)
+    thing = identify if name == "identify" else getattr(jf, name)  # of that name is the room, which is called
+    examples = doctest.DocTestParser().get_doctest(thing.__doc__ or "", {}, name, None, None)
+    assert examples.examples
+    said: list[str] = []
+    failed, _ = doctest.DocTestRunner().run(examples, out=said.append)
+    assert not failed, "".join(said)
 
 
 def test_every_name_of_the_package_is_there_and_nothing_loads_jax_before_it_is_needed():

@@ -28,7 +28,14 @@ _START = 100  # samples by which most pairs of trials are told apart
 
 
 def check_file(path: str | os.PathLike) -> list[Finding]:
-    """All that is wrong with a file; empty where it is as the format wants it. Never raises for what is in the file."""
+    """All that is wrong with a file; empty where it is as the format wants it. Never raises for what is in the file.
+
+    >>> import jaxfinger as jf
+    >>> jf.check("session.h5")
+    []
+    >>> [finding.severity for finding in jf.check("fit.json")]
+    ['error']
+    """
     session, report = inspect(path)
     if session is not None:
         examine(session, report)

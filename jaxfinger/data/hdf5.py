@@ -41,6 +41,10 @@ def read_session(
 ) -> Session:
     """The session in a file, in float64, or only the named trials of it. `report` takes what the checker finds.
 
+    >>> import jaxfinger as jf
+    >>> jf.read("session.h5")
+    Session('EMPS': 1 joint, 0 tendons; 1 ID.3-dynamic)
+
     Raises:
         UserError: the first error that `check_file` finds, in one sentence with file, place and mend.
     """
@@ -56,6 +60,12 @@ def read_session(
 
 def write_session(session: Session, path: str | os.PathLike, overwrite: bool = False) -> None:
     """Write a session; the file appears whole or not at all.
+
+    >>> import jaxfinger as jf
+    >>> session = jf.read("session.h5")
+    >>> jf.write(session.select("ID.3-dynamic"), "sweeps.h5")
+    >>> jf.read("sweeps.h5")
+    Session('EMPS': 1 joint, 0 tendons; 1 ID.3-dynamic)
 
     Raises:
         UserError: the file exists and `overwrite` is false, a channel has the wrong shape, or it cannot be written.

@@ -26,6 +26,11 @@ def write_predictions(
 
     Shapes and units are those of the measured channels; `time` may be given where it is not the trial's.
 
+    >>> import jaxfinger as jf
+    >>> session = jf.read("session.h5")
+    >>> mine = {trial.name: {"joint_torque": 0.0 * trial.joint_torque} for trial in session}
+    >>> jf.write_predictions("simulator.h5", session, mine)
+
     Raises:
         UserError: the file exists and `overwrite` is false, or a trial, channel or shape does not fit the session.
     """
@@ -62,6 +67,12 @@ def write_predictions(
 
 def read_predictions(path: str | os.PathLike) -> dict[str, dict[str, np.ndarray]]:
     """The predicted channels of a file, `{trial: {"time": (N,), channel: array}}`, in SI units.
+
+    >>> import jaxfinger as jf
+    >>> session, fit = jf.read("session.h5"), jf.load("fit.json")
+    >>> jf.write_predictions("predicted.h5", session, jf.predict(fit, session))
+    >>> {name: sorted(channels) for name, channels in jf.read_predictions("predicted.h5").items()}
+    {'01-ID3-dynamic-axis': ['joint_torque', 'time']}
 
     Raises:
         UserError: the first thing that is wrong with the file.

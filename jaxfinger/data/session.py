@@ -111,7 +111,15 @@ class Trial:
 
 @dataclass(frozen=True, repr=False)
 class Session:
-    """One specimen, its finger, and its trials by name (in the order of the session)."""
+    """One specimen, its finger, and its trials by name (in the order of the session).
+
+    >>> import jaxfinger as jf
+    >>> session = jf.read("session.h5")
+    >>> session["01-ID3-dynamic-axis"]
+    Trial('01-ID3-dynamic-axis': ID.3-dynamic, axis; 24841 samples, 24.8 s)
+    >>> session.finger.joint_names
+    ('axis',)
+    """
 
     specimen: str
     finger: FingerDescription
@@ -148,7 +156,8 @@ class Session:
     def __repr__(self) -> str:
         counts = Counter(t.experiment for t in self)
         trials = ", ".join(f"{k} {e}" for e, k in counts.items()) or "no trials"
-        return f"Session({self.specimen!r}: {self.finger.m} joints, {self.finger.n} tendons; {trials})"
+        m, n = self.finger.m, self.finger.n
+        return f"Session({self.specimen!r}: {m} joint{'s' * (m != 1)}, {n} tendon{'s' * (n != 1)}; {trials})"
 
     def _repr_html_(self) -> str:
         return f"<p>{escape(repr(self))}</p>{self.table()._repr_html_()}"

@@ -83,6 +83,12 @@ def diagnose(
     channel, the share of its signal up to which a gap does not matter. With `against` it is what an earlier fit of the
     same finger misses: its nominal parameters, each within its interval, are candidates for what has changed.
 
+    The servo axis with a model that leaves Coulomb's friction out:
+
+    >>> import jaxfinger as jf
+    >>> jf.diagnose(jf.read("session.h5"), jf.recipe("emps-no-coulomb"), quick=True)
+    Diagnosis('session.h5': explained; joint_coulomb at axis)
+
     Raises:
         UserError: an effect to leave out is unknown; the earlier fit is of another finger or recipe, or holds effects.
     """

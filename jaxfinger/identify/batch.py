@@ -34,7 +34,7 @@ AT_ONCE = 10  # sessions in one call: while the device fits them, the next are r
 SOLVER = VisibleGaussNewton(atol=SMALL, kink=KINK)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Members:
     """Fits of many sessions."""
 
@@ -43,6 +43,10 @@ class Members:
     failed: Bool[np.ndarray, " S"]  # did not converge, or holds data that no fit can take
     steps: np.ndarray  # linearisations of each, all stages together
     template: Fit
+
+    def __repr__(self) -> str:
+        count, failed = len(self.failed), np.count_nonzero(self.failed)
+        return f"Members({count} fit{'s' * (count != 1)} by recipe {self.template.recipe.name!r}: {failed} failed)"
 
     def model(self, k: int) -> Model:
         """The model of one member."""
@@ -80,6 +84,11 @@ class _Stage(eqx.Module):
 
 def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: Batching | None = None) -> Members:
     """Fit every session as the template was fitted to the session `of`.
+
+    >>> import jaxfinger as jf
+    >>> session, fit = jf.read("session.h5"), jf.load("fit.json")
+    >>> jf.fit_many([session, session], fit, of=session)
+    Members(2 fits by recipe 'emps': 0 failed)
 
     Raises:
         UserError: a session has another protocol than the template's, or other joints or tendons.

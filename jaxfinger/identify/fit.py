@@ -34,7 +34,15 @@ class StageReport:
 
 @dataclass(frozen=True, repr=False)
 class Fit:
-    """A model with the covariance of its flat vector of parameters (see `parameters`), and what made it."""
+    """A model with the covariance of its flat vector of parameters (see `parameters`), and what made it.
+
+    >>> import jaxfinger as jf
+    >>> fit = jf.load("fit.json")
+    >>> fit
+    Fit('EMPS', recipe 'emps': 4 parameters; ID.3-dynamic fitted)
+    >>> fit.table().column("name")
+    ['mass axis', 'elastic torque axis^0', 'damping axis', 'friction torque axis^0']
+    """
 
     model: Model
     covariance: np.ndarray  # (P, P); zero where a parameter was given, infinite on the diagonal where it is not seen

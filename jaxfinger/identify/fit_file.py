@@ -46,6 +46,9 @@ FINGER_STATIC = ("limits", "prismatic", "joint_names", "tendon_names", "active",
 def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None:
     """Write a fit to `path`, whole or not at all.
 
+    >>> import jaxfinger as jf
+    >>> jf.save(jf.load("fit.json"), "copy.json")
+
     Raises:
         UserError: the file exists and `overwrite` is false, or its folder cannot be written.
     """
@@ -64,6 +67,10 @@ HDF5 = b"\x89HDF\r\n\x1a\n"  # how such a file, as a session is one, begins
 
 def load_fit(path: str | os.PathLike, effects: str | os.PathLike | None = None) -> Fit:
     """Read a fit that `save_fit` wrote; `effects` is the Python file of a user's own effects in its model.
+
+    >>> import jaxfinger as jf
+    >>> jf.load("fit.json")
+    Fit('EMPS', recipe 'emps': 4 parameters; ID.3-dynamic fitted)
 
     Raises:
         UserError: the file cannot be read, is no fit, or has been damaged.

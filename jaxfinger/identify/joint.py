@@ -44,6 +44,10 @@ MISFIT = 1.3  # χ² a row above which another start is tried
 def refine(session: Session, fit: Fit, progress: Progress = lambda message: None) -> Fit:
     """The fit refined on all trials of `recipe.fit.joint_experiments`; its last stage report says what it gained.
 
+    >>> import jaxfinger as jf
+    >>> jf.refine(jf.read("session.h5"), jf.load("fit.json"))
+    Fit('EMPS', recipe 'emps': 4 parameters; ID.3-dynamic fitted, joint fitted)
+
     Raises:
         UserError: the session has none of these trials, or its finger is another one.
     """

@@ -33,6 +33,11 @@ def predict_session(
     Channels are those of the format's table. A joint whose torque was not measured stays NaN, and so does the excursion
     of a passive tendon. A trial of fewer than two samples is left out.
 
+    >>> import jaxfinger as jf
+    >>> predicted = jf.predict(jf.load("fit.json"), jf.read("session.h5"))
+    >>> predicted["01-ID3-dynamic-axis"]["joint_torque"].shape
+    (24841, 1)
+
     Raises:
         UserError: the model's joints or tendons are not those of the session.
     """

@@ -59,7 +59,15 @@ class Recipe:
 
 
 def read_recipe(path: str | Path | None) -> Recipe:
-    """The recipe in a TOML file; the paper's where there is none. UserError names the key to mend."""
+    """The recipe in a TOML file, or a shipped one by its name; the paper's where there is none.
+
+    >>> import jaxfinger as jf
+    >>> jf.recipe("emps").model.terms
+    ('joint_elastic', 'joint_coulomb', 'joint_damping')
+
+    Raises:
+        UserError: there is no such recipe, or a key of it is wrong; it names the key to mend.
+    """
     if path is None:
         return Recipe()
     path = Path(path)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from html import escape
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,6 +28,7 @@ from jaxfinger.identify.linearise import residuals_of
 from jaxfinger.identify.noise import estimate
 from jaxfinger.identify.predictions import model_for, simulate_trials
 from jaxfinger.model import Model
+from jaxfinger.table import Table
 
 ONLINE_CUTOFF = 10.0  # Hz, of the causal filter that a controller would differentiate
 
@@ -61,7 +63,7 @@ class Slope:
     predicted_std: float  # from the fit's covariance
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Validation:
     """Every score of a fit on a session."""
 
@@ -70,6 +72,18 @@ class Validation:
     scores: tuple[Score, ...]
     slopes: tuple[Slope, ...] = ()
     messages: tuple[str, ...] = ()  # what was not validated, and why
+
+    def __repr__(self) -> str:
+        count = len(self.scores)
+        return f"Validation({self.session!r}: {count} score{'s' * (count != 1)})"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(repr(self))}</p>{self.table()._repr_html_()}"
+
+    def table(self) -> Table:
+        """One row a score: what was predicted, the rms of its error, and the noise in it."""
+        names = ("experiment", "channel", "column", "rms", "noise", "units")
+        return Table({n: getattr(s, n) for n in names} for s in self.scores)
 
     def as_dict(self) -> dict:
         """Plain dictionaries, for JSON."""
@@ -83,6 +97,14 @@ def validate(
     progress: Callable[[str], None] = lambda message: None,
 ) -> Validation:
     """Scores of the recipe's validation experiments, or of others by name.
+
+    >>> import jaxfinger as jf
+    >>> validation = jf.validate(jf.load("fit.json"), jf.read("session.h5"))
+    >>> validation
+    Validation('session.h5': 1 score)
+    >>> (row,) = validation.table()
+    >>> f"{row['rms']:.1f} {row['units']} of error, {row['noise']:.1f} of it noise"
+    '1.7 N of error, 0.7 of it noise'
 
     Raises:
         UserError: the session has none of them, or is of another finger.

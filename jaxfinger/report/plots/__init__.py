@@ -1,4 +1,9 @@
-"""Figures as functions: each takes Matplotlib axes, or makes them, and returns them."""
+"""Figures as functions: each takes Matplotlib axes, or makes them, and returns them.
+
+>>> import jaxfinger as jf
+>>> axes = jf.plot.intervals(jf.load("fit.json"))
+>>> axes.figure.savefig("intervals.png")
+"""
 
 from jaxfinger.report.plots.fit import correlation, influence, intervals
 from jaxfinger.report.plots.gap import budget, closure, residuals, signal
