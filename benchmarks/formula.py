@@ -47,8 +47,7 @@ class Record:
     counts: Counts
     evidence: dict[frozenset[Key], Evidence]
     screened: frozenset[frozenset[Key]]  # sets that were not weighed in settled weights
-    sites: dict[str, int]
-    seen: tuple[Key, ...]
+    touched: dict[Key, np.ndarray]
     at_work: frozenset[Key]
     parameters: Parameters
 
@@ -61,7 +60,7 @@ class Record:
 
     def costs(self, p: Parameters) -> Costs:
         """Under other parameters."""
-        return Costs(p, float(unexplained(self.counts, self.evidence[frozenset()], p).sum()), self.sites)
+        return Costs(p, unexplained(self.counts, self.evidence[frozenset()], p), self.touched)
 
     def log_score(self, p: Parameters) -> float:
         """Σ log P of what is true of every cause and of «unlisted»."""
@@ -73,11 +72,11 @@ class Record:
         w = costs.weights(dict(zip(sets, scores.tolist(), strict=True)))
         settled = [(s - costs.of(k), k) for k, s in zip(sets, scores, strict=True) if k not in self.screened]
         _, best = max(settled, key=lambda x: x[0])
-        probability = dict.fromkeys(self.seen, 0.0)
+        probability = dict.fromkeys(self.touched, 0.0)
         for keys, v in w.items():
             for key in keys:
                 probability[key] += v
-        probability[UNLISTED] = costs.unlisted(float(unexplained(self.counts, self.evidence[best], p).sum()))
+        probability[UNLISTED] = costs.unlisted(unexplained(self.counts, self.evidence[best], p))
         P = np.clip(np.array(list(probability.values())), CLIP, 1.0 - CLIP)
         true = np.array([key in self.at_work for key in probability])
         return float(np.sum(np.log(np.where(true, P, 1.0 - P))))
@@ -95,8 +94,7 @@ def weigh(folder: Path) -> Record:
         search.bench.columns.counts,
         visited.evidence,
         frozenset(visited.screened),
-        dict(costs.sites),
-        tuple(search.table.keys),
+        search.table.touched,
         read_truth(folder, folder.parent.with_name(f"{folder.parent.name}-truth")).at_work,
         costs.parameters,
     )

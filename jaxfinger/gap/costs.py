@@ -1,13 +1,16 @@
 """What a set of causes must explain, in log evidence, before it is believed; and the probabilities that follow.
 
-A cause costs the evidence that an imitator would bring, and the log of the number of its rivals. Further sites of an
-effect that is in cost less and the log of its sites alone: one cause that acts at many sites is one cause.
+A cause costs the evidence that an imitator would bring where it acts, and the log of the number of its rivals. Further
+sites of an effect that is in cost less and the log of its sites alone: one cause that acts at many sites is one cause.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float
 from scipy.special import expit, logsumexp
 
 from jaxfinger.effects import NOMINAL_TERMS, Site
@@ -21,8 +24,13 @@ class Costs:
     """Of all sets of causes that the trials of one file can see."""
 
     parameters: Parameters
-    unknown: float  # log evidence that something is at work
-    sites: Mapping[str, int]  # of every effect that the trials can see
+    unknown: Float[np.ndarray, " C"]  # log evidence, column by column, that something is at work
+    touched: Mapping[Key, Float[np.ndarray, " C"]]  # of all that the trials see: the most it could explain of a column
+
+    @cached_property
+    def sites(self) -> Mapping[str, int]:
+        """Of every effect that the trials can see."""
+        return Counter(effect for effect, _ in self.touched)
 
     def of(self, keys: Iterable[Key]) -> float:
         """What a set must explain."""
@@ -38,9 +46,11 @@ class Costs:
         return len(effects) * np.log(len(self.sites)) + sum(np.log(max(self.sites.get(e, 1), 1)) for e, _ in keys)
 
     def evidence_needed(self, keys: Iterable[Key]) -> float:
-        """By every cause and site, and by every effect as a share of all that there is to explain."""
-        keys, p = list(keys), self.parameters
-        return p.prior * len(keys) + p.alike * self.unknown * len({e for e, _ in keys})
+        """By every cause and site, and by every effect as a share of what there is to explain where it acts."""
+        keys, p, where = list(keys), self.parameters, {}
+        for key in keys:
+            where[key[0]] = np.maximum(where.get(key[0], 0.0), self.touched[key])
+        return p.prior * len(keys) + p.alike * float(sum(w @ self.unknown for w in where.values()))
 
     def weights(self, scores: Mapping[frozenset[Key], float]) -> dict[frozenset[Key], float]:
         """Posterior probability of every set: ∝ exp(β (score − evidence needed) − log odds)."""
@@ -48,7 +58,7 @@ class Costs:
         log_w = [trust * (s - self.evidence_needed(keys)) - self.odds(keys) for keys, s in scores.items()]
         return dict(zip(scores, np.exp(np.array(log_w) - logsumexp(log_w)).tolist(), strict=True))
 
-    def unlisted(self, left: float) -> float:
+    def unlisted(self, left: Float[np.ndarray, " C"]) -> float:
         """Probability that something is at work which the catalogue lacks, from the log evidence that is left."""
-        p, taken = self.parameters, max(self.unknown - left, 0.0)
-        return float(expit(p.sharp * (left - p.open - p.left * taken)))
+        p, taken = self.parameters, np.maximum(self.unknown - left, 0.0)
+        return float(expit(p.sharp * (np.maximum(left - p.left * taken, 0.0).sum() - p.open)))

@@ -85,7 +85,7 @@ class Bench:
     columns: Columns
     parameters: Parameters
     null: State  # no cause, the nominal model refitted in the weights of the formula
-    unknown: float  # log evidence that something is at work
+    unknown: Float[np.ndarray, " C"]  # log evidence, column by column, that something is at work
     gap: float  # norm of what the nominal model misses: the size of the amplitudes' prior
 
     @classmethod
@@ -97,7 +97,7 @@ class Bench:
         judged = Linear(columns, (residual, nominal), prior_of(problem, 0), none, parameters).null
         assert judged is not None
         null = State(problem, columns, nominal, (), (), empty, empty, judged)
-        unknown = float(unexplained(columns.counts, judged.evidence, parameters).sum())
+        unknown = unexplained(columns.counts, judged.evidence, parameters)
         gap = float(np.sqrt(np.sum(judged.evidence.e + judged.evidence.o)))
         return cls(columns, parameters, null, unknown, gap)
 

@@ -35,10 +35,10 @@ class Parameters:
     form: float = 0.02  # ρ²: share of what causes explain in a column that the forms of their laws may miss
     looks: float = 25.0  # ν: independent looks outside of the features
     prior: float = 6.0  # log evidence that a cause must bring,
-    alike: float = 0.07  # and as a share of what the nominal model leaves unexplained: what an imitator gains of it
+    alike: float = 0.07  # and as a share of what is unexplained where it acts: what an imitator gains of it
     trust: float = 1.0  # β: of all log evidence, since neighbouring features and columns are no independent looks
     open: float = 12.0  # log evidence left, from which on something unlisted is as likely as not,
-    left: float = 0.12  # and as a share of what the causes take away: forms leave some of it
+    left: float = 0.12  # and in a column as a share of what the causes take away there: forms leave some of it
     sharp: float = 0.4  # and how fast that grows
 
 

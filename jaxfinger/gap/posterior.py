@@ -37,8 +37,7 @@ def posterior(search: Search, state: State) -> Posterior:
         causes[key] = sum(w[keys] for keys in inside)
         without = max(net[keys] for keys in scores if key not in keys)
         gains[key] = max((net[keys] for keys in inside), default=-np.inf) - without
-    left = float(unexplained(search.bench.columns.counts, state.judged.evidence, search.bench.parameters).sum())
-    unlisted = costs.unlisted(left)
+    unlisted = costs.unlisted(unexplained(search.bench.columns.counts, state.judged.evidence, search.bench.parameters))
     ambiguous = _ambiguous(w, state, causes)
     named = tuple(k for k in state.keys if causes[k] >= IS_NAMED and not any(k in s for s in ambiguous))
     return Posterior(causes, gains, w[frozenset()] * (1.0 - unlisted), unlisted, named, ambiguous)

@@ -60,6 +60,7 @@ class Table:
     units: Float[np.ndarray, " M"]
     absorbed: dict[Key, float]
     hidden: dict[Key, dict[str, float]]  # std of amplitudes, each alone, in their own units: what could hide
+    touched: dict[Key, Float[np.ndarray, " C"]]  # of all that the trials can see
     offers: list[Offered]
 
     def rows_of(self, offer: Offered) -> list[Int[np.ndarray, " k"]]:
@@ -69,7 +70,7 @@ class Table:
     @property
     def keys(self) -> list[Key]:
         """All that the trials can see."""
-        return list(dict.fromkeys(k for o in self.offers for k in o.keys))
+        return list(self.touched)
 
 
 def table_of(problem: Problem, bench: Bench, screening: Screening, together: bool = True) -> Table:
@@ -83,12 +84,15 @@ def table_of(problem: Problem, bench: Bench, screening: Screening, together: boo
         items += variants
         blocks += list(Z)
     Z = np.concatenate(blocks)
-    raw, seen = np.linalg.norm(Z, axis=1), np.linalg.norm(plain(Z), axis=1)
+    projected = plain(Z)
+    raw, seen = np.linalg.norm(Z, axis=1), np.linalg.norm(projected, axis=1)
     kept = seen > SEEN * raw
     units = np.where(kept, bench.gap / np.maximum(seen, 1e-300), 0.0)
     Z *= units[:, None]
+    claims = _claims(bench, projected * units[:, None])
     absorbed: dict[Key, float] = {}
     hidden: dict[Key, dict[str, float]] = {}
+    touched: dict[Key, Float[np.ndarray, " C"]] = {}
     offers, rows, start = [], {}, 0
     for v, block in zip(items, blocks, strict=True):
         at = np.arange(start, start + len(block))
@@ -106,9 +110,17 @@ def table_of(problem: Problem, bench: Bench, screening: Screening, together: boo
         if ends:
             low, high = np.array(ends).T
             offers.append(Offered((v,), at[kept[at]], low, high))
-    return Table(
-        Z, ByColumn(bench.columns, Z), rows, units, absorbed, hidden, offers + (_together(offers) if together else [])
-    )
+            touched[v.key] = np.maximum(touched.get(v.key, 0.0), claims[at].max(axis=0))
+    offers += _together(offers) if together else []
+    return Table(Z, ByColumn(bench.columns, Z), rows, units, absorbed, hidden, touched, offers)
+
+
+def _claims(bench: Bench, projected: Float[np.ndarray, "M N"]) -> Float[np.ndarray, "M C"]:
+    """Share of what the nominal model misses in every column that a signature could explain, were all of the gap its
+    own.
+    """
+    energy = np.stack([np.sum((projected[:, c.rows] @ c.basis) ** 2, axis=1) for c in bench.columns.items], axis=1)
+    return np.minimum(energy / np.maximum(bench.null.judged.evidence.e, 1e-300), 1.0)
 
 
 def _ends(v: Variant, name: str, unit: float) -> tuple[float, float]:
@@ -189,10 +201,7 @@ class Search:
     def __init__(self, bench: Bench, table: Table, progress: Progress = lambda message: None):
         self.bench, self.table, self.progress = bench, table, progress
         self.visited = Visited()
-        sites: dict[str, set] = {}
-        for effect, site in table.keys:
-            sites.setdefault(effect, set()).add(site)
-        self.costs = Costs(bench.parameters, bench.unknown, {e: len(s) for e, s in sites.items()})
+        self.costs = Costs(bench.parameters, bench.unknown, table.touched)
         self.visited.add((), bench.null.judged.evidence)
 
     def value(self, state: State) -> float:

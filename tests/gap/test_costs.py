@@ -1,18 +1,28 @@
 """What sets of causes must explain, and the probabilities that follow."""
 
+import numpy as np
 import pytest
 
 from jaxfinger.gap.costs import Costs
 from jaxfinger.gap.formula import Parameters
 
-SITES = {"tendon_stretch": 5, "joint_stribeck": 3, "joint_damping": 3}
-COSTS = Costs(Parameters(), 200.0, SITES)
+SITES = {"tendon_stretch": ("T1", "T2", "T3"), "joint_stribeck": ("MCP", "PIP"), "joint_damping": ("MCP", "PIP")}
+EXCURSION, TORQUE = np.eye(2)  # columns
+ACTS = {"tendon_stretch": EXCURSION, "joint_stribeck": TORQUE, "joint_damping": EXCURSION + TORQUE}
+TOUCHED = {(e, (s,)): ACTS[e] for e, sites in SITES.items() for s in sites}
+COSTS = Costs(Parameters(), 100.0 * (EXCURSION + TORQUE), TOUCHED)
 STRETCH, FURTHER, STRIBECK = ("tendon_stretch", ("T1",)), ("tendon_stretch", ("T2",)), ("joint_stribeck", ("MCP",))
 
 
 def test_one_cause_at_a_further_site_costs_less_than_another_cause():
     assert COSTS.of([STRETCH, FURTHER]) < COSTS.of([STRETCH, STRIBECK])
     assert COSTS.of([STRETCH, FURTHER]) > COSTS.of([STRETCH]) > COSTS.of([]) == 0.0
+
+
+def test_what_is_unexplained_raises_the_cost_of_causes_that_act_there():
+    loud = Costs(Parameters(), 100.0 * EXCURSION + 2000.0 * TORQUE, TOUCHED)
+    assert loud.of([STRETCH]) == COSTS.of([STRETCH])
+    assert loud.of([STRIBECK]) > COSTS.of([STRIBECK])
 
 
 def test_a_term_that_the_recipe_leaves_out_is_no_rarity():
@@ -26,7 +36,8 @@ def test_probabilities_are_shares_of_evidence_beyond_what_each_set_costs():
     assert COSTS.weights({k: s + 321.0 for k, s in sets.items()}) == pytest.approx(w)
 
 
-def test_the_more_is_left_the_likelier_something_is_unlisted_and_the_less_the_more_the_causes_took():
-    left = [COSTS.unlisted(x) for x in (0.0, 40.0, 60.0)]
-    assert left[0] < 0.01 < left[1] < left[2]
-    assert Costs(Parameters(), 2000.0, SITES).unlisted(60.0) < left[2]
+def test_the_more_is_left_the_likelier_something_is_unlisted_and_the_less_the_more_the_causes_took_there():
+    left = [COSTS.unlisted(x * EXCURSION) for x in (0.0, 40.0, 60.0)]
+    assert left[0] < 0.02 < left[1] < left[2]
+    assert Costs(Parameters(), 2000.0 * EXCURSION, TOUCHED).unlisted(60.0 * EXCURSION) < left[2]
+    assert Costs(Parameters(), 60.0 * EXCURSION + 2000.0 * TORQUE, TOUCHED).unlisted(60.0 * EXCURSION) >= left[2]
