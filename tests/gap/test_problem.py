@@ -7,7 +7,7 @@ import pytest
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap.augment import as_refitted, augmented_fit, nominal_fit
-from jaxfinger.gap.exact import Bench, at_one_model, fitted
+from jaxfinger.gap.exact import Bench, at_one_model, fitted, orthonormalised
 from jaxfinger.gap.formula import Parameters, Weights
 from jaxfinger.gap.problem import build, moved
 from jaxfinger.gap.signatures import Signatures, Variant
@@ -188,3 +188,23 @@ def test_without_id2_the_other_experiments_show_the_moment_arms(session):
     count = np.bincount(problem.column_of_row)
     assert np.all(energy[count > 100] < 1.5)
     assert np.all(energy[count > 100] > 0.5)
+
+
+@pytest.mark.parametrize("condition", [1e1, 1e6])
+def test_products_of_columns_span_what_householders_qr_does(condition):
+    rng = np.random.default_rng(0)
+    U, V = (np.linalg.qr(rng.standard_normal((n, 20)))[0] for n in (2000, 20))
+    A = U * np.geomspace(1.0, 1.0 / condition, 20) @ V.T
+    Q, T = orthonormalised(A)
+    np.testing.assert_allclose(Q.T @ Q, np.eye(20), atol=1e-13)
+    np.testing.assert_allclose(A @ T, Q, atol=1e-15 * condition)
+    np.testing.assert_allclose(Q @ (Q.T @ U), U, atol=1e-15 * condition)
+
+
+def test_a_column_that_is_the_sum_of_others_adds_no_direction():
+    A = np.random.default_rng(0).standard_normal((200, 3)) @ np.array(
+        [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 0.0]]
+    )
+    Q, _ = orthonormalised(A)
+    assert Q.shape == (200, 2)
+    np.testing.assert_allclose(Q @ (Q.T @ A), A, atol=1e-12)
