@@ -17,7 +17,7 @@ from jaxfinger.gap.screening import Screening
 from jaxfinger.gap.signatures import Variant
 from jaxfinger.identify.stages import Progress
 
-SEEN = 0.01  # of a signature that the nominal parameters leave: with less, products with them are larger
+SEEN = 1e-3  # of a signature that the nominal parameters leave: with less, the bend of a finite step is larger
 SHORT_LIST = 12  # candidates whose amplitudes are weighed until the weights settle
 EXACT = 3  # of them that are fitted exactly
 MOST = 12  # changes of the set
