@@ -1,7 +1,7 @@
 """What a set of causes must explain, in log evidence, before it is believed; and the probabilities that follow.
 
-A cause costs the evidence that an imitator would bring where it acts, and the log of the number of its rivals. Further
-sites of an effect that is in cost less and the log of its sites alone: one cause that acts at many sites is one cause.
+A cause costs the evidence that an imitator would bring where it acts, and the log of the number of its rivals. Rivals
+of a further site are the effect's other sites alone: one cause that acts at many sites is one cause.
 """
 
 from collections import Counter
@@ -45,12 +45,14 @@ class Costs:
         effects = {e for e, _ in keys} - set(NOMINAL_TERMS)
         return len(effects) * np.log(len(self.sites)) + sum(np.log(max(self.sites.get(e, 1), 1)) for e, _ in keys)
 
+    @cached_property
+    def _to_explain(self) -> Mapping[Key, float]:
+        """Log evidence, where each acts, that something is at work."""
+        return {key: float(share @ self.unknown) for key, share in self.touched.items()}
+
     def evidence_needed(self, keys: Iterable[Key]) -> float:
-        """By every cause and site, and by every effect as a share of what there is to explain where it acts."""
-        keys, p, where = list(keys), self.parameters, {}
-        for key in keys:
-            where[key[0]] = np.maximum(where.get(key[0], 0.0), self.touched[key])
-        return p.prior * len(keys) + p.alike * float(sum(w @ self.unknown for w in where.values()))
+        """By every cause and site, and as a share of what there is to explain where it acts."""
+        return sum(self.parameters.prior + self.parameters.alike * self._to_explain[key] for key in keys)
 
     def weights(self, scores: Mapping[frozenset[Key], float]) -> dict[frozenset[Key], float]:
         """Posterior probability of every set: ∝ exp(β (score − evidence needed) − log odds)."""
