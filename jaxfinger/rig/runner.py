@@ -135,14 +135,16 @@ class Runner:
             rig.reset(name or "operator")
         if not rig.prepare(Setup("", fixed=dict.fromkeys(rig.description.finger.joint_names, 0.0))):
             self._ask("Hands off: the drives are about to be switched on.")
-        latest = time.monotonic() + self._longest(PATIENCE_S)
-        while not self.reader.quiet(round(QUIET_S * rig.description.rate_hz)):
-            self.reader.next()
-            self._look(None)
-            if time.monotonic() > latest:
-                trouble = self.reader.trouble
-                what = trouble.sentence if trouble is not None else "too few samples came"
-                raise UserError(f"nothing was armed: {what}.")
+
+        def quiet() -> bool:
+            return self.reader.quiet(round(QUIET_S * rig.description.rate_hz))
+
+        self._pass(PATIENCE_S, quiet)
+        self._look(None)
+        if not quiet():
+            trouble = self.reader.trouble
+            what = trouble.sentence if trouble is not None else "too few samples came"
+            raise UserError(f"nothing was armed: {what}.")
         self.watch.guard()
         rig.arm()
 

@@ -1,10 +1,11 @@
-"""One short session with one effect in it, and its diagnosis among a handful of rivals."""
+"""One short session with one effect in it, and the problem that its diagnosis starts from."""
 
 import equinox as eqx
 import pytest
 
 from jaxfinger.effects import CATALOGUE
-from jaxfinger.gap import diagnose
+from jaxfinger.gap.problem import build
+from jaxfinger.identify import Recipe
 from jaxfinger.synthetic import ModelPlant, nominal_model, paper_finger, polynomial_finger, recipe_from, simulate
 
 TABLE = {
@@ -23,6 +24,7 @@ RECIPE = recipe_from(TABLE)
 RIVALS = ("joint_presliding", "joint_stribeck", "elastic_relaxation", "tendon_backlash", "tendon_stretch")
 WITHOUT = tuple(sorted(set(CATALOGUE) - set(RIVALS)))
 TRUTH = ("joint_presliding", ("PIP",))
+PLANTED = (*TRUTH, {"a": 1.0, "x0": 0.1})
 
 
 def session_with(*effects, seed=3, recipe=RECIPE):
@@ -35,11 +37,6 @@ def session_with(*effects, seed=3, recipe=RECIPE):
 
 
 @pytest.fixture(scope="session")
-def messages():
-    return []
-
-
-@pytest.fixture(scope="session")
-def diagnosis(messages):
-    session = session_with((*TRUTH, {"a": 1.0, "x0": 0.1}))
-    return diagnose(session, without=WITHOUT, progress=messages.append)
+def planted():
+    """The problem of a session with the one effect."""
+    return build(session_with(PLANTED), Recipe())

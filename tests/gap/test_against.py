@@ -8,14 +8,14 @@ from jaxfinger.effects import CATALOGUE, CHANGED
 from jaxfinger.errors import UserError
 from jaxfinger.gap import Status, diagnose
 from jaxfinger.gap.result import Key
-from jaxfinger.identify import Recipe, identify
+from jaxfinger.identify import Fit, Recipe, identify
+from jaxfinger.identify.stages import nominal_model
 from jaxfinger.report.gap_json import as_gap_json
 from jaxfinger.report.sentences import summary
 
-from .conftest import RIVALS, TRUTH, session_with
+from .conftest import PLANTED, RIVALS, TRUTH, session_with
 
 WITHOUT = tuple(sorted(set(CATALOGUE) - {*RIVALS, "payload", "joint_friction_asymmetric"}))
-EFFECT = (*TRUTH, {"a": 1.0, "x0": 0.1})
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +35,7 @@ def values(cause):
     return {v.name: v for v in cause.values}
 
 
+@pytest.mark.long
 def test_nothing_has_changed(earlier):
     found = beside(earlier)
     assert found.status is Status.NO_GAP
@@ -72,7 +73,7 @@ def test_one_parameter_has_changed(earlier, truth, group):
 @pytest.mark.long
 def test_an_effect_came_and_a_parameter_changed(earlier):
     """Both are named, each with its value; and what is written is `gap.json` 2."""
-    found = beside(earlier, EFFECT, changed("changed_damping", "MCP", d=3e-4))
+    found = beside(earlier, PLANTED, changed("changed_damping", "MCP", d=3e-4))
     assert found.status is Status.EXPLAINED
     assert set(found.named) == {Key(*TRUTH), Key("changed_damping", ("MCP",))}
     by = {c.effect: values(c) for c in found.budget}
@@ -88,8 +89,9 @@ def test_an_effect_came_and_a_parameter_changed(earlier):
     assert damping["parameters"]["d"]["units"] == "N m s/rad"
 
 
-def test_a_fit_that_cannot_be_compared_with_is_refused(earlier):
+def test_a_fit_that_cannot_be_compared_with_is_refused():
     session = replace(session_with(seed=8), file="b.h5")
+    earlier = Fit.before(session, Recipe(), nominal_model(session, Recipe()))
     with_effect = earlier.with_effect(CATALOGUE["joint_presliding"].at(earlier.model.finger, ("PIP",)), ())
     with pytest.raises(UserError, match=r"b\.h5: the fit to compare it with holds effects"):
         diagnose(session, against=with_effect)

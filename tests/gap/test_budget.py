@@ -9,9 +9,9 @@ from jaxfinger.gap.budget import held_out_gains
 from jaxfinger.gap.folds import FOLDS, fold_of_row
 
 
-def test_a_cause_explains_trials_that_it_has_not_seen_and_luck_does_not(diagnosis):
+def test_a_cause_explains_trials_that_it_has_not_seen_and_luck_does_not(planted):
     rng = np.random.default_rng(0)
-    problem, fold = diagnosis.problem, fold_of_row(diagnosis.problem)
+    problem, fold = planted, fold_of_row(planted)
     assert set(fold) == set(range(FOLDS))
     z, noise = rng.standard_normal((2, problem.r.size))
     r = noise + 2.0 * z

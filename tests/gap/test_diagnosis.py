@@ -15,9 +15,17 @@ from jaxfinger.gap.signatures import whitened
 from jaxfinger.gap.where import where
 from jaxfinger.identify.noise import whiten
 
-from .conftest import RIVALS, TRUTH, WITHOUT, session_with
+from .conftest import PLANTED, RIVALS, TRUTH, WITHOUT, session_with
 
-PLANTED = (*TRUTH, {"a": 1.0, "x0": 0.1})
+
+@pytest.fixture(scope="module")
+def messages():
+    return []
+
+
+@pytest.fixture(scope="module")
+def diagnosis(messages):
+    return diagnose(session_with(PLANTED), without=WITHOUT, progress=messages.append)
 
 
 def values(cause):
@@ -124,8 +132,8 @@ def test_nothing_is_named_where_nothing_is():
     assert found.augmented is found.nominal
 
 
-def test_signatures_are_whitened_as_the_residuals_are(diagnosis):
-    problem = diagnosis.problem
+def test_signatures_are_whitened_as_the_residuals_are(planted):
+    problem = planted
     rng = np.random.default_rng(0)
     for e, channel in (("ID.3-dynamic", "joint_torque"), ("ID.2", "tendon_excursion")):
         rows, stack = problem.rows[e], problem.stacks[e]
@@ -138,9 +146,9 @@ def test_signatures_are_whitened_as_the_residuals_are(diagnosis):
         np.testing.assert_allclose(mine, reference, rtol=1e-6, atol=1e-6 * np.abs(reference).max())
 
 
-def test_where_finds_a_planted_gap(diagnosis):
+def test_where_finds_a_planted_gap(planted):
     """White noise everywhere, and five deviations more in the upper angles of one trial."""
-    problem = diagnosis.problem
+    problem = planted
     rows = problem.rows["ID.3-dynamic"]
     r = np.random.default_rng(1).standard_normal(problem.r.size)
     trial, column = int(rows.trial[-1]), int(rows.column[rows.trial == rows.trial[-1]][0])
@@ -157,9 +165,8 @@ def test_where_finds_a_planted_gap(diagnosis):
     assert place.share > 0.9
 
 
-def test_no_place_stands_out_of_white_noise(diagnosis):
-    problem = diagnosis.problem
-    assert where(replace(problem, r=np.random.default_rng(2).standard_normal(problem.r.size))) == []
+def test_no_place_stands_out_of_white_noise(planted):
+    assert where(replace(planted, r=np.random.default_rng(2).standard_normal(planted.r.size))) == []
 
 
 def test_progress_is_told(diagnosis, messages):

@@ -13,11 +13,9 @@ from jaxfinger.identify import Recipe
 from jaxfinger.identify.parameters import describe
 from jaxfinger.synthetic import recipe_from
 
-from .conftest import RIVALS, TABLE, TRUTH, WITHOUT, session_with
+from .conftest import PLANTED, RIVALS, TABLE, TRUTH, WITHOUT, session_with
 
 pytestmark = pytest.mark.long
-
-PLANTED = (*TRUTH, {"a": 1.0, "x0": 0.1})
 
 
 def test_without_one_trial_the_verdict_is_the_same():

@@ -54,8 +54,8 @@ def test_a_shape_that_no_trial_tells_is_said_to_be_open(ambiguous):
     assert best["phi"].std > 0.5
 
 
-def test_an_experiment_that_is_missing_is_imagined_with_the_motion_of_another(diagnosis):
-    problem = diagnosis.problem
+def test_an_experiment_that_is_missing_is_imagined_with_the_motion_of_another(planted):
+    problem = planted
     lacking = replace(problem, stacks={e: s for e, s in problem.stacks.items() if e != "ID.3-dynamic"})
     lists = list(_short_list(lacking, {"ID.3-dynamic"}))
     assert all(set(stacks) == {"ID.3-dynamic"} for stacks in lists)

@@ -55,10 +55,10 @@ def test_the_scan_leaves_as_little_as_the_best_of_all_sets_of_periods(effect, se
     assert left(np.vstack([slope, columns(time, found.values())]), r) == pytest.approx(expected, rel=1e-6)
 
 
-def test_a_long_session_is_scanned_down_to_a_longer_period(diagnosis, monkeypatch):
+def test_a_long_session_is_scanned_down_to_a_longer_period(planted, monkeypatch):
     """A session over a day does not ask for memory in proportion, nor one of an instant for no period at all."""
     monkeypatch.setattr(Signatures, "of", lambda self, members: np.zeros((len(members), 1)))
-    problem, days = diagnosis.problem, {}
+    problem, days = planted, {}
     for length in (0.0, 100.0, 86400.0):
         for e, stack in problem.stacks.items():
             x = stack.batch.x

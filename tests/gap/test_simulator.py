@@ -13,12 +13,12 @@ from jaxfinger.gap.result import Key
 from jaxfinger.identify.predictions import predict_session
 from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger
 
-from .conftest import TRUTH, WITHOUT, session_with
+from .conftest import PLANTED, TRUTH, WITHOUT, session_with
 
 
 @pytest.fixture(scope="module")
 def session():
-    return session_with((*TRUTH, {"a": 1.0, "x0": 0.1}))
+    return session_with(PLANTED)
 
 
 def simulator(session, **factors):

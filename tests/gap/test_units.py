@@ -6,14 +6,14 @@ import pytest
 from jaxfinger.gap import diagnose
 from tests.units import Scale
 
-from .conftest import TRUTH, WITHOUT, session_with
+from .conftest import PLANTED, WITHOUT, session_with
 
 pytestmark = pytest.mark.long
 
 
 @pytest.fixture(scope="module")
 def session():
-    return session_with((*TRUTH, {"a": 1.0, "x0": 0.1}))
+    return session_with(PLANTED)
 
 
 @pytest.fixture(scope="module")
