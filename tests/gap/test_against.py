@@ -8,8 +8,7 @@ from jaxfinger.effects import CATALOGUE, CHANGED
 from jaxfinger.errors import UserError
 from jaxfinger.gap import Status, diagnose
 from jaxfinger.gap.result import Key
-from jaxfinger.identify import Fit, Recipe, identify
-from jaxfinger.identify.stages import nominal_model
+from jaxfinger.identify import Recipe, identify
 from jaxfinger.report.gap_json import as_gap_json
 from jaxfinger.report.sentences import summary
 
@@ -35,7 +34,6 @@ def values(cause):
     return {v.name: v for v in cause.values}
 
 
-@pytest.mark.long
 def test_nothing_has_changed(earlier):
     found = beside(earlier)
     assert found.status is Status.NO_GAP
@@ -89,9 +87,8 @@ def test_an_effect_came_and_a_parameter_changed(earlier):
     assert damping["parameters"]["d"]["units"] == "N m s/rad"
 
 
-def test_a_fit_that_cannot_be_compared_with_is_refused():
+def test_a_fit_that_cannot_be_compared_with_is_refused(earlier):
     session = replace(session_with(seed=8), file="b.h5")
-    earlier = Fit.before(session, Recipe(), nominal_model(session, Recipe()))
     with_effect = earlier.with_effect(CATALOGUE["joint_presliding"].at(earlier.model.finger, ("PIP",)), ())
     with pytest.raises(UserError, match=r"b\.h5: the fit to compare it with holds effects"):
         diagnose(session, against=with_effect)
