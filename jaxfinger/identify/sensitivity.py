@@ -75,7 +75,7 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
 
     >>> import jaxfinger as jf
     >>> session, fit = jf.read("session.h5"), jf.load("fit.json")
-    >>> gains = jf.sensitivity(fit, session, to="sensors")["sensors"]
+    >>> gains = jf.sensitivity(fit, session)["sensors"]
     >>> gains
     Sensitivity(of 4 parameters to 1 of the sensors)
     >>> float(gains.moves[0, fit.estimated[0]].round(2))

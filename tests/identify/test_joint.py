@@ -66,9 +66,9 @@ GROUPS = ("moment_arm", "elastic", "friction", "damping", "tendon_friction")
     [
         pytest.param(0.0, ("moment_arm",), marks=pytest.mark.long),
         pytest.param(0.0, ("tendon_friction",), marks=pytest.mark.long),
-        pytest.param(0.0, ("elastic", "friction"), marks=pytest.mark.long),
+        (0.0, ("elastic", "friction")),
         pytest.param(3.0, GROUPS, marks=pytest.mark.long),
-        (1 / 3, GROUPS),
+        pytest.param(1 / 3, GROUPS, marks=pytest.mark.long),
     ],
 )
 def test_poor_starts_lead_to_the_same_optimum(session, staged, joint, factor, groups):
