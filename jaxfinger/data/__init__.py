@@ -5,6 +5,7 @@ from jaxfinger.data.filtering import bridged as bridged
 from jaxfinger.data.filtering import longest_spike as longest_spike
 from jaxfinger.data.filtering import low_pass as low_pass
 from jaxfinger.data.filtering import outlier_mask as outlier_mask
+from jaxfinger.data.filtering import passed as passed
 from jaxfinger.data.filtering import smooth as smooth
 from jaxfinger.data.filtering import width as width
 from jaxfinger.data.filtering import without_spikes as without_spikes

@@ -220,7 +220,7 @@ def _motion(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repor
     if trial.experiment in NEEDS_TENDON and _span(_pulled(trial, finger)) < sizes.travel:
         message = f"tendon {trial.tendon} is never pulled; check the attribute `tendon`"
         report.warning(_place(trial, "tendon_force"), message)
-    elif trial.experiment in NEEDS_TENDON and not pulled_slowly(trial, _pulled(trial, finger), sizes.travel):
+    elif trial.experiment in NEEDS_TENDON and not pulled_slowly(trial, _pulled(trial, finger), sizes):
         message = f"tendon {trial.tendon} is pulled neither in holds of 0.2 s nor in ramps of a second"
         report.warning(_place(trial, "tendon_force"), f"{message}: nothing of the trial is judged; pull it slower")
 

@@ -152,6 +152,14 @@ def width(cutoff_hz: float) -> float:
     return np.sqrt(np.log(2.0)) / (2.0 * np.pi * cutoff_hz)
 
 
+def passed(cutoff_hz: float, step: float, order: int = 0) -> float:
+    """Standard deviation of a derivative of low-passed white noise of unit variance, a sample every `step` s.
+
+    With σ the filter's width, its square is step/(2π) ∫ ω^(2k) e^(−ω²σ²) dω = step Γ(k + ½)/(2π σ^(2k+1)).
+    """
+    return math.sqrt(step * math.gamma(order + 0.5) / (2.0 * math.pi * width(cutoff_hz) ** (2 * order + 1)))
+
+
 def outlier_mask(x: Float[np.ndarray, N * k], threshold: float = 8.0, longest: int = 5) -> Bool[np.ndarray, N * k]:
     """True where a sample is a spike: no motion that is seen before and after it leads there.
 

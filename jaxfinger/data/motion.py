@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxfinger.data.filtering import smooth
 from jaxfinger.data.session import Trial
+from jaxfinger.data.sizes import Sizes
 
 CUTOFF_HZ = 10.0  # faster than any commanded motion of the protocol, slower than most of the sensors' noise
 HOLD_CUTOFF_HZ = 5.0
@@ -15,7 +16,7 @@ QUICK, NYQUIST = 3.0, 0.4  # times a cut-off, or of the sampling rate, above whi
 SLOWEST = 6.0  # times its noise: a slower joint keeps the direction that it had
 BOUNDS = 1e-3, 0.1  # of the motion's speed: at least, beside a filter's tails, and at most, in a slow trial
 STILL = 0.1  # of the fastest motion of the trial
-SHORTEST_HOLD = 0.2  # s
+SHORTEST_HOLD = 0.2  # s, at the protocol's pace
 RAMP = 20  # averages of 1/20 s without a hold: the one in which a held tendon slips is a twentieth, and says little
 
 
@@ -77,12 +78,12 @@ def turned_on_time(
     return out
 
 
-def find_holds(trial: Trial, cutoff_hz: float = HOLD_CUTOFF_HZ) -> Int[np.ndarray, " N"]:
+def find_holds(trial: Trial, pace: float = 1.0) -> Int[np.ndarray, " N"]:
     """Index of the static hold of each sample, −1 between holds: the file's channel, or derived from stillness.
 
     Only stepped experiments hold: ID.3-static (the joint is still), ID.4 and VD.2 (the tension is): slower than a tenth
     of the fastest motion in the trial, for at least 0.2 s. The first and last 1/cutoff of a still stretch, blurred by
-    the filter, are left out.
+    the filter, are left out. `pace`: of the session (`data.sizes`), as so many times longer all of it is counted.
     """
     if trial.hold is not None:
         return trial.hold
@@ -90,7 +91,7 @@ def find_holds(trial: Trial, cutoff_hz: float = HOLD_CUTOFF_HZ) -> Int[np.ndarra
     x = _stepped_column(trial)
     if x is None or len(x) < 3:
         return hold
-    cutoff = fitting_cutoff(trial.time, cutoff_hz)
+    cutoff = fitting_cutoff(trial.time, HOLD_CUTOFF_HZ / pace)
     rate = np.abs(smooth(trial.time, x, cutoff)[1])
     still = rate < STILL * np.nanpercentile(rate, 99) if np.isfinite(rate).any() else np.zeros(len(x), bool)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
@@ -98,7 +99,7 @@ def find_holds(trial: Trial, cutoff_hz: float = HOLD_CUTOFF_HZ) -> Int[np.ndarra
     for first, stop in zip(edges[::2], edges[1::2], strict=True):
         begin = trial.time[first] + (1.0 / cutoff if first > 0 else 0.0)
         end = trial.time[stop - 1] - (1.0 / cutoff if stop < len(x) else 0.0)
-        if end - begin >= SHORTEST_HOLD:
+        if end - begin >= SHORTEST_HOLD * pace:
             hold[(trial.time >= begin) & (trial.time <= end)] = index
             index += 1
     return hold
@@ -141,16 +142,16 @@ def stretches_of(inside: Bool[np.ndarray, " M"]) -> list[tuple[int, int]]:
     return list(zip(edges[::2], edges[1::2], strict=True))
 
 
-def pulled_slowly(trial: Trial, pulled: Float[np.ndarray, " N"], travel: float) -> bool:
+def pulled_slowly(trial: Trial, pulled: Float[np.ndarray, " N"], sizes: Sizes) -> bool:
     """Whether a held joint's tendon is pulled in holds, or in ramps so slow that its friction can be told; of what is
-    not measured, or too short, nothing is said. `travel`: N, below which it has not moved.
+    not measured, or too short, nothing is said. `sizes`: of the session.
     """
     if len(pulled) < 3 or not np.isfinite(pulled).all():
         return True
-    hold, step = find_holds(trial), float(np.median(np.diff(trial.time)))
+    hold, step = find_holds(trial, sizes.pace), float(np.median(np.diff(trial.time)))
     if (hold >= 0).any():
         return True
-    size = max(1, round(1.0 / (RAMP * step)))
+    size = max(1, round(sizes.pace / (RAMP * step)))
     means = pulled[: len(pulled) // size * size].reshape(-1, size).mean(axis=1)[:, None]
-    least = max(1, round(1.0 / (size * step)))
-    return bool(slow_ramps(means, np.full(len(means), -1), least, travel).any())
+    least = max(1, round(sizes.pace / (size * step)))
+    return bool(slow_ramps(means, np.full(len(means), -1), least, sizes.travel).any())

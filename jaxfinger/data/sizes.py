@@ -1,16 +1,26 @@
 """Sizes of a session, so that no constant of one machine decides: a finger pulls with 10 N, a crane does not."""
 
 from dataclasses import dataclass
+from statistics import median_low
 
 import numpy as np
+from jaxtyping import Float
 
-from jaxfinger.data.session import Session
+from jaxfinger.data.session import Session, Trial
 
 SLACK = 0.02  # of the highest tension: taut is a fifth of it or more in protocols, and a tare is good to a hundredth
 NOISE = 6.0  # times its noise: what a tension sensor reads of a slack tendon is less, but once in a billion samples
 TRAVEL = 0.02  # of the highest tension: a tenth of a protocol's step, ten times the noise of a sensor of that range
 STRETCH = 0.04  # of the longest excursion at the highest tension: steel and fibre of an arm's length stretch by less
 LOOK = 1000  # samples of a trial that tell its sizes
+PASSES = 4000  # likewise how quick it is: a minute's trial still shows a motion of 15 ms
+# s in which a joint passes a tenth of its way in sweeps of the protocol (ID.3-dynamic of the sessions in datasets/):
+# what is reduced to a rate, cut off at a frequency or counted in seconds is meant for these. How fast tendons move a
+# finger says less: it sticks, and slips as fast as it does.
+SWEEP = 0.11
+# Of paces: what serves one serves motions twice as quick or as slow, of which a fit is the same within its errors
+# (tests/identify/test_units.py).
+LIKE = 4.0
 
 
 @dataclass(frozen=True)
@@ -20,6 +30,7 @@ class Sizes:
     tension: float  # N, the highest
     excursion: float  # m, the longest
     noise: float  # N, of a tension sensor
+    pace: float = 1.0  # times as long as the protocol's that its motions take: a power of `LIKE`
 
     @property
     def slack(self) -> float:
@@ -39,7 +50,7 @@ class Sizes:
 
 def sizes_of(session: Session) -> Sizes:
     """The sizes of all trials of a session, so that those of one trial do not depend on which others are read."""
-    tensions, excursions, noises = [0.0], [0.0], []
+    tensions, excursions, noises, paces = [0.0], [0.0], [], []
     for trial in session:
         every = max(1, len(trial.time) // LOOK)
         if trial.tendon_force is not None and len(trial.time) > 3:
@@ -52,4 +63,26 @@ def sizes_of(session: Session) -> Sizes:
         if trial.tendon_excursion is not None and len(trial.time) > 3:
             l = np.nan_to_num(trial.tendon_excursion[::every])
             excursions.append(float(np.ptp(np.percentile(l, (1, 99), axis=0), axis=0).max(initial=0.0)))
-    return Sizes(max(tensions), max(excursions), float(np.median(noises)) if noises else 0.0)
+        if trial.experiment == "ID.3-dynamic" and (quick := _quick(trial)) > 0.0:
+            paces.append(np.log(quick / SWEEP) / np.log(LIKE))
+    pace = LIKE ** round(median_low(paces)) if paces else 1.0
+    return Sizes(max(tensions), max(excursions), float(np.median(noises)) if noises else 0.0, pace)
+
+
+def _quick(trial: Trial) -> float:
+    """s in which a joint passes a tenth of its way where it is quick, of the joint that takes longest: at rest the way
+    is noise, and takes no time. 0 of a trial in which nothing moves.
+    """
+    every = max(1, len(trial.time) // PASSES)
+    columns = [x[np.isfinite(x)] for x in trial.q[::every].T]
+    step = float(np.median(np.diff(trial.time))) * every if len(trial.time) > 1 else 0.0
+    return step * max((_lag(x) for x in columns if x.size and np.ptp(x) > 0.0), default=0)
+
+
+def _lag(x: Float[np.ndarray, " N"]) -> float:
+    """The fewest samples over which a hundredth of the changes are a tenth of the way."""
+    way, lag, far = 0.1 * np.ptp(np.percentile(x, (1, 99))), 1, [0.0]
+    while far[-1] < way and lag < len(x):
+        far.append(float(np.percentile(np.abs(x[lag:] - x[:-lag]), 99)))
+        lag *= 2
+    return float(np.interp(way, far[-2:], (lag / 4.0, lag / 2.0)))

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import minimum_filter1d
 
-from jaxfinger.data import directions, low_pass, smooth, turned_on_time, width, without_spikes
+from jaxfinger.data import directions, low_pass, passed, smooth, turned_on_time, width, without_spikes
 from jaxfinger.data.motion import noise_of, quicker, still
 from jaxfinger.experiments.recording import Joints, Recording, Row, joints, row
 from jaxfinger.experiments.shrink import shrink
@@ -26,7 +26,7 @@ BREAKAWAY = 4.5  # widths kept clear after a joint that no motor moves has broke
 # Times the median loss: 1.5 standard deviations of the encoder, the way over which friction turns. Longer ways serve
 # contacts that give, shorter ones those that do not (benchmarks/reversals.py).
 ENCODER = 2.2
-CALM = 0.1  # s: over which q̈ is averaged where it does not rise above its noise
+CALM = 0.1  # s, at the protocol's pace: over which q̈ is averaged where it does not rise above its noise
 
 
 def reduce(r: Recording) -> Row:
@@ -43,7 +43,7 @@ def reduce(r: Recording) -> Row:
     if r.reduced or r.spec.slack:
         # Noise of q̈ would tell a fit of less inertia (errors in variables), and a prediction that stands beside a
         # measured torque of one that is not there: where q̈ does not rise above it, its mean takes its place.
-        qdd = shrink(qdd, round(CALM / r.step))
+        qdd = shrink(qdd, round(CALM * r.spec.pace / r.step), 1.4826 * j.noise * passed(j.cutoff, r.step, 2))
     if r.reduced:
         # q̈ is low-passed, so all else is too.
         joint, tendon, tension = (low_pass(r.trial.time, a, j.cutoff) for a in (joint, tendon, tension))

@@ -26,7 +26,7 @@ FEW = 3  # holds from which on their spread tells whether a fixture yields
 def reduce(r: Recording) -> Row:
     """Holds and ramps count from slack on; the excursion of a tendon counts wherever it is taut."""
     j = joints(r, sharp=not r.reduced)
-    hold = r.whole(find_holds(r.trial))
+    hold = r.whole(find_holds(r.trial, r.spec.pace))
     tension = measured = r.tension()
     if not r.reduced:
         # As smooth as the blocks of a fit: what slips at a noise peak would stay there until the next step.

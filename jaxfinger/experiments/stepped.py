@@ -12,13 +12,15 @@ from jaxfinger.experiments.driven import sliding
 from jaxfinger.experiments.recording import Recording, Row, joints, row, stretches
 
 NOTHING = "there is no hold whose direction of approach is known, and no motion in which the joint slides"
-CLEAR = 0.01  # s kept clear on either side of where a joint may stick: no measured channel is filtered, so none spreads
+# s, at the protocol's pace, kept clear on either side of where a joint may stick: no measured channel is filtered, so
+# none spreads.
+CLEAR = 0.01
 
 
 def reduce(r: Recording) -> Row:
     """Holds that were approached count, and motion in which the joint slides."""
     j = joints(r, sharp=True)
-    hold = find_holds(r.trial)
+    hold = find_holds(r.trial, r.spec.pace)
     slow = smooth(r.trial.time, r.trial.q, r.spec.cutoff_at(r.step))[1]
     if r.trial.joint_direction is not None:
         joint = r.trial.joint_direction.astype(float)
@@ -28,7 +30,7 @@ def reduce(r: Recording) -> Row:
             joint[samples] = joint[samples[len(samples) // 2]]
     moves = (hold < 0)[:, None]  # at a hold nothing does
     qd, qdd = j.qd * moves, j.qdd * moves
-    slides = sliding(r, qd, slow, joint, None, CLEAR)
+    slides = sliding(r, qd, slow, joint, None, CLEAR * r.spec.pace)
     at = r.whole(hold)
     known = r.mean(slides.astype(float)) > 1.0 - 1e-9
     approached = np.abs(r.mean(joint)) > 1.0 - 1e-9

@@ -1,6 +1,8 @@
 """What each experiment of the format is, as data: the only differences between them that a prediction needs."""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 from typing import Literal
 
 Kind = Literal["path", "driven", "stepped", "held"]
@@ -26,6 +28,11 @@ class Experiment:
     cutoff: float  # Hz
     sharp: float = 4.0  # times the cut-off beside a measurement that is not filtered, where noise of q̈ biases nothing
     slack: bool = False  # the tendons are slack by protocol
+    pace: float = 1.0  # times as long as the protocol's that the motions take, for which rate and cut-off are
+
+    def at(self, pace: float) -> Experiment:
+        """The experiment of a session of another pace (`data.sizes`)."""
+        return replace(self, rate=self.rate / pace, cutoff=self.cutoff / pace, pace=pace)
 
     @property
     def held(self) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxfinger.compilation import quick_jit
-from jaxfinger.data import Session, Trial, low_pass, smooth, width
+from jaxfinger.data import Session, Trial, low_pass, passed, smooth
 from jaxfinger.experiments import Stack, roomy
 from jaxfinger.identify.predictions import STEP
 from jaxfinger.model import Model, simulate
@@ -115,10 +115,8 @@ def _measured(trial: Trial, stack: Stack, b: int, x) -> _Measured:
     def on(values):
         return np.stack([np.interp(even, time - time[0], column) for column in values.T])
 
-    encoder, sigma = np.std(np.asarray(trial.q) - smooth(time, trial.q, cutoff)[0], axis=0), width(cutoff)
-    # White noise through a Gaussian of width w: σ² δ/(2 √π w) in the value, σ² δ/(4 √π w³) in its derivative.
-    value = encoder * np.sqrt(step / (2.0 * np.sqrt(np.pi) * sigma))
-    rate = encoder * np.sqrt(step / (4.0 * np.sqrt(np.pi) * sigma**3))
+    encoder = np.std(np.asarray(trial.q) - smooth(time, trial.q, cutoff)[0], axis=0)
+    value, rate = (encoder * passed(cutoff, step, k) for k in (0, 1))
     rest = tension - low_pass(time, tension, stack.experiment.cutoff_at(step))
     most = 4.0 * 1.4826 * np.median(np.abs(rest), axis=0)
     start = float(np.asarray(x.session_time - x.time)[b, 0])

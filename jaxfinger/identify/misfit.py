@@ -13,7 +13,7 @@ move with another record of the like motions. It takes Laplace's place where it 
 import numpy as np
 from jaxtyping import Float, Int
 
-STRETCH = 1.0  # s: about one movement
+STRETCH = 1.0  # s, at the protocol's pace: about one movement
 SURE = 4.0  # standard deviations of V by which it must exceed Laplace's
 
 

@@ -67,7 +67,7 @@ def _pulls(solution: Solution, sources: dict[str, Source], size: int, limit: flo
     out = []
     for name, lin in solution.linearised.items():
         B, wide, k = lin.jacobian.shape
-        time = np.asarray(sources[name].batch.x.time)
+        time = np.asarray(sources[name].batch.x.time) / sources[name].pace
         time = np.broadcast_to(time[:, None], (B, wide // time.shape[1], time.shape[1])).reshape(B, wide)
         counts = np.flatnonzero(lin.white)
         stretch = stretches(np.repeat(np.arange(B), wide)[counts], time.reshape(-1)[counts])

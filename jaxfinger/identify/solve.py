@@ -44,6 +44,7 @@ class Source(NamedTuple):
     effects: bool = True  # whether the model's effects show in it, if it has any
     affine: Int[np.ndarray, " a"] = np.zeros(0, int)  # those in which its residuals are affine together
     weights: Float[np.ndarray, " B"] | None = None  # of its trials, 1 by default
+    pace: float = 1.0  # times as long as the protocol's that its motions take
 
     def seen(self, model: Model) -> Model:
         """The model as the experiment shows it: what does not show is not compiled."""

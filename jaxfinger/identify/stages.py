@@ -347,7 +347,7 @@ def sources_of(
         linear = set.intersection(*(_linear(stacks[e].experiment, c) for c in channels))
         affine = np.array([i for i in positions if parameters[i].group in linear], dtype=int)
         filters = {c: jax.device_put(noise[e, c].coefficients) for c in channels}
-        out[e] = Source(stacks[e].batch, filters, positions, affine=affine)
+        out[e] = Source(stacks[e].batch, filters, positions, affine=affine, pace=stacks[e].experiment.pace)
     return out
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import FingerDescription, Session, Trial, import_file, read_session
+from jaxfinger.data.sizes import LIKE
 from jaxfinger.identify import Recipe, identify, read_recipe
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.identify.recipe import FitRecipe, ModelRecipe
@@ -84,9 +85,10 @@ def beside(fit, other, scale) -> tuple[np.ndarray, np.ndarray]:
     return shift[seen] / std[seen], scaled[seen] / std[seen]
 
 
-def test_in_other_units_of_mass_and_length_it_is_the_same(machine):
+def test_in_other_units_it_is_the_same_scaled(machine):
+    """Of time: what is counted in seconds and Hz follows the motions' pace, in steps."""
     session, fit = machine
-    scale = Scale(mass=1e-3, length=10.0)
+    scale = Scale(mass=1e-3, length=10.0, time=LIKE)
     other = identify(scale(session), fit.recipe)
     shift, ratio = beside(fit, other, scale)
     np.testing.assert_allclose(shift, 0.0, atol=1e-6)
@@ -94,11 +96,14 @@ def test_in_other_units_of_mass_and_length_it_is_the_same(machine):
     assert [s.warnings for s in other.stages] == [s.warnings for s in fit.stages]
 
 
-def test_a_machine_half_as_quick_has_the_same_fit_within_its_errors(machine):
-    """Not to the digit: channels are reduced to a rate in Hz."""
+@pytest.mark.parametrize(
+    "time", [0.1, pytest.param(1.25, marks=pytest.mark.long), 2.0, pytest.param(10.0, marks=pytest.mark.long)]
+)
+def test_a_quicker_or_slower_machine_has_the_same_fit_within_its_errors(machine, time):
+    """Between two steps of the pace, where another share of the noise and of what a model misses is filtered out."""
     session, fit = machine
-    scale = Scale(time=2.0)
+    scale = Scale(time=time)
     shift, ratio = beside(fit, identify(scale(session), fit.recipe), scale)
     assert np.abs(shift).max() < 1.96
-    assert ratio.min() > 0.75
-    assert ratio.max() < 1.25
+    assert ratio.min() > 0.4
+    assert ratio.max() < 1.7
