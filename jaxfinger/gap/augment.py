@@ -18,8 +18,8 @@ from jaxfinger.gap.problem import Problem, assemble, moved
 from jaxfinger.gap.result import Value
 from jaxfinger.gap.signatures import Signatures
 from jaxfinger.identify import Fit
+from jaxfinger.identify.cluster_robust import growth, pulls
 from jaxfinger.identify.fit import StageReport
-from jaxfinger.identify.misfit import growth, pulls
 from jaxfinger.identify.parameters import describe, ravel, units_at
 from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.solve import Solution, Source, linearise_each, missed_each, solve

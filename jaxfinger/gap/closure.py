@@ -17,7 +17,7 @@ from jaxfinger.gap.result import Closure
 from jaxfinger.identify.parameters import Free, ravel
 from jaxfinger.identify.predictions import simulate_trials
 from jaxfinger.identify.prior import Prior
-from jaxfinger.identify.solve import bounded
+from jaxfinger.identify.solve import bounded_least_squares
 from jaxfinger.model import Model
 
 RESOLVABLE = 1.1  # mean square before over that of the noise, from which on a gap can be said to close
@@ -116,7 +116,7 @@ def _refit(model: Model, free, J, r, training, prior: Prior, scales: Scales) -> 
     J, kept, scale = equilibrated(J, np.pad(root, ((0, 0), (0, len(free) - len(mean)))))
     room = [(end - theta) / np.where(scale > 0.0, scale, 1.0) for end in limits(model, free, scales)]
     b = np.concatenate([-r[training], pull, np.zeros(len(free))])
-    delta = bounded(np.vstack([J[training], kept]), b, *room) * scale
+    delta = bounded_least_squares(np.vstack([J[training], kept]), b, *room) * scale
     return Free.at(model, free).set(model, jax.device_put(theta + delta))
 
 

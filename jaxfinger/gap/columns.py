@@ -1,4 +1,4 @@
-"""White rows in the basis of the stand-in's features, column by column: what every evidence of the search is made of.
+"""White rows in the basis of the smooth laws' features, column by column: what every evidence of the search is made of.
 
 A column c is one joint, tendon or axis of one channel of one experiment. U_c (rows, K_c) spans what a smooth law could
 leave there; a residual and a signature enter every formula through their coefficients on U_c and through products of
@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signatures import whitened
-from jaxfinger.gap.standin import features
+from jaxfinger.gap.smooth_laws import features
 
 FEWEST = 50  # rows of a column, below which nothing smooth is told from noise
 DISTINCT = 0.1  # of the largest singular value: nearly collinear features differ in single samples
@@ -98,7 +98,7 @@ def _columns(problem: Problem):
 
 
 def white_features(problem: Problem, e: str, c: str, k: int, pick: Int[np.ndarray, " n"]) -> dict[str, np.ndarray]:
-    """The stand-in's features of a column in its white rows `pick`, (features, n) by variable."""
+    """Features of a column in its white rows `pick`, (features, n) by variable."""
     out, shape = {}, problem.stacks[e].batch.y[c].shape
     for variable, members in features(problem, e, c, k).items():
         if members:

@@ -45,7 +45,7 @@ from jaxfinger.gap.result import (
 from jaxfinger.gap.screening import Screening
 from jaxfinger.gap.sets import Offered, Search, Table, table_of
 from jaxfinger.gap.signatures import catalogue_for, changes_of, variants
-from jaxfinger.gap.standin import Explained, explained
+from jaxfinger.gap.smooth_laws import Explained, explained
 from jaxfinger.gap.where import where
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.parameters import describe, ravel, units_at

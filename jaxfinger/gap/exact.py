@@ -17,7 +17,7 @@ from jaxfinger.gap.columns import ByColumn, Columns
 from jaxfinger.gap.formula import Judged, Linear, Parameters, Weights, unexplained
 from jaxfinger.gap.problem import Problem, moved
 from jaxfinger.gap.signatures import Signatures, Variant
-from jaxfinger.identify.solve import bounded
+from jaxfinger.identify.solve import bounded_least_squares
 
 STEPS = 6  # of shapes and amplitudes at one nominal model
 STEP = 0.05  # of a difference, in units of a coordinate
@@ -95,7 +95,7 @@ class Bench:
         empty = np.empty((0, problem.r.size))
         nominal, none = ByColumn(columns, problem.J.T), ByColumn(columns, empty)
         residual = ByColumn(columns, problem.r[None])
-        judged = Linear(columns, (residual, nominal), prior_of(problem, 0), none, parameters).null
+        judged = Linear(columns, (residual, nominal), prior_products(problem, 0), none, parameters).null
         assert judged is not None
         null = State(problem, columns, nominal, (), (), empty, empty, judged)
         unknown = unexplained(columns.counts, judged.evidence, parameters)
@@ -111,7 +111,7 @@ class Bench:
         linear = Linear(
             self.columns,
             (ByColumn(self.columns, r[None]), nominal),
-            prior_of(problem, 0),
+            prior_products(problem, 0),
             ByColumn(self.columns, slopes),
             self.parameters,
             self.null.judged,
@@ -119,7 +119,7 @@ class Bench:
         return linear.judge(np.arange(len(slopes)), *room, middle=-sizes)
 
 
-def prior_of(problem: Problem, k: int) -> Float[np.ndarray, "d d"]:
+def prior_products(problem: Problem, k: int) -> Float[np.ndarray, "d d"]:
     """Products of the prior's rows with themselves: for a residual, the nominal parameters, and k slopes of unit
     precision, which are refitted with every set.
     """
@@ -238,7 +238,7 @@ def at_one_model(bench: Bench, problem: Problem, effects: list[CatalogueEffect],
     for _ in range(STEPS):
         rt, St = project.residual(r), project(slopes)
         A, b = np.vstack([St.T, np.eye(len(coordinates))]), np.concatenate([-rt, sizes])
-        delta = bounded(A, b, *_room(effects, coordinates))
+        delta = bounded_least_squares(A, b, *_room(effects, coordinates))
         reach = np.clip(1.0 / np.maximum(np.linalg.norm(St, axis=1), 1e-300), STEP / 20.0, STEP)
         for _ in range(HALVINGS):
             trial = _moved(effects, coordinates, delta)

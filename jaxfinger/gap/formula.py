@@ -2,7 +2,7 @@
 
     r̃ ~ N(0, σ²(I + Σ_i s_i² (z_i z_iᵀ + ρ² K_i) + s_u² K_u))
 
-column by column, in the basis of the stand-in's features (`columns`). With e_c the energy of the residual on the K_c
+column by column, in the basis of the smooth laws' features (`columns`). With e_c the energy of the residual on the K_c
 features of column c, and o_c that outside of them over m_c rows, both in squared noise,
 
     log L = −½ Σ_c [ K_c log v_c + e_c / v_c + ν log(1 + max(o_c − m_c, 0) / ν) ],

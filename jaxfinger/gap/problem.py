@@ -18,11 +18,11 @@ from jaxfinger.data import Predictions, Session
 from jaxfinger.effects import Scales
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Stack, prepare
-from jaxfinger.gap.groups import Group, grouped
+from jaxfinger.gap.merged_trials import MergedTrials, merged_trials
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
+from jaxfinger.identify.cluster_robust import stretches
 from jaxfinger.identify.linearise import Linearised
-from jaxfinger.identify.misfit import stretches
 from jaxfinger.identify.noise import Noise, estimate, history
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.prior import Prior, prior_of
@@ -70,7 +70,7 @@ class Problem:
     nominal: Model
     free: np.ndarray  # positions of the nominal parameters in the flat vector
     rows: dict[str, Rows]
-    groups: list[Group]  # the trials of the rows, merged
+    groups: list[MergedTrials]  # the trials of the rows, merged
     r: Float[np.ndarray, " N"]  # whitened residuals of the nominal model
     J: Float[np.ndarray, "N p"]  # their Jacobian, whitened
     root: Float[np.ndarray, "k p"]  # prior rows on the nominal parameters
@@ -124,7 +124,7 @@ class Problem:
         `predicted`, (columns, B, T), and the terms of (1) behind a torque or a force.
         """
 
-        def behind(group: Group) -> list[Terms | None]:
+        def behind(group: MergedTrials) -> list[Terms | None]:
             return [None if group.channel == "tendon_excursion" else _plain(self.nominal, x) for x in group.x]
 
         return {(g.channel, g.held): (g.merged(self.predicted), behind(g)) for g in self.groups}
@@ -285,8 +285,8 @@ def _at(nominal: Model, linearised: dict[str, Linearised], sources, rows, free, 
     }
 
 
-def _groups(stacks: dict[str, Stack], rows: dict[str, Rows], nominal: Model) -> list[Group]:
-    return grouped({e: stack for e, stack in stacks.items() if rows[e].size}, nominal)
+def _groups(stacks: dict[str, Stack], rows: dict[str, Rows], nominal: Model) -> list[MergedTrials]:
+    return merged_trials({e: stack for e, stack in stacks.items() if rows[e].size}, nominal)
 
 
 def layouts(stacks: dict[str, Stack], sources: dict[str, Source]) -> dict[str, Rows]:

@@ -14,7 +14,7 @@ from jaxfinger.data.schema import channel_units
 from jaxfinger.gap.exact import Whitened
 from jaxfinger.gap.problem import Problem, site
 from jaxfinger.gap.signatures import whitened
-from jaxfinger.gap.standin import Explained, concerned, since_reversal
+from jaxfinger.gap.smooth_laws import Explained, concerned, since_reversal
 
 TERMS = 3
 WORTH = 0.1  # share of what a smooth law could explain, that a further term must explain

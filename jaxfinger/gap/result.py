@@ -83,7 +83,7 @@ class Unexplained:
 
     share: float  # mean over channels with a gap
     share_ci95: tuple[float, float]
-    depends_on: tuple[str, ...]  # variables of the stand-in that carry most of it: `tension`, `q`, …
+    depends_on: tuple[str, ...]  # variables of the smooth law that carry most of it: `tension`, `q`, …
     where: Channel | None  # the column with most of it
     proposal: Proposal | None  # a closed form, unproven
 

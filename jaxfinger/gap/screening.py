@@ -31,7 +31,7 @@ Offer = tuple[list[Variant], Float[np.ndarray, "variants amplitudes N"]]
 
 
 @dataclass(frozen=True)
-class Table:
+class FixedShapes:
     """Variants whose shapes are fixed, with their signatures."""
 
     items: list[Variant]
@@ -99,7 +99,7 @@ class Scan:
 class Screening:
     """Signatures of every candidate."""
 
-    parts: dict[tuple, Table | Scan]
+    parts: dict[tuple, FixedShapes | Scan]
 
     @classmethod
     def of(cls, problem: Problem, items: list[Variant], progress: Progress = lambda message: None) -> "Screening":
@@ -108,11 +108,11 @@ class Screening:
         for v in items:
             groups.setdefault(_part(v), []).append(v)
 
-        def read(group: list[Variant]) -> Table | Scan:
+        def read(group: list[Variant]) -> FixedShapes | Scan:
             effect = group[0].effect
             if effect.periods() and any(e in problem.stacks for e in shows(effect, problem.nominal.finger)):
                 return Scan.of(signatures, group)
-            return Table(group, signatures.columns(group))
+            return FixedShapes(group, signatures.columns(group))
 
         parts = {}
         for key, part in zip(groups, side_by_side(read, groups.values()), strict=True):

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.gap.columns import ByColumn
 from jaxfinger.gap.costs import Costs, Key
-from jaxfinger.gap.exact import Bench, State, Whitened, fitted, prior_of
+from jaxfinger.gap.exact import Bench, State, Whitened, fitted, prior_products
 from jaxfinger.gap.formula import Evidence, Judged, Linear, Weights, unexplained
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.screening import Screening
@@ -214,7 +214,7 @@ class Search:
         return Linear(
             columns,
             (ByColumn(columns, r[None]), state.nominal, ByColumn(columns, slopes)),
-            prior_of(state.problem, len(slopes)),
+            prior_products(state.problem, len(slopes)),
             self.table.signatures,
             self.bench.parameters,
             self.bench.null.judged,

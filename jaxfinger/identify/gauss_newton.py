@@ -195,7 +195,7 @@ def compressed(rows: Float[Array, "N p+1"]) -> Compressed:
     return Compressed(T[:p, :p], T[:p, p], T[p, p] ** 2)
 
 
-def visible(A: Float[Array | np.ndarray, "k p"]) -> tuple:
+def scaled_directions(A: Float[Array | np.ndarray, "k p"]) -> tuple:
     """Of the column-scaled A = U diag(s) Vᵀ / scale: the step of one standard deviation along each singular vector (a
     column, zero where it is not seen), U, whether it is seen, V, and the scale. k ≥ p; NumPy's of NumPy's.
     """
@@ -219,7 +219,7 @@ def bounded_step(
 
     def towards(carry):
         x, held, _, count = carry
-        basis, U, *_ = visible(here.R * ~held)
+        basis, U, *_ = scaled_directions(here.R * ~held)
         target = jnp.where(held, x, -basis @ (U.T @ (here.d + here.R @ jnp.where(held, x, 0.0))))
         way = target - x
         room = jnp.where(way > 0.0, high - x, low - x)

@@ -19,15 +19,13 @@ from jaxfinger.model import Model, Motion, simulate
 
 STEP = 5e-4  # s: longest step of the forward simulation
 
-Predictions = dict[str, dict[str, np.ndarray]]
-
 
 def predict_session(
     fit: Fit | Model,
     session: Session,
     names: list[str] | None = None,
     progress: Callable[[str], None] = lambda message: None,
-) -> Predictions:
+) -> dict[str, dict[str, np.ndarray]]:
     """Predicted channels of the named trials (default all): `{trial: {channel: (N, columns)}}`, SI units.
 
     Channels are those of the format's table. A joint whose torque was not measured stays NaN, and so does the excursion
@@ -42,7 +40,7 @@ def predict_session(
         UserError: the model's joints or tendons are not those of the session.
     """
     model = model_for(fit, session)
-    out: Predictions = {}
+    out: dict[str, dict[str, np.ndarray]] = {}
     for experiment, stack in prepare(session, names, reduced=False).items():
         progress(f"predicting {len(stack.trials)} trials of {experiment}")
         driven = experiment == "VD.3" and session.finger.n > 0

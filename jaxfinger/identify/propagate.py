@@ -9,7 +9,7 @@ whose covariance is Σ_OO,
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxfinger.identify.misfit import growth, pulls, stretches
+from jaxfinger.identify.cluster_robust import growth, pulls, stretches
 from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.solve import Solution, Source
 

@@ -28,7 +28,7 @@ from jaxfinger.data import Session
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch, Stack, prepare
 from jaxfinger.identify.fit import Fit
-from jaxfinger.identify.gauss_newton import visible
+from jaxfinger.identify.gauss_newton import scaled_directions
 from jaxfinger.identify.linearise import Filters, huber, white_rows
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.predictions import model_for
@@ -151,7 +151,7 @@ def _seen(hessian: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p k"]:
     """The combinations of the parameters that a stage sees, a column each."""
     values, vectors = np.linalg.eigh(_scaled(hessian))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    basis, _, seen, *_ = visible(root.T * np.sqrt(np.abs(np.diag(hessian))))
+    basis, _, seen, *_ = scaled_directions(root.T * np.sqrt(np.abs(np.diag(hessian))))
     return basis[:, seen]
 
 
@@ -208,7 +208,7 @@ def _moves(change: Batch) -> bool:
     return any(np.any(np.asarray(a)) for a in jax.tree.leaves(change))
 
 
-class Score(eqx.Module):
+class CostGradient(eqx.Module):
     """One experiment's part of the gradient of the cost, by the parameters that it depends on."""
 
     by_trial: Float[Array, "B k"]
@@ -217,7 +217,7 @@ class Score(eqx.Module):
     by_sensor: Float[Array, "K k"]  # its derivative by every gain
 
 
-def _score_of(fit: Fit, source: Source, changes: list[Batch]) -> Score:
+def _score_of(fit: Fit, source: Source, changes: list[Batch]) -> CostGradient:
     free = Free.at(fit.model, source.positions)
     limit = jnp.asarray(fit.recipe.fit.huber)
     B = source.batch.x.time.shape[0]
@@ -227,7 +227,7 @@ def _score_of(fit: Fit, source: Source, changes: list[Batch]) -> Score:
 
 
 @quick_jit
-def _score(model: Model, free: Free, batch: Batch, filters: Filters, limit, changes: Batch, B: int) -> Score:
+def _score(model: Model, free: Free, batch: Batch, filters: Filters, limit, changes: Batch, B: int) -> CostGradient:
     theta = free.get(model)
 
     def rows(theta, data: Batch):
@@ -255,4 +255,4 @@ def _score(model: Model, free: Free, batch: Batch, filters: Filters, limit, chan
     data = batch.x.tension, batch.y
     by_sensor = jax.lax.map(lambda c: jax.jvp(moved, data, (c.x.tension, c.y))[1], changes)
     J = jax.lax.map(lambda v: jax.jvp(counting, (theta,), (v,))[1], jnp.eye(theta.size))
-    return Score(by_trial, jnp.einsum("kbr,lbr->bkl", J, J), hessian, by_sensor)
+    return CostGradient(by_trial, jnp.einsum("kbr,lbr->bkl", J, J), hessian, by_sensor)

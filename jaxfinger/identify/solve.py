@@ -20,8 +20,15 @@ from jaxtyping import Array, Float, Int
 from jaxfinger.compilation import side_by_side
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch
-from jaxfinger.identify.gauss_newton import Compressed, Outcome, State, VisibleGaussNewton, begin, bounded_step
-from jaxfinger.identify.gauss_newton import visible as scaled_directions
+from jaxfinger.identify.gauss_newton import (
+    Compressed,
+    Outcome,
+    State,
+    VisibleGaussNewton,
+    begin,
+    bounded_step,
+    scaled_directions,
+)
 from jaxfinger.identify.linearise import Filters, Linearised, Tangent, missed, tangent, triangular, whitened
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.prior import Prior
@@ -256,7 +263,9 @@ def visible(A: Float[np.ndarray, "k p"]) -> tuple[np.ndarray, np.ndarray, np.nda
     return basis[:, seen], V[:, ~seen].T, scale
 
 
-def bounded(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray | float = np.inf) -> np.ndarray:
+def bounded_least_squares(
+    A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray | float = np.inf
+) -> np.ndarray:
     """argmin ‖A δ + b‖ over low ≤ δ ≤ high, where δ = 0 is allowed: a step of the solver, by itself."""
     p = A.shape[1]
     room = -(-max(p, 1) // PAD) * PAD

@@ -14,7 +14,7 @@ from jaxfinger.effects import CatalogueEffect, amplitude
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import predict, prepare
 from jaxfinger.identify.parameters import describe, ravel
-from jaxfinger.identify.solve import ROUGH, bounded, solve
+from jaxfinger.identify.solve import ROUGH, bounded_least_squares, solve
 from jaxfinger.identify.stages import first_noise, sources_of
 
 EXPERIMENT, CHANNEL = "ID.3-static", "joint_torque"
@@ -139,7 +139,7 @@ def test_a_bounded_step_is_the_lowest_within_its_bounds(seed):
     A, b = rng.standard_normal((5, 3)) * [1.0, 1e-3, 1e3], rng.standard_normal(5)
     low, high = -rng.uniform(0.0, 1.0, 3), rng.uniform(0.0, 1.0, 3)
     low[0], high[1] = 0.0, 0.0  # at a bound
-    x = bounded(A, b, low, high)
+    x = bounded_least_squares(A, b, low, high)
     assert np.all((low - 1e-9 <= x) & (x <= high + 1e-9))
     others = rng.uniform(low, high, (200, 3))
     assert np.linalg.norm(A @ x + b) <= np.linalg.norm(others @ A.T + b, axis=1).min() + 1e-9

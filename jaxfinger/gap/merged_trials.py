@@ -14,7 +14,7 @@ from jaxfinger.model import Model, Motion, contact_map
 
 
 @dataclass(frozen=True)
-class Group:
+class MergedTrials:
     """One channel of several experiments, whose trials follow one another, padded to a common length, in blocks."""
 
     channel: str
@@ -32,23 +32,26 @@ class Group:
         return sorted({t // TRIALS for e in experiments for t in self.trials[e]})
 
 
-def grouped(stacks: dict[str, Stack], nominal: Model) -> list[Group]:
+def merged_trials(stacks: dict[str, Stack], nominal: Model) -> list[MergedTrials]:
     """Every channel of the stacks, held joints apart from moving ones."""
     kinds: dict[tuple, list[str]] = {}
     for e, stack in stacks.items():
         for c in stack.experiment.channels:
             held = stack.experiment.held and c != "tendon_excursion"
             kinds.setdefault((c, held), []).append(e)
-    return [_group(c, held, {e: stacks[e] for e in experiments}, nominal) for (c, held), experiments in kinds.items()]
+    return [
+        _merged_trials_of(c, held, {e: stacks[e] for e in experiments}, nominal)
+        for (c, held), experiments in kinds.items()
+    ]
 
 
-def _group(channel: str, held: bool, stacks: dict[str, Stack], nominal: Model) -> Group:
+def _merged_trials_of(channel: str, held: bool, stacks: dict[str, Stack], nominal: Model) -> MergedTrials:
     motions = [replace(s.batch.x, held=held) for s in stacks.values()]
     x = _merged(motions)
     ends = np.cumsum([0, *(m.time.shape[0] for m in motions)]).tolist()
     trials = {e: range(*ends) for e, ends in zip(stacks, pairwise(ends), strict=True)}
     contact = [_contact(nominal, block) if channel == "fingertip_force" else None for block in x]
-    return Group(channel, held, trials, x, contact)
+    return MergedTrials(channel, held, trials, x, contact)
 
 
 _contact = eqx.filter_jit(contact_map)

@@ -1,4 +1,4 @@
-"""The flexible stand-in: how much of a residual any smooth law, with or without memory, could explain.
+"""Any smooth law: how much of a residual one, with or without memory, could explain.
 
 Features of each channel's column: polynomials of the angles, tension, speed, directions, distance since reversal and
 time in the trial. It is the yardstick for «none of these», never the answer.
@@ -18,7 +18,7 @@ SMOOTHED = 15  # samples over which an angle or a tension is averaged before its
 
 @dataclass(frozen=True)
 class Explained:
-    """What the stand-in explains of one channel's column in one experiment."""
+    """What smooth laws explain of one channel's column in one experiment."""
 
     experiment: str
     channel: str

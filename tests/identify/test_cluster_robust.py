@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxfinger.identify.misfit import STRETCH, growth, pulls, stretches
+from jaxfinger.identify.cluster_robust import STRETCH, growth, pulls, stretches
 
 RATE, MOVEMENTS = 50.0, 60  # Hz; of one stretch each
 
