@@ -26,7 +26,7 @@ from jaxfinger.data import read_session
 from jaxfinger.gap.columns import Counts
 from jaxfinger.gap.costs import Costs, Key
 from jaxfinger.gap.diagnose import searched
-from jaxfinger.gap.formula import Evidence, Parameters, log_likelihood, unexplained
+from jaxfinger.gap.formula import Evidence, Parameters, log_likelihood, unexplained, unlisted
 from jaxfinger.gap.problem import build
 from jaxfinger.gap.signatures import catalogue_for
 from jaxfinger.identify import Recipe
@@ -76,7 +76,7 @@ class Record:
         for keys, v in w.items():
             for key in keys:
                 probability[key] += v
-        probability[UNLISTED] = costs.unlisted(unexplained(self.counts, self.evidence[best], p))
+        probability[UNLISTED] = unlisted(self.counts, self.evidence[best], p)
         P = np.clip(np.array(list(probability.values())), CLIP, 1.0 - CLIP)
         true = np.array([key in self.at_work for key in probability])
         return float(np.sum(np.log(np.where(true, P, 1.0 - P))))

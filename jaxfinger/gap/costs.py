@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import expit, logsumexp
+from scipy.special import logsumexp
 
 from jaxfinger.effects import NOMINAL_TERMS, Site
 from jaxfinger.gap.formula import Parameters
@@ -59,8 +59,3 @@ class Costs:
         trust = self.parameters.trust
         log_w = [trust * (s - self.evidence_needed(keys)) - self.odds(keys) for keys, s in scores.items()]
         return dict(zip(scores, np.exp(np.array(log_w) - logsumexp(log_w)).tolist(), strict=True))
-
-    def unlisted(self, left: Float[np.ndarray, " C"]) -> float:
-        """Probability that something is at work which the catalogue lacks, from the log evidence that is left."""
-        p, taken = self.parameters, np.maximum(self.unknown - left, 0.0)
-        return float(expit(p.sharp * (np.maximum(left - p.left * taken, 0.0).sum() - p.open)))

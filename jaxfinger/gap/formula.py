@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.special import expit
 
 from jaxfinger.gap.columns import ByColumn, Columns, Counts
 
@@ -37,9 +38,9 @@ class Parameters:
     prior: float = 6.0  # log evidence that a cause must bring,
     alike: float = 0.07  # and as a share of what is unexplained where it acts: what an imitator gains of it
     trust: float = 1.0  # β: of all log evidence, since neighbouring features and columns are no independent looks
-    open: float = 12.0  # log evidence left, from which on something unlisted is as likely as not,
-    left: float = 0.12  # and in a column as a share of what the causes take away there: forms leave some of it
-    sharp: float = 0.4  # and how fast that grows
+    open: float = 7.0  # log evidence left, from which on something unlisted is as likely as not,
+    left: float = 0.2  # beyond a share of what the causes explain in a column: forms may leave as much of it
+    sharp: float = 0.6  # and how fast that grows
 
 
 @dataclass(frozen=True)
@@ -76,11 +77,18 @@ def log_likelihood(
     return value, Weights(1.0 / v, 1.0 / (1.0 + excess))
 
 
-def unexplained(counts: Counts, x: Evidence, p: Parameters) -> Float[np.ndarray, " C"]:
-    """Log evidence, column by column, that something is at work beyond noise and what the causes' forms may miss."""
+def unexplained(counts: Counts, x: Evidence, p: Parameters, form: float | None = None) -> Float[np.ndarray, " C"]:
+    """Log evidence, column by column, that something is at work beyond noise and what the causes' forms may miss: a
+    share `form` of what they explain there, by default ρ².
+    """
     scale = np.maximum((p.looks + x.o) / (p.looks + counts.outside), 1.0)
-    floor = np.maximum(p.floor * scale, p.form * x.explained / counts.K)
+    floor = np.maximum(p.floor * scale, (p.form if form is None else form) * x.explained / counts.K)
     return 0.5 * counts.K * np.log(np.maximum(x.e / counts.K / floor, 1.0))
+
+
+def unlisted(counts: Counts, x: Evidence, p: Parameters) -> float:
+    """Probability that something is at work which no cause of a set is."""
+    return float(expit(p.sharp * (unexplained(counts, x, p, p.left).sum() - p.open)))
 
 
 @dataclass(frozen=True)

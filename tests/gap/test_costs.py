@@ -34,10 +34,3 @@ def test_probabilities_are_shares_of_evidence_beyond_what_each_set_costs():
     w = COSTS.weights(sets)
     assert list(w.values()) == pytest.approx([0.5, 0.5, 0.0])
     assert COSTS.weights({k: s + 321.0 for k, s in sets.items()}) == pytest.approx(w)
-
-
-def test_the_more_is_left_the_likelier_something_is_unlisted_and_the_less_the_more_the_causes_took_there():
-    left = [COSTS.unlisted(x * EXCURSION) for x in (0.0, 40.0, 60.0)]
-    assert left[0] < 0.02 < left[1] < left[2]
-    assert Costs(Parameters(), 2000.0 * EXCURSION, TOUCHED).unlisted(60.0 * EXCURSION) < left[2]
-    assert Costs(Parameters(), 60.0 * EXCURSION + 2000.0 * TORQUE, TOUCHED).unlisted(60.0 * EXCURSION) >= left[2]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.gap.columns import ByColumn, Column, Columns
-from jaxfinger.gap.formula import Linear, Parameters, unexplained
+from jaxfinger.gap.formula import Linear, Parameters, unexplained, unlisted
 
 ROWS, FEATURES, COLUMNS = 400, 20, 6
 
@@ -100,3 +100,15 @@ def test_an_amplitude_keeps_to_its_bounds(columns, rng):
     judged = bench.judge(np.array([0]), np.array([0.0]), np.array([np.inf]))
     assert judged.amplitudes[0] == 0.0
     assert judged.score <= bench.null.score
+
+
+def test_a_law_of_another_form_is_nothing_unlisted_but_what_no_cause_explains_is(columns, rng):
+    """A tenth of what a cause explains may be left where it acts; as much is a sign of more where it does not."""
+    noise = rng.standard_normal(ROWS * COLUMNS)
+    z, there, elsewhere = (smooth(columns, rng, c) for c in (0, 0, 3))
+    found = []
+    for other in (0.0 * there, there, elsewhere):
+        bench = linear(columns, noise + 120.0 * z + 30.0 * other, 120.0 * z[None])
+        found.append(unlisted(columns.counts, bench.judge(np.array([0])).evidence, Parameters()))
+    assert found[0] < 0.05
+    assert found[1] < 0.05 < 0.95 < found[2]
