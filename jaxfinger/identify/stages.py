@@ -273,7 +273,7 @@ def estimate_with_noise(
     sources = sources_of(stacks, reads, noise, parameters)
     model, solution = solve(model, free, sources, prior, huber, tangents=tangents)
     again = start_values(model, free, parameters, sources)
-    if again is not model:  # a tendon's friction has slid into its dead zone
+    if again is not model:  # a tendon's friction has slid into a dead zone
         other, second = solve(again, free, sources, prior, huber, tangents=tangents)
         if total_cost(other, second, free, prior) < total_cost(model, solution, free, prior):
             model, solution = other, second

@@ -1,8 +1,8 @@
-"""Where a fit starts, from the data: tendon friction, the one law of (1) that has a dead zone.
+"""Where a fit starts, from the data: tendon friction, the one law of (1) that has dead zones.
 
-The loss max(a₀ + a₁ f, 0) says nothing of a₀ and a₁ where it is zero at every tension, so a search can neither start
-there nor lead out of it. A few plausible losses, as shares of the highest tension that the trials show, are tried on
-every tendon's own trials; the best of them is the start.
+The loss min(max(a₀ + a₁ f, 0), f) says nothing of a₀ and a₁ where it is zero at every tension, nor where all of the
+tension is lost, so a search can neither start there nor lead out of it. A few plausible losses, as shares of the
+highest tension that the trials show, are tried on every tendon's own trials; the best of them is the start.
 """
 
 from dataclasses import replace
@@ -16,15 +16,18 @@ from jaxfinger.identify.parameters import Parameter
 from jaxfinger.identify.solve import Source, missed_each
 from jaxfinger.model import Model, TendonFriction
 
-# a₀ over the highest tension, and a₁: a tenth to a half of the tension lost, in all the forms that the law can have.
+# a₀ over the highest tension, and a₁: a thirtieth to most of the tension lost, in all the forms that the law can have.
 # The first is taken where no trial prefers another.
-PLAUSIBLE = ((0.0, 0.1), (0.0, 0.3), (0.0, 0.03), (0.1, 0.1), (0.1, 0.0), (0.03, 0.0), (-0.1, 0.5))
+PLAUSIBLE = (
+    *((0.0, 0.1), (0.0, 0.3), (0.0, 0.03), (0.0, 0.8)),
+    *((0.1, 0.1), (0.1, 0.0), (0.03, 0.0), (0.4, 0.2), (-0.1, 0.5)),
+)
 
 
 def start_values(
     model: Model, free: np.ndarray, parameters: list[Parameter], sources: dict[str, Source] | None = None
 ) -> Model:
-    """The model, with a loss that the trials prefer for every tendon whose friction is free and in its dead zone."""
+    """The model, with a loss that the trials prefer for every tendon whose friction is free and in a dead zone."""
     pulled = {e: s for e, s in (sources or {}).items() if _shows_friction(s, parameters)}
     highest = _highest(model, pulled)
     dead = [k for k in _free_tendons(model, free, parameters) if _is_dead(model, k, highest[k])]
@@ -56,9 +59,10 @@ def _highest(model: Model, sources: dict[str, Source]) -> Float[np.ndarray, " n"
 
 
 def _is_dead(model: Model, k: int, highest: float) -> bool:
-    """Whether the tendon loses nothing at any tension up to the highest."""
+    """Whether the tendon loses nothing at any tension up to the highest, or all of that."""
     a0, a1 = float(model.tendon_friction.constant[k]), float(model.tendon_friction.proportional[k])
-    return a0 <= 0.0 and a0 + a1 * (highest or 1.0) <= 0.0
+    nothing = a0 <= 0.0 and a0 + a1 * (highest or 1.0) <= 0.0
+    return nothing or 0.0 < highest <= a0 + a1 * highest
 
 
 def _with_losses(model: Model, tendons: list[int], highest: np.ndarray, shares: tuple[float, float]) -> Model:
