@@ -13,7 +13,6 @@ from jaxfinger.data import Session
 from jaxfinger.experiments import prepare
 from jaxfinger.identify import Fit
 from jaxfinger.model import Model, rigid_body
-from jaxfinger.model.tendon_friction import bounded
 from jaxfinger.report.measured import Points, arm_points, hold_points, loss_points
 
 SAMPLES = 61
@@ -98,7 +97,8 @@ def _curves(fit: Fit) -> Curves:
         return tuple(a.reshape(shape) for a in pair)
 
     arms, elastic, friction = shaped(arms, (finger.n, m, S)), shaped(elastic, (m, S)), shaped(friction, (m, S))
-    loss = shaped(loss, (finger.n, S))
+    # A loss of nothing, or of all, is as well known as the law that says so.
+    loss = np.clip(loss[0].reshape(finger.n, S), 0.0, f), loss[1].reshape(finger.n, S)
     angle = [(1e3 if p else 180 / np.pi) for p in finger.prismatic]
     torque = [(1.0 if p else 1e3) for p in finger.prismatic]
     estimated = _estimated(fit)
@@ -154,7 +154,7 @@ def _evaluate(q: Float[Array, "m m S"], tension: Float[Array, "n S"]):
             h.elastic_torque(q)[own, own],
             h.friction_magnitude(q)[own, own],
             h.damping,
-            bounded(model.tendon_friction.loss(tension), tension),
+            model.tendon_friction.loss(tension),
         )
         return jnp.concatenate([jnp.ravel(p) for p in parts])
 
