@@ -1,12 +1,20 @@
 """What holds each parameter, beside refits."""
 
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxfinger.errors import UserError
+from jaxfinger.experiments import prepare
 from jaxfinger.identify import identify
-from jaxfinger.identify.parameters import describe, ravel
+from jaxfinger.identify.parameters import Free, describe, ravel
+from jaxfinger.identify.resample import plan_of
 from jaxfinger.identify.sensitivity import sensitivity
+from jaxfinger.identify.solve import solve
+from jaxfinger.identify.stages import cad_prior, nominal_model, sources_of
 
 
 @pytest.fixture(scope="module")
@@ -53,3 +61,52 @@ def test_the_fit_of_other_trials_is_refused(fit, session):
     """Though they are repeats of the same motions."""
     with pytest.raises(UserError, match="give the session that it was made from"):
         sensitivity(fit, session.with_trials([t.name for t in list(session)[1::2]]), to="trials")
+
+
+def refit(fit, session, of=None, weight=None, gain=None):
+    """Stage after stage from the fit, to the last digit, under its noise. `of`: the session as it was fitted, where the
+    finger of `session` is another; `weight`: a trial and its weight; `gain`: a tendon and what its excursions are
+    multiplied by.
+    """
+    parameters, plan, stacks, model = describe(fit.model), plan_of(session, fit), prepare(session), fit.model
+    given = np.setdiff1d(np.arange(len(parameters)), np.concatenate([free for _, free in plan]))
+    own, was = (np.asarray(ravel(nominal_model(s, fit.recipe)))[given] for s in (session, of or session))
+    model = Free.at(model, given).set(model, jnp.asarray(np.asarray(ravel(model))[given] + own - was))
+    for reads, free in plan:
+        sources = sources_of(stacks, reads, fit.noise, parameters)
+        for e, source in sources.items():
+            if weight and weight[0] in stacks[e].trials:
+                weights = np.where(np.array(stacks[e].trials) == weight[0], weight[1], 1.0)
+                sources[e] = source._replace(weights=weights)
+            if gain and "tendon_excursion" in source.batch.y:
+                scaled = source.batch.y["tendon_excursion"].at[gain[0]].multiply(gain[1])
+                batch = eqx.tree_at(lambda b: b.y["tendon_excursion"], source.batch, scaled)
+                sources[e] = source._replace(batch=batch)
+        prior = cad_prior(session, fit.recipe, parameters, free)
+        model, _ = solve(model, free, sources, prior, fit.recipe.fit.huber, small=1e-9)
+    return np.asarray(ravel(model))
+
+
+def heavier(session, joint: int, mass: float):
+    """A link of the same density distribution, heavier by so many kg: its inertia grows with it."""
+    f = session.finger
+    masses = f.mass + mass * (np.arange(f.m) == joint)
+    return replace(session, finger=replace(f, mass=masses, inertia=f.inertia * (masses / f.mass)[:, None, None]))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["trials", "sensors", "cad"])
+def test_derivatives_are_those_of_refits_under_the_same_noise(fit, one_of_each, kind):
+    """Steps so short that hardly a sample passes Huber's limit on the way, where the cost has a kink of third order."""
+    session, finger = one_of_each, one_of_each.finger
+    name, step, refitted = {
+        "trials": ("01-ID.2-MCP-a", 1e-3, lambda h: refit(fit, session, weight=("01-ID.2-MCP-a", 1.0 + h))),
+        "sensors": (f"excursion {finger.tendon_names[1]}", 1e-4, lambda h: refit(fit, session, gain=(1, 1.0 + h))),
+        "cad": (f"mass {finger.joint_names[1]}", 1e-7, lambda h: refit(fit, heavier(session, 1, h), of=session)),
+    }[kind]
+    found = sensitivity(fit, session, to=kind)[kind]
+    seen = fit.estimated[np.isfinite(fit.std[fit.estimated])]
+    std = fit.std[seen]
+    derivative = found.values[found.names.index(name)][seen] / std
+    difference = (refitted(step) - refitted(-step))[seen] / (2.0 * step) / std
+    assert np.linalg.norm(difference - derivative) < 1e-4 * np.linalg.norm(derivative)
