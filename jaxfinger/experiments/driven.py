@@ -27,6 +27,9 @@ BREAKAWAY = 4.5  # widths kept clear after a joint that no motor moves has broke
 # contacts that give, shorter ones those that do not (benchmarks/reversals.py).
 ENCODER = 2.2
 CALM = 0.1  # s, at the protocol's pace: over which q̈ is averaged where it does not rise above its noise
+# Times what white noise of the encoder's size would leave in q̈: a grid's lines and vibration leave up to eight times as
+# much (datasets/emps), and what is more than that is motion.
+COLOURED = 10.0
 
 
 def reduce(r: Recording) -> Row:
@@ -43,7 +46,8 @@ def reduce(r: Recording) -> Row:
     if r.reduced or r.spec.slack:
         # Noise of q̈ would tell a fit of less inertia (errors in variables), and a prediction that stands beside a
         # measured torque of one that is not there: where q̈ does not rise above it, its mean takes its place.
-        qdd = shrink(qdd, round(CALM * r.spec.pace / r.step), 1.4826 * j.noise * passed(j.cutoff, r.step, 2))
+        most = COLOURED * 1.4826 * j.noise * passed(j.cutoff, r.step, 2)
+        qdd = shrink(qdd, round(CALM * r.spec.pace / r.step), most)
     if r.reduced:
         # q̈ is low-passed, so all else is too.
         joint, tendon, tension = (low_pass(r.trial.time, a, j.cutoff) for a in (joint, tendon, tension))
