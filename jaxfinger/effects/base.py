@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cache
 from itertools import combinations, permutations, product
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
@@ -16,6 +16,7 @@ from jaxfinger.effects.scales import Scales
 from jaxfinger.model import Effect, Finger
 
 Site = tuple[str, ...]
+Kind = TypeVar("Kind", bound="CatalogueEffect")
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,7 @@ class CatalogueEffect(Effect):
         return True
 
     @classmethod
-    def at(cls, finger: Finger, site: Site, **values: float) -> Self:
+    def at(cls: type[Kind], finger: Finger, site: Site, **values: float) -> Kind:
         """At a site of a finger; amplitudes default to zero, shapes to the first value worth trying there as far as the
         finger's description tells.
         """
@@ -230,12 +231,13 @@ def delta() -> Any:
 _SIXTH_ORDER = ((1, 0.75), (2, -0.15), (3, 1 / 60))  # how far off on either side, and weight
 
 
-def rate(y: Float[Array, "*T"], time: Float[Array, "*T"]) -> Float[Array, "*T"]:
+def rate(y: Float[Array, "*T"], time: Float[Array, "*#T"]) -> Float[Array, "*T"]:
     """Time derivative along the last axis; zero where time stands still.
 
     Central differences of the sixth order where samples are evenly spaced (Fornberg, Math. Comp. 51 (1988) 699), since
     reduced channels change by much from sample to sample; of the second order elsewhere.
     """
+    time = jnp.broadcast_to(time, y.shape)
     dy, dt = (jnp.asarray(jnp.gradient(a, axis=-1)) for a in (y, time))
     slope = jnp.where(dt > 0, dy / jnp.where(dt > 0, dt, 1.0), 0.0)
     if y.shape[-1] < 7:

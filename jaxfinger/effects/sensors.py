@@ -55,7 +55,7 @@ class TorqueSensorDrift(CatalogueEffect):
         if channel != "joint_torque":
             return y
         tared = x.session_time - x.time - self.tare
-        return y + (self._offset(x.session_time) - self._offset(tared)) * x.motorised
+        return y + (self._offset(x.session_time) - self._offset(tared))[None] * x.motorised
 
 
 class TensionSensorScale(CatalogueEffect):
@@ -180,5 +180,5 @@ class ChannelDelay(CatalogueEffect):
         if channel == "joint_torque":
             # The free finger's external torque is zero by construction, not by a sensor. A hold has no rate, though
             # the differences of its first and last sample reach over its edges.
-            return y - self._of(channel) * rate(y, x.time) * x.motorised * (x.qd != 0.0)
+            return y - self._of(channel) * rate(y, x.time) * jnp.where(x.qd != 0.0, x.motorised, 0.0)
         return y - self._of(channel) * rate(y, x.time)

@@ -32,7 +32,7 @@ class Terms(NamedTuple):
     friction: Float[Array, "m *T"]  # |τ_f|, N m
     direction: Float[Array, "m *T"]  # share of it that is built up
     tendon_direction: Float[Array, "n *T"]
-    torque_friction: Float[Array, "m *T"]  # μ
+    torque_friction: Float[Array, "m *#T"]  # μ
     shared: tuple[SharedFriction, ...]  # friction of what turns with several joints
 
 
@@ -85,7 +85,7 @@ def terms(model: Model, x: Motion, memory: tuple[Memory, ...], plain: Terms | No
     return Terms(finger, f_t, C, loss, f_j, h, friction, direction, tendon_direction, mu, shared)
 
 
-def _torque_friction(model: Model, x: Motion) -> Float[Array, "m *T"]:
+def _torque_friction(model: Model, x: Motion) -> Float[Array, "m *#T"]:
     mu = model.joint_torque.torque_friction
     for effect in model.effects:
         mu = effect.torque_friction(mu)
@@ -107,9 +107,10 @@ def resisting(e: Terms) -> Float[Array, "m *T"]:
     return e.h + e.direction * e.friction + _shared(e) - jnp.sum(e.C * e.f_j[:, None], axis=0)
 
 
-def _shared(e: Terms) -> Float[Array, "m *T"] | float:
+def _shared(e: Terms) -> Float[Array, "m *T"]:
     """Torque of the friction of what turns with several joints, N m."""
-    return sum(jnp.multiply.outer(s.ways, s.magnitude * s.direction) for s in e.shared)
+    parts = (jnp.multiply.outer(s.ways, s.magnitude * s.direction) for s in e.shared)
+    return sum(parts, start=jnp.zeros_like(e.h))
 
 
 def resisting_change(model: Model, x: Motion, plain: Terms) -> Float[Array, "m *T"]:
@@ -152,7 +153,7 @@ def contact_map(model: Model, x: Motion) -> Float[Array, "3 m *T"]:
     # (J Jᵀ + ε I) f = J τ, the minimum-norm solution as ε → 0.
     gram = jnp.sum(J[:, None] * J[None], axis=2)
     eps = 1e-10 * (gram[0, 0] + gram[1, 1] + gram[2, 2])
-    return _solved(gram + eps * jnp.eye(3).reshape(3, 3, *(1,) * eps.ndim), J)
+    return _solved(gram + eps[None, None] * jnp.eye(3).reshape(3, 3, *(1,) * eps.ndim), J)
 
 
 def _solved(A: Float[Array, "3 3 *T"], B: Float[Array, "3 m *T"]) -> Float[Array, "3 m *T"]:
@@ -161,6 +162,7 @@ def _solved(A: Float[Array, "3 3 *T"], B: Float[Array, "3 m *T"]) -> Float[Array
     A formula, since two programs that call LAPACK for thousands of samples at once can hold all of XLA's processor
     threads and wait for ever.
     """
+    A = A[:, :, None]  # beside the columns of B
     d0, l1, l2 = A[0, 0], A[1, 0] / A[0, 0], A[2, 0] / A[0, 0]
     d1, c = A[1, 1] - l1 * A[1, 0], A[2, 1] - l2 * A[1, 0]
     l3 = c / d1

@@ -62,7 +62,7 @@ class JointTorque(eqx.Module):
 
 
 def drive_torque(
-    needed: Float[Array, "m *T"], direction: Float[Array, "m *T"], mu: Float[Array, "m *T"]
+    needed: Float[Array, "m *T"], direction: Float[Array, "m *T"], mu: Float[Array, "m *#T"]
 ) -> Float[Array, "m *T"]:
     """τ, N m, of a drive that loses μ|τ| on the way: the solution of τ − μ|τ| s = needed, s the direction.
 

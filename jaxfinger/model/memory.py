@@ -57,16 +57,16 @@ def _settled(x: Motion) -> Motion:
 
 def _finer(x: Motion) -> Motion:
     """`FINER` instants a sample: cubic Hermite curves of q and q̇, straight lines of all else."""
-    s = jnp.arange(FINER) / FINER
+    s = jnp.arange(FINER, dtype=float) / FINER
 
     def between(a, bend):
-        inner = a[..., :-1, None] + s * jnp.diff(a)[..., None] + bend
+        inner = a[..., :-1, None] + jnp.multiply.outer(jnp.diff(a), s) + bend
         return jnp.concatenate([inner.reshape(*a.shape[:-1], FINER * (a.shape[-1] - 1)), a[..., -1:]], axis=-1)
 
-    step, rise = jnp.diff(x.time), jnp.diff(x.q)
+    step, rise = jnp.diff(x.time)[None], jnp.diff(x.q)
     leaving, arriving = (jnp.where(step > 0.0, step * qd - rise, 0.0) for qd in (x.qd[..., :-1], x.qd[..., 1:]))
-    bend = s * (1.0 - s) * ((1.0 - s) * leaving[..., None] - s * arriving[..., None])
-    return tree_at(lambda m: m.q, jax.tree.map(lambda a: between(a, jnp.zeros(1)), x), between(x.q, bend))
+    bend = jnp.multiply.outer(leaving, s * (1.0 - s) ** 2) - jnp.multiply.outer(arriving, s**2 * (1.0 - s))
+    return tree_at(lambda m: m.q, jax.tree.map(lambda a: between(a, 0.0), x), between(x.q, bend))
 
 
 def _blurred(z: Float[Array, "*Tfine"], time: Float[Array, "*T"], blur: Float[Array, "*T"]) -> Float[Array, "*T"]:
@@ -74,7 +74,8 @@ def _blurred(z: Float[Array, "*Tfine"], time: Float[Array, "*T"], blur: Float[Ar
     reach, count = REACH * FINER, time.shape[-1]
     offset = jnp.arange(-reach, reach + 1)
     step, width = jnp.diff(time)[..., :1], jnp.maximum(blur[..., :1], 1e-9)
-    weight = ndtr((offset / FINER + 0.5) * step / width) - ndtr((offset / FINER - 0.5) * step / width)
+    lag = (offset / FINER).reshape(*(1,) * (step.ndim - 1), -1)
+    weight = ndtr((lag + 0.5) * step / width) - ndtr((lag - 0.5) * step / width)
     weight = weight / jnp.sum(weight, axis=-1, keepdims=True)
-    at = jnp.clip(FINER * jnp.arange(count)[:, None] + offset, 0, FINER * (count - 1))
+    at = jnp.clip(FINER * jnp.arange(count)[:, None] + offset[None], 0, FINER * (count - 1))
     return jnp.einsum("...tk,...k->...t", z[..., at], weight)

@@ -26,8 +26,8 @@ def _add(*vectors: Vector) -> Vector:
     return jax.tree.map(lambda *components: functools.reduce(jnp.add, components), *vectors)
 
 
-def _scale(s: Scalar | float, v: Vector) -> Vector:
-    return jax.tree.map(lambda component: s * component, v)
+def _scale(s: Scalar, v: Vector) -> Vector:
+    return tuple(s * component for component in v) if isinstance(v, tuple) else s[None] * v
 
 
 def _dot(a: Vector, b: Vector) -> Scalar:
@@ -70,7 +70,7 @@ def _rotation(axis: Vector, angle: Scalar) -> Matrix:
     o = jnp.zeros_like(x)
     skew = jnp.stack([jnp.stack([o, -z, y]), jnp.stack([z, o, -x]), jnp.stack([-y, x, o])])
     identity = jnp.eye(3).reshape(3, 3, *(1,) * angle.ndim)
-    return c * identity + s * skew + (1.0 - c) * axis[:, None] * axis[None]
+    return c[None, None] * identity + s[None, None] * skew + (1.0 - c)[None, None] * axis[:, None] * axis[None]
 
 
 def _spin(omega: Vector, alpha: Vector) -> Matrix:
@@ -112,7 +112,7 @@ def _frame(j: _Joint, slides: bool) -> tuple[Matrix, Vector]:
     """The link's frame in its parent's."""
     if slides:
         return _rotation(j.axis, jnp.zeros_like(j.q)), _add(j.origin, _scale(j.q, j.axis))
-    return _rotation(j.axis, j.q), jax.tree.map(lambda a: a + jnp.zeros_like(j.q), j.origin)
+    return _rotation(j.axis, j.q), _add(j.origin, _scale(jnp.zeros_like(j.q), j.axis))
 
 
 def _recursion(step, state, links, finger: Finger, reverse: bool = False):
@@ -244,5 +244,5 @@ def fingertip(finger: Finger, q: Float[Array, "m *T"]) -> tuple[Float[Array, "3 
     axes, places = (jnp.asarray(a) for a in links)
     tip = jnp.asarray(_add(p, _mul(R, finger.fingertip.reshape(3, *(1,) * (q.ndim - 1)))))
     slides = jnp.array(finger.prismatic, dtype=float).reshape(-1, *(1,) * q.ndim)
-    columns = slides * axes + (1.0 - slides) * jnp.asarray(jax.vmap(_cross)(axes, tip - places))
+    columns = slides * axes + (1.0 - slides) * jnp.asarray(jax.vmap(_cross)(axes, tip[None] - places))
     return tip, jnp.moveaxis(columns, 0, 1)

@@ -34,7 +34,7 @@ class _State(NamedTuple):
     qd: Float[Array, " m"]
     drive: tuple[Drive, ...]  # of the memories, in the middle of the last step
     memory: tuple[Memory, ...]
-    friction: Float[Array, " m+n+s"]  # torques and tensions of friction, N m and N; s of what turns with several joints
+    friction: Float[Array, " k"]  # torques and tensions of friction, N m and N, then of what turns with several joints
 
 
 def simulate(
@@ -44,7 +44,7 @@ def simulate(
     q0: Float[Array, " m"],
     qd0: Float[Array, " m"],
     tau_ext: Float[Array, "m T"] | None = None,
-    session_start: float = 0.0,
+    session_start: Float[Array, ""] | float = 0.0,
     substeps: int = 2,
 ) -> tuple[Float[Array, "m T"], Float[Array, "m T"]]:
     """q, rad, and q̇, rad/s, from the first sample on, under the tension measured at the uniform instants `time`."""
@@ -69,7 +69,7 @@ def simulate(
             f, tau = f0 + share * (f1 - f0), tau0 + share * (tau1 - tau0)
             return _step(model, state, motion, t + share * dt * substeps, f, tau, dt), None
 
-        state, _ = jax.lax.scan(substep, state, (jnp.arange(substeps) + 0.5) / substeps)
+        state, _ = jax.lax.scan(substep, state, (jnp.arange(substeps, dtype=float) + 0.5) / substeps)
         return state, (state.q, state.qd)
 
     inputs = (time[:-1], tension.T[:-1], tension.T[1:], tau_ext.T[:-1], tau_ext.T[1:])
@@ -103,7 +103,7 @@ def _step(model: Model, state: _State, motion, t, f, tau, dt) -> _State:
     return _State(x.q + 0.5 * dt * qd, qd, drive, memory, friction)
 
 
-def _at_once(model: Model, x: Motion, memory) -> Float[Array, " m+n"]:
+def _at_once(model: Model, x: Motion, memory) -> Float[Array, " k"]:
     """Share of each joint's and tendon's friction that follows the sign of the velocity without delay."""
 
     def built(sign):

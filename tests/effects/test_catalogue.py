@@ -157,8 +157,8 @@ def test_all_effects_together_simulate_forward():
         site = kind.sites(FINGER)[-1]
         effects.append(plausible(kind, site, kind.shapes(FINGER, site, SCALES)[0], 0.5))
     T = 60
-    time = jnp.arange(T) * 1e-3
-    tension = jnp.zeros((FINGER.n, T)).at[:].set(jnp.asarray(FINGER.active, float)[:, None] * (2 + 40 * time))
+    time = jnp.arange(T, dtype=float) * 1e-3
+    tension = jnp.multiply.outer(jnp.asarray(FINGER.active, float), 2.0 + 40.0 * time)
     q0 = jnp.asarray(FINGER.limits).mean(axis=1)
     run = eqx.filter_jit(simulate, compiler_options=CHEAP)
     q, qd = run(with_effects(*effects), time, tension, q0, jnp.zeros(FINGER.m))

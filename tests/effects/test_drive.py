@@ -146,7 +146,7 @@ def test_what_turns_with_two_joints_holds_both_until_they_pull_hard_enough():
     pair = (FINGER.joint_names[0], FINGER.joint_names[1])
     effect = CATALOGUE["joint_coupling"].at(FINGER, pair, coulomb=0.01)
     model = eqx.tree_at(lambda m: m.effects, model, (effect,), is_leaf=lambda v: isinstance(v, tuple))
-    time, still = jnp.arange(50) * DT, jnp.zeros((FINGER.n, 50))
+    time, still = jnp.arange(50, dtype=float) * DT, jnp.zeros((FINGER.n, 50))
     tau = jnp.zeros((FINGER.m, 50)).at[:2].set(jnp.array([[0.005], [0.005]]))
     _, qd = run(model, time, still, jnp.zeros(FINGER.m), jnp.zeros(FINGER.m), tau)
     assert np.abs(qd).max() < 1e-3

@@ -113,12 +113,12 @@ def test_noise_of_an_encoder_at_rest_does_not_undo_friction():
     """A joint goes forward, rests, and goes back: what has built up stays until then."""
     rng, std = np.random.default_rng(0), 2e-4
     q = np.concatenate([np.linspace(0, 0.3, 50), np.full(400, 0.3), np.linspace(0.3, 0, 50)])
-    noisy = jnp.asarray(X.q[:, :1] + q + rng.normal(0, std, q.size))
-    time = jnp.arange(q.size) / 250.0
+    noisy = X.q[:, :1] + (q + rng.normal(0, std, q.size))[None]
+    time = jnp.arange(q.size, dtype=float) / 250.0
     x = jax.tree.map(lambda a: jnp.repeat(a[..., :1], q.size, axis=-1), X)
     x = replace(x, time=time, q=noisy)
     effect = CATALOGUE["joint_presliding"].at(FINGER, (FINGER.joint_names[1],), x0=0.002)
-    expected = memories(with_effects(effect), replace(x, q=X.q[:, :1] + jnp.asarray(q)))[0]
+    expected = memories(with_effects(effect), replace(x, q=X.q[:, :1] + jnp.asarray(q)[None]))[0]
     naive = memories(with_effects(effect), x)[0]
     shown = memories(with_effects(effect), replace(x, jitter=jnp.full_like(noisy, 8 * std)))[0]
     resting = slice(55, 445)

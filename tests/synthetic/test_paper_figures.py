@@ -1,5 +1,6 @@
 """The figures of the paper (Table I, Figs. 5–9 and their text) come out of the specimen's own functions."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -67,7 +68,7 @@ def test_flexors_lift_off_and_are_no_fourth_order_polynomials(tendon, joint):
 
 def test_gravity_at_the_mcp_runs_from_15_to_5():
     finger = Finger.from_description(paper_finger().description)
-    q = np.deg2rad([[10.0, 70.0], [0.0, 0.0], [0.0, 0.0]])
+    q = jnp.deg2rad(jnp.array([[10.0, 70.0], [0.0, 0.0], [0.0, 0.0]]))
     assert np.asarray(rigid_body.gravity_torque(finger, q))[0] * NMM == pytest.approx([15.0, 5.0], abs=0.5)
 
 
