@@ -1,10 +1,7 @@
 """What drives the finger: measured, commanded or simulated; batch last, time the very last axis."""
 
 import equinox as eqx
-import numpy as np
 from jaxtyping import Array, Float
-
-Samples = Array | np.ndarray  # of recordings, and in what is compiled
 
 
 class Motion(eqx.Module):
@@ -15,18 +12,18 @@ class Motion(eqx.Module):
     tendons move only when their loss is exceeded.
     """
 
-    time: Float[Samples, "*T"]  # s, from the trial's start
-    q: Float[Samples, "m *T"]  # rad
-    qd: Float[Samples, "m *T"]  # rad/s
-    qdd: Float[Samples, "m *T"]  # rad/s²
-    tension: Float[Samples, "n *T"]  # N, at the actuator
-    joint_direction: Float[Samples, "m *T"]
-    tendon_direction: Float[Samples, "n *T"]
-    session_time: Float[Samples, "*T"]  # s, from the session's start
-    motorised: Float[Samples, "m *T"]  # 1 where the external motor is coupled to the joint
+    time: Float[Array, "*T"]  # s, from the trial's start
+    q: Float[Array, "m *T"]  # rad
+    qd: Float[Array, "m *T"]  # rad/s
+    qdd: Float[Array, "m *T"]  # rad/s²
+    tension: Float[Array, "n *T"]  # N, at the actuator
+    joint_direction: Float[Array, "m *T"]
+    tendon_direction: Float[Array, "n *T"]
+    session_time: Float[Array, "*T"]  # s, from the session's start
+    motorised: Float[Array, "m *T"]  # 1 where the external motor is coupled to the joint
     held: bool = eqx.field(static=True, default=False)
-    temperature: Float[Samples, "m *T"] | None = None  # K, of each joint, where it is measured
+    temperature: Float[Array, "m *T"] | None = None  # K, of each joint, where it is measured
     # Of a recording: rad, what the encoder's noise turns an angle back by at rest; and s, the standard deviation of the
     # low-pass that all of it went through, 0 for none, where a sample is the mean of its interval.
-    jitter: Float[Samples, "m *T"] | None = None
-    blur: Float[Samples, "*T"] | None = None
+    jitter: Float[Array, "m *T"] | None = None
+    blur: Float[Array, "*T"] | None = None
