@@ -35,12 +35,12 @@ class Parameters:
     floor: float = 2.0  # v_c that noise alone may leave, since its colour is known from a few repeats
     form: float = 0.02  # ρ²: share of what causes explain in a column that the forms of their laws may miss
     looks: float = 25.0  # ν: independent looks outside of the features
-    prior: float = 6.0  # log evidence that a cause must bring,
-    alike: float = 0.07  # and as a share of what is unexplained where it acts: what an imitator gains of it
+    prior: float = 8.0  # log evidence that a cause must bring,
+    alike: float = 0.04  # and as a share of what is unexplained where it acts: what an imitator gains of it
     trust: float = 1.0  # β: of all log evidence, since neighbouring features and columns are no independent looks
-    open: float = 7.0  # log evidence left, from which on something unlisted is as likely as not,
-    left: float = 0.2  # beyond a share of what the causes explain in a column: forms may leave as much of it
-    sharp: float = 0.6  # and how fast that grows
+    open: float = 6.0  # log evidence left, from which on something unlisted is as likely as not,
+    left: float = 0.27  # beyond a share of what the causes explain in a column: forms may leave as much of it
+    sharp: float = 1.0  # and how fast that grows
 
 
 @dataclass(frozen=True)
