@@ -40,10 +40,13 @@ def test_the_truth_is_at_the_noise_floor(scored):
 
 
 def test_a_moment_ahead_the_truth_departs_by_the_noise_of_the_sensors(scored):
-    """Sticking included: friction that is solved for hides none of it."""
+    """Sticking included: friction that is solved for hides none of it. All joints are counted together, since of a
+    single one a handful of slips in two seconds tells.
+    """
     for ms in (50, 100, 200, 500):
-        for s in pick(scored, "VD.3", "q", f"{ms} ms ahead"):
-            assert s.rms < 2.0 * s.noise, s
+        joints = pick(scored, "VD.3", "q", f"{ms} ms ahead")
+        departs, noise = (np.mean([getattr(s, x) ** 2 for s in joints]) ** 0.5 for x in ("rms", "noise"))
+        assert 0.5 < departs / noise < 1.75, joints
     errors = [np.mean([s.rms for s in pick(scored, "VD.3", "q", f"{ms} ms ahead")]) for ms in (50, 500)]
     assert errors[0] < errors[1]
     (share,) = {s.method for s in pick(scored, "VD.3", "joint_torque")}
