@@ -18,8 +18,8 @@ PASSES = 4000  # likewise how quick it is: a minute's trial still shows a motion
 # what is reduced to a rate, cut off at a frequency or counted in seconds is meant for these. How fast tendons move a
 # finger says less: it sticks, and slips as fast as it does.
 SWEEP = 0.11
-# Of paces: what serves one serves motions twice as quick or as slow, of which a fit is the same within its errors
-# (tests/identify/test_units.py).
+# Of paces: what serves one serves motions twice as slow and four times as quick, of which a fit is the same within its
+# errors (tests/identify/test_units.py). Where sweeps are quick, slow motions of the same session need not be.
 LIKE = 4.0
 
 
@@ -65,7 +65,8 @@ def sizes_of(session: Session) -> Sizes:
             excursions.append(float(np.ptp(np.percentile(l, (1, 99), axis=0), axis=0).max(initial=0.0)))
         if trial.experiment == "ID.3-dynamic" and (quick := _quick(trial)) > 0.0:
             paces.append(np.log(quick / SWEEP) / np.log(LIKE))
-    pace = LIKE ** round(median_low(paces)) if paces else 1.0
+    steps = median_low(paces) if paces else 0.0
+    pace = 1.0 if -1.0 < steps < 0.0 else LIKE ** round(steps)
     return Sizes(max(tensions), max(excursions), float(np.median(noises)) if noises else 0.0, pace)
 
 
