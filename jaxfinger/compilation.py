@@ -12,8 +12,11 @@ Result = TypeVar("Result")
 
 # XLA's fusion emitters take half as long again, or more, to compile these scalar formulas, which then run no faster;
 # neither do they at -O2 and beyond, which takes a tenth more. What the environment's XLA_FLAGS state goes first.
-QUICK = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
-QUICK = {name: value for name, value in QUICK.items() if name not in os.environ.get("XLA_FLAGS", "")}
+QUICK = {
+    name: value
+    for name, value in {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}.items()
+    if name not in os.environ.get("XLA_FLAGS", "")
+}
 
 # The overloads of equinox leave the options of jit out.
 quick_jit = eqx.filter_jit(compiler_options=QUICK)  # type: ignore[call-overload]

@@ -17,7 +17,7 @@ from jaxfinger.data.motion import RAMP, slow_ramps, stretches_of
 from jaxfinger.experiments.recording import Recording, Row, joints, row, stretches
 from jaxfinger.experiments.shrink import shrink
 
-NOTHING = "no tendon is pulled from slack in holds of 0.2 s or in ramps of a second"
+NOTHING = "no tendon is pulled from slack in holds, or in ramps slow enough to tell its friction"
 PARTS = 6  # of a hold, whose means say how well its own is known; longer than an encoder's noise is correlated
 OVERSHOOT = 4.0  # standard deviations: tension beyond that of both holds by more was really there
 FEW = 3  # holds from which on their spread tells whether a fixture yields

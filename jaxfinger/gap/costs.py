@@ -25,11 +25,11 @@ class Costs:
 
     parameters: Parameters
     unknown: Float[np.ndarray, " C"]  # log evidence, column by column, that something is at work
-    touched: Mapping[Key, Float[np.ndarray, " C"]]  # of all that the trials see: the most it could explain of a column
+    touched: Mapping[Key, Float[np.ndarray, " C"]]  # of all that the trials can see: share of a column it could explain
 
     @cached_property
     def sites(self) -> Mapping[str, int]:
-        """Of every effect that the trials can see."""
+        """How many there are of every effect."""
         return Counter(effect for effect, _ in self.touched)
 
     def of(self, keys: Iterable[Key]) -> float:
@@ -47,11 +47,11 @@ class Costs:
 
     @cached_property
     def _to_explain(self) -> Mapping[Key, float]:
-        """Log evidence, where each acts, that something is at work."""
+        """Log evidence that something is at work, in the columns that each cause touches."""
         return {key: float(share @ self.unknown) for key, share in self.touched.items()}
 
     def evidence_needed(self, keys: Iterable[Key]) -> float:
-        """By every cause and site, and as a share of what there is to explain where it acts."""
+        """A sum over causes: of each a constant, and a share of the evidence in the columns that it touches."""
         return sum(self.parameters.prior + self.parameters.alike * self._to_explain[key] for key in keys)
 
     def weights(self, scores: Mapping[frozenset[Key], float]) -> dict[frozenset[Key], float]:

@@ -25,7 +25,7 @@ FACTOR = 0.7  # logarithm of the most by which a step changes a shape
 ROUNDS = 5  # of moving the nominal model
 SETTLED = 0.5  # change of the score below which it stays
 HALVINGS = 3
-ROUNDING = 1e-14  # of products of columns
+ROUNDING = 1e-14  # of the largest variance: a sum of ten thousand products is good to a hundred times 2.2e-16
 Room = tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]
 
 
@@ -169,10 +169,10 @@ class Whitened:
 
 
 def orthonormalised(A: Float[np.ndarray, "N p"]) -> tuple[Float[np.ndarray, "N k"], Float[np.ndarray, "p k"]]:
-    """Q and T, Q = A T with Qᵀ Q = I, of the directions that stand out of A's rounding.
+    """Q and T, Q = A T with Qᵀ Q = I, spanning the columns of A as far as they stand out of rounding.
 
-    From products of columns, twice (CholeskyQR2: Yamamoto et al. 2015), since Householder's QR of many rows takes
-    twenty times as long. What the first pass leaves oblique where A is ill-conditioned, the second one straightens.
+    From the products of columns, which cost a quarter of Householder's QR where rows are many. The first pass leaves Q
+    oblique where A is ill-conditioned; the second one mends that (as in CholeskyQR2: Yamamoto et al., ETNA 44 (2015)).
     """
     Q, T = A, np.eye(A.shape[1])
     for _ in range(2):

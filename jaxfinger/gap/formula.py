@@ -18,7 +18,7 @@ all. Nominal parameters are refitted with every set, in the weights that follow 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +30,7 @@ from jaxfinger.gap.columns import ByColumn, Columns, Counts
 
 @dataclass(frozen=True)
 class Parameters:
-    """All that the formula does not take from the file at hand."""
+    """All that the formula does not take from the file at hand. Where each number comes from: docs/results.md."""
 
     floor: float = 2.0  # v_c that noise alone may leave, since its colour is known from a few repeats
     form: float = 0.02  # ρ²: share of what causes explain in a column that the forms of their laws may miss
@@ -38,9 +38,9 @@ class Parameters:
     prior: float = 8.0  # log evidence that a cause must bring,
     alike: float = 0.04  # and as a share of what is unexplained where it acts: what an imitator gains of it
     trust: float = 1.0  # β: of all log evidence, since neighbouring features and columns are no independent looks
-    open: float = 6.0  # log evidence left, from which on something unlisted is as likely as not,
-    left: float = 0.27  # beyond a share of what the causes explain in a column: forms may leave as much of it
-    sharp: float = 1.0  # and how fast that grows
+    left: float = 0.27  # share of what causes explain in a column, up to which what is left there is theirs as well
+    open: float = 6.0  # log evidence beyond that, from which on something unlisted is as likely as not
+    sharp: float = 1.0  # and how fast that probability grows with it
 
 
 @dataclass(frozen=True)
@@ -77,18 +77,16 @@ def log_likelihood(
     return value, Weights(1.0 / v, 1.0 / (1.0 + excess))
 
 
-def unexplained(counts: Counts, x: Evidence, p: Parameters, form: float | None = None) -> Float[np.ndarray, " C"]:
-    """Log evidence, column by column, that something is at work beyond noise and what the causes' forms may miss: a
-    share `form` of what they explain there, by default ρ².
-    """
+def unexplained(counts: Counts, x: Evidence, p: Parameters) -> Float[np.ndarray, " C"]:
+    """Log evidence, column by column, that something is at work beyond noise and what the causes' forms may miss."""
     scale = np.maximum((p.looks + x.o) / (p.looks + counts.outside), 1.0)
-    floor = np.maximum(p.floor * scale, (p.form if form is None else form) * x.explained / counts.K)
+    floor = np.maximum(p.floor * scale, p.form * x.explained / counts.K)
     return 0.5 * counts.K * np.log(np.maximum(x.e / counts.K / floor, 1.0))
 
 
 def unlisted(counts: Counts, x: Evidence, p: Parameters) -> float:
     """Probability that something is at work which no cause of a set is."""
-    return float(expit(p.sharp * (unexplained(counts, x, p, p.left).sum() - p.open)))
+    return float(expit(p.sharp * (unexplained(counts, x, replace(p, form=p.left)).sum() - p.open)))
 
 
 @dataclass(frozen=True)

@@ -37,10 +37,10 @@ def posterior(search: Search, state: State) -> Posterior:
         causes[key] = sum(w[keys] for keys in inside)
         without = max(net[keys] for keys in scores if key not in keys)
         gains[key] = max((net[keys] for keys in inside), default=-np.inf) - without
-    left = unlisted(search.bench.columns.counts, state.judged.evidence, search.bench.parameters)
+    other = unlisted(search.bench.columns.counts, state.judged.evidence, search.bench.parameters)
     ambiguous = _ambiguous(w, state, causes)
     named = tuple(k for k in state.keys if causes[k] >= IS_NAMED and not any(k in s for s in ambiguous))
-    return Posterior(causes, gains, w[frozenset()] * (1.0 - left), left, named, ambiguous)
+    return Posterior(causes, gains, w[frozenset()] * (1.0 - other), other, named, ambiguous)
 
 
 def _ambiguous(w: dict[frozenset, float], state: State, causes: dict[Key, float]) -> tuple[tuple[Key, ...], ...]:

@@ -93,8 +93,11 @@ class Problem:
 
     @property
     def block_of_row(self) -> np.ndarray:
-        """(N,) running number of the stretch of a trial that a row lies in (`misfit.stretches`)."""
-        times = [np.asarray(self.sources[e].batch.x.time)[rows.trial, rows.time] for e, rows in self.rows.items()]
+        """(N,) running number of the stretch of a trial that a row lies in (`cluster_robust.stretches`)."""
+        times = []
+        for e, rows in self.rows.items():
+            source = self.sources[e]
+            times.append(np.asarray(source.batch.x.time)[rows.trial, rows.time] / source.pace)
         return stretches(self.trial_of_row, np.concatenate(times))
 
     @cached_property

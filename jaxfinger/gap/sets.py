@@ -17,7 +17,9 @@ from jaxfinger.gap.screening import Screening
 from jaxfinger.gap.signatures import Variant
 from jaxfinger.identify.stages import Progress
 
-SEEN = 1e-3  # of a signature that the nominal parameters leave: with less, the bend of a finite step is larger
+# Share of a signature that nominal parameters must leave. What they imitate altogether leaves rounding, below 1e-5. Of
+# a cause that leaves 2e-3, as an encoder's offset does, the bend over a plausible size is 0.4 % of what is left.
+SEEN = 1e-3
 SHORT_LIST = 12  # candidates whose amplitudes are weighed until the weights settle
 EXACT = 3  # of them that are fitted exactly
 MOST = 12  # changes of the set
@@ -60,7 +62,7 @@ class Table:
     units: Float[np.ndarray, " M"]
     absorbed: dict[Key, float]
     hidden: dict[Key, dict[str, float]]  # std of amplitudes, each alone, in their own units: what could hide
-    touched: dict[Key, Float[np.ndarray, " C"]]  # of all that the trials can see
+    touched: dict[Key, Float[np.ndarray, " C"]]  # of all that the trials can see (`Costs`)
     offers: list[Offered]
 
     def rows_of(self, offer: Offered) -> list[Int[np.ndarray, " k"]]:
@@ -89,7 +91,7 @@ def table_of(problem: Problem, bench: Bench, screening: Screening, together: boo
     kept = seen > SEEN * raw
     units = np.where(kept, bench.gap / np.maximum(seen, 1e-300), 0.0)
     Z *= units[:, None]
-    claims = _claims(bench, projected * units[:, None])
+    claims = _claims(bench, projected, units)
     absorbed: dict[Key, float] = {}
     hidden: dict[Key, dict[str, float]] = {}
     touched: dict[Key, Float[np.ndarray, " C"]] = {}
@@ -115,12 +117,12 @@ def table_of(problem: Problem, bench: Bench, screening: Screening, together: boo
     return Table(Z, ByColumn(bench.columns, Z), rows, units, absorbed, hidden, touched, offers)
 
 
-def _claims(bench: Bench, projected: Float[np.ndarray, "M N"]) -> Float[np.ndarray, "M C"]:
-    """Share of what the nominal model misses in every column that a signature could explain, were all of the gap its
-    own.
-    """
+def _claims(
+    bench: Bench, projected: Float[np.ndarray, "M N"], units: Float[np.ndarray, " M"]
+) -> Float[np.ndarray, "M C"]:
+    """Share of each column's gap that a signature would explain if it explained as much as all of the gap."""
     energy = np.stack([np.sum((projected[:, c.rows] @ c.basis) ** 2, axis=1) for c in bench.columns.items], axis=1)
-    return np.minimum(energy / np.maximum(bench.null.judged.evidence.e, 1e-300), 1.0)
+    return np.minimum(units[:, None] ** 2 * energy / np.maximum(bench.null.judged.evidence.e, 1e-300), 1.0)
 
 
 def _ends(v: Variant, name: str, unit: float) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Any smooth law: how much of a residual one, with or without memory, could explain.
+"""How much of a residual a smooth law, with or without memory, could explain.
 
 Features of each channel's column: polynomials of the angles, tension, speed, directions, distance since reversal and
 time in the trial. It is the yardstick for «none of these», never the answer.

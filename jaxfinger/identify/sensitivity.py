@@ -96,7 +96,7 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
         raise UserError(f"{session.file or 'the session'}: has none of the trials that the fit was made from")
     sources = sources_of(stacks, reads, fit.noise, parameters)
     sensors = _sensors(session, stacks, reads) if SENSORS in kinds else {}
-    scores = {e: _score_of(fit, s, [at(e) for at in sensors.values()]) for e, s in sources.items()}
+    scores = {e: _gradient_of(fit, s, [at(e) for at in sensors.values()]) for e, s in sources.items()}
     given = np.setdiff1d(np.flatnonzero(np.diag(cad_covariance(session, parameters)) > 0), _estimated(plan))
     cad = np.union1d(given, _with_prior(plan, session, parameters)).astype(int)
 
@@ -217,17 +217,17 @@ class CostGradient(eqx.Module):
     by_sensor: Float[Array, "K k"]  # its derivative by every gain
 
 
-def _score_of(fit: Fit, source: Source, changes: list[Batch]) -> CostGradient:
+def _gradient_of(fit: Fit, source: Source, changes: list[Batch]) -> CostGradient:
     free = Free.at(fit.model, source.positions)
     limit = jnp.asarray(fit.recipe.fit.huber)
     B = source.batch.x.time.shape[0]
     nothing = jax.tree.map(lambda a: np.zeros((0, *a.shape)), source.batch)
     stacked = jax.tree.map(lambda *a: np.stack(a), *changes) if changes else nothing
-    return jax.tree.map(np.asarray, _score(fit.model, free, source.batch, source.filters, limit, stacked, B))
+    return jax.tree.map(np.asarray, _gradient(fit.model, free, source.batch, source.filters, limit, stacked, B))
 
 
 @quick_jit
-def _score(model: Model, free: Free, batch: Batch, filters: Filters, limit, changes: Batch, B: int) -> CostGradient:
+def _gradient(model: Model, free: Free, batch: Batch, filters: Filters, limit, changes: Batch, B: int) -> CostGradient:
     theta = free.get(model)
 
     def rows(theta, data: Batch):
