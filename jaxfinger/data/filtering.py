@@ -83,7 +83,7 @@ def _smoothed(time: np.ndarray, x: np.ndarray, cutoff_hz: float, highest: int) -
         even = np.stack([_on_grid(time, columns[:, k], grid) for k in usable])
         coefficients = _spline(even, rate, cutoff_hz)
         at = None if grid is time else (time - grid[0]) * rate
-        found = np.stack([rate**k * _derivative(coefficients, k, at) for k in range(highest + 1)])
+        found = rate ** np.arange(highest + 1)[:, None, None] * _derivatives(coefficients, highest, at)
         out[:, :, usable] = np.moveaxis(found, 1, 2)
         out[:, ~np.isfinite(columns)] = np.nan
     return out.reshape(highest + 1, *x.shape)
@@ -105,23 +105,29 @@ def _spline(x: Float[np.ndarray, "k N"], rate: float, cutoff_hz: float) -> Float
     return found[:, reach - 2 : reach + N + 3]
 
 
-def _derivative(
-    coefficients: Float[np.ndarray, "k N+5"], order: int, at: Float[np.ndarray, " M"] | None
-) -> Float[np.ndarray, "k M"]:
-    """Of a spline, per sample to that order: at the samples, or at places counted in samples."""
+def _derivatives(
+    coefficients: Float[np.ndarray, "k N+5"], highest: int, at: Float[np.ndarray, " M"] | None
+) -> Float[np.ndarray, "d k M"]:
+    """Of a spline, per sample to the order of each, up to the highest: at the samples, or at places counted in them."""
     last = coefficients.shape[1] - 6
 
-    def at_samples(k: int, before: np.ndarray | slice) -> np.ndarray:
-        near = (coefficients[:, i : i + last + 1][:, before] for i in range(6))
-        return np.sum([w * c for w, c in zip(_B_SPLINE[k], near, strict=True) if w], axis=0)
+    def at_samples(order: int) -> Float[np.ndarray, "k N"]:
+        near = (coefficients[:, i : i + last + 1] for i in range(6))
+        return sum(w * c for w, c in zip(_B_SPLINE[order], near, strict=True) if w)
 
     if at is None:
-        return at_samples(order, slice(None))
+        return np.stack([at_samples(order) for order in range(highest + 1)])
     before = np.clip(np.floor(at).astype(int), 0, last)
-    away, out = at - before, at_samples(5, before)
-    for k in range(4, order - 1, -1):  # the interval's polynomial, by Horner's scheme
-        out = at_samples(k, before) + out * away / (k - order + 1)
-    return out
+    away, there = at - before, [at_samples(order)[:, before] for order in range(6)]
+
+    def polynomial(order: int) -> Float[np.ndarray, "k M"]:
+        """That of the interval, by Horner's scheme."""
+        out = there[5]
+        for k in range(4, order - 1, -1):
+            out = there[k] + out * away / (k - order + 1)
+        return out
+
+    return np.stack([polynomial(order) for order in range(highest + 1)])
 
 
 def _quick_length(size: int) -> int:

@@ -192,5 +192,5 @@ def joints_of(trial: Trial, finger: FingerDescription) -> tuple[str, ...]:
 
 def moving(trial: Trial, finger: FingerDescription) -> tuple[str, ...]:
     """The joints that go a tenth as far as the one that goes furthest, or more."""
-    span = np.ptp(np.nan_to_num(trial.q), axis=0)
+    span = np.array([np.ptp(column) for column in np.nan_to_num(trial.q).T])
     return tuple(name for name, s in zip(finger.joint_names, span, strict=True) if s > _MOVED * span.max())

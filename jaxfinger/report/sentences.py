@@ -109,7 +109,7 @@ def headline(d: Diagnosis) -> str:
     if not d.named and d.status in (Status.NO_GAP, Status.EXPLAINED) and tolerated(d):
         return "No gap beyond your tolerance"
     if d.status in (Status.EXPLAINED, Status.PARTLY):
-        text = f"{text}: {_listed([cause_name(c) for c in named_causes(d)])}"
+        text = f"{text}: {_listed([cause_name(c) for c in named_causes(d)], 'cause')}"
         if d.status is Status.PARTLY:
             text += f"; {percent(d.unexplained.share)} is left"
     elif d.status is Status.AMBIGUOUS and d.ambiguous_sets:
@@ -197,7 +197,7 @@ def _partly(d: Diagnosis) -> list[str]:
     left = [_left(d)]
     if stay := still_open(d.closures, d.relevance, d.tolerance):
         names = [f"{_of(x.experiment, x.channel)} ({number(x.after / x.noise, 2)} times its noise)" for x in stay]
-        left.append(f"what stays open on trials that no fit has seen is {_listed(names)}")
+        left.append(f"what stays open on trials that no fit has seen is {_listed(names, 'channel')}")
     return [size(d), "; ".join([_blamed(d), *unknown]), "; ".join(left)]
 
 
@@ -238,7 +238,7 @@ def _blamed(d: Diagnosis) -> str:
     """«tendon stretch at T3 makes 96 % of it (94 to 98 %), almost certainly»; of several, each with its share."""
     causes = named_causes(d)
     if not causes:
-        return f"the cause is {_listed([key_name(k) for k in d.named])}"
+        return f"the cause is {_listed([key_name(k) for k in d.named], 'cause')}"
     sure = certainty(min(c.probability for c in causes))
     if len(causes) == 1:
         c = causes[0]
@@ -248,7 +248,7 @@ def _blamed(d: Diagnosis) -> str:
         f"{cause_name(first)} ({percent(first.share)} of it)",
         *(f"{cause_name(c)} ({percent(c.share)})" for c in rest),
     ]
-    return f"the causes are {sure} {_listed(parts)}"
+    return f"the causes are {sure} {_listed(parts, 'cause')}"
 
 
 def _left(d: Diagnosis) -> str:
@@ -281,11 +281,11 @@ def _of(experiment: str, channel: str, column: str | None = None) -> str:
     return f"{channel_name(channel)}{f' {column}' if column else ''} of {experiment}"
 
 
-def _listed(parts: Sequence[str]) -> str:
+def _listed(parts: Sequence[str], what: str) -> str:
     """All of them, or the first few and how many more."""
     if len(parts) <= NAMED_AT_MOST:
         return joined(parts)
-    return ", ".join(parts[:NAMED_AT_MOST]) + _and_more(len(parts) - NAMED_AT_MOST, "cause")
+    return ", ".join(parts[:NAMED_AT_MOST]) + _and_more(len(parts) - NAMED_AT_MOST, what)
 
 
 def _and_more(count: int, what: str) -> str:

@@ -120,3 +120,9 @@ def test_a_long_list_of_causes_is_cut_and_counted():
     causes = tuple(replace(COUPLED, effect=f"effect_{c}", sites=((f"T{k}",),)) for k, c in enumerate("abcdef"))
     d = replace(explained(), budget=causes, named=tuple(Key(c.effect, c.sites[0]) for c in causes))
     assert sentences.headline(d).endswith("effect d at T3, and 2 more causes")
+
+
+def test_a_long_list_of_open_channels_counts_channels():
+    d = every()["still_open"]
+    lines = tuple(replace(d.closures[1], experiment=e) for e in ("VD.1", "VD.2", "VD.3", "ID.2", "ID.4", "ID.3-static"))
+    assert "and 2 more channels" in sentences.summary(replace(d, closures=lines))
