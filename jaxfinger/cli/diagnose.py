@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from json import loads
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import Output, console, plain, progress, read, refuse_output
+from jaxfinger.cli.output import Output, console, plain, print_json, progress, read, refuse_output, table
 from jaxfinger.errors import UserError
 
 FILES = ("gap.json", "nominal.json", "augmented.json", "report.html")
 
 
 def diagnose(
-    session: Path,
-    *,
+    *sessions: Path,
     output: Output,
     recipe: str | None = None,
     predictions: Path | None = None,
@@ -29,12 +29,15 @@ def diagnose(
 ) -> None:
     """Diagnose the gap between a session and the nominal model that is identified from it.
 
+    Of several sessions each has a diagnosis of its own, and a table says which cause is at work in which.
+
     Parameters
     ----------
-    session
-        Session (HDF5).
+    sessions
+        Session (HDF5), or several of one finger.
     output
-        Folder for gap.json, nominal.json, augmented.json and report.html; it is made where there is none.
+        Folder for gap.json, nominal.json, augmented.json and report.html; it is made where there is none. Of several
+        sessions each has a folder in it, named as its file.
     recipe
         The nominal model (TOML), or the name of a shipped recipe. A term that it leaves out is a candidate.
     predictions
@@ -52,12 +55,20 @@ def diagnose(
     quick
         A first look: half the samples, and no fit of causes and model together.
     json
-        Print gap.json, and nothing else, on stdout.
+        Print gap.json, and nothing else, on stdout; of several sessions an object of them, by file.
     overwrite
         Replace an earlier diagnosis in the folder.
     """
-    refuse(output, overwrite)
-    if predictions is not None and predictions.exists() and session.exists() and predictions.samefile(session):
+    folders = _folders(sessions, output)
+    for folder in folders.values():
+        refuse(folder, overwrite)
+    if predictions is not None and len(sessions) > 1:
+        raise UserError(f"{predictions}: are one session's predictions; give that session alone")
+    if (
+        predictions is not None
+        and predictions.exists()
+        and any(s.exists() and predictions.samefile(s) for s in sessions)
+    ):
         raise UserError(f"{predictions}: is the session itself; give the simulator's predictions of its trials")
     tolerated = _tolerance(tolerance or [])
     from dataclasses import replace
@@ -69,27 +80,46 @@ def diagnose(
     from jaxfinger.identify import load_fit, read_recipe
     from jaxfinger.report.gap_json import write
     from jaxfinger.report.page import write_page
-    from jaxfinger.report.screen import summary
+    from jaxfinger.report.screen import across, summary
 
-    with progress("first look" if quick else "diagnose") as say:
-        wanted = None if recipe is None and against is not None else read_recipe(recipe)
-        earlier = load_fit(against, effects) if against is not None else None
-        own = load(effects) if effects is not None else {}
-        say("reading the file")
-        simulated = read_predictions(predictions) if predictions is not None else None
-        measured = read(session)
-        make_folder(output)
-        found = run(measured, wanted, quick, own, tuple(without or ()), say, simulated, tolerated, earlier)
-        if against is not None:
-            found = replace(found, against=against.name)
-        say("writing the report")
-        write(found, output, overwrite)
-        write_page(found, output / "report.html", overwrite)
+    wanted = None if recipe is None and against is not None else read_recipe(recipe)
+    earlier = load_fit(against, effects) if against is not None else None
+    own = load(effects) if effects is not None else {}
+    simulated = read_predictions(predictions) if predictions is not None else None
+    measured = {session: read(session) for session in folders}
+    diagnoses = {}
+    for session, folder in folders.items():
+        of = f" {session.name}" if len(folders) > 1 else ""
+        with progress(f"first look{of}" if quick else f"diagnose{of}") as say:
+            make_folder(folder)
+            found = run(measured[session], wanted, quick, own, tuple(without or ()), say, simulated, tolerated, earlier)
+            if against is not None:
+                found = replace(found, against=against.name)
+            say("writing the report")
+            write(found, folder, overwrite)
+            write_page(found, folder / "report.html", overwrite)
+        diagnoses[session.name] = replace(found, problem=None)  # which holds all of its rows
+        if not json:
+            console().print(plain(summary(found)), markup=False, soft_wrap=True)
+            print(f"\n{folder / 'report.html'}: the evidence\n")
     if json:
-        print((output / "gap.json").read_text(encoding="utf-8"))
-        return
-    console().print(plain(summary(found)), markup=False, soft_wrap=True)
-    print(f"\n{output / 'report.html'}: the evidence")
+        texts = {s.name: loads((folder / "gap.json").read_text(encoding="utf-8")) for s, folder in folders.items()}
+        print_json(texts if len(texts) > 1 else next(iter(texts.values())))
+    elif len(diagnoses) > 1:
+        header, rows = across(diagnoses)
+        table("Probability of every cause, session by session, and its size", header, rows)
+
+
+def _folders(sessions: tuple[Path, ...], output: Path) -> dict[Path, Path]:
+    """Where the diagnosis of each goes."""
+    if not sessions:
+        raise UserError("diagnose needs a session (HDF5)")
+    if len(sessions) == 1:
+        return {sessions[0]: output}
+    folders = {s: output / s.stem for s in sessions}
+    if len(set(folders.values())) < len(sessions):
+        raise UserError(f"{output}: needs a folder for each session; give each once, in files of different names")
+    return folders
 
 
 def _tolerance(texts: list[str]) -> dict[str, float]:

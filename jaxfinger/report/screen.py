@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Mapping
 
-from jaxfinger.gap.result import Cause, ChannelBudget, Closure, Diagnosis
+from jaxfinger.gap.result import Cause, ChannelBudget, Closure, Diagnosis, Key
 from jaxfinger.report import sentences
 from jaxfinger.report.numbers import measured, percent, percent_range, quantity, unbroken
 from jaxfinger.report.plots.gap import rows_of, segments, shown
@@ -31,6 +32,23 @@ def summary(d: Diagnosis) -> str:
     if step := d.next_experiment:
         out += ["NEXT       " + f"{step.experiment}: {sentences.next_trial(step)}", ""]
     return "\n".join(out).rstrip()
+
+
+def across(diagnoses: Mapping[str, Diagnosis]) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of a table of several sessions: how probable every cause is in each that one of them names, and
+    where it is named its first parameter.
+    """
+    named = {key for d in diagnoses.values() for key in d.named}
+    rows = [[sentences.key_name(key), *(_said_of(key, d) for d in diagnoses.values())] for key in sorted(named)]
+    return ["cause", *diagnoses], rows
+
+
+def _said_of(key: Key, d: Diagnosis) -> str:
+    found = next((c for c in d.candidates if c.key == key), None)
+    if found is None:
+        return "not visible"
+    sizes = [f", {v.name} {measured(v.value, v.std, v.units)}" for v in found.values[:1] if key in d.named]
+    return percent(found.probability) + "".join(sizes)
 
 
 def _wrapped(text: str, indent: str = "") -> list[str]:

@@ -1,6 +1,7 @@
 """The command line, in this process: what it prints, where it writes, how it refuses."""
 
 import json
+import shutil
 import os
 import subprocess
 import sys
@@ -136,6 +137,18 @@ def test_a_first_look_at_the_axis_names_the_friction_that_its_recipe_leaves_out(
     assert "a first look" in verdict["summary"]
 
 
+def test_several_sessions_have_a_diagnosis_each_and_a_table_of_their_causes(folder, tmp_path, capsys):
+    again = tmp_path / "again.h5"
+    shutil.copy(folder / "emps.h5", again)
+    recipe, out = ROOT / "fits" / "emps-no-coulomb.toml", tmp_path / "out"
+    assert run("diagnose", folder / "emps.h5", again, "--recipe", recipe, "--quick", "-o", out) == 0
+    header, row = [line for line in capsys.readouterr().out.splitlines() if line.startswith(("cause", "joint coulomb"))]
+    assert header.split() == ["cause", "emps.h5", "again.h5"]
+    assert row.count("over 99 %, c0 ") == 2
+    one, other = (json.loads((out / name / "gap.json").read_text(encoding="utf-8")) for name in ("emps", "again"))
+    assert one | {"data": "again.h5"} == other
+
+
 def test_show_prints_tables_and_what_to_do_about_a_misfit(folder, capsys):
     assert run("show", folder / "fit.json") == 0
     out = capsys.readouterr().out
@@ -204,6 +217,8 @@ def test_a_stage_at_a_time(folder, tmp_path, capsys):
         (("diagnose", "{f}/emps.h5", "-o", "{t}", "--effects", "{f}"), "is not a Python file with effects"),
         (("diagnose", "{f}/emps.h5", "-o", "{t}", "--against", "{f}/emps.h5"), "is an HDF5 file and no fit"),
         (("diagnose", "{f}/emps.h5", "-o", "{t}", "--quik"), None),
+        (("diagnose", "-o", "{t}"), "needs a session"),
+        (("diagnose", "{f}/emps.h5", "{f}/emps.h5", "-o", "{t}"), "in files of different names"),
         (("demo", "-o", "{f}/fit.json"), "is a file"),
         (("look", "{f}/none.csv"), "does not exist"),
         (("simulate", "{f}/emps.h5", "-o", "{t}/x.h5"), "is not text"),

@@ -1,9 +1,11 @@
 """The diagnosis on one screen."""
 
+from dataclasses import replace
+
 import pytest
 
 from jaxfinger.report import sentences
-from jaxfinger.report.screen import summary
+from jaxfinger.report.screen import across, summary
 
 from .fabricated import every
 
@@ -26,3 +28,14 @@ def test_a_bar_shows_every_part():
     assert bar.count("▓") in range(17, 20)  # 62 % of a gap that is 97 % of the bar
     assert bar.count("?") in (1, 2)
     assert "▓ joint Stribeck at PIP" in text
+
+
+def test_a_table_of_several_sessions_says_which_cause_is_at_work_in_which():
+    header, rows = across({"monday.h5": ALL["two"], "tuesday.h5": ALL["partly_ambiguous"], "rest.h5": replace(ALL["no_gap"], candidates=())})
+    assert header == ["cause", "monday.h5", "tuesday.h5", "rest.h5"]
+    said = {row[0]: row[1:] for row in rows}
+    assert set(said) == {"tendon stretch at T3", "joint Stribeck at PIP"}
+    monday, tuesday, rest = said["tendon stretch at T3"]
+    assert " %, compliance " in monday
+    assert tuesday == "50 %"  # not named there: no size
+    assert rest == "not visible"
