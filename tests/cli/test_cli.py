@@ -1,8 +1,8 @@
 """The command line, in this process: what it prints, where it writes, how it refuses."""
 
 import json
-import shutil
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path

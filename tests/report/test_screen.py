@@ -31,7 +31,13 @@ def test_a_bar_shows_every_part():
 
 
 def test_a_table_of_several_sessions_says_which_cause_is_at_work_in_which():
-    header, rows = across({"monday.h5": ALL["two"], "tuesday.h5": ALL["partly_ambiguous"], "rest.h5": replace(ALL["no_gap"], candidates=())})
+    header, rows = across(
+        {
+            "monday.h5": ALL["two"],
+            "tuesday.h5": ALL["partly_ambiguous"],
+            "rest.h5": replace(ALL["no_gap"], candidates=()),
+        }
+    )
     assert header == ["cause", "monday.h5", "tuesday.h5", "rest.h5"]
     said = {row[0]: row[1:] for row in rows}
     assert set(said) == {"tendon stretch at T3", "joint Stribeck at PIP"}
