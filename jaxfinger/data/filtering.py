@@ -113,7 +113,7 @@ def _derivatives(
 
     def at_samples(order: int) -> Float[np.ndarray, "k N"]:
         near = (coefficients[:, i : i + last + 1] for i in range(6))
-        return sum(w * c for w, c in zip(_B_SPLINE[order], near, strict=True) if w)
+        return np.asarray(sum(w * c for w, c in zip(_B_SPLINE[order], near, strict=True) if w))
 
     if at is None:
         return np.stack([at_samples(order) for order in range(highest + 1)])

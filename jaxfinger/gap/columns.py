@@ -64,13 +64,21 @@ class Columns:
 class ByColumn:
     """Rows, column by column: their coefficients on the features, and their products, each made once."""
 
-    def __init__(self, columns: Columns, x: Float[np.ndarray, "k N"]):
-        self.parts = [x[:, c.rows] for c in columns.items]
+    def __init__(self, columns: Columns, *blocks: Float[np.ndarray, "k N"]):
+        self.columns, self.N = columns, blocks[0].shape[1]
+        self.parts = [np.concatenate([x[:, c.rows] for x in blocks]) for c in columns.items]
         self.B: Float[np.ndarray, "features k"] = np.concatenate(
             [c.basis.T @ p.T for c, p in zip(columns.items, self.parts, strict=True)]
         )
         self._with: WeakKeyDictionary[ByColumn, np.ndarray] = WeakKeyDictionary()
         self._among: dict[tuple[int, ...], np.ndarray] = {}
+
+    def rows(self, at: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k N"]:
+        """Some of the rows as they were, zero in columns that are not judged."""
+        out = np.zeros((len(at), self.N))
+        for c, part in zip(self.columns.items, self.parts, strict=True):
+            out[:, c.rows] = part[at]
+        return out
 
     def products(self, other: "ByColumn") -> Float[np.ndarray, "C k l"]:
         """With other rows."""

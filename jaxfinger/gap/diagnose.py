@@ -42,7 +42,7 @@ from jaxfinger.gap.result import (
     still_open,
     tolerated,
 )
-from jaxfinger.gap.screening import Screening
+from jaxfinger.gap.screening import read_parts
 from jaxfinger.gap.sets import Offered, Search, Table, table_of
 from jaxfinger.gap.signatures import catalogue_for, changes_of, variants
 from jaxfinger.gap.smooth_laws import Explained, explained
@@ -169,8 +169,8 @@ def searched(
     """All sets of the catalogue's effects that the evidence led to, and the best of them."""
     bench = Bench.of(problem, Parameters())
     progress("reading the signatures of all effects")
-    screening = Screening.of(problem, variants(catalogue, problem.nominal.finger, problem.scales), progress)
-    search = Search(bench, table_of(problem, bench, screening), progress)
+    parts = read_parts(problem, variants(catalogue, problem.nominal.finger, problem.scales), progress)
+    search = Search(bench, table_of(problem, bench, parts), progress)
     progress("weighing the evidence")
     return search, search.run()
 
@@ -364,7 +364,11 @@ def _candidates(problem: Problem, search: Search, chosen: State, found: Posterio
     others = search.alone(k for k in order if k not in inside)
     likely = [k for k in order if k in others][:HELD_OUT]
     gain |= dict(
-        zip(likely, held_out_gains(problem, [search.table.Z[others[k][0].columns] for k in likely]), strict=True)
+        zip(
+            likely,
+            held_out_gains(problem, [search.table.signatures.rows(others[k][0].columns) for k in likely]),
+            strict=True,
+        )
     )
     values = inside | {k: _alone(problem, search.table, *x) for k, x in others.items()}
     return tuple(

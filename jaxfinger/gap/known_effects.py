@@ -10,7 +10,7 @@ from jaxfinger.gap.augment import augmented_fit
 from jaxfinger.gap.exact import Bench
 from jaxfinger.gap.formula import Parameters
 from jaxfinger.gap.problem import Problem, build
-from jaxfinger.gap.screening import Screening
+from jaxfinger.gap.screening import read_parts
 from jaxfinger.gap.sets import Search, table_of
 from jaxfinger.gap.signatures import Variant, catalogue_for, variants
 from jaxfinger.identify import Fit, Recipe
@@ -46,7 +46,7 @@ def fit_with(
     problem = build(session, recipe, progress)
     offered = _offered(catalogue, keys, problem)
     bench = Bench.of(problem, Parameters())
-    table = table_of(problem, bench, Screening.of(problem, offered, progress), together=False)
+    table = table_of(problem, bench, read_parts(problem, offered, progress), together=False)
     wanted = list(dict.fromkeys(v.key for v in offered))
     if unseen := [k for k in wanted if k not in table.keys]:
         (effect, site), file = unseen[0], session.file or "the session"

@@ -1,5 +1,6 @@
 """Screening: the signatures of every candidate, read once."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Protocol, runtime_checkable
@@ -95,30 +96,26 @@ class Scan:
         return dict(zip(names, self.periods[sets[most]].tolist(), strict=True))
 
 
-@dataclass(frozen=True)
-class Screening:
-    """Signatures of every candidate."""
+Part = FixedShapes | Scan
 
-    parts: dict[tuple, FixedShapes | Scan]
 
-    @classmethod
-    def of(cls, problem: Problem, items: list[Variant], progress: Progress = lambda message: None) -> "Screening":
-        """Signatures at the problem's nominal model; classes are compiled side by side."""
-        signatures, groups = Signatures(problem), {}
-        for v in items:
-            groups.setdefault(_part(v), []).append(v)
+def read_parts(problem: Problem, items: list[Variant], progress: Progress = lambda message: None) -> Iterator[Part]:
+    """Signatures of every candidate at the problem's nominal model, class by class: together they fill the memory, so
+    that nobody keeps them twice. Classes are compiled side by side.
+    """
+    signatures, groups = Signatures(problem), {}
+    for v in items:
+        groups.setdefault(_part(v), []).append(v)
 
-        def read(group: list[Variant]) -> FixedShapes | Scan:
-            effect = group[0].effect
-            if effect.periods() and any(e in problem.stacks for e in shows(effect, problem.nominal.finger)):
-                return Scan.of(signatures, group)
-            return FixedShapes(group, signatures.columns(group))
+    def read(group: list[Variant]) -> Part:
+        effect = group[0].effect
+        if effect.periods() and any(e in problem.stacks for e in shows(effect, problem.nominal.finger)):
+            return Scan.of(signatures, group)
+        return FixedShapes(group, signatures.columns(group))
 
-        parts = {}
-        for key, part in zip(groups, side_by_side(read, groups.values()), strict=True):
-            parts[key] = part
-            progress(f"signatures of {key[0]} ({len(parts)} of {len(groups)} effects)")
-        return cls(parts)
+    for count, (key, part) in enumerate(zip(groups, side_by_side(read, groups.values()), strict=True), start=1):
+        progress(f"signatures of {key[0]} ({count} of {len(groups)} effects)")
+        yield part
 
 
 def _part(v: Variant) -> tuple:

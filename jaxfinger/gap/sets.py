@@ -13,7 +13,7 @@ from jaxfinger.gap.costs import Costs, Key
 from jaxfinger.gap.exact import Bench, State, Whitened, fitted, prior_products
 from jaxfinger.gap.formula import Evidence, Judged, Linear, Weights, unexplained
 from jaxfinger.gap.problem import Problem
-from jaxfinger.gap.screening import Screening
+from jaxfinger.gap.screening import Part
 from jaxfinger.gap.signatures import Variant
 from jaxfinger.identify.stages import Progress
 
@@ -56,8 +56,7 @@ class Offered:
 class Table:
     """All signatures at the nominal model, each in units of its prior, and what is made of them."""
 
-    Z: Float[np.ndarray, "M N"]
-    signatures: ByColumn  # the same
+    signatures: ByColumn
     rows: dict[Variant, Int[np.ndarray, " k"]]  # of every variant: all of its amplitudes'
     units: Float[np.ndarray, " M"]
     absorbed: dict[Key, float]
@@ -75,54 +74,63 @@ class Table:
         return list(self.touched)
 
 
-def table_of(problem: Problem, bench: Bench, screening: Screening, together: bool = True) -> Table:
+def table_of(problem: Problem, bench: Bench, parts: Iterable[Part], together: bool = True) -> Table:
     """Every candidate that the trials can see."""
     plain = Whitened(problem, bench.columns, Weights(*np.ones((2, len(bench.columns.items)))))
     rt = plain.residual(problem.r)
     items: list[Variant] = []
-    blocks = []
-    for part in screening.parts.values():
+    blocks, counts = [np.empty((0, problem.r.size))], []
+    found = [_seen(bench, plain, blocks[0])]
+    for part in parts:
         variants, Z = part.offer(plain, rt)
         items += variants
-        blocks += list(Z)
-    Z = np.concatenate(blocks)
-    projected = plain(Z)
-    raw, seen = np.linalg.norm(Z, axis=1), np.linalg.norm(projected, axis=1)
-    kept = seen > SEEN * raw
-    units = np.where(kept, bench.gap / np.maximum(seen, 1e-300), 0.0)
-    Z *= units[:, None]
-    claims = _claims(bench, projected, units)
+        counts += [Z.shape[1]] * len(Z)
+        blocks.append(Z.reshape(-1, Z.shape[2]))
+        found.append(_seen(bench, plain, blocks[-1]))
+        blocks[-1] *= found[-1].units[:, None]
+    raw, seen, units, claims = (np.concatenate(x) for x in zip(*found, strict=True))
+    kept = units > 0.0
     absorbed: dict[Key, float] = {}
     hidden: dict[Key, dict[str, float]] = {}
     touched: dict[Key, Float[np.ndarray, " C"]] = {}
     offers, rows, start = [], {}, 0
-    for v, block in zip(items, blocks, strict=True):
-        at = np.arange(start, start + len(block))
-        start += len(block)
+    for v, count in zip(items, counts, strict=True):
+        at = np.arange(start, start + count)
+        start += count
         rows[v] = at
         share = 1.0 - float(np.sum(seen[at] ** 2) / max(np.sum(raw[at] ** 2), 1e-300))
         if share < absorbed.get(v.key, np.inf):
             absorbed[v.key] = share
             hidden[v.key] = {
-                n: size / max(seen[i], 1e-12 * raw[i], 1e-300)
+                n: size / float(max(seen[i], 1e-12 * raw[i], 1e-300))
                 for i, (n, size) in zip(at, v.sizes.items(), strict=True)
                 if raw[i] > 0
             }
-        ends = [_ends(v, n, units[i]) for i, n in zip(at, v.sizes, strict=True) if kept[i]]
+        ends = [_ends(v, n, float(units[i])) for i, n in zip(at, v.sizes, strict=True) if kept[i]]
         if ends:
             low, high = np.array(ends).T
             offers.append(Offered((v,), at[kept[at]], low, high))
             touched[v.key] = np.maximum(touched.get(v.key, 0.0), claims[at].max(axis=0))
     offers += _together(offers) if together else []
-    return Table(Z, ByColumn(bench.columns, Z), rows, units, absorbed, hidden, touched, offers)
+    return Table(ByColumn(bench.columns, *blocks), rows, units, absorbed, hidden, touched, offers)
 
 
-def _claims(
-    bench: Bench, projected: Float[np.ndarray, "M N"], units: Float[np.ndarray, " M"]
-) -> Float[np.ndarray, "M C"]:
-    """Share of each column's gap that a signature would explain if it explained as much as all of the gap."""
+class Seen(NamedTuple):
+    """What of signatures the nominal parameters leave."""
+
+    raw: Float[np.ndarray, " M"]  # norms
+    seen: Float[np.ndarray, " M"]  # likewise, off what the nominal parameters can absorb
+    units: Float[np.ndarray, " M"]  # that make it as large as all of the gap; zero where next to nothing is left
+    claims: Float[np.ndarray, "M C"]  # share of each column's gap that it then explains
+
+
+def _seen(bench: Bench, plain: Whitened, Z: Float[np.ndarray, "M N"]) -> Seen:
+    projected = plain(Z)
+    raw, seen = np.linalg.norm(Z, axis=1), np.linalg.norm(projected, axis=1)
+    units = np.where(seen > SEEN * raw, bench.gap / np.maximum(seen, 1e-300), 0.0)
     energy = np.stack([np.sum((projected[:, c.rows] @ c.basis) ** 2, axis=1) for c in bench.columns.items], axis=1)
-    return np.minimum(units[:, None] ** 2 * energy / np.maximum(bench.null.judged.evidence.e, 1e-300), 1.0)
+    share = units[:, None] ** 2 * energy / np.maximum(bench.null.judged.evidence.e, 1e-300)
+    return Seen(raw, seen, units, np.minimum(share, 1.0))
 
 
 def _ends(v: Variant, name: str, unit: float) -> tuple[float, float]:
