@@ -71,6 +71,17 @@ def _white(r, batch: Batch, filters: Filters, channel: str):
     return whiten(r, batch.mask[channel], filters[channel], demean=CHANNELS[channel].free_zero)
 
 
+def _white_slopes(slopes: Float[np.ndarray, "p columns B T"], batch: Batch, filters: Filters, channel: str):
+    """Column by column, the derivatives by those parameters that it depends on."""
+    out, mask, coefficients = np.zeros_like(slopes), batch.mask[channel], filters[channel]
+    for k in range(slopes.shape[1]):
+        at, column = np.flatnonzero(slopes[:, k].any(axis=(1, 2))), slice(k, k + 1)
+        out[at, column] = whiten(
+            slopes[at, column], mask[column], coefficients[column], demean=CHANNELS[channel].free_zero
+        )
+    return out
+
+
 def _flat(white: dict):
     """(…, columns, B, T) of every channel as (…, B, rows)."""
     values = list(white.values())
@@ -129,7 +140,7 @@ def whitened(
     every trial with its weight, 1 by default.
     """
     white = white_of(along.residuals, batch, filters)
-    J = np.moveaxis(white_of(along.slopes, batch, filters), 0, -1)
+    J = np.moveaxis(_flat({c: _white_slopes(along.slopes[c], batch, filters, c) for c in filters}), 0, -1)
     factor = factored(white, J, limit)
     return Linearised(
         along.residuals, white, J, factor if weights is None else np.sqrt(weights)[:, None, None] * factor
