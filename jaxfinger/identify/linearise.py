@@ -76,9 +76,10 @@ def _white_slopes(slopes: Float[np.ndarray, "p columns B T"], batch: Batch, filt
     out, mask, coefficients = np.zeros_like(slopes), batch.mask[channel], filters[channel]
     for k in range(slopes.shape[1]):
         at, column = np.flatnonzero(slopes[:, k].any(axis=(1, 2))), slice(k, k + 1)
-        out[at, column] = whiten(
-            slopes[at, column], mask[column], coefficients[column], demean=CHANNELS[channel].free_zero
-        )
+        with np.errstate(invalid="ignore"):
+            out[at, column] = whiten(
+                slopes[at, column], mask[column], coefficients[column], demean=CHANNELS[channel].free_zero
+            )
     return out
 
 
