@@ -242,7 +242,7 @@ def _dead(trial: Trial, finger: FingerDescription, report: Report) -> None:
         values = getattr(trial, name)
         if values is None:
             continue
-        still = columns & np.array([np.ptp(column) == 0.0 for column in values.T])  # NaN is not still
+        still = columns & np.array([np.ptp(column) == 0.0 for column in values.T], bool)  # NaN is not still
         if name == "tendon_force":
             still &= values[0] == 0.0
         if name == "fingertip_force" and not still[columns].all():

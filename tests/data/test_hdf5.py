@@ -151,7 +151,9 @@ def test_a_prismatic_axis_has_units_of_length_and_force(session, tmp_path):
     trial = replace(
         session["03-ID.3-dynamic-MCP"], time=time, q=sweep, joint_torque=500 * sweep, joint="axis", tendon_force=None
     )
-    write_session(replace(session, finger=finger, trials={trial.name: trial}), tmp_path / "a.h5")
+    free = replace(trial, name="free", experiment="VD.3", joint=None, tendon_force=np.zeros((count, 0)))
+    trials = {t.name: t for t in (trial, free)}
+    write_session(replace(session, finger=finger, trials=trials), tmp_path / "a.h5")
     with h5py.File(tmp_path / "a.h5") as opened:
         assert opened[f"trials/{trial.name}/q"].attrs["units"] == "m"
         assert opened[f"trials/{trial.name}/joint_torque"].attrs["units"] == "N"
