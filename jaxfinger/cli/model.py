@@ -20,6 +20,7 @@ def identify(
     output: Output,
     recipe: str | None = None,
     joint: bool = False,
+    ahead: bool = False,
     figures: Path | None = None,
     json: bool = False,
     overwrite: bool = False,
@@ -38,6 +39,8 @@ def identify(
         What to fit (TOML), or the name of a shipped one: paper, human-like, emps. By default the paper's.
     joint
         Refine all parameters on all trials at once afterwards.
+    ahead
+        Likewise, on the motion of VD.3 too, by the angles that it predicts a moment ahead.
     figures
         Folder for the paper's figures of this fit.
     json
@@ -57,8 +60,8 @@ def identify(
         say("reading the file")
         session = read(file)
         fit = run(session, wanted, progress=say)
-        if joint:
-            fit = _refine(fit, session, say)
+        if joint or ahead:
+            fit = _refine(fit, session, say, ahead)
         content = _keep(fit, output, overwrite)
         if figures is not None:
             _draw(fit, session, figures, overwrite, say)
@@ -159,7 +162,9 @@ def fit_id4(
     _fit(("ID.4",), file, output, start, None, json, overwrite)
 
 
-def fit_joint(file: Path, *, output: Output, start: Path, json: bool = False, overwrite: bool = False) -> None:
+def fit_joint(
+    file: Path, *, output: Output, start: Path, ahead: bool = False, json: bool = False, overwrite: bool = False
+) -> None:
     """Refine every parameter on all trials at once.
 
     Parameters
@@ -170,6 +175,8 @@ def fit_joint(file: Path, *, output: Output, start: Path, json: bool = False, ov
         Fit to write (JSON).
     start
         The staged fit to refine.
+    ahead
+        On the motion of VD.3 too, by the angles that the fit predicts a moment ahead.
     json
         Print the parameters as JSON.
     overwrite
@@ -183,7 +190,7 @@ def fit_joint(file: Path, *, output: Output, start: Path, json: bool = False, ov
         say("reading the file")
         session, first = read(file), load_fit(start)
         model_for(first, session)
-        fit = _refine(first, session, say)
+        fit = _refine(first, session, say, ahead)
         content = _keep(fit, output, overwrite)
     _report(content, json)
 
@@ -362,11 +369,11 @@ def _keep(fit, output: Path, overwrite: bool) -> dict:
     return content
 
 
-def _refine(fit, session, say):
+def _refine(fit, session, say, ahead: bool):
     from jaxfinger.identify import refine
 
     say("refining on all trials at once")
-    return refine(session, fit, say)
+    return refine(session, fit, say, ahead)
 
 
 def _draw(fit, session, folder: Path, overwrite: bool, say) -> None:

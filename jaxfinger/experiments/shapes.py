@@ -22,7 +22,11 @@ def roomy(size: int, least: int) -> int:
 
 
 def blocks(batch: Batch) -> list[Batch]:
-    """The batch in stacks of TRIALS trials of a common length; what is added holds the last values, and counts not."""
+    """The batch in stacks of TRIALS trials of a common length; what is added holds the last values, and counts not.
+    One to simulate stays whole: its samples cost too much to add any.
+    """
+    if batch.x.ahead is not None:
+        return [batch]
     B, T = batch.x.time.shape
     ends = (-B % TRIALS, roomy(T, SAMPLES) - T)
     counting = {c: np.pad(a, [(0, 0), (0, ends[0]), (0, ends[1])]) for c, a in batch.mask.items()}

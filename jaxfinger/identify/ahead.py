@@ -34,7 +34,7 @@ class Ahead:
     noise: Float[np.ndarray, " m"]  # standard deviation of the error where the model is right
 
 
-class _Measured(NamedTuple):
+class Measured(NamedTuple):
     """One trial on an even clock, and the standard deviations of its state and tension."""
 
     time: Float[np.ndarray, " T"]
@@ -66,7 +66,7 @@ def noise_of_simulation(model: Model, session: Session, stack: Stack) -> Float[n
     x = model.true_motion(stack.batch.x)
     squares = []
     for b, name in enumerate(stack.trials):
-        m = _measured(session[name], stack, b, x)
+        m = measured(session[name], stack, b, x)
         one = _windows(m, np.zeros(1, int), m.time.size)
         squares.append(np.mean(_changed(model, m, one, np.random.default_rng(b))[1][0] ** 2, axis=-1))
     return np.sqrt(np.mean(squares, axis=0))
@@ -87,7 +87,7 @@ def _ends(limits: Float[np.ndarray, "m 2"]) -> tuple[Float[np.ndarray, " m"], Fl
 
 def _trial(model: Model, trial: Trial, stack: Stack, b: int, x, limits: Float[np.ndarray, "m 2"]):
     """Error and noise of every horizon: (starts, m)."""
-    m = _measured(trial, stack, b, x)
+    m = measured(trial, stack, b, x)
     step = m.time[1] - m.time[0]
     reach = [max(1, round(h / step)) for h in HORIZONS]
     first = np.arange(0, m.time.size - reach[0], max(1, round(EVERY / step)))
@@ -103,7 +103,7 @@ def _trial(model: Model, trial: Trial, stack: Stack, b: int, x, limits: Float[np
     return errors, noises
 
 
-def _measured(trial: Trial, stack: Stack, b: int, x) -> _Measured:
+def measured(trial: Trial, stack: Stack, b: int, x) -> Measured:
     time, N = np.asarray(trial.time), len(trial.time)
     step = float(np.median(np.diff(time)))
     even = np.arange(int(np.floor((time[-1] - time[0]) / step)) + 1) * step
@@ -121,22 +121,22 @@ def _measured(trial: Trial, stack: Stack, b: int, x) -> _Measured:
     most = 4.0 * 1.4826 * np.median(np.abs(rest), axis=0)
     start = float(np.asarray(x.session_time - x.time)[b, 0])
     noise = on(np.clip(rest, -most, most))  # jumps of the tension itself are none
-    return _Measured(even, on(q), on(qd), on(tension), start, value[:, None], rate[:, None], noise)
+    return Measured(even, on(q), on(qd), on(tension), start, value[:, None], rate[:, None], noise)
 
 
-def _surrogate(noise: Float[np.ndarray, "n T"], rng: np.random.Generator) -> Float[np.ndarray, "n T"]:
+def surrogate(noise: Float[np.ndarray, "n T"], rng: np.random.Generator) -> Float[np.ndarray, "n T"]:
     """Another noise of the same spectrum: its phases drawn anew (Theiler et al. 1992)."""
     spectrum = np.fft.rfft(noise, axis=-1)
     turn = np.exp(2j * np.pi * rng.random(spectrum.shape))
     return np.fft.irfft(spectrum * turn, noise.shape[-1], axis=-1)
 
 
-def _windows(m: _Measured, first: np.ndarray, length: int) -> Float[np.ndarray, "starts T"]:
+def _windows(m: Measured, first: np.ndarray, length: int) -> Float[np.ndarray, "starts T"]:
     """Samples from every start on; beyond the trial's end its last."""
     return np.minimum(first[:, None] + np.arange(length), m.time.size - 1)
 
 
-def _changed(model: Model, m: _Measured, at: np.ndarray, rng: np.random.Generator):
+def _changed(model: Model, m: Measured, at: np.ndarray, rng: np.random.Generator):
     """Simulated angles from every start, and by how much noise of state and tension changes them: (starts, m, T)."""
     step, (count, T) = float(m.time[1] - m.time[0]), at.shape
     wide = np.minimum(np.arange(roomy(count, 2)), count - 1)
@@ -146,7 +146,7 @@ def _changed(model: Model, m: _Measured, at: np.ndarray, rng: np.random.Generato
     first = at[:, 0]
     q, qd, f = m.q[:, first].T, m.qd[:, first].T, np.moveaxis(m.tension[:, at], 1, 0)
     drawn = [a + s * rng.standard_normal(a.shape) for a, s in ((q, m.q_std.T), (qd, m.qd_std.T))]
-    drawn.append(np.moveaxis((m.tension + _surrogate(m.tension_noise, rng))[:, at], 1, 0))
+    drawn.append(np.moveaxis((m.tension + surrogate(m.tension_noise, rng))[:, at], 1, 0))
     starts = m.session_start + m.time[first]
     substeps = max(1, int(np.ceil(step / STEP - 1e-6)))
     clock = jnp.asarray(step * np.arange(long))

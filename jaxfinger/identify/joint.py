@@ -17,11 +17,13 @@ from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.identifiability import name_invisible
+from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.predictions import model_for
 from jaxfinger.identify.prior import prior_of
 from jaxfinger.identify.propagate import propagate
+from jaxfinger.identify.shooting import AHEAD, Shooting, shooting
 from jaxfinger.identify.solve import solve, within
 from jaxfinger.identify.stages import (
     Progress,
@@ -41,21 +43,28 @@ STAGE = "joint"
 MISFIT = 1.3  # χ² a row above which another start is tried
 
 
-def refine(session: Session, fit: Fit, progress: Progress = lambda message: None) -> Fit:
-    """The fit refined on all trials of `recipe.fit.joint_experiments`; its last stage report says what it gained.
+def refine(session: Session, fit: Fit, progress: Progress = lambda message: None, ahead: bool = False) -> Fit:
+    """The fit refined on all trials of `recipe.fit.joint_experiments`; its last stage report says what it gained. With
+    `ahead` on those of VD.3 too, by the angles that it predicts a moment ahead (`shooting`).
 
     >>> import jaxfinger as jf
     >>> jf.refine(jf.read("session.h5"), jf.load("fit.json"))
     Fit('EMPS', recipe 'emps': 4 parameters; ID.3-dynamic fitted, joint fitted)
 
     Raises:
-        UserError: the session has none of these trials, or its finger is another one.
+        UserError: the session has none of these trials, with `ahead` no VD.3 either, or its finger is another one.
     """
     recipe = fit.recipe
     model = start = model_for(fit, session)
     progress("reading the recordings")
     stacks = prepare(session, [t.name for t in session if t.experiment in recipe.fit.joint_experiments])
     reads = {e: channels_of(e) for e in stacks}
+    given: dict[tuple[str, str], Noise] = {}
+    shots: Shooting | None = None
+    if ahead:
+        progress("simulating VD.3")
+        shots, stacks[AHEAD] = shooting(model, session)
+        reads[AHEAD], given[AHEAD, "q"] = ("q",), shots.noise(model)
     if not reads:
         raise UserError(
             f"{session.file or 'the session'}: has no trial of {', '.join(recipe.fit.joint_experiments)}; "
@@ -75,7 +84,8 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         prior = prior_of(np.asarray(ravel(fit.model)), fit.covariance, free)
     progress("refining on all trials at once")
     known, huber = (fit.noise if same else {}), recipe.fit.huber
-    model, solution, sources, noise = estimate_with_noise(model, free, stacks, reads, known, prior, huber)
+    model, solution, sources, noise = estimate_with_noise(model, free, stacks, reads, known, prior, huber, given=given)
+    noise = {key: n for key, n in noise.items() if key not in given}
     warnings = name_invisible(parameters, free, solution.invisible)
     if not solution.converged or warnings or solution.chi2_per_row(free.size) > MISFIT:
         progress("refining from a neutral start")
@@ -88,7 +98,15 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
                 "the earlier fit led to a poorer optimum",
             ]
 
+    if shots is not None:
+        progress("refining without what noise bends")
+        sources[AHEAD] = sources[AHEAD]._replace(batch=shots.straightened(model))
+        bent = np.asarray(ravel(model))
+        model, solution = solve(model, free, sources, prior, huber)
     covariance = propagate(fit.covariance, solution, sources, free, prior, huber)
+    if ahead:
+        theta = np.asarray(ravel(model))
+        covariance += _contradicted(refine(session, fit), theta, covariance) + np.outer(theta - bent, theta - bent)
     warnings += implausible(model, covariance, free, within(start, free)[0])
     refined = replace(
         fit,
@@ -101,6 +119,17 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
     trials = tuple(t for s in stacks.values() for t in s.trials)
     report = report_of(STAGE, solution, free, trials, warnings, _gain(fit, refined, same))
     return replace(refined, stages=(*fit.stages, report))
+
+
+def _contradicted(without: Fit, theta: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """What an estimate's covariance grows by where VD.3 moves it further from that `without` it than chance does: the
+    variance of such a move is the difference of both.
+    """
+    moved = theta - np.asarray(ravel(without.model))
+    with np.errstate(invalid="ignore"):  # of what neither sees
+        chance = np.maximum(np.nan_to_num(without.std**2 - np.diag(covariance), nan=np.inf), 0.0)
+    beyond = np.sign(moved) * np.sqrt(np.maximum(moved**2 - chance, 0.0))
+    return np.outer(beyond, beyond)
 
 
 def channels_of(experiment: str) -> tuple[str, ...]:

@@ -115,6 +115,8 @@ def tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -
 
     Compiled for a block of trials (`blocks`), whose additions are cut off again.
     """
+    if batch.x.ahead is not None:
+        return Tangent(*jax.tree.map(np.asarray, _simulated_tangent(model, free, batch, channels)))
     parts = [_tangent(model, free, block, channels, jax.device_put(True)) for block in blocks(batch)]
     residuals, slopes = zip(*parts, strict=True)
     return Tangent(_cut(residuals, batch), _cut(slopes, batch))
@@ -122,6 +124,8 @@ def tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -
 
 def missed(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> dict[str, np.ndarray]:
     """`residuals_of`, by the program of `tangent`: where that is compiled, it costs no compilation."""
+    if batch.x.ahead is not None:
+        return residuals_of(model, batch, channels)
     return _cut([_tangent(model, free, block, channels, jax.device_put(False))[0] for block in blocks(batch)], batch)
 
 
@@ -179,6 +183,24 @@ def _cut(parts: Sequence[dict[str, Array]], batch: Batch) -> dict[str, np.ndarra
 
 
 _residuals_jit = quick_jit(_residuals)
+
+
+@quick_jit
+def _simulated_tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> tuple[dict, dict]:
+    """Residuals of simulations and their derivatives, backwards start by start: each has a few angles, that many
+    parameters lead to.
+    """
+    shape = batch.x.time.shape
+    starts = jax.tree.map(lambda a: a.reshape(*a.shape[:-2], -1), batch)
+    values, split = ravel_pytree(free.values(model))
+
+    def one(values, start: Batch):
+        missed = _residuals(free.put(model, split(values)), start, channels)
+        return missed, missed
+
+    slopes, missed = jax.vmap(jax.jacrev(one, has_aux=True), in_axes=(None, -1), out_axes=-1)(values, starts)
+    apart = jax.tree.map(lambda a: a.reshape(*a.shape[:-1], *shape), (missed, slopes))
+    return apart[0], {c: jnp.moveaxis(J, 1, 0) for c, J in apart[1].items()}
 
 
 @quick_jit

@@ -4,9 +4,10 @@ Each stage is equation (1) with the terms that its experiment makes vanish, and 
 parameters of earlier stages stay fixed, and their errors go on (`propagate`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import equinox as eqx
 import jax
@@ -23,6 +24,7 @@ from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.propagate import propagate
 from jaxfinger.identify.recipe import Recipe
+from jaxfinger.identify.shooting import AHEAD
 from jaxfinger.identify.solve import ROUGH, Solution, Source, Tangents, solve, within
 from jaxfinger.identify.start import start_values
 from jaxfinger.model import Finger, Model
@@ -72,6 +74,7 @@ DEPENDS = {
     ("VD.2", "tendon_excursion"): {"moment_arm"},
     ("VD.3", "joint_torque"): _TORQUE | _HELD_TORQUE,
     ("VD.3", "tendon_excursion"): {"moment_arm"},
+    (AHEAD, "q"): _TORQUE | _HELD_TORQUE,
 }
 
 GROUP_OF_TERM = {
@@ -260,15 +263,18 @@ def estimate_with_noise(
     prior: Prior | None,
     huber: float,
     tangents: Tangents | None = None,
+    given: Mapping[tuple[str, str], Noise] = MappingProxyType({}),
 ) -> tuple[Model, Solution, dict[str, Source], dict[tuple[str, str], Noise]]:
-    """Noise from the residuals of a fit with first guesses of it, where it is not known; then the fit under it."""
-    tangents, parameters, noise = tangents or Tangents(), describe(model), dict(known)
+    """Noise from the residuals of a fit with first guesses of it, where it is not known; then the fit under it. What is
+    `given` stays: its residuals do not tell it.
+    """
+    tangents, parameters, noise = tangents or Tangents(), describe(model), known | dict(given)
     unknown = {(e, c): first_noise(stacks[e], c) for e in reads for c in reads[e] if (e, c) not in noise}
     model = start_values(model, free, parameters, sources_of(stacks, reads, noise | unknown, parameters))
     for _ in range(2 if unknown else 0):
         sources = sources_of(stacks, reads, noise | unknown, parameters)
         model, solution = solve(model, free, sources, prior, tangents=tangents, small=ROUGH)
-        noise |= _noise(solution, stacks, reads)
+        noise |= _noise(solution, stacks, reads, given)
         unknown = {}
     sources = sources_of(stacks, reads, noise, parameters)
     model, solution = solve(model, free, sources, prior, huber, tangents=tangents)
@@ -325,11 +331,12 @@ def first_noise(stack: Stack, channel: str) -> Noise:
     return Noise(std, std, np.zeros((columns, ORDER)), "first guess")
 
 
-def _noise(solution: Solution, stacks, reads) -> dict[tuple[str, str], Noise]:
+def _noise(solution: Solution, stacks, reads, given) -> dict[tuple[str, str], Noise]:
     return {
         (e, c): estimate(stacks[e], c, np.asarray(solution.linearised[e].residuals[c]))
         for e, channels in reads.items()
         for c in channels
+        if (e, c) not in given
     }
 
 

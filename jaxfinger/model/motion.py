@@ -27,3 +27,6 @@ class Motion(eqx.Module):
     # low-pass that all of it went through, 0 for none, where a sample is the mean of its interval.
     jitter: Float[Array, "m *T"] | None = None
     blur: Float[Array, "*T"] | None = None
+    # Of samples from which the motion is simulated: N, the tension at even instants from each on, and s, for how long.
+    ahead: Float[Array, "L n *T"] | None = None
+    horizon: Float[Array, "*T"] | None = None

@@ -65,6 +65,7 @@ def simulate(
     def sample(state, inputs):
         t, f0, f1, tau0, tau1 = inputs
 
+        @jax.checkpoint  # backwards through every step, none is kept
         def substep(state, share):
             f, tau = f0 + share * (f1 - f0), tau0 + share * (tau1 - tau0)
             return _step(model, state, motion, t + share * dt * substeps, f, tau, dt), None
@@ -75,6 +76,20 @@ def simulate(
     inputs = (time[:-1], tension.T[:-1], tension.T[1:], tau_ext.T[:-1], tau_ext.T[1:])
     _, (q, qd) = jax.lax.scan(sample, state0, inputs)
     return jnp.concatenate([q0[:, None], q.T], axis=1), jnp.concatenate([qd0[:, None], qd.T], axis=1)
+
+
+def ahead(model: Model, x: Motion) -> Float[Array, "m *T"]:
+    """q, rad, at the horizon of every sample: simulated from its state under the tension that follows."""
+    assert x.ahead is not None
+    assert x.horizon is not None
+    share = jnp.linspace(0.0, 1.0, x.ahead.shape[0])
+
+    def one(q, qd, tension, time, start, horizon):
+        return simulate(model, time + share * horizon, tension, q, qd, session_start=start, substeps=1)[0][:, -1]
+
+    q, qd, tension = jnp.moveaxis(x.q, 0, -1), jnp.moveaxis(x.qd, 0, -1), jnp.moveaxis(x.ahead, (0, 1), (-1, -2))
+    each = jnp.vectorize(one, signature="(m),(m),(n,l),(),(),()->(m)")
+    return jnp.moveaxis(each(q, qd, tension, x.time, x.session_time - x.time, x.horizon), -1, 0)
 
 
 def _step(model: Model, state: _State, motion, t, f, tau, dt) -> _State:
