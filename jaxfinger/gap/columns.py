@@ -5,6 +5,7 @@ leave there; a residual and a signature enter every formula through their coeffi
 what lies outside of it. That is some hundreds of numbers where there are tens of thousands of rows.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from weakref import WeakKeyDictionary
@@ -64,14 +65,27 @@ class Columns:
 class ByColumn:
     """Rows, column by column: their coefficients on the features, and their products, each made once."""
 
-    def __init__(self, columns: Columns, *blocks: Float[np.ndarray, "k N"]):
-        self.columns, self.N = columns, blocks[0].shape[1]
-        self.parts = [np.concatenate([x[:, c.rows] for x in blocks]) for c in columns.items]
+    def __init__(self, columns: Columns, x: Float[np.ndarray, "k N"]):
+        self.columns, self.N = columns, x.shape[1]
+        self.parts = [x[:, c.rows] for c in columns.items]
         self.B: Float[np.ndarray, "features k"] = np.concatenate(
             [c.basis.T @ p.T for c, p in zip(columns.items, self.parts, strict=True)]
         )
         self._with: WeakKeyDictionary[ByColumn, np.ndarray] = WeakKeyDictionary()
         self._among: dict[tuple[int, ...], np.ndarray] = {}
+
+    @classmethod
+    def joined(cls, many: Sequence["ByColumn"]) -> "ByColumn":
+        """All their rows, moved over: none is held twice."""
+        out = cls(many[0].columns, np.empty((0, many[0].N)))
+        out.B = np.concatenate([x.B for x in many], axis=1)
+        out.parts = [np.concatenate([x.parts.pop(0) for x in many]) for _ in out.parts]
+        return out
+
+    def in_single_precision(self) -> "ByColumn":
+        """The same, rounded to 6e-8 of each value: of a signature that leaves 1e-3 of itself, to 6e-5."""
+        self.parts = [x.astype(np.float32) for x in self.parts]
+        return self
 
     def rows(self, at: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k N"]:
         """Some of the rows as they were, zero in columns that are not judged."""
@@ -90,7 +104,7 @@ class ByColumn:
         """Of some of the rows with one another."""
         key = tuple(at.tolist())
         if key not in self._among:
-            some = [x[at] for x in self.parts]
+            some = [x[at].astype(np.float64) for x in self.parts]
             self._among[key] = np.stack([x @ x.T for x in some])
         return self._among[key]
 

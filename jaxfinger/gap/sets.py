@@ -79,15 +79,15 @@ def table_of(problem: Problem, bench: Bench, parts: Iterable[Part], together: bo
     plain = Whitened(problem, bench.columns, Weights(*np.ones((2, len(bench.columns.items)))))
     rt = plain.residual(problem.r)
     items: list[Variant] = []
-    blocks, counts = [np.empty((0, problem.r.size))], []
-    found = [_seen(bench, plain, blocks[0])]
+    none = np.empty((0, problem.r.size))
+    blocks, counts, found = [ByColumn(bench.columns, none).in_single_precision()], [], [_seen(bench, plain, none)]
     for part in parts:
         variants, Z = part.offer(plain, rt)
         items += variants
         counts += [Z.shape[1]] * len(Z)
-        blocks.append(Z.reshape(-1, Z.shape[2]))
-        found.append(_seen(bench, plain, blocks[-1]))
-        blocks[-1] *= found[-1].units[:, None]
+        Z = Z.reshape(-1, Z.shape[2])
+        found.append(_seen(bench, plain, Z))
+        blocks.append(ByColumn(bench.columns, Z * found[-1].units[:, None]).in_single_precision())
     raw, seen, units, claims = (np.concatenate(x) for x in zip(*found, strict=True))
     kept = units > 0.0
     absorbed: dict[Key, float] = {}
@@ -112,7 +112,7 @@ def table_of(problem: Problem, bench: Bench, parts: Iterable[Part], together: bo
             offers.append(Offered((v,), at[kept[at]], low, high))
             touched[v.key] = np.maximum(touched.get(v.key, 0.0), claims[at].max(axis=0))
     offers += _together(offers) if together else []
-    return Table(ByColumn(bench.columns, *blocks), rows, units, absorbed, hidden, touched, offers)
+    return Table(ByColumn.joined(blocks), rows, units, absorbed, hidden, touched, offers)
 
 
 class Seen(NamedTuple):

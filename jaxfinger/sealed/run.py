@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -186,9 +187,15 @@ def run_cases(
         with pool:
             jobs = {pool.submit(run_case, how[f.name], f, out): f.name for f in mine[first : first + at_once]}
             for job in as_completed(jobs):
-                results[jobs[job]] = job.result()
+                try:
+                    results[jobs[job]] = job.result()
+                except BrokenProcessPool:
+                    raise UserError(
+                        f"{cases}: the system ended a process while {jobs[job]} waited for it, as where memory is "
+                        "short; run the command again with fewer --workers: it goes on where it was"
+                    ) from None
                 if progress:
-                    progress(len(results), len(mine), f"{jobs[job]} {job.result()}")
+                    progress(len(results), len(mine), f"{jobs[job]} {results[jobs[job]]}")
     return results
 
 

@@ -1,6 +1,7 @@
 """Running a diagnosis over cases: sealed, resumable, in shares."""
 
 import json
+import os
 import sys
 
 import h5py
@@ -181,6 +182,16 @@ def test_processes_serve_several_cases_and_end(folder, tmp_path, monkeypatch):
     results = run_cases(folder, tmp_path / "out", diagnose, workers=2)
     assert results["case-004"] == "failed"
     assert sorted(results) == [f.name for f in sorted(folder.iterdir())]
+
+
+def ended(fit, out):
+    """As a process is that takes all of the memory."""
+    os._exit(9)
+
+
+def test_a_process_that_the_system_ends_is_a_sentence(folder, tmp_path):
+    with pytest.raises(UserError, match="the system ended a process while case-"):
+        run_cases(folder, tmp_path / "out", ended)
 
 
 def test_this_programs_own_diagnosis_runs_in_processes_of_their_own_and_says_what_it_refused(folder, tmp_path, capsys):
