@@ -18,9 +18,9 @@ from jaxfinger.synthetic import (
     SpecimenPlant,
     clean_session,
     measure,
-    nominal_model,
     recipe_from,
     study_finger,
+    true_model,
 )
 
 
@@ -29,7 +29,7 @@ def study(sessions: int, joints: int = 1, joint: bool = False):
     specimen = study_finger(joints)
     recipe = recipe_from({"trials": SHORT, "cad": {"mass": 0.02, "com": 3e-4}})
     clean = clean_session(recipe, SpecimenPlant(specimen), specimen.description)
-    model = nominal_model(specimen)
+    model = true_model(specimen)
     truth = np.asarray(ravel(model))
     z, spread, stated = [], [], []
     for seed in range(sessions):

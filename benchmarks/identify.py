@@ -35,8 +35,7 @@ from jaxfinger.identify.solve import solve
 from jaxfinger.identify.stages import STAGES, sources_of
 from jaxfinger.identify.start import start_values
 from jaxfinger.model import Finger, rigid_body
-from jaxfinger.synthetic import ModelPlant, paper_finger, polynomial_finger, recipe_from, simulate
-from jaxfinger.synthetic import nominal_model as true_model
+from jaxfinger.synthetic import ModelPlant, paper_finger, polynomial_finger, recipe_from, simulate, true_model
 
 TWENTY_MINUTES = {
     "specimen": {"kind": "polynomial"},

@@ -25,9 +25,9 @@ from jaxfinger.synthetic import (
     SpecimenPlant,
     clean_session,
     measure,
-    nominal_model,
     recipe_from,
     study_finger,
+    true_model,
 )
 
 HELD_OUT = {
@@ -66,7 +66,7 @@ def main() -> None:
     parser.add_argument("--identification-only", action="store_true")
     options = parser.parse_args()
     specimen = study_finger(options.joints)
-    plant, truth = SpecimenPlant(specimen), nominal_model(specimen)
+    plant, truth = SpecimenPlant(specimen), true_model(specimen)
     cad = {"mass": 0.05, "com": 2e-3}
     read = tuple(STAGES) if options.identification_only else tuple(EXPERIMENTS)
     trials = {**SHORT, **VALIDATION, "experiments": read}

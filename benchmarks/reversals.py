@@ -17,7 +17,7 @@ from jaxfinger.data import Session, Trial, read_session, smooth
 from jaxfinger.identify import Fit, identify
 from jaxfinger.identify.predictions import predict_session
 from jaxfinger.model import Model
-from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger, recipe_from, simulate
+from jaxfinger.synthetic import paper_finger, polynomial_finger, recipe_from, simulate, true_model
 
 NEAR = 0.06  # s from a reversal
 SLOW = 5.0  # Hz, of the filter in which a joint's speed crosses zero once
@@ -52,7 +52,7 @@ def simulated() -> tuple[Model, Session]:
     trials = {"experiments": ["ID.3-dynamic"], "rate": 1000.0, "id3_dynamic": sweep}
     session = simulate(recipe_from({"specimen": {"kind": "polynomial"}, "trials": trials}), seed=5)
     session = replace(session, trials={t.name: replace(t, joint_direction=None) for t in session})
-    return nominal_model(polynomial_finger(paper_finger())), session
+    return true_model(polynomial_finger(paper_finger())), session
 
 
 def main() -> None:

@@ -21,7 +21,7 @@ import jaxfinger as jf
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap.result import Key
 from jaxfinger.report import sentences
-from jaxfinger.synthetic import ModelPlant, nominal_model, paper_finger, polynomial_finger, recipe_from, simulate
+from jaxfinger.synthetic import ModelPlant, paper_finger, polynomial_finger, recipe_from, simulate, true_model
 
 session = jf.read(Path("datasets/demo-finger/session.h5"))
 fit = jf.identify(session)
@@ -55,7 +55,7 @@ assert abs(moved - shifts[k, j] * row["std"]) < 0.2 * abs(moved)
 # rest in one posture. Which neighbour pulls at it stays open, and the diagnosis says so.
 
 # %%
-model = nominal_model(polynomial_finger(paper_finger()))
+model = true_model(polynomial_finger(paper_finger()))
 coupling = CATALOGUE["passive_tendon"].at(model.finger, ("PIP", "DIP"), kappa=0.01, rho=1.0, phi=0.0)
 plant = ModelPlant(eqx.tree_at(lambda m: m.effects, model, (coupling,), is_leaf=lambda v: isinstance(v, tuple)))
 

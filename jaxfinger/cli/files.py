@@ -139,7 +139,7 @@ def simulate(
     if protocol is not None and source.suffix != ".json":
         raise UserError(f"{source}: a recipe brings its own trials; leave out --protocol, or give a fit")
     from jaxfinger.data import write_session
-    from jaxfinger.synthetic import Recipe, read_recipe
+    from jaxfinger.synthetic import SessionRecipe, read_session_recipe
     from jaxfinger.synthetic import simulate as run
 
     with progress("simulate") as say:
@@ -152,10 +152,10 @@ def simulate(
             from jaxfinger.synthetic.fitted import session_of_model
 
             fit = load_fit(source, effects)
-            recipe = read_recipe(protocol) if protocol else Recipe()
+            recipe = read_session_recipe(protocol) if protocol else SessionRecipe()
             session = session_of_model(fit.model, fit.specimen, recipe, seed, count)
         else:
-            session = run(read_recipe(source), seed, progress=count)
+            session = run(read_session_recipe(source), seed, progress=count)
         say("writing")
         write_session(session, output, overwrite)
     print(plain(f"{output}: {counted(len(session), 'trial')} of {session.specimen}"))

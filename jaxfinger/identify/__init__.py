@@ -8,7 +8,7 @@ from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.fit_file import load_fit, save_fit
 from jaxfinger.identify.identifiability import base_parameters
 from jaxfinger.identify.joint import refine
-from jaxfinger.identify.posterior import posterior
+from jaxfinger.identify.posterior import sampled_posterior
 from jaxfinger.identify.recipe import Recipe, read_recipe
 from jaxfinger.identify.resample import compress, refit
 from jaxfinger.identify.sensitivity import Sensitivity, sensitivity
@@ -29,11 +29,11 @@ __all__ = [
     "identifiability",
     "identify",
     "load_fit",
-    "posterior",
     "read_recipe",
     "refine",
     "refit",
     "robust",
+    "sampled_posterior",
     "sandwich",
     "save_fit",
     "sensitivity",

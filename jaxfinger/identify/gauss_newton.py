@@ -54,7 +54,7 @@ class Compressed(NamedTuple):
         return 0.5 * (self.d @ self.d + self.rho2)
 
 
-class State(eqx.Module):
+class Iterate(eqx.Module):
     """Of a search: where it is tried next, what is known at the best point, and the step that leads on from there."""
 
     trial: PyTree
@@ -79,12 +79,12 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
     kink: float = 0.0
     norm: Callable[[PyTree], Scalar] = optx.two_norm  # of z; the two-norm is that of the predicted descent
 
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> State:
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Iterate:
         """Nothing is known: the start is the first trial."""
         del fn, args, options, f_struct, aux_struct, tags
         return begin(y)
 
-    def step(self, fn, y, args, options, state: State, tags):
+    def step(self, fn, y, args, options, state: Iterate, tags):
         """Linearise at the trial, and go on from there or take a shorter step."""
         del tags
         at, unravel = ravel_pytree(state.trial)
@@ -99,11 +99,11 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
     def advance(
         self,
         y: Float[Array, " p"],
-        state: State,
+        state: Iterate,
         here: Compressed,
         low: Float[Array, " p"],
         high: Float[Array, " p"],
-    ) -> tuple[Float[Array, " p"], State]:
+    ) -> tuple[Float[Array, " p"], Iterate]:
         """The best point, and the state after the problem was linearised at the trial: the whole of a step but the
         linearisation, for callers that have programs of their own for that.
         """
@@ -137,7 +137,7 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
         outcome = Outcome.where(~accept & (state.length * size <= self.kink), Outcome.kink, outcome)
         outcome = Outcome.where(~accept & (shorter * size <= 0.1 * enough), Outcome.no_descent, outcome)
         outcome = Outcome.where(first & ~finite, Outcome.nowhere, outcome)
-        after = State(
+        after = Iterate(
             best + length * step,
             new,
             jnp.where(accept, here.cost, state.cost),
@@ -150,7 +150,7 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
         )
         return best, after
 
-    def terminate(self, fn, y, args, options, state: State, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
+    def terminate(self, fn, y, args, options, state: Iterate, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """At the end of the search, whichever it is."""
         del fn, y, args, options, tags
         result = optx.RESULTS.where(
@@ -159,21 +159,21 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
         result = optx.RESULTS.where(state.outcome == Outcome.nowhere, optx.RESULTS.nonfinite, result)
         return state.outcome != Outcome.going, result
 
-    def postprocess(self, fn, y, aux, args, options, state: State, tags, result):
+    def postprocess(self, fn, y, aux, args, options, state: Iterate, tags, result):
         """The outcome in words of this solver, and how often the problem was linearised."""
         del fn, args, options, tags, result
         return y, aux, {"outcome": state.outcome, "linearisations": state.evaluations}
 
 
-def begin(y: PyTree) -> State:
+def begin(y: PyTree) -> Iterate:
     """Before anything is known."""
     flat = ravel_pytree(y)[0]
     none = Compressed(jnp.zeros((flat.size, flat.size)), jnp.zeros_like(flat), jnp.array(0.0))
     zero, count = jnp.array(0.0), jnp.array(0)
-    return State(y, none, jnp.array(jnp.inf), jnp.zeros_like(flat), zero, jnp.array(1.0), zero, count, Outcome.going)
+    return Iterate(y, none, jnp.array(jnp.inf), jnp.zeros_like(flat), zero, jnp.array(1.0), zero, count, Outcome.going)
 
 
-def state_of_vector(state: State, trial: Float[Array, " p"]) -> State:
+def state_of_vector(state: Iterate, trial: Float[Array, " p"]) -> Iterate:
     """The state with its trial flat."""
     return eqx.tree_at(lambda s: s.trial, state, trial, is_leaf=lambda s: s is state.trial)
 

@@ -25,7 +25,7 @@ from jaxfinger.identify.uncertainty import Samples
 
 
 @dataclass(frozen=True)
-class Posterior:
+class SampledPosterior:
     """Draws, and how far they can be trusted."""
 
     samples: Samples
@@ -38,7 +38,9 @@ class Posterior:
         return self.divergences == 0 and bool(self.effective.min() > 100)
 
 
-def posterior(session: Session, fit: Fit, draws: int = 500, warmup: int = 300, seed: int = 0) -> Posterior:
+def sampled_posterior(
+    session: Session, fit: Fit, draws: int = 500, warmup: int = 300, seed: int = 0
+) -> SampledPosterior:
     """Draws from the posterior of a joint fit under its own noise, on the session that it was made from.
 
     Raises:
@@ -86,6 +88,6 @@ def posterior(session: Session, fit: Fit, draws: int = 500, warmup: int = 300, s
     z, divergent = sample(jax.random.key(seed))
     effective = np.asarray(blackjax.diagnostics.effective_sample_size(z[None]))
     values = compressed.theta + np.asarray(z) @ compressed.basis.T
-    return Posterior(
+    return SampledPosterior(
         Samples(values, np.zeros(draws, bool), fit.estimated), np.atleast_1d(effective), int(np.sum(divergent))
     )

@@ -22,8 +22,8 @@ from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch
 from jaxfinger.identify.gauss_newton import (
     Compressed,
+    Iterate,
     Outcome,
-    State,
     VisibleGaussNewton,
     begin,
     bounded_step,
@@ -182,7 +182,7 @@ def within(
     return np.where(masses, np.maximum(low, LIGHTEST * theta), low), high
 
 
-def _sentence(state: State) -> str:
+def _sentence(state: Iterate) -> str:
     """What a user reads of a search that did not converge; nothing of one that did."""
     if bool(state.outcome == Outcome.converged) or bool(state.outcome == Outcome.kink):
         return ""
@@ -208,7 +208,7 @@ def _compressed(rows: Float[np.ndarray, "N p+1"], room: int) -> Compressed:
 
 
 @eqx.filter_jit
-def _advance(solver: VisibleGaussNewton, y, state: State, here: Compressed, low, high):
+def _advance(solver: VisibleGaussNewton, y, state: Iterate, here: Compressed, low, high):
     return solver.advance(y, state, here, low, high)
 
 

@@ -41,7 +41,7 @@ class Filter:
 
 
 @dataclass(frozen=True)
-class Channel:
+class RigChannel:
     """value in SI = (raw · scale + offset) · factor; `of` is the tendon, joint or axis that it measures.
 
     `frozen` is the time in s after which identical raw values count as a fault (0: never).
@@ -122,7 +122,7 @@ class RigDescription:
     backend: str
     specimen: str
     finger: FingerDescription
-    channels: tuple[Channel, ...]
+    channels: tuple[RigChannel, ...]
     limits: Limits
     hard: HardLimits
     deadlines: Deadlines

@@ -14,7 +14,7 @@ from jaxfinger.data.finger_file import Finger, finger_from
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import Document, Fault, OneOf, Place, Within, one_of, parse_toml, read_toml, structure
 from jaxfinger.rig import backends, contract
-from jaxfinger.rig.channels import NOISY, UNITS, Channel, Deadlines, HardLimits, Limits, RigDescription
+from jaxfinger.rig.channels import NOISY, UNITS, Deadlines, HardLimits, Limits, RigChannel, RigDescription
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def _rig(document: Document) -> RigDescription:
     )
 
 
-def _channels(tables: tuple[ChannelTable, ...], finger: FingerDescription, place: Place) -> tuple[Channel, ...]:
+def _channels(tables: tuple[ChannelTable, ...], finger: FingerDescription, place: Place) -> tuple[RigChannel, ...]:
     owners = {
         "tension": finger.tendon_names,
         "excursion": finger.tendon_names,
@@ -190,7 +190,7 @@ def _channels(tables: tuple[ChannelTable, ...], finger: FingerDescription, place
         "tension_setpoint": tuple(np.array(finger.tendon_names)[finger.active]),
         "motor_temperature": (*finger.tendon_names, "external"),
     }
-    channels: list[Channel] = []
+    channels: list[RigChannel] = []
     for i, table in enumerate(tables):
         here = place / "channel" / i
         if table.of not in owners[table.kind]:
@@ -203,7 +203,7 @@ def _channels(tables: tuple[ChannelTable, ...], finger: FingerDescription, place
                 (here / "of").fail(f"'{other.name}' already measures the {table.kind} of '{table.of}'; remove one")
         frozen = table.frozen_s if table.frozen_s is not None else 1.0 if table.kind in NOISY else 0.0
         channels.append(
-            Channel(
+            RigChannel(
                 name=table.title,
                 kind=table.kind,
                 of=table.of,

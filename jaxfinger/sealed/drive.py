@@ -18,7 +18,7 @@ from jaxtyping import Float
 from scipy.optimize import nnls
 
 from .departures.base import Memory
-from .laws import Finger, State
+from .laws import Finger, Situation
 from .profiles import Builder, Profile
 from .protocols import Plan, sample_times
 
@@ -61,7 +61,7 @@ def _reachable(nominal: Finger, least: float, count: int, rng: np.random.Generat
     zero = np.zeros_like(q)
     c = nominal.specimen.elastic
     torque = nominal.plant.inverse_dynamics(q, zero, zero) + c[:, 0] + c[:, 1] * q + c[:, 2] * q**2
-    s = State(zero[:, 0], zero[:, 0], q, zero, zero, np.zeros((len(q), nominal.n)), zero)
+    s = Situation(zero[:, 0], zero[:, 0], q, zero, zero, np.zeros((len(q), nominal.n)), zero)
     margin = nominal.coulomb(s)[0]
     allocate = Allocator(nominal, least)
     still = np.zeros(nominal.n)
@@ -82,7 +82,7 @@ def feedforward(
     tendons' directions.
     """
     zero = np.zeros(len(q))
-    s = State(zero, zero, q, qd, qdd, np.zeros((len(q), nominal.n)), np.tanh(qd / 0.02))
+    s = Situation(zero, zero, q, qd, qdd, np.zeros((len(q), nominal.n)), np.tanh(qd / 0.02))
     torque = nominal.plant.inverse_dynamics(q, qd, qdd) + nominal.passive(s) + nominal.friction(s)
     return torque, np.tanh(nominal.speed(s) / 5e-4)
 
@@ -162,7 +162,7 @@ def simulate(finger: Finger, nominal: Finger, plans: Sequence[Plan]) -> list[Run
             command = command * (1 + 0.004 * noises[:, c]) + 0.02 * noises[:, c] * (command > 0)
         f = f + (command - f) * (STEP / LAG)
         t = np.full(batch, i * STEP)
-        s = State(t, starts + t, q, qd, np.zeros_like(q), f, np.sign(qd), memory=memory)
+        s = Situation(t, starts + t, q, qd, np.zeros_like(q), f, np.sign(qd), memory=memory)
         s.st = np.tanh(finger.speed(s) / 1e-4)
         for d in memories:
             u = d.inputs(finger, s)
@@ -186,13 +186,13 @@ def replay(finger: Finger, q: Float[np.ndarray, " m"], tension: Float[np.ndarray
         if k % CONTROL == 0:
             out.append(angle[0])
         t = np.full(1, k * STEP)
-        s = State(t, t, angle, rate, np.zeros_like(angle), f[None], np.sign(rate))
+        s = Situation(t, t, angle, rate, np.zeros_like(angle), f[None], np.sign(rate))
         s.st = np.tanh(finger.speed(s) / 1e-4)
         angle, rate = _advance(finger, s, [data], active)
     return np.array(out)
 
 
-def _advance(finger: Finger, s: State, data: list, active: np.ndarray):
+def _advance(finger: Finger, s: Situation, data: list, active: np.ndarray):
     """One MuJoCo step of every trial: smooth forces applied, dry friction left to its solver."""
     model = finger.plant.model
     _, arm = finger.path(s)

@@ -1,6 +1,6 @@
 """A true finger: the nominal laws of a specimen, and what departs from them.
 
-Every law takes a `State` and works on whatever leading axes its arrays have: a whole recording (time first), or
+Every law takes a `Situation` and works on whatever leading axes its arrays have: a whole recording (time first), or
 one instant of several trials that are simulated side by side.
 """
 
@@ -19,7 +19,7 @@ from .specimens import Specimen
 
 
 @dataclass
-class State:
+class Situation:
     """Where the finger is. Angles rad, tension at the actuator N, time s; directions −1, 0, +1."""
 
     t: Float[np.ndarray, ...]
@@ -75,18 +75,18 @@ class Finger:
         self._last = q, result
         return result
 
-    def path(self, s: State) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n m"]]:
+    def path(self, s: Situation) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n m"]]:
         """Excursion as the tendon is pulled in, and its derivative by q, departures included."""
         length, arm = self.geometry(s.q)
         for d in self._ready(s):
             length, arm = d.path(self, s, length, arm)
         return length, arm
 
-    def speed(self, s: State) -> Float[np.ndarray, "... n"]:
+    def speed(self, s: Situation) -> Float[np.ndarray, "... n"]:
         """l̇ = C q̇ in m/s."""
         return (self.geometry(s.q)[1] @ s.qd[..., None])[..., 0]
 
-    def passive(self, s: State) -> Float[np.ndarray, "... m"]:
+    def passive(self, s: Situation) -> Float[np.ndarray, "... m"]:
         """τ_k + τ_d in N m: what resists without dry friction."""
         c = self.specimen.elastic
         torque = c[:, 0] + c[:, 1] * s.q + c[:, 2] * s.q**2 + self.specimen.damping * s.qd
@@ -94,7 +94,7 @@ class Finger:
             torque = d.passive(self, s, torque)
         return torque
 
-    def coulomb(self, s: State) -> tuple[Float[np.ndarray, "... m"], Float[np.ndarray, "... m"]]:
+    def coulomb(self, s: Situation) -> tuple[Float[np.ndarray, "... m"], Float[np.ndarray, "... m"]]:
         """Limit of the joints' dry friction, and friction that is already decided by a memory state, N m."""
         c = self.specimen.coulomb
         limit, decided = c[:, 0] + c[:, 1] * s.q + c[:, 2] * s.q**2, np.zeros_like(s.q)
@@ -102,7 +102,7 @@ class Finger:
             limit, decided = d.coulomb(self, s, limit, decided)
         return limit, decided
 
-    def loss(self, s: State) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n"]]:
+    def loss(self, s: Situation) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n"]]:
         """Limit of the tendons' dry friction, and friction that is already decided, N. Never more than the tension."""
         a = self.specimen.friction
         limit, decided = np.clip(a[:, 0] + a[:, 1] * s.f, 0.0, np.maximum(s.f, 0.0)), np.zeros_like(s.f)
@@ -110,24 +110,24 @@ class Finger:
             limit, decided = d.loss(self, s, limit, decided)
         return np.clip(limit, 0.0, np.maximum(s.f, 0.0)), decided
 
-    def delivered(self, s: State, reaching: Float[np.ndarray, "... n"]) -> Float[np.ndarray, "... n"]:
+    def delivered(self, s: Situation, reaching: Float[np.ndarray, "... n"]) -> Float[np.ndarray, "... n"]:
         """Tension that acts on the joints, given what is left of each tendon's own."""
         for d in self._ready(s):
             reaching = d.deliver(self, s, reaching)
         return reaching
 
-    def friction(self, s: State) -> Float[np.ndarray, "... m"]:
+    def friction(self, s: Situation) -> Float[np.ndarray, "... m"]:
         """Joint friction where the directions are known, N m."""
         limit, decided = self.coulomb(s)
         return limit * s.sj + decided
 
-    def reaching_sliding(self, s: State) -> Float[np.ndarray, "... n"]:
+    def reaching_sliding(self, s: Situation) -> Float[np.ndarray, "... n"]:
         """f_j = f_t − s(l̇) loss where the tendons slide, N."""
         limit, decided = self.loss(s)
         assert s.st is not None
         return s.f - s.st * limit - decided
 
-    def reaching_held(self, s: State) -> Float[np.ndarray, "N n"]:
+    def reaching_held(self, s: Situation) -> Float[np.ndarray, "N n"]:
         """f_j at joints held at rest: it slips only when the loss is exceeded, starting from slack."""
         limit, decided = self.loss(s)
         high, low = s.f + limit, s.f - limit
@@ -144,7 +144,7 @@ class Finger:
             reaching[:, k] = column
         return reaching - decided
 
-    def remember(self, s: State) -> State:
+    def remember(self, s: Situation) -> Situation:
         """The state with every memory driven along the recording."""
         memory = {}
         for d in self.departures:
@@ -161,7 +161,7 @@ class Finger:
             memory[id(d)] = z
         return replace(s, memory=memory)
 
-    def _ready(self, s: State):
+    def _ready(self, s: Situation):
         """Departures that can act: a memory acts only once it has been driven."""
         for d in self.departures:
             if not isinstance(d, Memory) or id(d) in s.memory:

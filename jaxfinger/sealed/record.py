@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .drive import Run
-from .laws import Finger, State
+from .laws import Finger, Situation
 from .profiles import Profile
 from .protocols import FAST, Plan, sample_times
 
@@ -97,7 +97,7 @@ def record(finger: Finger, plan: Plan, motion: Motion, rigid: Float[np.ndarray, 
     session = plan.start + motion.time
     held = plan.experiment in ("ID.4", "VD.2")
     direction = np.zeros_like(motion.direction) if held else motion.direction
-    s = State(
+    s = Situation(
         motion.time,
         session,
         motion.q,
@@ -137,7 +137,7 @@ def needed_torque(
 ) -> Float[np.ndarray, "N m"]:
     """VD.3: the external torque that the finger would need to follow a motion under these tensions, N m."""
     session = plan.start + motion.time
-    s = State(motion.time, session, motion.q, motion.qd, motion.qdd, motion.tension, motion.direction)
+    s = Situation(motion.time, session, motion.q, motion.qd, motion.qdd, motion.tension, motion.direction)
     s.st = last_direction(finger.speed(s), 1e-6)
     s = finger.remember(s)
     pull = np.einsum("tnm,tn->tm", finger.path(s)[1], finger.delivered(s, finger.reaching_sliding(s)))
@@ -149,7 +149,7 @@ def rigid_torque(finger: Finger, motion: Motion) -> Float[np.ndarray, "N m"]:
     return finger.plant.inverse_dynamics(motion.q, motion.qd, motion.qdd)
 
 
-def _at_motor(finger: Finger, s: State, torque: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
+def _at_motor(finger: Finger, s: Situation, torque: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
     for d in finger.departures:
         torque = d.at_motor(finger, s, torque)
     return torque

@@ -59,7 +59,7 @@ class Simulator:
         return jax.lax.scan(sample, start, controller.targets)[1]
 
 
-class State(NamedTuple):
+class PlantState(NamedTuple):
     """Position, rad, velocity now and a step before, rad/s, and friction impulses of joints, then tendons."""
 
     q: Float[Array, " m"]
@@ -68,12 +68,12 @@ class State(NamedTuple):
     impulse: Float[Array, " m+n"]  # N m s and N s
 
 
-def at_rest(finger: Finger, q: Float[Array, " m"]) -> State:
+def at_rest(finger: Finger, q: Float[Array, " m"]) -> PlantState:
     """Nothing moves and nothing rubs yet."""
-    return State(q, jnp.zeros_like(q), jnp.zeros_like(q), jnp.zeros(finger.m + finger.n))
+    return PlantState(q, jnp.zeros_like(q), jnp.zeros_like(q), jnp.zeros(finger.m + finger.n))
 
 
-def step(specimen: Specimen, finger: Finger, state: State, tension: Float[Array, " n"], h: float) -> State:
+def step(specimen: Specimen, finger: Finger, state: PlantState, tension: Float[Array, " n"], h: float) -> PlantState:
     """One step of h s. Forces that depend on velocity take it extrapolated to the middle of the step."""
     q, v, v_before, impulse = state
     middle, v_middle = q + 0.5 * h * v, 1.5 * v - 0.5 * v_before
@@ -87,7 +87,7 @@ def step(specimen: Specimen, finger: Finger, state: State, tension: Float[Array,
     limit = h * jnp.concatenate([specimen.coulomb(middle), specimen.loss(tension)])
     impulse = friction_impulse(D @ M_inv @ D.T, D @ free, limit, impulse)
     v_after = free - M_inv @ (D.T @ impulse)
-    return State(middle + 0.5 * h * v_after, v_after, v, impulse)
+    return PlantState(middle + 0.5 * h * v_after, v_after, v, impulse)
 
 
 def _mass_and_bias(finger: Finger, q, v):

@@ -84,7 +84,7 @@ def study_finger(joints: int = 1) -> Specimen:
     return polynomial_finger(paper_finger() if joints == 3 else random_finger(0, joints, "planar", "antagonists"))
 
 
-def nominal_model(specimen: Specimen) -> Model:
+def true_model(specimen: Specimen) -> Model:
     """The true parameters of a polynomial specimen, as the nominal model holds them; passive tendons have no path."""
     (spring,), friction, finger = specimen.springs, specimen.friction, Finger.from_description(specimen.description)
     assert isinstance(spring, PolynomialSpring)

@@ -10,14 +10,14 @@ from jaxfinger.data import FingerDescription, Session
 from jaxfinger.model import Finger, Model
 from jaxfinger.synthetic.model_plant import ModelPlant
 from jaxfinger.synthetic.plant import SpecimenPlant
-from jaxfinger.synthetic.recipe import Recipe
+from jaxfinger.synthetic.recipe import SessionRecipe
 from jaxfinger.synthetic.routes import PolynomialRoute
 from jaxfinger.synthetic.simulate import Progress, clean_session, measure
 from jaxfinger.synthetic.specimen import PolynomialFriction, PolynomialSpring, Specimen
 
 
 def session_of_model(
-    model: Model, name: str, recipe: Recipe, seed: int | None = None, progress: Progress | None = None
+    model: Model, name: str, recipe: SessionRecipe, seed: int | None = None, progress: Progress | None = None
 ) -> Session:
     """The recipe's trials on a model, effects included, in place of the recipe's specimen.
 

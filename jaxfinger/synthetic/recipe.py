@@ -178,7 +178,7 @@ class Trials:
 
 
 @dataclass(frozen=True)
-class Channel:
+class Sensor:
     """`[sensors.<channel>]`: one kind of sensor, in the channel's unit."""
 
     std: NotNegative  # of the noise
@@ -192,11 +192,11 @@ class Channel:
 class Sensors:
     """`[sensors]`: the paper's test-bed, Sec. II-C."""
 
-    q: Channel = Channel(2e-4, 2.0 * np.pi / 2**14)  # AA5048B, 14 bit
-    tendon_force: Channel = Channel(0.03, 200.0 / 2**12)  # KD60 ±100 N on EL3008, 12 bit
-    tendon_excursion: Channel = Channel(1e-5, 1e-6, offset=2e-4)  # the motor's encoder on its pulley
-    joint_torque: Channel = Channel(3e-4, 1.0 / 2**16)  # ±0.5 N m, 16 bit, tared before every trial
-    fingertip_force: Channel = Channel(0.02, 100.0 / 2**16)  # K3D40 ±50 N, 16 bit
+    q: Sensor = Sensor(2e-4, 2.0 * np.pi / 2**14)  # AA5048B, 14 bit
+    tendon_force: Sensor = Sensor(0.03, 200.0 / 2**12)  # KD60 ±100 N on EL3008, 12 bit
+    tendon_excursion: Sensor = Sensor(1e-5, 1e-6, offset=2e-4)  # the motor's encoder on its pulley
+    joint_torque: Sensor = Sensor(3e-4, 1.0 / 2**16)  # ±0.5 N m, 16 bit, tared before every trial
+    fingertip_force: Sensor = Sensor(0.02, 100.0 / 2**16)  # K3D40 ±50 N, 16 bit
     outliers: Share = 0.0  # share of samples hit by a spike
     outlier_size: Annotated[tuple[float, float], Within(0.0, above=True)] = (10.0, 50.0)  # times the channel's noise
     clock_jitter: NotNegative = 2e-6  # s
@@ -211,7 +211,7 @@ class Cad:
 
 
 @dataclass(frozen=True)
-class Recipe:
+class SessionRecipe:
     """A simulated session."""
 
     seed: Some = 0
@@ -222,7 +222,7 @@ class Recipe:
 
 
 @dataclass(frozen=True)
-class RecipeFile(Recipe):
+class SessionRecipeFile(SessionRecipe):
     """A recipe as its file has it: `specimen`, or a finger and its terms."""
 
     specimen: SpecimenRecipe = field(default_factory=SpecimenRecipe)
@@ -236,7 +236,7 @@ class RecipeFile(Recipe):
             raise Fault("says which finger, as `finger` does; leave one of them out", "specimen")
 
 
-def read_recipe(path: str | os.PathLike) -> Recipe:
+def read_session_recipe(path: str | os.PathLike) -> SessionRecipe:
     """A recipe from its TOML file.
 
     Raises:
@@ -246,7 +246,7 @@ def read_recipe(path: str | os.PathLike) -> Recipe:
     return _recipe(document.content, document.place)
 
 
-def recipe_from(table: Mapping[str, Any]) -> Recipe:
+def recipe_from(table: Mapping[str, Any]) -> SessionRecipe:
     """A recipe from nested dictionaries: the defaults, with the given keys replaced.
 
     Raises:
@@ -255,8 +255,8 @@ def recipe_from(table: Mapping[str, Any]) -> Recipe:
     return _recipe(table, Place("recipe"))
 
 
-def _recipe(table: Mapping[str, Any], place: Place) -> Recipe:
-    said = structure(_merged(asdict(RecipeFile()), table), RecipeFile, place)
+def _recipe(table: Mapping[str, Any], place: Place) -> SessionRecipe:
+    said = structure(_merged(asdict(SessionRecipeFile()), table), SessionRecipeFile, place)
     specimen: SpecimenRecipe | DescribedFinger = said.specimen
     if said.finger is not None:
         finger = finger_from(said.finger, place / "finger")
@@ -274,7 +274,7 @@ def _recipe(table: Mapping[str, Any], place: Place) -> Recipe:
             message = f"says no `excursion` of tendon {unknown}, and it cannot be simulated without moment arms"
             (place / "finger").fail(f"{message}; write what CAD says of them, or simulate a fit")
         specimen = DescribedFinger(finger, said.terms, said.specimen.name)
-    return Recipe(said.seed, specimen, said.trials, said.sensors, said.cad)
+    return SessionRecipe(said.seed, specimen, said.trials, said.sensors, said.cad)
 
 
 def _unrouted(finger: FingerDescription) -> str | None:

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from jaxfinger.data import FingerDescription, Trial
 from jaxfinger.synthetic.plant import Channels
 from jaxfinger.synthetic.protocols import TrialPlan
-from jaxfinger.synthetic.recipe import Cad, Channel, Sensors
+from jaxfinger.synthetic.recipe import Cad, Sensor, Sensors
 
 Array = np.ndarray
 
@@ -62,16 +62,16 @@ def drawn_from_cad(finger: FingerDescription, cad: Cad, rng: np.random.Generator
     )
 
 
-def coloured_noise(channel: Channel, shape: tuple[int, int], dt: float, rng: np.random.Generator) -> Array:
+def coloured_noise(sensor: Sensor, shape: tuple[int, int], dt: float, rng: np.random.Generator) -> Array:
     """Noise of variance std², of which the share `coloured` decays as exp(−t / correlation_time) and the rest is white.
 
     The coloured part is the stationary AR(1) process x⁺ = a x + √(1 − a²) e, a = exp(−dt / correlation_time).
     """
-    white = np.sqrt(1.0 - channel.coloured) * rng.standard_normal(shape)
-    a = np.exp(-dt / channel.correlation_time)
+    white = np.sqrt(1.0 - sensor.coloured) * rng.standard_normal(shape)
+    a = np.exp(-dt / sensor.correlation_time)
     start = a * rng.standard_normal((1, shape[1]))
     colour, _ = lfilter([np.sqrt(1.0 - a**2)], [1.0, -a], rng.standard_normal(shape), axis=0, zi=start)
-    return channel.std * (white + np.sqrt(channel.coloured) * colour)
+    return sensor.std * (white + np.sqrt(sensor.coloured) * colour)
 
 
 def _instrumented(plan: TrialPlan, finger: FingerDescription) -> dict[str, Bool[Array, " columns"]]:
@@ -90,18 +90,18 @@ def _instrumented(plan: TrialPlan, finger: FingerDescription) -> dict[str, Bool[
 def _measured(
     clean: Float[Array, "N columns"],
     seen: Bool[Array, " columns"],
-    channel: Channel,
+    sensor: Sensor,
     sensors: Sensors,
     dt: float,
     rng: np.random.Generator,
 ) -> Float[Array, "N columns"]:
     count = int(seen.sum())
-    value = clean[:, seen] + channel.offset * rng.standard_normal(count)
-    value = value + coloured_noise(channel, (len(clean), count), dt, rng)
+    value = clean[:, seen] + sensor.offset * rng.standard_normal(count)
+    value = value + coloured_noise(sensor, (len(clean), count), dt, rng)
     if sensors.outliers:
         hit = rng.random(value.shape) < sensors.outliers
         size = rng.uniform(*sensors.outlier_size, value.shape) * rng.choice((-1.0, 1.0), value.shape)
-        value = value + hit * size * channel.std
+        value = value + hit * size * sensor.std
     recorded = np.full(clean.shape, np.nan, dtype=np.float32)  # as the rig stores it
-    recorded[:, seen] = np.round(value / channel.resolution) * channel.resolution
+    recorded[:, seen] = np.round(value / sensor.resolution) * sensor.resolution
     return recorded.astype(float)

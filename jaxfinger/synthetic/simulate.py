@@ -11,7 +11,7 @@ from jaxfinger.data import FingerDescription, Session
 from jaxfinger.synthetic.fingers import specimen_of
 from jaxfinger.synthetic.plant import Channels, Plant, SpecimenPlant
 from jaxfinger.synthetic.protocols import TrialPlan, session_plan
-from jaxfinger.synthetic.recipe import Recipe
+from jaxfinger.synthetic.recipe import SessionRecipe
 from jaxfinger.synthetic.sensors import drawn_from_cad, record
 
 Progress = Callable[[int, int, str], None]  # trials done, trials in all, name of the next
@@ -21,14 +21,14 @@ Progress = Callable[[int, int, str], None]  # trials done, trials in all, name o
 class CleanSession:
     """Every trial as planned, and its channels without noise."""
 
-    recipe: Recipe
+    recipe: SessionRecipe
     name: str
     finger: FingerDescription  # exact
     trials: tuple[tuple[TrialPlan, Channels], ...]
 
 
 def clean_session(
-    recipe: Recipe,
+    recipe: SessionRecipe,
     plant: Plant | None = None,
     finger: FingerDescription | None = None,
     progress: Progress | None = None,
@@ -67,13 +67,13 @@ def measure(clean: CleanSession, seed: int) -> Session:
 
 
 def simulate(
-    recipe: Recipe, seed: int | None = None, plant: Plant | None = None, progress: Progress | None = None
+    recipe: SessionRecipe, seed: int | None = None, plant: Plant | None = None, progress: Progress | None = None
 ) -> Session:
     """A session made to the recipe, with the recipe's seed unless another is given."""
     return measure(clean_session(recipe, plant, progress=progress), recipe.seed if seed is None else seed)
 
 
-def simulate_many(recipe: Recipe, seeds: Iterable[int], plant: Plant | None = None) -> Iterator[Session]:
+def simulate_many(recipe: SessionRecipe, seeds: Iterable[int], plant: Plant | None = None) -> Iterator[Session]:
     """Sessions that differ in nothing but the noise, one a seed."""
     clean = clean_session(recipe, plant)
     for seed in seeds:

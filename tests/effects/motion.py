@@ -10,9 +10,9 @@ import numpy as np
 from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.experiments import Batch, predict
 from jaxfinger.model import Model, Motion
-from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger
+from jaxfinger.synthetic import paper_finger, polynomial_finger, true_model
 
-MODEL: Model = nominal_model(polynomial_finger(paper_finger()))
+MODEL: Model = true_model(polynomial_finger(paper_finger()))
 
 
 def with_effects(*effects: CatalogueEffect) -> Model:

@@ -6,7 +6,7 @@ import pytest
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap.problem import build
 from jaxfinger.identify import Recipe
-from jaxfinger.synthetic import ModelPlant, nominal_model, paper_finger, polynomial_finger, recipe_from, simulate
+from jaxfinger.synthetic import ModelPlant, paper_finger, polynomial_finger, recipe_from, simulate, true_model
 
 TABLE = {
     "specimen": {"kind": "polynomial"},
@@ -28,7 +28,7 @@ PLANTED = (*TRUTH, {"a": 1.0, "x0": 0.1})
 
 
 def session_with(*effects, seed=3, recipe=RECIPE):
-    model = nominal_model(polynomial_finger(paper_finger()))
+    model = true_model(polynomial_finger(paper_finger()))
     members = tuple(
         (CATALOGUE[e] if isinstance(e, str) else e).at(model.finger, site, **values) for e, site, values in effects
     )

@@ -7,12 +7,12 @@ from jaxfinger.effects import CATALOGUE, Scales
 from jaxfinger.gap.closure import _line
 from jaxfinger.gap.exact import within_bounds
 from jaxfinger.model import Finger
-from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger
+from jaxfinger.synthetic import paper_finger, polynomial_finger, true_model
 
 
 @pytest.fixture(scope="module")
 def finger() -> Finger:
-    return nominal_model(polynomial_finger(paper_finger())).finger
+    return true_model(polynomial_finger(paper_finger())).finger
 
 
 @pytest.mark.parametrize("effect", sorted(CATALOGUE))

@@ -15,7 +15,7 @@ from jaxfinger.gap.where import where
 from jaxfinger.identify import Recipe
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.identify.recipe import ModelRecipe
-from jaxfinger.synthetic import SpecimenPlant, nominal_model, recipe_from, simulate, study_finger
+from jaxfinger.synthetic import SpecimenPlant, recipe_from, simulate, study_finger, true_model
 
 GAIN = 0.2
 
@@ -68,7 +68,7 @@ def test_damping_without_its_own_experiment_is_fitted_where_else_it_shows(sessio
     damping = [i for i, p in enumerate(describe(problem.nominal)) if p.group == "damping"]
     assert bool(set(damping) & set(problem.fit.estimated)) == (not missing)
     assert set(damping) <= set(problem.free)
-    fit, truth = nominal_fit(problem).fit, np.asarray(ravel(nominal_model(specimen)))
+    fit, truth = nominal_fit(problem).fit, np.asarray(ravel(true_model(specimen)))
     error = np.asarray(ravel(fit.model))[damping] - truth[damping]
     assert np.all(np.abs(error) < 4.0 * fit.std[damping])
     assert np.all(truth[damping] > 3.0 * fit.std[damping])  # it shows clearly

@@ -11,7 +11,7 @@ from jaxfinger.errors import UserError
 from jaxfinger.gap import Status, diagnose
 from jaxfinger.gap.result import Key
 from jaxfinger.identify.predictions import predict_session
-from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger
+from jaxfinger.synthetic import paper_finger, polynomial_finger, true_model
 
 from .conftest import PLANTED, TRUTH, WITHOUT, session_with
 
@@ -23,7 +23,7 @@ def session():
 
 def simulator(session, **factors):
     """Predictions of a finger without the effect, some of its parameters off by factors."""
-    model = nominal_model(polynomial_finger(paper_finger()))
+    model = true_model(polynomial_finger(paper_finger()))
     torque = model.joint_torque
     for name, factor in factors.items():
         torque = eqx.tree_at(lambda t, name=name: getattr(t, name), torque, factor * getattr(torque, name))

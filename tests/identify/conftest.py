@@ -8,11 +8,11 @@ from jaxfinger.identify.parameters import ravel
 from jaxfinger.synthetic import (
     clean_session,
     measure,
-    nominal_model,
     paper_finger,
     polynomial_finger,
     recipe_from,
     simulate,
+    true_model,
 )
 
 RECIPE = {
@@ -60,7 +60,7 @@ def session(clean):
 @pytest.fixture(scope="session")
 def truth():
     """The flat vector of the specimen's own parameters."""
-    return np.asarray(ravel(nominal_model(polynomial_finger(paper_finger()))))
+    return np.asarray(ravel(true_model(polynomial_finger(paper_finger()))))
 
 
 @pytest.fixture(scope="session")
@@ -82,4 +82,4 @@ def short():
 @pytest.fixture(scope="session")
 def short_truth(short):
     """The parameters that made it, as a fit."""
-    return Fit.before(short, Recipe(), nominal_model(polynomial_finger(paper_finger())))
+    return Fit.before(short, Recipe(), true_model(polynomial_finger(paper_finger())))

@@ -9,9 +9,9 @@ from jaxfinger.synthetic import (
     SpecimenPlant,
     clean_session,
     measure,
-    nominal_model,
     recipe_from,
     study_finger,
+    true_model,
 )
 
 pytestmark = pytest.mark.long
@@ -32,7 +32,7 @@ RECIPE = {
 def test_intervals_cover_the_truth_and_estimates_are_unbiased_and_efficient():
     specimen = study_finger()
     clean = clean_session(recipe_from(RECIPE), SpecimenPlant(specimen), specimen.description)
-    truth = np.asarray(ravel(nominal_model(specimen)))
+    truth = np.asarray(ravel(true_model(specimen)))
     sessions = [measure(clean, seed) for seed in range(SESSIONS)]
     # The rig's noise is estimated on a session of its own.
     other = measure(clean, SESSIONS)

@@ -11,10 +11,10 @@ from jaxfinger.identify import identify
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.identify.plausible import implausible
 from jaxfinger.report.curves import curves
-from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger
+from jaxfinger.synthetic import paper_finger, polynomial_finger, true_model
 from tests.identify.test_units import arm
 
-MODEL = nominal_model(polynomial_finger(paper_finger()))
+MODEL = true_model(polynomial_finger(paper_finger()))
 WRONG = {
     "would drive the joint": (lambda m: m.joint_torque.damping, -1e-3, 4e-4),
     "would push the joint on": (lambda m: m.joint_torque.friction, -2e-3, 4e-4),

@@ -5,14 +5,14 @@ import pytest
 
 from jaxfinger.errors import UserError
 from jaxfinger.identify import refine
-from jaxfinger.identify.posterior import posterior
+from jaxfinger.identify.posterior import sampled_posterior
 
 
 @pytest.mark.long
 def test_nuts_agrees_with_laplace_where_the_model_is_linear(session, staged):
     slow = session.select("ID.2")
     fit = refine(slow, staged)
-    found = posterior(slow, fit, draws=400, warmup=200)
+    found = sampled_posterior(slow, fit, draws=400, warmup=200)
     assert found.trusted
     seen = np.flatnonzero(np.isfinite(fit.std) & (fit.std > 0))
     ratio = np.sqrt(np.diag(found.samples.covariance))[seen] / fit.std[seen]
@@ -23,4 +23,4 @@ def test_nuts_agrees_with_laplace_where_the_model_is_linear(session, staged):
 
 def test_a_staged_fit_has_no_posterior(session, staged):
     with pytest.raises(UserError, match="refine it first"):
-        posterior(session, staged)
+        sampled_posterior(session, staged)

@@ -7,7 +7,7 @@ import pytest
 
 from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.model import TendonFriction
-from jaxfinger.synthetic import ModelPlant, nominal_model, paper_finger, polynomial_finger, recipe_from, simulate
+from jaxfinger.synthetic import ModelPlant, paper_finger, polynomial_finger, recipe_from, simulate, true_model
 
 TENSIONS = [4.0, 8.0, 12.0, 16.0]  # N
 RECIPE = recipe_from(
@@ -36,7 +36,7 @@ RECIPE = recipe_from(
 )
 def test_what_is_lost_is_found(a0, a1):
     """Beside 0.2 + 0.2 f. Between two dead zones a few tensions say little of a₀ and a₁, but all of what is lost."""
-    true = nominal_model(polynomial_finger(paper_finger()))
+    true = true_model(polynomial_finger(paper_finger()))
     n = true.finger.n
 
     def rubbing(constant, proportional):

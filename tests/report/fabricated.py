@@ -35,7 +35,7 @@ from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.report.curves import Curve, Curves
 from jaxfinger.report.measured import Points
 from jaxfinger.report.traces import Trace
-from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger
+from jaxfinger.synthetic import paper_finger, polynomial_finger, true_model
 
 STRETCH, STRIBECK = Key("tendon_stretch", ("T3",)), Key("joint_stribeck", ("PIP",))
 TORQUE, EXCURSION = Channel("ID.4", "joint_torque"), Channel("ID.4", "tendon_excursion")
@@ -45,7 +45,7 @@ TORQUE, EXCURSION = Channel("ID.4", "joint_torque"), Channel("ID.4", "tendon_exc
 def fits() -> tuple[Fit, Fit]:
     """A nominal fit whose parameters are known to a hundredth, neighbours correlated; and one whose T3 stretches."""
     finger = polynomial_finger(paper_finger())
-    model = nominal_model(finger)
+    model = true_model(finger)
     size = ravel(model).size
     empty = Fit(model, np.zeros((size, size)), np.zeros(0, int), Recipe(), specimen="finger A", data="a.h5")
     chosen = [i for i, p in enumerate(describe(model)) if p.determinable and p.group in ("elastic", "tendon_friction")]

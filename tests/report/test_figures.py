@@ -14,7 +14,7 @@ from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.report.curves import curves
 from jaxfinger.report.identification import draw_identification
 from jaxfinger.report.validation import draw_validation
-from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger, recipe_from, simulate
+from jaxfinger.synthetic import paper_finger, polynomial_finger, recipe_from, simulate, true_model
 
 RECIPE = {
     "specimen": {"kind": "polynomial"},
@@ -38,7 +38,7 @@ def session():
 @pytest.fixture(scope="module")
 def fit(session) -> Fit:
     """The truth, said to be known to one per cent."""
-    before = Fit.before(session, Recipe(), nominal_model(polynomial_finger(paper_finger())))
+    before = Fit.before(session, Recipe(), true_model(polynomial_finger(paper_finger())))
     groups = ("moment_arm", "elastic", "friction", "damping", "tendon_friction")
     chosen = [i for i, p in enumerate(describe(before.model)) if p.group in groups and p.determinable]
     flat = np.asarray(ravel(before.model))

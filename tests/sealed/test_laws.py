@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.sealed.departures import LISTED, UNLISTED, draw, presliding
-from jaxfinger.sealed.laws import Finger, State
+from jaxfinger.sealed.laws import Finger, Situation
 from jaxfinger.sealed.record import commanded, last_direction, record
 from jaxfinger.sealed.severity import Session, calibrate
 
@@ -16,7 +16,7 @@ def held(nominal, f):
     tension = np.zeros((n, nominal.n))
     tension[:, 0] = f
     zero = np.zeros((n, nominal.m))
-    return State(np.arange(n) * 0.1, np.arange(n) * 0.1, zero, zero, zero, tension, zero, held=True)
+    return Situation(np.arange(n) * 0.1, np.arange(n) * 0.1, zero, zero, zero, tension, zero, held=True)
 
 
 def test_held_tendon_rises_with_loss_keeps_its_plateau_and_slips_back(nominal):
@@ -45,10 +45,10 @@ def test_coupling_matrix_is_the_derivative_of_excursion(specimen, nominal):
 
     def length(x):
         z = np.zeros(3)
-        return finger.path(State(0.0, 0.0, x, z, z, np.full(finger.n, 2.0), z))[0]  # type: ignore[arg-type]
+        return finger.path(Situation(0.0, 0.0, x, z, z, np.full(finger.n, 2.0), z))[0]  # type: ignore[arg-type]
 
     z = np.zeros(3)
-    _, arm = finger.path(State(0.0, 0.0, q, z, z, np.full(finger.n, 2.0), z))  # type: ignore[arg-type]
+    _, arm = finger.path(Situation(0.0, 0.0, q, z, z, np.full(finger.n, 2.0), z))  # type: ignore[arg-type]
     numeric = np.stack([(length(q + h * e) - length(q - h * e)) / (2 * h) for e in np.eye(3)], axis=1)
     np.testing.assert_allclose(arm, numeric, atol=1e-10)
 

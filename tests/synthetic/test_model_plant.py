@@ -11,12 +11,12 @@ from jaxfinger.synthetic import (
     ModelPlant,
     SpecimenPlant,
     clean_session,
-    nominal_model,
     paper_finger,
     polynomial_finger,
     recipe_from,
     session_plan,
     simulate,
+    true_model,
 )
 
 SPECIMEN = polynomial_finger(paper_finger())
@@ -33,7 +33,7 @@ def plans():
 def test_prescribed_channels_agree(plans, experiment):
     plan, active = plans[experiment], SPECIMEN.description.active
     ours = SpecimenPlant(SPECIMEN).prescribed(plan)
-    theirs = ModelPlant(nominal_model(SPECIMEN)).prescribed(plan)
+    theirs = ModelPlant(true_model(SPECIMEN)).prescribed(plan)
     assert ours.keys() == theirs.keys()
     for channel in ours:
         rows = active if channel.startswith("tendon") else slice(None)
@@ -44,19 +44,19 @@ def test_driven_motion_agrees_under_the_same_tension(plans):
     """Two independent steppings of dry friction, under tension that is held over a sample and interpolated."""
     ours = SpecimenPlant(SPECIMEN)
     first = ours.driven(plans["VD.3"])
-    second = ModelPlant(nominal_model(SPECIMEN), driver=ours).driven(plans["VD.3"])
+    second = ModelPlant(true_model(SPECIMEN), driver=ours).driven(plans["VD.3"])
     assert np.array_equal(first["tendon_force"], second["tendon_force"])
     assert np.abs(first["q"] - second["q"]).max() < np.deg2rad(0.1)
 
 
 def test_model_without_a_driver_cannot_be_driven(plans):
     with pytest.raises(UserError, match=r"drop VD\.3"):
-        ModelPlant(nominal_model(SPECIMEN)).driven(plans["VD.3"])
+        ModelPlant(true_model(SPECIMEN)).driven(plans["VD.3"])
 
 
 def test_session_of_a_model():
     recipe = recipe_from({"trials": TRIALS | {"experiments": ["ID.4"]}})
-    session = simulate(recipe, seed=2, plant=ModelPlant(nominal_model(SPECIMEN)))
+    session = simulate(recipe, seed=2, plant=ModelPlant(true_model(SPECIMEN)))
     assert {t.experiment for t in session} == {"ID.4"}
     assert all(np.isfinite(t.joint_torque).any() for t in session)
 
@@ -64,7 +64,7 @@ def test_session_of_a_model():
 def test_a_sensor_drifts_on_between_repeats_of_one_motion():
     """Repeats differ by the drift between them, in closed form, and by nothing else."""
     recipe = recipe_from({"trials": TRIALS | {"experiments": ["ID.3-static"], "id3_static": {"repeats": 2}}})
-    model = nominal_model(SPECIMEN)
+    model = true_model(SPECIMEN)
     drift = CATALOGUE["torque_sensor_drift"].at(model.finger, ("torque_sensor",), A=1e-3, P=71.0, tare=3.0)
     model = eqx.tree_at(lambda m: m.effects, model, (drift,), is_leaf=lambda v: isinstance(v, tuple))
     clean = clean_session(recipe, ModelPlant(model), SPECIMEN.description)

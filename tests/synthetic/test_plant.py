@@ -7,11 +7,11 @@ import pytest
 from jaxfinger.model import Motion, external_torque, fingertip_force
 from jaxfinger.synthetic import (
     SpecimenPlant,
-    nominal_model,
     paper_finger,
     polynomial_finger,
     recipe_from,
     session_plan,
+    true_model,
 )
 from jaxfinger.synthetic.driven import QUICK
 from jaxfinger.synthetic.plant import BLOCK, joint_tension
@@ -49,7 +49,7 @@ def _motion(plan):
 
 @pytest.mark.parametrize("experiment", ["ID.3-static", "ID.3-dynamic", "ID.4"])
 def test_joint_torque_is_that_of_equation_1(plant, plans, experiment):
-    model = nominal_model(SPECIMEN)
+    model = true_model(SPECIMEN)
     chosen = [p for p in plans if p.experiment == experiment]
     for plan in chosen[:: max(1, len(chosen) // 3)]:
         torque = _sampled(plan, plant.prescribed(plan)["joint_torque"])
@@ -59,7 +59,7 @@ def test_joint_torque_is_that_of_equation_1(plant, plans, experiment):
 def test_fingertip_force_is_the_least_squares_one(plant, plans):
     plan = next(p for p in plans if p.experiment == "VD.2")
     force = _sampled(plan, plant.prescribed(plan)["fingertip_force"])
-    assert force == pytest.approx(np.asarray(FORCE(nominal_model(SPECIMEN), _motion(plan))), abs=1e-7)
+    assert force == pytest.approx(np.asarray(FORCE(true_model(SPECIMEN), _motion(plan))), abs=1e-7)
 
 
 def test_motor_torque_has_the_sign_of_the_load(plant):

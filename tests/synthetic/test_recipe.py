@@ -4,8 +4,8 @@ from pathlib import Path
 
 from hypothesis import given, settings
 
-from jaxfinger.identify import read_recipe as read_fit_recipe
-from jaxfinger.synthetic import read_recipe
+from jaxfinger.identify import read_recipe
+from jaxfinger.synthetic import read_session_recipe
 from tests.mutations import assert_read_or_refused, mutated
 
 ROOT = Path(__file__).parents[2]
@@ -14,13 +14,13 @@ ROOT = Path(__file__).parents[2]
 @settings(max_examples=60, deadline=None)
 @given(mutated((ROOT / "datasets" / "paper-finger" / "recipe.toml").read_text()))
 def test_a_mutated_recipe_of_the_simulator(tmp_path_factory, text):
-    assert_read_or_refused(lambda text: read_recipe(written(tmp_path_factory, text)), text)
+    assert_read_or_refused(lambda text: read_session_recipe(written(tmp_path_factory, text)), text)
 
 
 @settings(max_examples=60, deadline=None)
 @given(mutated((ROOT / "fits" / "human-like.toml").read_text()))
 def test_a_mutated_recipe_of_a_fit(tmp_path_factory, text):
-    assert_read_or_refused(lambda text: read_fit_recipe(written(tmp_path_factory, text)), text)
+    assert_read_or_refused(lambda text: read_recipe(written(tmp_path_factory, text)), text)
 
 
 def written(tmp_path_factory, text):

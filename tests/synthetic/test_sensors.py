@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.synthetic import paper_finger, recipe_from, session_plan
-from jaxfinger.synthetic.recipe import Cad, Channel, Sensors
+from jaxfinger.synthetic.recipe import Cad, Sensor, Sensors
 from jaxfinger.synthetic.sensors import coloured_noise, drawn_from_cad, record
 
 DESCRIPTION = paper_finger().description
@@ -30,7 +30,7 @@ def _record(experiment, sensors=None, seed=0):
 
 @pytest.mark.parametrize(("coloured", "dt"), [(0.0, 1e-3), (0.4, 1e-3), (0.4, 4e-3), (1.0, 1e-3)])
 def test_noise_has_its_variance_and_correlation_at_any_rate(coloured, dt):
-    channel = Channel(2.0, 1e-3, coloured, correlation_time=0.03)
+    channel = Sensor(2.0, 1e-3, coloured, correlation_time=0.03)
     x = coloured_noise(channel, (400_000, 2), dt, np.random.default_rng(1))
     assert x.std(axis=0) == pytest.approx(2.0, rel=0.03)
     assert np.corrcoef(x.T)[0, 1] == pytest.approx(0.0, abs=0.03)
@@ -40,7 +40,7 @@ def test_noise_has_its_variance_and_correlation_at_any_rate(coloured, dt):
 
 
 def test_noise_starts_stationary():
-    channel = Channel(1.0, 1e-3, coloured=1.0, correlation_time=0.03)
+    channel = Sensor(1.0, 1e-3, coloured=1.0, correlation_time=0.03)
     x = coloured_noise(channel, (5, 40_000), 1e-3, np.random.default_rng(2))
     assert x.std(axis=1) == pytest.approx(1.0, rel=0.02)
 
@@ -86,7 +86,7 @@ def test_spikes_are_as_many_and_as_large_as_asked():
 
 
 def test_offsets_are_constant_within_a_trial_and_differ_between_trials():
-    sensors = Sensors(tendon_excursion=Channel(0.0, 1e-9, offset=2e-4))
+    sensors = Sensors(tendon_excursion=Sensor(0.0, 1e-9, offset=2e-4))
     offsets = []
     for seed in range(60):
         x = _record("VD.1", sensors, seed).tendon_excursion[:, :4]

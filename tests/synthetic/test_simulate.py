@@ -11,7 +11,7 @@ from jaxfinger.synthetic import (
     clean_session,
     measure,
     paper_finger,
-    read_recipe,
+    read_session_recipe,
     recipe_from,
     session_plan,
     simulate,
@@ -170,7 +170,7 @@ def test_a_finger_file_is_a_recipe(tmp_path):
     (tmp_path / "finger.toml").write_text(FINGER)
     (tmp_path / "recipe.toml").write_text(f'finger = "finger.toml"\n{quick}{TERMS}')
     (tmp_path / "whole.toml").write_text(FINGER + TERMS + quick)
-    session, whole = (simulate(read_recipe(tmp_path / f"{name}.toml")) for name in ("recipe", "whole"))
+    session, whole = (simulate(read_session_recipe(tmp_path / f"{name}.toml")) for name in ("recipe", "whole"))
     assert _same(session, whole)
     assert session.finger.rotor_inertia == [1e-5]
     assert session.finger.mass_std == [0.001]
@@ -183,7 +183,7 @@ def test_a_finger_file_is_a_recipe(tmp_path):
     torque = -0.02 * 9.81 * 0.02 * np.cos(still.q[:, 0]) - 0.01 + 0.03 * still.q[:, 0]
     torque += 0.002 * still.joint_direction[:, 0]
     np.testing.assert_allclose(still.joint_torque[held, 0], torque[held], atol=2e-3)
-    bare = simulate(read_recipe(tmp_path / "finger.toml"))  # no terms, every experiment
+    bare = simulate(read_session_recipe(tmp_path / "finger.toml"))  # no terms, every experiment
     assert {t.experiment for t in bare} == set(EXPERIMENTS)
 
 
@@ -200,12 +200,12 @@ def test_a_finger_file_is_a_recipe(tmp_path):
 def test_mistakes_in_a_finger_to_simulate_are_named(tmp_path, old, new, said):
     (tmp_path / "finger.toml").write_text((FINGER + TERMS).replace(old, new))
     with pytest.raises(UserError, match=rf"finger\.toml, {said}"):
-        read_recipe(tmp_path / "finger.toml")
+        read_session_recipe(tmp_path / "finger.toml")
 
 
 def test_a_finger_without_tendons_is_simulated(tmp_path):
     (tmp_path / "arm.toml").write_text(FINGER.split("[[finger.tendons]]")[0])
-    session = simulate(read_recipe(tmp_path / "arm.toml"))
+    session = simulate(read_session_recipe(tmp_path / "arm.toml"))
     assert {t.experiment for t in session} == {"ID.3-static", "ID.3-dynamic"}
 
 
@@ -223,11 +223,11 @@ def test_files_that_are_no_recipe(tmp_path, text, said):
     if text is not None:
         path.write_text(text)
     with pytest.raises(UserError, match=rf"recipe\.toml.*{said}"):
-        read_recipe(path)
+        read_session_recipe(path)
 
 
 def test_shipped_session_is_the_shipped_recipe():
-    recipe = read_recipe(SHIPPED / "recipe.toml")
+    recipe = read_session_recipe(SHIPPED / "recipe.toml")
     session = read_session(SHIPPED / "session.h5")
     assert not _errors(SHIPPED / "session.h5")
     assert list(session.trials) == [p.name for p in session_plan(paper_finger().description, recipe.trials)]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxfinger.model import Motion, external_torque, rigid_body
-from jaxfinger.synthetic import nominal_model, paper_finger, polynomial_finger, random_finger
+from jaxfinger.synthetic import paper_finger, polynomial_finger, random_finger, true_model
 from jaxfinger.synthetic.routes import WrappedRoute
 
 LAYOUTS = st.sampled_from(["planar", "abduction", "spatial"])
@@ -90,7 +90,7 @@ def test_passive_tendon_couples_pip_and_dip_only_where_it_is_taut():
 
 def test_polynomial_finger_is_exactly_the_nominal_model():
     specimen = polynomial_finger(paper_finger())
-    model = nominal_model(specimen)
+    model = true_model(specimen)
     q = _inside(specimen, 30)
     active = specimen.description.active
     assert np.asarray(model.moment_arm.excursion(q))[active] == pytest.approx(specimen.excursion(q)[active], abs=1e-15)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxfinger.data import Trial, read_session
 from jaxfinger.errors import UserError
 from jaxfinger.rig.backend import Block, Command, CommandRefused, EndOfReplay, Rig, Status
-from jaxfinger.rig.channels import Channel, Filter, RigDescription
+from jaxfinger.rig.channels import Filter, RigChannel, RigDescription
 from jaxfinger.rig.contract import State, Trip
 
 BLOCK = 50
@@ -41,7 +41,7 @@ class ReplayRig(Rig):
         if name not in session.trials:
             raise UserError(f"{path}: has no trial '{name}'; choose one of {', '.join(session.trials)}.")
         trial, finger = session[name], session.finger
-        measured: list[Channel] = []
+        measured: list[RigChannel] = []
         columns: list[np.ndarray] = []
         for channel in self.description.channels:
             column = _column(trial, channel, finger.joint_names, finger.tendon_names)
@@ -100,7 +100,7 @@ class ReplayRig(Rig):
         return {"replay": str(self._path)}
 
 
-def _column(trial: Trial, channel: Channel, joints: tuple[str, ...], tendons: tuple[str, ...]) -> np.ndarray | None:
+def _column(trial: Trial, channel: RigChannel, joints: tuple[str, ...], tendons: tuple[str, ...]) -> np.ndarray | None:
     """The trial's column for a channel; the external torque sits in the column of the joint that it was coupled to."""
     array, names = {
         "tension": (trial.tendon_force, tendons),

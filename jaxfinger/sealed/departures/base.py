@@ -11,7 +11,7 @@ import numpy as np
 from jaxfinger.data import FingerDescription
 
 if TYPE_CHECKING:
-    from ..laws import Finger, State
+    from ..laws import Finger, Situation
     from ..record import Channels
 
 
@@ -48,26 +48,26 @@ class Departure:
     def body(self, finger: FingerDescription) -> FingerDescription:
         return finger
 
-    def path(self, finger: Finger, s: State, length: np.ndarray, arm: np.ndarray):
+    def path(self, finger: Finger, s: Situation, length: np.ndarray, arm: np.ndarray):
         return length, arm
 
-    def passive(self, finger: Finger, s: State, torque: np.ndarray) -> np.ndarray:
+    def passive(self, finger: Finger, s: Situation, torque: np.ndarray) -> np.ndarray:
         return torque
 
-    def coulomb(self, finger: Finger, s: State, limit: np.ndarray, decided: np.ndarray):
+    def coulomb(self, finger: Finger, s: Situation, limit: np.ndarray, decided: np.ndarray):
         return limit, decided
 
-    def loss(self, finger: Finger, s: State, limit: np.ndarray, decided: np.ndarray):
+    def loss(self, finger: Finger, s: Situation, limit: np.ndarray, decided: np.ndarray):
         return limit, decided
 
-    def deliver(self, finger: Finger, s: State, reaching: np.ndarray) -> np.ndarray:
+    def deliver(self, finger: Finger, s: Situation, reaching: np.ndarray) -> np.ndarray:
         return reaching
 
-    def at_motor(self, finger: Finger, s: State, torque: np.ndarray) -> np.ndarray:
+    def at_motor(self, finger: Finger, s: Situation, torque: np.ndarray) -> np.ndarray:
         """Torque at the external motor's sensor, (N, m)."""
         return torque
 
-    def contact(self, finger: Finger, s: State, force: np.ndarray) -> np.ndarray:
+    def contact(self, finger: Finger, s: Situation, force: np.ndarray) -> np.ndarray:
         """Force on the fingertip, (N, 3)."""
         return force
 
@@ -83,7 +83,7 @@ class Memory(Departure, ABC):
     states: ClassVar[int] = 1
 
     @abstractmethod
-    def inputs(self, finger: Finger, s: State) -> np.ndarray:
+    def inputs(self, finger: Finger, s: Situation) -> np.ndarray:
         """(..., i), what drives the state; must not use the state itself."""
 
     def start(self, u: np.ndarray) -> np.ndarray:
@@ -94,7 +94,7 @@ class Memory(Departure, ABC):
     def step(self, z: np.ndarray, before: np.ndarray, now: np.ndarray, dt: float) -> np.ndarray:
         """(..., k) one sample later."""
 
-    def state(self, s: State) -> np.ndarray:
+    def state(self, s: Situation) -> np.ndarray:
         return s.memory[id(self)]
 
 
