@@ -1,28 +1,185 @@
-"""What the pages tell a reader to type is a command that there is, with options that it has."""
+"""What the pages tell a reader to type runs: each command in a folder that holds the files which it names."""
 
+import math
+import os
+import pty
 import re
+import runpy
 import shlex
+import shutil
+import sys
 from pathlib import Path
 
+import matplotlib as mpl
 import pytest
+from cyclopts import MissingArgumentError
 
+from jaxfinger.cli import main
 from jaxfinger.cli.app import app
+from jaxfinger.rig import open_rig, parse_plan, parse_rig
+from jaxfinger.rig import run as record
+from jaxfinger.rig.simulated.examples import rig_toml
+from tests.rig.conftest import SHORT
 
 ROOT = Path(__file__).parents[1]
+BENCHMARK = ROOT / "datasets" / "sealed" / "README.md"
+GUIDE = ROOT / "docs" / "your-own-data.md"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "datasets").rglob("*.md"))]
+
+# What the guide says of a finger that is to be simulated, for its `finger.toml`: moment arms, and what else it does.
+PATHS = ({"T1": "[0.008, 1e-3]", "T2": "[-0.008, -1e-3]"}, "[terms.joints.MCP]\nelastic = [-0.01, 0.03]\n")
+# Which file of the shelf a page means by a name that is none of a file there.
+MEANS = {"SESSION": "session.h5", "SESSION.h5": "session.h5", "B.h5": "session.h5", "C.h5": "unseen.h5"}
+MEANS |= {"FILE": "session.h5", "FIT": "fit.json", "A-fit.json": "fit.json", "LOG": "LOG.csv", "bench.toml": "rig.toml"}
+MEANS |= {"…": ""}  # a reader puts more of the same there
+# What these do takes a minute and more; `sealed` works for minutes on each case.
+MATRIX = "jaxfinger.rig.matrix"  # its table is made and held to the page by tests/rig/test_matrix.py
+LONG = ("demo", "diagnose", "sealed")
 
 
 def commands(page: Path) -> list[str]:
-    """Lines of shell blocks that call jaxfinger."""
-    blocks = re.findall(r"```(?:sh|bash|console)\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    blocks += re.findall(r"\n\n((?:    [^\n]*\n)+)", page.read_text(encoding="utf-8"))
-    lines = "".join(blocks).replace("\\\n", " ").splitlines()
-    return [line.strip() for line in lines if line.strip().startswith("jaxfinger ")]
+    """What calls jaxfinger: in shell blocks, and within a sentence."""
+    text = page.read_text(encoding="utf-8")
+    fenced = r"```(\w*)[^\n]*\n(.*?)```"
+    shells = {"sh", "console"} if page == GUIDE else {"sh", "bash", "console"}  # test_guide follows its `bash` blocks
+    blocks = [block for language, block in re.findall(fenced, text, re.DOTALL) if language in shells]
+    prose = re.sub(fenced, "", text, flags=re.DOTALL)
+    blocks += re.findall(r"\n\n((?:    [^\n]*\n)+)", prose)
+    lines = "".join(blocks).replace("\\\n", " ").replace("&&", "\n").replace(".venv/bin/", "").splitlines()
+    lines += [" ".join(inline.split()) for inline in re.findall(r"`([^`]+)`", prose)]
+    return [" ".join(shlex.split(line, comments=True)) for line in lines if re.match(r"\s*jaxfinger( |$)", line)]
+
+
+def modules(page: Path) -> list[str]:
+    """Modules that a page tells to run."""
+    return re.findall(r"python -m (jaxfinger[\w.]*)", page.read_text(encoding="utf-8"))
+
+
+def long(line: str):
+    """Marked as a long proof where it takes so long."""
+    slow = line.split()[1] in LONG and not is_a_name(line)
+    return pytest.param(line, id=line[:70].replace("/", "_"), marks=[pytest.mark.long] if slow else [])
+
+
+def is_a_name(line: str) -> bool:
+    """Whether a sentence names a command, without the files that it would need."""
+    try:
+        app.parse_args(shlex.split(line)[1:], exit_on_error=False, print_error=False)
+    except MissingArgumentError:
+        return True
+    return False
+
+
+def typed(line: str) -> None:
+    """As at a prompt; an exit with anything but 0 is an error."""
+    code = 0
+    try:
+        main(shlex.split(line)[1:])
+    except SystemExit as end:
+        code = end.code or 0
+    assert code == 0, line
+
+
+@pytest.fixture(scope="module")
+def shelf(tmp_path_factory):
+    """The files of a reader, made by the same commands: sessions of the guide's finger, a fit, an interrupted run."""
+    folder = tmp_path_factory.mktemp("shelf")
+    (text,) = re.findall(r"```toml finger\.toml\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)
+    arms, terms = PATHS
+    for tendon, arm in arms.items():
+        text = text.replace(f'name = "{tendon}"\n', f'name = "{tendon}"\nexcursion = {{ MCP = {arm} }}\n')
+    (folder / "finger.toml").write_text(f"{text}\n{terms}", encoding="utf-8")
+    page = (ROOT / "docs" / "add-an-effect.md").read_text(encoding="utf-8")
+    (folder / "drag.py").write_text(re.findall(r"```python\n(.*?)```", page, re.DOTALL)[0], encoding="utf-8")
+    columns = "time,angle knuckle,angle middle,force A,force B,length A,length B"
+    swing = [40.0 - 30.0 * math.cos(0.02 * k) for k in range(1200)]
+    rows = [f"{0.02 * k:.2f},{q:.4f},20,2,2,{0.14 * q:.5f},{-0.14 * q:.5f}" for k, q in enumerate(swing)]
+    (folder / "LOG.csv").write_text("\n".join([columns, *rows]), encoding="utf-8")
+    (folder / "plan.toml").write_text(SHORT, encoding="utf-8")
+    (folder / "rig.toml").write_text(rig_toml(), encoding="utf-8")
+    rig, seen = parse_rig(rig_toml()), []
+
+    def interrupt(view):
+        seen.append(view.number)
+        if view.number == 2 and view.recording:
+            raise KeyboardInterrupt
+
+    outcome = record(parse_plan(SHORT, rig), open_rig(rig), folder / "interrupted.h5", observe=interrupt)
+    assert len(outcome.complete) == 1
+    outcome.log.rename(folder / "session.h5.wal")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for line in (
+            "jaxfinger new logged.toml mapping.toml LOG.csv --joints knuckle,middle --tendons A,B",
+            "jaxfinger simulate finger.toml -o session.h5",
+            "jaxfinger simulate finger.toml -o unseen.h5 --seed 3",
+            "jaxfinger identify session.h5 -o fit.json",
+            "jaxfinger predict fit.json session.h5 -o simulator.h5",
+        ):
+            typed(line)
+    return folder
+
+
+@pytest.fixture
+def reader(shelf, tmp_path, monkeypatch):
+    """A folder with what a command names and does not write, and a terminal, as `record` asks for."""
+
+    def prepare(line: str) -> tuple[str, list[Path]]:
+        words = [MEANS.get(word, word) for word in shlex.split(line)]
+        written = {words[k + 1] for k, word in enumerate(words) if word in ("-o", "--output")}
+        written |= set(words[2:4]) if words[1] == "new" else set()
+        for word in {*words, "logged.toml"} - written:  # the finger that mapping.toml names
+            for place in (shelf / word, ROOT / word):
+                if place.is_file():
+                    (tmp_path / word).parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copy(place, tmp_path / word)
+        if "--resume" in words:
+            shutil.copy(shelf / "interrupted.h5", tmp_path / "session.h5")
+            shutil.copy(shelf / "session.h5.wal", tmp_path / "session.h5.wal")
+        return shlex.join(filter(None, words)), [] if "--dry-run" in words else [tmp_path / name for name in written]
+
+    ours, theirs = pty.openpty()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    with os.fdopen(theirs) as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        with mpl.rc_context({"backend": "agg"}):
+            yield prepare
+    os.close(ours)
 
 
 @pytest.mark.parametrize(
-    ("page", "line"), [(p.name, line) for p in PAGES for line in commands(p)], ids=lambda x: x[:60].replace("/", "_")
+    "line", [long(c) for c in dict.fromkeys(c for p in PAGES if p != BENCHMARK for c in commands(p))]
 )
-def test_every_command_in_the_docs_is_one(page, line):
-    tokens = shlex.split(line, comments=True)[1:]
-    app.parse_args(tokens, exit_on_error=False, print_error=False)
+def test_every_command_of_the_pages_runs(line, reader, capsys):
+    if is_a_name(line):
+        typed(f"{line} --help")
+        assert "Usage" in capsys.readouterr().out
+        return
+    line, written = reader(line)
+    typed(line)
+    assert capsys.readouterr().out
+    assert [path for path in written if not path.exists()] == []
+
+
+@pytest.mark.long
+def test_the_commands_of_the_benchmark_run_in_their_order(tmp_path, monkeypatch, capsys):
+    """On one case instead of the page's forty, which take hours."""
+    monkeypatch.chdir(tmp_path)
+    lines = commands(BENCHMARK)
+    assert len(lines) > 5
+    for line in lines:
+        if is_a_name(line):
+            continue
+        typed(re.sub(r"--count \d+", "--count 1", line))
+        assert "failed" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("module", sorted({m for p in PAGES for m in modules(p)} - {MATRIX}))
+def test_every_module_that_the_pages_run_says_how(module, monkeypatch, capsys):
+    """It serves until it is stopped."""
+    monkeypatch.setattr(sys, "argv", [module, "--help"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_module(module, run_name="__main__")
+    assert not end.value.code
+    assert "usage" in capsys.readouterr().out
