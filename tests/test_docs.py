@@ -162,17 +162,13 @@ def test_every_command_of_the_pages_runs(line, reader, capsys):
     assert [path for path in written if not path.exists()] == []
 
 
-@pytest.mark.long
-def test_the_commands_of_the_benchmark_run_in_their_order(tmp_path, monkeypatch, capsys):
-    """On one case instead of the page's forty, which take hours."""
-    monkeypatch.chdir(tmp_path)
+def test_every_command_of_the_benchmark_is_one():
+    """They take hours: forty cases, each diagnosed for a minute. tests/sealed runs them on small ones."""
     lines = commands(BENCHMARK)
     assert len(lines) > 5
     for line in lines:
-        if is_a_name(line):
-            continue
-        typed(re.sub(r"--count \d+", "--count 1", line))
-        assert "failed" not in capsys.readouterr().out
+        if not is_a_name(line):
+            app.parse_args(shlex.split(line)[1:], exit_on_error=False, print_error=False)
 
 
 @pytest.mark.parametrize("module", sorted({m for p in PAGES for m in modules(p)} - {MATRIX}))
