@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from json import loads
 from pathlib import Path
 from typing import Annotated
 
@@ -62,14 +61,8 @@ def diagnose(
     folders = _folders(sessions, output)
     for folder in folders.values():
         refuse(folder, overwrite)
-    if predictions is not None and len(sessions) > 1:
-        raise UserError(f"{predictions}: are one session's predictions; give that session alone")
-    if (
-        predictions is not None
-        and predictions.exists()
-        and any(s.exists() and predictions.samefile(s) for s in sessions)
-    ):
-        raise UserError(f"{predictions}: is the session itself; give the simulator's predictions of its trials")
+    if predictions is not None:
+        _refuse_predictions(predictions, sessions)
     tolerated = _tolerance(tolerance or [])
     from dataclasses import replace
 
@@ -78,35 +71,38 @@ def diagnose(
     from jaxfinger.effects import load
     from jaxfinger.gap import diagnose as run
     from jaxfinger.identify import load_fit, read_recipe
-    from jaxfinger.report.gap_json import write
+    from jaxfinger.report.gap_json import as_gap_json, write
     from jaxfinger.report.page import write_page
     from jaxfinger.report.screen import across, summary
 
-    wanted = None if recipe is None and against is not None else read_recipe(recipe)
-    earlier = load_fit(against, effects) if against is not None else None
-    own = load(effects) if effects is not None else {}
-    simulated = read_predictions(predictions) if predictions is not None else None
-    measured = {session: read(session) for session in folders}
-    diagnoses = {}
-    for session, folder in folders.items():
-        of = f" {session.name}" if len(folders) > 1 else ""
-        with progress(f"first look{of}" if quick else f"diagnose{of}") as say:
+    texts, gaps, found = {}, {}, {}
+    with progress("first look" if quick else "diagnose") as say:
+        wanted = None if recipe is None and against is not None else read_recipe(recipe)
+        earlier = load_fit(against, effects) if against is not None else None
+        own = load(effects) if effects is not None else {}
+        say("reading the file")
+        simulated = read_predictions(predictions) if predictions is not None else None
+        measured = {session: read(session) for session in folders}
+        for session, folder in folders.items():
+            name = session.name
+            told = say if len(folders) == 1 else lambda message, name=name: say(f"{name}: {message}")
             make_folder(folder)
-            found = run(measured[session], wanted, quick, own, tuple(without or ()), say, simulated, tolerated, earlier)
+            d = run(measured[session], wanted, quick, own, tuple(without or ()), told, simulated, tolerated, earlier)
             if against is not None:
-                found = replace(found, against=against.name)
-            say("writing the report")
-            write(found, folder, overwrite)
-            write_page(found, folder / "report.html", overwrite)
-        diagnoses[session.name] = replace(found, problem=None)  # which holds all of its rows
-        if not json:
-            console().print(plain(summary(found)), markup=False, soft_wrap=True)
-            print(f"\n{folder / 'report.html'}: the evidence\n")
+                d = replace(d, against=against.name)
+            told("writing the report")
+            write(d, folder, overwrite)
+            write_page(d, folder / "report.html", overwrite)
+            texts[name], gaps[name] = summary(d), as_gap_json(d)
+            found[name] = replace(d, problem=None)  # which holds every row of the session
     if json:
-        texts = {s.name: loads((folder / "gap.json").read_text(encoding="utf-8")) for s, folder in folders.items()}
-        print_json(texts if len(texts) > 1 else next(iter(texts.values())))
-    elif len(diagnoses) > 1:
-        header, rows = across(diagnoses)
+        print_json(gaps if len(gaps) > 1 else gaps[sessions[0].name])
+        return
+    for session, folder in folders.items():
+        console().print(plain(texts[session.name]), markup=False, soft_wrap=True)
+        print(f"\n{folder / 'report.html'}: the evidence\n")
+    if len(found) > 1:
+        header, rows = across(found)
         table("Probability of every cause, session by session, and its size", header, rows)
 
 
@@ -120,6 +116,15 @@ def _folders(sessions: tuple[Path, ...], output: Path) -> dict[Path, Path]:
     if len(set(folders.values())) < len(sessions):
         raise UserError(f"{output}: needs a folder for each session; give each once, in files of different names")
     return folders
+
+
+def _refuse_predictions(predictions: Path, sessions: tuple[Path, ...]) -> None:
+    """Those of another simulator are of one session, and no session themselves."""
+    if len(sessions) > 1:
+        raise UserError(f"{predictions}: holds predictions of one session; give that session alone")
+    session = sessions[0]
+    if predictions.exists() and session.exists() and predictions.samefile(session):
+        raise UserError(f"{predictions}: is the session itself; give the simulator's predictions of its trials")
 
 
 def _tolerance(texts: list[str]) -> dict[str, float]:

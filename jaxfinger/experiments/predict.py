@@ -3,13 +3,13 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfinger.model import Model, Motion, ahead, excursion, external_torque, fingertip_force
+from jaxfinger.model import Model, Motion, excursion, external_torque, fingertip_force, simulated_ahead
 
 _TRUTH = {
     "tendon_excursion": excursion,
     "joint_torque": external_torque,
     "fingertip_force": fingertip_force,
-    "q": ahead,  # where a motion is simulated on
+    "q": simulated_ahead,
 }
 
 

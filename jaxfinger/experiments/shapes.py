@@ -23,9 +23,9 @@ def roomy(size: int, least: int) -> int:
 
 def blocks(batch: Batch) -> list[Batch]:
     """The batch in stacks of TRIALS trials of a common length; what is added holds the last values, and counts not.
-    One to simulate stays whole: its samples cost too much to add any.
+    A batch that simulations start from stays as it is: every sample added would be one more simulation.
     """
-    if batch.x.ahead is not None:
+    if batch.x.simulated:
         return [batch]
     B, T = batch.x.time.shape
     ends = (-B % TRIALS, roomy(T, SAMPLES) - T)

@@ -65,30 +65,21 @@ class Columns:
 class ByColumn:
     """Rows, column by column: their coefficients on the features, and their products, each made once."""
 
-    def __init__(self, columns: Columns, x: Float[np.ndarray, "k N"]):
+    def __init__(self, columns: Columns, x: Float[np.ndarray, "k N"], dtype: type = np.float64):
+        """`dtype`: of the rows that are kept; single precision holds a signature that leaves 1e-3 of itself to 6e-5."""
         self.columns, self.N = columns, x.shape[1]
-        self.parts = [x[:, c.rows] for c in columns.items]
-        self.B: Float[np.ndarray, "features k"] = np.concatenate(
-            [c.basis.T @ p.T for c, p in zip(columns.items, self.parts, strict=True)]
-        )
+        self.B: Float[np.ndarray, "features k"] = np.concatenate([c.basis.T @ x[:, c.rows].T for c in columns.items])
+        self.parts = [x[:, c.rows].astype(dtype) for c in columns.items]
         self._with: WeakKeyDictionary[ByColumn, np.ndarray] = WeakKeyDictionary()
         self._among: dict[tuple[int, ...], np.ndarray] = {}
 
-    @classmethod
-    def joined(cls, many: Sequence["ByColumn"]) -> "ByColumn":
-        """All their rows, moved over: none is held twice."""
-        out = cls(many[0].columns, np.empty((0, many[0].N)))
-        out.B = np.concatenate([x.B for x in many], axis=1)
-        out.parts = [np.concatenate([x.parts.pop(0) for x in many]) for _ in out.parts]
-        return out
-
-    def in_single_precision(self) -> "ByColumn":
-        """The same, rounded to 6e-8 of each value: of a signature that leaves 1e-3 of itself, to 6e-5."""
-        self.parts = [x.astype(np.float32) for x in self.parts]
-        return self
+    def take(self, others: Sequence["ByColumn"]) -> None:
+        """Rows of others behind its own; these are empty afterwards, so that none is held twice."""
+        self.B = np.concatenate([self.B, *(x.B for x in others)], axis=1)
+        self.parts = [np.concatenate([mine, *(x.parts.pop(0) for x in others)]) for mine in self.parts]
 
     def rows(self, at: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k N"]:
-        """Some of the rows as they were, zero in columns that are not judged."""
+        """Some of the rows, zero in columns that are not judged."""
         out = np.zeros((len(at), self.N))
         for c, part in zip(self.columns.items, self.parts, strict=True):
             out[:, c.rows] = part[at]

@@ -25,7 +25,7 @@ class Costs:
 
     parameters: Parameters
     unknown: Float[np.ndarray, " C"]  # log evidence, column by column, that something is at work
-    touched: Mapping[Key, Float[np.ndarray, " C"]]  # of all that the trials can see: share of a column it could explain
+    touched: Mapping[Key, Float[np.ndarray, " C"]]  # share that each visible cause could explain
 
     @cached_property
     def sites(self) -> Mapping[str, int]:

@@ -363,13 +363,8 @@ def _candidates(problem: Problem, search: Search, chosen: State, found: Posterio
     gain = dict(zip(chosen.keys, shares.overall()[0].tolist(), strict=True))
     others = search.alone(k for k in order if k not in inside)
     likely = [k for k in order if k in others][:HELD_OUT]
-    gain |= dict(
-        zip(
-            likely,
-            held_out_gains(problem, [search.table.signatures.rows(others[k][0].columns) for k in likely]),
-            strict=True,
-        )
-    )
+    signatures = [search.table.signatures.rows(others[k][0].columns) for k in likely]
+    gain |= dict(zip(likely, held_out_gains(problem, signatures), strict=True))
     values = inside | {k: _alone(problem, search.table, *x) for k, x in others.items()}
     return tuple(
         Candidate(Key(*k), found.causes[k], found.gains[k], gain.get(k, 0.0), values.get(k, ())) for k in order

@@ -100,8 +100,8 @@ Part = FixedShapes | Scan
 
 
 def read_parts(problem: Problem, items: list[Variant], progress: Progress = lambda message: None) -> Iterator[Part]:
-    """Signatures of every candidate at the problem's nominal model, class by class: together they fill the memory, so
-    that nobody keeps them twice. Classes are compiled side by side.
+    """Signatures of every candidate at the problem's nominal model, one class of effects after the other: together they
+    take gigabytes, of which a caller need not hold more than it keeps. Classes are compiled side by side.
     """
     signatures, groups = Signatures(problem), {}
     for v in items:

@@ -80,15 +80,16 @@ def table_of(problem: Problem, bench: Bench, parts: Iterable[Part], together: bo
     rt = plain.residual(problem.r)
     items: list[Variant] = []
     none = np.empty((0, problem.r.size))
-    blocks, counts, found = [ByColumn(bench.columns, none).in_single_precision()], [], [_seen(bench, plain, none)]
+    table, more, counts, found = ByColumn(bench.columns, none, np.float32), [], [], [_visible(bench, plain, none)]
     for part in parts:
         variants, Z = part.offer(plain, rt)
         items += variants
         counts += [Z.shape[1]] * len(Z)
         Z = Z.reshape(-1, Z.shape[2])
-        found.append(_seen(bench, plain, Z))
-        blocks.append(ByColumn(bench.columns, Z * found[-1].units[:, None]).in_single_precision())
-    raw, seen, units, claims = (np.concatenate(x) for x in zip(*found, strict=True))
+        found.append(_visible(bench, plain, Z))
+        more.append(ByColumn(bench.columns, Z * found[-1].units[:, None], np.float32))
+    table.take(more)
+    raw, left, units, claims = (np.concatenate(x) for x in zip(*found, strict=True))
     kept = units > 0.0
     absorbed: dict[Key, float] = {}
     hidden: dict[Key, dict[str, float]] = {}
@@ -98,11 +99,11 @@ def table_of(problem: Problem, bench: Bench, parts: Iterable[Part], together: bo
         at = np.arange(start, start + count)
         start += count
         rows[v] = at
-        share = 1.0 - float(np.sum(seen[at] ** 2) / max(np.sum(raw[at] ** 2), 1e-300))
+        share = 1.0 - float(np.sum(left[at] ** 2) / max(np.sum(raw[at] ** 2), 1e-300))
         if share < absorbed.get(v.key, np.inf):
             absorbed[v.key] = share
             hidden[v.key] = {
-                n: size / float(max(seen[i], 1e-12 * raw[i], 1e-300))
+                n: size / float(max(left[i], 1e-12 * raw[i], 1e-300))
                 for i, (n, size) in zip(at, v.sizes.items(), strict=True)
                 if raw[i] > 0
             }
@@ -112,25 +113,25 @@ def table_of(problem: Problem, bench: Bench, parts: Iterable[Part], together: bo
             offers.append(Offered((v,), at[kept[at]], low, high))
             touched[v.key] = np.maximum(touched.get(v.key, 0.0), claims[at].max(axis=0))
     offers += _together(offers) if together else []
-    return Table(ByColumn.joined(blocks), rows, units, absorbed, hidden, touched, offers)
+    return Table(table, rows, units, absorbed, hidden, touched, offers)
 
 
-class Seen(NamedTuple):
-    """What of signatures the nominal parameters leave."""
+class Visible(NamedTuple):
+    """How much of M signatures the trials can tell from the nominal parameters."""
 
     raw: Float[np.ndarray, " M"]  # norms
-    seen: Float[np.ndarray, " M"]  # likewise, off what the nominal parameters can absorb
-    units: Float[np.ndarray, " M"]  # that make it as large as all of the gap; zero where next to nothing is left
-    claims: Float[np.ndarray, "M C"]  # share of each column's gap that it then explains
+    left: Float[np.ndarray, " M"]  # norms of what the nominal parameters leave
+    units: Float[np.ndarray, " M"]  # sizes that would make what is left as large as the whole gap; zero: not visible
+    claims: Float[np.ndarray, "M C"]  # share of each column's gap that each would explain, that large
 
 
-def _seen(bench: Bench, plain: Whitened, Z: Float[np.ndarray, "M N"]) -> Seen:
+def _visible(bench: Bench, plain: Whitened, Z: Float[np.ndarray, "M N"]) -> Visible:
     projected = plain(Z)
-    raw, seen = np.linalg.norm(Z, axis=1), np.linalg.norm(projected, axis=1)
-    units = np.where(seen > SEEN * raw, bench.gap / np.maximum(seen, 1e-300), 0.0)
+    raw, left = np.linalg.norm(Z, axis=1), np.linalg.norm(projected, axis=1)
+    units = np.where(left > SEEN * raw, bench.gap / np.maximum(left, 1e-300), 0.0)
     energy = np.stack([np.sum((projected[:, c.rows] @ c.basis) ** 2, axis=1) for c in bench.columns.items], axis=1)
     share = units[:, None] ** 2 * energy / np.maximum(bench.null.judged.evidence.e, 1e-300)
-    return Seen(raw, seen, units, np.minimum(share, 1.0))
+    return Visible(raw, left, units, np.minimum(share, 1.0))
 
 
 def _ends(v: Variant, name: str, unit: float) -> tuple[float, float]:

@@ -17,14 +17,13 @@ from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.identifiability import name_invisible
-from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.predictions import model_for
-from jaxfinger.identify.prior import prior_of
+from jaxfinger.identify.prior import Prior, prior_of
 from jaxfinger.identify.propagate import propagate
 from jaxfinger.identify.shooting import AHEAD, Shooting, shooting
-from jaxfinger.identify.solve import solve, within
+from jaxfinger.identify.solve import Source, solve, within
 from jaxfinger.identify.stages import (
     Progress,
     cad_covariance,
@@ -33,6 +32,7 @@ from jaxfinger.identify.stages import (
     free_groups,
     report_of,
     seen_by,
+    sources_of,
     total_cost,
     touched_by,
 )
@@ -55,16 +55,13 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         UserError: the session has none of these trials, with `ahead` no VD.3 either, or its finger is another one.
     """
     recipe = fit.recipe
+    if ahead and fit.model.effects:
+        raise UserError("a fit with effects cannot be refined ahead; give one of the nominal model")
     model = start = model_for(fit, session)
+    shots = shooting(session) if ahead else None
     progress("reading the recordings")
     stacks = prepare(session, [t.name for t in session if t.experiment in recipe.fit.joint_experiments])
     reads = {e: channels_of(e) for e in stacks}
-    given: dict[tuple[str, str], Noise] = {}
-    shots: Shooting | None = None
-    if ahead:
-        progress("simulating VD.3")
-        shots, stacks[AHEAD] = shooting(model, session)
-        reads[AHEAD], given[AHEAD, "q"] = ("q",), shots.noise(model)
     if not reads:
         raise UserError(
             f"{session.file or 'the session'}: has no trial of {', '.join(recipe.fit.joint_experiments)}; "
@@ -84,8 +81,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         prior = prior_of(np.asarray(ravel(fit.model)), fit.covariance, free)
     progress("refining on all trials at once")
     known, huber = (fit.noise if same else {}), recipe.fit.huber
-    model, solution, sources, noise = estimate_with_noise(model, free, stacks, reads, known, prior, huber, given=given)
-    noise = {key: n for key, n in noise.items() if key not in given}
+    model, solution, sources, noise = estimate_with_noise(model, free, stacks, reads, known, prior, huber)
     warnings = name_invisible(parameters, free, solution.invisible)
     if not solution.converged or warnings or solution.chi2_per_row(free.size) > MISFIT:
         progress("refining from a neutral start")
@@ -98,15 +94,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
                 "the earlier fit led to a poorer optimum",
             ]
 
-    if shots is not None:
-        progress("refining without what noise bends")
-        sources[AHEAD] = sources[AHEAD]._replace(batch=shots.straightened(model))
-        bent = np.asarray(ravel(model))
-        model, solution = solve(model, free, sources, prior, huber)
     covariance = propagate(fit.covariance, solution, sources, free, prior, huber)
-    if ahead:
-        theta = np.asarray(ravel(model))
-        covariance += _contradicted(refine(session, fit), theta, covariance) + np.outer(theta - bent, theta - bent)
     warnings += implausible(model, covariance, free, within(start, free)[0])
     refined = replace(
         fit,
@@ -117,17 +105,41 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         specimen=session.specimen,
     )
     trials = tuple(t for s in stacks.values() for t in s.trials)
-    report = report_of(STAGE, solution, free, trials, warnings, _gain(fit, refined, same))
+    how = "CAD is the prior, the trials are read once" if same else "the earlier fit of other data is the prior"
+    report = report_of(STAGE, solution, free, trials, warnings, _gain(fit, refined, how))
+    refined = replace(refined, stages=(*fit.stages, report))
+    if shots is None:
+        return refined
+    progress("refining on the motion of VD.3")
+    return _on_motion(refined, shots, sources, prior, fit.covariance)
+
+
+def _on_motion(fit: Fit, shots: Shooting, sources: dict[str, Source], prior: Prior, before: np.ndarray) -> Fit:
+    """A joint fit, made from `sources` with `before` as the covariance of all else, refined on VD.3 too."""
+    free, huber, parameters = fit.estimated, fit.recipe.fit.huber, describe(fit.model)
+    noise = {(AHEAD, "q"): shots.noise(fit.model)}
+    sources = sources | sources_of({AHEAD: shots.stack}, {AHEAD: ("q",)}, noise, parameters)
+    first, _ = solve(fit.model, free, sources, prior, huber)
+    sources[AHEAD] = sources[AHEAD]._replace(batch=shots.corrected(first))
+    model, solution = solve(first, free, sources, prior, huber)
+    covariance = propagate(before, solution, sources, free, prior, huber)
+    moved, corrected = (np.asarray(ravel(model)) - np.asarray(ravel(m)) for m in (fit.model, first))
+    covariance += _contradiction(moved, fit.std**2, np.diag(covariance)) + np.outer(corrected, corrected)
+    warnings = name_invisible(parameters, free, solution.invisible)
+    warnings += implausible(model, covariance, free, within(fit.model, free)[0])
+    refined = replace(fit, model=model, covariance=covariance)
+    report = report_of(
+        AHEAD, solution, free, shots.stack.trials, warnings, _gain(fit, refined, "those of the joint refinement")
+    )
     return replace(refined, stages=(*fit.stages, report))
 
 
-def _contradicted(without: Fit, theta: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """What an estimate's covariance grows by where VD.3 moves it further from that `without` it than chance does: the
-    variance of such a move is the difference of both.
+def _contradiction(moved: np.ndarray, without: np.ndarray, together: np.ndarray) -> np.ndarray:
+    """Covariance that more trials add by what they contradict the others: estimates have `moved` by more than chance
+    makes them, whose variance is that `without` these trials less that `together` with them.
     """
-    moved = theta - np.asarray(ravel(without.model))
     with np.errstate(invalid="ignore"):  # of what neither sees
-        chance = np.maximum(np.nan_to_num(without.std**2 - np.diag(covariance), nan=np.inf), 0.0)
+        chance = np.maximum(np.nan_to_num(without - together, nan=np.inf), 0.0)
     beyond = np.sign(moved) * np.sqrt(np.maximum(moved**2 - chance, 0.0))
     return np.outer(beyond, beyond)
 
@@ -146,11 +158,10 @@ def _neutral(model: Model, free, parameters) -> Model:
     return Free.at(model, free).set(model, jax.device_put(flat[free]))
 
 
-def _gain(before: Fit, after: Fit, same: bool) -> str:
-    """How much narrower the intervals are than those of the earlier fit."""
+def _gain(before: Fit, after: Fit, how: str) -> str:
+    """How much narrower the intervals are than those of the earlier fit, and of what."""
     common = before.estimated[(before.std[before.estimated] > 0) & np.isfinite(before.std[before.estimated])]
     if not common.size:
         return ""
     ratio = after.std[common] / before.std[common]
-    prior = "CAD is the prior, the trials are read once" if same else "the earlier fit of other data is the prior"
-    return f"standard deviations are {np.median(ratio):.2f} of the earlier ones in the median ({prior})"
+    return f"standard deviations are {np.median(ratio):.2f} of the earlier ones in the median ({how})"

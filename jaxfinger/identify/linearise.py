@@ -72,7 +72,7 @@ def _white(r, batch: Batch, filters: Filters, channel: str):
 
 
 def _white_slopes(slopes: Float[np.ndarray, "p columns B T"], batch: Batch, filters: Filters, channel: str):
-    """Column by column, the derivatives by those parameters that it depends on."""
+    """White derivatives; those of a column by parameters that it does not depend on are zero as they are."""
     out, mask, coefficients = np.zeros_like(slopes), batch.mask[channel], filters[channel]
     for k in range(slopes.shape[1]):
         at, column = np.flatnonzero(slopes[:, k].any(axis=(1, 2))), slice(k, k + 1)
@@ -115,7 +115,7 @@ def tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -
 
     Compiled for a block of trials (`blocks`), whose additions are cut off again.
     """
-    if batch.x.ahead is not None:
+    if batch.x.simulated:
         return Tangent(*jax.tree.map(np.asarray, _simulated_tangent(model, free, batch, channels)))
     parts = [_tangent(model, free, block, channels, jax.device_put(True)) for block in blocks(batch)]
     residuals, slopes = zip(*parts, strict=True)
@@ -124,7 +124,7 @@ def tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -
 
 def missed(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> dict[str, np.ndarray]:
     """`residuals_of`, by the program of `tangent`: where that is compiled, it costs no compilation."""
-    if batch.x.ahead is not None:
+    if batch.x.simulated:
         return residuals_of(model, batch, channels)
     return _cut([_tangent(model, free, block, channels, jax.device_put(False))[0] for block in blocks(batch)], batch)
 
@@ -187,20 +187,18 @@ _residuals_jit = quick_jit(_residuals)
 
 @quick_jit
 def _simulated_tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> tuple[dict, dict]:
-    """Residuals of simulations and their derivatives, backwards start by start: each has a few angles, that many
-    parameters lead to.
+    """Residuals of simulations and their derivatives, start by start and backwards: a start predicts a few angles,
+    which depend on many parameters.
     """
-    shape = batch.x.time.shape
-    starts = jax.tree.map(lambda a: a.reshape(*a.shape[:-2], -1), batch)
     values, split = ravel_pytree(free.values(model))
 
     def one(values, start: Batch):
         missed = _residuals(free.put(model, split(values)), start, channels)
         return missed, missed
 
-    slopes, missed = jax.vmap(jax.jacrev(one, has_aux=True), in_axes=(None, -1), out_axes=-1)(values, starts)
-    apart = jax.tree.map(lambda a: a.reshape(*a.shape[:-1], *shape), (missed, slopes))
-    return apart[0], {c: jnp.moveaxis(J, 1, 0) for c, J in apart[1].items()}
+    each = jax.vmap(jax.jacrev(one, has_aux=True), in_axes=(None, -1), out_axes=-1)  # start of a trial
+    slopes, missed = jax.vmap(each, in_axes=(None, -2), out_axes=-2)(values, batch)
+    return missed, {c: jnp.moveaxis(J, 1, 0) for c, J in slopes.items()}
 
 
 @quick_jit

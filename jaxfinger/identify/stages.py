@@ -4,10 +4,9 @@ Each stage is equation (1) with the terms that its experiment makes vanish, and 
 parameters of earlier stages stay fixed, and their errors go on (`propagate`).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import equinox as eqx
 import jax
@@ -263,18 +262,15 @@ def estimate_with_noise(
     prior: Prior | None,
     huber: float,
     tangents: Tangents | None = None,
-    given: Mapping[tuple[str, str], Noise] = MappingProxyType({}),
 ) -> tuple[Model, Solution, dict[str, Source], dict[tuple[str, str], Noise]]:
-    """Noise from the residuals of a fit with first guesses of it, where it is not known; then the fit under it. What is
-    `given` stays: its residuals do not tell it.
-    """
-    tangents, parameters, noise = tangents or Tangents(), describe(model), known | dict(given)
+    """Noise from the residuals of a fit with first guesses of it, where it is not known; then the fit under it."""
+    tangents, parameters, noise = tangents or Tangents(), describe(model), dict(known)
     unknown = {(e, c): first_noise(stacks[e], c) for e in reads for c in reads[e] if (e, c) not in noise}
     model = start_values(model, free, parameters, sources_of(stacks, reads, noise | unknown, parameters))
     for _ in range(2 if unknown else 0):
         sources = sources_of(stacks, reads, noise | unknown, parameters)
         model, solution = solve(model, free, sources, prior, tangents=tangents, small=ROUGH)
-        noise |= _noise(solution, stacks, reads, given)
+        noise |= _noise(solution, stacks, reads)
         unknown = {}
     sources = sources_of(stacks, reads, noise, parameters)
     model, solution = solve(model, free, sources, prior, huber, tangents=tangents)
@@ -331,12 +327,11 @@ def first_noise(stack: Stack, channel: str) -> Noise:
     return Noise(std, std, np.zeros((columns, ORDER)), "first guess")
 
 
-def _noise(solution: Solution, stacks, reads, given) -> dict[tuple[str, str], Noise]:
+def _noise(solution: Solution, stacks, reads) -> dict[tuple[str, str], Noise]:
     return {
         (e, c): estimate(stacks[e], c, np.asarray(solution.linearised[e].residuals[c]))
         for e, channels in reads.items()
         for c in channels
-        if (e, c) not in given
     }
 
 

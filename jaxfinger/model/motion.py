@@ -27,6 +27,11 @@ class Motion(eqx.Module):
     # low-pass that all of it went through, 0 for none, where a sample is the mean of its interval.
     jitter: Float[Array, "m *T"] | None = None
     blur: Float[Array, "*T"] | None = None
-    # Of samples from which the motion is simulated: N, the tension at even instants from each on, and s, for how long.
-    ahead: Float[Array, "L n *T"] | None = None
+    # Of samples that a simulation starts from: N, the tension that follows, at even instants, and s, for how long.
+    tension_ahead: Float[Array, "L n *T"] | None = None
     horizon: Float[Array, "*T"] | None = None
+
+    @property
+    def simulated(self) -> bool:
+        """Whether a simulation starts from every sample."""
+        return self.horizon is not None

@@ -65,7 +65,7 @@ def simulate(
     def sample(state, inputs):
         t, f0, f1, tau0, tau1 = inputs
 
-        @jax.checkpoint  # backwards through every step, none is kept
+        @jax.checkpoint  # a derivative backwards keeps the states between the steps, and nothing of the steps
         def substep(state, share):
             f, tau = f0 + share * (f1 - f0), tau0 + share * (tau1 - tau0)
             return _step(model, state, motion, t + share * dt * substeps, f, tau, dt), None
@@ -78,16 +78,17 @@ def simulate(
     return jnp.concatenate([q0[:, None], q.T], axis=1), jnp.concatenate([qd0[:, None], qd.T], axis=1)
 
 
-def ahead(model: Model, x: Motion) -> Float[Array, "m *T"]:
+def simulated_ahead(model: Model, x: Motion) -> Float[Array, "m *T"]:
     """q, rad, at the horizon of every sample: simulated from its state under the tension that follows."""
-    assert x.ahead is not None
+    assert x.tension_ahead is not None
     assert x.horizon is not None
-    share = jnp.linspace(0.0, 1.0, x.ahead.shape[0])
+    share = jnp.linspace(0.0, 1.0, x.tension_ahead.shape[0])
 
     def one(q, qd, tension, time, start, horizon):
         return simulate(model, time + share * horizon, tension, q, qd, session_start=start, substeps=1)[0][:, -1]
 
-    q, qd, tension = jnp.moveaxis(x.q, 0, -1), jnp.moveaxis(x.qd, 0, -1), jnp.moveaxis(x.ahead, (0, 1), (-1, -2))
+    q, qd = jnp.moveaxis(x.q, 0, -1), jnp.moveaxis(x.qd, 0, -1)
+    tension = jnp.moveaxis(x.tension_ahead, (0, 1), (-1, -2))
     each = jnp.vectorize(one, signature="(m),(m),(n,l),(),(),()->(m)")
     return jnp.moveaxis(each(q, qd, tension, x.time, x.session_time - x.time, x.horizon), -1, 0)
 
