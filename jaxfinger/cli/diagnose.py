@@ -122,8 +122,7 @@ def _refuse_predictions(predictions: Path, sessions: tuple[Path, ...]) -> None:
     """Those of another simulator are of one session, and no session themselves."""
     if len(sessions) > 1:
         raise UserError(f"{predictions}: holds predictions of one session; give that session alone")
-    session = sessions[0]
-    if predictions.exists() and session.exists() and predictions.samefile(session):
+    if predictions.exists() and any(s.exists() and predictions.samefile(s) for s in sessions):
         raise UserError(f"{predictions}: is the session itself; give the simulator's predictions of its trials")
 
 
