@@ -122,7 +122,7 @@ def shelf(tmp_path_factory):
 
 @pytest.fixture
 def reader(shelf, tmp_path, monkeypatch):
-    """A folder with what a command names and does not write, and a terminal, as `record` asks for."""
+    """A folder with what a command names and does not write, a terminal, as `record` asks for, and a shell."""
 
     def prepare(line: str) -> tuple[str, list[Path]]:
         words = [MEANS.get(word, word) for word in shlex.split(line)]
@@ -141,6 +141,7 @@ def reader(shelf, tmp_path, monkeypatch):
     ours, theirs = pty.openpty()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("SHELL", "/bin/bash")
     with os.fdopen(theirs) as terminal:
         monkeypatch.setattr(sys, "stdin", terminal)
         with mpl.rc_context({"backend": "agg"}):
