@@ -5,10 +5,8 @@ leave there; a residual and a signature enter every formula through their coeffi
 what lies outside of it. That is some hundreds of numbers where there are tens of thousands of rows.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -60,44 +58,6 @@ class Columns:
     def sums(self, values: Float[np.ndarray, "features *n"]) -> Float[np.ndarray, "C *n"]:
         """Of features, column by column."""
         return np.add.reduceat(values, np.r_[0, np.cumsum(self.counts.K)[:-1]], axis=0)
-
-
-class ByColumn:
-    """Rows, column by column: their coefficients on the features, and their products, each made once."""
-
-    def __init__(self, columns: Columns, x: Float[np.ndarray, "k N"], dtype: type = np.float64):
-        """`dtype`: of the rows that are kept; single precision holds a signature that leaves 1e-3 of itself to 6e-5."""
-        self.columns, self.N = columns, x.shape[1]
-        self.B: Float[np.ndarray, "features k"] = np.concatenate([c.basis.T @ x[:, c.rows].T for c in columns.items])
-        self.parts = [x[:, c.rows].astype(dtype) for c in columns.items]
-        self._with: WeakKeyDictionary[ByColumn, np.ndarray] = WeakKeyDictionary()
-        self._among: dict[tuple[int, ...], np.ndarray] = {}
-
-    def take(self, others: Sequence["ByColumn"]) -> None:
-        """Rows of others behind its own; these are empty afterwards, so that none is held twice."""
-        self.B = np.concatenate([self.B, *(x.B for x in others)], axis=1)
-        self.parts = [np.concatenate([mine, *(x.parts.pop(0) for x in others)]) for mine in self.parts]
-
-    def rows(self, at: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k N"]:
-        """Some of the rows, zero in columns that are not judged."""
-        out = np.zeros((len(at), self.N))
-        for c, part in zip(self.columns.items, self.parts, strict=True):
-            out[:, c.rows] = part[at]
-        return out
-
-    def products(self, other: "ByColumn") -> Float[np.ndarray, "C k l"]:
-        """With other rows."""
-        if other not in self._with:
-            self._with[other] = np.stack([x @ y.T for x, y in zip(self.parts, other.parts, strict=True)])
-        return self._with[other]
-
-    def among(self, at: Int[np.ndarray, " k"]) -> Float[np.ndarray, "C k k"]:
-        """Of some of the rows with one another."""
-        key = tuple(at.tolist())
-        if key not in self._among:
-            some = [x[at].astype(np.float64) for x in self.parts]
-            self._among[key] = np.stack([x @ x.T for x in some])
-        return self._among[key]
 
 
 def _columns(problem: Problem):

@@ -169,7 +169,8 @@ def searched(
     """All sets of the catalogue's effects that the evidence led to, and the best of them."""
     bench = Bench.of(problem, Parameters())
     progress("reading the signatures of all effects")
-    parts = read_parts(problem, variants(catalogue, problem.nominal.finger, problem.scales), progress)
+    items = variants(catalogue, problem.nominal.finger, problem.scales)
+    parts = read_parts(problem, items, bench.columns, progress)
     search = Search(bench, table_of(problem, bench, parts), progress)
     progress("weighing the evidence")
     return search, search.run()
@@ -363,7 +364,7 @@ def _candidates(problem: Problem, search: Search, chosen: State, found: Posterio
     gain = dict(zip(chosen.keys, shares.overall()[0].tolist(), strict=True))
     others = search.alone(k for k in order if k not in inside)
     likely = [k for k in order if k in others][:HELD_OUT]
-    signatures = [search.table.signatures.rows(others[k][0].columns) for k in likely]
+    signatures = [search.table.signatures.dense(others[k][0].columns, problem.r.size) for k in likely]
     gain |= dict(zip(likely, held_out_gains(problem, signatures), strict=True))
     values = inside | {k: _alone(problem, search.table, *x) for k, x in others.items()}
     return tuple(

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.effects import CatalogueEffect, Scales
-from jaxfinger.gap.columns import ByColumn, Columns
+from jaxfinger.gap.by_column import ByColumn
+from jaxfinger.gap.columns import Columns
 from jaxfinger.gap.formula import Judged, Linear, Parameters, Weights, unexplained
 from jaxfinger.gap.problem import Problem, moved
 from jaxfinger.gap.signatures import Signatures, Variant
@@ -25,7 +26,7 @@ FACTOR = 0.7  # logarithm of the most by which a step changes a shape
 ROUNDS = 5  # of moving the nominal model
 SETTLED = 0.5  # change of the score below which it stays
 HALVINGS = 3
-ROUNDING = 1e-14  # of the largest variance: a sum of ten thousand products is good to a hundred times 2.2e-16
+ROUNDING = 1e-14  # relative, of sums of squares: one of ten thousand is good to a hundred times 2.2e-16
 Room = tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]
 
 
@@ -93,8 +94,8 @@ class Bench:
     def of(cls, problem: Problem, parameters: Parameters) -> "Bench":
         columns = Columns.of(problem)
         empty = np.empty((0, problem.r.size))
-        nominal, none = ByColumn(columns, problem.J.T), ByColumn(columns, empty)
-        residual = ByColumn(columns, problem.r[None])
+        nominal, none = ByColumn.of(columns, problem.J.T), ByColumn.of(columns, empty)
+        residual = ByColumn.of(columns, problem.r[None])
         judged = Linear(columns, (residual, nominal), prior_products(problem, 0), none, parameters).null
         assert judged is not None
         null = State(problem, columns, nominal, (), (), empty, empty, judged)
@@ -110,9 +111,9 @@ class Bench:
         """
         linear = Linear(
             self.columns,
-            (ByColumn(self.columns, r[None]), nominal),
+            (ByColumn.of(self.columns, r[None]), nominal),
             prior_products(problem, 0),
-            ByColumn(self.columns, slopes),
+            ByColumn.of(self.columns, slopes),
             self.parameters,
             self.null.judged,
         )
@@ -254,7 +255,7 @@ def at_one_model(bench: Bench, problem: Problem, effects: list[CatalogueEffect],
         effects, changes, slopes, r, sizes, cost = trial, new, new_slopes, new_r, new_sizes, new_cost
         if gain < 0.1 + 1e-3 * cost:
             break
-    nominal = ByColumn(bench.columns, problem.J.T)
+    nominal = ByColumn.of(bench.columns, problem.J.T)
     judged = bench.judge(problem, nominal, r, slopes, sizes, _room(effects, coordinates))
     return State(problem, bench.columns, nominal, tuple(effects), tuple(coordinates), changes, slopes, judged)
 

@@ -23,9 +23,11 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse import csc_array
 from scipy.special import expit
 
-from jaxfinger.gap.columns import ByColumn, Columns, Counts
+from jaxfinger.gap.by_column import ByColumn, Products
+from jaxfinger.gap.columns import Columns, Counts
 
 
 @dataclass(frozen=True)
@@ -124,18 +126,21 @@ class Linear:
     ):
         self.columns, self.parameters, self.prior = columns, parameters, prior
         self.further = further
-        self.BX = np.concatenate([x.B for x in base], axis=1)
-        self.TX = np.concatenate([np.concatenate([x.products(y) for y in base], axis=2) for x in base], axis=1)
-        self.BZ = further.B
-        self.TXZ = np.concatenate([x.products(further) for x in base], axis=1)
+        self.BX, self.BZ = np.concatenate([x.B for x in base], axis=1), further.B
+        self.TX = np.concatenate([Products.stacked([y.products(x) for y in base]).dense for x in base], axis=2)
+        self.TXZ = Products.stacked([x.products(further) for x in base])
         self.null = null
         if null is None:
             self.null = self.judge(np.empty(0, int))
 
+    def _inside(self, w: Weights) -> Float[np.ndarray, " features"]:
+        """What a feature weighs beyond what lies outside of it."""
+        return np.repeat(w.feature - w.outside, self.columns.counts.K)
+
     def _weighted(self, w: Weights, B, B2, T):
         """Products in the weights, summed over columns."""
-        inside = np.repeat(w.feature - w.outside, self.columns.counts.K)
-        return np.tensordot(w.outside, T, 1) + (B * inside[:, None]).T @ B2
+        outside = T.summed(w.outside) if isinstance(T, Products) else np.tensordot(w.outside, T, 1)
+        return outside + (B * self._inside(w)[:, None]).T @ B2
 
     def judge(
         self, picks: Int[np.ndarray, " k"], low=None, high=None, start: Weights | None = None, middle=None
@@ -145,7 +150,7 @@ class Linear:
         low = np.full(n, -np.inf) if low is None else low
         high = np.full(n, np.inf) if high is None else high
         T = np.empty((len(self.columns.items), k + n, k + n))
-        T[:, :k, :k], T[:, :k, k:] = self.TX, self.TXZ[:, :, picks]
+        T[:, :k, :k], T[:, :k, k:] = self.TX, self.TXZ.of(picks)
         T[:, k:, :k], T[:, k:, k:] = np.swapaxes(T[:, :k, k:], 1, 2), self.further.among(picks)
         B = np.concatenate([self.BX, self.BZ[:, picks]], axis=1)
         prior = np.zeros((k + n, k + n))
@@ -206,39 +211,42 @@ class Linear:
         scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-300))
         absorbed = np.linalg.solve(A * np.outer(scale, scale) + RIDGE * np.eye(k - 1), HXZ[1:] * scale[:, None])
         absorbed *= scale[:, None]  # of every further row, by the base
-        BZ = self.BZ - self.BX[:, 1:] @ absorbed
-        b = x @ HXZ  # residual is optimal in the base, so that projecting Z is all it takes
+        b = x @ HXZ  # the residual is optimal in the base, so that projecting Z is all it takes
+        amplitudes, occam, own = [], np.zeros(len(candidates)), np.zeros((len(candidates), len(self.columns.items)))
+        for n, (at, (low, high)) in enumerate(zip(candidates, bounds, strict=True)):
+            TZ, mine = self.further.among(at), self.BZ[:, at]
+            G = self._weighted(w, mine, mine, TZ) - HXZ[1:, at].T @ absorbed[:, at]
+            a = np.clip(np.linalg.solve(G + np.eye(len(at)), b[at]), low, high)
+            amplitudes.append(a)
+            occam[n] = 0.5 * np.linalg.slogdet(np.eye(len(at)) + G)[1] + 0.5 * float(a @ a)
+            own[n] = (TZ @ a) @ a
+        starts = np.cumsum([0, *(len(a) for a in amplitudes)])
+        shape = self.BZ.shape[1], len(candidates)
+        a = csc_array((np.concatenate(amplitudes), np.concatenate(candidates), starts), shape)
+        # What each candidate changes, refitted: Z a − X q.
+        q = np.vstack([np.zeros((1, len(candidates))), absorbed @ a])
+        change = self.BZ @ a - self.BX @ q
         assert self.null is not None
         r, null = self.BX @ x, self.null.b
-        Tr = np.einsum("i,cij->cj", x, self.TX)  # (C, k)
-        rZ = np.einsum("i,cij->cj", x, self.TXZ) - Tr[:, 1:] @ absorbed
-        # Products of projected further rows by column, for the candidates' blocks alone.
-        JZ = self.TX[:, 1:, 1:] @ absorbed
-        out: list[Evidence | None] = [None] * len(candidates)
-        for n, (at, (low, high)) in enumerate(zip(candidates, bounds, strict=True)):
-            Q = absorbed[:, at]
-            XQ = Q.T @ self.TXZ[:, 1:, at]
-            TZ = self.further.among(at) - XQ - np.swapaxes(XQ, 1, 2) + Q.T @ JZ[:, :, at]
-            inside = np.repeat(w.feature - w.outside, self.columns.counts.K)
-            G = np.tensordot(w.outside, TZ, 1) + (BZ[:, at] * inside[:, None]).T @ BZ[:, at]
-            a = np.clip(np.linalg.solve(G + np.eye(len(at)), b[at]), low, high)
-            if not a.any():
-                continue
-            change = BZ[:, at] @ a
-            e = self.columns.sums((r - change) ** 2)
-            total = now.evidence.e + now.evidence.o - 2.0 * rZ[:, at] @ a + np.einsum("m,cmn,n->c", a, TZ, a)
-            o, explained = np.maximum(total - e, 0.0), self.columns.sums((r - change - null) ** 2)
-            log_l, _ = log_likelihood(self.columns.counts, e, o, explained, self.parameters)
-            occam = 0.5 * np.linalg.slogdet(np.eye(len(at)) + G)[1] + 0.5 * float(a @ a)
-            out[n] = Evidence(e, o, explained, float(log_l - now.log_l - occam))
-        return out
+        e = self.columns.sums((r[:, None] - change) ** 2).T
+        explained = self.columns.sums((r[:, None] - change - null[:, None]) ** 2).T
+        along = self.TXZ.along(x) @ a - np.einsum("i,cij->cj", x, self.TX) @ q
+        norms = own.T - 2.0 * self.TXZ.bilinear(q, a) + np.stack([np.sum(q * (T @ q), axis=0) for T in self.TX])
+        total = now.evidence.e + now.evidence.o - 2.0 * along.T + norms.T
+        o = np.maximum(total - e, 0.0)
+        log_l, _ = log_likelihood(self.columns.counts, e, o, explained, self.parameters)
+        score = log_l - now.log_l - occam
+        return [
+            Evidence(e[n], o[n], explained[n], float(score[n])) if np.any(one) else None
+            for n, one in enumerate(amplitudes)
+        ]
 
     def std(self, at: Int[np.ndarray, " k"], w: Weights) -> Float[np.ndarray, " k"]:
         """Of the amplitudes of further rows, refitted with the base and with one another, without their prior."""
         k, base = self.BX.shape[1], self.prior
         H = np.zeros((k + len(at),) * 2)
         H[:k, :k] = self._weighted(w, self.BX, self.BX, self.TX) + base
-        H[:k, k:] = self._weighted(w, self.BX, self.BZ[:, at], self.TXZ[:, :, at])
+        H[:k, k:] = self._weighted(w, self.BX, self.BZ[:, at], self.TXZ.of(at))
         H[k:, :k] = H[:k, k:].T
         H[k:, k:] = self._weighted(w, self.BZ[:, at], self.BZ[:, at], self.further.among(at))
         scale = 1.0 / np.sqrt(np.maximum(np.diag(H)[1:], 1e-300))

@@ -46,7 +46,7 @@ def fit_with(
     problem = build(session, recipe, progress)
     offered = _offered(catalogue, keys, problem)
     bench = Bench.of(problem, Parameters())
-    table = table_of(problem, bench, read_parts(problem, offered, progress), together=False)
+    table = table_of(problem, bench, read_parts(problem, offered, bench.columns, progress), together=False)
     wanted = list(dict.fromkeys(v.key for v in offered))
     if unseen := [k for k in wanted if k not in table.keys]:
         (effect, site), file = unseen[0], session.file or "the session"

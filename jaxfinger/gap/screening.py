@@ -10,8 +10,10 @@ from jaxtyping import Float
 
 from jaxfinger.compilation import side_by_side
 from jaxfinger.experiments import shows
+from jaxfinger.gap.by_column import ByColumn
+from jaxfinger.gap.columns import Columns
 from jaxfinger.gap.problem import Problem
-from jaxfinger.gap.signatures import Signatures, Variant
+from jaxfinger.gap.signatures import CHUNK, Signatures, Variant
 from jaxfinger.identify.stages import Progress
 
 SHORTEST = 20.0  # s: the shortest period that is looked for
@@ -28,7 +30,7 @@ class Projector(Protocol):
         ...
 
 
-Offer = tuple[list[Variant], Float[np.ndarray, "variants amplitudes N"]]
+Offer = tuple[list[Variant], ByColumn]  # a row an amplitude of each
 
 
 @dataclass(frozen=True)
@@ -36,11 +38,17 @@ class FixedShapes:
     """Variants whose shapes are fixed, with their signatures."""
 
     items: list[Variant]
-    columns: Float[np.ndarray, "variants amplitudes N"]
+    rows: ByColumn
 
-    def offer(self, projector: Projector, rt: Float[np.ndarray, " N+prior"]) -> Offer:
+    @classmethod
+    def of(cls, signatures: Signatures, items: list[Variant], columns: Columns) -> "FixedShapes":
+        """Some at a time: whole rows of hundreds take gigabytes."""
+        parts = [items[k : k + CHUNK] for k in range(0, len(items), CHUNK)]
+        return cls(items, ByColumn.joined(columns, [by_column(signatures, part, columns) for part in parts]))
+
+    def offer(self, projector: Projector, rt: Float[np.ndarray, " N+prior"], columns: Columns) -> Offer:
         """All of them, whatever is left."""
-        return self.items, self.columns
+        return self.items, self.rows
 
 
 @dataclass(frozen=True)
@@ -76,11 +84,11 @@ class Scan:
         columns = signatures.of([effect.at(finger, site, **values) for values in members])
         return cls(signatures, items, periods, middle, columns)
 
-    def offer(self, projector: Projector, rt: Float[np.ndarray, " N+prior"]) -> Offer:
+    def offer(self, projector: Projector, rt: Float[np.ndarray, " N+prior"], columns: Columns) -> Offer:
         """Every variant with those periods that explain most together."""
         shape = {"middle": self.middle} | self.best(projector, rt)
         items = [v.with_shape(**shape) for v in self.items]
-        return items, self.signatures.columns(items)
+        return items, by_column(self.signatures, items, columns)
 
     def best(self, projector: Projector, rt: Float[np.ndarray, " N+prior"]) -> dict[str, float]:
         """The periods, s, by least squares over all sets of them."""
@@ -99,10 +107,16 @@ class Scan:
 Part = FixedShapes | Scan
 
 
-def read_parts(problem: Problem, items: list[Variant], progress: Progress = lambda message: None) -> Iterator[Part]:
-    """Signatures of every candidate at the problem's nominal model, one class of effects after the other: together they
-    take gigabytes, of which a caller need not hold more than it keeps. Classes are compiled side by side.
-    """
+def by_column(signatures: Signatures, items: list[Variant], columns: Columns) -> ByColumn:
+    """Signatures per plausible size, a row an amplitude of each of the variants, which are of one class."""
+    rows = signatures.columns(items)
+    return ByColumn.of(columns, rows.reshape(-1, rows.shape[-1]))
+
+
+def read_parts(
+    problem: Problem, items: list[Variant], columns: Columns, progress: Progress = lambda message: None
+) -> Iterator[Part]:
+    """Signatures of every candidate at the problem's nominal model. Classes of effects are compiled side by side."""
     signatures, groups = Signatures(problem), {}
     for v in items:
         groups.setdefault(_part(v), []).append(v)
@@ -111,7 +125,7 @@ def read_parts(problem: Problem, items: list[Variant], progress: Progress = lamb
         effect = group[0].effect
         if effect.periods() and any(e in problem.stacks for e in shows(effect, problem.nominal.finger)):
             return Scan.of(signatures, group)
-        return FixedShapes(group, signatures.columns(group))
+        return FixedShapes.of(signatures, group, columns)
 
     for count, (key, part) in enumerate(zip(groups, side_by_side(read, groups.values()), strict=True), start=1):
         progress(f"signatures of {key[0]} ({count} of {len(groups)} effects)")

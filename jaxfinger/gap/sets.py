@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfinger.effects import CatalogueEffect, Scales
-from jaxfinger.gap.columns import ByColumn
+from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.costs import Costs, Key
-from jaxfinger.gap.exact import Bench, State, Whitened, fitted, prior_products
+from jaxfinger.gap.exact import ROUNDING, Bench, State, Whitened, fitted, prior_products
 from jaxfinger.gap.formula import Evidence, Judged, Linear, Weights, unexplained
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.screening import Part
@@ -78,34 +78,24 @@ def table_of(problem: Problem, bench: Bench, parts: Iterable[Part], together: bo
     """Every candidate that the trials can see."""
     plain = Whitened(problem, bench.columns, Weights(*np.ones((2, len(bench.columns.items)))))
     rt = plain.residual(problem.r)
-    items: list[Variant] = []
-    none = np.empty((0, problem.r.size))
-    table, more, counts, found = ByColumn(bench.columns, none, np.float32), [], [], [_visible(bench, plain, none)]
-    for part in parts:
-        variants, Z = part.offer(plain, rt)
-        items += variants
-        counts += [Z.shape[1]] * len(Z)
-        Z = Z.reshape(-1, Z.shape[2])
-        found.append(_visible(bench, plain, Z))
-        more.append(ByColumn(bench.columns, Z * found[-1].units[:, None], np.float32))
-    table.take(more)
-    raw, left, units, claims = (np.concatenate(x) for x in zip(*found, strict=True))
+    offered = [part.offer(plain, rt, bench.columns) for part in parts]
+    items = [v for some, _ in offered for v in some]
+    signatures = ByColumn.joined(bench.columns, [rows for _, rows in offered])
+    raw, left, units, claims = _visible(bench, plain, signatures)
     kept = units > 0.0
     absorbed: dict[Key, float] = {}
     hidden: dict[Key, dict[str, float]] = {}
     touched: dict[Key, Float[np.ndarray, " C"]] = {}
     offers, rows, start = [], {}, 0
-    for v, count in zip(items, counts, strict=True):
-        at = np.arange(start, start + count)
-        start += count
+    for v in items:
+        at = np.arange(start, start + len(v.sizes))
+        start += len(v.sizes)
         rows[v] = at
         share = 1.0 - float(np.sum(left[at] ** 2) / max(np.sum(raw[at] ** 2), 1e-300))
         if share < absorbed.get(v.key, np.inf):
             absorbed[v.key] = share
             hidden[v.key] = {
-                n: size / float(max(left[i], 1e-12 * raw[i], 1e-300))
-                for i, (n, size) in zip(at, v.sizes.items(), strict=True)
-                if raw[i] > 0
+                n: size / float(left[i]) for i, (n, size) in zip(at, v.sizes.items(), strict=True) if left[i] > 0.0
             }
         ends = [_ends(v, n, float(units[i])) for i, n in zip(at, v.sizes, strict=True) if kept[i]]
         if ends:
@@ -113,7 +103,7 @@ def table_of(problem: Problem, bench: Bench, parts: Iterable[Part], together: bo
             offers.append(Offered((v,), at[kept[at]], low, high))
             touched[v.key] = np.maximum(touched.get(v.key, 0.0), claims[at].max(axis=0))
     offers += _together(offers) if together else []
-    return Table(table, rows, units, absorbed, hidden, touched, offers)
+    return Table(signatures.scaled(units), rows, units, absorbed, hidden, touched, offers)
 
 
 class Visible(NamedTuple):
@@ -125,11 +115,17 @@ class Visible(NamedTuple):
     claims: Float[np.ndarray, "M C"]  # share of each column's gap that each would explain, that large
 
 
-def _visible(bench: Bench, plain: Whitened, Z: Float[np.ndarray, "M N"]) -> Visible:
-    projected = plain(Z)
-    raw, left = np.linalg.norm(Z, axis=1), np.linalg.norm(projected, axis=1)
+def _visible(bench: Bench, plain: Whitened, Z: ByColumn) -> Visible:
+    """With Q spanning what the nominal parameters can absorb, ‖z − Q Qᵀ z‖² = ‖z‖² − ‖Qᵀ z‖²."""
+    columns, Q = bench.columns, plain.Q
+    square, onto = np.zeros(Z.count), np.zeros((Q.shape[1], Z.count))
+    for c, (at, rows) in zip(columns.items, Z.held, strict=True):
+        square[at] += np.sum(rows**2, axis=1)
+        onto[:, at] += Q[c.rows].T @ rows.T
+    raw, left = np.sqrt(square), np.sqrt(np.maximum(square - np.sum(onto**2, axis=0), ROUNDING * square))
     units = np.where(left > SEEN * raw, bench.gap / np.maximum(left, 1e-300), 0.0)
-    energy = np.stack([np.sum((projected[:, c.rows] @ c.basis) ** 2, axis=1) for c in bench.columns.items], axis=1)
+    absorbed = np.concatenate([c.basis.T @ Q[c.rows] for c in columns.items]) @ onto
+    energy = columns.sums((Z.B - absorbed) ** 2).T
     share = units[:, None] ** 2 * energy / np.maximum(bench.null.judged.evidence.e, 1e-300)
     return Visible(raw, left, units, np.minimum(share, 1.0))
 
@@ -224,7 +220,7 @@ class Search:
         columns = self.bench.columns
         return Linear(
             columns,
-            (ByColumn(columns, r[None]), state.nominal, ByColumn(columns, slopes)),
+            (ByColumn.of(columns, r[None]), state.nominal, ByColumn.of(columns, slopes)),
             prior_products(state.problem, len(slopes)),
             self.table.signatures,
             self.bench.parameters,

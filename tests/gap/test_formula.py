@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from jaxfinger.gap.columns import ByColumn, Column, Columns
+from jaxfinger.gap.by_column import ByColumn
+from jaxfinger.gap.columns import Column, Columns
 from jaxfinger.gap.formula import Linear, Parameters, unexplained, unlisted
 
 ROWS, FEATURES, COLUMNS = 400, 20, 6
@@ -32,8 +33,8 @@ def smooth(columns, rng, *where):
 
 def linear(columns, r, Z, J=None):
     J = np.empty((0, r.size)) if J is None else J
-    base = ByColumn(columns, np.vstack([r[None], J]))
-    return Linear(columns, [base], np.zeros((1 + len(J),) * 2), ByColumn(columns, Z), Parameters())
+    base = ByColumn.of(columns, np.vstack([r[None], J]))
+    return Linear(columns, [base], np.zeros((1 + len(J),) * 2), ByColumn.of(columns, Z), Parameters())
 
 
 def test_a_quiet_cause_counts_beside_a_loud_error(columns, rng):
