@@ -48,8 +48,8 @@ _B_SPLINE = (
 
 
 def smooth(
-    time: Float[np.ndarray, " N"], x: Float[np.ndarray, N * k], cutoff_hz: float
-) -> tuple[Float[np.ndarray, N * k], Float[np.ndarray, N * k], Float[np.ndarray, N * k]]:
+    time: Float[np.ndarray, " N"], x: Float[np.ndarray, "N *k"], cutoff_hz: float
+) -> tuple[Float[np.ndarray, "N *k"], Float[np.ndarray, "N *k"], Float[np.ndarray, "N *k"]]:
     """x, ẋ and ẍ below `cutoff_hz` (the frequency of -3 dB), zero-phase, at the given times.
 
     Columns that are NaN stay NaN; a few NaN in a column are bridged, and NaN in the result.
@@ -61,7 +61,9 @@ def smooth(
     return value, rate, acceleration
 
 
-def low_pass(time: Float[np.ndarray, " N"], x: Float[np.ndarray, N * k], cutoff_hz: float) -> Float[np.ndarray, N * k]:
+def low_pass(
+    time: Float[np.ndarray, " N"], x: Float[np.ndarray, "N *k"], cutoff_hz: float
+) -> Float[np.ndarray, "N *k"]:
     """x below `cutoff_hz` as `smooth` gives it, without its derivatives."""
     return _smoothed(time, x, cutoff_hz, 0)[0]
 
@@ -107,10 +109,10 @@ def _spline(x: Float[np.ndarray, "k N"], rate: float, cutoff_hz: float) -> Float
 
 
 def _derivatives(
-    coefficients: Float[np.ndarray, "k N+5"], highest: int, at: Float[np.ndarray, " M"] | None
+    coefficients: Float[np.ndarray, "k C"], highest: int, at: Float[np.ndarray, " M"] | None
 ) -> Float[np.ndarray, "d k M"]:
     """A spline and its derivatives, per sample, up to the highest order: d = highest + 1 of them, at the samples or at
-    places counted in samples.
+    places counted in samples. C = N + 5, as of `_spline`.
     """
     last = coefficients.shape[1] - 6
 
@@ -169,7 +171,7 @@ def passed(cutoff_hz: float, step: float, order: int = 0) -> float:
     return math.sqrt(step * math.gamma(order + 0.5) / (2.0 * math.pi * width(cutoff_hz) ** (2 * order + 1)))
 
 
-def outlier_mask(x: Float[np.ndarray, N * k], threshold: float = 8.0, longest: int = 5) -> Bool[np.ndarray, N * k]:
+def outlier_mask(x: Float[np.ndarray, "N *k"], threshold: float = 8.0, longest: int = 5) -> Bool[np.ndarray, "N *k"]:
     """True where a sample is a spike: no motion that is seen before and after it leads there.
 
     What motion allows, at whatever rate it is sampled, lies between the straight lines through the two samples on

@@ -19,7 +19,7 @@ class Variable:
     `present` (N, k) is false where a column is no part of the sample: messages of several publishers on one topic.
     """
 
-    values: Float[np.ndarray, N * k]
+    values: Float[np.ndarray, "N *k"]
     columns: tuple[str, ...] = ()
     clock: str = ""
     units: str = ""

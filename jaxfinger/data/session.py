@@ -28,7 +28,7 @@ class FingerDescription:
     joint i, in m/rad^p for p = 1, 2, …; NaN throughout for a tendon of which it is not known. None: nothing is known.
     """
 
-    gravity: Float[np.ndarray, 3]
+    gravity: Float[np.ndarray, "3"]
     joint_names: tuple[str, ...]
     axis: Float[np.ndarray, "m 3"]
     origin: Float[np.ndarray, "m 3"]
@@ -36,7 +36,7 @@ class FingerDescription:
     mass: Float[np.ndarray, " m"]
     com: Float[np.ndarray, "m 3"]
     inertia: Float[np.ndarray, "m 3 3"]
-    fingertip: Float[np.ndarray, 3]
+    fingertip: Float[np.ndarray, "3"]
     tendon_names: tuple[str, ...]
     active: Bool[np.ndarray, " n"]
     crosses: Bool[np.ndarray, "n m"]

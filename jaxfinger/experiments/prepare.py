@@ -26,8 +26,8 @@ class Batch(eqx.Module):
     """All trials of one experiment, reduced, padded to one length: B trials of T samples."""
 
     x: Motion  # (…, B, T)
-    y: dict[str, Float[Array, "columns B T"]]  # measured channels, zero where they do not count
-    mask: dict[str, Float[Array, "columns B T"]]  # 1 where a sample counts
+    y: dict[str, Float[Array, "_columns *B T"]]  # measured channels, zero where they do not count
+    mask: dict[str, Float[Array, "_columns *B T"]]  # 1 where a sample counts
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,8 @@ class Recording:
         """Block means."""
         # A product is ten times as fast as `mean` along an axis in the middle.
         M = len(a) // self.size
-        return np.ones(self.size) @ a[: M * self.size].reshape(M, self.size, math.prod(a.shape[1:])) / self.size
+        blocks = a[: M * self.size].reshape(M, self.size, math.prod(a.shape[1:]))
+        return (np.ones(self.size) @ blocks / self.size).reshape(M, *a.shape[1:])
 
     def lowest(self, a: Float[np.ndarray, "N k"]) -> Float[np.ndarray, "M k"]:
         """Least value of every block."""
@@ -185,7 +186,7 @@ def row(
     """
     y = r.y if y is None else y
     M = len(q)
-    time = r.mean(r.trial.time)[:, 0]
+    time = r.mean(r.trial.time)
     nothing = np.zeros((M, r.finger.m)), np.zeros((M, r.finger.n))
     joint, tendon = nothing if directions is None else map(r.mean, directions)
     start = r.trial.session_start if r.trial.session_start is not None else 0.0

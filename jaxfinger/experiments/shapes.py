@@ -1,6 +1,5 @@
 """Few distinct shapes, few compilations: sessions of like fingers share what was compiled for the first of them."""
 
-from dataclasses import replace
 from typing import TypeVar
 
 import jax
@@ -30,7 +29,8 @@ def blocks(batch: Batch) -> list[Batch]:
     B, T = batch.x.time.shape
     ends = (-B % TRIALS, roomy(T, SAMPLES) - T)
     counting = {c: np.pad(a, [(0, 0), (0, ends[0]), (0, ends[1])]) for c, a in batch.mask.items()}
-    return split(replace(padded(batch, *ends), mask=counting))
+    wide = padded(batch.x, *ends), padded(batch.y, *ends), counting
+    return [Batch(*jax.device_put(part)) for part in split(wide)]
 
 
 def padded(tree: Tree, trials: int, samples: int) -> Tree:

@@ -71,7 +71,7 @@ class Budget:
         strata = [np.array(s) for s in sorted(strata)]
 
         def draw() -> np.ndarray:
-            return np.bincount(np.concatenate([rng.choice(s, len(s)) for s in strata]), minlength=size)
+            return np.bincount(np.concatenate([rng.choice(s, len(s)) for s in strata]), minlength=size).astype(float)
 
         draws = np.array([means(draw()) for _ in range(DRAWS if inside else 1)])
         low, high = np.quantile(draws, (0.025, 0.975), axis=0)

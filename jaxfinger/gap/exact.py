@@ -153,11 +153,11 @@ class Whitened:
             )
         return out
 
-    def __call__(self, x: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "k N+prior"]:
+    def __call__(self, x: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "k rows"]:
         """Of signatures."""
         return self._off(np.pad(self.white(x), ((0, 0), (0, len(self.offset)))))
 
-    def residual(self, r: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N+prior"]:
+    def residual(self, r: Float[np.ndarray, " N"]) -> Float[np.ndarray, " rows"]:
         """Of a residual, with what the prior says of the nominal parameters as they are."""
         return self._off(np.concatenate([self.white(r[None])[0], -self.offset])[None])[0]
 

@@ -76,7 +76,7 @@ def log_likelihood(
     v = np.maximum(np.maximum(e / K, floor), p.form * explained / K)
     excess = np.maximum(o - counts.outside, 0.0) / nu
     value = -0.5 * np.sum(K * np.log(v) + e / v + nu * np.log1p(excess), axis=-1)
-    return value, Weights(1.0 / v, 1.0 / (1.0 + excess))
+    return np.asarray(value), Weights(1.0 / v, 1.0 / (1.0 + excess))
 
 
 def unexplained(counts: Counts, x: Evidence, p: Parameters) -> Float[np.ndarray, " C"]:
@@ -98,7 +98,7 @@ class Judged:
     evidence: Evidence
     log_l: float
     amplitudes: Float[np.ndarray, " k"]  # of the further rows, in units of their prior
-    solution: Float[np.ndarray, " base+k"]  # coefficients of all rows in the residual: 1, −δ, −a
+    solution: Float[np.ndarray, " coefficients"]  # coefficients of all rows in the residual: 1, −δ, −a
     b: Float[np.ndarray, " features"]  # of what is left, on the features
     weights: Weights
 
@@ -201,7 +201,7 @@ class Linear:
             free[first:][out] = False
         return x
 
-    def screen(self, now: Judged, candidates: list[Int[np.ndarray, " k"]], bounds) -> list[Evidence | None]:
+    def screen(self, now: Judged, candidates: list[Int[np.ndarray, " _k"]], bounds) -> list[Evidence | None]:
         """Of each candidate alone on top of the base, by one step in the weights; the score is its gain."""
         w, k = now.weights, self.BX.shape[1]
         x = now.solution[:k]

@@ -73,8 +73,8 @@ def next_experiment(problem: Problem, members: Sequence[State]) -> NextExperimen
     return _described(problem, *place, best, ids)
 
 
-def _information(problem: Problem, slopes: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "p+k p+k"]:
-    """What the trials and priors say of the nominal parameters and of a set's coordinates together."""
+def _information(problem: Problem, slopes: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "q q"]:
+    """What the trials and priors say of the nominal parameters and of a set's coordinates together: q = p + k."""
     A, p = np.vstack([problem.J.T, slopes]), problem.J.shape[1]
     P = A @ A.T
     P[:p, :p] += problem.root.T @ problem.root

@@ -23,9 +23,9 @@ RIDGE = 1e-9  # relative, of products of columns
 
 @runtime_checkable
 class Projector(Protocol):
-    """Rows off what the nominal parameters can absorb."""
+    """Rows off what the nominal parameters can absorb: the N of the trials, then the prior's."""
 
-    def __call__(self, x: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "k N+prior"]:
+    def __call__(self, x: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "k rows"]:
         """Of signatures."""
         ...
 
@@ -46,7 +46,7 @@ class FixedShapes:
         parts = [items[k : k + CHUNK] for k in range(0, len(items), CHUNK)]
         return cls(items, ByColumn.joined(columns, [by_column(signatures, part, columns) for part in parts]))
 
-    def offer(self, projector: Projector, rt: Float[np.ndarray, " N+prior"], columns: Columns) -> Offer:
+    def offer(self, projector: Projector, rt: Float[np.ndarray, " rows"], columns: Columns) -> Offer:
         """All of them, whatever is left."""
         return self.items, self.rows
 
@@ -63,7 +63,8 @@ class Scan:
     items: list[Variant]
     periods: Float[np.ndarray, " n"]  # s
     middle: float  # s
-    columns: Float[np.ndarray, "k+2n N"]  # signatures of the k amplitudes without a period, and of both of every period
+    # Signatures of the amplitudes without a period, and of both of every period.
+    columns: Float[np.ndarray, "members N"]
 
     @classmethod
     def of(cls, signatures: Signatures, items: list[Variant]) -> "Scan":
@@ -84,13 +85,13 @@ class Scan:
         columns = signatures.of([effect.at(finger, site, **values) for values in members])
         return cls(signatures, items, periods, middle, columns)
 
-    def offer(self, projector: Projector, rt: Float[np.ndarray, " N+prior"], columns: Columns) -> Offer:
+    def offer(self, projector: Projector, rt: Float[np.ndarray, " rows"], columns: Columns) -> Offer:
         """Every variant with those periods that explain most together."""
         shape = {"middle": self.middle} | self.best(projector, rt)
         items = [v.with_shape(**shape) for v in self.items]
         return items, by_column(self.signatures, items, columns)
 
-    def best(self, projector: Projector, rt: Float[np.ndarray, " N+prior"]) -> dict[str, float]:
+    def best(self, projector: Projector, rt: Float[np.ndarray, " rows"]) -> dict[str, float]:
         """The periods, s, by least squares over all sets of them."""
         names, n = list(self.items[0].effect.periods()), len(self.periods)
         A = projector(self.columns)

@@ -57,14 +57,14 @@ class Table:
     """All signatures at the nominal model, each in units of its prior, and what is made of them."""
 
     signatures: ByColumn
-    rows: dict[Variant, Int[np.ndarray, " k"]]  # of every variant: all of its amplitudes'
+    rows: dict[Variant, Int[np.ndarray, " _k"]]  # of every variant: all of its amplitudes'
     units: Float[np.ndarray, " M"]
     absorbed: dict[Key, float]
     hidden: dict[Key, dict[str, float]]  # std of amplitudes, each alone, in their own units: what could hide
     touched: dict[Key, Float[np.ndarray, " C"]]  # of all that the trials can see (`Costs`)
     offers: list[Offered]
 
-    def rows_of(self, offer: Offered) -> list[Int[np.ndarray, " k"]]:
+    def rows_of(self, offer: Offered) -> list[Int[np.ndarray, " _k"]]:
         """Of every variant of an offer, those that no trial shows too."""
         return [self.rows[v] for v in offer.variants]
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session, Trial, low_pass, passed, smooth
@@ -131,7 +131,7 @@ def surrogate(noise: Float[np.ndarray, "n T"], rng: np.random.Generator) -> Floa
     return np.fft.irfft(spectrum * turn, noise.shape[-1], axis=-1)
 
 
-def _windows(m: Measured, first: np.ndarray, length: int) -> Float[np.ndarray, "starts T"]:
+def _windows(m: Measured, first: np.ndarray, length: int) -> Int[np.ndarray, "starts T"]:
     """Samples from every start on; beyond the trial's end its last."""
     return np.minimum(first[:, None] + np.arange(length), m.time.size - 1)
 

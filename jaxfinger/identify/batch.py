@@ -64,7 +64,7 @@ class _Source(eqx.Module):
     basis: Float[Array, "k c"]  # rows of the coordinates of `resample` for them
     coordinates: Int[Array, " c"]  # those that move any of them
 
-    def rows(self, model: Model, flat: Float[Array, " P"], limit: float) -> Float[Array, " r"]:
+    def rows(self, model: Model, flat: Float[Array, " P"], limit: float | Float[Array, ""]) -> Float[Array, " r"]:
         """White residuals as Huber's cost sees them."""
         at = self.free.set(model, flat[self.columns])
         return huber(white_rows(at, self.batch, self.filters)[1].ravel()[self.counts], limit)
@@ -175,7 +175,7 @@ def _stack_sessions(
     return tuple(sources), tuple(stages)
 
 
-def _measured_rows(masks: list[Float[Array, "S columns B T"]]) -> Int[np.ndarray, " r"]:
+def _measured_rows(masks: list[Float[Array, "S _columns B T"]]) -> Int[np.ndarray, " r"]:
     """Positions, in the order of `white_rows`, of the columns that a trial of any session has measured."""
     some = np.concatenate([np.asarray(m).any(axis=(0, 3)) for m in masks])  # (columns of all channels, B)
     return np.flatnonzero(np.repeat(some.T[..., None], masks[0].shape[-1], axis=-1))
@@ -256,8 +256,8 @@ def _covariance(
     return covariance, sound
 
 
-def _gram(model: Model, flat: Float[Array, " P"], source: _Source, limit) -> Float[Array, "c+1 c+1"]:
-    """[J r]ᵀ[J r] of one experiment, J in the coordinates that bear on it."""
+def _gram(model: Model, flat: Float[Array, " P"], source: _Source, limit) -> Float[Array, "w w"]:
+    """[J r]ᵀ[J r] of one experiment, w = c + 1 wide, J in the coordinates that bear on it."""
 
     def rows(dz):
         return source.rows(model, flat.at[source.columns].add(source.basis @ dz), limit)

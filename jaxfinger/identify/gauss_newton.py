@@ -188,8 +188,8 @@ def _linearised(fn, at: Float[Array, " p"]) -> tuple[Compressed, Any]:
     return compressed(jnp.concatenate([J, r[None]]).T), aux
 
 
-def compressed(rows: Float[Array, "N p+1"]) -> Compressed:
-    """Of [J r]."""
+def compressed(rows: Float[Array, "N q"]) -> Compressed:
+    """Of [J r], q = p + 1 columns."""
     p = rows.shape[1] - 1
     T = jnp.linalg.qr(jnp.concatenate([rows, jnp.zeros((max(0, p + 1 - len(rows)), p + 1))]), mode="r")
     return Compressed(T[:p, :p], T[:p, p], T[p, p] ** 2)

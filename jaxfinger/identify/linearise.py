@@ -27,7 +27,7 @@ from jaxfinger.identify.noise import whiten
 from jaxfinger.identify.parameters import Free
 from jaxfinger.model import Model
 
-Filters = dict[str, Float[Array, "columns order+1 order+1"]]
+Filters = dict[str, Float[Array, "_columns lags lags"]]  # `Noise.coefficients` of every channel
 
 
 class Tangent(NamedTuple):

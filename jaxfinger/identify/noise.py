@@ -30,8 +30,8 @@ class Noise:
     source: str  # `repeats`, `holds`, both, or `residuals`
 
     @property
-    def coefficients(self) -> Float[np.ndarray, "columns order+1 order+1"]:
-        """The whitening filters [1, −a₁, …] / σ; row j predicts from j samples before, as after a gap.
+    def coefficients(self) -> Float[np.ndarray, "columns lags lags"]:
+        """The whitening filters [1, −a₁, …] / σ, order + 1 lags; row j predicts from j samples before, as after a gap.
 
         Levinson's recursion, downwards: a_k ← (a_k + a_j a_{j−k})/(1 − a_j²), σ² ← σ²/(1 − a_j²).
         """
@@ -50,7 +50,7 @@ class Noise:
 def whiten(
     r: Float[Array | np.ndarray, "*more columns B T"],
     mask: Float[Array | np.ndarray, "columns B T"],
-    coefficients: Float[Array | np.ndarray, "columns order+1 order+1"],
+    coefficients: Float[Array | np.ndarray, "columns lags lags"],
     demean: bool,
 ) -> Float[Array | np.ndarray, "*more columns B T"]:
     """White residuals of unit variance, zero where a sample does not count; NumPy's of NumPy's, JAX's of JAX's.
@@ -82,7 +82,7 @@ def history(mask: Float[Array | np.ndarray, "columns B T"], order: int) -> Float
     return total
 
 
-def _lag(a: Float[Array | np.ndarray, "columns B T"], k: int) -> Float[Array | np.ndarray, "columns B T"]:
+def _lag(a: Float[Array | np.ndarray, "*more T"], k: int) -> Float[Array | np.ndarray, "*more T"]:
     """a, k samples later."""
     xp = a.__array_namespace__()
     return xp.concat([xp.zeros_like(a[..., :k]), a[..., :-k]], axis=-1)

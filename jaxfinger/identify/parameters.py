@@ -38,7 +38,7 @@ class Free(eqx.Module):
 
     leaves: tuple[int, ...] = eqx.field(static=True)
     parts: tuple[str, ...] = eqx.field(static=True)  # field of the model that each of those leaves is of
-    entries: tuple[Int[Array, " k"], ...]  # positions within each of those leaves
+    entries: tuple[Int[Array | np.ndarray, " _k"], ...]  # positions within each of those leaves
 
     @classmethod
     def at(cls, model: Model, positions: Int[np.ndarray, " p"]) -> "Free":
@@ -53,12 +53,12 @@ class Free(eqx.Module):
         parts = tuple(str(getattr(paths[i][0][0], "name", "")) for i in leaves)
         return cls(leaves, parts, tuple(within[i] for i in leaves))
 
-    def values(self, model: Model) -> list[Float[Array, " k"]]:
+    def values(self, model: Model) -> list[Float[Array, " _k"]]:
         """The free parameters of a model, leaf by leaf."""
         leaves = _leaves(model)
         return [leaves[i].ravel()[e] for i, e in zip(self.leaves, self.entries, strict=True)]
 
-    def put(self, model: Model, values: list[Float[Array, " k"]]) -> Model:
+    def put(self, model: Model, values: list[Float[Array, " _k"]]) -> Model:
         """The model with other free parameters, leaf by leaf."""
         arrays, rest = eqx.partition(model, eqx.is_inexact_array)
         leaves, treedef = jax.tree.flatten(arrays)

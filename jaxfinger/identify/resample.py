@@ -121,7 +121,7 @@ def plan_of(session: Session, fit: Fit) -> list[tuple[dict[str, tuple[str, ...]]
     return [p for p, after in zip(plan, later, strict=True) if not np.isin(p[1], after).all()]
 
 
-def _prior_block(session: Session, fit: Fit, plan, parameters) -> Float[np.ndarray, "rows P+1"]:
+def _prior_block(session: Session, fit: Fit, plan, parameters) -> Float[np.ndarray, "rows {len(parameters)}+1"]:
     """CAD's rows on the masses and centres of mass that the fit estimated, at the fit."""
     free = np.unique(np.concatenate([f for _, f in plan]))
     prior = cad_prior(session, fit.recipe, parameters, free)
@@ -181,9 +181,12 @@ def _refit(grams: Grams, sizes: tuple[int, ...], weights: Float[Array, " K"], gi
 
 
 def staged_step(
-    H: Float[Array, "S q+1 q+1"], sizes: tuple[int, ...], given: Float[Array, " k"]
+    H: Float[Array, "S r r"], sizes: tuple[int, ...], given: Float[Array, " k"]
 ) -> tuple[Float[Array, " q"], Float[Array, "q q"], Bool[Array, ""]]:
-    """z of all stages, its covariance with the earlier stages' errors carried on, and whether all of it is seen."""
+    """z of all stages, its covariance with the earlier stages' errors carried on, and whether all of it is seen.
+
+    `H`: as `Grams` has it, r = q + 1, weighted and summed by stage.
+    """
     z, covariance, sound = given, jnp.eye(given.size), jnp.array(True)
     for stage, size in zip(H, sizes[1:], strict=True):
         start = z.size

@@ -196,8 +196,8 @@ def _wide(values: np.ndarray, room: int) -> Float[Array, " room"]:
     return jax.device_put(np.pad(values, (0, room - values.size)))
 
 
-def _compressed(rows: Float[np.ndarray, "N p+1"], room: int) -> Compressed:
-    """Of [J r] on the host, with room for more parameters, which show nowhere."""
+def _compressed(rows: Float[np.ndarray, "N q"], room: int) -> Compressed:
+    """Of [J r], q = p + 1 columns, on the host, with room for more parameters, which show nowhere."""
     p = rows.shape[1] - 1
     T = np.zeros((p + 1, p + 1))
     small = triangular(rows)
@@ -239,7 +239,9 @@ def missed_each(model: Model, sources: dict[str, Source]) -> dict[str, dict[str,
     return dict(zip(sources, side_by_side(one, sources.values()), strict=True))
 
 
-def _stacked(linearised: dict[str, Linearised], sources: dict[str, Source], size: int) -> Float[np.ndarray, "k P+1"]:
+def _stacked(
+    linearised: dict[str, Linearised], sources: dict[str, Source], size: int
+) -> Float[np.ndarray, "k {size}+1"]:
     """One triangular factor of all trials, its columns those of the flat vector, then the residual."""
     blocks = []
     for name, lin in linearised.items():

@@ -62,7 +62,7 @@ def _is_dead(model: Model, k: int, highest: float) -> bool:
     """Whether the tendon loses nothing at any tension up to the highest, or all of that."""
     a0, a1 = float(model.tendon_friction.constant[k]), float(model.tendon_friction.proportional[k])
     nothing = a0 <= 0.0 and a0 + a1 * (highest or 1.0) <= 0.0
-    return nothing or 0.0 < highest <= a0 + a1 * highest
+    return bool(nothing or 0.0 < highest <= a0 + a1 * highest)
 
 
 def _with_losses(model: Model, tendons: list[int], highest: np.ndarray, shares: tuple[float, float]) -> Model:

@@ -7,7 +7,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Self
 
 import numpy as np
 from jaxtyping import Float, Int, UInt
@@ -230,7 +229,7 @@ class Rig(ABC):
         """Let a simulated operator prepare the finger; False where a person must do it."""
         return False
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Rig:
         try:
             self.connect()
         except BaseException:

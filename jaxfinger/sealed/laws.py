@@ -22,8 +22,8 @@ from .specimens import Specimen
 class Situation:
     """Where the finger is. Angles rad, tension at the actuator N, time s; directions −1, 0, +1."""
 
-    t: Float[np.ndarray, ...]
-    session: Float[np.ndarray, ...]  # seconds since the session began
+    t: Float[np.ndarray, "..."]
+    session: Float[np.ndarray, "..."]  # seconds since the session began
     q: Float[np.ndarray, "... m"]
     qd: Float[np.ndarray, "... m"]
     qdd: Float[np.ndarray, "... m"]

@@ -73,7 +73,9 @@ def at_rest(finger: Finger, q: Float[Array, " m"]) -> PlantState:
     return PlantState(q, jnp.zeros_like(q), jnp.zeros_like(q), jnp.zeros(finger.m + finger.n))
 
 
-def step(specimen: Specimen, finger: Finger, state: PlantState, tension: Float[Array, " n"], h: float) -> PlantState:
+def step(
+    specimen: Specimen, finger: Finger, state: PlantState, tension: Float[Array, " n"], h: float | Float[Array, ""]
+) -> PlantState:
     """One step of h s. Forces that depend on velocity take it extrapolated to the middle of the step."""
     q, v, v_before, impulse = state
     middle, v_middle = q + 0.5 * h * v, 1.5 * v - 0.5 * v_before

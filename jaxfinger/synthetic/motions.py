@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 
 Array = np.ndarray
+Numbers = Sequence[float] | Float[Array, " _k"]
 
 
 class Path(NamedTuple):
@@ -29,7 +29,7 @@ class Staircase(NamedTuple):
     direction: Int[Array, " N"]  # −1, 0, 1
 
 
-def minimum_jerk(time: Float[Array, " N"], points: ArrayLike, move: ArrayLike, dwell: ArrayLike) -> Staircase:
+def minimum_jerk(time: Float[Array, " N"], points: Numbers, move: Numbers, dwell: Numbers) -> Staircase:
     """From points[0] on to each next point in `move` s and a rest of `dwell` s, without jumps of acceleration.
 
     x = x₀ + Δ (10 s³ − 15 s⁴ + 6 s⁵): Flash and Hogan (1985), eq. 3.

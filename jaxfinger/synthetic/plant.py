@@ -21,7 +21,7 @@ from jaxfinger.synthetic.protocols import TrialPlan
 from jaxfinger.synthetic.specimen import Specimen
 
 Array = np.ndarray
-Channels = dict[str, Float[Array, "channels N"]]
+Channels = dict[str, Float[Array, "_channels N"]]  # of one trial
 BLOCK = 4096  # samples: one compiled rigid-body call serves trials of any length
 
 

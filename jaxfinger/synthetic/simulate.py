@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxfinger.data import FingerDescription, Session
 from jaxfinger.synthetic.fingers import specimen_of
@@ -24,7 +25,7 @@ class CleanSession:
     recipe: SessionRecipe
     name: str
     finger: FingerDescription  # exact
-    trials: tuple[tuple[TrialPlan, Channels], ...]
+    trials: tuple[tuple[TrialPlan, dict[str, Float[np.ndarray, "_channels _N"]]], ...]
 
 
 def clean_session(

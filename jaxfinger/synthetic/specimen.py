@@ -23,11 +23,11 @@ Routes = tuple[Route | None, ...]  # one a joint, None where the joint is not cr
 class Spring(Protocol):
     """Something that stores energy in the joints' angles."""
 
-    def torque(self, q: Float[Array, m * T]) -> Float[Array, m * T]:
+    def torque(self, q: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
         """τ_k, N m, as it stands on the left of (1): the gradient of the energy."""
         ...
 
-    def energy(self, q: Float[Array, m * T]) -> Float[Array, "*T"]:
+    def energy(self, q: Float[Array, "m *T"]) -> Float[Array, "*T"]:
         """Stored energy, J."""
         ...
 
@@ -73,7 +73,7 @@ class PolynomialSpring:
 class Friction(Protocol):
     """Coulomb friction of the joints."""
 
-    def magnitude(self, q: Float[Array, m * T]) -> Float[Array, m * T]:
+    def magnitude(self, q: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
         """Torque that the joint takes before it slides, and while it does, N m."""
         ...
 
@@ -117,43 +117,43 @@ class Specimen:
     loss_constant: tuple[float, ...]  # a₀, N
     loss_proportional: tuple[float, ...]  # a₁
 
-    def excursion(self, q: Float[Array, m * T]) -> Float[Array, n * T]:
+    def excursion(self, q: Float[Array, "m *T"]) -> Float[Array, "n *T"]:
         """l = f(q), m."""
         return q.__array_namespace__().stack([total_excursion(routes, q) for routes in self.routes])
 
-    def moment_arm(self, q: Float[Array, m * T]) -> Float[Array, "n m *T"]:
+    def moment_arm(self, q: Float[Array, "m *T"]) -> Float[Array, "n m *T"]:
         """C = ∂f/∂q, m/rad, exact."""
         return q.__array_namespace__().stack([moment_arms(routes, q) for routes in self.routes])
 
-    def elastic(self, q: Float[Array, m * T]) -> Float[Array, m * T]:
+    def elastic(self, q: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
         """τ_k(q), N m: rubber bands and passive tendons."""
         return sum((spring.torque(q) for spring in self.springs), 0.0 * q)
 
-    def elastic_energy(self, q: Float[Array, m * T]) -> Float[Array, "*T"]:
+    def elastic_energy(self, q: Float[Array, "m *T"]) -> Float[Array, "*T"]:
         """Energy of the springs, J."""
         return sum((spring.energy(q) for spring in self.springs), 0.0 * q[0, ...])
 
-    def coulomb(self, q: Float[Array, m * T]) -> Float[Array, m * T]:
+    def coulomb(self, q: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
         """|τ_f|(q), N m."""
         return self.friction.magnitude(q)
 
-    def viscous(self, qd: Float[Array, m * T]) -> Float[Array, m * T]:
+    def viscous(self, qd: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
         """τ_d(q̇), N m."""
         return _column(self.damping, qd) * qd
 
-    def loss(self, tension: Float[Array, n * T]) -> Float[Array, n * T]:
+    def loss(self, tension: Float[Array, "n *T"]) -> Float[Array, "n *T"]:
         """Tension lost along a sliding tendon, N: a₀ + a₁ f_t, at least zero and at most f_t."""
         xp = tension.__array_namespace__()
         raw = _column(self.loss_constant, tension) + _column(self.loss_proportional, tension) * tension
         return xp.minimum(xp.maximum(raw, 0.0), xp.maximum(tension, 0.0))
 
 
-def total_excursion(routes: Sequence[Route | None], q: Float[Array, m * T]) -> Float[Array, "*T"]:
+def total_excursion(routes: Sequence[Route | None], q: Float[Array, "m *T"]) -> Float[Array, "*T"]:
     """Excursion of one tendon, m: the joints' contributions add up."""
     return sum((route.excursion(q[i, ...]) for i, route in enumerate(routes) if route), 0.0 * q[0, ...])
 
 
-def moment_arms(routes: Sequence[Route | None], q: Float[Array, m * T]) -> Float[Array, m * T]:
+def moment_arms(routes: Sequence[Route | None], q: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
     """Moment arms of one tendon, m/rad."""
     return q.__array_namespace__().stack(
         [route.moment_arm(q[i, ...]) if route else 0.0 * q[i, ...] for i, route in enumerate(routes)]

@@ -50,7 +50,7 @@ def test_dahl_friction_of_the_power_a_half_is_that_of_many_springs_that_slip_one
     strongest, x = 0.02, np.linspace(0.0, 0.05, 101)
     strengths = strongest * (np.arange(20_000) + 0.5) / 20_000
     expected = [np.sum(np.clip(-strengths + dx, -strengths, strengths)) / np.sum(strengths) for dx in x]
-    found = dahl(jnp.asarray(-1.0), jnp.asarray(x) / (strongest / np.sqrt(2.0)), jnp.asarray(0.5))
+    found = dahl(jnp.full(x.shape, -1.0), jnp.asarray(x) / (strongest / np.sqrt(2.0)), jnp.asarray(0.5))
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
@@ -94,7 +94,7 @@ def test_a_sharp_memory_is_what_the_low_pass_and_the_mean_leave_of_it(name, site
         return jnp.asarray(np.asarray(a).reshape(*a.shape[:-1], -1, 20).mean(axis=-1))
 
     q, qd, qdd = smooth(np.asarray(x.time), np.asarray(x.q).T, CUTOFF)
-    seen = jax.tree.map(block, replace(x, q=q.T, qd=qd.T, qdd=qdd.T))
+    seen = jax.tree.map(block, replace(x, q=jnp.asarray(q.T), qd=jnp.asarray(qd.T), qdd=jnp.asarray(qdd.T)))
     at_samples, shown = memory(seen), memory(replace(seen, blur=jnp.full_like(seen.time, width(CUTOFF))))
     inner = slice(5, -5)
     error, before = (np.abs(z - expected)[inner].max() / np.ptp(truth) for z in (shown, at_samples))

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from itertools import combinations
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
@@ -47,7 +48,8 @@ def test_the_scan_leaves_as_little_as_the_best_of_all_sets_of_periods(effect, se
     r = rng.standard_normal(4) @ columns(time, rng.uniform(40.0, 300.0, 2)) + 0.1 * rng.standard_normal(time.size)
     slope = (time / 1000.0)[None]
     items = [Variant(effect, SITE, (), scales=SCALES)]
-    scan = Scan(None, items, periods, 500.0, np.vstack([slope, columns(time, periods)]))
+    unread = object.__new__(Signatures)  # it is the columns that are scanned
+    scan = Scan(unread, items, periods, 500.0, np.vstack([slope, columns(time, periods)]))
     found = scan.best(lambda rows: rows, r)
     sets = combinations(periods, len(effect.periods()))
     expected = min(left(np.vstack([slope, columns(time, p)]), r) for p in sets)
@@ -63,7 +65,7 @@ def test_a_long_session_is_scanned_down_to_a_longer_period(planted, monkeypatch)
         for e, stack in problem.stacks.items():
             x = stack.batch.x
             clock = np.linspace(0.0, length, x.session_time.size).reshape(x.session_time.shape)
-            days[e] = replace(stack, batch=replace(stack.batch, x=replace(x, session_time=clock)))
+            days[e] = replace(stack, batch=replace(stack.batch, x=replace(x, session_time=jnp.asarray(clock))))
         there = Signatures(replace(problem, stacks=days))
         scan = Scan.of(there, [Variant(DRIFT, SITE, (), scales=problem.scales)])
         assert len(DRIFT.periods()) <= len(scan.periods) <= MOST

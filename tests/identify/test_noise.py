@@ -1,14 +1,13 @@
 """The noise of a channel from trials that repeat a motion, in columns of which some count for little."""
 
-from types import SimpleNamespace
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
 
-from jaxfinger.experiments import EXPERIMENTS
+from jaxfinger.experiments import EXPERIMENTS, Batch, Stack
 from jaxfinger.identify.noise import FEW, Noise, estimate, whiten
+from jaxfinger.model import Motion
 
 SIZES, COUNTS, LENGTH = np.array([1.0, 5.0, 0.2]), (2000, 150, 20), 2400
 COLOUR = np.array([1.1, -0.6, 0.15])  # as a filter at a fifth of the sampling rate leaves white noise
@@ -28,8 +27,11 @@ def repeated(seed):
     mask = np.zeros_like(residual)
     for column, count in zip(mask, COUNTS, strict=True):
         column[:, 100 : 100 + count] = 1.0
-    batch = SimpleNamespace(mask={"joint_torque": mask})
-    stack = SimpleNamespace(experiment=EXPERIMENTS["VD.3"], batch=batch, motions=("a", "a"))
+    still, whenever = jnp.zeros(mask.shape), jnp.zeros(mask.shape[1:])
+    x = Motion(whenever, still, still, still, still, still, still, whenever, still)
+    batch = Batch(x, {"joint_torque": jnp.asarray(residual)}, {"joint_torque": jnp.asarray(mask)})
+    holds, measured = np.full(mask.shape[1:], -1), {"joint_torque": True}
+    stack = Stack(EXPERIMENTS["VD.3"], batch, ("1", "2"), ("a", "a"), holds, 0.01, measured)
     return stack, residual, mask
 
 

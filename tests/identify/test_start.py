@@ -44,8 +44,8 @@ def test_what_is_lost_is_found(a0, a1):
         return eqx.tree_at(lambda m: m.tendon_friction, true, friction)
 
     def lost(model):
-        f = np.tile(TENSIONS, (n, 1))
-        return np.clip(model.tendon_friction.loss(f), 0.0, f)[np.array(model.finger.active)]
+        f = jnp.tile(jnp.asarray(TENSIONS), (n, 1))
+        return np.asarray(jnp.clip(model.tendon_friction.loss(f), 0.0, f))[np.array(model.finger.active)]
 
     session = simulate(RECIPE, seed=1, plant=ModelPlant(rubbing(a0, a1)))
     fit = identify(session, stages=("ID.4",), start=Fit.before(session, Recipe(), rubbing(0.0, 0.0)))

@@ -81,7 +81,8 @@ def test_the_integral_of_a_slow_motion_is_the_difference(short_truth, short):
     trial = next(iter(short.select("VD.1")))
     time = np.linspace(0.0, 20.0, 20001)
     sweep = 0.5 - 0.4 * np.cos(0.3 * time)
-    slow = replace(trial, time=time, q=np.stack([sweep, 0.5 * sweep, 0.3 * sweep], axis=1), tendon_excursion=None)
+    trial = replace(trial, tendon_force=None, tendon_excursion=None)
+    slow = replace(trial, time=time, q=np.stack([sweep, 0.5 * sweep, 0.3 * sweep], axis=1))
     path = excursion_path(short_truth.model, slow)
     np.testing.assert_allclose(path.integral, path.direct, atol=1e-4)
 

@@ -16,8 +16,8 @@ def motion(d, samples: int, seed: int = 0, held: bool = False) -> Motion:
     zero, time = np.zeros_like(q), np.arange(samples) * 0.01
     tension = rng.uniform(1, 5, (d.n, samples))
     direction = rng.choice([-1.0, 1.0], (d.n, samples))
-    x = Motion(time, q, qd, qdd, tension, np.sign(qd), direction, time, zero, held)
-    return jax.tree.map(jnp.asarray, x)
+    arrays = (time, q, qd, qdd, tension, np.sign(qd), direction, time, zero)
+    return Motion(*map(jnp.asarray, arrays), held)
 
 
 @pytest.fixture(params=[1, 3], ids="{} joints".format)

@@ -1,6 +1,7 @@
 """Prescribed trials: the specimen's plant against the nominal model, where both state the same physics."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -44,7 +45,8 @@ def _motion(plan):
     state = [
         _sampled(plan, x) for x in (plan.time, plan.q, plan.qd, plan.qdd, plan.tension, 1.0 * plan.joint_direction)
     ]
-    return Motion(*state, np.zeros((5, SAMPLES)), np.zeros(SAMPLES), np.zeros((3, SAMPLES)), held=plan.held)
+    rest = np.zeros((5, SAMPLES)), np.zeros(SAMPLES), np.zeros((3, SAMPLES))
+    return Motion(*map(jnp.asarray, (*state, *rest)), held=plan.held)
 
 
 @pytest.mark.parametrize("experiment", ["ID.3-static", "ID.3-dynamic", "ID.4"])

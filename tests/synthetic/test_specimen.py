@@ -93,12 +93,15 @@ def test_polynomial_finger_is_exactly_the_nominal_model():
     model = true_model(specimen)
     q = _inside(specimen, 30)
     active = specimen.description.active
-    assert np.asarray(model.moment_arm.excursion(q))[active] == pytest.approx(specimen.excursion(q)[active], abs=1e-15)
+    assert np.asarray(model.moment_arm.excursion(jnp.asarray(q)))[active] == pytest.approx(
+        specimen.excursion(q)[active], abs=1e-15
+    )
     zero, f = np.zeros_like(q), np.tile(np.linspace(0.0, 12.0, 30), (5, 1)) * active[:, None]
-    x = Motion(np.zeros(30), q, 0.3 + zero, zero, f, 1.0 + zero, np.ones_like(f), np.zeros(30), zero)
-    at_rest = Motion(np.zeros(30), q, zero, zero, 0.0 * f, zero, np.ones_like(f), np.zeros(30), zero)
+    rest = np.ones_like(f), np.zeros(30), zero
+    x = Motion(*map(jnp.asarray, (np.zeros(30), q, 0.3 + zero, zero, f, 1.0 + zero, *rest)))
+    at_rest = Motion(*map(jnp.asarray, (np.zeros(30), q, zero, zero, 0.0 * f, zero, *rest)))
     difference = np.asarray(external_torque(model, x) - external_torque(model, at_rest))
-    moving = np.asarray(rigid_body.coriolis(model.finger, q, 0.3 + zero))
+    moving = np.asarray(rigid_body.coriolis(model.finger, x.q, x.qd))
     expected = moving + specimen.viscous(0.3 + zero) + specimen.coulomb(q)
     expected -= np.einsum("nmt,nt->mt", specimen.moment_arm(q), f - specimen.loss(f))
     assert difference == pytest.approx(expected, abs=1e-12)
