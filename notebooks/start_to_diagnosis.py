@@ -9,7 +9,7 @@
 # %% [markdown]
 # # From a session file to a diagnosis
 # A shipped session of a simulated finger whose answer is known: tendon T3 stretches by 60 µm/N, and the friction of the
-# MCP joint is 0.9 higher at rest than in motion, falling over 0.35 rad/s (Stribeck).
+# MCP joint is 0.9 higher at rest than in motion, falling over 20°/s (Stribeck).
 
 # %%
 from pathlib import Path

@@ -19,7 +19,7 @@ BEFORE = """This finger is simulated, on a plant that shares no code with the mo
 and dry friction). Two things are the matter with it that the nominal model does not know; what, is said at the end.
 """
 ANSWER = """What is in fact the matter: tendon T3 stretches by 60 µm/N, and the friction of the MCP joint is 1.9 times
-as high at rest as in motion, falling over 0.35 rad/s (Stribeck; datasets/demo-finger)."""
+as high at rest as in motion, falling over 20°/s (Stribeck; datasets/demo-finger)."""
 NEXT = """Next: open the page; the same for your own finger is
   jaxfinger look LOG                          what a recording holds, and mapping lines for it
   jaxfinger new finger.toml mapping.toml LOG  templates, filled in as far as LOG tells

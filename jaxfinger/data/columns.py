@@ -52,7 +52,8 @@ class Source:
         if name in within:
             where.fail(f"derives {name!r} from itself, and the recording has no variable of this name; name another")
         there = sorted([*self.recording.variables, *self.derived])
-        return where.fail(f"{said}, which the recording has not; it has {listed(there, 30)}")
+        elsewhere = "; move what only some recordings hold to their trials" if where.keys[:1] == ("channels",) else ""
+        return where.fail(f"{said}, which the recording has not; it has {listed(there, 30)}{elsewhere}")
 
     def _derive(self, name: str, where: Place, within: tuple[str, ...]) -> Variable:
         where = where / "derived" / name

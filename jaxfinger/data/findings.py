@@ -22,8 +22,13 @@ class Finding:
     message: str
     local: bool = False
 
+    @property
+    def sentence(self) -> str:
+        """Place and message, of the file as a whole the message alone."""
+        return self.message if self.place == "/" else f"{self.place}: {self.message}"
+
     def __str__(self) -> str:
-        return f"{self.severity}: {self.place}: {self.message}"
+        return f"{self.severity}: {self.sentence}"
 
 
 class Report(list[Finding]):

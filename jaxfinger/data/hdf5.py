@@ -53,7 +53,7 @@ def read_session(
         report.extend(findings)
     fault = findings.fatal
     if fault is not None:
-        raise UserError(f"{path}: {fault.place}: {fault.message}")
+        raise UserError(f"{path}: {fault.sentence}")
     assert session is not None
     return session
 

@@ -24,7 +24,7 @@ from jaxfinger.data.parse import RANGES, in_order, listed
 from jaxfinger.data.recording import Recording
 from jaxfinger.data.schema import CHANNELS, DRIVES, TEMPERATURE, Channel, Entry, units_of
 from jaxfinger.data.session import FingerDescription, Session, Trial
-from jaxfinger.data.sources import load_recording
+from jaxfinger.data.sources import load_recording, refuse_path
 from jaxfinger.data.toml import Place
 
 
@@ -81,6 +81,8 @@ class _Recordings:
         self.paths = list({Path(source).resolve(): Path(source) for source in sources}.values())
         if not self.paths:
             where.fail("no recording was given; name at least one")
+        for path in self.paths:
+            refuse_path(path)
         self._constants, self._derived = mapping.constants, mapping.derived
         self._report = report
         self._loaded: dict[Path, Recording] = {}

@@ -20,7 +20,7 @@ _MEANINGS = (
     ("temperature", r"temp"),
     ("joint_torque", r"(^|_)tau|torque|effort|moment"),
     ("tendon_excursion", r"excursion|^l\d*$|length|pull|spool|linear|travel"),
-    ("tendon_force", r"tension|tendon.*force|^f_?t|cable|loadcell|^force"),
+    ("tendon_force", r"tension|tendon.*force|^f_?t|^f(\d|_(?!([xyz]|tip)$))|cable|loadcell|^force"),
     ("fingertip_force", r"f?tip|contact|^f[xyz]$|wrench"),
     ("q", r"^q[_\d]*|angle|pos|enc|theta|winkel|deg$"),
 )
@@ -235,7 +235,9 @@ def _experiment(
     Which joint a torque sensor holds no motion tells: `?`, which import refuses, unless it is the only one, or named by
     the file.
     """
-    q, force, torque = (channels.get(c, ()) for c in ("q", "tendon_force", "joint_torque"))
+    q, force, excursion, torque = (
+        channels.get(c, ()) for c in ("q", "tendon_force", "tendon_excursion", "joint_torque")
+    )
     units = [s.units or "rad" for s in q]
     spans = [(s.high - s.low) * TO_SI[u][1] / _MOVES.get(TO_SI[u][0], np.inf) for s, u in zip(q, units, strict=True)]
     moved = [k for k, span in enumerate(spans) if span > 1.0]
@@ -250,12 +252,12 @@ def _experiment(
         stem = recording.path.stem.lower()
         named = [name for name in names["q"] if name.lower() in stem] if len(names["q"]) > 1 else names["q"]
         return "ID.4", named[0] if len(named) == 1 else "?", tendon
-    if torque or not moved or not force:
+    if torque or not moved or not (force or excursion):
         return ("ID.3-static" if moved and _stepped(recording, q[most]) else "ID.3-dynamic"), joint, ""
     if len(moved) == 1:
         return "ID.2", joint, ""
-    high = max(s.high for s in force)
-    return ("VD.3" if max(pulls) > _FREE * high else "VD.1"), "", ""
+    high = max((s.high for s in force), default=0.0)
+    return ("VD.3" if max(pulls, default=0.0) > _FREE * high else "VD.1"), "", ""
 
 
 def _stepped(recording: Recording, seen: Seen) -> bool:

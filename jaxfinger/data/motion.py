@@ -148,10 +148,10 @@ def pulled_slowly(trial: Trial, pulled: Float[np.ndarray, " N"], sizes: Sizes) -
     """
     if len(pulled) < 3 or not np.isfinite(pulled).all():
         return True
-    hold, step = find_holds(trial, sizes.pace), float(np.median(np.diff(trial.time)))
+    hold, step = find_holds(trial, sizes.slow_pace), float(np.median(np.diff(trial.time)))
     if (hold >= 0).any():
         return True
-    size = max(1, round(sizes.pace / (RAMP * step)))
+    size = max(1, round(sizes.slow_pace / (RAMP * step)))
     means = pulled[: len(pulled) // size * size].reshape(-1, size).mean(axis=1)[:, None]
-    least = max(1, round(sizes.pace / (size * step)))
+    least = max(1, round(sizes.slow_pace / (size * step)))
     return bool(slow_ramps(means, np.full(len(means), -1), least, sizes.travel).any())

@@ -87,7 +87,7 @@ def read_predictions(path: str | os.PathLike) -> dict[str, dict[str, np.ndarray]
         except Exception:  # h5py raises nearly anything on a damaged file
             report.error("/", "cannot be read to the end: the file is damaged; predict again")
     if report.fatal is not None:
-        raise UserError(f"{path}: {report.fatal.place}: {report.fatal.message}")
+        raise UserError(f"{path}: {report.fatal.sentence}")
     return found
 
 

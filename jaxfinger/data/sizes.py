@@ -18,8 +18,9 @@ PASSES = 4000  # likewise how quick it is: a minute's trial still shows a motion
 # what is reduced to a rate, cut off at a frequency or counted in seconds is meant for these. How fast tendons move a
 # finger says less: it sticks, and slips as fast as it does.
 SWEEP = 0.11
+STEP = 0.27  # s, the same where it is led or stepped (ID.2, ID.3-static)
 # Of paces: what serves one serves motions twice as slow and four times as quick, of which a fit is the same within its
-# errors (tests/identify/test_units.py). Where sweeps are quick, slow motions of the same session need not be.
+# errors (tests/identify/test_units.py).
 LIKE = 4.0
 
 
@@ -31,6 +32,7 @@ class Sizes:
     excursion: float  # m, the longest
     noise: float  # N, of a tension sensor
     pace: float = 1.0  # times as long as the protocol's that its motions take: a power of `LIKE`
+    slow_pace: float = 1.0  # likewise of what is led, stepped or held: where sweeps are quick, steps need not be
 
     @property
     def slack(self) -> float:
@@ -50,7 +52,7 @@ class Sizes:
 
 def sizes_of(session: Session) -> Sizes:
     """The sizes of all trials of a session, so that those of one trial do not depend on which others are read."""
-    tensions, excursions, noises, paces = [0.0], [0.0], [], []
+    tensions, excursions, noises, sweeps, steps = [0.0], [0.0], [], [], []
     for trial in session:
         every = max(1, len(trial.time) // LOOK)
         if trial.tendon_force is not None and len(trial.time) > 3:
@@ -63,11 +65,20 @@ def sizes_of(session: Session) -> Sizes:
         if trial.tendon_excursion is not None and len(trial.time) > 3:
             l = np.nan_to_num(trial.tendon_excursion[::every])
             excursions.append(float(np.ptp(np.percentile(l, (1, 99), axis=0), axis=0).max(initial=0.0)))
-        if trial.experiment == "ID.3-dynamic" and (quick := _quick(trial)) > 0.0:
-            paces.append(np.log(quick / SWEEP) / np.log(LIKE))
-    steps = median_low(paces) if paces else 0.0
-    pace = 1.0 if -1.0 < steps < 0.0 else LIKE ** round(steps)
-    return Sizes(max(tensions), max(excursions), float(np.median(noises)) if noises else 0.0, pace)
+        if trial.experiment == "ID.3-dynamic":
+            sweeps.append(_quick(trial) / SWEEP)
+        if trial.experiment in ("ID.2", "ID.3-static"):
+            steps.append(_quick(trial) / STEP)
+    pace = _pace(sweeps)
+    slow = min(max(pace, _pace(steps)), 1.0) if pace < 1.0 and any(steps) else pace
+    return Sizes(max(tensions), max(excursions), float(np.median(noises)) if noises else 0.0, pace, slow)
+
+
+def _pace(times: list[float]) -> float:
+    """The pace of motions that take so many times as long as the protocol's; of none, the protocol's."""
+    powers = [np.log(t) / np.log(LIKE) for t in times if t > 0.0]
+    power = median_low(powers) if powers else 0.0
+    return 1.0 if -1.0 < power < 0.0 else LIKE ** round(power)
 
 
 def _quick(trial: Trial) -> float:

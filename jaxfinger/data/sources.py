@@ -15,8 +15,7 @@ def load_recording(path: Path) -> Recording:
     Raises:
         UserError: the file is missing, empty, of an unknown kind, or damaged.
     """
-    if not path.exists():
-        raise UserError(f"{path}: does not exist; name a recording")
+    refuse_path(path)
     kind = path.suffix.lower()
     try:
         if path.is_file() and path.stat().st_size == 0:
@@ -41,3 +40,11 @@ def load_recording(path: Path) -> Recording:
         said = f"{type(error).__name__}: {plain_reason(error)}"
         raise UserError(f"{path}: cannot be read ({said}); export the recording again") from error
     raise UserError(f"{path}: is of an unknown kind; give .mat, .csv, .mcap or a rosbag2 folder")
+
+
+def refuse_path(path: Path) -> None:
+    """UserError where there is no recording, or a folder that is no bag."""
+    if not path.exists():
+        raise UserError(f"{path}: does not exist; name a recording")
+    if path.is_dir() and not any(any(path.glob(kind)) for kind in ("*.yaml", "*.db3", "*.mcap")):
+        raise UserError(f"{path}: is a folder, and no rosbag2; name the recordings in it, as {path / '*.csv'}")

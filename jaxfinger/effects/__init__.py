@@ -3,6 +3,7 @@
 import importlib.util
 import inspect
 import os
+import sys
 from pathlib import Path
 
 from jaxfinger.effects import body, changed, drive, joint, nominal, sensors, tendon, transmission
@@ -42,12 +43,16 @@ def changes(elastic_degree: int, friction_degree: int, moment_arm_degree: int) -
 
 
 def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
-    """The effects that a user's Python file defines, by id. UserError where it cannot be loaded or defines none."""
+    """The effects that a user's Python file defines, by id.
+
+    Raises:
+        UserError: it cannot be loaded, or defines none; an id is the catalogue's, or a sentence for people is missing.
+    """
     path = Path(path)
     spec = importlib.util.spec_from_file_location(f"jaxfinger_user_{path.stem}", path)
     if spec is None or spec.loader is None or not path.exists():
         raise UserError(f"{path}: is not a Python file with effects")
-    module = importlib.util.module_from_spec(spec)
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
     except Exception as e:
@@ -55,6 +60,12 @@ def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
     found = _effects_in(module)
     if not found:
         raise UserError(f"{path}: defines no effect; subclass jaxfinger.effects.CatalogueEffect and give it an ID")
+    for name, kind in found.items():
+        if name in CATALOGUE | NOMINAL_TERMS | CHANGED:
+            raise UserError(f"{path}: {kind.__name__} has the ID {name}, which the catalogue has; choose another")
+        for said in ("HAPPENS", "LOOKS", "CHANGE", "__doc__"):
+            if not getattr(kind, said):
+                raise UserError(f"{path}: {kind.__name__} has no {said.strip('_')}; write its sentence")
     return found
 
 

@@ -10,13 +10,13 @@ from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
 
 
 class TendonStretch(CatalogueEffect):
-    """c (f + β f₀ (1 − exp(−f/f₀))): it lengthens under tension, softer while its fibres straighten (the toe)."""
+    """compliance (f + toe f₀ (1 − exp(−f/f₀))): it lengthens, softer while its fibres straighten (the toe)."""
 
     ID: ClassVar = "tendon_stretch"
     PLACE: ClassVar = "tendon"
     HAPPENS: ClassVar = "The tendon lengthens under tension."
     LOOKS: ClassVar = "Excursion goes with tension at a joint that does not move."
-    CHANGE: ClassVar = "Use a stiffer tendon, or give it this compliance."
+    CHANGE: ClassVar = "Use a stiffer tendon, or give the simulator's this compliance."
 
     compliance: Float[Array, ""] = amplitude("m/N", 0.04, "excursion/tension")
     toe: Float[Array, ""] = shape("1", (0.0, 2.0, 6.0), moves="by differences")

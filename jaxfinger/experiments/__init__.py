@@ -3,7 +3,7 @@
 from jaxfinger.experiments.predict import demean, predict
 from jaxfinger.experiments.prepare import Batch, NotJudged, Stack, not_judged, prepare
 from jaxfinger.experiments.shapes import SAMPLES, TRIALS, blocks, padded, roomy, split
-from jaxfinger.experiments.shows import shows
+from jaxfinger.experiments.shows import refuse_broken, shows
 from jaxfinger.experiments.table import EXPERIMENTS, Experiment
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "padded",
     "predict",
     "prepare",
+    "refuse_broken",
     "roomy",
     "shows",
     "split",

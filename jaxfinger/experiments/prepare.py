@@ -68,7 +68,7 @@ def prepare(
     With `minus` the channels are measurement minus prediction, and what is not predicted does not count.
     """
     sizes, stacks = sizes_of(session), {}
-    for spec in (e.at(sizes.pace) for e in EXPERIMENTS.values()):
+    for spec in (e.at(sizes.pace if e.kind == "driven" else sizes.slow_pace) for e in EXPERIMENTS.values()):
         chosen = [t for t in session if t.experiment == spec.name and (names is None or t.name in names)]
         trials = [t for t in chosen if len(t.time) > 1]
 

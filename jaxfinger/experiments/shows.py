@@ -2,6 +2,8 @@
 operations of a prediction.
 """
 
+import inspect
+import traceback
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -13,9 +15,10 @@ import numpy as np
 from jax.extend.core import Literal
 
 from jaxfinger.effects import CatalogueEffect
+from jaxfinger.errors import UserError, did_you_mean
 from jaxfinger.experiments.predict import predict
 from jaxfinger.experiments.table import EXPERIMENTS
-from jaxfinger.model import Finger, Model, Motion
+from jaxfinger.model import Effect, Finger, Model, Motion
 
 
 def shows(kind: type[CatalogueEffect], finger: Finger) -> dict[str, tuple[str, ...]]:
@@ -26,6 +29,22 @@ def shows(kind: type[CatalogueEffect], finger: Finger) -> dict[str, tuple[str, .
     """
     names = finger.joint_names, finger.tendon_names
     return _shows(kind, *names, finger.prismatic, finger.active, finger.crosses)
+
+
+def refuse_broken(kind: type[CatalogueEffect], finger: Finger) -> None:
+    """UserError where a user's effect fails in a prediction, or changes no channel at any size."""
+    file = inspect.getfile(kind)
+    try:
+        useless = kind.sites(finger) and not shows(kind, finger)
+    except Exception as e:
+        lines = [frame.lineno for frame in traceback.extract_tb(e.__traceback__) if frame.filename == file]
+        where = f"{file}, line {lines[-1]}" if lines else file
+        raise UserError(f"{where}: {kind.ID} fails in a prediction: {type(e).__name__}: {e}") from e
+    if useless:
+        hooks = {name for name in vars(Effect) if not name.startswith("_")}
+        odd = [name for name in vars(kind) if name not in hooks and callable(getattr(kind, name))]
+        near = next(filter(None, (did_you_mean(name, hooks) for name in odd if not name.startswith("_"))), "")
+        raise UserError(f"{file}: {kind.ID} changes no channel at any size; override a hook of Effect{near}")
 
 
 @cache

@@ -50,6 +50,7 @@ from jaxfinger.gap.where import where
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.parameters import describe, ravel, units_at
 from jaxfinger.identify.stages import Progress
+from jaxfinger.model import Finger
 
 COARSE = 2  # times as long averages in a first look
 NEARLY = 0.99  # of a signature that the nominal parameters imitate, from which on a cause is called absorbed
@@ -96,7 +97,7 @@ def diagnose(
         raise UserError("an earlier fit brings its own recipe and no other simulator; leave the other one out")
     recipe, tolerance = recipe or (against.recipe if against else Recipe()), dict(tolerance or {})
     changed = changes_of(against) if against else {}
-    catalogue = catalogue_for(recipe, effects) | changed
+    catalogue = catalogue_for(recipe, effects, Finger.from_description(session.finger)) | changed
     if unknown := set(without) - set(catalogue):
         raise UserError(
             f"the catalogue has no effect {', '.join(sorted(unknown))} to leave out"

@@ -37,12 +37,13 @@ def fit_with(
     recipe, keys = recipe or Recipe(), list(dict.fromkeys(keys))
     if there := [effect for effect, _ in keys if effect in recipe.model.terms]:
         raise UserError(f"{there[0]} is a term of the recipe's own model; leave it out here, or there")
-    catalogue = catalogue_for(recipe, effects)
+    finger = Finger.from_description(session.finger)
+    catalogue = catalogue_for(recipe, effects, finger)
     for effect, _ in keys:
         if effect not in catalogue:
             near = did_you_mean(effect, catalogue)
             raise UserError(f"the catalogue has no effect {effect}{near}; it has {', '.join(sorted(catalogue))}")
-    _refuse_elsewhere(catalogue, keys, Finger.from_description(session.finger))
+    _refuse_elsewhere(catalogue, keys, finger)
     problem = build(session, recipe, progress)
     offered = _offered(catalogue, keys, problem)
     bench = Bench.of(problem, Parameters())

@@ -16,11 +16,12 @@ from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.effects import CATALOGUE, CatalogueEffect, Changed, Scales, Site, changes, nominal_terms
-from jaxfinger.experiments import TRIALS, shows
+from jaxfinger.experiments import TRIALS, refuse_broken, shows
 from jaxfinger.gap.problem import Problem, Rows
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.parameters import describe
 from jaxfinger.model import (
+    Finger,
     Model,
     Motion,
     Terms,
@@ -64,8 +65,16 @@ class Variant:
         return self.effect.at(finger, self.site, **dict(self.shape), **amplitudes)
 
 
-def catalogue_for(recipe: Recipe, own: dict[str, type[CatalogueEffect]] | None) -> dict[str, type[CatalogueEffect]]:
-    """All that may be at work by id: the catalogue, the terms that a recipe may leave out, and a user's own."""
+def catalogue_for(
+    recipe: Recipe, own: dict[str, type[CatalogueEffect]] | None, finger: Finger
+) -> dict[str, type[CatalogueEffect]]:
+    """All that may be at work by id: the catalogue, the terms that a recipe may leave out, and a user's own.
+
+    Raises:
+        UserError: one of the user's own fails in a prediction, or changes none.
+    """
+    for kind in (own or {}).values():
+        refuse_broken(kind, finger)
     return CATALOGUE | nominal_terms(recipe.model.elastic_degree, recipe.model.friction_degree) | (own or {})
 
 

@@ -218,7 +218,7 @@ def test_identify_on_an_output_without_greek_of_torques_that_trade_off_exactly(t
     assert run("identify", tmp_path / "s.h5", "-o", tmp_path / "f.json") == 0
     sys.stdout.flush()
     warned, said = capsys.readouterr().err, out.getvalue().decode("cp1252")
-    assert "warning: /: has `created` 'on " in warned
+    assert "warning: has `created` 'on " in warned
     assert "\x1b" not in warned
     assert "friction torque J^2" in said
     row = next(line for line in said.splitlines() if line.startswith("J ") and "N mm s/rad" in line)

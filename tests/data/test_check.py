@@ -160,7 +160,7 @@ def test_each_fault_is_named_and_refused(file, fault, monkeypatch):
     assert any(f.place == place and words in f.message for f in errors), errors
     with pytest.raises(UserError) as refused:
         read_session(file)
-    assert str(refused.value).startswith(f"{file}: /")
+    assert str(refused.value).startswith(f"{file}: {place.removesuffix('/')}")
     assert "\n" not in str(refused.value)
 
 

@@ -154,6 +154,13 @@ def test_a_mistake_in_the_mapping_is_named(mapping, tmp_path, old, new, words):
     assert not (tmp_path / "out.h5").exists()
 
 
+def test_recordings_that_are_not_there_are_said_before_any_is_read(mapping, tmp_path):
+    (tmp_path / "logs").mkdir()
+    for given, words in (("lag.mat", "lag.mat: does not exist"), ("logs", "is a folder, .*name the recordings in it")):
+        with pytest.raises(UserError, match=words):
+            import_file([tmp_path / given], mapping, tmp_path / "out.h5")
+
+
 def test_a_recording_that_cannot_be_read(mapping, tmp_path):
     (tmp_path / "log.mat").write_bytes(b"not a recording")
     with pytest.raises(UserError, match="cannot be read"):

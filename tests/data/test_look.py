@@ -111,3 +111,22 @@ def test_variables_that_give_no_numbers_are_named(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "z is complex" in said
     assert "note is text" in said
+
+
+@pytest.mark.parametrize(
+    ("columns", "experiment"),
+    [
+        ({"F_A": 2.0, "F_B": 2.0, "A_mm": 1.0}, "ID.2"),
+        ({"A_mm": 1.0, "B_mm": 1.0}, "ID.2"),
+        ({"knob_Nmm": 1.0}, "ID.3-dynamic"),
+    ],
+)
+def test_what_is_measured_of_a_swept_joint_says_which_experiment_it_is(tmp_path, columns, experiment):
+    """Without a torque a swept joint tells of excursions; a column F_… is a force, of the tendon that it names."""
+    swing = 40.0 - 40.0 * np.cos(TIME / 1e3)
+    table = np.column_stack([TIME, swing, *(level + 0.1 * swing for level in columns.values())])
+    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header=",".join(["stamp_ms", "a_deg", *columns]), comments="")
+    recording = load_recording(tmp_path / "log.csv")
+    assert f'experiment = "{experiment}"' in proposal([recording])
+    forces = [s.name for s in columns_of(recording) if s.meaning == "tendon_force"]
+    assert forces == [name for name in columns if name.startswith("F_")]

@@ -11,7 +11,7 @@ import pytest
 
 from jaxfinger.effects import CATALOGUE, CHANGED, NOMINAL_TERMS, Scales, from_dict, load, nominal_terms, to_dict
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import EXPERIMENTS, Batch, predict, shows
+from jaxfinger.experiments import EXPERIMENTS, Batch, predict, refuse_broken, shows
 from jaxfinger.identify.parameters import describe, units_at
 from jaxfinger.model import (
     excursion,
@@ -264,3 +264,24 @@ def test_an_effect_on_a_link_leaves_it_a_body_at_all_that_its_bounds_allow(name,
         assert finger.mass[1] > 0.0
         moments = np.linalg.eigvalsh(finger.gyration[1])
         assert moments[2] <= moments[:2].sum() * (1.0 + 1e-9)
+
+
+DRAG = DOCUMENT.read_text().split("```python\n")[1].split("```")[0]
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "complaint"),
+    [
+        ('"joint_drag"', '"joint_stop"', "which the catalogue has"),
+        ("    CHANGE:", "    ALTER:", "JointDrag has no CHANGE"),
+        ("def torque", "def torqe", r"changes no channel at any size.*did you mean 'torque'"),
+        ("jnp.abs(x.qd[i])", "jnp.abs(x.speed[i])", r"drag.py, line \d+: joint_drag fails in a prediction: .*speed"),
+        ('"joint"', '"knuckle"', r"drag.py, line \d+: joint_drag fails in a prediction"),
+    ],
+)
+def test_an_effect_that_cannot_work_is_refused_in_a_sentence(tmp_path, right, wrong, complaint):
+    path = tmp_path / "drag.py"
+    assert right in DRAG
+    path.write_text(DRAG.replace(right, wrong, 1))
+    with pytest.raises(UserError, match=complaint):
+        refuse_broken(next(iter(load(path).values())), FINGER)

@@ -443,3 +443,21 @@ def test_another_unit_of_force_and_length_leaves_what_counts_alone():
     for one, other in ((small, large), (pull, big)):
         for a, b in zip(*(stack(t).batch.mask.values() for t in (one, other)), strict=True):
             np.testing.assert_array_equal(a, b)
+
+
+def test_steps_are_read_at_their_own_pace_however_quick_the_sweeps_are():
+    """A sweep of ten cycles a second beside steps of the protocol: what holds and steps say stays as it was."""
+    step, rng = 1.0 / 200.0, np.random.default_rng(1)
+    levels = np.radians([*range(0, 81, 10), *range(70, -1, -10)])
+    time = np.arange(0.0, 1.8 * len(levels), step)
+    q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
+    q[:, 0] = np.interp(
+        time, np.repeat(1.8 * np.arange(len(levels)), 2) + np.tile([0.0, 1.2], len(levels)), np.repeat(levels, 2)
+    )
+    q += np.radians(0.03) * rng.standard_normal(q.shape)
+    stairs = Trial("stairs", "ID.3-static", time, q, joint_torque=np.full(q.shape, 1e-2), joint=MCP)
+    quick = replace(sweep(), time=sweep().time / 30.0)
+    x = prepare(Session("a finger", FINGER, {t.name: t for t in (stairs, quick)}))["ID.3-static"]
+    alone = prepare(Session("a finger", FINGER, {"stairs": stairs}))["ID.3-static"]
+    for name in ("joint_direction", "q", "qd"):
+        np.testing.assert_array_equal(getattr(x.batch.x, name), getattr(alone.batch.x, name))
