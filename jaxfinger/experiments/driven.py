@@ -9,7 +9,7 @@ from scipy.ndimage import minimum_filter1d
 
 from jaxfinger.data import directions, low_pass, passed, smooth, turned_on_time, width, without_spikes
 from jaxfinger.data.motion import noise_of, quicker, still
-from jaxfinger.experiments.recording import Joints, Recording, Row, joints, row
+from jaxfinger.experiments.reduction import Joints, PreparedTrial, Row, joints, row
 from jaxfinger.experiments.shrink import shrink
 
 NOTHING = "nowhere do a joint and its tendons slide for long enough that the direction of their friction is known"
@@ -32,7 +32,7 @@ CALM = 0.1  # s, at the protocol's pace: over which q̈ is averaged where it doe
 COLOURED = 10.0
 
 
-def reduce(r: Recording) -> Row:
+def reduce(r: PreparedTrial) -> Row:
     """What slides counts for torque, everything for excursion."""
     j = joints(r, sharp=not r.reduced)
     # When a joint turns back shows best in the slower filter: there noise of q̇ is noise in time.
@@ -67,7 +67,7 @@ def reduce(r: Recording) -> Row:
     )
 
 
-def joint_directions(r: Recording, j: Joints, slow: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
+def joint_directions(r: PreparedTrial, j: Joints, slow: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
     """The protocol's directions, else those of the filtered motion: for a fit they turn where a motion back is sure
     (samples beside do not count), for a prediction where it began.
     """
@@ -77,7 +77,7 @@ def joint_directions(r: Recording, j: Joints, slow: Float[np.ndarray, "N m"]) ->
     return sure if r.reduced else turned_on_time(sure, j.q, ENCODER * j.noise)
 
 
-def tendon_rates(r: Recording) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]] | None:
+def tendon_rates(r: PreparedTrial) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]] | None:
     """Tendon speeds, m/s, in a slow filter and in a quicker one; none where excursions were not measured."""
     if r.trial.tendon_excursion is None:
         return None
@@ -87,7 +87,7 @@ def tendon_rates(r: Recording) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarr
     return slow, quick
 
 
-def tendon_directions(r: Recording, rates) -> Float[np.ndarray, "N n"]:
+def tendon_directions(r: PreparedTrial, rates) -> Float[np.ndarray, "N n"]:
     """The protocol's, else those of the measured excursions; 0 of tendons that are slack."""
     if r.spec.slack:
         return np.zeros((len(r.trial.time), r.finger.n))
@@ -101,7 +101,7 @@ def tendon_directions(r: Recording, rates) -> Float[np.ndarray, "N n"]:
 
 
 def sliding(
-    r: Recording,
+    r: PreparedTrial,
     qd: Float[np.ndarray, "N m"],
     slow: Float[np.ndarray, "N m"],
     direction: Float[np.ndarray, "N m"],
@@ -135,7 +135,7 @@ def sliding(
     return np.where(r.motorised, apart, minimum_filter1d(apart, 2 * half + 1, axis=0, origin=half))
 
 
-def _friction_known(r: Recording, slow, quick) -> Bool[np.ndarray, "N n"]:
+def _friction_known(r: PreparedTrial, slow, quick) -> Bool[np.ndarray, "N n"]:
     """Where a tendon is slack, or slides for certain: faster than it stretches, and in a quicker filter too."""
     tension, cutoff = r.tension(), min(r.spec.cutoff / 2.0, 0.2 / r.step)
     stretches = r.sizes.compliance * np.abs(smooth(r.trial.time, tension, cutoff)[1])

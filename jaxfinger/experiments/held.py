@@ -14,7 +14,7 @@ from scipy.optimize import isotonic_regression
 
 from jaxfinger.data import find_holds
 from jaxfinger.data.motion import RAMP, slow_ramps, stretches_of
-from jaxfinger.experiments.recording import Recording, Row, joints, row, stretches
+from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, stretches
 from jaxfinger.experiments.shrink import shrink
 
 NOTHING = "no tendon is pulled from slack in holds, or in ramps slow enough to tell its friction"
@@ -23,7 +23,7 @@ OVERSHOOT = 4.0  # standard deviations: tension beyond that of both holds by mor
 FEW = 3  # holds from which on their spread tells whether a fixture yields
 
 
-def reduce(r: Recording) -> Row:
+def reduce(r: PreparedTrial) -> Row:
     """Holds and ramps count from slack on; the excursion of a tendon counts wherever it is taut."""
     j = joints(r, sharp=not r.reduced)
     hold = r.whole(find_holds(r.trial, r.spec.pace))
@@ -42,7 +42,7 @@ def reduce(r: Recording) -> Row:
     return row(r, _in_fixture(r.mean(r.trial.q), hold), (still, still), pulled, counting, j.noise, hold=hold)
 
 
-def _from_slack(r: Recording, tension: Float[np.ndarray, "M n"]) -> Bool[np.ndarray, " M"]:
+def _from_slack(r: PreparedTrial, tension: Float[np.ndarray, "M n"]) -> Bool[np.ndarray, " M"]:
     """Where what friction has taken before the trial's first sample no longer matters: a recording that starts with a
     taut tendon counts from that tendon's first change on, or from where the protocol says how it was approached.
     """

@@ -4,12 +4,12 @@ import numpy as np
 
 from jaxfinger.data import directions
 from jaxfinger.data.motion import still
-from jaxfinger.experiments.recording import Recording, Row, joints, row
+from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row
 
 NOTHING = "no sample is measured"
 
 
-def reduce(r: Recording) -> Row:
+def reduce(r: PreparedTrial) -> Row:
     """Every sample counts where it is measured."""
     j = joints(r, sharp=not r.reduced)
     # Averaged over the same blocks as what it predicts, and not filtered where that is not.

@@ -13,7 +13,7 @@ from jaxfinger.data import Predictions, Session, Trial
 from jaxfinger.data.sizes import sizes_of
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import driven, held, path, stepped
-from jaxfinger.experiments.recording import Row, recording, stretches
+from jaxfinger.experiments.reduction import Row, prepared, stretches
 from jaxfinger.experiments.table import EXPERIMENTS, Experiment
 from jaxfinger.model import Motion
 
@@ -73,7 +73,7 @@ def prepare(
         trials = [t for t in chosen if len(t.time) > 1]
 
         def row(trial: Trial, spec: Experiment = spec) -> tuple[Row, dict[str, bool]]:
-            r = recording(spec, trial, session, sizes, reduced, minus, coarse)
+            r = prepared(spec, trial, session, sizes, reduced, minus, coarse)
             return KINDS[spec.kind].reduce(r), {c: bool(s.any()) for c, s in r.sound.items()}
 
         long = any(len(t.time) > LONG for t in trials)

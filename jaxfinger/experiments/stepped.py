@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from jaxfinger.data import directions, find_holds, smooth
 from jaxfinger.data.motion import still
 from jaxfinger.experiments.driven import sliding
-from jaxfinger.experiments.recording import Recording, Row, joints, row, stretches
+from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, stretches
 
 NOTHING = "there is no hold whose direction of approach is known, and no motion in which the joint slides"
 # s, at the protocol's pace, kept clear on either side of where a joint may stick: no measured channel is filtered, so
@@ -17,7 +17,7 @@ NOTHING = "there is no hold whose direction of approach is known, and no motion 
 CLEAR = 0.01
 
 
-def reduce(r: Recording) -> Row:
+def reduce(r: PreparedTrial) -> Row:
     """Holds that were approached count, and motion in which the joint slides."""
     j = joints(r, sharp=True)
     hold = find_holds(r.trial, r.spec.pace)

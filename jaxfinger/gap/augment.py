@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.experiments import shows
-from jaxfinger.gap.exact import State, Whitened
+from jaxfinger.gap.exact import SearchState, Whitened
 from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem, assemble, moved
 from jaxfinger.gap.result import Value
@@ -26,7 +26,7 @@ from jaxfinger.identify.solve import Solution, Source, linearise_each, missed_ea
 from jaxfinger.model import Model
 
 WITH_EFFECTS = "with the effects of the diagnosis"
-Missed = dict[tuple[str, str], Float[np.ndarray, "columns B T"]]  # measured − predicted, by experiment and channel
+Missed = dict[tuple[str, str], Float[np.ndarray, "_columns _B _T"]]  # measured − predicted, by experiment and channel
 
 
 class Fitted(NamedTuple):
@@ -45,7 +45,7 @@ def nominal_fit(problem: Problem) -> Fitted:
     return Fitted(fit, problem.r, problem.J, partial(missed_by, problem.sources))
 
 
-def augmented_fit(problem: Problem, chosen: State, hold: bool = False) -> Fitted:
+def augmented_fit(problem: Problem, chosen: SearchState, hold: bool = False) -> Fitted:
     """Nominal parameters, amplitudes and moving shapes, fitted exactly, with their covariance.
 
     With `hold` the causes stay where the formula has put them, since what is open would pull at them; the nominal
@@ -65,7 +65,7 @@ def augmented_fit(problem: Problem, chosen: State, hold: bool = False) -> Fitted
     return Fitted(fit, r, J, partial(missed_by, sources))
 
 
-def as_refitted(problem: Problem, chosen: State) -> Fitted:
+def as_refitted(problem: Problem, chosen: SearchState) -> Fitted:
     """The same where the search has led, with no fit of its own, and by the programs of the nominal model and of
     signatures, which are compiled already. Its intervals leave out the products of effects with the nominal parameters.
     """
@@ -178,7 +178,7 @@ def _seeing_effects(problem: Problem, source: Source, effects: tuple[CatalogueEf
 
 
 def _covariance(
-    problem: Problem, r: np.ndarray, J: np.ndarray, root: np.ndarray, chosen: State | None = None
+    problem: Problem, r: np.ndarray, J: np.ndarray, root: np.ndarray, chosen: SearchState | None = None
 ) -> Float[np.ndarray, "p p"]:
     """Laplace's, in the weights of the formula where there are causes, and wider where the residuals pull a parameter
     to and fro by more than the noise explains.

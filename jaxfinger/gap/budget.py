@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.gap.exact import Bench, State
+from jaxfinger.gap.exact import Bench, SearchState
 from jaxfinger.gap.folds import FOLDS, KEPT, equilibrated, fold_of_row
 from jaxfinger.gap.problem import Problem
 
@@ -79,7 +79,7 @@ class Budget:
         return value[:-1], np.stack([low[:-1], high[:-1]], axis=1), float(value[-1]), (float(low[-1]), float(high[-1]))
 
 
-def budget(bench: Bench, state: State, plain: Problem, open_columns: frozenset[int]) -> Budget:
+def budget(bench: Bench, state: SearchState, plain: Problem, open_columns: frozenset[int]) -> Budget:
     """`plain`: the problem at the nominal model refitted to all trials, which is the model before."""
     fold, trial = fold_of_row(plain), plain.trial_of_row
     cells, null, full = _products(bench, plain, state, fold, trial)
@@ -116,7 +116,7 @@ def budget(bench: Bench, state: State, plain: Problem, open_columns: frozenset[i
     )
 
 
-def _products(bench: Bench, plain: Problem, state: State, fold, trial):
+def _products(bench: Bench, plain: Problem, state: SearchState, fold, trial):
     """Cells (trial, column, fold, rows), and products of rows there: of the nominal model's, and of [residual, J,
     slopes, changes] of the set's.
     """
@@ -142,7 +142,9 @@ def _weights(cells, full, seen, k) -> np.ndarray:
     return (np.maximum(n, 1.0) / np.maximum(np.maximum(e, n), 1.0))[column]
 
 
-def _joint(seen, weight, state: State, k: int, of_coordinate, effects: int, without: int | None = None) -> np.ndarray:
+def _joint(
+    seen, weight, state: SearchState, k: int, of_coordinate, effects: int, without: int | None = None
+) -> np.ndarray:
     """Coefficients of [residual, J, slopes, changes] with slopes refitted, J too, a cause taken out where asked."""
     H = np.tensordot(weight, seen, 1)
     m = len(of_coordinate)
@@ -179,7 +181,7 @@ def _solved(H, prior, x, free: list[int]) -> np.ndarray:
     return out
 
 
-def held_out_gains(problem: Problem, members: list[Float[np.ndarray, "k N"]]) -> list[float]:
+def held_out_gains(problem: Problem, members: list[Float[np.ndarray, "_k N"]]) -> list[float]:
     """Share of the gap that signatures explain, each member's alone, on trials for which neither they nor the nominal
     parameters were refitted.
     """

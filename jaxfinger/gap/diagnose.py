@@ -15,7 +15,7 @@ from jaxfinger.experiments import not_judged
 from jaxfinger.gap.augment import Fitted, as_refitted, augmented_fit, nominal_fit, values_of
 from jaxfinger.gap.budget import A_GAP, Budget, budget, held_out_gains
 from jaxfinger.gap.closure import RESOLVABLE, closures
-from jaxfinger.gap.exact import Bench, State, Whitened
+from jaxfinger.gap.exact import Bench, SearchState, Whitened
 from jaxfinger.gap.formula import Parameters, Weights, unexplained
 from jaxfinger.gap.next_experiment import next_experiment
 from jaxfinger.gap.posterior import IS_NAMED, Posterior, posterior
@@ -26,10 +26,10 @@ from jaxfinger.gap.result import (
     Candidate,
     Cause,
     Change,
-    Channel,
     ChannelBudget,
     Closure,
     Diagnosis,
+    ExperimentChannel,
     Key,
     Left,
     NextExperiment,
@@ -43,7 +43,7 @@ from jaxfinger.gap.result import (
     tolerated,
 )
 from jaxfinger.gap.screening import read_parts
-from jaxfinger.gap.sets import Offered, Search, Table, table_of
+from jaxfinger.gap.sets import Offered, Search, SignatureTable, table_of
 from jaxfinger.gap.signatures import catalogue_for, changes_of, variants
 from jaxfinger.gap.smooth_laws import Explained, explained
 from jaxfinger.gap.where import where
@@ -166,7 +166,7 @@ def diagnose(
 
 def searched(
     problem: Problem, catalogue: Mapping[str, type[CatalogueEffect]], progress: Progress = lambda message: None
-) -> tuple[Search, State]:
+) -> tuple[Search, SearchState]:
     """All sets of the catalogue's effects that the evidence led to, and the best of them."""
     bench = Bench.of(problem, Parameters())
     progress("reading the signatures of all effects")
@@ -178,7 +178,7 @@ def searched(
 
 
 def _verdict(
-    problem: Problem, bench: Bench, state: State, found: Posterior, relevance: tuple[Relevance, ...]
+    problem: Problem, bench: Bench, state: SearchState, found: Posterior, relevance: tuple[Relevance, ...]
 ) -> Verdict:
     """The word for the posterior; whether named causes are all of the gap is for held-out trials to say. A channel
     whose mean square is surely above its noise's is no «no gap», however few features tell of it.
@@ -234,13 +234,13 @@ def _open(bench: Bench) -> frozenset[int]:
     return frozenset(np.flatnonzero(unexplained(bench.columns.counts, null, bench.parameters) > A_GAP).tolist())
 
 
-def _by_share(named, chosen: State, shares: Budget) -> list:
+def _by_share(named, chosen: SearchState, shares: Budget) -> list:
     value, _, _, _ = shares.overall()
     order = {k: v for k, v in zip(chosen.keys, value, strict=True)}
     return sorted(named, key=lambda k: -order.get(k, 0.0))
 
 
-def _causes(chosen: State, found: Posterior, shares: Budget, fit: Fit) -> tuple[Cause, ...]:
+def _causes(chosen: SearchState, found: Posterior, shares: Budget, fit: Fit) -> tuple[Cause, ...]:
     """One line an effect, with all of its sites that are in."""
     value, ends, _, _ = shares.overall()
     by_channel: dict[tuple[str, str], set[int]] = {}
@@ -258,7 +258,7 @@ def _causes(chosen: State, found: Posterior, shares: Budget, fit: Fit) -> tuple[
                 float(np.clip(value[at].sum(), 0.0, 1.0)),
                 (float(min(ends[at, 0].sum(), 1.0)), float(min(ends[at, 1].sum(), 1.0))),
                 {
-                    Channel(e, c): float(min(lost[at].sum(), 1.0))
+                    ExperimentChannel(e, c): float(min(lost[at].sum(), 1.0))
                     for (e, c), lost in of_channel.items()
                     if lost[at].sum() > 0.005
                 },
@@ -268,7 +268,7 @@ def _causes(chosen: State, found: Posterior, shares: Budget, fit: Fit) -> tuple[
     return tuple(sorted(out, key=lambda c: -c.share))
 
 
-def _unexplained(chosen: State, shares: Budget, left: list[Explained], status: Status, progress) -> Unexplained:
+def _unexplained(chosen: SearchState, shares: Budget, left: list[Explained], status: Status, progress) -> Unexplained:
     _, _, share, ends = shares.overall()
     if status in (Status.NO_GAP, Status.NOT_JUDGED) or not left or left[0].energy <= 0:
         return Unexplained(share, ends, (), None, None)
@@ -280,12 +280,12 @@ def _unexplained(chosen: State, shares: Budget, left: list[Explained], status: S
         progress("looking for a closed form of what remains")
         ones = Weights(*np.ones((2, len(chosen.columns.items))))
         proposal = propose(chosen.problem, Whitened(chosen.problem, chosen.columns, ones), chosen.r, left)
-    there = Channel(worst.experiment, worst.channel, site(chosen.problem, worst.channel, worst.column))
+    there = ExperimentChannel(worst.experiment, worst.channel, site(chosen.problem, worst.channel, worst.column))
     return Unexplained(share, ends, depends, there, proposal)
 
 
 def _channels(
-    problem: Problem, bench: Bench, chosen: State, causes: tuple[Cause, ...], shares: Budget
+    problem: Problem, bench: Bench, chosen: SearchState, causes: tuple[Cause, ...], shares: Budget
 ) -> tuple[ChannelBudget, ...]:
     """One line a column with a gap. Its gap in physical units is what is missed beyond the noise at the fit's rate."""
     found = []
@@ -358,7 +358,7 @@ def _not_judged(problem: Problem) -> tuple[NotJudged, ...]:
     return tuple(NotJudged(x.experiment, x.channel, why) for x in not_judged(problem.stacks))
 
 
-def _candidates(problem: Problem, search: Search, chosen: State, found: Posterior, shares: Budget, fit: Fit):
+def _candidates(problem: Problem, search: Search, chosen: SearchState, found: Posterior, shares: Budget, fit: Fit):
     """Every candidate tried, most probable first: as it is in the set, or alone on top of the nominal model."""
     order = sorted(found.causes, key=lambda k: (-found.causes[k], -found.gains[k]))
     inside = {k: values_of(fit, i) for i, k in enumerate(chosen.keys)}
@@ -374,7 +374,7 @@ def _candidates(problem: Problem, search: Search, chosen: State, found: Posterio
 
 
 def _alone(
-    problem: Problem, table: Table, offer: Offered, amplitudes: np.ndarray, std: np.ndarray
+    problem: Problem, table: SignatureTable, offer: Offered, amplitudes: np.ndarray, std: np.ndarray
 ) -> tuple[Value, ...]:
     """Amplitudes of a cause on top of the nominal model, linearly, and the shape that suits best."""
     (variant,), names = offer.variants, list(offer.variants[0].sizes)
@@ -388,7 +388,7 @@ def _alone(
     return tuple([*values, *(Value(variant.site, n, v, 0.0, units[n]) for n, v in variant.shape)])
 
 
-def _absorbed(problem: Problem, table: Table) -> tuple[Absorbed, ...]:
+def _absorbed(problem: Problem, table: SignatureTable) -> tuple[Absorbed, ...]:
     out = []
     for key, share in table.absorbed.items():
         if share > NEARLY:

@@ -43,7 +43,7 @@ class Coordinate:
 
 
 @dataclass(frozen=True)
-class State:
+class SearchState:
     """A set of causes at its optimum, and the problem at the nominal model that it leads to."""
 
     problem: Problem
@@ -86,7 +86,7 @@ class Bench:
 
     columns: Columns
     parameters: Parameters
-    null: State  # no cause, the nominal model refitted in the weights of the formula
+    null: SearchState  # no cause, the nominal model refitted in the weights of the formula
     unknown: Float[np.ndarray, " C"]  # log evidence, column by column, that something is at work
     gap: float  # norm of what the nominal model misses: the size of the amplitudes' prior
 
@@ -98,7 +98,7 @@ class Bench:
         residual = ByColumn.of(columns, problem.r[None])
         judged = Linear(columns, (residual, nominal), prior_products(problem, 0), none, parameters).null
         assert judged is not None
-        null = State(problem, columns, nominal, (), (), empty, empty, judged)
+        null = SearchState(problem, columns, nominal, (), (), empty, empty, judged)
         unknown = unexplained(columns.counts, judged.evidence, parameters)
         gap = float(np.sqrt(np.sum(judged.evidence.e + judged.evidence.o)))
         return cls(columns, parameters, null, unknown, gap)
@@ -186,11 +186,11 @@ def orthonormalised(A: Float[np.ndarray, "N p"]) -> tuple[Float[np.ndarray, "N k
 
 def fitted(
     bench: Bench, problem: Problem, variants: Sequence[Variant], start: Sequence[dict[str, float]], weights: Weights
-) -> State:
+) -> SearchState:
     """The causes together, from amplitudes `start` (in their own units), at the nominal model that they lead to."""
     finger = problem.nominal.finger
     effects = [within_bounds(v.at(finger, s), v.scales) for v, s in zip(variants, start, strict=True)]
-    best: State | None = None
+    best: SearchState | None = None
     for _ in range(ROUNDS):
         found = at_one_model(bench, problem, effects, weights)
         if best is not None and found.score < best.score + SETTLED:
@@ -201,7 +201,7 @@ def fitted(
     return best
 
 
-def _led(bench: Bench, state: State) -> Problem:
+def _led(bench: Bench, state: SearchState) -> Problem:
     """The problem at the nominal model that a set leads to; a part of the step where a whole one loses what it won."""
     project = Whitened(state.problem, bench.columns, state.judged.weights)
     step = project.nominal_step(state.r)
@@ -220,7 +220,7 @@ def _cost(project: Whitened, r: np.ndarray) -> float:
     return float(x @ x)
 
 
-def at_one_model(bench: Bench, problem: Problem, effects: list[CatalogueEffect], weights: Weights) -> State:
+def at_one_model(bench: Bench, problem: Problem, effects: list[CatalogueEffect], weights: Weights) -> SearchState:
     """Amplitudes and shapes at the problem's nominal model, its parameters eliminated by projection."""
     signatures, project = Signatures(problem), Whitened(problem, bench.columns, weights)
     coordinates = _coordinates(effects, problem.scales)
@@ -257,10 +257,10 @@ def at_one_model(bench: Bench, problem: Problem, effects: list[CatalogueEffect],
             break
     nominal = ByColumn.of(bench.columns, problem.J.T)
     judged = bench.judge(problem, nominal, r, slopes, sizes, _room(effects, coordinates))
-    return State(problem, bench.columns, nominal, tuple(effects), tuple(coordinates), changes, slopes, judged)
+    return SearchState(problem, bench.columns, nominal, tuple(effects), tuple(coordinates), changes, slopes, judged)
 
 
-def derivatives(signatures: Signatures, state: State) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "k N"]]:
+def derivatives(signatures: Signatures, state: SearchState) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "k N"]]:
     """White change of other rows by a set's causes, and its derivatives by their coordinates."""
     reach = np.full(len(state.coordinates), STEP / 20.0)
     changes, slopes = _evaluate(signatures, state.effects, state.coordinates, reach)

@@ -49,8 +49,8 @@ class Parameters:
 class Weights:
     """What the likeliest unknown makes of the columns."""
 
-    feature: Float[np.ndarray, " C"]  # 1 / v_c
-    outside: Float[np.ndarray, " C"]
+    feature: Float[np.ndarray, "*n C"]  # 1 / v_c
+    outside: Float[np.ndarray, "*n C"]
 
 
 class Evidence(NamedTuple):

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.experiments import EXPERIMENTS, Batch, Stack, shows
-from jaxfinger.gap.exact import State, Whitened, derivatives
+from jaxfinger.gap.exact import SearchState, Whitened, derivatives
 from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem, imagined
 from jaxfinger.gap.result import NextExperiment, Posture
@@ -38,7 +38,7 @@ FASTEST, SLOWER = 1.5, 0.25  # rad/s, times the speed
 LIKE = {"VD.2": "ID.4", "ID.4": "VD.2", "ID.3-static": "ID.2", "ID.3-dynamic": "ID.2"}
 
 
-def next_experiment(problem: Problem, members: Sequence[State]) -> NextExperiment | None:
+def next_experiment(problem: Problem, members: Sequence[SearchState]) -> NextExperiment | None:
     """For the fitted sets that rivals belong to; none where no trial is expected to separate them."""
     if len(members) < 2:
         return None
@@ -130,9 +130,10 @@ def _borrowed(problem: Problem, name: str, like: Stack) -> Stack:
     mask, y = {}, {}
     for c in spec.channels:
         columns = {"joint_torque": finger.m, "tendon_excursion": finger.n, "fingertip_force": 3}[c]
-        mask[c] = jnp.asarray(motor if c == "joint_torque" else np.ones((columns, *counts.shape))) * counts
+        shown = motor if c == "joint_torque" else np.ones((columns, *counts.shape))
         if c == "tendon_excursion":
-            mask[c] *= jnp.asarray((np.asarray(x.tension).max(axis=-1) > 0)[..., None])
+            shown = shown * (np.asarray(x.tension).max(axis=-1) > 0)[..., None]
+        mask[c] = jnp.asarray(shown * counts)
         y[c] = jnp.zeros_like(mask[c])
     x = replace(x, motorised=jnp.asarray(motor), held=spec.held)
     measured = dict.fromkeys(spec.channels, True)

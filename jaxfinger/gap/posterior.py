@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxfinger.gap.costs import Key
-from jaxfinger.gap.exact import State
+from jaxfinger.gap.exact import SearchState
 from jaxfinger.gap.formula import unlisted
 from jaxfinger.gap.sets import Search
 
@@ -26,7 +26,7 @@ class Posterior:
     ambiguous: tuple[tuple[Key, ...], ...]
 
 
-def posterior(search: Search, state: State) -> Posterior:
+def posterior(search: Search, state: SearchState) -> Posterior:
     """From the sets that a search has weighed."""
     costs, scores = search.costs, search.visited.scores
     w = costs.weights(scores)
@@ -43,7 +43,7 @@ def posterior(search: Search, state: State) -> Posterior:
     return Posterior(causes, gains, w[frozenset()] * (1.0 - other), other, named, ambiguous)
 
 
-def _ambiguous(w: dict[frozenset, float], state: State, causes: dict[Key, float]) -> tuple[tuple[Key, ...], ...]:
+def _ambiguous(w: dict[frozenset, float], state: SearchState, causes: dict[Key, float]) -> tuple[tuple[Key, ...], ...]:
     """Causes of the best set that others could take the place of."""
     out, whole = [], frozenset(state.keys)
     for key in state.keys:

@@ -40,7 +40,7 @@ class Key:
 
 
 @dataclass(frozen=True, order=True)
-class Channel:
+class ExperimentChannel:
     """One channel of one experiment, or one of its columns."""
 
     experiment: str
@@ -68,7 +68,7 @@ class Cause:
     probability: float  # that it is at work (at several sites: at each of them)
     share: float  # of the gap, mean over channels with a gap, lost on held-out trials when it alone is dropped
     share_ci95: tuple[float, float]
-    channels: dict[Channel, float]  # the same of each channel that it changes, columns together
+    channels: dict[ExperimentChannel, float]  # the same of each channel that it changes, columns together
     values: tuple[Value, ...]
 
     @property
@@ -84,7 +84,7 @@ class Unexplained:
     share: float  # mean over channels with a gap
     share_ci95: tuple[float, float]
     depends_on: tuple[str, ...]  # variables of the smooth law that carry most of it: `tension`, `q`, …
-    where: Channel | None  # the column with most of it
+    where: ExperimentChannel | None  # the column with most of it
     proposal: Proposal | None  # a closed form, unproven
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.costs import Costs, Key
-from jaxfinger.gap.exact import ROUNDING, Bench, State, Whitened, fitted, prior_products
+from jaxfinger.gap.exact import ROUNDING, Bench, SearchState, Whitened, fitted, prior_products
 from jaxfinger.gap.formula import Evidence, Judged, Linear, Weights, unexplained
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.screening import Part
@@ -53,7 +53,7 @@ class Offered:
 
 
 @dataclass(frozen=True)
-class Table:
+class SignatureTable:
     """All signatures at the nominal model, each in units of its prior, and what is made of them."""
 
     signatures: ByColumn
@@ -74,7 +74,7 @@ class Table:
         return list(self.touched)
 
 
-def table_of(problem: Problem, bench: Bench, parts: Iterable[Part], together: bool = True) -> Table:
+def table_of(problem: Problem, bench: Bench, parts: Iterable[Part], together: bool = True) -> SignatureTable:
     """Every candidate that the trials can see."""
     plain = Whitened(problem, bench.columns, Weights(*np.ones((2, len(bench.columns.items)))))
     rt = plain.residual(problem.r)
@@ -103,7 +103,7 @@ def table_of(problem: Problem, bench: Bench, parts: Iterable[Part], together: bo
             offers.append(Offered((v,), at[kept[at]], low, high))
             touched[v.key] = np.maximum(touched.get(v.key, 0.0), claims[at].max(axis=0))
     offers += _together(offers) if together else []
-    return Table(signatures.scaled(units), rows, units, absorbed, hidden, touched, offers)
+    return SignatureTable(signatures.scaled(units), rows, units, absorbed, hidden, touched, offers)
 
 
 class Visible(NamedTuple):
@@ -205,17 +205,17 @@ class Screened(NamedTuple):
 class Search:
     """Sets of causes of one file."""
 
-    def __init__(self, bench: Bench, table: Table, progress: Progress = lambda message: None):
+    def __init__(self, bench: Bench, table: SignatureTable, progress: Progress = lambda message: None):
         self.bench, self.table, self.progress = bench, table, progress
         self.visited = Visited()
         self.costs = Costs(bench.parameters, bench.unknown, table.touched)
         self.visited.add((), bench.null.judged.evidence)
 
-    def value(self, state: State) -> float:
+    def value(self, state: SearchState) -> float:
         """Score less costs."""
         return state.score - self.costs.of(state.keys)
 
-    def linear(self, state: State, r: np.ndarray, slopes: np.ndarray) -> Linear:
+    def linear(self, state: SearchState, r: np.ndarray, slopes: np.ndarray) -> Linear:
         """The table's rows on top of a state's base."""
         columns = self.bench.columns
         return Linear(
@@ -227,7 +227,7 @@ class Search:
             self.bench.null.judged,
         )
 
-    def without(self, state: State, cause: int | None) -> Rest:
+    def without(self, state: SearchState, cause: int | None) -> Rest:
         """What is left of a state without one cause; all of it for None."""
         kept = [i for i in range(len(state.effects)) if i != cause]
         at = [k for k, c in enumerate(state.coordinates) if c.effect in kept]
@@ -238,7 +238,7 @@ class Search:
         self.visited.add(keys, judged.evidence)
         return Rest(keys, r, slopes, judged.score)
 
-    def screened(self, state: State, without: int | None = None) -> Screened:
+    def screened(self, state: SearchState, without: int | None = None) -> Screened:
         """Every offer on top of the state, or of what is left of it without one cause."""
         keys, r, slopes, score = self.without(state, without)
         linear = self.linear(state, r, slopes)
@@ -281,12 +281,12 @@ class Search:
 
     def exactly(
         self,
-        state: State,
+        state: SearchState,
         without: int | None,
         offer: Offered | None = None,
         amplitudes: Sequence[float] | np.ndarray = (),
         weights: Weights | None = None,
-    ) -> State:
+    ) -> SearchState:
         """The state with an offer, or without a cause, or both, fitted exactly."""
         kept = [i for i in range(len(state.effects)) if i != without]
         variants = [_as_variant(state.effects[i], state.problem.scales) for i in kept]
@@ -304,12 +304,12 @@ class Search:
                 )
         return self._fitted(state.problem, variants, starts, weights or state.judged.weights)
 
-    def _fitted(self, problem, variants, starts, weights) -> State:
+    def _fitted(self, problem, variants, starts, weights) -> SearchState:
         found = fitted(self.bench, problem, variants, starts, weights)
         self.visited.add(found.keys, found.judged.evidence)
         return found
 
-    def in_its_best_form(self, state: State, first: int) -> State:
+    def in_its_best_form(self, state: SearchState, first: int) -> SearchState:
         """The state with those shapes of the causes from number `first` on that no refit moves as they suit it best,
         each tried from where the others have led.
         """
@@ -327,7 +327,7 @@ class Search:
                         best = max(best, other, key=lambda x: x.score)
         return best
 
-    def run(self) -> State:
+    def run(self) -> SearchState:
         """The best set that additions, drops and swaps lead to."""
         state = self.bench.null
         if not self.table.offers:
@@ -346,7 +346,7 @@ class Search:
                     self.in_its_best_form(found, len(state.effects) - 1)
         return state
 
-    def _tried(self, state: State, beside: State, most: int = EXACT) -> list[State]:
+    def _tried(self, state: SearchState, beside: SearchState, most: int = EXACT) -> list[SearchState]:
         """The state with each of the best offers that may be worth more than the one `beside`."""
         screened = self.screened(state)
         return [
@@ -355,19 +355,19 @@ class Search:
             if value >= self.value(beside) - CLOSE
         ]
 
-    def _best(self, state: State, tried: Iterable[State]) -> State | None:
+    def _best(self, state: SearchState, tried: Iterable[SearchState]) -> SearchState | None:
         """That which is worth most, in its best form, if it is worth more than the state."""
         best = max(tried, key=self.value, default=state)
         return self.in_its_best_form(best, len(state.effects)) if self.value(best) > self.value(state) else None
 
-    def _pairs(self, state: State, firsts: Sequence[State]) -> Iterator[State]:
+    def _pairs(self, state: SearchState, firsts: Sequence[SearchState]) -> Iterator[SearchState]:
         """Two causes more where neither alone is worth its cost, since each is hidden by what the other leaves open."""
         left = unexplained(self.bench.columns.counts, state.judged.evidence, self.bench.parameters)
         if left.sum() > self.bench.parameters.open:
             for first in firsts:
                 yield from self._tried(first, state, most=1)
 
-    def _pruned(self, state: State) -> State:
+    def _pruned(self, state: SearchState) -> SearchState:
         """Without those causes that explain too little beside the others."""
         while len(state.effects) > 1:
             now = self.value(state)
@@ -382,7 +382,7 @@ class Search:
             state = found
         return state
 
-    def _swapped(self, state: State) -> State | None:
+    def _swapped(self, state: SearchState) -> SearchState | None:
         now, best = self.value(state), None
         for i in range(len(state.effects)):
             screened = self.screened(state, i)
@@ -394,7 +394,7 @@ class Search:
                     best = found
         return best
 
-    def only(self, state: State, keys: Iterable[Key]) -> State:
+    def only(self, state: SearchState, keys: Iterable[Key]) -> SearchState:
         """The state with no other causes than these."""
         keys = set(keys)
         while others := [i for i, k in enumerate(state.keys) if k not in keys]:
@@ -403,7 +403,7 @@ class Search:
             state = self.exactly(state, others[0], None)
         return state
 
-    def rivals(self, state: State, members: Iterable[Key]) -> list[State]:
+    def rivals(self, state: SearchState, members: Iterable[Key]) -> list[SearchState]:
         """The state with each member of an ambiguous set in the place of the one that it holds."""
         members, out = list(members), [state]
         own = next(i for i, k in enumerate(state.keys) if k in members)

@@ -246,12 +246,12 @@ def _covariance(
     """Of the coordinates of `resample` at the optimum, and whether all of it is seen."""
     basis, sizes, prior, reads = coordinates
     q, last = basis.shape[1], reads[:, -1]
-    H = last[:, None, None] * prior
+    H = last[:, None, None] * prior[None]
     for k, s in enumerate(sources):
         gram = _gram(model, flat, s, limit)
         own = jnp.append(s.coordinates, q)
         of_stage = jnp.array([float(k in stage.reads) for stage in stages])
-        H = H.at[:, own[:, None], own].add(of_stage[:, None, None] * gram)
+        H = H.at[:, own[:, None], own].add(of_stage[:, None, None] * gram[None])
     _, covariance, sound = staged_step(H, sizes, jnp.zeros(sizes[0]))
     return covariance, sound
 

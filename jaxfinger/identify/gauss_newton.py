@@ -41,7 +41,7 @@ class Outcome(eqx.Enumeration):
     nowhere = "the model predicts nothing finite where the fit starts"
 
 
-class Compressed(NamedTuple):
+class Factor(NamedTuple):
     """‖r + J δ‖² = ‖d + R δ‖² + ρ² at a point."""
 
     R: Float[Array, "p p"]
@@ -58,7 +58,7 @@ class Iterate(eqx.Module):
     """Of a search: where it is tried next, what is known at the best point, and the step that leads on from there."""
 
     trial: PyTree
-    here: Compressed
+    here: Factor
     cost: Float[Array, ""]  # at the best point; infinite before the first
     step: Float[Array, " p"]  # whole, from the best point
     slope: Float[Array, ""]  # of the cost along it
@@ -100,7 +100,7 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
         self,
         y: Float[Array, " p"],
         state: Iterate,
-        here: Compressed,
+        here: Factor,
         low: Float[Array, " p"],
         high: Float[Array, " p"],
     ) -> tuple[Float[Array, " p"], Iterate]:
@@ -168,7 +168,7 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
 def begin(y: PyTree) -> Iterate:
     """Before anything is known."""
     flat = ravel_pytree(y)[0]
-    none = Compressed(jnp.zeros((flat.size, flat.size)), jnp.zeros_like(flat), jnp.array(0.0))
+    none = Factor(jnp.zeros((flat.size, flat.size)), jnp.zeros_like(flat), jnp.array(0.0))
     zero, count = jnp.array(0.0), jnp.array(0)
     return Iterate(y, none, jnp.array(jnp.inf), jnp.zeros_like(flat), zero, jnp.array(1.0), zero, count, Outcome.going)
 
@@ -178,21 +178,21 @@ def state_of_vector(state: Iterate, trial: Float[Array, " p"]) -> Iterate:
     return eqx.tree_at(lambda s: s.trial, state, trial, is_leaf=lambda s: s is state.trial)
 
 
-def _linearised(fn, at: Float[Array, " p"]) -> tuple[Compressed, Any]:
+def _linearised(fn, at: Float[Array, " p"]) -> tuple[Factor, Any]:
     def flat(v):
         r, aux = fn(v)
         return ravel_pytree(r)[0], aux
 
     r, push, aux = jax.linearize(flat, at, has_aux=True)
     J = jax.lax.map(push, jnp.eye(at.size), batch_size=TANGENTS) if at.size else jnp.zeros((0, r.size))
-    return compressed(jnp.concatenate([J, r[None]]).T), aux
+    return factor_of(jnp.concatenate([J, r[None]]).T), aux
 
 
-def compressed(rows: Float[Array, "N q"]) -> Compressed:
+def factor_of(rows: Float[Array, "N q"]) -> Factor:
     """Of [J r], q = p + 1 columns."""
     p = rows.shape[1] - 1
     T = jnp.linalg.qr(jnp.concatenate([rows, jnp.zeros((max(0, p + 1 - len(rows)), p + 1))]), mode="r")
-    return Compressed(T[:p, :p], T[:p, p], T[p, p] ** 2)
+    return Factor(T[:p, :p], T[:p, p], T[p, p] ** 2)
 
 
 def scaled_directions(A: Float[Array | np.ndarray, "k p"]) -> tuple:
@@ -202,14 +202,14 @@ def scaled_directions(A: Float[Array | np.ndarray, "k p"]) -> tuple:
     xp = A.__array_namespace__()
     norm = xp.linalg.norm(A, axis=0)
     scale = 1.0 / xp.where(norm > 0.0, norm, 1.0)
-    U, s, Vt = xp.linalg.svd(A * scale, full_matrices=False)
+    U, s, Vt = xp.linalg.svd(A * scale[None], full_matrices=False)
     seen = s > VISIBLE * xp.maximum(s[:1], 1e-300)
-    basis = scale[:, None] * Vt.T * xp.where(seen, 1.0 / xp.where(seen, s, 1.0), 0.0)
+    basis = scale[:, None] * Vt.T * xp.where(seen, 1.0 / xp.where(seen, s, 1.0), 0.0)[None]
     return basis, U, seen, Vt.T, scale
 
 
 def bounded_step(
-    here: Compressed, low: Float[Array, " p"], high: Float[Array, " p"], norm: Callable = optx.two_norm
+    here: Factor, low: Float[Array, " p"], high: Float[Array, " p"], norm: Callable = optx.two_norm
 ) -> tuple[Float[Array, " p"], Float[Array, ""]]:
     """argmin ‖R δ + d‖ over low ≤ δ ≤ high along what is seen, where δ = 0 is allowed; and the size of that step."""
     low, high = jnp.minimum(low, 0.0), jnp.maximum(high, 0.0)
@@ -219,7 +219,7 @@ def bounded_step(
 
     def towards(carry):
         x, held, _, count = carry
-        basis, U, *_ = scaled_directions(here.R * ~held)
+        basis, U, *_ = scaled_directions(jnp.where(held[None], 0.0, here.R))
         target = jnp.where(held, x, -basis @ (U.T @ (here.d + here.R @ jnp.where(held, x, 0.0))))
         way = target - x
         room = jnp.where(way > 0.0, high - x, low - x)

@@ -33,8 +33,8 @@ Filters = dict[str, Float[Array, "_columns lags lags"]]  # `Noise.coefficients` 
 class Tangent(NamedTuple):
     """One experiment's residuals at a model, and how they change with its parameters: in each channel's own unit."""
 
-    residuals: dict[str, Float[np.ndarray, "columns B T"]]  # measured − predicted
-    slopes: dict[str, Float[np.ndarray, "p columns B T"]]
+    residuals: dict[str, Float[np.ndarray, "_columns B T"]]  # measured − predicted
+    slopes: dict[str, Float[np.ndarray, "p _columns B T"]]
 
     def moved(self, by: Float[np.ndarray, " p"]) -> "Tangent":
         """On along the tangent: exact where the residuals are affine in what moves."""
@@ -44,7 +44,7 @@ class Tangent(NamedTuple):
 class Linearised(NamedTuple):
     """One experiment's residuals and compressed Jacobian at a model."""
 
-    residuals: dict[str, Float[np.ndarray, "columns B T"]]  # measured − predicted, by channel, in the channel's unit
+    residuals: dict[str, Float[np.ndarray, "_columns B T"]]  # measured − predicted, by channel, in the channel's unit
     white: Float[np.ndarray, "B rows"]  # the same, whitened and flat, before Huber
     jacobian: Float[np.ndarray, "B rows p"]  # J, likewise
     factor: Float[np.ndarray, "B k p+1"]  # triangular, of [J r] as Huber's cost sees them
@@ -105,7 +105,7 @@ def robust_share(r: Float[np.ndarray, "*N"], limit: float) -> Float[np.ndarray, 
     return limit / np.sqrt(limit * (2.0 * a - limit)) if limit else np.ones_like(a)
 
 
-def residuals_of(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[str, Float[np.ndarray, "columns B T"]]:
+def residuals_of(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[str, Float[np.ndarray, "_columns B T"]]:
     """Measured − predicted of every trial; also where a sample does not count."""
     return _cut([_residuals_jit(model, block, channels) for block in blocks(batch)], batch)
 

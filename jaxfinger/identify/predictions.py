@@ -84,7 +84,7 @@ def model_for(fit: Fit | Model, session: Session) -> Model:
 
 
 @quick_jit
-def _predict(model: Model, x: Motion, channels: tuple[str, ...]) -> dict[str, Float[Array, "columns 1 T"]]:
+def _predict(model: Model, x: Motion, channels: tuple[str, ...]) -> dict[str, Float[Array, "_columns 1 T"]]:
     return predict(model, x, channels)
 
 

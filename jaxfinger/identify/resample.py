@@ -175,7 +175,7 @@ def _refit_all(grams: Grams, sizes: tuple[int, ...], members: tuple[Array, Array
 
 
 def _refit(grams: Grams, sizes: tuple[int, ...], weights: Float[Array, " K"], given: Float[Array, " k"]):
-    H = jnp.tensordot(grams.reads * weights, grams.H, 1)
+    H = jnp.tensordot(grams.reads * weights[None], grams.H, 1)
     z, _, sound = staged_step(H, sizes, given)
     return z, sound & jnp.all(jnp.isfinite(z))
 

@@ -21,7 +21,7 @@ from jaxfinger.compilation import side_by_side
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch
 from jaxfinger.identify.gauss_newton import (
-    Compressed,
+    Factor,
     Iterate,
     Outcome,
     VisibleGaussNewton,
@@ -145,7 +145,7 @@ def solve(
         offset = prior.root @ (np.asarray(state.trial)[:p] - prior.mean)
         rows = np.concatenate([factor[:, [*free, size]], np.column_stack([prior.root, offset])])
         trial = state.trial
-        y, state = _advance(solver, y, state, _compressed(rows, room), *ends)
+        y, state = _advance(solver, y, state, _factor_of(rows, room), *ends)
         if np.array_equal(np.asarray(y), np.asarray(trial)):
             best = at, linearised, factor, rows
         if state.outcome == Outcome.nowhere:
@@ -196,7 +196,7 @@ def _wide(values: np.ndarray, room: int) -> Float[Array, " room"]:
     return jax.device_put(np.pad(values, (0, room - values.size)))
 
 
-def _compressed(rows: Float[np.ndarray, "N q"], room: int) -> Compressed:
+def _factor_of(rows: Float[np.ndarray, "N q"], room: int) -> Factor:
     """Of [J r], q = p + 1 columns, on the host, with room for more parameters, which show nowhere."""
     p = rows.shape[1] - 1
     T = np.zeros((p + 1, p + 1))
@@ -204,11 +204,11 @@ def _compressed(rows: Float[np.ndarray, "N q"], room: int) -> Compressed:
     T[: len(small)] = small
     R, d = np.zeros((room, room)), np.zeros(room)
     R[:p, :p], d[:p] = T[:p, :p], T[:p, p]
-    return Compressed(*jax.device_put((R, d, np.asarray(T[p, p] ** 2))))
+    return Factor(*jax.device_put((R, d, np.asarray(T[p, p] ** 2))))
 
 
 @eqx.filter_jit
-def _advance(solver: VisibleGaussNewton, y, state: Iterate, here: Compressed, low, high):
+def _advance(solver: VisibleGaussNewton, y, state: Iterate, here: Factor, low, high):
     return solver.advance(y, state, here, low, high)
 
 
@@ -229,7 +229,7 @@ def linearise_each(
     return dict(zip(sources, side_by_side(one, sources), strict=True))
 
 
-def missed_each(model: Model, sources: dict[str, Source]) -> dict[str, dict[str, Float[np.ndarray, "columns B T"]]]:
+def missed_each(model: Model, sources: dict[str, Source]) -> dict[str, dict[str, Float[np.ndarray, "_columns _B _T"]]]:
     """Measured − predicted of every experiment's channels; also where a sample does not count."""
 
     def one(s: Source):
@@ -272,9 +272,9 @@ def bounded_least_squares(
     p = A.shape[1]
     room = -(-max(p, 1) // PAD) * PAD
     ends = (_wide(np.broadcast_to(e, p), room) for e in (low, high))
-    return np.asarray(_bounded(_compressed(np.column_stack([A, b]), room), *ends))[:p]
+    return np.asarray(_bounded(_factor_of(np.column_stack([A, b]), room), *ends))[:p]
 
 
 @eqx.filter_jit
-def _bounded(here: Compressed, low: Float[Array, " p"], high: Float[Array, " p"]) -> Float[Array, " p"]:
+def _bounded(here: Factor, low: Float[Array, " p"], high: Float[Array, " p"]) -> Float[Array, " p"]:
     return bounded_step(here, low, high)[0]

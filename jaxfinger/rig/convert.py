@@ -21,7 +21,7 @@ from jaxfinger.rig.channels import SI, WATCHED, Filter, RigDescription
 
 
 @dataclass
-class Recording:
+class LoggedTrial:
     """One trial as it lies in the log."""
 
     start: dict[str, Any]
@@ -50,13 +50,13 @@ class Log:
     """A log, read: header, trials in their order, events."""
 
     header: dict[str, Any]
-    recordings: list[Recording]
+    trials: list[LoggedTrial]
     events: list[dict[str, Any]]
 
     @property
     def last_seq(self) -> int | None:
         """Number of the last sample in it."""
-        return next((int(r.blocks[-1].seq[-1]) for r in reversed(self.recordings) if r.blocks), None)
+        return next((int(r.blocks[-1].seq[-1]) for r in reversed(self.trials) if r.blocks), None)
 
 
 def header(rig: RigDescription, plan: str, filters: dict[str, Filter], fingerprint: dict[str, str]) -> dict[str, Any]:
@@ -78,24 +78,24 @@ def header(rig: RigDescription, plan: str, filters: dict[str, Filter], fingerpri
 def read_frames(frames: Iterable[wal.Frame], name: str = "log") -> Log:
     """Group the frames of a log; a trial whose end is missing was cut short."""
     head: dict[str, Any] | None = None
-    recordings: list[Recording] = []
+    trials: list[LoggedTrial] = []
     events: list[dict[str, Any]] = []
     for frame in frames:
         if frame.tag == wal.HEADER:
             head = frame.json
         elif frame.tag == wal.TRIAL:
-            recordings.append(Recording(frame.json))
+            trials.append(LoggedTrial(frame.json))
         elif frame.tag == wal.EVENT:
             events.append(frame.json)
-        elif recordings and frame.tag == wal.DATA:
-            recordings[-1].blocks.append(frame.block)
-        elif recordings and frame.tag == wal.MARK:
-            recordings[-1].marks.append(frame.json)
-        elif recordings and frame.tag == wal.END:
-            recordings[-1].end = frame.json
+        elif trials and frame.tag == wal.DATA:
+            trials[-1].blocks.append(frame.block)
+        elif trials and frame.tag == wal.MARK:
+            trials[-1].marks.append(frame.json)
+        elif trials and frame.tag == wal.END:
+            trials[-1].end = frame.json
     if head is None:
         raise UserError(f"{name}: the log ends within its first frame, before any sample was recorded.")
-    return Log(head, recordings, events)
+    return Log(head, trials, events)
 
 
 def _finger(values: dict[str, Any]) -> FingerDescription:
@@ -120,14 +120,14 @@ class Samples:
     clock_jumps: int
 
 
-def _samples(recording: Recording, width: int, rate_hz: float) -> Samples:
-    blocks = recording.blocks
+def _samples(logged: LoggedTrial, width: int, rate_hz: float) -> Samples:
+    blocks = logged.blocks
     empty = np.empty(0, np.int64)
     seq = np.concatenate([empty, *(b.seq.astype(np.int64) for b in blocks)])
     t = np.concatenate([empty, *(b.t_ns.astype(np.int64) for b in blocks)])
     x = np.concatenate([np.empty((0, width)), *(b.x for b in blocks)])
     fresh = seq > np.maximum.accumulate(np.concatenate([[-1], seq[:-1]])) if len(seq) else np.empty(0, bool)
-    keep = fresh & (seq >= int(recording.start["seq"]))
+    keep = fresh & (seq >= int(logged.start["seq"]))
     seq, t, x = seq[keep], t[keep], x[keep]
     if not len(seq):
         return Samples(seq, seq * 1.0, x, keep[:0], [], 0)
@@ -138,13 +138,13 @@ def _samples(recording: Recording, width: int, rate_hz: float) -> Samples:
         steps = np.where(wrong, nominal, steps)
     time = np.concatenate([[0], np.cumsum(steps)]) * 1e-9
     gaps = [(int(seq[i + 1]), int(jump[i] - 1)) for i in np.flatnonzero(jump > 1)]
-    end = recording.end or {}
+    end = logged.end or {}
     last = int(end.get("seq", seq[-1] + 1))
     return Samples(seq, time, x, (seq < last) & np.isfinite(x).all(1), gaps, int(wrong.sum()))
 
 
-def _trial(recording: Recording, samples: Samples, head: dict[str, Any], finger: FingerDescription) -> Trial:
-    start, keep = recording.start, samples.kept
+def _trial(logged: LoggedTrial, samples: Samples, head: dict[str, Any], finger: FingerDescription) -> Trial:
+    start, keep = logged.start, samples.kept
     seq, x, count = samples.seq[keep], samples.x[keep], int(keep.sum())
     where = {(c["kind"], c["of"]): i for i, c in enumerate(head["channels"])}
     tare = np.array([start["tare"].get(c["name"], 0.0) for c in head["channels"]])
@@ -167,7 +167,7 @@ def _trial(recording: Recording, samples: Samples, head: dict[str, Any], finger:
         torque = np.full((count, finger.m), np.nan)
         torque[:, finger.joint_names.index(start["motor"])] = x[:, sensor]
     time = samples.time[keep]
-    hold, joint_direction, tendon_direction = _marks(recording.marks, seq, finger)
+    hold, joint_direction, tendon_direction = _marks(logged.marks, seq, finger)
     return Trial(
         name=start["name"],
         experiment=start["experiment"],
@@ -182,7 +182,7 @@ def _trial(recording: Recording, samples: Samples, head: dict[str, Any], finger:
         hold=hold,
         joint=start["joint"],
         tendon=start["tendon"],
-        complete=recording.complete,
+        complete=logged.complete,
         motion=start["motion"],
         session_start=start["session_start"],
     )
@@ -210,39 +210,39 @@ def publish(log: Log, output: str | Path, overwrite: bool = False) -> Session:
     """Write the session of a log: whole or not at all, in a file version that old tools open."""
     finger = _finger(log.header["finger"])
     trials, extras = {}, {}
-    for recording in log.recordings:
-        samples = _samples(recording, len(log.header["channels"]), float(log.header["rate_hz"]))
+    for logged in log.trials:
+        samples = _samples(logged, len(log.header["channels"]), float(log.header["rate_hz"]))
         if samples.kept.sum() >= 2:
-            trials[recording.name] = _trial(recording, samples, log.header, finger)
-            extras[recording.name] = (recording, samples)
+            trials[logged.name] = _trial(logged, samples, log.header, finger)
+            extras[logged.name] = (logged, samples)
     session = Session(
         specimen=log.header["specimen"], finger=finger, trials=trials, source=log.header["source"],
         created=log.header["created"],
     )  # fmt: skip
     with new_file(output, overwrite) as file:
         write_into(file, session)
-        for name, (recording, samples) in extras.items():
-            _annotate(file.require_group(f"trials/{name}").attrs, recording, samples)
+        for name, (logged, samples) in extras.items():
+            _annotate(file.require_group(f"trials/{name}").attrs, logged, samples)
         _beside(file.create_group("rig"), log, extras)
     return session
 
 
-def _annotate(attributes: h5py.AttributeManager, recording: Recording, samples: Samples) -> None:
-    attributes["parameters"] = json.dumps(recording.start["parameters"])
+def _annotate(attributes: h5py.AttributeManager, logged: LoggedTrial, samples: Samples) -> None:
+    attributes["parameters"] = json.dumps(logged.start["parameters"])
     attributes["lost_samples"] = sum(lost for _, lost in samples.gaps)
     if samples.clock_jumps:
         attributes["clock_jumps"] = samples.clock_jumps
-    last = int((recording.end or {}).get("seq", 2**62))
+    last = int((logged.end or {}).get("seq", 2**62))
     if broken := int((~samples.kept & (samples.seq < last)).sum()):
         attributes["dropped_samples"] = broken  # not a number in some channel; they lie in /rig/dropped
-    if clocks := (recording.end or {}).get("clocks"):
+    if clocks := (logged.end or {}).get("clocks"):
         attributes["host_minus_device_s"], attributes["device_time_s"] = np.array(clocks) * 1e-9
-    if not recording.complete:
-        attributes["cause"] = recording.cause
-        attributes["trip"] = int((recording.end or {}).get("trip", 0))
+    if not logged.complete:
+        attributes["cause"] = logged.cause
+        attributes["trip"] = int((logged.end or {}).get("trip", 0))
 
 
-def _beside(group: h5py.Group, log: Log, extras: dict[str, tuple[Recording, Samples]]) -> None:
+def _beside(group: h5py.Group, log: Log, extras: dict[str, tuple[LoggedTrial, Samples]]) -> None:
     """`/rig`: what readers of the format ignore and people want to know."""
     text = h5py.string_dtype("utf-8")
     group.attrs["rig_file"], group.attrs["plan_file"] = log.header["rig"], log.header["plan"]

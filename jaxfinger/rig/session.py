@@ -94,8 +94,8 @@ def run(
     cause = cause or recorder.failure or ""
     log = read_log(path)
     for tag, value in recorder.unwritten:
-        if tag == wal.END and log.recordings and log.recordings[-1].end is None:
-            log.recordings[-1].end = value
+        if tag == wal.END and log.trials and log.trials[-1].end is None:
+            log.trials[-1].end = value
     try:
         convert.publish(log, output, overwrite=resume)
     except UserError as error:
@@ -105,7 +105,7 @@ def run(
         ) from error
     if not cause:
         path.unlink()
-    done = tuple(r.name for r in log.recordings if r.complete)
+    done = tuple(r.name for r in log.trials if r.complete)
     return Outcome(output, done, cause, path if cause else None)
 
 
@@ -135,7 +135,7 @@ def _earlier(plan: Plan, path: Path, output: Path, resume: bool) -> convert.Log 
 
 def _backlog(log: convert.Log, rig: Rig, recorder: Recorder) -> None:
     """Close the trial in which the recorder died, with what the controller's ring still holds of it."""
-    if not log.recordings or log.recordings[-1].end is not None:
+    if not log.trials or log.trials[-1].end is not None:
         return
     end = {"complete": False, "cause": "the recorder was killed", "trip": int(Trip.HOST)}
     last = log.last_seq
@@ -173,7 +173,7 @@ def _trials(
     log: convert.Log | None,
 ) -> str:
     """Record the trials that the log does not hold; returns why the run ended early, or an empty string."""
-    earlier = log.recordings if log else []
+    earlier = log.trials if log else []
     done = {r.start["planned"] for r in earlier if r.complete}
     names = {r.name for r in earlier}
     ends = [r.start["session_start"] + sum(map(len, r.blocks)) / rig.description.rate_hz for r in earlier]

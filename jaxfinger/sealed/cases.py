@@ -18,8 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from jaxfinger.data import Session as Recording
-from jaxfinger.data import Trial, write_session
+from jaxfinger.data import Session, Trial, write_session
 from jaxfinger.data.schema import CHANNELS
 
 from .closure import friction_known
@@ -30,7 +29,7 @@ from .laws import Finger
 from .protocols import Plan, draw_style, session_plans
 from .record import Motion, commanded, driven, read, record
 from .sensors import STD, UNITS, Sensors, draw_sensors, measure
-from .severity import Look, Session, by_channel, calibrate
+from .severity import Look, QuietSession, by_channel, calibrate
 from .specimens import LAYOUTS, Specimen, make_specimen
 
 SCHEMA = "jaxfinger-sealed/2"
@@ -132,7 +131,7 @@ def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: P
     }
     for file, plans in (("fit.h5", case.plans), ("fresh.h5", case.later)):
         trials = record_trials(finger, plans, motions, sensors, zero, rng)
-        session = Recording(
+        session = Session(
             specimen=f"sealed-{split}-{number:03d}",
             finger=specimen.cad,
             trials={t.name: t for t in trials},
@@ -177,7 +176,7 @@ def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: P
 class _Case:
     """Everything that a case's seed decides before anything is measured; `rng` goes on to draw the noise."""
 
-    quiet: Session
+    quiet: QuietSession
     plans: list[Plan]
     later: list[Plan]
     departures: list[Departure]
@@ -192,18 +191,18 @@ def _draw(seed: Sequence[int], split: str, spec: CaseSpec) -> _Case:
     nominal, sensors, style = Finger(specimen), draw_sensors(rng), draw_style(rng, foreign)
     plans = with_trajectories(nominal, session_plans(specimen, style, rng), rng)
     later = with_trajectories(nominal, session_plans(specimen, style, rng, fresh=True), rng)
-    quiet = Session(specimen, plans, sensors)
+    quiet = QuietSession(specimen, plans, sensors)
     return _Case(quiet, plans, later, *_withheld(spec, specimen, quiet, style.speeds, foreign, rng), rng)
 
 
-def rebuild(truth: dict) -> tuple[Session, list[Departure]]:
+def rebuild(truth: dict) -> tuple[QuietSession, list[Departure]]:
     """The noise-free session and the departures of a case, from its truth file alone; no slack tendon counts."""
     effects = truth["effects"]
     spec = CaseSpec(
         truth["kind"], truth["specimen"], tuple(e["effect"] for e in effects), tuple(e["severity"] for e in effects)
     )
     case = _draw(truth["seed"], truth["split"], spec)
-    quiet = Session(case.quiet.specimen, case.plans, case.quiet.sensors, slack_counts=False)
+    quiet = QuietSession(case.quiet.specimen, case.plans, case.quiet.sensors, slack_counts=False)
     return quiet, case.departures
 
 
@@ -223,7 +222,7 @@ def with_trajectories(nominal: Finger, plans: Sequence[Plan], rng: np.random.Gen
 def _withheld(
     spec: CaseSpec,
     specimen: Specimen,
-    quiet: Session,
+    quiet: QuietSession,
     speeds: Sequence[float],
     foreign: bool,
     rng: np.random.Generator,
@@ -266,12 +265,12 @@ def record_trials(
         yield measure(read(finger, record(finger, plan, motion)), finger.specimen, sensors, zero, rng)
 
 
-def _fresh_gap(departures: Sequence[Departure], quiet: Session, plans: Sequence[Plan]):
+def _fresh_gap(departures: Sequence[Departure], quiet: QuietSession, plans: Sequence[Plan]):
     """rms on the fresh trials by experiment and channel, of the nominal model refitted (before) and with the
     true effects (after), over the samples that predictions are judged by.
     """
     sensors = quiet.sensors
-    later = Session(quiet.specimen, plans, sensors)
+    later = QuietSession(quiet.specimen, plans, sensors)
     rows, labels = later.trace(departures)
     if departures:
         rows = rows - later.absorbed[0] @ quiet.absorb(quiet.trace(departures)[0])
@@ -295,10 +294,11 @@ def _fresh_gap(departures: Sequence[Departure], quiet: Session, plans: Sequence[
     return out
 
 
-def _judged(session: Session, look: Look) -> Bool[np.ndarray, " R"]:
+def _judged(session: QuietSession, look: Look) -> Bool[np.ndarray, " R"]:
     """Which of a trial's rows lie where a prediction of the like recording is judged."""
     plan, motion, cad = look.plan, look.motion, session.specimen.finger
-    held = sum(((motion.time >= begin) & (motion.time < end) for begin, end, _ in plan.holds), np.zeros(1, bool))
+    none = np.zeros(len(motion.time), bool)
+    held = sum(((motion.time >= begin) & (motion.time < end) for begin, end, _ in plan.holds), none)
     excursion = session.nominal.geometry(motion.q)[0]
     trial = Trial(
         plan.name, plan.experiment, motion.time, motion.q, motion.tension,

@@ -20,7 +20,7 @@ import numpy as np
 from .cases import rebuild
 from .departures import LISTED, draw_at, sites
 from .departures.draw import Index, Names
-from .severity import COARSE, Session
+from .severity import COARSE, QuietSession
 from .truth import TELLING
 
 DRAWS = 2  # shapes tried for each rival and site
@@ -37,7 +37,7 @@ class Rival:
 
 
 def distances(
-    session: Session, left: np.ndarray, truth: tuple[str, tuple[str, ...]], seed: int, draws: int = DRAWS
+    session: QuietSession, left: np.ndarray, truth: tuple[str, tuple[str, ...]], seed: int, draws: int = DRAWS
 ) -> list[Rival]:
     """Every listed cause other than the truth with its distance, nearest first. `left`: the truth's trace after
     a refit.

@@ -43,7 +43,7 @@ class Look:
     rigid: Float[np.ndarray, "N m"] | None
 
 
-class Session:
+class QuietSession:
     """The noise-free session of one specimen, with the directions that a nominal fit can absorb. The length of a
     tendon that is slack for a while may count, as it does in a case's severity, or not.
     """
@@ -266,7 +266,7 @@ def by_channel(
     return {label: float(np.sqrt(np.mean(np.square(values)))) for label, values in groups.items()}
 
 
-def severity(session: Session, departures: Sequence[Departure]) -> tuple[float, tuple[str, str, int]]:
+def severity(session: QuietSession, departures: Sequence[Departure]) -> tuple[float, tuple[str, str, int]]:
     """Largest rms by channel of what is left, in units of a hold's noise, and where."""
     trace, labels = session.trace(departures)
     sizes = by_channel(session.left(trace), labels)
@@ -275,7 +275,7 @@ def severity(session: Session, departures: Sequence[Departure]) -> tuple[float, 
 
 
 def calibrate(
-    session: Session, departure: Departure, target: float, attempts: int = 8
+    session: QuietSession, departure: Departure, target: float, attempts: int = 8
 ) -> tuple[Departure, float, tuple[str, str, int]]:
     """Resize a departure until its severity is `target`, within a tenth or as far as physical sizes go."""
     low = high = None  # (log size, log severity) below and above the target

@@ -15,10 +15,10 @@ from jaxfinger.gap.result import (
     Candidate,
     Cause,
     Change,
-    Channel,
     ChannelBudget,
     Closure,
     Diagnosis,
+    ExperimentChannel,
     Key,
     Left,
     NextExperiment,
@@ -39,7 +39,7 @@ from jaxfinger.report.traces import Trace
 from jaxfinger.synthetic import paper_finger, polynomial_finger, true_model
 
 STRETCH, STRIBECK = Key("tendon_stretch", ("T3",)), Key("joint_stribeck", ("PIP",))
-TORQUE, EXCURSION = Channel("ID.4", "joint_torque"), Channel("ID.4", "tendon_excursion")
+TORQUE, EXCURSION = ExperimentChannel("ID.4", "joint_torque"), ExperimentChannel("ID.4", "tendon_excursion")
 
 
 @cache
@@ -129,7 +129,7 @@ OPEN = Unexplained(
     0.3,
     (0.2, 0.4),
     ("tension", "q"),
-    Channel("ID.4", "joint_torque", "PIP"),
+    ExperimentChannel("ID.4", "joint_torque", "PIP"),
     Proposal("joint_torque", "PIP", ((1.2e-3, "sin(6 (q_PIP + q_DIP))"),), "N m", 0.8),
 )
 

@@ -8,7 +8,7 @@ import pytest
 from jaxfinger.sealed.departures import LISTED, UNLISTED, draw, presliding
 from jaxfinger.sealed.laws import Finger, Situation
 from jaxfinger.sealed.record import commanded, last_direction, record
-from jaxfinger.sealed.severity import Session, calibrate
+from jaxfinger.sealed.severity import calibrate
 
 
 def held(nominal, f):
@@ -41,14 +41,14 @@ def test_loss_never_exceeds_the_tension(nominal):
 def test_coupling_matrix_is_the_derivative_of_excursion(specimen, nominal):
     coupling = draw("moment_arm_coupling", specimen.finger, np.random.default_rng(0))
     finger = Finger(specimen, [coupling], nominal.plant)
-    q, h = np.array([0.4, 0.7, 0.3]), 1e-6
+    q, h, now = np.array([0.4, 0.7, 0.3]), 1e-6, np.array(0.0)
 
     def length(x):
         z = np.zeros(3)
-        return finger.path(Situation(0.0, 0.0, x, z, z, np.full(finger.n, 2.0), z))[0]  # type: ignore[arg-type]
+        return finger.path(Situation(now, now, x, z, z, np.full(finger.n, 2.0), z))[0]
 
     z = np.zeros(3)
-    _, arm = finger.path(Situation(0.0, 0.0, q, z, z, np.full(finger.n, 2.0), z))  # type: ignore[arg-type]
+    _, arm = finger.path(Situation(now, now, q, z, z, np.full(finger.n, 2.0), z))
     numeric = np.stack([(length(q + h * e) - length(q - h * e)) / (2 * h) for e in np.eye(3)], axis=1)
     np.testing.assert_allclose(arm, numeric, atol=1e-10)
 
@@ -80,12 +80,12 @@ def test_dahl_does_not_depend_on_the_step():
 
 
 def test_noise_free_session_without_departures_leaves_no_trace(specimen, plans, sensors):
-    assert np.all(Session(specimen, plans, sensors).trace([])[0] == 0.0)
+    assert np.all(QuietSession(specimen, plans, sensors).trace([])[0] == 0.0)
 
 
 @pytest.mark.parametrize("effect", [*LISTED, *UNLISTED])
 def test_every_departure_vanishes_with_its_size_and_shows_at_its_start(effect, specimen, plans, sensors):
-    session = Session(specimen, plans, sensors)
+    session = QuietSession(specimen, plans, sensors)
     site = np.random.default_rng(1)
     # A presliding length has no zero limit in coarse samples: its smallest physical size stands for zero.
     for _ in range(8):
@@ -114,7 +114,7 @@ def test_drive_inertia_is_seen_by_the_motor_only(specimen, plans, nominal):
 
 def test_a_refit_absorbs_what_the_nominal_model_can_say(specimen, plans, sensors):
     """A change of elastic stiffness is no effect: nothing is left of it. A stretch is, in the channel where it acts."""
-    session = Session(specimen, plans, sensors)
+    session = QuietSession(specimen, plans, sensors)
     stiffer = replace(specimen, elastic=specimen.elastic * 1.05)
     rows = [
         after - before

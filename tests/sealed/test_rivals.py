@@ -8,12 +8,12 @@ import pytest
 from jaxfinger.sealed import rivals
 from jaxfinger.sealed.departures import draw_at
 from jaxfinger.sealed.rivals import add_rivals, distances
-from jaxfinger.sealed.severity import COARSE, Session, calibrate
+from jaxfinger.sealed.severity import COARSE, QuietSession, calibrate
 
 
 @pytest.fixture
 def session(specimen, plans, sensors):
-    return Session(specimen, plans, sensors, slack_counts=False)
+    return QuietSession(specimen, plans, sensors, slack_counts=False)
 
 
 def test_the_same_cause_is_no_distance_away_and_a_foreign_one_all_of_it(session, specimen, monkeypatch):

@@ -46,4 +46,4 @@ def towards_first_motion(x: np.ndarray) -> np.ndarray:
 
 def friction(z: np.ndarray) -> np.ndarray:
     """Share of the sliding friction that has built up, (...,)."""
-    return z.mean(axis=-1)
+    return np.asarray(z.mean(axis=-1))

@@ -29,7 +29,7 @@ AT_REST = 6.0  # times the median loss: an angle that turns back by less has not
 
 
 @dataclass(frozen=True)
-class Recording:
+class PreparedTrial:
     """A trial, its spikes bridged, and how it is to be reduced."""
 
     spec: Experiment
@@ -92,7 +92,7 @@ class Row:
     dt: float  # s
 
 
-def recording(
+def prepared(
     spec: Experiment,
     trial: Trial,
     session: Session,
@@ -100,14 +100,14 @@ def recording(
     reduced: bool = True,
     minus: Predictions | None = None,
     coarse: int = 1,
-) -> Recording:
+) -> PreparedTrial:
     """A trial made ready: the channels that drive the model without spikes; those that it predicts keep theirs, which
     do not count.
     """
     step = float(np.median(np.diff(trial.time)))
     size = max(1, round(coarse / (spec.rate * step))) if reduced else 1
     y, sound = _measured(spec, trial, session.finger, minus, longest_spike(step))
-    return Recording(spec, _despiked(trial), session.finger, sizes, reduced, step, size, y, sound)
+    return PreparedTrial(spec, _despiked(trial), session.finger, sizes, reduced, step, size, y, sound)
 
 
 def _despiked(trial: Trial) -> Trial:
@@ -158,7 +158,7 @@ class Joints:
     cutoff: float  # Hz
 
 
-def joints(r: Recording, sharp: bool) -> Joints:
+def joints(r: PreparedTrial, sharp: bool) -> Joints:
     """Filtered angles; `sharp` where the measured channel beside them is not low-passed, so that q̇ and q̈ must not lose
     what is in it.
     """
@@ -168,7 +168,7 @@ def joints(r: Recording, sharp: bool) -> Joints:
 
 
 def row(
-    r: Recording,
+    r: PreparedTrial,
     q: Float[np.ndarray, "M m"],
     rates: tuple[Float[np.ndarray, "N m"], Float[np.ndarray, "N m"]],
     tension: Float[np.ndarray, "M n"],
@@ -213,7 +213,7 @@ def row(
     return Row(motion, values, mask, np.full(M, -1) if hold is None else hold, r.size * r.step)
 
 
-def _temperatures(r: Recording) -> Float[np.ndarray, "M m"]:
+def _temperatures(r: PreparedTrial) -> Float[np.ndarray, "M m"]:
     """K, of each joint: of the channels named after it, else of all; `WARM` where none was measured."""
     M, trial = len(r.trial.time) // r.size, r.trial
     if trial.temperature is None:
