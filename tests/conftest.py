@@ -1,23 +1,31 @@
-"""How the tests run: what is compiled or takes long is made once."""
+"""How the tests run: strictly, and what is compiled or takes long is made once.
 
+JAX reads its environment when it is imported, which other conftests do: all of it is set before. Processes of a test
+run, and those that tests start, have that of the first.
+"""
+
+import atexit
 import os
 import shutil
 import tempfile
-from functools import partial
 
+from jaxtyping import install_import_hook
+
+# Equations say which ranks and types meet: nothing is promoted in silence.
+os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
+os.environ["JAX_NUMPY_DTYPE_PROMOTION"] = "strict"
 # Most programs of the tests run once or twice: compiled cheaply they take less than half of what XLA takes by itself.
-CHEAP = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line has it: two threads wait more than work
+# Test processes share what they compile: each keeps it on disk for the others, in a folder of this run alone.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="jaxfinger-tests-")
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
-
-def pytest_configure(config):
-    """In the first process, before anything imports JAX; the others start with its environment.
-
-    Test processes share what they compile: each keeps it on disk for the others, in a folder of this run alone.
-    """
-    os.environ.setdefault("XLA_FLAGS", CHEAP)
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line has it: two threads wait more than work
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        folder = tempfile.mkdtemp(prefix="jaxfinger-tests-")
-        config.add_cleanup(partial(shutil.rmtree, folder, ignore_errors=True))
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
-        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+# Each annotation is checked when it is called; where `float` stands, an `int` may too (PEP 484). Not in the rig's room,
+# whose tests race a clock: checks took a third of the time of a simulated bench there.
+ROOMS = ("cli", "data", "effects", "experiments", "gap", "identify", "model", "report", "sealed", "synthetic")
+install_import_hook(
+    [f"jaxfinger.{room}" for room in ROOMS], "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
+)

@@ -152,8 +152,8 @@ class Products:
 
     def bilinear(self, x: Float[np.ndarray, "k n"], y: csc_array) -> Float[np.ndarray, "C n"]:
         """x_mᵀ X_cᵀ Z_c y_m of every m, for y (l, n) that is zero for the most part."""
-        y = y.tocsr()
-        return np.stack([np.sum(x[i] * (y[j].T @ values.T).T, axis=0) for i, j, values in self.blocks])
+        rows = y.tocsr()
+        return np.stack([np.sum(x[i] * (rows[j].T @ values.T).T, axis=0) for i, j, values in self.blocks])
 
     def of(self, at: Int[np.ndarray, " m"]) -> Float[np.ndarray, "C k m"]:
         """With some of the rows Z."""

@@ -281,7 +281,7 @@ class Diagnosis:
     left: tuple[Left, ...]  # largest first
     nominal: Fit
     augmented: Fit  # the nominal one where nothing is named
-    problem: Problem  # the recordings and residuals, for figures
+    problem: Problem | None  # the recordings and residuals, for figures; None where they are let go
 
     def __repr__(self) -> str:
         named = ", ".join(f"{k.effect} at {'-'.join(k.site)}" for k in self.named) or "nothing named"

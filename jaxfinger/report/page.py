@@ -175,7 +175,7 @@ def _parameters(d: Diagnosis) -> list[Markup]:
 def _curves(d: Diagnosis) -> Curves:
     """Of the model with its causes, with the slopes of the measured excursions."""
     found = curves(d.augmented)
-    if "ID.2" not in d.problem.stacks:
+    if d.problem is None or "ID.2" not in d.problem.stacks:
         return found
     return replace(found, arm_points=arm_points(d.problem.session, d.problem.stacks["ID.2"]))
 

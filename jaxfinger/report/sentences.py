@@ -167,7 +167,7 @@ def _subject(d: Diagnosis) -> str:
 
 def is_simulator(d: Diagnosis) -> bool:
     """Whether another simulator is diagnosed, and not the model that is identified."""
-    return d.problem.simulator is not None
+    return d.problem is not None and d.problem.simulator is not None
 
 
 def _no_gap(d: Diagnosis) -> list[str]:

@@ -33,8 +33,9 @@ class Trace:
 
 
 def worst_trial(d: Diagnosis) -> Trace:
-    """The column and trial with the most energy above noise."""
+    """The column and trial with the most energy above noise, of a diagnosis that still has its recordings."""
     problem = d.problem
+    assert problem is not None
     e, channel, column, b = _worst(problem)
     stack = problem.stacks[e]
     mask = np.asarray(stack.batch.mask[channel])[column, b] > 0

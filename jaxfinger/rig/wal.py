@@ -17,7 +17,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -81,7 +81,7 @@ def pack_frame(tag: bytes, payload: bytes) -> bytes:
 class LogWriter:
     """Appends frames; each is handed to the system at once, so the death of this process loses none of them."""
 
-    def __init__(self, file: BinaryIO, end: int = 0):
+    def __init__(self, file: io.RawIOBase | io.BufferedIOBase, end: int = 0):
         self._file, self._end = file, end
 
     @classmethod
@@ -134,7 +134,7 @@ class LogWriter:
         self._file.close()
 
 
-def frames(file: BinaryIO, name: str = "log") -> Iterator[Frame]:
+def frames(file: io.BufferedIOBase, name: str = "log") -> Iterator[Frame]:
     """The sound frames from the start on; stops, without complaint, at a torn or damaged one."""
     if file.read(len(MAGIC)) != MAGIC:
         raise UserError(f"{name}: not a recording log of jaxfinger; give the file that ends in .wal.")

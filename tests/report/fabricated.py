@@ -8,7 +8,6 @@ import numpy as np
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap.diagnose import agreeing
 from jaxfinger.gap.posterior import Posterior
-from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.propose import Proposal
 from jaxfinger.gap.result import (
     Absorbed,
@@ -138,13 +137,6 @@ def _candidate(key: Key, probability: float) -> Candidate:
     return Candidate(key, probability, 40.0, 0.9, (Value(key.site, "compliance", 9.1e-5, 3e-6, "m/N"),))
 
 
-def unread() -> Problem:
-    """Recordings of which a report reads only that no other simulator is judged by them."""
-    problem = object.__new__(Problem)
-    object.__setattr__(problem, "simulator", None)
-    return problem
-
-
 @cache
 def explained() -> Diagnosis:
     """One cause, and every channel comes down to its noise."""
@@ -177,7 +169,7 @@ def explained() -> Diagnosis:
         (Left("ID.4", "joint_torque", "PIP", 20.0, {"q": 15.0}),),
         nominal,
         augmented,
-        unread(),
+        None,
     )
 
 

@@ -8,7 +8,7 @@ import pytest
 from jaxfinger.sealed.departures import LISTED, UNLISTED, draw, presliding
 from jaxfinger.sealed.laws import Finger, Situation
 from jaxfinger.sealed.record import commanded, last_direction, record
-from jaxfinger.sealed.severity import calibrate
+from jaxfinger.sealed.severity import QuietSession, calibrate
 
 
 def held(nominal, f):

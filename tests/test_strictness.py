@@ -1,0 +1,23 @@
+"""The tests are stricter than users: what an annotation says is checked, and nothing is promoted in silence."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import TypeCheckError
+
+from jaxfinger.data.filtering import low_pass
+
+
+def test_shapes_are_checked():
+    with pytest.raises(TypeCheckError, match="x"):
+        low_pass(np.arange(100.0), np.zeros((99, 2)), 0.1)
+
+
+@pytest.mark.parametrize(
+    ("other", "what"), [(jnp.zeros((2, 3)), "rank_promotion"), (jnp.zeros(3, int), "dtype promotion")]
+)
+def test_nothing_is_promoted(other, what):
+    with ThreadPoolExecutor(1) as pool, pytest.raises((ValueError, TypeError), match=what):
+        pool.submit(jnp.add, jnp.zeros(3), other).result()
