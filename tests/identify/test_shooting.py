@@ -24,7 +24,7 @@ def recorded(seed: int, noise: float):
     """A session with motion under tension whose load cells have that noise, N."""
     trials = RECIPE["trials"] | {
         "experiments": ["ID.2", "ID.3-static", "ID.3-dynamic", "ID.4", "VD.3"],
-        "vd3": {"motions": 2, "duration": 3.0, "rate": 500.0},
+        "vd3": {"motions": 2, "duration": 2.0, "rate": 500.0},
     }
     sensors = RECIPE["sensors"] | {"tendon_force": {"std": noise, "resolution": noise}}
     return simulated(recipe_from(RECIPE | {"trials": trials, "sensors": sensors}), seed=seed)
