@@ -37,10 +37,15 @@ class Rival:
 
 
 def distances(
-    session: QuietSession, left: np.ndarray, truth: tuple[str, tuple[str, ...]], seed: int, draws: int = DRAWS
+    session: QuietSession,
+    left: np.ndarray,
+    truth: tuple[str, tuple[str, ...]],
+    seed: int,
+    draws: int = DRAWS,
+    more: int = MORE,
 ) -> list[Rival]:
     """Every listed cause other than the truth with its distance, nearest first. `left`: the truth's trace after
-    a refit.
+    a refit; `draws`, `more`: shapes that are tried of each, and further ones of the nearest.
     """
     rng = np.random.default_rng(seed)
     finger = session.specimen.finger
@@ -63,7 +68,7 @@ def distances(
         if (effect, names) != truth
     }
     for key in sorted(found, key=lambda k: -found[k])[:NEAREST]:
-        found[key] = max(found[key], imitated(*key, MORE))
+        found[key] = max(found[key], imitated(*key, more))
     return sorted(
         (Rival(effect, names, 0.5 * max(energy - best, 0.0)) for (effect, names, _), best in found.items()),
         key=lambda r: r.distance,

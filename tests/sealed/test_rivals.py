@@ -22,11 +22,11 @@ def test_the_same_cause_is_no_distance_away_and_a_foreign_one_all_of_it(session,
     truth, _, _ = calibrate(session, drive, 5.0)
     left = session.left(session.trace([truth])[0])
     energy = 0.5 * float(left @ left) / COARSE[250.0]
-    at = {(r.effect, r.site): r.distance for r in distances(session, left, ("unnamed", ()), seed=1)}
+    at = {(r.effect, r.site): r.distance for r in distances(session, left, ("unnamed", ()), seed=1, more=4)}
     assert at["drive_inertia", truth.site] == pytest.approx(0.0, abs=1e-6 * energy)
     assert at["tendon_stretch", ("T1",)] > 0.95 * energy
     assert ("drive_inertia", truth.site) not in {
-        (r.effect, r.site) for r in distances(session, left, ("drive_inertia", truth.site), seed=1)
+        (r.effect, r.site) for r in distances(session, left, ("drive_inertia", truth.site), seed=1, draws=1, more=1)
     }
 
 
@@ -44,7 +44,7 @@ def test_an_effect_that_nobody_lists_has_listed_imitators(session, specimen, mon
     assert said["energy"] > 0
     assert [(r["effect"], r["site"]) for r in said["rivals"]] == [(r.effect, list(r.site)) for r in near]
     left = session.left(session.trace([truth])[0])
-    all_of_them = distances(session, left, ("unnamed", ()), seed=1)
+    all_of_them = distances(session, left, ("unnamed", ()), seed=1, more=8)
     assert (all_of_them[0].effect, all_of_them[0].site) == ("tendon_stretch", ("T1",))
     assert all_of_them[0].distance < 0.8 * said["energy"]
     assert all(r.distance > 0.95 * said["energy"] for r in all_of_them if r.effect == "drive_inertia")
