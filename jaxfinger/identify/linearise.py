@@ -11,8 +11,9 @@ Outliers: with Huber's cost ρ(r) = r²/2 for |r| ≤ k and k|r| − k²/2 beyon
 whose sum of squares is that cost, and whose gradient Σ J ψ(r) is that of the M-estimate.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable
+from functools import partial
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +28,7 @@ from jaxfinger.identify.noise import whiten
 from jaxfinger.identify.parameters import Free
 from jaxfinger.model import Model
 
+Tree = TypeVar("Tree")
 Filters = dict[str, Float[Array, "_columns lags lags"]]  # `Noise.coefficients` of every channel
 
 
@@ -71,16 +73,24 @@ def _white(r, batch: Batch, filters: Filters, channel: str):
     return whiten(r, batch.mask[channel], filters[channel], demean=CHANNELS[channel].free_zero)
 
 
-def _white_slopes(slopes: Float[np.ndarray, "p columns B T"], batch: Batch, filters: Filters, channel: str):
-    """White derivatives; those of a column by parameters that it does not depend on are zero as they are."""
-    out, mask, coefficients = np.zeros_like(slopes), batch.mask[channel], filters[channel]
-    for k in range(slopes.shape[1]):
-        at, column = np.flatnonzero(slopes[:, k].any(axis=(1, 2))), slice(k, k + 1)
-        with np.errstate(invalid="ignore"):
-            out[at, column] = whiten(
-                slopes[at, column], mask[column], coefficients[column], demean=CHANNELS[channel].free_zero
-            )
-    return out
+def white_jacobian(
+    slopes: dict[str, Float[np.ndarray, "p columns B T"]], batch: Batch, filters: Filters
+) -> Float[np.ndarray, "B rows p"]:
+    """White derivatives in the order of `white_rows`; those of a column by parameters that it does not depend on are
+    zero as they are, which most are.
+    """
+    p, _, B, T = next(iter(slopes.values())).shape
+    out, row = np.zeros((B, sum(slopes[c].shape[1] for c in filters), T, p)), 0
+    for c, coefficients in filters.items():
+        for k, by_parameter in enumerate(np.moveaxis(slopes[c], 1, 0)):
+            at, column = np.flatnonzero(by_parameter.any(axis=(1, 2))), slice(k, k + 1)
+            with np.errstate(invalid="ignore"):
+                white = whiten(
+                    by_parameter[at, None], batch.mask[c][column], coefficients[column], demean=CHANNELS[c].free_zero
+                )
+            out[:, row, :, at] = white[:, 0]
+            row += 1
+    return out.reshape(B, -1, p)
 
 
 def _flat(white: dict):
@@ -107,7 +117,7 @@ def robust_share(r: Float[np.ndarray, "*N"], limit: float) -> Float[np.ndarray, 
 
 def residuals_of(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[str, Float[np.ndarray, "_columns B T"]]:
     """Measured − predicted of every trial; also where a sample does not count."""
-    return _cut([_residuals_jit(model, block, channels) for block in blocks(batch)], batch)
+    return _cut((_residuals_jit(model, block, channels) for block in blocks(batch)), batch)
 
 
 def tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> Tangent:
@@ -117,16 +127,16 @@ def tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -
     """
     if batch.x.simulated:
         return Tangent(*jax.tree.map(np.asarray, _simulated_tangent(model, free, batch, channels)))
-    parts = [_tangent(model, free, block, channels, jax.device_put(True)) for block in blocks(batch)]
-    residuals, slopes = zip(*parts, strict=True)
-    return Tangent(_cut(residuals, batch), _cut(slopes, batch))
+    return Tangent(
+        *_cut((_tangent(model, free, block, channels, jax.device_put(True)) for block in blocks(batch)), batch)
+    )
 
 
 def missed(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> dict[str, np.ndarray]:
     """`residuals_of`, by the program of `tangent`: where that is compiled, it costs no compilation."""
     if batch.x.simulated:
         return residuals_of(model, batch, channels)
-    return _cut([_tangent(model, free, block, channels, jax.device_put(False))[0] for block in blocks(batch)], batch)
+    return _cut((_tangent(model, free, block, channels, jax.device_put(False))[0] for block in blocks(batch)), batch)
 
 
 def linearise(model: Model, free: Free, batch: Batch, filters: Filters, limit: float = 0.0) -> Linearised:
@@ -145,7 +155,7 @@ def whitened(
     every trial with its weight, 1 by default.
     """
     white = white_of(along.residuals, batch, filters)
-    J = np.moveaxis(_flat({c: _white_slopes(along.slopes[c], batch, filters, c) for c in filters}), 0, -1)
+    J = white_jacobian(along.slopes, batch, filters)
     factor = factored(white, J, limit)
     return Linearised(
         along.residuals, white, J, factor if weights is None else np.sqrt(weights)[:, None, None] * factor
@@ -176,10 +186,21 @@ def triangular(A: Float[np.ndarray, "N p"]) -> Float[np.ndarray, "k p"]:
     return np.asarray(np.linalg.qr(A, mode="r"))
 
 
-def _cut(parts: Sequence[dict[str, Array]], batch: Batch) -> dict[str, np.ndarray]:
-    """Blocks of (…, B, T) put together again."""
-    B, T = batch.x.time.shape
-    return {c: np.concatenate([np.asarray(x[c]) for x in parts], axis=-2)[..., :B, :T] for c in parts[0]}
+def _cut(parts: Iterable[Tree], batch: Batch) -> Tree:
+    """Blocks of (…, B, T) put together again, each let go before the next one is made."""
+    (B, T), out, first = batch.x.time.shape, None, 0
+    for part in parts:
+        if out is None:
+            out = jax.tree.map(lambda a: np.empty((*a.shape[:-2], B, T)), part)
+        jax.tree.map(partial(_put, first), out, part)
+        first += jax.tree.leaves(part)[0].shape[-2]
+    assert out is not None
+    return out
+
+
+def _put(first: int, out: Float[np.ndarray, "*k B T"], block: Float[Array, "*k b t"]) -> None:
+    """Those samples of a block that are no padding, from trial number `first` on."""
+    out[..., first : first + block.shape[-2], :] = np.asarray(block)[..., : out.shape[-2] - first, : out.shape[-1]]
 
 
 _residuals_jit = quick_jit(_residuals)
