@@ -56,7 +56,7 @@ class Scales:
         length = length or 1.0
         time = [np.asarray(r.x.time) for r in recorded]
         trial = max((float(t.max()) for t in time if t.size), default=0.0) or 1.0
-        session = max((float(np.max(r.x.session_time)) for r in recorded), default=0.0)
+        session = max((float(np.asarray(r.x.session_time).max()) for r in recorded), default=0.0)
         session = max(session, trial)
 
         def each(count: int, values) -> Float[np.ndarray, " count"]:

@@ -81,13 +81,12 @@ def white_jacobian(
     """
     p, _, B, T = next(iter(slopes.values())).shape
     out, row = np.zeros((B, sum(slopes[c].shape[1] for c in filters), T, p)), 0
-    for c, coefficients in filters.items():
+    for c in filters:
+        coefficients, mask = np.asarray(filters[c]), np.asarray(batch.mask[c])
         for k, by_parameter in enumerate(np.moveaxis(slopes[c], 1, 0)):
             at, column = np.flatnonzero(by_parameter.any(axis=(1, 2))), slice(k, k + 1)
             with np.errstate(invalid="ignore"):
-                white = whiten(
-                    by_parameter[at, None], batch.mask[c][column], coefficients[column], demean=CHANNELS[c].free_zero
-                )
+                white = whiten(by_parameter[at, None], mask[column], coefficients[column], CHANNELS[c].free_zero)
             out[:, row, :, at] = white[:, 0]
             row += 1
     return out.reshape(B, -1, p)
