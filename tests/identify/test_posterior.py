@@ -1,5 +1,6 @@
 """NUTS against Laplace where the posterior is Gaussian: excursions are linear in their coefficients."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -12,7 +13,8 @@ from jaxfinger.identify.posterior import sampled_posterior
 def test_nuts_agrees_with_laplace_where_the_model_is_linear(session, staged):
     slow = session.select("ID.2")
     fit = refine(slow, staged)
-    found = sampled_posterior(slow, fit, draws=400, warmup=200)
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # blackjax promotes
+        found = sampled_posterior(slow, fit, draws=400, warmup=200)
     assert found.trusted
     seen = np.flatnonzero(np.isfinite(fit.std) & (fit.std > 0))
     ratio = np.sqrt(np.diag(found.samples.covariance))[seen] / fit.std[seen]
