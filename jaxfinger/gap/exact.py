@@ -26,7 +26,7 @@ FACTOR = 0.7  # logarithm of the most by which a step changes a shape
 ROUNDS = 5  # of moving the nominal model
 SETTLED = 0.5  # change of the score below which it stays
 HALVINGS = 3
-ROUNDING = 1e-14  # relative, of sums of squares: one of ten thousand is good to a hundred times 2.2e-16
+ROUNDING = 1e-14  # of the largest variance: a sum of ten thousand products is good to a hundred times 2.2e-16
 Room = tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]
 
 

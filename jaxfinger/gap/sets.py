@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.costs import Costs, Key
-from jaxfinger.gap.exact import ROUNDING, Bench, SearchState, Whitened, fitted, prior_products
+from jaxfinger.gap.exact import Bench, SearchState, Whitened, fitted, prior_products
 from jaxfinger.gap.formula import Evidence, Judged, Linear, Weights, unexplained
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.screening import Part
@@ -20,6 +20,7 @@ from jaxfinger.identify.stages import Progress
 # Share of a signature that nominal parameters must leave. What they imitate altogether leaves rounding, below 1e-5. Of
 # a cause that leaves 2e-3, as an encoder's offset does, the bend over a plausible size is 0.4 % of what is left.
 SEEN = 1e-3
+NOTHING = (1e-3 * SEEN) ** 2  # share of a sum of squares, of which less is nothing: two sums differ by 1e-14 of them
 SHORT_LIST = 12  # candidates whose amplitudes are weighed until the weights settle
 EXACT = 3  # of them that are fitted exactly
 MOST = 12  # changes of the set
@@ -95,7 +96,9 @@ def table_of(problem: Problem, bench: Bench, parts: Iterable[Part], together: bo
         if share < absorbed.get(v.key, np.inf):
             absorbed[v.key] = share
             hidden[v.key] = {
-                n: size / float(left[i]) for i, (n, size) in zip(at, v.sizes.items(), strict=True) if left[i] > 0.0
+                n: size / float(max(left[i], 1e-12 * raw[i]))
+                for i, (n, size) in zip(at, v.sizes.items(), strict=True)
+                if raw[i] > 0.0
             }
         ends = [_ends(v, n, float(units[i])) for i, n in zip(at, v.sizes, strict=True) if kept[i]]
         if ends:
@@ -122,7 +125,8 @@ def _visible(bench: Bench, plain: Whitened, Z: ByColumn) -> Visible:
     for c, (at, rows) in zip(columns.items, Z.held, strict=True):
         square[at] += np.sum(rows**2, axis=1)
         onto[:, at] += Q[c.rows].T @ rows.T
-    raw, left = np.sqrt(square), np.sqrt(np.maximum(square - np.sum(onto**2, axis=0), ROUNDING * square))
+    rest = square - np.sum(onto**2, axis=0)
+    raw, left = np.sqrt(square), np.sqrt(np.where(rest > NOTHING * square, rest, 0.0))
     units = np.where(left > SEEN * raw, bench.gap / np.maximum(left, 1e-300), 0.0)
     absorbed = np.concatenate([c.basis.T @ Q[c.rows] for c in columns.items]) @ onto
     energy = columns.sums((Z.B - absorbed) ** 2).T

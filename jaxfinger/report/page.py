@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 
 from jaxfinger.data.atomic import atomic_path
@@ -62,7 +62,9 @@ def render(d: Diagnosis, trace: Trace | None = None, found: Curves | None = None
         trace: the trial to show, measured beside predicted.
         found: the model's curves, whose moment arms are shown.
     """
-    template = Environment(loader=PackageLoader("jaxfinger.report", "."), autoescape=True).get_template("page.html.j2")
+    environment = Environment(loader=PackageLoader("jaxfinger.report", "."), autoescape=True)
+    environment.filters["code"] = _code
+    template = environment.get_template("page.html.j2")
     prismatic = d.nominal.model.finger.prismatic
     named = set(d.named).union(*d.ambiguous_sets)
     simulator = sentences.is_simulator(d)
@@ -106,6 +108,11 @@ def render(d: Diagnosis, trace: Trace | None = None, found: Curves | None = None
 
 
 # Pictures -------------------------------------------------------------------------------------------------------------
+def _code(text: str) -> Markup:
+    """A sentence whose `names` are set as code, the rest as text."""
+    return Markup("".join(f"<code>{escape(x)}</code>" if k % 2 else escape(x) for k, x in enumerate(text.split("`"))))
+
+
 def _both(draw: Callable[[Axes], object], name: str, says: str, size: Callable[[float], tuple[float, float]]) -> Markup:
     """A picture twice, for a phone and for a wider screen; one of them is shown."""
     parts = []

@@ -134,14 +134,14 @@ def test_what_is_improbable_or_too_long_is_left_out():
 
 def test_a_cause_says_what_to_do(monkeypatch):
     cls = CATALOGUE["tendon_stretch"]
-    for name, text in (("HAPPENS", "It gives."), ("LOOKS", "A slope over tension."), ("CHANGE", "Stiffen it.")):
+    for name, text in (("HAPPENS", "It gives."), ("LOOKS", "A slope over tension."), ("CHANGE", "Stiffen `it` <b>.")):
         monkeypatch.setattr(cls, name, text)
     page = render(explained())
     card = page.split('<article class="card"')[1].split("</article>")[0]
     for head, text in (
         ("What happens", "It gives."),
         ("What it looks like", "A slope over"),
-        ("What to change", "Stiff"),
+        ("What to change", "Stiffen <code>it</code> &lt;b&gt;."),
     ):
         assert text in card.split(f"<dt>{head}</dt>")[1].split("</dd>")[0]
     assert "The law" in card
