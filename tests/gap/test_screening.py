@@ -10,9 +10,12 @@ from jaxtyping import Array, Float
 
 from jaxfinger.effects import CATALOGUE, Scales, amplitude, shape
 from jaxfinger.gap import diagnose
+from jaxfinger.gap.exact import Bench
+from jaxfinger.gap.formula import Parameters
 from jaxfinger.gap.result import Key
-from jaxfinger.gap.screening import MOST, Scan
-from jaxfinger.gap.signatures import Signatures, Variant
+from jaxfinger.gap.screening import MOST, Scan, read_parts
+from jaxfinger.gap.sets import table_of
+from jaxfinger.gap.signatures import Signatures, Variant, variants
 from jaxfinger.model import Finger
 from jaxfinger.synthetic import paper_finger
 
@@ -85,3 +88,14 @@ def test_a_wandering_sensor_is_named_with_its_period():
     assert found.named == (Key("torque_sensor_drift", SITE),)
     (drift,) = found.augmented.model.effects
     assert float(drift.P) == pytest.approx(71.0, rel=0.05)
+
+
+def test_what_the_nominal_parameters_imitate_could_hide_without_end(planted):
+    """A constant torque beside an elastic torque whose constant is free: more of it than any machine has."""
+    bench = Bench.of(planted, Parameters())
+    items = variants({"joint_offset": CATALOGUE["joint_offset"]}, planted.nominal.finger, planted.scales)
+    table = table_of(planted, bench, read_parts(planted, items, bench.columns))
+    assert table.offers == []
+    assert {effect for effect, _ in table.absorbed} == {"joint_offset"}
+    assert min(table.absorbed.values()) > 1.0 - 1e-9
+    assert min(size for sizes in table.hidden.values() for size in sizes.values()) > 1e5  # N m
