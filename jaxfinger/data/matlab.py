@@ -77,13 +77,8 @@ def _scipy(path: Path) -> Mapping[str, Any]:
             loaded = scipy.io.loadmat(path, simplify_cells=True)
         except scipy.io.matlab.MatReadWarning as error:
             raise UserError(f"{path}: {error}; give each variable its own name") from None
-        except (
-            ArithmeticError,
-            LookupError,
-            MemoryError,
-            TypeError,
-            ValueError,
-        ):  # what damaged lengths and kinds make of SciPy
+        # What damaged lengths and kinds make of SciPy.
+        except (ArithmeticError, LookupError, MemoryError, TypeError, ValueError):
             raise damaged from None
     return {name: value for name, value in loaded.items() if not name.startswith("__")}
 

@@ -18,7 +18,7 @@ PASSES = 4000  # likewise how quick it is: a minute's trial still shows a motion
 # what is reduced to a rate, cut off at a frequency or counted in seconds is meant for these. How fast tendons move a
 # finger says less: it sticks, and slips as fast as it does.
 SWEEP = 0.11
-STEP = 0.27  # s, the same where it is led or stepped (ID.2, ID.3-static)
+STEP = 0.27  # s, likewise where it is led or stepped (ID.2, ID.3-static)
 # Of paces: what serves one serves motions twice as slow and four times as quick, of which a fit is the same within its
 # errors (tests/identify/test_units.py).
 LIKE = 4.0
@@ -32,7 +32,7 @@ class Sizes:
     excursion: float  # m, the longest
     noise: float  # N, of a tension sensor
     pace: float = 1.0  # times as long as the protocol's that its motions take: a power of `LIKE`
-    slow_pace: float = 1.0  # likewise of what is led, stepped or held: where sweeps are quick, steps need not be
+    slow_pace: float = 1.0  # likewise of what is led, stepped or held, which need not be as quick as sweeps
 
     @property
     def slack(self) -> float:
@@ -70,7 +70,7 @@ def sizes_of(session: Session) -> Sizes:
         if trial.experiment in ("ID.2", "ID.3-static"):
             steps.append(_quick(trial) / STEP)
     pace = _pace(sweeps)
-    slow = min(max(pace, _pace(steps)), 1.0) if pace < 1.0 and any(steps) else pace
+    slow = max(pace, min(_pace(steps), 1.0)) if any(steps) else pace  # quick only where its own motions are
     return Sizes(max(tensions), max(excursions), float(np.median(noises)) if noises else 0.0, pace, slow)
 
 

@@ -155,7 +155,7 @@ class Products:
         rows = y.tocsr()
         return np.stack([np.sum(x[i] * (rows[j].T @ values.T).T, axis=0) for i, j, values in self.blocks])
 
-    def of(self, at: Int[np.ndarray, " m"]) -> Float[np.ndarray, "C k m"]:
+    def with_rows(self, at: Int[np.ndarray, " m"]) -> Float[np.ndarray, "C k m"]:
         """With some of the rows Z."""
         out = np.zeros((len(self.blocks), self.shape[0], len(at)))
         for c, (i, j, values) in enumerate(self.blocks):

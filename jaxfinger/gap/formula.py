@@ -150,7 +150,7 @@ class Linear:
         low = np.full(n, -np.inf) if low is None else low
         high = np.full(n, np.inf) if high is None else high
         T = np.empty((len(self.columns.items), k + n, k + n))
-        T[:, :k, :k], T[:, :k, k:] = self.TX, self.TXZ.of(picks)
+        T[:, :k, :k], T[:, :k, k:] = self.TX, self.TXZ.with_rows(picks)
         T[:, k:, :k], T[:, k:, k:] = np.swapaxes(T[:, :k, k:], 1, 2), self.further.among(picks)
         B = np.concatenate([self.BX, self.BZ[:, picks]], axis=1)
         prior = np.zeros((k + n, k + n))
@@ -246,7 +246,7 @@ class Linear:
         k, base = self.BX.shape[1], self.prior
         H = np.zeros((k + len(at),) * 2)
         H[:k, :k] = self._weighted(w, self.BX, self.BX, self.TX) + base
-        H[:k, k:] = self._weighted(w, self.BX, self.BZ[:, at], self.TXZ.of(at))
+        H[:k, k:] = self._weighted(w, self.BX, self.BZ[:, at], self.TXZ.with_rows(at))
         H[k:, :k] = H[:k, k:].T
         H[k:, k:] = self._weighted(w, self.BZ[:, at], self.BZ[:, at], self.further.among(at))
         scale = 1.0 / np.sqrt(np.maximum(np.diag(H)[1:], 1e-300))

@@ -64,7 +64,7 @@ class Scan:
     periods: Float[np.ndarray, " n"]  # s
     middle: float  # s
     # Signatures of the amplitudes without a period, and of both of every period.
-    columns: Float[np.ndarray, "members N"]
+    rows: Float[np.ndarray, "members N"]
 
     @classmethod
     def of(cls, signatures: Signatures, items: list[Variant]) -> "Scan":
@@ -82,8 +82,8 @@ class Scan:
         without = set(size).difference(*effect.periods().values())
         members = [shape | {a: size[a]} for a in size if a in without]
         members += [shape | {name: period, a: size[a]} for period in periods for a in pair]
-        columns = signatures.of([effect.at(finger, site, **values) for values in members])
-        return cls(signatures, items, periods, middle, columns)
+        rows = signatures.of([effect.at(finger, site, **values) for values in members])
+        return cls(signatures, items, periods, middle, rows)
 
     def offer(self, projector: Projector, rt: Float[np.ndarray, " rows"], columns: Columns) -> Offer:
         """Every variant with those periods that explain most together."""
@@ -94,7 +94,7 @@ class Scan:
     def best(self, projector: Projector, rt: Float[np.ndarray, " rows"]) -> dict[str, float]:
         """The periods, s, by least squares over all sets of them."""
         names, n = list(self.items[0].effect.periods()), len(self.periods)
-        A = projector(self.columns)
+        A = projector(self.rows)
         A = A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300)
         G, b, k = A @ A.T + RIDGE * np.eye(len(A)), A @ rt, len(A) - 2 * n
         sets = np.array(list(combinations(range(n), len(names))))

@@ -20,7 +20,7 @@ from jaxfinger.identify.stages import Progress
 # Share of a signature that nominal parameters must leave. What they imitate altogether leaves rounding, below 1e-5. Of
 # a cause that leaves 2e-3, as an encoder's offset does, the bend over a plausible size is 0.4 % of what is left.
 SEEN = 1e-3
-NOTHING = (1e-3 * SEEN) ** 2  # share of a sum of squares, of which less is nothing: two sums differ by 1e-14 of them
+LEAST_LEFT = (1e-3 * SEEN) ** 2  # of ‖z‖²: ‖z‖² − ‖Qᵀ z‖² is good to 1e-14 of it, and less than this is taken for zero
 SHORT_LIST = 12  # candidates whose amplitudes are weighed until the weights settle
 EXACT = 3  # of them that are fitted exactly
 MOST = 12  # changes of the set
@@ -126,7 +126,7 @@ def _visible(bench: Bench, plain: Whitened, Z: ByColumn) -> Visible:
         square[at] += np.sum(rows**2, axis=1)
         onto[:, at] += Q[c.rows].T @ rows.T
     rest = square - np.sum(onto**2, axis=0)
-    raw, left = np.sqrt(square), np.sqrt(np.where(rest > NOTHING * square, rest, 0.0))
+    raw, left = np.sqrt(square), np.sqrt(np.where(rest > LEAST_LEFT * square, rest, 0.0))
     units = np.where(left > SEEN * raw, bench.gap / np.maximum(left, 1e-300), 0.0)
     absorbed = np.concatenate([c.basis.T @ Q[c.rows] for c in columns.items]) @ onto
     energy = columns.sums((Z.B - absorbed) ** 2).T

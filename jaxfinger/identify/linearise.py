@@ -73,7 +73,7 @@ def _white(r, batch: Batch, filters: Filters, channel: str):
     return whiten(r, batch.mask[channel], filters[channel], demean=CHANNELS[channel].free_zero)
 
 
-def white_jacobian(
+def _white_jacobian(
     slopes: dict[str, Float[np.ndarray, "p columns B T"]], batch: Batch, filters: Filters
 ) -> Float[np.ndarray, "B rows p"]:
     """White derivatives in the order of `white_rows`; those of a column by parameters that it does not depend on are
@@ -154,7 +154,7 @@ def whitened(
     every trial with its weight, 1 by default.
     """
     white = white_of(along.residuals, batch, filters)
-    J = white_jacobian(along.slopes, batch, filters)
+    J = _white_jacobian(along.slopes, batch, filters)
     factor = factored(white, J, limit)
     return Linearised(
         along.residuals, white, J, factor if weights is None else np.sqrt(weights)[:, None, None] * factor

@@ -49,7 +49,7 @@ def test_products_are_those_of_whole_rows(columns, rng):
     np.testing.assert_allclose(found.summed(weights), np.tensordot(weights, expected, 1), atol=1e-12)
     np.testing.assert_allclose(found.along(along), np.einsum("i,cij->cj", along, expected), atol=1e-12)
     some = np.array([5, 0, 3])
-    np.testing.assert_allclose(found.of(some), expected[:, :, some], atol=1e-12)
+    np.testing.assert_allclose(found.with_rows(some), expected[:, :, some], atol=1e-12)
     a, b = rng.standard_normal((len(both), 5)), rng.standard_normal((len(z), 5)) * (rng.uniform(size=(len(z), 5)) < 0.5)
     bilinear = np.einsum("in,cij,jn->cn", a, expected, b)
     np.testing.assert_allclose(found.bilinear(a, csc_array(b)), bilinear, atol=1e-12)
