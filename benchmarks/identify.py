@@ -3,19 +3,25 @@
     python benchmarks/identify.py [--only-inverse-dynamics]
 
 1. `jaxfinger identify` on a session of 30 trials, 20 minutes at 1 kHz, as a user runs it: with an empty compile cache
-   and with a full one; peak memory there and on half the session.
+   and with a full one, and on half the session.
 2. Inverse dynamics of 10,000, 100,000 and a million samples, 3 and 7 joints, against Pinocchio's batch call and
-   MuJoCo, in processor seconds of one thread: median and spread of five runs.
-3. Each stage's least squares against `scipy.optimize.least_squares` on the same rows, with the same derivatives; and
-   with the derivatives by the parameters of earlier stages too, which the errors that are passed on need.
+   MuJoCo, in processor seconds of one thread.
+3. Each stage's least squares against `scipy.optimize.least_squares` on the same compressed problem, from the same
+   start, by the quickest of its methods; and with the derivatives by the parameters of earlier stages too, which the
+   errors that are passed on need.
+
+All of it as median and spread of five runs.
 """
 
 import argparse
+import itertools
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 import equinox as eqx
@@ -29,14 +35,14 @@ import scipy.optimize
 from jaxfinger.data import FingerDescription, Session, read_session, write_session
 from jaxfinger.experiments import prepare
 from jaxfinger.identify import identify
-from jaxfinger.identify.linearise import linearise
 from jaxfinger.identify.parameters import Free, describe
-from jaxfinger.identify.solve import solve
+from jaxfinger.identify.solve import SMALL, Source, Tangents, linearise_each, solve, stacked
 from jaxfinger.identify.stages import STAGES, sources_of
 from jaxfinger.identify.start import start_values
-from jaxfinger.model import Finger, rigid_body
+from jaxfinger.model import Finger, Model, rigid_body
 from jaxfinger.synthetic import ModelPlant, paper_finger, polynomial_finger, recipe_from, simulate, true_model
 
+RUNS = 5
 TWENTY_MINUTES = {
     "specimen": {"kind": "polynomial"},
     "cad": {"mass": 0.02, "com": 3e-4},
@@ -66,60 +72,55 @@ MEASURED = """
 import resource, subprocess, sys, time
 begun = time.perf_counter()
 subprocess.run(sys.argv[1:], check=True, capture_output=True)
-print(time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024)
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(used.ru_utime + used.ru_stime, time.perf_counter() - begun, used.ru_maxrss / 1024)
 """
 
 
-def measured(session: Path, cache: Path) -> tuple[float, float]:
-    """Wall seconds and peak MiB of one `jaxfinger identify`."""
-    command = [
-        sys.executable,
-        "-m",
-        "jaxfinger",
-        "identify",
-        str(session),
-        "-o",
-        str(cache / "fit.json"),
-        "--overwrite",
-    ]
-    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache / "compiled")}
-    line = subprocess.run(
-        [sys.executable, "-c", MEASURED, *command], check=True, capture_output=True, text=True, env=environment
-    )
-    seconds, memory = map(float, line.stdout.split())
-    return seconds, memory
+def measured(session: Path, folder: Path, cold: bool = False) -> np.ndarray:
+    """Processor seconds, wall seconds and peak MiB of five runs of `jaxfinger identify`, (runs, 3)."""
+    compiled, rows = folder / "compiled", []
+    for run in range(RUNS):
+        cache = folder / f"cold-{run}" if cold else compiled
+        command = ["-m", "jaxfinger", "identify", str(session), "-o", str(folder / "fit.json"), "--overwrite"]
+        line = subprocess.run(
+            [sys.executable, "-c", MEASURED, sys.executable, *command],
+            check=True, capture_output=True, text=True, env=os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache)},
+        )  # fmt: skip
+        rows.append([float(x) for x in line.stdout.split()])
+        if cold:
+            shutil.rmtree(compiled, ignore_errors=True)
+            cache.rename(compiled)
+    return np.array(rows)
 
 
-def best(work, repeats: int = 3) -> float:
-    """Shortest time of a few runs, s, compiled before."""
-    work()
-    times = []
-    for _ in range(repeats):
-        begun = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - begun)
-    return min(times)
+def spread(values: np.ndarray, form: str = ".1f") -> str:
+    """Median, least and most."""
+    return f"{np.median(values):{form}} ({min(values):{form}} to {max(values):{form}})"
 
 
 def whole(folder: Path) -> None:
     """1. The command."""
     path = session_file(folder)
-    cold, memory = measured(path, folder)
-    warm, _ = measured(path, folder)
-    half, less = measured(folder / "half.h5", folder)
-    print(f"identify, empty compile cache: {cold:.1f} s; full cache: {warm:.1f} s; peak memory {memory:.0f} MiB")
-    print(f"identify, half the session:    {half:.1f} s; peak memory {less:.0f} MiB")
+    print(f"identify, median (least to most) of {RUNS} runs: seconds of processor, of wall; peak MiB")
+    for name, session, cold in (
+        ("empty compile cache", path, True),
+        ("full cache", path, False),
+        ("full cache, half the session", folder / "half.h5", False),
+    ):
+        used, wall, memory = measured(session, folder, cold).T
+        print(f"  {name:28}  {spread(used)}, {spread(wall)}; {memory.max():.0f}")
 
 
-def processor(work, runs: int = 5) -> tuple[float, float, float]:
-    """Median, least and most processor seconds of a few runs, compiled before."""
-    work()
+def processor(*works) -> list[np.ndarray]:
+    """Processor seconds of a few runs of each, compiled before, taking turns."""
     times = []
-    for _ in range(runs):
-        begun = time.process_time()
-        work()
-        times.append(time.process_time() - begun)
-    return float(np.median(times)), min(times), max(times)
+    for _ in range(RUNS + 1):
+        for work in works:
+            begun = time.process_time()
+            work()
+            times.append(time.process_time() - begun)
+    return list(np.reshape(times, (RUNS + 1, -1))[1:].T)
 
 
 def chain(m: int) -> FingerDescription:
@@ -174,11 +175,13 @@ def inverse_dynamics(joints: int, samples: int) -> None:
     begun = time.process_time()
     ours = eqx.filter_jit(rigid_body.inverse_dynamics).lower(finger, *x).compile()
     compiling = time.process_time() - begun
-    mine = processor(lambda: [jax.block_until_ready(ours(finger, *x)) for _ in range(repeats)])
     pool = pin.ModelPool(in_pinocchio(d), 1)
     a, b, c = (np.asfortranarray(v) for v in (q, qd, qdd))
     tau = np.zeros_like(a)
-    theirs = processor(lambda: [pin.rneaInParallel(1, pool, a, b, c, tau) for _ in range(repeats)])
+    mine, theirs = processor(
+        lambda: [jax.block_until_ready(ours(finger, *x)) for _ in range(repeats)],
+        lambda: [pin.rneaInParallel(1, pool, a, b, c, tau) for _ in range(repeats)],
+    )
     error = float(np.abs(np.asarray(ours(finger, *x)) - tau).max() / np.abs(tau).max())
     model = in_mujoco(d)
     data, few = mujoco.MjData(model), min(samples, 20_000)
@@ -188,52 +191,116 @@ def inverse_dynamics(joints: int, samples: int) -> None:
             data.qpos[:], data.qvel[:], data.qacc[:] = q[:, k], qd[:, k], qdd[:, k]
             mujoco.mj_inverse(model, data)
 
-    third = processor(by_mujoco)
+    (third,) = processor(by_mujoco)
     print(f"inverse dynamics, {joints} joints, {samples:,} samples (compiled in {compiling:.1f} s)")
     for name, seconds, count in (
         ("ours", mine, samples * repeats),
         ("Pinocchio, batch call", theirs, samples * repeats),
         ("MuJoCo, from Python", third, few),
     ):
-        each, low, high = (1e6 * s / count for s in seconds)
-        print(f"  {name:22s} {each:6.3f} µs a sample ({low:.3f} to {high:.3f})")
-    print(f"  Pinocchio / ours {theirs[0] / mine[0]:.2f}; largest difference {error:.0e} of the largest torque")
+        print(f"  {name:22s} {spread(1e6 * seconds / count, '6.3f')} µs a sample")
+    print(f"  Pinocchio / ours {np.median(theirs / mine):.2f}; largest difference {error:.0e} of the largest torque")
+
+
+class Compressed:
+    """One stage as the core compresses it: ½ ‖d + R δ‖² + ½ ρ² at every point, which is all that SciPy's methods ask of
+    residuals and Jacobians. What is linear is linearised once.
+    """
+
+    def __init__(self, model: Model, free: np.ndarray, sources: dict[str, Source], limit: float):
+        self.model, self.free, self.sources, self.limit = model, free, sources, limit
+        self.at = Free.at(model, free)
+        self.start, self.size = np.asarray(self.at.get(model)), len(describe(model))
+        self.quadratic = not limit and all(s.linear(model, free) for s in sources.values())
+        self.forget()
+
+    def forget(self) -> None:
+        """Back to before anything is known."""
+        self.tangents, self.known = Tangents(), None
+
+    def rows(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """[R d; 0 ρ] and where it is so."""
+        if self.known is None or not (self.quadratic or np.array_equal(self.known[0], theta)):
+            at = self.at.set(self.model, jnp.asarray(theta))
+            linearised = linearise_each(at, self.sources, self.limit, self.tangents, self.free)
+            factor = stacked(linearised, self.sources, self.size)
+            self.known = theta.copy(), factor[:, [*self.free, self.size]]
+        return self.known
+
+    def residual(self, theta: np.ndarray) -> np.ndarray:
+        at, rows = self.rows(theta)
+        residual = np.zeros(theta.size + 1)  # a factor has as many rows at every point, but for those that are zero
+        residual[: len(rows)] = rows[:, -1] + rows[:, :-1] @ (theta - at)
+        return residual
+
+    def jacobian(self, theta: np.ndarray) -> np.ndarray:
+        _, rows = self.rows(theta)
+        jacobian = np.zeros((theta.size + 1, theta.size))
+        jacobian[: len(rows)] = rows[:, :-1]
+        return jacobian
+
+    def apart(self, a: np.ndarray, b: np.ndarray) -> float:
+        """Distance of two points in standard deviations of the estimate, all parameters together."""
+        return float(np.linalg.norm(self.jacobian(b) @ (a - b)))
+
+
+def by_scipy(problem: Compressed, **options) -> np.ndarray:
+    """The optimum, from a problem of which nothing is known."""
+    problem.forget()
+    return scipy.optimize.least_squares(problem.residual, problem.start, jac=problem.jacobian, **options).x
+
+
+def rivals(problem: Compressed, optimum: np.ndarray, near: float) -> list[dict]:
+    """SciPy's methods and scales, each with its loosest tolerance that ends so near the optimum."""
+    out = []
+    for method, scale in itertools.product(("lm", "trf"), ("jac", 1.0)):
+        for tolerance in 10.0 ** -np.arange(2, 16):
+            options = {"method": method, "x_scale": scale} | dict.fromkeys(("ftol", "xtol", "gtol"), tolerance)
+            if problem.apart(by_scipy(problem, **options), optimum) < near:
+                out.append(options)
+                break
+    return out
 
 
 def stages(path: Path) -> None:
     """3. The least squares of every stage, all else equal."""
-    warm = best(lambda: identify(read_session(path)), 1)
-    print(f"identify, in a process that has compiled: {warm:.1f} s, reading included")
     session = read_session(path)
+    (again,) = processor(lambda: identify(read_session(path)))
+    print(f"identify, in a process that has compiled: {spread(again)} s of processor, reading included")
     fit, stacks = identify(session), prepare(session)
-    parameters = describe(fit.model)
-    for name, stage in STAGES.items():
-        reads = {e: c for e, c in stage.reads.items() if e in stacks}
-        groups = set(stage.frees)
-        free = np.array([i for i in fit.estimated if parameters[i].group in groups], dtype=int)
-        sources = sources_of(stacks, reads, fit.noise, parameters)
-        zero = Free.at(fit.model, free).set(fit.model, jnp.zeros(free.size))
-        start = start_values(zero, free, parameters, sources)
-        alone = {n: s._replace(positions=np.intersect1d(s.positions, free)) for n, s in sources.items()}
-        ours = best(lambda s=start, f=free, src=alone: solve(s, f, src)[0], 1)
-        passing = best(lambda s=start, f=free, src=sources: solve(s, f, src)[0], 1)
-        free_of = Free.at(start, free)
+    parameters, huber = describe(fit.model), fit.recipe.fit.huber
+    for limit, how in ((0.0, "plain least squares"), (huber, f"Huber's cost beyond {huber:g} standard deviations")):
+        print(f"a stage from zero, {how}; ms of processor")
+        for name, stage in STAGES.items():
+            reads = {e: c for e, c in stage.reads.items() if e in stacks}
+            free = np.array([i for i in fit.estimated if parameters[i].group in stage.frees], dtype=int)
+            sources = sources_of(stacks, reads, fit.noise, parameters)
+            zero = Free.at(fit.model, free).set(fit.model, jnp.zeros(free.size))
+            start = start_values(zero, free, parameters, sources)
+            alone = {n: s._replace(positions=np.intersect1d(s.positions, free)) for n, s in sources.items()}
+            one_stage(name, Compressed(start, free, alone, limit), sources)
 
-        def rows(theta, s=start, f=free_of, src=sources):
-            lin = [linearise(f.set(s, jnp.asarray(theta)), f, x.batch, x.filters) for x in src.values()]
-            r = np.concatenate([np.asarray(x.white).ravel() for x in lin])
-            return r, np.concatenate([np.asarray(x.jacobian).reshape(-1, theta.size) for x in lin])
 
-        def theirs(run=rows, s=start, f=free_of):
-            return scipy.optimize.least_squares(
-                lambda x: run(x)[0], np.asarray(f.get(s)), jac=lambda x: run(x)[1], method="trf", x_scale="jac"
-            )
+def one_stage(name: str, problem: Compressed, sources: dict[str, Source]) -> None:
+    """Ours beside the quickest of SciPy's ways."""
 
-        scipy_time = best(theirs, 1)
-        print(
-            f"{name:13} ours {ours:6.2f} s, SciPy {scipy_time:6.2f} s: {scipy_time / ours:.1f} times; "
-            f"with the errors passed on {passing:.2f} s"
-        )
+    def ours(read: dict[str, Source], small: float = SMALL):
+        model, solution = solve(problem.model, problem.free, read, huber=problem.limit, small=small)
+        return np.asarray(problem.at.get(model)), solution.linearisations
+
+    found, points = ours(problem.sources)
+    optimum, _ = ours(problem.sources, 1e-3 * SMALL)
+    options = rivals(problem, optimum, max(SMALL, problem.apart(found, optimum)))
+    works = [partial(by_scipy, problem, **o) for o in options]
+    mine, passing, *theirs = processor(lambda: ours(problem.sources), lambda: ours(sources), *works)
+    best = int(np.argmin([np.median(t) for t in theirs]))
+    used, away = options[best], problem.apart(works[best](), found)
+    print(
+        f"  {name:13} ours {spread(1e3 * mine)} at {points} points; "
+        f"SciPy {spread(1e3 * theirs[best])} by {used['method']}, x_scale={used['x_scale']}, {used['ftol']:.0e}; "
+        f"SciPy / ours {np.median(theirs[best] / mine):.2f}, {away:.0e} σ apart; "
+        f"ours with the derivatives that errors are passed on by {spread(1e3 * passing)}"
+    )
 
 
 def main() -> None:

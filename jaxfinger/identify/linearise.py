@@ -51,6 +51,23 @@ class Linearised(NamedTuple):
     jacobian: Float[np.ndarray, "B rows p"]  # J, likewise
     factor: Float[np.ndarray, "B k p+1"]  # triangular, of [J r] as Huber's cost sees them
 
+    def moved(
+        self,
+        by: Float[np.ndarray, " p"],
+        residuals: dict[str, Float[np.ndarray, "_columns B T"]],
+        limit: float,
+        weights: Float[np.ndarray, " B"] | None,
+    ) -> "Linearised":
+        """On along the tangent, to where the residuals are these: white rows move by J δ, without a limit factors by
+        R δ. The limit and the weights are those of before.
+        """
+        white = self.white + self.jacobian @ by
+        if limit:
+            return Linearised(residuals, white, self.jacobian, factored(white, self.jacobian, limit, weights))
+        factor = self.factor.copy()
+        factor[..., -1] += factor[..., :-1] @ by
+        return Linearised(residuals, white, self.jacobian, factor)
+
 
 def white_rows(model: Model, batch: Batch, filters: Filters) -> tuple[dict, Float[Array, "B rows"]]:
     """Residuals by channel, and the same white, one row a trial: unit variance where model and noise are right."""
@@ -155,14 +172,16 @@ def whitened(
     """
     white = white_of(along.residuals, batch, filters)
     J = _white_jacobian(along.slopes, batch, filters)
-    factor = factored(white, J, limit)
-    return Linearised(
-        along.residuals, white, J, factor if weights is None else np.sqrt(weights)[:, None, None] * factor
-    )
+    return Linearised(along.residuals, white, J, factored(white, J, limit, weights))
 
 
-def factored(white: Float[np.ndarray, "B rows"], J: Float[np.ndarray, "B rows p"], limit: float):
-    """(B, k, p+1): triangular factors of every trial, from the rows that count and the columns that it depends on."""
+def factored(
+    white: Float[np.ndarray, "B rows"],
+    J: Float[np.ndarray, "B rows p"],
+    limit: float,
+    weights: Float[np.ndarray, " B"] | None = None,
+) -> Float[np.ndarray, "B p+1 p+1"]:
+    """Triangular factors of every trial, from the rows that count and the columns that it depends on."""
     B, _, p = J.shape
     share = robust_share(white, limit)
     s = np.sign(white) * np.sqrt(np.maximum(limit * (2.0 * np.abs(white) - limit), 0.0)) if limit else white
@@ -177,7 +196,7 @@ def factored(white: Float[np.ndarray, "B rows"], J: Float[np.ndarray, "B rows p"
         A[:, -1] = s[b, rows]
         R = triangular(A)
         out[b, : len(R)][:, columns] = R
-    return out
+    return out if weights is None else np.sqrt(weights)[:, None, None] * out
 
 
 def triangular(A: Float[np.ndarray, "N p"]) -> Float[np.ndarray, "k p"]:

@@ -94,20 +94,30 @@ class Tangents:
 
     def __init__(self) -> None:
         self._known: dict[str, tuple[np.ndarray, Tangent]] = {}
+        self._white: dict[str, tuple[Source, float, np.ndarray, Linearised]] = {}
 
     def at(self, name: str, model: Model, source: Source, limit: float, linear: bool) -> Linearised:
-        """The experiment linearised at the model."""
+        """The experiment linearised at the model; whitened anew where the source is another one than before."""
         seen = source.seen(model)
         free = Free.at(seen, source.positions)
+        if not linear:
+            along = tangent(seen, free, source.batch, tuple(source.filters))
+            return whitened(along, source.batch, source.filters, limit, source.weights)
         values = np.asarray(free.get(seen))
-        known, along = self._known.get(name, (values, None)) if linear else (values, None)
+        known, along = self._known.get(name, (values, None))
         by = values - known
         if along is None or np.any(by[~np.isin(source.positions, source.affine)]):
             along, by = tangent(seen, free, source.batch, tuple(source.filters)), np.zeros_like(values)
-            if linear:
-                self._known[name] = values, along
+            self._known[name] = values, along
+            self._white.pop(name, None)
         along = along.moved(by) if by.any() else along
-        return whitened(along, source.batch, source.filters, limit, source.weights)
+        of, under, there, white = self._white.get(name, (None, limit, values, None))
+        if white is not None and of is source and under == limit:
+            white = white.moved(values - there, along.residuals, limit, source.weights)
+        else:
+            white = whitened(along, source.batch, source.filters, limit, source.weights)
+        self._white[name] = source, limit, values, white
+        return white
 
 
 def solve(
@@ -129,19 +139,19 @@ def solve(
     Raises:
         UserError: the model is not defined at its start.
     """
-    size, p, tangents = ravel(model).size, free.size, tangents or Tangents()
-    moved = Free.at(model, free)
-    theta = np.asarray(moved.get(model))
+    flat, p, tangents = np.asarray(ravel(model)), free.size, tangents or Tangents()
+    moved, theta, size = Free.at(model, free), flat[free], flat.size
     low, high = within(model, free, limits)
     prior = prior or Prior.none(theta)
     solver = VisibleGaussNewton(atol=small, kink=KINK)
     room = -(-max(p, 1) // PAD) * PAD
-    y, state = _wide(theta, room), begin(_wide(theta, room))
+    y = _wide(theta, room)
+    state = _begin(y)
     ends = _wide(low, room), _wide(high, room)
+    at = model
     for _ in range(STEPS):
-        at = moved.set(model, jax.device_put(np.asarray(state.trial)[:p]))
         linearised = linearise_each(at, sources, huber, tangents, free)
-        factor = _stacked(linearised, sources, size)
+        factor = stacked(linearised, sources, size)
         offset = prior.root @ (np.asarray(state.trial)[:p] - prior.mean)
         rows = np.concatenate([factor[:, [*free, size]], np.column_stack([prior.root, offset])])
         trial = state.trial
@@ -152,6 +162,7 @@ def solve(
             raise UserError(f"{Outcome[state.outcome]}: start from other parameters")
         if not bool(state.outcome == Outcome.going):
             break
+        at = moved.set(model, jax.device_put(np.asarray(state.trial)[:p]))
     model, linearised, factor, rows = best
     _, invisible, scale = visible(rows[:, :-1])
     white = np.concatenate([lin.white.ravel() for lin in linearised.values()])
@@ -207,6 +218,9 @@ def _factor_of(rows: Float[np.ndarray, "N q"], room: int) -> Factor:
     return Factor(*jax.device_put((R, d, np.asarray(T[p, p] ** 2))))
 
 
+_begin = eqx.filter_jit(begin)
+
+
 @eqx.filter_jit
 def _advance(solver: VisibleGaussNewton, y, state: Iterate, here: Factor, low, high):
     return solver.advance(y, state, here, low, high)
@@ -239,7 +253,7 @@ def missed_each(model: Model, sources: dict[str, Source]) -> dict[str, dict[str,
     return dict(zip(sources, side_by_side(one, sources.values()), strict=True))
 
 
-def _stacked(
+def stacked(
     linearised: dict[str, Linearised], sources: dict[str, Source], size: int
 ) -> Float[np.ndarray, "k {size}+1"]:
     """One triangular factor of all trials, its columns those of the flat vector, then the residual."""

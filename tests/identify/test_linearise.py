@@ -12,7 +12,7 @@ from jaxfinger.effects import CATALOGUE
 from jaxfinger.experiments import TRIALS, blocks, predict, prepare, roomy
 from jaxfinger.identify.linearise import _tangent, huber, linearise, missed, residuals_of, white_rows
 from jaxfinger.identify.parameters import Free, describe
-from jaxfinger.identify.solve import missed_each
+from jaxfinger.identify.solve import Tangents, missed_each
 from jaxfinger.identify.stages import first_noise, sources_of
 
 EXPERIMENT, CHANNELS = "ID.4", ("joint_torque", "tendon_excursion")
@@ -116,3 +116,25 @@ def test_no_program_that_runs_beside_another_calls_lapack(short, short_truth):
         free = Free.at(model, source.positions)
         program = _tangent.lower(model, free, blocks(source.batch)[0], tuple(source.filters), jnp.asarray(True))
         assert "lapack" not in program.as_text()
+
+
+@pytest.mark.parametrize("limit", [0.0, 3.0])
+def test_what_is_affine_moves_along_its_tangent_exactly(short, short_truth, limit):
+    """Residuals, white rows and factors, as if linearised and whitened there."""
+    (name, channel), rng = ("ID.2", "tendon_excursion"), np.random.default_rng(0)
+    trials = prepare(short, [t.name for t in short if t.experiment == name])[name]
+    noise, parameters = {(name, channel): first_noise(trials, channel)}, describe(short_truth.model)
+    source = sources_of({name: trials}, {name: (channel,)}, noise, parameters)[name]
+    source = source._replace(weights=rng.uniform(0.0, 2.0, len(trials.trials)))
+    free = Free.at(short_truth.model, source.positions)
+    start = np.asarray(free.get(short_truth.model))
+    there = free.set(short_truth.model, jnp.asarray(start * rng.uniform(0.9, 1.1, start.size)))
+    tangents = Tangents()
+    first = tangents.at(name, short_truth.model, source, limit, linear=True)
+    moved = tangents.at(name, there, source, limit, linear=True)
+    anew = Tangents().at(name, there, source, limit, linear=True)
+    assert np.abs(moved.white - first.white).max() > 1.0
+    np.testing.assert_allclose(moved.residuals[channel], anew.residuals[channel], atol=1e-12)
+    np.testing.assert_allclose(moved.white, anew.white, atol=1e-7)
+    found, expected = (np.einsum("bkp,bkq->bpq", lin.factor, lin.factor) for lin in (moved, anew))
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10 * expected.max())
