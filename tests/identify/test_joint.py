@@ -46,6 +46,7 @@ def test_the_same_data_are_counted_once(session, joint):
     assert np.abs((values(again) - values(joint))[free] / joint.std[free]).max() < 0.05
 
 
+@pytest.mark.long
 def test_other_data_are_the_prior(clean, staged, joint):
     """A second session halves the variance of what CAD has no part in, and the estimate stays between the two."""
     other = measure(clean, 1)

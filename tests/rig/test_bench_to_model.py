@@ -13,15 +13,28 @@ from jaxfinger.rig.simulated.plant import Plant, default_truth
 from tests.rig.conftest import ads_rig
 
 
-@pytest.fixture(scope="module")
-def session(tmp_path_factory):
-    path = tmp_path_factory.mktemp("bench") / "session.h5"
+def recorded(folder, plan):
+    """The session of a plan, recorded over ADS as fast as the stand-in goes."""
     with standin.running(speed=0) as where:
         rig = ads_rig(where)
-        outcome = run(parse_plan(plan_toml(postures=1), rig.description), rig, path)
+        outcome = run(parse_plan(plan, rig.description), rig, folder / "session.h5")
     assert outcome.cause == ""
-    assert [f for f in check_file(path) if f.severity == "error"] == []
-    return read_session(path)
+    assert [f for f in check_file(folder / "session.h5") if f.severity == "error"] == []
+    return read_session(folder / "session.h5")
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """Every experiment, every joint, every tendon."""
+    return recorded(tmp_path_factory.mktemp("bench"), plan_toml(postures=1))
+
+
+@pytest.fixture(scope="module")
+def static(tmp_path_factory):
+    """The plan's trials of ID.3-static."""
+    head, *trials = plan_toml(postures=1).split("\n[[trial]]\n")
+    kept = [t for t in trials if '"ID.3-static"' in t]
+    return recorded(tmp_path_factory.mktemp("static"), "\n[[trial]]\n".join([head, *kept]))
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +42,7 @@ def fit(session):
     return identify(session)
 
 
+@pytest.mark.long
 def test_every_trial_is_complete_and_free_of_gaps(session):
     assert len(session) == 16
     for trial in session:
@@ -36,11 +50,12 @@ def test_every_trial_is_complete_and_free_of_gaps(session):
         np.testing.assert_allclose(np.diff(trial.time), 1e-3, atol=1e-9)
 
 
-def test_static_torque_against_plain_least_squares(session):
+def test_static_torque_against_plain_least_squares(static):
     """The recording itself, without jaxfinger's fits: elastic torque and friction of every joint from the holds."""
     truth, plant = default_truth(), Plant()
-    for trial in session.select("ID.3-static"):
-        j = session.finger.joint_names.index(trial.joint)
+    assert len(static) == 3
+    for trial in static.select("ID.3-static"):
+        j = static.finger.joint_names.index(trial.joint)
         rows, torque, angles = [], [], []
         for hold in range(trial.hold.max() + 1):
             at = trial.hold == hold
@@ -56,6 +71,7 @@ def test_static_torque_against_plain_least_squares(session):
             assert np.abs(error).max() < 0.1e-3  # N m; the tare alone is good to 0.01e-3
 
 
+@pytest.mark.long
 def test_identify_finds_the_truth_of_the_finger(fit, session):
     """Moment arms to 0.02 mm, torques to 0.15 N mm over the angles that were driven, tendon friction to 2 %."""
     truth = default_truth()
@@ -76,6 +92,7 @@ def test_identify_finds_the_truth_of_the_finger(fit, session):
         assert found[f"damping {joint}"] == pytest.approx(truth.damping[j], abs=3e-5)
 
 
+@pytest.mark.long
 def test_the_model_predicts_excursion_along_a_free_path(fit, session):
     """VD.1: f(q) − f(q(0)) with the fitted polynomials, to 0.02 mm rms."""
     found = {row["name"]: row["value"] for row in fit.table()}
@@ -91,6 +108,7 @@ def test_the_model_predicts_excursion_along_a_free_path(fit, session):
         assert np.std(error) < 0.02e-3
 
 
+@pytest.mark.long
 def test_the_model_predicts_the_fingertips_force(fit, session):
     """VD.2: the slope of the fingertip's force against tension to 3 %; nothing of it was fitted."""
     slopes = {s.axis: s for s in validate(fit, session.select("VD.2"), ("VD.2",)).slopes}
