@@ -7,10 +7,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.costs import Costs, Key
-from jaxfinger.gap.exact import Bench, SearchState, Whitened, fitted, prior_products
+from jaxfinger.gap.exact import (
+    Bench,
+    SearchState,
+    Whitened,
+    amplitudes_of,
+    as_variant,
+    fitted,
+    led_plainly,
+    prior_products,
+)
 from jaxfinger.gap.formula import Evidence, Judged, Linear, Weights, unexplained
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.screening import Part
@@ -293,8 +301,8 @@ class Search:
     ) -> SearchState:
         """The state with an offer, or without a cause, or both, fitted exactly."""
         kept = [i for i in range(len(state.effects)) if i != without]
-        variants = [_as_variant(state.effects[i], state.problem.scales) for i in kept]
-        starts = [{n: float(getattr(state.effects[i], n)) for n in type(state.effects[i]).amplitudes()} for i in kept]
+        variants = [as_variant(state.effects[i], state.problem.scales) for i in kept]
+        starts = [amplitudes_of(state.effects[i]) for i in kept]
         if offer is not None:
             self.progress(f"fitting with {offer.effect} at {', '.join('-'.join(s) for _, s in offer.keys)}")
             mine = {i: float(a) for i, a in zip(offer.columns.tolist(), amplitudes, strict=True)}
@@ -323,10 +331,10 @@ class Search:
             grids, shapes = effect.worth_trying(scales, state.effects[i].site), effect.shape_parameters()
             for name in (n for n, p in shapes.items() if p.moves == "not"):
                 for value in set(grids[name]) - {float(getattr(best.effects[i], name))}:
-                    variants = [_as_variant(e, scales) for e in best.effects]
+                    variants = [as_variant(e, scales) for e in best.effects]
                     variants[i] = variants[i].with_shape(**{name: value})
                     if effect.sensible(scales, variants[i].site, dict(variants[i].shape)):
-                        starts = [{n: float(getattr(e, n)) for n in e.amplitudes()} for e in best.effects]
+                        starts = [amplitudes_of(e) for e in best.effects]
                         other = self._fitted(best.problem, variants, starts, best.judged.weights)
                         best = max(best, other, key=lambda x: x.score)
         return best
@@ -362,12 +370,24 @@ class Search:
     def _best(self, state: SearchState, tried: Iterable[SearchState]) -> SearchState | None:
         """That which is worth most, in its best form, if it is worth more than the state."""
         best = max(tried, key=self.value, default=state)
-        return self.in_its_best_form(best, len(state.effects)) if self.value(best) > self.value(state) else None
+        if self.value(best) <= self.value(state):
+            return None
+        best = self.in_its_best_form(best, len(state.effects))
+        return self._led_plainly(best) if self._open(best) else best
+
+    def _led_plainly(self, state: SearchState) -> SearchState:
+        found = led_plainly(self.bench, state)
+        self.visited.add(found.keys, found.judged.evidence)
+        return found
+
+    def _open(self, state: SearchState) -> bool:
+        """Whether more is left than the formula takes for noise and inexact laws."""
+        left = unexplained(self.bench.columns.counts, state.judged.evidence, self.bench.parameters)
+        return bool(left.sum() > self.bench.parameters.open)
 
     def _pairs(self, state: SearchState, firsts: Sequence[SearchState]) -> Iterator[SearchState]:
         """Two causes more where neither alone is worth its cost, since each is hidden by what the other leaves open."""
-        left = unexplained(self.bench.columns.counts, state.judged.evidence, self.bench.parameters)
-        if left.sum() > self.bench.parameters.open:
+        if self._open(state):
             for first in firsts:
                 yield from self._tried(first, state, most=1)
 
@@ -433,8 +453,3 @@ class Search:
             if (best := self._best_of(screened, key)) is not None:
                 out[key] = (*best, screened.linear.std(best[0].columns, screened.now.weights))
         return out
-
-
-def _as_variant(effect: CatalogueEffect, scales: Scales) -> Variant:
-    shapes = tuple((n, float(getattr(effect, n))) for n in effect.shape_parameters())
-    return Variant(type(effect), effect.site, shapes, scales=scales)

@@ -7,7 +7,7 @@ import pytest
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap.augment import as_refitted, augmented_fit, nominal_fit
-from jaxfinger.gap.exact import Bench, at_one_model, fitted, orthonormalised
+from jaxfinger.gap.exact import Bench, at_one_model, fitted, led_plainly, orthonormalised
 from jaxfinger.gap.formula import Parameters, Weights
 from jaxfinger.gap.problem import build, moved
 from jaxfinger.gap.signatures import Signatures, Variant
@@ -130,29 +130,29 @@ def test_an_amplitude_that_changes_nothing_keeps_a_size(session):
 def led(scaled):
     bench = Bench.of(scaled, Parameters())
     variant = Variant(CATALOGUE["torque_sensor_scale"], ("torque_sensor",), (), scales=scaled.scales)
-    return bench, fitted(bench, scaled, [variant], [{"gain": 0.05}], white(bench))
+    return bench, led_plainly(bench, fitted(bench, scaled, [variant], [{"gain": 0.05}], white(bench)))
 
 
-SLOWLY = pytest.mark.xfail(
-    strict=True,
-    reason="A set's rounds end before an effect of a fifth has led the nominal model all the way: columns that are "
-    "still open pull little at it. The joint fit at the end of a whole diagnosis goes there.",
-)
-
-
-@SLOWLY
 @pytest.mark.long
 def test_a_large_effect_is_judged_where_it_leads(scaled):
-    """A sensor's gain multiplies the torques refitted with it: where it leads, an exact fit finds no better."""
+    """A sensor's gain multiplies the torques refitted with it: the formula finds nothing better where an exact fit
+    leads.
+    """
     bench, state = led(scaled)
     exact = augmented_fit(scaled, state)
-    assert float(state.effects[0].gain) == pytest.approx(GAIN, abs=0.02)
-    assert float(np.sum(state.r**2)) == pytest.approx(float(np.sum(exact.r**2)), rel=0.02)
-    assert float(np.sum(exact.r**2)) < 1.1 * scaled.r.size
-    assert bench.gap**2 > 2.0 * float(np.sum(exact.r**2))
+    (effect,) = exact.fit.model.effects
+    nominal = np.asarray(ravel(exact.fit.model))[scaled.free] - np.asarray(ravel(scaled.nominal))[scaled.free]
+    there = at_one_model(bench, moved(scaled, nominal), [effect], white(bench))
+    assert float(state.effects[0].gain) == pytest.approx(GAIN, abs=0.005)
+    assert float(effect.gain) == pytest.approx(GAIN, abs=0.005)
+    assert state.score - bench.null.score > 0.95 * (there.score - bench.null.score) > 100.0
 
 
-@SLOWLY
+@pytest.mark.xfail(
+    strict=True,
+    reason="A quick refit leaves out the products of effects and nominal parameters: a gain of a fifth moves some by "
+    "several of their standard deviations.",
+)
 @pytest.mark.long
 def test_where_a_set_has_led_is_the_exact_fit(scaled):
     """Within the intervals, and what its parts miss is what the model misses."""
