@@ -27,6 +27,7 @@ def check(file: Path, *, json: bool = False) -> None:
         Print the findings as JSON.
     """
     from jaxfinger.data import check_file
+    from jaxfinger.data.findings import together
 
     with progress("check") as say:
         say(file.name)
@@ -35,8 +36,9 @@ def check(file: Path, *, json: bool = False) -> None:
     if json:
         print_json({"file": file, "ok": not errors, "findings": [asdict(f) for f in findings]})
     else:
-        for finding in findings:
-            console().print(plain(finding), markup=False, soft_wrap=True)
+        for finding in together(findings):
+            said = f"{finding.severity}: {file}: {finding.message}" if finding.place == "/" else finding
+            console().print(plain(said), markup=False, soft_wrap=True)
         rest = len(findings) - errors
         found = f"{counted(errors, 'error')}, {counted(rest, 'remark')}" if findings else "nothing to complain about"
         print(f"{file}: {found}")

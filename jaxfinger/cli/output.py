@@ -121,7 +121,9 @@ def plain(text: object) -> str:
 
 def remark(findings: Iterable[Finding], file: Path) -> None:
     """What the checker warns of, on stderr, so that no command works on doubtful numbers without a word."""
-    warnings = [finding for finding in findings if finding.severity == "warning" or finding.local]
+    from jaxfinger.data.findings import together
+
+    warnings = together(finding for finding in findings if finding.severity == "warning" or finding.local)
     for finding in warnings[:MOST_REMARKS]:
         print(plain(f"{file}: {finding}"), file=sys.stderr)
     if len(warnings) > MOST_REMARKS:

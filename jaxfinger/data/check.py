@@ -10,6 +10,7 @@ from datetime import datetime
 import h5py
 import numpy as np
 
+from jaxfinger.data.check_columns import check_columns
 from jaxfinger.data.check_finger import check_finger
 from jaxfinger.data.check_trial import check_trial
 from jaxfinger.data.check_work import check_work
@@ -141,6 +142,7 @@ def examine(session: Session, report: Report) -> None:
         check_spikes(session, report)
         if report.fatal is None:
             check_work(session, report)
+            check_columns(session, report)
 
 
 def check_spikes(session: Session, report: Report) -> None:

@@ -46,10 +46,9 @@ def _finite(finger: FingerDescription, report: Report) -> bool:
             if entry.kind != "float" or (value := getattr(finger, entry.name)) is None:
                 continue
             bad = ~np.isfinite(value).reshape(finger.m, -1).all(axis=1)
-            for name in np.array(finger.joint_names)[bad]:
-                report.error(
-                    f"/finger/{folder}/{entry.name}", f"joint {name} has a value that is not finite; write a number"
-                )
+            for i in np.flatnonzero(bad):
+                message = f"joint {finger.joint_names[i]} has a value that is not finite; write a number"
+                report.error(f"/finger/{folder}/{entry.name}", message, row=int(i))
                 ok = False
     if not np.isfinite(finger.fingertip).all():
         report.error("/finger/fingertip", "is not finite; write the contact point in the last link's frame")
@@ -70,15 +69,14 @@ def _gravity(finger: FingerDescription, report: Report) -> None:
 
 
 def _joints(finger: FingerDescription, report: Report) -> None:
-    for name, axis, (lower, upper) in zip(finger.joint_names, finger.axis, finger.limits, strict=True):
+    for i, (name, axis, (lower, upper)) in enumerate(zip(finger.joint_names, finger.axis, finger.limits, strict=True)):
         size = float(np.linalg.norm(axis))
         if abs(size - 1.0) > _UNIT_AXIS:
-            report.error("/finger/joints/axis", f"joint {name} has an axis {size:.4g} long; divide it by its length")
+            message = f"joint {name} has an axis {size:.4g} long; divide it by its length"
+            report.error("/finger/joints/axis", message, row=i)
         if lower >= upper:
-            report.error(
-                "/finger/joints/limits",
-                f"joint {name} has its lower limit {lower:.4g} at or above its upper {upper:.4g}; swap them",
-            )
+            message = f"joint {name} has its lower limit {lower:.4g} at or above its upper {upper:.4g}; swap them"
+            report.error("/finger/joints/limits", message, row=i)
     angles = np.abs(finger.limits[~np.array(finger.prismatic)])
     if angles.size and angles.max() > 2 * np.pi + 0.1:
         report.error(
@@ -90,10 +88,10 @@ def _links(finger: FingerDescription, report: Report) -> None:
     for i, name in enumerate(finger.joint_names):
         mass = finger.mass[i]
         if mass <= 0.0:
-            report.error(
-                "/finger/links/mass", f"the link of joint {name} weighs {mass:.4g} kg; a mass must be positive"
-            )
-        _inertia(finger.inertia[i], mass, name, report)
+            message = f"the link of joint {name} weighs {mass:.4g} kg; a mass must be positive"
+            report.error("/finger/links/mass", message, row=i)
+        if (fault := _inertia(finger.inertia[i], mass)) is not None:
+            report.error("/finger/links/inertia", f"the link of joint {name} has {fault}", row=i)
     for key in ("mass_std", "com_std"):
         value = getattr(finger, key)
         if value is not None and np.any(value < 0.0):
@@ -116,25 +114,22 @@ def _weight(finger: FingerDescription, report: Report) -> None:
         )
 
 
-def _inertia(inertia: np.ndarray, mass: float, name: str, report: Report) -> None:
-    place, whose = "/finger/links/inertia", f"the link of joint {name}"
+def _inertia(inertia: np.ndarray, mass: float) -> str | None:
+    """What no body has, or None."""
     scale = float(np.abs(inertia).max())
     if np.abs(inertia - inertia.T).max() > _ROUNDING * scale:
-        report.error(
-            place, f"{whose} has an inertia that is not symmetric; write the full matrix with both halves equal"
-        )
-        return
+        return "an inertia that is not symmetric; write the full matrix with both halves equal"
     small, middle, large = np.linalg.eigvalsh(inertia)
     if small <= 0.0:
-        report.error(place, f"{whose} has the principal inertia {small:.3g} kg m2; all three must be positive")
-    elif large > (small + middle) * (1.0 + _ROUNDING):
-        report.error(
-            place,
-            f"{whose} has principal inertias {small:.3g}, {middle:.3g}, {large:.3g} kg m2; no body has one larger than "
-            "the sum of the others; check frame, signs and units",
+        return f"the principal inertia {small:.3g} kg m2; all three must be positive"
+    if large > (small + middle) * (1.0 + _ROUNDING):
+        return (
+            f"principal inertias {small:.3g}, {middle:.3g}, {large:.3g} kg m2; no body has one larger than the sum of "
+            "the others; check frame, signs and units"
         )
-    elif mass > 0.0 and large / mass > _LARGEST_FINGER**2:
-        report.error(place, f"{whose} has a radius of gyration of {np.sqrt(large / mass):.3g} m; convert to kg m2")
+    if mass > 0.0 and large / mass > _LARGEST_FINGER**2:
+        return f"a radius of gyration of {np.sqrt(large / mass):.3g} m; convert to kg m2"
+    return None
 
 
 def _lengths(finger: FingerDescription, report: Report) -> None:
@@ -149,13 +144,13 @@ def _lengths(finger: FingerDescription, report: Report) -> None:
 
 def _tendons(finger: FingerDescription, report: Report) -> None:
     place = "/finger/tendons/crosses"
-    for name, active, crosses in zip(finger.tendon_names, finger.active, finger.crosses, strict=True):
-        if not crosses.any():
-            say = report.error if active else report.warning
-            say(
-                place,
-                f"{'active' if active else 'passive'} tendon {name} crosses no joint; mark the joints that it spans",
-            )
+    for k, (name, active) in enumerate(zip(finger.tendon_names, finger.active, strict=True)):
+        if not finger.crosses[k].any():
+            said = f"tendon {name} crosses no joint; mark the joints that it spans"
+            if active:
+                report.error(place, f"active {said}", row=k)
+            else:
+                report.warning(place, f"passive {said}")
 
 
 def _excursion(finger: FingerDescription, report: Report) -> None:
@@ -175,11 +170,17 @@ def _excursion(finger: FingerDescription, report: Report) -> None:
             continue
         spread = np.zeros_like(known) if std is None else std[k]
         if not (np.isfinite(known).all() and np.isfinite(spread).all()):
-            report.error(place, f"tendon {name} has values that are not finite; write all of them, or NaN throughout")
+            report.error(
+                place, f"tendon {name} has values that are not finite; write all of them, or NaN throughout", row=k
+            )
         elif np.any(spread < 0.0):
-            report.error(f"{place}_std", f"tendon {name} has a negative standard deviation; write its size")
+            report.error(f"{place}_std", f"tendon {name} has a negative standard deviation; write its size", row=k)
         elif np.any(known[~finger.crosses[k]] != 0.0):
             joint = finger.joint_names[int(np.argmax((known != 0.0).any(axis=1) & ~finger.crosses[k]))]
-            report.error(place, f"tendon {name} is pulled in by joint {joint}, which it does not cross; correct one")
+            report.error(
+                place, f"tendon {name} is pulled in by joint {joint}, which it does not cross; correct one", row=k
+            )
         elif np.abs(known[:, 0]).max(initial=0.0) > _LARGEST_ARM and not any(finger.prismatic):
-            report.error(place, f"tendon {name} has a moment arm of {np.abs(known[:, 0]).max():.4g} m; convert mm to m")
+            report.error(
+                place, f"tendon {name} has a moment arm of {np.abs(known[:, 0]).max():.4g} m; convert mm to m", row=k
+            )

@@ -160,10 +160,12 @@ def _sound(finger: FingerDescription, place: Place) -> FingerDescription:
     """The finger, unless the checker refuses it."""
     report = Report()
     check_finger(finger, report)
-    if report.fatal is not None:
-        place.fail(
-            f"{report.fatal.place.removeprefix('/finger').strip('/')}: {report.fatal.message}".removeprefix(": ")
-        )
+    if (fault := report.fatal) is not None:
+        kind, *key = fault.place.removeprefix("/finger").strip("/").split("/")
+        if fault.row is not None:  # a link is written with its joint
+            place = place / ("tendons" if kind == "tendons" else "joints") / fault.row / key[0]
+            place.fail(fault.message)
+        place.fail(": ".join(filter(None, ["/".join([kind, *key]), fault.message])))
     return finger
 
 

@@ -1,0 +1,127 @@
+"""Does a column of tendon_excursion belong to the tendon whose name it has? What tells two apart without a model:
+
+1. While one joint turns alone (ID.2), a tendon that crosses it travels, and one that does not stands still.
+2. Where the finger's description knows excursions, ID.2 shows the same ones.
+3. A tendon that is pulled at a held posture (ID.4) stretches, and no other.
+
+Only two columns of which each shows what the other should are named: anything less has other reasons too.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from itertools import combinations
+
+import numpy as np
+
+from jaxfinger.data.check_trial import STILL_JOINT
+from jaxfinger.data.findings import Report
+from jaxfinger.data.session import FingerDescription, Session, Trial
+
+_SAMPLES = 400  # of a trial; slopes of a motion need no more
+_STILL, _TRAVELS = (
+    0.05,
+    0.25,
+)  # of the largest travel at a joint: at most where a tendon stands still, at least where not
+_BETTER = 0.25  # of the misfit that columns have as they are, the most that they have exchanged
+_APART = 0.2  # of the known arms, the least such misfit: CAD and its tolerances are closer
+_TOLD = 0.9  # of a column's variance, what the tension explains at least where it stretches the tendon
+
+
+def check_columns(session: Session, report: Report) -> None:
+    """Report pairs of tendons whose columns look exchanged, each once, by the first evidence that tells."""
+    if any(session.finger.prismatic):
+        return
+    told: set[tuple[int, int]] = set()
+    arms = _arms(session)
+    for evidence in (_by_crossing(session.finger, arms), _by_description(session.finger, arms), _by_stretch(session)):
+        for pair, why in evidence:
+            if pair not in told:
+                told.add(pair)
+                first, second = (session.finger.tendon_names[k] for k in pair)
+                message = f"columns {first} and {second} of tendon_excursion look exchanged: {why}"
+                report.warning("/trials", f"{message}; exchange them, or mend what they are held against")
+
+
+def _arms(session: Session) -> dict[int, np.ndarray]:
+    """By joint: dl/dq of each tendon, m/rad, the median of those trials of ID.2 in which no other joint turns."""
+    found: dict[int, list[np.ndarray]] = defaultdict(list)
+    for trial in session.select("ID.2"):
+        spans = np.ptp(trial.q, axis=0)
+        i = int(np.argmax(np.nan_to_num(spans)))
+        if trial.tendon_excursion is not None and np.all(np.delete(spans, i) < STILL_JOINT) and spans[i] > STILL_JOINT:
+            found[i].append(np.array([_line(trial.q[:, i], l)[0] for l in trial.tendon_excursion.T]))
+    return {i: np.median(arms, axis=0) for i, arms in found.items()}
+
+
+def _by_crossing(finger: FingerDescription, arms: dict[int, np.ndarray]) -> Iterator[tuple[tuple[int, int], str]]:
+    for i, seen in arms.items():
+        size = np.abs(seen) / np.nanmax(np.abs(seen[finger.active]), initial=0.0)
+        still = np.flatnonzero(finger.active & finger.crosses[:, i] & (size < _STILL))
+        travel = np.flatnonzero(finger.active & ~finger.crosses[:, i] & (size > _TRAVELS))
+        if len(still) == len(travel) == 1:
+            (a,), (b,) = still, travel
+            names, joint = finger.tendon_names, finger.joint_names[i]
+            yield (
+                (min(a, b), max(a, b)),
+                f"where joint {joint} turns alone (ID.2), {names[b]}, which does not cross it, is pulled in by "
+                f"{1e3 * abs(seen[b]):.3g} mm a radian, and {names[a]}, which does, by {1e3 * abs(seen[a]):.2g} mm",
+            )
+
+
+def _by_description(finger: FingerDescription, arms: dict[int, np.ndarray]) -> Iterator[tuple[tuple[int, int], str]]:
+    if finger.excursion is None:
+        return
+    powers = np.arange(1, finger.excursion.shape[2] + 1)
+    for a, b in combinations(np.flatnonzero(finger.active), 2):
+        own, crossed, size, said = 0.0, 0.0, 0.0, ""
+        for i, seen in arms.items():
+            middle = finger.limits[i].mean()
+            known = finger.excursion[[a, b], i] @ (powers * middle ** (powers - 1))
+            if np.isfinite([*known, seen[a], seen[b]]).all():
+                own += np.abs(seen[[a, b]] - known).sum()
+                crossed += np.abs(seen[[b, a]] - known).sum()
+                size += np.abs(known).sum()
+                shown, told = (" and ".join(f"{1e3 * arm:.3g}" for arm in x) for x in (seen[[a, b]], known))
+                said = (
+                    said or f"ID.2 shows {shown} mm a radian at {finger.joint_names[i]}, the finger's file says {told}"
+                )
+        if own > _APART * size and crossed < _BETTER * own:
+            yield (int(a), int(b)), f"{said} (where both are the other way round for each tendon: correct the signs)"
+
+
+def _by_stretch(session: Session) -> Iterator[tuple[tuple[int, int], str]]:
+    finger = session.finger
+    moves: dict[int, set[int]] = defaultdict(set)
+    for trial in session.select("ID.4"):
+        if (
+            trial.tendon in finger.tendon_names
+            and trial.tendon_excursion is not None
+            and trial.tendon_force is not None
+        ):
+            moves[finger.tendon_names.index(trial.tendon)] |= _stretched(trial, finger)
+    for a, b in combinations(sorted(moves), 2):
+        if moves[a] == {b} and moves[b] == {a}:
+            names = finger.tendon_names
+            yield (a, b), f"where {names[a]} is pulled (ID.4), {names[b]} gives way alone, and the other way round"
+
+
+def _stretched(trial: Trial, finger: FingerDescription) -> set[int]:
+    """Tendons whose excursion follows the tension of the one that is pulled."""
+    if trial.tendon_force is None or trial.tendon_excursion is None:
+        return set()
+    pull = trial.tendon_force[:, finger.tendon_names.index(trial.tendon or "")]
+    return {int(k) for k in np.flatnonzero(finger.active) if _line(pull, trial.tendon_excursion[:, k])[1] > _TOLD}
+
+
+def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Slope of y on x, and the share of the variance that it explains; NaN where x stands still."""
+    thin = slice(None, None, max(1, len(x) // _SAMPLES))
+    x, y = x[thin], y[thin]
+    good = np.isfinite(x) & np.isfinite(y)
+    if good.sum() < 10 or np.ptp(x[good]) == 0.0:
+        return np.nan, np.nan
+    x, y = x[good] - x[good].mean(), y[good] - y[good].mean()
+    slope = float(x @ y / (x @ x))
+    return slope, slope**2 * float(x @ x) / max(float(y @ y), 1e-300)
