@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxfinger.data import Session, import_file, read_session
+from jaxfinger.data import Session, read_session
+from jaxfinger.data.importers import import_file
 from jaxfinger.gap import diagnose
 from jaxfinger.gap.columns import Columns
 from jaxfinger.gap.exact import Whitened

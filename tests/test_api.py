@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import jaxfinger as jf
-from jaxfinger.data import import_file
+from jaxfinger.data.importers import import_file
 from jaxfinger.identify.stages import identify
 from jaxfinger.table import Table
 

@@ -1,13 +1,29 @@
 """Which commands there are; each is imported when it runs."""
 
 from collections.abc import Callable
+from functools import reduce
 
-from cyclopts import App, Parameter
+from cyclopts import App, CycloptsError, CycloptsPanel, MissingArgumentError, Parameter
+from rich.text import Text
 
 from jaxfinger.cli import completion
 
+
+def _said(error: CycloptsError) -> object:
+    """What a command needs and was not given, as its help says it; of other errors what cyclopts says."""
+    lacking = error.argument
+    if not isinstance(error, MissingArgumentError) or lacking is None or error.keyword or not error.command_chain:
+        return CycloptsPanel(error)
+    name = lacking.name if lacking.index is None else lacking.name.strip("-").upper()
+    command = reduce(App.__getitem__, error.command_chain, app)
+    known = command.assemble_argument_collection(parse_docstring=True)
+    says = next(argument.parameter.help for argument in known if argument.name == lacking.name)
+    return Text(f"jaxfinger: {' '.join(error.command_chain)} needs {name}: {says}")
+
+
 app = App(
     name="jaxfinger",
+    error_formatter=_said,
     help="Identify the dynamic model of a tendon-driven finger, and say why the simulation still differs from it.",
     default_parameter=Parameter(negative=()),
 )

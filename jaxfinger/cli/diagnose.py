@@ -93,7 +93,7 @@ def diagnose(
             told("writing the report")
             write(d, folder, overwrite)
             write_page(d, folder / "report.html", overwrite)
-            texts[name], gaps[name] = summary(d), as_gap_json(d)
+            texts[name], gaps[name] = summary(d, own), as_gap_json(d)
             found[name] = replace(d, problem=None)  # which holds every row of the session
     if json:
         print_json(gaps if len(gaps) > 1 else gaps[sessions[0].name])

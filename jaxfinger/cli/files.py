@@ -185,8 +185,8 @@ def import_(
     if not sources:
         raise UserError(f"{mapping}: no recording was given; name at least one before --mapping")
     refuse_output(output, overwrite)
-    from jaxfinger.data import import_file
     from jaxfinger.data.findings import Report
+    from jaxfinger.data.importers import import_file
 
     report = Report()
     try:

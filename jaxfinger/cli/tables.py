@@ -133,6 +133,8 @@ def _parameters(parameters: list[dict]) -> list[tuple[str, str, str]]:
 
 def print_validation(result: Validation) -> None:
     """One row a channel's column."""
+    from jaxfinger.report.sentences import EXPERIMENTS
+
     print(plain(f"{result.specimen} · {result.session}\n"))
     for experiment in dict.fromkeys(s.experiment for s in result.scores):
         rows = []
@@ -141,7 +143,7 @@ def print_validation(result: Validation) -> None:
             what = s.channel + (f", {s.method}" if s.method else "")
             rows.append((what, s.column, number(s.rms), number(s.mean), number(s.noise), number(ratio, 2), s.units))
         header = ("channel", "", "rms error", "mean error", "noise", "rms/noise", "")
-        table(experiment, header, rows, left=2)
+        table(f"{experiment}: {EXPERIMENTS[experiment]}", header, rows, left=2)
     if result.slopes:
         rows = [
             (

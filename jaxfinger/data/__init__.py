@@ -1,4 +1,4 @@
-"""Sessions: read, write and check the HDF5 format; filtering, derivatives, directions, holds, decimation; importers."""
+"""Sessions: read, write and check the HDF5 format; filtering, derivatives, directions, holds, decimation."""
 
 from jaxfinger.data.check import check_file as check_file
 from jaxfinger.data.filtering import bridged as bridged
@@ -13,7 +13,6 @@ from jaxfinger.data.findings import Finding as Finding
 from jaxfinger.data.hdf5 import data_hash as data_hash
 from jaxfinger.data.hdf5 import read_session as read_session
 from jaxfinger.data.hdf5 import write_session as write_session
-from jaxfinger.data.importers import import_file as import_file
 from jaxfinger.data.motion import directions as directions
 from jaxfinger.data.motion import find_holds as find_holds
 from jaxfinger.data.motion import turned_on_time as turned_on_time

@@ -64,7 +64,7 @@ def _by_crossing(finger: FingerDescription, arms: dict[int, np.ndarray]) -> Iter
             (a,), (b,) = still, travel
             names, joint = finger.tendon_names, finger.joint_names[i]
             yield (
-                (min(a, b), max(a, b)),
+                (int(min(a, b)), int(max(a, b))),
                 f"where joint {joint} turns alone (ID.2), {names[b]}, which does not cross it, is pulled in by "
                 f"{1e3 * abs(seen[b]):.3g} mm a radian, and {names[a]}, which does, by {1e3 * abs(seen[a]):.2g} mm",
             )

@@ -211,7 +211,9 @@ def _friction_share(trial: Trial, joint: int) -> float:
         return np.nan  # only ever one way: friction and elastic torque trade off
     if trial.experiment != "ID.3-static" and np.count_nonzero(np.diff(columns[:, 0])) < _TURNS:
         return np.nan
-    return float(np.linalg.lstsq(columns, torque[way != 0.0])[0][0] / np.std(torque))
+    R = np.asarray(np.linalg.qr(np.column_stack([columns, torque[way != 0.0]]), mode="r"))
+    least = np.linalg.lstsq(R[:-1, :-1], R[:-1, -1])[0]  # also of fewer held angles than coefficients
+    return float(least[0] / np.std(torque))
 
 
 def _way(trial: Trial, joint: int, cutoff: float) -> np.ndarray:

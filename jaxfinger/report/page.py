@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -77,6 +77,7 @@ def render(d: Diagnosis, trace: Trace | None = None, found: Curves | None = None
         accent=ACCENTS[d.status],
         headline=sentences.headline(d),
         summary=unbroken(sentences.summary(d)),
+        experiments={k: v for k, v in sentences.EXPERIMENTS.items() if k in {*_experiments(d)}},
         budget=_budget(d) if d.channels else "",
         hidden_bars=max(len(d.channels) - gap_plots.MOST, 0),
         relevance=[_relevance(x) for x in d.relevance if x.tolerated or d.status is not Status.NO_GAP],
@@ -105,6 +106,12 @@ def render(d: Diagnosis, trace: Trace | None = None, found: Curves | None = None
         noise=_noise(d, prismatic),
         versions=", ".join(f"{k} {v}" for k, v in d.nominal.versions.items()),
     )
+
+
+def _experiments(d: Diagnosis) -> Iterator[str]:
+    """Those that the page speaks of."""
+    for found in (d.channels, d.closures, d.relevance, d.where, d.left, d.not_judged):
+        yield from (x.experiment for x in found)
 
 
 # Pictures -------------------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from jaxfinger.gap.result import Cause, ChannelBudget, Closure, Diagnosis, Key
 from jaxfinger.report import sentences
@@ -15,8 +15,8 @@ SIGNS = "█▓▒░▚▞"  # a cause each
 NOISE, TOGETHER, OPEN = "·", "+", "?"
 
 
-def summary(d: Diagnosis) -> str:
-    """Verdict, budget, causes, how far it closes, what next."""
+def summary(d: Diagnosis, own: Iterable[str] = ()) -> str:
+    """Verdict, budget, causes, how far it closes, what next; and what came of the user's `own` effects, by id."""
     out = [f"{d.specimen} · {d.data}{f' · beside {d.against}' if d.against else ''}", "", sentences.headline(d)]
     out += [*_wrapped(sentences.summary(d)), ""]
     if d.channels:
@@ -29,6 +29,9 @@ def summary(d: Diagnosis) -> str:
     if lines := shown(d.closures):
         out += ["HOW FAR    rms on held-out trials: noise, before → after, share closed (95 % interval)"]
         out += [_line(x) for x in lines] + [""]
+    named = {key.effect for key in d.named}
+    if lines := [_not_named(effect, d) for effect in own if effect not in named]:
+        out += ["YOURS      effects of your own that are not named", *lines, ""]
     if step := d.next_experiment:
         out += ["NEXT       " + f"{step.experiment}: {sentences.next_trial(step)}", ""]
     return "\n".join(out).rstrip()
@@ -86,6 +89,17 @@ def _cause(k: int, c: Cause) -> list[str]:
     at = [f" {'-'.join(v.site)}" if len(c.sites) > 1 else "" for v in c.values]
     values = [f"{v.name}{where} {measured(v.value, v.std, v.units)}" for v, where in zip(c.values, at, strict=True)]
     return [f"  {SIGNS[k % len(SIGNS)]} {sentences.cause_name(c)}: {says}", *_wrapped("; ".join(values), " " * 6)]
+
+
+def _not_named(effect: str, d: Diagnosis) -> str:
+    """How probable an effect is where it is likeliest, or why nothing is known of it."""
+    name = sentences.effect_name(effect)
+    if tried := [c for c in d.candidates if c.key.effect == effect]:
+        likeliest = max(tried, key=lambda c: c.probability)
+        return f"  {name}: probability {percent(likeliest.probability)} at {sentences.site_names([likeliest.key.site])}"
+    if any(x.key.effect == effect for x in d.absorbed):
+        return f"  {name}: the model's own parameters imitate it in these trials"
+    return f"  {name}: no trial shows it"
 
 
 def _line(x: Closure) -> str:

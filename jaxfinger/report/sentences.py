@@ -44,6 +44,15 @@ CHANNELS = {
     "tendon_force": "tendon force",
     "q": "simulated angle",
 }
+EXPERIMENTS = {
+    "ID.2": "one joint is moved slowly through its range, tendons taut",
+    "ID.3-static": "a motor takes a joint from one held angle to the next, tendons slack",
+    "ID.3-dynamic": "a motor sweeps joints at several speeds, tendons slack",
+    "ID.4": "at held joints one tendon is pulled, and let go again",
+    "VD.1": "all joints are moved along a free path, tendons taut",
+    "VD.2": "one tendon pulls the fingertip against a force sensor",
+    "VD.3": "tendons move the free finger",
+}
 VARIABLES = {
     "q": "the joint's own position",
     "qd": "speed",

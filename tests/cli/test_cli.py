@@ -356,3 +356,18 @@ def test_bash_completes_what_was_begun(capsys):
     ask = "COMP_WORDS=(jaxfinger iden); COMP_CWORD=1; _jaxfinger; echo ${COMPREPLY[@]}"
     script = f"{capsys.readouterr().out}\n{ask}"
     assert subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True).stdout == "identify\n"
+
+
+@pytest.mark.parametrize(
+    ("tokens", "says"),
+    [
+        (["validate", "fit.json"], "validate needs FILE: Session (HDF5), best of trials that the fit has not seen."),
+        (["fit", "id2"], "fit id2 needs FILE: Session (HDF5)."),
+        (["predict", "fit.json", "s.h5"], "predict needs --output: Predictions to write (HDF5)."),
+    ],
+)
+def test_what_a_command_needs_is_said_in_a_sentence(tokens, says, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(tokens)
+    assert end.value.code == 2
+    assert " ".join(capsys.readouterr().err.split()) == f"jaxfinger: {says}"

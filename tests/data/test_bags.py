@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from jaxfinger.data import check_file, import_file, read_session
+from jaxfinger.data import check_file, read_session
+from jaxfinger.data.importers import import_file
 from jaxfinger.data.sources import load_recording
 from jaxfinger.errors import UserError
 from tests.data.conftest import ONE_JOINT

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import scipy.io
 
-from jaxfinger.data import import_file
 from jaxfinger.data.findings import Report
+from jaxfinger.data.importers import import_file
 from jaxfinger.errors import UserError
 from tests.data.conftest import ONE_JOINT
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import scipy.io
 
-from jaxfinger.data import check_file, import_file, read_session, smooth
+from jaxfinger.data import check_file, read_session, smooth
+from jaxfinger.data.importers import import_file
 from jaxfinger.data.matlab import load_mat
 from jaxfinger.errors import UserError
 from tests.data.conftest import ONE_JOINT

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from jaxfinger.data import import_file, read_session
+from jaxfinger.data import read_session
+from jaxfinger.data.importers import import_file
 from jaxfinger.gap import Status, diagnose
 from jaxfinger.identify import read_recipe
 

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfinger.data import FingerDescription, Session, Trial, import_file, read_session
+from jaxfinger.data import FingerDescription, Session, Trial, read_session
+from jaxfinger.data.importers import import_file
 from jaxfinger.data.sizes import LIKE
 from jaxfinger.identify import Recipe, identify, read_recipe
 from jaxfinger.identify.parameters import describe, ravel

@@ -30,6 +30,15 @@ def test_a_bar_shows_every_part():
     assert "▓ joint Stribeck at PIP" in text
 
 
+def test_what_came_of_effects_of_ones_own_is_said():
+    d = ALL["no_gap"]
+    text = summary(d, ["tendon_stretch", "tendon_creep"])
+    assert "tendon stretch: probability 2 % at T3" in text
+    assert "tendon creep: no trial shows it" in text
+    assert "YOURS" not in summary(ALL["two"], ["tendon_stretch"])  # which is named
+    assert "YOURS" not in summary(d)
+
+
 def test_a_table_of_several_sessions_says_which_cause_is_at_work_in_which():
     header, rows = across(
         {
