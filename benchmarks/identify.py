@@ -16,7 +16,6 @@ All of it as median and spread of five runs.
 import argparse
 import itertools
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -78,20 +77,22 @@ print(used.ru_utime + used.ru_stime, time.perf_counter() - begun, used.ru_maxrss
 
 
 def measured(session: Path, folder: Path, cold: bool = False) -> np.ndarray:
-    """Processor seconds, wall seconds and peak MiB of five runs of `jaxfinger identify`, (runs, 3)."""
-    compiled, rows = folder / "compiled", []
-    for run in range(RUNS):
-        cache = folder / f"cold-{run}" if cold else compiled
-        command = ["-m", "jaxfinger", "identify", str(session), "-o", str(folder / "fit.json"), "--overwrite"]
+    """Processor seconds, wall seconds and peak MiB of five runs of `jaxfinger identify`, (runs, 3): each with an empty
+    compile cache of its own, or with one that a run before them has filled.
+    """
+    command = [sys.executable, "-m", "jaxfinger", "identify", str(session), "-o", str(folder / "fit.json")]
+    rows = []
+    for run in range(RUNS if cold else RUNS + 1):
+        cache = str(folder / (f"compiled-{run}" if cold else "compiled"))
         line = subprocess.run(
-            [sys.executable, "-c", MEASURED, sys.executable, *command],
-            check=True, capture_output=True, text=True, env=os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache)},
-        )  # fmt: skip
+            [sys.executable, "-c", MEASURED, *command, "--overwrite"],
+            check=True,
+            capture_output=True,
+            text=True,
+            env=os.environ | {"JAX_COMPILATION_CACHE_DIR": cache},
+        )
         rows.append([float(x) for x in line.stdout.split()])
-        if cold:
-            shutil.rmtree(compiled, ignore_errors=True)
-            cache.rename(compiled)
-    return np.array(rows)
+    return np.array(rows[-RUNS:])
 
 
 def spread(values: np.ndarray, form: str = ".1f") -> str:

@@ -192,7 +192,12 @@ def outlier_mask(x: Float[np.ndarray, "N *k"], threshold: float = 8.0, longest: 
 
 
 def longest_spike(step: float) -> int:
-    """Samples, `step` s apart, of the longest spike: 5 ms, as a bus or a power stage disturbs, but 2 to 25."""
+    """Samples, `step` s apart, of the longest spike: 5 ms, but 2 to 25.
+
+    What disturbs is electronics, a bus that stalls for a few cycles of 1 kHz or a power stage that switches, as long on
+    slow machines as on quick ones. One that falls between two samples shows in both; of more than 25 in a row the lines
+    from either side no longer tell.
+    """
     return round(min(max(5e-3 / step, 2.0), 25.0)) if step > 0.0 else 2
 
 

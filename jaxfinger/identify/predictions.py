@@ -17,7 +17,9 @@ from jaxfinger.experiments import SAMPLES, Stack, padded, predict, prepare, room
 from jaxfinger.identify.fit import Fit
 from jaxfinger.model import Model, Motion, simulate
 
-STEP = 5e-4  # s: longest step of the forward simulation
+# s, at the protocol's pace: longest step of a forward simulation. Steps of a quarter move angles half a second ahead by
+# less than an encoder rounds them (`tests/identify/test_shooting.py`).
+STEP = 5e-4
 
 
 def predict_session(
@@ -126,7 +128,7 @@ def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> 
         [[np.interp(g, t, f) for f in tension[:, b]] for b, (g, t) in enumerate(zip(grid, _times(stack), strict=True))]
     ).reshape(len(steps), session.finger.n, -1)
     starts = (x.session_time - x.time)[:, 0]
-    substeps = max(1, int(np.ceil(steps.max() / STEP - 1e-6)))
+    substeps = max(1, int(np.ceil(steps.max() / (STEP * stack.experiment.pace) - 1e-6)))
     wide = np.minimum(np.arange(roomy(len(models), 2)), len(models) - 1)  # for a common shape the last is repeated
     each = jax.tree.map(lambda a: jnp.asarray(a)[wide], (model, grid, even, x.q[..., 0].T, x.qd[..., 0].T, starts))
     q = np.asarray(_simulate(*each, substeps=substeps))[: len(models)]

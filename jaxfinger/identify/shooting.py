@@ -14,23 +14,21 @@ Noise slower than the experiment's cut-off cannot be told from tension itself an
 much as VD.3 contradicts the other trials (`joint`).
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch, Stack, prepare
-from jaxfinger.identify.ahead import HORIZONS, Measured, measured, surrogate
 from jaxfinger.identify.linearise import residuals_of
 from jaxfinger.identify.noise import ORDER, Noise
-from jaxfinger.identify.predictions import STEP
-from jaxfinger.model import Model, Motion
+from jaxfinger.identify.starts import HORIZONS, Measured, angles, measured, starts
+from jaxfinger.model import Model
 
 AHEAD = "VD.3 ahead"  # among the experiments that a fit reads, and among its stages
 HORIZON = HORIZONS[1]  # s, at the protocol's pace: h, one of those that `validate` prints; no study has compared them
@@ -49,8 +47,8 @@ class Shooting:
         batch, horizon = self.stack.batch, self.stack.dt
         here, out = residuals_of(model, batch, ("q",))["q"], []
         for k in range(DRAWS):
-            drawn = [_redrawn(m, np.random.default_rng([b, k])) for b, m in enumerate(self.trials)]
-            again = replace(_batch(drawn, horizon), y=batch.y)
+            noise = [np.random.default_rng([b, k]) for b in range(len(self.trials))]
+            again = _batch(self.trials, horizon, noise)
             out.append(here - residuals_of(model, again, ("q",))["q"])
         return np.clip(np.nan_to_num(out, nan=np.pi), -np.pi, np.pi)  # beyond half a turn it says no more
 
@@ -89,48 +87,17 @@ def shooting(session: Session) -> Shooting:
     return Shooting(trials, replace(whole, experiment=spec, batch=batch, holds=holds, dt=horizon, measured={"q": True}))
 
 
-def _redrawn(m: Measured, rng: np.random.Generator) -> Measured:
-    """What the sensors could have read as well."""
-    q, qd = (a + s * rng.standard_normal(a.shape) for a, s in ((m.q, m.q_std), (m.qd, m.qd_std)))
-    return m._replace(q=q, qd=qd, tension=m.tension + surrogate(m.tension_noise, rng))
-
-
-def _batch(trials: Sequence[Measured], horizon: float) -> Batch:
-    """Every start of every trial; those added for a common shape repeat the last one, and count not."""
-    each = [_starts(m, horizon) for m in trials]
-    sizes = np.array([q.shape[-1] for _, q in each])
-    W = int(sizes.max())
-
-    def stacked(*values) -> Float[Array, "*more B W"]:
-        wide = [a[..., np.minimum(np.arange(W), size - 1)] for a, size in zip(values, sizes, strict=True)]
-        return jnp.stack(wide, axis=-2)
-
-    x = jax.tree.map(stacked, *[x for x, _ in each])
-    y = stacked(*[q for _, q in each])
-    counts = np.arange(W) < sizes[:, None]
+def _batch(
+    trials: Sequence[Measured], horizon: float, noise: Sequence[np.random.Generator | None] | None = None
+) -> Batch:
+    """Every start of every trial; those added for a common shape repeat the last one, and count not. With `noise`, of
+    each trial, its states and tensions are redrawn.
+    """
+    times = [np.arange(0.0, m.time[-1] - horizon, horizon) for m in trials]
+    W = max(t.size for t in times)
+    wide = [t[np.minimum(np.arange(W), t.size - 1)] for t in times]
+    each = zip(trials, wide, noise or [None] * len(trials), strict=True)
+    x = jax.tree.map(lambda *a: jnp.stack(a, axis=-2), *[starts(m, t, horizon, rng) for m, t, rng in each])
+    y = jnp.stack([angles(m, t + horizon) for m, t in zip(trials, wide, strict=True)], axis=-2)
+    counts = np.arange(W) < np.array([t.size for t in times])[:, None]
     return Batch(x, {"q": y}, {"q": jnp.broadcast_to(counts, y.shape).astype(float)})
-
-
-def _starts(m: Measured, horizon: float) -> tuple[Motion, Float[Array, "m W"]]:
-    """The states at the starts, and the angles at their horizons."""
-    time = np.arange(0.0, m.time[-1] - horizon, horizon)
-    moments = time + horizon * np.linspace(0.0, 1.0, math.ceil(horizon / STEP) + 1)[:, None]
-
-    def at(values: np.ndarray, t: np.ndarray) -> Float[Array, "rows *t"]:
-        return jnp.asarray([np.interp(t, m.time, row) for row in values])
-
-    q, qd, tension = at(m.q, time), at(m.qd, time), at(m.tension, moments)
-    motion = Motion(
-        time=jnp.asarray(time),
-        q=q,
-        qd=qd,
-        qdd=jnp.zeros_like(q),
-        tension=tension[:, 0],
-        joint_direction=jnp.zeros_like(q),
-        tendon_direction=jnp.zeros_like(tension[:, 0]),
-        session_time=jnp.asarray(time + m.session_start),
-        motorised=jnp.zeros_like(q),
-        tension_ahead=jnp.swapaxes(tension, 0, 1),
-        horizon=jnp.full(time.shape, horizon),
-    )
-    return motion, at(m.q, time + horizon)

@@ -21,7 +21,7 @@ from scipy.signal import butter, sosfilt, sosfilt_zi
 from jaxfinger.data import Session, Trial, low_pass
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import Stack, not_judged, predict, prepare
+from jaxfinger.experiments import EXPERIMENTS, Stack, not_judged, predict, prepare
 from jaxfinger.identify.ahead import ahead, diverges, noise_of_simulation
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.linearise import residuals_of
@@ -30,7 +30,8 @@ from jaxfinger.identify.predictions import model_for, simulate_trials
 from jaxfinger.model import Model
 from jaxfinger.table import Table
 
-ONLINE_CUTOFF = 10.0  # Hz, of the causal filter that a controller would differentiate
+# Hz, at the protocol's pace, of the causal filter that a controller would differentiate: VD.3 is what it controls.
+ONLINE_CUTOFF = EXPERIMENTS["VD.3"].cutoff
 
 
 @dataclass(frozen=True)
@@ -167,8 +168,6 @@ def _floor(fit: Fit, stack: Stack, channel: str, residual: np.ndarray) -> tuple[
 
 
 def _rate(experiment: str) -> float:
-    from jaxfinger.experiments import EXPERIMENTS
-
     return EXPERIMENTS[experiment].rate
 
 
@@ -246,11 +245,13 @@ class ExcursionPath:
     direct: Float[np.ndarray, "N n"]  # f(q) − f(q(0))
 
 
-def excursion_path(model: Model, trial: Trial) -> ExcursionPath:
-    """Both forms of VD.1: the paper's integral drifts with every error of q̇, the difference does not."""
+def excursion_path(model: Model, trial: Trial, pace: float = 1.0) -> ExcursionPath:
+    """Both forms of VD.1: the paper's integral drifts with every error of q̇, the difference does not. `pace`: times as
+    long as the protocol's that its motion takes.
+    """
     q = trial.q
     step = float(np.median(np.diff(trial.time)))
-    sos = butter(2, min(0.9, 2.0 * ONLINE_CUTOFF * step), output="sos")
+    sos = butter(2, min(0.9, 2.0 * ONLINE_CUTOFF / pace * step), output="sos")
     filtered = sosfilt(sos, q, axis=0, zi=sosfilt_zi(sos)[:, :, None] * q[0])[0]
     qd = np.diff(filtered, axis=0, prepend=filtered[:1]) / np.diff(trial.time, prepend=trial.time[0] - step)[:, None]
     C = np.asarray(model.moment_arm.coupling(jnp.asarray(q.T)))
@@ -263,7 +264,7 @@ def excursion_path(model: Model, trial: Trial) -> ExcursionPath:
 
 def _integral_scores(model: Model, session: Session, stack: Stack, floor) -> list[Score]:
     """The paper's: mean over the path and error at its end, nothing removed but the start."""
-    paths = [excursion_path(model, session[name]) for name in stack.trials]
+    paths = [excursion_path(model, session[name], stack.experiment.pace) for name in stack.trials]
     scores = []
     for k, column in enumerate(columns(session, "tendon_excursion")):
         series = [(p.measured - p.integral)[:, k] for p in paths]

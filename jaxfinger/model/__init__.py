@@ -23,7 +23,7 @@ from jaxfinger.model.memory import memories  # noqa: E402
 from jaxfinger.model.model import Effect, Model, SharedFriction  # noqa: E402
 from jaxfinger.model.moment_arm import MomentArm  # noqa: E402
 from jaxfinger.model.motion import Motion  # noqa: E402
-from jaxfinger.model.simulate import forward_dynamics, simulate, simulated_ahead  # noqa: E402
+from jaxfinger.model.simulate import forward_dynamics, simulate, simulated_ahead, simulated_from  # noqa: E402
 from jaxfinger.model.tendon_friction import TendonFriction  # noqa: E402
 
 __all__ = [
@@ -50,4 +50,5 @@ __all__ = [
     "resisting_torque",
     "simulate",
     "simulated_ahead",
+    "simulated_from",
 ]

@@ -78,19 +78,26 @@ def simulate(
     return jnp.concatenate([q0[:, None], q.T], axis=1), jnp.concatenate([qd0[:, None], qd.T], axis=1)
 
 
-def simulated_ahead(model: Model, x: Motion) -> Float[Array, "m *T"]:
-    """q, rad, at the horizon of every sample: simulated from its state under the tension that follows."""
+def simulated_from(model: Model, x: Motion) -> Float[Array, "m L *T"]:
+    """q, rad, at even instants from every sample to its horizon: simulated from its state under the tension that
+    follows.
+    """
     assert x.tension_ahead is not None
     assert x.horizon is not None
     share = jnp.linspace(0.0, 1.0, x.tension_ahead.shape[0])
 
     def one(q, qd, tension, time, start, horizon):
-        return simulate(model, time + share * horizon, tension, q, qd, session_start=start, substeps=1)[0][:, -1]
+        return simulate(model, time + share * horizon, tension, q, qd, session_start=start, substeps=1)[0]
 
     q, qd = jnp.moveaxis(x.q, 0, -1), jnp.moveaxis(x.qd, 0, -1)
     tension = jnp.moveaxis(x.tension_ahead, (0, 1), (-1, -2))
-    each = jnp.vectorize(one, signature="(m),(m),(n,l),(),(),()->(m)")
-    return jnp.moveaxis(each(q, qd, tension, x.time, x.session_time - x.time, x.horizon), -1, 0)
+    each = jnp.vectorize(one, signature="(m),(m),(n,l),(),(),()->(m,l)")
+    return jnp.moveaxis(each(q, qd, tension, x.time, x.session_time - x.time, x.horizon), (-2, -1), (0, 1))
+
+
+def simulated_ahead(model: Model, x: Motion) -> Float[Array, "m *T"]:
+    """q, rad, at the horizon of every sample."""
+    return simulated_from(model, x)[:, -1]
 
 
 def _step(model: Model, state: _State, motion, t, f, tau, dt) -> _State:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from jaxfinger.data import Session, Trial
 from jaxfinger.data.atomic import make_folder
+from jaxfinger.data.sizes import sizes_of
 from jaxfinger.experiments import Stack, predict, prepare
 from jaxfinger.identify import Fit
 from jaxfinger.identify.predictions import model_for, predict_session
@@ -45,7 +46,7 @@ def draw_validation(
 
 def _vd1(model: Model, session: Session, trial: Trial) -> Figure:
     """Paper, Fig. 5: the path by hand, the excursions measured and predicted, and their errors."""
-    path = excursion_path(model, trial)
+    path = excursion_path(model, trial, sizes_of(session).slow_pace)
     joints, tendons = session.finger.joint_names, session.finger.tendon_names
     turn = np.array([display(session, "q", i)[0] for i in range(len(joints))])
     figure, axes = grid(4, 1, 6.4, 1.7, sharex=True)

@@ -5,15 +5,19 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 
 from jaxfinger.errors import UserError
+from jaxfinger.experiments import prepare
 from jaxfinger.identify import identify, refine
+from jaxfinger.identify.ahead import ahead
 from jaxfinger.identify.linearise import residuals_of, tangent
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.sensitivity import sensitivity
 from jaxfinger.identify.shooting import AHEAD, shooting
-from jaxfinger.identify.stages import sources_of
-from jaxfinger.model import simulate, simulated_ahead
+from jaxfinger.identify.stages import first_noise, sources_of
+from jaxfinger.identify.starts import starts
+from jaxfinger.model import Motion, external_torque, simulate, simulated_ahead
 from jaxfinger.synthetic import recipe_from
 from jaxfinger.synthetic import simulate as simulated
 
@@ -49,20 +53,75 @@ def test_a_prediction_is_the_simulation_from_its_start(short, staged):
     np.testing.assert_allclose(simulated_ahead(staged.model, x)[:, b, k], q[:, -1], atol=1e-12)
 
 
+def test_a_step_of_the_simulation_costs_less_than_an_encoder(short, staged):
+    """A quarter of the step moves angles half a second ahead by less than an encoder rounds them."""
+    rounds = recipe_from(RECIPE).sensors.q.resolution / np.sqrt(12.0)
+    for m in shooting(short).trials:
+        time, horizon = np.arange(0.0, m.time[-1] - 0.5, 0.1), 0.5
+        coarse, fine = (
+            simulated_ahead(staged.model, starts(m._replace(pace=pace), time, horizon)) for pace in (1.0, 0.25)
+        )
+        assert np.all(np.std(coarse - fine, axis=1) < rounds)
+
+
+def beside_differences(model, shots, every):
+    """Of every so many parameters: name, derivatives of the angles ahead of all starts, and differences."""
+    parameters, reads = describe(model), {AHEAD: ("q",)}
+    source = sources_of({AHEAD: shots.stack}, reads, {(AHEAD, "q"): first_noise(shots.stack, "q")}, parameters)[AHEAD]
+    free = Free.at(model, source.positions)
+    slopes = tangent(model, free, source.batch, ("q",)).slopes["q"]
+    at = np.asarray(free.get(model))
+    for k in range(0, at.size, every):
+        h = 1e-6 * max(abs(at[k]), 1e-4) * np.eye(at.size)[k]
+        up, down = (residuals_of(free.set(model, jnp.asarray(x)), source.batch, ("q",))["q"] for x in (at + h, at - h))
+        yield parameters[source.positions[k]].name, slopes[k], (up - down) / (2.0 * h[k])
+
+
 def test_derivatives_agree_with_differences_where_nothing_begins_to_stick(short, staged):
     shots = shooting(short)
-    parameters, reads = describe(staged.model), {AHEAD: ("q",)}
-    source = sources_of({AHEAD: shots.stack}, reads, {(AHEAD, "q"): shots.noise(staged.model)}, parameters)[AHEAD]
-    free = Free.at(staged.model, source.positions)
-    slopes = tangent(staged.model, free, source.batch, ("q",)).slopes["q"]
-    at, seen = np.asarray(free.get(staged.model)), np.asarray(source.batch.mask["q"]) > 0
-    for k in range(0, at.size, 9):
-        h = 1e-6 * max(abs(at[k]), 1e-6) * np.eye(at.size)[k]
-        up, down = (
-            residuals_of(free.set(staged.model, jnp.asarray(x)), source.batch, ("q",))["q"] for x in (at + h, at - h)
-        )
-        error = np.abs((up - down) / (2.0 * h[k]) - slopes[k])[seen] / max(np.abs(slopes[k][seen]).max(), 1e-30)
-        assert np.quantile(error, 0.9) < 1e-5, parameters[source.positions[k]].name
+    seen = np.asarray(shots.stack.batch.mask["q"]) > 0
+    for name, slopes, differences in beside_differences(staged.model, shots, 9):
+        error = np.abs(differences - slopes)[seen] / max(np.abs(slopes[seen]).max(), 1e-30)
+        assert np.quantile(error, 0.9) < 1e-5, name
+
+
+def test_derivatives_agree_with_differences_where_a_joint_at_rest_begins_to_slip(short, staged):
+    """Tension rises until friction yields: before, a parameter moves nothing; then the moment of it, and all after."""
+    shots = shooting(replace(short, trials={"rest": at_rest(short, staged.model)}))
+    x = shots.stack.batch.x
+    moved = np.abs(simulated_ahead(staged.model, x) - x.q)[0, 0]  # of the MCP
+    begins = int(np.argmax(moved > 0.0))
+    assert 0 < begins < moved.size - 1
+    found = {name: (a[0, 0], b[0, 0]) for name, a, b in beside_differences(staged.model, shots, 5)}
+    for name, (slopes, differences) in found.items():
+        np.testing.assert_allclose([slopes[:begins], differences[:begins]], 0.0, atol=1e-12, err_msg=name)
+        np.testing.assert_allclose(differences[begins], slopes[begins], rtol=1e-3, atol=1e-5, err_msg=name)
+        np.testing.assert_allclose(differences, slopes, rtol=1e-5, atol=1e-5 * np.abs(slopes).max(), err_msg=name)
+    assert found["friction torque MCP^0"][0][begins] > 1e-3  # more friction, later slip: more that it misses
+
+
+def at_rest(session, model):
+    """A trial that stands still while tension of T3 rises from where joints and tendons rest."""
+    (trial, *_) = (t for t in session if t.experiment == "VD.3")
+    time = np.arange(0.0, 2.0, 0.002)
+    m, n = session.finger.m, session.finger.n
+    q = np.tile(np.mean(trial.q, axis=0), (time.size, 1))
+
+    def torque(f):
+        still, slack = jnp.zeros((m, 1)), jnp.zeros((n, 1))
+        zero = jnp.zeros(1)
+        x = Motion(zero, jnp.asarray(q[:1].T), still, still, jnp.asarray(f)[:, None], still, slack, zero, still)
+        return np.asarray(external_torque(model, x))[:, 0]
+
+    active = np.flatnonzero(session.finger.active)
+    low = np.where(session.finger.active, 1.0, 0.0)
+    pulls = np.stack([torque(low) - torque(low + np.eye(n)[k]) for k in active], axis=1)
+    more, short = scipy.optimize.nnls(pulls, torque(low))
+    assert short < 1e-6
+    tension = np.tile(low, (time.size, 1))
+    tension[:, active] += more
+    tension[:, session.finger.tendon_names.index("T3")] += 6.0 * time
+    return replace(trial, name="rest", time=time, q=q, tendon_force=tension, tendon_excursion=None)
 
 
 def beside_the_truth(fit, truth):
@@ -79,6 +138,37 @@ def test_motion_ahead_is_read_beside_the_other_trials_and_narrows_intervals(shor
     assert both.stages[-1].trials == tuple(t.name for t in short if t.experiment == "VD.3")
     ratio = both.std[joint.estimated] / np.where(joint.std > 0.0, joint.std, 1.0)[joint.estimated]
     assert np.nanmedian(ratio) < 0.99
+
+
+@pytest.fixture(scope="module")
+def quiet():
+    """A session with quiet load cells, and its staged fit."""
+    session = recorded(0, 1e-4)
+    return session, identify(session)
+
+
+@pytest.mark.long
+def test_motion_ahead_brings_the_loss_of_a_tendon_nearer_to_the_truth(quiet, truth):
+    """T2 reaches over all joints: what the held ones hid of its friction, the free finger shows."""
+    session, staged = quiet
+    fitted, names = refine(session, staged, ahead=True), [p.name for p in describe(staged.model)]
+    for name in ("tendon friction T2 a0", "tendon friction T2 a1"):
+        i = names.index(name)
+        before, after = (abs(values(fit)[i] - truth[i]) for fit in (staged, fitted))
+        assert after < 0.5 * before
+        assert after < 1.96 * fitted.std[i]
+
+
+@pytest.mark.long
+def test_a_motion_that_no_fit_has_seen_is_predicted_better(quiet):
+    """Ahead of one motion, fitted by the other: squares of its errors, over those of noise, fall at every horizon."""
+    session, staged = quiet
+    seen, unseen = (t.name for t in session if t.experiment == "VD.3")
+    fitted = refine(session.with_trials([t.name for t in session if t.name != unseen]), staged, ahead=True)
+    assert seen in fitted.stages[-1].trials
+    stack = prepare(session, [unseen], reduced=False)["VD.3"]
+    for before, after in zip(*(ahead(fit.model, session, stack) for fit in (staged, fitted)), strict=True):
+        assert np.nanmean((after.error / before.noise) ** 2) < np.nanmean((before.error / before.noise) ** 2)
 
 
 @pytest.mark.long
