@@ -181,6 +181,11 @@ class CatalogueEffect(Effect):
         """
         return any(getattr(cls, h) is not getattr(Effect, h) for h in ("finger", "true_motion", "torque_friction"))
 
+    @classmethod
+    def reads(cls) -> bool:
+        """Whether it changes what a sensor says of what it measures."""
+        return cls.reading is not Effect.reading
+
     def bounds(self, scales: Scales) -> dict[str, tuple[float, float]]:
         """Least and most of every amplitude and of every shape that a refit moves: one-sided amplitudes not below zero,
         shares not above one, and shapes no further out than those worth trying.

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxfinger.experiments.prepare import Batch
 
-TRIALS, SAMPLES = 8, 256  # of a block; samples are doubled until the longest trial fits
+TRIALS, SAMPLES = 8, 128  # of a block; samples are doubled until the longest trial fits
 
 Tree = TypeVar("Tree")
 

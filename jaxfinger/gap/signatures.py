@@ -168,9 +168,17 @@ class Signatures:
             y0, plain = self.problem.without_effects[group.channel, group.held]
             columns, _, T = y0[0].shape
             raw = np.empty((len(members), columns, len(y0), TRIALS, T))
+            # What only resists changes a force by way of joint torques: their program serves for both.
+            by_torque = group.channel == "fingertip_force" and not (kind.moves_rigid_body() or kind.reads())
+            still = jnp.zeros_like(group.x[0].q)
             for b in group.of(shown):
-                block = group.x[b], y0[b], plain[b], group.contact[b]
-                raw[:, :, b] = np.asarray(_change(group.channel, stacked, nominal, *block, count))[: len(members)]
+                x, contact = group.x[b], group.contact[b]
+                if by_torque:
+                    torque = np.asarray(_change("joint_torque", stacked, nominal, x, still, plain[b], None, count))
+                    raw[:, :, b] = np.einsum("dmbt,kmbt->kdbt", np.asarray(contact), torque[: len(members)])
+                else:
+                    change = _change(group.channel, stacked, nominal, x, y0[b], plain[b], contact, count)
+                    raw[:, :, b] = np.asarray(change)[: len(members)]
             raw = raw.reshape(len(members), columns, -1, T)
             for e in shown:
                 mine, length = group.trials[e], self.problem.stacks[e].batch.x.time.shape[-1]

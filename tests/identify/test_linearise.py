@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxfinger.effects import CATALOGUE
-from jaxfinger.experiments import TRIALS, blocks, predict, prepare, roomy
+from jaxfinger.experiments import SAMPLES, TRIALS, blocks, predict, prepare, roomy
 from jaxfinger.identify.linearise import _tangent, huber, linearise, missed, residuals_of, white_rows
 from jaxfinger.identify.parameters import Free, describe
 from jaxfinger.identify.solve import Tangents, missed_each
@@ -31,7 +31,7 @@ def test_blocks_hold_every_trial_once_and_count_no_other(stack):
     parts, (B, T) = blocks(batch), batch.x.time.shape
     assert len(parts) > 1
     assert B % TRIALS
-    assert {part.x.time.shape for part in parts} == {(TRIALS, roomy(T, 256))}
+    assert {part.x.time.shape for part in parts} == {(TRIALS, roomy(T, SAMPLES))}
     for c in CHANNELS:
         mask, y = (np.concatenate([getattr(p, name)[c] for p in parts], axis=1) for name in ("mask", "y"))
         np.testing.assert_array_equal(mask[:, :B, :T], batch.mask[c])
