@@ -1,6 +1,6 @@
 """The only place that joins data to model: which trials an experiment takes, and what it predicts from what."""
 
-from jaxfinger.experiments.predict import demean, predict
+from jaxfinger.experiments.predict import change, demean, predict
 from jaxfinger.experiments.prepare import Batch, NotJudged, Stack, not_judged, prepare
 from jaxfinger.experiments.shapes import SAMPLES, TRIALS, blocks, padded, roomy, split
 from jaxfinger.experiments.shows import refuse_broken, shows
@@ -15,6 +15,7 @@ __all__ = [
     "NotJudged",
     "Stack",
     "blocks",
+    "change",
     "demean",
     "not_judged",
     "padded",

@@ -1,5 +1,5 @@
 """Where an effect can show: which predicted channels depend on its amplitudes, found by following these through the
-operations of a prediction.
+operations of what it changes.
 """
 
 import inspect
@@ -7,18 +7,19 @@ import traceback
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
+from jaxtyping import Array, Float
 
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError, did_you_mean
-from jaxfinger.experiments.predict import predict
+from jaxfinger.experiments.predict import change
 from jaxfinger.experiments.table import EXPERIMENTS
-from jaxfinger.model import Effect, Finger, Model, Motion
+from jaxfinger.model import Effect, Finger, Model, Motion, Terms, contact_map, plain_terms
 
 
 def shows(kind: type[CatalogueEffect], finger: Finger) -> dict[str, tuple[str, ...]]:
@@ -47,28 +48,50 @@ def refuse_broken(kind: type[CatalogueEffect], finger: Finger) -> None:
         raise UserError(f"{file}: {kind.ID} changes no channel at any size; override a hook of Effect{near}")
 
 
+class _Nominal(NamedTuple):
+    """Two samples of a finger without effects, that does nothing."""
+
+    finger: Finger
+    model: Model
+    x: Motion
+    plain: Terms
+    contact: Float[Array, "3 m *T"]
+
+    @classmethod
+    @cache
+    def of(cls, joint_names, tendon_names, prismatic, active, crosses, held: bool) -> "_Nominal":
+        m, n, T = len(joint_names), len(tendon_names), 2
+        described: Any = SimpleNamespace(
+            gravity=np.array([0.0, 0.0, -9.8]), axis=np.tile([0.0, 1.0, 0.0], (m, 1)), origin=np.ones((m, 3)),
+            mass=np.ones(m), com=np.ones((m, 3)), inertia=np.tile(np.eye(3), (m, 1, 1)), fingertip=np.ones(3),
+            limits=np.tile([-1.0, 1.0], (m, 1)), prismatic=prismatic, joint_names=joint_names,
+            tendon_names=tendon_names, active=active, crosses=crosses,
+        )  # fmt: skip
+        finger = Finger.from_description(described)
+        model = Model.zeros(finger)
+        joints, tendons, time = jnp.zeros((m, T)), jnp.zeros((n, T)), jnp.zeros(T)
+        x = Motion(time, joints, joints, joints, tendons, joints, tendons, time, joints, held, temperature=joints)
+        shapes = jax.eval_shape(lambda model: (plain_terms(model, x), contact_map(model, x)), model)
+        plain, contact = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), shapes)
+        return cls(finger, model, x, *jax.device_put((plain, contact)))
+
+
 @cache
-def _shows(kind, joint_names, tendon_names, prismatic, active, crosses) -> dict[str, tuple[str, ...]]:
-    m, n = len(joint_names), len(tendon_names)
-    described: Any = SimpleNamespace(
-        gravity=np.array([0.0, 0.0, -9.8]), axis=np.tile([0.0, 1.0, 0.0], (m, 1)), origin=np.ones((m, 3)),
-        mass=np.ones(m), com=np.ones((m, 3)), inertia=np.tile(np.eye(3), (m, 1, 1)), fingertip=np.ones(3),
-        limits=np.tile([-1.0, 1.0], (m, 1)), prismatic=prismatic, joint_names=joint_names,
-        tendon_names=tendon_names, active=active, crosses=crosses,
-    )  # fmt: skip
-    finger = Finger.from_description(described)
+def _shows(kind, *description) -> dict[str, tuple[str, ...]]:
+    finger = _Nominal.of(*description, held=False).finger
     sites = kind.sites(finger)
     if not sites:
         return {}
-    model, template, T = Model.zeros(finger), kind.at(finger, sites[0]), 2
-    joints, tendons, time = jnp.zeros((m, T)), jnp.zeros((n, T)), jnp.zeros(T)
-    amplitudes = {k: getattr(template, k) for k in kind.amplitudes()}
+    effect = kind.at(finger, sites[0])
+    amplitudes = {k: getattr(effect, k) for k in kind.amplitudes()}
 
     def depends(held: bool, channel: str) -> bool:
-        x = Motion(time, joints, joints, joints, tendons, joints, tendons, time, joints, held, temperature=joints)
+        _, model, x, plain, contact = _Nominal.of(*description, held=held)
+        y0 = {"joint_torque": x.q, "tendon_excursion": x.tension, "fingertip_force": contact[:, 0]}[channel]
+        of_force = contact if channel == "fingertip_force" else None
 
         def of(amplitudes):
-            return predict(replace(model, effects=(replace(template, **amplitudes),)), x, (channel,))
+            return change(channel, replace(effect, **amplitudes), model, x, y0, plain, of_force)
 
         return any(_reached(jax.make_jaxpr(of)(amplitudes).jaxpr))
 

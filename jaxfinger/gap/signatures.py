@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import product
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,22 +15,11 @@ from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.effects import CATALOGUE, CatalogueEffect, Changed, Scales, Site, changes, nominal_terms
-from jaxfinger.experiments import TRIALS, refuse_broken, shows
+from jaxfinger.experiments import TRIALS, change, refuse_broken, shows
 from jaxfinger.gap.problem import Problem, Rows
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.parameters import describe
-from jaxfinger.model import (
-    Finger,
-    Model,
-    Motion,
-    Terms,
-    excursion,
-    external_torque,
-    fingertip_force,
-    resisting,
-    resisting_change,
-    resisting_torque,
-)
+from jaxfinger.model import Finger, Model, Motion, Terms
 
 CHUNK = 8  # members of one call, at most
 
@@ -113,25 +101,10 @@ def _change(
 ) -> Float[Array, "variants columns B T"]:
     """Change of one channel's prediction by the first `count` of `effects` (arrays stacked along their first axis)."""
 
-    def one(effect):
-        model = eqx.tree_at(lambda m: m.effects, nominal, (effect,), is_leaf=lambda v: isinstance(v, tuple))
-        true = model.true_motion(x)
-        same = true is x  # but for a sensor's effect
-        if channel == "tendon_excursion":
-            y = excursion(model, true, y0 if same else None)
-        elif effect.moves_rigid_body() and contact is not None:
-            y = fingertip_force(model, true)
-        elif effect.moves_rigid_body():
-            y = external_torque(model, true, plain=plain if same else None)
-        else:
-            assert plain is not None
-            change = resisting_change(model, x, plain) if same else resisting_torque(model, true) - resisting(plain)
-            y = y0 + (change if contact is None else jnp.sum(contact * change[None], axis=1))
-        return effect.reading(channel, true, y) - y0
-
     def put(k, out):
-        change = one(jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, k, keepdims=False), effects))
-        return jax.lax.dynamic_update_index_in_dim(out, change, k, 0)
+        effect = jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, k, keepdims=False), effects)
+        one = change(channel, effect, nominal, x, y0, plain, contact)
+        return jax.lax.dynamic_update_index_in_dim(out, one, k, 0)
 
     return jax.lax.fori_loop(0, count, put, jnp.zeros((CHUNK, *y0.shape)))
 
@@ -146,11 +119,11 @@ class Signatures:
         """Whitened change of every row, for effects of one class."""
         out = np.zeros((len(members), self.problem.r.size))
         for k in range(0, len(members), CHUNK):
-            for e, channel, change in self.changes(members[k : k + CHUNK]):
+            for e, channel, raw in self.changes(members[k : k + CHUNK]):
                 rows = self.problem.rows[e]
                 number = self.problem.stacks[e].experiment.channels.index(channel)
                 of_channel = np.flatnonzero(rows.channel == number)
-                white = whitened(change, self.problem, rows, of_channel, channel)
+                white = whitened(raw, self.problem, rows, of_channel, channel)
                 out[k : k + CHUNK, rows.start + of_channel] = white
         return out
 
@@ -177,8 +150,8 @@ class Signatures:
                     torque = np.asarray(_change("joint_torque", stacked, nominal, x, still, plain[b], None, count))
                     raw[:, :, b] = np.einsum("dmbt,kmbt->kdbt", np.asarray(contact), torque[: len(members)])
                 else:
-                    change = _change(group.channel, stacked, nominal, x, y0[b], plain[b], contact, count)
-                    raw[:, :, b] = np.asarray(change)[: len(members)]
+                    found = _change(group.channel, stacked, nominal, x, y0[b], plain[b], contact, count)
+                    raw[:, :, b] = np.asarray(found)[: len(members)]
             raw = raw.reshape(len(members), columns, -1, T)
             for e in shown:
                 mine, length = group.trials[e], self.problem.stacks[e].batch.x.time.shape[-1]
