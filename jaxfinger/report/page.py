@@ -172,8 +172,10 @@ def _parameters(d: Diagnosis) -> list[Markup]:
     names = sorted((r["name"] for r in table if r["name"] in chosen), key=lambda n: n not in own)
     before = d.nominal if fit is not d.nominal else None
     out = []
-    for k, start in enumerate(range(0, len(names), INTERVAL_ROWS)):
-        some = names[start : start + INTERVAL_ROWS]
+    panels = max(math.ceil(len(names) / INTERVAL_ROWS), 1)
+    each = math.ceil(len(names) / panels)  # of one height beside each other
+    for k, start in enumerate(range(0, len(names), max(each, 1))):
+        some = names[start : start + each]
         out.append(
             _picture(lambda ax, some=some: plots.intervals(fit, some, before, ax), f"intervals-{k}",
                      "95 % intervals of " + ", ".join(some), *interval_size(len(some), NARROW))

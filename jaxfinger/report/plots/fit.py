@@ -20,6 +20,7 @@ EDGE = 2.1  # of the axis of intervals: a value and a half-width of its size
 
 INTERVAL_ROWS = 10  # in one panel of a page
 ROW = 0.36  # inches of height that a parameter and its name take
+SIGNS_AN_INCH = 12.0  # of a name and its value, at the size of text of `look`, with a gap between them
 
 
 def interval_size(rows: int, width: float) -> tuple[float, float]:
@@ -46,7 +47,7 @@ def intervals(
     rows = [table[n] for n in (table if parameters is None else parameters)]
     ax = axes_or_new(ax, *interval_size(len(rows), 4.6))
     old = {} if before is None else {r["name"]: r["value"] for r in before.table()}
-    at = ax.get_yaxis_transform()
+    at, width = ax.get_yaxis_transform(), ax.figure.bbox.width / ax.figure.dpi
     for y, row in enumerate(rows):
         value, std = row["value"], row["std"]
         half = HALF_95 * std if std is not None else 0.0
@@ -57,8 +58,9 @@ def intervals(
         ax.plot(value / scale, y, "o", color=AFTER, markersize=4)
         if row["name"] in old and abs(old[row["name"]] / scale) < EDGE:
             ax.plot(old[row["name"]] / scale, y, "D", color="none", markeredgecolor=BEFORE, markersize=5)
-        ax.text(0.0, y - 0.2, row["name"], transform=at, va="bottom", ha="left", bbox=CLEAR)
         text = measured(value, std, row["units"]) if std is not None else "not seen by these trials"
+        room = int(width * SIGNS_AN_INCH) - len(text)
+        ax.text(0.0, y - 0.2, _within(row["name"], room), transform=at, va="bottom", ha="left", bbox=CLEAR)
         ax.text(1.0, y - 0.2, text, transform=at, va="bottom", ha="right", bbox=CLEAR)
     ax.axvline(0.0, color=MUTED, linewidth=0.8)
     ax.set(yticks=[], ylim=(len(rows) - 0.5, -0.8), xlim=(-EDGE, EDGE), xticks=[-2, -1, 0, 1, 2])
@@ -70,6 +72,13 @@ def intervals(
         ax.plot([], [], "D", color="none", markeredgecolor=BEFORE, label="before")
         legend_below(ax, 2)
     return ax
+
+
+def _within(name: str, room: int) -> str:
+    """A parameter's name in so many signs: what is too long loses the end of its first word."""
+    first, _, rest = name.partition(" ")
+    over = len(name) - room
+    return name if over <= 0 else f"{first[: max(len(first) - over - 1, 4)]}… {rest}"
 
 
 def correlations(fit: Fit) -> tuple[list[str], Float[np.ndarray, "p p"]]:
