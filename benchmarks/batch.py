@@ -10,6 +10,7 @@ import argparse
 import os
 import socket
 import time
+from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
 import numpy as np
@@ -103,20 +104,13 @@ def spread_over(processes: int, count: int) -> tuple[float, float]:
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{s.getsockname()[1]}"
-    context = get_context("spawn")
-    results = context.SimpleQueue()
-    running = [
-        context.Process(target=one_process, args=(address, processes, k, count, results)) for k in range(processes)
-    ]
-    for p in running:
-        p.start()
-    times = [results.get() for _ in running]
-    for p in running:
-        p.join()
-    return max(t[0] for t in times), max(t[1] for t in times)
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        each = [pool.submit(one_process, address, processes, k, count) for k in range(processes)]
+        first, again = zip(*(one.result() for one in each), strict=True)
+    return max(first), max(again)
 
 
-def one_process(address: str, processes: int, process: int, count: int, results) -> None:
+def one_process(address: str, processes: int, process: int, count: int) -> tuple[float, float]:
     """What a launch command starts on every machine of a cluster."""
     initialise(address, processes, process)
     clean = clean_session(recipe_from(RECIPE))
@@ -124,7 +118,7 @@ def one_process(address: str, processes: int, process: int, count: int, results)
     fit, mine = identify(session), share(count)
     sessions = [measure(clean, k) if mine.start <= k < mine.stop else session for k in range(count)]
     _, first, again = timed(lambda: fit_many_distributed(sessions, fit, session))
-    results.put((first, again))
+    return first, again
 
 
 def main() -> None:
