@@ -62,6 +62,7 @@ def test_members_that_fail_are_named_and_spoil_nothing(members):
     assert np.isfinite(members.values[[0, 1, 3, 4]]).all()
 
 
+@pytest.mark.long
 def test_members_are_the_fits_of_each_session_alone(members, sessions, staged):
     free = staged.estimated
     for k, session in enumerate(sessions[:2]):

@@ -69,7 +69,7 @@ def test_killed_at_random_moments(controller, tmp_path):
     for k in range(2):
         folder = tmp_path / str(k)
         folder.mkdir()
-        path = kill_at(folder, controller, rng.randint(20_000, 900_000))
+        path = kill_at(folder, controller, rng.randint(20_000, 300_000))
         found = recover(path, folder / "rescued.h5")
         assert found.trials == found.incomplete == ("01-VD.1",)
         assert not [f for f in check_file(folder / "rescued.h5") if f.severity == "error"]
