@@ -18,6 +18,7 @@ OUTSIDE = 0.35  # rad beyond its limits that a joint is allowed to read
 # Of the highest tension. A good tare is off by a hundredth of it; a tendon that is held at little has a fifth.
 TARE = 0.03
 PUSHES = 0.1
+COLD = 200.0  # K, of a bench nowhere on earth
 _TAUT = ("ID.2", "VD.1", "VD.3")  # experiments through which tendons are held at some tension
 _FEW = 20  # samples, fewer than which show no usual step
 _MOVES_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic")
@@ -292,6 +293,13 @@ def _sizes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report
             report.warning(_place(trial, "q"), message)
     if trial.tendon_force is not None:
         _tension(trial, finger, sizes, report)
+    if trial.temperature is not None:
+        for name, x in zip(trial.temperature_names, trial.temperature.T, strict=True):
+            if np.nanmax(x, initial=-np.inf) < COLD:
+                report.warning(
+                    _place(trial, "temperature"),
+                    f'column {name} stays below {COLD:g} K; add 273.15 if it is in °C (`units = "degC"` in a mapping)',
+                )
     if not turning.all():
         return
     small = float(finger.mass.sum()) < 5.0

@@ -329,14 +329,14 @@ class Columns:
 def _converted(values: np.ndarray, spec: Reading, units: str, source: Source, where: Place) -> np.ndarray:
     """variable · scale + offset, unwrapped where asked, in SI."""
     said = spec.units or units
-    if said not in TO_SI or TO_SI[said][0] != units:
-        fitting = [name for name, (si, _) in TO_SI.items() if si == units]
+    if said not in TO_SI or TO_SI[said].si != units:
+        fitting = [name for name, unit in TO_SI.items() if unit.si == units]
         where.fail(f"has units {said!r}; it must be one of {listed(fitting)}, after `scale` and `offset`")
     unwrap = spec.unwrap if isinstance(spec, Column) else False
     if not isinstance(unwrap, bool):
         values = _unwrapped(values, unwrap)
     scale = single(source, spec.scale, where / "scale") if isinstance(spec.scale, str) else spec.scale
-    si = (values * scale + spec.offset) * TO_SI[said][1]
+    si = (values * scale + spec.offset) * TO_SI[said].factor + TO_SI[said].zero
     if unwrap is True:
         if units != "rad":
             where.fail("is no angle, so a whole turn means nothing; write unwrap = the period of the variable")

@@ -32,7 +32,7 @@ _SIZES = {
     "tendon_force": (("N", 500.0), ("mN", 1e6)),
     "tendon_excursion": (("m", 0.2), ("mm", 200.0)),
     "fingertip_force": (("N", 100.0), ("mN", 1e5)),
-    "temperature": (("K", 1e3),),
+    "temperature": (("degC", 200.0), ("K", 1e3)),
 }
 _UNITS_OF = {
     "time": ("s",),
@@ -112,7 +112,7 @@ def clocks_of(recording: Recording, seen: Sequence[Seen]) -> list[Ticks]:
 
 def ticks(name: str, variable: Variable, units: str) -> Ticks:
     """How a clock runs, once its stamps are in order."""
-    time = np.ravel(variable.values) * TO_SI[units][1]
+    time = np.ravel(variable.values) * TO_SI[units].factor
     steps = _steps(time)
     usual = float(np.median(steps)) if len(steps) else np.nan
     gaps = steps > _GAP * usual
@@ -139,10 +139,10 @@ def _meaning(name: str, column: str | int | None, x: np.ndarray, units: str) -> 
     if re.search(_NOT, word):
         return ""
     for meaning, pattern in _MEANINGS:
-        if re.search(pattern, word) and (not units or TO_SI[units][0] in _UNITS_OF[meaning]):
+        if re.search(pattern, word) and (not units or TO_SI[units].si in _UNITS_OF[meaning]):
             runs = len(x) > 2 and len(np.unique(x)) > 0.5 * len(x)
             return meaning if meaning != "time" or (column is None and runs) else ""
-    return _OF_UNITS.get(TO_SI[units][0], "") if units else ""
+    return _OF_UNITS.get(TO_SI[units].si, "") if units else ""
 
 
 def _spelt(name: str) -> str:
@@ -239,7 +239,9 @@ def _experiment(
         channels.get(c, ()) for c in ("q", "tendon_force", "tendon_excursion", "joint_torque")
     )
     units = [s.units or "rad" for s in q]
-    spans = [(s.high - s.low) * TO_SI[u][1] / _MOVES.get(TO_SI[u][0], np.inf) for s, u in zip(q, units, strict=True)]
+    spans = [
+        (s.high - s.low) * TO_SI[u].factor / _MOVES.get(TO_SI[u].si, np.inf) for s, u in zip(q, units, strict=True)
+    ]
     moved = [k for k, span in enumerate(spans) if span > 1.0]
     most = int(np.nanargmax(spans)) if moved else 0
     joint = names["q"][most] if q and most < len(names["q"]) else ""
@@ -290,6 +292,6 @@ def _column(seen: Seen) -> str:
     if seen.column is not None:
         parts.append(f"column = {quoted(seen.column) if isinstance(seen.column, str) else seen.column}")
     fits = {"q": "rad", "joint_torque": "N m", "tendon_force": "N", "fingertip_force": "N", "tendon_excursion": "m"}
-    if seen.units and TO_SI[seen.units][0] == fits.get(seen.meaning):
+    if seen.units and TO_SI[seen.units].si == fits.get(seen.meaning):
         parts.append(f'units = "{seen.units}"')
     return "{ " + ", ".join(parts) + " }"

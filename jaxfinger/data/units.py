@@ -3,32 +3,43 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
-# (SI unit, factor)
+
+class Unit(NamedTuple):
+    """So many of an SI unit, counted from its `zero`."""
+
+    si: str
+    factor: float
+    zero: float = 0.0
+
+
 TO_SI = {
-    "rad": ("rad", 1.0),
-    "mrad": ("rad", 1e-3),
-    "deg": ("rad", math.pi / 180.0),
-    "turn": ("rad", 2.0 * math.pi),
-    "m": ("m", 1.0),
-    "cm": ("m", 1e-2),
-    "mm": ("m", 1e-3),
-    "um": ("m", 1e-6),
-    "N": ("N", 1.0),
-    "mN": ("N", 1e-3),
-    "kN": ("N", 1e3),
-    "N m": ("N m", 1.0),
-    "N cm": ("N m", 1e-2),
-    "N mm": ("N m", 1e-3),
-    "mN m": ("N m", 1e-3),
-    "s": ("s", 1.0),
-    "ms": ("s", 1e-3),
-    "us": ("s", 1e-6),
-    "ns": ("s", 1e-9),
-    "K": ("K", 1.0),
-    "1": ("1", 1.0),
+    "rad": Unit("rad", 1.0),
+    "mrad": Unit("rad", 1e-3),
+    "deg": Unit("rad", math.pi / 180.0),
+    "turn": Unit("rad", 2.0 * math.pi),
+    "m": Unit("m", 1.0),
+    "cm": Unit("m", 1e-2),
+    "mm": Unit("m", 1e-3),
+    "um": Unit("m", 1e-6),
+    "N": Unit("N", 1.0),
+    "mN": Unit("N", 1e-3),
+    "kN": Unit("N", 1e3),
+    "N m": Unit("N m", 1.0),
+    "N cm": Unit("N m", 1e-2),
+    "N mm": Unit("N m", 1e-3),
+    "mN m": Unit("N m", 1e-3),
+    "s": Unit("s", 1.0),
+    "ms": Unit("s", 1e-3),
+    "us": Unit("s", 1e-6),
+    "ns": Unit("s", 1e-9),
+    "K": Unit("K", 1.0),
+    "degC": Unit("K", 1.0, 273.15),
+    "1": Unit("1", 1.0),
 }
 _SPELT = {"°": "deg", "degrees": "deg", "µm": "um", "µs": "us", "rev": "turn", "sec": "s"}
+_SPELT |= {"°c": "degC", "degc": "degC", "celsius": "degC"}
 
 
 def known(stated: str) -> str:

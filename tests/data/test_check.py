@@ -187,6 +187,15 @@ def test_a_measured_channel_that_is_missing_is_an_error_but_the_rest_is_read(fil
     assert len(read_session(file)) == len(session)
 
 
+def test_temperatures_in_degrees_celsius_are_said(file):
+    assert not any(f.place == f"/{VD3}/temperature" for f in check_file(file))
+    with h5py.File(file, "r+") as opened:
+        put(opened[VD3], "temperature", lambda x: x - 273.15)
+    said = [f.message for f in check_file(file) if f.place == f"/{VD3}/temperature"]
+    assert [m.split(" stays")[0] for m in said] == ["column motor T1", "column motor T2"]
+    assert all("273.15" in m for m in said)
+
+
 def test_a_slack_tendons_excursion_may_be_nan(file):
     with h5py.File(file, "r+") as opened:
         put(opened[ID2], "tendon_force", at((slice(0, 50), 0), 0.01))

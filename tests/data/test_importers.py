@@ -25,6 +25,7 @@ time = "t"
 q.MCP = { from = "enc", column = 1, units = "deg" }
 tendon_force.T1 = [{ from = "volts", scale = "gain", offset = -0.5, units = "N" }, { from = "extra", units = "mN" }]
 tendon_excursion.T1 = { from = "pull", units = "mm" }
+temperature.motor = { from = "warm", units = "degC" }
 """
 )
 TIME = np.arange(500) / 100
@@ -35,6 +36,7 @@ RECORDED = {
     "volts": 0.25 + 0.01 * TIME,
     "extra": 100.0 + 0 * TIME,
     "pull": 8.0 * ANGLE,
+    "warm": 20.0 + 0.1 * TIME,
     "gain": 10.0,
 }
 
@@ -54,6 +56,7 @@ def assert_imported(path):
     np.testing.assert_allclose(trial.q[:, 0], ANGLE, atol=1e-9)
     np.testing.assert_allclose(trial.tendon_force[:, 0], 10 * (0.25 + 0.01 * TIME) - 0.5 + 0.1, atol=1e-9)
     np.testing.assert_allclose(trial.tendon_excursion[:, 0], 0.008 * ANGLE, atol=1e-9)
+    np.testing.assert_allclose(trial.temperature[:, 0], 293.15 + 0.1 * TIME, atol=1e-9)
     assert np.isnan(trial.tendon_force[:, 1]).all()
     assert session.specimen == "bench finger"
 
@@ -90,8 +93,8 @@ def test_matlab_version_7_3_with_a_structure(mapping, tmp_path):
 
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
 def test_csv(mapping, tmp_path, delimiter):
-    columns = [RECORDED[name] for name in ("t", "volts", "extra", "pull")] + [np.rad2deg(ANGLE)]
-    lines = ["# logged", delimiter.join(("t", "volts", "extra", "pull", "enc"))]
+    columns = [RECORDED[name] for name in ("t", "volts", "extra", "pull", "warm")] + [np.rad2deg(ANGLE)]
+    lines = ["# logged", delimiter.join(("t", "volts", "extra", "pull", "warm", "enc"))]
     lines += [delimiter.join(repr(float(x)) for x in row) for row in zip(*columns, strict=True)]
     (tmp_path / "log.csv").write_text("\n".join(lines))
     text = MAPPING.replace(", column = 1", "").replace('scale = "gain"', "scale = 10.0")
