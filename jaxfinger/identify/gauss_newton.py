@@ -27,7 +27,6 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 VISIBLE = 1e-7  # relative singular value of the column-scaled Jacobian below which a combination is not seen
 FOLLOWS = 1e-3  # least share of the predicted descent by which a step counts as descent at all
 POOR, GOOD = 0.25, 0.75  # shares of it below which the next step is shorter, and above which it is longer
-SHORTER = 0.5  # times the last step, the most that one is which leads on where rounding hides the cost
 TANGENTS = 8  # columns of a Jacobian at a time: more do not fit into the processor's cache
 ROUNDING = 1e-12  # of a cost, relative: it cannot be told lower by less
 
@@ -71,8 +70,8 @@ class Iterate(eqx.Module):
 
 class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
     """Ends where a whole step is shorter than `atol + rtol ‖r‖` in the coordinates z, or no longer than `kink` in them
-    and lowers the cost no further, as far as rounding lets one see. Options: `lower` and `upper`, like y; a start
-    outside of them stays until a step leads back. `jac` as in `optimistix.GaussNewton` is always forward.
+    and lowers the cost no further. Options: `lower` and `upper`, like y; a start outside of them stays until a step
+    leads back. `jac` as in `optimistix.GaussNewton` is always forward.
     """
 
     rtol: float = 0.0
@@ -114,9 +113,8 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
         predicted = -state.length * state.slope - 0.5 * jnp.sum((state.here.R @ moved) ** 2)
         descent = state.cost - here.cost
         follows = jnp.where(predicted > 0.0, descent / jnp.where(predicted > 0.0, predicted, 1.0), 1.0)
-        # Where rounding hides what a step does to the cost, steps are good as long as they become shorter.
-        hidden = (jnp.abs(descent) <= ROUNDING * state.cost) & (predicted <= ROUNDING * state.cost)
-        accept = finite & (first | (follows >= FOLLOWS) | hidden)
+        flat = jnp.abs(descent) <= ROUNDING * state.cost
+        accept = finite & (first | (follows >= FOLLOWS) | (flat & (predicted <= ROUNDING * state.cost)))
 
         new = jax.tree.map(lambda a, b: jnp.where(accept, a, b), here, state.here)
         best = jnp.where(accept, state.trial, y)
@@ -131,14 +129,12 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
         shorter = jnp.clip(shorter, 0.1 * state.length, 0.5 * state.length)
         again = jnp.where(follows > GOOD, jnp.minimum(1.0, 2.0 * state.length), state.length)
         again = jnp.where(follows < POOR, jnp.clip(least, 0.1 * state.length, state.length), again)
-        again = jnp.where(hidden, state.length, again)
         length = jnp.where(first & accept, 1.0, jnp.where(accept, again, shorter))
 
         enough = self.atol + self.rtol * jnp.sqrt(2.0 * new.cost)
         outcome = Outcome.going
-        lost = ~accept | (hidden & (size > SHORTER * state.size))
-        outcome = Outcome.where(lost & (state.length * size <= self.kink), Outcome.kink, outcome)
         outcome = Outcome.where(accept & (size <= enough), Outcome.converged, outcome)
+        outcome = Outcome.where(~accept & (state.length * size <= self.kink), Outcome.kink, outcome)
         outcome = Outcome.where(~accept & (shorter * size <= 0.1 * enough), Outcome.no_descent, outcome)
         outcome = Outcome.where(first & ~finite, Outcome.nowhere, outcome)
         after = Iterate(

@@ -45,26 +45,3 @@ def test_it_batches_and_differentiates():
 def test_an_optimum_on_a_bound_is_found():
     found = optx.least_squares(rosenbrock, SOLVER, jnp.zeros(2), 1.0, {"upper": jnp.array([0.5, 5.0])})
     np.testing.assert_allclose(found.value, [0.5, 0.25], rtol=1e-7)
-
-
-def bent(y, a):
-    """Rows with a kink at zero, some of them curved, beside what no parameter changes and rounding is a share of."""
-    A, c, bend, rest = a
-    x = A @ y
-    return jnp.where(bend > 0.3, jnp.maximum(x, -0.8 * x) + 0.3 * bend * x**2, x) - c, rest
-
-
-def test_it_ends_where_rounding_hides_what_a_step_does_to_the_cost():
-    """A step seems to lead astray there, and is not to be shortened for it without end."""
-    solver, rng = VisibleGaussNewton(atol=1e-6, kink=0.1), np.random.default_rng(0)
-
-    @jax.jit
-    def steps(start, *a):
-        return optx.least_squares(bent, solver, start, a, throw=False, max_steps=60).stats["num_steps"]
-
-    taken = []
-    for _ in range(40):
-        A, c = rng.standard_normal((12, 4)), rng.standard_normal(12) * 10.0 ** rng.uniform(-3, 2)
-        bend, rest = rng.uniform(0.0, 0.9, 12), np.full(40, 10.0 ** rng.uniform(3, 4))
-        taken.append(int(steps(*map(jnp.asarray, (rng.standard_normal(4), A, c, bend, rest)))))
-    assert max(taken) < 40
