@@ -269,7 +269,7 @@ def _noise_elsewhere(problem: Problem, channel: str, columns: int) -> Noise:
     finger = problem.session.finger
     length = float(np.linalg.norm([*finger.origin[1:], finger.fingertip], axis=1).sum())
     std = np.full(columns, largest(channel) or (largest("joint_torque") or 1e-3) / length)
-    return Noise(std, std, np.zeros((columns, 1)), "elsewhere")
+    return Noise.white(std, "elsewhere")
 
 
 def _at(nominal: Model, linearised: dict[str, Linearised], sources, rows, free, prior: Prior) -> dict[str, Any]:

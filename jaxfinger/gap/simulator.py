@@ -18,6 +18,7 @@ from jaxfinger.data import Predictions, Session
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Stack, predict, prepare
 from jaxfinger.identify import Recipe
+from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.parameters import Free, describe
 from jaxfinger.identify.solve import solve
 from jaxfinger.identify.stages import (
@@ -48,12 +49,13 @@ def emulate(
             f"{session.file}: none of its trials is in the predictions; predict its trials under their own names"
         )
     told = {e: _told(stacks[e], s) for e, s in rest.items()}
-    emulator = _imitate(session, recipe, told)
+    noise = _measured_noise(stacks, told)
+    emulator = _imitate(session, recipe, told, noise)
     lacks = {t for t in recipe.model.terms if t in GROUP_OF_TERM and _absent(emulator, GROUP_OF_TERM[t], told)}
     if lacks:
         terms = tuple(t for t in recipe.model.terms if t not in lacks)
         recipe = replace(recipe, model=replace(recipe.model, terms=terms))
-        emulator = _imitate(session, recipe, told)
+        emulator = _imitate(session, recipe, told, noise)
     return emulator, recipe, {e: _rebased(s, _predict(emulator, told[e])) for e, s in rest.items()}
 
 
@@ -73,12 +75,24 @@ def _predict(model: Model, stack: Stack) -> dict:
     return eqx.filter_jit(predict)(model, stack.batch.x, stack.experiment.channels)
 
 
-def _imitate(session: Session, recipe: Recipe, told: dict[str, Stack]) -> Model:
+def _measured_noise(stacks: dict[str, Stack], told: dict[str, Stack]) -> dict[tuple[str, str], Noise]:
+    """Of every channel where its measurements have most. Predictions have none where joints are held, and a torque that
+    does not act, as in VD.3, has none either.
+    """
+    most: dict[str, float] = {}
+    for stack in stacks.values():
+        for c in stack.experiment.channels:
+            most[c] = max(most.get(c, 0.0), float(first_noise(stack, c).std.max()))
+    return {
+        (e, c): Noise.white(np.full(len(y), most[c]), "measured") for e, s in told.items() for c, y in s.batch.y.items()
+    }
+
+
+def _imitate(session: Session, recipe: Recipe, told: dict[str, Stack], noise: dict[tuple[str, str], Noise]) -> Model:
     """The nominal model nearest to the predictions; masses and centres of mass stay as CAD has them."""
     model = nominal_model(session, recipe)
     parameters = describe(model)
     reads = {e: s.experiment.channels for e, s in told.items()}
-    noise = {(e, c): first_noise(told[e], c) for e in told for c in reads[e]}
     groups = free_groups(recipe)
     free = np.array([i for i, p in enumerate(parameters) if p.group in groups and p.determinable], dtype=int)
     sources = sources_of(told, reads, noise, parameters)

@@ -29,6 +29,11 @@ class Noise:
     ar: Float[np.ndarray, "columns order"]  # a_k
     source: str  # `repeats`, `holds`, both, or `residuals`
 
+    @classmethod
+    def white(cls, std: Float[np.ndarray, " columns"], source: str) -> "Noise":
+        """Samples that do not depend on one another."""
+        return cls(std, std, np.zeros((len(std), ORDER)), source)
+
     @property
     def coefficients(self) -> Float[np.ndarray, "columns lags lags"]:
         """The whitening filters [1, −a₁, …] / σ, order + 1 lags; row j predicts from j samples before, as after a gap.

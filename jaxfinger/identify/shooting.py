@@ -26,7 +26,7 @@ from jaxfinger.data import Session
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch, Stack, prepare
 from jaxfinger.identify.linearise import residuals_of
-from jaxfinger.identify.noise import ORDER, Noise
+from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.starts import HORIZONS, Measured, angles, measured, starts
 from jaxfinger.model import Model
 
@@ -57,7 +57,7 @@ class Shooting:
         reading = np.stack([m.q_std for m in self.trials], axis=1)  # (m, B, 1)
         square = np.mean(self.changed(model) ** 2, axis=0) + reading**2
         std = np.sqrt(np.average(square, axis=(1, 2), weights=np.asarray(self.stack.batch.mask["q"])))
-        return Noise(std, std, np.zeros((len(std), ORDER)), "sensors' noise in state and tension")
+        return Noise.white(std, "sensors' noise in state and tension")
 
     def corrected(self, model: Model) -> Batch:
         """With what noise changes the model's predictions by, in the mean, added to the measured angles."""

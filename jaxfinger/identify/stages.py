@@ -17,7 +17,7 @@ from jaxfinger.data import Session, joints_of, moving
 from jaxfinger.experiments import EXPERIMENTS, Experiment, Stack, not_judged, prepare
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible
-from jaxfinger.identify.noise import ORDER, Noise, estimate
+from jaxfinger.identify.noise import Noise, estimate
 from jaxfinger.identify.parameters import Parameter, describe, ravel
 from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.prior import Prior
@@ -324,7 +324,7 @@ def first_noise(stack: Stack, channel: str) -> Noise:
     step = np.diff(y, axis=-1)[mask[..., 1:] & mask[..., :-1]]
     size = float(np.median(np.abs(step))) if step.size else 1.0
     std = np.full(columns, max(size, 1e-12))
-    return Noise(std, std, np.zeros((columns, ORDER)), "first guess")
+    return Noise.white(std, "first guess")
 
 
 def _noise(solution: Solution, stacks, reads) -> dict[tuple[str, str], Noise]:

@@ -1,19 +1,27 @@
 """Another simulator's predictions: what it lacks is named, what it has wrong is retuned."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
+from jaxfinger.experiments import demean, prepare
 from jaxfinger.gap import Status, diagnose
 from jaxfinger.gap.result import Key
+from jaxfinger.gap.simulator import emulate
+from jaxfinger.identify import Recipe, identify
 from jaxfinger.identify.predictions import predict_session
+from jaxfinger.identify.stages import first_noise
 from jaxfinger.synthetic import paper_finger, polynomial_finger, true_model
 
 from .conftest import PLANTED, TRUTH, WITHOUT, session_with
+
+DEMO = Path(__file__).parents[2] / "datasets" / "demo-finger" / "session.h5"
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +56,22 @@ def test_a_term_that_the_simulator_lacks_is_a_candidate(session):
     found = diagnose(session, without=(*WITHOUT, "gravity"), predictions=simulator(session, friction=0.0), quick=True)
     assert "joint_coulomb" not in found.problem.fit.recipe.model.terms
     assert any(c.key.effect == "joint_coulomb" for c in found.candidates[:4])
+
+
+@pytest.mark.long
+def test_the_shipped_sessions_own_fit_is_imitated_as_a_simulator():
+    """Its predictions are the same at every sample of a hold, and the torque of VD.3 is none at all: neither says how
+    near a model may come.
+    """
+    session = read_session(DEMO)
+    stacks, told = prepare(session), predict_session(identify(session, Recipe()).model, session)
+    _, recipe, rebased = emulate(session, Recipe(), stacks, told)
+    assert recipe == Recipe()
+    for e, stack in stacks.items():
+        for c in set(stack.experiment.channels) - ({"joint_torque"} if e == "VD.3" else set()):
+            mask = jnp.asarray(rebased[e].batch.mask[c])
+            off = demean(jnp.asarray(rebased[e].batch.y[c] - stack.batch.y[c]), mask)
+            assert jnp.sqrt(jnp.sum(off**2) / jnp.sum(mask)) < 0.5 * first_noise(stack, c).std.max()
 
 
 def test_predictions_of_other_trials_are_refused(session):
