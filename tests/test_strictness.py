@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
-from jaxfinger.data.filtering import low_pass
+from jaxfinger.identify.starts import surrogate
 
 
 def test_shapes_are_checked():
-    with pytest.raises(TypeCheckError, match="x"):
-        low_pass(np.arange(100.0), np.zeros((99, 2)), 0.1)
+    """Of a function that no other test calls a thousand times (`tests/strict.py`)."""
+    with pytest.raises(TypeCheckError, match="noise"):
+        surrogate(np.zeros(5), np.random.default_rng(0))
 
 
 @pytest.mark.parametrize(
