@@ -110,9 +110,15 @@ class Runner:
         trip, seq = (error.trip, error.seq) if isinstance(error, TrialEnded) else (Trip.HOST, None)
         if not (tripped(reader.latest) or isinstance(error, ControllerStopped)):
             reader.stop(Violation(trip, "host", reader.latest_seq, float("nan")))
+
+        def lets_go() -> bool:
+            block = reader.latest
+            return block is not None and (tripped(block) or int(block.state[-1]) == State.IDLE)
+
+        self._pass(AFTER_TRIP_S, lets_go)  # samples of a busy host come late: those before the stop first
         self._pass(AFTER_TRIP_S)
         cause = str(error).rstrip(".")
-        if reader.latest is not None and not (tripped(reader.latest) or int(reader.latest.state[-1]) == State.IDLE):
+        if reader.latest is not None and not lets_go():
             cause = f"{cause}; {HELD}"
         if reader.recording:
             place = {} if seq is None else {"seq": seq}
