@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
-from jaxfinger.identify.starts import surrogate
+from jaxfinger.data.filtering import low_pass
 
 
 def test_shapes_are_checked():
-    """Of a function that no other test calls a thousand times (`tests/strict.py`)."""
-    with pytest.raises(TypeCheckError, match="noise"):
-        surrogate(np.zeros(5), np.random.default_rng(0))
+    with pytest.raises(TypeCheckError, match="x"):
+        low_pass(np.arange(100.0), np.zeros((99, 2)), 0.1)
 
 
 @pytest.mark.parametrize(
