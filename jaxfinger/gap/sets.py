@@ -350,7 +350,10 @@ class Search:
             if better is None:
                 break
             state = self._pruned(better)
-        for i, key in enumerate(state.keys):  # what each could be replaced by
+        # What each could be replaced by starts where the state has led; so does the state once more, to be as settled.
+        if state.effects:
+            state = max(state, self.exactly(state, None), key=lambda s: s.score)
+        for i, key in enumerate(state.keys):
             screened = self.screened(state, i)
             for _, offer, amplitudes in self.best_offers(screened):
                 if key not in offer.keys:
