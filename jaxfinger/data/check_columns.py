@@ -16,17 +16,16 @@ from itertools import combinations
 import numpy as np
 
 from jaxfinger.data.check_trial import STILL_JOINT
+from jaxfinger.data.check_work import slope, thinned
 from jaxfinger.data.findings import Report
 from jaxfinger.data.session import FingerDescription, Session, Trial
 
-_SAMPLES = 400  # of a trial; slopes of a motion need no more
-_STILL, _TRAVELS = (
-    0.05,
-    0.25,
-)  # of the largest travel at a joint: at most where a tendon stands still, at least where not
-_BETTER = 0.25  # of the misfit that columns have as they are, the most that they have exchanged
-_APART = 0.2  # of the known arms, the least such misfit: CAD and its tolerances are closer
-_TOLD = 0.9  # of a column's variance, what the tension explains at least where it stretches the tendon
+# Shares of the largest arm at a joint: a tendon with no more stands still, one with more than the other travels. What
+# lies between may be a small arm, or a tendon that is drawn along, and tells nothing.
+_STILL, _TRAVELS = 0.05, 0.25
+_APART = 0.2  # of the known arms: columns that miss them by less may be right, since CAD is good to a tenth
+_BETTER = 0.25  # of that miss: exchanged columns miss by no more
+_TOLD = 0.9  # of the variance of a column: a tension that explains more stretches its tendon
 
 
 def check_columns(session: Session, report: Report) -> None:
@@ -51,7 +50,8 @@ def _arms(session: Session) -> dict[int, np.ndarray]:
         spans = np.ptp(trial.q, axis=0)
         i = int(np.argmax(np.nan_to_num(spans)))
         if trial.tendon_excursion is not None and np.all(np.delete(spans, i) < STILL_JOINT) and spans[i] > STILL_JOINT:
-            found[i].append(np.array([_line(trial.q[:, i], l)[0] for l in trial.tendon_excursion.T]))
+            q = thinned(trial.q[:, i])
+            found[i].append(np.array([slope(q, thinned(l)) for l in trial.tendon_excursion.T]))
     return {i: np.median(arms, axis=0) for i, arms in found.items()}
 
 
@@ -84,9 +84,8 @@ def _by_description(finger: FingerDescription, arms: dict[int, np.ndarray]) -> I
                 crossed += np.abs(seen[[b, a]] - known).sum()
                 size += np.abs(known).sum()
                 shown, told = (" and ".join(f"{1e3 * arm:.3g}" for arm in x) for x in (seen[[a, b]], known))
-                said = (
-                    said or f"ID.2 shows {shown} mm a radian at {finger.joint_names[i]}, the finger's file says {told}"
-                )
+                joint = finger.joint_names[i]
+                said = said or f"ID.2 shows {shown} mm a radian at {joint}, the finger's file says {told}"
         if own > _APART * size and crossed < _BETTER * own:
             yield (int(a), int(b)), f"{said} (where both are the other way round for each tendon: correct the signs)"
 
@@ -95,33 +94,19 @@ def _by_stretch(session: Session) -> Iterator[tuple[tuple[int, int], str]]:
     finger = session.finger
     moves: dict[int, set[int]] = defaultdict(set)
     for trial in session.select("ID.4"):
-        if (
-            trial.tendon in finger.tendon_names
-            and trial.tendon_excursion is not None
-            and trial.tendon_force is not None
-        ):
-            moves[finger.tendon_names.index(trial.tendon)] |= _stretched(trial, finger)
+        if trial.tendon in finger.tendon_names:
+            pulled = finger.tendon_names.index(trial.tendon)
+            moves[pulled] |= _stretched(trial, pulled, finger.active)
     for a, b in combinations(sorted(moves), 2):
         if moves[a] == {b} and moves[b] == {a}:
             names = finger.tendon_names
             yield (a, b), f"where {names[a]} is pulled (ID.4), {names[b]} gives way alone, and the other way round"
 
 
-def _stretched(trial: Trial, finger: FingerDescription) -> set[int]:
+def _stretched(trial: Trial, pulled: int, active: np.ndarray) -> set[int]:
     """Tendons whose excursion follows the tension of the one that is pulled."""
     if trial.tendon_force is None or trial.tendon_excursion is None:
         return set()
-    pull = trial.tendon_force[:, finger.tendon_names.index(trial.tendon or "")]
-    return {int(k) for k in np.flatnonzero(finger.active) if _line(pull, trial.tendon_excursion[:, k])[1] > _TOLD}
-
-
-def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Slope of y on x, and the share of the variance that it explains; NaN where x stands still."""
-    thin = slice(None, None, max(1, len(x) // _SAMPLES))
-    x, y = x[thin], y[thin]
-    good = np.isfinite(x) & np.isfinite(y)
-    if good.sum() < 10 or np.ptp(x[good]) == 0.0:
-        return np.nan, np.nan
-    x, y = x[good] - x[good].mean(), y[good] - y[good].mean()
-    slope = float(x @ y / (x @ x))
-    return slope, slope**2 * float(x @ x) / max(float(y @ y), 1e-300)
+    pull, l = thinned(trial.tendon_force[:, pulled]), thinned(trial.tendon_excursion)
+    explained = [slope(pull, x) * slope(x, pull) for x in l.T]  # of each variance: the squared correlation
+    return {int(k) for k in np.flatnonzero(active) if explained[k] > _TOLD}

@@ -18,7 +18,7 @@ OUTSIDE = 0.35  # rad beyond its limits that a joint is allowed to read
 # Of the highest tension. A good tare is off by a hundredth of it; a tendon that is held at little has a fifth.
 TARE = 0.03
 PUSHES = 0.1
-COLD = 200.0  # K, of a bench nowhere on earth
+COLD = 200.0  # K, −73 °C: no bench on earth is colder
 _TAUT = ("ID.2", "VD.1", "VD.3")  # experiments through which tendons are held at some tension
 _FEW = 20  # samples, fewer than which show no usual step
 _MOVES_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic")

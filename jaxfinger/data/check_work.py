@@ -62,7 +62,7 @@ class _Excursions:
             if trial.joint not in finger.joint_names or trial.tendon_excursion is None:
                 continue
             i = finger.joint_names.index(trial.joint)
-            q, l = _thinned(trial.q[:, i]), _thinned(trial.tendon_excursion)
+            q, l = thinned(trial.q[:, i]), thinned(trial.tendon_excursion)
             for k in np.flatnonzero(finger.active & finger.crosses[:, i]):
                 good = np.isfinite(q) & np.isfinite(l[:, k])
                 if good.sum() > 10 * _DEGREE and np.ptp(q[good]) > 0.0:
@@ -82,11 +82,12 @@ class _Excursions:
         return arm if abs(arm) > _CLEAR * largest and arm * self.arms[tendon, joint] > 0.0 else None
 
 
-def _thinned(x: np.ndarray) -> np.ndarray:
+def thinned(x: np.ndarray) -> np.ndarray:
+    """Some hundreds of a trial's samples, evenly spaced."""
     return x[:: max(1, len(x) // _SAMPLES)]
 
 
-def _slope(x: np.ndarray, y: np.ndarray) -> float:
+def slope(x: np.ndarray, y: np.ndarray) -> float:
     """Of y on x, by least squares; NaN where x stands still."""
     good = np.isfinite(x) & np.isfinite(y)
     x, y = x[good] - x[good].mean() if good.any() else x[good], y[good]
@@ -116,7 +117,7 @@ def _virtual_work(session: Session, kinematic: _Excursions, report: Report) -> N
         if trial.joint_torque is None or trial.tendon_force is None:
             continue
         seen = kinematic.arm(k, i, float(np.nanmedian(trial.q[:, i])))
-        felt = -_slope(_thinned(trial.tendon_force[:, k]), _thinned(trial.joint_torque[:, i]))
+        felt = -slope(thinned(trial.tendon_force[:, k]), thinned(trial.joint_torque[:, i]))
         if seen is None or not np.isfinite(felt):
             continue
         said = f"{trial.tendon} at {trial.joint} ({1e3 * seen:.3g} against {1e3 * felt:.3g} mm)"
@@ -141,13 +142,13 @@ def _paths(session: Session, kinematic: _Excursions, report: Report) -> None:
     for trial in session.select("VD.1", "VD.3"):
         if trial.tendon_excursion is None:
             continue
-        q, l = _thinned(trial.q), _thinned(trial.tendon_excursion)
+        q, l = thinned(trial.q), thinned(trial.tendon_excursion)
         for k in np.flatnonzero(finger.active):
             joints = np.flatnonzero(finger.crosses[k])
             if any((int(k), int(i)) not in kinematic.polynomials for i in joints) or not len(joints):
                 continue
             expected = np.sum([kinematic.polynomials[int(k), int(i)](q[:, i]) for i in joints], axis=0)
-            ratio = _slope(expected, l[:, k])
+            ratio = slope(expected, l[:, k])
             if np.isfinite(ratio) and not 1.0 / _APART < ratio < _APART and np.ptp(expected) > 1e-3:
                 found.append(f"{finger.tendon_names[k]} in {trial.name} ({ratio:.2g} times)")
     if found:
@@ -168,7 +169,7 @@ def _tip(session: Session, report: Report) -> None:
                 else trial.tendon_force[:, session.finger.tendon_names.index(trial.tendon)]
             )
             slopes = (
-                [_slope(_thinned(pull), _thinned(x)) for x in trial.fingertip_force.T] if pull is not None else [np.nan]
+                [slope(thinned(pull), thinned(x)) for x in trial.fingertip_force.T] if pull is not None else [np.nan]
             )
             size = float(np.linalg.norm(slopes))
             if np.isfinite(size) and not _TIP[0] < size < _TIP[1]:
@@ -212,7 +213,8 @@ def _friction_share(trial: Trial, joint: int) -> float:
     if trial.experiment != "ID.3-static" and np.count_nonzero(np.diff(columns[:, 0])) < _TURNS:
         return np.nan
     R = np.asarray(np.linalg.qr(np.column_stack([columns, torque[way != 0.0]]), mode="r"))
-    least = np.linalg.lstsq(R[:-1, :-1], R[:-1, -1])[0]  # also of fewer held angles than coefficients
+    # Where there are fewer held angles than coefficients, the smallest ones that fit.
+    least = np.linalg.lstsq(R[:-1, :-1], R[:-1, -1])[0]
     return float(least[0] / np.std(torque))
 
 

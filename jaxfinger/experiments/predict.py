@@ -1,6 +1,7 @@
 """What the model says each experiment's channels read, from the other measured channels."""
 
-import equinox as eqx
+from dataclasses import replace
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -45,7 +46,7 @@ def change(
 
     `plain`: the nominal terms of (1) behind a torque or a force; `contact`: of a force, the `contact_map`.
     """
-    model = eqx.tree_at(lambda m: m.effects, nominal, (effect,), is_leaf=lambda v: isinstance(v, tuple))
+    model = replace(nominal, effects=(effect,))
     true = model.true_motion(x)
     same = true is x  # but for a sensor's effect
     if channel == "tendon_excursion":

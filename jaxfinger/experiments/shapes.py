@@ -7,7 +7,8 @@ import numpy as np
 
 from jaxfinger.experiments.prepare import Batch
 
-TRIALS, SAMPLES = 8, 128  # of a block; samples are doubled until the longest trial fits
+# Of a block; samples are doubled until the longest trial fits. A quick look's trials have up to 128.
+TRIALS, SAMPLES = 8, 128
 
 Tree = TypeVar("Tree")
 

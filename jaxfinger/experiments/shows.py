@@ -49,7 +49,7 @@ def refuse_broken(kind: type[CatalogueEffect], finger: Finger) -> None:
 
 
 class _Nominal(NamedTuple):
-    """Two samples of a finger without effects, that does nothing."""
+    """A finger without effects, and two samples of it; of its arrays only the shapes mean something."""
 
     finger: Finger
     model: Model

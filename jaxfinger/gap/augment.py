@@ -69,7 +69,7 @@ def as_refitted(problem: Problem, chosen: SearchState) -> Fitted:
     """The same where the search has led, with no fit of its own, and by the programs of the nominal model and of
     signatures, which are compiled already. Its intervals leave out the products of effects with the nominal parameters.
     """
-    ones = Weights(*np.ones((2, len(chosen.columns.items))))
+    ones = Weights.plain(chosen.columns)
     there = moved(chosen.problem, Whitened(chosen.problem, chosen.columns, ones).nominal_step(chosen.r))
     model, moving = _with_effects(there.nominal, chosen.effects)
     labels = [p.name for p in describe(model)]

@@ -278,8 +278,8 @@ def _unexplained(chosen: SearchState, shares: Budget, left: list[Explained], sta
     proposal = None
     if status in (Status.PARTLY, Status.UNEXPLAINED):
         progress("looking for a closed form of what remains")
-        ones = Weights(*np.ones((2, len(chosen.columns.items))))
-        proposal = propose(chosen.problem, Whitened(chosen.problem, chosen.columns, ones), chosen.r, left)
+        plain = Whitened(chosen.problem, chosen.columns, Weights.plain(chosen.columns))
+        proposal = propose(chosen.problem, plain, chosen.r, left)
     there = ExperimentChannel(worst.experiment, worst.channel, site(chosen.problem, worst.channel, worst.column))
     return Unexplained(share, ends, depends, there, proposal)
 

@@ -24,7 +24,7 @@ STEPS = 6  # of shapes and amplitudes at one nominal model
 STEP = 0.05  # of a difference, in units of a coordinate
 FACTOR = 0.7  # logarithm of the most by which a step changes a shape
 ROUNDS = 5  # of moving the nominal model
-PLAIN = 3  # of them by plain least squares: a gain of a fifth is then known to a fiftieth
+PLAIN = 3  # steps of plain least squares, each nonlinear by a fifth of the one before: `tests/gap/test_problem.py`
 SETTLED = 0.5  # change of the score below which it stays
 HALVINGS = 3
 ROUNDING = 1e-14  # of the largest variance: a sum of ten thousand products is good to a hundred times 2.2e-16
@@ -205,10 +205,10 @@ def fitted(
 def led_plainly(bench: Bench, state: SearchState) -> SearchState:
     """The causes together where plain least squares leads from a state, if the formula says more for that.
 
-    A column that is open pulls little in the formula's weights, at causes that would close it too. Where these bend the
-    nominal model by much, no small step closes it, and `fitted` stays on this side.
+    The formula gives a column that is open little weight. Where it takes a large step in the nominal model to close it,
+    `fitted` ends before, since each small step wins less than it loses in the columns that are closed.
     """
-    plain = Weights(*np.ones((2, len(bench.columns.items))))
+    plain = Weights.plain(bench.columns)
     problem, effects, there = state.problem, list(state.effects), state
     for _ in range(PLAIN):
         there = at_one_model(bench, problem, effects, plain)
@@ -255,7 +255,7 @@ def at_one_model(bench: Bench, problem: Problem, effects: list[CatalogueEffect],
     changes, slopes = _evaluate(signatures, effects, coordinates, reach)
     # An amplitude is measured in the gap: one prior standard deviation changes as much as is missed in all. One that
     # changes nothing here keeps its own unit, as the warmth of a friction that there is none of.
-    plain = Whitened(problem, bench.columns, Weights(*np.ones((2, len(bench.columns.items)))))
+    plain = Whitened(problem, bench.columns, Weights.plain(bench.columns))
     norm = np.linalg.norm(plain(slopes), axis=1)
     grow = np.array([bench.gap / n if c.amplitude and n > 0.0 else 1.0 for c, n in zip(coordinates, norm, strict=True)])
     coordinates = [replace(c, unit=c.unit * g) if c.amplitude else c for c, g in zip(coordinates, grow, strict=True)]

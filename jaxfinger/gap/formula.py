@@ -52,6 +52,11 @@ class Weights:
     feature: Float[np.ndarray, "*n C"]  # 1 / v_c
     outside: Float[np.ndarray, "*n C"]
 
+    @classmethod
+    def plain(cls, columns: Columns) -> "Weights":
+        """Those of plain least squares."""
+        return cls(*np.ones((2, len(columns.items))))
+
 
 class Evidence(NamedTuple):
     """All that the formula needs to know of one set of causes."""
@@ -160,7 +165,7 @@ class Linear:
             prior[0, k:] = prior[k:, 0] = middle
             prior[0, 0] += float(middle @ middle)
         before = self.null.b if self.null else None
-        weights = start or (self.null.weights if self.null else self._white())
+        weights = start or (self.null.weights if self.null else Weights.plain(self.columns))
         for _ in range(ROUNDS):
             H = self._weighted(weights, B, B, T) + prior
             x = self._solve(H, low, high)
@@ -174,10 +179,6 @@ class Linear:
         sizes = -x[k:] if middle is None else -x[k:] - middle
         occam = 0.5 * _further_information(H, k) + 0.5 * float(sizes @ sizes) if n else 0.0
         return Judged(Evidence(e, o, explained, log_l - occam), log_l, -x[k:], x, b, weights)
-
-    def _white(self) -> Weights:
-        ones = np.ones(len(self.columns.items))
-        return Weights(ones, ones)
 
     def _solve(self, H, low, high):
         """Coefficients (1, −δ, −a); amplitudes that leave their bounds stay at them."""

@@ -43,7 +43,7 @@ def next_experiment(problem: Problem, members: Sequence[SearchState]) -> NextExp
     if len(members) < 2:
         return None
     shown = {e for m in members for x in m.effects for e in shows(type(x), problem.nominal.finger)}
-    ones = Weights(*np.ones((2, len(members[0].columns.items))))
+    ones = Weights.plain(members[0].columns)
     project, own = Whitened(problem, members[0].columns, ones), Signatures(problem)
     steps, known = [], []
     for m in members:

@@ -85,7 +85,7 @@ class SignatureTable:
 
 def table_of(problem: Problem, bench: Bench, parts: Iterable[Part], together: bool = True) -> SignatureTable:
     """Every candidate that the trials can see."""
-    plain = Whitened(problem, bench.columns, Weights(*np.ones((2, len(bench.columns.items)))))
+    plain = Whitened(problem, bench.columns, Weights.plain(bench.columns))
     rt = plain.residual(problem.r)
     offered = [part.offer(plain, rt, bench.columns) for part in parts]
     items = [v for some, _ in offered for v in some]
@@ -350,7 +350,7 @@ class Search:
             if better is None:
                 break
             state = self._pruned(better)
-        # What each could be replaced by starts where the state has led; so does the state once more, to be as settled.
+        # What could replace a cause is fitted from where the state has led. The state is so too, that none is favoured.
         if state.effects:
             state = max(state, self.exactly(state, None), key=lambda s: s.score)
         for i, key in enumerate(state.keys):

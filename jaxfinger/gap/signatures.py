@@ -141,13 +141,14 @@ class Signatures:
             y0, plain = self.problem.without_effects[group.channel, group.held]
             columns, _, T = y0[0].shape
             raw = np.empty((len(members), columns, len(y0), TRIALS, T))
-            # What only resists changes a force by way of joint torques: their program serves for both.
+            # An effect that resists and does no more changes a force by the joint torques that it adds, so that the
+            # program of these serves for both.
             by_torque = group.channel == "fingertip_force" and not (kind.moves_rigid_body() or kind.reads())
-            still = jnp.zeros_like(group.x[0].q)
             for b in group.of(shown):
                 x, contact = group.x[b], group.contact[b]
                 if by_torque:
-                    torque = np.asarray(_change("joint_torque", stacked, nominal, x, still, plain[b], None, count))
+                    none = jnp.zeros_like(x.q)
+                    torque = np.asarray(_change("joint_torque", stacked, nominal, x, none, plain[b], None, count))
                     raw[:, :, b] = np.einsum("dmbt,kmbt->kdbt", np.asarray(contact), torque[: len(members)])
                 else:
                     found = _change(group.channel, stacked, nominal, x, y0[b], plain[b], contact, count)

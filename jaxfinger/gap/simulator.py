@@ -76,8 +76,8 @@ def _predict(model: Model, stack: Stack) -> dict:
 
 
 def _measured_noise(stacks: dict[str, Stack], told: dict[str, Stack]) -> dict[tuple[str, str], Noise]:
-    """Of every channel where its measurements have most. Predictions have none where joints are held, and a torque that
-    does not act, as in VD.3, has none either.
+    """For each channel the largest noise that its measurements have in any experiment. Predictions themselves have none
+    where joints are held, and neither has the measured torque of VD.3, which is nothing throughout.
     """
     most: dict[str, float] = {}
     for stack in stacks.values():

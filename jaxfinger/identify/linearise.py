@@ -58,8 +58,10 @@ class Linearised(NamedTuple):
         limit: float,
         weights: Float[np.ndarray, " B"] | None,
     ) -> "Linearised":
-        """On along the tangent, to where the residuals are these: white rows move by J δ, without a limit factors by
-        R δ. The limit and the weights are those of before.
+        """The same at parameters further on by δ, where the model is linear and the residuals are those given.
+
+        White rows change by J δ, and factors by R δ unless Huber's cost weighs rows anew. `limit` and `weights` must be
+        those that it was made with.
         """
         white = self.white + self.jacobian @ by
         if limit:

@@ -21,7 +21,7 @@ GAIN = 0.2
 
 
 def white(bench):
-    return Weights(*np.ones((2, len(bench.columns.items))))
+    return Weights.plain(bench.columns)
 
 
 @pytest.fixture(scope="module")
