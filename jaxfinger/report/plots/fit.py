@@ -20,9 +20,8 @@ EDGE = 2.1  # of the axis of intervals: a value and a half-width of its size
 
 INTERVAL_ROWS = 10  # in one panel of a page
 ROW = 0.36  # inches of height that a parameter and its name take
-SIGNS_AN_INCH = (
-    12.0  # a letter is 0.6 of the 9 points of `theme.FONT` wide: 13, less the gap between a name and its value
-)
+# Letters are 0.6 of the 9 points of `theme.FONT` wide: 13, less the gap between a name and its value.
+SIGNS_AN_INCH = 12.0
 
 
 def interval_size(rows: int, width: float) -> tuple[float, float]:
