@@ -30,8 +30,8 @@ from jaxfinger.identify.solve import Source, linearise_each, solve
 from jaxfinger.identify.stages import (
     Progress,
     cad_prior,
-    first_noise,
     free_groups,
+    left_unknown,
     nominal_model,
     seen_by,
     sources_of,
@@ -173,13 +173,14 @@ def build(
             return cad_prior(session, recipe, parameters, free)
         return prior_of(np.asarray(ravel(against.model)), against.covariance, free)
 
-    noise = _with_unknown(fit.noise, stacks, _sources(stacks, fit.noise, parameters), fit.model)
-    sources = _sources(stacks, noise, parameters)
+    noise = _with_unknown(fit.noise, stacks, fit.model)
+    reads = {e: stack.experiment.channels for e, stack in stacks.items()}
+    sources = sources_of(stacks, reads, noise, parameters)
     start, more = _with_missing_stages(fit, free, sources, parameters, touched_by(stacks, session))
     if more.size > free.size:  # what no stage had fitted was no noise
         start, _ = solve(start, more, sources, known(more))
-        noise = _with_unknown(fit.noise, stacks, sources, start)
-        sources, free = _sources(stacks, noise, parameters), more
+        noise = _with_unknown(fit.noise, stacks, start)
+        sources, free = sources_of(stacks, reads, noise, parameters), more
     prior = known(free)
     nominal, solution = solve(start, free, sources, prior)
 
@@ -251,7 +252,7 @@ def imagined(problem: Problem, stacks: dict[str, Stack]) -> Problem:
     sources = {
         e: problem.sources[e]._replace(batch=stack.batch)
         if e in problem.sources
-        else _sources({e: stack}, known, describe(problem.nominal))[e]
+        else sources_of({e: stack}, {e: stack.experiment.channels}, known, describe(problem.nominal))[e]
         for e, stack in stacks.items()
     }
     rows, linearised = layouts(stacks, sources), linearise_each(problem.nominal, sources)
@@ -315,12 +316,10 @@ def assemble(
     return np.concatenate(r), np.concatenate(J)
 
 
-def _with_unknown(known: dict[tuple[str, str], Noise], stacks: dict[str, Stack], sources, model: Model):
+def _with_unknown(known: dict[tuple[str, str], Noise], stacks: dict[str, Stack], model: Model):
     """The noise of every channel: where no stage has read it, of what the model leaves of it."""
-    missing = {e: [c for c in stack.experiment.channels if (e, c) not in known] for e, stack in stacks.items()}
-    linearised = linearise_each(model, {e: sources[e] for e, channels in missing.items() if channels})
-    found = {(e, c): estimate(stacks[e], c, lin.residuals[c]) for e, lin in linearised.items() for c in missing[e]}
-    return known | found
+    left = left_unknown(model, stacks, {e: stack.experiment.channels for e, stack in stacks.items()}, known)
+    return known | {(e, c): estimate(stacks[e], c, x) for (e, c), x in left.items()}
 
 
 def _with_missing_stages(
@@ -339,13 +338,6 @@ def _with_missing_stages(
         seen |= set(sources[e].positions[np.any(lin.factor[..., :-1] != 0.0, axis=(0, 1))])
     added = np.array([i for i in unknown if i in seen], dtype=int)
     return start_values(fit.model, added, parameters, sources), np.union1d(free, added).astype(int)
-
-
-def _sources(stacks: dict[str, Stack], noise: dict[tuple[str, str], Noise], parameters) -> dict[str, Source]:
-    """Whitened by a first guess where the noise of a channel is not known yet."""
-    reads = {e: stack.experiment.channels for e, stack in stacks.items()}
-    guesses = {(e, c): first_noise(stacks[e], c) for e in reads for c in reads[e] if (e, c) not in noise}
-    return sources_of(stacks, reads, noise | guesses, parameters)
 
 
 def _layout(stack: Stack, filters, start: int) -> Rows:

@@ -82,7 +82,7 @@ def _measured_noise(stacks: dict[str, Stack], told: dict[str, Stack]) -> dict[tu
     most: dict[str, float] = {}
     for stack in stacks.values():
         for c in stack.experiment.channels:
-            most[c] = max(most.get(c, 0.0), float(first_noise(stack, c).std.max()))
+            most[c] = max(most.get(c, 0.0), float(first_noise(stack, c, stack.batch.y[c]).std.max()))
     return {
         (e, c): Noise.white(np.full(len(y), most[c]), "measured") for e, s in told.items() for c, y in s.batch.y.items()
     }

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxfinger.data import Session, joints_of, moving
 from jaxfinger.experiments import EXPERIMENTS, Experiment, Stack, not_judged, prepare
@@ -24,7 +25,7 @@ from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.propagate import propagate
 from jaxfinger.identify.recipe import Recipe
 from jaxfinger.identify.shooting import AHEAD
-from jaxfinger.identify.solve import ROUGH, Solution, Source, Tangents, solve, within
+from jaxfinger.identify.solve import ROUGH, Solution, Source, Tangents, missed_each, solve, within
 from jaxfinger.identify.start import start_values
 from jaxfinger.model import Finger, Model
 
@@ -265,7 +266,7 @@ def estimate_with_noise(
 ) -> tuple[Model, Solution, dict[str, Source], dict[tuple[str, str], Noise]]:
     """Noise from the residuals of a fit with first guesses of it, where it is not known; then the fit under it."""
     tangents, parameters, noise = tangents or Tangents(), describe(model), dict(known)
-    unknown = {(e, c): first_noise(stacks[e], c) for e in reads for c in reads[e] if (e, c) not in noise}
+    unknown = {(e, c): first_noise(stacks[e], c, x) for (e, c), x in left_unknown(model, stacks, reads, noise).items()}
     model = start_values(model, free, parameters, sources_of(stacks, reads, noise | unknown, parameters))
     for _ in range(2 if unknown else 0):
         sources = sources_of(stacks, reads, noise | unknown, parameters)
@@ -317,14 +318,29 @@ def _unseen(parameters, groups, free, touched) -> list[str]:
     return [f"no trial shows {', '.join(names)}: left as given, or at zero{mend}"] if names else []
 
 
-def first_noise(stack: Stack, channel: str) -> Noise:
-    """White noise of the channel's own size: good enough to find residuals whose noise can then be estimated."""
-    columns = stack.batch.y[channel].shape[0]
-    y, mask = np.asarray(stack.batch.y[channel]), np.asarray(stack.batch.mask[channel]) > 0
-    step = np.diff(y, axis=-1)[mask[..., 1:] & mask[..., :-1]]
+def left_unknown(
+    model: Model,
+    stacks: dict[str, Stack],
+    reads: dict[str, tuple[str, ...]],
+    known: dict[tuple[str, str], Noise],
+) -> dict[tuple[str, str], Float[np.ndarray, "_columns _B _T"]]:
+    """What the model leaves, in their units, of the channels read whose noise is not known."""
+    reads = {e: channels for e, channels in reads.items() if any((e, c) not in known for c in channels)}
+    white = {(e, c): Noise.white(np.ones(len(stacks[e].batch.y[c])), "none") for e in reads for c in reads[e]}
+    left = missed_each(model, sources_of(stacks, reads, white, describe(model)))
+    return {(e, c): left[e][c] for e, c in white if (e, c) not in known}
+
+
+def first_noise(stack: Stack, channel: str, left: Float[Array | np.ndarray, "columns B T"]) -> Noise:
+    """White noise by how much what is `left` of the channel changes from sample to sample: good enough to find
+    residuals whose noise can then be estimated.
+
+    Of the channel itself it would be none where that is nothing throughout, as the torque on a finger that is free.
+    """
+    left, mask = np.asarray(left), np.asarray(stack.batch.mask[channel]) > 0
+    step = np.diff(left, axis=-1)[mask[..., 1:] & mask[..., :-1]]
     size = float(np.median(np.abs(step))) if step.size else 1.0
-    std = np.full(columns, max(size, 1e-12))
-    return Noise.white(std, "first guess")
+    return Noise.white(np.full(len(left), max(size, 1e-12)), "first guess")
 
 
 def _noise(solution: Solution, stacks, reads) -> dict[tuple[str, str], Noise]:

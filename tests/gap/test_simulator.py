@@ -71,7 +71,7 @@ def test_the_shipped_sessions_own_fit_is_imitated_as_a_simulator():
         for c in set(stack.experiment.channels) - ({"joint_torque"} if e == "VD.3" else set()):
             mask = jnp.asarray(rebased[e].batch.mask[c])
             off = demean(jnp.asarray(rebased[e].batch.y[c] - stack.batch.y[c]), mask)
-            assert jnp.sqrt(jnp.sum(off**2) / jnp.sum(mask)) < 0.5 * first_noise(stack, c).std.max()
+            assert jnp.sqrt(jnp.sum(off**2) / jnp.sum(mask)) < 0.5 * first_noise(stack, c, stack.batch.y[c]).std.max()
 
 
 def test_predictions_of_other_trials_are_refused(session):

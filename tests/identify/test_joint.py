@@ -6,11 +6,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfinger.data import EXPERIMENTS
 from jaxfinger.errors import UserError
 from jaxfinger.identify import Recipe, identify, refine
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.recipe import FitRecipe
-from jaxfinger.synthetic import measure
+from jaxfinger.synthetic import (
+    SHORT,
+    SpecimenPlant,
+    clean_session,
+    measure,
+    recipe_from,
+    study_finger,
+    true_model,
+)
 
 
 def values(fit):
@@ -30,6 +39,21 @@ def test_estimates_lie_within_their_intervals(joint, truth):
     assert 0.6 < np.sqrt(np.mean(z**2)) < 1.4  # some thirty independent numbers
     assert np.abs(z).max() < 4.5
     assert 0.9 < joint.stages[-1].chi2_per_row < 1.1
+
+
+def test_all_trials_of_one_joint_are_refined_to_their_noise():
+    """One joint has as many parameters as the torque of VD.3, which is nothing throughout, has features: taken to be
+    without noise, it would be all that counts.
+    """
+    specimen = study_finger()
+    trials = {**SHORT, "experiments": list(EXPERIMENTS), "vd1": {"duration": 6.0}, "vd3": {"duration": 4.0}}
+    recipe = recipe_from({"cad": {"mass": 0.05, "com": 2e-3}, "trials": trials})
+    session = measure(clean_session(recipe, SpecimenPlant(specimen), specimen.description), 0)
+    joint = refine(session, identify(session, Recipe(fit=FitRecipe(joint_experiments=EXPERIMENTS))))
+    free = joint.estimated
+    z = (values(joint) - np.asarray(ravel(true_model(specimen))))[free] / joint.std[free]
+    assert 0.8 < joint.stages[-1].chi2_per_row < 1.2
+    assert np.sqrt(np.mean(z**2)) < 1.5
 
 
 def test_no_interval_is_wider_than_the_stages(staged, joint):

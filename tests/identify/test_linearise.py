@@ -53,7 +53,7 @@ def test_the_common_shape_changes_no_derivative(stack, short_truth, effects):
     members = tuple(CATALOGUE[e].at(short_truth.model.finger, ("T1",), **values) for e, values in effects)
     model = eqx.tree_at(lambda m: m.effects, short_truth.model, members, is_leaf=lambda v: isinstance(v, tuple))
     parameters = describe(model)
-    noise = {(EXPERIMENT, c): first_noise(stack, c) for c in CHANNELS}
+    noise = {(EXPERIMENT, c): first_noise(stack, c, stack.batch.y[c]) for c in CHANNELS}
     source = sources_of({EXPERIMENT: stack}, {EXPERIMENT: CHANNELS}, noise, parameters)[EXPERIMENT]
     of_effects = [i for i, p in enumerate(parameters) if p.group == "effects"]
     free = Free.at(model, np.union1d(source.positions, of_effects).astype(int))
@@ -82,7 +82,7 @@ def test_the_common_shape_changes_no_derivative(stack, short_truth, effects):
 def test_the_common_shape_changes_no_residual(stack, short_truth):
     """By the program of residuals alone, and by that of derivatives."""
     model = short_truth.model
-    noise = {(EXPERIMENT, c): first_noise(stack, c) for c in CHANNELS}
+    noise = {(EXPERIMENT, c): first_noise(stack, c, stack.batch.y[c]) for c in CHANNELS}
     source = sources_of({EXPERIMENT: stack}, {EXPERIMENT: CHANNELS}, noise, describe(model))[EXPERIMENT]
     predicted = predict(model, stack.batch.x, CHANNELS)
     alone = residuals_of(model, stack.batch, CHANNELS)
@@ -95,7 +95,7 @@ def test_the_common_shape_changes_no_residual(stack, short_truth):
 def test_an_experiment_that_shows_no_effect_is_predicted_without(stack, short_truth):
     effect = CATALOGUE["tendon_stretch"].at(short_truth.model.finger, ("T1",), compliance=2e-5)
     model = eqx.tree_at(lambda m: m.effects, short_truth.model, (effect,), is_leaf=lambda v: isinstance(v, tuple))
-    noise = {(EXPERIMENT, c): first_noise(stack, c) for c in CHANNELS}
+    noise = {(EXPERIMENT, c): first_noise(stack, c, stack.batch.y[c]) for c in CHANNELS}
     plain = describe(short_truth.model)
     source = sources_of({EXPERIMENT: stack}, {EXPERIMENT: CHANNELS}, noise, plain)[EXPERIMENT]
     silent = missed_each(model, {EXPERIMENT: source._replace(effects=False)})[EXPERIMENT]
@@ -111,7 +111,7 @@ def test_no_program_that_runs_beside_another_calls_lapack(short, short_truth):
     stacks = prepare(short)
     reads = {e: stack.experiment.channels for e, stack in stacks.items()}
     assert "fingertip_force" in reads["VD.2"]
-    noise = {(e, c): first_noise(stacks[e], c) for e in reads for c in reads[e]}
+    noise = {(e, c): first_noise(stacks[e], c, stacks[e].batch.y[c]) for e in reads for c in reads[e]}
     for source in sources_of(stacks, reads, noise, parameters).values():
         free = Free.at(model, source.positions)
         program = _tangent.lower(model, free, blocks(source.batch)[0], tuple(source.filters), jnp.asarray(True))
@@ -123,7 +123,8 @@ def test_what_is_affine_moves_along_its_tangent_exactly(short, short_truth, limi
     """Residuals, white rows and factors, as if linearised and whitened there."""
     (name, channel), rng = ("ID.2", "tendon_excursion"), np.random.default_rng(0)
     trials = prepare(short, [t.name for t in short if t.experiment == name])[name]
-    noise, parameters = {(name, channel): first_noise(trials, channel)}, describe(short_truth.model)
+    noise = {(name, channel): first_noise(trials, channel, trials.batch.y[channel])}
+    parameters = describe(short_truth.model)
     source = sources_of({name: trials}, {name: (channel,)}, noise, parameters)[name]
     source = source._replace(weights=rng.uniform(0.0, 2.0, len(trials.trials)))
     free = Free.at(short_truth.model, source.positions)

@@ -67,7 +67,8 @@ def test_a_step_of_the_simulation_costs_less_than_an_encoder(short, staged):
 def beside_differences(model, shots, every):
     """Of every so many parameters: name, derivatives of the angles ahead of all starts, and differences."""
     parameters, reads = describe(model), {AHEAD: ("q",)}
-    source = sources_of({AHEAD: shots.stack}, reads, {(AHEAD, "q"): first_noise(shots.stack, "q")}, parameters)[AHEAD]
+    noise = {(AHEAD, "q"): first_noise(shots.stack, "q", shots.stack.batch.y["q"])}
+    source = sources_of({AHEAD: shots.stack}, reads, noise, parameters)[AHEAD]
     free = Free.at(model, source.positions)
     slopes = tangent(model, free, source.batch, ("q",)).slopes["q"]
     at = np.asarray(free.get(model))

@@ -71,7 +71,7 @@ def _problem_of(kind, short, short_truth, start, true, shift=0.0):
     (position,) = (i for i, p in enumerate(parameters) if p.group == "effects")
     at_truth = eqx.tree_at(lambda m: m.effects[0].a, model, jnp.asarray(true))
     y = predict(at_truth, stack.batch.x, (CHANNEL,))[CHANNEL].at[effect.index[0]].add(shift)
-    noise = {(EXPERIMENT, CHANNEL): first_noise(stack, CHANNEL)}
+    noise = {(EXPERIMENT, CHANNEL): first_noise(stack, CHANNEL, stack.batch.y[CHANNEL])}
     batch = eqx.tree_at(lambda b: b.y[CHANNEL], stack.batch, y * stack.batch.mask[CHANNEL])
     reads = {EXPERIMENT: (CHANNEL,)}
     source = sources_of({EXPERIMENT: stack}, reads, noise, parameters)[EXPERIMENT]
