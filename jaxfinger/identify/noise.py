@@ -17,7 +17,9 @@ from jaxfinger.experiments import Batch, Stack
 
 ORDER = 3  # of the autoregression
 FEW, MANY = 50, 1000  # samples by which a column tells its size, and its colour
-SLOW = 15  # samples of the moving average that is taken for signal where nothing is repeated
+# s, at the protocol's pace, and samples at least, of the moving average that is taken for signal where nothing is
+# repeated: the low-passes of driven trials correlate noise over a tenth of it, and what goes with it weighs too much.
+SLOW, SAMPLES = 0.75, 15
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B 
         source = "repeats and holds" if _enough(series) else "holds"
         series = [a + b for a, b in zip(series, holds, strict=True)]
     if not _enough(series):
-        series, source = _fast_part(residual, mask), "residuals"
+        series, source = _fast_part(stack, residual, mask), "residuals"
     # A column with few samples of its own borrows the channel's size, and one with not many its colour, which the
     # filters give to all columns alike.
     own, whole = [_autoregression(c) for c in series], _autoregression([s for column in series for s in column])
@@ -189,15 +191,16 @@ def _between_holds(series: list[Series], ar: np.ndarray, innovation: np.ndarray)
     return max(1.0, float(np.sqrt(np.mean(ratios)))) if len(ratios) > 20 else 1.0
 
 
-def _fast_part(residual, mask) -> list[Series]:
+def _fast_part(stack: Stack, residual, mask) -> list[Series]:
     """Residuals less their moving average: without repeats, what a law could explain is taken to be slow."""
-    kernel = np.ones(SLOW) / SLOW
+    size = max(SAMPLES, round(SLOW * stack.experiment.pace / stack.dt))
+    kernel = np.ones(size) / size
     series: list[Series] = [[] for _ in range(len(residual))]
     for c, b in np.ndindex(residual.shape[:2]):
         e, counts = np.where(mask[c, b], residual[c, b], 0.0), mask[c, b]
         if counts.any():
             mean = np.convolve(e, kernel, "same") / np.maximum(np.convolve(counts, kernel, "same"), 1e-9)
-            series[c].append((np.where(counts, e - mean, 0.0), counts, 1 / SLOW))
+            series[c].append((np.where(counts, e - mean, 0.0), counts, 1 / size))
     return series
 
 

@@ -21,18 +21,21 @@ def coloured(rng, shape):
     return e[..., 200:]
 
 
+def stack_of(residual, mask, motions, dt):
+    still, whenever = jnp.zeros(mask.shape), jnp.zeros(mask.shape[1:])
+    x = Motion(whenever, still, still, still, still, still, still, whenever, still)
+    batch = Batch(x, {"joint_torque": jnp.asarray(residual)}, {"joint_torque": jnp.asarray(mask)})
+    holds, measured = np.full(mask.shape[1:], -1), {"joint_torque": True}
+    return Stack(EXPERIMENTS["VD.3"], batch, ("1", "2"), motions, holds, dt, measured)
+
+
 def repeated(seed):
     """Two trials of one motion; a column counts in one run of COUNTS samples."""
     residual = SIZES[:, None, None] * coloured(np.random.default_rng(seed), (3, 2))
     mask = np.zeros_like(residual)
     for column, count in zip(mask, COUNTS, strict=True):
         column[:, 100 : 100 + count] = 1.0
-    still, whenever = jnp.zeros(mask.shape), jnp.zeros(mask.shape[1:])
-    x = Motion(whenever, still, still, still, still, still, still, whenever, still)
-    batch = Batch(x, {"joint_torque": jnp.asarray(residual)}, {"joint_torque": jnp.asarray(mask)})
-    holds, measured = np.full(mask.shape[1:], -1), {"joint_torque": True}
-    stack = Stack(EXPERIMENTS["VD.3"], batch, ("1", "2"), ("a", "a"), holds, 0.01, measured)
-    return stack, residual, mask
+    return stack_of(residual, mask, ("a", "a"), 0.01), residual, mask
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +54,21 @@ def test_every_column_with_samples_of_its_own_comes_out_white(estimates):
     assert COUNTS[2] < FEW < COUNTS[1]
     np.testing.assert_allclose(energy.mean(axis=0)[:2], 1.0, atol=0.08)
     assert np.abs(energy[:, :2] - 1.0).max() < 0.35  # of 300 rows, in a single estimate
+
+
+def test_noise_that_nothing_repeats_keeps_its_slow_part():
+    """How well samples tell a constant hangs on it; the moving average takes a third of it at most."""
+    energy, long_run, true = [], [], 1.0 / (1.0 - COLOUR.sum()) ** 2
+    for seed in range(12):
+        residual = coloured(np.random.default_rng(seed), (1, 2))
+        mask = np.tile(np.arange(residual.shape[-1]) % 80 < 40, (1, 2, 1)).astype(float)
+        noise = estimate(stack_of(residual, mask, (None, None), 0.02), "joint_torque", residual)
+        assert noise.source == "residuals"
+        white = whiten(residual, mask, noise.coefficients, False)
+        energy.append(np.sum(white**2) / mask.sum())
+        long_run.append((noise.innovation[0] / (1.0 - noise.ar[0].sum())) ** 2 / true)
+    assert np.mean(energy) == pytest.approx(1.0, abs=0.08)
+    assert 0.67 < np.mean(long_run) < 1.1
 
 
 def test_after_a_gap_the_whitening_is_that_of_what_is_left():
