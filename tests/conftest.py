@@ -11,6 +11,8 @@ import tempfile
 
 from jaxtyping import install_import_hook
 
+from tests import checks
+
 # Equations say which ranks and types meet: nothing is promoted in silence.
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
 os.environ["JAX_NUMPY_DTYPE_PROMOTION"] = "strict"
@@ -28,9 +30,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
-# Each annotation is checked when it is called; where `float` stands, an `int` may too (PEP 484). Not in the rig's room,
-# whose tests race a clock: checks took a third of the time of a simulated bench there.
+# Each annotation is checked when it is called. Not in the rig's room, whose tests race a clock: checks took a third of
+# the time of a simulated bench there.
 ROOMS = ("cli", "data", "effects", "experiments", "gap", "identify", "model", "report", "sealed", "synthetic")
-install_import_hook(
-    [f"jaxfinger.{room}" for room in ROOMS], "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
-)
+install_import_hook([f"jaxfinger.{room}" for room in ROOMS], f"{checks.__name__}.checked")
