@@ -32,9 +32,7 @@ PATHS = ({"T1": "[0.008, 1e-3]", "T2": "[-0.008, -1e-3]"}, "[terms.joints.MCP]\n
 MEANS = {"SESSION": "session.h5", "SESSION.h5": "session.h5", "B.h5": "session.h5", "C.h5": "unseen.h5"}
 MEANS |= {"FILE": "session.h5", "FIT": "fit.json", "A-fit.json": "fit.json", "LOG": "LOG.csv", "bench.toml": "rig.toml"}
 MEANS |= {"…": ""}  # a reader puts more of the same there
-# What these do takes a minute and more; `sealed` works for minutes on each case.
 MATRIX = "jaxfinger.rig.matrix"  # its table is made and held to the page by tests/rig/test_matrix.py
-LONG = ("demo", "diagnose", "sealed")
 
 
 def commands(page: Path) -> list[str]:
@@ -53,12 +51,6 @@ def commands(page: Path) -> list[str]:
 def modules(page: Path) -> list[str]:
     """Modules that a page tells to run."""
     return re.findall(r"python -m (jaxfinger[\w.]*)", page.read_text(encoding="utf-8"))
-
-
-def long(line: str):
-    """Marked as a long proof where it takes so long."""
-    slow = line.split()[1] in LONG and not is_a_name(line)
-    return pytest.param(line, id=line[:70].replace("/", "_"), marks=[pytest.mark.long] if slow else [])
 
 
 def is_a_name(line: str) -> bool:
@@ -149,8 +141,11 @@ def reader(shelf, tmp_path, monkeypatch):
     os.close(ours)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
-    "line", [long(c) for c in dict.fromkeys(c for p in PAGES if p != BENCHMARK for c in commands(p))]
+    "line",
+    dict.fromkeys(c for p in PAGES if p != BENCHMARK for c in commands(p)),
+    ids=lambda c: c[:70].replace("/", "_"),
 )
 def test_every_command_of_the_pages_runs(line, reader, capsys):
     if is_a_name(line):
@@ -163,13 +158,14 @@ def test_every_command_of_the_pages_runs(line, reader, capsys):
     assert [path for path in written if not path.exists()] == []
 
 
-def test_every_command_of_the_benchmark_is_one():
-    """They take hours: forty cases, each diagnosed for a minute. tests/sealed runs them on small ones."""
-    lines = commands(BENCHMARK)
-    assert len(lines) > 5
+def test_every_command_of_the_pages_is_one():
+    """Also those of the benchmark, which take hours: tests/sealed runs them on small cases."""
+    lines = [line for page in PAGES for line in commands(page)]
+    assert len(lines) > 60
     for line in lines:
         if not is_a_name(line):
-            app.parse_args(shlex.split(line)[1:], exit_on_error=False, print_error=False)
+            words = [MEANS.get(word, word) for word in shlex.split(line)[1:]]
+            app.parse_args([*filter(None, words)], exit_on_error=False, print_error=False)
 
 
 @pytest.mark.parametrize("module", sorted({m for p in PAGES for m in modules(p)} - {MATRIX}))

@@ -78,6 +78,7 @@ def beside_differences(model, shots, every):
         yield parameters[source.positions[k]].name, slopes[k], (up - down) / (2.0 * h[k])
 
 
+@pytest.mark.long
 def test_derivatives_agree_with_differences_where_nothing_begins_to_stick(short, staged):
     shots = shooting(short)
     seen = np.asarray(shots.stack.batch.mask["q"]) > 0

@@ -24,6 +24,7 @@ def quick(monkeypatch):
 SPEC = CaseSpec("double", "planar", ("tendon_stretch", "torque_sensor_scale"), (10.0, 5.0))
 
 
+@pytest.mark.long
 def test_a_case_repeats_bit_for_bit_and_keeps_its_truth_apart(quick, tmp_path):
     first = make_case(3, "develop", SPEC, tmp_path / "a", tmp_path / "a-truth")
     second = make_case(3, "develop", SPEC, tmp_path / "b", tmp_path / "b-truth")
