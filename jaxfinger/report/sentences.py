@@ -27,6 +27,7 @@ from jaxfinger.gap.result import (
 from jaxfinger.report.numbers import alike, measured, number, percent, percent_range, quantity
 
 NAMED_AT_MOST = 4  # causes in one sentence
+MEASURABLE = 0.005  # share of a gap that is not said as 0 %
 LIKELY, SURE = 0.9, 0.99  # probabilities from which on a person says «very probably» and «almost certainly»
 
 HEADLINES = {
@@ -156,7 +157,7 @@ def size(d: Diagnosis) -> str:
         largest.setdefault(x.channel, x)
     lines = list(largest.values())[:2]
     if not lines:
-        return f"{_subject(d)} misses the measurements by more than their noise"
+        return f"all trials together show that {_subject(d)} misses something, no channel by more than its noise may do"
     return f"{_subject(d)} misses {joined([how_large(x, d.tolerance) for x in lines])}"
 
 
@@ -249,9 +250,15 @@ def _blamed(d: Diagnosis) -> str:
     if not causes:
         return f"the cause is {_listed([key_name(k) for k in d.named], 'cause')}"
     sure = certainty(min(c.probability for c in causes))
+    if not d.relevance:
+        are = "is" if len(causes) == 1 else "are"
+        return f"{_listed([cause_name(c) for c in causes], 'cause')} {are} {sure} at work"
     if len(causes) == 1:
         c = causes[0]
-        return f"{cause_name(c)} {sure} causes {percent(c.share)} of it (95 % interval {percent_range(*c.share_ci95)})"
+        share = f"{percent(c.share)} of it (95 % interval {percent_range(*c.share_ci95)})"
+        if c.share < MEASURABLE:
+            return f"{cause_name(c)} is {sure} at work, but closes {share} on trials that no fit has seen"
+        return f"{cause_name(c)} {sure} causes {share}"
     first, *rest = causes
     parts = [
         f"{cause_name(first)} ({percent(first.share)} of it)",

@@ -109,6 +109,20 @@ def test_a_signal_of_nothing_has_no_relative_size():
     assert sentences.size(d) == "the model misses the joint torque by 1.2 N mm (ID.4)"
 
 
+def test_a_cause_that_held_out_trials_do_not_show_is_not_said_to_cause_nothing():
+    d = explained()
+    hidden = replace(d, budget=(replace(d.budget[0], share=0.0, share_ci95=(0.0, 0.36)),))
+    text = sentences.summary(hidden)
+    assert "is almost certainly at work, but closes 0 % of it (95 % interval 0 to 36 %) on trials that no fit" in text
+
+
+def test_a_gap_that_shows_in_no_channel_alone_has_a_cause_and_no_share():
+    text = sentences.summary(replace(explained(), relevance=()))
+    assert text.startswith("All trials together show that the model misses something")
+    assert "Tendon stretch at T3 is almost certainly at work; with it" in text
+    assert "%" not in text
+
+
 @pytest.mark.parametrize(("chance", "word"), [(0.55, "probably"), (0.93, "very probably"), (0.995, "almost certainly")])
 def test_words_of_certainty_follow_the_probability(chance, word):
     d = explained()
