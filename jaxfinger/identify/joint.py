@@ -17,6 +17,7 @@ from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.identifiability import name_invisible
+from jaxfinger.identify.noise import SLOWER
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.predictions import model_for
@@ -81,7 +82,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         prior = prior_of(np.asarray(ravel(fit.model)), fit.covariance, free)
     progress("refining on all trials at once")
     known, huber = (fit.noise if same else {}), recipe.fit.huber
-    model, solution, sources, noise = estimate_with_noise(model, free, stacks, reads, known, prior, huber)
+    model, solution, sources, noise = estimate_with_noise(model, free, stacks, reads, known, prior, huber, slow=SLOWER)
     warnings = name_invisible(parameters, free, solution.invisible)
     if not solution.converged or warnings or solution.chi2_per_row(free.size) > MISFIT:
         progress("refining from a neutral start")

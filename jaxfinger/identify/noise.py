@@ -11,15 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
+from scipy.ndimage import uniform_filter1d
 
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.experiments import Batch, Stack
 
 ORDER = 3  # of the autoregression
 FEW, MANY = 50, 1000  # samples by which a column tells its size, and its colour
-# s, at the protocol's pace, and samples at least, of the moving average that is taken for signal where nothing is
-# repeated: the low-passes of driven trials correlate noise over a tenth of it, and what goes with it weighs too much.
-SLOW, SAMPLES = 0.75, 15
+# Samples of the moving average that is taken for signal where nothing is repeated: where a law may be missing, and
+# where the model is taken to be right. The first takes more than half of the long-run variance of VD.3's noise.
+SLOW, SLOWER = 15, 75
 
 
 @dataclass(frozen=True)
@@ -95,8 +96,10 @@ def _lag(a: Float[Array | np.ndarray, "*more T"], k: int) -> Float[Array | np.nd
     return xp.concat([xp.zeros_like(a[..., :k]), a[..., :-k]], axis=-1)
 
 
-def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B T"]) -> Noise:
-    """Noise of a channel from the residuals of a model, by the best source that the stack offers."""
+def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B T"], slow: int = SLOW) -> Noise:
+    """Noise of a channel from the residuals of a model, by the best source that the stack offers; `slow`: samples of
+    the moving average that no noise is looked for in, where nothing is repeated.
+    """
     batch: Batch = stack.batch
     mask = np.asarray(batch.mask[channel]) > 0
     demean = CHANNELS[channel].free_zero
@@ -106,7 +109,7 @@ def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B 
         source = "repeats and holds" if _enough(series) else "holds"
         series = [a + b for a, b in zip(series, holds, strict=True)]
     if not _enough(series):
-        series, source = _fast_part(stack, residual, mask), "residuals"
+        series, source = _fast_part(residual, mask, slow), "residuals"
     # A column with few samples of its own borrows the channel's size, and one with not many its colour, which the
     # filters give to all columns alike.
     own, whole = [_autoregression(c) for c in series], _autoregression([s for column in series for s in column])
@@ -191,16 +194,15 @@ def _between_holds(series: list[Series], ar: np.ndarray, innovation: np.ndarray)
     return max(1.0, float(np.sqrt(np.mean(ratios)))) if len(ratios) > 20 else 1.0
 
 
-def _fast_part(stack: Stack, residual, mask) -> list[Series]:
+def _fast_part(residual, mask, slow: int) -> list[Series]:
     """Residuals less their moving average: without repeats, what a law could explain is taken to be slow."""
-    size = max(SAMPLES, round(SLOW * stack.experiment.pace / stack.dt))
-    kernel = np.ones(size) / size
     series: list[Series] = [[] for _ in range(len(residual))]
     for c, b in np.ndindex(residual.shape[:2]):
         e, counts = np.where(mask[c, b], residual[c, b], 0.0), mask[c, b]
         if counts.any():
-            mean = np.convolve(e, kernel, "same") / np.maximum(np.convolve(counts, kernel, "same"), 1e-9)
-            series[c].append((np.where(counts, e - mean, 0.0), counts, 1 / size))
+            near, share = (uniform_filter1d(x, slow, mode="constant") for x in (e, counts.astype(float)))
+            mean = near / np.maximum(share, 1.0 / slow)
+            series[c].append((np.where(counts, e - mean, 0.0), counts, 1 / slow))
     return series
 
 

@@ -18,7 +18,7 @@ from jaxfinger.data import Session, joints_of, moving
 from jaxfinger.experiments import EXPERIMENTS, Experiment, Stack, not_judged, prepare
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible
-from jaxfinger.identify.noise import Noise, estimate
+from jaxfinger.identify.noise import SLOW, Noise, estimate
 from jaxfinger.identify.parameters import Parameter, describe, ravel
 from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.prior import Prior
@@ -263,15 +263,18 @@ def estimate_with_noise(
     prior: Prior | None,
     huber: float,
     tangents: Tangents | None = None,
+    slow: int = SLOW,
 ) -> tuple[Model, Solution, dict[str, Source], dict[tuple[str, str], Noise]]:
-    """Noise from the residuals of a fit with first guesses of it, where it is not known; then the fit under it."""
+    """Noise from the residuals of a fit with first guesses of it, where it is not known (`slow` as in
+    `noise.estimate`); then the fit under it.
+    """
     tangents, parameters, noise = tangents or Tangents(), describe(model), dict(known)
     unknown = {(e, c): first_noise(stacks[e], c, x) for (e, c), x in left_unknown(model, stacks, reads, noise).items()}
     model = start_values(model, free, parameters, sources_of(stacks, reads, noise | unknown, parameters))
     for _ in range(2 if unknown else 0):
         sources = sources_of(stacks, reads, noise | unknown, parameters)
         model, solution = solve(model, free, sources, prior, tangents=tangents, small=ROUGH)
-        noise |= _noise(solution, stacks, reads)
+        noise |= _noise(solution, stacks, reads, slow)
         unknown = {}
     sources = sources_of(stacks, reads, noise, parameters)
     model, solution = solve(model, free, sources, prior, huber, tangents=tangents)
@@ -343,9 +346,9 @@ def first_noise(stack: Stack, channel: str, left: Float[Array | np.ndarray, "col
     return Noise.white(np.full(len(left), max(size, 1e-12)), "first guess")
 
 
-def _noise(solution: Solution, stacks, reads) -> dict[tuple[str, str], Noise]:
+def _noise(solution: Solution, stacks, reads, slow: int) -> dict[tuple[str, str], Noise]:
     return {
-        (e, c): estimate(stacks[e], c, np.asarray(solution.linearised[e].residuals[c]))
+        (e, c): estimate(stacks[e], c, np.asarray(solution.linearised[e].residuals[c]), slow)
         for e, channels in reads.items()
         for c in channels
     }

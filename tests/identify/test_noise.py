@@ -6,7 +6,7 @@ import pytest
 import scipy.linalg
 
 from jaxfinger.experiments import EXPERIMENTS, Batch, Stack
-from jaxfinger.identify.noise import FEW, Noise, estimate, whiten
+from jaxfinger.identify.noise import FEW, SLOWER, Noise, estimate, whiten
 from jaxfinger.model import Motion
 
 SIZES, COUNTS, LENGTH = np.array([1.0, 5.0, 0.2]), (2000, 150, 20), 2400
@@ -62,7 +62,7 @@ def test_noise_that_nothing_repeats_keeps_its_slow_part():
     for seed in range(12):
         residual = coloured(np.random.default_rng(seed), (1, 2))
         mask = np.tile(np.arange(residual.shape[-1]) % 80 < 40, (1, 2, 1)).astype(float)
-        noise = estimate(stack_of(residual, mask, (None, None), 0.02), "joint_torque", residual)
+        noise = estimate(stack_of(residual, mask, (None, None), 0.02), "joint_torque", residual, SLOWER)
         assert noise.source == "residuals"
         white = whiten(residual, mask, noise.coefficients, False)
         energy.append(np.sum(white**2) / mask.sum())
