@@ -27,6 +27,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 VISIBLE = 1e-7  # relative singular value of the column-scaled Jacobian below which a combination is not seen
 FOLLOWS = 1e-3  # least share of the predicted descent by which a step counts as descent at all
 POOR, GOOD = 0.25, 0.75  # shares of it below which the next step is shorter, and above which it is longer
+SHORTER = 0.5  # of the last step: one at most so long is progress where the cost shows none
+STALLED = 4  # steps
 TANGENTS = 8  # columns of a Jacobian at a time: more do not fit into the processor's cache
 ROUNDING = 1e-12  # of a cost, relative: it cannot be told lower by less
 
@@ -37,6 +39,7 @@ class Outcome(eqx.Enumeration):
     going = "the search has not ended"
     converged = ""
     kink = "the last steps lie within a kink of the cost, a tenth of a standard deviation wide"
+    rounded = "rounding hides what the last steps do to the cost"
     no_descent = "no step along the descent lowers the cost: the model has a kink or a jump there"
     nowhere = "the model predicts nothing finite where the fit starts"
 
@@ -64,14 +67,16 @@ class Iterate(eqx.Module):
     slope: Float[Array, ""]  # of the cost along it
     length: Float[Array, ""]  # share of it that is tried
     size: Float[Array, ""]  # of the whole step, in standard deviations
+    stalled: Int[Array, ""]  # steps without progress since the cost last fell
     evaluations: Int[Array, ""]
     outcome: Outcome
 
 
 class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
     """Ends where a whole step is shorter than `atol + rtol ‖r‖` in the coordinates z, or no longer than `kink` in them
-    and lowers the cost no further. Options: `lower` and `upper`, like y; a start outside of them stays until a step
-    leads back. `jac` as in `optimistix.GaussNewton` is always forward.
+    and lowers the cost no further, or where rounding hides what steps do to the cost and they become no shorter.
+    Options: `lower` and `upper`, like y; a start outside of them stays until a step leads back. `jac` as in
+    `optimistix.GaussNewton` is always forward.
     """
 
     rtol: float = 0.0
@@ -113,8 +118,8 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
         predicted = -state.length * state.slope - 0.5 * jnp.sum((state.here.R @ moved) ** 2)
         descent = state.cost - here.cost
         follows = jnp.where(predicted > 0.0, descent / jnp.where(predicted > 0.0, predicted, 1.0), 1.0)
-        flat = jnp.abs(descent) <= ROUNDING * state.cost
-        accept = finite & (first | (follows >= FOLLOWS) | (flat & (predicted <= ROUNDING * state.cost)))
+        hidden = (jnp.abs(descent) <= ROUNDING * state.cost) & (predicted <= ROUNDING * state.cost)
+        accept = finite & (first | (follows >= FOLLOWS) | hidden)
 
         new = jax.tree.map(lambda a, b: jnp.where(accept, a, b), here, state.here)
         best = jnp.where(accept, state.trial, y)
@@ -130,12 +135,16 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
         again = jnp.where(follows > GOOD, jnp.minimum(1.0, 2.0 * state.length), state.length)
         again = jnp.where(follows < POOR, jnp.clip(least, 0.1 * state.length, state.length), again)
         length = jnp.where(first & accept, 1.0, jnp.where(accept, again, shorter))
+        # Where rounding hides what a step does to the cost, how long the next one is tells what it was worth.
+        lost = accept & hidden & (size > SHORTER * state.size)
+        stalled = jnp.where(accept & ~hidden, 0, state.stalled + lost.astype(int))
 
         enough = self.atol + self.rtol * jnp.sqrt(2.0 * new.cost)
         outcome = Outcome.going
         outcome = Outcome.where(accept & (size <= enough), Outcome.converged, outcome)
         outcome = Outcome.where(~accept & (state.length * size <= self.kink), Outcome.kink, outcome)
         outcome = Outcome.where(~accept & (shorter * size <= 0.1 * enough), Outcome.no_descent, outcome)
+        outcome = Outcome.where(stalled >= STALLED, Outcome.rounded, outcome)
         outcome = Outcome.where(first & ~finite, Outcome.nowhere, outcome)
         after = Iterate(
             best + length * step,
@@ -145,6 +154,7 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
             slope,
             length,
             size,
+            stalled,
             state.evaluations + 1,
             outcome,
         )
@@ -170,7 +180,9 @@ def begin(y: PyTree) -> Iterate:
     flat = ravel_pytree(y)[0]
     none = Factor(jnp.zeros((flat.size, flat.size)), jnp.zeros_like(flat), jnp.array(0.0))
     zero, count = jnp.array(0.0), jnp.array(0)
-    return Iterate(y, none, jnp.array(jnp.inf), jnp.zeros_like(flat), zero, jnp.array(1.0), zero, count, Outcome.going)
+    return Iterate(
+        y, none, jnp.array(jnp.inf), jnp.zeros_like(flat), zero, jnp.array(1.0), zero, count, count, Outcome.going
+    )
 
 
 def state_of_vector(state: Iterate, trial: Float[Array, " p"]) -> Iterate:

@@ -81,7 +81,7 @@ class Solution:
 
     @property
     def converged(self) -> bool:
-        """At an optimum, or in a kink a tenth of a standard deviation wide."""
+        """At an optimum, as far as rounding shows, or in a kink a tenth of a standard deviation wide."""
         return not self.message
 
     def chi2_per_row(self, estimated: int) -> float:
@@ -195,9 +195,11 @@ def within(
 
 def _sentence(state: Iterate) -> str:
     """What a user reads of a search that did not converge; nothing of one that did."""
-    if bool(state.outcome == Outcome.converged) or bool(state.outcome == Outcome.kink):
+    step = float(state.length * state.size)
+    within = bool(state.outcome == Outcome.rounded) and step <= KINK
+    if within or bool(state.outcome == Outcome.converged) or bool(state.outcome == Outcome.kink):
         return ""
-    last = f"the last step was {float(state.length * state.size):.2g} standard deviations"
+    last = f"the last step was {step:.2g} standard deviations"
     if bool(state.outcome == Outcome.going):
         return f"no end after {STEPS} linearisations; {last}"
     return f"{Outcome[state.outcome]}; {last}"

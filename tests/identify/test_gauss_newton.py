@@ -6,7 +6,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from jaxfinger.identify.gauss_newton import VisibleGaussNewton
+from jaxfinger.identify.gauss_newton import ROUNDING, Outcome, VisibleGaussNewton
 
 SOLVER = VisibleGaussNewton(atol=1e-9)
 
@@ -45,3 +45,35 @@ def test_it_batches_and_differentiates():
 def test_an_optimum_on_a_bound_is_found():
     found = optx.least_squares(rosenbrock, SOLVER, jnp.zeros(2), 1.0, {"upper": jnp.array([0.5, 5.0])})
     np.testing.assert_allclose(found.value, [0.5, 0.25], rtol=1e-7)
+
+
+def bent(y, a):
+    """Rows with kinks, some of them curved, beside what no parameter changes, of whose cost theirs is a small share."""
+    A, c, bend, rest = a
+    x = A @ y
+    return jnp.where(bend > 0.3, jnp.maximum(x, -0.8 * x) + 0.3 * bend * x**2, x) - c, rest
+
+
+def test_it_ends_where_rounding_hides_what_steps_do_to_the_cost():
+    """Of made problems of many scales, every search ends, and one that ends by rounding at a cost that no search
+    without the rest lowers by more than rounding hides.
+    """
+    solver, rng, rounded = VisibleGaussNewton(atol=1e-6, kink=0.1), np.random.default_rng(0), 0
+
+    @jax.jit
+    def found(start, *a):
+        return optx.least_squares(bent, solver, start, a, throw=False, max_steps=60)
+
+    for _ in range(100):
+        unit = 10.0 ** rng.uniform(-6, 6, 4)
+        A, c = rng.standard_normal((12, 4)) / unit, rng.standard_normal(12) * 10.0 ** rng.uniform(-3, 2)
+        bend, rest = rng.uniform(0.0, 0.9, 12), np.full(40, 10.0 ** rng.uniform(3, 4))
+        start, rows = jnp.asarray(unit * rng.standard_normal(4)), tuple(map(jnp.asarray, (A, c, bend)))
+        there = found(start, *rows, jnp.asarray(rest))
+        assert there.stats["outcome"] != Outcome.going
+        if there.stats["outcome"] == Outcome.rounded:
+            rounded += 1
+            further = found(there.value, *rows, jnp.asarray(0.0 * rest)).value
+            cost, lower = (0.5 * jnp.sum(bent(y, (*rows, rest))[0] ** 2) for y in (there.value, further))
+            assert cost - lower <= ROUNDING * 0.5 * np.sum(rest**2)
+    assert rounded > 10
