@@ -11,6 +11,7 @@ import os
 import socket
 import time
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 
 import numpy as np
@@ -80,7 +81,7 @@ def bootstrap_table(session, fit, resamples: int) -> None:
 def session_table(clean, session, fit, count: int, processes: int) -> None:
     """Sessions in one batch against `identify` one after another, filtering included in both."""
     sessions = [measure(clean, seed) for seed in range(count)]
-    members, first, batch = timed(lambda: fit_many(sessions, fit, session))
+    members, first, batch = timed(partial(fit_many, sessions, fit, session))
     few = min(count, 10)
     start = time.perf_counter()
     alone = [identify(s) for s in sessions[:few]]

@@ -30,7 +30,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
-# Each annotation is checked when it is called. Not in the rig's room, whose tests race a clock: checks took a third of
-# the time of a simulated bench there.
+# Each annotation is checked when it is called. Not in the rig's room: with it the tests of recorder and supervisor take
+# five times as long, and they race a clock.
 ROOMS = ("cli", "data", "effects", "experiments", "gap", "identify", "model", "report", "sealed", "synthetic")
 install_import_hook([f"jaxfinger.{room}" for room in ROOMS], f"{checks.__name__}.checked")
