@@ -116,6 +116,13 @@ def test_a_cause_that_held_out_trials_do_not_show_is_not_said_to_cause_nothing()
     assert "is almost certainly at work, but closes 0 % of it (95 % interval 0 to 36 %) on trials that no fit" in text
 
 
+@pytest.mark.parametrize(("share", "doubted"), [(0.1, False), (0.4, True)])
+def test_where_much_is_left_the_cause_that_is_named_is_doubted(share, doubted):
+    d = ALL["partly"]
+    text = sentences.summary(replace(d, unexplained=replace(d.unexplained, share=share)))
+    assert ("may only imitate a law that nobody listed" in text) == doubted
+
+
 def test_a_gap_that_shows_in_no_channel_alone_has_a_cause_and_no_share():
     text = sentences.summary(replace(explained(), relevance=()))
     assert text.startswith("All trials together show that the model misses something")
