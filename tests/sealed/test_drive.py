@@ -52,7 +52,10 @@ def specimen_active(nominal):
     return nominal.specimen.finger.active
 
 
-@pytest.mark.parametrize("kind", LAYOUTS)
+LARGE = ("chain", "human-like")  # most joints and tendons
+
+
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.long] * (k in LARGE)) for k in LAYOUTS])
 def test_the_same_tensions_open_loop_lead_to_the_same_motion(kind):
     """The fingers are statically stable under the recorded tensions, so a simulator can replay them."""
     rng = np.random.default_rng([3, 1])
