@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
-from scipy.linalg.lapack import dgeqrt
+from scipy.linalg import get_lapack_funcs
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data.schema import CHANNELS
@@ -31,6 +31,8 @@ from jaxfinger.model import Model
 
 Tree = TypeVar("Tree")
 Filters = dict[str, Float[Array, "_columns lags lags"]]  # `Noise.coefficients` of every channel
+PANEL = 32  # columns of a panel of ?geqrt, as LAPACK has it for ?geqrf
+(_geqrt,) = get_lapack_funcs(("geqrt",), dtype=np.float64)
 
 
 class Tangent(NamedTuple):
@@ -206,7 +208,7 @@ def triangular(A: Float[np.ndarray, "N p"]) -> Float[np.ndarray, "k p"]:
     """R of A = Q R. LAPACK's ?geqrt, whose panels are recursive, takes a third of ?geqrf's time on tall matrices."""
     if not A.size:
         return np.zeros((0, A.shape[1]))
-    return np.triu(dgeqrt(min(32, *A.shape), A)[0][: A.shape[1]])
+    return np.triu(_geqrt(min(PANEL, *A.shape), A)[0][: A.shape[1]])
 
 
 def _cut(parts: Iterable[Tree], batch: Batch) -> Tree:
