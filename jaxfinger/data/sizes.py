@@ -6,6 +6,7 @@ from statistics import median_low
 import numpy as np
 from jaxtyping import Float
 
+from jaxfinger.data.filtering import without_spikes
 from jaxfinger.data.session import Session, Trial
 
 SLACK = 0.02  # of the highest tension: taut is a fifth of it or more in protocols, and a tare is good to a hundredth
@@ -83,10 +84,10 @@ def _pace(times: list[float]) -> float:
 
 def _quick(trial: Trial) -> float:
     """s in which a joint passes a tenth of its way where it is quick, of the joint that takes longest: at rest the way
-    is noise, and takes no time. 0 of a trial in which nothing moves.
+    is noise, and takes no time. 0 of a trial in which nothing moves. Spikes are no motion.
     """
     every = max(1, len(trial.time) // PASSES)
-    columns = [x[np.isfinite(x)] for x in trial.q[::every].T]
+    columns = [x[np.isfinite(x)] for x in without_spikes(trial.q)[::every].T]
     step = float(np.median(np.diff(trial.time))) * every if len(trial.time) > 1 else 0.0
     return step * max((_lag(x) for x in columns if x.size and np.ptp(x) > 0.0), default=0)
 
