@@ -10,9 +10,9 @@ CONFIGURATION = BeartypeConf(is_pep484_tower=True)
 
 
 def checked(fn: Callable) -> Callable:
-    """jaxtyping has two functions made for one: before a call the first is given the arguments (and returns anything),
-    after it the second is given the arguments again and returns what the call did. It remembers the sizes that the
-    arguments had, so the second checks the return alone.
+    """A function that jaxtyping made to check another: one for the arguments, before a call, and one for what it
+    returned, after it, which is given the arguments once more. Their sizes are remembered in between, so that the
+    second one checks what was returned alone.
     """
     if fn.__annotations__.get("return", Any) is not Any:
         fn.__annotations__ = {"return": fn.__annotations__["return"]}

@@ -27,8 +27,10 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 VISIBLE = 1e-7  # relative singular value of the column-scaled Jacobian below which a combination is not seen
 FOLLOWS = 1e-3  # least share of the predicted descent by which a step counts as descent at all
 POOR, GOOD = 0.25, 0.75  # shares of it below which the next step is shorter, and above which it is longer
-SHORTER = 0.5  # of the last step: one at most so long is progress where the cost shows none
-STALLED = 4  # steps
+# Where the cost shows no progress, a step at most so long as the last one is some: a search that converges at this rate
+# or faster ends within a few steps. Steps that miss it, of which a few in a row end the search: a zigzag across a kink
+# may still descend by one or two (tests/identify/test_gauss_newton.py).
+SHORTER, STALLED = 0.5, 4
 TANGENTS = 8  # columns of a Jacobian at a time: more do not fit into the processor's cache
 ROUNDING = 1e-12  # of a cost, relative: it cannot be told lower by less
 

@@ -19,7 +19,8 @@ from jaxfinger.experiments import Batch, Stack
 ORDER = 3  # of the autoregression
 FEW, MANY = 50, 1000  # samples by which a column tells its size, and its colour
 # Samples of the moving average that is taken for signal where nothing is repeated: where a law may be missing, and
-# where the model is taken to be right. The first takes more than half of the long-run variance of VD.3's noise.
+# where the model is taken to be right. Of the long-run variance of noise such as VD.3's the first takes more than half,
+# the second a third at most (tests/identify/test_noise.py).
 SLOW, SLOWER = 15, 75
 
 
@@ -97,8 +98,9 @@ def _lag(a: Float[Array | np.ndarray, "*more T"], k: int) -> Float[Array | np.nd
 
 
 def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B T"], slow: int = SLOW) -> Noise:
-    """Noise of a channel from the residuals of a model, by the best source that the stack offers; `slow`: samples of
-    the moving average that no noise is looked for in, where nothing is repeated.
+    """Noise of a channel from the residuals of a model, by the best source that the stack offers.
+
+    `slow`: samples of the moving average of the residuals that counts as signal where nothing is repeated.
     """
     batch: Batch = stack.batch
     mask = np.asarray(batch.mask[channel]) > 0

@@ -27,7 +27,7 @@ from jaxfinger.gap.result import (
 from jaxfinger.report.numbers import alike, measured, number, percent, percent_range, quantity
 
 NAMED_AT_MOST = 4  # causes in one sentence
-MEASURABLE = 0.005  # share of a gap that is not said as 0 %
+MEASURABLE = 0.005  # share of a gap: `percent` says less as 0 %
 # Share of a gap beyond which what is named may imitate a law that nobody listed: imitators left 28 to 48 %, true causes
 # of a gap with one cause 20 % at most (`fresh` in docs/results.md).
 MUCH = 0.25
@@ -160,7 +160,7 @@ def size(d: Diagnosis) -> str:
         largest.setdefault(x.channel, x)
     lines = list(largest.values())[:2]
     if not lines:
-        return f"all trials together show that {_subject(d)} misses something, no channel by more than its noise may do"
+        return f"all trials together show that {_subject(d)} misses something, but no channel by more than its noise"
     return f"{_subject(d)} misses {joined([how_large(x, d.tolerance) for x in lines])}"
 
 
