@@ -2,20 +2,20 @@
 
 from jaxfinger.data.check import check_file as check_file
 from jaxfinger.data.filtering import bridged as bridged
+from jaxfinger.data.filtering import filter_std as filter_std
+from jaxfinger.data.filtering import filtered_noise_std as filtered_noise_std
 from jaxfinger.data.filtering import longest_spike as longest_spike
 from jaxfinger.data.filtering import low_pass as low_pass
 from jaxfinger.data.filtering import outlier_mask as outlier_mask
-from jaxfinger.data.filtering import passed as passed
 from jaxfinger.data.filtering import smooth as smooth
-from jaxfinger.data.filtering import width as width
 from jaxfinger.data.filtering import without_spikes as without_spikes
 from jaxfinger.data.findings import Finding as Finding
 from jaxfinger.data.hdf5 import data_hash as data_hash
 from jaxfinger.data.hdf5 import read_session as read_session
 from jaxfinger.data.hdf5 import write_session as write_session
 from jaxfinger.data.motion import directions as directions
+from jaxfinger.data.motion import directions_from_turning_points as directions_from_turning_points
 from jaxfinger.data.motion import find_holds as find_holds
-from jaxfinger.data.motion import turned_on_time as turned_on_time
 from jaxfinger.data.predictions import Predictions as Predictions
 from jaxfinger.data.predictions import read_predictions as read_predictions
 from jaxfinger.data.predictions import write_predictions as write_predictions
@@ -24,4 +24,4 @@ from jaxfinger.data.session import FingerDescription as FingerDescription
 from jaxfinger.data.session import Session as Session
 from jaxfinger.data.session import Trial as Trial
 from jaxfinger.data.session import joints_of as joints_of
-from jaxfinger.data.session import moving as moving
+from jaxfinger.data.session import moving_joints as moving_joints

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaxfinger.data.findings import Report
-from jaxfinger.data.motion import SHORTEST_HOLD, pulled_slowly
+from jaxfinger.data.motion import MIN_HOLD, pulled_slowly
 from jaxfinger.data.parse import listed
 from jaxfinger.data.schema import CHANNELS, DRIVES, MEASURED, MEASURES, NEEDS_JOINT, NEEDS_TENDON
 from jaxfinger.data.session import FingerDescription, Trial
@@ -222,7 +222,7 @@ def _motion(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repor
         message = f"tendon {trial.tendon} is never pulled; check the attribute `tendon`"
         report.warning(_place(trial, "tendon_force"), message)
     elif trial.experiment in NEEDS_TENDON and not pulled_slowly(trial, _pulled(trial, finger), sizes):
-        slowly = f"holds of {SHORTEST_HOLD * sizes.slow_pace:g} s nor in ramps of {sizes.slow_pace:g} s"
+        slowly = f"holds of {MIN_HOLD * sizes.slow_pace:g} s nor in ramps of {sizes.slow_pace:g} s"
         message = f"tendon {trial.tendon} is pulled neither in {slowly}"
         report.warning(_place(trial, "tendon_force"), f"{message}: nothing of the trial is judged; pull it slower")
 

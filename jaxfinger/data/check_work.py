@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxfinger.data.filtering import low_pass, smooth
 from jaxfinger.data.findings import Report
-from jaxfinger.data.motion import STILL, directions, fitting_cutoff
+from jaxfinger.data.motion import STILL_SHARE, directions, fitting_cutoff
 from jaxfinger.data.session import FingerDescription, Session, Trial
 
 _DEGREE = 3  # of l(q) over a joint's range
@@ -223,7 +223,7 @@ def _way(trial: Trial, joint: int, cutoff: float) -> np.ndarray:
     if trial.joint_direction is not None:
         return trial.joint_direction[:, joint].astype(float)
     rate = smooth(trial.time, trial.q[:, [joint]], cutoff)[1]
-    return directions(rate, STILL * np.percentile(np.abs(rate), 99, axis=0))[:, 0]
+    return directions(rate, STILL_SHARE * np.percentile(np.abs(rate), 99, axis=0))[:, 0]
 
 
 def _some(found: Iterable[str], most: int = 3) -> str:

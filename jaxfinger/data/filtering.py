@@ -103,7 +103,7 @@ def _spline(x: Float[np.ndarray, "k N"], rate: float, cutoff_hz: float) -> Float
     size = _quick_length(count)
     turn = 2.0 * np.pi / size * np.arange(size // 2 + 1)  # rad from sample to sample
     B = _B_SPLINE[0, 2] + 2.0 * (_B_SPLINE[0, 3] * np.cos(turn) + _B_SPLINE[0, 4] * np.cos(2.0 * turn))
-    H = np.exp(-0.5 * (rate * width(cutoff_hz) * turn) ** 2)
+    H = np.exp(-0.5 * (rate * filter_std(cutoff_hz) * turn) ** 2)
     found = np.fft.irfft(np.fft.rfft(wide - line, size) * H / B, size)[:, :count] + line
     return found[:, reach - 2 : reach + N + 3]
 
@@ -158,17 +158,17 @@ def _on_grid(time: np.ndarray, column: np.ndarray, grid: np.ndarray) -> np.ndarr
     return np.interp(grid, time[good], column[good])
 
 
-def width(cutoff_hz: float) -> float:
+def filter_std(cutoff_hz: float) -> float:
     """Standard deviation, s, of the Gaussian whose transfer function is 1/√2 at `cutoff_hz`."""
     return np.sqrt(np.log(2.0)) / (2.0 * np.pi * cutoff_hz)
 
 
-def passed(cutoff_hz: float, step: float, order: int = 0) -> float:
+def filtered_noise_std(cutoff_hz: float, step: float, order: int = 0) -> float:
     """Standard deviation of a derivative of low-passed white noise of unit variance, a sample every `step` s.
 
     With σ the filter's width, its square is step/(2π) ∫ ω^(2k) e^(−ω²σ²) dω = step Γ(k + ½)/(2π σ^(2k+1)).
     """
-    return math.sqrt(step * math.gamma(order + 0.5) / (2.0 * math.pi * width(cutoff_hz) ** (2 * order + 1)))
+    return math.sqrt(step * math.gamma(order + 0.5) / (2.0 * math.pi * filter_std(cutoff_hz) ** (2 * order + 1)))
 
 
 def outlier_mask(x: Float[np.ndarray, "N *k"], threshold: float = 8.0, longest: int = 5) -> Bool[np.ndarray, "N *k"]:

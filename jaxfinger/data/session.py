@@ -187,10 +187,10 @@ def joints_of(trial: Trial, finger: FingerDescription) -> tuple[str, ...]:
         return ()
     if trial.joint is not None or trial.experiment != "ID.2" or not len(trial.time):
         return trial.motorised(finger)
-    return moving(trial, finger)
+    return moving_joints(trial, finger)
 
 
-def moving(trial: Trial, finger: FingerDescription) -> tuple[str, ...]:
+def moving_joints(trial: Trial, finger: FingerDescription) -> tuple[str, ...]:
     """The joints that go a tenth as far as the one that goes furthest, or more."""
     span = np.array([np.ptp(column) for column in np.nan_to_num(trial.q).T])
     return tuple(name for name, s in zip(finger.joint_names, span, strict=True) if s > _MOVED * span.max())

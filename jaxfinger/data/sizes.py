@@ -22,7 +22,7 @@ SWEEP = 0.11
 STEP = 0.27  # s, likewise where it is led or stepped (ID.2, ID.3-static)
 # Of paces: what serves one serves motions twice as slow and four times as quick, of which a fit is the same within its
 # errors (tests/identify/test_units.py).
-LIKE = 4.0
+PACE_RATIO = 4.0
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Sizes:
     tension: float  # N, the highest
     excursion: float  # m, the longest
     noise: float  # N, of a tension sensor
-    pace: float = 1.0  # times as long as the protocol's that its motions take: a power of `LIKE`
+    pace: float = 1.0  # times as long as the protocol's that its motions take: a power of `PACE_RATIO`
     slow_pace: float = 1.0  # likewise of what is led, stepped or held, which need not be as quick as sweeps
 
     @property
@@ -77,9 +77,9 @@ def sizes_of(session: Session) -> Sizes:
 
 def _pace(times: list[float]) -> float:
     """The pace of motions that take so many times as long as the protocol's; of none, the protocol's."""
-    powers = [np.log(t) / np.log(LIKE) for t in times if t > 0.0]
+    powers = [np.log(t) / np.log(PACE_RATIO) for t in times if t > 0.0]
     power = median_low(powers) if powers else 0.0
-    return 1.0 if -1.0 < power < 0.0 else LIKE ** round(power)
+    return 1.0 if -1.0 < power < 0.0 else PACE_RATIO ** round(power)
 
 
 def _quick(trial: Trial) -> float:

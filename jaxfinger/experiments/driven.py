@@ -7,8 +7,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import minimum_filter1d
 
-from jaxfinger.data import directions, low_pass, passed, smooth, turned_on_time, width, without_spikes
-from jaxfinger.data.motion import noise_of, quicker, still
+from jaxfinger.data import (
+    directions,
+    directions_from_turning_points,
+    filter_std,
+    filtered_noise_std,
+    low_pass,
+    smooth,
+    without_spikes,
+)
+from jaxfinger.data.motion import quick_cutoff, rest_speed, speed_noise
 from jaxfinger.experiments.reduction import Joints, PreparedTrial, Row, joints, row
 from jaxfinger.experiments.shrink import shrink
 
@@ -40,13 +48,13 @@ def reduce(r: PreparedTrial) -> Row:
     joint = joint_directions(r, j, slow)
     rates = None if r.spec.slack else tendon_rates(r)
     tendon = tendon_directions(r, rates)
-    slides = sliding(r, j.qd, slow, joint, rates, CLEAR * width(r.spec.cutoff))
+    slides = sliding(r, j.qd, slow, joint, rates, CLEAR * filter_std(r.spec.cutoff))
 
     qdd, tension, y = j.qdd, r.tension(), r.y
     if r.reduced or r.spec.slack:
         # Noise of q̈ would tell a fit of less inertia (errors in variables), and a prediction that stands beside a
         # measured torque of one that is not there: where q̈ does not rise above it, its mean takes its place.
-        most = COLOURED * 1.4826 * j.noise * passed(j.cutoff, r.step, 2)
+        most = COLOURED * 1.4826 * j.noise * filtered_noise_std(j.cutoff, r.step, 2)
         qdd = shrink(qdd, round(CALM * r.spec.pace / r.step), most)
     if r.reduced:
         # q̈ is low-passed, so all else is too.
@@ -62,7 +70,7 @@ def reduce(r: PreparedTrial) -> Row:
         counting,
         j.noise,
         directions=(joint, tendon),
-        blur=width(j.cutoff),
+        blur=filter_std(j.cutoff),
         y=y,
     )
 
@@ -73,8 +81,8 @@ def joint_directions(r: PreparedTrial, j: Joints, slow: Float[np.ndarray, "N m"]
     """
     if r.trial.joint_direction is not None:
         return r.trial.joint_direction.astype(float)
-    sure = directions(slow, still(slow, r.quick_rates))
-    return sure if r.reduced else turned_on_time(sure, j.q, ENCODER * j.noise)
+    sure = directions(slow, rest_speed(slow, r.quick_rates))
+    return sure if r.reduced else directions_from_turning_points(sure, j.q, ENCODER * j.noise)
 
 
 def tendon_rates(r: PreparedTrial) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]] | None:
@@ -83,7 +91,7 @@ def tendon_rates(r: PreparedTrial) -> tuple[Float[np.ndarray, "N n"], Float[np.n
         return None
     excursion = without_spikes(np.nan_to_num(r.trial.tendon_excursion))
     cutoff = min(r.spec.cutoff / 2.0, 0.2 / r.step)
-    slow, quick = (smooth(r.trial.time, excursion, c)[1] for c in (cutoff, quicker(cutoff, r.step)))
+    slow, quick = (smooth(r.trial.time, excursion, c)[1] for c in (cutoff, quick_cutoff(cutoff, r.step)))
     return slow, quick
 
 
@@ -96,7 +104,7 @@ def tendon_directions(r: PreparedTrial, rates) -> Float[np.ndarray, "N n"]:
     if rates is None:
         return np.zeros((len(r.trial.time), r.finger.n))
     slow, quick = rates
-    least = np.minimum(0.1 * TENDON * noise_of(slow, quick), 0.1 * np.percentile(np.abs(slow), 95, axis=0))
+    least = np.minimum(0.1 * TENDON * speed_noise(slow, quick), 0.1 * np.percentile(np.abs(slow), 95, axis=0))
     return directions(slow, least)
 
 
@@ -131,7 +139,7 @@ def sliding(
     # lies before a recording and after it, on whose image the filter leans.
     apart = minimum_filter1d(slides, 2 * round(clear / r.step) + 1, axis=0, mode="constant", cval=False)
     # Reaches back only: a free joint that breaks away does so at once, and takes the others with it.
-    half = round(0.5 * BREAKAWAY * width(r.spec.cutoff) / r.step)
+    half = round(0.5 * BREAKAWAY * filter_std(r.spec.cutoff) / r.step)
     return np.where(r.motorised, apart, minimum_filter1d(apart, 2 * half + 1, axis=0, origin=half))
 
 
@@ -140,6 +148,6 @@ def _friction_known(r: PreparedTrial, slow, quick) -> Bool[np.ndarray, "N n"]:
     tension, cutoff = r.tension(), min(r.spec.cutoff / 2.0, 0.2 / r.step)
     stretches = r.sizes.compliance * np.abs(smooth(r.trial.time, tension, cutoff)[1])
     measured = np.isfinite(np.asarray(r.trial.tendon_excursion)).all(axis=0)
-    least = TENDON * noise_of(slow, quick)
+    least = TENDON * speed_noise(slow, quick)
     moves = (np.abs(slow) > least + stretches) & (np.sign(slow) * quick > 0.5 * least)
     return (tension <= r.sizes.slack) | (moves & measured)

@@ -13,7 +13,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.optimize import isotonic_regression
 
 from jaxfinger.data import find_holds
-from jaxfinger.data.motion import RAMP, slow_ramps, stretches_of
+from jaxfinger.data.motion import RAMP_BLOCKS, slow_ramps, stretches_of
 from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, stretches
 from jaxfinger.experiments.shrink import shrink
 
@@ -32,7 +32,7 @@ def reduce(r: PreparedTrial) -> Row:
         # As smooth as the blocks of a fit: what slips at a noise peak would stay there until the next step.
         tension = uniform_filter1d(tension, max(1, round(1.0 / (r.spec.rate * r.step))), axis=0, mode="nearest")
     pulled = r.taut(r.mean(tension))
-    ramps = slow_ramps(pulled, hold, round(RAMP / (r.spec.rate * r.step * r.size)), r.sizes.travel)
+    ramps = slow_ramps(pulled, hold, round(RAMP_BLOCKS / (r.spec.rate * r.step * r.size)), r.sizes.travel)
     pulled = _in_steps(_in_ramps(pulled, ramps, r.sizes.travel), np.where(ramps, -2, hold), slack=True)
     counts = (hold >= 0) | _goes_on(pulled, hold, r.sizes.travel)
     taut = r.lowest(measured) > r.sizes.slack
@@ -89,7 +89,7 @@ def _in_fixture(q: Float[np.ndarray, "M m"], hold: Int[np.ndarray, " M"]) -> Flo
     """
     runs = stretches(hold)
     if not runs:
-        return shrink(q, RAMP)
+        return shrink(q, RAMP_BLOCKS)
     if len(runs) < FEW:
         return _in_steps(q, hold)
     means = np.stack([q[run].mean(axis=0) for run in runs])

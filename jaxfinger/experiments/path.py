@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxfinger.data import directions
-from jaxfinger.data.motion import still
+from jaxfinger.data.motion import rest_speed
 from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row
 
 NOTHING = "no sample is measured"
@@ -15,7 +15,7 @@ def reduce(r: PreparedTrial) -> Row:
     # Averaged over the same blocks as what it predicts, and not filtered where that is not.
     q = r.mean(r.trial.q if r.reduced else j.q)
     joint = r.trial.joint_direction
-    joint = directions(j.qd, still(j.qd, r.quick_rates)) if joint is None else joint.astype(float)
+    joint = directions(j.qd, rest_speed(j.qd, r.quick_rates)) if joint is None else joint.astype(float)
     tension = r.taut(r.mean(r.tension()))
     everywhere = {c: np.ones((len(q), 1), bool) for c in r.y}
     return row(

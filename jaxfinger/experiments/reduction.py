@@ -20,7 +20,7 @@ from jaxfinger.data import (
     smooth,
     without_spikes,
 )
-from jaxfinger.data.motion import quicker
+from jaxfinger.data.motion import quick_cutoff
 from jaxfinger.data.sizes import Sizes
 from jaxfinger.effects.drive import WARM
 from jaxfinger.experiments.table import Experiment
@@ -45,7 +45,7 @@ class PreparedTrial:
     @cached_property
     def quick_rates(self) -> Float[np.ndarray, "N m"]:
         """rad/s, in a filter that still sees a joint stand still between two slips."""
-        return smooth(self.trial.time, self.trial.q, quicker(self.spec.cutoff_at(self.step), self.step))[1]
+        return smooth(self.trial.time, self.trial.q, quick_cutoff(self.spec.cutoff_at(self.step), self.step))[1]
 
     @property
     def motorised(self) -> Bool[np.ndarray, " m"]:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfinger.data import directions, find_holds, smooth
-from jaxfinger.data.motion import still
+from jaxfinger.data.motion import rest_speed
 from jaxfinger.experiments.driven import sliding
 from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, stretches
 
@@ -25,7 +25,7 @@ def reduce(r: PreparedTrial) -> Row:
     if r.trial.joint_direction is not None:
         joint = r.trial.joint_direction.astype(float)
     else:
-        joint = directions(slow, still(slow, r.quick_rates))
+        joint = directions(slow, rest_speed(slow, r.quick_rates))
         for samples in stretches(hold):  # a filter without phase sees the next step before it starts
             joint[samples] = joint[samples[len(samples) // 2]]
     moves = (hold < 0)[:, None]  # at a hold nothing does

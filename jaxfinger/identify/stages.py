@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfinger.data import Session, joints_of, moving
+from jaxfinger.data import Session, joints_of, moving_joints
 from jaxfinger.experiments import EXPERIMENTS, Experiment, Stack, not_judged, prepare
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible
@@ -298,7 +298,7 @@ def touched_by(reads, session: Session) -> tuple[set[str], set[tuple[str, str]],
     trials = [t for t in session if t.experiment in reads and len(t.time) > 1]
     joints = {joint for t in trials for joint in joints_of(t, session.finger)}
     moved = {(k, joint) for joint in joints for k in session.finger.tendon_names}
-    free = [set(moving(t, session.finger)) for t in trials if not EXPERIMENTS[t.experiment].held]
+    free = [set(moving_joints(t, session.finger)) for t in trials if not EXPERIMENTS[t.experiment].held]
     return joints, moved, {t.tendon for t in trials if t.tendon}, free
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.data import Trial, low_pass, passed, smooth
+from jaxfinger.data import Trial, filtered_noise_std, low_pass, smooth
 from jaxfinger.experiments import Stack
 from jaxfinger.identify.predictions import STEP
 from jaxfinger.model import Motion
@@ -57,7 +57,7 @@ def measured(trial: Trial, stack: Stack, b: int, x: Motion) -> Measured:
         return np.stack([np.interp(even, time - time[0], column) for column in values.T])
 
     encoder = np.std(np.asarray(trial.q) - smooth(time, trial.q, cutoff)[0], axis=0)
-    value, rate = (encoder * passed(cutoff, step, k) for k in (0, 1))
+    value, rate = (encoder * filtered_noise_std(cutoff, step, k) for k in (0, 1))
     rest = tension - low_pass(time, tension, stack.experiment.cutoff_at(step))
     most = 4.0 * 1.4826 * np.median(np.abs(rest), axis=0)
     noise = on(np.clip(rest, -most, most))  # jumps of the tension itself are none

@@ -1,4 +1,4 @@
-"""The sizes that a session's motions and tensions tell, whatever disturbs single samples."""
+"""Sizes of a session: spikes in single samples change none of them."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from jaxfinger.data.sizes import sizes_of
 
 @pytest.mark.parametrize("share", [0.005, 0.02])
 def test_spikes_make_no_machine_quicker_or_stronger(session, share):
-    """Single samples of every channel half a range off."""
+    """A share of single samples in angles and tensions is off by half of the channel's range."""
     rng = np.random.default_rng(0)
 
     def thrown(x):

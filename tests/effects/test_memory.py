@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxfinger.data import low_pass, smooth, width
+from jaxfinger.data import filter_std, low_pass, smooth
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.effects.base import dahl, rate
 from jaxfinger.model import excursion, joint_tension, memories
@@ -95,7 +95,7 @@ def test_a_sharp_memory_is_what_the_low_pass_and_the_mean_leave_of_it(name, site
 
     q, qd, qdd = smooth(np.asarray(x.time), np.asarray(x.q).T, CUTOFF)
     seen = jax.tree.map(block, replace(x, q=jnp.asarray(q.T), qd=jnp.asarray(qd.T), qdd=jnp.asarray(qdd.T)))
-    at_samples, shown = memory(seen), memory(replace(seen, blur=jnp.full_like(seen.time, width(CUTOFF))))
+    at_samples, shown = memory(seen), memory(replace(seen, blur=jnp.full_like(seen.time, filter_std(CUTOFF))))
     inner = slice(5, -5)
     error, before = (np.abs(z - expected)[inner].max() / np.ptp(truth) for z in (shown, at_samples))
     assert error < 0.02
@@ -104,7 +104,7 @@ def test_a_sharp_memory_is_what_the_low_pass_and_the_mean_leave_of_it(name, site
 
 def test_an_axis_without_tendons_has_a_memory_too():
     effect = CATALOGUE["joint_presliding"].at(FINGER, (FINGER.joint_names[1],), x0=0.006)
-    x = replace(X, blur=jnp.full_like(X.time, width(CUTOFF)))
+    x = replace(X, blur=jnp.full_like(X.time, filter_std(CUTOFF)))
     bare = replace(x, tension=x.tension[:0], tendon_direction=x.tendon_direction[:0])
     np.testing.assert_array_equal(*(memories(with_effects(effect), y)[0] for y in (x, bare)))
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from jaxfinger.data import Session, Trial, width
+from jaxfinger.data import Session, Trial, filter_std
 from jaxfinger.data.check_trial import check_trial
 from jaxfinger.data.findings import Report
 from jaxfinger.data.sizes import SLACK, sizes_of
@@ -18,7 +18,7 @@ RATE, ENCODER = 1000.0, 2e-4  # Hz, rad
 CYCLE = 3.0  # s
 FINGER = paper_finger().description
 MCP = FINGER.joint_names[0]
-FILTER = width(EXPERIMENTS["VD.3"].cutoff)
+FILTER = filter_std(EXPERIMENTS["VD.3"].cutoff)
 CLEAR, BREAKAWAY = driven.CLEAR * FILTER, driven.BREAKAWAY * FILTER  # s
 
 

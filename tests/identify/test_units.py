@@ -9,7 +9,7 @@ import pytest
 
 from jaxfinger.data import FingerDescription, Session, Trial, read_session
 from jaxfinger.data.importers import import_file
-from jaxfinger.data.sizes import LIKE
+from jaxfinger.data.sizes import PACE_RATIO
 from jaxfinger.identify import Recipe, identify, read_recipe
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.identify.recipe import FitRecipe, ModelRecipe
@@ -89,7 +89,7 @@ def beside(fit, other, scale) -> tuple[np.ndarray, np.ndarray]:
 def test_in_other_units_it_is_the_same_scaled(machine):
     """Of time: what is counted in seconds and Hz follows the motions' pace, in steps."""
     session, fit = machine
-    scale = Scale(mass=1e-3, length=10.0, time=LIKE)
+    scale = Scale(mass=1e-3, length=10.0, time=PACE_RATIO)
     other = identify(scale(session), fit.recipe)
     shift, ratio = beside(fit, other, scale)
     np.testing.assert_allclose(shift, 0.0, atol=1e-6)
