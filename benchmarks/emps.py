@@ -18,7 +18,7 @@ from jaxfinger.data import Session, read_session
 from jaxfinger.data.importers import import_file
 from jaxfinger.gap import diagnose
 from jaxfinger.gap.columns import Columns
-from jaxfinger.gap.exact import Whitened
+from jaxfinger.gap.exact import Projector
 from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem, build
 from jaxfinger.gap.propose import Proposal, terms
@@ -62,7 +62,7 @@ def gain(proposal: Proposal, problem: Problem) -> tuple[float, float]:
     library = dict(terms(problem, experiment, proposal.channel, 0))
     raw = np.sum([a * library[text] for a, text in proposal.terms], axis=0)
     columns = Columns.of(problem)
-    projector = Whitened(problem, columns, Weights(*np.ones((2, len(columns.items)))))
+    projector = Projector(problem, columns, Weights.plain(columns))
     z = projector(whitened(raw[None, None], problem, rows, np.arange(rows.size), proposal.channel))[0]
     r = projector.residual(problem.r)
     fitted = float(z @ r / (z @ z))

@@ -47,7 +47,7 @@ class Record:
     counts: Counts
     evidence: dict[frozenset[Key], Evidence]
     screened: frozenset[frozenset[Key]]  # sets that were not weighed in settled weights
-    touched: dict[Key, np.ndarray]
+    explainable: dict[Key, np.ndarray]
     at_work: frozenset[Key]
     parameters: Parameters
 
@@ -60,7 +60,7 @@ class Record:
 
     def costs(self, p: Parameters) -> Costs:
         """Under other parameters."""
-        return Costs(p, unexplained(self.counts, self.evidence[frozenset()], p), self.touched)
+        return Costs(p, unexplained(self.counts, self.evidence[frozenset()], p), self.explainable)
 
     def log_score(self, p: Parameters) -> float:
         """Σ log P of what is true of every cause and of «unlisted»."""
@@ -69,10 +69,10 @@ class Record:
         e, o, explained, score = (np.array(x) for x in zip(*self.evidence.values(), strict=True))
         was, is_now = (log_likelihood(self.counts, e, o, explained, q)[0] for q in (self.parameters, p))
         scores = score + is_now - was
-        w = costs.weights(dict(zip(sets, scores.tolist(), strict=True)))
+        w = costs.probabilities(dict(zip(sets, scores.tolist(), strict=True)))
         settled = [(s - costs.of(k), k) for k, s in zip(sets, scores, strict=True) if k not in self.screened]
         _, best = max(settled, key=lambda x: x[0])
-        probability = dict.fromkeys(self.touched, 0.0)
+        probability = dict.fromkeys(self.explainable, 0.0)
         for keys, v in w.items():
             for key in keys:
                 probability[key] += v
@@ -86,7 +86,9 @@ def weigh(folder: Path) -> Record:
     """Search one case."""
     recipe = Recipe()
     problem = build(read_session(folder / "fit.h5"), recipe)
-    effects = {k: v for k, v in catalogue_for(recipe, None).items() if k not in recipe.model.terms}
+    effects = {
+        k: v for k, v in catalogue_for(recipe, None, problem.nominal.finger).items() if k not in recipe.model.terms
+    }
     search, _ = searched(problem, effects)
     costs, visited = search.costs, search.visited
     return Record(
@@ -94,7 +96,7 @@ def weigh(folder: Path) -> Record:
         search.bench.columns.counts,
         visited.evidence,
         frozenset(visited.screened),
-        search.table.touched,
+        search.table.explainable,
         read_truth(folder, folder.parent.with_name(f"{folder.parent.name}-truth")).at_work,
         costs.parameters,
     )
@@ -149,7 +151,7 @@ def main() -> None:
         f"{len(records)} cases; log score a case {mean(records, Parameters()):.2f}, fitted {mean(records, whole):.2f}"
     )
     for name, value in asdict(whole).items():
-        print(f"  {name:<7}{getattr(Parameters(), name):8.3g} -> {value:.3g}")
+        print(f"  {name:<20}{getattr(Parameters(), name):8.3g} -> {value:.3g}")
     parts = [records[i::FOLDS] for i in range(FOLDS)]
     seen = [fit([r for p in parts if p is not part for r in p]) for part in parts]
     scores = [[mean(part, Parameters()), mean(part, p)] for part, p in zip(parts, seen, strict=True)]

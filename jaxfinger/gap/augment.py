@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.experiments import shows
-from jaxfinger.gap.exact import SearchState, Whitened
+from jaxfinger.gap.exact import Projector, SearchState
 from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem, assemble, moved
 from jaxfinger.gap.result import Value
@@ -70,7 +70,7 @@ def as_refitted(problem: Problem, chosen: SearchState) -> Fitted:
     signatures, which are compiled already. Its intervals leave out the products of effects with the nominal parameters.
     """
     ones = Weights.plain(chosen.columns)
-    there = moved(chosen.problem, Whitened(chosen.problem, chosen.columns, ones).nominal_step(chosen.r))
+    there = moved(chosen.problem, Projector(chosen.problem, chosen.columns, ones).nominal_step(chosen.r))
     model, moving = _with_effects(there.nominal, chosen.effects)
     labels = [p.name for p in describe(model)]
     columns = {}
@@ -184,8 +184,8 @@ def _covariance(
     to and fro by more than the noise explains.
     """
     if chosen is not None:
-        project = Whitened(problem, chosen.columns, chosen.judged.weights)
-        r, J = project.white(r[None])[0], project.white(J.T).T
+        project = Projector(problem, chosen.columns, chosen.linear_fit.weights)
+        r, J = project.weighted(r[None])[0], project.weighted(J.T).T
     information = J.T @ J + root.T @ root
     diagonal = np.diag(information)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))

@@ -12,8 +12,8 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.gap.exact import Bench, SearchState
-from jaxfinger.gap.folds import FOLDS, KEPT, equilibrated, fold_of_row
+from jaxfinger.gap.exact import Baseline, SearchState
+from jaxfinger.gap.folds import FOLD_PRIOR, FOLDS, equilibrated, fold_of_row
 from jaxfinger.gap.problem import Problem
 
 DRAWS = 400  # of the bootstrap over trials
@@ -79,10 +79,10 @@ class Budget:
         return value[:-1], np.stack([low[:-1], high[:-1]], axis=1), float(value[-1]), (float(low[-1]), float(high[-1]))
 
 
-def budget(bench: Bench, state: SearchState, plain: Problem, open_columns: frozenset[int]) -> Budget:
+def budget(baseline: Baseline, state: SearchState, plain: Problem, open_columns: frozenset[int]) -> Budget:
     """`plain`: the problem at the nominal model refitted to all trials, which is the model before."""
     fold, trial = fold_of_row(plain), plain.trial_of_row
-    cells, null, full = _products(bench, plain, state, fold, trial)
+    cells, null, full = _products(baseline, plain, state, fold, trial)
     n, before, after, without = [], [], [], []
     k, effects = state.problem.J.shape[1], len(state.effects)
     of_coordinate = np.array([c.effect for c in state.coordinates], int)
@@ -112,11 +112,11 @@ def budget(bench: Bench, state: SearchState, plain: Problem, open_columns: froze
         np.array(after),
         found,
         open_columns,
-        tuple((c.experiment, c.channel) for c in bench.columns.items),
+        tuple((c.experiment, c.channel) for c in baseline.columns.items),
     )
 
 
-def _products(bench: Bench, plain: Problem, state: SearchState, fold, trial):
+def _products(baseline: Baseline, plain: Problem, state: SearchState, fold, trial):
     """Cells (trial, column, fold, rows), and products of rows there: of the nominal model's, and of [residual, J,
     slopes, changes] of the set's.
     """
@@ -124,7 +124,7 @@ def _products(bench: Bench, plain: Problem, state: SearchState, fold, trial):
     rows0 = np.vstack([plain.r[None], plain.J.T])
     rows1 = np.vstack([state.r[None], here.J.T, state.slopes, state.changes])
     cells, null, full = [], [], []
-    for c, column in enumerate(bench.columns.items):
+    for c, column in enumerate(baseline.columns.items):
         key = trial[column.rows] * FOLDS + fold[column.rows]
         for u in np.unique(key):
             at = column.rows[key == u]
@@ -174,7 +174,9 @@ def _solved(H, prior, x, free: list[int]) -> np.ndarray:
     A = H.copy()
     A[:d, :d] += prior
     scale = np.sqrt(np.maximum(np.diag(H)[free], 1e-300))
-    M = A[np.ix_(free, free)] / np.outer(scale, scale) + KEPT**2 / max(float(np.max(scale**2)), 1.0) * np.eye(len(free))
+    M = A[np.ix_(free, free)] / np.outer(scale, scale) + FOLD_PRIOR**2 / max(float(np.max(scale**2)), 1.0) * np.eye(
+        len(free)
+    )
     out = x.copy()
     out[free] = 0.0
     out[free] = np.linalg.solve(M + 1e-11 * np.eye(len(free)), -(A[free] @ out) / scale) / scale

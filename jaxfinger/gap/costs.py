@@ -24,13 +24,13 @@ class Costs:
     """Of all sets of causes that the trials of one file can see."""
 
     parameters: Parameters
-    unknown: Float[np.ndarray, " C"]  # log evidence, column by column, that something is at work
-    touched: Mapping[Key, Float[np.ndarray, " C"]]  # share that each visible cause could explain
+    unexplained: Float[np.ndarray, " C"]  # log evidence, column by column, that something is at work
+    explainable: Mapping[Key, Float[np.ndarray, " C"]]  # share that each visible cause could explain
 
     @cached_property
     def sites(self) -> Mapping[str, int]:
         """How many there are of every effect."""
-        return Counter(effect for effect, _ in self.touched)
+        return Counter(effect for effect, _ in self.explainable)
 
     def of(self, keys: Iterable[Key]) -> float:
         """What a set must explain."""
@@ -48,14 +48,14 @@ class Costs:
     @cached_property
     def _to_explain(self) -> Mapping[Key, float]:
         """Log evidence that something is at work, in the columns that each cause touches."""
-        return {key: float(share @ self.unknown) for key, share in self.touched.items()}
+        return {key: float(share @ self.unexplained) for key, share in self.explainable.items()}
 
     def evidence_needed(self, keys: Iterable[Key]) -> float:
         """A sum over causes: of each a constant, and a share of the evidence in the columns that it touches."""
-        return sum(self.parameters.prior + self.parameters.alike * self._to_explain[key] for key in keys)
+        return sum(self.parameters.cause_cost + self.parameters.imitator_gain * self._to_explain[key] for key in keys)
 
-    def weights(self, scores: Mapping[frozenset[Key], float]) -> dict[frozenset[Key], float]:
+    def probabilities(self, scores: Mapping[frozenset[Key], float]) -> dict[frozenset[Key], float]:
         """Posterior probability of every set: ∝ exp(β (score − evidence needed) − log odds)."""
-        trust = self.parameters.trust
-        log_w = [trust * (s - self.evidence_needed(keys)) - self.odds(keys) for keys, s in scores.items()]
+        beta = self.parameters.tempering
+        log_w = [beta * (s - self.evidence_needed(keys)) - self.odds(keys) for keys, s in scores.items()]
         return dict(zip(scores, np.exp(np.array(log_w) - logsumexp(log_w)).tolist(), strict=True))

@@ -15,10 +15,10 @@ from jaxfinger.experiments import not_judged
 from jaxfinger.gap.augment import Fitted, as_refitted, augmented_fit, nominal_fit, values_of
 from jaxfinger.gap.budget import A_GAP, Budget, budget, held_out_gains
 from jaxfinger.gap.closure import RESOLVABLE, closures
-from jaxfinger.gap.exact import Bench, SearchState, Whitened
+from jaxfinger.gap.exact import Baseline, Projector, SearchState
 from jaxfinger.gap.formula import Parameters, Weights, unexplained
 from jaxfinger.gap.next_experiment import next_experiment
-from jaxfinger.gap.posterior import IS_NAMED, Posterior, posterior
+from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY, Posterior, posterior
 from jaxfinger.gap.problem import Problem, build, site
 from jaxfinger.gap.propose import propose
 from jaxfinger.gap.result import (
@@ -43,9 +43,9 @@ from jaxfinger.gap.result import (
     tolerated,
 )
 from jaxfinger.gap.screening import read_parts
-from jaxfinger.gap.sets import Offered, Search, SignatureTable, table_of
+from jaxfinger.gap.sets import Offer, Search, SignatureTable, table_of
 from jaxfinger.gap.signatures import catalogue_for, changes_of, variants
-from jaxfinger.gap.smooth_laws import Explained, explained
+from jaxfinger.gap.smooth_laws import SmoothPart, smooth_parts
 from jaxfinger.gap.where import where
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.parameters import describe, ravel, units_at
@@ -109,11 +109,11 @@ def diagnose(
     laws = {law for c in changed.values() for law in c.__mro__}  # an effect whose law a change has would be its copy
     catalogue = {k: c for k, c in catalogue.items() if k not in kept and (k in changed or c not in laws)}
     search, state = searched(problem, catalogue, progress)
-    bench, table, found = search.bench, search.table, posterior(search, state)
-    relevance = _relevance(problem, bench, tolerance)
-    verdict = _verdict(problem, bench, state, found, relevance)
+    baseline, table, found = search.baseline, search.table, posterior(search, state)
+    relevance = _relevance(problem, baseline, tolerance)
+    verdict = _verdict(problem, baseline, state, found, relevance)
     nominal = nominal_fit(problem)
-    chosen = bench.null
+    chosen = baseline.null
     if verdict.status in (Status.PARTLY, Status.AMBIGUOUS):
         chosen = search.only(state, (*verdict.named, *(k for s in found.ambiguous for k in s)))
     augmented: Fitted | None = None
@@ -124,7 +124,7 @@ def diagnose(
     progress("refitting without each third of the trials")
     lines = closures(problem, augmented, not quick)
     status = _closed(verdict.status, found, lines, relevance, tolerance)
-    shares = budget(bench, chosen, problem, _open(bench))
+    shares = budget(baseline, chosen, problem, _open(baseline))
     suggestion: NextExperiment | None = None
     if status is Status.AMBIGUOUS and not quick:
         progress("looking for the trial that would tell them apart")
@@ -132,7 +132,7 @@ def diagnose(
     fit = augmented.fit if augmented else nominal.fit
     causes = _causes(chosen, found, shares, fit)
     none, unlisted = agreeing(status, found, bool(relevance))
-    left = explained(chosen.problem, chosen.r)
+    left = smooth_parts(chosen.problem, chosen.r)
     return Diagnosis(
         status=status,
         named=tuple(Key(*k) for k in _by_share(verdict.named, chosen, shares)),
@@ -143,7 +143,7 @@ def diagnose(
         tolerance=tolerance,
         budget=causes,
         unexplained=_unexplained(chosen, shares, left, status, progress),
-        channels=_channels(problem, bench, chosen, causes, shares),
+        channels=_channels(problem, baseline, chosen, causes, shares),
         relevance=relevance,
         not_judged=_not_judged(problem),
         closures=lines,
@@ -168,22 +168,22 @@ def searched(
     problem: Problem, catalogue: Mapping[str, type[CatalogueEffect]], progress: Progress = lambda message: None
 ) -> tuple[Search, SearchState]:
     """All sets of the catalogue's effects that the evidence led to, and the best of them."""
-    bench = Bench.of(problem, Parameters())
+    baseline = Baseline.of(problem, Parameters())
     progress("reading the signatures of all effects")
     items = variants(catalogue, problem.nominal.finger, problem.scales)
-    parts = read_parts(problem, items, bench.columns, progress)
-    search = Search(bench, table_of(problem, bench, parts), progress)
+    parts = read_parts(problem, items, baseline.columns, progress)
+    search = Search(baseline, table_of(problem, baseline, parts), progress)
     progress("weighing the evidence")
     return search, search.run()
 
 
 def _verdict(
-    problem: Problem, bench: Bench, state: SearchState, found: Posterior, relevance: tuple[Relevance, ...]
+    problem: Problem, baseline: Baseline, state: SearchState, found: Posterior, relevance: tuple[Relevance, ...]
 ) -> Verdict:
     """The word for the posterior; whether named causes are all of the gap is for held-out trials to say. A channel
     whose mean square is surely above its noise's is no «no gap», however few features tell of it.
     """
-    if not bench.columns.items:
+    if not baseline.columns.items:
         return Verdict(Status.NOT_JUDGED, ())
     if found.named:
         return Verdict(Status.PARTLY, found.named)
@@ -221,17 +221,17 @@ def agreeing(status: Status, found: Posterior, gaps: bool) -> tuple[float, float
     most.
     """
     if status is Status.NO_GAP and not gaps:
-        unlisted = min(found.unlisted, 1.0 - IS_NAMED)
+        unlisted = min(found.unlisted, 1.0 - MIN_NAMED_PROBABILITY)
         return max(found.none, 1.0 - unlisted), unlisted
     left_open = status is Status.UNEXPLAINED or (status is Status.PARTLY and not found.ambiguous)
-    unlisted = max(found.unlisted, IS_NAMED) if left_open else found.unlisted
+    unlisted = max(found.unlisted, MIN_NAMED_PROBABILITY) if left_open else found.unlisted
     return min(found.none, 1.0 - unlisted), unlisted
 
 
-def _open(bench: Bench) -> frozenset[int]:
+def _open(baseline: Baseline) -> frozenset[int]:
     """Columns in which the nominal model alone leaves a gap."""
-    null = bench.null.judged.evidence
-    return frozenset(np.flatnonzero(unexplained(bench.columns.counts, null, bench.parameters) > A_GAP).tolist())
+    null = baseline.null.linear_fit.evidence
+    return frozenset(np.flatnonzero(unexplained(baseline.columns.counts, null, baseline.parameters) > A_GAP).tolist())
 
 
 def _by_share(named, chosen: SearchState, shares: Budget) -> list:
@@ -268,7 +268,7 @@ def _causes(chosen: SearchState, found: Posterior, shares: Budget, fit: Fit) -> 
     return tuple(sorted(out, key=lambda c: -c.share))
 
 
-def _unexplained(chosen: SearchState, shares: Budget, left: list[Explained], status: Status, progress) -> Unexplained:
+def _unexplained(chosen: SearchState, shares: Budget, left: list[SmoothPart], status: Status, progress) -> Unexplained:
     _, _, share, ends = shares.overall()
     if status in (Status.NO_GAP, Status.NOT_JUDGED) or not left or left[0].energy <= 0:
         return Unexplained(share, ends, (), None, None)
@@ -278,20 +278,20 @@ def _unexplained(chosen: SearchState, shares: Budget, left: list[Explained], sta
     proposal = None
     if status in (Status.PARTLY, Status.UNEXPLAINED):
         progress("looking for a closed form of what remains")
-        plain = Whitened(chosen.problem, chosen.columns, Weights.plain(chosen.columns))
+        plain = Projector(chosen.problem, chosen.columns, Weights.plain(chosen.columns))
         proposal = propose(chosen.problem, plain, chosen.r, left)
     there = ExperimentChannel(worst.experiment, worst.channel, site(chosen.problem, worst.channel, worst.column))
     return Unexplained(share, ends, depends, there, proposal)
 
 
 def _channels(
-    problem: Problem, bench: Bench, chosen: SearchState, causes: tuple[Cause, ...], shares: Budget
+    problem: Problem, baseline: Baseline, chosen: SearchState, causes: tuple[Cause, ...], shares: Budget
 ) -> tuple[ChannelBudget, ...]:
     """One line a column with a gap. Its gap in physical units is what is missed beyond the noise at the fit's rate."""
     found = []
     lines = [[i for i, (e, _) in enumerate(chosen.keys) if e == cause.effect] for cause in causes]
     for c in sorted(shares.open):
-        column = bench.columns.items[c]
+        column = baseline.columns.items[c]
         missed, noise = _mean_squares(problem, column.experiment, column.channel, column.column)
         _, lost, after = shares.of({c})
         found.append(
@@ -328,9 +328,11 @@ def _about_start(x: Float[np.ndarray, "columns B T"], mask, channel: str) -> Flo
     return x
 
 
-def _relevance(problem: Problem, bench: Bench, tolerance: Mapping[str, float]) -> tuple[Relevance, ...]:
+def _relevance(problem: Problem, baseline: Baseline, tolerance: Mapping[str, float]) -> tuple[Relevance, ...]:
     """Every channel with a gap, in the world: beside what the channel shows in the experiment that moves it most."""
-    channels = dict.fromkeys((bench.columns.items[c].experiment, bench.columns.items[c].channel) for c in _open(bench))
+    channels = dict.fromkeys(
+        (baseline.columns.items[c].experiment, baseline.columns.items[c].channel) for c in _open(baseline)
+    )
     out = []
     for e, c in channels:
         missed, noise = _mean_squares(problem, e, c)
@@ -365,7 +367,7 @@ def _candidates(problem: Problem, search: Search, chosen: SearchState, found: Po
     gain = dict(zip(chosen.keys, shares.overall()[0].tolist(), strict=True))
     others = search.alone(k for k in order if k not in inside)
     likely = [k for k in order if k in others][:HELD_OUT]
-    signatures = [search.table.signatures.dense(others[k][0].columns, problem.r.size) for k in likely]
+    signatures = [search.table.signatures.dense(others[k][0].rows, problem.r.size) for k in likely]
     gain |= dict(zip(likely, held_out_gains(problem, signatures), strict=True))
     values = inside | {k: _alone(problem, search.table, *x) for k, x in others.items()}
     return tuple(
@@ -374,14 +376,14 @@ def _candidates(problem: Problem, search: Search, chosen: SearchState, found: Po
 
 
 def _alone(
-    problem: Problem, table: SignatureTable, offer: Offered, amplitudes: np.ndarray, std: np.ndarray
+    problem: Problem, table: SignatureTable, offer: Offer, amplitudes: np.ndarray, std: np.ndarray
 ) -> tuple[Value, ...]:
     """Amplitudes of a cause on top of the nominal model, linearly, and the shape that suits best."""
     (variant,), names = offer.variants, list(offer.variants[0].sizes)
     units = units_at(problem.nominal.finger, variant.effect, variant.site)
     found = dict.fromkeys(names, (0.0, 0.0))
     of_row = dict(zip(table.rows[variant].tolist(), names, strict=True))
-    for row, a, s in zip(offer.columns.tolist(), amplitudes, std, strict=True):
+    for row, a, s in zip(offer.rows.tolist(), amplitudes, std, strict=True):
         unit = table.units[row] * variant.sizes[of_row[row]]
         found[of_row[row]] = (float(a * unit), float(s * unit))
     values = [Value(variant.site, n, a, s, units[n]) for n, (a, s) in found.items()]

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.columns import Columns
-from jaxfinger.gap.formula import Judged, Linear, Parameters, Weights, unexplained
+from jaxfinger.gap.formula import Linear, LinearFit, Parameters, Weights, unexplained
 from jaxfinger.gap.problem import Problem, moved
 from jaxfinger.gap.signatures import Signatures, Variant
 from jaxfinger.identify.solve import bounded_least_squares
@@ -54,12 +54,12 @@ class SearchState:
     coordinates: tuple[Coordinate, ...]
     changes: Float[np.ndarray, "effects N"]  # what each effect adds to every white row
     slopes: Float[np.ndarray, "k N"]  # derivatives by the coordinates, in their units
-    judged: Judged
+    linear_fit: LinearFit
 
     @property
     def score(self) -> float:
         """Comparable between sets."""
-        return self.judged.score
+        return self.linear_fit.score
 
     @property
     def keys(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
@@ -82,17 +82,17 @@ class SearchState:
 
 
 @dataclass(frozen=True)
-class Bench:
+class Baseline:
     """What is the same for all sets of one file."""
 
     columns: Columns
     parameters: Parameters
     null: SearchState  # no cause, the nominal model refitted in the weights of the formula
-    unknown: Float[np.ndarray, " C"]  # log evidence, column by column, that something is at work
+    unexplained: Float[np.ndarray, " C"]  # log evidence, column by column, that something is at work
     gap: float  # norm of what the nominal model misses: the size of the amplitudes' prior
 
     @classmethod
-    def of(cls, problem: Problem, parameters: Parameters) -> "Bench":
+    def of(cls, problem: Problem, parameters: Parameters) -> "Baseline":
         columns = Columns.of(problem)
         empty = np.empty((0, problem.r.size))
         nominal, none = ByColumn.of(columns, problem.J.T), ByColumn.of(columns, empty)
@@ -104,9 +104,9 @@ class Bench:
         gap = float(np.sqrt(np.sum(judged.evidence.e + judged.evidence.o)))
         return cls(columns, parameters, null, unknown, gap)
 
-    def judge(
+    def fit_linear(
         self, problem: Problem, nominal: ByColumn, r: np.ndarray, slopes: np.ndarray, sizes: np.ndarray, room: Room
-    ) -> Judged:
+    ) -> LinearFit:
         """A set at its optimum: `sizes`, how far its coordinates are from the middle of their priors, `room`, how far
         they may move on.
         """
@@ -116,9 +116,9 @@ class Bench:
             prior_products(problem, 0),
             ByColumn.of(self.columns, slopes),
             self.parameters,
-            self.null.judged,
+            self.null.linear_fit,
         )
-        return linear.judge(np.arange(len(slopes)), *room, middle=-sizes)
+        return linear.fit(np.arange(len(slopes)), *room, middle=-sizes)
 
 
 def prior_products(problem: Problem, k: int) -> Float[np.ndarray, "d d"]:
@@ -132,19 +132,19 @@ def prior_products(problem: Problem, k: int) -> Float[np.ndarray, "d d"]:
     return out
 
 
-class Whitened:
+class Projector:
     """Rows in the weights of the formula, projected off the nominal parameters."""
 
     def __init__(self, problem: Problem, columns: Columns, weights: Weights):
         self.columns, self.weights = columns, weights
-        A = np.vstack([self.white(problem.J.T).T, problem.root])
+        A = np.vstack([self.weighted(problem.J.T).T, problem.root])
         scale = np.linalg.norm(A, axis=0)
         scale = np.where(scale > 0, scale, 1.0)
         self.Q, self.T = orthonormalised(A / scale)
         self.T /= scale[:, None]  # Q = A T
         self.offset = problem.offset
 
-    def white(self, x: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "k N"]:
+    def weighted(self, x: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "k N"]:
         """W^½ x."""
         out = x.copy()
         for c, inside, outside in zip(self.columns.items, self.weights.feature, self.weights.outside, strict=True):
@@ -156,18 +156,18 @@ class Whitened:
 
     def __call__(self, x: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "k rows"]:
         """Of signatures."""
-        return self._off(np.pad(self.white(x), ((0, 0), (0, len(self.offset)))))
+        return self._off(np.pad(self.weighted(x), ((0, 0), (0, len(self.offset)))))
 
     def residual(self, r: Float[np.ndarray, " N"]) -> Float[np.ndarray, " rows"]:
         """Of a residual, with what the prior says of the nominal parameters as they are."""
-        return self._off(np.concatenate([self.white(r[None])[0], -self.offset])[None])[0]
+        return self._off(np.concatenate([self.weighted(r[None])[0], -self.offset])[None])[0]
 
     def _off(self, x):
         return x - (x @ self.Q) @ self.Q.T
 
     def nominal_step(self, r: Float[np.ndarray, " N"]) -> Float[np.ndarray, " p"]:
         """What the nominal parameters move by to absorb r."""
-        return self.T @ (self.Q.T @ np.concatenate([self.white(r[None])[0], -self.offset]))
+        return self.T @ (self.Q.T @ np.concatenate([self.weighted(r[None])[0], -self.offset]))
 
 
 def orthonormalised(A: Float[np.ndarray, "N p"]) -> tuple[Float[np.ndarray, "N k"], Float[np.ndarray, "p k"]]:
@@ -186,35 +186,39 @@ def orthonormalised(A: Float[np.ndarray, "N p"]) -> tuple[Float[np.ndarray, "N k
 
 
 def fitted(
-    bench: Bench, problem: Problem, variants: Sequence[Variant], start: Sequence[dict[str, float]], weights: Weights
+    baseline: Baseline,
+    problem: Problem,
+    variants: Sequence[Variant],
+    start: Sequence[dict[str, float]],
+    weights: Weights,
 ) -> SearchState:
     """The causes together, from amplitudes `start` (in their own units), at the nominal model that they lead to."""
     finger = problem.nominal.finger
     effects = [within_bounds(v.at(finger, s), v.scales) for v, s in zip(variants, start, strict=True)]
     best: SearchState | None = None
     for _ in range(ROUNDS):
-        found = at_one_model(bench, problem, effects, weights)
+        found = at_one_model(baseline, problem, effects, weights)
         if best is not None and found.score < best.score + SETTLED:
             return max(best, found, key=lambda s: s.score)
-        best, effects, weights = found, list(found.effects), found.judged.weights
-        problem = _led(bench, found, weights)
+        best, effects, weights = found, list(found.effects), found.linear_fit.weights
+        problem = _led(baseline, found, weights)
     assert best is not None
     return best
 
 
-def led_plainly(bench: Bench, state: SearchState) -> SearchState:
+def led_plainly(baseline: Baseline, state: SearchState) -> SearchState:
     """The causes together where plain least squares leads from a state, if the formula says more for that.
 
     The formula gives a column that is open little weight. Where it takes a large step in the nominal model to close it,
     `fitted` ends before, since each small step wins less than it loses in the columns that are closed.
     """
-    plain = Weights.plain(bench.columns)
+    plain = Weights.plain(baseline.columns)
     problem, effects, there = state.problem, list(state.effects), state
     for _ in range(PLAIN):
-        there = at_one_model(bench, problem, effects, plain)
-        problem, effects = _led(bench, there, plain), list(there.effects)
+        there = at_one_model(baseline, problem, effects, plain)
+        problem, effects = _led(baseline, there, plain), list(there.effects)
     variants, starts = [as_variant(e, problem.scales) for e in effects], [amplitudes_of(e) for e in effects]
-    return max(state, fitted(bench, problem, variants, starts, there.judged.weights), key=lambda s: s.score)
+    return max(state, fitted(baseline, problem, variants, starts, there.linear_fit.weights), key=lambda s: s.score)
 
 
 def amplitudes_of(effect: CatalogueEffect) -> dict[str, float]:
@@ -228,36 +232,38 @@ def as_variant(effect: CatalogueEffect, scales: Scales) -> Variant:
     return Variant(type(effect), effect.site, shapes, scales=scales)
 
 
-def _led(bench: Bench, state: SearchState, weights: Weights) -> Problem:
+def _led(baseline: Baseline, state: SearchState, weights: Weights) -> Problem:
     """The problem at the nominal model that a set leads to; a part of the step where a whole one loses what it won."""
-    project = Whitened(state.problem, bench.columns, weights)
+    project = Projector(state.problem, baseline.columns, weights)
     step = project.nominal_step(state.r)
     here = state.problem
     for _ in range(HALVINGS):
         here = moved(state.problem, step)
-        left = here.r - np.sum([Signatures(here).of([e])[0] for e in state.effects], axis=0)
-        if _cost(Whitened(here, bench.columns, weights), left) < 2.0 * _cost(project, state.r) + 100.0:
+        left = here.r - np.sum([Signatures(here).white_changes([e])[0] for e in state.effects], axis=0)
+        if _cost(Projector(here, baseline.columns, weights), left) < 2.0 * _cost(project, state.r) + 100.0:
             return here
         step = step / 3.0
     return here
 
 
-def _cost(project: Whitened, r: np.ndarray) -> float:
+def _cost(project: Projector, r: np.ndarray) -> float:
     x = project.residual(r)
     return float(x @ x)
 
 
-def at_one_model(bench: Bench, problem: Problem, effects: list[CatalogueEffect], weights: Weights) -> SearchState:
+def at_one_model(baseline: Baseline, problem: Problem, effects: list[CatalogueEffect], weights: Weights) -> SearchState:
     """Amplitudes and shapes at the problem's nominal model, its parameters eliminated by projection."""
-    signatures, project = Signatures(problem), Whitened(problem, bench.columns, weights)
+    signatures, project = Signatures(problem), Projector(problem, baseline.columns, weights)
     coordinates = _coordinates(effects, problem.scales)
     reach = np.full(len(coordinates), STEP)
     changes, slopes = _evaluate(signatures, effects, coordinates, reach)
     # An amplitude is measured in the gap: one prior standard deviation changes as much as is missed in all. One that
     # changes nothing here keeps its own unit, as the warmth of a friction that there is none of.
-    plain = Whitened(problem, bench.columns, Weights.plain(bench.columns))
+    plain = Projector(problem, baseline.columns, Weights.plain(baseline.columns))
     norm = np.linalg.norm(plain(slopes), axis=1)
-    grow = np.array([bench.gap / n if c.amplitude and n > 0.0 else 1.0 for c, n in zip(coordinates, norm, strict=True)])
+    grow = np.array(
+        [baseline.gap / n if c.amplitude and n > 0.0 else 1.0 for c, n in zip(coordinates, norm, strict=True)]
+    )
     coordinates = [replace(c, unit=c.unit * g) if c.amplitude else c for c, g in zip(coordinates, grow, strict=True)]
     slopes = slopes * grow[:, None]
     r = problem.r - changes.sum(axis=0)
@@ -282,9 +288,9 @@ def at_one_model(bench: Bench, problem: Problem, effects: list[CatalogueEffect],
         effects, changes, slopes, r, sizes, cost = trial, new, new_slopes, new_r, new_sizes, new_cost
         if gain < 0.1 + 1e-3 * cost:
             break
-    nominal = ByColumn.of(bench.columns, problem.J.T)
-    judged = bench.judge(problem, nominal, r, slopes, sizes, _room(effects, coordinates))
-    return SearchState(problem, bench.columns, nominal, tuple(effects), tuple(coordinates), changes, slopes, judged)
+    nominal = ByColumn.of(baseline.columns, problem.J.T)
+    judged = baseline.fit_linear(problem, nominal, r, slopes, sizes, _room(effects, coordinates))
+    return SearchState(problem, baseline.columns, nominal, tuple(effects), tuple(coordinates), changes, slopes, judged)
 
 
 def derivatives(signatures: Signatures, state: SearchState) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "k N"]]:
@@ -351,7 +357,7 @@ def _evaluate(signatures: Signatures, effects, coordinates, reach: Float[np.ndar
         mine = [k for k, c in enumerate(coordinates) if c.effect == i]
         # A difference of an amplitude is one of its plausible size: its prior may be far wider.
         steps = [_beside(effect, coordinates[k], reach[k]) for k in mine]
-        flat = signatures.of([effect, *steps])
+        flat = signatures.white_changes([effect, *steps])
         changes[i] = flat[0]
         for row, k in enumerate(mine, start=1):
             step = _step_taken(effect, steps[row - 1], coordinates[k])

@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from jaxfinger.gap.problem import Problem
 
 FOLDS = 3
-KEPT = 0.05  # precision, in deviations of the whole fit, that keeps near it what the other folds do not see
+FOLD_PRIOR = 0.05  # precision, in deviations of the whole fit, that keeps near it what the other folds do not see
 
 
 def folds(problem: Problem) -> dict[str, np.ndarray]:
@@ -42,4 +42,4 @@ def equilibrated(
     """
     size = np.linalg.norm(J, axis=0)
     scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
-    return J * scale, np.vstack([root * scale, KEPT * np.eye(len(size))]), scale
+    return J * scale, np.vstack([root * scale, FOLD_PRIOR * np.eye(len(size))]), scale

@@ -34,15 +34,17 @@ from jaxfinger.gap.columns import Columns, Counts
 class Parameters:
     """All that the formula does not take from the file at hand. Where each number comes from: docs/results.md."""
 
-    floor: float = 2.0  # v_c that noise alone may leave, since its colour is known from a few repeats
-    form: float = 0.02  # ρ²: share of what causes explain in a column that the forms of their laws may miss
-    looks: float = 25.0  # ν: independent looks outside of the features
-    prior: float = 8.0  # log evidence that a cause must bring,
-    alike: float = 0.04  # and as a share of what is unexplained where it acts: what an imitator gains of it
-    trust: float = 1.0  # β: of all log evidence, since neighbouring features and columns are no independent looks
-    left: float = 0.27  # share of what causes explain in a column, up to which what is left there is theirs as well
-    open: float = 6.0  # log evidence beyond that, from which on something unlisted is as likely as not
-    sharp: float = 1.0  # and how fast that probability grows with it
+    variance_floor: float = 2.0  # v_c that noise alone may leave, since its colour is known from a few repeats
+    form_error: float = 0.02  # ρ²: share of what causes explain in a column that the forms of their laws may miss
+    outside_samples: float = 25.0  # ν: independent looks outside of the features
+    cause_cost: float = 8.0  # log evidence that a cause must bring,
+    imitator_gain: float = 0.04  # and as a share of what is unexplained where it acts: what an imitator gains of it
+    tempering: float = 1.0  # β: of all log evidence, since neighbouring features and columns are no independent looks
+    form_error_unlisted: float = (
+        0.27  # share of what causes explain in a column, up to which what is left there is theirs as well
+    )
+    unlisted_threshold: float = 6.0  # log evidence beyond that, from which on something unlisted is as likely as not
+    unlisted_slope: float = 1.0  # and how fast that probability grows with it
 
 
 @dataclass(frozen=True)
@@ -75,10 +77,10 @@ def log_likelihood(
     p: Parameters,
 ) -> tuple[Float[np.ndarray, " *n"], Weights]:
     """log L and the weights that belong to it."""
-    K, nu = counts.K, p.looks
+    K, nu = counts.K, p.outside_samples
     scale = (nu + o) / (nu + counts.outside)
-    floor = p.floor * np.maximum(scale, 1.0)
-    v = np.maximum(np.maximum(e / K, floor), p.form * explained / K)
+    floor = p.variance_floor * np.maximum(scale, 1.0)
+    v = np.maximum(np.maximum(e / K, floor), p.form_error * explained / K)
     excess = np.maximum(o - counts.outside, 0.0) / nu
     value = -0.5 * np.sum(K * np.log(v) + e / v + nu * np.log1p(excess), axis=-1)
     return np.asarray(value), Weights(1.0 / v, 1.0 / (1.0 + excess))
@@ -86,18 +88,23 @@ def log_likelihood(
 
 def unexplained(counts: Counts, x: Evidence, p: Parameters) -> Float[np.ndarray, " C"]:
     """Log evidence, column by column, that something is at work beyond noise and what the causes' forms may miss."""
-    scale = np.maximum((p.looks + x.o) / (p.looks + counts.outside), 1.0)
-    floor = np.maximum(p.floor * scale, p.form * x.explained / counts.K)
+    scale = np.maximum((p.outside_samples + x.o) / (p.outside_samples + counts.outside), 1.0)
+    floor = np.maximum(p.variance_floor * scale, p.form_error * x.explained / counts.K)
     return 0.5 * counts.K * np.log(np.maximum(x.e / counts.K / floor, 1.0))
 
 
 def unlisted(counts: Counts, x: Evidence, p: Parameters) -> float:
     """Probability that something is at work which no cause of a set is."""
-    return float(expit(p.sharp * (unexplained(counts, x, replace(p, form=p.left)).sum() - p.open)))
+    return float(
+        expit(
+            p.unlisted_slope
+            * (unexplained(counts, x, replace(p, form_error=p.form_error_unlisted)).sum() - p.unlisted_threshold)
+        )
+    )
 
 
 @dataclass(frozen=True)
-class Judged:
+class LinearFit:
     """One set of causes on top of what is refitted with every set."""
 
     evidence: Evidence
@@ -127,7 +134,7 @@ class Linear:
         prior: Float[np.ndarray, "k k"],
         further: ByColumn,
         parameters: Parameters,
-        null: Judged | None = None,
+        null: LinearFit | None = None,
     ):
         self.columns, self.parameters, self.prior = columns, parameters, prior
         self.further = further
@@ -136,7 +143,7 @@ class Linear:
         self.TXZ = Products.stacked([x.products(further) for x in base])
         self.null = null
         if null is None:
-            self.null = self.judge(np.empty(0, int))
+            self.null = self.fit(np.empty(0, int))
 
     def _inside(self, w: Weights) -> Float[np.ndarray, " features"]:
         """What a feature weighs beyond what lies outside of it."""
@@ -147,9 +154,9 @@ class Linear:
         outside = T.summed(w.outside) if isinstance(T, Products) else np.tensordot(w.outside, T, 1)
         return outside + (B * self._inside(w)[:, None]).T @ B2
 
-    def judge(
+    def fit(
         self, picks: Int[np.ndarray, " k"], low=None, high=None, start: Weights | None = None, middle=None
-    ) -> Judged:
+    ) -> LinearFit:
         """The likeliest amplitudes of the rows `picks` within `low` and `high`, in units of their prior."""
         k, n = self.BX.shape[1], len(picks)
         low = np.full(n, -np.inf) if low is None else low
@@ -178,7 +185,7 @@ class Linear:
         H = self._weighted(weights, B, B, T) + prior
         sizes = -x[k:] if middle is None else -x[k:] - middle
         occam = 0.5 * _further_information(H, k) + 0.5 * float(sizes @ sizes) if n else 0.0
-        return Judged(Evidence(e, o, explained, log_l - occam), log_l, -x[k:], x, b, weights)
+        return LinearFit(Evidence(e, o, explained, log_l - occam), log_l, -x[k:], x, b, weights)
 
     def _solve(self, H, low, high):
         """Coefficients (1, −δ, −a); amplitudes that leave their bounds stay at them."""
@@ -202,7 +209,7 @@ class Linear:
             free[first:][out] = False
         return x
 
-    def screen(self, now: Judged, candidates: list[Int[np.ndarray, " _k"]], bounds) -> list[Evidence | None]:
+    def screen(self, now: LinearFit, candidates: list[Int[np.ndarray, " _k"]], bounds) -> list[Evidence | None]:
         """Of each candidate alone on top of the base, by one step in the weights; the score is its gain."""
         w, k = now.weights, self.BX.shape[1]
         x = now.solution[:k]

@@ -7,7 +7,7 @@ from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError, did_you_mean
 from jaxfinger.experiments import shows
 from jaxfinger.gap.augment import augmented_fit
-from jaxfinger.gap.exact import Bench
+from jaxfinger.gap.exact import Baseline
 from jaxfinger.gap.formula import Parameters
 from jaxfinger.gap.problem import Problem, build
 from jaxfinger.gap.screening import read_parts
@@ -46,14 +46,14 @@ def fit_with(
     _refuse_elsewhere(catalogue, keys, finger)
     problem = build(session, recipe, progress)
     offered = _offered(catalogue, keys, problem)
-    bench = Bench.of(problem, Parameters())
-    table = table_of(problem, bench, read_parts(problem, offered, bench.columns, progress), together=False)
+    baseline = Baseline.of(problem, Parameters())
+    table = table_of(problem, baseline, read_parts(problem, offered, baseline.columns, progress), together=False)
     wanted = list(dict.fromkeys(v.key for v in offered))
     if unseen := [k for k in wanted if k not in table.keys]:
         (effect, site), file = unseen[0], session.file or "the session"
         shown = ", ".join(shows(catalogue[effect], problem.nominal.finger))
         raise UserError(f"{file}: no trial shows {effect} at {'-'.join(site)}; record {shown}, or leave it out")
-    search, state = Search(bench, table, progress), bench.null
+    search, state = Search(baseline, table, progress), baseline.null
     for _ in wanted:
         screened = search.screened(state)
         _, offer, amplitudes = search.best_offers(screened, 1)[0]

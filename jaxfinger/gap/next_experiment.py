@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.experiments import EXPERIMENTS, Batch, Stack, shows
-from jaxfinger.gap.exact import SearchState, Whitened, derivatives
+from jaxfinger.gap.exact import Projector, SearchState, derivatives
 from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem, imagined
 from jaxfinger.gap.result import NextExperiment, Posture
@@ -44,7 +44,7 @@ def next_experiment(problem: Problem, members: Sequence[SearchState]) -> NextExp
         return None
     shown = {e for m in members for x in m.effects for e in shows(type(x), problem.nominal.finger)}
     ones = Weights.plain(members[0].columns)
-    project, own = Whitened(problem, members[0].columns, ones), Signatures(problem)
+    project, own = Projector(problem, members[0].columns, ones), Signatures(problem)
     steps, known = [], []
     for m in members:
         change, slopes = derivatives(own, m)

@@ -9,7 +9,7 @@ from jaxfinger.gap.exact import SearchState
 from jaxfinger.gap.formula import unlisted
 from jaxfinger.gap.sets import Search
 
-IS_NAMED = 0.5  # probability from which on a verdict says that a cause is at work
+MIN_NAMED_PROBABILITY = 0.5  # probability from which on a verdict says that a cause is at work
 SURE = 0.9  # share of a cause's probability, beside its rivals', below which they are an ambiguous set
 COVERED, RIVALS = 0.97, 3  # probability up to which a set takes in further ones, and how many at most
 
@@ -29,7 +29,7 @@ class Posterior:
 def posterior(search: Search, state: SearchState) -> Posterior:
     """From the sets that a search has weighed."""
     costs, scores = search.costs, search.visited.scores
-    w = costs.weights(scores)
+    w = costs.probabilities(scores)
     net = {keys: score - costs.of(keys) for keys, score in scores.items()}
     causes, gains = {}, {}
     for key in search.table.keys:
@@ -37,9 +37,9 @@ def posterior(search: Search, state: SearchState) -> Posterior:
         causes[key] = sum(w[keys] for keys in inside)
         without = max(net[keys] for keys in scores if key not in keys)
         gains[key] = max((net[keys] for keys in inside), default=-np.inf) - without
-    other = unlisted(search.bench.columns.counts, state.judged.evidence, search.bench.parameters)
+    other = unlisted(search.baseline.columns.counts, state.linear_fit.evidence, search.baseline.parameters)
     ambiguous = _ambiguous(w, state, causes)
-    named = tuple(k for k in state.keys if causes[k] >= IS_NAMED and not any(k in s for s in ambiguous))
+    named = tuple(k for k in state.keys if causes[k] >= MIN_NAMED_PROBABILITY and not any(k in s for s in ambiguous))
     return Posterior(causes, gains, w[frozenset()] * (1.0 - other), other, named, ambiguous)
 
 

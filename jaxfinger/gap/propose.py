@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxfinger.data.schema import channel_units
-from jaxfinger.gap.exact import Whitened
+from jaxfinger.gap.exact import Projector
 from jaxfinger.gap.problem import Problem, site
 from jaxfinger.gap.signatures import whitened
-from jaxfinger.gap.smooth_laws import Explained, concerned, since_reversal
+from jaxfinger.gap.smooth_laws import SmoothPart, concerned, since_reversal
 
 TERMS = 3
 WORTH = 0.1  # share of what a smooth law could explain, that a further term must explain
@@ -38,7 +38,7 @@ class Proposal:
         return f"{self.channel} {self.site} ≈ {body.lstrip('+')}"
 
 
-def propose(problem: Problem, project: Whitened, residual: np.ndarray, left: Sequence[Explained]) -> Proposal | None:
+def propose(problem: Problem, project: Projector, residual: np.ndarray, left: Sequence[SmoothPart]) -> Proposal | None:
     """The shortest sum of terms for the column that has most left; None where no term explains a fair part.
 
     `residual` (N,) is what the causes leave, `left` what a smooth law explains of it.

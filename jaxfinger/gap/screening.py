@@ -22,7 +22,7 @@ RIDGE = 1e-9  # relative, of products of columns
 
 
 @runtime_checkable
-class Projector(Protocol):
+class Project(Protocol):
     """Rows off what the nominal parameters can absorb: the N of the trials, then the prior's."""
 
     def __call__(self, x: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "k rows"]:
@@ -30,7 +30,7 @@ class Projector(Protocol):
         ...
 
 
-Offer = tuple[list[Variant], ByColumn]  # a row an amplitude of each
+VariantRows = tuple[list[Variant], ByColumn]  # a row an amplitude of each
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class FixedShapes:
         parts = [items[k : k + CHUNK] for k in range(0, len(items), CHUNK)]
         return cls(items, ByColumn.joined(columns, [by_column(signatures, part, columns) for part in parts]))
 
-    def offer(self, projector: Projector, rt: Float[np.ndarray, " rows"], columns: Columns) -> Offer:
+    def variant_rows(self, projector: Project, rt: Float[np.ndarray, " rows"], columns: Columns) -> VariantRows:
         """All of them, whatever is left."""
         return self.items, self.rows
 
@@ -82,16 +82,16 @@ class Scan:
         without = set(size).difference(*effect.periods().values())
         members = [shape | {a: size[a]} for a in size if a in without]
         members += [shape | {name: period, a: size[a]} for period in periods for a in pair]
-        rows = signatures.of([effect.at(finger, site, **values) for values in members])
+        rows = signatures.white_changes([effect.at(finger, site, **values) for values in members])
         return cls(signatures, items, periods, middle, rows)
 
-    def offer(self, projector: Projector, rt: Float[np.ndarray, " rows"], columns: Columns) -> Offer:
+    def variant_rows(self, projector: Project, rt: Float[np.ndarray, " rows"], columns: Columns) -> VariantRows:
         """Every variant with those periods that explain most together."""
         shape = {"middle": self.middle} | self.best(projector, rt)
         items = [v.with_shape(**shape) for v in self.items]
         return items, by_column(self.signatures, items, columns)
 
-    def best(self, projector: Projector, rt: Float[np.ndarray, " rows"]) -> dict[str, float]:
+    def best(self, projector: Project, rt: Float[np.ndarray, " rows"]) -> dict[str, float]:
         """The periods, s, by least squares over all sets of them."""
         names, n = list(self.items[0].effect.periods()), len(self.periods)
         A = projector(self.rows)
@@ -110,7 +110,7 @@ Part = FixedShapes | Scan
 
 def by_column(signatures: Signatures, items: list[Variant], columns: Columns) -> ByColumn:
     """Signatures per plausible size, a row an amplitude of each of the variants, which are of one class."""
-    rows = signatures.columns(items)
+    rows = signatures.per_amplitude(items)
     return ByColumn.of(columns, rows.reshape(-1, rows.shape[-1]))
 
 

@@ -10,16 +10,16 @@ from jaxtyping import Float, Int
 from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.costs import Costs, Key
 from jaxfinger.gap.exact import (
-    Bench,
+    Baseline,
+    Projector,
     SearchState,
-    Whitened,
     amplitudes_of,
     as_variant,
     fitted,
     led_plainly,
     prior_products,
 )
-from jaxfinger.gap.formula import Evidence, Judged, Linear, Weights, unexplained
+from jaxfinger.gap.formula import Evidence, Linear, LinearFit, Weights, unexplained
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.screening import Part
 from jaxfinger.gap.signatures import Variant
@@ -36,11 +36,11 @@ CLOSE = 8.0  # score within which a candidate may overtake another once it is fi
 
 
 @dataclass(frozen=True)
-class Offered:
+class Offer:
     """One way to add a cause: an effect at one site, or at all of its sites, in one shape."""
 
     variants: tuple[Variant, ...]
-    columns: Int[np.ndarray, " k"]  # rows of its signatures in the table
+    rows: Int[np.ndarray, " k"]  # rows of its signatures in the table
     low: Float[np.ndarray, " k"]
     high: Float[np.ndarray, " k"]
 
@@ -70,31 +70,31 @@ class SignatureTable:
     units: Float[np.ndarray, " M"]
     absorbed: dict[Key, float]
     hidden: dict[Key, dict[str, float]]  # std of amplitudes, each alone, in their own units: what could hide
-    touched: dict[Key, Float[np.ndarray, " C"]]  # of all that the trials can see (`Costs`)
-    offers: list[Offered]
+    explainable: dict[Key, Float[np.ndarray, " C"]]  # of all that the trials can see (`Costs`)
+    offers: list[Offer]
 
-    def rows_of(self, offer: Offered) -> list[Int[np.ndarray, " _k"]]:
+    def rows_of(self, offer: Offer) -> list[Int[np.ndarray, " _k"]]:
         """Of every variant of an offer, those that no trial shows too."""
         return [self.rows[v] for v in offer.variants]
 
     @property
     def keys(self) -> list[Key]:
         """All that the trials can see."""
-        return list(self.touched)
+        return list(self.explainable)
 
 
-def table_of(problem: Problem, bench: Bench, parts: Iterable[Part], together: bool = True) -> SignatureTable:
+def table_of(problem: Problem, baseline: Baseline, parts: Iterable[Part], together: bool = True) -> SignatureTable:
     """Every candidate that the trials can see."""
-    plain = Whitened(problem, bench.columns, Weights.plain(bench.columns))
+    plain = Projector(problem, baseline.columns, Weights.plain(baseline.columns))
     rt = plain.residual(problem.r)
-    offered = [part.offer(plain, rt, bench.columns) for part in parts]
+    offered = [part.variant_rows(plain, rt, baseline.columns) for part in parts]
     items = [v for some, _ in offered for v in some]
-    signatures = ByColumn.joined(bench.columns, [rows for _, rows in offered])
-    raw, left, units, claims = _visible(bench, plain, signatures)
+    signatures = ByColumn.joined(baseline.columns, [rows for _, rows in offered])
+    raw, left, units, claims = _visible(baseline, plain, signatures)
     kept = units > 0.0
     absorbed: dict[Key, float] = {}
     hidden: dict[Key, dict[str, float]] = {}
-    touched: dict[Key, Float[np.ndarray, " C"]] = {}
+    explainable: dict[Key, Float[np.ndarray, " C"]] = {}
     offers, rows, start = [], {}, 0
     for v in items:
         at = np.arange(start, start + len(v.sizes))
@@ -111,10 +111,10 @@ def table_of(problem: Problem, bench: Bench, parts: Iterable[Part], together: bo
         ends = [_ends(v, n, float(units[i])) for i, n in zip(at, v.sizes, strict=True) if kept[i]]
         if ends:
             low, high = np.array(ends).T
-            offers.append(Offered((v,), at[kept[at]], low, high))
-            touched[v.key] = np.maximum(touched.get(v.key, 0.0), claims[at].max(axis=0))
+            offers.append(Offer((v,), at[kept[at]], low, high))
+            explainable[v.key] = np.maximum(explainable.get(v.key, 0.0), claims[at].max(axis=0))
     offers += _together(offers) if together else []
-    return SignatureTable(signatures.scaled(units), rows, units, absorbed, hidden, touched, offers)
+    return SignatureTable(signatures.scaled(units), rows, units, absorbed, hidden, explainable, offers)
 
 
 class Visible(NamedTuple):
@@ -126,19 +126,19 @@ class Visible(NamedTuple):
     claims: Float[np.ndarray, "M C"]  # share of each column's gap that each would explain, that large
 
 
-def _visible(bench: Bench, plain: Whitened, Z: ByColumn) -> Visible:
+def _visible(baseline: Baseline, plain: Projector, Z: ByColumn) -> Visible:
     """With Q spanning what the nominal parameters can absorb, ‖z − Q Qᵀ z‖² = ‖z‖² − ‖Qᵀ z‖²."""
-    columns, Q = bench.columns, plain.Q
+    columns, Q = baseline.columns, plain.Q
     square, onto = np.zeros(Z.count), np.zeros((Q.shape[1], Z.count))
     for c, (at, rows) in zip(columns.items, Z.held, strict=True):
         square[at] += np.sum(rows**2, axis=1)
         onto[:, at] += Q[c.rows].T @ rows.T
     rest = square - np.sum(onto**2, axis=0)
     raw, left = np.sqrt(square), np.sqrt(np.where(rest > LEAST_LEFT * square, rest, 0.0))
-    units = np.where(left > SEEN * raw, bench.gap / np.maximum(left, 1e-300), 0.0)
+    units = np.where(left > SEEN * raw, baseline.gap / np.maximum(left, 1e-300), 0.0)
     absorbed = np.concatenate([c.basis.T @ Q[c.rows] for c in columns.items]) @ onto
     energy = columns.sums((Z.B - absorbed) ** 2).T
-    share = units[:, None] ** 2 * energy / np.maximum(bench.null.judged.evidence.e, 1e-300)
+    share = units[:, None] ** 2 * energy / np.maximum(baseline.null.linear_fit.evidence.e, 1e-300)
     return Visible(raw, left, units, np.minimum(share, 1.0))
 
 
@@ -147,9 +147,9 @@ def _ends(v: Variant, name: str, unit: float) -> tuple[float, float]:
     return -np.inf if amplitude.signed else 0.0, amplitude.most / (v.sizes[name] * unit)
 
 
-def _together(offers: list[Offered]) -> list[Offered]:
+def _together(offers: list[Offer]) -> list[Offer]:
     """One cause at all of its sites."""
-    alike: dict[tuple, list[Offered]] = {}
+    alike: dict[tuple, list[Offer]] = {}
     for o in offers:
         (v,) = o.variants
         alike.setdefault((v.effect.ID, v.size, v.shape), []).append(o)
@@ -157,8 +157,8 @@ def _together(offers: list[Offered]) -> list[Offered]:
     for group in alike.values():
         if len({o.keys for o in group}) == len(group) > 1:
             parts = ([*o.variants] for o in group)
-            columns, low, high = (np.concatenate([getattr(o, n) for o in group]) for n in ("columns", "low", "high"))
-            out.append(Offered(tuple(v for p in parts for v in p), columns, low, high))
+            rows, low, high = (np.concatenate([getattr(o, n) for o in group]) for n in ("rows", "low", "high"))
+            out.append(Offer(tuple(v for p in parts for v in p), rows, low, high))
     return out
 
 
@@ -210,18 +210,18 @@ class Screened(NamedTuple):
     keys: list[Key]
     score: float
     linear: Linear
-    now: Judged
+    now: LinearFit
     values: Float[np.ndarray, " offers"]
 
 
 class Search:
     """Sets of causes of one file."""
 
-    def __init__(self, bench: Bench, table: SignatureTable, progress: Progress = lambda message: None):
-        self.bench, self.table, self.progress = bench, table, progress
+    def __init__(self, baseline: Baseline, table: SignatureTable, progress: Progress = lambda message: None):
+        self.baseline, self.table, self.progress = baseline, table, progress
         self.visited = Visited()
-        self.costs = Costs(bench.parameters, bench.unknown, table.touched)
-        self.visited.add((), bench.null.judged.evidence)
+        self.costs = Costs(baseline.parameters, baseline.unexplained, table.explainable)
+        self.visited.add((), baseline.null.linear_fit.evidence)
 
     def value(self, state: SearchState) -> float:
         """Score less costs."""
@@ -229,14 +229,14 @@ class Search:
 
     def linear(self, state: SearchState, r: np.ndarray, slopes: np.ndarray) -> Linear:
         """The table's rows on top of a state's base."""
-        columns = self.bench.columns
+        columns = self.baseline.columns
         return Linear(
             columns,
             (ByColumn.of(columns, r[None]), state.nominal, ByColumn.of(columns, slopes)),
             prior_products(state.problem, len(slopes)),
             self.table.signatures,
-            self.bench.parameters,
-            self.bench.null.judged,
+            self.baseline.parameters,
+            self.baseline.null.linear_fit,
         )
 
     def without(self, state: SearchState, cause: int | None) -> Rest:
@@ -244,9 +244,11 @@ class Search:
         kept = [i for i in range(len(state.effects)) if i != cause]
         at = [k for k, c in enumerate(state.coordinates) if c.effect in kept]
         keys, slopes = [state.keys[i] for i in kept], state.slopes[at]
-        r, judged = state.problem.r - state.changes[kept].sum(axis=0), state.judged
+        r, judged = state.problem.r - state.changes[kept].sum(axis=0), state.linear_fit
         if cause is not None:
-            judged = self.bench.judge(state.problem, state.nominal, r, slopes, state.sizes()[at], state.room(at))
+            judged = self.baseline.fit_linear(
+                state.problem, state.nominal, r, slopes, state.sizes()[at], state.room(at)
+            )
         self.visited.add(keys, judged.evidence)
         return Rest(keys, r, slopes, judged.score)
 
@@ -254,9 +256,9 @@ class Search:
         """Every offer on top of the state, or of what is left of it without one cause."""
         keys, r, slopes, score = self.without(state, without)
         linear = self.linear(state, r, slopes)
-        now = linear.judge(np.empty(0, int), start=state.judged.weights)
+        now = linear.fit(np.empty(0, int), start=state.linear_fit.weights)
         offers = self.table.offers
-        found = linear.screen(now, [o.columns for o in offers], [(o.low, o.high) for o in offers])
+        found = linear.screen(now, [o.rows for o in offers], [(o.low, o.high) for o in offers])
         values = np.full(len(offers), -np.inf)
         for n, (o, more) in enumerate(zip(offers, found, strict=True)):
             if more is not None and not set(o.keys) & set(keys):
@@ -265,7 +267,7 @@ class Search:
                 self.visited.screen(together, more._replace(score=score + more.score))
         return Screened(keys, score, linear, now, values)
 
-    def best_offers(self, screened: Screened, most: int = EXACT) -> list[tuple[float, Offered, np.ndarray]]:
+    def best_offers(self, screened: Screened, most: int = EXACT) -> list[tuple[float, Offer, np.ndarray]]:
         """The offers whose sets are worth most once the weights settle, with amplitudes: one an effect, site and
         choice.
         """
@@ -277,7 +279,7 @@ class Search:
             if not np.isfinite(values[n]) or taken.get(form, 0) >= 2 or len(found) >= SHORT_LIST:
                 continue
             taken[form] = taken.get(form, 0) + 1
-            judged = linear.judge(o.columns, o.low, o.high, start=now.weights)
+            judged = linear.fit(o.rows, o.low, o.high, start=now.weights)
             together = [*keys, *o.keys]
             evidence = judged.evidence._replace(score=score + judged.score - now.score)
             self.visited.add(together, evidence)
@@ -295,7 +297,7 @@ class Search:
         self,
         state: SearchState,
         without: int | None,
-        offer: Offered | None = None,
+        offer: Offer | None = None,
         amplitudes: Sequence[float] | np.ndarray = (),
         weights: Weights | None = None,
     ) -> SearchState:
@@ -305,7 +307,7 @@ class Search:
         starts = [amplitudes_of(state.effects[i]) for i in kept]
         if offer is not None:
             self.progress(f"fitting with {offer.effect} at {', '.join('-'.join(s) for _, s in offer.keys)}")
-            mine = {i: float(a) for i, a in zip(offer.columns.tolist(), amplitudes, strict=True)}
+            mine = {i: float(a) for i, a in zip(offer.rows.tolist(), amplitudes, strict=True)}
             for v, rows in zip(offer.variants, self.table.rows_of(offer), strict=True):
                 variants.append(v)
                 starts.append(
@@ -314,11 +316,11 @@ class Search:
                         for i, (n, size) in zip(rows, v.sizes.items(), strict=True)
                     }
                 )
-        return self._fitted(state.problem, variants, starts, weights or state.judged.weights)
+        return self._fitted(state.problem, variants, starts, weights or state.linear_fit.weights)
 
     def _fitted(self, problem, variants, starts, weights) -> SearchState:
-        found = fitted(self.bench, problem, variants, starts, weights)
-        self.visited.add(found.keys, found.judged.evidence)
+        found = fitted(self.baseline, problem, variants, starts, weights)
+        self.visited.add(found.keys, found.linear_fit.evidence)
         return found
 
     def in_its_best_form(self, state: SearchState, first: int) -> SearchState:
@@ -335,13 +337,13 @@ class Search:
                     variants[i] = variants[i].with_shape(**{name: value})
                     if effect.sensible(scales, variants[i].site, dict(variants[i].shape)):
                         starts = [amplitudes_of(e) for e in best.effects]
-                        other = self._fitted(best.problem, variants, starts, best.judged.weights)
+                        other = self._fitted(best.problem, variants, starts, best.linear_fit.weights)
                         best = max(best, other, key=lambda x: x.score)
         return best
 
     def run(self) -> SearchState:
         """The best set that additions, drops and swaps lead to."""
-        state = self.bench.null
+        state = self.baseline.null
         if not self.table.offers:
             return state
         for _ in range(MOST):
@@ -379,14 +381,14 @@ class Search:
         return self._led_plainly(best) if self._open(best) else best
 
     def _led_plainly(self, state: SearchState) -> SearchState:
-        found = led_plainly(self.bench, state)
-        self.visited.add(found.keys, found.judged.evidence)
+        found = led_plainly(self.baseline, state)
+        self.visited.add(found.keys, found.linear_fit.evidence)
         return found
 
     def _open(self, state: SearchState) -> bool:
         """Whether more is left than the formula takes for noise and inexact laws."""
-        left = unexplained(self.bench.columns.counts, state.judged.evidence, self.bench.parameters)
-        return bool(left.sum() > self.bench.parameters.open)
+        left = unexplained(self.baseline.columns.counts, state.linear_fit.evidence, self.baseline.parameters)
+        return bool(left.sum() > self.baseline.parameters.unlisted_threshold)
 
     def _pairs(self, state: SearchState, firsts: Sequence[SearchState]) -> Iterator[SearchState]:
         """Two causes more where neither alone is worth its cost, since each is hidden by what the other leaves open."""
@@ -426,7 +428,7 @@ class Search:
         keys = set(keys)
         while others := [i for i, k in enumerate(state.keys) if k not in keys]:
             if len(others) == len(state.keys):
-                return self.bench.null
+                return self.baseline.null
             state = self.exactly(state, others[0], None)
         return state
 
@@ -441,18 +443,18 @@ class Search:
                 out.append(self.in_its_best_form(found, len(state.effects) - 1))
         return out
 
-    def _best_of(self, screened: Screened, key: Key) -> tuple[Offered, np.ndarray] | None:
+    def _best_of(self, screened: Screened, key: Key) -> tuple[Offer, np.ndarray] | None:
         _, _, linear, now, values = screened
         mine = [n for n, o in enumerate(self.table.offers) if o.keys == (key,) and np.isfinite(values[n])]
         if not mine:
             return None
         offer = self.table.offers[max(mine, key=lambda n: values[n])]
-        return offer, linear.judge(offer.columns, offer.low, offer.high, start=now.weights).amplitudes
+        return offer, linear.fit(offer.rows, offer.low, offer.high, start=now.weights).amplitudes
 
-    def alone(self, keys: Iterable[Key]) -> dict[Key, tuple[Offered, np.ndarray, np.ndarray]]:
+    def alone(self, keys: Iterable[Key]) -> dict[Key, tuple[Offer, np.ndarray, np.ndarray]]:
         """Of causes alone on top of the nominal model, linearly: the shape that suits best, amplitudes, their std."""
-        screened, out = self.screened(self.bench.null), {}
+        screened, out = self.screened(self.baseline.null), {}
         for key in keys:
             if (best := self._best_of(screened, key)) is not None:
-                out[key] = (*best, screened.linear.std(best[0].columns, screened.now.weights))
+                out[key] = (*best, screened.linear.std(best[0].rows, screened.now.weights))
         return out

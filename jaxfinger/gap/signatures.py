@@ -115,8 +115,8 @@ class Signatures:
 
     problem: Problem
 
-    def of(self, members: list[CatalogueEffect]) -> Float[np.ndarray, "members N"]:
-        """Whitened change of every row, for effects of one class."""
+    def white_changes(self, members: list[CatalogueEffect]) -> Float[np.ndarray, "members N"]:
+        """Projector change of every row, for effects of one class."""
         out = np.zeros((len(members), self.problem.r.size))
         for k in range(0, len(members), CHUNK):
             for e, channel, raw in self.changes(members[k : k + CHUNK]):
@@ -158,12 +158,12 @@ class Signatures:
                 mine, length = group.trials[e], self.problem.stacks[e].batch.x.time.shape[-1]
                 yield e, group.channel, raw[:, :, mine.start : mine.stop, :length]
 
-    def columns(self, items: list[Variant]) -> Float[np.ndarray, "variants amplitudes N"]:
+    def per_amplitude(self, items: list[Variant]) -> Float[np.ndarray, "variants amplitudes N"]:
         """Signatures per plausible size, one amplitude at a time, for variants of one class."""
         effect, finger = items[0].effect, self.problem.nominal.finger
         names = list(effect.amplitudes())
         members = [v.at(finger, {n: v.size * v.sizes[n]}) for v, n in product(items, names)]
-        found = self.of(members).reshape(len(items), len(names), -1)
+        found = self.white_changes(members).reshape(len(items), len(names), -1)
         found /= np.array([v.size for v in items])[:, None, None]
         return found
 

@@ -17,7 +17,7 @@ SMOOTHED = 15  # samples over which an angle or a tension is averaged before its
 
 
 @dataclass(frozen=True)
-class Explained:
+class SmoothPart:
     """What smooth laws explain of one channel's column in one experiment."""
 
     experiment: str
@@ -82,7 +82,7 @@ def concerned(finger: Finger, channel: str, column: int) -> tuple[list[int], lis
     return list(range(finger.m)), list(range(finger.n))
 
 
-def explained(problem: Problem, residual: np.ndarray) -> list[Explained]:
+def smooth_parts(problem: Problem, residual: np.ndarray) -> list[SmoothPart]:
     """Column by column, largest energy first."""
     found = []
     for e, rows in problem.rows.items():
@@ -101,7 +101,7 @@ def explained(problem: Problem, residual: np.ndarray) -> list[Explained]:
                         white = whitened(raw, problem, rows, pick, c)
                         blocks.append(white)
                         by[variable] = _energy(white, mine[pick])
-                found.append(Explained(e, c, int(column), _energy(np.concatenate(blocks), mine[pick]), len(pick), by))
+                found.append(SmoothPart(e, c, int(column), _energy(np.concatenate(blocks), mine[pick]), len(pick), by))
     return sorted(found, key=lambda x: -x.energy)
 
 

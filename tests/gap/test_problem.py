@@ -7,7 +7,7 @@ import pytest
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap.augment import as_refitted, augmented_fit, nominal_fit
-from jaxfinger.gap.exact import Bench, at_one_model, fitted, led_plainly, orthonormalised
+from jaxfinger.gap.exact import Baseline, at_one_model, fitted, led_plainly, orthonormalised
 from jaxfinger.gap.formula import Parameters, Weights
 from jaxfinger.gap.problem import build, moved
 from jaxfinger.gap.signatures import Signatures, Variant
@@ -20,8 +20,8 @@ from jaxfinger.synthetic import SpecimenPlant, recipe_from, simulate, study_fing
 GAIN = 0.2
 
 
-def white(bench):
-    return Weights.plain(bench.columns)
+def white(baseline):
+    return Weights.plain(baseline.columns)
 
 
 @pytest.fixture(scope="module")
@@ -83,13 +83,13 @@ def test_a_problem_moves_along_its_own_jacobian(problem):
 
 
 def planted(problem, **values):
-    """The problem with a presliding in its residuals, and a bench for it."""
+    """The problem with a presliding in its residuals, and a baseline for it."""
     kind, site = CATALOGUE["joint_presliding"], (problem.nominal.finger.joint_names[0],)
     effect = kind.at(problem.nominal.finger, site, **values)
-    there = replace(problem, r=problem.r + Signatures(problem).of([effect])[0])
+    there = replace(problem, r=problem.r + Signatures(problem).white_changes([effect])[0])
     return (
         there,
-        Bench.of(there, Parameters()),
+        Baseline.of(there, Parameters()),
         Variant(kind, site, tuple((n, values[n]) for n in ("x0", "delta")), scales=there.scales),
     )
 
@@ -97,9 +97,9 @@ def planted(problem, **values):
 @pytest.mark.parametrize(("share", "start"), [(0.5, 1.0), (3.0, 0.5)])
 def test_a_share_is_at_most_one_and_leaves_that_bound_where_it_is_less(problem, share, start):
     """Residuals of a friction of which so much builds up over 20 mrad."""
-    there, bench, variant = planted(problem, a=share, x0=0.02, delta=1.0)
+    there, baseline, variant = planted(problem, a=share, x0=0.02, delta=1.0)
     found = at_one_model(
-        bench, there, [variant.with_shape(x0=0.016).at(there.nominal.finger, {"a": start})], white(bench)
+        baseline, there, [variant.with_shape(x0=0.016).at(there.nominal.finger, {"a": start})], white(baseline)
     )
     assert float(found.effects[0].a) == pytest.approx(min(share, 1.0), abs=0.1 if share < 1.0 else 0.0)
 
@@ -107,9 +107,11 @@ def test_a_share_is_at_most_one_and_leaves_that_bound_where_it_is_less(problem, 
 @pytest.mark.parametrize("start", [(1.0, 0.014), (0.3, 0.04)])
 def test_a_length_is_found_while_the_share_stays_at_its_most(problem, start):
     """Which trials tell of a friction and its length is nearly their product: from any start the same optimum."""
-    there, bench, variant = planted(problem, a=1.0, x0=0.02, delta=0.5)
+    there, baseline, variant = planted(problem, a=1.0, x0=0.02, delta=0.5)
     a, x0 = start
-    found = at_one_model(bench, there, [variant.with_shape(x0=x0).at(there.nominal.finger, {"a": a})], white(bench))
+    found = at_one_model(
+        baseline, there, [variant.with_shape(x0=x0).at(there.nominal.finger, {"a": a})], white(baseline)
+    )
     assert float(found.effects[0].x0) == pytest.approx(0.02, abs=0.003)
     assert found.effects[0].delta == 0.5
 
@@ -118,19 +120,19 @@ def test_an_amplitude_that_changes_nothing_keeps_a_size(session):
     """The warmth of a Coulomb friction that the model has none of, beside the damping that is warm as well."""
     terms = tuple(t for t in ModelRecipe().terms if t != "joint_coulomb")
     problem = build(session, Recipe(model=ModelRecipe(terms=terms)))
-    bench = Bench.of(problem, Parameters())
+    baseline = Baseline.of(problem, Parameters())
     kind, site = CATALOGUE["joint_friction_warmup"], problem.nominal.finger.joint_names[:1]
     effect = kind.at(problem.nominal.finger, site, a=0.3, d=1e-4, T=100.0, by=0.0)
     beside = CATALOGUE["joint_torque_friction"].at(problem.nominal.finger, site, mu=0.1)
-    found = at_one_model(bench, problem, [beside, effect], white(bench))
+    found = at_one_model(baseline, problem, [beside, effect], white(baseline))
     assert np.isfinite(found.score)
     assert abs(float(found.effects[1].a)) <= 0.3
 
 
 def led(scaled):
-    bench = Bench.of(scaled, Parameters())
+    baseline = Baseline.of(scaled, Parameters())
     variant = Variant(CATALOGUE["torque_sensor_scale"], ("torque_sensor",), (), scales=scaled.scales)
-    return bench, led_plainly(bench, fitted(bench, scaled, [variant], [{"gain": 0.05}], white(bench)))
+    return baseline, led_plainly(baseline, fitted(baseline, scaled, [variant], [{"gain": 0.05}], white(baseline)))
 
 
 @pytest.mark.long
@@ -138,14 +140,14 @@ def test_a_large_effect_is_judged_where_it_leads(scaled):
     """A sensor's gain multiplies the torques refitted with it: the formula finds nothing better where an exact fit
     leads.
     """
-    bench, state = led(scaled)
+    baseline, state = led(scaled)
     exact = augmented_fit(scaled, state)
     (effect,) = exact.fit.model.effects
     nominal = np.asarray(ravel(exact.fit.model))[scaled.free] - np.asarray(ravel(scaled.nominal))[scaled.free]
-    there = at_one_model(bench, moved(scaled, nominal), [effect], white(bench))
+    there = at_one_model(baseline, moved(scaled, nominal), [effect], white(baseline))
     assert float(state.effects[0].gain) == pytest.approx(GAIN, abs=0.005)
     assert float(effect.gain) == pytest.approx(GAIN, abs=0.005)
-    assert state.score - bench.null.score > 0.95 * (there.score - bench.null.score) > 100.0
+    assert state.score - baseline.null.score > 0.95 * (there.score - baseline.null.score) > 100.0
 
 
 @pytest.mark.xfail(

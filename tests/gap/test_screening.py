@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxfinger.effects import CATALOGUE, Scales, amplitude, shape
 from jaxfinger.gap import diagnose
-from jaxfinger.gap.exact import Bench
+from jaxfinger.gap.exact import Baseline
 from jaxfinger.gap.formula import Parameters
 from jaxfinger.gap.result import Key
 from jaxfinger.gap.screening import MOST, Scan, read_parts
@@ -62,7 +62,7 @@ def test_the_scan_leaves_as_little_as_the_best_of_all_sets_of_periods(effect, se
 
 def test_a_long_session_is_scanned_down_to_a_longer_period(planted, monkeypatch):
     """A session over a day does not ask for memory in proportion, nor one of an instant for no period at all."""
-    monkeypatch.setattr(Signatures, "of", lambda self, members: np.zeros((len(members), 1)))
+    monkeypatch.setattr(Signatures, "white_changes", lambda self, members: np.zeros((len(members), 1)))
     problem, days = planted, {}
     for length in (0.0, 100.0, 86400.0):
         for e, stack in problem.stacks.items():
@@ -92,9 +92,9 @@ def test_a_wandering_sensor_is_named_with_its_period():
 
 def test_what_the_nominal_parameters_imitate_could_hide_without_end(planted):
     """A constant torque beside an elastic torque whose constant is free: more of it than any machine has."""
-    bench = Bench.of(planted, Parameters())
+    baseline = Baseline.of(planted, Parameters())
     items = variants({"joint_offset": CATALOGUE["joint_offset"]}, planted.nominal.finger, planted.scales)
-    table = table_of(planted, bench, read_parts(planted, items, bench.columns))
+    table = table_of(planted, baseline, read_parts(planted, items, baseline.columns))
     assert table.offers == []
     assert {effect for effect, _ in table.absorbed} == {"joint_offset"}
     assert min(table.absorbed.values()) > 1.0 - 1e-9
