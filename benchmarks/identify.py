@@ -35,7 +35,7 @@ from jaxfinger.data import FingerDescription, Session, read_session, write_sessi
 from jaxfinger.experiments import prepare
 from jaxfinger.identify import identify
 from jaxfinger.identify.parameters import Free, describe
-from jaxfinger.identify.solve import SMALL, Source, Tangents, linearise_each, solve, stacked
+from jaxfinger.identify.solve import STEP_TOLERANCE, Source, Tangents, linearise_each, solve, stacked
 from jaxfinger.identify.stages import STAGES, sources_of
 from jaxfinger.identify.start import start_values
 from jaxfinger.model import Finger, Model, rigid_body
@@ -212,7 +212,7 @@ class Compressed:
         self.model, self.free, self.sources, self.limit = model, free, sources, limit
         self.at = Free.at(model, free)
         self.start, self.size = np.asarray(self.at.get(model)), len(describe(model))
-        self.quadratic = not limit and all(s.linear(model, free) for s in sources.values())
+        self.quadratic = not limit and all(s.is_affine(model, free) for s in sources.values())
         self.forget()
 
     def forget(self) -> None:
@@ -285,13 +285,13 @@ def stages(path: Path) -> None:
 def one_stage(name: str, problem: Compressed, sources: dict[str, Source]) -> None:
     """Ours beside the quickest of SciPy's ways."""
 
-    def ours(read: dict[str, Source], small: float = SMALL):
-        model, solution = solve(problem.model, problem.free, read, huber=problem.limit, small=small)
+    def ours(read: dict[str, Source], small: float = STEP_TOLERANCE):
+        model, solution = solve(problem.model, problem.free, read, huber=problem.limit, tolerance=small)
         return np.asarray(problem.at.get(model)), solution.linearisations
 
     found, points = ours(problem.sources)
-    optimum, _ = ours(problem.sources, 1e-3 * SMALL)
-    options = rivals(problem, optimum, max(SMALL, problem.apart(found, optimum)))
+    optimum, _ = ours(problem.sources, 1e-3 * STEP_TOLERANCE)
+    options = rivals(problem, optimum, max(STEP_TOLERANCE, problem.apart(found, optimum)))
     works = [partial(by_scipy, problem, **o) for o in options]
     mine, passing, *theirs = processor(lambda: ours(problem.sources), lambda: ours(sources), *works)
     best = int(np.argmin([np.median(t) for t in theirs]))

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxfinger.identify import identify, refine
 from jaxfinger.identify.parameters import describe, ravel
-from jaxfinger.identify.posterior import posterior
+from jaxfinger.identify.posterior import sampled_posterior
 from jaxfinger.synthetic import SHORT, clean_session, measure, recipe_from
 
 RECIPE = {"specimen": {"kind": "polynomial"}, "trials": SHORT}
@@ -27,7 +27,7 @@ def main() -> None:
     session = measure(clean_session(recipe_from(RECIPE)), 0)
     fit = refine(session, identify(session))
     start = time.perf_counter()
-    found = posterior(session, fit, options.draws, options.warmup)
+    found = sampled_posterior(session, fit, options.draws, options.warmup)
     seconds = time.perf_counter() - start
     seen = np.flatnonzero(np.isfinite(fit.std) & (fit.std > 0))
     ratio = np.sqrt(np.diag(found.samples.covariance))[seen] / fit.std[seen]

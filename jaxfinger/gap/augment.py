@@ -18,11 +18,11 @@ from jaxfinger.gap.problem import Problem, assemble, moved
 from jaxfinger.gap.result import Value
 from jaxfinger.gap.signatures import Signatures
 from jaxfinger.identify import Fit
-from jaxfinger.identify.cluster_robust import growth, pulls
+from jaxfinger.identify.cluster_robust import growth, stretch_scores
 from jaxfinger.identify.fit import StageReport
 from jaxfinger.identify.parameters import describe, ravel, units_at
 from jaxfinger.identify.prior import Prior
-from jaxfinger.identify.solve import Solution, Source, linearise_each, missed_each, solve
+from jaxfinger.identify.solve import Solution, Source, linearise_each, residuals_each, solve
 from jaxfinger.model import Model
 
 WITH_EFFECTS = "with the effects of the diagnosis"
@@ -88,7 +88,7 @@ def as_refitted(problem: Problem, chosen: SearchState) -> Fitted:
 
 def missed_by(sources: dict[str, Source], model: Model) -> Missed:
     """Of a model, by the programs of fits."""
-    return {(e, c): x for e, channels in missed_each(model, sources).items() for c, x in channels.items()}
+    return {(e, c): x for e, channels in residuals_each(model, sources).items() for c, x in channels.items()}
 
 
 def _missed_apart(problem: Problem, model: Model) -> Missed:
@@ -190,7 +190,7 @@ def _covariance(
     diagonal = np.diag(information)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-13, hermitian=True) * np.outer(scale, scale)
-    grow = growth(inverse, pulls(r, J, problem.block_of_row), root)
+    grow = growth(inverse, stretch_scores(r, J, problem.block_of_row), root)
     return inverse * np.outer(grow, grow)
 
 

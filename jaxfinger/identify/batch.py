@@ -22,16 +22,16 @@ from jaxfinger.data import Session
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch, prepare
 from jaxfinger.identify.fit import Fit
-from jaxfinger.identify.gauss_newton import TANGENTS, VisibleGaussNewton
+from jaxfinger.identify.gauss_newton import TANGENTS_AT_ONCE, VisibleGaussNewton
 from jaxfinger.identify.linearise import Filters, huber, white_rows
 from jaxfinger.identify.parameters import Free, describe, ravel, with_flat
 from jaxfinger.identify.resample import Batching, Compressed, batching_here, compress, plan_of, staged_step
-from jaxfinger.identify.solve import KINK, SMALL, STEPS, within
+from jaxfinger.identify.solve import KINK_TOLERANCE, MAX_STEPS, STEP_TOLERANCE, parameter_bounds
 from jaxfinger.identify.stages import cad_prior, nominal_model, sources_of
 from jaxfinger.model import Model
 
 AT_ONCE = 10  # sessions in one call: while the device fits them, the next are read and filtered
-SOLVER = VisibleGaussNewton(atol=SMALL, kink=KINK)
+SOLVER = VisibleGaussNewton(atol=STEP_TOLERANCE, kink=KINK_TOLERANCE)
 
 
 @dataclass(frozen=True, repr=False)
@@ -159,12 +159,12 @@ def _stack_sessions(
     for of_stage, free in plan:
         mine = [e for e in names if e in of_stage]
         priors = [cad_prior(s, template.recipe, parameters, free) for s in sessions]
-        ends = [within(with_flat(template.model, start), free) for start in starts]
+        ends = [parameter_bounds(with_flat(template.model, start), free) for start in starts]
         low, high = (jnp.asarray(np.stack(side)) for side in zip(*ends, strict=True))
         stages.append(
             _Stage(
                 tuple(names.index(e) for e in mine),
-                tuple(single[e].linear(template.model, free) for e in mine),
+                tuple(single[e].is_affine(template.model, free) for e in mine),
                 jnp.asarray(free),
                 jnp.asarray(np.stack([p.mean for p in priors])),
                 jnp.asarray(priors[0].root),
@@ -230,14 +230,14 @@ def _fit_stage(model: Model, flat: Float[Array, " P"], sources: list[_Source], s
     along = []  # r and J of the rest
     if affine:
         r, push = jax.linearize(lambda y: jnp.concatenate(white(y, affine)), start)
-        along = [(r, jax.lax.map(push, jnp.eye(start.size), batch_size=TANGENTS).T)]
+        along = [(r, jax.lax.map(push, jnp.eye(start.size), batch_size=TANGENTS_AT_ONCE).T)]
 
     def rows(y, _):
         moved = [r + J @ (y - start) for r, J in along]
         return huber(jnp.concatenate([*moved, *white(y, curved)]), limit), stage.root @ (y - stage.mean)
 
     options = {"lower": stage.low, "upper": stage.high}
-    return optx.least_squares(rows, SOLVER, start, None, options, max_steps=STEPS, throw=False)
+    return optx.least_squares(rows, SOLVER, start, None, options, max_steps=MAX_STEPS, throw=False)
 
 
 def _covariance(
@@ -263,5 +263,5 @@ def _gram(model: Model, flat: Float[Array, " P"], source: _Source, limit) -> Flo
         return source.rows(model, flat.at[source.columns].add(source.basis @ dz), limit)
 
     r, push = jax.linearize(rows, jnp.zeros(source.basis.shape[1]))
-    A = jnp.concatenate([jax.lax.map(push, jnp.eye(source.basis.shape[1]), batch_size=TANGENTS), r[None]])
+    A = jnp.concatenate([jax.lax.map(push, jnp.eye(source.basis.shape[1]), batch_size=TANGENTS_AT_ONCE), r[None]])
     return A @ A.T

@@ -1,4 +1,4 @@
-"""Which combinations of parameters the trials cannot see, in words; what would show them; the rigid body's base."""
+"""Identifiability: combinations of parameters that the trials do not determine, remedies, and base parameters."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,12 @@ from jaxtyping import Float, Int
 from jaxfinger.identify.parameters import Parameter
 from jaxfinger.model import Finger, rigid_body
 
-WEAK = 1e-3  # relative singular value below which a combination is seen, but badly
+# Relative singular values. Below the first a combination is weak: its interval is more than 1000 times as wide as that
+# of the best. Below the second it is invisible: JᵀJ holds the squares, which are then zero to rounding.
+WEAK, INVISIBLE = 1e-3, 1e-7
 
-# What each group of parameters needs, as an experiment of the format.
-SHOWN_BY = {
+# Experiment of the format that determines each group of parameters.
+REMEDIES = {
     "moment_arm": "ID.2 of joint {joint} with tendon {tendon} taut",
     "elastic": "ID.3-static of joint {joint}",
     "friction": "ID.3-static of joint {joint}, every hold approached from both sides",
@@ -29,16 +31,16 @@ SHOWN_BY = {
 
 @dataclass(frozen=True)
 class Direction:
-    """One singular direction of the whitened Jacobian, its columns scaled to unit length."""
+    """One right singular vector of the white Jacobian, whose columns are scaled to unit length."""
 
     singular_value: float  # relative to the largest
-    shares: dict[str, float]  # of the parameters that make it up, largest first
-    remedy: str  # experiments that would show it; empty where it is seen well
+    shares: dict[str, float]  # entry of each parameter whose magnitude exceeds 0.05, largest first
+    remedy: str  # experiments that would determine it; empty where the status is `seen`
 
     @property
     def status(self) -> str:
         """`seen`, `weak` or `invisible`."""
-        return "invisible" if self.singular_value < 1e-7 else "weak" if self.singular_value < WEAK else "seen"
+        return "invisible" if self.singular_value < INVISIBLE else "weak" if self.singular_value < WEAK else "seen"
 
     def __str__(self) -> str:
         names = " ".join(f"{c:+.2f}·[{name}]" for name, c in self.shares.items())
@@ -48,9 +50,9 @@ class Direction:
 def directions(
     parameters: list[Parameter], free: Int[np.ndarray, " p"], information: Float[np.ndarray, "P P"]
 ) -> list[Direction]:
-    """Singular directions of the Jacobian J of the free parameters, weakest first, from JᵀJ over the flat vector.
+    """Singular vectors of the Jacobian J of the free parameters, weakest first.
 
-    Singular values below 1e-7 of the largest are zero to rounding: JᵀJ holds their squares.
+    `information` is JᵀJ over the flat vector.
     """
     N = information[np.ix_(free, free)]
     norm = np.sqrt(np.diag(N))
@@ -67,7 +69,7 @@ def directions(
 def name_invisible(
     parameters: list[Parameter], free: Int[np.ndarray, " p"], invisible: Float[np.ndarray, "k p"]
 ) -> list[str]:
-    """One sentence a combination: its parameters with their shares, largest first, and what would show it."""
+    """One sentence for each undetermined combination: its parameters and their shares, largest first, and a remedy."""
     sentences = []
     for v in invisible:
         names = " ".join(f"{c:+.2f}·[{name}]" for name, c in _shares(parameters, free, v).items())
@@ -83,12 +85,12 @@ def _shares(parameters, free, v) -> dict[str, float]:
 
 
 def _remedy(parameters, free, v) -> str:
-    """The experiment of the group that weighs most in the combination, for its joints and tendons."""
+    """Experiments that determine the parameters with the largest entries in the combination."""
     involved = [parameters[free[k]] for k in np.argsort(-np.abs(v)) if abs(v[k]) > 0.3]
     wanted = [
-        SHOWN_BY[p.group].format(joint=p.joint or "by joint, two of them moved together", tendon=p.tendon)
+        REMEDIES[p.group].format(joint=p.joint or "by joint, two of them moved together", tendon=p.tendon)
         for p in involved
-        if p.group in SHOWN_BY
+        if p.group in REMEDIES
     ]
     whole = [text for text in dict.fromkeys(wanted) if not any(other.startswith(f"{text},") for other in wanted)]
     return " and ".join(whole) or "a trial that moves what it acts on"
@@ -96,9 +98,9 @@ def _remedy(parameters, free, v) -> str:
 
 @dataclass(frozen=True)
 class BaseParameters:
-    """The combinations of the links' inertial parameters that torques can ever show."""
+    """Base parameters: the combinations of the links' inertial parameters that joint torques determine."""
 
-    names: tuple[str, ...]  # ten a link: m, m c (3), I about the joint (6)
+    names: tuple[str, ...]  # ten for each link: m, m c (3), I about the joint (6)
     singular_values: Float[np.ndarray, " k"]  # of the regressor with columns of unit length, largest first
     combinations: Float[np.ndarray, "rank k"]  # orthonormal rows, in units of each column
 
@@ -111,17 +113,19 @@ class BaseParameters:
 def base_parameters(
     finger: Finger, instrumented: list[int] | None = None, samples: int = 200, seed: int = 0
 ) -> BaseParameters:
-    """Base parameters of the chain from random motions (Gautier 1991): what no motion can tell apart is joined.
+    """Base parameters of the chain, from the singular values of its regressor on random motions (Gautier 1991).
 
-    `instrumented`: joints whose torque is measured (default all). The torque is linear in m, m c and the inertia about
-    the joint, π; the regressor's columns are the torques of one unit of each.
+    The torque is linear in the parameters π: m, m c and the inertia about the joint of each link. A column of the
+    regressor is the torque of one unit of one of them.
+
+    `instrumented`: indices of the joints whose torque is measured (default all).
     """
     rng = np.random.default_rng(seed)
     q, qd, qdd = rng.uniform(-1.5, 1.5, (3, finger.m, samples))
     rows = slice(None) if instrumented is None else instrumented
 
     def column(i: int, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-        """Torques of the chain with 1 kg on link i and nothing else."""
+        """Torques of the chain where link i has a mass of 1 kg and all other links none."""
         values = [np.zeros_like(v) for v in (finger.mass, finger.com, finger.gyration)]
         for array, value in zip(values, (1.0, com, inertia), strict=True):
             array[i] = value
@@ -131,7 +135,7 @@ def base_parameters(
     names, columns, axes, none = [], [], np.eye(3), np.zeros((3, 3))
     for i, joint in enumerate(finger.joint_names):
         mass = column(i, np.zeros(3), none)
-        # A mass at a unit distance, its inertia about the joint taken away, less one at the joint: m c alone.
+        # A mass at unit distance whose inertia about the joint is cancelled, less a mass at the joint, leaves m c.
         first = [column(i, e, np.outer(e, e) - np.eye(3)) - mass for e in axes]
         pairs = [(a, b) for a in range(3) for b in range(a, 3)]
         second = [column(i, np.zeros(3), _symmetric(a, b)) - mass for a, b in pairs]

@@ -24,7 +24,7 @@ from jaxfinger.identify.predictions import model_for
 from jaxfinger.identify.prior import Prior, prior_of
 from jaxfinger.identify.propagate import propagate
 from jaxfinger.identify.shooting import AHEAD, Shooting, shooting
-from jaxfinger.identify.solve import Source, solve, within
+from jaxfinger.identify.solve import Source, parameter_bounds, solve
 from jaxfinger.identify.stages import (
     Progress,
     cad_covariance,
@@ -96,7 +96,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
             ]
 
     covariance = propagate(fit.covariance, solution, sources, free, prior, huber)
-    warnings += implausible(model, covariance, free, within(start, free)[0])
+    warnings += implausible(model, covariance, free, parameter_bounds(start, free)[0])
     refined = replace(
         fit,
         model=model,
@@ -127,7 +127,7 @@ def _on_motion(fit: Fit, shots: Shooting, sources: dict[str, Source], prior: Pri
     moved, corrected = (np.asarray(ravel(model)) - np.asarray(ravel(m)) for m in (fit.model, first))
     covariance += _contradiction(moved, fit.std**2, np.diag(covariance)) + np.outer(corrected, corrected)
     warnings = name_invisible(parameters, free, solution.invisible)
-    warnings += implausible(model, covariance, free, within(fit.model, free)[0])
+    warnings += implausible(model, covariance, free, parameter_bounds(fit.model, free)[0])
     refined = replace(fit, model=model, covariance=covariance)
     report = report_of(
         AHEAD, solution, free, shots.stack.trials, warnings, _gain(fit, refined, "those of the joint refinement")

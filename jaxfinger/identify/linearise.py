@@ -1,14 +1,14 @@
-"""Equation (1) linearised at a model, trial by trial, and compressed: the common ground of every fit.
+"""Equation (1) linearised at a model and compressed, trial by trial.
 
 With J the Jacobian of a trial's white residuals r, one QR factorisation [J r] = Q [R d; 0 ρ] keeps all that least
 squares needs: ‖r + J δ‖² = ‖d + R δ‖² + ρ². A stage, the joint refinement, a bootstrap resample and a leave-one-out
-refit are sums over these small factors; their cost no longer depends on the number of samples.
+refit are sums over these small factors, at a cost that does not depend on the number of samples.
 
-Outliers: with Huber's cost ρ(r) = r²/2 for |r| ≤ k and k|r| − k²/2 beyond (Huber 1964), least squares reads
+Outliers: Huber's cost is ρ(r) = r²/2 for |r| ≤ k, and k|r| − k²/2 beyond (Huber 1964). Least squares of
 
     s(r) = sign(r) √(2 ρ(r)),   ∂s/∂r = ψ(r)/s(r),
 
-whose sum of squares is that cost, and whose gradient Σ J ψ(r) is that of the M-estimate.
+minimises that cost: the sum of squares of s is 2 Σ ρ(r), and its gradient is 2 Σ J ψ(r), with ψ = ρ′.
 """
 
 from collections.abc import Iterable
@@ -31,28 +31,28 @@ from jaxfinger.model import Model
 
 Tree = TypeVar("Tree")
 Filters = dict[str, Float[Array, "_columns lags lags"]]  # `Noise.coefficients` of every channel
-PANEL = 32  # columns of a panel of ?geqrt, as LAPACK has it for ?geqrf
+PANEL = 32  # columns of a panel of ?geqrt: LAPACK's own choice for ?geqrf
 (_geqrt,) = get_lapack_funcs(("geqrt",), dtype=np.float64)
 
 
 class Tangent(NamedTuple):
-    """One experiment's residuals at a model, and how they change with its parameters: in each channel's own unit."""
+    """Residuals of one experiment at a model and their derivatives by p free parameters, in each channel's unit."""
 
     residuals: dict[str, Float[np.ndarray, "_columns B T"]]  # measured − predicted
     slopes: dict[str, Float[np.ndarray, "p _columns B T"]]
 
     def moved(self, by: Float[np.ndarray, " p"]) -> "Tangent":
-        """On along the tangent: exact where the residuals are affine in what moves."""
+        """Tangent after a step `by` of the parameters, exact where the residuals are affine in those that move."""
         return Tangent({c: r + np.tensordot(by, self.slopes[c], 1) for c, r in self.residuals.items()}, self.slopes)
 
 
 class Linearised(NamedTuple):
-    """One experiment's residuals and compressed Jacobian at a model."""
+    """Residuals of one experiment at a model, and its compressed Jacobian by p free parameters."""
 
     residuals: dict[str, Float[np.ndarray, "_columns B T"]]  # measured − predicted, by channel, in the channel's unit
-    white: Float[np.ndarray, "B rows"]  # the same, whitened and flat, before Huber
-    jacobian: Float[np.ndarray, "B rows p"]  # J, likewise
-    factor: Float[np.ndarray, "B k p+1"]  # triangular, of [J r] as Huber's cost sees them
+    white: Float[np.ndarray, "B rows"]  # the same, white and flat, before Huber's cost
+    jacobian: Float[np.ndarray, "B rows p"]  # J of the white residuals, before Huber's cost
+    factor: Float[np.ndarray, "B k p+1"]  # triangular factor of [J r] under Huber's cost
 
     def moved(
         self,
@@ -61,10 +61,10 @@ class Linearised(NamedTuple):
         limit: float,
         weights: Float[np.ndarray, " B"] | None,
     ) -> "Linearised":
-        """The same at parameters further on by δ, where the model is linear and the residuals are those given.
+        """Linearisation after a step `by` of the parameters, where the residuals are affine in them.
 
-        White rows change by J δ, and factors by R δ unless Huber's cost weighs rows anew. `limit` and `weights` must be
-        those that it was made with.
+        `residuals` are those at the new parameters. White rows change by J δ. The last column of the factors changes by
+        R δ, unless Huber's cost gives the rows other weights. `limit` and `weights` must be those of this object.
         """
         white = self.white + self.jacobian @ by
         if limit:
@@ -75,13 +75,13 @@ class Linearised(NamedTuple):
 
 
 def white_rows(model: Model, batch: Batch, filters: Filters) -> tuple[dict, Float[Array, "B rows"]]:
-    """Residuals by channel, and the same white, one row a trial: unit variance where model and noise are right."""
+    """Residuals by channel, and the same whitened, one row a trial: unit variance where model and noise are right."""
     residuals = _residuals(model, batch, tuple(filters))
     return residuals, white_of(residuals, batch, filters)
 
 
 def white_of(residuals: dict, batch: Batch, filters: Filters):
-    """Residuals by channel, (…, columns, B, T), white: (…, B, rows); nothing finite where they are not."""
+    """Whiten residuals by channel, (…, columns, B, T), into rows (…, B, rows); entries that are not finite stay so."""
     with np.errstate(invalid="ignore"):
         return _flat({c: _white(residuals[c], batch, filters, c) for c in filters})
 
@@ -98,8 +98,9 @@ def _white(r, batch: Batch, filters: Filters, channel: str):
 def _white_jacobian(
     slopes: dict[str, Float[np.ndarray, "p columns B T"]], batch: Batch, filters: Filters
 ) -> Float[np.ndarray, "B rows p"]:
-    """White derivatives in the order of `white_rows`; those of a column by parameters that it does not depend on are
-    zero as they are, which most are.
+    """Whiten derivatives, in the order of `white_rows`.
+
+    A column does not depend on most parameters. Those derivatives are zero, and are not filtered.
     """
     p, _, B, T = next(iter(slopes.values())).shape
     out, row = np.zeros((B, sum(slopes[c].shape[1] for c in filters), T, p)), 0
@@ -115,7 +116,7 @@ def _white_jacobian(
 
 
 def _flat(white: dict):
-    """(…, columns, B, T) of every channel as (…, B, rows)."""
+    """Flatten channels of (…, columns, B, T) into rows (…, B, rows)."""
     values = list(white.values())
     xp = values[0].__array_namespace__()
     wide = xp.moveaxis(xp.concat(values, axis=-3), -2, -3)
@@ -123,7 +124,7 @@ def _flat(white: dict):
 
 
 def huber(r: Float[Array, "*N"], limit: float | Float[Array, ""]) -> Float[Array, "*N"]:
-    """s(r), which least squares makes Huber's cost of; a limit of 0 is none."""
+    """s(r) of the module's docstring, whose squares are Huber's cost; a `limit` of 0 leaves r as it is."""
     a = jnp.abs(r)
     beyond = (limit > 0.0) & (a > limit)
     root = jnp.sqrt(jnp.where(beyond, limit * (2.0 * a - limit), 1.0))
@@ -131,20 +132,20 @@ def huber(r: Float[Array, "*N"], limit: float | Float[Array, ""]) -> Float[Array
 
 
 def robust_share(r: Float[np.ndarray, "*N"], limit: float) -> Float[np.ndarray, "*N"]:
-    """∂s/∂r on the host: the share of a row that Huber's cost lets through."""
+    """∂s/∂r: factor of the Jacobian's rows under Huber's cost, computed by NumPy; 1 where `limit` is 0."""
     a = np.maximum(np.abs(r), limit)
     return limit / np.sqrt(limit * (2.0 * a - limit)) if limit else np.ones_like(a)
 
 
 def residuals_of(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[str, Float[np.ndarray, "_columns B T"]]:
-    """Measured − predicted of every trial; also where a sample does not count."""
+    """Measured − predicted of every trial, in the channels' units, also at samples whose mask is 0."""
     return _cut((_residuals_jit(model, block, channels) for block in blocks(batch)), batch)
 
 
 def tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> Tangent:
     """Residuals and their derivatives by the parameters in `free`.
 
-    Compiled for a block of trials (`blocks`), whose additions are cut off again.
+    The program is compiled for a block of trials (`blocks`); the block's padding is removed from the result.
     """
     if batch.x.simulated:
         return Tangent(*jax.tree.map(np.asarray, _simulated_tangent(model, free, batch, channels)))
@@ -153,8 +154,8 @@ def tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -
     )
 
 
-def missed(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """`residuals_of`, by the program of `tangent`: where that is compiled, it costs no compilation."""
+def residuals_by_tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Residuals as of `residuals_of`, computed by the program of `tangent`, so that none is compiled for them alone."""
     if batch.x.simulated:
         return residuals_of(model, batch, channels)
     return _cut((_tangent(model, free, block, channels, jax.device_put(False))[0] for block in blocks(batch)), batch)
@@ -172,8 +173,9 @@ def whitened(
     limit: float = 0.0,
     weights: Float[np.ndarray, " B"] | None = None,
 ) -> Linearised:
-    """White rows of a tangent and their factors; residuals beyond the `limit` count as Huber has it, 0 for none, and
-    every trial with its weight, 1 by default.
+    """Whiten and compress a tangent.
+
+    `limit`: Huber's, in standard deviations, 0 for none. `weights`: of the trials, 1 by default.
     """
     white = white_of(along.residuals, batch, filters)
     J = _white_jacobian(along.slopes, batch, filters)
@@ -186,7 +188,7 @@ def factored(
     limit: float,
     weights: Float[np.ndarray, " B"] | None = None,
 ) -> Float[np.ndarray, "B p+1 p+1"]:
-    """Triangular factors of every trial, from the rows that count and the columns that it depends on."""
+    """Triangular factor of [J r] of every trial under Huber's cost, from its rows and columns that are not all zero."""
     B, _, p = J.shape
     share = robust_share(white, limit)
     s = np.sign(white) * np.sqrt(np.maximum(limit * (2.0 * np.abs(white) - limit), 0.0)) if limit else white
@@ -205,14 +207,17 @@ def factored(
 
 
 def triangular(A: Float[np.ndarray, "N p"]) -> Float[np.ndarray, "k p"]:
-    """R of A = Q R. LAPACK's ?geqrt, whose panels are recursive, takes a third of ?geqrf's time on tall matrices."""
+    """R of A = Q R, k = min(N, p).
+
+    LAPACK's ?geqrt factors its panels recursively, and takes a third of ?geqrf's time on tall matrices.
+    """
     if not A.size:
         return np.zeros((0, A.shape[1]))
     return np.triu(_geqrt(min(PANEL, *A.shape), A)[0][: A.shape[1]])
 
 
 def _cut(parts: Iterable[Tree], batch: Batch) -> Tree:
-    """Blocks of (…, B, T) put together again, each let go before the next one is made."""
+    """Join blocks into arrays (…, B, T) without their padding; a block is released before the next one is computed."""
     (B, T), out, first = batch.x.time.shape, None, 0
     for part in parts:
         if out is None:
@@ -224,7 +229,7 @@ def _cut(parts: Iterable[Tree], batch: Batch) -> Tree:
 
 
 def _put(first: int, out: Float[np.ndarray, "*k B T"], block: Float[Array, "*k b t"]) -> None:
-    """Those samples of a block that are no padding, from trial number `first` on."""
+    """Copy a block without its padding into `out`, from trial number `first` on."""
     out[..., first : first + block.shape[-2], :] = np.asarray(block)[..., : out.shape[-2] - first, : out.shape[-1]]
 
 
@@ -233,23 +238,24 @@ _residuals_jit = quick_jit(_residuals)
 
 @quick_jit
 def _simulated_tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> tuple[dict, dict]:
-    """Residuals of simulations and their derivatives, start by start and backwards: a start predicts a few angles,
-    which depend on many parameters.
+    """Residuals of simulations and their derivatives, one start at a time, in reverse mode.
+
+    Reverse mode is cheaper here: a start predicts m angles, which depend on many more parameters.
     """
     values, split = ravel_pytree(free.values(model))
 
     def one(values, start: Batch):
-        missed = _residuals(free.put(model, split(values)), start, channels)
-        return missed, missed
+        residuals = _residuals(free.put(model, split(values)), start, channels)
+        return residuals, residuals
 
     each = jax.vmap(jax.jacrev(one, has_aux=True), in_axes=(None, -1), out_axes=-1)  # start of a trial
-    slopes, missed = jax.vmap(each, in_axes=(None, -2), out_axes=-2)(values, batch)
-    return missed, {c: jnp.moveaxis(J, 1, 0) for c, J in slopes.items()}
+    slopes, residuals = jax.vmap(each, in_axes=(None, -2), out_axes=-2)(values, batch)
+    return residuals, {c: jnp.moveaxis(J, 1, 0) for c, J in slopes.items()}
 
 
 @quick_jit
 def _tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...], slopes: Array):
-    """Residuals and their derivatives: zero unless `slopes`."""
+    """Residuals and their derivatives, which are zero and not computed where `slopes` is false."""
 
     def f(values):
         return _residuals(free.put(model, values), batch, channels)
@@ -259,8 +265,10 @@ def _tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...], 
     still = jax.tree.map(jnp.zeros_like, values)
 
     def columns(part: str) -> dict[str, Array]:
-        """Derivatives by the parameters of one part of the model. The derivative of a linear function is itself, but
-        for what the zeros of the other parts pass through: most of it.
+        """Derivatives by the parameters of one part of the model.
+
+        The pushforward is linear, so that its derivative at zero is itself. Taking the derivative lets JAX drop the
+        operations that only the other parts' zeros pass through, which are most of them.
         """
         mine = [k for k, p in enumerate(free.parts) if p == part]
         zero, split = ravel_pytree([still[k] for k in mine])

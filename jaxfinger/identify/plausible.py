@@ -1,4 +1,4 @@
-"""What no machine can be, said: a joint that drives itself, a mass of nothing, a tendon that gains tension."""
+"""Warnings of implausible estimates: negative damping, inertia or friction, mass on its bound, loss above 100 %."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -6,9 +6,9 @@ from jaxtyping import Float, Int
 from jaxfinger.identify.parameters import Parameter, describe, ravel
 from jaxfinger.model import Model
 
-SURE = 1.96  # standard deviations, a 95 % interval: within it a number of the wrong sign may be nothing
-# By group: what it means where it is negative.
-NEGATIVE = {
+Z95 = 1.96  # standard deviations to either side of a 95 % interval; a wrong sign within it may be chance
+# What a negative value of a parameter would mean, by group.
+MEANING_IF_NEGATIVE = {
     "damping": "would drive the joint instead of damping it",
     "rotor_inertia": "is no inertia",
     "torque_friction": "would add to the drive's torque instead of taking a share of it",
@@ -19,33 +19,33 @@ NEGATIVE = {
 def implausible(
     model: Model, covariance: Float[np.ndarray, "P P"], free: Int[np.ndarray, " p"], lightest: Float[np.ndarray, " p"]
 ) -> list[str]:
-    """One sentence for each free parameter or law that no machine can have, beyond its 95 % interval.
+    """One sentence for each free parameter or law whose 95 % interval lies wholly beyond what a machine can have.
 
-    `lightest`: the least that each free parameter may be; at that floor the trials want less.
+    `lightest`: lower bound of each free parameter. A mass on its bound is reported, since the trials ask for less.
     """
     parameters, values = describe(model), [float(v) for v in np.asarray(ravel(model))]
     std = [float(s) for s in np.sqrt(np.maximum(np.diag(covariance), 0.0))]
     out = []
     for i, floor in zip(free, lightest, strict=True):
         p = parameters[i]
-        if p.group in NEGATIVE and values[i] + SURE * std[i] < 0.0:
-            out.append(f"{_said(p, values[i], std[i])}: {NEGATIVE[p.group]}")
+        if p.group in MEANING_IF_NEGATIVE and values[i] + Z95 * std[i] < 0.0:
+            out.append(f"{_with_interval(p, values[i], std[i])}: {MEANING_IF_NEGATIVE[p.group]}")
         elif p.group == "mass" and values[i] <= 1.0001 * floor:
             out.append(
-                f"{_said(p, values[i], std[i])}: the trials would have it lighter still, down to nothing or below; "
-                "weigh the link, or look for what the model misses"
+                f"{_with_interval(p, values[i], std[i])}: the trials would have it lighter still, down to nothing or "
+                "below; weigh the link, or look for what the model misses"
             )
-    out += _friction(model, covariance, free, parameters)
-    return out + _losses(values, std, free, parameters)
+    out += _negative_friction(model, covariance, free, parameters)
+    return out + _excess_losses(values, std, free, parameters)
 
 
-def _said(p: Parameter, value: float, std: float) -> str:
-    known = f" ± {SURE * std:.2g}" if np.isfinite(std) else " ± ?"
+def _with_interval(p: Parameter, value: float, std: float) -> str:
+    known = f" ± {Z95 * std:.2g}" if np.isfinite(std) else " ± ?"
     return f"{p.name} is {value:.3g}{known} {p.units}"
 
 
-def _friction(model: Model, covariance, free, parameters) -> list[str]:
-    """Joints whose friction is below nothing somewhere in their range."""
+def _negative_friction(model: Model, covariance, free, parameters) -> list[str]:
+    """One sentence for each joint whose friction torque is negative somewhere in the joint's range."""
     out, finger = [], model.finger
     for i, joint in enumerate(finger.joint_names):
         at = [k for k in free if parameters[k].group == "friction" and parameters[k].joint == joint]
@@ -55,22 +55,22 @@ def _friction(model: Model, covariance, free, parameters) -> list[str]:
         q = np.linspace(low, high, 61)
         A = q[:, None] ** np.array([parameters[k].power for k in at])
         F, std = _with_std(A, np.asarray(ravel(model))[at], covariance[np.ix_(at, at)])
-        worst = int(np.argmin(F + SURE * std))
-        if F[worst] + SURE * std[worst] < 0.0:
+        worst = int(np.argmin(F + Z95 * std))
+        if F[worst] + Z95 * std[worst] < 0.0:
             unit, where = ("N", f"{q[worst]:.3g} m") if finger.prismatic[i] else ("N m", f"{np.degrees(q[worst]):.0f}°")
             out.append(
-                f"friction of joint {joint} is {F[worst]:.3g} ± {SURE * std[worst]:.2g} {unit} at {where}: it would "
+                f"friction of joint {joint} is {F[worst]:.3g} ± {Z95 * std[worst]:.2g} {unit} at {where}: it would "
                 "push the joint on; record trials there, or give the recipe a lower degree"
             )
     return out
 
 
-def _losses(values: list[float], std: list[float], free, parameters: list[Parameter]) -> list[str]:
-    """Tendons that lose more than all of a growing tension."""
+def _excess_losses(values: list[float], std: list[float], free, parameters: list[Parameter]) -> list[str]:
+    """One sentence for each tendon that loses more than an increase of its tension, a₁ > 1."""
     return [
-        f"{_said(parameters[k], values[k], std[k])}: the tendon would lose more than is pulled"
+        f"{_with_interval(parameters[k], values[k], std[k])}: the tendon would lose more than is pulled"
         for k in free
-        if parameters[k].term == "proportional" and values[k] - SURE * std[k] > 1.0
+        if parameters[k].term == "proportional" and values[k] - Z95 * std[k] > 1.0
     ]
 
 

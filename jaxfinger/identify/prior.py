@@ -1,4 +1,4 @@
-"""What is known before the trials are read: what CAD and scale say, or an earlier fit."""
+"""Prior knowledge of the parameters: from CAD and a scale, or from an earlier fit."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ class Prior(NamedTuple):
 
     @classmethod
     def none(cls, theta: Float[np.ndarray, " p"]) -> "Prior":
-        """Nothing is known."""
+        """Empty prior, with no rows."""
         return cls(theta, np.zeros((0, theta.size)))
 
     def cost(self, theta: Float[np.ndarray, " p"]) -> float:
@@ -26,7 +26,10 @@ class Prior(NamedTuple):
 def prior_of(
     values: Float[np.ndarray, " P"], covariance: Float[np.ndarray, "P P"], free: Int[np.ndarray, " p"]
 ) -> Prior:
-    """The whole covariance of an earlier fit of other recordings, where it is finite."""
+    """Prior on the free parameters from an earlier fit of other recordings, with its full covariance.
+
+    Parameters whose variance is zero or infinite get no row.
+    """
     variance = np.diag(covariance)[free]
     known = np.flatnonzero(np.isfinite(variance) & (variance > 0))
     std = np.sqrt(variance[known])

@@ -1,7 +1,7 @@
-"""From an optimum to intervals, stage after stage.
+"""Covariance of the parameters after each stage of a fit, with the errors of earlier stages propagated.
 
-With J_F the white Jacobian of a stage's own parameters, P the prior's precision, and J_O the Jacobian of the others,
-whose covariance is Σ_OO,
+With J_F the white Jacobian of a stage's free parameters, P the prior's precision, J_O the Jacobian of the other
+parameters, and Σ_OO their covariance,
 
     K = (J_Fᵀ J_F + P)⁻¹ J_Fᵀ J_O,   Σ_FF = (J_Fᵀ J_F + P)⁻¹ + K Σ_OO Kᵀ,   Σ_FO = −K Σ_OO.
 """
@@ -9,20 +9,27 @@ whose covariance is Σ_OO,
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxfinger.identify.cluster_robust import growth, pulls, stretches
+from jaxfinger.identify.cluster_robust import growth, stretch_scores, stretches
 from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.solve import Solution, Source
 
+# A parameter is undetermined where its entry in an undetermined combination exceeds this. Rounding changes entries by
+# about 1e-9 only (machine precision over the least relative singular value, 1e-7).
+MIN_SHARE = 1e-3
+
 
 def laplace(
-    information: Float[np.ndarray, "p p"], root: Float[np.ndarray, "k p"], pulled: Float[np.ndarray, "b p"]
+    information: Float[np.ndarray, "p p"], root: Float[np.ndarray, "k p"], scores: Float[np.ndarray, "b p"]
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-    """(JᵀJ + P)⁻¹ along what is seen, and by how much each standard deviation is larger than it says (`misfit`)."""
+    """Pseudo-inverse of JᵀJ + P, and the factor on each standard deviation (`cluster_robust.growth`).
+
+    `information` is JᵀJ, `root` a square root of P, `scores` those of the stretches.
+    """
     N = information + root.T @ root
     diagonal = np.diag(N)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     inverse = np.linalg.pinv(N * np.outer(scale, scale), rcond=1e-14, hermitian=True) * np.outer(scale, scale)
-    return inverse, growth(inverse, pulled, root)
+    return inverse, growth(inverse, scores, root)
 
 
 def propagate(
@@ -33,11 +40,13 @@ def propagate(
     prior: Prior | None,
     huber: float,
 ) -> Float[np.ndarray, "P P"]:
-    """Covariance of the flat vector after a stage (see the module's equation); infinite where nothing is seen.
+    """Covariance of the flat vector after a stage, by the module's equation.
 
-    Residuals larger than the noise say that the model misses something: intervals then widen with them (Birge's ratio,
-    as the Particle Data Group's scale factor S; Review of Particle Physics, §5.2.2), and by as much more as the
-    residuals pull a parameter to and fro from one stretch of the trials to the next (`misfit`).
+    The variance of a free parameter is infinite where trials and prior do not determine it, or where its estimate
+    depends on another parameter of infinite variance. Residuals larger than the noise show that the model is wrong.
+    Intervals then widen by Birge's ratio (the scale factor S of the Particle Data Group; Review of Particle Physics,
+    §5.2.2). They widen further where the scores of successive stretches vary more than that explains
+    (`cluster_robust`).
     """
     birge = max(1.0, solution.chi2_per_row(free.size))
     information = solution.information / birge
@@ -45,8 +54,8 @@ def propagate(
     others = np.setdiff1d(np.flatnonzero((variance > 0) & np.isfinite(variance)), free)
     unknown = np.setdiff1d(np.flatnonzero(np.isinf(variance)), free)
     root = np.zeros((0, free.size)) if prior is None else prior.root
-    pulled = _pulls(solution, sources, len(covariance), huber or np.inf)[:, free] / birge
-    inverse, grow = laplace(information[np.ix_(free, free)], root, pulled)
+    scores = _scores(solution, sources, len(covariance), huber or np.inf)[:, free] / birge
+    inverse, grow = laplace(information[np.ix_(free, free)], root, scores)
     out = covariance.copy()
     out[free, :] = out[:, free] = 0.0
     cross = inverse @ information[np.ix_(free, others)]
@@ -54,16 +63,16 @@ def propagate(
     out[np.ix_(free, free)] = inverse * np.outer(grow, grow) + cross @ inherited @ cross.T
     out[np.ix_(free, others)] = -cross @ inherited
     out[np.ix_(others, free)] = out[np.ix_(free, others)].T
-    blind = np.any(np.abs(solution.invisible) > 1e-3, axis=0)
-    # What leans on something unknown is no better known.
-    leans = inverse @ information[np.ix_(free, unknown)] * np.sqrt(np.diag(information)[unknown])
-    blind |= np.any(np.abs(leans) > 1e-3 * np.sqrt(np.diag(inverse))[:, None], axis=1)
-    out[free[blind], free[blind]] = np.inf
+    undetermined = np.any(np.abs(solution.invisible) > MIN_SHARE, axis=0)
+    # An estimate that depends on an undetermined parameter is undetermined, too.
+    dependence = inverse @ information[np.ix_(free, unknown)] * np.sqrt(np.diag(information)[unknown])
+    undetermined |= np.any(np.abs(dependence) > MIN_SHARE * np.sqrt(np.diag(inverse))[:, None], axis=1)
+    out[free[undetermined], free[undetermined]] = np.inf
     return out
 
 
-def _pulls(solution: Solution, sources: dict[str, Source], size: int, limit: float) -> Float[np.ndarray, "b P"]:
-    """Of every stretch of the trials on the flat vector (`misfit`); outliers pull with the limit."""
+def _scores(solution: Solution, sources: dict[str, Source], size: int, limit: float) -> Float[np.ndarray, "b P"]:
+    """Scores of all stretches by the flat vector; residuals beyond Huber's limit enter with the limit."""
     out = []
     for name, lin in solution.linearised.items():
         B, wide, k = lin.jacobian.shape
@@ -73,6 +82,6 @@ def _pulls(solution: Solution, sources: dict[str, Source], size: int, limit: flo
         stretch = stretches(np.repeat(np.arange(B), wide)[counts], time.reshape(-1)[counts])
         r, J = lin.white.reshape(-1)[counts], lin.jacobian.reshape(-1, k)[counts]
         block = np.zeros((stretch.max(initial=-1) + 1, size))
-        block[:, sources[name].positions] = pulls(np.clip(r, -limit, limit), J, stretch)
+        block[:, sources[name].positions] = stretch_scores(np.clip(r, -limit, limit), J, stretch)
         out.append(block)
     return np.concatenate(out)

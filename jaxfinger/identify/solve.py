@@ -1,12 +1,12 @@
-"""Every fit's way to its optimum: `VisibleGaussNewton`, an optimistix solver, on compressed trials.
+"""Minimisation behind every fit of one session: `VisibleGaussNewton`, stepped from outside, on compressed trials.
 
     min_θ  Σ_trials Huber(white residuals) + ½ ‖W (θ − μ)‖²
 
-One step of the solver reads the trials compressed at its trial point. Here they are linearised by one program an
-experiment, which all sessions of like fingers share, and the solver is stepped from outside
-(`optimistix` calls that interactive stepping); `batch` puts the same solver and the same rows through
-`optimistix.least_squares` in one program, which is compiled anew where a session differs from all before.
-An experiment whose residuals are affine in what is free is linearised once and moved along its tangent: exact.
+A step of the solver needs the trials linearised and compressed at its trial point. Each experiment is linearised by a
+program of its own, which all sessions of similar fingers share; the solver is stepped from Python (optimistix calls
+that interactive stepping). `batch` instead passes the same rows to `optimistix.least_squares` in one program, which is
+compiled for its sessions. An experiment whose residuals are affine in the free parameters is linearised once and then
+moved along its tangent, which is exact.
 """
 
 from dataclasses import dataclass
@@ -29,39 +29,51 @@ from jaxfinger.identify.gauss_newton import (
     bounded_step,
     scaled_directions,
 )
-from jaxfinger.identify.linearise import Filters, Linearised, Tangent, missed, tangent, triangular, whitened
+from jaxfinger.identify.linearise import (
+    Filters,
+    Linearised,
+    Tangent,
+    residuals_by_tangent,
+    tangent,
+    triangular,
+    whitened,
+)
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.prior import Prior
 from jaxfinger.model import Model
 
-SMALL = 1e-6  # a step this small, in standard deviations of the estimate, ends the search
-ROUGH = 0.02  # likewise where no more than residuals are wanted, as for their noise
-KINK = 0.1  # likewise one that does not lower the cost: what is left is a kink, where a tendon slips or a joint turns
-STEPS = 60
-LIGHTEST = 0.02  # share of its starting value below which no mass is let to fall
-PAD = 48  # compressed problems are padded to multiples of this, to share compilations
+# Lengths of a step, in standard deviations of the estimate, that end a search.
+STEP_TOLERANCE = 1e-6  # far below an interval, far above rounding
+ROUGH_TOLERANCE = 0.02  # where residuals alone are wanted, for their noise: all white ones change by 0.02 in norm
+KINK_TOLERANCE = (
+    0.1  # of a step that does not lower the cost: the cost has a kink where a tendon slips or a joint turns
+)
+MAX_STEPS = 60  # linearisations; it bounds the time of a fit, whose report says when it was reached
+MIN_MASS_SHARE = 0.02  # lower bound of a mass over its starting value: no link is fifty times lighter than CAD says
+PADDING = 48  # problems are padded to a multiple of so many parameters, so that they share compiled programs
 
 
 class Source(NamedTuple):
-    """One experiment as a fit reads it: its data, its whitening, and the parameters that it depends on."""
+    """One experiment as a fit reads it: its data, its whitening filters, and the parameters that it depends on."""
 
     batch: Batch
     filters: Filters
-    positions: Int[np.ndarray, " k"]  # in the flat vector, ascending
-    effects: bool = True  # whether the model's effects show in it, if it has any
-    affine: Int[np.ndarray, " a"] = np.zeros(0, int)  # those in which its residuals are affine together
+    positions: Int[np.ndarray, " k"]  # of those parameters in the flat vector, ascending
+    effects: bool = True  # whether its channels depend on the model's effects, if there are any
+    affine: Int[np.ndarray, " a"] = np.zeros(0, int)  # positions in which its residuals are jointly affine
     weights: Float[np.ndarray, " B"] | None = None  # of its trials, 1 by default
-    pace: float = 1.0  # times as long as the protocol's that its motions take
+    pace: float = 1.0  # duration of its motions over that of the protocol's
 
-    def seen(self, model: Model) -> Model:
-        """The model as the experiment shows it: what does not show is not compiled."""
+    def relevant_model(self, model: Model) -> Model:
+        """Model without effects that the experiment does not depend on, so that they are not compiled."""
         return model if self.effects or not model.effects else eqx.tree_at(lambda m: m.effects, model, ())
 
-    def linear(self, model: Model, free: Int[np.ndarray, " p"]) -> bool:
-        """Whether one linearisation says it all of the free parameters."""
+    def is_affine(self, model: Model, free: Int[np.ndarray, " p"]) -> bool:
+        """Whether the residuals are affine in the free parameters, so that one linearisation is exact."""
         mine = np.intersect1d(self.positions, free)
-        drives = np.any(np.asarray(model.joint_torque.torque_friction))  # they turn the sum of (1) into a share of it
-        return not self.seen(model).effects and not drives and bool(np.isin(mine, self.affine).all())
+        # With friction of its own torque a drive scales the sum of (1), which is then no longer affine.
+        drives = np.any(np.asarray(model.joint_torque.torque_friction))
+        return not self.relevant_model(model).effects and not drives and bool(np.isin(mine, self.affine).all())
 
 
 @dataclass(frozen=True)
@@ -71,43 +83,43 @@ class Solution:
     outcome: Outcome
     message: str  # empty where the search converged
     linearisations: int
-    cost: float  # half the sum of squared white residuals, as Huber has it, priors apart
-    rows: int  # white residuals that count
-    information: Float[np.ndarray, "P P"]  # JᵀJ over the whole flat vector, priors apart
-    invisible: Float[np.ndarray, "k p"]  # unit combinations of scaled parameters that neither trials nor prior see
-    scale: Float[np.ndarray, " p"]
+    cost: float  # ½ Σ s² of the white residuals under Huber's cost, without the prior
+    rows: int  # number of white residuals that are not zero
+    information: Float[np.ndarray, "P P"]  # JᵀJ over the whole flat vector, without the prior
+    invisible: Float[np.ndarray, "k p"]  # unit vectors of scaled parameters along the invisible combinations
+    scale: Float[np.ndarray, " p"]  # unit of each scaled parameter
     outliers: float  # share of white residuals beyond the robust limit
     linearised: dict[str, Linearised]
 
     @property
     def converged(self) -> bool:
-        """At an optimum, as far as rounding shows, or in a kink a tenth of a standard deviation wide."""
+        """Whether the search ended at an optimum, to rounding, or in a kink a tenth of a standard deviation wide."""
         return not self.message
 
     def chi2_per_row(self, estimated: int) -> float:
-        """1 where model and noise are right, with so many parameters estimated."""
+        """χ² over the degrees of freedom left by `estimated` parameters: about 1 where model and noise are right."""
         return 2.0 * self.cost / max(1, self.rows - estimated)
 
 
 class Tangents:
-    """What is known of experiments along their tangents: kept as long as nothing moves in which they are not affine."""
+    """Cache of the tangents of affine experiments, reused until a parameter moves in which they are not affine."""
 
     def __init__(self) -> None:
         self._known: dict[str, tuple[np.ndarray, Tangent]] = {}
         self._white: dict[str, tuple[Source, float, np.ndarray, Linearised]] = {}
 
     def at(self, name: str, model: Model, source: Source, limit: float, linear: bool) -> Linearised:
-        """The experiment linearised at the model; whitened anew where the source is another one than before."""
-        seen = source.seen(model)
-        free = Free.at(seen, source.positions)
+        """Linearise experiment `name` at the model; a cached tangent is whitened anew where the source has changed."""
+        relevant = source.relevant_model(model)
+        free = Free.at(relevant, source.positions)
         if not linear:
-            along = tangent(seen, free, source.batch, tuple(source.filters))
+            along = tangent(relevant, free, source.batch, tuple(source.filters))
             return whitened(along, source.batch, source.filters, limit, source.weights)
-        values = np.asarray(free.get(seen))
+        values = np.asarray(free.get(relevant))
         known, along = self._known.get(name, (values, None))
         by = values - known
         if along is None or np.any(by[~np.isin(source.positions, source.affine)]):
-            along, by = tangent(seen, free, source.batch, tuple(source.filters)), np.zeros_like(values)
+            along, by = tangent(relevant, free, source.batch, tuple(source.filters)), np.zeros_like(values)
             self._known[name] = values, along
             self._white.pop(name, None)
         along = along.moved(by) if by.any() else along
@@ -128,28 +140,31 @@ def solve(
     huber: float = 0.0,
     limits: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]] | None = None,
     tangents: Tangents | None = None,
-    small: float = SMALL,
+    tolerance: float = STEP_TOLERANCE,
 ) -> tuple[Model, Solution]:
-    """The model with its free parameters (positions in the flat vector) at the optimum, and what is known of it.
+    """Fit the free parameters, given by their positions in the flat vector.
 
-    `limits`: of each free parameter, below and above; what starts outside of them stays until a step leads back.
-    `huber`: robust limit in standard deviations, 0 for none. `tangents`: of earlier fits of the same trials.
-    `small`: standard deviations by which a step ends the search.
+    `huber`: robust limit in standard deviations, 0 for none. `limits`: lower and upper bounds of the free parameters;
+    one that starts outside of them moves only towards them. `tangents`: those of earlier fits of the same trials.
+    `tolerance`: length of a step, in standard deviations, that ends the search.
+
+    Returns:
+        The model at the optimum, and the solution there.
 
     Raises:
         UserError: the model is not defined at its start.
     """
     flat, p, tangents = np.asarray(ravel(model)), free.size, tangents or Tangents()
     moved, theta, size = Free.at(model, free), flat[free], flat.size
-    low, high = within(model, free, limits)
+    low, high = parameter_bounds(model, free, limits)
     prior = prior or Prior.none(theta)
-    solver = VisibleGaussNewton(atol=small, kink=KINK)
-    room = -(-max(p, 1) // PAD) * PAD
-    y = _wide(theta, room)
+    solver = VisibleGaussNewton(atol=tolerance, kink=KINK_TOLERANCE)
+    room = -(-max(p, 1) // PADDING) * PADDING
+    y = _padded(theta, room)
     state = _begin(y)
-    ends = _wide(low, room), _wide(high, room)
+    ends = _padded(low, room), _padded(high, room)
     at = model
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         linearised = linearise_each(at, sources, huber, tangents, free)
         factor = stacked(linearised, sources, size)
         offset = prior.root @ (np.asarray(state.trial)[:p] - prior.mean)
@@ -158,9 +173,9 @@ def solve(
         y, state = _advance(solver, y, state, _factor_of(rows, room), *ends)
         if np.array_equal(np.asarray(y), np.asarray(trial)):
             best = at, linearised, factor, rows
-        if state.outcome == Outcome.nowhere:
+        if state.outcome == Outcome.undefined_start:
             raise UserError(f"{Outcome[state.outcome]}: start from other parameters")
-        if not bool(state.outcome == Outcome.going):
+        if not bool(state.outcome == Outcome.running):
             break
         at = moved.set(model, jax.device_put(np.asarray(state.trial)[:p]))
     model, linearised, factor, rows = best
@@ -181,36 +196,36 @@ def solve(
     )
 
 
-def within(
+def parameter_bounds(
     model: Model,
     free: Int[np.ndarray, " p"],
     limits: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]] | None = None,
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Limits of every free parameter of a fit that starts from the model; no mass falls to nothing."""
+    """Lower and upper bounds of the free parameters: `limits`, by default none, and a positive bound of each mass."""
     theta = np.asarray(ravel(model))[free]
     masses = np.array([q.group == "mass" for q in describe(model)])[free]
     low, high = limits or (np.full(theta.size, -np.inf), np.full(theta.size, np.inf))
-    return np.where(masses, np.maximum(low, LIGHTEST * theta), low), high
+    return np.where(masses, np.maximum(low, MIN_MASS_SHARE * theta), low), high
 
 
 def _sentence(state: Iterate) -> str:
-    """What a user reads of a search that did not converge; nothing of one that did."""
+    """Message to the user about a search that did not converge; empty where it did."""
     step = float(state.length * state.size)
-    within = bool(state.outcome == Outcome.rounded) and step <= KINK
-    if within or bool(state.outcome == Outcome.converged) or bool(state.outcome == Outcome.kink):
+    at_rounding = bool(state.outcome == Outcome.rounded) and step <= KINK_TOLERANCE
+    if at_rounding or bool(state.outcome == Outcome.converged) or bool(state.outcome == Outcome.kink):
         return ""
     last = f"the last step was {step:.2g} standard deviations"
-    if bool(state.outcome == Outcome.going):
-        return f"no end after {STEPS} linearisations; {last}"
+    if bool(state.outcome == Outcome.running):
+        return f"no end after {MAX_STEPS} linearisations; {last}"
     return f"{Outcome[state.outcome]}; {last}"
 
 
-def _wide(values: np.ndarray, room: int) -> Float[Array, " room"]:
+def _padded(values: np.ndarray, room: int) -> Float[Array, " room"]:
     return jax.device_put(np.pad(values, (0, room - values.size)))
 
 
 def _factor_of(rows: Float[np.ndarray, "N q"], room: int) -> Factor:
-    """Of [J r], q = p + 1 columns, on the host, with room for more parameters, which show nowhere."""
+    """Compress the rows of [J r], q = p + 1 columns, and pad them with columns of zero to `room` parameters."""
     p = rows.shape[1] - 1
     T = np.zeros((p + 1, p + 1))
     small = triangular(rows)
@@ -235,22 +250,24 @@ def linearise_each(
     tangents: Tangents | None = None,
     free: Int[np.ndarray, " p"] | None = None,
 ) -> dict[str, Linearised]:
-    """Every experiment at the model; along the tangents of before where it is affine in what is free."""
+    """Linearise every experiment at the model, along its cached tangent where it is affine in the free parameters."""
     known = tangents or Tangents()
 
     def one(name: str) -> Linearised:
         s = sources[name]
-        return known.at(name, model, s, huber, free is not None and s.linear(model, free))
+        return known.at(name, model, s, huber, free is not None and s.is_affine(model, free))
 
     return dict(zip(sources, side_by_side(one, sources), strict=True))
 
 
-def missed_each(model: Model, sources: dict[str, Source]) -> dict[str, dict[str, Float[np.ndarray, "_columns _B _T"]]]:
-    """Measured − predicted of every experiment's channels; also where a sample does not count."""
+def residuals_each(
+    model: Model, sources: dict[str, Source]
+) -> dict[str, dict[str, Float[np.ndarray, "_columns _B _T"]]]:
+    """Measured − predicted of every experiment by channel, in the channel's unit, also at samples whose mask is 0."""
 
     def one(s: Source):
-        seen = s.seen(model)
-        return missed(seen, Free.at(seen, s.positions), s.batch, tuple(s.filters))
+        relevant = s.relevant_model(model)
+        return residuals_by_tangent(relevant, Free.at(relevant, s.positions), s.batch, tuple(s.filters))
 
     return dict(zip(sources, side_by_side(one, sources.values()), strict=True))
 
@@ -258,7 +275,7 @@ def missed_each(model: Model, sources: dict[str, Source]) -> dict[str, dict[str,
 def stacked(
     linearised: dict[str, Linearised], sources: dict[str, Source], size: int
 ) -> Float[np.ndarray, "k {size}+1"]:
-    """One triangular factor of all trials, its columns those of the flat vector, then the residual."""
+    """Triangular factor [R d] of all trials together, over the whole flat vector of `size` entries."""
     blocks = []
     for name, lin in linearised.items():
         block = np.zeros((lin.factor.shape[0] * lin.factor.shape[1], size + 1))
@@ -273,7 +290,7 @@ def stacked(
 
 
 def visible(A: Float[np.ndarray, "k p"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Basis B of the combinations that data or prior see, the others, and the scale of each parameter."""
+    """Basis (p, v) of the visible combinations, the invisible ones (i, p), and the scale (p,) of the parameters."""
     p = A.shape[1]
     basis, _, seen, V, scale = map(
         np.asarray, scaled_directions(np.concatenate([A, np.zeros((max(0, p - len(A)), p))]))
@@ -284,10 +301,10 @@ def visible(A: Float[np.ndarray, "k p"]) -> tuple[np.ndarray, np.ndarray, np.nda
 def bounded_least_squares(
     A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray | float = np.inf
 ) -> np.ndarray:
-    """argmin ‖A δ + b‖ over low ≤ δ ≤ high, where δ = 0 is allowed: a step of the solver, by itself."""
+    """Minimum δ of ‖A δ + b‖ over low ≤ δ ≤ high, by `gauss_newton.bounded_step`; bounds that exclude 0 move to 0."""
     p = A.shape[1]
-    room = -(-max(p, 1) // PAD) * PAD
-    ends = (_wide(np.broadcast_to(e, p), room) for e in (low, high))
+    room = -(-max(p, 1) // PADDING) * PADDING
+    ends = (_padded(np.broadcast_to(e, p), room) for e in (low, high))
     return np.asarray(_bounded(_factor_of(np.column_stack([A, b]), room), *ends))[:p]
 
 

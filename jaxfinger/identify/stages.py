@@ -25,7 +25,15 @@ from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.propagate import propagate
 from jaxfinger.identify.recipe import Recipe
 from jaxfinger.identify.shooting import AHEAD
-from jaxfinger.identify.solve import ROUGH, Solution, Source, Tangents, missed_each, solve, within
+from jaxfinger.identify.solve import (
+    ROUGH_TOLERANCE,
+    Solution,
+    Source,
+    Tangents,
+    parameter_bounds,
+    residuals_each,
+    solve,
+)
 from jaxfinger.identify.start import start_values
 from jaxfinger.model import Finger, Model
 
@@ -216,7 +224,7 @@ def run_stage(
     covariance = propagate(fit.covariance, solution, sources, free, prior, recipe.fit.huber)
     warnings = name_invisible(parameters, free, solution.invisible)
     warnings += _unseen(parameters, groups, free, touched)
-    warnings += implausible(model, covariance, free, within(fit.model, free)[0])
+    warnings += implausible(model, covariance, free, parameter_bounds(fit.model, free)[0])
     trials = tuple(t for e in reads for t in stacks[e].trials)
     report = report_of(stage.name, solution, free, trials, warnings)
     estimated = np.union1d(fit.estimated, free).astype(int)
@@ -273,7 +281,7 @@ def estimate_with_noise(
     model = start_values(model, free, parameters, sources_of(stacks, reads, noise | unknown, parameters))
     for _ in range(2 if unknown else 0):
         sources = sources_of(stacks, reads, noise | unknown, parameters)
-        model, solution = solve(model, free, sources, prior, tangents=tangents, small=ROUGH)
+        model, solution = solve(model, free, sources, prior, tangents=tangents, tolerance=ROUGH_TOLERANCE)
         noise |= _noise(solution, stacks, reads, slow)
         unknown = {}
     sources = sources_of(stacks, reads, noise, parameters)
@@ -330,7 +338,7 @@ def left_unknown(
     """What the model leaves, in their units, of the channels read whose noise is not known."""
     reads = {e: channels for e, channels in reads.items() if any((e, c) not in known for c in channels)}
     white = {(e, c): Noise.white(np.ones(len(stacks[e].batch.y[c])), "none") for e in reads for c in reads[e]}
-    left = missed_each(model, sources_of(stacks, reads, white, describe(model)))
+    left = residuals_each(model, sources_of(stacks, reads, white, describe(model)))
     return {(e, c): left[e][c] for e, c in white if (e, c) not in known}
 
 

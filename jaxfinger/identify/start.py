@@ -1,8 +1,8 @@
-"""Where a fit starts, from the data: tendon friction, the one law of (1) that has dead zones.
+"""Starting values of tendon friction, the only law of (1) with dead zones.
 
-The loss min(max(a₀ + a₁ f, 0), f) says nothing of a₀ and a₁ where it is zero at every tension, nor where all of the
-tension is lost, so a search can neither start there nor lead out of it. A few plausible losses, as shares of the
-highest tension that the trials show, are tried on every tendon's own trials; the best of them is the start.
+The loss min(max(a₀ + a₁ f, 0), f) has no derivative by a₀ and a₁ where it is zero at every tension, or where all of the
+tension is lost. A search can neither start in such a zone nor leave it. So a few candidates, scaled by the highest
+tension in the trials, are tried on the trials of each tendon, and the one of the lowest cost is the start.
 """
 
 from dataclasses import replace
@@ -13,12 +13,12 @@ from jaxtyping import Float
 
 from jaxfinger.identify.linearise import white_of
 from jaxfinger.identify.parameters import Parameter
-from jaxfinger.identify.solve import Source, missed_each
+from jaxfinger.identify.solve import Source, residuals_each
 from jaxfinger.model import Model, TendonFriction
 
-# a₀ over the highest tension, and a₁: a thirtieth to most of the tension lost, in all the forms that the law can have.
-# The first is taken where no trial prefers another.
-PLAUSIBLE = (
+# Candidates for (a₀ over the highest tension, a₁). They span losses from 3 % to 80 % of the tension, and the forms of
+# the law: proportional, constant, mixed, and with a negative a₀. The first is the start where all fit equally well.
+LOSS_CANDIDATES = (
     *((0.0, 0.1), (0.0, 0.3), (0.0, 0.03), (0.0, 0.8)),
     *((0.1, 0.1), (0.1, 0.0), (0.03, 0.0), (0.4, 0.2), (-0.1, 0.5)),
 )
@@ -27,17 +27,17 @@ PLAUSIBLE = (
 def start_values(
     model: Model, free: np.ndarray, parameters: list[Parameter], sources: dict[str, Source] | None = None
 ) -> Model:
-    """The model, with a loss that the trials prefer for every tendon whose friction is free and in a dead zone."""
+    """Set the friction of each tendon that is free and in a dead zone to the candidate that its trials fit best."""
     pulled = {e: s for e, s in (sources or {}).items() if _shows_friction(s, parameters)}
     highest = _highest(model, pulled)
     dead = [k for k in _free_tendons(model, free, parameters) if _is_dead(model, k, highest[k])]
     if not dead:
         return model
-    tried = [_with_losses(model, dead, highest, shares) for shares in PLAUSIBLE]
+    tried = [_with_losses(model, dead, highest, shares) for shares in LOSS_CANDIDATES]
     if not pulled:
         return tried[0]
     costs = np.stack([_costs(m, pulled, dead) for m in tried])
-    best = {k: PLAUSIBLE[int(np.argmin(costs[:, j]))] for j, k in enumerate(dead)}
+    best = {k: LOSS_CANDIDATES[int(np.argmin(costs[:, j]))] for j, k in enumerate(dead)}
     for k, shares in best.items():
         model = _with_losses(model, [k], highest, shares)
     return model
@@ -53,13 +53,13 @@ def _free_tendons(model: Model, free: np.ndarray, parameters: list[Parameter]) -
 
 
 def _highest(model: Model, sources: dict[str, Source]) -> Float[np.ndarray, " n"]:
-    """Highest tension of every tendon in these trials, N; none where nothing pulls it."""
+    """Highest tension of each tendon in these trials, N; zero where no trial pulls it."""
     none = np.zeros(model.finger.n)
     return np.max([none, *(np.asarray(s.batch.x.tension).max(axis=(1, 2)) for s in sources.values())], axis=0)
 
 
 def _is_dead(model: Model, k: int, highest: float) -> bool:
-    """Whether the tendon loses nothing at any tension up to the highest, or all of that."""
+    """Whether the tendon loses nothing at any tension up to the highest, or all of the highest."""
     a0, a1 = float(model.tendon_friction.constant[k]), float(model.tendon_friction.proportional[k])
     nothing = a0 <= 0.0 and a0 + a1 * (highest or 1.0) <= 0.0
     return bool(nothing or 0.0 < highest <= a0 + a1 * highest)
@@ -73,9 +73,9 @@ def _with_losses(model: Model, tendons: list[int], highest: np.ndarray, shares: 
 
 
 def _costs(model: Model, sources: dict[str, Source], tendons: list[int]) -> Float[np.ndarray, " k"]:
-    """½ ‖white residuals‖² of the trials that pull each tendon."""
+    """Cost ½ ‖white residuals‖² of each tendon, over the trials that pull it."""
     out = np.zeros(len(tendons))
-    for e, residuals in missed_each(model, sources).items():
+    for e, residuals in residuals_each(model, sources).items():
         s = sources[e]
         cost = 0.5 * np.sum(white_of(residuals, s.batch, s.filters) ** 2, axis=1)
         pulls = np.asarray(s.batch.x.tension).max(axis=2) > 0.0  # (n, B)

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from jaxfinger.identify.cluster_robust import STRETCH, growth, pulls, stretches
+from jaxfinger.identify.cluster_robust import STRETCH_DURATION, growth, stretch_scores, stretches
 
 RATE, MOVEMENTS = 50.0, 60  # Hz; of one stretch each
 
 
 def records(rng: np.random.Generator, missed: float, count: int = 300):
     """Fits of y = a + b v to records of movements at random speeds v; what each movement adds of its own is missed."""
-    n = int(RATE * STRETCH)
+    n = int(RATE * STRETCH_DURATION)
     time = np.arange(MOVEMENTS * n) / RATE
     for _ in range(count):
         v = np.repeat(rng.uniform(-1.0, 1.0, MOVEMENTS), n)
@@ -17,7 +17,7 @@ def records(rng: np.random.Generator, missed: float, count: int = 300):
         y = J @ [1.0, 2.0] + rng.normal(size=v.size) + missed * np.repeat(rng.normal(size=MOVEMENTS), n)
         estimate, *_ = np.linalg.lstsq(J, y, rcond=None)
         covariance = np.linalg.inv(J.T @ J)
-        g = pulls(y - J @ estimate, J, stretches(np.zeros(time.size, int), time))
+        g = stretch_scores(y - J @ estimate, J, stretches(np.zeros(time.size, int), time))
         yield estimate, np.sqrt(np.diag(covariance)), growth(covariance, g, np.zeros((0, 2)))
 
 
@@ -42,4 +42,4 @@ def test_stretches_do_not_run_over_from_one_trial_to_the_next():
     assert number.max() == 5
     for k in range(6):
         assert len(set(trial[number == k])) == 1
-        assert np.ptp(time[number == k]) < STRETCH
+        assert np.ptp(time[number == k]) < STRETCH_DURATION

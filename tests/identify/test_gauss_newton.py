@@ -7,7 +7,7 @@ import optimistix as optx
 import pytest
 import scipy.optimize
 
-from jaxfinger.identify.gauss_newton import ROUNDING, Outcome, VisibleGaussNewton
+from jaxfinger.identify.gauss_newton import COST_ROUNDING, Outcome, VisibleGaussNewton
 
 SOLVER = VisibleGaussNewton(atol=1e-9)
 
@@ -73,10 +73,10 @@ def test_it_ends_where_rounding_hides_what_steps_do_to_the_cost():
         bend, rest = rng.uniform(0.0, 0.9, 12), np.full(40, 10.0 ** rng.uniform(3, 4))
         start, rows = jnp.asarray(unit * rng.standard_normal(4)), tuple(map(jnp.asarray, (A, c, bend)))
         there = found(start, *rows, jnp.asarray(rest))
-        assert there.stats["outcome"] != Outcome.going
+        assert there.stats["outcome"] != Outcome.running
         if there.stats["outcome"] == Outcome.rounded:
             rounded += 1
             further = scipy.optimize.least_squares(bare, there.value, slopes, args=rows, x_scale="jac")
             cost = 0.5 * float(jnp.sum(bare(there.value, *rows) ** 2))
-            assert cost - further.cost <= ROUNDING * 0.5 * np.sum(rest**2)
+            assert cost - further.cost <= COST_ROUNDING * 0.5 * np.sum(rest**2)
     assert rounded > 10

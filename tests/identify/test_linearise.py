@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.experiments import SAMPLES, TRIALS, blocks, predict, prepare, roomy
-from jaxfinger.identify.linearise import _tangent, huber, linearise, missed, residuals_of, white_rows
+from jaxfinger.identify.linearise import _tangent, huber, linearise, residuals_by_tangent, residuals_of, white_rows
 from jaxfinger.identify.parameters import Free, describe
-from jaxfinger.identify.solve import Tangents, missed_each
+from jaxfinger.identify.solve import Tangents, residuals_each
 from jaxfinger.identify.stages import first_noise, sources_of
 
 EXPERIMENT, CHANNELS = "ID.4", ("joint_torque", "tendon_excursion")
@@ -86,7 +86,7 @@ def test_the_common_shape_changes_no_residual(stack, short_truth):
     source = sources_of({EXPERIMENT: stack}, {EXPERIMENT: CHANNELS}, noise, describe(model))[EXPERIMENT]
     predicted = predict(model, stack.batch.x, CHANNELS)
     alone = residuals_of(model, stack.batch, CHANNELS)
-    beside = missed(model, Free.at(model, source.positions), source.batch, CHANNELS)
+    beside = residuals_by_tangent(model, Free.at(model, source.positions), source.batch, CHANNELS)
     for c in CHANNELS:
         np.testing.assert_allclose(alone[c], stack.batch.y[c] - predicted[c], atol=1e-12)
         np.testing.assert_allclose(beside[c], stack.batch.y[c] - predicted[c], atol=1e-12)
@@ -98,8 +98,8 @@ def test_an_experiment_that_shows_no_effect_is_predicted_without(stack, short_tr
     noise = {(EXPERIMENT, c): first_noise(stack, c, stack.batch.y[c]) for c in CHANNELS}
     plain = describe(short_truth.model)
     source = sources_of({EXPERIMENT: stack}, {EXPERIMENT: CHANNELS}, noise, plain)[EXPERIMENT]
-    silent = missed_each(model, {EXPERIMENT: source._replace(effects=False)})[EXPERIMENT]
-    nominal, shown = (missed_each(m, {EXPERIMENT: source})[EXPERIMENT] for m in (short_truth.model, model))
+    silent = residuals_each(model, {EXPERIMENT: source._replace(effects=False)})[EXPERIMENT]
+    nominal, shown = (residuals_each(m, {EXPERIMENT: source})[EXPERIMENT] for m in (short_truth.model, model))
     for c in CHANNELS:
         np.testing.assert_array_equal(silent[c], nominal[c])
     assert np.abs(shown["tendon_excursion"] - nominal["tendon_excursion"]).max() > 5e-5

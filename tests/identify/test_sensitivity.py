@@ -83,7 +83,7 @@ def refit(fit, session, of=None, weight=None, gain=None):
                 batch = eqx.tree_at(lambda b: b.y["tendon_excursion"], source.batch, scaled)
                 sources[e] = source._replace(batch=batch)
         prior = cad_prior(session, fit.recipe, parameters, free)
-        model, _ = solve(model, free, sources, prior, fit.recipe.fit.huber, small=1e-9)
+        model, _ = solve(model, free, sources, prior, fit.recipe.fit.huber, tolerance=1e-9)
     return np.asarray(ravel(model))
 
 

@@ -14,7 +14,7 @@ from jaxfinger.effects import CatalogueEffect, amplitude
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import predict, prepare
 from jaxfinger.identify.parameters import describe, ravel
-from jaxfinger.identify.solve import ROUGH, bounded_least_squares, solve
+from jaxfinger.identify.solve import ROUGH_TOLERANCE, bounded_least_squares, solve
 from jaxfinger.identify.stages import first_noise, sources_of
 
 EXPERIMENT, CHANNEL = "ID.3-static", "joint_torque"
@@ -96,12 +96,12 @@ def test_steps_that_overshoot_settle_in_the_light_of_those_before(short, short_t
     side = jnp.where(jnp.sin(3.0 * source.batch.x.time) > 0.0, -1e-2, 1e-2)
     shifted = source.batch.y[CHANNEL].at[model.effects[0].index[0]].set(joint + side) * source.batch.mask[CHANNEL]
     source = source._replace(batch=eqx.tree_at(lambda b: b.y[CHANNEL], source.batch, shifted))
-    found, solution = solve(model, np.array([position]), {EXPERIMENT: source}, small=ROUGH)
+    found, solution = solve(model, np.array([position]), {EXPERIMENT: source}, tolerance=ROUGH_TOLERANCE)
     assert solution.converged
     assert solution.linearisations <= 10
     settled, exact = solve(model, np.array([position]), {EXPERIMENT: source})
     std = exact.information[position, position] ** -0.5
-    assert abs(float(ravel(found)[position] - ravel(settled)[position])) < 2 * ROUGH * std
+    assert abs(float(ravel(found)[position] - ravel(settled)[position])) < 2 * ROUGH_TOLERANCE * std
 
 
 @pytest.mark.parametrize(("low", "high", "end"), [(-0.5, 2.0, -0.5), (0.0, 2.0, 0.0), (-2.0, 2.0, -0.95)])
