@@ -1,4 +1,4 @@
-"""The catalogue of effects that the nominal model leaves out. Adding one touches one file: `docs/add-an-effect.md`."""
+"""The catalogue of effects that the nominal model leaves out. `docs/add-an-effect.md` tells how to add one."""
 
 import importlib.util
 import inspect
@@ -30,23 +30,26 @@ CHANGED = _effects_in(changed)  # candidates only beside an earlier fit
 
 
 def nominal_terms(elastic_degree: int, friction_degree: int) -> dict[str, type[CatalogueEffect]]:
-    """The terms that a recipe of these degrees may leave out, by id."""
+    """Effects that stand for terms a recipe may leave out, by id, as polynomials of the given degrees."""
     degrees = {"joint_elastic": elastic_degree, "joint_coulomb": friction_degree}
     return {n: nominal.of_degree(c, degrees[n]) if n in degrees else c for n, c in NOMINAL_TERMS.items()}
 
 
 def changes(elastic_degree: int, friction_degree: int, moment_arm_degree: int) -> dict[str, type[CatalogueEffect]]:
-    """What the nominal parameters of a recipe of these degrees may have changed by, by id."""
+    """Effects that stand for changes of nominal parameters since an earlier fit, by id, as polynomials of the given
+    degrees.
+    """
     degrees = {"changed_elastic": elastic_degree, "changed_friction": friction_degree}
     degrees["changed_moment_arm"] = moment_arm_degree - 1
     return {n: nominal.of_degree(c, degrees[n]) if n in degrees else c for n, c in CHANGED.items()}
 
 
 def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
-    """The effects that a user's Python file defines, by id.
+    """Load the effects that a user's Python file defines, by id.
 
     Raises:
-        UserError: it cannot be loaded, or defines none; an id is the catalogue's, or a sentence for people is missing.
+        UserError: The file cannot be loaded or defines no effect. An id is taken by the catalogue, or a sentence for
+            people is missing.
     """
     path = Path(path)
     spec = importlib.util.spec_from_file_location(f"jaxfinger_user_{path.stem}", path)
@@ -63,20 +66,26 @@ def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
     for name, kind in found.items():
         if name in CATALOGUE | NOMINAL_TERMS | CHANGED:
             raise UserError(f"{path}: {kind.__name__} has the ID {name}, which the catalogue has; choose another")
-        for said in ("HAPPENS", "LOOKS", "CHANGE", "__doc__"):
-            if not getattr(kind, said):
-                raise UserError(f"{path}: {kind.__name__} has no {said.strip('_')}; write its sentence")
+        for sentence in ("HAPPENS", "LOOKS", "CHANGE", "__doc__"):
+            if not getattr(kind, sentence):
+                raise UserError(f"{path}: {kind.__name__} has no {sentence.strip('_')}; write its sentence")
     return found
 
 
 def to_dict(effect: CatalogueEffect, units: dict[str, str]) -> dict:
-    """An effect as a result file holds it, with the units that its parameters have at its site."""
+    """Describe an effect as a result file holds it. `units`: those of its parameters at its site, by name."""
     parameters = {k: {"value": v, "units": units[k]} for k, v in effect.values().items()}
     return {"effect": effect.ID, "site": list(effect.site), "parameters": parameters}
 
 
 def from_dict(finger: Finger, content: dict, extra: dict[str, type[CatalogueEffect]] | None = None) -> CatalogueEffect:
-    """The effect that `to_dict` described."""
+    """Read back the effect that `to_dict` described.
+
+    `extra`: a user's effects, by id.
+
+    Raises:
+        UserError: No effect has this id.
+    """
     known = CATALOGUE | NOMINAL_TERMS | CHANGED | (extra or {})
     if content["effect"] not in known:
         raise UserError(

@@ -1,4 +1,4 @@
-"""What every effect of the catalogue says of itself, so that others can look for it."""
+"""Base class of the catalogue's effects. Each declares its sites and parameters, so that a search can try it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -21,33 +21,33 @@ Kind = TypeVar("Kind", bound="CatalogueEffect")
 
 @dataclass(frozen=True)
 class Amplitude:
-    """A parameter that the effect is (nearly) in proportion to, and that vanishes with it."""
+    """A parameter that the effect is proportional to, or nearly so. At zero the effect is absent."""
 
-    units: str  # where joints turn
-    size: float  # that an effect worth naming has, of the scale `of`
+    units: str  # for revolute joints
+    size: float  # of an effect worth naming, in units of the scale `of`
     of: str  # a product of `Scales`
     signed: bool
-    most: float  # 1 for the share of something
+    most: float  # upper bound: 1 for a share
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A parameter that says how an effect acts, and means nothing without an amplitude."""
+    """A parameter that sets how an effect acts: a length, a time constant, an exponent. Its amplitude sets how much."""
 
     units: str
-    values: tuple[float, ...]  # worth trying, of the scale `of`
+    values: tuple[float, ...]  # to try, in units of the scale `of`
     of: str
-    # How a refit moves it: by factors, by differences, or not at all, since it chooses a form, a side or a place.
+    # How a refit moves it: by factors, by differences, or not at all where it chooses a form, a side or a place.
     moves: str
-    # The two amplitudes of a period in the session's time, alike but for it. A fine scan finds a period, since a refit
-    # would stop in the nearest of many valleys.
+    # Where the shape is a period in the session's time: the amplitudes of its cosine and sine. A fine scan finds the
+    # period, since the cost has many local minima along it.
     period_of: tuple[str, str] | None = None
 
 
 def amplitude(units: str, size: float, of: str = "1", *, signed: bool = False, most: float = np.inf) -> Any:
-    """A field that is an amplitude: `amplitude("N m", 0.1, "torque")` is plausible at a tenth of the joint's torque.
+    """Declare a field that is an amplitude: `amplitude("N m", 0.1, "torque")` expects a tenth of the joint's torque.
 
-    It is not below zero unless `signed`, and not above `most`.
+    Its lower bound is zero unless `signed`, its upper bound `most`.
     """
     return eqx.field(metadata={"parameter": Amplitude(units, size, of, signed, most)})
 
@@ -55,9 +55,12 @@ def amplitude(units: str, size: float, of: str = "1", *, signed: bool = False, m
 def shape(
     units: str, values: tuple[float, ...], of: str = "1", *, moves: str = "by factors", period_of: Any = None
 ) -> Any:
-    """A field that is a shape, with the `values` worth trying in units of the scale `of`, the first one its default.
+    """Declare a field that is a shape, with the `values` to try in units of the scale `of`. The first is its default.
 
-    `moves`: `by factors`, `by differences`, or `not`.
+    `moves`: how a refit moves it, `by factors`, `by differences`, or `not`.
+
+    Raises:
+        ValueError: `moves` is none of the three.
     """
     if moves not in ("by factors", "by differences", "not"):
         raise ValueError(f"a shape moves by factors, by differences or not, where {moves!r} stands")
@@ -72,12 +75,13 @@ class CatalogueEffect(Effect):
     """
 
     ID: ClassVar[str]
-    PLACE: ClassVar[str]  # joint, tendon, joint pair, tendon pair, channel, or the site's own name
-    # For people, one sentence each: what happens, what it looks like in the data, what to change.
+    PLACE: ClassVar[str]  # joint, tendon, joint pair, tendon pair, channel, or the name of a single site
+    # Sentences for people: what happens, what it looks like in the data, what to change.
     HAPPENS: ClassVar[str] = ""
     LOOKS: ClassVar[str] = ""
     CHANGE: ClassVar[str] = ""
-    # Sizes, in plausible ones, at which its signature is read: several where it decides whether a held tendon slips.
+    # Multiples of the plausible size at which the signature is computed. An effect that decides whether a held tendon
+    # slips is not linear in its size, and has several.
     SIZES: ClassVar[tuple[float, ...]] = (1.0,)
 
     site: Site = eqx.field(static=True)
@@ -85,53 +89,59 @@ class CatalogueEffect(Effect):
 
     @classmethod
     def parameters(cls) -> Mapping[str, Amplitude | Shape]:
-        """Every parameter by name, in the order of the fields."""
+        """Parameters by name: amplitudes first, then shapes, each in the order of the fields."""
         return _declared(cls)
 
     @classmethod
     def amplitudes(cls) -> dict[str, Amplitude]:
-        """The amplitudes by name."""
+        """Amplitudes by name."""
         return {n: p for n, p in cls.parameters().items() if isinstance(p, Amplitude)}
 
     @classmethod
     def shape_parameters(cls) -> dict[str, Shape]:
-        """The shapes by name."""
+        """Shapes by name."""
         return {n: p for n, p in cls.parameters().items() if isinstance(p, Shape)}
 
     @classmethod
     def periods(cls) -> dict[str, tuple[str, str]]:
-        """Shapes that are periods in the session's time, with the two amplitudes of each. Such an effect has a shape
-        `middle`, from which phases count: the middle of the session.
+        """Amplitudes of the cosine and sine of every shape that is a period in the session's time.
+
+        Such an effect also has a shape `middle`, the middle of the session, where the phase is zero.
         """
         return {n: p.period_of for n, p in cls.shape_parameters().items() if p.period_of}
 
     @classmethod
     def sizes(cls, scales: Scales, site: Site) -> dict[str, float]:
-        """The plausible size of every amplitude at a site, in its own unit."""
+        """Plausible size of every amplitude at a site, in its own unit."""
         return {n: p.size * scales(p.of, site) for n, p in cls.amplitudes().items()}
 
     @classmethod
     def worth_trying(cls, scales: Scales, site: Site) -> dict[str, tuple[float, ...]]:
-        """The values of every shape that are worth trying at a site, in its own unit."""
+        """Values to try of every shape at a site, in its own unit."""
         grids = {n: np.array(p.values) * scales(p.of, site) for n, p in cls.shape_parameters().items()}
         return {n: tuple(values.tolist()) for n, values in grids.items()}
 
     @classmethod
     def shapes(cls, finger: Finger, site: Site, scales: Scales) -> list[dict[str, float]]:
-        """Every combination of shapes worth trying at a site; periods are scanned for instead."""
+        """Combinations of shapes to try at a site. A period has its default only, since a scan finds it."""
         grids = {n: v[:1] if n in cls.periods() else v for n, v in cls.worth_trying(scales, site).items()}
         combined = [dict(zip(grids, v, strict=True)) for v in product(*grids.values())]
         return [s for s in combined if cls.sensible(scales, site, s)]
 
     @classmethod
     def sensible(cls, scales: Scales, site: Site, shapes: dict[str, float]) -> bool:
-        """Whether a combination of shapes is worth trying where each of them is."""
+        """Whether a combination of shapes is worth trying."""
         return True
 
     @classmethod
     def at(cls: type[Kind], finger: Finger, site: Site, **values: float) -> Kind:
-        """At a site of a finger; amplitudes default to zero, shapes to the first value worth trying there as far as the
-        finger's description tells.
+        """Place the effect at a site of a finger, with parameters by name.
+
+        Amplitudes default to zero. Shapes default to the first of the values to try, scaled by the finger's
+        description.
+
+        Raises:
+            TypeError: The effect has no parameter of a given name.
         """
         site, shapes = tuple(site), cls.shape_parameters()
         defaults = dict.fromkeys(cls.amplitudes(), 0.0)
@@ -155,12 +165,12 @@ class CatalogueEffect(Effect):
 
     @classmethod
     def constants(cls, finger: Finger, site: Site) -> dict[str, Any]:
-        """Further fields that the finger decides."""
+        """Further fields of the effect, computed from the finger."""
         return {}
 
     @classmethod
     def sites(cls, finger: Finger) -> list[Site]:
-        """Every place of a finger where the effect can act."""
+        """Sites of a finger where the effect can act."""
         active = [name for name, a in zip(finger.tendon_names, finger.active, strict=True) if a]
         match cls.PLACE:
             case "joint":
@@ -176,35 +186,38 @@ class CatalogueEffect(Effect):
 
     @classmethod
     def moves_rigid_body(cls) -> bool:
-        """Whether it changes more than the torque that resists a motion: the rigid body, the motion itself, or what a
-        drive loses of all of (1).
+        """Whether the effect changes the rigid body, the motion itself, or the share of torque that a drive loses.
+
+        Such an effect changes more of equation (1) than the torque that resists a motion.
         """
         return any(getattr(cls, h) is not getattr(Effect, h) for h in ("finger", "true_motion", "torque_friction"))
 
     @classmethod
     def reads(cls) -> bool:
-        """Whether it changes what a sensor says of what it measures."""
+        """Whether the effect changes the reading of a sensor."""
         return cls.reading is not Effect.reading
 
     def bounds(self, scales: Scales) -> dict[str, tuple[float, float]]:
-        """Least and most of every amplitude and of every shape that a refit moves: one-sided amplitudes not below zero,
-        shares not above one, and shapes no further out than those worth trying.
+        """Lower and upper bound of every parameter that a refit moves, in its own unit.
+
+        Amplitudes without a sign start at zero, and shares end at their upper limit. A shape that moves by factors may
+        leave the range of values to try by a factor of two; one that moves by differences stays within it.
         """
         ends = {n: (-np.inf if p.signed else 0.0, p.most) for n, p in self.amplitudes().items()}
         for n, values in self.worth_trying(scales, self.site).items():
             moves = self.shape_parameters()[n].moves
             if moves != "not" and len(values) > 1:
-                wide = 1.0 if moves == "by differences" else 2.0
-                ends[n] = (min(values) / wide, max(values) * wide)
+                margin = 1.0 if moves == "by differences" else 2.0
+                ends[n] = (min(values) / margin, max(values) * margin)
         return ends
 
     @classmethod
     def units(cls) -> dict[str, str]:
-        """Units of every parameter, amplitudes and shapes, where joints turn."""
+        """Units of every parameter, for revolute joints."""
         return {n: p.units for n, p in cls.parameters().items()}
 
     def values(self) -> dict[str, float]:
-        """Every parameter by name."""
+        """Values of the parameters by name."""
         return {n: float(getattr(self, n)) for n in self.parameters()}
 
 
@@ -216,31 +229,33 @@ def _declared(cls: type[CatalogueEffect]) -> dict[str, Amplitude | Shape]:
 
 
 def dahl(z: Float[Array, "*T"], dx: Float[Array, "*T"], delta: Float[Array, ""]) -> Float[Array, "*T"]:
-    """Share of the friction that is built up after a displacement, in lengths: dz = (1 − z sgn dx)^δ dx (Dahl 1968).
+    """Presliding state z in [−1, 1] after the displacement dx: dz = (1 − z sgn dx)^δ dx (Dahl 1968).
 
-    δ = 1 builds up exponentially. δ = ½ has built up after 2√2 lengths, as many elements in parallel have that slip one
-    after the other (Maxwell slip, evenly spread).
+    z is the friction over its Coulomb value, dx the displacement over the presliding length. With δ = 1 friction builds
+    up exponentially. With δ = ½ it turns from −1 to 1 within 2√2 lengths, as that of parallel Maxwell-slip elements
+    whose strengths are evenly spread. The solution is exact for a displacement in one direction.
     """
     way = jnp.sign(dx)
-    lacking, share = 1.0 - z * way, jnp.abs(dx)
-    root = jnp.sqrt(jnp.maximum(lacking, 1e-12))  # whose slope at nothing is infinite
-    left = jnp.where(delta > 0.75, lacking * jnp.exp(-share), jnp.square(jnp.maximum(root - 0.5 * share, 0.0)))
+    lacking, length = 1.0 - z * way, jnp.abs(dx)
+    root = jnp.sqrt(jnp.maximum(lacking, 1e-12))  # The derivative of a root is infinite at zero.
+    left = jnp.where(delta > 0.75, lacking * jnp.exp(-length), jnp.square(jnp.maximum(root - 0.5 * length, 0.0)))
     return jnp.where(dx == 0.0, z, way * (1.0 - left))
 
 
 def delta() -> Any:
-    """A shape that chooses between both forms of `dahl`."""
+    """Declare a shape that chooses the exponent of `dahl`."""
     return shape("1", (1.0, 0.5), moves="not")
 
 
-_SIXTH_ORDER = ((1, 0.75), (2, -0.15), (3, 1 / 60))  # how far off on either side, and weight
+# Central differences of the sixth order: distance in samples, and weight (Fornberg, Math. Comp. 51 (1988) 699).
+_SIXTH_ORDER = ((1, 0.75), (2, -0.15), (3, 1 / 60))
 
 
 def rate(y: Float[Array, "*T"], time: Float[Array, "*#T"]) -> Float[Array, "*T"]:
-    """Time derivative along the last axis; zero where time stands still.
+    """Time derivative along the last axis, 1/s. It is zero where time stands still.
 
-    Central differences of the sixth order where samples are evenly spaced (Fornberg, Math. Comp. 51 (1988) 699), since
-    reduced channels change by much from sample to sample; of the second order elsewhere.
+    Evenly spaced samples have central differences of the sixth order, since those of the second order attenuate fast
+    changes of reduced channels. Other samples, and the first and last three, have the second order.
     """
     time = jnp.broadcast_to(time, y.shape)
     dy, dt = (jnp.asarray(jnp.gradient(a, axis=-1)) for a in (y, time))

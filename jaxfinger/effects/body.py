@@ -1,4 +1,4 @@
-"""The rigid body: another load, another mounting, and the inertia and ripple of the external motor's drive."""
+"""Effects on the rigid body: load, mounting, and the inertia and ripple of the external motor."""
 
 from typing import ClassVar
 
@@ -8,22 +8,21 @@ from jaxtyping import Array, Float
 
 from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
 
-# Of a link's mass, the most that an effect may take from it. A link without mass is no body, and its torques divide by
-# what is left; a tenth is less than any link that CAD describes loses.
-KEEPS = 0.9
+# Largest share of a link's mass that an effect may remove. The equations divide by the mass that is left, so it has to
+# stay positive. CAD is never wrong by nine tenths of a mass: the bound excludes no plausible link.
+MAX_REMOVED_SHARE = 0.9
 
 
 class Payload(CatalogueEffect):
-    """A point mass m at p in a link's frame: added to the link or, where it is `moved` (1), taken evenly from it.
+    """Point mass m at p in a link's frame, added to the link (`moved` 0) or taken evenly from its own mass (1).
 
-    Either way the link stays a body, its mass, first moment and inertia being those of a body and a point (parallel
-    axes): torques are linear in m.
+    Mass, first moment and inertia are those of the body and the point (parallel axes). Torques are linear in m.
     """
 
     ID: ClassVar = "payload"
-    PLACE: ClassVar = "joint"  # a link goes by its joint's name
+    PLACE: ClassVar = "joint"  # A link has its joint's name.
     HAPPENS: ClassVar = "A link carries a mass that CAD does not know of, or its mass sits elsewhere."
-    LOOKS: ClassVar = "Torque is off as a weight would have it: by posture, at this joint and all before it."
+    LOOKS: ClassVar = "Torque is off by that of a weight: it depends on posture, at this joint and all before it."
     CHANGE: ClassVar = "Weigh the link again, with cables and screws, and correct its mass and centre of mass."
 
     mass: Float[Array, ""] = amplitude("kg", 0.3, "mass")
@@ -33,9 +32,9 @@ class Payload(CatalogueEffect):
     moved: Float[Array, ""] = shape("1", (0.0, 1.0), moves="not")
 
     def bounds(self, scales):
-        """A link that mass is taken from keeps a tenth of its own: else it is no body."""
+        """Bounds that leave a link a tenth of its mass where mass is moved within it."""
         ends = super().bounds(scales)
-        return ends | ({"mass": (0.0, KEEPS * scales("mass", self.site))} if self.moved > 0.5 else {})
+        return ends | ({"mass": (0.0, MAX_REMOVED_SHARE * scales("mass", self.site))} if self.moved > 0.5 else {})
 
     def finger(self, finger):
         i, p = self.index[0], jnp.stack([self.x, self.y, self.z])
@@ -55,17 +54,17 @@ class Payload(CatalogueEffect):
 
 
 def _steiner(mass, com):
-    """Inertia of a point mass about the frame's origin."""
+    """Inertia of a point mass at `com` about the frame's origin, kg m²."""
     return mass * (com @ com * jnp.eye(3) - jnp.outer(com, com))
 
 
 class GravityTilt(CatalogueEffect):
-    """g + φ × g: the finger is mounted at another angle than believed (first order in φ)."""
+    """g + φ × g: the finger is mounted at another angle than described (first order in φ)."""
 
     ID: ClassVar = "gravity_tilt"
     PLACE: ClassVar = "base"
-    HAPPENS: ClassVar = "The finger is mounted at another angle than believed."
-    LOOKS: ClassVar = "All joints miss their weights together, as one turned gravity would have it."
+    HAPPENS: ClassVar = "The finger is mounted at another angle than described."
+    LOOKS: ClassVar = "The weight torques of all joints are off together, as under one turned gravity vector."
     CHANGE: ClassVar = "Measure the mounting with a level, and correct `gravity` of the finger."
 
     x: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
@@ -78,7 +77,7 @@ class GravityTilt(CatalogueEffect):
 
 
 class DriveInertia(CatalogueEffect):
-    """I q̈: shaft and coupler of the external motor add inertia where it is coupled."""
+    """I q̈: shaft and coupler of the external motor add inertia at the joint that it moves."""
 
     ID: ClassVar = "drive_inertia"
     PLACE: ClassVar = "joint"
@@ -93,21 +92,23 @@ class DriveInertia(CatalogueEffect):
         return h.at[i].add(self.inertia * x.qdd[i] * x.motorised[i])
 
 
-RIPPLES = (4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 14.0, 16.0, 18.0, 20.0, 24.0, 28.0, 32.0)  # in a turn
+# Periods in a turn of the joint. Steps grow with the number, since a joint's range is a part of a turn and does not
+# resolve neighbours at short periods; a refit moves between them.
+RIPPLES_PER_TURN = (4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 14.0, 16.0, 18.0, 20.0, 24.0, 28.0, 32.0)
 
 
 class TorqueRipple(CatalogueEffect):
-    """A sin(p q) + B cos(p q): torque of the drive that is periodic in angle (cogging, a misaligned coupler)."""
+    """A sin(p q) + B cos(p q): torque of the drive that is periodic in the angle (cogging, a misaligned coupler)."""
 
     ID: ClassVar = "torque_ripple"
     PLACE: ClassVar = "joint"
     HAPPENS: ClassVar = "The drive's torque is periodic in the angle."
     LOOKS: ClassVar = "The residual repeats over the angle, the same both ways."
-    CHANGE: ClassVar = "Align the coupler, or add the ripple to the motor; it is none of the finger's."
+    CHANGE: ClassVar = "Align the coupler, or add the ripple to the motor: the finger itself has none."
 
     A: Float[Array, ""] = amplitude("N m", 0.02, "torque", signed=True)
     B: Float[Array, ""] = amplitude("N m", 0.02, "torque", signed=True)
-    p: Float[Array, ""] = shape("1", RIPPLES, moves="by differences")
+    p: Float[Array, ""] = shape("1", RIPPLES_PER_TURN, moves="by differences")
 
     def torque(self, x, memory, h):
         i = self.index[0]

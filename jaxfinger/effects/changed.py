@@ -1,6 +1,6 @@
-"""Nominal parameters that are others than an earlier fit found: candidates where a session is diagnosed against it.
+"""Changes of nominal parameters since an earlier fit: candidates where a session is diagnosed against that fit.
 
-Each is what a term of the nominal model, at one place, has changed by, in the term's own parameters and by its law.
+Each effect changes one term of the nominal model at one site, by the term's own law and parameters.
 """
 
 from typing import ClassVar
@@ -11,70 +11,72 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.effects.base import CatalogueEffect, amplitude
-from jaxfinger.effects.body import KEEPS
+from jaxfinger.effects.body import MAX_REMOVED_SHARE
 from jaxfinger.effects.drive import JointOffset
 from jaxfinger.effects.nominal import JointCoulomb, JointDamping, JointElastic, TendonFrictionTerm
 
 
 class Changed(CatalogueEffect):
-    """Amplitudes in the order of the nominal parameters of `GROUP` at its site."""
+    """Base class: the amplitudes are changes of the nominal parameters of `GROUP` at the site, in their order."""
 
     GROUP: ClassVar[str]
-    LOOKS: ClassVar = "Every trial that depends on it is off in the same way; none before the change was."
-    CHANGE: ClassVar = "Find out what was changed on the finger in between, or identify it anew."
+    LOOKS: ClassVar = "Every trial that depends on it is off in the same way; no trial from before the change is."
+    CHANGE: ClassVar = "Find out what was changed on the finger since, or identify it again."
 
 
 class ChangedElastic(Changed, JointElastic):
-    """k₀ + k₁ q + k₂ q²: what a joint's elastic torque has changed by."""
+    """k₀ + k₁ q + k₂ q²: change of a joint's elastic torque."""
 
     ID: ClassVar = "changed_elastic"
     GROUP: ClassVar = "elastic"
-    HAPPENS: ClassVar = "The joint's elastic torque is another than when the fit was made."
+    HAPPENS: ClassVar = "The joint's elastic torque has changed since the fit was made."
 
 
 class ChangedPretension(Changed, JointOffset):
-    """τ₀: what the constant part of a joint's elastic torque has changed by, its stiffness the same."""
+    """τ₀: change of the constant part of a joint's elastic torque, at the same stiffness."""
 
     ID: ClassVar = "changed_pretension"
     GROUP: ClassVar = "elastic"
-    HAPPENS: ClassVar = "The pretension of the joint's spring, or a constant torque, is another than before."
+    HAPPENS: ClassVar = (
+        "The pretension of the joint's spring, or a constant torque, has changed since the fit was made."
+    )
 
 
 class ChangedFriction(Changed, JointCoulomb):
-    """s(q̇) (c₀ + c₁ q + c₂ q²): what a joint's Coulomb friction has changed by, more or less."""
+    """s(q̇) (c₀ + c₁ q + c₂ q²): change of a joint's Coulomb friction, of either sign."""
 
     ID: ClassVar = "changed_friction"
     GROUP: ClassVar = "friction"
-    HAPPENS: ClassVar = "The joint's dry friction is another than when the fit was made."
+    HAPPENS: ClassVar = "The joint's dry friction has changed since the fit was made."
 
     c0: Float[Array, ""] = amplitude("N m", 0.1, "torque", signed=True)
 
 
 class ChangedDamping(Changed, JointDamping):
-    """d q̇: what a joint's damping has changed by, more or less."""
+    """d q̇: change of a joint's damping, of either sign."""
 
     ID: ClassVar = "changed_damping"
     GROUP: ClassVar = "damping"
-    HAPPENS: ClassVar = "The joint's damping is another than when the fit was made."
+    HAPPENS: ClassVar = "The joint's damping has changed since the fit was made."
 
     d: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed", signed=True)
 
 
 class ChangedTendonFriction(Changed, TendonFrictionTerm):
-    """a₀ + a₁ f: what the affine friction of a tendon's path has changed by."""
+    """a₀ + a₁ f: change of the affine friction of a tendon's path."""
 
     ID: ClassVar = "changed_tendon_friction"
     GROUP: ClassVar = "tendon_friction"
-    HAPPENS: ClassVar = "The friction of the tendon's path is another than when the fit was made."
+    HAPPENS: ClassVar = "The friction of the tendon's path has changed since the fit was made."
 
 
 class ChangedMomentArm(Changed):
-    """a₁ q + a₂ q² + a₃ q³: what a tendon's excursion over one joint has changed by, and its moment arm with it."""
+    """a₁ q + a₂ q² + a₃ q³: change of a tendon's excursion over one joint, and of its moment arm with it."""
 
     ID: ClassVar = "changed_moment_arm"
     GROUP: ClassVar = "moment_arm"
     PLACE: ClassVar = "tendon and joint"
-    HAPPENS: ClassVar = "The tendon's moment arm at the joint is another than when the fit was made."
+    HAPPENS: ClassVar = "The tendon's moment arm at the joint has changed since the fit was made."
 
     a1: Float[Array, ""] = amplitude("m/rad", 0.05, "excursion/angle", signed=True)
     a2: Float[Array, ""] = amplitude("m/rad^2", 0.05, "excursion/angle/angle", signed=True)
@@ -102,35 +104,35 @@ class ChangedMomentArm(Changed):
 
 
 class ChangedMass(Changed):
-    """Δm at the link's own centre of mass, its shape kept: what its mass has changed by."""
+    """Δm: change of a link's mass. Its centre of mass and radii of gyration stay."""
 
     ID: ClassVar = "changed_mass"
     GROUP: ClassVar = "mass"
-    PLACE: ClassVar = "joint"  # a link goes by its joint's name
-    HAPPENS: ClassVar = "The link's mass is another than when the fit was made, its centre the same."
+    PLACE: ClassVar = "joint"  # A link has its joint's name.
+    HAPPENS: ClassVar = "The link's mass has changed since the fit was made; its centre is the same."
 
     m: Float[Array, ""] = amplitude("kg", 0.1, "mass", signed=True)
 
     def bounds(self, scales):
-        """A link keeps a tenth of its mass: else it is no body."""
-        return {"m": (-KEEPS * scales("mass", self.site), np.inf)}
+        """Bounds that leave a link a tenth of its mass."""
+        return {"m": (-MAX_REMOVED_SHARE * scales("mass", self.site), np.inf)}
 
     def finger(self, finger):
         return eqx.tree_at(lambda f: f.mass, finger, finger.mass.at[self.index[0]].add(self.m))
 
 
 class ChangedCom(Changed):
-    """Δc: what a link's centre of mass has moved by, in its frame."""
+    """Δc: displacement of a link's centre of mass, in the link's frame."""
 
     ID: ClassVar = "changed_com"
     GROUP: ClassVar = "com"
     PLACE: ClassVar = "joint"
-    HAPPENS: ClassVar = "The link's centre of mass is elsewhere than when the fit was made."
+    HAPPENS: ClassVar = "The link's centre of mass has moved since the fit was made."
 
     x: Float[Array, ""] = amplitude("m", 0.03, "length", signed=True)
     y: Float[Array, ""] = amplitude("m", 0.03, "length", signed=True)
     z: Float[Array, ""] = amplitude("m", 0.03, "length", signed=True)
 
     def finger(self, finger):
-        by = jnp.stack([self.x, self.y, self.z])
-        return eqx.tree_at(lambda f: f.com, finger, finger.com.at[self.index[0]].add(by))
+        shift = jnp.stack([self.x, self.y, self.z])
+        return eqx.tree_at(lambda f: f.com, finger, finger.com.at[self.index[0]].add(shift))

@@ -1,5 +1,5 @@
-"""What the drive of a joint brings with it: friction by direction, with its own torque and with warmth; a constant
-torque, a dead zone, and a motor that turns with two joints."""
+"""Effects of a joint's drive: friction that depends on direction, torque or temperature; a constant torque, a dead
+zone, and a motor that turns with two joints."""
 
 from typing import ClassVar
 
@@ -28,17 +28,17 @@ class JointOffset(CatalogueEffect):
 
 
 class JointFrictionAsymmetric(CatalogueEffect):
-    """±(F ± Δ) and d|q̇|: Coulomb friction and damping are larger one way than the other, each by twice its amplitude.
+    """Δ + d|q̇|: friction differs between the two directions, Coulomb friction by 2Δ and damping by 2d.
 
-    Coulomb friction of F + Δ forwards and F − Δ back is F to either side of Δ: a constant torque wherever the joint is
-    free, and none where a fixture holds it.
+    Coulomb friction of F + Δ forwards and F − Δ backwards is the symmetric F plus a constant torque Δ. It acts where
+    the joint is free; where a fixture holds the joint, the fixture carries it.
     """
 
     ID: ClassVar = "joint_friction_asymmetric"
     PLACE: ClassVar = "joint"
     HAPPENS: ClassVar = "Friction one way is larger than the other way."
-    LOOKS: ClassVar = "The two branches of the loop are not the same distance from its middle, the more so at speed."
-    CHANGE: ClassVar = "Give the joint two frictions, one a direction; look for a preloaded gear or seal."
+    LOOKS: ClassVar = "One branch of the loop of torque is farther from its middle than the other, more so at speed."
+    CHANGE: ClassVar = "Give the joint one friction for each direction; look for a preloaded gear or seal."
 
     coulomb: Float[Array, ""] = amplitude("N m", 0.06, "torque", signed=True)
     damping: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed", signed=True)
@@ -50,34 +50,37 @@ class JointFrictionAsymmetric(CatalogueEffect):
 
 
 class JointTorqueFriction(CatalogueEffect):
-    """μ |τ| s(q̇): a drive loses a share of the torque τ that it gives, as gears do (Rhoban's BAM, model M3)."""
+    """μ |τ| s(q̇): a drive loses a share μ of its torque τ, as gears do (Rhoban's BAM, model M3)."""
 
     ID: ClassVar = "joint_torque_friction"
     PLACE: ClassVar = "joint"
     HAPPENS: ClassVar = "The drive loses a share of the torque that it gives, as gears do."
-    LOOKS: ClassVar = "The loop of torque widens with the load: driving takes more, being driven gives less back."
+    LOOKS: ClassVar = (
+        "The loop of torque widens with the load: driving it takes more torque, being driven gives less back."
+    )
     CHANGE: ClassVar = "Give the drive an efficiency, or use a gear with less loss."
 
-    mu: Float[Array, ""] = amplitude("1", 0.1, most=0.95)  # from 1 on a gear locks itself
+    mu: Float[Array, ""] = amplitude("1", 0.1, most=0.95)  # A gear with μ ≥ 1 locks itself.
 
     def torque_friction(self, mu):
         return mu.at[self.index[0]].add(self.mu)
 
 
-WARM = 303.15  # K, at which friction is the nominal one; any other would only move the nominal friction
+# K, at which the effect is zero. Another value would shift the identified nominal friction and no prediction.
+NOMINAL_TEMPERATURE = 303.15
 
 
 class JointFrictionWarmup(CatalogueEffect):
-    """(F + d|q̇|) s(q̇) w, w = exp(−t/T) of the session's time, or (303 K − ϑ)/10 K of a temperature ϑ (`by` 1).
+    """(a F + d|q̇|) s(q̇) w: friction of cold grease. w = exp(−t/T) of the session's time t, or (303 K − ϑ)/10 K of the
+    joint's temperature ϑ (`by` 1).
 
-    Grease that is cold is stiff. `a` is the share by which Coulomb friction is larger at the session's start, or 10 K
-    colder, and d the damping that comes on top. T is no longer than the session: friction that falls more slowly than
-    that is as good as constant.
+    `a` is the share of Coulomb friction F, and d the damping, that the joint has more of at the session's start, or at
+    293 K. T is no longer than the session: a slower fall could not be told from constant friction.
     """
 
     ID: ClassVar = "joint_friction_warmup"
     PLACE: ClassVar = "joint"
-    HAPPENS: ClassVar = "Cold grease is stiff: friction falls while the session goes on or the joint warms up."
+    HAPPENS: ClassVar = "Cold grease is stiff: friction falls as the session goes on, or as the joint warms up."
     LOOKS: ClassVar = "The same motion needs less torque in later trials; the loops shrink."
     CHANGE: ClassVar = "Warm the joint up before recording, measure its temperature, or let friction depend on it."
 
@@ -94,7 +97,7 @@ class JointFrictionWarmup(CatalogueEffect):
         by_time = jnp.exp(-x.session_time / self.T)
         if x.temperature is None:
             return jnp.where(self.by > 0.5, 0.0, by_time)
-        return jnp.where(self.by > 0.5, (WARM - x.temperature[self.index[0]]) / 10.0, by_time)
+        return jnp.where(self.by > 0.5, (NOMINAL_TEMPERATURE - x.temperature[self.index[0]]) / 10.0, by_time)
 
     def joint_friction(self, x, f_j, C, F):
         i = self.index[0]
@@ -106,10 +109,10 @@ class JointFrictionWarmup(CatalogueEffect):
 
 
 class JointCoupling(CatalogueEffect):
-    """f(q̇_a + ρ q̇_b), on a, and ρ f, on b: friction and inertia of a motor that turns with two joints.
+    """f on joint a and ρ f on joint b: friction and inertia f of a motor that turns at the speed q̇_a + ρ q̇_b.
 
-    A belt or a differential leads one motor past a joint to the next. Its Coulomb friction knows its direction once it
-    has turned.
+    Such a motor drives a joint through a belt or a differential across another joint. The direction of its Coulomb
+    friction is that of its last motion, and zero before the first.
     """
 
     ID: ClassVar = "joint_coupling"
@@ -124,9 +127,10 @@ class JointCoupling(CatalogueEffect):
     inertia: Float[Array, ""] = amplitude("kg m2", 0.2, "mass*length*length")
     ratio: Float[Array, ""] = shape("1", (1.0, -1.0), moves="not")
 
-    def _ways(self, finger_m: int) -> Float[Array, " m"]:
+    def _ways(self, m: int) -> Float[Array, " m"]:
+        """Factors of the m joints' speeds in the motor's speed."""
         a, b = self.index
-        return jnp.zeros(finger_m).at[a].add(1.0).at[b].add(self.ratio)
+        return jnp.zeros(m).at[a].add(1.0).at[b].add(self.ratio)
 
     def drive(self, model, x):
         a, b = self.index
@@ -150,16 +154,15 @@ class JointCoupling(CatalogueEffect):
 
     def shared_friction(self, x, memory):
         if x.held:
-            return ()  # the fixture carries it
+            return ()  # The fixture carries it.
         return (SharedFriction(self._ways(len(x.qd)), self.coulomb * jnp.ones_like(memory), memory),)
 
 
 class JointBacklash(CatalogueEffect):
-    """q_link = p, p = clip(p before, q − b/2, q + b/2): a dead zone between the drive, whose angle q is measured, and
-    the link, which stays where it is while the drive crosses it (play operator).
+    """q_link = p, p = clip(p before, q − b/2, q + b/2): a dead zone b between drive and link (play operator).
 
-    `a` is the share of the angle that goes through the dead zone `width`; 1 where all of it does. A trial starts in the
-    middle of it.
+    The drive's angle q is measured. The link rests while the drive crosses the dead zone `width`. `a` is the share of
+    the angle that goes through it. A trial starts in its middle.
     """
 
     ID: ClassVar = "joint_backlash"

@@ -1,5 +1,5 @@
-"""Joints: friction that falls with speed, builds up after a reversal or grows with load; elasticity that hardens,
-relaxes, meets a stop, or couples two joints through a passive tendon."""
+"""Effects at the joints: friction that falls with speed, builds up after a reversal or grows with load; elasticity that
+hardens, relaxes, meets a stop, or couples two joints through a passive tendon."""
 
 from typing import ClassVar
 
@@ -12,8 +12,8 @@ from jaxfinger.effects.base import CatalogueEffect, amplitude, dahl, delta, shap
 class JointStribeck(CatalogueEffect):
     """τ_f (1 + a exp(−(|q̇|/v_s)^δ)): friction falls with speed after breakaway (Armstrong-Hélouvry 1994).
 
-    With δ = 1, a v_s near the joint's own speed is not told from a damping; with δ = 2, whose friction holds first
-    and then falls, it is.
+    With δ = 1 and a v_s near the joint's own speed, the friction falls almost linearly and could not be told from
+    negative damping. With δ = 2 it is flat at first, and can be.
     """
 
     ID: ClassVar = "joint_stribeck"
@@ -21,7 +21,8 @@ class JointStribeck(CatalogueEffect):
     HAPPENS: ClassVar = "Friction is largest just after the joint breaks away and falls as it speeds up."
     LOOKS: ClassVar = "Slow sweeps need more torque than fast ones; torque against speed dips before it rises."
     CHANGE: ClassVar = "Lubricate or reseat the bearing, or add a Stribeck term to the joint's friction."
-    SLOW: ClassVar = 0.4  # of the joint's speed, the largest v_s worth trying with δ = 1
+    # Largest v_s to try with δ = 1, as a share of the joint's speed; see above.
+    MAX_EXPONENTIAL_SPEED: ClassVar = 0.4
 
     a: Float[Array, ""] = amplitude("1", 0.5)
     v_s: Float[Array, ""] = shape("rad/s", (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.5), "speed")
@@ -29,10 +30,10 @@ class JointStribeck(CatalogueEffect):
 
     @classmethod
     def sensible(cls, scales, site, shapes):
-        return shapes["delta"] == 2.0 or shapes["v_s"] <= 1.001 * cls.SLOW * scales("speed", site)
+        return shapes["delta"] == 2.0 or shapes["v_s"] <= 1.001 * cls.MAX_EXPONENTIAL_SPEED * scales("speed", site)
 
     def bounds(self, scales):
-        ends, slow = super().bounds(scales), self.SLOW * scales("speed", self.site)
+        ends, slow = super().bounds(scales), self.MAX_EXPONENTIAL_SPEED * scales("speed", self.site)
         return ends | {"v_s": (ends["v_s"][0], 2.0 * slow)} if self.delta == 1.0 else ends
 
     def joint_friction(self, x, f_j, C, F):
@@ -42,9 +43,9 @@ class JointStribeck(CatalogueEffect):
 
 
 class JointPresliding(CatalogueEffect):
-    """After a reversal friction builds up over an angle x₀ instead of at once: dz = (1 − z sgn dq)^δ dq/x₀ (Dahl 1968).
+    """dz = (1 − z sgn dq)^δ dq/x₀: after a reversal friction builds up over an angle x₀ (Dahl 1968).
 
-    `a` is the share of the friction that behaves so; 1 where all of it does.
+    `a` is the share of the joint's friction that builds up so.
     """
 
     ID: ClassVar = "joint_presliding"
@@ -69,7 +70,7 @@ class JointPresliding(CatalogueEffect):
 
     def directions(self, x, memory, joint, tendon):
         if x.held:
-            return joint, tendon  # the fixture carries it
+            return joint, tendon  # The fixture carries it.
         i = self.index[0]
         return joint.at[i].set((1 - self.a) * joint[i] + self.a * memory), tendon
 
@@ -80,7 +81,7 @@ class JointLoadFriction(CatalogueEffect):
     ID: ClassVar = "joint_load_friction"
     PLACE: ClassVar = "joint"
     HAPPENS: ClassVar = "The tendons press the joint's bearing, and its friction grows with that load."
-    LOOKS: ClassVar = "The torque that is missing grows with tension and turns its sign with the motion."
+    LOOKS: ClassVar = "The missing torque grows with tension, and changes its sign with the direction of motion."
     CHANGE: ClassVar = "Use a better bearing, or make the joint's friction grow with the tendons' load."
 
     mu: Float[Array, ""] = amplitude("1", 0.1)
@@ -91,7 +92,7 @@ class JointLoadFriction(CatalogueEffect):
 
 
 class _TowardsAnEnd(CatalogueEffect):
-    """Shared by what happens near one end of a joint's range: `end` is +1 for the upper one, −1 for the lower."""
+    """Base class of effects near one end of a joint's range. `end` is +1 for the upper end, −1 for the lower."""
 
     limits: Float[Array, "2"]
 
@@ -101,7 +102,7 @@ class _TowardsAnEnd(CatalogueEffect):
 
 
 class ElasticHardening(_TowardsAnEnd):
-    """± τ_end exp(−d/w), d the angle to an end of the range: it stiffens exponentially towards it (Esteki 1996)."""
+    """± τ_end exp(−d/w), d the angle to an end of the range: an exponential spring (Esteki 1996)."""
 
     ID: ClassVar = "elastic_hardening"
     PLACE: ClassVar = "joint"
@@ -120,11 +121,14 @@ class ElasticHardening(_TowardsAnEnd):
 
 
 class JointStop(_TowardsAnEnd):
-    """± k ⟨d⟩₊ (1 + c ḋ): contact with a stop inside the range, `place` of the way from limit to limit."""
+    """± k ⟨d⟩₊ (1 + c ḋ), d the depth beyond an angle: contact with a stop inside the range.
+
+    The stop stands at the share `place` of the range, from the lower limit where `end` is +1, else from the upper one.
+    """
 
     ID: ClassVar = "joint_stop"
     PLACE: ClassVar = "joint"
-    HAPPENS: ClassVar = "The joint meets a stop inside the range that was recorded."
+    HAPPENS: ClassVar = "The joint meets a stop inside the recorded range."
     LOOKS: ClassVar = "Torque rises steeply beyond one angle and nowhere else."
     CHANGE: ClassVar = "Record short of the stop, move it, or add it as a contact."
 
@@ -143,12 +147,12 @@ class JointStop(_TowardsAnEnd):
 
 
 class ElasticRelaxation(CatalogueEffect):
-    """ż = k q̇ − z/T: a Maxwell branch beside the elastic torque, which relaxes at a hold (standard linear solid)."""
+    """k z, ż = q̇ − z/T: a Maxwell branch beside the elastic torque, which relaxes at a hold (standard linear solid)."""
 
     ID: ClassVar = "elastic_relaxation"
     PLACE: ClassVar = "joint"
     HAPPENS: ClassVar = "The elastic torque relaxes while the joint is held, and lags while it moves."
-    LOOKS: ClassVar = "Torque creeps at each hold, and the loop against the angle widens at a certain speed."
+    LOOKS: ClassVar = "Torque creeps at each hold, and the loop of torque against angle is widest at a certain speed."
     CHANGE: ClassVar = "Add a spring and damper in series beside the joint's spring; wait longer at holds."
 
     stiffness: Float[Array, ""] = amplitude("N m/rad", 0.3, "torque/angle")
@@ -169,9 +173,9 @@ class ElasticRelaxation(CatalogueEffect):
 
 
 class PassiveTendon(CatalogueEffect):
-    """An unmeasured elastic tendon over two joints, taut where x = q_a − ρ q_b − φ > 0: torques κx and −ρκx.
+    """κx and −ρκx on joints a and b: an unmeasured elastic tendon, taut where x = q_a − ρ q_b − φ > 0.
 
-    κ = k r_a², ρ = r_b/r_a, φ = l₀/r_a for a spring k on moment arms r_a, r_b with slack l₀ (Borghesan 2010).
+    A spring k on moment arms r_a, r_b with slack l₀ has κ = k r_a², ρ = r_b/r_a, φ = l₀/r_a (Borghesan 2010).
     """
 
     ID: ClassVar = "passive_tendon"

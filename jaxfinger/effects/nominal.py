@@ -1,4 +1,4 @@
-"""Terms of the nominal model that a recipe may leave out: they are candidates like any other."""
+"""Terms of the nominal model that a recipe may leave out. They are then candidates like other effects."""
 
 from functools import cache
 from typing import ClassVar
@@ -16,7 +16,7 @@ class JointElastic(CatalogueEffect):
     ID: ClassVar = "joint_elastic"
     PLACE: ClassVar = "joint"
     HAPPENS: ClassVar = "The joint has a spring that the recipe leaves out."
-    LOOKS: ClassVar = "Torque depends on the angle, the same both ways."
+    LOOKS: ClassVar = "Torque depends on the angle, the same in both directions."
     CHANGE: ClassVar = "Add `joint_elastic` to `model.terms` of the recipe."
 
     k0: Float[Array, ""] = amplitude("N m", 0.2, "torque", signed=True)
@@ -34,7 +34,7 @@ class JointCoulomb(CatalogueEffect):
     ID: ClassVar = "joint_coulomb"
     PLACE: ClassVar = "joint"
     HAPPENS: ClassVar = "The joint has dry friction that the recipe leaves out."
-    LOOKS: ClassVar = "Torque jumps at each reversal, by as much at any speed."
+    LOOKS: ClassVar = "Torque jumps at each reversal, by the same amount at any speed."
     CHANGE: ClassVar = "Add `joint_coulomb` to `model.terms` of the recipe."
 
     c0: Float[Array, ""] = amplitude("N m", 0.1, "torque")
@@ -52,7 +52,7 @@ class JointDamping(CatalogueEffect):
     ID: ClassVar = "joint_damping"
     PLACE: ClassVar = "joint"
     HAPPENS: ClassVar = "The joint has damping that the recipe leaves out."
-    LOOKS: ClassVar = "Torque is in proportion to speed."
+    LOOKS: ClassVar = "Torque is proportional to speed."
     CHANGE: ClassVar = "Add `joint_damping` to `model.terms` of the recipe."
 
     d: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed")
@@ -68,7 +68,9 @@ class TendonFrictionTerm(CatalogueEffect):
     ID: ClassVar = "tendon_friction"
     PLACE: ClassVar = "tendon"
     HAPPENS: ClassVar = "The tendon loses tension on its way, which the recipe leaves out."
-    LOOKS: ClassVar = "Torque is less than tension times moment arm while it is pulled, more while it is let go."
+    LOOKS: ClassVar = (
+        "Torque is less than tension times moment arm while the tendon is pulled, more while it is let go."
+    )
     CHANGE: ClassVar = "Add `tendon_friction` to `model.terms` of the recipe."
 
     a0: Float[Array, ""] = amplitude("N", 0.05, "tension", signed=True)
@@ -85,7 +87,7 @@ class Gravity(CatalogueEffect):
     ID: ClassVar = "gravity"
     PLACE: ClassVar = "base"
     HAPPENS: ClassVar = "The links have weight, which the recipe leaves out."
-    LOOKS: ClassVar = "Torque goes with posture as a weight would have it."
+    LOOKS: ClassVar = "Torque changes with posture as that of a weight does."
     CHANGE: ClassVar = "Add `gravity` to `model.terms` of the recipe."
 
     x: Float[Array, ""] = amplitude("m s-2", 0.2, "torque/mass/length", signed=True)
@@ -98,7 +100,7 @@ class Gravity(CatalogueEffect):
 
 @cache
 def of_degree(term: type[CatalogueEffect], degree: int) -> type[CatalogueEffect]:
-    """A polynomial term as a recipe of this degree has it: higher coefficients are nothing, and not looked for."""
+    """Restrict a polynomial term to a degree. Higher coefficients are zero, and no parameters."""
     names = list(term.parameters())
     if degree + 1 >= len(names):
         return term

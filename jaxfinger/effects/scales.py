@@ -1,4 +1,7 @@
-"""Sizes of a specimen, by which an effect's are plausible: the same physics in other units has the same catalogue."""
+"""Sizes of a specimen's signals, which scale the sizes that its effects may have.
+
+The same physics in other units then has the same catalogue.
+"""
 
 import math
 import re
@@ -11,12 +14,13 @@ from jaxtyping import Array, Float
 
 from jaxfinger.model import Finger, Motion
 
-MOST = 95.0  # percentile that counts as the most: some samples are spikes
+# Percentile of |signal| that counts as its size. The maximum would be that of spikes and of filters' edges.
+SIZE_PERCENTILE = 95.0
 
 
 @runtime_checkable
 class Recorded(Protocol):
-    """Trials of one experiment: motion, measured channels, and where they count (not zero)."""
+    """Trials of one experiment: motion, measured channels, and masks that are zero where samples do not count."""
 
     @property
     def x(self) -> Motion: ...
@@ -30,10 +34,10 @@ class Recorded(Protocol):
 
 @dataclass(frozen=True)
 class Scales:
-    """How large a specimen's signals are, joint by joint and tendon by tendon (SI; N and m where a joint slides)."""
+    """Sizes of a specimen's signals by joint and tendon, SI. Prismatic joints have N and m for N m and rad."""
 
-    torque: Float[np.ndarray, " m"]  # N m, of its torque sensor or drive; where none was measured, that of the tendons
-    angle: Float[np.ndarray, " m"]  # rad, that the joint goes through
+    torque: Float[np.ndarray, " m"]  # N m, measured; that of the links' weight where nothing was
+    angle: Float[np.ndarray, " m"]  # rad, range of the motion
     speed: Float[np.ndarray, " m"]  # rad/s
     acceleration: Float[np.ndarray, " m"]  # rad/s²
     mass: Float[np.ndarray, " m"]  # kg, of the link
@@ -48,7 +52,7 @@ class Scales:
 
     @classmethod
     def of(cls, finger: Finger, recorded: Iterable[Recorded] = ()) -> "Scales":
-        """What the trials show; where they show nothing, what the description lets expect."""
+        """Read the scales from trials, and from the finger's description where the trials show nothing."""
         recorded = list(recorded)
         m, n = finger.m, finger.n
         low, high = np.asarray(finger.limits).reshape(m, 2).T
@@ -60,19 +64,19 @@ class Scales:
         session = max(session, trial)
 
         def each(count: int, values) -> Float[np.ndarray, " count"]:
-            """The largest that any experiment shows, column by column."""
+            """Largest of the experiments' values, by column."""
             found = [np.asarray(v) for v in values]
             return np.max(found, axis=0) if found else np.zeros(count)
 
         travel = each(m, (_range(r.x.q) for r in recorded))
         angle = _filled(travel, high - low)
-        speed = _filled(each(m, (_most(r.x.qd) for r in recorded)), angle / min(trial, 1.0))
-        acceleration = _filled(each(m, (_most(r.x.qdd) for r in recorded)), speed**2 / angle)
+        speed = _filled(each(m, (_size(r.x.qd) for r in recorded)), angle / min(trial, 1.0))
+        acceleration = _filled(each(m, (_size(r.x.qdd) for r in recorded)), speed**2 / angle)
         mass = _filled(np.asarray(finger.mass), np.ones(m))
         weight = float(mass.sum() * (np.linalg.norm(np.asarray(finger.gravity)) or length / trial**2) * length)
         measured = each(m, (_counted(r, "joint_torque", m) for r in recorded))
         torque = _filled(measured, np.full(m, weight))
-        tension = _filled(each(n, (_most(r.x.tension) for r in recorded)), np.full(n, torque.max(initial=0.0) / length))
+        tension = _filled(each(n, (_size(r.x.tension) for r in recorded)), np.full(n, torque.max(initial=0.0) / length))
         pulled = each(n, (_counted(r, "tendon_excursion", n, _range) for r in recorded))
         excursion = _filled(pulled, np.full(n, 0.1 * length))
         pull = excursion * float(np.max(speed / angle, initial=0.0))
@@ -82,8 +86,10 @@ class Scales:
         )  # fmt: skip
 
     def __call__(self, of: str, site: tuple[str, ...] = ()) -> float:
-        """A product of scales at a site, such as `torque/speed` or `mass*length`; the largest of all at a site that is
-        no joint or tendon, and the smallest of a pair, which has to matter at both.
+        """Evaluate a product of scales at a site, such as `torque/speed` or `mass*length`.
+
+        A pair has the smaller of its two values, since its effect has to matter at both. A site that is neither joint
+        nor tendon has the largest of all joints or tendons.
         """
         value = 1.0
         for sign, name in re.findall(r"([*/]?)([a-z]+)", "" if of == "1" else of):
@@ -103,24 +109,30 @@ _OF_JOINTS = ("torque", "angle", "speed", "acceleration", "mass")
 
 
 def _filled(found: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    """Where nothing was found (zero, or a thousandth of the others), the median of the others, or `otherwise`."""
+    """Replace values below a thousandth of the largest by the median of the rest, or by `otherwise` if all are zero."""
     shows = found > 1e-3 * found.max(initial=0.0)
     return np.where(shows, found, np.median(found[shows]) if shows.any() else otherwise).astype(float)
 
 
-def _most(values) -> np.ndarray:
+def _size(values) -> np.ndarray:
+    """Size of each row: a high percentile of its absolute values."""
     flat = np.abs(np.asarray(values)).reshape(len(values), math.prod(np.shape(values)[1:]))
-    return np.percentile(flat, MOST, axis=1) if flat.size else np.zeros(len(flat))
+    return np.percentile(flat, SIZE_PERCENTILE, axis=1) if flat.size else np.zeros(len(flat))
 
 
 def _range(values) -> np.ndarray:
+    """Range of each row between its low and high percentile."""
     flat = np.asarray(values).reshape(len(values), math.prod(np.shape(values)[1:]))
-    return np.ptp(np.percentile(flat, [100.0 - MOST, MOST], axis=1), axis=0) if flat.size else np.zeros(len(flat))
+    return (
+        np.ptp(np.percentile(flat, [100.0 - SIZE_PERCENTILE, SIZE_PERCENTILE], axis=1), axis=0)
+        if flat.size
+        else np.zeros(len(flat))
+    )
 
 
-def _counted(r: Recorded, channel: str, columns: int, size=_most) -> np.ndarray:
-    """Of the samples of a channel that count, column by column."""
+def _counted(r: Recorded, channel: str, columns: int, measure=_size) -> np.ndarray:
+    """Size of a channel's samples that count, by column."""
     if channel not in r.y:
         return np.zeros(columns)
     y, mask = np.asarray(r.y[channel]), np.asarray(r.mask[channel]) > 0
-    return np.array([size(a[k][None])[0] if k.any() else 0.0 for a, k in zip(y, mask, strict=True)])
+    return np.array([measure(a[k][None])[0] if k.any() else 0.0 for a, k in zip(y, mask, strict=True)])

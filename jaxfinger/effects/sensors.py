@@ -1,4 +1,4 @@
-"""Sensors that do not say what the finger does: gains, offsets, drift, rotation, delay."""
+"""Errors of the sensors: gains, offsets, drift, rotation, delay."""
 
 from typing import ClassVar
 
@@ -25,11 +25,11 @@ class TorqueSensorScale(CatalogueEffect):
 
 
 class TorqueSensorDrift(CatalogueEffect):
-    """o(s) − o(tare), o = −b T exp(−s/T) + A cos(2π (s − m)/P) + B sin(2π (s − m)/P): an offset follows a temperature.
+    """o(s) − o(tare), o = −b T exp(−s/T) + A cos(2π (s − m)/P) + B sin(2π (s − m)/P): a thermal offset.
 
-    A strain gauge warms up from the session's start on, s = 0, at first by b a second, and goes with the room, which
-    heats and cools with a period P. The tare, `tare` seconds before the trial, takes away what the offset was then; m
-    is the middle of the session.
+    The gauge warms up from the session's start, s = 0; its offset changes by b a second at first. The room heats and
+    cools with a period P; m is the middle of the session. A tare, `tare` seconds before the trial, subtracts the offset
+    of that time.
     """
 
     ID: ClassVar = "torque_sensor_drift"
@@ -64,7 +64,7 @@ class TensionSensorScale(CatalogueEffect):
     ID: ClassVar = "tension_sensor_scale"
     PLACE: ClassVar = "tendon"
     HAPPENS: ClassVar = "A tendon's force sensor has a wrong gain or offset."
-    LOOKS: ClassVar = "All that its tension causes is off by the same share, both ways."
+    LOOKS: ClassVar = "Every effect of its tension is off by the same share, in both directions."
     CHANGE: ClassVar = "Calibrate the sensor with hanging weights."
 
     gain: Float[Array, ""] = amplitude("1", 0.05, signed=True)
@@ -78,9 +78,10 @@ class TensionSensorScale(CatalogueEffect):
 
 
 class _Encoder(CatalogueEffect):
-    """Shared by errors of a joint's encoder: q = q_measured − error(q_measured)."""
+    """Base class of the errors of a joint's encoder: q = q_measured − error(q_measured)."""
 
     def error(self, q: Float[Array, "*T"]) -> Float[Array, "*T"]:
+        """Error at the measured angle q, rad."""
         return jnp.zeros_like(q)
 
     def true_motion(self, x):
@@ -94,7 +95,7 @@ class EncoderOffset(_Encoder):
     ID: ClassVar = "encoder_offset"
     PLACE: ClassVar = "joint"
     HAPPENS: ClassVar = "A joint's encoder does not read zero at zero."
-    LOOKS: ClassVar = "Weights and moment arms are those of another angle, everywhere by the same one."
+    LOOKS: ClassVar = "Weights and moment arms fit another angle, by the same offset everywhere."
     CHANGE: ClassVar = "Zero the encoder in a jig of known posture."
 
     offset: Float[Array, ""] = amplitude("rad", 0.02, "angle", signed=True)
@@ -104,13 +105,13 @@ class EncoderOffset(_Encoder):
 
 
 class EncoderEccentricity(_Encoder):
-    """q_measured = q + A sin q + B cos q: once-per-turn error of an off-axis magnet, a sin(q + φ)."""
+    """q_measured = q + A sin q + B cos q: once-per-turn error of an off-axis magnet."""
 
     ID: ClassVar = "encoder_eccentricity"
     PLACE: ClassVar = "joint"
-    HAPPENS: ClassVar = "A joint's magnet is off its axis, and its angle errs once a turn."
-    LOOKS: ClassVar = "Excursion and torque bend as a sine of the angle would have it."
-    CHANGE: ClassVar = "Centre the magnet, or correct the angle by this sine."
+    HAPPENS: ClassVar = "A joint's magnet is off its axis: the angle has an error with a period of one turn."
+    LOOKS: ClassVar = "Excursion and torque are off by a sine of the angle."
+    CHANGE: ClassVar = "Centre the magnet, or subtract this sine from the angle."
 
     A: Float[Array, ""] = amplitude("rad", 0.01, "angle", signed=True)
     B: Float[Array, ""] = amplitude("rad", 0.01, "angle", signed=True)
@@ -143,12 +144,12 @@ CHANNELS = ("q", "tendon_force", "tendon_excursion", "joint_torque", "fingertip_
 
 
 class ChannelDelay(CatalogueEffect):
-    """y(t − d): one channel lags the others (first order in d). Where a fixture holds the joints all is at rest."""
+    """y(t − d): one channel lags the others (first order in d). In trials with held joints it shows nothing."""
 
     ID: ClassVar = "channel_delay"
     PLACE: ClassVar = "channel"
     HAPPENS: ClassVar = "One channel lags the others."
-    LOOKS: ClassVar = "The residual goes with the rate of that channel: nothing at rest, most at speed."
+    LOOKS: ClassVar = "The residual is proportional to the rate of that channel: zero at rest, largest at speed."
     CHANGE: ClassVar = "Take the channel's time stamps at its source, or shift it by the delay."
 
     delay: Float[Array, ""] = amplitude("s", 0.004, "angle/speed")
@@ -162,6 +163,7 @@ class ChannelDelay(CatalogueEffect):
         return (CHANNELS.index(site[0]),)
 
     def _of(self, channel: str) -> Float[Array, ""]:
+        """Delay of a channel, s: zero unless it is the site."""
         return jnp.where(self.index[0] == CHANNELS.index(channel), self.delay, 0.0)
 
     def true_motion(self, x):
@@ -178,7 +180,7 @@ class ChannelDelay(CatalogueEffect):
         if x.held:
             return y
         if channel == "joint_torque":
-            # The free finger's external torque is zero by construction, not by a sensor. A hold has no rate, though
-            # the differences of its first and last sample reach over its edges.
+            # No sensor measures the free finger's external torque, which is zero by definition. A joint at rest has no
+            # rate; the differences at the first and last sample of a hold would reach into the motion beside it.
             return y - self._of(channel) * rate(y, x.time) * jnp.where(x.qd != 0.0, x.motorised, 0.0)
         return y - self._of(channel) * rate(y, x.time)

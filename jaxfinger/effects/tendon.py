@@ -1,4 +1,4 @@
-"""Tendons: they stretch, creep and lag; their moment arms couple joints and grow with tension."""
+"""Effects of the tendons: stretch, creep and backlash; moment arms that couple joints or grow with tension."""
 
 from itertools import combinations
 from typing import ClassVar
@@ -10,13 +10,13 @@ from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
 
 
 class TendonStretch(CatalogueEffect):
-    """compliance (f + toe f₀ (1 − exp(−f/f₀))): it lengthens, softer while its fibres straighten (the toe)."""
+    """compliance (f + toe f₀ (1 − exp(−f/f₀))): stretch, softer at low tension while the fibres straighten (toe)."""
 
     ID: ClassVar = "tendon_stretch"
     PLACE: ClassVar = "tendon"
     HAPPENS: ClassVar = "The tendon lengthens under tension."
-    LOOKS: ClassVar = "Excursion goes with tension at a joint that does not move."
-    CHANGE: ClassVar = "Use a stiffer tendon, or give the simulator's this compliance."
+    LOOKS: ClassVar = "Excursion changes with tension while no joint moves."
+    CHANGE: ClassVar = "Use a stiffer tendon, or give the simulator's tendon this compliance."
 
     compliance: Float[Array, ""] = amplitude("m/N", 0.04, "excursion/tension")
     toe: Float[Array, ""] = shape("1", (0.0, 2.0, 6.0), moves="by differences")
@@ -29,13 +29,13 @@ class TendonStretch(CatalogueEffect):
 
 
 class TendonCreep(CatalogueEffect):
-    """c y, T ẏ = f − y: the tendon goes on lengthening under held tension (Kelvin–Voigt)."""
+    """c y, T ẏ = f − y: the tendon creeps under held tension (Kelvin–Voigt)."""
 
     ID: ClassVar = "tendon_creep"
     PLACE: ClassVar = "tendon"
     HAPPENS: ClassVar = "The tendon goes on lengthening while its tension is held."
-    LOOKS: ClassVar = "Excursion drifts at each hold, the slower the longer it lasts."
-    CHANGE: ClassVar = "Pre-stretch the tendon, wait at holds, or add a Kelvin-Voigt element."
+    LOOKS: ClassVar = "Excursion drifts during each hold, more and more slowly."
+    CHANGE: ClassVar = "Pre-stretch the tendon, wait longer at holds, or add a Kelvin-Voigt element."
 
     compliance: Float[Array, ""] = amplitude("m/N", 0.01, "excursion/tension")
     T: Float[Array, ""] = shape("s", (0.015, 0.05, 0.15, 0.5, 1.5), "trial")
@@ -55,9 +55,9 @@ class TendonCreep(CatalogueEffect):
 
 
 class TendonBacklash(CatalogueEffect):
-    """Excursion lags by a dead zone: p = clip(p before, f(q) − b/2, f(q) + b/2), the play operator.
+    """p = clip(p before, f(q) − b/2, f(q) + b/2): the excursion lags by a dead zone b (play operator).
 
-    `a` is the share of the excursion that goes through the dead zone `width`; 1 where all of it does.
+    `a` is the share of the excursion that goes through the dead zone `width`.
     """
 
     ID: ClassVar = "tendon_backlash"
@@ -85,14 +85,14 @@ class TendonBacklash(CatalogueEffect):
 
 
 class MomentArmCoupling(CatalogueEffect):
-    """A q_a q_b + B q_a² q_b + D q_a q_b²: excursion depends on two joints together."""
+    """A q_a q_b + B q_a² q_b + D q_a q_b²: the excursion depends on products of two joints' angles."""
 
     ID: ClassVar = "moment_arm_coupling"
     PLACE: ClassVar = "tendon"
-    HAPPENS: ClassVar = "A tendon's excursion depends on two joints together."
+    HAPPENS: ClassVar = "A tendon's excursion depends on two joints together, not on each by itself."
     LOOKS: ClassVar = "Its moment arm at one joint changes with the angle of the other."
     CHANGE: ClassVar = (
-        "Record a trial that moves both, and turn on `cross_terms` in the recipe; or route the tendon apart."
+        "Record a trial that moves both, and set `cross_terms` in the recipe; or route the tendon apart from one joint."
     )
 
     A: Float[Array, ""] = amplitude("m", 0.08, "excursion/angle/angle", signed=True)

@@ -1,4 +1,4 @@
-"""Friction of the tendons' paths beyond the affine law, and tendons that drag one another."""
+"""Friction of the tendons' paths beyond the affine law, and crosstalk between tendons."""
 
 from typing import ClassVar
 
@@ -9,16 +9,16 @@ from jaxfinger.effects.base import CatalogueEffect, amplitude, dahl, delta, shap
 
 
 class TendonFrictionCapstan(CatalogueEffect):
-    """f (1 − exp(−μ θ(q))), θ = Σ |q_i| over the joints crossed: the loss grows with the wrap, so with posture.
+    """f (1 − exp(−μ θ(q))), θ = Σ |q_i| over the joints crossed: the loss grows with the wrap angle, so with posture.
 
-    `curvature` 1 is Euler and Eytelwein's law, 0 its first order, f μ θ.
+    `curvature` 1 is Euler and Eytelwein's law; 0 is its first order, f μ θ.
     """
 
     ID: ClassVar = "tendon_friction_capstan"
     PLACE: ClassVar = "tendon"
-    HAPPENS: ClassVar = "The tendon's friction grows with the angle that it is wrapped by, so with posture."
+    HAPPENS: ClassVar = "The tendon's friction grows with the angle of its wrap, so with posture."
     LOOKS: ClassVar = "The share of tension that is lost rises as the finger flexes."
-    CHANGE: ClassVar = "Use Euler and Eytelwein's law of the wrap, or larger pulleys."
+    CHANGE: ClassVar = "Use Euler and Eytelwein's law for the wrap, or larger pulleys."
     SIZES: ClassVar = (1.0, 0.05)
 
     crossed: Float[Array, " m"]
@@ -42,8 +42,8 @@ class TendonFrictionViscous(CatalogueEffect):
     ID: ClassVar = "tendon_friction_viscous"
     PLACE: ClassVar = "tendon"
     HAPPENS: ClassVar = "The tendon's friction grows with its speed."
-    LOOKS: ClassVar = "Tension is lost in fast motions, and not in slow ones."
-    CHANGE: ClassVar = "Add damping to the tendon, or another lubricant to its sheath."
+    LOOKS: ClassVar = "More tension is lost in fast motions than in slow ones."
+    CHANGE: ClassVar = "Add damping to the tendon, or change the lubricant of its sheath."
 
     b: Float[Array, ""] = amplitude("N s/m", 0.04, "tension/pull")
 
@@ -53,11 +53,11 @@ class TendonFrictionViscous(CatalogueEffect):
 
 
 class TendonFrictionPresliding(CatalogueEffect):
-    """Friction builds up over a small excursion x₀ after each reversal: dz = (1 − z sgn dl)^δ dl/x₀ (Dahl, LuGre).
+    """dz = (1 − z sgn dl)^δ dl/x₀: after a reversal friction builds up over an excursion x₀ (Dahl, LuGre).
 
-    At a held joint a tendon that `stretches` (1) slides by its own stretch, in proportion to tension: there the length
-    is f₀ of tension. One that does not (0) has the nominal friction there. `a` is the share of the loss that behaves
-    so.
+    At held joints a tendon that `stretches` (1) slides in proportion to its tension: friction builds up over a change
+    f₀ of tension. One that does not stretch (0) has the nominal friction there. `a` is the share of the loss that
+    builds up so.
     """
 
     ID: ClassVar = "tendon_friction_presliding"
@@ -99,12 +99,12 @@ class TendonFrictionPresliding(CatalogueEffect):
 
 
 class TendonFrictionSaturating(CatalogueEffect):
-    """c f* ((f/f*)^p − f/f*), f* a large tension: the loss is not affine in tension."""
+    """c f* ((f/f*)^p − f/f*), f* a large tension: part of the loss that is not affine in tension."""
 
     ID: ClassVar = "tendon_friction_saturating"
     PLACE: ClassVar = "tendon"
-    HAPPENS: ClassVar = "What the tendon loses is not a straight line in its tension."
-    LOOKS: ClassVar = "The lost share falls, or rises, from low tension to high."
+    HAPPENS: ClassVar = "The tendon's loss is not a straight line in its tension."
+    LOOKS: ClassVar = "The share of tension that is lost falls, or rises, from low tension to high."
     CHANGE: ClassVar = "Use a power law for the tendon's friction; record more tensions in ID.4."
 
     c: Float[Array, ""] = amplitude("1", 0.15, signed=True)
@@ -118,16 +118,16 @@ class TendonFrictionSaturating(CatalogueEffect):
 
 
 class TendonCrosstalk(CatalogueEffect):
-    """f_k + ε max(f_j − f₀, 0): a pulled tendon j drags its neighbour k, from the tension on at which they touch.
+    """f_k + ε max(f_j − f₀, 0): a pulled tendon j drags its neighbour k once its tension exceeds the `onset` f₀.
 
-    `behind` 0: at the actuators, so that the neighbour's friction takes its share; 1: past the friction of both.
-    `onset` is f₀.
+    The drag adds to the tension at the actuators (`behind` 0), so that the neighbour's friction takes a share of it, or
+    past the friction of both tendons (1).
     """
 
     ID: ClassVar = "tendon_crosstalk"
     PLACE: ClassVar = "tendon pair"
     HAPPENS: ClassVar = "A tendon that is pulled drags its neighbour along."
-    LOOKS: ClassVar = "A joint feels a tendon that does not cross it, in proportion to that one's tension."
+    LOOKS: ClassVar = "Torque at a joint grows with the tension of a tendon that does not cross it."
     CHANGE: ClassVar = "Separate the two paths, or add the drag to the neighbour's tension."
     SIZES: ClassVar = (1.0, 0.05)
 

@@ -22,7 +22,7 @@ from jaxfinger.data import (
 )
 from jaxfinger.data.motion import quick_cutoff
 from jaxfinger.data.sizes import Sizes
-from jaxfinger.effects.drive import WARM
+from jaxfinger.effects.drive import NOMINAL_TEMPERATURE
 from jaxfinger.experiments.table import Experiment
 
 AT_REST = 6.0  # times the median loss: an angle that turns back by less has not moved; twice that for single samples
@@ -214,16 +214,16 @@ def row(
 
 
 def _temperatures(r: PreparedTrial) -> Float[np.ndarray, "M m"]:
-    """K, of each joint: of the channels named after it, else of all; `WARM` where none was measured."""
+    """K, of each joint: of the channels named after it, else of all; `NOMINAL_TEMPERATURE` where none was measured."""
     M, trial = len(r.trial.time) // r.size, r.trial
     if trial.temperature is None:
-        return np.full((M, r.finger.m), WARM)
+        return np.full((M, r.finger.m), NOMINAL_TEMPERATURE)
     of = [
         [k for k, name in enumerate(trial.temperature_names) if joint in name]
         or list(range(trial.temperature.shape[1]))
         for joint in r.finger.joint_names
     ]
-    known = np.where(np.isfinite(trial.temperature), trial.temperature, WARM)
+    known = np.where(np.isfinite(trial.temperature), trial.temperature, NOMINAL_TEMPERATURE)
     return np.stack([r.mean(known[:, k]).mean(axis=1) for k in of], axis=1)
 
 

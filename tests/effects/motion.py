@@ -1,4 +1,4 @@
-"""A finger that every test of the effects moves: free with reversals, and held while tension rises and falls."""
+"""The finger of the effects' tests and its motions: free with reversals, and held while tension rises and falls."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ def with_effects(*effects: CatalogueEffect) -> Model:
 
 
 def motion(T: int = 60, rate: float = 100.0, held: bool = False) -> Motion:
-    """All joints go through their ranges at different rates; tensions likewise."""
+    """A motion of T samples at `rate` Hz: joints go through their ranges at different rates, tensions likewise."""
     time = np.arange(T) / rate
     limits = np.asarray(MODEL.finger.limits)
     turns = 2 * np.pi * (1.5 + 0.7 * np.arange(MODEL.finger.m))[:, None]
@@ -42,7 +42,7 @@ def motion(T: int = 60, rate: float = 100.0, held: bool = False) -> Motion:
     return replace(x, held=held)
 
 
-# Each motion and what the nominal model reads of it.
+# The motions, each with the channels that the nominal model predicts for it.
 MOTIONS = [
     (x, predict(MODEL, x, channels))
     for x, channels in ((motion(), ("joint_torque", "tendon_excursion")), (motion(held=True), ("fingertip_force",)))

@@ -1,4 +1,4 @@
-"""Every effect of the catalogue: absent at zero, differentiable there, at every site and shape, written and read."""
+"""Every effect of the catalogue is absent at zero and differentiable there, and is written and read at every site."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -38,9 +38,9 @@ def written(effect):
 
 
 def value_and_slope(effect, x, channels):
-    """Channels, and their derivative along all amplitudes at once, each as fast as it is large.
+    """Channels, and their derivative as all amplitudes grow together, each by its plausible size.
 
-    One operation at a time, so that the effects share compilations.
+    Nothing is jitted: the effects then share the compiled operations.
     """
     sizes = effect.sizes(SCALES, effect.site)
     amplitudes = {n: (getattr(effect, n), jnp.asarray(unit)) for n, unit in sizes.items()}
@@ -88,7 +88,7 @@ def test_every_site_and_shape(name):
 
 
 def test_no_prediction_calls_lapack():
-    """Predictions run side by side, and two that call it can wait for each other for ever. All effects at once."""
+    """Predictions run side by side, and two that call LAPACK can deadlock. One model holds all effects."""
     model = with_effects(*(plausible(kind, kind.sites(FINGER)[0], {}) for kind in EVERY.values()))
     for x, nominal in MOTIONS:
         lowered = jax.jit(lambda model, x=x, channels=tuple(nominal): predict(model, x, channels)).lower(model)
@@ -97,7 +97,7 @@ def test_no_prediction_calls_lapack():
 
 @pytest.mark.parametrize("name", EVERY)
 def test_what_an_effect_leaves_alone_need_not_be_computed_again(name):
-    """Beside the terms without it, an effect changes the torque and the excursion as it does alone."""
+    """Torque and excursion computed from known nominal terms equal those computed from scratch."""
     kind = EVERY[name]
     effect = plausible(kind, kind.sites(FINGER)[0], kind.shapes(FINGER, kind.sites(FINGER)[0], SCALES)[0])
     model = with_effects(effect)
@@ -145,11 +145,13 @@ def test_a_term_that_a_recipe_left_out_has_the_recipes_degree():
     moving = [p for p in describe(with_effects(effect)) if p.group == "effects" and p.determinable]
     assert [p.name.split()[-1] for p in moving] == ["c0"]
     assert nominal_terms(2, 2) == NOMINAL_TERMS
-    assert nominal_terms(0, 1)["joint_coulomb"] is nominal_terms(2, 1)["joint_coulomb"]  # compiled once
+    assert (
+        nominal_terms(0, 1)["joint_coulomb"] is nominal_terms(2, 1)["joint_coulomb"]
+    )  # One class, so that it compiles once.
 
 
 def test_all_effects_together_simulate_forward():
-    """Sensors apart, all act in one finger; its motion stays finite and differs from the nominal one."""
+    """With all effects in one finger its motion stays finite and differs from the nominal one."""
     effects = []
     for kind in CATALOGUE.values():
         site = kind.sites(FINGER)[-1]
@@ -214,7 +216,7 @@ def test_every_effect_says_what_happens_what_it_looks_like_and_what_to_change(na
 
 
 def test_the_same_machine_in_other_units_has_the_same_catalogue():
-    """Masses and torques a thousandth, lengths ten times, times twice: sizes and shapes go with them."""
+    """Scales follow units: here masses and torques times 0.001, lengths times 10, times times 2."""
     x, y = MOTIONS[0]
     force = 1e-3 / 10.0
     unit = {"mass": 1e-3, "torque": 1e-3, "length": 10.0, "time": 2.0}
@@ -253,7 +255,7 @@ def test_a_scale_is_a_product_at_its_site():
 @pytest.mark.parametrize("name", ["payload", "changed_mass", "changed_com"])
 @pytest.mark.parametrize("end", [0, 1])
 def test_an_effect_on_a_link_leaves_it_a_body_at_all_that_its_bounds_allow(name, end):
-    """A mass above zero, and moments of inertia of which no one is larger than the other two together."""
+    """Its mass stays positive, and no moment of inertia exceeds the sum of the other two (triangle inequality)."""
     kind, site = EVERY[name], FINGER.joint_names[1:2]
     for shape in kind.shapes(FINGER, site, SCALES):
         effect = plausible(kind, site, shape, 50.0)

@@ -1,4 +1,4 @@
-"""What a joint's drive brings, against NumPy written from the formulas of the docstrings."""
+"""Effects of a joint's drive against NumPy written from the formulas of their docstrings."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.effects import CATALOGUE
-from jaxfinger.effects.drive import WARM
+from jaxfinger.effects.drive import NOMINAL_TEMPERATURE
 from jaxfinger.model import external_torque, rigid_body, simulate
 from tests.effects.motion import MODEL, motion, with_effects
 from tests.model.test_simulate import DT, slider
@@ -21,13 +21,14 @@ I, J = 1, 2  # joints
 
 
 def added(name, *sites, x=X, **values):
-    """What an effect adds to the external torque."""
+    """Change of the external torque by an effect, N m."""
     effect = CATALOGUE[name].at(FINGER, tuple(FINGER.joint_names[i] for i in sites), **values)
     model = with_effects(effect)
     return np.asarray(external_torque(model, model.true_motion(x)) - external_torque(MODEL, x))
 
 
 def at(joint, values):
+    """Torques with `values` at one joint and zeros at the others."""
     out = np.zeros_like(Q)
     out[joint] = values
     return out
@@ -43,11 +44,13 @@ def test_friction_by_direction_is_what_the_two_ways_differ_by():
     expected = np.where(S[I] > 0, forwards + 0.001 * QD[I], -back + 0.001 * -QD[I]) - S[I] * F[I]
     found = added("joint_friction_asymmetric", I, coulomb=0.002, damping=0.001)
     np.testing.assert_allclose(found, at(I, expected), atol=1e-15)
-    assert not added("joint_friction_asymmetric", I, x=HELD, coulomb=0.002, damping=0.001).any()  # the fixture's
+    assert not added(
+        "joint_friction_asymmetric", I, x=HELD, coulomb=0.002, damping=0.001
+    ).any()  # The fixture carries it.
 
 
 def test_a_drive_loses_a_share_of_the_torque_that_it_gives():
-    """τ − μ|τ| s is what the joint needs, found by trying both signs of τ."""
+    """The torque τ solves τ − μ|τ| s = needed. The test finds it by trying both signs."""
     needed = np.asarray(external_torque(MODEL, X))[I]
     expected = []
     for u, s in zip(needed, S[I], strict=True):
@@ -55,7 +58,7 @@ def test_a_drive_loses_a_share_of_the_torque_that_it_gives():
         expected.append(tau - u)
     found = added("joint_torque_friction", I, mu=0.3)
     np.testing.assert_allclose(found, at(I, expected), atol=1e-14)
-    assert np.all(found[I] * S[I] >= 0.0)  # it resists
+    assert np.all(found[I] * S[I] >= 0.0)  # It resists the motion.
     assert not added("joint_torque_friction", I, x=HELD, mu=0.3).any()
 
 
@@ -66,19 +69,19 @@ def test_friction_falls_as_the_session_goes_on():
 
 
 def test_friction_falls_with_the_temperature_of_the_joint():
-    temperature = WARM + np.linspace(-15.0, 5.0, Q.size).reshape(Q.shape)
+    temperature = NOMINAL_TEMPERATURE + np.linspace(-15.0, 5.0, Q.size).reshape(Q.shape)
     x = replace(X, temperature=jnp.asarray(temperature))
     found = added("joint_friction_warmup", I, x=x, a=0.4, d=1e-3, by=1.0)
-    cold = (WARM - temperature[I]) / 10.0
+    cold = (NOMINAL_TEMPERATURE - temperature[I]) / 10.0
     np.testing.assert_allclose(found, at(I, cold * (0.4 * S[I] * F[I] + 1e-3 * QD[I])), atol=1e-15)
-    assert not added("joint_friction_warmup", I, a=0.4, d=1e-3, by=1.0).any()  # no temperature was measured
+    assert not added("joint_friction_warmup", I, a=0.4, d=1e-3, by=1.0).any()  # No temperature was measured.
 
 
 @pytest.mark.parametrize("ratio", [1.0, -1.0])
 def test_a_motor_that_turns_with_two_joints_acts_on_both(ratio):
     speed, acceleration = QD[I] + ratio * QD[J], QDD[I] + ratio * QDD[J]
     way = np.sign(np.diff(Q[I] + ratio * Q[J], prepend=np.nan))
-    way[0] = 0.0  # it has not moved yet
+    way[0] = 0.0  # It has not moved yet.
     f = 0.003 * way + 2e-4 * speed + 1e-6 * acceleration
     found = added("joint_coupling", I, J, coulomb=0.003, damping=2e-4, inertia=1e-6, ratio=ratio)
     np.testing.assert_allclose(found, at(I, f) + at(J, ratio * f), atol=1e-15)
@@ -114,7 +117,7 @@ def test_a_link_lags_behind_its_drive_by_the_dead_zone():
 
 
 def pushed(push, **torque):
-    """Speed of 1 kg on a rail with 2 N of friction and 20 N s/m after 2 s, its joint torque changed by name."""
+    """Speed after 2 s of 1 kg on a rail with 2 N of friction and 20 N s/m, m/s. `torque`: fields of `JointTorque`."""
     model = slider(2.0, 20.0)
     for name, value in torque.items():
         model = eqx.tree_at(lambda m, n=name: getattr(m.joint_torque, n), model, jnp.full(1, value))
@@ -130,7 +133,7 @@ run = eqx.filter_jit(simulate)
 @pytest.mark.parametrize(("push", "torque", "force"), [
     (5.0, {"friction_by_direction": 0.5}, 2.5),
     (-5.0, {"friction_by_direction": 0.5}, -3.5),
-    (2.4, {"friction_by_direction": 0.5}, 0.0),  # it sticks up to 2.5 N forwards and 1.5 N back
+    (2.4, {"friction_by_direction": 0.5}, 0.0),  # It sticks up to 2.5 N forwards and 1.5 N backwards.
     (-1.4, {"friction_by_direction": 0.5}, 0.0),
     (5.0, {"torque_friction": 0.2}, 2.0),
     (2.4, {"torque_friction": 0.2}, 0.0),
@@ -140,7 +143,7 @@ def test_real_drives_stick_and_slide(push, torque, force):
 
 
 def test_what_turns_with_two_joints_holds_both_until_they_pull_hard_enough():
-    """Without other friction, joints that are pushed apart by less than the shared friction carries stand still."""
+    """Without other friction, joints stand still under less torque than the shared friction carries."""
     model = eqx.tree_at(lambda m: m.joint_torque, MODEL, MODEL.joint_torque.zeros(FINGER.m))
     model = eqx.tree_at(lambda m: m.finger.gravity, model, jnp.zeros(3))
     pair = (FINGER.joint_names[0], FINGER.joint_names[1])

@@ -1,4 +1,4 @@
-"""Memory operators against loops that integrate the differential equations of their docstrings in tiny steps."""
+"""Memory operators against loops that integrate the differential equations of their docstrings in small steps."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def state(effect):
 
 
 def fine(values):
-    """Time and the piecewise linear values, FINE steps a sample."""
+    """Time and values interpolated linearly, `FINE` steps per sample."""
     t = np.linspace(TIME[0], TIME[-1], FINE * (TIME.size - 1) + 1)
     return t, np.interp(t, TIME, np.asarray(values))
 
@@ -46,7 +46,7 @@ def test_dahl_friction_builds_up_over_its_angle():
 
 
 def test_dahl_friction_of_the_power_a_half_is_that_of_many_springs_that_slip_one_after_the_other():
-    """Maxwell slip: springs of one stiffness in parallel, of evenly spread strengths up to `strongest` of travel."""
+    """Maxwell slip: parallel springs of one stiffness that slip at evenly spread travels up to `strongest`."""
     strongest, x = 0.02, np.linspace(0.0, 0.05, 101)
     strengths = strongest * (np.arange(20_000) + 0.5) / 20_000
     expected = [np.sum(np.clip(-strengths + dx, -strengths, strengths)) / np.sum(strengths) for dx in x]
@@ -80,7 +80,7 @@ CUTOFF = 10.0
     ],
 )
 def test_a_sharp_memory_is_what_the_low_pass_and_the_mean_leave_of_it(name, site, values, leaf):
-    """Driven at 50 Hz by angles below 10 Hz, against the memory at 1 kHz, filtered and averaged."""
+    """The memory at 50 Hz of angles below 10 Hz equals the memory at 1 kHz, filtered and averaged."""
     effect = CATALOGUE[name].at(FINGER, (site,), **values)
     x = motion(int(RECORDED), RECORDED)
 
@@ -110,7 +110,7 @@ def test_an_axis_without_tendons_has_a_memory_too():
 
 
 def test_noise_of_an_encoder_at_rest_does_not_undo_friction():
-    """A joint goes forward, rests, and goes back: what has built up stays until then."""
+    """A joint goes forward, rests, and goes back. Its friction stays built up until it goes back."""
     rng, std = np.random.default_rng(0), 2e-4
     q = np.concatenate([np.linspace(0, 0.3, 50), np.full(400, 0.3), np.linspace(0.3, 0, 50)])
     noisy = X.q[:, :1] + (q + rng.normal(0, std, q.size))[None]
@@ -178,7 +178,7 @@ def test_kelvin_voigt_creeps_to_the_tension():
     found = state(CATALOGUE["tendon_creep"].at(FINGER, ("T2",), T=0.5))
     f, dt = np.asarray(X.tension)[k], (TIME[1] - TIME[0]) / FINE
     y = [0.0]
-    for held in np.concatenate([[f[0]], f[1:]])[1:]:  # tension is held over a sample
+    for held in np.concatenate([[f[0]], f[1:]])[1:]:  # The operator holds tension over a sample.
         creeping = y[-1]
         for _ in range(FINE):
             creeping += dt * (held - creeping) / 0.5
@@ -204,7 +204,7 @@ def test_tendon_presliding_follows_its_excursion():
     ("moment_arm_bowstring", {"b": 0.02}),
 ])  # fmt: skip
 def test_moment_arms_are_derivatives_of_the_excursion(name, values):
-    """C = ∂l/∂q, as virtual work demands; tension is a parameter."""
+    """C = ∂l/∂q at constant tension, from virtual work."""
     effect = CATALOGUE[name].at(FINGER, ("T1",), **values)
     model = with_effects(effect)
 
@@ -230,7 +230,7 @@ def test_a_delayed_channel_is_the_signal_a_while_ago():
 
 
 def test_rates_hold_up_to_the_cut_off_of_reduced_channels():
-    """10 Hz at 50 samples a second: 2 % of attenuation, where differences of the second order lose 24 %."""
+    """At 10 Hz and 50 samples a second they lose 2 %; differences of the second order would lose 24 %."""
     time = np.arange(60) / 50.0
     found = np.asarray(rate(jnp.asarray(np.sin(2 * np.pi * 10.0 * time)), jnp.asarray(time)))
     exact = 2 * np.pi * 10.0 * np.cos(2 * np.pi * 10.0 * time)
@@ -241,7 +241,7 @@ def test_rates_hold_up_to_the_cut_off_of_reduced_channels():
 
 @pytest.mark.parametrize("channel", ["tendon_force", "joint_torque", "tendon_excursion"])
 def test_a_delay_shows_nothing_where_all_is_at_rest(channel):
-    """Steps between holds are no rates at the holds, though differences reach over their edges."""
+    """At holds the rate is zero, though differences at their edges reach into the steps between them."""
     effect = CATALOGUE["channel_delay"].at(FINGER, (channel,), delay=5e-3)
     steps = jnp.asarray(np.repeat([[0.0, 1.0, 3.0]], 20, axis=1))
     still = replace(X, qd=jnp.zeros_like(X.qd), motorised=jnp.ones_like(X.motorised))
@@ -257,7 +257,7 @@ def test_rate_is_zero_where_time_stands_still():
 
 
 def test_payload_is_a_body_screwed_to_a_link():
-    """A small body at p on the link: composite mass, centre of mass, and inertia by the parallel axes."""
+    """Composite mass, centre of mass and inertia (parallel axes) of a small body at p on the link."""
     i, m, p = 1, 2e-3, np.array([0.012, 0.003, -0.004])
     place = {"x": p[0], "y": p[1], "z": p[2]}
     effect = CATALOGUE["payload"].at(FINGER, (FINGER.joint_names[i],), mass=m, **place)
@@ -293,7 +293,7 @@ def test_mass_that_is_moved_within_a_link_leaves_its_mass_as_it_is_and_a_body():
     np.testing.assert_allclose(moved.com[i], ((M - m) * c + m * p) / M, atol=1e-15)
     about_it = np.linalg.eigvalsh(np.asarray(moved.inertia[i]))
     assert about_it[0] > 0.0
-    assert about_it[2] <= about_it[0] + about_it[1] + 1e-15  # the triangle inequality of a body
+    assert about_it[2] <= about_it[0] + about_it[1] + 1e-15  # the triangle inequality of moments of inertia
 
 
 @pytest.mark.parametrize("onset", [0.0, 5.0])
