@@ -1,5 +1,5 @@
-"""The benchmark of the diagnosis on data whose effect is withheld: makes, runs and scores sealed cases.
+"""Benchmark of the diagnosis on sealed cases, whose true effect is withheld: makes, runs and scores them.
 
-It imports `jaxfinger.data` only. The plant is MuJoCo's rigid body with laws in plain NumPy, so that nothing of the
-model or of the catalogue under test is in the data.
+A departure is an effect of the plant that the nominal model lacks. The plant is MuJoCo's rigid body with laws in plain
+NumPy. The room imports `jaxfinger.data` only, so that no code of the model or the catalogue under test makes the data.
 """

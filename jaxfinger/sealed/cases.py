@@ -2,8 +2,8 @@
 
     ROOT/case-001/fit.h5, fresh.h5          TRUTH/case-001.json
 
-Everything follows from (split, number): the same case comes out bit for bit with the same libraries. Elsewhere
-rounding may differ, and the forward simulation of VD.3 amplifies it; what is the matter with the case stays the same.
+A case is a function of (split, number). With the same libraries it is the same bit for bit. With others its effects are
+the same; rounding differs, and the forward simulation of VD.3 amplifies the difference.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from jaxfinger.data.schema import CHANNELS
 from .closure import friction_known
 from .departures import LISTED, UNLISTED, draw
 from .departures.base import Departure
-from .drive import simulate, wish
+from .drive import desired_trajectory, simulate
 from .laws import Finger
 from .protocols import Plan, draw_style, session_plans
 from .record import Motion, commanded, driven, read, record
 from .sensors import STD, UNITS, Sensors, draw_sensors, measure
-from .severity import Look, QuietSession, by_channel, calibrate
+from .severity import CoarseTrial, NoiseFreeSession, by_channel, calibrate
 from .specimens import LAYOUTS, Specimen, make_specimen
 
 SCHEMA = "jaxfinger-sealed/2"
 SPLITS = {"develop": 1, "fresh": 2, "foreign": 3}
-MIXES = {"natural": (), "several": (1,)}  # and what they add to a case's seed
-SEVERITIES = (2.0, 5.0, 10.0)
-TEN = ("listed", "listed", "double", "listed", "none", "listed", "listed", "unlisted", "listed", "unlisted")
-LIKE_SIZE = (5.0, 10.0)  # severities of several causes at once, drawn between these
-SMALL = 2.5  # severity of an unlisted cause beside several listed ones
+MIXES = {"natural": (), "several": (1,)}  # Mixes, each with what it appends to a case's seed.
+SEVERITIES = (2.0, 5.0, 10.0)  # rms in units of a hold's noise: hardly visible, visible, clear
+KINDS_OF_TEN = ("listed", "listed", "double", "listed", "none", "listed", "listed", "unlisted", "listed", "unlisted")
+SEVERAL_SEVERITIES = (5.0, 10.0)  # Range for several causes at once: none hides the others.
+MINOR_SEVERITY = 2.5  # of an unlisted cause beside several listed ones: visible, and smaller than each of them
 CREATED = "2026-01-15T10:00:00+00:00"
 
 
 @dataclass(frozen=True)
 class CaseSpec:
-    """What a case is about. Effects by id; a severity each, in units of a hold's noise."""
+    """Kind, specimen and withheld effects of a case. Effects by id, each with a severity in units of a hold's noise."""
 
     kind: str  # none, listed, unlisted, double, several
     specimen: str
@@ -53,12 +53,13 @@ class CaseSpec:
 
 
 def case_specs(split: str, count: int, mix: str = "natural") -> list[CaseSpec]:
-    """The first `count` cases of a split.
+    """Specifications of the first `count` cases of a split.
 
-    `natural`: in every ten six listed effects, one or two without any, one or two unlisted, one double. Listed effects
-    come in turn, each severity equally often, on specimens that differ from round to round. Of `foreign` the listed
-    ones are those that have a form which no other split has.
-    `several`: three to five listed effects of like size, every other case with a small unlisted one beside them.
+    Mix `natural`: of every ten cases six have a listed effect, one has two of them, one or two have an unlisted effect,
+    and one or two none. Listed effects come in turn, each severity equally often, on specimens that differ from round
+    to round.
+    Split `foreign` has only listed effects with a form that no other split has.
+    Mix `several`: three to five listed effects of similar severity. Every other case also has a minor unlisted one.
     """
     if mix == "several":
         return _several(split, count)
@@ -69,7 +70,7 @@ def case_specs(split: str, count: int, mix: str = "natural") -> list[CaseSpec]:
     specs = []
     for i in range(count):
         specimen, _ = next(specimens)
-        kind = TEN[i % 10] if i % 20 != 19 else "none"
+        kind = KINDS_OF_TEN[i % 10] if i % 20 != 19 else "none"
         if kind == "none":
             specs.append(CaseSpec(kind, specimen))
         elif kind == "double":
@@ -89,19 +90,19 @@ def _several(split: str, count: int) -> list[CaseSpec]:
     rng = np.random.default_rng([SPLITS[split], 7, *MIXES["several"]])
     specimens = _rounds(["planar", *LAYOUTS], [1.0], rng)
     anywhere = [e for e in LISTED if e != "passive_tendon"]
-    specs = []
+    (lowest, highest), specs = SEVERAL_SEVERITIES, []
     for i in range(count):
         specimen, _ = next(specimens)
         effects = [str(e) for e in rng.choice(anywhere, int(rng.integers(3, 6)), replace=False)]
-        sizes = np.exp(rng.uniform(np.log(LIKE_SIZE[0]), np.log(LIKE_SIZE[1]), len(effects))).tolist()
+        sizes = np.exp(rng.uniform(np.log(lowest), np.log(highest), len(effects))).tolist()
         if i % 2:
-            effects, sizes = [*effects, str(rng.choice(list(UNLISTED)))], [*sizes, SMALL]
+            effects, sizes = [*effects, str(rng.choice(list(UNLISTED)))], [*sizes, MINOR_SEVERITY]
         specs.append(CaseSpec("several", specimen, tuple(effects), tuple(sizes)))
     return specs
 
 
 def _rounds(items: list[str], severities: Sequence[float], rng: np.random.Generator) -> Iterator[tuple[str, float]]:
-    """Round after round through all items, each in another order and with its next severity."""
+    """Yield all items round after round, each round in another order and each item with its next severity."""
     turn = 0
     while True:
         for i in rng.permutation(len(items)):
@@ -110,24 +111,26 @@ def _rounds(items: list[str], severities: Sequence[float], rng: np.random.Genera
 
 
 def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: Path, mix: str = "natural") -> Path:
-    """Write one case; a finished one is left alone. The truth is written last, so that its file means «finished»."""
+    """Write one case unless it is finished, and return its folder.
+
+    The truth is written last: where its file exists, the case is finished.
+    """
     name = f"case-{number:03d}"
     folder, truth_file = root / name, truth_root / f"{name}.json"
     if truth_file.exists() and (folder / "fit.h5").exists() and (folder / "fresh.h5").exists():
         return folder
     seed = [SPLITS[split], number, *MIXES[mix]]
     case = _draw(seed, split, spec)
-    departures = case.departures
-
     folder.mkdir(parents=True, exist_ok=True)
     truth_root.mkdir(parents=True, exist_ok=True)
-    specimen, sensors, rng = case.quiet.specimen, case.quiet.sensors, case.rng
-    finger = Finger(specimen, departures)
+    specimen, sensors, rng = case.noise_free.specimen, case.noise_free.sensors, case.rng
+    finger = Finger(specimen, case.departures)
     zero = rng.normal(0, 1e-4, finger.n)
-    # Side by side the simulations cost little more than one.
+    # Simulated together, the trials cost little more than one.
     together = [p for p in (*case.plans, *case.later) if p.experiment == "VD.3"]
     motions = {
-        p.seed: driven(r, p.rate) for p, r in zip(together, simulate(finger, case.quiet.nominal, together), strict=True)
+        p.seed: driven(r, p.rate)
+        for p, r in zip(together, simulate(finger, case.noise_free.nominal, together), strict=True)
     }
     for file, plans in (("fit.h5", case.plans), ("fresh.h5", case.later)):
         trials = record_trials(finger, plans, motions, sensors, zero, rng)
@@ -139,11 +142,18 @@ def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: P
             created=CREATED,
         )
         write_session(session, folder / file, overwrite=True)
-    truth = {
-        "schema": SCHEMA,
-        "case": name,
-        "split": split,
-        "seed": seed,
+    truth = {"schema": SCHEMA, "case": name, "split": split, "seed": seed} | _truth(spec, case)
+    part = truth_file.with_suffix(".part")
+    part.write_text(json.dumps(truth, indent=1))
+    os.replace(part, truth_file)
+    return folder
+
+
+def _truth(spec: CaseSpec, case: _Case) -> dict:
+    """Effects, noise and gap of a case for its truth."""
+    sensors = case.noise_free.sensors
+    closes = case.noise_free.closed_by(case.departures)
+    return {
         "kind": spec.kind,
         "specimen": spec.specimen,
         "effects": [
@@ -152,31 +162,27 @@ def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: P
                 "listed": d.listed,
                 "site": list(d.site),
                 "form": d.form,
-                "severity": wanted,
+                "severity": target,
                 "reached": reached,
                 "seen_in": list(seen),
-                "closes": closes,
+                "closes": share,
                 "parameters": {"size": d.size, "units": d.units, **d.shape},
                 "known": d.known(),
             }
-            for d, wanted, reached, seen, closes in zip(
-                departures, spec.severities, case.reached, case.where, case.quiet.closed_by(departures), strict=True
+            for d, target, reached, seen, share in zip(
+                case.departures, spec.severities, case.reached, case.where, closes, strict=True
             )
         ],
         "noise": {c: {"std": sensors.std[c], "hold": sensors.hold_std(c), "units": UNITS[c]} for c in STD},
-        "fresh": _fresh_gap(departures, case.quiet, case.later),
+        "fresh": _fresh_gap(case.departures, case.noise_free, case.later),
     }
-    part = truth_file.with_suffix(".part")
-    part.write_text(json.dumps(truth, indent=1))
-    os.replace(part, truth_file)
-    return folder
 
 
 @dataclass(frozen=True)
 class _Case:
-    """Everything that a case's seed decides before anything is measured; `rng` goes on to draw the noise."""
+    """Everything that a case's seed decides before the measurement. `rng` draws the noise next."""
 
-    quiet: QuietSession
+    noise_free: NoiseFreeSession
     plans: list[Plan]
     later: list[Plan]
     departures: list[Departure]
@@ -191,29 +197,29 @@ def _draw(seed: Sequence[int], split: str, spec: CaseSpec) -> _Case:
     nominal, sensors, style = Finger(specimen), draw_sensors(rng), draw_style(rng, foreign)
     plans = with_trajectories(nominal, session_plans(specimen, style, rng), rng)
     later = with_trajectories(nominal, session_plans(specimen, style, rng, fresh=True), rng)
-    quiet = QuietSession(specimen, plans, sensors)
-    return _Case(quiet, plans, later, *_withheld(spec, specimen, quiet, style.speeds, foreign, rng), rng)
+    noise_free = NoiseFreeSession(specimen, plans, sensors)
+    return _Case(noise_free, plans, later, *_withheld(spec, specimen, noise_free, style.speeds, foreign, rng), rng)
 
 
-def rebuild(truth: dict) -> tuple[QuietSession, list[Departure]]:
-    """The noise-free session and the departures of a case, from its truth file alone; no slack tendon counts."""
+def rebuild(truth: dict) -> tuple[NoiseFreeSession, list[Departure]]:
+    """Rebuild the noise-free session and the departures of a case from its truth. Slack tendons do not count in it."""
     effects = truth["effects"]
     spec = CaseSpec(
         truth["kind"], truth["specimen"], tuple(e["effect"] for e in effects), tuple(e["severity"] for e in effects)
     )
     case = _draw(truth["seed"], truth["split"], spec)
-    quiet = QuietSession(case.quiet.specimen, case.plans, case.quiet.sensors, slack_counts=False)
-    return quiet, case.departures
+    noise_free = NoiseFreeSession(case.noise_free.specimen, case.plans, case.noise_free.sensors, slack_counts=False)
+    return noise_free, case.departures
 
 
 def with_trajectories(nominal: Finger, plans: Sequence[Plan], rng: np.random.Generator) -> list[Plan]:
-    """VD.3 plans get a trajectory; repeats of a motion share it."""
+    """Give the VD.3 plans a trajectory. Repeats of a motion share it."""
     profiles = {}
     out = []
     for plan in plans:
         if plan.experiment == "VD.3":
             if plan.motion not in profiles:
-                profiles[plan.motion] = wish(nominal, plan, rng)
+                profiles[plan.motion] = desired_trajectory(nominal, plan, rng)
             plan = replace(plan, q=profiles[plan.motion])
         out.append(plan)
     return out
@@ -222,12 +228,15 @@ def with_trajectories(nominal: Finger, plans: Sequence[Plan], rng: np.random.Gen
 def _withheld(
     spec: CaseSpec,
     specimen: Specimen,
-    quiet: QuietSession,
+    noise_free: NoiseFreeSession,
     speeds: Sequence[float],
     foreign: bool,
     rng: np.random.Generator,
 ):
-    """The case's departures, sized; a site where the effect cannot be seen is drawn again, three times."""
+    """Draw the case's departures and calibrate their sizes, with the severities reached and where they are largest.
+
+    A site where the effect cannot be seen is drawn again, up to three times.
+    """
     chosen: list[Departure] = []
     reached, where = [], []
     for effect, target in zip(spec.effects, spec.severities, strict=True):
@@ -235,7 +244,7 @@ def _withheld(
         for _ in range(4):
             departure = draw(effect, specimen.finger, rng, speeds, foreign)
             assert departure is not None, f"{effect} has no site on {spec.specimen}"
-            candidate = calibrate(quiet, departure, target)
+            candidate = calibrate(noise_free, departure, target)
             if best is None or abs(np.log(candidate[1] / target)) < abs(np.log(best[1] / target)):
                 best = candidate
             if best[1] > 0.7 * target:
@@ -248,6 +257,7 @@ def _withheld(
 
 
 def _column(specimen: Specimen, label: tuple[str, str, int]) -> str:
+    """Name of the joint, tendon or axis of a label (experiment, channel, column)."""
     return CHANNELS[label[1]].columns(specimen.finger)[label[2]]
 
 
@@ -259,22 +269,23 @@ def record_trials(
     zero: np.ndarray,
     rng: np.random.Generator,
 ) -> Iterator[Trial]:
-    """The trials as measured; `motions`: the simulated ones, by their plan's seed."""
+    """Yield the measured trials of the plans. `motions`: the simulated motions by their plan's seed."""
     for plan in plans:
         motion = motions.get(plan.seed) or commanded(plan)
         yield measure(read(finger, record(finger, plan, motion)), finger.specimen, sensors, zero, rng)
 
 
-def _fresh_gap(departures: Sequence[Departure], quiet: QuietSession, plans: Sequence[Plan]):
-    """rms on the fresh trials by experiment and channel, of the nominal model refitted (before) and with the
-    true effects (after), over the samples that predictions are judged by.
+def _fresh_gap(departures: Sequence[Departure], noise_free: NoiseFreeSession, plans: Sequence[Plan]):
+    """Rows of the truth: rms on the fresh trials by experiment and channel, over the samples that `closure` counts.
+
+    `before` is that of the refitted nominal model, `after` that with the true effects.
     """
-    sensors = quiet.sensors
-    later = QuietSession(quiet.specimen, plans, sensors)
+    sensors = noise_free.sensors
+    later = NoiseFreeSession(noise_free.specimen, plans, sensors)
     rows, labels = later.trace(departures)
     if departures:
-        rows = rows - later.absorbed[0] @ quiet.absorb(quiet.trace(departures)[0])
-    counts = np.concatenate([_judged(later, look) for look in later.looks])
+        rows = rows - later.absorbed[0] @ noise_free.absorb(noise_free.trace(departures)[0])
+    counts = np.concatenate([_judged(later, coarse) for coarse in later.trials])
     gap = by_channel(rows[counts], [(e, c, 0) for (e, c, _), judged in zip(labels, counts, strict=True) if judged])
     out = []
     for (experiment, channel, _), value in sorted(gap.items()):
@@ -294,9 +305,9 @@ def _fresh_gap(departures: Sequence[Departure], quiet: QuietSession, plans: Sequ
     return out
 
 
-def _judged(session: QuietSession, look: Look) -> Bool[np.ndarray, " R"]:
-    """Which of a trial's rows lie where a prediction of the like recording is judged."""
-    plan, motion, cad = look.plan, look.motion, session.specimen.finger
+def _judged(session: NoiseFreeSession, coarse: CoarseTrial) -> Bool[np.ndarray, " R"]:
+    """Rows of a trial at samples where `closure` counts a prediction of its recording."""
+    plan, motion, cad = coarse.plan, coarse.motion, session.specimen.finger
     none = np.zeros(len(motion.time), bool)
     held = sum(((motion.time >= begin) & (motion.time < end) for begin, end, _ in plan.holds), none)
     excursion = session.nominal.geometry(motion.q)[0]
@@ -306,7 +317,7 @@ def _judged(session: QuietSession, look: Look) -> Bool[np.ndarray, " R"]:
     )  # fmt: skip
     known = np.broadcast_to(friction_known(trial, cad), motion.q.shape)
     every = np.ones(len(motion.time), bool)
-    rows = session.rows(session.nominal, look, motion, True)
+    rows = session.rows(session.nominal, coarse, motion, True)
     return np.concatenate([known[:, k] if c == "joint_torque" else every for _, c, k, _ in rows])
 
 
@@ -321,9 +332,9 @@ def make_cases(
     only: Iterable[int] | None = None,
     mix: str = "natural",
 ) -> list[int]:
-    """Make the cases 1 … count of a split (or share i of n of them) on several cores; returns their numbers.
+    """Make the cases 1 … count of a split, or share (i, n) of them, with several processes; return their numbers.
 
-    Finished cases are skipped, so a stopped run is taken up by calling again.
+    Finished cases are skipped: to resume a stopped run, call again. `progress` takes (done, total, name).
     """
     specs = case_specs(split, count, mix)
     wanted = set(only) if only is not None else None

@@ -1,6 +1,6 @@
-"""How far the gap closes on fresh trials: rms of measurement minus prediction, by experiment and channel.
+"""Gap on fresh trials: rms of measurement minus prediction, by experiment and channel.
 
-The predictions come from any tool in the predictions layout; nothing is assumed of the model.
+Predictions are files in the predictions layout, from any tool. Nothing is assumed of the model behind them.
 """
 
 from __future__ import annotations
@@ -24,43 +24,46 @@ CHANNELS = {
     "VD.2": ("fingertip_force", "tendon_excursion"),
     "VD.3": ("tendon_excursion", "joint_torque"),
 }
-MOVING = 0.05  # rad/s, and that speed times 5 mm for a tendon: torque in motion is judged where both slide
-CLEAR = 0.03  # s on either side of where one may stick: nobody knows its friction there
+SLIDING_SPEED = 0.05  # rad/s, over ten times the speed that an encoder's noise shows over `SLOPE_TIME`
+TYPICAL_ARM = 5e-3  # m, turns the speed of a joint into that of a tendon
+SLOPE_TIME = 0.05  # s on either side for the speed's difference
+CLEARANCE = 0.03  # s on either side of a joint or tendon that may stick, where friction may take any value
 
 
 def gap_by_channel(
     measured: Session, predicted: Mapping[str, Mapping[str, np.ndarray]]
 ) -> dict[tuple[str, str], float]:
-    """rms of measured minus predicted over all samples that both have, SI units; excursions less one constant a
-    trial and tendon, torque of ID.3 and VD.3 where friction is known: in holds, and where joint and tendons slide.
+    """rms of measured minus predicted by (experiment, channel), over the samples that both have, SI.
+
+    Excursions count less a constant for each trial and tendon. Torques of ID.3 and VD.3 count where friction is known.
     """
     squares: dict[tuple[str, str], list[np.ndarray]] = defaultdict(list)
     for trial in measured:
         if trial.name not in predicted:
             continue
         for channel in CHANNELS[trial.experiment]:
-            said = predicted[trial.name].get(channel)
-            seen = getattr(trial, channel)
-            if said is None:
+            prediction = predicted[trial.name].get(channel)
+            measurement = getattr(trial, channel)
+            if prediction is None:
                 continue
             if trial.experiment == "VD.3" and channel == "joint_torque":
-                seen = np.zeros_like(said)  # nothing acts from outside on the free finger
-            if seen is None:
+                measurement = np.zeros_like(prediction)  # No external torque acts on the free finger.
+            if measurement is None:
                 continue
-            difference = np.asarray(seen, dtype=float) - said
+            difference = np.asarray(measurement, dtype=float) - prediction
             if channel == "joint_torque":
                 difference = np.where(friction_known(trial, measured.finger), difference, np.nan)
             for column in difference.T:
-                rest = column[np.isfinite(column)]
-                if len(rest):
+                finite = column[np.isfinite(column)]
+                if len(finite):
                     squares[trial.experiment, channel].append(
-                        (rest - rest.mean() if channel == "tendon_excursion" else rest) ** 2
+                        (finite - finite.mean() if channel == "tendon_excursion" else finite) ** 2
                     )
     return {key: float(np.sqrt(np.concatenate(parts).mean())) for key, parts in sorted(squares.items())}
 
 
 def friction_known(trial: Trial, finger: FingerDescription) -> Bool[np.ndarray, "N m"] | Bool[np.ndarray, "N 1"]:
-    """Where the direction of friction is known to the sample: the torque counts there."""
+    """Samples at which the direction of friction is known: in holds of ID.3, and where joint and tendons slide."""
     if trial.experiment == "ID.3-static":
         return find_holds(trial)[:, None] >= 0
     if trial.experiment in ("ID.3-dynamic", "VD.3"):
@@ -69,19 +72,19 @@ def friction_known(trial: Trial, finger: FingerDescription) -> Bool[np.ndarray, 
 
 
 def _sliding(trial: Trial, finger: FingerDescription) -> Bool[np.ndarray, "N m"]:
-    """Where a joint moves, and every tendon across it where tendons drive it, clear of where they stop."""
+    """Samples at which a joint slides, and in VD.3 every tendon across it, clear of their stops."""
     rate = float(1.0 / np.median(np.diff(trial.time)))
-    width = max(int(0.05 * rate), 3)
+    width = max(int(SLOPE_TIME * rate), 3)
     speed = _slope(trial.q, trial.time, width)
-    slides = np.abs(speed) > MOVING
+    slides = np.abs(speed) > SLIDING_SPEED
     if trial.experiment == "VD.3" and trial.tendon_excursion is not None:
-        tendon = np.abs(_slope(trial.tendon_excursion, trial.time, width)) > MOVING * 5e-3
+        tendon = np.abs(_slope(trial.tendon_excursion, trial.time, width)) > SLIDING_SPEED * TYPICAL_ARM
         slides &= ~(~tendon @ (finger.crosses & finger.active[:, None]))
-    return minimum_filter1d(slides, 2 * round(CLEAR * rate) + 1, axis=0)
+    return minimum_filter1d(slides, 2 * round(CLEARANCE * rate) + 1, axis=0)
 
 
 def _slope(values: np.ndarray, time: np.ndarray, width: int) -> np.ndarray:
-    """Central difference over ± width samples."""
+    """Central difference over ± width samples; zero within `width` of the ends."""
     x = np.asarray(values, dtype=float)
     out = np.zeros_like(x)
     out[width:-width] = (x[2 * width :] - x[: -2 * width]) / (time[2 * width :] - time[: -2 * width])[:, None]
@@ -89,7 +92,7 @@ def _slope(values: np.ndarray, time: np.ndarray, width: int) -> np.ndarray:
 
 
 def fresh_rows(fresh: Path, predictions: Mapping[str, Path]) -> list[dict]:
-    """Rows for `fresh.json`: rms on the fresh trials of each named prediction (before, after, best)."""
+    """Rows for `fresh.json`: the rms on the fresh trials of each prediction, by its name (before, after, best)."""
     measured = read_session(fresh)
     gaps = {name: gap_by_channel(measured, read_predictions(file)) for name, file in predictions.items()}
     first, *others = gaps.values()

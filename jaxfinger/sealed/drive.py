@@ -1,8 +1,6 @@
-"""VD.3: tendons drive the free finger. Forward simulation in MuJoCo with true dry friction, under a tracking
-controller.
+"""VD.3, the tendons drive the free finger: forward simulation in MuJoCo with dry friction under a tracking controller.
 
-The controller knows the nominal specimen only. What it commands is recorded as tension; the finger goes where
-physics puts it.
+The controller uses the nominal specimen only. Tension lags its command, and the finger moves as its plant does.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -22,10 +20,10 @@ from .laws import Finger, Situation
 from .profiles import Builder, Profile
 from .protocols import Plan, sample_times
 
-MOST = 16.0  # N, largest commanded tension
+MAX_TENSION = 16.0  # N, largest commanded tension
 STEP = 5e-4  # s
-CONTROL = 2  # steps a control cycle: 1 kHz, the rate of the record
-LAG = 1.5e-3  # s, of the drives
+CONTROL = 2  # steps per control cycle: 1 kHz, the rate of the record
+LAG = 1.5e-3  # s, time constant of the drives
 
 
 @dataclass(frozen=True)
@@ -38,8 +36,8 @@ class Run:
     tension: Float[np.ndarray, "N n"]
 
 
-def wish(nominal: Finger, plan: Plan, rng: np.random.Generator) -> tuple[Profile, ...]:
-    """A trajectory between postures that tensions can hold; joints start and stop at their own times."""
+def desired_trajectory(nominal: Finger, plan: Plan, rng: np.random.Generator) -> tuple[Profile, ...]:
+    """Draw a trajectory between postures that tensions can hold. Each joint starts and stops at times of its own."""
     count = int(plan.duration / 1.6)
     postures = _reachable(nominal, plan.least, count + 1, rng)
     profiles = []
@@ -55,7 +53,7 @@ def wish(nominal: Finger, plan: Plan, rng: np.random.Generator) -> tuple[Profile
 
 
 def _reachable(nominal: Finger, least: float, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count m"]:
-    """Postures that tensions within bounds hold, with the joints' friction either way: the best of many random ones."""
+    """Draw postures that tensions within bounds can hold, with joint friction of either sign."""
     low, high = nominal.specimen.finger.limits.T
     q = low + (high - low) * rng.uniform(0.12, 0.8, (1500, nominal.m))
     zero = np.zeros_like(q)
@@ -68,9 +66,9 @@ def _reachable(nominal: Finger, least: float, count: int, rng: np.random.Generat
     miss = np.zeros(len(q))
     for i, arm in enumerate(nominal.geometry(q)[1]):
         for sign in (-1.5, 1.5):
-            wanted = torque[i] + sign * margin[i]
-            f = allocate(arm, wanted, still)
-            miss[i] = max(miss[i], np.abs(arm.T @ f - wanted).max() + 1e-3 * max(f.max() - 9.0, 0.0))
+            demanded = torque[i] + sign * margin[i]
+            f = allocate(arm, demanded, still)
+            miss[i] = max(miss[i], np.abs(arm.T @ f - demanded).max() + 1e-3 * max(f.max() - 9.0, 0.0))
     best = np.argsort(miss)[: max(3 * count, int(np.sum(miss < 2e-4)))]
     return q[rng.choice(best, count, replace=False)]
 
@@ -78,8 +76,9 @@ def _reachable(nominal: Finger, least: float, count: int, rng: np.random.Generat
 def feedforward(
     nominal: Finger, q: Float[np.ndarray, "N m"], qd: Float[np.ndarray, "N m"], qdd: Float[np.ndarray, "N m"]
 ):
-    """Joint torque of the nominal finger along a trajectory (friction included, smooth in velocity), and the
-    tendons' directions.
+    """Joint torque of the nominal finger along a trajectory, N m, and the tendons' directions.
+
+    Friction is included. It and the directions are smooth in velocity.
     """
     zero = np.zeros(len(q))
     s = Situation(zero, zero, q, qd, qdd, np.zeros((len(q), nominal.n)), np.tanh(qd / 0.02))
@@ -88,7 +87,7 @@ def feedforward(
 
 
 class Allocator:
-    """Tensions at the actuators that give joint torques, at least `least` N, small otherwise."""
+    """Map joint torques to small tensions at the actuators, none below `least`, N."""
 
     def __init__(self, nominal: Finger, least: float):
         self.least = least
@@ -107,12 +106,12 @@ class Allocator:
         rest = torque - arm.T @ offset - matrix @ np.full(len(self.active), self.least)
         extra, _ = nnls(np.vstack([matrix, self._small]), np.concatenate([rest, np.zeros(len(self.active))]))
         tension = np.zeros(self.n)
-        tension[self.active] = np.minimum(self.least + extra, MOST)
+        tension[self.active] = np.minimum(self.least + extra, MAX_TENSION)
         return tension
 
 
 def planned_tension(nominal: Finger, plan: Plan, t: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N n"]:
-    """Tension that would drive the wished trajectory open loop, N."""
+    """Tension that would drive the desired trajectory open loop, N."""
     q, qd, qdd = (np.stack(x, axis=1) for x in zip(*(p(t) for p in plan.q), strict=True))
     torque, direction = feedforward(nominal, q, qd, qdd)
     arms = nominal.geometry(q)[1]
@@ -121,28 +120,28 @@ def planned_tension(nominal: Finger, plan: Plan, t: Float[np.ndarray, " N"]) -> 
 
 
 def simulate(finger: Finger, nominal: Finger, plans: Sequence[Plan]) -> list[Run]:
-    """Run the VD.3 trials side by side; all have the same duration."""
+    """Simulate the VD.3 trials together. All must have the same duration."""
     if not plans:
         return []
     model = finger.plant.model
     active = np.flatnonzero(finger.specimen.finger.active)
     batch, m, n = len(plans), finger.m, finger.n
     fine = sample_times(plans[0], 1 / (STEP * CONTROL))
-    wished = [[np.stack(x, axis=1) for x in zip(*(p(fine) for p in plan.q), strict=True)] for plan in plans]
-    forward = [feedforward(nominal, *w) for w in wished]
+    desired = [[np.stack(x, axis=1) for x in zip(*(p(fine) for p in plan.q), strict=True)] for plan in plans]
+    forward = [feedforward(nominal, *w) for w in desired]
     noises = np.stack([_wander(np.random.default_rng(plan.seed), len(fine), n, STEP * CONTROL) for plan in plans])
     allocate = [Allocator(nominal, plan.least) for plan in plans]
-    inertia = np.diag(nominal.plant.mass_matrix(wished[0][0][0]))
+    inertia = np.diag(nominal.plant.mass_matrix(desired[0][0][0]))
     stiff = 0.03 + 0.05 * inertia / inertia.max()
     damp = 1.2 * np.sqrt(stiff * np.maximum(inertia, 2e-6))
 
     data = [mujoco.MjData(model) for _ in plans]
-    for d, w in zip(data, wished, strict=True):
+    for d, w in zip(data, desired, strict=True):
         d.qpos = w[0][0]
     f = np.stack(
         [
             a(nominal.geometry(w[0][0])[1], ff[0][0], ff[1][0])
-            for a, w, ff in zip(allocate, wished, forward, strict=True)
+            for a, w, ff in zip(allocate, desired, forward, strict=True)
         ]
     )
     command, starts = f.copy(), np.array([plan.start for plan in plans])
@@ -156,7 +155,7 @@ def simulate(finger: Finger, nominal: Finger, plans: Sequence[Plan]) -> list[Run
         if i % CONTROL == 0:
             c = i // CONTROL
             for b in range(batch):
-                w = wished[b]
+                w = desired[b]
                 torque = forward[b][0][c] + stiff * (w[0][c] - q[b]) + damp * (w[1][c] - qd[b])
                 command[b] = allocate[b](nominal.geometry(q[b])[1], torque, forward[b][1][c])
             command = command * (1 + 0.004 * noises[:, c]) + 0.02 * noises[:, c] * (command > 0)
@@ -175,8 +174,9 @@ def simulate(finger: Finger, nominal: Finger, plans: Sequence[Plan]) -> list[Run
 
 
 def replay(finger: Finger, q: Float[np.ndarray, " m"], tension: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
-    """Angles from rest at q under recorded tensions at 1 kHz, without a controller: how well motion can be
-    predicted at all.
+    """Simulate angles from rest at q under tensions recorded at 1 kHz, without a controller.
+
+    The difference from the recorded angles bounds how well any model can predict the motion.
     """
     data, active = mujoco.MjData(finger.plant.model), np.flatnonzero(finger.specimen.finger.active)
     data.qpos = q
@@ -193,15 +193,14 @@ def replay(finger: Finger, q: Float[np.ndarray, " m"], tension: Float[np.ndarray
 
 
 def _advance(finger: Finger, s: Situation, data: list, active: np.ndarray):
-    """One MuJoCo step of every trial: smooth forces applied, dry friction left to its solver."""
+    """Advance every trial by a MuJoCo step: smooth forces are applied, dry friction is left to its solver."""
     model = finger.plant.model
     _, arm = finger.path(s)
     limit, decided = finger.coulomb(s)
     loss, lost = finger.loss(s)
     assert s.st is not None
     sliding = s.st * loss
-    # The solver takes `sliding` off through the fixed tendons; what a departure adds to the delivered tension
-    # comes on top.
+    # The solver subtracts `sliding` through the fixed tendons. What a departure adds to the delivered tension stays.
     delivered = finger.delivered(s, s.f - lost - sliding) + sliding
     applied = np.einsum("bnm,bn->bm", arm, delivered) - finger.passive(s) - decided
     limit, loss = np.maximum(limit, 1e-9), np.maximum(loss, 1e-9)
@@ -215,7 +214,7 @@ def _advance(finger: Finger, s: Situation, data: list, active: np.ndarray):
 
 
 def _wander(rng: np.random.Generator, count: int, n: int, dt: float) -> Float[np.ndarray, "K n"]:
-    """Unit slow noise, correlated over half a second."""
+    """Slow noise of unit size, correlated over half a second."""
     knots = rng.normal(size=(int(count * dt / 0.5) + 3, n))
     at = np.arange(count) * dt / 0.5
     return np.stack([np.interp(at, np.arange(len(knots)), column) for column in knots.T], axis=1)

@@ -1,4 +1,4 @@
-"""The reliability diagram of the probabilities."""
+"""Reliability diagram of the probabilities."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from pathlib import Path
 
 
 def reliability_diagram(rows: Sequence[dict[str, float]], file: Path) -> Path:
-    """Said against came true, with 95 % intervals; the file's suffix (.svg, .png) sets the format."""
+    """Draw how often causes came true against the probability given, with 95 % intervals, and return the file.
+
+    `rows`: those of `score.reliability`. The file's suffix (.svg, .png) sets the format.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.2, 4.2), layout="constrained")

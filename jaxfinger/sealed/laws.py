@@ -1,7 +1,7 @@
-"""A true finger: the nominal laws of a specimen, and what departs from them.
+"""The true finger: nominal laws of a specimen, and its departures from them.
 
-Every law takes a `Situation` and works on whatever leading axes its arrays have: a whole recording (time first), or
-one instant of several trials that are simulated side by side.
+Every law takes a `Situation` and broadcasts over the leading axes of its arrays: a whole recording (time first), or one
+instant of several trials that are simulated together.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from .specimens import Specimen
 
 @dataclass
 class Situation:
-    """Where the finger is. Angles rad, tension at the actuator N, time s; directions −1, 0, +1."""
+    """State of the finger. Angles rad, tension at the actuator N, time s; directions −1, 0, +1."""
 
     t: Float[np.ndarray, "..."]
     session: Float[np.ndarray, "..."]  # seconds since the session began
@@ -28,15 +28,15 @@ class Situation:
     qd: Float[np.ndarray, "... m"]
     qdd: Float[np.ndarray, "... m"]
     f: Float[np.ndarray, "... n"]
-    sj: Float[np.ndarray, "... m"]  # direction in which each joint slides; 0 where a fixture holds it
-    st: Float[np.ndarray, "... n"] | None = None
-    held: bool = False  # every joint is at rest in a fixture
-    motor: bool = False  # the external motor with its torque sensor is coupled
-    memory: dict = field(default_factory=dict)  # by departure: (..., k)
+    sj: Float[np.ndarray, "... m"]  # direction in which each joint slides; 0 in a fixture
+    st: Float[np.ndarray, "... n"] | None = None  # direction in which each tendon slides
+    held: bool = False  # Every joint is at rest in a fixture.
+    motor: bool = False  # The external motor with its torque sensor is coupled.
+    memory: dict = field(default_factory=dict)  # States (..., k) by id of the departure.
 
 
 class Finger:
-    """A specimen with its departures. Without any it is the nominal plant."""
+    """A specimen with its departures; the nominal plant where there are none."""
 
     def __init__(self, specimen: Specimen, departures: Sequence[Departure] = (), plant: Plant | None = None):
         self.specimen = specimen
@@ -50,9 +50,7 @@ class Finger:
 
     @cached_property
     def _maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Exponents 1 … 4, and the matrices that take all qᵖ to l and all qᵖ⁻¹ to C: one product each instead
-        of a sum a joint.
-        """
+        """Exponents 1 … 4, and the matrices that map all qᵖ to l and all qᵖ⁻¹ to C, each in one product."""
         arms = self.specimen.excursion
         n, m, degree = arms.shape
         powers = np.arange(1, degree + 1)
@@ -64,7 +62,7 @@ class Finger:
     def geometry(
         self, q: Float[np.ndarray, "... m"]
     ) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n m"]]:
-        """Nominal excursion l = f(q) in m, and C = ∂f/∂q. The last result is kept: every law of an instant asks."""
+        """Nominal excursion l = f(q), m, and C = ∂f/∂q. The last result is cached, since many laws need it."""
         if self._last is not None and self._last[0] is q:
             return self._last[1]
         powers, to_length, to_arm = self._maps
@@ -76,18 +74,18 @@ class Finger:
         return result
 
     def path(self, s: Situation) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n m"]]:
-        """Excursion as the tendon is pulled in, and its derivative by q, departures included."""
+        """Excursion (positive pulled in), m, and its derivative by q, with departures."""
         length, arm = self.geometry(s.q)
         for d in self._ready(s):
             length, arm = d.path(self, s, length, arm)
         return length, arm
 
     def speed(self, s: Situation) -> Float[np.ndarray, "... n"]:
-        """l̇ = C q̇ in m/s."""
+        """Nominal l̇ = C q̇, m/s."""
         return (self.geometry(s.q)[1] @ s.qd[..., None])[..., 0]
 
     def passive(self, s: Situation) -> Float[np.ndarray, "... m"]:
-        """τ_k + τ_d in N m: what resists without dry friction."""
+        """τ_k + τ_d, N m: elastic and viscous torque, with departures."""
         c = self.specimen.elastic
         torque = c[:, 0] + c[:, 1] * s.q + c[:, 2] * s.q**2 + self.specimen.damping * s.qd
         for d in self._ready(s):
@@ -95,7 +93,7 @@ class Finger:
         return torque
 
     def coulomb(self, s: Situation) -> tuple[Float[np.ndarray, "... m"], Float[np.ndarray, "... m"]]:
-        """Limit of the joints' dry friction, and friction that is already decided by a memory state, N m."""
+        """Limit of the joints' dry friction, and the friction that a memory state determines, N m."""
         c = self.specimen.coulomb
         limit, decided = c[:, 0] + c[:, 1] * s.q + c[:, 2] * s.q**2, np.zeros_like(s.q)
         for d in self._ready(s):
@@ -103,7 +101,7 @@ class Finger:
         return limit, decided
 
     def loss(self, s: Situation) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n"]]:
-        """Limit of the tendons' dry friction, and friction that is already decided, N. Never more than the tension."""
+        """Limit of the tendons' dry friction, never above the tension, and the friction that a state determines, N."""
         a = self.specimen.friction
         limit, decided = np.clip(a[:, 0] + a[:, 1] * s.f, 0.0, np.maximum(s.f, 0.0)), np.zeros_like(s.f)
         for d in self._ready(s):
@@ -111,24 +109,24 @@ class Finger:
         return np.clip(limit, 0.0, np.maximum(s.f, 0.0)), decided
 
     def delivered(self, s: Situation, reaching: Float[np.ndarray, "... n"]) -> Float[np.ndarray, "... n"]:
-        """Tension that acts on the joints, given what is left of each tendon's own."""
+        """Tension that acts on the joints, N. `reaching`: what friction leaves of each tendon's own tension."""
         for d in self._ready(s):
             reaching = d.deliver(self, s, reaching)
         return reaching
 
     def friction(self, s: Situation) -> Float[np.ndarray, "... m"]:
-        """Joint friction where the directions are known, N m."""
+        """Joint friction for known directions, N m."""
         limit, decided = self.coulomb(s)
         return limit * s.sj + decided
 
     def reaching_sliding(self, s: Situation) -> Float[np.ndarray, "... n"]:
-        """f_j = f_t − s(l̇) loss where the tendons slide, N."""
+        """f_j = f_t − s(l̇) loss of sliding tendons, N."""
         limit, decided = self.loss(s)
         assert s.st is not None
         return s.f - s.st * limit - decided
 
     def reaching_held(self, s: Situation) -> Float[np.ndarray, "N n"]:
-        """f_j at joints held at rest: it slips only when the loss is exceeded, starting from slack."""
+        """f_j at joints held at rest, N. Starting from slack, a tendon slips only where the loss is exceeded."""
         limit, decided = self.loss(s)
         high, low = s.f + limit, s.f - limit
         reaching = np.empty_like(s.f)
@@ -145,7 +143,7 @@ class Finger:
         return reaching - decided
 
     def remember(self, s: Situation) -> Situation:
-        """The state with every memory driven along the recording."""
+        """Drive every memory along the recording."""
         memory = {}
         for d in self.departures:
             if not isinstance(d, Memory):
@@ -162,7 +160,7 @@ class Finger:
         return replace(s, memory=memory)
 
     def _ready(self, s: Situation):
-        """Departures that can act: a memory acts only once it has been driven."""
+        """Yield the departures that can act. One with a memory can once its state is known."""
         for d in self.departures:
             if not isinstance(d, Memory) or id(d) in s.memory:
                 yield d

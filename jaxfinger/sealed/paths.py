@@ -1,14 +1,14 @@
-"""Tendon paths of MuJoCo's spatial tendons, and the polynomials that fit them.
+"""Paths of MuJoCo's spatial tendons, and the polynomials that fit them.
 
-Between two eyelets that sit on neighbouring links the path depends on one angle only, so the excursion separates by
-joint. A flexor runs straight from eyelet to eyelet: with equal distances its excursion is 2R (cos α − cos(α + q/2)),
-and its moment arm grows as it bowstrings. An extensor wraps a pulley on the joint: r q. Over a finger's range a
-polynomial of fourth order misses the first by about 1e-5 R, a fiftieth of the excursion's noise. The specimens use
-these polynomials, so that they lie in the nominal class.
+Between eyelets on neighbouring links the path depends on one angle, so the excursion is a sum over joints. A flexor
+runs straight from eyelet to eyelet. Its excursion is 2R (cos α − cos(α + q/2)) for eyelets at equal distances R, and
+its moment arm grows as it bowstrings. An extensor wraps a pulley on the joint: r q. Over a finger's range a polynomial
+of fourth order misses the flexor by about 1e-5 R, a fiftieth of the excursion's noise. The specimens use these
+polynomials, so that they lie in the nominal class.
 """
 
 # pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module tells a type checker nothing of its functions.)
+# (MuJoCo's compiled module has no types.)
 from __future__ import annotations
 
 import mujoco
@@ -29,10 +29,10 @@ def spatial_lengths(
     joint: int,
     q: Float[np.ndarray, " K"],
 ) -> Float[np.ndarray, "K n"]:
-    """Path lengths in m as joint `joint` turns through q and the others rest at zero.
+    """Path lengths, m, at angles q of one joint with the others at zero.
 
-    `arm` is the moment arm at q = 0 in m (0: the tendon does not cross); `alpha` the eyelets' angle above the link
-    in rad.
+    `arm`: moment arms at q = 0, m, zero where a tendon does not cross. `alpha`: angles of the eyelets above the link,
+    rad.
     """
     spec = mujoco.MjSpec()
     bodies = add_chain(spec, finger)
@@ -45,7 +45,7 @@ def spatial_lengths(
             # A pull along −x at height h turns the joint by (h × −x)·axis: positive on the side axis × x.
             side = np.sign(arm[k, i]) * np.cross(finger.axis[i], [1.0, 0.0, 0.0])
             wraps = arm[k, i] < 0 and np.ptp(finger.limits[i]) > 1.0
-            if wraps:  # eyelets low enough that the straight line would cut the pulley over the whole range
+            if wraps:  # Eyelets so low that the tendon touches the pulley over the whole range.
                 height, along = 0.4 * abs(arm[k, i]), 2.5 * abs(arm[k, i])
             else:
                 height, along = abs(arm[k, i]), abs(arm[k, i]) / np.tan(alpha[k, i])
@@ -78,7 +78,7 @@ def spatial_lengths(
 def excursion_polynomials(
     finger: FingerDescription, arm: Float[np.ndarray, "n m"], alpha: Float[np.ndarray, "n m"]
 ) -> tuple[Float[np.ndarray, "n m 4"], float]:
-    """Coefficients of q, q², q³, q⁴ of the excursion (pulled in positive), and the worst misfit in m."""
+    """Fit q, q², q³, q⁴ to the excursion (positive pulled in). Return coefficients, m/radᵖ, and largest misfit, m."""
     coefficients = np.zeros((finger.n, finger.m, DEGREE))
     misfit = 0.0
     for i in range(finger.m):

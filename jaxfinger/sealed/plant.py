@@ -1,10 +1,10 @@
-"""The rigid body of a specimen, built from its description as a MuJoCo model.
+"""The rigid body of a specimen as a MuJoCo model.
 
-It shares no code with `jaxfinger.model`: the sealed cases are only worth something if their plant is another one.
+It shares no code with `jaxfinger.model`, so that the cases also test the model.
 """
 
 # pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module tells a type checker nothing of its functions.)
+# (MuJoCo's compiled module has no types.)
 from __future__ import annotations
 
 import mujoco
@@ -13,16 +13,16 @@ from jaxtyping import Float
 
 from jaxfinger.data import FingerDescription
 
-STICK = (0.9999, 0.9999, 1e-3, 0.5, 2.0)  # impedance of dry friction: creep of a sticking joint below 1e-3 rad/s
-
-TYPICAL_ARM = 5e-3  # m; MuJoCo scales the softness of a tendon's friction by the coefficients at compile time
+# MuJoCo's impedance (solimp) of dry friction, near its upper limit: a sticking joint creeps by less than 1e-3 rad/s.
+STICK_IMPEDANCE = (0.9999, 0.9999, 1e-3, 0.5, 2.0)
+TYPICAL_ARM = 5e-3  # m. MuJoCo scales the softness of a tendon's friction by its coefficients at compile time.
 
 
 def build(finger: FingerDescription, timestep: float = 5e-4) -> mujoco.MjModel:
-    """MuJoCo model of the serial chain; the active tendons are fixed tendons whose coefficients are C(q) of the moment.
+    """Build the MuJoCo model of the serial chain and its active tendons. `timestep`: s.
 
-    A fixed tendon's force acts through its coefficients, and MuJoCo solves the dry friction of joints and tendons
-    together as one convex problem. The caller sets coefficients and friction before every step.
+    Tendons are MuJoCo's fixed tendons. The caller sets their coefficients to C(q), and all friction, before every step.
+    MuJoCo solves the dry friction of joints and tendons as one convex problem.
     """
     spec = mujoco.MjSpec()
     spec.option.timestep = timestep
@@ -34,13 +34,13 @@ def build(finger: FingerDescription, timestep: float = 5e-4) -> mujoco.MjModel:
             tendon.wrap_joint(joint, TYPICAL_ARM)
     model = spec.compile()
     fast = [2.0 * timestep, 1.0]
-    model.dof_solref[:], model.dof_solimp[:] = fast, STICK
-    model.tendon_solref_fri[:], model.tendon_solimp_fri[:] = fast, STICK
+    model.dof_solref[:], model.dof_solimp[:] = fast, STICK_IMPEDANCE
+    model.tendon_solref_fri[:], model.tendon_solimp_fri[:] = fast, STICK_IMPEDANCE
     return model
 
 
 def add_chain(spec: mujoco.MjSpec, finger: FingerDescription) -> list:
-    """Add the finger's links to a specification; returns the bodies, base first."""
+    """Add the finger's links to a specification and return the bodies, base first."""
     bodies = [spec.worldbody]
     for i, name in enumerate(finger.joint_names):
         inertia = finger.inertia[i]
@@ -75,7 +75,7 @@ class Plant:
     def inverse_dynamics(
         self, q: Float[np.ndarray, "N m"], qd: Float[np.ndarray, "N m"], qdd: Float[np.ndarray, "N m"]
     ) -> Float[np.ndarray, "N m"]:
-        """M(q) q̈ + N(q, q̇) + G(q), by MuJoCo's recursive Newton–Euler."""
+        """M(q) q̈ + N(q, q̇) + G(q) by MuJoCo's recursive Newton–Euler."""
         model, data = self.model, self._data
         torque = np.empty_like(q)
         for i in range(len(q)):
@@ -87,13 +87,13 @@ class Plant:
         return torque
 
     def gravity_torque(self, q: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
-        """G(q); evaluated once where the whole recording holds one posture."""
+        """G(q), evaluated once where the whole recording holds one posture."""
         if np.ptp(q, axis=0).max() == 0.0:
             return np.broadcast_to(self.inverse_dynamics(q[:1], 0 * q[:1], 0 * q[:1]), q.shape)
         return self.inverse_dynamics(q, np.zeros_like(q), np.zeros_like(q))
 
     def mass_matrix(self, q: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m m"]:
-        """M(q) in kg m²."""
+        """M(q), kg m²."""
         model, data = self.model, self._data
         data.qpos = q
         mujoco.mj_forward(model, data)
@@ -102,7 +102,7 @@ class Plant:
         return dense
 
     def jacobian(self, q: Float[np.ndarray, " m"]) -> Float[np.ndarray, "3 m"]:
-        """∂x/∂q of the fingertip, base frame, in m."""
+        """∂x/∂q of the fingertip, base frame, m."""
         model, data = self.model, self._data
         data.qpos = q
         mujoco.mj_kinematics(model, data)
@@ -114,7 +114,7 @@ class Plant:
         return jac
 
     def fingertip(self, q: Float[np.ndarray, " m"]) -> Float[np.ndarray, " xyz"]:
-        """Place of the contact point in the base frame in m."""
+        """Position of the fingertip in the base frame, m."""
         model, data = self.model, self._data
         data.qpos = q
         mujoco.mj_kinematics(model, data)

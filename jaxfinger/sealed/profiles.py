@@ -1,7 +1,7 @@
-"""Smooth motions: velocity goes from knot to knot along a quintic smoothstep, so acceleration is continuous.
+"""Smooth motions: velocity follows a quintic smoothstep between knots, so that acceleration is continuous.
 
-Between two knots of velocity v₀, v₁ a time T apart, with x = (t − t₀)/T:
-v = v₀ + Δv (10x³ − 15x⁴ + 6x⁵), and its integral and derivative are exact.
+Between knots of velocity v₀ and v₁ a time T apart, with x = (t − t₀)/T: v = v₀ + (v₁ − v₀) (10x³ − 15x⁴ + 6x⁵).
+Value and acceleration are its exact integral and derivative.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from jaxtyping import Float
 
 @dataclass(frozen=True)
 class Profile:
-    """One coordinate over time, from velocity knots. Rests before and after."""
+    """One coordinate over time from its start and velocity knots, at rest before and after them."""
 
     start: float
     times: Float[np.ndarray, " k"]
     rates: Float[np.ndarray, " k"]
 
     def __call__(self, t: Float[np.ndarray, " N"]) -> tuple[Float[np.ndarray, " N"], ...]:
-        """Value, first and second derivative at t."""
+        """Value, first and second derivative at times t, s."""
         if len(self.times) < 2:
             return np.full_like(t, self.start), np.zeros_like(t), np.zeros_like(t)
         span = np.diff(self.times)
@@ -40,7 +40,7 @@ class Profile:
 
 @dataclass(frozen=True)
 class Builder:
-    """Collects moves and rests of one coordinate; immutable, each step gives a new one."""
+    """Immutable builder of a `Profile` from rests and moves: each call returns a new builder."""
 
     start: float
     now: float = 0.0
@@ -50,19 +50,20 @@ class Builder:
 
     @property
     def here(self) -> float:
+        """Value reached so far."""
         return self.start if self.value is None else self.value
 
     def rest(self, duration: float) -> Builder:
-        """Stay for a while."""
+        """Rest for `duration` s."""
         return self._then([(duration, 0.0)], self.here)
 
     def move(self, to: float, duration: float) -> Builder:
-        """Go to a value and stop there: accelerate, decelerate."""
+        """Move to a value in `duration` s and stop there."""
         peak = 2.0 * (to - self.here) / duration
         return self._then([(duration / 2, peak), (duration / 2, 0.0)], to)
 
     def sweep(self, to: float, speed: float, turn: float) -> Builder:
-        """Go to a value at constant speed, taking `turn` seconds to speed up and to slow down."""
+        """Move to a value at constant speed, with `turn` s each to speed up and to slow down."""
         distance = to - self.here
         cruise = max(abs(distance) / speed - turn, 1e-3)
         rate = distance / (cruise + turn)

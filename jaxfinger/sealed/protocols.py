@@ -1,7 +1,6 @@
-"""The experiments of a session: what is commanded, trial by trial, drawn from a seed.
+"""The experiments of a session: commands of its trials, drawn from a seed.
 
-A session has some forty trials like those of a bench; a fresh file has other postures, speeds and levels and
-repeats nothing.
+A session has about forty trials. A file of fresh trials has other postures, speeds and tensions, and no repeats.
 """
 
 from __future__ import annotations
@@ -14,13 +13,13 @@ from jaxtyping import Float
 from .profiles import Builder, Profile
 from .specimens import Specimen
 
-SLOW, FAST = 250.0, 1000.0  # samples per second
-LOGGED = 200.0  # of a bench whose logger has one rate for all
+SLOW, FAST = 250.0, 1000.0  # samples per second of experiments at rest or by hand, and of driven ones
+LOGGED = 200.0  # samples per second of a bench whose logger has one rate for all
 
 
 @dataclass(frozen=True)
 class Plan:
-    """One commanded trial. `q` and `tension` hold a profile per joint and tendon; holds are (begin, end, direction)."""
+    """One commanded trial, with a profile for each joint and tendon. Holds are (begin, end, direction)."""
 
     name: str
     motion: str
@@ -33,32 +32,32 @@ class Plan:
     joint: int | None = None
     tendon: int | None = None
     holds: tuple[tuple[float, float, int], ...] = ()
-    least: float = 2.0  # N, tension that VD.3 keeps on every tendon
-    wander: float = 0.0  # N, slow wander of the hand-held or constant tension
-    seed: int = 0  # process noise of this very trial
+    least: float = 2.0  # N, lowest tension of every tendon in VD.3
+    wander: float = 0.0  # N, slow wander of a tension that is held by hand or weight
+    seed: int = 0  # of the trial's process noise
 
 
 @dataclass(frozen=True)
 class Style:
-    """How this bench runs its experiments."""
+    """Settings of one bench's experiments."""
 
-    holds: int
-    hold_time: float
-    levels: int
-    top: float  # N
-    speeds: tuple[float, ...]  # rad/s
-    repeat: float  # chance that a trial is run again
-    unload: bool  # ID.4 lets tension go in steps, too
-    missing: str  # an experiment that this session lacks, or nothing
-    postures: int
-    base_tension: float
-    slow: float = SLOW  # samples per second of what is slow, and of what is fast
-    fast: float = FAST
-    together: bool = False  # ID.3-dynamic moves all joints at once
+    holds: int  # of ID.3-static, in each direction
+    hold_time: float  # s
+    levels: int  # of tension in ID.4, upwards
+    top: float  # N, highest tension in ID.4
+    speeds: tuple[float, ...]  # rad/s, of ID.3-dynamic
+    repeat: float  # probability that a trial is repeated
+    unload: bool  # ID.4 and VD.2 also step down.
+    missing: str  # An experiment that this session lacks, or "".
+    postures: int  # of ID.2 and ID.4
+    base_tension: float  # N, of ID.2 and VD.1
+    slow: float = SLOW  # samples per second
+    fast: float = FAST  # samples per second
+    together: bool = False  # ID.3-dynamic moves all joints at once.
 
 
 def draw_style(rng: np.random.Generator, foreign: bool = False) -> Style:
-    """Habits of one bench; `foreign`: one that logs at one rate, and drives all joints at once."""
+    """Draw the settings of one bench. A `foreign` one logs at one rate and drives all joints at once."""
     speeds = np.sort(rng.choice([0.3, 0.5, 0.7, 1.0, 1.4, 1.8, 2.3], size=int(rng.integers(3, 5)), replace=False))
     return Style(
         holds=int(rng.integers(7, 11)),
@@ -78,7 +77,7 @@ def draw_style(rng: np.random.Generator, foreign: bool = False) -> Style:
 
 
 def session_plans(specimen: Specimen, style: Style, rng: np.random.Generator, fresh: bool = False) -> list[Plan]:
-    """Every trial of the session in order."""
+    """Draw all trials of a session in order, or those of a `fresh` file."""
     protocol = _Protocol(specimen, style, rng, fresh)
     plans: list[Plan] = []
     for experiment, draft in protocol.drafts():
@@ -103,6 +102,8 @@ def session_plans(specimen: Specimen, style: Style, rng: np.random.Generator, fr
 
 
 class _Protocol:
+    """Drafts of a session's trials."""
+
     def __init__(self, specimen: Specimen, style: Style, rng: np.random.Generator, fresh: bool):
         self.specimen, self.style, self.rng, self.fresh = specimen, style, rng, fresh
         self.finger = specimen.finger
@@ -112,7 +113,7 @@ class _Protocol:
         self.letters = "a" if fresh else "abcdefg"[: style.postures]
 
     def drafts(self):
-        """(experiment, plan) in the order of a session, before repeats and numbering."""
+        """Yield (experiment, plan) in the order of a session, before repeats and numbering."""
         for j in range(self.m):
             for letter in () if self.fresh else self.letters:
                 yield "ID.2", self.id2(j, letter)
@@ -137,19 +138,21 @@ class _Protocol:
             yield "VD.3", self.vd3(letter)
 
     def _arms(self, k: int):
-        """Joints at which the tendon's torque is measured: those with a real moment arm, three at most."""
+        """Joints at which ID.4 measures the tendon: two or three largest moment arms above 1.5 mm."""
         arm = np.abs(self.specimen.excursion[k, :, 0])
         joints = [j for j in np.argsort(-arm) if self.finger.crosses[k, j] and arm[j] > 1.5e-3]
         return sorted(joints[:3] if self.m < 5 else joints[:2])
 
     def posture(self, low: float = 0.08, high: float = 0.7) -> Float[np.ndarray, " m"]:
-        """A fixed posture within the range."""
+        """Draw a posture within a part of the joints' ranges."""
         return self.low + (self.high - self.low) * self.rng.uniform(low, high, self.m)
 
     def _rest(self, values) -> list[Profile]:
+        """Constant profiles."""
         return [Builder(float(v)).profile() for v in values]
 
     def _ends(self, j: int) -> tuple[float, float]:
+        """Draw the ends of a joint's motion, rad."""
         span = self.high[j] - self.low[j]
         a, b = (0.12, 0.85) if self.fresh else (0.1, 0.95)
         return (
@@ -158,10 +161,11 @@ class _Protocol:
         )
 
     def _tensions(self, value: float) -> tuple[Profile, ...]:
+        """Constant tension of the active tendons, N."""
         return tuple(self._rest(np.where(self.finger.active, value, 0.0)))
 
     def id2(self, j: int, letter: str) -> Plan:
-        """Tendons at about 2 N, one joint through its range and back, twice, the second time another depth."""
+        """ID.2: tendons at about 2 N; one joint moves through its range and back, then through a part of it."""
         low, high = self._ends(j)
         q = self._rest(self.posture())
         pace = self.rng.uniform(4.5, 6.0)
@@ -184,7 +188,7 @@ class _Protocol:
         )
 
     def vd1(self, letter: str) -> Plan:
-        """All joints by hand along a free path."""
+        """VD.1: all joints are moved by hand along a free path."""
         q, duration = [], self.rng.uniform(18.0, 24.0)
         for j in range(self.m):
             b = Builder(self.low[j] + 0.15 * (self.high[j] - self.low[j]))
@@ -208,7 +212,7 @@ class _Protocol:
         )
 
     def static(self, j: int, letter: str) -> Plan:
-        """Tendons slack; one joint through holds, up and back."""
+        """ID.3-static: tendons slack; one joint steps through holds, up and back."""
         low, high = self._ends(j)
         count = self.style.holds - (2 if self.fresh else 0)
         up = np.linspace(low, high, count) + self.rng.uniform(-0.01, 0.01, count)
@@ -226,7 +230,7 @@ class _Protocol:
         )
 
     def dynamic(self, j: int, letter: str) -> Plan:
-        """Tendons slack; sweeps there and back at several speeds, and a small loop inside the range."""
+        """ID.3-dynamic: tendons slack; one joint sweeps back and forth at several speeds, then in a small loop."""
         low, high = self._ends(j)
         speeds = np.array(self.style.speeds) * (0.8 if self.fresh else 1.0) * self.rng.uniform(0.95, 1.05)
         b = Builder(low).rest(0.3)
@@ -245,7 +249,7 @@ class _Protocol:
         return Plan(name, name, "ID.3-dynamic", 0, b.now + 0.2, self.style.fast, tuple(q), self._tensions(0.0), j)
 
     def dynamic_together(self, letter: str) -> Plan:
-        """Tendons slack; all joints sweep at once, each to its own ends at its own speeds."""
+        """ID.3-dynamic: tendons slack; all joints sweep at once, each to its own ends at its own speeds."""
         pace = 0.8 if self.fresh else 1.0
         q, duration = [], self.rng.uniform(14.0, 18.0)
         for j in range(self.m):
@@ -261,6 +265,7 @@ class _Protocol:
         return Plan(name, name, "ID.3-dynamic", 0, duration, self.style.fast, tuple(q), self._tensions(0.0))
 
     def _steps(self, levels, hold: float) -> tuple[Builder, list[tuple[float, float, int]]]:
+        """Steps through levels, each held for `hold` s, and the holds."""
         b, holds = Builder(0.0).rest(0.15), []
         for level in levels:
             direction = 1 if level > b.here else -1
@@ -270,7 +275,7 @@ class _Protocol:
         return b, holds
 
     def id4(self, k: int, j: int, letter: str) -> Plan:
-        """The joint held by the torque sensor; one tendon up in steps, and down."""
+        """ID.4: the torque sensor holds the joint; the tension of one tendon steps up and, with `unload`, down."""
         top = self.style.top * (0.85 if self.fresh else 1.0)
         up = np.linspace(2.0, top, self.style.levels) + (self.rng.uniform(0.2, 0.6) if self.fresh else 0.0)
         down = np.array([0.68, 0.42, 0.2]) * top if self.style.unload else np.array([])
@@ -294,7 +299,7 @@ class _Protocol:
         )
 
     def vd2(self, k: int) -> Plan:
-        """Fingertip against the force sensor; one tendon up to 15 N, others at a constant tension or slack."""
+        """VD.2: the fingertip presses the force sensor; one tendon steps up to 15 N, others are constant or slack."""
         up = np.arange(4.0, 15.1, 1.0 if not self.fresh else 1.4)
         down = np.array([11.0, 7.0]) if self.style.unload else np.array([])
         b, holds = self._steps(np.concatenate([up, down]), self.style.hold_time * 0.75)
@@ -320,7 +325,7 @@ class _Protocol:
         )
 
     def vd3(self, letter: str) -> Plan:
-        """A wish of the free finger's trajectory; `drive` finds postures and tensions that the finger can follow."""
+        """VD.3: the tendons drive the free finger. `drive` draws the trajectory and finds the tensions."""
         return Plan(
             f"VD.3-{letter}",
             f"VD.3-{letter}",
@@ -335,5 +340,5 @@ class _Protocol:
 
 
 def sample_times(plan: Plan, rate: float | None = None) -> Float[np.ndarray, " N"]:
-    """Sampling times in s at the plan's rate or another."""
+    """Sampling times, s, at the plan's rate or another."""
     return np.arange(int(plan.duration * (rate or plan.rate))) / (rate or plan.rate)

@@ -1,4 +1,4 @@
-"""What an ideal bench would record of a plan: true channels, before sensors."""
+"""True channels of a plan, before the sensors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .protocols import FAST, Plan, sample_times
 
 @dataclass(frozen=True)
 class Channels:
-    """One trial without noise, time first. A channel that the experiment does not measure is None."""
+    """One trial without noise, time first, SI. A channel that the experiment does not measure is None."""
 
     plan: Plan
     time: Float[np.ndarray, " N"]
@@ -29,23 +29,25 @@ class Channels:
 
 @dataclass(frozen=True)
 class Motion:
-    """What happens to the finger in a trial: time s, angles rad, tension N, time first."""
+    """Motion and tension of the finger in a trial, time first: s, rad, N."""
 
     time: Float[np.ndarray, " N"]
     q: Float[np.ndarray, "N m"]
     qd: Float[np.ndarray, "N m"]
     qdd: Float[np.ndarray, "N m"]
     tension: Float[np.ndarray, "N n"]
-    direction: Float[np.ndarray, "N m"]  # of each joint's sliding, known from the true motion
+    direction: Float[np.ndarray, "N m"]  # in which each joint slides
 
 
 def commanded(plan: Plan, rate: float | None = None) -> Motion:
-    """The motion that a plan prescribes, with the process noise of this very trial: a repeat is never quite the
-    same.
+    """Motion that a plan commands, with the process noise of the trial's seed. `rate`: samples per second.
+
+    Process noise makes repeats differ. Where `rate` is given, ID.2 and ID.3 also have the instants before reversals,
+    which a coarse rate would miss.
     """
     rng = np.random.default_rng(plan.seed)
     t = sample_times(plan, rate)
-    if rate is not None and plan.experiment.startswith(("ID.2", "ID.3")):  # a coarse look still sees every reversal
+    if rate is not None and plan.experiment.startswith(("ID.2", "ID.3")):
         for profile in plan.q if plan.joint is None else [plan.q[plan.joint]]:
             t = np.union1d(t, _reversals(profile, plan))
     warped = t * (1 + 2e-5 * rng.normal())
@@ -63,27 +65,27 @@ def commanded(plan: Plan, rate: float | None = None) -> Motion:
         )
     )
     tension = tension + plan.wander * wander * pulled
-    if not plan.wander:  # a tension controller holds a level to a few hundredths
+    if not plan.wander:  # A tension controller holds a level to a fifth of a percent.
         tension = tension * (1 + 2e-3 * rng.normal(size=len(pulled)))
     return Motion(t, q, qd, qdd, tension, last_direction(qd))
 
 
 def _reversals(profile: Profile, plan: Plan) -> Float[np.ndarray, " r"]:
-    """Times just before a profile's rate changes sign, s."""
+    """Times, s, just before a profile's rate changes sign."""
     t = sample_times(plan)
     sign = last_direction(profile(t)[1][:, None])[:, 0]
     return t[1:][np.diff(sign) != 0] - 2e-3
 
 
 def driven(run: Run, rate: float = FAST) -> Motion:
-    """The motion of a simulated VD.3 trial, as often as it is logged; acceleration is not needed to measure it."""
+    """Motion of a simulated VD.3 trial at the rate of its log. Acceleration is zero, since no channel needs it."""
     direction, every = last_direction(run.qd, 1e-3), slice(None, None, round(FAST / rate))
     time, q, qd, tension, direction = (a[every] for a in (run.time, run.q, run.qd, run.tension, direction))
     return Motion(time, q, qd, np.zeros_like(q), tension, direction)
 
 
 def last_direction(rate: Float[np.ndarray, "N k"], still: float = 1e-9) -> Float[np.ndarray, "N k"]:
-    """Sign of the rate, kept through stops; before the first motion, that of the first motion."""
+    """Sign of the rate, kept through stops. Before the first motion it is that of the first motion."""
     sign = np.where(np.abs(rate) > still, np.sign(rate), 0.0)
     rows = np.arange(len(sign))[:, None]
     kept = np.maximum.accumulate(np.where(sign != 0, rows, 0), axis=0)
@@ -93,7 +95,7 @@ def last_direction(rate: Float[np.ndarray, "N k"], still: float = 1e-9) -> Float
 
 
 def record(finger: Finger, plan: Plan, motion: Motion, rigid: Float[np.ndarray, "N m"] | None = None) -> Channels:
-    """True channels of a trial. `rigid`: its rigid-body torque where it is known already."""
+    """True channels of a trial. `rigid`: its rigid-body torque, N m, where it is known already."""
     session = plan.start + motion.time
     held = plan.experiment in ("ID.4", "VD.2")
     direction = np.zeros_like(motion.direction) if held else motion.direction
@@ -124,7 +126,7 @@ def record(finger: Finger, plan: Plan, motion: Motion, rigid: Float[np.ndarray, 
         if plan.experiment == "ID.4":
             out = replace(out, torque=_at_motor(finger, s, torque))
         else:
-            # The joints' static friction takes what a contact force cannot: least squares.
+            # The contact force is the least-squares solution. Static friction of the joints takes the rest.
             force = torque @ np.linalg.pinv(finger.plant.jacobian(motion.q[0]))
             for d in finger.departures:
                 force = d.contact(finger, s, force)
@@ -135,7 +137,7 @@ def record(finger: Finger, plan: Plan, motion: Motion, rigid: Float[np.ndarray, 
 def needed_torque(
     finger: Finger, plan: Plan, motion: Motion, rigid: Float[np.ndarray, "N m"] | None = None
 ) -> Float[np.ndarray, "N m"]:
-    """VD.3: the external torque that the finger would need to follow a motion under these tensions, N m."""
+    """External torque, N m, that the finger needs to follow a motion under its tensions (VD.3)."""
     session = plan.start + motion.time
     s = Situation(motion.time, session, motion.q, motion.qd, motion.qdd, motion.tension, motion.direction)
     s.st = last_direction(finger.speed(s), 1e-6)
@@ -150,13 +152,14 @@ def rigid_torque(finger: Finger, motion: Motion) -> Float[np.ndarray, "N m"]:
 
 
 def _at_motor(finger: Finger, s: Situation, torque: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
+    """Torque at the external motor's sensor, N m."""
     for d in finger.departures:
         torque = d.at_motor(finger, s, torque)
     return torque
 
 
 def read(finger: Finger, channels: Channels) -> Channels:
-    """What biased sensors make of the true channels, still without noise."""
+    """Apply the departures of the sensors to the true channels. Noise is added later."""
     for d in finger.departures:
         channels = d.read(channels)
     return channels

@@ -1,9 +1,9 @@
-"""The ceiling: which other causes could not be told from the true one, by any method, with the session at hand.
+"""Rivals: causes that no method could tell from the true one with the data of the session.
 
-For the truth, listed or not, and each listed rival, the trace that a nominal refit leaves is known without noise. The
-log-likelihood that is lost when the rival, at its best size, stands in for the truth is D = ½ ‖z‖² (1 − cos²(z,
-z_rival)), with rows weighted so that the samples of one second count once: the quantitative distinguishability of
-Lundgren and Jung (2020, arXiv 2009.04756) for known noise. Below `TELLING` nats the two look alike.
+The noise-free residual z that a cause leaves after a refit of the nominal parameters is known. A rival that stands in
+for the truth at its best size loses D = ½ ‖z‖² (1 − cos²(z, z_rival)) nats of log likelihood, the quantitative
+distinguishability of Lundgren and Jung (2020, arXiv 2009.04756) for known noise. Rows are weighted so that the samples
+of one second count once. Causes less than `MIN_DISTANCE` nats apart cannot be told apart.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ import numpy as np
 from .cases import rebuild
 from .departures import LISTED, draw_at, sites
 from .departures.draw import Index, Names
-from .severity import COARSE, QuietSession
-from .truth import TELLING
+from .severity import COARSE, NoiseFreeSession
+from .truth import MIN_DISTANCE
 
-DRAWS = 2  # shapes tried for each rival and site
-NEAREST, MORE = 5, 30  # the nearest by these get more
+DRAWS = 2  # shapes drawn for each rival and site
+NEAREST, MORE = 5, 30  # Further shapes are drawn for the nearest rivals, whose distance decides.
 
 
 @dataclass(frozen=True)
 class Rival:
-    """A cause that could stand in for the truth, and the nats by which it misses."""
+    """A cause other than the truth, and its distance from the truth in nats."""
 
     effect: str
     site: tuple[str, ...]
@@ -37,27 +37,29 @@ class Rival:
 
 
 def distances(
-    session: QuietSession,
+    session: NoiseFreeSession,
     left: np.ndarray,
     truth: tuple[str, tuple[str, ...]],
     seed: int,
     draws: int = DRAWS,
     more: int = MORE,
 ) -> list[Rival]:
-    """Every listed cause other than the truth with its distance, nearest first. `left`: the truth's trace after
-    a refit; `draws`, `more`: shapes that are tried of each, and further ones of the nearest.
+    """Distances of all listed causes other than the truth, nearest first.
+
+    `left`: what a refit leaves of the truth's trace. `draws`, `more`: shapes drawn of each cause, and further ones of
+    the nearest.
     """
     rng = np.random.default_rng(seed)
     finger = session.specimen.finger
     energy = float(left @ left) / COARSE[250.0]
 
     def imitated(effect: str, names: Names, index: Index, draws: int) -> float:
-        """Energy of the truth's trace along the rival's, of the drawn shape that fits best."""
+        """Energy of the truth's trace along the rival's, for the drawn shape that fits best."""
         best = 0.0
         for _ in range(draws):
             rival = draw_at(effect, (names, index), finger, rng, (0.5, 1.0))
-            z = session.left(session.trace([rival])[0])
-            # Sizes are positive where physics says so, but signs of gains and offsets are free: take either.
+            z = session.refitted(session.trace([rival])[0])
+            # Both signs count, since gains and offsets may have either. Causes of positive size may come out too near.
             best = max(best, float(left @ z) ** 2 / max(float(z @ z), 1e-30) / COARSE[250.0])
         return best
 
@@ -76,14 +78,19 @@ def distances(
 
 
 def add_rivals(truth_file: Path) -> list[Rival]:
-    """Rebuild a single-effect case from its seed and write its rivals within `TELLING` nats into its truth."""
+    """Compute the rivals of a case with one effect, and write those within `MIN_DISTANCE` nats into its truth.
+
+    Other cases, and those that have rivals already, return no rivals.
+    """
     truth = json.loads(truth_file.read_text())
     if truth["kind"] not in ("listed", "unlisted") or "rivals" in truth:
         return []
     session, departures = rebuild(truth)
-    left = session.left(session.trace(departures)[0])
+    left = session.refitted(session.trace(departures)[0])
     cause = departures[0]
-    near = [r for r in distances(session, left, (cause.effect, cause.site), truth["seed"][1]) if r.distance < TELLING]
+    near = [
+        r for r in distances(session, left, (cause.effect, cause.site), truth["seed"][1]) if r.distance < MIN_DISTANCE
+    ]
     truth["energy"] = 0.5 * float(left @ left) / COARSE[250.0]
     truth["rivals"] = [{"effect": r.effect, "site": list(r.site), "distance": r.distance} for r in near]
     part = truth_file.with_suffix(".part")
@@ -98,7 +105,10 @@ def add_all(
     share: tuple[int, int] = (1, 1),
     progress: Callable[[int, int, str], None] | None = None,
 ) -> int:
-    """Rivals of every case under a truth folder (or share i of n); files that have them are left alone."""
+    """Add rivals to all cases of a truth folder, or share (i, n) of them; return how many were looked at.
+
+    `progress` takes (done, total, name).
+    """
     files: Sequence[Path] = [
         f for k, f in enumerate(sorted(truth_root.glob("case-*.json")), start=1) if k % share[1] == share[0] % share[1]
     ]

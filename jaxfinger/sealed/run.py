@@ -1,7 +1,6 @@
-"""Runs a diagnosis over sealed cases: on many cores, on many machines by shares, taken up again after a stop.
+"""Run a diagnosis over sealed cases: on many cores, on many machines by shares, and resumed after a stop.
 
-The diagnosis sees a copy of `fit.h5` in an empty folder and nothing else: neither the fresh trials nor any path to
-the truth.
+The diagnosis gets a copy of `fit.h5` in an empty folder. It sees neither the fresh trials nor a path to the truth.
 """
 
 from __future__ import annotations
@@ -27,7 +26,8 @@ from jaxfinger.errors import UserError
 
 from .truth import Cause, Truth, read_diagnosis, read_truth
 
-CASES_PER_PROCESS = 3  # compiled code of a case takes up to 18,000 memory maps; Linux gives a process 65,530
+# Compiled code of a case takes up to 18,000 memory maps. Linux gives a process 65,530.
+CASES_PER_PROCESS = 3
 
 Diagnose = Callable[[Path, Path], None]  # (session file, folder to write gap.json into)
 
@@ -39,7 +39,7 @@ class Command:
     line: str
 
     def without(self, effect: str) -> Command:
-        """The same with one effect taken out of the catalogue."""
+        """The same command with one effect taken out of the catalogue."""
         return Command(f"{self.line} --without {shlex.quote(effect)}")
 
     def __call__(self, fit: Path, out: Path) -> None:
@@ -47,8 +47,9 @@ class Command:
 
 
 def run_case(diagnose: Diagnose, folder: Path, out: Path) -> str:
-    """Diagnose one case into `out/<case>`; returns "done", "failed" or "skipped". A failure is recorded, and
-    scored as one.
+    """Diagnose one case into `out/<case>` unless it is done. Return "done", "failed" or "skipped".
+
+    `run.json` records the seconds and, of a failure, the error.
     """
     target = out / folder.name
     if (target / "run.json").exists():
@@ -62,7 +63,7 @@ def run_case(diagnose: Diagnose, folder: Path, out: Path) -> str:
             diagnose(fit, result)
             if not (result / "gap.json").exists():
                 raise RuntimeError("the diagnosis wrote no gap.json")
-        except Exception as error:  # whatever the code under test raises is its result
+        except Exception as error:  # Any error of the code under test is its result.
             record["error"] = f"{type(error).__name__}: {error}"
         record["seconds"] = time.perf_counter() - begun
         target.mkdir(parents=True, exist_ok=True)
@@ -77,8 +78,7 @@ def run_case(diagnose: Diagnose, folder: Path, out: Path) -> str:
 @dataclass(frozen=True)
 class Predict:
     """Shell command lines: `line` predicts a session by a fit, with {fit}, {session} and {out}; `refit` fits a session
-    with the effects that are truly there, with {session}, {effects} and {out}. Without it there is no best to compare
-    with.
+    with the true effects, with {session}, {effects} and {out}. An empty `refit` leaves the best out.
     """
 
     line: str
@@ -88,7 +88,7 @@ class Predict:
         _run([w.format(fit=fit, session=session, out=out) for w in shlex.split(self.line)])
 
     def best(self, session: Path, causes: Sequence[Cause], out: Path) -> None:
-        """A fit with the true effects."""
+        """Fit a session with the true effects into `out`."""
         words = []
         for w in shlex.split(self.refit):
             named = [f"{effect}:{'-'.join(site)}" for effect, site in causes]
@@ -97,15 +97,22 @@ class Predict:
 
 
 def _run(words: list[str]) -> None:
+    """Run a command.
+
+    Raises:
+        RuntimeError: Its exit status is not zero. The message is the end of what it printed.
+    """
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError((done.stderr or done.stdout).strip()[-2000:] or f"exit status {done.returncode}")
 
 
 def close_case(predict: Predict, folder: Path, diagnosed: Path, truth: Truth) -> str:
-    """Predict a case's fresh trials into `diagnosed/fresh.json`: by the nominal model (before), with the verdict's
-    effects (after), and with the true ones (best), which are the verdict's where it is right. "skipped" where it is
-    done, or where no known effect is there; "failed" where a command fails, which `close.log` tells.
+    """Predict a case's fresh trials into `diagnosed/fresh.json`, and return "done", "skipped" or "failed".
+
+    Predictions are those of the nominal model (before), with the verdict's effects (after), and with the true effects
+    (best, the same as after where the verdict is right). Cases that are done or have no listed effect are skipped. If a
+    command fails, `close.log` holds its message.
     """
     from .closure import fresh_rows
 
@@ -144,7 +151,7 @@ def close_cases(
     workers: int = 1,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> dict[str, str]:
-    """`close_case` for every diagnosed case; returns what became of each."""
+    """Call `close_case` for every diagnosed case, and return its results by case."""
     folders = [f.parent for f in sorted(cases.glob("*/fit.h5")) if (out / f.parent.name / "gap.json").exists()]
     truths = {f.name: read_truth(f, truth_root) for f in folders}
     results: dict[str, str] = {}
@@ -165,10 +172,13 @@ def run_cases(
     share: tuple[int, int] = (1, 1),
     progress: Callable[[int, int, str], None] | None = None,
 ) -> dict[str, str]:
-    """Diagnose every case of a folder, or share i of n of them; returns what became of each.
+    """Diagnose the cases of a folder, or share (i, n) of them, and return the results of `run_case` by case.
 
-    With a mapping only the cases that it names, each in its own way. Cases of like fingers follow one another, so that
-    a process that diagnoses several compiles once for them.
+    `diagnose` may map names of cases to diagnoses; other cases are then left out. Cases with the same crossings of
+    tendons and joints run in sequence, so that a process compiles once for them.
+
+    Raises:
+        UserError: The folder has no case, or the system ended a process.
     """
     folders = sorted(f.parent for f in cases.glob("*/fit.h5"))
     if not folders:
@@ -177,12 +187,13 @@ def run_cases(
         )
     how = diagnose if isinstance(diagnose, Mapping) else {f.name: diagnose for f in folders}
     mine = [f for k, f in enumerate(folders, start=1) if k % share[1] == share[0] % share[1] and f.name in how]
-    mine.sort(key=lambda f: (_finger(f / "fit.h5"), f.name))
+    mine.sort(key=lambda f: (_crossings(f / "fit.h5"), f.name))
     results: dict[str, str] = {}
-    commands = all(isinstance(d, Command) for d in how.values())  # which are processes of their own
+    commands = all(isinstance(d, Command) for d in how.values())  # A command starts its own process.
     at_once = len(mine) if commands else workers * CASES_PER_PROCESS
     for first in range(0, len(mine), max(1, at_once)):
-        # Spawned, since JAX's threads do not outlive a fork, and anew after some cases, since compiled code stays.
+        # Processes are spawned, since JAX's threads do not survive a fork. They are replaced after some cases, since
+        # compiled code stays in memory.
         pool = ThreadPoolExecutor(workers) if commands else ProcessPoolExecutor(workers, get_context("spawn"))
         with pool:
             jobs = {pool.submit(run_case, how[f.name], f, out): f.name for f in mine[first : first + at_once]}
@@ -199,8 +210,8 @@ def run_cases(
     return results
 
 
-def _finger(fit: Path) -> bytes:
-    """Which tendon crosses which joint; nothing where the file does not say."""
+def _crossings(fit: Path) -> bytes:
+    """Key of the matrix of which tendon crosses which joint; empty where the file has none."""
     try:
         with h5py.File(fit) as file:
             crosses = np.asarray(file["finger/tendons/crosses"])

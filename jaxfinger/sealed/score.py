@@ -1,4 +1,4 @@
-"""The scores of the diagnosis on sealed cases, each with an interval, from `gap.json` and the truth alone."""
+"""Scores of the diagnosis on sealed cases, each with an interval, from `gap.json` and the truth alone."""
 
 from __future__ import annotations
 
@@ -12,15 +12,17 @@ import numpy as np
 
 from .truth import NONE, UNLISTED, Cause, Diagnosis, Truth, read_diagnosis, read_truth
 
-LARGEST_SET = 3
-TO_CLOSE = 0.01  # of a sample's noise variance, over all channels: a share of less than that is any number
-Z95 = 1.959964
+LARGEST_SET = 3  # causes in an ambiguous set: more of them say too little to count as an answer
+# Closable energy in units of a sample's noise variance, summed over channels. The share of less than that is undefined.
+MIN_CLOSABLE = 0.01
+Z95 = 1.959964  # standard deviations, half width of a 95 % interval
+# Bins of the reliability diagram, narrow at 0 and 1, where most probabilities are.
 BINS = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0)
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A share or a mean with its 95 % interval over `count` cases; NaN where there are none."""
+    """A share or mean over `count` cases with its 95 % interval; NaN for no cases."""
 
     value: float
     low: float
@@ -30,7 +32,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Scores:
-    """Everything that the specification asks of a benchmark. See `score_cases` for what each figure counts."""
+    """Scores of a set of cases. `score_cases` defines the figures."""
 
     cases: int
     failed: int
@@ -48,7 +50,7 @@ class Scores:
 
 
 def wilson(hits: int, count: int, z: float = Z95) -> Figure:
-    """Share with Wilson's score interval (Wilson 1927), which stays within [0, 1] and is honest at 0 and at 1."""
+    """Share with Wilson's score interval (Wilson 1927), which stays within [0, 1] and keeps a width at 0 and 1."""
     if count == 0:
         return Figure(float("nan"), float("nan"), float("nan"), 0)
     p = hits / count
@@ -58,9 +60,7 @@ def wilson(hits: int, count: int, z: float = Z95) -> Figure:
 
 
 def bootstrap(values: Sequence[float], draws: int = 2000, of: Callable[..., np.ndarray] = np.mean) -> Figure:
-    """Mean, or median, with a percentile interval over resampled cases (fixed seed: scoring twice gives the same
-    figures).
-    """
+    """Mean, or the statistic `of`, with a percentile interval over resampled cases. The seed is fixed."""
     x = np.asarray(values, dtype=float)
     if not len(x):
         return Figure(float("nan"), float("nan"), float("nan"), 0)
@@ -70,18 +70,19 @@ def bootstrap(values: Sequence[float], draws: int = 2000, of: Callable[..., np.n
 
 
 def cause_right(truth: Truth, diagnosis: Diagnosis) -> bool:
-    """The first named effect and its site are true; of a double, either of its effects."""
+    """Whether the first named effect and its site are among the true causes."""
     return bool(diagnosis.named) and bool(diagnosis.answer) and diagnosis.named[0] in truth.causes
 
 
 def all_right(truth: Truth, diagnosis: Diagnosis) -> bool:
-    """All listed effects of several that matter are named, and nothing that is not at work."""
+    """Whether all listed causes that matter are named, and no cause that is not at work."""
     return set(truth.matters) <= set(diagnosis.named) <= set(truth.listed)
 
 
 def covered(truth: Truth, diagnosis: Diagnosis) -> bool:
-    """The truth is the named effect, or in the named set of at most three members; none and unlisted likewise
-    by status.
+    """Whether the truth is the named effect or in an ambiguous set of at most `LARGEST_SET` causes.
+
+    Cases without an effect and with an unlisted one count by the verdict's status.
     """
     if truth.kind == "none":
         return diagnosis.status == "no_gap"
@@ -94,52 +95,52 @@ def covered(truth: Truth, diagnosis: Diagnosis) -> bool:
 
 
 def brier(truth: Truth, diagnosis: Diagnosis) -> float:
-    """Σ (p − y)² over all candidates, «none» and «unlisted», of the probabilities p that each is at work; a truth that
-    is no candidate has probability zero.
+    """Brier score Σ (p − y)² over all candidates, «none» and «unlisted»: p is the probability that each is at work.
+
+    A true cause that is no candidate has probability zero.
     """
     concerned = {*diagnosis.probability, *truth.at_work}
     return float(sum((diagnosis.probability.get(c, 0.0) - (c in truth.at_work)) ** 2 for c in concerned))
 
 
 def on_truth(truth: Truth, diagnosis: Diagnosis) -> float:
-    """Mean of the probabilities given to what is at work."""
+    """Mean probability of the causes at work."""
     return float(np.mean([diagnosis.probability.get(c, 0.0) for c in truth.at_work]))
 
 
 def inside(truth: Truth, diagnosis: Diagnosis) -> list[bool]:
-    """Of named causes in the catalogue's own form, whether each true value lies in its 95 % interval."""
+    """Whether each true value of named causes in the catalogue's own form lies in its 95 % interval."""
     return [
-        abs(said[0] - truth.known[cause][name]) <= Z95 * said[1]
+        abs(value - truth.known[cause][name]) <= Z95 * std
         for cause, values in diagnosis.values.items()
-        for name, said in values.items()
+        for name, (value, std) in values.items()
         if cause in diagnosis.named and name in truth.known.get(cause, {})
     ]
 
 
 def closed_share(rows: Sequence[Mapping], truth: Sequence[Mapping], by_law: bool = False) -> float:
-    """Gap closed on fresh trials, as a share of what refitting with the true effect closes.
+    """Share of the closable gap that a diagnosis closes on fresh trials.
 
-    `rows`: rms by experiment and channel before, after, and at best, with the true effect, where that was refitted;
-    `truth`: the truth's rows, whose `after` stands in for the best where it was not, and everywhere with `by_law`. Of a
-    truth that says no `gap` but what another nominal model and the true effect leave, the latter counts: there is to
-    close what lies between our nominal model and that.
-    Energy above noise is summed over channels in units of each channel's noise. NaN where next to nothing is to be
-    closed. Forward simulation of VD.3 (`q`) amplifies and is left out.
+    `rows`: rms by experiment and channel before and after, and at best, which is a refit with the true effects.
+    `truth`: the truth's rows. Where `rows` have no best, and everywhere with `by_law`, their `after` stands in for it.
+    Rows of a truth without a `gap` come from another nominal model; only their `after` counts.
+    Energies are in units of each channel's noise variance, summed over channels. The share is NaN where less than
+    `MIN_CLOSABLE` can be closed. The forward simulation of VD.3 (`q`) amplifies differences and does not count.
     """
     at = {(r["experiment"], r["channel"]): r for r in rows}
     done = possible = 0.0
     for r in truth:
-        seen = at.get((r["experiment"], r["channel"]))
-        if seen is None or (r["experiment"], r["channel"]) == ("VD.3", "q"):
+        ours = at.get((r["experiment"], r["channel"]))
+        if ours is None or (r["experiment"], r["channel"]) == ("VD.3", "q"):
             continue
         noise = float(r.get("noise", r["after"])) or 1.0
-        done += (seen["before"] ** 2 - seen["after"] ** 2) / noise**2
-        if "best" in seen and not by_law:
-            possible += (seen["before"] ** 2 - seen["best"] ** 2) / noise**2
+        done += (ours["before"] ** 2 - ours["after"] ** 2) / noise**2
+        if "best" in ours and not by_law:
+            possible += (ours["before"] ** 2 - ours["best"] ** 2) / noise**2
         else:
-            before = r["before"] if "gap" in r else seen["before"]
+            before = r["before"] if "gap" in r else ours["before"]
             possible += max(before**2 - r["after"] ** 2, 0.0) / noise**2
-    return done / possible if possible > TO_CLOSE else float("nan")
+    return done / possible if possible > MIN_CLOSABLE else float("nan")
 
 
 FIGURES: dict[str, tuple[Callable[[Truth], bool], Callable[[Truth, Diagnosis], bool]]] = {
@@ -161,17 +162,20 @@ FIGURES: dict[str, tuple[Callable[[Truth], bool], Callable[[Truth, Diagnosis], b
 
 
 def score_cases(pairs: Sequence[tuple[Truth, Diagnosis]]) -> Scores:
-    """All scores of a set of cases.
+    """Compute all scores of a set of cases.
 
-    cause, covered: single listed effects; «where distinguishable»: of these, where no other cause fits as well
-    (see `rivals`). false alarm: cases without an effect for which one is named; false gap: or called anything but «no
-    gap». open set: effects that the catalogue lacks, and of these those that no listed one imitates. double, several:
-    cases with two listed effects, and with more, or with an unlisted one beside them; named, of those that matter: of
-    their listed effects that close more than a tenth of some channel's gap; at work, of those named. values inside:
-    of all named effects in the catalogue's own form.
-    Brier, probability on the truth: every case that was diagnosed. set size: verdicts that name something. closed:
-    cases with predictions on the fresh trials, as a share of what a refit with the true effects closes (mean), and of
-    what the plant's own law would (median: its rows are those of a linearised plant). seconds: cost of a case.
+    - cause, covered: cases with one listed effect. «where distinguishable»: those without a rival (see `rivals`).
+    - false alarm: cases without an effect for which one is named. false gap: those with a verdict other than «no gap».
+    - open set: cases with one unlisted effect. «where distinguishable»: those without a rival.
+    - double, several: cases with two listed effects; with more, or with an unlisted one beside listed ones.
+    - named, of those that matter: listed effects that close more than `MIN_CLOSED_SHARE` of some channel's gap.
+    - at work, of those named: effects that are named in double and several cases.
+    - values inside 95 % intervals: parameters of named effects in the catalogue's own form.
+    - Brier, probability on the truth: all diagnosed cases.
+    - set size: verdicts that name an effect.
+    - closed: mean of `closed_share` over cases with predictions on the fresh trials. «of what the true law closes»:
+      the median of `closed_share` by law, since rows of the linearised plant have outliers.
+    - seconds: time of a case.
     """
     done = [(t, d) for t, d in pairs if d.status != "failed"]
     figures = _shares(pairs)
@@ -220,13 +224,9 @@ def score_cases(pairs: Sequence[tuple[Truth, Diagnosis]]) -> Scores:
 
 
 def reliability(pairs: Sequence[tuple[Truth, Diagnosis]]) -> list[dict[str, float]]:
-    """Probabilities said against how often they came true, over all candidates, «none» and «unlisted» of all cases."""
-    said, came = [], []
-    for t, d in pairs:
-        for c, p in d.probability.items():
-            said.append(p)
-            came.append(float(c in t.at_work))
-    p, y = np.array(said), np.array(came)
+    """Mean probability and share that came true by bin, over all candidates, «none» and «unlisted» of all cases."""
+    given = [(p, float(c in t.at_work)) for t, d in pairs for c, p in d.probability.items()]
+    p, y = np.array(given).reshape(-1, 2).T
     rows = []
     for low, high in pairwise(BINS):
         inside = (p >= low) & ((p < high) | ((high == 1.0) & (p <= 1.0)))
@@ -247,7 +247,7 @@ def reliability(pairs: Sequence[tuple[Truth, Diagnosis]]) -> list[dict[str, floa
 
 
 def score_folder(cases: Path, diagnoses: Path, truth_root: Path | None) -> Scores:
-    """Scores of every case under a folder for which a diagnosis was tried."""
+    """Score the cases of a folder that have a folder of a diagnosis."""
     folders = sorted(f.parent for f in cases.glob("*/fit.h5"))
     return score_cases(
         [
@@ -260,16 +260,16 @@ def score_folder(cases: Path, diagnoses: Path, truth_root: Path | None) -> Score
 
 @dataclass(frozen=True)
 class Imitators:
-    """What is answered in place of an effect that the catalogue was made to lack."""
+    """Answers to the cases of an effect that was withheld from the catalogue."""
 
     effect: str
-    unexplained: Figure  # share of the cases called unexplained, or a set
-    no_gap: int  # of the same cases: called no gap
-    answers: list[tuple[str, int]]  # what was named instead, most often first
+    unexplained: Figure  # share of cases with the verdict unexplained or ambiguous
+    no_gap: int  # cases with the verdict no gap
+    answers: list[tuple[str, int]]  # answers with their counts, most frequent first
 
 
 def imitators(cases: Path, withheld: Path, truth_root: Path | None) -> list[Imitators]:
-    """By effect, what the diagnosis says of cases whose own effect was taken out of its catalogue."""
+    """Count the answers to cases whose effect was withheld from the catalogue, by effect."""
     by_effect: dict[str, list[Diagnosis]] = {}
     for folder in sorted(f.parent for f in cases.glob("*/fit.h5")):
         truth, diagnosis = read_truth(folder, truth_root), read_diagnosis(withheld / folder.name)

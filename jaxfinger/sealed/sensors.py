@@ -1,4 +1,4 @@
-"""What real sensors add: noise, partly coloured, quantisation, a tare before every trial, encoders zeroed by hand."""
+"""Errors of the sensors: partly coloured noise, quantisation, tares, and excursions zeroed by hand."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from jaxfinger.data import Trial
 from .record import Channels, last_direction
 from .specimens import Specimen
 
-WHITE = 0.7  # share of the variance that is white; the rest is first-order with CORRELATION
-CORRELATION = 0.012  # s
+WHITE = 0.7  # share of the variance that is white; the rest is a first-order process
+CORRELATION = 0.012  # s, correlation time of that process
 UNITS = {"q": "rad", "tendon_force": "N", "tendon_excursion": "m", "joint_torque": "N m", "fingertip_force": "N"}
 STD = {"q": 2e-4, "tendon_force": 0.02, "tendon_excursion": 1e-5, "joint_torque": 3e-4, "fingertip_force": 0.02}
 RESOLUTION = {
@@ -27,12 +27,12 @@ RESOLUTION = {
 
 @dataclass(frozen=True)
 class Sensors:
-    """Noise of one bench: standard deviation by channel (before quantisation)."""
+    """Noise of one bench: standard deviations by channel, before quantisation."""
 
     std: dict[str, float]
 
     def hold_std(self, channel: str, duration: float = 1.0, rate: float = 250.0) -> float:
-        """Standard deviation of a channel's mean over a hold, from the noise's own autocovariance."""
+        """Standard deviation of a channel's mean over a hold of `duration` s, from the autocovariance of the noise."""
         count = int(duration * rate)
         lag = np.arange(count)
         covariance = (1 - WHITE) * np.exp(-lag / (rate * CORRELATION)) + WHITE * (lag == 0)
@@ -41,12 +41,12 @@ class Sensors:
 
 
 def draw_sensors(rng: np.random.Generator) -> Sensors:
-    """A bench whose noise lies within a third of the usual."""
+    """Draw a bench whose noise is within a third of `STD`."""
     return Sensors({name: std * float(rng.uniform(0.75, 1.33)) for name, std in STD.items()})
 
 
 def noise(shape: tuple[int, int], dt: float, std: float, rng: np.random.Generator) -> Float[np.ndarray, "N k"]:
-    """Stationary noise: WHITE of the variance white, the rest an Ornstein–Uhlenbeck process sampled at dt."""
+    """Draw stationary noise: a share `WHITE` of the variance is white, the rest an Ornstein–Uhlenbeck process."""
     from scipy.signal import lfilter
 
     phi = np.exp(-dt / CORRELATION)
@@ -59,7 +59,7 @@ def noise(shape: tuple[int, int], dt: float, std: float, rng: np.random.Generato
 def measure(
     channels: Channels, specimen: Specimen, sensors: Sensors, zero: Float[np.ndarray, " n"], rng: np.random.Generator
 ) -> Trial:
-    """The trial as the bench writes it. `zero`: the session's excursion offsets in m."""
+    """Measure a trial as the bench records it. `zero`: excursion offsets of the session, m."""
     plan, finger = channels.plan, specimen.finger
     dt = 1.0 / plan.rate
     jitter = np.clip(rng.normal(0, 3e-5, len(channels.time)), -0.2 * dt, 0.2 * dt)
@@ -71,7 +71,7 @@ def measure(
         step = RESOLUTION[name]
         return (np.round(noisy / step) * step).astype(np.float32)
 
-    # Columns and channels that this experiment does not measure.
+    # NaN marks columns that the experiment does not measure.
     slack = ~finger.active | (np.abs(channels.tension).max(axis=0) < 0.3)
     tension = np.where(finger.active, channels.tension, np.nan)
     excursion = torque = force = None
@@ -106,7 +106,7 @@ def measure(
 
 
 def _protocol_channels(channels: Channels, active: np.ndarray):
-    """Hold index and commanded directions, where the experiment has holds."""
+    """Hold index and commanded directions of joints and tendons; None where the experiment has none."""
     plan, t = channels.plan, channels.time
     if not plan.holds:
         return None, None, None

@@ -1,11 +1,9 @@
-"""How large a departure's trace is once the nominal parameters have been refitted.
+"""Severity of a departure: the size of its trace after a refit of the nominal parameters.
 
-The nominal model is linearised here, in NumPy, around the true specimen: every parameter that a fit may move is
-perturbed, and
-what the departure adds to the noise-free channels is projected off those directions. Channels are weighted by the
-noise of a
-hold's mean, and CAD's uncertainty enters as prior rows. Severity is the rms of what is left, in the channel
-(experiment, quantity, joint or tendon) where it is largest, in units of that noise.
+A trace is what departures change in the noise-free channels, as residuals of the nominal model. Channels are in units
+of the noise of a hold's mean. The nominal model is linearised in NumPy around the true specimen, by perturbing every
+parameter that a fit may move; CAD's uncertainty enters as prior precisions. A refit projects the trace off these
+directions. Severity is the rms of the rest in the channel (experiment, quantity, column) where it is largest.
 """
 
 from __future__ import annotations
@@ -26,36 +24,36 @@ from .record import Channels, Motion, commanded, last_direction, needed_torque, 
 from .sensors import Sensors
 from .specimens import Specimen
 
-COARSE = {250.0: 25.0, 1000.0: 60.0, 200.0: 40.0}  # Hz: enough for what survives in the mean
-UNSEEN = 1e-9  # severity of what leaves no trace at all, so that its logarithm exists
-SLIDING = 0.03  # rad/s: what counts as a sliding joint
-TAUT = 0.3  # N
+COARSE = {250.0: 25.0, 1000.0: 60.0, 200.0: 40.0}  # Hz by a log's rate: enough for an rms over a trial
+MIN_SEVERITY = 1e-9  # of a departure without any trace: its logarithm has to exist
+SLIDING_SPEED = 0.03  # rad/s, from which on a joint counts as sliding
+TYPICAL_ARM = 5e-3  # m, turns the speed of a joint into that of a tendon
+TAUT_TENSION = 0.3  # N, above which a tendon counts as taut: 15 times the noise of its sensor
 
 
 @dataclass(frozen=True)
-class Look:
-    """A trial at a coarse rate: its plan, the motion that nominal tensions and angles make, the rigid torque
-    along it.
-    """
+class CoarseTrial:
+    """A trial at a coarse rate: plan, motion of the nominal finger, and rigid-body torque along it, N m."""
 
     plan: Plan
     motion: Motion
     rigid: Float[np.ndarray, "N m"] | None
 
 
-class QuietSession:
-    """The noise-free session of one specimen, with the directions that a nominal fit can absorb. The length of a
-    tendon that is slack for a while may count, as it does in a case's severity, or not.
+class NoiseFreeSession:
+    """The noise-free session of one specimen, and the directions that a nominal fit can absorb.
+
+    `slack_counts`: whether the excursion of a tendon counts while it is slack, as it does in a case's severity.
     """
 
     def __init__(self, specimen: Specimen, plans: Sequence[Plan], sensors: Sensors, slack_counts: bool = True):
         self.specimen, self.sensors, self.slack_counts = specimen, sensors, slack_counts
         self.nominal = Finger(specimen)
-        # Repeats say nothing new without noise.
+        # Without noise repeats are equal.
         unique = {plan.motion: plan for plan in reversed(plans)}
-        self.looks = [self._look(plan) for plan in unique.values()]
+        self.trials = [self._coarse_trial(plan) for plan in unique.values()]
 
-    def _look(self, plan: Plan) -> Look:
+    def _coarse_trial(self, plan: Plan) -> CoarseTrial:
         rate = COARSE[plan.rate]
         if plan.experiment == "VD.3":
             t = np.arange(int(plan.duration * rate)) / rate
@@ -63,7 +61,7 @@ class QuietSession:
             motion = Motion(t, q, qd, qdd, planned_tension(self.nominal, plan, t), last_direction(qd))
         else:
             motion = commanded(plan, rate)
-        return Look(plan, motion, self._rigid(self.nominal, plan, motion))
+        return CoarseTrial(plan, motion, self._rigid(self.nominal, plan, motion))
 
     @staticmethod
     def _rigid(finger: Finger, plan: Plan, motion: Motion) -> Float[np.ndarray, "N m"] | None:
@@ -76,32 +74,36 @@ class QuietSession:
         )
 
     def rows(
-        self, finger: Finger, look: Look, motion: Motion, same_body: bool
+        self, finger: Finger, coarse: CoarseTrial, motion: Motion, same_body: bool
     ) -> Iterator[tuple[str, str, int, np.ndarray]]:
-        """(experiment, channel, column, values in units of a hold's noise) of one trial as this finger makes it."""
-        plan = look.plan
-        rigid = look.rigid if same_body and motion is look.motion else self._rigid(finger, plan, motion)
+        """Yield (experiment, channel, column, values in units of a hold's noise) of one trial of a finger.
+
+        `same_body`: whether its rigid body is the nominal one.
+        """
+        plan = coarse.plan
+        rigid = coarse.rigid if same_body and motion is coarse.motion else self._rigid(finger, plan, motion)
         channels = read(finger, self._true(finger, plan, motion, rigid))
-        yield from self._rows_of(channels, look)
+        yield from self._rows_of(channels, coarse)
 
     def _true(self, finger: Finger, plan: Plan, motion: Motion, rigid) -> Channels:
+        """True channels; VD.3 has the external torque that its motion needs."""
         out = record(finger, plan, motion, rigid)
         if plan.experiment == "VD.3":
             out = replace(out, torque=needed_torque(finger, plan, motion, rigid))
         return out
 
-    def _rows_of(self, channels: Channels, look: Look) -> Iterator[tuple[str, str, int, np.ndarray]]:
-        plan, e = look.plan, look.plan.experiment
+    def _rows_of(self, channels: Channels, coarse: CoarseTrial) -> Iterator[tuple[str, str, int, np.ndarray]]:
+        plan, e = coarse.plan, coarse.plan.experiment
         finger = self.specimen.finger
         if channels.excursion is not None:
-            taut = look.motion.tension > TAUT
+            taut = coarse.motion.tension > TAUT_TENSION
             pulled = finger.active & taut.any(axis=0)
             for k in np.flatnonzero(pulled if e != "ID.4" else np.arange(finger.n) == plan.tendon):
                 x = channels.excursion[:, k] / self.sensors.hold_std("tendon_excursion")
                 counts = taut[:, k] | self.slack_counts
                 yield e, "tendon_excursion", int(k), (x - x.mean(where=counts) if counts.any() else x) * counts
         if channels.torque is not None:
-            slides = self._sliding(look.motion) if e == "VD.3" else np.ones(look.motion.q.shape)
+            slides = self._sliding(coarse.motion) if e == "VD.3" else np.ones(coarse.motion.q.shape)
             scale = self.sensors.hold_std("joint_torque")
             for j in range(finger.m) if plan.joint is None else [plan.joint]:
                 yield e, "joint_torque", j, channels.torque[:, j] / scale * slides[:, j]
@@ -110,39 +112,44 @@ class QuietSession:
                 yield e, "fingertip_force", i, channels.force[:, i] / self.sensors.hold_std("fingertip_force")
 
     def _sliding(self, motion: Motion) -> Float[np.ndarray, "N m"]:
-        """1 where a joint and every tendon across it slide, else 0: VD.3 is judged there only."""
-        joint = np.abs(motion.qd) > SLIDING
+        """Mask: 1 where a joint and every tendon across it slide, else 0."""
+        joint = np.abs(motion.qd) > SLIDING_SPEED
         arm = self.nominal.geometry(motion.q)[1]
-        tendon = np.abs(np.einsum("tnm,tm->tn", arm, motion.qd)) > SLIDING * 5e-3
+        tendon = np.abs(np.einsum("tnm,tm->tn", arm, motion.qd)) > SLIDING_SPEED * TYPICAL_ARM
         finger = self.specimen.finger
         blocked = ~tendon @ (finger.crosses & finger.active[:, None])
         return (joint & ~blocked).astype(float)
 
     def trace(self, departures: Sequence[Departure]) -> tuple[np.ndarray, list[tuple[str, str, int]]]:
-        """What the departures add to what the nominal model says of the reported inputs; labels by row."""
+        """Residuals of the nominal model on data with departures, in units of a hold's noise, and labels by row.
+
+        The nominal model predicts from the angles and tensions that the sensors report.
+        """
         finger = Finger(self.specimen, departures)
         same_body = finger.plant.finger is self.specimen.finger
         values, labels = [], []
-        for look in self.looks:
-            plan, motion = look.plan, look.motion
-            rigid = look.rigid if same_body else self._rigid(finger, plan, motion)
+        for coarse in self.trials:
+            plan, motion = coarse.plan, coarse.motion
+            rigid = coarse.rigid if same_body else self._rigid(finger, plan, motion)
             true = self._true(finger, plan, motion, rigid)
-            if plan.experiment == "VD.3":  # the motion is the finger's own: it needs no external torque
+            if plan.experiment == "VD.3":  # The free finger needs no external torque.
                 true = replace(true, torque=None)
             channels = read(finger, true)
             inputs = self._reported(motion, channels)
-            expected = list(self.rows(self.nominal, look, inputs, True))
+            expected = list(self.rows(self.nominal, coarse, inputs, True))
             if plan.experiment == "VD.3":
                 own = needed_torque(finger, plan, motion, rigid)
                 channels = replace(channels, torque=own)
-            for (e, c, k, seen), (_, _, _, said) in zip(self._rows_of(channels, look), expected, strict=True):
-                values.append(seen - said)
-                labels += [(e, c, k)] * len(seen)
+            for (e, c, k, measured), (_, _, _, predicted) in zip(
+                self._rows_of(channels, coarse), expected, strict=True
+            ):
+                values.append(measured - predicted)
+                labels += [(e, c, k)] * len(measured)
         return np.concatenate(values), labels
 
     @staticmethod
     def _reported(motion: Motion, channels: Channels) -> Motion:
-        """The motion as the sensors tell it: what the model is fed."""
+        """Motion as the sensors report it, the input of the model."""
         if channels.q is motion.q and channels.tension is motion.tension:
             return motion
         rate = np.gradient(channels.q - motion.q, motion.time, axis=0)
@@ -150,14 +157,17 @@ class QuietSession:
 
     @cached_property
     def _base(self) -> list[np.ndarray]:
+        """Rows of the nominal finger by trial."""
         return [
-            np.concatenate([x for *_, x in self.rows(self.nominal, look, look.motion, True)]) for look in self.looks
+            np.concatenate([x for *_, x in self.rows(self.nominal, coarse, coarse.motion, True)])
+            for coarse in self.trials
         ]
 
     @cached_property
     def absorbed(self) -> tuple[Float[np.ndarray, "R P"], Float[np.ndarray, " P"]]:
-        """Derivatives of all rows by every nominal parameter, scaled so that 1 is a free or prior-sized change;
-        prior precisions.
+        """Derivatives of all rows by the nominal parameters, and prior precisions.
+
+        A change of 1 is one prior standard deviation of CAD's parameters, and a typical change of the others.
         """
         base = np.concatenate(self._base)
         columns, prior = [], []
@@ -166,9 +176,9 @@ class QuietSession:
             finger = Finger(changed, (), plant)
             same = changed.finger is self.specimen.finger
             column, at = np.zeros_like(base), 0
-            for look, before in zip(self.looks, self._base, strict=True):
-                if concerns(look.plan):
-                    moved = np.concatenate([x for *_, x in self.rows(finger, look, look.motion, same)])
+            for coarse, before in zip(self.trials, self._base, strict=True):
+                if concerns(coarse.plan):
+                    moved = np.concatenate([x for *_, x in self.rows(finger, coarse, coarse.motion, same)])
                     column[at : at + len(before)] = (moved - before) / size
                 at += len(before)
             columns.append(column)
@@ -176,9 +186,7 @@ class QuietSession:
         return np.stack(columns, axis=1), np.array(prior)
 
     def _neighbours(self) -> Iterator[tuple[Callable[[Plan], bool], Specimen, float, float]]:
-        """Specimens one small parameter change away: (trials it concerns, specimen, size of the change, prior
-        precision).
-        """
+        """Yield specimens with one parameter changed: (trials concerned, specimen, size of the change, precision)."""
         s = self.specimen
         for name, array, step, unit in (
             ("excursion", s.excursion, 1e-6, 1e-4),
@@ -209,39 +217,40 @@ class QuietSession:
 
     @cached_property
     def _solver(self):
+        """Matrix that maps a trace to the least-squares change of the nominal parameters."""
         jac, prior = self.absorbed
-        # Coarse samples of one hold share its noise: about as many as fall into a second count as one.
+        # Severities are in units of the noise of a hold, about a second long: the rows of one second count once.
         gram = jac.T @ jac / COARSE[250.0] + np.diag(prior)
         return np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ jac.T / COARSE[250.0]
 
     def absorb(self, trace: Float[np.ndarray, " R"]) -> Float[np.ndarray, " P"]:
-        """The nominal parameters' move that imitates a trace best."""
+        """Change of the nominal parameters that explains a trace best."""
         return self._solver @ trace
 
-    def left(self, trace: Float[np.ndarray, " R"]) -> Float[np.ndarray, " R"]:
-        """What a refit of the nominal parameters leaves of a trace."""
+    def refitted(self, trace: Float[np.ndarray, " R"]) -> Float[np.ndarray, " R"]:
+        """Rest of a trace after a refit of the nominal parameters."""
         return trace - self.absorbed[0] @ self.absorb(trace)
 
     def closed_by(self, departures: Sequence[Departure]) -> list[float]:
-        """Of each departure, the share of a channel's gap that it closes, added alone to a refitted nominal model, in
-        the channel (experiment, quantity, joint or tendon) where that is most, among those that stand out of the noise.
+        """Share of a channel's gap that each departure closes, in the channel where the share is largest.
+
+        The share is 1 − (rms without the departure / rms of all)², both after a refit of the nominal parameters. Only
+        channels whose rms exceeds a hold's noise count.
         """
         if not departures:
             return []
         whole, labels = self.trace(departures)
-        before = by_channel(self.left(whole), labels)
+        before = by_channel(self.refitted(whole), labels)
         gaps = [c for c, size in before.items() if size > 1.0]
         out = []
         for i in range(len(departures)):
-            after = by_channel(self.left(self.trace([*departures[:i], *departures[i + 1 :]])[0]), labels)
+            after = by_channel(self.refitted(self.trace([*departures[:i], *departures[i + 1 :]])[0]), labels)
             out.append(max((1.0 - (after[c] / before[c]) ** 2 for c in gaps), default=0.0))
         return out
 
 
 def _concern(parameter: str, index: int) -> Callable[[Plan], bool]:
-    """Whether a trial can depend on a parameter of the joint or tendon `index`; sparing the others is what
-    makes this fast.
-    """
+    """Predicate of the plans that depend on a parameter of joint or tendon `index`. The others need no evaluation."""
 
     def concerns(plan: Plan) -> bool:
         if parameter in ("excursion", "friction"):
@@ -259,25 +268,28 @@ def _concern(parameter: str, index: int) -> Callable[[Plan], bool]:
 def by_channel(
     rows: Float[np.ndarray, " R"], labels: Sequence[tuple[str, str, int]]
 ) -> dict[tuple[str, str, int], float]:
-    """rms of the rows by (experiment, channel, column)."""
+    """rms of rows by label (experiment, channel, column)."""
     groups: dict[tuple[str, str, int], list[float]] = {}
     for value, label in zip(rows.tolist(), labels, strict=True):
         groups.setdefault(label, []).append(value)
     return {label: float(np.sqrt(np.mean(np.square(values)))) for label, values in groups.items()}
 
 
-def severity(session: QuietSession, departures: Sequence[Departure]) -> tuple[float, tuple[str, str, int]]:
-    """Largest rms by channel of what is left, in units of a hold's noise, and where."""
+def severity(session: NoiseFreeSession, departures: Sequence[Departure]) -> tuple[float, tuple[str, str, int]]:
+    """Severity of departures in units of a hold's noise, and the label of the channel where it is reached."""
     trace, labels = session.trace(departures)
-    sizes = by_channel(session.left(trace), labels)
+    sizes = by_channel(session.refitted(trace), labels)
     where = max(sizes, key=lambda label: sizes[label])
-    return max(sizes[where], UNSEEN), where
+    return max(sizes[where], MIN_SEVERITY), where
 
 
 def calibrate(
-    session: QuietSession, departure: Departure, target: float, attempts: int = 8
+    session: NoiseFreeSession, departure: Departure, target: float, attempts: int = 8
 ) -> tuple[Departure, float, tuple[str, str, int]]:
-    """Resize a departure until its severity is `target`, within a tenth or as far as physical sizes go."""
+    """Resize a departure until its severity is within a tenth of `target`, or its size at a physical limit.
+
+    Return the departure, the severity reached, and the label of the channel where it is reached.
+    """
     low = high = None  # (log size, log severity) below and above the target
     best = None
     size = departure.size
@@ -290,7 +302,7 @@ def calibrate(
             break
         point = np.log(size), np.log(reached / target)
         low, high = (point, high) if point[1] < 0 else (low, point)
-        if low and high:  # false position, kept off the ends
+        if low and high:  # False position, at least a tenth of the interval off its ends.
             share = np.clip(low[1] / (low[1] - high[1]), 0.1, 0.9)
             size = float(np.exp(low[0] + share * (high[0] - low[0])))
         else:

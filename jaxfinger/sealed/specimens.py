@@ -1,4 +1,4 @@
-"""Seeded specimens: five kinds of finger, each with its own true parameters, and what CAD believes of them."""
+"""Seeded specimens of five kinds of finger: their true parameters, and those of their CAD."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ Y, Z = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class Layout:
-    """What tells one kind of finger from another. Lengths mm, masses g, angles deg; arms mm at q = 0, flexion
+    """Nominal dimensions of one kind of finger. Lengths mm, masses g, angles deg; moment arms mm at q = 0, flexion
     positive.
     """
 
     joints: tuple[str, ...]
     axis: tuple[tuple[float, float, float], ...]
-    length: tuple[float, ...]  # of link i, from joint i to joint i + 1 (or the tip)
+    length: tuple[float, ...]  # of link i, from joint i to joint i + 1 or the tip
     mass: tuple[float, ...]
     limits: tuple[tuple[float, float], ...]
-    rest: tuple[float, ...]  # angle of no elastic torque
+    rest: tuple[float, ...]  # angles without elastic torque
     stiffness: tuple[float, ...]  # N mm/rad
-    arms: dict[str, tuple[float, ...]]  # active tendons
+    arms: dict[str, tuple[float, ...]]  # of the active tendons
     passive: dict[str, tuple[float, ...]]
 
 
@@ -106,10 +106,10 @@ LAYOUTS = {
 
 @dataclass(frozen=True)
 class Specimen:
-    """A finger that lies in the nominal model's class. `finger` is true, `cad` is what the session says of it.
+    """True parameters of a finger in the nominal class. The session contains `cad` in place of the true `finger`.
 
-    excursion: coefficients of q … q⁴ (m/radᵖ); elastic, coulomb: of 1, q, q² (N m); damping N m s/rad;
-    friction: a₀ (N), a₁ (1) of the active tendons.
+    excursion: coefficients of q … q⁴ (m/radᵖ); elastic, coulomb: of 1, q, q² (N m); damping: N m s/rad; friction:
+    a₀ (N) and a₁ (1) of the active tendons.
     """
 
     kind: str
@@ -120,21 +120,21 @@ class Specimen:
     coulomb: Float[np.ndarray, "m 3"]
     damping: Float[np.ndarray, " m"]
     friction: Float[np.ndarray, "n 2"]
-    misfit: float  # m, of the polynomials against MuJoCo's paths
+    misfit: float  # m, largest misfit of the polynomials to MuJoCo's paths
 
 
 def make_specimen(kind: str, rng: np.random.Generator) -> Specimen:
-    """One specimen of a kind in `LAYOUTS`, its dimensions and parameters drawn around the layout's."""
+    """Draw a specimen of a kind in `LAYOUTS`, with dimensions and parameters around the layout's."""
     layout = LAYOUTS[kind]
     m = len(layout.joints)
     arms = {**layout.arms, **layout.passive}
     n, active = len(arms), np.array([name in layout.arms for name in arms])
     arm = np.array(list(arms.values())) * 1e-3 * rng.uniform(0.88, 1.12, (n, m))
     truth = _body(layout, arm, active, rng)
-    # A flexor's eyelets close in on each other: 2α + q must stay below π.
+    # The eyelets of a flexor approach each other: 2α + q must stay below π.
     alpha = rng.uniform(0.64, 0.72, (n, m))
     excursion, misfit = excursion_polynomials(truth, arm, alpha)
-    excursion[~active] = 0.0  # a passive tendon is slack in the nominal model
+    excursion[~active] = 0.0  # A passive tendon is slack in the nominal model.
 
     stiffness = np.array(layout.stiffness) * 1e-3 * rng.uniform(0.8, 1.2, m)
     rest = np.deg2rad(layout.rest) + rng.uniform(-0.08, 0.08, m)
@@ -151,7 +151,7 @@ def make_specimen(kind: str, rng: np.random.Generator) -> Specimen:
 def _body(
     layout: Layout, arm: Float[np.ndarray, "n m"], active: np.ndarray, rng: np.random.Generator
 ) -> FingerDescription:
-    """The true finger: links as rods of about 9 mm radius."""
+    """Draw the true rigid body: links are rods of about 9 mm radius."""
     m = len(layout.joints)
     length = np.array(layout.length) * 1e-3 * rng.uniform(0.92, 1.08, m)
     mass = np.array(layout.mass) * 1e-3 * rng.uniform(0.85, 1.15, m)
@@ -162,7 +162,7 @@ def _body(
         across = mass[i] * (3 * radius**2 + length[i] ** 2) / 12
         tilt = _rotation(rng.normal(0, 0.04, 3))
         inertia[i] = tilt @ np.diag([mass[i] * radius**2 / 2, across, across * 1.02]) @ tilt.T
-    hang = rng.uniform(-0.9, 0.9)  # rad, about y from hanging straight down
+    hang = rng.uniform(-0.9, 0.9)  # rad about y, from hanging straight down
     return FingerDescription(
         gravity=9.81 * np.array([np.cos(hang), 0.0, np.sin(hang)]),
         joint_names=layout.joints,
@@ -182,7 +182,7 @@ def _body(
 
 
 def _cad(truth: FingerDescription, rng: np.random.Generator) -> FingerDescription:
-    """What CAD and scale say: off by about one standard deviation, inertia scaled with mass."""
+    """Draw the description by CAD and scale: off by about one standard deviation, inertia scaled with mass."""
     assert truth.mass_std is not None
     assert truth.com_std is not None
     mass = truth.mass + truth.mass_std * rng.normal(size=truth.m)
@@ -195,7 +195,7 @@ def _cad(truth: FingerDescription, rng: np.random.Generator) -> FingerDescriptio
 
 
 def _rotation(vector: Float[np.ndarray, " xyz"]) -> Float[np.ndarray, "3 3"]:
-    """Rotation by |vector| about its direction (Rodrigues)."""
+    """Rotation matrix by |vector| about its direction (Rodrigues)."""
     angle = np.linalg.norm(vector)
     x, y, z = vector / angle
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -1,4 +1,4 @@
-"""The scores as tables for a terminal."""
+"""The scores as tables for a terminal or a page."""
 
 from __future__ import annotations
 
@@ -9,11 +9,18 @@ from rich.table import Table
 
 from .score import Figure, Imitators, Scores
 
-PLAIN = ("Brier", "probability on the truth", "set size", "closed", "closed, of what the true law closes", "seconds")
+NOT_PERCENT = (
+    "Brier",
+    "probability on the truth",
+    "set size",
+    "closed",
+    "closed, of what the true law closes",
+    "seconds",
+)
 
 
 def render(scores: Scores) -> Group:
-    """One screen: the figures, then where they come from and where it fails."""
+    """Tables of all figures, of their split by effect, severity and specimen, of wrong verdicts and of reliability."""
     head = Table(title=f"{scores.cases} sealed cases, {scores.failed} failed", title_justify="left")
     for column in ("score", "value", "95 % interval", "cases"):
         head.add_column(column, justify="left" if column == "score" else "right")
@@ -56,7 +63,7 @@ def render(scores: Scores) -> Group:
 
 
 def markdown(blocks: Mapping[str, Scores]) -> str:
-    """One table for a page: a row a score, a column a block of cases, each value with its 95 % interval and count."""
+    """Markdown table with a row for each score and a column for each block of cases: value (95 % interval), count."""
     names = list(dict.fromkeys(n for s in blocks.values() for n, f in s.figures.items() if f.count))
     lines = [f"| | {' | '.join(blocks)} |", "| --- |" + " --- |" * len(blocks)]
     for n in names:
@@ -70,7 +77,7 @@ def _cell(name: str, f: Figure) -> str:
 
 
 def render_imitators(rows: Sequence[Imitators]) -> Table:
-    """What is named in place of every effect that was withheld."""
+    """Table of what is named in place of each withheld effect."""
     table = Table(title="withheld from the catalogue", title_justify="left")
     for column in ("effect", "cases", "unexplained, or a set", "no gap", "named instead"):
         table.add_column(column, overflow="fold")
@@ -99,4 +106,4 @@ def _split_table(title: str, split: Mapping[str, Mapping[str, Figure]]) -> Table
 def _value(name: str, value: float) -> str:
     if name == "seconds":
         return f"{value:.1f} s"
-    return f"{value:.2f}" if name in PLAIN else f"{100 * value:.0f} %"
+    return f"{value:.2f}" if name in NOT_PERCENT else f"{100 * value:.0f} %"

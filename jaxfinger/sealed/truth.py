@@ -1,4 +1,4 @@
-"""Reading verdicts and truths. Only closing and scoring come here; nothing that diagnoses does."""
+"""Read verdicts and truths. Only `close_case` and scoring call this, never a diagnosis."""
 
 from __future__ import annotations
 
@@ -12,38 +12,39 @@ from jaxfinger.errors import UserError
 Cause = tuple[str, tuple[str, ...]]  # effect, site
 NONE: Cause = ("none", ())
 UNLISTED: Cause = ("unlisted", ())
-TELLING = 3.0  # nats: below, two causes look alike, or a cause looks like none
-MATTERS = 0.1  # share of some channel's gap that a cause closes, from which on it ought to be named
+# Nats (odds of 20 to 1), below which data do not tell two causes apart, or a cause from none.
+MIN_DISTANCE = 3.0
+# Share of some channel's gap: a cause that closes more ought to be named. Less is hardly seen on a diagnosis's page.
+MIN_CLOSED_SHARE = 0.1
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What is the matter with a case; effects in order of size."""
+    """True causes of a case, in order of severity, those of the catalogue first."""
 
     name: str
     kind: str  # none, listed, unlisted, double, several
-    causes: tuple[Cause, ...]  # of the catalogue first
-    listed: tuple[Cause, ...] = ()  # those of the catalogue
-    matters: tuple[Cause, ...] = ()  # of these, those that close more than MATTERS of some channel's gap
-    known: Mapping[Cause, Mapping[str, float]] = field(
-        default_factory=dict
-    )  # true values of the catalogue's parameters
+    causes: tuple[Cause, ...]
+    listed: tuple[Cause, ...] = ()  # causes of the catalogue
+    matters: tuple[Cause, ...] = ()  # listed causes that close more than MIN_CLOSED_SHARE of some channel's gap
+    # True values of the catalogue's parameters.
+    known: Mapping[Cause, Mapping[str, float]] = field(default_factory=dict)
     severity: float | str | None = None
-    reached: float | None = None  # severity that the calibration reached; None where the source does not say
+    reached: float | None = None  # severity that the calibration reached; None if unknown
     specimen: str = ""
     fresh: tuple[Mapping, ...] = ()
-    rivals: int | None = None  # causes that no method could tell from the truth with this session; None: not computed
+    rivals: int | None = None  # causes less than MIN_DISTANCE from the truth, «none» included; None if not computed
 
     @property
     def at_work(self) -> frozenset[Cause]:
-        """Everything whose probability should be one: the listed causes, «unlisted» for all others, or «none»."""
+        """Candidates that are at work: the listed causes, «unlisted» for any others, or «none»."""
         strange = {UNLISTED} if set(self.causes) - set(self.listed) else set()
         return frozenset({*self.listed, *strange} or {NONE})
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What a `gap.json` says, and what it cost."""
+    """Verdict of a `gap.json`, with its cost in seconds."""
 
     status: str  # no_gap, explained, partly, ambiguous, unexplained, not_judged, or failed
     named: tuple[Cause, ...]
@@ -51,21 +52,22 @@ class Diagnosis:
     probability: dict[Cause, float]
     seconds: float | None = None
     fresh: tuple[Mapping, ...] = ()  # rms on the fresh trials, before and after
-    values: Mapping[Cause, Mapping[str, tuple[float, float]]] = field(default_factory=dict)  # named causes': value, std
+    values: Mapping[Cause, Mapping[str, tuple[float, float]]] = field(default_factory=dict)  # (value, std) by cause
 
     @property
     def answer(self) -> tuple[Cause, ...]:
-        """The set that the verdict stands for: the first ambiguous set, or what it names."""
+        """Answer of the verdict: the first ambiguous set, or the named causes."""
         if self.status == "ambiguous" and self.sets:
             return self.sets[0]
         return self.named if self.status in ("explained", "partly", "ambiguous") else ()
 
 
-FAILED = Diagnosis("failed", (), (), {})
-
-
 def read_truth(folder: Path, truth_root: Path | None) -> Truth:
-    """The truth of a case: `TRUTH/<case>.json`, or `truth.json` beside the data as the practice cases have it."""
+    """Read the truth of a case: `TRUTH/<case>.json`, or `truth.json` beside the data.
+
+    Raises:
+        UserError: There is no truth, or it is not JSON.
+    """
     name = folder.name
     files = ([truth_root / f"{name}.json"] if truth_root else []) + [folder / "truth.json"]
     file = next((f for f in files if f.exists()), None)
@@ -83,18 +85,22 @@ def read_truth(folder: Path, truth_root: Path | None) -> Truth:
         data.get("kind") or kinds.get(len(effects), "several"),
         tuple(causes),
         tuple(map(_cause, listed)),
-        tuple(_cause(e) for e in listed if e.get("closes", 1.0) > MATTERS),
+        tuple(_cause(e) for e in listed if e.get("closes", 1.0) > MIN_CLOSED_SHARE),
         {c: e.get("known", {}) for c, e in causes.items()},
         effects[0].get("severity") if effects else None,
         effects[0].get("reached") if effects else None,
         data.get("specimen", ""),
         tuple(data.get("fresh", ())),
-        len(data["rivals"]) + (data["energy"] < TELLING) if "rivals" in data else None,
+        len(data["rivals"]) + (data["energy"] < MIN_DISTANCE) if "rivals" in data else None,
     )
 
 
 def read_diagnosis(folder: Path) -> Diagnosis:
-    """The verdict in a folder that `diagnose` wrote; `FAILED` where it wrote none."""
+    """Read the verdict in a folder that `diagnose` wrote. Without a `gap.json` its status is `failed`.
+
+    Raises:
+        UserError: `gap.json` is not JSON, or of another schema.
+    """
     file = folder / "gap.json"
     cost = _load(folder / "run.json") if (folder / "run.json").exists() else {}
     if not file.exists():

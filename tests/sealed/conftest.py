@@ -1,11 +1,11 @@
-"""A small specimen and a short session, made once."""
+"""A specimen and a short session for all tests of the room."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from jaxfinger.sealed.drive import wish
+from jaxfinger.sealed.drive import desired_trajectory
 from jaxfinger.sealed.laws import Finger
 from jaxfinger.sealed.protocols import draw_style, session_plans
 from jaxfinger.sealed.sensors import Sensors, draw_sensors
@@ -13,7 +13,7 @@ from jaxfinger.sealed.specimens import Specimen, make_specimen
 
 
 def short(plans, nominal, rng):
-    """One trial of every kind, and a VD.3 of two seconds."""
+    """Keep one trial of every kind, with a VD.3 of two seconds."""
     kept, seen = [], set()
     for plan in plans:
         key = (plan.experiment, plan.joint == 0, plan.tendon == 0)
@@ -22,7 +22,7 @@ def short(plans, nominal, rng):
         seen.add(key)
         if plan.experiment == "VD.3":
             plan = replace(plan, duration=2.0)
-            plan = replace(plan, q=wish(nominal, plan, rng))
+            plan = replace(plan, q=desired_trajectory(nominal, plan, rng))
         kept.append(plan)
     return kept
 

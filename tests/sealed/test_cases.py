@@ -1,4 +1,4 @@
-"""A case from its seed: the same twice, its truth elsewhere."""
+"""Cases repeat bit for bit from their seeds, and keep their truth in another tree."""
 
 import json
 
@@ -52,7 +52,7 @@ def test_a_case_repeats_bit_for_bit_and_keeps_its_truth_apart(quick, tmp_path):
     done = []
     make_cases("develop", 3, tmp_path / "a", tmp_path / "a-truth", only=[3], progress=lambda *a: done.append(a))
     assert done == [(1, 1, "case-003")]
-    assert (first / "fit.h5").stat().st_mtime_ns != stamp  # our touch, not a new file
+    assert (first / "fit.h5").stat().st_mtime_ns != stamp  # `touch` has changed it; the file is the old one.
     assert json.loads((tmp_path / "a-truth" / "case-003.json").read_text()) == truth
 
 

@@ -1,4 +1,4 @@
-"""rms on fresh trials, of differences put in by hand."""
+"""rms on fresh trials, of known differences."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def test_differences_put_in_come_out(specimen, nominal: Finger, plans):
             joint_torque=truth.torque,
             fingertip_force=truth.force,
         )  # fmt: skip
-        said = {"time": truth.time, "tendon_excursion": truth.excursion + 3e-3}  # a constant is no gap
+        said = {"time": truth.time, "tendon_excursion": truth.excursion + 3e-3}  # A constant is no gap.
         if truth.torque is not None:
             said["joint_torque"] = truth.torque + 2e-3
         if truth.force is not None:
@@ -37,11 +37,11 @@ def test_differences_put_in_come_out(specimen, nominal: Finger, plans):
 def test_torque_of_vd3_counts_only_where_joint_and_tendons_slide(specimen):
     t = np.arange(4000) * 1e-3
     q = np.full((4000, 3), 0.4)
-    q[:, 0] += np.where(t < 2, 0.0, 0.3 * (t - 2))  # the base joint rests, then moves at 0.3 rad/s
+    q[:, 0] += np.where(t < 2, 0.0, 0.3 * (t - 2))  # The base joint rests, then moves at 0.3 rad/s.
     length = Finger(specimen).geometry(q)[0]
     trial = Trial("v", "VD.3", t, q, np.full((4000, 5), 3.0), tendon_excursion=length)
     torque = np.zeros((4000, 3))
-    torque[t < 1.9, 0] = 1.0  # friction at rest takes any value
+    torque[t < 1.9, 0] = 1.0  # Friction at rest takes any value.
     torque[t > 2.1, 0] = 2e-3
     torque[:, 1:] = 1.0
     gap = gap_by_channel(Session("s", specimen.cad, {"v": trial}), {"v": {"time": t, "joint_torque": torque}})
@@ -51,7 +51,7 @@ def test_torque_of_vd3_counts_only_where_joint_and_tendons_slide(specimen):
 def test_torque_of_the_driven_joint_counts_in_holds_and_clear_of_reversals(specimen):
     t = np.arange(4000) * 1e-3
     q = np.full((4000, 3), 0.4)
-    q[:, 0] += 0.3 * np.abs(t - 2.0)  # turns back at 2 s
+    q[:, 0] += 0.3 * np.abs(t - 2.0)  # The joint turns back at 2 s.
     torque = np.full((4000, 3), np.nan)
     torque[:, 0] = np.where(np.abs(t - 2.0) < 0.02, 1.0, 2e-3)
     sweep = Trial("d", "ID.3-dynamic", t, q, joint_torque=torque, joint=specimen.cad.joint_names[0])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.sealed.departures import draw
-from jaxfinger.sealed.drive import Allocator, replay, simulate, wish
+from jaxfinger.sealed.drive import Allocator, desired_trajectory, replay, simulate
 from jaxfinger.sealed.laws import Finger
 from jaxfinger.sealed.protocols import draw_style, session_plans
 from jaxfinger.sealed.record import Motion, last_direction, needed_torque
@@ -27,7 +27,7 @@ def test_where_everything_slides_the_finger_needs_no_external_torque(effect, spe
     crosses = specimen.finger.crosses & specimen.finger.active[:, None]
     slides = (np.abs(run.qd) > 0.15) & ~(~tendon @ crosses)
     assert slides.sum() > 100
-    assert np.median(np.abs(torque[slides])) < 1e-4  # a third of the torque sensor's noise; friction alone is 3e-3
+    assert np.median(np.abs(torque[slides])) < 1e-4  # N m: a third of the torque sensor's noise. Friction is 3e-3.
 
 
 def test_repeats_of_a_motion_differ_a_little_and_seeds_repeat(nominal, plans):
@@ -52,18 +52,18 @@ def specimen_active(nominal):
     return nominal.specimen.finger.active
 
 
-LARGE = ("chain", "human-like")  # most joints and tendons
+LARGE = ("chain", "human-like")  # fingers with the most joints and tendons
 
 
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.long] * (k in LARGE)) for k in LAYOUTS])
 def test_the_same_tensions_open_loop_lead_to_the_same_motion(kind):
-    """The fingers are statically stable under the recorded tensions, so a simulator can replay them."""
+    """The fingers are statically stable under the recorded tensions, so that a simulator can replay them."""
     rng = np.random.default_rng([3, 1])
     specimen = make_specimen(kind, rng)
     nominal = Finger(specimen)
     plan = next(p for p in session_plans(specimen, draw_style(rng), rng) if p.experiment == "VD.3")
     plan = replace(plan, duration=2.0)
-    plan = replace(plan, q=wish(nominal, plan, rng))
+    plan = replace(plan, q=desired_trajectory(nominal, plan, rng))
     run = simulate(nominal, nominal, [plan])[0]
     assert np.ptp(run.q, axis=0).max() > 0.1
     wished = np.stack([p(run.time)[0] for p in plan.q], axis=1)

@@ -1,4 +1,4 @@
-"""The room shares no code with what it tests."""
+"""The room shares no code with the model and the diagnosis that it tests."""
 
 import ast
 import subprocess

@@ -1,4 +1,4 @@
-"""The nominal laws and the departures, against hand calculations."""
+"""Nominal laws and departures against calculations by hand."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 from jaxfinger.sealed.departures import LISTED, UNLISTED, draw, presliding
 from jaxfinger.sealed.laws import Finger, Situation
 from jaxfinger.sealed.record import commanded, last_direction, record
-from jaxfinger.sealed.severity import QuietSession, calibrate
+from jaxfinger.sealed.severity import NoiseFreeSession, calibrate
 
 
 def held(nominal, f):
@@ -26,11 +26,11 @@ def test_held_tendon_rises_with_loss_keeps_its_plateau_and_slips_back(nominal):
     top = 10.0 - (a0 + 10 * a1)
     assert reaching[1] == pytest.approx(4 - (a0 + 4 * a1))
     assert reaching[2] == pytest.approx(top)
-    assert reaching[3] == pytest.approx(top)  # 9.5 N is within the loss of the plateau
+    assert reaching[3] == pytest.approx(top)  # 9.5 N is within the loss of the plateau.
     assert reaching[5] == pytest.approx(4 + (a0 + 4 * a1))
     assert np.all(
         nominal.reaching_held(held(nominal, f))[:, 1:] == 0.0
-    )  # slack tendons have neither tension nor friction
+    )  # Slack tendons have neither tension nor friction.
 
 
 def test_loss_never_exceeds_the_tension(nominal):
@@ -80,14 +80,14 @@ def test_dahl_does_not_depend_on_the_step():
 
 
 def test_noise_free_session_without_departures_leaves_no_trace(specimen, plans, sensors):
-    assert np.all(QuietSession(specimen, plans, sensors).trace([])[0] == 0.0)
+    assert np.all(NoiseFreeSession(specimen, plans, sensors).trace([])[0] == 0.0)
 
 
 @pytest.mark.parametrize("effect", [*LISTED, *UNLISTED])
 def test_every_departure_vanishes_with_its_size_and_shows_at_its_start(effect, specimen, plans, sensors):
-    session = QuietSession(specimen, plans, sensors)
+    session = NoiseFreeSession(specimen, plans, sensors)
     site = np.random.default_rng(1)
-    # A presliding length has no zero limit in coarse samples: its smallest physical size stands for zero.
+    # A presliding length has an effect in coarse samples however small it is. Its smallest size stands for zero.
     for _ in range(8):
         departure = draw(effect, specimen.finger, site)
         assert departure is not None
@@ -113,20 +113,20 @@ def test_drive_inertia_is_seen_by_the_motor_only(specimen, plans, nominal):
 
 
 def test_a_refit_absorbs_what_the_nominal_model_can_say(specimen, plans, sensors):
-    """A change of elastic stiffness is no effect: nothing is left of it. A stretch is, in the channel where it acts."""
-    session = QuietSession(specimen, plans, sensors)
+    """Nothing remains of a change of stiffness. A stretch remains in the channel where it acts."""
+    session = NoiseFreeSession(specimen, plans, sensors)
     stiffer = replace(specimen, elastic=specimen.elastic * 1.05)
     rows = [
         after - before
-        for look in session.looks
+        for coarse in session.trials
         for (*_, after), (*_, before) in zip(
-            session.rows(Finger(stiffer), look, look.motion, True),
-            session.rows(session.nominal, look, look.motion, True),
+            session.rows(Finger(stiffer), coarse, coarse.motion, True),
+            session.rows(session.nominal, coarse, coarse.motion, True),
             strict=True,
         )
     ]
     change = np.concatenate(rows)
-    assert np.abs(session.left(change)).max() < 1e-3 * np.abs(change).max()
+    assert np.abs(session.refitted(change)).max() < 1e-3 * np.abs(change).max()
     sized, reached, where = calibrate(session, draw("tendon_stretch", specimen.finger, np.random.default_rng(0)), 5.0)
     assert reached == pytest.approx(5.0, rel=0.11)
     assert where[1] == "tendon_excursion"

@@ -1,4 +1,4 @@
-"""MuJoCo's rigid body as we build it, against closed forms and balances."""
+"""The rigid body as a MuJoCo model, against closed forms and the power balance."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from jaxfinger.sealed.specimens import LAYOUTS, make_specimen
 
 
 def pendulum(specimen):
-    """The first link alone, hanging about y."""
+    """Description of the first link alone, hanging about y."""
     f = specimen.finger
     return replace(
         f,
@@ -50,7 +50,7 @@ def test_mass_matrix_is_what_inverse_dynamics_multiplies_by(nominal):
 
 
 def test_power_balance_along_a_motion():
-    """d/dt (½ q̇ᵀ M q̇ + V) = q̇ᵀ τ for any motion; V from the fingertip-free centres of mass by integration of G."""
+    """d/dt (½ q̇ᵀ M q̇) = q̇ᵀ (τ − G) for any motion."""
     specimen = make_specimen("human-like", np.random.default_rng(2))
     plant = Plant(specimen.finger)
     t = np.linspace(0, 1, 4001)[:, None]
@@ -73,16 +73,14 @@ def test_jacobian_is_the_derivative_of_the_fingertip(nominal):
 @pytest.mark.parametrize("kind", LAYOUTS)
 def test_nominal_polynomials_fit_the_spatial_tendons_far_below_noise(kind):
     specimen = make_specimen(kind, np.random.default_rng(9))
-    assert (
-        specimen.misfit < 1e-6
-    )  # a tenth of one sample's noise; what matters is that the truth is the polynomial itself
+    assert specimen.misfit < 1e-6  # m: a tenth of a sample's noise
     active = specimen.finger.active
     assert np.array_equal(specimen.finger.crosses[active], np.any(specimen.excursion[active] != 0, axis=-1))
     assert np.all(specimen.excursion[~active] == 0.0)
 
 
 def test_paths_separate_by_joint(specimen):
-    """A symmetric eyelet pair gives l = 2R (cos α − cos(α + q/2)) for a flexor: MuJoCo against trigonometry."""
+    """MuJoCo's path between symmetric eyelets is l = 2R (cos α − cos(α + q/2)) for a flexor."""
     f = specimen.finger
     arm, alpha = np.zeros((f.n, f.m)), np.full((f.n, f.m), 0.6)
     arm[0, 1] = 6e-3
@@ -92,7 +90,7 @@ def test_paths_separate_by_joint(specimen):
     np.testing.assert_allclose(lengths[-1] - lengths[:-1], 2 * radius * (np.cos(0.6) - np.cos(0.6 + q / 2)), atol=1e-12)
     coefficients, _ = excursion_polynomials(f, arm, alpha)
     assert coefficients[0, 1, 0] == pytest.approx(6e-3, rel=2e-3)
-    arm[0, 1] = -6e-3  # an extensor wraps its pulley: the arm is constant
+    arm[0, 1] = -6e-3  # An extensor wraps its pulley: the arm is constant.
     lengths = spatial_lengths(f, arm, alpha, 1, np.append(q, 0.0))[:, 0]
     np.testing.assert_allclose(lengths[-1] - lengths[:-1], -6e-3 * q, atol=1e-9)
 

@@ -1,4 +1,4 @@
-"""Running a diagnosis over cases: sealed, resumable, in shares."""
+"""Runs of a diagnosis over cases: sealed, resumable, in shares."""
 
 import json
 import os
@@ -29,7 +29,7 @@ def folder(tmp_path):
 
 
 def diagnose(fit, out):
-    """Says what it can see."""
+    """Stand in for a diagnosis: write down what it can see."""
     out.mkdir()
     if fit.read_text() == "session 4":
         raise ValueError("cannot")
@@ -111,7 +111,7 @@ def test_withheld_effects_are_taken_out_one_by_one(folder, capsys):
     for name, found in effects.items():
         truth = {"effects": [{"effect": e, "site": ["DIP"], "listed": True} for e in found]}
         (folder / name / "truth.json").write_text(json.dumps(truth))
-    # Stands in for a diagnosis: names a drive inertia where the payload is lacking, and else nothing that is known.
+    # This diagnosis names a drive's inertia where the payload is withheld, and «unexplained» otherwise.
     says = "lacks = sys.argv[sys.argv.index('--without') + 1]; named = [dict(effect='drive_inertia', site=['DIP'])]; "
     verdict = (
         "dict(status='explained', effects=named) if lacks == 'payload' else dict(status='unexplained', effects=[])"
@@ -155,7 +155,7 @@ def test_fresh_trials_are_predicted_where_a_known_effect_is_there_and_by_a_refit
     assert done == {"case-001": "done", "case-002": "done", "case-003": "done", "case-004": "skipped"}
     assert seen["case-001"] == {"before": "nominal", "after": "augmented", "best": "augmented"}
     assert seen["case-002"] == {"before": "nominal", "after": "augmented", "best": "['payload:DIP']"}
-    assert seen["case-003"]["best"] == "['payload:DIP']"  # what is there and is not named counts
+    assert seen["case-003"]["best"] == "['payload:DIP']"  # The true effect is not named, and is refitted.
     assert json.loads((tmp_path / "out" / "case-001" / "fresh.json").read_text()) == {"rows": [{"before": 1.0}]}
     assert close_cases(folder, tmp_path / "out", predict, None)["case-001"] == "skipped"
     (tmp_path / "out" / "case-001" / "fresh.json").unlink()
@@ -185,7 +185,7 @@ def test_processes_serve_several_cases_and_end(folder, tmp_path, monkeypatch):
 
 
 def ended(fit, out):
-    """As a process is that takes all of the memory."""
+    """End as a process that takes all of the memory."""
     os._exit(9)
 
 

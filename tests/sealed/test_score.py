@@ -1,4 +1,4 @@
-"""Scores of verdicts made by hand, whose figures are known."""
+"""Scores of verdicts made by hand, against known figures."""
 
 import json
 from io import StringIO
@@ -49,7 +49,7 @@ def test_every_figure_of_a_set_made_by_hand():
         (
             LISTED,
             said("ambiguous", [STRETCH], [[STRETCH, CREEP, STRETCH_T1, ("payload", ("MCP",))]], stretch=1.0),
-        ),  # set too large
+        ),  # The set is too large.
         (SOUND, said("no_gap", none=1.0)),
         (SOUND, said("explained", [CREEP], creep=0.7, none=0.3)),  # false alarm
         (STRANGE, said("unexplained", unlisted=0.8, creep=0.2)),
@@ -110,7 +110,7 @@ def test_a_failed_diagnosis_counts_as_wrong(tmp_path):
     assert s.failed == 3
     assert s.figures["cause"].value == 0.0
     assert s.figures["open set"].value == 0.0
-    assert s.figures["false alarm"].value == 0.0  # it named nothing
+    assert s.figures["false alarm"].value == 0.0  # It named nothing.
     assert len(s.missed) == 3
 
 
@@ -148,11 +148,11 @@ def test_closed_is_a_share_of_what_the_true_effect_closes():
     assert closed_share([row], ceiling) == pytest.approx((25 - 17) / (25 - 9))
     assert closed_share([row | {"after": 3.0}], ceiling) == pytest.approx(1.0)
     assert closed_share([row | {"after": 6.0}], ceiling) < 0
-    ours = row | {"before": 7.0}  # of a nominal model that another refit gives
+    ours = row | {"before": 7.0}  # of another nominal model
     assert closed_share([ours], ceiling) == pytest.approx((49 - 17) / (49 - 9))
     assert closed_share([ours], [ceiling[0] | {"gap": 4.0}]) == pytest.approx((49 - 17) / (25 - 9))
     assert np.isnan(closed_share([], ceiling))
-    refitted = row | {"best": np.sqrt(15.0)}  # what a refit with the true effect leaves, in place of the law itself
+    refitted = row | {"best": np.sqrt(15.0)}  # A refit with the true effect takes the place of the law.
     assert closed_share([refitted], ceiling) == pytest.approx((25 - 17) / (25 - 15))
     assert closed_share([refitted], ceiling, by_law=True) == pytest.approx((25 - 17) / (25 - 9))
     assert np.isnan(closed_share([row | {"best": 4.9999}], ceiling))
@@ -201,7 +201,7 @@ def test_a_folder_with_truth_beside_the_data_or_apart(tmp_path):
     (tmp_path / "t").mkdir()
     (tmp_path / "t" / "case-02.json").write_text(json.dumps({"kind": "none", "effects": []}))
     scores = score_folder(tmp_path / "cases", tmp_path / "d", tmp_path / "t")
-    assert scores.cases == 2  # the third was never diagnosed
+    assert scores.cases == 2  # The third has no diagnosis.
     assert scores.figures["cause"].value == 1.0
     assert scores.figures["false alarm"].value == 1.0
     assert scores.by_severity["mid"]["cause"].count == 1

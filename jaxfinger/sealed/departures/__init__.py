@@ -1,4 +1,4 @@
-"""The departures from the nominal model, in forms of the textbook; none of this code is the diagnosis's."""
+"""Departures of the plant from the nominal model, in textbook forms. They share no code with the diagnosis."""
 
 from .draw import LISTED, UNLISTED, draw, draw_at, sites
 

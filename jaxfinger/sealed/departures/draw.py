@@ -1,4 +1,4 @@
-"""Draws a departure for a specimen: where it sits, its form and its shape. The size comes from calibration."""
+"""Draw a departure for a specimen: its site, form and shape. Calibration sets its size."""
 
 from __future__ import annotations
 
@@ -116,8 +116,9 @@ def draw(
     speeds: Sequence[float] = (0.5, 1.0),
     foreign: bool = False,
 ) -> Departure | None:
-    """A departure of its start size, or None where this finger has no site for it. `speeds`: of the dynamic
-    sweeps, rad/s. `foreign`: in a form that no other split has, where there is one.
+    """Draw a departure of its start size, or None where the finger has no site for it.
+
+    `speeds`: those of the dynamic sweeps, rad/s. `foreign`: use a form that no other split has, if there is one.
     """
     possible = sites(effect, finger)
     if not possible:
@@ -133,14 +134,14 @@ def draw_at(
     speeds: Sequence[float],
     foreign: bool = False,
 ) -> Departure:
-    """A departure of its start size at a given site, its form and shape drawn."""
+    """Draw the form and shape of a departure of its start size at a given site."""
     kind = {**LISTED, **UNLISTED}[effect]
     forms = kind.foreign if foreign and kind.foreign else kind.forms
     return kind(kind.start_size, *site, str(rng.choice(forms)), _shape(kind, finger, site[1], rng, speeds))
 
 
 def sites(effect: str, finger: FingerDescription) -> list[tuple[Names, Index]]:
-    """Every place where an effect can sit on this finger: names as the diagnosis writes them, and indices."""
+    """Sites where an effect can act on a finger: names as the diagnosis writes them, and indices."""
     kind = {**LISTED, **UNLISTED}[effect]
     joints, tendons = finger.joint_names, finger.tendon_names
     active = [int(k) for k in np.flatnonzero(finger.active)]
@@ -174,6 +175,7 @@ def _shape(
     rng: np.random.Generator,
     speeds: Sequence[float],
 ):
+    """Draw the shape of a departure: parameters other than the size, SI."""
     sign = float(rng.choice([-1.0, 1.0]))
     phase = float(rng.uniform(0, 2 * np.pi))
     if kind is joint.Stribeck:

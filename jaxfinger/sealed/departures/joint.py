@@ -13,7 +13,7 @@ from .base import Departure, Memory, add_at, put_at
 
 @dataclass(frozen=True, eq=False)
 class Stribeck(Departure):
-    """Breakaway above Coulomb: limit · (1 + a g(|q̇|/v_s)), g Gaussian, exponential, Lorentzian or a stretched
+    """limit · (1 + a g(|q̇|/v_s)): friction falls after breakaway. g is Gaussian, exponential, Lorentzian or a stretched
     exponential.
     """
 
@@ -38,7 +38,7 @@ class Stribeck(Departure):
 
 @dataclass(frozen=True, eq=False)
 class JointPresliding(Memory):
-    """Friction builds up over an angle after each reversal. The size is the presliding angle."""
+    """Friction that builds up over an angle after each reversal. The size is the presliding angle."""
 
     effect: ClassVar[str] = "joint_presliding"
     units: ClassVar[str] = "rad"
@@ -66,8 +66,8 @@ class JointPresliding(Memory):
 
 @dataclass(frozen=True, eq=False)
 class LoadFriction(Departure):
-    """The bearing's friction grows with its load from tension, μ Σ |c_k f_k|; linear, as a power (Palli 2014), or
-    from a preload on.
+    """μ Σ |c_k f_k|: the bearing's friction grows with its load from tension, linearly, as a power (Palli 2014), or
+    beyond a preload.
     """
 
     effect: ClassVar[str] = "joint_load_friction"
@@ -92,7 +92,7 @@ class LoadFriction(Departure):
 
 @dataclass(frozen=True, eq=False)
 class Hardening(Departure):
-    """Elastic torque that stiffens towards an end: exponential, cubic beyond an onset, tangent, or a sixth power."""
+    """Elastic torque that stiffens towards an end: exponential, cubic beyond an onset, tangent, or sixth power."""
 
     effect: ClassVar[str] = "elastic_hardening"
     units: ClassVar[str] = "N m"
@@ -119,7 +119,7 @@ class Hardening(Departure):
 
 @dataclass(frozen=True, eq=False)
 class Relaxation(Memory):
-    """Viscoelastic torque: one Maxwell branch, three over two decades (a power law in time), or three over three."""
+    """Viscoelastic torque: one Maxwell branch, or three of them over two decades or over three."""
 
     effect: ClassVar[str] = "elastic_relaxation"
     units: ClassVar[str] = "N m/rad"
@@ -136,6 +136,7 @@ class Relaxation(Memory):
     }
 
     def _times(self):
+        """Relaxation times of the branches, s."""
         return self.shape["tau"] * np.array(self.SPECTRA[self.form])
 
     def inputs(self, finger, s):
@@ -152,7 +153,7 @@ class Relaxation(Memory):
 
 @dataclass(frozen=True, eq=False)
 class Stop(Departure):
-    """Contact inside the range: linear spring and damper, or Hunt–Crossley x^1.5 (1 + λ ẋ)."""
+    """Contact inside the range: a linear spring and damper, or Hunt–Crossley x^1.5 (1 + λ ẋ)."""
 
     effect: ClassVar[str] = "joint_stop"
     units: ClassVar[str] = "N m/rad"
@@ -173,7 +174,7 @@ class Stop(Departure):
 
 @dataclass(frozen=True, eq=False)
 class PassiveTendon(Departure):
-    """An unmeasured elastic tendon between two joints: one-sided spring on its stretch, linear or with a toe."""
+    """An unmeasured elastic tendon over two joints: a one-sided spring, linear or with a toe."""
 
     effect: ClassVar[str] = "passive_tendon"
     units: ClassVar[str] = "N/m"
@@ -193,7 +194,7 @@ class PassiveTendon(Departure):
 
 @dataclass(frozen=True, eq=False)
 class DriveInertia(Departure):
-    """Shaft and coupler between the torque sensor and the joint."""
+    """Inertia of shaft and coupler between the torque sensor and the joint."""
 
     effect: ClassVar[str] = "drive_inertia"
     units: ClassVar[str] = "kg m2"
@@ -211,8 +212,8 @@ class DriveInertia(Departure):
 
 @dataclass(frozen=True, eq=False)
 class TorqueRipple(Departure):
-    """Torque periodic in the joint's angle: cogging of the external motor or a misaligned coupler; with a
-    second harmonic or not, or the flat tops of a slotted motor.
+    """Torque periodic in the joint's angle, from cogging or a misaligned coupler: a sine, two harmonics, or a wave with
+    flat tops, as of a slotted motor.
     """
 
     effect: ClassVar[str] = "torque_ripple"
@@ -235,7 +236,7 @@ class TorqueRipple(Departure):
 
 @dataclass(frozen=True, eq=False)
 class AsymmetricFriction(Departure):
-    """Viscous friction that differs between the two directions, Δd |q̇|."""
+    """Δd |q̇|: viscous friction that differs between the two directions, or shear-thinning, with |q̇|^0.6."""
 
     effect: ClassVar[str] = "joint_friction_asymmetric"
     units: ClassVar[str] = "N m s/rad"
@@ -252,7 +253,10 @@ class AsymmetricFriction(Departure):
 
 @dataclass(frozen=True, eq=False)
 class TorqueFriction(Departure):
-    """A gear's friction grows with the torque that the external motor sends through it, μ |G + τ_k|."""
+    """μ |G + τ_k|: friction of a gear that grows with the torque through it, linearly or as a power.
+
+    The gear sits at the external motor.
+    """
 
     effect: ClassVar[str] = "joint_torque_friction"
     units: ClassVar[str] = "1"
@@ -274,7 +278,7 @@ class TorqueFriction(Departure):
 
 @dataclass(frozen=True, eq=False)
 class WarmingFriction(Departure):
-    """Dry friction that falls as the session warms the bearing: limit · (1 + a g(t)), g exponential or rational."""
+    """limit · (1 + a g(t)): dry friction that falls as the bearing warms up. g is exponential or rational."""
 
     effect: ClassVar[str] = "joint_friction_warmup"
     units: ClassVar[str] = "1"

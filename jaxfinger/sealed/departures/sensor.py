@@ -1,4 +1,4 @@
-"""Departures of the body that CAD describes, of the mounting, and of the sensors."""
+"""Departures of the rigid body, of the mounting, and of the sensors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .base import Departure, add_at
 
 @dataclass(frozen=True, eq=False)
 class Payload(Departure):
-    """A link with an unknown point mass, or with mass displaced along it."""
+    """An unknown point mass on a link, or mass displaced along it."""
 
     effect: ClassVar[str] = "payload"
     units: ClassVar[str] = "kg"
@@ -36,7 +36,7 @@ class Payload(Departure):
 
 @dataclass(frozen=True, eq=False)
 class Tilt(Departure):
-    """The finger is mounted at another angle than believed: in its plane, or out of it."""
+    """Mounting at another angle than described, in the finger's plane or out of it."""
 
     effect: ClassVar[str] = "gravity_tilt"
     units: ClassVar[str] = "rad"
@@ -54,7 +54,7 @@ class Tilt(Departure):
 
 @dataclass(frozen=True, eq=False)
 class TorqueScale(Departure):
-    """Gain error of the torque sensor: one gain, or one that bends with the load."""
+    """Gain error of the torque sensor, constant or growing with the load."""
 
     effect: ClassVar[str] = "torque_sensor_scale"
     units: ClassVar[str] = "1"
@@ -77,8 +77,8 @@ class TorqueScale(Departure):
 
 @dataclass(frozen=True, eq=False)
 class TorqueDrift(Departure):
-    """Offset of the torque sensor that moves after its tare: with time, as the session warms it, wandering over
-    minutes, or anew after every tare, when current flows.
+    """Offset of the torque sensor that drifts after its tare: in proportion to time, exponentially as the session warms
+    it, as sines over minutes, or anew after every tare.
     """
 
     effect: ClassVar[str] = "torque_sensor_drift"
@@ -109,7 +109,7 @@ class TorqueDrift(Departure):
 
 @dataclass(frozen=True, eq=False)
 class TensionScale(Departure):
-    """Gain of one tendon's force sensor, with an offset or without."""
+    """Gain error of one tendon's force sensor, with an offset or without."""
 
     effect: ClassVar[str] = "tension_sensor_scale"
     units: ClassVar[str] = "1"
@@ -147,8 +147,8 @@ class EncoderOffset(Departure):
 
 @dataclass(frozen=True, eq=False)
 class Eccentricity(Departure):
-    """Once-per-turn error of an off-axis magnet, alone, with the second harmonic of a field that is not uniform, or
-    as far off as the angle of the sum of two fields says.
+    """Once-per-turn error of an off-axis magnet: a sine, a sine with the second harmonic of a non-uniform field, or the
+    angle of the sum of two fields.
     """
 
     effect: ClassVar[str] = "encoder_eccentricity"
@@ -171,7 +171,7 @@ class Eccentricity(Departure):
 
 @dataclass(frozen=True, eq=False)
 class ForceRotation(Departure):
-    """The fingertip's force sensor is turned against the base frame."""
+    """Rotation of the fingertip's force sensor against the base frame."""
 
     effect: ClassVar[str] = "force_sensor_rotation"
     units: ClassVar[str] = "rad"
@@ -190,7 +190,7 @@ class ForceRotation(Departure):
 
 @dataclass(frozen=True, eq=False)
 class Delay(Departure):
-    """One channel lags the others: a time shift, or a first-order low pass with that time constant."""
+    """Lag of one channel: a time shift, or a first-order low pass with that time constant."""
 
     effect: ClassVar[str] = "channel_delay"
     units: ClassVar[str] = "s"
@@ -214,14 +214,14 @@ class Delay(Departure):
         if self.form == "shift":
             late = np.stack([np.interp(t - self.size, t, column) for column in values.T], axis=1)
         else:
-            # Exact response to a signal that is linear between samples: a ramp lags by the time constant.
+            # Exact response to a signal that is linear between samples. A ramp lags by the time constant.
             tau = max(self.size, 1e-9)
             slope = np.diff(values, axis=0) / np.diff(t)[:, None]
-            keep = np.exp(-np.diff(t) / tau)
+            decays = np.exp(-np.diff(t) / tau)
             lag = tau * slope[0]
             late = np.array(values)
             late[0] = values[0] - lag
-            for i, share in enumerate(keep):
-                lag = tau * slope[i] + (lag - tau * slope[i]) * share
+            for i, decay in enumerate(decays):
+                lag = tau * slope[i] + (lag - tau * slope[i]) * decay
                 late[i + 1] = values[i + 1] - lag
         return replace(channels, **{name: late})

@@ -13,8 +13,8 @@ from .base import Departure, Memory, add_at, put_at
 
 @dataclass(frozen=True, eq=False)
 class Stretch(Departure):
-    """Lengthening under tension; the size is the compliance. Linear, a toe that stiffens, under the mean tension
-    along the path, which friction makes smaller than the actuator's, or a power law.
+    """Stretch under tension: linear, with a toe, as a power law, or linear in the mean tension along the path, which
+    friction changes. The size is the compliance.
     """
 
     effect: ClassVar[str] = "tendon_stretch"
@@ -43,7 +43,7 @@ class Stretch(Departure):
 
 @dataclass(frozen=True, eq=False)
 class Creep(Memory):
-    """Goes on lengthening under held tension: one Kelvin–Voigt element, or four over three decades (log time)."""
+    """Creep under held tension: one Kelvin–Voigt element, or four over three decades (nearly logarithmic in time)."""
 
     effect: ClassVar[str] = "tendon_creep"
     units: ClassVar[str] = "m/N"
@@ -65,9 +65,7 @@ class Creep(Memory):
 
 @dataclass(frozen=True, eq=False)
 class Backlash(Memory):
-    """The encoder's side lags by a dead zone at each reversal: a play operator, or elastic slip with a rounded
-    corner.
-    """
+    """Dead zone between tendon and encoder: a play operator, or elastic slip with rounded corners."""
 
     effect: ClassVar[str] = "tendon_backlash"
     units: ClassVar[str] = "m"
@@ -80,7 +78,7 @@ class Backlash(Memory):
 
     def step(self, z, before, now, dt):
         half = max(self.size, 1e-12) / 2
-        if self.form == "play":  # z: offset of the output from the input within the dead zone, −1 … 1
+        if self.form == "play":  # z in [−1, 1]: offset of the output from the input over half the dead zone
             return np.clip(z - (now - before) / half, -1.0, 1.0)
         dx = now - before
         return -np.sign(dx) - (-np.sign(dx) - z) * np.exp(-np.abs(dx) / half)
@@ -91,8 +89,8 @@ class Backlash(Memory):
 
 @dataclass(frozen=True, eq=False)
 class Coupling(Departure):
-    """Excursion that depends on two joints together: product of sines, of angles, or of an angle and a square; or the
-    straight run between two eyelets, one before and one behind both joints.
+    """Excursion that depends on two joints together: a product of sines, of angles, of a sine and a square, or the
+    straight run between an eyelet before both joints and one behind them.
     """
 
     effect: ClassVar[str] = "moment_arm_coupling"
@@ -122,7 +120,7 @@ class Coupling(Departure):
 
 @dataclass(frozen=True, eq=False)
 class Bowstring(Departure):
-    """The tendon lifts off under tension: c(q) (1 + b g(f)), g linear, saturating, beyond a threshold, or a root."""
+    """c(q) (1 + b g(f)): the tendon lifts off under tension. g is linear, saturating, beyond a threshold, or a root."""
 
     effect: ClassVar[str] = "moment_arm_bowstring"
     units: ClassVar[str] = "1/N"
@@ -151,8 +149,8 @@ class Bowstring(Departure):
 
 @dataclass(frozen=True, eq=False)
 class Capstan(Departure):
-    """Friction that grows with the wrap angle: Euler–Eytelwein, its first order, weighted by the pulleys' radii, or
-    once a joint is bent so far that the tendon touches its pulley.
+    """Friction that grows with the wrap angle: Euler–Eytelwein's law, its first order, with angles weighted by the
+    pulleys' radii, or beyond an angle at which the tendon touches its pulley.
     """
 
     effect: ClassVar[str] = "tendon_friction_capstan"
@@ -181,7 +179,7 @@ class Capstan(Departure):
 
 @dataclass(frozen=True, eq=False)
 class ViscousTendon(Departure):
-    """Friction with the tendon's speed: linear, or shear-thinning |l̇|^0.7."""
+    """Friction that grows with the tendon's speed, linearly or shear-thinning, with |l̇|^0.7."""
 
     effect: ClassVar[str] = "tendon_friction_viscous"
     units: ClassVar[str] = "N s/m"
@@ -205,7 +203,7 @@ class ViscousTendon(Departure):
 class TendonPresliding(Memory):
     """Friction that builds up over an excursion after each reversal. The size is that excursion.
 
-    An inextensible tendon over a held joint does not move: there the nominal hysteresis stays.
+    At held joints the nominal hysteresis stays, since an inextensible tendon does not move there.
     """
 
     effect: ClassVar[str] = "tendon_friction_presliding"
@@ -259,7 +257,7 @@ class Saturating(Departure):
 
 @dataclass(frozen=True, eq=False)
 class Crosstalk(Departure):
-    """A pulled tendon drags its neighbour: f_k + ε f_j, linear or beyond a threshold. Site: dragged, pulled."""
+    """f_k + ε f_j: a pulled tendon j drags its neighbour k, linearly or beyond a threshold. The site is (k, j)."""
 
     effect: ClassVar[str] = "tendon_crosstalk"
     units: ClassVar[str] = "1"

@@ -1,6 +1,4 @@
-"""Departures that the catalogue of the diagnosis lacks; the right verdict is that none of the known effects
-explains them.
-"""
+"""Departures that the catalogue of the diagnosis lacks. The right verdict is that no known effect explains them."""
 
 from __future__ import annotations
 
@@ -14,7 +12,7 @@ from .base import Departure, Memory, add_at
 
 @dataclass(frozen=True, eq=False)
 class MotorCogging(Departure):
-    """The tendon's motor cogs behind its force sensor: the tension that acts ripples with the excursion."""
+    """Cogging of a tendon's motor behind its force sensor: the tension that acts ripples with the excursion."""
 
     effect: ClassVar[str] = "gear cogging of a tendon's motor, in tension"
     listed: ClassVar[bool] = False
@@ -32,7 +30,7 @@ class MotorCogging(Departure):
 
 @dataclass(frozen=True, eq=False)
 class SlackSag(Departure):
-    """At low tension the tendon sags between its eyelets: a catenary's shortening w²/f²."""
+    """Sag of a tendon between its eyelets at low tension f, in proportion to 1/(1 + f²), as of a catenary."""
 
     effect: ClassVar[str] = "sag of a tendon at low tension"
     listed: ClassVar[bool] = False
@@ -50,7 +48,7 @@ class SlackSag(Departure):
 
 @dataclass(frozen=True, eq=False)
 class SidewaysYield(Departure):
-    """The base yields sideways under tension and the contact drifts: a lateral force on the fingertip."""
+    """Lateral force on the fingertip, from a base that yields sideways under tension."""
 
     effect: ClassVar[str] = "abduction that the model does not have, yielding under tension"
     listed: ClassVar[bool] = False
@@ -66,7 +64,7 @@ class SidewaysYield(Departure):
 
 @dataclass(frozen=True, eq=False)
 class StickSlip(Memory):
-    """The fingertip sticks and slips on the sensor: the force relaxes in jumps as tension rises."""
+    """Stick-slip of the fingertip on the sensor: the force relaxes in jumps as tension rises."""
 
     effect: ClassVar[str] = "stick-slip of the fingertip's contact"
     listed: ClassVar[bool] = False
@@ -79,7 +77,7 @@ class StickSlip(Memory):
         return np.sum(s.f, axis=-1)[..., None]
 
     def step(self, z, before, now, dt):
-        # z: tangential strain since the last slip, in units of the breakaway strain
+        # z is the tangential strain since the last slip, in units of the breakaway strain.
         z = z + (now - before) / self.shape["pitch"]
         return np.where(np.abs(z) > 1.0, 0.2 * np.sign(z), z)
 
@@ -90,7 +88,7 @@ class StickSlip(Memory):
 
 @dataclass(frozen=True, eq=False)
 class Saturation(Departure):
-    """The torque amplifier saturates: readings bend towards a ceiling."""
+    """Saturation of the torque amplifier: readings bend towards a ceiling."""
 
     effect: ClassVar[str] = "saturation of the torque channel's converter"
     listed: ClassVar[bool] = False
@@ -109,7 +107,7 @@ class Saturation(Departure):
 
 @dataclass(frozen=True, eq=False)
 class EncoderCrosstalk(Departure):
-    """A joint's magnet reaches its neighbour's encoder."""
+    """Magnetic crosstalk: a joint's magnet acts on its neighbour's encoder."""
 
     effect: ClassVar[str] = "magnetic crosstalk between neighbouring encoders"
     listed: ClassVar[bool] = False
@@ -126,7 +124,7 @@ class EncoderCrosstalk(Departure):
 
 @dataclass(frozen=True, eq=False)
 class SumOfAngles(Departure):
-    """Magnets on neighbouring links attract: torque periodic in the sum of two angles."""
+    """Torque periodic in the sum of two angles, from magnets on neighbouring links."""
 
     effect: ClassVar[str] = "magnets on neighbouring links: a torque periodic in the sum of two angles"
     listed: ClassVar[bool] = False
@@ -143,7 +141,7 @@ class SumOfAngles(Departure):
 
 @dataclass(frozen=True, eq=False)
 class BaseYield(Departure):
-    """The mount bends under the sum of the tensions: every measured excursion moves together."""
+    """Mount that yields under the sum of the tensions: all measured excursions change together."""
 
     effect: ClassVar[str] = "mount that yields under the sum of the tensions"
     listed: ClassVar[bool] = False
@@ -159,7 +157,7 @@ class BaseYield(Departure):
 
 @dataclass(frozen=True, eq=False)
 class QuadraticDrag(Departure):
-    """Churning in the grease: resistance with the square of speed, and with the angle."""
+    """Drag with the square of speed, modulated by the angle (grease that churns)."""
 
     effect: ClassVar[str] = "drag with the square of speed that depends on posture"
     listed: ClassVar[bool] = False
