@@ -1,10 +1,10 @@
-"""How far ahead should `identify --ahead` look? The joint fit refined with every horizon, judged on another motion.
+"""The horizon of `identify --ahead`: the joint fit refined with each of several horizons, judged on another motion.
 
     python benchmarks/ahead.py [--sessions 4] [--noise 1e-4]
 
-A joint of a simulated finger, measured badly, as in `joint.py`. Errors are those of predictions 50, 100, 200 and 500 ms
-ahead on trials of VD.3 that no fit has seen, over the noise that the sensors give them: root mean square, in the median
-of the sessions.
+The finger is simulated, has one joint, and poor CAD, as in `joint.py`. Errors are those of predictions 50, 100, 200 and
+500 ms ahead on unseen trials of VD.3, divided by the noise that the sensors give them: root mean square, median over
+the sessions.
 """
 
 import argparse
@@ -17,12 +17,12 @@ from jaxfinger.identify import STAGES, Fit, identify, refine, shooting
 from jaxfinger.identify.ahead import ahead
 from jaxfinger.synthetic import SHORT, SpecimenPlant, clean_session, measure, recipe_from, study_finger
 
-TRIED = (0.05, 0.1, 0.2, 0.4)  # s
+TRIED = (0.05, 0.1, 0.2, 0.4)  # s, horizons
 
 
 def main() -> None:
-    """Print a row a horizon."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    """Print a row for each horizon."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--sessions", type=int, default=4)
     parser.add_argument("--noise", type=float, default=1e-4, help="of the load cells, N")
     options = parser.parse_args()

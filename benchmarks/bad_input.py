@@ -1,11 +1,11 @@
-"""How bad input is met: mistakes of unit, sign and column that pass without a word, and files that are damaged.
+"""Bad input: mistakes of unit, sign and column that pass without a warning, and damaged files.
 
     python benchmarks/bad_input.py mistakes SESSION.h5 … [--sound SESSION.h5 …]
     python benchmarks/bad_input.py mutations [--count N]
 
-`mistakes` makes every mistake of a mapping in a sound session, and counts those that the checker does not warn of;
-sound files must have no warning. `mutations` mutates mappings, recordings and sessions, and counts tracebacks, crashes,
-hangs and files written where none should be.
+`mistakes` makes every mistake of a mapping in a sound session, and counts those that the checker does not warn of.
+Sound files must have no warning. `mutations` mutates mappings, recordings and sessions, and counts tracebacks, crashes,
+hangs and files that should not have been written.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from jaxfinger.data.findings import Report
 ROOT = Path(__file__).parents[1]
 Mistake = Callable[[Trial], Trial]
 
-# Numbers taken for SI that are in other units: how many times too large they come out.
+# Units that a mapping may confuse with SI, and the factors by which values then come out too large.
 UNITS = {
     "time": {"ms": 1e3, "us": 1e6, "ns": 1e9, "s taken for ms": 1e-3, "min": 1 / 60},
     "q": {"deg": 57.29578, "turn": 0.1591549, "mrad": 1e3, "rad taken for deg": 0.01745329, "motor of gear 10": 10},
@@ -50,7 +50,7 @@ UNITS = {
 
 
 def mistakes(session: Session) -> Iterator[tuple[str, Mistake]]:
-    """Every mistake that a mapping can make with the channels of this session, in all of its trials."""
+    """Yield the mistakes that a mapping can make with the channels of a session, by name."""
     m, n = session.finger.m, session.finger.n
     active = np.flatnonzero(session.finger.active)
     for channel, units in UNITS.items():
@@ -106,7 +106,7 @@ def _exchanged(x: np.ndarray, a: int, b: int) -> np.ndarray:
 
 
 def findings(session: Session) -> Report:
-    """What the checker says of a session in memory."""
+    """Findings of the checker on a session in memory."""
     report = Report()
     check_session(session, report)
     examine(session, report)
@@ -114,23 +114,23 @@ def findings(session: Session) -> Report:
 
 
 def said(session: Session) -> set[str]:
-    """Errors and warnings."""
+    """Errors and warnings of the checker on a session."""
     return {str(f) for f in findings(session) if f.severity != "note"}
 
 
 def run_mistakes(paths: list[str], sound: list[str]) -> None:
-    """Print the mistakes that pass without a word, and the warnings on sound files."""
+    """Print the mistakes that pass without a warning, and the warnings on sound files."""
     for path in paths:
         session = read_session(path)
         before, silent, count = said(session), [], 0
         for name, mistake in mistakes(session):
             wrong = replace(session, trials={t.name: mistake(t) for t in session})
             if all(wrong[t.name] is t for t in session):
-                continue  # the session has no such channel
+                continue  # The session has no such channel.
             count += 1
             if said(wrong) <= before:
                 silent.append(name)
-        print(f"{path}: {len(silent)} of {count} mistakes pass without a word: {'; '.join(silent)}")
+        print(f"{path}: {len(silent)} of {count} mistakes pass without a warning: {'; '.join(silent)}")
     warnings = {path: said(read_session(path)) for path in (*paths, *sound)}
     print(f"{sum(map(len, warnings.values()))} warnings on {len(warnings)} sound files")
     for path, texts in warnings.items():
@@ -138,7 +138,7 @@ def run_mistakes(paths: list[str], sound: list[str]) -> None:
             print(f"  {path}: {text}")
 
 
-# A value of a mapping in the place of another.
+# Values that a mutation puts in the place of another.
 VALUES = (
     "3",
     "-1",
@@ -156,11 +156,11 @@ VALUES = (
     '"t"',
     '"../x"',
 )
-PATIENCE = 20.0  # s of processor time before a command counts as hung
+HANG_TIME = 20.0  # s of processor time after which a command counts as hung
 
 
 def mutated_text(text: str, rng: np.random.Generator) -> str:
-    """A mapping as a slip leaves it: a value, a line, a key or a character changed."""
+    """Mutate a mapping as a slip of the hand does: change a value, a line, a key or a character."""
     lines = text.splitlines()
     k = int(rng.integers(len(lines)))
     line = lines[k]
@@ -187,9 +187,9 @@ def mutated_text(text: str, rng: np.random.Generator) -> str:
 
 
 def mutated_bytes(raw: bytes, rng: np.random.Generator) -> bytes:
-    """A file as a fault of memory, disk or editor leaves it: bytes changed, lost, doubled, or its end missing.
+    """Mutate a file as a fault of memory, disk or editor does: change, remove or double bytes, or cut off its end.
 
-    In half of the files all bytes keep their place: where some move, a binary file seldom opens at all.
+    Half of the files keep all bytes in their places, since a binary file with moved bytes hardly ever opens.
     """
     out = bytearray(raw)
     kinds = 3 if rng.integers(2) else 6
@@ -213,7 +213,7 @@ def mutated_bytes(raw: bytes, rng: np.random.Generator) -> bytes:
 
 
 def mutated_table(raw: bytes, rng: np.random.Generator) -> bytes:
-    """A CSV with a cell, a line or a separator changed."""
+    """Mutate a cell, a line or the separators of a CSV."""
     lines = raw.decode().splitlines()
     k = int(rng.choice([0, 1, int(rng.integers(len(lines)))]))
     cells = lines[k].split(",")
@@ -237,7 +237,7 @@ def mutated_table(raw: bytes, rng: np.random.Generator) -> bytes:
 
 
 def mutate_structure(path: Path, rng: np.random.Generator) -> None:
-    """One object of an HDF5 file removed, or in another shape, type or place; or an attribute changed."""
+    """Remove an object of an HDF5 file, change its shape, type or place, or change an attribute."""
     with h5py.File(path, "r+") as file:
         names: list[str] = []
         file.visit(names.append)
@@ -293,7 +293,7 @@ def mutate_structure(path: Path, rng: np.random.Generator) -> None:
 
 @dataclass
 class Counts:
-    """What happened to the mutated inputs of one kind."""
+    """Counts of what happened to the mutated inputs of one kind."""
 
     tried: int = 0
     taken: int = 0
@@ -301,11 +301,11 @@ class Counts:
     tracebacks: list[str] = field(default_factory=list)
     crashes: int = 0
     hangs: int = 0
-    written: int = 0  # at the final path by a command that failed, or refused by `check` afterwards
+    written: int = 0  # files of a command that failed, or that `check` refuses
 
 
 def outcome(command: Callable[[], None], out: Path | None) -> str:
-    """In a child process: 0 or 2, with what was written; a traceback's last line; or how it died."""
+    """Run a command in a child process. Return its exit code, a traceback's last line, "hang", "crash" or "written"."""
     read, write = os.pipe()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -316,13 +316,13 @@ def outcome(command: Callable[[], None], out: Path | None) -> str:
         os.dup2(silence, 1)
         os.dup2(silence, 2)
         signal.signal(signal.SIGPROF, signal.SIG_DFL)
-        signal.setitimer(signal.ITIMER_PROF, PATIENCE)
+        signal.setitimer(signal.ITIMER_PROF, HANG_TIME)
         said = "0"
         try:
             command()
         except SystemExit as end:
             said = str(end.code or 0)
-        except BaseException as error:  # what is counted
+        except BaseException as error:  # Any error is counted.
             place = traceback.extract_tb(error.__traceback__)[-1]
             said = f"{type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})"
         os.write(write, said.encode()[:4000])
@@ -344,10 +344,10 @@ Prepare = Callable[[np.random.Generator | None], tuple[list[str], Path | None]]
 
 
 def count(kind: str, number: int, prepare: Prepare) -> None:
-    """Run a command on so many mutated inputs, and print what happened.
+    """Run a command on `number` mutated inputs, and print what happened.
 
-    `prepare(None)` gives the sound input, which must be taken. It runs in this process, so that what a command imports
-    is there before the children fork: importing it is nine tenths of a command's time.
+    `prepare(None)` gives the sound input, which must be taken. It runs in this process, so that the children fork with
+    all imports done: importing is nine tenths of a command's time.
     """
     tokens, out = prepare(None)
     said = io.StringIO()
@@ -388,7 +388,7 @@ def count(kind: str, number: int, prepare: Prepare) -> None:
 
 
 def as_newer_matlab(old: Path, new: Path) -> None:
-    """The recording of a case as MATLAB writes it since v7.3, and its mapping."""
+    """Write the recording of a case as MATLAB 7.3 does, and its mapping."""
     new.mkdir()
     signals = scipy.io.loadmat(old / "log.mat", simplify_cells=True)["S"]
     with h5py.File(new / "log.mat", "w", userblock_size=512) as file:
@@ -401,7 +401,7 @@ def as_newer_matlab(old: Path, new: Path) -> None:
 
 
 def run_mutations(number: int) -> None:
-    """Mutated mappings and recordings through `import`, mutated sessions through `check`."""
+    """Run mutated mappings and recordings through `import`, and mutated sessions through `check`."""
     sys.path.insert(0, str(ROOT))
     from docs.own_data_logs import main as write_own_data_logs
     from tests.data.conftest import make_session
@@ -462,7 +462,9 @@ def run_mutations(number: int) -> None:
 
         def of_structure(rng: np.random.Generator | None):
             session.write_bytes(raw)
-            with suppress(OSError, ValueError, TypeError, KeyError, RuntimeError, OverflowError):  # not to be written
+            with suppress(
+                OSError, ValueError, TypeError, KeyError, RuntimeError, OverflowError
+            ):  # h5py refuses to write it.
                 if rng:
                     mutate_structure(session, rng)
             return ["check", str(session)], None

@@ -1,9 +1,9 @@
-"""Batch fits against one after another, and bootstrap refits against SciPy: ratios from one run.
+"""Times of batch fits and bootstrap refits, beside single fits and SciPy, as ratios from one run.
 
     python benchmarks/batch.py [--resamples 1000] [--sessions 100] [--processes 2]
 
-Every count of resamples and sessions is compiled once, and its compile time stated apart. The batch runs in one process
-and, as `identify.distributed` spreads it, in one process a core; `identify` one after another has all cores too.
+Each number of resamples or sessions compiles once; compile times are printed separately. The batch runs in one process
+and, spread by `identify.distributed`, in one process per core. Single fits with `identify` may use all cores too.
 """
 
 import argparse
@@ -30,7 +30,7 @@ RECIPE = {
 
 
 def timed(work):
-    """Result and seconds of a first call (with compilation) and of a second."""
+    """Result, seconds of a first call (with compilation) and seconds of a second one."""
     start = time.perf_counter()
     work()
     first = time.perf_counter() - start
@@ -40,21 +40,24 @@ def timed(work):
 
 
 def scipy_refit(compressed, roots, weights) -> np.ndarray:
-    """One staged refit as SciPy does it: a least-squares problem a stage, on the rows of the compressed trials."""
+    """One staged refit by SciPy: a least-squares problem for each stage, on the rows of the compressed trials."""
     z, start = np.zeros(compressed.sizes[0]), compressed.sizes[0]
     for row, size in zip(np.asarray(compressed.grams.reads), compressed.sizes[1:], strict=True):
         w = np.sqrt(row * np.append(weights, 1.0))
         A = np.concatenate([s * r for s, r in zip(w, roots, strict=True) if s > 0])
         own, given = A[:, start : start + size], A[:, -1] + A[:, :start] @ z
         found = scipy.optimize.least_squares(
-            lambda x, o=own, g=given: o @ x + g, np.zeros(size), jac=lambda x, o=own: o, method="lm"
+            lambda x, o=own, g=given: o @ x + g,
+            np.zeros(size),
+            jac=lambda x, o=own: o,
+            method="lm",  # pyright: ignore
         )
         z, start = np.concatenate([z, found.x]), start + size
     return compressed.theta + compressed.basis @ z
 
 
 def bootstrap_table(session, fit, resamples: int) -> None:
-    """1,000 refits in one call against a SciPy loop over the same compressed trials, and how the cost grows."""
+    """Print times of refits in one call, and of a SciPy loop over the same compressed trials."""
     compressed, first, again = timed(lambda: compress(session, fit))
     print(f"compress the session: {first:.2f} s, {again:.2f} s warm")
     roots = []
@@ -79,7 +82,7 @@ def bootstrap_table(session, fit, resamples: int) -> None:
 
 
 def session_table(clean, session, fit, count: int, processes: int) -> None:
-    """Sessions in one batch against `identify` one after another, filtering included in both."""
+    """Print times of sessions in one batch, and of single fits with `identify`. Both include the filters."""
     sessions = [measure(clean, seed) for seed in range(count)]
     members, first, batch = timed(partial(fit_many, sessions, fit, session))
     few = min(count, 10)
@@ -94,14 +97,14 @@ def session_table(clean, session, fit, count: int, processes: int) -> None:
     print(f"{count} sessions in one batch: {batch:.2f} s, compile {first - batch:.2f} s, failed {members.failed.sum()}")
     print(f"  ratio {each * count / batch:.1f}")
     print(f"  largest difference {difference:.2f} standard deviations (the batch takes the template's noise)")
-    del sessions  # the processes make their own
+    del sessions  # The processes make their own.
     first, spread = spread_over(processes, count)
     print(f"the same spread over {processes} processes: {spread:.2f} s, compile {first - spread:.2f} s")
     print(f"  ratio {each * count / spread:.1f}")
 
 
 def spread_over(processes: int, count: int) -> tuple[float, float]:
-    """Seconds of a first and a second batch in as many processes, until the last has gathered all members."""
+    """Seconds of a first and a second batch in several processes, until the last has gathered all members."""
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{s.getsockname()[1]}"
@@ -112,7 +115,7 @@ def spread_over(processes: int, count: int) -> tuple[float, float]:
 
 
 def one_process(address: str, processes: int, process: int, count: int) -> tuple[float, float]:
-    """What a launch command starts on every machine of a cluster."""
+    """Work of one process, as a launch command starts it on every machine of a cluster: seconds of two batches."""
     initialise(address, processes, process)
     clean = clean_session(recipe_from(RECIPE))
     session = measure(clean, 0)
@@ -124,7 +127,7 @@ def one_process(address: str, processes: int, process: int, count: int) -> tuple
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--resamples", type=int, default=1000)
     parser.add_argument("--sessions", type=int, default=100)
     parser.add_argument("--processes", type=int, default=os.cpu_count())

@@ -1,10 +1,10 @@
-"""Are the stated intervals true? Bias, coverage and spread of the staged and joint fits over simulated sessions.
+"""Calibration of the intervals: bias, coverage and spread of staged and joint fits over simulated sessions.
 
     python benchmarks/coverage.py [--sessions 200] [--joints 1|3] [--joint]
 
-Every session has new noise, new offsets and new errors of CAD. `z` is (estimate − truth)/stated standard deviation.
-Coverage: share of |z| < 1.96. Spread: standard deviation of the estimates over the mean stated one, which for a right
-noise model is the Cramér–Rao bound of the stage.
+Every session has new noise, new offsets and new errors of CAD. `z` is (estimate − truth) over the stated standard
+deviation. Coverage is the share of |z| < 1.96. Spread is the standard deviation of the estimates over the mean of the
+stated ones, which is the Cramér–Rao bound of the stage if the noise model is right.
 """
 
 import argparse
@@ -25,7 +25,10 @@ from jaxfinger.synthetic import (
 
 
 def study(sessions: int, joints: int = 1, joint: bool = False):
-    """`(z (sessions, p), ratio of spread to stated (p,), names)` over seeded sessions of a polynomial specimen."""
+    """Values of z (sessions, p), ratios of spread to stated standard deviation (p,), and names of the parameters.
+
+    The sessions are seeded and of one polynomial specimen.
+    """
     specimen = study_finger(joints)
     recipe = recipe_from({"trials": SHORT, "cad": {"mass": 0.02, "com": 3e-4}})
     clean = clean_session(recipe, SpecimenPlant(specimen), specimen.description)
@@ -46,7 +49,7 @@ def study(sessions: int, joints: int = 1, joint: bool = False):
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--sessions", type=int, default=200)
     parser.add_argument("--joints", type=int, default=1, choices=(1, 3))
     parser.add_argument("--joint", action="store_true", help="refine jointly after the stages")

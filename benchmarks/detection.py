@@ -1,10 +1,10 @@
-"""How large an effect must be before the diagnosis names it: the same finger and session, the effect at several sizes.
+"""Detection limits: how often the diagnosis names an effect in the same session at several sizes of it.
 
     python benchmarks/detection.py tendon_stretch joint_stribeck [--severities 0.5 1 2 5] [--fingers 1]
 
-A severity is what a refitted nominal model leaves, rms in the channel that shows it best, in units of the noise of a
-hold's mean (`jaxfinger/sealed/severity.py`). Each size is a sealed case of its own, made and diagnosed in a process
-that knows nothing of the truth; a row says how often cause and site were named, and with which probability.
+A severity is the rms that a refitted nominal model leaves in the channel that shows the effect best, in units of the
+noise of a hold's mean (`jaxfinger/sealed/severity.py`). Each size is a sealed case, diagnosed in a process without its
+truth. A row states how often effect and site were named, and with which probability.
 """
 
 import argparse
@@ -18,19 +18,19 @@ import numpy as np
 from jaxfinger.sealed.cases import CaseSpec, make_case
 from jaxfinger.sealed.run import Command, run_cases
 
-FIRST = 10_000  # numbers of the `develop` split that no block of cases uses
+FIRST = 10_000  # first number of a case, which no block of `jaxfinger sealed make` reaches
 DIAGNOSE = Command(f"{sys.executable} -m jaxfinger diagnose {{fit}} -o {{out}}")
 
 
 def made(effect: str, number: int, severity: float, specimen: str, folder: Path) -> Path:
-    """A case with one effect of one size; the seed is the finger's, so that sizes differ in nothing else."""
+    """Make a case with one effect of one size. The seed is the finger's, so that sizes differ in nothing else."""
     root = folder / f"{effect}-{number}-{severity:g}"
     make_case(number, "develop", CaseSpec("listed", specimen, (effect,), (severity,)), root, root / "truth")
     return root
 
 
 def judged(root: Path, out: Path) -> tuple[float, bool, float, str]:
-    """Severity reached, whether the first effect named is the true one, its probability, and what was said."""
+    """Severity reached, whether the first named effect is the true one, its probability, and the verdict's status."""
     truth = json.loads(next((root / "truth").glob("*.json")).read_text(encoding="utf-8"))["effects"][0]
     if not list(out.glob("*/gap.json")):
         return truth["reached"], False, 0.0, "failed"
@@ -42,8 +42,8 @@ def judged(root: Path, out: Path) -> tuple[float, bool, float, str]:
 
 
 def main() -> None:
-    """Print a row a size."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    """Print a row for each size."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("effects", nargs="+")
     parser.add_argument("--severities", type=float, nargs="+", default=[0.5, 1.0, 2.0, 5.0])
     parser.add_argument("--specimen", default="planar")

@@ -1,8 +1,8 @@
-"""Seconds of a diagnosis as a user runs it: a first look and the whole one, compile cache empty and full.
+"""Seconds of `jaxfinger diagnose`, with and without `--quick`, with an empty and a full compile cache.
 
     python benchmarks/diagnose.py [SESSION.h5 ...]      # default: the shipped session
 
-Each has a cache of its own: neither finds what the other has compiled.
+Each of the two has its own cache, so that neither uses what the other has compiled.
 """
 
 import argparse
@@ -29,13 +29,13 @@ def seconds(session: Path, folder: Path, *options: str) -> float:
 
 
 def verdict(folder: Path) -> str:
-    """What the last diagnosis said."""
+    """Verdict of the last diagnosis."""
     said = json.loads((folder / "gap" / "gap.json").read_text(encoding="utf-8"))["verdict"]
     return ", ".join([said["status"], *("-".join([e["effect"], *e["site"]]) for e in said["effects"])])
 
 
 def main() -> None:
-    """Both, twice, of every file."""
+    """Print times of both, first with an empty cache, for every file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sessions", nargs="*", type=Path, default=[SHIPPED])
     for path in parser.parse_args().sessions:

@@ -1,10 +1,10 @@
-"""Real measurements with a known answer: terms of the EMPS axis withheld, found, and judged on another recording; then,
-with nothing withheld, whether what remains is real.
+"""Diagnosis of real measurements, the EMPS axis, with known terms withheld, and judged on another recording.
 
     python benchmarks/emps.py
 
-What remains is a formula that one recording proposed. On the other, with its own nominal parameters refitted, the
-formula's gain is 1 where it is real, and 0 where it was noise. ± is half of a 95 % interval.
+With nothing withheld, the diagnosis of one recording proposes a formula for the rest. On the other recording, with its
+nominal parameters refitted, the formula's gain is 1 if the rest is real and 0 if it is noise. ± is half of a 95 %
+interval.
 """
 
 import tempfile
@@ -31,7 +31,7 @@ ROOT = Path(__file__).parents[1]
 DATA = ROOT / "datasets/emps"
 PUBLISHED = 20.39  # N, Coulomb friction (NOTICE.md)
 
-
+# Names of terms that are withheld, and their ids.
 TERMS = {
     "Coulomb": "joint_coulomb",
     "damping": "joint_damping",
@@ -41,7 +41,7 @@ TERMS = {
 
 
 def recordings(folder: Path) -> tuple[Session, Session]:
-    """The one for estimation, and the one disturbed by pulses, as session files in the folder."""
+    """Import the recording for estimation and the one with pulses as sessions, with files in the folder."""
     found = []
     for recording, mapping in (("DATA_EMPS.mat", "emps.toml"), ("DATA_EMPS_PULSES.mat", "emps-pulses.toml")):
         file = folder / f"{Path(mapping).stem}.h5"
@@ -51,13 +51,13 @@ def recordings(folder: Path) -> tuple[Session, Session]:
 
 
 def rms(fit: Fit, session: Session) -> float:
-    """N, of the motor's force at every sample."""
+    """rms error of the motor's force over all samples, N."""
     (score,) = validate(fit, session).scores
     return score.rms
 
 
 def gain(proposal: Proposal, problem: Problem) -> tuple[float, float]:
-    """By how much the proposal must be multiplied to fit another recording, and the standard deviation of that."""
+    """Factor by which the proposal fits another recording best, and its standard deviation."""
     ((experiment, rows),) = problem.rows.items()
     library = dict(terms(problem, experiment, proposal.channel, 0))
     raw = np.sum([a * library[text] for a, text in proposal.terms], axis=0)
@@ -66,19 +66,19 @@ def gain(proposal: Proposal, problem: Problem) -> tuple[float, float]:
     z = projector(whitened(raw[None, None], problem, rows, np.arange(rows.size), proposal.channel))[0]
     r = projector.residual(problem.r)
     fitted = float(z @ r / (z @ z))
-    scale = np.sqrt(np.sum((r - fitted * z) ** 2) / r.size)  # what else remains is no white noise
+    scale = np.sqrt(np.sum((r - fitted * z) ** 2) / r.size)  # The rest is no white noise of unit variance.
     return fitted, float(scale / np.linalg.norm(z))
 
 
 def main() -> None:
-    """In a folder that is gone afterwards."""
+    """Print the report, with files in a temporary folder."""
     with tempfile.TemporaryDirectory() as folder:
         report(*recordings(Path(folder)))
 
 
 def one_to_three_withheld(estimation: Session, pulses: Session) -> None:
-    """A line for each choice of one to three of four terms: what is named, and N missed on the pulses: before, with
-    what is named, and by the model with all four.
+    """Print a line for each choice of one to three of four terms: verdict, and rms on the pulses before, with the named
+    effects, and with all four terms.
     """
     full = read_recipe(ROOT / "fits/emps.toml")
 
@@ -98,7 +98,7 @@ def one_to_three_withheld(estimation: Session, pulses: Session) -> None:
 
 
 def report(estimation: Session, pulses: Session) -> None:
-    """Print what is named, its value, the shrinkage on the pulses, and the gain of what remains there."""
+    """Print the named effect and its value, the share of the gap on the pulses that it closes, and the rest's gain."""
     withheld = diagnose(estimation, read_recipe(ROOT / "fits/emps-no-coulomb.toml"))
     (key,) = withheld.named
     lines = [line for line in withheld.augmented.table() if str(line["name"]).startswith(key.effect)]

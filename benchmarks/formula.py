@@ -1,14 +1,14 @@
-"""Fits the nine numbers of the diagnosis's formula (`jaxfinger/gap/formula.py`) by log score on sealed cases.
+"""Fit the nine numbers of the diagnosis's formula (`jaxfinger/gap/formula.py`) by log score on sealed cases.
 
     jaxfinger sealed make cases --split develop --count 40
-    python benchmarks/formula.py weigh records cases           # a minute a case; goes on where it was stopped
+    python benchmarks/formula.py weigh records cases           # a minute per case; resumes after a stop
     python benchmarks/formula.py fit records
 
-`weigh` searches every case and keeps what was said of every set of causes that the search has weighed. `fit` asks how
-probable that evidence makes the truth under other numbers: the mean over cases of Σ log P, over all causes that a
-session's trials can see, at work or not, and «something unlisted». Probabilities are kept within CLIP, since no search
-visits every set. A number is believed within a factor of WITHIN of where it starts, as one standard deviation; four
-fifths of the cases choose, the last fifth scores, five times over.
+`weigh` searches every case and stores the evidence of every set of causes that the search weighs. `fit` maximises the
+log score of these records: the mean over cases of Σ log P of what is true, over all causes that a session's trials can
+show and «something unlisted». Probabilities are clipped by `CLIP`, since no search visits every set. Each number has a
+log-normal prior around its present value, a factor of `PRIOR_FACTOR` per standard deviation. Scores are
+cross-validated over `FOLDS` parts of the cases.
 """
 
 import argparse
@@ -33,39 +33,39 @@ from jaxfinger.identify import Recipe
 from jaxfinger.sealed.run import CASES_PER_PROCESS
 from jaxfinger.sealed.truth import UNLISTED, read_truth
 
-CLIP = 1e-3
-WITHIN = 3.0
+CLIP = 1e-3  # least probability: a cause that no visited set has costs at most 7 nats
+PRIOR_FACTOR = 3.0  # wide: it only keeps numbers that the cases do not determine
 FOLDS = 5
-MOST = 100  # sets of a case, the likeliest, that `fit` weighs
+MAX_SETS = 100  # likeliest sets of a case that `fit` keeps, for speed
 
 
 @dataclass(frozen=True)
 class Record:
-    """What one case's search has said."""
+    """Evidence from one case's search."""
 
     case: str
     counts: Counts
     evidence: dict[frozenset[Key], Evidence]
-    screened: frozenset[frozenset[Key]]  # sets that were not weighed in settled weights
+    screened: frozenset[frozenset[Key]]  # sets that have not been weighed in settled weights
     explainable: dict[Key, np.ndarray]
     at_work: frozenset[Key]
     parameters: Parameters
 
     def likeliest(self) -> "Record":
-        """With its likeliest sets alone."""
+        """Keep the likeliest sets only."""
         costs, best = self.costs(self.parameters), {frozenset(): self.evidence[frozenset()]}
-        for keys in sorted(self.evidence, key=lambda k: costs.of(k) - self.evidence[k].score)[:MOST]:
+        for keys in sorted(self.evidence, key=lambda k: costs.of(k) - self.evidence[k].score)[:MAX_SETS]:
             best[keys] = self.evidence[keys]
         return replace(self, evidence=best)
 
     def costs(self, p: Parameters) -> Costs:
-        """Under other parameters."""
+        """Costs of sets under other parameters."""
         return Costs(p, unexplained(self.counts, self.evidence[frozenset()], p), self.explainable)
 
     def log_score(self, p: Parameters) -> float:
-        """Σ log P of what is true of every cause and of «unlisted»."""
+        """Σ log P of the truth about every cause and «unlisted»."""
         costs, sets = self.costs(p), list(self.evidence)
-        # Causes stay as they are: to first order they are at an optimum.
+        # The causes' values stay. They are at an optimum, so the evidence changes with them in second order only.
         e, o, explained, score = (np.array(x) for x in zip(*self.evidence.values(), strict=True))
         was, is_now = (log_likelihood(self.counts, e, o, explained, q)[0] for q in (self.parameters, p))
         scores = score + is_now - was
@@ -83,7 +83,7 @@ class Record:
 
 
 def weigh(folder: Path) -> Record:
-    """Search one case."""
+    """Search one case and record its evidence."""
     recipe = Recipe()
     problem = build(read_session(folder / "fit.h5"), recipe)
     effects = {
@@ -103,16 +103,16 @@ def weigh(folder: Path) -> Record:
 
 
 def moved(x: Iterable[float]) -> Parameters:
-    """The formula's numbers, times e to the x."""
+    """Multiply the formula's present numbers by e to the x."""
     return Parameters(*(v * float(np.exp(d)) for v, d in zip(astuple(Parameters()), x, strict=True)))
 
 
 def fit(records: list[Record]) -> Parameters:
-    """The numbers that make the truth likeliest."""
+    """Maximise the log score over the numbers, with their prior."""
 
     def loss(x: np.ndarray) -> float:
         p = moved(x)
-        return -sum(r.log_score(p) for r in records) + 0.5 * float(np.sum((x / np.log(WITHIN)) ** 2))
+        return -sum(r.log_score(p) for r in records) + 0.5 * float(np.sum((x / np.log(PRIOR_FACTOR)) ** 2))
 
     start = np.zeros(len(astuple(Parameters())))
     simplex = np.vstack([start, start + 0.5 * np.eye(len(start))])
@@ -121,12 +121,12 @@ def fit(records: list[Record]) -> Parameters:
 
 
 def mean(records: list[Record], p: Parameters) -> float:
-    """Log score a case."""
+    """Mean log score of the cases."""
     return float(np.mean([r.log_score(p) for r in records]))
 
 
 def main() -> None:
-    """Weigh cases, or print the numbers as they are, as they fit, and what each is worth on cases not seen."""
+    """Weigh cases; or print present and fitted numbers, and their log scores on the cases that did not choose them."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("what", choices=["weigh", "fit"])
     parser.add_argument("records", type=Path)

@@ -1,17 +1,20 @@
-"""The staged identification: seconds, memory, and ratios to other libraries, from one run.
+"""Times and memory of the staged identification, and ratios to other libraries, from one run.
 
     python benchmarks/identify.py [--only-inverse-dynamics]
 
-1. `jaxfinger identify` on a session of 30 trials, 20 minutes at 1 kHz, as a user runs it: with an empty compile cache
-   and with a full one, and on half the session.
-2. Inverse dynamics of 10,000, 100,000 and a million samples, 3 and 7 joints, against Pinocchio's batch call and
+1. The command `jaxfinger identify` on a session of 30 trials, 20 minutes at 1 kHz: with an empty and a full compile
+   cache, and on half the session.
+2. Inverse dynamics of 10,000, 100,000 and a million samples with 3 and 7 joints, beside Pinocchio's batch call and
    MuJoCo, in processor seconds of one thread.
-3. Each stage's least squares against `scipy.optimize.least_squares` on the same compressed problem, from the same
-   start, by the quickest of its methods; and with the derivatives by the parameters of earlier stages too, which the
-   errors that are passed on need.
+3. Least squares of each stage, beside the quickest method of `scipy.optimize.least_squares` on the same compressed
+   problem from the same start; and the same with derivatives by the parameters of earlier stages, which the
+   propagation of their errors needs.
 
-All of it as median and spread of five runs.
+Each figure is the median of five runs, with the smallest and largest.
 """
+
+# pyright: reportAttributeAccessIssue=false
+# (The compiled modules of MuJoCo and Pinocchio have no types.)
 
 import argparse
 import itertools
@@ -56,7 +59,7 @@ TWENTY_MINUTES = {
 
 
 def session_file(folder: Path) -> Path:
-    """A simulated session of about 30 trials and 20 minutes at 1 kHz."""
+    """Simulate a session of about 30 trials and 20 minutes at 1 kHz, write it and its half, and return its file."""
     plant = ModelPlant(true_model(polynomial_finger(paper_finger())))
     session = simulate(recipe_from(TWENTY_MINUTES), seed=0, plant=plant)
     write_session(session, folder / "session.h5")
@@ -77,8 +80,9 @@ print(used.ru_utime + used.ru_stime, time.perf_counter() - begun, used.ru_maxrss
 
 
 def measured(session: Path, folder: Path, cold: bool = False) -> np.ndarray:
-    """Processor seconds, wall seconds and peak MiB of five runs of `jaxfinger identify`, (runs, 3): each with an empty
-    compile cache of its own, or with one that a run before them has filled.
+    """Processor seconds, wall seconds and peak MiB of five runs of `jaxfinger identify`, (runs, 3).
+
+    `cold`: each run has an empty compile cache. Otherwise a run before them fills a common one.
     """
     command = [sys.executable, "-m", "jaxfinger", "identify", str(session), "-o", str(folder / "fit.json")]
     rows = []
@@ -96,12 +100,12 @@ def measured(session: Path, folder: Path, cold: bool = False) -> np.ndarray:
 
 
 def spread(values: np.ndarray, form: str = ".1f") -> str:
-    """Median, least and most."""
+    """Median with the smallest and largest value, as text."""
     return f"{np.median(values):{form}} ({min(values):{form}} to {max(values):{form}})"
 
 
 def whole(folder: Path) -> None:
-    """1. The command."""
+    """Print part 1, the command."""
     path = session_file(folder)
     print(f"identify, median (least to most) of {RUNS} runs: seconds of processor, of wall; peak MiB")
     for name, session, cold in (
@@ -114,7 +118,7 @@ def whole(folder: Path) -> None:
 
 
 def processor(*works) -> list[np.ndarray]:
-    """Processor seconds of a few runs of each, compiled before, taking turns."""
+    """Processor seconds of `RUNS` runs of each function, which take turns after a first run that compiles."""
     times = []
     for _ in range(RUNS + 1):
         for work in works:
@@ -125,7 +129,7 @@ def processor(*works) -> list[np.ndarray]:
 
 
 def chain(m: int) -> FingerDescription:
-    """m revolute joints with any axes, links with full inertia tensors."""
+    """Draw a chain of m revolute joints with arbitrary axes and links with full inertia tensors."""
     rng = np.random.default_rng(m)
     axis, root = rng.standard_normal((m, 3)), rng.standard_normal((m, 3, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
@@ -138,7 +142,7 @@ def chain(m: int) -> FingerDescription:
 
 
 def in_pinocchio(d: FingerDescription) -> pin.Model:
-    """The chain."""
+    """The chain as Pinocchio's model."""
     model = pin.Model()
     for i in range(d.m):
         joint = pin.JointModelRevoluteUnaligned(d.axis[i])
@@ -149,7 +153,7 @@ def in_pinocchio(d: FingerDescription) -> pin.Model:
 
 
 def in_mujoco(d: FingerDescription) -> mujoco.MjModel:
-    """The chain."""
+    """The chain as MuJoCo's model."""
     spec = mujoco.MjSpec()
     spec.option.gravity = d.gravity
     body = spec.worldbody
@@ -167,7 +171,7 @@ def in_mujoco(d: FingerDescription) -> mujoco.MjModel:
 
 
 def inverse_dynamics(joints: int, samples: int) -> None:
-    """2. One call for all samples, on one thread; repeated until a run takes some tenths of a second."""
+    """Print part 2, inverse dynamics: one call for all samples on one thread, repeated for small numbers of them."""
     d = chain(joints)
     finger = Finger.from_description(d)
     q, qd, qdd = np.random.default_rng(0).uniform(-1, 1, (3, joints, samples))
@@ -204,8 +208,9 @@ def inverse_dynamics(joints: int, samples: int) -> None:
 
 
 class Compressed:
-    """One stage as the core compresses it: ½ ‖d + R δ‖² + ½ ρ² at every point, which is all that SciPy's methods ask of
-    residuals and Jacobians. What is linear is linearised once.
+    """The compressed cost of a stage, ½ ‖d + R δ‖² + ½ ρ² at every point, as residuals and Jacobians for SciPy.
+
+    A linear stage is linearised once.
     """
 
     def __init__(self, model: Model, free: np.ndarray, sources: dict[str, Source], limit: float):
@@ -216,11 +221,11 @@ class Compressed:
         self.forget()
 
     def forget(self) -> None:
-        """Back to before anything is known."""
+        """Forget all linearisations."""
         self.tangents, self.known = Tangents(), None
 
     def rows(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[R d; 0 ρ] and where it is so."""
+        """Point of the linearisation, and [R d; 0 ρ] there."""
         if self.known is None or not (self.quadratic or np.array_equal(self.known[0], theta)):
             at = self.at.set(self.model, jnp.asarray(theta))
             linearised = linearise_each(at, self.sources, self.limit, self.tangents, self.free)
@@ -230,7 +235,7 @@ class Compressed:
 
     def residual(self, theta: np.ndarray) -> np.ndarray:
         at, rows = self.rows(theta)
-        residual = np.zeros(theta.size + 1)  # a factor has as many rows at every point, but for those that are zero
+        residual = np.zeros(theta.size + 1)  # SciPy needs a fixed number of rows; missing ones are zero.
         residual[: len(rows)] = rows[:, -1] + rows[:, :-1] @ (theta - at)
         return residual
 
@@ -241,18 +246,18 @@ class Compressed:
         return jacobian
 
     def apart(self, a: np.ndarray, b: np.ndarray) -> float:
-        """Distance of two points in standard deviations of the estimate, all parameters together."""
+        """Distance of two points in standard deviations of the estimate (Mahalanobis)."""
         return float(np.linalg.norm(self.jacobian(b) @ (a - b)))
 
 
 def by_scipy(problem: Compressed, **options) -> np.ndarray:
-    """The optimum, from a problem of which nothing is known."""
+    """Optimum by SciPy, without earlier linearisations."""
     problem.forget()
-    return scipy.optimize.least_squares(problem.residual, problem.start, jac=problem.jacobian, **options).x
+    return scipy.optimize.least_squares(problem.residual, problem.start, jac=problem.jacobian, **options).x  # pyright: ignore
 
 
 def rivals(problem: Compressed, optimum: np.ndarray, near: float) -> list[dict]:
-    """SciPy's methods and scales, each with its loosest tolerance that ends so near the optimum."""
+    """SciPy's methods and scales, each with the loosest tolerance that ends nearer than `near` to the optimum."""
     out = []
     for method, scale in itertools.product(("lm", "trf"), ("jac", 1.0)):
         for tolerance in 10.0 ** -np.arange(2, 16):
@@ -264,7 +269,7 @@ def rivals(problem: Compressed, optimum: np.ndarray, near: float) -> list[dict]:
 
 
 def stages(path: Path) -> None:
-    """3. The least squares of every stage, all else equal."""
+    """Print part 3, the least squares of every stage."""
     session = read_session(path)
     (again,) = processor(lambda: identify(read_session(path)))
     print(f"identify, in a process that has compiled: {spread(again)} s of processor, reading included")
@@ -283,7 +288,7 @@ def stages(path: Path) -> None:
 
 
 def one_stage(name: str, problem: Compressed, sources: dict[str, Source]) -> None:
-    """Ours beside the quickest of SciPy's ways."""
+    """Print a stage's times, ours beside those of SciPy's quickest method."""
 
     def ours(read: dict[str, Source], small: float = STEP_TOLERANCE):
         model, solution = solve(problem.model, problem.free, read, huber=problem.limit, tolerance=small)
@@ -305,8 +310,8 @@ def one_stage(name: str, problem: Compressed, sources: dict[str, Source]) -> Non
 
 
 def main() -> None:
-    """Print all three."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    """Print all parts."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only-inverse-dynamics", action="store_true")
     only = parser.parse_args().only_inverse_dynamics
     for joints in (3, 7):

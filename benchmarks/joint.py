@@ -1,13 +1,12 @@
-"""Does the joint refinement predict better than the stages, on trials that neither has seen?
+"""Prediction errors of the joint refinement and of the stages, on trials that neither has read.
 
     python benchmarks/joint.py [--sessions 100] [--joints 3|1] [--identification-only]
 
-Every session has new noise, new offsets and a finger that was measured badly. It holds all experiments of the protocol:
-the stages read ID.2 to ID.4, and the joint refinement reads all of it, or with `--identification-only` what the stages
-read. Held out: VD.1, VD.2 and VD.3 in other postures and motions, which neither reads. An error is the root mean square
-over all channels, each in units of the noise of one sample: on the held-out trials of what the model predicts less what
-the true one does, so that a fit wins or loses by its parameters alone; on the fitted trials of the residuals, averaged
-over blocks.
+Every session has new noise, new offsets and poor CAD. It contains all experiments of the protocol. The stages read ID.2
+to ID.4; the joint refinement reads all experiments, or with `--identification-only` those of the stages. Held out are
+VD.1, VD.2 and VD.3 in other postures and motions. An error is the root mean square over all channels, in units of the
+noise of a sample. On held-out trials it is that of the predictions against those of the true model, so that only
+parameters count. On fitted trials it is that of the residuals, averaged over blocks.
 """
 
 import argparse
@@ -43,24 +42,24 @@ predicted = eqx.filter_jit(predict)
 
 
 def error(model: Model, stacks: dict[str, Stack], truth: Model | None = None) -> float:
-    """Root mean square in units of a sample's noise, over all channels that count."""
+    """Root mean square error of a model against the data or a true model, in units of a sample's noise."""
     energy, count = 0.0, 0.0
     for stack in stacks.values():
         channels = stack.experiment.channels
         found = predicted(model, stack.batch.x, channels)
-        wanted = predicted(truth, stack.batch.x, channels) if truth else stack.batch.y
+        expected = predicted(truth, stack.batch.x, channels) if truth else stack.batch.y
         for c in channels:
             mask = np.asarray(stack.batch.mask[c])
-            residual = mask * np.asarray(wanted[c] - found[c]) / getattr(SENSORS, c).std
-            if c == "tendon_excursion":  # the encoders' arbitrary zero
+            residual = mask * np.asarray(expected[c] - found[c]) / getattr(SENSORS, c).std
+            if c == "tendon_excursion":  # The encoders' zeros are arbitrary.
                 residual -= mask * residual.sum(-1, keepdims=True) / np.maximum(mask.sum(-1, keepdims=True), 1.0)
             energy, count = energy + float(np.sum(residual**2)), count + float(mask.sum())
     return (energy / count) ** 0.5
 
 
 def main() -> None:
-    """Print both errors of both fits, and how often joint wins."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    """Print both errors of both fits, and how often the joint one is the better."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--sessions", type=int, default=100)
     parser.add_argument("--joints", type=int, default=3, choices=(1, 3))
     parser.add_argument("--identification-only", action="store_true")

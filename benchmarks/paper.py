@@ -1,7 +1,7 @@
-"""The shipped session of the paper's finger beside the figures of the paper: `python benchmarks/paper.py`.
+"""Identified figures of the shipped paper finger beside those of the paper: `python benchmarks/paper.py`.
 
-The session is simulated (`datasets/paper-finger`): the finger is built to the paper's numbers, and this says how well
-they come back.
+The session is simulated (`datasets/paper-finger`) from the paper's numbers. The table shows how well the identification
+recovers them.
 """
 
 from pathlib import Path
@@ -30,7 +30,7 @@ PAPERS = ", the paper's"
 
 
 def comparison(fit, result) -> list[tuple[str, str, str, str]]:
-    """Quantity, the paper's figure, this fit's, unit."""
+    """Rows of quantity, the paper's figure, this fit's figure, and unit."""
     from jaxfinger.report.curves import curves
 
     found = curves(fit)
@@ -57,7 +57,7 @@ def comparison(fit, result) -> list[tuple[str, str, str, str]]:
 
 
 def _gravity(fit) -> str:
-    """At the MCP, the other joints straight: the paper does not say how it held them."""
+    """Range of the gravity torque at the MCP. The other joints are straight here; the paper does not say."""
     import jax.numpy as jnp
 
     from jaxfinger.model import rigid_body
@@ -68,6 +68,7 @@ def _gravity(fit) -> str:
 
 
 def _at(curve, x: float) -> str:
+    """Value of a curve at x, with its error."""
     return with_error(float(np.interp(x, curve.x, curve.y)), float(np.interp(x, curve.x, curve.std)))
 
 

@@ -1,8 +1,8 @@
-"""NUTS against Laplace's covariance on a joint fit of one specimen, every parameter and nonlinearity included.
+"""NUTS beside Laplace's covariance on a joint fit of one specimen, over all parameters of the nonlinear model.
 
     python benchmarks/posterior.py [--draws 500] [--warmup 300]
 
-Prints how the standard deviations and means of the draws compare with those that the fit states.
+Prints standard deviations and means of the draws relative to those of the fit.
 """
 
 import argparse
@@ -20,7 +20,7 @@ RECIPE = {"specimen": {"kind": "polynomial"}, "trials": SHORT}
 
 def main() -> None:
     """Print the comparison."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--draws", type=int, default=500)
     parser.add_argument("--warmup", type=int, default=300)
     options = parser.parse_args()

@@ -1,10 +1,10 @@
-"""How far `predict` misses the torque of swept joints (ID.3-dynamic) near their reversals, and elsewhere.
+"""Errors of the predicted torque of swept joints (ID.3-dynamic), near their reversals and elsewhere.
 
     python benchmarks/reversals.py [FOLDER ...]
 
-Each folder holds `fit.h5`, from which the model is identified, and `fresh.h5`, whose trials are predicted. A reversal
-is where the joint's angle, in a slow filter, turns back. The last line is a simulated finger and its true model: its
-friction turns at once, where a real contact gives before it slides.
+Each folder has `fit.h5`, from which the model is identified, and `fresh.h5`, whose trials are predicted. A reversal is
+an instant at which the joint's angle, slowly filtered, turns back. The last line is a simulated finger with its true
+model, whose friction changes its sign at once; a real contact yields before it slides.
 """
 
 import argparse
@@ -19,12 +19,12 @@ from jaxfinger.identify.predictions import predict_session
 from jaxfinger.model import Model
 from jaxfinger.synthetic import paper_finger, polynomial_finger, recipe_from, simulate, true_model
 
-NEAR = 0.06  # s from a reversal
-SLOW = 5.0  # Hz, of the filter in which a joint's speed crosses zero once
+NEAR = 0.06  # s: samples within this time of a reversal count as near it
+SLOW = 5.0  # Hz, cut-off of a filter in which a joint's speed crosses zero once per reversal
 
 
 def turning_times(trial: Trial, joint: int) -> np.ndarray:
-    """Instants, s, at which a joint that moves turns back."""
+    """Times, s, at which a moving joint turns back."""
     rate = smooth(trial.time, trial.q[:, joint], SLOW)[1]
     turns = np.flatnonzero(np.diff(np.sign(rate)) != 0)
     slope = np.abs(rate[np.minimum(turns + 50, len(rate) - 1)])
@@ -32,7 +32,7 @@ def turning_times(trial: Trial, joint: int) -> np.ndarray:
 
 
 def errors(fit: Fit | Model, session: Session) -> tuple[np.ndarray, np.ndarray]:
-    """Measured less predicted torque, N mm: near reversals, and elsewhere."""
+    """Measured minus predicted torque, N mm, near reversals and elsewhere."""
     names = [t.name for t in session if t.experiment == "ID.3-dynamic"]
     near, far = [], []
     for name, channels in predict_session(fit, session, names).items():
@@ -47,7 +47,7 @@ def errors(fit: Fit | Model, session: Session) -> tuple[np.ndarray, np.ndarray]:
 
 
 def simulated() -> tuple[Model, Session]:
-    """A finger of the nominal model's own form, whose directions are derived, and its true model."""
+    """True model and simulated session of a nominal finger, without its commanded directions."""
     sweep = {"repeats": 1, "postures": [[25, 30, 45]], "cycles": 1}
     trials = {"experiments": ["ID.3-dynamic"], "rate": 1000.0, "id3_dynamic": sweep}
     session = simulate(recipe_from({"specimen": {"kind": "polynomial"}, "trials": trials}), seed=5)
@@ -56,7 +56,7 @@ def simulated() -> tuple[Model, Session]:
 
 
 def main() -> None:
-    """One line a folder."""
+    """Print a line for each folder."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folders", nargs="*", type=Path)
     print(f"{'':24s} rms error, N mm: within {1e3 * NEAR:.0f} ms of a reversal, elsewhere")

@@ -1,10 +1,10 @@
-"""Recording at full rate, and killing the recorder: the figures behind the promises of `jaxfinger record`.
+"""Figures of `jaxfinger record`: samples lost at full rate, sessions after a killed recorder, cost of the stand-in.
 
     python benchmarks/rig_recording.py stream --minutes 10    1 kHz x 60 channels over ADS beside a busy interpreter
     python benchmarks/rig_recording.py kill --count 200       kill -9 at random moments; every session must be readable
     python benchmarks/rig_recording.py plant                  cost of one cycle of the stand-in
 
-Prints one JSON object. Timings are of this machine; load on it is printed beside them.
+Prints one JSON object, which includes the load of the machine.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import tempfile
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,13 +40,13 @@ from jaxfinger.rig.simulated.controller import Controller
 from jaxfinger.rig.simulated.examples import rig_toml
 from jaxfinger.rig.watch import Watch
 
-# this machine is busy on purpose: what is measured must not end because of it
-SLOW = {"stale_s": 5.0, "lag_s": 5.0, "thread_s": 5.0, "disk_s": 5.0, "clock_offset_s": 5.0}
+# Time limits, s, that a busy machine does not exceed: the measurement loads it on purpose.
+SLOW: dict[str, Any] = {"stale_s": 5.0, "lag_s": 5.0, "thread_s": 5.0, "disk_s": 5.0, "clock_offset_s": 5.0}
 PATIENT = "[controller]\nheartbeat_s = 5.0\n"
 
 
 def all_slots(where: str, **rig) -> RigDescription:
-    """A rig file with 60 channels: the finger's 15, and the slots that the stand-in leaves at zero."""
+    """Description of a rig with 60 channels: the finger's 15, and the slots that the stand-in leaves at zero."""
     description = parse_rig(rig_toml("ads", {"net_id": standin.NET_ID, "ip": where, "port": 851}, **rig) + PATIENT)
     used = {c.slot for c in description.channels}
     spare = [s for s in range(VALUES) if s not in used]
@@ -55,14 +56,14 @@ def all_slots(where: str, **rig) -> RigDescription:
 
 
 def replace_channel(record, **changes):
-    """dataclasses.replace; spare channels sit still at zero, so they are not watched for being frozen."""
+    """Replace fields. Spare channels stay at zero, and are therefore not watched for being frozen."""
     from dataclasses import replace
 
     return replace(record, **({"frozen": 0.0} if "slot" in changes else {}), **changes)
 
 
 def stream(minutes: float, busy: bool) -> dict:
-    """Record for so long; count what was lost; latency is from the sample's own time to its arrival in Python."""
+    """Record for `minutes` and count lost samples. Latency is the time from a sample to its arrival in Python."""
     samples = round(minutes * 60_000)
     with standin.running(speed=1.0, heartbeat=5.0) as where, tempfile.TemporaryDirectory() as folder:
         description = all_slots(where, **SLOW)
@@ -100,9 +101,8 @@ def stream(minutes: float, busy: bool) -> dict:
             reader.close()
             wall, cpu = time.monotonic() - wall, time.process_time() - cpu_all - sum(spun)
             recorder.close()
-        offsets = np.array(
-            [arrived - t[-1] for arrived, t in arrivals]
-        )  # both clocks run at the same rate on one machine
+        # On one machine both clocks run at the same rate.
+        offsets = np.array([arrived - t[-1] for arrived, t in arrivals])
         ages = np.concatenate([arrived - t for arrived, t in arrivals]) - offsets.min()
         blocks = [f.block for f in wal.read_log(recorder.path) if f.tag == wal.DATA]
         seq = np.concatenate([b.seq for b in blocks]).astype(np.int64)
@@ -115,14 +115,14 @@ def stream(minutes: float, busy: bool) -> dict:
             "error": None if reader.error is None else str(reader.error),
             "latency_ms": {f"p{p}": round(float(np.percentile(ages, p)) / 1e6, 1) for p in (50, 99, 99.9, 100)},
             "poll_ms": description.poll_s * 1e3,
-            "cores_used": round(cpu / wall, 3),  # reader, supervisor, writer: everything but the busy thread
+            "cores_used": round(cpu / wall, 3),  # all threads but the busy one
             "log_MB": round(recorder_size(blocks) / 1e6, 1),
             "load_average": os.getloadavg()[0],
         }
 
 
 def recorder_size(blocks) -> int:
-    """Bytes of the blocks in the log."""
+    """Size of the blocks in the log, bytes."""
     return sum(len(wal.pack_block(b)) for b in blocks)
 
 
@@ -145,13 +145,13 @@ for line in sys.stdin:
 
 
 def kill(count: int, seed: int) -> dict:
-    """Kill the recorder `count` times at random moments of a recording at real speed; recover and check every log.
+    """Kill the recorder `count` times at random moments of a recording at real speed, and recover and check every log.
 
-    `unsaved_ms` is how far the log was behind the controller when a new connection asked it, just after the kill.
+    `unsaved_ms`: samples, one a millisecond, that the controller had just after the kill and the log had not.
     """
     rng = random.Random(seed)
     unreadable, unsaved, torn = 0, [], 0
-    # one process imports once and bears the recorders: 200 starts of Python would measure imports
+    # One process imports everything and forks the recorders: 200 starts of Python would take most of the time.
     born = subprocess.Popen([sys.executable, "-c", NURSERY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     with (
         standin.running(speed=1.0, heartbeat=3.0) as where,
@@ -201,7 +201,7 @@ def kill(count: int, seed: int) -> dict:
 
 
 def plant() -> dict:
-    """Microseconds of one cycle: controller, finger, sample."""
+    """Processor time of one cycle of the stand-in, μs: controller, finger and sample."""
     found = {}
     for name, mode, contact in (
         ("fixed", (1, 1, 1), 0),
@@ -223,7 +223,7 @@ def plant() -> dict:
 
 
 def main() -> None:
-    """Command line."""
+    """Print the measurement that the command line chooses."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("stream", "kill", "plant"))
     parser.add_argument("--minutes", type=float, default=10.0)

@@ -1,10 +1,10 @@
-"""Does a verdict survive what happens to real files? One session, diagnosed as it is and after each mishap.
+"""Verdicts on one session, as it is and after each of the mishaps that happen to real files.
 
     python benchmarks/robustness.py SESSION.h5 --expect tendon_stretch:T3   # or none, or unexplained
     python benchmarks/robustness.py SESSION.h5 --expect none --only "half the rate" --only "0.5 % spikes"
 
-A mishap changes what was recorded, never what is the matter with the finger. A row is right where the first cause named
-is the expected one, and where none is, «no gap»; where the catalogue does not have it, «unexplained».
+A mishap changes the recording and not the finger. A row is right if the first named cause is the expected one. For
+`none` the right verdict is «no gap», for a cause that the catalogue lacks it is «unexplained».
 """
 
 import argparse
@@ -24,34 +24,34 @@ from jaxfinger.sealed.run import Command
 CHANNELS = ("q", "tendon_force", "tendon_excursion", "joint_torque", "fingertip_force")
 SAMPLED = ("time", *CHANNELS, "joint_direction", "tendon_direction", "hold")
 SEED = 0
-STATUS = {"none": "no_gap", "unexplained": "unexplained"}  # what is expected where no cause is
+STATUS = {"none": "no_gap", "unexplained": "unexplained"}  # right verdicts without a cause to name
 DIAGNOSE = Command(f"{sys.executable} -m jaxfinger diagnose {{fit}} -o {{out}}")
 
 
 def each(session: Session, change: Callable[[Trial, np.random.Generator], Trial]) -> Session:
-    """The session with every trial changed, with random numbers of its own."""
+    """Change every trial of a session, each with its own stream of random numbers."""
     streams = np.random.default_rng(SEED).spawn(len(session))
     return replace(session, trials={t.name: change(t, rng) for t, rng in zip(session, streams, strict=True)})
 
 
 def where(trial: Trial, samples) -> Trial:
-    """Only these samples of a trial."""
+    """Keep some samples of a trial."""
     kept = {c: getattr(trial, c)[samples] for c in SAMPLED if getattr(trial, c) is not None}
     return replace(trial, **kept)
 
 
 def thinned(step: int) -> Callable[[Session], Session]:
-    """Every so many samples."""
+    """Keep every `step`-th sample."""
     return lambda session: each(session, lambda t, rng: where(t, slice(None, None, step)))
 
 
 def measured(trial: Trial, change: Callable[[np.ndarray], np.ndarray], channels=CHANNELS) -> Trial:
-    """A trial with its channels changed."""
+    """Change the channels of a trial."""
     return replace(trial, **{c: change(getattr(trial, c)) for c in channels if getattr(trial, c) is not None})
 
 
 def spiked(share: float) -> Callable[[Session], Session]:
-    """A share of the samples of every channel thrown far off."""
+    """Put spikes on a share of the samples of every channel."""
 
     def change(trial, rng):
         def throw(x):
@@ -64,11 +64,13 @@ def spiked(share: float) -> Callable[[Session], Session]:
 
 
 def noisier(factor: float, channel: str) -> Callable[[Session], Session]:
-    """One channel with white noise added until its noise is `factor` times as large."""
+    """Add white noise to a channel until its noise is `factor` times as large."""
 
     def change(trial, rng):
         def add(x):
-            own = 1.4826 * np.median(np.abs(np.diff(x, axis=0)), axis=0) / np.sqrt(2.0)  # NaN where not measured
+            own = (
+                1.4826 * np.median(np.abs(np.diff(x, axis=0)), axis=0) / np.sqrt(2.0)
+            )  # NaN in columns that are not measured
             return x + np.sqrt(factor**2 - 1.0) * own * rng.standard_normal(x.shape)
 
         return measured(trial, add, (channel,))
@@ -77,7 +79,7 @@ def noisier(factor: float, channel: str) -> Callable[[Session], Session]:
 
 
 def jittered(share: float) -> Callable[[Session], Session]:
-    """Samples taken off the beat, at the times that the file states."""
+    """Sample at times off the regular grid, as the file's times state."""
 
     def change(trial, rng):
         step = float(np.median(np.diff(trial.time)))
@@ -92,7 +94,7 @@ def jittered(share: float) -> Callable[[Session], Session]:
 
 
 def first_of_each_motion(session: Session) -> Session:
-    """No motion repeated."""
+    """Remove repeats of motions."""
     seen: dict = {}
     for trial in session:
         seen.setdefault(trial.motion or trial.name, trial.name)
@@ -100,7 +102,7 @@ def first_of_each_motion(session: Session) -> Session:
 
 
 def one_posture(session: Session) -> Session:
-    """One trial of each experiment, joint and tendon."""
+    """Keep one trial of each experiment, joint and tendon."""
     seen: dict = {}
     for trial in session:
         seen.setdefault((trial.experiment, trial.joint, trial.tendon), trial.name)
@@ -108,12 +110,12 @@ def one_posture(session: Session) -> Session:
 
 
 def without(experiment: str) -> Callable[[Session], Session]:
-    """One experiment not done."""
+    """Remove an experiment."""
     return lambda session: session.with_trials([t.name for t in session if t.experiment != experiment])
 
 
 def cut_short(session: Session) -> Session:
-    """The last trial of each experiment stops at 60 % of its length."""
+    """End the last trial of each experiment at 60 % of its length."""
     last = {t.experiment: t.name for t in session}
 
     def change(trial, rng):
@@ -125,7 +127,7 @@ def cut_short(session: Session) -> Session:
 
 
 def dead_column(session: Session) -> Session:
-    """The encoder of the last tendon's motor dead throughout VD.3."""
+    """Remove the excursion of the last tendon from VD.3, as a dead encoder does."""
 
     def change(trial, rng):
         if trial.experiment != "VD.3" or trial.tendon_excursion is None:
@@ -138,13 +140,13 @@ def dead_column(session: Session) -> Session:
 
 
 def unmarked(session: Session) -> Session:
-    """No commanded directions, no marked holds and no times of day: all derived from the channels."""
+    """Remove commanded directions, holds, motions and start times, which are then derived from the channels."""
     absent = {"joint_direction": None, "tendon_direction": None, "hold": None, "session_start": None, "motion": None}
     return each(session, lambda t, rng: replace(t, **absent))
 
 
 def renamed(session: Session) -> Session:
-    """Joints and tendons under other names, of another alphabetical order."""
+    """Rename joints and tendons, in another alphabetical order."""
     finger = session.finger
     joints = {name: f"{'ZYXWV'[k % 5]}{k}" for k, name in enumerate(finger.joint_names)}
     tendons = {name: f"{'sragh'[k % 5]}{k}" for k, name in enumerate(finger.tendon_names)}
@@ -175,7 +177,7 @@ MISHAPS: dict[str, Callable[[Session], Session]] = {
 
 
 def verdict(session: Session, folder: Path) -> dict:
-    """The verdict of `jaxfinger diagnose`, in a process of its own; what it said where it failed."""
+    """Verdict of `jaxfinger diagnose` in its own process. The summary of a failure is its last line."""
     write_session(session, folder / "session.h5")
     try:
         DIAGNOSE(folder / "session.h5", folder / "out")
@@ -185,7 +187,7 @@ def verdict(session: Session, folder: Path) -> dict:
 
 
 def expected_in(changed: Session, session: Session, expect: str) -> str:
-    """The expected cause under the names that the changed session has for its joints and tendons."""
+    """Expected cause in the changed session's names of joints and tendons."""
     effect, _, site = expect.partition(":")
     ours, theirs = session.finger, changed.finger
     names = dict(zip((*ours.joint_names, *ours.tendon_names), (*theirs.joint_names, *theirs.tendon_names), strict=True))
@@ -193,8 +195,8 @@ def expected_in(changed: Session, session: Session, expect: str) -> str:
 
 
 def main() -> None:
-    """Print a row a mishap."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    """Print a row for each mishap."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("session", type=Path)
     parser.add_argument("--expect", required=True, help="effect:site of the truth, none, or unexplained")
     parser.add_argument("--only", action="append", choices=list(MISHAPS), help="this mishap (may be repeated)")

@@ -1,4 +1,4 @@
-"""Makes the picture at the top of README: `python docs/figures.py`."""
+"""Make the picture at the top of README: `python docs/figures.py`."""
 
 from pathlib import Path
 
@@ -13,4 +13,6 @@ HERE = Path(__file__).parent
 if __name__ == "__main__":
     session = jf.read(HERE.parent / "datasets" / "demo-finger" / "session.h5")
     axes = jf.plot.budget(jf.diagnose(session))
-    axes.figure.savefig(HERE / "budget.png", dpi=150, bbox_inches="tight")
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    figure.savefig(HERE / "budget.png", dpi=150, bbox_inches="tight")

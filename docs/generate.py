@@ -1,4 +1,4 @@
-"""Pages that follow from the code, written while the site is built: commands, causes, drawings of the experiments."""
+"""Write the pages and drawings that follow from the code while the site is built: commands, causes, experiments."""
 
 import inspect
 import io
@@ -14,7 +14,7 @@ import numpy as np
 from jaxfinger.cli.app import app
 from jaxfinger.effects import CATALOGUE, NOMINAL_TERMS
 
-# What moves ("move"), what is held by a fixture ("held"), and what is free, in each experiment; and what is measured.
+# Joints that move and joints that a fixture holds, the tension of the tendons, and the sensors, of each experiment.
 EXPERIMENTS = {
     "ID.2": dict(moving=(1,), held=(0, 2), tendon="2 N", motor=False, force=False),
     "ID.3-static": dict(moving=(0,), held=(1, 2), tendon="slack", motor=True, force=False),
@@ -27,14 +27,14 @@ EXPERIMENTS = {
 
 
 def finger(angles: tuple[float, ...]) -> np.ndarray:
-    """Places of the joints and the tip of a planar finger that flexes downwards, in link lengths."""
+    """Positions of the joints and the tip of a planar finger that flexes downwards, cm."""
     lengths, heading = (4.3, 2.7, 2.3), -np.cumsum(angles)
     steps = [np.array([length * np.cos(h), length * np.sin(h)]) for length, h in zip(lengths, heading, strict=True)]
     return np.cumsum([np.zeros(2), *steps], axis=0)
 
 
 def draw(name: str, moving: tuple, held: tuple, tendon: str, motor: bool, force: bool) -> str:
-    """One experiment as an SVG: hollow joints are held, arrows show what moves."""
+    """Draw an experiment as an SVG. Hollow joints are held; the light finger shows the motion."""
     figure, axes = plt.subplots(figsize=(4.6, 2.7))
     pose, other = (0.25, 0.5, 0.35), tuple(a + 0.45 * (j in moving) for j, a in enumerate((0.25, 0.5, 0.35)))
     places = finger(pose)
@@ -50,8 +50,8 @@ def draw(name: str, moving: tuple, held: tuple, tendon: str, motor: bool, force:
         axes.annotate(("MCP", "PIP", "DIP")[j], place, (-10, 13), textcoords="offset points", fontsize=10)
     if motor:
         axes.plot(*places[0], "s", ms=24, mec="C1", mfc="none", mew=2, zorder=5)
-        label = dict(textcoords="offset points", color="C1", fontsize=10)
-        axes.annotate("motor with torque sensor", places[0], (-60, 34), **label)
+        label = "motor with torque sensor"
+        axes.annotate(label, places[0], (-60, 34), textcoords="offset points", color="C1", fontsize=10)
     if force:
         tip = places[-1]
         axes.annotate("", tip, tip + np.array([0.4, -1.7]), arrowprops=dict(arrowstyle="->", color="C2", lw=2))
@@ -72,7 +72,9 @@ with mkdocs_gen_files.open("commands.md", "w") as file:
     file.write(app.generate_docs(recursive=True, include_hidden=False))
 
 with mkdocs_gen_files.open("causes.md", "w") as file:
-    file.write("# The catalogue of causes\n\nWhat the nominal model leaves out, as `jaxfinger effects` prints it.\n")
+    file.write(
+        "# The catalogue of causes\n\nEffects that the nominal model leaves out, as `jaxfinger effects` prints them.\n"
+    )
     for effect in (CATALOGUE | NOMINAL_TERMS).values():
         file.write(f"\n## `{effect.ID}`\n\nAt a {effect.PLACE.replace('_', ' ')}. {inspect.getdoc(effect)}\n\n")
         for title, text in (

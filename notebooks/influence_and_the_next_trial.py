@@ -7,9 +7,9 @@
 # ---
 
 # %% [markdown]
-# # What holds a parameter, and which trial comes next
-# A fit is only as good as the trials behind it. Two questions: which trial, sensor or value of CAD holds a parameter
-# where it is; and which trial would settle what the recordings leave open.
+# # The influence of trials, and which trial comes next
+# A fit is only as good as the trials behind it. Two questions: which trial, sensor or value of CAD determines a
+# parameter; and which trial would decide between causes that the recordings leave open.
 
 # %%
 from pathlib import Path
@@ -28,9 +28,9 @@ fit = jf.identify(session)
 
 # %% [markdown]
 # ## Influence
-# No reruns: a derivative, and for a trial that is left out one step from the fit. A row is a trial, a sensor that reads
-# 1 % more, or a value of CAD one standard deviation larger; a square's area is how many of its own standard deviations
-# the parameter then moves.
+# The influence is a derivative of the fit, or for a trial that is left out one step from the fit; nothing is fitted
+# again. A row is a trial without which the fit is made, a sensor that reads 1 % more, or a value of CAD that is one
+# standard deviation larger. The area of a square is the change of the parameter in its own standard deviations.
 
 # %%
 found = jf.sensitivity(fit, session)
@@ -38,21 +38,23 @@ jf.plot.influence(found["trials"], fit)
 jf.plot.influence({kind: found[kind] for kind in ("sensors", "cad")}, fit)
 
 # %% [markdown]
-# The trial that moves most of those that other trials stand in for, and what a refit without it gives.
+# The trial with the largest finite influence, and the change in a real refit without it.
 
 # %%
-shifts = np.nan_to_num(found["trials"].shifts(fit), posinf=0.0)  # infinite: no other trial tells of the parameter
+shifts = np.nan_to_num(
+    found["trials"].shifts(fit), posinf=0.0
+)  # infinite where no other trial determines the parameter
 k, j = np.unravel_index(np.argmax(np.abs(shifts)), shifts.shape)
 trial, row = found["trials"].names[k], fit.table()[j]
 rest = jf.identify(session.with_trials([t.name for t in session if t.name != trial]))
 moved = {r["name"]: r["value"] for r in rest.table()}[row["name"]] - row["value"]
-print(f"{row['name']} without {trial}: {moved / row['std']:+.1f} standard deviations; said {shifts[k, j]:+.1f}")
+print(f"{row['name']} without {trial}: {moved / row['std']:+.1f} standard deviations; predicted {shifts[k, j]:+.1f}")
 assert abs(moved - shifts[k, j] * row["std"]) < 0.2 * abs(moved)
 
 # %% [markdown]
 # ## The next trial
-# A finger whose PIP is coupled to its DIP by a slip of tendon, and of which only the PIP was ever moved, the others at
-# rest in one posture. Which neighbour pulls at it stays open, and the diagnosis says so.
+# A slip of tendon couples the PIP of a finger to its DIP. In the recordings only the PIP moves, and the other joints
+# rest in one posture. The diagnosis cannot tell which neighbour the PIP is coupled to, and says so.
 
 # %%
 model = true_model(polynomial_finger(paper_finger()))
@@ -61,7 +63,7 @@ plant = ModelPlant(eqx.tree_at(lambda m: m.effects, model, (coupling,), is_leaf=
 
 
 def recorded(*postures):
-    """A session of trials of the PIP, the other joints at rest at these angles of MCP, PIP and DIP, in degrees."""
+    """A session of trials of the PIP in postures of MCP, PIP and DIP, deg."""
     trials = {"rate": 100.0, "experiments": ["ID.2", "ID.3-static", "ID.3-dynamic"]}
     trials["id2"] = {"repeats": 2, "postures": [[25, 35, 40]], "stroke_time": 2.0, "strokes": 2}
     trials["id3_static"] = {"repeats": 2, "postures": list(postures), "move": 0.4, "dwell": 0.4}
@@ -71,15 +73,16 @@ def recorded(*postures):
     return whole.with_trials([t.name for t in whole if t.joint == "PIP"])
 
 
-others = tuple(set(CATALOGUE) - {"passive_tendon", "elastic_hardening", "joint_stop"})  # left out to be quick
+others = tuple(set(CATALOGUE) - {"passive_tendon", "elastic_hardening", "joint_stop"})  # left out to save time
 diagnosis = jf.diagnose(recorded([25, 30, 45]), without=others)
 print(sentences.summary(diagnosis))
 
 # %% [markdown]
-# It names the trial that would tell, and where to hold the other joints. Recorded, that trial settles it.
+# It names the trial that would decide, and where to hold the other joints. With that trial the cause is known.
 
 # %%
 step = diagnosis.next_experiment
+assert step is not None
 print(f"{step.experiment}: {sentences.next_trial(step)}")
 at = {p.joint: float(np.degrees(p.low)) for p in step.postures if not p.moves}
 settled = jf.diagnose(recorded([25, 30, 45], [at["MCP"], 30, at["DIP"]]), without=others)

@@ -8,9 +8,9 @@
 
 # %% [markdown]
 # # Joint against stepwise
-# The staged fits pass their errors on: what ID.3 makes of the links' masses, ID.4 takes for granted. The joint
-# refinement reads all trials at once. Both fit the same session here; `benchmarks/joint.py`
-# repeats it on a hundred, and `benchmarks/coverage.py` on two hundred, with the truth beside them.
+# Staged fits pass their errors on: ID.4 takes the links' masses from ID.3. The joint refinement reads all trials at
+# once. Here both fit the same session. `benchmarks/joint.py` repeats this on a hundred sessions and
+# `benchmarks/coverage.py` on two hundred, and compare with the true parameters.
 
 # %%
 from pathlib import Path
@@ -25,15 +25,15 @@ staged = jf.identify(session)
 joint = jf.refine(session, staged)
 
 # %% [markdown]
-# Both as intervals. Joint can only gain where stages share something, the links' weight above all: CAD tells elastic
-# torque from gravity, and the trials of ID.3 and ID.4 in other postures add to what CAD knows.
+# Parameters of both fits with their intervals. The joint fit gains only where stages share parameters, above all the
+# links' weight: CAD separates elastic torque from gravity, and the trials of ID.3 and ID.4 in other postures add to it.
 
 # %%
 jf.plot.intervals(staged)
 jf.plot.intervals(joint)
 
 # %% [markdown]
-# How much narrower the joint intervals are, and how far apart the two estimates lie in standard deviations.
+# Widths of the joint intervals relative to the stepwise ones.
 
 # %%
 common = np.intersect1d(staged.estimated, joint.estimated)

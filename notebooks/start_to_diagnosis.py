@@ -8,8 +8,8 @@
 
 # %% [markdown]
 # # From a session file to a diagnosis
-# A shipped session of a simulated finger whose answer is known: tendon T3 stretches by 60 µm/N, and the friction of the
-# MCP joint is 0.9 higher at rest than in motion, falling over 20°/s (Stribeck).
+# The shipped session is that of a simulated finger with two known causes: tendon T3 stretches by 60 µm/N, and the
+# friction of the MCP joint at rest is 1.9 times that in motion and falls over 20°/s (Stribeck).
 
 # %%
 from pathlib import Path
@@ -21,7 +21,7 @@ print(session)
 
 # %% [markdown]
 # ## Identify
-# All stages, each with its χ² per row: 1 is what the noise alone gives.
+# All stages with their χ² per row, which is 1 for noise alone.
 
 # %%
 fit = jf.identify(session)
@@ -29,7 +29,7 @@ for stage in fit.stages:
     print(f"{stage.name:14} {stage.status:10} χ² per row {stage.chi2_per_row:.2f}")
 
 # %% [markdown]
-# Moment arms and joint torques with their 95 % bands, and all parameters as intervals.
+# Moment arms and joint torques with their 95 % bands, and all parameters with their intervals.
 
 # %%
 jf.plot.moment_arms(fit, "MCP")
@@ -38,7 +38,8 @@ jf.plot.intervals(fit)
 
 # %% [markdown]
 # ## Diagnose
-# The budget: a bar a channel. Each colour is what is lost when that cause alone is dropped, on trials that no fit saw.
+# The budget has a bar for each channel. A coloured part is the share of the gap that opens again, on trials that no
+# fit has read, if that cause is dropped.
 
 # %%
 diagnosis = jf.diagnose(session, quick=True)
@@ -47,7 +48,7 @@ for cause in diagnosis.budget:
     print(f"{cause.effect} at {cause.sites}: probability {cause.probability:.2f}, share {cause.share:.2f}")
 
 # %% [markdown]
-# The truth is among what is named, and its value inside the interval.
+# The stretch is named, and its true value is inside the interval.
 
 # %%
 stretch = next(c for c in diagnosis.budget if c.effect == "tendon_stretch")

@@ -8,9 +8,9 @@
 
 # %% [markdown]
 # # Diagnose your own simulator
-# Any simulator is diagnosed by its predictions of a session's trials: an HDF5 file in the layout that
-# `jaxfinger predict` writes. Here the «simulator» is the fitted nominal model, in which tendons do not stretch and
-# joints have no Stribeck friction, as in most simulators of fingers.
+# A simulator is diagnosed by its predictions for the trials of a session: an HDF5 file in the layout that
+# `jaxfinger predict` writes. Here the simulator is the fitted nominal model. Its tendons do not stretch and its joints
+# have no Stribeck friction, as in most simulators of fingers.
 
 # %%
 from pathlib import Path
@@ -21,7 +21,7 @@ session = jf.read(Path("datasets/demo-finger/session.h5"))
 simulator = jf.identify(session).model
 
 # %% [markdown]
-# What it predicts of every trial, and a diagnosis of the gap between that and the measurements.
+# Predictions for every trial, and a diagnosis of the gap between them and the measurements.
 
 # %%
 predictions = jf.predict(simulator, session)
@@ -31,7 +31,7 @@ for cause in diagnosis.budget:
     print(f"{cause.effect} at {cause.sites}: probability {cause.probability:.2f}, share {cause.share:.2f}")
 
 # %% [markdown]
-# What it lacks is named, and where.
+# The diagnosis names the effects that the simulator lacks, and their sites.
 
 # %%
 named = {(cause.effect, site) for cause in diagnosis.budget for site in cause.sites}

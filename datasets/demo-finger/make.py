@@ -1,6 +1,6 @@
-"""Makes `session.h5` and `fresh.h5` beside this file: `python datasets/demo-finger/make.py`.
+"""Make `session.h5` and `fresh.h5` beside this file: `python datasets/demo-finger/make.py`.
 
-A planar finger on the independent plant of the sealed cases, with two causes that the nominal model lacks.
+The plant is that of the sealed cases, a planar finger with two causes that the nominal model lacks.
 """
 
 from dataclasses import replace
@@ -28,7 +28,7 @@ CAUSES = (
 
 
 def main() -> None:
-    """Both files, the same bit for bit with the same libraries."""
+    """Write both files. With the same libraries they are the same bit for bit."""
     rng = np.random.default_rng(20261125)
     specimen = make_specimen("planar", rng)
     nominal, finger, sensors = Finger(specimen), Finger(specimen, CAUSES), draw_sensors(rng)
