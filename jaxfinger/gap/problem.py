@@ -30,12 +30,12 @@ from jaxfinger.identify.solve import Source, linearise_each, solve
 from jaxfinger.identify.stages import (
     Progress,
     cad_prior,
+    can_determine,
+    coverage_of,
     free_groups,
-    left_unknown,
     nominal_model,
-    seen_by,
+    residuals_for_noise,
     sources_of,
-    touched_by,
 )
 from jaxfinger.identify.start import start_values
 from jaxfinger.model import Model, Terms, plain_terms
@@ -176,7 +176,7 @@ def build(
     noise = _with_unknown(fit.noise, stacks, fit.model)
     reads = {e: stack.experiment.channels for e, stack in stacks.items()}
     sources = sources_of(stacks, reads, noise, parameters)
-    start, more = _with_missing_stages(fit, free, sources, parameters, touched_by(stacks, session))
+    start, more = _with_missing_stages(fit, free, sources, parameters, coverage_of(stacks, session))
     if more.size > free.size:  # what no stage had fitted was no noise
         start, _ = solve(start, more, sources, known(more))
         noise = _with_unknown(fit.noise, stacks, start)
@@ -318,7 +318,7 @@ def assemble(
 
 def _with_unknown(known: dict[tuple[str, str], Noise], stacks: dict[str, Stack], model: Model):
     """The noise of every channel: where no stage has read it, of what the model leaves of it."""
-    left = left_unknown(model, stacks, {e: stack.experiment.channels for e, stack in stacks.items()}, known)
+    left = residuals_for_noise(model, stacks, {e: stack.experiment.channels for e, stack in stacks.items()}, known)
     return known | {(e, c): estimate(stacks[e], c, x) for (e, c), x in left.items()}
 
 
@@ -331,7 +331,7 @@ def _with_missing_stages(
     """
     groups = free_groups(fit.recipe)
     unknown = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in set(free)]
-    unknown = [i for i in unknown if len(parameters[i].spans) < 2 or seen_by(parameters[i], touched)]
+    unknown = [i for i in unknown if len(parameters[i].spans) < 2 or can_determine(parameters[i], touched)]
     start = start_values(fit.model, np.array(unknown, dtype=int), parameters, sources)
     seen = set()
     for e, lin in linearise_each(start, sources if unknown else {}).items():

@@ -1,9 +1,9 @@
-"""Many sessions fitted in one compiled call: forty specimens of a lab, or hundreds of simulated sessions.
+"""Fits of many sessions in one compiled program: specimens of a lab, or simulated sessions.
 
-All members share the protocol, the recipe and the rig's noise with one session that was identified by itself (the
-template), and start where it ended; the links of each are its own. Each then runs the stages of `identify` in order, by
-the same solver on the same rows, as `optimistix.least_squares` does it in one program. A member that fails or does not
-converge is named and leaves the rest as they are.
+All sessions (the members) share the protocol, the recipe and the noise of one session that was identified by itself,
+the template. Each member starts from the template's parameters with links of its own, and runs the stages of `identify`
+in order, by the same solver on the same rows, through `optimistix.least_squares`. A member that fails or does not
+converge is reported and does not change the others.
 """
 
 from collections.abc import Sequence
@@ -30,18 +30,18 @@ from jaxfinger.identify.solve import KINK_TOLERANCE, MAX_STEPS, STEP_TOLERANCE, 
 from jaxfinger.identify.stages import cad_prior, nominal_model, sources_of
 from jaxfinger.model import Model
 
-AT_ONCE = 10  # sessions in one call: while the device fits them, the next are read and filtered
+SESSIONS_AT_ONCE = 10  # in one call, so that the next sessions are read and filtered while the device fits these
 SOLVER = VisibleGaussNewton(atol=STEP_TOLERANCE, kink=KINK_TOLERANCE)
 
 
 @dataclass(frozen=True, repr=False)
 class Members:
-    """Fits of many sessions."""
+    """Fits of S sessions."""
 
     values: Float[np.ndarray, "S P"]  # flat vectors; NaN where a member failed
     std: Float[np.ndarray, "S P"]
-    failed: Bool[np.ndarray, " S"]  # did not converge, or holds data that no fit can take
-    steps: np.ndarray  # linearisations of each, all stages together
+    failed: Bool[np.ndarray, " S"]  # did not converge, or its trials do not determine all parameters
+    steps: np.ndarray  # linearisations of each member, summed over stages
     template: Fit
 
     def __repr__(self) -> str:
@@ -49,32 +49,32 @@ class Members:
         return f"Members({count} fit{'s' * (count != 1)} by recipe {self.template.recipe.name!r}: {failed} failed)"
 
     def model(self, k: int) -> Model:
-        """The model of one member."""
+        """Model of member `k`."""
         return with_flat(self.template.model, jnp.asarray(self.values[k]))
 
 
 class _Source(eqx.Module):
-    """One experiment of all members, and how it is read."""
+    """One experiment of all members, with the parameters and coordinates that it depends on."""
 
-    batch: Batch  # every array with the members first
+    batch: Batch  # members along the first axis of every array
     filters: Filters
-    free: Free  # what it depends on
-    columns: Int[Array, " k"]  # likewise, positions in the flat vector
-    counts: Int[Array, " r"]  # rows of the trials' measured columns
-    basis: Float[Array, "k c"]  # rows of the coordinates of `resample` for them
-    coordinates: Int[Array, " c"]  # those that move any of them
+    free: Free  # parameters that it depends on
+    columns: Int[Array, " k"]  # their positions in the flat vector
+    counts: Int[Array, " r"]  # rows of columns that some member measured
+    basis: Float[Array, "k c"]  # their part of the basis of `resample`
+    coordinates: Int[Array, " c"]  # numbers of the coordinates of `resample` that move any of them
 
     def rows(self, model: Model, flat: Float[Array, " P"], limit: float | Float[Array, ""]) -> Float[Array, " r"]:
-        """White residuals as Huber's cost sees them."""
+        """White residuals under Huber's cost."""
         at = self.free.set(model, flat[self.columns])
         return huber(white_rows(at, self.batch, self.filters)[1].ravel()[self.counts], limit)
 
 
 class _Stage(eqx.Module):
-    """What a stage estimates, from which experiments, and what is known of it before."""
+    """Free parameters of a stage, the experiments that it reads, its prior and its bounds."""
 
-    reads: tuple[int, ...] = eqx.field(static=True)  # numbers of experiments
-    linear: tuple[bool, ...] = eqx.field(static=True)  # whether each of them is affine in what is free
+    reads: tuple[int, ...] = eqx.field(static=True)  # indices of the sources that it reads
+    linear: tuple[bool, ...] = eqx.field(static=True)  # whether each of them is affine in the free parameters
     free: Int[Array, " p"]  # positions in the flat vector
     mean: Float[Array, "S p"]  # of the prior
     root: Float[Array, "k p"]
@@ -83,7 +83,9 @@ class _Stage(eqx.Module):
 
 
 def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: Batching | None = None) -> Members:
-    """Fit every session as the template was fitted to the session `of`.
+    """Fit every session as `template` was fitted to the session `of`.
+
+    `batching`: as in `resample.refit`.
 
     >>> import jaxfinger as jf
     >>> session, fit = jf.read("session.h5"), jf.load("fit.json")
@@ -100,11 +102,11 @@ def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: 
     coordinates = jnp.asarray(compressed.basis), compressed.sizes, compressed.grams.H[-1], compressed.grams.reads
     shared = nominal_model(of, template.recipe)
     starts = [_start(s, template, shared) for s in sessions]
-    at_once = min(len(sessions), AT_ONCE)
+    at_once = min(len(sessions), SESSIONS_AT_ONCE)
     with ThreadPoolExecutor(1) as device:
         shares = []
         for first in range(0, len(sessions), at_once):
-            members = [k % len(sessions) for k in range(first, first + at_once)]  # every share has one length
+            members = [k % len(sessions) for k in range(first, first + at_once)]  # always as many
             start = jnp.stack([starts[k] for k in members])
             chosen = [sessions[k] for k in members]
             work = _stack_sessions(chosen, template, compressed, start)
@@ -117,7 +119,7 @@ def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: 
 
 
 def _start(session: Session, template: Fit, shared: Model) -> Float[Array, " P"]:
-    """The template's flat vector with the session's own links for the shared ones."""
+    """Flat vector from which a session starts: the template's, with the links of the session's own description."""
     own = nominal_model(session, template.recipe)
     if jax.tree.structure(own) != jax.tree.structure(shared):
         raise UserError(
@@ -176,7 +178,7 @@ def _stack_sessions(
 
 
 def _measured_rows(masks: list[Float[Array, "S _columns B T"]]) -> Int[np.ndarray, " r"]:
-    """Positions, in the order of `white_rows`, of the columns that a trial of any session has measured."""
+    """Positions, in the order of `white_rows`, of the rows of columns that any session measured."""
     some = np.concatenate([np.asarray(m).any(axis=(0, 3)) for m in masks])  # (columns of all channels, B)
     return np.flatnonzero(np.repeat(some.T[..., None], masks[0].shape[-1], axis=-1))
 
@@ -205,8 +207,8 @@ def _fit_all(model, starts, sources, stages, coordinates, limit, batching):
 
 
 def _fit(model: Model, start: Float[Array, " P"], sources: list[_Source], stages: list[_Stage], coordinates, limit):
-    """The stages of one member, one after another; then its covariance."""
-    model = with_flat(model, start)  # with links of its own
+    """Run the stages of one member in order, then compute its covariance."""
+    model = with_flat(model, start)  # the member's own links
     flat, sound, steps = start, jnp.array(True), jnp.array(0)
     for stage in stages:
         found = _fit_stage(model, flat, sources, stage, limit)
@@ -219,7 +221,7 @@ def _fit(model: Model, start: Float[Array, " P"], sources: list[_Source], stages
 
 
 def _fit_stage(model: Model, flat: Float[Array, " P"], sources: list[_Source], stage: _Stage, limit):
-    """What is affine in the free parameters is linearised once: white residuals r + J δ."""
+    """Fit one stage; experiments that are affine in the free parameters are linearised once, r + J δ."""
     start, mine = flat[stage.free], [sources[k] for k in stage.reads]
 
     def white(y, of: list[_Source]):
@@ -227,7 +229,7 @@ def _fit_stage(model: Model, flat: Float[Array, " P"], sources: list[_Source], s
 
     affine = [s for s, linear in zip(mine, stage.linear, strict=True) if linear]
     curved = [s for s, linear in zip(mine, stage.linear, strict=True) if not linear]
-    along = []  # r and J of the rest
+    along = []  # r and J of the affine sources
     if affine:
         r, push = jax.linearize(lambda y: jnp.concatenate(white(y, affine)), start)
         along = [(r, jax.lax.map(push, jnp.eye(start.size), batch_size=TANGENTS_AT_ONCE).T)]
@@ -243,7 +245,7 @@ def _fit_stage(model: Model, flat: Float[Array, " P"], sources: list[_Source], s
 def _covariance(
     model: Model, flat: Float[Array, " P"], sources: list[_Source], stages: list[_Stage], coordinates, limit
 ):
-    """Of the coordinates of `resample` at the optimum, and whether all of it is seen."""
+    """Covariance of the coordinates of `resample` at the optimum, and whether the trials determine all of them."""
     basis, sizes, prior, reads = coordinates
     q, last = basis.shape[1], reads[:, -1]
     H = last[:, None, None] * prior[None]
@@ -257,7 +259,7 @@ def _covariance(
 
 
 def _gram(model: Model, flat: Float[Array, " P"], source: _Source, limit) -> Float[Array, "w w"]:
-    """[J r]ᵀ[J r] of one experiment, w = c + 1 wide, J in the coordinates that bear on it."""
+    """Gram matrix [J r]ᵀ[J r] of one experiment, with J by the c coordinates that move it, w = c + 1."""
 
     def rows(dz):
         return source.rows(model, flat.at[source.columns].add(source.basis @ dz), limit)

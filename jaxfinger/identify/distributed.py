@@ -1,12 +1,13 @@
-"""The same work spread over processes and machines with JAX's own runtime: each maps its share, results are gathered.
+"""Refits and batches of fits spread over processes and machines by JAX's distributed runtime.
 
-A cluster job is a launch command: start one process a machine with the same arguments and its own number,
+Each process computes its share of the members, and all results are gathered. A job starts one process on each machine,
+with the same arguments and a number of its own:
 
     initialise("host:port", processes=4, process=k)
     theta, failed = refit_distributed(compressed, weights)
     members = fit_many_distributed(sessions, fit, session)
 
-or leave the arguments of `initialise` out where the scheduler is one that JAX knows (Slurm, Open MPI, a TPU pod).
+Under a scheduler that JAX knows (Slurm, Open MPI, a TPU pod), `initialise` needs no arguments.
 """
 
 from collections.abc import Sequence
@@ -22,12 +23,12 @@ from jaxfinger.identify.resample import Batching, Compressed, refit
 
 
 def initialise(address: str | None = None, processes: int | None = None, process: int | None = None) -> None:
-    """Join the job; before anything else touches a device."""
+    """Join the job. Call it before any other use of a device."""
     jax.distributed.initialize(coordinator_address=address, num_processes=processes, process_id=process)
 
 
 def share(count: int) -> slice:
-    """The members of this process: equal shares in order, the last one may be shorter."""
+    """Members of this process out of `count`: equal shares in order, of which the last may be shorter or empty."""
     size = -(-count // jax.process_count())
     return slice(min(count, jax.process_index() * size), min(count, (jax.process_index() + 1) * size))
 
@@ -38,7 +39,7 @@ def refit_distributed(
     given: Float[np.ndarray, "R k"] | None = None,
     batching: Batching | None = None,
 ) -> tuple[Float[np.ndarray, "R P"], Bool[np.ndarray, " R"]]:
-    """`refit`, every process its share; all of them return all members."""
+    """Run `refit` with the members shared among processes; each process returns all members."""
     mine = share(len(weights))
     theta, failed = refit(compressed, weights[mine], None if given is None else given[mine], batching)
     return gather(theta, len(weights)), gather(failed, len(weights)).astype(bool)
@@ -47,8 +48,9 @@ def refit_distributed(
 def fit_many_distributed(
     sessions: Sequence[Session], template: Fit, of: Session, batching: Batching | None = None
 ) -> Members:
-    """`fit_many`, every process its share; all of them return all members. No process reads another's sessions, so
-    `sessions` may be a sequence that reads its files when asked for them.
+    """Run `fit_many` with the sessions shared among processes; each process returns all members.
+
+    A process reads its own sessions only, so that `sessions` may be a sequence that reads files on access.
     """
     mine = share(len(sessions))
     found = fit_many([sessions[k] for k in range(mine.start, mine.stop)], template, of, batching)
@@ -59,7 +61,7 @@ def fit_many_distributed(
 
 
 def gather(mine: np.ndarray, count: int) -> np.ndarray:
-    """The shares of all processes, in order, on every process."""
+    """Shares of all processes, joined in order, `count` rows, on every process."""
     from jax.experimental.multihost_utils import process_allgather
 
     size = -(-count // jax.process_count())

@@ -20,21 +20,21 @@ SCHEMA = "jaxfinger-fit/2"
 
 @dataclass(frozen=True)
 class StageReport:
-    """What became of one stage."""
+    """Outcome of one stage."""
 
     name: str
     status: str  # `fitted`, `not converged` or `skipped`
     message: str = ""
     trials: tuple[str, ...] = ()
-    rows: int = 0
-    chi2_per_row: float = float("nan")  # 1 where model and noise are right
+    rows: int = 0  # number of white residuals that are not zero
+    chi2_per_row: float = float("nan")  # about 1 where model and noise are right
     outliers: float = 0.0  # share of white residuals beyond the robust limit
     warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, repr=False)
 class Fit:
-    """A model with the covariance of its flat vector of parameters (see `parameters`), and what made it.
+    """An identified model, the covariance of its flat vector (see `parameters`), and their provenance.
 
     >>> import jaxfinger as jf
     >>> fit = jf.load("fit.json")
@@ -45,8 +45,8 @@ class Fit:
     """
 
     model: Model
-    covariance: np.ndarray  # (P, P); zero where a parameter was given, infinite on the diagonal where it is not seen
-    estimated: np.ndarray  # positions of the estimated parameters
+    covariance: np.ndarray  # (P, P); zero for parameters that are given, infinite on the diagonal for undetermined ones
+    estimated: np.ndarray  # positions of the estimated parameters in the flat vector
     recipe: Recipe
     noise: dict[tuple[str, str], Noise] = field(default_factory=dict)  # by experiment and channel
     stages: tuple[StageReport, ...] = ()
@@ -58,7 +58,7 @@ class Fit:
 
     @classmethod
     def before(cls, session: Session, recipe: Recipe, model: Model) -> "Fit":
-        """Nothing estimated yet."""
+        """Fit of a session before its first stage, with zero covariance."""
         P = ravel(model).size
         return cls(
             model,
@@ -74,11 +74,11 @@ class Fit:
 
     @property
     def std(self) -> np.ndarray:
-        """Standard deviation of every entry of the flat vector."""
+        """Standard deviation of every entry of the flat vector, in SI units."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     def with_effect(self, effect: Effect, free: tuple[str, ...]) -> "Fit":
-        """The fit with an effect on top of its model, whose named parameters a joint refinement is to estimate."""
+        """Copy of the fit with an effect added to its model; its parameters named in `free` count as estimated."""
         model = replace(self.model, effects=(*self.model.effects, effect))
         old, new = ravel(self.model).size, ravel(model).size
         added = [i for i in range(old, new) if describe(model)[i].term in free]
@@ -94,7 +94,7 @@ class Fit:
         return f"<p>{escape(repr(self))}</p>{self.table()._repr_html_()}"
 
     def table(self) -> Table:
-        """One row an estimated parameter: name, group, value, std (None where the trials do not see it), units (SI)."""
+        """One row for each estimated parameter: name, group, value, std (None where undetermined) and SI units."""
         values, std, parameters = np.asarray(ravel(self.model)), self.std, describe(self.model)
         return Table(
             {
@@ -108,9 +108,9 @@ class Fit:
         )
 
     def function(self, f) -> tuple[np.ndarray, np.ndarray]:
-        """Value and standard deviation of any function of the model, by the delta method.
+        """Value and standard deviation of a function `f` of the model that returns an array, by the delta method.
 
-        Where it depends on a parameter that the trials cannot see, the standard deviation is infinite.
+        The standard deviation is infinite where the value depends on an undetermined parameter.
         """
         import jax
 

@@ -1,6 +1,6 @@
-"""The file of a fit: JSON that people can read, floats to the last bit, infinities and NaN as null.
+"""The file of a fit: readable JSON with exact floats; infinities and NaN are null.
 
-Parameters are named as in `describe`; the covariance is stored only where it is not zero.
+Parameters are named as in `describe`. Only rows of the covariance whose variance is not zero are stored.
 """
 
 import json
@@ -44,7 +44,7 @@ FINGER_STATIC = ("limits", "prismatic", "joint_names", "tendon_names", "active",
 
 
 def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None:
-    """Write a fit to `path`, whole or not at all.
+    """Write a fit to `path`; where that fails, no partial file is left.
 
     >>> import jaxfinger as jf
     >>> jf.save(jf.load("fit.json"), "copy.json")
@@ -56,13 +56,13 @@ def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None
 
 
 def write_content(content: dict[str, Any], path: str | os.PathLike, overwrite: bool = False) -> None:
-    """Write the file of a fit from what is in it."""
+    """Write the file of a fit from its content (`content_of`)."""
     lines = ",\n".join(f" {json.dumps(k)}: {json.dumps(v, allow_nan=False)}" for k, v in content.items())
     with atomic_path(path, overwrite) as part:
         part.write_text("{\n" + lines + "\n}\n", encoding="utf-8")
 
 
-HDF5 = b"\x89HDF\r\n\x1a\n"  # how such a file, as a session is one, begins
+HDF5 = b"\x89HDF\r\n\x1a\n"  # first bytes of an HDF5 file, such as a session
 
 
 def load_fit(path: str | os.PathLike, effects: str | os.PathLike | None = None) -> Fit:
@@ -96,11 +96,11 @@ def load_fit(path: str | os.PathLike, effects: str | os.PathLike | None = None) 
 
 
 def content_of(fit: Fit) -> dict[str, Any]:
-    """What the file of a fit holds."""
+    """Content of the file of a fit."""
     model, names = fit.model, [p.name for p in describe(fit.model)]
     rows = np.flatnonzero(np.diag(fit.covariance) != 0)
     covariance = np.where(np.isfinite(fit.covariance), fit.covariance, np.inf)[np.ix_(rows, rows)]
-    catalogued = [e for e in model.effects if isinstance(e, CatalogueEffect)]  # as `describe` has made sure
+    catalogued = [e for e in model.effects if isinstance(e, CatalogueEffect)]  # all of them: `describe` refuses others
     effects = [to_dict(e, units_at(model.finger, type(e), e.site)) for e in catalogued]
     content = {
         "schema": SCHEMA,
@@ -135,7 +135,7 @@ def _arrays(module) -> dict[str, list]:
 
 
 def _without_infinities(value: Any) -> Any:
-    """JSON has no infinity and no NaN: null."""
+    """Replace infinities and NaN by None, since JSON has neither."""
     match value:
         case dict():
             return {k: _without_infinities(v) for k, v in value.items()}
@@ -191,7 +191,7 @@ def _model(content: dict[str, Any], effects: str | os.PathLike | None) -> Model:
 def _array(values: list, shape: tuple[int, ...], name: str) -> jnp.ndarray:
     array = np.array(values, dtype=float)
     if 0 in shape and not array.size:
-        array = array.reshape(shape)  # a finger without tendons: lists do not tell how wide nothing is
+        array = array.reshape(shape)  # an empty list has no width, as for a finger without tendons
     if array.ndim != len(shape) or any(a != s for a, s in zip(array.shape, shape, strict=True) if s >= 0):
         raise ValueError(f"{name} has shape {array.shape}")
     if not np.isfinite(array).all():

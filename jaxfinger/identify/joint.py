@@ -2,9 +2,10 @@
 
     min_θ  Σ_trials ‖white residuals(θ)‖² + ‖Σ^(−1/2) (θ − μ)‖²
 
-(μ, Σ) is a fit of other recordings, with all that it knew. A fit of these very recordings is no more than the start:
-then the prior is what CAD and scale say, and nothing is counted twice. Masses and centres of mass are free wherever
-CAD states how well it knows them; masses stay positive, and a link's inertia follows its mass: CAD knows its shape.
+The prior (μ, Σ) is an earlier fit of other recordings with its full covariance. Where the earlier fit used these same
+recordings it gives only the start, and the prior is the finger's description, so that no data are counted twice. Masses
+and centres of mass are free wherever the description gives their standard deviations. Masses stay positive, and the
+inertia of a link is proportional to its mass, since CAD gives its shape.
 """
 
 from dataclasses import replace
@@ -17,7 +18,7 @@ from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.identifiability import name_invisible
-from jaxfinger.identify.noise import SLOWER
+from jaxfinger.identify.noise import LONG_SIGNAL_WINDOW
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.predictions import model_for
@@ -29,37 +30,41 @@ from jaxfinger.identify.stages import (
     Progress,
     cad_covariance,
     cad_prior,
+    can_determine,
+    coverage_of,
     estimate_with_noise,
     free_groups,
     report_of,
-    seen_by,
     sources_of,
     total_cost,
-    touched_by,
 )
 from jaxfinger.identify.start import start_values
 from jaxfinger.model import Model
 
 STAGE = "joint"
-MISFIT = 1.3  # χ² a row above which another start is tried
+# χ² per row above which another start is tried. Noise alone gives 1 to a few percent, as a fit reads thousands of rows.
+RESTART_CHI2 = 1.3
 
 
 def refine(session: Session, fit: Fit, progress: Progress = lambda message: None, ahead: bool = False) -> Fit:
-    """The fit refined on all trials of `recipe.fit.joint_experiments`; its last stage report says what it gained. With
-    `ahead` on those of VD.3 too, by the angles that it predicts a moment ahead (`shooting`).
+    """Refine a fit on all trials of `recipe.fit.joint_experiments` at once.
+
+    The last stage report says by how much intervals have changed. With `ahead` the fit also reads VD.3, by the angles
+    that it predicts a short time ahead (`shooting`).
 
     >>> import jaxfinger as jf
     >>> jf.refine(jf.read("session.h5"), jf.load("fit.json"))
     Fit('EMPS', recipe 'emps': 4 parameters; ID.3-dynamic fitted, joint fitted)
 
     Raises:
-        UserError: the session has none of these trials, with `ahead` no VD.3 either, or its finger is another one.
+        UserError: the session has none of these trials, or is of another finger; or `ahead` is given and there is no
+            VD.3 trial, or the fit has effects.
     """
     recipe = fit.recipe
     if ahead and fit.model.effects:
         raise UserError("a fit with effects cannot be refined ahead; give one of the nominal model")
     model = start = model_for(fit, session)
-    shots = shooting(session) if ahead else None
+    starts = shooting(session) if ahead else None
     progress("reading the recordings")
     stacks = prepare(session, [t.name for t in session if t.experiment in recipe.fit.joint_experiments])
     reads = {e: channels_of(e) for e in stacks}
@@ -70,9 +75,9 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         )
     parameters = describe(model)
     cad = np.flatnonzero(np.diag(cad_covariance(session, parameters)))
-    touched = touched_by(reads, session)
+    coverage = coverage_of(reads, session)
     groups = free_groups(recipe)
-    seen = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and seen_by(p, touched)]
+    seen = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and can_determine(p, coverage)]
     free = np.union1d(np.union1d(fit.estimated, cad), seen).astype(int)
 
     same = fit.data_hash == (data_hash(session.file) if session.file else "")
@@ -82,9 +87,11 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         prior = prior_of(np.asarray(ravel(fit.model)), fit.covariance, free)
     progress("refining on all trials at once")
     known, huber = (fit.noise if same else {}), recipe.fit.huber
-    model, solution, sources, noise = estimate_with_noise(model, free, stacks, reads, known, prior, huber, slow=SLOWER)
+    model, solution, sources, noise = estimate_with_noise(
+        model, free, stacks, reads, known, prior, huber, window=LONG_SIGNAL_WINDOW
+    )
     warnings = name_invisible(parameters, free, solution.invisible)
-    if not solution.converged or warnings or solution.chi2_per_row(free.size) > MISFIT:
+    if not solution.converged or warnings or solution.chi2_per_row(free.size) > RESTART_CHI2:
         progress("refining from a neutral start")
         neutral = start_values(_neutral(model, free, parameters), free, parameters, sources)
         other, second = solve(neutral, free, sources, prior, huber)
@@ -109,19 +116,19 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
     how = "CAD is the prior, the trials are read once" if same else "the earlier fit of other data is the prior"
     report = report_of(STAGE, solution, free, trials, warnings, _gain(fit, refined, how))
     refined = replace(refined, stages=(*fit.stages, report))
-    if shots is None:
+    if starts is None:
         return refined
     progress("refining on the motion of VD.3")
-    return _on_motion(refined, shots, sources, prior, fit.covariance)
+    return _on_motion(refined, starts, sources, prior, fit.covariance)
 
 
-def _on_motion(fit: Fit, shots: Shooting, sources: dict[str, Source], prior: Prior, before: np.ndarray) -> Fit:
-    """A joint fit, made from `sources` with `before` as the covariance of all else, refined on VD.3 too."""
+def _on_motion(fit: Fit, starts: Shooting, sources: dict[str, Source], prior: Prior, before: np.ndarray) -> Fit:
+    """Refine a joint fit, made from `sources`, on VD.3 too; `before` is the covariance before the joint fit."""
     free, huber, parameters = fit.estimated, fit.recipe.fit.huber, describe(fit.model)
-    noise = {(AHEAD, "q"): shots.noise(fit.model)}
-    sources = sources | sources_of({AHEAD: shots.stack}, {AHEAD: ("q",)}, noise, parameters)
+    noise = {(AHEAD, "q"): starts.noise(fit.model)}
+    sources = sources | sources_of({AHEAD: starts.stack}, {AHEAD: ("q",)}, noise, parameters)
     first, _ = solve(fit.model, free, sources, prior, huber)
-    sources[AHEAD] = sources[AHEAD]._replace(batch=shots.corrected(first))
+    sources[AHEAD] = sources[AHEAD]._replace(batch=starts.corrected(first))
     model, solution = solve(first, free, sources, prior, huber)
     covariance = propagate(before, solution, sources, free, prior, huber)
     moved, corrected = (np.asarray(ravel(model)) - np.asarray(ravel(m)) for m in (fit.model, first))
@@ -130,29 +137,34 @@ def _on_motion(fit: Fit, shots: Shooting, sources: dict[str, Source], prior: Pri
     warnings += implausible(model, covariance, free, parameter_bounds(fit.model, free)[0])
     refined = replace(fit, model=model, covariance=covariance)
     report = report_of(
-        AHEAD, solution, free, shots.stack.trials, warnings, _gain(fit, refined, "those of the joint refinement")
+        AHEAD, solution, free, starts.stack.trials, warnings, _gain(fit, refined, "those of the joint refinement")
     )
     return replace(refined, stages=(*fit.stages, report))
 
 
 def _contradiction(moved: np.ndarray, without: np.ndarray, together: np.ndarray) -> np.ndarray:
-    """Covariance that more trials add by what they contradict the others: estimates have `moved` by more than chance
-    makes them, whose variance is that `without` these trials less that `together` with them.
+    """Covariance to add where further trials contradict the others.
+
+    By chance, estimates move with the variance `without` these trials less that `together` with them. `moved` beyond
+    that is an error.
     """
-    with np.errstate(invalid="ignore"):  # of what neither sees
+    with np.errstate(invalid="ignore"):  # infinite variances of undetermined parameters
         chance = np.maximum(np.nan_to_num(without - together, nan=np.inf), 0.0)
     beyond = np.sign(moved) * np.sqrt(np.maximum(moved**2 - chance, 0.0))
     return np.outer(beyond, beyond)
 
 
 def channels_of(experiment: str) -> tuple[str, ...]:
-    """What a held joint's tendons show of their excursion is stretch, not moment arm."""
+    """Channels of an experiment that a joint fit reads.
+
+    The excursion at held joints is left out: there it measures the stretch of tendons, and not their moment arms.
+    """
     e = EXPERIMENTS[experiment]
     return tuple(c for c in e.channels if not (e.held and c == "tendon_excursion"))
 
 
 def _neutral(model: Model, free, parameters) -> Model:
-    """Every coefficient zero, the links as they are: most of (1) is linear, and a few steps lead to the data."""
+    """Model whose free coefficients are zero, except masses and centres of mass: a start that no earlier fit biases."""
     flat = np.array(ravel(model))
     linear = [i for i in free if parameters[i].group not in ("mass", "com")]
     flat[linear] = 0.0
@@ -160,7 +172,7 @@ def _neutral(model: Model, free, parameters) -> Model:
 
 
 def _gain(before: Fit, after: Fit, how: str) -> str:
-    """How much narrower the intervals are than those of the earlier fit, and of what."""
+    """Message on the ratio of standard deviations after and before, in the median; `how` names the prior."""
     common = before.estimated[(before.std[before.estimated] > 0) & np.isfinite(before.std[before.estimated])]
     if not common.size:
         return ""

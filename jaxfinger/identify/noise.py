@@ -1,9 +1,12 @@
-"""Noise of each channel, and the filter that makes it white.
+"""Noise of each channel, and the filter that whitens it.
 
-At a fit's rate the noise of a channel is autoregressive: e_t = Σ_k a_k e_{t−k} + σ w_t, w white. Then
-r_t − Σ_k a_k r_{t−k}, divided by σ, is white when r is, which is generalised least squares with a short filter.
-Its source, best first: differences between trials that repeat one motion (pure error, the motion's and the inputs'
-noise included), scatter within holds, the residuals themselves (which hide part of a gap, and are named so).
+At a fit's rate the noise of a channel is modelled as autoregressive: e_t = Σ_k a_k e_{t−k} + σ w_t, with w white. So
+the filtered residuals (r_t − Σ_k a_k r_{t−k}) / σ are white with unit variance where r is noise, and least squares of
+them is generalised least squares.
+
+The noise is estimated from the best source that the trials offer. From best to worst these are differences between
+trials that repeat one motion (pure error, which includes the noise of the inputs), the scatter within holds, and the
+residuals of a fit, which may hide part of a gap.
 """
 
 from dataclasses import dataclass
@@ -17,32 +20,43 @@ from jaxfinger.data.schema import CHANNELS
 from jaxfinger.experiments import Batch, Stack
 
 ORDER = 3  # of the autoregression
-FEW, MANY = 50, 1000  # samples by which a column tells its size, and its colour
-# Samples of the moving average that is taken for signal where nothing is repeated: where a law may be missing, and
-# where the model is taken to be right. Of the long-run variance of noise such as VD.3's the first takes more than half,
-# the second a third at most (tests/identify/test_noise.py).
-SLOW, SLOWER = 15, 75
+# A column needs more samples than the first for a standard deviation of its own, known to 10 % from 50 (1/√(2 n)), and
+# more than the second for coefficients a_k of its own, known to 0.03 from 1000 (1/√n).
+MIN_SAMPLES_FOR_STD, MIN_SAMPLES_FOR_COEFFICIENTS = 50, 1000
+MIN_SAMPLES_OF_SOURCE = (
+    100  # of repeats or holds, which tell a standard deviation to 7 %; with fewer, residuals are used
+)
+MIN_SAMPLES_OF_REPEAT = 20  # common samples of trials that repeat one motion, below which they are left out
+MIN_SAMPLES_OF_HOLD = 5  # a hold needs more: a straight line takes two of them
+MIN_HOLDS = 20  # more are needed to scale the noise of holds, whose standard deviation they then tell to 16 %
+MAX_LAG = 400  # samples over which the means of holds are correlated: 20 s at the rate of held experiments
+SPECTRUM = 4096  # frequencies at which the noise's spectrum is evaluated: more than ten times the largest lag
+# Samples of the moving average that counts as signal where no motion is repeated: the shorter where the model may lack
+# a law, the longer where it is taken to be right. Of the long-run variance of noise such as VD.3's the shorter removes
+# more than half, the longer a third at most (tests/identify/test_noise.py).
+SIGNAL_WINDOW, LONG_SIGNAL_WINDOW = 15, 75
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of one channel in one experiment, at the rate of the reduced data; one row a column of the channel."""
+    """Noise of one channel in one experiment, at the rate of the reduced data; one row for each column."""
 
-    std: Float[np.ndarray, " columns"]  # of a sample, in the channel's unit
-    innovation: Float[np.ndarray, " columns"]  # σ, likewise
+    std: Float[np.ndarray, " columns"]  # standard deviation of a sample, in the channel's unit
+    innovation: Float[np.ndarray, " columns"]  # σ, in the channel's unit
     ar: Float[np.ndarray, "columns order"]  # a_k
-    source: str  # `repeats`, `holds`, both, or `residuals`
+    source: str  # `repeats`, `holds`, `repeats and holds`, or `residuals`
 
     @classmethod
     def white(cls, std: Float[np.ndarray, " columns"], source: str) -> "Noise":
-        """Samples that do not depend on one another."""
+        """White noise of these standard deviations."""
         return cls(std, std, np.zeros((len(std), ORDER)), source)
 
     @property
     def coefficients(self) -> Float[np.ndarray, "columns lags lags"]:
-        """The whitening filters [1, −a₁, …] / σ, order + 1 lags; row j predicts from j samples before, as after a gap.
+        """Whitening filters [1, −a₁, …] / σ; row j uses j past samples, as at the start of a trial or after a gap.
 
-        Levinson's recursion, downwards: a_k ← (a_k + a_j a_{j−k})/(1 − a_j²), σ² ← σ²/(1 − a_j²).
+        Filters of lower order follow from Levinson's recursion, run downwards:
+        a_k ← (a_k + a_j a_{j−k})/(1 − a_j²), σ² ← σ²/(1 − a_j²).
         """
         order = self.ar.shape[1]
         out = np.zeros((len(self.std), order + 1, order + 1))
@@ -62,9 +76,10 @@ def whiten(
     coefficients: Float[Array | np.ndarray, "columns lags lags"],
     demean: bool,
 ) -> Float[Array | np.ndarray, "*more columns B T"]:
-    """White residuals of unit variance, zero where a sample does not count; NumPy's of NumPy's, JAX's of JAX's.
+    """Whiten residuals to unit variance, in their array type; zero where `mask` is 0.
 
-    With `demean`, what a constant per trial and column could explain is projected out (the encoders' arbitrary zero).
+    `coefficients`: `Noise.coefficients`. With `demean`, one constant for each trial and column is projected out, since
+    the zero of an encoder is arbitrary.
     """
     xp = r.__array_namespace__()
     mask, coefficients = xp.asarray(mask), xp.asarray(coefficients)
@@ -83,7 +98,7 @@ def whiten(
 
 
 def history(mask: Float[Array | np.ndarray, "columns B T"], order: int) -> Float[Array | np.ndarray, "columns B T"]:
-    """How many samples before each count without a gap, at most `order`."""
+    """Number of valid samples right before each sample, without a gap, at most `order`."""
     unbroken, total = mask, 0.0 * mask
     for k in range(1, order + 1):
         unbroken = unbroken * _lag(mask, k)
@@ -92,15 +107,17 @@ def history(mask: Float[Array | np.ndarray, "columns B T"], order: int) -> Float
 
 
 def _lag(a: Float[Array | np.ndarray, "*more T"], k: int) -> Float[Array | np.ndarray, "*more T"]:
-    """a, k samples later."""
+    """Delay `a` by k samples, with zeros at the start."""
     xp = a.__array_namespace__()
     return xp.concat([xp.zeros_like(a[..., :k]), a[..., :-k]], axis=-1)
 
 
-def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B T"], slow: int = SLOW) -> Noise:
-    """Noise of a channel from the residuals of a model, by the best source that the stack offers.
+def estimate(
+    stack: Stack, channel: str, residual: Float[np.ndarray, "columns B T"], window: int = SIGNAL_WINDOW
+) -> Noise:
+    """Estimate the noise of a channel from the residuals of a model, by the best source that the stack offers.
 
-    `slow`: samples of the moving average of the residuals that counts as signal where nothing is repeated.
+    `window`: samples of the moving average that counts as signal where no motion is repeated.
     """
     batch: Batch = stack.batch
     mask = np.asarray(batch.mask[channel]) > 0
@@ -111,17 +128,17 @@ def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B 
         source = "repeats and holds" if _enough(series) else "holds"
         series = [a + b for a, b in zip(series, holds, strict=True)]
     if not _enough(series):
-        series, source = _fast_part(residual, mask, slow), "residuals"
-    # A column with few samples of its own borrows the channel's size, and one with not many its colour, which the
-    # filters give to all columns alike.
+        series, source = _fast_part(residual, mask, window), "residuals"
+    # A column with too few samples takes the standard deviation or the coefficients of all columns together. Their
+    # coefficients are alike, since all pass the same averaging and filters.
     own, whole = [_autoregression(c) for c in series], _autoregression([s for column in series for s in column])
-    if not own:  # tendons of a machine that has none
+    if not own:  # the channel has no column, as excursions of a machine without tendons
         return Noise(np.zeros(0), np.zeros(0), np.zeros((0, *np.shape(whole[2]))), source)
-    sizes = [row[0] if _count(c) > FEW else whole[0] for c, row in zip(series, own, strict=True)]
+    sizes = [row[0] if _count(c) > MIN_SAMPLES_FOR_STD else whole[0] for c, row in zip(series, own, strict=True)]
     scaled = [(e / size, m, lost) for c, size in zip(series, sizes, strict=True) for e, m, lost in c]
     unit, spread, colour = _autoregression(scaled)
     rows = [
-        row if _count(c) > MANY else (size, size * spread / unit, colour)
+        row if _count(c) > MIN_SAMPLES_FOR_COEFFICIENTS else (size, size * spread / unit, colour)
         for c, row, size in zip(series, own, sizes, strict=True)
     ]
     std, innovation, ar = (np.array(x) for x in zip(*rows, strict=True))
@@ -131,7 +148,7 @@ def estimate(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B 
     return Noise(std, innovation, ar, source)
 
 
-# Values, which of them count, and the share of their covariance that centring has taken from every lag.
+# Values, which of them are valid, and the share of their covariance that removing a mean or a line takes from each lag.
 Series = list[tuple[np.ndarray, np.ndarray, float]]
 
 
@@ -140,7 +157,7 @@ def _count(column: Series) -> int:
 
 
 def _enough(series: list[Series]) -> bool:
-    return sum(map(_count, series)) > 100
+    return sum(map(_count, series)) > MIN_SAMPLES_OF_SOURCE
 
 
 def _centred(e: np.ndarray, mask: np.ndarray, demean: bool) -> np.ndarray:
@@ -148,14 +165,14 @@ def _centred(e: np.ndarray, mask: np.ndarray, demean: bool) -> np.ndarray:
 
 
 def _repeats(stack: Stack, residual, mask, demean) -> list[Series]:
-    """Residuals about the mean of the trials that repeat one motion, scaled to the noise of a single trial."""
+    """Deviations of trials that repeat one motion from their mean, scaled to the noise of a single trial."""
     series: list[Series] = [[] for _ in range(len(residual))]
     motions = [m for m in dict.fromkeys(stack.motions) if m is not None and stack.motions.count(m) > 1]
     for motion in motions:
         members = [b for b, name in enumerate(stack.motions) if name == motion]
         for c, column in enumerate(series):
             both = mask[c, members].all(axis=0)
-            if both.sum() < 20:
+            if both.sum() < MIN_SAMPLES_OF_REPEAT:
                 continue
             mean = residual[c, members].mean(axis=0)
             scale = np.sqrt(len(members) / (len(members) - 1))
@@ -164,13 +181,13 @@ def _repeats(stack: Stack, residual, mask, demean) -> list[Series]:
 
 
 def _within_holds(stack: Stack, residual, mask) -> list[Series]:
-    """Scatter about a straight line through each hold: what creeps or relaxes in it is no noise."""
+    """Deviations from a straight line through each hold, which removes creep and relaxation."""
     series: list[Series] = [[] for _ in range(len(residual))]
     for c, b in np.ndindex(residual.shape[:2]):
         e, counts, lost = np.zeros(residual.shape[2]), np.zeros(residual.shape[2], bool), []
         for hold in stack.samples_of_holds(b, mask[c, b]):
             n = len(hold)
-            if n > 5:
+            if n > MIN_SAMPLES_OF_HOLD:
                 line = np.polyval(np.polyfit(hold, residual[c, b, hold], 1), hold)
                 e[hold], counts[hold] = residual[c, b, hold] - line, True
                 lost.append(2 / n)
@@ -180,36 +197,37 @@ def _within_holds(stack: Stack, residual, mask) -> list[Series]:
 
 
 def _between_holds(series: list[Series], ar: np.ndarray, innovation: np.ndarray) -> float:
-    """How much more the means of holds scatter between repeats than their samples' noise explains; at least 1.
+    """Scatter of the means of holds between repeats over that which the samples' noise explains; at least 1.
 
-    A hold's tension is measured with an error of its own, which all samples of the hold share: no scatter within holds
-    shows it, and the held joint's torque depends on the tension at holds alone.
+    The tension of a hold has an error that all samples of the hold share, and that no scatter within holds shows. The
+    torque of a held joint depends on it.
     """
     ratios = []
     for column, a, sigma in zip(series, ar, innovation, strict=True):
-        covariance = np.fft.irfft(np.abs(sigma / np.fft.rfft(np.r_[1.0, -a], 4096)) ** 2)[:400]  # Wiener–Khinchin
+        spectrum = np.abs(sigma / np.fft.rfft(np.r_[1.0, -a], SPECTRUM)) ** 2
+        covariance = np.fft.irfft(spectrum)[:MAX_LAG]  # Wiener–Khinchin
         for e, counts, _ in column:
             for hold in np.ma.clump_unmasked(np.ma.masked_array(e, ~counts)):
-                n = min(hold.stop - hold.start, 400)
+                n = min(hold.stop - hold.start, MAX_LAG)
                 expected = (covariance[0] + 2 * ((1 - np.arange(1, n) / n) @ covariance[1:n])) / n
                 ratios.append(e[hold].mean() ** 2 / expected)
-    return max(1.0, float(np.sqrt(np.mean(ratios)))) if len(ratios) > 20 else 1.0
+    return max(1.0, float(np.sqrt(np.mean(ratios)))) if len(ratios) > MIN_HOLDS else 1.0
 
 
-def _fast_part(residual, mask, slow: int) -> list[Series]:
-    """Residuals less their moving average: without repeats, what a law could explain is taken to be slow."""
+def _fast_part(residual, mask, window: int) -> list[Series]:
+    """Residuals less their moving average over `window` samples, which may be signal."""
     series: list[Series] = [[] for _ in range(len(residual))]
     for c, b in np.ndindex(residual.shape[:2]):
         e, counts = np.where(mask[c, b], residual[c, b], 0.0), mask[c, b]
         if counts.any():
-            near, share = (uniform_filter1d(x, slow, mode="constant") for x in (e, counts.astype(float)))
-            mean = near / np.maximum(share, 1.0 / slow)
-            series[c].append((np.where(counts, e - mean, 0.0), counts, 1 / slow))
+            near, share = (uniform_filter1d(x, window, mode="constant") for x in (e, counts.astype(float)))
+            mean = near / np.maximum(share, 1.0 / window)
+            series[c].append((np.where(counts, e - mean, 0.0), counts, 1 / window))
     return series
 
 
 def _autoregression(series: Series) -> tuple[float, float, np.ndarray]:
-    """Standard deviation, innovation and coefficients by Yule–Walker, robust to a few outliers."""
+    """Standard deviation, innovation σ and coefficients a_k by Yule–Walker, from values clipped at four robust std."""
     if not series or not any(m.any() for _, m, _ in series):
         return 1.0, 1.0, np.zeros(ORDER)
     values = np.concatenate([e[m] for e, m, _ in series])
@@ -227,12 +245,14 @@ def _autoregression(series: Series) -> tuple[float, float, np.ndarray]:
 
 
 def _lagged(series: Series, k: int) -> float:
-    """Autocovariance at lag k, with what centring took given back: removing d fitted terms from n white samples
-    takes a share d/n of the variance from every lag."""
-    total = count = back = 0.0
+    """Autocovariance at lag k, corrected for the removal of d fitted terms from n samples.
+
+    For white samples that removal takes the share d/n of the variance from every lag.
+    """
+    total = count = removed = 0.0
     for e, m, lost in series:
         both = m[k:] & m[: m.size - k]
         n = int(both.sum())
         total, count = total + float(np.sum(e[k:][both] * e[: e.size - k][both])), count + n
-        back += n * lost * float(np.mean(e[m] ** 2)) / max(1e-9, 1 - lost) if n else 0.0
-    return (total + back) / count if count else 0.0
+        removed += n * lost * float(np.mean(e[m] ** 2)) / max(1e-9, 1 - lost) if n else 0.0
+    return (total + removed) / count if count else 0.0

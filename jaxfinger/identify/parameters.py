@@ -1,6 +1,6 @@
 """The model's parameters as one flat vector, with a name and a unit for every entry.
 
-Flat vectors exist only inside a solver call and in a covariance; a parameter lives in its module.
+Flat vectors exist only inside a solver call and in a covariance. Elsewhere a parameter is a field of its module.
 """
 
 from dataclasses import dataclass
@@ -20,12 +20,12 @@ from jaxfinger.model import Finger, Model
 
 @eqx.filter_jit
 def ravel(model: Model) -> Float[Array, " P"]:
-    """Every floating-point leaf of the model, flat."""
+    """Flat vector of the model: its floating-point leaves in order."""
     return jnp.concatenate([jnp.ravel(leaf) for leaf in _leaves(model)])
 
 
 def with_flat(model: Model, flat: Float[Array, " P"]) -> Model:
-    """The model with its floating-point leaves replaced by `flat`."""
+    """Copy of the model with the flat vector `flat`, the inverse of `ravel`."""
     arrays, rest = eqx.partition(model, eqx.is_inexact_array)
     leaves, treedef = jax.tree.flatten(arrays)
     ends = np.cumsum([0] + [leaf.size for leaf in leaves])
@@ -34,15 +34,19 @@ def with_flat(model: Model, flat: Float[Array, " P"]) -> Model:
 
 
 class Free(eqx.Module):
-    """Which entries of the flat vector are free: per leaf, so that the derivative of the rest is known to vanish."""
+    """Free entries of the flat vector, kept leaf by leaf, so that JAX sees that the other leaves are constant."""
 
-    leaves: tuple[int, ...] = eqx.field(static=True)
-    parts: tuple[str, ...] = eqx.field(static=True)  # field of the model that each of those leaves is of
+    leaves: tuple[int, ...] = eqx.field(static=True)  # numbers of the leaves with free entries
+    parts: tuple[str, ...] = eqx.field(static=True)  # field of the model that holds each of those leaves
     entries: tuple[Int[Array | np.ndarray, " _k"], ...]  # positions within each of those leaves
 
     @classmethod
     def at(cls, model: Model, positions: Int[np.ndarray, " p"]) -> "Free":
-        """The entries at these positions of the flat vector, in ascending order."""
+        """Free entries at these positions of the flat vector, which must ascend.
+
+        Raises:
+            ValueError: the positions do not ascend.
+        """
         paths, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(model, eqx.is_inexact_array))
         starts = np.cumsum([0] + [leaf.size for _, leaf in paths])
         positions = np.asarray(positions)
@@ -54,12 +58,12 @@ class Free(eqx.Module):
         return cls(leaves, parts, tuple(within[i] for i in leaves))
 
     def values(self, model: Model) -> list[Float[Array, " _k"]]:
-        """The free parameters of a model, leaf by leaf."""
+        """Free parameters of a model, leaf by leaf."""
         leaves = _leaves(model)
         return [leaves[i].ravel()[e] for i, e in zip(self.leaves, self.entries, strict=True)]
 
     def put(self, model: Model, values: list[Float[Array, " _k"]]) -> Model:
-        """The model with other free parameters, leaf by leaf."""
+        """Copy of the model with these free parameters, leaf by leaf."""
         arrays, rest = eqx.partition(model, eqx.is_inexact_array)
         leaves, treedef = jax.tree.flatten(arrays)
         for i, e, value in zip(self.leaves, self.entries, values, strict=True):
@@ -68,12 +72,12 @@ class Free(eqx.Module):
 
     @eqx.filter_jit
     def get(self, model: Model) -> Float[Array, " p"]:
-        """The free parameters of a model."""
+        """Free parameters of a model as one vector."""
         return jnp.concatenate(self.values(model))
 
     @eqx.filter_jit
     def set(self, model: Model, theta: Float[Array, " p"]) -> Model:
-        """The model with its free parameters set to `theta`."""
+        """Copy of the model with its free parameters set to `theta`."""
         ends = np.cumsum([0] + [e.size for e in self.entries])
         return self.put(model, [theta[a:b] for a, b in pairwise(ends)])
 
@@ -83,11 +87,11 @@ def _leaves(model: Model):
 
 
 def units_at(finger: Finger, effect: type[CatalogueEffect], site: Site) -> dict[str, str]:
-    """Units of an effect's parameters at a site: those of lengths and forces where its joints slide."""
+    """Units of an effect's parameters at a site; those of sliding joints are of lengths and forces."""
     own = [slides for joint, slides in zip(finger.joint_names, finger.prismatic, strict=True) if joint in site]
     if own:
         return {k: units_where(u, own) for k, u in effect.units().items()}
-    # A base or a sensor that is turned is turned by an angle.
+    # Orientations of a base or a sensor stay angles.
     return {k: u if u == "rad" else units_where(u, finger.prismatic) for k, u in effect.units().items()}
 
 
@@ -96,25 +100,25 @@ class Parameter:
     """One entry of the flat vector."""
 
     name: str  # for people, for example `moment arm T1 MCP^2`
-    group: str  # the field of the model it lives in, for example `moment_arm`
+    group: str  # kind of parameter, for example `moment_arm`, `mass` or `friction`
     units: str
     joint: str | None = None
     tendon: str | None = None
     power: int | None = None
-    spans: tuple[str, ...] = ()  # joints on which a tendon's excursion depends together
-    term: str = ""  # field of the module that it is, for example `constant`, where a group has several
+    spans: tuple[str, ...] = ()  # joints whose angles the term of a tendon's excursion multiplies
+    term: str = ""  # its field in the module where a group has several, for example `constant`
     determinable: bool = True  # false where the finger has no such parameter: a tendon that does not cross the joint
 
 
 def describe(model: Model) -> list[Parameter]:
-    """The flat vector's entries, in order."""
+    """Describe the entries of the flat vector, in order."""
     leaves, structure = jax.tree.flatten(eqx.filter(model, eqx.is_inexact_array))
     return list(_described(structure, tuple(leaf.shape for leaf in leaves)))
 
 
 @cache
 def _described(structure, shapes: tuple[tuple[int, ...], ...]) -> tuple[Parameter, ...]:
-    """Of a model of this structure: names and units do not depend on its numbers."""
+    """Describe the entries of any model of this structure; names and units do not depend on its numbers."""
     model = jax.tree.unflatten(structure, [np.zeros(shape) for shape in shapes])
     paths, _ = jax.tree_util.tree_flatten_with_path(model)
     entries = []
@@ -174,7 +178,7 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
             assert isinstance(effect, CatalogueEffect)
             label = f"{effect.ID} {'-'.join(effect.site)} {field}"
             units = units_at(model.finger, type(effect), effect.site)
-            if index or field not in units:  # a constant that the effect carries
+            if index or field not in units:  # a constant of the effect
                 return Parameter(f"{label} {index}" if index else label, "constant", "", determinable=False)
             return Parameter(label, "effects", units[field], term=field)
     raise AssertionError(keys)

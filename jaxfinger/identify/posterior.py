@@ -1,7 +1,7 @@
-"""The whole posterior of a joint fit by NUTS, through blackjax: the reference that Laplace's covariance is held to.
+"""Samples from the full posterior of a joint fit by NUTS (blackjax), the reference for Laplace's covariance.
 
-Sampled in the coordinates of `resample`, in which Laplace's posterior is the unit Gaussian: a short trajectory crosses
-it, and a small effective sample size or divergences are themselves a sign that the intervals are not to be trusted.
+The coordinates are those of `resample`, in which Laplace's posterior is the unit Gaussian and short trajectories
+suffice. A small effective sample size or divergences show that the posterior is far from it.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from jaxfinger.identify.uncertainty import Samples
 
 @dataclass(frozen=True)
 class SampledPosterior:
-    """Draws, and how far they can be trusted."""
+    """Draws from a posterior with their diagnostics."""
 
     samples: Samples
     effective: Float[np.ndarray, " q"]  # effective sample size of each coordinate
@@ -34,14 +34,16 @@ class SampledPosterior:
 
     @property
     def trusted(self) -> bool:
-        """Whether the chain has seen enough of the posterior to judge another approximation by it."""
+        """Whether the chain can judge an approximation: no divergence, and effective sample sizes above 100."""
         return self.divergences == 0 and bool(self.effective.min() > 100)
 
 
 def sampled_posterior(
     session: Session, fit: Fit, draws: int = 500, warmup: int = 300, seed: int = 0
 ) -> SampledPosterior:
-    """Draws from the posterior of a joint fit under its own noise, on the session that it was made from.
+    """Draw from the posterior of a joint fit under its own noise, given the session that it was made from.
+
+    `draws`: number of draws after `warmup` steps of adaptation.
 
     Raises:
         UserError: the fit is not a joint one, or blackjax is not installed.
@@ -75,7 +77,7 @@ def sampled_posterior(
     def sample(key):
         adapt, walk = jax.random.split(key)
         adaptation = blackjax.window_adaptation(blackjax.nuts, log_density)
-        run = adaptation.run  # its protocol leaves num_steps out
+        run = adaptation.run  # its annotated protocol lacks the argument num_steps
         (state, parameters), _ = run(adapt, jnp.zeros(basis.shape[1]), warmup)  # type: ignore[call-arg]
         kernel = blackjax.nuts.build_kernel()
 

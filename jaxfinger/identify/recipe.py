@@ -1,4 +1,4 @@
-"""A recipe: what a researcher edits to move from one finger to another. TOML, strict about unknown keys."""
+"""Recipes: the choices of a fit that change from one finger to another, in a TOML file without unknown keys."""
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -10,15 +10,15 @@ from jaxfinger.data.toml import structure as from_tables
 from jaxfinger.errors import UserError, did_you_mean
 
 PAPER = ("joint_elastic", "joint_coulomb", "joint_damping", "tendon_friction", "gravity")
-# Terms that real machines need: a constant torque, friction by direction, friction that grows with the torque of the
-# joint's own drive, and the reflected inertia of a geared rotor.
+# Beside the paper's terms, those that other machines need: a constant torque, friction that differs by direction,
+# friction in proportion to the torque of the joint's own drive, and the reflected inertia of a geared rotor.
 TERMS = (*PAPER, "joint_offset", "joint_friction_asymmetric", "joint_torque_friction", "rotor_inertia")
 STAGES = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4")
 
 
 @dataclass(frozen=True)
 class ModelRecipe:
-    """Which terms the nominal model has, and their degrees."""
+    """Terms of the nominal model and their polynomial degrees."""
 
     moment_arm_degree: Annotated[int, Within(1, 10)] = 4
     cross_terms: bool = False  # q_a q_b, q_a² q_b, q_a q_b² in f(q); they need a trial that moves two joints
@@ -33,24 +33,24 @@ class ModelRecipe:
 
 @dataclass(frozen=True)
 class FitRecipe:
-    """How the fits are done."""
+    """Options of the fits."""
 
     stages: Annotated[tuple[str, ...], OneOf(STAGES)] = STAGES
     huber: Annotated[float, Within(0.0)] = 3.0  # robust limit in standard deviations; 0 for plain least squares
     free_inertia: bool = False  # estimate masses and centres of mass too, with CAD as the prior
-    joint_experiments: Annotated[tuple[str, ...], OneOf(EXPERIMENTS)] = STAGES  # what the joint refinement reads
+    joint_experiments: Annotated[tuple[str, ...], OneOf(EXPERIMENTS)] = STAGES  # that the joint fit reads
 
 
 @dataclass(frozen=True)
 class ValidationRecipe:
-    """What validation reads."""
+    """Experiments that validation reads."""
 
     experiments: Annotated[tuple[str, ...], OneOf(EXPERIMENTS)] = ("VD.1", "VD.2", "VD.3")
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """One specimen's recipe; every field has the paper's choice as its default."""
+    """Recipe of one specimen; the default of every field is the paper's choice."""
 
     name: str = "paper"
     model: ModelRecipe = field(default_factory=ModelRecipe)
@@ -59,7 +59,7 @@ class Recipe:
 
 
 def read_recipe(path: str | Path | None) -> Recipe:
-    """The recipe in a TOML file, or a shipped one by its name; the paper's where there is none.
+    """Read a recipe from a TOML file, or a shipped one by its name; for None, the paper's.
 
     >>> import jaxfinger as jf
     >>> jf.recipe("emps").model.terms
@@ -82,23 +82,29 @@ def read_recipe(path: str | Path | None) -> Recipe:
 
 
 def structure(content: dict, where: str) -> Recipe:
-    """A recipe from nested dictionaries, strictly."""
+    """Recipe from nested dictionaries.
+
+    `where`: file or place that messages name.
+
+    Raises:
+        UserError: a key is unknown or its value is not allowed.
+    """
     return from_tables(content, Recipe, Place(where))
 
 
 def as_dict(recipe: Recipe) -> dict:
-    """For a result file."""
+    """Nested dictionaries of the recipe, for a result file."""
     return asdict(recipe)
 
 
 def _folders() -> list[Path]:
-    """Where the shipped recipes lie: in an installed package, or in a checkout."""
+    """Folders of the shipped recipes, in an installed package or in a checkout."""
     here = Path(__file__).resolve().parents[1]
     return [folder for folder in (here / "fits", here.parent / "fits") if folder.is_dir()]
 
 
 def _shipped(name: str) -> Path | None:
-    """A recipe that comes with the package, by its name with or without `.toml`."""
+    """Path of a shipped recipe by its name, with or without `.toml`; None where there is none."""
     candidates = (folder / (name if name.endswith(".toml") else f"{name}.toml") for folder in _folders())
     return next((path for path in candidates if path.exists()), None)
 

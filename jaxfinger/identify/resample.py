@@ -1,14 +1,14 @@
 """Refits of a fit's own trials under other weights, all in one compiled call.
 
-At the optimum each trial b is a triangular factor [R_b d_b] (`linearise`). A stage s with basis B_s of what it sees,
-reading trials with weights w_b, moves its parameters by B_s z_s,
+At the optimum each trial b is compressed to a triangular factor [R_b d_b] (`linearise`). Let B_s be the basis of the
+combinations visible to stage s (`gauss_newton`). With trial weights w_b, the stage changes its parameters by B_s z_s,
 
     H_s = Σ_b w_b [R_b B_1 … R_b B_s d_b]ᵀ [R_b B_1 … R_b B_s d_b]
     z_s = −H_s[s, s]⁻¹ (H_s[s, d] + Σ_{t<s} H_s[s, t] z_t),
 
-so that a refit passes its errors on from stage to stage as the fit itself does, and costs a sum of small matrices.
-In these coordinates H_s[s, s] is near the identity: Gram matrices lose nothing. z_0 is given, not solved for: what CAD
-leaves open of the links and no stage estimates, in standard deviations.
+so that the errors of a stage propagate to the next as in the fit itself, and a refit costs a sum of small matrices. In
+these coordinates H_s[s, s] is near the identity, so that Gram matrices are well conditioned. z_0 is given, not solved
+for: errors, in standard deviations, of what CAD gives and no stage estimates.
 """
 
 from dataclasses import dataclass
@@ -30,35 +30,37 @@ from jaxfinger.identify.linearise import linearise, triangular
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.shooting import AHEAD
 from jaxfinger.identify.solve import visible
-from jaxfinger.identify.stages import STAGES, cad_covariance, cad_prior, sources_of, stage_free, touched_by
+from jaxfinger.identify.stages import STAGES, cad_covariance, cad_prior, coverage_of, sources_of, stage_free
 
 Batching = Literal["map", "vmap"]
-PIVOT = 1e-4  # smallest pivot of a Cholesky factor of H_s[s, s], which is the identity for the trials as they are
+# Smallest pivot of a Cholesky factor of H_s[s, s], which is the identity where all weights are 1. A smaller one means
+# that a standard deviation would grow by 10⁴: the weighted trials do not determine the combination.
+MIN_PIVOT = 1e-4
 
 
 class Grams(NamedTuple):
-    """The compressed trials in the coordinates of the stages; the last column is the residual."""
+    """Gram matrices of the compressed trials in the q coordinates of the stages; the last column is the residual."""
 
-    H: Float[Array, "K q+1 q+1"]  # one a trial, then the prior's, which is never resampled
+    H: Float[Array, "K q+1 q+1"]  # one for each trial, then the prior's, whose weight is always 1
     reads: Float[Array, "S K"]  # 1 where a stage reads a trial
 
 
 @dataclass(frozen=True)
 class Compressed:
-    """A fit's trials, ready to be weighted anew."""
+    """A fit's trials, compressed for refits under other weights."""
 
     grams: Grams
-    sizes: tuple[int, ...]  # number of coordinates: given by CAD, then of each stage
+    sizes: tuple[int, ...]  # number of coordinates: those given (z_0), then those of each stage
     basis: Float[np.ndarray, "P q"]  # δθ = basis z
     theta: Float[np.ndarray, " P"]  # the fit's flat vector
-    positions: dict[str, np.ndarray]  # in the flat vector, of what each experiment depends on
+    positions: dict[str, np.ndarray]  # in the flat vector, of the parameters that each experiment depends on
     information: Float[np.ndarray, "P P"]  # JᵀJ of all trials, without priors
     trials: tuple[str, ...]
-    strata: tuple[tuple, ...]  # experiment, joint and tendon of each trial: what is resampled together
+    strata: tuple[tuple, ...]  # experiment, joint and tendon of each trial; trials of one stratum are exchangeable
 
 
 def compress(session: Session, fit: Fit) -> Compressed:
-    """The trials of the session that the fit was made from, linearised at the fit: the only pass over the samples."""
+    """Linearise and compress the trials of `session`, from which the fit was made; no later step reads samples."""
     parameters = describe(fit.model)
     plan = plan_of(session, fit)
     names = [t.name for t in session if any(t.experiment in reads for reads, _ in plan)]
@@ -104,10 +106,12 @@ def compress(session: Session, fit: Fit) -> Compressed:
 
 
 def plan_of(session: Session, fit: Fit) -> list[tuple[dict[str, tuple[str, ...]], np.ndarray]]:
-    """What each stage read and estimated; a stage whose parameters a later one estimates again is left out.
+    """Channels read, by experiment, and positions estimated, for each stage of a fit.
+
+    A stage is left out where later ones estimate all of its parameters again.
 
     Raises:
-        UserError: the fit was refined ahead, on starts of simulations that nobody else reads.
+        UserError: the fit was refined with `ahead`, whose simulations cannot be refitted.
     """
     parameters = describe(fit.model)
     done = [s.name for s in fit.stages if s.status != "skipped"]
@@ -115,14 +119,14 @@ def plan_of(session: Session, fit: Fit) -> list[tuple[dict[str, tuple[str, ...]]
         raise UserError(f"{session.file or 'the session'}: the fit was refined with --ahead; give one without it")
     if JOINT in done:
         return [({e: channels_of(e) for e in fit.recipe.fit.joint_experiments}, fit.estimated)]
-    touched = {name: touched_by(STAGES[name].reads, session) for name in done}
-    plan = [(STAGES[n].reads, stage_free(fit, STAGES[n], parameters, touched[n])) for n in done]
+    coverage = {name: coverage_of(STAGES[name].reads, session) for name in done}
+    plan = [(STAGES[n].reads, stage_free(fit, STAGES[n], parameters, coverage[n])) for n in done]
     later = [np.concatenate([np.zeros(0, int), *(f for _, f in plan[k + 1 :])]) for k in range(len(plan))]
     return [p for p, after in zip(plan, later, strict=True) if not np.isin(p[1], after).all()]
 
 
 def _prior_block(session: Session, fit: Fit, plan, parameters) -> Float[np.ndarray, "rows {len(parameters)}+1"]:
-    """CAD's rows on the masses and centres of mass that the fit estimated, at the fit."""
+    """Rows [root, root (θ − mean)] of the description's prior on the estimated parameters, at the fit."""
     free = np.unique(np.concatenate([f for _, f in plan]))
     prior = cad_prior(session, fit.recipe, parameters, free)
     rows = np.zeros((len(prior.root), len(parameters) + 1))
@@ -132,7 +136,7 @@ def _prior_block(session: Session, fit: Fit, plan, parameters) -> Float[np.ndarr
 
 
 def _given(session: Session, plan, parameters) -> Float[np.ndarray, "P k"]:
-    """One standard deviation of every mass and centre of mass that CAD gives and no stage estimates."""
+    """Basis of z_0: one standard deviation of each parameter that the description gives and no stage estimates."""
     std = np.sqrt(np.diag(cad_covariance(session, parameters)))
     std[np.concatenate([free for _, free in plan])] = 0.0
     return np.diag(std)[:, std > 0]
@@ -144,11 +148,14 @@ def refit(
     given: Float[np.ndarray, "R k"] | None = None,
     batching: Batching | None = None,
 ) -> tuple[Float[np.ndarray, "R P"], Bool[np.ndarray, " R"]]:
-    """Flat vectors of the refits under each row of trial weights, and which of them failed (and are NaN).
+    """Refit the trials under each row of weights.
 
-    `given`: what CAD gives moves by so many of its standard deviations (default none).
-    `batching`: one after another (`map`, best on a CPU) or in lockstep (`vmap`, best on a GPU); by default what suits
-    the device at hand.
+    `weights`: of R refits and K trials. `given`: z_0 of each refit, in standard deviations (default zero).
+    `batching`: refits run one after another (`map`, best on a CPU) or in lockstep (`vmap`, best on a GPU); the default
+    suits the device.
+
+    Returns:
+        Flat vectors (R, P) in SI units, NaN where a refit failed, and which of them failed (R,).
     """
     weights = np.concatenate([weights, np.ones((len(weights), 1))], axis=1)
     if given is None:
@@ -162,7 +169,7 @@ def refit(
 
 
 def batching_here(batching: Batching | None) -> Batching:
-    """What was asked for, or what suits the device at hand."""
+    """The batching asked for, else the one that suits the device."""
     return batching or ("map" if jax.default_backend() == "cpu" else "vmap")
 
 
@@ -183,17 +190,20 @@ def _refit(grams: Grams, sizes: tuple[int, ...], weights: Float[Array, " K"], gi
 def staged_step(
     H: Float[Array, "S r r"], sizes: tuple[int, ...], given: Float[Array, " k"]
 ) -> tuple[Float[Array, " q"], Float[Array, "q q"], Bool[Array, ""]]:
-    """z of all stages, its covariance with the earlier stages' errors carried on, and whether all of it is seen.
+    """Solve for z stage by stage, and propagate the covariance.
 
-    `H`: as `Grams` has it, r = q + 1, weighted and summed by stage.
+    `H`: weighted Gram matrices, summed over the trials of each stage; r = q + 1. `given`: z_0.
+
+    Returns:
+        z, its covariance, and whether the trials determine all of z.
     """
     z, covariance, sound = given, jnp.eye(given.size), jnp.array(True)
     for stage, size in zip(H, sizes[1:], strict=True):
         start = z.size
         own = slice(start, start + size)
         L = jnp.linalg.cholesky(stage[own, own])
-        sound &= jnp.all(jnp.diagonal(L) > PIVOT)  # false for NaN too
-        # K of the earlier stages' errors, and the step
+        sound &= jnp.all(jnp.diagonal(L) > MIN_PIVOT)  # false for NaN too
+        # K of the equation in `propagate`, and the step.
         right = jnp.concatenate([stage[own, :start], stage[own, -1:]], axis=1)
         solved = jax.scipy.linalg.cho_solve((L, True), right)
         K = solved[:, :start]

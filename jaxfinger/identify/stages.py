@@ -1,7 +1,7 @@
 """The paper's staged identification, ID.2 → ID.3-static → ID.3-dynamic → ID.4.
 
-Each stage is equation (1) with the terms that its experiment makes vanish, and frees the parameters that it shows. The
-parameters of earlier stages stay fixed, and their errors go on (`propagate`).
+Each stage fits equation (1) to experiments in which some of its terms vanish, and estimates the parameters of the
+others. The parameters of earlier stages stay fixed, and their errors are propagated (`propagate`).
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from jaxfinger.data import Session, joints_of, moving_joints
 from jaxfinger.experiments import EXPERIMENTS, Experiment, Stack, not_judged, prepare
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible
-from jaxfinger.identify.noise import SLOW, Noise, estimate
+from jaxfinger.identify.noise import SIGNAL_WINDOW, Noise, estimate
 from jaxfinger.identify.parameters import Parameter, describe, ravel
 from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.prior import Prior
@@ -42,23 +42,23 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Stage:
-    """Which experiments and channels a stage reads, and which groups of parameters it frees."""
+    """Experiments and channels that a stage reads, and the groups of parameters that it frees."""
 
     name: str
     reads: dict[str, tuple[str, ...]]
     frees: tuple[str, ...]
 
 
-# What a motor that moves a joint shows of its torque.
+# Groups on which the torque of a motor that moves a joint depends.
 _DRIVEN = ("elastic", "friction", "damping", "friction_by_direction", "torque_friction", "rotor_inertia")
 
 STAGES = {
     s.name: s
     for s in (
         Stage("ID.2", {"ID.2": ("tendon_excursion",)}, ("moment_arm",)),
-        # From hold to hold the joint moves, slowly: that shows damping, too, if less well.
+        # Between holds the joint moves slowly, so that the stage determines damping, too, though less well.
         Stage("ID.3-static", {"ID.3-static": ("joint_torque",)}, _DRIVEN),
-        # The dynamic phase augments the static one: both are read, so that a sweep refines what the holds gave.
+        # Both phases are read, so that the sweeps refine the estimates from the holds.
         Stage(
             "ID.3-dynamic",
             {"ID.3-static": ("joint_torque",), "ID.3-dynamic": ("joint_torque",)},
@@ -98,7 +98,7 @@ GROUP_OF_TERM = {
 
 
 def nominal_model(session: Session, recipe: Recipe) -> Model:
-    """The recipe's nominal model of the session's finger: what its description gives, all other fitted terms zero."""
+    """Nominal model of the session's finger, with the recipe's terms: values from the description, else zero."""
     finger = Finger.from_description(session.finger)
     r, known = recipe.model, session.finger.excursion
     model = Model.zeros(
@@ -117,7 +117,7 @@ def nominal_model(session: Session, recipe: Recipe) -> Model:
 
 
 def _by_exponents(model: Model, known: np.ndarray, parameters: list[Parameter]) -> np.ndarray:
-    """(n, m, k) polynomials of the joints as the moment arm's coefficients in order, zero beyond the power k."""
+    """Flat coefficients of the moment arms, from polynomials `known` (n, m, k) of single joints; else zero."""
     joints, tendons = model.finger.joint_names, model.finger.tendon_names
     values = np.zeros(model.moment_arm.coefficients.size)
     for at, p in enumerate(p for p in parameters if p.group == "moment_arm"):
@@ -127,13 +127,14 @@ def _by_exponents(model: Model, known: np.ndarray, parameters: list[Parameter]) 
 
 
 def free_groups(recipe: Recipe) -> set[str]:
-    """Groups of parameters that the recipe's nominal model has."""
+    """Groups of parameters in the recipe's nominal model."""
     return {"moment_arm"} | {GROUP_OF_TERM[t] for t in recipe.model.terms if t in GROUP_OF_TERM}
 
 
 def cad_covariance(session: Session, parameters: list[Parameter]) -> np.ndarray:
-    """Covariance of the flat vector before any fit: what CAD and scale say of masses, centres of mass, rotors and
-    excursions.
+    """Covariance of the flat vector before any fit.
+
+    It is diagonal: the description's standard deviations of masses, centres of mass, rotors and excursions, else zero.
     """
     variance, finger = np.zeros(len(parameters)), session.finger
     position = {g: [i for i, p in enumerate(parameters) if p.group == g] for g in ("mass", "com")}
@@ -150,7 +151,7 @@ def cad_covariance(session: Session, parameters: list[Parameter]) -> np.ndarray:
 
 
 def cad_prior(session: Session, recipe: Recipe, parameters: list[Parameter], free: np.ndarray) -> Prior:
-    """What the finger's description says of the free parameters: a row each that it gives a standard deviation of."""
+    """Prior from the finger's description: one row for each free parameter whose standard deviation it gives."""
     variance = np.diag(cad_covariance(session, parameters))[free]
     rows = np.flatnonzero(variance > 0)
     root = np.zeros((rows.size, free.size))
@@ -166,12 +167,13 @@ def identify(
     progress: Progress = lambda message: None,
     stacks: dict[str, Stack] | None = None,
 ) -> Fit:
-    """Run the staged fits on a session; a stage whose data are missing is skipped and named.
+    """Run the staged fits on a session. A stage whose trials are missing is reported as skipped.
 
-    `stages` limits the run to some of them; `start` gives the parameters of earlier ones; `stacks` are the session's
-    trials where they are prepared already.
+    `recipe`: by default that of `start`, or the paper's. `stages`: names of those to run, by default the recipe's.
+    `start`: a fit that holds the parameters of earlier stages. `progress`: called with a sentence at each step.
+    `stacks`: the session's trials, where `prepare` has read them already.
 
-    The servo axis whose parameters are published (Janot, Gautier, Brunot 2019) weighs 95.11 kg:
+    The published mass of the servo axis (Janot, Gautier, Brunot 2019) is 95.11 kg:
 
     >>> import jaxfinger as jf
     >>> fit = jf.identify(jf.read("session.h5"), jf.recipe("emps"))
@@ -184,7 +186,7 @@ def identify(
     fit = start or Fit.before(session, recipe, nominal_model(session, recipe))
     if start is None:
         fit = replace(fit, covariance=cad_covariance(session, describe(fit.model)))
-    with ThreadPoolExecutor(1) as pool:  # a stage compiles while the recordings of the next are filtered
+    with ThreadPoolExecutor(1) as pool:  # a stage is compiled while the recordings of the next are filtered
         experiments = dict.fromkeys(e for s in wanted for e in STAGES[s].reads) if stacks is None else ()
         named = {e: [t.name for t in session if t.experiment == e] for e in experiments}
         pending = {e: pool.submit(prepare, session, names) for e, names in named.items()}
@@ -200,7 +202,7 @@ def identify(
 def run_stage(
     fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session, tangents: Tangents | None = None
 ) -> Fit:
-    """One stage: noise, estimate, covariance, and what its trials cannot see."""
+    """Run one stage: noise, estimates, covariance, and warnings of undetermined or implausible parameters."""
     recipe = fit.recipe
     if stage.name not in stacks:
         report = StageReport(stage.name, "skipped", message=f"the session has no {stage.name} trial")
@@ -212,8 +214,8 @@ def run_stage(
         return replace(fit, stages=(*fit.stages, report))
     parameters = describe(fit.model)
     groups = set(stage.frees) & free_groups(recipe)
-    touched = touched_by(reads, session)
-    free = stage_free(fit, stage, parameters, touched)
+    coverage = coverage_of(reads, session)
+    free = stage_free(fit, stage, parameters, coverage)
     if not free.size:
         report = StageReport(stage.name, "skipped", message="the recipe leaves its terms out of the nominal model")
         return replace(fit, stages=(*fit.stages, report))
@@ -223,7 +225,7 @@ def run_stage(
     )
     covariance = propagate(fit.covariance, solution, sources, free, prior, recipe.fit.huber)
     warnings = name_invisible(parameters, free, solution.invisible)
-    warnings += _unseen(parameters, groups, free, touched)
+    warnings += _unseen(parameters, groups, free, coverage)
     warnings += implausible(model, covariance, free, parameter_bounds(fit.model, free)[0])
     trials = tuple(t for e in reads for t in stacks[e].trials)
     report = report_of(stage.name, solution, free, trials, warnings)
@@ -236,7 +238,7 @@ def run_stage(
 def report_of(
     name: str, solution: Solution, free: np.ndarray, trials: tuple[str, ...], warnings: list[str], message: str = ""
 ) -> StageReport:
-    """What became of a fit; `message` is said where it converged."""
+    """Report of a stage from its solution; `message` is used where the search converged."""
     return StageReport(
         name,
         "fitted" if solution.converged else "not converged",
@@ -249,14 +251,14 @@ def report_of(
     )
 
 
-def stage_free(fit: Fit, stage: Stage, parameters: list[Parameter], touched) -> np.ndarray:
-    """Positions of the parameters that a stage estimates: those of its groups that its trials touch."""
+def stage_free(fit: Fit, stage: Stage, parameters: list[Parameter], coverage) -> np.ndarray:
+    """Positions of the parameters that a stage estimates: those of its groups that its trials can determine."""
     groups = set(stage.frees) & free_groups(fit.recipe)
     prior_groups = {"mass", "com"} if fit.recipe.fit.free_inertia and stage.name.startswith("ID.3") else set()
     free = [
         i
         for i, p in enumerate(parameters)
-        if (p.group in groups and p.determinable and (p.joint or p.tendon) is not None and seen_by(p, touched))
+        if (p.group in groups and p.determinable and (p.joint or p.tendon) is not None and can_determine(p, coverage))
         or (p.group in prior_groups and fit.covariance[i, i] > 0)
     ]
     return np.array(free, dtype=int)
@@ -271,18 +273,25 @@ def estimate_with_noise(
     prior: Prior | None,
     huber: float,
     tangents: Tangents | None = None,
-    slow: int = SLOW,
+    window: int = SIGNAL_WINDOW,
 ) -> tuple[Model, Solution, dict[str, Source], dict[tuple[str, str], Noise]]:
-    """Noise from the residuals of a fit with first guesses of it, where it is not known (`slow` as in
-    `noise.estimate`); then the fit under it.
+    """Fit the free parameters, after estimating the noise of the channels read unless all of it is `known`.
+
+    Unknown noise is guessed first. Then the noise of all channels is estimated twice, each time from the residuals of a
+    fit. The last fit uses Huber's cost. `window`: as in `noise.estimate`.
+
+    Returns:
+        The model, the solution, the sources and the noise.
     """
     tangents, parameters, noise = tangents or Tangents(), describe(model), dict(known)
-    unknown = {(e, c): first_noise(stacks[e], c, x) for (e, c), x in left_unknown(model, stacks, reads, noise).items()}
+    unknown = {
+        (e, c): first_noise(stacks[e], c, x) for (e, c), x in residuals_for_noise(model, stacks, reads, noise).items()
+    }
     model = start_values(model, free, parameters, sources_of(stacks, reads, noise | unknown, parameters))
     for _ in range(2 if unknown else 0):
         sources = sources_of(stacks, reads, noise | unknown, parameters)
         model, solution = solve(model, free, sources, prior, tangents=tangents, tolerance=ROUGH_TOLERANCE)
-        noise |= _noise(solution, stacks, reads, slow)
+        noise |= _noise(solution, stacks, reads, window)
         unknown = {}
     sources = sources_of(stacks, reads, noise, parameters)
     model, solution = solve(model, free, sources, prior, huber, tangents=tangents)
@@ -295,13 +304,16 @@ def estimate_with_noise(
 
 
 def total_cost(model: Model, solution: Solution, free: np.ndarray, prior: Prior | None) -> float:
-    """What a fit minimises, the prior included."""
+    """Cost that a fit minimises, the prior included."""
     return solution.cost + (prior.cost(np.asarray(ravel(model))[free]) if prior else 0.0)
 
 
-def touched_by(reads, session: Session) -> tuple[set[str], set[tuple[str, str]], set[str], list[set[str]]]:
-    """Joints instrumented or moved, (tendon, joint) pairs recorded together, tendons pulled, and the joints that move
-    together, by the trials read.
+def coverage_of(reads, session: Session) -> tuple[set[str], set[tuple[str, str]], set[str], list[set[str]]]:
+    """Coverage of the trials read, for `can_determine`.
+
+    Returns:
+        Joints that are instrumented or move; pairs (tendon, joint) recorded together; tendons that are pulled; and for
+        each trial that is not held the set of joints that move.
     """
     trials = [t for t in session if t.experiment in reads and len(t.time) > 1]
     joints = {joint for t in trials for joint in joints_of(t, session.finger)}
@@ -310,10 +322,10 @@ def touched_by(reads, session: Session) -> tuple[set[str], set[tuple[str, str]],
     return joints, moved, {t.tendon for t in trials if t.tendon}, free
 
 
-def seen_by(p: Parameter, touched) -> bool:
-    """Whether trials may tell a parameter, by what `touched_by` says of them."""
-    joints, moved, tendons, together = touched
-    if p.group == "moment_arm" and len(p.spans) > 1:  # one joint at a time never shows what two do together
+def can_determine(p: Parameter, coverage) -> bool:
+    """Whether trials can determine a parameter, given their `coverage` (`coverage_of`)."""
+    joints, moved, tendons, together = coverage
+    if p.group == "moment_arm" and len(p.spans) > 1:  # a term of two joints needs a trial that moves both
         return any(joints.issuperset(p.spans) for joints in together)
     if p.group == "moment_arm":
         return (p.tendon, p.joint) in moved
@@ -322,41 +334,41 @@ def seen_by(p: Parameter, touched) -> bool:
     return p.joint in joints
 
 
-def _unseen(parameters, groups, free, touched) -> list[str]:
+def _unseen(parameters, groups, free, coverage) -> list[str]:
     names = [p.name for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in set(free)]
     pairs = {" and ".join(p.spans) for p in parameters if p.name in names and len(p.spans) > 1}
     mend = f"; record a trial that moves {' together, and '.join(sorted(pairs))} together" if pairs else ""
     return [f"no trial shows {', '.join(names)}: left as given, or at zero{mend}"] if names else []
 
 
-def left_unknown(
+def residuals_for_noise(
     model: Model,
     stacks: dict[str, Stack],
     reads: dict[str, tuple[str, ...]],
     known: dict[tuple[str, str], Noise],
 ) -> dict[tuple[str, str], Float[np.ndarray, "_columns _B _T"]]:
-    """What the model leaves, in their units, of the channels read whose noise is not known."""
+    """Residuals of a model, in the channels' units, by experiment and channel, where the noise is not known."""
     reads = {e: channels for e, channels in reads.items() if any((e, c) not in known for c in channels)}
     white = {(e, c): Noise.white(np.ones(len(stacks[e].batch.y[c])), "none") for e in reads for c in reads[e]}
-    left = residuals_each(model, sources_of(stacks, reads, white, describe(model)))
-    return {(e, c): left[e][c] for e, c in white if (e, c) not in known}
+    residuals = residuals_each(model, sources_of(stacks, reads, white, describe(model)))
+    return {(e, c): residuals[e][c] for e, c in white if (e, c) not in known}
 
 
-def first_noise(stack: Stack, channel: str, left: Float[Array | np.ndarray, "columns B T"]) -> Noise:
-    """White noise by how much what is `left` of the channel changes from sample to sample: good enough to find
-    residuals whose noise can then be estimated.
+def first_noise(stack: Stack, channel: str, residual: Float[Array | np.ndarray, "columns B T"]) -> Noise:
+    """First guess of a channel's noise: white, as large as the median step of its residuals from sample to sample.
 
-    Of the channel itself it would be none where that is nothing throughout, as the torque on a finger that is free.
+    It serves for a first fit, from whose residuals the noise is estimated. Residuals are used since the channel itself
+    may be zero throughout, as the torque on a free finger.
     """
-    left, mask = np.asarray(left), np.asarray(stack.batch.mask[channel]) > 0
-    step = np.diff(left, axis=-1)[mask[..., 1:] & mask[..., :-1]]
+    residual, mask = np.asarray(residual), np.asarray(stack.batch.mask[channel]) > 0
+    step = np.diff(residual, axis=-1)[mask[..., 1:] & mask[..., :-1]]
     size = float(np.median(np.abs(step))) if step.size else 1.0
-    return Noise.white(np.full(len(left), max(size, 1e-12)), "first guess")
+    return Noise.white(np.full(len(residual), max(size, 1e-12)), "first guess")
 
 
-def _noise(solution: Solution, stacks, reads, slow: int) -> dict[tuple[str, str], Noise]:
+def _noise(solution: Solution, stacks, reads, window: int) -> dict[tuple[str, str], Noise]:
     return {
-        (e, c): estimate(stacks[e], c, np.asarray(solution.linearised[e].residuals[c]), slow)
+        (e, c): estimate(stacks[e], c, np.asarray(solution.linearised[e].residuals[c]), window)
         for e, channels in reads.items()
         for c in channels
     }
@@ -368,7 +380,7 @@ def sources_of(
     noise: dict[tuple[str, str], Noise],
     parameters: list[Parameter],
 ) -> dict[str, Source]:
-    """Every experiment as a fit reads it."""
+    """Sources of a fit: every experiment read, with its whitening filters and the parameters that it depends on."""
     out = {}
     for e, channels in reads.items():
         groups = set().union(*(DEPENDS[e, c] for c in channels), {"effects"})
@@ -381,8 +393,9 @@ def sources_of(
 
 
 def _linear(experiment: Experiment, channel: str) -> set[str]:
-    """Groups of parameters in which a channel is affine, the others as they are: the sum of (1), where no tendon slips
-    and no drive loses a share of its torque.
+    """Groups of parameters in which a channel is jointly affine, with all others fixed.
+
+    A torque is affine where the tendons are slack, so that the clipped loss of tendon friction does not enter.
     """
     if channel == "tendon_excursion":
         return {"moment_arm"}

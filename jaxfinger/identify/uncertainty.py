@@ -1,10 +1,10 @@
-"""Other ways to the uncertainty of a fit than its Laplace covariance: they trust the trials, not the noise model.
+"""Uncertainty of a fit from the scatter between trials, without the noise model of Laplace's covariance.
 
-Trials are the units: samples of one trial share its friction, its posture and its noise. Strata are the trials of one
+The unit is the trial, since its samples share friction, posture and noise. A stratum holds the trials of one
 experiment, joint and tendon.
 
 * `bootstrap`: n − 1 trials are drawn from the n of each stratum and weighted n/(n − 1), which makes the variance
-  unbiased for small n (Rao & Wu 1988); a stratum of one trial keeps it, and so tells nothing of its own scatter.
+  unbiased for small n (Rao & Wu 1988). A stratum of a single trial always keeps it and adds no variance.
 * `sandwich`: refits without one trial at a time, the cluster-robust covariance in its conservative form CR3
   (MacKinnon & White 1985; Cameron & Miller 2015).
 """
@@ -24,19 +24,19 @@ from jaxfinger.identify.resample import Batching, Compressed, compress, refit
 
 @dataclass(frozen=True)
 class Samples:
-    """Flat vectors drawn by resampling or from a posterior."""
+    """R flat vectors drawn by resampling or from a posterior, in SI units."""
 
     values: Float[np.ndarray, "R P"]  # NaN where a member failed
     failed: Bool[np.ndarray, " R"]
-    estimated: np.ndarray  # positions that vary
+    estimated: np.ndarray  # positions of the estimated parameters
 
     @property
     def covariance(self) -> Float[np.ndarray, "P P"]:
-        """Over the members that did not fail."""
+        """Sample covariance of the members that did not fail."""
         return np.cov(self.values[~self.failed], rowvar=False)
 
     def interval(self, level: float = 0.95) -> Float[np.ndarray, "2 P"]:
-        """Lower and upper percentile of every parameter."""
+        """Lower and upper bound of the central interval of every parameter, as percentiles."""
         tail = 50 * (1 - level)
         return np.percentile(self.values[~self.failed], [tail, 100 - tail], axis=0)
 
@@ -49,9 +49,10 @@ def bootstrap(
     batching: Batching | None = None,
     compressed: Compressed | None = None,
 ) -> Samples:
-    """Refits to resampled trials of the session that the fit was made from; the samples are read once.
+    """Refit to resampled trials of the session that the fit was made from.
 
-    What CAD gives and no stage estimates is drawn from its own distribution: no trial shows its error.
+    Parameters that CAD gives and no stage estimates are drawn from their own distribution, since trials do not show
+    their errors. `compressed`: the result of `compress(session, fit)`, where it is known.
     """
     compressed = compressed or compress(session, fit)
     rng = np.random.default_rng(seed)
@@ -61,7 +62,7 @@ def bootstrap(
 
 
 def draw_weights(strata: tuple[tuple, ...], resamples: int, rng: np.random.Generator) -> Float[np.ndarray, "R K"]:
-    """Weights of the trials in each resample: mean one, and the variance of a mean unbiased in every stratum."""
+    """Weights of the K trials in each of R resamples (Rao & Wu 1988): their mean is 1 in every stratum."""
     weights = np.ones((resamples, len(strata)))
     for members in _members(strata):
         n = len(members)
@@ -76,7 +77,7 @@ def _members(strata: tuple[tuple, ...]) -> list[np.ndarray]:
 
 
 def sandwich(session: Session, fit: Fit, compressed: Compressed | None = None) -> Float[np.ndarray, "P P"]:
-    """Covariance of the flat vector from the scatter between trials.
+    """Cluster-robust covariance CR3 of the flat vector, from refits without one trial at a time.
 
     Raises:
         UserError: without one of its trials the session no longer shows every parameter.
@@ -87,7 +88,7 @@ def sandwich(session: Session, fit: Fit, compressed: Compressed | None = None) -
         n = len(members)
         for k in members if n > 1 else []:
             weights = np.ones(len(compressed.strata))
-            # The others take over its weight, so that the stratum counts as before beside the other strata.
+            # The other trials take over its weight, so that the stratum keeps its total weight.
             weights[members] = n / (n - 1)
             weights[k] = 0.0
             rows.append(weights)
@@ -96,7 +97,7 @@ def sandwich(session: Session, fit: Fit, compressed: Compressed | None = None) -
     if failed.any():
         lost = compressed.trials[int(np.argmin(rows[int(np.argmax(failed))]))]
         raise UserError(f"without trial {lost} the session no longer shows every parameter; record another like it")
-    # What CAD leaves open comes on top: one standard deviation of each at a time, all trials as they are.
+    # Errors of CAD are added: one standard deviation of each given parameter at a time, with all trials.
     k = compressed.sizes[0]
     inherited, _ = refit(compressed, np.ones((k, len(compressed.strata))), np.eye(k))
     delta = np.concatenate([(theta - compressed.theta) * np.sqrt(factors)[:, None], inherited - compressed.theta])
@@ -104,10 +105,10 @@ def sandwich(session: Session, fit: Fit, compressed: Compressed | None = None) -
 
 
 def robust(session: Session, fit: Fit) -> Fit:
-    """The fit with a covariance that neither the noise model nor the scatter between trials contradicts.
+    """Copy of the fit whose standard deviations are the larger of Laplace's and the sandwich's; correlations are kept.
 
-    Where trials scatter more than the noise explains, the standard deviation is the sandwich's; where a stratum has too
-    few trials to tell, Laplace's stays.
+    Raises:
+        UserError: without one of its trials the session no longer shows every parameter.
     """
     wide = np.sqrt(np.diag(sandwich(session, fit)))
     std = fit.std
@@ -116,6 +117,6 @@ def robust(session: Session, fit: Fit) -> Fit:
 
 
 def identifiability(session: Session, fit: Fit, compressed: Compressed | None = None) -> list[Direction]:
-    """How well the session's trials see each combination of the parameters that the fit estimated, weakest first."""
+    """Singular directions of the estimated parameters on the session's trials, weakest first."""
     compressed = compressed or compress(session, fit)
     return directions(describe(fit.model), fit.estimated, compressed.information)

@@ -6,7 +6,7 @@ import pytest
 import scipy.linalg
 
 from jaxfinger.experiments import EXPERIMENTS, Batch, Stack
-from jaxfinger.identify.noise import FEW, SLOWER, Noise, estimate, whiten
+from jaxfinger.identify.noise import LONG_SIGNAL_WINDOW, MIN_SAMPLES_FOR_STD, Noise, estimate, whiten
 from jaxfinger.model import Motion
 
 SIZES, COUNTS, LENGTH = np.array([1.0, 5.0, 0.2]), (2000, 150, 20), 2400
@@ -51,7 +51,7 @@ def estimates():
 
 def test_every_column_with_samples_of_its_own_comes_out_white(estimates):
     energy = np.array([white for _, white in estimates])
-    assert COUNTS[2] < FEW < COUNTS[1]
+    assert COUNTS[2] < MIN_SAMPLES_FOR_STD < COUNTS[1]
     np.testing.assert_allclose(energy.mean(axis=0)[:2], 1.0, atol=0.08)
     assert np.abs(energy[:, :2] - 1.0).max() < 0.35  # of 300 rows, in a single estimate
 
@@ -62,7 +62,7 @@ def test_noise_that_nothing_repeats_keeps_its_slow_part():
     for seed in range(12):
         residual = coloured(np.random.default_rng(seed), (1, 2))
         mask = np.tile(np.arange(residual.shape[-1]) % 80 < 40, (1, 2, 1)).astype(float)
-        noise = estimate(stack_of(residual, mask, (None, None), 0.02), "joint_torque", residual, SLOWER)
+        noise = estimate(stack_of(residual, mask, (None, None), 0.02), "joint_torque", residual, LONG_SIGNAL_WINDOW)
         assert noise.source == "residuals"
         white = whiten(residual, mask, noise.coefficients, False)
         energy.append(np.sum(white**2) / mask.sum())
