@@ -1,4 +1,4 @@
-"""jaxfinger: the dynamic model of a tendon-driven finger, from recordings, and why it still misses the bench.
+"""jaxfinger: dynamic models of tendon-driven fingers from recordings, and diagnosis of the remaining sim-to-real gap.
 
     import jaxfinger as jf
 
@@ -40,7 +40,7 @@ _PLACES = {
     "check": "data:check_file",
     "diagnose": "gap.diagnose:diagnose",
     "fit_many": "identify:fit_many",
-    "identify": "identify",  # the room is called as its function
+    "identify": "identify",  # the package itself is callable
     "load": "identify:load_fit",
     "plot": "report.plots",
     "predict": "identify.predictions:predict_session",

@@ -1,4 +1,4 @@
-"""`python -m jaxfinger`: the command line, whatever is on the path."""
+"""Command line as `python -m jaxfinger`, for where the script `jaxfinger` is not on the path."""
 
 from jaxfinger.cli import main
 

@@ -1,4 +1,4 @@
-"""How functions are compiled and run: what runs a few times only must compile cheaply."""
+"""Compilation and concurrent runs of JAX functions; most run only a few times, so compile time matters most."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -10,23 +10,24 @@ import equinox as eqx
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# XLA's fusion emitters take half as long again, or more, to compile these scalar formulas, which then run no faster;
-# neither do they at -O2 and beyond, which takes a tenth more. What the environment's XLA_FLAGS state goes first.
+# XLA's fusion emitters compile these scalar formulas 50 % slower or worse, and -O2 and above 10 % slower; neither makes
+# them run faster. Options in the environment's XLA_FLAGS take precedence.
 QUICK = {
     name: value
     for name, value in {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}.items()
     if name not in os.environ.get("XLA_FLAGS", "")
 }
 
-# The overloads of equinox leave the options of jit out.
+# Equinox passes compiler options on to jax.jit, but its annotated overloads lack them.
 quick_jit = eqx.filter_jit(compiler_options=QUICK)  # type: ignore[call-overload]
 
 
 def side_by_side(f: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """f of each item, in order, two at a time: while one is traced by Python, another compiles or runs.
+    """Apply f to each item, two at a time, and yield the results in order.
 
-    No program among them may call LAPACK, as QR and `solve` do: two that do, dispatched at once, can hold all of XLA's
-    processor threads and wait for ever (8,192 systems of three equations do). NumPy has no such trap.
+    While Python traces one call, the other compiles or runs. The programs must not call LAPACK, as QR and `solve` do:
+    two programs that do can hold all of XLA's processor threads and deadlock (8,192 systems of three equations do).
+    NumPy's LAPACK calls are safe.
     """
     with ThreadPoolExecutor(2) as pool:
         yield from pool.map(f, items)

@@ -1,23 +1,23 @@
-"""What a user can mend is said in one sentence, without a traceback."""
+"""Errors that users can mend: one sentence, printed without a traceback."""
 
 from collections.abc import Collection
 from difflib import get_close_matches
 
 
 class UserError(Exception):
-    """A mistake in a file, a recipe or a command: the message names the place and the mend."""
+    """Mistake in a file, a recipe or a command; the message names the place and the remedy."""
 
 
 def did_you_mean(said: object, known: Collection[str]) -> str:
-    """` (did you mean 'time'?)`, to follow a name that is not known; empty where none is near it."""
+    """Suffix ` (did you mean 'time'?)` for a message on an unknown name; empty where no known name is similar."""
     if not isinstance(said, str):
         return ""
-    # Letters swapped, which difflib counts as two mistakes, or of another case, which it takes for others.
+    # difflib counts swapped letters as two mistakes and letters of another case as wrong; these come first.
     swapped = [name for name in known if sorted(name.casefold()) == sorted(said.casefold())]
     close = swapped or get_close_matches(said, list(known), 1)
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 def counted(number: int, noun: str) -> str:
-    """`1 error`, `2 errors`."""
+    """Number and noun, as `1 error` or `2 errors`."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

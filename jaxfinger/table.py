@@ -1,4 +1,4 @@
-"""Rows of a result: a list of dictionaries that prints as a table, in a terminal and in a notebook."""
+"""Tables of results: lists of dictionaries that print as tables in a terminal and in a notebook."""
 
 from collections.abc import Iterable
 from html import escape
@@ -6,29 +6,33 @@ from typing import Any
 
 
 class Table(list[dict[str, Any]]):
-    """Rows with the same keys, in order. SI units, named in a column where they differ from row to row."""
+    """List of rows, dictionaries with the same keys in order; SI units, in a column where they differ by row."""
 
     def __init__(self, rows: Iterable[dict[str, Any]] = ()):
         super().__init__(rows)
 
     @property
     def columns(self) -> list[str]:
-        """The keys of the rows."""
+        """Keys of the rows, in order of first occurrence."""
         return list(dict.fromkeys(k for row in self for k in row))
 
     def column(self, name: str) -> list[Any]:
-        """One column; None where a row lacks it.
+        """Values of one column; None where a row lacks it.
 
         Raises:
-            KeyError: there is no such column; it says which there are.
+            KeyError: there is no such column; the message lists the columns.
         """
         if name not in self.columns:
             raise KeyError(f"no column {name!r}; there are {', '.join(self.columns)}")
         return [row.get(name) for row in self]
 
     def to_dataframe(self):
-        """The rows as a pandas DataFrame, where pandas is installed."""
-        # Not a dependency: whoever asks for a DataFrame has it.
+        """Rows as a pandas DataFrame.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        # pandas is not a dependency, since only this method needs it.
         import pandas  # pyright: ignore[reportMissingImports]
 
         return pandas.DataFrame(list(self), columns=self.columns)

@@ -1,4 +1,7 @@
-"""The only place that joins data to model: which trials an experiment takes, and what it predicts from what."""
+"""Experiments: reduction of trials to arrays that a model reads, and prediction of channels from others.
+
+This is the only room that joins data to the model.
+"""
 
 from jaxfinger.experiments.predict import change, demean, predict
 from jaxfinger.experiments.prepare import Batch, NotJudged, Stack, not_judged, prepare

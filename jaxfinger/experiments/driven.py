@@ -1,6 +1,7 @@
-"""Joints that a motor or tendons drive (ID.3-dynamic, VD.3): torque counts where they slide, so that friction is known.
+"""Reduction of trials in which a motor or tendons drive the joints (ID.3-dynamic, VD.3).
 
-Both sides of (1) go through one low-pass before a fit; a prediction of every sample does without.
+A torque sample is valid where the joint and its tendons slide, since only then the direction of friction is known. For
+a fit both sides of (1) pass the same low-pass; for a prediction of every sample they do not.
 """
 
 import numpy as np
@@ -20,44 +21,47 @@ from jaxfinger.data.motion import quick_cutoff, rest_speed, speed_noise
 from jaxfinger.experiments.reduction import Joints, PreparedTrial, Row, joints, row
 from jaxfinger.experiments.shrink import shrink
 
-NOTHING = "nowhere do a joint and its tendons slide for long enough that the direction of their friction is known"
+NONE_VALID = "nowhere do a joint and its tendons slide for long enough that the direction of their friction is known"
 
-# Speeds are compared with their own noise (`data.motion`).
-FREE = 0.05  # of the motion's speed: a slower joint that tendons drive may stick and slip, its friction unknown
-DRIVEN = 3.0  # times the noise, or FREE if that is less: likewise a joint that a motor moves, which does not stick
-TENDON = 2.5  # times the noise: likewise a tendon
-LOST = 0.5  # of a joint's speed: what the slower filter may lose of it; stick and slip lose 1 to 3 times it
-ABOVE_NOISE = 15.0  # times the noise: what it loses must be more to be a slip
-ROUNDING = 1e-6  # of the motion's speed: what it loses of a joint that stands still in a simulated file
-CLEAR = 2.3  # widths of the filter kept clear on either side of where friction is not known: 1 % of a jump is left
-BREAKAWAY = 4.5  # widths kept clear after a joint that no motor moves has broken away: it does so at once
-# Times the median loss: 1.5 standard deviations of the encoder, the way over which friction turns. Longer ways serve
-# contacts that give, shorter ones those that do not (benchmarks/reversals.py).
-ENCODER = 2.2
-CALM = 0.1  # s, at the protocol's pace: over which q̈ is averaged where it does not rise above its noise
-# Times what white noise of the encoder's size would leave in q̈: a grid's lines and vibration leave up to eight times as
-# much (datasets/emps), and what is more than that is motion.
-COLOURED = 10.0
+# A joint or tendon slides for certain above these speeds; below, it may stick and its friction is unknown. Noise is
+# that of the speed itself (`data.motion`).
+MIN_SPEED_SHARE = 0.05  # of the motion's speed, for a joint that tendons drive and that may stick and slip
+MIN_SPEED_TO_NOISE = 3.0  # times the noise, for a joint that a motor moves; the share above where that is less
+MIN_TENDON_SPEED_TO_NOISE = 2.5  # times the noise, for a tendon
+# A slip between two stops is shorter than the slow filter, which then loses speed against the quick one.
+MAX_LOST_SPEED_SHARE = 0.5  # of a joint's speed that the slow filter may lose; stick and slip lose 1 to 3 times it
+MIN_SLIP_TO_NOISE = 15.0  # times the noise: a smaller loss is not a slip
+ROUNDING_SHARE = 1e-6  # of the motion's speed: a loss by rounding, of a joint at rest in a simulated file
+CLEAR_WIDTHS = 2.3  # widths of the filter left out on either side of unknown friction: 1 % of a jump remains beyond
+# Widths left out after a joint that no motor moves has broken away: it does so suddenly.
+BREAKAWAY_WIDTHS = 4.5
+# Travel over which friction reverses, in median residuals of the encoder: 1.5 of its standard deviations. A longer
+# travel suits compliant contacts, a shorter one stiff contacts (benchmarks/reversals.py).
+REVERSAL_TRAVEL = 2.2
+ACCELERATION_WINDOW = 0.1  # s, at the protocol's pace, over which q̈ is averaged where it does not exceed its noise
+# Largest noise of q̈, in units of that from white encoder noise: an encoder's grid and vibration cause up to eight
+# (datasets/emps), and more than ten is motion.
+MAX_ACCELERATION_NOISE = 10.0
 
 
 def reduce(r: PreparedTrial) -> Row:
-    """What slides counts for torque, everything for excursion."""
+    """Reduce a trial: torque is valid where joints and tendons slide, excursion everywhere."""
     j = joints(r, sharp=not r.reduced)
-    # When a joint turns back shows best in the slower filter: there noise of q̇ is noise in time.
+    # Reversals are taken from the slow filter: noise of q̇ moves the time of a reversal.
     slow = j.qd if r.reduced else smooth(r.trial.time, r.trial.q, r.spec.cutoff_at(r.step))[1]
     joint = joint_directions(r, j, slow)
     rates = None if r.spec.slack else tendon_rates(r)
     tendon = tendon_directions(r, rates)
-    slides = sliding(r, j.qd, slow, joint, rates, CLEAR * filter_std(r.spec.cutoff))
+    slides = sliding(r, j.qd, slow, joint, rates, CLEAR_WIDTHS * filter_std(r.spec.cutoff))
 
     qdd, tension, y = j.qdd, r.tension(), r.y
     if r.reduced or r.spec.slack:
-        # Noise of q̈ would tell a fit of less inertia (errors in variables), and a prediction that stands beside a
-        # measured torque of one that is not there: where q̈ does not rise above it, its mean takes its place.
-        most = COLOURED * 1.4826 * j.noise * filtered_noise_std(j.cutoff, r.step, 2)
-        qdd = shrink(qdd, round(CALM * r.spec.pace / r.step), most)
+        # Noise of q̈ biases a fit to less inertia (errors in variables), and adds a spurious torque to a prediction.
+        # Where q̈ does not exceed its noise, it is therefore replaced by its running mean.
+        most = MAX_ACCELERATION_NOISE * 1.4826 * j.noise * filtered_noise_std(j.cutoff, r.step, 2)
+        qdd = shrink(qdd, round(ACCELERATION_WINDOW * r.spec.pace / r.step), most)
     if r.reduced:
-        # q̈ is low-passed, so all else is too.
+        # All other terms pass the low-pass of q̈.
         joint, tendon, tension = (low_pass(r.trial.time, a, j.cutoff) for a in (joint, tendon, tension))
         y = {c: low_pass(r.trial.time, values, j.cutoff) for c, values in y.items()}
     known = r.mean(slides.astype(float)) > 1.0 - 1e-9
@@ -76,17 +80,19 @@ def reduce(r: PreparedTrial) -> Row:
 
 
 def joint_directions(r: PreparedTrial, j: Joints, slow: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
-    """The protocol's directions, else those of the filtered motion: for a fit they turn where a motion back is sure
-    (samples beside do not count), for a prediction where it began.
+    """Directions of the joints: the protocol's, else those of the filtered motion.
+
+    For a fit they reverse where the motion back is certain, since samples near a reversal are left out. For a
+    prediction they reverse where the motion back began.
     """
     if r.trial.joint_direction is not None:
         return r.trial.joint_direction.astype(float)
     sure = directions(slow, rest_speed(slow, r.quick_rates))
-    return sure if r.reduced else directions_from_turning_points(sure, j.q, ENCODER * j.noise)
+    return sure if r.reduced else directions_from_turning_points(sure, j.q, REVERSAL_TRAVEL * j.noise)
 
 
 def tendon_rates(r: PreparedTrial) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]] | None:
-    """Tendon speeds, m/s, in a slow filter and in a quicker one; none where excursions were not measured."""
+    """Tendon speeds, m/s, in a slow filter and in a quicker one; None where excursions were not measured."""
     if r.trial.tendon_excursion is None:
         return None
     excursion = without_spikes(np.nan_to_num(r.trial.tendon_excursion))
@@ -96,7 +102,7 @@ def tendon_rates(r: PreparedTrial) -> tuple[Float[np.ndarray, "N n"], Float[np.n
 
 
 def tendon_directions(r: PreparedTrial, rates) -> Float[np.ndarray, "N n"]:
-    """The protocol's, else those of the measured excursions; 0 of tendons that are slack."""
+    """Directions of the tendons: the protocol's, else those of the measured excursions; 0 for slack tendons."""
     if r.spec.slack:
         return np.zeros((len(r.trial.time), r.finger.n))
     if r.trial.tendon_direction is not None:
@@ -104,8 +110,8 @@ def tendon_directions(r: PreparedTrial, rates) -> Float[np.ndarray, "N n"]:
     if rates is None:
         return np.zeros((len(r.trial.time), r.finger.n))
     slow, quick = rates
-    least = np.minimum(0.1 * TENDON * speed_noise(slow, quick), 0.1 * np.percentile(np.abs(slow), 95, axis=0))
-    return directions(slow, least)
+    noise, speed = speed_noise(slow, quick), np.percentile(np.abs(slow), 95, axis=0)
+    return directions(slow, np.minimum(0.1 * MIN_TENDON_SPEED_TO_NOISE * noise, 0.1 * speed))
 
 
 def sliding(
@@ -116,38 +122,39 @@ def sliding(
     rates: tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]] | None,
     clear: float,
 ) -> Bool[np.ndarray, "N m"]:
-    """Where a joint and every taut tendon across it slide, so that the directions of friction are known.
+    """Whether a joint and every taut tendon across it slide, so that the directions of friction are known.
 
-    `slow`: speeds in the slower filter; `rates`: of the tendons, none where all are slack or not measured; `clear`: s,
-    kept clear on either side of where they are not.
+    `qd`, `slow`: joint speeds, rad/s, in the fit's filter and in a slower one. `rates`: speeds of the tendons, None
+    where all are slack or unmeasured. `clear`: s, left out on either side of samples where they do not slide.
     """
     lost, fast = np.abs(r.quick_rates - slow), np.percentile(np.abs(qd), 95, axis=0)
     noise = np.median(lost, axis=0)
-    least = np.where(r.motorised, np.minimum(DRIVEN * noise, FREE * fast), FREE * fast)
+    least = MIN_SPEED_SHARE * fast
+    least = np.where(r.motorised, np.minimum(MIN_SPEED_TO_NOISE * noise, least), least)
     slides = (np.abs(qd) > least) & (np.sign(qd) == np.sign(direction))
-    slides[1:] &= np.sign(qd[1:]) == np.sign(qd[:-1])  # a quick reversal has no slow sample
+    slides[1:] &= np.sign(qd[1:]) == np.sign(qd[:-1])  # a quick reversal may have no slow sample
     if rates is not None and r.trial.tendon_force is not None:
         known = _friction_known(r, *rates)
         for i in range(r.finger.m):
             slides[:, i] &= known[:, r.finger.crosses[:, i] & r.finger.active].all(axis=1)
     if not r.spec.stepped:
-        # A slip between two stops is too fast for the filter, and moves every joint.
+        # A slip of one joint between two stops disturbs every joint.
         pace = np.percentile(np.abs(slow), 95, axis=0)
-        most = np.maximum(LOST * pace, ABOVE_NOISE * noise) + ROUNDING * pace.max(initial=0.0)
-        slides &= np.all(lost <= most, axis=1)[:, None]
-    # The filter spreads the jump of friction at a reversal, and friction before it slides is not known; nor is what
-    # lies before a recording and after it, on whose image the filter leans.
+        most = np.maximum(MAX_LOST_SPEED_SHARE * pace, MIN_SLIP_TO_NOISE * noise)
+        slides &= np.all(lost <= most + ROUNDING_SHARE * pace.max(initial=0.0), axis=1)[:, None]
+    # The filter spreads the jump of friction at a reversal, and reads samples of unknown friction before a slide.
+    # Beyond the ends of a recording it reads extrapolated samples.
     apart = minimum_filter1d(slides, 2 * round(clear / r.step) + 1, axis=0, mode="constant", cval=False)
-    # Reaches back only: a free joint that breaks away does so at once, and takes the others with it.
-    half = round(0.5 * BREAKAWAY * filter_std(r.spec.cutoff) / r.step)
+    # The window reaches back only: a free joint breaks away suddenly and moves the others.
+    half = round(0.5 * BREAKAWAY_WIDTHS * filter_std(r.spec.cutoff) / r.step)
     return np.where(r.motorised, apart, minimum_filter1d(apart, 2 * half + 1, axis=0, origin=half))
 
 
 def _friction_known(r: PreparedTrial, slow, quick) -> Bool[np.ndarray, "N n"]:
-    """Where a tendon is slack, or slides for certain: faster than it stretches, and in a quicker filter too."""
+    """Whether a tendon is slack, or slides for certain: faster than it stretches, and in both filters."""
     tension, cutoff = r.tension(), min(r.spec.cutoff / 2.0, 0.2 / r.step)
     stretches = r.sizes.compliance * np.abs(smooth(r.trial.time, tension, cutoff)[1])
     measured = np.isfinite(np.asarray(r.trial.tendon_excursion)).all(axis=0)
-    least = TENDON * speed_noise(slow, quick)
+    least = MIN_TENDON_SPEED_TO_NOISE * speed_noise(slow, quick)
     moves = (np.abs(slow) > least + stretches) & (np.sign(slow) * quick > 0.5 * least)
     return (tension <= r.sizes.slack) | (moves & measured)

@@ -1,8 +1,8 @@
-"""A fixture holds the joints while a tendon is pulled (ID.4, VD.2), in steps or in ramps.
+"""Reduction of trials in which a fixture holds the joints while a tendon is pulled, in steps or ramps (ID.4, VD.2).
 
-A tendon slips past its loss only, and keeps the tension that it has at the joints until it does (from slack on:
-`tendon_friction.held`). Holds count, and motion of which the model knows where it slips: a step that goes on as the one
-before, and ramps so slow that they hardly change within a block.
+A held tendon slips only where its loss is exceeded, and otherwise keeps its tension at the joints
+(`tendon_friction.held`, from slack on). Valid samples are holds, and changes in which the model knows where the tendon
+slips: a step in the direction of the one before, and ramps so slow that the tension hardly changes within a block.
 """
 
 from itertools import pairwise
@@ -17,34 +17,38 @@ from jaxfinger.data.motion import RAMP_BLOCKS, slow_ramps, stretches_of
 from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, stretches
 from jaxfinger.experiments.shrink import shrink
 
-NOTHING = "no tendon is pulled from slack in holds, or in ramps slow enough to tell its friction"
-PARTS = 6  # of a hold, whose means say how well its own is known; longer than an encoder's noise is correlated
-OVERSHOOT = 4.0  # standard deviations: tension beyond that of both holds by more was really there
-FEW = 3  # holds from which on their spread tells whether a fixture yields
+NONE_VALID = "no tendon is pulled from slack in holds, or in ramps slow enough to tell its friction"
+HOLD_PARTS = 6  # of a hold, whose means give the noise of its mean; encoder noise is correlated over less than one part
+MIN_OVERSHOOT = 4.0  # standard deviations of noise beyond both holds; tension beyond that is a real overshoot
+MIN_HOLDS = 3  # from which on the spread of holds shows whether a fixture yields
+RAMP_SAMPLE = -2  # marks the samples of a ramp among the numbers of holds
 
 
 def reduce(r: PreparedTrial) -> Row:
-    """Holds and ramps count from slack on; the excursion of a tendon counts wherever it is taut."""
+    """Reduce a trial: holds and ramps are valid once friction no longer depends on the past, excursions where taut."""
     j = joints(r, sharp=not r.reduced)
     hold = r.whole(find_holds(r.trial, r.spec.pace))
     tension = measured = r.tension()
     if not r.reduced:
-        # As smooth as the blocks of a fit: what slips at a noise peak would stay there until the next step.
+        # As smooth as the block means of a fit: a tendon that slips at a peak of noise would stay there.
         tension = uniform_filter1d(tension, max(1, round(1.0 / (r.spec.rate * r.step))), axis=0, mode="nearest")
     pulled = r.taut(r.mean(tension))
     ramps = slow_ramps(pulled, hold, round(RAMP_BLOCKS / (r.spec.rate * r.step * r.size)), r.sizes.travel)
-    pulled = _in_steps(_in_ramps(pulled, ramps, r.sizes.travel), np.where(ramps, -2, hold), slack=True)
-    counts = (hold >= 0) | _goes_on(pulled, hold, r.sizes.travel)
+    pulled = _monotonic_ramps(pulled, ramps, r.sizes.travel)
+    pulled = _clipped_between_holds(pulled, np.where(ramps, RAMP_SAMPLE, hold), slack=True)
+    counts = (hold >= 0) | _continues(pulled, hold, r.sizes.travel)
     taut = r.lowest(measured) > r.sizes.slack
     known = ((counts | ramps) & _from_slack(r, pulled))[:, None]
     counting = {c: counts[:, None] | taut if c == "tendon_excursion" else known for c in r.y}
     still = np.zeros_like(j.qd)
-    return row(r, _in_fixture(r.mean(r.trial.q), hold), (still, still), pulled, counting, j.noise, hold=hold)
+    return row(r, _fixture_angles(r.mean(r.trial.q), hold), (still, still), pulled, counting, j.noise, hold=hold)
 
 
 def _from_slack(r: PreparedTrial, tension: Float[np.ndarray, "M n"]) -> Bool[np.ndarray, " M"]:
-    """Where what friction has taken before the trial's first sample no longer matters: a recording that starts with a
-    taut tendon counts from that tendon's first change on, or from where the protocol says how it was approached.
+    """Whether friction no longer depends on the time before the trial, block by block.
+
+    A tendon that is taut at the first sample counts from its first change of tension on, or from where the protocol
+    gives its direction.
     """
     known = np.abs(tension - tension[0]) > r.sizes.travel
     if r.trial.tendon_direction is not None:
@@ -53,9 +57,10 @@ def _from_slack(r: PreparedTrial, tension: Float[np.ndarray, "M n"]) -> Bool[np.
     return np.asarray(np.all(np.logical_or.accumulate(known, axis=0), axis=1))
 
 
-def _in_ramps(tension: Float[np.ndarray, "M n"], ramps: Bool[np.ndarray, " M"], travel: float):
-    """Tension that only rises or only falls between two turning points: a held tendon keeps the highest that it has
-    seen, so a running maximum over noise would drift upwards.
+def _monotonic_ramps(tension: Float[np.ndarray, "M n"], ramps: Bool[np.ndarray, " M"], travel: float):
+    """Make the tension of ramps monotonic between turning points, by isotonic regression.
+
+    A held tendon keeps the highest tension that it has seen, so that peaks of noise would add up.
     """
     out = tension.copy()
     for begin, end in stretches_of(ramps):
@@ -69,7 +74,7 @@ def _in_ramps(tension: Float[np.ndarray, "M n"], ramps: Bool[np.ndarray, " M"], 
 
 
 def _turning_points(x: Float[np.ndarray, " M"], least: float) -> list[int]:
-    """Where x turns back by more than `least`."""
+    """Indices where x reverses by more than `least`."""
     turns, way, low, high = [], 0, 0, 0
     for i, value in enumerate(x):
         low, high = (i if value < x[low] else low), (i if value > x[high] else high)
@@ -80,32 +85,33 @@ def _turning_points(x: Float[np.ndarray, " M"], least: float) -> list[int]:
     return [t for t in turns if t > 0]
 
 
-def _in_fixture(q: Float[np.ndarray, "M m"], hold: Int[np.ndarray, " M"]) -> Float[np.ndarray, "M m"]:
-    """The mean of all holds, and of what they differ by, the share that is not the noise of their means (James and
-    Stein's estimator); without holds likewise of every second's angles.
+def _fixture_angles(q: Float[np.ndarray, "M m"], hold: Int[np.ndarray, " M"]) -> Float[np.ndarray, "M m"]:
+    """Angles in a fixture that may yield: means of holds, shrunk towards their common mean (James and Stein).
 
-    A fixture may yield. Noise of the angle would look like a law of it, and near a singular posture a contact force
-    amplifies it a thousandfold.
+    The share of their spread that the noise of a mean explains is removed. Otherwise noise of the angle would look like
+    a law of it, and near a singular posture it would be amplified a thousandfold in a contact force. Without holds the
+    local Wiener filter does the same (`shrink`).
     """
     runs = stretches(hold)
     if not runs:
         return shrink(q, RAMP_BLOCKS)
-    if len(runs) < FEW:
-        return _in_steps(q, hold)
+    if len(runs) < MIN_HOLDS:
+        return _clipped_between_holds(q, hold)
     means = np.stack([q[run].mean(axis=0) for run in runs])
-    parts = [np.stack([x.mean(axis=0) for x in np.array_split(q[run], PARTS)]) for run in runs if len(run) >= PARTS]
-    noise = np.mean([x.var(axis=0, ddof=1) / PARTS for x in parts], axis=0) if parts else np.zeros(q.shape[1])
+    splits = [np.array_split(q[run], HOLD_PARTS) for run in runs if len(run) >= HOLD_PARTS]
+    parts = [np.stack([x.mean(axis=0) for x in split]) for split in splits]
+    noise = np.mean([x.var(axis=0, ddof=1) / HOLD_PARTS for x in parts], axis=0) if parts else np.zeros(q.shape[1])
     spread = means.var(axis=0, ddof=1)
     share = 1.0 - np.minimum(noise / np.where(spread > 0.0, spread, 1.0), 1.0)
-    return means.mean(axis=0) + share * (_in_steps(q, hold) - means.mean(axis=0))
+    return means.mean(axis=0) + share * (_clipped_between_holds(q, hold) - means.mean(axis=0))
 
 
-def _in_steps(values: Float[np.ndarray, "M k"], hold: Int[np.ndarray, " M"], slack: bool = False):
-    """At a hold its mean, and between holds nothing beyond the two means; before and after all as in the first and
-    last, or down to nothing where it is `slack` there. Samples of a ramp, marked by −2, stay as they are.
+def _clipped_between_holds(values: Float[np.ndarray, "M k"], hold: Int[np.ndarray, " M"], slack: bool = False):
+    """Replace holds by their means and clip samples between two holds to the range of both means.
 
-    What lies beyond the two means by more than four standard deviations is a real overshoot, and stays but for those
-    four.
+    Before the first and after the last hold the range is that hold's mean; with `slack` it extends to zero. An
+    overshoot beyond the range is kept, less `MIN_OVERSHOOT` standard deviations of noise. Samples of ramps are not
+    changed.
     """
     runs = stretches(hold)
     if not runs:
@@ -119,18 +125,18 @@ def _in_steps(values: Float[np.ndarray, "M k"], hold: Int[np.ndarray, " M"], sla
     after = np.minimum(np.searchsorted([run[0] for run in runs], at, side="right") + 1, len(means) - 1)
     kept = np.clip(out, np.minimum(means[before], means[after]), np.maximum(means[before], means[after]))
     beyond = out - kept
-    out = kept + np.sign(beyond) * np.maximum(np.abs(beyond) - OVERSHOOT * noise, 0.0)
+    out = kept + np.sign(beyond) * np.maximum(np.abs(beyond) - MIN_OVERSHOOT * noise, 0.0)
     for mean, run in zip(means[1:], runs, strict=False):
         out[run] = mean
-    out[hold == -2] = values[hold == -2]
+    out[hold == RAMP_SAMPLE] = values[hold == RAMP_SAMPLE]
     return out
 
 
-def _goes_on(tension: Float[np.ndarray, "M n"], hold: Int[np.ndarray, " M"], travel: float) -> Bool[np.ndarray, " M"]:
-    """Between which holds every tendon goes on as it went before.
+def _continues(tension: Float[np.ndarray, "M n"], hold: Int[np.ndarray, " M"], travel: float) -> Bool[np.ndarray, " M"]:
+    """Whether a sample lies between holds in a step that every tendon takes in the direction of its last one.
 
-    Where it turns back, or leaves slack, it sticks and then slips within one block, whose mean tension does not tell
-    when.
+    A tendon that turns back or leaves slack sticks first and then slips within one block, whose mean tension does not
+    tell when.
     """
     out = np.zeros(len(hold), bool)
     runs = stretches(hold)

@@ -1,4 +1,4 @@
-"""Joints along a path, by a hand or a motor (ID.2, VD.1): the tendons' excursions follow their angles."""
+"""Reduction of trials in which a hand or a motor moves the joints along a path (ID.2, VD.1)."""
 
 import numpy as np
 
@@ -6,13 +6,13 @@ from jaxfinger.data import directions
 from jaxfinger.data.motion import rest_speed
 from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row
 
-NOTHING = "no sample is measured"
+NONE_VALID = "no sample is measured"
 
 
 def reduce(r: PreparedTrial) -> Row:
-    """Every sample counts where it is measured."""
+    """Reduce a trial: every measured sample is valid, since excursions follow the angles alone."""
     j = joints(r, sharp=not r.reduced)
-    # Averaged over the same blocks as what it predicts, and not filtered where that is not.
+    # In a fit the excursions are block means of unfiltered samples, so the angles are, too.
     q = r.mean(r.trial.q if r.reduced else j.q)
     joint = r.trial.joint_direction
     joint = directions(j.qd, rest_speed(j.qd, r.quick_rates)) if joint is None else joint.astype(float)

@@ -1,4 +1,4 @@
-"""What the model says each experiment's channels read, from the other measured channels."""
+"""Predictions of an experiment's channels by a model, from the other measured channels."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ from jaxfinger.model import (
     simulated_ahead,
 )
 
-_TRUTH = {
+_PREDICTORS = {
     "tendon_excursion": excursion,
     "joint_torque": external_torque,
     "fingertip_force": fingertip_force,
@@ -28,9 +28,9 @@ _TRUTH = {
 
 
 def predict(model: Model, measured: Motion, channels: tuple[str, ...]) -> dict[str, Float[Array, "columns *T"]]:
-    """Each channel by its dataset's name, batch last; units of the format."""
+    """Predict the reading of each channel, by its dataset's name, in the format's units; batch last."""
     x = model.true_motion(measured)
-    return {c: model.reading(c, x, _TRUTH[c](model, x)) for c in channels}
+    return {c: model.reading(c, x, _PREDICTORS[c](model, x)) for c in channels}
 
 
 def change(
@@ -42,13 +42,13 @@ def change(
     plain: Terms | None,
     contact: Float[Array, "3 m *T"] | None,
 ) -> Float[Array, "columns *T"]:
-    """What an effect changes in a channel's prediction `y0`, of which only that is evaluated.
+    """Change of a channel's nominal prediction `y0` by one effect; only changed terms of (1) are evaluated.
 
-    `plain`: the nominal terms of (1) behind a torque or a force; `contact`: of a force, the `contact_map`.
+    `plain`: nominal terms (`plain_terms`), for a torque or a force. `contact`: `contact_map`, for a force, else None.
     """
     model = replace(nominal, effects=(effect,))
     true = model.true_motion(x)
-    same = true is x  # but for a sensor's effect
+    same = true is x  # false for effects of sensors
     if channel == "tendon_excursion":
         y = excursion(model, true, y0 if same else None)
     elif effect.moves_rigid_body() and contact is not None:
@@ -63,6 +63,6 @@ def change(
 
 
 def demean(y: Float[Array, "columns B T"], mask: Float[Array, "columns B T"]) -> Float[Array, "columns B T"]:
-    """Without one constant a trial and column: the encoders' zero of an excursion is arbitrary."""
+    """Remove the mean over valid samples of each trial and column, since the zero of an encoder is arbitrary."""
     mean = jnp.sum(y * mask, axis=-1, keepdims=True) / jnp.maximum(jnp.sum(mask, axis=-1, keepdims=True), 1.0)
     return (y - mean) * mask

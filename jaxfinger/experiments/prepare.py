@@ -1,4 +1,4 @@
-"""From recordings to arrays that a fit can take: each trial by its kind of motion, then padded stacks of trials."""
+"""Preparation of recordings for a model: trials are reduced by their kind of motion, and stacked with padding."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -18,37 +18,38 @@ from jaxfinger.experiments.table import EXPERIMENTS, Experiment
 from jaxfinger.model import Motion
 
 KINDS = {"path": path, "driven": driven, "stepped": stepped, "held": held}
-LONG = 10_000  # samples of a trial from which on its filters, which let go of the interpreter, are worth a thread
-FEW_LENGTHS = 64  # samples to whose multiples trials are padded: few distinct lengths, few compilations
+# Samples of a trial above which it is filtered in a thread of its own; filters release the interpreter's lock.
+MIN_THREADED_SAMPLES = 10_000
+LENGTH_MULTIPLE = 64  # samples; trials are padded to multiples of it, so that few lengths have to be compiled
 
 
 class Batch(eqx.Module):
-    """All trials of one experiment, reduced, padded to one length: B trials of T samples."""
+    """B trials of one experiment, reduced and padded to T samples."""
 
     x: Motion  # (…, B, T)
-    y: dict[str, Float[Array, "_columns *B T"]]  # measured channels, zero where they do not count
-    mask: dict[str, Float[Array, "_columns *B T"]]  # 1 where a sample counts
+    y: dict[str, Float[Array, "_columns *B T"]]  # measured channels, zero where the mask is 0
+    mask: dict[str, Float[Array, "_columns *B T"]]  # 1 where a sample is valid, else 0
 
 
 @dataclass(frozen=True)
 class Stack:
-    """A batch with the names of its trials, on the host."""
+    """A batch with the names, motions and holds of its trials."""
 
     experiment: Experiment
     batch: Batch
     trials: tuple[str, ...]
-    motions: tuple[str | None, ...]  # trials with the same motion repeat one another
+    motions: tuple[str | None, ...]  # trials of the same name of a motion repeat it
     holds: Int[np.ndarray, "B T"]  # index of the static hold, −1 between holds
-    dt: float  # s
+    dt: float  # s, between samples
     measured: dict[str, bool]  # by channel: whether any trial measured it
 
     def samples_of_holds(self, trial: int, counts: np.ndarray) -> list[np.ndarray]:
-        """Which samples of each static hold of a trial count, hold by hold; `counts`: (T,), not zero where one does."""
+        """Indices of the valid samples of each hold of a trial; `counts` (T,) is nonzero where a sample is valid."""
         return stretches(np.where(counts, self.holds[trial], -1))
 
 
 class NotJudged(NamedTuple):
-    """A channel of an experiment of which not one sample counts, and why."""
+    """Channel of an experiment without a single valid sample, and the reason."""
 
     experiment: str
     channel: str
@@ -62,10 +63,14 @@ def prepare(
     minus: Predictions | None = None,
     coarse: int = 1,
 ) -> dict[str, Stack]:
-    """One stack an experiment, of the named trials (default all), averaged to the experiment's rate unless told.
+    """Reduce and stack the named trials (default all), one stack for each experiment.
 
-    `coarse`: averaged over so many times as long.
-    With `minus` the channels are measurement minus prediction, and what is not predicted does not count.
+    `reduced`: whether trials are averaged to the experiment's rate, for a fit; otherwise every sample is kept.
+    `coarse`: factor on the length of the averaging blocks. `minus`: predictions that are subtracted from the
+    measurements; samples without a prediction are invalid.
+
+    Raises:
+        UserError: trials of one experiment are sampled at rates too different to be stacked.
     """
     sizes, stacks = sizes_of(session), {}
     for spec in (e.at(sizes.pace if e.kind == "driven" else sizes.slow_pace) for e in EXPERIMENTS.values()):
@@ -76,7 +81,7 @@ def prepare(
             r = prepared(spec, trial, session, sizes, reduced, minus, coarse)
             return KINDS[spec.kind].reduce(r), {c: bool(s.any()) for c, s in r.sound.items()}
 
-        long = any(len(t.time) > LONG for t in trials)
+        long = any(len(t.time) > MIN_THREADED_SAMPLES for t in trials)
         with ThreadPoolExecutor(None if long else 1) as pool:
             rows = list(pool.map(row, trials))
         if rows:
@@ -85,13 +90,13 @@ def prepare(
 
 
 def not_judged(stacks: dict[str, Stack]) -> list[NotJudged]:
-    """The channels of which no sample counts in any trial: whoever finds no gap there has not looked."""
+    """Channels without a valid sample in any trial, in which no gap can be found."""
     out = []
     for name, stack in stacks.items():
         for c in stack.experiment.channels:
             if not np.asarray(stack.batch.mask[c]).any():
                 kind = KINDS[stack.experiment.kind]
-                out.append(NotJudged(name, c, kind.NOTHING if stack.measured[c] else "no trial measured it"))
+                out.append(NotJudged(name, c, kind.NONE_VALID if stack.measured[c] else "no trial measured it"))
     return out
 
 
@@ -105,7 +110,7 @@ def _stack(spec: Experiment, trials: list[Trial], reduced_trials: list[tuple[Row
             f"{spec.rate:g} Hz"
         )
     T = max(r.motion["time"].size for r in rows)
-    T = -(-T // FEW_LENGTHS) * FEW_LENGTHS
+    T = -(-T // LENGTH_MULTIPLE) * LENGTH_MULTIPLE
 
     def pad(arrays, constant=False):
         out = np.zeros((*arrays[0].shape[:-1], len(arrays), T))

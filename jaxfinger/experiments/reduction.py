@@ -1,4 +1,4 @@
-"""The steps that all kinds of motion share on the way from a recording to arrays that a model reads."""
+"""Steps of the reduction of a trial that all kinds of motion share."""
 
 import math
 from collections.abc import Mapping
@@ -25,71 +25,72 @@ from jaxfinger.data.sizes import Sizes
 from jaxfinger.effects.drive import NOMINAL_TEMPERATURE
 from jaxfinger.experiments.table import Experiment
 
-AT_REST = 6.0  # times the median loss: an angle that turns back by less has not moved; twice that for single samples
+# An angle that turns back by less has not moved, in median residuals of the encoder; twice that for single samples.
+JITTER = 6.0
 
 
 @dataclass(frozen=True)
 class PreparedTrial:
-    """A trial, its spikes bridged, and how it is to be reduced."""
+    """A trial of N samples whose spikes are bridged, to be reduced to M blocks of `size` samples."""
 
     spec: Experiment
-    trial: Trial  # spikes bridged in what drives the model
+    trial: Trial  # with spikes bridged in the angles and tensions
     finger: FingerDescription
     sizes: Sizes
-    reduced: bool  # averaged for a fit; else for a prediction of every sample
-    step: float  # s
+    reduced: bool  # whether blocks are averaged for a fit; otherwise each sample is a block
+    step: float  # s, between samples
     size: int  # samples of a block
-    y: dict[str, Float[np.ndarray, "N columns"]]  # what is to be predicted, spikes bridged
-    sound: dict[str, Bool[np.ndarray, "N columns"]]  # measured, and no spike
+    y: dict[str, Float[np.ndarray, "N columns"]]  # channels to be predicted, spikes bridged
+    sound: dict[str, Bool[np.ndarray, "N columns"]]  # whether a sample is measured and not a spike
 
     @cached_property
     def quick_rates(self) -> Float[np.ndarray, "N m"]:
-        """rad/s, in a filter that still sees a joint stand still between two slips."""
+        """Joint speeds, rad/s, in a filter quick enough to resolve a stop between two slips."""
         return smooth(self.trial.time, self.trial.q, quick_cutoff(self.spec.cutoff_at(self.step), self.step))[1]
 
     @property
     def motorised(self) -> Bool[np.ndarray, " m"]:
-        """Which joints an external motor or a fixture with a torque sensor is coupled to."""
+        """Whether an external motor, or a fixture with a torque sensor, is coupled to each joint."""
         coupled = joints_of(self.trial, self.finger) if "joint_torque" in self.spec.channels else ()
         return np.array([name in coupled for name in self.finger.joint_names])
 
     def mean(self, a: Float[np.ndarray, "N *k"]) -> Float[np.ndarray, "M *k"]:
-        """Block means."""
-        # A product is ten times as fast as `mean` along an axis in the middle.
+        """Means of blocks."""
+        # A matrix product is ten times as fast as `mean` along the middle axis.
         M = len(a) // self.size
         blocks = a[: M * self.size].reshape(M, self.size, math.prod(a.shape[1:]))
         return (np.ones(self.size) @ blocks / self.size).reshape(M, *a.shape[1:])
 
     def lowest(self, a: Float[np.ndarray, "N k"]) -> Float[np.ndarray, "M k"]:
-        """Least value of every block."""
+        """Minima of blocks."""
         M = len(a) // self.size
         return a[: M * self.size].reshape(M, self.size, -1).min(axis=1)
 
     def whole(self, hold: Int[np.ndarray, " N"]) -> Int[np.ndarray, " M"]:
-        """Hold of every block, −1 where it is not wholly within one."""
+        """Number of the hold of each block, −1 where the block is not wholly within one."""
         blocks = hold[: len(hold) // self.size * self.size].reshape(-1, self.size)
         return np.where((blocks == blocks[:, :1]).all(axis=1), blocks[:, 0], -1)
 
     def tension(self) -> Float[np.ndarray, "N n"]:
-        """Measured tension, zero where there is none."""
+        """Measured tension, N, zero where it was not measured."""
         force = self.trial.tendon_force
         return np.zeros((len(self.trial.time), self.finger.n)) if force is None else np.nan_to_num(force)
 
     def taut(self, tension: Float[np.ndarray, "M n"]) -> Float[np.ndarray, "M n"]:
-        """Tension without that of tendons that are slack all the time."""
+        """Tension, N, set to zero for tendons that are slack throughout the trial."""
         slack = np.percentile(tension, 95, axis=0) < self.sizes.slack
         return np.where(slack | self.spec.slack, 0.0, tension)
 
 
 @dataclass(frozen=True)
 class Row:
-    """One trial, reduced: NumPy arrays with time last."""
+    """One reduced trial: NumPy arrays with time last, by field of `Motion` or by channel."""
 
     motion: dict[str, np.ndarray]
     y: dict[str, np.ndarray]
     mask: dict[str, np.ndarray]
     hold: np.ndarray
-    dt: float  # s
+    dt: float  # s, length of a block
 
 
 def prepared(
@@ -101,8 +102,9 @@ def prepared(
     minus: Predictions | None = None,
     coarse: int = 1,
 ) -> PreparedTrial:
-    """A trial made ready: the channels that drive the model without spikes; those that it predicts keep theirs, which
-    do not count.
+    """Prepare a trial for its reduction: bridge spikes and find valid samples.
+
+    `minus`, `coarse`: as in `prepare`.
     """
     step = float(np.median(np.diff(trial.time)))
     size = max(1, round(coarse / (spec.rate * step))) if reduced else 1
@@ -116,14 +118,14 @@ def _despiked(trial: Trial) -> Trial:
 
 
 def _measured(spec: Experiment, trial: Trial, finger: FingerDescription, minus: Predictions | None, longest: int):
-    """The channels to be predicted, spikes bridged, and which samples of them are measured and no spike."""
+    """Channels to be predicted, with spikes bridged, and whether each sample is measured and not a spike."""
     N = len(trial.time)
     width = {"tendon_excursion": finger.n, "joint_torque": finger.m, "fingertip_force": 3}
     y, sound = {}, {}
     for c in spec.channels:
         values = getattr(trial, c)
         if values is None and c == "joint_torque" and spec.kind == "driven":
-            values = np.zeros((N, finger.m))  # nothing acts from outside on the free finger
+            values = np.zeros((N, finger.m))  # no external torque acts on the free finger
         if values is None:
             values = np.full((N, width[c]), np.nan)
         if minus is not None:
@@ -140,7 +142,7 @@ def _measured(spec: Experiment, trial: Trial, finger: FingerDescription, minus: 
 
 
 def _predicted(prediction: Mapping[str, np.ndarray], channel: str, trial: Trial, like: np.ndarray) -> np.ndarray:
-    """A predicted channel at the trial's times, NaN where there is none."""
+    """Predicted channel at the trial's times, in the shape of `like`; NaN where there is no prediction."""
     if channel not in prediction:
         return np.full(like.shape, np.nan)
     columns = prediction[channel].T
@@ -149,18 +151,19 @@ def _predicted(prediction: Mapping[str, np.ndarray], channel: str, trial: Trial,
 
 @dataclass(frozen=True)
 class Joints:
-    """Angles and their derivatives in the filter of a prediction, and what that filter took off: (N, m)."""
+    """Filtered angles, rad, with derivatives, rad/s and rad/s²."""
 
     q: Float[np.ndarray, "N m"]
     qd: Float[np.ndarray, "N m"]
     qdd: Float[np.ndarray, "N m"]
-    noise: Float[np.ndarray, " m"]  # rad, the median of what it took off: the encoder's noise
-    cutoff: float  # Hz
+    noise: Float[np.ndarray, " m"]  # rad, median magnitude of the filter's residual, the encoder's noise
+    cutoff: float  # Hz, of the filter
 
 
 def joints(r: PreparedTrial, sharp: bool) -> Joints:
-    """Filtered angles; `sharp` where the measured channel beside them is not low-passed, so that q̇ and q̈ must not lose
-    what is in it.
+    """Filter the angles of a trial.
+
+    `sharp` raises the cut-off. It is for channels that are not low-passed themselves, in which quick motion remains.
     """
     cutoff = r.spec.cutoff_at(r.step, sharp)
     q, qd, qdd = smooth(r.trial.time, r.trial.q, cutoff)
@@ -179,10 +182,11 @@ def row(
     blur: float = 0.0,
     y: dict[str, Float[np.ndarray, "N k"]] | None = None,
 ) -> Row:
-    """Put together what a kind of motion has found: block means, and which of them count.
+    """Assemble a reduced trial of M blocks.
 
-    `q`, `tension`, `hold`: of the blocks; `counting`: which blocks of a channel count where it is measured; `blur`: s,
-    the width of the low-pass that all of it went through.
+    `q`, rad, `tension`, N, and `hold` are of the blocks, `rates`, rad/s and rad/s², `directions` and `y` of the
+    samples, which are averaged here. `counting`: blocks of each channel that are valid where measured. `noise`: rad, of
+    the encoder. `blur`: s, width of the low-pass of all arrays.
     """
     y = r.y if y is None else y
     M = len(q)
@@ -201,7 +205,7 @@ def row(
         "session_time": time + start,
         "motorised": np.repeat(r.motorised.astype(float)[:, None], M, axis=1),
         "temperature": _temperatures(r).T,
-        "jitter": np.repeat(AT_REST * (1.0 if r.reduced else 2.0) * noise[:, None], M, axis=1),
+        "jitter": np.repeat(JITTER * (1.0 if r.reduced else 2.0) * noise[:, None], M, axis=1),
     }
     if r.reduced:
         motion["blur"] = np.full(M, blur)
@@ -209,12 +213,12 @@ def row(
     for c in y:
         counts = (r.mean(r.sound[c].astype(float)) > 0.5) & counting[c]
         mask[c] = counts.astype(float).T
-        values[c] = r.mean(y[c]).T * mask[c]  # of all samples, as everything else that the model reads
+        values[c] = r.mean(y[c]).T * mask[c]  # mean of all samples, as of the other arrays
     return Row(motion, values, mask, np.full(M, -1) if hold is None else hold, r.size * r.step)
 
 
 def _temperatures(r: PreparedTrial) -> Float[np.ndarray, "M m"]:
-    """K, of each joint: of the channels named after it, else of all; `NOMINAL_TEMPERATURE` where none was measured."""
+    """Temperature of each joint, K: from sensors named after it, else from all, else `NOMINAL_TEMPERATURE`."""
     M, trial = len(r.trial.time) // r.size, r.trial
     if trial.temperature is None:
         return np.full((M, r.finger.m), NOMINAL_TEMPERATURE)
@@ -228,5 +232,5 @@ def _temperatures(r: PreparedTrial) -> Float[np.ndarray, "M m"]:
 
 
 def stretches(hold: Int[np.ndarray, " M"]) -> list[Int[np.ndarray, " k"]]:
-    """The samples of each hold, hold by hold in the order of time."""
+    """Indices of the samples of each hold, in order of time."""
     return [np.flatnonzero(hold == k) for k in dict.fromkeys(hold[hold >= 0].tolist())]

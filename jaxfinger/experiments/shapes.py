@@ -1,4 +1,4 @@
-"""Few distinct shapes, few compilations: sessions of like fingers share what was compiled for the first of them."""
+"""Padding to a few common shapes, so that sessions of similar fingers share compiled programs."""
 
 from typing import TypeVar
 
@@ -7,14 +7,15 @@ import numpy as np
 
 from jaxfinger.experiments.prepare import Batch
 
-# Of a block; samples are doubled until the longest trial fits. A quick look's trials have up to 128.
+# Trials in a block, and its least number of samples, which doubles until the longest trial fits. Trials of a session
+# recorded for a quick look have up to 128 samples.
 TRIALS, SAMPLES = 8, 128
 
 Tree = TypeVar("Tree")
 
 
 def roomy(size: int, least: int) -> int:
-    """The first of least · (1, 2, 4, 8, …) that holds `size`."""
+    """Smallest of least · (1, 2, 4, 8, …) that is not below `size`."""
     room = least
     while room < size:
         room *= 2
@@ -22,8 +23,9 @@ def roomy(size: int, least: int) -> int:
 
 
 def blocks(batch: Batch) -> list[Batch]:
-    """The batch in stacks of TRIALS trials of a common length; what is added holds the last values, and counts not.
-    A batch that simulations start from stays as it is: every sample added would be one more simulation.
+    """Split a batch into blocks of TRIALS trials of a common length; padding repeats the last values with mask 0.
+
+    A batch of starts of simulations is not padded, since every sample added would be one more simulation.
     """
     if batch.x.simulated:
         return [batch]
@@ -35,12 +37,12 @@ def blocks(batch: Batch) -> list[Batch]:
 
 
 def padded(tree: Tree, trials: int, samples: int) -> Tree:
-    """Every array, (…, B, T), with so many more trials and samples that hold the last values."""
+    """Pad every array (…, B, T) by so many trials and samples, which repeat the last values."""
     ends = (0, trials), (0, samples)
     return jax.tree.map(lambda a: np.pad(a, [(0, 0)] * (np.ndim(a) - 2) + [*ends], "edge"), tree)
 
 
 def split(tree: Tree) -> list[Tree]:
-    """Every array, (…, B, T), in parts of TRIALS trials."""
+    """Split every array (…, B, T) into parts of TRIALS trials."""
     count = jax.tree.leaves(tree)[0].shape[-2]
     return [jax.tree.map(lambda a, b=b: a[..., b : b + TRIALS, :], tree) for b in range(0, count, TRIALS)]

@@ -1,6 +1,4 @@
-"""Where an effect can show: which predicted channels depend on its amplitudes, found by following these through the
-operations of what it changes.
-"""
+"""Channels that an effect can change, found by tracing the dependence of predictions on the effect's amplitudes."""
 
 import inspect
 import traceback
@@ -23,17 +21,21 @@ from jaxfinger.model import Effect, Finger, Model, Motion, Terms, contact_map, p
 
 
 def shows(kind: type[CatalogueEffect], finger: Finger) -> dict[str, tuple[str, ...]]:
-    """Channels of each experiment that an effect can change; an experiment without one is left out.
+    """Channels of each experiment that an effect can change; experiments without one are left out.
 
-    A channel that is not among them is as it is without the effect, in any trial. One that is may be so in a trial of
-    no use: friction that grows with tension shows nothing where all tendons are slack.
+    The effect changes no other channel in any trial. A channel that it can change may still be unchanged in some
+    trials, as by friction in proportion to tension where all tendons are slack.
     """
     names = finger.joint_names, finger.tendon_names
     return _shows(kind, *names, finger.prismatic, finger.active, finger.crosses)
 
 
 def refuse_broken(kind: type[CatalogueEffect], finger: Finger) -> None:
-    """UserError where a user's effect fails in a prediction, or changes no channel at any size."""
+    """Check a user's effect.
+
+    Raises:
+        UserError: it fails in a prediction, or changes no channel at any amplitude.
+    """
     file = inspect.getfile(kind)
     try:
         useless = kind.sites(finger) and not shows(kind, finger)
@@ -49,7 +51,7 @@ def refuse_broken(kind: type[CatalogueEffect], finger: Finger) -> None:
 
 
 class _Nominal(NamedTuple):
-    """A finger without effects, and two samples of it; of its arrays only the shapes mean something."""
+    """A nominal model with a motion of two samples, whose shapes alone matter."""
 
     finger: Finger
     model: Model
@@ -102,7 +104,7 @@ def _shows(kind, *description) -> dict[str, tuple[str, ...]]:
 
 
 def _reached(jaxpr) -> list[bool]:
-    """Which results depend on the arguments: an operation hands on what it takes."""
+    """Whether each result depends on the arguments; an operation's outputs depend on all of its inputs."""
     dependent = set(jaxpr.invars)
 
     def tainted(v) -> bool:

@@ -1,4 +1,4 @@
-"""The local Wiener filter, for what a fit takes as given: noise there would bias it."""
+"""Local Wiener filter for the regressors of a fit, whose noise would bias it."""
 
 import numpy as np
 from jaxtyping import Float
@@ -10,13 +10,13 @@ from jaxfinger.data.filtering import robust_std
 def shrink(
     x: Float[np.ndarray, "N k"], window: int, most: Float[np.ndarray, " k"] | float = np.inf
 ) -> Float[np.ndarray, "N k"]:
-    """The local Wiener filter: of each column's deviation from its running mean, the share that is more than noise.
+    """Shrink the deviation of each column from its running mean by the share that noise explains.
 
-    x̂ = x̄ + max(0, 1 − σ²/s²) (x − x̄), s² the variance within the window, σ from the median of |x − x̄|: the noise of
-    most of the trial, unless that is motion, too: no sensor has more noise than `most`. As a regressor x̂ is rid of most
-    of the bias of its coefficient towards zero (regression calibration; Carroll et al., Measurement Error in Nonlinear
-    Models, 2nd ed., ch. 4). `scipy.signal.wiener` takes the signal to be zero beyond its ends, and would pull the mean
-    there towards it.
+    x̂ = x̄ + max(0, 1 − σ²/s²) (x − x̄), with x̄ and s² the mean and variance within `window` samples. σ comes from the
+    median of |x − x̄| over the trial; it is at most `most`, the largest noise of the sensor, since a trial may move
+    most of the time. As a regressor x̂ has most of the attenuation bias of its coefficient removed (regression
+    calibration; Carroll et al., Measurement Error in Nonlinear Models, 2nd ed., ch. 4). Unlike here,
+    `scipy.signal.wiener` takes the signal as zero beyond its ends, which biases the mean there.
     """
     out = np.array(x, np.float64)
     window = 2 * (max(window, 2) // 2) + 1

@@ -1,6 +1,7 @@
-"""A motor steps a joint from hold to hold (ID.3-static): friction is known at holds whose approach was seen.
+"""Reduction of trials in which a motor steps a joint from hold to hold (ID.3-static).
 
-Before the first motion a direction is unknown, and so is friction: a hold there tells nothing of it.
+A hold is valid where the direction of its approach is known, which gives the direction of friction. Before the first
+motion it is unknown.
 """
 
 import numpy as np
@@ -11,14 +12,14 @@ from jaxfinger.data.motion import rest_speed
 from jaxfinger.experiments.driven import sliding
 from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, stretches
 
-NOTHING = "there is no hold whose direction of approach is known, and no motion in which the joint slides"
-# s, at the protocol's pace, kept clear on either side of where a joint may stick: no measured channel is filtered, so
-# none spreads.
-CLEAR = 0.01
+NONE_VALID = "there is no hold whose direction of approach is known, and no motion in which the joint slides"
+# s at the protocol's pace, left out on either side of samples where a joint may stick. It is short, since no measured
+# channel is filtered.
+CLEAR_TIME = 0.01
 
 
 def reduce(r: PreparedTrial) -> Row:
-    """Holds that were approached count, and motion in which the joint slides."""
+    """Reduce a trial: valid are holds of known approach, and motion in which the joint slides."""
     j = joints(r, sharp=True)
     hold = find_holds(r.trial, r.spec.pace)
     slow = smooth(r.trial.time, r.trial.q, r.spec.cutoff_at(r.step))[1]
@@ -26,11 +27,11 @@ def reduce(r: PreparedTrial) -> Row:
         joint = r.trial.joint_direction.astype(float)
     else:
         joint = directions(slow, rest_speed(slow, r.quick_rates))
-        for samples in stretches(hold):  # a filter without phase sees the next step before it starts
+        for samples in stretches(hold):  # a zero-phase filter shows the next step before it starts
             joint[samples] = joint[samples[len(samples) // 2]]
-    moves = (hold < 0)[:, None]  # at a hold nothing does
+    moves = (hold < 0)[:, None]  # nothing moves in a hold
     qd, qdd = j.qd * moves, j.qdd * moves
-    slides = sliding(r, qd, slow, joint, None, CLEAR * r.spec.pace)
+    slides = sliding(r, qd, slow, joint, None, CLEAR_TIME * r.spec.pace)
     at = r.whole(hold)
     known = r.mean(slides.astype(float)) > 1.0 - 1e-9
     approached = np.abs(r.mean(joint)) > 1.0 - 1e-9
@@ -42,7 +43,7 @@ def reduce(r: PreparedTrial) -> Row:
 
 
 def _at_rest(q: Float[np.ndarray, "M m"], hold: Int[np.ndarray, " M"]) -> Float[np.ndarray, "M m"]:
-    """At a hold its mean: what moves there is the encoder's noise, which neither f(q) nor friction follows."""
+    """Replace the angles of each hold by their mean, since changes within a hold are the encoder's noise."""
     out = q.copy()
     for samples in stretches(hold):
         out[samples] = q[samples].mean(axis=0)

@@ -1,4 +1,4 @@
-"""What each experiment of the format is, as data: the only differences between them that a prediction needs."""
+"""Table of the format's experiments, with the differences between them that a prediction needs."""
 
 from __future__ import annotations
 
@@ -12,45 +12,47 @@ Kind = Literal["path", "driven", "stepped", "held"]
 class Experiment:
     """One row of the format's table of experiments.
 
-    `kind` says how its joints move, and so which samples count: along a `path`, where only excursions are read;
-    `driven` by a motor or by tendons, where friction is known as long as they slide; `stepped` from hold to hold;
-    `held` by a fixture, so that joints carry no friction, and tendons slip only past their loss.
+    `kind` is the kind of motion, which decides which samples are valid. Joints move along a `path`, where only
+    excursions are read; they are `driven` by a motor or by tendons, where friction is known while they slide; they are
+    `stepped` from hold to hold; or they are `held` by a fixture, which carries their friction, while tendons slip only
+    where their loss is exceeded.
 
-    `rate` and `cutoff` say how a trial is reduced before a fit: slow experiments are averaged over blocks of 1/rate s,
-    q̇ and q̈ come from a zero-phase low-pass at `cutoff`. Both sides of (1) are averaged and filtered alike. A higher
-    cut-off lets the encoder's noise into q̈, and a fit takes that for less inertia.
+    For a fit, samples are averaged over blocks of 1/`rate`, and q̇ and q̈ come from a zero-phase low-pass at `cutoff`.
+    Both sides of (1) are averaged and filtered alike. A higher cut-off would let the encoder's noise into q̈, which
+    biases the inertia downwards.
     """
 
     name: str
     kind: Kind
-    channels: tuple[str, ...]  # what the model predicts
+    channels: tuple[str, ...]  # that the model predicts
     rate: float  # Hz
     cutoff: float  # Hz
-    sharp: float = 4.0  # times the cut-off beside a measurement that is not filtered, where noise of q̈ biases nothing
-    slack: bool = False  # the tendons are slack by protocol
-    pace: float = 1.0  # times as long as the protocol's that the motions take, for which rate and cut-off are
+    # Factor on the cut-off where the measured channel is not filtered: there the noise of q̈ biases no estimate.
+    sharp: float = 4.0
+    slack: bool = False  # whether the tendons are slack by protocol
+    pace: float = 1.0  # duration of the motions over that of the protocol's, for which rate and cut-off hold
 
     def at(self, pace: float) -> Experiment:
-        """The experiment of a session of another pace (`data.sizes`)."""
+        """Experiment with rate and cut-off for a session of another pace (`data.sizes`)."""
         return replace(self, rate=self.rate / pace, cutoff=self.cutoff / pace, pace=pace)
 
     @property
     def held(self) -> bool:
-        """A fixture holds the joints."""
+        """Whether a fixture holds the joints."""
         return self.kind == "held"
 
     @property
     def stepped(self) -> bool:
-        """A motor moves a joint from hold to hold."""
+        """Whether a motor moves a joint from hold to hold."""
         return self.kind == "stepped"
 
     @property
     def rests(self) -> bool:
-        """It is read at holds above all."""
+        """Whether most valid samples are holds."""
         return self.kind in ("stepped", "held")
 
     def cutoff_at(self, step: float, sharp: bool = False) -> float:
-        """Hz, of a trial with a sample every `step` s: a fifth of its rate at most."""
+        """Cut-off, Hz, for a trial with a sample every `step` s: at most a fifth of the sampling rate."""
         return min(self.cutoff * (self.sharp if sharp else 1.0), 0.2 / step)
 
 

@@ -1,4 +1,4 @@
-"""Staged fits, joint refinement, their uncertainty, and the file that holds a result."""
+"""Identification: staged fits, joint refinement, their uncertainty, and the file of a fit."""
 
 import sys
 from types import ModuleType
@@ -41,7 +41,7 @@ __all__ = [
 
 
 class _Room(ModuleType):
-    """The room is called as its function: `jaxfinger.identify(session)`."""
+    """Module type that makes the package callable: `jaxfinger.identify(session)` runs `stages.identify`."""
 
     def __call__(self, *args, **keywords) -> Fit:
         return identify(*args, **keywords)

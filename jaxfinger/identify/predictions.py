@@ -1,4 +1,4 @@
-"""What a model predicts for every sample of a session, trial by trial: the format's table "Predictions"."""
+"""Predictions of a model for every sample of a session, trial by trial, as in the format's table "Predictions"."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from jaxfinger.experiments import SAMPLES, Stack, padded, predict, prepare, room
 from jaxfinger.identify.fit import Fit
 from jaxfinger.model import Model, Motion, simulate
 
-# s, at the protocol's pace: longest step of a forward simulation. Steps of a quarter move angles half a second ahead by
-# less than an encoder rounds them (`tests/identify/test_shooting.py`).
-STEP = 5e-4
+# Longest time step of a forward simulation, in s at the protocol's pace. Steps a quarter as long change angles
+# predicted half a second ahead by less than an encoder's resolution (tests/identify/test_shooting.py).
+MAX_TIME_STEP = 5e-4
 
 
 def predict_session(
@@ -28,10 +28,10 @@ def predict_session(
     names: list[str] | None = None,
     progress: Callable[[str], None] = lambda message: None,
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Predicted channels of the named trials (default all): `{trial: {channel: (N, columns)}}`, SI units.
+    """Predict the channels of the named trials (default all): `{trial: {channel: (N, columns)}}`, in SI units.
 
-    Channels are those of the format's table. A joint whose torque was not measured stays NaN, and so does the excursion
-    of a passive tendon. A trial of fewer than two samples is left out.
+    Channels are those of the format's table. Columns without a sensor are NaN: the torque of a joint where it was not
+    measured, and the excursion of a passive tendon. A trial of fewer than two samples is left out.
 
     >>> import jaxfinger as jf
     >>> predicted = jf.predict(jf.load("fit.json"), jf.read("session.h5"))
@@ -55,7 +55,7 @@ def predict_session(
             values = _predict(model, x, stack.experiment.channels)
             channels = {c: np.array(v[:, 0, :N]).T for c, v in values.items()}
             if experiment == "VD.3":
-                # It stands beside no measured channel: above the cut-off is the noise of q̈ and of tension alone.
+                # No measured channel stands beside it, and above the cut-off it holds only noise of q̈ and tension.
                 time = session[name].time
                 cutoff = stack.experiment.cutoff_at(float(np.median(np.diff(time))))
                 channels["joint_torque"] = low_pass(time, channels["joint_torque"], cutoff)
@@ -64,7 +64,7 @@ def predict_session(
 
 
 def model_for(fit: Fit | Model, session: Session) -> Model:
-    """The fit's model, mounted as the session's finger is: `gravity` belongs to the rig and not to the finger.
+    """Model of the fit with the session's `gravity`, which belongs to the rig and not to the finger.
 
     Raises:
         UserError: the model's joints or tendons are not those of the session.
@@ -91,7 +91,7 @@ def _predict(model: Model, x: Motion, channels: tuple[str, ...]) -> dict[str, Fl
 
 
 def _only_measurable(channels: dict[str, np.ndarray], trial: Trial, session: Session) -> dict[str, np.ndarray]:
-    """NaN where the rig has no sensor: passive tendons, and joints without the torque sensor."""
+    """Set columns without a sensor to NaN: passive tendons, and joints without a torque sensor."""
     finger = session.finger
     if "tendon_excursion" in channels:
         channels["tendon_excursion"][:, ~finger.active] = np.nan
@@ -105,9 +105,9 @@ def _only_measurable(channels: dict[str, np.ndarray], trial: Trial, session: Ses
 
 
 def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> dict[str, dict[str, np.ndarray]]:
-    """q of each VD.3 trial of a full-rate stack, simulated from its first sample under the measured tension.
+    """Simulate q, rad, of each VD.3 trial of a full-rate stack from its first sample under the measured tension.
 
-    `models`: one a trial, alike but for their numbers.
+    `models`: one for each trial, of one structure.
 
     Raises:
         UserError: the finger has no tendons, so nothing drives it.
@@ -120,7 +120,7 @@ def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> 
     model = jax.tree.map(lambda *a: jnp.stack(a), *models)
     x = jax.vmap(lambda model, x: model.true_motion(x), in_axes=(0, -2), out_axes=-2)(model, stack.batch.x)
     steps = np.array([np.median(np.diff(session[name].time)) for name in stack.trials])
-    # Moreau's rule wants even steps: each trial gets its own uniform clock, all the same number of samples.
+    # The simulation takes even steps: each trial gets its own uniform instants, all trials the same number of them.
     longest = max(session[name].duration / step for name, step in zip(stack.trials, steps, strict=True))
     grid = steps[:, None] * np.arange(roomy(int(np.ceil(longest)) + 1, 512))
     tension = np.asarray(x.tension)
@@ -128,11 +128,11 @@ def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> 
         [[np.interp(g, t, f) for f in tension[:, b]] for b, (g, t) in enumerate(zip(grid, _times(stack), strict=True))]
     ).reshape(len(steps), session.finger.n, -1)
     starts = (x.session_time - x.time)[:, 0]
-    substeps = max(1, int(np.ceil(steps.max() / (STEP * stack.experiment.pace) - 1e-6)))
-    wide = np.minimum(np.arange(roomy(len(models), 2)), len(models) - 1)  # for a common shape the last is repeated
+    substeps = max(1, int(np.ceil(steps.max() / (MAX_TIME_STEP * stack.experiment.pace) - 1e-6)))
+    wide = np.minimum(np.arange(roomy(len(models), 2)), len(models) - 1)  # pad to a common shape with the last trial
     each = jax.tree.map(lambda a: jnp.asarray(a)[wide], (model, grid, even, x.q[..., 0].T, x.qd[..., 0].T, starts))
     q = np.asarray(_simulate(*each, substeps=substeps))[: len(models)]
-    # Whatever has left the finger's range by its whole width has no more to say, and may grow beyond all numbers.
+    # A simulation that diverges may overflow; it is clipped where it leaves the range by the range's whole width.
     low, high = session.finger.limits.T[:, :, None]
     span = np.where(np.isfinite(high - low), high - low, 2 * np.pi)
     q = np.clip(np.nan_to_num(q, nan=np.inf), low - span, high + span)
@@ -147,7 +147,7 @@ def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> 
 
 
 def _times(stack: Stack) -> list[np.ndarray]:
-    """Times of each trial from its first sample; the padding at the end repeats the last one."""
+    """Times of each trial from its first sample, s; the padding repeats the last one."""
     time = np.asarray(stack.batch.x.time)
     return [row - row[0] for row in time]
 

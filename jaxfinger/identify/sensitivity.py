@@ -1,15 +1,16 @@
-"""What holds each parameter where it is: derivatives of estimates by trials, sensors and CAD, without a rerun.
+"""Sensitivity of the estimates to trials, sensor gains and CAD, by the implicit function theorem, without refits.
 
-A stage s estimates θ_s where its score, the gradient of what it minimises, is zero: S_s(θ_s, θ_t<s, φ) = 0. By the
-implicit function theorem, whatever φ stands for,
+The estimate θ_s of stage s is where its score S_s, the gradient of its cost, is zero: S_s(θ_s, θ_t<s, φ) = 0. For a
+datum φ (the weight of a trial, the gain of a sensor, a value of CAD),
 
     dθ_s/dφ = −(∂S_s/∂θ_s)⁻¹ (∂S_s/∂φ + Σ_t<s ∂S_s/∂θ_t dθ_t/dφ),
 
-stage after stage, with exact second derivatives: those of the residuals included, and of Huber's cost. The noise model
-is held as it is.
+stage after stage. Second derivatives are exact, those of the residuals and of Huber's cost included. The noise model is
+fixed.
 
-A derivative by the weight of a trial does not say what the fit is without it: the only trial that tells of a parameter
-holds it at any weight. One Newton step from the whole fit does (Pregibon 1981), with H_k = J_kᵀJ_k of trial k:
+The derivative by the weight of a trial does not tell the estimate without that trial: a parameter that a single trial
+determines is the same at any weight. One Newton step from the fit tells it (Pregibon 1981), with H_k = J_kᵀJ_k of
+trial k:
 
     Δθ_s = (∂S_s/∂θ_s − H_k)⁻¹ (S_s,k − Σ_t<s (∂S_s/∂θ_t − H_k,st) Δθ_t).
 """
@@ -39,26 +40,32 @@ from jaxfinger.model import Model
 
 TRIALS, SENSORS, CAD = "trials", "sensors", "cad"
 KINDS = (TRIALS, SENSORS, CAD)
-ALONE = 1e-6  # of what a parameter's trials tell of it, below which the others tell nothing
-AT_OPTIMUM = 0.3  # standard deviations that one more step may be long, where a fit is that of the session
+# Share of a parameter's information, the diagonal of JᵀJ, below which the other trials do not determine the parameter:
+# without the trial its standard deviation would grow a thousandfold.
+MIN_SHARE_OF_OTHERS = 1e-6
+# Longest further Newton step, in standard deviations, of a fit at its optimum. A search may end in a kink with a step
+# of 0.1 (`solve.KINK_TOLERANCE`); other data move a fit by more.
+MAX_STEP_AT_OPTIMUM = 0.3
 
 
 @dataclass(frozen=True, repr=False)
 class Sensitivity:
-    """dθ/dφ of every parameter by every φ of one kind."""
+    """Derivatives dθ/dφ of P parameters by the K data φ of one kind."""
 
-    kind: str  # `trials`: by the weight of each; `sensors`: by each gain, 1 as it is; `cad`: by each value
+    kind: str  # of φ: `trials`, their weights; `sensors`, their gains about 1; `cad`, its values
     names: tuple[str, ...]
-    values: Float[np.ndarray, "K P"]  # SI units of the parameter, a unit of φ
-    moves: Float[np.ndarray, "K P"]  # of the parameter by a step of φ: a trial left out, gain + 1 %, CAD + 1 std
+    values: Float[np.ndarray, "K P"]  # dθ/dφ, SI units
+    moves: Float[np.ndarray, "K P"]  # Δθ for a step of φ: a trial left out, gain + 1 %, CAD + 1 standard deviation
 
     def __repr__(self) -> str:
         moved = np.count_nonzero(self.values.any(axis=0))
         return f"Sensitivity(of {moved} parameters to {len(self.names)} of the {self.kind})"
 
     def shifts(self, fit: Fit) -> Float[np.ndarray, "K p"]:
-        """By how many standard deviations each estimated parameter moves with one step; 0 where they are unknown, and
-        infinite where no other trial tells of the parameter.
+        """`moves` of the estimated parameters in their standard deviations.
+
+        The entry is 0 where the standard deviation is unknown, and infinite where no other trial determines the
+        parameter.
         """
         std = fit.std[fit.estimated]
         sure = (std > 0) & np.isfinite(std)
@@ -68,10 +75,10 @@ class Sensitivity:
 def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> dict[str, Sensitivity]:
     """Derivatives of the fit's parameters by the weight of each trial, the gain of each sensor, each value of CAD.
 
-    Sensors are those of the joints' torques and of the tendons' forces and excursions. `to`: some of `trials`,
+    Sensors are those of the joints' torques and of the tendons' forces and excursions. `to`: one or more of `trials`,
     `sensors`, `cad`.
 
-    What a torque sensor's gain that is 1 % too large does to the mass of the axis, in kg:
+    The mass of the axis changes by so many kg where the gain of the torque sensor is 1 % too large:
 
     >>> import jaxfinger as jf
     >>> session, fit = jf.read("session.h5"), jf.load("fit.json")
@@ -87,7 +94,7 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
     kinds = (to,) if isinstance(to, str) else tuple(to)
     if unknown := set(kinds) - set(KINDS):
         raise UserError(f"sensitivity to {sorted(unknown)}: it takes some of {list(KINDS)}")
-    model_for(fit, session)  # refuses the session of another finger
+    model_for(fit, session)  # raises for a session of another finger
     parameters, plan = describe(fit.model), plan_of(session, fit)
     stacks = prepare(session, [t.name for t in session if any(t.experiment in reads for reads, _ in plan)])
     plan = [({e: c for e, c in reads.items() if e in stacks}, free) for reads, free in plan]
@@ -124,7 +131,7 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
                 by[free, last[SENSORS] + np.searchsorted(cad, i)] -= precision[:, k]
         own, others = H[np.ix_(free, free)], np.setdiff1d(np.arange(P), free)
         basis = _seen(own)
-        _refuse_another(basis.T @ S[free], session)
+        _require_optimum(basis.T @ S[free], session)
         right = by[free] + H[np.ix_(free, others)] @ moved[others]
         moved[free] = -basis @ np.linalg.solve(basis.T @ own @ basis, basis.T @ right)
         for j, (e, name) in enumerate(trials):
@@ -133,7 +140,7 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
                 at = sources[e].positions
                 mine[np.ix_(at, at)] = scores[e].information[stacks[e].trials.index(name)]
             rest, told = (H - mine)[free], np.diag(H)[free] - np.diag(precision)
-            alone[free, j] = (np.diag(precision) == 0.0) & (told - np.diag(mine)[free] < ALONE * told)
+            alone[free, j] = (np.diag(precision) == 0.0) & (told - np.diag(mine)[free] < MIN_SHARE_OF_OTHERS * told)
             kept = np.flatnonzero(~alone[free, j])
             basis = _seen(rest[np.ix_(kept, free[kept])])
             right = by[free, j] - rest[:, others] @ without[others, j]
@@ -148,7 +155,7 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
 
 
 def _seen(hessian: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p k"]:
-    """The combinations of the parameters that a stage sees, a column each."""
+    """Basis of the combinations visible to a stage, one in each column, from its Hessian."""
     values, vectors = np.linalg.eigh(_scaled(hessian))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     basis, _, seen, *_ = scaled_directions(root.T * np.sqrt(np.abs(np.diag(hessian))))
@@ -161,8 +168,8 @@ def _scaled(H: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
     return H / np.outer(size, size)
 
 
-def _refuse_another(step: Float[np.ndarray, " k"], session: Session) -> None:
-    if not np.all(np.abs(step) < AT_OPTIMUM):
+def _require_optimum(step: Float[np.ndarray, " k"], session: Session) -> None:
+    if not np.all(np.abs(step) < MAX_STEP_AT_OPTIMUM):
         raise UserError(
             f"{session.file or 'the session'}: the fit is not the optimum of these trials, which would move it by "
             f"{np.abs(step).max():.2g} standard deviations; give the session that it was made from, or fit that again"
@@ -179,7 +186,7 @@ def _with_prior(plan, session: Session, parameters: list[Parameter]) -> np.ndarr
 
 
 def _sensors(session: Session, stacks: dict[str, Stack], reads) -> dict[str, Callable[[str], Batch]]:
-    """By name, what the data of an experiment change by when a sensor's gain does, per unit of gain."""
+    """Sensors by name, each with a function that gives the derivative of an experiment's batch by its gain."""
     finger, out = session.finger, {}
     for i, joint in enumerate(finger.joint_names):
         out[f"torque {joint}"] = lambda e, i=i: _gain(stacks[e].batch, "joint_torque", i)
@@ -191,7 +198,7 @@ def _sensors(session: Session, stacks: dict[str, Stack], reads) -> dict[str, Cal
 
 
 def _gain(batch: Batch, what: str, column: int) -> Batch:
-    """The batch's derivative by one gain."""
+    """Derivative of the batch by the gain of one column of the channel `what`."""
 
     def only(a):
         values = np.zeros_like(a)
@@ -209,12 +216,12 @@ def _moves(change: Batch) -> bool:
 
 
 class CostGradient(eqx.Module):
-    """One experiment's part of the gradient of the cost, by the parameters that it depends on."""
+    """Gradient of the cost of one experiment by the k parameters that it depends on, and its derivatives."""
 
-    by_trial: Float[Array, "B k"]
-    information: Float[Array, "B k k"]  # of each trial: JᵀJ of the rows within Huber's limit
-    hessian: Float[Array, "k k"]
-    by_sensor: Float[Array, "K k"]  # its derivative by every gain
+    by_trial: Float[Array, "B k"]  # gradient of each trial's cost
+    information: Float[Array, "B k k"]  # JᵀJ of each trial, from the rows within Huber's limit
+    hessian: Float[Array, "k k"]  # of all trials
+    by_sensor: Float[Array, "K k"]  # derivative of the gradient by each gain
 
 
 def _gradient_of(fit: Fit, source: Source, changes: list[Batch]) -> CostGradient:
@@ -233,8 +240,8 @@ def _gradient(model: Model, free: Free, batch: Batch, filters: Filters, limit, c
     def rows(theta, data: Batch):
         return white_rows(free.set(model, theta), data, filters)[1]
 
-    def counting(theta):
-        """Rows beyond Huber's limit pull, and tell nothing: their cost is linear."""
+    def informative(theta):
+        """White residuals whose Jacobian is zero beyond Huber's limit, where the cost is linear."""
         r = rows(theta, batch)
         return jnp.where(limit > 0.0, jnp.clip(r, -limit, limit), r)
 
@@ -242,7 +249,7 @@ def _gradient(model: Model, free: Free, batch: Batch, filters: Filters, limit, c
         return 0.5 * jnp.sum(weights[:, None] * huber(rows(theta, data), limit) ** 2)
 
     whole, gradient = jnp.ones(B), jax.grad(cost)
-    # The transpose of the gradient's derivative by the weights: one trial's gradient after another.
+    # The gradient's derivative by the weight of a trial is that trial's own gradient.
     by_trial = jax.lax.map(lambda w: jax.jvp(lambda v: gradient(theta, batch, v), (whole,), (w,))[1], jnp.eye(B))
     hessian = jax.lax.map(
         lambda v: jax.jvp(lambda t: gradient(t, batch, whole), (theta,), (v,))[1], jnp.eye(theta.size)
@@ -251,8 +258,8 @@ def _gradient(model: Model, free: Free, batch: Batch, filters: Filters, limit, c
     def moved(tension, y):
         return gradient(theta, eqx.tree_at(lambda b: (b.x.tension, b.y), batch, (tension, y)), whole)
 
-    # Angles stay out of it: powers of an angle that is zero have no derivative of their own.
+    # Angles are left out: at an angle of zero JAX gives no finite derivative of its powers.
     data = batch.x.tension, batch.y
     by_sensor = jax.lax.map(lambda c: jax.jvp(moved, data, (c.x.tension, c.y))[1], changes)
-    J = jax.lax.map(lambda v: jax.jvp(counting, (theta,), (v,))[1], jnp.eye(theta.size))
+    J = jax.lax.map(lambda v: jax.jvp(informative, (theta,), (v,))[1], jnp.eye(theta.size))
     return CostGradient(by_trial, jnp.einsum("kbr,lbr->bkl", J, J), hessian, by_sensor)

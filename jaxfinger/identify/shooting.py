@@ -1,17 +1,17 @@
-"""VD.3 in a fit: prediction errors a moment ahead, so that motion under tension alone tells of every parameter.
+"""VD.3 in a fit: errors of angles predicted a short horizon h ahead, under measured tension alone.
 
     min_θ  Σ_k ‖(q(t_k + h) − q̂(t_k + h | θ)) / σ‖²,   t_k = 0, h, 2h, …
 
-q̂ is simulated from the state measured at t_k under the measured tension, sticking and sliding as they come: multiple
-shooting (Bock and Plitt 1984) whose states are measured, or least squares of a prediction error (Ljung 1999, §7.2). σ
-is what the sensors' noise in state, tension and reading changes it by. A whole simulation would be no criterion: a tiny
-error at its start grows until it is all that one sees at its end.
+q̂ is simulated from the state measured at t_k under the measured tension, with sticking and sliding. This is multiple
+shooting with measured states (Bock and Plitt 1984), or least squares of a prediction error (Ljung 1999, §7.2). σ is the
+standard deviation of the error due to the sensors' noise in state, tension and reading. A single simulation of the
+whole trial would not do: small errors at its start grow until they dominate its end.
 
-Noise of the tension frees joints that stick, so that predictions are off in the mean, too, and with them the fit. How
-far is seen by adding more of the same noise: the mean of what that changes is added to the measured angles, and the fit
-made once more (simulation and extrapolation: Cook and Stefanski 1994). Intervals widen by as far as the fit then moves.
-Noise slower than the experiment's cut-off cannot be told from tension itself and stays; so intervals widen, too, by as
-much as VD.3 contradicts the other trials (`joint`).
+Noise of the tension frees joints that stick, which biases predictions and thus the fit. The bias is estimated by adding
+more noise of the same kind (simulation and extrapolation: Cook and Stefanski 1994). The mean change of the predictions
+is added to the measured angles, the fit is repeated, and its intervals widen by the change of the estimates. Noise
+slower than the experiment's cut-off cannot be separated from the tension itself. Intervals therefore also widen where
+VD.3 contradicts the other trials (`joint`).
 """
 
 from collections.abc import Sequence
@@ -30,45 +30,46 @@ from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.starts import HORIZONS, Measured, angles, measured, starts
 from jaxfinger.model import Model
 
-AHEAD = "VD.3 ahead"  # among the experiments that a fit reads, and among its stages
-# s, at the protocol's pace: h. With 0.05 s an unseen motion is predicted a tenth better where load cells are quiet, and
-# a fifth worse where they are not; with 0.2 s a third worse, and a fifth better (benchmarks/ahead.py).
+AHEAD = "VD.3 ahead"  # name of the experiment and of the stage
+# h, in s at the protocol's pace. Compared with it, 0.05 s predicts an unseen motion a tenth better with quiet load
+# cells and a fifth worse with noisy ones; 0.2 s predicts a third worse and a fifth better (benchmarks/ahead.py).
 HORIZON = HORIZONS[1]
-DRAWS = 16  # of the sensors' noise: they tell its mean effect to a quarter of its standard deviation
+NOISE_DRAWS = 16  # of the sensors' noise; the mean effect is then known to 1/√16 of its standard deviation
 
 
 @dataclass(frozen=True)
 class Shooting:
-    """The starts of all VD.3 trials, with the angles that follow."""
+    """Starts of all VD.3 trials, with the angles measured one horizon later."""
 
     trials: tuple[Measured, ...]
     stack: Stack
 
     def changed(self, model: Model) -> Float[np.ndarray, "draws m B W"]:
-        """rad: what every draw of the sensors' noise changes the model's predictions by."""
+        """Change of the model's predictions by each draw of the sensors' noise, rad, for B trials of W starts."""
         batch, horizon = self.stack.batch, self.stack.dt
         here, out = residuals_of(model, batch, ("q",))["q"], []
-        for k in range(DRAWS):
+        for k in range(NOISE_DRAWS):
             noise = [np.random.default_rng([b, k]) for b in range(len(self.trials))]
             again = _batch(self.trials, horizon, noise)
             out.append(here - residuals_of(model, again, ("q",))["q"])
-        return np.clip(np.nan_to_num(out, nan=np.pi), -np.pi, np.pi)  # beyond half a turn it says no more
+        # A simulation that changes by half a turn has diverged.
+        return np.clip(np.nan_to_num(out, nan=np.pi), -np.pi, np.pi)
 
     def noise(self, model: Model) -> Noise:
-        """Of a prediction and the reading beside it."""
+        """Noise of the difference of a reading and a prediction."""
         reading = np.stack([m.q_std for m in self.trials], axis=1)  # (m, B, 1)
         square = np.mean(self.changed(model) ** 2, axis=0) + reading**2
         std = np.sqrt(np.average(square, axis=(1, 2), weights=np.asarray(self.stack.batch.mask["q"])))
         return Noise.white(std, "sensors' noise in state and tension")
 
     def corrected(self, model: Model) -> Batch:
-        """With what noise changes the model's predictions by, in the mean, added to the measured angles."""
+        """Batch whose measured angles are shifted by the mean change of the predictions under noise."""
         batch = self.stack.batch
         return replace(batch, y={"q": batch.y["q"] + self.changed(model).mean(axis=0)})
 
 
 def shooting(session: Session) -> Shooting:
-    """All VD.3 trials, cut into starts.
+    """Cut all VD.3 trials into starts.
 
     Raises:
         UserError: the session has no VD.3 trial that tendons drive, or one is too short.
@@ -92,8 +93,10 @@ def shooting(session: Session) -> Shooting:
 def _batch(
     trials: Sequence[Measured], horizon: float, noise: Sequence[np.random.Generator | None] | None = None
 ) -> Batch:
-    """Every start of every trial; those added for a common shape repeat the last one, and count not. With `noise`, of
-    each trial, its states and tensions are redrawn.
+    """Batch of every start of every trial.
+
+    Trials with fewer starts are padded with their last start, whose mask is 0. `noise`: for each trial a generator,
+    with which its states and tensions are redrawn.
     """
     times = [np.arange(0.0, m.time[-1] - horizon, horizon) for m in trials]
     W = max(t.size for t in times)

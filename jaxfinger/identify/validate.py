@@ -1,9 +1,8 @@
-"""How well a model predicts trials: error of every channel in the units that people read, beside the noise floor.
+"""Validation: errors of a model's predictions by channel, in units for people, beside the noise floor.
 
-Errors are those of block means at the rate at which a fit reads the experiment (20 Hz, 50 Hz where it moves fast), so
-that they are compared with the noise at that rate. Excursions and angles are scored after removing one constant a
-trial (the encoders' arbitrary zero) or none; the mean error of an excursion counts from the trial's first sample, as
-the paper's does.
+Errors are those of block means at the rate at which a fit reads the experiment (20 Hz, or 50 Hz where it moves fast),
+and so is the noise. Excursions are scored after the mean error of each trial is removed, since the zero of an encoder
+is arbitrary. Their mean error, like the paper's, is relative to the trial's first sample.
 """
 
 from __future__ import annotations
@@ -30,13 +29,14 @@ from jaxfinger.identify.predictions import model_for, simulate_trials
 from jaxfinger.model import Model
 from jaxfinger.table import Table
 
-# Hz, at the protocol's pace, of the causal filter that a controller would differentiate: VD.3 is what it controls.
+# Cut-off, Hz at the protocol's pace, of the causal filter with which a controller would differentiate angles: that of
+# VD.3, the motion that it controls.
 ONLINE_CUTOFF = EXPERIMENTS["VD.3"].cutoff
 
 
 @dataclass(frozen=True)
 class Score:
-    """Error of one column of one channel over all trials of an experiment; `units` are those of the numbers."""
+    """Error of one column of a channel over all trials of an experiment, in `units`."""
 
     experiment: str
     channel: str
@@ -44,35 +44,35 @@ class Score:
     units: str
     rms: float
     mean: float
-    noise: float | None  # standard deviation of the sensor at the same rate; None where nothing shows it
+    noise: float | None  # standard deviation of the sensor at the same rate; None where it is unknown
     noise_source: str
     samples: int
     trials: int
-    method: str = ""  # where an experiment is judged in two ways
+    method: str = ""  # names the method where an experiment is judged in two ways
 
 
 @dataclass(frozen=True)
 class Slope:
-    """VD.2: force along one axis against tension, a straight line through the holds (the paper's Fig. 9)."""
+    """Slope of the fingertip force along one axis against tension in VD.2, through the holds (the paper's Fig. 9)."""
 
     trial: str
     tendon: str
     axis: str
     measured: float  # N/N
-    measured_std: float  # scatter of the holds about the model's curve
-    predicted: float
-    predicted_std: float  # from the fit's covariance
+    measured_std: float  # N/N, from the scatter of the holds about the model's curve
+    predicted: float  # N/N
+    predicted_std: float  # N/N, from the fit's covariance
 
 
 @dataclass(frozen=True, repr=False)
 class Validation:
-    """Every score of a fit on a session."""
+    """Scores of a fit on a session."""
 
     specimen: str
     session: str
     scores: tuple[Score, ...]
     slopes: tuple[Slope, ...] = ()
-    messages: tuple[str, ...] = ()  # what was not validated, and why
+    messages: tuple[str, ...] = ()  # sentences on what was not validated, and why
 
     def __repr__(self) -> str:
         count = len(self.scores)
@@ -82,12 +82,12 @@ class Validation:
         return f"<p>{escape(repr(self))}</p>{self.table()._repr_html_()}"
 
     def table(self) -> Table:
-        """One row a score: what was predicted, the rms of its error, and the noise in it."""
+        """One row for each score: experiment, channel, column, rms of the error, noise, and units."""
         names = ("experiment", "channel", "column", "rms", "noise", "units")
         return Table({n: getattr(s, n) for n in names} for s in self.scores)
 
     def as_dict(self) -> dict:
-        """Plain dictionaries, for JSON."""
+        """Nested dictionaries, for JSON."""
         return asdict(self)
 
 
@@ -97,7 +97,7 @@ def validate(
     experiments: tuple[str, ...] | None = None,
     progress: Callable[[str], None] = lambda message: None,
 ) -> Validation:
-    """Scores of the recipe's validation experiments, or of others by name.
+    """Score a fit on the trials of the recipe's validation experiments, or on those of `experiments`.
 
     >>> import jaxfinger as jf
     >>> validation = jf.validate(jf.load("fit.json"), jf.read("session.h5"))
@@ -108,7 +108,7 @@ def validate(
     '1.7 N of error, 0.7 of it noise'
 
     Raises:
-        UserError: the session has none of them, or is of another finger.
+        UserError: the session has no trial of these experiments, or is of another finger.
     """
     model = model_for(fit, session)
     wanted = experiments or fit.recipe.validation.experiments
@@ -144,7 +144,7 @@ def validate(
 
 
 def _residuals(model: Model, fit: Fit, stack: Stack) -> tuple[dict, dict[str, tuple[np.ndarray, str]]]:
-    """Measured less predicted, NaN where a sample does not count, and the noise floor by channel."""
+    """Residuals by channel, NaN where the mask is 0, and the noise floor of each channel with its source."""
     residuals, floors = {}, {}
     for c, raw in residuals_of(model, stack.batch, stack.experiment.channels).items():
         mask = np.asarray(stack.batch.mask[c]) > 0
@@ -157,7 +157,7 @@ _predict = eqx.filter_jit(predict)
 
 
 def _floor(fit: Fit, stack: Stack, channel: str, residual: np.ndarray) -> tuple[np.ndarray, str]:
-    """Noise of each column: from repeats and holds here, else the fit's of the same sensor, else the fast residuals."""
+    """Noise of each column: from repeats or holds, else the fit's of the same sensor, else from fast residuals."""
     here = estimate(stack, channel, residual)
     if here.source == "residuals":
         rate = stack.experiment.rate
@@ -172,7 +172,7 @@ def _rate(experiment: str) -> float:
 
 
 def _channel_scores(session: Session, stack: Stack, channel: str, residual, floor) -> list[Score]:
-    """One score a column that was measured; residual (columns, B, T), NaN where it does not count."""
+    """One score for each measured column; `residual` is (columns, B, T), NaN where the mask is 0."""
     share = _share(session, stack, channel)
     sliding = f"inverse dynamics where it slides, {share:.0%} of the samples"
     method = {"VD.1": "f(q) − f(q(0))", "VD.3": sliding if channel == "joint_torque" else ""}
@@ -183,26 +183,29 @@ def _channel_scores(session: Session, stack: Stack, channel: str, residual, floo
         if series:
             found = _score(series, CHANNELS[channel].free_zero)
             scores.append(
-                _make(session, stack.experiment.name, channel, k, column, *found, (floor[0][k], floor[1]), method)
+                _make_score(session, stack.experiment.name, channel, k, column, *found, (floor[0][k], floor[1]), method)
             )
     return scores
 
 
 def _share(session: Session, stack: Stack, channel: str) -> float:
-    """Of all samples of the trials, averaged over the columns, how many count."""
+    """Share of the trials' samples whose mask is 1, averaged over the columns."""
     whole = sum(session[name].duration for name in stack.trials) / stack.dt
     mask = np.asarray(stack.batch.mask[channel])
     return float(mask.sum() / (len(mask) * max(whole, 1.0)))
 
 
 def _score(series: list[np.ndarray], zeroed: bool) -> tuple[float, float, int, int]:
-    """rms, mean, samples and trials of the errors of several trials."""
+    """rms, mean, number of samples and number of trials of the errors of several trials.
+
+    With `zeroed`, the rms is about each trial's mean, and the mean is relative to each trial's first sample.
+    """
     mean = float(np.mean(np.concatenate([r - r[0] if zeroed else r for r in series])))
     errors = np.concatenate([r - r.mean() if zeroed else r for r in series])
     return float(np.sqrt(np.mean(errors**2))), mean, errors.size, len(series)
 
 
-def _make(session, experiment, channel, k, column, rms, mean, samples, trials, floor, method) -> Score:
+def _make_score(session, experiment, channel, k, column, rms, mean, samples, trials, floor, method) -> Score:
     factor, units = display(session, channel, k)
     noise = None if floor[0] is None or not np.isfinite(floor[0]) else float(floor[0]) * factor
     return Score(
@@ -221,12 +224,12 @@ def _make(session, experiment, channel, k, column, rms, mean, samples, trials, f
 
 
 def columns(session: Session, channel: str) -> tuple[str, ...]:
-    """Names of a channel's columns."""
+    """Names of the columns of a channel."""
     return CHANNELS[channel].columns(session.finger)
 
 
 def display(session: Session, channel: str, k: int) -> tuple[float, str]:
-    """Factor and unit in which people read a column: mm, N mm, N and degrees; mm and N for a prismatic joint."""
+    """Factor from SI and unit for people of a column: mm, N mm, N and degrees; mm and N for a prismatic joint."""
     if channel in ("q", "joint_torque") and session.finger.prismatic[k]:
         return (1e3, "mm") if channel == "q" else (1.0, "N")
     return CHANNELS[channel].people
@@ -237,7 +240,7 @@ def display(session: Session, channel: str, k: int) -> tuple[float, str]:
 
 @dataclass(frozen=True)
 class ExcursionPath:
-    """VD.1 of one trial: all (N, n) in m, from the first sample."""
+    """Excursions of one trial of VD.1, m, relative to its first sample."""
 
     time: Float[np.ndarray, " N"]
     measured: Float[np.ndarray, "N n"]
@@ -246,8 +249,10 @@ class ExcursionPath:
 
 
 def excursion_path(model: Model, trial: Trial, pace: float = 1.0) -> ExcursionPath:
-    """Both forms of VD.1: the paper's integral drifts with every error of q̇, the difference does not. `pace`: times as
-    long as the protocol's that its motion takes.
+    """Predict the excursions of a trial by both forms of VD.1.
+
+    The paper's integral accumulates the errors of q̇; the difference f(q) − f(q(0)) does not. `pace`: duration of the
+    trial's motion over that of the protocol's.
     """
     q = trial.q
     step = float(np.median(np.diff(trial.time)))
@@ -263,7 +268,7 @@ def excursion_path(model: Model, trial: Trial, pace: float = 1.0) -> ExcursionPa
 
 
 def _integral_scores(model: Model, session: Session, stack: Stack, floor) -> list[Score]:
-    """The paper's: mean over the path and error at its end, nothing removed but the start."""
+    """Scores of the paper's integral form of VD.1; errors are relative to the first sample."""
     paths = [excursion_path(model, session[name], stack.experiment.pace) for name in stack.trials]
     scores = []
     for k, column in enumerate(columns(session, "tendon_excursion")):
@@ -274,7 +279,7 @@ def _integral_scores(model: Model, session: Session, stack: Stack, floor) -> lis
             found = (float(np.sqrt(np.mean(errors**2))), float(errors.mean()), errors.size, len(series))
             method = "∫ C q̇ dt, the paper's"
             scores.append(
-                _make(session, "VD.1", "tendon_excursion", k, column, *found, (floor[0][k], floor[1]), method)
+                _make_score(session, "VD.1", "tendon_excursion", k, column, *found, (floor[0][k], floor[1]), method)
             )
     return scores
 
@@ -283,7 +288,7 @@ def _integral_scores(model: Model, session: Session, stack: Stack, floor) -> lis
 
 
 def _slopes(fit: Fit, model: Model, session: Session, stack: Stack) -> list[Slope]:
-    """Slopes along every axis against the tension of the tendon that is pulled, through the samples of the holds."""
+    """Slopes of the force along each axis against the tension of the pulled tendon, by regression over the holds."""
     x, measured = stack.batch.x, np.asarray(stack.batch.y["fingertip_force"])
     mask, tension = np.asarray(stack.batch.mask["fingertip_force"]), np.asarray(x.tension)
     lines = []
@@ -322,9 +327,9 @@ def _slopes(fit: Fit, model: Model, session: Session, stack: Stack) -> list[Slop
 
 
 def _slope_std(f: np.ndarray, errors: np.ndarray, weights: np.ndarray) -> float:
-    """Standard deviation of a slope from the scatter of the holds about the model's curve; a hold counts once."""
+    """Standard deviation of a slope, from the scatter of the means of holds about the model's curve."""
     counts = weights != 0
-    levels, hold = np.unique(f[counts], return_inverse=True)  # at a hold the tension is the hold's mean
+    levels, hold = np.unique(f[counts], return_inverse=True)  # within a hold the tension is constant, its mean
     mean = np.bincount(hold, errors[counts]) / np.bincount(hold)
     centred = levels - levels.mean()
     rest = mean - mean.mean() - (centred @ mean) / (centred @ centred) * centred
@@ -335,40 +340,40 @@ def _slope_std(f: np.ndarray, errors: np.ndarray, weights: np.ndarray) -> float:
 
 
 def _simulation_scores(model: Model, session: Session, names: list[str]) -> tuple[list[Score], list[str]]:
-    """q under the measured tension, against q: from states all along the trials, and from the first sample on."""
+    """Scores of simulated angles, from starts all along the trials and from the first sample, and messages."""
     stack = prepare(session, names, reduced=False)["VD.3"]
     paths = simulate_trials([model] * len(stack.trials), session, stack)
     scores = []
-    for moment in ahead(model, session, stack):
+    for prediction in ahead(model, session, stack):
         for k, column in enumerate(session.finger.joint_names):
-            errors = [moment.error[np.isfinite(moment.error[:, k]), k]]
+            errors = [prediction.error[np.isfinite(prediction.error[:, k]), k]]
             if errors[0].size:
                 rms, mean, samples, _ = _score(errors, False)
                 found = rms, mean, samples, len(stack.trials)
-                noise = _unless_it_diverges(moment.noise[k], "sensors' noise in state and tension", session, k)
-                method = f"{1e3 * moment.horizon:.0f} ms ahead of the measured state"
-                scores.append(_make(session, "VD.3", "q", k, column, *found, noise, method))
-    through = noise_of_simulation(model, session, stack)
+                noise = _unless_it_diverges(prediction.noise[k], "sensors' noise in state and tension", session, k)
+                method = f"{1e3 * prediction.horizon:.0f} ms ahead of the measured state"
+                scores.append(_make_score(session, "VD.3", "q", k, column, *found, noise, method))
+    simulated_noise = noise_of_simulation(model, session, stack)
     for k, column in enumerate(session.finger.joint_names):
         series = [session[name].q[:, k] - paths[name]["q"][:, k] for name in stack.trials]
         found = _score([e[np.isfinite(e)] for e in series], False)
         encoder = float(np.sqrt(np.mean([_encoder(session[name], k) ** 2 for name in stack.trials])))
         method = "simulated forward from the first sample"
         source = "sensors' noise in start, tension and reading"
-        noise = _unless_it_diverges(float(np.hypot(encoder, through[k])), source, session, k)
-        scores.append(_make(session, "VD.3", "q", k, column, *found, noise, method))
+        noise = _unless_it_diverges(float(np.hypot(encoder, simulated_noise[k])), source, session, k)
+        scores.append(_make_score(session, "VD.3", "q", k, column, *found, noise, method))
     return scores, _divergence(session, paths)
 
 
 def _unless_it_diverges(noise: float, source: str, session: Session, k: int) -> tuple[float | None, str]:
-    """A simulation's noise and where it is from; none where it is as large as the joint's range."""
+    """Noise of a simulation with its source; None where the noise is as large as the joint's range."""
     if noise < np.ptp(session.finger.limits[k]):
         return noise, source
     return None, "none: the sensors' noise alone makes the simulation diverge"
 
 
 def _divergence(session: Session, paths: dict[str, dict[str, np.ndarray]]) -> list[str]:
-    """Which whole simulations left the finger's range."""
+    """One sentence for each trial whose whole simulation diverges."""
     out = []
     for name, path in paths.items():
         away = diverges(path["q"], session.finger.limits)
@@ -382,7 +387,7 @@ def _divergence(session: Session, paths: dict[str, dict[str, np.ndarray]]) -> li
 
 
 def _encoder(trial: Trial, k: int) -> float:
-    """Scatter of an encoder about its own smooth motion, rad."""
+    """Standard deviation of an encoder's reading about its low-passed motion, rad."""
     step = float(np.median(np.diff(trial.time)))
     q = trial.q[:, k]
     return float(np.std(q - low_pass(trial.time, q, min(20.0, 0.2 / step))))

@@ -1,4 +1,7 @@
-"""Equation (1) of the paper as pure functions of a parameter pytree and a motion; estimation needs float64."""
+"""Equation (1) of the paper as pure functions of a parameter pytree and a motion.
+
+Importing the package switches JAX to float64, which estimation needs.
+"""
 
 import jax
 

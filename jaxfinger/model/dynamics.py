@@ -1,9 +1,10 @@
-"""Equation (1), once:
+"""Equation (1), written once:
 
     M(q) q̈ + N(q, q̇) + G(q) + h(q, q̇) = Cᵀ(q) (f_t − f_f) + Jᵀ(q) f_ext + τ_ext − s(q̇) μ |τ_ext|
 
-The last term is what the joints' own drives lose of their torque; the paper has none, μ = 0.
-Every experiment reads one of its unknowns from the others; all functions broadcast over the batch, which is last.
+(Li et al. 2024). The last term is the friction of the joints' own drives in proportion to their torque, an addition to
+the paper, where μ = 0. Each function solves (1) for one channel, given the others. All functions broadcast over batch
+axes, which are last.
 """
 
 from typing import NamedTuple
@@ -21,26 +22,27 @@ from jaxfinger.model.tendon_friction import bounded, held
 
 
 class Terms(NamedTuple):
-    """The terms of (1) other than the rigid body's, for one motion."""
+    """Terms of (1) for one motion, except those of the rigid body."""
 
     finger: Finger
     f_t: Float[Array, "n *T"]  # tension that enters the tendon's path, N
-    C: Float[Array, "n m *T"]
-    loss: Float[Array, "n *T"]  # of a sliding tendon, N
+    C: Float[Array, "n m *T"]  # coupling matrix, m/rad
+    loss: Float[Array, "n *T"]  # tension lost by a sliding tendon, |f_f|, N
     f_j: Float[Array, "n *T"]  # f_t − f_f: tension at the joints, N
     h: Float[Array, "m *T"]  # τ_k + τ_d, N m
-    friction: Float[Array, "m *T"]  # |τ_f|, N m
-    direction: Float[Array, "m *T"]  # share of it that is built up
-    tendon_direction: Float[Array, "n *T"]
-    torque_friction: Float[Array, "m *#T"]  # μ
-    shared: tuple[SharedFriction, ...]  # friction of what turns with several joints
+    friction: Float[Array, "m *T"]  # magnitude of τ_f, N m
+    direction: Float[Array, "m *T"]  # of τ_f, −1 … 1: sign of q̇, or the share of friction that is built up
+    tendon_direction: Float[Array, "n *T"]  # of f_f, likewise
+    torque_friction: Float[Array, "m *#T"]  # μ, 1
+    shared: tuple[SharedFriction, ...]  # friction that acts on several joints
 
 
 def terms(model: Model, x: Motion, memory: tuple[Memory, ...], plain: Terms | None = None) -> Terms:
-    """Each term as the nominal model has it, then as the effects change it.
+    """Evaluate the terms of (1): those of the nominal model, changed by the effects in order.
 
-    `plain`: the terms of the same motion without effects, where they are known. What no effect changes is taken from
-    there: a hook that is not overridden returns the very array that it was given.
+    `plain`: terms of the same motion without effects (`plain_terms`), where they are known. Terms that no effect
+    changes are taken from it. They are recognised by identity, since a hook that is not overridden returns its
+    argument.
     """
     effects = list(zip(model.effects, memory, strict=True))
     finger, f_t = model.finger, x.tension
@@ -78,7 +80,7 @@ def terms(model: Model, x: Motion, memory: tuple[Memory, ...], plain: Terms | No
         h, friction = plain.h, plain.friction
     for effect, state in effects:
         h = effect.torque(x, state, h)
-        if not x.held:  # else a fixture carries it
+        if not x.held:  # a fixture that holds the joints carries their friction
             friction = effect.joint_friction(x, f_j, C, friction)
     shared = tuple(s for effect, state in effects for s in effect.shared_friction(x, state))
     mu = _torque_friction(model, x)
@@ -93,34 +95,34 @@ def _torque_friction(model: Model, x: Motion) -> Float[Array, "m *#T"]:
 
 
 def plain_terms(model: Model, x: Motion) -> Terms:
-    """The terms of a model without effects."""
+    """Terms of (1) without the model's effects."""
     return terms(model, x, ())
 
 
 def resisting_torque(model: Model, x: Motion, plain: Terms | None = None) -> Float[Array, "m *T"]:
-    """h − Cᵀ(f_t − f_f): all of (1) but the rigid body and the surroundings, N m."""
+    """h − Cᵀ(f_t − f_f), N m: (1) without the rigid body and external forces."""
     return resisting(terms(model, x, memories(model, x), plain))
 
 
 def resisting(e: Terms) -> Float[Array, "m *T"]:
-    """`resisting_torque` of its terms, N m."""
-    return e.h + e.direction * e.friction + _shared(e) - jnp.sum(e.C * e.f_j[:, None], axis=0)
+    """h − Cᵀ(f_t − f_f), N m, from the terms `e`."""
+    return e.h + e.direction * e.friction + _shared_torque(e) - jnp.sum(e.C * e.f_j[:, None], axis=0)
 
 
-def _shared(e: Terms) -> Float[Array, "m *T"]:
-    """Torque of the friction of what turns with several joints, N m."""
+def _shared_torque(e: Terms) -> Float[Array, "m *T"]:
+    """Torque of the friction that acts on several joints, N m."""
     parts = (jnp.multiply.outer(s.ways, s.magnitude * s.direction) for s in e.shared)
     return sum(parts, start=jnp.zeros_like(e.h))
 
 
 def resisting_change(model: Model, x: Motion, plain: Terms) -> Float[Array, "m *T"]:
-    """What the effects add to `resisting_torque`, N m: of the terms that they change."""
+    """Change of `resisting_torque` by the effects, N m, computed from the terms that they change."""
     e = terms(model, x, memories(model, x), plain)
     change = e.h - plain.h if e.h is not plain.h else jnp.zeros_like(plain.h)
     if e.friction is not plain.friction or e.direction is not x.joint_direction:
         change += e.direction * e.friction - plain.direction * plain.friction
     if e.shared:
-        change += _shared(e)
+        change += _shared_torque(e)
     if e.C is not plain.C or e.f_j is not plain.f_j:
         change -= jnp.sum(e.C * e.f_j[:, None] - plain.C * plain.f_j[:, None], axis=0)
     return change
@@ -129,7 +131,7 @@ def resisting_change(model: Model, x: Motion, plain: Terms) -> Float[Array, "m *
 def external_torque(
     model: Model, x: Motion, f_ext: Float[Array, "3 *T"] | None = None, plain: Terms | None = None
 ) -> Float[Array, "m *T"]:
-    """τ_ext of (1): the torque that must act on the joints from outside for the motion to be as it is, N m."""
+    """τ_ext of (1), N m: the external torque on the joints that the motion requires."""
     e = terms(model, x, memories(model, x), plain)
     tau = rigid_body.inverse_dynamics(e.finger, x.q, x.qd, x.qdd) + resisting(e)
     if f_ext is not None:
@@ -141,14 +143,14 @@ def external_torque(
 def fingertip_force(model: Model, x: Motion) -> Float[Array, "3 *T"]:
     """f_ext at rest, base frame, N: the least-squares solution of Jᵀ f_ext = G + h − Cᵀ(f_t − f_f).
 
-    The joints over-determine a planar contact force; what it cannot take is taken by the joints' static friction. A
-    direction in which the fingertip cannot be moved carries no force.
+    The joints may over-determine the force; the rest of their torque is carried by their static friction. The force is
+    zero along directions in which the joints cannot move the fingertip.
     """
     return jnp.sum(contact_map(model, x) * external_torque(model, x)[None], axis=1)
 
 
 def contact_map(model: Model, x: Motion) -> Float[Array, "3 m *T"]:
-    """Pseudo-inverse of Jᵀ: the fingertip force that balances joint torques best, N/(N m)."""
+    """Pseudo-inverse of Jᵀ, 1/m: the map from joint torques to the fingertip force that balances them best."""
     _, J = rigid_body.fingertip(model.finger, x.q)
     # (J Jᵀ + ε I) f = J τ, the minimum-norm solution as ε → 0.
     gram = jnp.sum(J[:, None] * J[None], axis=2)
@@ -159,8 +161,8 @@ def contact_map(model: Model, x: Motion) -> Float[Array, "3 m *T"]:
 def _solved(A: Float[Array, "3 3 *T"], B: Float[Array, "3 m *T"]) -> Float[Array, "3 m *T"]:
     """A⁻¹ B for positive definite A = L D Lᵀ, sample by sample.
 
-    A formula, since two programs that call LAPACK for thousands of samples at once can hold all of XLA's processor
-    threads and wait for ever.
+    The formula avoids LAPACK: two programs that call it for thousands of samples at once can hold all of XLA's
+    processor threads and deadlock.
     """
     A = A[:, :, None]  # beside the columns of B
     d0, l1, l2 = A[0, 0], A[1, 0] / A[0, 0], A[2, 0] / A[0, 0]
@@ -174,7 +176,7 @@ def _solved(A: Float[Array, "3 3 *T"], B: Float[Array, "3 m *T"]) -> Float[Array
 
 
 def excursion(model: Model, x: Motion, plain: Float[Array, "n *T"] | None = None) -> Float[Array, "n *T"]:
-    """l, m: f(q), which is `plain` where it is known, and what the effects add."""
+    """Tendon excursion l, m: f(q) changed by the effects. `plain`: f(q), where it is known."""
     l = model.moment_arm.excursion(x.q) if plain is None else plain
     f = x.tension
     states = memories(model, x)
@@ -186,11 +188,11 @@ def excursion(model: Model, x: Motion, plain: Float[Array, "n *T"] | None = None
 
 
 def joint_tension(model: Model, x: Motion) -> Float[Array, "n *T"]:
-    """f_t − f_f: the tension that reaches the joints, N."""
+    """Tension that reaches the joints, f_t − f_f, N."""
     return terms(model, x, memories(model, x)).f_j
 
 
 def elastic_and_friction(model: Model, x: Motion) -> Float[Array, "m *T"]:
-    """h of (1), N m."""
+    """h of (1), N m: elastic torque, damping and joint friction."""
     e = terms(model, x, memories(model, x))
-    return e.h + e.direction * e.friction + _shared(e)
+    return e.h + e.direction * e.friction + _shared_torque(e)

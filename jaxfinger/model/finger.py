@@ -1,4 +1,4 @@
-"""What ID.1 gives: the rigid chain, its inertia, how it is mounted, and which tendon crosses which joint."""
+"""The finger as ID.1 describes it: rigid chain, inertia, mounting, and which tendon crosses which joint."""
 
 from typing import Protocol, runtime_checkable
 
@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 @runtime_checkable
 class Description(Protocol):
-    """The arrays of ID.1, however they were read; `rotor_inertia` (m,), kg m², may be missing or None."""
+    """Arrays of ID.1 under the format's names and units; `rotor_inertia` (m,), kg m², may be missing or None."""
 
     @property
     def gravity(self) -> Float[Array | np.ndarray, "3"]: ...
@@ -55,10 +55,10 @@ class Description(Protocol):
 class Finger(eqx.Module):
     """A serial chain of m joints, base to tip, moved by n tendons.
 
-    Link i moves with joint i; its frame sits on the joint and is parallel to its parent's frame at q = 0. A positive
-    angle about `axis` is flexion or abduction. A prismatic joint moves along its axis. A rotor that is geared to joint
-    i adds to `rotor_inertia[i, i]`; one that turns with several joints to their cross terms, too. Its own gyroscopic
-    torque is left out (Featherstone 2008, §9.6).
+    Link i moves with joint i. Its frame lies at the joint and is parallel to its parent's frame at q = 0. A positive
+    angle about `axis` is flexion or abduction; a prismatic joint moves along its axis. A rotor that is geared to joint
+    i adds to `rotor_inertia[i, i]`, and one that turns with several joints also to their cross terms. Gyroscopic
+    torques of rotors are neglected (Featherstone 2008, §9.6).
     """
 
     gravity: Float[Array, "3"]  # m/s², base frame
@@ -66,19 +66,19 @@ class Finger(eqx.Module):
     origin: Float[Array, "m 3"]  # m, in the parent link's frame
     mass: Float[Array, " m"]  # kg
     com: Float[Array, "m 3"]  # m, in the link frame
-    gyration: Float[Array, "m 3 3"]  # m², inertia about the centre of mass over the mass
-    rotor_inertia: Float[Array, "m m"]  # kg m², of geared rotors, reflected to the joints that they turn with
+    gyration: Float[Array, "m 3 3"]  # m², inertia about the centre of mass divided by the mass
+    rotor_inertia: Float[Array, "m m"]  # kg m², of geared rotors, reflected to the joints
     fingertip: Float[Array, "3"]  # m, in the last link's frame
-    limits: tuple[tuple[float, float], ...] = eqx.field(static=True)  # rad
+    limits: tuple[tuple[float, float], ...] = eqx.field(static=True)  # rad, or m where prismatic
     prismatic: tuple[bool, ...] = eqx.field(static=True)
     joint_names: tuple[str, ...] = eqx.field(static=True)
     tendon_names: tuple[str, ...] = eqx.field(static=True)
-    active: tuple[bool, ...] = eqx.field(static=True)
-    crosses: tuple[tuple[bool, ...], ...] = eqx.field(static=True)  # n rows of m
+    active: tuple[bool, ...] = eqx.field(static=True)  # whether an actuator pulls each tendon
+    crosses: tuple[tuple[bool, ...], ...] = eqx.field(static=True)  # n rows of m: whether a tendon crosses a joint
 
     @classmethod
     def from_description(cls, d: Description) -> "Finger":
-        """From anything that holds the arrays of ID.1 under the format's names."""
+        """Finger from an object with the arrays of ID.1 under the format's names."""
         arrays = {
             k: jnp.asarray(getattr(d, k), dtype=float)
             for k in ("gravity", "axis", "origin", "mass", "com", "inertia", "fingertip")
@@ -99,8 +99,10 @@ class Finger(eqx.Module):
 
     @property
     def inertia(self) -> Float[Array, "m 3 3 *T"]:
-        """kg m², about the centre of mass: a link that weighs more than CAD says is denser, and its inertia grows with
-        its mass, so that it stays the inertia of a body.
+        """Inertia of the links about their centres of mass, kg m².
+
+        It is proportional to the mass, as for a body of another density, so that it remains physically possible where a
+        fit changes the mass.
         """
         return self.mass[:, None, None] * self.gyration
 

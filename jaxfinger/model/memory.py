@@ -1,4 +1,4 @@
-"""States of the effects with memory, driven along a motion."""
+"""States (memories) of the effects that have them, integrated along a motion."""
 
 import jax
 import jax.numpy as jnp
@@ -9,24 +9,25 @@ from jaxtyping import Array, Float
 from jaxfinger.model.model import Effect, Memory, Model
 from jaxfinger.model.motion import Motion
 
-FINER = 5  # instants a sample of a fit at which a sharp memory is driven
-REACH = 3  # samples on either side that a low-pass is cut at: it is narrower than a sample
+SUBSAMPLES = 5  # instants for each sample of a fit at which a sharp memory is evaluated
+KERNEL_REACH = 3  # samples to either side at which the low-pass is cut off; its width is less than one sample
 
 
 def memories(model: Model, x: Motion) -> tuple[Memory, ...]:
-    """State of every effect with memory at each sample, as the fit's low-pass shows it (`Motion.blur`)."""
-    return tuple(_seen(model, effect, x) if effect.has_memory else () for effect in model.effects)
+    """State of every effect at each sample, after the fit's low-pass (`Motion.blur`); () for effects without memory."""
+    return tuple(_memory_of(model, effect, x) if effect.has_memory else () for effect in model.effects)
 
 
-def _seen(model: Model, effect: Effect, x: Motion) -> Memory:
+def _memory_of(model: Model, effect: Effect, x: Motion) -> Memory:
     if not effect.sharp:
-        return _along(model, effect, x)
+        return _integrated(model, effect, x)
     if (blur := x.blur) is None:
-        return _along(model, effect, _settled(x))
-    return jax.tree.map(lambda z: _blurred(z, x.time, blur), _along(model, effect, _settled(_finer(x))))
+        return _integrated(model, effect, _without_jitter(x))
+    fine = _integrated(model, effect, _without_jitter(_resampled(x)))
+    return jax.tree.map(lambda z: _low_passed(z, x.time, blur), fine)
 
 
-def _along(model: Model, effect: Effect, x: Motion) -> Memory:
+def _integrated(model: Model, effect: Effect, x: Motion) -> Memory:
     drives = jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), effect.drive(model, x))
     first = jax.tree.map(lambda a: a[0], drives)
 
@@ -39,8 +40,8 @@ def _along(model: Model, effect: Effect, x: Motion) -> Memory:
     return jax.tree.map(lambda a: jnp.moveaxis(a, 0, -1), memory)
 
 
-def _settled(x: Motion) -> Motion:
-    """Angles turn back only where they go back by more than the encoder's noise."""
+def _without_jitter(x: Motion) -> Motion:
+    """Motion whose angles turn back only where they do so by more than the encoder's noise (`Motion.jitter`)."""
     if x.jitter is None:
         return x
 
@@ -55,13 +56,13 @@ def _settled(x: Motion) -> Motion:
     return tree_at(lambda m: m.q, x, jnp.moveaxis(settled, 0, -1))
 
 
-def _finer(x: Motion) -> Motion:
-    """`FINER` instants a sample: cubic Hermite curves of q and q̇, straight lines of all else."""
-    s = jnp.arange(FINER, dtype=float) / FINER
+def _resampled(x: Motion) -> Motion:
+    """Motion at `SUBSAMPLES` instants for each sample: cubic Hermite interpolation of q, linear of all else."""
+    s = jnp.arange(SUBSAMPLES, dtype=float) / SUBSAMPLES
 
     def between(a, bend):
         inner = a[..., :-1, None] + jnp.multiply.outer(jnp.diff(a), s) + bend
-        return jnp.concatenate([inner.reshape(*a.shape[:-1], FINER * (a.shape[-1] - 1)), a[..., -1:]], axis=-1)
+        return jnp.concatenate([inner.reshape(*a.shape[:-1], SUBSAMPLES * (a.shape[-1] - 1)), a[..., -1:]], axis=-1)
 
     step, rise = jnp.diff(x.time)[None], jnp.diff(x.q)
     leaving, arriving = (jnp.where(step > 0.0, step * qd - rise, 0.0) for qd in (x.qd[..., :-1], x.qd[..., 1:]))
@@ -69,13 +70,13 @@ def _finer(x: Motion) -> Motion:
     return tree_at(lambda m: m.q, jax.tree.map(lambda a: between(a, 0.0), x), between(x.q, bend))
 
 
-def _blurred(z: Float[Array, "*Tfine"], time: Float[Array, "*T"], blur: Float[Array, "*T"]) -> Float[Array, "*T"]:
-    """Mean over every sample's interval of what the low-pass lets through."""
-    reach, count = REACH * FINER, time.shape[-1]
+def _low_passed(z: Float[Array, "*Tfine"], time: Float[Array, "*T"], blur: Float[Array, "*T"]) -> Float[Array, "*T"]:
+    """State after a Gaussian low-pass of standard deviation `blur`, s, averaged over the interval of each sample."""
+    reach, count = KERNEL_REACH * SUBSAMPLES, time.shape[-1]
     offset = jnp.arange(-reach, reach + 1)
     step, width = jnp.diff(time)[..., :1], jnp.maximum(blur[..., :1], 1e-9)
-    lag = (offset / FINER).reshape(*(1,) * (step.ndim - 1), -1)
+    lag = (offset / SUBSAMPLES).reshape(*(1,) * (step.ndim - 1), -1)
     weight = ndtr((lag + 0.5) * step / width) - ndtr((lag - 0.5) * step / width)
     weight = weight / jnp.sum(weight, axis=-1, keepdims=True)
-    at = jnp.clip(FINER * jnp.arange(count)[:, None] + offset[None], 0, FINER * (count - 1))
+    at = jnp.clip(SUBSAMPLES * jnp.arange(count)[:, None] + offset[None], 0, SUBSAMPLES * (count - 1))
     return jnp.einsum("...tk,...k->...t", z[..., at], weight)

@@ -1,4 +1,4 @@
-"""The parameters of equation (1) in one pytree, and what an effect may change in it."""
+"""The parameters of equation (1) in one pytree, and the hooks through which effects change the equation."""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -16,41 +16,44 @@ Memory = Any
 
 
 class SharedFriction(NamedTuple):
-    """Friction of something that turns with several joints: magnitude · direction · ways, on their torques."""
+    """Friction that acts on several joints, such as that of a motor geared to them.
 
-    ways: Float[Array, " m"]  # its speed is ways · q̇
+    Its torque on the joints is ways · magnitude · direction.
+    """
+
+    ways: Float[Array, " m"]  # gear ratios: its speed is ways · q̇
     magnitude: Float[Array, "*T"]  # N m
     direction: Float[Array, "*T"]  # sign of its speed
 
 
 class Effect(eqx.Module):
-    """A physical effect that equation (1) leaves out: exactly absent at its zero value.
+    """Physical effect that equation (1) leaves out; at zero amplitude the equation is exactly the nominal one.
 
-    A subclass overrides the hooks that it acts through and leaves the rest as they are. Every hook broadcasts over the
-    batch axes at the end. An effect with memory says what drives it, its state at the first sample, and how that goes
-    on to the next one; the states are driven along the motion, measured or simulated.
+    A subclass overrides the hooks through which it acts; the defaults change nothing. Every hook broadcasts over
+    batch axes, which are last. An effect with memory defines the drive of its state, the state at the first sample, and
+    the step to the next one; states are integrated along measured and simulated motions.
     """
 
-    # Whether the memory turns corners within a sample of a fit, as friction does at a reversal.
+    # Whether the state changes abruptly within a sample of a fit, as friction does at a reversal.
     sharp: ClassVar[bool] = False
 
     @property
     def has_memory(self) -> bool:
-        """Whether it has a state."""
+        """Whether the effect has a state."""
         return type(self).next_memory is not Effect.next_memory
 
-    # Sensors: what the finger did, from what the sensors said; and what a sensor says of what the finger does.
+    # Sensors: the true motion from the measured one, and the reading of a sensor from the true channel.
     def true_motion(self, x: Motion) -> Motion:
-        """The motion behind the measured one."""
+        """True motion, given the measured one."""
         return x
 
     def reading(self, channel: str, x: Motion, y: Float[Array, "channels *T"]) -> Float[Array, "channels *T"]:
-        """What the sensor of `channel` (a dataset's name) reads of `y`."""
+        """Reading of the sensor of `channel` (a dataset's name), given its true value `y`."""
         return y
 
     # Memory.
     def drive(self, model: "Model", x: Motion) -> Drive:
-        """What drives the state, at every sample of `x` at once."""
+        """Inputs of the state, at every sample of `x` at once."""
         return ()
 
     def initial_memory(self, drive: Drive) -> Memory:
@@ -58,12 +61,12 @@ class Effect(eqx.Module):
         return ()
 
     def next_memory(self, memory: Memory, before: Drive, drive: Drive) -> Memory:
-        """State one sample on, where the drive goes from `before` to `drive`."""
+        """State at the next sample, while the drive changes from `before` to `drive`."""
         return memory
 
     # Terms of equation (1), in the order in which they are evaluated.
     def finger(self, finger: Finger) -> Finger:
-        """Another rigid body or another mounting."""
+        """Finger with a changed rigid body or mounting."""
         return finger
 
     def tension(self, x: Motion, memory: Memory, f: Float[Array, "n *T"]) -> Float[Array, "n *T"]:
@@ -73,8 +76,9 @@ class Effect(eqx.Module):
     def directions(
         self, x: Motion, memory: Memory, joint: Float[Array, "m *T"], tendon: Float[Array, "n *T"]
     ) -> tuple[Float[Array, "m *T"], Float[Array, "n *T"]]:
-        """Share of the friction that is built up, in [−1, 1], in place of the sign of the motion; affine in that sign,
-        which the forward simulation solves for.
+        """Directions of joint and tendon friction in [−1, 1], the built-up share, given the signs of motion.
+
+        The result must be affine in the signs, since the forward simulation solves for them.
         """
         return joint, tendon
 
@@ -85,7 +89,7 @@ class Effect(eqx.Module):
     def loss(
         self, x: Motion, f: Float[Array, "n *T"], C: Float[Array, "n m *T"], loss: Float[Array, "n *T"]
     ) -> Float[Array, "n *T"]:
-        """Tension lost by a sliding tendon, N, before it is bounded by the tension."""
+        """Tension lost by a sliding tendon, N, before it is clipped to [0, f_t]."""
         return loss
 
     def held_tension(
@@ -105,7 +109,7 @@ class Effect(eqx.Module):
         return F
 
     def torque_friction(self, mu: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
-        """Share of its own torque that each joint's drive loses to friction."""
+        """Share μ of its own torque that each joint's drive loses to friction."""
         return mu
 
     def shared_friction(self, x: Motion, memory: Memory) -> tuple[SharedFriction, ...]:
@@ -113,7 +117,7 @@ class Effect(eqx.Module):
         return ()
 
     def torque(self, x: Motion, memory: Memory, h: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
-        """Torque h that resists the motion, on the left of (1), friction apart, N m."""
+        """Torque h on the left of (1) without friction, N m."""
         return h
 
     def excursion(
@@ -124,7 +128,7 @@ class Effect(eqx.Module):
 
 
 class Model(eqx.Module):
-    """Every parameter of equation (1), each in one place, and the effects on top of it, in order."""
+    """Parameters of equation (1), each in one place, and the effects that change it, in order."""
 
     finger: Finger
     moment_arm: MomentArm
@@ -142,7 +146,10 @@ class Model(eqx.Module):
         elastic_degree: int = 2,
         friction_degree: int = 2,
     ) -> "Model":
-        """The rigid body alone: no moment arms, no joint torque, no tendon friction."""
+        """Model of the rigid body alone, with zero moment arms, joint torques and tendon friction.
+
+        `cross`: whether the excursion has terms of two joints (`MomentArm.zeros`).
+        """
         return cls(
             finger,
             MomentArm.zeros(finger.n, finger.m, moment_arm_degree, cross),
@@ -151,13 +158,13 @@ class Model(eqx.Module):
         )
 
     def true_motion(self, x: Motion) -> Motion:
-        """The motion behind the measured one, as the effects have it."""
+        """True motion, given the measured one, by the effects in order."""
         for effect in self.effects:
             x = effect.true_motion(x)
         return x
 
     def reading(self, channel: str, x: Motion, y: Float[Array, "channels *T"]) -> Float[Array, "channels *T"]:
-        """What the sensor of `channel` reads of `y`."""
+        """Reading of the sensor of `channel`, given its true value `y`, by the effects in order."""
         for effect in self.effects:
             y = effect.reading(channel, x, y)
         return y

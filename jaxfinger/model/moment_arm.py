@@ -1,4 +1,4 @@
-"""Tendon excursion l = f(q), equation (2): polynomials of the joints' angles, and C = ∂f/∂q, never fitted apart."""
+"""Tendon excursion l = f(q), equation (2) of the paper, as polynomials of the joints' angles, and C = ∂f/∂q."""
 
 from functools import reduce
 from itertools import accumulate, combinations
@@ -12,8 +12,8 @@ from jaxtyping import Array, Float, Int
 class MomentArm(eqx.Module):
     """l_k = Σ_t coefficients[k, t] Π_i q_i^exponents[t, i], zero at q = 0; positive when the tendon is pulled in.
 
-    The nominal form has the powers 1 … degree of one joint at a time; cross terms between joints are further rows of
-    `exponents`. Units of a coefficient: m/rad^(sum of its exponents).
+    The nominal terms are the powers 1 … degree of each joint; cross terms of two joints are further rows of
+    `exponents`. The unit of a coefficient is m/rad^(sum of its exponents).
     """
 
     coefficients: Float[Array, "n terms"]
@@ -21,7 +21,10 @@ class MomentArm(eqx.Module):
 
     @classmethod
     def zeros(cls, n: int, m: int, degree: int = 4, cross: bool = False) -> "MomentArm":
-        """All coefficients zero; with `cross`, the terms q_a q_b, q_a² q_b and q_a q_b² of every pair of joints."""
+        """Moment arms of zero for `n` tendons and `m` joints.
+
+        `cross` adds the terms q_a q_b, q_a² q_b and q_a q_b² of every pair of joints.
+        """
         exponents = [tuple(p * (i == j) for j in range(m)) for i in range(m) for p in range(1, degree + 1)]
         if cross:
             exponents += [
@@ -32,25 +35,25 @@ class MomentArm(eqx.Module):
         return cls(jnp.zeros((n, len(exponents))), tuple(exponents))
 
     def of(self, tendon: Int[Array, ""]) -> "MomentArm":
-        """One tendon's row."""
+        """Moment arms of a single tendon, given its index."""
         return MomentArm(self.coefficients[tendon][None], self.exponents)
 
-    # Compiled on their own, so that Python traces them once, however many effects and experiments read them.
+    # Compiled apart, so that Python traces them once for all effects and experiments.
     @jax.jit
     def excursion(self, q: Float[Array, "m *T"]) -> Float[Array, "n *T"]:
-        """f(q), m."""
+        """Excursion f(q), m."""
         powers = self._powers(q)
         return jnp.tensordot(self.coefficients, jnp.stack([_monomial(powers, e) for e in self.exponents]), 1)
 
     @jax.jit
     def coupling(self, q: Float[Array, "m *T"]) -> Float[Array, "n m *T"]:
-        """C(q) = ∂f/∂q, m/rad: the moment arm of tendon k about joint i at [k, i]."""
+        """Coupling matrix C(q) = ∂f/∂q, m/rad; entry [k, i] is the moment arm of tendon k about joint i."""
         powers = self._powers(q)
         gradient = jnp.stack([jnp.stack([_derivative(powers, e, i) for i in range(len(q))]) for e in self.exponents])
         return jnp.tensordot(self.coefficients, gradient, 1)
 
     def _powers(self, q: Float[Array, "m *T"]) -> list[Float[Array, "m *T"]]:
-        """1, q, q², …"""
+        """Powers 1, q, q², … up to the highest exponent."""
         return list(accumulate([q] * max(map(max, self.exponents)), jnp.multiply, initial=jnp.ones_like(q)))
 
 

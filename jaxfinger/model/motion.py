@@ -1,4 +1,4 @@
-"""What drives the finger: measured, commanded or simulated; batch last, time the very last axis."""
+"""State and inputs of the finger along a motion, measured, commanded or simulated; time is the last axis."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -7,9 +7,9 @@ from jaxtyping import Array, Float
 class Motion(eqx.Module):
     """The state and inputs of equation (1) at the same instants.
 
-    Directions are the signs of q̇ and l̇: the protocol's where it is known, smooth where derivatives are needed.
-    A tendon without tension measurement (passive, slack) carries zero. `held`: a fixture holds the joints, so that
-    tendons move only when their loss is exceeded.
+    Directions are the signs of q̇ and l̇, by the protocol or from the measured motion; values between −1 and 1 are block
+    means or low-passed signs. The tension of a tendon without measurement (passive or slack) is zero. `held`: a fixture
+    holds the joints, so that tendons slip only where their loss is exceeded.
     """
 
     time: Float[Array, "*T"]  # s, from the trial's start
@@ -23,15 +23,14 @@ class Motion(eqx.Module):
     motorised: Float[Array, "m *T"]  # 1 where the external motor is coupled to the joint
     held: bool = eqx.field(static=True, default=False)
     temperature: Float[Array, "m *T"] | None = None  # K, of each joint, where it is measured
-    # Of a recording: rad, what the encoder's noise turns an angle back by at rest; and s, the standard deviation of the
-    # low-pass that all of it went through, 0 for none, where a sample is the mean of its interval.
-    jitter: Float[Array, "m *T"] | None = None
-    blur: Float[Array, "*T"] | None = None
-    # Of samples that a simulation starts from: N, the tension that follows, at even instants, and s, for how long.
-    tension_ahead: Float[Array, "L n *T"] | None = None
-    horizon: Float[Array, "*T"] | None = None
+    # Recordings only.
+    jitter: Float[Array, "m *T"] | None = None  # rad, largest reversal of an angle by the encoder's noise alone
+    blur: Float[Array, "*T"] | None = None  # s, standard deviation of the low-pass before averaging; 0 for none
+    # Starts of simulations only.
+    tension_ahead: Float[Array, "L n *T"] | None = None  # N, at L even instants from the start to the horizon
+    horizon: Float[Array, "*T"] | None = None  # s, duration of the simulation
 
     @property
     def simulated(self) -> bool:
-        """Whether a simulation starts from every sample."""
+        """Whether every sample is the start of a simulation."""
         return self.horizon is not None

@@ -1,9 +1,9 @@
 """Rigid-body terms of equation (1) by recursive Newton–Euler (Luh, Walker, Paul 1980; Featherstone 2008, ch. 5).
 
-Every function takes joint arrays `(m, *T)` with the batch last and broadcasts over it. A 3-vector is one array
-`(3, *T)`, which compiles quickly, or a tuple of its three components, which runs quickly:
-every product is then one loop along the long axis. The recursion is the same for both. A long batch goes through by
-components, in blocks that stay in the processor's cache.
+Every function takes joint arrays `(m, *T)` with the batch last and broadcasts over it. A 3-vector is either one array
+`(3, *T)`, which compiles quickly, or a tuple of three components, which runs quickly, since every product is then one
+loop along the long axis. The recursion is the same for both. A long batch is computed by components, in blocks that fit
+into the processor's cache.
 """
 
 import functools
@@ -74,20 +74,20 @@ def _rotation(axis: Vector, angle: Scalar) -> Matrix:
 
 
 def _spin(omega: Vector, alpha: Vector) -> Matrix:
-    """[α]ₓ + [ω]ₓ[ω]ₓ = [α]ₓ + ω ωᵀ − ω² I: what a point of a turning body accelerates by, times where it is."""
+    """[α]ₓ + [ω]ₓ[ω]ₓ = [α]ₓ + ω ωᵀ − ω² I, which maps the position of a body's point to its relative acceleration."""
     (x, y, z), (u, v, w) = omega, alpha
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
     rows = ((-yy - zz, xy - w, xz + v), (xy + w, -xx - zz, yz - u), (xz - v, yz + u, -xx - yy))
     return rows if isinstance(omega, tuple) else jnp.stack([jnp.stack(row) for row in rows])
 
 
-BLOCK = 1024  # samples, 8 KiB an array
-LONG = 8192  # samples from which on a run of a tenth of the time is worth half a second more to compile
-CHAIN = 3  # links that XLA may take in one loop; with each further one it computes more of them again
+BLOCK = 1024  # samples in a block, 8 KiB for each array: the arrays of a link fit into the processor's cache
+LONG = 8192  # samples above which components are used: they run in a tenth of the time and compile 0.5 s longer
+CHAIN = 3  # links that XLA may fuse into one loop; beyond, it computes links repeatedly
 
 
 class _Joint(NamedTuple):
-    """One joint and its link, or all of them, base to tip along the first axis of every array."""
+    """One joint and its link, or all of them, from base to tip along the first axis of every array."""
 
     axis: Vector
     origin: Vector
@@ -109,14 +109,14 @@ def _joints(finger: Finger, q, qd, qdd, by_components: bool) -> _Joint:
 
 
 def _frame(j: _Joint, slides: bool) -> tuple[Matrix, Vector]:
-    """The link's frame in its parent's."""
+    """Rotation and position of the link's frame in its parent's frame."""
     if slides:
         return _rotation(j.axis, jnp.zeros_like(j.q)), _add(j.origin, _scale(j.q, j.axis))
     return _rotation(j.axis, j.q), _add(j.origin, _scale(jnp.zeros_like(j.q), j.axis))
 
 
 def _recursion(step, state, links, finger: Finger, reverse: bool = False):
-    """Link by link, `step(state, link, slides)`: a scan where all joints are of one kind, since it compiles faster."""
+    """Run `step(state, link, slides)` along the chain; where all joints are of one kind a scan compiles faster."""
     slides = finger.prismatic
     if len(set(slides)) == 1:
         return jax.lax.scan(functools.partial(step, slides=slides[0]), state, links, reverse=reverse)
@@ -126,11 +126,11 @@ def _recursion(step, state, links, finger: Finger, reverse: bool = False):
 
 
 def _unrolled(step, state, links: list, finger: Finger, reverse: bool = False) -> tuple:
-    """Link by link, one after the other in the program."""
+    """Run `step(state, link, slides)` along the chain, unrolled in the program."""
     out = {}
     for i in reversed(range(finger.m)) if reverse else range(finger.m):
         if out and finger.m > CHAIN:
-            # A choice ends a loop: what a link hands on is written down, and not computed again where it is read.
+            # A conditional ends XLA's loop fusion, so that a link's state is stored and not computed again.
             never = finger.mass[0] < 0.0
             state = jax.lax.cond(never, lambda s: jax.tree.map(jnp.negative, s), lambda s: s, state)
         state, out[i] = step(state, links[i], finger.prismatic[i])
@@ -141,12 +141,12 @@ def _unrolled(step, state, links: list, finger: Finger, reverse: bool = False) -
 def inverse_dynamics(
     finger: Finger, q: Float[Array, "m *T"], qd: Float[Array, "m *T"], qdd: Float[Array, "m *T"]
 ) -> Float[Array, "m *T"]:
-    """M(q) q̈ + N(q, q̇) + G(q), in N m (N for a prismatic joint), the rotors' inertia in M."""
+    """M(q) q̈ + N(q, q̇) + G(q), N m (N for a prismatic joint), with the inertia of rotors in M."""
     return _chain_dynamics(finger, q, qd, qdd) + jnp.tensordot(finger.rotor_inertia, qdd, 1)
 
 
 def _chain_dynamics(finger: Finger, q, qd, qdd) -> Float[Array, "m *T"]:
-    """The same of the links alone."""
+    """Inverse dynamics of the links without rotors, N m."""
     samples = math.prod(q.shape[1:])
     if samples <= LONG:
         return jnp.asarray(_newton_euler(finger, q, qd, qdd, by_components=False))
@@ -163,10 +163,10 @@ def _chain_dynamics(finger: Finger, q, qd, qdd) -> Float[Array, "m *T"]:
 
 
 def _newton_euler(finger: Finger, q, qd, qdd, by_components: bool) -> Float[Array, "m *T"] | list[Scalar]:
-    """`_chain_dynamics`, joint by joint where it goes by components."""
+    """Recursive Newton–Euler without rotors, N m; by components it returns a list with one entry for each joint."""
 
     def outward(state, j: _Joint, slides: bool):
-        """Angular velocity ω, angular and linear acceleration α, a of the link's frame, in that frame."""
+        """Propagate ω, α and a of the link's frame, in that frame, and return the link's force and moment."""
         omega, alpha, a = state
         R, p = _frame(j, slides)
         back = _transposed(R)
@@ -183,7 +183,7 @@ def _newton_euler(finger: Finger, q, qd, qdd, by_components: bool) -> Float[Arra
         return (omega, alpha, a), (R, p, force, moment)
 
     def inward(wrench, link, slides: bool):
-        """Force and moment that the parent applies to the link, at its joint; then both in the parent's frame."""
+        """Sum the force and moment that the parent applies to the link, take the joint's torque, and turn both."""
         (force, moment), (j, (R, p, f, n)) = wrench, link
         force, moment = _add(f, force), _add(n, moment)
         torque = _dot(j.axis, force if slides else moment)
@@ -204,18 +204,18 @@ def _newton_euler(finger: Finger, q, qd, qdd, by_components: bool) -> Float[Arra
 
 
 def gravity_torque(finger: Finger, q: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
-    """G(q), N m."""
+    """Gravity torque G(q), N m."""
     zero = jnp.zeros_like(q)
     return inverse_dynamics(finger, q, zero, zero)
 
 
 def coriolis(finger: Finger, q: Float[Array, "m *T"], qd: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
-    """N(q, q̇): Coriolis and centrifugal torque, N m."""
+    """Coriolis and centrifugal torque N(q, q̇), N m."""
     return inverse_dynamics(_weightless(finger), q, qd, jnp.zeros_like(q))
 
 
 def mass_matrix(finger: Finger, q: Float[Array, "m *T"]) -> Float[Array, "m m *T"]:
-    """M(q), kg m²: its columns are the torques of a unit acceleration of one joint, without gravity."""
+    """Mass matrix M(q), kg m²; column i is the torque of a unit acceleration of joint i without gravity."""
     zero = jnp.zeros_like(q)
     unit = jnp.stack([zero.at[i].set(1.0) for i in range(finger.m)])
     weightless = _weightless(finger)
@@ -231,7 +231,7 @@ def fingertip(finger: Finger, q: Float[Array, "m *T"]) -> tuple[Float[Array, "3 
     """Position of the fingertip, m, and its Jacobian J, m/rad, in the base frame."""
 
     def outward(pose, j: _Joint, slides: bool):
-        """The link's frame in the base frame; the joint's axis there, and where the joint is."""
+        """Propagate the link's frame in the base frame, and return the joint's axis and position there."""
         (R, p), (turn, shift) = pose, _frame(j, slides)
         p = _add(p, _mul(R, shift))
         R = jnp.sum(R[:, :, None] * jnp.asarray(turn)[None], axis=1)

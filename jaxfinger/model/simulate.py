@@ -1,8 +1,8 @@
 """Forward dynamics, and simulation in time under measured tension.
 
-Coulomb friction is a set-valued law: regularised with a narrow tanh it is stiff, and explicit steps give right-looking
-trajectories with meaningless derivatives. Moreau's midpoint rule (Moreau 1988; Acary & Brogliato 2008, ch. 10) solves
-for the friction impulses of a step instead, so that joints and tendons stick and slide without a smoothing width.
+Coulomb friction is a set-valued law. Regularised with a narrow tanh it is stiff, and explicit steps give plausible
+trajectories with meaningless derivatives. Moreau's midpoint rule (Moreau 1988; Acary & Brogliato 2008, ch. 10) instead
+solves for the friction impulses of a step, so that joints and tendons stick and slide without a smoothing width.
 """
 
 from typing import NamedTuple
@@ -16,13 +16,15 @@ from jaxfinger.model.dynamics import resisting, terms
 from jaxfinger.model.model import Drive, Memory, Model
 from jaxfinger.model.motion import Motion
 
-SWEEPS = 12  # of projected Gauss–Seidel over the frictions of a step, warm-started from the last step
+# Sweeps of projected Gauss–Seidel over the frictions of a step. They start from the last step's frictions, so that
+# few sweeps are needed.
+SWEEPS = 12
 
 
 def forward_dynamics(
     model: Model, x: Motion, memory: tuple[Memory, ...], tau_ext: Float[Array, " m"] | float = 0.0
 ) -> Float[Array, " m"]:
-    """q̈ of (1) at one sample, rad/s², friction in the directions that `x` states."""
+    """q̈ of (1) at one sample, rad/s², with friction in the directions given by `x`."""
     e = terms(model, x, memory)
     bias = rigid_body.inverse_dynamics(e.finger, x.q, x.qd, jnp.zeros_like(x.q))
     drive = tau_ext - e.direction * e.torque_friction * jnp.abs(tau_ext)
@@ -32,9 +34,9 @@ def forward_dynamics(
 class _State(NamedTuple):
     q: Float[Array, " m"]
     qd: Float[Array, " m"]
-    drive: tuple[Drive, ...]  # of the memories, in the middle of the last step
+    drive: tuple[Drive, ...]  # of the memories, at the midpoint of the last step
     memory: tuple[Memory, ...]
-    friction: Float[Array, " k"]  # torques and tensions of friction, N m and N, then of what turns with several joints
+    friction: Float[Array, " k"]  # of joints, N m, tendons, N, and shared friction, N m
 
 
 def simulate(
@@ -47,13 +49,17 @@ def simulate(
     session_start: Float[Array, ""] | float = 0.0,
     substeps: int = 2,
 ) -> tuple[Float[Array, "m T"], Float[Array, "m T"]]:
-    """q, rad, and q̇, rad/s, from the first sample on, under the tension measured at the uniform instants `time`."""
+    """Simulate q, rad, and q̇, rad/s, from `q0` and `qd0` at the first of the uniform instants `time`, s.
+
+    `tension`, N, and `tau_ext`, N m (default zero), are interpolated linearly. `session_start`: session's time, s, at
+    time 0. `substeps`: integration steps for each sample.
+    """
     dt = (time[1] - time[0]) / substeps
     if tau_ext is None:
         tau_ext = jnp.zeros((model.finger.m, time.size))
 
     def motion(t, q, qd, f):
-        unresolved = jnp.zeros_like(q), jnp.zeros_like(f)  # directions: their friction is solved for
+        unresolved = jnp.zeros_like(q), jnp.zeros_like(f)  # directions are solved for
         return Motion(t, q, qd, jnp.zeros_like(q), f, *unresolved, t + session_start, jnp.zeros_like(q))
 
     x0 = motion(time[0], q0, qd0, tension[:, 0])
@@ -65,7 +71,7 @@ def simulate(
     def sample(state, inputs):
         t, f0, f1, tau0, tau1 = inputs
 
-        @jax.checkpoint  # a derivative backwards keeps the states between the steps, and nothing of the steps
+        @jax.checkpoint  # reverse mode stores only the states between steps
         def substep(state, share):
             f, tau = f0 + share * (f1 - f0), tau0 + share * (tau1 - tau0)
             return _step(model, state, motion, t + share * dt * substeps, f, tau, dt), None
@@ -79,9 +85,7 @@ def simulate(
 
 
 def simulated_from(model: Model, x: Motion) -> Float[Array, "m L *T"]:
-    """q, rad, at even instants from every sample to its horizon: simulated from its state under the tension that
-    follows.
-    """
+    """Simulate q, rad, from the state of every sample under `tension_ahead`, at L even instants to its horizon."""
     assert x.tension_ahead is not None
     assert x.horizon is not None
     share = jnp.linspace(0.0, 1.0, x.tension_ahead.shape[0])
@@ -96,38 +100,41 @@ def simulated_from(model: Model, x: Motion) -> Float[Array, "m L *T"]:
 
 
 def simulated_ahead(model: Model, x: Motion) -> Float[Array, "m *T"]:
-    """q, rad, at the horizon of every sample."""
+    """Simulated q, rad, at the horizon of every sample."""
     return simulated_from(model, x)[:, -1]
 
 
 def _step(model: Model, state: _State, motion, t, f, tau, dt) -> _State:
-    """One midpoint step: forces at the middle position, friction from the velocity that it leads to."""
+    """One midpoint step: forces at the midpoint, friction that opposes the velocity at the end of the step."""
     qd = state.qd
     x = motion(t, state.q + 0.5 * dt * qd, qd, f)
     drive = tuple(effect.drive(model, x) for effect in model.effects)
     memory = tuple(
         effect.next_memory(*now) for effect, *now in zip(model.effects, state.memory, state.drive, drive, strict=True)
     )
-    e = terms(model, x, memory)  # with the friction that the effects' memories have built up, and no other
-    at_once = _at_once(model, x, memory)
+    e = terms(model, x, memory)  # with the friction built up in memories only
+    immediate = _immediate_share(model, x, memory)
     M = rigid_body.mass_matrix(e.finger, x.q)
     bias = rigid_body.inverse_dynamics(e.finger, x.q, qd, jnp.zeros_like(qd))
     M_inv = jnp.linalg.inv(M)
-    # What turns with several joints sticks and slides as they do: its friction is solved for.
+    # Shared friction sticks and slides like that of joints, and is solved for.
     free = qd + dt * M_inv @ (tau - bias - resisting(e._replace(shared=())))
 
-    # Rates of joints, tendons and what turns with several joints: D q̇.
+    # D q̇ are the rates of joints, tendons and shared frictions.
     D = jnp.concatenate([jnp.eye(qd.size), e.C, *(s.ways[None] for s in e.shared)])
-    joint = at_once[: qd.size] * (e.friction + e.torque_friction * jnp.abs(tau))
-    limit = jnp.concatenate([joint, at_once[qd.size :] * e.loss, *(s.magnitude[None] for s in e.shared)])
+    joint = immediate[: qd.size] * (e.friction + e.torque_friction * jnp.abs(tau))
+    limit = jnp.concatenate([joint, immediate[qd.size :] * e.loss, *(s.magnitude[None] for s in e.shared)])
     A = dt * D @ M_inv @ D.T
     friction = _gauss_seidel(A, D @ free, limit, state.friction)
     qd = free - dt * M_inv @ (D.T @ friction)
     return _State(x.q + 0.5 * dt * qd, qd, drive, memory, friction)
 
 
-def _at_once(model: Model, x: Motion, memory) -> Float[Array, " k"]:
-    """Share of each joint's and tendon's friction that follows the sign of the velocity without delay."""
+def _immediate_share(model: Model, x: Motion, memory) -> Float[Array, " k"]:
+    """Share of each joint's and tendon's friction that follows the sign of its velocity immediately.
+
+    Directions are affine in the sign, so that the share is their difference between sign 1 and sign 0.
+    """
 
     def built(sign):
         joint, tendon = jnp.full_like(x.joint_direction, sign), jnp.full_like(x.tendon_direction, sign)
@@ -139,7 +146,7 @@ def _at_once(model: Model, x: Motion, memory) -> Float[Array, " k"]:
 
 
 def _gauss_seidel(A, rates, limit, start):
-    """Friction λ with |λ| ≤ limit that opposes the rates v = rates − A λ which remain: λ_i = limit_i sign(v_i)."""
+    """Friction λ, |λ_i| ≤ limit_i, that opposes the rates v = rates − A λ: λ_i = limit_i sign(v_i) where v_i ≠ 0."""
     diagonal = jnp.maximum(jnp.diagonal(A), 1e-30)
 
     def sweep(_, friction):

@@ -1,4 +1,4 @@
-"""f_f: the tension lost between the actuator and the joint."""
+"""Tendon friction f_f, the tension lost between the actuator and the joints."""
 
 import equinox as eqx
 import jax
@@ -7,31 +7,31 @@ from jaxtyping import Array, Float
 
 
 class TendonFriction(eqx.Module):
-    """Affine in tension: the loss of a sliding tendon is a₀ + a₁ f_t, at least zero and never more than f_t."""
+    """Loss of a sliding tendon, affine in its tension: a₀ + a₁ f_t, clipped to [0, f_t] (`bounded`)."""
 
     constant: Float[Array, " n"]  # a₀, N
     proportional: Float[Array, " n"]  # a₁, 1
 
     @classmethod
     def zeros(cls, n: int) -> "TendonFriction":
-        """A frictionless transmission."""
+        """Frictionless transmission of `n` tendons."""
         return cls(jnp.zeros(n), jnp.zeros(n))
 
     def loss(self, tension: Float[Array, "n *T"]) -> Float[Array, "n *T"]:
-        """a₀ + a₁ f_t, N, before it is kept within [0, f_t] (`bounded`)."""
+        """a₀ + a₁ f_t, N, before it is clipped (`bounded`)."""
         a0, a1 = (a.reshape(-1, *(1,) * (tension.ndim - 1)) for a in (self.constant, self.proportional))
         return a0 + a1 * tension
 
 
 def bounded(loss: Float[Array, "n *T"], tension: Float[Array, "n *T"]) -> Float[Array, "n *T"]:
-    """A tendon cannot lose more than its tension; a slack one loses nothing."""
+    """Clip a loss to [0, f_t], N: a tendon cannot lose more than its tension, and a slack one loses nothing."""
     return jnp.clip(loss, 0.0, jnp.maximum(tension, 0.0))
 
 
 def held(tension: Float[Array, "n *T"], loss: Float[Array, "n *T"]) -> Float[Array, "n *T"]:
-    """Tension at a joint that is held: it follows only when the loss is exceeded, starting from slack.
+    """Tension f_j at a held joint, N: the tendon slips only where the loss is exceeded, and starts from slack.
 
-    f_j = clip(f_j before, f_t − loss, f_t + loss), along the last axis, which is time.
+    f_j = clip(f_j before, f_t − loss, f_t + loss), along time, the last axis.
     """
 
     def slip(f_j, bounds):

@@ -19,7 +19,7 @@ CYCLE = 3.0  # s
 FINGER = paper_finger().description
 MCP = FINGER.joint_names[0]
 FILTER = filter_std(EXPERIMENTS["VD.3"].cutoff)
-CLEAR, BREAKAWAY = driven.CLEAR * FILTER, driven.BREAKAWAY * FILTER  # s
+CLEAR, BREAKAWAY = driven.CLEAR_WIDTHS * FILTER, driven.BREAKAWAY_WIDTHS * FILTER  # s
 
 
 def sweep(duration=9.0, noise=ENCODER, seed=0, **fields) -> Trial:
