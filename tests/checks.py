@@ -1,18 +1,20 @@
-"""What checks the annotations in the tests: beartype, of each value once."""
+"""Type checker of the annotations in the tests: beartype, once for each value."""
 
 from collections.abc import Callable
 from typing import Any
 
 from beartype import BeartypeConf, beartype
 
-# Where `float` stands, an `int` may too (PEP 484).
+# An `int` may be given where `float` is annotated (PEP 484).
 CONFIGURATION = BeartypeConf(is_pep484_tower=True)
 
 
 def checked(fn: Callable) -> Callable:
-    """A function that jaxtyping made to check another: one for the arguments, before a call, and one for what it
-    returned, after it, which is given the arguments once more. Their sizes are remembered in between, so that the
-    second one checks what was returned alone.
+    """Wrap one of jaxtyping's checking functions with beartype.
+
+    jaxtyping makes two of them for each function: one checks the arguments before a call, the other the returned value
+    after it and the arguments again. Sizes are remembered in between, so that here the second one checks the returned
+    value alone.
     """
     if fn.__annotations__.get("return", Any) is not Any:
         fn.__annotations__ = {"return": fn.__annotations__["return"]}

@@ -1,4 +1,4 @@
-"""Mistakes in TOML files, and what must become of them."""
+"""Random mistakes in TOML files, and the assertion that a reader reads or refuses them."""
 
 import re
 
@@ -9,7 +9,7 @@ from jaxfinger.errors import UserError
 
 @st.composite
 def mutated(draw, text):
-    """A file with keys or values replaced, lines dropped, doubled or moved, and a few characters changed."""
+    """Mutate a file: replace keys or values, drop, double or move lines, and change a few characters."""
     lines = text.splitlines()
     other = st.sampled_from(
         [
@@ -52,7 +52,7 @@ def mutated(draw, text):
 
 
 def assert_read_or_refused(read, text):
-    """`read` takes the text, or raises UserError that begins with the file and a line that the file has."""
+    """Assert that `read` accepts the text, or raises a UserError that begins with the file and one of its lines."""
     try:
         read(text)
         said = "mutated.toml, line 1: "

@@ -1,4 +1,4 @@
-"""`import jaxfinger as jf`: what a notebook sees."""
+"""The names of `import jaxfinger as jf`, and how results show in a notebook."""
 
 import doctest
 import subprocess
@@ -18,7 +18,7 @@ DEMO = DATASETS / "demo-finger" / "session.h5"
 
 @pytest.fixture(scope="module")
 def axis(tmp_path_factory):
-    """What the examples of the docstrings start from: a real servo axis in `session.h5`, and its fit in `fit.json`."""
+    """Folder for the examples of docstrings: a real servo axis in `session.h5`, and its fit in `fit.json`."""
     folder = tmp_path_factory.mktemp("axis")
     import_file([DATASETS / "emps" / "DATA_EMPS.mat"], DATASETS / "emps" / "emps.toml", folder / "session.h5")
     jf.save(jf.identify(jf.read(folder / "session.h5"), jf.recipe("emps")), folder / "fit.json")
@@ -28,7 +28,7 @@ def axis(tmp_path_factory):
 @pytest.mark.parametrize("name", jf.__all__)
 def test_every_name_of_the_package_has_an_example_that_runs(name, axis, monkeypatch):
     monkeypatch.chdir(axis)
-    thing = identify if name == "identify" else getattr(jf, name)  # of that name is the room, which is called
+    thing = identify if name == "identify" else getattr(jf, name)  # the name is a callable package
     examples = doctest.DocTestParser().get_doctest(thing.__doc__ or "", {}, name, None, None)
     assert examples.examples
     said: list[str] = []

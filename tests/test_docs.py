@@ -1,4 +1,4 @@
-"""What the pages tell a reader to type runs: each command in a folder that holds the files which it names."""
+"""Commands in the documentation run, each in a folder that holds the files it names."""
 
 import math
 import os
@@ -26,20 +26,20 @@ BENCHMARK = ROOT / "datasets" / "sealed" / "README.md"
 GUIDE = ROOT / "docs" / "your-own-data.md"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "datasets").rglob("*.md"))]
 
-# What the guide says of a finger that is to be simulated, for its `finger.toml`: moment arms, and what else it does.
+# Additions to the guide's `finger.toml` with which it can be simulated: moment arms, and terms of the model.
 PATHS = ({"T1": "[0.008, 1e-3]", "T2": "[-0.008, -1e-3]"}, "[terms.joints.MCP]\nelastic = [-0.01, 0.03]\n")
-# Which file of the shelf a page means by a name that is none of a file there.
+# Files of the shelf for placeholders in the pages.
 MEANS = {"SESSION": "session.h5", "SESSION.h5": "session.h5", "B.h5": "session.h5", "C.h5": "unseen.h5"}
 MEANS |= {"FILE": "session.h5", "FIT": "fit.json", "A-fit.json": "fit.json", "LOG": "LOG.csv", "bench.toml": "rig.toml"}
-MEANS |= {"…": ""}  # a reader puts more of the same there
-MATRIX = "jaxfinger.rig.matrix"  # its table is made and held to the page by tests/rig/test_matrix.py
+MEANS |= {"…": ""}  # stands for more arguments of the same kind
+MATRIX = "jaxfinger.rig.matrix"  # tests/rig/test_matrix.py runs it and compares its table with the page
 
 
 def commands(page: Path) -> list[str]:
-    """What calls jaxfinger: in shell blocks, and within a sentence."""
+    """Commands of jaxfinger on a page, from shell blocks and from within sentences."""
     text = page.read_text(encoding="utf-8")
     fenced = r"```(\w*)[^\n]*\n(.*?)```"
-    shells = {"sh", "console"} if page == GUIDE else {"sh", "bash", "console"}  # test_guide follows its `bash` blocks
+    shells = {"sh", "console"} if page == GUIDE else {"sh", "bash", "console"}  # test_guide runs its `bash` blocks
     blocks = [block for language, block in re.findall(fenced, text, re.DOTALL) if language in shells]
     prose = re.sub(fenced, "", text, flags=re.DOTALL)
     blocks += re.findall(r"\n\n((?:    [^\n]*\n)+)", prose)
@@ -49,12 +49,12 @@ def commands(page: Path) -> list[str]:
 
 
 def modules(page: Path) -> list[str]:
-    """Modules that a page tells to run."""
+    """Modules that a page runs by `python -m`."""
     return re.findall(r"python -m (jaxfinger[\w.]*)", page.read_text(encoding="utf-8"))
 
 
 def is_a_name(line: str) -> bool:
-    """Whether a sentence names a command, without the files that it would need."""
+    """Whether a line names a command without the files that it needs."""
     try:
         app.parse_args(shlex.split(line)[1:], exit_on_error=False, print_error=False)
     except MissingArgumentError:
@@ -63,7 +63,7 @@ def is_a_name(line: str) -> bool:
 
 
 def typed(line: str) -> None:
-    """As at a prompt; an exit with anything but 0 is an error."""
+    """Run a line as typed at a prompt; assert that it exits with 0."""
     code = 0
     try:
         main(shlex.split(line)[1:])
@@ -74,7 +74,7 @@ def typed(line: str) -> None:
 
 @pytest.fixture(scope="module")
 def shelf(tmp_path_factory):
-    """The files of a reader, made by the same commands: sessions of the guide's finger, a fit, an interrupted run."""
+    """Folder with a reader's files, made by the same commands: sessions of the guide's finger, a fit, a stopped run."""
     folder = tmp_path_factory.mktemp("shelf")
     (text,) = re.findall(r"```toml finger\.toml\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)
     arms, terms = PATHS
@@ -114,7 +114,7 @@ def shelf(tmp_path_factory):
 
 @pytest.fixture
 def reader(shelf, tmp_path, monkeypatch):
-    """A folder with what a command names and does not write, a terminal, as `record` asks for, and a shell."""
+    """Folder with the files that a command reads, a terminal, which `record` needs, and a shell."""
 
     def prepare(line: str) -> tuple[str, list[Path]]:
         words = [MEANS.get(word, word) for word in shlex.split(line)]
@@ -159,7 +159,7 @@ def test_every_command_of_the_pages_runs(line, reader, capsys):
 
 
 def test_every_command_of_the_pages_is_one():
-    """Also those of the benchmark, which take hours: tests/sealed runs them on small cases."""
+    """The benchmark's commands are included. They take hours, so that tests/sealed runs them on small cases."""
     lines = [line for page in PAGES for line in commands(page)]
     assert len(lines) > 40
     for line in lines:
@@ -170,7 +170,7 @@ def test_every_command_of_the_pages_is_one():
 
 @pytest.mark.parametrize("module", sorted({m for p in PAGES for m in modules(p)} - {MATRIX}))
 def test_every_module_that_the_pages_run_says_how(module, monkeypatch, capsys):
-    """It serves until it is stopped."""
+    """Modules are asked for their help alone, since they serve until stopped."""
     monkeypatch.setattr(sys, "argv", [module, "--help"])
     with pytest.raises(SystemExit) as end:
         runpy.run_module(module, run_name="__main__")

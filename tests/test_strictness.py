@@ -1,4 +1,4 @@
-"""The tests are stricter than users: what an annotation says is checked, and nothing is promoted in silence."""
+"""The tests are stricter than users: annotations are checked, and nothing is promoted silently."""
 
 from concurrent.futures import ThreadPoolExecutor
 

@@ -1,4 +1,4 @@
-"""The same machine in other units: masses, lengths and times of a session, or of a number, by factors."""
+"""Conversion of sessions and numbers to other units of mass, length and time."""
 
 import re
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from jaxfinger.data import Session, Trial
 
 @dataclass(frozen=True)
 class Scale:
-    """How many of the other units one of mass, length and time is."""
+    """Factors from SI to other units of mass, length and time."""
 
     mass: float = 1.0
     length: float = 1.0
@@ -21,7 +21,7 @@ class Scale:
         return self.mass * self.length / self.time**2
 
     def of(self, units: str) -> float:
-        """The factor of a number in such units, as parameters write them: `N m s/rad^2`."""
+        """Factor of a number with these units, in the notation of parameters, as `N m s/rad^2`."""
         base = {"kg": self.mass, "m": self.length, "s": self.time, "N": self.force, "rad": 1.0, "1": 1.0}
         out, (above, _, below) = 1.0, units.partition("/")
         for text, sign in ((above, 1), (below, -1)):
@@ -30,7 +30,7 @@ class Scale:
         return out
 
     def __call__(self, session: Session) -> Session:
-        """The same motions and weights, in the other units."""
+        """Session with the same motions and forces in the other units."""
         f = session.finger
         slides = np.array(f.prismatic)
         angle = np.where(slides, self.length, 1.0)  # of each joint's coordinate

@@ -1,4 +1,4 @@
-"""What a fit reads of a recording: directions, which samples count, what is averaged."""
+"""Reduction of recordings: directions, valid samples and averages."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -23,7 +23,7 @@ CLEAR, BREAKAWAY = driven.CLEAR_WIDTHS * FILTER, driven.BREAKAWAY_WIDTHS * FILTE
 
 
 def sweep(duration=9.0, noise=ENCODER, seed=0, **fields) -> Trial:
-    """The external motor sweeps the MCP: it turns back every half cycle, at rest for no sample."""
+    """Trial in which the external motor sweeps the MCP, reversing every half cycle without rest."""
     time = np.arange(round(duration * RATE)) / RATE
     q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
     q[:, 0] += 0.5 * np.cos(2 * np.pi * time / CYCLE + 0.3)
@@ -40,7 +40,7 @@ def stack(*trials: Trial, **options):
 
 
 def test_averages_twice_as_long_are_those_of_two():
-    """Of what the model reads and of what it predicts, but for blocks that a reversal touches."""
+    """Arrays that the model reads are compared over all blocks that both cover."""
     fine, coarse = (stack(sweep(), coarse=c) for c in (1, 2))
     assert coarse.dt == pytest.approx(2.0 * fine.dt)
     for name in ("q", "qd", "qdd", "time"):
@@ -56,7 +56,7 @@ def turning_points(duration=9.0):
 
 
 def test_at_every_sample_a_joint_turns_back_once_and_over_the_way_that_its_encoder_cannot_tell():
-    """Friction turns from where the motion back began to one and a half times the encoder's noise from there."""
+    """Friction reverses between the start of the motion back and a travel of 1.5 standard deviations of the encoder."""
     x = stack(sweep(), reduced=False).batch.x
     time, direction = np.asarray(x.time)[0], np.asarray(x.joint_direction)[0, 0]
     turned = time[1:][(np.diff(np.sign(direction)) != 0) & (time[1:] > 0.5)]
@@ -69,7 +69,7 @@ def test_at_every_sample_a_joint_turns_back_once_and_over_the_way_that_its_encod
 
 
 def test_a_joint_that_stops_turns_when_it_moves_again():
-    """Up, a stop of a second in which noise has no direction, and down."""
+    """The joint moves up, stops for a second, in which noise has no direction, and moves down."""
     time = np.arange(4000) / RATE
     q = np.tile(np.interp(time, [0.0, 1.5, 2.5, 4.0], [0.2, 0.8, 0.8, 0.2])[:, None], (1, 3))
     q += ENCODER * np.random.default_rng(4).standard_normal(q.shape)
@@ -82,7 +82,7 @@ def test_a_joint_that_stops_turns_when_it_moves_again():
 
 
 def test_where_a_prediction_reads_no_acceleration_there_is_none():
-    """Between reversals at constant speed, q̈ is the encoder's noise: 2 rad/s² of a filter that sees reversals."""
+    """At constant speed q̈ is the encoder's noise, 2 rad/s² after a filter that resolves reversals."""
     time = np.arange(6000) / RATE
     corners = [0.0, 2.0, 4.0, 6.0], [0.2, 1.0, 0.2, 1.0]
     q = np.tile(np.interp(time, *corners)[:, None], (1, 3)) + ENCODER * np.random.default_rng(5).normal(size=(6000, 3))
@@ -107,7 +107,7 @@ def test_samples_around_a_reversal_do_not_count_and_the_others_do():
 
 @pytest.mark.parametrize("creep", [-0.01, 0.01])
 def test_a_creep_whose_direction_is_not_known_does_not_count(creep):
-    """Slower than what tells a direction from noise, before the first motion or after one that went the other way."""
+    """Its speed is within the noise, before the first motion or after one in the other direction."""
     time = np.arange(6000) / RATE
     rate = np.select([time < 1.0, time < 2.0, time < 4.0, time < 5.0], [0.0, creep, 0.6, creep], 0.6)
     q = np.tile(np.radians([-40.0, 30.0, 20.0]), (time.size, 1))
@@ -122,7 +122,7 @@ def test_a_creep_whose_direction_is_not_known_does_not_count(creep):
 
 
 def test_around_a_slip_faster_than_the_filter_no_joint_counts():
-    """The DIP jumps by 0.2 rad within 15 ms, twice, while the PIP sweeps on: what is spread moves every joint."""
+    """The DIP jumps by 0.2 rad within 15 ms, twice, while the PIP sweeps on; a jump disturbs every joint."""
     time = np.arange(4000) / RATE
     q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
     q[:, 1] += 0.3 * time
@@ -146,7 +146,7 @@ def test_around_a_slip_faster_than_the_filter_no_joint_counts():
 
 
 def test_where_a_joint_sticks_and_slips_no_joint_counts():
-    """Steps of 40 mrad, fourteen a second, are a small part of the travel, and smooth motion to a filter of 10 Hz."""
+    """Fourteen steps of 40 mrad in a second are small beside the travel, and smooth after a filter of 10 Hz."""
     time = np.arange(4000) / RATE
     steps = np.interp(time % 0.07, [0.0, 0.05, 0.07], [0.0, 0.0, 0.04]) + 0.04 * np.floor(time / 0.07)
     smooth = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1)) + 0.3 * time[:, None] * [0.0, 1.0, 1.0]
@@ -166,7 +166,7 @@ def test_where_a_joint_sticks_and_slips_no_joint_counts():
 
 
 def test_a_tendon_that_may_only_stretch_has_no_known_friction():
-    """Let go by 50 N/s, a tendon of 40 µm/N shortens by 2 mm/s: a motor as slow says nothing of its other end."""
+    """A tendon of 40 µm/N shortens by 2 mm/s at −50 N/s; at that motor speed its other end may be at rest."""
     time = np.arange(4000) / RATE
     q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1)) + 0.3 * time[:, None]
     q += ENCODER * np.random.default_rng(2).standard_normal(q.shape)
@@ -181,7 +181,7 @@ def test_a_tendon_that_may_only_stretch_has_no_known_friction():
 
 
 def test_a_tendon_that_stands_still_for_a_moment_has_no_known_friction():
-    """For 60 ms, which a filter of 5 Hz takes for half the speed."""
+    """It stops for 60 ms, which a filter of 5 Hz shows as half the speed."""
     time = np.arange(4000) / RATE
     q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1)) + 0.3 * time[:, None]
     q += ENCODER * np.random.default_rng(2).standard_normal(q.shape)
@@ -196,11 +196,11 @@ def test_a_tendon_that_stands_still_for_a_moment_has_no_known_friction():
 
 
 def test_between_holds_counts_a_tension_that_goes_on_or_a_joint_that_slides():
-    """Where it turns back a tendon sticks; at the ends of a move a joint may."""
+    """A tendon sticks where its tension turns back; a joint may stick at the ends of a move."""
     time = np.arange(7000) / RATE
     heights = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 3.0, 2.0, 1.0])
     second = np.floor(time).astype(int)
-    step = np.interp(time - second, [0.0, 0.3], [0.0, 1.0])  # in 0.3 s to the next height, then still
+    step = np.interp(time - second, [0.0, 0.3], [0.0, 1.0])  # 0.3 s to the next height, then at rest
     level = heights[second] + step * (heights[second + 1] - heights[second])
     hold = np.where(time - second > 0.33, second, -1).astype(np.int32)
     q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
@@ -211,7 +211,7 @@ def test_between_holds_counts_a_tension_that_goes_on_or_a_joint_that_slides():
     stepped = Trial("steps", "ID.3-static", time, moved, joint_torque=torque, joint=MCP, hold=hold)
     held, static = (stack(t) for t in (fixed, stepped))
     counts = np.asarray(held.batch.mask["joint_torque"])[0, 0] > 0
-    between = {k: counts[20 * k : 20 * k + 6] for k in range(7)}  # the 0.3 s before the hold number k
+    between = {k: counts[20 * k : 20 * k + 6] for k in range(7)}  # the 0.3 s before hold number k
     assert [bool(x.all()) for x in between.values()] == [False, False, True, True, False, True, True]
     assert not between[4].any()
     moves = np.asarray(static.batch.mask["joint_torque"])[0, 0] > 0
@@ -226,7 +226,7 @@ def test_between_holds_counts_a_tension_that_goes_on_or_a_joint_that_slides():
 
 
 def test_the_excursion_of_a_taut_tendon_counts_on_every_ramp():
-    """No friction decides it; a slack tendon's length is not that of its path."""
+    """Friction does not change the excursion, but the length of a slack tendon is not that of its path."""
     time = np.arange(5000) / RATE
     level = np.interp(time, [0.5, 1.0, 2.0, 2.5, 3.5, 4.0], [0.0, 4.0, 4.0, 8.0, 8.0, 2.0])
     hold = np.where((time > 1.05) & (time < 2.0), 0, np.where((time > 2.55) & (time < 3.5), 1, -1)).astype(np.int32)
@@ -242,7 +242,7 @@ def test_the_excursion_of_a_taut_tendon_counts_on_every_ramp():
 
 @pytest.mark.parametrize("reduced", [True, False])
 def test_a_held_joint_follows_what_its_fixture_yields_and_no_noise(reduced):
-    """f(q) of that noise would be a law of the angle in what remains of the excursion."""
+    """Otherwise noise of the angle would look like a law of the angle in the residual excursion."""
     time = np.arange(9000) / RATE
     level = np.floor(time) + np.interp(time % 1.0, [0.0, 0.3], [-1.0, 0.0])  # a step every second, up in 0.3 s
     hold = np.where(time % 1.0 > 0.35, np.floor(time), -1).astype(np.int32)
@@ -265,7 +265,7 @@ def test_a_slow_sweep_of_the_motor_slides_and_a_finger_as_slow_may_stick():
     q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
     q[:, 0] += 0.05 * time
     q += 0.1 * ENCODER * np.random.default_rng(1).standard_normal(q.shape)
-    fast = q + np.where(time[:, None] > 3.0, 3.0 * (time[:, None] - 3.0), 0.0)  # so that slow is slow beside it
+    fast = q + np.where(time[:, None] > 3.0, 3.0 * (time[:, None] - 3.0), 0.0)  # slow beside the rest
     torque = np.where(np.arange(3) == 0, 1e-2, np.nan) * np.ones_like(q)
     driven = stack(Trial("slow", "ID.3-dynamic", time, fast, joint_torque=torque, joint=MCP))
     free = stack(Trial("free", "VD.3", time, fast, tendon_force=np.zeros((time.size, FINGER.n))))
@@ -281,7 +281,7 @@ def test_the_protocols_directions_are_taken_as_they_are():
 
 
 def test_a_hold_keeps_the_direction_that_led_to_it_though_nothing_says_so():
-    """Up in two steps and down in one: at each hold friction has the sign of the step before it."""
+    """After two steps up and one down, friction at each hold has the sign of the step before it."""
     time = np.arange(8000) / RATE
     corners = ([0.0, 2.0, 2.5, 4.0, 4.5, 6.0, 6.5, 8.0], [0.2, 0.2, 0.5, 0.5, 0.8, 0.8, 0.5, 0.5])
     q = np.tile(np.interp(time, *corners)[:, None], (1, 3)) + ENCODER * np.random.default_rng(2).normal(size=(8000, 3))
@@ -330,7 +330,7 @@ def test_trials_of_other_rates_are_refused_by_name():
 
 
 def stairs(first: float, duration=8.0, seed=2):
-    """Steps up and down of the MCP after a rest of `first` s at an angle that no motion led to."""
+    """Trial with steps of the MCP up and down, after a rest of `first` s of unknown approach."""
     time = np.arange(round((first + duration) * RATE)) / RATE
     corners = np.array([0.0, first, first + 0.5, first + 2.0, first + 2.5, first + 4.0, first + 4.5, first + 6.0])
     q = np.tile(np.interp(time, corners, [0.2, 0.2, 0.5, 0.5, 0.8, 0.8, 0.5, 0.5])[:, None], (1, 3))
@@ -352,7 +352,7 @@ def test_a_hold_before_the_first_motion_tells_nothing_of_friction(given):
 
 
 def ramps(rise: float, start: float = 0.0, rest: float = 0.0) -> Trial:
-    """A tendon pulled from `start` to 8 N in `rise` s and let go as slowly, twice, without a hold; at rest before."""
+    """Trial in which a tendon rests for `rest` s, is pulled to 8 N in `rise` s and released as slowly, twice."""
     corners = rest + rise * np.arange(5)
     time = np.arange(round(corners[-1] * RATE)) / RATE
     rng = np.random.default_rng(7)
@@ -374,7 +374,7 @@ def test_slow_ramps_of_tension_count_without_holds(reduced):
     turns = [0, *(T * np.arange(1, 4) // 4), T]
     for k, (a, b) in enumerate(pairwise(turns)):
         inner = pulled[a + T // 80 : b - T // 80]
-        assert (np.diff(inner) * (1 if k % 2 == 0 else -1) >= 0.0).all()  # noise drags no tendon up
+        assert (np.diff(inner) * (1 if k % 2 == 0 else -1) >= 0.0).all()  # noise does not add up
     assert not_judged({"ID.4": found}) == [("ID.4", "tendon_excursion", "no trial measured it")]
 
 
@@ -394,7 +394,7 @@ def test_quick_ramps_without_holds_are_not_judged_and_said_not_to_be():
     [(4.0, 1.0, ""), (0.1, 1.0, "nothing of the trial is judged"), (4.0, 0.01, "T1 is never pulled")],
 )
 def test_the_checker_says_what_a_fit_counts(rise, pulled, said, newton):
-    """Whatever a finger's size, beside a trial that tells how much tension is much."""
+    """The size of the forces does not matter; another trial gives their scale."""
     trials = [ramps(rise), replace(ramps(4.0), name="another", tendon="T2")]
     own, other = (newton * t.tendon_force for t in trials)
     trials = [
@@ -411,7 +411,7 @@ def test_the_checker_says_what_a_fit_counts(rise, pulled, said, newton):
 
 
 def test_a_tendon_that_was_taut_before_the_recording_counts_from_its_first_change_on():
-    """Whether it was pulled or let go to where it is, nobody saw."""
+    """It is not known whether its tension rose or fell before."""
     found = stack(ramps(4.0, start=4.0, rest=2.0))
     at, counts = np.asarray(found.batch.x.time)[0], np.asarray(found.batch.mask["joint_torque"])[0, 0] > 0
     assert not counts[at < 2.0].any()
@@ -431,7 +431,7 @@ def test_several_joints_excited_at_once_are_all_motorised():
 
 
 def test_another_unit_of_force_and_length_leaves_what_counts_alone():
-    """The same finger, a thousand times as heavy and ten times as long: nothing of a finger's size decides."""
+    """Samples are the same for a finger 1000 times as strong and ten times as long."""
     time = np.arange(4000) / RATE
     q = np.radians([40.0, 30.0, 20.0]) + 0.3 * time[:, None]
     q += ENCODER * np.random.default_rng(2).standard_normal(q.shape)
@@ -446,7 +446,7 @@ def test_another_unit_of_force_and_length_leaves_what_counts_alone():
 
 
 def test_steps_are_read_at_their_own_pace_however_quick_the_sweeps_are():
-    """A sweep of ten cycles a second beside steps of the protocol: what holds and steps say stays as it was."""
+    """Sweeps of ten cycles a second do not change the reduction of steps at the protocol's pace."""
     step, rng = 1.0 / 200.0, np.random.default_rng(1)
     levels = np.radians([*range(0, 81, 10), *range(70, -1, -10)])
     time = np.arange(0.0, 1.8 * len(levels), step)

@@ -1,4 +1,4 @@
-"""A session whose truth the nominal model can express, its staged fit and its joint refinement, made once."""
+"""Fixtures: sessions whose truth the nominal model can express, a staged fit and its joint refinement."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ RECIPE = {
     },
     "sensors": {"clock_jitter": 0.0},
 }
-# Every experiment, a quarter of a minute each.
+# All experiments, a quarter of a minute each.
 SHORT_RECIPE = recipe_from(
     {
         "specimen": {"kind": "polynomial"},
@@ -59,7 +59,7 @@ def session(clean):
 
 @pytest.fixture(scope="session")
 def truth():
-    """The flat vector of the specimen's own parameters."""
+    """Flat vector of the specimen's true parameters."""
     return np.asarray(ravel(true_model(polynomial_finger(paper_finger()))))
 
 
@@ -81,5 +81,5 @@ def short():
 
 @pytest.fixture(scope="session")
 def short_truth(short):
-    """The parameters that made it, as a fit."""
+    """True parameters of `short` as a fit."""
     return Fit.before(short, Recipe(), true_model(polynomial_finger(paper_finger())))

@@ -1,4 +1,4 @@
-"""Many sessions at once give what each gives alone; members that fail are named; work spreads over processes."""
+"""Fits of many sessions at once equal single fits, report members that fail, and can be shared among processes."""
 
 import pickle
 import socket
@@ -31,7 +31,7 @@ def without_excursion(session):
 
 
 def with_bursts(session):
-    """Three newton millimetres too many in every fiftieth sample of a torque, in bursts of five."""
+    """Session with torques 3 N mm too large in every fiftieth sample, in bursts of five."""
     rng = np.random.default_rng(0)
 
     def hit(trial):
@@ -50,7 +50,7 @@ def with_heavier_links(session):
 
 @pytest.fixture(scope="module")
 def members(sessions, session, staged):
-    """One call for all: two as they are, one that lacks a joint's excursions, and the second spoilt and loaded."""
+    """Fits of two plain sessions, one without a joint's excursions, and the second with bursts and heavy links."""
     second = sessions[1]
     odd = [without_excursion(sessions[2]), with_bursts(second), with_heavier_links(second)]
     return fit_many([*sessions[:2], *odd], staged, session)
@@ -68,21 +68,21 @@ def test_members_are_the_fits_of_each_session_alone(members, sessions, staged):
     for k, session in enumerate(sessions[:2]):
         alone = identify(session)
         difference = (members.values[k] - np.asarray(ravel(alone.model)))[free] / alone.std[free]
-        # Alone it estimates its own noise, and so weighs its samples a little differently.
+        # A single fit estimates its own noise, so that its weights differ a little.
         assert np.abs(difference).max() < 0.5
         assert np.median(np.abs(difference)) < 0.1
         np.testing.assert_allclose(members.std[k][free], alone.std[free], rtol=0.25)
 
 
 def test_members_are_what_identify_finds_from_the_same_start_outliers_included(members, sessions, staged):
-    """By the same solver on the same rows, with the same weights."""
+    """Solver, rows and weights are the same."""
     own = replace(staged.model, finger=nominal_model(sessions[1], staged.recipe).finger)
     again, free = replace(staged, model=own, stages=()), staged.estimated
     for k, member in ((3, with_bursts(sessions[1])), (1, sessions[1])):
         alone = np.asarray(ravel(identify(member, start=again, stages=("ID.2", "ID.3-dynamic", "ID.4")).model))
         scale = np.maximum(np.abs(alone), staged.std)[free]
         assert np.abs((members.values[k] - alone)[free] / scale).max() < 1e-8
-    # Bursts that least squares without weights would move by several standard deviations.
+    # Without robust weights the bursts would move estimates by several standard deviations.
     assert np.abs((members.values[3] - members.values[1])[free] / staged.std[free]).max() < 1.5
 
 
@@ -94,7 +94,7 @@ def test_the_template_itself_comes_back(members, staged):
 
 
 def test_members_keep_their_own_links(members, sessions, staged):
-    """Specimens of a lab differ: heavier links change gravity, and so what is left to the elastic torques."""
+    """Heavier links change gravity torques, and thus the estimated elastic torques."""
     heavy = with_heavier_links(sessions[1])
     alone = identify(heavy)
     free = staged.estimated
@@ -130,7 +130,7 @@ np.savez(target + process, theta=theta, failed=failed, values=found.values, std=
 
 @pytest.mark.long
 def test_two_processes_share_refits_and_sessions(sessions, session, staged, members, tmp_path):
-    """Three sessions: two for the first process, one for the second."""
+    """Of three sessions the first process fits two and the second one."""
     compressed = compress(session, staged)
     weights = draw_weights(compressed.strata, 5, np.random.default_rng(0))
     weights[3] = np.nan

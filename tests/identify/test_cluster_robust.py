@@ -1,14 +1,14 @@
-"""The sandwich by stretches: Laplace where the model is right, wide enough where it is wrong."""
+"""The sandwich by stretches equals Laplace's covariance where the model is right, and covers where it is wrong."""
 
 import numpy as np
 
 from jaxfinger.identify.cluster_robust import STRETCH_DURATION, growth, stretch_scores, stretches
 
-RATE, MOVEMENTS = 50.0, 60  # Hz; of one stretch each
+RATE, MOVEMENTS = 50.0, 60  # Hz; movements last one stretch each
 
 
 def records(rng: np.random.Generator, missed: float, count: int = 300):
-    """Fits of y = a + b v to records of movements at random speeds v; what each movement adds of its own is missed."""
+    """Fits of y = a + b v to movements at random speeds v, each with an offset of its own that the model misses."""
     n = int(RATE * STRETCH_DURATION)
     time = np.arange(MOVEMENTS * n) / RATE
     for _ in range(count):
@@ -26,7 +26,7 @@ def test_intervals_cover_where_the_model_misses_something_of_every_movement():
     error = np.array([np.abs(e - [1.0, 2.0]) for e, *_ in found])
     laplace = np.array([s for _, s, _ in found])
     wide = np.array([s * g for _, s, g in found])
-    assert np.mean(error < 1.96 * laplace) < 0.6  # what the noise alone would say
+    assert np.mean(error < 1.96 * laplace) < 0.6  # from the noise alone
     assert 0.92 < np.mean(error < 1.96 * wide) < 0.98
 
 

@@ -1,4 +1,4 @@
-"""Are the stated intervals true? Two hundred sessions of a finger whose truth the nominal model can express."""
+"""Coverage of the stated intervals over 200 sessions of a finger whose truth the nominal model can express."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def test_intervals_cover_the_truth_and_estimates_are_unbiased_and_efficient():
     clean = clean_session(recipe_from(RECIPE), SpecimenPlant(specimen), specimen.description)
     truth = np.asarray(ravel(true_model(specimen)))
     sessions = [measure(clean, seed) for seed in range(SESSIONS)]
-    # The rig's noise is estimated on a session of its own.
+    # The rig's noise is estimated on another session.
     other = measure(clean, SESSIONS)
     template = identify(other)
     members = fit_many(sessions, template, other)
@@ -45,6 +45,6 @@ def test_intervals_cover_the_truth_and_estimates_are_unbiased_and_efficient():
     coverage = np.mean(np.abs(z) < 1.96)
     assert 0.93 < coverage < 0.97
     assert np.abs(z.mean(axis=0)).max() < 4 / np.sqrt(SESSIONS)
-    # The stated deviation is the Cramér–Rao bound of the stage under the noise that was found.
+    # The stated standard deviation is the Cramér–Rao bound of the stage under the estimated noise.
     spread = members.values[:, free].std(axis=0, ddof=1) / members.std[:, free].mean(axis=0)
     assert spread.max() < 1.2

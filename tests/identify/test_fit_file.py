@@ -1,4 +1,4 @@
-"""The file of a fit: what is written is read back to the last bit; a bad file is one sentence."""
+"""The file of a fit is read back exactly; a bad file is refused in one sentence."""
 
 import json
 from dataclasses import replace

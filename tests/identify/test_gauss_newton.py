@@ -1,4 +1,4 @@
-"""The solver of every fit as an optimistix solver: test problems beside Dogleg, jit, vmap and differentiation."""
+"""`VisibleGaussNewton` as an optimistix solver: test problems against Dogleg, jit, vmap and differentiation."""
 
 import jax
 import jax.numpy as jnp
@@ -49,15 +49,17 @@ def test_an_optimum_on_a_bound_is_found():
 
 
 def bent(y, a):
-    """Rows with kinks, some of them curved, beside what no parameter changes, of whose cost theirs is a small share."""
+    """Rows with kinks, some of them curved, and constant rows, which make up most of the cost."""
     A, c, bend, rest = a
     x = A @ y
     return jnp.where(bend > 0.3, jnp.maximum(x, -0.8 * x) + 0.3 * bend * x**2, x) - c, rest
 
 
 def test_it_ends_where_rounding_hides_what_steps_do_to_the_cost():
-    """Of made problems of many scales, every search ends; where by rounding, SciPy does not lower the cost of the rows
-    that parameters change by more than rounding hides.
+    """Searches on random problems of many scales all end.
+
+    Where one ends by rounding, SciPy lowers the cost of the rows that depend on parameters by no more than rounding
+    hides.
     """
     solver, rng, rounded = VisibleGaussNewton(atol=1e-6, kink=0.1), np.random.default_rng(0), 0
 

@@ -1,4 +1,4 @@
-"""What the finger's description gives beside its links: rotors and excursions; and the terms that real drives need."""
+"""Rotors and excursions of a finger's description as starts and priors, and the terms that real drives need."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def test_standard_deviations_of_the_description_are_the_prior():
     arms = {n: s for n, s in said.items() if n.startswith("excursion")}
     assert arms
     np.testing.assert_allclose(list(arms.values()), 0.1)
-    assert not any(n.endswith(("^3", "^4")) for n in arms)  # nobody said how well those are known
+    assert not any(n.endswith(("^3", "^4")) for n in arms)  # the description gives no standard deviations of these
     np.testing.assert_array_equal(prior.mean, np.asarray(ravel(model))[free])
 
 

@@ -1,4 +1,4 @@
-"""What trials cannot see is named with the experiment that would show it; base parameters of known chains."""
+"""Invisible combinations are named with the experiment that would determine them; base parameters of known chains."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ PARAMETERS = [
 def test_a_combination_that_is_not_seen_is_named():
     rng = np.random.default_rng(0)
     a, b = rng.standard_normal((2, 50))
-    J = np.column_stack([a, b, 2 * a])  # the first and the last parameter cannot be told apart
+    J = np.column_stack([a, b, 2 * a])  # the first and the last column are proportional
     found = directions(PARAMETERS, np.arange(3), J.T @ J)
     assert [d.status for d in found] == ["invisible", "seen", "seen"]
     assert set(found[0].shares) == {"elastic torque MCP^0", "centre of mass MCP x"}
@@ -37,14 +37,14 @@ def test_a_parameter_that_no_trial_touches_is_invisible():
 
 @pytest.mark.parametrize("m", [1, 3])
 def test_base_parameters_of_a_spatial_chain(m):
-    """A revolute chain with generic axes and gravity along no axis: 3 + 7 (m − 1) (Gautier 1991; Khalil 2002)."""
+    """A revolute chain with generic axes and gravity along none has 3 + 7 (m − 1) (Gautier 1991; Khalil 2002)."""
     base = base_parameters(Finger.from_description(description(m, m, prismatic=False)))
     assert base.rank == 3 + 7 * (m - 1)
     np.testing.assert_allclose(base.combinations @ base.combinations.T, np.eye(base.rank), atol=1e-10)
 
 
 def test_base_parameters_of_a_planar_finger():
-    """Parallel axes, gravity in the plane: 3 a link, the first's mass moments 2 and its inertia 1."""
+    """Parallel axes and gravity in their plane leave 3 for each link: 2 mass moments and an inertia."""
     d = description(3, 3, prismatic=False)
     planar = dict(
         axis=np.tile([0.0, 1.0, 0.0], (3, 1)),

@@ -1,4 +1,4 @@
-"""The joint refinement: right, no wider than the stages, the same from poor starts, and never counting data twice."""
+"""The joint refinement covers the truth, narrows intervals, has one optimum, and counts no data twice."""
 
 from dataclasses import replace
 
@@ -36,14 +36,16 @@ def test_estimates_lie_within_their_intervals(joint, truth):
     free = joint.estimated
     z = (values(joint) - truth)[free] / joint.std[free]
     assert joint.stages[-1].status == "fitted"
-    assert 0.6 < np.sqrt(np.mean(z**2)) < 1.4  # some thirty independent numbers
+    assert 0.6 < np.sqrt(np.mean(z**2)) < 1.4  # bounds for about thirty independent values
     assert np.abs(z).max() < 4.5
     assert 0.9 < joint.stages[-1].chi2_per_row < 1.1
 
 
 def test_all_trials_of_one_joint_are_refined_to_their_noise():
-    """One joint has as many parameters as the torque of VD.3, which is nothing throughout, has features: taken to be
-    without noise, it would be all that counts.
+    """The external torque of VD.3 is zero throughout.
+
+    Its noise must not be taken for zero: the parameters of one joint are enough to fit it exactly, at the cost of all
+    other channels.
     """
     specimen = study_finger()
     trials = {**SHORT, "experiments": list(EXPERIMENTS), "vd1": {"duration": 6.0}, "vd3": {"duration": 4.0}}
@@ -63,7 +65,7 @@ def test_no_interval_is_wider_than_the_stages(staged, joint):
 
 
 def test_the_same_data_are_counted_once(session, joint):
-    """A second refinement changes nothing: neither the estimate nor the intervals."""
+    """A second refinement changes neither estimates nor intervals."""
     again = refine(session, joint)
     free = joint.estimated
     np.testing.assert_allclose(again.std[free], joint.std[free], rtol=1e-3)
@@ -72,7 +74,7 @@ def test_the_same_data_are_counted_once(session, joint):
 
 @pytest.mark.long
 def test_other_data_are_the_prior(clean, staged, joint):
-    """A second session halves the variance of what CAD has no part in, and the estimate stays between the two."""
+    """A second session halves the variance of parameters on which CAD has no prior."""
     other = measure(clean, 1)
     both = refine(other, replace(joint, data_hash="of another file"))
     groups = np.array([p.group for p in describe(joint.model)])
@@ -105,7 +107,7 @@ def test_poor_starts_lead_to_the_same_optimum(session, staged, joint, factor, gr
 
 @pytest.mark.long
 def test_a_start_without_a_slope_is_left(session, staged, joint):
-    """Losses so negative that every one is bounded at zero have no derivative: the same optimum, or the fit says so."""
+    """Losses clipped at zero everywhere have no derivative. The fit finds the optimum, or reports that it did not."""
     found = refine(session, scaled(staged, -3.0, "tendon_friction"))
     free = joint.estimated
     same = np.abs((values(found) - values(joint))[free] / joint.std[free]).max() < 0.1
@@ -113,7 +115,7 @@ def test_a_start_without_a_slope_is_left(session, staged, joint):
 
 
 def test_masses_stay_positive(session, staged):
-    """CAD that is far too heavy and sure of itself in nothing pulls the masses down, not below zero."""
+    """From masses in CAD that are far too large and uncertain, trials reduce them, but not below zero."""
     finger = replace(session.finger, mass=session.finger.mass * 3, mass_std=session.finger.mass * 3)
     fit = refine(replace(session, finger=finger), staged)
     assert np.all(np.asarray(fit.model.finger.mass) > 0)

@@ -1,4 +1,4 @@
-"""What is compiled for a common shape says of the trials what the plain equations say."""
+"""Programs compiled for a common shape agree with the plain equations."""
 
 import equinox as eqx
 import jax
@@ -26,7 +26,7 @@ def test_a_stack_has_room_and_less_than_as_much_again(size, least):
 
 
 def test_blocks_hold_every_trial_once_and_count_no_other(stack):
-    """And have one shape, whatever the number of trials."""
+    """All blocks have one shape, whatever the number of trials."""
     batch = jax.tree.map(lambda a: np.concatenate([a, a, a], axis=-2), stack.batch)
     parts, (B, T) = blocks(batch), batch.x.time.shape
     assert len(parts) > 1
@@ -49,7 +49,7 @@ EFFECTS = (("tendon_stretch", {"compliance": 2e-5}), ("tendon_friction_preslidin
 
 @pytest.mark.parametrize("effects", [(), EFFECTS], ids=["nominal", "with effects"])
 def test_the_common_shape_changes_no_derivative(stack, short_truth, effects):
-    """Nor do derivatives part by part, with what the other parts' zeros pass through left out."""
+    """Derivatives computed part by part are exact, too."""
     members = tuple(CATALOGUE[e].at(short_truth.model.finger, ("T1",), **values) for e, values in effects)
     model = eqx.tree_at(lambda m: m.effects, short_truth.model, members, is_leaf=lambda v: isinstance(v, tuple))
     parameters = describe(model)
@@ -72,7 +72,7 @@ def test_the_common_shape_changes_no_derivative(stack, short_truth, effects):
     whole = np.concatenate([J * np.asarray(J_s)[..., None], np.asarray(s)[..., None]], axis=-1)
     expected = np.einsum("brp,brq->bpq", whole, whole)
     scale = np.sqrt(np.einsum("bpp->bp", expected)).max(axis=0)
-    seen = scale > 1e-10 * scale.max()  # f(q) of joints that are held leaves nothing but rounding
+    seen = scale > 1e-10 * scale.max()  # f(q) of held joints contributes rounding alone
     assert seen.sum() > 20
     gram = np.einsum("bkp,bkq->bpq", found.factor, found.factor)
     gram, expected = ((x / (scale + 1e-300) / (scale + 1e-300)[:, None])[:, seen][:, :, seen] for x in (gram, expected))
@@ -80,7 +80,7 @@ def test_the_common_shape_changes_no_derivative(stack, short_truth, effects):
 
 
 def test_the_common_shape_changes_no_residual(stack, short_truth):
-    """By the program of residuals alone, and by that of derivatives."""
+    """The program of residuals and that of derivatives agree with the prediction."""
     model = short_truth.model
     noise = {(EXPERIMENT, c): first_noise(stack, c, stack.batch.y[c]) for c in CHANNELS}
     source = sources_of({EXPERIMENT: stack}, {EXPERIMENT: CHANNELS}, noise, describe(model))[EXPERIMENT]
@@ -106,7 +106,7 @@ def test_an_experiment_that_shows_no_effect_is_predicted_without(stack, short_tr
 
 
 def test_no_program_that_runs_beside_another_calls_lapack(short, short_truth):
-    """Two that do can wait for each other for ever."""
+    """Two programs that do can deadlock."""
     model, parameters = short_truth.model, describe(short_truth.model)
     stacks = prepare(short)
     reads = {e: stack.experiment.channels for e, stack in stacks.items()}
@@ -120,7 +120,7 @@ def test_no_program_that_runs_beside_another_calls_lapack(short, short_truth):
 
 @pytest.mark.parametrize("limit", [0.0, 3.0])
 def test_what_is_affine_moves_along_its_tangent_exactly(short, short_truth, limit):
-    """Residuals, white rows and factors, as if linearised and whitened there."""
+    """Residuals, white rows and factors equal those of a new linearisation."""
     (name, channel), rng = ("ID.2", "tendon_excursion"), np.random.default_rng(0)
     trials = prepare(short, [t.name for t in short if t.experiment == name])[name]
     noise = {(name, channel): first_noise(trials, channel, trials.batch.y[channel])}

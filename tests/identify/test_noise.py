@@ -1,4 +1,4 @@
-"""The noise of a channel from trials that repeat a motion, in columns of which some count for little."""
+"""Noise of a channel, from repeats and from residuals, with columns that have few samples."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +10,7 @@ from jaxfinger.identify.noise import LONG_SIGNAL_WINDOW, MIN_SAMPLES_FOR_STD, No
 from jaxfinger.model import Motion
 
 SIZES, COUNTS, LENGTH = np.array([1.0, 5.0, 0.2]), (2000, 150, 20), 2400
-COLOUR = np.array([1.1, -0.6, 0.15])  # as a filter at a fifth of the sampling rate leaves white noise
+COLOUR = np.array([1.1, -0.6, 0.15])  # of white noise after a low-pass at a fifth of the sampling rate
 
 
 def coloured(rng, shape):
@@ -30,7 +30,7 @@ def stack_of(residual, mask, motions, dt):
 
 
 def repeated(seed):
-    """Two trials of one motion; a column counts in one run of COUNTS samples."""
+    """Two trials of one motion; each column is valid in one run of COUNTS samples."""
     residual = SIZES[:, None, None] * coloured(np.random.default_rng(seed), (3, 2))
     mask = np.zeros_like(residual)
     for column, count in zip(mask, COUNTS, strict=True):
@@ -57,7 +57,7 @@ def test_every_column_with_samples_of_its_own_comes_out_white(estimates):
 
 
 def test_noise_that_nothing_repeats_keeps_its_slow_part():
-    """How well samples tell a constant hangs on it; the moving average takes a third of it at most."""
+    """The long-run variance determines the interval of a constant; the moving average may remove a third at most."""
     energy, long_run, true = [], [], 1.0 / (1.0 - COLOUR.sum()) ** 2
     for seed in range(12):
         residual = coloured(np.random.default_rng(seed), (1, 2))
@@ -72,7 +72,7 @@ def test_noise_that_nothing_repeats_keeps_its_slow_part():
 
 
 def test_after_a_gap_the_whitening_is_that_of_what_is_left():
-    """Two runs with a gap of two samples between: white energy is eᵀC⁻¹e of each run, C from the spectrum."""
+    """With a gap between two runs, the white energy of each is eᵀC⁻¹e, with C from the spectrum."""
     noise = Noise(np.ones(1), np.array([0.7]), COLOUR[None], "given")
     spectrum = np.abs(0.7 / np.fft.rfft(np.r_[1.0, -COLOUR], 4096)) ** 2
     covariance = scipy.linalg.toeplitz(np.fft.irfft(spectrum)[:5])

@@ -1,4 +1,4 @@
-"""Every notebook runs from its first cell to its last, and what it claims holds."""
+"""Every notebook runs from its first cell to its last, and its assertions hold."""
 
 from pathlib import Path
 

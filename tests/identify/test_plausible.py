@@ -1,4 +1,4 @@
-"""What no machine can be is said in a sentence, beyond its interval and not within it."""
+"""Implausible estimates are reported where their interval excludes plausible values, and not otherwise."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ WRONG = {
 
 
 def said(where, value: float, std: float) -> list[str]:
-    """Of a model one number of which is estimated to be `value`."""
+    """Warnings for a model with one parameter estimated as `value`."""
     at = where(MODEL)
     first = (0,) * at.ndim
     model = eqx.tree_at(where, MODEL, jnp.zeros_like(at).at[first].set(value))
@@ -59,7 +59,7 @@ def test_a_mass_that_ends_at_its_floor_is_said_to_be_wanted_lighter():
 
 
 def test_a_stage_says_so():
-    """An arm whose base helps along."""
+    """The arm's base is pushed along by a negative damping."""
     session, recipe = arm()
 
     def helped(trial):
@@ -72,7 +72,7 @@ def test_a_stage_says_so():
 
 
 def test_curves_of_what_is_not_seen_are_unknown_and_of_nothing_lost_as_unsure_as_their_law(staged):
-    """Also at the tensions at which the law says that nothing is lost."""
+    """This holds also at tensions at which the law gives no loss."""
     tendon = staged.model.finger.tendon_names[0]
     laws = [i for i, p in enumerate(describe(staged.model)) if p.group == "tendon_friction" and p.tendon == tendon]
     negative = np.asarray(ravel(staged.model))[laws[0]]

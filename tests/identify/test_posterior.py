@@ -1,4 +1,4 @@
-"""NUTS against Laplace where the posterior is Gaussian: excursions are linear in their coefficients."""
+"""NUTS agrees with Laplace's covariance where the posterior is Gaussian, as for excursions."""
 
 import jax
 import numpy as np
@@ -18,7 +18,7 @@ def test_nuts_agrees_with_laplace_where_the_model_is_linear(session, staged):
     assert found.trusted
     seen = np.flatnonzero(np.isfinite(fit.std) & (fit.std > 0))
     ratio = np.sqrt(np.diag(found.samples.covariance))[seen] / fit.std[seen]
-    # Four hundred draws give a standard deviation to a few per cent.
+    # 400 draws give a standard deviation to a few per cent.
     np.testing.assert_allclose(ratio, 1.0, atol=0.2)
     assert abs(np.median(ratio) - 1) < 0.06
 

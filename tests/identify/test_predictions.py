@@ -48,14 +48,14 @@ def test_the_truth_predicts_to_the_noise(predicted, short, experiment):
                 error = error - np.ma.median(np.ma.masked_invalid(error), axis=0).filled(0.0)
             counts = np.isfinite(error)
             assert (counts == np.isfinite(measured)).all()
-            # At a reversal of a sweep the instant is not known to a sample: nine in ten must be right.
+            # The instant of a reversal is not known to a sample, so that a tenth of the samples may be wrong.
             limit = 4.5 * getattr(NOISE, channel).std + getattr(NOISE, channel).resolution
             share = np.mean(np.abs(error[counts]) < limit)
             assert share > (0.9 if experiment == "ID.3-dynamic" else 0.97), (trial.name, channel)
 
 
 def test_the_torque_that_a_free_finger_lacks_keeps_little_of_the_noise_of_tension(predicted, short_truth, short):
-    """It stands beside no measured torque: below 10 Hz is a fifth of what lies below 250."""
+    """No measured torque stands beside it. Its cut-off of 10 Hz lets a fifth of the noise below 250 Hz pass."""
     (name,) = (t.name for t in short.select("VD.3"))
     trial = short[name]
     noise = 0.02 * np.random.default_rng(3).standard_normal(trial.tendon_force.shape)

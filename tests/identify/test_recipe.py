@@ -1,4 +1,4 @@
-"""A recipe of the identification: shipped ones are read by name, mistakes are named."""
+"""Recipes: shipped ones are read by name, mistakes are named with their line."""
 
 import pytest
 

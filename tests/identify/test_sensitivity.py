@@ -1,4 +1,4 @@
-"""What holds each parameter, beside refits."""
+"""Sensitivities of the parameters against refits."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ from jaxfinger.identify.stages import cad_prior, nominal_model, sources_of
 
 @pytest.fixture(scope="module")
 def one_of_each(session):
-    """Every second trial: of the repeats of a motion, one."""
+    """Every second trial, which is one of the two repeats of each motion."""
     return session.with_trials([t.name for t in list(session)[::2]])
 
 
@@ -34,7 +34,7 @@ def found(fit, one_of_each):
 
 
 def test_what_a_fit_is_without_a_trial_is_said_without_a_refit(fit, found, one_of_each):
-    """Of the trial that moves most of those that others stand in for."""
+    """Compared for the trial with the largest finite shift."""
     shifts = found.shifts(fit)
     k = int(np.argmax(np.abs(np.nan_to_num(shifts, posinf=0.0)).max(axis=1)))
     rest = identify(one_of_each.with_trials([t.name for t in one_of_each if t.name != found.names[k]]))
@@ -45,7 +45,7 @@ def test_what_a_fit_is_without_a_trial_is_said_without_a_refit(fit, found, one_o
 
 
 def test_what_one_trial_alone_tells_of_is_unknown_without_it(fit, found, one_of_each):
-    """The only trial in which a joint moves slowly is all that says how the tendons pass it."""
+    """The only trial of ID.2 at a joint alone determines the moment arms there."""
     (trial,) = [t for t in one_of_each if t.experiment == "ID.2" and t.joint == "DIP"][:1]
     others = [t for t in one_of_each if t.experiment == "ID.2" and t.joint == "DIP" and t is not trial]
     session = one_of_each.with_trials([t.name for t in one_of_each if t not in others])
@@ -58,15 +58,16 @@ def test_what_one_trial_alone_tells_of_is_unknown_without_it(fit, found, one_of_
 
 
 def test_the_fit_of_other_trials_is_refused(fit, session):
-    """Though they are repeats of the same motions."""
+    """Repeats of the same motions are other trials, too."""
     with pytest.raises(UserError, match="give the session that it was made from"):
         sensitivity(fit, session.with_trials([t.name for t in list(session)[1::2]]), to="trials")
 
 
 def refit(fit, session, of=None, weight=None, gain=None):
-    """Stage after stage from the fit, to the last digit, under its noise. `of`: the session as it was fitted, where the
-    finger of `session` is another; `weight`: a trial and its weight; `gain`: a tendon and what its excursions are
-    multiplied by.
+    """Refit stage after stage from the fit to convergence, under its noise.
+
+    `of`: the session as it was fitted, where the finger of `session` is another. `weight`: a trial and its weight.
+    `gain`: a tendon and the factor on its excursions.
     """
     parameters, plan, stacks, model = describe(fit.model), plan_of(session, fit), prepare(session), fit.model
     given = np.setdiff1d(np.arange(len(parameters)), np.concatenate([free for _, free in plan]))
@@ -88,7 +89,7 @@ def refit(fit, session, of=None, weight=None, gain=None):
 
 
 def heavier(session, joint: int, mass: float):
-    """A link of the same density distribution, heavier by so many kg: its inertia grows with it."""
+    """Session whose link is heavier by `mass`, kg, with inertia in proportion."""
     f = session.finger
     masses = f.mass + mass * (np.arange(f.m) == joint)
     return replace(session, finger=replace(f, mass=masses, inertia=f.inertia * (masses / f.mass)[:, None, None]))
@@ -97,7 +98,7 @@ def heavier(session, joint: int, mass: float):
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["trials", "sensors", "cad"])
 def test_derivatives_are_those_of_refits_under_the_same_noise(fit, one_of_each, kind):
-    """Steps so short that hardly a sample passes Huber's limit on the way, where the cost has a kink of third order."""
+    """Steps are so short that hardly a sample crosses Huber's limit, where the second derivative jumps."""
     session, finger = one_of_each, one_of_each.finger
     name, step, refitted = {
         "trials": ("01-ID.2-MCP-a", 1e-3, lambda h: refit(fit, session, weight=("01-ID.2-MCP-a", 1.0 + h))),

@@ -1,4 +1,4 @@
-"""VD.3 in the joint refinement: derivatives through sticking and sliding, and what motion ahead tells of a damping."""
+"""VD.3 in the joint refinement: derivatives through sticking and sliding, accuracy of estimates and intervals."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ from .conftest import RECIPE
 
 
 def recorded(seed: int, noise: float):
-    """A session with motion under tension whose load cells have that noise, N."""
+    """Session with motion under tension whose load cells have this noise, N."""
     trials = RECIPE["trials"] | {
         "experiments": ["ID.2", "ID.3-static", "ID.3-dynamic", "ID.4", "VD.3"],
         "vd3": {"motions": 2, "duration": 2.0, "rate": 500.0},
@@ -54,7 +54,7 @@ def test_a_prediction_is_the_simulation_from_its_start(short, staged):
 
 
 def test_a_step_of_the_simulation_costs_less_than_an_encoder(short, staged):
-    """A quarter of the step moves angles half a second ahead by less than an encoder rounds them."""
+    """Steps a quarter as long change angles half a second ahead by less than an encoder's resolution."""
     rounds = recipe_from(RECIPE).sensors.q.resolution / np.sqrt(12.0)
     for m in shooting(short).trials:
         time, horizon = np.arange(0.0, m.time[-1] - 0.5, 0.1), 0.5
@@ -65,7 +65,7 @@ def test_a_step_of_the_simulation_costs_less_than_an_encoder(short, staged):
 
 
 def beside_differences(model, shots, every):
-    """Of every so many parameters: name, derivatives of the angles ahead of all starts, and differences."""
+    """Yield name, derivatives and difference quotients of the predicted angles, for each `every`-th parameter."""
     parameters, reads = describe(model), {AHEAD: ("q",)}
     noise = {(AHEAD, "q"): first_noise(shots.stack, "q", shots.stack.batch.y["q"])}
     source = sources_of({AHEAD: shots.stack}, reads, noise, parameters)[AHEAD]
@@ -88,10 +88,10 @@ def test_derivatives_agree_with_differences_where_nothing_begins_to_stick(short,
 
 
 def test_derivatives_agree_with_differences_where_a_joint_at_rest_begins_to_slip(short, staged):
-    """Tension rises until friction yields: before, a parameter moves nothing; then the moment of it, and all after."""
+    """Tension rises until friction yields. Before, parameters change nothing; then they change the time of the slip."""
     shots = shooting(replace(short, trials={"rest": at_rest(short, staged.model)}))
     x = shots.stack.batch.x
-    moved = np.abs(simulated_ahead(staged.model, x) - x.q)[0, 0]  # of the MCP
+    moved = np.abs(simulated_ahead(staged.model, x) - x.q)[0, 0]  # MCP, first trial
     begins = int(np.argmax(moved > 0.0))
     assert 0 < begins < moved.size - 1
     found = {name: (a[0, 0], b[0, 0]) for name, a, b in beside_differences(staged.model, shots, 5)}
@@ -99,11 +99,11 @@ def test_derivatives_agree_with_differences_where_a_joint_at_rest_begins_to_slip
         np.testing.assert_allclose([slopes[:begins], differences[:begins]], 0.0, atol=1e-12, err_msg=name)
         np.testing.assert_allclose(differences[begins], slopes[begins], rtol=1e-3, atol=1e-5, err_msg=name)
         np.testing.assert_allclose(differences, slopes, rtol=1e-5, atol=1e-5 * np.abs(slopes).max(), err_msg=name)
-    assert found["friction torque MCP^0"][0][begins] > 1e-3  # more friction, later slip: more that it misses
+    assert found["friction torque MCP^0"][0][begins] > 1e-3  # more friction delays the slip
 
 
 def at_rest(session, model):
-    """A trial that stands still while tension of T3 rises from where joints and tendons rest."""
+    """Trial at rest while the tension of T3 rises from an equilibrium."""
     (trial, *_) = (t for t in session if t.experiment == "VD.3")
     time = np.arange(0.0, 2.0, 0.002)
     m, n = session.finger.m, session.finger.n
@@ -127,7 +127,7 @@ def at_rest(session, model):
 
 
 def beside_the_truth(fit, truth):
-    """How many standard deviations every estimate that has one is off."""
+    """Errors of the determined estimates in their standard deviations."""
     seen = fit.estimated[(fit.std[fit.estimated] > 0) & np.isfinite(fit.std[fit.estimated])]
     return (values(fit) - truth)[seen] / fit.std[seen]
 
@@ -151,7 +151,7 @@ def quiet():
 
 @pytest.mark.long
 def test_motion_ahead_brings_the_loss_of_a_tendon_nearer_to_the_truth(quiet, truth):
-    """T2 reaches over all joints: what the held ones hid of its friction, the free finger shows."""
+    """T2 crosses all joints. Free motion determines parts of its friction that held joints do not."""
     session, staged = quiet
     fitted, names = refine(session, staged, ahead=True), [p.name for p in describe(staged.model)]
     for name in ("tendon friction T2 a0", "tendon friction T2 a1"):
@@ -163,7 +163,7 @@ def test_motion_ahead_brings_the_loss_of_a_tendon_nearer_to_the_truth(quiet, tru
 
 @pytest.mark.long
 def test_a_motion_that_no_fit_has_seen_is_predicted_better(quiet):
-    """Ahead of one motion, fitted by the other: squares of its errors, over those of noise, fall at every horizon."""
+    """A fit of one motion reduces the squared errors of the other, relative to noise, at every horizon."""
     session, staged = quiet
     seen, unseen = (t.name for t in session if t.experiment == "VD.3")
     fitted = refine(session.with_trials([t.name for t in session if t.name != unseen]), staged, ahead=True)
@@ -176,7 +176,7 @@ def test_a_motion_that_no_fit_has_seen_is_predicted_better(quiet):
 @pytest.mark.long
 @pytest.mark.parametrize(("seed", "noise"), [(0, 1e-4), (0, 0.03), (1, 0.03), (2, 0.03)])
 def test_intervals_hold_also_where_load_cells_are_noisy(truth, seed, noise):
-    """Noise bends predictions: where a fit takes them as they are, single estimates are 11 standard deviations off."""
+    """Noise biases predictions. Without the correction single estimates are wrong by 11 standard deviations."""
     session = recorded(seed, noise)
     z = beside_the_truth(refine(session, identify(session), ahead=True), truth)
     assert np.sqrt(np.mean(z**2)) < 1.3

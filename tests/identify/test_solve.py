@@ -1,4 +1,4 @@
-"""The least squares behind every fit, where a full step leads astray."""
+"""Least squares of a fit on problems where a full Gauss–Newton step fails."""
 
 from typing import ClassVar
 
@@ -21,7 +21,7 @@ EXPERIMENT, CHANNEL = "ID.3-static", "joint_torque"
 
 
 class Bend(CatalogueEffect):
-    """10 N mm · law(a) at a joint."""
+    """Torque of 10 N mm · law(a) at a joint."""
 
     PLACE: ClassVar = "joint"
 
@@ -32,14 +32,14 @@ class Bend(CatalogueEffect):
 
 
 class Logarithm(Bend):
-    """log(1 + a): from a = 0, a Newton step towards a = −0.95 lands where no logarithm is."""
+    """log(1 + a): a Newton step from a = 0 towards a = −0.95 leaves the domain of the logarithm."""
 
     ID: ClassVar = "logarithm"
     law = staticmethod(jnp.log1p)
 
 
 class Kink(Bend):
-    """a above zero, −0.8 a below: no step leads below what a = 0 predicts."""
+    """a above zero and −0.8 a below, with its minimum at the kink."""
 
     ID: ClassVar = "kink"
 
@@ -49,8 +49,9 @@ class Kink(Bend):
 
 
 class Overshoot(Bend):
-    """a at first, a − 0.95 a² later (Dennis and Schnabel 1996, §10.2): where the data are −1 and 1, every Gauss–Newton
-    step goes nearly as far beyond the minimum as it started before it.
+    """a and a − 0.95 a² in turn (Dennis and Schnabel 1996, §10.2).
+
+    With data −1 and 1 every Gauss–Newton step ends nearly as far beyond the minimum as it started before it.
     """
 
     ID: ClassVar = "overshoot"
@@ -61,8 +62,9 @@ class Overshoot(Bend):
 
 
 def _problem_of(kind, short, short_truth, start, true, shift=0.0):
-    """A model with the effect at its start, its position in the flat vector, and data of its truth without noise,
-    moved by `shift` N m at the effect's joint.
+    """Model with the effect at `start`, the effect's position in the flat vector, and noiseless data.
+
+    The data are those of the effect at `true`, plus `shift` N m at its joint.
     """
     stack = prepare(short, [t.name for t in short if t.experiment == EXPERIMENT])[EXPERIMENT]
     effect = kind.at(short_truth.model.finger, ("MCP",), a=start)

@@ -1,4 +1,4 @@
-"""A stage that no sample informs says so, and estimates nothing."""
+"""Stages without valid samples are skipped; parameters that no trial determines are named."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def test_a_stage_of_which_nothing_counts_is_skipped_and_says_why():
 
 @pytest.mark.parametrize("moved", [1, 2])
 def test_cross_terms_need_a_trial_that_moves_both_joints(moved):
-    """One joint at a time leaves them at zero, and says which joints to move together."""
+    """With one joint moved at a time they stay zero, and a warning names the joints to move together."""
     time = np.linspace(0.0, 8.0, 801)
     q = np.full((time.size, FINGER.m), 0.4)
     for i in range(moved):

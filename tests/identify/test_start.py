@@ -1,4 +1,4 @@
-"""Tendon friction from a thirtieth of the usual to nearly all of the tension is found, beyond every dead zone."""
+"""Tendon friction from a thirtieth of the usual to nearly all of the tension is found across dead zones."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ RECIPE = recipe_from(
     ids=["a thirtieth", "thirty times", "all of half the tensions", "nine tenths", "above 4 N alone"],
 )
 def test_what_is_lost_is_found(a0, a1):
-    """Beside 0.2 + 0.2 f. Between two dead zones a few tensions say little of a₀ and a₁, but all of what is lost."""
+    """Cases range about 0.2 + 0.2 f. The loss is compared, since a few tensions may not determine both a₀ and a₁."""
     true = true_model(polynomial_finger(paper_finger()))
     n = true.finger.n
 

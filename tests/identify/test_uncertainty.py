@@ -1,4 +1,4 @@
-"""Bootstrap and sandwich from the compressed trials, against refits by SciPy and against Laplace."""
+"""Bootstrap and sandwich from compressed trials, against refits by SciPy and against Laplace's covariance."""
 
 from itertools import pairwise
 
@@ -18,7 +18,7 @@ def compressed(session, staged):
 
 
 def by_scipy(compressed, weights):
-    """The staged refit as SciPy does it: one least-squares problem a stage on the stacked rows of its trials."""
+    """Staged refit by SciPy: one least-squares problem for each stage, on the stacked rows of its trials."""
     grams, reads = np.asarray(compressed.grams.H), np.asarray(compressed.grams.reads)
     z, start = np.zeros(compressed.sizes[0]), compressed.sizes[0]
     for row, size in zip(reads, compressed.sizes[1:], strict=True):
@@ -82,14 +82,14 @@ def test_weights_leave_every_stratum_its_share(sizes, seed):
 
 
 def test_bootstrap_variance_of_a_mean_is_unbiased():
-    """n trials of one number each: the variance of the weighted mean is s²/n, not (n − 1)/n of it."""
+    """For n trials of one number each the variance of the weighted mean is s²/n, not (n − 1)/n of it."""
     x = np.array([1.0, 2.0, 4.0])
     means = draw_weights((("a",),) * 3, 200_000, np.random.default_rng(0)) @ x / 3
     np.testing.assert_allclose(means.var(), x.var(ddof=1) / 3, rtol=0.02)
 
 
 def test_bootstrap_and_sandwich_agree_with_laplace(session, staged, compressed):
-    """Where the noise model is right they differ by what four trials a stratum leave open: some forty per cent."""
+    """Where the noise model is right they differ by chance alone, some 40 % with four trials in a stratum."""
     samples = bootstrap(session, staged, 500, compressed=compressed)
     assert not samples.failed.any()
     free = staged.estimated

@@ -1,4 +1,4 @@
-"""A fit is about a machine, not about the units that it is written in, nor about its size."""
+"""A fit does not depend on the units of its data, nor on the size and pace of the machine."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def arm(seed: int = 0) -> tuple[Session, Recipe]:
-    """Three joints, ten kilograms, a metre: the torques of its motors while all joints move at once."""
+    """Arm of three joints, 10 kg and 1 m, with the torques of its motors while all joints move at once."""
     rng, m = np.random.default_rng(seed), 3
     finger = FingerDescription(
         gravity=np.array([0.0, 0.0, -9.81]),
@@ -68,7 +68,7 @@ def axis(tmp_path_factory):
 
 @pytest.fixture(scope="module", params=["finger", "axis", "arm"])
 def machine(request):
-    """A session, and its fit."""
+    """Session of a machine and its fit."""
     if request.param == "finger":
         return request.getfixturevalue("session"), request.getfixturevalue("staged")
     session, recipe = request.getfixturevalue("axis") if request.param == "axis" else arm()
@@ -76,7 +76,7 @@ def machine(request):
 
 
 def beside(fit, other, scale) -> tuple[np.ndarray, np.ndarray]:
-    """How many standard deviations each estimate of the scaled session is away, and the ratio of these."""
+    """Difference of each estimate of the scaled session in standard deviations, and the ratio of these."""
     units = np.array([scale.of(describe(fit.model)[i].units) for i in fit.estimated])
     np.testing.assert_array_equal(other.estimated, fit.estimated)
     std, scaled = fit.std[fit.estimated], other.std[fit.estimated] / units
@@ -87,7 +87,7 @@ def beside(fit, other, scale) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_in_other_units_it_is_the_same_scaled(machine):
-    """Of time: what is counted in seconds and Hz follows the motions' pace, in steps."""
+    """Time is scaled by one step of the pace, with which all constants in seconds and Hz are scaled."""
     session, fit = machine
     scale = Scale(mass=1e-3, length=10.0, time=PACE_RATIO)
     other = identify(scale(session), fit.recipe)
@@ -100,7 +100,7 @@ def test_in_other_units_it_is_the_same_scaled(machine):
 @pytest.mark.long
 @pytest.mark.parametrize("time", [0.1, 1.25, 2.0, 10.0])
 def test_a_quicker_or_slower_machine_has_the_same_fit_within_its_errors(machine, time):
-    """Between two steps of the pace, where another share of the noise and of what a model misses is filtered out."""
+    """Between two steps of the pace, filters remove another share of noise and model errors."""
     session, fit = machine
     scale = Scale(time=time)
     shift, ratio = beside(fit, identify(scale(session), fit.recipe), scale)

@@ -1,4 +1,4 @@
-"""Validation: the truth scores at the noise floor, an error of known size is found, what is missing is said."""
+"""Validation: the truth scores at the noise floor, errors of known size are found, missing trials are named."""
 
 from dataclasses import replace
 
@@ -40,9 +40,7 @@ def test_the_truth_is_at_the_noise_floor(scored):
 
 
 def test_a_moment_ahead_the_truth_departs_by_the_noise_of_the_sensors(scored):
-    """Sticking included: friction that is solved for hides none of it. All joints are counted together, since of a
-    single one a handful of slips in two seconds tells.
-    """
+    """Sticking is included. Joints are averaged, since a single one slips only a few times in two seconds."""
     for ms in (50, 100, 200, 500):
         joints = pick(scored, "VD.3", "q", f"{ms} ms ahead")
         departs, noise = (np.mean([getattr(s, x) ** 2 for s in joints]) ** 0.5 for x in ("rms", "noise"))
@@ -54,7 +52,7 @@ def test_a_moment_ahead_the_truth_departs_by_the_noise_of_the_sensors(scored):
 
 
 def test_a_weak_spring_shows_a_moment_ahead(short_truth, scored, short):
-    """Of twice the elastic torque, and a joint pushed out of its range is said to diverge."""
+    """Errors grow with a threefold elastic torque, and a joint pushed out of its range is reported to diverge."""
     elastic = short_truth.model.joint_torque.elastic
     wrong = eqx.tree_at(lambda m: m.joint_torque.elastic, short_truth.model, 3.0 * elastic)
     result = validate(replace(short_truth, model=wrong), short, ("VD.3",))
@@ -77,7 +75,7 @@ def test_the_integral_drifts_and_the_difference_does_not(short_truth, short):
 
 
 def test_the_integral_of_a_slow_motion_is_the_difference(short_truth, short):
-    """∫ C q̇ dt = f(q) − f(q₀) where filter and sampling cost nothing."""
+    """∫ C q̇ dt = f(q) − f(q₀) where errors of filter and sampling are negligible."""
     trial = next(iter(short.select("VD.1")))
     time = np.linspace(0.0, 20.0, 20001)
     sweep = 0.5 - 0.4 * np.cos(0.3 * time)
@@ -100,7 +98,7 @@ def test_a_wrong_moment_arm_is_found_in_size_and_place(short_truth, scored, shor
 
 
 def test_slope_of_the_force_and_its_error_from_the_fit(short_truth, short):
-    """δ(slope) from the covariance equals the change of the slope under a change of the parameter."""
+    """The slope's standard deviation from the covariance equals its change under a step of the parameter."""
     from jaxfinger.identify.parameters import describe
 
     i = [p.name for p in describe(short_truth.model)].index("tendon friction T2 a1")

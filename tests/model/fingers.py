@@ -9,7 +9,7 @@ from jaxfinger.model import Finger, JointTorque, Model, MomentArm, TendonFrictio
 
 
 def description(seed: int, m: int, n: int = 2, prismatic: bool = True) -> FingerDescription:
-    """m joints with any axes, a fifth of them prismatic, links with full inertia tensors."""
+    """Random finger of m joints with any axes, a fifth of them prismatic, and full inertia tensors."""
     rng = np.random.default_rng(seed)
     axis = rng.standard_normal((m, 3))
     root = rng.standard_normal((m, 3, 3))
@@ -31,7 +31,7 @@ def description(seed: int, m: int, n: int = 2, prismatic: bool = True) -> Finger
 
 
 def model(d: FingerDescription, seed: int = 0, **sizes) -> Model:
-    """Equation (1) with every coefficient drawn at random, friction positive."""
+    """Model of the finger with random coefficients and positive friction."""
     rng = np.random.default_rng(seed)
     zeros = Model.zeros(Finger.from_description(d), **sizes)
     draw = lambda a: jnp.asarray(rng.standard_normal(a.shape))  # noqa: E731
@@ -46,7 +46,7 @@ def model(d: FingerDescription, seed: int = 0, **sizes) -> Model:
 
 
 def in_pinocchio(d: FingerDescription) -> tuple[pin.Model, int]:
-    """The chain, and its fingertip's frame."""
+    """Chain in Pinocchio, and the frame number of its fingertip."""
     chain, joint = pin.Model(), 0
     chain.gravity.linear = d.gravity
     for i in range(d.m):

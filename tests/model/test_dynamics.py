@@ -27,7 +27,7 @@ def case(request):
 
 
 def test_equation_one_term_by_term(case):
-    """Against the sum written out with NumPy and Pinocchio."""
+    """The reference is the sum written out with NumPy and Pinocchio."""
     d, f, x = case
     f_ext = np.random.default_rng(1).standard_normal((3, 6))
     chain, tip = in_pinocchio(d)
@@ -75,7 +75,7 @@ def test_jit_and_vmap_change_nothing(case):
 
 @pytest.mark.parametrize("held", [False, True])
 def test_derivatives_agree_with_differences(held):
-    """With respect to every parameter and the motion, along a random direction."""
+    """Derivatives by all parameters and the motion are compared along a random direction."""
     d = description(3, 3, n=3)
     at = (model(d), motion(d, 6, held=held))
 

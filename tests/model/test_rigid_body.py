@@ -39,7 +39,7 @@ def theirs(chain, tip, q, qd, qdd):
 
 @pytest.mark.parametrize("m", range(1, 8))
 def test_agrees_with_pinocchio(m):
-    """To 1e-10 of the size of each quantity."""
+    """The tolerance is 1e-10 of the size of each quantity."""
     d = description(seed=m, m=m)
     q, qd, qdd = np.random.default_rng(m).standard_normal((3, m, SAMPLES))
     got = ours(Finger.from_description(d), q, qd, qdd)
@@ -51,7 +51,7 @@ def test_agrees_with_pinocchio(m):
 
 
 def test_a_heavier_link_is_denser():
-    """A fit moves the mass; the inertia about the centre of mass goes with it, and stays that of a body."""
+    """Where a fit changes a mass, the inertia about the centre of mass changes in proportion."""
     d = description(3, 3)
     factor = np.array([0.5, 1.0, 3.0])
     finger = Finger.from_description(d)

@@ -56,7 +56,7 @@ def test_energy_of_the_free_finger_is_kept_to_integration_error():
 
 
 def slider(friction: float, damping: float = 0.0) -> Model:
-    """1 kg on a rail, weightless, without tendons' pull: q in m, τ in N."""
+    """Mass of 1 kg on a rail without gravity and tendon forces: q in m, τ in N."""
     d = replace(
         description(0, 1, n=1),
         gravity=np.zeros(3),
@@ -92,7 +92,7 @@ def test_dry_friction_slides_above_its_limit():
 
 
 def test_a_sliding_mass_stops_and_stays():
-    """It slides v₀²/2F far, in the time v₀/F, and does not turn back."""
+    """It slides by v₀²/2F in the time v₀/F and does not turn back."""
     t, q, qd = drive(slider(2.0), push=0.0, speed=1.0)
     moving = t < 0.5 - DT
     np.testing.assert_allclose(qd[moving], 1.0 - 2.0 * t[moving], atol=1e-9)
@@ -101,7 +101,7 @@ def test_a_sliding_mass_stops_and_stays():
 
 
 def test_a_tendon_that_sticks_holds_the_joint():
-    """A tendon under 10 N that loses a₀ = 1 N over an arm of 0.1 m/m resists 0.1 N either way."""
+    """A tendon with a loss of a₀ = 1 N at an arm of 0.1 m/m resists 0.1 N in either direction."""
     f = slider(0.0)
     f = eqx.tree_at(
         lambda f: (f.moment_arm.coefficients, f.tendon_friction.constant),

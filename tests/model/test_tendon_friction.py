@@ -1,4 +1,4 @@
-"""What a tendon loses: bounded by its tension, and held until the loss is exceeded."""
+"""Tendon friction: bounded by the tension; a held tendon slips only where the loss is exceeded."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,7 +34,7 @@ def test_a_tendon_never_loses_more_than_its_tension(f, a0, a1):
 
 
 def test_release_stays_on_a_plateau():
-    """a₁ = 0.25: pulled to 8 N, 6 N arrive; on release f_j keeps 6 N until 1.25 f_t has come down to it, at 4.8 N."""
+    """With a₁ = 0.25, 6 N of 8 N reach the joint; on release f_j keeps 6 N until 1.25 f_t falls to it, at 4.8 N."""
     friction = TendonFriction(jnp.zeros(1), jnp.full(1, 0.25))
     f = jnp.array([[0.0, 4.0, 8.0, 6.0, 5.0, 4.0, 0.0]])
     expected = [[0.0, 3.0, 6.0, 6.0, 6.0, 5.0, 0.0]]
