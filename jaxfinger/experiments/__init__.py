@@ -3,10 +3,10 @@
 This is the only room that joins data to the model.
 """
 
+from jaxfinger.experiments.affected import affected_channels, refuse_broken
 from jaxfinger.experiments.predict import change, demean, predict
 from jaxfinger.experiments.prepare import Batch, NotJudged, Stack, not_judged, prepare
-from jaxfinger.experiments.shapes import SAMPLES, TRIALS, blocks, padded, roomy, split
-from jaxfinger.experiments.shows import refuse_broken, shows
+from jaxfinger.experiments.shapes import SAMPLES, TRIALS, blocks, padded, padded_size, split
 from jaxfinger.experiments.table import EXPERIMENTS, Experiment
 
 __all__ = [
@@ -17,15 +17,15 @@ __all__ = [
     "Experiment",
     "NotJudged",
     "Stack",
+    "affected_channels",
     "blocks",
     "change",
     "demean",
     "not_judged",
     "padded",
+    "padded_size",
     "predict",
     "prepare",
     "refuse_broken",
-    "roomy",
-    "shows",
     "split",
 ]

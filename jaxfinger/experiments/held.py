@@ -20,7 +20,7 @@ from jaxfinger.experiments.shrink import shrink
 NONE_VALID = "no tendon is pulled from slack in holds, or in ramps slow enough to tell its friction"
 HOLD_PARTS = 6  # of a hold, whose means give the noise of its mean; encoder noise is correlated over less than one part
 MIN_OVERSHOOT = 4.0  # standard deviations of noise beyond both holds; tension beyond that is a real overshoot
-MIN_HOLDS = 3  # from which on the spread of holds shows whether a fixture yields
+MIN_HOLDS = 3  # to see from the spread of holds whether a fixture yields; two leave a single degree of freedom
 RAMP_SAMPLE = -2  # marks the samples of a ramp among the numbers of holds
 
 

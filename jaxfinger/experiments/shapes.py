@@ -14,7 +14,7 @@ TRIALS, SAMPLES = 8, 128
 Tree = TypeVar("Tree")
 
 
-def roomy(size: int, least: int) -> int:
+def padded_size(size: int, least: int) -> int:
     """Smallest of least · (1, 2, 4, 8, …) that is not below `size`."""
     room = least
     while room < size:
@@ -30,7 +30,7 @@ def blocks(batch: Batch) -> list[Batch]:
     if batch.x.simulated:
         return [batch]
     B, T = batch.x.time.shape
-    ends = (-B % TRIALS, roomy(T, SAMPLES) - T)
+    ends = (-B % TRIALS, padded_size(T, SAMPLES) - T)
     counting = {c: np.pad(a, [(0, 0), (0, ends[0]), (0, ends[1])]) for c, a in batch.mask.items()}
     wide = padded(batch.x, *ends), padded(batch.y, *ends), counting
     return [Batch(*jax.device_put(part)) for part in split(wide)]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfinger.effects import CatalogueEffect, Scales
-from jaxfinger.experiments import shows
+from jaxfinger.experiments import affected_channels
 from jaxfinger.gap.exact import Projector, SearchState
 from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem, assemble, moved
@@ -172,7 +172,7 @@ def _widths(scales: Scales, effect: CatalogueEffect) -> CatalogueEffect:
 
 def _seeing_effects(problem: Problem, source: Source, effects: tuple[CatalogueEffect, ...], moving, experiment: str):
     """The source, reading the effects' parameters too where one of them shows."""
-    if not any(experiment in shows(type(e), problem.nominal.finger) for e in effects):
+    if not any(experiment in affected_channels(type(e), problem.nominal.finger) for e in effects):
         return source._replace(effects=False)
     return source._replace(positions=np.union1d(source.positions, moving).astype(int))
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from jaxfinger.data import Session
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError, did_you_mean
-from jaxfinger.experiments import shows
+from jaxfinger.experiments import affected_channels
 from jaxfinger.gap.augment import augmented_fit
 from jaxfinger.gap.exact import Baseline
 from jaxfinger.gap.formula import Parameters
@@ -51,7 +51,7 @@ def fit_with(
     wanted = list(dict.fromkeys(v.key for v in offered))
     if unseen := [k for k in wanted if k not in table.keys]:
         (effect, site), file = unseen[0], session.file or "the session"
-        shown = ", ".join(shows(catalogue[effect], problem.nominal.finger))
+        shown = ", ".join(affected_channels(catalogue[effect], problem.nominal.finger))
         raise UserError(f"{file}: no trial shows {effect} at {'-'.join(site)}; record {shown}, or leave it out")
     search, state = Search(baseline, table, progress), baseline.null
     for _ in wanted:

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfinger.experiments import SAMPLES, TRIALS, Stack, padded, roomy, split
+from jaxfinger.experiments import SAMPLES, TRIALS, Stack, padded, padded_size, split
 from jaxfinger.model import Model, Motion, contact_map
 
 
@@ -59,7 +59,7 @@ _contact = eqx.filter_jit(contact_map)
 
 def _merged(parts: Sequence) -> list:
     """Arrays (…, B, T) one after the other along their trials, in blocks of a common length."""
-    T = roomy(max(jax.tree.leaves(p)[0].shape[-1] for p in parts), SAMPLES)
+    T = padded_size(max(jax.tree.leaves(p)[0].shape[-1] for p in parts), SAMPLES)
     wide = [padded(p, 0, T - jax.tree.leaves(p)[0].shape[-1]) for p in parts]
     whole = jax.tree.map(lambda *a: np.concatenate(a, axis=-2), *wide)
     return jax.device_put(split(padded(whole, -jax.tree.leaves(whole)[0].shape[-2] % TRIALS, 0)))

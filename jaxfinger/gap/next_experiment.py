@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.experiments import EXPERIMENTS, Batch, Stack, shows
+from jaxfinger.experiments import EXPERIMENTS, Batch, Stack, affected_channels
 from jaxfinger.gap.exact import Projector, SearchState, derivatives
 from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem, imagined
@@ -42,7 +42,7 @@ def next_experiment(problem: Problem, members: Sequence[SearchState]) -> NextExp
     """For the fitted sets that rivals belong to; none where no trial is expected to separate them."""
     if len(members) < 2:
         return None
-    shown = {e for m in members for x in m.effects for e in shows(type(x), problem.nominal.finger)}
+    shown = {e for m in members for x in m.effects for e in affected_channels(type(x), problem.nominal.finger)}
     ones = Weights.plain(members[0].columns)
     project, own = Projector(problem, members[0].columns, ones), Signatures(problem)
     steps, known = [], []

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.compilation import side_by_side
-from jaxfinger.experiments import shows
+from jaxfinger.experiments import affected_channels
 from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.columns import Columns
 from jaxfinger.gap.problem import Problem
@@ -71,7 +71,7 @@ class Scan:
         """All signatures, read once."""
         effect, site = items[0].effect, items[0].site
         stacks, finger = signatures.problem.stacks, signatures.problem.nominal.finger
-        where = shows(effect, finger)
+        where = affected_channels(effect, finger)
         times = np.concatenate([np.ravel(stacks[e].batch.x.session_time) for e in where if e in stacks])
         start, end = float(times.min()), float(times.max())
         longest, middle = 2.0 * max(end - start, SHORTEST), (start + end) / 2.0
@@ -124,7 +124,7 @@ def read_parts(
 
     def read(group: list[Variant]) -> Part:
         effect = group[0].effect
-        if effect.periods() and any(e in problem.stacks for e in shows(effect, problem.nominal.finger)):
+        if effect.periods() and any(e in problem.stacks for e in affected_channels(effect, problem.nominal.finger)):
             return Scan.of(signatures, group)
         return FixedShapes.of(signatures, group, columns)
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.effects import CATALOGUE, CatalogueEffect, Changed, Scales, Site, changes, nominal_terms
-from jaxfinger.experiments import TRIALS, change, refuse_broken, shows
+from jaxfinger.experiments import TRIALS, affected_channels, change, refuse_broken
 from jaxfinger.gap.problem import Problem, Rows
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.parameters import describe
@@ -133,7 +133,7 @@ class Signatures:
         padded = members + members[:1] * (CHUNK - len(members))
         stacked = jax.tree.map(lambda *a: np.stack(a), *[replace(m, site=()) for m in padded])
         count = jax.device_put(len(members))
-        where = shows(kind, nominal.finger)
+        where = affected_channels(kind, nominal.finger)
         for group in self.problem.groups:
             shown = [e for e in group.trials if group.channel in where.get(e, ())]
             if not shown:

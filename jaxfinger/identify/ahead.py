@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session
-from jaxfinger.experiments import Stack, roomy
+from jaxfinger.experiments import Stack, padded_size
 from jaxfinger.identify.starts import Measured, angles, measured, starts
 from jaxfinger.model import Model, simulated_from
 
@@ -46,7 +46,7 @@ def noise_of_simulation(model: Model, session: Session, stack: Stack) -> Float[n
     squares = []
     for b, m in enumerate(_trials(model, session, stack)):
         steps = int(np.ceil(m.time[-1] / m.step))
-        horizon = m.step * roomy(steps, 512)  # for a common shape
+        horizon = m.step * padded_size(steps, 512)  # for a common shape
         _, change = _changed(model, m, np.zeros(1), horizon, np.random.default_rng(b))
         squares.append(np.mean(change[:, : steps + 1, 0] ** 2, axis=-1))
     return np.sqrt(np.mean(squares, axis=0))
@@ -90,7 +90,7 @@ def _changed(
 ) -> tuple[Float[np.ndarray, "m L W"], Float[np.ndarray, "m L W"]]:
     """Simulated angles from W starts, rad, and their change under another draw of the sensors' noise."""
     W = time.size
-    padded = time[np.minimum(np.arange(roomy(W, 2)), W - 1)]  # pad to a common shape with the last start
+    padded = time[np.minimum(np.arange(padded_size(W, 2)), W - 1)]  # pad to a common shape with the last start
     two = (np.asarray(_simulate(model, starts(m, padded, horizon, noise)))[..., :W] for noise in (None, rng))
     exact, noisy = (np.nan_to_num(q, nan=1e3, posinf=1e3, neginf=-1e3) for q in two)
     return exact, noisy - exact

@@ -43,7 +43,7 @@ COST_ROUNDING = 1e-12  # relative: a cost sums some 10⁴ squares, each rounded 
 
 
 class Outcome(eqx.Enumeration):
-    """How a search ended."""
+    """Ending of a search, in a sentence for users."""
 
     running = "the search has not ended"
     converged = ""

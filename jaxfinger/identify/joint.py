@@ -67,7 +67,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
     starts = shooting(session) if ahead else None
     progress("reading the recordings")
     stacks = prepare(session, [t.name for t in session if t.experiment in recipe.fit.joint_experiments])
-    reads = {e: channels_of(e) for e in stacks}
+    reads = {e: joint_channels(e) for e in stacks}
     if not reads:
         raise UserError(
             f"{session.file or 'the session'}: has no trial of {', '.join(recipe.fit.joint_experiments)}; "
@@ -154,7 +154,7 @@ def _contradiction(moved: np.ndarray, without: np.ndarray, together: np.ndarray)
     return np.outer(beyond, beyond)
 
 
-def channels_of(experiment: str) -> tuple[str, ...]:
+def joint_channels(experiment: str) -> tuple[str, ...]:
     """Channels of an experiment that a joint fit reads.
 
     The excursion at held joints is left out: there it measures the stretch of tendons, and not their moment arms.

@@ -19,16 +19,14 @@ from scipy.ndimage import uniform_filter1d
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.experiments import Batch, Stack
 
-ORDER = 3  # of the autoregression
+ORDER = 3  # of the autoregression: describes white noise after a low-pass (tests/identify/test_noise.py)
 # A column needs more samples than the first for a standard deviation of its own, known to 10 % from 50 (1/√(2 n)), and
 # more than the second for coefficients a_k of its own, known to 0.03 from 1000 (1/√n).
 MIN_SAMPLES_FOR_STD, MIN_SAMPLES_FOR_COEFFICIENTS = 50, 1000
-MIN_SAMPLES_OF_SOURCE = (
-    100  # of repeats or holds, which tell a standard deviation to 7 %; with fewer, residuals are used
-)
-MIN_SAMPLES_OF_REPEAT = 20  # common samples of trials that repeat one motion, below which they are left out
+MIN_SAMPLES_OF_SOURCE = 100  # of repeats or holds, below which residuals are used; 100 give a standard deviation to 7 %
+MIN_SAMPLES_OF_REPEAT = 20  # common samples of trials that repeat one motion; fewer add little to an autocovariance
 MIN_SAMPLES_OF_HOLD = 5  # a hold needs more: a straight line takes two of them
-MIN_HOLDS = 20  # more are needed to scale the noise of holds, whose standard deviation they then tell to 16 %
+MIN_HOLDS = 20  # more are needed to scale the noise of holds, whose standard deviation is then known to 16 %
 MAX_LAG = 400  # samples over which the means of holds are correlated: 20 s at the rate of held experiments
 SPECTRUM = 4096  # frequencies at which the noise's spectrum is evaluated: more than ten times the largest lag
 # Samples of the moving average that counts as signal where no motion is repeated: the shorter where the model may lack

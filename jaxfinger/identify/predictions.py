@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session, Trial, joints_of, low_pass
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import SAMPLES, Stack, padded, predict, prepare, roomy
+from jaxfinger.experiments import SAMPLES, Stack, padded, padded_size, predict, prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.model import Model, Motion, simulate
 
@@ -48,7 +48,7 @@ def predict_session(
         driven = experiment == "VD.3" and session.finger.n > 0
         free = simulate_trials([model] * len(stack.trials), session, stack) if driven else {}
         T = stack.batch.x.time.shape[-1]
-        wide = padded(stack.batch.x, 0, roomy(T, SAMPLES) - T)  # for a common shape
+        wide = padded(stack.batch.x, 0, padded_size(T, SAMPLES) - T)  # for a common shape
         for b, name in enumerate(stack.trials):
             N = len(session[name].time)
             x = jax.tree.map(lambda a, b=b: a[..., b : b + 1, :], wide)
@@ -122,14 +122,15 @@ def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> 
     steps = np.array([np.median(np.diff(session[name].time)) for name in stack.trials])
     # The simulation takes even steps: each trial gets its own uniform instants, all trials the same number of them.
     longest = max(session[name].duration / step for name, step in zip(stack.trials, steps, strict=True))
-    grid = steps[:, None] * np.arange(roomy(int(np.ceil(longest)) + 1, 512))
+    grid = steps[:, None] * np.arange(padded_size(int(np.ceil(longest)) + 1, 512))
     tension = np.asarray(x.tension)
     even = np.stack(
         [[np.interp(g, t, f) for f in tension[:, b]] for b, (g, t) in enumerate(zip(grid, _times(stack), strict=True))]
     ).reshape(len(steps), session.finger.n, -1)
     starts = (x.session_time - x.time)[:, 0]
     substeps = max(1, int(np.ceil(steps.max() / (MAX_TIME_STEP * stack.experiment.pace) - 1e-6)))
-    wide = np.minimum(np.arange(roomy(len(models), 2)), len(models) - 1)  # pad to a common shape with the last trial
+    # Pad to a common shape with the last trial.
+    wide = np.minimum(np.arange(padded_size(len(models), 2)), len(models) - 1)
     each = jax.tree.map(lambda a: jnp.asarray(a)[wide], (model, grid, even, x.q[..., 0].T, x.qd[..., 0].T, starts))
     q = np.asarray(_simulate(*each, substeps=substeps))[: len(models)]
     # A simulation that diverges may overflow; it is clipped where it leaves the range by the range's whole width.

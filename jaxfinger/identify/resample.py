@@ -25,7 +25,7 @@ from jaxfinger.errors import UserError
 from jaxfinger.experiments import prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.joint import STAGE as JOINT
-from jaxfinger.identify.joint import channels_of
+from jaxfinger.identify.joint import joint_channels
 from jaxfinger.identify.linearise import linearise, triangular
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.shooting import AHEAD
@@ -118,7 +118,7 @@ def plan_of(session: Session, fit: Fit) -> list[tuple[dict[str, tuple[str, ...]]
     if done[-1:] == [AHEAD]:
         raise UserError(f"{session.file or 'the session'}: the fit was refined with --ahead; give one without it")
     if JOINT in done:
-        return [({e: channels_of(e) for e in fit.recipe.fit.joint_experiments}, fit.estimated)]
+        return [({e: joint_channels(e) for e in fit.recipe.fit.joint_experiments}, fit.estimated)]
     coverage = {name: coverage_of(STAGES[name].reads, session) for name in done}
     plan = [(STAGES[n].reads, stage_free(fit, STAGES[n], parameters, coverage[n])) for n in done]
     later = [np.concatenate([np.zeros(0, int), *(f for _, f in plan[k + 1 :])]) for k in range(len(plan))]

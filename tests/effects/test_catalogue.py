@@ -11,7 +11,7 @@ import pytest
 
 from jaxfinger.effects import CATALOGUE, CHANGED, NOMINAL_TERMS, Scales, from_dict, load, nominal_terms, to_dict
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import EXPERIMENTS, Batch, predict, refuse_broken, shows
+from jaxfinger.experiments import EXPERIMENTS, Batch, affected_channels, predict, refuse_broken
 from jaxfinger.identify.parameters import describe, units_at
 from jaxfinger.model import (
     excursion,
@@ -56,7 +56,7 @@ def value_and_slope(effect, x, channels):
 def test_absent_at_zero_and_differentiable_there(name):
     kind = EVERY[name]
     site = kind.sites(FINGER)[0]
-    shown = {c for channels in shows(kind, FINGER).values() for c in channels}
+    shown = {c for channels in affected_channels(kind, FINGER).values() for c in channels}
     largest = 0.0
     for x, nominal in MOTIONS:
         y, slope = value_and_slope(kind.at(FINGER, site, **kind.shapes(FINGER, site, SCALES)[0]), x, tuple(nominal))
@@ -74,7 +74,7 @@ def test_every_site_and_shape(name):
     kind = EVERY[name]
     sites = kind.sites(FINGER)
     assert sites
-    for experiment, channels in shows(kind, FINGER).items():
+    for experiment, channels in affected_channels(kind, FINGER).items():
         assert set(channels) <= set(EXPERIMENTS[experiment].channels)
     seen = set()
     for site in sites:

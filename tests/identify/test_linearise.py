@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxfinger.effects import CATALOGUE
-from jaxfinger.experiments import SAMPLES, TRIALS, blocks, predict, prepare, roomy
+from jaxfinger.experiments import SAMPLES, TRIALS, blocks, padded_size, predict, prepare
 from jaxfinger.identify.linearise import _tangent, huber, linearise, residuals_by_tangent, residuals_of, white_rows
 from jaxfinger.identify.parameters import Free, describe
 from jaxfinger.identify.solve import Tangents, residuals_each
@@ -20,9 +20,9 @@ EXPERIMENT, CHANNELS = "ID.4", ("joint_torque", "tendon_excursion")
 
 @given(st.integers(1, 10**6), st.sampled_from([2, 8, 256, 512]))
 def test_a_stack_has_room_and_less_than_as_much_again(size, least):
-    room = roomy(size, least)
+    room = padded_size(size, least)
     assert size <= room < max(least + 1, 2 * size)
-    assert roomy(room, least) == room
+    assert padded_size(room, least) == room
 
 
 def test_blocks_hold_every_trial_once_and_count_no_other(stack):
@@ -31,7 +31,7 @@ def test_blocks_hold_every_trial_once_and_count_no_other(stack):
     parts, (B, T) = blocks(batch), batch.x.time.shape
     assert len(parts) > 1
     assert B % TRIALS
-    assert {part.x.time.shape for part in parts} == {(TRIALS, roomy(T, SAMPLES))}
+    assert {part.x.time.shape for part in parts} == {(TRIALS, padded_size(T, SAMPLES))}
     for c in CHANNELS:
         mask, y = (np.concatenate([getattr(p, name)[c] for p in parts], axis=1) for name in ("mask", "y"))
         np.testing.assert_array_equal(mask[:, :B, :T], batch.mask[c])

@@ -20,14 +20,14 @@ from jaxfinger.experiments.table import EXPERIMENTS
 from jaxfinger.model import Effect, Finger, Model, Motion, Terms, contact_map, plain_terms
 
 
-def shows(kind: type[CatalogueEffect], finger: Finger) -> dict[str, tuple[str, ...]]:
+def affected_channels(kind: type[CatalogueEffect], finger: Finger) -> dict[str, tuple[str, ...]]:
     """Channels of each experiment that an effect can change; experiments without one are left out.
 
     The effect changes no other channel in any trial. A channel that it can change may still be unchanged in some
     trials, as by friction in proportion to tension where all tendons are slack.
     """
     names = finger.joint_names, finger.tendon_names
-    return _shows(kind, *names, finger.prismatic, finger.active, finger.crosses)
+    return _affected_channels(kind, *names, finger.prismatic, finger.active, finger.crosses)
 
 
 def refuse_broken(kind: type[CatalogueEffect], finger: Finger) -> None:
@@ -38,12 +38,12 @@ def refuse_broken(kind: type[CatalogueEffect], finger: Finger) -> None:
     """
     file = inspect.getfile(kind)
     try:
-        useless = kind.sites(finger) and not shows(kind, finger)
+        without_effect = kind.sites(finger) and not affected_channels(kind, finger)
     except Exception as e:
         lines = [frame.lineno for frame in traceback.extract_tb(e.__traceback__) if frame.filename == file]
         where = f"{file}, line {lines[-1]}" if lines else file
         raise UserError(f"{where}: {kind.ID} fails in a prediction: {type(e).__name__}: {e}") from e
-    if useless:
+    if without_effect:
         hooks = {name for name in vars(Effect) if not name.startswith("_")}
         odd = [name for name in vars(kind) if name not in hooks and callable(getattr(kind, name))]
         near = next(filter(None, (did_you_mean(name, hooks) for name in odd if not name.startswith("_"))), "")
@@ -79,7 +79,7 @@ class _Nominal(NamedTuple):
 
 
 @cache
-def _shows(kind, *description) -> dict[str, tuple[str, ...]]:
+def _affected_channels(kind, *description) -> dict[str, tuple[str, ...]]:
     finger = _Nominal.of(*description, held=False).finger
     sites = kind.sites(finger)
     if not sites:
