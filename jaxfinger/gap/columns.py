@@ -1,8 +1,8 @@
-"""White rows in the basis of the smooth laws' features, column by column: what every evidence of the search is made of.
+"""Columns: the white rows of one joint, tendon or axis of one channel, with a basis of smooth features.
 
-A column c is one joint, tendon or axis of one channel of one experiment. U_c (rows, K_c) spans what a smooth law could
-leave there; a residual and a signature enter every formula through their coefficients on U_c and through products of
-what lies outside of it. That is some hundreds of numbers where there are tens of thousands of rows.
+U_c (n_c, K_c) spans what a smooth law could leave in the n_c rows of column c (`smooth_laws`). Residuals and signatures
+enter the formula through their coefficients on U_c and through their products column by column (`by_column`): some
+hundreds of numbers a signature, instead of tens of thousands of rows.
 """
 
 from dataclasses import dataclass
@@ -12,27 +12,23 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfinger.gap.problem import Problem
-from jaxfinger.gap.signatures import whitened
-from jaxfinger.gap.smooth_laws import features
-
-FEWEST = 50  # rows of a column, below which nothing smooth is told from noise
-DISTINCT = 0.1  # of the largest singular value: nearly collinear features differ in single samples
+from jaxfinger.gap.smooth_laws import measured_columns, orthonormal_basis, white_features
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column that is judged."""
+    """One column of a channel, with rows enough to tell a smooth law from noise."""
 
     experiment: str
     channel: str
-    column: int
-    rows: Int[np.ndarray, " n"]
-    basis: Float[np.ndarray, "n K"]  # orthonormal
+    column: int  # joint, tendon or axis
+    rows: Int[np.ndarray, " n"]  # positions in the problem's stacked rows
+    basis: Float[np.ndarray, "n K"]  # U_c, orthonormal
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Of every column, its features, and its rows less these."""
+    """Dimensions of every column: K_c on the features, m_c = n_c − K_c outside of them."""
 
     K: Int[np.ndarray, " C"]
     outside: Int[np.ndarray, " C"]
@@ -46,43 +42,19 @@ class Columns:
 
     @classmethod
     def of(cls, problem: Problem) -> "Columns":
-        """The columns with samples enough."""
-        return cls(tuple(_columns(problem)))
+        """Compute the bases of all columns of a problem that have `smooth_laws.MIN_ROWS` rows."""
+        items = []
+        for e, c, k, pick in measured_columns(problem):
+            features = np.concatenate(list(white_features(problem, e, c, k, pick).values()))
+            items.append(Column(e, c, k, problem.rows[e].start + pick, orthonormal_basis(features)))
+        return cls(tuple(items))
 
     @cached_property
     def counts(self) -> Counts:
-        """Features and rows of every column."""
+        """Dimensions of every column."""
         K = np.array([c.basis.shape[1] for c in self.items], int)
         return Counts(K, np.array([len(c.rows) for c in self.items], int) - K)
 
     def sums(self, values: Float[np.ndarray, "features *n"]) -> Float[np.ndarray, "C *n"]:
-        """Of features, column by column."""
+        """Sum a value of every feature over each column's features."""
         return np.add.reduceat(values, np.r_[0, np.cumsum(self.counts.K)[:-1]], axis=0)
-
-
-def _columns(problem: Problem):
-    for e, rows in problem.rows.items():
-        for number, c in enumerate(problem.stacks[e].experiment.channels):
-            for k in np.unique(rows.column[rows.channel == number]):
-                pick = np.flatnonzero((rows.channel == number) & (rows.column == k))
-                if len(pick) >= FEWEST:
-                    white = np.concatenate(list(white_features(problem, e, c, int(k), pick).values()))
-                    yield Column(e, c, int(k), rows.start + pick, orthonormal(white))
-
-
-def white_features(problem: Problem, e: str, c: str, k: int, pick: Int[np.ndarray, " n"]) -> dict[str, np.ndarray]:
-    """Features of a column in its white rows `pick`, (features, n) by variable."""
-    out, shape = {}, problem.stacks[e].batch.y[c].shape
-    for variable, members in features(problem, e, c, k).items():
-        if members:
-            raw = np.zeros((len(members), *shape))
-            raw[:, k] = np.stack(members)
-            out[variable] = whitened(raw, problem, problem.rows[e], pick, c)
-    return out
-
-
-def orthonormal(features: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "n K"]:
-    """A basis of what features span that are no near copies of each other."""
-    A = features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-300)
-    U, s, _ = np.linalg.svd(A.T, full_matrices=False)
-    return U[:, s > DISTINCT * s[0]]

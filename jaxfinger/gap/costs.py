@@ -1,7 +1,13 @@
-"""What a set of causes must explain, in log evidence, before it is believed; and the probabilities that follow.
+"""Prior costs of sets of causes, in nats of log evidence, and the posterior probabilities of sets.
 
-A cause costs the evidence that an imitator would bring where it acts, and the log of the number of its rivals. Rivals
-of a further site are the effect's other sites alone: one cause that acts at many sites is one cause.
+The log of the prior odds against a set counts, for every effect in it, the effects that the trials can see, and for
+every site the sites of that effect: one effect at many sites is one cause. Beyond that, a cause must bring the evidence
+that an imitator of the true cause would bring where it acts,
+
+    cause_cost + imitator_gain Σ_c τ_c u_c,
+
+with u_c the evidence in column c that something is at work (`formula.unexplained`), and τ_c the share of that column's
+gap which the cause would explain if it were as large as the whole gap.
 """
 
 from collections import Counter
@@ -16,46 +22,49 @@ from scipy.special import logsumexp
 from jaxfinger.effects import NOMINAL_TERMS, Site
 from jaxfinger.gap.formula import Parameters
 
-Key = tuple[str, Site]  # effect, site
+Key = tuple[str, Site]  # A cause: effect and site.
 
 
 @dataclass(frozen=True)
 class Costs:
-    """Of all sets of causes that the trials of one file can see."""
+    """Costs of all sets of causes that the trials of one file can see."""
 
     parameters: Parameters
-    unexplained: Float[np.ndarray, " C"]  # log evidence, column by column, that something is at work
-    explainable: Mapping[Key, Float[np.ndarray, " C"]]  # share that each visible cause could explain
+    unexplained: Float[np.ndarray, " C"]  # u_c, nats
+    explainable: Mapping[Key, Float[np.ndarray, " C"]]  # τ_c of every cause that the trials can see
 
     @cached_property
     def sites(self) -> Mapping[str, int]:
-        """How many there are of every effect."""
+        """Number of sites of every effect."""
         return Counter(effect for effect, _ in self.explainable)
 
     def of(self, keys: Iterable[Key]) -> float:
-        """What a set must explain."""
+        """Cost of a set, nats: log odds against it and the evidence that its causes need."""
         keys = list(keys)
         return self.odds(keys) + self.evidence_needed(keys)
 
     def odds(self, keys: Iterable[Key]) -> float:
-        """Log odds against just these effects and sites, of all that there are. A term that the recipe leaves out is no
-        rarity: it is as likely at work as not.
+        """Log prior odds against these effects and sites.
+
+        A term of the nominal model that the recipe leaves out costs no odds for its effect, since it is as likely at
+        work as not.
         """
         keys = list(keys)
         effects = {e for e, _ in keys} - set(NOMINAL_TERMS)
         return len(effects) * np.log(len(self.sites)) + sum(np.log(max(self.sites.get(e, 1), 1)) for e, _ in keys)
 
     @cached_property
-    def _to_explain(self) -> Mapping[Key, float]:
-        """Log evidence that something is at work, in the columns that each cause touches."""
+    def _evidence_where_it_acts(self) -> Mapping[Key, float]:
+        """Σ_c τ_c u_c of every cause."""
         return {key: float(share @ self.unexplained) for key, share in self.explainable.items()}
 
     def evidence_needed(self, keys: Iterable[Key]) -> float:
-        """A sum over causes: of each a constant, and a share of the evidence in the columns that it touches."""
-        return sum(self.parameters.cause_cost + self.parameters.imitator_gain * self._to_explain[key] for key in keys)
+        """Log evidence that a set's causes must bring, summed over the causes."""
+        p, there = self.parameters, self._evidence_where_it_acts
+        return sum(p.cause_cost + p.imitator_gain * there[key] for key in keys)
 
     def probabilities(self, scores: Mapping[frozenset[Key], float]) -> dict[frozenset[Key], float]:
-        """Posterior probability of every set: ∝ exp(β (score − evidence needed) − log odds)."""
+        """Posterior probability of every set, ∝ exp(β (score − evidence needed) − log odds)."""
         beta = self.parameters.tempering
         log_w = [beta * (s - self.evidence_needed(keys)) - self.odds(keys) for keys, s in scores.items()]
         return dict(zip(scores, np.exp(np.array(log_w) - logsumexp(log_w)).tolist(), strict=True))

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.columns import Columns
-from jaxfinger.gap.formula import Linear, LinearFit, Parameters, Weights, unexplained
+from jaxfinger.gap.formula import LinearFit, LinearModel, Parameters, Weights, unexplained
 from jaxfinger.gap.problem import Problem, moved
 from jaxfinger.gap.signatures import Signatures, Variant
 from jaxfinger.identify.solve import bounded_least_squares
@@ -97,7 +97,7 @@ class Baseline:
         empty = np.empty((0, problem.r.size))
         nominal, none = ByColumn.of(columns, problem.J.T), ByColumn.of(columns, empty)
         residual = ByColumn.of(columns, problem.r[None])
-        judged = Linear(columns, (residual, nominal), prior_products(problem, 0), none, parameters).null
+        judged = LinearModel(columns, (residual, nominal), prior_products(problem, 0), none, parameters).null
         assert judged is not None
         null = SearchState(problem, columns, nominal, (), (), empty, empty, judged)
         unknown = unexplained(columns.counts, judged.evidence, parameters)
@@ -110,7 +110,7 @@ class Baseline:
         """A set at its optimum: `sizes`, how far its coordinates are from the middle of their priors, `room`, how far
         they may move on.
         """
-        linear = Linear(
+        linear = LinearModel(
             self.columns,
             (ByColumn.of(self.columns, r[None]), nominal),
             prior_products(problem, 0),
@@ -118,7 +118,7 @@ class Baseline:
             self.parameters,
             self.null.linear_fit,
         )
-        return linear.fit(np.arange(len(slopes)), *room, middle=-sizes)
+        return linear.fit(np.arange(len(slopes)), *room, sizes=sizes)
 
 
 def prior_products(problem: Problem, k: int) -> Float[np.ndarray, "d d"]:

@@ -1,16 +1,22 @@
-"""Each third of a session held out in turn."""
+"""Folds of a session for cross-validation: each third of it is held out in turn."""
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfinger.gap.problem import Problem
 
-FOLDS = 3
-FOLD_PRIOR = 0.05  # precision, in deviations of the whole fit, that keeps near it what the other folds do not see
+FOLDS = 3  # Every refit then has two thirds of the trials.
+# Root of the information of a weak prior about the fit to all trials, in that of all trials on each nominal parameter
+# alone. A parameter that the other folds do not show stays near that fit. The prior has 0.25 % of the information.
+FOLD_PRIOR = 0.05
 
 
 def folds(problem: Problem) -> dict[str, np.ndarray]:
-    """(B, T) fold of every sample, by experiment: whole trials, or contiguous blocks of one that stands alone."""
+    """Fold of every sample, (B, T) by experiment.
+
+    Trials of one experiment, joint and tendon are dealt to the folds as wholes. One that stands alone is divided into
+    2 FOLDS contiguous blocks of equal duration.
+    """
     strata = {n: (t.experiment, t.joint, t.tendon) for n in problem.trial_names for t in [problem.session[n]]}
     count = {s: list(strata.values()).count(s) for s in strata.values()}
     seen: dict[tuple, int] = {}
@@ -37,8 +43,9 @@ def fold_of_row(problem: Problem) -> Int[np.ndarray, " N"]:
 def equilibrated(
     J: Float[np.ndarray, "N p"], root: Float[np.ndarray, "k p"]
 ) -> tuple[Float[np.ndarray, "N p"], Float[np.ndarray, "k+p p"], Float[np.ndarray, " p"]]:
-    """J in columns of length one, the prior's rows in the same units with those that keep near the whole fit what no
-    trial shows, and the scale: zero where J has nothing.
+    """Scale the nominal parameters so that the columns of J have length one, and add the prior of FOLD_PRIOR.
+
+    Returns the scaled J, the prior's rows in the same units, and the scale, which is zero for a zero column of J.
     """
     size = np.linalg.norm(J, axis=0)
     scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)

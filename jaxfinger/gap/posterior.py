@@ -1,4 +1,4 @@
-"""What all visited sets of causes say together: how probable each cause is, «nothing», and which are rivals."""
+"""Posterior over all visited sets of causes: probabilities of causes and of «nothing», and ambiguous sets."""
 
 from dataclasses import dataclass
 
@@ -9,25 +9,28 @@ from jaxfinger.gap.exact import SearchState
 from jaxfinger.gap.formula import unlisted
 from jaxfinger.gap.sets import Search
 
-MIN_NAMED_PROBABILITY = 0.5  # probability from which on a verdict says that a cause is at work
-SURE = 0.9  # share of a cause's probability, beside its rivals', below which they are an ambiguous set
-COVERED, RIVALS = 0.97, 3  # probability up to which a set takes in further ones, and how many at most
+MIN_NAMED_PROBABILITY = 0.5  # More likely at work than not.
+# Shares of the probability of a cause and its rivals together:
+MIN_UNAMBIGUOUS_SHARE = 0.9  # The cause itself has odds of nine to one; with less it is one of an ambiguous set.
+MIN_COVERAGE = 0.97  # Members are added to an ambiguous set up to here; `next_experiment.SETTLES` asks as much of one.
+MAX_MEMBERS = 3  # of an ambiguous set. Sealed cases count no larger set as an answer (`sealed.score`).
+MIN_RIVALRY = 0.5  # probability of a cause and its rivals. With less the best set is no likely answer at all.
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Probabilities that each is at work at all; they need not sum to one."""
+    """Probabilities of the causes. Several may be at work, so that they need not sum to one."""
 
-    causes: dict[Key, float]
-    gains: dict[Key, float]  # log evidence of the best set with a cause less the best without
-    none: float
-    unlisted: float
-    named: tuple[Key, ...]
-    ambiguous: tuple[tuple[Key, ...], ...]
+    causes: dict[Key, float]  # probability that the cause is at work, alone or with others
+    gains: dict[Key, float]  # nats: net evidence of the best set with the cause less that of the best set without it
+    none: float  # probability that nothing is at work
+    unlisted: float  # probability that something is at work which the catalogue lacks
+    named: tuple[Key, ...]  # causes of the best set that are likely and not ambiguous
+    ambiguous: tuple[tuple[Key, ...], ...]  # sets of causes that could replace one another in the best set
 
 
 def posterior(search: Search, state: SearchState) -> Posterior:
-    """From the sets that a search has weighed."""
+    """Posterior over the sets that a search has visited; `state` is the best of them."""
     costs, scores = search.costs, search.visited.scores
     w = costs.probabilities(scores)
     net = {keys: score - costs.of(keys) for keys, score in scores.items()}
@@ -44,17 +47,21 @@ def posterior(search: Search, state: SearchState) -> Posterior:
 
 
 def _ambiguous(w: dict[frozenset, float], state: SearchState, causes: dict[Key, float]) -> tuple[tuple[Key, ...], ...]:
-    """Causes of the best set that others could take the place of."""
+    """Causes of the best set, each with the rivals that could take its place, likeliest first.
+
+    `w` are the posterior probabilities of all visited sets. A rival's weight is that of the best set with the rival in
+    the cause's place.
+    """
     out, whole = [], frozenset(state.keys)
     for key in state.keys:
         rest = whole - {key}
         rivals = {next(iter(s - rest)): v for s, v in w.items() if len(s) == len(whole) and rest < s}
         total = sum(rivals.values())
-        if rivals.get(key, 0.0) >= SURE * total or total < 0.5:
+        if rivals.get(key, 0.0) >= MIN_UNAMBIGUOUS_SHARE * total or total < MIN_RIVALRY:
             continue
         members, mass = [], 0.0
         for k in sorted(rivals, key=lambda k: -rivals[k]):
-            if mass >= COVERED * total or len(members) == RIVALS:
+            if mass >= MIN_COVERAGE * total or len(members) == MAX_MEMBERS:
                 break
             members.append(k)
             mass += rivals[k]

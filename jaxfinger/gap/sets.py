@@ -19,7 +19,7 @@ from jaxfinger.gap.exact import (
     led_plainly,
     prior_products,
 )
-from jaxfinger.gap.formula import Evidence, Linear, LinearFit, Weights, unexplained
+from jaxfinger.gap.formula import Evidence, LinearFit, LinearModel, Weights, unexplained
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.screening import Part
 from jaxfinger.gap.signatures import Variant
@@ -167,7 +167,7 @@ class Visited:
     """What was said of every set that was weighed."""
 
     evidence: dict[frozenset[Key], Evidence] = field(default_factory=dict)
-    screened: set[frozenset[Key]] = field(default_factory=set)  # those of which `Linear.screen` alone has spoken
+    screened: set[frozenset[Key]] = field(default_factory=set)  # those of which `LinearModel.screen` alone has spoken
 
     @property
     def scores(self) -> dict[frozenset[Key], float]:
@@ -209,7 +209,7 @@ class Screened(NamedTuple):
 
     keys: list[Key]
     score: float
-    linear: Linear
+    linear: LinearModel
     now: LinearFit
     values: Float[np.ndarray, " offers"]
 
@@ -227,10 +227,10 @@ class Search:
         """Score less costs."""
         return state.score - self.costs.of(state.keys)
 
-    def linear(self, state: SearchState, r: np.ndarray, slopes: np.ndarray) -> Linear:
+    def linear(self, state: SearchState, r: np.ndarray, slopes: np.ndarray) -> LinearModel:
         """The table's rows on top of a state's base."""
         columns = self.baseline.columns
-        return Linear(
+        return LinearModel(
             columns,
             (ByColumn.of(columns, r[None]), state.nominal, ByColumn.of(columns, slopes)),
             prior_products(state.problem, len(slopes)),

@@ -1,35 +1,49 @@
-"""How much of a residual a smooth law, with or without memory, could explain.
+"""The part of a residual that smooth laws, with or without memory, could explain.
 
-Features of each channel's column: polynomials of the angles, tension, speed, directions, distance since reversal and
-time in the trial. It is the yardstick for «none of these», never the answer.
+Features of a column are polynomials of angles and tensions, functions of speed, direction, time, and of the distance
+since the last reversal. They bound what any listed or unlisted law could explain; they never name a cause.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.ndimage import uniform_filter1d
 
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signatures import whitened
 from jaxfinger.model import Finger
 
-SMOOTHED = 15  # samples over which an angle or a tension is averaged before its reversals are looked for
+MIN_ROWS = 50  # rows. A column has some forty features, which would fit the noise of fewer rows.
+# Nearly collinear features differ in a few samples only. A direction with a smaller singular value, relative to the
+# largest, would therefore fit single samples.
+MIN_RELATIVE_SINGULAR_VALUE = 0.1
+SMOOTHING = 15  # samples. Averages of so many have a quarter of the noise, which would add reversals of its own.
+MIN_REVERSAL = 0.02  # share of a signal's range. A way back that is shorter is noise, or no change of direction.
+
+# Scales of the laws that the features resemble, within the range that the catalogue tries (`effects`).
+CREEPING = 0.1  # rad/s, Stribeck's velocity
+LENGTHS = (0.02, 0.1)  # rad, pre-sliding and backlash of a joint
+PULL = 1.0  # N, pre-sliding of a tendon, as the tension that changes over it
+TIMES = (1.0, 5.0)  # s, creep and relaxation within a trial
 
 
 @dataclass(frozen=True)
 class SmoothPart:
-    """What smooth laws explain of one channel's column in one experiment."""
+    """Energy of one column's residual that smooth laws explain, in squared noise standard deviations."""
 
     experiment: str
     channel: str
-    column: int
-    energy: float  # of the residual above noise: drop of the sum of squares, less its expectation under noise
-    rows: int
-    by_variable: dict[str, float]  # the same, for the features of one variable alone
+    column: int  # joint, tendon or axis
+    energy: float  # drop of the sum of squares, less its expectation under noise
+    by_variable: dict[str, float]  # the same by the features of one variable alone
 
 
-def features(problem: Problem, experiment: str, channel: str, column: int) -> dict[str, list[np.ndarray]]:
-    """Features (B, T) by the variable that they depend on."""
+def features(
+    problem: Problem, experiment: str, channel: str, column: int
+) -> dict[str, list[Float[np.ndarray, "_B _T"]]]:
+    """Features of one column, each (B, T), grouped by the variable that they depend on."""
     stack = problem.stacks[experiment]
     x = stack.batch.x
     finger = problem.nominal.finger
@@ -48,10 +62,10 @@ def features(problem: Problem, experiment: str, channel: str, column: int) -> di
     for i in own:
         u = _unit(q[i])
         out["q"] += [np.cos(k * np.arccos(u)) for k in range(1, 7)]
-        out["qd"] += [_unit(qd[i]) ** p for p in (1, 2, 3)] + [np.exp(-np.abs(qd[i]) / 0.1)]
+        out["qd"] += [_unit(qd[i]) ** p for p in (1, 2, 3)] + [np.exp(-np.abs(qd[i]) / CREEPING)]
         out["direction"] += [direction[i] * u**p for p in range(3)]
-        travelled = since_reversal(_calm(q[i]))
-        for length in (0.02, 0.1):
+        travelled = since_reversal(_smoothed(q[i]))
+        for length in LENGTHS:
             out["distance since reversal"] += [
                 np.exp(-np.abs(travelled) / length) * s
                 for s in (1.0, direction[i], np.tanh(travelled / (0.1 * length)))
@@ -60,21 +74,25 @@ def features(problem: Problem, experiment: str, channel: str, column: int) -> di
         if f[k].any():
             u = f[k] / max(f[k].max(), 1e-9)
             out["tension"] += [u, u**2, np.sqrt(np.maximum(u, 0))] + [u * _unit(q[i]) for i in own]
-            pulled = since_reversal(_calm(f[k]))
-            out["distance since reversal"] += [np.exp(-np.abs(pulled) / 1.0) * np.tanh(pulled / 0.1)]
+            pulled = since_reversal(_smoothed(f[k]))
+            out["distance since reversal"] += [np.exp(-np.abs(pulled) / PULL) * np.tanh(pulled / (0.1 * PULL))]
     for i in range(finger.m):
         if i not in own:
             out["other joints"] += [_unit(q[i]), _unit(q[i]) ** 2] + [_unit(q[i]) * _unit(q[j]) for j in own]
         else:
             out["other joints"] += [_unit(q[i]) * _unit(q[j]) for j in own if j > i]
     span = max(float(time.max()), 1e-9)
-    out["time"] += [(time / span) ** p for p in (1, 2)] + [np.exp(-time / s) for s in (1.0, 5.0)]
+    out["time"] += [(time / span) ** p for p in (1, 2)] + [np.exp(-time / s) for s in TIMES]
     out["time"] += [np.asarray(x.session_time) / max(float(np.asarray(x.session_time).max()), 1e-9)]
     return out
 
 
 def concerned(finger: Finger, channel: str, column: int) -> tuple[list[int], list[int]]:
-    """Joints and tendons that bear on a column: a joint and what crosses it, a tendon and what it crosses, or all."""
+    """Joints and tendons that a column's features depend on.
+
+    A joint's torque depends on the joint and the tendons across it, a tendon's excursion on the tendon and the joints
+    that it crosses, a component of the fingertip's force on all.
+    """
     if channel == "joint_torque":
         return [column], [k for k in range(finger.n) if finger.crosses[k][column]]
     if channel == "tendon_excursion":
@@ -82,56 +100,72 @@ def concerned(finger: Finger, channel: str, column: int) -> tuple[list[int], lis
     return list(range(finger.m)), list(range(finger.n))
 
 
-def smooth_parts(problem: Problem, residual: np.ndarray) -> list[SmoothPart]:
-    """Column by column, largest energy first."""
-    found = []
+def measured_columns(problem: Problem) -> Iterator[tuple[str, str, int, Int[np.ndarray, " n"]]]:
+    """Experiment, channel, column and rows of every column with MIN_ROWS rows; rows count within the experiment."""
     for e, rows in problem.rows.items():
-        mine = residual[rows.start : rows.start + rows.size]
         for number, c in enumerate(problem.stacks[e].experiment.channels):
-            for column in np.unique(rows.column[rows.channel == number]):
-                pick = np.flatnonzero((rows.channel == number) & (rows.column == column))
-                if len(pick) < 50:
-                    continue
-                by = {}
-                blocks = []
-                for variable, members in features(problem, e, c, int(column)).items():
-                    if members:
-                        raw = np.zeros((len(members), problem.stacks[e].batch.y[c].shape[0], *members[0].shape))
-                        raw[:, column] = np.stack(members)
-                        white = whitened(raw, problem, rows, pick, c)
-                        blocks.append(white)
-                        by[variable] = _energy(white, mine[pick])
-                found.append(SmoothPart(e, c, int(column), _energy(np.concatenate(blocks), mine[pick]), len(pick), by))
+            for k in np.unique(rows.column[rows.channel == number]):
+                pick = np.flatnonzero((rows.channel == number) & (rows.column == k))
+                if len(pick) >= MIN_ROWS:
+                    yield e, c, int(k), pick
+
+
+def white_features(
+    problem: Problem, experiment: str, channel: str, column: int, pick: Int[np.ndarray, " n"]
+) -> dict[str, Float[np.ndarray, "_k n"]]:
+    """Features of a column in its rows `pick`, whitened as the residuals are, by variable."""
+    out, shape = {}, problem.stacks[experiment].batch.y[channel].shape
+    for variable, members in features(problem, experiment, channel, column).items():
+        if members:
+            raw = np.zeros((len(members), *shape))
+            raw[:, column] = np.stack(members)
+            out[variable] = whitened(raw, problem, problem.rows[experiment], pick, channel)
+    return out
+
+
+def orthonormal_basis(features: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "n K"]:
+    """Orthonormal basis of the span of normalised features, without directions that only near copies differ in."""
+    A = features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-300)
+    U, s, _ = np.linalg.svd(A.T, full_matrices=False)
+    return U[:, s > MIN_RELATIVE_SINGULAR_VALUE * s[0]]
+
+
+def smooth_parts(problem: Problem, residual: Float[np.ndarray, " N"]) -> list[SmoothPart]:
+    """Energy that smooth laws explain of a white residual in every column, largest first."""
+    found = []
+    for e, c, k, pick in measured_columns(problem):
+        r, white = residual[problem.rows[e].start + pick], white_features(problem, e, c, k, pick)
+        by_variable = {variable: _energy(features, r) for variable, features in white.items()}
+        found.append(SmoothPart(e, c, k, _energy(np.concatenate(list(white.values())), r), by_variable))
     return sorted(found, key=lambda x: -x.energy)
 
 
-def _energy(features: np.ndarray, r: np.ndarray) -> float:
-    """Energy of the residual in the span of the features, less its expectation. Nearly collinear features are left out:
-    their differences are narrow, and would single out samples."""
-    scale = np.linalg.norm(features, axis=1, keepdims=True)
-    U, s, _ = np.linalg.svd((features / np.maximum(scale, 1e-300)).T, full_matrices=False)
-    kept = s > 0.1 * s[0]
-    b = U[:, kept].T @ r
-    return float(b @ b - kept.sum())
+def _energy(features: Float[np.ndarray, "k n"], r: Float[np.ndarray, " n"]) -> float:
+    """Energy of a residual in the span of features, less its expectation under white noise."""
+    U = orthonormal_basis(features)
+    b = U.T @ r
+    return float(b @ b - U.shape[1])
 
 
-def _unit(u: np.ndarray) -> np.ndarray:
-    """Onto [−1, 1]."""
+def _unit(u: Float[np.ndarray, "*B T"]) -> Float[np.ndarray, "*B T"]:
+    """Scale a signal linearly onto [−1, 1]; zero where it is constant."""
     low, high = float(u.min()), float(u.max())
     return np.zeros_like(u) if high - low < 1e-9 else np.clip(2 * (u - low) / (high - low) - 1, -1, 1)
 
 
-def _calm(u: np.ndarray) -> np.ndarray:
-    """Without the noise of single samples: the residual has its share of a reading's noise, and a whitened feature that
-    turned with it would look like a law.
+def _smoothed(u: Float[np.ndarray, "*B T"]) -> Float[np.ndarray, "*B T"]:
+    """Moving average, so that noise makes no reversals.
+
+    The noise of an angle or a tension is in the residual too. A feature that turned with it would correlate with the
+    residual without any law behind it.
     """
-    return uniform_filter1d(u, SMOOTHED, axis=-1, mode="nearest")
+    return uniform_filter1d(u, SMOOTHING, axis=-1, mode="nearest")
 
 
-def since_reversal(u: np.ndarray) -> np.ndarray:
-    """Signed distance along the last axis since the last turning point."""
+def since_reversal(u: Float[np.ndarray, "*B T"]) -> Float[np.ndarray, "*B T"]:
+    """Signed distance from the last reversal, along the last axis."""
     step = np.diff(u, axis=-1, prepend=u[..., :1])
-    threshold = 0.02 * max(float(np.ptp(u)), 1e-12)
+    threshold = MIN_REVERSAL * max(float(np.ptp(u)), 1e-12)
     out = np.zeros_like(u)
     for index in np.ndindex(u.shape[:-1]):
         turn = extreme = u[index][0]

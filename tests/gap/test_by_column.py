@@ -1,13 +1,14 @@
-"""Rows held where they are not zero, against the same rows whole."""
+"""Rows stored by column give the same products as whole rows."""
 
 import numpy as np
 import pytest
 from scipy.sparse import csc_array
 
 from jaxfinger.gap.by_column import ByColumn, Products
-from jaxfinger.gap.columns import Column, Columns, orthonormal
+from jaxfinger.gap.columns import Column, Columns
+from jaxfinger.gap.smooth_laws import orthonormal_basis
 
-SIZES = (60, 80, 50)  # rows of a column
+SIZES = (60, 80, 50)  # rows of each column
 
 
 @pytest.fixture
@@ -20,14 +21,16 @@ def columns(rng):
     starts = np.cumsum([0, *SIZES])
     return Columns(
         tuple(
-            Column("VD.1", "tendon_excursion", k, start + np.arange(n), orthonormal(rng.standard_normal((k + 2, n))))
+            Column(
+                "VD.1", "tendon_excursion", k, start + np.arange(n), orthonormal_basis(rng.standard_normal((k + 2, n)))
+            )
             for k, (start, n) in enumerate(zip(starts, SIZES, strict=False))
         )
     )
 
 
 def rows(columns, rng, count):
-    """Each zero in some of the columns, one of them in all."""
+    """Random rows, each zero in some columns, the last in all."""
     x = rng.standard_normal((count, sum(SIZES)))
     for c, column in enumerate(columns.items):
         x[c::2, column.rows] = 0.0
@@ -36,6 +39,7 @@ def rows(columns, rng, count):
 
 
 def whole(columns, x, z):
+    """Products of whole rows in every column."""
     return np.stack([x[:, c.rows] @ z[:, c.rows].T for c in columns.items])
 
 
@@ -66,8 +70,8 @@ def test_rows_joined_and_scaled_are_the_same_rows(columns, rng):
     assert found.count == 9
 
 
-def test_nothing_is_held_of_a_column_that_no_row_touches(columns, rng):
+def test_nothing_is_stored_of_a_column_where_all_rows_are_zero(columns, rng):
     x = np.zeros((3, sum(SIZES)))
     x[:, columns.items[1].rows] = rng.standard_normal((3, SIZES[1]))
-    assert [held.rows.size for held in ByColumn.of(columns, x).held] == [0, 3 * SIZES[1], 0]
+    assert [rows.values.size for rows in ByColumn.of(columns, x).nonzero] == [0, 3 * SIZES[1], 0]
     assert ByColumn.joined(columns, []).count == 0

@@ -1,4 +1,4 @@
-"""What sets of causes must explain, and the probabilities that follow."""
+"""Costs of sets of causes, and the probabilities that follow from them."""
 
 import numpy as np
 import pytest

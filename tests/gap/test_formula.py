@@ -1,11 +1,11 @@
-"""The formula on rows that no recording made."""
+"""The formula on made-up rows: random features, signatures and noise."""
 
 import numpy as np
 import pytest
 
 from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.columns import Column, Columns
-from jaxfinger.gap.formula import Linear, Parameters, unexplained, unlisted
+from jaxfinger.gap.formula import LinearModel, Parameters, unexplained, unlisted
 
 ROWS, FEATURES, COLUMNS = 400, 20, 6
 
@@ -23,7 +23,7 @@ def rng():
 
 
 def smooth(columns, rng, *where):
-    """A direction in the features of some columns, of length one in each."""
+    """A random row of length one on the features of some columns, zero in the others."""
     x = np.zeros(ROWS * COLUMNS)
     for c in where:
         a = rng.standard_normal(FEATURES)
@@ -34,17 +34,17 @@ def smooth(columns, rng, *where):
 def linear(columns, r, Z, J=None):
     J = np.empty((0, r.size)) if J is None else J
     base = ByColumn.of(columns, np.vstack([r[None], J]))
-    return Linear(columns, [base], np.zeros((1 + len(J),) * 2), ByColumn.of(columns, Z), Parameters())
+    return LinearModel(columns, [base], np.zeros((1 + len(J),) * 2), ByColumn.of(columns, Z), Parameters())
 
 
 def test_a_quiet_cause_counts_beside_a_loud_error(columns, rng):
-    """Something unknown a hundred times as large in one column changes nothing of what a cause of another is worth."""
+    """An unknown error in one column, fifty times as large, leaves the gain of a cause in another as it is."""
     z, loud = smooth(columns, rng, 0), smooth(columns, rng, 3)
     noise = rng.standard_normal(ROWS * COLUMNS)
     gains = []
     for size in (0.0, 3000.0):
-        baseline = linear(columns, noise + 60.0 * z + size * loud, 60.0 * z[None])
-        gains.append(baseline.fit(np.array([0])).score - baseline.null.score)
+        model = linear(columns, noise + 60.0 * z + size * loud, 60.0 * z[None])
+        gains.append(model.fit(np.array([0])).score - model.null.score)
     assert gains[0] > 20.0
     assert gains[1] == pytest.approx(gains[0], abs=0.5)
 
@@ -54,18 +54,18 @@ def test_an_imitator_gains_a_part_of_many_columns_and_a_cause_all_of_its_own(col
     noise = rng.standard_normal(ROWS * COLUMNS)
     r = noise + 100.0 * everywhere.sum(axis=0)
     half = everywhere.sum(axis=0) + np.stack([smooth(columns, rng, c) for c in range(COLUMNS)]).sum(axis=0)
-    baseline = linear(columns, r, 100.0 * np.stack([everywhere.sum(axis=0), half]))
-    true, imitator = (baseline.fit(np.array([k])).score - baseline.null.score for k in (0, 1))
+    model = linear(columns, r, 100.0 * np.stack([everywhere.sum(axis=0), half]))
+    true, imitator = (model.fit(np.array([k])).score - model.null.score for k in (0, 1))
     assert true > 3.0 * imitator
 
 
 def test_the_size_of_the_gap_is_no_prior_on_what_noise_gives(columns, rng):
     r = rng.standard_normal(ROWS * COLUMNS)
     Z = 20.0 * np.stack([smooth(columns, rng, *range(COLUMNS)) for _ in range(200)])
-    baseline = linear(columns, r, Z)
-    found = [baseline.fit(np.array([k])).score - baseline.null.score for k in range(len(Z))]
+    model = linear(columns, r, Z)
+    found = [model.fit(np.array([k])).score - model.null.score for k in range(len(Z))]
     assert max(found) < 6.0
-    assert unexplained(columns.counts, baseline.null.evidence, Parameters()).sum() == 0.0
+    assert unexplained(columns.counts, model.null.evidence, Parameters()).sum() == 0.0
 
 
 def test_a_noise_that_is_larger_than_believed_is_no_gap(columns, rng):
@@ -77,39 +77,39 @@ def test_a_noise_that_is_larger_than_believed_is_no_gap(columns, rng):
 def test_what_the_nominal_parameters_absorb_is_no_evidence(columns, rng):
     z = smooth(columns, rng, 0, 1)
     r = rng.standard_normal(ROWS * COLUMNS) + 200.0 * z
-    baseline = linear(columns, r, 200.0 * z[None], J=z[None])
-    assert baseline.fit(np.array([0])).score - baseline.null.score < 0.5
+    model = linear(columns, r, 200.0 * z[None], J=z[None])
+    assert model.fit(np.array([0])).score - model.null.score < 0.5
 
 
 def test_a_step_of_the_screen_is_close_to_the_likeliest_amplitude(columns, rng):
     z = np.stack([smooth(columns, rng, 0, 2), smooth(columns, rng, 1)])
     J = rng.standard_normal((3, ROWS * COLUMNS))
     r = rng.standard_normal(ROWS * COLUMNS) + 30.0 * z[0]
-    baseline = linear(columns, r, 30.0 * z, J=J)
+    model = linear(columns, r, 30.0 * z, J=J)
     ends = (np.array([0.0]), np.array([np.inf]))
-    screened = baseline.screen(baseline.null, [np.array([0]), np.array([1])], [ends, ends])
+    screened = model.screen(model.null, [np.array([0]), np.array([1])], [ends, ends])
     for k, more in enumerate(screened):
         gain = more.score if more else 0.0
-        judged = baseline.fit(np.array([k]), *ends).score - baseline.null.score
-        assert max(gain, 0.0) == pytest.approx(max(judged, 0.0), abs=0.1 * abs(judged) + 1.0)
+        fitted = model.fit(np.array([k]), *ends).score - model.null.score
+        assert max(gain, 0.0) == pytest.approx(max(fitted, 0.0), abs=0.1 * abs(fitted) + 1.0)
 
 
 def test_an_amplitude_keeps_to_its_bounds(columns, rng):
     z = smooth(columns, rng, 0)
     r = rng.standard_normal(ROWS * COLUMNS) - 50.0 * z
-    baseline = linear(columns, r, 50.0 * z[None])
-    judged = baseline.fit(np.array([0]), np.array([0.0]), np.array([np.inf]))
-    assert judged.amplitudes[0] == 0.0
-    assert judged.score <= baseline.null.score
+    model = linear(columns, r, 50.0 * z[None])
+    fitted = model.fit(np.array([0]), np.array([0.0]), np.array([np.inf]))
+    assert fitted.amplitudes[0] == 0.0
+    assert fitted.score <= model.null.score
 
 
 def test_a_law_of_another_form_is_nothing_unlisted_but_what_no_cause_explains_is(columns, rng):
-    """A tenth of what a cause explains may be left where it acts; as much is a sign of more where it does not."""
+    """A sixteenth of the explained energy may be left in the cause's own column, but not in another."""
     noise = rng.standard_normal(ROWS * COLUMNS)
     z, there, elsewhere = (smooth(columns, rng, c) for c in (0, 0, 3))
     found = []
     for other in (0.0 * there, there, elsewhere):
-        baseline = linear(columns, noise + 120.0 * z + 30.0 * other, 120.0 * z[None])
-        found.append(unlisted(columns.counts, baseline.fit(np.array([0])).evidence, Parameters()))
+        model = linear(columns, noise + 120.0 * z + 30.0 * other, 120.0 * z[None])
+        found.append(unlisted(columns.counts, model.fit(np.array([0])).evidence, Parameters()))
     assert found[0] < 0.05
     assert found[1] < 0.05 < 0.95 < found[2]
