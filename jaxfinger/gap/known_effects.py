@@ -1,4 +1,4 @@
-"""The model with effects that are known to be there: no verdict, only their sizes and shapes, fitted with the rest."""
+"""Fit of the model with effects that are known to be at work: their sizes and shapes, without a verdict."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,7 @@ from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.stages import Progress
 from jaxfinger.model import Finger
 
-Named = tuple[str, tuple[str, ...]]  # effect, site; a pair may be joined by a hyphen
+Named = tuple[str, tuple[str, ...]]  # Effect and site; a pair of joints or tendons may be joined by a hyphen.
 
 
 def fit_with(
@@ -27,12 +27,16 @@ def fit_with(
     effects: dict[str, type[CatalogueEffect]] | None = None,
     progress: Progress = lambda message: None,
 ) -> Fit:
-    """Nominal parameters and these effects at these sites, fitted to all trials together. `effects` adds a user's own.
+    """Fit the nominal parameters and given effects at given sites to all trials together.
 
-    The effects join in order of what they explain, each in the form that suits the trials best.
+    The effects are added in the order of what they explain, each in the shape that fits the trials best.
+
+    Args:
+        keys: effect and site of every cause.
+        effects: a user's own effects, by id.
 
     Raises:
-        UserError: no effect of that name, not at that site, in the recipe's model already, or shown by no trial.
+        UserError: an effect is unknown, cannot act at its site, is part of the recipe's model, or shows in no trial.
     """
     recipe, keys = recipe or Recipe(), list(dict.fromkeys(keys))
     if there := [effect for effect, _ in keys if effect in recipe.model.terms]:
@@ -64,7 +68,7 @@ def fit_with(
 
 
 def _offered(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[Named], problem: Problem) -> list[Variant]:
-    """Every form of the effects at their sites."""
+    """Variants of the effects at their sites."""
     offered, finger = [], problem.nominal.finger
     for effect, site in keys:
         offers = variants({effect: catalogue[effect]}, finger, problem.scales)
@@ -73,7 +77,7 @@ def _offered(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[Named],
 
 
 def _refuse_elsewhere(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[Named], finger: Finger) -> None:
-    """Before any fit: every effect can act at its site."""
+    """Raise a UserError for an effect that cannot act at its site."""
     for effect, site in keys:
         sites = ["-".join(s) for s in catalogue[effect].sites(finger)]
         if (named := "-".join(site)) not in sites:

@@ -1,8 +1,8 @@
-"""A closed form for what no known effect explains: a few terms of a physical library, found by sparse regression.
+"""Closed form for what no known effect explains: a few terms of a physical library, found by sparse regression.
 
-Orthogonal matching pursuit (Pati, Rezaiifar & Krishnaprasad 1993) on whitened rows, the nominal parameters and the
-chosen effects projected out. It is a proposal for a person to look at, never a verdict: the library holds what laws of
-friction, elasticity and transmission are made of, and the truth may be none of it.
+Orthogonal matching pursuit (Pati, Rezaiifar and Krishnaprasad 1993) selects the terms on white rows, off the nominal
+parameters. The library holds terms that laws of friction, elasticity and transmission are made of. The true law may
+have none of them, so the closed form is a proposal for a person to look at, and no verdict.
 """
 
 from collections.abc import Sequence
@@ -16,32 +16,39 @@ from jaxfinger.gap.problem import Problem, site
 from jaxfinger.gap.signatures import whitened
 from jaxfinger.gap.smooth_laws import SmoothPart, concerned, since_reversal
 
-TERMS = 3
-WORTH = 0.1  # share of what a smooth law could explain, that a further term must explain
-SPEEDS, LENGTHS, PERIODS = (0.05, 0.2, 0.8), (0.02, 0.1, 0.4), (1, 2, 3, 4, 5, 6, 8, 10, 12, 16)
+MAX_TERMS = 3  # A formula of more terms is no law that a person could recognise.
+MIN_GAIN_SHARE = 0.1  # Share of the energy that smooth laws explain which every further term must explain.
+MIN_UNABSORBED = 0.05  # Share of a term's norm that nominal parameters must leave, lest its coefficient be arbitrary.
+# Scales of the library's terms, a factor of four or five apart, so that neighbouring terms are clearly distinct.
+SPEEDS = (0.05, 0.2, 0.8)  # rad/s
+LENGTHS = (0.02, 0.1, 0.4)  # rad
+HARMONICS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16)  # periods a turn
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """Σ aₖ termₖ for one column of one channel in all experiments, `share` of what a smooth law could explain there."""
+    """Formula Σ aₖ termₖ for one column of one channel in all experiments."""
 
     channel: str
     site: str
-    terms: tuple[tuple[float, str], ...]  # coefficient in the channel's unit (angles rad, forces N), and formula
+    terms: tuple[tuple[float, str], ...]  # coefficient in the channel's unit (angles rad, forces N), and term
     units: str
-    share: float
+    share: float  # share of the energy that smooth laws could explain there
 
     @property
     def formula(self) -> str:
-        """For people: with the unit that each coefficient has where the term has none of its own."""
+        """Formula for people, every coefficient with the channel's unit."""
         body = " ".join(f"{a:+.3g} {self.units} · {text}" for a, text in self.terms)
         return f"{self.channel} {self.site} ≈ {body.lstrip('+')}"
 
 
 def propose(problem: Problem, project: Projector, residual: np.ndarray, left: Sequence[SmoothPart]) -> Proposal | None:
-    """The shortest sum of terms for the column that has most left; None where no term explains a fair part.
+    """Propose a formula for the column where smooth laws explain most of a residual; None if no term is worth it.
 
-    `residual` (N,) is what the causes leave, `left` what a smooth law explains of it.
+    Args:
+        project: projection off the nominal parameters.
+        residual: (N,) white residual that the causes leave.
+        left: what smooth laws explain of it in every column; one at least.
     """
     by_column: dict[tuple[str, int], float] = {}
     for x in left:
@@ -51,16 +58,16 @@ def propose(problem: Problem, project: Projector, residual: np.ndarray, left: Se
 
     Z, r = project(columns), project.residual(residual)
     norm = np.linalg.norm(Z, axis=1)
-    usable = norm > 0.05 * np.linalg.norm(columns, axis=1)
+    usable = norm > MIN_UNABSORBED * np.linalg.norm(columns, axis=1)
     found: list[int] = []
     rest, energy = r, 0.0
-    while len(found) < TERMS:
+    while len(found) < MAX_TERMS:
         gain = np.where(usable, (Z @ rest) ** 2 / np.maximum(norm, 1e-300) ** 2, 0.0)
         gain[found] = 0.0
         trial = [*found, int(np.argmax(gain))]
         a = np.linalg.lstsq(Z[trial].T, r, rcond=1e-10)[0]
         explained = float(r @ r - np.sum((r - a @ Z[trial]) ** 2))
-        if explained - energy < WORTH * most:
+        if explained - energy < MIN_GAIN_SHARE * most:
             break
         found, rest, energy = trial, r - a @ Z[trial], explained
     if not found:
@@ -72,7 +79,7 @@ def propose(problem: Problem, project: Projector, residual: np.ndarray, left: Se
 
 
 def _columns(problem: Problem, channel: str, column: int) -> tuple[list[str], np.ndarray]:
-    """Formulas of the library, and their whitened rows in every experiment that reads the channel."""
+    """Terms of the library, and their white rows (terms, N) in every experiment that reads the channel."""
     found: dict[str, np.ndarray] = {}
     for e, rows in problem.rows.items():
         channels = problem.stacks[e].experiment.channels
@@ -88,7 +95,7 @@ def _columns(problem: Problem, channel: str, column: int) -> tuple[list[str], np
 
 
 def terms(problem: Problem, experiment: str, channel: str, column: int) -> list[tuple[str, np.ndarray]]:
-    """The library of one column: formulas and their values (B, T)."""
+    """Library of one column: terms and their values (B, T)."""
     x, finger = problem.stacks[experiment].batch.x, problem.nominal.finger
     q, qd, f, s = (np.asarray(a) for a in (x.q, x.qd, x.tension, x.joint_direction))
     time = np.asarray(x.time)
@@ -104,14 +111,14 @@ def terms(problem: Problem, experiment: str, channel: str, column: int) -> list[
         out += [(f"exp(−|{v}|/{w:g}) {d}", np.exp(-np.abs(qd[i]) / w) * s[i]) for w in SPEEDS]
         travelled = since_reversal(q[i])
         out += [(f"exp(−|Δ{a}|/{w:g}) {d}", np.exp(-np.abs(travelled) / w) * s[i]) for w in LENGTHS]
-        out += [(f"{g}({p} {a})", fun(p * q[i])) for p in PERIODS for g, fun in (("sin", np.sin), ("cos", np.cos))]
+        out += [(f"{g}({p} {a})", fun(p * q[i])) for p in HARMONICS for g, fun in (("sin", np.sin), ("cos", np.cos))]
         for j in range(finger.m):
             if j != i:
                 b = f"q_{names[j]}"
                 out += [(f"{a} {b}", q[i] * q[j]), (f"{a} {b}²", q[i] * q[j] ** 2), (b, q[j]), (f"{b}²", q[j] ** 2)]
                 out += [(f"q̇_{names[j]}", qd[j])]
                 for sign, name in ((1, "+"), (-1, "−")):
-                    for p in PERIODS:
+                    for p in HARMONICS:
                         angle = p * (q[i] + sign * q[j])
                         out += [
                             (f"sin({p} ({a} {name} {b}))", np.sin(angle)),

@@ -1,9 +1,12 @@
-"""Screening: the signatures of every candidate, read once."""
+"""Signatures of every candidate at the nominal model, read once before the search.
 
-from collections.abc import Iterator
+Shapes are tried on the grid of each effect. Periods in the session's time are scanned for instead, since the residual's
+sum of squares has a narrow valley for each.
+"""
+
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -16,21 +19,14 @@ from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signatures import CHUNK, Signatures, Variant
 from jaxfinger.identify.stages import Progress
 
-SHORTEST = 20.0  # s: the shortest period that is looked for
-MOST = 300  # periods: beyond 50 minutes the shortest grows with the session, for memory's sake
-RIDGE = 1e-9  # relative, of products of columns
+MIN_PERIOD = 20.0  # s. Drifts take minutes; shorter periods are those of the motion itself.
+# Limits memory. In sessions longer than 50 minutes the shortest period therefore grows with the session.
+MAX_PERIODS = 300
+RIDGE = 1e-9  # relative. Keeps products of nearly collinear rows invertible.
 
-
-@runtime_checkable
-class Project(Protocol):
-    """Rows off what the nominal parameters can absorb: the N of the trials, then the prior's."""
-
-    def __call__(self, x: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "k rows"]:
-        """Of signatures."""
-        ...
-
-
-VariantRows = tuple[list[Variant], ByColumn]  # a row an amplitude of each
+# Projection of k rows of N numbers off the nominal parameters; the prior's rows come after the N (`exact.Projector`).
+Project = Callable[[Float[np.ndarray, "k N"]], Float[np.ndarray, "k rows"]]
+VariantRows = tuple[list[Variant], ByColumn]  # variants, and one row for each amplitude of each
 
 
 @dataclass(frozen=True)
@@ -42,40 +38,39 @@ class FixedShapes:
 
     @classmethod
     def of(cls, signatures: Signatures, items: list[Variant], columns: Columns) -> "FixedShapes":
-        """Some at a time: whole rows of hundreds take gigabytes."""
+        """Read the signatures of `items`, CHUNK at a time, since hundreds of whole rows would take gigabytes."""
         parts = [items[k : k + CHUNK] for k in range(0, len(items), CHUNK)]
         return cls(items, ByColumn.joined(columns, [by_column(signatures, part, columns) for part in parts]))
 
-    def variant_rows(self, projector: Project, rt: Float[np.ndarray, " rows"], columns: Columns) -> VariantRows:
-        """All of them, whatever is left."""
+    def variant_rows(self, project: Project, rt: Float[np.ndarray, " rows"], columns: Columns) -> VariantRows:
+        """All variants and their rows, whatever the residual."""
         return self.items, self.rows
 
 
 @dataclass(frozen=True)
 class Scan:
-    """Variants of one effect and site whose periods in the session's time are open.
+    """Variants of one effect and site, whose periods in the session's time are to be found.
 
-    As in a periodogram (Lomb 1976, Scargle 1982): where a session lasts L, valleys of a sum of squares lie 1/L apart in
-    frequency, and the scan takes half of that.
+    In a session of length L the valleys of a sum of squares lie 1/L apart in frequency, as in a periodogram (Lomb 1976,
+    Scargle 1982). The scan takes frequencies 1/(2L) apart.
     """
 
     signatures: Signatures
     items: list[Variant]
-    periods: Float[np.ndarray, " n"]  # s
-    middle: float  # s
-    # Signatures of the amplitudes without a period, and of both of every period.
-    rows: Float[np.ndarray, "members N"]
+    periods: Float[np.ndarray, " n"]  # s, descending
+    middle: float  # s, session time from which phases count
+    rows: Float[np.ndarray, "members N"]  # signatures of amplitudes without a period, then of the pair of every period
 
     @classmethod
     def of(cls, signatures: Signatures, items: list[Variant]) -> "Scan":
-        """All signatures, read once."""
+        """Read the signatures of an effect at one site for all periods of the scan."""
         effect, site = items[0].effect, items[0].site
         stacks, finger = signatures.problem.stacks, signatures.problem.nominal.finger
         where = affected_channels(effect, finger)
         times = np.concatenate([np.ravel(stacks[e].batch.x.session_time) for e in where if e in stacks])
         start, end = float(times.min()), float(times.max())
-        longest, middle = 2.0 * max(end - start, SHORTEST), (start + end) / 2.0
-        periods = longest / np.arange(1, int(np.clip(longest / SHORTEST, len(effect.periods()), MOST)) + 1)
+        longest, middle = 2.0 * max(end - start, MIN_PERIOD), (start + end) / 2.0
+        periods = longest / np.arange(1, int(np.clip(longest / MIN_PERIOD, len(effect.periods()), MAX_PERIODS)) + 1)
         shape = dict(items[0].shape) | {"middle": middle}
         size = items[0].sizes
         name, pair = next(iter(effect.periods().items()))
@@ -85,18 +80,18 @@ class Scan:
         rows = signatures.white_changes([effect.at(finger, site, **values) for values in members])
         return cls(signatures, items, periods, middle, rows)
 
-    def variant_rows(self, projector: Project, rt: Float[np.ndarray, " rows"], columns: Columns) -> VariantRows:
-        """Every variant with those periods that explain most together."""
-        shape = {"middle": self.middle} | self.best(projector, rt)
+    def variant_rows(self, project: Project, rt: Float[np.ndarray, " rows"], columns: Columns) -> VariantRows:
+        """All variants, with the periods that explain most of the projected residual `rt`."""
+        shape = {"middle": self.middle} | self.best(project, rt)
         items = [v.with_shape(**shape) for v in self.items]
         return items, by_column(self.signatures, items, columns)
 
-    def best(self, projector: Project, rt: Float[np.ndarray, " rows"]) -> dict[str, float]:
-        """The periods, s, by least squares over all sets of them."""
+    def best(self, project: Project, rt: Float[np.ndarray, " rows"]) -> dict[str, float]:
+        """Periods, s, by shape: of all sets of the scan's periods that which explains most of `rt` by least squares."""
         names, n = list(self.items[0].effect.periods()), len(self.periods)
-        A = projector(self.rows)
+        A = project(self.rows)
         A = A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300)
-        G, b, k = A @ A.T + RIDGE * np.eye(len(A)), A @ rt, len(A) - 2 * n
+        G, b, k = A @ A.T + RIDGE * np.eye(len(A)), A @ rt, len(A) - 2 * n  # The first k rows have no period.
         sets = np.array(list(combinations(range(n), len(names))))
         pairs = (k + 2 * sets[:, :, None] + np.arange(2)).reshape(len(sets), -1)
         rows = np.column_stack([np.tile(np.arange(k), (len(sets), 1)), pairs])
@@ -109,7 +104,7 @@ Part = FixedShapes | Scan
 
 
 def by_column(signatures: Signatures, items: list[Variant], columns: Columns) -> ByColumn:
-    """Signatures per plausible size, a row an amplitude of each of the variants, which are of one class."""
+    """Signatures of variants of one class per plausible size, one row for each amplitude of each."""
     rows = signatures.per_amplitude(items)
     return ByColumn.of(columns, rows.reshape(-1, rows.shape[-1]))
 
@@ -117,7 +112,7 @@ def by_column(signatures: Signatures, items: list[Variant], columns: Columns) ->
 def read_parts(
     problem: Problem, items: list[Variant], columns: Columns, progress: Progress = lambda message: None
 ) -> Iterator[Part]:
-    """Signatures of every candidate at the problem's nominal model. Classes of effects are compiled side by side."""
+    """Read the signatures of all variants at the problem's nominal model; classes are compiled side by side."""
     signatures, groups = Signatures(problem), {}
     for v in items:
         groups.setdefault(_part(v), []).append(v)
@@ -134,5 +129,5 @@ def read_parts(
 
 
 def _part(v: Variant) -> tuple:
-    """What is read together: a class of effects, and one site where its periods are open."""
+    """Group of variants that are read together: one class, and one site if it has periods."""
     return (v.effect.ID, v.site) if v.effect.periods() else (v.effect.ID,)

@@ -1,7 +1,8 @@
-"""Signatures: what an effect adds to every whitened row, the nominal parameters as they are.
+"""Signatures: the change of every white row by an effect, at fixed nominal parameters.
 
-Site, shape and amplitude of an effect are arrays, and trials of one kind are stacked whatever their experiment: one
-compiled function a class of effects and kind of prediction serves them all. Only what the effect changes is evaluated.
+Site, shape and amplitude of an effect are arrays, and trials of one kind are stacked whatever their experiment. One
+compiled function for each class of effects and kind of prediction therefore serves all sites, shapes and trials. Only
+channels that the effect changes are evaluated.
 """
 
 from collections.abc import Iterator, Mapping
@@ -21,45 +22,45 @@ from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.parameters import describe
 from jaxfinger.model import Finger, Model, Motion, Terms
 
-CHUNK = 8  # members of one call, at most
+CHUNK = 8  # effects of one compiled call. Each needs memory of the size of the channel that it changes.
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One effect at one site with one shape, and the amplitude at which its signature is read."""
+    """One effect at one site with one choice of shapes, and the size at which its signature is read."""
 
     effect: type[CatalogueEffect]
     site: Site
     shape: tuple[tuple[str, float], ...]
-    size: float = 1.0  # plausible sizes
-    scales: Scales = field(kw_only=True, compare=False)  # of the specimen
+    size: float = 1.0  # in plausible sizes of every amplitude
+    scales: Scales = field(kw_only=True, compare=False)  # scales of the specimen
 
     @property
     def key(self) -> tuple[str, Site]:
-        """What a verdict names."""
+        """Effect and site, as a verdict names them."""
         return self.effect.ID, self.site
 
     @property
     def sizes(self) -> dict[str, float]:
-        """The plausible size of every amplitude, in its own unit."""
+        """Plausible size of every amplitude, in its own unit."""
         return self.effect.sizes(self.scales, self.site)
 
     def with_shape(self, **values: float) -> "Variant":
-        """The same with other values of some shapes."""
+        """Replace the values of some shapes."""
         return replace(self, shape=tuple((dict(self.shape) | values).items()))
 
     def at(self, finger, amplitudes: dict[str, float]) -> CatalogueEffect:
-        """The effect itself."""
+        """Make the effect with these amplitudes, in their own units."""
         return self.effect.at(finger, self.site, **dict(self.shape), **amplitudes)
 
 
 def catalogue_for(
     recipe: Recipe, own: dict[str, type[CatalogueEffect]] | None, finger: Finger
 ) -> dict[str, type[CatalogueEffect]]:
-    """All that may be at work by id: the catalogue, the terms that a recipe may leave out, and a user's own.
+    """Effects that may be at work, by id: the catalogue, the terms that a recipe may leave out, and a user's `own`.
 
     Raises:
-        UserError: one of the user's own fails in a prediction, or changes none.
+        UserError: an effect of the user's fails in a prediction, or changes none.
     """
     for kind in (own or {}).values():
         refuse_broken(kind, finger)
@@ -67,7 +68,7 @@ def catalogue_for(
 
 
 def changes_of(fit: Fit) -> dict[str, type[CatalogueEffect]]:
-    """What an earlier fit's own parameters may have changed by, by id: those that it gives a standard deviation."""
+    """Effects «changed since an earlier fit», by id, for the groups of parameters that the fit gives an uncertainty."""
     r, parameters = fit.recipe.model, describe(fit.model)
     known = {p.group for p, s in zip(parameters, fit.std, strict=True) if s > 0.0}
     return {
@@ -78,7 +79,7 @@ def changes_of(fit: Fit) -> dict[str, type[CatalogueEffect]]:
 
 
 def variants(effects: Mapping[str, type[CatalogueEffect]], finger, scales: Scales) -> list[Variant]:
-    """Every effect at every site with every shape and size worth trying."""
+    """Variants of every effect: all its sites, shapes worth trying, and sizes."""
     return [
         Variant(effect, site, tuple(shape.items()), size, scales=scales)
         for effect in effects.values()
@@ -99,7 +100,10 @@ def _change(
     contact: Array | None,
     count: Array,
 ) -> Float[Array, "variants columns B T"]:
-    """Change of one channel's prediction by the first `count` of `effects` (arrays stacked along their first axis)."""
+    """Change of one channel's prediction by each of the first `count` effects, stacked along their arrays' first axis.
+
+    Rows from `count` on are zero.
+    """
 
     def put(k, out):
         effect = jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, k, keepdims=False), effects)
@@ -111,12 +115,12 @@ def _change(
 
 @dataclass(frozen=True)
 class Signatures:
-    """Reads signatures off a problem."""
+    """Evaluates what effects change in a problem's rows, at its nominal model."""
 
     problem: Problem
 
     def white_changes(self, members: list[CatalogueEffect]) -> Float[np.ndarray, "members N"]:
-        """Projector change of every row, for effects of one class."""
+        """Change of every white row by each of some effects of one class."""
         out = np.zeros((len(members), self.problem.r.size))
         for k in range(0, len(members), CHUNK):
             for e, channel, raw in self.changes(members[k : k + CHUNK]):
@@ -128,7 +132,10 @@ class Signatures:
         return out
 
     def changes(self, members: list[CatalogueEffect]) -> Iterator[tuple[str, str, Float[np.ndarray, "members c B T"]]]:
-        """Change of every channel of an experiment that shows effects of one class, at most CHUNK of them."""
+        """Change of every channel that shows the effects, with its experiment; not whitened, in the channel's unit.
+
+        `members` are effects of one class, CHUNK at most.
+        """
         kind, nominal = type(members[0]), self.problem.nominal
         padded = members + members[:1] * (CHUNK - len(members))
         stacked = jax.tree.map(lambda *a: np.stack(a), *[replace(m, site=()) for m in padded])
@@ -141,8 +148,8 @@ class Signatures:
             y0, plain = self.problem.without_effects[group.channel, group.held]
             columns, _, T = y0[0].shape
             raw = np.empty((len(members), columns, len(y0), TRIALS, T))
-            # An effect that resists and does no more changes a force by the joint torques that it adds, so that the
-            # program of these serves for both.
+            # An effect that only resists motion changes the fingertip's force by the joint torques that it adds. The
+            # program that computes joint torques then serves for both.
             by_torque = group.channel == "fingertip_force" and not (kind.moves_rigid_body() or kind.reads())
             for b in group.of(shown):
                 x, contact = group.x[b], group.contact[b]
@@ -159,7 +166,7 @@ class Signatures:
                 yield e, group.channel, raw[:, :, mine.start : mine.stop, :length]
 
     def per_amplitude(self, items: list[Variant]) -> Float[np.ndarray, "variants amplitudes N"]:
-        """Signatures per plausible size, one amplitude at a time, for variants of one class."""
+        """Signatures of variants of one class, for each amplitude alone, in units of its plausible size."""
         effect, finger = items[0].effect, self.problem.nominal.finger
         names = list(effect.amplitudes())
         members = [v.at(finger, {n: v.size * v.sizes[n]}) for v, n in product(items, names)]
@@ -171,7 +178,10 @@ class Signatures:
 def whitened(
     raw: Float[np.ndarray, "members columns B T"], problem: Problem, rows: Rows, of_channel: np.ndarray, channel: str
 ) -> Float[np.ndarray, "members rows"]:
-    """The rows that count, whitened as the residuals are (`noise.whiten`)."""
+    """Whiten changes of a channel as its residuals are (`noise.whiten`), in its rows `of_channel` of an experiment.
+
+    As in the residuals, the arbitrary zero of an excursion is projected out in every trial.
+    """
     column, trial, time = rows.column[of_channel], rows.trial[of_channel], rows.time[of_channel]
     filters = problem.noise[rows.experiment, channel].coefficients[column, rows.history[of_channel]]
     lags = range(filters.shape[1])

@@ -1,4 +1,4 @@
-"""The gap is what the nominal model misses, not what nobody recorded; and it is linear only nearby."""
+"""The regression problem of a diagnosis, and exact fits of sets of causes in it."""
 
 from dataclasses import replace
 
@@ -62,7 +62,7 @@ def scaled(session):
 
 @pytest.mark.parametrize("missing", [(), ("ID.3-static",)])
 def test_damping_without_its_own_experiment_is_fitted_where_else_it_shows(session, specimen, missing):
-    """By the stages on the moves between holds; without them, by the diagnosis on the free motion."""
+    """The stages fit it on the moves between holds; without ID.3-static the diagnosis fits it on the free motion."""
     trials = {t.name: t for t in session if t.experiment not in missing}
     problem = build(replace(session, trials=trials), Recipe())
     damping = [i for i, p in enumerate(describe(problem.nominal)) if p.group == "damping"]
@@ -71,11 +71,11 @@ def test_damping_without_its_own_experiment_is_fitted_where_else_it_shows(sessio
     fit, truth = nominal_fit(problem).fit, np.asarray(ravel(true_model(specimen)))
     error = np.asarray(ravel(fit.model))[damping] - truth[damping]
     assert np.all(np.abs(error) < 4.0 * fit.std[damping])
-    assert np.all(truth[damping] > 3.0 * fit.std[damping])  # it shows clearly
+    assert np.all(truth[damping] > 3.0 * fit.std[damping])  # The trials do determine it.
 
 
 def test_a_problem_moves_along_its_own_jacobian(problem):
-    """A thousandth of a standard deviation in every parameter: exact residuals move as the linear ones say."""
+    """For steps of a thousandth of a standard deviation, exact residuals change as the Jacobian says."""
     step = 1e-3 / np.linalg.norm(np.vstack([problem.J, problem.root]), axis=0)
     there = moved(problem, step)
     np.testing.assert_allclose(there.r - problem.r, -problem.J @ step, atol=1e-6)
@@ -83,7 +83,7 @@ def test_a_problem_moves_along_its_own_jacobian(problem):
 
 
 def planted(problem, **values):
-    """The problem with a presliding in its residuals, and a baseline for it."""
+    """The problem with a pre-sliding in its residuals, its baseline, and the variant to fit."""
     kind, site = CATALOGUE["joint_presliding"], (problem.nominal.finger.joint_names[0],)
     effect = kind.at(problem.nominal.finger, site, **values)
     there = replace(problem, r=problem.r + Signatures(problem).white_changes([effect])[0])
@@ -96,7 +96,7 @@ def planted(problem, **values):
 
 @pytest.mark.parametrize(("share", "start"), [(0.5, 1.0), (3.0, 0.5)])
 def test_a_share_is_at_most_one_and_leaves_that_bound_where_it_is_less(problem, share, start):
-    """Residuals of a friction of which so much builds up over 20 mrad."""
+    """The residuals hold a friction whose planted share builds up over 20 mrad."""
     there, baseline, variant = planted(problem, a=share, x0=0.02, delta=1.0)
     found = at_one_model(
         baseline, there, [variant.with_shape(x0=0.016).at(there.nominal.finger, {"a": start})], white(baseline)
@@ -105,8 +105,8 @@ def test_a_share_is_at_most_one_and_leaves_that_bound_where_it_is_less(problem, 
 
 
 @pytest.mark.parametrize("start", [(1.0, 0.014), (0.3, 0.04)])
-def test_a_length_is_found_while_the_share_stays_at_its_most(problem, start):
-    """Which trials tell of a friction and its length is nearly their product: from any start the same optimum."""
+def test_a_length_is_found_while_the_share_stays_at_its_upper_bound(problem, start):
+    """Trials determine little more than the product of share and length; both starts lead to the same optimum."""
     there, baseline, variant = planted(problem, a=1.0, x0=0.02, delta=0.5)
     a, x0 = start
     found = at_one_model(
@@ -117,7 +117,7 @@ def test_a_length_is_found_while_the_share_stays_at_its_most(problem, start):
 
 
 def test_an_amplitude_that_changes_nothing_keeps_a_size(session):
-    """The warmth of a Coulomb friction that the model has none of, beside the damping that is warm as well."""
+    """An amplitude of warm-up scales the Coulomb friction, which this model has none of."""
     terms = tuple(t for t in ModelRecipe().terms if t != "joint_coulomb")
     problem = build(session, Recipe(model=ModelRecipe(terms=terms)))
     baseline = Baseline.of(problem, Parameters())
@@ -137,8 +137,8 @@ def led(scaled):
 
 @pytest.mark.long
 def test_a_large_effect_is_judged_where_it_leads(scaled):
-    """A sensor's gain multiplies the torques refitted with it: the formula finds nothing better where an exact fit
-    leads.
+    """A sensor's gain multiplies the refitted torques, so that one linearisation errs; the optimum of the formula is at
+    the exact fit all the same.
     """
     baseline, state = led(scaled)
     exact = augmented_fit(scaled, state)
@@ -152,12 +152,12 @@ def test_a_large_effect_is_judged_where_it_leads(scaled):
 
 @pytest.mark.xfail(
     strict=True,
-    reason="A quick refit leaves out the products of effects and nominal parameters: a gain of a fifth moves some by "
-    "several of their standard deviations.",
+    reason="A quick refit leaves out products of effects and nominal parameters. With a gain error of a fifth, some "
+    "parameters are off by several standard deviations.",
 )
 @pytest.mark.long
 def test_where_a_set_has_led_is_the_exact_fit(scaled):
-    """Within the intervals, and what its parts miss is what the model misses."""
+    """Its parameters lie within the intervals of the exact fit, and its parts miss as much as the whole model does."""
     _, state = led(scaled)
     quick, exact = as_refitted(scaled, state), augmented_fit(scaled, state)
     np.testing.assert_array_equal(quick.fit.estimated, exact.fit.estimated)
@@ -170,8 +170,8 @@ def test_where_a_set_has_led_is_the_exact_fit(scaled):
 
 
 def test_where_a_joint_is_held_it_is_no_variable(problem):
-    """A fixture holds the joint of ID.4, so that only noise moves it: a gap at middle tension, which a trial passes
-    twice, lies at middle tension.
+    """A fixture holds the joint of ID.4, so that only noise moves it. A gap at middle tension, which a trial passes
+    twice, is found at middle tension and not at an angle.
     """
     rows = problem.rows["ID.4"]
     r = np.random.default_rng(1).standard_normal(problem.r.size)
@@ -184,7 +184,7 @@ def test_where_a_joint_is_held_it_is_no_variable(problem):
 
 
 def test_without_id2_the_other_experiments_show_the_moment_arms(session):
-    """What ID.2 would have fitted is first in the residuals of the other experiments, and must not pass for noise."""
+    """Moment arms that no stage has fitted show in the other residuals, and are not taken for noise."""
     problem = build(session.with_trials([t.name for t in session if t.experiment != "ID.2"]), Recipe())
     energy = np.bincount(problem.column_of_row, problem.r**2) / np.maximum(np.bincount(problem.column_of_row), 1)
     count = np.bincount(problem.column_of_row)
@@ -193,7 +193,7 @@ def test_without_id2_the_other_experiments_show_the_moment_arms(session):
 
 
 @pytest.mark.parametrize("condition", [1e1, 1e6])
-def test_products_of_columns_span_what_householders_qr_does(condition):
+def test_orthonormal_columns_span_the_matrix_at_any_condition(condition):
     rng = np.random.default_rng(0)
     U, V = (np.linalg.qr(rng.standard_normal((n, 20)))[0] for n in (2000, 20))
     A = U * np.geomspace(1.0, 1.0 / condition, 20) @ V.T

@@ -1,4 +1,4 @@
-"""The scan for periods in the session's time, against all pairs of periods and against a planted drift."""
+"""The scan for periods agrees with trying all sets of periods, and finds a planted drift."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -13,7 +13,7 @@ from jaxfinger.gap import diagnose
 from jaxfinger.gap.exact import Baseline
 from jaxfinger.gap.formula import Parameters
 from jaxfinger.gap.result import Key
-from jaxfinger.gap.screening import MOST, Scan, read_parts
+from jaxfinger.gap.screening import MAX_PERIODS, Scan, read_parts
 from jaxfinger.gap.sets import table_of
 from jaxfinger.gap.signatures import Signatures, Variant, variants
 from jaxfinger.model import Finger
@@ -35,7 +35,7 @@ def left(rows, r):
 
 
 class TwoPeriods(DRIFT):
-    """As a user's effect with two periods would be."""
+    """A user's effect with two periods."""
 
     A_2: Float[Array, ""] = amplitude("N m", 0.006, "torque", signed=True)
     B_2: Float[Array, ""] = amplitude("N m", 0.006, "torque", signed=True)
@@ -51,7 +51,7 @@ def test_the_scan_leaves_as_little_as_the_best_of_all_sets_of_periods(effect, se
     r = rng.standard_normal(4) @ columns(time, rng.uniform(40.0, 300.0, 2)) + 0.1 * rng.standard_normal(time.size)
     slope = (time / 1000.0)[None]
     items = [Variant(effect, SITE, (), scales=SCALES)]
-    unread = object.__new__(Signatures)  # it is the columns that are scanned
+    unread = object.__new__(Signatures)  # Scan.best uses its rows alone.
     scan = Scan(unread, items, periods, 500.0, np.vstack([slope, columns(time, periods)]))
     found = scan.best(lambda rows: rows, r)
     sets = combinations(periods, len(effect.periods()))
@@ -61,7 +61,7 @@ def test_the_scan_leaves_as_little_as_the_best_of_all_sets_of_periods(effect, se
 
 
 def test_a_long_session_is_scanned_down_to_a_longer_period(planted, monkeypatch):
-    """A session over a day does not ask for memory in proportion, nor one of an instant for no period at all."""
+    """A session of a day does not need memory in proportion, and one of an instant still has a period to try."""
     monkeypatch.setattr(Signatures, "white_changes", lambda self, members: np.zeros((len(members), 1)))
     problem, days = planted, {}
     for length in (0.0, 100.0, 86400.0):
@@ -71,17 +71,17 @@ def test_a_long_session_is_scanned_down_to_a_longer_period(planted, monkeypatch)
             days[e] = replace(stack, batch=replace(stack.batch, x=replace(x, session_time=jnp.asarray(clock))))
         there = Signatures(replace(problem, stacks=days))
         scan = Scan.of(there, [Variant(DRIFT, SITE, (), scales=problem.scales)])
-        assert len(DRIFT.periods()) <= len(scan.periods) <= MOST
+        assert len(DRIFT.periods()) <= len(scan.periods) <= MAX_PERIODS
         assert np.all(scan.periods > 0.0)
 
 
 @pytest.mark.xfail(
     strict=True,
-    reason="A drift that repeats differ by is taken for their noise, and what lies below the noise is no evidence.",
+    reason="A drift by which repeats differ is taken for noise, and what lies below the noise is no evidence.",
 )
 @pytest.mark.long
 def test_a_wandering_sensor_is_named_with_its_period():
-    """A period that lies between those of the scan, and far from the first value that is tried."""
+    """The period lies between two of the scan, and far from the first value that is tried."""
     truth = {"A": 1e-3, "B": -5e-4, "P": 71.0, "T": 1e4, "tare": 3.0}
     keep = {*RIVALS, "torque_sensor_drift"}
     found = diagnose(session_with(("torque_sensor_drift", SITE, truth)), without=tuple(sorted(set(CATALOGUE) - keep)))
@@ -90,8 +90,8 @@ def test_a_wandering_sensor_is_named_with_its_period():
     assert float(drift.P) == pytest.approx(71.0, rel=0.05)
 
 
-def test_what_the_nominal_parameters_imitate_could_hide_without_end(planted):
-    """A constant torque beside an elastic torque whose constant is free: more of it than any machine has."""
+def test_what_the_nominal_parameters_imitate_could_hide_at_any_size(planted):
+    """The elastic torque's constant imitates a constant torque: more of it could hide than any machine has."""
     baseline = Baseline.of(planted, Parameters())
     items = variants({"joint_offset": CATALOGUE["joint_offset"]}, planted.nominal.finger, planted.scales)
     table = table_of(planted, baseline, read_parts(planted, items, baseline.columns))
