@@ -76,7 +76,7 @@ def as_refitted(problem: Problem, chosen: SearchState) -> Fitted:
     columns = {}
     for c, column in zip(chosen.coordinates, chosen.slopes, strict=True):
         effect = chosen.effects[c.effect]
-        unit = c.unit if c.shifts else float(getattr(effect, c.name))
+        unit = c.unit if c.by_differences else float(getattr(effect, c.name))
         columns[f"{effect.ID} {'-'.join(effect.site)} {c.name}"] = column / unit
     moving = np.array([i for i in moving if labels[i] in columns], int)
     r = there.r - chosen.changes.sum(axis=0)

@@ -1,8 +1,18 @@
-"""Sets of causes fitted exactly: amplitudes, shapes and nominal parameters move, in the weights of the formula.
+"""Exact fits of sets of causes: amplitudes, shapes and nominal parameters, in the weights of the formula.
 
-Gauss–Newton on amplitudes and shapes with signatures read again at each step, the nominal parameters eliminated by
-projection, then the nominal model moved to where they lead, until both settle. What nobody knows is part of the noise
-(`formula`): a column that the causes do not explain pulls at none of them.
+With nominal parameters θ and causes i of amplitudes and shapes p_i, the white residual left is
+
+    x(θ, p) = W (y − ŷ(θ)) − Σ_i Δ_i(θ, p_i),
+
+where Δ_i is the white change of every row by cause i. A fit alternates two steps until the log evidence settles:
+
+1. Gauss–Newton on p at fixed θ (`fit_at_nominal`). Rows are multiplied by the root of the formula's weights and
+   projected off the derivatives by θ (`Projector`), so that θ follows p to first order, as in variable projection
+   (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413). Changes and their derivatives are evaluated at every p.
+2. θ moves to where the projection says that p takes it, with residual and Jacobian evaluated there
+   (`_with_nominal_refitted`).
+
+A column that the causes leave unexplained has low weights (`formula`), so that it hardly biases p and θ.
 """
 
 from collections.abc import Sequence
@@ -15,102 +25,126 @@ from jaxtyping import Float
 from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.columns import Columns
+from jaxfinger.gap.costs import Key
 from jaxfinger.gap.formula import LinearFit, LinearModel, Parameters, Weights, unexplained
 from jaxfinger.gap.problem import Problem, moved
 from jaxfinger.gap.signatures import Signatures, Variant
 from jaxfinger.identify.solve import bounded_least_squares
 
-STEPS = 6  # of shapes and amplitudes at one nominal model
-STEP = 0.05  # of a difference, in units of a coordinate
-FACTOR = 0.7  # logarithm of the most by which a step changes a shape
-ROUNDS = 5  # of moving the nominal model
-PLAIN = 3  # steps of plain least squares, each nonlinear by a fifth of the one before: `tests/gap/test_problem.py`
-SETTLED = 0.5  # change of the score below which it stays
-HALVINGS = 3
-ROUNDING = 1e-14  # of the largest variance: a sum of ten thousand products is good to a hundred times 2.2e-16
-Room = tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]
+MAX_ROUNDS = 5  # moves of the nominal model in one fit
+MIN_SCORE_GAIN = 0.5  # nats. A round that gains less ends the fit: sets differ by several nats where it matters.
+MAX_STEPS = 6  # Gauss–Newton steps on amplitudes and shapes at one nominal model
+# A step that gains less than this, plus this share of the cost, is the last one. The cost is in squared standard
+# deviations, of which a tenth is 0.05 nats.
+MIN_COST_GAIN, MIN_RELATIVE_COST_GAIN = 0.1, 1e-3
+MAX_TRIES = 3  # of a step, each a third as long as the one before
+MAX_LOG_FACTOR = 0.7  # A step changes a shape by a factor of two at most, since linearisations hold no further.
+# A finite difference changes the white rows by one standard deviation of the noise, within these bounds in units of its
+# coordinate: a longer one would be nonlinear, a shorter one rounding.
+MAX_DIFFERENCE, MIN_DIFFERENCE = 0.05, 0.0025
+# Rounds of ordinary least squares. With a gain error of a fifth, each leaves a fifth of the error that the one before
+# left (`tests/gap/test_problem.py`).
+PLAIN_ROUNDS = 3
+# Relative to the largest variance of columns: sums of ten thousand products are good to 100 times the rounding 2.2e-16.
+MIN_RELATIVE_VARIANCE = 1e-14
+
+Bounds = tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]  # lower, upper
 
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One amplitude or one shape that a refit moves."""
+    """One amplitude or one shape of one effect of a set, which a fit moves."""
 
-    effect: int
+    effect: int  # position in the set
     name: str
     amplitude: bool
-    unit: float  # of its prior's standard deviation: an amplitude's own units, or the step of a shape
-    shifts: bool  # moves by differences, not by factors
+    # Change of the parameter per unit of a coordinate that moves by differences: prior standard deviation of an
+    # amplitude, half a step of a shape's grid. For a shape that moves by factors, the coordinate is their logarithm.
+    unit: float
+    by_differences: bool
     scales: Scales
 
 
 @dataclass(frozen=True)
 class SearchState:
-    """A set of causes at its optimum, and the problem at the nominal model that it leads to."""
+    """A set of causes at its optimum, linearised there."""
 
-    problem: Problem
+    problem: Problem  # at the nominal model refitted with the set
     columns: Columns
-    nominal: ByColumn  # −∂r/∂θ of the nominal parameters
+    nominal: ByColumn  # rows ∂ŷ/∂θ of the nominal parameters, white
     effects: tuple[CatalogueEffect, ...]
     coordinates: tuple[Coordinate, ...]
-    changes: Float[np.ndarray, "effects N"]  # what each effect adds to every white row
-    slopes: Float[np.ndarray, "k N"]  # derivatives by the coordinates, in their units
+    changes: Float[np.ndarray, "effects N"]  # white change of every row by each effect
+    slopes: Float[np.ndarray, "k N"]  # derivatives of the changes by the coordinates
     linear_fit: LinearFit
 
     @property
     def score(self) -> float:
-        """Comparable between sets."""
+        """Log evidence, comparable between sets of one problem."""
         return self.linear_fit.score
 
     @property
-    def keys(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
-        """(effect, site) of each."""
+    def keys(self) -> tuple[Key, ...]:
+        """The causes: effect and site of each."""
         return tuple((e.ID, e.site) for e in self.effects)
 
     def sizes(self) -> Float[np.ndarray, " k"]:
-        """Amplitudes in standard deviations of their prior."""
+        """Amplitudes in prior standard deviations, zero for shapes."""
         return _sizes(self.effects, self.coordinates)
 
-    def room(self, at: list[int]) -> Room:
-        """How far some of the coordinates may move, back and forth."""
-        low, high = _room(self.effects, self.coordinates)
+    def step_bounds(self, at: list[int]) -> Bounds:
+        """Bounds of a further step of the coordinates `at`."""
+        low, high = _step_bounds(self.effects, self.coordinates)
         return low[at], high[at]
 
     @property
     def r(self) -> Float[np.ndarray, " N"]:
-        """White residual."""
+        """White residual that the causes leave."""
         return self.problem.r - self.changes.sum(axis=0)
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """What is the same for all sets of one file."""
+    """The nominal model without causes, which all sets of one problem are compared with."""
 
     columns: Columns
     parameters: Parameters
-    null: SearchState  # no cause, the nominal model refitted in the weights of the formula
-    unexplained: Float[np.ndarray, " C"]  # log evidence, column by column, that something is at work
-    gap: float  # norm of what the nominal model misses: the size of the amplitudes' prior
+    null: SearchState  # no cause, the nominal parameters refitted in the weights of the formula
+    unexplained: Float[np.ndarray, " C"]  # u_c, nats: log evidence that something is at work in column c
+    gap: float  # norm of the null's white residual, the unit of all amplitudes
 
     @classmethod
     def of(cls, problem: Problem, parameters: Parameters) -> "Baseline":
+        """Refit the nominal parameters in the weights of the formula."""
         columns = Columns.of(problem)
         empty = np.empty((0, problem.r.size))
         nominal, none = ByColumn.of(columns, problem.J.T), ByColumn.of(columns, empty)
         residual = ByColumn.of(columns, problem.r[None])
-        judged = LinearModel(columns, (residual, nominal), prior_products(problem, 0), none, parameters).null
-        assert judged is not None
-        null = SearchState(problem, columns, nominal, (), (), empty, empty, judged)
-        unknown = unexplained(columns.counts, judged.evidence, parameters)
-        gap = float(np.sqrt(np.sum(judged.evidence.e + judged.evidence.o)))
-        return cls(columns, parameters, null, unknown, gap)
+        model = LinearModel(columns, (residual, nominal), prior_products(problem, 0), none, parameters)
+        assert model.null is not None
+        evidence = model.null.evidence
+        return cls(
+            columns,
+            parameters,
+            SearchState(problem, columns, nominal, (), (), empty, empty, model.null),
+            unexplained(columns.counts, evidence, parameters),
+            float(np.sqrt(np.sum(evidence.e + evidence.o))),
+        )
 
     def fit_linear(
-        self, problem: Problem, nominal: ByColumn, r: np.ndarray, slopes: np.ndarray, sizes: np.ndarray, room: Room
+        self,
+        problem: Problem,
+        nominal: ByColumn,
+        r: Float[np.ndarray, " N"],
+        slopes: Float[np.ndarray, "k N"],
+        sizes: Float[np.ndarray, " k"],
+        bounds: Bounds,
     ) -> LinearFit:
-        """A set at its optimum: `sizes`, how far its coordinates are from the middle of their priors, `room`, how far
-        they may move on.
+        """Fit a set that is linearised at `r`, with `slopes` by its coordinates, and take its evidence.
+
+        `sizes` are the amplitudes at `r` in prior standard deviations, `bounds` those of a further step.
         """
-        linear = LinearModel(
+        model = LinearModel(
             self.columns,
             (ByColumn.of(self.columns, r[None]), nominal),
             prior_products(problem, 0),
@@ -118,13 +152,11 @@ class Baseline:
             self.parameters,
             self.null.linear_fit,
         )
-        return linear.fit(np.arange(len(slopes)), *room, sizes=sizes)
+        return model.fit(np.arange(len(slopes)), *bounds, sizes=sizes)
 
 
 def prior_products(problem: Problem, k: int) -> Float[np.ndarray, "d d"]:
-    """Products of the prior's rows with themselves: for a residual, the nominal parameters, and k slopes of unit
-    precision, which are refitted with every set.
-    """
+    """Prior of a `LinearModel`'s base (d = 1 + p + k): residual, p nominal parameters, k amplitudes with N(0, I)."""
     rows = np.column_stack([-problem.offset, problem.root])
     out = np.zeros((rows.shape[1] + k,) * 2)
     out[: rows.shape[1], : rows.shape[1]] = rows.T @ rows
@@ -133,19 +165,23 @@ def prior_products(problem: Problem, k: int) -> Float[np.ndarray, "d d"]:
 
 
 class Projector:
-    """Rows in the weights of the formula, projected off the nominal parameters."""
+    """Projection of weighted rows off what the nominal parameters can absorb.
+
+    A row x of N numbers becomes (I − Q Qᵀ) [W^½ x; 0] with the weights W of the formula, where Q spans [W^½ J; R] and R
+    is the root of the information of the nominal parameters' prior.
+    """
 
     def __init__(self, problem: Problem, columns: Columns, weights: Weights):
         self.columns, self.weights = columns, weights
         A = np.vstack([self.weighted(problem.J.T).T, problem.root])
         scale = np.linalg.norm(A, axis=0)
         scale = np.where(scale > 0, scale, 1.0)
-        self.Q, self.T = orthonormalised(A / scale)
+        self.Q, self.T = orthonormalise(A / scale)
         self.T /= scale[:, None]  # Q = A T
         self.offset = problem.offset
 
     def weighted(self, x: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "k N"]:
-        """W^½ x."""
+        """Multiply rows by W^½."""
         out = x.copy()
         for c, inside, outside in zip(self.columns.items, self.weights.feature, self.weights.outside, strict=True):
             mine = x[:, c.rows]
@@ -155,222 +191,276 @@ class Projector:
         return out
 
     def __call__(self, x: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "k rows"]:
-        """Of signatures."""
+        """Project signatures, which the prior says nothing of."""
         return self._off(np.pad(self.weighted(x), ((0, 0), (0, len(self.offset)))))
 
     def residual(self, r: Float[np.ndarray, " N"]) -> Float[np.ndarray, " rows"]:
-        """Of a residual, with what the prior says of the nominal parameters as they are."""
-        return self._off(np.concatenate([self.weighted(r[None])[0], -self.offset])[None])[0]
+        """Project a residual, together with that of the nominal parameters' prior."""
+        return self._off(self._with_prior(r)[None])[0]
+
+    def nominal_step(self, r: Float[np.ndarray, " N"]) -> Float[np.ndarray, " p"]:
+        """Change of the nominal parameters that absorbs as much of a residual as they can."""
+        return self.T @ (self.Q.T @ self._with_prior(r))
+
+    def _with_prior(self, r):
+        return np.concatenate([self.weighted(r[None])[0], -self.offset])
 
     def _off(self, x):
         return x - (x @ self.Q) @ self.Q.T
 
-    def nominal_step(self, r: Float[np.ndarray, " N"]) -> Float[np.ndarray, " p"]:
-        """What the nominal parameters move by to absorb r."""
-        return self.T @ (self.Q.T @ np.concatenate([self.weighted(r[None])[0], -self.offset]))
 
+def orthonormalise(A: Float[np.ndarray, "N p"]) -> tuple[Float[np.ndarray, "N k"], Float[np.ndarray, "p k"]]:
+    """Q and T with Q = A T and Qᵀ Q = I, where Q spans the columns of A but for directions that are rounding.
 
-def orthonormalised(A: Float[np.ndarray, "N p"]) -> tuple[Float[np.ndarray, "N k"], Float[np.ndarray, "p k"]]:
-    """Q and T, Q = A T with Qᵀ Q = I, spanning the columns of A as far as they stand out of rounding.
-
-    From the products of columns, which cost a quarter of Householder's QR where rows are many. The first pass leaves Q
-    oblique where A is ill-conditioned; the second one mends that (as in CholeskyQR2: Yamamoto et al., ETNA 44 (2015)).
+    The products AᵀA cost a quarter of Householder's QR where rows are many. If A is ill-conditioned, the first pass
+    leaves Q oblique, and the second one mends that (as in CholeskyQR2: Yamamoto et al., ETNA 44 (2015) 306).
     """
     Q, T = A, np.eye(A.shape[1])
     for _ in range(2):
         variance, V = np.linalg.eigh(Q.T @ Q)
-        kept = variance > ROUNDING * variance.max(initial=0.0)
+        kept = variance > MIN_RELATIVE_VARIANCE * variance.max(initial=0.0)
         step = V[:, kept] / np.sqrt(variance[kept])
         Q, T = Q @ step, T @ step
     return Q, T
 
 
-def fitted(
+def fit_set(
     baseline: Baseline,
     problem: Problem,
     variants: Sequence[Variant],
     start: Sequence[dict[str, float]],
     weights: Weights,
 ) -> SearchState:
-    """The causes together, from amplitudes `start` (in their own units), at the nominal model that they lead to."""
+    """Fit a set of causes from amplitudes `start`, in their own units, and from the problem's nominal model."""
     finger = problem.nominal.finger
     effects = [within_bounds(v.at(finger, s), v.scales) for v, s in zip(variants, start, strict=True)]
     best: SearchState | None = None
-    for _ in range(ROUNDS):
-        found = at_one_model(baseline, problem, effects, weights)
-        if best is not None and found.score < best.score + SETTLED:
+    for _ in range(MAX_ROUNDS):
+        found = fit_at_nominal(baseline, problem, effects, weights)
+        if best is not None and found.score < best.score + MIN_SCORE_GAIN:
             return max(best, found, key=lambda s: s.score)
         best, effects, weights = found, list(found.effects), found.linear_fit.weights
-        problem = _led(baseline, found, weights)
+        problem = _with_nominal_refitted(baseline, found, weights)
     assert best is not None
     return best
 
 
-def led_plainly(baseline: Baseline, state: SearchState) -> SearchState:
-    """The causes together where plain least squares leads from a state, if the formula says more for that.
+def refit_from_plain(baseline: Baseline, state: SearchState) -> SearchState:
+    """Fit a set from where ordinary least squares takes it, and return that fit or `state`, whichever scores higher.
 
-    The formula gives a column that is open little weight. Where it takes a large step in the nominal model to close it,
-    `fitted` ends before, since each small step wins less than it loses in the columns that are closed.
+    The formula gives a column that is left unexplained little weight. If only a large step of the nominal model would
+    close that column, `fit_set` ends before, since every small step costs more in the closed columns than it gains.
     """
     plain = Weights.plain(baseline.columns)
     problem, effects, there = state.problem, list(state.effects), state
-    for _ in range(PLAIN):
-        there = at_one_model(baseline, problem, effects, plain)
-        problem, effects = _led(baseline, there, plain), list(there.effects)
+    for _ in range(PLAIN_ROUNDS):
+        there = fit_at_nominal(baseline, problem, effects, plain)
+        problem, effects = _with_nominal_refitted(baseline, there, plain), list(there.effects)
     variants, starts = [as_variant(e, problem.scales) for e in effects], [amplitudes_of(e) for e in effects]
-    return max(state, fitted(baseline, problem, variants, starts, there.linear_fit.weights), key=lambda s: s.score)
+    return max(state, fit_set(baseline, problem, variants, starts, there.linear_fit.weights), key=lambda s: s.score)
 
 
 def amplitudes_of(effect: CatalogueEffect) -> dict[str, float]:
-    """By name, in their own units."""
+    """Amplitudes of an effect by name, in their own units."""
     return {n: float(getattr(effect, n)) for n in effect.amplitudes()}
 
 
 def as_variant(effect: CatalogueEffect, scales: Scales) -> Variant:
-    """What an effect is but for its amplitudes."""
+    """Class, site and shapes of an effect."""
     shapes = tuple((n, float(getattr(effect, n))) for n in effect.shape_parameters())
     return Variant(type(effect), effect.site, shapes, scales=scales)
 
 
-def _led(baseline: Baseline, state: SearchState, weights: Weights) -> Problem:
-    """The problem at the nominal model that a set leads to; a part of the step where a whole one loses what it won."""
+def _with_nominal_refitted(baseline: Baseline, state: SearchState, weights: Weights) -> Problem:
+    """The problem at the nominal model refitted with a set, by one step of the linearisation.
+
+    The step is cut to a third, and again, where its curvature more than doubles the cost.
+    """
     project = Projector(state.problem, baseline.columns, weights)
     step = project.nominal_step(state.r)
     here = state.problem
-    for _ in range(HALVINGS):
+    for _ in range(MAX_TRIES):
         here = moved(state.problem, step)
         left = here.r - np.sum([Signatures(here).white_changes([e])[0] for e in state.effects], axis=0)
+        # The constant keeps a cost near zero, as of a perfect fit, from refusing every step.
         if _cost(Projector(here, baseline.columns, weights), left) < 2.0 * _cost(project, state.r) + 100.0:
             return here
         step = step / 3.0
     return here
 
 
-def _cost(project: Projector, r: np.ndarray) -> float:
+def _cost(project: Projector, r: Float[np.ndarray, " N"]) -> float:
+    """Weighted sum of squares of a residual, the nominal parameters refitted."""
     x = project.residual(r)
     return float(x @ x)
 
 
-def at_one_model(baseline: Baseline, problem: Problem, effects: list[CatalogueEffect], weights: Weights) -> SearchState:
-    """Amplitudes and shapes at the problem's nominal model, its parameters eliminated by projection."""
+@dataclass(frozen=True)
+class _Point:
+    """Effects of a set at one nominal model, and what they leave."""
+
+    effects: Sequence[CatalogueEffect]
+    changes: Float[np.ndarray, "effects N"]
+    slopes: Float[np.ndarray, "k N"]
+    r: Float[np.ndarray, " N"]
+    sizes: Float[np.ndarray, " k"]
+    cost: float  # weighted sum of squares and ‖sizes‖²
+
+
+def fit_at_nominal(
+    baseline: Baseline, problem: Problem, effects: list[CatalogueEffect], weights: Weights
+) -> SearchState:
+    """Fit amplitudes and shapes from `effects` at the problem's nominal model, whose parameters are projected out."""
     signatures, project = Signatures(problem), Projector(problem, baseline.columns, weights)
     coordinates = _coordinates(effects, problem.scales)
-    reach = np.full(len(coordinates), STEP)
-    changes, slopes = _evaluate(signatures, effects, coordinates, reach)
-    # An amplitude is measured in the gap: one prior standard deviation changes as much as is missed in all. One that
-    # changes nothing here keeps its own unit, as the warmth of a friction that there is none of.
-    plain = Projector(problem, baseline.columns, Weights.plain(baseline.columns))
-    norm = np.linalg.norm(plain(slopes), axis=1)
-    grow = np.array(
-        [baseline.gap / n if c.amplitude and n > 0.0 else 1.0 for c, n in zip(coordinates, norm, strict=True)]
-    )
-    coordinates = [replace(c, unit=c.unit * g) if c.amplitude else c for c, g in zip(coordinates, grow, strict=True)]
-    slopes = slopes * grow[:, None]
-    r = problem.r - changes.sum(axis=0)
-    sizes = _sizes(effects, coordinates)
-    cost = _cost(project, r) + float(sizes @ sizes)
-    for _ in range(STEPS):
-        rt, St = project.residual(r), project(slopes)
-        A, b = np.vstack([St.T, np.eye(len(coordinates))]), np.concatenate([-rt, sizes])
-        delta = bounded_least_squares(A, b, *_room(effects, coordinates))
-        reach = np.clip(1.0 / np.maximum(np.linalg.norm(St, axis=1), 1e-300), STEP / 20.0, STEP)
-        for _ in range(HALVINGS):
-            trial = _moved(effects, coordinates, delta)
-            new, new_slopes = _evaluate(signatures, trial, coordinates, reach)
-            new_r, new_sizes = problem.r - new.sum(axis=0), _sizes(trial, coordinates)
-            new_cost = _cost(project, new_r) + float(new_sizes @ new_sizes)
-            if new_cost < cost:
-                break
+    changes, slopes = _evaluate(signatures, effects, coordinates, np.full(len(coordinates), MAX_DIFFERENCE))
+    coordinates, slopes = _in_units_of_the_gap(baseline, problem, coordinates, slopes)
+
+    def point(effects: Sequence[CatalogueEffect], changes, slopes) -> _Point:
+        r, sizes = problem.r - changes.sum(axis=0), _sizes(effects, coordinates)
+        return _Point(effects, changes, slopes, r, sizes, _cost(project, r) + float(sizes @ sizes))
+
+    def gauss_newton(now: _Point) -> _Point | None:
+        """The point after one step within the bounds, cut until the cost falls; None where it never does."""
+        S = project(now.slopes)
+        A, b = np.vstack([S.T, np.eye(len(coordinates))]), np.concatenate([-project.residual(now.r), now.sizes])
+        delta = bounded_least_squares(A, b, *_step_bounds(now.effects, coordinates))
+        difference = np.clip(1.0 / np.maximum(np.linalg.norm(S, axis=1), 1e-300), MIN_DIFFERENCE, MAX_DIFFERENCE)
+        for _ in range(MAX_TRIES):
+            there = _stepped(now.effects, coordinates, delta)
+            new = point(there, *_evaluate(signatures, there, coordinates, difference))
+            if new.cost < now.cost:
+                return new
             delta = delta / 3.0
-        else:
+        return None
+
+    here = point(effects, changes, slopes)
+    for _ in range(MAX_STEPS):
+        new = gauss_newton(here)
+        if new is None:
             break
-        gain = cost - new_cost
-        effects, changes, slopes, r, sizes, cost = trial, new, new_slopes, new_r, new_sizes, new_cost
-        if gain < 0.1 + 1e-3 * cost:
+        gain, here = here.cost - new.cost, new
+        if gain < MIN_COST_GAIN + MIN_RELATIVE_COST_GAIN * here.cost:
             break
-    nominal = ByColumn.of(baseline.columns, problem.J.T)
-    judged = baseline.fit_linear(problem, nominal, r, slopes, sizes, _room(effects, coordinates))
-    return SearchState(problem, baseline.columns, nominal, tuple(effects), tuple(coordinates), changes, slopes, judged)
+    nominal, bounds = ByColumn.of(baseline.columns, problem.J.T), _step_bounds(here.effects, coordinates)
+    return SearchState(
+        problem,
+        baseline.columns,
+        nominal,
+        tuple(here.effects),
+        tuple(coordinates),
+        here.changes,
+        here.slopes,
+        baseline.fit_linear(problem, nominal, here.r, here.slopes, here.sizes, bounds),
+    )
+
+
+def _in_units_of_the_gap(
+    baseline: Baseline, problem: Problem, coordinates: list[Coordinate], slopes: Float[np.ndarray, "k N"]
+) -> tuple[list[Coordinate], Float[np.ndarray, "k N"]]:
+    """Coordinates and slopes in the units of the formula: an amplitude of one changes as much as is missed in all.
+
+    An amplitude that changes nothing here keeps its plausible size as its unit, as the warm-up of a friction of zero.
+    """
+    project = Projector(problem, baseline.columns, Weights.plain(baseline.columns))
+    norm = np.linalg.norm(project(slopes), axis=1)
+    pairs = zip(coordinates, norm, strict=True)
+    factor = np.array([baseline.gap / n if c.amplitude and n > 0.0 else 1.0 for c, n in pairs])
+    scaled = [replace(c, unit=c.unit * f) if c.amplitude else c for c, f in zip(coordinates, factor, strict=True)]
+    return scaled, slopes * factor[:, None]
 
 
 def derivatives(signatures: Signatures, state: SearchState) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "k N"]]:
-    """White change of other rows by a set's causes, and its derivatives by their coordinates."""
-    reach = np.full(len(state.coordinates), STEP / 20.0)
-    changes, slopes = _evaluate(signatures, state.effects, state.coordinates, reach)
+    """White change of the rows of `signatures` by a set's causes, and its derivatives by their coordinates."""
+    difference = np.full(len(state.coordinates), MIN_DIFFERENCE)
+    changes, slopes = _evaluate(signatures, state.effects, state.coordinates, difference)
     return changes.sum(axis=0), slopes
 
 
-def _sizes(effects, coordinates) -> Float[np.ndarray, " k"]:
-    """Amplitudes in standard deviations of their prior; zero for shapes, whose middle is where they are."""
+def _sizes(effects: Sequence[CatalogueEffect], coordinates: Sequence[Coordinate]) -> Float[np.ndarray, " k"]:
+    """Amplitudes in prior standard deviations. Shapes are zero, since their prior is centred where they are."""
     return np.array([float(getattr(effects[c.effect], c.name)) / c.unit if c.amplitude else 0.0 for c in coordinates])
 
 
 def _coordinates(effects: Sequence[CatalogueEffect], scales: Scales) -> list[Coordinate]:
+    """Coordinates of all amplitudes, in plausible sizes, and of all shapes that a fit moves."""
     out = []
     for i, effect in enumerate(effects):
         out += [Coordinate(i, n, True, unit, True, scales) for n, unit in effect.sizes(scales, effect.site).items()]
         for n, values in effect.worth_trying(scales, effect.site).items():
             moves = effect.shape_parameters()[n].moves
             if moves != "not" and len(values) > 1:
-                shifts = moves == "by differences"
-                unit = float(np.mean(np.abs(np.diff(np.sort(values))))) / 2 if shifts else 1.0
-                out.append(Coordinate(i, n, False, unit, shifts, scales))
+                by_differences = moves == "by differences"
+                unit = float(np.mean(np.abs(np.diff(np.sort(values))))) / 2 if by_differences else 1.0
+                out.append(Coordinate(i, n, False, unit, by_differences, scales))
     return out
 
 
 def _shifted(effect: CatalogueEffect, c: Coordinate, by: float) -> CatalogueEffect:
+    """The effect with one coordinate moved, within its bounds."""
     value = float(getattr(effect, c.name))
-    value = value + by * c.unit if c.shifts else value * float(np.exp(np.clip(by, -FACTOR, FACTOR)))
+    if c.by_differences:
+        value = value + by * c.unit
+    else:
+        value = value * float(np.exp(np.clip(by, -MAX_LOG_FACTOR, MAX_LOG_FACTOR)))
     return within_bounds(replace(effect, **{c.name: jax.device_put(value)}), c.scales)
 
 
 def within_bounds(effect: CatalogueEffect, scales: Scales) -> CatalogueEffect:
-    """The effect with every number within its bounds."""
+    """Clip every parameter of an effect to its bounds."""
     values = {n: np.clip(float(getattr(effect, n)), *ends) for n, ends in effect.bounds(scales).items()}
     return replace(effect, **jax.device_put(values))
 
 
-def _room(effects, coordinates) -> Room:
-    """How far each coordinate may move, back and forth."""
+def _step_bounds(effects: Sequence[CatalogueEffect], coordinates: Sequence[Coordinate]) -> Bounds:
+    """Bounds of a step of every coordinate; they hold zero."""
     out = []
     for c in coordinates:
         value, ends = float(getattr(effects[c.effect], c.name)), effects[c.effect].bounds(c.scales)[c.name]
-        ways = [(end - value) / c.unit if c.shifts else np.log(end / value) for end in ends]
-        most = np.inf if c.shifts else FACTOR
-        out.append((max(min(ways[0], 0.0), -most), min(max(ways[1], 0.0), most)))
+        low, high = [(end - value) / c.unit if c.by_differences else np.log(end / value) for end in ends]
+        most = np.inf if c.by_differences else MAX_LOG_FACTOR
+        out.append((max(min(low, 0.0), -most), min(max(high, 0.0), most)))
     low, high = np.array(out).T if out else (np.empty(0), np.empty(0))
     return low, high
 
 
-def _moved(effects, coordinates, delta):
+def _stepped(
+    effects: Sequence[CatalogueEffect], coordinates: Sequence[Coordinate], delta: Float[np.ndarray, " k"]
+) -> list[CatalogueEffect]:
+    """Effects with every coordinate moved by `delta`, within its bounds."""
     out = list(effects)
     for c, d in zip(coordinates, delta, strict=True):
         out[c.effect] = _shifted(out[c.effect], c, float(d))
     return out
 
 
-def _evaluate(signatures: Signatures, effects, coordinates, reach: Float[np.ndarray, " k"]):
-    """White change by each effect, and its derivatives by every coordinate, as differences over its `reach`."""
+def _evaluate(
+    signatures: Signatures,
+    effects: Sequence[CatalogueEffect],
+    coordinates: Sequence[Coordinate],
+    difference: Float[np.ndarray, " k"],
+) -> tuple[Float[np.ndarray, "effects N"], Float[np.ndarray, "k N"]]:
+    """White change of every row by each effect, and its derivatives by the coordinates as differences."""
     size = signatures.problem.r.size
     changes, slopes = np.zeros((len(effects), size)), np.zeros((len(coordinates), size))
     for i, effect in enumerate(effects):
         mine = [k for k, c in enumerate(coordinates) if c.effect == i]
-        # A difference of an amplitude is one of its plausible size: its prior may be far wider.
-        steps = [_beside(effect, coordinates[k], reach[k]) for k in mine]
-        flat = signatures.white_changes([effect, *steps])
-        changes[i] = flat[0]
-        for row, k in enumerate(mine, start=1):
-            step = _step_taken(effect, steps[row - 1], coordinates[k])
-            slopes[k] = (flat[row] - flat[0]) / step if step else 0.0
+        neighbours = [_neighbour(effect, coordinates[k], difference[k]) for k in mine]
+        change, *beside = signatures.white_changes([effect, *neighbours])
+        changes[i] = change
+        for k, neighbour, there in zip(mine, neighbours, beside, strict=True):
+            step = _distance(effect, neighbour, coordinates[k])
+            slopes[k] = (there - change) / step if step else 0.0
     return changes, slopes
 
 
-def _beside(effect: CatalogueEffect, c: Coordinate, h: float) -> CatalogueEffect:
-    """A step for a difference: back where a bound leaves no way forward."""
+def _neighbour(effect: CatalogueEffect, c: Coordinate, h: float) -> CatalogueEffect:
+    """The effect with one coordinate moved by h, or by −h where its upper bound holds it."""
     ahead = _shifted(effect, c, h)
     return ahead if float(getattr(ahead, c.name)) != float(getattr(effect, c.name)) else _shifted(effect, c, -h)
 
 
-def _step_taken(before, after, c: Coordinate) -> float:
+def _distance(before: CatalogueEffect, after: CatalogueEffect, c: Coordinate) -> float:
+    """Distance between two effects along one coordinate."""
     a, b = float(getattr(before, c.name)), float(getattr(after, c.name))
-    return (b - a) / c.unit if c.shifts else float(np.log(b / a))
+    return (b - a) / c.unit if c.by_differences else float(np.log(b / a))

@@ -59,10 +59,10 @@ def fit_with(
         raise UserError(f"{file}: no trial shows {effect} at {'-'.join(site)}; record {shown}, or leave it out")
     search, state = Search(baseline, table, progress), baseline.null
     for _ in wanted:
-        screened = search.screened(state)
+        screened = search.screen(state)
         _, offer, amplitudes = search.best_offers(screened, 1)[0]
-        found = search.exactly(state, None, offer, amplitudes, screened.now.weights)
-        state = search.in_its_best_form(found, len(state.effects))
+        found = search.fit_exactly(state, None, offer, amplitudes, screened.now.weights)
+        state = search.with_best_choices(found, len(state.effects))
     progress("fitting the effects and all nominal parameters together")
     return augmented_fit(problem, state).fit
 

@@ -7,7 +7,7 @@ import pytest
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap.augment import as_refitted, augmented_fit, nominal_fit
-from jaxfinger.gap.exact import Baseline, at_one_model, fitted, led_plainly, orthonormalised
+from jaxfinger.gap.exact import Baseline, fit_at_nominal, fit_set, orthonormalise, refit_from_plain
 from jaxfinger.gap.formula import Parameters, Weights
 from jaxfinger.gap.problem import build, moved
 from jaxfinger.gap.signatures import Signatures, Variant
@@ -20,7 +20,7 @@ from jaxfinger.synthetic import SpecimenPlant, recipe_from, simulate, study_fing
 GAIN = 0.2
 
 
-def white(baseline):
+def plain(baseline):
     return Weights.plain(baseline.columns)
 
 
@@ -98,8 +98,8 @@ def planted(problem, **values):
 def test_a_share_is_at_most_one_and_leaves_that_bound_where_it_is_less(problem, share, start):
     """The residuals hold a friction whose planted share builds up over 20 mrad."""
     there, baseline, variant = planted(problem, a=share, x0=0.02, delta=1.0)
-    found = at_one_model(
-        baseline, there, [variant.with_shape(x0=0.016).at(there.nominal.finger, {"a": start})], white(baseline)
+    found = fit_at_nominal(
+        baseline, there, [variant.with_shape(x0=0.016).at(there.nominal.finger, {"a": start})], plain(baseline)
     )
     assert float(found.effects[0].a) == pytest.approx(min(share, 1.0), abs=0.1 if share < 1.0 else 0.0)
 
@@ -109,8 +109,8 @@ def test_a_length_is_found_while_the_share_stays_at_its_upper_bound(problem, sta
     """Trials determine little more than the product of share and length; both starts lead to the same optimum."""
     there, baseline, variant = planted(problem, a=1.0, x0=0.02, delta=0.5)
     a, x0 = start
-    found = at_one_model(
-        baseline, there, [variant.with_shape(x0=x0).at(there.nominal.finger, {"a": a})], white(baseline)
+    found = fit_at_nominal(
+        baseline, there, [variant.with_shape(x0=x0).at(there.nominal.finger, {"a": a})], plain(baseline)
     )
     assert float(found.effects[0].x0) == pytest.approx(0.02, abs=0.003)
     assert found.effects[0].delta == 0.5
@@ -124,7 +124,7 @@ def test_an_amplitude_that_changes_nothing_keeps_a_size(session):
     kind, site = CATALOGUE["joint_friction_warmup"], problem.nominal.finger.joint_names[:1]
     effect = kind.at(problem.nominal.finger, site, a=0.3, d=1e-4, T=100.0, by=0.0)
     beside = CATALOGUE["joint_torque_friction"].at(problem.nominal.finger, site, mu=0.1)
-    found = at_one_model(baseline, problem, [beside, effect], white(baseline))
+    found = fit_at_nominal(baseline, problem, [beside, effect], plain(baseline))
     assert np.isfinite(found.score)
     assert abs(float(found.effects[1].a)) <= 0.3
 
@@ -132,7 +132,7 @@ def test_an_amplitude_that_changes_nothing_keeps_a_size(session):
 def led(scaled):
     baseline = Baseline.of(scaled, Parameters())
     variant = Variant(CATALOGUE["torque_sensor_scale"], ("torque_sensor",), (), scales=scaled.scales)
-    return baseline, led_plainly(baseline, fitted(baseline, scaled, [variant], [{"gain": 0.05}], white(baseline)))
+    return baseline, refit_from_plain(baseline, fit_set(baseline, scaled, [variant], [{"gain": 0.05}], plain(baseline)))
 
 
 @pytest.mark.long
@@ -144,7 +144,7 @@ def test_a_large_effect_is_judged_where_it_leads(scaled):
     exact = augmented_fit(scaled, state)
     (effect,) = exact.fit.model.effects
     nominal = np.asarray(ravel(exact.fit.model))[scaled.free] - np.asarray(ravel(scaled.nominal))[scaled.free]
-    there = at_one_model(baseline, moved(scaled, nominal), [effect], white(baseline))
+    there = fit_at_nominal(baseline, moved(scaled, nominal), [effect], plain(baseline))
     assert float(state.effects[0].gain) == pytest.approx(GAIN, abs=0.005)
     assert float(effect.gain) == pytest.approx(GAIN, abs=0.005)
     assert state.score - baseline.null.score > 0.95 * (there.score - baseline.null.score) > 100.0
@@ -197,7 +197,7 @@ def test_orthonormal_columns_span_the_matrix_at_any_condition(condition):
     rng = np.random.default_rng(0)
     U, V = (np.linalg.qr(rng.standard_normal((n, 20)))[0] for n in (2000, 20))
     A = U * np.geomspace(1.0, 1.0 / condition, 20) @ V.T
-    Q, T = orthonormalised(A)
+    Q, T = orthonormalise(A)
     np.testing.assert_allclose(Q.T @ Q, np.eye(20), atol=1e-13)
     np.testing.assert_allclose(A @ T, Q, atol=1e-15 * condition)
     np.testing.assert_allclose(Q @ (Q.T @ U), U, atol=1e-15 * condition)
@@ -207,6 +207,6 @@ def test_a_column_that_is_the_sum_of_others_adds_no_direction():
     A = np.random.default_rng(0).standard_normal((200, 3)) @ np.array(
         [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 0.0]]
     )
-    Q, _ = orthonormalised(A)
+    Q, _ = orthonormalise(A)
     assert Q.shape == (200, 2)
     np.testing.assert_allclose(Q @ (Q.T @ A), A, atol=1e-12)
