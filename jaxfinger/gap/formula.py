@@ -67,7 +67,7 @@ class Parameters:
     form_error: float = 0.02  # ρ²: an inexact form of a law may miss a seventh of its effect, 0.02 of the energy.
     outside_samples: float = 25.0  # ν: the standard deviation of the noise is known to a fifth, 1/√ν.
     cause_cost: float = 8.0  # nats that every cause must bring (`costs`)
-    imitator_gain: float = 0.04  # share of u_c in its columns that a cause must bring too, as an imitator gains as much
+    imitator_gain: float = 0.04  # share of Σ_c τ_c u_c (`costs`) that a cause must bring, since an imitator gains it
     tempering: float = 1.0  # β: power of the likelihood; below 1 it would allow for dependent features and columns.
     form_error_unlisted: float = 0.27  # ρ² in `unlisted`: less than that share of E_c may be the listed causes' own.
     unlisted_threshold: float = 6.0  # nats left unexplained at which something unlisted is as likely as not
@@ -111,14 +111,19 @@ def log_likelihood(
     return np.asarray(value), Weights(1.0 / v, 1.0 / (1.0 + excess))
 
 
-def _variance_floor(counts: Counts, o, explained, p: Parameters) -> Float[np.ndarray, "*n C"]:
+def _variance_floor(
+    counts: Counts, o: Float[np.ndarray, "*n C"], explained: Float[np.ndarray, "*n C"], p: Parameters
+) -> Float[np.ndarray, "*n C"]:
     """Variance on the features that noise and inexact laws may leave (step 3)."""
     noise = np.maximum((p.outside_samples + o) / (p.outside_samples + counts.outside), 1.0)
     return np.maximum(p.variance_floor * noise, p.form_error * explained / counts.K)
 
 
 def unexplained(counts: Counts, evidence: Evidence, p: Parameters) -> Float[np.ndarray, " C"]:
-    """Log evidence u_c in every column that more is at work than noise and inexact forms of the causes' laws."""
+    """Log evidence in every column that more is at work than noise and inexact forms of the causes' laws.
+
+    It is u_c = ½ K_c max(0, log(e_c / K_c) − log v⁰_c), with v⁰_c the lower bound of v_c in step 3.
+    """
     floor = _variance_floor(counts, evidence.o, evidence.explained, p)
     return 0.5 * counts.K * np.log(np.maximum(evidence.e / counts.K / floor, 1.0))
 
