@@ -1,13 +1,13 @@
-"""Prior costs of sets of causes, in nats of log evidence, and the posterior probabilities of sets.
+"""Costs of sets of causes, in nats of log evidence, and the posterior probabilities of sets.
 
-The log of the prior odds against a set counts, for every effect in it, the effects that the trials can see, and for
-every site the sites of that effect: one effect at many sites is one cause. Beyond that, a cause must bring the evidence
-that an imitator of the true cause would bring where it acts,
+A set costs the log of the prior odds against it, and the evidence that imitators of the true causes would bring:
 
-    cause_cost + imitator_gain Σ_c τ_c u_c,
+    cost = Σ_effects log E + Σ_causes [ log S_effect + cause_cost + imitator_gain Σ_c τ_c u_c ].
 
-with u_c the evidence in column c that something is at work (`formula.unexplained`), and τ_c the share of that column's
-gap which the cause would explain if it were as large as the whole gap.
+E is the number of effects that the trials can see, S_effect the number of sites where they can see an effect. So an
+effect at one site more costs less than another effect. u_c is the evidence in column c that something is at work
+(`formula.unexplained`), and τ_c the share of that column's gap which the cause would explain if it were as large as the
+whole gap.
 """
 
 from collections import Counter
@@ -44,9 +44,9 @@ class Costs:
         return self.odds(keys) + self.evidence_needed(keys)
 
     def odds(self, keys: Iterable[Key]) -> float:
-        """Log prior odds against these effects and sites.
+        """Log prior odds against these effects and sites: Σ_effects log E + Σ_causes log S_effect.
 
-        A term of the nominal model that the recipe leaves out costs no odds for its effect, since it is as likely at
+        A term of the nominal model that the recipe leaves out costs no log E, since it is as likely at
         work as not.
         """
         keys = list(keys)

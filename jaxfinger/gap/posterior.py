@@ -41,16 +41,16 @@ def posterior(search: Search, state: SearchState) -> Posterior:
         without = max(net[keys] for keys in scores if key not in keys)
         gains[key] = max((net[keys] for keys in inside), default=-np.inf) - without
     other = unlisted(search.baseline.columns.counts, state.linear_fit.evidence, search.baseline.parameters)
-    ambiguous = _ambiguous(w, state, causes)
+    ambiguous = _ambiguous(w, state)
     named = tuple(k for k in state.keys if causes[k] >= MIN_NAMED_PROBABILITY and not any(k in s for s in ambiguous))
     return Posterior(causes, gains, w[frozenset()] * (1.0 - other), other, named, ambiguous)
 
 
-def _ambiguous(w: dict[frozenset, float], state: SearchState, causes: dict[Key, float]) -> tuple[tuple[Key, ...], ...]:
+def _ambiguous(w: dict[frozenset[Key], float], state: SearchState) -> tuple[tuple[Key, ...], ...]:
     """Causes of the best set, each with the rivals that could take its place, likeliest first.
 
-    `w` are the posterior probabilities of all visited sets. A rival's weight is that of the best set with the rival in
-    the cause's place.
+    `w` are the posterior probabilities of all visited sets. Rivals compare by the probability of the best set with the
+    rival in the cause's place.
     """
     out, whole = [], frozenset(state.keys)
     for key in state.keys:
