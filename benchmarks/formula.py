@@ -93,7 +93,7 @@ def weigh(folder: Path) -> Record:
     costs, visited = search.costs, search.visited
     return Record(
         folder.name,
-        search.bench.columns.counts,
+        search.baseline.columns.counts,
         visited.evidence,
         frozenset(visited.screened),
         search.table.explainable,
