@@ -1,4 +1,4 @@
-"""Sessions: read, write and check the HDF5 format; filtering, derivatives, directions, holds, decimation."""
+"""Sessions: read, write and check the HDF5 format; filtering, derivatives, directions, holds."""
 
 from jaxfinger.data.check import check_file as check_file
 from jaxfinger.data.filtering import bridged as bridged

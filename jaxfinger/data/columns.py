@@ -16,7 +16,7 @@ from jaxfinger.data.mapping import Column, MappedTrial, Reading, Said, terms
 from jaxfinger.data.parse import listed
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.toml import Place
-from jaxfinger.data.units import TO_SI, known
+from jaxfinger.data.units import TO_SI, unit_name
 from jaxfinger.errors import UserError, counted
 
 # Two clocks of one recording run about as long and tick about as often. Units are mistaken by a thousand, so thirty,
@@ -353,7 +353,7 @@ def _unwrapped(values: np.ndarray, period: float) -> np.ndarray:
 
 def _stated(variable: Variable, spec: Column, units: str, report: Report, where: Place) -> None:
     """Does the file state other units than the mapping?"""
-    stated, said = known(variable.units), spec.units or units
+    stated, said = unit_name(variable.units), spec.units or units
     if stated and said in TO_SI and stated != said and spec.scale == 1.0 and TO_SI[stated] != TO_SI[said]:
         report.warning(
             where.key, f"the recording states {variable.units}, and the mapping reads {said}; correct one of them"

@@ -1,18 +1,19 @@
-"""Derivatives from noisy encoders, without phase: low-pass, then a spline.
+"""Zero-phase derivatives from noisy encoders (a low-pass, then a spline), and the detection of spikes.
 
-1. The low-pass is a Gaussian: no phase, no ringing, and one number to state, its cut-off, where |H| = 1/√2. Butterworth
-   both ways was the other choice: flatter below the cut-off, but it lets more noise into the second derivative, and
-   spreads a jump of friction three times as far.
-2. Its standard deviation in time is σ = √(ln 2) / (2π cutoff): 13 ms at 10 Hz.
-3. Samples that are not evenly spaced are first interpolated to the median interval: the filter knows no other.
-4. At both ends the signal goes on as its odd mirror image about the end, further than filter and spline reach. Without
-   the straight line between the ends of that it is a period, and the low-pass a product of its Fourier series.
-5. Derivatives are those of the quintic spline through the filtered samples, so differencing adds no error of its own,
-   and noise near half the sampling rate is not multiplied by that rate as (iω) would. Its coefficients are the Fourier
-   series over that of the B-spline's samples (Unser, IEEE Signal Processing Magazine 16(6), 1999, eq. 9). scipy's
-   `BSpline` says the same to rounding, but takes 0.3 s to import, which `check` would have to wait for.
+1. The low-pass is a Gaussian. It has no phase and no ringing, and one parameter, its cut-off, where |H| = 1/√2.
+   A Butterworth filter applied both ways is flatter below the cut-off, but lets more noise into the second derivative
+   and spreads a jump of friction three times as far.
+2. The Gaussian's standard deviation in time is σ = √(ln 2) / (2π cutoff): 13 ms at 10 Hz.
+3. Samples that are not evenly spaced are first interpolated to the median interval, since the filter needs even ones.
+4. Beyond both ends the signal is continued by its odd mirror image about the end, further than filter and spline reach.
+   Minus the straight line between its ends the continued signal is periodic, so the low-pass is a product with its
+   Fourier series.
+5. The derivatives are those of the quintic spline through the filtered samples. Differencing would add an error, and a
+   factor iω would multiply noise near half the sampling rate by that rate. The spline's coefficients are the Fourier
+   series divided by that of the B-spline's samples (Unser, IEEE Signal Processing Magazine 16(6), 1999, eq. 9). scipy's
+   `BSpline` agrees to rounding, but its import takes 0.3 s, for which `check` would have to wait.
 
-Within about one `1/cutoff_hz` of an end all of it leans on the image.
+Within about `1/cutoff_hz` of an end the results depend on the mirror image.
 """
 
 from __future__ import annotations
@@ -24,14 +25,16 @@ from jaxtyping import Bool, Float
 
 from jaxfinger.errors import UserError
 
-_JUMP = 12.0  # times their mean: the largest second difference that noise makes, with room
-_EVEN = 1e-3  # intervals this equal (relative) need no resampling
-_PASSES = 4  # spikes that are found, and those that they hid
-_AT_END = 10  # samples that tell how fast a motion starts or ends
-_SMALL = 1e-4  # of a column's travel: what lies beyond its surroundings by less is no spike
-_SPLINE_REACH = 20  # samples: the quintic spline's largest pole, 0.43, is 5e-8 by then
-# The quintic B-spline's value and five derivatives at a sample, of the coefficients from two samples before it to three
-# after; the fifth is that of the interval which follows. (Divided by 5!, 4!, 3!, 2!, 1, 1.)
+# Largest second difference as a multiple of the mean one. That of Gaussian noise stays below it, so a column below it
+# has no spikes to look for.
+_MAX_NOISE_BEND = 12.0
+_EVEN = 1e-3  # Intervals that differ by less than this share need no resampling.
+_MAX_PASSES = 4  # Each pass finds spikes that those found before had hidden; longer chains of them are rare.
+_END_SAMPLES = 10  # at each end, whose steps show how fast a motion starts or stops
+_MIN_SPIKE_SHARE = 1e-4  # of a column's travel: a smaller deviation is no spike, even where the column has no noise.
+_SPLINE_REACH = 20  # samples after which the quintic spline's largest pole, 0.43, has decayed to 5e-8
+# Value and five derivatives of the quintic spline at a sample: weights of the B-spline coefficients from two samples
+# before it to three after. The fifth derivative is that of the interval after the sample.
 _B_SPLINE = (
     np.array(
         [
@@ -50,9 +53,10 @@ _B_SPLINE = (
 def smooth(
     time: Float[np.ndarray, " N"], x: Float[np.ndarray, "N *k"], cutoff_hz: float
 ) -> tuple[Float[np.ndarray, "N *k"], Float[np.ndarray, "N *k"], Float[np.ndarray, "N *k"]]:
-    """x, ẋ and ẍ below `cutoff_hz` (the frequency of -3 dB), zero-phase, at the given times.
+    """Low-pass x with zero phase and differentiate it twice: x, ẋ and ẍ at the given times.
 
-    Columns that are NaN stay NaN; a few NaN in a column are bridged, and NaN in the result.
+    `time` is in s, `cutoff_hz` the frequency of -3 dB. NaN are interpolated for the filter and stay NaN in the result,
+    as do columns with fewer than three finite samples.
 
     Raises:
         UserError: the cut-off is not between zero and half the sampling rate.
@@ -64,12 +68,12 @@ def smooth(
 def low_pass(
     time: Float[np.ndarray, " N"], x: Float[np.ndarray, "N *k"], cutoff_hz: float
 ) -> Float[np.ndarray, "N *k"]:
-    """x below `cutoff_hz` as `smooth` gives it, without its derivatives."""
+    """Low-pass x as `smooth` does, without derivatives."""
     return _smoothed(time, x, cutoff_hz, 0)[0]
 
 
 def _smoothed(time: np.ndarray, x: np.ndarray, cutoff_hz: float, highest: int) -> np.ndarray:
-    """x and its derivatives up to the highest, stacked."""
+    """Filtered x and its derivatives up to the order `highest`, stacked along the first axis."""
     time, x = np.asarray(time, np.float64), np.asarray(x, np.float64)
     if len(time) < 3:
         return np.stack([x, *[np.zeros_like(x)] * highest])
@@ -93,14 +97,16 @@ def _smoothed(time: np.ndarray, x: np.ndarray, cutoff_hz: float, highest: int) -
 
 
 def _spline(x: Float[np.ndarray, "k N"], rate: float, cutoff_hz: float) -> Float[np.ndarray, "k N+5"]:
-    """Coefficients of the quintic spline through x low-passed, from two samples before the first to three after the
+    """Coefficients of the quintic spline through low-passed x, from two samples before the first to three after the
     last.
     """
-    N, reach = x.shape[1], math.ceil(rate / cutoff_hz) + _SPLINE_REACH  # 7.5 standard deviations of the Gaussian
+    # 1/cutoff is 7.5 standard deviations of the Gaussian.
+    N, reach = x.shape[1], math.ceil(rate / cutoff_hz) + _SPLINE_REACH
     wide = np.pad(x, [(0, 0), (reach, reach)], mode="reflect", reflect_type="odd")
     count = wide.shape[1]
-    line = wide[:, :1] + (wide[:, -1:] - wide[:, :1]) / (count - 1) * np.arange(count)  # its own spline coefficients
-    size = _quick_length(count)
+    # A straight line is its own spline coefficients, so it is added back to them.
+    line = wide[:, :1] + (wide[:, -1:] - wide[:, :1]) / (count - 1) * np.arange(count)
+    size = _fourier_length(count)
     turn = 2.0 * np.pi / size * np.arange(size // 2 + 1)  # rad from sample to sample
     B = _B_SPLINE[0, 2] + 2.0 * (_B_SPLINE[0, 3] * np.cos(turn) + _B_SPLINE[0, 4] * np.cos(2.0 * turn))
     H = np.exp(-0.5 * (rate * filter_std(cutoff_hz) * turn) ** 2)
@@ -111,8 +117,9 @@ def _spline(x: Float[np.ndarray, "k N"], rate: float, cutoff_hz: float) -> Float
 def _derivatives(
     coefficients: Float[np.ndarray, "k C"], highest: int, at: Float[np.ndarray, " M"] | None
 ) -> Float[np.ndarray, "d k M"]:
-    """A spline and its derivatives, per sample, up to the highest order: d = highest + 1 of them, at the samples or at
-    places counted in samples. C = N + 5, as of `_spline`.
+    """Values of a spline and of its derivatives up to the order `highest` (d = highest + 1), per sample interval.
+
+    They are taken at the N = C - 5 samples, or at `at`, counted in samples. The coefficients are those of `_spline`.
     """
     last = coefficients.shape[1] - 6
 
@@ -126,7 +133,7 @@ def _derivatives(
     away, there = at - before, [at_samples(order)[:, before] for order in range(6)]
 
     def polynomial(order: int) -> Float[np.ndarray, "k M"]:
-        """That of the interval, by Horner's scheme."""
+        """Derivative of the interval's polynomial, by Horner's scheme."""
         out = there[5]
         for k in range(4, order - 1, -1):
             out = there[k] + out * away / (k - order + 1)
@@ -135,15 +142,13 @@ def _derivatives(
     return np.stack([polynomial(order) for order in range(highest + 1)])
 
 
-def _quick_length(size: int) -> int:
-    """The least even length of a quick Fourier transform that holds so many samples: a power of two, or 3, 5, 9 or 15
-    times one.
-    """
+def _fourier_length(size: int) -> int:
+    """Shortest even length, at least `size`, with a fast Fourier transform: 1, 3, 5, 9 or 15 times a power of two."""
     return min(k << max(1, math.ceil(math.log2(size / k))) for k in (1, 3, 5, 9, 15))
 
 
 def uniform_grid(time: Float[np.ndarray, " N"]) -> Float[np.ndarray, " K"]:
-    """Evenly spaced times from the first to the last, at about the median interval; `time` itself where it is even."""
+    """Evenly spaced times over the recording, at about its median interval; `time` itself where it is even."""
     steps = np.diff(time)
     interval = float(np.median(steps))
     if np.all(np.abs(steps - interval) <= _EVEN * interval):
@@ -159,26 +164,28 @@ def _on_grid(time: np.ndarray, column: np.ndarray, grid: np.ndarray) -> np.ndarr
 
 
 def filter_std(cutoff_hz: float) -> float:
-    """Standard deviation, s, of the Gaussian whose transfer function is 1/√2 at `cutoff_hz`."""
+    """Standard deviation, s, of the Gaussian filter, whose transfer function is 1/√2 at `cutoff_hz`."""
     return np.sqrt(np.log(2.0)) / (2.0 * np.pi * cutoff_hz)
 
 
 def filtered_noise_std(cutoff_hz: float, step: float, order: int = 0) -> float:
-    """Standard deviation of a derivative of low-passed white noise of unit variance, a sample every `step` s.
+    """Standard deviation of low-passed white noise, or of its derivative of order k, per s^k.
 
-    With σ the filter's width, its square is step/(2π) ∫ ω^(2k) e^(−ω²σ²) dω = step Γ(k + ½)/(2π σ^(2k+1)).
+    The noise has unit variance and a sample every `step` s. With σ the filter's standard deviation, the variance is
+    step/(2π) ∫ ω^(2k) e^(−ω²σ²) dω = step Γ(k + ½)/(2π σ^(2k+1)).
     """
     return math.sqrt(step * math.gamma(order + 0.5) / (2.0 * math.pi * filter_std(cutoff_hz) ** (2 * order + 1)))
 
 
 def outlier_mask(x: Float[np.ndarray, "N *k"], threshold: float = 8.0, longest: int = 5) -> Bool[np.ndarray, "N *k"]:
-    """True where a sample is a spike: no motion that is seen before and after it leads there.
+    """Mark spikes: samples that no motion seen before and after them leads to.
 
-    What motion allows, at whatever rate it is sampled, lies between the straight lines through the two samples on
-    either side, and those samples themselves: a smooth turn, a corner and a step stay between them, a spike does not.
-    Finds spikes of up to `longest` samples, up to about one sample in ten; `threshold` times the noise, a robust
-    standard deviation, and at least a sensor's step, so that a quantised channel at rest is not full of spikes. NaN is
-    no spike.
+    A sample of a motion lies within the range of its two neighbours and of the straight lines through the two samples
+    on either side. Smooth turns, corners and steps stay within that range at any sampling rate. A spike is outside by
+    more than `threshold` times the noise. The noise is a robust standard deviation, and at least the
+    sensor's resolution, so that a quantised channel at rest has no spikes. NaN is no spike.
+
+    Spikes of up to `longest` samples are found, in up to about one sample in ten.
     """
     x = np.asarray(x, np.float64)
     columns = x.reshape(len(x), -1)
@@ -192,27 +199,27 @@ def outlier_mask(x: Float[np.ndarray, "N *k"], threshold: float = 8.0, longest: 
 
 
 def longest_spike(step: float) -> int:
-    """Samples, `step` s apart, of the longest spike: 5 ms, but 2 to 25.
+    """Number of samples, `step` s apart, of the longest spike: 5 ms, but at least 2 and at most 25 samples.
 
-    What disturbs is electronics, a bus that stalls for a few cycles of 1 kHz or a power stage that switches, as long on
-    slow machines as on quick ones. One that falls between two samples shows in both; of more than 25 in a row the lines
-    from either side no longer tell.
+    Spikes come from electronics, such as a bus that stalls for a few cycles of 1 kHz or a power stage that switches.
+    They last as long on slow machines as on quick ones. A spike between two samples shows in both. Over more than 25
+    samples the lines from either side are no prediction.
     """
     return round(min(max(5e-3 / step, 2.0), 25.0)) if step > 0.0 else 2
 
 
 def without_spikes(x: Float[np.ndarray, "N k"]) -> Float[np.ndarray, "N k"]:
-    """x with straight lines across spikes of one sample or two, so that a filter does not spread them."""
+    """x with spikes of one or two samples replaced by straight lines, so that a filter does not spread them."""
     out = np.array(x, np.float64)
     if len(out) > 2:
         bend = np.abs(np.diff(out, 2, axis=0))
-        rough = ~(bend.max(axis=0) < _JUMP * bend.mean(axis=0))  # else as noise is: nothing to look for
+        rough = ~(bend.max(axis=0) < _MAX_NOISE_BEND * bend.mean(axis=0))
         out[:, rough] = bridged(out[:, rough], outlier_mask(out[:, rough], longest=2))
     return out
 
 
 def bridged(x: Float[np.ndarray, "N k"], spikes: Bool[np.ndarray, "N k"]) -> Float[np.ndarray, "N k"]:
-    """x with straight lines where `spikes` is true."""
+    """x with the samples that `spikes` marks replaced by straight lines between their neighbours."""
     n, out = np.arange(len(x)), np.array(x, np.float64)
     for column, bad in zip(out.T, spikes.T, strict=True):
         if bad.any() and not bad.all():
@@ -221,17 +228,17 @@ def bridged(x: Float[np.ndarray, "N k"], spikes: Bool[np.ndarray, "N k"]) -> Flo
 
 
 def _spikes(values: Float[np.ndarray, " N"], threshold: float, longest: int) -> Bool[np.ndarray, " N"]:
-    # A second difference, of variance 6 σ², shows the noise in motion and at rest.
-    noise = max(robust_std(np.diff(values, 2)) / np.sqrt(6.0), _step(values), _SMALL * np.ptp(values))
+    # Second differences show the noise in motion and at rest. Their variance is 6 σ².
+    noise = max(robust_std(np.diff(values, 2)) / np.sqrt(6.0), _resolution(values), _MIN_SPIKE_SHARE * np.ptp(values))
     spikes, least = np.zeros(len(values), bool), threshold * noise
-    for _ in range(_PASSES):  # one spike beside another bends its lines: judge again with a line across what was found
+    for _ in range(_MAX_PASSES):  # A spike bends the lines beside it, so its neighbours are judged again without it.
         found = _beyond(bridged(values[:, None], spikes[:, None])[:, 0], least, longest) & ~spikes
         if not found.any():
             break
         spikes |= found
     if not spikes.any():
         return spikes
-    # A sound sample between two spikes lies beyond both, and not beyond what is left without them.
+    # A sound sample between two spikes is outside the range of both. Without them it is not, so it is unmarked here.
     x = np.pad(bridged(values[:, None], spikes[:, None])[:, 0], 2, mode="edge")
     k = np.arange(len(values)) + 2
     lines = 2.0 * x[k - 1] - x[k - 2], 2.0 * x[k + 1] - x[k + 2]
@@ -240,19 +247,22 @@ def _spikes(values: Float[np.ndarray, " N"], threshold: float, longest: int) -> 
 
 
 def _beyond(values: Float[np.ndarray, " N"], least: float, longest: int) -> Bool[np.ndarray, " N"]:
-    """Where samples lie by more than `least` beyond all that their surroundings allow."""
+    """Mark samples that lie outside the range of their surroundings by more than `least`."""
     x = np.concatenate([[np.median(values[:5])] * 2, values, [np.median(values[-5:])] * 2])
     spikes = np.zeros(len(x), bool)
     bend = np.abs(np.diff(x, 2))
-    sharp = bend > least  # at the sample before a spike's first, and after its last
+    sharp = bend > least  # A spike bends most about the sample before its first and the one after its last.
     if not sharp.any():
         return spikes[2:-2]
     ends = x[0], x[-1]
-    # At an end one side tells less: there a spike is what lies beyond five of the steps beside it, and beyond where a
-    # motion leads that sets off or comes to rest within its last four samples, at most by the sharpest bend elsewhere
-    # (less five standard deviations, which are noise's own).
+    # Near an end one side is missing. A spike there must be further from the end's median than five of the steps beside
+    # it, and further than a motion can lead that starts or stops within the last four samples. Such a motion bends at
+    # most as sharply as the sharpest bend elsewhere, less five standard deviations of noise. Over four samples a bend
+    # adds up to six times itself.
     sets_off = 6.0 * max(bend[6:-6].max(initial=0.0) - 0.6 * np.sqrt(6.0) * least, 0.0)
-    reach = [5.0 * np.abs(np.diff(part)).max() + sets_off for part in (values[2:_AT_END], values[-_AT_END:-2])]
+    reach = [
+        5.0 * np.abs(np.diff(part)).max() + sets_off for part in (values[2:_END_SAMPLES], values[-_END_SAMPLES:-2])
+    ]
     first, last = np.flatnonzero(sharp[:-2]) + 2, np.zeros(len(x), bool)
     last[1:-2] = sharp[1:]
     for size in range(1, longest + 1):
@@ -272,12 +282,12 @@ def _beyond(values: Float[np.ndarray, " N"], least: float, longest: int) -> Bool
 
 
 def robust_std(values: Float[np.ndarray, " N"]) -> float:
-    """Standard deviation of most of the values."""
+    """Robust standard deviation: 1.4826 times the median absolute deviation, exact for Gaussian values."""
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
-def _step(values: Float[np.ndarray, " N"]) -> float:
-    """A sensor's step: the smallest change between samples that is more than rounding."""
+def _resolution(values: Float[np.ndarray, " N"]) -> float:
+    """Resolution of a sensor: the smallest change between samples that is more than rounding."""
     changes = np.abs(np.diff(values))
     changes = changes[changes > 1e-6 * np.ptp(values)]
     return float(changes.min()) if len(changes) else 0.0

@@ -11,7 +11,7 @@ import numpy as np
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
-from jaxfinger.data.units import TO_SI, known
+from jaxfinger.data.units import TO_SI, unit_name
 
 _GAP = 5.0  # times the median interval: a sample or more was lost
 # What a name says that a variable is: (channel, pattern), the first that fits. Words of robots' logs in several habits.
@@ -88,7 +88,7 @@ def columns_of(recording: Recording) -> list[Seen]:
         table = variable.values.reshape(len(variable.values), -1)
         for k, x in enumerate(table.T):
             column = None if table.shape[1] == 1 else (variable.columns[k] if variable.columns else k)
-            units, stated = known(variable.units), bool(known(variable.units))
+            units, stated = unit_name(variable.units), bool(unit_name(variable.units))
             spelt = units or _spelt(name)
             meaning = _meaning(name, column, x, spelt)
             if spelt:
@@ -148,7 +148,7 @@ def _meaning(name: str, column: str | int | None, x: np.ndarray, units: str) -> 
 def _spelt(name: str) -> str:
     """The unit that a name ends in, `stamp_ms`; of one letter it may be anything."""
     last = re.split(r"[\s_./]", name.strip())[-1]
-    return known(last) if len(last) > 1 else ""
+    return unit_name(last) if len(last) > 1 else ""
 
 
 def _tick(x: np.ndarray) -> str:

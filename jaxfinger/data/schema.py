@@ -1,4 +1,4 @@
-"""The dataset format, version 1.1 (docs/dataset-format.md), as tables: reader, writer and checker go by these."""
+"""The dataset format, version 1.1 (docs/dataset-format.md), as tables that the reader, writer and checker share."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Kind = Literal["float", "bool", "text", "int8", "int32"]
 class Entry:
     """One dataset: its name, its shape (N samples, m joints, n tendons), its units, and whether it may be absent.
 
-    An axis whose letter has no size yet (k powers of an excursion, c temperatures) may have any length.
+    The letters k (powers of an excursion) and c (temperatures) stand for axes of any length.
     """
 
     name: str
@@ -32,17 +32,17 @@ class Entry:
 
 @dataclass(frozen=True)
 class Channel(Entry):
-    """What a trial measures: a dataset, its columns, and how people read it.
+    """A dataset of a trial, with its columns and the unit in which people read it.
 
-    `people` is the factor from SI to the unit that people read, and that unit, of revolute joints. `free_zero`: each
-    trial sets the channel's zero anew, so that it is compared after removing one constant a trial.
+    `people` holds that unit for revolute joints, after the factor from SI to it. `free_zero` is true where each trial
+    sets the channel's zero anew, so that values are compared after removing one constant a trial.
     """
 
     people: tuple[float, str] = (1.0, "")
     free_zero: bool = False
 
     def columns(self, finger: FingerDescription) -> tuple[str, ...]:
-        """Names of its columns: joints, tendons, or the axes of a force."""
+        """Names of the channel's columns: joints, tendons, or the axes of a force."""
         return {"m": finger.joint_names, "n": finger.tendon_names}.get(str(self.shape[1]), AXES)
 
 
@@ -89,7 +89,7 @@ CHANNELS = {
 }
 MEASURED = tuple(name for name, entry in CHANNELS.items() if entry.kind == "float")
 
-# What each experiment moves or holds (its attributes), and what it drives and measures (its channels).
+# Experiments whose trials must name a joint or a tendon, and the channels that each experiment drives and measures.
 NEEDS_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4")
 NEEDS_TENDON = ("ID.4", "VD.2")
 DRIVES = {"ID.4": ("tendon_force",), "VD.2": ("tendon_force",), "VD.3": ("tendon_force",)}
@@ -104,7 +104,7 @@ MEASURES = {
 }
 
 
-# Of a finger whose joints all slide, the format's axes of a linear drive.
+# Units of a finger with prismatic joints only: lengths and forces take the place of angles and torques.
 _SLIDING = {
     "rad": "m", "rad/s": "m/s", "1/rad": "1/m", "N m": "N", "N m/s": "N/s", "N m/rad": "N/m", "N m s/rad": "N s/m",
     "s/rad": "s/m", "N m/rad^2": "N/m^2", "kg m2": "kg",
@@ -113,15 +113,15 @@ _SLIDING = {
 
 
 def units_where(units: str, prismatic: Sequence[bool]) -> str:
-    """Units, where every joint is prismatic those of lengths and forces in place of angles and torques."""
+    """The units, translated where every joint is prismatic: lengths and forces replace angles and torques."""
     return _SLIDING.get(units, units) if prismatic and all(prismatic) else units
 
 
 def channel_units(channel: str, prismatic: Sequence[bool]) -> str:
-    """The units of a channel of a trial."""
+    """Units of a trial's channel, translated where every joint is prismatic."""
     return units_where(CHANNELS[channel].units or "1", prismatic)
 
 
 def units_of(entry: Entry, prismatic: Sequence[bool]) -> str | None:
-    """The units of a dataset: where every joint is prismatic, angles are lengths and torques forces."""
+    """Units of a dataset, translated where every joint is prismatic; None for a dataset without units."""
     return None if entry.units is None else units_where(entry.units, prismatic)

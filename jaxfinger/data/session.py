@@ -1,4 +1,4 @@
-"""A session in memory: the finger as ID.1 gives it, and the trials, in NumPy, as the file holds them (SI units)."""
+"""A session in memory: the finger as ID.1 gives it and the trials, NumPy arrays in SI units laid out as in the file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from jaxtyping import Bool, Float, Int
 
 from jaxfinger.table import Table
 
-_MOVED = 0.1  # of the way of the joint that moves most: another that goes less far is held
+# Share of the longest travel among the joints: a joint that travels less is held. A fixture yields a little, and a
+# joint that is moved goes through much of its range.
+_MIN_TRAVEL_SHARE = 0.1
 EXPERIMENTS = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4", "VD.1", "VD.2", "VD.3")
 
 
@@ -20,12 +22,13 @@ EXPERIMENTS = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4", "VD.1", "VD.2", "V
 class FingerDescription:
     """`/finger`: m joints from base to tip, n tendons; frames as in the format (x to the tip, z dorsal).
 
-    Lengths m, masses kg, inertia kg m² about the centre of mass, gravity m/s² in the base frame.
-    `mass_std` and `com_std` are None where CAD and scale gave none.
+    Lengths are in m, masses in kg, inertias in kg m² about the centre of mass, gravity in m/s² in the base frame.
+    `crosses[k, i]` is true where tendon k spans joint i. `mass_std` and `com_std` are None where they are unknown.
 
-    `rotor_inertia` (kg m²) is that of a geared rotor, reflected to the joint: it adds to the joint's own equation and
-    to no link. `excursion` is what CAD or a model says of the tendons: tendon k pulls in Σ_p c[k, i, p-1] q_i^p at
-    joint i, in m/rad^p for p = 1, 2, …; NaN throughout for a tendon of which it is not known. None: nothing is known.
+    `rotor_inertia` (kg m²) is the inertia of a geared rotor, reflected to the joint. It enters the equation of that
+    joint and of no link. `excursion` holds the known excursions from CAD or a model: tendon k pulls in
+    Σ_p c[k, i, p-1] q_i^p at joint i, c in m/rad^p for p = 1, 2, …. A tendon whose excursion is unknown is NaN
+    throughout; None means that no excursion is known.
     """
 
     gravity: Float[np.ndarray, "3"]
@@ -65,10 +68,11 @@ class FingerDescription:
 
 @dataclass(frozen=True, repr=False)
 class Trial:
-    """`/trials/<name>`: one recording of N samples. Channels that the trial did not measure are None; columns NaN.
+    """`/trials/<name>`: one recording of N samples, m joints and n tendons, in SI units.
 
-    `joint` is the one that is moved or instrumented; None where there is none, or where several are at once.
-    `temperature` is in K, of what the rig measures (`temperature_names`).
+    A channel that the trial did not measure is None; a column that it did not measure is NaN. `joint` is the joint that
+    is moved or instrumented, None where there is none or several. `temperature` is in K, one column for each of
+    `temperature_names`.
     """
 
     name: str
@@ -91,7 +95,7 @@ class Trial:
     temperature_names: tuple[str, ...] = ()
 
     def motorised(self, finger: FingerDescription) -> tuple[str, ...]:
-        """Joints whose external torque is measured: the one that the trial names, else those with a torque channel."""
+        """Joints whose external torque is measured: the one that the trial names, else all with a torque column."""
         if self.joint is not None:
             return (self.joint,)
         if self.joint_torque is None:
@@ -126,7 +130,7 @@ class Session:
     trials: Mapping[str, Trial] = field(default_factory=dict)
     source: str = "jaxfinger"
     created: str = ""
-    file: str = ""  # where it was read from; empty in memory
+    file: str = ""  # Path that it was read from; empty for a session made in memory.
 
     def __iter__(self) -> Iterator[Trial]:
         return iter(self.trials.values())
@@ -140,7 +144,7 @@ class Session:
         return self.trials[name]
 
     def table(self) -> Table:
-        """One row a trial: name, experiment, joint, tendon, samples, duration in s."""
+        """Table with one row a trial: name, experiment, joint, tendon, samples, duration in s."""
         return Table(
             {
                 "trial": t.name,
@@ -165,7 +169,10 @@ class Session:
     def select(
         self, *experiments: str, joint: str | None = None, tendon: str | None = None, complete: bool | None = None
     ) -> Session:
-        """The session with only the trials of these experiments (all if none named), joint and tendon."""
+        """Session with only the trials of these experiments, this joint, this tendon and this completeness.
+
+        A criterion that is not given selects all.
+        """
         keep = {
             t.name: t
             for t in self
@@ -177,12 +184,12 @@ class Session:
         return replace(self, trials=keep)
 
     def with_trials(self, names) -> Session:
-        """The session with only the named trials."""
+        """Session with only the named trials, in this order; KeyError where one is missing."""
         return replace(self, trials={name: self.trials[name] for name in names})
 
 
 def joints_of(trial: Trial, finger: FingerDescription) -> tuple[str, ...]:
-    """The joints that a trial of ID.2, ID.3 or ID.4 moves or instruments; none of VD.1, VD.2 and VD.3."""
+    """Joints that a trial of ID.2, ID.3 or ID.4 moves or instruments; empty for VD.1, VD.2 and VD.3."""
     if not trial.experiment.startswith("ID."):
         return ()
     if trial.joint is not None or trial.experiment != "ID.2" or not len(trial.time):
@@ -191,6 +198,6 @@ def joints_of(trial: Trial, finger: FingerDescription) -> tuple[str, ...]:
 
 
 def moving_joints(trial: Trial, finger: FingerDescription) -> tuple[str, ...]:
-    """The joints that go a tenth as far as the one that goes furthest, or more."""
+    """Joints whose travel is more than a tenth of the longest travel among the joints."""
     span = np.array([np.ptp(column) for column in np.nan_to_num(trial.q).T])
-    return tuple(name for name, s in zip(finger.joint_names, span, strict=True) if s > _MOVED * span.max())
+    return tuple(name for name, s in zip(finger.joint_names, span, strict=True) if s > _MIN_TRAVEL_SHARE * span.max())

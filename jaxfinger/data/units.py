@@ -1,4 +1,4 @@
-"""Units that a mapping may name, and what one of them is in SI."""
+"""Units that a mapping may name, with their conversion to SI."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Unit(NamedTuple):
-    """So many of an SI unit, counted from its `zero`."""
+    """Conversion to the SI unit `si`: value · `factor` + `zero`."""
 
     si: str
     factor: float
@@ -42,8 +42,8 @@ _SPELT = {"°": "deg", "degrees": "deg", "µm": "um", "µs": "us", "rev": "turn"
 _SPELT |= {"°c": "degC", "degc": "degC", "celsius": "degC"}
 
 
-def known(stated: str) -> str:
-    """A file's spelling of a unit as the one that a mapping uses; empty where it is none of these."""
+def unit_name(stated: str) -> str:
+    """Name in `TO_SI` of a unit as a file spells it; empty where it is not listed there."""
     plain = stated.strip().replace("·", " ").replace("*", " ").replace("µ", "u")
     plain = _SPELT.get(plain.lower(), plain)
     joined = {name.replace(" ", ""): name for name in TO_SI if name != "1"}

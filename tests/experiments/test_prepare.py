@@ -9,7 +9,7 @@ import pytest
 from jaxfinger.data import Session, Trial, filter_std
 from jaxfinger.data.check_trial import check_trial
 from jaxfinger.data.findings import Report
-from jaxfinger.data.sizes import SLACK, sizes_of
+from jaxfinger.data.sizes import SLACK_SHARE, sizes_of
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, driven, not_judged, prepare
 from jaxfinger.synthetic import paper_finger
@@ -236,7 +236,7 @@ def test_the_excursion_of_a_taut_tendon_counts_on_every_ramp():
     found = stack(trial)
     pulled, slack = (np.asarray(found.batch.mask["tendon_excursion"])[k, 0, :100] > 0 for k in (0, 1))
     at = found.batch.x.time[0, :100]
-    np.testing.assert_array_equal(pulled, level.reshape(100, 50).min(axis=1) > SLACK * level.max())
+    np.testing.assert_array_equal(pulled, level.reshape(100, 50).min(axis=1) > SLACK_SHARE * level.max())
     assert not slack[(at < 1.0) | (at > 3.5)].any()
 
 
@@ -296,7 +296,7 @@ def test_a_hold_keeps_the_direction_that_led_to_it_though_nothing_says_so():
 
 
 def test_a_slack_tendon_pulls_with_nothing():
-    tension = np.full((9000, FINGER.n), 0.5 * SLACK * 5.0)
+    tension = np.full((9000, FINGER.n), 0.5 * SLACK_SHARE * 5.0)
     tension[:, 0] = 5.0
     trial = replace(sweep(tendon_force=tension), experiment="VD.3", joint_torque=None, joint=None)
     found = np.asarray(stack(trial).batch.x.tension)[:, 0]
