@@ -1,4 +1,4 @@
-"""Check a file: every fault that it has, each in one sentence with its mend."""
+"""Check a file: every fault in it, each in one sentence with its mend."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from jaxfinger.data.schema import MEASURED
 from jaxfinger.data.session import EXPERIMENTS, Session, Trial
 from jaxfinger.data.sizes import sizes_of
 
-_MANY_SPIKES = (
-    0.1  # of a column: as many as the mask finds with certainty; motors driven by a coarse encoder reach 0.09
-)
-_START = 100  # samples by which most pairs of trials are told apart
+# Share of a column's samples from which spikes are a warning instead of a note. Up to this share the mask finds them
+# with certainty; motors driven by a coarse encoder reach 0.09.
+_MANY_SPIKES = 0.1
+_FIRST_SAMPLES = 100  # Most pairs of trials differ in them, so few need to be compared whole.
 
 
 def check_file(path: str | os.PathLike) -> list[Finding]:
-    """All that is wrong with a file; empty where it is as the format wants it. Never raises for what is in the file.
+    """Check a session file: its faults, none for a sound file. Faults of the file are never raised.
 
     >>> import jaxfinger as jf
     >>> jf.check("session.h5")
@@ -44,7 +44,10 @@ def check_file(path: str | os.PathLike) -> list[Finding]:
 
 
 def inspect(path: str | os.PathLike, trials: Collection[str] | None = None) -> tuple[Session | None, Report]:
-    """What could be read of a file (or of the named trials), and what is wrong with it."""
+    """Read a file, or only the named trials: the session, None where it is unusable, and the findings about it.
+
+    Checks that look at every sample are left to `examine`.
+    """
     report = Report()
     file = open_file(path, report)
     if file is None:
@@ -52,7 +55,7 @@ def inspect(path: str | os.PathLike, trials: Collection[str] | None = None) -> t
     try:
         with file:
             session = parse_file(file, os.fspath(path), report, trials)
-    except Exception as error:  # h5py raises nearly anything on a damaged file
+    except Exception as error:  # h5py raises exceptions of many kinds on a damaged file.
         said = plain_reason(error)
         report.error("/", f"cannot be read to the end ({said}): the file is damaged; record or import it again")
         return None, report
@@ -62,8 +65,8 @@ def inspect(path: str | os.PathLike, trials: Collection[str] | None = None) -> t
 
 
 def check_session(session: Session, report: Report) -> None:
-    """Report every fault of a session in memory: what the writer cannot see from shapes alone."""
-    # Wild numbers overflow here and there; what is wrong with them is said by the checks.
+    """Report every fault of a session in memory that shows without a look at every sample."""
+    # Extreme numbers may overflow; the checks themselves report them.
     with np.errstate(all="ignore"):
         check_finger(session.finger, report)
         sizes = sizes_of(session)
@@ -81,7 +84,7 @@ def check_session(session: Session, report: Report) -> None:
 
 
 def open_file(path: str | os.PathLike, report: Report) -> h5py.File | None:
-    """The open file, or None with the reason reported."""
+    """Open the file; None with the reason reported where it does not open."""
     reason = why_closed(path)
     if reason is not None:
         report.error("/", reason)
@@ -98,7 +101,7 @@ def _check_order(session: Session, report: Report) -> None:
 
 
 def _check_motions(session: Session, report: Report) -> None:
-    """Trials of one `motion` must be repeats of one thing."""
+    """Report trials that share a `motion` and differ in experiment, joint or tendon."""
     kinds: dict[str, set] = defaultdict(set)
     for trial in session:
         if trial.motion is not None:
@@ -113,11 +116,11 @@ def _check_motions(session: Session, report: Report) -> None:
 
 
 def _check_copies(session: Session, report: Report) -> None:
-    """A recording counts once: a copy would pass for a repeat without noise."""
+    """Report trials that are copies of another: a copy would pass for a repeat without noise."""
     alike: dict[tuple, list[Trial]] = defaultdict(list)
     for trial in session:
         measured = {name: values for name in MEASURED if (values := getattr(trial, name)) is not None}
-        start = tuple((name, np.ascontiguousarray(values[:_START]).tobytes()) for name, values in measured.items())
+        start = tuple((name, np.ascontiguousarray(x[:_FIRST_SAMPLES]).tobytes()) for name, x in measured.items())
         earlier = alike[(trial.experiment, len(trial.time), start)]
         for other in earlier if len(trial.time) > 1 else ():
             if all(np.array_equal(values, getattr(other, name), equal_nan=True) for name, values in measured.items()):
@@ -137,7 +140,7 @@ def _check_created(created: str, report: Report) -> None:
 
 
 def examine(session: Session, report: Report) -> None:
-    """Report what takes a look at every sample: spikes, and channels that contradict each other."""
+    """Report spikes, and channels that contradict each other: the checks that look at every sample."""
     with np.errstate(all="ignore"):
         check_spikes(session, report)
         if report.fatal is None:
@@ -146,7 +149,7 @@ def examine(session: Session, report: Report) -> None:
 
 
 def check_spikes(session: Session, report: Report) -> None:
-    """Report samples that are far from their neighbours."""
+    """Report columns that hold spikes (`outlier_mask`)."""
     for trial, name in ((trial, name) for trial in session for name in MEASURED):
         longest = longest_spike(float(np.median(np.diff(trial.time))) if len(trial.time) > 1 else 0.0)
         values = getattr(trial, name)

@@ -1,10 +1,10 @@
-"""Does a column of tendon_excursion belong to the tendon whose name it has? What tells two apart without a model:
+"""Check that each column of tendon_excursion belongs to the tendon of its name. No model is needed for three tests:
 
 1. While one joint turns alone (ID.2), a tendon that crosses it travels, and one that does not stands still.
-2. Where the finger's description knows excursions, ID.2 shows the same ones.
-3. A tendon that is pulled at a held posture (ID.4) stretches, and no other.
+2. Where the finger's description holds excursions, ID.2 shows the same ones.
+3. A tendon that is pulled at a held posture (ID.4) stretches, and no other does.
 
-Only two columns of which each shows what the other should are named: anything less has other reasons too.
+Two columns are reported only if each shows what the other should. A fault in one of them alone has other explanations.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from itertools import combinations
 
 import numpy as np
 
-from jaxfinger.data.check_trial import STILL_JOINT
+from jaxfinger.data.check_trial import STILL_ANGLE
 from jaxfinger.data.check_work import slope, thinned
 from jaxfinger.data.findings import Report
 from jaxfinger.data.session import FingerDescription, Session, Trial
 
-# Shares of the largest arm at a joint: a tendon with no more stands still, one with more than the other travels. What
-# lies between may be a small arm, or a tendon that is drawn along, and tells nothing.
-_STILL, _TRAVELS = 0.05, 0.25
-_APART = 0.2  # of the known arms: columns that miss them by less may be right, since CAD is good to a tenth
-_BETTER = 0.25  # of that miss: exchanged columns miss by no more
-_TOLD = 0.9  # of the variance of a column: a tension that explains more stretches its tendon
+# Shares of the largest moment arm at a joint. A tendon with a smaller arm than the first stands still, one with a
+# larger arm than the second travels. An arm between them may be a small one, or a tendon may be dragged along.
+_MAX_STILL_ARM, _MIN_TRAVEL_ARM = 0.05, 0.25
+_MAX_CAD_ERROR = 0.2  # of the known arms: CAD is good to a tenth, so columns that miss by less may be right.
+_MAX_EXCHANGED_ERROR = 0.25  # of the error as named: exchanged columns must fit the known arms this much better.
+_MIN_STRETCH_R2 = 0.9  # squared correlation of excursion with tension, from which the tendon is taken to stretch
 
 
 def check_columns(session: Session, report: Report) -> None:
-    """Report pairs of tendons whose columns look exchanged, each once, by the first evidence that tells."""
+    """Report pairs of tendons whose columns look exchanged, each pair once, by the first test that shows it."""
     if any(session.finger.prismatic):
         return
     told: set[tuple[int, int]] = set()
@@ -44,12 +44,12 @@ def check_columns(session: Session, report: Report) -> None:
 
 
 def _arms(session: Session) -> dict[int, np.ndarray]:
-    """By joint: dl/dq of each tendon, m/rad, the median of those trials of ID.2 in which no other joint turns."""
+    """Moment arms dl/dq of all tendons, m/rad, by joint: medians over the ID.2 trials in which no other joint turns."""
     found: dict[int, list[np.ndarray]] = defaultdict(list)
     for trial in session.select("ID.2"):
         spans = np.ptp(trial.q, axis=0)
         i = int(np.argmax(np.nan_to_num(spans)))
-        if trial.tendon_excursion is not None and np.all(np.delete(spans, i) < STILL_JOINT) and spans[i] > STILL_JOINT:
+        if trial.tendon_excursion is not None and np.all(np.delete(spans, i) < STILL_ANGLE) and spans[i] > STILL_ANGLE:
             q = thinned(trial.q[:, i])
             found[i].append(np.array([slope(q, thinned(l)) for l in trial.tendon_excursion.T]))
     return {i: np.median(arms, axis=0) for i, arms in found.items()}
@@ -58,8 +58,8 @@ def _arms(session: Session) -> dict[int, np.ndarray]:
 def _by_crossing(finger: FingerDescription, arms: dict[int, np.ndarray]) -> Iterator[tuple[tuple[int, int], str]]:
     for i, seen in arms.items():
         size = np.abs(seen) / np.nanmax(np.abs(seen[finger.active]), initial=0.0)
-        still = np.flatnonzero(finger.active & finger.crosses[:, i] & (size < _STILL))
-        travel = np.flatnonzero(finger.active & ~finger.crosses[:, i] & (size > _TRAVELS))
+        still = np.flatnonzero(finger.active & finger.crosses[:, i] & (size < _MAX_STILL_ARM))
+        travel = np.flatnonzero(finger.active & ~finger.crosses[:, i] & (size > _MIN_TRAVEL_ARM))
         if len(still) == len(travel) == 1:
             (a,), (b,) = still, travel
             names, joint = finger.tendon_names, finger.joint_names[i]
@@ -86,7 +86,7 @@ def _by_description(finger: FingerDescription, arms: dict[int, np.ndarray]) -> I
                 shown, told = (" and ".join(f"{1e3 * arm:.3g}" for arm in x) for x in (seen[[a, b]], known))
                 joint = finger.joint_names[i]
                 said = said or f"ID.2 shows {shown} mm a radian at {joint}, the finger's file says {told}"
-        if own > _APART * size and crossed < _BETTER * own:
+        if own > _MAX_CAD_ERROR * size and crossed < _MAX_EXCHANGED_ERROR * own:
             yield (int(a), int(b)), f"{said} (where both are the other way round for each tendon: correct the signs)"
 
 
@@ -104,9 +104,9 @@ def _by_stretch(session: Session) -> Iterator[tuple[tuple[int, int], str]]:
 
 
 def _stretched(trial: Trial, pulled: int, active: np.ndarray) -> set[int]:
-    """Tendons whose excursion follows the tension of the one that is pulled."""
+    """Tendons whose excursion follows the tension of the pulled one."""
     if trial.tendon_force is None or trial.tendon_excursion is None:
         return set()
     pull, l = thinned(trial.tendon_force[:, pulled]), thinned(trial.tendon_excursion)
-    explained = [slope(pull, x) * slope(x, pull) for x in l.T]  # of each variance: the squared correlation
-    return {int(k) for k in np.flatnonzero(active) if explained[k] > _TOLD}
+    R2 = [slope(pull, x) * slope(x, pull) for x in l.T]
+    return {int(k) for k in np.flatnonzero(active) if R2[k] > _MIN_STRETCH_R2}

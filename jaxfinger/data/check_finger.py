@@ -1,4 +1,4 @@
-"""Is the finger of a file physically possible, and in SI units?"""
+"""Check that the finger of a file is physically possible and in SI units."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from jaxfinger.data.findings import Report
 from jaxfinger.data.schema import JOINTS, LINKS
 from jaxfinger.data.session import FingerDescription
 
-_UNIT_AXIS = 1e-3
-_ROUNDING = 1e-5  # of float32 tables
-_LEAD = 11_300.0  # kg/m³
-_LARGEST_FINGER = 2.0  # m; lengths beyond it are taken for mm
-_LARGEST_ARM = 0.5  # m; as an excursion a turn
+UNIT_AXIS_TOLERANCE = 1e-3  # of an axis's length: axes typed with three digits pass.
+_ROUNDING = 1e-5  # relative: 100 times that of float32, for tables that were computed in it
+_LEAD_DENSITY = 11_300.0  # kg/m³
+_MAX_LENGTH = 2.0  # m: longer than any finger or arm, so that a larger number is one in mm.
+_MAX_ARM = 0.5  # m: larger than any moment arm, so that a larger number is one in mm.
 
 
 def check_finger(finger: FingerDescription, report: Report) -> None:
@@ -71,7 +71,7 @@ def _gravity(finger: FingerDescription, report: Report) -> None:
 def _joints(finger: FingerDescription, report: Report) -> None:
     for i, (name, axis, (lower, upper)) in enumerate(zip(finger.joint_names, finger.axis, finger.limits, strict=True)):
         size = float(np.linalg.norm(axis))
-        if abs(size - 1.0) > _UNIT_AXIS:
+        if abs(size - 1.0) > UNIT_AXIS_TOLERANCE:
             message = f"joint {name} has an axis {size:.4g} long; divide it by its length"
             report.error("/finger/joints/axis", message, row=i)
         if lower >= upper:
@@ -105,9 +105,9 @@ def _links(finger: FingerDescription, report: Report) -> None:
 
 
 def _weight(finger: FingerDescription, report: Report) -> None:
-    """Grams taken for kg: no machine is heavier than a cube of lead as long as it is."""
+    """Report grams written as kg: no machine is heavier than a cube of lead of its length."""
     length = float(np.linalg.norm(finger.origin, axis=1).sum() + np.linalg.norm(finger.fingertip))
-    if not any(finger.prismatic) and length > 0.0 and finger.mass.sum() > _LEAD * length**3:
+    if not any(finger.prismatic) and length > 0.0 and finger.mass.sum() > _LEAD_DENSITY * length**3:
         report.warning(
             "/finger/links/mass",
             f"the links weigh {finger.mass.sum():.4g} kg at {length:.3g} m of length; check that these are no grams",
@@ -115,7 +115,7 @@ def _weight(finger: FingerDescription, report: Report) -> None:
 
 
 def _inertia(inertia: np.ndarray, mass: float) -> str | None:
-    """What no body has, or None."""
+    """Fault of an inertia matrix that no body has, or None."""
     scale = float(np.abs(inertia).max())
     if np.abs(inertia - inertia.T).max() > _ROUNDING * scale:
         return "an inertia that is not symmetric; write the full matrix with both halves equal"
@@ -127,7 +127,7 @@ def _inertia(inertia: np.ndarray, mass: float) -> str | None:
             f"principal inertias {small:.3g}, {middle:.3g}, {large:.3g} kg m2; no body has one larger than the sum of "
             "the others; check frame, signs and units"
         )
-    if mass > 0.0 and large / mass > _LARGEST_FINGER**2:
+    if mass > 0.0 and large / mass > _MAX_LENGTH**2:
         return f"a radius of gyration of {np.sqrt(large / mass):.3g} m; convert to kg m2"
     return None
 
@@ -138,7 +138,7 @@ def _lengths(finger: FingerDescription, report: Report) -> None:
     lengths = {"joints/origin": finger.origin, "links/com": finger.com, "fingertip": finger.fingertip}
     for key, value in lengths.items():
         longest = float(np.linalg.norm(np.atleast_2d(value), axis=1).max())
-        if longest > _LARGEST_FINGER:
+        if longest > _MAX_LENGTH:
             report.error(f"/finger/{key}", f"reaches {longest:.4g} m; convert mm to m")
 
 
@@ -154,7 +154,7 @@ def _tendons(finger: FingerDescription, report: Report) -> None:
 
 
 def _excursion(finger: FingerDescription, report: Report) -> None:
-    """A tendon's known excursion is finite, or NaN throughout where it is not known; at joints not crossed it is 0."""
+    """Check known excursions: finite, or NaN throughout where unknown, and 0 at joints that a tendon does not cross."""
     place = "/finger/tendons/excursion"
     if finger.excursion is None:
         if finger.excursion_std is not None:
@@ -180,7 +180,7 @@ def _excursion(finger: FingerDescription, report: Report) -> None:
             report.error(
                 place, f"tendon {name} is pulled in by joint {joint}, which it does not cross; correct one", row=k
             )
-        elif np.abs(known[:, 0]).max(initial=0.0) > _LARGEST_ARM and not any(finger.prismatic):
+        elif np.abs(known[:, 0]).max(initial=0.0) > _MAX_ARM and not any(finger.prismatic):
             report.error(
                 place, f"tendon {name} has a moment arm of {np.abs(known[:, 0]).max():.4g} m; convert mm to m", row=k
             )

@@ -1,4 +1,4 @@
-"""Can a trial be what it says it is?"""
+"""Check that a trial's channels fit its experiment, its finger and SI units."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from jaxfinger.data.session import FingerDescription, Trial
 from jaxfinger.data.sizes import Sizes
 from jaxfinger.errors import counted
 
-STILL_JOINT = 0.01  # rad: five times the noise of a 14-bit encoder
-STILL_AXIS = 1e-4  # m
-OUTSIDE = 0.35  # rad beyond its limits that a joint is allowed to read
-# Of the highest tension. A good tare is off by a hundredth of it; a tendon that is held at little has a fifth.
-TARE = 0.03
-PUSHES = 0.1
-COLD = 200.0  # K, −73 °C: no bench on earth is colder
-_TAUT = ("ID.2", "VD.1", "VD.3")  # experiments through which tendons are held at some tension
-_FEW = 20  # samples, fewer than which show no usual step
+STILL_ANGLE = 0.01  # rad: five times the noise of a 14-bit encoder
+STILL_DISTANCE = 1e-4  # m, likewise of a prismatic joint: a hundredth of a rad at a radius of 10 mm
+MAX_OVERTRAVEL = 0.35  # rad, 20 degrees, that a joint may read beyond its limits, since stated limits are approximate
+# Shares of the highest tension. A good tare is off by a hundredth, and tendons at little tension hold a fifth.
+MAX_TARE_ERROR = 0.03
+MAX_PUSH = 0.1
+COLD = 200.0  # K, −73 °C: no laboratory is colder, so lower values are in °C.
+_TAUT = ("ID.2", "VD.1", "VD.3")  # experiments that keep all tendons taut
+_MIN_SAMPLES = 20  # Fewer samples show no typical step.
 _MOVES_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic")
 _STEPPED = ("ID.3-static", "ID.4", "VD.2")
 
 
 def check_trial(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
-    """Report every fault of one trial that could be read; `sizes` are those of its session."""
+    """Report every fault of one trial. `sizes` are those of its session."""
     _named(trial, finger, report)
     _time(trial, report)
     for name in MEASURED:
@@ -45,7 +45,7 @@ def _place(trial: Trial, channel: str = "") -> str:
 
 
 def _named(trial: Trial, finger: FingerDescription, report: Report) -> None:
-    """Do the attributes `joint` and `tendon` fit the experiment and the finger's tables?"""
+    """Check that the attributes `joint` and `tendon` fit the experiment and the finger's tables."""
     place = _place(trial)
     for kind, value, names, needed in (
         ("joint", trial.joint, finger.joint_names, trial.experiment in NEEDS_JOINT),
@@ -114,7 +114,7 @@ def _time(trial: Trial, report: Report) -> None:
 
 
 def _holes(trial: Trial, name: str, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
-    """NaN is a whole column's way to say «not measured»; inside a column only a slack tendon's excursion may be NaN."""
+    """Check NaN: a whole column means «not measured»; within a column only a slack tendon's excursion may be NaN."""
     values = getattr(trial, name)
     bad = ~np.isfinite(values)
     if not bad.any():
@@ -146,7 +146,7 @@ def _slack(trial: Trial, where: np.ndarray, tendon: int, sizes: Sizes) -> bool:
 
 
 def _present(trial: Trial, finger: FingerDescription, report: Report) -> None:
-    """Are the channels there that the experiment lives by?"""
+    """Check that the channels that the experiment drives and measures are there."""
     what = trial.experiment
     for name in DRIVES.get(what, ()):
         if getattr(trial, name) is None:
@@ -173,13 +173,13 @@ def _present(trial: Trial, finger: FingerDescription, report: Report) -> None:
 
 
 def _pulled(trial: Trial, finger: FingerDescription) -> np.ndarray:
-    """Tension of the tendon that the trial pulls; empty where there is none."""
+    """Tension, N, of the tendon that the trial pulls; empty where there is none."""
     tendon = _index(finger.tendon_names, trial.tendon)
     return np.zeros(0) if trial.tendon_force is None or tendon is None else trial.tendon_force[:, tendon]
 
 
 def _span(values: np.ndarray) -> float:
-    """How far a column travels, outliers aside."""
+    """Travel of a column, from its first to its 99th percentile; NaN where a sample is not finite."""
     if len(values) == 0 or not np.isfinite(values).all():
         return np.nan
     low, high = np.percentile(values, [1.0, 99.0])
@@ -191,11 +191,11 @@ def _spans(trial: Trial) -> np.ndarray:
 
 
 def _still(finger: FingerDescription) -> np.ndarray:
-    return np.where(finger.prismatic, STILL_AXIS, STILL_JOINT)
+    return np.where(finger.prismatic, STILL_DISTANCE, STILL_ANGLE)
 
 
 def _motion(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
-    """Does what the experiment moves move, and what it holds stand still?"""
+    """Check that the joints and tendons that the experiment moves do move, and that those it holds stand still."""
     spans, still = _spans(trial), _still(finger)
     say = report.error if trial.complete else report.warning
     place = _place(trial, "q")
@@ -228,8 +228,8 @@ def _motion(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repor
 
 
 def _dead(trial: Trial, finger: FingerDescription, report: Report) -> None:
-    """Does what the experiment measures vary at all? A sensor has noise; a channel without any is not connected."""
-    if len(trial.time) < _FEW:
+    """Report measured columns that never change: every sensor has noise, so such a column is not connected."""
+    if len(trial.time) < _MIN_SAMPLES:
         return
     moved = _index(finger.joint_names, trial.joint)
     crossing = finger.active & (finger.crosses[:, moved] if moved is not None else finger.crosses.any(axis=1))
@@ -243,11 +243,11 @@ def _dead(trial: Trial, finger: FingerDescription, report: Report) -> None:
         values = getattr(trial, name)
         if values is None:
             continue
-        still = columns & np.array([np.ptp(column) == 0.0 for column in values.T], bool)  # NaN is not still
+        still = columns & np.array([np.ptp(column) == 0.0 for column in values.T], bool)  # False for NaN.
         if name == "tendon_force":
             still &= values[0] == 0.0
         if name == "fingertip_force" and not still[columns].all():
-            continue  # the planar finger presses along one axis
+            continue  # A planar finger presses along one axis only.
         for k in np.flatnonzero(still):
             report.warning(
                 _place(trial, name),
@@ -257,14 +257,14 @@ def _dead(trial: Trial, finger: FingerDescription, report: Report) -> None:
 
 
 def _jumps(trial: Trial, finger: FingerDescription, report: Report) -> None:
-    """Does an encoder wrap? Between two samples a joint does not go most of the way that it goes in the whole trial."""
+    """Report encoders that wrap: no joint goes half of the whole trial's travel between two samples."""
     for k, name in enumerate(finger.joint_names):
         x = trial.q[:, k]
-        if len(x) < _FEW or not np.isfinite(x).all():
+        if len(x) < _MIN_SAMPLES or not np.isfinite(x).all():
             continue
         steps = np.abs(np.diff(x))
         jumps = steps > 0.5 * np.ptp(x)
-        still = STILL_AXIS if finger.prismatic[k] else STILL_JOINT
+        still = STILL_DISTANCE if finger.prismatic[k] else STILL_ANGLE
         if not jumps.any() or np.ptp(x) < still or np.percentile(steps, 90.0) > 0.1 * np.ptp(x):
             continue
         size, at = float(np.median(steps[jumps])), trial.time[int(np.argmax(jumps))]
@@ -278,7 +278,7 @@ def _jumps(trial: Trial, finger: FingerDescription, report: Report) -> None:
 
 
 def _sizes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
-    """Are the values of the size that SI units give them, and on the right side of zero?"""
+    """Check that values have plausible sizes in SI units, and tensions the right sign."""
     turning = ~np.array(finger.prismatic)
     for k, name in enumerate(finger.joint_names):
         if not turning[k] or not np.isfinite(trial.q[:, k]).all():
@@ -288,7 +288,7 @@ def _sizes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report
         where = f"column {name} runs from {low:.3g} to {high:.3g} rad"
         if max(-low, high) > 2.0 * np.pi:
             report.error(_place(trial, "q"), f"{where}, more than a turn; convert degrees to rad")
-        elif low < lower - OUTSIDE or high > upper + OUTSIDE:
+        elif low < lower - MAX_OVERTRAVEL or high > upper + MAX_OVERTRAVEL:
             message = f"{where}, far outside its limits {lower:.3g} to {upper:.3g}; correct one or the other"
             report.warning(_place(trial, "q"), message)
     if trial.tendon_force is not None:
@@ -303,6 +303,7 @@ def _sizes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report
     if not turning.all():
         return
     small = float(finger.mass.sum()) < 5.0
+    # A finger of less than 5 kg neither pulls in half a metre of tendon nor has 5 N m at a joint, except in wrong units.
     for name, most, mend in (("tendon_excursion", 0.5, "mm to m"), ("joint_torque", 5.0, "N mm to N m")):
         values = getattr(trial, name)
         if values is None or not small:
@@ -326,9 +327,9 @@ def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repo
             report.note(place, f"column {name} is measured though the tendon is passive; it is ignored")
             continue
         low = float(np.percentile(x, 5.0))
-        if low < -max(PUSHES * sizes.tension, sizes.slack):
+        if low < -max(MAX_PUSH * sizes.tension, sizes.slack):
             report.error(place, f"column {name} falls to {low:.3g} N, and a tendon cannot push; check sign and tare")
-        elif low < -max(TARE * sizes.tension, sizes.slack):
+        elif low < -max(MAX_TARE_ERROR * sizes.tension, sizes.slack):
             report.warning(place, f"column {name} falls to {low:.3g} N, below zero by more than noise; check the tare")
         if np.percentile(x, 95.0) > 2000.0:
             report.warning(place, f"column {name} exceeds 2000 N; check that it is in N and not in mN")

@@ -1,11 +1,11 @@
-"""Do the channels of a session agree with each other? Two laws hold for every finger, whatever its model.
+"""Check that the channels of a session agree with each other. Two laws hold for every finger, whatever its model.
 
-1. Virtual work. A tendon that pulls in dl while a joint turns by dq puts the torque f dl/dq on it. So the moment arm
-   seen by the encoders (ID.2: dl/dq) and that seen by the sensors of force (ID.4: −dτ/df, the motor holding against it)
-   are one. Friction takes a part of what arrives at the joint, never its sign.
-2. Passivity. Over a cycle the external motor puts work into a joint, and never takes any out: ∮ τ dq > 0.
+1. Virtual work. A tendon that pulls in dl while a joint turns by dq exerts the torque f dl/dq on it. So the encoders
+   (ID.2: dl/dq) and the force sensors (ID.4: −dτ/df, since the motor holds against it) show one moment arm. Friction
+   reduces the torque that arrives at the joint but never changes its sign.
+2. Passivity. Over a cycle the external motor puts work into a joint and never takes any out: ∮ τ dq > 0.
 
-Where they fail, a sign, a unit or a column is wrong, in one of the channels that the sentence names.
+Where a law fails, a sign, a unit or a column is wrong in one of the channels that the finding names.
 """
 
 from __future__ import annotations
@@ -17,22 +17,21 @@ import numpy as np
 
 from jaxfinger.data.filtering import low_pass, smooth
 from jaxfinger.data.findings import Report
-from jaxfinger.data.motion import STILL_SHARE, directions, fitting_cutoff
+from jaxfinger.data.motion import CUTOFF_HZ, STILL_SHARE, directions, fitting_cutoff
 from jaxfinger.data.session import FingerDescription, Session, Trial
 
-_DEGREE = 3  # of l(q) over a joint's range
-_SAMPLES = 400  # of a trial; slopes of a motion need no more
-_CLEAR = 0.25  # of the largest arm at a joint: smaller ones may change sign with the posture
-# What arrives at a joint is less than what is pulled, by friction: routed tendons lose up to two thirds (the shipped
-# session). Units that people mistake are at least four times apart (N and lbf).
-_LEAST, _MOST = 0.2, 1.5
-_APART = 3.0  # of two measurements of one excursion, without friction between them
-_TIP = (0.002, 1.0)  # N at the fingertip for each N of tension: a moment arm over a finger's length, with room
-_LONGEST_ARM = 0.4  # of the finger's length
-_SHORTEST_ARM = 0.004
-CUTOFF_HZ = 10.0  # faster than any commanded motion of the protocol, slower than most of the noise of sensors
-_TURNS = 3  # of a motion: with fewer, what accelerates it passes for what turns with its direction
-_TAKEN = 0.05  # of the torque's spread that a motor may seem to take out, by a delay between the channels
+_DEGREE = 3  # of l(q): the moment arm is then a parabola over a joint's range, enough to tell a sign or a unit
+_SAMPLES = 400  # of a trial: slopes of a motion need no more.
+_MIN_ARM_SHARE = 0.25  # of the largest arm at a joint: smaller arms may change sign with the posture.
+# Ratio of the arm that torques show to the arm that excursions show. Friction reduces it: routed tendons lose up to two
+# thirds of their tension (the shipped session). Units that people confuse differ at least fourfold (N and lbf).
+_MIN_ARM_RATIO, _MAX_ARM_RATIO = 0.2, 1.5
+_MAX_EXCURSION_RATIO = 3.0  # of two measurements of one excursion: units that people confuse differ by more.
+_FORCE_RATIOS = (0.002, 1.0)  # N at the fingertip for each N of tension: a moment arm over a finger's length, with room
+# Moment arms as shares of the finger's length: neither nearly as long as a finger nor thinner than a hair.
+_MIN_ARM, _MAX_ARM = 0.004, 0.4
+_MIN_TURNS = 3  # of a motion: with fewer, torque that accelerates the joint looks like friction.
+_MAX_NEGATIVE_FRICTION = 0.05  # of the torque's spread: a delay between the channels makes friction seem this negative.
 
 Arms = Mapping[tuple[int, int], float]  # (tendon, joint): m
 
@@ -47,12 +46,12 @@ def check_work(session: Session, report: Report) -> None:
     _lengths(kinematic.arms, finger, report)
     _virtual_work(session, kinematic, report)
     _paths(session, kinematic, report)
-    _tip(session, report)
+    _fingertip(session, report)
     _passivity(session, report)
 
 
 class _Excursions:
-    """Excursion of each tendon over each joint's angle, as ID.2 shows it: polynomials l(q)."""
+    """Excursions that ID.2 shows: a polynomial l(q), m, for each pair of tendon and joint, and its mean moment arm."""
 
     def __init__(self, session: Session):
         self.polynomials: dict[tuple[int, int], np.polynomial.Polynomial] = {}
@@ -73,33 +72,33 @@ class _Excursions:
         self.arms = {key: float(np.diff(p(p.domain))[0] / np.diff(p.domain)[0]) for key, p in self.polynomials.items()}
 
     def arm(self, tendon: int, joint: int, angle: float) -> float | None:
-        """dl/dq at an angle, m/rad; None where it is not known, or so small that it may change sign."""
+        """Moment arm dl/dq, m/rad, at an angle; None where it is unknown or so small that it may change sign."""
         p = self.polynomials.get((tendon, joint))
         largest = max((abs(arm) for (_, i), arm in self.arms.items() if i == joint), default=0.0)
         if p is None or not p.domain[0] - 0.1 <= angle <= p.domain[1] + 0.1:
             return None
         arm = float(p.deriv()(angle))
-        return arm if abs(arm) > _CLEAR * largest and arm * self.arms[tendon, joint] > 0.0 else None
+        return arm if abs(arm) > _MIN_ARM_SHARE * largest and arm * self.arms[tendon, joint] > 0.0 else None
 
 
 def thinned(x: np.ndarray) -> np.ndarray:
-    """Some hundreds of a trial's samples, evenly spaced."""
+    """Every k-th sample of a trial, so that some hundreds are left."""
     return x[:: max(1, len(x) // _SAMPLES)]
 
 
 def slope(x: np.ndarray, y: np.ndarray) -> float:
-    """Of y on x, by least squares; NaN where x stands still."""
+    """Slope of y over x by least squares; NaN where x stands still or few samples are finite."""
     good = np.isfinite(x) & np.isfinite(y)
     x, y = x[good] - x[good].mean() if good.any() else x[good], y[good]
     return float(x @ y / (x @ x)) if len(x) > 10 and np.ptp(x) > 0.0 else np.nan
 
 
 def _lengths(arms: Arms, finger: FingerDescription, report: Report) -> None:
-    """Moment arms are parts of a finger: neither as long as it is nor thinner than a hair."""
+    """Report joints whose largest moment arm does not fit the finger's length."""
     length = float(np.linalg.norm(finger.origin, axis=1)[1:].sum() + np.linalg.norm(finger.fingertip))
     for i, joint in enumerate(finger.joint_names):
         largest = max((abs(arm) for (_, k), arm in arms.items() if k == i), default=np.nan)
-        if largest > _LONGEST_ARM * length or largest < _SHORTEST_ARM * length:
+        if largest > _MAX_ARM * length or largest < _MIN_ARM * length:
             report.warning(
                 "/trials",
                 f"ID.2 gives moment arms of {1e3 * largest:.3g} mm at joint {joint} of a finger {1e3 * length:.3g} mm "
@@ -108,6 +107,7 @@ def _lengths(arms: Arms, finger: FingerDescription, report: Report) -> None:
 
 
 def _virtual_work(session: Session, kinematic: _Excursions, report: Report) -> None:
+    """Report moment arms of ID.4 that contradict those of ID.2."""
     finger = session.finger
     turned, far = [], []
     for trial in session.select("ID.4"):
@@ -122,9 +122,9 @@ def _virtual_work(session: Session, kinematic: _Excursions, report: Report) -> N
             continue
         said = f"{trial.tendon} at {trial.joint} ({1e3 * seen:.3g} against {1e3 * felt:.3g} mm)"
         ratio = felt / seen
-        if ratio < -_LEAST:
+        if ratio < -_MIN_ARM_RATIO:
             turned.append(said)
-        elif not _LEAST < ratio < _MOST:
+        elif not _MIN_ARM_RATIO < ratio < _MAX_ARM_RATIO:
             far.append(said)
     for found, what in ((turned, "the sign"), (far, "the units or the column")):
         if found:
@@ -136,7 +136,7 @@ def _virtual_work(session: Session, kinematic: _Excursions, report: Report) -> N
 
 
 def _paths(session: Session, kinematic: _Excursions, report: Report) -> None:
-    """Do free motions show the excursions that ID.2 shows?"""
+    """Report free motions whose excursions contradict those of ID.2."""
     finger = session.finger
     found = []
     for trial in session.select("VD.1", "VD.3"):
@@ -149,7 +149,8 @@ def _paths(session: Session, kinematic: _Excursions, report: Report) -> None:
                 continue
             expected = np.sum([kinematic.polynomials[int(k), int(i)](q[:, i]) for i in joints], axis=0)
             ratio = slope(expected, l[:, k])
-            if np.isfinite(ratio) and not 1.0 / _APART < ratio < _APART and np.ptp(expected) > 1e-3:
+            agree = 1.0 / _MAX_EXCURSION_RATIO < ratio < _MAX_EXCURSION_RATIO
+            if np.isfinite(ratio) and not agree and np.ptp(expected) > 1e-3:
                 found.append(f"{finger.tendon_names[k]} in {trial.name} ({ratio:.2g} times)")
     if found:
         report.warning(
@@ -159,21 +160,16 @@ def _paths(session: Session, kinematic: _Excursions, report: Report) -> None:
         )
 
 
-def _tip(session: Session, report: Report) -> None:
-    found = []
+def _fingertip(session: Session, report: Report) -> None:
+    """Report fingertip forces that are too large or too small for the tension."""
+    found, names = [], session.finger.tendon_names
     for trial in session.select("VD.2"):
-        if trial.tendon in session.finger.tendon_names and trial.fingertip_force is not None:
-            pull = (
-                None
-                if trial.tendon_force is None
-                else trial.tendon_force[:, session.finger.tendon_names.index(trial.tendon)]
-            )
-            slopes = (
-                [slope(thinned(pull), thinned(x)) for x in trial.fingertip_force.T] if pull is not None else [np.nan]
-            )
-            size = float(np.linalg.norm(slopes))
-            if np.isfinite(size) and not _TIP[0] < size < _TIP[1]:
-                found.append(f"{size:.3g} N for each N of {trial.tendon} in {trial.name}")
+        if trial.tendon not in names or trial.fingertip_force is None or trial.tendon_force is None:
+            continue
+        pull = thinned(trial.tendon_force[:, names.index(trial.tendon)])
+        size = float(np.linalg.norm([slope(pull, thinned(x)) for x in trial.fingertip_force.T]))
+        if np.isfinite(size) and not _FORCE_RATIOS[0] < size < _FORCE_RATIOS[1]:
+            found.append(f"{size:.3g} N for each N of {trial.tendon} in {trial.name}")
     if found:
         report.warning(
             "/trials", f"the fingertip presses with {_some(found)}; check the units of fingertip_force and tendon_force"
@@ -181,6 +177,7 @@ def _tip(session: Session, report: Report) -> None:
 
 
 def _passivity(session: Session, report: Report) -> None:
+    """Report joints whose torque has friction of the wrong sign."""
     finger = session.finger
     shares: dict[str, list[float]] = defaultdict(list)
     for trial in session.select("ID.3-static", "ID.3-dynamic"):
@@ -189,7 +186,7 @@ def _passivity(session: Session, report: Report) -> None:
         share = _friction_share(trial, finger.joint_names.index(trial.joint))
         if np.isfinite(share):
             shares[trial.joint].append(share)
-    found = [joint for joint, of_trials in shares.items() if np.median(of_trials) < -_TAKEN]
+    found = [joint for joint, of_trials in shares.items() if np.median(of_trials) < -_MAX_NEGATIVE_FRICTION]
     if found:
         report.warning(
             "/trials",
@@ -199,7 +196,7 @@ def _passivity(session: Session, report: Report) -> None:
 
 
 def _friction_share(trial: Trial, joint: int) -> float:
-    """What of the torque turns with the direction of motion, in parts of its spread; NaN where nothing tells."""
+    """Friction torque over the torque's standard deviation, by regression on direction and angle; NaN where unclear."""
     assert trial.joint_torque is not None
     q, torque = trial.q[:, [joint]], trial.joint_torque[:, [joint]]
     if not (np.isfinite(q).all() and np.isfinite(torque).all() and np.ptp(torque) > 0.0):
@@ -209,17 +206,17 @@ def _friction_share(trial: Trial, joint: int) -> float:
     q, torque = (low_pass(trial.time, x, cutoff)[:, 0] for x in (q, torque))
     columns = np.column_stack([way, np.polynomial.polynomial.polyvander((q - q.mean()) / np.ptp(q), 5)])[way != 0.0]
     if len(columns) < 50 or np.ptp(columns[:, 0]) == 0.0:
-        return np.nan  # only ever one way: friction and elastic torque trade off
-    if trial.experiment != "ID.3-static" and np.count_nonzero(np.diff(columns[:, 0])) < _TURNS:
+        return np.nan  # In one direction only, friction and elastic torque cannot be told apart.
+    if trial.experiment != "ID.3-static" and np.count_nonzero(np.diff(columns[:, 0])) < _MIN_TURNS:
         return np.nan
     R = np.asarray(np.linalg.qr(np.column_stack([columns, torque[way != 0.0]]), mode="r"))
-    # Where there are fewer held angles than coefficients, the smallest ones that fit.
+    # There may be fewer held angles than coefficients, so `lstsq` gives the smallest coefficients that fit.
     least = np.linalg.lstsq(R[:-1, :-1], R[:-1, -1])[0]
     return float(least[0] / np.std(torque))
 
 
 def _way(trial: Trial, joint: int, cutoff: float) -> np.ndarray:
-    """(N,) direction of a joint's motion: the file's channel, or where it moves by its filtered speed."""
+    """Direction (N,) of a joint's motion: the file's channel, or derived from its filtered speed."""
     if trial.joint_direction is not None:
         return trial.joint_direction[:, joint].astype(float)
     rate = smooth(trial.time, trial.q[:, [joint]], cutoff)[1]

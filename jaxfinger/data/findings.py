@@ -1,4 +1,4 @@
-"""What the checker has to say about a file, one sentence a finding."""
+"""Findings of the checker about a file, one sentence each."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Severity = Literal["error", "warning", "note"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One fault of a file: where it is (a path inside the file) and a sentence that ends with the mend.
+    """One fault of a file: its place (a path inside the file) and a sentence that ends with the mend.
 
-    error: the file breaks the format, or a number read from it would be wrong.
-    warning: it can be read, but something will be missing or looks unlikely. note: worth knowing.
-    An error that is `local` leaves the rest of the file usable, and does not stop `read_session`. What is about one
-    joint (with its link) or one tendon of the finger has its `row` among these.
+    An error means that the file breaks the format, or that a number read from it would be wrong. After a warning the
+    file can be read, but something will be missing or looks unlikely. A note is worth knowing.
+    An error that is `local` leaves the rest of the file usable and does not stop `read_session`. `row` is the index of
+    the joint (with its link) or of the tendon that a finding in `/finger` is about.
     """
 
     severity: Severity
@@ -30,7 +30,7 @@ class Finding:
 
     @property
     def sentence(self) -> str:
-        """Place and message, of the file as a whole the message alone."""
+        """Place and message; the message alone where it is about the whole file."""
         return self.message if self.place == "/" else f"{self.place}: {self.message}"
 
     def __str__(self) -> str:
@@ -38,7 +38,7 @@ class Finding:
 
 
 class Report(list[Finding]):
-    """The findings so far, with a short way to add one."""
+    """List of findings, with a method to add each kind."""
 
     def error(self, place: str, message: str, local: bool = False, row: int | None = None) -> None:
         self.append(Finding("error", place, message, local, row))
@@ -60,8 +60,9 @@ _NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.]*(?:e[-+]?\d+)?%?")
 
 
 def together(findings: Iterable[Finding], named: int = 3) -> list[Finding]:
-    """What is found in several trials alike as one finding: that of the first, and the names of the next ones. Numbers
-    in the sentences may differ.
+    """Merge findings that several trials share: the finding of the first trial, and the names of the next `named` ones.
+
+    Findings are shared if they differ in nothing but trials and numbers.
     """
     alike: dict[object, list[tuple[Finding, str]]] = {}
     for finding in findings:

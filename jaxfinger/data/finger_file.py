@@ -29,14 +29,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from jaxfinger.data.check_finger import check_finger
+from jaxfinger.data.check_finger import UNIT_AXIS_TOLERANCE, check_finger
 from jaxfinger.data.findings import Report
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import Fault, Place, Within, as_key, one_of, quoted, read_toml, structure
 
 Vector = tuple[float, float, float]
 NotNegative = Annotated[float, Within(0.0)]
-_UNIT_AXIS = 1e-3
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ class Joint:
         if lower >= upper:
             raise Fault("must be [lower, upper], the lower first", key)
         length = float(np.linalg.norm(self.axis))
-        if abs(length - 1.0) > _UNIT_AXIS:
+        if abs(length - 1.0) > UNIT_AXIS_TOLERANCE:
             raise Fault(f"is {length:.4g} long; divide it by its length", "axis")
         if self.rotor_inertia is None and self.rotor_inertia_std is not None:
             raise Fault("is missing beside `rotor_inertia_std`; write both, or neither", "rotor_inertia")
