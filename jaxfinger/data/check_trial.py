@@ -303,7 +303,7 @@ def _sizes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report
     if not turning.all():
         return
     small = float(finger.mass.sum()) < 5.0
-    # A finger of less than 5 kg neither pulls in half a metre of tendon nor has 5 N m at a joint, except in wrong units.
+    # Fingers of less than 5 kg neither pull in half a metre of tendon nor have 5 N m at a joint, except in wrong units.
     for name, most, mend in (("tendon_excursion", 0.5, "mm to m"), ("joint_torque", 5.0, "N mm to N m")):
         values = getattr(trial, name)
         if values is None or not small:

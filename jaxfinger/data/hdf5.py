@@ -1,4 +1,4 @@
-"""Sessions as files: read, write, hash (dataset format, version 1.1)."""
+"""Session files: read, write, hash (dataset format, version 1.1)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from jaxfinger.data.schema import (
 from jaxfinger.data.session import FingerDescription, Session, Trial
 from jaxfinger.errors import UserError
 
-# The newest file version that MATLAB before R2021b and other old tools open.
+# The newest version of HDF5 files that MATLAB before R2021b and other old tools open.
 LIBVER = ("earliest", "v108")
 _TEXT = h5py.string_dtype("utf-8")
 
@@ -39,7 +39,7 @@ _TEXT = h5py.string_dtype("utf-8")
 def read_session(
     path: str | os.PathLike, trials: Collection[str] | None = None, report: Report | None = None
 ) -> Session:
-    """The session in a file, in float64, or only the named trials of it. `report` takes what the checker finds.
+    """Read the session in a file, or only its named trials, in float64. Findings of the checker go to `report`.
 
     >>> import jaxfinger as jf
     >>> jf.read("session.h5")
@@ -78,9 +78,10 @@ def write_session(session: Session, path: str | os.PathLike, overwrite: bool = F
 
 @contextmanager
 def new_file(path: str | os.PathLike, overwrite: bool = False) -> Iterator[h5py.File]:
-    """The one way in which HDF5 files are written: made in memory, then written whole as `atomic_path` does.
+    """A new HDF5 file in memory, which is written whole to `path` on success (`atomic_path`).
 
-    The HDF5 library crashes the interpreter where a disk fills up while it closes a file, so it never sees the disk.
+    All HDF5 files are written in this way: where a disk fills up while the HDF5 library closes a file, the library
+    crashes the interpreter, so it must not write to the disk itself.
 
     Raises:
         UserError: the file exists and `overwrite` is false, or it cannot be written.
@@ -94,7 +95,7 @@ def new_file(path: str | os.PathLike, overwrite: bool = False) -> Iterator[h5py.
 
 
 def write_into(file: h5py.File, session: Session) -> None:
-    """Write a session into a file of `new_file`, which may hold more beside it."""
+    """Write a session into an open file, which may also hold other groups."""
     write_header(file, session)
     trials = file.create_group("trials")
     for name, trial in session.trials.items():
@@ -102,7 +103,11 @@ def write_into(file: h5py.File, session: Session) -> None:
 
 
 def data_hash(path: str | os.PathLike) -> str:
-    """SHA-256 of a file's bytes, in hexadecimal."""
+    """SHA-256 of a file's bytes, in hexadecimal.
+
+    Raises:
+        UserError: the file cannot be read.
+    """
     try:
         with open(path, "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -111,7 +116,7 @@ def data_hash(path: str | os.PathLike) -> str:
 
 
 def write_header(file: h5py.File, session: Session) -> None:
-    """Root attributes and `/finger`."""
+    """Write the root attributes and `/finger`."""
     file.attrs["format"] = FORMAT
     file.attrs["format_version"] = VERSION
     file.attrs["specimen"] = session.specimen
@@ -163,7 +168,7 @@ def _write_trial(group: h5py.Group, trial: Trial, finger: FingerDescription) -> 
 
 
 def write_dataset(group: h5py.Group, entry: Entry, value, prismatic: Sequence[bool]) -> None:
-    """One dataset with its `units`, compressed where it is a channel."""
+    """Write one dataset with its `units`, compressed where it is long."""
     if entry.kind == "text":
         group.create_dataset(entry.name, data=list(value), dtype=_TEXT)
         return
@@ -179,7 +184,7 @@ def write_dataset(group: h5py.Group, entry: Entry, value, prismatic: Sequence[bo
 
 
 def _lossless_single(value: np.ndarray) -> np.ndarray:
-    """float32 where that loses nothing: sensors of 16 bits or fewer then take half the space."""
+    """Value as float32 where no digit is lost, which halves the space of sensors with 16 bits or fewer."""
     with np.errstate(over="ignore"):
         single = value.astype(np.float32)
     return single if np.array_equal(single, value, equal_nan=True) else value

@@ -1,4 +1,4 @@
-"""MATLAB's .mat files, v4 to v7.2 through SciPy, v7.3 as the HDF5 that it is."""
+"""MATLAB's .mat files: v4 to v7.2 through SciPy, v7.3, which is HDF5, through h5py."""
 
 from __future__ import annotations
 
@@ -14,25 +14,28 @@ import scipy.io
 import scipy.sparse
 
 from jaxfinger.data.opening import why_closed, why_unreadable
-from jaxfinger.data.probe import rest, survives
+from jaxfinger.data.probe import restart_timer, survives
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.errors import UserError
 
 _NUMBERS = ("double", "single", "logical", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64")
-_SLOWEST = 1e6  # bytes a second: a hundredth of what SciPy reads from a compressed file
+_MIN_SPEED = 1e6  # bytes/s: a hundredth of the speed at which SciPy reads a compressed file
 _OBJECT = (
     "is a MATLAB object ({kind}), which only MATLAB can open; save its members as arrays, as `x.Data` and `x.Time`"
 )
 
 
+_ONE = "choose one and save it alone"
+
+
 class _Unusable(str):
-    """In place of a value: why it gives no numbers."""
+    """Reason why a variable gives no numbers, in place of its value."""
 
 
 def load_mat(path: Path) -> Recording:
-    """Every numeric variable, samples first; members of structures as `outer.inner`.
+    """Load every numeric variable, samples first. Members of structures are named `outer.inner`.
 
-    A Simulink structure with time (`S.time` beside `S.signals`) is its signals' clock.
+    The clock of a signal in a Simulink structure with time (`S.time` beside `S.signals`) is `S.time`.
 
     Raises:
         UserError: the file is damaged, or holds two variables of one name.
@@ -51,7 +54,10 @@ def load_mat(path: Path) -> Recording:
 
 
 def _on_clock(variable: Variable, variables: Mapping[str, Variable]) -> Variable:
-    """Simulink stacks the samples of a signal of k×1 along the third axis; SciPy leaves k×N of it."""
+    """Variable with its clock, if there is one, and samples first as on the clock.
+
+    Simulink stacks the samples of a k×1 signal along the third axis, and SciPy makes k×N of it.
+    """
     if variable.clock not in variables:
         return Variable(variable.values)
     count, values = len(variables[variable.clock].values), variable.values
@@ -60,8 +66,8 @@ def _on_clock(variable: Variable, variables: Mapping[str, Variable]) -> Variable
 
 
 def _visit(path: Path) -> None:
-    rest(path.stat().st_size / _SLOWEST)
-    with warnings.catch_warnings(), suppress(Exception):  # what it raises, the reader meets too
+    restart_timer(path.stat().st_size / _MIN_SPEED)
+    with warnings.catch_warnings(), suppress(Exception):  # The reader meets the same exception and reports it.
         warnings.simplefilter("ignore")
         scipy.io.loadmat(path)
 
@@ -77,7 +83,7 @@ def _scipy(path: Path) -> Mapping[str, Any]:
             loaded = scipy.io.loadmat(path, simplify_cells=True)
         except scipy.io.matlab.MatReadWarning as error:
             raise UserError(f"{path}: {error}; give each variable its own name") from None
-        # What damaged lengths and kinds make of SciPy.
+        # SciPy raises these on damaged lengths and types.
         except (ArithmeticError, LookupError, MemoryError, TypeError, ValueError):
             raise damaged from None
     return {name: value for name, value in loaded.items() if not name.startswith("__")}
@@ -100,7 +106,7 @@ def _from_hdf5(item: Any) -> Any:
         return _Unusable("is a sparse matrix; save full(…) of it")
     if isinstance(item, h5py.Group):
         return {name: _from_hdf5(child) for name, child in item.items()}
-    if item.dtype.kind == "O":  # references: a cell array, or a member of a list of structures
+    if item.dtype.kind == "O":  # References are a cell array, or a member of a list of structures.
         return _Unusable(f"is a list of {item.size} {'cells' if kind == 'cell' else 'structures'}; {_ONE}")
     if kind == "char":
         return _Unusable("is text; name a variable of numbers")
@@ -108,9 +114,6 @@ def _from_hdf5(item: Any) -> Any:
         return _Unusable("is empty")
     reason = why_unreadable(item)
     return _Unusable(reason) if reason is not None else _plain(item[()].T)
-
-
-_ONE = "choose one and save it alone"
 
 
 def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -122,7 +125,7 @@ def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def _plain(value: Any) -> Any:
-    """An array of numbers, or why it is none."""
+    """Value as an array of float64, or `_Unusable` with the reason why it is none."""
     if isinstance(value, _Unusable):
         return value
     if isinstance(value, str):
@@ -146,7 +149,7 @@ def _plain(value: Any) -> Any:
 
 
 def _samples_first(array: np.ndarray) -> np.ndarray:
-    """Rows of one, and Simulink's k×1×N signals (MATLAB stacks samples along the third axis), with samples first."""
+    """Array with samples first: single rows are transposed, and so are Simulink's k×1×N signals."""
     if array.ndim > 2:
         array = np.moveaxis(array, -1, 0).reshape(array.shape[-1], -1)
     return np.atleast_1d(np.squeeze(array)) if 1 in array.shape or not array.ndim else array

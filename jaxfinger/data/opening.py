@@ -1,4 +1,4 @@
-"""Why an HDF5 file, or a part of one, cannot be read: the true reason, as the rest of a sentence with its mend."""
+"""Reasons why an HDF5 file, or a part of one, cannot be read: the end of a sentence, with its mend."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _DAMAGED = "copy it again, or recover it from the recorder's log"
 
 
 def why_closed(path: str | os.PathLike) -> str | None:
-    """Why the file does not open as HDF5, or None where it does."""
+    """Reason why the file does not open as HDF5, or None where it does."""
     path = Path(path)
     if not path.is_file():
         return f"{'is a folder' if path.is_dir() else 'does not exist'}; name a file"
@@ -44,7 +44,7 @@ def _reason(path: Path, error: str) -> str:
 
 
 def why_unreadable(item: h5py.Dataset) -> str | None:
-    """Why the values of a dataset cannot be trusted or read, or None where they can."""
+    """Reason why the values of a dataset cannot be read or trusted, or None where they can."""
     if item.is_virtual or item.external:
         kind = "virtual" if item.is_virtual else "external"
         return (
@@ -66,7 +66,7 @@ def why_unreadable(item: h5py.Dataset) -> str | None:
 
 
 def plain_reason(error: object) -> str:
-    """What a library said, on one line and without its own advice of where in its code it happened."""
+    """Message of a library's exception on one line, without its details about where in its code it happened."""
     text = re.sub(r"\s+", " ", str(error)).strip()
     inner = re.search(r"\(([^()]+)\)\s*$", text)
     return (inner.group(1) if inner else text)[:200] or type(error).__name__

@@ -1,4 +1,7 @@
-"""From an open HDF5 file to a `Session`, leniently: what cannot be read is reported and left out."""
+"""Lenient parsing of an open HDF5 file into a `Session`: parts that cannot be read are reported and left out.
+
+HDF5 raises exceptions of many kinds on a damaged file, so the functions here catch all of them.
+"""
 
 from __future__ import annotations
 
@@ -26,9 +29,9 @@ from jaxfinger.data.schema import (
 )
 from jaxfinger.data.session import EXPERIMENTS, FingerDescription, Session, Trial
 
-# gzip shrinks a constant by at most about 1:1030: a dataset that claims more than this cannot be in the file.
-_LARGEST_COMPRESSION = 1100
-# What whole numbers may be, by kind: lowest, highest, in words.
+# gzip shrinks a constant by at most about 1:1030, so a dataset that claims more than this cannot be in the file.
+_MAX_COMPRESSION = 1100
+# Allowed whole numbers, by kind: lowest, highest, and both in words.
 RANGES = {
     "bool": (0, 1, "false or true"),
     "int8": (-1, 1, "-1, 0 or 1"),
@@ -37,7 +40,7 @@ RANGES = {
 
 
 def parse_file(file: h5py.File, path: str, report: Report, names: Collection[str] | None = None) -> Session | None:
-    """The session of an open file, or None where not even the finger can be read. `names` limits the trials."""
+    """Session of an open file; None where its header or finger cannot be read. `names` limits the trials."""
     if not parse_version(file, report):
         return None
     if text_attribute(file, "content", "/", Report()) == "predictions":
@@ -55,7 +58,7 @@ def parse_file(file: h5py.File, path: str, report: Report, names: Collection[str
 
 
 def parse_version(file: h5py.File, report: Report) -> bool:
-    """Whether the file says that it is ours, in a version that this reader knows."""
+    """Whether the file states our format, in a version that this reader knows."""
     format_name = text_attribute(file, "format", "/", report)
     if format_name != FORMAT:
         said = "has no attribute `format`" if format_name is None else f"has format {format_name!r}"
@@ -71,7 +74,7 @@ def parse_version(file: h5py.File, report: Report) -> bool:
 
 
 def parse_finger(file: h5py.File, report: Report) -> FingerDescription | None:
-    """`/finger`: None where a table that cannot be done without is missing or misshapen."""
+    """Read `/finger`; None where an indispensable table is missing or misshapen."""
     group = child(file, "finger", "/finger", report, h5py.Group)
     if group is None:
         return None
@@ -118,7 +121,7 @@ def parse_finger(file: h5py.File, report: Report) -> FingerDescription | None:
 
 
 def _table(group, name: str, entries: Sequence[Entry], sizes: dict, prismatic, report: Report) -> dict[str, Any]:
-    """The datasets of one table; the first, its names, says how long the table is."""
+    """Read the datasets of one table. The first one, the names, sets the table's length."""
     place = f"/finger/{name}"
     table = child(group, name, place, report, h5py.Group)
     if table is None:
@@ -164,7 +167,7 @@ def parse_trials(
 
 
 def parse_trial(trials: h5py.Group, name: str, finger: FingerDescription, report: Report) -> Trial | None:
-    """One recording, or None where its time or joint positions cannot be read."""
+    """Read one recording; None where its experiment, time or joint positions cannot be read."""
     place = f"/trials/{name}"
     group = child(trials, name, place, report, h5py.Group)
     if group is None:
@@ -206,7 +209,7 @@ def parse_trial(trials: h5py.Group, name: str, finger: FingerDescription, report
 
 
 def _temperature(group: h5py.Group, place: str, sizes: Mapping[str, int], report: Report) -> dict[str, Any]:
-    """Temperatures and their names, where they fit: a file of 1.0 may hold a dataset of this name that is its own."""
+    """Temperatures and their names. Misfits are left out: a file of version 1.0 may use the name for its own data."""
     if TEMPERATURE.name not in group:
         return {}
     found = Report()
@@ -216,7 +219,7 @@ def _temperature(group: h5py.Group, place: str, sizes: Mapping[str, int], report
         try:
             said: Any = group[TEMPERATURE.name].attrs["names"]
             names = tuple(_decode(name) for name in np.atleast_1d(said))
-        except Exception:  # absent, or no strings
+        except Exception:  # The attribute is absent, or does not hold strings.
             names = ()
         if len(names) != values.shape[1]:
             message = f"has {values.shape[1]} columns and {len(names)} names; name each in its attribute `names`"
@@ -246,21 +249,21 @@ def _session_start(group: h5py.Group, place: str, report: Report) -> float | Non
 
 
 def in_order(trials: Mapping[str, Trial]) -> dict[str, Trial]:
-    """Trials in the order of the session: by `session_start` where every trial has one, else by name."""
+    """Sort trials by `session_start` where every trial has one, else by name."""
     if all(trial.session_start is not None for trial in trials.values()):
         return dict(sorted(trials.items(), key=lambda item: (item[1].session_start, item[0])))
     return dict(sorted(trials.items()))
 
 
 def child(parent: h5py.Group, name: str, place: str, report: Report, kind: type) -> Any:
-    """A group or dataset of the parent, or None with the reason reported."""
+    """Member of a group, of this kind (h5py.Group or h5py.Dataset); None with the reason reported."""
     what = "group" if kind is h5py.Group else "dataset"
     try:
         if isinstance(parent.get(name, getlink=True), h5py.ExternalLink):
             report.error(place, f"lies in another file, to which this one only links; copy the {what} into this one")
             return None
         item = parent.get(name)
-    except Exception:  # a damaged file raises nearly anything
+    except Exception:
         report.error(
             place, "cannot be opened: the file is damaged or its link leads nowhere; record or import it again"
         )
@@ -274,7 +277,10 @@ def child(parent: h5py.Group, name: str, place: str, report: Report, kind: type)
 
 
 def dataset(group, entry: Entry, place: str, sizes: Mapping[str, int | None], prismatic, report: Report) -> Any:
-    """The value of one dataset in its declared shape (names as a tuple of str), or None with the reason reported."""
+    """Value of one dataset in its declared shape (names as a tuple of str); None with the reason reported.
+
+    `sizes` holds the lengths of the axes N, m and n that are known so far.
+    """
     place = f"{place}/{entry.name}"
     if entry.optional and entry.name not in group:
         return None
@@ -289,7 +295,7 @@ def dataset(group, entry: Entry, place: str, sizes: Mapping[str, int | None], pr
             report.error(place, reason)
             return None
         value = _names(item) if entry.kind == "text" else item[()]
-    except Exception as error:  # as above
+    except Exception as error:
         said = plain_reason(error)
         report.error(place, f"cannot be read ({said}): the file is truncated or damaged; record or import it again")
         return None
@@ -303,7 +309,7 @@ def dataset(group, entry: Entry, place: str, sizes: Mapping[str, int | None], pr
 
 def _plausible_size(item: h5py.Dataset) -> bool:
     stored = 2**20 + item.file.id.get_filesize()
-    return item.size * item.dtype.itemsize <= _LARGEST_COMPRESSION * stored
+    return item.size * item.dtype.itemsize <= _MAX_COMPRESSION * stored
 
 
 def _right_shape(value: Any, entry: Entry, place: str, sizes: Mapping[str, int | None], report: Report) -> bool:
@@ -340,7 +346,7 @@ def _check_units(item: h5py.Dataset, entry: Entry, place: str, prismatic: Sequen
 
 
 def _plain(units: str) -> str:
-    """`N·m`, `N*m` and `N m` are the same units, and so are `1` and none."""
+    """Units in one spelling: `N·m`, `N*m` and `N m` become the same, and an empty string becomes `1`."""
     return units.translate(str.maketrans("", "", " ·*^")).replace("⋅", "").replace("²", "2").replace("⁻", "-") or "1"
 
 
@@ -349,7 +355,7 @@ def _as_kind(value: np.ndarray, entry: Entry, place: str, report: Report) -> np.
         if value.dtype.kind not in "fiu":
             report.error(place, f"holds {value.dtype}, not numbers; write it as float64")
             return None
-        with np.errstate(invalid="ignore", over="ignore"):  # of wild values the checks will tell
+        with np.errstate(invalid="ignore", over="ignore"):  # The checks report extreme values.
             return np.ascontiguousarray(value, np.float64)
     if (
         value.dtype.kind not in "biuf"
@@ -370,28 +376,33 @@ def _names(item: h5py.Dataset) -> tuple[str, ...]:
 
 
 def _decode(value: Any) -> str:
-    """A string from the ways in which h5py, MATLAB and C write one."""
+    """Decode a string, however h5py, MATLAB or C wrote it.
+
+    Raises:
+        TypeError: the value is no string.
+        UnicodeError: its bytes are not UTF-8.
+    """
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
     if isinstance(value, bytes):
         return value.decode("utf-8")
     if isinstance(value, str):
-        value.encode("utf-8")  # h5py smuggles broken bytes through as surrogates
+        value.encode("utf-8")  # Raises for broken bytes, which h5py passes on as surrogates.
         return str(value)
     raise TypeError(f"{type(value).__name__} is not a string")
 
 
 def text_attribute(item: Any, key: str, place: str, report: Report) -> str | None:
-    """A string attribute, or None where it is absent; a value that is no string is reported."""
+    """String attribute; None where it is absent, and with a report where it is no string."""
     try:
         return _decode(item.attrs[key]) if key in item.attrs else None
-    except Exception:  # as above
+    except Exception:
         report.error(place, f"has an attribute `{key}` that is not a UTF-8 string; write it as one")
         return None
 
 
 def number_attribute(item: Any, key: str, place: str, report: Report, shape: tuple[int, ...]) -> np.ndarray | None:
-    """A numeric attribute as float64 of this shape, or None with the reason reported."""
+    """Numeric attribute as float64 of this shape; None with the reason reported."""
     try:
         if key not in item.attrs:
             report.error(place, f"has no attribute `{key}`; write it")
@@ -400,7 +411,7 @@ def number_attribute(item: Any, key: str, place: str, report: Report, shape: tup
         if value.dtype.kind not in "biuf":
             raise TypeError(value.dtype)
         value = value.astype(np.float64).reshape(shape)
-    except Exception:  # as above
+    except Exception:
         report.error(place, f"has an attribute `{key}` that is not {shape or 'one'} of numbers; write it as such")
         return None
     if not np.all(np.isfinite(value)):
@@ -410,6 +421,6 @@ def number_attribute(item: Any, key: str, place: str, report: Report, shape: tup
 
 
 def listed(names: Sequence[str], most: int = 8) -> str:
-    """Names for a sentence: the first few, and how many more."""
+    """Names as part of a sentence: the first `most` ones, and how many more there are."""
     shown = ", ".join(names[:most])
     return f"{shown} and {len(names) - most} more" if len(names) > most else shown or "none"

@@ -1,4 +1,4 @@
-"""What a model predicts for a session, in the session's own layout (dataset format, "Predictions")."""
+"""Files of predictions for a session, in the session's own layout (dataset format, "Predictions")."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ Predictions = Mapping[str, Mapping[str, np.ndarray]]  # {trial: {channel: (N, co
 def write_predictions(
     path: str | os.PathLike, session: Session, predictions: Predictions, overwrite: bool = False
 ) -> None:
-    """Write predicted channels, `{trial: {channel: array}}`, beside times, root attributes and finger of the session.
+    """Write predicted channels, `{trial: {channel: array}}`, with the session's times, root attributes and finger.
 
-    Shapes and units are those of the measured channels; `time` may be given where it is not the trial's.
+    Shapes and units are those of the measured channels. A trial's channels may include `time`, (N,) in s, where the
+    prediction has times of its own.
 
     >>> import jaxfinger as jf
     >>> session = jf.read("session.h5")
@@ -66,7 +67,7 @@ def write_predictions(
 
 
 def read_predictions(path: str | os.PathLike) -> dict[str, dict[str, np.ndarray]]:
-    """The predicted channels of a file, `{trial: {"time": (N,), channel: array}}`, in SI units.
+    """Read the predicted channels of a file, `{trial: {"time": (N,), channel: array}}`, in SI units.
 
     >>> import jaxfinger as jf
     >>> session, fit = jf.read("session.h5"), jf.load("fit.json")
@@ -75,7 +76,7 @@ def read_predictions(path: str | os.PathLike) -> dict[str, dict[str, np.ndarray]
     {'01-ID3-dynamic-axis': ['joint_torque', 'time']}
 
     Raises:
-        UserError: the first thing that is wrong with the file.
+        UserError: the first fault of the file.
     """
     report = Report()
     found: dict[str, dict[str, np.ndarray]] = {}
@@ -84,7 +85,7 @@ def read_predictions(path: str | os.PathLike) -> dict[str, dict[str, np.ndarray]
         try:
             with file:
                 found = _parse(file, report)
-        except Exception:  # h5py raises nearly anything on a damaged file
+        except Exception:  # h5py raises exceptions of many kinds on a damaged file.
             report.error("/", "cannot be read to the end: the file is damaged; predict again")
     if report.fatal is not None:
         raise UserError(f"{path}: {report.fatal.sentence}")
@@ -92,7 +93,7 @@ def read_predictions(path: str | os.PathLike) -> dict[str, dict[str, np.ndarray]
 
 
 def _complete(place: str, time: np.ndarray, values: np.ndarray, report: Report) -> None:
-    """A column is predicted at every sample or, all NaN, at none."""
+    """Report a channel with a column that is NaN in some of its samples: predictions cover all samples or none."""
     bad = ~np.isfinite(values).reshape(len(values), -1)
     for column in bad.T:
         if column.any() and not column.all():

@@ -1,4 +1,4 @@
-"""A finger and a mapping to fill in: TOML with comments, which is read as it stands."""
+"""Templates of a finger file and a mapping file: TOML with comments that explain each key, valid as it stands."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from collections.abc import Sequence
 
 from jaxfinger.data.toml import as_key, quoted
 
-_RADIUS = 0.007  # m, of a link taken for a rod: the example's numbers are those of an adult's finger
+# Links of an adult's finger, taken for rods, give the example's numbers.
+_RADIUS = 0.007  # m
 _LENGTHS = (0.045, 0.028, 0.023)  # m, base to tip
+_MASS = 1e4  # kg/m³, over length · radius²: rods of 3200 kg/m³, a little more than aluminium
 
 
 def finger_template(joints: Sequence[str], tendons: Sequence[str]) -> str:
-    """`finger.toml`: every number is an example to replace; what each means stands beside it."""
+    """Text of a `finger.toml` with example numbers, each with its meaning beside it."""
     text = """# The finger, as CAD, scale and ruler give it. Every number below is an example: replace it by your own.
 # Frames: x along the straight finger to its tip, z out of the back of the hand, y = z × x. At zero angle all links lie
 # along x. A positive angle flexes: about +y it carries the tip from +x toward -z.
@@ -22,7 +24,7 @@ gravity = [0.0, 0.0, -9.81]     # m/s², in the frame of the base: how the finge
     text += f"fingertip = [{_length(len(joints) - 1)}, 0.0, 0.0]  # m, the contact point, from the last joint\n"
     for i, name in enumerate(joints):
         length, before = _length(i), _length(i - 1) if i else 0.0
-        mass = float(f"{1e4 * length * _RADIUS**2:.2g}")
+        mass = float(f"{_MASS * length * _RADIUS**2:.2g}")
         along = float(f"{mass * _RADIUS**2 / 2:.2g}")
         across = float(f"{mass * (length**2 / 12 + _RADIUS**2 / 4):.2g}")
         text += f"""
@@ -67,7 +69,7 @@ COLUMNS = """# Which column of which recording is what. Import with:
 
 
 def mapping_template(specimen: str, finger: str, joints: Sequence[str], tendons: Sequence[str]) -> str:
-    """`mapping.toml`: which column of which recording is what, before there is a recording."""
+    """Text of a `mapping.toml` for a rig without recordings: channels of all joints and tendons, and example trials."""
     trials = [(f"{joint}", "ID.2", joint, "") for joint in joints] if tendons else []
     trials += [(f"{joint}", "ID.3-dynamic", joint, "") for joint in joints]
     trials += [(f"{tendon}-{joints[-1]}", "ID.4", joints[-1], tendon) for tendon in tendons]
