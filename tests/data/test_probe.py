@@ -36,7 +36,7 @@ def test_what_raises_in_the_walk_does_not_survive(file, monkeypatch):
 
 def test_a_busy_machine_damages_no_file_and_a_circle_does(file, monkeypatch):
     """Patience is in processor time: to sleep costs none."""
-    monkeypatch.setattr(probe, "_PATIENCE", 0.1)
+    monkeypatch.setattr(probe, "_MAX_CPU_TIME", 0.1)
     monkeypatch.setattr(probe, "_walk", lambda *_: time.sleep(0.5))
     assert probe.survives(file)
 
