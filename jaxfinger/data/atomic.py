@@ -1,4 +1,4 @@
-"""A file appears whole or not at all, and none is overwritten unless asked."""
+"""Atomic writing: a file appears whole or not at all, and none is overwritten unless asked."""
 
 from __future__ import annotations
 
@@ -13,17 +13,19 @@ from jaxfinger.errors import UserError
 
 try:
     import fcntl
-except ImportError:  # no such locks on Windows: what a killed process leaves stays there
+except ImportError:  # Windows has no such locks, so the files that a killed process leaves stay there.
     fcntl = None
 
-YOUNG_S = 60.0  # an empty part may be a moment old and not locked yet
+# Age, s, from which an empty unlocked part is an orphan. The process of a younger one may not have locked it yet.
+MIN_ORPHAN_AGE = 60.0
 
 
 @contextmanager
 def atomic_path(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Path]:
-    """A temporary path beside `path` to write to; on success it is synced to disk and takes the place of `path`.
+    """Context of a temporary path beside `path` to write to. On success it is synced to disk and replaces `path`.
 
-    What a killed process left half-written for the same `path` is removed: a part that is being written is locked.
+    Half-written files that killed processes left for the same `path` are removed first. They are recognised by their
+    missing lock.
 
     Raises:
         UserError: the file exists and `overwrite` is false, or its folder cannot be written.
@@ -43,7 +45,7 @@ def atomic_path(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Pa
         _lock(handle)
         yield part
         _sync(part)
-        part.chmod(0o666 & ~_umask())  # mkstemp makes it private
+        part.chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner can read.
         refuse_existing(path, overwrite)
         os.replace(part, path)
         _sync(path.parent)
@@ -57,23 +59,24 @@ def atomic_path(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Pa
 
 
 def _lock(handle: int) -> bool:
-    """Mark an open file as being written, until it is closed or its process dies; False where another does so."""
+    """Lock an open file until it is closed or the process dies. False where another process holds it or none can."""
     if fcntl is None:
         return False
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:  # locked by another, or a file system without locks
+    except OSError:  # Another process holds the lock, or the file system has no locks.
         return False
     return True
 
 
 def _remove_orphans(folder: Path, prefix: str, suffix: str) -> None:
+    """Remove parts of this name that no process has locked."""
     with suppress(OSError):
         for entry in os.scandir(folder):
             if not (entry.name.startswith(prefix) and entry.name.endswith(suffix)):
                 continue
             with suppress(OSError):
-                young = not entry.stat().st_size and time.time() - entry.stat().st_mtime < YOUNG_S
+                young = not entry.stat().st_size and time.time() - entry.stat().st_mtime < MIN_ORPHAN_AGE
                 handle = os.open(entry.path, os.O_RDONLY)
                 try:
                     if not young and _lock(handle):
@@ -83,10 +86,10 @@ def _remove_orphans(folder: Path, prefix: str, suffix: str) -> None:
 
 
 def make_folder(path: str | os.PathLike) -> Path:
-    """The folder, made where there is none.
+    """Make the folder where there is none, and return its path.
 
     Raises:
-        UserError: it is a file, or cannot be made.
+        UserError: the path is a file, or the folder cannot be made.
     """
     path = Path(path)
     try:
@@ -98,10 +101,10 @@ def make_folder(path: str | os.PathLike) -> Path:
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Before any work: an output file that exists is only replaced when asked.
+    """Refuse an output path that cannot be written, before any work is done.
 
     Raises:
-        UserError: there is a file and `overwrite` is false, or there is what is no file.
+        UserError: the path is a file and `overwrite` is false, or a folder, device or pipe.
     """
     if path.is_dir():
         raise UserError(f"{path}: is a folder; name a file in it")

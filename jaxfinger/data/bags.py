@@ -1,4 +1,4 @@
-"""rosbag2 and MCAP recordings: `/topic.field`, with `/topic.time` in s from the recording's start."""
+"""rosbag2 and MCAP recordings: variables `/topic.field`, with `/topic.time` in s from the recording's start."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from jaxfinger.data.opening import plain_reason
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.errors import UserError
 
-_NS = 1e-9  # s: stamps are whole numbers of ns, and stay so until their start is taken off
+_NS = 1e-9  # s. Stamps stay whole numbers of ns until their start is subtracted, so that no digit is lost.
 _CLOCKS = ("time", "stamp")
 
 
 @dataclass
 class _Topic:
-    """The messages of one topic, field by field, beside the index of the message that each value is from."""
+    """Messages of one topic, field by field: the indices of the messages that hold the field, and its values."""
 
-    log: list[int] = field(default_factory=list)  # ns, when each message was logged
-    stamps: list[int | None] = field(default_factory=list)  # ns, when it was made, by its header
-    names: list[tuple[str, ...] | None] = field(default_factory=list)  # of its columns, as JointState has them
+    log: list[int] = field(default_factory=list)  # ns, time at which each message was logged
+    stamps: list[int | None] = field(default_factory=list)  # ns, time at which it was made, by its header
+    names: list[tuple[str, ...] | None] = field(default_factory=list)  # names of its columns, as in JointState
     values: dict[str, tuple[list[int], list[np.ndarray]]] = field(default_factory=lambda: defaultdict(lambda: ([], [])))
 
 
 def load_bag(path: Path) -> Recording:
-    """Every numeric field of every topic: (N,) or, where the field is a list of k numbers, (N, k).
+    """Load every numeric field of every topic: (N,), or (N, k) for lists of k numbers.
 
-    `/topic.time` is when the message was logged; messages with a header also have `/topic.stamp`, when it was made.
-    Where messages carry a list of names (JointState), the columns of their lists go by these. A field that a message
-    lacks is NaN there. Topics that cannot be decoded are left out, with the reason.
+    `/topic.time` is the time of logging. Messages with a header also have `/topic.stamp`, the time at which they were
+    made. Where messages carry a list of names (JointState), these name the columns of their other lists. A field that a
+    message lacks is NaN there. Topics that cannot be decoded are left out, with the reason.
 
     Raises:
-        UserError: a package is missing, or the recording cannot be read at all.
+        UserError: a package for reading bags is not installed.
     """
     topics: dict[str, _Topic] = defaultdict(_Topic)
     unusable: dict[str, str] = {}
@@ -65,8 +65,10 @@ def _undecoded(error: Exception) -> str:
 
 
 def _start(topics: Iterable[_Topic]) -> int:
-    """The recording's start: when the first message of the busiest topic was logged. A latched message may be logged
-    at any time."""
+    """Start of the recording, ns: the time of logging of the first message of the busiest topic.
+
+    The earliest message of all will not do, since a latched message may be logged at any time.
+    """
     busiest = max(topics, key=lambda topic: len(topic.log), default=None)
     return min(busiest.log) if busiest is not None else 0
 
@@ -88,7 +90,7 @@ def _add(topic: _Topic, stamp: int, message: Any) -> None:
 
 
 def _fields(message: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Numbers as arrays, the header's stamp in ns, and the names that go with lists."""
+    """Names and values of a message's fields: numbers as arrays, the header's stamp in ns, and the names of columns."""
     items = message.items() if isinstance(message, dict) else vars(message).items()
     for name, value in items:
         inner = prefix + name
@@ -103,13 +105,14 @@ def _fields(message: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         elif isinstance(value, bool | int | float | np.ndarray | list):
             try:
                 array = np.asarray(value)
-            except ValueError:  # lists of lists of several lengths
+            except ValueError:  # Nested lists have different lengths.
                 continue
             if array.size and array.dtype.kind in "biuf":
                 yield inner, array.astype(np.float64)
 
 
 def _collect(name: str, topic: _Topic, start: int, variables: dict[str, Variable], unusable: dict[str, str]) -> None:
+    """Add the variables of a topic to `variables`, or the reason against one to `unusable`."""
     count = len(topic.log)
     clock = f"{name}.time"
     variables[clock] = Variable((np.array(topic.log, object) - start).astype(np.float64) * _NS, units="s")
@@ -120,7 +123,7 @@ def _collect(name: str, topic: _Topic, start: int, variables: dict[str, Variable
     elif any(stamp is not None for stamp in topic.stamps):
         unusable[f"{name}.stamp"] = "is missing in some of its messages; take `time`, when they were logged"
     for key, (indices, values) in topic.values.items():
-        # A field called `time` or `stamp` is not the clock of that name.
+        # The clocks have the names `time` and `stamp`, so fields with these names get a longer one.
         called = f"{name}.message.{key}" if key in _CLOCKS else f"{name}.{key}"
         widths = sorted({value.shape for value in values})
         names = {topic.names[i] for i in indices} - {None}
@@ -153,7 +156,7 @@ def _by_name(
     clock: str,
     variables: dict[str, Variable],
 ) -> str | None:
-    """A list whose entries go by the message's names: a column for each name that occurs. Else, why not."""
+    """Add a list with named entries to `variables`, a column for each name that occurs; a reason where it cannot be."""
     order: list[str] = []
     for names in dict.fromkeys(topic.names):
         if names is not None and len(set(names)) < len(names):
@@ -175,7 +178,7 @@ def _by_name(
 
 
 def _messages(path: Path) -> Iterator[tuple[str, int, Any]]:
-    """(topic, ns, message), and in place of a message that cannot be decoded the reason."""
+    """Topic, time in ns and content of every message; the reason takes the place of content that cannot be decoded."""
     return _mcap_messages(path) if path.suffix.lower() == ".mcap" else _rosbag_messages(path)
 
 
@@ -189,13 +192,13 @@ def _rosbag_messages(path: Path) -> Iterator[tuple[str, int, Any]]:
                 message = reader.deserialize(raw, connection.msgtype)
             except KeyError:
                 message = f"is of the type {connection.msgtype}, whose definition the recording does not carry"
-            except Exception as error:  # of one topic; the others are read
+            except Exception as error:  # It concerns one topic; the others are still read.
                 message = error
             yield connection.topic, stamp, message
 
 
 def _mcap_messages(path: Path) -> Iterator[tuple[str, int, Any]]:
-    """Messages in JSON, or in CDR by the definition that the file carries. A file cut short is read to the cut."""
+    """Messages of an MCAP file in JSON, or in CDR by the file's own definitions. A cut file is read up to the cut."""
     from mcap.exceptions import EndOfFile
     from mcap.reader import NonSeekingReader
 
@@ -204,7 +207,7 @@ def _mcap_messages(path: Path) -> Iterator[tuple[str, int, Any]]:
         try:
             for schema, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
                 yield channel.topic, message.log_time, _decoded(schema, channel, message, decoders)
-        except (EndOfFile, struct.error):  # cut between records, or inside one
+        except (EndOfFile, struct.error):  # The file is cut between two records, or inside one.
             return
 
 
@@ -218,7 +221,7 @@ def _decoded(schema: Any, channel: Any, message: Any, decoders: dict[int, Any]) 
             if channel.id not in decoders:
                 decoders[channel.id] = _ros_decoder(schema)
             return decoders[channel.id](message.data)
-    except Exception as error:  # of one topic; the others are read
+    except Exception as error:  # It concerns one topic; the others are still read.
         return error
     return f"is in {encoding or 'an unnamed encoding'}, which is not read (JSON and CDR are); convert it"
 

@@ -1,4 +1,4 @@
-"""The columns of one trial: a variable of a recording, in SI, on the trial's clock."""
+"""Columns of a trial from the variables of a recording, in SI units on the trial's clock."""
 
 from __future__ import annotations
 
@@ -12,34 +12,36 @@ from jaxtyping import Float, Int
 
 from jaxfinger.data.expressions import ExpressionError, evaluate
 from jaxfinger.data.findings import Report
-from jaxfinger.data.mapping import Column, MappedTrial, Reading, Said, terms
+from jaxfinger.data.mapping import Column, ColumnSpec, MappedTrial, Reading, terms
 from jaxfinger.data.parse import listed
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.toml import Place
 from jaxfinger.data.units import TO_SI, unit_name
 from jaxfinger.errors import UserError, counted
 
-# Two clocks of one recording run about as long and tick about as often. Units are mistaken by a thousand, so thirty,
-# half of it, tells a mistaken unit from a slow sensor.
-_OTHER_UNITS = 30.0
-_COVERED = 0.5  # of a trial that a clock must cover: below it two clocks are taken to share no time
-_FEW = 10  # samples within the trial, fewer than which tell no motion
-_SLOW = 0.2  # s: a clock that ticks more slowly is likely in other units
+# Ratio of the durations or intervals of two clocks, from which one is taken to be in other units. Mistaken units are
+# wrong by a thousand and slow sensors by less than thirty, the geometric mean of one and a thousand.
+_MAX_CLOCK_RATIO = 30.0
+_MIN_COVERAGE = 0.5  # of a trial: a clock that covers less is taken to be a wrong one.
+_MIN_SAMPLES = 10  # within the trial: fewer show no motion.
+_MAX_INTERVAL = 0.2  # s: a clock with longer intervals is probably in other units.
 
 
 @dataclass(frozen=True)
 class Source:
-    """A recording with the variables that the mapping derives of it."""
+    """A recording, with the variables that a mapping derives from it."""
 
     recording: Recording
     constants: Mapping[str, Any] = field(default_factory=dict)
     derived: Mapping[str, str] = field(default_factory=dict)
 
     def variable(self, name: str, where: Place, within: tuple[str, ...] = ()) -> Variable:
-        """The variable of this name: derived, or as the recording has it.
+        """Variable of this name: the derived one, else the recording's.
+
+        `within` are the names of the derived variables that are being computed; `where` is the place to blame.
 
         Raises:
-            UserError: there is none, or it gives no numbers; the reason is said.
+            UserError: there is no such variable, or it gives no numbers, or it is derived from itself.
         """
         if name in self.derived and name not in within:
             return self._derive(name, where, within)
@@ -83,7 +85,7 @@ class Source:
 
 
 def _column(variable: Variable, name: str, column: Any, where: Place) -> tuple[np.ndarray, int]:
-    """One column by its place or its name, and its place."""
+    """Column of a variable by its number or name, and its number."""
     values, names = variable.values, variable.columns
     if values.ndim == 1:
         if column not in (None, 0):
@@ -110,7 +112,7 @@ def _column(variable: Variable, name: str, column: Any, where: Place) -> tuple[n
 
 
 def single(source: Source, name: str, where: Place) -> float:
-    """A number of the recording or of the mapping's constants."""
+    """Single number of this name, from the mapping's constants or else the recording."""
     values = np.asarray(source.constants.get(name) if name in source.constants else source.variable(name, where).values)
     if values.size != 1:
         where.fail(f"is scaled by {name!r}, which holds {values.size} values; name a single number")
@@ -119,23 +121,29 @@ def single(source: Source, name: str, where: Place) -> float:
 
 @dataclass(frozen=True)
 class Clock:
-    """When the samples of a trial were taken, and which rows of the recording they are."""
+    """Times of a trial's samples, and their rows in the recording."""
 
     time: Float[np.ndarray, " N"]  # s
     rows: Int[np.ndarray, " N"]
-    total: int  # rows of the recording
+    total: int  # number of rows of the recording
     source: Source
-    name: str = ""  # of the variable; empty where the sampling rate is given
+    name: str = ""  # name of the clock's variable; empty where the sampling rate is given
     units: str = "s"
     sort: bool = False
 
     def keep(self, rows: np.ndarray) -> Clock:
-        """Only these samples, by mask or index."""
+        """Clock of these samples only, by mask or index."""
         return Clock(self.time[rows], self.rows[rows], self.total, self.source, self.name, self.units, self.sort)
 
 
 def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place, report: Report) -> Clock:
-    """The clock that `time` or `rate_hz` gives, cut to `span` and `where`; `first` is the column of the first joint."""
+    """Clock of a trial by its `time` or `rate_hz`, cut to its `span` and `where`.
+
+    `first` is the column of the first joint: it has the number of samples, and shows which messages count.
+
+    Raises:
+        UserError: a variable cannot be read, times are out of order without `sort`, or no sample is left.
+    """
     if trial.time is None:
         assert trial.rate_hz is not None
         count = len(_column(source.variable(first.from_, where), first.from_, first.column, where)[0])
@@ -155,7 +163,7 @@ def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place,
 
 
 def _first_rows(first: Column, source: Source, where: Place) -> np.ndarray | None:
-    """Of a topic with several publishers, the messages that carry the trial's first joint."""
+    """Mask of the messages with the trial's first joint on a topic of several publishers; None on other topics."""
     if first.file is not None:
         return None
     variable = source.variable(first.from_, where)
@@ -165,7 +173,7 @@ def _first_rows(first: Column, source: Source, where: Place) -> np.ndarray | Non
 
 
 def _cut(clock: Clock, trial: MappedTrial, where: Place) -> Clock:
-    """`span`: seconds from the recording's first sample; `where`: a condition on its rows."""
+    """Cut a clock by the trial's `where`, a condition on rows of the recording, and `span`, s from the first sample."""
     if trial.where is not None:
         place, text = where / "where", trial.where
 
@@ -188,7 +196,11 @@ def _cut(clock: Clock, trial: MappedTrial, where: Place) -> Clock:
 
 
 def in_order(time: np.ndarray, name: str, sort: bool, where: Place, report: Report) -> np.ndarray:
-    """The order in which these times increase. Without `sort` they must do so by themselves."""
+    """Indices that put times into increasing order, without repeated ones.
+
+    Raises:
+        UserError: the times do not increase and `sort` is false.
+    """
     late = np.diff(time) <= 0.0
     if not late.any():
         return np.arange(len(time))
@@ -206,21 +218,21 @@ def in_order(time: np.ndarray, name: str, sort: bool, where: Place, report: Repo
 
 
 @dataclass
-class Columns:
-    """Reads columns onto a trial's clock, and remembers from when to when all of them are known."""
+class ColumnReader:
+    """Reader of columns onto a trial's clock. `begin` and `end` bound the time, s, for which all columns are known."""
 
     clock: Clock
-    sources: Callable[[str, Place], Source]  # other files by name
+    sources: Callable[[str, Place], Source]  # other recordings by name
     report: Report
     begin: float = -np.inf
     end: float = np.inf
 
-    def column(self, said: Said, units: str, whole: bool, where: Place) -> Float[np.ndarray, " N"]:
-        """One column: a term, or the sum of a list of them. `whole`: labels, which are not interpolated."""
-        return np.sum([self._term(term, units, whole, where) for term in terms(said)], axis=0)
+    def column(self, spec: ColumnSpec, units: str, whole: bool, where: Place) -> Float[np.ndarray, " N"]:
+        """One column in `units` (SI): a term or a sum of terms. `whole` marks labels, which are not interpolated."""
+        return np.sum([self._term(term, units, whole, where) for term in terms(spec)], axis=0)
 
     def _term(self, spec: Column, units: str, whole: bool, where: Place) -> np.ndarray:
-        """variable · scale + offset, in SI, on the trial's clock."""
+        """One term, variable · scale + offset, in SI units on the trial's clock."""
         clock = self.clock
         source = clock.source if spec.file is None else self.sources(spec.file, where)
         name = spec.from_
@@ -251,7 +263,7 @@ class Columns:
     def _own_clock(
         self, spec: Column, variable: Variable, source: Source, here: np.ndarray, where: Place
     ) -> tuple[str, np.ndarray] | None:
-        """Name and times, s, of the clock of a variable that does not share the trial's rows."""
+        """Name and times, s, of a variable's own clock; None for a variable that shares the trial's rows."""
         clock = self.clock
         if spec.time is not None:
             place = where / "time"
@@ -275,7 +287,11 @@ class Columns:
         return f"`{own}`", known_clocks[own].values
 
     def _onto(self, time: np.ndarray, values: np.ndarray, name: str, whole: bool, where: Place) -> np.ndarray:
-        """Values at the trial's times: between two samples of their own clock interpolated, beyond its ends NaN."""
+        """Values at the trial's times, interpolated between the samples of their own clock, and NaN beyond its ends.
+
+        Raises:
+            UserError: the two clocks do not fit each other.
+        """
         trial = self.clock.time
         good = np.isfinite(time)
         time, values = time[good], values[good]
@@ -291,19 +307,20 @@ class Columns:
         longer = (time[-1] - time[0]) / max(trial[-1] - trial[0], 1e-12)
         slower = np.median(np.diff(time)) / max(float(np.median(np.diff(trial))) if len(trial) > 1 else 0.0, 1e-12)
         few = int(((time >= trial[0]) & (time <= trial[-1])).sum())
-        if min(longer, slower) > _OTHER_UNITS or max(longer, slower) < 1.0 / _OTHER_UNITS or (few < _FEW <= len(time)):
+        units_differ = min(longer, slower) > _MAX_CLOCK_RATIO or max(longer, slower) < 1.0 / _MAX_CLOCK_RATIO
+        if units_differ or few < _MIN_SAMPLES <= len(time):
             where.fail(
                 f"{said}; they do not share their units: write time = {{ from = {name.strip('`')!r}, units = 'ms' }}, "
                 "or so"
             )
-        if inside.mean() < _COVERED:
+        if inside.mean() < _MIN_COVERAGE:
             begin, end = trial[inside][0] - trial[0], trial[inside][-1] - trial[0]
             where.fail(
                 f"{said}: it covers only a part; name another clock, or cut the trial by span = "
                 f"[{begin:.4g}, {end:.4g}]"
             )
         step = float(np.median(np.diff(time)))
-        if step > _SLOW:
+        if step > _MAX_INTERVAL:
             self.report.warning(
                 where.key, f"the clock {name} ticks every {step:.3g} s; convert ms to s if that is what it is"
             )
@@ -322,12 +339,12 @@ class Columns:
 
     @property
     def covered(self) -> np.ndarray:
-        """The samples at which every clock runs."""
+        """Mask of the samples at which every clock runs."""
         return (self.clock.time >= self.begin) & (self.clock.time <= self.end)
 
 
 def _converted(values: np.ndarray, spec: Reading, units: str, source: Source, where: Place) -> np.ndarray:
-    """variable · scale + offset, unwrapped where asked, in SI."""
+    """Convert a variable to SI units: variable · scale + offset, unwrapped where the mapping says so."""
     said = spec.units or units
     if said not in TO_SI or TO_SI[said].si != units:
         fitting = [name for name, unit in TO_SI.items() if unit.si == units]
@@ -352,7 +369,7 @@ def _unwrapped(values: np.ndarray, period: float) -> np.ndarray:
 
 
 def _stated(variable: Variable, spec: Column, units: str, report: Report, where: Place) -> None:
-    """Does the file state other units than the mapping?"""
+    """Warn where the recording states other units than the mapping."""
     stated, said = unit_name(variable.units), spec.units or units
     if stated and said in TO_SI and stated != said and spec.scale == 1.0 and TO_SI[stated] != TO_SI[said]:
         report.warning(
@@ -361,7 +378,11 @@ def _stated(variable: Variable, spec: Column, units: str, report: Report, where:
 
 
 def find(name: str, paths: Mapping[Path, Any], where: Place) -> Path:
-    """The given recording that `file` names: by the last parts of its path, as many as it takes."""
+    """Path of the given recording that `file` names, by the last parts of its path.
+
+    Raises:
+        UserError: no recording or several have this name.
+    """
     if not name:
         where.fail("has a `file` without a name; write that of a recording")
     parts = Path(name).parts

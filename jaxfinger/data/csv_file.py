@@ -1,8 +1,8 @@
-"""CSV as programs write it: the dialect is the one in which the most cells are numbers.
+"""CSV files of any program. The dialect is the one in which most cells are numbers.
 
-Excel, TwinCAT Scope, oscilloscopes and `numpy.savetxt` differ in separator, decimal mark, quotes, encoding, and in what
-stands above the numbers. The standard library's Sniffer and its successors guess separator and quotes from punctuation,
-and know neither decimal commas nor headers of several lines; numbers tell all of them at once.
+Excel, TwinCAT Scope, oscilloscopes and `numpy.savetxt` differ in separator, decimal mark, quotes, encoding and header.
+The standard library's Sniffer and its successors guess separator and quotes from punctuation, and know neither decimal
+commas nor headers of several lines. Counting numbers finds all of these at once.
 """
 
 from __future__ import annotations
@@ -22,36 +22,36 @@ from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.errors import UserError, counted
 
 _COMMENTS = ("#", "%")
-# (separator, decimal mark); None is any run of blanks. Of equals the first is taken.
+# Pairs of separator and decimal mark; None is any run of blanks. Among equally good ones the first is taken.
 _DIALECTS = ((",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("|", "."), (None, "."), (None, ","))
-_SAMPLE = 60  # lines from which the dialect is told
+_DIALECT_LINES = 60  # lines from the middle of the file that decide the dialect: enough for rare text cells to be few
 _TRUTH = {"true": 1.0, "false": 0.0}
 _UNIT = r"%|°|deg|rad|turn|rev|rpm|k?Hz|[mun]?s|[munc]?m|[mk]?N|[mk]?N[ ·*]?[cm]?m|[mu]?A|[mk]?V|°?C|K|[mk]?g|1|-|bool"
 _ALONE = re.compile(rf"^[\[(]?({_UNIT}|{_UNIT}/s2?|)[\])]?$")
 _BEHIND = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
 _STAMP = re.compile(r"^\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
-_SCOPE = "SampleTime[ms]"  # TwinCAT Scope: a column of times in ms beside each channel
+_SCOPE = "SampleTime[ms]"  # header of TwinCAT Scope, which writes a column of times in ms beside each channel
 
 
 @dataclass(frozen=True)
 class _Line:
-    number: int  # in the file, from 1
+    number: int  # line number in the file, from 1
     text: str
 
 
 def load_csv(path: Path) -> Recording:
-    """Columns by the names above the numbers; without names `column 0`, `column 1` and so on.
+    """Load the columns of a CSV file by the names above the numbers, or as `column 0`, `column 1` and so on.
 
-    Empty cells are NaN, True and False are 1 and 0, dates with a time of day are seconds since 1970.
+    Empty cells are NaN, True and False are 1 and 0, and dates with a time of day are seconds since 1970.
 
     Raises:
-        UserError: no columns of numbers, or a line of another width.
+        UserError: the file has no column of numbers, or a line with another number of cells.
     """
     lines = [_Line(number, text) for number, text in enumerate(_lines(_decode(path.read_bytes())), 1) if text.strip()]
     body = [line for line in lines if not line.text.lstrip().startswith(_COMMENTS)]
     if not body:
         raise UserError(f"{path}: holds no samples; it needs a line of names, then one line a sample")
-    sample = body[len(body) // 2 :][:_SAMPLE]
+    sample = body[len(body) // 2 :][:_DIALECT_LINES]
     split, numeric = _dialect([line.text for line in sample])
     if not any(numeric):
         raise UserError(f"{path}: holds no column of numbers; give a table with one line a sample")
@@ -63,7 +63,7 @@ def load_csv(path: Path) -> Recording:
         raise UserError(f"{path}: names {given} and holds {len(numeric)}; give each column one name")
     body, remarks = body[first:], ()
     if not names and [_cell(cell) for cell in split(body[0].text)] == list(range(len(numeric))) and len(body) > 1:
-        names, body = tuple(split(body[0].text)), body[1:]  # numbered columns, as pandas names them
+        names, body = tuple(split(body[0].text)), body[1:]  # pandas writes such a line over unnamed columns.
     if len(body) > 1 and len(split(body[-1].text)) < len(numeric):
         body, remarks = body[:-1], ("its last line is cut short and is left out",)
     columns, faults = _columns(path, body, split, numeric)
@@ -77,7 +77,7 @@ def _lines(text: str) -> list[str]:
 
 
 def _decode(raw: bytes) -> str:
-    """By its mark, as UTF-8, or as Western European, in which every byte is a character."""
+    """Decode by the byte order mark, as UTF-16 where many bytes are zero, as UTF-8, or else as Western European."""
     marks = (codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")
     for mark, encoding in marks:
         if raw.startswith(mark):
@@ -94,7 +94,7 @@ Split = Callable[[str], list[str]]
 
 
 def _dialect(sample: Sequence[str]) -> tuple[Split, list[bool]]:
-    """How a line is cut into cells (with points for decimal commas), and which columns hold numbers."""
+    """Find the dialect: a function that splits a line into cells with decimal points, and a mask of numeric columns."""
     best: tuple[tuple[float, int], Split, list[bool]] | None = None
     for separator, mark in _DIALECTS:
         split = _splitter(separator, mark)
@@ -124,7 +124,7 @@ def _splitter(separator: str | None, mark: str) -> Split:
 
 
 def _cell(cell: str) -> float | None:
-    """A number, or None where it is none."""
+    """Number in a cell: NaN in an empty cell, None in one that holds something else."""
     try:
         return float(cell) if "_" not in cell else None
     except ValueError:
@@ -146,10 +146,10 @@ def _is_sample(cells: Sequence[str], numeric: Sequence[bool]) -> bool:
 
 
 def _names(above: Sequence[_Line], split: Split, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
-    """Names of the columns, their units, and whether these are the pairs of columns of TwinCAT Scope.
+    """Names of the columns, their units, and whether they are pairs of time and value as TwinCAT Scope writes them.
 
-    The line next above the numbers that has a cell for each column is the names, unless it is one of units; behind a
-    comment mark (numpy.savetxt, gnuplot) it counts too.
+    The names are the nearest line above the numbers that has a cell for each column and holds no units. They may stand
+    behind a comment mark (numpy.savetxt, gnuplot).
     """
     rows = []
     for line in reversed(above):
@@ -173,12 +173,12 @@ def _names(above: Sequence[_Line], split: Split, width: int) -> tuple[tuple[str,
 def _columns(
     path: Path, body: Sequence[_Line], split: Split, numeric: Sequence[bool]
 ) -> tuple[list[np.ndarray | None], list[str]]:
-    """The columns as numbers; None, with the reason, where a cell is none."""
+    """Columns as numbers and a fault for each: None with the reason where a cell is no number, else an empty string."""
     separator, mark = split.separator, split.mark  # type: ignore[attr-defined]
     width, texts = len(numeric), [line.text for line in body]
     plain = all(numeric) and separator is not None and not any('"' in text for text in texts)
     if plain and all(text.count(str(separator)) == width - 1 for text in texts):
-        try:  # at the speed of C, where every cell is a plain number
+        try:  # numpy reads plain numbers much faster than the loop below.
             if mark == ",":
                 texts = [text.replace(",", ".") for text in texts]
             table = np.loadtxt(texts, delimiter=separator, ndmin=2, comments=None)
@@ -210,7 +210,7 @@ def _named(path, columns, faults, names, units, remarks) -> Recording:
     names = names or ("",) * len(columns)
     places: dict[str, list[int]] = defaultdict(list)
     for k, name in enumerate(names):
-        if name or (columns[k] is not None and not np.isnan(columns[k]).all()):
+        if name or (columns[k] is not None and not np.isnan(columns[k]).all()):  # Trailing separators make empty ones.
             places[name or f"column {k}"].append(k)
     variables, unusable = {}, {}
     for name, (k, *others) in places.items():
@@ -226,7 +226,7 @@ def _named(path, columns, faults, names, units, remarks) -> Recording:
 
 
 def _pairs(path, columns, faults, names, units) -> Recording:
-    """TwinCAT Scope: beside every channel the times of its own, in ms; each comes out as `name.time`, in s."""
+    """Recording of TwinCAT Scope, with a column of times in ms before every channel. It becomes `name.time`, in s."""
     variables: dict[str, Variable] = {}
     unusable: dict[str, str] = {}
     for k in range(0, len(columns), 2):
@@ -239,7 +239,7 @@ def _pairs(path, columns, faults, names, units) -> Recording:
         if clock is None or values is None:
             unusable[name] = faults[k] or faults[k + 1]
             continue
-        filled = np.isfinite(clock)  # channels sampled more slowly end earlier
+        filled = np.isfinite(clock)  # Channels with a lower sampling rate end earlier.
         variables[f"{name}.time"] = Variable(clock[filled] * 1e-3, units="s")
         variables[name] = Variable(values[filled], clock=f"{name}.time", units=units[k + 1])
     return Recording(path, variables, unusable)

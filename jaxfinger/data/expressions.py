@@ -1,5 +1,7 @@
-"""Arithmetic in a mapping: `kt * current`, `M @ motors`. Parsed, never evaluated as Python: what is not listed here is
-refused."""
+"""Arithmetic in a mapping, such as `kt * current` or `M @ motors`.
+
+Expressions are parsed, never evaluated as Python. Operators and functions that are not listed here are refused.
+"""
 
 from __future__ import annotations
 
@@ -34,25 +36,26 @@ _OPERATORS: dict[type, Callable] = {
 _FUNCTIONS = {
     name: getattr(np, name) for name in ("sin", "cos", "tan", "arctan", "sqrt", "exp", "log", "deg2rad", "rad2deg")
 } | {"abs": np.abs, "sign": np.sign}
-_LONGEST = 2000  # characters; deep nesting exhausts the parser before that
+_MAX_LENGTH = 2000  # characters, longer than any formula. Deep nesting fails earlier, with a message of its own.
 
 
 class ExpressionError(ValueError):
-    """The rest of a sentence that begins with the expression."""
+    """Fault of an expression. The message is the end of a sentence that begins with the expression."""
 
 
 def evaluate(text: str, lookup: Callable[[str, Any], Any], constants: Mapping[str, Any]) -> np.ndarray:
-    """The value of an expression over the samples: (N,) or (N, k).
+    """Value of an expression over N samples: (N,) or (N, k).
 
-    `name`, `outer.inner` and, for names that are no identifiers, `'q [deg]'` are variables: `lookup(name, column)`;
-    `name[1]` and `name['MCP']` choose a column. `[a, b]` puts variables beside each other. `constants` (numbers and
-    matrices) come first. `M @ x` multiplies every sample by a matrix.
+    Variables are `name`, `outer.inner` or, for names that are no identifiers, `'q [deg]'`. Their values are
+    `lookup(name, column)`, where `name[1]` and `name['MCP']` choose a column and `name` alone passes None. A constant
+    (number or matrix) goes before a variable of the same name. `[a, b]` puts variables beside each other, and `M @ x`
+    multiplies every sample by a matrix.
 
     Raises:
-        ExpressionError: it does not parse, or holds what is not allowed, or the shapes do not fit.
+        ExpressionError: the text does not parse, holds something that is not allowed, or its shapes do not fit.
     """
-    if len(text) > _LONGEST:
-        raise ExpressionError(f"is longer than {_LONGEST} characters; derive it in steps")
+    if len(text) > _MAX_LENGTH:
+        raise ExpressionError(f"is longer than {_MAX_LENGTH} characters; derive it in steps")
     try:
         tree = ast.parse(text.strip(), mode="eval")
         with np.errstate(all="ignore"):
@@ -108,7 +111,7 @@ def _value(node: ast.AST, lookup: Callable[[str, Any], Any], constants: Mapping[
 
 
 def _aligned(apply: Callable, left: Any, right: Any) -> Any:
-    """(N,) times (N, k) goes sample by sample."""
+    """Apply an operator to two values, and to (N,) and (N, k) sample by sample."""
     if {np.ndim(left), np.ndim(right)} == {1, 2}:
         column, table = (left, right) if np.ndim(left) == 1 else (right, left)
         if len(column) == len(table):

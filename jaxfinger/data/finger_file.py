@@ -1,4 +1,4 @@
-"""The finger in TOML, the one form of mapping, rig and finger files: read into, and written from, a finger's record.
+"""The finger in TOML, read and written. Mapping, rig and finger files describe a finger in this one form:
 
     [finger]
     gravity = [0.0, 0.0, -9.81]       # m/s², in the base frame
@@ -17,7 +17,7 @@
     crosses = ["MCP"]
     excursion = { MCP = [0.008, 1e-3] }   # m/rad, m/rad², …, optional: what CAD says of pulled length against angle
 
-Elsewhere `finger = "session.h5"` or `finger = "finger.toml"` takes it from another file.
+A line `finger = "session.h5"` or `finger = "finger.toml"` takes the description from another file.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ NotNegative = Annotated[float, Within(0.0)]
 
 @dataclass(frozen=True)
 class Joint:
-    """`[[finger.joints]]`: a joint and its link. Lengths m, angles rad (m of a prismatic joint), kg, kg m²."""
+    """`[[finger.joints]]`: a joint and its link. Units m, kg, kg m², and rad (m for a prismatic joint)."""
 
     name: str
     axis: Vector
@@ -73,7 +73,7 @@ class Joint:
 
     @property
     def range(self) -> tuple[float, float]:
-        """Lower and upper limit in rad, or m."""
+        """Lower and upper limit, rad (m for a prismatic joint)."""
         if self.limits is not None:
             return self.limits
         lower, upper = np.radians(np.array(self.limits_deg, np.float64))
@@ -82,7 +82,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class Tendon:
-    """`[[finger.tendons]]`. `excursion` gives, by joint, the coefficients of q, q², … in m/rad, m/rad², …"""
+    """`[[finger.tendons]]`. `excursion` holds the coefficients of q, q², … in m/rad, m/rad², … by joint."""
 
     name: str
     crosses: tuple[str, ...]
@@ -105,7 +105,7 @@ class Tendon:
 
 @dataclass(frozen=True)
 class Finger:
-    """`[finger]`."""
+    """`[finger]`: gravity in m/s² in the base frame, fingertip in m in the last link's frame, joints and tendons."""
 
     gravity: Vector
     fingertip: Vector
@@ -134,10 +134,10 @@ class Finger:
 
 
 def finger_from(said: str | Finger, place: Place) -> FingerDescription:
-    """The finger that a file describes, or takes from the session (HDF5) or TOML file that it names.
+    """Description of a finger. `said` is its table, or the name of a session (HDF5) or TOML file that holds one.
 
     Raises:
-        UserError: the other file cannot be read, or no finger can be as it is described.
+        UserError: the other file cannot be read, or the checker refuses the finger.
     """
     if isinstance(said, Finger):
         return _sound(_description(said), place)
@@ -156,12 +156,12 @@ def finger_from(said: str | Finger, place: Place) -> FingerDescription:
 
 
 def _sound(finger: FingerDescription, place: Place) -> FingerDescription:
-    """The finger, unless the checker refuses it."""
+    """Check a finger and return it; UserError at the fault's key where the checker refuses it."""
     report = Report()
     check_finger(finger, report)
     if (fault := report.fatal) is not None:
         kind, *key = fault.place.removeprefix("/finger").strip("/").split("/")
-        if fault.row is not None:  # a link is written with its joint
+        if fault.row is not None:  # The file has links in the tables of their joints.
             place = place / ("tendons" if kind == "tendons" else "joints") / fault.row / key[0]
             place.fail(fault.message)
         place.fail(": ".join(filter(None, ["/".join([kind, *key]), fault.message])))
@@ -217,7 +217,7 @@ def _description(finger: Finger) -> FingerDescription:
 
 
 def finger_toml(finger: FingerDescription) -> str:
-    """The finger as text of a TOML file, the inverse of `finger_from`."""
+    """Text of a TOML file that describes the finger, the inverse of `finger_from`."""
     lines = ["[finger]", f"gravity = {_numbers(finger.gravity)}", f"fingertip = {_numbers(finger.fingertip)}"]
     for i, name in enumerate(finger.joint_names):
         lines += ["", "[[finger.joints]]", f"name = {quoted(name)}"]
@@ -246,5 +246,5 @@ def finger_toml(finger: FingerDescription) -> str:
 
 
 def _numbers(value: np.ndarray | float) -> str:
-    """Numbers in as few digits as read back as the same."""
+    """Numbers in TOML, with the fewest digits that give the same floats when read."""
     return str(np.asarray(value, np.float64).tolist())

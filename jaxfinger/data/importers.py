@@ -1,7 +1,7 @@
-"""Recordings of other tools as sessions, by a mapping file (TOML), as docs/your-own-data.md has it.
+"""Import of other tools' recordings as sessions by a mapping file (TOML; docs/your-own-data.md).
 
-A column is (variable · scale + offset) in `units`; a list of such tables is their sum. Variables on their own clock
-are interpolated to the trial's. Columns that are not named are NaN: not measured.
+A column is (variable · scale + offset) in `units`, or the sum of a list of such terms. Variables with a clock of their
+own are interpolated to the trial's. Columns without a mapping are NaN, which means not measured.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from jaxfinger.data.check import check_session, examine
-from jaxfinger.data.columns import Columns, Source, find, trial_clock
+from jaxfinger.data.columns import ColumnReader, Source, find, trial_clock
 from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.finger_file import finger_from
 from jaxfinger.data.hdf5 import write_session
@@ -35,12 +35,13 @@ def import_file(
     overwrite: bool = False,
     report: Report | None = None,
 ) -> Session:
-    """Turn recordings into one dataset file by a mapping file; the session is returned too.
+    """Import recordings by a mapping file, write the session to `out`, and return it.
 
-    `report` takes what is worth saying of recordings, mapping and session: all that `check_file` would say.
+    Findings about recordings, mapping and session, including all of `check_file`, go to `report`.
 
     Raises:
-        UserError: a mistake in the mapping, a variable that is not there, or a session that the checker refuses.
+        UserError: the mapping has a mistake, a variable is missing, the checker refuses the session, or `out` cannot be
+            written.
     """
     session = import_session(sources, mapping_path, report)
     write_session(session, out, overwrite)
@@ -50,7 +51,11 @@ def import_file(
 def import_session(
     sources: Sequence[str | os.PathLike], mapping_path: str | os.PathLike, report: Report | None = None
 ) -> Session:
-    """The session that a mapping makes of recordings, in memory; refused where the checker finds an error."""
+    """Import recordings by a mapping file as a session in memory.
+
+    Raises:
+        UserError: the mapping has a mistake, a variable is missing, or the checker refuses the session.
+    """
     report = Report() if report is None else report
     mapping, where = read_mapping(Path(mapping_path))
     finger = finger_from(mapping.finger, where / "finger")
@@ -75,7 +80,7 @@ def import_session(
 
 
 class _Recordings:
-    """The given files, each read once and when it is first needed."""
+    """The given recordings. Each is read when it is first needed, and only once."""
 
     def __init__(self, sources: Sequence[str | os.PathLike], mapping: MappingFile, where: Place, report: Report):
         self.paths = list({Path(source).resolve(): Path(source) for source in sources}.values())
@@ -89,7 +94,7 @@ class _Recordings:
         self._sources: dict[tuple[Path, str], Source] = {}
 
     def source(self, name: str | None, derived: Mapping[str, str], where: Place) -> Source:
-        """The recording called `name`, or the only one, with what the mapping and the trial derive of it."""
+        """Recording of this name, or the only one, with the variables that mapping and trial derive from it."""
         if name is None and len(self.paths) > 1:
             where.fail(f"has no `file`; name one of {listed([str(path) for path in self.paths])}")
         path = self.paths[0] if name is None else find(name, dict.fromkeys(self.paths), where)
@@ -103,14 +108,14 @@ class _Recordings:
         )
 
     def unread(self) -> None:
-        """Name the recordings that no trial reads."""
+        """Warn of recordings that no trial reads."""
         for path in self.paths:
             if path not in self._loaded:
                 self._report.warning(str(path), "is read by no trial; name it as `file` of one, or leave it out")
 
 
 def _where_of(fault: Finding, where: Place) -> Place:
-    """The key of a mapping that a place in the session comes from."""
+    """Key of the mapping from which the place of a finding comes."""
     _, room, *names = fault.place.split("/")
     for key in (
         ("trials", names[0], *(("channels", *names[1:]) if len(names) > 1 else ())) if room == "trials" else (room,)
@@ -128,13 +133,13 @@ def _trial(
     where: Place,
     report: Report,
 ) -> Trial:
-    channels = trial.channels.over(shared).said()
+    channels = trial.channels.over(shared).mapped()
     source = recordings.source(trial.file, trial.derived, where)
     if "q" not in channels:
         where.fail("maps no channel `q`; name the joint positions")
     clock = trial_clock(trial, terms(next(iter(channels["q"].values())))[0], source, where, report)
-    columns = Columns(clock, lambda file, place: recordings.source(file, trial.derived, place), report)
-    own = trial.channels.said()
+    columns = ColumnReader(clock, lambda file, place: recordings.source(file, trial.derived, place), report)
+    own = trial.channels.mapped()
     places = {c: (where if c in own else Place(where.file, where.lines)) / "channels" / c for c in channels}
     values = {channel: _channel(channel, said, columns, finger, places[channel]) for channel, said in channels.items()}
     keep = columns.covered
@@ -147,7 +152,7 @@ def _trial(
         for channel, x in values.items()
     }
     if not finger.n and "tendon_force" in DRIVES.get(trial.experiment, ()):
-        arrays.setdefault("tendon_force", np.zeros((len(time), 0)))  # of a machine without tendons
+        arrays.setdefault("tendon_force", np.zeros((len(time), 0)))  # The format requires it without tendons, too.
     return Trial(
         name=name,
         experiment=trial.experiment,
@@ -166,8 +171,8 @@ def _entry(channel: str) -> Entry:
     return TEMPERATURE if channel == "temperature" else CHANNELS[channel]
 
 
-def _channel(channel: str, spec: Any, columns: Columns, finger: FingerDescription, where: Place) -> np.ndarray:
-    """One channel (N, columns): those that are named, the others NaN (directions 0)."""
+def _channel(channel: str, spec: Any, columns: ColumnReader, finger: FingerDescription, where: Place) -> np.ndarray:
+    """One channel (N, columns). Columns without a mapping are NaN, or 0 in directions."""
     entry = _entry(channel)
     units = units_of(entry, finger.prismatic) or "1"
     if channel == "hold":
@@ -185,7 +190,11 @@ def _channel(channel: str, spec: Any, columns: Columns, finger: FingerDescriptio
 
 
 def _labels(channel: str, values: np.ndarray, where: Place) -> np.ndarray:
-    """Directions and holds as the whole numbers that they must be: never wrapped or cut to fit."""
+    """Directions or holds as whole numbers.
+
+    Raises:
+        UserError: a value is not whole or out of its range; converting it would wrap or cut it.
+    """
     kind = CHANNELS[channel].kind
     lowest, highest, allowed = RANGES[kind]
     bad = ~((values >= lowest) & (values <= highest) & (values == np.round(values)))

@@ -1,4 +1,4 @@
-"""What a recording holds (names, sizes, rates, gaps, units guessed from ranges), and a mapping that reads it."""
+"""Survey of a recording (names, ranges, rates, gaps, guessed units), and a proposal of a mapping that reads it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
 from jaxfinger.data.units import TO_SI, unit_name
 
-_GAP = 5.0  # times the median interval: a sample or more was lost
-# What a name says that a variable is: (channel, pattern), the first that fits. Words of robots' logs in several habits.
+_MIN_GAP = 5.0  # times the median interval: well beyond jitter, so samples were lost.
+# Patterns of names for each channel, of which the first that fits counts: common words in logs of robots.
 _MEANINGS = (
     ("time", r"^t$|time|stamp|clock|zeit|^sec"),
     ("temperature", r"temp"),
@@ -24,17 +24,19 @@ _MEANINGS = (
     ("fingertip_force", r"f?tip|contact|^f[xyz]$|wrench"),
     ("q", r"^q[_\d]*|angle|pos|enc|theta|winkel|deg$"),
 )
-_NOT = r"(?<![a-z])vel|speed|dot|^v$|^dq|cmd|command|ref|desired|set|goal"
-# Largest sizes that a channel has in its units: the first unit in which the numbers are no larger is the guess.
-_SIZES = {
+# Names of velocities and commands, which belong to no channel.
+_NO_CHANNEL = r"(?<![a-z])vel|speed|dot|^v$|^dq|cmd|command|ref|desired|set|goal"
+# Largest plausible values of a channel by unit, with room for arms. The first unit whose largest value is not exceeded
+# is the guess. Torques from 5 to 100 may be an arm's in N m or a finger's in N mm, so their unit stays open.
+_MAX_VALUES = {
     "q": (("rad", 7.0), ("deg", 400.0)),
-    "joint_torque": (("N m", 5.0), ("", 100.0), ("N mm", 5e3)),  # a finger's in N mm, or an arm's in N m: nothing tells
+    "joint_torque": (("N m", 5.0), ("", 100.0), ("N mm", 5e3)),
     "tendon_force": (("N", 500.0), ("mN", 1e6)),
     "tendon_excursion": (("m", 0.2), ("mm", 200.0)),
     "fingertip_force": (("N", 100.0), ("mN", 1e5)),
     "temperature": (("degC", 200.0), ("K", 1e3)),
 }
-_UNITS_OF = {
+_SI_UNITS = {
     "time": ("s",),
     "temperature": ("K",),
     "joint_torque": ("N m", "N"),
@@ -43,46 +45,47 @@ _UNITS_OF = {
     "fingertip_force": ("N",),
     "q": ("rad", "m"),
 }
-_OF_UNITS = {"rad": "q", "N m": "joint_torque", "N": "tendon_force", "m": "tendon_excursion"}
-_MOVES = {"rad": 0.1, "m": 1e-3}  # spans of an angle, or a slide, that moves; less is what a fixture yields
-_TICKS = (("s", 1e-5, 0.5), ("ms", 0.01, 500.0), ("us", 10.0, 5e5), ("ns", 1e4, 5e8))  # of usual intervals
-_PARTS = 400  # of a recording: a step of a protocol lasts several, and noise is averaged in each
-_STANDS = 0.1  # of the quickest change from part to part, below which a joint stands still
-_MOSTLY = 0.4  # share of the parts in which a stepped joint stands still; one that swings does so in a sixteenth
-_FREE = 0.5  # of the highest tension, by which tension changes where it drives the finger (VD.3), and not along a path
+_CHANNEL_OF_UNITS = {"rad": "q", "N m": "joint_torque", "N": "tendon_force", "m": "tendon_excursion"}
+_MIN_TRAVEL = {"rad": 0.1, "m": 1e-3}  # Less is the yield of a fixture.
+# Ranges of the usual interval, 10 µs to 0.5 s, in each unit. Where they overlap the first one counts.
+_INTERVALS = (("s", 1e-5, 0.5), ("ms", 0.01, 500.0), ("us", 10.0, 5e5), ("ns", 1e4, 5e8))
+_PARTS = 400  # of a recording: a step of a protocol lasts several of them, and each averages noise.
+_MAX_STILL_CHANGE = 0.1  # of the quickest change between parts: with less a joint stands still.
+_MIN_STILL_SHARE = 0.4  # of the parts: a stepped joint stands still in more of them, a swinging one in a sixteenth.
+_MIN_TENSION_CHANGE = 0.5  # of the highest tension: larger where tendons drive the finger (VD.3), smaller in VD.1.
 _HEAD = 'specimen = "my finger"\nfinger = "finger.toml"'
 
 
 @dataclass(frozen=True)
 class Seen:
-    """One column of a recording."""
+    """Survey of one column of a recording."""
 
     name: str
-    column: str | int | None
+    column: str | int | None  # name or number, None for a variable with one column
     samples: int
-    low: float
-    high: float
-    missing: int  # NaN
-    units: str  # stated by the recording, else guessed; empty where nothing tells
-    stated: bool
-    meaning: str  # a channel, `time`, or empty
+    low: float  # smallest value
+    high: float  # largest value
+    missing: int  # number of values that are NaN or infinite
+    units: str  # as the recording states them, else a guess; empty where they are unclear
+    stated: bool  # whether the recording states the units
+    meaning: str  # channel, `time`, or empty
 
 
 @dataclass(frozen=True)
 class Ticks:
-    """One clock of a recording: a variable that increases as times do."""
+    """Survey of one clock of a recording: a variable that increases as times do."""
 
     name: str
     units: str
     duration: float  # s
     rate: float  # Hz
-    gaps: int
-    longest: float  # s
-    disordered: int  # stamps that do not increase
+    gaps: int  # number of gaps
+    longest: float  # s, longest gap
+    disordered: int  # number of stamps that do not increase
 
 
 def columns_of(recording: Recording) -> list[Seen]:
-    """Every column of every variable."""
+    """Survey every column of every variable of a recording."""
     found = []
     for name, variable in recording.variables.items():
         table = variable.values.reshape(len(variable.values), -1)
@@ -94,7 +97,7 @@ def columns_of(recording: Recording) -> list[Seen]:
             if spelt:
                 units = spelt
             elif not stated:
-                units = _tick(x) if meaning == "time" else _guess(meaning, x)
+                units = _time_unit(x) if meaning == "time" else _unit(meaning, x)
             finite = x[np.isfinite(x)]
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
             found.append(Seen(name, column, len(x), low, high, len(x) - len(finite), units, stated, meaning))
@@ -102,7 +105,7 @@ def columns_of(recording: Recording) -> list[Seen]:
 
 
 def clocks_of(recording: Recording, seen: Sequence[Seen]) -> list[Ticks]:
-    """Rate, duration and gaps of every clock."""
+    """Survey every clock among the columns of a recording."""
     return [
         ticks(s.name, recording.variables[s.name], s.units or "s")
         for s in seen
@@ -111,11 +114,11 @@ def clocks_of(recording: Recording, seen: Sequence[Seen]) -> list[Ticks]:
 
 
 def ticks(name: str, variable: Variable, units: str) -> Ticks:
-    """How a clock runs, once its stamps are in order."""
+    """Survey one clock, with its stamps put into order."""
     time = np.ravel(variable.values) * TO_SI[units].factor
     steps = _steps(time)
     usual = float(np.median(steps)) if len(steps) else np.nan
-    gaps = steps > _GAP * usual
+    gaps = steps > _MIN_GAP * usual
     return Ticks(
         name,
         units,
@@ -128,45 +131,48 @@ def ticks(name: str, variable: Variable, units: str) -> Ticks:
 
 
 def _steps(time: np.ndarray) -> np.ndarray:
-    """From stamp to stamp, in the order of time: what the order of the file says of them would be no rate."""
+    """Intervals between the distinct stamps in order of time, since stamps in the file may be out of order."""
     return np.diff(np.unique(time[np.isfinite(time)]))
 
 
 def _meaning(name: str, column: str | int | None, x: np.ndarray, units: str) -> str:
-    """What the last word of a name says, where it can be so; else what has these units."""
-    bare = re.sub(r"[\[(].*", "", name).strip("/ ")  # units stand in brackets
+    """Channel or `time` by the last word of a name where the units allow it, else by the units; empty where unclear."""
+    bare = re.sub(r"[\[(].*", "", name).strip("/ ")  # Units stand in brackets.
     word = re.split(r"[./]", bare)[-1].lower()
-    if re.search(_NOT, word):
+    if re.search(_NO_CHANNEL, word):
         return ""
     for meaning, pattern in _MEANINGS:
-        if re.search(pattern, word) and (not units or TO_SI[units].si in _UNITS_OF[meaning]):
+        if re.search(pattern, word) and (not units or TO_SI[units].si in _SI_UNITS[meaning]):
             runs = len(x) > 2 and len(np.unique(x)) > 0.5 * len(x)
             return meaning if meaning != "time" or (column is None and runs) else ""
-    return _OF_UNITS.get(TO_SI[units].si, "") if units else ""
+    return _CHANNEL_OF_UNITS.get(TO_SI[units].si, "") if units else ""
 
 
 def _spelt(name: str) -> str:
-    """The unit that a name ends in, `stamp_ms`; of one letter it may be anything."""
+    """Unit at the end of a name such as `stamp_ms`. A single letter is not taken for one."""
     last = re.split(r"[\s_./]", name.strip())[-1]
     return unit_name(last) if len(last) > 1 else ""
 
 
-def _tick(x: np.ndarray) -> str:
+def _time_unit(x: np.ndarray) -> str:
+    """Guess the unit of a clock from its usual interval."""
     steps = _steps(x)
     step = float(np.median(steps)) if len(steps) else np.nan
-    return next((unit for unit, low, high in _TICKS if low <= step < high), "s")
+    return next((unit for unit, low, high in _INTERVALS if low <= step < high), "s")
 
 
-def _guess(meaning: str, x: np.ndarray) -> str:
+def _unit(meaning: str, x: np.ndarray) -> str:
+    """Guess the unit of a channel from the size of its values."""
     size = float(np.nanpercentile(np.abs(x), 99.0)) if np.isfinite(x).any() else np.nan
-    return next((unit for unit, most in _SIZES.get(meaning, ()) if size <= most), "")
+    return next((unit for unit, largest in _MAX_VALUES.get(meaning, ()) if size <= largest), "")
 
 
 def proposal(recordings: Sequence[Recording], finger: FingerDescription | None = None, head: str = _HEAD) -> str:
-    """A mapping (TOML) that reads these recordings: one trial of each, to be corrected by who knows the rig.
+    """Propose a mapping (TOML) with one trial for each recording, to be corrected by someone who knows the rig.
 
-    Joints and tendons are those of the finger whose names the columns hold, else in order; without a finger they are
-    named by the recordings. What all recordings have alike is shared. `head`: the lines of specimen and finger.
+    Columns are assigned to the finger's joints and tendons by name, or in order where names do not match. Without a
+    finger, joints and tendons are named as in the recordings. Channels that all recordings map alike are shared. `head`
+    holds the lines of specimen and finger.
     """
     looked = [_looked(recording, finger) for recording in recordings]
     channels = {channel: None for trial in looked for channel in trial.channels}
@@ -191,13 +197,14 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
 
 @dataclass(frozen=True)
 class _Looked:
-    """What a recording may be as a trial: the lines that say so, and of each channel its columns by name."""
+    """Proposal for one recording as a trial."""
 
-    lines: list[str]
-    channels: dict[str, list[tuple[str, str]]]
+    lines: list[str]  # of TOML: experiment, joint, tendon and time
+    channels: dict[str, list[tuple[str, str]]]  # name and reading of each column
 
 
 def _looked(recording: Recording, finger: FingerDescription | None) -> _Looked:
+    """Propose a trial for a recording."""
     seen = columns_of(recording)
     clock = next((s for s in seen if s.meaning == "time" and s.name.endswith(".stamp")), None)
     clock = clock or next((s for s in seen if s.meaning == "time"), None)
@@ -208,7 +215,7 @@ def _looked(recording: Recording, finger: FingerDescription | None) -> _Looked:
     names = {channel: _names(channel, columns, finger) for channel, columns in channels.items()}
     experiment, joint, tendon = _experiment(recording, channels, names)
     if joint and len(channels.get("joint_torque", ())) == 1:
-        names["joint_torque"] = [joint]  # the one that the motor moves
+        names["joint_torque"] = [joint]  # A single torque sensor belongs to the joint that the motor moves.
     lines = [f'experiment = "{experiment}"   # guessed: ID.2, ID.3-static, ID.3-dynamic, ID.4, VD.1, VD.2 or VD.3']
     lines += [f"joint = {quoted(joint)}   # that is moved, or held by the torque sensor"] if joint else []
     lines += [f"tendon = {quoted(tendon)}   # that is pulled"] if tendon else []
@@ -230,17 +237,17 @@ def _looked(recording: Recording, finger: FingerDescription | None) -> _Looked:
 def _experiment(
     recording: Recording, channels: Mapping[str, Sequence[Seen]], names: Mapping[str, Sequence[str]]
 ) -> tuple[str, str, str]:
-    """What moves tells which experiment it may be, of which joint and tendon; empty where none is.
+    """Guess experiment, joint and tendon (empty where there is none) from what moves.
 
-    Which joint a torque sensor holds no motion tells: `?`, which import refuses, unless it is the only one, or named by
-    the file.
+    No motion shows which joint a torque sensor holds. It is the only joint, or the one in the file's name, or else `?`,
+    which import refuses.
     """
     q, force, excursion, torque = (
         channels.get(c, ()) for c in ("q", "tendon_force", "tendon_excursion", "joint_torque")
     )
     units = [s.units or "rad" for s in q]
     spans = [
-        (s.high - s.low) * TO_SI[u].factor / _MOVES.get(TO_SI[u].si, np.inf) for s, u in zip(q, units, strict=True)
+        (s.high - s.low) * TO_SI[u].factor / _MIN_TRAVEL.get(TO_SI[u].si, np.inf) for s, u in zip(q, units, strict=True)
     ]
     moved = [k for k, span in enumerate(spans) if span > 1.0]
     most = int(np.nanargmax(spans)) if moved else 0
@@ -259,7 +266,7 @@ def _experiment(
     if len(moved) == 1:
         return "ID.2", joint, ""
     high = max((s.high for s in force), default=0.0)
-    return ("VD.3" if max(pulls, default=0.0) > _FREE * high else "VD.1"), "", ""
+    return ("VD.3" if max(pulls, default=0.0) > _MIN_TENSION_CHANGE * high else "VD.1"), "", ""
 
 
 def _stepped(recording: Recording, seen: Seen) -> bool:
@@ -270,10 +277,11 @@ def _stepped(recording: Recording, seen: Seen) -> bool:
     x = table[:, 0 if seen.column is None else columns.index(seen.column) if columns else int(seen.column)]
     x = x[np.isfinite(x)]
     steps = np.abs(np.diff([part.mean() for part in np.array_split(x, min(len(x), _PARTS))]))
-    return float(np.mean(steps < _STANDS * np.percentile(steps, 95.0))) > _MOSTLY
+    return float(np.mean(steps < _MAX_STILL_CHANGE * np.percentile(steps, 95.0))) > _MIN_STILL_SHARE
 
 
 def _names(channel: str, columns: Sequence[Seen], finger: FingerDescription | None) -> list[str]:
+    """Names of joints, tendons, axes or sensors for the columns of a channel."""
     if channel == "temperature":
         return [s.name for s in columns]
     if channel == "fingertip_force":
@@ -288,6 +296,7 @@ def _names(channel: str, columns: Sequence[Seen], finger: FingerDescription | No
 
 
 def _column(seen: Seen) -> str:
+    """Inline table (TOML) that reads a column."""
     parts = [f"from = {quoted(seen.name)}"]
     if seen.column is not None:
         parts.append(f"column = {quoted(seen.column) if isinstance(seen.column, str) else seen.column}")

@@ -1,4 +1,4 @@
-"""What a mapping file may say, as records; docs/your-own-data.md says it in words.
+"""Mapping files as records. docs/your-own-data.md explains them in words.
 
 specimen = "finger 3"
 finger = "finger.toml"              # or a session, or a table [finger] as in `finger_file`
@@ -26,17 +26,17 @@ from jaxfinger.data.finger_file import Finger
 from jaxfinger.data.session import EXPERIMENTS
 from jaxfinger.data.toml import Fault, NotEmpty, OneOf, Place, Positive, Within, read_toml
 
-_Place = Annotated[int, Within(0)] | str  # of a column: from 0, or its name
+_ColumnKey = Annotated[int, Within(0)] | str  # number of a column, from 0, or its name
 
 
 class _Numbers:
-    """Annotation of a number, a list or a matrix of numbers."""
+    """Annotation of a value that must be a number, a list or a matrix of numbers."""
 
     def check(self, value: Any) -> None:
         """Raise Fault where the value is anything else."""
         try:
             numbers = np.asarray(value)
-        except ValueError:  # rows of different lengths
+        except ValueError:  # Rows have different lengths.
             numbers = np.asarray("")
         if numbers.dtype.kind not in "iuf" or not np.isfinite(numbers).all() or numbers.size == 0:
             raise Fault("must be a number, a list or a matrix of numbers")
@@ -44,37 +44,37 @@ class _Numbers:
 
 @dataclass(frozen=True)
 class Reading:
-    """A variable of a recording: (variable · scale + offset) in `units`."""
+    """Reading of a recording's variable: (variable · scale + offset) in `units`."""
 
     from_: str
-    column: _Place | None = None
-    scale: float | str = 1.0  # or the name of a variable that holds one number
+    column: _ColumnKey | None = None
+    scale: float | str = 1.0  # a number, or the name of a variable that holds one number
     offset: float = 0.0
     units: str | None = None
 
 
 @dataclass(frozen=True)
 class Column(Reading):
-    """A variable that is a column of a channel, or one of those whose sum is."""
+    """Term of a column of a channel: a reading, with its own clock or file where these are not the trial's."""
 
     time: str | Reading | None = None  # the variable's own clock
-    file: str | None = None  # where it is not the trial's
-    unwrap: bool | Positive = False  # true: of whole turns; else the period of the variable
+    file: str | None = None  # the recording that holds it, where it is not the trial's
+    unwrap: bool | Positive = False  # true: whole turns are unwrapped; a number: the variable's period
 
 
-Said = str | Column | Annotated[tuple[str | Column, ...], NotEmpty()]  # of a list, the sum
-Columns = Mapping[str, Said]
+ColumnSpec = str | Column | Annotated[tuple[str | Column, ...], NotEmpty()]  # A list means the sum of its terms.
+Columns = Mapping[str, ColumnSpec]
 
 
-def terms(said: Said) -> tuple[Column, ...]:
-    """The variables whose sum a column is."""
-    each = said if isinstance(said, tuple) else (said,)
+def terms(spec: ColumnSpec) -> tuple[Column, ...]:
+    """Terms whose sum is the column."""
+    each = spec if isinstance(spec, tuple) else (spec,)
     return tuple(Column(term) if isinstance(term, str) else term for term in each)
 
 
 @dataclass(frozen=True)
 class Channels:
-    """`[channels]`: of each channel the columns that were measured, by joint, tendon, axis or name."""
+    """`[channels]`: the measured columns of each channel, by the name of their joint, tendon, axis or sensor."""
 
     q: Columns = field(default_factory=dict)
     tendon_force: Columns = field(default_factory=dict)
@@ -84,24 +84,24 @@ class Channels:
     joint_direction: Columns = field(default_factory=dict)
     tendon_direction: Columns = field(default_factory=dict)
     temperature: Columns = field(default_factory=dict)
-    hold: Said | None = None
+    hold: ColumnSpec | None = None
 
     def over(self, shared: Channels) -> Channels:
-        """These channels, and the shared ones of which these say nothing."""
+        """Channels of a trial: these ones, and the shared ones that these leave out."""
         own = {f.name: value for f in fields(self) if (value := getattr(self, f.name))}
         return replace(shared, **own)
 
-    def said(self) -> dict[str, Any]:
-        """The channels of which something is said."""
+    def mapped(self) -> dict[str, Any]:
+        """Mapped channels by name."""
         return {f.name: value for f in fields(self) if (value := getattr(self, f.name))}
 
 
 @dataclass(frozen=True)
 class MappedTrial:
-    """`[trials.<name>]`: which part of which recording a trial is."""
+    """`[trials.<name>]`: the part of a recording that is a trial."""
 
     experiment: Annotated[str, OneOf(EXPERIMENTS)]
-    file: str | None = None  # may be left out where one recording is given
+    file: str | None = None  # optional where only one recording is given
     joint: str | None = None
     tendon: str | None = None
     complete: bool = True
@@ -125,7 +125,7 @@ class MappedTrial:
 
 @dataclass(frozen=True)
 class MappingFile:
-    """A mapping file. `derived` are expressions of variables, `constants` numbers for them."""
+    """Content of a mapping file. `derived` are expressions of variables by name, `constants` the numbers in them."""
 
     specimen: str
     finger: str | Finger
@@ -148,15 +148,15 @@ class MappingFile:
 
     @property
     def created_text(self) -> str | None:
-        """When the recordings were made, as the format has it (ISO 8601)."""
+        """Date and time of the recordings in ISO 8601, as the dataset format has it."""
         return self.created if self.created is None or isinstance(self.created, str) else self.created.isoformat()
 
 
 def read_mapping(path: str | Path) -> tuple[MappingFile, Place]:
-    """A mapping file, and the place of its keys for what is found wrong with them later.
+    """Read a mapping file; also returns the place of its keys, for faults that are found later.
 
     Raises:
-        UserError: it cannot be read, or a key is unknown, of the wrong type or missing.
+        UserError: the file cannot be read, or a key is unknown, of the wrong type or missing.
     """
     document = read_toml(path, "name a mapping file")
     return document.read(MappingFile), document.place

@@ -1,4 +1,4 @@
-"""What a recording of another tool holds: variables by name, each with its clock, and why some cannot be used."""
+"""Recordings of other tools: their variables by name, each with its clock, and why some cannot be used."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from jaxtyping import Bool, Float
 
 @dataclass(frozen=True)
 class Variable:
-    """Numbers of one name, samples first: (N,) or (N, k), in the units of the recording.
+    """Variable of a recording: an array (N,) or (N, k), samples first, in the units of the recording.
 
-    `columns` are the names that the recording gives to the k columns, where it does. `clock` names the variable that
-    says when the samples were taken, where the format ties one to them. `units` is what the recording states.
-    `present` (N, k) is false where a column is no part of the sample: messages of several publishers on one topic.
+    `columns` are the recording's names of the k columns, empty where it gives none. `clock` is the name of the variable
+    with the times of the samples, empty where the format states none. `units` are those that the recording states.
+    `present` (N, k) is false where a sample lacks a column, as in messages of several publishers on one topic.
     """
 
     values: Float[np.ndarray, "N *k"]
@@ -28,8 +28,11 @@ class Variable:
 
 @dataclass(frozen=True)
 class Recording:
-    """The variables of one file. `unusable` holds those that are there and give no numbers, each with the reason: the
-    rest of a sentence that begins with the name. `remarks` are sentences about the file as a whole."""
+    """Variables of one file.
+
+    `unusable` holds the variables that give no numbers, each with the reason: the end of a sentence that begins with
+    the name. `remarks` are sentences about the file as a whole.
+    """
 
     path: Path
     variables: Mapping[str, Variable] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Recordings of other tools by the kind of their file: MATLAB .mat (v4 to v7.3), CSV, rosbag2 and MCAP."""
+"""Loading of recordings of other tools by the kind of file: MATLAB .mat (v4 to v7.3), CSV, rosbag2 and MCAP."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jaxfinger.errors import UserError
 
 
 def load_recording(path: Path) -> Recording:
-    """Every numeric variable of a recording, and why the others are none.
+    """Load every numeric variable of a recording, and the reasons why others cannot be used.
 
     Raises:
         UserError: the file is missing, empty, of an unknown kind, or damaged.
@@ -36,14 +36,18 @@ def load_recording(path: Path) -> Recording:
         raise
     except PermissionError:
         raise UserError(f"{path}: may not be read; change its permissions") from None
-    except Exception as error:  # readers of foreign formats raise nearly anything
+    except Exception as error:  # Readers of foreign formats raise exceptions of many kinds.
         said = f"{type(error).__name__}: {plain_reason(error)}"
         raise UserError(f"{path}: cannot be read ({said}); export the recording again") from error
     raise UserError(f"{path}: is of an unknown kind; give .mat, .csv, .mcap or a rosbag2 folder")
 
 
 def refuse_path(path: Path) -> None:
-    """UserError where there is no recording, or a folder that is no bag."""
+    """Refuse a path without a recording.
+
+    Raises:
+        UserError: the path does not exist, or is a folder without a rosbag2.
+    """
     if not path.exists():
         raise UserError(f"{path}: does not exist; name a recording")
     if path.is_dir() and not any(any(path.glob(kind)) for kind in ("*.yaml", "*.db3", "*.mcap")):

@@ -1,10 +1,10 @@
-"""The one reader of TOML files: a file becomes a frozen dataclass, or one sentence that names file, line and key.
+"""Reader of TOML files: a file becomes a frozen dataclass, or an error that names file, line and key in one sentence.
 
-A dataclass is the table: its fields are the keys, their types what a value may be. A key that no field has, a value of
-another type, and a required key that is missing are refused; nothing is converted but whole numbers to floats. A field
-whose key is a word of Python ends in an underscore (`from_` reads `from`).
+A dataclass declares a table: its fields are the keys, with their types. Unknown keys, values of another type and
+missing required keys are refused. Values are not converted, except whole numbers to floats. A field whose key is a
+word of Python ends in an underscore (`from_` reads `from`).
 
-tomllib gives the values, tree-sitter their lines; cattrs finds what reads a type.
+tomllib reads the values, tree-sitter finds their lines, and cattrs selects the function that reads a type.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Keys = tuple[str | int, ...]
 
 
 class Fault(ValueError):
-    """What is wrong with a value: the end of a sentence whose subject is the key to which `keys` lead from here."""
+    """Fault of a value. The message is the end of a sentence whose subject is the key, at the path `keys` from here."""
 
     def __init__(self, message: str, *keys: str | int):
         super().__init__(message)
@@ -40,7 +40,7 @@ class Fault(ValueError):
 
 @dataclass(frozen=True)
 class Within:
-    """Annotation of a number: `Annotated[float, Within(0.1, 100.0, "N")]`. `above`: its lower end is excluded."""
+    """Annotation of a number with bounds: `Annotated[float, Within(0.1, 100.0, "N")]`. `above` excludes the lower one."""
 
     low: float = -math.inf
     high: float = math.inf
@@ -59,7 +59,7 @@ class Within:
 
 @dataclass(frozen=True)
 class OneOf:
-    """Annotation of a name, or of a list of names: `Annotated[str, OneOf(EXPERIMENTS)]`."""
+    """Annotation of a name, or a list of names, with the known ones: `Annotated[str, OneOf(EXPERIMENTS)]`."""
 
     known: tuple[str, ...]
 
@@ -70,7 +70,7 @@ class OneOf:
 
 @dataclass(frozen=True)
 class NotEmpty:
-    """Annotation of a list that needs an element."""
+    """Annotation of a list that may not be empty."""
 
 
 Positive = Annotated[float, Within(0.0, above=True)]
@@ -79,7 +79,7 @@ Share = Annotated[float, Within(0.0, 1.0)]
 
 @dataclass(frozen=True)
 class Place:
-    """A key of a file, for sentences about it; `lines` is None of what was never text."""
+    """Place of a key in a file, for messages about it. `lines` is None for content that was never text."""
 
     file: str
     lines: Mapping[Keys, int] | None = field(default=None, repr=False)
@@ -90,26 +90,26 @@ class Place:
 
     @property
     def key(self) -> str:
-        """The key as the file has it, `finger.joints[0].mass`."""
+        """Key as text, such as `finger.joints[0].mass`."""
         return "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in self.keys).removeprefix(".")
 
     @property
     def line(self) -> int | None:
-        """Its line (1 is the first); where it is not written, that of the table in which it is missing."""
+        """Line of the key, from 1; for a missing key the line of its table."""
         if self.lines is None:
             return None
         ends = range(len(self.keys), 0, -1)
         return next((self.lines[self.keys[:end]] for end in ends if self.keys[:end] in self.lines), 1)
 
     def fail(self, message: str) -> NoReturn:
-        """Raise UserError about this key."""
+        """Raise UserError with a message about this key."""
         where = self.file if self.line is None else f"{self.file}, line {self.line}"
         raise UserError(f"{where}: {self.key + ': ' if self.keys else ''}{message}")
 
 
 @dataclass(frozen=True)
 class Document:
-    """A TOML file, parsed."""
+    """Parsed TOML file: its text, its content as dictionaries, and the place of its keys."""
 
     path: Path
     text: str
@@ -117,19 +117,19 @@ class Document:
     place: Place
 
     def read(self, kind: type[T]) -> T:
-        """The file as a dataclass.
+        """Content of the file as a dataclass.
 
         Raises:
-            UserError: an unknown key, a value of the wrong type or out of its range, or a key that is missing.
+            UserError: a key is unknown or missing, or a value has a wrong type or is out of range.
         """
         return structure(self.content, kind, self.place)
 
 
 def read_toml(path: str | Path, mend: str = "give the path of a TOML file") -> Document:
-    """Parse a file; `mend` says what to give where it cannot be read.
+    """Parse a file. `mend` is the advice in the message if it cannot be read.
 
     Raises:
-        UserError: it cannot be read, or is not TOML.
+        UserError: the file cannot be read, or is not TOML.
     """
     path = Path(path)
     try:
@@ -145,12 +145,16 @@ def read_toml(path: str | Path, mend: str = "give the path of a TOML file") -> D
 
 
 def parse_toml(text: str, path: str | Path) -> Document:
-    """Parse text that came from `path`; UserError where it is not TOML."""
+    """Parse the text of the file `path`.
+
+    Raises:
+        UserError: the text is not TOML.
+    """
     try:
         content = tomllib.loads(text)
     except RecursionError:
         raise UserError(f"{path}, line 1: is nested too deeply; no file of jaxfinger is") from None
-    except ValueError as error:  # also numbers of thousands of digits
+    except ValueError as error:  # This includes integers of thousands of digits.
         found = re.search(r" \(at (?:line (\d+), column \d+|end of document)\)", str(error))
         line = int(found[1]) if found and found[1] else len(text.splitlines()) or 1
         said = str(error)[: found.start()] if found else str(error)
@@ -159,7 +163,11 @@ def parse_toml(text: str, path: str | Path) -> Document:
 
 
 def structure(content: Any, kind: type[T], place: Place) -> T:
-    """Parsed TOML, or any nested dictionaries, as a dataclass; UserError names what does not fit."""
+    """Convert nested dictionaries, such as parsed TOML, to a dataclass.
+
+    Raises:
+        UserError: a key is unknown or missing, or a value has a wrong type or is out of range.
+    """
     try:
         return _CONVERTER.structure(content, kind)
     except Fault as fault:
@@ -169,13 +177,13 @@ def structure(content: Any, kind: type[T], place: Place) -> T:
 
 
 def quoted(text: str) -> str:
-    """A string in the quotes of TOML."""
+    """Quote and escape a string for TOML."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
 
 
 def as_key(text: str) -> str:
-    """A key as TOML writes it: bare where it may be."""
+    """Key for TOML, quoted only where it must be."""
     return text if re.fullmatch(r"[A-Za-z0-9_-]+", text) else quoted(text)
 
 
@@ -183,13 +191,13 @@ def as_key(text: str) -> str:
 
 
 def _lines(text: str) -> dict[Keys, int]:
-    """The line of every key and of every element of a list."""
+    """Line of every key and of every element of a list, from 1."""
     root = tree_sitter.Parser(_language()).parse(text.encode()).root_node
     lines: dict[Keys, int] = {}
     counts: dict[Keys, int] = {}
 
     def resolved(names: Sequence[str]) -> Keys:
-        """A header's path, with the index of the last element where a name is that of an array of tables."""
+        """Path of a header. After the name of an array of tables comes the index of its last element."""
         path: Keys = ()
         for name in names:
             path = (*path, name)
@@ -236,7 +244,7 @@ def _language() -> tree_sitter.Language:
 
 
 def _names(key: tree_sitter.Node) -> list[str]:
-    """The parts of a key, bare, quoted or dotted."""
+    """Parts of a key, which may be bare, quoted or dotted."""
     names: list[str] = []
     table = tomllib.loads(f"{(key.text or b'').decode()} = 0")
     while isinstance(table, dict):
@@ -249,7 +257,7 @@ def _names(key: tree_sitter.Node) -> list[str]:
 
 
 def _at(key: str | int, hook: Callable[[Any, Any], Any], value: Any, kind: Any) -> Any:
-    """The hook's result; a fault is that of the key."""
+    """Result of a hook; a fault is raised with the key put before its path."""
     try:
         return hook(value, kind)
     except Fault as fault:
@@ -257,7 +265,7 @@ def _at(key: str | int, hook: Callable[[Any, Any], Any], value: Any, kind: Any) 
 
 
 def shown(value: Any) -> str:
-    """A value as a file has it, cut to a part of a line."""
+    """Value as TOML writes it, shortened to fit into a message."""
     if isinstance(value, Mapping):
         return "a table"
     text = str(value).lower() if isinstance(value, bool) else str(value) if hasattr(value, "isoformat") else repr(value)
@@ -295,7 +303,11 @@ def _text(value: Any, _: Any) -> str:
 
 
 def one_of(value: Any, known: Sequence[str]) -> str:
-    """The value, which must be one of the known names; raises Fault."""
+    """Return the value if it is one of the known names.
+
+    Raises:
+        Fault: it is not.
+    """
     if not isinstance(value, str) or value not in known:
         raise Fault(f"is {shown(value)}{did_you_mean(value, known)}; choose one of {', '.join(known)}")
     return value
@@ -352,7 +364,7 @@ def _mapping(kind: Any) -> Callable[[Any, Any], Any]:
 
 
 def _union(kind: Any) -> Callable[[Any, Any], Any]:
-    """The member that the value's TOML type says; of several that may be, the first."""
+    """Reader of a union: it takes the first member that fits the value's TOML type."""
     members = [arg for arg in get_args(kind) if arg is not NoneType]
     hooks = [(_CONVERTER.get_structure_hook(member), member) for member in members]
 
@@ -372,7 +384,7 @@ def _union(kind: Any) -> Callable[[Any, Any], Any]:
         return plain.get(base, "a list" if get_origin(base) is tuple else "a table")
 
     def read(value: Any, _: Any) -> Any:
-        if value is None and NoneType in get_args(kind):  # defaults of Python; TOML has no such value
+        if value is None and NoneType in get_args(kind):  # TOML has no null; Python's defaults may be None.
             return None
         if len(hooks) == 1:
             return hooks[0][0](value, members[0])
@@ -385,7 +397,7 @@ def _union(kind: Any) -> Callable[[Any, Any], Any]:
 
 
 def _table(kind: Any) -> Callable[[Any, Any], Any]:
-    """A dataclass from a table. Unknown keys are named first: they explain those that are missing."""
+    """Reader of a dataclass. It reports unknown keys first, since misspelt ones explain those that are missing."""
     hints = get_type_hints(kind, include_extras=True)
     keys = {f.name: f.name.rstrip("_") for f in fields(kind)}
     required = [keys[f.name] for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import read_session, write_session
-from jaxfinger.data.atomic import YOUNG_S, atomic_path
+from jaxfinger.data.atomic import MIN_ORPHAN_AGE, atomic_path
 from jaxfinger.data.predictions import write_predictions
 from jaxfinger.errors import UserError
 
@@ -72,7 +72,7 @@ def test_what_a_killed_process_left_is_removed_and_what_another_writes_is_not(tm
     young.touch()
     old = tmp_path / ".a.txt.old.part"
     old.touch()
-    os.utime(old, (0, time.time() - 2 * YOUNG_S))
+    os.utime(old, (0, time.time() - 2 * MIN_ORPHAN_AGE))
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", KILLED, file, "live"], **pipes) as living:
         assert living.stdout.readline() == "writing\n"

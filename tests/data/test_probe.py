@@ -49,7 +49,7 @@ def test_a_busy_machine_damages_no_file_and_a_circle_does(file, monkeypatch):
 
 
 def test_more_objects_than_fit_are_a_circle(file, monkeypatch):
-    monkeypatch.setattr(probe, "_LEAST_OBJECT", 10**6)
+    monkeypatch.setattr(probe, "_MIN_OBJECT_SIZE", 10**6)
     assert not probe.survives(file)
 
 
