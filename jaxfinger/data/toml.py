@@ -40,7 +40,7 @@ class Fault(ValueError):
 
 @dataclass(frozen=True)
 class Within:
-    """Annotation of a number with bounds: `Annotated[float, Within(0.1, 100.0, "N")]`. `above` excludes the lower one."""
+    """Annotation of a number with bounds: `Annotated[float, Within(0.1, 100.0, "N")]`. `above` excludes the lower."""
 
     low: float = -math.inf
     high: float = math.inf
