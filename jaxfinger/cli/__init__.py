@@ -1,4 +1,4 @@
-"""The command line: parse, call, print. Nothing here imports JAX before a command runs."""
+"""Command line: parse, call, print. Nothing here imports JAX before a command runs."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-FULL = (errno.ENOSPC, errno.EDQUOT)
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def main(tokens: Sequence[str] | None = None) -> None:
-    """Entry point of `jaxfinger`. Exits 2 with one sentence where the user can mend something."""
+    """Entry point of `jaxfinger`. A mistake that the user can mend ends in one sentence and exit code 2."""
     _environment()
     _streams()
     from cyclopts import CycloptsError
@@ -32,19 +32,19 @@ def main(tokens: Sequence[str] | None = None) -> None:
         print(plain(f"jaxfinger: {error}"), file=sys.stderr)
         raise SystemExit(2) from None
     except CycloptsError:
-        raise SystemExit(2) from None  # cyclopts has said what is wrong
+        raise SystemExit(2) from None  # cyclopts has printed the message.
     except BrokenPipeError:
-        _say_no_more()
+        _discard_stdout()
         raise SystemExit(1) from None
     except OSError as error:
-        if error.errno not in FULL:
+        if error.errno not in DISK_FULL:
             raise
-        _say_no_more()
+        _discard_stdout()
         print(f"jaxfinger: the disk takes no more ({error.strerror}); free space, or write elsewhere", file=sys.stderr)
         raise SystemExit(2) from None
     except Exception:
         platform = os.environ.get("JAX_PLATFORMS")
-        if not platform or _computes():
+        if not platform or _has_device():
             raise
         print(
             f"jaxfinger: JAX_PLATFORMS names {platform}, which is not there; unset it, or set it to cpu",
@@ -53,39 +53,39 @@ def main(tokens: Sequence[str] | None = None) -> None:
         raise SystemExit(2) from None
 
 
-def _say_no_more() -> None:
-    """What still waits to be written to stdout is dropped, so that its flush at the end fails no more."""
+def _discard_stdout() -> None:
+    """Discard buffered output, so that the flush of stdout at exit cannot fail again."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _computes() -> bool:
+def _has_device() -> bool:
     """Whether JAX has a device to compute on."""
     import jax
 
     try:
         return bool(jax.devices())
-    except Exception:  # of whatever kind its backends raise
+    except Exception:  # JAX's backends raise exceptions of many kinds.
         return False
 
 
 def _streams() -> None:
-    """What the terminal cannot encode is replaced; what libraries warn their callers of is not for a user."""
+    """Replace characters that the terminal cannot encode, and hide warnings that libraries address to programmers."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    if not sys.warnoptions:  # `python -W` and PYTHONWARNINGS ask for them
-        warnings.showwarning = _unsaid
-    logging.getLogger().addHandler(logging.NullHandler())  # else what nobody handles goes to stderr
+    if not sys.warnoptions:  # `python -W` and PYTHONWARNINGS ask for warnings.
+        warnings.showwarning = _hide_warning
+    logging.getLogger().addHandler(logging.NullHandler())  # Without a handler, log records go to stderr.
 
 
-def _unsaid(message, category, filename, lineno, file=None, line=None) -> None:
-    """In the place of `warnings.showwarning`; a filter that makes warnings errors still does."""
+def _hide_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    """Stand in for `warnings.showwarning` and print nothing. Filters that turn warnings into errors still work."""
 
 
 def _environment() -> None:
-    """Before any import of NumPy or JAX: small factorisations on one thread, compilations kept between runs."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA writes past Python to stderr
+    """Set environment variables before NumPy and JAX are imported: one thread for BLAS, and a cache of compilations."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # Threads slow small factorisations down.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA writes to stderr without Python's logging.
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         from platformdirs import user_cache_path
 
@@ -93,7 +93,7 @@ def _environment() -> None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError:
-            return  # a home without room for a cache: compile each time
+            return  # The home folder cannot hold a cache, so each run compiles anew.
         if os.access(folder, os.W_OK):
             os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

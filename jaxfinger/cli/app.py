@@ -1,4 +1,4 @@
-"""Which commands there are; each is imported when it runs."""
+"""Table of the commands. Each is imported when it runs."""
 
 from collections.abc import Callable
 from functools import reduce
@@ -9,21 +9,21 @@ from rich.text import Text
 from jaxfinger.cli import completion
 
 
-def _said(error: CycloptsError) -> object:
-    """What a command needs and was not given, as its help says it; of other errors what cyclopts says."""
-    lacking = error.argument
-    if not isinstance(error, MissingArgumentError) or lacking is None or error.keyword or not error.command_chain:
+def _message(error: CycloptsError) -> object:
+    """Message of an error: the help of the argument that is missing, or cyclopts' own message for other errors."""
+    missing = error.argument
+    if not isinstance(error, MissingArgumentError) or missing is None or error.keyword or not error.command_chain:
         return CycloptsPanel(error)
-    name = lacking.name if lacking.index is None else lacking.name.strip("-").upper()
+    name = missing.name if missing.index is None else missing.name.strip("-").upper()
     command = reduce(App.__getitem__, error.command_chain, app)
     known = command.assemble_argument_collection(parse_docstring=True)
-    says = next(argument.parameter.help for argument in known if argument.name == lacking.name)
-    return Text(f"jaxfinger: {' '.join(error.command_chain)} needs {name}: {says}")
+    text = next(argument.parameter.help for argument in known if argument.name == missing.name)
+    return Text(f"jaxfinger: {' '.join(error.command_chain)} needs {name}: {text}")
 
 
 app = App(
     name="jaxfinger",
-    error_formatter=_said,
+    error_formatter=_message,
     help="Identify the dynamic model of a tendon-driven finger, and say why the simulation still differs from it.",
     default_parameter=Parameter(negative=()),
 )
@@ -77,7 +77,9 @@ for name, text in SEALED.items():
 app.command(sealed)
 
 
-def _for_a_shell(act: Callable[[App, completion.Shell | None], str]) -> Callable[..., None]:
+def _shell_command(act: Callable[[App, completion.Shell | None], str]) -> Callable[..., None]:
+    """Make a command that prints the result of an action for a shell."""
+
     def command(shell: completion.Shell | None = None, /) -> None:
         """Let a shell complete commands, options and files.
 
@@ -95,4 +97,4 @@ for name, act, text in (
     ("--install-completion", completion.install, "Let your shell complete commands, options and files."),
     ("--show-completion", completion.show, "Print the script that does so, to install it yourself."),
 ):
-    app.command(_for_a_shell(act), name=name, help=text)
+    app.command(_shell_command(act), name=name, help=text)

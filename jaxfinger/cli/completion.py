@@ -13,19 +13,19 @@ Shell = Literal["bash", "zsh", "fish", "powershell"]
 
 
 def show(app: App, shell: Shell | None) -> str:
-    """The script that makes a shell complete `jaxfinger`.
+    """Script that makes a shell complete `jaxfinger`.
 
     Raises:
-        UserError: no shell is given, and which one runs this cannot be told.
+        UserError: no shell is given, and the running one is not recognised.
     """
     return app.generate_completion(shell=_shell(shell))
 
 
 def install(app: App, shell: Shell | None) -> str:
-    """Write that script where the shell looks for it, have it read at the start, and say where it is.
+    """Install the script so that the shell reads it when it starts; returns a sentence that says where it is.
 
     Raises:
-        UserError: the shell cannot be told, or the file cannot be written.
+        UserError: no shell is given and the running one is not recognised, or the file cannot be written.
     """
     shell = _shell(shell)
     try:
@@ -36,6 +36,7 @@ def install(app: App, shell: Shell | None) -> str:
 
 
 def _shell(given: Shell | None) -> Shell:
+    """Name of the given shell, or of the running one."""
     from cyclopts.completion.detect import ShellDetectionError, detect_shell
 
     if given is not None:

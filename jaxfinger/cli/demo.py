@@ -77,10 +77,10 @@ def demo(
 
 
 def shipped(name: str) -> Path:
-    """A file of the demo finger, in the package or in the source tree.
+    """Path of a file of the demo finger, in the package or the source tree.
 
     Raises:
-        UserError: it is in neither.
+        UserError: the file is in neither.
     """
     here = Path(__file__).resolve().parents[1]
     for path in (here / "demo" / name, here.parent / "datasets" / "demo-finger" / name):
@@ -90,7 +90,7 @@ def shipped(name: str) -> Path:
 
 
 def closing(before: Validation, after: Validation) -> list[tuple[str, ...]]:
-    """A row an experiment and channel: noise and rms of both models, over all columns."""
+    """Rows of a table, one for each experiment and channel: noise and rms error of both models over all columns."""
     from jaxfinger.report.numbers import number
 
     rows: dict[tuple[str, ...], list[tuple[float | None, float, float]]] = defaultdict(list)

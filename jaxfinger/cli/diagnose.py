@@ -1,4 +1,4 @@
-"""`jaxfinger diagnose`: where the model misses the finger, which effect is to blame, how far the gap shrinks."""
+"""`jaxfinger diagnose`: where the model misses the finger, which effects cause it, and how far the gap shrinks."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ def diagnose(
 ) -> None:
     """Diagnose the gap between a session and the nominal model that is identified from it.
 
-    Of several sessions each has a diagnosis of its own, and a table says which cause is at work in which.
+    Each of several sessions has a diagnosis of its own, and a table shows which cause is at work in which session.
 
     Parameters
     ----------
     sessions
         Session (HDF5), or several of one finger.
     output
-        Folder for gap.json, nominal.json, augmented.json and report.html; it is made where there is none. Of several
-        sessions each has a folder in it, named as its file.
+        Folder for gap.json, nominal.json, augmented.json and report.html; it is made where there is none. Each of
+        several sessions has a folder in it, named after its file.
     recipe
-        The nominal model (TOML), or the name of a shipped recipe. A term that it leaves out is a candidate.
+        The nominal model (TOML), or the name of a shipped recipe. A term that it leaves out is a candidate cause.
     predictions
         Another simulator's predictions of the session's trials (HDF5, as `predict` writes them): the gap is then
         that between the measurements and this simulator.
     against
-        An earlier fit of the same finger (JSON, as `identify` writes it): what has changed since? Its intervals are
-        what is known, its recipe is the nominal model, and each of its parameters is a candidate beside the effects.
+        An earlier fit of the same finger (JSON, as `identify` writes it), to find what has changed since. Its intervals
+        are the prior, its recipe is the nominal model, and each of its parameters is a candidate beside the effects.
     effects
         A Python file with effects of your own, beside those of the catalogue.
     without
@@ -54,7 +54,7 @@ def diagnose(
     quick
         A first look: half the samples, and no fit of causes and model together.
     json
-        Print gap.json, and nothing else, on stdout; of several sessions an object of them, by file.
+        Print gap.json, and nothing else, on stdout; for several sessions one object with the gap.json of each file.
     overwrite
         Replace an earlier diagnosis in the folder.
     """
@@ -94,7 +94,7 @@ def diagnose(
             write(d, folder, overwrite)
             write_page(d, folder / "report.html", overwrite)
             texts[name], gaps[name] = summary(d, own), as_gap_json(d)
-            found[name] = replace(d, problem=None)  # which holds every row of the session
+            found[name] = replace(d, problem=None)  # The problem holds every row of the session: its memory is freed.
     if json:
         print_json(gaps if len(gaps) > 1 else gaps[sessions[0].name])
         return
@@ -107,7 +107,7 @@ def diagnose(
 
 
 def _folders(sessions: tuple[Path, ...], output: Path) -> dict[Path, Path]:
-    """Where the diagnosis of each goes."""
+    """Output folder of each session; UserError where two sessions would share one."""
     if not sessions:
         raise UserError("diagnose needs a session (HDF5)")
     if len(sessions) == 1:
@@ -119,7 +119,7 @@ def _folders(sessions: tuple[Path, ...], output: Path) -> dict[Path, Path]:
 
 
 def _refuse_predictions(predictions: Path, sessions: tuple[Path, ...]) -> None:
-    """Those of another simulator are of one session, and no session themselves."""
+    """Refuse predictions for several sessions, and a session in place of predictions."""
     if len(sessions) > 1:
         raise UserError(f"{predictions}: holds predictions of one session; give that session alone")
     if predictions.exists() and any(s.exists() and predictions.samefile(s) for s in sessions):
@@ -127,7 +127,7 @@ def _refuse_predictions(predictions: Path, sessions: tuple[Path, ...]) -> None:
 
 
 def _tolerance(texts: list[str]) -> dict[str, float]:
-    """Shares of a signal by channel."""
+    """Tolerated shares of the signal by channel, from texts such as `2%` and `joint_torque=5%`."""
     channels, out = ("joint_torque", "tendon_excursion", "fingertip_force"), {}
     for text in texts:
         channel, _, share = text.rpartition("=")
@@ -143,7 +143,7 @@ def _tolerance(texts: list[str]) -> dict[str, float]:
 
 
 def refuse(output: Path, overwrite: bool) -> None:
-    """Before anything is read: no file is overwritten unasked."""
+    """Refuse a folder with an earlier diagnosis that may not be overwritten, before anything is read."""
     if output.exists() and not output.is_dir():
         raise UserError(f"{output}: is a file; name a folder")
     for name in FILES if output.is_dir() else ():

@@ -1,4 +1,4 @@
-"""The catalogue of causes, for people."""
+"""`jaxfinger effects`: the catalogue of causes in words."""
 
 from pathlib import Path
 

@@ -47,6 +47,7 @@ def check(file: Path, *, json: bool = False) -> None:
 
 
 def _as_dict(recording: Recording) -> dict:
+    """Survey of a recording for JSON."""
     from jaxfinger.data.look import clocks_of, columns_of
 
     seen = columns_of(recording)
@@ -133,7 +134,7 @@ def simulate(
     effects
         The Python file of effects of your own, where the fit's model has some.
     seed
-        Of the noise; by default the recipe's.
+        Seed of the noise; by default the recipe's.
     overwrite
         Replace a file that is already there.
     """

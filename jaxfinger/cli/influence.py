@@ -1,4 +1,4 @@
-"""`jaxfinger influence`: what holds each parameter of a fit where it is."""
+"""`jaxfinger influence`: the trials, sensors and CAD values on which each parameter of a fit depends."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 
 from jaxfinger.cli.output import print_json, progress, refuse_figure, table
 
-SHOWN = 3  # of each kind, the strongest
-MOST = 40  # rows, and columns, of the picture: more names than that are too small to read on a page
+SHOWN = 3  # strongest influences of each kind for a parameter, so that a row fits the screen
+MAX_NAMES = 40  # rows and columns of the picture: more names are too small to read on a page.
 STEPS = {"trials": "left out", "sensors": "gain + 1 %", "cad": "+ 1 standard deviation"}
 
 
@@ -50,7 +50,7 @@ def influence(
             from jaxfinger.report.plots import influence as draw
             from jaxfinger.report.theme import save
 
-            picture = draw(found, loaded, MOST).get_figure(root=True)
+            picture = draw(found, loaded, MAX_NAMES).get_figure(root=True)
             assert picture is not None
             save(picture, figure, overwrite)
     if json:
@@ -72,11 +72,11 @@ def influence(
         rows = []
         for j, name in enumerate(names):
             strongest = sorted(range(len(s.names)), key=lambda k, j=j: -abs(shifts[k, j]))[:SHOWN]
-            rows.append((name, ", ".join(_said(s.names[k], shifts[k, j]) for k in strongest if shifts[k, j])))
+            rows.append((name, ", ".join(_in_words(s.names[k], shifts[k, j]) for k in strongest if shifts[k, j])))
         table(
             f"By {kind}, {STEPS[kind]}: standard deviations that each parameter moves", ("parameter", ""), rows, left=2
         )
 
 
-def _said(name: str, shift: float) -> str:
+def _in_words(name: str, shift: float) -> str:
     return f"{name} {shift:+.2f}" if isfinite(shift) else f"{name} alone tells of it"

@@ -1,4 +1,4 @@
-"""`jaxfinger identify`, `fit`, `validate`, `predict`, `show`: sessions to models, models to predictions."""
+"""`jaxfinger identify`, `fit`, `validate`, `predict`, `show`: from sessions to models, from models to predictions."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def identify(
     joint
         Refine all parameters on all trials at once afterwards.
     ahead
-        Likewise, on the motion of VD.3 too, by the angles that it predicts a moment ahead.
+        Refine as with --joint, and on the motion of VD.3 too, by the angles that the model predicts a moment ahead.
     figures
         Folder for the paper's figures of this fit.
     json
@@ -62,7 +62,7 @@ def identify(
         fit = run(session, wanted, progress=say)
         if joint or ahead:
             fit = _refine(fit, session, say, ahead)
-        content = _keep(fit, output, overwrite)
+        content = _write(fit, output, overwrite)
         if figures is not None:
             _draw(fit, session, figures, overwrite, say)
     _report(content, json)
@@ -71,6 +71,7 @@ def identify(
 def _fit(
     stages: tuple[str, ...], file: Path, output: Path, start: Path | None, recipe: str | None, json: bool, overwrite
 ):
+    """Run some stages of the identification on a session, write the fit and print it."""
     refuse_output(output, overwrite)
     if start is not None and recipe is not None:
         raise UserError(f"{start}: a fit to start from brings its own recipe; leave out --recipe or --start")
@@ -83,18 +84,18 @@ def _fit(
         session = read(file)
         first = load_fit(start) if start else None
         if first is not None:
-            model_for(first, session)  # refuses the session of another finger
+            model_for(first, session)  # Refuses the session of another finger.
         fit = run(session, None if first else read_recipe(recipe), stages, first, say)
         if all(s.status == "skipped" for s in fit.stages):
             raise UserError(
                 f"{file}: {'; '.join(s.message for s in fit.stages)}; nothing is fitted, so nothing written"
             )
-        content = _keep(fit, output, overwrite)
+        content = _write(fit, output, overwrite)
     _report(content, json)
 
 
-def _of_stages(name: str, stages: tuple[str, ...], summary: str):
-    """The command that runs some of the first stages."""
+def _stage_command(name: str, stages: tuple[str, ...], summary: str):
+    """Make a command that runs these stages."""
 
     def command(
         file: Path,
@@ -128,8 +129,8 @@ def _of_stages(name: str, stages: tuple[str, ...], summary: str):
     return command
 
 
-fit_id2 = _of_stages("fit_id2", ("ID.2",), "Fit the moment arms alone (ID.2).")
-fit_id3 = _of_stages(
+fit_id2 = _stage_command("fit_id2", ("ID.2",), "Fit the moment arms alone (ID.2).")
+fit_id3 = _stage_command(
     "fit_id3",
     ("ID.3-static", "ID.3-dynamic"),
     "Fit elastic torque, friction and damping of the joints alone (ID.3-static, ID.3-dynamic).",
@@ -176,7 +177,7 @@ def fit_joint(
     start
         The staged fit to refine.
     ahead
-        On the motion of VD.3 too, by the angles that the fit predicts a moment ahead.
+        Refine on the motion of VD.3 too, by the angles that the fit predicts a moment ahead.
     json
         Print the parameters as JSON.
     overwrite
@@ -191,7 +192,7 @@ def fit_joint(
         session, first = read(file), load_fit(start)
         model_for(first, session)
         fit = _refine(first, session, say, ahead)
-        content = _keep(fit, output, overwrite)
+        content = _write(fit, output, overwrite)
     _report(content, json)
 
 
@@ -235,11 +236,12 @@ def fit_effects(
         own = load(effects) if effects is not None else {}
         say("reading the file")
         fit = fit_with(read(file), keys, wanted, own, say)
-        content = _keep(fit, output, overwrite)
+        content = _write(fit, output, overwrite)
     _report(content, json)
 
 
 def _key(text: str) -> tuple[str, tuple[str, ...]]:
+    """Name and site of an effect, from `name:site`."""
     name, _, site = text.partition(":")
     if not (name and site):
         raise UserError(f"--effect {text}: say the effect and where it sits, for example tendon_stretch:T3")
@@ -338,7 +340,7 @@ def show(fit: Path, *, effects: Path | None = None, json: bool = False) -> None:
     json
         Print it as JSON.
     """
-    content = _as_read(fit)
+    content = _written_content(fit)
     if content is None:
         from jaxfinger.cli.tables import fit_to_read
         from jaxfinger.identify import load_fit
@@ -350,8 +352,8 @@ def show(fit: Path, *, effects: Path | None = None, json: bool = False) -> None:
         raise UserError(f"{fit}: is damaged ({error!r}); identify the session again") from None
 
 
-def _as_read(path: Path) -> dict | None:
-    """What is in the file of a fit that a command wrote, which needs no computing; None of any other."""
+def _written_content(path: Path) -> dict | None:
+    """Content of a fit file with what `fit_to_read` adds, so that JAX is not needed; None for any other file."""
     try:
         content = loads(path.read_bytes())
     except (OSError, ValueError):
@@ -359,8 +361,8 @@ def _as_read(path: Path) -> dict | None:
     return content if isinstance(content, dict) and "seen" in content else None
 
 
-def _keep(fit, output: Path, overwrite: bool) -> dict:
-    """What a fit's file holds, once it is written."""
+def _write(fit, output: Path, overwrite: bool) -> dict:
+    """Write a fit, and return the content of its file."""
     from jaxfinger.cli.tables import fit_to_read
     from jaxfinger.identify.fit_file import write_content
 

@@ -1,4 +1,4 @@
-"""`jaxfinger new`: a finger and a mapping to fill in."""
+"""`jaxfinger new`: write a finger file and a mapping file to fill in."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def new(
 
 
 def _asked(question: str, given: str | None, default: str) -> str:
-    """What was given, else what is answered on a terminal, else the default."""
+    """The given text, else the answer on a terminal, else the default."""
     if given is not None or not (sys.stdin.isatty() and sys.stdout.isatty()):
         return default if given is None else given
     from rich.prompt import Prompt
@@ -86,8 +86,9 @@ def _asked(question: str, given: str | None, default: str) -> str:
     return Prompt.ask(question, default=default)
 
 
-def _names(what: str, said: str) -> list[str]:
-    names = [name.strip() for name in said.split(",") if name.strip()]
+def _names(what: str, text: str) -> list[str]:
+    """Names in a list with commas; UserError where one occurs twice."""
+    names = [name.strip() for name in text.split(",") if name.strip()]
     for i, name in enumerate(names):
         if name in names[:i]:
             raise UserError(f"new: the {what} {name} is named twice; give each its own name")
@@ -95,7 +96,7 @@ def _names(what: str, said: str) -> list[str]:
 
 
 def _from(path: Path, folder: Path) -> str:
-    """The path as a file in the folder names it."""
+    """Path relative to the folder where it lies inside, else absolute."""
     try:
         return path.resolve().relative_to(folder.resolve()).as_posix()
     except ValueError:

@@ -1,4 +1,4 @@
-"""What the commands print: tables and JSON on stdout, progress on stderr."""
+"""Output of the commands: tables and JSON on stdout, progress on stderr."""
 
 from __future__ import annotations
 
@@ -25,25 +25,28 @@ if TYPE_CHECKING:
     from jaxfinger.data.findings import Finding
 
 FIGURES = (".svg", ".png")
-MOST_REMARKS = 20  # what a person reads before the results scroll away
+MAX_REMARKS = 20  # More would push the results off the screen.
+MIN_TIMED = 3.0  # s: people look at the time of work that takes longer.
+MIN_DONE = 0.1  # share of the work: before, the elapsed time is no basis for an estimate of the rest.
 Output = Annotated[Path, Parameter(name=["--output", "-o"])]
 
 
 @contextmanager
 def progress(title: str) -> Iterator[Callable[[str], None]]:
-    """What is being done, on stderr: a line that renews itself, or one line a step where it is no terminal.
+    """Show progress on stderr: one line that is renewed, or a line a step where stderr is no terminal.
 
-    Beside it stand the share done and about how long the rest takes: as the work says itself (`Step`), or by when each
-    step began the last time that the same command came to its end.
+    The context is a function that takes the name of the step that begins. Beside it stand the share done and an
+    estimate of the time left. The share comes from the work itself (`Step`), or from the times at which the steps began
+    when the same command last ran to its end.
     """
     console, begun = Console(stderr=True), time.monotonic()
-    earlier = Earlier(title)
+    earlier = StepTimes(title)
     if not console.is_terminal:
 
         def say(message: str) -> None:
             seconds = time.monotonic() - begun
             step = earlier.step(message, seconds)
-            about = f" ({_so_far(step, seconds)})" if step else ""
+            about = f" ({_estimate(step, seconds)})" if step else ""
             print(plain(f"{title}: {message}{about}"), file=sys.stderr, flush=True)
 
         yield say
@@ -59,14 +62,14 @@ def progress(title: str) -> Iterator[Callable[[str], None]]:
                 seconds = time.monotonic() - begun
                 bar.update(task, description=plain(f"{title}: {message}"))
                 if step := earlier.step(message, seconds):
-                    bar.update(task, total=1.0, completed=step.done, about=_so_far(step, seconds))
+                    bar.update(task, total=1.0, completed=step.done, about=_estimate(step, seconds))
 
             yield tell
     earlier.keep(time.monotonic() - begun)
 
 
-class Earlier:
-    """When each step of a command began the last time, as a share of the whole; kept beside the compiled programs."""
+class StepTimes:
+    """Times at which a command's steps began in its last run, as shares of the whole. Stored beside JAX's cache."""
 
     def __init__(self, title: str):
         folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")
@@ -79,18 +82,18 @@ class Earlier:
             found = json.loads(self.file.read_text(encoding="utf-8")) if self.file else {}
             return {t: {str(k): float(v) for k, v in shares.items()} for t, shares in found.items()}
         except (OSError, ValueError, AttributeError, TypeError):
-            return {}  # none yet, or none that can be read: an estimate is no reason to stop
+            return {}  # The file is missing or damaged. Work goes on without an estimate.
 
     def step(self, message: str, seconds: float) -> Step | None:
-        """The message with the share that is done, where it is known."""
+        """Step with the share that is done when it begins; None where that is unknown."""
         self.began.setdefault(str(message), seconds)
         if isinstance(message, Step):
             return message
         return Step(message, self.shares[message]) if message in self.shares else None
 
     def keep(self, seconds: float) -> None:
-        """For the next time, of work that took long."""
-        if self.file is None or seconds < LONG:
+        """Store the times of this run, which took `seconds`, if it took long enough for an estimate to be of use."""
+        if self.file is None or seconds < MIN_TIMED:
             return
         told = self._all() | {self.title: {m: round(s / seconds, 3) for m, s in self.began.items()}}
         part = self.file.with_suffix(f".{os.getpid()}")
@@ -101,38 +104,34 @@ class Earlier:
             part.unlink(missing_ok=True)
 
 
-LONG = 3.0  # s of work from which on people look at the time
-EARLY = 0.1  # share done before which the time so far says nothing of the time that is left
-
-
-def _so_far(step: Step, seconds: float) -> str:
-    """Share done, and about how long the rest takes if it goes on as so far."""
+def _estimate(step: Step, seconds: float) -> str:
+    """Share done, and the time left if the rest goes on at the same speed."""
     text = f"{100 * step.done:.0f} %"
-    if not EARLY <= step.done < 1.0:
+    if not MIN_DONE <= step.done < 1.0:
         return text
     left = seconds * (1.0 - step.done) / step.done
     return f"{text}, about {f'{left / 60:.0f} min' if left > 90 else f'{max(left, 1.0):.0f} s'} left"
 
 
 def plain(text: object) -> str:
-    """Text for a terminal: control characters, which would steer it, as their escapes."""
+    """Text for a terminal, with control characters, which could steer it, replaced by escapes."""
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in str(text))
 
 
 def remark(findings: Iterable[Finding], file: Path) -> None:
-    """What the checker warns of, on stderr, so that no command works on doubtful numbers without a word."""
+    """Print the checker's warnings on stderr, so that no command silently works on doubtful numbers."""
     from jaxfinger.data.findings import together
 
     warnings = together(finding for finding in findings if finding.severity == "warning" or finding.local)
-    for finding in warnings[:MOST_REMARKS]:
+    for finding in warnings[:MAX_REMARKS]:
         print(plain(f"{file}: {finding}"), file=sys.stderr)
-    if len(warnings) > MOST_REMARKS:
-        print(f"{file}: {len(warnings) - MOST_REMARKS} more: run `jaxfinger check`", file=sys.stderr)
+    if len(warnings) > MAX_REMARKS:
+        print(f"{file}: {len(warnings) - MAX_REMARKS} more: run `jaxfinger check`", file=sys.stderr)
     sys.stderr.flush()
 
 
 def read(path: Path) -> Session:
-    """The session in a file, once what the checker warns of is said."""
+    """Read a session, and print the checker's warnings about it."""
     from jaxfinger.data import read_session
     from jaxfinger.data.check import examine
     from jaxfinger.data.findings import Report
@@ -145,7 +144,7 @@ def read(path: Path) -> Session:
 
 
 def table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> None:
-    """A table whose first `left` columns are text and the rest numbers."""
+    """Print a table. Its first `left` columns are text, the others numbers."""
     out = Table(
         title=Text(plain(title)), title_justify="left", title_style="bold", header_style="", box=None, pad_edge=False
     )
@@ -158,18 +157,18 @@ def table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]], left
 
 
 def console() -> Console:
-    """Stdout, without colour of its own for numbers; wide where it is no terminal, so that tables stay whole."""
+    """Console on stdout that does not colour numbers, and is wide where stdout is no terminal, to keep rows whole."""
     out = Console(highlight=False)
     return out if out.is_terminal else Console(highlight=False, width=160)
 
 
 def print_json(content: Any) -> None:
-    """JSON for programs: NaN and infinities as null."""
+    """Print JSON for programs, with null for NaN and infinities."""
     print(json.dumps(without_infinities(content), indent=1, ensure_ascii=False))
 
 
 def without_infinities(value: Any) -> Any:
-    """For JSON, which has no infinity and no NaN: null."""
+    """Replace NaN and infinities, which JSON does not have, by None, and paths by text."""
     match value:
         case dict():
             return {str(k): without_infinities(v) for k, v in value.items()}
@@ -183,7 +182,7 @@ def without_infinities(value: Any) -> Any:
 
 
 def refuse_output(path: Path, overwrite: bool) -> None:
-    """Before any work: what will be written can be, and replaces nothing unasked."""
+    """Refuse an output file that cannot be written or may not be replaced, before any work is done."""
     from jaxfinger.data.atomic import refuse_existing
 
     refuse_existing(path, overwrite)
@@ -192,7 +191,7 @@ def refuse_output(path: Path, overwrite: bool) -> None:
 
 
 def refuse_figure(path: Path, overwrite: bool) -> None:
-    """The same for a picture, whose kind its name says."""
+    """Refuse a picture that is neither .svg nor .png, cannot be written or may not be replaced."""
     if path.suffix not in FIGURES:
         raise UserError(f"{path}: is to be a picture; give a name that ends in {' or '.join(FIGURES)}")
     refuse_output(path, overwrite)

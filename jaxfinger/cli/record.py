@@ -47,7 +47,7 @@ def record(
     view = LiveView(description)
     try:
         with ExitStack() as stack:
-            stack.enter_context(_ends_as_interrupts())
+            stack.enter_context(_signals_as_interrupts())
             operator = Nobody() if yes else stack.enter_context(AtTerminal(view.say))
             stack.enter_context(view)
             outcome = run(checked, open_rig(description), output, resume=resume, operator=operator, observe=view)
@@ -67,22 +67,22 @@ def record(
 
 
 @contextmanager
-def _ends_as_interrupts() -> Iterator[None]:
-    """A terminal that closes, or a request to end, is as Ctrl-C: let go, and keep what was recorded."""
-    ends = (signal.SIGTERM, signal.SIGHUP) if threading.current_thread() is threading.main_thread() else ()
-    before = [signal.signal(end, signal.default_int_handler) for end in ends]
+def _signals_as_interrupts() -> Iterator[None]:
+    """Treat SIGTERM and SIGHUP (a closed terminal) like Ctrl-C: release the finger and keep the recording."""
+    signals = (signal.SIGTERM, signal.SIGHUP) if threading.current_thread() is threading.main_thread() else ()
+    handlers = [signal.signal(number, signal.default_int_handler) for number in signals]
     try:
         yield
     finally:
-        for end, handler in zip(ends, before, strict=True):
-            signal.signal(end, handler)
+        for number, handler in zip(signals, handlers, strict=True):
+            signal.signal(number, handler)
 
 
 def _leave(sentence: str, code: int) -> NoReturn:
-    """End beside a terminal that takes no output: say it on stderr where that is another, and wait for nothing."""
-    saying = threading.Thread(target=print, args=(sentence,), kwargs={"file": sys.stderr, "flush": True}, daemon=True)
-    saying.start()
-    saying.join(1.0)
+    """Exit although the terminal takes no output. Stderr may lead elsewhere, so the sentence has 1 s to be printed."""
+    printing = threading.Thread(target=print, args=(sentence,), kwargs={"file": sys.stderr, "flush": True}, daemon=True)
+    printing.start()
+    printing.join(1.0)
     os._exit(code)
 
 

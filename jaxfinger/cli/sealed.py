@@ -1,4 +1,4 @@
-"""`jaxfinger sealed make | run | score`: the benchmark of the diagnosis on data whose effect is withheld."""
+"""`jaxfinger sealed make | run | close | score | rivals`: the benchmark of the diagnosis on cases with hidden truth."""
 
 from __future__ import annotations
 
@@ -127,12 +127,12 @@ def run(
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """`jaxfinger diagnose`, silently, in a process that keeps what it has compiled for the cases that follow."""
+    """`jaxfinger diagnose` without output, in this process, so that compiled functions serve the cases that follow."""
 
     left_out: tuple[str, ...] = ()
 
     def without(self, effect: str) -> Diagnosis:
-        """The same with one effect taken out of the catalogue."""
+        """Diagnosis with one effect taken out of the catalogue."""
         return Diagnosis((effect,))
 
     def __call__(self, fit: Path, out: Path) -> None:
@@ -216,6 +216,7 @@ def _beside(folder: Path, what: str) -> Path:
 
 
 def _share(text: str) -> tuple[int, int]:
+    """Numbers i and n of a share `i/n`."""
     try:
         i, n = (int(x) for x in text.split("/"))
     except ValueError:
@@ -227,7 +228,7 @@ def _share(text: str) -> tuple[int, int]:
 
 @contextmanager
 def _bar(title: str) -> Iterator[Callable[[int, int, str], None]]:
-    """A progress bar that takes (done, total, what)."""
+    """Show a progress bar. The context is a function that takes the numbers done and in total, and a description."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,

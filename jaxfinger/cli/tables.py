@@ -1,4 +1,4 @@
-"""A fit and a validation as tables that people read."""
+"""Tables of a fit and of a validation for people."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ if TYPE_CHECKING:
     from jaxfinger.identify.validate import Validation
 
 
-MISFIT = 1.5  # χ² per row above which a model or its noise is not right
+# χ² per row above which the model or its noise is taken to be wrong: residuals of 1.22 times the noise.
+MAX_CHI2 = 1.5
 
 
 def fit_to_read(fit: Fit) -> dict:
-    """A fit as its file holds it, with what people read of it: its parameters, and what its curves reach."""
+    """Content of a fit's file, with a part `seen` that people read: parameters, and ranges of the fit's curves."""
     from jaxfinger.identify.fit_file import content_of
     from jaxfinger.report.curves import curves
 
@@ -41,7 +42,7 @@ def fit_to_read(fit: Fit) -> dict:
 
 
 def fit_as_dict(content: dict) -> dict:
-    """What made the fit, its stages and its parameters (SI units)."""
+    """Fit for JSON output: its origin, its stages, and its parameters in SI units."""
     kept = ("specimen", "data", "data_hash", "recipe", "created", "versions", "stages")
     return {k: content[k] for k in kept} | {
         "parameters": content["seen"]["parameters"],
@@ -51,7 +52,7 @@ def fit_as_dict(content: dict) -> dict:
 
 
 def print_fit(content: dict, parameters: bool = True) -> None:
-    """Stages, warnings, and the finger as the paper describes it; ± is half of a 95 % interval."""
+    """Print a fit: stages, warnings, and the finger as in the paper's tables. ± is half of a 95 % interval."""
     seen, stages = content["seen"], content["stages"]
     about = (content["specimen"], content["data"], f"recipe {content['recipe']['name']}", content["created"])
     print(plain(" · ".join(about) + "\n"))
@@ -81,7 +82,7 @@ def _warnings(stages: list[dict]) -> None:
         for text in ([s["message"]] if s["message"] else []) + list(s["warnings"]):
             out.print(plain(f"{s['name']}: {text}"), markup=False, soft_wrap=True)
         chi2 = s["chi2_per_row"]
-        if s["status"] == "fitted" and chi2 is not None and chi2 > MISFIT:
+        if s["status"] == "fitted" and chi2 is not None and chi2 > MAX_CHI2:
             out.print(
                 f"{s['name']}: the residuals are {chi2**0.5:.1f} times the noise, so the model misses something "
                 "and the intervals are wider by that or more: run `jaxfinger diagnose`, or give the recipe more terms",
@@ -121,7 +122,7 @@ def _joints(joints: list[dict]) -> None:
 
 
 def _parameters(parameters: list[dict]) -> list[tuple[str, str, str]]:
-    """Name, value with its 95 % interval, and the unit that suits their size."""
+    """Rows of name, value with its 95 % interval, and a unit that suits their size."""
     rows = []
     for p in parameters:
         half = HALF_95 * (p["std"] or 0.0)
@@ -132,7 +133,7 @@ def _parameters(parameters: list[dict]) -> list[tuple[str, str, str]]:
 
 
 def print_validation(result: Validation) -> None:
-    """One row a channel's column."""
+    """Print a validation, one row for each column of a channel."""
     from jaxfinger.report.sentences import EXPERIMENTS
 
     print(plain(f"{result.specimen} · {result.session}\n"))
