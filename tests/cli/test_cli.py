@@ -1,4 +1,4 @@
-"""The command line, in this process: what it prints, where it writes, how it refuses."""
+"""Command line, run in this process: its output, its files, and its refusals."""
 
 import json
 import os
@@ -31,7 +31,7 @@ def run(*tokens) -> int:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """The servo axis: estimation and validation recordings imported, and the fit of the first."""
+    """Folder with both recordings of the servo axis as sessions, and a fit of the first."""
     folder = tmp_path_factory.mktemp("emps")
     for name, recording in (("emps", "DATA_EMPS"), ("emps-pulses", "DATA_EMPS_PULSES")):
         mapping = EMPS / f"{name}.toml"
@@ -121,7 +121,7 @@ def test_a_term_that_the_recipe_left_out_is_fitted_as_an_effect_that_is_known(fo
     assert c0["std"] < 2.0
     assert run("validate", fit, folder / "emps-pulses.h5", "--json") == 0
     (score,) = json.loads(capsys.readouterr().out)["scores"]
-    assert score["rms"] < 6.0  # N; 10.7 without Coulomb friction
+    assert score["rms"] < 6.0  # N. Without Coulomb friction it is 10.7.
     assert run("fit", "effects", folder / "emps.h5", "--effect", "joint_coulomb", "-o", tmp_path / "other.json") == 2
     assert "for example tendon_stretch:T3" in capsys.readouterr().err
 
@@ -129,7 +129,7 @@ def test_a_term_that_the_recipe_left_out_is_fitted_as_an_effect_that_is_known(fo
 def test_a_first_look_at_the_axis_names_the_friction_that_its_recipe_leaves_out(folder, tmp_path, capsys):
     recipe = ROOT / "fits" / "emps-no-coulomb.toml"
     assert run("diagnose", folder / "emps.h5", "--recipe", recipe, "--quick", "--json", "-o", tmp_path) == 0
-    gap = json.loads(capsys.readouterr().out)  # and nothing else
+    gap = json.loads(capsys.readouterr().out)  # Stdout holds nothing else.
     assert gap == json.loads((tmp_path / "gap.json").read_text(encoding="utf-8"))
     verdict = gap["verdict"]
     assert verdict["status"] == "explained"
@@ -160,7 +160,7 @@ def test_validation_on_the_other_recording(folder, tmp_path, capsys):
     assert run("validate", folder / "fit.json", folder / "emps-pulses.h5", "--json") == 0
     (score,) = json.loads(capsys.readouterr().out)["scores"]
     assert (score["experiment"], score["column"], score["units"]) == ("ID.3-dynamic", "axis", "N")
-    assert 0 < score["noise"] < score["rms"] < 12  # of forces up to 150 N
+    assert 0 < score["noise"] < score["rms"] < 12  # N, where forces reach 150 N
 
 
 def test_prediction_is_a_file_of_the_same_layout(folder, tmp_path):
@@ -277,7 +277,7 @@ def _clock(monkeypatch, *seconds):
 
 
 def test_the_time_left_is_learned_from_the_last_run(capsys, monkeypatch, tmp_path):
-    """Of work that came to its end, whatever it took this time."""
+    """Only a run that came to its end counts."""
     from jaxfinger.cli import output
 
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
@@ -306,7 +306,7 @@ def test_the_time_left_is_learned_from_the_last_run(capsys, monkeypatch, tmp_pat
 
 
 def test_a_terminal_of_ascii_and_a_library_that_warns():
-    """Greek letters are replaced, and nothing of a library reaches stderr."""
+    """Greek letters are replaced, and no warning of a library reaches stderr."""
     code = (
         "import warnings, logging, sys; from jaxfinger.cli import main\n"
         "try: main(['show', '--help'])\n"
@@ -331,7 +331,7 @@ def test_effects_lists_the_catalogue_and_prints_one_in_full(capsys):
 
 
 def test_a_disk_that_is_full_is_one_sentence(folder):
-    """What a command says, and what it would have written, cannot be: no traceback, and another exit code than 0."""
+    """A command whose output does not fit on the disk ends without a traceback, and not with exit code 0."""
     command = [sys.executable, "-m", "jaxfinger", "show", str(folder / "fit.json")]
     with open("/dev/full", "w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)

@@ -1,4 +1,4 @@
-"""`jaxfinger diagnose` refuses before it works."""
+"""`jaxfinger diagnose` refuses mistakes before it starts to work."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""`jaxfinger new` writes a finger and a mapping that are read as they stand."""
+"""`jaxfinger new` writes a finger and a mapping that can be read unchanged."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from jaxfinger.cli import main
 from jaxfinger.data import check_file, read_session
 
-NAMES = ("MCP", "P.IP")  # one that TOML must quote
+NAMES = ("MCP", "P.IP")  # TOML must quote the second.
 
 
 @pytest.fixture
@@ -16,7 +16,7 @@ def written(tmp_path):
 
 
 def log(path, moved, pulled=False):
-    """A recording by a rig of one's own: columns as the template names them, angles in degrees, lengths in mm."""
+    """Write a recording with the template's names of columns, angles in degrees and lengths in mm."""
     rng, time = np.random.default_rng(len(str(path))), np.arange(600) / 50
     sweep = 40 - 30 * np.cos(time)
     angle = {name: sweep if name == moved and not pulled else 20 + 0.01 * rng.standard_normal(600) for name in NAMES}
@@ -54,7 +54,7 @@ def test_nothing_is_overwritten_unless_asked_and_names_differ(written, capsys):
 
 
 def foreign(path, moves=(), pulls=None, torque=False, stepped=False):
-    """A log of another rig: own names, joints in the wrong order, degrees, mm, ms, N mm."""
+    """Write a log of another rig: names of its own, joints in the wrong order, in degrees, mm, ms and N mm."""
     rng, time = np.random.default_rng(len(str(path))), np.arange(1200) / 50
     way = np.interp(time % 2.0, [0, 0.6, 2.0], [0.0, 1.0, 1.0]) + time // 2.0 if stepped else 6 - 6 * np.cos(time)
     angle = {n: 20 + (5 * way if n in moves else 0) + 0.01 * rng.standard_normal(1200) for n in ("middle", "knuckle")}
@@ -78,7 +78,7 @@ FOREIGN = {
 
 
 def test_recordings_are_read_and_what_moves_tells_what_they_are(tmp_path, capsys):
-    """One file a trial, and nothing is typed but names: what was guessed imports as it stands."""
+    """Each trial is one file, and only names are given: the guessed mapping can be imported unchanged."""
     for name, (how, _) in FOREIGN.items():
         foreign(tmp_path / f"{name}.csv", **how)
     files = [f"{tmp_path}/{name}.csv" for name in FOREIGN]

@@ -1,4 +1,4 @@
-"""A small session with every experiment and channel of the format."""
+"""Fixture: a small session with every experiment and channel of the format."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def make_finger() -> FingerDescription:
 
 
 def steps(count, levels):
-    """A staircase that ramps between its levels; hold index and level a sample."""
+    """Staircase with ramps between its levels: the value at each sample, and the index of its hold."""
     each = count // len(levels)
     x, hold = np.zeros(count), np.full(count, -1, np.int32)
     for i, level in enumerate(levels):
@@ -90,7 +90,7 @@ def make_session() -> Session:
     q = np.column_stack([sweep, 0.5 * sweep])
     warm = {"temperature": 300.0 + np.outer(time, [0.1, 0.2]), "temperature_names": ("motor T1", "motor T2")}
     trials.append(Trial("07-VD.3", "VD.3", time, q, tension(), excursion, **warm))
-    q = np.column_stack([sweep, 0.5 * sweep])  # both joints at once: no attribute `joint`
+    q = np.column_stack([sweep, 0.5 * sweep])  # Both joints move at once, so the trial has no attribute `joint`.
     trials.append(Trial("08-ID.3-dynamic", "ID.3-dynamic", time, q, joint_torque=0.01 * q))
     return Session("test finger", make_finger(), {t.name: t for t in trials}, "tests", "2026-01-01T00:00:00+00:00")
 
@@ -100,7 +100,7 @@ def session() -> Session:
     return make_session()
 
 
-# A mapping file as far as the finger.
+# The start of a mapping file, up to the end of the finger.
 ONE_JOINT = """
 specimen = "bench finger"
 [finger]

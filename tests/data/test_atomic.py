@@ -1,4 +1,4 @@
-"""A file appears whole or not at all, whatever happens to the disk or to the process that writes it."""
+"""Atomic writing: a file appears whole or not at all if the disk fills up or the writing process is killed."""
 
 import os
 import resource
@@ -19,7 +19,7 @@ from jaxfinger.errors import UserError
 
 @contextmanager
 def room_for(size: int):
-    """No file may grow beyond `size` bytes: writing fails within a file, as on a disk that fills up."""
+    """Limit files to `size` bytes, so that writing fails within a file as on a disk that fills up."""
     old = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, old[1]))
     try:
@@ -82,6 +82,6 @@ def test_what_a_killed_process_left_is_removed_and_what_another_writes_is_not(tm
             assert orphan.name not in names
             assert old.name not in names
             assert {young.name, ".b.txt.x.part"} <= names
-            assert len(names) == 4  # and the parts of the two that are writing
+            assert len(names) == 4  # The other two are the parts of the two writers.
         living.stdin.close()
     assert file.read_text() == "whole"

@@ -1,4 +1,4 @@
-"""MCAP and rosbag2 recordings: exact, and readable to the cut when cut short."""
+"""MCAP and rosbag2 recordings are read exactly, and up to the cut where they are cut short."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Inputs that went wrong, each for its kind: `cases/<name>/expected.txt` says what a user should get."""
+"""Inputs of users, one of each kind of mistake. `cases/<name>/expected.txt` states what the user should get."""
 
 import io
 import shutil
@@ -80,7 +80,7 @@ def test_what_cannot_be_read_is_refused_in_one_sentence(case, recording, mapping
 
 @pytest.mark.parametrize(("case", "recording", "mapping"), IMPORTED)
 def test_what_other_programs_write_is_read(case, recording, mapping, tmp_path):
-    """Every one of these holds the same log: 1200 samples, of which the first and the last tell."""
+    """All of these files hold the same log of 1200 samples. Its first and last samples are compared."""
     assert bring_in(case, recording, mapping, tmp_path / "s.h5") == 0
     trial = read_session(tmp_path / "s.h5")["01-dyn"]
     assert trial.q.shape == (1200, 1)
@@ -95,7 +95,7 @@ def test_units_that_the_recording_states_are_compared(tmp_path, capsys):
 
 
 def test_a_joint_of_two_publishers_is_found_by_its_name(tmp_path):
-    """Positions of J and of L differ; the log's other publisher is no sample of this trial."""
+    """The two publishers of the topic send the joints J and L. Messages with L are no samples of this trial."""
     case = CASES / "joint-states-of-two-publishers"
     text = (case / "m.toml").read_text().replace("column = 0", 'column = "J"')
     (tmp_path / "m.toml").write_text(text)
@@ -120,7 +120,7 @@ def test_a_span_counts_from_the_first_sample(tmp_path):
 
 
 def test_a_clock_of_its_own_has_the_units_of_the_time(tmp_path):
-    """Both count ms; the torque then runs as in the log."""
+    """The trial's clock and the torque's own clock both count ms. The torque must have the log's range."""
     assert bring_in("own-clock-in-ms", "log.mat", "m.toml", tmp_path / "s.h5") == 0
     torque = read_session(tmp_path / "s.h5")["01-dyn"].joint_torque[:, 0]
     assert torque.min() == pytest.approx(-0.06, abs=0.01)
@@ -187,7 +187,7 @@ def test_predictions_with_a_few_nan(tmp_path, capsys):
 
 
 def test_a_platform_that_is_not_there(monkeypatch, capsys):
-    """JAX raises whatever it likes; that it has no device tells."""
+    """Without a device, JAX may raise an exception of any kind. The message is given only where there is no device."""
 
     def fail(*arguments, **options):
         raise AssertionError("no backend")
@@ -209,7 +209,7 @@ def test_import_repeats_what_check_warns_of(tmp_path, capsys):
 
 
 def test_identify_on_an_output_without_greek_of_torques_that_trade_off_exactly(tmp_path, capsys, monkeypatch):
-    """It repeats what check warns of; what the trials cannot see has no interval."""
+    """`identify` repeats the checker's warnings, and torques that the trials do not determine have no interval."""
     assert bring_in("unseen-torques-with-an-interval-of-zero", "log.csv", "m.toml", tmp_path / "s.h5") == 0
     with h5py.File(tmp_path / "s.h5", "r+") as file:
         file.attrs["created"] = "on \x1b[31mMonday"
@@ -228,7 +228,7 @@ def test_identify_on_an_output_without_greek_of_torques_that_trade_off_exactly(t
 
 @pytest.mark.parametrize("kind", ["virtual", "external", "link"])
 def test_numbers_that_lie_in_another_file_are_refused(kind, tmp_path):
-    """A source that is missing reads as zeros."""
+    """HDF5 reads zeros where the other file is missing."""
     shutil.copyfile(SOUND, tmp_path / "s.h5")
     place = "trials/01-dyn/q"
     with h5py.File(tmp_path / "s.h5", "r+") as file:

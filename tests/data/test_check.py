@@ -1,4 +1,4 @@
-"""Every fault that users make is found, named with its place, and refused by the reader without a traceback."""
+"""Faults in session files: the checker names each with its place, and the reader refuses it without a traceback."""
 
 import shutil
 from dataclasses import replace
@@ -26,7 +26,7 @@ def file(good, tmp_path):
 
 
 def put(group, name, change):
-    """Replace a dataset by a changed copy, with its attributes."""
+    """Replace a dataset by a changed copy with the same attributes."""
     old = group[name]
     value, attributes = change(old[()]), dict(old.attrs)
     del group[name]
@@ -152,7 +152,7 @@ ERRORS = {
 
 @pytest.mark.parametrize("fault", ERRORS)
 def test_each_fault_is_named_and_refused(file, fault, monkeypatch):
-    monkeypatch.setattr("jaxfinger.data.opening.survives", lambda path: True)  # whole files with wrong content
+    monkeypatch.setattr("jaxfinger.data.opening.survives", lambda path: True)  # These files are whole; forks cost time.
     change, place, words = ERRORS[fault]
     with h5py.File(file, "r+") as opened:
         change(opened)

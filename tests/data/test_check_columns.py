@@ -1,4 +1,4 @@
-"""Columns of two tendons that were taken for one another are named, by each kind of evidence alone."""
+"""Exchanged columns of two tendons are reported, by each of the three tests alone."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ RATE, TIME = 100.0, np.arange(0.0, 9.0, 0.01)
 
 
 def exchanged(session):
-    """With the columns of both active tendons in each other's place."""
+    """Session with the columns of both active tendons exchanged."""
 
     def other(trial: Trial) -> Trial:
         return replace(trial, tendon_excursion=trial.tendon_excursion[:, [1, 0, 2]])
@@ -21,7 +21,7 @@ def exchanged(session):
 
 
 def turning(joint: int, arms, noise=2e-5) -> Trial:
-    """ID.2 of one joint, with the tendons' moment arms at it, m."""
+    """ID.2 trial of one joint. `arms` are the tendons' moment arms at it, m."""
     rng = np.random.default_rng(joint)
     q = 0.4 + 1e-4 * rng.standard_normal((len(TIME), 2))
     q[:, joint] += 0.4 * np.sin(2.0 * np.pi * 0.2 * TIME)
@@ -31,7 +31,7 @@ def turning(joint: int, arms, noise=2e-5) -> Trial:
 
 
 def pulled(tendon: int, stiffness=5e4) -> Trial:
-    """ID.4 of one tendon, which stretches."""
+    """ID.4 trial of one tendon that stretches. `stiffness` is in N/m."""
     rng = np.random.default_rng(10 + tendon)
     q = 0.4 + 1e-5 * rng.standard_normal((len(TIME), 2))
     force = 2.0 + 0.02 * rng.standard_normal((len(TIME), 3))
@@ -43,7 +43,7 @@ def pulled(tendon: int, stiffness=5e4) -> Trial:
 
 
 def of(session, *trials, known=None):
-    """The trials alone, of the session's finger, which knows these excursions."""
+    """Session with only these trials and the session's finger, with `known` as its known excursions."""
     finger = replace(session.finger, excursion=known, excursion_std=None)
     return replace(session, finger=finger, trials={t.name: t for t in trials})
 
@@ -63,7 +63,7 @@ def test_columns_that_were_taken_for_one_another_are_named(session, evidence):
 
 
 def test_what_has_other_reasons_is_not_named(session):
-    """A coupling between joints, CAD that is a tenth off, tendons that do not stretch."""
+    """Three innocent sessions: a coupling between joints, CAD that is a tenth off, and tendons that do not stretch."""
     known = np.array([[[0.008], [0.005]], [[0.007], [0.0]], [[np.nan], [np.nan]]])
     rigid = (pulled(0, np.inf), pulled(1, np.inf))
     for odd in (

@@ -1,4 +1,4 @@
-"""Channels that contradict each other are said, and a sound session has no contradiction."""
+"""Channels that contradict each other are reported, and a sound session has no contradiction."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ FRICTION = 0.004  # N m
 
 @pytest.fixture(scope="module")
 def sound(session):
-    """With friction in the joint that moves, so that its cycles take work."""
+    """Session with friction in the moving joint, so that a cycle takes work from the motor."""
     trial = session["03-ID.3-dynamic-MCP"]
     way = np.sign(np.gradient(trial.q[:, 0]))
     torque = trial.joint_torque + FRICTION * way[:, None]
@@ -49,13 +49,15 @@ def test_what_contradicts_is_said(sound, experiment, channel, change, words):
 
 
 def test_most_mistakes_of_a_mapping_are_said(sound):
-    """Made in every trial alike, as a mapping makes them."""
+    """Each mistake is made in all trials alike, as a mapping makes it.
+
+    Up to 16 mistakes stay silent here: the session has a single ID.4 trial, and no VD.3 with excursions of a third
+    joint.
+    """
     before = said(sound)
     silent = [
         name
         for name, mistake in mistakes(sound)
         if said(replace(sound, trials={t.name: mistake(t) for t in sound})) <= before
     ]
-    assert len(silent) <= 16, (
-        silent
-    )  # the small session has one ID.4 trial, and no VD.3 with excursions of a third joint
+    assert len(silent) <= 16, silent

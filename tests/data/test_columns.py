@@ -1,4 +1,4 @@
-"""Columns on clocks of their own, of other files, unwrapped, sorted, chosen by a condition."""
+"""Columns of a mapping: own clocks, other files, unwrapping, sorting, and rows chosen by a condition."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_a_slower_clock_is_interpolated_and_the_trial_cut_to_it(tmp_path):
     trial, said = bring_in(tmp_path, OWN)
     assert trial.time[-1] == pytest.approx(SLOW[-1])
     np.testing.assert_allclose(trial.joint_torque[:, 0], 0.01 * np.sin(trial.time), atol=1e-5)
-    assert not any("cut" in text for text in said)  # by less than two ticks
+    assert not any("cut" in text for text in said)  # Less than two intervals are cut, which is no finding.
 
 
 def test_a_clock_that_covers_a_part(tmp_path):
@@ -111,7 +111,7 @@ def test_derived_variables_and_rows_by_a_condition(tmp_path):
 
 
 def test_an_encoder_in_counts_is_unwrapped(tmp_path):
-    counts = np.round(Q * 4096 / (2 * np.pi) * 10) % 4096  # behind a gear of ten
+    counts = np.round(Q * 4096 / (2 * np.pi) * 10) % 4096  # The encoder is on the motor's side of a gear of 10:1.
     text = '{ from = "counts", unwrap = 4096, scale = 0.00015339807878856412, units = "rad" }'
     recorded = {"t": TIME, "counts": counts, "now": 0.01 * np.cos(TIME)}
     scipy.io.savemat(tmp_path / "log.mat", recorded)

@@ -1,4 +1,4 @@
-"""CSV as programs write it, and lines that are wrong."""
+"""CSV files of many programs, and files with wrong lines."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Arithmetic of a mapping: what it computes, and that nothing else runs."""
+"""Arithmetic in a mapping: its values, and the refusal of everything else."""
 
 import numpy as np
 import pytest

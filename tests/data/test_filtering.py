@@ -1,4 +1,4 @@
-"""Derivatives, decimation, spikes: against closed forms."""
+"""Derivatives, shrinking and spikes, compared with closed forms."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_derivatives_of_a_sine_in_the_pass_band(even):
     w = 2 * np.pi * 1.5
     x, xd, xdd = smooth(time, np.sin(w * time)[:, None], 20.0)
     k = inner(time, 20.0)
-    gain = 2.0 ** (-0.5 * (1.5 / 20.0) ** 2)  # of a Gaussian; linear resampling costs (w h)^2 / 8 = 1.1e-5 more
+    gain = 2.0 ** (-0.5 * (1.5 / 20.0) ** 2)  # Gaussian. Linear resampling adds an error of (w h)^2 / 8 = 1.1e-5.
     np.testing.assert_allclose(x[k, 0], gain * np.sin(w * time[k]), atol=5e-5)
     np.testing.assert_allclose(xd[k, 0], gain * w * np.cos(w * time[k]), atol=1e-3 * w)
     np.testing.assert_allclose(xdd[k, 0], -gain * (w**2) * np.sin(w * time[k]), atol=1e-3 * w**2)
@@ -106,8 +106,11 @@ def test_a_quantised_channel_has_no_spikes():
 
 
 def test_a_shrunk_regressor_is_rid_of_most_of_its_bias():
-    """Bursts of acceleration between long quiet stretches, seen through noise: least squares with weights that favour
-    fast changes, as whitening does, finds too little inertia from the noisy one."""
+    """The regressor has bursts of acceleration between long quiet stretches, and noise.
+
+    Least squares with weights that favour fast changes, as whitening does, underestimates inertia from the noisy
+    regressor.
+    """
     rng = np.random.default_rng(0)
     n = np.arange(40_000)
     burst = np.exp(-0.5 * (((n % 1000) - 500) / 30.0) ** 2) * np.sign((n // 1000) % 2 - 0.5)
@@ -125,7 +128,7 @@ def test_a_shrunk_regressor_is_rid_of_most_of_its_bias():
 
 def test_shrinking_leaves_a_smooth_motion_and_a_constant_alone():
     slow = np.sin(2 * np.pi * np.arange(5000) / 5000)[:, None]
-    np.testing.assert_allclose(shrink(slow, 100), slow, atol=3e-3)  # the ends too
+    np.testing.assert_allclose(shrink(slow, 100), slow, atol=3e-3)  # This includes both ends.
     np.testing.assert_array_equal(shrink(np.ones((500, 2)), 100), np.ones((500, 2)))
 
 
@@ -144,9 +147,9 @@ def test_spikes_are_bridged_and_everything_else_is_left_alone():
 
 @pytest.mark.parametrize("rate", [100.0, 250.0, 1000.0])
 def test_a_reversal_without_noise_is_no_spike_that_matters(rate):
-    """Coarse samples bend at a reversal; a line across one or two of them is as good."""
+    """Coarse samples may be taken for spikes at a reversal, but a line across one or two of them changes little."""
     time = np.arange(0.0, 10.0, 1.0 / rate)
-    q = 1.0 - np.cos(np.pi * np.maximum(time - 2.0, 0.0))[:, None]  # rests, then turns back every second
+    q = 1.0 - np.cos(np.pi * np.maximum(time - 2.0, 0.0))[:, None]  # The joint rests, then turns back every second.
     np.testing.assert_allclose(without_spikes(q), q, atol=(np.pi / rate) ** 2)
 
 
@@ -157,9 +160,9 @@ def test_a_reversal_without_noise_is_no_spike_that_matters(rate):
     noise=st.sampled_from([0.0, 1e-4, 1e-3]),
     seed=st.integers(0, 99),
 )
-@example(rate=20.0, stroke=1.7544745778404764, noise=0.0, seed=64)  # sets off at the recording's last samples
+@example(rate=20.0, stroke=1.7544745778404764, noise=0.0, seed=64)  # The motion starts at the last samples.
 def test_a_motion_is_no_spike_at_any_rate_and_spikes_in_it_are(rate, stroke, noise, seed):
-    """A hand's strokes, from 20 to 1000 Hz."""
+    """The motion is a hand's strokes, sampled at 20 to 1000 Hz."""
     rng = np.random.default_rng(seed)
     time = np.arange(round(20 * rate)) / rate
     x = motions.wander(time, 0.0, 1.0, rng, (stroke, 1.5 * stroke)).x + noise * rng.standard_normal(time.size)

@@ -1,4 +1,4 @@
-"""What a reader gets of the checker's findings: one line for what trials have in common, with its subject."""
+"""Findings for people: one line for a fault that trials share, and a subject in every sentence."""
 
 import pytest
 

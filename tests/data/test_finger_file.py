@@ -1,4 +1,4 @@
-"""A finger in TOML: read, written, and refused where no finger can be so."""
+"""A finger in TOML is read and written, and refused where it is impossible."""
 
 from dataclasses import fields, replace
 

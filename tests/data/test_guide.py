@@ -1,4 +1,4 @@
-"""docs/your-own-data.md, from start to end."""
+"""The guide docs/your-own-data.md works from start to end, and names every key and unit."""
 
 import re
 import shlex
@@ -23,7 +23,7 @@ BLOCKS = re.findall(r"^```(\w+)([^\n]*)\n(.*?)^```", GUIDE, re.M | re.S)
 
 @pytest.fixture(scope="module")
 def followed(tmp_path_factory):
-    """The folder of a reader who has typed everything."""
+    """Folder after all commands of the guide were run in it, with all of its files."""
     folder = tmp_path_factory.mktemp("reader")
     patch = pytest.MonkeyPatch()
     patch.chdir(folder)

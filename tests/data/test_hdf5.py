@@ -1,4 +1,4 @@
-"""What is written comes back; nothing is overwritten or left half written."""
+"""Session files: written values are read back, and no file is overwritten or left half written."""
 
 from dataclasses import fields, replace
 
@@ -59,7 +59,7 @@ def test_the_format_to_the_letter(file):
         warm = opened["trials/07-VD.3/temperature"]
         assert (warm.attrs["units"], list(warm.attrs["names"])) == ("K", ["motor T1", "motor T2"])
         assert "joint" not in opened["trials/08-ID.3-dynamic"].attrs
-        # Superblock 0 and object headers of version 1: what MATLAB before R2021b reads.
+        # MATLAB before R2021b reads superblock 0 and object headers of version 1 only.
         assert opened.id.get_create_plist().get_version()[0] == 0
 
 
@@ -81,7 +81,7 @@ def test_nothing_is_overwritten_unless_asked(session, file):
 def test_a_failed_write_leaves_the_old_file_and_no_litter(session, file):
     before = data_hash(file)
     bad = replace(session["07-VD.3"])
-    object.__setattr__(bad, "tendon_force", np.zeros((3, 3)))  # no trial could be made so where types are checked
+    object.__setattr__(bad, "tendon_force", np.zeros((3, 3)))  # The tests' type checks refuse it in the constructor.
     with pytest.raises(UserError, match=r"/trials/07-VD.3/tendon_force: has shape \(3, 3\); it must be \(900, 3\)"):
         write_session(replace(session, trials={bad.name: bad}), file, overwrite=True)
     with pytest.raises(UserError, match="is no channel"):
@@ -100,14 +100,14 @@ def test_order_of_the_session(session, tmp_path):
 
 
 def test_what_other_writers_do_is_read(session, file):
-    """Bytes for strings, float32, unknown groups, attributes and datasets, optional parts missing."""
+    """Other writers store strings as bytes, use float32, add groups and attributes, and leave optional parts out."""
     with h5py.File(file, "r+") as opened:
         opened.attrs["specimen"] = np.bytes_("fingers")
         opened.attrs["made_with"] = "something"
         opened.create_group("video/frames")
         trial = opened["trials/07-VD.3"]
         del trial["temperature"]
-        trial["temperature"] = np.zeros(3)  # of 1.0, where it may be anything
+        trial["temperature"] = np.zeros(3)  # In version 1.0 the name has no meaning.
         opened.attrs["format_version"] = "1.0"
         single = trial["q"][()].astype(np.float32)
         del trial["q"]

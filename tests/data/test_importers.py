@@ -1,4 +1,4 @@
-"""Recordings of other tools come in with their numbers intact; mistakes in a mapping are named."""
+"""Recordings of other tools are imported with their numbers intact, and mistakes in a mapping are named."""
 
 from pathlib import Path
 
@@ -70,7 +70,7 @@ def test_matlab_version_5(mapping, tmp_path):
 
 
 def test_a_byte_that_crashes_the_reader_of_matlab_files_is_said(tmp_path):
-    """One byte of a length is enough."""
+    """A single wrong byte in a length crashes SciPy's reader."""
     raw = bytearray((Path(__file__).parent / "cases" / "simulink-signal-of-two-columns" / "log.mat").read_bytes())
     raw[29337] = 50
     (tmp_path / "log.mat").write_bytes(raw)
@@ -79,7 +79,7 @@ def test_a_byte_that_crashes_the_reader_of_matlab_files_is_said(tmp_path):
 
 
 def test_matlab_version_7_3_with_a_structure(mapping, tmp_path):
-    """v7.3 is HDF5 behind a 512-byte user block, its arrays transposed, its structures groups."""
+    """Version 7.3 is HDF5 after a user block of 512 bytes, with transposed arrays, and groups as structures."""
     with h5py.File(tmp_path / "log.mat", "w", userblock_size=512) as file:
         for name, value in RECORDED.items():
             file[f"log/{name}"] = np.atleast_2d(np.transpose(value))

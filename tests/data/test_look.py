@@ -1,4 +1,4 @@
-"""`look` says what a recording holds; what it proposes is a mapping that imports."""
+"""`look` describes a recording and proposes a mapping that imports it."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ TIME = np.delete(np.arange(1000), [500, 501, 502, 503, 504, 505, 506]) * 5.0
 
 @pytest.fixture
 def log(tmp_path):
-    """Degrees, N mm and ms, as ranges tell, and a gap."""
+    """CSV file with a gap, in degrees, N mm and ms, which only its ranges show."""
     columns = [TIME, 40 + 30 * np.sin(TIME / 1e3), 80 * np.cos(TIME / 1e3), 300 * np.sin(TIME / 1e2)]
     path = tmp_path / "log.csv"
     np.savetxt(path, np.column_stack(columns), "%.6f", ",", header="t,enc,dq,tau", comments="")
@@ -122,7 +122,7 @@ def test_variables_that_give_no_numbers_are_named(tmp_path, capsys):
     ],
 )
 def test_what_is_measured_of_a_swept_joint_says_which_experiment_it_is(tmp_path, columns, experiment):
-    """Without a torque a swept joint tells of excursions; a column F_… is a force, of the tendon that it names."""
+    """Without torque, a swept joint means ID.2. A column F_… is a force."""
     swing = 40.0 - 40.0 * np.cos(TIME / 1e3)
     table = np.column_stack([TIME, swing, *(level + 0.1 * swing for level in columns.values())])
     np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header=",".join(["stamp_ms", "a_deg", *columns]), comments="")

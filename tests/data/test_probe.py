@@ -1,4 +1,4 @@
-"""The child that walks a file first: what it survives, and what it does not."""
+"""The child process that reads a file first survives sound files, and dies of damaged ones."""
 
 import time
 
@@ -35,7 +35,7 @@ def test_what_raises_in_the_walk_does_not_survive(file, monkeypatch):
 
 
 def test_a_busy_machine_damages_no_file_and_a_circle_does(file, monkeypatch):
-    """Patience is in processor time: to sleep costs none."""
+    """The limit is one of processor time, of which sleep takes none."""
     monkeypatch.setattr(probe, "_MAX_CPU_TIME", 0.1)
     monkeypatch.setattr(probe, "_walk", lambda *_: time.sleep(0.5))
     assert probe.survives(file)

@@ -1,4 +1,4 @@
-"""The one TOML reader: whatever is written in a file, it is read, or refused in one sentence with file and line."""
+"""Reader of TOML: any text is either read, or refused in one sentence with file and line."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
