@@ -4,7 +4,7 @@ from pathlib import Path
 
 
 def effects(id: str | None = None, /, *, effects: Path | None = None) -> None:
-    """What may make a finger differ from its model: all of it in a table, or one effect in full.
+    """List the effects that may make a finger differ from its model, or describe one of them in full.
 
     Parameters
     ----------

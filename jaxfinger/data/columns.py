@@ -19,8 +19,8 @@ from jaxfinger.data.toml import Place
 from jaxfinger.data.units import TO_SI, unit_name
 from jaxfinger.errors import UserError, counted
 
-# Ratio of the durations or intervals of two clocks, from which one is taken to be in other units. Mistaken units are
-# wrong by a thousand and slow sensors by less than thirty, the geometric mean of one and a thousand.
+# Ratio of the durations and intervals of two clocks, from which one is taken to be in other units: about the geometric
+# mean of one, for clocks in the same units, and a thousand, for mistaken ones. Slow sensors have a smaller one.
 _MAX_CLOCK_RATIO = 30.0
 _MIN_COVERAGE = 0.5  # of a trial: a clock that covers less is taken to be a wrong one.
 _MIN_SAMPLES = 10  # within the trial: fewer show no motion.

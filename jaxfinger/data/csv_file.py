@@ -24,7 +24,7 @@ from jaxfinger.errors import UserError, counted
 _COMMENTS = ("#", "%")
 # Pairs of separator and decimal mark; None is any run of blanks. Among equally good ones the first is taken.
 _DIALECTS = ((",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("|", "."), (None, "."), (None, ","))
-_DIALECT_LINES = 60  # lines from the middle of the file that decide the dialect: enough for rare text cells to be few
+_DIALECT_LINES = 60  # They decide the dialect, and are taken from the middle of the file, after any header.
 _TRUTH = {"true": 1.0, "false": 0.0}
 _UNIT = r"%|°|deg|rad|turn|rev|rpm|k?Hz|[mun]?s|[munc]?m|[mk]?N|[mk]?N[ ·*]?[cm]?m|[mu]?A|[mk]?V|°?C|K|[mk]?g|1|-|bool"
 _ALONE = re.compile(rf"^[\[(]?({_UNIT}|{_UNIT}/s2?|)[\])]?$")

@@ -15,7 +15,7 @@
     [[finger.tendons]]
     name = "T1"
     crosses = ["MCP"]
-    excursion = { MCP = [0.008, 1e-3] }   # m/rad, m/rad², …, optional: what CAD says of pulled length against angle
+    excursion = { MCP = [0.008, 1e-3] }   # m/rad, m/rad², …, optional: excursion over angle, where CAD knows it
 
 A line `finger = "session.h5"` or `finger = "finger.toml"` takes the description from another file.
 """

@@ -10,7 +10,7 @@ from jaxfinger.data.session import Trial
 from jaxfinger.data.sizes import Sizes
 
 CUTOFF_HZ = 10.0  # Faster than any commanded motion of the protocol, slower than most of the sensors' noise.
-HOLD_CUTOFF_HZ = 5.0  # Steps between holds are slower than other motions, so a slower filter still shows them.
+HOLD_CUTOFF_HZ = 5.0  # Stillness needs no fast filter, and at half the cut-off the speed has a third of the noise.
 QUICK_CUTOFF_RATIO = 3.0  # A slip that one filter spreads shows in a filter three times as fast.
 MAX_CUTOFF_SHARE = 0.4  # of the sampling rate; `smooth` needs a cut-off below half of it.
 REST_SPEED_NOISE = 6.0  # times the noise of the speed: a slower joint may be at rest.

@@ -21,7 +21,7 @@ import h5py.h5o as h5o
 # busy machine.
 _MAX_CPU_TIME = 5.0
 _MIN_OBJECT_SIZE = 16  # bytes: no object of a file is smaller, so a walk over more objects than fit runs in a loop.
-_SMALL = 10_000  # elements: smaller datasets are read whole, so that tables and names are read, and channels are not.
+_SMALL = 10_000  # elements: datasets below it, such as names and tables, are read whole. Channels would take too long.
 
 
 def survives(path: str | os.PathLike, visit: Callable[[Path], None] | None = None) -> bool:
