@@ -31,7 +31,7 @@ import scipy.io
 
 from jaxfinger.cli import main as main_of_jaxfinger
 from jaxfinger.data import Session, Trial, check_file, read_session, write_session
-from jaxfinger.data.check import check_session, examine
+from jaxfinger.data.check import check_samples, check_session
 from jaxfinger.data.findings import Report
 
 ROOT = Path(__file__).parents[1]
@@ -109,7 +109,7 @@ def findings(session: Session) -> Report:
     """Findings of the checker on a session in memory."""
     report = Report()
     check_session(session, report)
-    examine(session, report)
+    check_samples(session, report)
     return report
 
 

@@ -27,7 +27,7 @@ def check(file: Path, *, json: bool = False) -> None:
         Print the findings as JSON.
     """
     from jaxfinger.data import check_file
-    from jaxfinger.data.findings import together
+    from jaxfinger.data.findings import merged
 
     with progress("check") as say:
         say(file.name)
@@ -36,7 +36,7 @@ def check(file: Path, *, json: bool = False) -> None:
     if json:
         print_json({"file": file, "ok": not errors, "findings": [asdict(f) for f in findings]})
     else:
-        for finding in together(findings):
+        for finding in merged(findings):
             said = f"{finding.severity}: {file}: {finding.message}" if finding.place == "/" else finding
             console().print(plain(said), markup=False, soft_wrap=True)
         rest = len(findings) - errors

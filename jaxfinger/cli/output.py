@@ -120,9 +120,9 @@ def plain(text: object) -> str:
 
 def remark(findings: Iterable[Finding], file: Path) -> None:
     """Print the checker's warnings on stderr, so that no command silently works on doubtful numbers."""
-    from jaxfinger.data.findings import together
+    from jaxfinger.data.findings import merged
 
-    warnings = together(finding for finding in findings if finding.severity == "warning" or finding.local)
+    warnings = merged(finding for finding in findings if finding.severity == "warning" or finding.local)
     for finding in warnings[:MAX_REMARKS]:
         print(plain(f"{file}: {finding}"), file=sys.stderr)
     if len(warnings) > MAX_REMARKS:
@@ -133,12 +133,12 @@ def remark(findings: Iterable[Finding], file: Path) -> None:
 def read(path: Path) -> Session:
     """Read a session, and print the checker's warnings about it."""
     from jaxfinger.data import read_session
-    from jaxfinger.data.check import examine
+    from jaxfinger.data.check import check_samples
     from jaxfinger.data.findings import Report
 
     report = Report()
     session = read_session(path, report=report)
-    examine(session, report)
+    check_samples(session, report)
     remark(report, path)
     return session
 

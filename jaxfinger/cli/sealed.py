@@ -18,7 +18,7 @@ from cyclopts import Parameter
 from jaxfinger.cli.output import console
 from jaxfinger.errors import UserError
 
-Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
+Folder = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 PREDICT = f"{shlex.quote(sys.executable)} -m jaxfinger predict {{fit}} {{session}} -o {{out}}"
 REFIT = f"{shlex.quote(sys.executable)} -m jaxfinger fit effects {{session}} --effect {{effects}} -o {{out}}"
 
@@ -84,7 +84,7 @@ def rivals(folder: Path, *, truth: Path | None = None, workers: int | None = Non
 def run(
     folder: Path,
     *,
-    output: Output = None,
+    output: Folder = None,
     command: str | None = None,
     withheld: bool = False,
     truth: Path | None = None,
@@ -175,7 +175,7 @@ def close(
     print(f"{out}: {len(results)} cases" + (f"; failed, see close.log: {', '.join(failed)}" if failed else ""))
 
 
-def score(folder: Path, *, diagnoses: Path | None = None, truth: Path | None = None, output: Output = None) -> None:
+def score(folder: Path, *, diagnoses: Path | None = None, truth: Path | None = None, output: Folder = None) -> None:
     """Print every score of the diagnosis on FOLDER's cases, with intervals, confusions and reliability; and what stands
     in for effects that were withheld, where `run --withheld` has been.
 

@@ -37,16 +37,16 @@ def check_file(path: str | os.PathLike) -> list[Finding]:
     >>> [finding.severity for finding in jf.check("fit.json")]
     ['error']
     """
-    session, report = inspect(path)
+    session, report = read_and_check(path)
     if session is not None:
-        examine(session, report)
+        check_samples(session, report)
     return list(report)
 
 
-def inspect(path: str | os.PathLike, trials: Collection[str] | None = None) -> tuple[Session | None, Report]:
+def read_and_check(path: str | os.PathLike, trials: Collection[str] | None = None) -> tuple[Session | None, Report]:
     """Read a file, or only the named trials: the session, None where it is unusable, and the findings about it.
 
-    Checks that look at every sample are left to `examine`.
+    Checks that look at every sample are left to `check_samples`.
     """
     report = Report()
     file = open_file(path, report)
@@ -139,7 +139,7 @@ def _check_created(created: str, report: Report) -> None:
         report.warning("/", f"has `created` {created!r}; write ISO 8601 with time zone, as 2026-01-31T12:00:00+00:00")
 
 
-def examine(session: Session, report: Report) -> None:
+def check_samples(session: Session, report: Report) -> None:
     """Report spikes, and channels that contradict each other: the checks that look at every sample."""
     with np.errstate(all="ignore"):
         check_spikes(session, report)

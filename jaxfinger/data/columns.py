@@ -151,14 +151,14 @@ def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place,
         return _cut(clock, trial, where)
     rows_of = _first_rows(first, source, where)
     place = where / "time"
-    said = Reading(trial.time) if isinstance(trial.time, str) else trial.time
-    values, _ = _column(source.variable(said.from_, place), said.from_, said.column, place)
-    time = _converted(values, said, "s", source, place)
+    reading = Reading(trial.time) if isinstance(trial.time, str) else trial.time
+    values, _ = _column(source.variable(reading.from_, place), reading.from_, reading.column, place)
+    time = _converted(values, reading, "s", source, place)
     rows = np.arange(len(time))
     if rows_of is not None and len(rows_of) == len(rows):
         rows = rows[rows_of]
-    order = in_order(time[rows], f"`{said.from_}`", trial.sort, place, report)
-    clock = Clock(time[rows][order], rows[order], len(time), source, said.from_, said.units or "s", trial.sort)
+    order = increasing_order(time[rows], f"`{reading.from_}`", trial.sort, place, report)
+    clock = Clock(time[rows][order], rows[order], len(time), source, reading.from_, reading.units or "s", trial.sort)
     return _cut(clock, trial, where)
 
 
@@ -195,7 +195,7 @@ def _cut(clock: Clock, trial: MappedTrial, where: Place) -> Clock:
     return clock
 
 
-def in_order(time: np.ndarray, name: str, sort: bool, where: Place, report: Report) -> np.ndarray:
+def increasing_order(time: np.ndarray, name: str, sort: bool, where: Place, report: Report) -> np.ndarray:
     """Indices that put times into increasing order, without repeated ones.
 
     Raises:
@@ -238,7 +238,7 @@ class ColumnReader:
         name = spec.from_
         variable = source.variable(name, where)
         values, k = _column(variable, name, spec.column, where)
-        _stated(variable, spec, units, self.report, where)
+        _compare_units(variable, spec, units, self.report, where)
         values = _converted(values, spec, units, source, where)
         here = np.ones(len(values), bool) if variable.present is None else variable.present[:, k]
         own = self._own_clock(spec, variable, source, here, where)
@@ -257,7 +257,7 @@ class ColumnReader:
         if len(time) != len(values):
             where.fail(f"has {len(values)} samples, and its clock {own_name} has {len(time)}; name its own clock")
         time, values = time[here], values[here]
-        order = in_order(time, own_name, clock.sort, where, self.report)
+        order = increasing_order(time, own_name, clock.sort, where, self.report)
         return self._onto(time[order], values[order], own_name, whole, where)
 
     def _own_clock(
@@ -267,9 +267,9 @@ class ColumnReader:
         clock = self.clock
         if spec.time is not None:
             place = where / "time"
-            said = Reading(spec.time, units=clock.units) if isinstance(spec.time, str) else spec.time
-            values, _ = _column(source.variable(said.from_, place), said.from_, said.column, place)
-            return f"`{said.from_}`", _converted(values, said, "s", source, place)
+            reading = Reading(spec.time, units=clock.units) if isinstance(spec.time, str) else spec.time
+            values, _ = _column(source.variable(reading.from_, place), reading.from_, reading.column, place)
+            return f"`{reading.from_}`", _converted(values, reading, "s", source, place)
         known_clocks = source.recording.variables
         main = known_clocks.get(clock.name)
         shared = source.recording is clock.source.recording
@@ -297,26 +297,26 @@ class ColumnReader:
         time, values = time[good], values[good]
         if len(time) < 2:
             where.fail(f"the clock {name} holds {len(time)} samples; name a clock that runs through the trial")
-        said = (
+        runs = (
             f"the clock {name} runs from {time[0]:.10g} to {time[-1]:.10g} s, "
             f"the trial from {trial[0]:.10g} to {trial[-1]:.10g} s"
         )
         inside = (trial >= time[0]) & (trial <= time[-1])
         if not inside.any():
-            where.fail(f"{said}; they do not overlap: name a clock that counts from the same start, in the same units")
+            where.fail(f"{runs}; they do not overlap: name a clock that counts from the same start, in the same units")
         longer = (time[-1] - time[0]) / max(trial[-1] - trial[0], 1e-12)
         slower = np.median(np.diff(time)) / max(float(np.median(np.diff(trial))) if len(trial) > 1 else 0.0, 1e-12)
         few = int(((time >= trial[0]) & (time <= trial[-1])).sum())
         units_differ = min(longer, slower) > _MAX_CLOCK_RATIO or max(longer, slower) < 1.0 / _MAX_CLOCK_RATIO
         if units_differ or few < _MIN_SAMPLES <= len(time):
             where.fail(
-                f"{said}; they do not share their units: write time = {{ from = {name.strip('`')!r}, units = 'ms' }}, "
+                f"{runs}; they do not share their units: write time = {{ from = {name.strip('`')!r}, units = 'ms' }}, "
                 "or so"
             )
         if inside.mean() < _MIN_COVERAGE:
             begin, end = trial[inside][0] - trial[0], trial[inside][-1] - trial[0]
             where.fail(
-                f"{said}: it covers only a part; name another clock, or cut the trial by span = "
+                f"{runs}: it covers only a part; name another clock, or cut the trial by span = "
                 f"[{begin:.4g}, {end:.4g}]"
             )
         step = float(np.median(np.diff(time)))
@@ -327,11 +327,11 @@ class ColumnReader:
         gaps = np.diff(time) > max(20.0 * step, 0.1)
         if gaps.any():
             longest = float(np.diff(time).max())
-            said = f"{counted(int(gaps.sum()), 'gap')}, the longest {longest:.3g} s"
-            self.report.warning(where.key, f"the clock {name} has {said}; values there are lines")
+            count = f"{counted(int(gaps.sum()), 'gap')}, the longest {longest:.3g} s"
+            self.report.warning(where.key, f"the clock {name} has {count}; values there are lines")
         self.begin, self.end = max(self.begin, time[0]), min(self.end, time[-1])
         if max(time[0] - trial[0], trial[-1] - time[-1]) > 2.0 * step:
-            self.report.warning(where.key, f"{said}; the trial is cut to what both cover")
+            self.report.warning(where.key, f"{runs}; the trial is cut to what both cover")
         if whole:
             values = values[np.clip(np.searchsorted(time, trial, "right") - 1, 0, len(time) - 1)]
             return np.where(inside, values, np.nan)
@@ -345,15 +345,15 @@ class ColumnReader:
 
 def _converted(values: np.ndarray, spec: Reading, units: str, source: Source, where: Place) -> np.ndarray:
     """Convert a variable to SI units: variable · scale + offset, unwrapped where the mapping says so."""
-    said = spec.units or units
-    if said not in TO_SI or TO_SI[said].si != units:
+    own = spec.units or units
+    if own not in TO_SI or TO_SI[own].si != units:
         fitting = [name for name, unit in TO_SI.items() if unit.si == units]
-        where.fail(f"has units {said!r}; it must be one of {listed(fitting)}, after `scale` and `offset`")
+        where.fail(f"has units {own!r}; it must be one of {listed(fitting)}, after `scale` and `offset`")
     unwrap = spec.unwrap if isinstance(spec, Column) else False
     if not isinstance(unwrap, bool):
         values = _unwrapped(values, unwrap)
     scale = single(source, spec.scale, where / "scale") if isinstance(spec.scale, str) else spec.scale
-    si = (values * scale + spec.offset) * TO_SI[said].factor + TO_SI[said].zero
+    si = (values * scale + spec.offset) * TO_SI[own].factor + TO_SI[own].zero
     if unwrap is True:
         if units != "rad":
             where.fail("is no angle, so a whole turn means nothing; write unwrap = the period of the variable")
@@ -368,12 +368,12 @@ def _unwrapped(values: np.ndarray, period: float) -> np.ndarray:
     return out
 
 
-def _stated(variable: Variable, spec: Column, units: str, report: Report, where: Place) -> None:
+def _compare_units(variable: Variable, spec: Column, units: str, report: Report, where: Place) -> None:
     """Warn where the recording states other units than the mapping."""
-    stated, said = unit_name(variable.units), spec.units or units
-    if stated and said in TO_SI and stated != said and spec.scale == 1.0 and TO_SI[stated] != TO_SI[said]:
+    stated, mapped = unit_name(variable.units), spec.units or units
+    if stated and mapped in TO_SI and stated != mapped and spec.scale == 1.0 and TO_SI[stated] != TO_SI[mapped]:
         report.warning(
-            where.key, f"the recording states {variable.units}, and the mapping reads {said}; correct one of them"
+            where.key, f"the recording states {variable.units}, and the mapping reads {mapped}; correct one of them"
         )
 
 

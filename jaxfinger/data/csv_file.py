@@ -25,11 +25,11 @@ _COMMENTS = ("#", "%")
 # Pairs of separator and decimal mark; None is any run of blanks. Among equally good ones the first is taken.
 _DIALECTS = ((",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("|", "."), (None, "."), (None, ","))
 _DIALECT_LINES = 60  # They decide the dialect, and are taken from the middle of the file, after any header.
-_TRUTH = {"true": 1.0, "false": 0.0}
+_BOOLEANS = {"true": 1.0, "false": 0.0}
 _UNIT = r"%|°|deg|rad|turn|rev|rpm|k?Hz|[mun]?s|[munc]?m|[mk]?N|[mk]?N[ ·*]?[cm]?m|[mu]?A|[mk]?V|°?C|K|[mk]?g|1|-|bool"
-_ALONE = re.compile(rf"^[\[(]?({_UNIT}|{_UNIT}/s2?|)[\])]?$")
-_BEHIND = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
-_STAMP = re.compile(r"^\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
+_UNIT_CELL = re.compile(rf"^[\[(]?({_UNIT}|{_UNIT}/s2?|)[\])]?$")
+_UNIT_SUFFIX = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")  # in brackets after a name
+_DATE = re.compile(r"^\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
 _SCOPE = "SampleTime[ms]"  # header of TwinCAT Scope, which writes a column of times in ms beside each channel
 
 
@@ -129,9 +129,9 @@ def _cell(cell: str) -> float | None:
         return float(cell) if "_" not in cell else None
     except ValueError:
         pass
-    if cell.lower() in _TRUTH:
-        return _TRUTH[cell.lower()]
-    if _STAMP.match(cell):
+    if cell.lower() in _BOOLEANS:
+        return _BOOLEANS[cell.lower()]
+    if _DATE.match(cell):
         try:
             stamp = datetime.fromisoformat(cell)
             return (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp()
@@ -165,7 +165,7 @@ def _names(above: Sequence[_Line], split: Split, width: int) -> tuple[tuple[str,
         return labelled["Name"], labelled.get("Unit", ("",) * width), True
     words = [row for row in rows if sum(_cell(cell) is None for cell in row) * 2 > width]
     units = ("",) * width
-    if len(words) > 1 and all(_ALONE.match(cell) for cell in words[0]):
+    if len(words) > 1 and all(_UNIT_CELL.match(cell) for cell in words[0]):
         units = tuple(cell.strip("[]()") for cell in words.pop(0))
     return tuple(words[0]) if words else (), units, False
 
@@ -220,8 +220,8 @@ def _named(path, columns, faults, names, units, remarks) -> Recording:
         elif columns[k] is None:
             unusable[name] = faults[k]
         else:
-            behind = _BEHIND.search(name)
-            variables[name] = Variable(columns[k], units=units[k] or (behind.group(1).strip() if behind else ""))
+            suffix = _UNIT_SUFFIX.search(name)
+            variables[name] = Variable(columns[k], units=units[k] or (suffix.group(1).strip() if suffix else ""))
     return Recording(path, variables, unusable, remarks)
 
 

@@ -59,7 +59,7 @@ _TRIAL = re.compile(r"/trials/([^/]+)(.*)")
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.]*(?:e[-+]?\d+)?%?")
 
 
-def together(findings: Iterable[Finding], named: int = 3) -> list[Finding]:
+def merged(findings: Iterable[Finding], named: int = 3) -> list[Finding]:
     """Merge findings that several trials share: the finding of the first trial, and the names of the next `named` ones.
 
     Findings are shared if they differ in nothing but trials and numbers.

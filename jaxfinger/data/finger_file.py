@@ -133,21 +133,21 @@ class Finger:
                 raise Fault(f"is missing, and other joints have it; write it{none}", "joints", without[0], key)
 
 
-def finger_from(said: str | Finger, place: Place) -> FingerDescription:
-    """Description of a finger. `said` is its table, or the name of a session (HDF5) or TOML file that holds one.
+def finger_from(source: str | Finger, place: Place) -> FingerDescription:
+    """Description of a finger. `source` is its table, or the name of a session (HDF5) or TOML file that holds one.
 
     Raises:
         UserError: the other file cannot be read, or the checker refuses the finger.
     """
-    if isinstance(said, Finger):
-        return _sound(_description(said), place)
-    other = Path(place.file).parent / said
+    if isinstance(source, Finger):
+        return _sound(_description(source), place)
+    other = Path(place.file).parent / source
     if other.suffix.lower() in (".h5", ".hdf5"):
         from jaxfinger.data.hdf5 import read_session
 
         return read_session(other, trials=()).finger
     if other.suffix.lower() != ".toml":
-        place.fail(f"is {said!r}; name a session (.h5) or a TOML file with a table [finger]")
+        place.fail(f"is {source!r}; name a session (.h5) or a TOML file with a table [finger]")
     document = read_toml(other, f"correct `{place.key}` in {place.file}")
     if "finger" not in document.content:
         document.place.fail("has no table [finger]; write it as docs/your-own-data.md says")

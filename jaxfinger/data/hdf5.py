@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from jaxfinger.data.atomic import atomic_path
-from jaxfinger.data.check import inspect
+from jaxfinger.data.check import read_and_check
 from jaxfinger.data.findings import Report
 from jaxfinger.data.schema import (
     CHANNELS,
@@ -48,7 +48,7 @@ def read_session(
     Raises:
         UserError: the first error that `check_file` finds, in one sentence with file, place and mend.
     """
-    session, findings = inspect(path, trials)
+    session, findings = read_and_check(path, trials)
     if report is not None:
         report.extend(findings)
     fault = findings.fatal

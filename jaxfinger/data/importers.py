@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from jaxfinger.data.check import check_session, examine
+from jaxfinger.data.check import check_samples, check_session
 from jaxfinger.data.columns import ColumnReader, Source, find, trial_clock
 from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.finger_file import finger_from
 from jaxfinger.data.hdf5 import write_session
 from jaxfinger.data.mapping import Channels, MappedTrial, MappingFile, read_mapping, terms
-from jaxfinger.data.parse import RANGES, in_order, listed
+from jaxfinger.data.parse import RANGES, listed, sorted_trials
 from jaxfinger.data.recording import Recording
 from jaxfinger.data.schema import CHANNELS, DRIVES, TEMPERATURE, Channel, Entry, units_of
 from jaxfinger.data.session import FingerDescription, Session, Trial
@@ -68,12 +68,12 @@ def import_session(
     session = Session(
         specimen=mapping.specimen,
         finger=finger,
-        trials=in_order(trials),
+        trials=sorted_trials(trials),
         source=mapping.source or f"imported from {', '.join(sorted({p.name for p in recordings.paths}))}",
         created=mapping.created_text or datetime.now(UTC).isoformat(timespec="seconds"),
     )
     check_session(session, report)
-    examine(session, report)
+    check_samples(session, report)
     if report.fatal is not None:
         _where_of(report.fatal, where).fail(report.fatal.message)
     return session

@@ -57,7 +57,7 @@ _HEAD = 'specimen = "my finger"\nfinger = "finger.toml"'
 
 
 @dataclass(frozen=True)
-class Seen:
+class ColumnSurvey:
     """Survey of one column of a recording."""
 
     name: str
@@ -72,7 +72,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Ticks:
+class ClockSurvey:
     """Survey of one clock of a recording: a variable that increases as times do."""
 
     name: str
@@ -84,7 +84,7 @@ class Ticks:
     disordered: int  # number of stamps that do not increase
 
 
-def columns_of(recording: Recording) -> list[Seen]:
+def columns_of(recording: Recording) -> list[ColumnSurvey]:
     """Survey every column of every variable of a recording."""
     found = []
     for name, variable in recording.variables.items():
@@ -100,26 +100,26 @@ def columns_of(recording: Recording) -> list[Seen]:
                 units = _time_unit(x) if meaning == "time" else _unit(meaning, x)
             finite = x[np.isfinite(x)]
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
-            found.append(Seen(name, column, len(x), low, high, len(x) - len(finite), units, stated, meaning))
+            found.append(ColumnSurvey(name, column, len(x), low, high, len(x) - len(finite), units, stated, meaning))
     return found
 
 
-def clocks_of(recording: Recording, seen: Sequence[Seen]) -> list[Ticks]:
+def clocks_of(recording: Recording, seen: Sequence[ColumnSurvey]) -> list[ClockSurvey]:
     """Survey every clock among the columns of a recording."""
     return [
-        ticks(s.name, recording.variables[s.name], s.units or "s")
+        _clock_survey(s.name, recording.variables[s.name], s.units or "s")
         for s in seen
         if s.meaning == "time" and s.samples > 2
     ]
 
 
-def ticks(name: str, variable: Variable, units: str) -> Ticks:
+def _clock_survey(name: str, variable: Variable, units: str) -> ClockSurvey:
     """Survey one clock, with its stamps put into order."""
     time = np.ravel(variable.values) * TO_SI[units].factor
     steps = _steps(time)
     usual = float(np.median(steps)) if len(steps) else np.nan
     gaps = steps > _MIN_GAP * usual
-    return Ticks(
+    return ClockSurvey(
         name,
         units,
         float(steps.sum()),
@@ -174,18 +174,18 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
     finger, joints and tendons are named as in the recordings. Channels that all recordings map alike are shared. `head`
     holds the lines of specimen and finger.
     """
-    looked = [_looked(recording, finger) for recording in recordings]
-    channels = {channel: None for trial in looked for channel in trial.channels}
+    proposed = [_trial_proposal(recording, finger) for recording in recordings]
+    channels = {channel: None for trial in proposed for channel in trial.channels}
     shared = {}
-    for channel in channels if len(looked) > 1 else ():
-        first = looked[0].channels.get(channel)
-        if first is not None and all(trial.channels.get(channel) == first for trial in looked):
+    for channel in channels if len(proposed) > 1 else ():
+        first = proposed[0].channels.get(channel)
+        if first is not None and all(trial.channels.get(channel) == first for trial in proposed):
             shared[channel] = first
     lines = [head]
     if shared:
         lines += ["", "[channels]   # of all trials"]
         lines += [f"{channel}.{as_key(name)} = {said}" for channel, rows in shared.items() for name, said in rows]
-    for number, (recording, trial) in enumerate(zip(recordings, looked, strict=True), 1):
+    for number, (recording, trial) in enumerate(zip(recordings, proposed, strict=True), 1):
         stem = re.sub(r"[^A-Za-z0-9_-]+", "-", recording.path.stem).strip("-") or "log"
         stem = stem if re.match(r"\d", stem) else f"{number:02}-{stem}"
         lines += ["", f"[trials.{as_key(stem)}]", f"file = {quoted(recording.path.name)}", *trial.lines]
@@ -196,19 +196,19 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
 
 
 @dataclass(frozen=True)
-class _Looked:
+class _Proposal:
     """Proposal for one recording as a trial."""
 
     lines: list[str]  # of TOML: experiment, joint, tendon and time
     channels: dict[str, list[tuple[str, str]]]  # name and reading of each column
 
 
-def _looked(recording: Recording, finger: FingerDescription | None) -> _Looked:
+def _trial_proposal(recording: Recording, finger: FingerDescription | None) -> _Proposal:
     """Propose a trial for a recording."""
     seen = columns_of(recording)
     clock = next((s for s in seen if s.meaning == "time" and s.name.endswith(".stamp")), None)
     clock = clock or next((s for s in seen if s.meaning == "time"), None)
-    channels: dict[str, list[Seen]] = {}
+    channels: dict[str, list[ColumnSurvey]] = {}
     for s in seen:
         if s.meaning not in ("", "time") and s.samples > 2:
             channels.setdefault(s.meaning, []).append(s)
@@ -231,11 +231,11 @@ def _looked(recording: Recording, finger: FingerDescription | None) -> _Looked:
         channel: [(name, _column(s)) for name, s in zip(names[channel], columns, strict=False)]
         for channel, columns in channels.items()
     }
-    return _Looked(lines, rows)
+    return _Proposal(lines, rows)
 
 
 def _experiment(
-    recording: Recording, channels: Mapping[str, Sequence[Seen]], names: Mapping[str, Sequence[str]]
+    recording: Recording, channels: Mapping[str, Sequence[ColumnSurvey]], names: Mapping[str, Sequence[str]]
 ) -> tuple[str, str, str]:
     """Guess experiment, joint and tendon (empty where there is none) from what moves.
 
@@ -269,7 +269,7 @@ def _experiment(
     return ("VD.3" if max(pulls, default=0.0) > _MIN_TENSION_CHANGE * high else "VD.1"), "", ""
 
 
-def _stepped(recording: Recording, seen: Seen) -> bool:
+def _stepped(recording: Recording, seen: ColumnSurvey) -> bool:
     """Whether a joint stands still for much of the time between its moves."""
     values = recording.variables[seen.name].values
     table = values.reshape(len(values), -1)
@@ -280,7 +280,7 @@ def _stepped(recording: Recording, seen: Seen) -> bool:
     return float(np.mean(steps < _MAX_STILL_CHANGE * np.percentile(steps, 95.0))) > _MIN_STILL_SHARE
 
 
-def _names(channel: str, columns: Sequence[Seen], finger: FingerDescription | None) -> list[str]:
+def _names(channel: str, columns: Sequence[ColumnSurvey], finger: FingerDescription | None) -> list[str]:
     """Names of joints, tendons, axes or sensors for the columns of a channel."""
     if channel == "temperature":
         return [s.name for s in columns]
@@ -295,7 +295,7 @@ def _names(channel: str, columns: Sequence[Seen], finger: FingerDescription | No
     return own if len(own) == len(columns) == len(set(own)) else known
 
 
-def _column(seen: Seen) -> str:
+def _column(seen: ColumnSurvey) -> str:
     """Inline table (TOML) that reads a column."""
     parts = [f"from = {quoted(seen.name)}"]
     if seen.column is not None:

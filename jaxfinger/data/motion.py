@@ -64,17 +64,17 @@ def directions(rate: Float[np.ndarray, "N k"], threshold: Float[np.ndarray, " k"
 
 
 def directions_from_turning_points(
-    sure: Float[np.ndarray, "N k"], x: Float[np.ndarray, "N k"], way: Float[np.ndarray, " k"]
+    sure: Float[np.ndarray, "N k"], x: Float[np.ndarray, "N k"], distance: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "N k"]:
     """Move each change of direction back to the turning point of x before it.
 
     `sure` are directions that change only once a motion is faster than its noise, so they change late. From the turning
-    point on, the direction goes linearly in x from the old to the new over the distance `way`: bodies in contact deform
+    point on, the direction goes linearly in x from the old to the new over `distance`: bodies in contact deform
     before they slide, by a distance that an encoder does not show within its noise. Only travel that is not undone
     before the next change counts.
     """
     out = sure.copy()
-    for direction, column, least in zip(out.T, x.T, way, strict=True):
+    for direction, column, least in zip(out.T, x.T, distance, strict=True):
         turns = np.flatnonzero((np.diff(direction) != 0) & (direction[:-1] != 0)) + 1
         edges = [0, *turns, len(direction)]
         for last, turn, end in zip(edges, edges[1:], edges[2:], strict=False):

@@ -54,7 +54,7 @@ def parse_file(file: h5py.File, path: str, report: Report, names: Collection[str
     if finger is None:
         return None
     trials = parse_trials(file, finger, report, names)
-    return Session(specimen or "", finger, in_order(trials), source or "", created or "", path)
+    return Session(specimen or "", finger, sorted_trials(trials), source or "", created or "", path)
 
 
 def parse_version(file: h5py.File, report: Report) -> bool:
@@ -128,8 +128,9 @@ def _table(group, name: str, entries: Sequence[Entry], sizes: dict, prismatic, r
         return {}
     found: dict[str, Any] = {}
     sizes = dict(sizes)
-    if entries is JOINTS:
-        kinds = dataset(table, entries[2], place, {}, (), Report()) if "type" in table else None
+    if entries is JOINTS:  # The units of the other datasets depend on the types.
+        type_entry = next(entry for entry in JOINTS if entry.name == "type")
+        kinds = dataset(table, type_entry, place, {}, (), Report()) if "type" in table else None
         prismatic = tuple(kind == "prismatic" for kind in kinds) if kinds is not None else ()
     for entry in entries:
         value = dataset(table, entry, place, sizes, prismatic, report)
@@ -248,7 +249,7 @@ def _session_start(group: h5py.Group, place: str, report: Report) -> float | Non
     return None if value is None else float(value)
 
 
-def in_order(trials: Mapping[str, Trial]) -> dict[str, Trial]:
+def sorted_trials(trials: Mapping[str, Trial]) -> dict[str, Trial]:
     """Sort trials by `session_start` where every trial has one, else by name."""
     if all(trial.session_start is not None for trial in trials.values()):
         return dict(sorted(trials.items(), key=lambda item: (item[1].session_start, item[0])))

@@ -76,6 +76,13 @@ def test_gaps_of_a_clock_are_said(tmp_path):
     assert any("1 gap, the longest 2" in text for text in said)
 
 
+def test_a_clock_with_a_gap_that_starts_late_is_said_to_cut_the_trial(tmp_path):
+    keep = (SLOW > 0.5) & ((SLOW < 2) | (SLOW > 4))
+    _, said = bring_in(tmp_path, OWN, slow=SLOW[keep], tau=0.01 * np.sin(SLOW[keep]))
+    runs = "the clock `slow` runs from 0.55 to 5.95 s, the trial from 0 to 5.99 s"
+    assert any(f"{runs}; the trial is cut to what both cover" in text for text in said)
+
+
 def test_samples_are_sorted_on_request(tmp_path):
     order = np.random.default_rng(0).permutation(len(TIME))
     with pytest.raises(UserError, match="sort = true"):

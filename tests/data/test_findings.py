@@ -3,7 +3,7 @@
 import pytest
 
 from jaxfinger.cli import main
-from jaxfinger.data.findings import Report, together
+from jaxfinger.data.findings import Report, merged
 from jaxfinger.data.finger_file import finger_from
 from jaxfinger.data.toml import Place
 from jaxfinger.errors import UserError
@@ -20,7 +20,7 @@ def test_what_trials_have_in_common_is_said_once():
     report.warning("/trials/02-ID.4/tendon_force", "tendon T2 is never pulled")
     report.error("/", "is empty")
     report.error("/", "is empty")
-    gaps, *others = together(report)
+    gaps, *others = merged(report)
     assert gaps.place == "/trials/00-ID.2/time"
     assert gaps.message.endswith("bridge it (likewise in 5 other trials: 01-ID.2, 02-ID.2, 03-ID.2 and 2 more)")
     assert others == report[6:]
