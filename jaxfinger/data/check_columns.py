@@ -56,6 +56,7 @@ def _arms(session: Session) -> dict[int, np.ndarray]:
 
 
 def _by_crossing(finger: FingerDescription, arms: dict[int, np.ndarray]) -> Iterator[tuple[tuple[int, int], str]]:
+    """Pairs of tendons of which one crosses a joint and stands still there, and the other the other way round."""
     for i, seen in arms.items():
         size = np.abs(seen) / np.nanmax(np.abs(seen[finger.active]), initial=0.0)
         still = np.flatnonzero(finger.active & finger.crosses[:, i] & (size < _MAX_STILL_ARM))
@@ -71,6 +72,7 @@ def _by_crossing(finger: FingerDescription, arms: dict[int, np.ndarray]) -> Iter
 
 
 def _by_description(finger: FingerDescription, arms: dict[int, np.ndarray]) -> Iterator[tuple[tuple[int, int], str]]:
+    """Pairs of tendons whose measured arms fit the known excursions only if they are exchanged."""
     if finger.excursion is None:
         return
     powers = np.arange(1, finger.excursion.shape[2] + 1)
@@ -91,6 +93,7 @@ def _by_description(finger: FingerDescription, arms: dict[int, np.ndarray]) -> I
 
 
 def _by_stretch(session: Session) -> Iterator[tuple[tuple[int, int], str]]:
+    """Pairs of tendons of which each alone stretches where the other is pulled."""
     finger = session.finger
     moves: dict[int, set[int]] = defaultdict(set)
     for trial in session.select("ID.4"):

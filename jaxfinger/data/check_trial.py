@@ -84,6 +84,7 @@ def _index(names: tuple[str, ...], name: str | None) -> int | None:
 
 
 def _time(trial: Trial, report: Report) -> None:
+    """Check that time increases from 0 in s, without gaps."""
     place, time = _place(trial, "time"), trial.time
     if not np.isfinite(time).all():
         report.error(
@@ -318,6 +319,7 @@ def _sizes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report
 
 
 def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
+    """Check that tensions are positive but for noise and tare, and not in mN."""
     assert trial.tendon_force is not None
     place = _place(trial, "tendon_force")
     for name, active, x in zip(finger.tendon_names, finger.active, trial.tendon_force.T, strict=True):
@@ -336,6 +338,7 @@ def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repo
 
 
 def _holds(trial: Trial, report: Report) -> None:
+    """Check that the channel `hold` marks holds, each with an index of its own."""
     if trial.hold is None:
         return
     place = _place(trial, "hold")

@@ -207,6 +207,7 @@ def _columns(
 
 
 def _named(path, columns, faults, names, units, remarks) -> Recording:
+    """Recording of a table with named columns. Columns that share a name or hold no numbers are unusable."""
     names = names or ("",) * len(columns)
     places: dict[str, list[int]] = defaultdict(list)
     for k, name in enumerate(names):

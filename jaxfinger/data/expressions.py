@@ -71,6 +71,8 @@ def evaluate(text: str, lookup: Callable[[str, Any], Any], constants: Mapping[st
 
 
 def _value(node: ast.AST, lookup: Callable[[str, Any], Any], constants: Mapping[str, Any]) -> Any:
+    """Value of a node of the syntax tree; ExpressionError for a kind of node that is not allowed."""
+
     def inner(child: ast.AST) -> Any:
         return _value(child, lookup, constants)
 
@@ -120,6 +122,7 @@ def _aligned(apply: Callable, left: Any, right: Any) -> Any:
 
 
 def _name(node: ast.AST) -> str:
+    """Name of a variable, `name`, `outer.inner` or `'any name'`."""
     match node:
         case ast.Name(id=name):
             return name

@@ -228,6 +228,7 @@ def bridged(x: Float[np.ndarray, "N k"], spikes: Bool[np.ndarray, "N k"]) -> Flo
 
 
 def _spikes(values: Float[np.ndarray, " N"], threshold: float, longest: int) -> Bool[np.ndarray, " N"]:
+    """Mark the spikes of one finite column (`outlier_mask`)."""
     # Second differences show the noise in motion and at rest. Their variance is 6 σ².
     noise = max(robust_std(np.diff(values, 2)) / np.sqrt(6.0), _resolution(values), _MIN_SPIKE_SHARE * np.ptp(values))
     spikes, least = np.zeros(len(values), bool), threshold * noise

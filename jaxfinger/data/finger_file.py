@@ -169,6 +169,7 @@ def _sound(finger: FingerDescription, place: Place) -> FingerDescription:
 
 
 def _description(finger: Finger) -> FingerDescription:
+    """Convert the tables of a finger to arrays."""
     joints, tendons = finger.joints, finger.tendons
     names = tuple(joint.name for joint in joints)
 

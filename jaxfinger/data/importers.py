@@ -133,6 +133,7 @@ def _trial(
     where: Place,
     report: Report,
 ) -> Trial:
+    """Read one trial from its recordings."""
     channels = trial.channels.over(shared).mapped()
     source = recordings.source(trial.file, trial.derived, where)
     if "q" not in channels:

@@ -153,6 +153,7 @@ def _joint_types(joints: Mapping[str, Any], report: Report) -> tuple[bool, ...]:
 def parse_trials(
     file: h5py.File, finger: FingerDescription, report: Report, names: Collection[str] | None
 ) -> dict[str, Trial]:
+    """Read all trials, or the named ones, that can be read."""
     group = child(file, "trials", "/trials", report, h5py.Group)
     if group is None:
         return {}
@@ -352,6 +353,7 @@ def _plain(units: str) -> str:
 
 
 def _as_kind(value: np.ndarray, entry: Entry, place: str, report: Report) -> np.ndarray | None:
+    """Array in the type of its entry; None with the reason reported where a value does not fit."""
     if entry.kind == "float":
         if value.dtype.kind not in "fiu":
             report.error(place, f"holds {value.dtype}, not numbers; write it as float64")
