@@ -8,8 +8,8 @@ datum φ (the weight of a trial, the gain of a sensor, a value of CAD),
 stage after stage. Second derivatives are exact, those of the residuals and of Huber's cost included. The noise model is
 fixed.
 
-The derivative by the weight of a trial does not tell the estimate without that trial: a parameter that a single trial
-determines is the same at any weight. One Newton step from the fit tells it (Pregibon 1981), with H_k = J_kᵀJ_k of
+The derivative by the weight of a trial does not give the estimate without that trial: a parameter that a single trial
+determines is the same at any weight. One Newton step from the fit gives it (Pregibon 1981), with H_k = J_kᵀJ_k of
 trial k:
 
     Δθ_s = (∂S_s/∂θ_s − H_k)⁻¹ (S_s,k − Σ_t<s (∂S_s/∂θ_t − H_k,st) Δθ_t).
@@ -17,12 +17,13 @@ trial k:
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session
@@ -33,6 +34,7 @@ from jaxfinger.identify.gauss_newton import scaled_directions
 from jaxfinger.identify.linearise import Filters, huber, white_rows
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.predictions import model_for
+from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.resample import plan_of
 from jaxfinger.identify.solve import Source
 from jaxfinger.identify.stages import cad_covariance, cad_prior, sources_of
@@ -107,54 +109,116 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
     given = np.setdiff1d(np.flatnonzero(np.diag(cad_covariance(session, parameters)) > 0), _estimated(plan))
     cad = np.union1d(given, _with_prior(plan, session, parameters)).astype(int)
 
-    trials = [(e, t) for e in sources for t in stacks[e].trials]
-    P, blocks = len(parameters), {TRIALS: len(trials), SENSORS: len(sensors), CAD: cad.size}
-    moved, without = np.zeros((P, sum(blocks.values()))), np.zeros((P, len(trials)))
-    alone = np.zeros(without.shape, bool)
-    last = {k: i for k, i in zip(blocks, np.cumsum(list(blocks.values())), strict=True)}
-    moved[given, last[SENSORS] + np.searchsorted(cad, given)] = 1.0
+    data = _Data(tuple((e, t) for e in sources for t in stacks[e].trials), tuple(sensors), cad)
+    P, K = len(parameters), len(data.trials)
+    derivatives, without, alone = np.zeros((P, data.count)), np.zeros((P, K)), np.zeros((P, K), bool)
+    derivatives[given, data.columns_of_cad(given)] = 1.0
     for of_stage, free in plan:
-        H, S, by = np.zeros((P, P)), np.zeros(P), np.zeros((P, moved.shape[1]))
-        for e in of_stage:
-            at, score = sources[e].positions, scores[e]
-            H[np.ix_(at, at)] += score.hessian
-            S[at] += score.by_trial.sum(axis=0)
-            mine = np.array([k for k, (name, _) in enumerate(trials) if name == e])
-            by[np.ix_(at, mine)] += score.by_trial.T
-            by[at, last[TRIALS] : last[SENSORS]] += score.by_sensor.T
+        parts = {e: (sources[e].positions, scores[e]) for e in of_stage}
         prior = cad_prior(session, fit.recipe, parameters, free)
         precision = prior.root.T @ prior.root
-        H[np.ix_(free, free)] += precision
-        S[free] += precision @ (np.asarray(ravel(fit.model))[free] - prior.mean)
-        for k, i in enumerate(free):
-            if precision[k, k] > 0.0:
-                by[free, last[SENSORS] + np.searchsorted(cad, i)] -= precision[:, k]
+        H, S, by = _score_of_stage(fit, free, prior, parts, data)
         own, others = H[np.ix_(free, free)], np.setdiff1d(np.arange(P), free)
-        basis = _seen(own)
+        basis = _visible_basis(own)
         _require_optimum(basis.T @ S[free], session)
-        right = by[free] + H[np.ix_(free, others)] @ moved[others]
-        moved[free] = -basis @ np.linalg.solve(basis.T @ own @ basis, basis.T @ right)
-        for j, (e, name) in enumerate(trials):
+        right = by[free] + H[np.ix_(free, others)] @ derivatives[others]
+        derivatives[free] = -basis @ np.linalg.solve(basis.T @ own @ basis, basis.T @ right)
+        for j, (e, name) in enumerate(data.trials):
             mine = np.zeros((P, P))
-            if e in of_stage:
-                at = sources[e].positions
-                mine[np.ix_(at, at)] = scores[e].information[stacks[e].trials.index(name)]
-            rest, told = (H - mine)[free], np.diag(H)[free] - np.diag(precision)
-            alone[free, j] = (np.diag(precision) == 0.0) & (told - np.diag(mine)[free] < MIN_SHARE_OF_OTHERS * told)
+            if e in parts:
+                at, score = parts[e]
+                mine[np.ix_(at, at)] = score.information[stacks[e].trials.index(name)]
+            total = np.diag(H)[free] - np.diag(precision)
+            left = total - np.diag(mine)[free]
+            alone[free, j] = (np.diag(precision) == 0.0) & (left < MIN_SHARE_OF_OTHERS * total)
             kept = np.flatnonzero(~alone[free, j])
-            basis = _seen(rest[np.ix_(kept, free[kept])])
-            right = by[free, j] - rest[:, others] @ without[others, j]
-            step = np.linalg.solve(basis.T @ rest[np.ix_(kept, free[kept])] @ basis, basis.T @ right[kept])
-            without[free[kept], j] = basis @ step
-    names = {TRIALS: [t for _, t in trials], SENSORS: list(sensors), CAD: [parameters[i].name for i in cad]}
+            without[free[kept], j] = _step_without(H - mine, by[:, j], free, kept, without[:, j])
+    names = {TRIALS: [t for _, t in data.trials], SENSORS: list(sensors), CAD: [parameters[i].name for i in cad]}
     std = np.sqrt(np.diag(cad_covariance(session, parameters)))
-    values = {k: moved[:, last[k] - blocks[k] : last[k]].T for k in KINDS}
+    values = {k: derivatives[:, data.columns(k)].T for k in KINDS}
     moves = {TRIALS: np.where(alone, np.inf, without).T, SENSORS: 0.01 * values[SENSORS]}
     moves[CAD] = std[cad][:, None] * values[CAD]
     return {k: Sensitivity(k, tuple(names[k]), values[k], moves[k]) for k in KINDS if k in kinds}
 
 
-def _seen(hessian: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p k"]:
+class CostGradient(eqx.Module):
+    """Gradient of the cost of one experiment by the k parameters that it depends on, and its derivatives."""
+
+    by_trial: Float[Array, "B k"]  # gradient of each trial's cost
+    information: Float[Array, "B k k"]  # JᵀJ of each trial, from the rows within Huber's limit
+    hessian: Float[Array, "k k"]  # of all trials
+    by_sensor: Float[Array, "K k"]  # derivative of the gradient by each gain
+
+
+class _Data(NamedTuple):
+    """All data φ, one column each: trials, then sensors, then values of CAD."""
+
+    trials: tuple[tuple[str, str], ...]  # experiment and name
+    sensors: tuple[str, ...]
+    cad: Int[np.ndarray, " c"]  # positions in the flat vector, ascending
+
+    @property
+    def count(self) -> int:
+        """Number of columns."""
+        return len(self.trials) + len(self.sensors) + self.cad.size
+
+    def columns(self, kind: str) -> slice:
+        """Columns of one kind of data."""
+        ends = np.cumsum([0, len(self.trials), len(self.sensors), self.cad.size])
+        k = KINDS.index(kind)
+        return slice(int(ends[k]), int(ends[k + 1]))
+
+    def columns_of_cad(self, positions: Int[np.ndarray, " k"]) -> Int[np.ndarray, " k"]:
+        """Columns of the values of CAD at these positions of the flat vector."""
+        return self.columns(CAD).start + np.searchsorted(self.cad, positions)
+
+
+def _score_of_stage(
+    fit: Fit,
+    free: Int[np.ndarray, " p"],
+    prior: Prior,
+    parts: dict[str, tuple[Int[np.ndarray, " _k"], CostGradient]],
+    data: _Data,
+) -> tuple[Float[np.ndarray, "P P"], Float[np.ndarray, " P"], Float[np.ndarray, "P K"]]:
+    """∂S/∂θ, S and ∂S/∂φ of a stage with its prior, over the whole flat vector.
+
+    `parts`: for each experiment of the stage, the positions that it depends on and the gradient of its cost.
+    """
+    theta = np.asarray(ravel(fit.model))
+    H, S, by = np.zeros((theta.size, theta.size)), np.zeros(theta.size), np.zeros((theta.size, data.count))
+    for e, (at, score) in parts.items():
+        H[np.ix_(at, at)] += score.hessian
+        S[at] += score.by_trial.sum(axis=0)
+        mine = np.array([k for k, (name, _) in enumerate(data.trials) if name == e])
+        by[np.ix_(at, mine)] += score.by_trial.T
+        by[at, data.columns(SENSORS)] += score.by_sensor.T
+    precision = prior.root.T @ prior.root
+    H[np.ix_(free, free)] += precision
+    S[free] += precision @ (theta[free] - prior.mean)
+    known = np.diag(precision) > 0.0
+    by[np.ix_(free, data.columns_of_cad(free[known]))] -= precision[:, known]
+    return H, S, by
+
+
+def _step_without(
+    H: Float[np.ndarray, "P P"],
+    score: Float[np.ndarray, " P"],
+    free: Int[np.ndarray, " p"],
+    kept: Int[np.ndarray, " k"],
+    earlier: Float[np.ndarray, " P"],
+) -> Float[np.ndarray, " k"]:
+    """Newton step Δθ of the parameters free[kept] of a stage without one trial.
+
+    `H`: ∂S/∂θ without the trial. `score`: that of the trial. `earlier`: Δθ of earlier stages.
+    """
+    others = np.setdiff1d(np.arange(len(H)), free)
+    own = H[np.ix_(free[kept], free[kept])]
+    basis = _visible_basis(own)
+    right = score[free] - H[np.ix_(free, others)] @ earlier[others]
+    return basis @ np.linalg.solve(basis.T @ own @ basis, basis.T @ right[kept])
+
+
+def _visible_basis(hessian: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p k"]:
     """Basis of the combinations visible to a stage, one in each column, from its Hessian."""
     values, vectors = np.linalg.eigh(_scaled(hessian))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -213,15 +277,6 @@ def _gain(batch: Batch, what: str, column: int) -> Batch:
 
 def _moves(change: Batch) -> bool:
     return any(np.any(np.asarray(a)) for a in jax.tree.leaves(change))
-
-
-class CostGradient(eqx.Module):
-    """Gradient of the cost of one experiment by the k parameters that it depends on, and its derivatives."""
-
-    by_trial: Float[Array, "B k"]  # gradient of each trial's cost
-    information: Float[Array, "B k k"]  # JᵀJ of each trial, from the rows within Huber's limit
-    hessian: Float[Array, "k k"]  # of all trials
-    by_sensor: Float[Array, "K k"]  # derivative of the gradient by each gain
 
 
 def _gradient_of(fit: Fit, source: Source, changes: list[Batch]) -> CostGradient:

@@ -203,22 +203,23 @@ def run_stage(
     fit: Fit, stage: Stage, stacks: dict[str, Stack], session: Session, tangents: Tangents | None = None
 ) -> Fit:
     """Run one stage: noise, estimates, covariance, and warnings of undetermined or implausible parameters."""
+
+    def skipped(message: str) -> Fit:
+        return replace(fit, stages=(*fit.stages, StageReport(stage.name, "skipped", message)))
+
     recipe = fit.recipe
     if stage.name not in stacks:
-        report = StageReport(stage.name, "skipped", message=f"the session has no {stage.name} trial")
-        return replace(fit, stages=(*fit.stages, report))
+        return skipped(f"the session has no {stage.name} trial")
     reads = {e: c for e, c in stage.reads.items() if e in stacks}
     lost = [x for x in not_judged({stage.name: stacks[stage.name]}) if x.channel in stage.reads[stage.name]]
     if lost:
-        report = StageReport(stage.name, "skipped", message=f"no sample of {lost[0].channel} counts: {lost[0].reason}")
-        return replace(fit, stages=(*fit.stages, report))
+        return skipped(f"no sample of {lost[0].channel} counts: {lost[0].reason}")
     parameters = describe(fit.model)
     groups = set(stage.frees) & free_groups(recipe)
     coverage = coverage_of(reads, session)
     free = stage_free(fit, stage, parameters, coverage)
     if not free.size:
-        report = StageReport(stage.name, "skipped", message="the recipe leaves its terms out of the nominal model")
-        return replace(fit, stages=(*fit.stages, report))
+        return skipped("the recipe leaves its terms out of the nominal model")
     prior = cad_prior(session, recipe, parameters, free)
     model, solution, sources, noise = estimate_with_noise(
         fit.model, free, stacks, reads, fit.noise, prior, recipe.fit.huber, tangents
