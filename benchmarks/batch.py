@@ -49,8 +49,8 @@ def scipy_refit(compressed, roots, weights) -> np.ndarray:
         found = scipy.optimize.least_squares(
             lambda x, o=own, g=given: o @ x + g,
             np.zeros(size),
-            jac=lambda x, o=own: o,
-            method="lm",  # pyright: ignore
+            jac=lambda x, o=own: o,  # pyright: ignore[reportArgumentType]: SciPy's default value gives the type
+            method="lm",
         )
         z, start = np.concatenate([z, found.x]), start + size
     return compressed.theta + compressed.basis @ z

@@ -2,8 +2,8 @@
 
     python benchmarks/emps.py
 
-With nothing withheld, the diagnosis of one recording proposes a formula for the rest. On the other recording, with its
-nominal parameters refitted, the formula's gain is 1 if the rest is real and 0 if it is noise. ± is half of a 95 %
+With nothing withheld, the diagnosis of one recording may propose a formula for the rest. On the other recording, with
+its nominal parameters refitted, the formula's gain is 1 if the rest is real and 0 if it is noise. ± is half of a 95 %
 interval.
 """
 

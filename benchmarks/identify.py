@@ -253,7 +253,7 @@ class Compressed:
 def by_scipy(problem: Compressed, **options) -> np.ndarray:
     """Optimum by SciPy, without earlier linearisations."""
     problem.forget()
-    return scipy.optimize.least_squares(problem.residual, problem.start, jac=problem.jacobian, **options).x  # pyright: ignore
+    return scipy.optimize.least_squares(problem.residual, problem.start, jac=problem.jacobian, **options).x  # pyright: ignore[reportArgumentType]
 
 
 def rivals(problem: Compressed, optimum: np.ndarray, near: float) -> list[dict]:
