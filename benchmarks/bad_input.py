@@ -113,7 +113,7 @@ def findings(session: Session) -> Report:
     return report
 
 
-def said(session: Session) -> set[str]:
+def complaints(session: Session) -> set[str]:
     """Errors and warnings of the checker on a session."""
     return {str(f) for f in findings(session) if f.severity != "note"}
 
@@ -122,16 +122,16 @@ def run_mistakes(paths: list[str], sound: list[str]) -> None:
     """Print the mistakes that pass without a warning, and the warnings on sound files."""
     for path in paths:
         session = read_session(path)
-        before, silent, count = said(session), [], 0
+        before, silent, count = complaints(session), [], 0
         for name, mistake in mistakes(session):
             wrong = replace(session, trials={t.name: mistake(t) for t in session})
             if all(wrong[t.name] is t for t in session):
                 continue  # The session has no such channel.
             count += 1
-            if said(wrong) <= before:
+            if complaints(wrong) <= before:
                 silent.append(name)
         print(f"{path}: {len(silent)} of {count} mistakes pass without a warning: {'; '.join(silent)}")
-    warnings = {path: said(read_session(path)) for path in (*paths, *sound)}
+    warnings = {path: complaints(read_session(path)) for path in (*paths, *sound)}
     print(f"{sum(map(len, warnings.values()))} warnings on {len(warnings)} sound files")
     for path, texts in warnings.items():
         for text in sorted(texts):
@@ -317,27 +317,27 @@ def outcome(command: Callable[[], None], out: Path | None) -> str:
         os.dup2(silence, 2)
         signal.signal(signal.SIGPROF, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_PROF, HANG_TIME)
-        said = "0"
+        result = "0"
         try:
             command()
         except SystemExit as end:
-            said = str(end.code or 0)
+            result = str(end.code or 0)
         except BaseException as error:  # Any error is counted.
             place = traceback.extract_tb(error.__traceback__)[-1]
-            said = f"{type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})"
-        os.write(write, said.encode()[:4000])
+            result = f"{type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})"
+        os.write(write, result.encode()[:4000])
         os._exit(0)
     os.close(write)
     with os.fdopen(read, "rb") as pipe:
-        said = pipe.read().decode()
+        result = pipe.read().decode()
     _, status = os.waitpid(child, 0)
     if os.WIFSIGNALED(status):
         return "hang" if os.WTERMSIG(status) == signal.SIGPROF else "crash"
-    if said == "2" and out is not None and out.exists():
+    if result == "2" and out is not None and out.exists():
         return "written"
-    if said == "0" and out is not None and any(f.severity == "error" and not f.local for f in check_file(out)):
+    if result == "0" and out is not None and any(f.severity == "error" and not f.local for f in check_file(out)):
         return "written"
-    return said
+    return result
 
 
 Prepare = Callable[[np.random.Generator | None], tuple[list[str], Path | None]]
@@ -350,20 +350,20 @@ def count(kind: str, number: int, prepare: Prepare) -> None:
     all imports done: importing is nine tenths of a command's time.
     """
     tokens, out = prepare(None)
-    said = io.StringIO()
+    printed = io.StringIO()
     try:
-        with redirect_stdout(said), redirect_stderr(said):
+        with redirect_stdout(printed), redirect_stderr(printed):
             main_of_jaxfinger(tokens)
     except SystemExit:
-        raise SystemExit(f"the sound input of {kind} is refused: {said.getvalue()}") from None
+        raise SystemExit(f"the sound input of {kind} is refused: {printed.getvalue()}") from None
     if out is not None:
         out.unlink()
     counts = Counts()
     for k in range(number):
         tokens, out = prepare(np.random.default_rng(k))
-        said = outcome(lambda tokens=tokens: main_of_jaxfinger(tokens), out)
+        result = outcome(lambda tokens=tokens: main_of_jaxfinger(tokens), out)
         counts.tried += 1
-        match said:
+        match result:
             case "0":
                 counts.taken += 1
             case "2":
@@ -375,7 +375,7 @@ def count(kind: str, number: int, prepare: Prepare) -> None:
             case "written":
                 counts.written += 1
             case _:
-                counts.tracebacks.append(f"{k}: {said}")
+                counts.tracebacks.append(f"{k}: {result}")
         if out is not None:
             out.unlink(missing_ok=True)
     print(

@@ -4,7 +4,7 @@ The controller uses the nominal specimen only. Tension lags its command, and the
 """
 
 # pyright: reportAttributeAccessIssue=false
-# (MuJoCo's compiled module tells a type checker nothing of its functions.)
+# (MuJoCo's compiled module has no types.)
 from __future__ import annotations
 
 from collections.abc import Sequence

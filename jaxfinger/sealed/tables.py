@@ -49,7 +49,7 @@ def render(scores: Scores) -> Group:
         parts.append(table)
     if scores.reliability:
         table = Table(title="reliability", title_justify="left")
-        for column in ("said", "came true", "95 % interval", "candidates"):
+        for column in ("probability", "came true", "95 % interval", "candidates"):
             table.add_column(column, justify="right")
         for r in scores.reliability:
             table.add_row(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.bad_input import said
+from benchmarks.bad_input import complaints
 from jaxfinger.data import Trial
 
 RATE, TIME = 100.0, np.arange(0.0, 9.0, 0.01)
@@ -56,8 +56,8 @@ def test_columns_that_were_taken_for_one_another_are_named(session, evidence):
         "description": (of(session, turning(0, (0.008, -0.007)), known=known), "ID.2 shows -7 and 8 mm a radian"),
         "stretch": (of(session, pulled(0), pulled(1)), "where T1 is pulled (ID.4), T2 gives way alone"),
     }[evidence]
-    assert not any("look exchanged" in text for text in said(sound))
-    (found,) = (text for text in said(exchanged(sound)) if "look exchanged" in text)
+    assert not any("look exchanged" in text for text in complaints(sound))
+    (found,) = (text for text in complaints(exchanged(sound)) if "look exchanged" in text)
     assert "columns T1 and T2 of tendon_excursion" in found
     assert words in found
 
@@ -71,4 +71,4 @@ def test_what_has_other_reasons_is_not_named(session):
         of(session, turning(0, (0.0072, 0.0077)), known=known),
         of(session, *rigid),
     ):
-        assert not any("look exchanged" in text for text in said(odd))
+        assert not any("look exchanged" in text for text in complaints(odd))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.bad_input import mistakes, said
+from benchmarks.bad_input import complaints, mistakes
 from jaxfinger.data import Trial
 
 FRICTION = 0.004  # N m
@@ -21,7 +21,7 @@ def sound(session):
 
 
 def test_a_sound_session_has_no_contradiction(sound):
-    assert not any("contradict" in text or "work" in text or "excursions along" in text for text in said(sound))
+    assert not any("contradict" in text or "work" in text or "excursions along" in text for text in complaints(sound))
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def test_what_contradicts_is_said(sound, experiment, channel, change, words):
         values = getattr(trial, channel)
         return trial if trial.experiment != experiment else replace(trial, **{channel: change(values)})
 
-    found = said(replace(sound, trials={t.name: wrong(t) for t in sound})) - said(sound)
+    found = complaints(replace(sound, trials={t.name: wrong(t) for t in sound})) - complaints(sound)
     assert any(words in text for text in found), found
 
 
@@ -54,10 +54,10 @@ def test_most_mistakes_of_a_mapping_are_said(sound):
     Up to 16 mistakes stay silent here: the session has a single ID.4 trial, and no VD.3 with excursions of a third
     joint.
     """
-    before = said(sound)
+    before = complaints(sound)
     silent = [
         name
         for name, mistake in mistakes(sound)
-        if said(replace(sound, trials={t.name: mistake(t) for t in sound})) <= before
+        if complaints(replace(sound, trials={t.name: mistake(t) for t in sound})) <= before
     ]
     assert len(silent) <= 16, silent
