@@ -26,7 +26,7 @@ from jaxfinger.rig.plan import PlannedTrial
 from jaxfinger.rig.protocols import Covered, Dwell, Mark, Protocol, Reached, Settled, Start, Tare
 from jaxfinger.rig.reader import Reader, tripped
 from jaxfinger.rig.safety import Violation
-from jaxfinger.rig.trips import PERSIST
+from jaxfinger.rig.trips import FULL_COUNT
 from jaxfinger.rig.waits import AtPose, Elapsed, Passes, Steady, reached
 from jaxfinger.rig.watch import Watch
 
@@ -303,4 +303,6 @@ class Runner:
     def _stopped(self, status: Status) -> NoReturn:
         """Raise ControllerStopped with its cause."""
         self.reader.note("trip", status.cause)
-        raise ControllerStopped(f"the controller stopped: {status.cause}", status.trip, status.trip_seq - PERSIST + 1)
+        raise ControllerStopped(
+            f"the controller stopped: {status.cause}", status.trip, status.trip_seq - FULL_COUNT + 1
+        )

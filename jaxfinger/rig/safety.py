@@ -1,6 +1,10 @@
-"""Safety on the host, on top of the controller's own: pure NumPy on blocks, so the same code runs online and on files.
+"""The host's own limits, in addition to the controller's: `admit` checks commands, `Supervisor` checks samples.
 
-Not a certified safety function: hardware (torque-off input, drive current limits) and the controller come first.
+Neither talks to the rig, so the same code supervises a running rig and a recorded file. `admit` refuses a command
+before it is sent. `Supervisor` only reports; the `Reader` stops the rig.
+
+This is not a certified safety function. The drives' torque-off input and current limits come first, the controller's
+limits second, these last.
 """
 
 from __future__ import annotations
@@ -12,16 +16,18 @@ import numpy as np
 from jaxfinger.rig.backend import Block, Command, CommandRefused, JointMove, TensionRamp
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.contract import Flag, State, Trip
-from jaxfinger.rig.trips import Count, Drift, Driven, Excursion, Run
+from jaxfinger.rig.trips import Drift, LeakyCount, RunLength, UnexplainedExcursion, UnfollowedMove
 
-VELOCITY_SPAN = 20  # samples over which host-side velocity and tension rate are taken: encoder steps must not trip
+# Samples over which the host takes joint velocity and tension rate: 20 ms at 1 kHz. One step of a 14-bit encoder
+# (3.8e-4 rad) then reads as 0.02 rad/s; from one sample to the next it would read as 0.4 rad/s.
+VELOCITY_SPAN = 20
 
 
 @dataclass(frozen=True)
 class Violation:
-    """A limit that was broken: which, by which channel, at which sample, with what value (SI).
+    """One broken limit: its trip code, the channel that broke it, the sample at which it tripped, and the value (SI).
 
-    From sample `since` on samples are not to be trusted.
+    `since` is the number of the first bad sample: data from there on do not belong to the trial. Its default is `seq`.
     """
 
     trip: Trip
@@ -36,12 +42,17 @@ class Violation:
 
     @property
     def sentence(self) -> str:
-        """The violation in words."""
+        """Sentence for people, without a full stop."""
         return f"{self.trip.sentence} ({self.channel} = {self.value:.4g} at sample {self.seq})"
 
 
 def admit(command: Command, rig: RigDescription) -> None:
-    """Refuse a set-point that is not finite, out of range or too fast; raises CommandRefused, and nothing moves."""
+    """Check a command against the host's limits before it is sent.
+
+    Raises:
+        CommandRefused: a tension, angle, rate, speed or acceleration is not finite or out of range, or the tendon or
+            joint does not exist. Nothing is sent then, so nothing moves.
+    """
     limits, finger = rig.limits, rig.finger
     if isinstance(command, TensionRamp):
         if not 0 < command.rate <= limits.tension_rate:
@@ -69,7 +80,11 @@ def admit(command: Command, rig: RigDescription) -> None:
 
 
 class Supervisor:
-    """Checks every block in order, and remembers what it needs between blocks. The first violations latch it."""
+    """The host's limits on samples. Blocks must be given in order and without exception.
+
+    State is kept from block to block, so that the size of blocks makes no difference. `latched` holds the violations of
+    the first block that had any.
+    """
 
     def __init__(self, rig: RigDescription):
         self.rig = rig
@@ -90,32 +105,32 @@ class Supervisor:
         self._trip = [_TRIPS[k] for k in kind]
         self._patience = np.array([c.frozen for c in rig.channels]) * rig.rate_hz
         self._patience[self._patience == 0] = np.inf
-        # tendons whose excursion and tension are both measured
+        # Columns (excursion, tension) of the tendons on which both are measured, for the check of frozen encoders.
         pairs = [(int(i), rig.index("tension", rig.channels[int(i)].of)) for i in np.flatnonzero(kind == "excursion")]
         self._excursion = np.array([(i, j) for i, j in pairs if j is not None], int).reshape(-1, 2)
         self._setpoint = np.flatnonzero(kind == "tension_setpoint")
         self._follower = np.array(rig.columns("tension", (rig.channels[int(i)].of for i in self._setpoint)), int)
 
-        self._bad = Count(n)
-        self._flagged = Count(1)
-        self._fast = Count(len(self._angle))
-        self._steep = Count(len(self._tension))
-        astray = int(limits.tension_error_s * rig.rate_hz) + 1 if len(self._setpoint) else 1
-        self._astray = Count(len(self._setpoint), astray)
-        self._same = Run(n)
+        self._range_count = LeakyCount(n)
+        self._flag_count = LeakyCount(1)
+        self._velocity_count = LeakyCount(len(self._angle))
+        self._tension_rate_count = LeakyCount(len(self._tension))
+        late = int(limits.tension_error_s * rig.rate_hz) + 1 if len(self._setpoint) else 1
+        self._tracking_count = LeakyCount(len(self._setpoint), late)
+        self._repeats = RunLength(n)
         self._clock_drift = Drift(rig.deadlines.clock_rate)
-        self._unexplained = Excursion(len(self._excursion))
-        self._ran = Count(len(self._excursion))
-        self._driven: Driven | None = None
-        self._first: tuple[int, int] | None = None  # number and time (ns) of the first sample
-        self._before: tuple[int, int] | None = None  # of the sample before
-        self._tail = np.empty((0, n))  # the VELOCITY_SPAN samples before, and their numbers
-        self._tail_seq = np.empty(0, np.int64)
-        self._last: np.ndarray | None = None
-        self.tripped: tuple[Violation, ...] = ()
+        self._unexplained = UnexplainedExcursion(len(self._excursion))
+        self._encoder_count = LeakyCount(len(self._excursion))
+        self._move: UnfollowedMove | None = None
+        self._first: tuple[int, int] | None = None  # number and device time (ns) of the first sample
+        self._before: tuple[int, int] | None = None  # number and device time (ns) of the previous sample
+        self._tail = np.empty((0, n))  # the last VELOCITY_SPAN samples of earlier blocks
+        self._tail_seq = np.empty(0, np.int64)  # their numbers
+        self._last: np.ndarray | None = None  # the last sample of the previous block
+        self.latched: tuple[Violation, ...] = ()
 
     def check(self, block: Block) -> list[Violation]:
-        """Violations in this block, first ones first; they also latch in `tripped`."""
+        """Return the violations in a block, in the order of their samples."""
         if not len(block):
             return []
         seq = block.seq.astype(np.int64)
@@ -129,8 +144,8 @@ class Supervisor:
             *self._still(block, seq),
         ]
         found.sort(key=lambda v: v.seq)
-        if found and not self.tripped:
-            self.tripped = tuple(found)
+        if found and not self.latched:
+            self.latched = tuple(found)
         self._tail = np.concatenate([self._tail, block.x])[-VELOCITY_SPAN:]
         self._tail_seq = np.concatenate([self._tail_seq, seq])[-VELOCITY_SPAN:]
         self._last = block.x[-1]
@@ -140,11 +155,12 @@ class Supervisor:
         return self.rig.channels[int(channel)].name
 
     def _codes(self, block: Block, seq: np.ndarray) -> list[Violation]:
-        odd = np.flatnonzero(block.state > max(State))
-        return [Violation(Trip.CONTRACT, "state", int(seq[i]), float(block.state[i])) for i in odd[:1]]
+        """CONTRACT at the first sample whose state the contract does not define."""
+        unknown = np.flatnonzero(block.state > max(State))
+        return [Violation(Trip.CONTRACT, "state", int(seq[i]), float(block.state[i])) for i in unknown[:1]]
 
     def _clock(self, block: Block, seq: np.ndarray) -> list[Violation]:
-        """The device's time never stands or runs back, and passes as its samples do."""
+        """CLOCK where the device's time does not increase, or departs from the count of samples by clock_offset_s."""
         t, allowed = block.t_ns.astype(np.int64), self.rig.deadlines.clock_offset_s
         if self._first is None:
             self._first = int(seq[0]), int(t[0])
@@ -163,21 +179,23 @@ class Supervisor:
         return found
 
     def _values(self, block: Block, seq: np.ndarray) -> list[Violation]:
+        """Channels that are out of their limits, not finite, or flagged by their terminal, with a full count."""
         bad = ~np.isfinite(block.x) | (block.x > self._high) | (block.x < self._low)
         found = []
-        for channel, row, since in self._bad(bad, seq):
+        for channel, row, since in self._range_count(bad, seq):
             value = float(block.x[row, channel])
             trip = self._trip[channel] if np.isfinite(value) else Trip.INVALID
             found.append(Violation(trip, self._name(channel), int(seq[row]), value, since))
         flagged = (block.flags & int(Flag.BUS | Flag.ENCODER | Flag.ANALOG)) != 0
-        for _, row, since in self._flagged(flagged[:, None], seq):
+        for _, row, since in self._flag_count(flagged[:, None], seq):
             value = float(block.flags[row] & 0xFFFF)
             found.append(Violation(Trip.INVALID, "terminal flags", int(seq[row]), value, since))
         return found
 
     def _frozen(self, block: Block, seq: np.ndarray) -> list[Violation]:
+        """FROZEN where a channel has repeated one value for its `frozen` time."""
         last = self._last if self._last is not None else np.full(block.x.shape[1], np.nan)
-        late = self._same(block.x == np.concatenate([last[None], block.x[:-1]])) >= self._patience
+        late = self._repeats(block.x == np.concatenate([last[None], block.x[:-1]])) >= self._patience
         found = []
         for channel in np.flatnonzero(late.any(0)):
             row = int(np.argmax(late[:, channel]))
@@ -186,9 +204,9 @@ class Supervisor:
         return found
 
     def _rates(self, block: Block, seq: np.ndarray) -> list[Violation]:
-        """Joint velocity and tension rate over VELOCITY_SPAN samples."""
+        """VELOCITY and TENSION_RATE, each over VELOCITY_SPAN samples, with a full count."""
         x, number = np.concatenate([self._tail, block.x]), np.concatenate([self._tail_seq, seq])
-        rows = len(x) - VELOCITY_SPAN  # samples of this block with so many before them
+        rows = len(x) - VELOCITY_SPAN  # samples of this block that have VELOCITY_SPAN samples before them
         if rows <= 0:
             return []
         seconds = (number[VELOCITY_SPAN:] - number[:-VELOCITY_SPAN]) / self.rig.rate_hz
@@ -196,8 +214,8 @@ class Supervisor:
         rate = (x[VELOCITY_SPAN:] - x[:-VELOCITY_SPAN]) / seconds[:, None]
         limits, found = self.rig.limits, []
         for count, channels, limit, trip in (
-            (self._fast, self._angle, limits.joint_velocity_max, Trip.VELOCITY),
-            (self._steep, self._tension, limits.tension_rate_max, Trip.TENSION_RATE),
+            (self._velocity_count, self._angle, limits.joint_velocity_max, Trip.VELOCITY),
+            (self._tension_rate_count, self._tension, limits.tension_rate_max, Trip.TENSION_RATE),
         ):
             for k, row, since in count(np.abs(rate[:, channels]) > limit, seq[-rows:]):
                 value = float(rate[row, channels[k]])
@@ -205,48 +223,52 @@ class Supervisor:
         return found
 
     def _tracking(self, block: Block, seq: np.ndarray) -> list[Violation]:
-        """Tensions that stay away from their set-points while the drives are on."""
+        """TRACKING where a tension differs from its set-point by more than tension_error_max for tension_error_s.
+
+        Samples count only in the states ARMED and MOVING: otherwise the tension follows no set-point.
+        """
         on = np.isin(block.state, (State.ARMED, State.MOVING))
         error = block.x[:, self._setpoint] - block.x[:, self._follower]
-        astray = on[:, None] & (np.abs(error) > self.rig.limits.tension_error_max)
+        off_target = on[:, None] & (np.abs(error) > self.rig.limits.tension_error_max)
         return [
             Violation(
                 Trip.TRACKING, f"set-point minus {self._name(self._follower[k])}", int(seq[row]), float(error[row, k])
             )
-            for k, row, _ in self._astray(astray, seq)
+            for k, row, _ in self._tracking_count(off_target, seq)
         ]
 
     def _still(self, block: Block, seq: np.ndarray) -> list[Violation]:
-        """A frozen encoder: a tendon under steady load runs, or the external motor drives, but no encoder moves."""
+        """FROZEN where an encoder stays still although the external motor or a tendon must have moved its joint."""
         found = []
-        if (driven := self._driven) is not None:
-            angle = block.x[:, driven.column]
-            if (row := driven(angle, block.state == State.MOVING)) is not None:
-                self._driven = None
-                name = self._name(driven.column)
+        if (move := self._move) is not None:
+            angle = block.x[:, move.column]
+            if (row := move(angle, block.state == State.MOVING)) is not None:
+                self._move = None
+                name = self._name(move.column)
                 found.append(Violation(Trip.FROZEN, name, int(seq[row]), float(angle[row])))
         channels, tensions = self._excursion.T
         ran = self._unexplained(block.x[:, self._angle], block.x[:, channels], block.x[:, tensions])
-        for k, row, since in self._ran(ran > Excursion.UNEXPLAINED, seq):
+        for k, row, since in self._encoder_count(ran > UnexplainedExcursion.MAX_UNEXPLAINED, seq):
             name = f"joint encoders, while {self._name(channels[k])} ran by m"
             found.append(Violation(Trip.FROZEN, name, int(seq[row]), float(ran[row, k]), since))
         return found
 
     def commanded(self, command: Command) -> None:
-        """Tell which move was commanded, so that an encoder that does not follow is found."""
+        """Take note of a command, to check that the joint's encoder follows a move of the external motor."""
         if isinstance(command, JointMove) and self._last is not None:
             column = self.rig.index("joint_position", command.joint)
-            if column is not None and abs(command.target - self._last[column]) > 5 * Excursion.STILL:
-                self._driven = Driven(column, float(self._last[column]), command.speed, self.rig.rate_hz)
+            if column is not None and abs(command.target - self._last[column]) > UnfollowedMove.DISTANCE:
+                self._move = UnfollowedMove(column, float(self._last[column]), command.speed, self.rig.rate_hz)
         elif not isinstance(command, TensionRamp):
-            self._driven = None
+            self._move = None
 
 
 def armed(block: Block) -> bool:
-    """Whether the controller holds or moves the finger anywhere in the block, or may: its state is unknown."""
+    """Whether any sample has the drives on (ARMED, MOVING), or a state that the contract does not define."""
     return bool((np.isin(block.state, (State.ARMED, State.MOVING)) | (block.state > max(State))).any())
 
 
+# The trip code of a finite value out of its limits, by kind of channel.
 _TRIPS = {
     "tension": Trip.TENSION,
     "excursion": Trip.INVALID,

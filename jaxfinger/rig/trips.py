@@ -1,5 +1,7 @@
-"""The state machines behind the trips. What they say of a sample depends on samples and their times alone: cut the same
-samples into other blocks, and they trip at the same sample.
+"""State machines that decide when a fault has lasted long enough to stop the rig.
+
+Each keeps its state from block to block, so the result depends only on the samples and their times: the same samples in
+blocks of another size trip at the same sample.
 """
 
 from __future__ import annotations
@@ -7,27 +9,31 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-PERSIST = 3  # bad samples: one odd sample must not drop the finger
-LEAK = 0.25  # what a good sample takes off the count: what is bad more often than in one sample of five ends in a trip
+# Consecutive bad samples that trip a limit, as on the controller (docs/plc-contract.md, Trips). One odd sample must not
+# drop the finger.
+FULL_COUNT = 3
+# A good sample lowers the count by this much. A share p of bad samples fills the count where p > LEAK (1 - p), so a
+# fault in more than one sample of five trips in the end.
+LEAK = 0.25
 
 
 class Hit(tuple[int, int, int]):
-    """(column, row at which its count is full, number of the sample at which its bad samples began)."""
+    """Full count: (column, row of the block at which it fills, number of the sample at which its bad samples began)."""
 
 
-class Count:
-    """A leaking count a column: a bad sample adds 1, a good one takes off LEAK; at `need` it is full."""
+class LeakyCount:
+    """One count per column. A bad sample adds 1, a good one subtracts LEAK down to 0; at `need` the count is full."""
 
-    def __init__(self, width: int, need: int = PERSIST):
+    def __init__(self, width: int, need: int = FULL_COUNT):
         self.need = need
         self._level = np.zeros(width)
         self._since = np.zeros(width, np.int64)
 
     def __call__(self, bad: Bool[np.ndarray, "N C"], seq: Int[np.ndarray, " N"]) -> list[Hit]:
-        """The first sample of each column at which the count is full."""
+        """Return the first sample of the block at which each column's count is full."""
         if not bad.any() and not self._level.any():
             return []
-        # sums of quarters are exact in floating point, so that no rounding depends on where a block ends
+        # Multiples of a quarter add without rounding, so the result does not depend on where a block ends.
         total = self._level + np.cumsum(np.where(bad, 1.0, -LEAK), 0)
         level = total - np.minimum(np.minimum.accumulate(total, 0), 0.0)
         hits = []
@@ -56,14 +62,14 @@ class Count:
         return [hit] if hit is not None else []
 
 
-class Run:
-    """Length of the run of True that ends at each sample, column by column."""
+class RunLength:
+    """Number of consecutive True samples up to and including each sample, column by column."""
 
     def __init__(self, width: int):
         self._length = np.zeros(width, np.int64)
 
     def __call__(self, true: Bool[np.ndarray, "N C"]) -> Int[np.ndarray, "N C"]:
-        """Run lengths, those of earlier blocks included."""
+        """Run lengths in samples. A run that began in an earlier block counts from its beginning."""
         index = np.arange(len(true))[:, None]
         last_false = np.maximum.accumulate(np.where(true, -1, index), 0)
         runs = np.where(last_false >= 0, index - last_false, index + 1 + self._length) * true
@@ -72,10 +78,11 @@ class Run:
 
 
 class Drift:
-    """How far a clock is from where it should be: the reference follows it, at most at `rate`.
+    """Change of a clock's lead over another clock that a rate error of at most `rate` (s/s) does not explain.
 
-    A clock that differs by less than `rate` is followed for ever; one that differs by more is left behind until it is
-    farther away than any offset that is allowed.
+    A reference follows the lead by at most `rate` seconds per second. A clock whose rate is wrong by less stays near
+    its reference. The lead of a clock whose rate is wrong by more leaves the reference behind, beyond every bound. A
+    jump shows at once.
     """
 
     def __init__(self, rate: float):
@@ -83,7 +90,10 @@ class Drift:
         self._reference: float | None = None
 
     def __call__(self, low: float, high: float, elapsed: float) -> float:
-        """Distance of the clock, known to lie in [low, high], from its reference, after `elapsed` s more."""
+        """Signed distance in s from the reference to the interval [low, high] in which the lead (s) lies.
+
+        It is zero where the reference lies in the interval. `elapsed` is the time in s since the last call.
+        """
         if self._reference is None:
             self._reference = (low + high) / 2
         away = min(high - self._reference, 0.0) + max(low - self._reference, 0.0)
@@ -92,13 +102,19 @@ class Drift:
         return away
 
 
-class Excursion:
-    """Tendons that run under steady load while no joint encoder moves: an encoder is frozen."""
+class UnexplainedExcursion:
+    """Excursion of tendons under steady tension while no joint encoder moves.
 
-    LOADED = 1.0  # N: a slack tendon may run
-    STEADY = 0.5  # N: a change of load stretches tendon and spool
-    STILL = 0.02  # rad: an encoder that counts as not moving
-    UNEXPLAINED = 1.5e-3  # m of excursion
+    More than MAX_UNEXPLAINED of it means that an encoder is frozen. The thresholds are proposals, to be tuned on the
+    bench.
+    """
+
+    MIN_TENSION = 1.0  # N. A tendon with less may be slack, and may then run without moving a joint.
+    MAX_TENSION_CHANGE = 0.5  # N. A larger change stretches tendon and spool: excursion counts anew from there.
+    # rad, 1.1°. An encoder that changes by less counts as still. With moment arms up to 10.5 mm (Table I of the paper)
+    # one such joint explains at most 0.2 mm of excursion.
+    MAX_STILL_ANGLE = 0.02
+    MAX_UNEXPLAINED = 1.5e-3  # m: seven times these 0.2 mm, which leaves room for several joints and for noise.
 
     def __init__(self, tendons: int):
         self._angle: list[float] | None = None
@@ -107,33 +123,42 @@ class Excursion:
     def __call__(
         self, angle: Float[np.ndarray, "N m"], length: Float[np.ndarray, "N n"], load: Float[np.ndarray, "N n"]
     ) -> Float[np.ndarray, "N n"]:
-        """Excursion, m, that no encoder explains, at each sample."""
+        """Unexplained excursion in m of each tendon at each sample.
+
+        `angle` holds the joint encoders in rad, `length` and `load` the tendons' excursions in m and tensions in N.
+        """
         ran = np.zeros(length.shape)
         if not length.shape[1]:
             return ran
         for row, (q, l, f) in enumerate(zip(angle.tolist(), length.tolist(), load.tolist(), strict=True)):
             at = self._angle
-            if at is None or any(abs(a - b) > self.STILL for a, b in zip(q, at, strict=True)):
+            if at is None or any(abs(a - b) > self.MAX_STILL_ANGLE for a, b in zip(q, at, strict=True)):
                 self._angle, self._length, self._load = q, l, f
                 continue
             for k, tension in enumerate(f):
-                if not tension >= self.LOADED or abs(tension - self._load[k]) > self.STEADY:
+                if not tension >= self.MIN_TENSION or abs(tension - self._load[k]) > self.MAX_TENSION_CHANGE:
                     self._length[k], self._load[k] = l[k], tension
                 else:
                     ran[row, k] = abs(l[k] - self._length[k])
         return ran
 
 
-class Driven:
-    """An encoder that does not follow the external motor."""
+class UnfollowedMove:
+    """Watch over one commanded move of the external motor: its joint's encoder must follow, or it is frozen.
+
+    `column` is the encoder's column, `start` its angle (rad) at the command, `speed` the commanded speed (rad/s). The
+    encoder must leave `start` by MAX_STILL_ANGLE before the motor, at that speed, has covered DISTANCE.
+    """
+
+    DISTANCE = 5 * UnexplainedExcursion.MAX_STILL_ANGLE  # rad. The factor 5 leaves time to accelerate.
 
     def __init__(self, column: int, start: float, speed: float, rate_hz: float):
         self.column = column
-        self._start, self._need = start, 5 * Excursion.STILL / speed * rate_hz
+        self._start, self._need = start, self.DISTANCE / speed * rate_hz
         self._still = 0
 
     def __call__(self, angle: Float[np.ndarray, " N"], moving: Bool[np.ndarray, " N"]) -> int | None:
-        """Row at which the motor must have moved the joint by five times what counts as not moving."""
-        still = self._still + np.cumsum(moving & (np.abs(angle - self._start) < Excursion.STILL))
+        """Row of the block at which the encoder is found frozen, or None. `moving` marks samples in state MOVING."""
+        still = self._still + np.cumsum(moving & (np.abs(angle - self._start) < UnexplainedExcursion.MAX_STILL_ANGLE))
         self._still = int(still[-1])
         return int(np.argmax(still > self._need)) if self._still > self._need else None

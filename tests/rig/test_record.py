@@ -181,8 +181,8 @@ def test_a_recording_played_back(files, rig):
         supervisor = Supervisor(replay.description)
         with pytest.raises(AssertionError):
             play(replay, supervisor, [], 0)
-        assert supervisor.tripped[0].trip is Trip.TENSION
-        assert trial.tendon_force[supervisor.tripped[0].seq, 2] > 5.0
+        assert supervisor.latched[0].trip is Trip.TENSION
+        assert trial.tendon_force[supervisor.latched[0].seq, 2] > 5.0
 
 
 def play(replay, supervisor, tension, column):

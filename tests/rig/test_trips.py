@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxfinger.rig.trips import LEAK, PERSIST, Count, Drift, Run
+from jaxfinger.rig.trips import FULL_COUNT, LEAK, Drift, LeakyCount, RunLength
 
 streams = st.lists(st.booleans(), min_size=1, max_size=80)
 cuts = st.lists(st.integers(1, 79), max_size=10)
@@ -29,10 +29,10 @@ def fills(bad: list[bool], need: int) -> list[tuple[int, int]]:
 
 
 @settings(deadline=None)
-@given(streams, cuts, st.sampled_from([PERSIST, 1, 7]))
+@given(streams, cuts, st.sampled_from([FULL_COUNT, 1, 7]))
 def test_a_count_fills_at_the_same_sample_however_it_is_cut(bad, at, need):
     expected = fills(bad, need)
-    count = Count(2, need)  # beside a column in which nothing is ever bad
+    count = LeakyCount(2, need)  # beside a column in which nothing is ever bad
     both = np.stack([np.zeros(len(bad), bool), np.array(bad)], 1)
     hits = [
         (a + row, since)
@@ -49,14 +49,14 @@ def test_a_count_fills_at_the_same_sample_however_it_is_cut(bad, at, need):
     [("111", 2), ("110110", 4), ("10101010", 6), ("100100100100100", 12), ("11", None), ("1000010000" * 50, None)],
 )
 def test_what_is_bad_every_other_time_trips_and_one_odd_sample_does_not(pattern, trips_at):
-    found = fills([c == "1" for c in pattern], PERSIST)
-    hits = Count(1)(np.array([[c == "1"] for c in pattern]), np.arange(len(pattern)))
+    found = fills([c == "1" for c in pattern], FULL_COUNT)
+    hits = LeakyCount(1)(np.array([[c == "1"] for c in pattern]), np.arange(len(pattern)))
     assert [h[1] for h in hits] == [k for k, _ in found[:1]]
     assert (hits[0][1] if hits else None) == trips_at
 
 
 def test_a_count_that_was_full_for_long_drains_as_one_that_just_filled():
-    count = Count(1)
+    count = LeakyCount(1)
     count(np.ones((500, 1), bool), np.arange(500))
     count(np.zeros((12, 1), bool), np.arange(500, 512))
     assert count(np.ones((2, 1), bool), np.arange(512, 514)) == []
@@ -70,7 +70,7 @@ def test_runs_against_a_loop(true, at):
     for yes in true:
         length = length + 1 if yes else 0
         expected.append(length)
-    run = Run(1)
+    run = RunLength(1)
     found = np.concatenate([run(np.array(true[a:b])[:, None])[:, 0] for a, b in pieces(len(true), at)])
     np.testing.assert_array_equal(found, expected)
 
