@@ -1,4 +1,4 @@
-"""What every rig offers to the recorder and the protocols: blocks of samples, set-points, state. One file a backend."""
+"""The interface of a rig: blocks of samples, commands, states. Each backend is one file that implements `Rig`."""
 
 from __future__ import annotations
 
@@ -17,34 +17,36 @@ from jaxfinger.rig.contract import State, Trip
 
 
 class RigError(UserError):
-    """The rig cannot go on; the trial under way ends, what was recorded stays."""
+    """The rig cannot go on. The trial under way ends; what was recorded stays."""
 
 
 class ConnectionLost(RigError):
-    """The controller does not answer any more."""
+    """The controller does not answer."""
 
 
 class StaleRig(RigError):
-    """The controller answers but writes no new samples."""
+    """The controller answers but writes no samples."""
 
 
 class ControllerRestarted(RigError):
-    """The controller's program was restarted: its samples start a new count and are never spliced to the old."""
+    """The controller's program was restarted. Its samples count anew, so they cannot continue the recording."""
 
 
 class CommandRefused(RigError):
-    """Host or controller refused a set-point; nothing moved."""
+    """Host or controller refused a command, so it had no effect."""
 
 
 class EndOfReplay(RigError):
-    """The recording that is replayed is at its end."""
+    """The replayed recording is at its end."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """N consecutive samples in SI units; `lost_before` counts the samples lost between this block and the one before.
+    """N consecutive samples of C channels.
 
-    `t_ns` is the device's clock, `x` the channels in the order of the rig file.
+    `seq` numbers the samples, `t_ns` is the device's clock (ns since 2000-01-01), `x` the channels in SI units in the
+    order of the rig file, `state` the controller's state, `flags` as in `contract.Flag`. `lost_before` samples between
+    the previous block and this one were lost.
     """
 
     seq: UInt[np.ndarray, " N"]
@@ -59,15 +61,16 @@ class Block:
 
     @property
     def acknowledged(self) -> Int[np.ndarray, " N"]:
-        """Id, modulo 65536, of the last command that the controller had seen at each sample."""
+        """Id, modulo 65536, of the last command that the controller had processed at each sample."""
         return (self.flags >> 16).astype(np.int64)
 
 
 @dataclass(frozen=True)
-class Look:
-    """A look at the head of the controller's ring: `head` samples were written at some time from `asked` to `answered`.
+class HeadReading:
+    """One reading of the head of the controller's ring.
 
-    Times are of the host's monotonic clock, in s.
+    The controller had written `head` samples at some time between `asked` and `answered` (s, the host's monotonic
+    clock).
     """
 
     asked: float
@@ -77,7 +80,12 @@ class Look:
 
 @dataclass(frozen=True)
 class Status:
-    """State of the controller and the first cause of a trip."""
+    """State of the controller, with the first cause of a trip.
+
+    `trip_seq` is the sample at which it tripped, `trip_value` the value in SI of the channel `trip_channel`, which is
+    empty where no single channel is the cause. `head` counts the samples written, `acknowledged` is the id of the last
+    command processed.
+    """
 
     state: State
     trip: Trip = Trip.NONE
@@ -89,14 +97,14 @@ class Status:
 
     @property
     def cause(self) -> str:
-        """The trip in words, with channel and value where one channel is to blame."""
+        """Sentence for people, with channel and value where one channel is the cause."""
         where = f" ({self.trip_channel} = {self.trip_value:.4g})" if self.trip_channel else ""
         return self.trip.sentence + where
 
 
 @dataclass(frozen=True)
 class TensionRamp:
-    """Ramp tendons to new tensions (N by tendon; others stay) at `rate` (N/s)."""
+    """Ramp the named tendons to `targets` (N) at `rate` (N/s). The other tendons keep their set-points."""
 
     targets: dict[str, float]
     rate: float
@@ -114,7 +122,7 @@ class JointMove:
 
 @dataclass(frozen=True)
 class Hold:
-    """Freeze every ramp where it is."""
+    """Freeze every ramp and move where it is. Tension stays on."""
 
 
 Command = TensionRamp | JointMove | Hold
@@ -122,8 +130,10 @@ Command = TensionRamp | JointMove | Hold
 
 @dataclass(frozen=True)
 class Setup:
-    """What the operator prepares: joints fixed at an angle (rad), one on the external motor, joints moved by hand, the
-    fingertip on its force sensor. Joints that are not named are free.
+    """Preparation of the finger by the operator; `text` is the prompt.
+
+    Joints are `fixed` at an angle (rad), coupled to the external `motor`, or moved by `hand`; all others are free. With
+    `contact` the fingertip rests on its force sensor.
     """
 
     text: str
@@ -134,50 +144,66 @@ class Setup:
 
 
 class Rig(ABC):
-    """A rig, connected inside a `with`. It is never armed by connecting, and releases the finger on leaving.
+    """A rig. `with rig:` connects it, and on leaving releases the finger if it is armed, then disconnects.
 
-    `synchronous` rigs make samples when they are read and need no thread of their own. Where time is simulated, reading
-    makes it pass, and the host's clock has nothing to do with the controller's.
+    Connecting arms nothing. A `synchronous` rig makes samples when it is read, so nothing else runs beside the reading
+    thread. With `simulated_time` time passes only as samples are read, so the host's clock says nothing about the
+    controller's.
     """
 
     description: RigDescription
     synchronous: bool = False
     simulated_time: bool = False
-    look: Look | None = None  # the newest, where the rig has a ring
-    alive: Callable[[], None] = staticmethod(lambda: None)  # called while a call waits: its thread is well
+    head_reading: HeadReading | None = None  # the newest one, on a rig with a ring
+    # A call that waits calls this again and again: it tells the watch that the calling thread is alive (watch.py).
+    report_alive: Callable[[], None] = staticmethod(lambda: None)
 
     @abstractmethod
     def connect(self) -> None:
-        """Connect, and verify versions, sizes and limits; raises UserError with the mend."""
+        """Connect, and compare versions, sizes and limits with the rig file. Nothing is armed.
+
+        Raises:
+            UserError: the controller does not answer, or differs from what contract and rig file demand.
+        """
 
     @abstractmethod
     def close(self) -> None:
-        """Disconnect; safe to call twice."""
+        """Disconnect. A second call does nothing."""
 
     @abstractmethod
     def poll(self) -> Block | None:
-        """The samples since the last call, or the first of them; None where there is no new one.
+        """Samples since the last call, or the first of them. None where there is no new sample.
 
-        Raises ConnectionLost, ControllerRestarted.
+        Raises:
+            ConnectionLost: the controller does not answer.
+            ControllerRestarted: its program was restarted.
         """
 
     @abstractmethod
     def beat(self) -> None:
-        """Tell the controller that the whole host is well; without it, it lets go."""
+        """Send one heartbeat. The controller releases the finger if none comes for its heartbeat time (`heartbeat_s`).
+
+        A heartbeat says that the whole host is well, so in a recording only the watch sends it (watch.py).
+        """
 
     def _pause(self, seconds: float) -> None:
-        """Let time pass until the next look."""
+        """Wait; where time is simulated, let it pass."""
         time.sleep(seconds)
 
     def read_block(self, timeout: float) -> Block:
-        """The samples since the last call, at least one; whoever waits here is well, and the controller is told so.
+        """Wait for samples; return those since the last call, at least one. Heartbeats are sent meanwhile.
 
-        Raises StaleRig after `timeout` s without a new one, and what `poll` raises. Who stood still looks again.
+        It serves before arming and where time is simulated. A recording in real time calls `poll`, so that this thread
+        cannot vouch for the others.
+
+        Raises:
+            StaleRig: no sample came for `timeout` s.
+            ConnectionLost, ControllerRestarted: as `poll`.
         """
         deadline = time.monotonic() + timeout
         while True:
-            late = time.monotonic() > deadline
-            with suppress(ConnectionLost):  # `poll` mends it, or says so
+            late = time.monotonic() > deadline  # Before the poll: a thread that was held up polls once more.
+            with suppress(ConnectionLost):  # `poll` reconnects, or raises.
                 self.beat()
             if (block := self.poll()) is not None:
                 return block
@@ -187,15 +213,19 @@ class Rig(ABC):
 
     @abstractmethod
     def rewind(self, seq: int) -> None:
-        """Let the next block start at sample `seq`, as far as the controller's ring still holds it."""
+        """Make the next block start at sample `seq`, or at the oldest later sample that the ring still holds."""
 
     @abstractmethod
     def command(self, command: Command) -> int:
-        """Send a set-point; returns its id, which samples echo once it is seen. Raises CommandRefused."""
+        """Send a command; return its id, which samples carry from when the controller has processed it.
+
+        Raises:
+            CommandRefused: host or controller refused it.
+        """
 
     @abstractmethod
     def arm(self) -> int:
-        """Switch the drives on at the present set-points; the only call after which something may move."""
+        """Switch the drives on at the present set-points. Only after this call can anything move."""
 
     @abstractmethod
     def disarm(self) -> int:
@@ -203,30 +233,37 @@ class Rig(ABC):
 
     @abstractmethod
     def release(self) -> int:
-        """Release tension in the right order: motor torque off, all tendons together, then drives off."""
+        """Release the finger: external motor to zero torque, all tendons down together, then drives off.
+
+        The controller does this by itself once it has the command; it takes 0.7 s (docs/plc-contract.md, Release).
+        """
 
     @abstractmethod
     def stop(self, cause: Trip) -> None:
-        """Release and latch; only `reset` leads out."""
+        """Stop the rig: release the finger and latch state TRIPPED with this cause. Only `reset` ends that state."""
 
     @abstractmethod
     def reset(self, operator: str) -> int:
-        """Clear a latched stop, in the name of an operator."""
+        """Clear a latched stop in the name of an operator.
+
+        Raises:
+            CommandRefused: tension is still on, or the name is empty.
+        """
 
     @abstractmethod
     def status(self) -> Status:
-        """State and trip now."""
+        """Present state and trip."""
 
     @abstractmethod
     def filters(self) -> dict[str, Filter]:
-        """The filter that each channel's terminal really runs, by channel name."""
+        """Filter settings of the terminals as the controller reads them, by channel name."""
 
     @abstractmethod
     def fingerprint(self) -> dict[str, str]:
-        """What identifies controller and program, for the file."""
+        """Identity of controller, program and its present run, for the file."""
 
     def prepare(self, setup: Setup) -> bool:
-        """Let a simulated operator prepare the finger; False where a person must do it."""
+        """Let a simulated operator prepare the finger. Return False where a person must do it."""
         return False
 
     def __enter__(self) -> Rig:
@@ -238,12 +275,13 @@ class Rig(ABC):
         return self
 
     def __exit__(self, kind, error, trace) -> None:
-        with suppress(UserError):  # a rig that does not answer any more misses our heartbeat, and lets go by itself
+        # A rig that does not answer cannot be told to release. It gets no heartbeat either, so it releases by itself.
+        with suppress(UserError):
             if self.status().state in (State.ARMED, State.MOVING):
                 self.release()
         self.close()
 
 
 def stale(seconds: float) -> str:
-    """What is wrong where no sample comes."""
+    """Message of StaleRig."""
     return f"the controller answers but wrote no sample for {seconds:g} s; see whether its task runs."

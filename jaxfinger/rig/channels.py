@@ -1,4 +1,4 @@
-"""What a rig file says: the slot, calibration and unit of each channel, the limits, and the finger on the bench."""
+"""Contents of a rig file: slot, calibration and unit of each channel, limits, deadlines, the finger on the bench."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import parse_toml
 
-# Dimension of each kind of channel, and the units in which a calibration may be written, as factors to SI.
+# Kinds of channel, and for each the units in which its calibration may be written, as factors to SI. The first is SI.
 UNITS: Mapping[str, Mapping[str, float]] = {
     "tension": {"N": 1.0},
     "excursion": {"m": 1.0, "mm": 1e-3},
@@ -22,18 +22,18 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "tension_setpoint": {"N": 1.0},
     "motor_temperature": {"degC": 1.0},
 }
-WATCHED = (
-    "tension_setpoint",
-    "motor_temperature",
-)  # for safety alone: a rig may have them, a session does not need them
-SI = {kind: next(iter(units)) for kind, units in UNITS.items()}
-NOISY = ("tension", "external_torque", "fingertip_force")  # analog: a value that repeats for long is a fault
-DYNAMIC_BANDWIDTH = 100.0  # Hz: below it, a channel is refused for dynamic experiments
+SAFETY_KINDS = ("tension_setpoint", "motor_temperature")  # watched, but no part of a session; a rig may lack them
+SI_UNITS = {kind: next(iter(units)) for kind, units in UNITS.items()}
+# Kinds behind an analog input. Its noise changes every value, so a value that repeats for long is a fault.
+ANALOG_KINDS = ("tension", "external_torque", "fingertip_force")
+# Hz, −3 dB. Channels with less are refused for dynamic experiments. A first-order filter of 100 Hz delays a signal by
+# 1.6 ms, in which a joint at 1.5 rad/s (ID.3-dynamic) turns by 0.14°. The factory filter of an EL3008 has 22 Hz.
+MIN_DYNAMIC_BANDWIDTH = 100.0
 
 
 @dataclass(frozen=True)
 class Filter:
-    """The filter that a terminal runs: switched on or not, its setting, its −3 dB bandwidth in Hz (None: unknown)."""
+    """Filter of a terminal: whether it is on, setting (CoE 0x8000:15), −3 dB bandwidth in Hz (None: unknown)."""
 
     enabled: bool
     setting: int
@@ -42,9 +42,9 @@ class Filter:
 
 @dataclass(frozen=True)
 class RigChannel:
-    """value in SI = (raw · scale + offset) · factor; `of` is the tendon, joint or axis that it measures.
+    """One channel: value in SI = (raw · scale + offset) · factor.
 
-    `frozen` is the time in s after which identical raw values count as a fault (0: never).
+    `of` is the tendon, joint or axis that it measures. A value that repeats for `frozen` s is a fault (0: never).
     """
 
     name: str
@@ -59,35 +59,37 @@ class RigChannel:
 
     @property
     def factor(self) -> float:
-        """From the calibration's unit to SI."""
+        """Factor from the calibration's unit to SI."""
         return UNITS[self.kind][self.unit]
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits that the host watches (SI), never looser than the controller's own.
+    """The host's limits. Connecting is refused where one is looser than the controller's own.
 
-    `joint_margin` is the distance in rad that a joint keeps from its mechanical limits.
+    `tension_rate`, `joint_margin` and `joint_velocity` bound commands: one beyond them is refused. The others bound
+    measured values: one beyond them stops the rig.
     """
 
-    tension_max: float
-    tension_rate: float  # of set-points
-    tension_rate_max: float  # measured
-    joint_margin: float
-    joint_velocity: float  # of set-points
-    joint_velocity_max: float  # measured
-    joint_torque_max: float
-    fingertip_force_max: float
-    tension_error_max: float  # set-point minus measured; infinite on a rig whose set-points are no channel
-    tension_error_s: float  # that it may last
-    temperature_max: float  # of motors, °C; infinite on a rig that does not measure it
+    tension_max: float  # N, of commands and measured values
+    tension_rate: float  # N/s, of commands
+    tension_rate_max: float  # N/s, measured
+    joint_margin: float  # rad that commanded angles keep from the joint's mechanical limits
+    joint_velocity: float  # rad/s, of commands
+    joint_velocity_max: float  # rad/s, measured
+    joint_torque_max: float  # N m, of the external motor
+    fingertip_force_max: float  # N, each axis
+    tension_error_max: float  # N between set-point and tension; infinite on a rig whose set-points are no channel
+    tension_error_s: float  # s that the tension may differ by more
+    temperature_max: float  # °C, of the motors; infinite on a rig that does not measure it
 
 
 @dataclass(frozen=True)
 class HardLimits:
-    """The loosest limits that the controller itself may have (SI): a backstop far beyond the host's own is none.
+    """The loosest limits that the controller itself may have (SI). Connecting is refused where its own are looser.
 
-    `heartbeat_s` is how long it may hold tension without a sign of life from the host.
+    The controller is the backstop of the host: with limits far beyond the host's it would not be one. `heartbeat_s` is
+    how long it may hold tension without a heartbeat of the host, s.
     """
 
     tension_max: float
@@ -100,23 +102,19 @@ class HardLimits:
 
 @dataclass(frozen=True)
 class Deadlines:
-    """How long, in s, anything may take before tension is let go; `clock_rate` is a ratio.
+    """Times after which the host stops the rig, in s; `clock_rate` is a ratio."""
 
-    stale: no new sample · lag: a sample's way to the supervisor · thread: a thread of the host without a sign of life ·
-    disk: a frame's way to the disk · clock_offset, clock_rate: the controller's clock against samples and host.
-    """
-
-    stale_s: float
-    lag_s: float
-    thread_s: float
-    disk_s: float
-    clock_offset_s: float
-    clock_rate: float
+    stale_s: float  # without a new sample of the controller
+    lag_s: float  # from a sample to its supervision
+    thread_s: float  # without a sign of life of a watched thread of the host
+    disk_s: float  # for the disk to take a frame of the log
+    clock_offset_s: float  # between the device's clock and its samples, and between samples and the host's clock
+    clock_rate: float  # relative error of these clocks that is followed without counting as an offset
 
 
 @dataclass(frozen=True)
 class RigDescription:
-    """A rig file, read: `text` is the file itself, which goes into every session."""
+    """A rig file, read. `text` is the file itself; every session keeps it."""
 
     name: str
     backend: str
@@ -144,7 +142,7 @@ class RigDescription:
         return [c.slot for c in self.channels]
 
     def calibrate(self, raw: Float[np.ndarray, "N V"]) -> Float[np.ndarray, "N C"]:
-        """Raw values of the controller's sample to SI; the fingertip's force turned into the base frame."""
+        """Convert raw values of the controller's samples to SI, the fingertip's force in the base frame."""
         gain = np.array([c.scale * c.factor for c in self.channels])
         bias = np.array([c.offset * c.factor for c in self.channels])
         x = raw[:, self.slots] * gain + bias

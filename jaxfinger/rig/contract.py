@@ -1,7 +1,7 @@
-"""The contract with the controller's program: memory layout, commands, states. `docs/plc-contract.md` says it in words.
+"""The contract with the controller's program: memory layout, commands, states; in words in `docs/plc-contract.md`.
 
-Every structure holds fields of 4 or 8 bytes on their natural boundary, so that TwinCAT's packing and NumPy's agree;
-sizes are compared when the adapter connects.
+Every structure holds fields of 4 or 8 bytes on their natural boundary, so that TwinCAT's packing and NumPy's agree. The
+adapter compares the sizes when it connects.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from enum import IntEnum, IntFlag
 import numpy as np
 
 VERSION = 1
-VALUES = 60  # LREAL channels in one sample
-TARGETS = 18  # actuation modules of the rig
-RING = 16384  # samples: 16 s at 1 kHz, 8 MiB
-CYCLE_NS = 1_000_000
+VALUES = 60  # LREAL values in one sample
+TARGETS = 18  # targets in one command: the rig has 18 actuation modules
+RING = 16384  # samples in the ring: 16 s at 1 kHz, 8 MiB. A host that stalls for less loses none.
+CYCLE_NS = 1_000_000  # cycle of the stand-in's task; a real controller states its own in stInfo
 PREFIX = "GVL_Jaxfinger."
 
 INFO = np.dtype(
@@ -47,8 +47,8 @@ STATUS = np.dtype(
         ("trip_seq", "<u8"),
         ("trip_value", "<f8"),
         ("trip_slot", "<i4"),
-        ("acknowledged", "<u4"),  # id of the last command seen
-        ("refused", "<u4"),  # why that command was refused; 0: accepted
+        ("acknowledged", "<u4"),  # id of the last command processed
+        ("refused", "<u4"),  # `Refusal` of that command; 0: accepted
         ("spare", "<u4"),
     ]
 )
@@ -63,39 +63,39 @@ COMMAND = np.dtype(
         ("target", "<f8", TARGETS),  # N per tendon (NaN: leave as it is), or rad in target[0]
     ]
 )
-LIMITS = np.dtype(
+LIMITS = np.dtype(  # the controller's own limits, above which it stops the rig
     [
-        ("tension_max", "<f8"),
-        ("tension_rate_max", "<f8"),
-        ("joint_velocity_max", "<f8"),
-        ("joint_torque_max", "<f8"),
-        ("fingertip_force_max", "<f8"),
-        ("heartbeat_s", "<f8"),
+        ("tension_max", "<f8"),  # N
+        ("tension_rate_max", "<f8"),  # N/s
+        ("joint_velocity_max", "<f8"),  # rad/s
+        ("joint_torque_max", "<f8"),  # N m
+        ("fingertip_force_max", "<f8"),  # N
+        ("heartbeat_s", "<f8"),  # s without a heartbeat of the host
     ]
 )
-FILTER = np.dtype([("enabled", "<u4"), ("setting", "<u4"), ("bandwidth", "<f8")])  # per slot, as read from CoE
+FILTER = np.dtype([("enabled", "<u4"), ("setting", "<u4"), ("bandwidth", "<f8")])  # per slot, from CoE; bandwidth in Hz
 
-# What a bench has besides the controller: the stand-in's operator and its faults. A real controller has no such symbol.
+# Orders to the stand-in's simulated operator, and faults to inject. A real controller has no such symbol.
 BENCH = np.dtype(
     [
         ("id", "<u4"),
         ("contact", "<u4"),
         ("fault", "<u4"),
         ("fault_slot", "<i4"),
-        ("fault_seq", "<u8"),
-        ("amount", "<f8"),  # what a spike adds to its slot, or the size of another fault
-        ("lockstep", "<u4"),  # 1: time goes as fast as the host reads, so that its clock means nothing
+        ("fault_seq", "<u8"),  # sample from which the fault acts
+        ("amount", "<f8"),  # size of the fault; `simulated.faults` gives its unit
+        ("lockstep", "<u4"),  # 1: time advances only as the host reads, so the host's clock says nothing about it
         ("spare", "<u4"),
-        ("mode", "<i4", TARGETS),
-        ("pose", "<f8", TARGETS),
+        ("mode", "<i4", TARGETS),  # `Mode` per joint
+        ("pose", "<f8", TARGETS),  # rad per joint
     ]
 )
-FAULTS = (  # what the stand-in can do wrong on request; `simulated.faults` says what each means
+FAULTS = (  # faults that the stand-in injects on request; `simulated.faults` describes each
     "none", "nan", "freeze", "spike", "flag", "flicker", "clock-back", "clock-frozen", "clock-rate", "clock-jump",
     "slow", "stall", "restart", "cut", "delay", "deaf", "state",
 )  # fmt: skip
 
-SYMBOLS: dict[str, tuple[np.dtype, int]] = {
+SYMBOLS: dict[str, tuple[np.dtype, int]] = {  # name: (type of one element, number of elements)
     "stInfo": (INFO, 1),
     "stStatus": (STATUS, 1),
     "stLimits": (LIMITS, 1),
@@ -112,14 +112,14 @@ class State(IntEnum):
 
     INIT = 0
     IDLE = 1
-    ARMED = 2  # tensions and external motor hold their set-points
-    MOVING = 3  # a ramp or a move is under way
-    RELEASING = 4
-    TRIPPED = 5  # latched: drives are off until RESET
+    ARMED = 2  # drives are on; tensions and external motor hold their set-points
+    MOVING = 3  # drives are on; a ramp or a move is under way
+    RELEASING = 4  # tensions ramp down, then the drives go off
+    TRIPPED = 5  # latched: tension is released, and nothing can be armed until RESET
 
 
 class Mode(IntEnum):
-    """What holds a joint of the stand-in's finger."""
+    """How a joint of the stand-in's finger is held."""
 
     FREE = 0
     FIXED = 1
@@ -138,11 +138,11 @@ class Kind(IntEnum):
     HOLD = 5
     RELEASE = 6
     RESET = 7
-    STOP = 8  # latched stop with the host's cause in `index`
+    STOP = 8  # release and latch TRIPPED, with the host's cause in `index`
 
 
 class Trip(IntEnum):
-    """Causes of a latched stop; the value is the code on the wire."""
+    """Causes of a latched stop. The value is the code on the wire: the controller finds 1 to 9, the host 20 to 29."""
 
     NONE = 0
     TENSION = 1
@@ -154,12 +154,12 @@ class Trip(IntEnum):
     FORCE = 7
     INVALID = 8  # NaN, infinite, or flagged by the terminal
     HEARTBEAT = 9
-    FROZEN = 20  # codes from 20 on are found by the host
+    FROZEN = 20
     STALE = 21
     CLOCK = 22
     OPERATOR = 23
     RECORDER = 24
-    HOST = 25
+    HOST = 25  # a thread of the host is silent, or the plan cannot go on
     TRACKING = 26
     TEMPERATURE = 27
     LAG = 28
@@ -167,7 +167,7 @@ class Trip(IntEnum):
 
     @property
     def sentence(self) -> str:
-        """The cause in words."""
+        """The cause in words, for people."""
         return _SENTENCES[self]
 
 
@@ -201,11 +201,11 @@ class Refusal(IntEnum):
     NONE = 0
     STATE = 1  # not in this state
     RANGE = 2  # a target or rate beyond the hard limits, or not a number
-    KIND = 3  # an unknown kind
+    KIND = 3  # a kind of command that the controller does not know
 
 
 class Flag(IntFlag):
-    """Low half of a sample's flags; the high half is the id of the last command seen, modulo 65536."""
+    """Low half of a sample's flags. The high half is the id of the last command processed, modulo 65536."""
 
     BUS = 1  # working counter or device state not OK
     ENCODER = 2  # parity or magnet error of a joint encoder
@@ -213,7 +213,7 @@ class Flag(IntFlag):
 
 
 def layout(ring: int = RING) -> dict[str, tuple[int, int]]:
-    """Offset and size in bytes of every symbol when they are laid end to end on 8-byte boundaries."""
+    """Offset and size in bytes of every symbol in the stand-in's memory: end to end, on 8-byte boundaries."""
     place, offset = {}, 0
     for name, (dtype, count) in SYMBOLS.items():
         size = dtype.itemsize * (ring if name == "aRing" else count)

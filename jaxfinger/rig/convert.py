@@ -1,4 +1,4 @@
-"""From the log to a session: trials in the dataset format, and beside them gaps, trips, filters and events."""
+"""Turn a log into a session: trials in the dataset format, and in `/rig` gaps, trips, filters and events."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from jaxfinger.data.session import FingerDescription
 from jaxfinger.errors import UserError
 from jaxfinger.rig import wal
 from jaxfinger.rig.backend import Block
-from jaxfinger.rig.channels import SI, WATCHED, Filter, RigDescription
+from jaxfinger.rig.channels import SAFETY_KINDS, SI_UNITS, Filter, RigDescription
 
 
 @dataclass
 class LoggedTrial:
-    """One trial as it lies in the log."""
+    """One trial of the log: its TRIAL frame, its blocks, its marks, and its END frame (None: it was cut short)."""
 
     start: dict[str, Any]
     blocks: list[Block] = field(default_factory=list)
@@ -31,7 +31,7 @@ class LoggedTrial:
 
     @property
     def name(self) -> str:
-        """Name of the trial."""
+        """Name of the trial in the file."""
         return self.start["name"]
 
     @property
@@ -41,13 +41,13 @@ class LoggedTrial:
 
     @property
     def cause(self) -> str:
-        """Why it did not, in words."""
+        """Why the trial was cut short, in words."""
         return "the recorder was killed" if self.end is None else str(self.end.get("cause", ""))
 
 
 @dataclass
 class Log:
-    """A log, read: header, trials in their order, events."""
+    """A log, read: its header, its trials in their order, its events."""
 
     header: dict[str, Any]
     trials: list[LoggedTrial]
@@ -55,12 +55,12 @@ class Log:
 
     @property
     def last_seq(self) -> int | None:
-        """Number of the last sample in it."""
+        """Number of the last sample in the log, or None."""
         return next((int(r.blocks[-1].seq[-1]) for r in reversed(self.trials) if r.blocks), None)
 
 
 def header(rig: RigDescription, plan: str, filters: dict[str, Filter], fingerprint: dict[str, str]) -> dict[str, Any]:
-    """The log's first frame: all that a session file needs besides the samples."""
+    """First frame of a log: everything that the session file needs besides the samples."""
     finger = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(rig.finger).items()}
     return {
         "specimen": rig.specimen,
@@ -76,7 +76,11 @@ def header(rig: RigDescription, plan: str, filters: dict[str, Filter], fingerpri
 
 
 def read_frames(frames: Iterable[wal.Frame], name: str = "log") -> Log:
-    """Group the frames of a log; a trial whose end is missing was cut short."""
+    """Group the frames of a log by trial.
+
+    Raises:
+        UserError: there is no whole header frame.
+    """
     head: dict[str, Any] | None = None
     trials: list[LoggedTrial] = []
     events: list[dict[str, Any]] = []
@@ -110,7 +114,12 @@ def _finger(values: dict[str, Any]) -> FingerDescription:
 
 @dataclass(frozen=True)
 class Samples:
-    """The samples of one trial, each once: `kept` make the trial, the rest came after a trip or were not numbers."""
+    """The samples of one trial, each once.
+
+    `seq` (N,) numbers them, `time` (N,) is in s from the first, `x` (N, C) in SI. Those marked in `kept` (N,) make the
+    trial; the others came after a trip or are not finite in some channel. `clock_jumps` counts the samples at which the
+    device's clock did not increase.
+    """
 
     seq: np.ndarray
     time: np.ndarray
@@ -121,6 +130,7 @@ class Samples:
 
 
 def _samples(logged: LoggedTrial, width: int, rate_hz: float) -> Samples:
+    """Join the blocks of a trial, drop repeated samples, find gaps, and mend times at which the clock ran back."""
     blocks = logged.blocks
     empty = np.empty(0, np.int64)
     seq = np.concatenate([empty, *(b.seq.astype(np.int64) for b in blocks)])
@@ -134,7 +144,7 @@ def _samples(logged: LoggedTrial, width: int, rate_hz: float) -> Samples:
     steps, jump = np.diff(t), np.diff(seq)
     nominal = np.round(jump * 1e9 / rate_hz).astype(np.int64)
     wrong = steps <= 0
-    if wrong.any():  # a clock that ran back: the counter says how much time went by
+    if wrong.any():  # Where the clock ran back, the count of samples gives the time that passed.
         steps = np.where(wrong, nominal, steps)
     time = np.concatenate([[0], np.cumsum(steps)]) * 1e-9
     gaps = [(int(seq[i + 1]), int(jump[i] - 1)) for i in np.flatnonzero(jump > 1)]
@@ -144,6 +154,7 @@ def _samples(logged: LoggedTrial, width: int, rate_hz: float) -> Samples:
 
 
 def _trial(logged: LoggedTrial, samples: Samples, head: dict[str, Any], finger: FingerDescription) -> Trial:
+    """Make the trial of the dataset format. Channels that mean nothing in this trial are left out or NaN."""
     start, keep = logged.start, samples.kept
     seq, x, count = samples.seq[keep], samples.x[keep], int(keep.sum())
     where = {(c["kind"], c["of"]): i for i, c in enumerate(head["channels"])}
@@ -167,7 +178,7 @@ def _trial(logged: LoggedTrial, samples: Samples, head: dict[str, Any], finger: 
         torque = np.full((count, finger.m), np.nan)
         torque[:, finger.joint_names.index(start["motor"])] = x[:, sensor]
     time = samples.time[keep]
-    hold, joint_direction, tendon_direction = _marks(logged.marks, seq, finger)
+    hold, joint_direction, tendon_direction = _marked(logged.marks, seq, finger)
     return Trial(
         name=start["name"],
         experiment=start["experiment"],
@@ -188,8 +199,8 @@ def _trial(logged: LoggedTrial, samples: Samples, head: dict[str, Any], finger: 
     )
 
 
-def _marks(marks: list[dict[str, Any]], seq: np.ndarray, finger: FingerDescription):
-    """Holds and commanded directions: each mark counts from its sample to the next mark."""
+def _marked(marks: list[dict[str, Any]], seq: np.ndarray, finger: FingerDescription):
+    """Return hold (N,), joint directions (N, m) and tendon directions (N, n). A mark holds until the next one."""
     if not marks:
         return None, None, None
     hold = np.full(len(seq), -1, np.int32)
@@ -202,12 +213,16 @@ def _marks(marks: list[dict[str, Any]], seq: np.ndarray, finger: FingerDescripti
             (tendon, finger.tendon_names, mark["tendon_direction"]),
         ):
             values[after] = [directions.get(name, 0) for name in names]
-    held = hold if (hold >= 0).any() else None  # cut short before the first hold
+    held = hold if (hold >= 0).any() else None  # None: the trial was cut short before its first hold.
     return held, joint, tendon if any(m["tendon_direction"] for m in marks) else None
 
 
 def publish(log: Log, output: str | Path, overwrite: bool = False) -> Session:
-    """Write the session of a log: whole or not at all, in a file version that old tools open."""
+    """Write the session of a log: the whole file or none. Trials with fewer than two good samples are left out.
+
+    Raises:
+        UserError: the file exists and is not to be overwritten, or cannot be written.
+    """
     finger = _finger(log.header["finger"])
     trials, extras = {}, {}
     for logged in log.trials:
@@ -222,19 +237,20 @@ def publish(log: Log, output: str | Path, overwrite: bool = False) -> Session:
     with new_file(output, overwrite) as file:
         write_into(file, session)
         for name, (logged, samples) in extras.items():
-            _annotate(file.require_group(f"trials/{name}").attrs, logged, samples)
-        _beside(file.create_group("rig"), log, extras)
+            _write_trial_attributes(file.require_group(f"trials/{name}").attrs, logged, samples)
+        _write_rig_group(file.create_group("rig"), log, extras)
     return session
 
 
-def _annotate(attributes: h5py.AttributeManager, logged: LoggedTrial, samples: Samples) -> None:
+def _write_trial_attributes(attributes: h5py.AttributeManager, logged: LoggedTrial, samples: Samples) -> None:
+    """Write the attributes that only a recording on the rig has."""
     attributes["parameters"] = json.dumps(logged.start["parameters"])
     attributes["lost_samples"] = sum(lost for _, lost in samples.gaps)
     if samples.clock_jumps:
         attributes["clock_jumps"] = samples.clock_jumps
     last = int((logged.end or {}).get("seq", 2**62))
     if broken := int((~samples.kept & (samples.seq < last)).sum()):
-        attributes["dropped_samples"] = broken  # not a number in some channel; they lie in /rig/dropped
+        attributes["dropped_samples"] = broken  # Not finite in some channel; /rig/dropped holds them.
     if clocks := (logged.end or {}).get("clocks"):
         attributes["host_minus_device_s"], attributes["device_time_s"] = np.array(clocks) * 1e-9
     if not logged.complete:
@@ -242,8 +258,8 @@ def _annotate(attributes: h5py.AttributeManager, logged: LoggedTrial, samples: S
         attributes["trip"] = int((logged.end or {}).get("trip", 0))
 
 
-def _beside(group: h5py.Group, log: Log, extras: dict[str, tuple[LoggedTrial, Samples]]) -> None:
-    """`/rig`: what readers of the format ignore and people want to know."""
+def _write_rig_group(group: h5py.Group, log: Log, extras: dict[str, tuple[LoggedTrial, Samples]]) -> None:
+    """Write `/rig`, which readers of the format ignore: how the session was recorded, and what no trial holds."""
     text = h5py.string_dtype("utf-8")
     group.attrs["rig_file"], group.attrs["plan_file"] = log.header["rig"], log.header["plan"]
     group.attrs["fingerprint"] = json.dumps(log.header["fingerprint"])
@@ -261,13 +277,13 @@ def _beside(group: h5py.Group, log: Log, extras: dict[str, tuple[LoggedTrial, Sa
     table.create_dataset("trial", data=[g[0] for g in gaps] or np.empty(0, object), dtype=text)
     table.create_dataset("seq", data=np.array([g[1] for g in gaps], np.int64))
     table.create_dataset("lost", data=np.array([g[2] for g in gaps], np.int64))
-    watched = group.create_group("watched")  # channels that safety alone needs, sample for sample beside the trial
+    watched = group.create_group("watched")  # channels of SAFETY_KINDS, sample for sample beside the trial
     for i, channel in enumerate(log.header["channels"]):
-        if channel["kind"] in WATCHED:
+        if channel["kind"] in SAFETY_KINDS:
             for name, (_, samples) in extras.items():
                 place = watched.create_dataset(f"{name}/{channel['name']}", data=samples.x[samples.kept, i])
-                place.attrs["units"] = SI[channel["kind"]]
-    dropped = group.create_group("dropped")  # samples after a trip, or not a number
+                place.attrs["units"] = SI_UNITS[channel["kind"]]
+    dropped = group.create_group("dropped")  # samples after a trip, or not finite in some channel
     dropped.create_dataset("channel", data=[c["name"] for c in log.header["channels"]], dtype=text)
     for name, (_, samples) in extras.items():
         if not samples.kept.all():

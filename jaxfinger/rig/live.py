@@ -1,4 +1,4 @@
-"""The live view in the terminal: tensions, angles, what is waited for, progress."""
+"""The live view in the terminal: tensions, angles, progress, what the run waits for."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from rich.text import Text
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.runner import View
 
-REFRESH_S = 0.1
-STALLED_S = 2.0  # after which a terminal that takes no output is left alone
+REFRESH_S = 0.1  # s between two drawings
+STALLED_S = 2.0  # s that closing waits for a terminal that takes no output
 
 
 class LiveView(AbstractContextManager):
-    """Call it with every View; a thread of its own draws the newest ten times a second, and prints what is said.
+    """Shows every View that it is called with. A thread of its own draws the newest one and prints messages.
 
-    Whoever calls never waits: a terminal that takes no output stalls that thread alone. Outside a terminal it is a line
-    a trial.
+    The caller never waits: a terminal that takes no output stalls only that thread. `stalled` is then true at the end.
+    Without a terminal, one line for each trial is printed.
     """
 
     def __init__(self, rig: RigDescription, console: Console | None = None):
         self._rig = rig
         self._console = console or Console()
         self._live: Live | None = None
-        if self._console.is_terminal:  # what others print is not sent through the view, to wait for the terminal
+        if self._console.is_terminal:  # Output of others must not pass through the view and wait for the terminal.
             self._live = Live(console=self._console, auto_refresh=False, redirect_stdout=False, redirect_stderr=False)
         self._trial = ""
         self._view: View | None = None
         self._said: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name="jaxfinger-view", daemon=True)
-        self.stalled = False  # at the end: something was not printed, since the terminal takes no output
+        self.stalled = False
 
     def __enter__(self) -> LiveView:
         self._thread.start()
@@ -50,11 +50,11 @@ class LiveView(AbstractContextManager):
         self.stalled = self._thread.is_alive()
 
     def say(self, text: str) -> None:
-        """Print above the view."""
+        """Print a line above the view, without waiting for it."""
         self._said.put(text)
 
     def __call__(self, view: View) -> None:
-        """Show a View."""
+        """Show a View, without waiting for it."""
         if self._live is not None:
             self._view = view
         elif view.trial != self._trial:
@@ -75,7 +75,7 @@ class LiveView(AbstractContextManager):
             self._live.update(self.draw(view), refresh=True)
 
     def draw(self, view: View) -> Group:
-        """The view as something rich can print."""
+        """Render a View for rich."""
         table = Table(box=None, padding=(0, 1), show_header=False)
         table.add_column(justify="left")
         table.add_column(justify="right")

@@ -1,9 +1,10 @@
-"""The fault matrix: each fault × where it is injected × block size × phase, and what must come of it.
+"""The fault matrix: which faults stop the rig, who finds them, and how soon tension must be off.
 
-    python -m jaxfinger.rig.matrix      the table of docs/recording.md
+    python -m jaxfinger.rig.matrix      prints the table of docs/recording.md
 
-Cells of the supervisor alone run on a virtual clock: a stream of samples, cut into blocks of a size, in which a fault
-begins. Cells over the wire run against the stand-in (`tests/rig/test_matrix.py`).
+Each fault is tried in several phases of a recording and sizes of blocks. A cell of the supervisor alone is a stream of
+samples in which the fault begins; no time passes. A cell over the wire records from the stand-in in real time
+(`tests/rig/test_matrix.py`).
 """
 
 from __future__ import annotations
@@ -19,27 +20,31 @@ from jaxfinger.rig.contract import Flag, State, Trip
 from jaxfinger.rig.safety import Supervisor, Violation
 from jaxfinger.rig.watch import PERIOD_S
 
-BLOCKS = (1, 2, 3, 10, 50)
+BLOCK_SIZES = (1, 2, 3, 10, 50)  # samples
 PHASES = ("arming", "ramp", "hold", "letting go")
-STOP_S = 0.3  # from where a fault shows to the stop
-RELEASE_S = 0.7  # of the controller, from the stop to the last newton
+# s allowed from where a fault shows to the stop. The slowest way is the controller's heartbeat watchdog, 0.25 s, and
+# one period of the watch.
+STOP_S = 0.3
+RELEASE_S = 0.7  # s from the stop to no tension: the controller ramps to 2 N in 0.2 s and to 0.5 N in 0.5 s
 OFF_S = STOP_S + RELEASE_S
-LOST_S = 0.2  # that may be missing from what was recorded before the fault
-END_S = 10.0  # until `record` ends by itself
+LOST_S = 0.2  # s of samples before the fault that may be missing from the file
+END_S = 10.0  # s from the fault until `record` has ended by itself
 
-BEGIN = 400  # sample at which a fault begins
-LENGTH = 1800  # of a stream
-BEFORE = 5  # samples from arming to the fault, in the phase of arming
+BEGIN = 400  # number of the sample at which a fault begins
+LENGTH = 1800  # samples of a stream
+ARMED_BEFORE = 5  # samples from arming to the fault, in the phase "arming"
 
 Spoil = Callable[[Block, np.ndarray, RigDescription], None]
 
 
 @dataclass(frozen=True)
 class Row:
-    """One fault. `shows` is how long it cannot be told from a sound rig, s; `causes` are those that may be named.
+    """One fault, with the description `says` for people.
 
-    `spoil` makes it in a stream from a mask of samples on, `wire` in the stand-in (`simulated.faults`). Where `off` is
-    false, no software can let go: the drives' own watchdog does.
+    `by` names who stops the rig, `causes` the trip codes that may be given for it. For `shows` s the fault cannot be
+    told from a sound rig. `spoil` puts it into a stream at a mask of samples, `wire` is the fault of the stand-in
+    (`simulated.faults`) or of the host's threads and disk. It is tried in `phases`. With `at_once` the stop takes
+    tension off without a ramp. Where `off` is false no software can take tension off: the drives' own watchdog does.
     """
 
     name: str
@@ -55,7 +60,7 @@ class Row:
 
 
 def _set(kind: str, of: str, value: float) -> Spoil:
-    """A channel reads a value."""
+    """The channel reads `value` at the masked samples."""
 
     def spoil(block: Block, at: np.ndarray, rig: RigDescription) -> None:
         block.x[at, rig.index(kind, of)] = value
@@ -64,7 +69,7 @@ def _set(kind: str, of: str, value: float) -> Spoil:
 
 
 def _run(kind: str, of: str, step: float) -> Spoil:
-    """A channel runs by so much a sample, for forty samples."""
+    """The channel runs away by `step` per masked sample, for forty samples."""
 
     def spoil(block: Block, at: np.ndarray, rig: RigDescription) -> None:
         block.x[:, rig.index(kind, of)] += np.minimum(np.cumsum(at), 40) * step
@@ -73,7 +78,7 @@ def _run(kind: str, of: str, step: float) -> Spoil:
 
 
 def _time(rate: float = 1.0, jump: float = 0.0) -> Spoil:
-    """The device's clock at `rate`, after a jump, s."""
+    """The device's clock jumps by `jump` s and then runs at `rate`."""
 
     def spoil(block: Block, at: np.ndarray, rig: RigDescription) -> None:
         since = np.cumsum(at) * at  # samples since the fault began
@@ -100,8 +105,8 @@ def _state(block: Block, at: np.ndarray, rig: RigDescription) -> None:
     block.state[at] = 42
 
 
-def _after(name: str) -> Callable[[RigDescription], float]:
-    """A fault that shows once a deadline of the rig file has passed."""
+def _deadline(name: str) -> Callable[[RigDescription], float]:
+    """Value in s of a deadline of the rig file: the fault shows once it has passed."""
     return lambda rig: getattr(rig.deadlines, name)
 
 
@@ -127,40 +132,40 @@ MATRIX = (
     Row("clock back", "the controller's clock runs back", HOST, (Trip.CLOCK,), _time(jump=-0.5), "clock-back"),
     Row("clock frozen", "the controller's clock stands still", HOST, (Trip.CLOCK,), _time(rate=0.0), "clock-frozen"),
     Row("clock slow", "the controller's clock a hundred times too slow", HOST, (Trip.CLOCK,), _time(rate=0.01),
-        "clock-rate=0.01", shows=_after("clock_offset_s")),
+        "clock-rate=0.01", shows=_deadline("clock_offset_s")),
     Row("clock fast", "the controller's clock a thousand times too fast", HOST, (Trip.CLOCK,), _time(rate=1000.0),
         "clock-rate=1000"),
     Row("clock jump", "the controller's clock jumps by an hour", HOST, (Trip.CLOCK,), _time(jump=3600.0),
         "clock-jump"),
     Row("state", "the controller tells a state that the contract has not", HOST, (Trip.CONTRACT,), _state, "state"),
     Row("slow", "the whole controller a hundred times too slow", HOST, (Trip.CLOCK, Trip.STALE), wire="slow",
-        shows=_after("clock_offset_s"), off=False),
-    Row("stall", "the controller's task stands still", HOST, (Trip.STALE,), wire="stall", shows=_after("stale_s"),
+        shows=_deadline("clock_offset_s"), off=False),
+    Row("stall", "the controller's task stands still", HOST, (Trip.STALE,), wire="stall", shows=_deadline("stale_s"),
         off=False),
     Row("restart", "the controller's program restarts", HOST, (Trip.STALE,), wire="restart", at_once=True),
     Row("cut", "the connection is cut", CONTROLLER, (Trip.HEARTBEAT,), wire="cut"),
     Row("lag", "samples reach the host too late", HOST, (Trip.LAG, Trip.HEARTBEAT), wire="delay=0.2",
-        shows=_after("lag_s")),
+        shows=_deadline("lag_s")),
     Row("key", "stop key, also while the terminal takes no output", HOST, (Trip.OPERATOR,), wire="key"),
     Row("deaf", "stop key, and the controller ignores STOP", CONTROLLER, (Trip.HEARTBEAT,), wire="deaf"),
     Row("reader", "the thread that reads and supervises hangs", HOST, (Trip.HOST, Trip.HEARTBEAT), wire="reader",
-        shows=_after("thread_s")),
+        shows=_deadline("thread_s")),
     Row("call", "that thread hangs in a call to the controller", CONTROLLER, (Trip.HOST, Trip.HEARTBEAT), wire="call"),
     Row("runner", "the thread that carries out the plan hangs", HOST, (Trip.HOST,), wire="runner",
-        shows=_after("thread_s")),
+        shows=_deadline("thread_s")),
     Row("watch", "the thread of stop key and heartbeat hangs", CONTROLLER, (Trip.HEARTBEAT,), wire="watch"),
     Row("host", "the host's process is stopped or killed", CONTROLLER, (Trip.HEARTBEAT,), wire="host"),
-    Row("disk", "the disk does not answer", HOST, (Trip.RECORDER,), wire="disk", shows=_after("disk_s")),
+    Row("disk", "the disk does not answer", HOST, (Trip.RECORDER,), wire="disk", shows=_deadline("disk_s")),
     Row("full", "the disk is full", HOST, (Trip.RECORDER,), wire="full"),
 )  # fmt: skip
 
 
 def stream(rig: RigDescription, phase: str, seed: int = 0) -> Block:
-    """LENGTH samples of a sound finger in a phase; the fault is to begin at BEGIN."""
+    """Return LENGTH samples of a sound finger in a phase; sample BEGIN lies within it."""
     rng, finger, k = np.random.default_rng(seed), rig.finger, np.arange(LENGTH)
     seconds = np.maximum(k - BEGIN, 0) / rig.rate_hz
     state, wanted = {
-        "arming": (np.where(k < BEGIN - BEFORE, State.IDLE, State.ARMED), 0.0 * k),
+        "arming": (np.where(k < BEGIN - ARMED_BEFORE, State.IDLE, State.ARMED), 0.0 * k),
         "ramp": (np.full(LENGTH, State.MOVING), 3.0 + 5.0 * k / rig.rate_hz),
         "hold": (np.full(LENGTH, State.ARMED), np.full(LENGTH, 8.0)),
         "letting go": (
@@ -180,14 +185,17 @@ def stream(rig: RigDescription, phase: str, seed: int = 0) -> Block:
 
 
 def blocks(whole: Block, size: int) -> Iterator[Block]:
-    """A stream in blocks of a size."""
+    """Cut a stream into blocks of `size` samples."""
     for start in range(0, len(whole), size):
         cut = slice(start, start + size)
         yield Block(whole.seq[cut], whole.t_ns[cut], whole.x[cut], whole.state[cut], whole.flags[cut])
 
 
 def supervise(rig: RigDescription, row: Row, phase: str, size: int) -> tuple[Violation, int] | None:
-    """One cell of the supervisor alone: the first violation, and the sample with which it reaches the host."""
+    """Run one cell of the supervisor alone.
+
+    Return the first violation, and the last sample of the block that brought it to the host, or None.
+    """
     assert row.spoil is not None
     whole = stream(rig, phase)
     row.spoil(whole, np.arange(LENGTH) >= BEGIN, rig)
@@ -199,20 +207,26 @@ def supervise(rig: RigDescription, row: Row, phase: str, size: int) -> tuple[Vio
 
 
 def cells() -> Iterator[tuple[Row, str, int]]:
-    """Every cell of the supervisor alone."""
-    return ((row, phase, size) for row in MATRIX if row.spoil is not None for phase in row.phases for size in BLOCKS)
+    """Yield every cell of the supervisor alone: row, phase, block size."""
+    return (
+        (row, phase, size) for row in MATRIX if row.spoil is not None for phase in row.phases for size in BLOCK_SIZES
+    )
 
 
 Results = dict[tuple[str, str, int], "tuple[Violation, int] | None"]
 
 
 def run(rig: RigDescription) -> Results:
-    """Run every cell of the supervisor alone."""
+    """Run every cell of the supervisor alone. The result is by name of the row, phase and block size."""
     return {(row.name, phase, size): supervise(rig, row, phase, size) for row, phase, size in cells()}
 
 
 def stopped_s(rig: RigDescription, row: Row, results: Results) -> float:
-    """From where a fault shows to the stop, s, at the latest: the worst cell, and the host's next read and look."""
+    """Longest time in s from where a fault shows to the stop.
+
+    A fault that the host finds takes the samples of the worst cell, a pause of the reader and a period of the watch.
+    One that only the controller finds takes its heartbeat time.
+    """
     if row.by == CONTROLLER:
         return rig.hard.heartbeat_s + (PERIOD_S if row.name == "deaf" else 0.0)
     hits = [hit for (name, _, _), hit in results.items() if name == row.name]
@@ -221,7 +235,7 @@ def stopped_s(rig: RigDescription, row: Row, results: Results) -> float:
 
 
 def table(rig: RigDescription, results: Results) -> str:
-    """The matrix as it stands in docs/recording.md."""
+    """Return the matrix as the table of docs/recording.md."""
     lines = [
         "| fault | shows after | then stopped within | tension off within | by |",
         "| --- | --- | --- | --- | --- |",
@@ -235,7 +249,7 @@ def table(rig: RigDescription, results: Results) -> str:
 
 
 def main() -> None:
-    """Print the table, with the figures of the example rig file."""
+    """Print the table for the example rig file."""
     from jaxfinger.rig.rig_file import parse_rig
     from jaxfinger.rig.simulated.examples import rig_toml
 

@@ -1,4 +1,4 @@
-"""Who stands at the rig: a person at the terminal, or nobody (a simulated rig prepares itself)."""
+"""Operators: a person at the terminal, or nobody (a simulated rig prepares itself)."""
 
 from __future__ import annotations
 
@@ -15,33 +15,34 @@ from jaxfinger.errors import UserError
 
 @runtime_checkable
 class Operator(Protocol):
-    """Answers prompts and may stop the run at any time."""
+    """Answers prompts, and can stop the run at any time. The watch asks `stop_requested` every 20 ms."""
 
-    def ask(self, text: str, alive: Callable[[], bool]) -> None:
-        """Return once it is done; give up when `alive` turns false."""
+    def ask(self, text: str, keep_waiting: Callable[[], bool]) -> None:
+        """Show a prompt. Return when the operator has done it, or when `keep_waiting()` is false."""
         ...
 
     def stop_requested(self) -> bool:
-        """Whether the stop key was pressed."""
+        """Whether the operator wants the rig stopped. Must not wait: the heartbeat comes from the same thread."""
         ...
 
 
 class Nobody:
-    """For rigs that prepare themselves: a prompt that a person would have to answer is an error."""
+    """No operator, for rigs that prepare themselves. A prompt that needs a person is an error."""
 
-    def ask(self, text: str, alive: Callable[[], bool]) -> None:
-        """Refuse: nobody is there to do it."""
+    def ask(self, text: str, keep_waiting: Callable[[], bool]) -> None:
+        """Raise UserError: nobody is there to do it."""
         raise UserError(f"a person must do this, so run without --yes: {text}")
 
     def stop_requested(self) -> bool:
-        """Never."""
+        """Return False."""
         return False
 
 
 class AtTerminal:
-    """A person at the terminal: Enter answers a prompt, q, space or Escape stops the rig at any time.
+    """A person at the terminal. Enter answers a prompt; q, space or Escape stops the rig at any time.
 
-    Keys are read by whoever asks for them, and nothing is printed: a terminal that takes no output still gives keys.
+    The thread that asks for keys reads them itself and prints nothing, so keys also arrive from a terminal that takes
+    no output. A terminal that is gone counts as a stop, since its stop key is gone with it.
     """
 
     def __init__(self, say: Callable[[str], None] = print):
@@ -60,7 +61,7 @@ class AtTerminal:
             raise UserError("the operator's stop key needs a terminal; run in one, or use --yes on a simulated rig.")
         keys = self._keys = sys.stdin.fileno()
         self._settings = termios.tcgetattr(keys)
-        tty.setcbreak(keys, termios.TCSANOW)  # any other waits for output that nobody may be reading
+        tty.setcbreak(keys, termios.TCSANOW)  # Other modes wait until the terminal has taken all output: maybe never.
         return self
 
     def __exit__(self, *_) -> None:
@@ -71,13 +72,13 @@ class AtTerminal:
         self._keys = None
 
     def _poll(self) -> None:
-        """Take the keys that were pressed; never waits."""
+        """Read the keys that were pressed, without waiting."""
         if self._keys is None or not self._reading.acquire(blocking=False):
             return
         try:
             while select.select([self._keys], [], [], 0)[0]:
                 pressed = os.read(self._keys, 64)
-                if not pressed:  # the terminal is gone, and the stop key with it
+                if not pressed:  # The terminal is gone.
                     self._stop.set()
                     return
                 for key in pressed.decode(errors="replace"):
@@ -88,20 +89,20 @@ class AtTerminal:
             self._reading.release()
 
     def key(self, key: str) -> None:
-        """A key was pressed."""
+        """Act on one key."""
         if key in ("q", " ", "\x1b"):
             self._stop.set()
         elif key in ("\n", "\r"):
             self._enter.set()
 
-    def ask(self, text: str, alive: Callable[[], bool]) -> None:
-        """Show the prompt and wait for Enter; the rig is watched meanwhile."""
+    def ask(self, text: str, keep_waiting: Callable[[], bool]) -> None:
+        """Show the prompt and wait for Enter. A stop key or a false `keep_waiting()` ends the wait too."""
         self._enter.clear()
         self._say(f"{text}\n  Enter when done; q, space or Escape stops the rig.")
-        while not self._enter.wait(0.05) and not self.stop_requested() and alive():
+        while not self._enter.wait(0.05) and not self.stop_requested() and keep_waiting():
             pass
 
     def stop_requested(self) -> bool:
-        """Whether q, space or Escape was pressed."""
+        """Whether q, space or Escape was pressed, or the terminal is gone."""
         self._poll()
         return self._stop.is_set()

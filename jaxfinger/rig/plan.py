@@ -1,4 +1,4 @@
-"""Plan files: which experiments, in which order, how often. Checked command by command before anything moves."""
+"""Plan files: which experiments, in which order, how often. Every command is checked before anything moves."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.protocols import EXPERIMENTS, Common, Covered, Dwell, Protocol, Settled, Start, Tare
 from jaxfinger.rig.safety import admit
 
-STEPS = 100_000  # of one trial: commands, marks and waits; the longest of the paper's has a hundred
+# Steps of one trial (commands, marks and waits). The paper's longest trial has a hundred. More than this is a mistake
+# in the plan, and checking it would seem to hang.
+MAX_STEPS = 100_000
 
 
 @dataclass(frozen=True)
 class PlannedTrial:
-    """One recording to make: trials of the same `motion` are repeats of each other."""
+    """One trial to record. Trials with the same `motion` repeat each other; `line` is its line in the plan file."""
 
     name: str
     experiment: str
@@ -31,22 +33,22 @@ class PlannedTrial:
 
     @property
     def joint(self) -> str | None:
-        """The joint that is moved or instrumented."""
+        """Name of the joint that is moved or instrumented, or None."""
         return getattr(self.parameters, "joint", None)
 
     @property
     def tendon(self) -> str | None:
-        """The tendon that is pulled."""
+        """Name of the tendon that is pulled, or None."""
         return getattr(self.parameters, "tendon", None)
 
     def protocol(self, rig: RigDescription) -> Protocol:
-        """The steps of the experiment."""
+        """Steps of the experiment."""
         return EXPERIMENTS[self.experiment][0](rig.finger, self.parameters)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A plan file, read."""
+    """A plan file, read and checked. `text` is the file itself."""
 
     name: str
     operator: str
@@ -57,7 +59,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a trial will do, from its commands alone: seconds, prompts, and the highest tension."""
+    """Duration in s, prompts, and highest tension in N that a trial's commands give."""
 
     name: str
     seconds: float
@@ -67,7 +69,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Head:
-    """`[plan]`."""
+    """Keys of `[plan]`."""
 
     name: str
     operator: str = ""
@@ -75,19 +77,23 @@ class Head:
 
 @dataclass(frozen=True)
 class PlanFile:
-    """A plan file; which keys a trial takes depends on its experiment."""
+    """Tables of a plan file. The keys of a `[[trial]]` depend on its experiment."""
 
     plan: Head
     trial: Annotated[tuple[Mapping[str, Any], ...], NotEmpty()]
 
 
 def read_plan(path: str | Path, rig: RigDescription) -> Plan:
-    """Read a plan and check every command that it will give against the rig; raises UserError with the line."""
+    """Read a plan file and check every command that it will give against the limits of the rig file.
+
+    Raises:
+        UserError: the file cannot be read, or a key or command is wrong. The sentence gives the line.
+    """
     return _plan(read_toml(path, "give the path of a plan file"), rig)
 
 
 def parse_plan(text: str, rig: RigDescription, path: str | Path = "plan.toml") -> Plan:
-    """A plan that is already in memory."""
+    """Read a plan from text, as `read_plan` does; `path` names it in messages."""
     return _plan(parse_toml(text, path), rig)
 
 
@@ -98,17 +104,18 @@ def _plan(document: Document, rig: RigDescription) -> Plan:
         PlannedTrial(f"{i:02d}-{t.motion.rsplit('-', 1)[0]}", t.experiment, t.motion, t.parameters, t.line)
         for i, t in enumerate(trials, 1)
     )
-    for trial in {trial.line: trial for trial in reversed(named)}.values():  # repeats do the same
+    for trial in {trial.line: trial for trial in reversed(named)}.values():  # one of each set of repeats
         try:
             for number, _ in enumerate(commands(trial, rig)):
-                if number == STEPS:
-                    raise UserError(f"takes more than {STEPS} steps; shorten it")
+                if number == MAX_STEPS:
+                    raise UserError(f"takes more than {MAX_STEPS} steps; shorten it")
         except UserError as error:
             raise UserError(f"{document.path}, line {trial.line}: {trial.name}: {error}") from error
     return Plan(file.plan.name, file.plan.operator, named, document.text, str(document.path))
 
 
 def _trials(index: int, table: Mapping[str, Any], rig: RigDescription, place: Place) -> Iterator[PlannedTrial]:
+    """Yield the repeats of one `[[trial]]`, without their final names."""
     if "experiment" not in table:
         place.fail("has no `experiment`; add a line 'experiment = …'")
     try:
@@ -117,13 +124,14 @@ def _trials(index: int, table: Mapping[str, Any], rig: RigDescription, place: Pl
         (place / "experiment").fail(fault.message)
     keys = {key: value for key, value in table.items() if key != "experiment"}
     parameters = structure(keys, EXPERIMENTS[experiment][1], place)
-    _sensible(experiment, parameters, rig, place)
+    _check_parameters(experiment, parameters, rig, place)
     what = [experiment, *(str(getattr(parameters, key)) for key in ("tendon", "joint") if hasattr(parameters, key))]
     for _ in range(parameters.repeats):
         yield PlannedTrial("", experiment, f"{'-'.join(what)}-{index + 1}", parameters, place.line or 1)
 
 
-def _sensible(experiment: str, parameters: Common, rig: RigDescription, place: Place) -> None:
+def _check_parameters(experiment: str, parameters: Common, rig: RigDescription, place: Place) -> None:
+    """Refuse parameters that do not fit the finger or the rig's channels. Raises UserError with the line."""
     finger, values = rig.finger, vars(parameters)
     for key, names in (("joint", finger.joint_names), ("tendon", finger.tendon_names)):
         if key in values:
@@ -155,7 +163,13 @@ def _sensible(experiment: str, parameters: Common, rig: RigDescription, place: P
 
 
 def commands(trial: PlannedTrial, rig: RigDescription) -> Iterator[Any]:
-    """Every step of a trial, each command checked against the limits: protocols do not depend on measurements."""
+    """Yield every step of a trial, each command checked against the limits.
+
+    The steps of a protocol do not depend on measurements, so those checked here are those of the run.
+
+    Raises:
+        CommandRefused: a command is beyond the limits.
+    """
     for step in trial.protocol(rig):
         if isinstance(step, TensionRamp | JointMove):
             admit(step, rig)
@@ -163,7 +177,10 @@ def commands(trial: PlannedTrial, rig: RigDescription) -> Iterator[Any]:
 
 
 def estimate(trial: PlannedTrial, rig: RigDescription) -> Estimate:
-    """Duration without the operator's pauses, prompts and highest tension, from the commands alone."""
+    """Estimate duration (without the operator's pauses), prompts and highest tension from the commands alone.
+
+    A joint moved by hand is taken to need 4 s for each pass to and fro.
+    """
     seconds, highest, prompts = 0.0, 0.0, []
     tension = dict.fromkeys(rig.finger.tendon_names, 0.0)
     angle = trial.parameters.posture(rig.finger)

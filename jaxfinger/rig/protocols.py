@@ -1,7 +1,7 @@
-"""The paper's experiments, each a generator of commands, waits and marks; the same code drives simulator and rig.
+"""The paper's experiments as protocols: generators of commands, waits and marks that the runner carries out.
 
-A protocol starts unrecorded (posture, pretension, taring), yields `Start`, and is recorded until it ends. Angles in
-plan files are degrees, tensions N, torques N m, times s.
+A protocol begins unrecorded (posture, pretension, taring), yields `Start`, and is recorded from there to its end. Plan
+files give angles in degrees, tensions in N, times in s; commands are in SI.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from jaxfinger.rig.backend import Command, JointMove, Setup, TensionRamp
 
 @dataclass(frozen=True)
 class Reached:
-    """Wait until the controller has carried out the last command."""
+    """Wait until the controller has carried out the last command, at most `timeout` s."""
 
     timeout: float = 60.0
 
 
 @dataclass(frozen=True)
 class Dwell:
-    """Wait so many seconds of device time."""
+    """Wait `seconds` of device time."""
 
     seconds: float
 
 
 @dataclass(frozen=True)
 class Settled:
-    """Wait until every named tension stayed within `within` N of its value for `seconds`."""
+    """Wait until every named tension has stayed within `within` N of its value for `seconds`, at most `timeout` s."""
 
     tensions: dict[str, float]
     within: float = 0.3
@@ -43,7 +43,7 @@ class Settled:
 
 @dataclass(frozen=True)
 class Covered:
-    """Wait until the joints have been moved through `share` of their range, `passes` times each way."""
+    """Wait until each joint has been moved through `share` of its range `passes` times each way, for `timeout` s."""
 
     joints: tuple[str, ...]
     share: float
@@ -53,7 +53,7 @@ class Covered:
 
 @dataclass(frozen=True)
 class Tare:
-    """Take the mean of these kinds of channel over `seconds`, unloaded, as their zero."""
+    """Take the mean of these kinds of channel over `seconds` as their zero. The sensors must be unloaded."""
 
     kinds: tuple[str, ...]
     seconds: float = 0.5
@@ -61,7 +61,7 @@ class Tare:
 
 @dataclass(frozen=True)
 class Mark:
-    """From here on, samples belong to this hold (−1: none), with these commanded directions."""
+    """Assign the samples from here on to a hold (−1: none) and to commanded directions (−1, 0, 1) by name."""
 
     hold: int = -1
     joint_direction: dict[str, int] = field(default_factory=dict)
@@ -70,12 +70,14 @@ class Mark:
 
 @dataclass(frozen=True)
 class Start:
-    """Record from here on; `loaded` are the tendons whose excursion means something."""
+    """Record from here on. Excursions count for the `loaded` tendons; a slack tendon's encoder says nothing."""
 
     loaded: tuple[str, ...] = ()
 
 
-Count = Annotated[int, Within(1, 1000)]  # repeats or passes: noise is known to 2 % from as many
+MIN_TARGET = 0.6  # N, the lowest target of VD.3: tendons stay taut. The controller takes less than 0.2 N for slack.
+# Repeats or passes. A thousand of them give the noise's standard deviation to 2 % (1/√2000); more is a mistake.
+Count = Annotated[int, Within(1, 1000)]
 NotNegative = Annotated[float, Within(0.0)]
 Step = Command | Setup | Reached | Dwell | Settled | Covered | Tare | Mark | Start
 Protocol = Iterator[Step]
@@ -83,9 +85,9 @@ Protocol = Iterator[Step]
 
 @dataclass(frozen=True)
 class Common:
-    """What every experiment takes from the plan."""
+    """Keys that every experiment has."""
 
-    posture_deg: tuple[float, ...] = ()  # of the joints that are fixed; empty: all at 20°
+    posture_deg: tuple[float, ...] = ()  # angles at which joints are fixed; empty: all at 20°
     tension_rate: NotNegative = 10.0  # N/s
     repeats: Count = 1
 
@@ -97,7 +99,7 @@ class Common:
 
 @dataclass(frozen=True)
 class MomentArms(Common):
-    """ID.2: `passes` times through `share` of the joint's range by hand, all tendons at `pretension` N."""
+    """ID.2: a joint moved by hand through `share` of its range `passes` times, all tendons at `pretension` N."""
 
     joint: str = field(kw_only=True)
     pretension: NotNegative = 2.0
@@ -113,11 +115,13 @@ class MomentArms(Common):
 
 @dataclass(frozen=True)
 class StaticTorque(Common):
-    """ID.3-static: every `step_deg` of `range_deg`, up and back; holds last `dwell` s, after `settle` s."""
+    """ID.3-static: a joint held every `step_deg` of `range_deg`, up and back. A hold begins `settle` s after the move
+    and lasts `dwell` s.
+    """
 
     joint: str = field(kw_only=True)
     range_deg: tuple[float, float] = (0.0, 70.0)
-    step_deg: Annotated[float, Within(0.01, unit="deg")] = 10.0  # AA5048B resolves 0.02°
+    step_deg: Annotated[float, Within(0.01, unit="deg")] = 10.0  # at least 0.01°: the encoder AA5048B resolves 0.02°
     speed_deg_s: NotNegative = 30.0
     settle: NotNegative = 0.2
     dwell: NotNegative = 0.5
@@ -125,7 +129,7 @@ class StaticTorque(Common):
 
 @dataclass(frozen=True)
 class DynamicTorque(Common):
-    """ID.3-dynamic: to and fro through `range_deg` at each of `speeds_deg_s`, `passes` times."""
+    """ID.3-dynamic: a joint driven to and fro through `range_deg` `passes` times at each of `speeds_deg_s`."""
 
     joint: str = field(kw_only=True)
     range_deg: tuple[float, float] = (10.0, 65.0)
@@ -136,7 +140,7 @@ class DynamicTorque(Common):
 
 @dataclass(frozen=True)
 class TendonFriction(Common):
-    """ID.4: one tendon in `levels` N, up and, where `down`, back; the joint is held by the torque sensor."""
+    """ID.4: one tendon pulled through `levels` N, and with `down` back; the torque sensor holds the joint."""
 
     joint: str = field(kw_only=True)
     tendon: str = field(kw_only=True)
@@ -148,7 +152,7 @@ class TendonFriction(Common):
 
 @dataclass(frozen=True)
 class FreeExcursion(Common):
-    """VD.1: all joints moved by hand for `seconds`, all tendons at `pretension` N."""
+    """VD.1: all joints moved by hand for `seconds`, with all tendons at `pretension` N."""
 
     pretension: NotNegative = 2.0
     seconds: NotNegative = 20.0
@@ -156,30 +160,20 @@ class FreeExcursion(Common):
 
 @dataclass(frozen=True)
 class FingertipForce(Common):
-    """VD.2: fingertip on its sensor, one tendon in `levels` N, the others slack."""
+    """VD.2: fingertip on its force sensor, one tendon pulled through `levels` N, the others slack."""
 
     tendon: str = field(kw_only=True)
-    levels: Annotated[tuple[float, ...], Within(0.0, unit="N", above=True)] = (
-        4.0,
-        5.0,
-        6.0,
-        7.0,
-        8.0,
-        9.0,
-        10.0,
-        11.0,
-        12.0,
-        13.0,
-        14.0,
-        15.0,
-    )
+    levels: Annotated[tuple[float, ...], Within(0.0, unit="N", above=True)] = tuple(float(f) for f in range(4, 16))
     settle: NotNegative = 0.3
     dwell: NotNegative = 0.5
 
 
 @dataclass(frozen=True)
 class Trajectory(Common):
-    """VD.3: the free finger along a random path of tensions about `mean` N, a new target every `interval` s."""
+    """VD.3: the free finger under random tensions about `mean` N, with new targets every `interval` s.
+
+    Targets lie within `amplitude` N of the mean; `seed` chooses them.
+    """
 
     mean: tuple[float, ...] = ()  # N per active tendon; empty: 2 N each
     amplitude: NotNegative = 0.8  # N
@@ -189,6 +183,7 @@ class Trajectory(Common):
 
 
 def _all(finger: FingerDescription, tension: float) -> dict[str, float]:
+    """One tension for every active tendon."""
     return {name: tension for name, active in zip(finger.tendon_names, finger.active, strict=True) if active}
 
 
@@ -197,12 +192,13 @@ def _angles(posture: dict[str, float]) -> str:
 
 
 def _tension(targets: dict[str, float], rate: float) -> Protocol:
+    """Ramp tensions and wait until the controller has done it."""
     yield TensionRamp(targets, rate)
     yield Reached()
 
 
 def _tared(finger: FingerDescription, posture: dict[str, float], kinds: tuple[str, ...], rate: float) -> Protocol:
-    """Tendons slack, sensors unloaded, zero taken: before every trial."""
+    """Take the tension off, unload the sensors, and tare them: the beginning of every trial that reads them."""
     yield Setup(f"Fix all joints: {_angles(posture)}. Uncouple the external motor, free the fingertip.", fixed=posture)
     yield from _tension(_all(finger, 0.0), rate)
     yield Dwell(0.3)
@@ -210,7 +206,7 @@ def _tared(finger: FingerDescription, posture: dict[str, float], kinds: tuple[st
 
 
 def moment_arms(finger: FingerDescription, p: MomentArms) -> Protocol:
-    """ID.2: all tendons pre-tensioned; the operator moves one joint through its range, the others are fixed."""
+    """ID.2: all tendons are pre-tensioned; the operator moves one joint through its range, the others are fixed."""
     posture = p.posture(finger)
     yield Setup(f"Fix all joints: {_angles(posture)}.", fixed=posture)
     pretension = _all(finger, p.pretension)
@@ -225,7 +221,11 @@ def moment_arms(finger: FingerDescription, p: MomentArms) -> Protocol:
 
 
 def static_torque(finger: FingerDescription, p: StaticTorque) -> Protocol:
-    """ID.3-static: tendons slack; the motor stops the joint at sampled angles from extension to flexion, and back."""
+    """ID.3-static: tendons are slack; the external motor stops the joint at angles from extension to flexion and back.
+
+    Friction must point the same way in all holds of one direction. So the first hold lies `approach` + 0.02 rad above
+    the lower end and is reached from below, and the first hold on the way back lies 0.05 rad below the upper end.
+    """
     posture = p.posture(finger)
     low, high = np.radians(p.range_deg)
     grid = np.linspace(low, high, max(2, round((p.range_deg[1] - p.range_deg[0]) / p.step_deg) + 1))
@@ -235,7 +235,7 @@ def static_torque(finger: FingerDescription, p: StaticTorque) -> Protocol:
     approach = min(0.05, float(grid[1] - grid[0]) / 2)
     yield JointMove(p.joint, float(low), speed)
     yield Reached()
-    yield JointMove(p.joint, float(low) + approach, speed)  # friction has a direction before the first hold
+    yield JointMove(p.joint, float(low) + approach, speed)  # gives friction its direction before the first hold
     yield Reached()
     yield Start()
     up = [float(low) + approach + 0.02, *grid[1:].tolist()]
@@ -253,7 +253,7 @@ def static_torque(finger: FingerDescription, p: StaticTorque) -> Protocol:
 
 
 def dynamic_torque(finger: FingerDescription, p: DynamicTorque) -> Protocol:
-    """ID.3-dynamic: as the static phase, but the joint is driven to and fro at several velocities."""
+    """ID.3-dynamic: tendons are slack; the external motor drives the joint to and fro at several speeds."""
     posture = p.posture(finger)
     low, high = np.radians(p.range_deg).tolist()
     yield from _tared(finger, posture, ("external_torque",), p.tension_rate)
@@ -268,12 +268,13 @@ def dynamic_torque(finger: FingerDescription, p: DynamicTorque) -> Protocol:
 
 
 def _coupled(posture: dict[str, float], joint: str) -> Protocol:
+    """Couple one joint to the external motor, the others fixed."""
     others = {name: angle for name, angle in posture.items() if name != joint}
     yield Setup(f"Couple the external motor to {joint}; the other joints stay fixed.", fixed=others, motor=joint)
 
 
 def tendon_friction(finger: FingerDescription, p: TendonFriction) -> Protocol:
-    """ID.4: the joint is held by the torque sensor; one tendon is pulled in steps, the others are slack."""
+    """ID.4: the torque sensor holds the joint; one tendon is pulled in steps, the others are slack."""
     posture = p.posture(finger)
     yield from _tared(finger, posture, ("external_torque",), p.tension_rate)
     yield from _coupled(posture, p.joint)
@@ -292,6 +293,10 @@ def fingertip_force(finger: FingerDescription, p: FingertipForce) -> Protocol:
 
 
 def _steps(tendon: str, levels: tuple[float, ...], down: bool, settle: float, dwell: float, rate: float) -> Protocol:
+    """Record one tendon pulled through tensions, each with a hold.
+
+    It begins at half the first level, so that the first hold is reached from below too.
+    """
     first = levels[0]
     yield from _tension({tendon: first / 2}, rate)
     yield Start(loaded=(tendon,))
@@ -317,7 +322,7 @@ def free_excursion(finger: FingerDescription, p: FreeExcursion) -> Protocol:
 
 
 def trajectory(finger: FingerDescription, p: Trajectory) -> Protocol:
-    """VD.3: tendons alone drive the free finger."""
+    """VD.3: the tendons alone drive the free finger. No target is below MIN_TARGET, so that no tendon falls slack."""
     posture, names = p.posture(finger), list(_all(finger, 0.0))
     mean = np.array(p.mean or (2.0,) * len(names))
     rng = np.random.default_rng(p.seed)
@@ -327,11 +332,12 @@ def trajectory(finger: FingerDescription, p: Trajectory) -> Protocol:
     yield Dwell(1.0)
     yield Start(loaded=tuple(names))
     for _ in range(round(p.seconds / p.interval)):
-        target = np.maximum(mean + p.amplitude * rng.uniform(-1, 1, len(names)), 0.6)
+        target = np.maximum(mean + p.amplitude * rng.uniform(-1, 1, len(names)), MIN_TARGET)
         yield TensionRamp(dict(zip(names, target.tolist(), strict=True)), p.tension_rate)
         yield Dwell(p.interval)
 
 
+# Protocol and parameters of each experiment.
 EXPERIMENTS = {
     "ID.2": (moment_arms, MomentArms),
     "ID.3-static": (static_torque, StaticTorque),
@@ -341,4 +347,4 @@ EXPERIMENTS = {
     "VD.2": (fingertip_force, FingertipForce),
     "VD.3": (trajectory, Trajectory),
 }
-DYNAMIC = ("ID.3-dynamic", "VD.1", "VD.3")  # experiments that a filtered terminal spoils
+DYNAMIC = ("ID.3-dynamic", "VD.1", "VD.3")  # experiments for which a terminal's filter is too slow

@@ -1,4 +1,8 @@
-"""Reads the rig without pause: every block goes to the recorder, past the supervisor, and on to who waits for it."""
+"""The reader pulls every block from the rig, supervises it, hands it to the recorder, and queues it for the runner.
+
+The reader stops the rig itself on a violation, without waiting for the runner. The watch (watch.py) looks after the
+reader: a reader that is silent for `thread_s`, or gets no new sample for `stale_s`, ends the run.
+"""
 
 from __future__ import annotations
 
@@ -10,21 +14,24 @@ from typing import Any
 
 from jaxfinger.errors import UserError
 from jaxfinger.rig import wal
-from jaxfinger.rig.backend import Block, Look, Rig, StaleRig, stale
+from jaxfinger.rig.backend import Block, HeadReading, Rig, StaleRig, stale
 from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.safety import Supervisor, Violation, armed
 from jaxfinger.rig.trips import Drift
 
-EPOCH_NS = 946_684_800 * 10**9  # 2000-01-01 in Unix time: where a controller's clock starts
-KEEP = 3000  # blocks that a busy runner may lag behind
-JOIN_S = 1.0  # that a reader which hangs in a call is waited for
+EPOCH_NS = 946_684_800 * 10**9  # Unix time of 2000-01-01, ns: zero of the controller's clock
+# Blocks that may wait for the runner: 150 s at one every 50 ms (poll_s). Limits memory; recorder and supervisor have
+# had the blocks that are dropped.
+MAX_WAITING_BLOCKS = 3000
+JOIN_S = 1.0  # s that closing waits for a reader that hangs in a call; the thread is then left behind
 
 
 class Reader:
-    """One thread (or, for synchronous rigs, none) from the rig to the log.
+    """Reads the rig in a thread of its own; a synchronous rig is read by the thread that calls `next`.
 
-    `violation` and `error` latch the first reason to end the run; the rig is stopped here, at once, not by the runner.
+    `violation` holds the cause for which the rig was stopped, `error` why it cannot be read. The first of each stays;
+    either ends the run, and with either the watch sends no more heartbeats.
     """
 
     def __init__(self, rig: Rig, recorder: Recorder, supervisor: Supervisor):
@@ -32,21 +39,22 @@ class Reader:
         self.first_seq = self.latest_seq = self.latest_t = -1
         self.violation: Violation | None = None
         self.error: Exception | None = None
-        self.trouble: Violation | None = None  # the newest violation while nothing was armed
+        self.unarmed_violation: Violation | None = None  # the newest one found while nothing was armed
         self.samples = self.lost = 0
         self.latest: Block | None = None
         self.lag_s = 0.0
         self._host = HostClock(rig)
-        self._clocks: tuple[int, int] | None = None  # host minus device, and device time (ns), of the quickest block
+        # Host's minus device's clock, and device's clock, both ns, of the block of this trial that came quickest.
+        self._clocks: tuple[int, int] | None = None
         self._recording = False
-        self._blocks: deque[Block] = deque(maxlen=KEEP)
+        self._blocks: deque[Block] = deque(maxlen=MAX_WAITING_BLOCKS)
         self._news = threading.Condition()
         self._first_cause = threading.Lock()
         self._running = False
         self._thread: threading.Thread | None = None
 
     def start(self, prepare: Callable[[], None] = lambda: None) -> None:
-        """Start reading; a thread of its own calls `prepare` first."""
+        """Start reading. The reader's own thread calls `prepare` first; a synchronous rig has no such thread."""
         self._running = True
         if not self.rig.synchronous:
             arguments = {"target": self._loop, "args": (prepare,), "name": "jaxfinger-reader", "daemon": True}
@@ -54,7 +62,7 @@ class Reader:
             self._thread.start()
 
     def close(self) -> None:
-        """Stop reading; a thread that hangs in a call to a dead network is left behind."""
+        """Stop reading. A thread that hangs in a call to the controller is left behind."""
         self._running = False
         if self._thread is not None:
             self._thread.join(JOIN_S)
@@ -66,12 +74,17 @@ class Reader:
         while self._running and self.error is None:
             started = time.monotonic()
             read = self._step(news)
-            self.rig.alive()
+            self.rig.report_alive()
             news = time.monotonic() if read else news
-            if self.rig.look is None or self.rig.look.head <= self.latest_seq + 1:  # else there is more to fetch
+            head = self.rig.head_reading
+            if head is None or head.head <= self.latest_seq + 1:  # The ring is empty; otherwise read on at once.
                 time.sleep(max(0.0, poll - (time.monotonic() - started)))
 
     def _read(self, news: float) -> Block | None:
+        """Read a block, or None where there is no new sample; `news` is when the last one came (s, monotonic).
+
+        Raises StaleRig once none has come for `stale_s`.
+        """
         patience = self.rig.description.deadlines.stale_s
         if self.rig.simulated_time:
             return self.rig.read_block(patience)
@@ -81,7 +94,10 @@ class Reader:
         return block
 
     def _step(self, news: float) -> bool:
-        """Read what is there; whether there was anything."""
+        """Read, supervise, record and queue one block; stop the rig where a violation is found while it is armed.
+
+        Return whether there was a block. No exception leaves this function: it becomes `error`.
+        """
         try:
             if (block := self._read(news)) is None:
                 return False
@@ -91,7 +107,7 @@ class Reader:
             with self._news:
                 if self._recording:
                     self.recorder.block(block)
-                    # every delay on the way adds to the difference of the clocks, so the smallest is the truest
+                    # Delay on the way only adds to the difference of the clocks, so the smallest is the nearest.
                     clocks = arrived - int(block.t_ns[-1]), int(block.t_ns[-1])
                     self._clocks = min(self._clocks or clocks, clocks)
                 self.latest, self.latest_seq, self.latest_t = block, int(block.seq[-1]), int(block.t_ns[-1])
@@ -108,9 +124,9 @@ class Reader:
                 elif self.recorder.failure is not None:
                     self.stop(Violation(Trip.RECORDER, "recorder", self.latest_seq, float("nan")))
             elif found:
-                self.trouble = found[0]
+                self.unarmed_violation = found[0]
             return True
-        except Exception as error:  # whatever it is, nobody would watch the rig any more: the trial must end
+        except Exception as error:  # Of any kind: without a reader nothing supervises the rig, so the run must end.
             with self._news:
                 known = isinstance(error, UserError)
                 self.error = error if known else UserError(f"the rig cannot be read: {type(error).__name__}: {error}")
@@ -118,7 +134,11 @@ class Reader:
             return False
 
     def stop(self, violation: Violation) -> None:
-        """Stop the rig for this cause; the first cause counts. Whether or not it arrives, heartbeats end."""
+        """Stop the rig for this cause. Only the first call has an effect.
+
+        The controller gets STOP. It also gets no more heartbeats, so it releases the finger by itself where STOP does
+        not arrive.
+        """
         with self._first_cause:
             if self.violation is not None:
                 return
@@ -130,22 +150,22 @@ class Reader:
             self.note("stop", f"the stop was not acknowledged: {error}")
 
     def note(self, kind: str, text: str) -> None:
-        """Log an event with the present sample."""
+        """Log an event, with the number of the newest sample."""
         self.recorder.put(wal.EVENT, {"seq": self.latest_seq, "kind": kind, "text": text})
 
     def begin(self, start: dict[str, Any]) -> None:
-        """Record from the next sample on."""
+        """Begin a trial in the log: samples are recorded from the next one on."""
         with self._news:
             self.recorder.put(wal.TRIAL, {**start, "seq": self.latest_seq + 1})
             self._recording, self._clocks = True, None
 
     def mark(self, mark: dict[str, Any]) -> None:
-        """Log a mark that counts from the next sample on."""
+        """Log a mark; it holds from the next sample on."""
         with self._news:
             self.recorder.put(wal.MARK, {**mark, "seq": self.latest_seq + 1})
 
     def end(self, end: dict[str, Any]) -> None:
-        """Stop recording; without a `seq`, every sample so far belongs to the trial."""
+        """End the trial in the log. Samples before number `end["seq"]` belong to it; without it, all so far."""
         with self._news:
             clocks = {"clocks": self._clocks} if self._clocks and not self.rig.synchronous else {}
             self.recorder.put(wal.END, {"seq": self.latest_seq + 1, **clocks, **end})
@@ -153,21 +173,22 @@ class Reader:
 
     @property
     def recording(self) -> bool:
-        """Whether samples go to the log."""
+        """Whether a trial is being recorded."""
         return self._recording
 
     def quiet(self, samples: int) -> bool:
-        """Whether the newest so many samples were read, and nothing was wrong in them."""
-        since = max(self.first_seq, self.trouble.seq + 1 if self.trouble is not None else 0)
+        """Whether at least this many samples have come since the start and since the newest violation."""
+        bad = self.unarmed_violation
+        since = max(self.first_seq, bad.seq + 1 if bad is not None else 0)
         return self.latest is not None and self.latest_seq - since + 1 >= samples
 
     def forget(self) -> None:
-        """Drop blocks that nobody waited for: what is waited for next starts now."""
+        """Drop the queued blocks, so that the next wait starts with samples from now on."""
         with self._news:
             self._blocks.clear()
 
     def next(self, timeout: float = 0.1) -> Block | None:
-        """The next block, or None after `timeout` s without one or at an error."""
+        """Return the next queued block, or None after `timeout` s without one, or at an error."""
         if self.rig.synchronous and not self._blocks and self.error is None:
             self._step(0.0)
         with self._news:
@@ -177,33 +198,39 @@ class Reader:
 
 
 class HostClock:
-    """What only the host's clock tells: how many samples there should be by now, and how late they are supervised."""
+    """Checks that need the host's clock: whether samples come at their rate, and how late they are supervised.
+
+    The supervisor compares the device's clock with its samples; a controller that is slow as a whole passes that check.
+    """
 
     def __init__(self, rig: Rig):
         self._rig, self._deadlines = rig, rig.description.deadlines
         self._drift = Drift(self._deadlines.clock_rate)
-        self._look: Look | None = None
+        self._last: HeadReading | None = None
         self.lag_s = 0.0
 
     def check(self, block: Block) -> list[Violation]:
-        """Violations once a block has been supervised; `lag_s` is the greatest age that its first sample may have."""
-        look, rate = self._rig.look, self._rig.description.rate_hz
-        if look is None or self._rig.simulated_time:
+        """Return CLOCK and LAG violations of a block that has just been supervised.
+
+        Sets `lag_s`, the greatest age in s that the block's first sample can have.
+        """
+        now, rate = self._rig.head_reading, self._rig.description.rate_hz
+        if now is None or self._rig.simulated_time:
             return []
         seq, found = int(block.seq[-1]), []
-        if look is not self._look:
-            passed = look.asked - self._look.asked if self._look is not None else 0.0
-            # at some time from `asked` to `answered`, samples had gone on for head to head + 1 periods
-            away = self._drift(look.head / rate - look.answered, (look.head + 1) / rate - look.asked, passed)
-            self._look = look
+        if now is not self._last:
+            passed = now.asked - self._last.asked if self._last is not None else 0.0
+            # At some time between `asked` and `answered` the controller had run for head to head + 1 periods.
+            away = self._drift(now.head / rate - now.answered, (now.head + 1) / rate - now.asked, passed)
+            self._last = now
             if abs(away) > self._deadlines.clock_offset_s:
                 found.append(Violation(Trip.CLOCK, "samples ahead of the host's clock, in s", seq, away))
-        self.lag_s = (look.head - int(block.seq[0])) / rate + time.monotonic() - look.asked
+        self.lag_s = (now.head - int(block.seq[0])) / rate + time.monotonic() - now.asked
         if self.lag_s > self._deadlines.lag_s:
             found.append(Violation(Trip.LAG, "s from a sample to its supervision", seq, self.lag_s))
         return found
 
 
 def tripped(block: Block | None) -> bool:
-    """Whether the newest sample says that the controller is stopped."""
+    """Whether the newest sample of a block has the controller in state TRIPPED."""
     return block is not None and int(block.state[-1]) == State.TRIPPED

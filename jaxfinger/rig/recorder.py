@@ -1,4 +1,7 @@
-"""The recorder: a queue and a thread that writes the log, so that a slow disk never holds up the reader of the rig."""
+"""The recorder writes the log in a thread of its own behind a queue, so that a slow disk never holds up the reader.
+
+The watch stops the rig where a frame waits for longer than `disk_s`, the reader where `failure` is set.
+"""
 
 from __future__ import annotations
 
@@ -15,52 +18,58 @@ from jaxfinger.errors import UserError
 from jaxfinger.rig import wal
 from jaxfinger.rig.backend import Block
 
-SYNC_S = 1.0  # between two fdatasync: what a power cut can cost
-QUEUE_LIMIT = 1_000_000  # samples waiting for a slow disk before the run is ended
-LEAST_FREE = 500 * 2**20  # bytes that must be free on the disk before a session starts
+SYNC_S = 1.0  # s between two fdatasync: a power cut costs at most as much of the recording
+# Samples that may wait for a slow disk before the run ends: 17 min at 1 kHz, 0.5 GB of memory with 60 channels.
+QUEUE_LIMIT = 1_000_000
+# Free bytes that a new session demands: 17 min at 1 kHz with 60 channels, 0.5 MB/s.
+MIN_FREE_BYTES = 500 * 2**20
 
 
 class Recorder:
-    """Takes frames without waiting; `failure` says, from then on, why the log could not be written any more."""
+    """Takes frames without waiting.
+
+    `failure` says why the log cannot be written (None: it can), `unwritten` holds the frames of JSON that failed, and
+    after `close` `hangs` is true where the disk did not answer.
+
+    Raises:
+        UserError: the disk has less than MIN_FREE_BYTES, or the log exists or cannot be created.
+    """
 
     def __init__(self, path: Path, header: dict[str, Any], resume: bool = False, opener: Callable | None = None):
         self.path = path
-        if not resume and (free := shutil.disk_usage(path.parent).free) < LEAST_FREE:
+        if not resume and (free := shutil.disk_usage(path.parent).free) < MIN_FREE_BYTES:
             raise UserError(
-                f"{path.parent}: only {free / 2**20:.0f} MiB are free; a session needs {LEAST_FREE >> 20} MiB."
+                f"{path.parent}: only {free / 2**20:.0f} MiB are free; a session needs {MIN_FREE_BYTES >> 20} MiB."
             )
         self._log = opener(path) if opener else wal.LogWriter.append(path) if resume else wal.LogWriter.create(path)
         self._queue: queue.SimpleQueue[tuple[bytes, Any] | None] = queue.SimpleQueue()
-        self._since: deque[float] = deque()  # when each frame that waits for the disk was handed over
+        self._since: deque[float] = deque()  # when each waiting frame was queued (s, monotonic)
         self._waiting = 0
         self._lock = threading.Lock()
         self.failure: str | None = None
-        self.hangs = False  # the disk did not answer until the end
-        self.unwritten: list[tuple[bytes, dict[str, Any]]] = []  # frames of JSON that found no room
+        self.hangs = False
+        self.unwritten: list[tuple[bytes, dict[str, Any]]] = []
         self._thread = threading.Thread(target=self._work, name="jaxfinger-writer", daemon=True)
         self._thread.start()
         if not resume:
             self.put(wal.HEADER, header)
 
-    def put(self, tag: bytes, value: dict[str, Any]) -> None:
-        """Queue a frame of JSON."""
-        self._put(tag, value)
-
-    def _put(self, tag: bytes, value: Any) -> None:
+    def put(self, tag: bytes, value: Any) -> None:
+        """Queue a frame: a block for `wal.DATA`, a dictionary of JSON for the other tags. Never waits."""
         self._since.append(time.monotonic())
         self._queue.put((tag, value))
 
     def block(self, block: Block) -> None:
-        """Queue a block of samples; never waits."""
+        """Queue a block of samples. Never waits."""
         with self._lock:
             self._waiting += len(block)
             if self._waiting > QUEUE_LIMIT and self.failure is None:
                 self.failure = f"the disk is too slow: {self._waiting} samples wait to be written to {self.path.name}"
-        self._put(wal.DATA, block)
+        self.put(wal.DATA, block)
 
     @property
     def waiting_s(self) -> float:
-        """How long the oldest frame has waited for the disk."""
+        """Time in s for which the oldest queued frame has waited for the disk."""
         try:
             return time.monotonic() - self._since[0]
         except IndexError:
@@ -68,17 +77,20 @@ class Recorder:
 
     @property
     def waiting(self) -> int:
-        """Samples that are not yet written."""
+        """Number of samples that are queued and not yet written."""
         return self._waiting
 
     def flush(self, timeout: float = 60.0) -> None:
-        """Wait until all that was queued is written (or has failed)."""
+        """Wait until all that was queued is written or has failed, at most `timeout` s."""
         done = threading.Event()
-        self._put(b"", done)
+        self.put(b"", done)
         done.wait(timeout)
 
     def close(self, timeout: float = 5.0) -> None:
-        """Write the rest, force it to the disk, and stop the thread; a disk that answers no more is left behind."""
+        """Write what is queued, force it to the disk, and end the thread.
+
+        Where the disk does not answer for `timeout` s, the thread is left behind and `hangs` is true.
+        """
         self._queue.put(None)
         self._thread.join(timeout)
         self.hangs = self._thread.is_alive()

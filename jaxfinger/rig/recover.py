@@ -1,4 +1,4 @@
-"""A readable session from the log of a recording that was killed."""
+"""Make a session from the log of a recording that was killed, without the rig."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxfinger.rig.convert import Log, publish, read_frames
 
 @dataclass(frozen=True)
 class Recovered:
-    """What came out: trials written, those that were cut short, and bytes at the log's end that were not sound."""
+    """Names of the trials written, names of those that were cut short, and damaged bytes at the log's end."""
 
     trials: tuple[str, ...]
     incomplete: tuple[str, ...]
@@ -19,12 +19,16 @@ class Recovered:
 
 
 def read_log(path: str | Path) -> Log:
-    """The sound part of a log."""
+    """Read the sound part of a log. Raises UserError where there is none."""
     return read_frames(wal.read_log(path), str(path))
 
 
 def recover(path: str | Path, output: str | Path, overwrite: bool = False) -> Recovered:
-    """Write the session that the log holds; the log stays as it is."""
+    """Write the session that a log holds. The log is not changed.
+
+    Raises:
+        UserError: the log cannot be read, or the session cannot be written.
+    """
     session = publish(read_log(path), output, overwrite)
     incomplete = tuple(t.name for t in session if not t.complete)
     return Recovered(tuple(session.trials), incomplete, Path(path).stat().st_size - wal.sound_length(path))

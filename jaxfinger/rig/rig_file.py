@@ -1,4 +1,4 @@
-"""The rig file, read: every mistake is refused with its line, and nothing is connected."""
+"""Read a rig file. Every mistake is refused with its line; nothing is connected."""
 
 from __future__ import annotations
 
@@ -14,30 +14,36 @@ from jaxfinger.data.finger_file import Finger, finger_from
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import Document, Fault, OneOf, Place, Within, one_of, parse_toml, read_toml, structure
 from jaxfinger.rig import backends, contract
-from jaxfinger.rig.channels import NOISY, UNITS, Deadlines, HardLimits, Limits, RigChannel, RigDescription
+from jaxfinger.rig.channels import ANALOG_KINDS, UNITS, Deadlines, HardLimits, Limits, RigChannel, RigDescription
+
+# s, default of `frozen_s` for analog channels: a thousand equal values at 1 kHz. Sensor noise prevents them unless the
+# converter's step is much larger than the noise; give a longer `frozen_s` there.
+FROZEN_S = 1.0
 
 
 @dataclass(frozen=True)
 class Head:
-    """`[rig]`."""
+    """Keys of `[rig]`. `Deadlines` says what each time limits."""
 
     name: str
     backend: str
     specimen: str
     rate_hz: Annotated[float, Within(1.0, 20000.0, "Hz")] = 1000.0
-    poll_s: Annotated[float, Within(0.001, 1.0, "s")] = 0.05
-    allow_filtered: bool = False
+    poll_s: Annotated[float, Within(0.001, 1.0, "s")] = 0.05  # pause between two reads of the ring
+    allow_filtered: bool = False  # dynamic experiments behind a slow filter
+    # stale_s, lag_s and thread_s: four to five times poll_s, and about the 0.25 s after which the controller itself
+    # would release the finger for want of a heartbeat.
     stale_s: Annotated[float, Within(0.01, 60.0, "s")] = 0.2
     lag_s: Annotated[float, Within(0.01, 60.0, "s")] = 0.25
     thread_s: Annotated[float, Within(0.05, 60.0, "s")] = 0.2
     disk_s: Annotated[float, Within(0.1, 60.0, "s")] = 1.0  # fdatasync took up to 0.29 s on a busy disk
-    clock_offset_s: Annotated[float, Within(0.001, 60.0, "s")] = 0.1
-    clock_rate: Annotated[float, Within(1e-6, 0.1)] = 1e-3  # quartz and network time are good to 5e-4
+    clock_offset_s: Annotated[float, Within(0.001, 60.0, "s")] = 0.1  # twice poll_s
+    clock_rate: Annotated[float, Within(1e-6, 0.1)] = 1e-3  # twice the 5e-4 of quartz and network time
 
 
 @dataclass(frozen=True)
 class ChannelTable:
-    """`[[channel]]`: value in SI = (raw · scale + offset) in `unit`."""
+    """Keys of `[[channel]]`: the value in `unit` is raw · scale + offset."""
 
     kind: Annotated[str, OneOf(tuple(UNITS))]
     slot: Annotated[int, Within(0, contract.VALUES - 1)]
@@ -58,13 +64,13 @@ class ChannelTable:
 
     @property
     def title(self) -> str:
-        """The channel's name, or what it measures."""
+        """Name of the channel; its kind and owner where the file gives none."""
         return self.name or f"{self.kind} {self.of}".strip()
 
 
 @dataclass(frozen=True)
 class LimitsTable:
-    """`[limits]`, as people write them; None: on a kind of channel that a rig may lack."""
+    """Keys of `[limits]`. Those that may be None watch a kind of channel that a rig may lack."""
 
     tension_max: Annotated[float, Within(0.1, 100.0, "N")]
     tension_rate: Annotated[float, Within(0.1, 1000.0, "N/s")]
@@ -85,8 +91,9 @@ class LimitsTable:
             raise Fault("is above `joint_velocity_max_deg_s`, so every move would trip", "joint_velocity_deg_s")
 
 
-# The kinds of channel that a rig may lack, and the limits that watch them.
-_WATCHED = {
+# Kinds of channel that a rig may lack, and the limits that watch them. A limit is demanded with its channel and refused
+# without it, since it would watch nothing.
+_OPTIONAL_LIMITS = {
     "tension_setpoint": ("tension_error_max", "tension_error_s"),
     "motor_temperature": ("temperature_max",),
 }
@@ -94,7 +101,7 @@ _WATCHED = {
 
 @dataclass(frozen=True)
 class ControllerTable:
-    """`[controller]`: what its own limits may be; None: twice the host's own."""
+    """Keys of `[controller]`: the loosest limits that the controller may have (None: twice the host's)."""
 
     tension_max: Annotated[float, Within(0.1, unit="N")] | None = None
     tension_rate_max: Annotated[float, Within(1.0, unit="N/s")] | None = None
@@ -106,7 +113,7 @@ class ControllerTable:
 
 @dataclass(frozen=True)
 class FingertipSensor:
-    """`[fingertip_sensor]`: its rotation to the base frame, row by row."""
+    """Keys of `[fingertip_sensor]`: its rotation to the base frame, row by row."""
 
     rotation: tuple[float, float, float, float, float, float, float, float, float]
 
@@ -116,13 +123,13 @@ class FingertipSensor:
 
     @property
     def matrix(self) -> np.ndarray:
-        """The rotation (3, 3)."""
+        """Rotation (3, 3)."""
         return np.array(self.rotation).reshape(3, 3)
 
 
 @dataclass(frozen=True)
 class RigFile:
-    """A rig file; `address` is read by its backend."""
+    """Tables of a rig file. The keys of `[address]` depend on the backend."""
 
     rig: Head
     limits: LimitsTable
@@ -134,12 +141,16 @@ class RigFile:
 
 
 def read_rig(path: str | Path) -> RigDescription:
-    """Read and check a rig file; raises UserError with the line to mend. Nothing is connected."""
+    """Read and check a rig file. Nothing is connected.
+
+    Raises:
+        UserError: the file cannot be read, or a key is wrong. The sentence gives the line.
+    """
     return _rig(read_toml(path, "give the path of a rig file"))
 
 
 def parse_rig(text: str, path: str | Path = "rig.toml") -> RigDescription:
-    """A rig file that is already in memory, as a session or a log carries it."""
+    """Read a rig file from text, which sessions and logs carry, as `read_rig` does. `path` names it in messages."""
     return _rig(parse_toml(text, path))
 
 
@@ -181,6 +192,7 @@ def _rig(document: Document) -> RigDescription:
 
 
 def _channels(tables: tuple[ChannelTable, ...], finger: FingerDescription, place: Place) -> tuple[RigChannel, ...]:
+    """Check slots and owners of the channels, and that every joint and every active tendon has one."""
     owners = {
         "tension": finger.tendon_names,
         "excursion": finger.tendon_names,
@@ -201,7 +213,7 @@ def _channels(tables: tuple[ChannelTable, ...], finger: FingerDescription, place
                 (here / "slot").fail(f"slot {table.slot} already holds '{other.name}'; give each channel its own slot")
             if (other.kind, other.of) == (table.kind, table.of):
                 (here / "of").fail(f"'{other.name}' already measures the {table.kind} of '{table.of}'; remove one")
-        frozen = table.frozen_s if table.frozen_s is not None else 1.0 if table.kind in NOISY else 0.0
+        default = FROZEN_S if table.kind in ANALOG_KINDS else 0.0
         channels.append(
             RigChannel(
                 name=table.title,
@@ -212,7 +224,7 @@ def _channels(tables: tuple[ChannelTable, ...], finger: FingerDescription, place
                 scale=table.scale,
                 offset=table.offset,
                 source=table.source,
-                frozen=frozen,
+                frozen=default if table.frozen_s is None else table.frozen_s,
             )
         )
     present = {(c.kind, c.of) for c in channels}
@@ -229,7 +241,8 @@ def _channels(tables: tuple[ChannelTable, ...], finger: FingerDescription, place
 
 
 def _limits(table: LimitsTable, finger: FingerDescription, kinds: set[str], place: Place) -> Limits:
-    for kind, keys in _WATCHED.items():  # such a limit must be there with the channel, and only then
+    """Convert `[limits]` to SI. A limit on a kind of channel that the rig lacks becomes infinite."""
+    for kind, keys in _OPTIONAL_LIMITS.items():
         for key in keys:
             given = getattr(table, key) is not None
             if given and kind not in kinds:
@@ -255,6 +268,8 @@ def _limits(table: LimitsTable, finger: FingerDescription, kinds: set[str], plac
 
 
 def _hard_limits(table: ControllerTable, limits: Limits) -> HardLimits:
+    """Convert `[controller]` to SI, with twice the host's limits as defaults."""
+
     def or_twice(value: float | None, host: float) -> float:
         return 2 * host if value is None else value
 

@@ -1,6 +1,6 @@
-"""The host's side of the contract: pull the controller's ring without losing a sample, send commands, read states.
+"""The host's side of the contract: pull samples from the controller's ring, send commands, read states.
 
-A subclass only says how bytes of a symbol are read and written: over ADS, or in the memory of a simulated controller.
+A subclass only reads and writes the bytes of a symbol: over ADS, or in the memory of a simulated controller.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from jaxfinger.rig.backend import (
     CommandRefused,
     ConnectionLost,
     ControllerRestarted,
+    HeadReading,
     Hold,
     JointMove,
-    Look,
     Rig,
     RigError,
     Setup,
@@ -35,17 +35,22 @@ from jaxfinger.rig.channels import Filter, RigDescription
 from jaxfinger.rig.contract import Kind, Mode, State, Trip
 from jaxfinger.rig.safety import admit
 
-MARGIN = 64  # records that the controller may overwrite while a block is on its way
-LARGEST = 100  # records in one request: 50 KiB keep the controller's task short
-STOP_S = 0.05  # that a STOP waits for a command under way, which it then overwrites
-LOAD = "load the program of docs/plc-contract.md"
+# Oldest records of the ring that are not asked for: the controller may overwrite them while the answer is on its way.
+# 64 ms at 1 kHz; a request takes about 1 ms.
+OVERWRITE_MARGIN = 64
+MAX_RECORDS = 100  # records in one request: 50 KiB. Copying them delays the controller's task.
+# s that a STOP waits for another thread's command to be acknowledged; then it overwrites that command.
+STOP_WAIT_S = 0.05
+REMEDY = (
+    "load the program of docs/plc-contract.md"  # of every message about a controller that differs from the contract
+)
 Code = TypeVar("Code", bound=IntEnum)
 
 
 class RingRig(Rig):
-    """A rig behind the contract's symbols."""
+    """A rig whose controller has the symbols of the contract."""
 
-    answer_s = 2.0  # longest wait for the acknowledgement of a command
+    answer_s = 2.0  # s to wait for the acknowledgement of a command; the contract demands it in the cycle that reads it
 
     def __init__(self, description: RigDescription):
         self.description = description
@@ -53,29 +58,29 @@ class RingRig(Rig):
         self.ring = contract.RING
         self.boot = 0
         self._id = 0
-        self._sending = threading.Lock()  # runner, reader and watch may command
+        self._sending = threading.Lock()  # Runner, reader and watch may command at the same time.
         self._beat = 0
         self._program = ""
 
-    # how bytes travel -------------------------------------------------------------------------------------------
+    # bytes of a symbol ------------------------------------------------------------------------------------------
     @abstractmethod
     def _open(self) -> None:
-        """Open the way to the controller."""
+        """Open the connection."""
 
     @abstractmethod
     def _read(self, symbol: str, offset: int, size: int) -> bytes:
-        """`size` bytes of a symbol from `offset` on."""
+        """Read `size` bytes of a symbol from `offset` on. Raises ConnectionLost."""
 
     @abstractmethod
     def _write(self, symbol: str, data: bytes, mend: bool = True) -> None:
-        """Write a symbol whole; only where `mend` is true, a broken way is mended first."""
+        """Write a whole symbol. With `mend`, a lost connection is first opened again. Raises ConnectionLost."""
 
     @abstractmethod
     def _sizes(self) -> dict[str, int]:
-        """Size in bytes of every symbol that the controller has."""
+        """Sizes in bytes of the symbols that the controller has."""
 
     def _has_bench(self) -> bool:
-        """Whether the controller is a stand-in that has its own operator."""
+        """Whether the controller is a stand-in with a simulated operator."""
         return False
 
     # connect ----------------------------------------------------------------------------------------------------
@@ -89,7 +94,7 @@ class RingRig(Rig):
             ("number of values in ST_Sample", int(info["values"]), contract.VALUES),
         ):
             if found != wanted:
-                raise UserError(f"the controller's {what} is {found}, the adapter's is {wanted}; {LOAD}.")
+                raise UserError(f"the controller's {what} is {found}, the adapter's is {wanted}; {REMEDY}.")
         cycle = 1e9 / self.description.rate_hz
         if abs(int(info["cycle_ns"]) - cycle) > 1e-3 * cycle:
             self.description.fail(
@@ -99,22 +104,22 @@ class RingRig(Rig):
                 f"{self.description.rate_hz:g} Hz; mend `rate_hz` or the task's cycle",
             )
         self.ring, self._program = int(info["ring_length"]), bytes(info["program"]).decode(errors="replace")
-        least = math.ceil(self.description.deadlines.lag_s * self.description.rate_hz) + MARGIN + LARGEST
+        least = math.ceil(self.description.deadlines.lag_s * self.description.rate_hz) + OVERWRITE_MARGIN + MAX_RECORDS
         if self.ring < least:
             raise UserError(
                 f"the controller's ring holds {self.ring} samples, but a host that may lag by "
-                f"{self.description.deadlines.lag_s:g} s needs {least}; {LOAD}."
+                f"{self.description.deadlines.lag_s:g} s needs {least}; {REMEDY}."
             )
         self._compare_limits()
         if self._has_bench():
             self.simulated_time = type(self).simulated_time or bool(self._record("stBench", contract.BENCH)["lockstep"])
-        self.status()  # refuses what the contract does not know
+        self.status()  # Refuses a state or trip code that the contract does not define.
         status = self._status()
         self.boot, self.next_seq, self._id = int(status["boot"]), int(status["head"]), int(status["acknowledged"])
-        self.look = None
+        self.head_reading = None
 
     def _compare_sizes(self) -> None:
-        """SIZEOF of all that the contract lists: where one differs, fields lie elsewhere than the host thinks."""
+        """Refuse a controller on which the size of a symbol is not the contract's: its fields would lie elsewhere."""
         sizes = self._sizes()
         for symbol, (dtype, count) in contract.SYMBOLS.items():
             size = sizes.get(symbol, 0)
@@ -122,16 +127,21 @@ class RingRig(Rig):
             if not fits and not (symbol == "stBench" and symbol not in sizes):
                 wanted = f"a multiple of {dtype.itemsize}" if symbol == "aRing" else f"{dtype.itemsize * count}"
                 raise UserError(
-                    f"{contract.PREFIX}{symbol} has {size} bytes on the controller, the contract has {wanted}; {LOAD}."
+                    f"{contract.PREFIX}{symbol} has {size} bytes on the controller, the contract has {wanted}; "
+                    f"{REMEDY}."
                 )
         (length,) = np.frombuffer(self._read("stInfo", 0, contract.INFO.itemsize), contract.INFO)["ring_length"]
         if (held := sizes["aRing"] // contract.SAMPLE.itemsize) != length:
-            raise UserError(f"the controller's ring holds {held} samples, but stInfo says {length}; {LOAD}.")
+            raise UserError(f"the controller's ring holds {held} samples, but stInfo says {length}; {REMEDY}.")
 
     def _compare_limits(self) -> None:
-        """Host and controller share these limits: the host's is never the looser one, the controller's not by far."""
+        """Refuse limits by which the controller would not be the backstop of the host.
+
+        A limit of the host may not be looser than the controller's own, nor the controller's looser than `[controller]`
+        allows.
+        """
         found, soft, hard = self._record("stLimits", contract.LIMITS), self.description.limits, self.description.hard
-        for name, suffix, unit in (  # rig files give velocities in degrees
+        for name, suffix, unit in (  # A rig file gives velocities in degrees.
             ("tension_max", "", 1.0),
             ("tension_rate_max", "", 1.0),
             ("joint_velocity_max", "_deg_s", 180 / np.pi),
@@ -140,7 +150,7 @@ class RingRig(Rig):
             ("heartbeat_s", "", 1.0),
         ):
             key, theirs, most = f"{name}{suffix}", float(found[name]), getattr(hard, name)
-            ours = getattr(soft, name, None)  # the host has no heartbeat to watch
+            ours = getattr(soft, name, None)  # The host has no limit of its own on the heartbeat.
             if ours is not None and not theirs >= ours - 1e-9:
                 looser = f"is {ours * unit:g}, looser than the controller's {theirs * unit:g}; lower it"
                 self.description.fail("limits", key, looser)
@@ -154,29 +164,41 @@ class RingRig(Rig):
         self._write("nHostBeat", np.uint64(self._beat).tobytes(), mend=False)
 
     def poll(self) -> Block | None:
-        if self.look is None or self.look.head <= self.next_seq:
+        if self.head_reading is None or self.head_reading.head <= self.next_seq:
             self._head()
-        assert self.look is not None
-        return self._pull(self.look.head) if self.look.head > self.next_seq else None
+        assert self.head_reading is not None
+        return self._pull(self.head_reading.head) if self.head_reading.head > self.next_seq else None
 
     def _head(self) -> int:
-        """Samples that the controller has written, if it is still the same run of its program."""
+        """Read how many samples the controller has written.
+
+        Raises:
+            ControllerRestarted: its boot number changed, or the count fell.
+        """
         asked = time.monotonic()
         status = self._status()
-        self.look = Look(asked, time.monotonic(), int(status["head"]))
-        if int(status["boot"]) != self.boot or self.look.head < self.next_seq:
+        self.head_reading = HeadReading(asked, time.monotonic(), int(status["head"]))
+        if int(status["boot"]) != self.boot or self.head_reading.head < self.next_seq:
             raise ControllerRestarted(
                 "the controller's program was restarted, so this recording cannot go on; start again with --resume."
             )
-        return self.look.head
+        return self.head_reading.head
 
     def _pull(self, head: int) -> Block:
+        """Read the next samples, at most MAX_RECORDS, up to `head`; count those that the ring does not hold any more.
+
+        A record was torn, or overwritten by the controller, where one of its two numbers is not the expected one. The
+        head is then read again, and the samples are read from where the ring now starts.
+
+        Raises:
+            ConnectionLost: ten reads in a row were torn.
+        """
         lost = 0
         for _ in range(10):
-            oldest = head - self.ring + MARGIN
+            oldest = head - self.ring + OVERWRITE_MARGIN
             if self.next_seq < oldest:
                 lost, self.next_seq = lost + oldest - self.next_seq, oldest
-            count = min(head - self.next_seq, LARGEST)
+            count = min(head - self.next_seq, MAX_RECORDS)
             start = self.next_seq % self.ring
             first = min(count, self.ring - start)
             size = contract.SAMPLE.itemsize
@@ -192,13 +214,13 @@ class RingRig(Rig):
                     records["seq"].copy(), records["t_ns"].copy(), self.description.calibrate(records["value"]),
                     records["state"].copy(), records["flags"].copy(), lost,
                 )  # fmt: skip
-            head = self._head()  # torn, or overtaken by the writer: look again from where the ring now starts
+            head = self._head()
         raise ConnectionLost(
             "ten reads of the controller's ring were torn; its task writes records in the wrong order."
         )
 
     def rewind(self, seq: int) -> None:
-        self.next_seq, self.look = min(seq, int(self._status()["head"])), None
+        self.next_seq, self.head_reading = min(seq, int(self._status()["head"])), None
 
     # commands ---------------------------------------------------------------------------------------------------
     def command(self, command: Command) -> int:
@@ -234,10 +256,14 @@ class RingRig(Rig):
         return self._send(Kind.RESET)
 
     def _send(self, kind: Kind, index: int = 0, rate: float = 0.0, acceleration: float = 0.0, target=None) -> int:
-        """Send a command and wait for its acknowledgement; a STOP waits for no other command."""
-        patience = time.monotonic() + (STOP_S if kind is Kind.STOP else self.answer_s)
+        """Send a command, wait for its acknowledgement, return its id.
+
+        Commands of other threads go first, but a STOP waits for them no longer than STOP_WAIT_S and then overwrites the
+        command under way, which raises CommandRefused in its own thread.
+        """
+        patience = time.monotonic() + (STOP_WAIT_S if kind is Kind.STOP else self.answer_s)
         while not (mine := self._sending.acquire(timeout=0.02)) and time.monotonic() < patience:
-            self.alive()
+            self.report_alive()
         try:
             return self._send_alone(kind, index, rate, acceleration, target)
         finally:
@@ -245,6 +271,15 @@ class RingRig(Rig):
                 self._sending.release()
 
     def _send_alone(self, kind: Kind, index: int, rate: float, acceleration: float, target) -> int:
+        """Write a command and poll the status until it is acknowledged.
+
+        A command that is not acknowledged within `answer_s` must not take effect later, when nobody expects it, so it
+        is overwritten. RELEASE, STOP and DISARM stay: they only take tension off.
+
+        Raises:
+            CommandRefused: the controller refused it, or it gave way to a STOP.
+            ConnectionLost: no acknowledgement came.
+        """
         self._id = number = (self._id + 1) % 2**32
         order = np.zeros((), contract.COMMAND)
         order["id"], order["kind"], order["index"] = number, kind, index
@@ -253,12 +288,13 @@ class RingRig(Rig):
         self._write("stCommand", order.tobytes())
         deadline, asked = time.monotonic() + self.answer_s, 0.0
         while int((status := self._status())["acknowledged"]) != number:
-            self.alive()
+            self.report_alive()
             if self._id != number and kind is not Kind.STOP:
                 raise CommandRefused(f"{kind.name} gave way to a stop.")
-            late, asked = asked > deadline, time.monotonic()  # a host that stood still asks once more
+            # Too late only if this status was asked for after the deadline: a host that was held up asks once more.
+            late, asked = asked > deadline, time.monotonic()
             if late:
-                if kind not in (Kind.RELEASE, Kind.STOP, Kind.DISARM):  # must not take effect when nobody expects it
+                if kind not in (Kind.RELEASE, Kind.STOP, Kind.DISARM):
                     order["kind"] = Kind.NONE
                     self._write("stCommand", order.tobytes())
                 raise ConnectionLost(f"the controller did not acknowledge {kind.name} within {self.answer_s:g} s.")
@@ -302,7 +338,7 @@ class RingRig(Rig):
     def fingerprint(self) -> dict[str, str]:
         return {"program": self._program, "contract": str(contract.VERSION), "boot": str(self.boot)}
 
-    # a stand-in's operator ----------------------------------------------------------------------------------------
+    # the stand-in's operator and faults -----------------------------------------------------------------------------
     def prepare(self, setup: Setup) -> bool:
         if not self._has_bench():
             return False
@@ -317,9 +353,10 @@ class RingRig(Rig):
         return True
 
     def inject(self, fault: str, slot: int = 0, after: int = 0, amount: float = math.nan) -> None:
-        """Let the stand-in fail: `fault` of contract.FAULTS, from `after` samples from now on. For tests and drills.
+        """Make the stand-in fail in `after` samples from now, for tests and drills.
 
-        What `amount` means, and what it is where none is given, `simulated.faults` says.
+        `fault` is one of contract.FAULTS, `slot` the value that it strikes. `simulated.faults` gives the meaning of
+        `amount` and its default.
         """
         order = np.zeros((), contract.BENCH)
         order["fault"], order["fault_slot"] = contract.FAULTS.index(fault), slot
@@ -333,11 +370,11 @@ class RingRig(Rig):
 
 
 def _known(codes: type[Code], code: int, what: str) -> Code:
-    """A code of the contract; raises RigError for any other."""
+    """Return the code as a member of `codes`. Raises RigError where the contract does not define it."""
     try:
         return codes(code)
     except ValueError:
-        raise RigError(f"the controller's {what} is {code}, which the contract does not know; {LOAD}.") from None
+        raise RigError(f"the controller's {what} is {code}, which the contract does not know; {REMEDY}.") from None
 
 
 def _bandwidth(hertz: float) -> float | None:

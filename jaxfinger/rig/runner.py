@@ -1,4 +1,4 @@
-"""Carries out protocols on an open rig: their steps become commands and waits."""
+"""The runner carries out a plan's protocols on an open rig: it arms, sends commands, waits, and ends each trial."""
 
 from __future__ import annotations
 
@@ -30,16 +30,23 @@ from jaxfinger.rig.trips import FULL_COUNT
 from jaxfinger.rig.waits import AtPose, Elapsed, Passes, Steady, reached
 from jaxfinger.rig.watch import Watch
 
-AFTER_TRIP_S = 1.0  # that is still recorded after a trip, and in which the controller has released all tension
-QUIET_S = 0.3  # without a fault before anything is armed: a clock that runs wrong shows within 0.1 s
-PATIENCE_S = 5.0  # for that quiet: many times as long, since the first samples of a busy host come late
-SLACK_S = 5.0  # that a wait of known length may take longer
-HELD = "tension was not seen to fall, so switch the drives off and see that it is off"
+# s of samples that are still recorded after a stop. The controller needs 0.7 s of them to release all tension.
+AFTER_TRIP_S = 1.0
+# s of samples without a violation before the rig is armed: three times the 0.1 s (clock_offset_s) within which a clock
+# that runs wrong shows.
+QUIET_S = 0.3
+QUIET_TIMEOUT_S = 5.0  # s to wait for these samples. Much longer, since the first samples of a busy host come late.
+TIMEOUT_MARGIN_S = 5.0  # s by which a wait of known length may take longer before the trial ends
+TENSION_NOT_SEEN_TO_FALL = "tension was not seen to fall, so switch the drives off and see that it is off"
 
 
 @dataclass(frozen=True)
 class View:
-    """What the live view shows: the trial, its place in the plan, what is waited for, and the newest samples."""
+    """State of the run for the live view.
+
+    `trial` is number `number` of `count`, `doing` says what is waited for, `block` holds the newest samples, `lost`
+    counts lost samples, `lag_s` is how far the host is behind the rig.
+    """
 
     trial: str
     number: int
@@ -52,7 +59,7 @@ class View:
 
 
 class TrialEnded(UserError):
-    """The trial under way cannot go on; `trip` and `seq` say why and where its good samples end."""
+    """The trial under way cannot go on. Its samples before number `seq` are good (None: all so far)."""
 
     def __init__(self, message: str, trip: Trip, seq: int | None = None):
         super().__init__(message)
@@ -60,11 +67,15 @@ class TrialEnded(UserError):
 
 
 class ControllerStopped(TrialEnded):
-    """The controller has stopped the rig, and let go, for a cause of its own."""
+    """The controller stopped the rig and released the finger for a cause of its own."""
 
 
 class Runner:
-    """Carries out protocols on an open rig."""
+    """Carries out protocols on an open rig, in the thread that calls it.
+
+    `watch` is the watch over this run, `tare` holds the zeros of the tared channels (SI), `t0` the device time (ns) of
+    the session's first recorded sample.
+    """
 
     def __init__(self, rig: Rig, reader: Reader, operator: Operator, observe: Callable[[View], None] | None = None):
         self.rig, self.reader, self.operator = rig, reader, operator
@@ -79,7 +90,11 @@ class Runner:
 
     # one trial --------------------------------------------------------------------------------------------------
     def trial(self, trial: PlannedTrial, name: str, number: int, count: int, begun_s: float) -> str:
-        """Run one trial; returns why it ended early, or an empty string."""
+        """Run one trial. Return why it ended early, or an empty string.
+
+        `name` is the trial's name in the file, `number` its place among the plan's `count` trials. A session that is
+        resumed has lasted `begun_s` s before.
+        """
         self._start = {
             "name": name,
             "planned": trial.name,
@@ -95,40 +110,48 @@ class Runner:
             self.reader.end({"complete": True})
             return ""
         except UserError as error:
-            return self.ended(error)
+            return self.abort(error)
         except KeyboardInterrupt:
-            return self.interrupted()
+            return self.abort_interrupted()
 
-    def interrupted(self) -> str:
-        """Stop the rig after Ctrl-C; returns why the run ended."""
+    def abort_interrupted(self) -> str:
+        """Stop the rig after Ctrl-C. Return why the run ended."""
         self.reader.stop(Violation(Trip.OPERATOR, "interrupt", self.reader.latest_seq, float("nan")))
-        return self.ended(TrialEnded("the run was interrupted", Trip.OPERATOR))
+        return self.abort(TrialEnded("the run was interrupted", Trip.OPERATOR))
 
-    def ended(self, error: UserError) -> str:
-        """Let go, record what follows, close the trial; returns why it ended."""
+    def abort(self, error: UserError) -> str:
+        """Stop the rig unless it is stopped, record AFTER_TRIP_S more, end the trial. Return why it ended.
+
+        If no sample shows that the controller released the finger, the sentence tells the operator to switch the drives
+        off.
+        """
         reader = self.reader
         trip, seq = (error.trip, error.seq) if isinstance(error, TrialEnded) else (Trip.HOST, None)
         if not (tripped(reader.latest) or isinstance(error, ControllerStopped)):
             reader.stop(Violation(trip, "host", reader.latest_seq, float("nan")))
 
-        def lets_go() -> bool:
+        def released() -> bool:
             block = reader.latest
             return block is not None and (tripped(block) or int(block.state[-1]) == State.IDLE)
 
-        self._pass(AFTER_TRIP_S, lets_go)  # samples of a busy host come late: those before the stop first
-        self._pass(AFTER_TRIP_S)
+        self._let_pass(AFTER_TRIP_S, released)  # A busy host first has to read the samples before the stop.
+        self._let_pass(AFTER_TRIP_S)
         cause = str(error).rstrip(".")
-        if reader.latest is not None and not lets_go():
-            cause = f"{cause}; {HELD}"
+        if reader.latest is not None and not released():
+            cause = f"{cause}; {TENSION_NOT_SEEN_TO_FALL}"
         if reader.recording:
             place = {} if seq is None else {"seq": seq}
             reader.end({"complete": False, "cause": cause, "trip": int(trip), **place})
         return cause
 
-    def ready(self, name: str) -> None:
-        """Let go what an earlier host left loaded, clear a latched stop with the operator's consent, and arm.
+    def arm(self, name: str) -> None:
+        """Bring the controller to IDLE, wait for samples without a violation, and arm the rig.
 
-        Raises UserError where anything is wrong before that; then nothing was armed.
+        An earlier host may have left the finger loaded: it is released. A latched stop is cleared once the operator has
+        agreed. The operator is told to take hands off before the drives are switched on.
+
+        Raises:
+            UserError: something is wrong; nothing was armed.
         """
         rig, status = self.rig, self.rig.status()
         if status.state in (State.ARMED, State.MOVING):
@@ -136,7 +159,7 @@ class Runner:
         if status.state is State.TRIPPED and not rig.prepare(Setup("")):
             self._ask(f"The controller is stopped: {status.cause}. See that finger and hands are safe.")
         if status.state is not State.IDLE:
-            self._pass(AFTER_TRIP_S)
+            self._let_pass(AFTER_TRIP_S)
         if status.state is State.TRIPPED:
             rig.reset(name or "operator")
         if not rig.prepare(Setup("", fixed=dict.fromkeys(rig.description.finger.joint_names, 0.0))):
@@ -145,54 +168,62 @@ class Runner:
         def quiet() -> bool:
             return self.reader.quiet(round(QUIET_S * rig.description.rate_hz))
 
-        self._pass(PATIENCE_S, quiet)
-        self._look(None)
+        self._let_pass(QUIET_TIMEOUT_S, quiet)
+        self._check(None)
         if not quiet():
-            trouble = self.reader.trouble
-            what = trouble.sentence if trouble is not None else "too few samples came"
+            bad = self.reader.unarmed_violation
+            what = bad.sentence if bad is not None else "too few samples came"
             raise UserError(f"nothing was armed: {what}.")
         self.watch.guard()
         rig.arm()
 
-    def let_go(self) -> str:
-        """Release the finger after the last trial; returns what went wrong."""
+    def release(self) -> str:
+        """Release the finger after the last trial. Return what went wrong, or an empty string."""
         try:
             self.rig.release()
-            self._pass(AFTER_TRIP_S, lambda: self.rig.status().state in (State.IDLE, State.TRIPPED))
+            self._let_pass(AFTER_TRIP_S, lambda: self.rig.status().state in (State.IDLE, State.TRIPPED))
             if self.rig.status().state is not State.IDLE:
                 raise TrialEnded("the controller did not release the finger after the last trial", Trip.HOST)
         except UserError as error:
-            return self.ended(error)
+            return self.abort(error)
         return ""
 
-    def _pass(self, seconds: float, done: Callable[[], bool] = lambda: False) -> None:
-        """Let so much time pass, by samples and by the host's clock, or less where it is done."""
+    def _let_pass(self, seconds: float, done: Callable[[], bool] = lambda: False) -> None:
+        """Wait for `seconds` of samples, or until `done`, or until the host's limit for that time is over."""
         reader, rate = self.reader, self.rig.description.rate_hz
-        latest = time.monotonic() + self._longest(seconds)
+        latest = time.monotonic() + self._host_limit(seconds)
         start: int | None = None
         while reader.error is None and time.monotonic() < latest and not done():
-            self.rig.alive()
+            self.rig.report_alive()
             reader.next()
             start = reader.latest_seq if start is None and reader.latest_seq >= 0 else start
             if start is not None and reader.latest_seq - start >= seconds * rate:
                 break
 
-    def _longest(self, seconds: float) -> float:
-        """On the host's clock, for something that may take so long on the controller's."""
-        if self.rig.simulated_time:  # a simulation may be slow
+    def _host_limit(self, seconds: float) -> float:
+        """Time in s on the host's clock after which to give up what may take `seconds` on the controller's.
+
+        0.5 s and the allowed error of the clocks' rates come on top. A simulation may be slower than real time.
+        """
+        if self.rig.simulated_time:
             return 60.0 + 10.0 * seconds
         return 0.5 + (1.0 + self.rig.description.deadlines.clock_rate) * seconds
 
     def _ask(self, text: str) -> None:
-        def alive() -> bool:
-            self.rig.alive()
+        def keep_waiting() -> bool:
+            self.rig.report_alive()
             return self.reader.error is None and self.reader.violation is None
 
-        self.operator.ask(text, alive)
-        self._look(None)
+        self.operator.ask(text, keep_waiting)
+        self._check(None)
 
     def carry_out(self, protocol: Protocol, place: tuple[str, int, int]) -> None:
-        """Carry out the steps of a protocol; `place` is a trial's name, its number and how many there are."""
+        """Carry out the steps of a protocol; `place` is the trial's name, its number and the count of trials.
+
+        Raises:
+            TrialEnded: the rig was stopped, cannot be read, or a wait took too long.
+            CommandRefused: host or controller refused a command.
+        """
         self._place = place
         for step in protocol:
             if isinstance(step, TensionRamp | JointMove | Hold):
@@ -209,7 +240,7 @@ class Runner:
             elif isinstance(step, Reached):
                 self._wait("moving", lambda b: reached(b, self._id), step.timeout)
             elif isinstance(step, Dwell):
-                self._wait("waiting", Elapsed(self.reader, step.seconds), step.seconds + SLACK_S)
+                self._wait("waiting", Elapsed(self.reader, step.seconds), step.seconds + TIMEOUT_MARGIN_S)
             elif isinstance(step, Settled):
                 self._wait("tensions settling", Steady(self.rig.description, step), step.timeout)
             else:
@@ -219,10 +250,10 @@ class Runner:
     def _command(self, step: TensionRamp | JointMove | Hold) -> None:
         try:
             self._id = self.rig.command(step)
-        except CommandRefused:  # where the rig has just been stopped, that is the cause
-            self._look(None)
+        except CommandRefused:  # If the rig has just been stopped, the stop is the cause: raise that instead.
+            self._check(None)
             if (status := self.rig.status()).state is State.TRIPPED:
-                self._stopped(status)
+                self._raise_stopped(status)
             raise
 
     def _begin(self, step: Start) -> None:
@@ -247,6 +278,11 @@ class Runner:
         self._wait("finger being prepared", AtPose(self.rig.description, setup), 60.0)
 
     def _tare(self, step: Tare) -> None:
+        """Take the mean of the channels as their zero; refuse a torque or force sensor that is loaded or noisy.
+
+        At most 20 % of the channel's limit in the mean and 2 % in the standard deviation pass: an unloaded sensor has
+        only its offset and its noise.
+        """
         rig = self.rig.description
         columns = [i for i, c in enumerate(rig.channels) if c.kind in step.kinds]
         rows: list[np.ndarray] = []
@@ -256,12 +292,12 @@ class Runner:
             rows.append(block.x[:, columns])
             return elapsed(block)
 
-        self._wait("taring", enough, step.seconds + SLACK_S)
+        self._wait("taring", enough, step.seconds + TIMEOUT_MARGIN_S)
         values = np.concatenate(rows)
-        tops = {"external_torque": rig.limits.joint_torque_max, "fingertip_force": rig.limits.fingertip_force_max}
+        limits = {"external_torque": rig.limits.joint_torque_max, "fingertip_force": rig.limits.fingertip_force_max}
         for i, mean, spread in zip(columns, values.mean(0), values.std(0), strict=True):
-            top = tops.get(rig.channels[i].kind)
-            if not np.isfinite(mean) or (top is not None and (abs(mean) > 0.2 * top or spread > 0.02 * top)):
+            limit = limits.get(rig.channels[i].kind)
+            if not np.isfinite(mean) or (limit is not None and (abs(mean) > 0.2 * limit or spread > 0.02 * limit)):
                 raise UserError(
                     f"'{rig.channels[i].name}' cannot be tared: it reads {mean:.3g} ± {spread:.2g}; "
                     "unload it and see its cable."
@@ -270,12 +306,16 @@ class Runner:
 
     # waiting ----------------------------------------------------------------------------------------------------
     def _wait(self, doing: str, done: Callable[[Block], bool], timeout: float) -> None:
-        """Wait for blocks until it is done; ends on the device's clock and on the host's, and at the stop key."""
+        """Wait until a block is `done`.
+
+        Raises:
+            TrialEnded: `timeout` s have passed on the device's clock, or the host's limit for it, or the run must end.
+        """
         self.reader.forget()
-        start, latest = self.reader.latest_t, time.monotonic() + self._longest(timeout)
+        start, latest = self.reader.latest_t, time.monotonic() + self._host_limit(timeout)
         while True:
             block = self.reader.next()
-            self._look(block)
+            self._check(block)
             if block is not None:
                 self.observe(
                     View(*self._place, doing, block, self.reader.lost, self.reader.recording, self.reader.lag_s)
@@ -285,23 +325,26 @@ class Runner:
             if time.monotonic() > latest or (block is not None and (int(block.t_ns[-1]) - start) * 1e-9 > timeout):
                 raise TrialEnded(f"{doing} took longer than {timeout:g} s", Trip.HOST)
 
-    def _look(self, block: Block | None) -> None:
-        """A sign of life; raises TrialEnded where the run must end."""
+    def _check(self, block: Block | None) -> None:
+        """Report a sign of life to the watch. Raise TrialEnded where the run must end.
+
+        A synchronous rig has no watch thread, so its watch checks here.
+        """
         reader = self.reader
-        self.rig.alive()
+        self.rig.report_alive()
         if self.rig.synchronous:
-            self.watch.look()
+            self.watch.check()
         if reader.violation is not None:
             trip, since = reader.violation.trip, reader.violation.since
             cause = reader.recorder.failure if trip is Trip.RECORDER else None
             raise TrialEnded(cause or reader.violation.sentence, trip, since)
         if tripped(block):
-            self._stopped(self.rig.status())
+            self._raise_stopped(self.rig.status())
         if reader.error is not None:
             raise TrialEnded(str(reader.error), Trip.STALE)
 
-    def _stopped(self, status: Status) -> NoReturn:
-        """Raise ControllerStopped with its cause."""
+    def _raise_stopped(self, status: Status) -> NoReturn:
+        """Raise ControllerStopped with its cause; the trip's FULL_COUNT bad samples are left out of the trial."""
         self.reader.note("trip", status.cause)
         raise ControllerStopped(
             f"the controller stopped: {status.cause}", status.trip, status.trip_seq - FULL_COUNT + 1

@@ -1,4 +1,4 @@
-"""A whole session: the trials of a plan that its log does not hold yet, one after the other; the log becomes a file."""
+"""Record a whole session: run the trials of a plan one after the other, then turn the log into the session file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import h5py
 from jaxfinger.errors import UserError
 from jaxfinger.rig import convert, wal
 from jaxfinger.rig.backend import Rig, Setup, TensionRamp
-from jaxfinger.rig.channels import DYNAMIC_BANDWIDTH, Filter, RigDescription
+from jaxfinger.rig.channels import MIN_DYNAMIC_BANDWIDTH, Filter, RigDescription
 from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.operator import Nobody, Operator
 from jaxfinger.rig.plan import Plan
@@ -26,7 +26,11 @@ from jaxfinger.rig.safety import Supervisor
 
 @dataclass(frozen=True)
 class Outcome:
-    """A run: trials that are complete, why it ended early (empty: it did not), and the log to resume from."""
+    """Result of a run.
+
+    `complete` names the trials that are complete, `cause` says why the run ended early (empty: it did not), `log` is
+    the log to resume from (None: every trial is complete).
+    """
 
     session: Path
     complete: tuple[str, ...]
@@ -35,15 +39,17 @@ class Outcome:
 
 
 def log_path(output: Path) -> Path:
-    """Where the log of a session lies."""
+    """Path of a session's log: beside the session."""
     return output.with_name(output.name + ".wal")
 
 
 def refuse_filtered(plan: Plan, rig: RigDescription, filters: dict[str, Filter]) -> None:
-    """Refuse dynamic experiments on terminals whose filter spoils them: 1 kHz of samples are not 1 kHz of signal."""
-    slow = [
-        name for name, f in filters.items() if f.enabled and (f.bandwidth is None or f.bandwidth < DYNAMIC_BANDWIDTH)
-    ]
+    """Refuse dynamic experiments where a terminal's filter is slower than MIN_DYNAMIC_BANDWIDTH, or unknown.
+
+    Raises:
+        UserError: such a filter is on, the plan has a dynamic experiment, and the rig file does not allow it.
+    """
+    slow = [n for n, f in filters.items() if f.enabled and (f.bandwidth or 0.0) < MIN_DYNAMIC_BANDWIDTH]
     dynamic = [t.name for t in plan.trials if t.experiment in DYNAMIC]
     if slow and dynamic and not rig.allow_filtered:
         width = filters[slow[0]].bandwidth
@@ -64,12 +70,16 @@ def run(
 ) -> Outcome:
     """Record a session: every trial of the plan that the log does not hold yet.
 
-    Publishes what there is, also when cut short. Raises UserError before anything moves where plan, rig and files do
-    not fit together.
+    The session file is written also where the run ends early; the log is then kept, to resume from. However the run
+    ends, the finger is released: by the host where it can, otherwise by the controller, which gets no heartbeat.
+
+    Raises:
+        UserError: plan, rig and files do not fit together, and nothing was armed; or the session could not be written
+            from the log.
     """
     output, operator = Path(output), operator or Nobody()
     path = log_path(output)
-    log = _earlier(plan, path, output, resume)
+    log = _log_to_resume(plan, path, output, resume)
     with rig:
         filters = rig.filters()
         refuse_filtered(plan, rig.description, filters)
@@ -78,11 +88,11 @@ def run(
         recorder = Recorder(path, head, resume=log is not None)
         try:
             if log is not None:
-                _backlog(log, rig, recorder)
+                _close_killed_trial(log, rig, recorder)
             cause = _trials(plan, rig, recorder, operator, observe, log)
         except UserError:
             recorder.close()
-            if log is None:  # nothing moved, so there is nothing to resume
+            if log is None:  # Nothing was armed or recorded, so there is nothing to resume.
                 path.unlink(missing_ok=True)
             raise
         except BaseException:
@@ -109,8 +119,12 @@ def run(
     return Outcome(output, done, cause, path if cause else None)
 
 
-def _earlier(plan: Plan, path: Path, output: Path, resume: bool) -> convert.Log | None:
-    """The log to go on with, or None; refuses to mix sessions or to overwrite one."""
+def _log_to_resume(plan: Plan, path: Path, output: Path, resume: bool) -> convert.Log | None:
+    """Return the log to resume, or None for a new session.
+
+    Raises:
+        UserError: the run would overwrite a session, or mix two.
+    """
     if not resume:
         if output.exists():
             raise UserError(f"{output}: exists already and is not overwritten; choose another name.")
@@ -133,8 +147,11 @@ def _earlier(plan: Plan, path: Path, output: Path, resume: bool) -> convert.Log 
     return log
 
 
-def _backlog(log: convert.Log, rig: Rig, recorder: Recorder) -> None:
-    """Close the trial in which the recorder died, with what the controller's ring still holds of it."""
+def _close_killed_trial(log: convert.Log, rig: Rig, recorder: Recorder) -> None:
+    """Close the trial in which an earlier recorder died. Its missing samples are read from the controller's ring.
+
+    Only a controller with the same fingerprint (program, boot number) still has them.
+    """
     if not log.trials or log.trials[-1].end is not None:
         return
     end = {"complete": False, "cause": "the recorder was killed", "trip": int(Trip.HOST)}
@@ -153,8 +170,12 @@ def _backlog(log: convert.Log, rig: Rig, recorder: Recorder) -> None:
     recorder.put(wal.END, end)
 
 
-def _reference(rig: RigDescription) -> Protocol:
-    """Tendon encoders read zero with the finger straight and its tendons under 2 N."""
+def _zero_excursions(rig: RigDescription) -> Protocol:
+    """Protocol that tares the tendon encoders: they read zero with the finger straight and 2 N on its tendons.
+
+    2 N is the pretension of the paper's experiments (`MomentArms`). It takes out slack, so that every session's zero is
+    the same.
+    """
     straight = dict.fromkeys(rig.finger.joint_names, 0.0)
     pretension = {n: 2.0 for n, active in zip(rig.finger.tendon_names, rig.finger.active, strict=True) if active}
     yield Setup("Fix the finger straight: all joints at 0°.", fixed=straight)
@@ -172,7 +193,11 @@ def _trials(
     observe: Callable[[View], None] | None,
     log: convert.Log | None,
 ) -> str:
-    """Record the trials that the log does not hold; returns why the run ended early, or an empty string."""
+    """Record the trials that the log does not hold. Return why the run ended early, or an empty string.
+
+    Raises:
+        UserError: something was wrong before anything was armed.
+    """
     earlier = log.trials if log else []
     done = {r.start["planned"] for r in earlier if r.complete}
     names = {r.name for r in earlier}
@@ -185,12 +210,12 @@ def _trials(
         runner.watch.start()
         reader.start(lambda: runner.watch.join("reader"))
         try:
-            runner.ready(plan.operator)
-            runner.carry_out(_reference(rig.description), ("reference", 0, len(plan.trials)))
+            runner.arm(plan.operator)
+            runner.carry_out(_zero_excursions(rig.description), ("reference", 0, len(plan.trials)))
         except UserError as error:
-            if not runner.watch.guards and reader.violation is None:  # nothing was armed
+            if not runner.watch.guards and reader.violation is None:  # Nothing was armed.
                 raise UserError(str(error)) from error
-            return runner.ended(error)
+            return runner.abort(error)
         for trial in left:
             name, again = trial.name, 1
             while name in names:
@@ -198,9 +223,9 @@ def _trials(
                 name = f"{trial.name}-{again}"
             if cause := runner.trial(trial, name, plan.trials.index(trial) + 1, len(plan.trials), begun):
                 return f"{name}: {cause}"
-        return runner.let_go()
+        return runner.release()
     except KeyboardInterrupt:
-        return runner.interrupted()
+        return runner.abort_interrupted()
     finally:
         runner.watch.close()
         reader.close()

@@ -1,4 +1,4 @@
-"""The stand-in controller on the command line: `python -m jaxfinger.rig.standin`; the code is `simulated.standin`."""
+"""Entry point of `python -m jaxfinger.rig.standin`, the stand-in controller (`simulated.standin`)."""
 
 from jaxfinger.rig.simulated.standin import main
 

@@ -1,4 +1,4 @@
-"""What a step of a protocol waits for: each is asked with every block, and says whether it has come."""
+"""Conditions that a step of a protocol waits for. Each is called with every new block and returns whether it is met."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxfinger.rig.reader import Reader
 
 
 class Elapsed:
-    """So many seconds of device time from now on."""
+    """`seconds` of device time have passed since now."""
 
     def __init__(self, reader: Reader, seconds: float):
         self._until = reader.latest_t + int(seconds * 1e9)
@@ -22,11 +22,12 @@ class Elapsed:
 
 
 def reached(block: Block, number: int) -> bool:
+    """Whether the controller has carried out command `number`: a sample has processed it and is ARMED, not MOVING."""
     return bool(np.any((block.acknowledged == number & 0xFFFF) & (block.state == State.ARMED)))
 
 
 class Steady:
-    """Every tension within its band for long enough."""
+    """Every tension of the step has stayed within its band for `step.seconds`."""
 
     def __init__(self, rig: RigDescription, step: Settled):
         self._columns = rig.columns("tension", step.tensions)
@@ -42,7 +43,7 @@ class Steady:
 
 
 class Passes:
-    """Every joint through its range, to and fro, often enough."""
+    """Every joint of the step has gone through `step.share` of its range `step.passes` times each way."""
 
     def __init__(self, rig: RigDescription, step: Covered):
         self._columns = rig.columns("joint_position", step.joints)
@@ -61,11 +62,13 @@ class Passes:
 
 
 class AtPose:
-    """Fixed joints where their fixtures hold them."""
+    """Every fixed joint is within TOLERANCE of the angle at which its fixture holds it."""
+
+    TOLERANCE = 0.02  # rad, 1.1°: fifty steps of a 14-bit encoder
 
     def __init__(self, rig: RigDescription, setup: Setup):
         self._columns = rig.columns("joint_position", setup.fixed)
         self._pose = np.array(list(setup.fixed.values()))
 
     def __call__(self, block: Block) -> bool:
-        return not self._columns or bool((np.abs(block.x[-1, self._columns] - self._pose) < 0.02).all())
+        return not self._columns or bool((np.abs(block.x[-1, self._columns] - self._pose) < self.TOLERANCE).all())

@@ -1,10 +1,10 @@
-"""A write-ahead log: frames of tag, length and CRC, appended and never changed, so that every prefix of it is readable.
+"""A write-ahead log: frames with a checksum, appended and never changed, so that every prefix of the file is readable.
 
     file  = "JXFWAL01" frame*
     frame = tag (4 bytes), length (u32), crc32 of tag + length + payload (u32), payload
 
-HDF5 itself cannot be the log: killed between two flushes it loses all or cannot be opened (measured), while a prefix of
-this file loses only the frame that was being written.
+All numbers are little endian. HDF5 cannot be the log: killed between two flushes, an HDF5 file loses everything or
+cannot be opened (measured). A prefix of this file loses only the frame that was being written.
 """
 
 from __future__ import annotations
@@ -25,16 +25,19 @@ from jaxfinger.errors import UserError
 from jaxfinger.rig.backend import Block
 
 MAGIC = b"JXFWAL01"
-_HEAD = struct.Struct("<4sII")
-_DATA = struct.Struct("<IIQ")  # samples, channels, lost before
-LARGEST_FRAME = 64 * 2**20
+_HEAD = struct.Struct("<4sII")  # tag, length, crc32
+_DATA = struct.Struct("<IIQ")  # samples, channels, samples lost before
+# A longer length is damage. A block of MAX_RECORDS samples (ring.py) with 60 channels has 50 KB.
+MAX_FRAME_BYTES = 64 * 2**20
 
+# Tags. HEADER is the first frame. TRIAL and END enclose a trial, DATA holds a block of it, MARK a hold or directions.
+# An EVENT may stand anywhere.
 HEADER, TRIAL, DATA, MARK, EVENT, END = b"HEAD", b"TRIA", b"DATA", b"MARK", b"EVNT", b"ENDT"
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame: its tag, payload, and where the next one starts in the file."""
+    """One frame: its tag, its payload, and the byte of the file at which it ends."""
 
     tag: bytes
     payload: bytes
@@ -42,12 +45,12 @@ class Frame:
 
     @property
     def json(self) -> dict[str, Any]:
-        """The payload of every frame but DATA."""
+        """Payload of every frame but DATA, as a dictionary."""
         return json.loads(self.payload)
 
     @property
     def block(self) -> Block:
-        """The payload of a DATA frame."""
+        """Payload of a DATA frame, as a block."""
         count, channels, lost = _DATA.unpack_from(self.payload)
         at = _DATA.size
         parts = []
@@ -68,25 +71,28 @@ def pack_block(block: Block) -> bytes:
 
 
 def pack_json(value: dict[str, Any]) -> bytes:
-    """Payload of every other frame."""
+    """Payload of every frame but DATA."""
     return json.dumps(value, separators=(",", ":")).encode()
 
 
 def pack_frame(tag: bytes, payload: bytes) -> bytes:
-    """One frame, ready to append."""
+    """Bytes of one frame."""
     crc = zlib.crc32(payload, zlib.crc32(tag + struct.pack("<I", len(payload))))
     return _HEAD.pack(tag, len(payload), crc) + payload
 
 
 class LogWriter:
-    """Appends frames; each is handed to the system at once, so the death of this process loses none of them."""
+    """Appends frames. Each is handed to the operating system at once, so the death of this process loses none.
+
+    `end` is the length of the file's sound part.
+    """
 
     def __init__(self, file: io.RawIOBase | io.BufferedIOBase, end: int = 0):
         self._file, self._end = file, end
 
     @classmethod
     def create(cls, path: Path) -> LogWriter:
-        """A new log; refuses to replace one."""
+        """Create a log. Raises UserError where one exists or the file cannot be written."""
         try:
             file = open(path, "xb", buffering=0)  # noqa: SIM115 - the writer owns it
         except FileExistsError as error:
@@ -103,7 +109,7 @@ class LogWriter:
 
     @classmethod
     def append(cls, path: Path) -> LogWriter:
-        """Go on with a log, after cutting off a torn last frame."""
+        """Open a log to append to it, after cutting off a torn last frame."""
         end = sound_length(path)
         file = open(path, "r+b", buffering=0)  # noqa: SIM115 - the writer owns it
         file.truncate(end)
@@ -111,7 +117,7 @@ class LogWriter:
         return cls(file, end)
 
     def write(self, tag: bytes, payload: bytes) -> None:
-        """Append one frame; raises OSError on a full disk, with everything before it intact."""
+        """Append one frame. Raises OSError on a full disk; the frames before stay intact."""
         self._write(pack_frame(tag, payload))
 
     def _write(self, data: bytes) -> None:
@@ -120,13 +126,13 @@ class LogWriter:
             while view:
                 view = view[self._file.write(view) or 0 :]
         except OSError:
-            self._file.seek(self._end)  # half a frame must not hide what is written after it
+            self._file.seek(self._end)  # Half a frame would hide every frame written after it.
             self._file.truncate()
             raise
         self._end += len(data)
 
     def sync(self) -> None:
-        """Force what was written to the disk."""
+        """Wait until the disk has what was written."""
         os.fdatasync(self._file.fileno())
 
     def close(self) -> None:
@@ -135,13 +141,17 @@ class LogWriter:
 
 
 def frames(file: io.BufferedIOBase, name: str = "log") -> Iterator[Frame]:
-    """The sound frames from the start on; stops, without complaint, at a torn or damaged one."""
+    """Yield the sound frames from the start on. A torn or damaged frame ends them without an error.
+
+    Raises:
+        UserError: the file is not a log.
+    """
     if file.read(len(MAGIC)) != MAGIC:
         raise UserError(f"{name}: not a recording log of jaxfinger; give the file that ends in .wal.")
     end = len(MAGIC)
     while len(head := file.read(_HEAD.size)) == _HEAD.size:
         tag, length, crc = _HEAD.unpack(head)
-        if length > LARGEST_FRAME or len(payload := file.read(length)) < length:
+        if length > MAX_FRAME_BYTES or len(payload := file.read(length)) < length:
             return
         if zlib.crc32(payload, zlib.crc32(head[:8])) != crc:
             return
@@ -150,7 +160,7 @@ def frames(file: io.BufferedIOBase, name: str = "log") -> Iterator[Frame]:
 
 
 def read_log(path: str | Path) -> Iterator[Frame]:
-    """The sound frames of a log file."""
+    """Yield the sound frames of a log file. Raises UserError where it is not a log or cannot be read."""
     try:
         file = open(path, "rb")  # noqa: SIM115 - closed below
     except OSError as error:
@@ -160,7 +170,7 @@ def read_log(path: str | Path) -> Iterator[Frame]:
 
 
 def read_bytes(data: bytes) -> Iterator[Frame]:
-    """The sound frames of a log in memory."""
+    """Yield the sound frames of a log in memory."""
     return frames(io.BytesIO(data))
 
 

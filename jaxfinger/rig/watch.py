@@ -1,7 +1,14 @@
-"""Sees that the whole host is well, and only then says so to the controller.
+"""The watch: checks that the whole host is well, and sends the heartbeat to the controller only while it is.
 
-One thread polls the stop key, looks at every other thread and at the disk, and writes the heartbeat. Where anything is
-silent for too long it stops the rig and beats no more; where it hangs itself, beats end by themselves.
+Who watches whom, in a recording in real time:
+
+- The watch is one thread. Every PERIOD_S it checks the stop key, and from just before the rig is armed also the reader
+  and the runner (a sign of life within `thread_s`) and the disk (no frame waits for `disk_s`).
+- If a check fails, the watch stops the rig with the cause and sends no more heartbeats.
+- If the watch itself hangs, or the whole process, the heartbeats end too.
+- The controller releases the finger by itself when no heartbeat has come for `heartbeat_s` (0.25 s).
+
+The reader supervises the samples (reader.py); the watch supervises the host.
 """
 
 from __future__ import annotations
@@ -17,35 +24,41 @@ from jaxfinger.rig.operator import Operator
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.safety import Violation
 
-PERIOD_S = 0.02  # between two looks at the key
-BEAT_S = 0.05  # between two heartbeats: a fifth of the time after which the controller lets go
-STALL_S = 0.1  # the most that one look adds to a thread's silence: where this thread was late, so may others have been
-JOIN_S = 1.0
+PERIOD_S = 0.02  # s between two checks: the most that it adds to the time from stop key to STOP
+# s between two heartbeats: a fifth of the 0.25 s after which the controller releases, so four may come late or be lost.
+BEAT_S = 0.05
+# s, the most that one check adds to a thread's silence. If the watch itself ran late, the machine was busy, and the
+# other threads may have been late for the same reason.
+MAX_COUNTED_S = 0.1
+JOIN_S = 1.0  # s that closing waits for a watch that hangs; the thread is then left behind
 
 
 class Watch:
-    """`join`, `guard` and `alive` are called by the threads that are watched; `look` once per period."""
+    """The watch over one run. The watched threads call `join` or `guard` once, and `report_alive` again and again.
+
+    `guards` is true from just before the drives are switched on: from then on silence stops the rig.
+    """
 
     def __init__(self, rig: Rig, reader: Reader, operator: Operator):
         self.rig, self.reader, self.operator = rig, reader, operator
         self._names: dict[int, str] = {}
-        self._signs: dict[int, int] = {}
-        self._seen: dict[int, int] = {}
-        self._silent: dict[int, float] = {}
-        self._looked = self._beaten = time.monotonic()
-        self.guards = False  # from just before the drives are switched on
+        self._signs: dict[int, int] = {}  # signs of life so far, by thread
+        self._seen: dict[int, int] = {}  # signs at the last check
+        self._silent: dict[int, float] = {}  # s without a new sign
+        self._checked = self._beaten = time.monotonic()  # when it last checked, and last sent a heartbeat
+        self.guards = False
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
-        rig.alive = self.alive
+        rig.report_alive = self.report_alive
 
     def start(self) -> None:
-        """Start looking; synchronous rigs have no second thread, and whoever reads them looks."""
+        """Start the watch's thread. A synchronous rig has none: the runner calls `check` between blocks."""
         if not self.rig.synchronous:
             self._thread = threading.Thread(target=self._loop, name="jaxfinger-watch", daemon=True)
             self._thread.start()
 
     def close(self) -> None:
-        """Stop looking, and beat no more."""
+        """Stop checking. No heartbeat follows."""
         self._closing.set()
         if self._thread is not None:
             self._thread.join(JOIN_S)
@@ -57,39 +70,47 @@ class Watch:
         self._names[me] = name
 
     def guard(self) -> None:
-        """From now on nothing may be silent: the calling thread is about to arm the rig."""
+        """Watch the calling thread, the runner, and stop the rig from now on where a thread or the disk is silent.
+
+        The runner calls it just before it arms the rig.
+        """
         self.join("runner")
         self.guards = True
 
-    def alive(self) -> None:
-        """A sign of life of the calling thread."""
+    def report_alive(self) -> None:
+        """Record a sign of life of the calling thread."""
         me = threading.get_ident()
         if me in self._signs:
             self._signs[me] += 1
 
     def _loop(self) -> None:
         while not self._closing.wait(PERIOD_S):
-            self.look()
+            self.check()
 
-    def look(self) -> None:
-        """Look at the key, the threads and the disk; beat where all is well."""
+    def check(self) -> None:
+        """Check stop key, threads and disk. Stop the rig where one fails, else send a heartbeat where it is due."""
         now = time.monotonic()
-        passed, self._looked = min(now - self._looked, STALL_S), now
+        passed, self._checked = min(now - self._checked, MAX_COUNTED_S), now
         if self.reader.violation is not None or self.reader.error is not None:
-            return  # the rig is being stopped
-        if (cause := self._key() or self._wrong(passed)) is not None:
+            return  # The rig is being stopped, or nothing reads it: no heartbeat.
+        if (cause := self._key() or self._silence(passed)) is not None:
             self.reader.stop(cause)
         elif not self.rig.simulated_time and now - self._beaten >= BEAT_S:
             self._beaten = now
-            with suppress(UserError):  # who reads the rig will say what is wrong
+            with suppress(UserError):  # A lost connection is the reader's to report.
                 self.rig.beat()
 
     def _key(self) -> Violation | None:
+        """OPERATOR once the stop key was pressed."""
         if self.operator.stop_requested():
             return Violation(Trip.OPERATOR, "stop key", self.reader.latest_seq, float("nan"))
         return None
 
-    def _wrong(self, passed: float) -> Violation | None:
+    def _silence(self, passed: float) -> Violation | None:
+        """HOST where a watched thread was silent for `thread_s`, RECORDER where a frame has waited for `disk_s`.
+
+        `passed` is the time in s since the last check. Simulated time says nothing about threads, so there it is None.
+        """
         if self.rig.simulated_time or not self.guards:
             return None
         deadlines, seq = self.rig.description.deadlines, self.reader.latest_seq

@@ -6,7 +6,19 @@ from pathlib import Path
 
 import pytest
 
-from jaxfinger.rig.matrix import BEGIN, BLOCKS, MATRIX, OFF_S, PHASES, STOP_S, blocks, run, stopped_s, stream, table
+from jaxfinger.rig.matrix import (
+    BEGIN,
+    BLOCK_SIZES,
+    MATRIX,
+    OFF_S,
+    PHASES,
+    STOP_S,
+    blocks,
+    run,
+    stopped_s,
+    stream,
+    table,
+)
 from jaxfinger.rig.safety import Supervisor
 from tests.rig.wire import Cell, try_cell
 
@@ -21,16 +33,16 @@ def results(rig):
 
 @pytest.mark.parametrize("row", STREAMS, ids=lambda row: row.name)
 def test_the_supervisor_finds_each_fault_at_the_same_sample_in_blocks_of_any_size(rig, results, row):
-    assert {size for name, _, size in results if name == row.name} == set(BLOCKS)
+    assert {size for name, _, size in results if name == row.name} == set(BLOCK_SIZES)
     for phase in row.phases:
-        hits = [results[row.name, phase, size] for size in BLOCKS]
+        hits = [results[row.name, phase, size] for size in BLOCK_SIZES]
         assert all(hits), phase
         violations, arrived = zip(*hits, strict=True)
         assert violations[0].trip in row.causes, (phase, violations[0])
         assert {v.seq for v in violations} == {violations[0].seq}
         since = (violations[0].seq - BEGIN) / rig.rate_hz
         assert 0 <= since <= row.shows(rig) + 0.1
-        assert max(arrived) - violations[0].seq < max(BLOCKS)
+        assert max(arrived) - violations[0].seq < max(BLOCK_SIZES)
 
 
 @pytest.mark.parametrize("phase", PHASES)

@@ -13,7 +13,7 @@ from jaxfinger.rig import contract, parse_rig
 from jaxfinger.rig.backend import CommandRefused, ControllerRestarted, StaleRig, TensionRamp
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import State, Trip
-from jaxfinger.rig.ring import LARGEST, MARGIN
+from jaxfinger.rig.ring import MAX_RECORDS, OVERWRITE_MARGIN
 from jaxfinger.rig.simulated.controller import Controller, HardLimits
 from jaxfinger.rig.simulated.examples import rig_toml
 
@@ -33,10 +33,10 @@ def test_every_sample_comes_once_or_is_counted_as_lost(rig, pauses):
                 machine.controller.cycle()
             while machine.next_seq < machine.controller.seq:
                 block = machine.read_block(1.0)
-                assert len(block) <= LARGEST
+                assert len(block) <= MAX_RECORDS
                 assert int(block.seq[0]) == expected + block.lost_before
                 np.testing.assert_array_equal(np.diff(block.seq.astype(np.int64)), 1)
-                assert block.lost_before == 0 or pause > 512 - MARGIN
+                assert block.lost_before == 0 or pause > 512 - OVERWRITE_MARGIN
                 expected = int(block.seq[-1]) + 1
         assert expected == sum(pauses)
 

@@ -214,7 +214,7 @@ def test_the_operators_stop_key(rig, record):
     class Presses:
         asked = 0
 
-        def ask(self, text, alive):
+        def ask(self, text, keep_waiting):
             raise AssertionError("a simulated rig prepares itself")
 
         def stop_requested(self):
@@ -288,8 +288,8 @@ def test_a_person_at_a_bench_that_prepares_nothing_itself(rig, record):
     machine.prepare = lambda setup: bool(wanted.append(setup))
 
     class Person:
-        def ask(self, text, alive):
-            assert alive()
+        def ask(self, text, keep_waiting):
+            assert keep_waiting()
             prompts.append(text)
             by_itself(wanted[-1])
             machine._pause(1.0)
@@ -365,7 +365,7 @@ def test_a_gap_is_counted_and_written(rig, record, tmp_path):
     ],
 )
 def test_what_is_wrong_before_arming_is_a_sentence_and_nothing_moves(rig, record, tmp_path, monkeypatch, fault, says):
-    monkeypatch.setattr(runner, "PATIENCE_S", 0.3)
+    monkeypatch.setattr(runner, "QUIET_TIMEOUT_S", 0.3)
     controller = Controller()
     if fault == "ring":
         controller.tell_ring(1)

@@ -86,7 +86,7 @@ class Host:
         if name in self.hangs:
             self.go.wait(60.0)
 
-    def ask(self, text, alive):
+    def ask(self, text, keep_waiting):
         raise AssertionError("the stand-in prepares itself")
 
     def stop_requested(self) -> bool:

@@ -1,4 +1,4 @@
-"""One file a backend: its `Address` is what [address] holds in the rig file, `make(description)` its Rig."""
+"""Backends, one file each: `Address` declares the keys of `[address]` in the rig file, `make(description)` the Rig."""
 
 from __future__ import annotations
 
@@ -14,5 +14,5 @@ NAMES = tuple(module.name for module in iter_modules(__path__))
 
 
 def open_rig(description: RigDescription) -> Rig:
-    """The rig that a rig file describes, not yet connected."""
+    """Return the rig that a rig file describes, not yet connected."""
     return import_module(f"{__name__}.{description.backend}").make(description)

@@ -1,7 +1,7 @@
-"""TwinCAT over ADS through pyads: blocks are pulled from the controller's ring, no notification is ever registered.
+"""TwinCAT over ADS through pyads. Samples are pulled from the controller's ring; no notification is ever registered.
 
-Notifications lose samples silently once a client stalls (AdsLib throws frames away when its 4 MiB buffer is full), and
-`Connection.close()` with a live one crashes the process; a ring with a counter does neither.
+Notifications lose samples without a word when a client stalls: AdsLib throws frames away once its 4 MiB buffer is full.
+`Connection.close()` with a live notification crashes the process. A ring with a counter does neither.
 """
 
 from __future__ import annotations
@@ -21,16 +21,21 @@ from jaxfinger.rig.backend import ConnectionLost
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.ring import RingRig
 
+# ms after which AdsLib gives up a request. A request takes about 1 ms, and after 0.25 s without a heartbeat the
+# controller has released the finger anyway.
 TIMEOUT_MS = 500
-WAIT_S = 0.02  # between two looks at a wait for another thread's call: a fifth of the shortest, BUSY_S
-CALL_S = 0.7  # longer than the time-out of any call
-BUSY_S = 0.1  # that a heartbeat waits for other calls: two of its periods, `watch.BEAT_S`
-PAUSE_S = 0.1  # between attempts to connect: a router needs some milliseconds to forget a program that was killed
+LOCK_POLL_S = 0.02  # s between two attempts to get the connection: a fifth of the shortest wait, MAX_BEAT_WAIT_S
+MAX_CALL_S = 0.7  # s after which another thread's call counts as hanging: longer than TIMEOUT_MS
+MAX_BEAT_WAIT_S = 0.1  # s that a heartbeat waits for other calls: two of its periods, `watch.BEAT_S`
+RETRY_S = 0.1  # s between attempts to connect: a router needs some milliseconds to forget a program that was killed
 
 
 @dataclass(frozen=True)
 class Address:
-    """`net_id`, `ip` (host, or host:port) and ADS `port` of the controller; patience to connect, and to mend a cut."""
+    """Keys of `[address]`: `net_id`, `ip` (host or host:port) and ADS `port` of the controller.
+
+    `reconnect_s` is how long to try to connect, and to connect again after a cut.
+    """
 
     net_id: str
     ip: str
@@ -44,7 +49,10 @@ class Address:
 
 
 class AdsRig(RingRig):
-    """The controller behind one ADS connection; one request at a time, since AdsLib allows no second on a port."""
+    """A controller behind one ADS connection.
+
+    Requests go one at a time, since AdsLib allows no second one on a port. `reconnects` counts mended cuts.
+    """
 
     def __init__(self, description: RigDescription):
         super().__init__(description)
@@ -53,18 +61,20 @@ class AdsRig(RingRig):
         except ImportError as error:
             raise UserError("the backend 'ads' needs pyads; install it with: pip install 'jaxfinger[rig]'") from error
         self._pyads = pyads
-        self._failures = (pyads.ADSError, RuntimeError)  # the latter where AdsLib opens no port or an answer is short
+        self._failures = (pyads.ADSError, RuntimeError)  # RuntimeError: AdsLib opens no port, or an answer is short
         self._connection = None
         self._lock = threading.Lock()
         self._places: dict[str, tuple[int, int, int]] = {}  # symbol: group, offset, size in bytes
         self.reconnects = 0
-        self._calls = 0  # that took the connection
-        self._given_up = self._mending = self._closed = False
+        self._calls = 0  # calls that have had the connection
+        self._mending = False  # a call is connecting again
+        self._given_up = False  # a call could not connect again, so later calls do not try
+        self._closed = False
 
     def _open(self) -> None:
         where, self._given_up, self._closed = self.description.address, False, False
         deadline = time.monotonic() + float(where["reconnect_s"])
-        while True:  # a router may still hang up on the connection of a program that was killed a moment ago
+        while True:  # A router may still hang up on the connection of a program that was killed a moment ago.
             try:
                 self._attach()
                 return
@@ -75,7 +85,7 @@ class AdsRig(RingRig):
                         f"no answer from {where['net_id']} port {where['port']} at {where['ip']} ({error}); check "
                         "cable, NetId, and that the controller has a route back to this computer."
                     ) from error
-                time.sleep(PAUSE_S)
+                time.sleep(RETRY_S)
 
     def _attach(self) -> None:
         where = self.description.address
@@ -84,13 +94,13 @@ class AdsRig(RingRig):
         self._connection = connection
         port = connection._port
         assert port is not None
-        connection.set_timeout(TIMEOUT_MS)  # belongs to the port, so it is lost with every close
+        connection.set_timeout(TIMEOUT_MS)  # It belongs to the port, so every close loses it.
         places = {}
         for symbol in contract.SYMBOLS:
             try:
                 info = self._pyads.pyads_ex.adsGetSymbolInfo(port, connection._adr, contract.PREFIX + symbol)
             except self._pyads.ADSError as error:
-                if error.err_code != 1808:  # symbol not found
+                if error.err_code != 1808:  # 1808: symbol not found
                     raise
                 if symbol == "stBench":
                     continue
@@ -98,11 +108,12 @@ class AdsRig(RingRig):
                     f"the controller has no symbol {contract.PREFIX}{symbol}; load the program of docs/plc-contract.md."
                 ) from error
             places[symbol] = (info.iGroup, info.iOffs, info.size)
-        self._places = places  # as a whole: an earlier set stays where the controller is lost halfway
+        self._places = places  # Replaced as a whole: where the controller is lost halfway, the earlier set stays.
 
     def close(self) -> None:
-        self._closed = self._given_up = True  # a thread that was left behind must not open it again
-        if self._lock.acquire(timeout=CALL_S):  # else another thread hangs in a call, and closes when it comes back
+        self._closed = self._given_up = True  # A thread that was left behind must not connect again.
+        # Where the lock is not free, another thread hangs in a call; it closes the connection when it comes back.
+        if self._lock.acquire(timeout=MAX_CALL_S):
             try:
                 self._detach()
             finally:
@@ -115,16 +126,20 @@ class AdsRig(RingRig):
             self._connection = None
 
     def _call(self, request: Callable[[], bytes], mend: bool = True) -> bytes:
-        """Do a request; after a cut, close, open and do it again until `reconnect_s` is over."""
+        """Do a request. With `mend`, connect again and repeat it after a cut, for `reconnect_s` at most.
+
+        Raises:
+            ConnectionLost: the request failed, or another thread's call hangs.
+        """
         patience = float(self.description.address["reconnect_s"])
-        self._take(mend)
+        self._acquire(mend)
         try:
             return request()
         except self._failures as first:
             self._mending = mend
             deadline = time.monotonic() + patience
             while mend and not self._given_up and time.monotonic() < deadline:
-                self.alive()
+                self.report_alive()
                 self._detach()
                 try:
                     self._attach()
@@ -132,7 +147,7 @@ class AdsRig(RingRig):
                     self.reconnects += 1
                     return answer
                 except self._failures:
-                    time.sleep(PAUSE_S)
+                    time.sleep(RETRY_S)
             self._given_up |= mend
             raise ConnectionLost(f"the connection to the controller is lost ({first}).") from first
         finally:
@@ -141,19 +156,23 @@ class AdsRig(RingRig):
                 self._detach()
             self._lock.release()
 
-    def _take(self, patient: bool) -> None:
-        """Wait for the connection, which another thread may be using, or mending for so long as that may take.
+    def _acquire(self, patient: bool) -> None:
+        """Take the connection, which another thread may be using.
 
-        One call hangs, not several in a row. Waits are counted, not clocked: where this thread stood still, so did the
-        other's call.
+        A patient call waits MAX_CALL_S for any one call of others, and without limit while one is connecting again. A
+        heartbeat is not patient: it waits MAX_BEAT_WAIT_S in all. The waits are counted, not measured by the clock: a
+        machine that held up this thread also held up the other's call.
+
+        Raises:
+            ConnectionLost: the other call hangs.
         """
         call, waits = self._calls, 0
-        while not self._lock.acquire(timeout=WAIT_S):
-            self.alive()
+        while not self._lock.acquire(timeout=LOCK_POLL_S):
+            self.report_alive()
             if patient and self._calls != call:
                 call, waits = self._calls, 0
             waits += 1
-            if waits * WAIT_S > (CALL_S if patient else BUSY_S) and not (patient and self._mending):
+            if waits * LOCK_POLL_S > (MAX_CALL_S if patient else MAX_BEAT_WAIT_S) and not (patient and self._mending):
                 raise ConnectionLost("a call to the controller hangs.")
         self._calls += 1
 
@@ -162,7 +181,7 @@ class AdsRig(RingRig):
             if self._connection is None:
                 raise self._pyads.ADSError(text="not connected")
             group, start, _ = self._places[symbol]
-            # as ctypes, since pyads would turn every byte into a Python object: 0.06 ms against 1.6 ms for 25 KiB
+            # As ctypes, since pyads would turn every byte into a Python object: 0.06 ms instead of 1.6 ms for 25 KiB.
             return bytes(self._connection.read(group, start + offset, ctypes.c_ubyte * size, return_ctypes=True))
 
         return self._call(request)
@@ -185,5 +204,5 @@ class AdsRig(RingRig):
 
 
 def make(description: RigDescription) -> AdsRig:
-    """The rig of a rig file."""
+    """Return the rig of a rig file."""
     return AdsRig(description)

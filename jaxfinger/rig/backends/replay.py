@@ -1,4 +1,4 @@
-"""A recorded trial, played back as if it came from a rig: to look at it live, or to supervise it again."""
+"""Play a recorded trial back as if it came from a rig, to view it live or to supervise it again."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from jaxfinger.rig.backend import Block, Command, CommandRefused, EndOfReplay, R
 from jaxfinger.rig.channels import Filter, RigChannel, RigDescription
 from jaxfinger.rig.contract import State, Trip
 
-BLOCK = 50
+BLOCK_SAMPLES = 50  # samples in a block: as many as 50 ms (poll_s) give at 1 kHz
 
 
 @dataclass(frozen=True)
 class Address:
-    """`file`, a session beside the rig file, and the name of a `trial` in it."""
+    """Keys of `[address]`: `file`, a session relative to the rig file, and the name of a `trial` in it."""
 
     file: str
     trial: str
 
 
 class ReplayRig(Rig):
-    """Blocks of a recorded trial; its channels are those that the trial measured, and nothing can be commanded."""
+    """The blocks of a recorded trial, in state ARMED, with the channels that it measured. Commands are refused."""
 
     synchronous = True
     simulated_time = True
@@ -57,7 +57,7 @@ class ReplayRig(Rig):
         pass
 
     def poll(self) -> Block:
-        part = slice(self._at, self._at + BLOCK)
+        part = slice(self._at, self._at + BLOCK_SAMPLES)
         t_ns, x = self._time[part], self._x[part]
         if not len(x):
             raise EndOfReplay("the recording is at its end.")
@@ -101,18 +101,18 @@ class ReplayRig(Rig):
 
 
 def _column(trial: Trial, channel: RigChannel, joints: tuple[str, ...], tendons: tuple[str, ...]) -> np.ndarray | None:
-    """The trial's column for a channel; the external torque sits in the column of the joint that it was coupled to."""
+    """Return the trial's values (N,) of a channel, or None. External torque is that of the trial's joint."""
     array, names = {
         "tension": (trial.tendon_force, tendons),
         "excursion": (trial.tendon_excursion, tendons),
         "joint_position": (trial.q, joints),
         "fingertip_force": (trial.fingertip_force, ("x", "y", "z")),
         "external_torque": (trial.joint_torque, joints),
-    }.get(channel.kind, (None, ()))  # what is watched for safety alone is in no session
+    }.get(channel.kind, (None, ()))  # Channels of SAFETY_KINDS are in no session.
     of = channel.of or (trial.joint or "")
     return array[:, names.index(of)] if array is not None and of in names else None
 
 
 def make(description: RigDescription) -> ReplayRig:
-    """The rig of a rig file."""
+    """Return the rig of a rig file."""
     return ReplayRig(description)

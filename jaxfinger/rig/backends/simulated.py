@@ -1,4 +1,4 @@
-"""The simulated specimen in this process: the controller's program around a finger, as fast as it is read."""
+"""A simulated finger in this process: the controller's program runs as fast as its samples are read."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.ring import RingRig
 from jaxfinger.rig.simulated.controller import Controller
 
-BEAT = 50  # cycles
+BEAT_CYCLES = 50  # cycles of 1 ms between two heartbeats, as `watch.BEAT_S` in real time
 
 
 @dataclass(frozen=True)
 class Address:
-    """`seed` of the sensors' noise; `filtered = 1` for terminals at their factory filter."""
+    """Keys of `[address]`: `seed` of the sensors' noise; `filtered = 1` for terminals with their factory filter on."""
 
     seed: Annotated[int, Within(0)] = 0
     filtered: Annotated[int, Within(0, 1)] = 0
 
 
 class SimulatedRig(RingRig):
-    """Samples are made when they are read, so a session takes no longer than its computation and repeats exactly."""
+    """A simulated rig. Its samples are computed when they are read, so a session repeats exactly."""
 
     synchronous = True
     simulated_time = True
@@ -47,9 +47,9 @@ class SimulatedRig(RingRig):
         self.controller.memory[at : at + len(data)] = data
 
     def _pause(self, seconds: float) -> None:
-        """Who makes time pass is well meanwhile."""
+        """Run the controller for `seconds`, with heartbeats: the thread that makes time pass is alive."""
         for k in range(max(1, round(seconds * self.description.rate_hz))):
-            if k % BEAT == 0:
+            if k % BEAT_CYCLES == 0:
                 self.beat()
             self.controller.cycle()
 
@@ -61,5 +61,5 @@ class SimulatedRig(RingRig):
 
 
 def make(description: RigDescription) -> SimulatedRig:
-    """The rig of a rig file."""
+    """Return the rig of a rig file."""
     return SimulatedRig(description)

@@ -1,1 +1,1 @@
-"""The simulated controller, its finger and its ADS server: a bench to try the adapter on, which knows nothing of it."""
+"""A test bench for the adapter: simulated controller, finger and ADS server. It shares only the contract with it."""

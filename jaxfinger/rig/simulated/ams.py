@@ -1,8 +1,8 @@
-"""A small AMS/TCP server that serves a controller's memory as ADS symbols, on the loopback address alone.
+"""A small AMS/TCP server that serves a controller's memory as ADS symbols, only on the loopback address.
 
 AMS/TCP header: 2 bytes zero, length (u32). AMS header: target NetId and port, source NetId and port, command (u16),
 state flags (u16), length (u32), error (u32), invoke id (u32). All little endian (Beckhoff Information System, «ADS/AMS
-specification»). As a TwinCAT router does, it keeps one connection per client address: the newest wins.
+specification»). Like a TwinCAT router it keeps one connection per client address: a new one closes the old one.
 """
 
 from __future__ import annotations
@@ -16,18 +16,22 @@ from collections.abc import Callable, Mapping
 
 _TCP = struct.Struct("<HI")
 _AMS = struct.Struct("<6sH6sHHHIII")
-RESPONSE = 0x0005
+RESPONSE = 0x0005  # state flags of an answer
+# Commands.
 READ_DEVICE_INFO, READ, WRITE, READ_STATE, WRITE_CONTROL, READ_WRITE = 1, 2, 3, 4, 5, 9
+# Index groups. MEMORY addresses the controller's memory by offset.
 HANDLE_BY_NAME, VALUE_BY_NAME, VALUE_BY_HANDLE, RELEASE_HANDLE = 0xF003, 0xF004, 0xF005, 0xF006
 INFO_BY_NAME = 0xF009
 MEMORY = 0x4040
+# Error codes.
 OK, UNKNOWN_SERVICE, INVALID_GROUP, INVALID_OFFSET, INVALID_SIZE, NO_SYMBOL = 0, 0x701, 0x702, 0x703, 0x705, 0x710
 
 
 class AmsServer:
-    """Serves `memory` with `places` (symbol -> offset, size); `lock` is held while it is touched.
+    """Serves `memory`, in which `places` gives offset and size of each symbol.
 
-    Every answer comes `delay()` s late.
+    It holds `lock` while it reads or writes the memory. Every answer comes `delay()` s late. `port` is the TCP port
+    (0: any free one).
     """
 
     def __init__(
@@ -57,14 +61,14 @@ class AmsServer:
         threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
 
     def cut(self) -> None:
-        """Drop every connection, as a pulled cable does."""
+        """Close every connection, as a pulled cable would."""
         with self._clients_lock:
             clients, self._clients = list(self._clients.values()), {}
         for client in clients:
             _hang_up(client)
 
     def close(self) -> None:
-        """Stop listening and drop every connection."""
+        """Stop listening and close every connection."""
         self._server.shutdown()
         self._server.server_close()
         self.cut()
@@ -158,6 +162,7 @@ class AmsServer:
 
 
 def _exactly(client: socket.socket, size: int) -> bytes:
+    """Receive exactly `size` bytes."""
     data = bytearray()
     while len(data) < size:
         part = client.recv(size - len(data))

@@ -1,7 +1,8 @@
-"""The controller's program in Python: what the Structured Text of `docs/JaxfingerRing.st` does, cycle by cycle.
+"""The controller's program in Python, cycle by cycle: the contract's reference (`docs/plc-contract.md`).
 
-The stand-in and the in-process simulated rig both run it around the simulated finger: commands, ramps, hard limits,
-heartbeat, release, and the ring of samples, in the memory layout of the contract.
+The stand-in and the backend `simulated` both run it around the simulated finger: commands, ramps, hard limits,
+heartbeat, release, and the ring of samples, in the memory layout of the contract. The thresholds of its limits are
+written here and not imported from the host's code, on which a controller must not depend.
 """
 
 from __future__ import annotations
@@ -20,13 +21,19 @@ from jaxfinger.rig.simulated.plant import DT, Plant, Sensors
 _SAMPLE = struct.Struct(f"<QQII{contract.VALUES}dQ")
 _COMMAND = struct.Struct(f"<IIiIdd{contract.TARGETS}d")
 _STATUS = struct.Struct("<QQIIQdiIII")
-TEMPERATURE = 30.0  # °C, of the simulated motors, which stay cool
-_EPOCH_NS = 820_000_000 * 1_000_000_000  # the simulated distributed clock starts in the year 2025
+TEMPERATURE = 30.0  # °C of the simulated motors, which stay cool
+_EPOCH_NS = 820_000_000 * 1_000_000_000  # ns since 2000-01-01 at the start: the simulated clock begins in 2025
+FULL_COUNT, LEAK = 3, 0.25  # bad cycles that trip a limit, and what a good one takes off (contract, Trips)
+# A tendon with a set-point above LOADED N that reads less than SLACK N is slack or broken (contract, trip 3).
+LOADED, SLACK = 1.5, 0.2
+# Release (contract): all tendons in proportion until the highest is at most so many N, each ramp within so many s.
+RELEASE_RAMPS = ((2.0, 0.2), (0.5, 0.5))
+FORCE_LAG = 0.015  # s, time constant of the drives' force loop
 
 
 @dataclass(frozen=True)
 class HardLimits:
-    """The controller's own limits, SI; the fields of ST_Limits."""
+    """The controller's own limits: the fields of ST_Limits, SI. The numbers are proposals for tendons up to 15 N."""
 
     tension_max: float = 20.0
     tension_rate_max: float = 500.0
@@ -37,7 +44,7 @@ class HardLimits:
 
 
 class Slots:
-    """Where the simulated rig puts its channels: `noisy` of a sensor each, then set-points and motor temperatures."""
+    """Slots of the simulated rig's channels: first the `noisy` ones of sensors, then set-points and temperatures."""
 
     def __init__(self, n: int, m: int):
         self.tension = list(range(n))
@@ -51,7 +58,11 @@ class Slots:
 
 
 class Controller:
-    """One cycle of the program per `cycle()`; `memory` is the controller's memory as ADS serves it."""
+    """The program; `cycle()` runs one cycle of 1 ms. `memory` holds the symbols, as ADS serves them.
+
+    With `filtered` the terminals have their factory filter on. `lockstep` tells the host that time advances only as it
+    reads.
+    """
 
     def __init__(
         self,
@@ -71,11 +82,11 @@ class Controller:
         self.ring = ring
         self.place = contract.layout(ring)
         self.memory = bytearray(sum(self.place["stBench"]))
-        self.faults: dict[str, tuple[int, int, float]] = {}  # kind: (slot, first seq, amount)
-        self.standing: dict[str, tuple[int, int, float]] = {}  # those that nobody can mend
+        self.faults: dict[str, tuple[int, int, float]] = {}  # kind: (slot, first sample, amount)
+        self.standing: dict[str, tuple[int, int, float]] = {}  # faults that preparing the finger does not mend
         self.filtered, self.lockstep = filtered, lockstep
         self.struck: int | None = None  # number of the sample at which a fault first showed
-        self.cut = False  # the server is asked to drop its connections
+        self.cut = False  # asks the server to close its connections
         self.rng = np.random.default_rng(seed)
         self.boot = 0
         self.start()
@@ -86,17 +97,18 @@ class Controller:
         self.boot += 1
         self.seq = 0
         self.state = State.IDLE
-        self._code = int(self.state)  # as it is told
+        self._code = int(self.state)  # state as written to the sample, which a fault may change
         self.trip, self.trip_seq, self.trip_value, self.trip_slot = Trip.NONE, 0, 0.0, -1
         self.acknowledged, self.refused = 0, Refusal.NONE
         self.target, self.setpoint, self.tension = [0.0] * n, [0.0] * n, [0.0] * n
         self.rate = 10.0
-        self.motor: tuple[float, float, float] | None = None  # angle, velocity, acceleration of the external motor
+        # Angle (rad), velocity and acceleration of the external motor; None: no torque, or no joint coupled.
+        self.motor: tuple[float, float, float] | None = None
         self.goal, self.speed, self.acceleration = 0.0, 0.5, 20.0
-        self.beat, self.beat_age = 0, 0
-        self.ramps: list[tuple[float, float]] = []  # of a release: (tension, seconds)
+        self.beat, self.beat_age = 0, 0  # last heartbeat, and cycles since it changed
+        self.ramps: list[tuple[float, float]] = []  # ramps left of a release: (share of the start's tensions, s)
         self.bench = 0
-        self.over: dict[tuple[Trip, int], float] = {}
+        self.over: dict[tuple[Trip, int], float] = {}  # leaky count by limit and slot
         self.memory[:] = bytes(len(self.memory))
         info = np.zeros((), contract.INFO)
         info["version"], info["sample_size"], info["ring_length"] = (
@@ -110,21 +122,21 @@ class Controller:
         limits = self.limits
         self._put("stLimits", struct.pack("<6d", *(getattr(limits, name) for name in contract.LIMITS.names or ())))
         filters = np.zeros(contract.VALUES, contract.FILTER)
-        if self.filtered:  # the factory setting of an EL3008: 50 Hz FIR, -3 dB at 22 Hz
+        if self.filtered:  # Factory setting of an EL3008: 50 Hz FIR, −3 dB at 22 Hz.
             filters["enabled"][[*self.slots.tension, self.slots.torque, *self.slots.force]] = 1
             filters["bandwidth"][filters["enabled"] == 1] = 22.0
         self._put("aFilter", filters.tobytes())
         bench = np.zeros((), contract.BENCH)
         bench["lockstep"] = self.lockstep
         self._put("stBench", bench.tobytes())
-        self.off = 0  # number of the sample since which no tendon is to be pulled; -1: one is
+        self.off = 0  # number of the sample since which every set-point is zero; −1: one is not
         self._frozen_t, self._struck_t = 0, 0
         self._noise = self.rng.standard_normal((4096, self.slots.noisy))
         self._values = self._before = [0.0] * contract.VALUES
         self._status()
 
     def tell_ring(self, length: int) -> None:
-        """Say that the ring has another length than it has."""
+        """State a wrong length of the ring in stInfo."""
         self.place["aRing"] = self.place["aRing"][0], length * contract.SAMPLE.itemsize
         at = self.place["stInfo"][0] + contract.INFO.fields["ring_length"][1]  # type: ignore[index]
         struct.pack_into("<I", self.memory, at, length)
@@ -161,23 +173,27 @@ class Controller:
     def strike(
         self, kind: str, slot: int = 0, first: int = 0, amount: float = math.nan, standing: bool = False
     ) -> None:
-        """A fault of `faults.CATALOGUE` from sample `first` on, until somebody prepares the finger, or for ever."""
+        """Begin a fault of `faults.CATALOGUE` at sample `first`.
+
+        It lasts until the finger is prepared, or for ever where it is `standing`. Without `amount` it has its default.
+        """
         self.struck = None
         self.faults[kind] = slot, first, CATALOGUE[kind].amount if math.isnan(amount) else amount
         if standing:
             self.standing[kind] = self.faults[kind]
 
     def amount(self, kind: str) -> float | None:
-        """The amount of a fault that is there, for those that strike outside of the program."""
+        """Amount of a fault that is active, or None. The server asks this for faults outside of the program."""
         _, first, amount = self.faults.get(kind, (0, math.inf, 0.0))
         return amount if self.seq >= first else None
 
     def report(self) -> dict[str, int | None]:
-        """What happened, in numbers of samples: where the fault showed, where it stopped, since when tension is off."""
+        """Return the state, and the numbers of the samples where the fault showed, it tripped, and tension was off."""
         return {"head": self.seq, "state": int(self.state), "trip": int(self.trip), "boot": self.boot,
                 "trip_seq": self.trip_seq, "fault_seq": self.struck, "off_seq": self.off}  # fmt: skip
 
     def _commands(self, deaf: bool) -> None:
+        """Process a new command. A `deaf` controller acknowledges STOP and RELEASE without obeying."""
         offset, _ = self.place["stCommand"]
         number, kind, index, _, rate, acceleration, *target = _COMMAND.unpack_from(self.memory, offset)
         if number == self.acknowledged:
@@ -187,6 +203,7 @@ class Controller:
         self.refused = Refusal.NONE if ignored else self._obey(kind, index, rate, acceleration, target)
 
     def _obey(self, kind: int, index: int, rate: float, acceleration: float, target: list[float]) -> Refusal:
+        """Carry out a command, or refuse it. STOP is obeyed in every state."""
         on = self.state in (State.ARMED, State.MOVING)
         if kind == Kind.STOP:
             self._stop(Trip(index), -1, 0.0)
@@ -216,6 +233,7 @@ class Controller:
         return Refusal.NONE
 
     def _set(self, kind: int, rate: float, acceleration: float, target: list[float]) -> Refusal:
+        """Set the goals of TENSION, JOINT or HOLD, or refuse those beyond the hard limits."""
         limits, n = self.limits, self.plant.n
         if kind == Kind.HOLD:
             self.target = self.setpoint[:]
@@ -240,6 +258,7 @@ class Controller:
         return Refusal.NONE
 
     def _heartbeat(self) -> None:
+        """Stop where the host's heartbeat has not changed for `heartbeat_s` while the drives are on."""
         offset, _ = self.place["nHostBeat"]
         (beat,) = struct.unpack_from("<Q", self.memory, offset)
         self.beat_age = 0 if beat != self.beat else self.beat_age + 1
@@ -248,23 +267,25 @@ class Controller:
             self._stop(Trip.HEARTBEAT, -1, self.beat_age * DT)
 
     def _release(self) -> None:
-        """All tendons together, in proportion: 2 N within 0.2 s, then 0.5 N within 0.5 s, then drives off."""
+        """Begin a release: the motor loses its torque at once, the tendons begin RELEASE_RAMPS."""
         self.state, self.motor = State.RELEASING, None
         peak = max([*self.setpoint, 1e-9])
-        self.ramps = [(min(2.0 / peak, 1.0), 0.2), (min(0.5 / peak, 1.0), 0.5)]
+        self.ramps = [(min(tension / peak, 1.0), seconds) for tension, seconds in RELEASE_RAMPS]
         self._from, self._ramp_time = self.setpoint[:], 0.0
 
     def _stop(self, trip: Trip, slot: int, value: float) -> None:
+        """Release and latch TRIPPED. The first cause stays."""
         if self.state is State.TRIPPED:
             return
         self.trip, self.trip_seq, self.trip_slot, self.trip_value = trip, self.seq, slot, value
         if self.state in (State.ARMED, State.MOVING):
             self._release()
-        if trip in (Trip.TENSION, Trip.SLACK):  # over-tension or a broken tendon: drives off at once
+        if trip in (Trip.TENSION, Trip.SLACK):  # Over-tension or a broken tendon: drives off at once, without a ramp.
             self.ramps, self.setpoint = [], [0.0] * self.plant.n
         self.target, self.state = self.setpoint[:], State.TRIPPED
 
     def _ramps(self) -> None:
+        """Advance the release, or tensions and motor toward their goals. Tensions follow with the drives' lag."""
         n = self.plant.n
         if self.ramps:
             share, seconds = self.ramps[0]
@@ -278,7 +299,7 @@ class Controller:
                 if self.ramps:
                     peak = max([*self.setpoint, 1e-9])
                     self._from, self._ramp_time = self.setpoint[:], 0.0
-                    self.ramps[0] = (min(0.5 / peak, 1.0), self.ramps[0][1])
+                    self.ramps[0] = (min(RELEASE_RAMPS[1][0] / peak, 1.0), self.ramps[0][1])
                 else:
                     self.setpoint = [0.0] * n
             self.target = self.setpoint[:]
@@ -296,21 +317,22 @@ class Controller:
             self.motor = (self.goal, 0.0, 0.0)
         if Mode.MOTOR not in self.plant.mode:
             self.motor = None
-        lag = DT / (DT + 0.015)  # the drive's force loop
+        lag = DT / (DT + FORCE_LAG)
         self.tension = [f + lag * (s - f) for f, s in zip(self.tension, self.setpoint, strict=True)]
 
     def _move(self) -> bool:
-        """Trapezoidal velocity profile of the external motor toward its goal; False when it is there."""
+        """Advance the external motor on a trapezoidal velocity profile. Return False when it is at its goal."""
         if self.motor is None:
             return False
         angle, velocity, _ = self.motor
         distance = self.goal - angle
-        brake = self.acceleration * DT / 2  # the fastest from which whole cycles of braking stop at the goal
+        # Braking in whole cycles from a velocity v covers v²/(2a) + v DT/2. `allowed` is the v that reaches the goal.
+        brake = self.acceleration * DT / 2
         allowed = min(self.speed, math.sqrt(brake**2 + 2 * self.acceleration * abs(distance)) - brake)
         change = math.copysign(allowed, distance) - velocity
         change = min(max(change, -self.acceleration * DT), self.acceleration * DT)
         velocity += change
-        if abs(distance) <= abs(velocity) * DT + 1e-6:  # never past the goal: friction remembers the direction
+        if abs(distance) <= abs(velocity) * DT + 1e-6:  # Never past the goal: friction keeps the direction of approach.
             self.motor = (self.goal, 0.0, 0.0)
             return False
         self.motor = (angle + velocity * DT, velocity, change / DT)
@@ -318,6 +340,7 @@ class Controller:
 
     # measuring --------------------------------------------------------------------------------------------------
     def _measure(self, fault: dict[str, tuple[int, float]]) -> int:
+        """Fill the values of this cycle's sample, with noise and faults. Return its flags."""
         plant, s, slots = self.plant, self.sensors, self.slots
         noise = self._noise[self.seq % 4096].tolist()
         fresh = self._values[:]
@@ -346,8 +369,8 @@ class Controller:
         return flags
 
     def _check(self, flags: int) -> None:
-        """Hard limits, each after three bad cycles, off which a good one takes a quarter: one odd sample must not drop
-        the finger, and a value that is bad every other time must.
+        """Stop where a hard limit's leaky count is full. One odd sample must not drop the finger; a value that is bad
+        every other time must.
         """
         if self.state not in (State.ARMED, State.MOVING):
             self.over.clear()
@@ -366,7 +389,7 @@ class Controller:
         found += [
             (Trip.SLACK, i, values[i])
             for i, wanted in zip(slots.tension, self.setpoint, strict=True)
-            if wanted > 1.5 and values[i] < 0.2
+            if wanted > LOADED and values[i] < SLACK
         ]
         found += [
             (Trip.POSITION, slot, values[slot])
@@ -382,15 +405,16 @@ class Controller:
             found.append((Trip.TORQUE, slots.torque, values[slots.torque]))
         found += [(Trip.FORCE, i, values[i]) for i in slots.force if abs(values[i]) > limits.fingertip_force_max]
         bad = {(trip, slot) for trip, slot, _ in found}
-        self.over = {key: level - 0.25 for key, level in self.over.items() if level > 0.25 or key in bad}
-        self.over |= {key: self.over.get(key, -0.25) + 1.25 for key in bad}
+        # Every count leaks; a bad cycle gives that back and adds 1.
+        self.over = {key: level - LEAK for key, level in self.over.items() if level > LEAK or key in bad}
+        self.over |= {key: self.over.get(key, -LEAK) + LEAK + 1 for key in bad}
         for trip, slot, value in found:
-            if self.over[trip, slot] >= 3:
+            if self.over[trip, slot] >= FULL_COUNT:
                 self._stop(trip, slot, value)
                 return
 
     def _time(self, fault: dict[str, tuple[int, float]]) -> int:
-        """The device's time, ns; `fault` makes it wrong."""
+        """Device's time in ns, with its faults."""
         t = _EPOCH_NS + self.seq * contract.CYCLE_NS
         if "clock-frozen" in fault:
             return self._struck_t
@@ -400,6 +424,7 @@ class Controller:
         return t - round(fault.get("clock-back", (0, 0.0))[1] * 1e9)
 
     def _sample(self, flags: int, fault: dict[str, tuple[int, float]]) -> None:
+        """Write this cycle's sample into the ring, then the status with the new head."""
         offset, _ = self.place["aRing"]
         at = offset + (self.seq % self.ring) * _SAMPLE.size
         self._code = round(fault["state"][1]) if "state" in fault else int(self.state)
@@ -416,7 +441,7 @@ class Controller:
         )  # fmt: skip
 
     def _bench(self) -> None:
-        """The simulated operator: how each joint is held and where, the fingertip's contact, faults to inject."""
+        """Obey a new order to the simulated operator: prepare the finger, or inject a fault."""
         offset, size = self.place["stBench"]
         (number,) = struct.unpack_from("<I", self.memory, offset)
         if number == self.bench:
@@ -428,6 +453,6 @@ class Controller:
             self.strike(contract.FAULTS[kind], *where)
             return
         m = self.plant.m
-        self.faults = dict(self.standing)  # who prepares the finger has mended the rest
+        self.faults = dict(self.standing)  # Preparing the finger mends the others.
         self.plant.prepare([Mode(v) for v in order["mode"][:m]], order["pose"][:m].tolist(), bool(order["contact"]))
         self.motor = None

@@ -1,4 +1,4 @@
-"""A rig file and a plan to start from: for the simulated finger, the stand-in, or, after editing, the bench."""
+"""Example rig file and plan, for the simulated finger, for the stand-in, or to edit for a bench."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ temperature_max = 70.0          # degC, of the motors
 def rig_toml(
     backend: str = "simulated", address: dict | None = None, finger: FingerDescription | None = None, **rig: object
 ) -> str:
-    """A rig file whose channels sit where the simulated rig has them; `rig` adds keys to [rig]."""
+    """Return a rig file with the channels of the simulated rig; `rig` adds keys to `[rig]`."""
     finger = finger or default_truth().finger
     slots = Slots(finger.n, finger.m)
     head = {"name": "example", "backend": backend, "specimen": "simulated finger", "rate_hz": 1000.0, **rig}
@@ -63,7 +63,7 @@ def _toml(value: object) -> str:
 
 
 def plan_toml(repeats: int = 1, postures: int = 2) -> str:
-    """The paper's session, shortened: every experiment, every joint, every tendon, ID.4 at one or two postures."""
+    """Return a plan of the paper's session, shortened: every experiment, joint and tendon, ID.4 at 1 or 2 postures."""
     trials = [f'experiment = "ID.2"\njoint = "{j}"\nrepeats = {repeats}' for j in ("MCP", "PIP", "DIP")]
     trials.append('experiment = "VD.1"\nseconds = 12.0')
     for joint in ("MCP", "PIP", "DIP"):

@@ -1,4 +1,4 @@
-"""What the stand-in does wrong on request: `python -m jaxfinger.rig.standin --fault NAME[:SLOT][=AMOUNT][@SECONDS]`."""
+"""Faults of the stand-in on request: `python -m jaxfinger.rig.standin --fault NAME[:SLOT][=AMOUNT][@SECONDS]`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from jaxfinger.rig import contract
 
 @dataclass(frozen=True)
 class Misbehaviour:
-    """One fault: what it does, what its amount means (`…` in the sentence), and the amount where none is given."""
+    """One kind of fault: a sentence in which `…` stands for its amount, and the default amount."""
 
     says: str
     amount: float = 0.0
 
 
+# Faults that can strike at any time.
 CATALOGUE = {
     "nan": Misbehaviour("the slot is not a number"),
     "flicker": Misbehaviour("the slot is not a number in two samples of three"),
@@ -34,6 +35,7 @@ CATALOGUE = {
     "deaf": Misbehaviour("STOP and RELEASE are acknowledged and ignored"),
     "state": Misbehaviour("the state is …", 42.0),
 }
+# Faults of the program itself, from its start on.
 AT_START = {
     "watchdog": Misbehaviour("the controller holds tension for … s without a heartbeat", 3600.0),
     "size": Misbehaviour("ST_Command has … bytes", 168.0),
@@ -44,7 +46,7 @@ assert set(CATALOGUE) == set(contract.FAULTS) - {"none"}
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault, the slot that it strikes, its amount, and when it begins, s after the start."""
+    """One fault to inject: its name, the slot that it strikes, its amount, and when it begins (s after the start)."""
 
     name: str
     slot: int
@@ -53,7 +55,7 @@ class Fault:
 
 
 def parse(text: str) -> Fault:
-    """A fault as it stands on the command line; raises ValueError with the names that there are."""
+    """Read a fault from the command line's form. Raises ValueError, with the known names."""
     found = re.fullmatch(r"([a-z-]+)(?::(\d+))?(?:=([-+.\deE]+))?(?:@([.\d]+))?", text)
     known = CATALOGUE | AT_START
     if found is None or found[1] not in known:

@@ -1,8 +1,8 @@
-"""A planar finger to drive the stand-in controller: equation (1) for joints about +y, in scalar Python, 1 ms a step.
+"""The planar finger of the stand-in: equation (1) for joints about +y, in scalar Python, in steps of 1 ms.
 
-Joints are fixed, on the external motor, moved by hand, or free. Only free joints need forward dynamics: velocities
-are advanced by impulses, with joint and tendon friction as box-constrained impulses (projected Gauss–Seidel), so that
-the finger truly sticks. This code shares nothing with `jaxfinger.model`, which is what makes recordings of it a test.
+Joints are fixed, coupled to the external motor, moved by hand, or free. Only free joints need forward dynamics:
+impulses advance their velocities, and joint and tendon friction are impulses within bounds (projected Gauss–Seidel), so
+that the finger truly sticks. This code shares nothing with `jaxfinger.model`, so recordings of it test the model.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from jaxtyping import Float
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.rig.contract import Mode
 
-DT = 1e-3
+DT = 1e-3  # s, one cycle of the controller
 
 
 @dataclass(frozen=True)
 class PlantTruth:
-    """The true parameters, for comparison with what `identify` finds from a recording. SI units.
+    """True parameters, to compare with what `identify` finds from a recording. SI units.
 
-    `excursion[i, j, k]` multiplies q_j^(k+1) in tendon i's excursion; `elastic` and `friction` are polynomials in q
-    from degree 0; `a0`, `a1` give the tension lost on the way; `loss = min(max(a0 + a1 f_t, 0), f_t)`.
+    `excursion[i, j, k]` multiplies q_j^(k+1) in the excursion of tendon i. `elastic` and `friction` are coefficients of
+    polynomials in q from degree 0. The tension lost on the way is min(max(a0 + a1 f_t, 0), f_t).
     """
 
     finger: FingerDescription
@@ -38,7 +38,7 @@ class PlantTruth:
 
 @dataclass(frozen=True)
 class Sensors:
-    """White noise (standard deviation) and resolution of the rig's sensors, SI units."""
+    """White noise (standard deviation), resolution and offsets of the rig's sensors, SI units."""
 
     tension_noise: float = 0.02
     torque_noise: float = 2e-4
@@ -51,7 +51,7 @@ class Sensors:
 
 
 def default_truth() -> PlantTruth:
-    """Three joints and four tendons with the paper's moment arms, elastic torque and tendon friction."""
+    """Return three joints and four tendons, with moment arms, elastic torque and friction like the paper's."""
     deg = math.pi / 180
     finger = FingerDescription(
         gravity=np.array([0.0, 0.0, -9.81]),
@@ -86,6 +86,7 @@ def default_truth() -> PlantTruth:
 
 
 def _poly(coefficients, x: float) -> float:
+    """Σ_p coefficients[p] x^p."""
     value = 0.0
     for c in reversed(coefficients):
         value = value * x + c
@@ -94,24 +95,28 @@ def _poly(coefficients, x: float) -> float:
 
 @dataclass
 class Plant:
-    """State of the finger: angles, velocities, tension that reaches the joints. `step` advances it by 1 ms."""
+    """The finger with its state; `step` advances it by 1 ms.
+
+    The state: angles `q` (rad), velocities `qd` (rad/s), tensions `transmitted` (N) that reach the joints. `step` also
+    sets `external_torque` (N m) and `tip_force` (N, base frame).
+    """
 
     truth: PlantTruth = field(default_factory=default_truth)
-    stop_stiffness: float = 2.0  # N m/rad, of the mechanical limits of a free joint
+    stop_stiffness: float = 2.0  # N m/rad of the mechanical limits of a free joint
 
     def __post_init__(self):
         t, f = self.truth, self.truth.finger
         self.m, self.n = f.m, f.n
         self.q = [0.0] * self.m
         self.qd = [0.0] * self.m
-        self.transmitted = [0.0] * self.n  # f_j: what reaches held joints
+        self.transmitted = [0.0] * self.n  # f_j: tension at the joints
         self.mode = [Mode.FIXED] * self.m
-        self.pose = [0.0] * self.m  # where fixtures hold, and where a hand's motion is centred
+        self.pose = [0.0] * self.m  # angles at which fixtures hold the joints
         self.contact = False
         self.external_torque = 0.0
         self.tip_force = [0.0, 0.0, 0.0]
         self._clock = 0.0
-        self._impulses: dict[tuple[str, int], float] = {}  # of friction on free joints, in the last step
+        self._impulses: dict[tuple[str, int], float] = {}  # friction impulses of the last step
         self._approach = 0.0  # direction in which the external motor last moved its joint
         self._length = [*f.origin[1:, 0].tolist(), float(f.fingertip[0])]
         self._com = f.com[:, 0].tolist()
@@ -130,14 +135,14 @@ class Plant:
         return [sum(_poly(self._excursion[i][j], self.q[j]) for j in self._crossed[i]) for i in range(self.n)]
 
     def moment_arms(self) -> list[list[float]]:
-        """C(q), (n, m) in m."""
+        """C(q), (n, m), m/rad."""
         return [
             [_poly(self._arm[i][j], self.q[j]) if j in self._crossed[i] else 0.0 for j in range(self.m)]
             for i in range(self.n)
         ]
 
     def _points(self):
-        """Per joint (x, z), per link the direction (cos, sin) of its axis, and the tip."""
+        """Return (x, z) of each joint, the direction (cos, sin) of each link, and (x, z) of the tip."""
         angle = x = z = 0.0
         joints, directions = [], []
         for length, q in zip(self._length, self.q, strict=True):
@@ -162,10 +167,11 @@ class Plant:
         return torque
 
     def _loss(self, i: int, tension: float) -> float:
+        """Tension lost along tendon i where it slides, N."""
         return min(max(self._a0[i] + self._a1[i] * tension, 0.0), max(tension, 0.0))
 
     def mass_matrix(self) -> Float[np.ndarray, "m m"]:
-        """M(q) of the planar chain."""
+        """M(q) of the planar chain, kg m²."""
         joints, directions, _ = self._points()
         matrix = np.zeros((self.m, self.m))
         for k in range(self.m):
@@ -179,7 +185,7 @@ class Plant:
         return matrix
 
     def coriolis(self) -> Float[np.ndarray, " m"]:
-        """N(q, q̇): the centripetal accelerations −ω² r of the links, projected on the joints."""
+        """N(q, q̇), N m: the links' centripetal accelerations −ω² r, projected on the joints."""
         joints, directions, _ = self._points()
         torque, ax, az, omega = np.zeros(self.m), 0.0, 0.0, 0.0
         for k in range(self.m):
@@ -194,7 +200,7 @@ class Plant:
 
     # motion -----------------------------------------------------------------------------------------------------
     def prepare(self, mode: list[Mode], pose: list[float], contact: bool) -> None:
-        """What the operator does between trials: fixtures, the external motor, hands, the fingertip's sensor."""
+        """Set how each joint is held and at which angle, and whether the fingertip rests on its sensor."""
         self.mode, self.pose, self.contact = list(mode), list(pose), contact
         self._clock, self._approach, self._impulses = 0.0, 0.0, {}
 
@@ -217,23 +223,30 @@ class Plant:
         self._react(tension, motor, acceleration)
 
     def _hand(self, j: int) -> float:
-        """A slow sweep through the joint's range: one joint alone repeats itself, several never come round together."""
+        """Angle at which the hand holds joint j: a slow sweep of the joint's range.
+
+        Several joints have periods whose ratios differ, so that their motion does not soon repeat.
+        """
         low, high = self._limits[j]
         low, high = low + 0.06 * (high - low), low + 0.92 * (high - low)
         period = 4.0 * (1.0 + 0.37 * j if self.mode.count(Mode.HAND) > 1 else 1.0)
         return low + (high - low) * 0.5 * (1 - math.cos(2 * math.pi * self._clock / period))
 
     def _follow(self, j: int, target: float, speed: float) -> None:
+        """Move joint j toward an angle at no more than `speed`, rad/s."""
         move = min(max(target - self.q[j], -speed * DT), speed * DT)
         self.q[j] += move
         self.qd[j] = move / DT
 
     def _fall(self, free: list[int], tension: list[float]) -> None:
-        """Free joints: M Δq̇ = Δt (Cᵀ f_t − N − G − τ_k) + friction impulses, each within ± its bound."""
+        """Advance the free joints: M Δq̇ = Δt (Cᵀ f_t − N − G − h) + friction impulses, each within ± its bound.
+
+        Here h is without joint friction: it and the tendon friction f_f are the impulses.
+        """
         arms = self.moment_arms()
         gravity, coriolis = self.gravity_torque(), self.coriolis()
         matrix = self.mass_matrix()[np.ix_(free, free)]
-        letting_go = 1e-2 * max(1.0 - self._clock / 0.6, 0.0)  # N m s/rad: a hand lets the finger go gently
+        letting_go = 1e-2 * max(1.0 - self._clock / 0.6, 0.0)  # N m s/rad, damping by the hand that lets the finger go
         drive = []
         for j in free:
             torque = sum(arms[i][j] * tension[i] for i in range(self.n)) - gravity[j] - coriolis[j]
@@ -241,7 +254,7 @@ class Plant:
             low, high = self._limits[j]
             beyond = max(low - self.q[j], 0.0) - max(self.q[j] - high, 0.0)
             torque += self.stop_stiffness * beyond
-            # damping and the stop's spring are taken implicitly: links of a few grams are stiff at 1 ms
+            # Damping and the stop's spring are taken implicitly: for links of a few grams they are stiff at 1 ms.
             stop = DT**2 * self.stop_stiffness + DT * 5e-3 if beyond else 0.0
             matrix[len(drive), len(drive)] += DT * (self._damping[j] + letting_go) + stop
             drive.append(torque)
@@ -258,7 +271,9 @@ class Plant:
         rows = []
         for name, (direction, bound) in constraints.items():
             response = inverse @ direction
-            start = min(max(self._impulses.get(name, 0.0), -bound), bound)  # warm: sticking converges
+            start = min(
+                max(self._impulses.get(name, 0.0), -bound), bound
+            )  # The last step's impulse: sticking converges.
             velocity = velocity + response * start
             impulses[name] = start
             rows.append((name, direction, bound, response, float(direction @ response)))
@@ -273,7 +288,9 @@ class Plant:
             self.q[j] += DT * self.qd[j]
 
     def _transmit(self, tension: list[float], before: list[float]) -> None:
-        """f_j: where the joints move the tendon slides and its direction decides; where they are held, f_j slips."""
+        """Update f_j. A tendon that slides loses tension against its direction. At held joints f_j stays within ± the
+        loss of f_t.
+        """
         for i in range(self.n):
             slide = sum(_poly(self._arm[i][j], self.q[j]) * (self.q[j] - before[j]) for j in self._crossed[i])
             loss = self._loss(i, tension[i])
@@ -283,7 +300,7 @@ class Plant:
                 self.transmitted[i] = min(max(self.transmitted[i], tension[i] - loss), tension[i] + loss)
 
     def _react(self, tension: list[float], motor, acceleration: list[float]) -> None:
-        """Torque of the external motor and force on the fingertip, from (1)."""
+        """Compute the external motor's torque and the force on the fingertip from (1)."""
         self.external_torque, self.tip_force = 0.0, [0.0, 0.0, 0.0]
         if Mode.MOTOR in self.mode and motor is not None:
             j = self.mode.index(Mode.MOTOR)
@@ -311,7 +328,7 @@ class Plant:
             self.tip_force = [float(force[0]), 0.0, float(force[1])]
 
     def _motor_direction(self, velocity: float) -> float:
-        """At the holds of ID.3-static friction keeps the direction of approach; a joint that never moved shows none."""
+        """Sign of joint friction on the motor: the direction in which it last moved the joint, 0 if it never did."""
         if velocity:
             self._approach = math.copysign(1.0, velocity)
         return self._approach

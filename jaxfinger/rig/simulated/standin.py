@@ -1,4 +1,4 @@
-"""A stand-in controller: the simulated finger at 1 kHz behind real ADS on 127.0.0.1, in a process of its own.
+"""A stand-in for the real controller: a simulated finger at 1 kHz behind real ADS on 127.0.0.1, in its own process.
 
     python -m jaxfinger.rig.standin --port 48898
 
@@ -24,13 +24,13 @@ from jaxfinger.rig.simulated.controller import Controller, HardLimits
 from jaxfinger.rig.simulated.faults import AT_START, CATALOGUE, Fault, parse
 
 NET_ID = "127.0.0.1.1.1"
-BURST = 100  # cycles in a row before others get the memory
+BURST = 100  # cycles in a row before ADS requests get the memory
 
 
 def serve(controller: Controller, speed: float, port: int, stop: threading.Event, say: Callable[[str], None]) -> None:
-    """Run the controller at `speed` times real time until `stop`; a slow machine stretches time, it loses no sample.
+    """Run the controller at `speed` times real time until `stop`. A slow machine stretches time and loses no sample.
 
-    At speed 0 time goes as fast as the host reads: each heartbeat buys BURST cycles, so that no machine is too slow.
+    At speed 0 time advances only as the host reads (`Lockstep`), so that no machine is too slow.
     """
     lock = threading.Lock()
     places = {contract.PREFIX + name: place for name, place in controller.place.items()}
@@ -54,7 +54,7 @@ def serve(controller: Controller, speed: float, port: int, stop: threading.Event
 
 
 class RealTime:
-    """As many cycles as the clock says, in bursts, so that requests are answered in between."""
+    """Pace of the clock: as many cycles as are due, in bursts, so that requests are answered in between."""
 
     def __init__(self, controller: Controller, speed: float):
         self._controller, self._period = controller, contract.CYCLE_NS * 1e-9 / speed
@@ -62,18 +62,18 @@ class RealTime:
         self.rest = min(self._period, 1e-3)
 
     def due(self) -> int:
-        """Cycles to run now."""
+        """Number of cycles to run now."""
         period = self._period / (self._controller.amount("slow") or 1.0)
         behind = int((time.monotonic() - self._next) / period)
         count = min(behind, BURST)
         self._next += count * period
-        if behind > 20 * BURST:  # the machine stood still: stretch time rather than race after it
+        if behind > 20 * BURST:  # More than 2 s behind: the machine stood still. Stretch time instead of catching up.
             self._next = time.monotonic()
         return count
 
 
 class Lockstep:
-    """A burst for every heartbeat, and a cycle for every command that waits."""
+    """Pace of the host: a burst of cycles for every heartbeat, and one cycle while a command waits."""
 
     rest = 1e-4
 
@@ -81,7 +81,7 @@ class Lockstep:
         self._controller, self._beat = controller, 0
 
     def due(self) -> int:
-        """Cycles to run now."""
+        """Number of cycles to run now."""
         memory, place = self._controller.memory, self._controller.place
         (beat,) = struct.unpack_from("<Q", memory, place["nHostBeat"][0])
         (command,) = struct.unpack_from("<I", memory, place["stCommand"][0])
@@ -90,7 +90,7 @@ class Lockstep:
 
 
 class StandIn:
-    """A stand-in in a process of its own: where it listens, and a way to it that is no connection of the rig."""
+    """A stand-in in another process: its address `where`, and access to it through its standard input and output."""
 
     def __init__(self, process: subprocess.Popen[str]):
         self._process = process
@@ -111,11 +111,11 @@ class StandIn:
         return json.loads(self._line())
 
     def report(self) -> dict[str, Any]:
-        """`Controller.report` now."""
+        """Return `Controller.report`."""
         return self._ask("report")
 
     def strike(self, fault: str) -> dict[str, Any]:
-        """A fault as on the command line, from the next sample on; returns the report."""
+        """Begin a fault, written as on the command line, at the next sample. Return the report."""
         return self._ask(f"fault {fault}")
 
 
@@ -123,7 +123,7 @@ class StandIn:
 def started(
     speed: float = 1.0, heartbeat: float = 0.25, seed: int = 0, filtered: bool = False, faults: Sequence[str] = ()
 ) -> Iterator[StandIn]:
-    """A stand-in in a process of its own, which ends with this one."""
+    """Start a stand-in in a process that ends with this one. `heartbeat` is its watchdog in s."""
     arguments = ["--speed", str(speed), "--heartbeat", str(heartbeat), "--seed", str(seed)]
     arguments += [word for fault in faults for word in ("--fault", fault)] + (["--filtered"] if filtered else [])
     command = [sys.executable, "-m", "jaxfinger.rig.standin", "--with-parent", *arguments]
@@ -144,13 +144,13 @@ def started(
 
 @contextmanager
 def running(speed: float = 1.0, heartbeat: float = 0.25, seed: int = 0, filtered: bool = False) -> Iterator[str]:
-    """As `started`; yields host:port for the rig file's `ip`."""
+    """Start a stand-in as `started` does. Yield host:port, for `ip` in the rig file."""
     with started(speed, heartbeat, seed, filtered) as bench:
         yield bench.where
 
 
 def make(speed: float, heartbeat: float, seed: int, filtered: bool, faults: Sequence[Fault]) -> Controller:
-    """The controller that the command line asks for."""
+    """Return the controller that the command line asks for."""
     at_start = {fault.name: fault.amount for fault in faults if fault.name in AT_START}
     limits = HardLimits(heartbeat_s=at_start.get("watchdog", heartbeat * (speed or 1.0)))
     controller = Controller(limits=limits, seed=seed, filtered=filtered, lockstep=speed == 0)
