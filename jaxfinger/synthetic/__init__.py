@@ -1,4 +1,4 @@
-"""A simulated specimen on a simulated rig: it stands in for the bench, so it shares no assumption with the fit."""
+"""A simulated specimen on a simulated rig. It stands in for the bench, so it shares no assumption with the fit."""
 
 from jaxfinger.synthetic.fingers import polynomial_finger as polynomial_finger
 from jaxfinger.synthetic.fingers import specimen_of as specimen_of

@@ -1,11 +1,11 @@
-"""VD.3 at the finger: tendons drive the free joints, both slide with dry friction that is not smoothed.
+"""Forward simulation of VD.3: tendons drive the free joints. The dry friction of both is not smoothed.
 
 Moreau's time stepping (Moreau 1988; Acary and Brogliato 2008, ch. 10): over a step h the velocity changes by smooth
-forces, taken at the middle position, and by friction impulses λ, which must oppose the sliding that remains:
+forces F, taken at the middle position, and by friction impulses λ, which must oppose the sliding that remains:
 
     M (v⁺ − v) = h F(q + h v / 2, v) − Dᵀ λ,    λ_i ∈ h limit_i Sgn((D v⁺)_i),    D = [1; C]
 
-with the joints' rates first and the tendons' after. Gauss–Seidel projection solves for λ until it stands still.
+with the joints' rates first and the tendons' after. Projected Gauss–Seidel iterations solve for λ.
 """
 
 from __future__ import annotations
@@ -20,32 +20,37 @@ from jaxtyping import Float
 from jaxfinger.compilation import QUICK
 from jaxfinger.model import rigid_body
 from jaxfinger.model.finger import Finger
-from jaxfinger.synthetic.controller import Controller, Targets
+from jaxfinger.synthetic.controller import Targets, TensionController
 from jaxfinger.synthetic.specimen import Specimen
 
 Array = Any  # NumPy or JAX
-SUBSTEPS = 2  # a sample of the rig's clock
-SWEEPS = 200  # at most
-TOLERANCE = 1e-9  # of the impulses' change, relative to their limits
+# Steps per sample of the recording: 0.5 ms at 1 kHz, at which free motion keeps its energy to 0.5 % over 50 ms
+# (`test_frictionless_undriven_finger_keeps_its_energy`).
+SUBSTEPS = 2
+MAX_SWEEPS = 200  # Gauss–Seidel sweeps of a step: bounds its time. The sweeps start from the last step's impulses.
+TOLERANCE = 1e-9  # largest change of an impulse in the last sweep, relative to its limit
 
 
 class Simulator:
-    """Forward simulation of a specimen; compiled once for all trials of a length."""
+    """Forward simulation of a specimen, compiled once for all trials of one length."""
 
     def __init__(self, specimen: Specimen, finger: Finger):
         self.specimen, self.finger = specimen, finger
         self._run = jax.jit(self._simulate, compiler_options=QUICK)
 
     def __call__(
-        self, q0: Float[Array, " m"], dt: float, controller: Controller
+        self, q0: Float[Array, " m"], dt: float, controller: TensionController
     ) -> tuple[Float[Array, "m N"], Float[Array, "m N"], Float[Array, "n N"]]:
-        """q, rad, q̇, rad/s, and tension, N, every `dt` s, from rest; the tension is constant between two samples."""
+        """Return q (rad), q̇ (rad/s) and tension (N) every `dt` s, from rest at `q0` (rad).
+
+        The tension is constant between two samples.
+        """
         targets = Targets(*(jnp.asarray(x.T) for x in controller.targets))
         outputs = self._run(jnp.asarray(q0), dt, controller._replace(targets=targets))
         q, v, tension = (np.asarray(x).T for x in outputs)
         return q, v, tension
 
-    def _simulate(self, q0, dt, controller: Controller):
+    def _simulate(self, q0, dt, controller: TensionController):
         def sample(carry, target):
             state, tension = carry
             tension = controller.tension(self.specimen, state.q, state.v, tension, target, dt)
@@ -60,23 +65,23 @@ class Simulator:
 
 
 class PlantState(NamedTuple):
-    """Position, rad, velocity now and a step before, rad/s, and friction impulses of joints, then tendons."""
+    """State of the simulation between two steps."""
 
-    q: Float[Array, " m"]
-    v: Float[Array, " m"]
-    v_before: Float[Array, " m"]
-    impulse: Float[Array, " m+n"]  # N m s and N s
+    q: Float[Array, " m"]  # rad
+    v: Float[Array, " m"]  # rad/s
+    v_before: Float[Array, " m"]  # rad/s, a step before
+    impulse: Float[Array, " m+n"]  # friction impulses of the last step: joints (N m s), then tendons (N s)
 
 
 def at_rest(finger: Finger, q: Float[Array, " m"]) -> PlantState:
-    """Nothing moves and nothing rubs yet."""
+    """Return the state of a finger at rest at q, without friction impulses."""
     return PlantState(q, jnp.zeros_like(q), jnp.zeros_like(q), jnp.zeros(finger.m + finger.n))
 
 
 def step(
     specimen: Specimen, finger: Finger, state: PlantState, tension: Float[Array, " n"], h: float | Float[Array, ""]
 ) -> PlantState:
-    """One step of h s. Forces that depend on velocity take it extrapolated to the middle of the step."""
+    """Advance by one step of h s. Forces that depend on velocity are taken at its value extrapolated to mid-step."""
     q, v, v_before, impulse = state
     middle, v_middle = q + 0.5 * h * v, 1.5 * v - 0.5 * v_before
     C = specimen.moment_arm(middle)
@@ -93,7 +98,7 @@ def step(
 
 
 def _mass_and_bias(finger: Finger, q, v):
-    """M and N + G from one batched recursion: at rest, at unit accelerations, and at the velocity v."""
+    """Return M (m, m) and N + G (m,) from one batched recursion: at rest, at unit accelerations, and at velocity v."""
     m = q.size
     columns = jnp.repeat(q[:, None], m + 2, axis=1)
     qd = jnp.zeros((m, m + 2)).at[:, -1].set(v)
@@ -103,7 +108,10 @@ def _mass_and_bias(finger: Finger, q, v):
 
 
 def friction_impulse(A, rates, limit, start):
-    """λ with |λ_i| ≤ limit_i that opposes w = rates − A λ wherever w_i is not zero, by projected Gauss–Seidel."""
+    """Return λ with |λ_i| ≤ limit_i that opposes w = rates − A λ wherever w_i is not zero.
+
+    Projected Gauss–Seidel from `start`, until no impulse changes by more than TOLERANCE of its limit.
+    """
     diagonal = jnp.diagonal(A)
     gain = jnp.where(diagonal > 0.0, 1.0 / jnp.where(diagonal > 0.0, diagonal, 1.0), 0.0)
     scale = jnp.maximum(limit, 1e-3 * jnp.max(limit)) + 1e-300
@@ -117,6 +125,6 @@ def friction_impulse(A, rates, limit, start):
         return new, jnp.max(jnp.abs(new - old) / scale), count + 1
 
     def moving(state):
-        return (state[1] > TOLERANCE) & (state[2] < SWEEPS)
+        return (state[1] > TOLERANCE) & (state[2] < MAX_SWEEPS)
 
     return jax.lax.while_loop(moving, sweep, (jnp.clip(start, -limit, limit), jnp.inf, 0))[0]

@@ -1,4 +1,4 @@
-"""Specimens by recipe: described ones, the paper's, one whose truth the nominal model can express, random ones."""
+"""Specimens that a recipe can ask for: the paper's finger, its polynomial form, random fingers, described fingers."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from jaxfinger.synthetic.recipe import DescribedFinger, JointTerms, SpecimenReci
 from jaxfinger.synthetic.routes import PolynomialRoute, Route
 from jaxfinger.synthetic.specimen import PolynomialFriction, PolynomialSpring, Specimen
 
-EXCURSION_DEGREE, TORQUE_DEGREE = 4, 2  # the paper's
+EXCURSION_DEGREE, TORQUE_DEGREE = 4, 2  # degrees of the paper's polynomials (ID.2, ID.3)
 
 
 def specimen_of(recipe: SpecimenRecipe | DescribedFinger) -> Specimen:
-    """The specimen that `[specimen]` asks for, or that is described.
+    """Return the specimen that `[specimen]` asks for, or the described one.
 
     Raises:
         UserError: the random finger is to have fewer than 1 or more than 7 joints.
@@ -36,7 +36,7 @@ def specimen_of(recipe: SpecimenRecipe | DescribedFinger) -> Specimen:
 
 
 def _described(said: DescribedFinger) -> Specimen:
-    """The finger with the moment arms that its file knows, and with its terms."""
+    """Return the finger of a description, with the moment arms of its file and its terms."""
     finger = said.finger
     joints = [said.terms.joints.get(name, JointTerms()) for name in finger.joint_names]
     tendons = [said.terms.tendons.get(name, TendonTerms()) for name in finger.tendon_names]
@@ -57,7 +57,10 @@ def _described(said: DescribedFinger) -> Specimen:
 
 
 def polynomial_finger(specimen: Specimen) -> Specimen:
-    """The nearest specimen whose terms are the nominal model's polynomials, so that statistics have an exact truth."""
+    """Replace a specimen's terms by least-squares polynomials over the joints' ranges, the nominal model's form.
+
+    The nominal model can express the result exactly, so statistics over its sessions have an exact truth.
+    """
     limits = specimen.description.limits
     q = np.linspace(limits[:, 0], limits[:, 1], 401, axis=1)
 
@@ -80,12 +83,15 @@ def polynomial_finger(specimen: Specimen) -> Specimen:
 
 
 def study_finger(joints: int = 1) -> Specimen:
-    """For studies over many sessions, with an exact truth: the paper's finger with three joints, else a random one."""
+    """Return a polynomial finger for studies over many sessions: the paper's for three joints, else a random one."""
     return polynomial_finger(paper_finger() if joints == 3 else random_finger(0, joints, "planar", "antagonists"))
 
 
 def true_model(specimen: Specimen) -> Model:
-    """The true parameters of a polynomial specimen, as the nominal model holds them; passive tendons have no path."""
+    """Return the nominal model with the true parameters of a polynomial specimen.
+
+    A passive tendon keeps a zero moment arm: it is no part of the nominal model.
+    """
     (spring,), friction, finger = specimen.springs, specimen.friction, Finger.from_description(specimen.description)
     assert isinstance(spring, PolynomialSpring)
     assert isinstance(friction, PolynomialFriction)
@@ -104,5 +110,5 @@ def true_model(specimen: Specimen) -> Model:
 
 
 def _fitted(q, values, powers) -> tuple[float, ...]:
-    """Coefficients of the least-squares polynomial in the given powers."""
+    """Coefficients of the least-squares polynomial with the given powers of q."""
     return tuple(np.linalg.lstsq(np.stack([q**p for p in powers], axis=1), values, rcond=None)[0].tolist())

@@ -1,4 +1,4 @@
-"""The session that the rig would record of a fitted model."""
+"""Simulate the session that the rig would record of a fitted model."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ from jaxfinger.synthetic.specimen import PolynomialFriction, PolynomialSpring, S
 def session_of_model(
     model: Model, name: str, recipe: SessionRecipe, seed: int | None = None, progress: Progress | None = None
 ) -> Session:
-    """The recipe's trials on a model, effects included, in place of the recipe's specimen.
+    """Simulate the recipe's trials on a model, with its effects, in place of the recipe's specimen.
+
+    `name` becomes the session's specimen. The recipe's seed is used unless `seed` is given.
 
     Raises:
         UserError: the recipe does not fit the finger, or a driven motion leaves the joints' limits.
@@ -32,7 +34,7 @@ def session_of_model(
 
 
 def describe_finger(finger: Finger) -> FingerDescription:
-    """The model's finger as a file holds it."""
+    """Return the model's finger as a file describes it."""
     arrays = ("gravity", "axis", "origin", "limits", "mass", "com", "inertia", "fingertip")
     return FingerDescription(
         **{k: np.array(getattr(finger, k)) for k in arrays},
@@ -45,7 +47,7 @@ def describe_finger(finger: Finger) -> FingerDescription:
 
 
 def _nominal_specimen(model: Model, description: FingerDescription) -> Specimen:
-    """The model without effects and cross terms: what the rig's controller knows of it in VD.3."""
+    """Return the model without effects and without terms that couple joints, for the rig's controller of VD.3."""
     rows = np.asarray(model.moment_arm.coefficients)
 
     def route(k: int, i: int) -> PolynomialRoute | None:

@@ -1,4 +1,4 @@
-"""A model in place of the finger: a fit, or the nominal model with effects switched on, recorded by the same rig."""
+"""A plant that is a model: a fit, or the nominal model with effects, recorded by the same simulated rig."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from jaxfinger.synthetic.plant import Channels, Plant
 from jaxfinger.synthetic.protocols import TrialPlan
 
 Array = np.ndarray
-LEAST = 1024  # samples: lengths are rounded up to a power of two from here on, so that few programs are compiled
+MIN_SAMPLES = 1024  # Trials are padded to a power of two, at least this, so that few lengths are compiled.
 
 
 class ModelPlant:
-    """What a model predicts of a plan; the encoders read the planned motion.
+    """A plant whose channels are a model's predictions. In prescribed trials the encoders read the planned motion.
 
-    VD.3 is simulated forward under the tensions of `driver`, a plant whose controller closes the loop: the model's own
-    motion departs from the plan as far as the two plants differ.
+    VD.3 is simulated forward under the tensions of `driver`, a plant with a controller. The model's motion departs from
+    the driver's as far as the two plants differ.
     """
 
     def __init__(self, model: Model, driver: Plant | None = None):
         self.model = model
         self.driver = driver
-        self.by_the_clock = bool(model.effects)
+        self.depends_on_session_time = bool(model.effects)
 
     def prescribed(self, plan: TrialPlan) -> Channels:
-        """All channels of the plan's experiment."""
+        """Return the channels of the plan's experiment, without noise."""
         channels = ("tendon_excursion",)
         if plan.experiment.startswith("ID.3"):
             channels = ("joint_torque",)
@@ -48,7 +48,7 @@ class ModelPlant:
         }
 
     def driven(self, plan: TrialPlan) -> Channels:
-        """VD.3 under the driver's tensions, from rest at its first position.
+        """Return the channels of VD.3 under the driver's tensions, from rest at its first position.
 
         Raises:
             UserError: there is no driver.
@@ -57,7 +57,7 @@ class ModelPlant:
             raise UserError(f"recipe: trial {plan.name} needs tensions that the model alone does not give; drop VD.3")
         driven = self.driver.driven(plan)
         tension, q0 = jnp.asarray(driven["tendon_force"]), jnp.asarray(driven["q"][:, 0])
-        start: Any = jnp.asarray(plan.session_start)  # traced, so that trials share a program
+        start: Any = jnp.asarray(plan.session_start)  # As an array it is traced, so all trials share one compilation.
         q, _ = _simulate(self.model, jnp.asarray(plan.time), tension, q0, jnp.zeros_like(q0), session_start=start)
         excursion = _predict(
             self.model, self._motion(plan, np.asarray(q), driven["tendon_force"]), ("tendon_excursion",)
@@ -71,7 +71,10 @@ class ModelPlant:
     def _motion(
         self, plan: TrialPlan, q: Float[Array, "m N"] | None = None, tension: Float[Array, "n N"] | None = None
     ) -> Motion:
-        """The plan, or a motion at the plan's instants, as the model takes it; the last sample repeated as padding."""
+        """Return the plan's motion, or `q` and `tension` at its instants, as the model takes it.
+
+        The last sample is repeated up to a power of two of samples.
+        """
         q, tension = plan.q if q is None else q, plan.tension if tension is None else tension
         qd, qdd = (plan.qd, plan.qdd) if q is plan.q else _derivatives(plan.time, q)
         joint = np.sign(qd) if plan.joint_direction is None else 1.0 * plan.joint_direction
@@ -80,7 +83,7 @@ class ModelPlant:
         motorised = np.zeros_like(q)
         if plan.joint is not None and plan.experiment != "ID.2":
             motorised[plan.joint] = 1.0
-        padded = max(LEAST, 1 << (plan.time.size - 1).bit_length()) - plan.time.size
+        padded = max(MIN_SAMPLES, 1 << (plan.time.size - 1).bit_length()) - plan.time.size
 
         def pad(x: Array):
             return jnp.asarray(np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, padded)], mode="edge"))

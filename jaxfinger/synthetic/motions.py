@@ -1,4 +1,4 @@
-"""Commanded motions with their exact derivatives: steps, sweeps, and paths as a hand leads them."""
+"""Commanded motions with their exact derivatives: steps, sweeps, strokes of a hand, sines."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ class Path(NamedTuple):
 
 
 class Staircase(NamedTuple):
-    """A path of steps: where it dwells, and in which direction it moves or was approached."""
+    """A path of steps with dwells between them."""
 
     path: Path
     step: Int[Array, " N"]  # index of the point that the sample is at or moving to
-    dwelling: Int[Array, " N"]  # 1 at rest
-    direction: Int[Array, " N"]  # −1, 0, 1
+    dwelling: Int[Array, " N"]  # 1 where it dwells
+    direction: Int[Array, " N"]  # −1, 0, 1: direction of the move, kept in the dwell after it
 
 
 def minimum_jerk(time: Float[Array, " N"], points: Numbers, move: Numbers, dwell: Numbers) -> Staircase:
-    """From points[0] on to each next point in `move` s and a rest of `dwell` s, without jumps of acceleration.
+    """Minimum-jerk steps from points[0] to each next point: k-th move of move[k] s, then a dwell of dwell[k] s.
 
-    x = x₀ + Δ (10 s³ − 15 s⁴ + 6 s⁵): Flash and Hogan (1985), eq. 3.
+    x = x₀ + Δ (10 s³ − 15 s⁴ + 6 s⁵), s from 0 to 1 (Flash and Hogan 1985, eq. 3). The acceleration has no jumps.
     """
     start = np.concatenate([[0.0], np.cumsum(np.add(move, dwell))])[:-1]
     k = np.clip(np.searchsorted(start, time, side="right") - 1, 0, start.size - 1)
@@ -50,14 +50,15 @@ def minimum_jerk(time: Float[Array, " N"], points: Numbers, move: Numbers, dwell
 def sweeps(
     rate: float, lower: float, upper: float, speeds: Sequence[float], cycles: int, acceleration: float = 10.0
 ) -> Path:
-    """Back and forth from lower to upper and back, `cycles` times at each speed (rad/s), from rest to rest.
+    """Sweeps from lower to upper and back (rad), `cycles` times at each speed (rad/s), at `rate` Hz, from rest to rest.
 
-    The velocity is constant but for the reversals, where it is v cos(π s / 2), s from −1 to 1: the acceleration is
-    continuous, and at every reversal the same (rad/s²) whatever the speed.
+    The velocity is constant except at the reversals. There it is v cos(π s / 2), s from −1 to 1, so the acceleration is
+    continuous, and its peak `acceleration` (rad/s²) is the same at every speed. A range too short to reach a speed is
+    swept at the highest speed that it allows.
     """
     fastest = np.sqrt(0.5 * acceleration * (upper - lower))
-    v = np.minimum(speeds, fastest)  # a short range leaves no room to reach a high speed
-    turn = v / acceleration  # s: v × turn is the way covered while speeding up
+    v = np.minimum(speeds, fastest)
+    turn = v / acceleration  # s. v · turn is the distance covered while speeding up.
     ramp = 0.5 * np.pi * turn  # s
     cruise = (upper - lower) / v - 2.0 * turn
     half = cruise + 2.0 * ramp
@@ -79,7 +80,7 @@ def sweeps(
 def wander(
     time: Float[Array, " N"], lower: float, upper: float, rng: np.random.Generator, stroke: tuple[float, float]
 ) -> Path:
-    """As a hand leads a joint: minimum-jerk strokes, of a random time within `stroke` s, to random places."""
+    """Path of a joint led by hand: minimum-jerk strokes to random places, each of a random time within `stroke` (s)."""
     strokes = rng.uniform(*stroke, int(time[-1] / stroke[0]) + 2)
     places = rng.uniform(lower, upper, strokes.size + 1)
     return minimum_jerk(time, places, strokes, np.zeros(strokes.size)).path
@@ -93,7 +94,7 @@ def swing(
     slow: float = 0.25,
     fast: float = 0.7,
 ) -> Path:
-    """Two sines, of `slow` to `fast` Hz, about a centre, let in over the first second: the motion starts at rest."""
+    """Sum of two sines of `slow` to `fast` Hz about a centre, faded in over the first second: it starts at rest."""
     w = 2.0 * np.pi * np.sort(rng.uniform(slow, fast, 2))
     share = rng.uniform(0.4, 0.6)
     sines = [

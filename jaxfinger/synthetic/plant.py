@@ -1,4 +1,4 @@
-"""What happens at the finger when a plan is run: channels without noise, at the plan's instants, batch last."""
+"""Plants: what the finger does when a plan is run, as channels without noise at the plan's instants, time last."""
 
 from __future__ import annotations
 
@@ -15,45 +15,45 @@ from jaxfinger.compilation import QUICK
 from jaxfinger.errors import UserError
 from jaxfinger.model import rigid_body
 from jaxfinger.model.finger import Finger
-from jaxfinger.synthetic.controller import Controller, feedforward
+from jaxfinger.synthetic.controller import TensionController, feedforward
 from jaxfinger.synthetic.driven import Simulator
 from jaxfinger.synthetic.protocols import TrialPlan
 from jaxfinger.synthetic.specimen import Specimen
 
 Array = np.ndarray
-Channels = dict[str, Float[Array, "_channels N"]]  # of one trial
-BLOCK = 4096  # samples: one compiled rigid-body call serves trials of any length
+Channels = dict[str, Float[Array, "_channels N"]]  # channels of one trial, by name, SI
+BLOCK_SAMPLES = 4096  # samples of one rigid-body call, so that one compilation serves trials of any length
 
 
 @runtime_checkable
 class Plant(Protocol):
-    """Anything that can stand in for the finger on the rig: a specimen, or a fitted model."""
+    """Anything that the rig can record in place of a finger: a specimen, or a model."""
 
-    by_the_clock: bool  # whether the session's time tells repeats of one motion apart
+    depends_on_session_time: bool  # whether repeats of one motion differ with the session's time
 
     def prescribed(self, plan: TrialPlan) -> Channels:
-        """Motion and tension as planned: `q`, `tendon_force`, and the channels that they cause."""
+        """Return motion and tension as planned (`q`, `tendon_force`) and the channels that follow from them."""
         ...
 
     def driven(self, plan: TrialPlan) -> Channels:
-        """VD.3: the motion that tendons make of the planned one, and their tensions."""
+        """Return motion, tensions and excursions of VD.3, in which the tendons drive the finger along the plan."""
         ...
 
 
 class SpecimenPlant:
-    """The finger as it really is: equation (1) with the specimen's terms."""
+    """A specimen as a plant: equation (1) with the specimen's terms."""
 
-    by_the_clock = False
+    depends_on_session_time = False
 
     def __init__(self, specimen: Specimen):
         self.specimen = specimen
         self.finger = Finger.from_description(specimen.description)
 
     def prescribed(self, plan: TrialPlan) -> Channels:
-        """All channels of the plan's experiment; those that the rig does not measure are left out later."""
+        """Return all channels of the plan's experiment; `sensors.record` leaves out what the rig does not measure."""
         channels = {"q": plan.q, "tendon_force": plan.tension}
         if plan.held:
-            pose = plan.q[:, :1]  # held all the time: the terms of the pose are wanted once
+            pose = plan.q[:, :1]  # The joints are held: one sample gives the terms that depend on q.
             torque = self._holding_torque(pose, joint_tension(plan.tension, self.specimen.loss(plan.tension)))
             channels["tendon_excursion"] = np.repeat(self.specimen.excursion(pose), plan.time.size, axis=1)
             if plan.experiment == "VD.2":
@@ -67,7 +67,7 @@ class SpecimenPlant:
         return channels
 
     def driven(self, plan: TrialPlan) -> Channels:
-        """Forward simulation under the rig's tracking controller.
+        """Return the channels of VD.3, simulated forward under the rig's tension controller.
 
         Raises:
             UserError: the motion leaves the joints' limits.
@@ -97,15 +97,15 @@ class SpecimenPlant:
         return gravity + self.specimen.elastic(pose) - self.specimen.moment_arm(pose)[:, :, 0].T @ tension
 
     def _contact_force(self, pose: Float[Array, "m 1"], torque: Float[Array, "m N"]) -> Float[Array, "3 N"]:
-        """Least-squares solution of Jᵀ f_ext = τ, N.
+        """Contact force f_ext (3, N), N: least-squares solution of Jᵀ f_ext = τ.
 
-        What a planar contact force cannot take is taken by the joints' static friction (dataset format, VD.2).
+        The joints' static friction takes the rest of the torque (dataset format, VD.2).
         """
         _, jacobian = self._fingertip(self.finger, jnp.asarray(pose[:, 0]))
         return np.linalg.pinv(np.asarray(jacobian).T, rcond=1e-9) @ torque
 
-    def controller(self, plan: TrialPlan) -> Controller:
-        """The rig's controller for a VD.3 plan."""
+    def controller(self, plan: TrialPlan) -> TensionController:
+        """Return the rig's tension controller for a VD.3 plan."""
         return feedforward(self.specimen, plan, self._rigid_body(plan.q, plan.qd, plan.qdd))
 
     @cached_property
@@ -122,19 +122,19 @@ class SpecimenPlant:
         return jax.jit(rigid_body.fingertip, compiler_options=QUICK)
 
     def _rigid_body(self, *state: Float[Array, "m N"]) -> Float[Array, "m N"]:
-        """M q̈ + N + G, in blocks of equal length."""
+        """M q̈ + N + G, N m, computed in blocks of BLOCK_SAMPLES."""
         samples = state[0].shape[1]
-        padded = -(-samples // BLOCK) * BLOCK
+        padded = -(-samples // BLOCK_SAMPLES) * BLOCK_SAMPLES
         state = tuple(np.pad(x, ((0, 0), (0, padded - samples)), mode="edge") for x in state)
         blocks = [
-            np.asarray(self._inverse_dynamics(self.finger, *(jnp.asarray(x[:, k : k + BLOCK]) for x in state)))
-            for k in range(0, padded, BLOCK)
+            np.asarray(self._inverse_dynamics(self.finger, *(jnp.asarray(x[:, k : k + BLOCK_SAMPLES]) for x in state)))
+            for k in range(0, padded, BLOCK_SAMPLES)
         ]
         return np.concatenate(blocks, axis=1)[:, :samples]
 
 
 def joint_tension(tension: Float[Array, "n N"], loss: Float[Array, "n N"]) -> Float[Array, "n N"]:
-    """Tension at a held joint, N, from slack on: f_j = clip(f_j before, f_t − loss, f_t + loss), sample by sample."""
+    """Tension at a held joint, N: f_j = clip(previous f_j, f_t − loss, f_t + loss), sample by sample, from slack on."""
     reached = np.zeros_like(tension)
     for k in np.flatnonzero(tension.any(axis=1)):
         f = 0.0

@@ -1,4 +1,4 @@
-"""The rig's programme: every trial of a session as commanded, one function an experiment."""
+"""The trials of a simulated session as commanded, one function per experiment."""
 
 from __future__ import annotations
 
@@ -16,14 +16,18 @@ from jaxfinger.synthetic import motions
 from jaxfinger.synthetic.recipe import Postures, Trials
 
 Array = np.ndarray
-FRACTIONS = (0.3, 0.55)  # of the joints' ranges: the postures where the recipe names none
-INSET = 0.08  # share of a joint's range that steps and sweeps keep away from its ends
-PAUSE = 15.0  # s between trials
+# Postures where the recipe names none, as shares of the joints' ranges: slightly and half flexed.
+DEFAULT_POSTURES = (0.3, 0.55)
+INSET = 0.08  # share of a joint's range that steps and sweeps keep from each end, clear of the mechanical stops
+PAUSE = 15.0  # s between trials, in which an operator would prepare the next one
 
 
 @dataclass(frozen=True)
 class TrialPlan:
-    """One trial as commanded; joint arrays (m, N), tendon arrays (n, N). In VD.3, `q` is the desired motion."""
+    """One trial as commanded, with joint arrays (m, N) and tendon arrays (n, N). In VD.3 `q` is the desired motion.
+
+    Trials with the same `motion` repeat each other.
+    """
 
     name: str
     experiment: str
@@ -33,22 +37,23 @@ class TrialPlan:
     qd: Float[Array, "m N"]  # rad/s
     qdd: Float[Array, "m N"]  # rad/s²
     tension: Float[Array, "n N"]  # N
-    joint: int | None = None  # moved or instrumented
-    tendon: int | None = None  # pulled
-    joint_direction: Int[Array, "m N"] | None = None
-    tendon_direction: Int[Array, "n N"] | None = None
-    hold: Int[Array, " N"] | None = None
-    session_start: float = 0.0  # s
+    joint: int | None = None  # index of the joint that is moved or instrumented
+    tendon: int | None = None  # index of the tendon that is pulled
+    joint_direction: Int[Array, "m N"] | None = None  # −1, 0, 1
+    tendon_direction: Int[Array, "n N"] | None = None  # −1, 0, 1
+    hold: Int[Array, " N"] | None = None  # index of the hold, −1 between holds
+    session_start: float = 0.0  # s from the start of the session
 
     @property
     def held(self) -> bool:
-        """A fixture holds the joints: they carry no friction, and tendons move only when their loss is exceeded."""
+        """Whether fixtures hold the joints. Then joints show no friction, and tendons move only beyond their loss."""
         return self.experiment in ("ID.4", "VD.2")
 
 
 def session_plan(finger: FingerDescription, trials: Trials) -> tuple[TrialPlan, ...]:
-    """All trials of a session in the order in which the rig runs them, repeats side by side; without tendons, those of
-    them that need none.
+    """Return all trials of a session in the order in which the rig runs them, repeats side by side.
+
+    A finger without active tendons has only the trials of ID.3.
 
     Raises:
         UserError: a posture or a tendon of the recipe does not fit the finger.
@@ -76,7 +81,7 @@ def session_plan(finger: FingerDescription, trials: Trials) -> tuple[TrialPlan, 
 
 
 def _excursions(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
-    """ID.2: the joint from one end of its range to the other and back, as slowly as a hand does it."""
+    """ID.2: a joint moved by hand from one end of its range to the other and back."""
     e = trials.id2
     for joint in range(finger.m):
         for letter, posture in _postures(finger, e.postures, "trials.id2"):
@@ -91,7 +96,7 @@ def _excursions(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan
 
 
 def _static(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
-    """ID.3-static: every hold approached from below on the way up and from above on the way down."""
+    """ID.3-static: a joint held in steps. Holds are approached from below on the way up, from above on the way down."""
     e = trials.id3_static
     for joint in range(finger.m):
         lower, upper = _inset(finger.limits[joint])
@@ -99,7 +104,7 @@ def _static(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
         count = max(5, round((upper - lower) / np.deg2rad(e.step)) + 1)
         steps = np.linspace(lower, upper, count)
         points = [lower - margin, *steps, upper + margin, *steps[::-1]]
-        turn = count + 1  # the point beyond the last hold, where nothing is held
+        turn = count + 1  # index of the point beyond the last hold, which is no hold
         dwell = [e.dwell if k != turn else 0.0 for k in range(1, len(points))]
         move = [e.move] * (len(points) - 1)
         time = _clock(trials.rate, sum(move) + sum(dwell))
@@ -115,7 +120,7 @@ def _static(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
 
 
 def _sweeps(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
-    """ID.3-dynamic: the joint back and forth at constant speeds."""
+    """ID.3-dynamic: a joint driven back and forth at constant speeds."""
     e = trials.id3_dynamic
     for joint in range(finger.m):
         path = motions.sweeps(trials.rate, *_inset(finger.limits[joint]), e.speeds, e.cycles)
@@ -129,7 +134,7 @@ def _sweeps(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
 
 
 def _pulls(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
-    """ID.4: from slack up through the tensions and back down, the instrumented joint held."""
+    """ID.4: a tendon pulled from slack up through the tensions and back down, with the instrumented joint held."""
     e = trials.id4
     for tendon in np.flatnonzero(finger.active):
         crossed = np.flatnonzero(finger.crosses[tendon])
@@ -152,7 +157,7 @@ def _pulls(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
 
 
 def _contacts(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
-    """VD.2: the fingertip in the thimble, one tendon pulled in rising steps, the others slack."""
+    """VD.2: the fingertip on its force sensor, one tendon pulled in rising steps, the others slack."""
     e = trials.vd2
     most = max(np.flatnonzero(finger.active), key=lambda k: finger.crosses[k].sum())
     for name in e.tendons or (finger.tendon_names[most],):
@@ -166,7 +171,7 @@ def _contacts(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
 
 
 def _free_paths(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
-    """VD.1: all joints led by hand, tendons kept taut."""
+    """VD.1: all joints led by hand, with the tendons kept taut."""
     e = trials.vd1
     for k in range(e.motions):
         motion = f"VD.1-{_letter(k)}"
@@ -177,7 +182,7 @@ def _free_paths(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan
 
 
 def _drives(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
-    """VD.3: what the tendons are to make of the finger; the tensions come of the rig's controller."""
+    """VD.3: the desired motion of the free finger. Its tensions come from the rig's controller when it is run."""
     e = trials.vd3
     for k in range(e.motions):
         motion = f"VD.3-{_letter(k)}"
@@ -189,7 +194,7 @@ def _drives(finger: FingerDescription, trials: Trials) -> Iterator[TrialPlan]:
 
 
 def _moved(finger, experiment, motion, time, posture, joint, path, tension) -> TrialPlan:
-    """One joint along a path, the others held at a posture."""
+    """Plan one joint along a path, with the others held at a posture."""
     q = np.repeat(posture[:, None], time.size, axis=1)
     q[joint] = path.x
     rates = [_row(finger.m, joint, x) for x in (path.v, path.a)]
@@ -197,7 +202,7 @@ def _moved(finger, experiment, motion, time, posture, joint, path, tension) -> T
 
 
 def _stepped(finger, rate, experiment, motion, posture, tendon, tensions, move, dwell, joint=None) -> TrialPlan:
-    """All joints held, one tendon from slack through steps of tension."""
+    """Plan one tendon from slack through steps of tension, with all joints held."""
     count = len(tensions)
     time = _clock(rate, count * (move + dwell))
     stairs = motions.minimum_jerk(time, (0.0, *tensions), (move,) * count, (dwell,) * count)
@@ -220,10 +225,10 @@ def _stepped(finger, rate, experiment, motion, posture, tendon, tensions, move, 
 
 
 def _postures(finger: FingerDescription, given: Postures, key: str, count: int = 2) -> Iterator[tuple[str, Array]]:
-    """Postures with a letter each, rad: the recipe's, or `count` at fractions of the joints' ranges."""
+    """Yield a letter and a posture (m,), rad, for each posture of the recipe, or for the first `count` defaults."""
     if not given:
         lower, upper = finger.limits.T
-        for k, fraction in enumerate(FRACTIONS[:count]):
+        for k, fraction in enumerate(DEFAULT_POSTURES[:count]):
             yield _letter(k), lower + fraction * (upper - lower)
     for k, degrees in enumerate(given):
         if len(degrees) != finger.m:
@@ -239,35 +244,38 @@ def _postures(finger: FingerDescription, given: Postures, key: str, count: int =
 
 
 def _holds(stairs: motions.Staircase, skip: int | None = None) -> Array:
-    """Running index of the rests, −1 elsewhere; the point `skip` is none."""
+    """Running index of the dwells, −1 between them. The dwell at point `skip` does not count."""
     resting = (stairs.dwelling == 1) & (stairs.step != (-1 if skip is None else skip))
     number = stairs.step - 1 if skip is None else stairs.step - 1 - (stairs.step > skip)
     return np.where(resting, number, -1)
 
 
 def _taut(finger: FingerDescription, time: Array, tension: float, rng: np.random.Generator) -> Array:
-    """Every active tendon kept near one tension; the controller lets it wander by a twentieth."""
+    """Tensions (n, N), N, of active tendons that a controller keeps near one value, within a twentieth of it."""
     wave = np.stack([np.sin(2 * np.pi * (rng.uniform(0.05, 0.2) * time + rng.uniform())) for _ in range(finger.n)])
     return tension * (1.0 + 0.05 * wave) * finger.active[:, None]
 
 
 def _slack(finger: FingerDescription, time: Array) -> Array:
+    """Tensions (n, N) of slack tendons."""
     return np.zeros((finger.n, time.size))
 
 
 def _row(rows: int, row: int, values: Array) -> Array:
-    """Zero but for one row."""
+    """Return an array of zeros with one row of values."""
     table = np.zeros((rows, values.size), dtype=values.dtype)
     table[row] = values
     return table
 
 
 def _stacked(paths: Sequence[motions.Path]) -> tuple[Array, Array, Array]:
+    """Return q, q̇ and q̈, each (m, N), of the joints' paths."""
     q, qd, qdd = (np.stack(parts) for parts in zip(*paths, strict=True))
     return q, qd, qdd
 
 
 def _inset(limits: Array) -> tuple[float, float]:
+    """Joint limits moved inward by INSET of the range, rad."""
     margin = INSET * (limits[1] - limits[0])
     return float(limits[0] + margin), float(limits[1] - margin)
 
@@ -281,5 +289,5 @@ def _letter(k: int) -> str:
 
 
 def _rng(trials: Trials, motion: str) -> np.random.Generator:
-    """The same commanded motion in every session that is planned with this seed."""
+    """Random generator of one motion: it depends only on the motion's name and `motion_seed`."""
     return np.random.default_rng([trials.motion_seed, zlib.crc32(motion.encode())])

@@ -1,4 +1,4 @@
-"""Fingers that nobody built: 1 to 7 joints, abduction or skewed axes, tendons laid out in two ways."""
+"""Random fingers: 1 to 7 joints, planar, with abduction or with tilted axes, and two layouts of tendons."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from jaxfinger.synthetic.paper_finger import box_inertia
 from jaxfinger.synthetic.routes import Route, WrappedRoute
 from jaxfinger.synthetic.specimen import GrowingFriction, PolynomialSpring, Routes, Specimen
 
-ABDUCTION = np.deg2rad(20.0)
+ABDUCTION = np.deg2rad(20.0)  # range of abduction to either side, as of a human MCP joint
 
 
 def random_finger(seed: int, m: int = 3, layout: str = "planar", tendons: str = "antagonists") -> Specimen:
-    """A specimen of m joints.
+    """Return a random specimen of m joints.
 
-    `layout`: `planar` (all joints flex about y), `abduction` (the first joint turns about z, at the second's place),
-    `spatial` (axes tilted at random). `tendons`: `antagonists` (a flexor and an extensor a joint, crossing the joint
-    before it too) or `fewest` (m flexors and one extensor along the whole finger).
+    `layout` is `planar` (all joints flex about y), `abduction` (the first joint turns about z, at the place of the
+    second) or `spatial` (axes tilted at random). `tendons` is `antagonists` (a flexor and an extensor per joint, which
+    also cross the joint before it) or `fewest` (m flexors and one extensor along the whole finger).
     """
     rng = np.random.default_rng([seed, m])
     description = _description(rng, m, layout, tendons)
@@ -68,16 +68,18 @@ def _description(rng: np.random.Generator, m: int, layout: str, tendons: str) ->
 
 
 def _crossings(m: int, tendons: str) -> np.ndarray:
+    """Which joints each tendon crosses, (n, m)."""
     pairs = np.array([[i - 1 <= j <= i for j in range(m)] for i in range(m)])
     return np.repeat(pairs, 2, axis=0) if tendons == "antagonists" else np.vstack([pairs, np.ones(m, dtype=bool)])
 
 
 def _flexors(m: int, tendons: str) -> list[bool]:
+    """Whether each tendon is a flexor."""
     return [True, False] * m if tendons == "antagonists" else [True] * m + [False]
 
 
 def _routes(rng: np.random.Generator, crosses: np.ndarray, flexor: bool) -> Routes:
-    """A tendon's paths; at the joints before its last one it passes nearer to the axis."""
+    """Routes of one tendon. A flexor passes nearer to the axis at the joints before its last one."""
     last = np.flatnonzero(crosses)[-1]
     return tuple(
         _route(rng, flexor, 1.0 if i == last or not flexor else 0.4) if crossed else None
@@ -86,7 +88,7 @@ def _routes(rng: np.random.Generator, crosses: np.ndarray, flexor: bool) -> Rout
 
 
 def _route(rng: np.random.Generator, flexor: bool, scale: float) -> Route:
-    """As the paper's T3 (lifts off its pulley) or T2 (wraps an eccentric head), at random sizes."""
+    """Route of random size like the paper's T3 (lifts off its pulley) or T2 (wraps an eccentric head)."""
     radius, x, z = scale * rng.uniform(4.5e-3, 6.5e-3), *(scale * rng.uniform(-1e-3, 1e-3, 2))
     proximal, distal = scale * rng.uniform(12e-3, 18e-3, 2)
     height = scale * rng.uniform(-0.8e-3, 0.2e-3) if flexor else radius
@@ -96,6 +98,6 @@ def _route(rng: np.random.Generator, flexor: bool, scale: float) -> Route:
 
 
 def _springs(rng: np.random.Generator, m: int) -> PolynomialSpring:
-    """Soft springs about a posture within each joint's range, stiffening as q³, beyond the nominal degree."""
+    """Soft springs about a rest angle within each joint's range. Their q³ term is beyond the nominal model's degree."""
     stiffness, rest = rng.uniform(0.02, 0.04, m), rng.uniform(0.2, 0.8, m)
     return PolynomialSpring(tuple((-k * r, k, 0.0, 0.2 * k) for k, r in zip(stiffness, rest, strict=True)))

@@ -1,7 +1,7 @@
-"""What is simulated: the specimen, the trials, the sensors. One TOML table each, every key optional.
+"""The recipe of a simulated session: specimen, trials, sensors. Each is a TOML table; every key is optional.
 
-In the place of `[specimen]` stands `[finger]`, as mappings and rig files have it, or the name of a file with it; then a
-finger file is a recipe too. What a finger does beside its links' weight and inertia, `[terms]` says.
+A recipe may describe its finger instead of naming a specimen: by `[finger]`, as in mappings and rig files, or by the
+name of a file with it. So a finger file is a recipe too. `[terms]` then gives elastic torque, friction, damping, loss.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jaxfinger.data import EXPERIMENTS, FingerDescription
 from jaxfinger.data.finger_file import Finger, finger_from
 from jaxfinger.data.toml import Fault, NotEmpty, OneOf, Place, Positive, Share, Within, one_of, read_toml, structure
 
-# A quick session of one joint or a few, for studies over many of them.
+# `[trials]` of a short session, for studies over many sessions: the identification trials at 200 Hz, few steps each.
 SHORT: Mapping[str, Any] = {
     "experiments": ["ID.2", "ID.3-static", "ID.3-dynamic", "ID.4"],
     "rate": 200.0,
@@ -28,29 +28,30 @@ SHORT: Mapping[str, Any] = {
     "id4": {"tensions": [4.0, 7.0, 10.0]},
 }
 
-Count = Annotated[int, Within(1)]
-Some = Annotated[int, Within(0)]
+PositiveInt = Annotated[int, Within(1)]
+NonNegativeInt = Annotated[int, Within(0)]
 NotNegative = Annotated[float, Within(0.0)]
-Several = Annotated[tuple[float, ...], NotEmpty(), Within(0.0, above=True)]
-Postures = tuple[tuple[float, ...], ...]  # degrees, one angle a joint; empty: taken from the finger's limits
+PositiveFloats = Annotated[tuple[float, ...], NotEmpty(), Within(0.0, above=True)]
+Postures = tuple[tuple[float, ...], ...]  # degrees, one angle per joint; empty: taken from the finger's limits
 
 
 @dataclass(frozen=True)
 class SpecimenRecipe:
-    """`[specimen]`: which finger."""
+    """Keys of `[specimen]`: the finger to simulate."""
 
     kind: Literal["paper", "polynomial", "random"] = "paper"
-    name: str = ""
-    passive_tendon: bool = False  # paper: T5 pulls where it is taut
-    seed: Some = 0  # random: which one
-    joints: Count = 3  # random
-    layout: Literal["planar", "abduction", "spatial"] = "planar"  # random
-    tendons: Literal["antagonists", "fewest"] = "antagonists"  # random: 2 m or m + 1 tendons
+    name: str = ""  # empty: the specimen's own name
+    passive_tendon: bool = False  # kind paper: T5 pulls where it is taut
+    # The rest is for kind random (`random_finger`).
+    seed: NonNegativeInt = 0
+    joints: PositiveInt = 3
+    layout: Literal["planar", "abduction", "spatial"] = "planar"
+    tendons: Literal["antagonists", "fewest"] = "antagonists"  # 2 m or m + 1 tendons
 
 
 @dataclass(frozen=True)
 class JointTerms:
-    """`[terms.joints.<joint>]`: torque of springs, of friction and of damping."""
+    """Keys of `[terms.joints.<joint>]`: elastic torque, friction and damping of a joint."""
 
     elastic: tuple[float, ...] = (0.0,)  # N m/rad^p of τ_k, p = 0, 1, …
     friction: tuple[float, ...] = (0.0,)  # N m/rad^p of |τ_f|, p = 0, 1, …
@@ -59,7 +60,7 @@ class JointTerms:
 
 @dataclass(frozen=True)
 class TendonTerms:
-    """`[terms.tendons.<tendon>]`: the tension that is lost on the way, a₀ + a₁ f."""
+    """Keys of `[terms.tendons.<tendon>]`: the loss a₀ + a₁ f_t of a tendon's tension."""
 
     constant: NotNegative = 0.0  # a₀, N
     proportional: NotNegative = 0.0  # a₁
@@ -67,7 +68,7 @@ class TendonTerms:
 
 @dataclass(frozen=True)
 class Terms:
-    """`[terms]`: what is not said of is not there."""
+    """Tables of `[terms]`. Terms that are not given are zero."""
 
     joints: Mapping[str, JointTerms] = field(default_factory=dict)
     tendons: Mapping[str, TendonTerms] = field(default_factory=dict)
@@ -75,7 +76,7 @@ class Terms:
 
 @dataclass(frozen=True)
 class DescribedFinger:
-    """The specimen that a finger's description and its terms make."""
+    """A specimen made of a finger's description and its terms."""
 
     finger: FingerDescription
     terms: Terms
@@ -84,20 +85,20 @@ class DescribedFinger:
 
 @dataclass(frozen=True)
 class Excursions:
-    """`[trials.id2]`: one joint moved slowly through its range."""
+    """Keys of `[trials.id2]`: one joint moved slowly through its range."""
 
-    repeats: Some = 2
+    repeats: NonNegativeInt = 2
     postures: Postures = ()  # of the other joints
-    strokes: Count = 4
+    strokes: PositiveInt = 4
     stroke_time: Positive = 5.0  # s
     tension: Positive = 2.0  # N
 
 
 @dataclass(frozen=True)
 class Static:
-    """`[trials.id3_static]`: one joint stepped through held angles, up and back."""
+    """Keys of `[trials.id3_static]`: one joint stepped through held angles, up and back."""
 
-    repeats: Some = 2
+    repeats: NonNegativeInt = 2
     postures: Postures = ()
     step: Positive = 10.0  # degrees
     move: Positive = 0.8  # s
@@ -106,68 +107,69 @@ class Static:
 
 @dataclass(frozen=True)
 class Sweeps:
-    """`[trials.id3_dynamic]`: one joint swept at several speeds."""
+    """Keys of `[trials.id3_dynamic]`: one joint swept at several speeds."""
 
-    repeats: Some = 2
+    repeats: NonNegativeInt = 2
     postures: Postures = ()
-    speeds: Several = (0.5, 1.0, 1.5)  # rad/s
-    cycles: Count = 2
+    speeds: PositiveFloats = (0.5, 1.0, 1.5)  # rad/s
+    cycles: PositiveInt = 2
 
 
 @dataclass(frozen=True)
 class Pulls:
-    """`[trials.id4]`: one tendon pulled in steps, a joint held by the torque sensor."""
+    """Keys of `[trials.id4]`: one tendon pulled in steps, a joint held by the torque sensor."""
 
-    repeats: Some = 2
+    repeats: NonNegativeInt = 2
     postures: Postures = ()
-    tensions: Several = (4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0)  # N
-    release: bool = True  # let go in the same steps
-    joints: Literal["distal", "all"] = "distal"  # which of the joints that the tendon crosses
+    tensions: PositiveFloats = (4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0)  # N
+    release: bool = True  # release the tension in the same steps
+    joints: Literal["distal", "all"] = "distal"  # the last or all of the joints that the tendon crosses
     move: Positive = 0.4  # s
     dwell: NotNegative = 0.8  # s
 
 
 @dataclass(frozen=True)
 class FreePaths:
-    """`[trials.vd1]`: all joints led by hand."""
+    """Keys of `[trials.vd1]`: all joints led by hand."""
 
-    repeats: Some = 1
-    motions: Some = 3
+    repeats: NonNegativeInt = 1
+    motions: NonNegativeInt = 3
     duration: Positive = 20.0  # s
     tension: Positive = 2.0  # N
 
 
 @dataclass(frozen=True)
 class Contacts:
-    """`[trials.vd2]`: fingertip against the force sensor, one tendon stepped."""
+    """Keys of `[trials.vd2]`: fingertip on the force sensor, one tendon stepped."""
 
-    repeats: Some = 2
+    repeats: NonNegativeInt = 2
     postures: Postures = ()
     tendons: tuple[str, ...] = ()  # empty: the active tendon that crosses most joints
-    tensions: Several = tuple(float(f) for f in range(4, 16))  # N
+    tensions: PositiveFloats = tuple(float(f) for f in range(4, 16))  # N
     move: Positive = 0.3  # s
     dwell: NotNegative = 0.7  # s
 
 
 @dataclass(frozen=True)
 class Drives:
-    """`[trials.vd3]`: tendons drive the free finger along a trajectory."""
+    """Keys of `[trials.vd3]`: tendons drive the free finger along a trajectory."""
 
-    repeats: Some = 1
-    motions: Some = 2
+    repeats: NonNegativeInt = 1
+    motions: NonNegativeInt = 2
     duration: Positive = 8.0  # s
-    centre: Share = 0.2  # share of a joint's range: bowstringing flexors make a far flexed finger unstable
+    # Centre of the motion as a share of a joint's range. Bowstringing flexors make a far flexed finger unstable.
+    centre: Share = 0.2
     amplitude: Share = 0.12  # share of a joint's range to either side
-    rate: Positive = 1000.0  # Hz: the simulation's own and the recording's
+    rate: Positive = 1000.0  # Hz, of simulation and recording
 
 
 @dataclass(frozen=True)
 class Trials:
-    """`[trials]`: what is recorded."""
+    """Keys of `[trials]`: the trials to record."""
 
     experiments: Annotated[tuple[str, ...], OneOf(EXPERIMENTS)] = EXPERIMENTS
     rate: Positive = 1000.0  # Hz
-    motion_seed: Some = 0  # of the motions led by hand; the noise has its own
+    motion_seed: NonNegativeInt = 0  # seed of the random motions; noise has the recipe's own seed
     id2: Excursions = Excursions()
     id3_static: Static = Static()
     id3_dynamic: Sweeps = Sweeps()
@@ -179,18 +181,18 @@ class Trials:
 
 @dataclass(frozen=True)
 class Sensor:
-    """`[sensors.<channel>]`: one kind of sensor, in the channel's unit."""
+    """Keys of `[sensors.<channel>]`: one kind of sensor, in the channel's SI unit."""
 
-    std: NotNegative  # of the noise
-    resolution: Positive  # of the converter
+    std: NotNegative  # standard deviation of the noise
+    resolution: Positive  # step of the converter
     coloured: Share = 0.4  # share of the noise's variance that is correlated in time
     correlation_time: Positive = 0.03  # s, of that share
-    offset: NotNegative = 0.0  # standard deviation of a constant a trial: zeroing, taring
+    offset: NotNegative = 0.0  # standard deviation of an offset per trial, from zeroing or taring
 
 
 @dataclass(frozen=True)
 class Sensors:
-    """`[sensors]`: the paper's test-bed, Sec. II-C."""
+    """Keys of `[sensors]`. The defaults are those of the paper's test-bed, Sec. II-C."""
 
     q: Sensor = Sensor(2e-4, 2.0 * np.pi / 2**14)  # AA5048B, 14 bit
     tendon_force: Sensor = Sensor(0.03, 200.0 / 2**12)  # KD60 ±100 N on EL3008, 12 bit
@@ -198,23 +200,23 @@ class Sensors:
     joint_torque: Sensor = Sensor(3e-4, 1.0 / 2**16)  # ±0.5 N m, 16 bit, tared before every trial
     fingertip_force: Sensor = Sensor(0.02, 100.0 / 2**16)  # K3D40 ±50 N, 16 bit
     outliers: Share = 0.0  # share of samples hit by a spike
-    outlier_size: Annotated[tuple[float, float], Within(0.0, above=True)] = (10.0, 50.0)  # times the channel's noise
-    clock_jitter: NotNegative = 2e-6  # s
+    outlier_size: Annotated[tuple[float, float], Within(0.0, above=True)] = (10.0, 50.0)  # range, times the noise's std
+    clock_jitter: NotNegative = 2e-6  # s, standard deviation
 
 
 @dataclass(frozen=True)
 class Cad:
-    """`[cad]`: how well ID.1 knows the links; what the file says is drawn with these standard deviations."""
+    """Keys of `[cad]`: standard deviations of the errors that the session's masses and centres of mass get (ID.1)."""
 
-    mass: NotNegative = 0.0  # share of each mass
+    mass: NotNegative = 0.0  # as a share of each mass
     com: NotNegative = 0.0  # m
 
 
 @dataclass(frozen=True)
 class SessionRecipe:
-    """A simulated session."""
+    """Recipe of a simulated session. `seed` is that of the noise."""
 
-    seed: Some = 0
+    seed: NonNegativeInt = 0
     specimen: SpecimenRecipe | DescribedFinger = field(default_factory=SpecimenRecipe)
     trials: Trials = field(default_factory=Trials)
     sensors: Sensors = field(default_factory=Sensors)
@@ -223,7 +225,7 @@ class SessionRecipe:
 
 @dataclass(frozen=True)
 class SessionRecipeFile(SessionRecipe):
-    """A recipe as its file has it: `specimen`, or a finger and its terms."""
+    """Tables of a recipe's file: `specimen`, or a finger and its terms."""
 
     specimen: SpecimenRecipe = field(default_factory=SpecimenRecipe)
     finger: str | Finger | None = None
@@ -237,7 +239,7 @@ class SessionRecipeFile(SessionRecipe):
 
 
 def read_session_recipe(path: str | os.PathLike) -> SessionRecipe:
-    """A recipe from its TOML file.
+    """Read a recipe from its TOML file.
 
     Raises:
         UserError: the file cannot be read, or a key is unknown, of the wrong type, or out of its range.
@@ -247,7 +249,7 @@ def read_session_recipe(path: str | os.PathLike) -> SessionRecipe:
 
 
 def recipe_from(table: Mapping[str, Any]) -> SessionRecipe:
-    """A recipe from nested dictionaries: the defaults, with the given keys replaced.
+    """Make a recipe from nested dictionaries: the defaults, with the given keys replaced.
 
     Raises:
         UserError: a key is unknown or has the wrong type or a value out of its range.
@@ -256,6 +258,7 @@ def recipe_from(table: Mapping[str, Any]) -> SessionRecipe:
 
 
 def _recipe(table: Mapping[str, Any], place: Place) -> SessionRecipe:
+    """Check the tables of a recipe and turn a described finger into a specimen."""
     said = structure(_merged(asdict(SessionRecipeFile()), table), SessionRecipeFile, place)
     specimen: SpecimenRecipe | DescribedFinger = said.specimen
     if said.finger is not None:
@@ -278,14 +281,14 @@ def _recipe(table: Mapping[str, Any], place: Place) -> SessionRecipe:
 
 
 def _unrouted(finger: FingerDescription) -> str | None:
-    """The first active tendon whose moment arms the finger does not know."""
+    """Name of the first active tendon without known moment arms, or None."""
     arms = [None] * finger.n if finger.excursion is None else finger.excursion
     rows = zip(finger.tendon_names, finger.active, arms, strict=True)
     return next((name for name, active, c in rows if active and (c is None or np.isnan(c).any())), None)
 
 
 def _merged(default: Any, given: Any) -> Any:
-    """The defaults of a table with the given keys put over them, at any depth."""
+    """Return the default table with the given keys replaced, at any depth."""
     if not (isinstance(default, Mapping) and isinstance(given, Mapping)):
         return given
     return {**default, **{key: _merged(default.get(key), value) for key, value in given.items()}}

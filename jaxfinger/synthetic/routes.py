@@ -1,6 +1,7 @@
-"""Path of a tendon over one joint, in the plane across the joint's axis: excursion and its exact derivative.
+"""Routes: the path of a tendon over one joint, with its excursion and the exact derivative.
 
-The plane's coordinates are (along, above): along the finger, and towards extension, with the axis at the origin.
+A route lies in the plane across the joint's axis, with the axis at the origin. Its coordinates are (along, above):
+along the finger, and towards extension.
 Flexion by q turns a point of the distal link by (x, z) → (x cos q + z sin q, −x sin q + z cos q).
 All functions take NumPy arrays or traced JAX arrays alike (Python array API standard).
 """
@@ -19,10 +20,10 @@ Point = tuple[float, float]
 
 @runtime_checkable
 class Route(Protocol):
-    """What a tendon does at one joint: excursion l(q), m, zero at q = 0, and the moment arm dl/dq, m/rad."""
+    """Path of a tendon over one joint, as a function of the joint's angle q (rad)."""
 
     def excursion(self, q: Float[np.ndarray, "*T"]) -> Float[np.ndarray, "*T"]:
-        """l(q), m, positive when the tendon is pulled in."""
+        """l(q), m, zero at q = 0, positive when the tendon is pulled in."""
         ...
 
     def moment_arm(self, q: Float[np.ndarray, "*T"]) -> Float[np.ndarray, "*T"]:
@@ -32,7 +33,7 @@ class Route(Protocol):
 
 @dataclass(frozen=True)
 class PolynomialRoute:
-    """l = Σ_p coefficients[p − 1] q^p: the nominal model's own form, for tests of coverage."""
+    """Route l = Σ_p coefficients[p − 1] q^p: the nominal model's form, for exact truth."""
 
     coefficients: tuple[float, ...]  # m/rad^p
 
@@ -53,10 +54,10 @@ class PolynomialRoute:
 
 @dataclass(frozen=True)
 class WrappedRoute:
-    """The shortest path from `proximal` to `distal` that stays on one side of a circular surface.
+    """Route along the shortest path from `proximal` to `distal` on one side of a circular surface. Lengths in m.
 
-    The surface need not be concentric with the axis (eccentric contact); the tendon lifts off it where the straight
-    line clears it, and with `radius` zero there is nothing to touch. Lengths in m.
+    The surface need not be concentric with the axis (eccentric contact). The tendon lifts off it where the straight
+    line clears it. With `radius` zero there is no surface.
     """
 
     proximal: Point  # via point on the proximal link
@@ -71,7 +72,7 @@ class WrappedRoute:
         return self._length_at_zero - self._path(q)[0]
 
     def moment_arm(self, q):
-        """dl/dq = −u · dP/dq, m/rad: u is the direction in which the last straight piece reaches the moving point P."""
+        """dl/dq = −u · dP/dq, m/rad. The last straight piece reaches the moving point P in the direction u."""
         return -self._path(q)[1]
 
     @cached_property
@@ -79,7 +80,7 @@ class WrappedRoute:
         return float(self._path(np.zeros(()))[0])
 
     def _path(self, q):
-        """Length L and dL/dq, seen from the link that carries the surface: only the other link's point moves."""
+        """Length L (m) and dL/dq, seen from the link that carries the surface: only the other link's point moves."""
         xp = q.__array_namespace__()
         moving, fixed, turn = (
             (self.proximal, self.distal, -1.0) if self.on_distal else (self.distal, self.proximal, 1.0)

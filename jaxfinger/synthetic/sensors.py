@@ -1,4 +1,4 @@
-"""What the rig records of clean channels: offsets, coloured noise, spikes, converters with a finite resolution."""
+"""Sensors of the simulated rig: they add offsets, coloured noise and spikes, and round to the converters' steps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ Array = np.ndarray
 def record(
     plan: TrialPlan, clean: Channels, finger: FingerDescription, sensors: Sensors, rng: np.random.Generator
 ) -> Trial:
-    """The trial as the rig writes it, in the file's orientation; columns without a sensor are NaN."""
+    """Return the trial that the rig records of clean channels, time first. Columns without a sensor are NaN.
+
+    The clock's jitter is limited to a fifth of a sample, so that times increase.
+    """
     dt = float(plan.time[1] - plan.time[0])
     channels = {
         name: _measured(clean[name].T, seen, getattr(sensors, name), sensors, dt, rng)
@@ -48,7 +51,10 @@ def record(
 
 
 def drawn_from_cad(finger: FingerDescription, cad: Cad, rng: np.random.Generator) -> FingerDescription:
-    """The finger as ID.1 gives it: masses and centres of mass off by what their standard deviations say."""
+    """Return the finger as ID.1 gives it: masses and centres of mass with random errors, and their standard deviations.
+
+    A mass is at least a tenth of the true one.
+    """
     mass_std = cad.mass * finger.mass
     com_std = np.full(finger.com.shape, cad.com)
     mass = np.maximum(finger.mass + mass_std * rng.standard_normal(finger.m), 0.1 * finger.mass)
@@ -63,9 +69,10 @@ def drawn_from_cad(finger: FingerDescription, cad: Cad, rng: np.random.Generator
 
 
 def coloured_noise(sensor: Sensor, shape: tuple[int, int], dt: float, rng: np.random.Generator) -> Array:
-    """Noise of variance std², of which the share `coloured` decays as exp(−t / correlation_time) and the rest is white.
+    """Noise of variance std² and the given shape (N, columns).
 
-    The coloured part is the stationary AR(1) process x⁺ = a x + √(1 − a²) e, a = exp(−dt / correlation_time).
+    The share `coloured` of the variance is the stationary AR(1) process x⁺ = a x + √(1 − a²) e with
+    a = exp(−dt / correlation_time); the rest is white.
     """
     white = np.sqrt(1.0 - sensor.coloured) * rng.standard_normal(shape)
     a = np.exp(-dt / sensor.correlation_time)
@@ -75,13 +82,13 @@ def coloured_noise(sensor: Sensor, shape: tuple[int, int], dt: float, rng: np.ra
 
 
 def _instrumented(plan: TrialPlan, finger: FingerDescription) -> dict[str, Bool[Array, " columns"]]:
-    """Which columns of each channel have a sensor that says something in this experiment."""
+    """Mask of the columns of each channel that have a sensor which counts in this experiment."""
     joint = np.arange(finger.m) == (-1 if plan.joint is None else plan.joint)
     pulled = finger.active & (np.arange(finger.n) == plan.tendon) if plan.held else finger.active
     return {
         "q": np.ones(finger.m, dtype=bool),
         "tendon_force": finger.active,
-        "tendon_excursion": pulled,  # a slack tendon's encoder says nothing
+        "tendon_excursion": pulled,  # The encoder of a slack tendon does not measure its excursion.
         "joint_torque": joint,
         "fingertip_force": np.ones(3, dtype=bool),
     }
@@ -95,6 +102,7 @@ def _measured(
     dt: float,
     rng: np.random.Generator,
 ) -> Float[Array, "N columns"]:
+    """Return one channel as its sensors record it; columns outside of the mask `seen` are NaN."""
     count = int(seen.sum())
     value = clean[:, seen] + sensor.offset * rng.standard_normal(count)
     value = value + coloured_noise(sensor, (len(clean), count), dt, rng)
@@ -102,6 +110,6 @@ def _measured(
         hit = rng.random(value.shape) < sensors.outliers
         size = rng.uniform(*sensors.outlier_size, value.shape) * rng.choice((-1.0, 1.0), value.shape)
         value = value + hit * size * sensor.std
-    recorded = np.full(clean.shape, np.nan, dtype=np.float32)  # as the rig stores it
+    recorded = np.full(clean.shape, np.nan, dtype=np.float32)  # The rig stores single precision.
     recorded[:, seen] = np.round(value / sensor.resolution) * sensor.resolution
     return recorded.astype(float)

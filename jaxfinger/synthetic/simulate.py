@@ -1,4 +1,4 @@
-"""A simulated session: plan, run the plant, record. Noise can be drawn anew without running the plant again."""
+"""Simulate a session: plan the trials, run the plant, record. Noise can be drawn anew without another run."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from jaxfinger.synthetic.protocols import TrialPlan, session_plan
 from jaxfinger.synthetic.recipe import SessionRecipe
 from jaxfinger.synthetic.sensors import drawn_from_cad, record
 
-Progress = Callable[[int, int, str], None]  # trials done, trials in all, name of the next
+Progress = Callable[[int, int, str], None]  # called with trials done, trials in all, name of the next
 
 
 @dataclass(frozen=True)
 class CleanSession:
-    """Every trial as planned, and its channels without noise."""
+    """A session before the sensors: every planned trial with its channels without noise."""
 
     recipe: SessionRecipe
-    name: str
-    finger: FingerDescription  # exact
+    name: str  # of the specimen
+    finger: FingerDescription  # exact, without the errors of CAD
     trials: tuple[tuple[TrialPlan, dict[str, Float[np.ndarray, "_channels _N"]]], ...]
 
 
@@ -43,12 +43,12 @@ def clean_session(
     finger = finger or specimen.description
     plant = plant or SpecimenPlant(specimen)
     plans = session_plan(finger, recipe.trials)
-    done: dict[tuple, Channels] = {}  # by motion: repeats command the same, and most plants repeat themselves
+    done: dict[tuple, Channels] = {}  # by motion: repeats have the same channels on most plants
     trials = []
     for k, plan in enumerate(plans):
         if progress:
             progress(k, len(plans), plan.name)
-        key = (plan.motion, plan.session_start if plant.by_the_clock else 0.0)
+        key = (plan.motion, plan.session_start if plant.depends_on_session_time else 0.0)
         if key not in done:
             done[key] = plant.driven(plan) if plan.experiment == "VD.3" else plant.prescribed(plan)
         trials.append((plan, done[key]))
@@ -56,7 +56,7 @@ def clean_session(
 
 
 def measure(clean: CleanSession, seed: int) -> Session:
-    """The session as the rig records it; the seed fixes noise, offsets, spikes and the errors of CAD."""
+    """Record a clean session. The seed determines noise, offsets, spikes and the errors of CAD."""
     recipe = clean.recipe
     cad, *streams = np.random.default_rng(seed).spawn(len(clean.trials) + 1)
     trials = {
@@ -70,12 +70,16 @@ def measure(clean: CleanSession, seed: int) -> Session:
 def simulate(
     recipe: SessionRecipe, seed: int | None = None, plant: Plant | None = None, progress: Progress | None = None
 ) -> Session:
-    """A session made to the recipe, with the recipe's seed unless another is given."""
+    """Simulate the recipe's session, on its specimen or on another plant, with its seed unless another is given.
+
+    Raises:
+        UserError: as `clean_session`.
+    """
     return measure(clean_session(recipe, plant, progress=progress), recipe.seed if seed is None else seed)
 
 
 def simulate_many(recipe: SessionRecipe, seeds: Iterable[int], plant: Plant | None = None) -> Iterator[Session]:
-    """Sessions that differ in nothing but the noise, one a seed."""
+    """Yield one session per seed. They differ only in what the seed of `measure` determines."""
     clean = clean_session(recipe, plant)
     for seed in seeds:
         yield measure(clean, seed)

@@ -1,6 +1,6 @@
-"""The truth about a simulated finger: equation (1) with whatever terms the specimen has, nominal or not.
+"""Specimens: the terms of equation (1) of a simulated finger, of the nominal model's form or not.
 
-All functions take joint arrays `(m, *T)`, NumPy or traced JAX, with the batch last. Units SI.
+All functions take joint arrays `(m, *T)`, NumPy or traced JAX, with the batch last. Units are SI.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from jaxfinger.data import FingerDescription
 from jaxfinger.synthetic.routes import Route
 
 Array = Any  # NumPy or JAX
-Routes = tuple[Route | None, ...]  # one a joint, None where the joint is not crossed
+Routes = tuple[Route | None, ...]  # one per joint, None where the tendon does not cross it
 
 
 @runtime_checkable
 class Spring(Protocol):
-    """Something that stores energy in the joints' angles."""
+    """Elastic element whose energy depends on the joints' angles."""
 
     def torque(self, q: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
-        """τ_k, N m, as it stands on the left of (1): the gradient of the energy."""
+        """τ_k, N m, with the sign of the left side of (1): the gradient of the energy."""
         ...
 
     def energy(self, q: Float[Array, "m *T"]) -> Float[Array, "*T"]:
@@ -34,11 +34,11 @@ class Spring(Protocol):
 
 @dataclass(frozen=True)
 class Band:
-    """A rubber band or a passive tendon: k (stretch − l(q)), where it is taut, along a path over one or more joints."""
+    """A rubber band or a passive tendon over one or more joints. Its tension is k (stretch − l(q)) where it is taut."""
 
     routes: Routes
     stiffness: float  # N/m
-    stretch: float  # m at q = 0; negative: slack there
+    stretch: float  # m at q = 0; negative: it is slack there
 
     def tension(self, q):
         """k max(stretch − l(q), 0), N."""
@@ -55,7 +55,7 @@ class Band:
 
 @dataclass(frozen=True)
 class PolynomialSpring:
-    """τ_k,i = Σ_p coefficients[i][p] q_i^p: the nominal model's form."""
+    """Springs with τ_k,i = Σ_p coefficients[i][p] q_i^p: the nominal model's form."""
 
     coefficients: tuple[tuple[float, ...], ...]  # N m/rad^p, one row a joint
 
@@ -74,13 +74,13 @@ class Friction(Protocol):
     """Coulomb friction of the joints."""
 
     def magnitude(self, q: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
-        """Torque that the joint takes before it slides, and while it does, N m."""
+        """|τ_f|, N m: the torque that sliding takes, and the most that sticking can hold."""
         ...
 
 
 @dataclass(frozen=True)
 class GrowingFriction:
-    """constant + growth (1 − cos q): the joint's faces are pressed together as it flexes."""
+    """Friction constant + growth (1 − cos q), as if the joint's faces were pressed together while it flexes."""
 
     constant: tuple[float, ...]  # N m
     growth: tuple[float, ...]  # N m
@@ -95,9 +95,9 @@ class GrowingFriction:
 
 @dataclass(frozen=True)
 class PolynomialFriction:
-    """Σ_p coefficients[i][p] q_i^p: the nominal model's form."""
+    """Friction |τ_f,i| = Σ_p coefficients[i][p] q_i^p: the nominal model's form."""
 
-    coefficients: tuple[tuple[float, ...], ...]  # N m/rad^p
+    coefficients: tuple[tuple[float, ...], ...]  # N m/rad^p, one row per joint
 
     def magnitude(self, q):
         """|τ_f|, N m."""
@@ -106,11 +106,11 @@ class PolynomialFriction:
 
 @dataclass(frozen=True)
 class Specimen:
-    """A finger as it really is; `description` is exact, whatever CAD will say of it."""
+    """A simulated finger. `description` is exact; the session's file may have errors of CAD."""
 
     name: str
     description: FingerDescription
-    routes: tuple[Routes, ...]  # n tendons of m joints
+    routes: tuple[Routes, ...]  # n tendons, m joints each
     springs: tuple[Spring, ...]
     friction: Friction
     damping: tuple[float, ...]  # N m s/rad
@@ -126,7 +126,7 @@ class Specimen:
         return q.__array_namespace__().stack([moment_arms(routes, q) for routes in self.routes])
 
     def elastic(self, q: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
-        """τ_k(q), N m: rubber bands and passive tendons."""
+        """τ_k(q), N m: the sum over all springs."""
         return sum((spring.torque(q) for spring in self.springs), 0.0 * q)
 
     def elastic_energy(self, q: Float[Array, "m *T"]) -> Float[Array, "*T"]:
@@ -142,19 +142,19 @@ class Specimen:
         return _column(self.damping, qd) * qd
 
     def loss(self, tension: Float[Array, "n *T"]) -> Float[Array, "n *T"]:
-        """Tension lost along a sliding tendon, N: a₀ + a₁ f_t, at least zero and at most f_t."""
+        """Tension lost along a sliding tendon, N: a₀ + a₁ f_t, at least 0 and at most f_t."""
         xp = tension.__array_namespace__()
         raw = _column(self.loss_constant, tension) + _column(self.loss_proportional, tension) * tension
         return xp.minimum(xp.maximum(raw, 0.0), xp.maximum(tension, 0.0))
 
 
 def total_excursion(routes: Sequence[Route | None], q: Float[Array, "m *T"]) -> Float[Array, "*T"]:
-    """Excursion of one tendon, m: the joints' contributions add up."""
+    """Excursion of one tendon, m: the sum over the joints that it crosses."""
     return sum((route.excursion(q[i, ...]) for i, route in enumerate(routes) if route), 0.0 * q[0, ...])
 
 
 def moment_arms(routes: Sequence[Route | None], q: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
-    """Moment arms of one tendon, m/rad."""
+    """Moment arms of one tendon at all joints, m/rad."""
     return q.__array_namespace__().stack(
         [route.moment_arm(q[i, ...]) if route else 0.0 * q[i, ...] for i, route in enumerate(routes)]
     )
@@ -173,5 +173,5 @@ def _polynomials(rows: Sequence[Sequence[float]], q):
 
 
 def _column(values: Sequence[float], like):
-    """One value a row, to broadcast along the batch."""
+    """Return one value per row, shaped to broadcast along the batch."""
     return np.asarray(values, dtype=float).reshape((-1,) + (1,) * (like.ndim - 1))

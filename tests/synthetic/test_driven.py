@@ -10,7 +10,7 @@ import pytest
 from jaxfinger.errors import UserError
 from jaxfinger.model import Finger, rigid_body
 from jaxfinger.synthetic import SpecimenPlant, paper_finger, recipe_from, session_plan
-from jaxfinger.synthetic.controller import FLOOR
+from jaxfinger.synthetic.controller import MIN_ACTUATOR_TENSION
 from jaxfinger.synthetic.driven import QUICK, at_rest, friction_impulse, step
 from jaxfinger.synthetic.specimen import GrowingFriction
 
@@ -50,7 +50,7 @@ def test_tendons_move_every_joint_along_the_plan(driven):
     assert (np.ptp(q, axis=1) > 0.15).all()
     assert (np.mean(np.abs(v) > 1e-3, axis=1) > 0.6).all()  # it sticks at reversals
     active = SPECIMEN.description.active
-    assert (tension[active] >= 0.99 * FLOOR).all()
+    assert (tension[active] >= 0.99 * MIN_ACTUATOR_TENSION).all()
     assert tension[active].max() < 20.0
     assert not tension[~active].any()
 

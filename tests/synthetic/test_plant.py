@@ -15,7 +15,7 @@ from jaxfinger.synthetic import (
     true_model,
 )
 from jaxfinger.synthetic.driven import QUICK
-from jaxfinger.synthetic.plant import BLOCK, joint_tension
+from jaxfinger.synthetic.plant import BLOCK_SAMPLES, joint_tension
 
 SPECIMEN = polynomial_finger(paper_finger())
 TRIALS = {"rate": 100.0, "id3_static": {"dwell": 0.3}, "id4": {"joints": "all"}}
@@ -89,8 +89,8 @@ def test_held_tendon_rises_by_the_law_and_falls_from_a_plateau():
 
 def test_blocks_leave_no_seam(plant):
     """The torque of a trial longer than a block is that of its pieces."""
-    q = np.tile(np.linspace(0.1, 1.0, BLOCK + 100), (3, 1))
+    q = np.tile(np.linspace(0.1, 1.0, BLOCK_SAMPLES + 100), (3, 1))
     whole = plant._rigid_body(q, q, q)
-    pieces = [plant._rigid_body(*[q[:, k]] * 3) for k in (slice(0, 50), slice(BLOCK - 50, BLOCK + 100))]
+    pieces = [plant._rigid_body(*[q[:, k]] * 3) for k in (slice(0, 50), slice(BLOCK_SAMPLES - 50, BLOCK_SAMPLES + 100))]
     assert whole[:, :50] == pytest.approx(pieces[0], abs=1e-15)
-    assert whole[:, BLOCK - 50 :] == pytest.approx(pieces[1], abs=1e-15)
+    assert whole[:, BLOCK_SAMPLES - 50 :] == pytest.approx(pieces[1], abs=1e-15)

@@ -107,7 +107,7 @@ def test_any_model_can_stand_in_for_the_finger():
     """A plant that predicts prescribed channels is recorded by the same rig."""
 
     class Rope:
-        by_the_clock = False
+        depends_on_session_time = False
 
         def prescribed(self, plan):
             return {
