@@ -52,14 +52,14 @@ def short(rig):
 
 
 def ads_rig(where: str, **rig) -> AdsRig:
-    """An ADS rig for a stand-in at host:port, patient with a loaded machine."""
+    """Return an ADS rig for a stand-in at host:port, with deadlines that a loaded machine keeps."""
     address = {"net_id": standin.NET_ID, "ip": where, "port": 851, "reconnect_s": 20}
     return AdsRig(parse_rig(rig_toml("ads", address, **{"stale_s": 20.0, "poll_s": 0.002, **rig}) + PATIENT))
 
 
 @pytest.fixture
 def quiet_block(rig) -> Callable[..., Block]:
-    """Blocks of an armed finger at rest: sensor noise, nothing wrong."""
+    """Return a function that makes blocks of an armed finger at rest: sensor noise, no fault."""
 
     def make(count: int = 400, first: int = 0, seed: int = 0, state: State = State.ARMED) -> Block:
         rng = np.random.default_rng(seed)
@@ -77,7 +77,7 @@ def quiet_block(rig) -> Callable[..., Block]:
 
 @pytest.fixture
 def record(short, tmp_path) -> Callable:
-    """Record the short plan on a rig, with a fault once a named trial is being recorded."""
+    """Return a function that records the short plan on a rig, and calls `fault` once a named trial is recorded."""
 
     def go(rig, fault: Callable | None = None, at: tuple[str, str] = ("02-ID.4-T3-MCP", "waiting"), **options):
         done = []

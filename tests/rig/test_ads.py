@@ -1,4 +1,4 @@
-"""The adapter over the wire: real AMS/TCP from another process. Judged by sequence numbers, never by the wall clock."""
+"""The adapter over real AMS/TCP from another process. Sequence numbers judge it, never the wall clock."""
 
 import contextlib
 import json
@@ -69,7 +69,7 @@ def lockstep(fast_process):
 
 
 def collect(rig, samples, patience=20.0):
-    """Sequence numbers and times of at least so many samples, and how many were lost."""
+    """Return sequence numbers and times of at least `samples` samples, and how many were lost."""
     seq, t, lost = [], [], 0
     while sum(map(len, seq)) < samples:
         block = rig.read_block(patience)
@@ -83,7 +83,7 @@ def test_every_sample_arrives_also_after_the_host_slept(real_time):
     with ads_rig(real_time) as rig:
         assert rig.fingerprint()["program"] == "jaxfinger stand-in"
         first, _, _ = collect(rig, 300)
-        time.sleep(2.0)  # a long compilation, say: notifications would start to be thrown away
+        time.sleep(2.0)  # Such as a long compilation; AdsLib would begin to throw notifications away.
         seq, t, lost = collect(rig, 2500)
         assert lost == 0
         assert seq[0] == first[-1] + 1
@@ -119,7 +119,7 @@ def test_a_task_that_stands_still_is_noticed(real_time):
         rig.answer_s = 0.3
         with pytest.raises(ConnectionLost, match="acknowledge"):
             rig.arm()
-        rig.prepare(Setup(""))  # the task runs again: what was given up must not happen now
+        rig.prepare(Setup(""))  # The task runs again; the command that was given up must have no effect.
         collect(rig, 50)
         assert rig.status().state is State.IDLE
 
@@ -146,7 +146,7 @@ def test_commands_states_and_the_latch(real_time):
 
 
 def test_a_joint_that_runs_beyond_its_stop_is_let_go_in_the_right_order(lockstep):
-    """A free MCP that one tendon pulls past 92°: the controller's own limit, with no supervisor on this side."""
+    """A tendon pulls the free MCP past 92°, the controller's own limit. No supervisor runs on this side."""
     with ads_rig(lockstep) as rig:
         rig.prepare(Setup("", fixed={"PIP": 0.3, "DIP": 0.3}))
         rig.arm()
@@ -180,7 +180,7 @@ def test_nobody_there(tmp_path):
 
 @pytest.mark.parametrize("calls", [1, 8])
 def test_one_call_that_never_ends_hangs_and_many_slow_ones_do_not(calls):
-    """Of another thread, while this one waits for the connection."""
+    """The calls are another thread's; this thread waits for the connection."""
     rig, begun = ads_rig("127.0.0.1:1"), threading.Event()
 
     def work():
@@ -202,7 +202,7 @@ def test_one_call_that_never_ends_hangs_and_many_slow_ones_do_not(calls):
 
 
 def test_a_connection_that_is_closed_while_it_opens_is_opened_again(monkeypatch):
-    """As by a router that still hangs up on the program that was killed a moment ago."""
+    """A router does so while it still hangs up on a program that was killed a moment ago."""
     controller, lock, serve, hung_up = Controller(), threading.Lock(), AmsServer._serve, []
 
     def hang_up(self, client):
@@ -261,7 +261,7 @@ def test_the_adapter_listens_nowhere_and_the_stand_in_on_loopback_alone(real_tim
 
 
 def test_any_ads_client_can_read_the_stand_in(real_time):
-    """By name and by handle, with an error code for what is not there: pyads' own calls, not the adapter's."""
+    """pyads' own calls read by name and by handle, and get an error code for an unknown symbol."""
     plc = pyads.Connection(standin.NET_ID, 851, real_time)
     plc.open()
     try:
@@ -295,8 +295,9 @@ def test_a_session_over_the_wire(lockstep, record):
 
 @pytest.mark.parametrize("lags", [False, True])
 def test_the_controllers_own_trip_ends_the_trial_with_its_cause(lockstep, record, monkeypatch, lags):
-    """A rig file that knows no stop before 170°: the host sees nothing wrong when a tendon pulls the MCP past 92°.
-    Where samples lag, a command that is refused tells of the trip; either way nobody stops the rig once more.
+    """The rig file has no stop before 170°, so the host sees nothing wrong when a tendon pulls the MCP past 92°.
+
+    Where samples lag, the host learns of the trip by a command that is refused. Either way it sends no stop of its own.
     """
     if lags:
         monkeypatch.setattr(runner, "tripped", lambda block: False)

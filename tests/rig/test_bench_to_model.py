@@ -1,4 +1,4 @@
-"""From bench to model: record the paper's session against the stand-in over ADS, identify, compare with the truth."""
+"""Record the paper's session from the stand-in over ADS, identify, and compare with the truth."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from tests.rig.conftest import ads_rig
 
 
 def recorded(folder, plan):
-    """The session of a plan, recorded over ADS as fast as the stand-in goes."""
+    """Return the session of a plan, recorded over ADS as fast as the stand-in runs."""
     with standin.running(speed=0) as where:
         rig = ads_rig(where)
         outcome = run(parse_plan(plan, rig.description), rig, folder / "session.h5")
@@ -25,13 +25,13 @@ def recorded(folder, plan):
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
-    """Every experiment, every joint, every tendon."""
+    """A session with every experiment, joint and tendon."""
     return recorded(tmp_path_factory.mktemp("bench"), plan_toml(postures=1))
 
 
 @pytest.fixture(scope="module")
 def static(tmp_path_factory):
-    """The plan's trials of ID.3-static."""
+    """A session with the plan's trials of ID.3-static."""
     head, *trials = plan_toml(postures=1).split("\n[[trial]]\n")
     kept = [t for t in trials if '"ID.3-static"' in t]
     return recorded(tmp_path_factory.mktemp("static"), "\n[[trial]]\n".join([head, *kept]))
@@ -51,7 +51,7 @@ def test_every_trial_is_complete_and_free_of_gaps(session):
 
 
 def test_static_torque_against_plain_least_squares(static):
-    """The recording itself, without jaxfinger's fits: elastic torque and friction of every joint from the holds."""
+    """Least squares on the holds, without jaxfinger's fits, finds elastic torque and friction of every joint."""
     truth, plant = default_truth(), Plant()
     assert len(static) == 3
     for trial in static.select("ID.3-static"):
@@ -73,7 +73,7 @@ def test_static_torque_against_plain_least_squares(static):
 
 @pytest.mark.long
 def test_identify_finds_the_truth_of_the_finger(fit, session):
-    """Moment arms to 0.02 mm, torques to 0.15 N mm over the angles that were driven, tendon friction to 2 %."""
+    """Moment arms agree to 0.02 mm, torques to 0.15 N mm over the driven angles, tendon friction to 2 %."""
     truth = default_truth()
     found = {row["name"]: row["value"] for row in fit.table()}
     angles = np.linspace(0.1, 1.1, 30)
@@ -94,7 +94,7 @@ def test_identify_finds_the_truth_of_the_finger(fit, session):
 
 @pytest.mark.long
 def test_the_model_predicts_excursion_along_a_free_path(fit, session):
-    """VD.1: f(q) − f(q(0)) with the fitted polynomials, to 0.02 mm rms."""
+    """VD.1: f(q) − f(q(0)) with the fitted polynomials agrees to 0.02 mm rms."""
     found = {row["name"]: row["value"] for row in fit.table()}
     (trial,) = session.select("VD.1")
     for i, tendon in enumerate(session.finger.tendon_names):
@@ -110,7 +110,7 @@ def test_the_model_predicts_excursion_along_a_free_path(fit, session):
 
 @pytest.mark.long
 def test_the_model_predicts_the_fingertips_force(fit, session):
-    """VD.2: the slope of the fingertip's force against tension to 3 %; nothing of it was fitted."""
+    """VD.2: the slope of the fingertip's force against tension agrees to 3 %. No fit reads VD.2."""
     slopes = {s.axis: s for s in validate(fit, session.select("VD.2"), ("VD.2",)).slopes}
     for axis in ("x", "z"):
         assert slopes[axis].predicted == pytest.approx(slopes[axis].measured, rel=0.03)

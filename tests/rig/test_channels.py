@@ -1,4 +1,4 @@
-"""A rig file with an error is refused with the line to mend; calibration turns raw values into SI."""
+"""Rig files: an error is refused with its line; calibration turns raw values into SI."""
 
 from dataclasses import asdict
 from pkgutil import iter_modules
@@ -77,7 +77,7 @@ def test_a_missing_limit_is_refused(name):
     [("tension_setpoint", ("tension_error_max", "tension_error_s")), ("motor_temperature", ("temperature_max",))],
 )
 def test_a_rig_may_lack_set_points_and_temperatures_and_then_has_no_limit_on_them(kind, names):
-    """With such a channel its limit is demanded; a limit without the channel would watch nothing, and is refused."""
+    """With such a channel its limit is demanded. Without it the limit is refused: it would watch nothing."""
     without = "[[channel]]".join(b for b in GOOD.split("[[channel]]") if f'kind = "{kind}"' not in b)
     for name in names:
         line = line_of(without, f"{name} =")
@@ -138,7 +138,7 @@ def test_the_finger_may_come_from_an_earlier_session(tmp_path):
 
 
 def test_a_backend_is_one_file(tmp_path, monkeypatch):
-    """A module put into the folder of backends is all it takes: rig files may name it, and it reads its own address."""
+    """A module in the folder of backends suffices: rig files may name it, and it declares its own address."""
     (tmp_path / "bench_of_mine.py").write_text(
         "from jaxfinger.rig.backends.simulated import SimulatedRig as make\n"
         "from dataclasses import dataclass\n"
@@ -147,7 +147,7 @@ def test_a_backend_is_one_file(tmp_path, monkeypatch):
         "    lucky_number: int\n"
     )
     monkeypatch.setattr(backends, "__path__", [*backends.__path__, str(tmp_path)])
-    monkeypatch.setattr(backends, "NAMES", (*backends.NAMES, "bench_of_mine"))  # as importing the package would find
+    monkeypatch.setattr(backends, "NAMES", (*backends.NAMES, "bench_of_mine"))  # as an import of the package would find
     assert {module.name for module in iter_modules(backends.__path__)} == set(backends.NAMES)
     rig = parse_rig(rig_toml("bench_of_mine", {"lucky_number": 7}))
     with open_rig(rig) as machine:

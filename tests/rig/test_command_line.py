@@ -1,4 +1,4 @@
-"""The commands as a person types them, in processes of their own: exit codes, sentences, what lies in the folder."""
+"""The commands as a person types them, each in a process of its own: exit codes, messages, files."""
 
 import os
 import pty
@@ -43,7 +43,7 @@ def bench(controller, tmp_path):
 
 
 def said(errors: str) -> str:
-    """What jaxfinger says: AdsLib writes dated lines of its own, as when a connection closes or an answer is late."""
+    """Return jaxfinger's own lines of stderr. AdsLib writes dated lines, such as when a connection closes."""
     dated = r"\d{4}-\d\d-\d\dT[\d:+]+ (Info|Warning): "
     return "".join(line for line in errors.splitlines(keepends=True) if not re.match(dated, line))
 
@@ -63,7 +63,7 @@ def record_in(folder: Path, *more) -> list[str]:
 
 @contextmanager
 def recording(*words, **streams):
-    """A recorder that takes Ctrl-C, also where this run was started to ignore it, and that never outlives its test."""
+    """Start a recorder that takes Ctrl-C, even where this test run ignores it, and end it with its test."""
 
     def takes_interrupts():
         signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -116,7 +116,7 @@ def test_recover_after_a_kill(bench):
 
 @pytest.mark.parametrize("moment", ["trial", "reference"])
 def test_control_c_ends_the_run_with_a_sentence(bench, moment):
-    """Also before the first trial, while tendons are pre-tensioned for the encoders' zero."""
+    """The moment `reference` lies before the first trial, while tendons are pre-tensioned to tare their encoders."""
     (bench / "plan.toml").write_text(LONG)
     with recording(bench, "--yes", stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         wait_for_log(process, bench, 300_000 if moment == "trial" else 100)
@@ -152,12 +152,12 @@ MISTAKES = {
         "joint: is 'DPI' (did you mean 'DIP'?); choose one of MCP, PIP, DIP",
     ),
 }
-HEADERS = {"missing limit": "[limits]", "too high": "[[trial]]"}  # where the line itself is not there, or not to blame
+HEADERS = {"missing limit": "[limits]", "too high": "[[trial]]"}  # line that is named where the mistake itself has none
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_is_one_sentence_with_its_line_and_nothing_moves(bench, mistake):
-    """The stand-in is not even asked: its address is taken out of the rig file's reach first."""
+    """The rig file has an address at which nothing listens, so the rig cannot even have been asked."""
     name, good, bad, says = MISTAKES[mistake]
     rig = bench / "rig.toml"
     rig.write_text(rig.read_text().replace("127.0.0.1:", "127.0.0.2:"))
@@ -193,7 +193,7 @@ def test_the_recorder_starts_without_jax_and_the_heavy_parts_of_scipy():
 
 @contextmanager
 def real_rig(folder, fault=(), **deadlines):
-    """A stand-in in real time with its own watchdog of 0.25 s, and a plan that holds 8 N."""
+    """Start a stand-in in real time with its watchdog of 0.25 s; write a plan that holds 8 N."""
     with standin.started(faults=fault) as machine:
         address = {"net_id": standin.NET_ID, "ip": machine.where, "port": 851, "reconnect_s": 3}
         (folder / "rig.toml").write_text(rig_toml("ads", address, **{**CALM, **deadlines}))
@@ -202,7 +202,7 @@ def real_rig(folder, fault=(), **deadlines):
 
 
 def wait_for_tension(machine, process):
-    """Until all tendons are held at 8 N and the trial is recorded."""
+    """Wait until the finger is armed and its tendons are under tension."""
     deadline = time.monotonic() + 60.0
     while not (machine.report()["state"] == State.ARMED and machine.report()["off_seq"] < 0):
         assert process.poll() is None, "the recorder ended by itself"
@@ -211,7 +211,7 @@ def wait_for_tension(machine, process):
 
 
 def let_go(machine, head):
-    """Seconds of the stand-in's own clock from sample `head` to the stop and to no tension."""
+    """Return the trip, and the seconds of the stand-in's clock from sample `head` to the stop and to no tension."""
     deadline = time.monotonic() + 10.0
     while (report := machine.report())["off_seq"] < 0 and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -219,7 +219,7 @@ def let_go(machine, head):
 
 
 def until_the_machine_keeps_up(attempt):
-    """Real time is judged on a machine that does not stand still itself."""
+    """Repeat an attempt that failed while the machine itself stood still for longer than STALL_S."""
     for left in reversed(range(ATTEMPTS)):
         quiet, worst = threading.Event(), [0.0]
         threading.Thread(target=stalls, args=(quiet, worst), daemon=True).start()
@@ -235,7 +235,7 @@ def until_the_machine_keeps_up(attempt):
 
 @pytest.mark.parametrize("terminal", ["Ctrl-S", "nobody reads"])
 def test_the_stop_key_at_a_terminal_that_takes_no_output(tmp_path, terminal):
-    """A real pseudo-terminal for keys and output; the rig is let go as if nothing were amiss, and the run ends."""
+    """On a real pseudo-terminal the stop key releases the finger as always, and the run ends."""
 
     def attempt():
         folder = Path(tempfile.mkdtemp(dir=tmp_path))
@@ -270,7 +270,7 @@ def test_the_stop_key_at_a_terminal_that_takes_no_output(tmp_path, terminal):
 
 
 def fill(terminal: int) -> None:
-    """Write until the terminal takes no more."""
+    """Write until the terminal takes no more output."""
     os.set_blocking(terminal, False)
     try:
         while True:
@@ -283,7 +283,7 @@ def fill(terminal: int) -> None:
 
 @pytest.mark.parametrize("end", [signal.SIGSTOP, signal.SIGKILL, signal.SIGHUP])
 def test_a_host_that_is_stopped_or_killed_holds_no_tension(tmp_path, end):
-    """Stopped as by a debugger, killed, or its terminal closed: the controller, or at last the host, lets go."""
+    """The host is stopped as by a debugger, killed, or loses its terminal. The finger is released all the same."""
 
     def attempt():
         folder = Path(tempfile.mkdtemp(dir=tmp_path))

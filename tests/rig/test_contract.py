@@ -1,4 +1,4 @@
-"""The document and the Structured Text say the same as the adapter: fields, types, sizes, codes."""
+"""Document, Structured Text and adapter agree on fields, types, sizes and codes."""
 
 import re
 from pathlib import Path
@@ -57,7 +57,7 @@ def test_the_document_names_every_symbol_with_its_size():
     for symbol, (dtype, count) in contract.SYMBOLS.items():
         row = next((line for line in text.splitlines() if line.startswith(f"| `{symbol}` ")), None)
         if symbol == "stBench":
-            assert row is None  # a stand-in's alone
+            assert row is None  # only the stand-in has it
         else:
             assert row is not None
             assert int(row.split("|")[3].replace("\u202f", "").replace(" ", "")) == dtype.itemsize * count

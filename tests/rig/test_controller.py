@@ -1,4 +1,4 @@
-"""The controller's program: ramps, hard limits, heartbeat, the order of a release, the latch."""
+"""The controller's program: ramps, hard limits, heartbeat, order of a release, latch."""
 
 import struct
 
@@ -13,7 +13,7 @@ from jaxfinger.rig.simulated.controller import Controller, HardLimits
 
 
 class Bench:
-    """A controller with a host that beats, command by command."""
+    """A controller, and a host that sends heartbeats and commands."""
 
     def __init__(self, **limits):
         self.c = Controller(limits=HardLimits(**limits))
@@ -108,7 +108,7 @@ def test_over_tension_drops_all_at_once(loaded):
 
 
 def test_a_joint_beyond_its_stops_is_let_go_after_three_cycles(loaded):
-    """Against a stop of 92°; the motor of the joint goes first, then the tendons together."""
+    """The stop lies at 92°. The external motor is switched off first, then all tendons go down together."""
     loaded.bench(fault=contract.FAULTS.index("spike"), slot=loaded.c.slots.angle[0], amount=1.4)
     before, held = loaded.c.seq, list(loaded.c.setpoint)
     ramp = loaded.run(4)
@@ -151,7 +151,7 @@ commands = st.tuples(
 @given(st.lists(commands, max_size=12))
 @example([(Kind.ARM, [0.0] * 4, 10.0, 1), (Kind.TENSION, [0.0, 0.0, 0.0, 1.0], 251.0, 1)])
 def test_no_sequence_of_commands_breaks_the_limits(sequence):
-    """Whatever is sent: set-points stay within the hard limit, and rise no faster than the hardest rate."""
+    """Set-points stay within the hard limit of tension and rise no faster than that of its rate."""
     bench = Bench(heartbeat_s=1e9)
     bench.bench(mode=(2, 1, 1))
     before = np.zeros(4)
@@ -166,7 +166,7 @@ def test_no_sequence_of_commands_breaks_the_limits(sequence):
 @settings(max_examples=15, deadline=None)
 @given(st.floats(-0.1, 1.5), st.floats(0.05, 10.0), st.floats(1.0, 50.0))
 def test_the_motor_reaches_its_goal_without_passing_it(goal, speed, acceleration):
-    """Friction at a hold remembers the direction of approach, so a goal must not be overrun."""
+    """Friction at a hold keeps the direction of approach, so the motor must not overrun its goal."""
     bench = Bench(heartbeat_s=1e9)
     bench.bench(mode=(2, 1, 1))
     bench.run(5)

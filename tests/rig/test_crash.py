@@ -16,7 +16,7 @@ from jaxfinger.rig.session import log_path
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.examples import rig_toml
 
-SAYS = "recorder.txt"  # what a recorder prints
+SAYS = "recorder.txt"  # output of the recorders
 PLAN = '[plan]\nname = "p"\noperator = "t"\n[[trial]]\nexperiment = "VD.1"\nseconds = 2000.0\n'
 RECORD = """
 import sys
@@ -75,7 +75,7 @@ def test_killed_at_random_moments(controller, tmp_path):
         assert not [f for f in check_file(folder / "rescued.h5") if f.severity == "error"]
         trial = read_session(folder / "rescued.h5")["01-VD.1"]
         np.testing.assert_allclose(np.diff(trial.time), 1e-3, atol=1e-9)
-        # twelve random cuts more of the same log: as many deaths of the recorder within a write
+        # Each random cut of the log stands for a recorder that died within a write.
         image = path.read_bytes()
         whole = len(trial.time)
         for _ in range(12):

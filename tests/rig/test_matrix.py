@@ -1,4 +1,4 @@
-"""Every cell of the fault matrix: the supervisor alone on a virtual clock, and the recorder against the stand-in."""
+"""The fault matrix: the supervisor alone on streams of samples, and the recorder against the stand-in."""
 
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
@@ -62,30 +62,30 @@ def test_the_documents_table_is_the_matrix(rig, results):
     assert table(rig, results) in RECORDING.read_text(encoding="utf-8")
 
 
-CELLS = [  # kinds of rows, in one of the phases, at one of the sizes: poll_s of 1 ms is a sample or two a block
+CELLS = [  # one phase and one pause between reads for each row; a pause of 1 ms gives blocks of a sample or two
     Cell("disk"), Cell("stall"), Cell("call"), Cell("reader"), Cell("runner"), Cell("watch"), Cell("cut"),
     Cell("deaf"), Cell("lag"), Cell("slow"), Cell("full"), Cell("restart"), Cell("nan", "letting go"),
     Cell("key", "ramp"), Cell("flicker", "ramp", 0.001), Cell("temperature", "hold", 0.01, ("delay=0.01",)),
     Cell("clock fast", "arming"),
 ]  # fmt: skip
-LANES = 3  # at a time: each sleeps most of the time
+LANES = 3  # cells at a time; each sleeps most of its time
 
 
 @pytest.fixture(scope="module")
 def over_the_wire():
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(LANES - 1, context) as pool, ProcessPoolExecutor(1, context) as other:
-        # a call that hangs keeps its connection for as long as its process lives
+        # A call that hangs keeps its connection for as long as its process lives.
         yield {cell: (other if cell.row == "call" else pool).submit(try_cell, cell) for cell in CELLS}
 
 
 @pytest.mark.parametrize("cell", CELLS, ids=lambda cell: f"{cell.row}-{cell.phase}")
 def test_the_recorder_lets_go_over_the_wire(over_the_wire, cell):
-    """Stopped, tension off, data kept, the cause named, and ended by itself, each within its time."""
+    """The rig stops, tension is off, data are kept, the cause is named, and the run ends, each within its time."""
     found, faults = over_the_wire[cell].result()
     assert not faults, (faults, found)
 
 
 def test_every_row_is_tested_over_the_wire_or_as_a_stream():
-    hosts = {"host"}  # killed and stopped in test_command_line
+    hosts = {"host"}  # test_command_line stops and kills the host
     assert {row.name for row in MATRIX} == {c.row for c in CELLS} | {row.name for row in STREAMS} | hosts

@@ -1,4 +1,4 @@
-"""Rig and plan files, whatever is written in them: read, or refused with the line."""
+"""Mutated rig and plan files are read, or refused with the line."""
 
 from hypothesis import HealthCheck, given, settings
 

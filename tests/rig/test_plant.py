@@ -1,4 +1,4 @@
-"""The simulated finger against references of its own: potential energy, derivatives, the laws of friction."""
+"""The simulated finger against independent references: potential energy, derivatives, laws of friction."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ angles = st.lists(st.floats(-0.1, 1.3), min_size=3, max_size=3)
 
 
 def potential(q: np.ndarray) -> float:
-    """−Σ m g·p, by rotation matrices."""
+    """Potential energy −Σ m g·p, J, by rotation matrices."""
     f = default_truth().finger
     rotation, place, energy = np.eye(3), np.zeros(3), 0.0
     for j in range(3):
@@ -143,8 +143,8 @@ def test_a_free_finger_comes_to_rest_and_friction_holds_it_there():
     still = list(plant.q)
     for _ in range(500):
         plant.step([3.0, 2.5, 2.5, 2.5], None)
-    np.testing.assert_allclose(plant.q, still, atol=1e-9)  # it sticks, it does not creep
+    np.testing.assert_allclose(plant.q, still, atol=1e-9)  # It sticks and does not creep.
     for _ in range(500):
         plant.step([3.0, 2.5, 2.4, 2.5], None)
-    np.testing.assert_allclose(plant.q, still, atol=1e-9)  # a small pull back is taken by friction
+    np.testing.assert_allclose(plant.q, still, atol=1e-9)  # Friction takes a small change of tension.
     assert DT == 1e-3

@@ -1,4 +1,4 @@
-"""The reader: how far the host's clock leads the controller's goes into the log, trial by trial."""
+"""The reader logs by how much the host's clock leads the controller's, and turns every exception into an error."""
 
 import time
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ from jaxfinger.rig.safety import Supervisor
 
 @pytest.mark.parametrize(("lead_s", "drift"), [(3.0, 5e-3), (-0.5, -1e-3)])
 def test_the_drift_between_two_clocks_shows_from_trial_to_trial(simulated, tmp_path, monkeypatch, lead_s, drift):
-    """Blocks are up to 40 ms on their way; 10 s lie between the trials."""
+    """Blocks take up to 40 ms to arrive; 10 s lie between the trials."""
     rng, born = np.random.default_rng(5), simulated.controller
     start = None
 
@@ -27,7 +27,7 @@ def test_the_drift_between_two_clocks_shows_from_trial_to_trial(simulated, tmp_p
         return EPOCH_NS + device + int(lead_s * 1e9 + drift * (device - start) + on_its_way)
 
     monkeypatch.setattr(module, "time", SimpleNamespace(time_ns=host, monotonic=time.monotonic))
-    simulated.synchronous = False  # as a rig with a clock of its own; here its samples are still made when read
+    simulated.synchronous = False  # as a rig with a clock of its own; its samples are still made when they are read
     recorder = Recorder(tmp_path / "a.wal", {})
     with simulated:
         reader = Reader(simulated, recorder, Supervisor(simulated.description))

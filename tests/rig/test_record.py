@@ -1,4 +1,4 @@
-"""What a person meets: the commands, the live view, the keys, a recording played back."""
+"""The parts that a person sees: commands, live view, keys, a recording played back."""
 
 import io
 import os
@@ -122,12 +122,12 @@ def test_keys_at_the_terminal(key):
     assert not person.stop_requested()
     person.key(key)
     assert person.stop_requested()
-    person.ask("again", lambda: True)  # returns at once: the rig is being stopped
+    person.ask("again", lambda: True)  # Returns at once: the rig is being stopped.
     AtTerminal(said.append).ask("dead", lambda: False)
 
 
 def test_a_terminal_that_is_gone_is_a_stop():
-    """Its stop key is gone with it."""
+    """A terminal that is gone has no stop key."""
     ours, theirs = os.pipe()
     person = AtTerminal()
     person._keys = ours
@@ -150,7 +150,7 @@ def test_a_session_that_cannot_be_written_stays_in_its_log(files, rig, monkeypat
 
 
 def test_a_bench_cannot_prepare_itself(rig, tmp_path, monkeypatch):
-    """--yes on a rig that needs hands is refused before it is armed."""
+    """--yes is refused before arming on a rig that a person must prepare."""
     machine = SimulatedRig(rig)
     monkeypatch.setattr(machine, "_has_bench", lambda: False)
     with pytest.raises(UserError, match="run without --yes"):

@@ -1,4 +1,4 @@
-"""A slow disk never holds up whoever hands samples over, and loses none of them."""
+"""The recorder: a slow disk neither holds up the reader nor loses samples."""
 
 import threading
 
@@ -16,7 +16,7 @@ def block(first, count=50):
 
 
 class Slow(wal.LogWriter):
-    """A disk that does not answer until it is let go."""
+    """A disk that does not answer until `go` is set."""
 
     go = threading.Event()
 
@@ -30,7 +30,7 @@ def test_a_disk_that_stands_still_does_not_hold_up_the_reader(tmp_path):
     log = Recorder(tmp_path / "a.wal", {}, opener=Slow.create)
     for k in range(400):
         log.block(block(50 * k))
-    assert log.waiting == 20_000  # all taken, none written: this line is reached while the disk stands still
+    assert log.waiting == 20_000  # all queued, none written: the disk has not answered yet
     Slow.go.set()
     log.flush()
     log.close()

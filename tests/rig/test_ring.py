@@ -1,4 +1,4 @@
-"""Pulling the ring: no sample lost, none twice, overruns counted, torn records read again, restarts never spliced."""
+"""Reading the ring: every sample comes once or is counted as lost; torn records and restarts are noticed."""
 
 import threading
 import time
@@ -195,7 +195,7 @@ def test_two_threads_may_command(rig):
 
 
 def test_a_stop_waits_for_no_other_command(rig):
-    """A controller that acknowledges nothing, with a command under way: the STOP is written over it at once."""
+    """While a command waits for a controller that acknowledges nothing, a STOP is written over it."""
     machine = small(rig)
     with machine:
         machine.arm()

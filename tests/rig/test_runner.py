@@ -1,4 +1,4 @@
-"""Whole sessions on the simulated rig: complete ones, and what each fault leaves behind."""
+"""Whole sessions on the simulated rig: complete ones, and ones that a fault ends."""
 
 import json
 import resource
@@ -28,7 +28,7 @@ def slot(rig, kind, of=""):
 
 
 def wait_until_written(log, trial):
-    """The writer may be a whole sync behind a simulated rig, which runs as fast as it is read."""
+    """Wait for the writer: it may be a whole sync behind a simulated rig, which runs as fast as it is read."""
     deadline = time.monotonic() + 30.0
     while trial.encode() not in log.read_bytes():
         assert time.monotonic() < deadline
@@ -112,7 +112,7 @@ def test_a_fault_ends_the_trial_safely_with_cause_and_data(rig, record, fault, c
     assert trip.sentence in outcome.cause
     assert machine.controller.state is State.TRIPPED
     assert max(machine.controller.setpoint) <= 8.0
-    assert 0 < machine.controller.trip_seq - at[0] <= within + 100  # samples; a block of the host may be 100 long
+    assert 0 < machine.controller.trip_seq - at[0] <= within + 100  # samples; a block of the host may have 100
     assert outcome.complete == ("01-ID.2-DIP",)
     assert serious(outcome.session) == []
     session = read_session(outcome.session)
@@ -120,13 +120,13 @@ def test_a_fault_ends_the_trial_safely_with_cause_and_data(rig, record, fault, c
     cut = session["02-ID.4-T3-MCP"]
     assert not cut.complete
     assert np.isfinite(cut.tendon_force).all()
-    assert cut.tendon_force.max() < 8.0  # the spike itself is not in the trial
+    assert cut.tendon_force.max() < 8.0  # The spike itself is not in the trial.
     with h5py.File(outcome.session) as file:
         attributes = file["trials/02-ID.4-T3-MCP"].attrs
         assert attributes["trip"] == trip
         assert trip.sentence in attributes["cause"]
         after = file["rig/dropped/02-ID.4-T3-MCP"]
-        assert after["seq"].shape[0] > 500  # what came after the trip lies beside the trial
+        assert after["seq"].shape[0] > 500  # Samples after the trip lie beside the trial.
         assert any(trip.sentence in json.loads(e)["text"] for e in file["rig/events"].asstr()[()])
 
 
@@ -184,7 +184,7 @@ def test_a_latched_controller_is_reset_before_a_resumed_run(rig, record):
 
 
 def test_the_recorder_may_die_and_the_ring_fills_the_trial(rig, record, short, tmp_path):
-    """A log that ends within a trial is closed with what the controller's ring still holds."""
+    """A log that ends within a trial gets the samples that the controller's ring still holds."""
     machine = SimulatedRig(rig)
     lengths = []
 
@@ -282,7 +282,7 @@ def test_a_disk_that_stays_too_slow_ends_the_trial_and_keeps_what_was_written(ri
 
 
 def test_a_person_at_a_bench_that_prepares_nothing_itself(rig, record):
-    """Every setup of the plan becomes a prompt; the run goes on when it is answered."""
+    """Every setup of the plan becomes a prompt. The run goes on once it is answered."""
     machine, prompts, wanted = SimulatedRig(rig), [], []
     by_itself = machine.prepare
     machine.prepare = lambda setup: bool(wanted.append(setup))
@@ -337,7 +337,7 @@ def test_a_loaded_torque_sensor_cannot_be_tared(rig, record):
 
 
 def test_a_gap_is_counted_and_written(rig, record, tmp_path):
-    """A host that sleeps longer than the ring lasts: the samples are lost, and the file says how many."""
+    """The host sleeps for longer than the ring lasts. The file gives the number of lost samples."""
     machine = SimulatedRig(rig, Controller(ring=1024))
 
     def sleep(m):
@@ -379,7 +379,7 @@ def test_what_is_wrong_before_arming_is_a_sentence_and_nothing_moves(rig, record
 
 
 def test_a_controller_that_does_not_release_is_said(rig, record):
-    """RELEASE after the last trial and STOP are both ignored: the watchdog lets go, and the run says what happened."""
+    """RELEASE after the last trial and STOP are both ignored. The run says so and asks to switch the drives off."""
     machine = SimulatedRig(rig)
     outcome = record(machine, lambda m: m.controller.strike("deaf"))
     assert "did not release the finger after the last trial" in outcome.cause

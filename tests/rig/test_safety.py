@@ -1,4 +1,4 @@
-"""The supervisor finds each fault, never a healthy finger, and finds the same however samples are cut into blocks."""
+"""The supervisor finds each fault and no other, at the same sample in blocks of any size."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -126,11 +126,11 @@ def test_speed_and_tension_rate(rig, quiet_block):
 @pytest.mark.parametrize("tension", [-1.5, 5.5])
 @pytest.mark.parametrize("pieces", [1, 7, 900])
 def test_a_tension_that_stays_away_from_its_set_point(rig, quiet_block, tension, pieces):
-    """2 N are wanted; 3 N of error may last 0.2 s, however the samples are cut into blocks."""
+    """The set-point is 2 N. An error above 3 N may last 0.2 s, in blocks of any size."""
 
     def astray(x):
         x[20:220, column(rig, "tension", "T3")] = tension  # 200 samples are allowed
-        x[1020:, column(rig, "tension", "T3")] = tension  # good samples count a quarter
+        x[1020:, column(rig, "tension", "T3")] = tension  # each good sample before takes off a quarter
         x[:, column(rig, "tension", "T3")] += np.random.default_rng(1).normal(0, 1e-3, 1300)
 
     block, supervisor = spoil(quiet_block(1300), astray), Supervisor(rig)
@@ -139,7 +139,7 @@ def test_a_tension_that_stays_away_from_its_set_point(rig, quiet_block, tension,
     assert (found[0].seq, found[0].channel) == (1220, "set-point minus tension T3")
     assert found[0].value == pytest.approx(2.0 - tension, abs=0.01)
     off = replace(block, state=np.full(1300, State.IDLE, np.uint32))
-    assert not [v for v in Supervisor(rig).check(off) if v.trip is Trip.TRACKING]  # drives off: nothing to follow
+    assert not [v for v in Supervisor(rig).check(off) if v.trip is Trip.TRACKING]  # drives off
 
 
 def test_time_that_jumps_back(rig, quiet_block):
@@ -169,7 +169,7 @@ KINDS = ("nan", "over", "flag", "fast", "steep", "astray", "freeze", "frozen enc
 
 
 def faulty(rig, block: Block, kind: str, at: np.ndarray) -> Block:
-    """A stream with one kind of fault at the samples `at` (a mask)."""
+    """Return the stream with one kind of fault at the samples of the mask `at`."""
     x, t, flags, state = block.x.copy(), block.t_ns.astype(np.int64), block.flags.copy(), block.state.copy()
     first = int(np.argmax(at)) if at.any() else len(x)
     if kind in ("nan", "over"):
@@ -205,7 +205,7 @@ def faulty(rig, block: Block, kind: str, at: np.ndarray) -> Block:
     cuts=st.one_of(st.lists(st.integers(1, 1299), max_size=12), st.sampled_from([1, 2, 3, 10, 50])),
 )
 def test_the_first_trip_is_the_same_however_samples_arrive(rig, quiet_block, kind, pattern, start, length, cuts):
-    """Every check, any pattern of good and bad samples, any partition of the stream."""
+    """For every check, any pattern of good and bad samples and any partition of the stream."""
     at = np.zeros(1300, bool)
     at[start : start + length] = np.resize(pattern, min(length, 1300 - start))
     block = faulty(rig, quiet_block(1300), kind, at)
@@ -219,7 +219,7 @@ def test_the_first_trip_is_the_same_however_samples_arrive(rig, quiet_block, kin
             break
     if isinstance(cuts, int) and 1300 % cuts and not online:
         online = supervisor.check(part(block, 1300 - 1300 % cuts, 1300))
-    assert repr(online[:1]) == repr(whole[:1])  # of NaN too
+    assert repr(online[:1]) == repr(whole[:1])  # repr also compares NaN
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The state machines against loops that are obviously right, and against any way to cut a stream into blocks."""
+"""The state machines against plain loops, for any partition of a stream into blocks."""
 
 from itertools import pairwise
 
@@ -18,7 +18,7 @@ def pieces(length: int, at: list[int]):
 
 
 def fills(bad: list[bool], need: int) -> list[tuple[int, int]]:
-    """Sample by sample: where the count is full at a bad sample, and where its bad samples began."""
+    """Return the bad samples at which the count is full, each with the sample at which its bad samples began."""
     level, since, found = 0.0, 0, []
     for k, wrong in enumerate(bad):
         since = k if wrong and level == 0.0 else since
@@ -32,7 +32,7 @@ def fills(bad: list[bool], need: int) -> list[tuple[int, int]]:
 @given(streams, cuts, st.sampled_from([FULL_COUNT, 1, 7]))
 def test_a_count_fills_at_the_same_sample_however_it_is_cut(bad, at, need):
     expected = fills(bad, need)
-    count = LeakyCount(2, need)  # beside a column in which nothing is ever bad
+    count = LeakyCount(2, need)  # the other column is never bad
     both = np.stack([np.zeros(len(bad), bool), np.array(bad)], 1)
     hits = [
         (a + row, since)

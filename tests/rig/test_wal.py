@@ -1,4 +1,4 @@
-"""The log: every prefix of it can be read, and damage costs only what follows it."""
+"""The log: every prefix of it can be read, and damage costs only the frames from there on."""
 
 import io
 
@@ -19,7 +19,7 @@ def block(first: int, count: int, channels: int = 3, lost: int = 0) -> Block:
 
 
 class Pieces(io.BytesIO):
-    """A file that remembers its length after every write, and may write less than it is given."""
+    """A file that keeps its length after every write in `ends`, and may write less than it is given."""
 
     def __init__(self, most: int = 1 << 30):
         super().__init__()
@@ -44,7 +44,7 @@ def a_log(most: int = 1 << 30) -> tuple[Pieces, list[int]]:
 
 
 def test_killed_at_every_write():
-    """Whatever is there at each write, also half a frame, every whole frame before it is read."""
+    """After each write, even of half a frame, every whole frame before it can be read."""
     file, ends = a_log(most=700)
     data = file.getvalue()
     for cut in file.ends[1:]:

@@ -1,8 +1,7 @@
-"""One cell of the fault matrix over the wire: record against the stand-in in real time, let a fault strike, and see by
-the stand-in's own clock when it stopped and when tension was off.
+"""One cell of the fault matrix over the wire: record from the stand-in in real time and let a fault strike.
 
-Cells run in processes of their own, several at a time. A machine that stands still for longer than STALL_S proves
-nothing about the rig, so such a cell is run again.
+The stand-in's own clock gives the times of the stop and of no tension. Cells run in processes of their own, several at
+a time. A machine that stands still for longer than STALL_S proves nothing about the rig, so such a cell is run again.
 """
 
 from __future__ import annotations
@@ -29,11 +28,12 @@ from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.examples import rig_toml
 
 PLAN = '[plan]\nname = "hold"\noperator = "tester"\n[[trial]]\nexperiment = "VD.1"\npretension = 8.0\nseconds = 30.0\n'
-STALL_S = 0.03
+STALL_S = 0.03  # s; a tenth of matrix.STOP_S
 ATTEMPTS = 5
-# deadlines of other rows than the one under test: a loaded machine must not trip over them
+# Deadlines of all rows but the one under test: long, so that a loaded machine keeps them.
 CALM = {"stale_s": 3.0, "lag_s": 3.0, "thread_s": 3.0, "disk_s": 10.0, "clock_offset_s": 3.0}
-OF = {
+# The deadline that a row tests; it keeps its default.
+TESTED_DEADLINE = {
     "slow": "clock_offset_s", "stall": "stale_s", "lag": "lag_s", "reader": "thread_s", "runner": "thread_s",
     "disk": "disk_s", "clock slow": "clock_offset_s",
 }  # fmt: skip
@@ -41,7 +41,7 @@ OF = {
 
 @dataclass(frozen=True)
 class Cell:
-    """A row of the matrix, when it strikes, the pause between two reads; `also` are faults from the start."""
+    """A row of the matrix, the phase in which it strikes, the pause between two reads, and faults from the start."""
 
     row: str
     phase: str = "hold"
@@ -51,7 +51,7 @@ class Cell:
 
 @dataclass
 class Found:
-    """What came of a cell: times in s since the fault struck; `stall_s` is how long the machine stood still."""
+    """Result of a cell, with times in s since the fault struck; `stall_s` is how long the machine stood still."""
 
     cell: Cell
     cause: str
@@ -59,12 +59,12 @@ class Found:
     stop_s: float | None
     off_s: float | None
     end_s: float
-    missing_s: float | None  # of what was recorded before the fault
+    missing_s: float | None  # s of samples before the fault that are not in the file
     stall_s: float
 
 
 class Host:
-    """What strikes on the host's side: keys, threads and disk."""
+    """Operator and faults on the host's side: stop key, threads that hang, disk."""
 
     def __init__(self, monkey: contextlib.ExitStack):
         self.pressed = False
@@ -106,7 +106,7 @@ class Host:
 
 
 def stalls(stop: threading.Event, worst: list[float]) -> None:
-    """How long this machine lets a thread wait that wants to run."""
+    """Measure how long this machine keeps a thread waiting that wants to run."""
     while not stop.is_set():
         asked = time.monotonic()
         time.sleep(0.005)
@@ -114,9 +114,9 @@ def stalls(stop: threading.Event, worst: list[float]) -> None:
 
 
 def once(cell: Cell) -> Found | str:
-    """Run a cell; only a sentence where the run ended before the fault struck, since the machine was too busy."""
+    """Run a cell. Return only the run's sentence where it ended before the fault struck: the machine was too busy."""
     row = next(r for r in matrix.MATRIX if r.name == cell.row)
-    deadlines = {k: v for k, v in CALM.items() if k != OF.get(cell.row)}
+    deadlines = {k: v for k, v in CALM.items() if k != TESTED_DEADLINE.get(cell.row)}
     with contextlib.ExitStack() as stack:
         bench = stack.enter_context(standin.started(faults=cell.also))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -178,7 +178,7 @@ def once(cell: Cell) -> Found | str:
         while recorder.is_alive() and time.monotonic() - struck_at < 15.0:
             recorder.join(0.02)
             if "runner" in host.hangs and bench.report()["off_seq"] >= 0:
-                host.go.set()  # the debugger goes on, so that the run may end
+                host.go.set()  # Let the runner go on, so that the run can end.
         report, fault = bench.report(), report["fault_seq"] if row.wire in HOSTS else bench.report()["fault_seq"]
         restarted = report["boot"] != boot
         fault = report["head"] if fault is None else fault
@@ -202,7 +202,7 @@ HOSTS = ("key", "deaf", *HANGS)
 
 
 def judge(found: Found) -> list[str]:
-    """What is wrong with a cell that ran."""
+    """Return the faults of a cell's result."""
     row = next(r for r in matrix.MATRIX if r.name == found.cell.row)
     rig = parse_rig(rig_toml())
     shows, faults = row.shows(rig), []
@@ -221,6 +221,7 @@ def judge(found: Found) -> list[str]:
     return faults
 
 
+# Sentences by which a run may also name the cause.
 SAYS = {
     "stall": ["wrote no sample"],
     "slow": ["wrote no sample"],
@@ -236,14 +237,14 @@ SAYS = {
 
 @functools.cache
 def _silence() -> None:
-    """AdsLib writes lines of its own when a connection closes."""
+    """Send stderr to nowhere: AdsLib writes to it when a connection closes."""
     import os
 
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 
 
 def try_cell(cell: Cell) -> tuple[Found | str, list[str]]:
-    """A cell on a machine that keeps up; its last attempt where the machine never does."""
+    """Run a cell until the machine keeps up, at most ATTEMPTS times. Return the last result and its faults."""
     _silence()
     for _ in range(ATTEMPTS):
         found = once(cell)

@@ -1,4 +1,4 @@
-"""The driven finger: dry friction that is not smoothed, and where the energy goes."""
+"""The driven finger: dry friction that is not smoothed, and the balance of energy."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ FINGER = Finger.from_description(SPECIMEN.description)
 
 
 def _potential(q):
-    """Gravity and springs, J, by plane geometry."""
+    """Potential energy of gravity and springs, J, by plane geometry."""
     d = SPECIMEN.description
     pitch = np.cumsum(q, axis=0)
     height, energy = np.zeros(q.shape[1]), SPECIMEN.elastic_energy(q)
@@ -36,7 +36,7 @@ def _energy(q, v):
 
 @pytest.fixture(scope="module")
 def driven():
-    """Plan, plant, and a driven trial with its velocity."""
+    """A plan, its plant, and position, velocity and tension of the driven trial."""
     recipe = recipe_from({"trials": {"experiments": ["VD.3"], "vd3": {"motions": 1, "duration": 3.0}}})
     plan = session_plan(SPECIMEN.description, recipe.trials)[0]
     plant = SpecimenPlant(SPECIMEN)
@@ -60,7 +60,7 @@ def test_work_of_the_tendons_is_stored_or_lost_to_friction(driven):
     dt = plan.time[1]
     middle, rate = 0.5 * (q[:, 1:] + q[:, :-1]), np.diff(q, axis=1) / dt
     pulled = np.diff(SPECIMEN.excursion(q), axis=1)
-    f = tension[:, :-1]  # acts from this sample to the next
+    f = tension[:, :-1]  # acts from one sample to the next
     work = (f * pulled).sum()
     joints = (SPECIMEN.coulomb(middle) * np.abs(rate)).sum() * dt
     tendons = (SPECIMEN.loss(f) * np.abs(pulled)).sum()
@@ -84,7 +84,7 @@ def test_frictionless_undriven_finger_keeps_its_energy():
     advance = jax.jit(lambda state, h: step(free, FINGER, state, jnp.zeros(5), h), compiler_options=QUICK)
 
     def drift(h):
-        """Change of energy over 50 ms of free motion, as a share of what became kinetic."""
+        """Change of energy over 50 ms of free motion, as a share of the potential energy that became kinetic."""
         state = start
         for _ in range(round(0.05 / h)):
             state = advance(state, h)
@@ -97,7 +97,7 @@ def test_frictionless_undriven_finger_keeps_its_energy():
 
 
 def test_finger_sticks_where_friction_can_hold_it():
-    """Between the tensions that pull it up and let it down, nothing moves at all."""
+    """Nothing moves under tensions between the one that pulls the finger up and the one that lets it down."""
     advance = jax.jit(lambda state, f: step(SPECIMEN, FINGER, state, f, 5e-4), compiler_options=QUICK)
     q0 = np.deg2rad([[55.0], [50.0], [40.0]])
     zero = np.zeros_like(q0)

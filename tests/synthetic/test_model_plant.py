@@ -1,4 +1,4 @@
-"""A model behind the rig's sensors agrees with the specimen whose parameters it has."""
+"""A model as a plant agrees with the specimen whose parameters it has."""
 
 import equinox as eqx
 import numpy as np
@@ -41,7 +41,7 @@ def test_prescribed_channels_agree(plans, experiment):
 
 
 def test_driven_motion_agrees_under_the_same_tension(plans):
-    """Two independent steppings of dry friction, under tension that is held over a sample and interpolated."""
+    """Two independent simulations of dry friction agree; one holds tension over a sample, the other interpolates it."""
     ours = SpecimenPlant(SPECIMEN)
     first = ours.driven(plans["VD.3"])
     second = ModelPlant(true_model(SPECIMEN), driver=ours).driven(plans["VD.3"])

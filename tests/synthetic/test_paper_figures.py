@@ -1,4 +1,4 @@
-"""The figures of the paper (Table I, Figs. 5–9 and their text) come out of the specimen's own functions."""
+"""The specimen's functions give the figures of the paper (Table I, Figs. 5–9 and their text)."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +27,7 @@ def _over_range(specimen):
 
 @pytest.mark.parametrize(("tendon", "joint"), RANGES)
 def test_moment_arms_span_table_1(tendon, joint):
-    """As the table was made: the derivative of the fourth-order polynomial that fits the excursion in ID.2."""
+    """The table is of the derivative of the fourth-order polynomial that fits the excursion in ID.2."""
     specimen = paper_finger()
     d = specimen.description
     i, j = d.tendon_names.index(tendon), d.joint_names.index(joint)

@@ -1,4 +1,4 @@
-"""Prescribed trials: the specimen's plant against the nominal model, where both state the same physics."""
+"""Prescribed trials: the specimen's plant agrees with the nominal model on a specimen of its form."""
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ FORCE = jax.jit(fingertip_force, compiler_options=QUICK)
 
 
 def _sampled(plan, x):
-    """A few instants spread over the plan, always as many."""
+    """Return SAMPLES instants spread over the plan, so that one compilation serves all plans."""
     return x[..., np.linspace(0, plan.time.size - 1, SAMPLES).astype(int)]
 
 

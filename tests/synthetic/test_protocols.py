@@ -1,4 +1,4 @@
-"""Plans: derivatives of the commanded motions, directions, holds, and recipes that do not fit."""
+"""Plans: derivatives of the commanded motions, directions, holds, and recipes that do not fit the finger."""
 
 import numpy as np
 import pytest

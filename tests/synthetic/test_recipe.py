@@ -1,4 +1,4 @@
-"""Recipes, of the simulator and of fits, whatever is written in them: read, or refused with the line."""
+"""Mutated recipes of the simulator and of fits are read, or refused with the line."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What the sensors add: noise of the stated size and colour, converter steps, spikes, CAD errors, missing columns."""
+"""Sensors: noise of the stated size and colour, converter steps, spikes, CAD errors, missing columns."""
 
 import numpy as np
 import pytest

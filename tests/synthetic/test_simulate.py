@@ -1,4 +1,4 @@
-"""Whole sessions: reproducible, in the format, from any plant; recipes with mistakes."""
+"""Whole sessions are reproducible, follow the format and take any plant; mistakes in recipes are named."""
 
 from pathlib import Path
 
@@ -165,7 +165,7 @@ proportional = 0.2
 
 
 def test_a_finger_file_is_a_recipe(tmp_path):
-    """The one form of mappings and rig files: as the recipe itself, and named by one."""
+    """A finger in the form of mappings and rig files serves as the recipe itself, or is named by one."""
     quick = '[trials]\nexperiments = ["ID.2", "ID.3-static", "ID.4"]\nrate = 50.0\n'
     (tmp_path / "finger.toml").write_text(FINGER)
     (tmp_path / "recipe.toml").write_text(f'finger = "finger.toml"\n{quick}{TERMS}')

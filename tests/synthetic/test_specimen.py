@@ -1,4 +1,4 @@
-"""Routes and specimens: derivatives, energies, and the variants."""
+"""Routes and specimens: derivatives, energies, random and polynomial fingers."""
 
 import jax
 import jax.numpy as jnp
