@@ -69,7 +69,7 @@ def _set(kind: str, of: str, value: float) -> Spoil:
 
 
 def _run(kind: str, of: str, step: float) -> Spoil:
-    """The channel runs away by `step` per masked sample, for forty samples."""
+    """The channel changes by `step` per masked sample, for forty samples."""
 
     def spoil(block: Block, at: np.ndarray, rig: RigDescription) -> None:
         block.x[:, rig.index(kind, of)] += np.minimum(np.cumsum(at), 40) * step

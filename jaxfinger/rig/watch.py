@@ -25,7 +25,8 @@ from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.safety import Violation
 
 PERIOD_S = 0.02  # s between two checks: the most that it adds to the time from stop key to STOP
-# s between two heartbeats: a fifth of the 0.25 s after which the controller releases, so four may come late or be lost.
+# s between two heartbeats: a fifth of the 0.25 s after which the controller releases the finger, so that one that comes
+# late does no harm.
 BEAT_S = 0.05
 # s, the most that one check adds to a thread's silence. If the watch itself ran late, the machine was busy, and the
 # other threads may have been late for the same reason.

@@ -25,7 +25,10 @@ class Address:
 
 
 class ReplayRig(Rig):
-    """The blocks of a recorded trial, in state ARMED, with the channels that it measured. Commands are refused."""
+    """The blocks of a recorded trial, in state ARMED, with the channels that it measured.
+
+    Commands are refused. Stop and release have nothing to act on.
+    """
 
     synchronous = True
     simulated_time = True
