@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxfinger.data.schema import channel_units
 from jaxfinger.gap.exact import Projector
@@ -42,25 +43,26 @@ class Proposal:
         return f"{self.channel} {self.site} ≈ {body.lstrip('+')}"
 
 
-def propose(problem: Problem, project: Projector, residual: np.ndarray, left: Sequence[SmoothPart]) -> Proposal | None:
+def propose(
+    problem: Problem, project: Projector, residual: Float[np.ndarray, " N"], left: Sequence[SmoothPart]
+) -> Proposal | None:
     """Propose a formula for the column where smooth laws explain most of a residual; None if no term is worth it.
 
     Args:
         project: projection off the nominal parameters.
-        residual: (N,) white residual that the causes leave.
+        residual: white residual that the causes leave.
         left: what smooth laws explain of it in every column; one at least.
     """
     by_column: dict[tuple[str, int], float] = {}
     for x in left:
         by_column[x.channel, x.column] = by_column.get((x.channel, x.column), 0.0) + max(x.energy, 0.0)
     (channel, column), most = max(by_column.items(), key=lambda kv: kv[1])
-    names, columns = _columns(problem, channel, column)
-
-    Z, r = project(columns), project.residual(residual)
+    names, rows = _library_rows(problem, channel, column)
+    Z, r = project(rows), project.residual(residual)
     norm = np.linalg.norm(Z, axis=1)
-    usable = norm > MIN_UNABSORBED * np.linalg.norm(columns, axis=1)
+    usable = norm > MIN_UNABSORBED * np.linalg.norm(rows, axis=1)
     found: list[int] = []
-    rest, energy = r, 0.0
+    coefficients, rest, energy = np.empty(0), r, 0.0
     while len(found) < MAX_TERMS:
         gain = np.where(usable, (Z @ rest) ** 2 / np.maximum(norm, 1e-300) ** 2, 0.0)
         gain[found] = 0.0
@@ -69,16 +71,15 @@ def propose(problem: Problem, project: Projector, residual: np.ndarray, left: Se
         explained = float(r @ r - np.sum((r - a @ Z[trial]) ** 2))
         if explained - energy < MIN_GAIN_SHARE * most:
             break
-        found, rest, energy = trial, r - a @ Z[trial], explained
+        found, coefficients, rest, energy = trial, a, r - a @ Z[trial], explained
     if not found:
         return None
-    a = np.linalg.lstsq(Z[found].T, r, rcond=1e-10)[0]
-    named = tuple((float(v), names[i]) for v, i in zip(a, found, strict=True))
+    named = tuple((float(v), names[i]) for v, i in zip(coefficients, found, strict=True))
     units = channel_units(channel, problem.session.finger.prismatic)
     return Proposal(channel, site(problem, channel, column), named, units, min(1.0, energy / most))
 
 
-def _columns(problem: Problem, channel: str, column: int) -> tuple[list[str], np.ndarray]:
+def _library_rows(problem: Problem, channel: str, column: int) -> tuple[list[str], Float[np.ndarray, "terms N"]]:
     """Terms of the library, and their white rows (terms, N) in every experiment that reads the channel."""
     found: dict[str, np.ndarray] = {}
     for e, rows in problem.rows.items():
@@ -94,8 +95,8 @@ def _columns(problem: Problem, channel: str, column: int) -> tuple[list[str], np
     return list(found), np.stack(list(found.values()))
 
 
-def terms(problem: Problem, experiment: str, channel: str, column: int) -> list[tuple[str, np.ndarray]]:
-    """Library of one column: terms and their values (B, T)."""
+def terms(problem: Problem, experiment: str, channel: str, column: int) -> list[tuple[str, Float[np.ndarray, "B T"]]]:
+    """Library of one column: terms and their values."""
     x, finger = problem.stacks[experiment].batch.x, problem.nominal.finger
     q, qd, f, s = (np.asarray(a) for a in (x.q, x.qd, x.tension, x.joint_direction))
     time = np.asarray(x.time)

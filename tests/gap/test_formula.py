@@ -49,7 +49,7 @@ def test_a_quiet_cause_counts_beside_a_loud_error(columns, rng):
     assert gains[1] == pytest.approx(gains[0], abs=0.5)
 
 
-def test_an_imitator_gains_a_part_of_many_columns_and_a_cause_all_of_its_own(columns, rng):
+def test_an_imitator_that_explains_half_of_every_column_gains_much_less_than_the_cause(columns, rng):
     everywhere = np.stack([smooth(columns, rng, c) for c in range(COLUMNS)])
     noise = rng.standard_normal(ROWS * COLUMNS)
     r = noise + 100.0 * everywhere.sum(axis=0)
@@ -59,7 +59,7 @@ def test_an_imitator_gains_a_part_of_many_columns_and_a_cause_all_of_its_own(col
     assert true > 3.0 * imitator
 
 
-def test_the_size_of_the_gap_is_no_prior_on_what_noise_gives(columns, rng):
+def test_signatures_gain_nothing_from_noise(columns, rng):
     r = rng.standard_normal(ROWS * COLUMNS)
     Z = 20.0 * np.stack([smooth(columns, rng, *range(COLUMNS)) for _ in range(200)])
     model = linear(columns, r, Z)
