@@ -43,7 +43,8 @@ from jaxfinger.gap.result import (
     tolerated,
 )
 from jaxfinger.gap.screening import read_parts
-from jaxfinger.gap.sets import Offer, Search, SignatureTable, table_of
+from jaxfinger.gap.sets import Search
+from jaxfinger.gap.signature_table import Offer, SignatureTable, table_of
 from jaxfinger.gap.signatures import catalogue_for, changes_of, variants
 from jaxfinger.gap.smooth_laws import SmoothPart, smooth_parts
 from jaxfinger.gap.where import where

@@ -11,7 +11,8 @@ from jaxfinger.gap.exact import Baseline
 from jaxfinger.gap.formula import Parameters
 from jaxfinger.gap.problem import Problem, build
 from jaxfinger.gap.screening import read_parts
-from jaxfinger.gap.sets import Search, table_of
+from jaxfinger.gap.sets import Search
+from jaxfinger.gap.signature_table import table_of
 from jaxfinger.gap.signatures import Variant, catalogue_for, variants
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.stages import Progress

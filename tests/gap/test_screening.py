@@ -14,7 +14,7 @@ from jaxfinger.gap.exact import Baseline
 from jaxfinger.gap.formula import Parameters
 from jaxfinger.gap.result import Key
 from jaxfinger.gap.screening import MAX_PERIODS, Scan, read_parts
-from jaxfinger.gap.sets import table_of
+from jaxfinger.gap.signature_table import table_of
 from jaxfinger.gap.signatures import Signatures, Variant, variants
 from jaxfinger.model import Finger
 from jaxfinger.synthetic import paper_finger
