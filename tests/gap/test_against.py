@@ -1,4 +1,4 @@
-"""A session beside an earlier fit of the same finger: what has changed in between, and what has not."""
+"""A session compared with an earlier fit of the same finger: what has changed is named, and nothing else."""
 
 from dataclasses import replace
 
@@ -52,7 +52,7 @@ def test_nothing_has_changed(earlier):
     ids=lambda x: x if isinstance(x, str) else "",
 )
 def test_one_parameter_has_changed(earlier, truth, group):
-    """By its name, its value before, and its value now."""
+    """The change is named with the parameter's value before and now."""
     found = beside(earlier, truth)
     assert found.status is Status.EXPLAINED
     assert found.named == (Key(truth[0].ID, truth[1]),)
@@ -70,7 +70,7 @@ def test_one_parameter_has_changed(earlier, truth, group):
 
 @pytest.mark.long
 def test_an_effect_came_and_a_parameter_changed(earlier):
-    """Both are named, each with its value; and what is written is `gap.json` 2."""
+    """Both are named, each with its value, and `gap.json` holds them."""
     found = beside(earlier, PLANTED, changed("changed_damping", "MCP", d=3e-4))
     assert found.status is Status.EXPLAINED
     assert set(found.named) == {Key(*TRUTH), Key("changed_damping", ("MCP",))}

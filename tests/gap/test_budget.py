@@ -1,4 +1,4 @@
-"""What a signature explains of trials that its amplitude has not seen."""
+"""Held-out gain: the share that a signature explains of trials which its amplitude is not fitted to."""
 
 from dataclasses import replace
 

@@ -37,8 +37,8 @@ def test_a_length_that_a_linear_step_turned_negative_comes_back(finger):
     assert 0.0 < within_bounds(effect, scales).values()["x0"] <= least
 
 
-def test_trials_without_a_gap_say_nothing_of_how_far_it_closes():
-    """Two tendons of ten show it: a draw of the bootstrap that has neither would say that nothing closes."""
+def test_trials_without_a_gap_do_not_widen_the_interval_of_how_far_it_closes():
+    """Two trials of twenty show the gap; draws of the bootstrap without either of them do not count."""
     rng = np.random.default_rng(1)
     noise = 1.0 + 0.02 * rng.standard_normal((20, 2))
     before = np.where(np.arange(20) < 2, 400.0, 1.0) * noise[:, 0]

@@ -1,4 +1,4 @@
-"""Ways in which a diagnosis could fool its user, each as a session with a known answer."""
+"""Ways in which a diagnosis could mislead its user, each tested on a session whose causes are known."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def test_a_users_copy_of_a_listed_effect_is_its_rival_and_not_its_better():
 
 
 def test_a_gain_that_friction_absorbs_is_not_named():
-    """A tendon that is only ever pulled further: its sensor's gain and its affine friction are one thing."""
+    """While a tendon is only pulled further, a gain error of its sensor and affine friction have the same effect."""
     trials = TABLE["trials"] | {
         "experiments": ["ID.2", "ID.3-static", "ID.4"],
         "id4": {"repeats": 2, "postures": [[25, 30, 45]], "release": False, "dwell": 0.4},
@@ -60,7 +60,7 @@ def test_a_gain_that_friction_absorbs_is_not_named():
     ids=lambda t: t[0],
 )
 def test_without_sweeps_the_moves_between_holds_show_what_depends_on_speed(truth):
-    """A friction of which three quarters fall with speed is a negative damping at first: one linearisation errs."""
+    """Three quarters of this friction fall with speed, as with negative damping; one linearisation is not enough."""
     trials = TABLE["trials"] | {"experiments": ["ID.2", "ID.3-static"]}
     keep = {*RIVALS, "drive_inertia", "torque_ripple"}
     session = session_with(truth, recipe=recipe_from(TABLE | {"trials": trials}))
@@ -84,7 +84,7 @@ def test_a_little_friction_of_the_wrap_is_seen_though_a_lot_would_slip_elsewhere
 
 
 def test_the_order_of_the_trials_in_a_file_says_nothing():
-    """A sensor that drifts over the session does so by the clock."""
+    """A sensor drifts with the clock, not with the order of the trials in a file."""
     keep = {*RIVALS, "torque_sensor_drift"}
     session = session_with(("torque_sensor_drift", ("torque_sensor",), {"slope": 1e-4, "A": 1e-3, "P": 250.0}))
     backwards = replace(session, trials=dict(reversed(session.trials.items())))
@@ -102,8 +102,8 @@ def test_a_nominal_model_more_flexible_than_needed_hides_no_cause():
 
 
 def test_many_repeats_of_what_no_candidate_explains_make_none_right():
-    """Repeats tell noise and nothing of the form: a law of the wrong sign stays unexplained however often it is seen,
-    and no amplitude comes out with a sign that it cannot have.
+    """Repeats reduce noise but tell nothing about the form of a law. A law with the sign reversed stays unexplained
+    however often it is repeated, and no amplitude gets a sign that it cannot have.
     """
     trials = TABLE["trials"] | {k: TABLE["trials"][k] | {"repeats": 4} for k in ("id2", "id3_static", "id3_dynamic")}
     upside_down = ("joint_stribeck", ("PIP",), {"a": -0.8, "v_s": 0.2, "delta": 2.0})
@@ -116,7 +116,7 @@ def test_many_repeats_of_what_no_candidate_explains_make_none_right():
 
 
 def test_what_the_finger_decides_of_an_effect_is_not_fitted():
-    """A stop sits in a range that the file states: its place moves, and the range does not."""
+    """A fit moves the place of a stop, but not the range of the joint, which the file states."""
     keep = {"joint_stop", "torque_ripple"}
     truth = ("joint_stop", ("PIP",), {"stiffness": 0.05, "place": 0.7, "end": 1.0})
     found = diagnose(session_with(truth), without=tuple(sorted(set(CATALOGUE) - keep)))

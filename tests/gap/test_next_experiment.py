@@ -20,7 +20,7 @@ USUAL = [25, 30, 45]  # MCP, PIP, DIP, degrees
 
 
 def of_one_joint(*postures):
-    """Only the PIP is ever moved, the others resting in the given postures: which of them it is tied to stays open."""
+    """A session in which only the PIP moves and the other joints rest, so that its coupling to them is ambiguous."""
     trials = TABLE["trials"]
     there = {k: trials[k] | {"postures": list(postures)} for k in ("id3_static", "id3_dynamic")}
     session = session_with(TRUTH, recipe=recipe_from(TABLE | {"trials": trials | there}))
@@ -48,7 +48,7 @@ def test_the_suggestion_once_run_settles_the_verdict(ambiguous):
 
 @pytest.mark.long
 def test_a_shape_that_no_trial_tells_is_said_to_be_open(ambiguous):
-    """With the DIP in one posture only φ + ρ q_DIP shows: neither ρ nor φ is known."""
+    """With the DIP in one posture only φ + ρ q_DIP can be estimated, neither ρ nor φ alone."""
     best = {v.name: v for v in ambiguous.candidates[0].values}
     assert best["rho"].std > 0.5
     assert best["phi"].std > 0.5

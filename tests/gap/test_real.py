@@ -1,4 +1,4 @@
-"""A real servo axis with a published answer (datasets/emps)."""
+"""A real servo axis whose friction is published (datasets/emps)."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +25,7 @@ def axis(tmp_path_factory):
     "withheld", [pytest.param(("joint_coulomb",), marks=pytest.mark.long), ("joint_coulomb", "joint_damping")]
 )
 def test_what_is_withheld_is_named_with_its_published_value(axis, withheld):
-    """Without either friction each hides the other: neither alone is worth its cost."""
+    """Where both frictions are withheld, neither alone is worth its cost, since each hides the other."""
     full = read_recipe(ROOT / "fits/emps.toml")
     recipe = replace(full, model=replace(full.model, terms=tuple(t for t in full.model.terms if t not in withheld)))
     found = diagnose(axis, recipe)

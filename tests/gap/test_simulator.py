@@ -1,4 +1,4 @@
-"""Another simulator's predictions: what it lacks is named, what it has wrong is retuned."""
+"""Diagnosis of another simulator: effects that it lacks are named, parameters that are wrong in it are refitted."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -60,8 +60,8 @@ def test_a_term_that_the_simulator_lacks_is_a_candidate(session):
 
 @pytest.mark.long
 def test_the_shipped_sessions_own_fit_is_imitated_as_a_simulator():
-    """Its predictions are the same at every sample of a hold, and the torque of VD.3 is none at all: neither says how
-    near a model may come.
+    """Its predictions are constant in every hold, and zero for the torque of VD.3. Neither is an accuracy that the
+    imitation must reach.
     """
     session = read_session(DEMO)
     stacks, told = prepare(session), predict_session(identify(session, Recipe()).model, session)

@@ -1,4 +1,4 @@
-"""A verdict is about a machine, not about the units or the scale that it is written in."""
+"""A verdict depends neither on the units nor on the scale of the machine."""
 
 import numpy as np
 import pytest
