@@ -167,7 +167,7 @@ def prior_products(problem: Problem, k: int) -> Float[np.ndarray, "d d"]:
 class Projector:
     """Projection of weighted rows off what the nominal parameters can absorb.
 
-    A row x of N numbers becomes (I − Q Qᵀ) [W^½ x; 0] with the weights W of the formula, where Q spans [W^½ J; R] and R
+    A row x of N numbers becomes (I − Q Qᵀ) [Ω^½ x; 0] with the weights Ω of the formula, where Q spans [Ω^½ J; R] and R
     is the root of the information of the nominal parameters' prior.
     """
 
@@ -181,7 +181,7 @@ class Projector:
         self.offset = problem.offset
 
     def weighted(self, x: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "k N"]:
-        """Multiply rows by W^½."""
+        """Multiply rows by Ω^½."""
         out = x.copy()
         for c, inside, outside in zip(self.columns.items, self.weights.feature, self.weights.outside, strict=True):
             mine = x[:, c.rows]

@@ -238,7 +238,7 @@ class LinearModel:
         return B, T, prior
 
     def _weighted(self, w: Weights, B, B2, T):
-        """Weighted products Σ_c X_c W_c Y_cᵀ, W_c = w_outside I + (w_feature − w_outside) U_c U_cᵀ.
+        """Weighted products Σ_c X_c Ω_c Y_cᵀ, Ω_c = w_outside I + (w_feature − w_outside) U_c U_cᵀ.
 
         B and B2 are the coefficients of X and Y on the features, T their products in every column.
         """
