@@ -25,7 +25,7 @@ from scipy.optimize import minimize
 from jaxfinger.data import read_session
 from jaxfinger.gap.columns import Counts
 from jaxfinger.gap.costs import Costs, Key
-from jaxfinger.gap.diagnose import searched
+from jaxfinger.gap.diagnose import search_for_causes
 from jaxfinger.gap.formula import Evidence, Parameters, log_likelihood, unexplained, unlisted
 from jaxfinger.gap.problem import build
 from jaxfinger.gap.signatures import catalogue_for
@@ -89,7 +89,7 @@ def weigh(folder: Path) -> Record:
     effects = {
         k: v for k, v in catalogue_for(recipe, None, problem.nominal.finger).items() if k not in recipe.model.terms
     }
-    search, _ = searched(problem, effects)
+    search, _ = search_for_causes(problem, effects)
     costs, visited = search.costs, search.visited
     return Record(
         folder.name,

@@ -73,7 +73,7 @@ def diagnose(
     from jaxfinger.identify import load_fit, read_recipe
     from jaxfinger.report.gap_json import as_gap_json, write
     from jaxfinger.report.page import write_page
-    from jaxfinger.report.screen import across, summary
+    from jaxfinger.report.screen import comparison, summary
 
     texts, gaps, found = {}, {}, {}
     with progress("first look" if quick else "diagnose") as say:
@@ -102,7 +102,7 @@ def diagnose(
         console().print(plain(texts[session.name]), markup=False, soft_wrap=True)
         print(f"\n{folder / 'report.html'}: the evidence\n")
     if len(found) > 1:
-        header, rows = across(found)
+        header, rows = comparison(found)
         table("Probability of every cause, session by session, and its size", header, rows)
 
 

@@ -1,4 +1,4 @@
-"""The augmented model: the effects of the verdict and every nominal parameter, together."""
+"""Fits of the augmented model: the effects of a verdict and the nominal parameters, fitted together to all trials."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,30 +26,30 @@ from jaxfinger.identify.solve import Solution, Source, linearise_each, residuals
 from jaxfinger.model import Model
 
 WITH_EFFECTS = "with the effects of the diagnosis"
-Missed = dict[tuple[str, str], Float[np.ndarray, "_columns _B _T"]]  # measured − predicted, by experiment and channel
+Residuals = dict[tuple[str, str], Float[np.ndarray, "_columns _B _T"]]  # y − ŷ by experiment and channel
 
 
 class Fitted(NamedTuple):
-    """A model fitted to all trials of a problem, at its optimum."""
+    """A model fitted to all trials of a problem, with residuals and Jacobian at its optimum."""
 
     fit: Fit
-    r: Float[np.ndarray, " N"]  # white residuals
-    J: Float[np.ndarray, "N p"]  # their Jacobian by the fit's estimated parameters
-    missed: Callable[[Model], Missed]  # of a model with the same effects
+    r: Float[np.ndarray, " N"]  # whitened residuals
+    J: Float[np.ndarray, "N p"]  # whitened derivatives of the predictions by the fit's estimated parameters
+    residuals_of: Callable[[Model], Residuals]  # for any model with the same effects
 
 
 def nominal_fit(problem: Problem) -> Fitted:
-    """The nominal model refitted to all trials, with no effect."""
+    """The nominal model of a problem as a fit: the optimum is the problem's own, the covariance is computed here."""
     covariance = _covariance(problem, problem.r, problem.J, problem.root)
     fit = _fit(problem, problem.nominal, problem.free, covariance, problem.r, "all trials")
-    return Fitted(fit, problem.r, problem.J, partial(missed_by, problem.sources))
+    return Fitted(fit, problem.r, problem.J, partial(residuals_by, problem.sources))
 
 
 def augmented_fit(problem: Problem, chosen: SearchState, hold: bool = False) -> Fitted:
-    """Nominal parameters, amplitudes and moving shapes, fitted exactly, with their covariance.
+    """Fit nominal parameters, amplitudes and shapes of the chosen set together by nonlinear least squares.
 
-    With `hold` the causes stay where the formula has put them, since what is open would pull at them; the nominal
-    parameters alone are refitted.
+    With `hold` amplitudes and shapes stay at the optimum of the formula, and the nominal parameters alone are refitted.
+    That is for a gap which the set leaves open: plain least squares would bend the causes to explain it.
     """
     model, moving = _with_effects(chosen.problem.nominal, chosen.effects)
     free, prior = np.concatenate([problem.free, moving]), _prior(problem, model, moving)
@@ -62,12 +62,14 @@ def augmented_fit(problem: Problem, chosen: SearchState, hold: bool = False) -> 
         linearised = solution.linearised
     r, J = assemble(linearised, sources, problem.rows, free, ravel(model).size)
     fit = _fit(problem, fitted, free, _covariance(problem, r, J, prior.root, chosen), r, WITH_EFFECTS, solution)
-    return Fitted(fit, r, J, partial(missed_by, sources))
+    return Fitted(fit, r, J, partial(residuals_by, sources))
 
 
 def as_refitted(problem: Problem, chosen: SearchState) -> Fitted:
-    """The same where the search has led, with no fit of its own, and by the programs of the nominal model and of
-    signatures, which are compiled already. Its intervals leave out the products of effects with the nominal parameters.
+    """The augmented model at the optimum that the search has found, without a fit of its own: for a quick diagnosis.
+
+    It needs only the compiled functions of the nominal model and of signatures. Second derivatives by a parameter of an
+    effect and a nominal one are left out, so that beside a large effect nominal parameters and intervals are biased.
     """
     ones = Weights.plain(chosen.columns)
     there = moved(chosen.problem, Projector(chosen.problem, chosen.columns, ones).nominal_step(chosen.r))
@@ -83,85 +85,97 @@ def as_refitted(problem: Problem, chosen: SearchState) -> Fitted:
     J = np.column_stack([there.J, *(columns[labels[i]] for i in moving)])
     free, prior = np.concatenate([problem.free, moving]), _prior(problem, model, moving)
     fit = _fit(problem, model, free, _covariance(problem, r, J, prior.root, chosen), r, WITH_EFFECTS)
-    return Fitted(fit, r, J, partial(_missed_apart, problem))
+    return Fitted(fit, r, J, partial(_residuals_in_parts, problem))
 
 
-def missed_by(sources: dict[str, Source], model: Model) -> Missed:
-    """Of a model, by the programs of fits."""
+def residuals_by(sources: dict[str, Source], model: Model) -> Residuals:
+    """Residuals of a model, computed with the compiled functions of the fits."""
     return {(e, c): x for e, channels in residuals_each(model, sources).items() for c, x in channels.items()}
 
 
-def _missed_apart(problem: Problem, model: Model) -> Missed:
-    """Of a model with effects, by the programs of its nominal part and of their signatures."""
+def _residuals_in_parts(problem: Problem, model: Model) -> Residuals:
+    """Residuals of a model with effects, computed with the compiled functions of its nominal part and of signatures."""
     nominal = eqx.tree_at(lambda m: m.effects, model, (), is_leaf=lambda v: isinstance(v, tuple))
-    missed = missed_by(problem.sources, nominal)
-    predicted = {(e, c): np.asarray(problem.sources[e].batch.y[c]) - x for (e, c), x in missed.items()}
+    residuals = residuals_by(problem.sources, nominal)
+    predicted = {(e, c): np.asarray(problem.sources[e].batch.y[c]) - x for (e, c), x in residuals.items()}
     there = replace(problem, nominal=nominal, predicted=predicted)
     effects = [e for e in model.effects if isinstance(e, CatalogueEffect)]
     for effect in effects:
         for e, c, change in Signatures(there).changes([effect]):
-            missed[e, c] = missed[e, c] - change[0]
-    return missed
+            residuals[e, c] = residuals[e, c] - change[0]
+    return residuals
 
 
 def _with_effects(nominal: Model, effects: tuple[CatalogueEffect, ...]) -> tuple[Model, Int[np.ndarray, " k"]]:
-    """The model, and which of its effects' parameters a fit moves."""
+    """The nominal model with effects, and the positions of the effects' parameters that a refit moves."""
     model = eqx.tree_at(lambda m: m.effects, nominal, effects, is_leaf=lambda v: isinstance(v, tuple))
-    parameters, moves = describe(model), np.asarray(ravel(_on_effects(_moves, model)))
+    parameters, moves = describe(model), np.asarray(ravel(_on_effects(_moving, model)))
     first = ravel(nominal).size
     moving = [i for i in range(first, len(parameters)) if parameters[i].determinable and moves[i]]
     return model, np.array(moving, dtype=int)
 
 
 def _prior(problem: Problem, model: Model, moving: Int[np.ndarray, " k"]) -> Prior:
-    """The problem's, and a weak one on amplitudes and shapes, so that a flat direction stays put."""
+    """The problem's prior, and a weak one on amplitudes and shapes about their values, which holds flat directions."""
     mean = np.concatenate([problem.prior.mean, np.asarray(ravel(model))[moving]])
-    (rows, p), wide = problem.root.shape, np.asarray(ravel(_on_effects(partial(_widths, problem.scales), model)))
+    (rows, p), std = problem.root.shape, np.asarray(ravel(_on_effects(partial(_prior_std, problem.scales), model)))
     root = np.zeros((rows + len(moving), p + len(moving)))
-    root[:rows, :p], root[rows:, p:] = problem.root, np.diag(1.0 / wide[moving])
+    root[:rows, :p], root[rows:, p:] = problem.root, np.diag(1.0 / std[moving])
     return Prior(mean, root)
 
 
 def _on_effects(change: Callable[[CatalogueEffect], CatalogueEffect], model: Model) -> Model:
+    """The model with `change` applied to each of its effects.
+
+    The functions below return an effect whose parameters are replaced by a mark, bound or width, so that `ravel` lays
+    these out in the order of the flat parameter vector.
+    """
     changed = tuple(change(e) for e in model.effects if isinstance(e, CatalogueEffect))
     return eqx.tree_at(lambda m: m.effects, model, changed, is_leaf=lambda v: isinstance(v, tuple))
 
 
-def _moves(effect: CatalogueEffect) -> CatalogueEffect:
-    """Of every parameter 1 where a fit may move it: not a choice, nor a share that is at its most."""
+def _moving(effect: CatalogueEffect) -> CatalogueEffect:
+    """Mark with 1 the parameters that a refit moves, with 0 the others.
+
+    Fixed are choices (form, side, place) and shares at their upper limit.
+    """
     stays = {n for n, p in effect.shape_parameters().items() if p.moves == "not" or len(p.values) == 1}
     stays |= {n for n, p in effect.amplitudes().items() if getattr(effect, n) >= p.most}
     return replace(effect, **{n: jnp.asarray(float(n not in stays)) for n in effect.values()})
 
 
 def limits(model: Model, free: np.ndarray, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
-    """Least and most of every free parameter: those of effects keep within bounds."""
+    """Lower and upper bounds of the free parameters (p,): those of the effects, and none for nominal parameters."""
     of_effect = np.array([p.group == "effects" for p in describe(model)])[free]
     low, high = (np.asarray(ravel(_on_effects(partial(_limit, side, scales), model)))[free] for side in (0, 1))
     return np.where(of_effect, low, -np.inf), np.where(of_effect, high, np.inf)
 
 
 def without_shapes(model: Model, free: np.ndarray) -> np.ndarray:
-    """The free parameters but those of effects that are no amplitudes."""
+    """Positions of the free parameters without the effects' shapes."""
     shapes = np.asarray(ravel(_on_effects(_shapes, model))) > 0.0
     of_effect = np.array([p.group == "effects" for p in describe(model)])
     return free[~(of_effect & shapes)[free]]
 
 
 def _shapes(effect: CatalogueEffect) -> CatalogueEffect:
-    """Of every parameter 1 where it is no amplitude."""
+    """Mark shapes with 1, amplitudes with 0."""
     return replace(effect, **{n: jnp.asarray(float(n in effect.shape_parameters())) for n in effect.values()})
 
 
 def _limit(side: int, scales: Scales, effect: CatalogueEffect) -> CatalogueEffect:
-    """Of every parameter, the bound below or above (`side` 0 or 1) that refits keep to."""
+    """Lower (`side` 0) or upper (1) bound of each parameter."""
     ends = effect.bounds(scales)
     free = (-np.inf, np.inf)
     return replace(effect, **{n: jnp.asarray(ends.get(n, free)[side], dtype=float) for n in effect.values()})
 
 
-def _widths(scales: Scales, effect: CatalogueEffect) -> CatalogueEffect:
-    """Of the prior: three times an amplitude's own or plausible size, three times a factor, the range of a place."""
+def _prior_std(scales: Scales, effect: CatalogueEffect) -> CatalogueEffect:
+    """Standard deviation of the prior of each parameter.
+
+    For an amplitude three times the larger of its value and its plausible size; for a shape that moves by differences
+    the range of its grid, for another three times its value.
+    """
     size = {n: abs(v) for n, v in effect.values().items()}
     amplitudes = {n: 3.0 * max(size[n], unit) for n, unit in effect.sizes(scales, effect.site).items()}
     grids, shapes = effect.worth_trying(scales, effect.site), effect.shape_parameters()
@@ -171,7 +185,7 @@ def _widths(scales: Scales, effect: CatalogueEffect) -> CatalogueEffect:
 
 
 def _seeing_effects(problem: Problem, source: Source, effects: tuple[CatalogueEffect, ...], moving, experiment: str):
-    """The source, reading the effects' parameters too where one of them shows."""
+    """The source of an experiment, with the effects' parameters among its own if one of the effects shows in it."""
     if not any(experiment in affected_channels(type(e), problem.nominal.finger) for e in effects):
         return source._replace(effects=False)
     return source._replace(positions=np.union1d(source.positions, moving).astype(int))
@@ -180,8 +194,10 @@ def _seeing_effects(problem: Problem, source: Source, effects: tuple[CatalogueEf
 def _covariance(
     problem: Problem, r: np.ndarray, J: np.ndarray, root: np.ndarray, chosen: SearchState | None = None
 ) -> Float[np.ndarray, "p p"]:
-    """Laplace's, in the weights of the formula where there are causes, and wider where the residuals pull a parameter
-    to and fro by more than the noise explains.
+    """Laplace covariance (JᵀJ + prior precision)⁻¹, with causes in the weights of the formula.
+
+    Standard deviations grow where the scores of successive stretches vary more than the noise explains
+    (`cluster_robust`).
     """
     if chosen is not None:
         project = Projector(problem, chosen.columns, chosen.linear_fit.weights)
@@ -195,6 +211,7 @@ def _covariance(
 
 
 def _fit(problem: Problem, model: Model, free, block, r, what: str, solution: Solution | None = None) -> Fit:
+    """A fit of the model whose free parameters have the covariance `block`, with one more stage, named `what`."""
     covariance = np.zeros((ravel(model).size,) * 2)
     covariance[np.ix_(free, free)] = block
     report = StageReport(
@@ -216,7 +233,7 @@ def _fit(problem: Problem, model: Model, free, block, r, what: str, solution: So
 
 
 def values_of(fit: Fit, index: int) -> tuple[Value, ...]:
-    """Every parameter of the fit's effect number `index`."""
+    """Values and standard deviations of all parameters of the fit's effect number `index`."""
     effect = fit.model.effects[index]
     assert isinstance(effect, CatalogueEffect)
     label = f"{effect.ID} {'-'.join(effect.site)} "

@@ -1,53 +1,62 @@
-"""How the gap of every channel is made up, on trials that no fit has seen.
+"""The share of each cause in the gap of each channel, on trials that no fit has seen.
 
-A third of the trials is held out in turn. The others refit the causes' amplitudes and shapes in the weights of the
-formula, and the nominal parameters to what the causes leave; then each cause alone is dropped, and the nominal
-parameters are refitted without it. All of that is linear about the causes' optimum, and made of products of rows by
-trial and column. The share of a cause is what is lost without it, in mean squares of white residuals beyond noise.
+Each third of the trials is held out in turn. On the others the amplitudes and shapes of the causes are refitted in the
+weights of the formula, and then the nominal parameters to what the causes leave. The same is done with each cause alone
+taken out. With E the mean square of held-out white residuals, the share of cause i is
+
+    (E without i − E with all) / (E of the nominal model − 1),
+
+where 1 is the mean square of the noise. All refits are linear about the causes' optimum, so they need only the products
+of rows (residual, Jacobian, slopes, changes) by trial and column.
 """
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from jaxfinger.gap.exact import Baseline, SearchState
+from jaxfinger.gap.exact import Baseline, SearchState, prior_products
 from jaxfinger.gap.folds import FOLD_PRIOR, FOLDS, equilibrated, fold_of_row
 from jaxfinger.gap.problem import Problem
 
-DRAWS = 400  # of the bootstrap over trials
-A_GAP = 6.0  # log evidence of a column, from which on it is called one with a gap
-STANDS_OUT = 1.05  # mean square of a held-out channel in that of its noise, below which shares of it mean nothing
+DRAWS = 400  # Draws of the bootstrap over trials: the quantiles of a 95 % interval then rest on ten draws each.
+# Log evidence from which a column is said to have a gap: the same at which, over all columns, something unlisted is as
+# likely as not (`formula.Parameters.unlisted_threshold`).
+MIN_GAP_EVIDENCE = 6.0
+# Shares are relative to a gap of at least 0.05 in mean square of the noise. Below that, noise divides noise.
+MIN_RELATIVE_GAP = 0.05
 
 
 @dataclass(frozen=True)
 class Budget:
-    """Sums of squares of held-out white residuals by trial (its running number) and column."""
+    """Sums of squares of held-out white residuals, in cells of one trial and one column."""
 
-    cells: list[tuple[int, int]]  # trial, column
-    n: Float[np.ndarray, " cells"]
-    before: Float[np.ndarray, " cells"]
-    after: Float[np.ndarray, " cells"]
-    without: Float[np.ndarray, "causes cells"]
+    cells: list[tuple[int, int]]  # number of the trial (`Problem.trial_of_row`) and of the column (`Columns.items`)
+    n: Float[np.ndarray, " cells"]  # rows, which is also the sum of squares that the noise leaves
+    before: Float[np.ndarray, " cells"]  # with the nominal model
+    after: Float[np.ndarray, " cells"]  # with all causes
+    without: Float[np.ndarray, "causes cells"]  # with all causes but one
     open: frozenset[int]  # columns with a gap
-    channels: tuple[tuple[str, str], ...]  # of every column
+    channels: tuple[tuple[str, str], ...]  # experiment and channel of each column
 
-    def of(self, columns: set[int]) -> tuple[float, Float[np.ndarray, " causes"], float]:
-        """Gap per sample, share of it lost without each cause, and left with all."""
+    def of(self, columns: set[int]) -> tuple[Float[np.ndarray, " causes"], float]:
+        """Share of the columns' gap that comes back without each cause, and the share that is left with all causes."""
         return self._shares(np.isin([c for _, c in self.cells], list(columns)).astype(float))
 
-    def _shares(self, weight: Float[np.ndarray, " cells"]):
+    def _shares(self, weight: Float[np.ndarray, " cells"]) -> tuple[Float[np.ndarray, " causes"], float]:
         n = max(float(weight @ self.n), 1e-9)
-        gap = float(weight @ (self.before - self.n))
-        after = float(weight @ (self.after - self.n))
+        gap = max(float(weight @ (self.before - self.n)), MIN_RELATIVE_GAP * n)
         lost = (self.without - self.after) @ weight
-        safe = max(gap, (STANDS_OUT - 1.0) * n)
-        return gap / n, np.clip(lost / safe, 0.0, 1.0), float(np.clip(after / safe, 0.0, 1.0))
+        left = float(weight @ (self.after - self.n))
+        return np.clip(lost / gap, 0.0, 1.0), float(np.clip(left / gap, 0.0, 1.0))
 
     def overall(self) -> tuple[np.ndarray, np.ndarray, float, tuple[float, float]]:
-        """Of each cause the mean share over channels with a gap, with a 95 % interval of a bootstrap over trials; and
-        what is left.
+        """Mean shares over the channels with a gap, with 95 % intervals from a bootstrap over trials.
+
+        Returns the share of each cause (causes,), its interval (causes, 2), the share left with all causes, and its
+        interval.
         """
         rng = np.random.default_rng(0)
         column = np.array([c for _, c in self.cells], int)
@@ -61,14 +70,13 @@ class Budget:
             found = [self._shares(w * count[trial]) for w in inside if (w * count[trial] * self.n).sum() > 0]
             if not found:
                 return np.zeros(len(self.without) + 1)
-            return np.mean([np.append(lost, left) for _, lost, left in found], axis=0)
+            return np.mean([np.append(lost, left) for lost, left in found], axis=0)
 
         size = int(trial.max(initial=0)) + 1
         value = means(np.ones(size))
-        # Within an experiment, so that no draw lacks one.
-        experiment = np.array([list(dict.fromkeys(self.channels)).index(self.channels[c]) for c in column], int)
-        strata = {tuple(np.unique(trial[experiment == e])) for e in np.unique(experiment)}
-        strata = [np.array(s) for s in sorted(strata)]
+        # Trials are drawn within their experiment, so that no draw lacks an experiment.
+        experiment = np.array([self.channels[c][0] for c in column])
+        strata = sorted((np.unique(trial[experiment == e]) for e in set(experiment)), key=lambda s: s[0])
 
         def draw() -> np.ndarray:
             return np.bincount(np.concatenate([rng.choice(s, len(s)) for s in strata]), minlength=size).astype(float)
@@ -80,96 +88,98 @@ class Budget:
 
 
 def budget(baseline: Baseline, state: SearchState, plain: Problem, open_columns: frozenset[int]) -> Budget:
-    """`plain`: the problem at the nominal model refitted to all trials, which is the model before."""
-    fold, trial = fold_of_row(plain), plain.trial_of_row
-    cells, null, full = _products(baseline, plain, state, fold, trial)
-    n, before, after, without = [], [], [], []
-    k, effects = state.problem.J.shape[1], len(state.effects)
-    of_coordinate = np.array([c.effect for c in state.coordinates], int)
+    """Hold out each third of the trials in turn, and sum the squares that the causes leave there.
+
+    `plain` is the problem at the nominal model without causes, the model before; `state` holds the causes.
+    """
+    cells, null, full = _products(baseline, plain, state)
+    fold = np.array([c.fold for c in cells], int)
+    order, before, after, without = [], [], [], []
     for held in range(FOLDS):
-        seen, unseen = (
-            [i for i, c in enumerate(cells) if c[2] != held],
-            [i for i, c in enumerate(cells) if c[2] == held],
-        )
-        weight = _weights(cells, full, seen, k)
-        x0 = _nominal(null[seen].sum(axis=0), plain, np.eye(1 + k)[0], k)
-        joint = _joint(full[seen], weight, state, k, of_coordinate, effects)
-        x1 = _nominal(full[seen].sum(axis=0), state.problem, joint, k)
-        less = []
-        for i in range(effects):
-            y = _joint(full[seen], weight, state, k, of_coordinate, effects, without=i)
-            less.append(_nominal(full[seen].sum(axis=0), state.problem, y, k))
+        seen, unseen = np.flatnonzero(fold != held), np.flatnonzero(fold == held)
+        weight = _weights(cells, full, seen)
+        H0, H1 = null[seen].sum(axis=0), full[seen].sum(axis=0)
+        x0 = _nominal(H0, plain, np.eye(len(H0))[0])
+        x1 = _nominal(H1, state.problem, _joint(full[seen], weight, state))
+        less = [_nominal(H1, state.problem, _joint(full[seen], weight, state, i)) for i in range(len(state.effects))]
         for i in unseen:
-            n.append((cells[i][0], cells[i][1], cells[i][3]))
+            order.append(cells[i])
             before.append(x0 @ null[i] @ x0)
             after.append(x1 @ full[i] @ x1)
             without.append([x @ full[i] @ x for x in less])
-    found = np.array(without).reshape(len(n), effects).T
     return Budget(
-        [(t, c) for t, c, _ in n],
-        np.array([m for _, _, m in n], float),
+        [(c.trial, c.column) for c in order],
+        np.array([c.rows for c in order], float),
         np.array(before),
         np.array(after),
-        found,
+        np.array(without).reshape(len(order), len(state.effects)).T,
         open_columns,
         tuple((c.experiment, c.channel) for c in baseline.columns.items),
     )
 
 
-def _products(baseline: Baseline, plain: Problem, state: SearchState, fold, trial):
-    """Cells (trial, column, fold, rows), and products of rows there: of the nominal model's, and of [residual, J,
-    slopes, changes] of the set's.
+class Cell(NamedTuple):
+    """Rows of one trial and fold in one column."""
+
+    trial: int
+    column: int
+    fold: int
+    rows: int  # how many
+
+
+def _products(
+    baseline: Baseline, plain: Problem, state: SearchState
+) -> tuple[list[Cell], Float[np.ndarray, "cells d d"], Float[np.ndarray, "cells f f"]]:
+    """Cells, and the products of rows in each of them.
+
+    First those of [residual, J] at the nominal model, then those of [residual, J, slopes, changes] at the causes'
+    optimum.
     """
-    here = state.problem
+    fold, trial = fold_of_row(plain), plain.trial_of_row
     rows0 = np.vstack([plain.r[None], plain.J.T])
-    rows1 = np.vstack([state.r[None], here.J.T, state.slopes, state.changes])
+    rows1 = np.vstack([state.r[None], state.problem.J.T, state.slopes, state.changes])
     cells, null, full = [], [], []
     for c, column in enumerate(baseline.columns.items):
         key = trial[column.rows] * FOLDS + fold[column.rows]
         for u in np.unique(key):
             at = column.rows[key == u]
-            cells.append((int(u) // FOLDS, c, int(u) % FOLDS, len(at)))
+            cells.append(Cell(int(u) // FOLDS, c, int(u) % FOLDS, len(at)))
             null.append(rows0[:, at] @ rows0[:, at].T)
             full.append(rows1[:, at] @ rows1[:, at].T)
     return cells, np.array(null), np.array(full)
 
 
-def _weights(cells, full, seen, k) -> np.ndarray:
-    """Of the seen cells: a column that the causes leave open counts as noisy as it is."""
-    column = np.array([cells[i][1] for i in seen])
-    n = np.bincount(column, [cells[i][3] for i in seen])
-    e = np.bincount(column, [full[i][0, 0] for i in seen])
+def _weights(cells: list[Cell], full, seen: Int[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
+    """Weight of each seen cell: the inverse of its column's mean square with all causes, at most 1."""
+    column = np.array([cells[i].column for i in seen])
+    n = np.bincount(column, [cells[i].rows for i in seen])
+    e = np.bincount(column, full[seen, 0, 0])
     return (np.maximum(n, 1.0) / np.maximum(np.maximum(e, n), 1.0))[column]
 
 
-def _joint(
-    seen, weight, state: SearchState, k: int, of_coordinate, effects: int, without: int | None = None
-) -> np.ndarray:
-    """Coefficients of [residual, J, slopes, changes] with slopes refitted, J too, a cause taken out where asked."""
-    H = np.tensordot(weight, seen, 1)
-    m = len(of_coordinate)
-    x = np.zeros(1 + k + m + effects)
+def _joint(seen, weight, state: SearchState, without: int | None = None) -> Float[np.ndarray, " f"]:
+    """Coefficients of [residual, J, slopes, changes] after a refit of J and slopes, without one cause if asked.
+
+    A cause is taken out where its change, which the residual lacks, comes back with coefficient 1.
+    """
+    k, m, H = state.problem.J.shape[1], len(state.coordinates), np.tensordot(weight, seen, 1)
+    x = np.zeros(len(H))
     x[0] = 1.0
     if without is not None:
         x[1 + k + m + without] = 1.0
-    moves = [1 + k + j for j in range(m) if of_coordinate[j] != without]
-    prior = np.zeros((1 + k + m,) * 2)
-    root = np.column_stack([-state.problem.offset, state.problem.root])
-    prior[: 1 + k, : 1 + k] = root.T @ root
-    prior[1 + k :, 1 + k :] = np.eye(m)
-    return _solved(H, prior, x, [*range(1, 1 + k), *moves])
+    moves = [1 + k + j for j, c in enumerate(state.coordinates) if c.effect != without]
+    return _solved(H, prior_products(state.problem, m), x, [*range(1, 1 + k), *moves])
 
 
-def _nominal(H, problem: Problem, x: np.ndarray, k: int) -> np.ndarray:
-    """The same with the nominal parameters refitted in white weights, and the rest as it is in x."""
-    x = x.copy()
+def _nominal(H, problem: Problem, x: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
+    """Coefficients x with those of J refitted with equal weights for all rows, the others unchanged."""
+    k, x = problem.J.shape[1], x.copy()
     x[1 : 1 + k] = 0.0
-    root = np.column_stack([-problem.offset, problem.root])
-    return _solved(H, root.T @ root, x, list(range(1, 1 + k)))
+    return _solved(H, prior_products(problem, 0), x, list(range(1, 1 + k)))
 
 
 def _solved(H, prior, x, free: list[int]) -> np.ndarray:
-    """x with its free coefficients at the least squares; what the trials do not see stays near nothing."""
+    """Coefficients x with the free ones at the least squares. A weak ridge keeps unseen ones near zero."""
     d = len(prior)
     A = H.copy()
     A[:d, :d] += prior
@@ -184,22 +194,23 @@ def _solved(H, prior, x, free: list[int]) -> np.ndarray:
 
 
 def held_out_gains(problem: Problem, members: list[Float[np.ndarray, "_k N"]]) -> list[float]:
-    """Share of the gap that signatures explain, each member's alone, on trials for which neither they nor the nominal
-    parameters were refitted.
+    """Share of the gap that each member's signatures explain alone, on trials that their refit has not seen.
+
+    Each third of the trials is held out in turn, and nominal parameters and amplitudes are refitted to the others.
     """
     J, kept, _ = equilibrated(problem.J, problem.root)
     p, of_row = J.shape[1], fold_of_row(problem)
     columns = np.column_stack([J, problem.r, *(z.T for z in members)])
     prior = np.zeros((len(kept), columns.shape[1]))
     prior[:, :p], prior[: len(problem.root), p] = kept, -problem.offset
-    # The rows that keep near the whole fit bound the condition of J, so that products of columns are all it takes.
+    # Normal equations are accurate enough: the rows of `kept` bound the condition number of J.
     products, of_prior = [rows.T @ rows for rows in (columns[of_row == k] for k in range(FOLDS))], prior.T @ prior
     ends = np.cumsum([1, *(len(z) for z in members)])
     alone, with_member = 0.0, np.zeros(len(members))
     for k in range(FOLDS):
         seen = of_prior + sum(products[i] for i in range(FOLDS) if i != k)
         nominal = np.linalg.solve(seen[:p, :p], seen[:p, p:])
-        off = np.vstack([-nominal, np.eye(nominal.shape[1])])  # targets, less what the refitted parameters take of them
+        off = np.vstack([-nominal, np.eye(nominal.shape[1])])  # subtracts what the refitted nominal parameters absorb
         fitted, left = (off.T @ x @ off for x in (seen, products[k]))
         alone += float(left[0, 0])
         for i, (a, b) in enumerate(pairwise(ends)):

@@ -1,11 +1,10 @@
-"""Diagnose the sim-to-real gap of a session: where, which causes, how far it shrinks, what next; as data."""
+"""`diagnose`: where the gap of a session lies, which causes explain it, how far it shrinks, and what to record next."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxfinger.data import Predictions, Session
 from jaxfinger.data.schema import channel_units
@@ -13,10 +12,11 @@ from jaxfinger.effects import CatalogueEffect, Changed
 from jaxfinger.errors import UserError, did_you_mean
 from jaxfinger.experiments import not_judged
 from jaxfinger.gap.augment import Fitted, as_refitted, augmented_fit, nominal_fit, values_of
-from jaxfinger.gap.budget import A_GAP, Budget, budget, held_out_gains
-from jaxfinger.gap.closure import RESOLVABLE, closures
+from jaxfinger.gap.budget import MIN_GAP_EVIDENCE, Budget, budget, held_out_gains
+from jaxfinger.gap.closure import MIN_RESOLVABLE_RATIO, centred, closures
+from jaxfinger.gap.columns import Columns
 from jaxfinger.gap.exact import Baseline, Projector, SearchState
-from jaxfinger.gap.formula import Parameters, Weights, unexplained
+from jaxfinger.gap.formula import Parameters, Weights
 from jaxfinger.gap.next_experiment import next_experiment
 from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY, Posterior, posterior
 from jaxfinger.gap.problem import Problem, build, site
@@ -53,16 +53,19 @@ from jaxfinger.identify.parameters import describe, ravel, units_at
 from jaxfinger.identify.stages import Progress
 from jaxfinger.model import Finger
 
-COARSE = 2  # times as long averages in a first look
-NEARLY = 0.99  # of a signature that the nominal parameters imitate, from which on a cause is called absorbed
-DEPENDS = 0.2  # share of what is left that a variable must carry to be named
-HELD_OUT = 12  # candidates beside the named ones, the likeliest, that are tried on held-out trials
-CONTRADICTED = 3.0  # standard deviations by which a simulator's parameter must be off
+COARSE = 2  # A quick diagnosis averages over twice as many samples, which halves the rows.
+# The thresholds of this module decide what a report mentions, and no verdict.
+# Share of a signature's energy that the nominal parameters imitate, from which a cause is listed as absorbed: of what
+# it changes, a tenth in rms is then left to see.
+MIN_ABSORBED = 0.99
+MIN_VARIABLE_SHARE = 0.2  # Share of the smooth law's energy that one variable must explain to be listed.
+MAX_HELD_OUT = 12  # Candidates outside of the chosen set, most probable first, that are tried on held-out trials.
+MIN_DEVIATION = 3.0  # Standard deviations: the usual three sigma, by which a simulator's parameter must be off.
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the posterior says in a word, and whom it names."""
+    """Status and named causes (effect and site) that follow from the posterior alone, without held-out trials."""
 
     status: Status
     named: tuple[tuple[str, tuple[str, ...]], ...]
@@ -79,20 +82,31 @@ def diagnose(
     tolerance: Mapping[str, float] | None = None,
     against: Fit | None = None,
 ) -> Diagnosis:
-    """Diagnose a session. `effects` adds a user's own, `without` withholds some of the catalogue by id.
+    """Diagnose the gap between a session and the nominal model that is identified from it (docs/method/diagnosis.md).
 
-    With `predictions` the gap is that between the measurements and another simulator's predictions. `tolerance`: by
-    channel, the share of its signal up to which a gap does not matter. With `against` it is what an earlier fit of the
-    same finger misses: its nominal parameters, each within its interval, are candidates for what has changed.
-
-    The servo axis with a model that leaves Coulomb's friction out:
+    A servo axis with a model that leaves Coulomb friction out:
 
     >>> import jaxfinger as jf
     >>> jf.diagnose(jf.read("session.h5"), jf.recipe("emps-no-coulomb"), quick=True)
     Diagnosis('session.h5': explained; joint_coulomb at axis)
 
+    Args:
+        session: the recordings.
+        recipe: the nominal model; a term that it leaves out is a candidate.
+        quick: take a first look: half the samples, no joint fit of causes and nominal parameters, no forward simulation
+            and no next experiment.
+        effects: the user's own effects by id, candidates beside the catalogue's.
+        without: ids of effects that are no candidates.
+        progress: called with a message before each step.
+        predictions: of another simulator; the gap is then that between the measurements and these.
+        tolerance: by channel, the share of its signal up to which a gap does not matter.
+        against: an earlier fit of the same finger. Its recipe is the nominal model, and each of its parameters may have
+            changed by more than its interval says: these changes are candidates too.
+
     Raises:
-        UserError: an effect to leave out is unknown; the earlier fit is of another finger or recipe, or holds effects.
+        UserError: an effect to leave out is unknown; one of the user's own fails in a prediction or changes none;
+            `predictions` has none of the session's trials; `against` is of another finger or recipe, holds effects, or
+            comes with `predictions`.
     """
     if against is not None and (predictions is not None or recipe not in (None, against.recipe)):
         raise UserError("an earlier fit brings its own recipe and no other simulator; leave the other one out")
@@ -107,9 +121,9 @@ def diagnose(
         )
     problem = build(session, recipe, progress, predictions, COARSE if quick else 1, against)
     kept = set(problem.fit.recipe.model.terms) | set(without)
-    laws = {law for c in changed.values() for law in c.__mro__}  # an effect whose law a change has would be its copy
+    laws = {law for c in changed.values() for law in c.__mro__}  # An effect that a change inherits from is its copy.
     catalogue = {k: c for k, c in catalogue.items() if k not in kept and (k in changed or c not in laws)}
-    search, state = searched(problem, catalogue, progress)
+    search, state = search_for_causes(problem, catalogue, progress)
     baseline, table, found = search.baseline, search.table, posterior(search, state)
     relevance = _relevance(problem, baseline, tolerance)
     verdict = _verdict(problem, baseline, state, found, relevance)
@@ -120,19 +134,19 @@ def diagnose(
     augmented: Fitted | None = None
     if chosen.effects:
         progress("fitting the effects and all nominal parameters together")
-        whole = found.unlisted <= 0.5
-        augmented = as_refitted(problem, chosen) if quick else augmented_fit(problem, chosen, not whole)
+        something_open = found.unlisted > MIN_NAMED_PROBABILITY
+        augmented = as_refitted(problem, chosen) if quick else augmented_fit(problem, chosen, hold=something_open)
     progress("refitting without each third of the trials")
     lines = closures(problem, augmented, not quick)
-    status = _closed(verdict.status, found, lines, relevance, tolerance)
-    shares = budget(baseline, chosen, problem, _open(baseline))
+    status = _explained_or_partly(verdict.status, found, lines, relevance, tolerance)
+    shares = budget(baseline, chosen, problem, _columns_with_gap(baseline))
     suggestion: NextExperiment | None = None
     if status is Status.AMBIGUOUS and not quick:
         progress("looking for the trial that would tell them apart")
         suggestion = next_experiment(problem, search.rivals(state, found.ambiguous[0]))
     fit = augmented.fit if augmented else nominal.fit
     causes = _causes(chosen, found, shares, fit)
-    none, unlisted = agreeing(status, found, bool(relevance))
+    none, unlisted = consistent_with(status, found, bool(relevance))
     left = smooth_parts(chosen.problem, chosen.r)
     return Diagnosis(
         status=status,
@@ -146,7 +160,7 @@ def diagnose(
         unexplained=_unexplained(chosen, shares, left, status, progress),
         channels=_channels(problem, baseline, chosen, causes, shares),
         relevance=relevance,
-        not_judged=_not_judged(problem),
+        not_judged=_not_judged(problem, baseline.columns),
         closures=lines,
         where=tuple(where(problem)) if status is not Status.NO_GAP else (),
         candidates=_candidates(problem, search, chosen, found, shares, fit),
@@ -165,10 +179,10 @@ def diagnose(
     )
 
 
-def searched(
+def search_for_causes(
     problem: Problem, catalogue: Mapping[str, type[CatalogueEffect]], progress: Progress = lambda message: None
 ) -> tuple[Search, SearchState]:
-    """All sets of the catalogue's effects that the evidence led to, and the best of them."""
+    """Search sets of the catalogue's effects; return the search, which holds all visited sets, and the best set."""
     baseline = Baseline.of(problem, Parameters())
     progress("reading the signatures of all effects")
     items = variants(catalogue, problem.nominal.finger, problem.scales)
@@ -181,8 +195,10 @@ def searched(
 def _verdict(
     problem: Problem, baseline: Baseline, state: SearchState, found: Posterior, relevance: tuple[Relevance, ...]
 ) -> Verdict:
-    """The word for the posterior; whether named causes are all of the gap is for held-out trials to say. A channel
-    whose mean square is surely above its noise's is no «no gap», however few features tell of it.
+    """Verdict of the posterior; held-out trials decide later between `partly` and `explained`.
+
+    Without a cause to name it is `unexplained` if some channel's mean square is surely above that of its noise,
+    whatever the evidence, or if there is a gap and something unlisted is probable.
     """
     if not baseline.columns.items:
         return Verdict(Status.NOT_JUDGED, ())
@@ -192,34 +208,38 @@ def _verdict(
         return Verdict(Status.AMBIGUOUS, found.ambiguous[0][:1])
     matters = [x for x in relevance if not x.tolerated]
     seen = any(
-        missed > RESOLVABLE * noise
+        missed > MIN_RESOLVABLE_RATIO * noise
         for missed, noise in (_mean_squares(problem, x.experiment, x.channel) for x in matters)
     )
-    return Verdict(Status.UNEXPLAINED if seen or (matters and found.unlisted > 0.5) else Status.NO_GAP, ())
+    return Verdict(
+        Status.UNEXPLAINED if seen or (matters and found.unlisted > MIN_NAMED_PROBABILITY) else Status.NO_GAP, ()
+    )
 
 
-def _closed(
+def _explained_or_partly(
     status: Status,
     found: Posterior,
     lines: tuple[Closure, ...],
     relevance: tuple[Relevance, ...],
     tolerance: Mapping[str, float],
 ) -> Status:
-    """Whether the named causes are all: nothing unlisted is likely, and every channel comes down to its noise; or what
-    is left in every channel with a gap is tolerated.
+    """`explained` in place of `partly` where every channel closes to its noise, or to the user's tolerance.
+
+    If something unlisted is probable, only the tolerance counts: what is left of every gap must be within it.
     """
     if status is not Status.PARTLY or found.ambiguous or still_open(lines, relevance, tolerance):
         return status
     with_gap = {(x.experiment, x.channel) for x in relevance}
-    minded = [x for x in lines if (x.experiment, x.channel) in with_gap and not tolerated(x, relevance, tolerance)]
-    return Status.EXPLAINED if found.unlisted <= 0.5 or not minded else status
+    matter = [x for x in lines if (x.experiment, x.channel) in with_gap and not tolerated(x, relevance, tolerance)]
+    return Status.EXPLAINED if found.unlisted <= MIN_NAMED_PROBABILITY or not matter else status
 
 
-def agreeing(status: Status, found: Posterior, gaps: bool) -> tuple[float, float]:
-    """Probabilities that nothing is at work, and that something is which the catalogue lacks, as far as the verdict's
-    words allow. A channel with a gap of which no cause is named, or that the named causes leave open on held-out
-    trials, makes the second one half at least. Traces in many columns, none of which has a gap, make it one half at
-    most.
+def consistent_with(status: Status, found: Posterior, gaps: bool) -> tuple[float, float]:
+    """Probabilities of «nothing» and «something unlisted» at work, bounded so that they agree with the verdict.
+
+    `gaps` says whether any channel has a gap. Where a gap has no named cause, or the named causes leave it open on
+    held-out trials, «unlisted» is at least one half. Under `no_gap`, where many columns have traces and none has a gap,
+    it is at most one half.
     """
     if status is Status.NO_GAP and not gaps:
         unlisted = min(found.unlisted, 1.0 - MIN_NAMED_PROBABILITY)
@@ -229,25 +249,25 @@ def agreeing(status: Status, found: Posterior, gaps: bool) -> tuple[float, float
     return min(found.none, 1.0 - unlisted), unlisted
 
 
-def _open(baseline: Baseline) -> frozenset[int]:
-    """Columns in which the nominal model alone leaves a gap."""
-    null = baseline.null.linear_fit.evidence
-    return frozenset(np.flatnonzero(unexplained(baseline.columns.counts, null, baseline.parameters) > A_GAP).tolist())
+def _columns_with_gap(baseline: Baseline) -> frozenset[int]:
+    """Numbers of the columns in which the nominal model alone leaves a gap."""
+    return frozenset(np.flatnonzero(baseline.unexplained > MIN_GAP_EVIDENCE).tolist())
 
 
 def _by_share(named, chosen: SearchState, shares: Budget) -> list:
+    """Named causes, largest share of the gap first."""
     value, _, _, _ = shares.overall()
     order = {k: v for k, v in zip(chosen.keys, value, strict=True)}
     return sorted(named, key=lambda k: -order.get(k, 0.0))
 
 
 def _causes(chosen: SearchState, found: Posterior, shares: Budget, fit: Fit) -> tuple[Cause, ...]:
-    """One line an effect, with all of its sites that are in."""
+    """One line for each effect of the chosen set, its sites together, largest share first."""
     value, ends, _, _ = shares.overall()
     by_channel: dict[tuple[str, str], set[int]] = {}
     for c in sorted(shares.open):
         by_channel.setdefault(shares.channels[c], set()).add(c)
-    of_channel = {k: shares.of(cs)[1] for k, cs in by_channel.items()}
+    of_channel = {k: shares.of(cs)[0] for k, cs in by_channel.items()}
     out = []
     for effect in dict.fromkeys(e for e, _ in chosen.keys):
         at = [i for i, (e, _) in enumerate(chosen.keys) if e == effect]
@@ -270,12 +290,13 @@ def _causes(chosen: SearchState, found: Posterior, shares: Budget, fit: Fit) -> 
 
 
 def _unexplained(chosen: SearchState, shares: Budget, left: list[SmoothPart], status: Status, progress) -> Unexplained:
+    """Share of the gap that the chosen set leaves, the variables that it depends on, and a closed form for it."""
     _, _, share, ends = shares.overall()
     if status in (Status.NO_GAP, Status.NOT_JUDGED) or not left or left[0].energy <= 0:
         return Unexplained(share, ends, (), None, None)
     worst = left[0]
     variables = sorted(worst.by_variable.items(), key=lambda kv: -kv[1])[:2]
-    depends = tuple(k for k, v in variables if v > DEPENDS * worst.energy)
+    depends = tuple(k for k, v in variables if v > MIN_VARIABLE_SHARE * worst.energy)
     proposal = None
     if status in (Status.PARTLY, Status.UNEXPLAINED):
         progress("looking for a closed form of what remains")
@@ -288,13 +309,13 @@ def _unexplained(chosen: SearchState, shares: Budget, left: list[SmoothPart], st
 def _channels(
     problem: Problem, baseline: Baseline, chosen: SearchState, causes: tuple[Cause, ...], shares: Budget
 ) -> tuple[ChannelBudget, ...]:
-    """One line a column with a gap. Its gap in physical units is what is missed beyond the noise at the fit's rate."""
+    """One line for each column with a gap; gap and noise are rms values in physical units at the fit's sample rate."""
     found = []
     lines = [[i for i, (e, _) in enumerate(chosen.keys) if e == cause.effect] for cause in causes]
     for c in sorted(shares.open):
         column = baseline.columns.items[c]
         missed, noise = _mean_squares(problem, column.experiment, column.channel, column.column)
-        _, lost, after = shares.of({c})
+        lost, after = shares.of({c})
         found.append(
             ChannelBudget(
                 column.experiment,
@@ -311,33 +332,23 @@ def _channels(
 
 
 def _mean_squares(problem: Problem, e: str, c: str, column: int | None = None) -> tuple[float, float]:
-    """Of what the nominal model misses and of the noise, over the samples that count."""
+    """Mean squares of the nominal model's residual and of the noise, over the samples that count, in squared units."""
     stack, noise = problem.stacks[e], problem.noise[e, c]
     mask, y = (np.asarray(a[c]) for a in (stack.batch.mask, stack.batch.y))
     pick = slice(None) if column is None else slice(column, column + 1)
-    missed = _about_start((y - problem.predicted[e, c])[pick], mask[pick], c)
+    missed = centred((y - problem.predicted[e, c])[pick], mask[pick], c)
     count = max(float(mask[pick].sum()), 1.0)
     of_noise = float((mask[pick] * noise.std[pick, None, None] ** 2).sum()) / count
     return float((missed**2).sum()) / count, of_noise
 
 
-def _about_start(x: Float[np.ndarray, "columns B T"], mask, channel: str) -> Float[np.ndarray, "columns B T"]:
-    """Of excursions, which start anywhere, what is about their mean."""
-    x = np.where(mask > 0, x, 0.0)
-    if channel == "tendon_excursion":
-        x = (x - x.sum(axis=-1, keepdims=True) / np.maximum(mask.sum(axis=-1, keepdims=True), 1.0)) * (mask > 0)
-    return x
-
-
 def _relevance(problem: Problem, baseline: Baseline, tolerance: Mapping[str, float]) -> tuple[Relevance, ...]:
-    """Every channel with a gap, in the world: beside what the channel shows in the experiment that moves it most."""
-    channels = dict.fromkeys(
-        (baseline.columns.items[c].experiment, baseline.columns.items[c].channel) for c in _open(baseline)
-    )
+    """Size of each channel's gap, and relative to the channel's signal in the experiment that moves it most."""
+    items = [baseline.columns.items[c] for c in _columns_with_gap(baseline)]
     out = []
-    for e, c in channels:
+    for e, c in dict.fromkeys((x.experiment, x.channel) for x in items):
         missed, noise = _mean_squares(problem, e, c)
-        if missed <= noise:  # what features tell of is too small to be seen beside the noise
+        if missed <= noise:  # The evidence is in some features alone: the channel as a whole misses no more than noise.
             continue
         signal = max(_signal(problem, other, c) for other, s in problem.stacks.items() if c in s.experiment.channels)
         gap = (missed - noise) ** 0.5
@@ -353,21 +364,29 @@ def _signal(problem: Problem, e: str, c: str) -> float:
     mask, y = np.asarray(batch.mask[c]), np.asarray(batch.y[c])
     x = np.where(mask > 0, y, 0.0)
     x = (x - x.sum(axis=(1, 2), keepdims=True) / np.maximum(mask.sum(axis=(1, 2), keepdims=True), 1.0)) * (mask > 0)
-    return float(np.sqrt((_about_start(x, mask, c) ** 2).sum() / max(float(mask.sum()), 1.0)))
+    return float(np.sqrt((centred(x, mask, c) ** 2).sum() / max(float(mask.sum()), 1.0)))
 
 
-def _not_judged(problem: Problem) -> tuple[NotJudged, ...]:
+def _not_judged(problem: Problem, columns: Columns) -> tuple[NotJudged, ...]:
+    """Channels of which no sample counts, and channels of which too few count to make a column."""
     why = Reason.NOTHING_COUNTS if problem.simulator is None else Reason.NOT_PREDICTED
-    return tuple(NotJudged(x.experiment, x.channel, why) for x in not_judged(problem.stacks))
+    out = [NotJudged(x.experiment, x.channel, why) for x in not_judged(problem.stacks)]
+    known = {(x.experiment, x.channel) for x in (*out, *columns.items)}
+    few = [(e, c) for e, s in problem.stacks.items() for c in s.experiment.channels if (e, c) not in known]
+    return (*out, *(NotJudged(e, c, Reason.FEW_SAMPLES) for e, c in few))
 
 
 def _candidates(problem: Problem, search: Search, chosen: SearchState, found: Posterior, shares: Budget, fit: Fit):
-    """Every candidate tried, most probable first: as it is in the set, or alone on top of the nominal model."""
+    """All candidates, most probable first.
+
+    Values and held-out share of a member of the chosen set are those in the set, of others those alone on top of the
+    nominal model.
+    """
     order = sorted(found.causes, key=lambda k: (-found.causes[k], -found.gains[k]))
     inside = {k: values_of(fit, i) for i, k in enumerate(chosen.keys)}
     gain = dict(zip(chosen.keys, shares.overall()[0].tolist(), strict=True))
     others = search.alone(k for k in order if k not in inside)
-    likely = [k for k in order if k in others][:HELD_OUT]
+    likely = [k for k in order if k in others][:MAX_HELD_OUT]
     signatures = [search.table.signatures.dense(others[k][0].rows, problem.r.size) for k in likely]
     gain |= dict(zip(likely, held_out_gains(problem, signatures), strict=True))
     values = inside | {k: _alone(problem, search.table, *x) for k, x in others.items()}
@@ -379,7 +398,7 @@ def _candidates(problem: Problem, search: Search, chosen: SearchState, found: Po
 def _alone(
     problem: Problem, table: SignatureTable, offer: Offer, amplitudes: np.ndarray, std: np.ndarray
 ) -> tuple[Value, ...]:
-    """Amplitudes of a cause on top of the nominal model, linearly, and the shape that suits best."""
+    """Values of a cause alone on top of the nominal model: amplitudes by linear least squares, and the best shape."""
     (variant,), names = offer.variants, list(offer.variants[0].sizes)
     units = units_at(problem.nominal.finger, variant.effect, variant.site)
     found = dict.fromkeys(names, (0.0, 0.0))
@@ -392,9 +411,10 @@ def _alone(
 
 
 def _absorbed(problem: Problem, table: SignatureTable) -> tuple[Absorbed, ...]:
+    """Causes whose signatures the nominal parameters imitate, with the amplitudes that could stay hidden."""
     out = []
     for key, share in table.absorbed.items():
-        if share > NEARLY:
+        if share > MIN_ABSORBED:
             hidden = table.hidden.get(key, {})
             effect = next(v.effect for v in table.rows if v.key == key)
             units = units_at(problem.nominal.finger, effect, key[1])
@@ -404,7 +424,7 @@ def _absorbed(problem: Problem, table: SignatureTable) -> tuple[Absorbed, ...]:
 
 
 def _changed(against: Fit, found: Posterior, fit: Fit) -> tuple[Change, ...]:
-    """Nominal parameters that are others than an earlier fit found: as that has them, and with what they changed by."""
+    """Nominal parameters that have changed since an earlier fit: values before, and after with the change added."""
     old, new, parameters = np.asarray(ravel(against.model)), np.asarray(ravel(fit.model)), describe(fit.model)
     at = {p.name: i for i, p in enumerate(parameters)}
     out = []
@@ -424,13 +444,13 @@ def _changed(against: Fit, found: Posterior, fit: Fit) -> tuple[Change, ...]:
 
 
 def _retuned(problem: Problem, fit: Fit) -> tuple[Change, ...]:
-    """For another simulator: the parameters that the measurements contradict most."""
+    """Parameters of another simulator that the measurements contradict; the one that changes predictions most first."""
     if problem.simulator is None:
         return ()
     old, new = (np.asarray(ravel(model))[problem.free] for model in (problem.simulator, fit.model))
     std = fit.std[problem.free]
     off = np.abs(new - old)
-    weight = off * np.linalg.norm(problem.J, axis=0) * (off > CONTRADICTED * std)
+    weight = off * np.linalg.norm(problem.J, axis=0) * (off > MIN_DEVIATION * std)
     parameters = describe(problem.nominal)
     return tuple(
         Change(p.name, p.group, p.units, float(old[i]), 0.0, float(new[i]), float(std[i]), 1.0)

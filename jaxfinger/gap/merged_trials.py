@@ -1,4 +1,4 @@
-"""Trials of several experiments that are predicted alike, merged: one program reads a signature off all of them."""
+"""Trials of several experiments that share a channel, merged so that one compiled function predicts all of them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,25 +15,28 @@ from jaxfinger.model import Model, Motion, contact_map
 
 @dataclass(frozen=True)
 class MergedTrials:
-    """One channel of several experiments, whose trials follow one another, padded to a common length, in blocks."""
+    """One channel of several experiments: their trials in sequence, padded to a common length, in blocks of TRIALS."""
 
     channel: str
     held: bool  # whether a fixture holds the joints
-    trials: dict[str, range]  # of each experiment
-    x: list[Motion]
-    contact: list[Array | None]  # of the fingertip's force: `contact_map`
+    trials: dict[str, range]  # positions of each experiment's trials in the sequence
+    x: list[Motion]  # one for each block
+    contact: list[Array | None]  # `contact_map` of each block for the fingertip force, None for other channels
 
     def merged(self, arrays: Mapping[tuple[str, str], np.ndarray]) -> list[Float[Array, "columns B T"]]:
-        """Arrays of the experiments and channels, (columns, trials, time), in the blocks of `x`."""
+        """Arrays (columns, trials, time) by experiment and channel, merged into the blocks of `x`."""
         return _merged([arrays[e, self.channel] for e in self.trials])
 
     def of(self, experiments: Sequence[str]) -> list[int]:
-        """The blocks in which trials of these experiments are."""
+        """Numbers of the blocks that hold trials of these experiments."""
         return sorted({t // TRIALS for e in experiments for t in self.trials[e]})
 
 
 def merged_trials(stacks: dict[str, Stack], nominal: Model) -> list[MergedTrials]:
-    """Every channel of the stacks, held joints apart from moving ones."""
+    """One group for each channel of the stacks; experiments with held joints have a group of their own.
+
+    Excursions are predicted alike whether joints are held or not, so they form one group.
+    """
     kinds: dict[tuple, list[str]] = {}
     for e, stack in stacks.items():
         for c in stack.experiment.channels:
@@ -46,6 +49,7 @@ def merged_trials(stacks: dict[str, Stack], nominal: Model) -> list[MergedTrials
 
 
 def _merged_trials_of(channel: str, held: bool, stacks: dict[str, Stack], nominal: Model) -> MergedTrials:
+    """The group of one channel from the stacks that have it."""
     motions = [replace(s.batch.x, held=held) for s in stacks.values()]
     x = _merged(motions)
     ends = np.cumsum([0, *(m.time.shape[0] for m in motions)]).tolist()
@@ -58,7 +62,7 @@ _contact = eqx.filter_jit(contact_map)
 
 
 def _merged(parts: Sequence) -> list:
-    """Arrays (…, B, T) one after the other along their trials, in blocks of a common length."""
+    """Arrays (…, B, T) joined along B and split into blocks of TRIALS trials, all padded to one length T."""
     T = padded_size(max(jax.tree.leaves(p)[0].shape[-1] for p in parts), SAMPLES)
     wide = [padded(p, 0, T - jax.tree.leaves(p)[0].shape[-1]) for p in parts]
     whole = jax.tree.map(lambda *a: np.concatenate(a, axis=-2), *wide)

@@ -1,14 +1,14 @@
-"""What next: the trial of the format that would best separate the members of an ambiguous set.
+"""The next experiment: the trial that is expected to separate the members of an ambiguous set best.
 
-Every trial of the session is imagined again: other joints elsewhere, tendons pulled further and let go again, slower
-and faster; and where an experiment is missing, its trials are imagined with the motion of one that resembles it. All
-members, as fitted to the file, predict the trial. Its expected log evidence for i against j is
+Candidates are the session's trials and variants of them: resting joints elsewhere, tendons pulled further and released
+again, motion slower or faster. Trials of a missing experiment borrow the motion of an experiment that resembles it. All
+members, as fitted to the file, predict each trial. Its expected log evidence for member i against member j is
 
     D_ij = ½ min_η ( ‖δ − A η‖² + ηᵀ P η ),   δ = ŷ_i − ŷ_j,
 
-δ white, A the derivatives of j's prediction by the nominal parameters and its own, and P the information on them that
-the file holds already: what j can imitate without contradicting the file separates nothing (T-optimality; Atkinson &
-Fedorov, Biometrika 62 (1975) 57). The trial that separates the worst pair best is the suggestion.
+with δ whitened, A the derivatives of j's prediction by the nominal parameters and j's own, and P the information on
+these that the file holds already. A difference that j can imitate without contradicting the file separates nothing
+(T-optimality; Atkinson & Fedorov, Biometrika 62 (1975) 57). The trial with the largest min D_ij is suggested.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,7 +17,7 @@ from itertools import permutations
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxfinger.experiments import EXPERIMENTS, Batch, Stack, affected_channels
 from jaxfinger.gap.exact import Projector, SearchState, derivatives
@@ -27,22 +27,28 @@ from jaxfinger.gap.result import NextExperiment, Posture
 from jaxfinger.gap.signatures import Signatures
 from jaxfinger.model import Finger
 
-SETTLES = 3.5  # log evidence at which one member has 97 %
-REPEATS = 10  # a trial that must be repeated more often than this is no suggestion
-REST = 0.05  # rad (or, of a joint that slides, a twentieth of its range): a joint that moves by less is at rest
-PLACES = (0.2, 0.8)  # of their ranges, where joints at rest are imagined too
-HIGHEST = 15.0  # N: as far as the format's protocols pull a tendon
-LOOSE = 3.0  # times: how much further tendons are pulled that a protocol keeps at about 2 N
-FASTEST, SLOWER = 1.5, 0.25  # rad/s, times the speed
-# Whose motion an experiment that the session lacks would have. VD.1 and VD.3 have motions of their own.
-LIKE = {"VD.2": "ID.4", "ID.4": "VD.2", "ID.3-static": "ID.2", "ID.3-dynamic": "ID.2"}
+DECISIVE = 3.5  # Log evidence at which one of two members has a probability of 97 %: 1 / (1 + e^−3.5).
+MAX_REPEATS = 10  # A trial that needs more repeats to be decisive is not suggested: it would take a session of its own.
+# rad, or the share of the range of a sliding joint: a joint that moves by less is at rest. Held joints yield by less,
+# and commanded motions go through more.
+MIN_MOTION = 0.05
+REST_POSITIONS = (0.2, 0.8)  # Shares of the range at which resting joints are tried, well clear of the stops.
+MAX_TENSION = 15.0  # N, to which the protocols of the format pull a tendon
+MAX_TENSION_FACTOR = 3.0  # Where joints are free, tension only keeps tendons taut (about 2 N): no more than threefold.
+FAST_SPEED = 1.5  # rad/s, to which motion without tendons is sped up
+SLOW_FACTOR = 0.25  # Slow motion has a quarter of the speed.
+# The experiment whose motion a missing one borrows. VD.1 and VD.3 have motions of their own.
+MOTION_FROM = {"VD.2": "ID.4", "ID.4": "VD.2", "ID.3-static": "ID.2", "ID.3-dynamic": "ID.2"}
 
 
 def next_experiment(problem: Problem, members: Sequence[SearchState]) -> NextExperiment | None:
-    """For the fitted sets that rivals belong to; none where no trial is expected to separate them."""
+    """The trial that is expected to separate the fitted sets `members` best, one set for each rival.
+
+    Returns None where there are fewer than two, or where no trial would separate them in MAX_REPEATS repeats.
+    """
     if len(members) < 2:
         return None
-    shown = {e for m in members for x in m.effects for e in affected_channels(type(x), problem.nominal.finger)}
+    showing = {e for m in members for x in m.effects for e in affected_channels(type(x), problem.nominal.finger)}
     ones = Weights.plain(members[0].columns)
     project, own = Projector(problem, members[0].columns, ones), Signatures(problem)
     steps, known = [], []
@@ -51,7 +57,7 @@ def next_experiment(problem: Problem, members: Sequence[SearchState]) -> NextExp
         steps.append(project.nominal_step(problem.r - change))
         known.append(_information(problem, slopes))
     best, place = 0.0, None
-    for stacks in _short_list(problem, shown):
+    for stacks in _short_list(problem, showing):
         there = imagined(problem, stacks)
         signatures = Signatures(there)
         read = [derivatives(signatures, m) for m in members]
@@ -66,15 +72,15 @@ def next_experiment(problem: Problem, members: Sequence[SearchState]) -> NextExp
             )
             if worst > best:
                 best, place = worst, trial
-    if place is None or best * REPEATS < SETTLES:
+    if place is None or best * MAX_REPEATS < DECISIVE:
         return None
-    alike = set.intersection(*(set(m.keys) for m in members))
-    ids = tuple(dict.fromkeys(e for m in members for e, site in m.keys if (e, site) not in alike))
+    shared = set.intersection(*(set(m.keys) for m in members))
+    ids = tuple(dict.fromkeys(e for m in members for e, site in m.keys if (e, site) not in shared))
     return _described(problem, *place, best, ids)
 
 
 def _information(problem: Problem, slopes: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "q q"]:
-    """What the trials and priors say of the nominal parameters and of a set's coordinates together: q = p + k."""
+    """Information P of the file's trials and the priors on nominal parameters and a set's coordinates, q = p + k."""
     A, p = np.vstack([problem.J.T, slopes]), problem.J.shape[1]
     P = A @ A.T
     P[:p, :p] += problem.root.T @ problem.root
@@ -85,7 +91,7 @@ def _information(problem: Problem, slopes: Float[np.ndarray, "k N"]) -> Float[np
 def expected_evidence(
     delta: Float[np.ndarray, " N"], slopes: Float[np.ndarray, "k N"], information: Float[np.ndarray, "k k"]
 ) -> float:
-    """½ min over η of ‖δ − slopesᵀ η‖² + ηᵀ P η."""
+    """D = ½ min over η of ‖δ − slopesᵀ η‖² + ηᵀ P η, with `information` P."""
     scale = np.sqrt(np.diag(information) + np.sum(slopes**2, axis=1))
     scale = np.where(scale > 0, scale, 1.0)
     H = (information + slopes @ slopes.T) / np.outer(scale, scale)
@@ -94,28 +100,28 @@ def expected_evidence(
 
 
 # The short list -------------------------------------------------------------------------------------------------------
-def _short_list(problem: Problem, shown: set[str]) -> Iterator[dict[str, Stack]]:
-    """The session's trials as they are and otherwise, then those of the experiments that it lacks.
+def _short_list(problem: Problem, showing: set[str]) -> Iterator[dict[str, Stack]]:
+    """Candidate trials: the session's own, those of missing experiments in `showing`, and variants of both.
 
-    All experiments change together, since stacks of the shapes of the session's own are compiled already.
+    One variant holds all experiments, since stacks in the shapes of the session's own are compiled already.
     """
     own = problem.stacks
-    lacks = {
+    lacking = {
         name: _borrowed(problem, name, own[like])
-        for name, like in LIKE.items()
-        if name in shown and name not in own and like in own
+        for name, like in MOTION_FROM.items()
+        if name in showing and name not in own and like in own
     }
-    for stacks in (own, lacks):
-        if shown & set(stacks):
-            for share in (None, *PLACES):
-                there = {e: _at(s, problem.nominal.finger, share) for e, s in stacks.items()}
+    for stacks in (own, lacking):
+        if showing & set(stacks):
+            for share in (None, *REST_POSITIONS):
+                there = {e: _resting_at(s, problem.nominal.finger, share) for e, s in stacks.items()}
                 yield there
                 yield {e: _harder(s) for e, s in there.items()}
                 yield {e: _slower(s) for e, s in there.items()}
 
 
 def _borrowed(problem: Problem, name: str, like: Stack) -> Stack:
-    """An experiment that the session lacks, with the motion of another."""
+    """Trials of an experiment that the session lacks, with the motion of another; measured channels are zero."""
     spec, x, finger = EXPERIMENTS[name], like.batch.x, problem.nominal.finger
     if spec.slack:
         x = replace(x, tension=jnp.zeros_like(x.tension), tendon_direction=jnp.zeros_like(x.tendon_direction))
@@ -140,8 +146,8 @@ def _borrowed(problem: Problem, name: str, like: Stack) -> Stack:
     return Stack(spec, Batch(x, y, mask), like.trials, like.motions, like.holds, like.dt, measured)
 
 
-def _at(stack: Stack, finger: Finger, share: float | None) -> Stack:
-    """With the joints that rest so far up their ranges."""
+def _resting_at(stack: Stack, finger: Finger, share: float | None) -> Stack:
+    """The stack with resting joints at a share of their ranges, or as it is for None."""
     if share is None:
         return stack
     q = np.asarray(stack.batch.x.q)
@@ -150,17 +156,19 @@ def _at(stack: Stack, finger: Finger, share: float | None) -> Stack:
 
 
 def _harder(stack: Stack) -> Stack:
-    """With tendons pulled further, and at held joints let go again in the same steps; without tension, faster."""
+    """The stack with tendons pulled further, and at held joints released again in the same steps.
+
+    Without tension it moves faster instead. VD.3 stays as it is, since its motion follows from its tension.
+    """
     x, spec = stack.batch.x, stack.experiment
-    if spec.name == "VD.3":  # its motion follows from its tension
+    if spec.name == "VD.3":
         return stack
     if spec.slack:
-        speed = float(np.percentile(np.abs(np.asarray(x.qd)).max(axis=0), 99))
-        return stack if spec.rests else _at_speed(stack, max(1.0, FASTEST / max(speed, 1e-3)))
+        return stack if spec.rests else _sped_up(stack, max(1.0, FAST_SPEED / max(_speed(x.qd), 1e-3)))
     f = np.asarray(x.tension)
     top = f.max(axis=(0, -1), keepdims=True)
-    top = np.where(top > 0.0, top, HIGHEST)
-    f = f * np.clip(HIGHEST / top, 1.0, np.inf if spec.held else LOOSE)
+    top = np.where(top > 0.0, top, MAX_TENSION)
+    f = f * np.clip(MAX_TENSION / top, 1.0, np.inf if spec.held else MAX_TENSION_FACTOR)
     falls = f[..., -1].max(axis=0) < 0.5 * f.max(axis=(0, -1))
     if not spec.held or falls.all():
         return _with(stack, tension=f)
@@ -172,31 +180,39 @@ def _harder(stack: Stack) -> Stack:
 
 
 def _slower(stack: Stack) -> Stack:
-    """Where joints move and the speed is free."""
+    """The stack at a quarter of its speed, where joints move and their speed is free to choose."""
     spec = stack.experiment
-    return stack if spec.rests or spec.name == "VD.3" else _at_speed(stack, SLOWER)
+    return stack if spec.rests or spec.name == "VD.3" else _sped_up(stack, SLOW_FACTOR)
 
 
-def _at_speed(stack: Stack, times: float) -> Stack:
+def _sped_up(stack: Stack, factor: float) -> Stack:
+    """The same path in time, velocity and acceleration of `factor` times the speed."""
     x = stack.batch.x
-    return _with(stack, time=x.time / times, qd=x.qd * times, qdd=x.qdd * times**2)
+    return _with(stack, time=x.time / factor, qd=x.qd * factor, qdd=x.qdd * factor**2)
 
 
 def _with(stack: Stack, **motion) -> Stack:
+    """The stack with some fields of its motion replaced."""
     x = replace(stack.batch.x, **{k: jnp.asarray(v) for k, v in motion.items()})
     return replace(stack, batch=replace(stack.batch, x=x))
 
 
 def _moves(finger: Finger, q: Float[np.ndarray, "m *T"]) -> np.ndarray:
-    """Which joints move in a trial."""
+    """Whether each joint moves in a trial, (m,) or (m, B)."""
     slides = np.array(finger.prismatic)
     low, high = np.asarray(finger.limits).T
-    rest = np.where(slides, 0.05 * (high - low), REST)
+    rest = np.where(slides, MIN_MOTION * (high - low), MIN_MOTION)
     return np.ptp(q, axis=-1) > rest.reshape(-1, *[1] * (q.ndim - 2))
 
 
-# As data --------------------------------------------------------------------------------------------------------------
+def _speed(qd: Float[Array | np.ndarray, "m *T"]) -> float:
+    """99th percentile over the samples of the fastest joint's speed, which spikes do not move."""
+    return float(np.percentile(np.abs(np.asarray(qd)).max(axis=0), 99))
+
+
+# The suggestion -------------------------------------------------------------------------------------------------------
 def _described(problem: Problem, stack: Stack, b: int, evidence: float, ids: tuple[str, ...]) -> NextExperiment:
+    """The suggestion as data: trial number `b` of a stack, which brings `evidence` and separates the effects `ids`."""
     finger, spec = problem.nominal.finger, stack.experiment
     trial = problem.session[stack.trials[b]]
     x = stack.batch.x
@@ -207,10 +223,7 @@ def _described(problem: Problem, stack: Stack, b: int, evidence: float, ids: tup
         Posture(name, float(q[i].min()), float(q[i].max()), bool(moves[i]), finger.prismatic[i])
         for i, name in enumerate(finger.joint_names)
     )
-    speed = None
-    if not spec.rests:
-        speed = float(np.percentile(np.abs(np.asarray(x.qd)[:, b]).max(axis=0), 99))
-    often = int(np.ceil(SETTLES / evidence))
+    repeats = int(np.ceil(DECISIVE / evidence))
     return NextExperiment(
         spec.name,
         spec.name not in problem.stacks,
@@ -220,9 +233,9 @@ def _described(problem: Problem, stack: Stack, b: int, evidence: float, ids: tup
         None if spec.slack else float(f.max()),
         spec.held,
         spec.held and bool(f[:, -1].max() < 0.5 * f.max()),
-        speed,
+        None if spec.rests else _speed(x.qd[:, b]),
         any(finger.prismatic),
-        often,
-        often * evidence,
+        repeats,
+        repeats * evidence,
         ids,
     )

@@ -1,8 +1,10 @@
-"""The gap as one whitened regression: every trial's residuals after the nominal parameters are refitted to all of them.
+"""The gap as one whitened regression: residuals of all trials after a refit of the nominal parameters to all of them.
 
     r = y − ŷ(θ̂),   r̃ = (I − Q Qᵀ) W r,   z̃ = (I − Q Qᵀ) W ∂ŷ/∂a
 
-Q spans the whitened Jacobian of the nominal parameters: what they can absorb is no evidence (Frisch–Waugh–Lovell).
+W whitens by the noise of each channel. Q spans the whitened Jacobian of the nominal parameters: the projection removes
+what they can absorb, which is no evidence (theorem of Frisch, Waugh and Lovell). This module makes W r and the whitened
+Jacobian; `signatures` makes W ∂ŷ/∂a; `exact.Projector` projects.
 """
 
 from dataclasses import dataclass, replace
@@ -43,16 +45,16 @@ from jaxfinger.model import Model, Terms, plain_terms
 
 @dataclass(frozen=True)
 class Rows:
-    """Where the rows of one experiment come from: indices into (columns of its channels, trial, time)."""
+    """Channel, column, trial and time of each whitened row of one experiment. Masked samples have no row."""
 
     experiment: str
-    start: int  # first row in the stacked vector
-    keep: np.ndarray  # (rows,) positions in the flattened (B, channels × T) block
+    start: int  # position of the first row in the vector of all experiments' rows
+    keep: np.ndarray  # (rows,) positions in the flattened (B, columns of all channels, T) block of white residuals
     channel: np.ndarray  # (rows,) index of the channel among the experiment's
-    column: np.ndarray  # (rows,) joint, tendon or axis
+    column: np.ndarray  # (rows,) index of the joint, tendon or axis
     trial: np.ndarray  # (rows,) index of the trial in the stack
     time: np.ndarray  # (rows,) index of the sample
-    history: np.ndarray  # (rows,) samples before it that the whitening reads
+    history: np.ndarray  # (rows,) number of preceding samples that the whitening filter reads
 
     @property
     def size(self) -> int:
@@ -62,19 +64,22 @@ class Rows:
 
 @dataclass(frozen=True)
 class Problem:
-    """Everything that the search for effects reads."""
+    """Recordings, nominal model, whitened residuals and Jacobian: the input of the search for effects.
+
+    N rows, p free nominal parameters. Dictionaries are keyed by experiment, or by experiment and channel.
+    """
 
     session: Session
     stacks: dict[str, Stack]
     noise: dict[tuple[str, str], Noise]
     nominal: Model
-    free: np.ndarray  # positions of the nominal parameters in the flat vector
+    free: np.ndarray  # positions of the free nominal parameters in the flat vector
     rows: dict[str, Rows]
-    groups: list[MergedTrials]  # the trials of the rows, merged
+    groups: list[MergedTrials]  # the same trials, merged by what predicts them
     r: Float[np.ndarray, " N"]  # whitened residuals of the nominal model
-    J: Float[np.ndarray, "N p"]  # their Jacobian, whitened
-    root: Float[np.ndarray, "k p"]  # prior rows on the nominal parameters
-    offset: Float[np.ndarray, " k"]  # root (θ̂ − μ)
+    J: Float[np.ndarray, "N p"]  # whitened ∂ŷ/∂θ
+    root: Float[np.ndarray, "k p"]  # square root of the prior precision of the free parameters
+    offset: Float[np.ndarray, " k"]  # root (θ̂ − prior mean)
     predicted: dict[tuple[str, str], np.ndarray]  # ŷ of the nominal model, (columns, B, T)
     fit: Fit  # the staged fit
     sources: dict[str, Source]
@@ -84,7 +89,7 @@ class Problem:
 
     @property
     def trial_of_row(self) -> np.ndarray:
-        """(N,) running number of each row's trial over all experiments."""
+        """(N,) number of each row's trial, counted over all experiments."""
         out, first = np.empty(self.r.size, int), 0
         for rows in self.rows.values():
             out[rows.start : rows.start + rows.size] = rows.trial + first
@@ -93,7 +98,7 @@ class Problem:
 
     @property
     def block_of_row(self) -> np.ndarray:
-        """(N,) running number of the stretch of a trial that a row lies in (`cluster_robust.stretches`)."""
+        """(N,) number of the stretch of a trial to which each row belongs (`cluster_robust.stretches`)."""
         times = []
         for e, rows in self.rows.items():
             source = self.sources[e]
@@ -102,7 +107,7 @@ class Problem:
 
     @cached_property
     def columns(self) -> list[tuple[str, str, int]]:
-        """Experiment, channel and column of every measured column."""
+        """Experiment, channel and column index of all columns of all experiments."""
         return [
             (e, c, k)
             for e, stack in self.stacks.items()
@@ -112,7 +117,7 @@ class Problem:
 
     @cached_property
     def column_of_row(self) -> np.ndarray:
-        """(N,) position in `columns` of every row."""
+        """(N,) position in `columns` of each row's column."""
         position = {key: i for i, key in enumerate(self.columns)}
         out = np.empty(self.r.size, int)
         for e, rows in self.rows.items():
@@ -123,18 +128,20 @@ class Problem:
 
     @cached_property
     def without_effects(self) -> dict[tuple[str, bool], tuple[list, list[Terms | None]]]:
-        """What the nominal model says of every block of the groups, by channel and whether joints are held:
-        `predicted`, (columns, B, T), and the terms of (1) behind a torque or a force.
+        """Predictions of the nominal model by channel and whether joints are held, block by block of the group.
+
+        Each value holds `predicted` (columns, B, T) of every block and, for torques and forces, the terms of
+        equation (1) that it is computed from.
         """
 
-        def behind(group: MergedTrials) -> list[Terms | None]:
+        def terms(group: MergedTrials) -> list[Terms | None]:
             return [None if group.channel == "tendon_excursion" else _plain(self.nominal, x) for x in group.x]
 
-        return {(g.channel, g.held): (g.merged(self.predicted), behind(g)) for g in self.groups}
+        return {(g.channel, g.held): (g.merged(self.predicted), terms(g)) for g in self.groups}
 
     @property
     def trial_names(self) -> list[str]:
-        """Names in the order of `trial_of_row`."""
+        """Names of the trials, in the order of the numbers in `trial_of_row`."""
         return [t for e in self.rows for t in self.stacks[e].trials]
 
 
@@ -151,8 +158,17 @@ def build(
 ) -> Problem:
     """Identify the nominal model, refit it to all trials together, and stack the whitened residuals.
 
-    With `predictions` another simulator takes the nominal model's place (see `simulator`); `coarse` as in `prepare`.
-    With `against` an earlier fit is where the search starts, and its covariance the prior: `recipe` is that fit's.
+    Args:
+        session: the recordings.
+        recipe: the nominal model; with `against`, the recipe of that fit.
+        progress: called with a message before each step.
+        predictions: of another simulator, which then takes the nominal model's place (see `simulator`).
+        coarse: factor by which averages are longer, as in `prepare`.
+        against: an earlier fit of the same finger. Its values start the identification, and its covariance is the
+            prior of the refit.
+
+    Raises:
+        UserError: `predictions` has none of the session's trials; `against` is of another finger or holds effects.
     """
     progress("reading the recordings")
     measured = stacks = prepare(session, coarse=coarse)
@@ -160,31 +176,32 @@ def build(
     if predictions is not None:
         progress("imitating the simulator")
         simulator, recipe, stacks = emulate(session, recipe, stacks, predictions, coarse)
-    earlier = None if against is None else _as_found(session, against)
+    earlier = None if against is None else _start_from(session, against)
     fit = identify(session, recipe, start=earlier, progress=progress, stacks=measured)
     parameters = describe(fit.model)
     progress("refitting the nominal model to all trials")
+    # Masses and centres of mass move within the uncertainty that CAD states.
     cad = [i for i, p in enumerate(parameters) if p.group in ("mass", "com") and fit.covariance[i, i] > 0]
-    cad = np.setdiff1d(cad, fit.estimated)
     free = np.union1d(fit.estimated, cad).astype(int)
 
-    def known(free: np.ndarray) -> Prior:
+    def prior_on(free: np.ndarray) -> Prior:
         if against is None:
             return cad_prior(session, recipe, parameters, free)
         return prior_of(np.asarray(ravel(against.model)), against.covariance, free)
 
-    noise = _with_unknown(fit.noise, stacks, fit.model)
+    noise = _with_missing_noise(fit.noise, stacks, fit.model)
     reads = {e: stack.experiment.channels for e, stack in stacks.items()}
     sources = sources_of(stacks, reads, noise, parameters)
-    start, more = _with_missing_stages(fit, free, sources, parameters, coverage_of(stacks, session))
-    if more.size > free.size:  # what no stage had fitted was no noise
-        start, _ = solve(start, more, sources, known(more))
-        noise = _with_unknown(fit.noise, stacks, start)
+    start, more = _with_unfitted(fit, free, sources, parameters, coverage_of(stacks, session))
+    if more.size > free.size:
+        # Residuals held what the added parameters explain, so noise estimated from them was too large.
+        start, _ = solve(start, more, sources, prior_on(more))
+        noise = _with_missing_noise(fit.noise, stacks, start)
         sources, free = sources_of(stacks, reads, noise, parameters), more
-    prior = known(free)
+    prior = prior_on(free)
     nominal, solution = solve(start, free, sources, prior)
 
-    rows = layouts(stacks, sources)
+    rows = _layouts(stacks, sources)
     return Problem(
         session=session,
         stacks=stacks,
@@ -202,8 +219,8 @@ def build(
     )
 
 
-def _as_found(session: Session, against: Fit) -> Fit:
-    """The session's own finger, and in it what the earlier fit says of its nominal parameters.
+def _start_from(session: Session, against: Fit) -> Fit:
+    """A start for `identify`: the session's own finger with the nominal parameters and covariance of an earlier fit.
 
     Raises:
         UserError: the fit is of another finger, or holds effects.
@@ -224,14 +241,14 @@ def _as_found(session: Session, against: Fit) -> Fit:
 
 
 def site(problem: Problem, channel: str, column: int) -> str:
-    """Name of a channel's column."""
+    """Name of the joint, tendon or axis that is column number `column` of a channel."""
     finger = problem.nominal.finger
     names = {"joint_torque": finger.joint_names, "tendon_excursion": finger.tendon_names}.get(channel, ("x", "y", "z"))
     return names[column]
 
 
 def moved(problem: Problem, by: Float[np.ndarray, " p"]) -> Problem:
-    """The same rows at another nominal model: its free parameters moved, residuals and Jacobian exact there."""
+    """The problem at another nominal model, whose free parameters differ by `by`; residuals and Jacobian are exact."""
     at = Free.at(problem.nominal, problem.free)
     nominal = at.set(problem.nominal, jax.device_put(np.asarray(at.get(problem.nominal)) + by))
     linearised = linearise_each(nominal, problem.sources)
@@ -239,10 +256,9 @@ def moved(problem: Problem, by: Float[np.ndarray, " p"]) -> Problem:
 
 
 def imagined(problem: Problem, stacks: dict[str, Stack]) -> Problem:
-    """Trials that nobody has run, as the nominal model sees them; their measured channels mean nothing.
+    """The problem with trials that nobody has run: rows, predictions and Jacobian hold, measured channels are filler.
 
-    Noise of an experiment that the session lacks is that of the channel elsewhere. The force sensor is then taken to be
-    as good as the torque sensor at the length of the finger.
+    A channel of an experiment that the session lacks gets the noise of `_noise_elsewhere`.
     """
     known = dict(problem.noise)
     for e, stack in stacks.items():
@@ -255,14 +271,18 @@ def imagined(problem: Problem, stacks: dict[str, Stack]) -> Problem:
         else sources_of({e: stack}, {e: stack.experiment.channels}, known, describe(problem.nominal))[e]
         for e, stack in stacks.items()
     }
-    rows, linearised = layouts(stacks, sources), linearise_each(problem.nominal, sources)
+    rows, linearised = _layouts(stacks, sources), linearise_each(problem.nominal, sources)
     at = _at(problem.nominal, linearised, sources, rows, problem.free, problem.prior)
     groups = _groups(stacks, rows, problem.nominal)
     return replace(problem, stacks=stacks, sources=sources, rows=rows, groups=groups, noise=known, **at)
 
 
 def _noise_elsewhere(problem: Problem, channel: str, columns: int) -> Noise:
-    """White, of the largest size that the channel has in any experiment."""
+    """White noise with the largest standard deviation that the channel has in any experiment.
+
+    A force sensor that was never recorded is assumed to be as good as the torque sensor at the length of the finger.
+    Where no torque was recorded either, 1e-3 N m stands in, a guess at a small torque sensor.
+    """
 
     def largest(c: str) -> float | None:
         return max((float(n.std.max()) for (_, k), n in problem.noise.items() if k == c), default=None)
@@ -274,7 +294,7 @@ def _noise_elsewhere(problem: Problem, channel: str, columns: int) -> Noise:
 
 
 def _at(nominal: Model, linearised: dict[str, Linearised], sources, rows, free, prior: Prior) -> dict[str, Any]:
-    """What of a problem depends on its nominal model."""
+    """The fields of a problem that depend on its nominal model."""
     r, J = assemble(linearised, sources, rows, free, ravel(nominal).size)
     return {
         "nominal": nominal,
@@ -293,8 +313,8 @@ def _groups(stacks: dict[str, Stack], rows: dict[str, Rows], nominal: Model) -> 
     return merged_trials({e: stack for e, stack in stacks.items() if rows[e].size}, nominal)
 
 
-def layouts(stacks: dict[str, Stack], sources: dict[str, Source]) -> dict[str, Rows]:
-    """The rows that count, experiment by experiment, stacked."""
+def _layouts(stacks: dict[str, Stack], sources: dict[str, Source]) -> dict[str, Rows]:
+    """Rows of all experiments, each experiment's after those of the one before."""
     rows, start = {}, 0
     for e in sources:
         rows[e] = _layout(stacks[e], sources[e].filters, start)
@@ -305,7 +325,10 @@ def layouts(stacks: dict[str, Stack], sources: dict[str, Source]) -> dict[str, R
 def assemble(
     linearised: dict[str, Linearised], sources: dict[str, Source], rows: dict[str, Rows], free: np.ndarray, size: int
 ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N p"]]:
-    """White residuals and the derivatives of the white predictions by the free parameters."""
+    """Stack white residuals (N,) and the derivatives of white predictions by the free parameters (N, p).
+
+    `size` is the length of the flat vector of all parameters, of which `free` are positions.
+    """
     r, J = [], []
     for e, lin in linearised.items():
         keep = rows[e].keep
@@ -316,32 +339,33 @@ def assemble(
     return np.concatenate(r), np.concatenate(J)
 
 
-def _with_unknown(known: dict[tuple[str, str], Noise], stacks: dict[str, Stack], model: Model):
-    """The noise of every channel: where no stage has read it, of what the model leaves of it."""
+def _with_missing_noise(known: dict[tuple[str, str], Noise], stacks: dict[str, Stack], model: Model):
+    """Noise of all channels: as known, and estimated from the model's residuals where no stage has read the channel."""
     left = residuals_for_noise(model, stacks, {e: stack.experiment.channels for e, stack in stacks.items()}, known)
     return known | {(e, c): estimate(stacks[e], c, x) for (e, c), x in left.items()}
 
 
-def _with_missing_stages(
-    fit: Fit, free: np.ndarray, sources: dict[str, Source], parameters: list[Parameter], touched
+def _with_unfitted(
+    fit: Fit, free: np.ndarray, sources: dict[str, Source], parameters: list[Parameter], coverage
 ) -> tuple[Model, np.ndarray]:
-    """A start and the free parameters, with those terms of the recipe whose experiment is missing but which others see.
+    """Add to `free` the recipe's parameters that no stage has fitted but some trial shows; return model and positions.
 
-    Without ID.3-dynamic nobody estimates damping; VD.3 shows it all the same, and its lack is no gap.
+    A stage is skipped where its experiment is missing: without ID.3-dynamic none estimates damping, though VD.3 shows
+    it. Left at zero, such a parameter would pass for a gap. The model holds start values of the added parameters.
     """
     groups = free_groups(fit.recipe)
-    unknown = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in set(free)]
-    unknown = [i for i in unknown if len(parameters[i].spans) < 2 or can_determine(parameters[i], touched)]
-    start = start_values(fit.model, np.array(unknown, dtype=int), parameters, sources)
+    unfitted = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in set(free)]
+    unfitted = [i for i in unfitted if len(parameters[i].spans) < 2 or can_determine(parameters[i], coverage)]
+    start = start_values(fit.model, np.array(unfitted, dtype=int), parameters, sources)
     seen = set()
-    for e, lin in linearise_each(start, sources if unknown else {}).items():
+    for e, lin in linearise_each(start, sources if unfitted else {}).items():
         seen |= set(sources[e].positions[np.any(lin.factor[..., :-1] != 0.0, axis=(0, 1))])
-    added = np.array([i for i in unknown if i in seen], dtype=int)
+    added = np.array([i for i in unfitted if i in seen], dtype=int)
     return start_values(fit.model, added, parameters, sources), np.union1d(free, added).astype(int)
 
 
 def _layout(stack: Stack, filters, start: int) -> Rows:
-    """Rows that count, in the order of `white_rows`: trial, channel's column, time."""
+    """Rows of the samples that count, in the order of `white_rows`: trial, column of a channel, time."""
     counts, before, channel, column = [], [], [], []
     for number, c in enumerate(filters):
         mask = np.asarray(stack.batch.mask[c])

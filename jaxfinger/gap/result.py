@@ -1,4 +1,4 @@
-"""What a diagnosis found: numbers, names and kinds, no sentence. `report` turns them into words and a page."""
+"""The result of a diagnosis as data: numbers, names and enums. `report` turns it into sentences and a page."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,31 +9,33 @@ from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.propose import Proposal
 from jaxfinger.identify import Fit
 
-OPEN = 1.3  # rms of a channel after, in that of its noise, which is itself known to a fifth
+# A channel stays open where its rms with the causes in exceeds that of its noise by this factor. The noise itself is
+# known to a fifth, so that a smaller excess may be an error of its estimate.
+MAX_CLOSED_RMS = 1.3
 
 
 class Status(StrEnum):
-    """The verdict, by the ids of `gap.json`."""
+    """The verdict; values are the ids in `gap.json`."""
 
-    NO_GAP = "no_gap"  # nothing beyond the noise in any channel that was judged
-    EXPLAINED = "explained"  # every channel comes down to its noise, or to what the user tolerates
-    PARTLY = "partly"  # the named causes are at work, and the rest is open
-    AMBIGUOUS = "ambiguous"  # rivals that the trials cannot tell apart
-    UNEXPLAINED = "unexplained"  # a gap of which no known cause explains a fair part
-    NOT_JUDGED = "not_judged"  # no channel has a sample that counts
+    NO_GAP = "no_gap"  # no channel that was judged misses more than its noise
+    EXPLAINED = "explained"  # with the named causes every channel comes down to its noise or the user's tolerance
+    PARTLY = "partly"  # causes are named, and part of the gap stays open
+    AMBIGUOUS = "ambiguous"  # the trials cannot tell some rival causes apart
+    UNEXPLAINED = "unexplained"  # there is a gap, and no cause is probable enough to be named
+    NOT_JUDGED = "not_judged"  # no channel has enough samples that count
 
 
 class Reason(StrEnum):
     """Why a channel is not judged."""
 
-    NOTHING_COUNTS = "nothing_counts"  # no sample of it passed the experiment's rules
+    NOTHING_COUNTS = "nothing_counts"  # no sample passed the experiment's rules
     FEW_SAMPLES = "few_samples"  # too few samples count to tell a law from noise
-    NOT_PREDICTED = "not_predicted"  # the other simulator says nothing of it
+    NOT_PREDICTED = "not_predicted"  # the other simulator does not predict it
 
 
 @dataclass(frozen=True, order=True)
 class Key:
-    """One cause at one site: an effect's id, or `changed_` and a group of nominal parameters."""
+    """Name of one cause at one site: the id of an effect, or `changed_` and a group of nominal parameters."""
 
     effect: str
     site: Site
@@ -45,7 +47,7 @@ class ExperimentChannel:
 
     experiment: str
     name: str  # for example `joint_torque`
-    column: str | None = None  # name of the joint, tendon or axis; None: all columns together
+    column: str | None = None  # name of the joint, tendon or axis; None stands for all columns together
 
 
 @dataclass(frozen=True)
@@ -54,56 +56,56 @@ class Value:
 
     site: Site
     name: str
-    value: float
-    std: float
+    value: float  # in `units`
+    std: float  # in `units`
     units: str
 
 
 @dataclass(frozen=True)
 class Cause:
-    """One line of the budget: one effect, at one site or at several that came in together."""
+    """One line of the budget: one effect at all sites where it is in the chosen set."""
 
     effect: str
     sites: tuple[Site, ...]
-    probability: float  # that it is at work (at several sites: at each of them)
-    share: float  # of the gap, mean over channels with a gap, lost on held-out trials when it alone is dropped
+    probability: float  # that it is at work; with several sites, the smallest of theirs
+    share: float  # of the gap that comes back on held-out trials without it: mean over channels with a gap
     share_ci95: tuple[float, float]
-    channels: dict[ExperimentChannel, float]  # the same of each channel that it changes, columns together
+    channels: dict[ExperimentChannel, float]  # share of each channel's gap, all its columns together
     values: tuple[Value, ...]
 
     @property
     def keys(self) -> tuple[Key, ...]:
-        """Its sites one by one."""
+        """One key for each site."""
         return tuple(Key(self.effect, s) for s in self.sites)
 
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What of the gap no named cause closes."""
+    """The part of the gap that no named cause closes."""
 
-    share: float  # mean over channels with a gap
+    share: float  # of the gap, mean over channels with a gap
     share_ci95: tuple[float, float]
-    depends_on: tuple[str, ...]  # variables of the smooth law that carry most of it: `tension`, `q`, …
-    where: ExperimentChannel | None  # the column with most of it
-    proposal: Proposal | None  # a closed form, unproven
+    depends_on: tuple[str, ...]  # variables of the smooth law that explain most of it: `tension`, `q`, …
+    where: ExperimentChannel | None  # the column with the largest part of it
+    proposal: Proposal | None  # a closed form for a person to check
 
 
 @dataclass(frozen=True)
 class Relevance:
-    """How large a channel's gap is in the world."""
+    """Size of a channel's gap in physical units and relative to the channel's signal."""
 
     experiment: str
     channel: str
     units: str
     gap: float  # rms beyond the noise, in `units`
-    signal: float  # rms of the channel about its mean, over the same samples
+    signal: float  # rms of the channel about its mean in the experiment that moves it most, in `units`
     relative: float  # gap / signal
-    tolerated: bool  # whether the user's tolerance covers it
+    tolerated: bool  # whether the user's tolerance covers the gap
 
 
 @dataclass(frozen=True)
 class NotJudged:
-    """A channel that is no part of the verdict."""
+    """A channel that the verdict does not cover."""
 
     experiment: str
     channel: str
@@ -112,66 +114,69 @@ class NotJudged:
 
 @dataclass(frozen=True)
 class ChannelBudget:
-    """How the misfit of one column with a gap is made up, on held-out trials. Shares are of its gap; what causes close
-    together, or only together, makes them sum to more or less than one.
+    """Budget of one column with a gap, as shares of its gap on held-out trials.
+
+    Shares need not sum to one: a part that either of two causes closes counts for neither, and a part that only both
+    together close counts for both.
     """
 
     experiment: str
     channel: str
     column: str
     units: str
-    noise: float  # rms
-    gap: float  # rms of what the nominal model misses beyond the noise
-    by_cause: tuple[float, ...]  # in the order of `Diagnosis.budget`: lost when this cause alone is dropped
-    unexplained: float  # left with all causes in
+    noise: float  # rms, in `units`
+    gap: float  # rms of the nominal model's residual beyond the noise, in `units`
+    by_cause: tuple[float, ...]  # share that comes back without this cause alone, in the order of `Diagnosis.budget`
+    unexplained: float  # share that is left with all causes in
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One cause at one site, tried."""
+    """One cause at one site that was tried."""
 
     key: Key
     probability: float  # that it is at work, alone or with others
-    log_evidence: float  # of the best set with it less the best set without it
+    log_evidence: float  # of the best set with it, minus that of the best set without it
     held_out: float  # share of the gap that it explains on trials that its fit has not seen
     values: tuple[Value, ...]
 
 
 @dataclass(frozen=True)
 class Absorbed:
-    """A cause that the nominal parameters imitate with this file's trials."""
+    """A cause that the nominal parameters imitate on the trials of this file."""
 
     key: Key
-    share: float  # of its signature that they imitate
-    hidden: tuple[Value, ...]  # per amplitude: `value` 0 and the `std` that the trials leave it, all that could hide
+    share: float  # of the signature's energy that they imitate
+    hidden: tuple[Value, ...]  # for each amplitude: `value` 0, and as `std` the size that could stay hidden
 
 
 @dataclass(frozen=True)
 class Closure:
-    """How far one channel closes on held-out trials: rms in its unit, at the rate of the fit."""
+    """Gap of one channel on held-out trials without and with the causes, at the sample rate of the fit."""
 
     experiment: str
     channel: str
     units: str
-    noise: float
-    before: float
-    after: float
-    closed: float
+    noise: float  # rms, in `units`
+    before: float  # rms of the nominal model's (or the other simulator's) residual, in `units`
+    after: float  # rms of the augmented model's residual, in `units`
+    closed: float  # 1 − (after² − noise²) / (before² − noise²)
     closed_ci95: tuple[float, float]
-    resolvable: bool  # whether the gap before stands out of the noise
-    diverged: bool = False  # whether a forward simulation ran away: it closes nothing, and says nothing
+    resolvable: bool  # whether the gap before stands out from the noise
+    diverged: bool = False  # whether a forward simulation ran away; `closed` is then 0 and means nothing
 
     @property
     def stays_open(self) -> bool:
-        """Whether a channel with a gap misses more than its noise after all. Angles simulated forward are not judged by
-        that, since they amplify what is small.
+        """Whether a channel with a gap still misses more than its noise with the causes in.
+
+        Simulated angles do not count, since forward simulation amplifies small errors.
         """
         judged = self.resolvable and not self.diverged and self.channel != "q"
-        return judged and self.noise > 0 and self.after > OPEN * self.noise
+        return judged and self.noise > 0 and self.after > MAX_CLOSED_RMS * self.noise
 
 
 def tolerated(line: Closure, relevance: Sequence[Relevance], tolerance: Mapping[str, float]) -> bool:
-    """Whether what a channel misses beyond its noise after all, beside its signal, is within the user's tolerance."""
+    """Whether the rest of a channel's gap, relative to its signal, is within the user's tolerance."""
     left = max(line.after**2 - line.noise**2, 0.0) ** 0.5
     signal = {(x.experiment, x.channel): x.signal for x in relevance}.get((line.experiment, line.channel), 0.0)
     return left <= tolerance.get(line.channel, -1.0) * signal
@@ -180,44 +185,44 @@ def tolerated(line: Closure, relevance: Sequence[Relevance], tolerance: Mapping[
 def still_open(
     closures: Sequence[Closure], relevance: Sequence[Relevance], tolerance: Mapping[str, float]
 ) -> list[Closure]:
-    """Channels that stay open by more than the user tolerates."""
+    """Channels that stay open and whose rest the user does not tolerate."""
     return [x for x in closures if x.stays_open and not tolerated(x, relevance, tolerance)]
 
 
 @dataclass(frozen=True)
 class Left:
-    """What a smooth law could still explain in one column, beyond the causes."""
+    """The part of one column's residual, with the causes in, that a smooth law could still explain."""
 
     experiment: str
     channel: str
     column: str
-    energy: float  # in squared standard deviations, above what noise gives
-    by_variable: dict[str, float]  # the same, for the features of one variable alone
+    energy: float  # of the explained part in squared standard deviations of the noise, less its expectation under noise
+    by_variable: dict[str, float]  # the same for the features of one variable alone
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where the nominal model misses."""
+    """A region of one trial's motion in which the nominal model misses a channel by much."""
 
     experiment: str
     trial: str
     channel: str
     site: str
-    variable: str
-    low: float
+    variable: str  # `time`, `q`, `qd` or `tendon_force`
+    low: float  # of the variable, SI
     high: float
-    share: float  # of the gap's energy above noise, in the whole file
+    share: float  # of the energy above noise in all places that stand out in the file
 
 
 @dataclass(frozen=True)
 class Change:
-    """A nominal parameter that two sessions, or simulator and finger, disagree on."""
+    """A nominal parameter whose value differs between two sessions, or between another simulator and the finger."""
 
     name: str
     group: str
     units: str
-    before: float
-    before_std: float
+    before: float  # in the earlier session, or in the simulator
+    before_std: float  # 0 for a simulator
     after: float
     after_std: float
     probability: float  # that it has changed
@@ -225,7 +230,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Posture:
-    """Where a joint is in a trial that has not been run: rad, m where it slides."""
+    """Range of one joint in a proposed trial: rad, or m for a sliding joint."""
 
     joint: str
     low: float
@@ -236,35 +241,39 @@ class Posture:
 
 @dataclass(frozen=True)
 class NextExperiment:
-    """The trial that would best separate rivals."""
+    """The trial that is expected to separate rivals best."""
 
     experiment: str
-    lacking: bool  # whether the session has no trial of it
-    joint: str | None  # that is driven, in an experiment of one joint
-    tendon: str | None  # that is pulled, at held joints
+    lacking: bool  # whether the session has no trial of this experiment
+    joint: str | None  # the driven joint, in an experiment of one joint
+    tendon: str | None  # the pulled tendon, in an experiment with held joints
     postures: tuple[Posture, ...]
-    tension: float | None  # N, the highest; None without tension
-    steps: bool  # whether it is pulled in steps
-    released: bool  # and let go in steps again
-    speed: float | None  # rad/s; None where joints rest
-    slides: bool  # whether that speed is m/s for some joint
-    times: int  # how often
-    evidence: float  # expected, of all those times together
+    tension: float | None  # N, the largest; None without tension
+    steps: bool  # whether tension rises in steps
+    released: bool  # whether it also falls in steps
+    speed: float | None  # rad/s, 99th percentile of the fastest joint's; None where joints rest
+    slides: bool  # whether some joint slides, so that its speed is in m/s
+    times: int  # number of repeats
+    evidence: float  # expected log evidence of all repeats together
     separates: tuple[str, ...]  # ids of effects
 
 
 @dataclass(frozen=True, repr=False)
 class Diagnosis:
-    """Everything that a report shows."""
+    """Everything that a report shows.
+
+    The verdict is `status` and `named`. The causes' shares are in `budget`, the shrinkage of each channel's gap in
+    `closures`, and the model with the causes in `augmented`.
+    """
 
     status: Status
-    named: tuple[Key, ...]  # in order of their share; under `ambiguous` the likeliest of the first set
+    named: tuple[Key, ...]  # largest share first; under `ambiguous` the likeliest member of the first ambiguous set
     data: str  # file name
     specimen: str
-    against: str | None  # file name of the fit
+    against: str | None  # file name of the earlier fit
     quick: bool
-    tolerance: dict[str, float]  # by channel, of its signal; empty: none
-    budget: tuple[Cause, ...]  # in order of their share
+    tolerance: dict[str, float]  # by channel, as a share of its signal; empty where the user gave none
+    budget: tuple[Cause, ...]  # largest share first
     unexplained: Unexplained
     channels: tuple[ChannelBudget, ...]
     relevance: tuple[Relevance, ...]
@@ -272,16 +281,16 @@ class Diagnosis:
     closures: tuple[Closure, ...]
     where: tuple[Place, ...]
     candidates: tuple[Candidate, ...]  # most probable first
-    none: float  # probability that nothing is at work
-    unlisted: float  # that something which the catalogue lacks is
+    none: float  # probability that no cause is at work
+    unlisted: float  # probability that something is at work which the catalogue lacks
     ambiguous_sets: tuple[tuple[Key, ...], ...]
     next_experiment: NextExperiment | None
     absorbed: tuple[Absorbed, ...]
     changes: tuple[Change, ...]
-    left: tuple[Left, ...]  # largest first
+    left: tuple[Left, ...]  # largest energy first
     nominal: Fit
-    augmented: Fit  # the nominal one where nothing is named
-    problem: Problem | None  # the recordings and residuals, for figures; None where they are let go
+    augmented: Fit  # the nominal fit where nothing is named
+    problem: Problem | None  # recordings and residuals, for figures; None where they were dropped to save memory
 
     def __repr__(self) -> str:
         named = ", ".join(f"{k.effect} at {'-'.join(k.site)}" for k in self.named) or "nothing named"

@@ -1,15 +1,24 @@
-"""Where the gap lies: energy of the white residuals above noise, by trial, channel, site, and region of the motion."""
+"""Where the gap lies: trials, columns and regions of the motion where whitened residuals exceed the noise."""
 
 import numpy as np
 
 from jaxfinger.gap.problem import Problem, site
 from jaxfinger.gap.result import Place
 
-BINS = 6
+BINS = 6  # Quantile bins of a variable; a region is a run of them. Six are three thirds, each halved.
+MIN_ROWS = 20  # Rows of a column in a trial. With fewer, single samples decide where its gap lies.
+# Energy above the noise, in standard deviations of white noise's, from which a column of a trial stands out. Residuals
+# are never quite white, and a rest of colour adds up to a few.
+MIN_DEVIATIONS = 5.0
+MIN_REGION_SHARE = 0.5  # A region holds at least half of the gap of its trial and column.
 
 
 def where(problem: Problem, most: int = 12) -> list[Place]:
-    """The places with the largest share of the gap, and the region of the motion that holds most of it."""
+    """Places of the gap: the `most` columns of trials with the largest energy above noise, each with its region.
+
+    A region is the range of one variable that concentrates the column's gap best. `Place.share` is the region's share
+    of the energy above noise in all places that stand out. Largest share first.
+    """
     found, total = [], 0.0
     for e, rows in problem.rows.items():
         stack = problem.stacks[e]
@@ -19,8 +28,7 @@ def where(problem: Problem, most: int = 12) -> list[Place]:
                 for b in np.unique(rows.trial):
                     pick = (rows.channel == number) & (rows.column == column) & (rows.trial == b)
                     energy, n = float(r2[pick].sum()), int(pick.sum())
-                    # Coloured remains of noise add up: five deviations of white noise are not much.
-                    if n < 20 or energy < 5.0 * np.sqrt(2.0 * n):
+                    if n < MIN_ROWS or energy < MIN_DEVIATIONS * np.sqrt(2.0 * n):  # the variance of χ²(n) is 2 n
                         continue
                     total += energy
                     found.append((energy, e, c, int(column), int(b), pick, r2[pick]))
@@ -37,7 +45,11 @@ def where(problem: Problem, most: int = 12) -> list[Place]:
 
 
 def _region(problem: Problem, e, c, column, b, time, energy):
-    """The variable and the run of its bins that holds the gap in the smallest part of the trial."""
+    """Variable, lower and upper end of the region, and its share of the column's energy in the trial.
+
+    Among all variables and runs of bins with MIN_REGION_SHARE of the energy, the one whose share of the energy exceeds
+    its share of the samples most. The whole trial, as a range of time, where no run does.
+    """
     x = problem.stacks[e].batch.x
     finger = problem.nominal.finger
     if c == "tendon_excursion":
@@ -47,7 +59,7 @@ def _region(problem: Problem, e, c, column, b, time, energy):
         joint = column if c == "joint_torque" else 0
         tendon = int(np.argmax(np.asarray(x.tension)[:, b].max(axis=-1))) if finger.n else None
     variables = {"time": np.asarray(x.time)[b]}
-    if not problem.stacks[e].experiment.held:  # else only noise moves the joint
+    if not problem.stacks[e].experiment.held:  # A held joint is moved by noise alone.
         variables |= {"q": np.asarray(x.q)[joint, b], "qd": np.asarray(x.qd)[joint, b]}
     if tendon is not None:
         variables["tendon_force"] = np.asarray(x.tension)[tendon, b]
@@ -65,6 +77,6 @@ def _region(problem: Problem, e, c, column, b, time, energy):
         for i in range(len(part)):
             for j in range(i, len(part)):
                 share, size = part[i : j + 1].sum(), width[i : j + 1].sum()
-                if share >= 0.5 and share - size > best[4]:
+                if share >= MIN_REGION_SHARE and share - size > best[4]:
                     best = (name, float(edges[i]), float(edges[j + 1]), float(min(share, 1.0)), float(share - size))
     return best[:4]

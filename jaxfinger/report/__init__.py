@@ -1,1 +1,1 @@
-"""."""
+"""Sentences, `gap.json`, figures and pages from fits and diagnoses."""

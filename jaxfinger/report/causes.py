@@ -1,4 +1,4 @@
-"""What a cause is, in the words of its effect: what happens, what it looks like in the data, what to change."""
+"""Texts that an effect has about itself: what happens, what it looks like in the data, what to change."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from jaxfinger.gap.result import Diagnosis
 
 @dataclass(frozen=True)
 class Words:
-    """Short texts; empty where the effect says nothing."""
+    """Texts about a cause; empty where the effect has none."""
 
     happens: str
-    looks: str = ""
-    change: str = ""
+    looks: str = ""  # what the effect looks like in the data
+    change: str = ""  # what to change in the simulator or on the bench
     form: str = ""  # the law, with the names of its parameters
 
 
 def words(effect: str, d: Diagnosis) -> Words:
-    """Of an effect of the catalogue, a term of the nominal model, a user's effect, or a parameter that has changed."""
+    """Texts about an effect of the catalogue, a term of the nominal model, a user's effect or a changed parameter."""
     of_model = {e.ID: type(e) for e in d.augmented.model.effects if isinstance(e, CatalogueEffect)}
     known = of_model | NOMINAL_TERMS | CHANGED | CATALOGUE
     if effect not in known:

@@ -1,4 +1,4 @@
-"""The curves of the paper's figures, from a fit, and what was measured beside them, in the units that people read."""
+"""Curves of the paper's figures, computed from a fit, and measured points beside them, in units for people."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from jaxfinger.identify import Fit
 from jaxfinger.model import Model, rigid_body
 from jaxfinger.report.measured import Points, arm_points, hold_points, loss_points
 
-SAMPLES = 61
-TENSION = 12.0  # N: the paper's protocol goes to 10 N, its validation to 15 N
+SAMPLES = 61  # Points of a curve: two degrees apart over a range of 120°, closer than a figure resolves.
+MAX_TENSION = 12.0  # N, of the tendon friction's curve: the paper's protocol goes to 10 N, its validation to 15 N.
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Curve:
     std: Float[np.ndarray, " S"]
 
     def range(self) -> tuple[float, float, float]:
-        """Largest and smallest value, and the largest standard deviation."""
+        """Largest value, smallest value and largest standard deviation."""
         return float(self.y.max()), float(self.y.min()), float(self.std.max())
 
 
@@ -39,28 +39,28 @@ class JointCurves:
     elastic: Curve
     friction: Curve
     gravity: Float[np.ndarray, " S"]
-    damping: tuple[float, float]  # N mm s/rad (N s/m), its standard deviation
+    damping: tuple[float, float]  # value and standard deviation, N mm s/rad (N s/m)
     prismatic: bool
-    flexing: Points | None = None  # torque of the holds reached in the positive direction, and in the other one
-    extending: Points | None = None
+    flexing: Points | None = None  # torque of holds that were reached in the positive direction
+    extending: Points | None = None  # and in the negative direction
 
 
 @dataclass(frozen=True)
 class Curves:
-    """Everything that the paper draws of a model, with what was measured where a session was given."""
+    """The curves that the paper draws of a model, and measured points if a session was given."""
 
-    moment_arm: dict[tuple[str, str], Curve]  # (tendon, joint): mm against degrees
+    moment_arm: dict[tuple[str, str], Curve]  # by tendon and joint: mm against degrees
     joints: dict[str, JointCurves]
-    tendon_friction: dict[str, Curve]  # loss of a sliding tendon, N against N of tension
+    tendon_friction: dict[str, Curve]  # by tendon: tension lost while it slides against tension, both N
     arm_points: dict[tuple[str, str], Points] = field(default_factory=dict)
     loss_points: dict[str, Points] = field(default_factory=dict)
 
 
 def curves(fit: Fit, session: Session | None = None) -> Curves:
-    """One joint over its range, the others in the middle of theirs; pairs that the finger has and the fit estimated.
+    """Compute the curves of a fit over each joint's range, the other joints in the middle of theirs.
 
-    With a session, what was measured goes along: slopes of the excursions of ID.2, torques of the holds of ID.3-static,
-    losses of the holds of ID.4.
+    Curves without an estimated parameter are left out. A session adds measured points: slopes of the excursions of
+    ID.2, torques of the holds of ID.3-static, losses of the holds of ID.4.
     """
     found = _curves(fit)
     return found if session is None else _with_points(found, fit, session)
@@ -87,7 +87,7 @@ def _curves(fit: Fit) -> Curves:
     q = np.tile(limits.mean(axis=1)[:, None, None], (1, m, S))
     for i in range(m):
         q[i, i] = np.linspace(limits[i, 0], limits[i, 1], S)
-    f = np.linspace(0.0, TENSION, S)
+    f = np.linspace(0.0, MAX_TENSION, S)
     values, std = fit.function(_evaluate(jnp.asarray(q), jnp.asarray(np.tile(f, (finger.n, 1)))))
     cuts = np.cumsum((finger.n * m * S, m * S, m * S, m))
     arms, elastic, friction, damping, loss = zip(np.split(values, cuts), np.split(std, cuts), strict=True)
@@ -97,7 +97,7 @@ def _curves(fit: Fit) -> Curves:
         return tuple(a.reshape(shape) for a in pair)
 
     arms, elastic, friction = shaped(arms, (finger.n, m, S)), shaped(elastic, (m, S)), shaped(friction, (m, S))
-    # A loss of nothing, or of all, is as well known as the law that says so.
+    # A clipped loss keeps the standard deviation of the unclipped law.
     loss = np.clip(loss[0].reshape(finger.n, S), 0.0, f), loss[1].reshape(finger.n, S)
     angle = [(1e3 if p else 180 / np.pi) for p in finger.prismatic]
     torque = [(1.0 if p else 1e3) for p in finger.prismatic]
@@ -125,7 +125,7 @@ def _curves(fit: Fit) -> Curves:
 
 
 def _estimated(fit: Fit) -> set:
-    """Joints, tendons and (tendon, joint) pairs of which the fit has estimated something."""
+    """Joints, tendons and (tendon, joint) pairs of the parameters that the fit has estimated."""
     from jaxfinger.identify.parameters import describe
 
     found, parameters = set(), describe(fit.model)
@@ -141,7 +141,7 @@ def _estimated(fit: Fit) -> set:
 
 
 def _evaluate(q: Float[Array, "m m S"], tension: Float[Array, "n S"]):
-    """All curves of a model as one flat vector, so that one derivative gives every standard deviation."""
+    """Function of a model that returns all curves as one flat vector: one derivative gives all standard deviations."""
     m = q.shape[0]
     own = jnp.arange(m)
 

@@ -1,4 +1,4 @@
-"""`gap.json`, schema jaxfinger-gap/2: SI units, angles rad; no NaN; a probability says the same as the words."""
+"""`gap.json`, schema jaxfinger-gap/2 (docs/gap-json.md): SI units, angles in rad, no NaN."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SCHEMA = "jaxfinger-gap/2"
 
 
 def as_gap_json(d: Diagnosis) -> dict:
-    """What `gap.json` holds."""
+    """Content of `gap.json` as a dictionary."""
     step = d.next_experiment
     return {
         "schema": SCHEMA,
@@ -106,12 +106,12 @@ def as_gap_json(d: Diagnosis) -> dict:
 
 
 def text(d: Diagnosis) -> str:
-    """The file's content."""
+    """Content of `gap.json` as text."""
     return json.dumps(as_gap_json(d), indent=1, allow_nan=False, ensure_ascii=False)
 
 
 def write(d: Diagnosis, folder: str | Path, overwrite: bool = False) -> None:
-    """`gap.json`, `nominal.json` and `augmented.json` in a folder, which is made where there is none.
+    """Write `gap.json`, `nominal.json` and `augmented.json` into a folder, which is made if it does not exist.
 
     Raises:
         UserError: one of them exists and `overwrite` is false, or the folder cannot be written.
@@ -124,7 +124,7 @@ def write(d: Diagnosis, folder: str | Path, overwrite: bool = False) -> None:
 
 
 def _chance(probability: float) -> float:
-    """A sum of weights within 0 and 1, which rounding may leave by a hair."""
+    """A probability clipped to 0 and 1, since rounding may lift a sum of weights above 1."""
     return min(max(probability, 0.0), 1.0)
 
 
@@ -133,12 +133,12 @@ def _key(key: Key) -> dict:
 
 
 def _sites(cause: Cause) -> list[str]:
-    """The one site's names, or every site's name."""
+    """Names in the one site, or with several sites the name of each."""
     return list(cause.sites[0]) if len(cause.sites) == 1 else ["-".join(s) for s in cause.sites]
 
 
 def _parameters(values: tuple[Value, ...], sites: tuple[Site, ...]) -> dict:
-    """By name, and at several sites by name and site."""
+    """Values by the parameter's name, or with several sites by name and site."""
     return {
         v.name if len(sites) == 1 else f"{v.name} {'-'.join(v.site)}": {
             "value": v.value,

@@ -1,4 +1,4 @@
-"""The paper's figures of a model: moment arms, torque of the joints, tendon friction, each with what was measured."""
+"""The paper's figures of a model: moment arms, joint torques and tendon friction, each with measured points."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from jaxfinger.report import plots
 from jaxfinger.report.curves import curves
 from jaxfinger.report.theme import grid, look, save
 
-ACROSS = 3  # panels in a row: a finger has three joints, an arm up to seven
+PANELS_PER_ROW = 3  # A finger has three joints, an arm up to seven.
 
 
 @look()
 def draw_identification(
     fit: Fit, session: Session, folder: str | Path, overwrite: bool = False, suffix: str = ".svg"
 ) -> list[Path]:
-    """Write the figures that the fit has something to show for; the paths written.
+    """Write the figures for which the fit has estimated something; return the paths.
 
     Raises:
         UserError: a figure exists and `overwrite` is false.
@@ -41,9 +41,9 @@ def draw_identification(
 
 
 def _panels(draw, found, joints: list[str]) -> Figure:
-    """One panel a joint."""
-    rows = -(-len(joints) // ACROSS)
-    figure, axes = grid(rows, min(len(joints), ACROSS), 3.4, 3.0)
+    """A figure with one panel for each joint."""
+    rows = -(-len(joints) // PANELS_PER_ROW)
+    figure, axes = grid(rows, min(len(joints), PANELS_PER_ROW), 3.4, 3.0)
     panels = [ax for row in axes for ax in row]
     for joint, ax in zip(joints, panels, strict=False):
         draw(found, joint, ax)

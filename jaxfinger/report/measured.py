@@ -1,4 +1,4 @@
-"""What the trials show of a model's curves without a fit: slopes of excursions, torques of holds, losses of tendons."""
+"""Measured points of a model's curves: slopes of excursions, torques of holds, losses of tension."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from jaxfinger.data import Session
 from jaxfinger.experiments import Stack, predict
 from jaxfinger.model import Model, TendonFriction, rigid_body
 
-SHORT_ARM = 1e-3  # m: a shorter moment arm says nothing of the tension behind a torque
-PARTS = 6  # of a joint's stroke in ID.2, one slope each: the powers of a moment arm of degree 4 still show
-LEAST = 8  # samples from which a slope is taken
+MIN_ARM = 1e-3  # m: with a shorter moment arm, an error of the torque is a large error of the tension behind it.
+STROKE_PARTS = 6  # Parts of a joint's stroke in ID.2, with one slope each: enough to show a moment arm of degree 4.
+MIN_SAMPLES = 8  # Samples of a part: twice the four coefficients that are fitted to them.
+MIN_STEP = 0.1  # N, by which a hold's tension must exceed that of all before it, so that tension was rising.
 
 
 @dataclass(frozen=True)
 class Points:
-    """Measured values y at x; their scatter is all that they say of their error."""
+    """Measured values y at x, without error bars: their scatter shows their error."""
 
     x: Float[np.ndarray, " P"]
     y: Float[np.ndarray, " P"]
 
 
 def arm_points(session: Session, stack: Stack) -> dict[tuple[str, str], Points]:
-    """By (tendon, joint): moment arm in mm against degrees (a number against mm where the joint slides).
+    """Moment arms by tendon and joint, in mm against degrees (dimensionless against mm for a sliding joint).
 
-    A trial of ID.2 moves one joint, so that the slope of a tendon's excursion over its angle is the moment arm; taken
-    over every sixth of the stroke, forth and back together, so that friction of the pulled tendon cancels.
+    A trial of ID.2 moves one joint, so that the moment arm is the slope of a tendon's excursion over the angle. One
+    slope is taken in each sixth of the stroke, from both directions together, so that the tendon's friction cancels.
     """
     finger = session.finger
     q, time = np.asarray(stack.batch.x.q), np.asarray(stack.batch.x.time)
@@ -47,17 +48,17 @@ def arm_points(session: Session, stack: Stack) -> dict[tuple[str, str], Points]:
             if not (finger.crosses[k][i] and seen.any()):
                 continue
             x, length, t = q[i, b][seen], y[k, b][seen], time[b][seen]
-            edges = np.linspace(x.min(), x.max(), PARTS + 1)
+            edges = np.linspace(x.min(), x.max(), STROKE_PARTS + 1)
             for low, high in pairwise(edges):
                 part = (x >= low) & (x <= high)
-                if part.sum() >= LEAST and np.ptp(x[part]) > 0.5 * (high - low):
+                if part.sum() >= MIN_SAMPLES and np.ptp(x[part]) > 0.5 * (high - low):
                     slope = _slope(x[part], length[part], t[part])
                     found.setdefault((tendon, joint), []).append((x[part].mean() * angle, slope * arm))
     return {key: Points(*np.array(rows).T) for key, rows in found.items()}
 
 
 def _slope(x, y, time) -> float:
-    """Slope of y over x at its mean, of a parabola beside a drift in time."""
+    """Slope of y over x at the mean of x, from a least-squares parabola in x plus a linear drift in time."""
     x = x - x.mean()
     columns = np.stack([np.ones_like(x), x, x**2, time - time.mean()], axis=1)
     norm = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
@@ -65,7 +66,7 @@ def _slope(x, y, time) -> float:
 
 
 def hold_points(model: Model, stack: Stack) -> dict[tuple[str, int], Points]:
-    """By joint and direction of approach (±1): τ_ext − G of every hold in N mm against degrees (N, mm)."""
+    """Resisting torques τ_ext − G of holds by joint and direction of approach (±1), in N mm against degrees (N, mm)."""
     finger, x = model.finger, stack.batch.x
     y, mask = np.asarray(stack.batch.y["joint_torque"]), np.asarray(stack.batch.mask["joint_torque"])
     h = y - np.asarray(rigid_body.gravity_torque(finger, x.q))
@@ -80,7 +81,10 @@ def hold_points(model: Model, stack: Stack) -> dict[tuple[str, int], Points]:
 
 
 def loss_points(model: Model, session: Session, stack: Stack) -> dict[str, Points]:
-    """By tendon: loss in N against tension in N of each hold of rising tension, from the joint's torque, eq. (1)."""
+    """Tension lost by tendon, in N against tension in N, in each hold of rising tension.
+
+    The loss is the measured torque less that of equation (1) without tendon friction, over the moment arm.
+    """
     frictionless = eqx.tree_at(lambda m: m.tendon_friction, model, TendonFriction.zeros(model.finger.n))
     x = stack.batch.x
     y, mask = np.asarray(stack.batch.y["joint_torque"]), np.asarray(stack.batch.mask["joint_torque"])
@@ -96,7 +100,7 @@ def loss_points(model: Model, session: Session, stack: Stack) -> dict[str, Point
         highest = 0.0
         for run in stack.samples_of_holds(b, mask[i, b]):
             arm = C[k, i, b, run].mean()
-            if f[run].mean() > highest + 0.1 and abs(arm) > SHORT_ARM:
+            if f[run].mean() > highest + MIN_STEP and abs(arm) > MIN_ARM:
                 lost = (y[i, b, run] - without[i, b, run]).mean() / arm
                 found.setdefault(trial.tendon, []).append((f[run].mean(), lost))
             highest = max(highest, f[run].mean())

@@ -1,6 +1,6 @@
-"""Numbers as people read them: in a unit of their size, no more digits than their interval holds.
+"""Numbers as text: in a unit that suits their size, and with no more digits than their interval supports.
 
-There is one ± in all that is printed or drawn: half of a 95 % interval, 1.96 standard deviations.
+In all that is printed or drawn ± means half of a 95 % interval, 1.96 standard deviations.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ import math
 import re
 from collections.abc import Sequence
 
-HALF_95 = 1.96  # standard deviations to either end of a 95 % interval
+HALF_95 = 1.96  # Standard deviations from the mean to either end of a normal distribution's central 95 % interval.
 DASH = "–"
 _POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
 
 def scaled(size: float, units: str) -> tuple[float, str]:
-    """Factor and name of the unit in which an SI quantity of this size is read: 1e3 and «N mm/rad²».
+    """Factor from SI, and name, of the unit in which people read a quantity of this size: 1e3 and «N mm/rad²».
 
-    Angles in degrees; masses in grams; torques of a finger in N mm; else the SI prefix that leaves one to three digits
-    before the point. The factor multiplies the SI value.
+    Angles have degrees, masses grams, torques between 1e-6 and 1 N m have N mm; others have the SI prefix that leaves
+    one to three digits before the point. The SI value times the factor is the value in that unit.
     """
     factor, unit = _scaled(abs(size), units)
     return factor, unit.replace("^", "").translate(_POWERS) if "^" in unit or "m2" in unit else unit
@@ -43,7 +43,7 @@ def _scaled(size: float, units: str) -> tuple[float, str]:
 def _prefixed(size: float, units: str, factor: float) -> tuple[float, str]:
     if not (size > 0 and math.isfinite(size)):
         return factor, units
-    rounded = float(f"{size:.2g}")  # so that 999.7 µm is 1 mm
+    rounded = float(f"{size:.2g}")  # 999.7 µm must become 1 mm.
     step, prefix = next(((s, p) for s, p in _PREFIXES if rounded >= s), _PREFIXES[-1])
     if prefix in ("k", "M", "G") and units.startswith(("m", "s")):
         step, prefix = 1.0, ""
@@ -51,14 +51,17 @@ def _prefixed(size: float, units: str, factor: float) -> tuple[float, str]:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A bare number, its whole part written out up to a million; a dash where there is none."""
+    """A number without a unit, with so many significant digits; integers below a million are written out.
+
+    None and non-finite numbers give a dash.
+    """
     if value is None or not math.isfinite(value):
         return DASH
     return f"{value:.0f}" if 10**digits - 0.5 <= abs(value) < 1e6 else f"{value:.{digits}g}"
 
 
 def with_error(value: float, std: float | None) -> str:
-    """`value ± half of the 95 % interval`, the half to two digits and the value no finer."""
+    """`value ± half of the 95 % interval`, with two digits of the half and as many decimals of the value."""
     if std is None or not math.isfinite(std):
         return f"{value:.4g} ± ?"
     if std == 0:
@@ -71,7 +74,7 @@ def with_error(value: float, std: float | None) -> str:
 
 
 def quantity(value: float, units: str, digits: int = 2) -> str:
-    """An SI quantity to a few digits in a unit of its size: 6.1e-6 m is «6.1 µm»."""
+    """An SI quantity in the unit of `scaled`: 6.1e-6 m gives «6.1 µm»."""
     if not math.isfinite(value):
         return DASH
     factor, unit = scaled(float(f"{value:.{digits}g}"), units)
@@ -79,14 +82,14 @@ def quantity(value: float, units: str, digits: int = 2) -> str:
 
 
 def alike(values: Sequence[float], units: str, digits: int = 2) -> tuple[list[str], str]:
-    """SI quantities to a few digits in the one unit that suits the largest, and that unit."""
+    """SI quantities as numbers in the unit that suits the largest, and the name of that unit."""
     largest = max((abs(v) for v in values if math.isfinite(v)), default=0.0)
     factor, unit = scaled(float(f"{largest:.{digits}g}"), units)
     return [number(v * factor, digits) for v in values], _joined("", unit).strip()
 
 
 def measured(value: float, std: float | None, units: str) -> str:
-    """An SI quantity with its 95 % interval in a unit of its size: «12.1 ± 0.8 N/mm» where it has one."""
+    """An SI quantity in the unit of `scaled`, with its 95 % interval if it has one: «12.1 ± 0.8 N/mm»."""
     size = abs(value) if not std or not math.isfinite(std) else max(abs(value), HALF_95 * std)
     factor, unit = scaled(size, units)
     if not std:
@@ -98,7 +101,7 @@ _UNIT = re.compile(r"(?<=\d) (?=%|[nµmkMG]?(?:m|N|g|s)\b)")
 
 
 def unbroken(text: str) -> str:
-    """With no-break spaces between numbers and their units."""
+    """Put no-break spaces between numbers and their units."""
     return _UNIT.sub("\u00a0", text)
 
 
@@ -107,7 +110,7 @@ def _joined(text: str, unit: str) -> str:
 
 
 def percent(share: float) -> str:
-    """A share in whole per cent; small ones to one digit, and what is nearly all or nothing as that."""
+    """A share in whole per cent; below 1 % with one digit, and from 99.5 % short of 100 % as «over 99 %»."""
     value = 100 * share
     if not math.isfinite(value):
         return DASH
@@ -119,5 +122,5 @@ def percent(share: float) -> str:
 
 
 def percent_range(low: float, high: float) -> str:
-    """A 95 % interval of a share: «35 to 47 %»."""
+    """An interval of shares: «35 to 47 %»."""
     return f"{100 * low:.0f} to {100 * high:.0f} %"

@@ -1,4 +1,4 @@
-"""A diagnosis for people: one page that carries all it needs, readable on a phone, in light and in dark."""
+"""The page of a diagnosis: one HTML file without network, readable on a phone, in light and in dark mode."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 
 from jaxfinger.data.atomic import atomic_path
 from jaxfinger.data.schema import channel_units, units_where
+from jaxfinger.gap.diagnose import MIN_VARIABLE_SHARE
 from jaxfinger.gap.result import Absorbed, Candidate, Cause, Closure, Diagnosis, Key, Left, Place, Status, Value
 from jaxfinger.report import plots, sentences
 from jaxfinger.report.causes import words
@@ -32,35 +33,36 @@ ACCENTS = {
     Status.UNEXPLAINED: "open",
     Status.NOT_JUDGED: "wrong",
 }
-NARROW, WIDE = 3.35, 7.4  # inches: a phone of 360 px with its margins, and a reading column
-WORTH_A_LINE = 0.01  # probability of a further cause below which nobody wants to read of it
-WORTH_A_PLACE = 0.02  # share of the gap, likewise
-CHANGES = 8  # parameters at most, the plainest, of which the page says that they have changed
-BEYOND = 1e5  # in SI units: a torque, length, mass or gain that no machine has whose trials are diagnosed
-LARGEST = 24  # parameters in the picture of intervals: those known worst, beside all of the causes
-VARIABLES = {"q": "rad", "qd": "rad/s", "tendon_force": "N", "time": "s"}
+NARROW, WIDE = 3.35, 7.4  # Inches, the widths of figures: a phone of 360 px less its margins, and a reading column.
+# The four limits keep the page readable; `gap.json` holds everything.
+MIN_PROBABILITY = 0.01  # of a cause that is listed though it is not named
+MIN_PLACE_SHARE = 0.02  # of the gap, for a place to be listed
+MAX_CHANGES = 8  # changed parameters
+MAX_INTERVALS = 24  # parameters in the figures of intervals: those of the causes, then those known worst
+MAX_SIZE = 1e5  # SI units: no torque, length, mass or gain of a machine that is diagnosed is larger.
+VARIABLES = {"q": "rad", "qd": "rad/s", "tendon_force": "N", "time": "s"}  # units of a region's variable
 
 
 def write_page(d: Diagnosis, path: str | Path, overwrite: bool = False) -> None:
-    """Write the page (HTML, no network).
+    """Write the page of a diagnosis.
 
     Raises:
         UserError: the file exists and `overwrite` is false, or its folder cannot be written.
     """
-    some = d.status is not Status.NOT_JUDGED
-    html = render(d, worst_trial(d) if some else None, _curves(d) if some and not d.quick else None)
+    judged = d.status is not Status.NOT_JUDGED
+    html = render(d, worst_trial(d) if judged else None, _curves(d) if judged and not d.quick else None)
     with atomic_path(path, overwrite) as part:
         part.write_text(html, encoding="utf-8")
 
 
 @look()
 def render(d: Diagnosis, trace: Trace | None = None, found: Curves | None = None) -> str:
-    """The page as text.
+    """The page as HTML text.
 
     Args:
         d: the diagnosis.
-        trace: the trial to show, measured beside predicted.
-        found: the model's curves, whose moment arms are shown.
+        trace: the trial to show, measured and predicted; None leaves it out.
+        found: curves of the model, of which the moment arms are shown; None leaves them out.
     """
     environment = Environment(loader=PackageLoader("jaxfinger.report", "."), autoescape=True)
     environment.filters["code"] = _code
@@ -68,9 +70,9 @@ def render(d: Diagnosis, trace: Trace | None = None, found: Curves | None = None
     prismatic = d.nominal.model.finger.prismatic
     named = set(d.named).union(*d.ambiguous_sets)
     simulator = sentences.is_simulator(d)
-    say = sentences.contradicted if simulator else sentences.change
+    change = sentences.contradicted if simulator else sentences.change
     judged = d.candidates if d.status is not Status.NOT_JUDGED else ()
-    rest = [c for c in judged if c.key not in named and c.probability >= WORTH_A_LINE]
+    others = [c for c in judged if c.key not in named and c.probability >= MIN_PROBABILITY]
     return template.render(
         d=d,
         css=css(),
@@ -79,14 +81,14 @@ def render(d: Diagnosis, trace: Trace | None = None, found: Curves | None = None
         summary=unbroken(sentences.summary(d)),
         experiments={k: v for k, v in sentences.EXPERIMENTS.items() if k in {*_experiments(d)}},
         budget=_budget(d) if d.channels else "",
-        hidden_bars=max(len(d.channels) - gap_plots.MOST, 0),
+        hidden_bars=max(len(d.channels) - gap_plots.MAX_BARS, 0),
         relevance=[_relevance(x) for x in d.relevance if x.tolerated or d.status is not Status.NO_GAP],
         cards=_cards(d),
         rivals=[sentences.sentence(sentences.cannot_tell(s)) for s in d.ambiguous_sets if d.status is Status.PARTLY],
-        changes=[say(x) for x in d.changes[:CHANGES]],
+        changes=[change(x) for x in d.changes[:MAX_CHANGES]],
         changed="What the measurements say of the simulator's parameters" if simulator else "What has changed",
-        others=[{"name": sentences.key_name(c.key), "probability": percent(c.probability)} for c in rest],
-        places=[_place(p, prismatic) for p in d.where if p.share >= WORTH_A_PLACE],
+        others=[{"name": sentences.key_name(c.key), "probability": percent(c.probability)} for c in others],
+        places=[_place(p, prismatic) for p in d.where if p.share >= MIN_PLACE_SHARE],
         trace=_trace(trace) if trace else "",
         trace_name=f"{trace.trial}: {trace.name}" if trace else "",
         closure=_closure(d) if gap_plots.shown(d.closures) else "",
@@ -109,45 +111,48 @@ def render(d: Diagnosis, trace: Trace | None = None, found: Curves | None = None
 
 
 def _experiments(d: Diagnosis) -> Iterator[str]:
-    """Those that the page speaks of."""
+    """Experiments that the page mentions."""
     for found in (d.channels, d.closures, d.relevance, d.where, d.left, d.not_judged):
         yield from (x.experiment for x in found)
 
 
 # Pictures -------------------------------------------------------------------------------------------------------------
 def _code(text: str) -> Markup:
-    """A sentence whose `names` are set as code, the rest as text."""
+    """A sentence as HTML, with names between backquotes set as code."""
     return Markup("".join(f"<code>{escape(x)}</code>" if k % 2 else escape(x) for k, x in enumerate(text.split("`"))))
 
 
-def _both(draw: Callable[[Axes], object], name: str, says: str, size: Callable[[float], tuple[float, float]]) -> Markup:
-    """A picture twice, for a phone and for a wider screen; one of them is shown."""
+def _both(
+    draw: Callable[[Axes], object], name: str, label: str, size: Callable[[float], tuple[float, float]]
+) -> Markup:
+    """A picture in two widths, for a phone and for a wider screen, of which the page's style shows one."""
     parts = []
     for kind, width in (("narrow", NARROW), ("wide", WIDE)):
-        parts.append(f'<div class="{kind}">{_picture(draw, f"{name}-{kind}", says, *size(width))}</div>')
+        parts.append(f'<div class="{kind}">{_picture(draw, f"{name}-{kind}", label, *size(width))}</div>')
     return Markup("".join(parts))
 
 
-def _picture(draw: Callable[[Axes], object], name: str, says: str, width: float, height: float) -> Markup:
+def _picture(draw: Callable[[Axes], object], name: str, label: str, width: float, height: float) -> Markup:
+    """A picture of one panel, `width` by `height` inches; `label` is what a screen reader reads out."""
     figure, ((ax,),) = grid(1, 1, width, height)
     draw(ax)
-    return inline(figure, name, says)
+    return inline(figure, name, label)
 
 
 def _budget(d: Diagnosis) -> Markup:
-    says = "Budget of the gap, a bar a channel: " + "; ".join(
+    label = "Budget of the gap, a bar a channel: " + "; ".join(
         f"{sentences.cause_name(c)} {percent(c.share)}" for c in d.budget
     )
     return _both(
-        lambda ax: plots.budget(d, ax), "budget", f"{says}; unexplained {percent(d.unexplained.share)}",
+        lambda ax: plots.budget(d, ax), "budget", f"{label}; unexplained {percent(d.unexplained.share)}",
         lambda width: gap_plots.budget_size(d, width),
     )  # fmt: skip
 
 
 def _closure(d: Diagnosis) -> Markup:
-    says = "rms of every channel in units of its noise, before and after"
+    label = "rms of every channel in units of its noise, before and after"
     return _both(
-        lambda ax: plots.closure(d.closures, ax), "closure", says, lambda w: gap_plots.closure_size(d.closures, w)
+        lambda ax: plots.closure(d.closures, ax), "closure", label, lambda w: gap_plots.closure_size(d.closures, w)
     )
 
 
@@ -157,23 +162,23 @@ def _trace(trace: Trace) -> Markup:
         figure, axes = grid(2, 1, width, 1.9, sharex=True)
         plots.signal(trace, axes[0][0])
         plots.residuals(trace, axes[1][0])
-        says = f"{trace.name} in {trace.trial}, measured and predicted, and what is missed"
-        parts.append(f'<div class="{kind}">{inline(figure, f"trace-{kind}", says)}</div>')
+        label = f"{trace.name} in {trace.trial}, measured and predicted, and what is missed"
+        parts.append(f'<div class="{kind}">{inline(figure, f"trace-{kind}", label)}</div>')
     return Markup("".join(parts))
 
 
 def _parameters(d: Diagnosis) -> list[Markup]:
-    """Intervals of the causes' parameters and of the nominal ones that are known worst, and who depends on whom."""
+    """Figures of intervals (the causes' parameters and the nominal ones known worst) and of correlations."""
     fit = d.augmented
     table = fit.table()
     own = {r["name"] for r in table} - {r["name"] for r in d.nominal.table()}
     vague = sorted(table, key=lambda r: -(r["std"] or math.inf) / max(abs(r["value"]), 1e-300))
-    chosen = own | {r["name"] for r in vague[: max(LARGEST - len(own), 0)]}
+    chosen = own | {r["name"] for r in vague[: max(MAX_INTERVALS - len(own), 0)]}
     names = sorted((r["name"] for r in table if r["name"] in chosen), key=lambda n: n not in own)
     before = d.nominal if fit is not d.nominal else None
     out = []
     panels = max(math.ceil(len(names) / INTERVAL_ROWS), 1)
-    each = math.ceil(len(names) / panels)  # of one height beside each other
+    each = math.ceil(len(names) / panels)  # Panels stand side by side, so they have as many rows.
     for k, start in enumerate(range(0, len(names), max(each, 1))):
         some = names[start : start + each]
         out.append(
@@ -189,7 +194,7 @@ def _parameters(d: Diagnosis) -> list[Markup]:
 
 
 def _curves(d: Diagnosis) -> Curves:
-    """Of the model with its causes, with the slopes of the measured excursions."""
+    """Curves of the augmented model, with moment arms from the measured excursions if the session has ID.2."""
     found = curves(d.augmented)
     if d.problem is None or "ID.2" not in d.problem.stacks:
         return found
@@ -197,7 +202,7 @@ def _curves(d: Diagnosis) -> Curves:
 
 
 def _arms(found: Curves) -> list[Markup]:
-    """One panel a joint."""
+    """One picture of moment arms for each joint."""
     joints = list(dict.fromkeys(j for _, j in found.moment_arm))
     return [
         _picture(lambda ax, j=j: plots.moment_arms(found, j, ax), f"arms-{k}", f"moment arms about {j}", NARROW, 2.9)
@@ -221,6 +226,7 @@ def _relevance(x) -> dict:
 
 
 def _cards(d: Diagnosis) -> list[dict]:
+    """A card for each cause of the budget and each rival; only rivals where the verdict is `ambiguous`."""
     if d.status is Status.AMBIGUOUS and d.ambiguous_sets:
         by_key = {c.key: c for c in d.candidates}
         return [_rival(d, k, by_key.get(key), key) for k, key in enumerate(d.ambiguous_sets[0])]
@@ -248,6 +254,7 @@ def _rival(d: Diagnosis, k: int, c: Candidate | None, key: Key) -> dict:
 
 
 def _texts(d: Diagnosis, k: int, effect: str) -> dict:
+    """Colour number `k` and the effect's texts about itself."""
     return {"colour": PALETTE[k % len(PALETTE)].name} | asdict(words(effect, d))
 
 
@@ -273,12 +280,12 @@ def _line(x: Closure) -> dict:
 
 def _left(x: Left) -> str:
     most = sorted(x.by_variable.items(), key=lambda kv: -kv[1])[:2]
-    named = [sentences.VARIABLES.get(k, k) for k, v in most if v > 0.2 * x.energy]
+    named = [sentences.VARIABLES.get(k, k) for k, v in most if v > MIN_VARIABLE_SHARE * x.energy]
     return f"{_name(x.experiment, x.channel, x.column)}" + (f": goes with {sentences.joined(named)}" if named else "")
 
 
 def _absorbed(found: Sequence[Absorbed]) -> list[str]:
-    """A line an effect: its sites, and how much could hide there at most, as the half-width of its 95 % interval."""
+    """One line for each effect: its sites, and how much could stay hidden there, half of a 95 % interval."""
     by_effect: dict[str, list[Absorbed]] = {}
     for x in found:
         by_effect.setdefault(x.key.effect, []).append(x)
@@ -287,18 +294,19 @@ def _absorbed(found: Sequence[Absorbed]) -> list[str]:
         hidden: dict[tuple[str, str], float] = {}
         for v in (v for x in some for v in x.hidden if math.isfinite(v.std)):
             hidden[v.name, v.units] = max(hidden.get((v.name, v.units), 0.0), HALF_95 * v.std)
-        much = "".join(f", {_at_most(half, units)} of {name}" for (name, units), half in hidden.items())
-        lines.append(f"{sentences.effect_name(effect)} at {sentences.site_names([x.key.site for x in some])}{much}")
+        amounts = "".join(f", {_up_to(half, units)} of {name}" for (name, units), half in hidden.items())
+        lines.append(f"{sentences.effect_name(effect)} at {sentences.site_names([x.key.site for x in some])}{amounts}")
     return lines
 
 
-def _at_most(half: float, units: str) -> str:
-    """How much could hide; more than half a turn, or than any machine has, is as much as one likes."""
-    without_end = half > math.pi if units == "rad" else half > BEYOND
-    return "any amount" if without_end else f"up to {quantity(half, units)}"
+def _up_to(half: float, units: str) -> str:
+    """Upper limit of a hidden amount; none where it exceeds half a turn or MAX_SIZE."""
+    unlimited = half > math.pi if units == "rad" else half > MAX_SIZE
+    return "any amount" if unlimited else f"up to {quantity(half, units)}"
 
 
 def _noise(d: Diagnosis, prismatic: tuple[bool, ...]) -> list[dict]:
+    """Standard deviations of each channel's noise, and where they were estimated from."""
     out = []
     for (experiment, channel), n in d.nominal.noise.items():
         units = channel_units(channel, prismatic)

@@ -1,4 +1,4 @@
-"""A diagnosis on one screen of a terminal, 100 columns."""
+"""Summary of a diagnosis for a terminal: one screen, 100 columns wide."""
 
 from __future__ import annotations
 
@@ -10,18 +10,22 @@ from jaxfinger.report import sentences
 from jaxfinger.report.numbers import measured, percent, percent_range, quantity, unbroken
 from jaxfinger.report.plots.gap import rows_of, segments, shown
 
-WIDTH, BAR, MOST = 100, 30, 6
-SIGNS = "█▓▒░▚▞"  # a cause each
-NOISE, TOGETHER, OPEN = "·", "+", "?"
+WIDTH, BAR = 100, 30  # Characters in a line and in a bar; beside the bar a channel's name must fit.
+MAX_BARS = 6  # so that the summary fits on one screen
+SIGNS = "█▓▒░▚▞"  # fills of the causes in a bar
+NOISE, TOGETHER, OPEN = "·", "+", "?"  # fills of noise, of what several causes close together, and of the unexplained
 
 
 def summary(d: Diagnosis, own: Iterable[str] = ()) -> str:
-    """Verdict, budget, causes, how far it closes, what next; and what came of the user's `own` effects, by id."""
+    """Verdict, budget, causes, closures and next experiment as text; `own` are ids of the user's effects.
+
+    The user's effects that are not named have a line each with their probability, or the reason why they have none.
+    """
     out = [f"{d.specimen} · {d.data}{f' · beside {d.against}' if d.against else ''}", "", sentences.headline(d)]
     out += [*_wrapped(sentences.summary(d)), ""]
     if d.channels:
         out += ["BUDGET     what the model misses in each channel, as mean square"]
-        out += [_bar(x) for x in rows_of(d, MOST)]
+        out += [_bar(x) for x in rows_of(d, MAX_BARS)]
         out += [f"  {_legend(d)}", ""]
     if d.budget:
         out += ["CAUSES     share of the gap (95 % interval), probability, parameters (± half of a 95 % interval)"]
@@ -37,16 +41,18 @@ def summary(d: Diagnosis, own: Iterable[str] = ()) -> str:
     return "\n".join(out).rstrip()
 
 
-def across(diagnoses: Mapping[str, Diagnosis]) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of a table of several sessions: how probable every cause is in each that one of them names, and
-    where it is named its first parameter.
+def comparison(diagnoses: Mapping[str, Diagnosis]) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of a table of causes (rows) in several sessions (columns).
+
+    It holds every cause that some session names: its probability in each session, and its first parameter where named.
     """
     named = {key for d in diagnoses.values() for key in d.named}
-    rows = [[sentences.key_name(key), *(_said_of(key, d) for d in diagnoses.values())] for key in sorted(named)]
+    rows = [[sentences.key_name(key), *(_in_session(key, d) for d in diagnoses.values())] for key in sorted(named)]
     return ["cause", *diagnoses], rows
 
 
-def _said_of(key: Key, d: Diagnosis) -> str:
+def _in_session(key: Key, d: Diagnosis) -> str:
+    """Probability of a cause in one session, and its first parameter where it is named there."""
     found = next((c for c in d.candidates if c.key == key), None)
     if found is None:
         return "not visible"
@@ -55,12 +61,13 @@ def _said_of(key: Key, d: Diagnosis) -> str:
 
 
 def _wrapped(text: str, indent: str = "") -> list[str]:
-    """In lines, no number apart from its unit."""
+    """Wrap a text to lines of WIDTH characters, with no break between a number and its unit."""
     lines = textwrap.wrap(unbroken(text), WIDTH, initial_indent=indent, subsequent_indent=indent)
     return [line.replace("\u00a0", " ") for line in lines]
 
 
 def _bar(x: ChannelBudget) -> str:
+    """The budget of one column as a bar of characters, with its name and gap."""
     noise, causes, together, left = segments(x)
     parts = [
         (noise, NOISE),
@@ -78,7 +85,7 @@ def _bar(x: ChannelBudget) -> str:
 
 def _legend(d: Diagnosis) -> str:
     parts = [f"{NOISE} noise", *(f"{SIGNS[k % len(SIGNS)]} {sentences.cause_name(c)}" for k, c in enumerate(d.budget))]
-    seen = [segments(x) for x in rows_of(d, MOST)]
+    seen = [segments(x) for x in rows_of(d, MAX_BARS)]
     parts += [f"{TOGETHER} several together"] if any(s[2] > 0.5 / BAR for s in seen) else []
     parts += [f"{OPEN} unexplained"] if any(s[3] > 0.5 / BAR for s in seen) else []
     return "  ".join(parts)
@@ -92,7 +99,7 @@ def _cause(k: int, c: Cause) -> list[str]:
 
 
 def _not_named(effect: str, d: Diagnosis) -> str:
-    """How probable an effect is where it is likeliest, or why nothing is known of it."""
+    """Probability of an effect at its most probable site, or why it has none."""
     name = sentences.effect_name(effect)
     if tried := [c for c in d.candidates if c.key.effect == effect]:
         likeliest = max(tried, key=lambda c: c.probability)
@@ -104,5 +111,5 @@ def _not_named(effect: str, d: Diagnosis) -> str:
 
 def _line(x: Closure) -> str:
     name = f"{x.experiment} {sentences.channel_name(x.channel)}"
-    said = sentences.closing(x)
-    return f"  {name:<26} {said.noise:>7}  {said.before:>6} → {said.after:<8} {said.unit:<5}  {said.closed}"
+    text = sentences.closing(x)
+    return f"  {name:<26} {text.noise:>7}  {text.before:>6} → {text.after:<8} {text.unit:<5}  {text.closed}"

@@ -1,7 +1,7 @@
-"""A diagnosis in words. Every sentence about a verdict, a cause, a size or a trial is made here, from data and enums.
+"""Sentences of a diagnosis: all sentences about a verdict, a cause, a size or a trial, made from data and enums.
 
-Whoever reads aloud what `summary` returns should have told a colleague what is the matter: how large the gap is in the
-world, what causes it and how sure that is, what is left and what to do about it.
+`summary`, read aloud, tells a colleague how large the gap is in physical units, what causes it and how sure that is,
+what is left, and what to do about it.
 """
 
 from __future__ import annotations
@@ -26,12 +26,14 @@ from jaxfinger.gap.result import (
 )
 from jaxfinger.report.numbers import alike, measured, number, percent, percent_range, quantity
 
-NAMED_AT_MOST = 4  # causes in one sentence
-MEASURABLE = 0.005  # share of a gap: `percent` says less as 0 %
-# Share of a gap beyond which what is named may imitate a law that nobody listed: imitators left 28 to 48 %, true causes
-# of a gap with one cause 20 % at most (`fresh` in docs/results.md).
-MUCH = 0.25
-LIKELY, SURE = 0.9, 0.99  # probabilities from which on a person says «very probably» and «almost certainly»
+MAX_NAMES = 4  # Causes or channels in one sentence; more make it hard to read, and the page lists all.
+MIN_SHARE = 0.005  # Share of a gap: `percent` rounds a smaller one to 0 %.
+# Share of a gap: with more left, what is named may imitate a law that nobody listed. Imitators left 28 to 48 %, true
+# single causes 20 % at most (`fresh` in docs/results.md).
+MAX_LEFT = 0.25
+# Probabilities from which a cause is said to be «very probably» and «almost certainly» at work: those of «very likely»
+# and «virtually certain» in reports of the IPCC (Mastrandrea et al., Guidance Note on uncertainties, 2010).
+VERY_PROBABLE, ALMOST_CERTAIN = 0.9, 0.99
 
 HEADLINES = {
     Status.NO_GAP: "No gap beyond the noise",
@@ -70,54 +72,56 @@ VARIABLES = {
 REASONS = {
     Reason.NOTHING_COUNTS: "no sample of it counts: record it with holds or at a speed at which friction is known",
     Reason.FEW_SAMPLES: "too few of its samples count to tell a law from noise: record it longer or more often",
-    Reason.NOT_PREDICTED: "the other simulator says nothing of it: let its file hold this channel too",
+    Reason.NOT_PREDICTED: "the other simulator does not predict it: add this channel to the file of its predictions",
 }
 
 
 # Names ----------------------------------------------------------------------------------------------------------------
 def effect_name(effect: str) -> str:
-    """An effect's id as words: `tendon_stretch` is «tendon stretch», `changed_damping` «a change of damping»."""
+    """Name of an effect: `tendon_stretch` gives «tendon stretch», `changed_damping` «a change of damping»."""
     return effect.replace("changed_", "a change of ").replace("_", " ").replace("stribeck", "Stribeck")
 
 
 def channel_name(channel: str) -> str:
-    """A channel as people say it."""
+    """Name of a channel: `joint_torque` gives «joint torque»."""
     return CHANNELS.get(channel, channel.replace("_", " "))
 
 
 def site_names(sites: Iterable[Site]) -> str:
-    """Where: «T3», «T3 and T4», «MCP-PIP»."""
+    """Names of sites: «T3», «T3 and T4», «MCP-PIP»."""
     return joined(["-".join(s) for s in sites])
 
 
 def key_name(key: Key) -> str:
-    """A cause and its site."""
+    """Name of a cause and its site: «tendon stretch at T3»."""
     return f"{effect_name(key.effect)} at {site_names([key.site])}"
 
 
 def cause_name(cause: Cause) -> str:
-    """A cause and all its sites."""
+    """Name of a cause and all its sites: «tendon stretch at T3 and T4»."""
     return f"{effect_name(cause.effect)} at {site_names(cause.sites)}"
 
 
 def joined(parts: Sequence[str], word: str = "and") -> str:
-    """«a», «a and b», «a, b and c»."""
+    """Join parts as a list in a sentence: «a», «a and b», «a, b and c»."""
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} {word} {parts[-1]}" if parts else ""
 
 
 def sentence(text: str) -> str:
-    """With a capital and a full stop."""
+    """Make a text a sentence, with a capital and a full stop."""
     return text[0].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
 
 
 def certainty(probability: float) -> str:
-    """How a person says a probability of 50 % or more."""
-    return "almost certainly" if probability >= SURE else "very probably" if probability >= LIKELY else "probably"
+    """Adverb for a probability of 50 % or more."""
+    if probability >= VERY_PROBABLE:
+        return "almost certainly" if probability >= ALMOST_CERTAIN else "very probably"
+    return "probably"
 
 
 # The verdict ----------------------------------------------------------------------------------------------------------
 def headline(d: Diagnosis) -> str:
-    """The verdict in one line, the whole of it."""
+    """The whole verdict in one line."""
     text = HEADLINES[d.status]
     if not d.named and d.status in (Status.NO_GAP, Status.EXPLAINED) and tolerated(d):
         return "No gap beyond your tolerance"
@@ -131,7 +135,7 @@ def headline(d: Diagnosis) -> str:
 
 
 def summary(d: Diagnosis) -> str:
-    """Two or three sentences: how large, why, what is left; and one more for what was not judged."""
+    """Two or three sentences on how large the gap is, why, and what is left; then the caveats."""
     parts = {
         Status.NO_GAP: _no_gap,
         Status.EXPLAINED: _explained,
@@ -144,17 +148,17 @@ def summary(d: Diagnosis) -> str:
 
 
 def tolerated(d: Diagnosis) -> bool:
-    """Whether there are gaps, all of which the user tolerates."""
+    """Whether there are gaps and the user tolerates all of them."""
     return bool(d.relevance) and all(x.tolerated for x in d.relevance)
 
 
 def named_causes(d: Diagnosis) -> list[Cause]:
-    """The lines of the budget that the verdict names, in order of their share."""
+    """Lines of the budget that the verdict names, largest share first."""
     return [c for c in d.budget if set(c.keys) & set(d.named)]
 
 
 def size(d: Diagnosis) -> str:
-    """How large the gap is in the world: of each channel the line that matters most."""
+    """How large the gap is in physical units: of at most two channels the experiment that matters most."""
     largest: dict[str, Relevance] = {}
     for x in sorted(d.relevance, key=lambda x: (x.tolerated, -x.relative)):
         largest.setdefault(x.channel, x)
@@ -165,7 +169,7 @@ def size(d: Diagnosis) -> str:
 
 
 def how_large(x: Relevance, tolerance: dict[str, float]) -> str:
-    """«the tendon excursion by 6 µm in 20 mm (0.03 %, VD.1)»."""
+    """Size of one channel's gap: «the tendon excursion by 6 µm in 20 mm (0.03 %, VD.1)»."""
     text = f"the {channel_name(x.channel)} by {quantity(x.gap, x.units)}"
     inside = f", within your tolerance of {percent(tolerance[x.channel])}" if x.tolerated else ""
     if not x.signal > 0:
@@ -179,7 +183,7 @@ def _subject(d: Diagnosis) -> str:
 
 
 def is_simulator(d: Diagnosis) -> bool:
-    """Whether another simulator is diagnosed, and not the model that is identified."""
+    """Whether another simulator is diagnosed instead of the identified model."""
     return d.problem is not None and d.problem.simulator is not None
 
 
@@ -187,8 +191,8 @@ def _no_gap(d: Diagnosis) -> list[str]:
     chance = f"the probability that nothing is at work beyond it is {percent(d.none)}"
     if tolerated(d):
         return [size(d), chance if d.none >= 0.5 else "nothing is missed by more than you tolerate"]
-    channels = len({(x.experiment, x.channel) for x in d.closures})
-    return [f"{_subject(d)} predicts {_counted(channels)} to within the noise", chance]
+    judged = {(x.experiment, x.channel) for x in d.closures} - {(x.experiment, x.channel) for x in d.not_judged}
+    return [f"{_subject(d)} predicts {_counted(len(judged))} to within the noise", chance]
 
 
 def _counted(channels: int) -> str:
@@ -211,13 +215,13 @@ def _partly(d: Diagnosis) -> list[str]:
     if stay := still_open(d.closures, d.relevance, d.tolerance):
         names = [f"{_of(x.experiment, x.channel)} ({number(x.after / x.noise, 2)} times its noise)" for x in stay]
         left.append(f"what stays open on trials that no fit has seen is {_listed(names, 'channel')}")
-    if d.unexplained.share > MUCH and named_causes(d):
+    if d.unexplained.share > MAX_LEFT and named_causes(d):
         left.append("so much is left that what is named may only imitate a law that nobody listed")
     return [size(d), "; ".join([_blamed(d), *unknown]), "; ".join(left)]
 
 
 def cannot_tell(members: Sequence[Key]) -> str:
-    """Of rivals that these trials leave."""
+    """Say that these trials cannot tell the members of an ambiguous set apart."""
     names = [key_name(k) for k in members]
     if len(names) == 2:
         return f"these trials cannot tell {names[0]} from {names[1]}"
@@ -236,8 +240,8 @@ def _ambiguous(d: Diagnosis) -> list[str]:
 
 
 def _unexplained(d: Diagnosis) -> list[str]:
-    lies = _lies(d)
-    return [size(d), "none of the known causes explains it" + (f": it{lies}" if lies else "")]
+    pattern = _pattern(d)
+    return [size(d), "none of the known causes explains it" + (f": it{pattern}" if pattern else "")]
 
 
 def _nothing_judged(d: Diagnosis) -> list[str]:
@@ -250,7 +254,7 @@ def _nothing_judged(d: Diagnosis) -> list[str]:
 
 
 def _blamed(d: Diagnosis) -> str:
-    """«tendon stretch at T3 makes 96 % of it (94 to 98 %), almost certainly»; of several, each with its share."""
+    """Causes and shares: «tendon stretch at T3 almost certainly causes 96 % of it (95 % interval 94 to 98 %)»."""
     causes = named_causes(d)
     if not causes:
         return f"the cause is {_listed([key_name(k) for k in d.named], 'cause')}"
@@ -261,7 +265,7 @@ def _blamed(d: Diagnosis) -> str:
     if len(causes) == 1:
         c = causes[0]
         share = f"{percent(c.share)} of it (95 % interval {percent_range(*c.share_ci95)})"
-        if c.share < MEASURABLE:
+        if c.share < MIN_SHARE:
             return f"{cause_name(c)} is {sure} at work, but closes {share} on trials that no fit has seen"
         return f"{cause_name(c)} {sure} causes {share}"
     first, *rest = causes
@@ -274,13 +278,12 @@ def _blamed(d: Diagnosis) -> str:
 
 def _left(d: Diagnosis) -> str:
     u = d.unexplained
-    return (
-        f"what is left, {percent(u.share)} of the gap ({percent_range(*u.share_ci95)}),{_lies(d) or ' has no pattern'}"
-    )
+    pattern = _pattern(d) or " has no pattern"
+    return f"what is left, {percent(u.share)} of the gap ({percent_range(*u.share_ci95)}),{pattern}"
 
 
-def _lies(d: Diagnosis) -> str:
-    """Where what no cause explains is, and what it depends on."""
+def _pattern(d: Diagnosis) -> str:
+    """Column in which most of the unexplained gap lies, and the variables that it depends on; empty where unknown."""
     u = d.unexplained
     parts = [f"lies mostly in {_of(u.where.experiment, u.where.name, u.where.column)}"] if u.where else []
     parts += [f"goes with {joined([VARIABLES.get(v, v) for v in u.depends_on])}"] if u.depends_on else []
@@ -288,14 +291,14 @@ def _lies(d: Diagnosis) -> str:
 
 
 def unlisted(d: Diagnosis) -> str:
-    """How probable it is that a cause is at work which nobody has listed."""
+    """Sentence on the probability that a cause is at work which the catalogue lacks."""
     return f"Something that the catalogue lacks is at work with a probability of {percent(d.unlisted)}."
 
 
 def proposal(d: Diagnosis) -> str | None:
-    """A closed form of what is left, and that nobody has proven it."""
+    """Sentence on the closed form proposed for what is left; None where there is none."""
     p = d.unexplained.proposal
-    return None if p is None else (f"A formula that fits {percent(p.share)} of what is left, unproven: {p.formula}.")
+    return None if p is None else f"A formula that fits {percent(p.share)} of what is left, unproven: {p.formula}."
 
 
 def _of(experiment: str, channel: str, column: str | None = None) -> str:
@@ -303,10 +306,10 @@ def _of(experiment: str, channel: str, column: str | None = None) -> str:
 
 
 def _listed(parts: Sequence[str], what: str) -> str:
-    """All of them, or the first few and how many more."""
-    if len(parts) <= NAMED_AT_MOST:
+    """Join all parts, or the first few and the number of the others."""
+    if len(parts) <= MAX_NAMES:
         return joined(parts)
-    return ", ".join(parts[:NAMED_AT_MOST]) + _and_more(len(parts) - NAMED_AT_MOST, what)
+    return ", ".join(parts[:MAX_NAMES]) + _and_more(len(parts) - MAX_NAMES, what)
 
 
 def _and_more(count: int, what: str) -> str:
@@ -318,9 +321,7 @@ def _probability(d: Diagnosis, key: Key) -> float | None:
 
 
 def _caveats(d: Diagnosis) -> list[str]:
-    """What a reader must know beside the verdict: a simulator's own values, simulations that ran away, channels that
-    were not judged.
-    """
+    """Sentences beside the verdict: diverged simulations, retuned or changed parameters, channels not judged."""
     out = [diverged(x) for x in d.closures if x.diverged]
     if is_simulator(d):
         out.append(retuned(d.changes))
@@ -333,9 +334,9 @@ def _caveats(d: Diagnosis) -> list[str]:
     return out
 
 
-# Single things --------------------------------------------------------------------------------------------------------
+# Single items ---------------------------------------------------------------------------------------------------------
 def diverged(x: Closure) -> str:
-    """Of a forward simulation that ran away."""
+    """Say that a forward simulation ran away, and what to judge by instead."""
     return (
         f"simulated forward, {x.experiment} diverges, so that its angles close nothing and say nothing; judge by "
         f"its torques and by the motion a fraction of a second ahead"
@@ -343,7 +344,7 @@ def diverged(x: Closure) -> str:
 
 
 def retuned(changes: Sequence[Change]) -> str:
-    """Of another simulator: which of its parameters the measurements contradict."""
+    """Say which parameters of another simulator the measurements contradict."""
     if not changes:
         return "the simulator's parameters agree with the measurements"
     most = [
@@ -353,12 +354,12 @@ def retuned(changes: Sequence[Change]) -> str:
 
 
 def reason(x: NotJudged) -> str:
-    """Why a channel was not judged, and the mend."""
+    """Say why a channel was not judged, and what to do about it."""
     return sentence(f"{_of(x.experiment, x.channel)}: {REASONS[x.reason]}")
 
 
 def change(x: Change) -> str:
-    """A nominal parameter that is another than it was."""
+    """Sentence on a nominal parameter that has changed since an earlier fit."""
     return sentence(
         f"{x.name} was {measured(x.before, x.before_std, x.units)} and is {measured(x.after, x.after_std, x.units)}: "
         f"{certainty(x.probability) if x.probability >= 0.5 else 'perhaps'} changed ({percent(x.probability)})"
@@ -366,13 +367,13 @@ def change(x: Change) -> str:
 
 
 def contradicted(x: Change) -> str:
-    """A parameter of another simulator that the measurements contradict."""
+    """Sentence on a parameter of another simulator that the measurements contradict."""
     old, new = measured(x.before, None, x.units), measured(x.after, x.after_std, x.units)
     return sentence(f"{x.name} is {old} in the simulator, and {new} by the measurements")
 
 
 def next_trial(step: NextExperiment) -> str:
-    """What to record: which joint or tendon, where, how far, how fast, how often."""
+    """Instructions for a suggested trial: joint or tendon, posture, tension, speed and number of repeats."""
     parts = ["the session lacks this experiment"] if step.lacking else []
     parts += [f"joint {step.joint}"] if step.joint else []
     parts += [f"tendon {step.tendon}"] if step.tendon else []
@@ -392,7 +393,7 @@ def _posture(p: Posture) -> str:
 
 
 class Closing(NamedTuple):
-    """How far a channel closes, in words and numbers of one unit."""
+    """Texts of one line of closures; the numbers are in `unit`."""
 
     noise: str
     before: str
@@ -402,7 +403,7 @@ class Closing(NamedTuple):
 
 
 def closing(x: Closure) -> Closing:
-    """Of a line of the diagnosis."""
+    """Texts of one line of a diagnosis's closures."""
     (noise, before, after), unit = alike((x.noise, x.before, x.after), x.units)
     closed = f"{percent(x.closed)} ({percent_range(*x.closed_ci95)})" if x.resolvable else "no gap to close"
     if x.diverged:

@@ -1,8 +1,8 @@
-"""One look for every figure and page: colours that all eyes tell apart, in light and in dark, and figures as SVG.
+"""Style of all figures and pages: colours for light and dark mode, legends, and figures as SVG.
 
 Colours follow Okabe & Ito (Color Universal Design, 2008), with lightness spread so that they differ under protanopia,
-deuteranopia and tritanopia too; `tests/report/test_theme.py` measures that, and contrast. Figures are drawn in the
-light colours; inside a page each becomes a CSS variable, so that a reader's dark mode reaches the figures too.
+deuteranopia and tritanopia too; `tests/report/test_theme.py` measures these differences and the contrast. Figures are
+drawn in the light colours. Inside a page each colour becomes a CSS variable, so that dark mode changes figures too.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import ScaledTranslation
 
 from jaxfinger.data.atomic import atomic_path
+from jaxfinger.report.numbers import HALF_95
 
 
 @dataclass(frozen=True)
 class Colour:
-    """A colour of the light mode and its counterpart of the dark one."""
+    """A colour in light mode and its counterpart in dark mode, as hexadecimal RGB."""
 
     name: str
     light: str
@@ -51,19 +52,19 @@ MUTED_ = Colour("muted", "#57606a", "#a9b1ba")
 RULE = Colour("rule", "#d3d8de", "#3a414a")
 NOISE_ = Colour("noise", "#b4bac2", "#5b636d")
 OPEN_ = Colour("open", "#4a4f58", "#c3c9d1")
-WRONG_ = Colour("wrong", "#b3261e", "#ff8a80")  # kept for what is wrong
+WRONG_ = Colour("wrong", "#b3261e", "#ff8a80")  # red, used only for what is wrong
 LINK = Colour("link", "#0a58a6", "#7fbdf5")
 THEME = (*PALETTE, BACKGROUND, PANEL, INK_, MUTED_, RULE, NOISE_, OPEN_, WRONG_, LINK)
 
 COLOURS = tuple(c.light for c in PALETTE)
 INK, MUTED, NOISE, OPEN, WRONG = (c.light for c in (INK_, MUTED_, NOISE_, OPEN_, WRONG_))
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
-LINES: tuple[Literal["-", "--", "-.", ":"], ...] = ("-", "--", "-.", ":")  # a second sign beside colour
+LINES: tuple[Literal["-", "--", "-.", ":"], ...] = ("-", "--", "-.", ":")  # tell curves apart beside colour
 
-CLEAR: dict[str, Any] = {"facecolor": BACKGROUND.light, "edgecolor": "none", "pad": 0.6}  # behind text on a line
-FONT = 9.0  # pt, which is 12 px on a page
-PHONE = 4.0  # in: a narrower figure is made for a phone
-TICKS, LABEL = 18.0, 14.0  # pt below the axes that their ticks and their label take
+CLEAR: dict[str, Any] = {"facecolor": BACKGROUND.light, "edgecolor": "none", "pad": 0.6}  # box behind text on a line
+FONT = 9.0  # pt, 12 px on a page
+PHONE_WIDTH = 4.0  # Inches: a narrower figure is for a phone.
+TICKS, LABEL = 18.0, 14.0  # pt that tick labels and the axis label take below the axes
 LOOK: dict[Any, Any] = {
     "font.size": FONT,
     "axes.titlesize": FONT,
@@ -98,18 +99,18 @@ LOOK: dict[Any, Any] = {
 
 
 def colour(k: int) -> str:
-    """The k-th colour; they repeat, and the line style of `line` tells the rounds apart."""
+    """Colour number k of the palette, which repeats; `line` then gives another line style."""
     return COLOURS[k % len(COLOURS)]
 
 
 def line(k: int) -> Literal["-", "--", "-.", ":"]:
-    """The line style that goes with the k-th colour."""
+    """Line style of curve number k: one for each round through the palette."""
     return LINES[k // len(COLOURS) % len(LINES)]
 
 
 @contextmanager
 def look() -> Iterator[None]:
-    """The style of all that is drawn and saved inside a `with` (or by a function so decorated)."""
+    """Context manager and decorator that applies the style to all that is drawn and saved inside."""
     with rc_context(LOOK):
         yield
 
@@ -123,29 +124,28 @@ def grid(rows: int, columns: int, width: float, height: float, **share) -> tuple
 
 
 def axes_or_new(ax: Axes | None, width: float = 4.6, height: float = 3.2) -> Axes:
-    """The axes to draw on: those given, or the only ones of a new figure, which needs no display."""
+    """The given axes, or those of a new figure of `width` by `height` inches, which needs no display."""
     if ax is not None:
         return ax
     with look():
         return grid(1, 1, width, height)[1][0][0]
 
 
-def across(ax: Axes) -> int:
-    """Entries of a legend in a row: two where the figure is made for a phone."""
+def legend_columns(ax: Axes) -> int:
+    """Number of a legend's columns: two in a figure for a phone, else three."""
     figure = ax.get_figure(root=True)
-    return 2 if figure is not None and figure.get_size_inches()[0] < PHONE else 3
+    return 2 if figure is not None and figure.get_size_inches()[0] < PHONE_WIDTH else 3
 
 
 def band(ax: Axes, x, y, std, colour: str, label: str | None = None, **line) -> None:
-    """A curve with its 95 % interval; without where that is unknown."""
-    std = np.where(np.isfinite(std), std, np.nan)
+    """Draw a curve with its 95 % interval as a band; no band where `std` is not finite."""
     ax.plot(x, y, color=colour, label=label, **line)
-    std = np.where(np.isfinite(std), std, np.nan)  # no band where nothing is known
-    ax.fill_between(x, y - 1.96 * std, y + 1.96 * std, color=colour, alpha=0.22, linewidth=0)
+    half = HALF_95 * np.where(np.isfinite(std), std, np.nan)
+    ax.fill_between(x, y - half, y + half, color=colour, alpha=0.22, linewidth=0)
 
 
 def legend_below(ax: Axes, columns: int = 3, labelled: bool = True, handles: Sequence[Artist] | None = None) -> None:
-    """A legend under the axes, where it covers no curve; `labelled`: whether the x axis has a label above it."""
+    """Draw a legend below the axes, where it covers no curve; `labelled` says whether the x axis has a label there."""
     handles = ax.get_legend_handles_labels()[0] if handles is None else handles
     if handles:
         down = ScaledTranslation(0.0, -(TICKS + LABEL * labelled) / 72, ax.figure.dpi_scale_trans)
@@ -154,21 +154,25 @@ def legend_below(ax: Axes, columns: int = 3, labelled: bool = True, handles: Seq
 
 
 def legend_beside(ax: Axes, handles: Sequence[Artist] | None = None) -> None:
-    """A legend right of the axes."""
+    """Draw a legend to the right of the axes."""
     handles = ax.get_legend_handles_labels()[0] if handles is None else handles
     if handles:
         ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderpad=0, handlelength=1.4)
 
 
 def save(figure: Figure, path: Path, overwrite: bool) -> Path:
-    """By the suffix: .svg or .png."""
+    """Save a figure as SVG or PNG, by the suffix of `path`, and return the path.
+
+    Raises:
+        UserError: the file exists and `overwrite` is false.
+    """
     with atomic_path(path, overwrite) as part:
         figure.savefig(part, format=path.suffix[1:], dpi=150, metadata={"Date": None} if path.suffix == ".svg" else {})
     return path
 
 
 def css() -> Markup:
-    """The colours as CSS variables, for light and for dark."""
+    """The colours as CSS variables, with a media query for dark mode."""
     light = " ".join(f"--{c.name}: {c.light};" for c in THEME)
     dark = " ".join(f"--{c.name}: {c.dark};" for c in THEME)
     return Markup(
@@ -180,10 +184,10 @@ _HEX = re.compile(r"#[0-9a-f]{6}\b")
 _VARIABLE = {c.light: f"var(--{c.name})" for c in reversed(THEME)}
 
 
-def inline(figure: Figure, name: str, says: str) -> Markup:
-    """A figure as SVG inside a page: its text stays text, its colours are the page's, and `says` is read aloud.
+def inline(figure: Figure, name: str, label: str) -> Markup:
+    """A figure as SVG for a page: text stays text, and the colours are the page's CSS variables.
 
-    `name` sets the figure's ids apart from those of others in the page.
+    `name` is a prefix of the figure's ids, unique in the page; `label` is what a screen reader reads out.
     """
     out = io.StringIO()
     with look(), rc_context({"svg.hashsalt": name}):
@@ -193,4 +197,4 @@ def inline(figure: Figure, name: str, says: str) -> Markup:
     text = re.sub(r'\bid="', f'id="{name}-', text)
     text = re.sub(r'(href="#|url\(#)', rf"\1{name}-", text)
     text = re.sub(r"font: ([\d.]+px) [^;\"]*", r"font: \1 system-ui, sans-serif", text)
-    return Markup(text.replace("<svg", f'<svg role="img" aria-label="{escape(says)}"', 1))
+    return Markup(text.replace("<svg", f'<svg role="img" aria-label="{escape(label)}"', 1))

@@ -1,4 +1,4 @@
-"""The trial in which the model misses most, measured and predicted before and after."""
+"""The trial that the nominal model misses most: measured, and predicted before and after the causes."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.data.schema import channel_units
-from jaxfinger.gap.problem import Problem
+from jaxfinger.data.schema import CHANNELS, channel_units
+from jaxfinger.gap.problem import Problem, site
 from jaxfinger.gap.result import Diagnosis
 from jaxfinger.identify.linearise import residuals_of
 from jaxfinger.model import Model
@@ -18,30 +18,30 @@ from jaxfinger.report.sentences import channel_name
 
 @dataclass(frozen=True)
 class Trace:
-    """One column of one channel of one trial, in units for people; NaN where no sample counts."""
+    """One column of one channel in one trial, in units for people; NaN where no sample counts."""
 
     experiment: str
     trial: str
     name: str  # of the channel and its column
     units: str
-    time: Float[np.ndarray, " T"]
+    time: Float[np.ndarray, " T"]  # s
     measured: Float[np.ndarray, " T"]
-    before: Float[np.ndarray, " T"]
-    after: Float[np.ndarray, " T"]
-    half: float  # of the noise's 95 % interval
-    changed: bool  # whether there is an «after»
+    before: Float[np.ndarray, " T"]  # predicted by the nominal model, or by the other simulator
+    after: Float[np.ndarray, " T"]  # predicted by the augmented model
+    half: float  # half of the noise's 95 % interval
+    changed: bool  # whether `after` differs from `before`
 
 
 def worst_trial(d: Diagnosis) -> Trace:
-    """The column and trial with the most energy above noise, of a diagnosis that still has its recordings."""
+    """Trace of the column and trial with the most energy above noise; the diagnosis must hold its `problem`."""
     problem = d.problem
     assert problem is not None
     e, channel, column, b = _worst(problem)
     stack = problem.stacks[e]
     mask = np.asarray(stack.batch.mask[channel])[column, b] > 0
-    seen = np.arange(mask.size) <= np.flatnonzero(mask).max()  # the rest is padding
+    seen = np.arange(mask.size) <= np.flatnonzero(mask).max()  # Later samples are padding.
     y = np.where(mask, np.asarray(stack.batch.y[channel])[column, b], np.nan)
-    free_zero = channel == "tendon_excursion"
+    free_zero = CHANNELS[channel].free_zero
     residuals = [_residual(problem, e, channel, problem.simulator), _residual(problem, e, channel, None)]
     changed = d.augmented is not d.nominal
     if changed:
@@ -57,7 +57,7 @@ def worst_trial(d: Diagnosis) -> Trace:
     return Trace(
         e,
         stack.trials[b],
-        f"{channel_name(channel)} {_column(problem, channel, column)}",
+        f"{channel_name(channel)} {site(problem, channel, column)}",
         unit,
         np.asarray(stack.batch.x.time)[b][seen],
         factor * y[seen],
@@ -69,7 +69,7 @@ def worst_trial(d: Diagnosis) -> Trace:
 
 
 def _residual(problem: Problem, experiment: str, channel: str, model: Model | None) -> np.ndarray:
-    """(columns, B, T) measured less predicted, by the nominal model where no other is given."""
+    """Measured less predicted, (columns, B, T), by a model or for None by the nominal one."""
     batch = problem.stacks[experiment].batch
     if model is None:
         return np.asarray(batch.y[channel]) - problem.predicted[experiment, channel]
@@ -77,7 +77,7 @@ def _residual(problem: Problem, experiment: str, channel: str, model: Model | No
 
 
 def _worst(problem: Problem) -> tuple[str, str, int, int]:
-    """Experiment, channel, column and trial (its index in the stack)."""
+    """Experiment, channel, column and trial (index in its stack) with the most energy above noise."""
     best, most = None, -np.inf
     for e, rows in problem.rows.items():
         excess = problem.r[rows.start : rows.start + rows.size] ** 2 - 1.0
@@ -92,9 +92,3 @@ def _worst(problem: Problem) -> tuple[str, str, int, int]:
     if best is None:
         raise ValueError("no sample of any channel counts")
     return best
-
-
-def _column(problem: Problem, channel: str, column: int) -> str:
-    finger = problem.session.finger
-    names = {"joint_torque": finger.joint_names, "tendon_excursion": finger.tendon_names}
-    return names.get(channel, ("x", "y", "z"))[column]

@@ -1,4 +1,4 @@
-"""Traces of the validation experiments: VD.1 and VD.2 as in the paper, and VD.3."""
+"""Figures of the validation experiments: VD.1 and VD.2 as in the paper, and VD.3."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from jaxfinger.model import Model
 from jaxfinger.report import plots
 from jaxfinger.report.theme import grid, legend_beside, look, save
 
-PANELS = 3  # VD.2 trials in one figure
+MAX_PANELS = 3  # VD.2 trials in one figure, which then fits across a page
 
 
 @look()
 def draw_validation(
     fit: Fit, session: Session, folder: str | Path, overwrite: bool = False, suffix: str = ".svg"
 ) -> list[Path]:
-    """Write one figure for each validation experiment of the session; the paths written.
+    """Write one figure for each validation experiment of the session; return the paths.
 
     Raises:
         UserError: a figure exists and `overwrite` is false, or the session is of another finger.
@@ -37,7 +37,7 @@ def draw_validation(
     if trials := list(session.select("VD.1")):
         figures["vd1"] = _vd1(model, session, trials[0])
     if trials := list(session.select("VD.2")):
-        names = [t.name for t in trials[:PANELS]]
+        names = [t.name for t in trials[:MAX_PANELS]]
         figures["vd2"] = _vd2(model, session, prepare(session, names)["VD.2"])
     if trials := list(session.select("VD.3")):
         figures["vd3"] = _vd3(model, session, trials[0])
@@ -45,7 +45,7 @@ def draw_validation(
 
 
 def _vd1(model: Model, session: Session, trial: Trial) -> Figure:
-    """Paper, Fig. 5: the path by hand, the excursions measured and predicted, and their errors."""
+    """Angles, excursions measured and predicted, and their errors by f(q) and by ∫ C q̇ dt (paper, Fig. 5)."""
     path = excursion_path(model, trial, sizes_of(session).slow_pace)
     joints, tendons = session.finger.joint_names, session.finger.tendon_names
     turn = np.array([display(session, "q", i)[0] for i in range(len(joints))])
@@ -64,7 +64,7 @@ def _vd1(model: Model, session: Session, trial: Trial) -> Figure:
 
 
 def _vd2(model: Model, session: Session, stack: Stack) -> Figure:
-    """Paper, Fig. 9: force at the fingertip against tension, holds measured and predicted."""
+    """Fingertip force against tension, measured and predicted, hold by hold (paper, Fig. 9)."""
     forces = np.asarray(_predict(model, stack.batch.x, ("fingertip_force",))["fingertip_force"])
     measured, mask = (np.asarray(a["fingertip_force"]) for a in (stack.batch.y, stack.batch.mask))
     figure, (axes,) = grid(1, len(stack.trials), 3.2, 2.8, sharey=True)
@@ -73,8 +73,10 @@ def _vd2(model: Model, session: Session, stack: Stack) -> Figure:
         k = session.finger.tendon_names.index(tendon) if tendon else int(np.argmax(np.ptp(stack.batch.x.tension, 2)))
         runs = stack.samples_of_holds(b, mask[:, b].max(axis=0))
         at = np.array([np.asarray(stack.batch.x.tension)[k, b, r].mean() for r in runs])
-        seen, said = (np.array([[y[a, b, r].mean() for r in runs] for a in range(3)]) for y in (measured, forces))
-        plots.against_tension(at, seen, said, ax)
+        observed, predicted = (
+            np.array([[y[a, b, r].mean() for r in runs] for a in range(3)]) for y in (measured, forces)
+        )
+        plots.against_tension(at, observed, predicted, ax)
         ax.set(title=name, xlabel=f"tension of {session.finger.tendon_names[k]} (N)")
     axes[0].set_ylabel("force at the fingertip (N)\n○ measured, × model")
     legend_beside(axes[-1])
@@ -82,7 +84,10 @@ def _vd2(model: Model, session: Session, stack: Stack) -> Figure:
 
 
 def _vd3(model: Model, session: Session, trial: Trial) -> Figure:
-    """The whole model: motion simulated forward from the first sample, and the torque it lacks where all slide."""
+    """Motion simulated forward from the first sample, its error, and the torque that the model lacks.
+
+    The torque is shown where all joints and tendons slide, since friction is not known elsewhere.
+    """
     simulated = predict_session(model, session, [trial.name])[trial.name]["q"]
     stack = prepare(session, [trial.name])["VD.3"]
     time, slides = np.asarray(stack.batch.x.time)[0], np.asarray(stack.batch.mask["joint_torque"])[:, 0] > 0
@@ -101,7 +106,7 @@ def _vd3(model: Model, session: Session, trial: Trial) -> Figure:
 
 
 def _unit(session: Session, channel: str) -> str:
-    """Of a channel's first column, for people."""
+    """Unit in which people read a channel's first column."""
     return display(session, channel, 0)[1].replace("degrees", "°")
 
 

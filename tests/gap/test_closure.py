@@ -54,5 +54,5 @@ def test_trials_without_a_gap_do_not_widen_the_interval_of_how_far_it_closes():
 def test_a_simulation_that_runs_away_closes_nothing():
     rows = np.stack([np.full(6, 4.0), np.full(6, 0.1), np.full(6, 0.01), np.full(6, 100.0)], axis=1)
     assert _line("VD.3", "q", "rad", rows).closed > 0.9
-    line = _line("VD.3", "q", "rad", rows, runs_away=True)
+    line = _line("VD.3", "q", "rad", rows, diverged=True)
     assert (line.closed, line.closed_ci95, line.diverged, line.resolvable) == (0.0, (0.0, 0.0), True, False)

@@ -10,7 +10,9 @@ from jaxtyping import Array, Float
 from jaxfinger.effects import CATALOGUE, CatalogueEffect, amplitude
 from jaxfinger.errors import UserError
 from jaxfinger.gap import Status, diagnose, fit_with
-from jaxfinger.gap.result import Key
+from jaxfinger.gap.columns import Columns
+from jaxfinger.gap.diagnose import _not_judged
+from jaxfinger.gap.result import Key, NotJudged, Reason
 from jaxfinger.gap.signatures import whitened
 from jaxfinger.gap.where import where
 from jaxfinger.identify.noise import whiten
@@ -44,7 +46,7 @@ def test_the_planted_cause_its_site_and_its_size_are_named(diagnosis):
 
 
 def test_the_budget_is_the_gap(diagnosis):
-    """One cause is all of it, in every column that has a gap, and what it leaves is little."""
+    """The one cause has nearly all of the gap of each column, and little is left."""
     (cause,) = diagnosis.budget
     assert cause.share > 0.85
     assert cause.share_ci95[0] <= cause.share <= cause.share_ci95[1]
@@ -57,8 +59,8 @@ def test_the_budget_is_the_gap(diagnosis):
     assert {c.experiment for c in cause.channels} == {x.experiment for x in diagnosis.channels}
 
 
-def test_a_gap_has_a_size_in_the_world_that_a_user_may_tolerate(diagnosis):
-    """The relevance is that of the residuals; a tolerance above it leaves nothing to explain."""
+def test_a_gap_has_a_size_in_physical_units(diagnosis):
+    """It is the rms of the residuals beyond the noise, and nothing is tolerated unless the user says so."""
     for x in diagnosis.relevance:
         (line,) = [c for c in diagnosis.closures if (c.experiment, c.channel) == (x.experiment, x.channel)]
         assert x.gap == pytest.approx(np.sqrt(line.before**2 - line.noise**2), rel=0.1)
@@ -84,7 +86,7 @@ def test_two_causes_are_both_named_and_keep_their_sizes():
     assert by["joint_presliding"]["x0"].value == pytest.approx(0.1, rel=0.2)
     assert by["elastic_relaxation"]["stiffness"].value == pytest.approx(0.1, rel=0.2)
     assert by["elastic_relaxation"]["T"].value == pytest.approx(1.0, rel=0.3)
-    # A loud column hides no quiet one: each cause closes the column of its own joint.
+    # A column with a large gap hides none with a small one: each cause closes the column of its own joint.
     for x in found.channels:
         own = [c.effect for c in found.budget].index("joint_presliding" if x.column == "PIP" else "elastic_relaxation")
         assert np.argmax(x.by_cause) == own
@@ -92,7 +94,7 @@ def test_two_causes_are_both_named_and_keep_their_sizes():
 
 @pytest.mark.long
 def test_a_first_look_names_what_the_whole_one_does(diagnosis):
-    """From half the samples, with no fit of causes and model together."""
+    """A first look reads half the samples, and fits causes and nominal parameters in turn."""
     look = diagnose(session_with(PLANTED), without=WITHOUT, quick=True)
     assert (look.status, look.named) == (diagnosis.status, diagnosis.named)
     ours, theirs = (values(d.budget[0]) for d in (look, diagnosis))
@@ -169,6 +171,13 @@ def test_no_place_stands_out_of_white_noise(planted):
     assert where(replace(planted, r=np.random.default_rng(2).standard_normal(planted.r.size))) == []
 
 
+def test_a_channel_with_too_few_samples_is_listed_as_not_judged(planted):
+    columns = Columns.of(planted)
+    assert _not_judged(planted, columns) == ()
+    fewer = Columns(tuple(c for c in columns.items if c.experiment != "ID.2"))
+    assert _not_judged(planted, fewer) == (NotJudged("ID.2", "tendon_excursion", Reason.FEW_SAMPLES),)
+
+
 def test_progress_is_told(diagnosis, messages):
     assert len(messages) > 5
     assert any("refitting" in m for m in messages)
@@ -195,8 +204,9 @@ class SumOfAngles(CatalogueEffect):
 @pytest.mark.parametrize("known", [RIVALS, ("tendon_backlash", "tendon_stretch")])
 @pytest.mark.long
 def test_a_law_that_nobody_listed_gets_a_proposal_in_closed_form(known):
-    """Whether the catalogue has effects of that joint, which explain some of it, or none that explains any. Nothing is
-    named then, and the model that is handed on is the nominal one.
+    """It does so whether the catalogue's effects explain some of the gap or none of it.
+
+    Nothing is named in either case, and the augmented model is the nominal one.
     """
     session = session_with((SumOfAngles, ("PIP", "DIP"), {"a": 3e-3}))
     found = diagnose(session, without=tuple(set(CATALOGUE) - set(known)), quick=True)
@@ -209,5 +219,4 @@ def test_a_law_that_nobody_listed_gets_a_proposal_in_closed_form(known):
     assert found.unexplained.proposal.site == "PIP"
     assert found.unexplained.proposal.share > 0.5
     assert found.where[0].site == "PIP"
-    # Where the user does not mind, nothing is amiss.
     assert all(x.relative < 0.9 for x in found.relevance)

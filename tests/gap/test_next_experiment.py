@@ -7,7 +7,7 @@ import pytest
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap import Status, diagnose
-from jaxfinger.gap.next_experiment import SETTLES, _short_list, expected_evidence
+from jaxfinger.gap.next_experiment import DECISIVE, _short_list, expected_evidence
 from jaxfinger.gap.problem import imagined
 from jaxfinger.gap.result import Key
 from jaxfinger.synthetic import recipe_from
@@ -38,9 +38,9 @@ def test_the_suggestion_once_run_settles_the_verdict(ambiguous):
     assert set(ambiguous.ambiguous_sets[0]) == {Key(*TRUTH[:2]), Key("passive_tendon", ("MCP", "PIP"))}
     suggestion = ambiguous.next_experiment
     assert suggestion.separates == ("passive_tendon",)
-    assert suggestion.evidence > SETTLES
+    assert suggestion.evidence > DECISIVE
     at = {p.joint: float(np.degrees(p.low)) for p in suggestion.postures if not p.moves}
-    assert max(abs(at["MCP"] - USUAL[0]), abs(at["DIP"] - USUAL[2])) > 5.0  # elsewhere than all that was done
+    assert max(abs(at["MCP"] - USUAL[0]), abs(at["DIP"] - USUAL[2])) > 5.0  # away from all recorded postures
     settled = diagnose(of_one_joint(USUAL, [at["MCP"], USUAL[1], at["DIP"]]), without=WITHOUT)
     assert settled.status is Status.EXPLAINED
     assert settled.named == (Key(*TRUTH[:2]),)
@@ -64,10 +64,11 @@ def test_an_experiment_that_is_missing_is_imagined_with_the_motion_of_another(pl
         there = imagined(lacking, stacks)
         rows, x = there.rows["ID.3-dynamic"], stacks["ID.3-dynamic"].batch.x
         moved = [problem.nominal.finger.joint_names.index(problem.session[t].joint) for t in there.trial_names]
-        np.testing.assert_array_equal(rows.column, np.array(moved)[rows.trial])  # one torque, of the moved joint
+        # Only the torque of the moved joint counts.
+        np.testing.assert_array_equal(rows.column, np.array(moved)[rows.trial])
         assert rows.size > 300
         assert np.isfinite(there.J).all()
-        assert np.abs(there.J).max(axis=0).min() == 0.0  # moment arms: the tendons are slack
+        assert np.abs(there.J).max(axis=0).min() == 0.0  # moment arms do not show, since the tendons are slack
         assert not np.asarray(x.tension).any()
         fastest.append(float(np.abs(np.asarray(x.qd)).max()))
     assert max(fastest) > 3.9 * min(fastest)

@@ -53,7 +53,7 @@ def problem(session):
 
 @pytest.fixture(scope="module")
 def scaled(session):
-    """The same session from a torque sensor whose gain is far off."""
+    """The same session recorded with a torque sensor whose gain is off by a fifth."""
     trials = {
         t.name: t if t.joint_torque is None else replace(t, joint_torque=(1.0 + GAIN) * t.joint_torque) for t in session
     }
@@ -165,8 +165,8 @@ def test_where_a_set_has_led_is_the_exact_fit(scaled):
     shift = np.asarray(ravel(quick.fit.model) - ravel(exact.fit.model))[i]
     assert np.all(np.abs(shift) < 1.0 * std)
     np.testing.assert_allclose(quick.fit.std[i], std, rtol=1.5 * GAIN)
-    for key, missed in exact.missed(quick.fit.model).items():
-        np.testing.assert_allclose(quick.missed(quick.fit.model)[key], missed, atol=1e-12)
+    for key, residuals in exact.residuals_of(quick.fit.model).items():
+        np.testing.assert_allclose(quick.residuals_of(quick.fit.model)[key], residuals, atol=1e-12)
 
 
 def test_where_a_joint_is_held_it_is_no_variable(problem):

@@ -44,7 +44,7 @@ def test_the_missing_effect_is_named_and_the_wrong_parameters_retuned(session):
     assert found.status is Status.EXPLAINED
     assert found.named == (Key(*TRUTH),)
     assert any(c.group == "damping" and c.before > 2.0 * c.after for c in found.changes)
-    # Before is the simulator as it is, after the finger's own parameters with the effect.
+    # Before, the simulator predicts as it is; after, the model has the finger's own parameters and the effect.
     line = next(x for x in found.closures if x.experiment == "ID.3-dynamic")
     own = next(x for x in diagnose(session, without=WITHOUT, quick=True).closures if x.experiment == "ID.3-dynamic")
     assert line.before > 1.2 * own.before

@@ -1,4 +1,4 @@
-"""A browser, and every page once: `chromium` of the system through Playwright, with no network to go to."""
+"""Fixtures: the system's Chromium through Playwright, without network, and the pages to look at."""
 
 import shutil
 

@@ -1,4 +1,4 @@
-"""Diagnoses that no recording made, one of every kind, so that words and pages are tested without a search."""
+"""Fabricated diagnoses, one of each kind, so that sentences and pages are tested without a search."""
 
 from dataclasses import replace
 from functools import cache
@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 from jaxfinger.effects import CATALOGUE
-from jaxfinger.gap.diagnose import agreeing
+from jaxfinger.gap.diagnose import consistent_with
 from jaxfinger.gap.posterior import Posterior
 from jaxfinger.gap.propose import Proposal
 from jaxfinger.gap.result import (
@@ -43,7 +43,7 @@ TORQUE, EXCURSION = ExperimentChannel("ID.4", "joint_torque"), ExperimentChannel
 
 @cache
 def fits() -> tuple[Fit, Fit]:
-    """A nominal fit whose parameters are known to a hundredth, neighbours correlated; and one whose T3 stretches."""
+    """A nominal fit with parameters known to 1 % and correlated with neighbours, and one in which T3 stretches."""
     finger = polynomial_finger(paper_finger())
     model = true_model(finger)
     size = ravel(model).size
@@ -174,7 +174,7 @@ def explained() -> Diagnosis:
 
 
 def every() -> dict[str, Diagnosis]:
-    """By name: one of every status, and the variations that need words of their own."""
+    """Diagnoses by name: one of each status, and variations that need sentences of their own."""
     one = explained()
     two = replace(
         one,
@@ -251,7 +251,7 @@ def every() -> dict[str, Diagnosis]:
         "still_open": replace(
             one,
             status=Status.PARTLY,
-            unlisted=agreeing(Status.PARTLY, Posterior({}, {}, 0.0, 0.02, (), ()), gaps=True)[1],
+            unlisted=consistent_with(Status.PARTLY, Posterior({}, {}, 0.0, 0.02, (), ()), gaps=True)[1],
             closures=(LINES[0], replace(LINES[1], after=3.1e-5), LINES[2]),
         ),
         "ambiguous": replace(
@@ -289,7 +289,7 @@ def every() -> dict[str, Diagnosis]:
 
 
 def trace() -> Trace:
-    """A second of a torque that the model misses by a sine until it knows its cause."""
+    """One second of a torque that the nominal model misses by a sine and the augmented model predicts."""
     time = np.linspace(0.0, 4.0, 161)
     measured = 10.0 * np.sin(time) + np.random.default_rng(0).normal(0.0, 0.3, time.size)
     measured[40:44] = np.nan

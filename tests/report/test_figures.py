@@ -1,4 +1,4 @@
-"""The curves are those of the model, with the spread that its covariance makes; the figures are written whole."""
+"""Curves are those of the model, with standard deviations from its covariance; figures are written whole."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +37,7 @@ def session():
 
 @pytest.fixture(scope="module")
 def fit(session) -> Fit:
-    """The truth, said to be known to one per cent."""
+    """A fit that holds the true model, with standard deviations of one per cent."""
     before = Fit.before(session, Recipe(), true_model(polynomial_finger(paper_finger())))
     groups = ("moment_arm", "elastic", "friction", "damping", "tendon_friction")
     chosen = [i for i, p in enumerate(describe(before.model)) if p.group in groups and p.determinable]

@@ -1,4 +1,4 @@
-"""`gap.json` is to the letter, and its numbers say what its words say."""
+"""`gap.json` follows its schema, and its numbers agree with its sentences."""
 
 import json
 from dataclasses import replace
@@ -17,7 +17,7 @@ ALL = every()
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_it_is_to_the_letter(name):
+def test_it_follows_the_schema(name):
     jsonschema.validate(json.loads(text(ALL[name])), SCHEMA)
 
 
@@ -54,7 +54,7 @@ def test_one_cause_at_many_sites_is_one_line_and_every_site_is_named():
 
 
 def test_a_schema_of_the_test_is_strict():
-    """What the schema would have to refuse, it does."""
+    """A file that breaks the schema is refused."""
     gap = as_gap_json(explained())
     for wrong in (gap | {"extra": 1}, gap | {"none": 1.2}, gap | {"budget": [{"effect": "x"}]}, gap | {"data": None}):
         with pytest.raises(jsonschema.ValidationError):

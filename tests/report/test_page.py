@@ -57,13 +57,13 @@ def _luminance(colour):
 
 
 def contrast(a, b):
-    """WCAG 2.2."""
+    """Contrast ratio of two colours by WCAG 2.2."""
     dark, light = sorted(map(_luminance, (a, b)))
     return (light + 0.05) / (dark + 0.05)
 
 
 def opened(browser, path, width, scheme):
-    """The page with all that folds unfolded, and what it asked for."""
+    """The page with all details open, and the requests that it made."""
     page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
     asked, said = [], []
     page.on("request", lambda r: asked.append(r.url))

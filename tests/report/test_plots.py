@@ -1,4 +1,4 @@
-"""Figures as functions: they draw on the axes that they are given, and show what they are told."""
+"""Figures as functions: they draw on the axes that they are given, and show their arguments."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from .fabricated import BARS, LINES, every, fits, trace
 
 
 def held(shifts, count=30):
-    """Trials of which some move some of the estimated parameters by so many standard deviations."""
+    """A sensitivity in which some trials shift some parameters by given numbers of standard deviations."""
     fit = fits()[1]
     values = np.zeros((count, fit.std.size))
     for (row, column), shift in shifts.items():
@@ -65,7 +65,7 @@ def test_a_bar_is_whole(bar):
 
 
 def test_a_bar_keeps_the_proportion_of_its_causes():
-    """Where what each cause alone closes sums to more than all of them close."""
+    """Shares that sum to more than all causes close are scaled down in proportion."""
     _, causes, together, _ = segments(replace(BARS[2], by_cause=(0.6, 0.3), unexplained=0.4))
     assert causes[0] == pytest.approx(2 * causes[1])
     assert together == pytest.approx(0.0)

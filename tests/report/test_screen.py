@@ -1,11 +1,11 @@
-"""The diagnosis on one screen."""
+"""The summary for a terminal."""
 
 from dataclasses import replace
 
 import pytest
 
 from jaxfinger.report import sentences
-from jaxfinger.report.screen import across, summary
+from jaxfinger.report.screen import comparison, summary
 
 from .fabricated import every
 
@@ -40,7 +40,7 @@ def test_what_came_of_effects_of_ones_own_is_said():
 
 
 def test_a_table_of_several_sessions_says_which_cause_is_at_work_in_which():
-    header, rows = across(
+    header, rows = comparison(
         {
             "monday.h5": ALL["two"],
             "tuesday.h5": ALL["partly_ambiguous"],

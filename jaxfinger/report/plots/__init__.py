@@ -1,4 +1,4 @@
-"""Figures as functions: each takes Matplotlib axes, or makes them, and returns them.
+"""Figures as functions: each draws on given Matplotlib axes, or on new ones, and returns them.
 
 >>> import jaxfinger as jf
 >>> axes = jf.plot.intervals(jf.load("fit.json"))

@@ -1,4 +1,4 @@
-"""What a fit knows and how it knows it: intervals, correlations, and what holds each parameter where it is."""
+"""Figures of a fit: intervals, correlations, and the influence of trials, sensors and CAD on each parameter."""
 
 from __future__ import annotations
 
@@ -14,35 +14,34 @@ from jaxfinger.identify.sensitivity import Sensitivity
 from jaxfinger.report.numbers import HALF_95, measured
 from jaxfinger.report.theme import AFTER, BEFORE, CLEAR, COLOURS, MUTED, axes_or_new, legend_below, look
 
-FILLED = 0.8  # of a cell, by the side of the largest square
-EDGE = 2.1  # of the axis of intervals: a value and a half-width of its size
-
-
-INTERVAL_ROWS = 10  # in one panel of a page
-ROW = 0.36  # inches of height that a parameter and its name take
-# Letters are 0.6 of the 9 points of `theme.FONT` wide: 13, less the gap between a name and its value.
-SIGNS_AN_INCH = 12.0
+MAX_SIDE = 0.8  # Side of the largest square in that of its cell, so that neighbours do not touch.
+X_LIMIT = 2.1  # Relative to the scale of a row: a value of 1 with a half-width of 1 reaches 2.
+INTERVAL_ROWS = 10  # Rows in one panel of a page, which then fits on a phone's screen.
+ROW_HEIGHT = 0.36  # Inches that a parameter and its name take.
+# Letters are on average 0.6 of the font's 9 points (`theme.FONT`) wide, which makes 13; one is left for the gap between
+# name and value.
+CHARACTERS_PER_INCH = 12.0
 
 
 def interval_size(rows: int, width: float) -> tuple[float, float]:
     """Width and height in inches that `intervals` fills."""
-    return width, 0.95 + ROW * max(rows, 1)
+    return width, 0.95 + ROW_HEIGHT * max(rows, 1)
 
 
 @look()
 def intervals(
     fit: Fit, parameters: Sequence[str] | None = None, before: Fit | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Parameters with their 95 % intervals, one row each, in shares of the value, or of the half-width if that is more.
+    """Draw parameters with their 95 % intervals, one row each, and return the axes.
 
-    So a row says at a glance how well a parameter is known and whether its interval holds zero; the value with its unit
-    stands above it.
+    Each row is relative to the larger of the parameter's magnitude and the half-width of its interval, so that it shows
+    how well the parameter is known and whether its interval holds zero. The value with its unit stands above the row.
 
     Args:
-        fit: with what it estimated.
+        fit: the fit whose estimated parameters are drawn.
         parameters: names to show, in this order; by default all that were estimated.
         before: another fit, whose values of the same parameters are marked.
-        ax: the axes to draw on; new ones without.
+        ax: the axes to draw on; by default those of a new figure.
     """
     table = {r["name"]: r for r in fit.table()}
     rows = [table[n] for n in (table if parameters is None else parameters)]
@@ -57,14 +56,14 @@ def intervals(
             [(value - half) / scale, (value + half) / scale], [y, y], color=AFTER, linewidth=2.4, solid_capstyle="butt"
         )
         ax.plot(value / scale, y, "o", color=AFTER, markersize=4)
-        if row["name"] in old and abs(old[row["name"]] / scale) < EDGE:
+        if row["name"] in old and abs(old[row["name"]] / scale) < X_LIMIT:
             ax.plot(old[row["name"]] / scale, y, "D", color="none", markeredgecolor=BEFORE, markersize=5)
         text = measured(value, std, row["units"]) if std is not None else "not seen by these trials"
-        room = int(width * SIGNS_AN_INCH) - len(text)
-        ax.text(0.0, y - 0.2, _within(row["name"], room), transform=at, va="bottom", ha="left", bbox=CLEAR)
+        room = int(width * CHARACTERS_PER_INCH) - len(text)
+        ax.text(0.0, y - 0.2, _shortened(row["name"], room), transform=at, va="bottom", ha="left", bbox=CLEAR)
         ax.text(1.0, y - 0.2, text, transform=at, va="bottom", ha="right", bbox=CLEAR)
     ax.axvline(0.0, color=MUTED, linewidth=0.8)
-    ax.set(yticks=[], ylim=(len(rows) - 0.5, -0.8), xlim=(-EDGE, EDGE), xticks=[-2, -1, 0, 1, 2])
+    ax.set(yticks=[], ylim=(len(rows) - 0.5, -0.8), xlim=(-X_LIMIT, X_LIMIT), xticks=[-2, -1, 0, 1, 2])
     ax.set_xlabel("value and interval, relative to the larger")
     ax.grid(axis="y", visible=False)
     ax.spines["left"].set_visible(False)
@@ -75,15 +74,15 @@ def intervals(
     return ax
 
 
-def _within(name: str, room: int) -> str:
-    """A parameter's name in so many signs: what is too long loses the end of its first word."""
+def _shortened(name: str, room: int) -> str:
+    """A parameter's name in at most `room` characters, for which its first word loses its end."""
     first, _, rest = name.partition(" ")
     over = len(name) - room
     return name if over <= 0 else f"{first[: max(len(first) - over - 1, 4)]}… {rest}"
 
 
 def correlations(fit: Fit) -> tuple[list[str], Float[np.ndarray, "p p"]]:
-    """Names of the estimated parameters that the trials see, and their correlation."""
+    """Names of the estimated parameters that the trials determine, and their correlation matrix."""
     seen = [i for i in fit.estimated if np.isfinite(fit.covariance[i, i]) and fit.covariance[i, i] > 0]
     C = fit.covariance[np.ix_(seen, seen)]
     std = np.sqrt(np.diag(C))
@@ -93,14 +92,14 @@ def correlations(fit: Fit) -> tuple[list[str], Float[np.ndarray, "p p"]]:
 
 @look()
 def correlation(fit: Fit, most: int = 16, ax: Axes | None = None) -> Axes:
-    """Correlations of the parameters that depend on each other most: a square's area is |ρ|, its colour the sign.
+    """Draw correlations of the most correlated parameters, and return the axes: area of a square |ρ|, colour its sign.
 
-    Where |ρ| nears 1, only a combination of the two is known well, whatever each one's interval says.
+    Where |ρ| is near 1, the trials determine a combination of the two parameters better than either one.
 
     Args:
-        fit: with its covariance.
-        most: at most so many parameters, those whose largest |ρ| with another is largest.
-        ax: the axes to draw on; new ones without.
+        fit: the fit with its covariance.
+        most: largest number of parameters; those whose largest |ρ| with another is largest are drawn.
+        ax: the axes to draw on; by default those of a new figure.
     """
     names, R = correlations(fit)
     strongest = np.abs(R - np.diag(np.diag(R))).max(axis=0, initial=0.0)
@@ -115,17 +114,17 @@ def correlation(fit: Fit, most: int = 16, ax: Axes | None = None) -> Axes:
 
 @look()
 def influence(found: Sensitivity | Mapping[str, Sensitivity], fit: Fit, most: int = 16, ax: Axes | None = None) -> Axes:
-    """What holds each parameter where it is: a square's area is how far a row moves a column, its colour the way.
+    """Draw how each row shifts each parameter, and return the axes: area of a square the shift, colour its sign.
 
-    A row is a trial that is left out, a sensor that reads 1 % more, or a value of CAD that is one standard deviation
-    larger; the parameter moves by that many of its own standard deviations. Where no other trial tells of a parameter,
-    the square is as large as the largest.
+    A row is a trial left out, a sensor that reads 1 % more, or a value of CAD that is one standard deviation larger.
+    Shifts are in standard deviations of the parameter. Where no other trial determines a parameter, the square is as
+    large as the largest.
 
     Args:
-        found: as `sensitivity` returns it, or one kind of it.
-        fit: that it was made for.
-        most: at most so many rows and columns, those with the largest shifts.
-        ax: the axes to draw on; new ones without.
+        found: result of `sensitivity`, or one kind of it.
+        fit: the fit that it belongs to.
+        most: largest number of rows and of columns; those with the largest shifts are drawn.
+        ax: the axes to draw on; by default those of a new figure.
     """
     kinds = [found] if isinstance(found, Sensitivity) else list(found.values())
     shifts = np.concatenate([kind.shifts(fit) for kind in kinds])
@@ -146,10 +145,10 @@ def influence(found: Sensitivity | Mapping[str, Sensitivity], fit: Fit, most: in
 
 
 def _squares(ax: Axes, values, rows: Sequence[str], columns: Sequence[str], up: str, down: str) -> None:
-    """Values of −1 to 1 as squares whose area is their size."""
+    """Draw values from −1 to 1 as squares whose area is their magnitude."""
     at = ax.get_window_extent().transformed(ax.figure.dpi_scale_trans.inverted())  # inches
     cell = 72.0 * min(at.width / max(len(columns), 1), at.height / max(len(rows), 1))
-    size = (FILLED * cell) ** 2
+    size = (MAX_SIDE * cell) ** 2
     for sign, colour, label in ((1, COLOURS[0], up), (-1, COLOURS[1], down)):
         i, j = np.nonzero(sign * values > 0.02)
         ax.scatter(j, i, s=size * np.abs(values[i, j]), marker="s", color=colour, linewidths=0, label=label)

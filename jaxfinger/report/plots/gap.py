@@ -1,4 +1,4 @@
-"""A diagnosis in pictures: how the gap is made up, how far it closes, what is missed in the worst trial."""
+"""Figures of a diagnosis: the budget of the gap, how far it closes, and the trial that the model misses most."""
 
 from __future__ import annotations
 
@@ -21,29 +21,30 @@ from jaxfinger.report.theme import (
     NOISE,
     OPEN,
     WRONG,
-    across,
     axes_or_new,
     colour,
     legend_below,
+    legend_columns,
     look,
 )
 from jaxfinger.report.traces import Trace
 
-MOST = 12  # bars in one picture
-ROW = 0.42  # inches of height that a bar and its label take
-HATCH = "////"
-SEEN = 0.004  # share of a bar below which a segment is not drawn
+MAX_BARS = 12  # Bars in one picture, which then fits on a screen.
+ROW_HEIGHT = 0.42  # Inches that a bar and its label take.
+HATCH = "////"  # marks the unexplained part beside its colour
+MIN_SEGMENT = 0.004  # Share of a bar: a smaller segment is narrower than two pixels.
 
 
-def rows_of(d: Diagnosis, most: int = MOST) -> list[ChannelBudget]:
-    """The columns with a gap, largest in units of their noise first."""
+def rows_of(d: Diagnosis, most: int = MAX_BARS) -> list[ChannelBudget]:
+    """The `most` columns with the largest gaps relative to their noise, largest first."""
     return sorted(d.channels, key=lambda x: -x.gap / max(x.noise, 1e-300))[:most]
 
 
 def segments(x: ChannelBudget) -> tuple[float, list[float], float, float]:
-    """Shares of a column's mean square: noise, every cause, what only several causes close together, unexplained.
+    """Segments of a column's bar, as shares of its mean square: noise, causes, several together, unexplained.
 
-    What is lost when one cause alone is dropped need not sum to what all close: where it sums to more, all are scaled.
+    The shares of the causes need not sum to what all close. If they sum to less, the rest is closed by several causes
+    together; if they sum to more, they are scaled down in proportion.
     """
     noise = x.noise**2 / max(x.noise**2 + x.gap**2, 1e-300)
     causes, left = [max(s, 0.0) for s in x.by_cause], min(max(x.unexplained, 0.0), 1.0)
@@ -51,7 +52,7 @@ def segments(x: ChannelBudget) -> tuple[float, list[float], float, float]:
     over = max(sum(causes) / room, 1.0) if room > 0 else math.inf
     causes = [(s / over) * (1.0 - noise) for s in causes]
     together, left = max(room * (1.0 - noise) - sum(causes), 0.0), left * (1.0 - noise)
-    if len(causes) < 2:  # nothing to close with others
+    if len(causes) < 2:  # One cause alone closes all that is closed.
         causes, left, together = [c + together for c in causes], left + together * (not causes), 0.0
     return noise, causes, together, left
 
@@ -60,18 +61,19 @@ def budget_size(d: Diagnosis, width: float) -> tuple[float, float]:
     """Width and height in inches that `budget` fills."""
     entries = len(d.budget) + 3
     lines = entries if width < 5 else -(-entries // 2)
-    return width, 0.45 + ROW * max(len(rows_of(d)), 1) + 0.19 * lines
+    return width, 0.45 + ROW_HEIGHT * max(len(rows_of(d)), 1) + 0.19 * lines
 
 
 @look()
 def budget(d: Diagnosis, ax: Axes | None = None) -> Axes:
-    """The budget of causes: one bar a column with a gap, one colour a cause; its length is the mean square missed.
+    """Draw the budget of the gap, one bar for each column with a gap, and return the axes.
 
-    Noise stands first and what nobody knows last, hatched. Beside each name stands the gap in physical units.
+    The length of a bar is the mean square of the nominal model's residual. Noise comes first, then a colour for each
+    cause, then the unexplained part, hatched. Beside the column's name stands the gap in physical units.
 
     Args:
         d: the diagnosis.
-        ax: the axes to draw on; new ones without.
+        ax: the axes to draw on; by default those of a new figure.
     """
     ax = axes_or_new(ax, *budget_size(d, 6.4))
     rows = rows_of(d)
@@ -81,7 +83,7 @@ def budget(d: Diagnosis, ax: Axes | None = None) -> Axes:
         parts += [(together, MUTED, None), (left, OPEN, HATCH)]
         start = 0.0
         for share, fill, hatch in parts:
-            if share > SEEN:
+            if share > MIN_SEGMENT:
                 ax.barh(y, share, left=start, height=0.42, color=fill, hatch=hatch, edgecolor="none", linewidth=0)
             start += share
         name = f"{x.experiment} · {channel_name(x.channel)} {x.column}"
@@ -90,37 +92,37 @@ def budget(d: Diagnosis, ax: Axes | None = None) -> Axes:
     seen = [segments(x) for x in rows]
     handles = [Patch(color=NOISE, label="noise")]
     handles += [Patch(color=colour(i), label=cause_name(cause)) for i, cause in enumerate(d.budget)]
-    if any(s[2] > SEEN for s in seen):
+    if any(s[2] > MIN_SEGMENT for s in seen):
         handles.append(Patch(color=MUTED, label="several together"))
-    if any(s[3] > SEEN for s in seen):
+    if any(s[3] > MIN_SEGMENT for s in seen):
         handles.append(Patch(facecolor=OPEN, hatch=HATCH, linewidth=0, label="unexplained"))
     ax.set(yticks=[], xlim=(0, 1), ylim=(max(len(rows), 1) - 0.6, -0.95))
     ax.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "25 %", "50 %", "75 %", "100 %"])
     ax.spines["left"].set_visible(False)
     ax.grid(axis="y", visible=False)
-    legend_below(ax, across(ax) - 1, labelled=False, handles=handles)
+    legend_below(ax, legend_columns(ax) - 1, labelled=False, handles=handles)
     return ax
 
 
 def closure_size(lines: Sequence[Closure], width: float) -> tuple[float, float]:
     """Width and height in inches that `closure` fills."""
-    return width, 1.05 + ROW * max(len(shown(lines)), 1)
+    return width, 1.05 + ROW_HEIGHT * max(len(shown(lines)), 1)
 
 
 def shown(lines: Sequence[Closure]) -> list[Closure]:
-    """Those with a noise to compare with, and no simulation that ran away."""
+    """Lines that are drawn: those whose noise is known and whose simulation did not diverge."""
     return [x for x in lines if x.noise > 0 and not x.diverged]
 
 
 @look()
 def closure(lines: Sequence[Closure], ax: Axes | None = None) -> Axes:
-    """How far each channel closes on held-out trials: rms in units of its noise, before and after, on a log axis.
+    """Draw how far each channel closes on held-out trials, and return the axes.
 
-    What `stays_open` is drawn in the colour of what is wrong.
+    Values are rms relative to the noise, before and after, on a logarithmic axis. Channels that stay open are red.
 
     Args:
-        lines: the diagnosis's `closures`.
-        ax: the axes to draw on; new ones without.
+        lines: `closures` of the diagnosis.
+        ax: the axes to draw on; by default those of a new figure.
     """
     rows = shown(lines)
     changed = any(x.before != x.after for x in rows)
@@ -159,28 +161,29 @@ def closure(lines: Sequence[Closure], ax: Axes | None = None) -> Axes:
 
 @look()
 def signal(trace: Trace, ax: Axes | None = None) -> Axes:
-    """One column of one trial over time: measured in dots, the model before and after as lines."""
+    """Draw one column of one trial over time: dots are measured, lines are the model before and after."""
     ax = axes_or_new(ax, 6.4, 2.2)
     ax.plot(trace.time, trace.measured, ".", color=INK, markersize=2.0, label="measured")
     for predicted, colour_, style, label in _models(trace):
         ax.plot(trace.time, predicted, style, color=colour_, linewidth=1.1, label=label)
     ax.set_title(f"{trace.name} ({trace.units})")
-    legend_below(ax, across(ax), labelled=False)
+    legend_below(ax, legend_columns(ax), labelled=False)
     return ax
 
 
 @look()
 def residuals(trace: Trace, ax: Axes | None = None) -> Axes:
-    """What the model misses over time, before and after, with the 95 % interval of the noise about zero."""
+    """Draw measured less model over time, before and after, with the 95 % interval of the noise about zero."""
     ax = axes_or_new(ax, 6.4, 2.2)
     ax.axhspan(-trace.half, trace.half, color=NOISE, alpha=0.5, linewidth=0, label="noise, 95 %")
     for predicted, colour_, _, label in _models(trace):
         ax.plot(trace.time, trace.measured - predicted, ".", color=colour_, markersize=2.4, label=label)
     ax.set(title=f"measured less model ({trace.units})", xlabel="time (s)")
-    legend_below(ax, across(ax))
+    legend_below(ax, legend_columns(ax))
     return ax
 
 
 def _models(trace: Trace) -> list[tuple[np.ndarray, str, str, str]]:
+    """Prediction, colour, line style and label of the model before and, if it differs, after."""
     both = [(trace.before, BEFORE, "--", "model before")]
     return [*both, (trace.after, AFTER, "-", "model after")] if trace.changed else both

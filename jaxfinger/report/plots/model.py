@@ -1,4 +1,4 @@
-"""The curves of a model, one panel a call: each takes axes or makes them, and returns them."""
+"""Figures of a model's curves: each function draws one panel and returns its axes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,18 @@ from matplotlib.axes import Axes
 from jaxfinger.identify import Fit
 from jaxfinger.report.curves import Curves, JointCurves, curves
 from jaxfinger.report.measured import Points
-from jaxfinger.report.theme import COLOURS, INK, MUTED, across, axes_or_new, band, colour, legend_below, line, look
+from jaxfinger.report.theme import (
+    COLOURS,
+    INK,
+    MUTED,
+    axes_or_new,
+    band,
+    colour,
+    legend_below,
+    legend_columns,
+    line,
+    look,
+)
 
 
 def _curves(of: Fit | Curves) -> Curves:
@@ -15,7 +26,7 @@ def _curves(of: Fit | Curves) -> Curves:
 
 
 def _measured(ax: Axes) -> None:
-    """What the points are, in a legend."""
+    """Add an entry for measured points to the legend."""
     ax.plot([], [], "o", color=INK, markersize=3.2, markeredgewidth=0, label="measured")
 
 
@@ -25,15 +36,15 @@ def _points(ax: Axes, points: Points, colour: str, marker: str = "o", label: str
 
 @look()
 def moment_arms(of: Fit | Curves, joint: str, ax: Axes | None = None) -> Axes:
-    """Moment arms about one joint over its angle, mm (paper, Fig. 4); flexion positive.
+    """Draw moment arms about one joint against its angle, mm, flexion positive, and return the axes (paper, Fig. 4).
 
-    Lines and bands are the fit and its 95 % interval; points, where `curves` was given a session, are slopes of the
-    measured excursion.
+    Lines and bands are the fit and its 95 % interval. Points are slopes of the measured excursion, if `curves` was
+    given a session.
 
     Args:
-        of: a fit, or its `curves`, which are computed once for many panels.
-        joint: its name.
-        ax: the axes to draw on; new ones without.
+        of: a fit, or its `curves`, which are then computed once for many panels.
+        joint: name of the joint.
+        ax: the axes to draw on; by default those of a new figure.
     """
     found, ax = _curves(of), axes_or_new(ax)
     tendons = list(dict.fromkeys(t for t, _ in found.moment_arm))
@@ -49,15 +60,16 @@ def moment_arms(of: Fit | Curves, joint: str, ax: Axes | None = None) -> Axes:
     slides = joint in found.joints and found.joints[joint].prismatic
     ax.set(title=joint, xlabel="position (mm)" if slides else "joint angle (°)")
     ax.set_ylabel("moment arm" if slides else "moment arm (mm)")
-    legend_below(ax, 3 if across(ax) < 3 else 5)
+    legend_below(ax, 3 if legend_columns(ax) < 3 else 5)
     return ax
 
 
 @look()
 def joint_torque(of: Fit | Curves, joint: str, ax: Axes | None = None) -> Axes:
-    """Resisting torque of one joint over its angle, N mm (paper, Fig. 6): elastic, and with friction either way.
+    """Draw the resisting torque of one joint against its angle, N mm, and return the axes (paper, Fig. 6).
 
-    Arguments as of `moment_arms`; points are holds, by the direction in which they were reached.
+    Lines are the elastic torque, and its sum with friction in either direction. Points are holds, with a marker for the
+    direction in which they were reached. Arguments as in `moment_arms`.
     """
     c: JointCurves = _curves(of).joints[joint]
     ax = axes_or_new(ax)
@@ -76,9 +88,9 @@ def joint_torque(of: Fit | Curves, joint: str, ax: Axes | None = None) -> Axes:
 
 @look()
 def tendon_friction(of: Fit | Curves, ax: Axes | None = None) -> Axes:
-    """Tension lost on the way to the finger against tension at the actuator, N, while it rises (paper, Fig. 8).
+    """Draw tension lost to friction against rising tension at the actuator, N, and return the axes (paper, Fig. 8).
 
-    Arguments as of `moment_arms`; points are holds of ID.4.
+    Points are holds of ID.4. Arguments as in `moment_arms`.
     """
     found, ax = _curves(of), axes_or_new(ax)
     for k, (tendon, c) in enumerate(found.tendon_friction.items()):
@@ -88,5 +100,5 @@ def tendon_friction(of: Fit | Curves, ax: Axes | None = None) -> Axes:
     if found.loss_points:
         _measured(ax)
     ax.set(xlabel="tension at the actuator (N)", ylabel="tension lost (N)", xlim=(0, None), ylim=(0, None))
-    legend_below(ax, 3 if across(ax) < 3 else 5)
+    legend_below(ax, 3 if legend_columns(ax) < 3 else 5)
     return ax

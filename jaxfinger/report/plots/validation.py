@@ -1,4 +1,4 @@
-"""A model beside what was measured: points are measured, lines are the model, one colour a joint, tendon or axis."""
+"""Figures of measurement and model: one colour for each joint, tendon or axis."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from jaxfinger.report.theme import INK, MUTED, axes_or_new, colour, legend_beside, line, look
 
-POINTS = 600  # of a curve over time that a figure shows: more than it has pixels makes a file, no picture
+MAX_POINTS = 600  # Points of a curve over time: about the pixels across a figure. More only make its file larger.
 
 
 @look()
@@ -23,17 +23,17 @@ def over_time(
     model: Float[np.ndarray, "T columns"] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Columns of a channel over time: what was measured in points, what the model says as lines.
+    """Draw columns of a channel over time, measured as points and predicted as lines, and return the axes.
 
     Args:
         time: s.
-        names: of the columns; one that is NaN throughout is left out.
-        measured: in the unit of the axis; without a model it is drawn as lines.
+        names: names of the columns; a column that is NaN throughout is left out.
+        measured: in the unit of the axis; without `model` it is drawn as lines.
         model: in the same unit.
-        ax: the axes to draw on; new ones without.
+        ax: the axes to draw on; by default those of a new figure.
     """
     ax = axes_or_new(ax, 6.4, 2.2)
-    thin = slice(None, None, max(len(time) // POINTS, 1))
+    thin = slice(None, None, max(len(time) // MAX_POINTS, 1))
     handles = []
     for k, name in enumerate(names):
         both = [y[:, k] for y in (measured, model) if y is not None]
@@ -62,9 +62,12 @@ def missed(
     errors: Float[np.ndarray, "T columns"],
     ax: Axes | None = None,
 ) -> Axes:
-    """Measured less model over time, one colour a column; arguments as of `over_time`."""
+    """Draw measured less predicted over time, one colour for each column, and return the axes.
+
+    Arguments as in `over_time`; `errors` in the unit of the axis.
+    """
     ax = axes_or_new(ax, 6.4, 2.2)
-    thin = slice(None, None, max(len(time) // POINTS, 1))
+    thin = slice(None, None, max(len(time) // MAX_POINTS, 1))
     ax.axhline(0.0, color=MUTED, linewidth=0.6)
     for k in range(len(names)):
         if np.isfinite(errors[:, k]).any():
@@ -79,13 +82,15 @@ def against_tension(
     model: Float[np.ndarray, "3 holds"],
     ax: Axes | None = None,
 ) -> Axes:
-    """Force at the fingertip against tension, N, hold by hold (paper, Fig. 9): circles are measured, crosses the model.
+    """Draw the fingertip force against tension, hold by hold, and return the axes (paper, Fig. 9).
+
+    Circles are measured, crosses are predicted.
 
     Args:
-        tension: N, of the pulled tendon in every hold.
-        measured: mean force of every hold along x, y and z.
+        tension: of the pulled tendon in each hold, N.
+        measured: mean force of each hold along x, y and z, N.
         model: the same as predicted.
-        ax: the axes to draw on; new ones without.
+        ax: the axes to draw on; by default those of a new figure.
     """
     ax = axes_or_new(ax)
     for a, axis in enumerate("xyz"):
