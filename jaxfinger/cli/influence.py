@@ -79,4 +79,4 @@ def influence(
 
 
 def _in_words(name: str, shift: float) -> str:
-    return f"{name} {shift:+.2f}" if isfinite(shift) else f"{name} alone tells of it"
+    return f"{name} {shift:+.2f}" if isfinite(shift) else f"{name} alone determines it"

@@ -136,11 +136,15 @@ def _collect(name: str, topic: _Topic, start: int, variables: dict[str, Variable
             if fault:
                 unusable[called] = fault
         elif len(widths) > 1:
-            lengths = [len(value) if value.ndim else 1 for value in values]
-            turn = next(i for i, length in enumerate(lengths) if length != lengths[0])
+            turn = next(i for i, value in enumerate(values) if value.shape != values[0].shape)
+            before, after = values[0], values[turn]
+            if max(before.ndim, after.ndim) == 1 and before.size != after.size:
+                change = f"length from {before.size} to {after.size}"
+            else:
+                change = f"shape from {before.shape} to {after.shape}"
             unusable[called] = (
-                f"changes its length from {lengths[0]} to {lengths[turn]} at message {indices[turn]}; cut the bag "
-                "there, or log the parts on topics of their own"
+                f"changes its {change} at message {indices[turn]}; cut the bag there, or log the parts on topics of "
+                "their own"
             )
         else:
             array = np.full((count, *widths[0]), np.nan)

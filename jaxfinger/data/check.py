@@ -111,7 +111,7 @@ def _check_motions(session: Session, report: Report) -> None:
             report.warning(
                 "/trials",
                 f"the motion {motion!r} is shared by trials that differ in experiment, joint or tendon; "
-                "their differences are no pure noise: name the motions apart",
+                "their differences are not only noise: give each motion its own name",
             )
 
 

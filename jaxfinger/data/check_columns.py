@@ -40,7 +40,7 @@ def check_columns(session: Session, report: Report) -> None:
                 told.add(pair)
                 first, second = (session.finger.tendon_names[k] for k in pair)
                 message = f"columns {first} and {second} of tendon_excursion look exchanged: {why}"
-                report.warning("/trials", f"{message}; exchange them, or mend what they are held against")
+                report.warning("/trials", f"{message}; exchange them, or correct what contradicts them")
 
 
 def _arms(session: Session) -> dict[int, np.ndarray]:

@@ -60,7 +60,7 @@ def _gravity(finger: FingerDescription, report: Report) -> None:
     size = float(np.linalg.norm(finger.gravity))
     if size == 0.0:
         report.warning(
-            "/finger", "has `gravity` zero: no mass can be seen; write the base frame's gravity, 9.81 m s-2 long"
+            "/finger", "has `gravity` zero: no mass can be identified; write the base frame's gravity, 9.81 m s-2 long"
         )
     elif not 9.0 < size < 10.5:
         report.error("/finger", f"has `gravity` {size:.4g} long; it must be in m s-2, about 9.81")

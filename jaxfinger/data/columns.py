@@ -240,8 +240,8 @@ class ColumnReader:
         values, k = _column(variable, name, spec.column, where)
         _compare_units(variable, spec, units, self.report, where)
         values = _converted(values, spec, units, source, where)
-        here = np.ones(len(values), bool) if variable.present is None else variable.present[:, k]
-        own = self._own_clock(spec, variable, source, here, where)
+        present = np.ones(len(values), bool) if variable.present is None else variable.present[:, k]
+        own = self._own_clock(spec, variable, source, present, where)
         if own is None:
             if len(values) != clock.total and np.ndim(variable.values) == 2 and variable.values.shape[1] == clock.total:
                 where.fail(
@@ -256,12 +256,12 @@ class ColumnReader:
         own_name, time = own
         if len(time) != len(values):
             where.fail(f"has {len(values)} samples, and its clock {own_name} has {len(time)}; name its own clock")
-        time, values = time[here], values[here]
+        time, values = time[present], values[present]
         order = increasing_order(time, own_name, clock.sort, where, self.report)
         return self._onto(time[order], values[order], own_name, whole, where)
 
     def _own_clock(
-        self, spec: Column, variable: Variable, source: Source, here: np.ndarray, where: Place
+        self, spec: Column, variable: Variable, source: Source, present: np.ndarray, where: Place
     ) -> tuple[str, np.ndarray] | None:
         """Name and times, s, of a variable's own clock; None for a variable that shares the trial's rows."""
         clock = self.clock
@@ -276,11 +276,12 @@ class ColumnReader:
         same_rows = shared and variable.clock in (clock.name, main.clock if main else "")
         if not shared and not variable.clock:
             where.fail(f"is of {source.recording.path.name}, not of the trial's own file; name its clock by `time`")
-        if (not variable.clock or same_rows) and (here.all() or here[clock.rows].all()):
+        if (not variable.clock or same_rows) and (present.all() or present[clock.rows].all()):
             return None
         if not clock.name:
-            where.fail("is on a clock of its own, and `rate_hz` says no time; name the trial's `time`")
+            where.fail("is on a clock of its own, which `rate_hz` cannot be compared with; name the trial's `time`")
         own = variable.clock or clock.name
+        # A trial that goes by the headers' stamps compares them with stamps, not with times of logging.
         stamp = own.removesuffix(".time") + ".stamp"
         if clock.name.endswith(".stamp") and stamp in known_clocks:
             own = stamp
@@ -297,6 +298,16 @@ class ColumnReader:
         time, values = time[good], values[good]
         if len(time) < 2:
             where.fail(f"the clock {name} holds {len(time)} samples; name a clock that runs through the trial")
+        self._check_clock(time, name, where)
+        self.begin, self.end = max(self.begin, time[0]), min(self.end, time[-1])
+        if whole:
+            values = values[np.clip(np.searchsorted(time, trial, "right") - 1, 0, len(time) - 1)]
+            return np.where((trial >= time[0]) & (trial <= time[-1]), values, np.nan)
+        return np.interp(trial, time, values, left=np.nan, right=np.nan)
+
+    def _check_clock(self, time: np.ndarray, name: str, where: Place) -> None:
+        """Refuse a clock that does not fit the trial's, and warn of gaps in it and of samples that it cuts off."""
+        trial = self.clock.time
         runs = (
             f"the clock {name} runs from {time[0]:.10g} to {time[-1]:.10g} s, "
             f"the trial from {trial[0]:.10g} to {trial[-1]:.10g} s"
@@ -304,8 +315,10 @@ class ColumnReader:
         inside = (trial >= time[0]) & (trial <= time[-1])
         if not inside.any():
             where.fail(f"{runs}; they do not overlap: name a clock that counts from the same start, in the same units")
+        steps = np.diff(time)
+        step = float(np.median(steps))
         longer = (time[-1] - time[0]) / max(trial[-1] - trial[0], 1e-12)
-        slower = np.median(np.diff(time)) / max(float(np.median(np.diff(trial))) if len(trial) > 1 else 0.0, 1e-12)
+        slower = step / max(float(np.median(np.diff(trial))) if len(trial) > 1 else 0.0, 1e-12)
         few = int(((time >= trial[0]) & (time <= trial[-1])).sum())
         units_differ = min(longer, slower) > _MAX_CLOCK_RATIO or max(longer, slower) < 1.0 / _MAX_CLOCK_RATIO
         if units_differ or few < _MIN_SAMPLES <= len(time):
@@ -319,23 +332,16 @@ class ColumnReader:
                 f"{runs}: it covers only a part; name another clock, or cut the trial by span = "
                 f"[{begin:.4g}, {end:.4g}]"
             )
-        step = float(np.median(np.diff(time)))
         if step > _MAX_INTERVAL:
             self.report.warning(
                 where.key, f"the clock {name} ticks every {step:.3g} s; convert ms to s if that is what it is"
             )
-        gaps = np.diff(time) > max(20.0 * step, 0.1)
+        gaps = steps > max(20.0 * step, 0.1)  # Jitter is shorter than 20 intervals, commanded motion slower than 0.1 s.
         if gaps.any():
-            longest = float(np.diff(time).max())
-            count = f"{counted(int(gaps.sum()), 'gap')}, the longest {longest:.3g} s"
-            self.report.warning(where.key, f"the clock {name} has {count}; values there are lines")
-        self.begin, self.end = max(self.begin, time[0]), min(self.end, time[-1])
+            count = f"{counted(int(gaps.sum()), 'gap')}, the longest {float(steps.max()):.3g} s"
+            self.report.warning(where.key, f"the clock {name} has {count}; values in gaps are interpolated")
         if max(time[0] - trial[0], trial[-1] - time[-1]) > 2.0 * step:
             self.report.warning(where.key, f"{runs}; the trial is cut to what both cover")
-        if whole:
-            values = values[np.clip(np.searchsorted(time, trial, "right") - 1, 0, len(time) - 1)]
-            return np.where(inside, values, np.nan)
-        return np.interp(trial, time, values, left=np.nan, right=np.nan)
 
     @property
     def covered(self) -> np.ndarray:

@@ -47,6 +47,31 @@ def test_mcap_cut_short_is_read_to_the_cut(tmp_path):
     np.testing.assert_array_equal(position, np.arange(len(position))[:, None] * [0.1, -0.2])
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "words"),
+    [
+        ([1.0, 2.0], [1.0, 2.0, 3.0], "changes its length from 2 to 3 at message 1"),
+        (1.0, [1.0], "changes its shape from () to (1,) at message 1"),
+        ([[1.0, 2.0]], [[1.0]], "changes its shape from (1, 2) to (1, 1) at message 1"),
+    ],
+)
+def test_a_field_that_changes_its_shape_is_unusable_and_the_others_are_read(tmp_path, first, second, words):
+    from mcap.writer import Writer
+
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("state", "jsonschema", b"{}")
+        channel = writer.register_channel("/state", "json", schema)
+        for i, value in enumerate((first, second)):
+            body = json.dumps({"x": value, "y": i}).encode()
+            writer.add_message(channel, log_time=i, publish_time=i, data=body)
+        writer.finish()
+    found = load_recording(tmp_path / "log.mcap")
+    assert words in found.unusable["/state.x"]
+    np.testing.assert_array_equal(found.variables["/state.y"].values, [0, 1])
+
+
 def write_rosbag2(path):
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
