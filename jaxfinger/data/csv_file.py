@@ -11,7 +11,7 @@ import codecs
 import csv
 import re
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,8 +22,6 @@ from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.errors import UserError, counted
 
 _COMMENTS = ("#", "%")
-# Pairs of separator and decimal mark; None is any run of blanks. Among equally good ones the first is taken.
-_DIALECTS = ((",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("|", "."), (None, "."), (None, ","))
 _DIALECT_LINES = 60  # They decide the dialect, and are taken from the middle of the file, after any header.
 _BOOLEANS = {"true": 1.0, "false": 0.0}
 _UNIT = r"%|°|deg|rad|turn|rev|rpm|k?Hz|[mun]?s|[munc]?m|[mk]?N|[mk]?N[ ·*]?[cm]?m|[mu]?A|[mk]?V|°?C|K|[mk]?g|1|-|bool"
@@ -31,6 +29,29 @@ _UNIT_CELL = re.compile(rf"^[\[(]?({_UNIT}|{_UNIT}/s2?|)[\])]?$")
 _UNIT_SUFFIX = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")  # in brackets after a name
 _DATE = re.compile(r"^\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
 _SCOPE = "SampleTime[ms]"  # header of TwinCAT Scope, which writes a column of times in ms beside each channel
+
+
+@dataclass(frozen=True)
+class _Dialect:
+    """Separator of the cells (None is any run of blanks) and decimal mark."""
+
+    separator: str | None
+    mark: str
+
+    def split(self, line: str) -> list[str]:
+        """Cells of a line, with decimal points."""
+        cells = line.split() if self.separator is None else next(csv.reader([line], delimiter=self.separator), [])
+        cells = [cell.strip() for cell in cells]
+        if self.mark == ",":
+            cells = [cell.replace(",", ".") if cell.count(",") == 1 else cell for cell in cells]
+        return cells
+
+
+# Of equally good dialects the first is taken.
+_DIALECTS = tuple(
+    _Dialect(*pair)
+    for pair in ((",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("|", "."), (None, "."), (None, ","))
+)
 
 
 @dataclass(frozen=True)
@@ -52,12 +73,13 @@ def load_csv(path: Path) -> Recording:
     if not body:
         raise UserError(f"{path}: holds no samples; it needs a line of names, then one line a sample")
     sample = body[len(body) // 2 :][:_DIALECT_LINES]
-    split, numeric = _dialect([line.text for line in sample])
+    dialect, numeric = _find_dialect([line.text for line in sample])
+    split = dialect.split
     if not any(numeric):
         raise UserError(f"{path}: holds no column of numbers; give a table with one line a sample")
     first = next(i for i, line in enumerate(body) if _is_sample(split(line.text), numeric))
     above = [line for line in lines if line.number < body[first].number]
-    names, units, scope = _names(above, split, len(numeric))
+    names, units, scope = _names(above, dialect, len(numeric))
     if not names and first > 0 and len(split(body[first - 1].text)) != len(numeric):
         given = counted(len(split(body[first - 1].text)), "column")
         raise UserError(f"{path}: names {given} and holds {len(numeric)}; give each column one name")
@@ -66,7 +88,7 @@ def load_csv(path: Path) -> Recording:
         names, body = tuple(split(body[0].text)), body[1:]  # pandas writes such a line over unnamed columns.
     if len(body) > 1 and len(split(body[-1].text)) < len(numeric):
         body, remarks = body[:-1], ("its last line is cut short and is left out",)
-    columns, faults = _columns(path, body, split, numeric)
+    columns, faults = _columns(path, body, dialect, numeric)
     if scope:
         return _pairs(path, columns, faults, names, units)
     return _named(path, columns, faults, names, units, remarks)
@@ -82,7 +104,7 @@ def _decode(raw: bytes) -> str:
     for mark, encoding in marks:
         if raw.startswith(mark):
             return raw.decode(encoding, errors="replace")
-    if raw[1:200:2].count(0) > 20:
+    if raw[1:200:2].count(0) > 20:  # Latin text in UTF-16 has a zero in every second byte.
         return raw.decode("utf-16-le", errors="replace")
     try:
         return raw.decode("utf-8")
@@ -90,15 +112,11 @@ def _decode(raw: bytes) -> str:
         return raw.decode("cp1252", errors="replace")
 
 
-Split = Callable[[str], list[str]]
-
-
-def _dialect(sample: Sequence[str]) -> tuple[Split, list[bool]]:
-    """Find the dialect: a function that splits a line into cells with decimal points, and a mask of numeric columns."""
-    best: tuple[tuple[float, int], Split, list[bool]] | None = None
-    for separator, mark in _DIALECTS:
-        split = _splitter(separator, mark)
-        rows = [split(line) for line in sample]
+def _find_dialect(sample: Sequence[str]) -> tuple[_Dialect, list[bool]]:
+    """Dialect of a file by some of its lines, and a mask of the columns that hold numbers."""
+    best: tuple[tuple[float, int], _Dialect, list[bool]] | None = None
+    for dialect in _DIALECTS:
+        rows = [dialect.split(line) for line in sample]
         widths = [len(row) for row in rows]
         width = max(set(widths), key=widths.count)
         rows = [row for row in rows if len(row) == width]
@@ -106,21 +124,11 @@ def _dialect(sample: Sequence[str]) -> tuple[Split, list[bool]]:
         filled = np.array([[bool(cell) for cell in row] for row in rows])
         numeric = ((numbers & filled).sum(axis=0) * 2 > filled.sum(axis=0)) | ~filled.any(axis=0)
         share = float((numbers & filled).sum()) / max(int(filled.sum()), 1) * len(rows) / len(sample)
-        score = (round(share, 2), width)
+        score = (round(share, 2), width)  # Among dialects with about the same share of numbers, more columns win.
         if best is None or score > best[0]:
-            best = score, split, numeric.tolist()
+            best = score, dialect, numeric.tolist()
     assert best is not None
     return best[1], best[2] if best[0][0] > 0.0 else [False]
-
-
-def _splitter(separator: str | None, mark: str) -> Split:
-    def split(line: str) -> list[str]:
-        cells = line.split() if separator is None else next(csv.reader([line], delimiter=separator), [])
-        cells = [cell.strip() for cell in cells]
-        return [cell.replace(",", ".") if cell.count(",") == 1 else cell for cell in cells] if mark == "," else cells
-
-    split.separator, split.mark = separator, mark  # type: ignore[attr-defined]
-    return split
 
 
 def _cell(cell: str) -> float | None:
@@ -145,7 +153,7 @@ def _is_sample(cells: Sequence[str], numeric: Sequence[bool]) -> bool:
     return len(cells) == len(numeric) and None not in values and not all(np.isnan(v) for v in values if v is not None)
 
 
-def _names(above: Sequence[_Line], split: Split, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
+def _names(above: Sequence[_Line], dialect: _Dialect, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
     """Names of the columns, their units, and whether they are pairs of time and value as TwinCAT Scope writes them.
 
     The names are the nearest line above the numbers that has a cell for each column and holds no units. They may stand
@@ -155,7 +163,7 @@ def _names(above: Sequence[_Line], split: Split, width: int) -> tuple[tuple[str,
     for line in reversed(above):
         text = line.text.strip()
         plain = text.lstrip("".join(_COMMENTS)).strip()
-        cells = split(line.text if plain == text else plain)
+        cells = dialect.split(line.text if plain == text else plain)
         if plain != text and len(cells) != width:
             cells = plain.replace(",", " ").split()
         if len(cells) == width and any(cells):
@@ -171,15 +179,14 @@ def _names(above: Sequence[_Line], split: Split, width: int) -> tuple[tuple[str,
 
 
 def _columns(
-    path: Path, body: Sequence[_Line], split: Split, numeric: Sequence[bool]
+    path: Path, body: Sequence[_Line], dialect: _Dialect, numeric: Sequence[bool]
 ) -> tuple[list[np.ndarray | None], list[str]]:
     """Columns as numbers and a fault for each: None with the reason where a cell is no number, else an empty string."""
-    separator, mark = split.separator, split.mark  # type: ignore[attr-defined]
-    width, texts = len(numeric), [line.text for line in body]
+    separator, width, texts = dialect.separator, len(numeric), [line.text for line in body]
     plain = all(numeric) and separator is not None and not any('"' in text for text in texts)
     if plain and all(text.count(str(separator)) == width - 1 for text in texts):
         try:  # numpy reads plain numbers much faster than the loop below.
-            if mark == ",":
+            if dialect.mark == ",":
                 texts = [text.replace(",", ".") for text in texts]
             table = np.loadtxt(texts, delimiter=separator, ndmin=2, comments=None)
             return list(table.T), [""] * width
@@ -187,7 +194,7 @@ def _columns(
             pass
     rows = []
     for line in body:
-        rows.append(split(line.text))
+        rows.append(dialect.split(line.text))
         if len(rows[-1]) != width:
             raise UserError(
                 f"{path}: line {line.number} has {len(rows[-1])} cells, the others have {width}; correct or drop it"
