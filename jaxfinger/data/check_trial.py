@@ -27,16 +27,16 @@ _STEPPED = ("ID.3-static", "ID.4", "VD.2")
 
 def check_trial(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
     """Report every fault of one trial. `sizes` are those of its session."""
-    _named(trial, finger, report)
+    _attributes(trial, finger, report)
     _time(trial, report)
     for name in MEASURED:
         if getattr(trial, name) is not None:
-            _holes(trial, name, finger, sizes, report)
-    _present(trial, finger, report)
+            _nan(trial, name, finger, sizes, report)
+    _channels(trial, finger, report)
     _motion(trial, finger, sizes, report)
-    _dead(trial, finger, report)
-    _jumps(trial, finger, report)
-    _sizes(trial, finger, sizes, report)
+    _constant_columns(trial, finger, report)
+    _encoder_wraps(trial, finger, report)
+    _magnitudes(trial, finger, sizes, report)
     _holds(trial, report)
 
 
@@ -44,14 +44,14 @@ def _place(trial: Trial, channel: str = "") -> str:
     return f"/trials/{trial.name}/{channel}".rstrip("/")
 
 
-def _named(trial: Trial, finger: FingerDescription, report: Report) -> None:
+def _attributes(trial: Trial, finger: FingerDescription, report: Report) -> None:
     """Check that the attributes `joint` and `tendon` fit the experiment and the finger's tables."""
     place = _place(trial)
     for kind, value, names, needed in (
         ("joint", trial.joint, finger.joint_names, trial.experiment in NEEDS_JOINT),
         ("tendon", trial.tendon, finger.tendon_names, trial.experiment in NEEDS_TENDON),
     ):
-        if value is None and needed and not (kind == "joint" and _several(trial, finger)):
+        if value is None and needed and not (kind == "joint" and _several_joints(trial, finger)):
             report.error(
                 place, f"is {trial.experiment} and has no attribute `{kind}`; write which one of {listed(names)}"
             )
@@ -72,10 +72,10 @@ def _named(trial: Trial, finger: FingerDescription, report: Report) -> None:
         report.error(place, f"{message}; correct the trial or /finger/tendons/crosses")
 
 
-def _several(trial: Trial, finger: FingerDescription) -> bool:
+def _several_joints(trial: Trial, finger: FingerDescription) -> bool:
     """Whether the trial moves, or measures the torque of, more than one joint."""
     if trial.experiment == "ID.2":
-        return sum(bool(span >= still) for span, still in zip(_spans(trial), _still(finger), strict=True)) > 1
+        return sum(bool(span >= still) for span, still in zip(_spans(trial), _still_spans(finger), strict=True)) > 1
     return len(trial.motorised(finger)) > 1
 
 
@@ -114,7 +114,7 @@ def _time(trial: Trial, report: Report) -> None:
         report.warning(place, f"has {lost}; samples were lost, derivatives bridge them")
 
 
-def _holes(trial: Trial, name: str, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
+def _nan(trial: Trial, name: str, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
     """Check NaN: a whole column means «not measured»; within a column only a slack tendon's excursion may be NaN."""
     values = getattr(trial, name)
     bad = ~np.isfinite(values)
@@ -146,7 +146,7 @@ def _slack(trial: Trial, where: np.ndarray, tendon: int, sizes: Sizes) -> bool:
     return trial.tendon_force is not None and bool(np.all(trial.tendon_force[where, tendon] < sizes.slack))
 
 
-def _present(trial: Trial, finger: FingerDescription, report: Report) -> None:
+def _channels(trial: Trial, finger: FingerDescription, report: Report) -> None:
     """Check that the channels that the experiment drives and measures are there."""
     what = trial.experiment
     for name in DRIVES.get(what, ()):
@@ -191,13 +191,14 @@ def _spans(trial: Trial) -> np.ndarray:
     return np.array([_span(column) for column in trial.q.T])
 
 
-def _still(finger: FingerDescription) -> np.ndarray:
+def _still_spans(finger: FingerDescription) -> np.ndarray:
+    """Travel (m,) of each joint, rad or m, below which it stands still."""
     return np.where(finger.prismatic, STILL_DISTANCE, STILL_ANGLE)
 
 
 def _motion(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
     """Check that the joints and tendons that the experiment moves do move, and that those it holds stand still."""
-    spans, still = _spans(trial), _still(finger)
+    spans, still = _spans(trial), _still_spans(finger)
     say = report.error if trial.complete else report.warning
     place = _place(trial, "q")
     moved = _index(finger.joint_names, trial.joint) if trial.experiment in _MOVES_JOINT else None
@@ -228,7 +229,7 @@ def _motion(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repor
         report.warning(_place(trial, "tendon_force"), f"{message}: nothing of the trial is judged; pull it slower")
 
 
-def _dead(trial: Trial, finger: FingerDescription, report: Report) -> None:
+def _constant_columns(trial: Trial, finger: FingerDescription, report: Report) -> None:
     """Report measured columns that never change: every sensor has noise, so such a column is not connected."""
     if len(trial.time) < _MIN_SAMPLES:
         return
@@ -257,7 +258,7 @@ def _dead(trial: Trial, finger: FingerDescription, report: Report) -> None:
             )
 
 
-def _jumps(trial: Trial, finger: FingerDescription, report: Report) -> None:
+def _encoder_wraps(trial: Trial, finger: FingerDescription, report: Report) -> None:
     """Report encoders that wrap: no joint goes half of the whole trial's travel between two samples."""
     for k, name in enumerate(finger.joint_names):
         x = trial.q[:, k]
@@ -278,7 +279,7 @@ def _jumps(trial: Trial, finger: FingerDescription, report: Report) -> None:
         )
 
 
-def _sizes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
+def _magnitudes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
     """Check that values have plausible sizes in SI units, and tensions the right sign."""
     turning = ~np.array(finger.prismatic)
     for k, name in enumerate(finger.joint_names):

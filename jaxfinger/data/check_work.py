@@ -11,13 +11,14 @@ Where a law fails, a sign, a unit or a column is wrong in one of the channels th
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
 from jaxfinger.data.filtering import low_pass, smooth
 from jaxfinger.data.findings import Report
 from jaxfinger.data.motion import CUTOFF_HZ, STILL_SHARE, directions, fitting_cutoff
+from jaxfinger.data.parse import listed
 from jaxfinger.data.session import FingerDescription, Session, Trial
 
 _DEGREE = 3  # of l(q): the moment arm is then a parabola over a joint's range, enough to tell a sign or a unit
@@ -43,9 +44,9 @@ def check_work(session: Session, report: Report) -> None:
         _passivity(session, report)
         return
     kinematic = _Excursions(session)
-    _lengths(kinematic.arms, finger, report)
+    _arm_lengths(kinematic.arms, finger, report)
     _virtual_work(session, kinematic, report)
-    _paths(session, kinematic, report)
+    _free_paths(session, kinematic, report)
     _fingertip(session, report)
     _passivity(session, report)
 
@@ -93,7 +94,7 @@ def slope(x: np.ndarray, y: np.ndarray) -> float:
     return float(x @ y / (x @ x)) if len(x) > 10 and np.ptp(x) > 0.0 else np.nan
 
 
-def _lengths(arms: Arms, finger: FingerDescription, report: Report) -> None:
+def _arm_lengths(arms: Arms, finger: FingerDescription, report: Report) -> None:
     """Report joints whose largest moment arm does not fit the finger's length."""
     length = float(np.linalg.norm(finger.origin, axis=1)[1:].sum() + np.linalg.norm(finger.fingertip))
     for i, joint in enumerate(finger.joint_names):
@@ -131,11 +132,11 @@ def _virtual_work(session: Session, kinematic: _Excursions, report: Report) -> N
             report.warning(
                 "/trials",
                 "moment arms that excursions show (ID.2) and those that torques show (ID.4) contradict each other: "
-                f"{_some(found)}; check {what} of joint_torque, tendon_excursion, tendon_force or q",
+                f"{listed(found, 3)}; check {what} of joint_torque, tendon_excursion, tendon_force or q",
             )
 
 
-def _paths(session: Session, kinematic: _Excursions, report: Report) -> None:
+def _free_paths(session: Session, kinematic: _Excursions, report: Report) -> None:
     """Report free motions whose excursions contradict those of ID.2."""
     finger = session.finger
     found = []
@@ -155,8 +156,8 @@ def _paths(session: Session, kinematic: _Excursions, report: Report) -> None:
     if found:
         report.warning(
             "/trials",
-            f"excursions along free paths are not those that ID.2 shows: {_some(found)}; check sign, units and columns "
-            "of tendon_excursion and q in these trials",
+            f"excursions along free paths are not those that ID.2 shows: {listed(found, 3)}; check sign, units and "
+            "columns of tendon_excursion and q in these trials",
         )
 
 
@@ -172,7 +173,8 @@ def _fingertip(session: Session, report: Report) -> None:
             found.append(f"{size:.3g} N for each N of {trial.tendon} in {trial.name}")
     if found:
         report.warning(
-            "/trials", f"the fingertip presses with {_some(found)}; check the units of fingertip_force and tendon_force"
+            "/trials",
+            f"the fingertip presses with {listed(found, 3)}; check the units of fingertip_force and tendon_force",
         )
 
 
@@ -190,7 +192,7 @@ def _passivity(session: Session, report: Report) -> None:
     if found:
         report.warning(
             "/trials",
-            f"the external motor takes work out of the joint in every cycle: {_some(found)}; check the sign of "
+            f"the external motor takes work out of the joint in every cycle: {listed(found, 3)}; check the sign of "
             "joint_torque and of q",
         )
 
@@ -202,27 +204,23 @@ def _friction_share(trial: Trial, joint: int) -> float:
     if not (np.isfinite(q).all() and np.isfinite(torque).all() and np.ptp(torque) > 0.0):
         return np.nan
     cutoff = fitting_cutoff(trial.time, CUTOFF_HZ)
-    way = _way(trial, joint, cutoff)
+    direction = _direction(trial, joint, cutoff)
     q, torque = (low_pass(trial.time, x, cutoff)[:, 0] for x in (q, torque))
-    columns = np.column_stack([way, np.polynomial.polynomial.polyvander((q - q.mean()) / np.ptp(q), 5)])[way != 0.0]
+    moves, powers = direction != 0.0, np.polynomial.polynomial.polyvander((q - q.mean()) / np.ptp(q), 5)
+    columns = np.column_stack([direction, powers])[moves]
     if len(columns) < 50 or np.ptp(columns[:, 0]) == 0.0:
         return np.nan  # In one direction only, friction and elastic torque cannot be told apart.
     if trial.experiment != "ID.3-static" and np.count_nonzero(np.diff(columns[:, 0])) < _MIN_TURNS:
         return np.nan
-    R = np.asarray(np.linalg.qr(np.column_stack([columns, torque[way != 0.0]]), mode="r"))
+    R = np.asarray(np.linalg.qr(np.column_stack([columns, torque[moves]]), mode="r"))
     # There may be fewer held angles than coefficients, so `lstsq` gives the smallest coefficients that fit.
     least = np.linalg.lstsq(R[:-1, :-1], R[:-1, -1])[0]
     return float(least[0] / np.std(torque))
 
 
-def _way(trial: Trial, joint: int, cutoff: float) -> np.ndarray:
+def _direction(trial: Trial, joint: int, cutoff: float) -> np.ndarray:
     """Direction (N,) of a joint's motion: the file's channel, or derived from its filtered speed."""
     if trial.joint_direction is not None:
         return trial.joint_direction[:, joint].astype(float)
     rate = smooth(trial.time, trial.q[:, [joint]], cutoff)[1]
     return directions(rate, STILL_SHARE * np.percentile(np.abs(rate), 99, axis=0))[:, 0]
-
-
-def _some(found: Iterable[str], most: int = 3) -> str:
-    found = list(found)
-    return ", ".join(found[:most]) + (f" and {len(found) - most} more" if len(found) > most else "")

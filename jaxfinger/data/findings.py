@@ -67,6 +67,7 @@ def merged(findings: Iterable[Finding], named: int = 3) -> list[Finding]:
     alike: dict[object, list[tuple[Finding, str]]] = {}
     for finding in findings:
         at = _TRIAL.fullmatch(finding.place)
+        # A finding about no trial has a key of its own.
         key = (finding.severity, finding.local, at[2], _NUMBER.sub("", finding.message)) if at else object()
         alike.setdefault(key, []).append((finding, at[1] if at else ""))
     out = []
