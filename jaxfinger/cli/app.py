@@ -36,7 +36,7 @@ COMMANDS = {
     "validate": ("model:validate", "How well a fit predicts the trials of a session."),
     "predict": ("model:predict", "What a fit predicts for every sample of a session."),
     "show": ("model:show", "What a fit file says."),
-    "influence": ("influence:influence", "Which trials, sensors and CAD values hold each parameter of a fit."),
+    "influence": ("influence:influence", "On which trials, sensors and CAD values each parameter of a fit depends."),
     "diagnose": (
         "diagnose:diagnose",
         "Where the model misses the finger, what is to blame, how far it shrinks.",

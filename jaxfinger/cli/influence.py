@@ -15,7 +15,7 @@ STEPS = {"trials": "left out", "sensors": "gain + 1 %", "cad": "+ 1 standard dev
 def influence(
     fit: Path, file: Path, *, figure: Path | None = None, json: bool = False, overwrite: bool = False
 ) -> None:
-    """Say which trials, sensors and CAD values hold each parameter where it is.
+    """Show on which trials, sensors and CAD values each parameter depends.
 
     A derivative, not a rerun: by how many of its standard deviations a parameter moves when a trial is left out, a
     sensor reads one per cent more, or a value of CAD is one standard deviation larger.

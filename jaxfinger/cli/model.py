@@ -145,7 +145,7 @@ def fit_id4(
     json: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Fit the tendons' friction alone (ID.4); it stands on the moment arms and joint torques of `start`.
+    """Fit the tendons' friction alone (ID.4), with the moment arms and joint torques of `start`.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ def check_file(path: str | os.PathLike) -> list[Finding]:
 def read_and_check(path: str | os.PathLike, trials: Collection[str] | None = None) -> tuple[Session | None, Report]:
     """Read a file, or only the named trials: the session, None where it is unusable, and the findings about it.
 
-    Checks that look at every sample are left to `check_samples`.
+    The slow checks, for spikes and contradictions, are left to `check_samples`.
     """
     report = Report()
     file = open_file(path, report)
@@ -65,7 +65,7 @@ def read_and_check(path: str | os.PathLike, trials: Collection[str] | None = Non
 
 
 def check_session(session: Session, report: Report) -> None:
-    """Report every fault of a session in memory that shows without a look at every sample."""
+    """Report every fault of a session in memory, except those that `check_samples` finds."""
     # Extreme numbers may overflow; the checks themselves report them.
     with np.errstate(all="ignore"):
         check_finger(session.finger, report)
@@ -140,7 +140,7 @@ def _check_created(created: str, report: Report) -> None:
 
 
 def check_samples(session: Session, report: Report) -> None:
-    """Report spikes, and channels that contradict each other: the checks that look at every sample."""
+    """Report spikes, and channels that contradict each other. These checks are slow, as they filter every channel."""
     with np.errstate(all="ignore"):
         check_spikes(session, report)
         if report.fatal is None:

@@ -71,8 +71,8 @@ def merged(findings: Iterable[Finding], named: int = 3) -> list[Finding]:
         key = (finding.severity, finding.local, at[2], _NUMBER.sub("", finding.message)) if at else object()
         alike.setdefault(key, []).append((finding, at[1] if at else ""))
     out = []
-    for (first, of), *others in alike.values():
-        names = list(dict.fromkeys(name for _, name in others if name != of))
+    for (first, trial), *others in alike.values():
+        names = list(dict.fromkeys(name for _, name in others if name != trial))
         if names:
             rest = f" and {len(names) - named} more" if len(names) > named else ""
             also = f" (likewise in {counted(len(names), 'other trial')}: {', '.join(names[:named])}{rest})"
