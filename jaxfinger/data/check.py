@@ -140,7 +140,7 @@ def _check_created(created: str, report: Report) -> None:
 
 
 def check_samples(session: Session, report: Report) -> None:
-    """Report spikes, and channels that contradict each other. These checks are slow, as they filter every channel."""
+    """Report spikes, and channels that contradict each other. These checks are slow: they go through every sample."""
     with np.errstate(all="ignore"):
         check_spikes(session, report)
         if report.fatal is None:
