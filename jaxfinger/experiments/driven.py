@@ -23,14 +23,14 @@ from jaxfinger.experiments.shrink import shrink
 
 NONE_VALID = "nowhere do a joint and its tendons slide for long enough that the direction of their friction is known"
 
-# A joint or tendon slides for certain above these speeds; below, it may stick and its friction is unknown. Noise is
-# that of the speed itself (`data.motion`).
+# A joint or tendon slides for certain above these speeds; below, it may stick and its friction is unknown. The noise of
+# a speed is a median (`data.motion.speed_noise`), two thirds of a standard deviation.
 MIN_SPEED_SHARE = 0.05  # of the motion's speed, for a joint that tendons drive and that may stick and slip
-MIN_SPEED_TO_NOISE = 3.0  # times the noise, for a joint that a motor moves; the share above where that is less
-MIN_TENDON_SPEED_TO_NOISE = 2.5  # times the noise, for a tendon
+MIN_SPEED_TO_NOISE = 3.0  # two standard deviations, for a joint that a motor moves; the share above where that is less
+MIN_TENDON_SPEED_TO_NOISE = 2.5  # 1.7 standard deviations, for a tendon, and half of that in the quicker filter
 # A slip between two stops is shorter than the slow filter, which then loses speed against the quick one.
 MAX_LOST_SPEED_SHARE = 0.5  # of a joint's speed that the slow filter may lose; stick and slip lose 1 to 3 times it
-MIN_SLIP_TO_NOISE = 15.0  # times the noise: a smaller loss is not a slip
+MIN_SLIP_TO_NOISE = 15.0  # ten standard deviations: a smaller loss is not a slip
 ROUNDING_SHARE = 1e-6  # of the motion's speed: a loss by rounding, of a joint at rest in a simulated file
 CLEAR_WIDTHS = 2.3  # widths of the filter left out on either side of unknown friction: 1 % of a jump remains beyond
 # Widths left out after a joint that no motor moves has broken away: it does so suddenly.
@@ -110,6 +110,7 @@ def tendon_directions(r: PreparedTrial, rates) -> Float[np.ndarray, "N n"]:
     if rates is None:
         return np.zeros((len(r.trial.time), r.finger.n))
     slow, quick = rates
+    # The direction is needed, too, where sliding is not certain: it holds on down to a tenth of that speed.
     noise, speed = speed_noise(slow, quick), np.percentile(np.abs(slow), 95, axis=0)
     return directions(slow, np.minimum(0.1 * MIN_TENDON_SPEED_TO_NOISE * noise, 0.1 * speed))
 

@@ -103,6 +103,7 @@ def not_judged(stacks: dict[str, Stack]) -> list[NotJudged]:
 def _stack(spec: Experiment, trials: list[Trial], reduced_trials: list[tuple[Row, dict[str, bool]]], reduced) -> Stack:
     rows = [row for row, _ in reduced_trials]
     steps = {round(r.dt, 6) for r in rows}
+    # One noise model serves all trials of a stack, so that their sampling times must be alike.
     if reduced and max(steps) > 1.5 * min(steps):
         raise UserError(
             f"the {spec.name} trials are sampled at different rates ({min(steps):g} s and {max(steps):g} s a sample "

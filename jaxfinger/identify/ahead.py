@@ -92,6 +92,7 @@ def _changed(
     W = time.size
     padded = time[np.minimum(np.arange(padded_size(W, 2)), W - 1)]  # pad to a common shape with the last start
     two = (np.asarray(_simulate(model, starts(m, padded, horizon, noise)))[..., :W] for noise in (None, rng))
+    # A simulation that overflows counts as far out of range.
     exact, noisy = (np.nan_to_num(q, nan=1e3, posinf=1e3, neginf=-1e3) for q in two)
     return exact, noisy - exact
 

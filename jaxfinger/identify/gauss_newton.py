@@ -32,6 +32,8 @@ MIN_RELATIVE_SINGULAR_VALUE = 1e-7
 # Actual descent over predicted descent. Below the first a step is rejected, below the second the next one is shorter,
 # above the third it is longer (Nocedal and Wright 2006, algorithm 4.1, with a small η).
 MIN_DESCENT_RATIO, POOR_DESCENT_RATIO, GOOD_DESCENT_RATIO = 1e-3, 0.25, 0.75
+# A shortened step over the last one, as in a backtracking line search (Dennis and Schnabel 1996, §6.3.2).
+MIN_SHORTENING, MAX_SHORTENING = 0.1, 0.5
 # Where rounding hides the descent, a step counts as progress if it is at most this share of the last one. A search that
 # converges at this rate or faster ends within a few steps.
 MAX_LENGTH_RATIO = 0.5
@@ -143,10 +145,11 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
         # Minimum of the parabola through the costs at both ends of the tried step, with the slope at its start.
         curved = here.cost - state.cost - state.slope * state.length
         least = -state.slope * state.length**2 / jnp.where(curved > 0.0, 2.0 * curved, 1.0)
-        shorter = jnp.where(finite & (curved > 0.0), least, 0.5 * state.length)
-        shorter = jnp.clip(shorter, 0.1 * state.length, 0.5 * state.length)
+        shorter = jnp.where(finite & (curved > 0.0), least, MAX_SHORTENING * state.length)
+        shorter = jnp.clip(shorter, MIN_SHORTENING * state.length, MAX_SHORTENING * state.length)
         again = jnp.where(follows > GOOD_DESCENT_RATIO, jnp.minimum(1.0, 2.0 * state.length), state.length)
-        again = jnp.where(follows < POOR_DESCENT_RATIO, jnp.clip(least, 0.1 * state.length, state.length), again)
+        poor = jnp.clip(least, MIN_SHORTENING * state.length, state.length)
+        again = jnp.where(follows < POOR_DESCENT_RATIO, poor, again)
         length = jnp.where(first & accept, 1.0, jnp.where(accept, again, shorter))
         # Where rounding hides the change of the cost, the length of the next step shows whether this one was progress.
         no_progress = accept & hidden & (size > MAX_LENGTH_RATIO * state.size)

@@ -13,6 +13,10 @@ from jaxfinger.model import Finger, rigid_body
 # Relative singular values. Below the first a combination is weak: its interval is more than 1000 times as wide as that
 # of the best. Below the second it is invisible: JᵀJ holds the squares, which are then zero to rounding.
 WEAK, INVISIBLE = 1e-3, 1e-7
+# Entries of a unit vector: smaller ones hold less than 0.25 % of its square and are not shown, or less than 9 % and
+# need no remedy.
+SHOWN, DOMINANT = 0.05, 0.3
+RANK_TOLERANCE = 1e-9  # relative, of a regressor's columns and singular values, far above rounding
 
 # Experiment of the format that determines each group of parameters.
 REMEDIES = {
@@ -34,7 +38,7 @@ class Direction:
     """One right singular vector of the white Jacobian, whose columns are scaled to unit length."""
 
     singular_value: float  # relative to the largest
-    shares: dict[str, float]  # entry of each parameter whose magnitude exceeds 0.05, largest first
+    shares: dict[str, float]  # entries of parameters that exceed `SHOWN`, largest first
     remedy: str  # experiments that would determine it; empty where the status is `seen`
 
     @property
@@ -81,12 +85,12 @@ def name_invisible(
 
 
 def _shares(parameters, free, v) -> dict[str, float]:
-    return {parameters[free[k]].name: float(v[k]) for k in np.argsort(-np.abs(v)) if abs(v[k]) > 0.05}
+    return {parameters[free[k]].name: float(v[k]) for k in np.argsort(-np.abs(v)) if abs(v[k]) > SHOWN}
 
 
 def _remedy(parameters, free, v) -> str:
     """Experiments that determine the parameters with the largest entries in the combination."""
-    involved = [parameters[free[k]] for k in np.argsort(-np.abs(v)) if abs(v[k]) > 0.3]
+    involved = [parameters[free[k]] for k in np.argsort(-np.abs(v)) if abs(v[k]) > DOMINANT]
     wanted = [
         REMEDIES[p.group].format(joint=p.joint or "by joint, two of them moved together", tendon=p.tendon)
         for p in involved
@@ -144,9 +148,9 @@ def base_parameters(
         names += [f"{label} {joint}" for label in labels]
     Y = np.stack(columns, axis=1)
     norm = np.linalg.norm(Y, axis=0)
-    Y = Y / np.where(norm > 1e-9 * norm.max(), norm, np.inf)
+    Y = Y / np.where(norm > RANK_TOLERANCE * norm.max(), norm, np.inf)
     _, s, Vt = np.linalg.svd(Y, full_matrices=False)
-    return BaseParameters(tuple(names), s, Vt[s > 1e-9 * s[0]])
+    return BaseParameters(tuple(names), s, Vt[s > RANK_TOLERANCE * s[0]])
 
 
 def _symmetric(a: int, b: int) -> Float[np.ndarray, "3 3"]:

@@ -95,7 +95,8 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         progress("refining from a neutral start")
         neutral = start_values(_neutral(model, free, parameters), free, parameters, sources)
         other, second = solve(neutral, free, sources, prior, huber)
-        if total_cost(other, second, free, prior) < total_cost(model, solution, free, prior) * (1 - 1e-6):
+        before, after = (total_cost(*x, free, prior) for x in ((model, solution), (other, second)))
+        if after < before * (1 - 1e-6):  # beyond rounding
             model, solution = other, second
             warnings = [
                 *name_invisible(parameters, free, solution.invisible),

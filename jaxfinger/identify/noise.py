@@ -28,6 +28,7 @@ MIN_SAMPLES_OF_REPEAT = 20  # common samples of trials that repeat one motion; f
 MIN_SAMPLES_OF_HOLD = 5  # a hold needs more: a straight line takes two of them
 MIN_HOLDS = 20  # more are needed to scale the noise of holds, whose standard deviation is then known to 16 %
 MAX_LAG = 400  # samples over which the means of holds are correlated: 20 s at the rate of held experiments
+MIN_STD = 1e-12  # SI units, of residuals that are all zero, as in noiseless files: it keeps filters finite
 SPECTRUM = 4096  # frequencies at which the noise's spectrum is evaluated: more than ten times the largest lag
 # Samples of the moving average that counts as signal where no motion is repeated: the shorter where the model may lack
 # a law, the longer where it is taken to be right. Of the long-run variance of noise such as VD.3's the shorter removes
@@ -62,7 +63,7 @@ class Noise:
         for j in range(order, -1, -1):
             out[:, j, : j + 1] = np.concatenate([np.ones((len(a), 1)), -a], axis=1) / sigma[:, None]
             if j:
-                last = np.clip(a[:, -1:], -0.99, 0.99)
+                last = np.clip(a[:, -1:], -0.99, 0.99)  # keeps a nearly unstable filter finite
                 a = (a[:, :-1] + last * a[:, -2::-1]) / (1.0 - last**2)
                 sigma = sigma / np.sqrt(1.0 - last[:, 0] ** 2)
         return out
@@ -233,8 +234,8 @@ def _autoregression(series: Series) -> tuple[float, float, np.ndarray]:
     clipped = [(np.clip(e, -limit, limit), m, lost) for e, m, lost in series]
     covariance = np.array([_lagged(clipped, k) for k in range(ORDER + 1)])
     if covariance[0] <= 0:
-        return 1e-12, 1e-12, np.zeros(ORDER)
-    covariance[0] *= 1.0 + 1e-6
+        return MIN_STD, MIN_STD, np.zeros(ORDER)
+    covariance[0] *= 1.0 + 1e-6  # keeps the Toeplitz system regular
     ar = scipy.linalg.solve_toeplitz(covariance[:-1], covariance[1:])
     innovation = covariance[0] - ar @ covariance[1:]
     if not 0 < innovation <= covariance[0] * 1.001:

@@ -43,11 +43,9 @@ from jaxfinger.identify.prior import Prior
 from jaxfinger.model import Model
 
 # Lengths of a step, in standard deviations of the estimate, that end a search.
-STEP_TOLERANCE = 1e-6  # far below an interval, far above rounding
+STEP_TOLERANCE = 1e-6  # a millionth of an interval's half width, and still above rounding
 ROUGH_TOLERANCE = 0.02  # where residuals alone are wanted, for their noise: all white ones change by 0.02 in norm
-KINK_TOLERANCE = (
-    0.1  # of a step that does not lower the cost: the cost has a kink where a tendon slips or a joint turns
-)
+KINK_TOLERANCE = 0.1  # of a rejected step: it lies within a kink of the cost, as where a tendon slips or a joint turns
 MAX_STEPS = 60  # linearisations; it bounds the time of a fit, whose report says when it was reached
 MIN_MASS_SHARE = 0.02  # lower bound of a mass over its starting value: no link is fifty times lighter than CAD says
 PADDING = 48  # problems are padded to a multiple of so many parameters, so that they share compiled programs

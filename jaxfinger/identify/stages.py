@@ -18,7 +18,7 @@ from jaxfinger.data import Session, joints_of, moving_joints
 from jaxfinger.experiments import EXPERIMENTS, Experiment, Stack, not_judged, prepare
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible
-from jaxfinger.identify.noise import SIGNAL_WINDOW, Noise, estimate
+from jaxfinger.identify.noise import MIN_STD, SIGNAL_WINDOW, Noise, estimate
 from jaxfinger.identify.parameters import Parameter, describe, ravel
 from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.prior import Prior
@@ -364,7 +364,7 @@ def first_noise(stack: Stack, channel: str, residual: Float[Array | np.ndarray, 
     residual, mask = np.asarray(residual), np.asarray(stack.batch.mask[channel]) > 0
     step = np.diff(residual, axis=-1)[mask[..., 1:] & mask[..., :-1]]
     size = float(np.median(np.abs(step))) if step.size else 1.0
-    return Noise.white(np.full(len(residual), max(size, 1e-12)), "first guess")
+    return Noise.white(np.full(len(residual), max(size, MIN_STD)), "first guess")
 
 
 def _noise(solution: Solution, stacks, reads, window: int) -> dict[tuple[str, str], Noise]:

@@ -50,7 +50,7 @@ def measured(trial: Trial, stack: Stack, b: int, x: Motion) -> Measured:
     time, N = np.asarray(trial.time), len(trial.time)
     step = float(np.median(np.diff(time)))
     even = np.arange(int(np.floor((time[-1] - time[0]) / step)) + 1) * step
-    cutoff = min(STATE_CUTOFF_RATIO * stack.experiment.cutoff, 0.2 / step)
+    cutoff = min(STATE_CUTOFF_RATIO * stack.experiment.cutoff, 0.2 / step)  # at most as in `Experiment.cutoff_at`
     raw = np.asarray(x.q)[:, b, :N].T
     q, qd, _ = smooth(time, raw, cutoff)
     tension = np.asarray(x.tension)[:, b, :N].T

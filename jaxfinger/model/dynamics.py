@@ -152,7 +152,8 @@ def fingertip_force(model: Model, x: Motion) -> Float[Array, "3 *T"]:
 def contact_map(model: Model, x: Motion) -> Float[Array, "3 m *T"]:
     """Pseudo-inverse of Jᵀ, 1/m: the map from joint torques to the fingertip force that balances them best."""
     _, J = rigid_body.fingertip(model.finger, x.q)
-    # (J Jᵀ + ε I) f = J τ, the minimum-norm solution as ε → 0.
+    # (J Jᵀ + ε I) f = J τ, the minimum-norm solution as ε → 0. ε is 1e-10 of the trace: far above rounding, and without
+    # effect unless the posture is nearly singular.
     gram = jnp.sum(J[:, None] * J[None], axis=2)
     eps = 1e-10 * (gram[0, 0] + gram[1, 1] + gram[2, 2])
     return _solved(gram + eps[None, None] * jnp.eye(3).reshape(3, 3, *(1,) * eps.ndim), J)
