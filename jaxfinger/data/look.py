@@ -255,16 +255,17 @@ def _experiment(
     pulls = [s.high - s.low for s in force]
     pulled = int(np.nanargmax(pulls)) if force and np.isfinite(pulls).any() else 0
     tendon = names["tendon_force"][pulled] if force and pulled < len(names["tendon_force"]) else ""
-    if q and not moved:
+    if q and not moved:  # The joints are held, and a tendon is pulled.
         if not torque and channels.get("fingertip_force"):
             return "VD.2", "", tendon
         stem = recording.path.stem.lower()
         named = [name for name in names["q"] if name.lower() in stem] if len(names["q"]) > 1 else names["q"]
         return "ID.4", named[0] if len(named) == 1 else "?", tendon
-    if torque or not moved or not (force or excursion):
+    if torque or not moved or not (force or excursion):  # A motor moves a joint.
         return ("ID.3-static" if moved and _stepped(recording, q[most]) else "ID.3-dynamic"), joint, ""
     if len(moved) == 1:
         return "ID.2", joint, ""
+    # Several joints are moved, by hand or by the tendons.
     high = max((s.high for s in force), default=0.0)
     return ("VD.3" if max(pulls, default=0.0) > _MIN_TENSION_CHANGE * high else "VD.1"), "", ""
 
