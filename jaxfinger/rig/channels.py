@@ -85,7 +85,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class HardLimits:
+class LoosestLimits:
     """The loosest limits that the controller itself may have (SI). Connecting is refused where its own are looser.
 
     The controller is the backstop of the host: with limits far beyond the host's it would not be one. `heartbeat_s` is
@@ -122,7 +122,7 @@ class RigDescription:
     finger: FingerDescription
     channels: tuple[RigChannel, ...]
     limits: Limits
-    hard: HardLimits
+    loosest_limits: LoosestLimits
     deadlines: Deadlines
     rate_hz: float
     poll_s: float

@@ -228,7 +228,7 @@ def stopped_s(rig: RigDescription, row: Row, results: Results) -> float:
     One that only the controller finds takes its heartbeat time.
     """
     if row.by == CONTROLLER:
-        return rig.hard.heartbeat_s + (PERIOD_S if row.name == "deaf" else 0.0)
+        return rig.loosest_limits.heartbeat_s + (PERIOD_S if row.name == "deaf" else 0.0)
     hits = [hit for (name, _, _), hit in results.items() if name == row.name]
     samples = max((hit[0].seq - BEGIN + 1 if hit else LENGTH for hit in hits), default=0)
     return max(samples / rig.rate_hz - row.shows(rig), 0.0) + rig.poll_s + PERIOD_S

@@ -68,7 +68,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Head:
+class PlanTable:
     """Keys of `[plan]`."""
 
     name: str
@@ -79,7 +79,7 @@ class Head:
 class PlanFile:
     """Tables of a plan file. The keys of a `[[trial]]` depend on its experiment."""
 
-    plan: Head
+    plan: PlanTable
     trial: Annotated[tuple[Mapping[str, Any], ...], NotEmpty()]
 
 

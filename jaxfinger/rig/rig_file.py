@@ -14,7 +14,7 @@ from jaxfinger.data.finger_file import Finger, finger_from
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import Document, Fault, OneOf, Place, Within, one_of, parse_toml, read_toml, structure
 from jaxfinger.rig import backends, contract
-from jaxfinger.rig.channels import ANALOG_KINDS, UNITS, Deadlines, HardLimits, Limits, RigChannel, RigDescription
+from jaxfinger.rig.channels import ANALOG_KINDS, UNITS, Deadlines, Limits, LoosestLimits, RigChannel, RigDescription
 
 # s, default of `frozen_s` for analog channels: a thousand equal values at 1 kHz. Sensor noise prevents them unless the
 # converter's step is much larger than the noise; give a longer `frozen_s` there.
@@ -22,7 +22,7 @@ FROZEN_S = 1.0
 
 
 @dataclass(frozen=True)
-class Head:
+class RigTable:
     """Keys of `[rig]`. `Deadlines` says what each time limits."""
 
     name: str
@@ -131,7 +131,7 @@ class FingertipSensor:
 class RigFile:
     """Tables of a rig file. The keys of `[address]` depend on the backend."""
 
-    rig: Head
+    rig: RigTable
     limits: LimitsTable
     finger: str | Finger
     channel: tuple[ChannelTable, ...]
@@ -172,7 +172,7 @@ def _rig(document: Document) -> RigDescription:
         finger=finger,
         channels=channels,
         limits=limits,
-        hard=_hard_limits(file.controller, limits),
+        loosest_limits=_loosest_limits(file.controller, limits),
         deadlines=Deadlines(
             stale_s=head.stale_s,
             lag_s=head.lag_s,
@@ -267,14 +267,14 @@ def _limits(table: LimitsTable, finger: FingerDescription, kinds: set[str], plac
     )
 
 
-def _hard_limits(table: ControllerTable, limits: Limits) -> HardLimits:
+def _loosest_limits(table: ControllerTable, limits: Limits) -> LoosestLimits:
     """Convert `[controller]` to SI, with twice the host's limits as defaults."""
 
     def or_twice(value: float | None, host: float) -> float:
         return 2 * host if value is None else value
 
     velocity = table.joint_velocity_max_deg_s
-    return HardLimits(
+    return LoosestLimits(
         tension_max=or_twice(table.tension_max, limits.tension_max),
         tension_rate_max=or_twice(table.tension_rate_max, limits.tension_rate_max),
         joint_velocity_max=or_twice(

@@ -140,7 +140,8 @@ class RingRig(Rig):
         A limit of the host may not be looser than the controller's own, nor the controller's looser than `[controller]`
         allows.
         """
-        found, soft, hard = self._record("stLimits", contract.LIMITS), self.description.limits, self.description.hard
+        found, limits = self._record("stLimits", contract.LIMITS), self.description.limits
+        loosest = self.description.loosest_limits
         for name, suffix, unit in (  # A rig file gives velocities in degrees.
             ("tension_max", "", 1.0),
             ("tension_rate_max", "", 1.0),
@@ -149,8 +150,8 @@ class RingRig(Rig):
             ("fingertip_force_max", "", 1.0),
             ("heartbeat_s", "", 1.0),
         ):
-            key, theirs, most = f"{name}{suffix}", float(found[name]), getattr(hard, name)
-            ours = getattr(soft, name, None)  # The host has no limit of its own on the heartbeat.
+            key, theirs, most = f"{name}{suffix}", float(found[name]), getattr(loosest, name)
+            ours = getattr(limits, name, None)  # The host has no limit of its own on the heartbeat.
             if ours is not None and not theirs >= ours - 1e-9:
                 looser = f"is {ours * unit:g}, looser than the controller's {theirs * unit:g}; lower it"
                 self.description.fail("limits", key, looser)

@@ -21,7 +21,7 @@ from typing import Any
 from jaxfinger.rig import contract
 from jaxfinger.rig.simulated.ams import AmsServer
 from jaxfinger.rig.simulated.controller import Controller, HardLimits
-from jaxfinger.rig.simulated.faults import AT_START, CATALOGUE, Fault, parse
+from jaxfinger.rig.simulated.faults import AT_START, CATALOGUE, InjectedFault, parse
 
 NET_ID = "127.0.0.1.1.1"
 BURST = 100  # cycles in a row before ADS requests get the memory
@@ -149,7 +149,7 @@ def running(speed: float = 1.0, heartbeat: float = 0.25, seed: int = 0, filtered
         yield bench.where
 
 
-def make(speed: float, heartbeat: float, seed: int, filtered: bool, faults: Sequence[Fault]) -> Controller:
+def make(speed: float, heartbeat: float, seed: int, filtered: bool, faults: Sequence[InjectedFault]) -> Controller:
     """Return the controller that the command line asks for."""
     at_start = {fault.name: fault.amount for fault in faults if fault.name in AT_START}
     limits = HardLimits(heartbeat_s=at_start.get("watchdog", heartbeat * (speed or 1.0)))
