@@ -191,7 +191,7 @@ _SENTENCES = {
     Trip.TRACKING: "tendon tension does not follow its set-point",
     Trip.TEMPERATURE: "motor temperature above its limit",
     Trip.LAG: "the host is too far behind the rig",
-    Trip.CONTRACT: "the controller says what the contract does not know",
+    Trip.CONTRACT: "the controller reports a state that the contract does not define",
 }
 
 

@@ -375,7 +375,7 @@ def _known(codes: type[Code], code: int, what: str) -> Code:
     try:
         return codes(code)
     except ValueError:
-        raise RigError(f"the controller's {what} is {code}, which the contract does not know; {REMEDY}.") from None
+        raise RigError(f"the controller's {what} is {code}, which the contract does not define; {REMEDY}.") from None
 
 
 def _bandwidth(hertz: float) -> float | None:

@@ -263,5 +263,5 @@ def test_a_code_that_the_contract_does_not_know_is_a_sentence(rig, field, says):
     machine = small(rig)
     at = machine.controller.place["stStatus"][0] + contract.STATUS.fields[field][1]
     machine.controller.memory[at : at + 4] = np.uint32(77).tobytes()
-    with pytest.raises(UserError, match=f"the controller's {says}, which the contract does not know"):
+    with pytest.raises(UserError, match=f"the controller's {says}, which the contract does not define"):
         machine.connect()
