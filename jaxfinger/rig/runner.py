@@ -73,8 +73,8 @@ class ControllerStopped(TrialEnded):
 class Runner:
     """Carries out protocols on an open rig, in the thread that calls it.
 
-    `watch` is the watch over this run, `tare` holds the zeros of the tared channels (SI), `t0` the device time (ns) of
-    the session's first recorded sample.
+    `watch` is the watch over this run, `tare` holds the zeros of the tared channels (SI), `t0` the device time (ns) at
+    which the first trial began.
     """
 
     def __init__(self, rig: Rig, reader: Reader, operator: Operator, observe: Callable[[View], None] | None = None):
@@ -210,6 +210,8 @@ class Runner:
         return 0.5 + (1.0 + self.rig.description.deadlines.clock_rate) * seconds
 
     def _ask(self, text: str) -> None:
+        """Prompt the operator and wait for the answer. Raises TrialEnded where the run must end."""
+
         def keep_waiting() -> bool:
             self.rig.report_alive()
             return self.reader.error is None and self.reader.violation is None
@@ -248,6 +250,7 @@ class Runner:
                 self._wait("moved by hand", Passes(self.rig.description, step), step.timeout)
 
     def _command(self, step: TensionRamp | JointMove | Hold) -> None:
+        """Send a command. Raises ControllerStopped where it was refused because the rig has just stopped."""
         try:
             self._id = self.rig.command(step)
         except CommandRefused:  # If the rig has just been stopped, the stop is the cause: raise that instead.
@@ -257,6 +260,7 @@ class Runner:
             raise
 
     def _begin(self, step: Start) -> None:
+        """Begin to record the trial. Its time in the session is the device's time since the first trial began."""
         if self.t0 is None:
             self.t0 = self.reader.latest_t
         self.reader.begin(
@@ -271,6 +275,11 @@ class Runner:
         )
 
     def _prepare(self, setup: Setup) -> None:
+        """Have the finger prepared, by a simulated operator or by a person.
+
+        The person's hands may be at an armed finger under tension. Meanwhile the runner sends no command; the limits of
+        host and controller, the heartbeat and the stop key act as always.
+        """
         self._setup = setup
         if not self.rig.prepare(setup):
             self._ask(setup.text)
