@@ -80,12 +80,6 @@ class Recorder:
         """Number of samples that are queued and not yet written."""
         return self._waiting
 
-    def flush(self, timeout: float = 60.0) -> None:
-        """Wait until all that was queued is written or has failed, at most `timeout` s."""
-        done = threading.Event()
-        self.put(b"", done)
-        done.wait(timeout)
-
     def close(self, timeout: float = 5.0) -> None:
         """Write what is queued, force it to the disk, and end the thread.
 
@@ -109,9 +103,6 @@ class Recorder:
         self._log.close()
 
     def _write(self, tag: bytes, value: Any) -> None:
-        if tag == b"":
-            value.set()
-            return
         try:
             if self.failure is None or tag != wal.DATA:
                 self._log.write(tag, wal.pack_block(value) if tag == wal.DATA else wal.pack_json(value))

@@ -148,9 +148,13 @@ class UnfollowedMove:
 
     `column` is the encoder's column, `start` its angle (rad) at the command, `speed` the commanded speed (rad/s). The
     encoder must leave `start` by MAX_STILL_ANGLE before the motor, at that speed, has covered DISTANCE.
+
+    The time to accelerate is not added. A motor with acceleration a (rad/s²) leaves `start` in time where the speed is
+    at most 0.5 √a rad/s; a faster move trips although its encoder follows.
     """
 
-    DISTANCE = 5 * UnexplainedExcursion.MAX_STILL_ANGLE  # rad. The factor 5 leaves time to accelerate.
+    # rad. The factor 5 leaves time to start: with the default acceleration of 20 rad/s² up to 2.2 rad/s (128 °/s).
+    DISTANCE = 5 * UnexplainedExcursion.MAX_STILL_ANGLE
 
     def __init__(self, column: int, start: float, speed: float, rate_hz: float):
         self.column = column

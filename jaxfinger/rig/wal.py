@@ -169,11 +169,6 @@ def read_log(path: str | Path) -> Iterator[Frame]:
         yield from frames(file, str(path))
 
 
-def read_bytes(data: bytes) -> Iterator[Frame]:
-    """Yield the sound frames of a log in memory."""
-    return frames(io.BytesIO(data))
-
-
 def sound_length(path: str | Path) -> int:
     """Length in bytes of the sound part of a log."""
     end = len(MAGIC)

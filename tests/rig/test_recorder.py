@@ -32,8 +32,7 @@ def test_a_disk_that_stands_still_does_not_hold_up_the_reader(tmp_path):
         log.block(block(50 * k))
     assert log.waiting == 20_000  # all queued, none written: the disk has not answered yet
     Slow.go.set()
-    log.flush()
-    log.close()
+    log.close(60.0)
     assert log.failure is None
     seq = np.concatenate([f.block.seq for f in wal.read_log(log.path) if f.tag == wal.DATA])
     np.testing.assert_array_equal(seq, np.arange(20_000))

@@ -18,6 +18,11 @@ def block(first: int, count: int, channels: int = 3, lost: int = 0) -> Block:
     return Block(seq, seq * 1_000_000, x, np.full(count, 2, np.uint32), np.full(count, 1 << 16, np.uint32), lost)
 
 
+def frames_in(data: bytes):
+    """Yield the sound frames of a log in memory."""
+    return wal.frames(io.BytesIO(data))
+
+
 class Pieces(io.BytesIO):
     """A file that keeps its length after every write in `ends`, and may write less than it is given."""
 
@@ -49,7 +54,7 @@ def test_killed_at_every_write():
     data = file.getvalue()
     for cut in file.ends[1:]:
         whole = sum(end <= cut for end in ends)
-        found = list(wal.read_bytes(data[:cut]))
+        found = list(frames_in(data[:cut]))
         assert len(found) == whole
         samples = sum(len(f.block) for f in found if f.tag == wal.DATA)
         assert samples == 50 * max(whole - 1, 0)
@@ -59,7 +64,7 @@ def test_killed_at_every_byte_of_a_frame():
     file, ends = a_log()
     data = file.getvalue()
     for cut in range(ends[3], ends[4] + 1):
-        assert len(list(wal.read_bytes(data[:cut]))) == (4 if cut < ends[4] else 5)
+        assert len(list(frames_in(data[:cut]))) == (4 if cut < ends[4] else 5)
 
 
 @settings(max_examples=60, deadline=None)
@@ -69,7 +74,7 @@ def test_a_flipped_bit_costs_only_what_follows(data):
     image = bytearray(file.getvalue())
     at = data.draw(st.integers(len(wal.MAGIC), len(image) - 1))
     image[at] ^= 1 << data.draw(st.integers(0, 7))
-    assert len(list(wal.read_bytes(bytes(image)))) == sum(end <= at for end in ends)
+    assert len(list(frames_in(bytes(image)))) == sum(end <= at for end in ends)
 
 
 @settings(max_examples=40, deadline=None)
@@ -80,7 +85,7 @@ def test_blocks_survive_the_round_trip(count, channels, first, lost, seed):
     x = rng.standard_normal((count, channels))
     x[rng.random(x.shape) < 0.1] = np.nan
     sent = Block(seq, seq + 7, x, rng.integers(0, 9, count, np.uint32), rng.integers(0, 2**32, count, np.uint32), lost)
-    (frame,) = wal.read_bytes(wal.MAGIC + wal.pack_frame(wal.DATA, wal.pack_block(sent)))
+    (frame,) = frames_in(wal.MAGIC + wal.pack_frame(wal.DATA, wal.pack_block(sent)))
     got = frame.block
     for name in ("seq", "t_ns", "x", "state", "flags"):
         np.testing.assert_array_equal(getattr(got, name), getattr(sent, name))
@@ -116,7 +121,7 @@ def test_a_full_disk_leaves_no_half_frame():
     with pytest.raises(OSError, match="No space"):
         writer.write(wal.DATA, wal.pack_block(block(40, 400)))
     writer.write(wal.END, wal.pack_json({"complete": False}))
-    assert [f.tag for f in wal.read_bytes(file.getvalue())] == [wal.DATA, wal.END]
+    assert [f.tag for f in frames_in(file.getvalue())] == [wal.DATA, wal.END]
 
 
 def test_what_is_no_log_is_refused(tmp_path):
