@@ -20,6 +20,7 @@ FADE_SPEED = 0.05  # rad/s. Below it the feed-forward of friction fades, so that
 STIFFNESS = 0.3  # N m/rad
 DAMPING = 0.006  # N m s/rad
 TENSION_LAG = 0.01  # s, time constant of the tension loop
+MIN_LEVERAGE = 1e-6  # m²: a joint with moment arms below 1 mm gets no more feedback than one of 1 mm.
 
 
 class Targets(NamedTuple):
@@ -35,7 +36,7 @@ class TensionController(NamedTuple):
 
     targets: Targets
     active: Float[Array, " n"]  # 1 or 0
-    leverage: Float[Array, " m"]  # m²: sum of the squared moment arms at each joint
+    leverage: Float[Array, " m"]  # m²: sum over tendons of the squared mean moment arm at each joint
 
     def tension(self, specimen: Specimen, q, v, before, target: Targets, dt):
         """Return the next tension (n,), N. The tension loop follows its command with a first-order lag.
@@ -59,11 +60,11 @@ def feedforward(specimen: Specimen, plan: TrialPlan, rigid_body: Float[Array, "m
     rate = np.einsum("nmt,mt->nt", C, plan.qd)
     arm = np.abs(C).max(axis=(1, 2))[:, None] + 1e-12
     tension = at_actuator(specimen, at_joint, np.tanh(rate / (FADE_SPEED * arm))) * active[:, None]
-    leverage = (C * active[:, None, None] ** 2).mean(axis=2)
+    mean_arm = (C * active[:, None, None]).mean(axis=2)
     return TensionController(
         Targets(plan.q, plan.qd, np.maximum(tension, MIN_ACTUATOR_TENSION * active[:, None])),
         active,
-        np.maximum((leverage**2).sum(axis=0), 1e-6),
+        np.maximum((mean_arm**2).sum(axis=0), MIN_LEVERAGE),
     )
 
 

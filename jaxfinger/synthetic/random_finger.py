@@ -1,4 +1,7 @@
-"""Random fingers: 1 to 7 joints, planar, with abduction or with tilted axes, and two layouts of tendons."""
+"""Random fingers: 1 to 7 joints, planar, with abduction or with tilted axes, and two layouts of tendons.
+
+Lengths, masses, moment arms, springs and friction are drawn around those of the paper's finger.
+"""
 
 from __future__ import annotations
 
