@@ -41,8 +41,8 @@ class TensionController(NamedTuple):
     def tension(self, specimen: Specimen, q, v, before, target: Targets, dt):
         """Return the next tension (n,), N. The tension loop follows its command with a first-order lag.
 
-        The feedback torque τ becomes the tension C τ / Σ c². Its torque CᵀC τ / Σ c² always acts against the error,
-        since CᵀC is positive semidefinite.
+        The feedback torque τ becomes the tension C (τ / Σ c²), which gives the joints the torque CᵀC (τ / Σ c²). What a
+        joint's own error contributes to its torque acts against the error: the diagonal of CᵀC is positive.
         """
         torque = STIFFNESS * (target.q - q) + DAMPING * (target.qd - v)
         command = target.tension + specimen.moment_arm(q) @ (torque / self.leverage)
