@@ -117,7 +117,7 @@ class JointMove:
     joint: str
     target: float
     speed: float
-    acceleration: float = 20.0
+    acceleration: float = 20.0  # rad/s²: reaches the paper's fastest 1.5 rad/s in 75 ms
 
 
 @dataclass(frozen=True)

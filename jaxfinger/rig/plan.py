@@ -21,6 +21,9 @@ from jaxfinger.rig.safety import admit
 MAX_STEPS = 100_000
 
 
+HAND_PASS_S = 4.0  # s, as the simulated operator takes: a range of 100° at 50 °/s
+
+
 @dataclass(frozen=True)
 class PlannedTrial:
     """One trial to record. Trials with the same `motion` repeat each other; `line` is its line in the plan file."""
@@ -179,7 +182,7 @@ def commands(trial: PlannedTrial, rig: RigDescription) -> Iterator[Any]:
 def estimate(trial: PlannedTrial, rig: RigDescription) -> Estimate:
     """Estimate duration (without the operator's pauses), prompts and highest tension from the commands alone.
 
-    A joint moved by hand is taken to need 4 s for each pass to and fro.
+    A joint moved by hand is taken to need HAND_PASS_S for each pass to and fro.
     """
     seconds, highest, prompts = 0.0, 0.0, []
     tension = dict.fromkeys(rig.finger.tendon_names, 0.0)
@@ -195,7 +198,7 @@ def estimate(trial: PlannedTrial, rig: RigDescription) -> Estimate:
         elif isinstance(step, Dwell | Settled | Tare):
             seconds += step.seconds
         elif isinstance(step, Covered):
-            seconds += 4.0 * step.passes
+            seconds += HAND_PASS_S * step.passes
         elif isinstance(step, Setup):
             prompts.append(step.text)
         elif isinstance(step, Start):

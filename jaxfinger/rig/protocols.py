@@ -36,7 +36,7 @@ class Settled:
     """Wait until every named tension has stayed within `within` N of its value for `seconds`, at most `timeout` s."""
 
     tensions: dict[str, float]
-    within: float = 0.3
+    within: float = 0.3  # N: a tenth of tension_error_max of the example rig file
     seconds: float = 0.5
     timeout: float = 20.0
 
@@ -102,10 +102,10 @@ class MomentArms(Common):
     """ID.2: a joint moved by hand through `share` of its range `passes` times, all tendons at `pretension` N."""
 
     joint: str = field(kw_only=True)
-    pretension: NotNegative = 2.0
-    share: float = 0.8
+    pretension: NotNegative = 2.0  # N
+    share: float = 0.8  # at most 0.85: hands must not run the joint into its stops
     passes: Count = 3
-    timeout: NotNegative = 120.0
+    timeout: NotNegative = 120.0  # s for all passes
 
     def __post_init__(self):
         if not 0.1 <= self.share <= 0.85:
@@ -123,8 +123,8 @@ class StaticTorque(Common):
     range_deg: tuple[float, float] = (0.0, 70.0)
     step_deg: Annotated[float, Within(0.01, unit="deg")] = 10.0  # at least 0.01°: the encoder AA5048B resolves 0.02°
     speed_deg_s: NotNegative = 30.0
-    settle: NotNegative = 0.2
-    dwell: NotNegative = 0.5
+    settle: NotNegative = 0.2  # s
+    dwell: NotNegative = 0.5  # s
 
 
 @dataclass(frozen=True)
@@ -146,15 +146,15 @@ class TendonFriction(Common):
     tendon: str = field(kw_only=True)
     levels: Annotated[tuple[float, ...], Within(0.0, unit="N", above=True)] = (2.0, 4.0, 6.0, 8.0, 10.0)
     down: bool = True
-    settle: NotNegative = 0.3
-    dwell: NotNegative = 0.5
+    settle: NotNegative = 0.3  # s before a hold
+    dwell: NotNegative = 0.5  # s of a hold
 
 
 @dataclass(frozen=True)
 class FreeExcursion(Common):
     """VD.1: all joints moved by hand for `seconds`, with all tendons at `pretension` N."""
 
-    pretension: NotNegative = 2.0
+    pretension: NotNegative = 2.0  # N
     seconds: NotNegative = 20.0
 
 
@@ -177,7 +177,7 @@ class Trajectory(Common):
 
     mean: tuple[float, ...] = ()  # N per active tendon; empty: 2 N each
     amplitude: NotNegative = 0.8  # N
-    interval: Positive = 0.5
+    interval: Positive = 0.5  # s
     seconds: NotNegative = 10.0
     seed: Annotated[int, Within(0)] = 0
 

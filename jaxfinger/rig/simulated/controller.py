@@ -35,12 +35,12 @@ FORCE_LAG = 0.015  # s, time constant of the drives' force loop
 class HardLimits:
     """The controller's own limits: the fields of ST_Limits, SI. The numbers are proposals for tendons up to 15 N."""
 
-    tension_max: float = 20.0
-    tension_rate_max: float = 500.0
-    joint_velocity_max: float = 10.5
-    joint_torque_max: float = 0.5
-    fingertip_force_max: float = 20.0
-    heartbeat_s: float = 0.25
+    tension_max: float = 20.0  # N
+    tension_rate_max: float = 500.0  # N/s
+    joint_velocity_max: float = 10.5  # rad/s, 600 °/s
+    joint_torque_max: float = 0.5  # N m
+    fingertip_force_max: float = 20.0  # N
+    heartbeat_s: float = 0.25  # s
 
 
 class Slots:

@@ -28,11 +28,11 @@ class PlantTruth:
     """
 
     finger: FingerDescription
-    excursion: Float[np.ndarray, "n m 4"]
-    elastic: Float[np.ndarray, "m 3"]
-    friction: Float[np.ndarray, "m 3"]
-    damping: Float[np.ndarray, " m"]
-    a0: Float[np.ndarray, " n"]
+    excursion: Float[np.ndarray, "n m 4"]  # m/rad^(k+1)
+    elastic: Float[np.ndarray, "m 3"]  # N m/rad^p
+    friction: Float[np.ndarray, "m 3"]  # N m/rad^p
+    damping: Float[np.ndarray, " m"]  # N m s/rad
+    a0: Float[np.ndarray, " n"]  # N
     a1: Float[np.ndarray, " n"]
 
 
@@ -40,14 +40,14 @@ class PlantTruth:
 class Sensors:
     """White noise (standard deviation), resolution and offsets of the rig's sensors, SI units."""
 
-    tension_noise: float = 0.02
-    torque_noise: float = 2e-4
-    force_noise: float = 0.02
-    angle_noise: float = 1e-4
-    angle_step: float = 2 * math.pi / 2**14  # AA5048B: 14 bit
-    excursion_noise: float = 2e-6
-    torque_offset: float = 3e-3  # before taring
-    force_offset: tuple[float, float, float] = (0.08, -0.05, 0.03)
+    tension_noise: float = 0.02  # N
+    torque_noise: float = 2e-4  # N m
+    force_noise: float = 0.02  # N
+    angle_noise: float = 1e-4  # rad
+    angle_step: float = 2 * math.pi / 2**14  # rad; AA5048B, 14 bit
+    excursion_noise: float = 2e-6  # m
+    torque_offset: float = 3e-3  # N m, before taring
+    force_offset: tuple[float, float, float] = (0.08, -0.05, 0.03)  # N, before taring
 
 
 def default_truth() -> PlantTruth:
