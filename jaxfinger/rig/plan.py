@@ -19,8 +19,6 @@ from jaxfinger.rig.safety import admit
 # Steps of one trial (commands, marks and waits). The paper's longest trial has a hundred. More than this is a mistake
 # in the plan, and checking it would seem to hang.
 MAX_STEPS = 100_000
-
-
 HAND_PASS_S = 4.0  # s, as the simulated operator takes: a range of 100° at 50 °/s
 
 
