@@ -183,7 +183,7 @@ class Rig(ABC):
     def beat(self) -> None:
         """Send one heartbeat. The controller releases the finger if none comes for its heartbeat time (`heartbeat_s`).
 
-        A heartbeat says that the whole host is well, so in a recording only the watch sends it (watch.py).
+        It means that the whole host is well, so in a recording in real time only the watch sends it (watch.py).
         """
 
     def _pause(self, seconds: float) -> None:
@@ -193,8 +193,8 @@ class Rig(ABC):
     def read_block(self, timeout: float) -> Block:
         """Wait for samples; return those since the last call, at least one. Heartbeats are sent meanwhile.
 
-        It serves before arming and where time is simulated. A recording in real time calls `poll`, so that this thread
-        cannot vouch for the others.
+        It serves before arming and where time is simulated. A recording in real time calls `poll` instead: heartbeats
+        from this thread would go on while another thread hangs.
 
         Raises:
             StaleRig: no sample came for `timeout` s.
