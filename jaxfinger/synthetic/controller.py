@@ -72,8 +72,8 @@ def distribute(C: Float[Array, "n m N"], torque: Float[Array, "m N"], sweeps: in
     """Return tensions f ≥ MIN_JOINT_TENSION, N, that nearly minimise ‖Cᵀ f − τ‖² + ε ‖f‖² at each sample.
 
     Projected coordinate descent over the tendons, all samples at once. ε is a thousandth of the largest Σ c² of a
-    tendon: small beside the torque, it keeps antagonists from pulling against each other. After 300 sweeps no tension is
-    farther from the minimum than 0.5 N on the paper's finger and 2 N on a random one of seven joints; feedback corrects
+    tendon: small beside the torque, it keeps antagonists from pulling against each other. After 300 sweeps tensions are
+    within 0.5 N of the minimum on the paper's finger, and within 2 N on a random one of seven joints. Feedback corrects
     the rest.
     """
     f = np.full((C.shape[0], C.shape[2]), MIN_JOINT_TENSION)
