@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -61,6 +62,24 @@ class SignatureTable:
     hidden: dict[Key, dict[str, float]]
     explainable: dict[Key, Float[np.ndarray, " C"]]  # τ_c of every cause that the trials can see (`costs`)
     offers: list[Offer]
+
+    @cached_property
+    def _offer_of(self) -> dict[tuple[Variant, ...], Offer]:
+        return {o.variants: o for o in self.offers}
+
+    def neighbours(self, offer: Offer) -> list[Offer]:
+        """The offers whose shapes differ from an offer's in one that fits move, by one step of its grid."""
+        first, found = offer.variants[0], []
+        grids, shapes = first.effect.worth_trying(first.scales, first.site), first.effect.shape_parameters()
+        for name, value in first.shape:
+            grid = sorted(set(grids[name]))
+            if shapes[name].moves == "not" or value not in grid:
+                continue
+            at = grid.index(value)
+            for other in grid[max(at - 1, 0) : at] + grid[at + 1 : at + 2]:
+                variants = tuple(v.with_shape(**{name: other}) for v in offer.variants)
+                found += [self._offer_of[variants]] if variants in self._offer_of else []
+        return found
 
     def rows_of(self, offer: Offer) -> list[Int[np.ndarray, " _k"]]:
         """Rows of every variant of an offer, with those that the trials do not see."""
