@@ -258,7 +258,8 @@ class Supervisor:
         if isinstance(command, JointMove) and self._last is not None:
             column = self.rig.index("joint_position", command.joint)
             if column is not None and abs(command.target - self._last[column]) > UnfollowedMove.DISTANCE:
-                self._move = UnfollowedMove(column, float(self._last[column]), command.speed, self.rig.rate_hz)
+                start, rate = float(self._last[column]), self.rig.rate_hz
+                self._move = UnfollowedMove(column, start, command.speed, command.acceleration, rate)
         elif not isinstance(command, TensionRamp):
             self._move = None
 

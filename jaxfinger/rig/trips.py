@@ -146,19 +146,18 @@ class UnexplainedExcursion:
 class UnfollowedMove:
     """Watch over one commanded move of the external motor: its joint's encoder must follow, or it is frozen.
 
-    `column` is the encoder's column, `start` its angle (rad) at the command, `speed` the commanded speed (rad/s). The
-    encoder must leave `start` by MAX_STILL_ANGLE before the motor, at that speed, has covered DISTANCE.
-
-    The time to accelerate is not added. A motor with acceleration a (rad/s²) leaves `start` in time where the speed is
-    at most 0.5 √a rad/s; a faster move trips although its encoder follows.
+    `column` is the encoder's column, `start` its angle (rad) at the command, `speed` (rad/s) and `acceleration`
+    (rad/s²) those of the command. The encoder must leave `start` by MAX_STILL_ANGLE before the motor, which starts from
+    rest, has covered DISTANCE.
     """
 
-    # rad. The factor 5 leaves time to start: with the default acceleration of 20 rad/s² up to 2.2 rad/s (128 °/s).
+    # rad. A motor that only accelerates covers it in √5 times the time that it needs for MAX_STILL_ANGLE: the rest is
+    # for delays of drive and encoder, 75 ms at 10 rad/s².
     DISTANCE = 5 * UnexplainedExcursion.MAX_STILL_ANGLE
 
-    def __init__(self, column: int, start: float, speed: float, rate_hz: float):
+    def __init__(self, column: int, start: float, speed: float, acceleration: float, rate_hz: float):
         self.column = column
-        self._start, self._need = start, self.DISTANCE / speed * rate_hz
+        self._start, self._need = start, _time_to_cover(self.DISTANCE, speed, acceleration) * rate_hz
         self._still = 0
 
     def __call__(self, angle: Float[np.ndarray, " N"], moving: Bool[np.ndarray, " N"]) -> int | None:
@@ -166,3 +165,11 @@ class UnfollowedMove:
         still = self._still + np.cumsum(moving & (np.abs(angle - self._start) < UnexplainedExcursion.MAX_STILL_ANGLE))
         self._still = int(still[-1])
         return int(np.argmax(still > self._need)) if self._still > self._need else None
+
+
+def _time_to_cover(distance: float, speed: float, acceleration: float) -> float:
+    """Time (s) in which a motor covers `distance` (rad) from rest, with constant acceleration up to `speed`."""
+    while_accelerating = speed**2 / (2.0 * acceleration)
+    if distance <= while_accelerating:
+        return float(np.sqrt(2.0 * distance / acceleration))
+    return distance / speed + speed / (2.0 * acceleration)

@@ -107,6 +107,35 @@ def test_an_encoder_that_does_not_follow_the_motor(rig, quiet_block):
     assert found[0].channel == "joint_position MCP"
 
 
+SPEEDS = [(speed, acceleration) for speed in (0.2, 1.0, 2.0) for acceleration in (1.0, 10.0, 100.0)]
+
+
+def moved(rig, quiet_block, speed, acceleration, delay):
+    """What the supervisor finds where an encoder follows the motor after `delay` s, and the motor's way in rad."""
+    time, start = np.arange(1500) / rig.rate_hz, speed / acceleration
+    covered = np.where(time < start, 0.5 * acceleration * time**2, speed * (time - 0.5 * start))
+    block, at = quiet_block(1500, 50, state=State.MOVING), column(rig, "joint_position", "MCP")
+    follows = np.interp(time - delay, time, np.minimum(covered, 0.5))
+    supervisor = Supervisor(rig)
+    supervisor.check(quiet_block(50))
+    supervisor.commanded(JointMove("MCP", 2.0, speed, acceleration))
+    found = supervisor.check(spoil(block, lambda x: x.__setitem__((slice(None), at), x[:, at] + follows)))
+    return [v for v in found if v.trip is Trip.FROZEN], covered
+
+
+@pytest.mark.parametrize(("speed", "acceleration"), SPEEDS)
+def test_an_encoder_that_follows_the_motor_is_sound_at_any_speed(rig, quiet_block, speed, acceleration):
+    found, _ = moved(rig, quiet_block, speed, acceleration, delay=0.01)
+    assert found == []
+
+
+@pytest.mark.parametrize(("speed", "acceleration"), SPEEDS)
+def test_a_frozen_one_is_found_when_the_motor_has_covered_a_tenth_of_a_radian(rig, quiet_block, speed, acceleration):
+    found, covered = moved(rig, quiet_block, speed, acceleration, delay=np.inf)
+    assert [v.channel for v in found] == ["joint_position MCP"]
+    assert covered[found[0].seq - 50] == pytest.approx(0.1, abs=2.0 * speed / rig.rate_hz)
+
+
 def test_speed_and_tension_rate(rig, quiet_block):
     def fast(x):
         x[:, column(rig, "joint_position", "MCP")] = np.clip(np.arange(400) * 0.012 - 2.0, 0.0, 1.2)
