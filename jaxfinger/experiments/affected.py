@@ -17,7 +17,7 @@ from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError, did_you_mean
 from jaxfinger.experiments.predict import change
 from jaxfinger.experiments.table import EXPERIMENTS
-from jaxfinger.model import Effect, Finger, Model, Motion, Terms, contact_map, plain_terms
+from jaxfinger.model import Effect, Finger, Model, Motion, Terms, contact_map, terms_without_effects
 
 
 def affected_channels(kind: type[CatalogueEffect], finger: Finger) -> dict[str, tuple[str, ...]]:
@@ -56,7 +56,7 @@ class _Nominal(NamedTuple):
     finger: Finger
     model: Model
     x: Motion
-    plain: Terms
+    terms: Terms
     contact: Float[Array, "3 m *T"]
 
     @classmethod
@@ -73,9 +73,9 @@ class _Nominal(NamedTuple):
         model = Model.zeros(finger)
         joints, tendons, time = jnp.zeros((m, T)), jnp.zeros((n, T)), jnp.zeros(T)
         x = Motion(time, joints, joints, joints, tendons, joints, tendons, time, joints, held, temperature=joints)
-        shapes = jax.eval_shape(lambda model: (plain_terms(model, x), contact_map(model, x)), model)
-        plain, contact = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), shapes)
-        return cls(finger, model, x, *jax.device_put((plain, contact)))
+        shapes = jax.eval_shape(lambda model: (terms_without_effects(model, x), contact_map(model, x)), model)
+        terms, contact = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), shapes)
+        return cls(finger, model, x, *jax.device_put((terms, contact)))
 
 
 @cache
@@ -88,12 +88,12 @@ def _affected_channels(kind, *description) -> dict[str, tuple[str, ...]]:
     amplitudes = {k: getattr(effect, k) for k in kind.amplitudes()}
 
     def depends(held: bool, channel: str) -> bool:
-        _, model, x, plain, contact = _Nominal.of(*description, held=held)
+        _, model, x, terms, contact = _Nominal.of(*description, held=held)
         y0 = {"joint_torque": x.q, "tendon_excursion": x.tension, "fingertip_force": contact[:, 0]}[channel]
         of_force = contact if channel == "fingertip_force" else None
 
         def of(amplitudes):
-            return change(channel, replace(effect, **amplitudes), model, x, y0, plain, of_force)
+            return change(channel, replace(effect, **amplitudes), model, x, y0, terms, of_force)
 
         return any(_reached(jax.make_jaxpr(of)(amplitudes).jaxpr))
 

@@ -64,7 +64,7 @@ def reduce(r: PreparedTrial) -> Row:
         # All other terms pass the low-pass of q̈.
         joint, tendon, tension = (low_pass(r.trial.time, a, j.cutoff) for a in (joint, tendon, tension))
         y = {c: low_pass(r.trial.time, values, j.cutoff) for c, values in y.items()}
-    known = r.mean(slides.astype(float)) > 1.0 - 1e-9
+    known = r.mean(slides.astype(float)) > 1.0 - 1e-9  # all samples of the block
     counting = {c: known if c == "joint_torque" else np.ones((len(known), 1), bool) for c in y}
     return row(
         r,

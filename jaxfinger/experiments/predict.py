@@ -39,12 +39,13 @@ def change(
     nominal: Model,
     x: Motion,
     y0: Float[Array, "columns *T"],
-    plain: Terms | None,
+    terms: Terms | None,
     contact: Float[Array, "3 m *T"] | None,
 ) -> Float[Array, "columns *T"]:
     """Change of a channel's nominal prediction `y0` by one effect; only changed terms of (1) are evaluated.
 
-    `plain`: nominal terms (`plain_terms`), for a torque or a force. `contact`: `contact_map`, for a force, else None.
+    `terms`: nominal terms (`terms_without_effects`), for a torque or a force. `contact`: `contact_map`, for a force,
+    else None.
     """
     model = replace(nominal, effects=(effect,))
     true = model.true_motion(x)
@@ -54,10 +55,10 @@ def change(
     elif effect.moves_rigid_body() and contact is not None:
         y = fingertip_force(model, true)
     elif effect.moves_rigid_body():
-        y = external_torque(model, true, plain=plain if same else None)
+        y = external_torque(model, true, nominal=terms if same else None)
     else:
-        assert plain is not None
-        more = resisting_change(model, x, plain) if same else resisting_torque(model, true) - resisting(plain)
+        assert terms is not None
+        more = resisting_change(model, x, terms) if same else resisting_torque(model, true) - resisting(terms)
         y = y0 + (more if contact is None else jnp.sum(contact * more[None], axis=1))
     return effect.reading(channel, true, y) - y0
 

@@ -33,7 +33,7 @@ def reduce(r: PreparedTrial) -> Row:
     qd, qdd = j.qd * moves, j.qdd * moves
     slides = sliding(r, qd, slow, joint, None, CLEAR_TIME * r.spec.pace)
     at = r.whole(hold)
-    known = r.mean(slides.astype(float)) > 1.0 - 1e-9
+    known = r.mean(slides.astype(float)) > 1.0 - 1e-9  # all samples of the block
     approached = np.abs(r.mean(joint)) > 1.0 - 1e-9
     counting = dict.fromkeys(r.y, ((at >= 0)[:, None] & approached) | known)
     q = _at_rest(r.mean(r.trial.q), at)

@@ -40,7 +40,7 @@ from jaxfinger.identify.stages import (
     sources_of,
 )
 from jaxfinger.identify.start import start_values
-from jaxfinger.model import Model, Terms, plain_terms
+from jaxfinger.model import Model, Terms, terms_without_effects
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,10 @@ class Problem:
         """
 
         def terms(group: MergedTrials) -> list[Terms | None]:
-            return [None if group.channel == "tendon_excursion" else _plain(self.nominal, x) for x in group.x]
+            return [
+                None if group.channel == "tendon_excursion" else _terms_without_effects(self.nominal, x)
+                for x in group.x
+            ]
 
         return {(g.channel, g.held): (g.merged(self.predicted), terms(g)) for g in self.groups}
 
@@ -145,7 +148,7 @@ class Problem:
         return [t for e in self.rows for t in self.stacks[e].trials]
 
 
-_plain = eqx.filter_jit(plain_terms)
+_terms_without_effects = eqx.filter_jit(terms_without_effects)
 
 
 def build(

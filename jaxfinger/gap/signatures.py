@@ -96,7 +96,7 @@ def _change(
     nominal: Model,
     x: Motion,
     y0: Float[Array, "columns B T"],
-    plain: Terms | None,
+    terms: Terms | None,
     contact: Array | None,
     count: Array,
 ) -> Float[Array, "variants columns B T"]:
@@ -107,7 +107,7 @@ def _change(
 
     def put(k, out):
         effect = jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, k, keepdims=False), effects)
-        one = change(channel, effect, nominal, x, y0, plain, contact)
+        one = change(channel, effect, nominal, x, y0, terms, contact)
         return jax.lax.dynamic_update_index_in_dim(out, one, k, 0)
 
     return jax.lax.fori_loop(0, count, put, jnp.zeros((CHUNK, *y0.shape)))
@@ -145,7 +145,7 @@ class Signatures:
             shown = [e for e in group.trials if group.channel in where.get(e, ())]
             if not shown:
                 continue
-            y0, plain = self.problem.without_effects[group.channel, group.held]
+            y0, terms = self.problem.without_effects[group.channel, group.held]
             columns, _, T = y0[0].shape
             raw = np.empty((len(members), columns, len(y0), TRIALS, T))
             # An effect that only resists motion changes the fingertip's force by the joint torques that it adds. The
@@ -155,10 +155,10 @@ class Signatures:
                 x, contact = group.x[b], group.contact[b]
                 if by_torque:
                     none = jnp.zeros_like(x.q)
-                    torque = np.asarray(_change("joint_torque", stacked, nominal, x, none, plain[b], None, count))
+                    torque = np.asarray(_change("joint_torque", stacked, nominal, x, none, terms[b], None, count))
                     raw[:, :, b] = np.einsum("dmbt,kmbt->kdbt", np.asarray(contact), torque[: len(members)])
                 else:
-                    found = _change(group.channel, stacked, nominal, x, y0[b], plain[b], contact, count)
+                    found = _change(group.channel, stacked, nominal, x, y0[b], terms[b], contact, count)
                     raw[:, :, b] = np.asarray(found)[: len(members)]
             raw = raw.reshape(len(members), columns, -1, T)
             for e in shown:

@@ -169,9 +169,9 @@ def identify(
 ) -> Fit:
     """Run the staged fits on a session. A stage whose trials are missing is reported as skipped.
 
-    `recipe`: by default that of `start`, or the paper's. `stages`: names of those to run, by default the recipe's.
-    `start`: a fit that holds the parameters of earlier stages. `progress`: called with a sentence at each step.
-    `stacks`: the session's trials, where `prepare` has read them already.
+    `recipe`: by default the paper's. `stages`: names of those to run, by default the recipe's. `start`: a fit with the
+    parameters of earlier stages, whose own recipe decides on terms and options. `progress`: called with a sentence at
+    each step. `stacks`: the session's trials, where `prepare` has read them already.
 
     The published mass of the servo axis (Janot, Gautier, Brunot 2019) is 95.11 kg:
 

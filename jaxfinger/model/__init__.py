@@ -15,10 +15,10 @@ from jaxfinger.model.dynamics import (  # noqa: E402
     external_torque,
     fingertip_force,
     joint_tension,
-    plain_terms,
     resisting,
     resisting_change,
     resisting_torque,
+    terms_without_effects,
 )
 from jaxfinger.model.finger import Finger  # noqa: E402
 from jaxfinger.model.joint_torque import JointTorque  # noqa: E402
@@ -47,11 +47,11 @@ __all__ = [
     "forward_dynamics",
     "joint_tension",
     "memories",
-    "plain_terms",
     "resisting",
     "resisting_change",
     "resisting_torque",
     "simulate",
     "simulated_ahead",
     "simulated_from",
+    "terms_without_effects",
 ]

@@ -37,11 +37,11 @@ class Terms(NamedTuple):
     shared: tuple[SharedFriction, ...]  # friction that acts on several joints
 
 
-def terms(model: Model, x: Motion, memory: tuple[Memory, ...], plain: Terms | None = None) -> Terms:
+def terms(model: Model, x: Motion, memory: tuple[Memory, ...], nominal: Terms | None = None) -> Terms:
     """Evaluate the terms of (1): those of the nominal model, changed by the effects in order.
 
-    `plain`: terms of the same motion without effects (`plain_terms`), where they are known. Terms that no effect
-    changes are taken from it. They are recognised by identity, since a hook that is not overridden returns its
+    `nominal`: terms of the same motion without effects (`terms_without_effects`), where they are known. Terms that no
+    effect changes are taken from it. They are recognised by identity, since a hook that is not overridden returns its
     argument.
     """
     effects = list(zip(model.effects, memory, strict=True))
@@ -52,7 +52,7 @@ def terms(model: Model, x: Motion, memory: tuple[Memory, ...], plain: Terms | No
         f_t = effect.tension(x, state, f_t)
         direction, tendon_direction = effect.directions(x, state, direction, tendon_direction)
 
-    C = model.moment_arm.coupling(x.q) if plain is None else plain.C
+    C = model.moment_arm.coupling(x.q) if nominal is None else nominal.C
     for effect, _ in effects:
         C = effect.coupling(x, f_t, C)
     affine = loss = model.tendon_friction.loss(f_t)
@@ -60,8 +60,8 @@ def terms(model: Model, x: Motion, memory: tuple[Memory, ...], plain: Terms | No
         loss = effect.loss(x, f_t, C, loss)
     as_before = f_t is x.tension and loss is affine and (x.held or tendon_direction is x.tendon_direction)
     loss = bounded(loss, f_t)
-    if plain is not None and as_before:
-        f_j = plain.f_j
+    if nominal is not None and as_before:
+        f_j = nominal.f_j
     elif x.held:
         f_j = held(f_t, loss)
     else:
@@ -72,12 +72,12 @@ def terms(model: Model, x: Motion, memory: tuple[Memory, ...], plain: Terms | No
     for effect, _ in effects:
         f_j = effect.delivered(x, f_j)
 
-    if plain is None:
+    if nominal is None:
         h = model.joint_torque.elastic_torque(x.q) + model.joint_torque.damping_torque(x.qd)
         h = h + model.joint_torque.directional_torque(x.qd, slides=not x.held)
         friction = model.joint_torque.friction_magnitude(x.q)
     else:
-        h, friction = plain.h, plain.friction
+        h, friction = nominal.h, nominal.friction
     for effect, state in effects:
         h = effect.torque(x, state, h)
         if not x.held:  # a fixture that holds the joints carries their friction
@@ -94,14 +94,14 @@ def _torque_friction(model: Model, x: Motion) -> Float[Array, "m *#T"]:
     return mu.reshape(-1, *(1,) * (x.q.ndim - 1))
 
 
-def plain_terms(model: Model, x: Motion) -> Terms:
+def terms_without_effects(model: Model, x: Motion) -> Terms:
     """Terms of (1) without the model's effects."""
     return terms(model, x, ())
 
 
-def resisting_torque(model: Model, x: Motion, plain: Terms | None = None) -> Float[Array, "m *T"]:
+def resisting_torque(model: Model, x: Motion, nominal: Terms | None = None) -> Float[Array, "m *T"]:
     """h − Cᵀ(f_t − f_f), N m: (1) without the rigid body and external forces."""
-    return resisting(terms(model, x, memories(model, x), plain))
+    return resisting(terms(model, x, memories(model, x), nominal))
 
 
 def resisting(e: Terms) -> Float[Array, "m *T"]:
@@ -115,24 +115,24 @@ def _shared_torque(e: Terms) -> Float[Array, "m *T"]:
     return sum(parts, start=jnp.zeros_like(e.h))
 
 
-def resisting_change(model: Model, x: Motion, plain: Terms) -> Float[Array, "m *T"]:
+def resisting_change(model: Model, x: Motion, nominal: Terms) -> Float[Array, "m *T"]:
     """Change of `resisting_torque` by the effects, N m, computed from the terms that they change."""
-    e = terms(model, x, memories(model, x), plain)
-    change = e.h - plain.h if e.h is not plain.h else jnp.zeros_like(plain.h)
-    if e.friction is not plain.friction or e.direction is not x.joint_direction:
-        change += e.direction * e.friction - plain.direction * plain.friction
+    e = terms(model, x, memories(model, x), nominal)
+    change = e.h - nominal.h if e.h is not nominal.h else jnp.zeros_like(nominal.h)
+    if e.friction is not nominal.friction or e.direction is not x.joint_direction:
+        change += e.direction * e.friction - nominal.direction * nominal.friction
     if e.shared:
         change += _shared_torque(e)
-    if e.C is not plain.C or e.f_j is not plain.f_j:
-        change -= jnp.sum(e.C * e.f_j[:, None] - plain.C * plain.f_j[:, None], axis=0)
+    if e.C is not nominal.C or e.f_j is not nominal.f_j:
+        change -= jnp.sum(e.C * e.f_j[:, None] - nominal.C * nominal.f_j[:, None], axis=0)
     return change
 
 
 def external_torque(
-    model: Model, x: Motion, f_ext: Float[Array, "3 *T"] | None = None, plain: Terms | None = None
+    model: Model, x: Motion, f_ext: Float[Array, "3 *T"] | None = None, nominal: Terms | None = None
 ) -> Float[Array, "m *T"]:
     """τ_ext of (1), N m: the external torque on the joints that the motion requires."""
-    e = terms(model, x, memories(model, x), plain)
+    e = terms(model, x, memories(model, x), nominal)
     tau = rigid_body.inverse_dynamics(e.finger, x.q, x.qd, x.qdd) + resisting(e)
     if f_ext is not None:
         _, J = rigid_body.fingertip(model.finger, x.q)
@@ -176,9 +176,9 @@ def _solved(A: Float[Array, "3 3 *T"], B: Float[Array, "3 m *T"]) -> Float[Array
     return jnp.stack([B[0] / d0 - l1 * y - l2 * z, y, z])
 
 
-def excursion(model: Model, x: Motion, plain: Float[Array, "n *T"] | None = None) -> Float[Array, "n *T"]:
-    """Tendon excursion l, m: f(q) changed by the effects. `plain`: f(q), where it is known."""
-    l = model.moment_arm.excursion(x.q) if plain is None else plain
+def excursion(model: Model, x: Motion, nominal: Float[Array, "n *T"] | None = None) -> Float[Array, "n *T"]:
+    """Tendon excursion l, m: f(q) changed by the effects. `nominal`: f(q), where it is known."""
+    l = model.moment_arm.excursion(x.q) if nominal is None else nominal
     f = x.tension
     states = memories(model, x)
     for effect, state in zip(model.effects, states, strict=True):

@@ -16,10 +16,10 @@ from jaxfinger.identify.parameters import describe, units_at
 from jaxfinger.model import (
     excursion,
     external_torque,
-    plain_terms,
     resisting_change,
     resisting_torque,
     simulate,
+    terms_without_effects,
 )
 from tests.effects.motion import MODEL, MOTIONS, SCALES, with_effects
 
@@ -104,10 +104,10 @@ def test_what_an_effect_leaves_alone_need_not_be_computed_again(name):
     for x, _ in MOTIONS:
         if model.true_motion(x) is not x:
             continue
-        plain = plain_terms(MODEL, x)
+        plain = terms_without_effects(MODEL, x)
         expected = resisting_torque(model, x) - resisting_torque(MODEL, x)
         np.testing.assert_allclose(resisting_change(model, x, plain), expected, atol=1e-14)
-        np.testing.assert_allclose(external_torque(model, x, plain=plain), external_torque(model, x), atol=1e-14)
+        np.testing.assert_allclose(external_torque(model, x, nominal=plain), external_torque(model, x), atol=1e-14)
         np.testing.assert_array_equal(excursion(model, x, excursion(MODEL, x)), excursion(model, x))
 
 

@@ -1,5 +1,6 @@
 """VD.3 in the joint refinement: derivatives through sticking and sliding, accuracy of estimates and intervals."""
 
+import importlib
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -62,6 +63,18 @@ def test_a_step_of_the_simulation_costs_less_than_an_encoder(short, staged):
             simulated_ahead(staged.model, starts(m._replace(pace=pace), time, horizon)) for pace in (1.0, 0.25)
         )
         assert np.all(np.std(coarse - fine, axis=1) < rounds)
+
+
+def test_sweeps_over_frictions_leave_less_than_an_encoder(short, staged, monkeypatch):
+    """Eight times as many sweeps change angles 0.1 s ahead by less than an encoder's resolution."""
+    rounds = recipe_from(RECIPE).sensors.q.resolution / np.sqrt(12.0)
+    batch = shooting(short).stack.batch
+    few = simulated_ahead(staged.model, batch.x)
+    module = importlib.import_module("jaxfinger.model.simulate")
+    monkeypatch.setattr(module, "SWEEPS", 8 * module.SWEEPS)
+    change = np.where(batch.mask["q"] > 0, few - simulated_ahead(staged.model, batch.x), np.nan)
+    assert np.nanmax(np.abs(change)) > 0.0
+    assert np.all(np.nanstd(change, axis=(1, 2)) < rounds)
 
 
 def beside_differences(model, shots, every):
