@@ -9,7 +9,7 @@ where Δ_i is the white change of every row by cause i. A fit alternates two ste
 1. Gauss–Newton on p at fixed θ (`fit_at_nominal`). Rows are multiplied by the root of the formula's weights and
    projected off the derivatives by θ (`Projector`), so that θ follows p to first order, as in variable projection
    (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413). Changes and their derivatives are evaluated at every p.
-2. θ moves to where the projection says that p takes it, with residual and Jacobian evaluated there
+2. θ moves by the step that the projection implies, and residual and Jacobian are evaluated exactly there
    (`_with_nominal_refitted`).
 
 A column that the causes leave unexplained has low weights (`formula`), so that it hardly biases p and θ.
@@ -191,7 +191,7 @@ class Projector:
         return out
 
     def __call__(self, x: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "k rows"]:
-        """Project signatures, which the prior says nothing of."""
+        """Project signatures. Their prior rows are zero, since effects do not enter the prior."""
         return self._off(np.pad(self.weighted(x), ((0, 0), (0, len(self.offset)))))
 
     def residual(self, r: Float[np.ndarray, " N"]) -> Float[np.ndarray, " rows"]:

@@ -129,7 +129,7 @@ def table_of(problem: Problem, baseline: Baseline, parts: Iterable[Part], togeth
 
 
 class Visibility(NamedTuple):
-    """How much of M signatures z the trials can tell from the nominal parameters."""
+    """Norms of M signatures z and of what the nominal parameters leave of them."""
 
     norm: Float[np.ndarray, " M"]  # ‖z‖
     left: Float[np.ndarray, " M"]  # ‖z − Q Qᵀ z‖, what the nominal parameters leave
