@@ -34,28 +34,12 @@ def closures(problem: Problem, augmented: Fitted | None, forward: bool = True) -
     augmented model refitted likewise. With None for `augmented` after equals before.
     """
     fold, of_row = folds(problem), fold_of_row(problem)
-    moving: list[np.ndarray] = []  # choices of the parameters that a refit moves
-    if augmented is not None:
-        whole, every = augmented.fit.model, augmented.fit.estimated
-        shapeless = without_shapes(whole, every)
-        moving = [every, shapeless] if len(shapeless) < len(every) else [every]
     # By experiment and channel, of each trial: mean squares before, after and of the noise, and the number of samples.
     energies: dict[tuple[str, str], list[np.ndarray]] = {}
     models = []
     for k in range(FOLDS):
-        training, seen = of_row != k, {e: f != k for e, f in fold.items()}
-        refitted = _refit(problem.nominal, problem.free, problem.J, problem.r, training, problem.prior, problem.scales)
-        before = after = problem.simulator or refitted
-        old = new = residuals_by(problem.sources, before)
-        # A linear step may lead a shape too far. Of the refits with and without shapes the one that fits its own trials
-        # better is taken, and neither if the model before fits them best.
-        for free in moving:
-            assert augmented is not None
-            columns = augmented.J[:, np.isin(every, free)]
-            model = _refit(whole, free, columns, augmented.r, training, problem.prior, problem.scales)
-            residuals = augmented.residuals_of(model)
-            if _misfit(problem, residuals, seen) < _misfit(problem, new, seen):
-                after, new = model, residuals
+        seen = {e: f != k for e, f in fold.items()}
+        (before, old), (after, new) = _before_and_after(problem, augmented, of_row != k, seen)
         models.append((before, after))
         for e, c in old:
             mask = np.asarray(problem.stacks[e].batch.mask[c]) * ~seen[e]
@@ -71,6 +55,32 @@ def closures(problem: Problem, augmented: Fitted | None, forward: bool = True) -
         values, diverged = _forward(problem, fold["VD.3"], models)
         lines.append(_line("VD.3", "q", channel_units("q", prismatic), np.array(values), diverged))
     return tuple(lines)
+
+
+def _before_and_after(
+    problem: Problem, augmented: Fitted | None, training: np.ndarray, seen: dict[str, np.ndarray]
+) -> tuple[tuple[Model, Residuals], tuple[Model, Residuals]]:
+    """Models before and after, refitted to the training rows (the samples `seen`), each with its residuals.
+
+    A linear step may lead a shape too far. Of the refits with and without shapes the one that fits its own trials
+    better is taken, and neither if the model before fits them best.
+    """
+
+    def refit(model: Model, free: np.ndarray, J: np.ndarray, r: np.ndarray) -> Model:
+        return _refit(model, free, J, r, training, problem.prior, problem.scales)
+
+    model = problem.simulator or refit(problem.nominal, problem.free, problem.J, problem.r)
+    before = best = model, residuals_by(problem.sources, model)
+    if augmented is None:
+        return before, best
+    whole, every = augmented.fit.model, augmented.fit.estimated
+    shapeless = without_shapes(whole, every)
+    for free in (every, shapeless) if len(shapeless) < len(every) else (every,):
+        model = refit(whole, free, augmented.J[:, np.isin(every, free)], augmented.r)
+        residuals = augmented.residuals_of(model)
+        if _misfit(problem, residuals, seen) < _misfit(problem, best[1], seen):
+            best = model, residuals
+    return before, best
 
 
 def _forward(problem: Problem, fold: np.ndarray, models: list[tuple[Model, Model]]):

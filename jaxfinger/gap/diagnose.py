@@ -1,7 +1,8 @@
 """`diagnose`: where the gap of a session lies, which causes explain it, how far it shrinks, and what to record next."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,7 @@ from jaxfinger.gap.screening import read_parts
 from jaxfinger.gap.sets import Search
 from jaxfinger.gap.signature_table import Offer, SignatureTable, table_of
 from jaxfinger.gap.signatures import catalogue_for, changes_of, variants
-from jaxfinger.gap.smooth_laws import SmoothPart, smooth_parts
+from jaxfinger.gap.smooth_laws import SmoothPart, measured_columns, smooth_parts
 from jaxfinger.gap.where import where
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.parameters import describe, ravel, units_at
@@ -120,6 +121,17 @@ def diagnose(
             f"it has {', '.join(sorted(catalogue))}"
         )
     problem = build(session, recipe, progress, predictions, COARSE if quick else 1, against)
+    diagnosed = partial(
+        Diagnosis,
+        data=Path(session.file).name if session.file else "",
+        specimen=session.specimen,
+        against=None if against is None else against.data or against.specimen,
+        quick=quick,
+        tolerance=tolerance,
+        problem=problem,
+    )
+    if next(measured_columns(problem), None) is None:
+        return _nothing_judged(problem, diagnosed)
     kept = set(problem.fit.recipe.model.terms) | set(without)
     laws = {law for c in changed.values() for law in c.__mro__}  # An effect that a change inherits from is its copy.
     catalogue = {k: c for k, c in catalogue.items() if k not in kept and (k in changed or c not in laws)}
@@ -148,14 +160,9 @@ def diagnose(
     causes = _causes(chosen, found, shares, fit)
     none, unlisted = consistent_with(status, found, bool(relevance))
     left = smooth_parts(chosen.problem, chosen.r)
-    return Diagnosis(
+    return diagnosed(
         status=status,
         named=tuple(Key(*k) for k in _by_share(verdict.named, chosen, shares)),
-        data=Path(session.file).name if session.file else "",
-        specimen=session.specimen,
-        against=None if against is None else against.data or against.specimen,
-        quick=quick,
-        tolerance=tolerance,
         budget=causes,
         unexplained=_unexplained(chosen, shares, left, status, progress),
         channels=_channels(problem, baseline, chosen, causes, shares),
@@ -175,7 +182,32 @@ def diagnose(
         ),
         nominal=nominal.fit,
         augmented=fit,
-        problem=problem,
+    )
+
+
+def _nothing_judged(problem: Problem, diagnosed: Callable[..., Diagnosis]) -> Diagnosis:
+    """The diagnosis of a session in which no column has enough samples: every probability is one half."""
+    fit = nominal_fit(problem).fit
+    return diagnosed(
+        status=Status.NOT_JUDGED,
+        named=(),
+        budget=(),
+        unexplained=Unexplained(0.0, (0.0, 0.0), (), None, None),
+        channels=(),
+        relevance=(),
+        not_judged=_not_judged(problem, Columns(())),
+        closures=(),
+        where=(),
+        candidates=(),
+        none=0.5,
+        unlisted=0.5,
+        ambiguous_sets=(),
+        next_experiment=None,
+        absorbed=(),
+        changes=(),
+        left=(),
+        nominal=fit,
+        augmented=fit,
     )
 
 
@@ -200,8 +232,6 @@ def _verdict(
     Without a cause to name it is `unexplained` if some channel's mean square is surely above that of its noise,
     whatever the evidence, or if there is a gap and something unlisted is probable.
     """
-    if not baseline.columns.items:
-        return Verdict(Status.NOT_JUDGED, ())
     if found.named:
         return Verdict(Status.PARTLY, found.named)
     if found.ambiguous:
@@ -292,7 +322,7 @@ def _causes(chosen: SearchState, found: Posterior, shares: Budget, fit: Fit) -> 
 def _unexplained(chosen: SearchState, shares: Budget, left: list[SmoothPart], status: Status, progress) -> Unexplained:
     """Share of the gap that the chosen set leaves, the variables that it depends on, and a closed form for it."""
     _, _, share, ends = shares.overall()
-    if status in (Status.NO_GAP, Status.NOT_JUDGED) or not left or left[0].energy <= 0:
+    if status is Status.NO_GAP or not left or left[0].energy <= 0:
         return Unexplained(share, ends, (), None, None)
     worst = left[0]
     variables = sorted(worst.by_variable.items(), key=lambda kv: -kv[1])[:2]

@@ -33,10 +33,10 @@ MAX_REPEATS = 10  # A trial that needs more repeats to be decisive is not sugges
 # and commanded motions go through more.
 MIN_MOTION = 0.05
 REST_POSITIONS = (0.2, 0.8)  # Shares of the range at which resting joints are tried, well clear of the stops.
-MAX_TENSION = 15.0  # N, to which the protocols of the format pull a tendon
+MAX_TENSION = 15.0  # N, the largest tension of the format's protocols: that of VD.2 (docs/experiments.md).
 MAX_TENSION_FACTOR = 3.0  # Where joints are free, tension only keeps tendons taut (about 2 N): no more than threefold.
-FAST_SPEED = 1.5  # rad/s, to which motion without tendons is sped up
-SLOW_FACTOR = 0.25  # Slow motion has a quarter of the speed.
+FAST_SPEED = 1.5  # rad/s, the fastest sweep of ID.3-dynamic, to which motion without tendons is sped up.
+SLOW_FACTOR = 0.25  # A quarter of the speed brings the sweeps (0.5 to 1.5 rad/s) below their slowest.
 # The experiment whose motion a missing one borrows. VD.1 and VD.3 have motions of their own.
 MOTION_FROM = {"VD.2": "ID.4", "ID.4": "VD.2", "ID.3-static": "ID.2", "ID.3-dynamic": "ID.2"}
 

@@ -85,7 +85,7 @@ class Unexplained:
 
     share: float  # of the gap, mean over channels with a gap
     share_ci95: tuple[float, float]
-    depends_on: tuple[str, ...]  # variables of the smooth law that explain most of it: `tension`, `q`, …
+    depends_on: tuple[str, ...]  # up to two variables with which a smooth law explains it: `tension`, `q`, …
     where: ExperimentChannel | None  # the column with the largest part of it
     proposal: Proposal | None  # a closed form for a person to check
 

@@ -1,6 +1,6 @@
 """A diagnosis from end to end: the planted causes are found, and all that is returned agrees with itself."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -169,6 +169,22 @@ def test_where_finds_a_planted_gap(planted):
 
 def test_no_place_stands_out_of_white_noise(planted):
     assert where(replace(planted, r=np.random.default_rng(2).standard_normal(planted.r.size))) == []
+
+
+@pytest.mark.parametrize(("measured", "reason"), [(False, Reason.NOTHING_COUNTS), (True, Reason.FEW_SAMPLES)])
+def test_a_session_in_which_too_few_samples_count_is_not_judged(measured, reason):
+    """Three seconds of ID.2 are 30 rows of a first look, and a column has 50 at least."""
+    session = session_with()
+    trial = next(iter(session.select("ID.2")))
+    arrays = {f.name: getattr(trial, f.name) for f in fields(trial)}
+    short = replace(trial, **{k: x[:300] for k, x in arrays.items() if isinstance(x, np.ndarray)})
+    if not measured:
+        short = replace(short, tendon_excursion=np.full_like(short.tendon_excursion, np.nan))
+    found = diagnose(replace(session, trials={short.name: short}), without=WITHOUT, quick=True)
+    assert found.status is Status.NOT_JUDGED
+    assert found.not_judged == (NotJudged("ID.2", "tendon_excursion", reason),)
+    assert not found.named
+    assert found.augmented is found.nominal
 
 
 def test_a_channel_with_too_few_samples_is_listed_as_not_judged(planted):
