@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import NoReturn
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxfinger.errors import UserError
 from jaxfinger.rig.backend import (
@@ -37,6 +38,9 @@ AFTER_TRIP_S = 1.0
 QUIET_S = 0.3
 QUIET_TIMEOUT_S = 5.0  # s to wait for these samples. Much longer, since the first samples of a busy host come late.
 TIMEOUT_MARGIN_S = 5.0  # s by which a wait of known length may take longer before the trial ends
+# N of measured tension, up to which a tendon counts as released. In 0.7 s the controller ramps to 2 N, then to 0.5 N
+# (docs/plc-contract.md); what lies between is for zeros of load cells and for friction that holds a tendon.
+RELEASED_TENSION = 2.0
 TENSION_NOT_SEEN_TO_FALL = "tension was not seen to fall, so switch the drives off and see that it is off"
 
 
@@ -122,8 +126,8 @@ class Runner:
     def abort(self, error: UserError) -> str:
         """Stop the rig unless it is stopped, record AFTER_TRIP_S more, end the trial. Return why it ended.
 
-        If no sample shows that the controller released the finger, the sentence tells the operator to switch the drives
-        off.
+        If no sample shows the controller stopped and every tendon's measured tension at most RELEASED_TENSION, the
+        sentence tells the operator to switch the drives off.
         """
         reader = self.reader
         trip, seq = (error.trip, error.seq) if isinstance(error, TrialEnded) else (Trip.HOST, None)
@@ -132,7 +136,9 @@ class Runner:
 
         def released() -> bool:
             block = reader.latest
-            return block is not None and (tripped(block) or int(block.state[-1]) == State.IDLE)
+            if block is None or not (tripped(block) or int(block.state[-1]) == State.IDLE):
+                return False
+            return bool(np.all(self._tensions(block) <= RELEASED_TENSION))  # NaN is no tension seen
 
         self._let_pass(AFTER_TRIP_S, released)  # A busy host first has to read the samples before the stop.
         self._let_pass(AFTER_TRIP_S)
@@ -143,6 +149,12 @@ class Runner:
             place = {} if seq is None else {"seq": seq}
             reader.end({"complete": False, "cause": cause, "trip": int(trip), **place})
         return cause
+
+    def _tensions(self, block: Block) -> Float[np.ndarray, " n"]:
+        """Measured tension (N) of every tendon in the newest sample of a block, less its tare."""
+        at = self.rig.description.columns("tension", self.rig.description.finger.tendon_names)
+        zeros = [self.tare.get(self.rig.description.channels[k].name, 0.0) for k in at]
+        return block.x[-1, at] - np.array(zeros)
 
     def arm(self, name: str) -> None:
         """Bring the controller to IDLE, wait for samples without a violation, and arm the rig.

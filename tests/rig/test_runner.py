@@ -14,6 +14,7 @@ from jaxfinger.errors import UserError
 from jaxfinger.rig import parse_plan, parse_rig, recorder, recover, runner, wal
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import State, Trip
+from jaxfinger.rig.runner import TENSION_NOT_SEEN_TO_FALL
 from jaxfinger.rig.session import log_path, run
 from jaxfinger.rig.simulated.controller import Controller
 from jaxfinger.rig.simulated.examples import rig_toml
@@ -376,6 +377,20 @@ def test_what_is_wrong_before_arming_is_a_sentence_and_nothing_moves(rig, record
     assert says in str(error.value)
     assert controller.state is State.IDLE
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_tension_that_cannot_be_seen_was_not_seen_to_fall(rig, record):
+    """The controller has stopped and released, and one load cell reads nothing, or stays where it was."""
+    machine = SimulatedRig(rig)
+    outcome = record(machine, lambda m: m.inject("nan", slot(m, "tension", "T3")))
+    assert max(machine.controller.setpoint) == 0.0
+    assert TENSION_NOT_SEEN_TO_FALL in outcome.cause
+
+
+def test_a_tension_that_fell_is_not_asked_for(rig, record):
+    outcome = record(SimulatedRig(rig), lambda m: m.inject("nan", slot(m, "external_torque")))
+    assert outcome.cause
+    assert TENSION_NOT_SEEN_TO_FALL not in outcome.cause
 
 
 def test_a_controller_that_does_not_release_is_said(rig, record):
