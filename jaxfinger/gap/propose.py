@@ -20,9 +20,12 @@ from jaxfinger.gap.smooth_laws import SmoothPart, concerned, since_reversal
 MAX_TERMS = 3  # A formula of more terms is no law that a person could recognise.
 MIN_GAIN_SHARE = 0.1  # Share of the energy that smooth laws explain which every further term must explain.
 MIN_UNABSORBED = 0.05  # Share of a term's norm that nominal parameters must leave, lest its coefficient be arbitrary.
-# Scales of the library's terms, a factor of four or five apart, so that neighbouring terms are clearly distinct.
-SPEEDS = (0.05, 0.2, 0.8)  # rad/s
-LENGTHS = (0.02, 0.1, 0.4)  # rad
+# Scales of the library's terms, as shares of the specimen's own (`effects.Scales`), a factor of four or five apart, so
+# that neighbouring terms are clearly distinct.
+SPEEDS = (0.05, 0.2, 0.8)
+LENGTHS = (0.015, 0.08, 0.3)  # of a joint's range
+TENSION_CHANGE = 0.08
+TIMES = (0.03, 0.15)  # of the longest trial
 HARMONICS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16)  # periods a turn
 
 
@@ -97,21 +100,22 @@ def _library_rows(problem: Problem, channel: str, column: int) -> tuple[list[str
 
 def terms(problem: Problem, experiment: str, channel: str, column: int) -> list[tuple[str, Float[np.ndarray, "B T"]]]:
     """Library of one column: terms and their values."""
-    x, finger = problem.stacks[experiment].batch.x, problem.nominal.finger
+    x, finger, scales = problem.stacks[experiment].batch.x, problem.nominal.finger, problem.scales
     q, qd, f, s = (np.asarray(a) for a in (x.q, x.qd, x.tension, x.joint_direction))
     time = np.asarray(x.time)
     names, tendons = finger.joint_names, finger.tendon_names
     own, taut = concerned(finger, channel, column)
     out: list[tuple[str, np.ndarray]] = [("t", time)]
-    out += [(f"exp(−t/{tau:g} s)", np.exp(-time / tau)) for tau in (1.0, 5.0)]
+    out += [(f"exp(−t/{tau:g} s)", np.exp(-time / tau)) for tau in _rounded(TIMES, scales.trial)]
     for i in own:
         a, v, d = f"q_{names[i]}", f"q̇_{names[i]}", f"sign q̇_{names[i]}"
         out += [(f"{a}^{p}" if p > 1 else a, q[i] ** p) for p in (1, 2, 3, 4)]
         out += [(f"{v}|{v}|", qd[i] * np.abs(qd[i])), (f"{v}³", qd[i] ** 3), (f"{a} {v}", q[i] * qd[i])]
         out += [(d, s[i]), (f"{a} {d}", q[i] * s[i])]
-        out += [(f"exp(−|{v}|/{w:g}) {d}", np.exp(-np.abs(qd[i]) / w) * s[i]) for w in SPEEDS]
+        speeds, lengths = _rounded(SPEEDS, scales.speed[i]), _rounded(LENGTHS, scales.angle[i])
+        out += [(f"exp(−|{v}|/{w:g}) {d}", np.exp(-np.abs(qd[i]) / w) * s[i]) for w in speeds]
         travelled = since_reversal(q[i])
-        out += [(f"exp(−|Δ{a}|/{w:g}) {d}", np.exp(-np.abs(travelled) / w) * s[i]) for w in LENGTHS]
+        out += [(f"exp(−|Δ{a}|/{w:g}) {d}", np.exp(-np.abs(travelled) / w) * s[i]) for w in lengths]
         out += [(f"{g}({p} {a})", fun(p * q[i])) for p in HARMONICS for g, fun in (("sin", np.sin), ("cos", np.cos))]
         for j in range(finger.m):
             if j != i:
@@ -130,9 +134,15 @@ def terms(problem: Problem, experiment: str, channel: str, column: int) -> list[
             b = f"f_{tendons[k]}"
             pulled = since_reversal(f[k])
             out += [(b, f[k]), (f"{b}²", f[k] ** 2), (f"√{b}", np.sqrt(np.maximum(f[k], 0.0)))]
-            out += [(f"exp(−|Δ{b}|/1 N) sign Δ{b}", np.exp(-np.abs(pulled)) * np.sign(pulled))]
+            (w,) = _rounded((TENSION_CHANGE,), scales.tension[k])
+            out += [(f"exp(−|Δ{b}|/{w:g} N) sign Δ{b}", np.exp(-np.abs(pulled) / w) * np.sign(pulled))]
             for i in own:
                 a = f"q_{names[i]}"
                 out += [(f"{b} {a}", f[k] * q[i]), (f"{b} {a}²", f[k] * q[i] ** 2), (f"{b}² {a}", f[k] ** 2 * q[i])]
                 out += [(f"{b} sign q̇_{names[i]}", f[k] * s[i])]
     return [(text, np.broadcast_to(values, time.shape)) for text, values in out]
+
+
+def _rounded(shares: tuple[float, ...], scale: float) -> list[float]:
+    """Shares of a scale, to two digits, as the formula shows them."""
+    return [float(f"{share * scale:.2g}") for share in shares]
