@@ -25,7 +25,8 @@ from jaxfinger.data.sizes import Sizes
 from jaxfinger.effects.drive import NOMINAL_TEMPERATURE
 from jaxfinger.experiments.table import Experiment
 
-# An angle that turns back by less has not moved, in median residuals of the encoder; twice that for single samples.
+# An angle that turns back by less has not moved: four standard deviations of the encoder's noise, given in its median
+# residuals. Twice as much for single samples, which are not averaged.
 JITTER = 6.0
 
 

@@ -6,8 +6,8 @@ from jaxtyping import Float, Int
 from jaxfinger.gap.problem import Problem
 
 FOLDS = 3  # Every refit then has two thirds of the trials.
-# Root of the information of a weak prior about the fit to all trials, in that of all trials on each nominal parameter
-# alone. A parameter that the other folds do not show stays near that fit. The prior has 0.25 % of the information.
+# A weak prior holds every nominal parameter near the fit to all trials, so that one which the other folds do not show
+# stays there. This is the root of its information, relative to that of all trials on the parameter: 0.05² is 0.25 %.
 FOLD_PRIOR = 0.05
 
 

@@ -200,7 +200,8 @@ class LinearModel:
         Args:
             low, high: bounds of the amplitudes.
             start: weights of the first round; those of the null by default.
-            sizes: where the prior's N(0, I) already sees the amplitudes, from where they count on; zero by default.
+            sizes: amplitudes that the residual already lacks, in prior standard deviations; the fitted ones add to them
+                under the prior N(0, I). Zero by default.
         """
         k, n = self.BX.shape[1], len(picks)
         low = np.full(n, -np.inf) if low is None else low

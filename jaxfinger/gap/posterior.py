@@ -12,7 +12,7 @@ from jaxfinger.gap.sets import Search
 MIN_NAMED_PROBABILITY = 0.5  # More likely at work than not.
 # Shares of the probability of a cause and its rivals together:
 MIN_UNAMBIGUOUS_SHARE = 0.9  # The cause itself has odds of nine to one; with less it is one of an ambiguous set.
-MIN_COVERAGE = 0.97  # Members are added to an ambiguous set up to here; `next_experiment.SETTLES` asks as much of one.
+MIN_COVERAGE = 0.97  # Members are added to an ambiguous set up to here; `next_experiment.DECISIVE` asks as much of one.
 MAX_MEMBERS = 3  # of an ambiguous set. Sealed cases count no larger set as an answer (`sealed.score`).
 MIN_RIVALRY = 0.5  # probability of a cause and its rivals. With less the best set is no likely answer at all.
 

@@ -39,7 +39,7 @@ SHORT_LIST = 12  # offers that are compared with settled weights: a few for each
 MAX_PER_CHOICE = 2  # of the short list, for one cause and one choice of its fixed shapes
 MAX_EXACT = 3  # offers that are fitted exactly: each fit takes seconds
 MAX_CHANGES = 12  # changes of the set in one search
-MAX_SCORE_GAP = 8.0  # nats. An exact fit seldom gains more, so that a set further behind will not overtake another.
+MAX_SCORE_GAP = 8.0  # nats. A set whose linear fit is further behind is not fitted exactly: each fit takes seconds.
 MIN_SWAP_GAIN = 1.0  # nats that a swap must bring, so that two sets of like evidence are not swapped forth and back
 
 
@@ -124,7 +124,7 @@ class Search:
             if better is None:
                 break
             state = self._pruned(better)
-        # Rivals are fitted from the state's optimum; so is the state once more, that none of them is favoured.
+        # Rivals are fitted from the state's optimum; so is the state once more, so that none of them is favoured.
         if state.effects:
             state = max(state, self.fit_exactly(state, None), key=lambda s: s.score)
         self._visit_rivals(state)

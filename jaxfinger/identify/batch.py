@@ -74,7 +74,7 @@ class _Stage(eqx.Module):
     """Free parameters of a stage, the experiments that it reads, its prior and its bounds."""
 
     reads: tuple[int, ...] = eqx.field(static=True)  # indices of the sources that it reads
-    linear: tuple[bool, ...] = eqx.field(static=True)  # whether each of them is affine in the free parameters
+    affine: tuple[bool, ...] = eqx.field(static=True)  # whether each of them is affine in the free parameters
     free: Int[Array, " p"]  # positions in the flat vector
     mean: Float[Array, "S p"]  # of the prior
     root: Float[Array, "k p"]
@@ -184,7 +184,7 @@ def _measured_rows(masks: list[Float[Array, "S _columns B T"]]) -> Int[np.ndarra
 
 
 def _padded(batch: Batch, T: int) -> Batch:
-    """Longer by samples that do not count."""
+    """Pad a batch to T samples; the added ones have mask 0."""
     more = T - batch.x.time.shape[-1]
 
     def pad(a, mode):
@@ -227,8 +227,8 @@ def _fit_stage(model: Model, flat: Float[Array, " P"], sources: list[_Source], s
     def white(y, of: list[_Source]):
         return [s.rows(model, flat.at[stage.free].set(y), 0.0) for s in of]
 
-    affine = [s for s, linear in zip(mine, stage.linear, strict=True) if linear]
-    curved = [s for s, linear in zip(mine, stage.linear, strict=True) if not linear]
+    affine = [s for s, is_affine in zip(mine, stage.affine, strict=True) if is_affine]
+    curved = [s for s, is_affine in zip(mine, stage.affine, strict=True) if not is_affine]
     along = []  # r and J of the affine sources
     if affine:
         r, push = jax.linearize(lambda y: jnp.concatenate(white(y, affine)), start)

@@ -1,4 +1,4 @@
-"""The result of an identification, and its file."""
+"""The result of an identification."""
 
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime

@@ -7,15 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxfinger.identify.gauss_newton import MIN_RELATIVE_SINGULAR_VALUE
 from jaxfinger.identify.parameters import Parameter
 from jaxfinger.model import Finger, rigid_body
 
-# Relative singular values. Below the first a combination is weak: its interval is more than 1000 times as wide as that
-# of the best. Below the second it is invisible: JᵀJ holds the squares, which are then zero to rounding.
-WEAK, INVISIBLE = 1e-3, 1e-7
-# Entries of a unit vector: smaller ones hold less than 0.25 % of its square and are not shown, or less than 9 % and
+# A combination whose relative singular value is smaller is weak: its interval is more than 1000 times as wide as that
+# of the best. Below `gauss_newton.MIN_RELATIVE_SINGULAR_VALUE` it is invisible.
+MIN_SEEN_SINGULAR_VALUE = 1e-3
+# Entries of a unit vector. Smaller ones hold less than 0.25 % of its square and are not shown, or less than 9 % and
 # need no remedy.
-SHOWN, DOMINANT = 0.05, 0.3
+MIN_SHOWN_ENTRY, MIN_ENTRY_OF_REMEDY = 0.05, 0.3
 RANK_TOLERANCE = 1e-9  # relative, of a regressor's columns and singular values, far above rounding
 
 # Experiment of the format that determines each group of parameters.
@@ -38,13 +39,15 @@ class Direction:
     """One right singular vector of the white Jacobian, whose columns are scaled to unit length."""
 
     singular_value: float  # relative to the largest
-    shares: dict[str, float]  # entries of parameters that exceed `SHOWN`, largest first
+    shares: dict[str, float]  # entries of parameters that exceed `MIN_SHOWN_ENTRY`, largest first
     remedy: str  # experiments that would determine it; empty where the status is `seen`
 
     @property
     def status(self) -> str:
         """`seen`, `weak` or `invisible`."""
-        return "invisible" if self.singular_value < INVISIBLE else "weak" if self.singular_value < WEAK else "seen"
+        if self.singular_value < MIN_RELATIVE_SINGULAR_VALUE:
+            return "invisible"
+        return "weak" if self.singular_value < MIN_SEEN_SINGULAR_VALUE else "seen"
 
     def __str__(self) -> str:
         names = " ".join(f"{c:+.2f}·[{name}]" for name, c in self.shares.items())
@@ -66,7 +69,9 @@ def directions(
     out = []
     for value, v in zip(values / max(values[-1], 1e-300), vectors.T, strict=True):
         shares = _shares(parameters, free, v)
-        out.append(Direction(float(value), shares, _remedy(parameters, free, v) if value < WEAK else ""))
+        out.append(
+            Direction(float(value), shares, _remedy(parameters, free, v) if value < MIN_SEEN_SINGULAR_VALUE else "")
+        )
     return out
 
 
@@ -85,12 +90,12 @@ def name_invisible(
 
 
 def _shares(parameters, free, v) -> dict[str, float]:
-    return {parameters[free[k]].name: float(v[k]) for k in np.argsort(-np.abs(v)) if abs(v[k]) > SHOWN}
+    return {parameters[free[k]].name: float(v[k]) for k in np.argsort(-np.abs(v)) if abs(v[k]) > MIN_SHOWN_ENTRY}
 
 
 def _remedy(parameters, free, v) -> str:
     """Experiments that determine the parameters with the largest entries in the combination."""
-    involved = [parameters[free[k]] for k in np.argsort(-np.abs(v)) if abs(v[k]) > DOMINANT]
+    involved = [parameters[free[k]] for k in np.argsort(-np.abs(v)) if abs(v[k]) > MIN_ENTRY_OF_REMEDY]
     wanted = [
         REMEDIES[p.group].format(joint=p.joint or "by joint, two of them moved together", tendon=p.tendon)
         for p in involved

@@ -1,11 +1,11 @@
 """Joint refinement: every parameter of equation (1) from all trials at once.
 
-    min_θ  Σ_trials ‖white residuals(θ)‖² + ‖Σ^(−1/2) (θ − μ)‖²
+    min_θ  Σ_trials ‖white residuals(θ)‖² + ‖Λ^½ (θ − μ)‖²
 
-The prior (μ, Σ) is an earlier fit of other recordings with its full covariance. Where the earlier fit used these same
-recordings it gives only the start, and the prior is the finger's description, so that no data are counted twice. Masses
-and centres of mass are free wherever the description gives their standard deviations. Masses stay positive, and the
-inertia of a link is proportional to its mass, since CAD gives its shape.
+The prior, of mean μ and precision Λ, is an earlier fit of other recordings with its full covariance. Where the earlier
+fit used these same recordings it gives only the start, and the prior is the finger's description, so that no data are
+counted twice. Masses and centres of mass are free wherever the description gives their standard deviations. Masses stay
+positive, and the inertia of a link is proportional to its mass, since CAD gives its shape.
 """
 
 from dataclasses import replace
@@ -41,7 +41,7 @@ from jaxfinger.identify.stages import (
 from jaxfinger.identify.start import start_values
 from jaxfinger.model import Model
 
-STAGE = "joint"
+JOINT = "joint"  # name of the stage
 # χ² per row above which another start is tried. Noise alone gives 1 to a few percent, as a fit reads thousands of rows.
 RESTART_CHI2 = 1.3
 
@@ -115,7 +115,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
     )
     trials = tuple(t for s in stacks.values() for t in s.trials)
     how = "CAD is the prior, the trials are read once" if same else "the earlier fit of other data is the prior"
-    report = report_of(STAGE, solution, free, trials, warnings, _gain(fit, refined, how))
+    report = report_of(JOINT, solution, free, trials, warnings, _gain(fit, refined, how))
     refined = replace(refined, stages=(*fit.stages, report))
     if starts is None:
         return refined
@@ -167,8 +167,8 @@ def joint_channels(experiment: str) -> tuple[str, ...]:
 def _neutral(model: Model, free, parameters) -> Model:
     """Model whose free coefficients are zero, except masses and centres of mass: a start that no earlier fit biases."""
     flat = np.array(ravel(model))
-    linear = [i for i in free if parameters[i].group not in ("mass", "com")]
-    flat[linear] = 0.0
+    coefficients = [i for i in free if parameters[i].group not in ("mass", "com")]
+    flat[coefficients] = 0.0
     return Free.at(model, free).set(model, jax.device_put(flat[free]))
 
 

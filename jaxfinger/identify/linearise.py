@@ -4,11 +4,11 @@ With J the Jacobian of a trial's white residuals r, one QR factorisation [J r] =
 squares needs: ‖r + J δ‖² = ‖d + R δ‖² + ρ². A stage, the joint refinement, a bootstrap resample and a leave-one-out
 refit are sums over these small factors, at a cost that does not depend on the number of samples.
 
-Outliers: Huber's cost is ρ(r) = r²/2 for |r| ≤ k, and k|r| − k²/2 beyond (Huber 1964). Least squares of
+Outliers: Huber's cost is H(r) = r²/2 for |r| ≤ k, and k|r| − k²/2 beyond (Huber 1964). Least squares of
 
-    s(r) = sign(r) √(2 ρ(r)),   ∂s/∂r = ψ(r)/s(r),
+    s(r) = sign(r) √(2 H(r)),   ∂s/∂r = ψ(r)/s(r),
 
-minimises that cost: the sum of squares of s is 2 Σ ρ(r), and its gradient is 2 Σ J ψ(r), with ψ = ρ′.
+minimises that cost: the sum of squares of s is 2 Σ H(r), and its gradient is 2 Σ J ψ(r), with ψ = H′.
 """
 
 from collections.abc import Iterable

@@ -16,7 +16,7 @@ from jaxfinger.data import Session
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import prepare
 from jaxfinger.identify.fit import Fit
-from jaxfinger.identify.joint import STAGE as JOINT
+from jaxfinger.identify.joint import JOINT
 from jaxfinger.identify.linearise import white_rows
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.resample import compress, plan_of

@@ -1,4 +1,4 @@
-"""Prior knowledge of the parameters: from CAD and a scale, or from an earlier fit."""
+"""Prior on the parameters: from the finger's description, or from an earlier fit."""
 
 from typing import NamedTuple
 

@@ -1,9 +1,9 @@
 """Covariance of the parameters after each stage of a fit, with the errors of earlier stages propagated.
 
-With J_F the white Jacobian of a stage's free parameters, P the prior's precision, J_O the Jacobian of the other
+With J_F the white Jacobian of a stage's free parameters, Λ the prior's precision, J_O the Jacobian of the other
 parameters, and Σ_OO their covariance,
 
-    K = (J_Fᵀ J_F + P)⁻¹ J_Fᵀ J_O,   Σ_FF = (J_Fᵀ J_F + P)⁻¹ + K Σ_OO Kᵀ,   Σ_FO = −K Σ_OO.
+    K = (J_Fᵀ J_F + Λ)⁻¹ J_Fᵀ J_O,   Σ_FF = (J_Fᵀ J_F + Λ)⁻¹ + K Σ_OO Kᵀ,   Σ_FO = −K Σ_OO.
 """
 
 import numpy as np
@@ -21,9 +21,9 @@ MIN_SHARE = 1e-3
 def laplace(
     information: Float[np.ndarray, "p p"], root: Float[np.ndarray, "k p"], scores: Float[np.ndarray, "b p"]
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-    """Pseudo-inverse of JᵀJ + P, and the factor on each standard deviation (`cluster_robust.growth`).
+    """Pseudo-inverse of JᵀJ + Λ, and the factor on each standard deviation (`cluster_robust.growth`).
 
-    `information` is JᵀJ, `root` a square root of P, `scores` those of the stretches.
+    `information` is JᵀJ, `root` a square root of Λ, `scores` those of the stretches.
     """
     N = information + root.T @ root
     diagonal = np.diag(N)

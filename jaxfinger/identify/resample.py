@@ -24,8 +24,7 @@ from jaxfinger.data import Session
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import prepare
 from jaxfinger.identify.fit import Fit
-from jaxfinger.identify.joint import STAGE as JOINT
-from jaxfinger.identify.joint import joint_channels
+from jaxfinger.identify.joint import JOINT, joint_channels
 from jaxfinger.identify.linearise import linearise, triangular
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.shooting import AHEAD

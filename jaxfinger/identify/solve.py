@@ -1,12 +1,12 @@
 """Minimisation behind every fit of one session: `VisibleGaussNewton`, stepped from outside, on compressed trials.
 
-    min_θ  Σ_trials Huber(white residuals) + ½ ‖W (θ − μ)‖²
+    min_θ  Σ_trials Huber(white residuals) + ½ ‖Λ^½ (θ − μ)‖²
 
-A step of the solver needs the trials linearised and compressed at its trial point. Each experiment is linearised by a
-program of its own, which all sessions of similar fingers share; the solver is stepped from Python (optimistix calls
-that interactive stepping). `batch` instead passes the same rows to `optimistix.least_squares` in one program, which is
-compiled for its sessions. An experiment whose residuals are affine in the free parameters is linearised once and then
-moved along its tangent, which is exact.
+with the prior's mean μ and precision Λ. A step of the solver needs the trials linearised and compressed at its trial
+point. Each experiment is linearised by a program of its own, which all sessions of similar fingers share; the solver is
+stepped from Python (optimistix calls that interactive stepping). `batch` instead passes the same rows to
+`optimistix.least_squares` in one program, which is compiled for its sessions. An experiment whose residuals are affine
+in the free parameters is linearised once and then moved along its tangent, which is exact.
 """
 
 from dataclasses import dataclass
@@ -106,11 +106,11 @@ class Tangents:
         self._known: dict[str, tuple[np.ndarray, Tangent]] = {}
         self._white: dict[str, tuple[Source, float, np.ndarray, Linearised]] = {}
 
-    def at(self, name: str, model: Model, source: Source, limit: float, linear: bool) -> Linearised:
+    def at(self, name: str, model: Model, source: Source, limit: float, affine: bool) -> Linearised:
         """Linearise experiment `name` at the model; a cached tangent is whitened anew where the source has changed."""
         relevant = source.relevant_model(model)
         free = Free.at(relevant, source.positions)
-        if not linear:
+        if not affine:
             along = tangent(relevant, free, source.batch, tuple(source.filters))
             return whitened(along, source.batch, source.filters, limit, source.weights)
         values = np.asarray(free.get(relevant))

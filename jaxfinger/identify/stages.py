@@ -386,14 +386,14 @@ def sources_of(
     for e, channels in reads.items():
         groups = set().union(*(DEPENDS[e, c] for c in channels), {"effects"})
         positions = np.array([i for i, p in enumerate(parameters) if p.group in groups and p.determinable])
-        linear = set.intersection(*(_linear(stacks[e].experiment, c) for c in channels))
-        affine = np.array([i for i in positions if parameters[i].group in linear], dtype=int)
+        groups_affine = set.intersection(*(_affine_groups(stacks[e].experiment, c) for c in channels))
+        affine = np.array([i for i in positions if parameters[i].group in groups_affine], dtype=int)
         filters = {c: jax.device_put(noise[e, c].coefficients) for c in channels}
         out[e] = Source(stacks[e].batch, filters, positions, affine=affine, pace=stacks[e].experiment.pace)
     return out
 
 
-def _linear(experiment: Experiment, channel: str) -> set[str]:
+def _affine_groups(experiment: Experiment, channel: str) -> set[str]:
     """Groups of parameters in which a channel is jointly affine, with all others fixed.
 
     A torque is affine where the tendons are slack, so that the clipped loss of tendon friction does not enter.

@@ -175,7 +175,8 @@ def _channel_scores(session: Session, stack: Stack, channel: str, residual, floo
     """One score for each measured column; `residual` is (columns, B, T), NaN where the mask is 0."""
     share = _share(session, stack, channel)
     sliding = f"inverse dynamics where it slides, {share:.0%} of the samples"
-    method = {"VD.1": "f(q) − f(q(0))", "VD.3": sliding if channel == "joint_torque" else ""}
+    methods = {"VD.1": "f(q) − f(q(0))", "VD.3": sliding if channel == "joint_torque" else ""}
+    method = methods.get(stack.experiment.name, "")
     scores = []
     for k, column in enumerate(columns(session, channel)):
         series = [r[np.isfinite(r)] for r in residual[k]]
@@ -219,7 +220,7 @@ def _make_score(session, experiment, channel, k, column, rms, mean, samples, tri
         floor[1],
         samples,
         trials,
-        method.get(experiment, "") if isinstance(method, dict) else method,
+        method,
     )
 
 
