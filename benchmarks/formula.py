@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 
 from jaxfinger.data import read_session
 from jaxfinger.gap.columns import Counts
-from jaxfinger.gap.costs import Costs, Key
+from jaxfinger.gap.costs import CauseKey, Costs
 from jaxfinger.gap.diagnose import search_for_causes
 from jaxfinger.gap.formula import Evidence, Parameters, log_likelihood, unexplained, unlisted
 from jaxfinger.gap.problem import build
@@ -45,10 +45,10 @@ class Record:
 
     case: str
     counts: Counts
-    evidence: dict[frozenset[Key], Evidence]
-    screened: frozenset[frozenset[Key]]  # sets that have not been weighed in settled weights
-    explainable: dict[Key, np.ndarray]
-    at_work: frozenset[Key]
+    evidence: dict[frozenset[CauseKey], Evidence]
+    screened: frozenset[frozenset[CauseKey]]  # sets that have not been weighed in settled weights
+    explainable: dict[CauseKey, np.ndarray]
+    at_work: frozenset[CauseKey]
     parameters: Parameters
 
     def likeliest(self) -> "Record":

@@ -134,7 +134,7 @@ def _parameters(parameters: list[dict]) -> list[tuple[str, str, str]]:
 
 def print_validation(result: Validation) -> None:
     """Print a validation, one row for each column of a channel."""
-    from jaxfinger.report.sentences import EXPERIMENTS
+    from jaxfinger.report.sentences import EXPERIMENT_SENTENCES
 
     print(plain(f"{result.specimen} · {result.session}\n"))
     for experiment in dict.fromkeys(s.experiment for s in result.scores):
@@ -144,7 +144,7 @@ def print_validation(result: Validation) -> None:
             what = s.channel + (f", {s.method}" if s.method else "")
             rows.append((what, s.column, number(s.rms), number(s.mean), number(s.noise), number(ratio, 2), s.units))
         header = ("channel", "", "rms error", "mean error", "noise", "rms/noise", "")
-        table(f"{experiment}: {EXPERIMENTS[experiment]}", header, rows, left=2)
+        table(f"{experiment}: {EXPERIMENT_SENTENCES[experiment]}", header, rows, left=2)
     if result.slopes:
         rows = [
             (

@@ -19,7 +19,7 @@ from jaxfinger.data.motion import find_holds as find_holds
 from jaxfinger.data.predictions import Predictions as Predictions
 from jaxfinger.data.predictions import read_predictions as read_predictions
 from jaxfinger.data.predictions import write_predictions as write_predictions
-from jaxfinger.data.session import EXPERIMENTS as EXPERIMENTS
+from jaxfinger.data.session import EXPERIMENT_NAMES as EXPERIMENT_NAMES
 from jaxfinger.data.session import FingerDescription as FingerDescription
 from jaxfinger.data.session import Session as Session
 from jaxfinger.data.session import Trial as Trial

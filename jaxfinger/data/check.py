@@ -19,7 +19,7 @@ from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.opening import plain_reason, why_closed
 from jaxfinger.data.parse import listed, parse_file
 from jaxfinger.data.schema import MEASURED
-from jaxfinger.data.session import EXPERIMENTS, Session, Trial
+from jaxfinger.data.session import EXPERIMENT_NAMES, Session, Trial
 from jaxfinger.data.sizes import sizes_of
 
 # Share of a column's samples from which spikes are a warning instead of a note. Up to this share the mask finds them
@@ -71,8 +71,10 @@ def check_session(session: Session, report: Report) -> None:
         check_finger(session.finger, report)
         sizes = sizes_of(session)
         for trial in session:
-            if trial.experiment not in EXPERIMENTS:
-                message = f"has the unknown experiment {trial.experiment!r}; it must be one of {', '.join(EXPERIMENTS)}"
+            if trial.experiment not in EXPERIMENT_NAMES:
+                message = (
+                    f"has the unknown experiment {trial.experiment!r}; it must be one of {', '.join(EXPERIMENT_NAMES)}"
+                )
                 report.error(f"/trials/{trial.name}", message)
                 continue
             check_trial(trial, session.finger, sizes, report)

@@ -23,7 +23,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from jaxfinger.data.finger_file import Finger
-from jaxfinger.data.session import EXPERIMENTS
+from jaxfinger.data.session import EXPERIMENT_NAMES
 from jaxfinger.data.toml import Fault, NotEmpty, OneOf, Place, Positive, Within, read_toml
 
 _ColumnKey = Annotated[int, Within(0)] | str  # number of a column, from 0, or its name
@@ -100,7 +100,7 @@ class Channels:
 class MappedTrial:
     """`[trials.<name>]`: the part of a recording that is a trial."""
 
-    experiment: Annotated[str, OneOf(EXPERIMENTS)]
+    experiment: Annotated[str, OneOf(EXPERIMENT_NAMES)]
     file: str | None = None  # optional where only one recording is given
     joint: str | None = None
     tendon: str | None = None

@@ -27,7 +27,7 @@ from jaxfinger.data.schema import (
     Entry,
     units_of,
 )
-from jaxfinger.data.session import EXPERIMENTS, FingerDescription, Session, Trial
+from jaxfinger.data.session import EXPERIMENT_NAMES, FingerDescription, Session, Trial
 
 # gzip shrinks a constant by at most about 1:1030, so a dataset that claims more than this cannot be in the file.
 _MAX_COMPRESSION = 1100
@@ -175,9 +175,9 @@ def parse_trial(trials: h5py.Group, name: str, finger: FingerDescription, report
     if group is None:
         return None
     experiment = text_attribute(group, "experiment", place, report)
-    if experiment not in EXPERIMENTS:
+    if experiment not in EXPERIMENT_NAMES:
         said = "has no attribute `experiment`" if experiment is None else f"has the unknown experiment {experiment!r}"
-        report.error(place, f"{said}; it must be one of {', '.join(EXPERIMENTS)}")
+        report.error(place, f"{said}; it must be one of {', '.join(EXPERIMENT_NAMES)}")
     complete = _complete(group, place, report)
     time = dataset(group, TIME, place, {}, finger.prismatic, report)
     if time is None:
@@ -194,7 +194,7 @@ def parse_trial(trials: h5py.Group, name: str, finger: FingerDescription, report
         value = dataset(group, entry, place, sizes, finger.prismatic, report)
         if value is not None:
             channels[key] = value
-    if "q" not in channels or experiment not in EXPERIMENTS:
+    if "q" not in channels or experiment not in EXPERIMENT_NAMES:
         return None
     return Trial(
         name=name,

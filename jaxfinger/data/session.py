@@ -15,7 +15,7 @@ from jaxfinger.table import Table
 # Share of the longest travel among the joints: a joint that travels less is held. A fixture yields a little, and a
 # joint that is moved goes through much of its range.
 _MIN_TRAVEL_SHARE = 0.1
-EXPERIMENTS = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4", "VD.1", "VD.2", "VD.3")
+EXPERIMENT_NAMES = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4", "VD.1", "VD.2", "VD.3")
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ class Within:
 
 @dataclass(frozen=True)
 class OneOf:
-    """Annotation of a name, or a list of names, with the known ones: `Annotated[str, OneOf(EXPERIMENTS)]`."""
+    """Annotation of a name, or a list of names, with the known ones: `Annotated[str, OneOf(EXPERIMENT_NAMES)]`."""
 
     known: tuple[str, ...]
 

@@ -14,7 +14,7 @@ from scipy.optimize import isotonic_regression
 
 from jaxfinger.data import find_holds
 from jaxfinger.data.motion import RAMP_BLOCKS, slow_ramps, stretches_of
-from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, stretches
+from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, runs_of_holds
 from jaxfinger.experiments.shrink import shrink
 
 NONE_VALID = "no tendon is pulled from slack in holds, or in ramps slow enough to tell its friction"
@@ -92,7 +92,7 @@ def _fixture_angles(q: Float[np.ndarray, "M m"], hold: Int[np.ndarray, " M"]) ->
     a law of it, and near a singular posture it would be amplified a thousandfold in a contact force. Without holds the
     local Wiener filter does the same (`shrink`).
     """
-    runs = stretches(hold)
+    runs = runs_of_holds(hold)
     if not runs:
         return shrink(q, RAMP_BLOCKS)
     if len(runs) < MIN_HOLDS:
@@ -113,7 +113,7 @@ def _clipped_between_holds(values: Float[np.ndarray, "M k"], hold: Int[np.ndarra
     overshoot beyond the range is kept, less `MIN_OVERSHOOT` standard deviations of noise. Samples of ramps are not
     changed.
     """
-    runs = stretches(hold)
+    runs = runs_of_holds(hold)
     if not runs:
         return values
     out, at = values.copy(), np.arange(len(values))
@@ -139,7 +139,7 @@ def _continues(tension: Float[np.ndarray, "M n"], hold: Int[np.ndarray, " M"], t
     tell when.
     """
     out = np.zeros(len(hold), bool)
-    runs = stretches(hold)
+    runs = runs_of_holds(hold)
     steps = np.diff([tension[run].mean(axis=0) for run in runs], axis=0)
     ways = np.where(np.abs(steps) > travel, np.sign(steps), 0.0)
     for k in range(1, len(ways)):

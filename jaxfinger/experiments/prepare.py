@@ -13,7 +13,7 @@ from jaxfinger.data import Predictions, Session, Trial
 from jaxfinger.data.sizes import sizes_of
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import driven, held, path, stepped
-from jaxfinger.experiments.reduction import Row, prepared, stretches
+from jaxfinger.experiments.reduction import Row, prepared, runs_of_holds
 from jaxfinger.experiments.table import EXPERIMENTS, Experiment
 from jaxfinger.model import Motion
 
@@ -45,7 +45,7 @@ class Stack:
 
     def samples_of_holds(self, trial: int, counts: np.ndarray) -> list[np.ndarray]:
         """Indices of the valid samples of each hold of a trial; `counts` (T,) is nonzero where a sample is valid."""
-        return stretches(np.where(counts, self.holds[trial], -1))
+        return runs_of_holds(np.where(counts, self.holds[trial], -1))
 
 
 class NotJudged(NamedTuple):

@@ -232,6 +232,6 @@ def _temperatures(r: PreparedTrial) -> Float[np.ndarray, "M m"]:
     return np.stack([r.mean(known[:, k]).mean(axis=1) for k in of], axis=1)
 
 
-def stretches(hold: Int[np.ndarray, " M"]) -> list[Int[np.ndarray, " k"]]:
+def runs_of_holds(hold: Int[np.ndarray, " M"]) -> list[Int[np.ndarray, " k"]]:
     """Indices of the samples of each hold, in order of time."""
     return [np.flatnonzero(hold == k) for k in dict.fromkeys(hold[hold >= 0].tolist())]

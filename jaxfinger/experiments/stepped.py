@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from jaxfinger.data import directions, find_holds, smooth
 from jaxfinger.data.motion import rest_speed
 from jaxfinger.experiments.driven import sliding
-from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, stretches
+from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, runs_of_holds
 
 NONE_VALID = "there is no hold whose direction of approach is known, and no motion in which the joint slides"
 # s at the protocol's pace, left out on either side of samples where a joint may stick. It is short, since no measured
@@ -27,7 +27,7 @@ def reduce(r: PreparedTrial) -> Row:
         joint = r.trial.joint_direction.astype(float)
     else:
         joint = directions(slow, rest_speed(slow, r.quick_rates))
-        for samples in stretches(hold):  # a zero-phase filter shows the next step before it starts
+        for samples in runs_of_holds(hold):  # a zero-phase filter shows the next step before it starts
             joint[samples] = joint[samples[len(samples) // 2]]
     moves = (hold < 0)[:, None]  # nothing moves in a hold
     qd, qdd = j.qd * moves, j.qdd * moves
@@ -45,6 +45,6 @@ def reduce(r: PreparedTrial) -> Row:
 def _at_rest(q: Float[np.ndarray, "M m"], hold: Int[np.ndarray, " M"]) -> Float[np.ndarray, "M m"]:
     """Replace the angles of each hold by their mean, since changes within a hold are the encoder's noise."""
     out = q.copy()
-    for samples in stretches(hold):
+    for samples in runs_of_holds(hold):
         out[samples] = q[samples].mean(axis=0)
     return out

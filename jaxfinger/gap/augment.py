@@ -206,7 +206,7 @@ def _covariance(
     diagonal = np.diag(information)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-13, hermitian=True) * np.outer(scale, scale)
-    grow = growth(inverse, stretch_scores(r, J, problem.block_of_row), root)
+    grow = growth(inverse, stretch_scores(r, J, problem.stretch_of_row), root)
     return inverse * np.outer(grow, grow)
 
 

@@ -22,7 +22,7 @@ from scipy.special import logsumexp
 from jaxfinger.effects import NOMINAL_TERMS, Site
 from jaxfinger.gap.formula import Parameters
 
-Key = tuple[str, Site]  # A cause: effect and site.
+CauseKey = tuple[str, Site]  # A cause in the search: id of the effect, and site. A diagnosis holds it as `result.Key`.
 
 
 @dataclass(frozen=True)
@@ -31,19 +31,19 @@ class Costs:
 
     parameters: Parameters
     unexplained: Float[np.ndarray, " C"]  # u_c, nats
-    explainable: Mapping[Key, Float[np.ndarray, " C"]]  # τ_c of every cause that the trials can see
+    explainable: Mapping[CauseKey, Float[np.ndarray, " C"]]  # τ_c of every cause that the trials can see
 
     @cached_property
     def sites(self) -> Mapping[str, int]:
         """Number of sites of every effect."""
         return Counter(effect for effect, _ in self.explainable)
 
-    def of(self, keys: Iterable[Key]) -> float:
+    def of(self, keys: Iterable[CauseKey]) -> float:
         """Cost of a set, nats: log odds against it and the evidence that its causes need."""
         keys = list(keys)
         return self.odds(keys) + self.evidence_needed(keys)
 
-    def odds(self, keys: Iterable[Key]) -> float:
+    def odds(self, keys: Iterable[CauseKey]) -> float:
         """Log prior odds against these effects and sites: Σ_effects log E + Σ_causes log S_effect.
 
         A term of the nominal model that the recipe leaves out costs no log E, since it is as likely at
@@ -54,16 +54,16 @@ class Costs:
         return len(effects) * np.log(len(self.sites)) + sum(np.log(max(self.sites.get(e, 1), 1)) for e, _ in keys)
 
     @cached_property
-    def _evidence_where_it_acts(self) -> Mapping[Key, float]:
+    def _evidence_where_it_acts(self) -> Mapping[CauseKey, float]:
         """Σ_c τ_c u_c of every cause."""
         return {key: float(share @ self.unexplained) for key, share in self.explainable.items()}
 
-    def evidence_needed(self, keys: Iterable[Key]) -> float:
+    def evidence_needed(self, keys: Iterable[CauseKey]) -> float:
         """Log evidence that a set's causes must bring, summed over the causes."""
         p, there = self.parameters, self._evidence_where_it_acts
         return sum(p.cause_cost + p.imitator_gain * there[key] for key in keys)
 
-    def probabilities(self, scores: Mapping[frozenset[Key], float]) -> dict[frozenset[Key], float]:
+    def probabilities(self, scores: Mapping[frozenset[CauseKey], float]) -> dict[frozenset[CauseKey], float]:
         """Posterior probability of every set, ∝ exp(β (score − evidence needed) − log odds)."""
         beta = self.parameters.tempering
         log_w = [beta * (s - self.evidence_needed(keys)) - self.odds(keys) for keys, s in scores.items()]

@@ -16,6 +16,7 @@ from jaxfinger.gap.augment import Fitted, as_refitted, augmented_fit, nominal_fi
 from jaxfinger.gap.budget import MIN_GAP_EVIDENCE, Budget, budget, held_out_gains
 from jaxfinger.gap.closure import MIN_RESOLVABLE_RATIO, centred, closures
 from jaxfinger.gap.columns import Columns
+from jaxfinger.gap.costs import CauseKey
 from jaxfinger.gap.exact import Baseline, Projector, SearchState
 from jaxfinger.gap.formula import Parameters, Weights
 from jaxfinger.gap.next_experiment import next_experiment
@@ -69,7 +70,7 @@ class Verdict:
     """Status and named causes (effect and site) that follow from the posterior alone, without held-out trials."""
 
     status: Status
-    named: tuple[tuple[str, tuple[str, ...]], ...]
+    named: tuple[CauseKey, ...]
 
 
 def diagnose(

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.columns import Columns
-from jaxfinger.gap.costs import Key
+from jaxfinger.gap.costs import CauseKey
 from jaxfinger.gap.formula import LinearFit, LinearModel, Parameters, Weights, unexplained
 from jaxfinger.gap.problem import Problem, moved
 from jaxfinger.gap.signatures import Signatures, Variant
@@ -84,7 +84,7 @@ class SearchState:
         return self.linear_fit.score
 
     @property
-    def keys(self) -> tuple[Key, ...]:
+    def keys(self) -> tuple[CauseKey, ...]:
         """The causes: effect and site of each."""
         return tuple((e.ID, e.site) for e in self.effects)
 

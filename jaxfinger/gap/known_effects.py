@@ -7,6 +7,7 @@ from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError, did_you_mean
 from jaxfinger.experiments import affected_channels
 from jaxfinger.gap.augment import augmented_fit
+from jaxfinger.gap.costs import CauseKey
 from jaxfinger.gap.exact import Baseline
 from jaxfinger.gap.formula import Parameters
 from jaxfinger.gap.problem import Problem, build
@@ -18,12 +19,10 @@ from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.stages import Progress
 from jaxfinger.model import Finger
 
-Named = tuple[str, tuple[str, ...]]  # Effect and site; a pair of joints or tendons may be joined by a hyphen.
-
 
 def fit_with(
     session: Session,
-    keys: Sequence[Named],
+    keys: Sequence[CauseKey],
     recipe: Recipe | None = None,
     effects: dict[str, type[CatalogueEffect]] | None = None,
     progress: Progress = lambda message: None,
@@ -33,7 +32,7 @@ def fit_with(
     The effects are added in the order of what they explain, each in the shape that fits the trials best.
 
     Args:
-        keys: effect and site of every cause.
+        keys: effect and site of every cause; the names of a pair of joints or tendons may be joined by a hyphen.
         effects: a user's own effects, by id.
 
     Raises:
@@ -68,7 +67,7 @@ def fit_with(
     return augmented_fit(problem, state).fit
 
 
-def _offered(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[Named], problem: Problem) -> list[Variant]:
+def _offered(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[CauseKey], problem: Problem) -> list[Variant]:
     """Variants of the effects at their sites."""
     offered, finger = [], problem.nominal.finger
     for effect, site in keys:
@@ -77,7 +76,7 @@ def _offered(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[Named],
     return offered
 
 
-def _refuse_elsewhere(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[Named], finger: Finger) -> None:
+def _refuse_elsewhere(catalogue: dict[str, type[CatalogueEffect]], keys: Sequence[CauseKey], finger: Finger) -> None:
     """Raise a UserError for an effect that cannot act at its site."""
     for effect, site in keys:
         sites = ["-".join(s) for s in catalogue[effect].sites(finger)]

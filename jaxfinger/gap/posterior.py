@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxfinger.gap.costs import Key
+from jaxfinger.gap.costs import CauseKey
 from jaxfinger.gap.exact import SearchState
 from jaxfinger.gap.formula import unlisted
 from jaxfinger.gap.sets import Search
@@ -21,12 +21,12 @@ MIN_RIVALRY = 0.5  # probability of a cause and its rivals. With less the best s
 class Posterior:
     """Probabilities of the causes. Several may be at work, so that they need not sum to one."""
 
-    causes: dict[Key, float]  # probability that the cause is at work, alone or with others
-    gains: dict[Key, float]  # nats: net evidence of the best set with the cause less that of the best set without it
+    causes: dict[CauseKey, float]  # probability that the cause is at work, alone or with others
+    gains: dict[CauseKey, float]  # nats: net evidence of the best set with the cause less that of the best without it
     none: float  # probability that nothing is at work
     unlisted: float  # probability that something is at work which the catalogue lacks
-    named: tuple[Key, ...]  # causes of the best set that are likely and not ambiguous
-    ambiguous: tuple[tuple[Key, ...], ...]  # sets of causes that could replace one another in the best set
+    named: tuple[CauseKey, ...]  # causes of the best set that are likely and not ambiguous
+    ambiguous: tuple[tuple[CauseKey, ...], ...]  # sets of causes that could replace one another in the best set
 
 
 def posterior(search: Search, state: SearchState) -> Posterior:
@@ -46,7 +46,7 @@ def posterior(search: Search, state: SearchState) -> Posterior:
     return Posterior(causes, gains, w[frozenset()] * (1.0 - other), other, named, ambiguous)
 
 
-def _ambiguous(w: dict[frozenset[Key], float], state: SearchState) -> tuple[tuple[Key, ...], ...]:
+def _ambiguous(w: dict[frozenset[CauseKey], float], state: SearchState) -> tuple[tuple[CauseKey, ...], ...]:
     """Causes of the best set, each with the rivals that could take its place, likeliest first.
 
     `w` are the posterior probabilities of all visited sets. Rivals compare by the probability of the best set with the

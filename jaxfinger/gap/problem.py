@@ -97,7 +97,7 @@ class Problem:
         return out
 
     @property
-    def block_of_row(self) -> np.ndarray:
+    def stretch_of_row(self) -> np.ndarray:
         """(N,) number of the stretch of a trial to which each row belongs (`cluster_robust.stretches`)."""
         times = []
         for e, rows in self.rows.items():

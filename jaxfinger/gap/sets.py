@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.gap.by_column import ByColumn
-from jaxfinger.gap.costs import Costs, Key
+from jaxfinger.gap.costs import CauseKey, Costs
 from jaxfinger.gap.exact import (
     Baseline,
     SearchState,
@@ -47,15 +47,15 @@ MIN_SWAP_GAIN = 1.0  # nats that a swap must bring, so that two sets of like evi
 class Visited:
     """Evidence of every set that the search has visited; costs are not taken off."""
 
-    evidence: dict[frozenset[Key], Evidence] = field(default_factory=dict)
-    screened: set[frozenset[Key]] = field(default_factory=set)  # sets that `LinearModel.screen` alone has weighed
+    evidence: dict[frozenset[CauseKey], Evidence] = field(default_factory=dict)
+    screened: set[frozenset[CauseKey]] = field(default_factory=set)  # sets that `LinearModel.screen` alone has weighed
 
     @property
-    def scores(self) -> dict[frozenset[Key], float]:
+    def scores(self) -> dict[frozenset[CauseKey], float]:
         """Log evidence of every set."""
         return {keys: x.score for keys, x in self.evidence.items()}
 
-    def screen(self, keys: Iterable[Key], evidence: Evidence) -> None:
+    def screen(self, keys: Iterable[CauseKey], evidence: Evidence) -> None:
         """Record evidence in fixed weights. It is higher than in settled ones, and gives way to them."""
         key = frozenset(keys)
         if key not in self.evidence:
@@ -63,7 +63,7 @@ class Visited:
         if key in self.screened:
             self._keep_better(key, evidence)
 
-    def add(self, keys: Iterable[Key], evidence: Evidence) -> None:
+    def add(self, keys: Iterable[CauseKey], evidence: Evidence) -> None:
         """Record evidence in settled weights; the best of a set's records counts."""
         key = frozenset(keys)
         if key in self.screened:
@@ -71,7 +71,7 @@ class Visited:
             del self.evidence[key]
         self._keep_better(key, evidence)
 
-    def _keep_better(self, key: frozenset[Key], evidence: Evidence) -> None:
+    def _keep_better(self, key: frozenset[CauseKey], evidence: Evidence) -> None:
         if key not in self.evidence or evidence.score > self.evidence[key].score:
             self.evidence[key] = evidence
 
@@ -79,7 +79,7 @@ class Visited:
 class Reduced(NamedTuple):
     """A set without one of its causes, fitted linearly."""
 
-    keys: list[Key]
+    keys: list[CauseKey]
     r: Float[np.ndarray, " N"]
     slopes: Float[np.ndarray, "k N"]
     score: float
@@ -88,7 +88,7 @@ class Reduced(NamedTuple):
 class Screened(NamedTuple):
     """A set, perhaps without one of its causes, and the net evidence of it with each offer added."""
 
-    keys: list[Key]
+    keys: list[CauseKey]
     score: float
     model: LinearModel
     now: LinearFit  # fit of the set alone
@@ -337,7 +337,7 @@ class Search:
         return best
 
     # For the verdict --------------------------------------------------------------------------------------------------
-    def only(self, state: SearchState, keys: Iterable[Key]) -> SearchState:
+    def only(self, state: SearchState, keys: Iterable[CauseKey]) -> SearchState:
         """The set without all causes but these, fitted exactly."""
         keys = set(keys)
         while others := [i for i, k in enumerate(state.keys) if k not in keys]:
@@ -346,7 +346,7 @@ class Search:
             state = self.fit_exactly(state, others[0])
         return state
 
-    def rivals(self, state: SearchState, members: Iterable[Key]) -> list[SearchState]:
+    def rivals(self, state: SearchState, members: Iterable[CauseKey]) -> list[SearchState]:
         """The set, which holds one member of an ambiguous set, and the sets with each other member in its place."""
         members, out = list(members), [state]
         own = next(i for i, k in enumerate(state.keys) if k in members)
@@ -357,7 +357,7 @@ class Search:
                 out.append(self.with_best_choices(found, len(state.effects) - 1))
         return out
 
-    def _best_offer_of(self, screened: Screened, key: Key) -> tuple[Offer, Float[np.ndarray, " k"]] | None:
+    def _best_offer_of(self, screened: Screened, key: CauseKey) -> tuple[Offer, Float[np.ndarray, " k"]] | None:
         """Best offer of one cause alone on top of a set, with its amplitudes; None where there is none."""
         mine = [n for n, o in enumerate(self.table.offers) if o.keys == (key,) and np.isfinite(screened.net[n])]
         if not mine:
@@ -366,7 +366,9 @@ class Search:
         fit = screened.model.fit(offer.rows, offer.low, offer.high, start=screened.now.weights)
         return offer, fit.amplitudes
 
-    def alone(self, keys: Iterable[Key]) -> dict[Key, tuple[Offer, Float[np.ndarray, " _k"], Float[np.ndarray, " _k"]]]:
+    def alone(
+        self, keys: Iterable[CauseKey]
+    ) -> dict[CauseKey, tuple[Offer, Float[np.ndarray, " _k"], Float[np.ndarray, " _k"]]]:
         """Best offer of each cause alone on top of the nominal model, its amplitudes, and their standard deviations.
 
         Amplitudes are linear estimates, in prior standard deviations.

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfinger.gap.by_column import ByColumn
-from jaxfinger.gap.costs import Key
+from jaxfinger.gap.costs import CauseKey
 from jaxfinger.gap.exact import Baseline, Projector
 from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem
@@ -34,7 +34,7 @@ class Offer:
     high: Float[np.ndarray, " k"]
 
     @property
-    def keys(self) -> tuple[Key, ...]:
+    def keys(self) -> tuple[CauseKey, ...]:
         """The causes: effect and site of each."""
         return tuple(v.key for v in self.variants)
 
@@ -57,10 +57,10 @@ class SignatureTable:
     signatures: ByColumn  # M rows, in prior standard deviations of their amplitudes
     rows: dict[Variant, Int[np.ndarray, " _k"]]  # rows of every variant, one for each of its amplitudes
     units: Float[np.ndarray, " M"]  # prior standard deviations, in plausible sizes; zero if the trials see nothing
-    absorbed: dict[Key, float]  # share of a cause's energy that the nominal parameters imitate, at its best shape
+    absorbed: dict[CauseKey, float]  # share of a cause's energy that the nominal parameters imitate, at its best shape
     # Standard deviations of the cause's amplitudes, each alone, in their own units: as much of it could be hidden.
-    hidden: dict[Key, dict[str, float]]
-    explainable: dict[Key, Float[np.ndarray, " C"]]  # τ_c of every cause that the trials can see (`costs`)
+    hidden: dict[CauseKey, dict[str, float]]
+    explainable: dict[CauseKey, Float[np.ndarray, " C"]]  # τ_c of every cause that the trials can see (`costs`)
     offers: list[Offer]
 
     @cached_property
@@ -86,7 +86,7 @@ class SignatureTable:
         return [self.rows[v] for v in offer.variants]
 
     @property
-    def keys(self) -> list[Key]:
+    def keys(self) -> list[CauseKey]:
         """Causes that the trials can see."""
         return list(self.explainable)
 
@@ -103,9 +103,9 @@ def table_of(problem: Problem, baseline: Baseline, parts: Iterable[Part], togeth
     signatures = ByColumn.joined(baseline.columns, [rows for _, rows in read])
     norm, left, units, share = _visibility(baseline, project, signatures)
     seen = units > 0.0
-    absorbed: dict[Key, float] = {}
-    hidden: dict[Key, dict[str, float]] = {}
-    explainable: dict[Key, Float[np.ndarray, " C"]] = {}
+    absorbed: dict[CauseKey, float] = {}
+    hidden: dict[CauseKey, dict[str, float]] = {}
+    explainable: dict[CauseKey, Float[np.ndarray, " C"]] = {}
     offers, rows, start = [], {}, 0
     for v in items:
         at = np.arange(start, start + len(v.sizes))

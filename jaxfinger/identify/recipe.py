@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from jaxfinger.data.session import EXPERIMENTS
+from jaxfinger.data.session import EXPERIMENT_NAMES
 from jaxfinger.data.toml import Fault, OneOf, Place, Within, read_toml
 from jaxfinger.data.toml import structure as from_tables
 from jaxfinger.errors import UserError, did_you_mean
@@ -13,7 +13,7 @@ PAPER = ("joint_elastic", "joint_coulomb", "joint_damping", "tendon_friction", "
 # Beside the paper's terms, those that other machines need: a constant torque, friction that differs by direction,
 # friction in proportion to the torque of the joint's own drive, and the reflected inertia of a geared rotor.
 TERMS = (*PAPER, "joint_offset", "joint_friction_asymmetric", "joint_torque_friction", "rotor_inertia")
-STAGES = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4")
+STAGE_NAMES = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4")
 
 
 @dataclass(frozen=True)
@@ -35,17 +35,17 @@ class ModelRecipe:
 class FitRecipe:
     """Options of the fits."""
 
-    stages: Annotated[tuple[str, ...], OneOf(STAGES)] = STAGES
+    stages: Annotated[tuple[str, ...], OneOf(STAGE_NAMES)] = STAGE_NAMES
     huber: Annotated[float, Within(0.0)] = 3.0  # robust limit in standard deviations; 0 for plain least squares
     free_inertia: bool = False  # estimate masses and centres of mass too, with CAD as the prior
-    joint_experiments: Annotated[tuple[str, ...], OneOf(EXPERIMENTS)] = STAGES  # that the joint fit reads
+    joint_experiments: Annotated[tuple[str, ...], OneOf(EXPERIMENT_NAMES)] = STAGE_NAMES  # that the joint fit reads
 
 
 @dataclass(frozen=True)
 class ValidationRecipe:
     """Experiments that validation reads."""
 
-    experiments: Annotated[tuple[str, ...], OneOf(EXPERIMENTS)] = ("VD.1", "VD.2", "VD.3")
+    experiments: Annotated[tuple[str, ...], OneOf(EXPERIMENT_NAMES)] = ("VD.1", "VD.2", "VD.3")
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ MIN_PLACE_SHARE = 0.02  # of the gap, for a place to be listed
 MAX_CHANGES = 8  # changed parameters
 MAX_INTERVALS = 24  # parameters in the figures of intervals: those of the causes, then those known worst
 MAX_SIZE = 1e5  # SI units: no torque, length, mass or gain of a machine that is diagnosed is larger.
-VARIABLES = {"q": "rad", "qd": "rad/s", "tendon_force": "N", "time": "s"}  # units of a region's variable
+VARIABLE_UNITS = {"q": "rad", "qd": "rad/s", "tendon_force": "N", "time": "s"}  # units of a region's variable
 
 
 def write_page(d: Diagnosis, path: str | Path, overwrite: bool = False) -> None:
@@ -79,7 +79,7 @@ def render(d: Diagnosis, trace: Trace | None = None, found: Curves | None = None
         accent=ACCENTS[d.status],
         headline=sentences.headline(d),
         summary=unbroken(sentences.summary(d)),
-        experiments={k: v for k, v in sentences.EXPERIMENTS.items() if k in {*_experiments(d)}},
+        experiments={k: v for k, v in sentences.EXPERIMENT_SENTENCES.items() if k in {*_experiments(d)}},
         budget=_budget(d) if d.channels else "",
         hidden_bars=max(len(d.channels) - gap_plots.MAX_BARS, 0),
         relevance=[_relevance(x) for x in d.relevance if x.tolerated or d.status is not Status.NO_GAP],
@@ -264,8 +264,8 @@ def _value(v: Value, sites: bool) -> str:
 
 
 def _place(p: Place, prismatic: tuple[bool, ...]) -> dict:
-    units = units_where(VARIABLES.get(p.variable, "1"), prismatic)
-    variable = sentences.VARIABLES.get(p.variable, p.variable)
+    units = units_where(VARIABLE_UNITS.get(p.variable, "1"), prismatic)
+    variable = sentences.VARIABLE_NAMES.get(p.variable, p.variable)
     return {
         "name": _name(p.experiment, p.channel, p.site),
         "trial": p.trial,
@@ -280,7 +280,7 @@ def _line(x: Closure) -> dict:
 
 def _left(x: Left) -> str:
     most = sorted(x.by_variable.items(), key=lambda kv: -kv[1])[:2]
-    named = [sentences.VARIABLES.get(k, k) for k, v in most if v > MIN_VARIABLE_SHARE * x.energy]
+    named = [sentences.VARIABLE_NAMES.get(k, k) for k, v in most if v > MIN_VARIABLE_SHARE * x.energy]
     return f"{_name(x.experiment, x.channel, x.column)}" + (f": goes with {sentences.joined(named)}" if named else "")
 
 

@@ -43,14 +43,14 @@ HEADLINES = {
     Status.UNEXPLAINED: "Unexplained by any known cause",
     Status.NOT_JUDGED: "Nothing could be judged",
 }
-CHANNELS = {
+CHANNEL_NAMES = {
     "joint_torque": "joint torque",
     "tendon_excursion": "tendon excursion",
     "fingertip_force": "fingertip force",
     "tendon_force": "tendon force",
     "q": "simulated angle",
 }
-EXPERIMENTS = {
+EXPERIMENT_SENTENCES = {
     "ID.2": "one joint is moved slowly through its range, tendons taut",
     "ID.3-static": "a motor takes a joint from one held angle to the next, tendons slack",
     "ID.3-dynamic": "a motor sweeps joints at several speeds, tendons slack",
@@ -59,7 +59,7 @@ EXPERIMENTS = {
     "VD.2": "one tendon pulls the fingertip against a force sensor",
     "VD.3": "tendons move the free finger",
 }
-VARIABLES = {
+VARIABLE_NAMES = {
     "q": "the joint's own position",
     "qd": "speed",
     "direction": "the direction of motion",
@@ -84,7 +84,7 @@ def effect_name(effect: str) -> str:
 
 def channel_name(channel: str) -> str:
     """Name of a channel: `joint_torque` gives «joint torque»."""
-    return CHANNELS.get(channel, channel.replace("_", " "))
+    return CHANNEL_NAMES.get(channel, channel.replace("_", " "))
 
 
 def site_names(sites: Iterable[Site]) -> str:
@@ -286,7 +286,7 @@ def _pattern(d: Diagnosis) -> str:
     """Column in which most of the unexplained gap lies, and the variables that it depends on; empty where unknown."""
     u = d.unexplained
     parts = [f"lies mostly in {_of(u.where.experiment, u.where.name, u.where.column)}"] if u.where else []
-    parts += [f"goes with {joined([VARIABLES.get(v, v) for v in u.depends_on])}"] if u.depends_on else []
+    parts += [f"goes with {joined([VARIABLE_NAMES.get(v, v) for v in u.depends_on])}"] if u.depends_on else []
     return f" {joined(parts)}" if parts else ""
 
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from jaxfinger.data import EXPERIMENTS, FingerDescription
+from jaxfinger.data import EXPERIMENT_NAMES, FingerDescription
 from jaxfinger.data.finger_file import Finger, finger_from
 from jaxfinger.data.toml import Fault, NotEmpty, OneOf, Place, Positive, Share, Within, one_of, read_toml, structure
 
@@ -167,7 +167,7 @@ class Drives:
 class Trials:
     """Keys of `[trials]`: the trials to record."""
 
-    experiments: Annotated[tuple[str, ...], OneOf(EXPERIMENTS)] = EXPERIMENTS
+    experiments: Annotated[tuple[str, ...], OneOf(EXPERIMENT_NAMES)] = EXPERIMENT_NAMES
     rate: Positive = 1000.0  # Hz
     motion_seed: NonNegativeInt = 0  # seed of the random motions; noise has the recipe's own seed
     id2: Excursions = Excursions()

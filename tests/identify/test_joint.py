@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfinger.data import EXPERIMENTS
+from jaxfinger.data import EXPERIMENT_NAMES
 from jaxfinger.errors import UserError
 from jaxfinger.identify import Recipe, identify, refine
 from jaxfinger.identify.parameters import Free, describe, ravel
@@ -48,10 +48,10 @@ def test_all_trials_of_one_joint_are_refined_to_their_noise():
     other channels.
     """
     specimen = study_finger()
-    trials = {**SHORT, "experiments": list(EXPERIMENTS), "vd1": {"duration": 6.0}, "vd3": {"duration": 4.0}}
+    trials = {**SHORT, "experiments": list(EXPERIMENT_NAMES), "vd1": {"duration": 6.0}, "vd3": {"duration": 4.0}}
     recipe = recipe_from({"cad": {"mass": 0.05, "com": 2e-3}, "trials": trials})
     session = measure(clean_session(recipe, SpecimenPlant(specimen), specimen.description), 0)
-    joint = refine(session, identify(session, Recipe(fit=FitRecipe(joint_experiments=EXPERIMENTS))))
+    joint = refine(session, identify(session, Recipe(fit=FitRecipe(joint_experiments=EXPERIMENT_NAMES))))
     free = joint.estimated
     z = (values(joint) - np.asarray(ravel(true_model(specimen))))[free] / joint.std[free]
     assert 0.8 < joint.stages[-1].chi2_per_row < 1.2

@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxfinger.data import EXPERIMENTS
+from jaxfinger.data import EXPERIMENT_NAMES
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.errors import UserError
 from jaxfinger.synthetic import (
@@ -29,7 +29,7 @@ def plans():
     return {plan.experiment: plan for plan in plans}
 
 
-@pytest.mark.parametrize("experiment", [e for e in EXPERIMENTS if e != "VD.3"])
+@pytest.mark.parametrize("experiment", [e for e in EXPERIMENT_NAMES if e != "VD.3"])
 def test_prescribed_channels_agree(plans, experiment):
     plan, active = plans[experiment], SPECIMEN.description.active
     ours = SpecimenPlant(SPECIMEN).prescribed(plan)

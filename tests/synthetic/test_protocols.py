@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxfinger.data import EXPERIMENTS
+from jaxfinger.data import EXPERIMENT_NAMES
 from jaxfinger.errors import UserError
 from jaxfinger.synthetic import paper_finger, random_finger, recipe_from, session_plan
 
@@ -16,7 +16,7 @@ def plans():
 
 
 def test_every_experiment_is_planned_and_repeats_share_their_motion(plans):
-    assert {p.experiment for p in plans} == set(EXPERIMENTS)
+    assert {p.experiment for p in plans} == set(EXPERIMENT_NAMES)
     assert len({p.name for p in plans}) == len(plans)
     motions = [p.motion for p in plans if p.experiment == "ID.4"]
     assert all(motions.count(motion) == 2 for motion in motions)
@@ -88,6 +88,6 @@ def test_recipe_that_does_not_fit_the_finger(change, said):
 def test_any_finger_has_a_programme():
     description = random_finger(5, 6, "abduction", "fewest").description
     plans = session_plan(description, recipe_from({"trials": {"rate": 50.0}}).trials)
-    assert {p.experiment for p in plans} == set(EXPERIMENTS)
+    assert {p.experiment for p in plans} == set(EXPERIMENT_NAMES)
     assert {p.joint for p in plans if p.experiment == "ID.3-static"} == set(range(6))
     assert {p.tendon for p in plans if p.experiment == "ID.4"} == set(range(7))

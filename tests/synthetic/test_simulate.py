@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxfinger.data import EXPERIMENTS, check_file, read_session, write_session
+from jaxfinger.data import EXPERIMENT_NAMES, check_file, read_session, write_session
 from jaxfinger.errors import UserError
 from jaxfinger.synthetic import (
     clean_session,
@@ -21,7 +21,7 @@ from tests.data.conftest import ONE_JOINT
 
 QUICK_TRIALS = {
     "rate": 50.0,
-    "experiments": [e for e in EXPERIMENTS if e != "VD.3"],
+    "experiments": [e for e in EXPERIMENT_NAMES if e != "VD.3"],
     "id2": {"stroke_time": 1.0, "strokes": 2},
     "vd1": {"motions": 1, "duration": 4.0},
 }
@@ -184,7 +184,7 @@ def test_a_finger_file_is_a_recipe(tmp_path):
     torque += 0.002 * still.joint_direction[:, 0]
     np.testing.assert_allclose(still.joint_torque[held, 0], torque[held], atol=2e-3)
     bare = simulate(read_session_recipe(tmp_path / "finger.toml"))  # no terms, every experiment
-    assert {t.experiment for t in bare} == set(EXPERIMENTS)
+    assert {t.experiment for t in bare} == set(EXPERIMENT_NAMES)
 
 
 @pytest.mark.parametrize(
@@ -232,4 +232,4 @@ def test_shipped_session_is_the_shipped_recipe():
     assert not _errors(SHIPPED / "session.h5")
     assert list(session.trials) == [p.name for p in session_plan(paper_finger().description, recipe.trials)]
     assert (SHIPPED / "session.h5").stat().st_size < 1.9e6
-    assert {t.experiment for t in session} == set(EXPERIMENTS)
+    assert {t.experiment for t in session} == set(EXPERIMENT_NAMES)
