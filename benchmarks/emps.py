@@ -18,9 +18,9 @@ from jaxfinger.data import Session, read_session
 from jaxfinger.data.importers import import_file
 from jaxfinger.gap import diagnose
 from jaxfinger.gap.columns import Columns
-from jaxfinger.gap.exact import Projector
 from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem, build
+from jaxfinger.gap.projector import Projector
 from jaxfinger.gap.propose import Proposal, terms
 from jaxfinger.gap.signatures import whitened
 from jaxfinger.identify import Fit, Recipe, read_recipe

@@ -12,9 +12,10 @@ from jaxtyping import Float, Int
 
 from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.experiments import affected_channels
-from jaxfinger.gap.exact import Projector, SearchState
+from jaxfinger.gap.exact import SearchState
 from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem, assemble, moved
+from jaxfinger.gap.projector import Projector
 from jaxfinger.gap.result import Value
 from jaxfinger.gap.signatures import Signatures
 from jaxfinger.identify import Fit

@@ -17,11 +17,12 @@ from jaxfinger.gap.budget import MIN_GAP_EVIDENCE, Budget, budget, held_out_gain
 from jaxfinger.gap.closure import MIN_RESOLVABLE_RATIO, centred, closures
 from jaxfinger.gap.columns import Columns
 from jaxfinger.gap.costs import CauseKey
-from jaxfinger.gap.exact import Baseline, Projector, SearchState
+from jaxfinger.gap.exact import Baseline, SearchState
 from jaxfinger.gap.formula import Parameters, Weights
 from jaxfinger.gap.next_experiment import next_experiment
 from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY, Posterior, posterior
 from jaxfinger.gap.problem import Problem, build, site
+from jaxfinger.gap.projector import Projector
 from jaxfinger.gap.propose import propose
 from jaxfinger.gap.result import (
     Absorbed,

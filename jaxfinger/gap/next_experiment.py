@@ -20,9 +20,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.experiments import EXPERIMENTS, Batch, Stack, affected_channels
-from jaxfinger.gap.exact import Projector, SearchState, derivatives
+from jaxfinger.gap.exact import SearchState, derivatives
 from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem, imagined
+from jaxfinger.gap.projector import Projector
 from jaxfinger.gap.result import NextExperiment, Posture
 from jaxfinger.gap.signatures import Signatures
 from jaxfinger.model import Finger

@@ -4,7 +4,7 @@
 
 W whitens by the noise of each channel. Q spans the whitened Jacobian of the nominal parameters: the projection removes
 what they can absorb, which is no evidence (theorem of Frisch, Waugh and Lovell). This module makes W r and the whitened
-Jacobian; `signatures` makes W ∂ŷ/∂a; `exact.Projector` projects.
+Jacobian; `signatures` makes W ∂ŷ/∂a; `projector` projects.
 """
 
 from dataclasses import dataclass, replace

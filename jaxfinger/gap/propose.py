@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.data.schema import channel_units
-from jaxfinger.gap.exact import Projector
 from jaxfinger.gap.problem import Problem, site
+from jaxfinger.gap.projector import Projector
 from jaxfinger.gap.signatures import whitened
 from jaxfinger.gap.smooth_laws import SmoothPart, concerned, since_reversal
 

@@ -24,7 +24,7 @@ MIN_PERIOD = 20.0  # s. Drifts take minutes; shorter periods are those of the mo
 MAX_PERIODS = 300
 RIDGE = 1e-9  # relative. Keeps products of nearly collinear rows invertible.
 
-# Projection of k rows of N numbers off the nominal parameters; the prior's rows come after the N (`exact.Projector`).
+# Projection of k rows of N numbers off the nominal parameters; the prior's rows come after the N (`projector`).
 Project = Callable[[Float[np.ndarray, "k N"]], Float[np.ndarray, "k rows"]]
 VariantRows = tuple[list[Variant], ByColumn]  # variants, and one row for each amplitude of each
 

@@ -10,9 +10,10 @@ from jaxtyping import Float, Int
 
 from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.costs import CauseKey
-from jaxfinger.gap.exact import Baseline, Projector
+from jaxfinger.gap.exact import Baseline
 from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.problem import Problem
+from jaxfinger.gap.projector import Projector
 from jaxfinger.gap.screening import Part
 from jaxfinger.gap.signatures import Variant
 

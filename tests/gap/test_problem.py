@@ -7,9 +7,10 @@ import pytest
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap.augment import as_refitted, augmented_fit, nominal_fit
-from jaxfinger.gap.exact import Baseline, fit_at_nominal, fit_set, orthonormalise, refit_from_plain
+from jaxfinger.gap.exact import Baseline, fit_at_nominal, fit_set, refit_from_plain
 from jaxfinger.gap.formula import Parameters, Weights
 from jaxfinger.gap.problem import build, moved
+from jaxfinger.gap.projector import orthonormalise
 from jaxfinger.gap.signatures import Signatures, Variant
 from jaxfinger.gap.where import where
 from jaxfinger.identify import Recipe
