@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 
 from jaxfinger.data.atomic import atomic_path
 from jaxfinger.data.schema import channel_units, units_where
-from jaxfinger.gap.diagnose import MIN_VARIABLE_SHARE
+from jaxfinger.gap.parts import MIN_VARIABLE_SHARE
 from jaxfinger.gap.result import Absorbed, Candidate, Cause, Closure, Diagnosis, Key, Left, Place, Status, Value
 from jaxfinger.report import plots, sentences
 from jaxfinger.report.causes import words

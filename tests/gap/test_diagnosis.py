@@ -11,7 +11,7 @@ from jaxfinger.effects import CATALOGUE, CatalogueEffect, amplitude
 from jaxfinger.errors import UserError
 from jaxfinger.gap import Status, diagnose, fit_with
 from jaxfinger.gap.columns import Columns
-from jaxfinger.gap.diagnose import _not_judged
+from jaxfinger.gap.parts import channels_not_judged
 from jaxfinger.gap.result import Key, NotJudged, Reason
 from jaxfinger.gap.signatures import whitened
 from jaxfinger.gap.where import where
@@ -189,9 +189,9 @@ def test_a_session_in_which_too_few_samples_count_is_not_judged(measured, reason
 
 def test_a_channel_with_too_few_samples_is_listed_as_not_judged(planted):
     columns = Columns.of(planted)
-    assert _not_judged(planted, columns) == ()
+    assert channels_not_judged(planted, columns) == ()
     fewer = Columns(tuple(c for c in columns.items if c.experiment != "ID.2"))
-    assert _not_judged(planted, fewer) == (NotJudged("ID.2", "tendon_excursion", Reason.FEW_SAMPLES),)
+    assert channels_not_judged(planted, fewer) == (NotJudged("ID.2", "tendon_excursion", Reason.FEW_SAMPLES),)
 
 
 def test_progress_is_told(diagnosis, messages):
