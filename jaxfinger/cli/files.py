@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -46,11 +47,11 @@ def check(file: Path, *, json: bool = False) -> None:
         raise SystemExit(2)
 
 
-def _as_dict(recording: Recording) -> dict:
-    """Survey of a recording for JSON."""
+def _as_dict(recording: Recording, among: Sequence[Recording]) -> dict:
+    """Survey of a recording, one of several of one rig, for JSON."""
     from jaxfinger.data.look import clocks_of, columns_of
 
-    seen = columns_of(recording)
+    seen = columns_of(recording, among)
     return {
         "file": recording.path,
         "columns": [asdict(s) for s in seen],
@@ -82,10 +83,10 @@ def look(*recordings: Path, finger: Path | None = None, json: bool = False) -> N
     described = finger_from(str(finger.resolve()), Place(str(finger))) if finger is not None else None
     loaded = [load_recording(path) for path in recordings]
     if json:
-        print_json([_as_dict(recording) for recording in loaded])
+        print_json([_as_dict(recording, loaded) for recording in loaded])
         return
     for recording in loaded:
-        seen = columns_of(recording)
+        seen = columns_of(recording, loaded)
         rows = [
             (
                 s.name + ("" if s.column is None else f"[{s.column}]"),

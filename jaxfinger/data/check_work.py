@@ -11,7 +11,7 @@ Where a law fails, a sign, a unit or a column is wrong in one of the channels th
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -110,7 +110,9 @@ def _arm_lengths(arms: Arms, finger: FingerDescription, report: Report) -> None:
 def _virtual_work(session: Session, kinematic: _Excursions, report: Report) -> None:
     """Report moment arms of ID.4 that contradict those of ID.2."""
     finger = session.finger
-    turned, far = [], []
+    turned: dict[tuple[str, str], str] = {}  # what to say of each tendon and joint
+    far: dict[tuple[str, str], str] = {}
+    agreed: list[tuple[str, str]] = []
     for trial in session.select("ID.4"):
         if trial.joint not in finger.joint_names or trial.tendon not in finger.tendon_names:
             continue
@@ -124,16 +126,33 @@ def _virtual_work(session: Session, kinematic: _Excursions, report: Report) -> N
         said = f"{trial.tendon} at {trial.joint} ({1e3 * seen:.3g} against {1e3 * felt:.3g} mm)"
         ratio = felt / seen
         if ratio < -_MIN_ARM_RATIO:
-            turned.append(said)
+            turned[trial.tendon, trial.joint] = said
         elif not _MIN_ARM_RATIO < ratio < _MAX_ARM_RATIO:
-            far.append(said)
+            far[trial.tendon, trial.joint] = said
+        else:
+            agreed.append((trial.tendon, trial.joint))
     for found, what in ((turned, "the sign"), (far, "the units or the column")):
         if found:
             report.warning(
                 "/trials",
                 "moment arms that excursions show (ID.2) and those that torques show (ID.4) contradict each other: "
-                f"{listed(found, 3)}; check {what} of joint_torque, tendon_excursion, tendon_force or q",
+                f"{listed(list(found.values()), 3)}; check {what} of {_suspects(found, agreed)}",
             )
+
+
+def _suspects(found: Collection[tuple[str, str]], agreed: Collection[tuple[str, str]]) -> str:
+    """Channels that may be wrong, given the pairs of tendon and joint that contradict each other and those that agree.
+
+    A joint at which another tendon agrees has a sound angle and torque; a tendon that agrees at another joint has sound
+    tension and excursion.
+    """
+    tendons, joints = ({pair[k] for pair in found} for k in (0, 1))
+    sound_tendons, sound_joints = ({pair[k] for pair in agreed} for k in (0, 1))
+    if len(tendons) == 1 and joints <= sound_joints and not tendons & sound_tendons:
+        return f"tendon_excursion or tendon_force of {min(tendons)}"
+    if len(joints) == 1 and tendons <= sound_tendons and not joints & sound_joints:
+        return f"joint_torque or q of {min(joints)}"
+    return "joint_torque, tendon_excursion, tendon_force or q"
 
 
 def _free_paths(session: Session, kinematic: _Excursions, report: Report) -> None:

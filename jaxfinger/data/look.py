@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxfinger.data.parse import listed
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
@@ -20,18 +21,19 @@ _MEANINGS = (
     ("temperature", r"temp"),
     ("joint_torque", r"(^|_)tau|torque|effort|moment"),
     ("tendon_excursion", r"excursion|^l\d*$|length|pull|spool|linear|travel"),
-    ("tendon_force", r"tension|tendon.*force|^f_?t|^f(\d|_(?!([xyz]|tip)$))|cable|loadcell|^force"),
+    ("tendon_force", r"tension|tendon.*force|^f_?t|^f(\d|_(?!([xyz]|tip)$))|cable|loadcell|(^|_)cell(_|\d|$)|^force"),
     ("fingertip_force", r"f?tip|contact|^f[xyz]$|wrench"),
     ("q", r"^q[_\d]*|angle|pos|enc|theta|winkel|deg$"),
 )
 # Names of velocities and commands, which belong to no channel.
 _NO_CHANNEL = r"(?<![a-z])vel|speed|dot|^v$|^dq|cmd|command|ref|desired|set|goal"
 # Largest plausible values of a channel by unit, with room for arms. The first unit whose largest value is not exceeded
-# is the guess. Torques from 5 to 100 may be an arm's in N m or a finger's in N mm, so their unit stays open.
+# is the guess. Torques from 5 to 100 may be an arm's in N m or a finger's in N mm, and large tensions may be in mN or
+# gf, so their unit stays open.
 _MAX_VALUES = {
     "q": (("rad", 7.0), ("deg", 400.0)),
     "joint_torque": (("N m", 5.0), ("", 100.0), ("N mm", 5e3)),
-    "tendon_force": (("N", 500.0), ("mN", 1e6)),
+    "tendon_force": (("N", 500.0), ("", 1e6)),
     "tendon_excursion": (("m", 0.2), ("mm", 200.0)),
     "fingertip_force": (("N", 100.0), ("mN", 1e5)),
     "temperature": (("degC", 200.0), ("K", 1e3)),
@@ -53,6 +55,7 @@ _PARTS = 400  # of a recording: a step of a protocol lasts several of them, and 
 _MAX_STILL_CHANGE = 0.1  # of the quickest change between parts: with less a joint stands still.
 _MIN_STILL_SHARE = 0.4  # of the parts: a stepped joint stands still in more of them, a swinging one in a sixteenth.
 _MIN_TENSION_CHANGE = 0.5  # of the highest tension: larger where tendons drive the finger (VD.3), smaller in VD.1.
+_MAX_LEFT_OUT = 12  # variables that are named, so that the line of a large bag stays readable.
 _HEAD = 'specimen = "my finger"\nfinger = "finger.toml"'
 
 
@@ -84,9 +87,14 @@ class ClockSurvey:
     disordered: int  # number of stamps that do not increase
 
 
-def columns_of(recording: Recording) -> list[ColumnSurvey]:
-    """Survey every column of every variable of a recording."""
+def columns_of(recording: Recording, among: Sequence[Recording] = ()) -> list[ColumnSurvey]:
+    """Survey every column of every variable of a recording.
+
+    A unit is guessed from the largest values that the column has in any recording `among` these: a joint that is held
+    at 5 degrees could be one at 5 rad, until another recording shows it at 80.
+    """
     found = []
+    others = [other for other in among if other is not recording]
     for name, variable in recording.variables.items():
         table = variable.values.reshape(len(variable.values), -1)
         for k, x in enumerate(table.T):
@@ -97,11 +105,21 @@ def columns_of(recording: Recording) -> list[ColumnSurvey]:
             if spelt:
                 units = spelt
             elif not stated:
-                units = _time_unit(x) if meaning == "time" else _unit(meaning, x)
+                alike = [x, *(y for other in others for y in _same_column(other, name, variable, k))]
+                units = _time_unit(x) if meaning == "time" else _unit(meaning, alike)
             finite = x[np.isfinite(x)]
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
             found.append(ColumnSurvey(name, column, len(x), low, high, len(x) - len(finite), units, stated, meaning))
     return found
+
+
+def _same_column(recording: Recording, name: str, variable: Variable, k: int) -> list[np.ndarray]:
+    """Column `k` of the variable of this name in another recording, where its columns and stated units are the same."""
+    other = recording.variables.get(name)
+    if other is None or other.columns != variable.columns or other.units != variable.units:
+        return []
+    table = other.values.reshape(len(other.values), -1)
+    return [table[:, k]] if k < table.shape[1] else []
 
 
 def clocks_of(recording: Recording, seen: Sequence[ColumnSurvey]) -> list[ClockSurvey]:
@@ -161,9 +179,9 @@ def _time_unit(x: np.ndarray) -> str:
     return next((unit for unit, low, high in _INTERVALS if low <= step < high), "s")
 
 
-def _unit(meaning: str, x: np.ndarray) -> str:
-    """Guess the unit of a channel from the size of its values."""
-    size = float(np.nanpercentile(np.abs(x), 99.0)) if np.isfinite(x).any() else np.nan
+def _unit(meaning: str, columns: Sequence[np.ndarray]) -> str:
+    """Guess the unit of a channel from the size of its values in several recordings."""
+    size = max((float(np.nanpercentile(np.abs(x), 99.0)) for x in columns if np.isfinite(x).any()), default=np.nan)
     return next((unit for unit, largest in _MAX_VALUES.get(meaning, ()) if size <= largest), "")
 
 
@@ -174,7 +192,7 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
     finger, joints and tendons are named as in the recordings. Channels that all recordings map alike are shared. `head`
     holds the lines of specimen and finger.
     """
-    proposed = [_trial_proposal(recording, finger) for recording in recordings]
+    proposed = [_trial_proposal(recording, recordings, finger) for recording in recordings]
     channels = {channel: None for trial in proposed for channel in trial.channels}
     shared = {}
     for channel in channels if len(proposed) > 1 else ():
@@ -192,6 +210,9 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
         for channel, rows in trial.channels.items():
             if channel not in shared:
                 lines += [f"channels.{channel}.{as_key(name)} = {said}" for name, said in rows]
+        if trial.left_out:
+            named = [quoted(name) for name in trial.left_out]
+            lines.append(f"# in no channel yet: {listed(named, _MAX_LEFT_OUT)}")
     return "\n".join(lines) + "\n"
 
 
@@ -201,11 +222,14 @@ class _Proposal:
 
     lines: list[str]  # of TOML: experiment, joint, tendon and time
     channels: dict[str, list[tuple[str, str]]]  # name and reading of each column
+    left_out: list[str]  # names of variables that no channel reads
 
 
-def _trial_proposal(recording: Recording, finger: FingerDescription | None) -> _Proposal:
-    """Propose a trial for a recording."""
-    seen = columns_of(recording)
+def _trial_proposal(
+    recording: Recording, recordings: Sequence[Recording], finger: FingerDescription | None
+) -> _Proposal:
+    """Propose a trial for a recording, one of several of one rig."""
+    seen = columns_of(recording, recordings)
     clock = next((s for s in seen if s.meaning == "time" and s.name.endswith(".stamp")), None)
     clock = clock or next((s for s in seen if s.meaning == "time"), None)
     channels: dict[str, list[ColumnSurvey]] = {}
@@ -231,7 +255,9 @@ def _trial_proposal(recording: Recording, finger: FingerDescription | None) -> _
         channel: [(name, _column(s)) for name, s in zip(names[channel], columns, strict=False)]
         for channel, columns in channels.items()
     }
-    return _Proposal(lines, rows)
+    read = {s.name for channel, columns in channels.items() for s in columns[: len(rows[channel])]}
+    left_out = dict.fromkeys(s.name for s in seen if s.name not in read and s.meaning != "time")
+    return _Proposal(lines, rows, list(left_out))
 
 
 def _experiment(
@@ -304,4 +330,5 @@ def _column(seen: ColumnSurvey) -> str:
     fits = {"q": "rad", "joint_torque": "N m", "tendon_force": "N", "fingertip_force": "N", "tendon_excursion": "m"}
     if seen.units and TO_SI[seen.units].si == fits.get(seen.meaning):
         parts.append(f'units = "{seen.units}"')
-    return "{ " + ", ".join(parts) + " }"
+    unclear = "" if seen.units else "   # units? SI as it stands"
+    return "{ " + ", ".join(parts) + " }" + unclear

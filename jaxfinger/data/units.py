@@ -26,6 +26,8 @@ TO_SI = {
     "N": Unit("N", 1.0),
     "mN": Unit("N", 1e-3),
     "kN": Unit("N", 1e3),
+    "gf": Unit("N", 9.80665e-3),  # standard gravity, ISO 80000-4
+    "kgf": Unit("N", 9.80665),
     "N m": Unit("N m", 1.0),
     "N cm": Unit("N m", 1e-2),
     "N mm": Unit("N m", 1e-3),

@@ -14,9 +14,9 @@ MAX_REMOVED_SHARE = 0.9
 
 
 class Payload(CatalogueEffect):
-    """Point mass m at p in a link's frame, added to the link (`moved` 0) or taken evenly from its own mass (1).
+    """Point `mass` at (x, y, z) in a link's frame, added to the link (`moved` 0) or taken evenly from its own mass (1).
 
-    Mass, first moment and inertia are those of the body and the point (parallel axes). Torques are linear in m.
+    Mass, first moment and inertia are those of the body and the point (parallel axes). Torques are linear in `mass`.
     """
 
     ID: ClassVar = "payload"
@@ -59,7 +59,7 @@ def _steiner(mass, com):
 
 
 class GravityTilt(CatalogueEffect):
-    """g + φ × g: the finger is mounted at another angle than described (first order in φ)."""
+    """g + φ × g, φ = (x, y, z): the finger is mounted at another angle than described (first order in φ)."""
 
     ID: ClassVar = "gravity_tilt"
     PLACE: ClassVar = "base"
@@ -77,7 +77,7 @@ class GravityTilt(CatalogueEffect):
 
 
 class DriveInertia(CatalogueEffect):
-    """I q̈: shaft and coupler of the external motor add inertia at the joint that it moves."""
+    """inertia · q̈: shaft and coupler of the external motor add inertia at the joint that it moves."""
 
     ID: ClassVar = "drive_inertia"
     PLACE: ClassVar = "joint"

@@ -28,10 +28,10 @@ class JointOffset(CatalogueEffect):
 
 
 class JointFrictionAsymmetric(CatalogueEffect):
-    """Δ + d|q̇|: friction differs between the two directions, Coulomb friction by 2Δ and damping by 2d.
+    """coulomb + damping |q̇|: friction differs between the two directions, by twice that.
 
-    Coulomb friction of F + Δ forwards and F − Δ backwards is the symmetric F plus a constant torque Δ. It acts where
-    the joint is free; where a fixture holds the joint, the fixture carries it.
+    Coulomb friction of F + Δ forwards and F − Δ backwards is the symmetric F plus a constant torque Δ, `coulomb`. It
+    acts where the joint is free; where a fixture holds the joint, the fixture carries it.
     """
 
     ID: ClassVar = "joint_friction_asymmetric"
@@ -109,7 +109,7 @@ class JointFrictionWarmup(CatalogueEffect):
 
 
 class JointCoupling(CatalogueEffect):
-    """f on joint a and ρ f on joint b: friction and inertia f of a motor that turns at the speed q̇_a + ρ q̇_b.
+    """f on joint a, ratio · f on joint b, f = coulomb s(v) + damping v + inertia v̇: a motor at v = q̇_a + ratio · q̇_b.
 
     Such a motor drives a joint through a belt or a differential across another joint. The direction of its Coulomb
     friction is that of its last motion, and zero before the first.
@@ -159,10 +159,10 @@ class JointCoupling(CatalogueEffect):
 
 
 class JointBacklash(CatalogueEffect):
-    """q_link = p, p = clip(p before, q − b/2, q + b/2): a dead zone b between drive and link (play operator).
+    """q_link = q + a (p − q), p = clip(p before, q − width/2, q + width/2): a dead zone between drive and link.
 
-    The drive's angle q is measured. The link rests while the drive crosses the dead zone `width`. `a` is the share of
-    the angle that goes through it. A trial starts in its middle.
+    The drive's angle q is measured. The link rests while the drive crosses the dead zone `width` (play operator). `a`
+    is the share of the angle that goes through it. A trial starts in its middle.
     """
 
     ID: ClassVar = "joint_backlash"

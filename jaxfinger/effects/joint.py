@@ -43,10 +43,7 @@ class JointStribeck(CatalogueEffect):
 
 
 class JointPresliding(CatalogueEffect):
-    """dz = (1 − z sgn dq)^δ dq/x₀: after a reversal friction builds up over an angle x₀ (Dahl 1968).
-
-    `a` is the share of the joint's friction that builds up so.
-    """
+    """dz = (1 − z sgn dq)^δ dq/x₀: after a reversal a share `a` of friction builds up over an angle x₀ (Dahl 1968)."""
 
     ID: ClassVar = "joint_presliding"
     PLACE: ClassVar = "joint"
@@ -102,7 +99,7 @@ class _TowardsAnEnd(CatalogueEffect):
 
 
 class ElasticHardening(_TowardsAnEnd):
-    """± τ_end exp(−d/w), d the angle to an end of the range: an exponential spring (Esteki 1996)."""
+    """± τ_end exp(−d/width), d the angle to an end of the range: an exponential spring (Esteki 1996)."""
 
     ID: ClassVar = "elastic_hardening"
     PLACE: ClassVar = "joint"
@@ -121,7 +118,7 @@ class ElasticHardening(_TowardsAnEnd):
 
 
 class JointStop(_TowardsAnEnd):
-    """± k ⟨d⟩₊ (1 + c ḋ), d the depth beyond an angle: contact with a stop inside the range.
+    """± stiffness ⟨d⟩₊ (1 + damping ḋ), d the depth beyond `place`: contact with a stop inside the range.
 
     The stop stands at the share `place` of the range, from the lower limit where `end` is +1, else from the upper one.
     """
@@ -147,7 +144,7 @@ class JointStop(_TowardsAnEnd):
 
 
 class ElasticRelaxation(CatalogueEffect):
-    """k z, ż = q̇ − z/T: a Maxwell branch beside the elastic torque, which relaxes at a hold (standard linear solid)."""
+    """stiffness · z, ż = q̇ − z/T: a Maxwell branch beside the elastic torque, which relaxes at a hold."""
 
     ID: ClassVar = "elastic_relaxation"
     PLACE: ClassVar = "joint"
@@ -173,7 +170,7 @@ class ElasticRelaxation(CatalogueEffect):
 
 
 class PassiveTendon(CatalogueEffect):
-    """κx and −ρκx on joints a and b: an unmeasured elastic tendon, taut where x = q_a − ρ q_b − φ > 0.
+    """κ x and −ρ κ x on joints a and b: an unmeasured elastic tendon, taut where x = q_a − ρ q_b − φ > 0.
 
     A spring k on moment arms r_a, r_b with slack l₀ has κ = k r_a², ρ = r_b/r_a, φ = l₀/r_a (Borghesan 2010).
     """

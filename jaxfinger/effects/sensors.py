@@ -10,7 +10,7 @@ from jaxfinger.effects.base import CatalogueEffect, amplitude, rate, shape
 
 
 class TorqueSensorScale(CatalogueEffect):
-    """τ (1 + g): gain error of the joint torque sensor."""
+    """τ (1 + gain): gain error of the joint torque sensor."""
 
     ID: ClassVar = "torque_sensor_scale"
     PLACE: ClassVar = "torque_sensor"
@@ -25,11 +25,11 @@ class TorqueSensorScale(CatalogueEffect):
 
 
 class TorqueSensorDrift(CatalogueEffect):
-    """o(s) − o(tare), o = −b T exp(−s/T) + A cos(2π (s − m)/P) + B sin(2π (s − m)/P): a thermal offset.
+    """o(s) − o(tare), o = −slope T exp(−s/T) + A cos(2π (s − m)/P) + B sin(2π (s − m)/P): a thermal offset.
 
-    The gauge warms up from the session's start, s = 0; its offset changes by b a second at first. The room heats and
-    cools with a period P; m is the middle of the session. A tare, `tare` seconds before the trial, subtracts the offset
-    of that time.
+    The gauge warms up from the session's start, s = 0; its offset changes by `slope` a second at first. The room heats
+    and cools with a period P; m is the middle of the session. A tare, `tare` seconds before the trial, subtracts the
+    offset of that time.
     """
 
     ID: ClassVar = "torque_sensor_drift"
@@ -90,7 +90,7 @@ class _Encoder(CatalogueEffect):
 
 
 class EncoderOffset(_Encoder):
-    """q_measured = q + o: zero error of a joint's encoder."""
+    """q_measured = q + offset: zero error of a joint's encoder."""
 
     ID: ClassVar = "encoder_offset"
     PLACE: ClassVar = "joint"
@@ -121,7 +121,7 @@ class EncoderEccentricity(_Encoder):
 
 
 class ForceSensorRotation(CatalogueEffect):
-    """F + φ × F: the fingertip's force sensor is turned against the base frame (first order in φ)."""
+    """F + φ × F, φ = (x, y, z): the fingertip's force sensor is turned against the base frame (first order in φ)."""
 
     ID: ClassVar = "force_sensor_rotation"
     PLACE: ClassVar = "fingertip"
@@ -144,7 +144,7 @@ CHANNELS = ("q", "tendon_force", "tendon_excursion", "joint_torque", "fingertip_
 
 
 class ChannelDelay(CatalogueEffect):
-    """y(t − d): one channel lags the others (first order in d). In trials with held joints it shows nothing."""
+    """y(t − delay): one channel lags the others (first order). In trials with held joints it shows nothing."""
 
     ID: ClassVar = "channel_delay"
     PLACE: ClassVar = "channel"

@@ -29,7 +29,7 @@ class TendonStretch(CatalogueEffect):
 
 
 class TendonCreep(CatalogueEffect):
-    """c y, T ẏ = f − y: the tendon creeps under held tension (Kelvin–Voigt)."""
+    """compliance · y, T ẏ = f − y: the tendon creeps under held tension (Kelvin–Voigt)."""
 
     ID: ClassVar = "tendon_creep"
     PLACE: ClassVar = "tendon"
@@ -55,9 +55,9 @@ class TendonCreep(CatalogueEffect):
 
 
 class TendonBacklash(CatalogueEffect):
-    """p = clip(p before, f(q) − b/2, f(q) + b/2): the excursion lags by a dead zone b (play operator).
+    """f + a (p − f), p = clip(p before, f − width/2, f + width/2): the excursion f(q) lags by a dead zone.
 
-    `a` is the share of the excursion that goes through the dead zone `width`.
+    `a` is the share of the excursion that goes through the dead zone `width` (play operator).
     """
 
     ID: ClassVar = "tendon_backlash"

@@ -53,11 +53,11 @@ class TendonFrictionViscous(CatalogueEffect):
 
 
 class TendonFrictionPresliding(CatalogueEffect):
-    """dz = (1 − z sgn dl)^δ dl/x₀: after a reversal friction builds up over an excursion x₀ (Dahl, LuGre).
+    """dz = (1 − z sgn dl)^δ dl/x₀: after a reversal the share `a` of friction builds up over an excursion x₀, or f₀ of
+    tension at held joints (Dahl, LuGre).
 
     At held joints a tendon that `stretches` (1) slides in proportion to its tension: friction builds up over a change
-    f₀ of tension. One that does not stretch (0) has the nominal friction there. `a` is the share of the loss that
-    builds up so.
+    f₀ of tension. One that does not stretch (0) has the nominal friction there.
     """
 
     ID: ClassVar = "tendon_friction_presliding"

@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.bad_input import complaints, mistakes
 from jaxfinger.data import Trial
+from jaxfinger.data.check_work import _suspects
 
 FRICTION = 0.004  # N m
 
@@ -61,3 +62,17 @@ def test_most_mistakes_of_a_mapping_are_said(sound):
         if complaints(replace(sound, trials={t.name: mistake(t) for t in sound})) <= before
     ]
     assert len(silent) <= 16, silent
+
+
+@pytest.mark.parametrize(
+    ("found", "agreed", "suspects"),
+    [
+        ([("T1", "MCP")], [("T2", "MCP")], "tendon_excursion or tendon_force of T1"),
+        ([("T1", "MCP"), ("T1", "PIP")], [("T2", "MCP"), ("T2", "PIP")], "tendon_excursion or tendon_force of T1"),
+        ([("T1", "PIP"), ("T2", "PIP")], [("T1", "MCP"), ("T2", "MCP")], "joint_torque or q of PIP"),
+        ([("T1", "MCP")], [], "joint_torque, tendon_excursion, tendon_force or q"),
+        ([("T1", "MCP")], [("T2", "MCP"), ("T1", "PIP")], "joint_torque, tendon_excursion, tendon_force or q"),
+    ],
+)
+def test_what_agrees_narrows_down_what_may_be_wrong(found, agreed, suspects):
+    assert _suspects(found, agreed) == suspects

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.cli import main
-from jaxfinger.data import check_file, read_session
+from jaxfinger.data import check_file, read_predictions, read_session
 from jaxfinger.data.mapping import Column, MappedTrial, MappingFile
 from jaxfinger.data.units import TO_SI
 
@@ -98,3 +98,14 @@ def test_the_guide_names_every_key_and_unit():
     assert [key for key in keys if f"`{key}`" not in GUIDE and f"`[{key}]`" not in GUIDE] == []
     units = GUIDE[GUIDE.index("Units: ") :].split("\n")[0]
     assert [unit for unit in TO_SI if unit != "1" and unit not in units] == []
+
+
+def test_the_page_writes_predictions_of_another_simulator(followed, monkeypatch):
+    """The page's script predicts the torque of the joint that is moved, and of no other."""
+    monkeypatch.chdir(followed)
+    (script,) = (text for kind, _, text in BLOCKS if kind == "python")
+    exec(compile(script, "page", "exec"), {})
+    found = read_predictions("simulator.h5")
+    session = read_session("session.h5")
+    assert set(found) == {trial.name for trial in session if trial.experiment.startswith("ID.3")}
+    assert all(np.isfinite(channels["joint_torque"]).all() for channels in found.values())

@@ -11,6 +11,7 @@ from jaxfinger.cli import main
 from jaxfinger.data.look import clocks_of, columns_of, proposal
 from jaxfinger.data.mapping import read_mapping
 from jaxfinger.data.sources import load_recording
+from jaxfinger.data.units import TO_SI
 from tests.data.conftest import ONE_JOINT, make_finger
 
 CASES = Path(__file__).parent / "cases"
@@ -130,3 +131,30 @@ def test_what_is_measured_of_a_swept_joint_says_which_experiment_it_is(tmp_path,
     assert f'experiment = "{experiment}"' in proposal([recording])
     forces = [s.name for s in columns_of(recording) if s.meaning == "tendon_force"]
     assert forces == [name for name in columns if name.startswith("F_")]
+
+
+def test_a_unit_is_guessed_from_all_recordings_of_a_column(tmp_path):
+    """A joint held at 5 degrees in one recording is in degrees where another recording shows it at 80."""
+    logs = []
+    for name, angle in (("held", np.full(len(TIME), 5.7)), ("moved", 40.0 - 40.0 * np.cos(TIME / 1e3))):
+        logs.append(tmp_path / f"{name}.csv")
+        np.savetxt(logs[-1], np.column_stack([TIME, angle]), "%.6f", ",", header="t,enc", comments="")
+    recordings = [load_recording(log) for log in logs]
+    assert columns_of(recordings[0])[1].units == "rad"
+    assert columns_of(recordings[0], recordings)[1].units == "deg"
+    assert 'units = "rad"' not in proposal(recordings)
+
+
+def test_what_no_channel_reads_and_unclear_units_are_marked(tmp_path):
+    """Tensions of a thousand may be in mN or gf, so no unit is guessed, and the proposal says so."""
+    names = ("enc", "cell_A", "reaction")
+    table = np.column_stack([TIME, 40 + 30 * np.sin(TIME / 1e3), 600 + 600 * np.sin(TIME / 1e3), TIME])
+    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header=f"t,{','.join(names)}", comments="")
+    said = proposal([load_recording(tmp_path / "log.csv")])
+    assert 'channels.tendon_force.T1 = { from = "cell_A" }   # units? SI as it stands' in said
+    assert '# in no channel yet: "reaction"' in said
+
+
+@pytest.mark.parametrize(("unit", "newtons"), [("gf", 9.80665e-3), ("kgf", 9.80665)])
+def test_cells_may_read_gram_force(unit, newtons):
+    assert TO_SI[unit] == ("N", newtons, 0.0)

@@ -1,5 +1,6 @@
 """Every effect of the catalogue is absent at zero and differentiable there, and is written and read at every site."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from jaxfinger.model import (
     simulate,
     terms_without_effects,
 )
+from jaxfinger.report.causes import first_sentence
 from tests.effects.motion import MODEL, MOTIONS, SCALES, with_effects
 
 EVERY = CATALOGUE | NOMINAL_TERMS | CHANGED
@@ -285,3 +287,17 @@ def test_an_effect_that_cannot_work_is_refused_in_a_sentence(tmp_path, right, wr
     path.write_text(DRAG.replace(right, wrong, 1))
     with pytest.raises(UserError, match=complaint):
         refuse_broken(next(iter(load(path).values())), FINGER)
+
+
+# Letters that stand for these names in a formula.
+LETTERS = {"mu": "μ", "epsilon": "ε", "kappa": "κ", "rho": "ρ", "phi": "φ", "tau": "τ", "tau_end": "τ_end"}
+LETTERS |= {"delta": "δ", "x0": "x₀", "f0": "f₀"}
+
+
+@pytest.mark.parametrize("kind", CATALOGUE.values(), ids=CATALOGUE)
+def test_the_formula_of_an_effect_names_its_parameters(kind):
+    """The page prints formula and values together, so that a reader must find each value's place in the formula."""
+    moves = [n for n, p in kind.shape_parameters().items() if p.moves != "not"]
+    symbols = [LETTERS.get(n, n) for n in (*kind.amplitudes(), *moves)]
+    formula = first_sentence(kind)
+    assert [s for s in symbols if not re.search(rf"(?<![a-z]){re.escape(s)}(?![a-z])", formula)] == []
