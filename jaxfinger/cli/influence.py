@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jaxfinger.cli.output import print_json, progress, refuse_figure, table
 
-SHOWN = 3  # strongest influences of each kind for a parameter, so that a row fits the screen
+MAX_INFLUENCES = 3  # strongest influences of each kind for a parameter, so that a row fits the screen
 MAX_NAMES = 40  # rows and columns of the picture: more names are too small to read on a page.
 STEPS = {"trials": "left out", "sensors": "gain + 1 %", "cad": "+ 1 standard deviation"}
 
@@ -71,7 +71,7 @@ def influence(
         shifts = s.shifts(loaded)
         rows = []
         for j, name in enumerate(names):
-            strongest = sorted(range(len(s.names)), key=lambda k, j=j: -abs(shifts[k, j]))[:SHOWN]
+            strongest = sorted(range(len(s.names)), key=lambda k, j=j: -abs(shifts[k, j]))[:MAX_INFLUENCES]
             rows.append((name, ", ".join(_in_words(s.names[k], shifts[k, j]) for k in strongest if shifts[k, j])))
         table(
             f"By {kind}, {STEPS[kind]}: standard deviations that each parameter moves", ("parameter", ""), rows, left=2

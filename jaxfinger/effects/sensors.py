@@ -140,7 +140,8 @@ class ForceSensorRotation(CatalogueEffect):
         return y + jnp.stack([b * y[2] - c * y[1], c * y[0] - a * y[2], a * y[1] - b * y[0]])
 
 
-CHANNELS = ("q", "tendon_force", "tendon_excursion", "joint_torque", "fingertip_force")
+# Channels that may lag the others; their order gives the index of a site.
+DELAYED_CHANNELS = ("q", "tendon_force", "tendon_excursion", "joint_torque", "fingertip_force")
 
 
 class ChannelDelay(CatalogueEffect):
@@ -156,15 +157,15 @@ class ChannelDelay(CatalogueEffect):
 
     @classmethod
     def sites(cls, finger):
-        return [(c,) for c in CHANNELS]
+        return [(c,) for c in DELAYED_CHANNELS]
 
     @classmethod
     def indices(cls, finger, site):
-        return (CHANNELS.index(site[0]),)
+        return (DELAYED_CHANNELS.index(site[0]),)
 
     def _of(self, channel: str) -> Float[Array, ""]:
         """Delay of a channel, s: zero unless it is the site."""
-        return jnp.where(self.index[0] == CHANNELS.index(channel), self.delay, 0.0)
+        return jnp.where(self.index[0] == DELAYED_CHANNELS.index(channel), self.delay, 0.0)
 
     def true_motion(self, x):
         if x.held:

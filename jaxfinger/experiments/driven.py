@@ -48,18 +48,18 @@ def reduce(r: PreparedTrial) -> Row:
     """Reduce a trial: torque is valid where joints and tendons slide, excursion everywhere."""
     j = joints(r, sharp=not r.reduced)
     # Reversals are taken from the slow filter: noise of q̇ moves the time of a reversal.
-    slow = j.qd if r.reduced else smooth(r.trial.time, r.trial.q, r.spec.cutoff_at(r.step))[1]
+    slow = j.qd if r.reduced else smooth(r.trial.time, r.trial.q, r.experiment.cutoff_at(r.step))[1]
     joint = joint_directions(r, j, slow)
-    rates = None if r.spec.slack else tendon_rates(r)
+    rates = None if r.experiment.slack else tendon_rates(r)
     tendon = tendon_directions(r, rates)
-    slides = sliding(r, j.qd, slow, joint, rates, CLEAR_WIDTHS * filter_std(r.spec.cutoff))
+    slides = sliding(r, j.qd, slow, joint, rates, CLEAR_WIDTHS * filter_std(r.experiment.cutoff))
 
     qdd, tension, y = j.qdd, r.tension(), r.y
-    if r.reduced or r.spec.slack:
+    if r.reduced or r.experiment.slack:
         # Noise of q̈ biases a fit to less inertia (errors in variables), and adds a spurious torque to a prediction.
         # Where q̈ does not exceed its noise, it is therefore replaced by its running mean.
         most = MAX_ACCELERATION_NOISE * 1.4826 * j.noise * filtered_noise_std(j.cutoff, r.step, 2)
-        qdd = shrink(qdd, round(ACCELERATION_WINDOW * r.spec.pace / r.step), most)
+        qdd = shrink(qdd, round(ACCELERATION_WINDOW * r.experiment.pace / r.step), most)
     if r.reduced:
         # All other terms pass the low-pass of q̈.
         joint, tendon, tension = (low_pass(r.trial.time, a, j.cutoff) for a in (joint, tendon, tension))
@@ -96,14 +96,14 @@ def tendon_rates(r: PreparedTrial) -> tuple[Float[np.ndarray, "N n"], Float[np.n
     if r.trial.tendon_excursion is None:
         return None
     excursion = without_spikes(np.nan_to_num(r.trial.tendon_excursion))
-    cutoff = min(r.spec.cutoff / 2.0, 0.2 / r.step)
+    cutoff = min(r.experiment.cutoff / 2.0, 0.2 / r.step)
     slow, quick = (smooth(r.trial.time, excursion, c)[1] for c in (cutoff, quick_cutoff(cutoff, r.step)))
     return slow, quick
 
 
 def tendon_directions(r: PreparedTrial, rates) -> Float[np.ndarray, "N n"]:
     """Directions of the tendons: the protocol's, else those of the measured excursions; 0 for slack tendons."""
-    if r.spec.slack:
+    if r.experiment.slack:
         return np.zeros((len(r.trial.time), r.finger.n))
     if r.trial.tendon_direction is not None:
         return r.trial.tendon_direction.astype(float)
@@ -138,7 +138,7 @@ def sliding(
         known = _friction_known(r, *rates)
         for i in range(r.finger.m):
             slides[:, i] &= known[:, r.finger.crosses[:, i] & r.finger.active].all(axis=1)
-    if not r.spec.stepped:
+    if not r.experiment.stepped:
         # A slip of one joint between two stops disturbs every joint.
         pace = np.percentile(np.abs(slow), 95, axis=0)
         most = np.maximum(MAX_LOST_SPEED_SHARE * pace, MIN_SLIP_TO_NOISE * noise)
@@ -147,13 +147,13 @@ def sliding(
     # Beyond the ends of a recording it reads extrapolated samples.
     apart = minimum_filter1d(slides, 2 * round(clear / r.step) + 1, axis=0, mode="constant", cval=False)
     # The window reaches back only: a free joint breaks away suddenly and moves the others.
-    half = round(0.5 * BREAKAWAY_WIDTHS * filter_std(r.spec.cutoff) / r.step)
+    half = round(0.5 * BREAKAWAY_WIDTHS * filter_std(r.experiment.cutoff) / r.step)
     return np.where(r.motorised, apart, minimum_filter1d(apart, 2 * half + 1, axis=0, origin=half))
 
 
 def _friction_known(r: PreparedTrial, slow, quick) -> Bool[np.ndarray, "N n"]:
     """Whether a tendon is slack, or slides for certain: faster than it stretches, and in both filters."""
-    tension, cutoff = r.tension(), min(r.spec.cutoff / 2.0, 0.2 / r.step)
+    tension, cutoff = r.tension(), min(r.experiment.cutoff / 2.0, 0.2 / r.step)
     stretches = r.sizes.compliance * np.abs(smooth(r.trial.time, tension, cutoff)[1])
     measured = np.isfinite(np.asarray(r.trial.tendon_excursion)).all(axis=0)
     least = MIN_TENDON_SPEED_TO_NOISE * speed_noise(slow, quick)

@@ -27,13 +27,13 @@ RAMP_SAMPLE = -2  # marks the samples of a ramp among the numbers of holds
 def reduce(r: PreparedTrial) -> Row:
     """Reduce a trial: holds and ramps are valid once friction no longer depends on the past, excursions where taut."""
     j = joints(r, sharp=not r.reduced)
-    hold = r.whole(find_holds(r.trial, r.spec.pace))
+    hold = r.whole(find_holds(r.trial, r.experiment.pace))
     tension = measured = r.tension()
     if not r.reduced:
         # As smooth as the block means of a fit: a tendon that slips at a peak of noise would stay there.
-        tension = uniform_filter1d(tension, max(1, round(1.0 / (r.spec.rate * r.step))), axis=0, mode="nearest")
+        tension = uniform_filter1d(tension, max(1, round(1.0 / (r.experiment.rate * r.step))), axis=0, mode="nearest")
     pulled = r.taut(r.mean(tension))
-    ramps = slow_ramps(pulled, hold, round(RAMP_BLOCKS / (r.spec.rate * r.step * r.size)), r.sizes.travel)
+    ramps = slow_ramps(pulled, hold, round(RAMP_BLOCKS / (r.experiment.rate * r.step * r.size)), r.sizes.travel)
     pulled = _monotonic_ramps(pulled, ramps, r.sizes.travel)
     pulled = _clipped_between_holds(pulled, np.where(ramps, RAMP_SAMPLE, hold), slack=True)
     counts = (hold >= 0) | _continues(pulled, hold, r.sizes.travel)

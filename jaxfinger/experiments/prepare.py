@@ -73,19 +73,19 @@ def prepare(
         UserError: trials of one experiment are sampled at rates too different to be stacked.
     """
     sizes, stacks = sizes_of(session), {}
-    for spec in (e.at(sizes.pace if e.kind == "driven" else sizes.slow_pace) for e in EXPERIMENTS.values()):
-        chosen = [t for t in session if t.experiment == spec.name and (names is None or t.name in names)]
+    for experiment in (e.at(sizes.pace if e.kind == "driven" else sizes.slow_pace) for e in EXPERIMENTS.values()):
+        chosen = [t for t in session if t.experiment == experiment.name and (names is None or t.name in names)]
         trials = [t for t in chosen if len(t.time) > 1]
 
-        def row(trial: Trial, spec: Experiment = spec) -> tuple[Row, dict[str, bool]]:
-            r = prepared(spec, trial, session, sizes, reduced, minus, coarse)
-            return KINDS[spec.kind].reduce(r), {c: bool(s.any()) for c, s in r.sound.items()}
+        def row(trial: Trial, experiment: Experiment = experiment) -> tuple[Row, dict[str, bool]]:
+            r = prepared(experiment, trial, session, sizes, reduced, minus, coarse)
+            return KINDS[experiment.kind].reduce(r), {c: bool(s.any()) for c, s in r.sound.items()}
 
         long = any(len(t.time) > MIN_THREADED_SAMPLES for t in trials)
         with ThreadPoolExecutor(None if long else 1) as pool:
             rows = list(pool.map(row, trials))
         if rows:
-            stacks[spec.name] = _stack(spec, trials, rows, reduced)
+            stacks[experiment.name] = _stack(experiment, trials, rows, reduced)
     return stacks
 
 
@@ -100,15 +100,17 @@ def not_judged(stacks: dict[str, Stack]) -> list[NotJudged]:
     return out
 
 
-def _stack(spec: Experiment, trials: list[Trial], reduced_trials: list[tuple[Row, dict[str, bool]]], reduced) -> Stack:
+def _stack(
+    experiment: Experiment, trials: list[Trial], reduced_trials: list[tuple[Row, dict[str, bool]]], reduced
+) -> Stack:
     rows = [row for row, _ in reduced_trials]
     steps = {round(r.dt, 6) for r in rows}
     # One noise model serves all trials of a stack, so that their sampling times must be alike.
     if reduced and max(steps) > 1.5 * min(steps):
         raise UserError(
-            f"the {spec.name} trials are sampled at different rates ({min(steps):g} s and {max(steps):g} s a sample "
-            f"after reduction): resample trial {trials[int(np.argmax([r.dt for r in rows]))].name} to at least "
-            f"{spec.rate:g} Hz"
+            f"the {experiment.name} trials are sampled at different rates ({min(steps):g} s and {max(steps):g} s a "
+            f"sample after reduction): resample trial {trials[int(np.argmax([r.dt for r in rows]))].name} to at least "
+            f"{experiment.rate:g} Hz"
         )
     T = max(r.motion["time"].size for r in rows)
     T = -(-T // LENGTH_MULTIPLE) * LENGTH_MULTIPLE
@@ -121,15 +123,15 @@ def _stack(spec: Experiment, trials: list[Trial], reduced_trials: list[tuple[Row
                 out[..., b, a.shape[-1] :] = a[..., -1:]
         return jax.device_put(out)
 
-    x = Motion(**{k: pad([r.motion[k] for r in rows]) for k in rows[0].motion}, held=spec.held)
-    y = {c: pad([r.y[c] for r in rows], constant=True) for c in spec.channels}
-    mask = {c: pad([r.mask[c] for r in rows], constant=True) for c in spec.channels}
+    x = Motion(**{k: pad([r.motion[k] for r in rows]) for k in rows[0].motion}, held=experiment.held)
+    y = {c: pad([r.y[c] for r in rows], constant=True) for c in experiment.channels}
+    mask = {c: pad([r.mask[c] for r in rows], constant=True) for c in experiment.channels}
     return Stack(
-        spec,
+        experiment,
         Batch(x, y, mask),
         tuple(t.name for t in trials),
         tuple(t.motion for t in trials),
         np.stack([np.pad(r.hold, (0, T - r.hold.size), constant_values=-1) for r in rows]),
         float(np.median([r.dt for r in rows])),
-        {c: any(measured[c] for _, measured in reduced_trials) for c in spec.channels},
+        {c: any(measured[c] for _, measured in reduced_trials) for c in experiment.channels},
     )

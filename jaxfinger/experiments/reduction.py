@@ -34,7 +34,7 @@ JITTER = 6.0
 class PreparedTrial:
     """A trial of N samples whose spikes are bridged, to be reduced to M blocks of `size` samples."""
 
-    spec: Experiment
+    experiment: Experiment
     trial: Trial  # with spikes bridged in the angles and tensions
     finger: FingerDescription
     sizes: Sizes
@@ -47,12 +47,12 @@ class PreparedTrial:
     @cached_property
     def quick_rates(self) -> Float[np.ndarray, "N m"]:
         """Joint speeds, rad/s, in a filter quick enough to resolve a stop between two slips."""
-        return smooth(self.trial.time, self.trial.q, quick_cutoff(self.spec.cutoff_at(self.step), self.step))[1]
+        return smooth(self.trial.time, self.trial.q, quick_cutoff(self.experiment.cutoff_at(self.step), self.step))[1]
 
     @property
     def motorised(self) -> Bool[np.ndarray, " m"]:
         """Whether an external motor, or a fixture with a torque sensor, is coupled to each joint."""
-        coupled = joints_of(self.trial, self.finger) if "joint_torque" in self.spec.channels else ()
+        coupled = joints_of(self.trial, self.finger) if "joint_torque" in self.experiment.channels else ()
         return np.array([name in coupled for name in self.finger.joint_names])
 
     def mean(self, a: Float[np.ndarray, "N *k"]) -> Float[np.ndarray, "M *k"]:
@@ -80,7 +80,7 @@ class PreparedTrial:
     def taut(self, tension: Float[np.ndarray, "M n"]) -> Float[np.ndarray, "M n"]:
         """Tension, N, set to zero for tendons that are slack throughout the trial."""
         slack = np.percentile(tension, 95, axis=0) < self.sizes.slack
-        return np.where(slack | self.spec.slack, 0.0, tension)
+        return np.where(slack | self.experiment.slack, 0.0, tension)
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Row:
 
 
 def prepared(
-    spec: Experiment,
+    experiment: Experiment,
     trial: Trial,
     session: Session,
     sizes: Sizes,
@@ -108,9 +108,9 @@ def prepared(
     `minus`, `coarse`: as in `prepare`.
     """
     step = float(np.median(np.diff(trial.time)))
-    size = max(1, round(coarse / (spec.rate * step))) if reduced else 1
-    y, sound = _measured(spec, trial, session.finger, minus, longest_spike(step))
-    return PreparedTrial(spec, _despiked(trial), session.finger, sizes, reduced, step, size, y, sound)
+    size = max(1, round(coarse / (experiment.rate * step))) if reduced else 1
+    y, sound = _measured(experiment, trial, session.finger, minus, longest_spike(step))
+    return PreparedTrial(experiment, _despiked(trial), session.finger, sizes, reduced, step, size, y, sound)
 
 
 def _despiked(trial: Trial) -> Trial:
@@ -118,14 +118,14 @@ def _despiked(trial: Trial) -> Trial:
     return replace(trial, q=without_spikes(trial.q), tendon_force=tension)
 
 
-def _measured(spec: Experiment, trial: Trial, finger: FingerDescription, minus: Predictions | None, longest: int):
+def _measured(experiment: Experiment, trial: Trial, finger: FingerDescription, minus: Predictions | None, longest: int):
     """Channels to be predicted, with spikes bridged, and whether each sample is measured and not a spike."""
     N = len(trial.time)
     width = {"tendon_excursion": finger.n, "joint_torque": finger.m, "fingertip_force": 3}
     y, sound = {}, {}
-    for c in spec.channels:
+    for c in experiment.channels:
         values = getattr(trial, c)
-        if values is None and c == "joint_torque" and spec.kind == "driven":
+        if values is None and c == "joint_torque" and experiment.kind == "driven":
             values = np.zeros((N, finger.m))  # no external torque acts on the free finger
         if values is None:
             values = np.full((N, width[c]), np.nan)
@@ -166,7 +166,7 @@ def joints(r: PreparedTrial, sharp: bool) -> Joints:
 
     `sharp` raises the cut-off. It is for channels that are not low-passed themselves, in which quick motion remains.
     """
-    cutoff = r.spec.cutoff_at(r.step, sharp)
+    cutoff = r.experiment.cutoff_at(r.step, sharp)
     q, qd, qdd = smooth(r.trial.time, r.trial.q, cutoff)
     return Joints(q, qd, qdd, np.median(np.abs(r.trial.q - q), axis=0), cutoff)
 

@@ -21,8 +21,8 @@ CLEAR_TIME = 0.01
 def reduce(r: PreparedTrial) -> Row:
     """Reduce a trial: valid are holds of known approach, and motion in which the joint slides."""
     j = joints(r, sharp=True)
-    hold = find_holds(r.trial, r.spec.pace)
-    slow = smooth(r.trial.time, r.trial.q, r.spec.cutoff_at(r.step))[1]
+    hold = find_holds(r.trial, r.experiment.pace)
+    slow = smooth(r.trial.time, r.trial.q, r.experiment.cutoff_at(r.step))[1]
     if r.trial.joint_direction is not None:
         joint = r.trial.joint_direction.astype(float)
     else:
@@ -31,7 +31,7 @@ def reduce(r: PreparedTrial) -> Row:
             joint[samples] = joint[samples[len(samples) // 2]]
     moves = (hold < 0)[:, None]  # nothing moves in a hold
     qd, qdd = j.qd * moves, j.qdd * moves
-    slides = sliding(r, qd, slow, joint, None, CLEAR_TIME * r.spec.pace)
+    slides = sliding(r, qd, slow, joint, None, CLEAR_TIME * r.experiment.pace)
     at = r.whole(hold)
     known = r.mean(slides.astype(float)) > 1.0 - 1e-9  # all samples of the block
     approached = np.abs(r.mean(joint)) > 1.0 - 1e-9

@@ -28,7 +28,7 @@ class Experiment:
     rate: float  # Hz
     cutoff: float  # Hz
     # Factor on the cut-off where the measured channel is not filtered: there the noise of q̈ biases no estimate.
-    sharp: float = 4.0
+    sharp_ratio: float = 4.0
     slack: bool = False  # whether the tendons are slack by protocol
     pace: float = 1.0  # duration of the motions over that of the protocol's, for which rate and cut-off hold
 
@@ -53,7 +53,7 @@ class Experiment:
 
     def cutoff_at(self, step: float, sharp: bool = False) -> float:
         """Cut-off, Hz, for a trial with a sample every `step` s: at most a fifth of the sampling rate."""
-        return min(self.cutoff * (self.sharp if sharp else 1.0), 0.2 / step)
+        return min(self.cutoff * (self.sharp_ratio if sharp else 1.0), 0.2 / step)
 
 
 EXPERIMENTS = {
@@ -61,7 +61,7 @@ EXPERIMENTS = {
     for e in (
         Experiment("ID.2", "path", ("tendon_excursion",), 20.0, 5.0),
         Experiment("ID.3-static", "stepped", ("joint_torque",), 20.0, 5.0, slack=True),
-        Experiment("ID.3-dynamic", "driven", ("joint_torque",), 50.0, 10.0, sharp=3.0, slack=True),
+        Experiment("ID.3-dynamic", "driven", ("joint_torque",), 50.0, 10.0, sharp_ratio=3.0, slack=True),
         Experiment("ID.4", "held", ("joint_torque", "tendon_excursion"), 20.0, 5.0),
         Experiment("VD.1", "path", ("tendon_excursion",), 20.0, 5.0),
         Experiment("VD.2", "held", ("fingertip_force", "tendon_excursion"), 20.0, 5.0),

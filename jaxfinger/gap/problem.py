@@ -106,27 +106,6 @@ class Problem:
         return stretches(self.trial_of_row, np.concatenate(times))
 
     @cached_property
-    def columns(self) -> list[tuple[str, str, int]]:
-        """Experiment, channel and column index of all columns of all experiments."""
-        return [
-            (e, c, k)
-            for e, stack in self.stacks.items()
-            for c in stack.experiment.channels
-            for k in range(len(stack.batch.y[c]))
-        ]
-
-    @cached_property
-    def column_of_row(self) -> np.ndarray:
-        """(N,) position in `columns` of each row's column."""
-        position = {key: i for i, key in enumerate(self.columns)}
-        out = np.empty(self.r.size, int)
-        for e, rows in self.rows.items():
-            channels = self.stacks[e].experiment.channels
-            keys = zip(rows.channel, rows.column, strict=True)
-            out[rows.start : rows.start + rows.size] = [position[e, channels[c], int(k)] for c, k in keys]
-        return out
-
-    @cached_property
     def without_effects(self) -> dict[tuple[str, bool], tuple[list, list[Terms | None]]]:
         """Predictions of the nominal model by channel and whether joints are held, block by block of the group.
 

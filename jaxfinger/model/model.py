@@ -64,7 +64,7 @@ class Effect(eqx.Module):
         """State at the next sample, while the drive changes from `before` to `drive`."""
         return memory
 
-    # Terms of equation (1), in the order in which they are evaluated.
+    # Terms of equation (1), in the order in which they are evaluated, then the excursion.
     def finger(self, finger: Finger) -> Finger:
         """Finger with a changed rigid body or mounting."""
         return finger
@@ -102,23 +102,23 @@ class Effect(eqx.Module):
         """Tension f_j past the tendons' friction, N."""
         return f_j
 
+    def torque(self, x: Motion, memory: Memory, h: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
+        """Torque h on the left of (1) without friction, N m."""
+        return h
+
     def joint_friction(
         self, x: Motion, f_j: Float[Array, "n *T"], C: Float[Array, "n m *T"], F: Float[Array, "m *T"]
     ) -> Float[Array, "m *T"]:
         """Magnitude of the joints' friction torque, N m."""
         return F
 
-    def torque_friction(self, mu: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
-        """Share μ of its own torque that each joint's drive loses to friction."""
-        return mu
-
     def shared_friction(self, x: Motion, memory: Memory) -> tuple[SharedFriction, ...]:
         """Friction that acts on several joints at once."""
         return ()
 
-    def torque(self, x: Motion, memory: Memory, h: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
-        """Torque h on the left of (1) without friction, N m."""
-        return h
+    def torque_friction(self, mu: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
+        """Share μ of its own torque that each joint's drive loses to friction."""
+        return mu
 
     def excursion(
         self, x: Motion, memory: Memory, f: Float[Array, "n *T"], l: Float[Array, "n *T"]
