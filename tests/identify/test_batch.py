@@ -56,6 +56,7 @@ def members(sessions, session, staged):
     return fit_many([*sessions[:2], *odd], staged, session)
 
 
+@pytest.mark.long
 def test_members_that_fail_are_named_and_spoil_nothing(members):
     np.testing.assert_array_equal(members.failed, [False, False, True, False, False])
     assert np.isnan(members.values[2]).all()
@@ -74,6 +75,7 @@ def test_members_are_the_fits_of_each_session_alone(members, sessions, staged):
         np.testing.assert_allclose(members.std[k][free], alone.std[free], rtol=0.25)
 
 
+@pytest.mark.long
 def test_members_are_what_identify_finds_from_the_same_start_outliers_included(members, sessions, staged):
     """Solver, rows and weights are the same."""
     own = replace(staged.model, finger=nominal_model(sessions[1], staged.recipe).finger)
@@ -86,6 +88,7 @@ def test_members_are_what_identify_finds_from_the_same_start_outliers_included(m
     assert np.abs((members.values[3] - members.values[1])[free] / staged.std[free]).max() < 1.5
 
 
+@pytest.mark.long
 def test_the_template_itself_comes_back(members, staged):
     free = staged.estimated
     difference = (members.values[0] - np.asarray(ravel(staged.model)))[free] / staged.std[free]
@@ -93,6 +96,7 @@ def test_the_template_itself_comes_back(members, staged):
     np.testing.assert_allclose(members.std[0][free], staged.std[free], rtol=0.02)
 
 
+@pytest.mark.long
 def test_members_keep_their_own_links(members, sessions, staged):
     """Heavier links change gravity torques, and thus the estimated elastic torques."""
     heavy = with_heavier_links(sessions[1])

@@ -100,6 +100,7 @@ def test_derivatives_agree_with_differences_where_nothing_begins_to_stick(short,
         assert np.quantile(error, 0.9) < 1e-5, name
 
 
+@pytest.mark.long
 def test_derivatives_agree_with_differences_where_a_joint_at_rest_begins_to_slip(short, staged):
     """Tension rises until friction yields. Before, parameters change nothing; then they change the time of the slip."""
     shots = shooting(replace(short, trials={"rest": at_rest(short, staged.model)}))

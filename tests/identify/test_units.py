@@ -66,7 +66,7 @@ def axis(tmp_path_factory):
     return read_session(file), read_recipe("emps")
 
 
-@pytest.fixture(scope="module", params=["finger", "axis", "arm"])
+@pytest.fixture(scope="module", params=["finger", "axis", pytest.param("arm", marks=pytest.mark.long)])
 def machine(request):
     """Session of a machine and its fit."""
     if request.param == "finger":

@@ -56,6 +56,7 @@ def test_a_case_repeats_bit_for_bit_and_keeps_its_truth_apart(quick, tmp_path):
     assert json.loads((tmp_path / "a-truth" / "case-003.json").read_text()) == truth
 
 
+@pytest.mark.long
 def test_fresh_trials_repeat_nothing_of_the_session(quick, tmp_path):
     folder = make_case(1, "fresh", CaseSpec("none", "n-plus-one"), tmp_path / "c", tmp_path / "t")
     fit, fresh = read_session(folder / "fit.h5"), read_session(folder / "fresh.h5")
@@ -99,6 +100,7 @@ def test_several_causes_come_by_threes_to_fives_every_other_time_with_an_unliste
     assert specs != case_specs("develop", 40, "several")
 
 
+@pytest.mark.long
 def test_foreign_cases_have_forms_and_protocols_that_no_other_split_has(quick, tmp_path):
     kinds = LISTED.values()
     assert all(not set(k.foreign) & set(k.forms) for k in kinds)

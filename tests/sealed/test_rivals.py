@@ -16,6 +16,7 @@ def session(specimen, plans, sensors):
     return NoiseFreeSession(specimen, plans, sensors, slack_counts=False)
 
 
+@pytest.mark.long
 def test_the_same_cause_is_no_distance_away_and_a_foreign_one_all_of_it(session, specimen, monkeypatch):
     monkeypatch.setattr(rivals, "LISTED", ["drive_inertia", "tendon_stretch"])
     drive = draw_at("drive_inertia", (("MCP",), (0,)), specimen.finger, np.random.default_rng(0), (1.0,))
@@ -30,6 +31,7 @@ def test_the_same_cause_is_no_distance_away_and_a_foreign_one_all_of_it(session,
     }
 
 
+@pytest.mark.long
 def test_an_effect_that_nobody_lists_has_listed_imitators(session, specimen, monkeypatch, tmp_path):
     """Sag at low tension resembles a stretch with a toe. A drive's inertia resembles neither."""
     monkeypatch.setattr(rivals, "LISTED", ["drive_inertia", "tendon_stretch"])

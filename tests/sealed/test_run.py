@@ -194,6 +194,7 @@ def test_a_process_that_the_system_ends_is_a_sentence(folder, tmp_path):
         run_cases(folder, tmp_path / "out", ended)
 
 
+@pytest.mark.long
 def test_this_programs_own_diagnosis_runs_in_processes_of_their_own_and_says_what_it_refused(folder, tmp_path, capsys):
     cli.run(folder, workers=2)
     said = capsys.readouterr().out
