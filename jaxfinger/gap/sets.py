@@ -186,8 +186,8 @@ class Search:
         now, best = self.net_evidence(state), None
         for i in range(len(state.effects)):
             screened = self.screen(state, i)
-            for net, offer, amplitudes in self.best_offers(screened, 1):
-                if net < now - 0.5 * MAX_SCORE_GAP or offer.keys == (state.keys[i],):
+            for net, offer, amplitudes in self.best_offers(screened, 1, other_than=state.keys[i]):
+                if net < now - 0.5 * MAX_SCORE_GAP:
                     continue
                 found = self.fit_exactly(state, i, offer, amplitudes, screened.now.weights)
                 if self.net_evidence(found) > max(now + MIN_SWAP_GAIN, self.net_evidence(best) if best else -np.inf):
@@ -198,7 +198,7 @@ class Search:
         """Fit the best offers in the place of each cause, for the posterior."""
         for i, key in enumerate(state.keys):
             screened = self.screen(state, i)
-            for _, offer, amplitudes in self.best_offers(screened):
+            for _, offer, amplitudes in self.best_offers(screened, other_than=key):
                 if key not in offer.keys:
                     found = self.fit_exactly(state, i, offer, amplitudes, screened.now.weights)
                     self.with_best_choices(found, len(state.effects) - 1)
@@ -239,17 +239,23 @@ class Search:
                 self.visited.screen(together, more._replace(score=score + more.score))
         return Screened(keys, score, model, now, net)
 
-    def best_offers(self, screened: Screened, most: int = MAX_EXACT) -> list[Addition]:
-        """At most `most` offers, each of another cause or choice, by the net evidence that they may have, best first.
+    def best_offers(self, screened: Screened, most: int = MAX_EXACT, other_than: Key | None = None) -> list[Addition]:
+        """Offers that may be best once they are fitted, each of another cause or choice, best first.
 
-        Weights are settled and shapes between those of the grid. Offers MAX_SCORE_GAP behind the best are left out.
+        They are the best `most` with shapes of the grid, and the best `most` with shapes between those; each without
+        offers that are MAX_SCORE_GAP behind the first. Weights are settled. The cause `other_than` is left out.
         """
         keys, score, model, now, net = screened
         found, taken = [], {}
         for n in np.argsort(-net)[: 4 * SHORT_LIST]:
             o = self.table.offers[n]
             choice = o.keys, o.choices
-            if not np.isfinite(net[n]) or taken.get(choice, 0) >= MAX_PER_CHOICE or len(found) >= SHORT_LIST:
+            if (
+                o.keys == (other_than,)
+                or not np.isfinite(net[n])
+                or taken.get(choice, 0) >= MAX_PER_CHOICE
+                or len(found) >= SHORT_LIST
+            ):
                 continue
             taken[choice] = taken.get(choice, 0) + 1
             fit = model.fit(o.rows, o.low, o.high, start=now.weights)
@@ -260,8 +266,12 @@ class Search:
         best: dict[tuple, Addition] = {}
         for x in sorted(found, key=lambda x: -x.net):
             best.setdefault((x.offer.keys, x.offer.choices), x)
-        promising = sorted((self._with_fitted_shapes(screened, x) for x in best.values()), key=lambda x: -x.net)
-        return [x for x in promising[:most] if x.net > promising[0].net - MAX_SCORE_GAP]
+        on_grid = list(best.values())
+        between = sorted((self._with_fitted_shapes(screened, x) for x in on_grid), key=lambda x: -x.net)
+        chosen = {
+            id(x.offer) for some in (on_grid, between) for x in some[:most] if x.net > some[0].net - MAX_SCORE_GAP
+        }
+        return [x for x in between if id(x.offer) in chosen]
 
     def _with_fitted_shapes(self, screened: Screened, found: Addition) -> Addition:
         """An addition with the net evidence that it may have once its shapes are fitted.

@@ -39,3 +39,10 @@ def test_neighbours_differ_by_one_step_of_one_shape(found):
             assert offer.keys == other.keys
             assert fixed == same
             assert 0.0 < abs(place - beside) < 0.08
+
+
+def test_what_could_replace_a_cause_is_another(found):
+    search, state = found
+    offers = search.best_offers(search.screen(state, 0), most=1, other_than=STOP)
+    assert offers
+    assert all(x.offer.keys != (STOP,) for x in offers)
