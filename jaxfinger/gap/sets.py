@@ -1,8 +1,8 @@
 """Search for the causes: the sets of causes with the most evidence.
 
 A set starts empty. It grows by one cause, or by two that hide each other, loses causes that are not worth their cost,
-and swaps causes for better ones, as long as its net evidence grows: log evidence less cost (`costs`). Candidates are
-compared at three levels, each more exact and for fewer of them:
+and swaps a cause for a better one, or for two that it imitates, as long as its net evidence grows: log evidence less
+cost (`costs`). Candidates are compared at three levels, each more exact and for fewer of them:
 
 1. all offers, by one least squares in fixed weights (`LinearModel.screen`);
 2. the best SHORT_LIST of them, with the weights settled (`LinearModel.fit`);
@@ -121,6 +121,7 @@ class Search:
             additions = self._additions(state, state)
             better = self._best(state, additions) or self._swapped(state)
             better = better or self._best(state, self._pairs(state, additions))
+            better = better or self._best(state, self._pairs_for_one(state), len(state.effects) - 1)
             if better is None:
                 break
             state = self._pruned(better)
@@ -135,12 +136,14 @@ class Search:
         return state.score - self.costs.of(state.keys)
 
     # One change of a set ----------------------------------------------------------------------------------------------
-    def _additions(self, state: SearchState, beside: SearchState, most: int = MAX_EXACT) -> list[SearchState]:
+    def _additions(
+        self, state: SearchState, beside: SearchState, most: int = MAX_EXACT, other_than: CauseKey | None = None
+    ) -> list[SearchState]:
         """The set with each of the best offers, fitted exactly, if it may have more net evidence than `beside`."""
         screened = self.screen(state)
         return [
             self.fit_exactly(state, None, offer, amplitudes, screened.now.weights)
-            for net, offer, amplitudes in self.best_offers(screened, most)
+            for net, offer, amplitudes in self.best_offers(screened, most, other_than)
             if net >= self.net_evidence(beside) - MAX_SCORE_GAP
         ]
 
@@ -150,12 +153,24 @@ class Search:
             for first in firsts:
                 yield from self._additions(first, state, most=1)
 
-    def _best(self, state: SearchState, found: Iterable[SearchState]) -> SearchState | None:
-        """The best of the sets found, with its best choices, if it has more net evidence than `state`."""
+    def _pairs_for_one(self, state: SearchState) -> Iterator[SearchState]:
+        """The set with two causes in the place of one that imitates both."""
+        if self._leaves_more(state):
+            for i, key in enumerate(state.keys):
+                screened = self.screen(state, i)
+                for _, offer, amplitudes in self.best_offers(screened, other_than=key):
+                    first = self.fit_exactly(state, i, offer, amplitudes, screened.now.weights)
+                    yield from self._additions(first, state, most=1, other_than=key)
+
+    def _best(self, state: SearchState, found: Iterable[SearchState], kept: int | None = None) -> SearchState | None:
+        """The best of the sets found, with its best choices, if it has more net evidence than `state`.
+
+        `kept` is how many causes of the state it has (None: all); they come first.
+        """
         best = max(found, key=self.net_evidence, default=state)
         if self.net_evidence(best) <= self.net_evidence(state):
             return None
-        best = self.with_best_choices(best, len(state.effects))
+        best = self.with_best_choices(best, len(state.effects) if kept is None else kept)
         if self._leaves_more(best):
             best = refit_from_plain(self.baseline, best)
             self.visited.add(best.keys, best.linear_fit.evidence)
@@ -239,7 +254,9 @@ class Search:
                 self.visited.screen(together, more._replace(score=score + more.score))
         return Screened(keys, score, model, now, net)
 
-    def best_offers(self, screened: Screened, most: int = MAX_EXACT, other_than: Key | None = None) -> list[Addition]:
+    def best_offers(
+        self, screened: Screened, most: int = MAX_EXACT, other_than: CauseKey | None = None
+    ) -> list[Addition]:
         """Offers that may be best once they are fitted, each of another cause or choice, best first.
 
         They are the best `most` with shapes of the grid, and the best `most` with shapes between those; each without
