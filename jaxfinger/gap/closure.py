@@ -1,4 +1,4 @@
-"""How far the gap shrinks: rms before, rms after and noise on trials that no fit has seen, in physical units.
+"""Closure of the gap: rms before, rms after and noise on trials that no fit has seen, in physical units.
 
 Each third of the trials is held out in turn, stratified by experiment, joint and tendon (`folds`).
 """

@@ -123,8 +123,8 @@ def _short_list(problem: Problem, showing: set[str]) -> Iterator[dict[str, Stack
 
 def _borrowed(problem: Problem, name: str, like: Stack) -> Stack:
     """Trials of an experiment that the session lacks, with the motion of another; measured channels are zero."""
-    spec, x, finger = EXPERIMENTS[name], like.batch.x, problem.nominal.finger
-    if spec.slack:
+    experiment, x, finger = EXPERIMENTS[name], like.batch.x, problem.nominal.finger
+    if experiment.slack:
         x = replace(x, tension=jnp.zeros_like(x.tension), tendon_direction=jnp.zeros_like(x.tendon_direction))
     joints = [problem.session[t].joint for t in like.trials]
     motor = np.zeros(x.q.shape)
@@ -135,16 +135,16 @@ def _borrowed(problem: Problem, name: str, like: Stack) -> Stack:
             motor[own, b] = 1.0
     counts = np.stack([np.asarray(m) for m in like.batch.mask.values() for m in m]).max(axis=0)
     mask, y = {}, {}
-    for c in spec.channels:
+    for c in experiment.channels:
         columns = {"joint_torque": finger.m, "tendon_excursion": finger.n, "fingertip_force": 3}[c]
         shown = motor if c == "joint_torque" else np.ones((columns, *counts.shape))
         if c == "tendon_excursion":
             shown = shown * (np.asarray(x.tension).max(axis=-1) > 0)[..., None]
         mask[c] = jnp.asarray(shown * counts)
         y[c] = jnp.zeros_like(mask[c])
-    x = replace(x, motorised=jnp.asarray(motor), held=spec.held)
-    measured = dict.fromkeys(spec.channels, True)
-    return Stack(spec, Batch(x, y, mask), like.trials, like.motions, like.holds, like.dt, measured)
+    x = replace(x, motorised=jnp.asarray(motor), held=experiment.held)
+    measured = dict.fromkeys(experiment.channels, True)
+    return Stack(experiment, Batch(x, y, mask), like.trials, like.motions, like.holds, like.dt, measured)
 
 
 def _resting_at(stack: Stack, finger: Finger, share: float | None) -> Stack:
@@ -161,17 +161,17 @@ def _harder(stack: Stack) -> Stack:
 
     Without tension it moves faster instead. VD.3 stays as it is, since its motion follows from its tension.
     """
-    x, spec = stack.batch.x, stack.experiment
-    if spec.name == "VD.3":
+    x, experiment = stack.batch.x, stack.experiment
+    if experiment.name == "VD.3":
         return stack
-    if spec.slack:
-        return stack if spec.rests else _sped_up(stack, max(1.0, FAST_SPEED / max(_speed(x.qd), 1e-3)))
+    if experiment.slack:
+        return stack if experiment.rests else _sped_up(stack, max(1.0, FAST_SPEED / max(_speed(x.qd), 1e-3)))
     f = np.asarray(x.tension)
     top = f.max(axis=(0, -1), keepdims=True)
     top = np.where(top > 0.0, top, MAX_TENSION)
-    f = f * np.clip(MAX_TENSION / top, 1.0, np.inf if spec.held else MAX_TENSION_FACTOR)
+    f = f * np.clip(MAX_TENSION / top, 1.0, np.inf if experiment.held else MAX_TENSION_FACTOR)
     falls = f[..., -1].max(axis=0) < 0.5 * f.max(axis=(0, -1))
-    if not spec.held or falls.all():
+    if not experiment.held or falls.all():
         return _with(stack, tension=f)
     T = f.shape[-1]
     there_and_back = np.r_[0:T:2, T - 1 - T % 2 : 0 : -2]
@@ -182,12 +182,12 @@ def _harder(stack: Stack) -> Stack:
 
 def _slower(stack: Stack) -> Stack:
     """The stack at a quarter of its speed, where joints move and their speed is free to choose."""
-    spec = stack.experiment
-    return stack if spec.rests or spec.name == "VD.3" else _sped_up(stack, SLOW_FACTOR)
+    experiment = stack.experiment
+    return stack if experiment.rests or experiment.name == "VD.3" else _sped_up(stack, SLOW_FACTOR)
 
 
 def _sped_up(stack: Stack, factor: float) -> Stack:
-    """The same path in time, velocity and acceleration of `factor` times the speed."""
+    """The stack with the same path at `factor` times the speed: time, velocity and acceleration are scaled."""
     x = stack.batch.x
     return _with(stack, time=x.time / factor, qd=x.qd * factor, qdd=x.qdd * factor**2)
 
@@ -214,7 +214,7 @@ def _speed(qd: Float[Array | np.ndarray, "m *T"]) -> float:
 # The suggestion -------------------------------------------------------------------------------------------------------
 def _described(problem: Problem, stack: Stack, b: int, evidence: float, ids: tuple[str, ...]) -> NextExperiment:
     """The suggestion as data: trial number `b` of a stack, which brings `evidence` and separates the effects `ids`."""
-    finger, spec = problem.nominal.finger, stack.experiment
+    finger, experiment = problem.nominal.finger, stack.experiment
     trial = problem.session[stack.trials[b]]
     x = stack.batch.x
     counts = np.stack([np.asarray(m)[b] for mask in stack.batch.mask.values() for m in mask]).max(axis=0) > 0
@@ -226,15 +226,15 @@ def _described(problem: Problem, stack: Stack, b: int, evidence: float, ids: tup
     )
     repeats = int(np.ceil(DECISIVE / evidence))
     return NextExperiment(
-        spec.name,
-        spec.name not in problem.stacks,
-        trial.joint if trial.joint and spec.name.startswith("ID") else None,
-        trial.tendon if trial.tendon and spec.held else None,
+        experiment.name,
+        experiment.name not in problem.stacks,
+        trial.joint if trial.joint and experiment.name.startswith("ID") else None,
+        trial.tendon if trial.tendon and experiment.held else None,
         postures,
-        None if spec.slack else float(f.max()),
-        spec.held,
-        spec.held and bool(f[:, -1].max() < 0.5 * f.max()),
-        None if spec.rests else _speed(x.qd[:, b]),
+        None if experiment.slack else float(f.max()),
+        experiment.held,
+        experiment.held and bool(f[:, -1].max() < 0.5 * f.max()),
+        None if experiment.rests else _speed(x.qd[:, b]),
         any(finger.prismatic),
         repeats,
         repeats * evidence,

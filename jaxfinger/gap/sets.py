@@ -40,7 +40,7 @@ MAX_PER_CHOICE = 2  # of the short list, for one cause and one choice of its fix
 MAX_EXACT = 3  # offers that are fitted exactly: each fit takes seconds
 MAX_CHANGES = 12  # changes of the set in one search
 MAX_SCORE_GAP = 8.0  # nats. A set whose linear fit is further behind is not fitted exactly: each fit takes seconds.
-MIN_SWAP_GAIN = 1.0  # nats that a swap must bring, so that two sets of like evidence are not swapped forth and back
+MIN_SWAP_GAIN = 1.0  # nats that a swap must bring, so that two sets of like evidence are not swapped back and forth
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Where the gap lies: trials, columns and regions of the motion where whitened residuals exceed the noise."""
+"""Places of the gap: trials, columns and regions of the motion where whitened residuals exceed the noise."""
 
 import numpy as np
 

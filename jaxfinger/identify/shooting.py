@@ -85,9 +85,11 @@ def shooting(session: Session) -> Shooting:
     if short:
         raise UserError(f"{file}: trial {short[0]} is shorter than {horizon:g} s; leave it out")
     batch = _batch(trials, horizon)
-    spec = replace(whole.experiment, name=AHEAD, channels=("q",), rate=1.0 / horizon)
+    experiment = replace(whole.experiment, name=AHEAD, channels=("q",), rate=1.0 / horizon)
     holds = np.full(batch.x.time.shape, -1)
-    return Shooting(trials, replace(whole, experiment=spec, batch=batch, holds=holds, dt=horizon, measured={"q": True}))
+    return Shooting(
+        trials, replace(whole, experiment=experiment, batch=batch, holds=holds, dt=horizon, measured={"q": True})
+    )
 
 
 def _batch(

@@ -32,6 +32,8 @@ from jaxfinger.table import Table
 # Cut-off, Hz at the protocol's pace, of the causal filter with which a controller would differentiate angles: that of
 # VD.3, the motion that it controls.
 ONLINE_CUTOFF = EXPERIMENTS["VD.3"].cutoff
+# Cut-off, Hz, of the low-pass about which an angle of VD.3 scatters by the encoder's noise: twice the experiment's.
+ENCODER_CUTOFF = 20.0
 
 
 @dataclass(frozen=True)
@@ -391,4 +393,4 @@ def _encoder(trial: Trial, k: int) -> float:
     """Standard deviation of an encoder's reading about its low-passed motion, rad."""
     step = float(np.median(np.diff(trial.time)))
     q = trial.q[:, k]
-    return float(np.std(q - low_pass(trial.time, q, min(20.0, 0.2 / step))))
+    return float(np.std(q - low_pass(trial.time, q, min(ENCODER_CUTOFF, 0.2 / step))))

@@ -158,7 +158,7 @@ def named_causes(d: Diagnosis) -> list[Cause]:
 
 
 def size(d: Diagnosis) -> str:
-    """How large the gap is in physical units: of at most two channels the experiment that matters most."""
+    """Size of the gap in physical units, for at most two channels, each in the experiment where it matters most."""
     largest: dict[str, Relevance] = {}
     for x in sorted(d.relevance, key=lambda x: (x.tolerated, -x.relative)):
         largest.setdefault(x.channel, x)

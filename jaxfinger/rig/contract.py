@@ -119,7 +119,7 @@ class State(IntEnum):
 
 
 class Mode(IntEnum):
-    """How a joint of the stand-in's finger is held."""
+    """Way in which a joint of the stand-in's finger is held."""
 
     FREE = 0
     FIXED = 1

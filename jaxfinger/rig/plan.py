@@ -13,7 +13,7 @@ from jaxfinger.data.toml import Document, Fault, NotEmpty, Place, one_of, parse_
 from jaxfinger.errors import UserError
 from jaxfinger.rig.backend import JointMove, Setup, TensionRamp
 from jaxfinger.rig.channels import RigDescription
-from jaxfinger.rig.protocols import EXPERIMENTS, Common, Covered, Dwell, Protocol, Settled, Start, Tare
+from jaxfinger.rig.protocols import PROTOCOLS, Common, Covered, Dwell, Protocol, Settled, Start, Tare
 from jaxfinger.rig.safety import admit
 
 # Steps of one trial (commands, marks and waits). The paper's longest trial has a hundred. More than this is a mistake
@@ -44,7 +44,7 @@ class PlannedTrial:
 
     def protocol(self, rig: RigDescription) -> Protocol:
         """Steps of the experiment."""
-        return EXPERIMENTS[self.experiment][0](rig.finger, self.parameters)
+        return PROTOCOLS[self.experiment][0](rig.finger, self.parameters)
 
 
 @dataclass(frozen=True)
@@ -120,11 +120,11 @@ def _trials(index: int, table: Mapping[str, Any], rig: RigDescription, place: Pl
     if "experiment" not in table:
         place.fail("has no `experiment`; add a line 'experiment = …'")
     try:
-        experiment = one_of(table["experiment"], tuple(EXPERIMENTS))
+        experiment = one_of(table["experiment"], tuple(PROTOCOLS))
     except Fault as fault:
         (place / "experiment").fail(fault.message)
     keys = {key: value for key, value in table.items() if key != "experiment"}
-    parameters = structure(keys, EXPERIMENTS[experiment][1], place)
+    parameters = structure(keys, PROTOCOLS[experiment][1], place)
     _check_parameters(experiment, parameters, rig, place)
     what = [experiment, *(str(getattr(parameters, key)) for key in ("tendon", "joint") if hasattr(parameters, key))]
     for _ in range(parameters.repeats):

@@ -337,8 +337,8 @@ def trajectory(finger: FingerDescription, p: Trajectory) -> Protocol:
         yield Dwell(p.interval)
 
 
-# Protocol and parameters of each experiment.
-EXPERIMENTS = {
+# Protocol of each experiment, and the class of its parameters.
+PROTOCOLS = {
     "ID.2": (moment_arms, MomentArms),
     "ID.3-static": (static_torque, StaticTorque),
     "ID.3-dynamic": (dynamic_torque, DynamicTorque),

@@ -39,7 +39,7 @@ class Command:
     line: str
 
     def without(self, effect: str) -> Command:
-        """The same command with one effect taken out of the catalogue."""
+        """Copy of the command with one effect taken out of the catalogue."""
         return Command(f"{self.line} --without {shlex.quote(effect)}")
 
     def __call__(self, fit: Path, out: Path) -> None:

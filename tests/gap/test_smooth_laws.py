@@ -1,4 +1,4 @@
-"""What smooth laws could explain depends neither on the units nor on the scale of the machine."""
+"""The energy that smooth laws could explain depends neither on the units nor on the scale of the machine."""
 
 from dataclasses import replace
 

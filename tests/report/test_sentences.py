@@ -1,4 +1,4 @@
-"""What a person reads: how large first, then why, then what is left; never more sure than the numbers."""
+"""Sentences say how large the gap is, then why, then what is left, and are never more sure than the numbers."""
 
 from dataclasses import replace
 

@@ -6,7 +6,7 @@ import pytest
 from jaxfinger.errors import UserError
 from jaxfinger.rig import estimate, parse_plan
 from jaxfinger.rig.backend import JointMove, Setup, TensionRamp
-from jaxfinger.rig.protocols import EXPERIMENTS, Mark, Start
+from jaxfinger.rig.protocols import PROTOCOLS, Mark, Start
 from jaxfinger.rig.simulated.examples import plan_toml
 
 HEAD = '[plan]\nname = "p"\n[[trial]]\n'
@@ -60,7 +60,7 @@ def test_repeats_share_their_motion(rig):
 
 def test_the_shipped_plan_holds_every_experiment(rig):
     plan = parse_plan(plan_toml(), rig)
-    assert {t.experiment for t in plan.trials} == set(EXPERIMENTS)
+    assert {t.experiment for t in plan.trials} == set(PROTOCOLS)
     assert all(estimate(t, rig).seconds > 1.0 for t in plan.trials)
 
 

@@ -111,7 +111,7 @@ SPEEDS = [(speed, acceleration) for speed in (0.2, 1.0, 2.0) for acceleration in
 
 
 def moved(rig, quiet_block, speed, acceleration, delay):
-    """What the supervisor finds where an encoder follows the motor after `delay` s, and the motor's way in rad."""
+    """Findings of the supervisor where an encoder follows the motor after `delay` s, and the motor's way in rad."""
     time, start = np.arange(1500) / rig.rate_hz, speed / acceleration
     covered = np.where(time < start, 0.5 * acceleration * time**2, speed * (time - 0.5 * start))
     block, at = quiet_block(1500, 50, state=State.MOVING), column(rig, "joint_position", "MCP")

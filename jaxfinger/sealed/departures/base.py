@@ -42,7 +42,7 @@ class Departure:
         return {}
 
     def resized(self, size: float) -> Departure:
-        """The same departure with another size."""
+        """Copy of the departure with another size."""
         return replace(self, size=size)
 
     def body(self, finger: FingerDescription) -> FingerDescription:
