@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxfinger.gap.smooth_laws import features
+from jaxfinger.gap.smooth_laws import features, measured_columns
 
 
 def slower_and_stronger(problem):
@@ -28,7 +28,7 @@ def slower_and_stronger(problem):
 
 def test_features_are_the_same_at_another_scale(planted):
     other = slower_and_stronger(planted)
-    for e, c, column in planted.columns:
+    for e, c, column, _ in measured_columns(planted):
         ours, theirs = (features(p, e, c, column) for p in (planted, other))
         assert ours.keys() == theirs.keys()
         for variable, members in ours.items():
