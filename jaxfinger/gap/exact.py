@@ -177,7 +177,9 @@ def fit_set(
     for _ in range(MAX_ROUNDS):
         found = fit_at_nominal(baseline, problem, effects, weights)
         if best is not None and found.score < best.score + MIN_SCORE_GAIN:
-            return max(best, found, key=lambda s: s.score)
+            # A score is that of the optimum of the linearisation. The later round starts from the weights of that
+            # optimum, and its values are nearer to it: in low weights, the prior shrinks the amplitudes of the first.
+            return found if found.score > best.score - MIN_SCORE_GAIN else best
         best, effects, weights = found, list(found.effects), found.linear_fit.weights
         problem = _with_nominal_refitted(baseline, found, weights)
     assert best is not None
