@@ -45,7 +45,7 @@ def commands(page: Path) -> list[str]:
     blocks += re.findall(r"\n\n((?:    [^\n]*\n)+)", prose)
     lines = "".join(blocks).replace("\\\n", " ").replace("&&", "\n").replace(".venv/bin/", "").splitlines()
     lines += [" ".join(inline.split()) for inline in re.findall(r"`([^`]+)`", prose)]
-    return [" ".join(shlex.split(line, comments=True)) for line in lines if re.match(r"\s*jaxfinger( |$)", line)]
+    return [" ".join(shlex.split(line, comments=True)) for line in lines if re.match(r"\s*jaxfinger \S", line)]
 
 
 def modules(page: Path) -> list[str]:

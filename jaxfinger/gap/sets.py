@@ -158,7 +158,7 @@ class Search:
         if self._leaves_more(state):
             for i, key in enumerate(state.keys):
                 screened = self.screen(state, i)
-                for _, offer, amplitudes in self.best_offers(screened, other_than=key):
+                for _, offer, amplitudes in self.best_offers(screened, 1, other_than=key):
                     first = self.fit_exactly(state, i, offer, amplitudes, screened.now.weights)
                     yield from self._additions(first, state, most=1, other_than=key)
 
