@@ -131,9 +131,9 @@ def test_what_is_affine_moves_along_its_tangent_exactly(short, short_truth, limi
     start = np.asarray(free.get(short_truth.model))
     there = free.set(short_truth.model, jnp.asarray(start * rng.uniform(0.9, 1.1, start.size)))
     tangents = Tangents()
-    first = tangents.at(name, short_truth.model, source, limit, linear=True)
-    moved = tangents.at(name, there, source, limit, linear=True)
-    anew = Tangents().at(name, there, source, limit, linear=True)
+    first = tangents.at(name, short_truth.model, source, limit, affine=True)
+    moved = tangents.at(name, there, source, limit, affine=True)
+    anew = Tangents().at(name, there, source, limit, affine=True)
     assert np.abs(moved.white - first.white).max() > 1.0
     np.testing.assert_allclose(moved.residuals[channel], anew.residuals[channel], atol=1e-12)
     np.testing.assert_allclose(moved.white, anew.white, atol=1e-7)
