@@ -94,7 +94,6 @@ def columns_of(recording: Recording, among: Sequence[Recording] = ()) -> list[Co
     at 5 degrees could be one at 5 rad, until another recording shows it at 80.
     """
     found = []
-    others = [other for other in among if other is not recording]
     for name, variable in recording.variables.items():
         table = variable.values.reshape(len(variable.values), -1)
         for k, x in enumerate(table.T):
@@ -105,21 +104,19 @@ def columns_of(recording: Recording, among: Sequence[Recording] = ()) -> list[Co
             if spelt:
                 units = spelt
             elif not stated:
-                alike = [x, *(y for other in others for y in _same_column(other, name, variable, k))]
-                units = _time_unit(x) if meaning == "time" else _unit(meaning, alike)
+                units = _time_unit(x) if meaning == "time" else _unit(meaning, _sizes(name, k, recording, among))
             finite = x[np.isfinite(x)]
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
             found.append(ColumnSurvey(name, column, len(x), low, high, len(x) - len(finite), units, stated, meaning))
     return found
 
 
-def _same_column(recording: Recording, name: str, variable: Variable, k: int) -> list[np.ndarray]:
-    """Column `k` of the variable of this name in another recording, where its columns and stated units are the same."""
-    other = recording.variables.get(name)
-    if other is None or other.columns != variable.columns or other.units != variable.units:
-        return []
-    table = other.values.reshape(len(other.values), -1)
-    return [table[:, k]] if k < table.shape[1] else []
+def _sizes(name: str, k: int, recording: Recording, among: Sequence[Recording]) -> list[float]:
+    """Sizes of column `k` of a variable, in its recording and in those of `among` with the same columns and units."""
+    variable = recording.variables[name]
+    alike = [variable, *(v for other in among if (v := other.variables.get(name)) is not None)]
+    same = [v for v in alike if (v.columns, v.units) == (variable.columns, variable.units)]
+    return [v.sizes[k] for v in same if k < len(v.sizes)]
 
 
 def clocks_of(recording: Recording, seen: Sequence[ColumnSurvey]) -> list[ClockSurvey]:
@@ -179,9 +176,9 @@ def _time_unit(x: np.ndarray) -> str:
     return next((unit for unit, low, high in _INTERVALS if low <= step < high), "s")
 
 
-def _unit(meaning: str, columns: Sequence[np.ndarray]) -> str:
-    """Guess the unit of a channel from the size of its values in several recordings."""
-    size = max((float(np.nanpercentile(np.abs(x), 99.0)) for x in columns if np.isfinite(x).any()), default=np.nan)
+def _unit(meaning: str, sizes: Sequence[float]) -> str:
+    """Guess the unit of a channel from the sizes of its values in several recordings."""
+    size = max((size for size in sizes if not np.isnan(size)), default=np.nan)
     return next((unit for unit, largest in _MAX_VALUES.get(meaning, ()) if size <= largest), "")
 
 

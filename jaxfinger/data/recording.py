@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,12 @@ class Variable:
     clock: str = ""
     units: str = ""
     present: Bool[np.ndarray, "N k"] | None = None
+
+    @cached_property
+    def sizes(self) -> tuple[float, ...]:
+        """99th percentile of the absolute values of every column, NaN where none is finite."""
+        columns = np.abs(self.values.reshape(len(self.values), -1)).T
+        return tuple(float(np.nanpercentile(x, 99.0)) if np.isfinite(x).any() else np.nan for x in columns)
 
 
 @dataclass(frozen=True)

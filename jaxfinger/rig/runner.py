@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 from typing import NoReturn
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxfinger.errors import UserError
 from jaxfinger.rig.backend import (
@@ -129,7 +128,8 @@ class Runner:
         If no sample shows the controller stopped and every tendon's measured tension at most RELEASED_TENSION, the
         sentence tells the operator to switch the drives off.
         """
-        reader = self.reader
+        reader, rig = self.reader, self.rig.description
+        tensions = rig.columns("tension", rig.finger.tendon_names)
         trip, seq = (error.trip, error.seq) if isinstance(error, TrialEnded) else (Trip.HOST, None)
         if not (tripped(reader.latest) or isinstance(error, ControllerStopped)):
             reader.stop(Violation(trip, "host", reader.latest_seq, float("nan")))
@@ -138,7 +138,7 @@ class Runner:
             block = reader.latest
             if block is None or not (tripped(block) or int(block.state[-1]) == State.IDLE):
                 return False
-            return bool(np.all(self._tensions(block) <= RELEASED_TENSION))  # NaN is no tension seen
+            return bool(np.all(block.x[-1, tensions] <= RELEASED_TENSION))  # NaN is no tension seen
 
         self._let_pass(AFTER_TRIP_S, released)  # A busy host first has to read the samples before the stop.
         self._let_pass(AFTER_TRIP_S)
@@ -149,12 +149,6 @@ class Runner:
             place = {} if seq is None else {"seq": seq}
             reader.end({"complete": False, "cause": cause, "trip": int(trip), **place})
         return cause
-
-    def _tensions(self, block: Block) -> Float[np.ndarray, " n"]:
-        """Measured tension (N) of every tendon in the newest sample of a block, less its tare."""
-        at = self.rig.description.columns("tension", self.rig.description.finger.tendon_names)
-        zeros = [self.tare.get(self.rig.description.channels[k].name, 0.0) for k in at]
-        return block.x[-1, at] - np.array(zeros)
 
     def arm(self, name: str) -> None:
         """Bring the controller to IDLE, wait for samples without a violation, and arm the rig.

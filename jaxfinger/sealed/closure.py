@@ -79,8 +79,15 @@ def _sliding(trial: Trial, finger: FingerDescription) -> Bool[np.ndarray, "N m"]
     slides = np.abs(speed) > SLIDING_SPEED
     if trial.experiment == "VD.3" and trial.tendon_excursion is not None:
         tendon = np.abs(_slope(trial.tendon_excursion, trial.time, width)) > SLIDING_SPEED * TYPICAL_ARM
-        slides &= ~(~tendon @ (finger.crosses & finger.active[:, None]))
+        slides = sliding_with_tendons(slides, tendon, finger)
     return minimum_filter1d(slides, 2 * round(CLEARANCE * rate) + 1, axis=0)
+
+
+def sliding_with_tendons(
+    joint: Bool[np.ndarray, "N m"], tendon: Bool[np.ndarray, "N n"], finger: FingerDescription
+) -> Bool[np.ndarray, "N m"]:
+    """Mark the joints that slide together with every active tendon across them. `joint`, `tendon`: those that slide."""
+    return joint & ~(~tendon @ (finger.crosses & finger.active[:, None]))
 
 
 def _slope(values: np.ndarray, time: np.ndarray, width: int) -> np.ndarray:

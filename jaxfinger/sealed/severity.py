@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
+from .closure import TYPICAL_ARM, sliding_with_tendons
 from .departures.base import Departure
 from .drive import planned_tension
 from .laws import Finger
@@ -26,8 +27,7 @@ from .specimens import Specimen
 
 COARSE = {250.0: 25.0, 1000.0: 60.0, 200.0: 40.0}  # Hz by a log's rate: enough for an rms over a trial
 MIN_SEVERITY = 1e-9  # of a departure without any trace: its logarithm has to exist
-SLIDING_SPEED = 0.03  # rad/s, from which on a joint counts as sliding
-TYPICAL_ARM = 5e-3  # m, turns the speed of a joint into that of a tendon
+SLIDING_SPEED = 0.03  # rad/s: a faster joint slides. Lower than in `closure`, since these speeds carry no noise.
 TAUT_TENSION = 0.3  # N, above which a tendon counts as taut: 15 times the noise of its sensor
 
 
@@ -116,9 +116,7 @@ class NoiseFreeSession:
         joint = np.abs(motion.qd) > SLIDING_SPEED
         arm = self.nominal.geometry(motion.q)[1]
         tendon = np.abs(np.einsum("tnm,tm->tn", arm, motion.qd)) > SLIDING_SPEED * TYPICAL_ARM
-        finger = self.specimen.finger
-        blocked = ~tendon @ (finger.crosses & finger.active[:, None])
-        return (joint & ~blocked).astype(float)
+        return sliding_with_tendons(joint, tendon, self.specimen.finger).astype(float)
 
     def trace(self, departures: Sequence[Departure]) -> tuple[np.ndarray, list[tuple[str, str, int]]]:
         """Residuals of the nominal model on data with departures, in units of a hold's noise, and labels by row.
