@@ -42,7 +42,7 @@ def main(tokens: Sequence[str] | None = None) -> None:
         _discard_stdout()
         print(f"jaxfinger: the disk takes no more ({error.strerror}); free space, or write elsewhere", file=sys.stderr)
         raise SystemExit(2) from None
-    except Exception:
+    except Exception:  # Without a device JAX raises exceptions of many kinds; every other error is raised again.
         platform = os.environ.get("JAX_PLATFORMS")
         if not platform or _has_device():
             raise

@@ -15,7 +15,8 @@ from jaxfinger.errors import counted
 STILL_ANGLE = 0.01  # rad: five times the noise of a 14-bit encoder
 STILL_DISTANCE = 1e-4  # m, likewise of a prismatic joint: a hundredth of a rad at a radius of 10 mm
 MAX_OVERTRAVEL = 0.35  # rad, 20 degrees, that a joint may read beyond its limits, since stated limits are approximate
-# Shares of the highest tension. A good tare is off by a hundredth, and tendons at little tension hold a fifth.
+# Readings below zero, as shares of the highest tension. A good tare is off by a hundredth. A taut tendon is held at a
+# fifth or more (`data.sizes`), so a column of the wrong sign reads at least twice MAX_PUSH below zero.
 MAX_TARE_ERROR = 0.03
 MAX_PUSH = 0.1
 COLD = 200.0  # K, −73 °C: no laboratory is colder, so lower values are in °C.

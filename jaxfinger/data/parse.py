@@ -265,7 +265,7 @@ def child(parent: h5py.Group, name: str, place: str, report: Report, kind: type)
             report.error(place, f"lies in another file, to which this one only links; copy the {what} into this one")
             return None
         item = parent.get(name)
-    except Exception:
+    except Exception:  # h5py raises exceptions of many kinds on a damaged file.
         report.error(
             place, "cannot be opened: the file is damaged or its link leads nowhere; record or import it again"
         )
@@ -297,7 +297,7 @@ def dataset(group, entry: Entry, place: str, sizes: Mapping[str, int | None], pr
             report.error(place, reason)
             return None
         value = _names(item) if entry.kind == "text" else item[()]
-    except Exception as error:
+    except Exception as error:  # h5py raises exceptions of many kinds on a damaged file.
         said = plain_reason(error)
         report.error(place, f"cannot be read ({said}): the file is truncated or damaged; record or import it again")
         return None
@@ -399,7 +399,7 @@ def text_attribute(item: Any, key: str, place: str, report: Report) -> str | Non
     """String attribute; None where it is absent, and with a report where it is no string."""
     try:
         return _decode(item.attrs[key]) if key in item.attrs else None
-    except Exception:
+    except Exception:  # The value is no string, or cannot be read: h5py then raises exceptions of many kinds.
         report.error(place, f"has an attribute `{key}` that is not a UTF-8 string; write it as one")
         return None
 
@@ -414,7 +414,7 @@ def number_attribute(item: Any, key: str, place: str, report: Report, shape: tup
         if value.dtype.kind not in "biuf":
             raise TypeError(value.dtype)
         value = value.astype(np.float64).reshape(shape)
-    except Exception:
+    except Exception:  # The value is of another kind or shape, or cannot be read: h5py then raises many kinds.
         report.error(place, f"has an attribute `{key}` that is not {shape or 'one'} of numbers; write it as such")
         return None
     if not np.all(np.isfinite(value)):

@@ -94,5 +94,5 @@ def _attempt(action):
     """Result of an action; None where it raises, since the reader reports that object and goes on with the others."""
     try:
         return action()
-    except Exception:
+    except Exception:  # h5py raises exceptions of many kinds on a damaged file.
         return None

@@ -58,7 +58,7 @@ def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as e:
+    except Exception as e:  # The file is a user's program, which may raise anything.
         raise UserError(f"{path}: cannot be loaded: {type(e).__name__}: {e}") from e
     found = _effects_in(module)
     if not found:

@@ -39,7 +39,7 @@ def refuse_broken(kind: type[CatalogueEffect], finger: Finger) -> None:
     file = inspect.getfile(kind)
     try:
         without_effect = kind.sites(finger) and not affected_channels(kind, finger)
-    except Exception as e:
+    except Exception as e:  # The effect is a user's program, which may raise anything.
         lines = [frame.lineno for frame in traceback.extract_tb(e.__traceback__) if frame.filename == file]
         where = f"{file}, line {lines[-1]}" if lines else file
         raise UserError(f"{where}: {kind.ID} fails in a prediction: {type(e).__name__}: {e}") from e
