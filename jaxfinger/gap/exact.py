@@ -173,16 +173,16 @@ def fit_set(
     """Fit a set of causes from amplitudes `start`, in their own units, and from the problem's nominal model."""
     finger = problem.nominal.finger
     effects = [within_bounds(v.at(finger, s), v.scales) for v, s in zip(variants, start, strict=True)]
-    best: SearchState | None = None
-    for _ in range(MAX_ROUNDS):
-        found = fit_at_nominal(baseline, problem, effects, weights)
-        if best is not None and found.score < best.score + MIN_SCORE_GAIN:
+    best = fit_at_nominal(baseline, problem, effects, weights)
+    for _ in range(MAX_ROUNDS - 1):
+        weights = best.linear_fit.weights
+        problem = _with_nominal_refitted(baseline, best, weights)
+        found = fit_at_nominal(baseline, problem, list(best.effects), weights)
+        if found.score < best.score + MIN_SCORE_GAIN:
             # A score is that of the optimum of the linearisation. The later round starts from the weights of that
             # optimum, and its values are nearer to it: in low weights, the prior shrinks the amplitudes of the first.
             return found if found.score > best.score - MIN_SCORE_GAIN else best
-        best, effects, weights = found, list(found.effects), found.linear_fit.weights
-        problem = _with_nominal_refitted(baseline, found, weights)
-    assert best is not None
+        best = found
     return best
 
 

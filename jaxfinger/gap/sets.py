@@ -11,7 +11,7 @@ cost (`costs`). Candidates are compared at three levels, each more exact and for
 The evidence of every set on the way is kept, and `posterior` makes probabilities of it.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -118,10 +118,7 @@ class Search:
         if not self.table.offers:
             return state
         for _ in range(MAX_CHANGES):
-            additions = self._additions(state, state)
-            better = self._best(state, additions) or self._swapped(state)
-            better = better or self._best(state, self._pairs(state, additions))
-            better = better or self._best(state, self._pairs_for_one(state), len(state.effects) - 1)
+            better = self._better(state)
             if better is None:
                 break
             state = self._pruned(better)
@@ -136,41 +133,60 @@ class Search:
         return state.score - self.costs.of(state.keys)
 
     # One change of a set ----------------------------------------------------------------------------------------------
-    def _additions(
-        self, state: SearchState, beside: SearchState, most: int = MAX_EXACT, other_than: CauseKey | None = None
+    def _better(self, state: SearchState) -> SearchState | None:
+        """A set with more net evidence, one change away; None if there is none.
+
+        The changes, in this order: one cause more; one swapped for another; two more, of which each alone is not worth
+        its cost while the other is missing; two in the place of one that imitates both.
+        """
+        kept, now = len(state.effects), self.net_evidence(state)
+        added = self._added(state, now)
+        if better := self._best(state, added, kept):
+            return better
+        open_set = self._leaves_more(state)
+        replaced = self._replaced(state, -np.inf if open_set else now - 0.5 * MAX_SCORE_GAP)
+        if better := self._best(state, (x for _, x in replaced), kept - 1, MIN_SWAP_GAIN):
+            return better
+        if not open_set:
+            return None
+        pairs = (x for first in added for x in self._added(first, now, most=1))
+        if better := self._best(state, pairs, kept):
+            return better
+        pairs = (x for key, first in replaced for x in self._added(first, now, most=1, other_than=key))
+        return self._best(state, pairs, kept - 1)
+
+    def _added(
+        self, state: SearchState, now: float, most: int = MAX_EXACT, other_than: CauseKey | None = None
     ) -> list[SearchState]:
-        """The set with each of the best offers, fitted exactly, if it may have more net evidence than `beside`."""
+        """The set with each of the best offers, fitted exactly, if it may have more net evidence than `now`."""
         screened = self.screen(state)
         return [
             self.fit_exactly(state, None, offer, amplitudes, screened.now.weights)
             for net, offer, amplitudes in self.best_offers(screened, most, other_than)
-            if net >= self.net_evidence(beside) - MAX_SCORE_GAP
+            if net >= now - MAX_SCORE_GAP
         ]
 
-    def _pairs(self, state: SearchState, firsts: Sequence[SearchState]) -> Iterator[SearchState]:
-        """The set with two causes more, of which each alone is not worth its cost while the other is missing."""
-        if self._leaves_more(state):
-            for first in firsts:
-                yield from self._additions(first, state, most=1)
+    def _replaced(self, state: SearchState, least: float, most: int = 1) -> list[tuple[CauseKey, SearchState]]:
+        """Every cause, and the set with the best others in its place that may have net evidence `least`, fitted."""
+        found = []
+        for i, key in enumerate(state.keys):
+            screened = self.screen(state, i)
+            for net, offer, amplitudes in self.best_offers(screened, most, other_than=key):
+                if net >= least:
+                    found.append((key, self.fit_exactly(state, i, offer, amplitudes, screened.now.weights)))
+        return found
 
-    def _pairs_for_one(self, state: SearchState) -> Iterator[SearchState]:
-        """The set with two causes in the place of one that imitates both."""
-        if self._leaves_more(state):
-            for i, key in enumerate(state.keys):
-                screened = self.screen(state, i)
-                for _, offer, amplitudes in self.best_offers(screened, 1, other_than=key):
-                    first = self.fit_exactly(state, i, offer, amplitudes, screened.now.weights)
-                    yield from self._additions(first, state, most=1, other_than=key)
+    def _best(
+        self, state: SearchState, found: Iterable[SearchState], kept: int, gain: float = 0.0
+    ) -> SearchState | None:
+        """The best of the sets found, with its best choices, if it has over `gain` more net evidence than `state`.
 
-    def _best(self, state: SearchState, found: Iterable[SearchState], kept: int | None = None) -> SearchState | None:
-        """The best of the sets found, with its best choices, if it has more net evidence than `state`.
-
-        `kept` is how many causes of the state it has (None: all); they come first.
+        Its first `kept` causes are the state's.
         """
         best = max(found, key=self.net_evidence, default=state)
-        if self.net_evidence(best) <= self.net_evidence(state):
+        if self.net_evidence(best) <= self.net_evidence(state) + gain:
             return None
-        best = self.with_best_choices(best, len(state.effects) if kept is None else kept)
+        best = self.with_best_choices(best, kept)
         if self._leaves_more(best):
             best = refit_from_plain(self.baseline, best)
             self.visited.add(best.keys, best.linear_fit.evidence)
@@ -196,27 +212,10 @@ class Search:
             state = found
         return state
 
-    def _swapped(self, state: SearchState) -> SearchState | None:
-        """The set with one cause swapped for a better one, if there is one."""
-        now, best = self.net_evidence(state), None
-        for i in range(len(state.effects)):
-            screened = self.screen(state, i)
-            for net, offer, amplitudes in self.best_offers(screened, 1, other_than=state.keys[i]):
-                if net < now - 0.5 * MAX_SCORE_GAP:
-                    continue
-                found = self.fit_exactly(state, i, offer, amplitudes, screened.now.weights)
-                if self.net_evidence(found) > max(now + MIN_SWAP_GAIN, self.net_evidence(best) if best else -np.inf):
-                    best = found
-        return best
-
     def _visit_rivals(self, state: SearchState) -> None:
-        """Fit the best offers in the place of each cause, for the posterior."""
-        for i, key in enumerate(state.keys):
-            screened = self.screen(state, i)
-            for _, offer, amplitudes in self.best_offers(screened, other_than=key):
-                if key not in offer.keys:
-                    found = self.fit_exactly(state, i, offer, amplitudes, screened.now.weights)
-                    self.with_best_choices(found, len(state.effects) - 1)
+        """Fit the best others in the place of each cause, for the posterior."""
+        for _, found in self._replaced(state, -np.inf, MAX_EXACT):
+            self.with_best_choices(found, len(state.effects) - 1)
 
     # Linear: all offers at once ---------------------------------------------------------------------------------------
     def without(self, state: SearchState, cause: int | None) -> Reduced:
@@ -280,15 +279,12 @@ class Search:
             evidence = fit.evidence._replace(score=score + fit.score - now.score)
             self.visited.add(together, evidence)
             found.append(Addition(evidence.score - self.costs.of(together), o, fit.amplitudes))
-        best: dict[tuple, Addition] = {}
+        on_grid: dict[tuple, Addition] = {}
         for x in sorted(found, key=lambda x: -x.net):
-            best.setdefault((x.offer.keys, x.offer.choices), x)
-        on_grid = list(best.values())
-        between = sorted((self._with_fitted_shapes(screened, x) for x in on_grid), key=lambda x: -x.net)
-        chosen = {
-            id(x.offer) for some in (on_grid, between) for x in some[:most] if x.net > some[0].net - MAX_SCORE_GAP
-        }
-        return [x for x in between if id(x.offer) in chosen]
+            on_grid.setdefault((x.offer.keys, x.offer.choices), x)
+        fitted = {form: self._with_fitted_shapes(screened, x) for form, x in on_grid.items()}
+        chosen = _nearest_best(on_grid, most) | _nearest_best(fitted, most)
+        return sorted((fitted[form] for form in chosen), key=lambda x: -x.net)
 
     def _with_fitted_shapes(self, screened: Screened, found: Addition) -> Addition:
         """An addition with the net evidence that it may have once its shapes are fitted.
@@ -405,3 +401,9 @@ class Search:
             if (best := self._best_offer_of(screened, key)) is not None:
                 out[key] = (*best, screened.model.std(best[0].rows, screened.now.weights))
         return out
+
+
+def _nearest_best(found: Mapping[tuple, Addition], most: int) -> set[tuple]:
+    """Keys of the `most` additions with the most net evidence, without those MAX_SCORE_GAP behind the best."""
+    order = sorted(found, key=lambda k: -found[k].net)[:most]
+    return {k for k in order if found[k].net > found[order[0]].net - MAX_SCORE_GAP}
