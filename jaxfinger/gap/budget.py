@@ -11,6 +11,7 @@ of rows (residual, Jacobian, slopes, changes) by trial and column.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -29,21 +30,34 @@ MIN_GAP_EVIDENCE = 6.0
 MIN_RELATIVE_GAP = 0.05
 
 
+class Cell(NamedTuple):
+    """Rows of one trial and fold in one column."""
+
+    trial: int  # number in `Problem.trial_of_row`
+    column: int  # number in `Columns.items`
+    fold: int
+    rows: int  # how many
+
+
 @dataclass(frozen=True)
 class Budget:
-    """Sums of squares of held-out white residuals, in cells of one trial and one column."""
+    """Sums of squares of held-out white residuals in each cell."""
 
-    cells: list[tuple[int, int]]  # number of the trial (`Problem.trial_of_row`) and of the column (`Columns.items`)
-    n: Float[np.ndarray, " cells"]  # rows, which is also the sum of squares that the noise leaves
+    cells: list[Cell]
     before: Float[np.ndarray, " cells"]  # with the nominal model
     after: Float[np.ndarray, " cells"]  # with all causes
     without: Float[np.ndarray, "causes cells"]  # with all causes but one
     open: frozenset[int]  # columns with a gap
     channels: tuple[tuple[str, str], ...]  # experiment and channel of each column
 
+    @cached_property
+    def n(self) -> Float[np.ndarray, " cells"]:
+        """Rows of each cell, which is also the sum of squares that the noise leaves."""
+        return np.array([c.rows for c in self.cells], float)
+
     def of(self, columns: set[int]) -> tuple[Float[np.ndarray, " causes"], float]:
         """Share of the columns' gap that comes back without each cause, and the share that is left with all causes."""
-        return self._shares(np.isin([c for _, c in self.cells], list(columns)).astype(float))
+        return self._shares(np.isin([c.column for c in self.cells], list(columns)).astype(float))
 
     def _shares(self, weight: Float[np.ndarray, " cells"]) -> tuple[Float[np.ndarray, " causes"], float]:
         n = max(float(weight @ self.n), 1e-9)
@@ -52,39 +66,50 @@ class Budget:
         left = float(weight @ (self.after - self.n))
         return np.clip(lost / gap, 0.0, 1.0), float(np.clip(left / gap, 0.0, 1.0))
 
+    @cached_property
     def overall(self) -> tuple[np.ndarray, np.ndarray, float, tuple[float, float]]:
         """Mean shares over the channels with a gap, with 95 % intervals from a bootstrap over trials.
 
-        Returns the share of each cause (causes,), its interval (causes, 2), the share left with all causes, and its
-        interval.
+        The interval says how the mean depends on the trials that were recorded, and not how channels differ. Returns
+        the share of each cause (causes,), its interval (causes, 2), the share left with all causes, and its interval.
         """
         rng = np.random.default_rng(0)
-        column = np.array([c for _, c in self.cells], int)
-        trial = np.array([t for t, _ in self.cells], int)
-        by_channel: dict[tuple[str, str], list[int]] = {}
-        for c in sorted(self.open):
-            by_channel.setdefault(self.channels[c], []).append(c)
-        inside = [np.isin(column, cs) for cs in by_channel.values()]
+        unit, strata = self._drawn()
+        channel = [self.channels[c.column] if c.column in self.open else None for c in self.cells]
+        inside = [np.array([x == c for x in channel], float) for c in sorted(set(channel) - {None})]
 
-        def means(count: np.ndarray) -> np.ndarray:
-            found = [self._shares(w * count[trial]) for w in inside if (w * count[trial] * self.n).sum() > 0]
-            if not found:
+        def means(weights: list[Float[np.ndarray, " cells"]]) -> np.ndarray:
+            if not weights:
                 return np.zeros(len(self.without) + 1)
-            return np.mean([np.append(lost, left) for lost, left in found], axis=0)
+            return np.mean([np.append(*self._shares(w)) for w in weights], axis=0)
 
-        size = int(trial.max(initial=0)) + 1
-        value = means(np.ones(size))
-        # Trials are drawn within their experiment, so that no draw lacks an experiment.
-        experiment = np.array([self.channels[c][0] for c in column])
-        strata = sorted((np.unique(trial[experiment == e]) for e in set(experiment)), key=lambda s: s[0])
-
-        def draw() -> np.ndarray:
-            return np.bincount(np.concatenate([rng.choice(s, len(s)) for s in strata]), minlength=size).astype(float)
-
-        draws = np.array([means(draw()) for _ in range(DRAWS if inside else 1)])
-        low, high = np.quantile(draws, (0.025, 0.975), axis=0)
+        value, draws = means(inside), []
+        for _ in range(DRAWS if inside else 0):
+            count = np.bincount(np.concatenate([rng.choice(s, len(s)) for s in strata]), minlength=unit.max() + 1)
+            weights = [w * count[unit] for w in inside]
+            if all(w @ self.n > 0 for w in weights):  # Without one of the channels the mean is another quantity.
+                draws.append(means(weights))
+        low, high = np.quantile([value, *draws], (0.025, 0.975), axis=0)
         low, high = np.minimum(low, value), np.maximum(high, value)
         return value[:-1], np.stack([low[:-1], high[:-1]], axis=1), float(value[-1]), (float(low[-1]), float(high[-1]))
+
+    def _drawn(self) -> tuple[Int[np.ndarray, " cells"], list[np.ndarray]]:
+        """What the bootstrap draws: the unit to which each cell belongs, and strata of units.
+
+        Units are trials. A stratum holds those that show the same channels with a gap, so that each draw holds each
+        channel as often as the session does. The parts of a trial that is alone in its stratum are drawn in its place:
+        a trial drawn from itself would give an interval of no width.
+        """
+        shown: dict[int, set[tuple[str, str]]] = {}
+        for c in self.cells:
+            shown.setdefault(c.trial, set()).update({self.channels[c.column]} if c.column in self.open else ())
+        alike: dict[frozenset, list[int]] = {}
+        for trial in sorted(shown):
+            alike.setdefault(frozenset(shown[trial]), []).append(trial)
+        alone = {trials[0] for trials in alike.values() if len(trials) == 1}
+        unit = np.array([c.trial * FOLDS + (c.fold if c.trial in alone else 0) for c in self.cells], int)
+        trial = np.array([c.trial for c in self.cells], int)
+        return unit, [np.unique(unit[np.isin(trial, trials)]) for trials in alike.values()]
 
 
 def budget(baseline: Baseline, state: SearchState, plain: Problem, open_columns: frozenset[int]) -> Budget:
@@ -108,23 +133,13 @@ def budget(baseline: Baseline, state: SearchState, plain: Problem, open_columns:
             after.append(x1 @ full[i] @ x1)
             without.append([x @ full[i] @ x for x in less])
     return Budget(
-        [(c.trial, c.column) for c in order],
-        np.array([c.rows for c in order], float),
+        order,
         np.array(before),
         np.array(after),
         np.array(without).reshape(len(order), len(state.effects)).T,
         open_columns,
         tuple((c.experiment, c.channel) for c in baseline.columns.items),
     )
-
-
-class Cell(NamedTuple):
-    """Rows of one trial and fold in one column."""
-
-    trial: int
-    column: int
-    fold: int
-    rows: int  # how many
 
 
 def _products(

@@ -19,7 +19,7 @@ from jaxfinger.report import plots, sentences
 from jaxfinger.report.causes import words
 from jaxfinger.report.curves import Curves, curves
 from jaxfinger.report.measured import arm_points
-from jaxfinger.report.numbers import HALF_95, measured, percent, percent_range, quantity, unbroken
+from jaxfinger.report.numbers import HALF_95, measured, percent, quantity, unbroken
 from jaxfinger.report.plots import gap as gap_plots
 from jaxfinger.report.plots.fit import INTERVAL_ROWS, interval_size
 from jaxfinger.report.theme import PALETTE, css, grid, inline, look
@@ -237,7 +237,7 @@ def _cards(d: Diagnosis) -> list[dict]:
 
 
 def _card(d: Diagnosis, k: int, c: Cause) -> dict:
-    says = f"{percent(c.share)} of the gap ({percent_range(*c.share_ci95)}); probability {percent(c.probability)}."
+    says = f"{sentences.shared(d, c, ' of the gap')}; probability {percent(c.probability)}."
     return _texts(d, k, c.effect) | {
         "name": sentences.sentence(sentences.cause_name(c)).rstrip("."),
         "says": says,

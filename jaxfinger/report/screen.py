@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 
 from jaxfinger.gap.result import Cause, ChannelBudget, Closure, Diagnosis, Key
 from jaxfinger.report import sentences
-from jaxfinger.report.numbers import measured, percent, percent_range, quantity, unbroken
+from jaxfinger.report.numbers import measured, percent, quantity, unbroken
 from jaxfinger.report.plots.gap import rows_of, segments, shown
 
 WIDTH, BAR = 100, 30  # Characters in a line and in a bar; beside the bar a channel's name must fit.
@@ -29,7 +29,7 @@ def summary(d: Diagnosis, own: Iterable[str] = ()) -> str:
         out += [f"  {_legend(d)}", ""]
     if d.budget:
         out += ["CAUSES     share of the gap (95 % interval), probability, parameters (± half of a 95 % interval)"]
-        out += [line for k, c in enumerate(d.budget) for line in _cause(k, c)] + [""]
+        out += [line for k, c in enumerate(d.budget) for line in _cause(d, k, c)] + [""]
     if lines := shown(d.closures):
         out += ["HOW FAR    rms on held-out trials: noise, before → after, share closed (95 % interval)"]
         out += [_line(x) for x in lines] + [""]
@@ -91,11 +91,12 @@ def _legend(d: Diagnosis) -> str:
     return "  ".join(parts)
 
 
-def _cause(k: int, c: Cause) -> list[str]:
-    says = f"{percent(c.share)} ({percent_range(*c.share_ci95)}), probability {percent(c.probability)}"
+def _cause(d: Diagnosis, k: int, c: Cause) -> list[str]:
+    says = f"{sentences.shared(d, c)}, probability {percent(c.probability)}"
     at = [f" {'-'.join(v.site)}" if len(c.sites) > 1 else "" for v in c.values]
     values = [f"{v.name}{where} {measured(v.value, v.std, v.units)}" for v, where in zip(c.values, at, strict=True)]
-    return [f"  {SIGNS[k % len(SIGNS)]} {sentences.cause_name(c)}: {says}", *_wrapped("; ".join(values), " " * 6)]
+    first, *rest = _wrapped(f"{SIGNS[k % len(SIGNS)]} {sentences.cause_name(c)}: {says}", "  ")
+    return [first, *("    " + line for line in rest), *_wrapped("; ".join(values), " " * 6)]
 
 
 def _not_named(effect: str, d: Diagnosis) -> str:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jaxfinger.gap.budget import Budget, held_out_gains
+from jaxfinger.gap.budget import Budget, Cell, held_out_gains
 from jaxfinger.gap.folds import FOLDS, fold_of_row
 
 
@@ -25,15 +25,38 @@ def test_a_cause_explains_trials_that_it_has_not_seen_and_luck_does_not(planted)
     assert together < cause
 
 
+CHANNELS = (("ID.4", "joint_torque"), ("ID.4", "tendon_excursion"))
+
+
+def made(cells: list[tuple[int, int]], left: np.ndarray, open_columns: set[int]) -> Budget:
+    """A budget of one cause, with the gap of each (trial, column) before it and the share of it that it leaves."""
+    before = 200.0 + 20.0 * np.random.default_rng(0).standard_normal(len(cells))
+    after = 50.0 + left * (before - 50.0)
+    rows = [Cell(trial, column, trial % FOLDS, 50) for trial, column in cells]
+    return Budget(rows, before, after, before[None], frozenset(open_columns), CHANNELS)
+
+
 def test_intervals_are_the_same_whether_or_not_a_trial_lacks_another_channel():
-    """A bootstrap draws trials within an experiment, whatever channels a trial has."""
-    rng = np.random.default_rng(0)
     cells = [(trial, column) for trial in range(6) for column in (0, 1)]
-    n = np.full(12, 50.0)
-    before, after = n * (4.0 + rng.standard_normal(12)), n * (1.5 + 0.2 * rng.standard_normal(12))
-    channels = (("ID.4", "joint_torque"), ("ID.4", "tendon_excursion"))
-    whole = Budget(cells, n, before, after, before[None], frozenset({0}), channels)
-    kept = np.flatnonzero(np.arange(12) != 11)  # the last trial without its excursion
-    less = Budget(cells[:-1], n[kept], before[kept], after[kept], before[None, kept], frozenset({0}), channels)
-    for mine, theirs in zip(whole.overall(), less.overall(), strict=True):
+    left = 0.2 + 0.1 * np.random.default_rng(1).random(12)
+    whole, less = (made(cells[:k], left[:k], {0}) for k in (12, 11))  # the last trial without its excursion
+    for mine, theirs in zip(whole.overall, less.overall, strict=True):
         np.testing.assert_allclose(mine, theirs)
+
+
+def test_channels_that_disagree_do_not_widen_the_interval_of_their_mean():
+    """Two trials of twelve show the channel that the cause closes: no draw may lack it."""
+    cells = [(trial, 0) for trial in range(12)] + [(0, 1), (1, 1)]
+    share, ends, left, _ = made(cells, np.repeat([1.0, 0.0], (12, 2)), {0, 1}).overall
+    assert share == pytest.approx([0.5])
+    assert left == pytest.approx(0.5)
+    np.testing.assert_allclose(ends, [[0.5, 0.5]], atol=1e-12)
+
+
+def test_a_channel_of_one_trial_has_an_interval_from_the_parts_of_that_trial():
+    cells = [Cell(0, 0, fold, 50) for fold in range(FOLDS)]
+    before, after = np.full(FOLDS, 200.0), np.array([50.0, 60.0, 90.0])
+    budget = Budget(cells, before, after, before[None], frozenset({0}), CHANNELS)
+    (share,), ((low, high),), _, _ = budget.overall
+    assert low < share - 0.05
+    assert high > share + 0.05

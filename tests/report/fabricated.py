@@ -39,6 +39,7 @@ from jaxfinger.synthetic import paper_finger, polynomial_finger, true_model
 
 STRETCH, STRIBECK = Key("tendon_stretch", ("T3",)), Key("joint_stribeck", ("PIP",))
 TORQUE, EXCURSION = ExperimentChannel("ID.4", "joint_torque"), ExperimentChannel("ID.4", "tendon_excursion")
+PATH = ExperimentChannel("VD.1", "tendon_excursion")
 
 
 @cache
@@ -75,7 +76,7 @@ STRETCHES = Cause(
     0.995,
     0.96,
     (0.94, 0.98),
-    {TORQUE: 0.02, EXCURSION: 0.97},
+    {EXCURSION: 0.97, PATH: 0.95},
     (Value(("T3",), "compliance", 9.1e-5, 3e-6, "m/N"),),
 )
 RUBS = Cause(
@@ -84,7 +85,7 @@ RUBS = Cause(
     0.93,
     0.41,
     (0.35, 0.47),
-    {TORQUE: 0.62},
+    {TORQUE: 0.41},
     (Value(("PIP",), "a", 0.52, 0.04, "1"), Value(("PIP",), "v_s", 0.11, 0.02, "rad/s")),
 )
 COUPLED = Cause(

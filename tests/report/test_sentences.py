@@ -7,7 +7,7 @@ import pytest
 from jaxfinger.gap.result import Key
 from jaxfinger.report import sentences
 
-from .fabricated import COUPLED, LARGE, SMALL, every, explained
+from .fabricated import COUPLED, EXCURSION, LARGE, SMALL, every, explained
 
 ALL = every()
 SIZE = "The model misses the joint torque by 1.2 N mm in 30 N mm (4 %, ID.4) and the tendon excursion by 6 µm in 20 mm"
@@ -114,6 +114,17 @@ def test_a_cause_that_held_out_trials_do_not_show_is_not_said_to_cause_nothing()
     hidden = replace(d, budget=(replace(d.budget[0], share=0.0, share_ci95=(0.0, 0.36)),))
     text = sentences.summary(hidden)
     assert "is almost certainly at work, but closes 0 % of it (95 % interval 0 to 36 %) on trials that no fit" in text
+
+
+def test_where_channels_disagree_their_shares_stand_in_place_of_the_interval():
+    d = explained()
+    disagreeing = replace(d.budget[0], share=0.5, channels={EXCURSION: 0.98})  # the second channel: nothing
+    text = sentences.summary(replace(d, budget=(disagreeing,)))
+    says = "causes 50 % of it (0 % in tendon excursion of VD.1, 98 % in tendon excursion of ID.4);"
+    assert says in text
+    third = replace(d.channels[0], experiment="ID.2")
+    text = sentences.summary(replace(d, budget=(disagreeing,), channels=(*d.channels, third)))
+    assert "(from 0 % in tendon excursion of VD.1 to 98 % in tendon excursion of ID.4)" in text
 
 
 @pytest.mark.parametrize(("share", "doubted"), [(0.1, False), (0.4, True)])
