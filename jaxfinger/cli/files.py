@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import Output, console, plain, print_json, progress, refuse_output, remark, table
+from jaxfinger.cli.output import Output, console, plain, print_json, print_warnings, progress, refuse_output, table
 from jaxfinger.errors import UserError, counted
 from jaxfinger.progress import Step
 
@@ -33,16 +34,16 @@ def check(file: Path, *, json: bool = False) -> None:
     with progress("check") as say:
         say(file.name)
         findings = check_file(file)
-    errors = sum(f.severity == "error" for f in findings)
+    count = Counter(f.severity for f in findings)
+    errors = count["error"]
     if json:
         print_json({"file": file, "ok": not errors, "findings": [asdict(f) for f in findings]})
     else:
         for finding in merged(findings):
             said = f"{finding.severity}: {file}: {finding.message}" if finding.place == "/" else finding
             console().print(plain(said), markup=False, soft_wrap=True)
-        rest = len(findings) - errors
-        found = f"{counted(errors, 'error')}, {counted(rest, 'remark')}" if findings else "nothing to complain about"
-        print(f"{file}: {found}")
+        found = ", ".join(counted(count[s], s) for s in ("error", "warning", "note") if s == "error" or count[s])
+        print(f"{file}: {found if findings else 'nothing to complain about'}")
     if errors:
         raise SystemExit(2)
 
@@ -196,5 +197,5 @@ def import_(
             say(", ".join(s.name for s in sources))
             session = import_file(sources, mapping, output, overwrite, report)
     finally:
-        remark(report, mapping)
+        print_warnings(report, mapping)
     print(plain(f"{output}: {counted(len(session), 'trial')} of {session.specimen}"))

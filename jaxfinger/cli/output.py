@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jaxfinger.data.findings import Finding
 
 FIGURES = (".svg", ".png")
-MAX_REMARKS = 20  # More would push the results off the screen.
+MAX_WARNINGS = 20  # More would push the results off the screen.
 MIN_TIMED = 3.0  # s: people look at the time of work that takes longer.
 MIN_DONE = 0.1  # share of the work: before, the elapsed time is no basis for an estimate of the rest.
 Output = Annotated[Path, Parameter(name=["--output", "-o"])]
@@ -118,15 +118,15 @@ def plain(text: object) -> str:
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in str(text))
 
 
-def remark(findings: Iterable[Finding], file: Path) -> None:
+def print_warnings(findings: Iterable[Finding], file: Path) -> None:
     """Print the checker's warnings on stderr, so that no command silently works on doubtful numbers."""
     from jaxfinger.data.findings import merged
 
     warnings = merged(finding for finding in findings if finding.severity == "warning" or finding.local)
-    for finding in warnings[:MAX_REMARKS]:
+    for finding in warnings[:MAX_WARNINGS]:
         print(plain(f"{file}: {finding}"), file=sys.stderr)
-    if len(warnings) > MAX_REMARKS:
-        print(f"{file}: {len(warnings) - MAX_REMARKS} more: run `jaxfinger check`", file=sys.stderr)
+    if len(warnings) > MAX_WARNINGS:
+        print(f"{file}: {len(warnings) - MAX_WARNINGS} more: run `jaxfinger check`", file=sys.stderr)
     sys.stderr.flush()
 
 
@@ -139,7 +139,7 @@ def read(path: Path) -> Session:
     report = Report()
     session = read_session(path, report=report)
     check_samples(session, report)
-    remark(report, path)
+    print_warnings(report, path)
     return session
 
 

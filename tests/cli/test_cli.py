@@ -91,8 +91,12 @@ def test_check_names_what_is_wrong(folder, tmp_path, capsys):
     bad.write_bytes((folder / "emps.h5").read_bytes())
     with h5py.File(bad, "r+") as file:
         del next(iter(file["trials"].values()))["q"]
+        file.attrs["created"] = "Monday"
     assert run("check", bad) == 2
-    assert "q" in capsys.readouterr().out
+    *found, count = capsys.readouterr().out.splitlines()
+    assert any("/q: is missing" in line for line in found)
+    assert count == f"{bad}: 1 error, 1 warning"
+    assert sorted(line.split(":")[0] for line in found) == ["error", "warning"]
 
 
 def test_the_published_axis_comes_back(folder, capsys):
