@@ -80,7 +80,8 @@ def _joints(finger: FingerDescription, report: Report) -> None:
     angles = np.abs(finger.limits[~np.array(finger.prismatic)])
     if angles.size and angles.max() > 2 * np.pi + 0.1:
         report.error(
-            "/finger/joints/limits", f"reaches {angles.max():.4g} rad, more than a turn; convert degrees to rad"
+            "/finger/joints/limits",
+            f"reaches {angles.max():.4g} rad, more than a turn; convert degrees to rad, or write `limits_deg`",
         )
 
 

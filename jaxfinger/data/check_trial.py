@@ -10,6 +10,7 @@ from jaxfinger.data.parse import listed
 from jaxfinger.data.schema import CHANNELS, DRIVES, MEASURED, MEASURES, NEEDS_JOINT, NEEDS_TENDON
 from jaxfinger.data.session import FingerDescription, Trial
 from jaxfinger.data.sizes import Sizes
+from jaxfinger.data.units import conversion
 from jaxfinger.errors import counted
 
 STILL_ANGLE = 0.01  # rad: five times the noise of a 14-bit encoder
@@ -108,7 +109,7 @@ def _time(trial: Trial, report: Report) -> None:
     if abs(time[0]) > max(10.0 * usual, 0.01):
         report.warning(place, f"starts at {time[0]:.6g} s; count from 0 in each trial")
     if usual > 0.2:
-        report.warning(place, f"has a sample every {usual:.3g} s; convert ms to s if that is what it is")
+        report.warning(place, f"has a sample every {usual:.3g} s; {conversion('ms')} if that is what it is")
     gaps = steps > max(20.0 * usual, 0.02)
     if gaps.any():
         lost = f"{counted(int(gaps.sum()), 'gap')}, the longest {steps.max():.3g} s"
@@ -290,7 +291,7 @@ def _magnitudes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: R
         lower, upper = finger.limits[k]
         where = f"column {name} runs from {low:.3g} to {high:.3g} rad"
         if max(-low, high) > 2.0 * np.pi:
-            report.error(_place(trial, "q"), f"{where}, more than a turn; convert degrees to rad")
+            report.error(_place(trial, "q"), f"{where}, more than a turn; {conversion('deg')}")
         elif low < lower - MAX_OVERTRAVEL or high > upper + MAX_OVERTRAVEL:
             message = f"{where}, far outside its limits {lower:.3g} to {upper:.3g}; correct one or the other"
             report.warning(_place(trial, "q"), message)
@@ -307,7 +308,7 @@ def _magnitudes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: R
         return
     small = float(finger.mass.sum()) < 5.0
     # Fingers of less than 5 kg neither pull in half a metre of tendon nor have 5 N m at a joint, except in wrong units.
-    for name, most, mend in (("tendon_excursion", 0.5, "mm to m"), ("joint_torque", 5.0, "N mm to N m")):
+    for name, most, unit in (("tendon_excursion", 0.5, "mm"), ("joint_torque", 5.0, "N mm")):
         values = getattr(trial, name)
         if values is None or not small:
             continue
@@ -316,7 +317,7 @@ def _magnitudes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: R
                 size = np.percentile(np.abs(x), 90.0)
                 report.error(
                     _place(trial, name),
-                    f"column {column} is of size {size:.3g}, too large for a finger; convert {mend}",
+                    f"column {column} is of size {size:.3g}, too large for a finger; {conversion(unit)}",
                 )
 
 
@@ -336,7 +337,7 @@ def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repo
         elif low < -max(MAX_TARE_ERROR * sizes.tension, sizes.slack):
             report.warning(place, f"column {name} falls to {low:.3g} N, below zero by more than noise; check the tare")
         if np.percentile(x, 95.0) > 2000.0:
-            report.warning(place, f"column {name} exceeds 2000 N; check that it is in N and not in mN")
+            report.warning(place, f"column {name} exceeds 2000 N; {conversion('mN')} if that is what it is")
 
 
 def _holds(trial: Trial, report: Report) -> None:

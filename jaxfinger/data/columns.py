@@ -334,7 +334,9 @@ class ColumnReader:
             )
         if step > _MAX_INTERVAL:
             self.report.warning(
-                where.key, f"the clock {name} ticks every {step:.3g} s; convert ms to s if that is what it is"
+                where.key,
+                f"the clock {name} ticks every {step:.3g} s; write time = {{ from = {name.strip('`')!r}, "
+                "units = 'ms' }} if that is what it is",
             )
         gaps = steps > max(20.0 * step, 0.1)  # Jitter is shorter than 20 intervals, commanded motion slower than 0.1 s.
         if gaps.any():

@@ -44,6 +44,16 @@ _SPELT = {"°": "deg", "degrees": "deg", "µm": "um", "µs": "us", "rev": "turn"
 _SPELT |= {"°c": "degC", "degc": "degC", "celsius": "degC"}
 
 
+def conversion(unit: str) -> str:
+    """What to do about numbers that are in `unit` and are read as SI: «convert mm to m (`units = "mm"` in a mapping)».
+
+    A variable that is named by a string alone needs a table for its units; of these only times are common.
+    """
+    spelt = f'units = "{unit}"'
+    si = TO_SI[unit].si
+    return f"convert {unit} to {si} (`{f'time = {{ from = …, {spelt} }}' if si == 's' else spelt}` in a mapping)"
+
+
 def unit_name(stated: str) -> str:
     """Name in `TO_SI` of a unit as a file spells it; empty where it is not listed there."""
     plain = stated.strip().replace("·", " ").replace("*", " ").replace("µ", "u")

@@ -122,7 +122,7 @@ ERRORS = {
     "q with a hole": (values(f"{ID2}/q", at((slice(100, 110), 0), np.nan)), f"/{ID2}/q", "column MCP is NaN in 10"),
     "q infinite": (values(f"{ID2}/q", at((3, 1), np.inf)), f"/{ID2}/q", "infinite"),
     "q words": (values(f"{ID2}/q", lambda q: np.full(q.shape, b"x")), f"/{ID2}/q", "numbers"),
-    "q degrees": (values(f"{ID2}/q", np.rad2deg), f"/{ID2}/q", "degrees"),
+    "q degrees": (values(f"{ID2}/q", np.rad2deg), f"/{ID2}/q", "convert deg to rad"),
     "joint still": (values(f"{ID2}/q", at((slice(None), 0), 0.3)), f"/{ID2}/q", "MCP never moves"),
     "all joints still": (values(f"{VD3}/q", lambda q: 0 * q), f"/{VD3}/q", "no joint moves"),
     "excursion in mm": (values(f"{ID2}/tendon_excursion", lambda x: 1e3 * x), f"/{ID2}/tendon_excursion", "mm to m"),

@@ -1,5 +1,7 @@
 """Recordings of other tools are imported with their numbers intact, and mistakes in a mapping are named."""
 
+import re
+from contextlib import suppress
 from pathlib import Path
 
 import h5py
@@ -8,6 +10,7 @@ import pytest
 import scipy.io
 
 from jaxfinger.data import check_file, read_session, smooth
+from jaxfinger.data.findings import Report
 from jaxfinger.data.importers import import_file
 from jaxfinger.data.matlab import load_mat
 from jaxfinger.errors import UserError
@@ -138,7 +141,7 @@ def test_sampling_rate_span_and_own_clock(mapping, tmp_path):
         ),
         ('crosses = ["MCP"]', 'crosses = ["DIP"]', r"tendons\[0\]\.crosses\[0\]: is 'DIP'; choose one of MCP"),
         ("mass = 0.02", "", r"line 6: finger\.joints\[0\]\.mass: is missing"),
-        ('units = "deg"', 'units = "rad"', r"line \d+: trials\.01-ID2\.channels\.q: .*convert degrees to rad"),
+        ('units = "deg"', 'units = "rad"', r"line \d+: trials\.01-ID2\.channels\.q: .*convert deg to rad"),
         ('joint = "MCP"', 'joint = "MCP"\ncomplete = "false"', "complete: must be true or false, not 'false'"),
         ('joint = "MCP"', 'joint = "MCP"\nmotion = 3', "motion: must be a string in quotes, not 3"),
         ('joint = "MCP"', 'joint = "MCP"\nsession_start = "12"', "session_start: must be a number, not '12'"),
@@ -156,6 +159,30 @@ def test_a_mistake_in_the_mapping_is_named(mapping, tmp_path, old, new, words):
         import_file([tmp_path / "log.mat"], mapping, tmp_path / "out.h5")
     assert str(refused.value).startswith(str(mapping))
     assert not (tmp_path / "out.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("channel", "factor", "mapped", "said"),
+    [
+        ("t", 1e3, 'time = "t"', "time = { from = …, units = "),
+        ("enc", 1.0, ', units = "deg" }', "`units = "),
+        ("pull", 1.0, ', units = "mm" }', "`units = "),
+        ("volts", 2e3, 'offset = -0.5, units = "N" }', "`units = "),
+    ],
+)
+def test_what_is_said_of_wrong_units_mends_the_mapping(mapping, tmp_path, channel, factor, mapped, said):
+    scipy.io.savemat(tmp_path / "log.mat", RECORDED | {channel: factor * RECORDED[channel]})
+    left_out = mapped if channel == "t" else mapped.split("units")[0].rstrip(", ") + " }"
+    mapping.write_text(MAPPING.replace(mapped, left_out))
+    report = Report()
+    with suppress(UserError):  # An error is in the report, too.
+        import_file([tmp_path / "log.mat"], mapping, tmp_path / "out.h5", report=report)
+    (told,) = {m.group(1) for f in report if (m := re.search(rf'{said}"(.*?)"', f.message))}
+    mended = f'time = {{ from = "t", units = "{told}" }}' if channel == "t" else f'{left_out[:-2]}, units = "{told}" }}'
+    mapping.write_text(MAPPING.replace(mapped, mended))
+    report = Report()
+    import_file([tmp_path / "log.mat"], mapping, tmp_path / "out.h5", overwrite=True, report=report)
+    assert [f for f in report if f.severity != "note"] == []
 
 
 def test_recordings_that_are_not_there_are_said_before_any_is_read(mapping, tmp_path):
