@@ -35,6 +35,7 @@ from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.safety import Supervisor
 from jaxfinger.rig.session import log_path
+from jaxfinger.rig.signals import Interrupts
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.controller import Controller
 from jaxfinger.rig.simulated.examples import rig_toml
@@ -79,7 +80,7 @@ def stream(minutes: float, busy: bool) -> dict:
                 Path(folder) / "s.wal", {**header(description, "", rig.filters(), rig.fingerprint()), "created": ""}
             )
             reader = Reader(rig, recorder, Supervisor(description))
-            watch = Watch(rig, reader, Nobody())
+            watch = Watch(rig, reader, Nobody(), Interrupts())
             start = {"name": "t", "tare": {}, "loaded": [], "motor": None, "contact": False}
             spinner = threading.Thread(target=spin, daemon=True)
             if busy:

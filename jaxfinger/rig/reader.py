@@ -122,7 +122,7 @@ class Reader:
                 if found:
                     self.stop(found[0])
                 elif self.recorder.failure is not None:
-                    self.stop(Violation(Trip.RECORDER, "recorder", self.latest_seq, float("nan")))
+                    self.stop(Violation.of_host(Trip.RECORDER, self.latest_seq, self.recorder.failure))
             elif found:
                 self.unarmed_violation = found[0]
             return True
@@ -170,6 +170,11 @@ class Reader:
             clocks = {"clocks": self._clocks} if self._clocks and not self.rig.synchronous else {}
             self.recorder.put(wal.END, {"seq": self.latest_seq + 1, **clocks, **end})
             self._recording = False
+
+    @property
+    def reads(self) -> bool:
+        """Whether samples can still come: it was started, and neither an error nor `close` has ended it."""
+        return self._running and self.error is None
 
     @property
     def recording(self) -> bool:

@@ -26,9 +26,10 @@ from jaxfinger.rig.plan import PlannedTrial
 from jaxfinger.rig.protocols import Covered, Dwell, Mark, Protocol, Reached, Settled, Start, Tare
 from jaxfinger.rig.reader import Reader, tripped
 from jaxfinger.rig.safety import Violation
+from jaxfinger.rig.signals import Interrupts
 from jaxfinger.rig.trips import FULL_COUNT
 from jaxfinger.rig.waits import AtPose, Elapsed, Passes, Steady, reached
-from jaxfinger.rig.watch import Watch
+from jaxfinger.rig.watch import INTERRUPTED, Watch
 
 # s of samples that are still recorded after a stop. The controller needs 0.7 s of them to release all tension.
 AFTER_TRIP_S = 1.0
@@ -80,9 +81,16 @@ class Runner:
     which the first trial began.
     """
 
-    def __init__(self, rig: Rig, reader: Reader, operator: Operator, observe: Callable[[View], None] | None = None):
+    def __init__(
+        self,
+        rig: Rig,
+        reader: Reader,
+        operator: Operator,
+        interrupts: Interrupts,
+        observe: Callable[[View], None] | None = None,
+    ):
         self.rig, self.reader, self.operator = rig, reader, operator
-        self.watch = Watch(rig, reader, operator)
+        self.watch = Watch(rig, reader, operator, interrupts)
         self.observe = observe or (lambda view: None)
         self.tare: dict[str, float] = {}
         self.t0: int | None = None
@@ -118,9 +126,8 @@ class Runner:
             return self.abort_interrupted()
 
     def abort_interrupted(self) -> str:
-        """Stop the rig after Ctrl-C. Return why the run ended."""
-        self.reader.stop(Violation(Trip.OPERATOR, "interrupt", self.reader.latest_seq, float("nan")))
-        return self.abort(TrialEnded("the run was interrupted", Trip.OPERATOR))
+        """Stop the rig after a KeyboardInterrupt. Return why the run ended."""
+        return self.abort(TrialEnded(INTERRUPTED, Trip.OPERATOR))
 
     def abort(self, error: UserError) -> str:
         """Stop the rig unless it is stopped, record AFTER_TRIP_S more, end the trial. Return why it ended.
@@ -132,7 +139,7 @@ class Runner:
         tensions = rig.columns("tension", rig.finger.tendon_names)
         trip, seq = (error.trip, error.seq) if isinstance(error, TrialEnded) else (Trip.HOST, None)
         if not (tripped(reader.latest) or isinstance(error, ControllerStopped)):
-            reader.stop(Violation(trip, "host", reader.latest_seq, float("nan")))
+            reader.stop(Violation.of_host(trip, reader.latest_seq, str(error).rstrip(".")))
 
         def released() -> bool:
             block = reader.latest
@@ -174,7 +181,7 @@ class Runner:
         def quiet() -> bool:
             return self.reader.quiet(round(QUIET_S * rig.description.rate_hz))
 
-        self._let_pass(QUIET_TIMEOUT_S, quiet)
+        self._let_pass(QUIET_TIMEOUT_S, lambda: quiet() or self.reader.violation is not None)
         self._check(None)
         if not quiet():
             bad = self.reader.unarmed_violation
@@ -188,6 +195,7 @@ class Runner:
         try:
             self.rig.release()
             self._let_pass(AFTER_TRIP_S, lambda: self.rig.status().state in (State.IDLE, State.TRIPPED))
+            self._check(None)
             if self.rig.status().state is not State.IDLE:
                 raise TrialEnded("the controller did not release the finger after the last trial", Trip.HOST)
         except UserError as error:
@@ -199,7 +207,7 @@ class Runner:
         reader, rate = self.reader, self.rig.description.rate_hz
         latest = time.monotonic() + self._host_limit(seconds)
         start: int | None = None
-        while reader.error is None and time.monotonic() < latest and not done():
+        while reader.reads and time.monotonic() < latest and not done():
             self.rig.report_alive()
             reader.next()
             start = reader.latest_seq if start is None and reader.latest_seq >= 0 else start
@@ -350,9 +358,7 @@ class Runner:
         if self.rig.synchronous:
             self.watch.check()
         if reader.violation is not None:
-            trip, since = reader.violation.trip, reader.violation.since
-            cause = reader.recorder.failure if trip is Trip.RECORDER else None
-            raise TrialEnded(cause or reader.violation.sentence, trip, since)
+            raise TrialEnded(reader.violation.sentence, reader.violation.trip, reader.violation.since)
         if tripped(block):
             self._raise_stopped(self.rig.status())
         if reader.error is not None:

@@ -28,6 +28,7 @@ class Violation:
     """One broken limit: its trip code, the channel that broke it, the sample at which it tripped, and the value (SI).
 
     `since` is the number of the first bad sample: data from there on do not belong to the trial. Its default is `seq`.
+    `cause` is a sentence without a full stop, where no channel broke a limit.
     """
 
     trip: Trip
@@ -35,6 +36,12 @@ class Violation:
     seq: int
     value: float
     since: int = -1
+    cause: str = ""
+
+    @classmethod
+    def of_host(cls, trip: Trip, seq: int, cause: str) -> Violation:
+        """Violation that the host states in a sentence of its own, found at sample `seq`."""
+        return cls(trip, "host", seq, float("nan"), cause=cause)
 
     def __post_init__(self):
         if self.since < 0:
@@ -43,7 +50,7 @@ class Violation:
     @property
     def sentence(self) -> str:
         """Sentence for people, without a full stop."""
-        return f"{self.trip.sentence} ({self.channel} = {self.value:.4g} at sample {self.seq})"
+        return self.cause or f"{self.trip.sentence} ({self.channel} = {self.value:.4g} at sample {self.seq})"
 
 
 def admit(command: Command, rig: RigDescription) -> None:

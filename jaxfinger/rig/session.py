@@ -22,6 +22,7 @@ from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.recover import read_log
 from jaxfinger.rig.runner import Runner, View
 from jaxfinger.rig.safety import Supervisor
+from jaxfinger.rig.signals import Interrupts
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def run(
     output, operator = Path(output), operator or Nobody()
     path = log_path(output)
     log = _log_to_resume(plan, path, output, resume)
-    with rig:
+    with rig, Interrupts() as interrupts:
         filters = rig.filters()
         refuse_filtered(plan, rig.description, filters)
         head = convert.header(rig.description, plan.text, filters, rig.fingerprint())
@@ -89,7 +90,7 @@ def run(
         try:
             if log is not None:
                 _close_killed_trial(log, rig, recorder)
-            cause = _trials(plan, rig, recorder, operator, observe, log)
+            cause = _trials(plan, rig, recorder, operator, interrupts, observe, log)
         except UserError:
             recorder.close()
             if log is None:  # Nothing was armed or recorded, so there is nothing to resume.
@@ -190,6 +191,7 @@ def _trials(
     rig: Rig,
     recorder: Recorder,
     operator: Operator,
+    interrupts: Interrupts,
     observe: Callable[[View], None] | None,
     log: convert.Log | None,
 ) -> str:
@@ -205,7 +207,7 @@ def _trials(
     begun = max(ends, default=0.0)
     left = [t for t in plan.trials if t.name not in done]
     reader = Reader(rig, recorder, Supervisor(rig.description))
-    runner = Runner(rig, reader, operator, observe)
+    runner = Runner(rig, reader, operator, interrupts, observe)
     try:
         runner.watch.start()
         reader.start(lambda: runner.watch.join("reader"))

@@ -2,8 +2,9 @@
 
 Who watches whom, in a recording in real time:
 
-- The watch is one thread. Every PERIOD_S it checks the stop key, and from just before the rig is armed also the reader
-  and the runner (a sign of life within `thread_s`) and the disk (no frame waits for `disk_s`).
+- The watch is one thread. Every PERIOD_S it checks the stop key and the signals that end a program (Ctrl-C, SIGTERM,
+  SIGHUP), and from just before the rig is armed also the reader and the runner (a sign of life within `thread_s`) and
+  the disk (no frame waits for `disk_s`).
 - If a check fails, the watch stops the rig with the cause and sends no more heartbeats.
 - If the watch itself hangs, or the whole process, the heartbeats end too.
 - The controller releases the finger by itself when no heartbeat has come for `heartbeat_s` (0.25 s).
@@ -23,6 +24,7 @@ from jaxfinger.rig.contract import Trip
 from jaxfinger.rig.operator import Operator
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.safety import Violation
+from jaxfinger.rig.signals import Interrupts
 
 PERIOD_S = 0.02  # s between two checks: the most that it adds to the time from stop key to STOP
 # s between two heartbeats: a fifth of the 0.25 s after which the controller releases the finger, so that one that comes
@@ -32,6 +34,7 @@ BEAT_S = 0.05
 # other threads may have been late for the same reason.
 MAX_COUNTED_S = 0.1
 JOIN_S = 1.0  # s that closing waits for a watch that hangs; the thread is then left behind
+INTERRUPTED = "the run was interrupted"
 
 
 class Watch:
@@ -40,8 +43,8 @@ class Watch:
     `guards` is true from just before the drives are switched on: from then on silence stops the rig.
     """
 
-    def __init__(self, rig: Rig, reader: Reader, operator: Operator):
-        self.rig, self.reader, self.operator = rig, reader, operator
+    def __init__(self, rig: Rig, reader: Reader, operator: Operator, interrupts: Interrupts):
+        self.rig, self.reader, self.operator, self.interrupts = rig, reader, operator, interrupts
         self._names: dict[int, str] = {}
         self._signs: dict[int, int] = {}  # signs of life so far, by thread
         self._seen: dict[int, int] = {}  # signs at the last check
@@ -89,7 +92,7 @@ class Watch:
             self.check()
 
     def check(self) -> None:
-        """Check stop key, threads and disk. Stop the rig where one fails, else send a heartbeat where it is due."""
+        """Check stop key, signals, threads, disk: stop the rig where one fails, else send a heartbeat if it is due."""
         now = time.monotonic()
         passed, self._checked = min(now - self._checked, MAX_COUNTED_S), now
         if self.reader.violation is not None or self.reader.error is not None:
@@ -102,9 +105,11 @@ class Watch:
                 self.rig.beat()
 
     def _key(self) -> Violation | None:
-        """OPERATOR once the stop key was pressed."""
+        """OPERATOR once the stop key was pressed or a signal asked the run to end."""
+        if self.interrupts.requested:
+            return Violation.of_host(Trip.OPERATOR, self.reader.latest_seq, INTERRUPTED)
         if self.operator.stop_requested():
-            return Violation(Trip.OPERATOR, "stop key", self.reader.latest_seq, float("nan"))
+            return Violation.of_host(Trip.OPERATOR, self.reader.latest_seq, Trip.OPERATOR.sentence)
         return None
 
     def _silence(self, passed: float) -> Violation | None:

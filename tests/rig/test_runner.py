@@ -2,6 +2,7 @@
 
 import json
 import resource
+import signal
 import time
 from dataclasses import replace
 
@@ -14,8 +15,13 @@ from jaxfinger.errors import UserError
 from jaxfinger.rig import parse_plan, parse_rig, recorder, recover, runner, wal
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import State, Trip
-from jaxfinger.rig.runner import TENSION_NOT_SEEN_TO_FALL
+from jaxfinger.rig.operator import Nobody
+from jaxfinger.rig.reader import Reader
+from jaxfinger.rig.recorder import Recorder
+from jaxfinger.rig.runner import TENSION_NOT_SEEN_TO_FALL, Runner
+from jaxfinger.rig.safety import Supervisor
 from jaxfinger.rig.session import log_path, run
+from jaxfinger.rig.signals import ENDING, Interrupts
 from jaxfinger.rig.simulated.controller import Controller
 from jaxfinger.rig.simulated.examples import rig_toml
 
@@ -228,15 +234,44 @@ def test_the_operators_stop_key(rig, record):
     assert machine.controller.trip is Trip.OPERATOR
 
 
-def test_ctrl_c_stops_the_rig_and_keeps_the_trial(rig, record):
+@pytest.mark.parametrize("number", [*ENDING, None], ids=lambda number: number.name if number else "KeyboardInterrupt")
+def test_a_signal_stops_the_rig_and_keeps_the_trial(rig, record, number):
+    """KeyboardInterrupt is what a second signal raises."""
+
     def interrupt(m):
-        raise KeyboardInterrupt
+        if number is None:
+            raise KeyboardInterrupt
+        signal.raise_signal(number)
 
     machine = SimulatedRig(rig)
+    before = [signal.getsignal(n) for n in ENDING]
     outcome = record(machine, interrupt)
-    assert "interrupted" in outcome.cause
+    assert outcome.cause == "02-ID.4-T3-MCP: the run was interrupted"
+    assert machine.controller.trip is Trip.OPERATOR
     assert machine.controller.state is State.TRIPPED
     assert not read_session(outcome.session)["02-ID.4-T3-MCP"].complete
+    assert [signal.getsignal(n) for n in ENDING] == before
+
+
+def test_the_first_signal_is_a_wish_and_the_second_an_exception():
+    with Interrupts() as interrupts:
+        signal.raise_signal(signal.SIGINT)
+        assert interrupts.requested
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+
+
+def test_a_run_that_nothing_reads_ends_at_once(rig, tmp_path):
+    """An interrupt may strike before the reader has started: no sample can come, so none is waited for."""
+    machine = SimulatedRig(rig)
+    machine.synchronous = False
+    with machine:
+        recorder = Recorder(tmp_path / "session.h5.wal", {})
+        runner = Runner(machine, Reader(machine, recorder, Supervisor(rig)), Nobody(), Interrupts())
+        begun = time.monotonic()
+        assert runner.abort_interrupted() == "the run was interrupted"
+        assert time.monotonic() - begun < 10.0  # _host_limit allows 70 s for each of two waits
+        recorder.close()
 
 
 def test_a_full_disk_ends_the_trial_and_keeps_what_was_written(rig, record, tmp_path):

@@ -1,0 +1,37 @@
+"""Signals that end a program, taken as a wish to stop the rig."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType
+from typing import Any
+
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, kill, a closed terminal
+
+
+class Interrupts:
+    """While it is entered, the first of the ENDING signals sets `requested`, and a second raises KeyboardInterrupt.
+
+    An exception that strikes at any line of the main thread can leave a lock taken for ever (that of the reader's
+    queue, or that of the connection over which STOP goes) and a thread not started. Only the main thread gets signals;
+    in another one nothing is taken.
+    """
+
+    def __init__(self):
+        self.requested = False
+        self._handlers: dict[int, Any] = {}  # handlers from before, by signal
+
+    def __enter__(self) -> Interrupts:
+        if threading.current_thread() is threading.main_thread():
+            self._handlers = {number: signal.signal(number, self._take) for number in ENDING}
+        return self
+
+    def __exit__(self, *_) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+
+    def _take(self, number: int, frame: FrameType | None) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
