@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from jaxfinger.data.expressions import ExpressionError, evaluate
 from jaxfinger.data.findings import Report
@@ -18,6 +17,9 @@ from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.toml import Place
 from jaxfinger.data.units import TO_SI, unit_name
 from jaxfinger.errors import UserError, counted
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
 
 # Ratio of the durations and intervals of two clocks, from which one is taken to be in other units: about the geometric
 # mean of one, for clocks in the same units, and a thousand, for mistaken ones. Slow sensors have a smaller one.

@@ -19,11 +19,14 @@ Within about `1/cutoff_hz` of an end the results depend on the mirror image.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from jaxfinger.errors import UserError
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
 
 # Largest second difference as a multiple of the mean one. That of Gaussian noise stays below it, so a column below it
 # has no spikes to look for.

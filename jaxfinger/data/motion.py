@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
 from jaxfinger.data.filtering import smooth
 from jaxfinger.data.session import Trial
 from jaxfinger.data.sizes import Sizes
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
 
 CUTOFF_HZ = 10.0  # Faster than any commanded motion of the protocol, slower than most of the sensors' noise.
 HOLD_CUTOFF_HZ = 5.0  # Stillness needs no fast filter, and at half the cut-off the speed has a third of the noise.

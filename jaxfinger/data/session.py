@@ -6,11 +6,14 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
 from jaxfinger.table import Table
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
 
 # Share of the longest travel among the joints: a joint that travels less is held. A fixture yields a little, and a
 # joint that is moved goes through much of its range.

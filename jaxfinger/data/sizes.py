@@ -3,14 +3,19 @@
 Thresholds are relative to them, so that no constant depends on one machine: a finger pulls with 10 N, a crane with kN.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from statistics import median_low
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxfinger.data.filtering import without_spikes
 from jaxfinger.data.session import Session, Trial
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Of the highest tension. A protocol holds taut tendons at a fifth of it or more, and a tare is good to a hundredth.
 SLACK_SHARE = 0.02

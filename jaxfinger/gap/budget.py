@@ -75,8 +75,10 @@ class Budget:
         """
         rng = np.random.default_rng(0)
         unit, strata = self._drawn()
-        channel = [self.channels[c.column] if c.column in self.open else None for c in self.cells]
-        inside = [np.array([x == c for x in channel], float) for c in sorted(set(channel) - {None})]
+        inside = [
+            np.array([c.column in self.open and self.channels[c.column] == channel for c in self.cells], float)
+            for channel in sorted({self.channels[c] for c in self.open})
+        ]
 
         def means(weights: list[Float[np.ndarray, " cells"]]) -> np.ndarray:
             if not weights:

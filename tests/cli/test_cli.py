@@ -57,7 +57,7 @@ def test_what_needs_no_computing_needs_no_jax(folder, command, file):
     code = (
         "import sys; from jaxfinger.cli import main\n"
         f"main([{command!r}, {str(folder / file)!r}])\n"
-        "print('loaded', [m for m in ('jax', 'scipy') if m in sys.modules])"
+        "print('loaded', [m for m in ('jax', 'scipy', 'jaxtyping') if m in sys.modules])"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert "loaded []" in out
