@@ -15,6 +15,7 @@ from jaxfinger.rig.backend import JointMove, Setup, TensionRamp
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.protocols import PROTOCOLS, Common, Covered, Dwell, Protocol, Settled, Start, Tare
 from jaxfinger.rig.safety import admit
+from jaxfinger.rig.trips import time_to_cover
 
 # Steps of one trial (commands, marks and waits). The paper's longest trial has a hundred. More than this is a mistake
 # in the plan, and checking it would seem to hang.
@@ -191,7 +192,8 @@ def estimate(trial: PlannedTrial, rig: RigDescription) -> Estimate:
             tension.update(step.targets)
             highest = max(highest, *tension.values())
         elif isinstance(step, JointMove):
-            seconds += abs(step.target - angle[step.joint]) / step.speed
+            half = abs(step.target - angle[step.joint]) / 2.0  # The motor slows down as it speeds up.
+            seconds += 2.0 * time_to_cover(half, step.speed, step.acceleration)
             angle[step.joint] = step.target
         elif isinstance(step, Dwell | Settled | Tare):
             seconds += step.seconds

@@ -157,7 +157,7 @@ class UnfollowedMove:
 
     def __init__(self, column: int, start: float, speed: float, acceleration: float, rate_hz: float):
         self.column = column
-        self._start, self._need = start, _time_to_cover(self.DISTANCE, speed, acceleration) * rate_hz
+        self._start, self._need = start, time_to_cover(self.DISTANCE, speed, acceleration) * rate_hz
         self._still = 0
 
     def __call__(self, angle: Float[np.ndarray, " N"], moving: Bool[np.ndarray, " N"]) -> int | None:
@@ -167,7 +167,7 @@ class UnfollowedMove:
         return int(np.argmax(still > self._need)) if self._still > self._need else None
 
 
-def _time_to_cover(distance: float, speed: float, acceleration: float) -> float:
+def time_to_cover(distance: float, speed: float, acceleration: float) -> float:
     """Time (s) in which a motor covers `distance` (rad) from rest, with constant acceleration up to `speed`."""
     while_accelerating = speed**2 / (2.0 * acceleration)
     if distance <= while_accelerating:

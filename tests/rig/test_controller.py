@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from jaxfinger.rig import contract
 from jaxfinger.rig.contract import Kind, Refusal, State, Trip
 from jaxfinger.rig.simulated.controller import Controller, HardLimits
+from jaxfinger.rig.trips import time_to_cover
 
 
 class Bench:
@@ -181,3 +182,5 @@ def test_the_motor_reaches_its_goal_without_passing_it(goal, speed, acceleration
     assert np.all(steps >= -1e-12)
     assert path[-1] == pytest.approx(goal, abs=1e-9)
     assert np.abs(np.diff(path)).max() <= speed * 1e-3 + 1e-6
+    expected = 2.0 * time_to_cover(abs(goal - start) / 2.0, speed, acceleration)
+    assert 1e-3 * len(path) == pytest.approx(expected, rel=0.01, abs=0.01)

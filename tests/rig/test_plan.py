@@ -64,6 +64,16 @@ def test_the_shipped_plan_holds_every_experiment(rig):
     assert all(estimate(t, rig).seconds > 1.0 for t in plan.trials)
 
 
+def test_an_estimate_counts_the_time_to_speed_up_and_to_slow_down(rig):
+    """40° at 50 °/s²: half of it takes √(40/50) s, and the motor never reaches 100 °/s."""
+    text = 'experiment = "ID.3-dynamic"\njoint = "PIP"\nrange_deg = [0.0, 40.0]\nspeeds_deg_s = [100.0]\n'
+    one, three = (
+        estimate(parse_plan(f"{HEAD}{text}acceleration_deg_s2 = 50.0\npasses = {n}", rig).trials[0], rig).seconds
+        for n in (1, 3)
+    )
+    assert three - one == pytest.approx(4 * 2 * (40 / 50) ** 0.5)
+
+
 def test_static_torque_holds_up_and_back(rig):
     done = steps('experiment = "ID.3-static"\njoint = "PIP"\nrange_deg = [0.0, 40.0]\nstep_deg = 10.0', rig)
     angle, held = None, []
