@@ -86,17 +86,16 @@ def _smoothed(time: np.ndarray, x: np.ndarray, cutoff_hz: float, highest: int) -
         raise UserError(
             f"a cut-off of {cutoff_hz:g} Hz must lie between 0 and half the sampling rate, {0.5 * rate:.4g} Hz"
         )
-    columns = x.reshape(len(time), -1)
-    out = np.full((highest + 1, *columns.shape), np.nan)
-    usable = [k for k in range(columns.shape[1]) if np.isfinite(columns[:, k]).sum() >= 3]
-    if usable:
-        even = np.stack([_on_grid(time, columns[:, k], grid) for k in usable])
+    columns = x.reshape(len(time), -1).T
+    out, finite = np.full((highest + 1, *columns.shape), np.nan), np.isfinite(columns)
+    usable = np.flatnonzero(finite.sum(axis=1) >= 3)
+    if usable.size:
+        even = np.stack([_on_grid(time, columns[k], grid) for k in usable])
         coefficients = _spline(even, rate, cutoff_hz)
         at = None if grid is time else (time - grid[0]) * rate
-        found = rate ** np.arange(highest + 1)[:, None, None] * _derivatives(coefficients, highest, at)
-        out[:, :, usable] = np.moveaxis(found, 1, 2)
-        out[:, ~np.isfinite(columns)] = np.nan
-    return out.reshape(highest + 1, *x.shape)
+        out[:, usable] = rate ** np.arange(highest + 1)[:, None, None] * _derivatives(coefficients, highest, at)
+        out[:, ~finite] = np.nan
+    return np.moveaxis(out, 1, 2).reshape(highest + 1, *x.shape)
 
 
 def _spline(x: Float[np.ndarray, "k N"], rate: float, cutoff_hz: float) -> Float[np.ndarray, "k N+5"]:
@@ -195,7 +194,7 @@ def outlier_mask(x: Float[np.ndarray, "N *k"], threshold: float = 8.0, longest: 
     """
     x = np.asarray(x, np.float64)
     columns = x.reshape(len(x), -1)
-    mask = np.zeros(columns.shape, bool)
+    mask = np.zeros_like(columns, bool)
     for k, column in enumerate(columns.T):
         good = np.isfinite(column)
         values = column[good]
