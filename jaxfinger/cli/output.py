@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import sys
 import time
@@ -18,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jaxfinger.errors import UserError
+from jaxfinger.jsonable import jsonable
 from jaxfinger.progress import Step
 
 if TYPE_CHECKING:
@@ -164,21 +164,7 @@ def console() -> Console:
 
 def print_json(content: Any) -> None:
     """Print JSON for programs, with null for NaN and infinities."""
-    print(json.dumps(without_infinities(content), indent=1, ensure_ascii=False))
-
-
-def without_infinities(value: Any) -> Any:
-    """Replace NaN and infinities, which JSON does not have, by None, and paths by text."""
-    match value:
-        case dict():
-            return {str(k): without_infinities(v) for k, v in value.items()}
-        case list() | tuple():
-            return [without_infinities(v) for v in value]
-        case float() if not math.isfinite(value):
-            return None
-        case Path():
-            return str(value)
-    return value
+    print(json.dumps(jsonable(content), indent=1, ensure_ascii=False))
 
 
 def refuse_output(path: Path, overwrite: bool) -> None:

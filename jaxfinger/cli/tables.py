@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jaxfinger.cli.output import console, plain, table, without_infinities
+from jaxfinger.cli.output import console, plain, table
+from jaxfinger.jsonable import jsonable
 from jaxfinger.report.numbers import HALF_95, number, scaled, with_error
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def fit_to_read(fit: Fit) -> dict:
         ],
         "tendon_friction": [[t, *map(float, (c.x[-1], c.y[-1], c.std[-1]))] for t, c in found.tendon_friction.items()],
     }
-    return content_of(fit) | {"seen": without_infinities(seen)}
+    return content_of(fit) | {"seen": jsonable(seen)}
 
 
 def fit_as_dict(content: dict) -> dict:

@@ -19,6 +19,7 @@ from jaxfinger.identify.fit import SCHEMA, Fit, StageReport
 from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.parameters import describe, units_at
 from jaxfinger.identify.recipe import as_dict, structure
+from jaxfinger.jsonable import jsonable
 from jaxfinger.model import Finger, JointTorque, Model, MomentArm, TendonFriction
 
 FINGER: dict[str, tuple] = {
@@ -127,23 +128,11 @@ def content_of(fit: Fit) -> dict[str, Any]:
             for (e, c), n in fit.noise.items()
         ],
     }
-    return _without_infinities(content)
+    return jsonable(content)
 
 
 def _arrays(module) -> dict[str, list]:
     return {k: np.asarray(v).tolist() for k, v in vars(module).items()}
-
-
-def _without_infinities(value: Any) -> Any:
-    """Replace infinities and NaN by None, since JSON has neither."""
-    match value:
-        case dict():
-            return {k: _without_infinities(v) for k, v in value.items()}
-        case list() | tuple():
-            return [_without_infinities(v) for v in value]
-        case float() if not np.isfinite(value):
-            return None
-    return value
 
 
 def _from_dict(content: dict[str, Any], path: str, effects: str | os.PathLike | None) -> Fit:
