@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.data import Session, joints_of, moving_joints
+from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, Experiment, Stack, not_judged, prepare
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible
@@ -169,9 +170,9 @@ def identify(
 ) -> Fit:
     """Run the staged fits on a session. A stage whose trials are missing is reported as skipped.
 
-    `recipe`: by default the paper's. `stages`: names of those to run, by default the recipe's. `start`: a fit with the
-    parameters of earlier stages, whose own recipe decides on terms and options. `progress`: called with a sentence at
-    each step. `stacks`: the session's trials, where `prepare` has read them already.
+    `recipe`: by default that of `start`, else the paper's. `stages`: names of those to run, by default the recipe's.
+    `start`: a fit with the parameters of earlier stages; its recipe is the recipe of its terms. `progress`: called with
+    a sentence at each step. `stacks`: the session's trials, where `prepare` has read them already.
 
     The published mass of the servo axis (Janot, Gautier, Brunot 2019) is 95.11 kg:
 
@@ -180,7 +181,12 @@ def identify(
     >>> mass = fit.table()[0]
     >>> f"{mass['value']:.0f} ± {1.96 * mass['std']:.1f} {mass['units']}"
     '95 ± 0.4 kg'
+
+    Raises:
+        UserError: `recipe` is another than that of `start`.
     """
+    if start is not None and recipe not in (None, start.recipe):
+        raise UserError("a fit to start from brings its own recipe; leave out `recipe` or `start`")
     recipe = recipe or (start.recipe if start else Recipe())
     wanted = stages or recipe.fit.stages
     fit = start or Fit.before(session, recipe, nominal_model(session, recipe))

@@ -5,7 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfinger.errors import UserError
 from jaxfinger.identify import Fit, Recipe, identify
+from jaxfinger.identify.recipe import ModelRecipe
 from jaxfinger.model import TendonFriction
 from jaxfinger.synthetic import ModelPlant, paper_finger, polynomial_finger, recipe_from, simulate, true_model
 
@@ -52,3 +54,10 @@ def test_what_is_lost_is_found(a0, a1):
     assert fit.stages[-1].status == "fitted"
     assert fit.stages[-1].chi2_per_row < 1.5
     np.testing.assert_allclose(lost(fit.model), lost(rubbing(a0, a1)), atol=0.03)  # N
+
+
+def test_a_start_and_another_recipe_are_refused():
+    session = simulate(RECIPE, seed=1)
+    start = Fit.before(session, Recipe(), true_model(polynomial_finger(paper_finger())))
+    with pytest.raises(UserError, match="a fit to start from brings its own recipe; leave out `recipe` or `start`"):
+        identify(session, Recipe(model=ModelRecipe(elastic_degree=3)), start=start)
