@@ -6,10 +6,10 @@ With nominal parameters θ and causes i of amplitudes and shapes p_i, the white 
 
 where Δ_i is the white change of every row by cause i. A fit alternates two steps until the log evidence settles:
 
-1. Gauss–Newton on p at fixed θ (`fit_at_nominal`). Rows are multiplied by the root of the formula's weights and
-   projected off the derivatives by θ (`Projector`), so that θ follows p to first order, as in variable projection
-   (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413). Changes and their derivatives are evaluated at every p.
-2. θ moves by the step that the projection implies, and residual and Jacobian are evaluated exactly there
+1. Gauss–Newton on p (`fit_at_nominal`), in the weights of the formula. θ is refitted with every p to first order
+   (`LinearModel`), as in variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413). Changes and
+   their derivatives are evaluated at every p.
+2. θ moves by the step that this refit implies, and residual and Jacobian are evaluated exactly there
    (`_with_nominal_refitted`).
 
 A column that the causes leave unexplained has low weights (`formula`), so that it hardly biases p and θ.
@@ -28,9 +28,7 @@ from jaxfinger.gap.columns import Columns
 from jaxfinger.gap.costs import CauseKey
 from jaxfinger.gap.formula import LinearFit, LinearModel, Parameters, Weights, unexplained
 from jaxfinger.gap.problem import Problem, moved
-from jaxfinger.gap.projector import Projector
 from jaxfinger.gap.signatures import Signatures, Variant
-from jaxfinger.identify.solve import bounded_least_squares
 
 MAX_ROUNDS = 5  # moves of the nominal model in one fit
 MIN_SCORE_GAIN = 0.5  # nats. A round that gains less ends the fit: sets differ by several nats where it matters.
@@ -130,20 +128,11 @@ class Baseline:
             float(np.sqrt(np.sum(evidence.e + evidence.o))),
         )
 
-    def fit_linear(
-        self,
-        problem: Problem,
-        nominal: ByColumn,
-        r: Float[np.ndarray, " N"],
-        slopes: Float[np.ndarray, "k N"],
-        sizes: Float[np.ndarray, " k"],
-        bounds: Bounds,
-    ) -> LinearFit:
-        """Fit a set that is linearised at `r`, with `slopes` by its coordinates, and take its evidence.
-
-        `sizes` are the amplitudes at `r` in prior standard deviations, `bounds` those of a further step.
-        """
-        model = LinearModel(
+    def linear_model(
+        self, problem: Problem, nominal: ByColumn, r: Float[np.ndarray, " N"], slopes: Float[np.ndarray, "k N"]
+    ) -> LinearModel:
+        """A set linearised where it leaves the white residual `r`, with `slopes` by its coordinates."""
+        return LinearModel(
             self.columns,
             (ByColumn.of(self.columns, r[None]), nominal),
             prior_products(problem, 0),
@@ -151,7 +140,6 @@ class Baseline:
             self.parameters,
             self.null.linear_fit,
         )
-        return model.fit(np.arange(len(slopes)), *bounds, sizes=sizes)
 
 
 def prior_products(problem: Problem, k: int) -> Float[np.ndarray, "d d"]:
@@ -217,56 +205,53 @@ def _with_nominal_refitted(baseline: Baseline, state: SearchState, weights: Weig
 
     The step is cut to a third, and again, where its curvature more than doubles the cost.
     """
-    project = Projector(state.problem, baseline.columns, weights)
-    step = project.nominal_step(state.r)
-    here = state.problem
+    here, none = state.problem, np.empty((0, state.problem.r.size))
+    step, cost = baseline.linear_model(here, state.nominal, state.r, none).base_step(weights)
     for _ in range(MAX_TRIES):
         here = moved(state.problem, step)
         left = here.r - np.sum([Signatures(here).white_changes([e])[0] for e in state.effects], axis=0)
+        nominal = ByColumn.of(baseline.columns, here.J.T)
         # The constant keeps a cost near zero, as of a perfect fit, from refusing every step.
-        if _cost(Projector(here, baseline.columns, weights), left) < 2.0 * _cost(project, state.r) + 100.0:
+        if baseline.linear_model(here, nominal, left, none).base_step(weights)[1] < 2.0 * cost + 100.0:
             return here
         step = step / 3.0
     return here
 
 
-def _cost(project: Projector, r: Float[np.ndarray, " N"]) -> float:
-    """Weighted sum of squares of a residual, the nominal parameters refitted."""
-    x = project.residual(r)
-    return float(x @ x)
-
-
 @dataclass(frozen=True)
 class _Point:
-    """Effects of a set at one nominal model, and what they leave."""
+    """Effects of a set at one nominal model, linearised."""
 
     effects: Sequence[CatalogueEffect]
     changes: Float[np.ndarray, "effects N"]
     slopes: Float[np.ndarray, "k N"]
-    r: Float[np.ndarray, " N"]
     sizes: Float[np.ndarray, " k"]
-    cost: float  # weighted sum of squares and ‖sizes‖²
+    linear: LinearModel
+    cost: float  # weighted sum of squares, the nominal parameters refitted, and ‖sizes‖²
 
 
 def fit_at_nominal(
     baseline: Baseline, problem: Problem, effects: list[CatalogueEffect], weights: Weights
 ) -> SearchState:
-    """Fit amplitudes and shapes from `effects` at the problem's nominal model, whose parameters are projected out."""
-    signatures, project = Signatures(problem), Projector(problem, baseline.columns, weights)
+    """Fit amplitudes and shapes from `effects` around the problem's nominal model, which is refitted to first order."""
+    signatures, nominal = Signatures(problem), ByColumn.of(baseline.columns, problem.J.T)
     coordinates = _coordinates(effects, problem.scales)
     changes, slopes = _evaluate(signatures, effects, coordinates, np.full(len(coordinates), MAX_DIFFERENCE))
-    coordinates, slopes = _in_units_of_the_gap(baseline, problem, coordinates, slopes)
+    factors = _units_of_the_gap(baseline, baseline.linear_model(problem, nominal, problem.r, slopes), coordinates)
+    coordinates = [replace(c, unit=c.unit * f) for c, f in zip(coordinates, factors, strict=True)]
 
     def point(effects: Sequence[CatalogueEffect], changes, slopes) -> _Point:
-        r, sizes = problem.r - changes.sum(axis=0), _sizes(effects, coordinates)
-        return _Point(effects, changes, slopes, r, sizes, _cost(project, r) + float(sizes @ sizes))
+        linear, sizes = (
+            baseline.linear_model(problem, nominal, problem.r - changes.sum(axis=0), slopes),
+            _sizes(effects, coordinates),
+        )
+        return _Point(effects, changes, slopes, sizes, linear, linear.base_step(weights)[1] + float(sizes @ sizes))
 
     def gauss_newton(now: _Point) -> _Point | None:
         """The point after one step within the bounds, cut until the cost falls; None where it never does."""
-        S = project(now.slopes)
-        A, b = np.vstack([S.T, np.eye(len(coordinates))]), np.concatenate([-project.residual(now.r), now.sizes])
-        delta = bounded_least_squares(A, b, *_step_bounds(now.effects, coordinates))
-        difference = np.clip(1.0 / np.maximum(np.linalg.norm(S, axis=1), 1e-300), MIN_DIFFERENCE, MAX_DIFFERENCE)
+        delta, information = now.linear.step(weights, *_step_bounds(now.effects, coordinates), now.sizes)
+        std = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+        difference = np.clip(std, MIN_DIFFERENCE, MAX_DIFFERENCE)
         for _ in range(MAX_TRIES):
             there = _stepped(now.effects, coordinates, delta)
             new = point(there, *_evaluate(signatures, there, coordinates, difference))
@@ -275,7 +260,7 @@ def fit_at_nominal(
             delta = delta / 3.0
         return None
 
-    here = point(effects, changes, slopes)
+    here = point(effects, changes, slopes * factors[:, None])
     for _ in range(MAX_STEPS):
         new = gauss_newton(here)
         if new is None:
@@ -283,7 +268,7 @@ def fit_at_nominal(
         gain, here = here.cost - new.cost, new
         if gain < MIN_COST_GAIN + MIN_RELATIVE_COST_GAIN * here.cost:
             break
-    nominal, bounds = ByColumn.of(baseline.columns, problem.J.T), _step_bounds(here.effects, coordinates)
+    bounds = _step_bounds(here.effects, coordinates)
     return SearchState(
         problem,
         baseline.columns,
@@ -292,23 +277,23 @@ def fit_at_nominal(
         tuple(coordinates),
         here.changes,
         here.slopes,
-        baseline.fit_linear(problem, nominal, here.r, here.slopes, here.sizes, bounds),
+        here.linear.fit(np.arange(len(coordinates)), *bounds, sizes=here.sizes),
     )
 
 
-def _in_units_of_the_gap(
-    baseline: Baseline, problem: Problem, coordinates: list[Coordinate], slopes: Float[np.ndarray, "k N"]
-) -> tuple[list[Coordinate], Float[np.ndarray, "k N"]]:
-    """Coordinates and slopes in the units of the formula: an amplitude of one changes as much as is missed in all.
+def _units_of_the_gap(
+    baseline: Baseline, linear: LinearModel, coordinates: Sequence[Coordinate]
+) -> Float[np.ndarray, " k"]:
+    """Factor of every coordinate's unit with which an amplitude of one changes as much as is missed in all.
 
-    An amplitude that changes nothing here keeps its plausible size as its unit, as the warm-up of a friction of zero.
+    Shapes keep their units, and so does an amplitude that changes nothing here, as the warm-up of a friction of zero.
     """
-    project = Projector(problem, baseline.columns, Weights.plain(baseline.columns))
-    norm = np.linalg.norm(project(slopes), axis=1)
-    pairs = zip(coordinates, norm, strict=True)
-    factor = np.array([baseline.gap / n if c.amplitude and n > 0.0 else 1.0 for c, n in pairs])
-    scaled = [replace(c, unit=c.unit * f) if c.amplitude else c for c, f in zip(coordinates, factor, strict=True)]
-    return scaled, slopes * factor[:, None]
+    k = len(coordinates)
+    _, information = linear.step(Weights.plain(baseline.columns), np.zeros(k), np.zeros(k), np.zeros(k))
+    norm = np.sqrt(np.maximum(np.diag(information), 0.0))
+    return np.array(
+        [baseline.gap / n if c.amplitude and n > 0.0 else 1.0 for c, n in zip(coordinates, norm, strict=True)]
+    )
 
 
 def derivatives(signatures: Signatures, state: SearchState) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "k N"]]:

@@ -221,6 +221,28 @@ class LinearModel:
         occam = 0.5 * _log_det_refitted(H, k) + 0.5 * float(a @ a) if n else 0.0
         return LinearFit(Evidence(e, o, explained, log_l - occam), log_l, -u[k:], u, b, weights)
 
+    def base_step(self, w: Weights) -> tuple[Float[np.ndarray, " p"], float]:
+        """Step δ of what the base refits, in given weights, and the weighted sum of squares that it leaves."""
+        H = self._weighted(w, self.BX, self.BX, self.XX) + self.prior
+        u = self._optimum(H, *np.empty((2, 0)))
+        return -u[1:], float(u @ H @ u)
+
+    def step(
+        self,
+        w: Weights,
+        low: Float[np.ndarray, " l"],
+        high: Float[np.ndarray, " l"],
+        sizes: Float[np.ndarray, " l"],
+    ) -> tuple[Float[np.ndarray, " l"], Float[np.ndarray, "l l"]]:
+        """Step of the amplitudes of all rows of Z in given weights, the base refitted with them; and its information.
+
+        Bounds and `sizes` are as in `fit`. The information is without that of the prior.
+        """
+        B, T, prior = self._rows_of(np.arange(self.Z.count), sizes)
+        H, k = self._weighted(w, B, B, T), self.BX.shape[1]
+        G = _refitted(H + np.pad(self.prior, (0, len(sizes))), k)
+        return -self._optimum(H + prior, low, high)[k:], G
+
     def _rows_of(self, picks: Int[np.ndarray, " k"], sizes: Float[np.ndarray, " k"]):
         """Rows [X; Z of a set]: coefficients on the features, products in every column, and products of the prior.
 
@@ -332,9 +354,14 @@ class LinearModel:
 
 
 def _log_det_refitted(H: Float[np.ndarray, "d d"], k: int) -> float:
-    """log det of the information on all but the first k coefficients, once those but the residual's are refitted."""
+    """log det of `_refitted`."""
+    return float(np.linalg.slogdet(_refitted(H, k))[1])
+
+
+def _refitted(H: Float[np.ndarray, "d d"], k: int) -> Float[np.ndarray, "m m"]:
+    """Information on all but the first k coefficients, once those but the residual's are refitted."""
     A, C, D = H[1:k, 1:k], H[1:k, k:], H[k:, k:]
-    return float(np.linalg.slogdet(D - C.T @ _ridge_solve(A, C))[1])
+    return D - C.T @ _ridge_solve(A, C)
 
 
 def _ridge_solve(A: Float[np.ndarray, "k k"], C: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k n"]:

@@ -225,8 +225,8 @@ class Search:
         keys, slopes = [state.keys[i] for i in kept], state.slopes[at]
         r, fit = state.problem.r - state.changes[kept].sum(axis=0), state.linear_fit
         if cause is not None:
-            bounds = state.step_bounds(at)
-            fit = self.baseline.fit_linear(state.problem, state.nominal, r, slopes, state.sizes()[at], bounds)
+            model = self.baseline.linear_model(state.problem, state.nominal, r, slopes)
+            fit = model.fit(np.arange(len(at)), *state.step_bounds(at), sizes=state.sizes()[at])
         self.visited.add(keys, fit.evidence)
         return Reduced(keys, r, slopes, fit.score)
 
