@@ -94,7 +94,7 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
     """
 
     rtol: float = 0.0
-    atol: float = 1e-3
+    atol: float | Float[Array, ""] = 1e-3
     kink: float = 0.0
     norm: Callable[[PyTree], Scalar] = optx.two_norm  # of z; half the squared two-norm is the predicted descent
 
@@ -194,11 +194,10 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
 def begin(y: PyTree) -> Iterate:
     """State of a search before the first linearisation, with `y` as the trial point."""
     flat = ravel_pytree(y)[0]
-    none = Factor(jnp.zeros((flat.size, flat.size)), jnp.zeros_like(flat), jnp.array(0.0))
-    zero, count = jnp.array(0.0), jnp.array(0)
-    return Iterate(
-        y, none, jnp.array(jnp.inf), jnp.zeros_like(flat), zero, jnp.array(1.0), zero, count, count, Outcome.running
-    )
+    # Scalars get their type here, as those of later states have it, so that one compiled step serves all states.
+    zero, one, infinite, count = jnp.zeros(()), jnp.ones(()), jnp.full((), jnp.inf, float), jnp.zeros((), int)
+    none = Factor(jnp.zeros((flat.size, flat.size)), jnp.zeros_like(flat), zero)
+    return Iterate(y, none, infinite, jnp.zeros_like(flat), zero, one, zero, count, count, Outcome.running)
 
 
 def state_of_vector(state: Iterate, trial: Float[Array, " p"]) -> Iterate:

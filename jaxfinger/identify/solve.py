@@ -156,7 +156,7 @@ def solve(
     moved, theta, size = Free.at(model, free), flat[free], flat.size
     low, high = parameter_bounds(model, free, limits)
     prior = prior or Prior.none(theta)
-    solver = VisibleGaussNewton(atol=tolerance, kink=KINK_TOLERANCE)
+    least = jax.device_put(tolerance)
     room = -(-max(p, 1) // PADDING) * PADDING
     y = _padded(theta, room)
     state = _begin(y)
@@ -168,7 +168,7 @@ def solve(
         offset = prior.root @ (np.asarray(state.trial)[:p] - prior.mean)
         rows = np.concatenate([factor[:, [*free, size]], np.column_stack([prior.root, offset])])
         trial = state.trial
-        y, state = _advance(solver, y, state, _factor_of(rows, room), *ends)
+        y, state = _advance(least, y, state, _factor_of(rows, room), *ends)
         if np.array_equal(np.asarray(y), np.asarray(trial)):
             best = at, linearised, factor, rows
         if state.outcome == Outcome.undefined_start:
@@ -237,8 +237,8 @@ _begin = eqx.filter_jit(begin)
 
 
 @eqx.filter_jit
-def _advance(solver: VisibleGaussNewton, y, state: Iterate, here: Factor, low, high):
-    return solver.advance(y, state, here, low, high)
+def _advance(tolerance: Float[Array, ""], y, state: Iterate, here: Factor, low, high):
+    return VisibleGaussNewton(atol=tolerance, kink=KINK_TOLERANCE).advance(y, state, here, low, high)
 
 
 def linearise_each(
