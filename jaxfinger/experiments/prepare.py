@@ -1,5 +1,6 @@
 """Preparation of recordings for a model: trials are reduced by their kind of motion, and stacked with padding."""
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -82,7 +83,7 @@ def prepare(
             return KINDS[experiment.kind].reduce(r), {c: bool(s.any()) for c, s in r.sound.items()}
 
         long = any(len(t.time) > MIN_THREADED_SAMPLES for t in trials)
-        with ThreadPoolExecutor(None if long else 1) as pool:
+        with ThreadPoolExecutor(os.cpu_count() if long else 1) as pool:
             rows = list(pool.map(row, trials))
         if rows:
             stacks[experiment.name] = _stack(experiment, trials, rows, reduced)
