@@ -1,6 +1,6 @@
 """Padding to a few common shapes, so that sessions of similar fingers share compiled programs."""
 
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -10,8 +10,19 @@ from jaxfinger.experiments.prepare import Batch
 # Trials in a block, and its least number of samples, which doubles until the longest trial fits. Trials of a session
 # recorded for a quick look have up to 128 samples.
 TRIALS, SAMPLES = 8, 128
+# Samples of a block of a pointwise batch: a minute of slow motion, so that slow and quick experiments share programs.
+# With eight trials an array of a block is 64 KiB, which stays in a processor's cache.
+PIECE = 1024
 
 Tree = TypeVar("Tree")
+
+
+class Block(NamedTuple):
+    """Part of a batch, in a common shape."""
+
+    trial: int  # number of its first trial in the whole batch
+    sample: int  # number of its first sample
+    batch: Batch
 
 
 def padded_size(size: int, least: int) -> int:
@@ -22,18 +33,24 @@ def padded_size(size: int, least: int) -> int:
     return room
 
 
-def blocks(batch: Batch) -> list[Batch]:
+def blocks(batch: Batch, pointwise: bool = False) -> list[Block]:
     """Split a batch into blocks of TRIALS trials of a common length; padding repeats the last values with mask 0.
 
-    A batch of starts of simulations is not padded, since every sample added would be one more simulation.
+    `pointwise`: whether no sample's prediction depends on another sample, so that long trials may be cut, too. A batch
+    of starts of simulations is not padded, since every sample added would be one more simulation.
     """
     if batch.x.simulated:
-        return [batch]
+        return [Block(0, 0, batch)]
     B, T = batch.x.time.shape
-    ends = (-B % TRIALS, padded_size(T, SAMPLES) - T)
+    length = min(padded_size(T, SAMPLES), PIECE) if pointwise else padded_size(T, SAMPLES)
+    ends = (-B % TRIALS, -T % length)
     counting = {c: np.pad(a, [(0, 0), (0, ends[0]), (0, ends[1])]) for c, a in batch.mask.items()}
     wide = padded(batch.x, *ends), padded(batch.y, *ends), counting
-    return [Batch(*jax.device_put(part)) for part in split(wide)]
+    return [
+        Block(TRIALS * k, first, Batch(*jax.device_put(jax.tree.map(lambda a, t=first: a[..., t : t + length], part))))
+        for k, part in enumerate(split(wide))
+        for first in range(0, T, length)
+    ]
 
 
 def padded(tree: Tree, trials: int, samples: int) -> Tree:

@@ -11,7 +11,7 @@ Outliers: Huber's cost is H(r) = r²/2 for |r| ≤ k, and k|r| − k²/2 beyond 
 minimises that cost: the sum of squares of s is 2 Σ H(r), and its gradient is 2 Σ J ψ(r), with ψ = H′.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple, TypeVar
 
@@ -24,7 +24,7 @@ from scipy.linalg import get_lapack_funcs
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data.schema import CHANNELS
-from jaxfinger.experiments import Batch, blocks, predict
+from jaxfinger.experiments import Batch, Block, blocks, predict
 from jaxfinger.identify.noise import whiten
 from jaxfinger.identify.parameters import Free
 from jaxfinger.model import Model
@@ -139,7 +139,7 @@ def robust_share(r: Float[np.ndarray, "*N"], limit: float) -> Float[np.ndarray, 
 
 def residuals_of(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[str, Float[np.ndarray, "_columns B T"]]:
     """Measured − predicted of every trial, in the channels' units, also at samples whose mask is 0."""
-    return _cut((_residuals_jit(model, block, channels) for block in blocks(batch)), batch)
+    return _by_blocks(lambda block: _residuals_jit(model, block, channels), model, batch)
 
 
 def tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> Tangent:
@@ -150,7 +150,7 @@ def tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -
     if batch.x.simulated:
         return Tangent(*jax.tree.map(np.asarray, _simulated_tangent(model, free, batch, channels)))
     return Tangent(
-        *_cut((_tangent(model, free, block, channels, jax.device_put(True)) for block in blocks(batch)), batch)
+        *_by_blocks(lambda block: _tangent(model, free, block, channels, jax.device_put(True)), model, batch)
     )
 
 
@@ -158,7 +158,7 @@ def residuals_by_tangent(model: Model, free: Free, batch: Batch, channels: tuple
     """Residuals as of `residuals_of`, computed by the program of `tangent`, so that none is compiled for them alone."""
     if batch.x.simulated:
         return residuals_of(model, batch, channels)
-    return _cut((_tangent(model, free, block, channels, jax.device_put(False))[0] for block in blocks(batch)), batch)
+    return _by_blocks(lambda block: _tangent(model, free, block, channels, jax.device_put(False))[0], model, batch)
 
 
 def linearise(model: Model, free: Free, batch: Batch, filters: Filters, limit: float = 0.0) -> Linearised:
@@ -216,21 +216,27 @@ def triangular(A: Float[np.ndarray, "N p"]) -> Float[np.ndarray, "k p"]:
     return np.triu(_geqrt(min(PANEL, *A.shape), A)[0][: A.shape[1]])
 
 
-def _cut(parts: Iterable[Tree], batch: Batch) -> Tree:
-    """Join blocks into arrays (…, B, T) without their padding; a block is released before the next one is computed."""
-    (B, T), out, first = batch.x.time.shape, None, 0
-    for part in parts:
+def _by_blocks(f: Callable[[Batch], Tree], model: Model, batch: Batch) -> Tree:
+    """Apply f to the blocks of a batch, and join its arrays (…, B, T) without their padding.
+
+    A block's result is released before the next one is computed. Without effects, which may have a memory, (1) of
+    joints that are not held is pointwise in time.
+    """
+    (B, T), out = batch.x.time.shape, None
+    for block in blocks(batch, pointwise=not (model.effects or batch.x.held)):
+        part = f(block.batch)
         if out is None:
             out = jax.tree.map(lambda a: np.empty((*a.shape[:-2], B, T)), part)
-        jax.tree.map(partial(_put, first), out, part)
-        first += jax.tree.leaves(part)[0].shape[-2]
+        jax.tree.map(partial(_put, block), out, part)
     assert out is not None
     return out
 
 
-def _put(first: int, out: Float[np.ndarray, "*k B T"], block: Float[Array, "*k b t"]) -> None:
-    """Copy a block without its padding into `out`, from trial number `first` on."""
-    out[..., first : first + block.shape[-2], :] = np.asarray(block)[..., : out.shape[-2] - first, : out.shape[-1]]
+def _put(block: Block, out: Float[np.ndarray, "*k B T"], part: Float[Array, "*k b t"]) -> None:
+    """Copy a block's array without its padding into `out`."""
+    b, t = part.shape[-2:]
+    room = out[..., block.trial : block.trial + b, block.sample : block.sample + t]
+    room[...] = np.asarray(part)[..., : room.shape[-2], : room.shape[-1]]
 
 
 _residuals_jit = quick_jit(_residuals)

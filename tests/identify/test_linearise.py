@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxfinger.effects import CATALOGUE
-from jaxfinger.experiments import SAMPLES, TRIALS, blocks, padded_size, predict, prepare
+from jaxfinger.experiments import SAMPLES, TRIALS, blocks, padded_size, predict, prepare, shapes
 from jaxfinger.identify.linearise import _tangent, huber, linearise, residuals_by_tangent, residuals_of, white_rows
 from jaxfinger.identify.parameters import Free, describe
 from jaxfinger.identify.solve import Tangents, residuals_each
@@ -28,7 +28,7 @@ def test_a_stack_has_room_and_less_than_as_much_again(size, least):
 def test_blocks_hold_every_trial_once_and_count_no_other(stack):
     """All blocks have one shape, whatever the number of trials."""
     batch = jax.tree.map(lambda a: np.concatenate([a, a, a], axis=-2), stack.batch)
-    parts, (B, T) = blocks(batch), batch.x.time.shape
+    parts, (B, T) = [block.batch for block in blocks(batch)], batch.x.time.shape
     assert len(parts) > 1
     assert B % TRIALS
     assert {part.x.time.shape for part in parts} == {(TRIALS, padded_size(T, SAMPLES))}
@@ -92,6 +92,15 @@ def test_the_common_shape_changes_no_residual(stack, short_truth):
         np.testing.assert_allclose(beside[c], stack.batch.y[c] - predicted[c], atol=1e-12)
 
 
+def test_a_trial_that_is_cut_keeps_its_residuals(short, short_truth, monkeypatch):
+    monkeypatch.setattr(shapes, "PIECE", SAMPLES)
+    moving = prepare(short, [t.name for t in short if t.experiment == "ID.3-dynamic"])["ID.3-dynamic"].batch
+    assert moving.x.time.shape[1] > SAMPLES
+    found = residuals_of(short_truth.model, moving, ("joint_torque",))["joint_torque"]
+    predicted = predict(short_truth.model, moving.x, ("joint_torque",))["joint_torque"]
+    np.testing.assert_allclose(found, moving.y["joint_torque"] - predicted, atol=1e-12)
+
+
 def test_an_experiment_that_shows_no_effect_is_predicted_without(stack, short_truth):
     effect = CATALOGUE["tendon_stretch"].at(short_truth.model.finger, ("T1",), compliance=2e-5)
     model = eqx.tree_at(lambda m: m.effects, short_truth.model, (effect,), is_leaf=lambda v: isinstance(v, tuple))
@@ -114,7 +123,7 @@ def test_no_program_that_runs_beside_another_calls_lapack(short, short_truth):
     noise = {(e, c): first_noise(stacks[e], c, stacks[e].batch.y[c]) for e in reads for c in reads[e]}
     for source in sources_of(stacks, reads, noise, parameters).values():
         free = Free.at(model, source.positions)
-        program = _tangent.lower(model, free, blocks(source.batch)[0], tuple(source.filters), jnp.asarray(True))
+        program = _tangent.lower(model, free, blocks(source.batch)[0].batch, tuple(source.filters), jnp.asarray(True))
         assert "lapack" not in program.as_text()
 
 
