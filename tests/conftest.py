@@ -8,6 +8,8 @@ import atexit
 import os
 import shutil
 import tempfile
+from pathlib import Path
+from pkgutil import iter_modules
 
 from jaxtyping import install_import_hook
 
@@ -29,7 +31,9 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
-# Annotations are checked at each call, except in the rig: there its tests would take five times as long, and those of
-# recorder and supervisor are timed.
+# Annotations are checked at each call, except in the simulated controller and plant, which run at 1 kHz in plain
+# Python: tests of the rig would take five times as long. `trips` is called for each sample, too.
 ROOMS = ("cli", "data", "effects", "experiments", "gap", "identify", "model", "report", "sealed", "synthetic")
-install_import_hook([f"jaxfinger.{room}" for room in ROOMS], f"{checks.__name__}.checked")
+UNCHECKED = ("simulated", "trips")
+RIG = [m.name for m in iter_modules([str(Path(__file__).parents[1] / "jaxfinger" / "rig")]) if m.name not in UNCHECKED]
+install_import_hook([f"jaxfinger.{m}" for m in (*ROOMS, *(f"rig.{m}" for m in RIG))], f"{checks.__name__}.checked")

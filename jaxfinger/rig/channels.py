@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NoReturn
 
 import numpy as np
@@ -136,19 +137,29 @@ class RigDescription:
         """Raise UserError at the line of a key of the rig file."""
         (parse_toml(self.text, self.path).place / table / key).fail(message)
 
-    @property
+    @cached_property
     def slots(self) -> list[int]:
         """Slot of each channel in the controller's sample."""
         return [c.slot for c in self.channels]
 
+    @cached_property
+    def _gain(self) -> Float[np.ndarray, " C"]:
+        return np.array([c.scale * c.factor for c in self.channels])
+
+    @cached_property
+    def _bias(self) -> Float[np.ndarray, " C"]:
+        return np.array([c.offset * c.factor for c in self.channels])
+
+    @cached_property
+    def _force(self) -> list[int]:
+        """Columns of the fingertip's force along x, y and z, as far as the rig measures it."""
+        return self.columns("fingertip_force", "xyz")
+
     def calibrate(self, raw: Float[np.ndarray, "N V"]) -> Float[np.ndarray, "N C"]:
         """Convert raw values of the controller's samples to SI, the fingertip's force in the base frame."""
-        gain = np.array([c.scale * c.factor for c in self.channels])
-        bias = np.array([c.offset * c.factor for c in self.channels])
-        x = raw[:, self.slots] * gain + bias
-        force = self.columns("fingertip_force", "xyz")
-        if len(force) == 3:
-            x[:, force] = x[:, force] @ self.sensor_rotation.T
+        x = raw[:, self.slots] * self._gain + self._bias
+        if len(self._force) == 3:
+            x[:, self._force] = x[:, self._force] @ self.sensor_rotation.T
         return x
 
     def index(self, kind: str, of: str = "") -> int | None:
