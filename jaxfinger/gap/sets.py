@@ -167,12 +167,16 @@ class Search:
         ]
 
     def _replaced(self, state: SearchState, least: float, most: int = 1) -> list[tuple[CauseKey, SearchState]]:
-        """Every cause, and the set with the best others in its place that may have net evidence `least`, fitted."""
+        """Every cause, and the set with the best others in its place that may have net evidence `least`, fitted.
+
+        Another that is not worth its cost in that place is no rival.
+        """
         found = []
         for i, key in enumerate(state.keys):
             screened = self.screen(state, i)
+            empty = screened.score - self.costs.of(screened.keys)
             for net, offer, amplitudes in self.best_offers(screened, most, other_than=key):
-                if net >= least:
+                if net >= max(least, empty):
                     found.append((key, self.fit_exactly(state, i, offer, amplitudes, screened.now.weights)))
         return found
 
