@@ -11,7 +11,7 @@ Outliers: Huber's cost is H(r) = r²/2 for |r| ≤ k, and k|r| − k²/2 beyond 
 minimises that cost: the sum of squares of s is 2 Σ H(r), and its gradient is 2 Σ J ψ(r), with ψ = H′.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import NamedTuple, TypeVar
 
@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from scipy.linalg import get_lapack_funcs
 
 from jaxfinger.compilation import quick_jit
@@ -142,23 +142,31 @@ def residuals_of(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[
     return _by_blocks(lambda block: _residuals_jit(model, block, channels), model, batch)
 
 
-def tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> Tangent:
+def tangent(
+    model: Model, free: Free, batch: Batch, channels: tuple[str, ...], parts: Collection[str] | None = None
+) -> Tangent:
     """Residuals and their derivatives by the parameters in `free`.
 
-    The program is compiled for a block of trials (`blocks`); the block's padding is removed from the result.
+    `parts`: fields of the model by whose parameters derivatives are computed, by default all; the others are zero. The
+    program is compiled for a block of trials (`blocks`); the block's padding is removed from the result.
     """
     if batch.x.simulated:
         return Tangent(*jax.tree.map(np.asarray, _simulated_tangent(model, free, batch, channels)))
-    return Tangent(
-        *_by_blocks(lambda block: _tangent(model, free, block, channels, jax.device_put(True)), model, batch)
-    )
+    wanted = _wanted(free, free.parts if parts is None else parts)
+    return Tangent(*_by_blocks(lambda block: _tangent(model, free, block, channels, wanted), model, batch))
 
 
 def residuals_by_tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Residuals as of `residuals_of`, computed by the program of `tangent`, so that none is compiled for them alone."""
     if batch.x.simulated:
         return residuals_of(model, batch, channels)
-    return _by_blocks(lambda block: _tangent(model, free, block, channels, jax.device_put(False))[0], model, batch)
+    none = _wanted(free, ())
+    return _by_blocks(lambda block: _tangent(model, free, block, channels, none)[0], model, batch)
+
+
+def _wanted(free: Free, parts: Collection[str]) -> Bool[Array, " parts"]:
+    """Whether derivatives by each part of the model that has free parameters are wanted."""
+    return jax.device_put(np.array([part in parts for part in dict.fromkeys(free.parts)]))
 
 
 def linearise(model: Model, free: Free, batch: Batch, filters: Filters, limit: float = 0.0) -> Linearised:
@@ -260,8 +268,8 @@ def _simulated_tangent(model: Model, free: Free, batch: Batch, channels: tuple[s
 
 
 @quick_jit
-def _tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...], slopes: Array):
-    """Residuals and their derivatives, which are zero and not computed where `slopes` is false."""
+def _tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...], wanted: Bool[Array, " parts"]):
+    """Residuals and their derivatives, which are zero and not computed for the parts of the model not `wanted`."""
 
     def f(values):
         return _residuals(free.put(model, values), batch, channels)
@@ -270,7 +278,7 @@ def _tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...], 
     residuals, pushforward = jax.linearize(f, values)
     still = jax.tree.map(jnp.zeros_like, values)
 
-    def columns(part: str) -> dict[str, Array]:
+    def columns(part: str, wanted: Bool[Array, ""]) -> dict[str, Array]:
         """Derivatives by the parameters of one part of the model.
 
         The pushforward is linear, so that its derivative at zero is itself. Taking the derivative lets JAX drop the
@@ -283,13 +291,11 @@ def _tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...], 
             moved = dict(zip(mine, split(step), strict=True))
             return pushforward([moved.get(k, z) for k, z in enumerate(still)])
 
-        return jax.lax.map(lambda unit: jax.jvp(alone, (zero,), (unit,))[1], jnp.eye(zero.size))
+        return jax.lax.cond(
+            wanted,
+            lambda: jax.lax.map(lambda unit: jax.jvp(alone, (zero,), (unit,))[1], jnp.eye(zero.size)),
+            lambda: {c: jnp.zeros((zero.size, *r.shape)) for c, r in residuals.items()},
+        )
 
-    def jacobian():
-        parts = [columns(part) for part in dict.fromkeys(free.parts)]
-        return jax.tree.map(lambda *a: jnp.concatenate(a), *parts)
-
-    count = sum(v.size for v in values)
-    nothing = {c: (count, *r.shape) for c, r in residuals.items()}
-    J = jax.lax.cond(slopes, jacobian, lambda: {c: jnp.zeros(shape) for c, shape in nothing.items()})
-    return residuals, J
+    parts = [columns(part, of_part) for part, of_part in zip(dict.fromkeys(free.parts), wanted, strict=True)]
+    return residuals, jax.tree.map(lambda *a: jnp.concatenate(a), *parts)

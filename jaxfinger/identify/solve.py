@@ -66,6 +66,10 @@ class Source(NamedTuple):
         """Model without effects that the experiment does not depend on, so that they are not compiled."""
         return model if self.effects or not model.effects else eqx.tree_at(lambda m: m.effects, model, ())
 
+    def parts(self, model: Model) -> set[str]:
+        """Fields of the model on whose parameters the residuals depend."""
+        return set(Free.at(self.relevant_model(model), self.positions).parts)
+
     def is_affine(self, model: Model, free: Int[np.ndarray, " p"]) -> bool:
         """Whether the residuals are affine in the free parameters, so that one linearisation is exact."""
         mine = np.intersect1d(self.positions, free)
@@ -106,12 +110,17 @@ class Tangents:
         self._known: dict[str, tuple[np.ndarray, Tangent]] = {}
         self._white: dict[str, tuple[Source, float, np.ndarray, Linearised]] = {}
 
-    def at(self, name: str, model: Model, source: Source, limit: float, affine: bool) -> Linearised:
-        """Linearise experiment `name` at the model; a cached tangent is whitened anew where the source has changed."""
+    def at(
+        self, name: str, model: Model, source: Source, limit: float, affine: bool, parts: set[str] | None = None
+    ) -> Linearised:
+        """Linearise experiment `name` at the model; a cached tangent is whitened anew where the source has changed.
+
+        `parts`: as in `linearise.tangent`, where the experiment is not affine.
+        """
         relevant = source.relevant_model(model)
         free = Free.at(relevant, source.positions)
         if not affine:
-            along = tangent(relevant, free, source.batch, tuple(source.filters))
+            along = tangent(relevant, free, source.batch, tuple(source.filters), parts)
             return whitened(along, source.batch, source.filters, limit, source.weights)
         values = np.asarray(free.get(relevant))
         known, along = self._known.get(name, (values, None))
@@ -163,7 +172,7 @@ def solve(
     ends = _padded(low, room), _padded(high, room)
     at = model
     for _ in range(MAX_STEPS):
-        linearised = linearise_each(at, sources, huber, tangents, free)
+        linearised = linearise_each(at, sources, huber, tangents, free, alone=True)
         factor = stacked(linearised, sources, size)
         offset = prior.root @ (np.asarray(state.trial)[:p] - prior.mean)
         rows = np.concatenate([factor[:, [*free, size]], np.column_stack([prior.root, offset])])
@@ -176,7 +185,11 @@ def solve(
         if not bool(state.outcome == Outcome.running):
             break
         at = moved.set(model, jax.device_put(np.asarray(state.trial)[:p]))
-    model, linearised, factor, rows = best
+    model, linearised, _, rows = best
+    # Errors of the other parameters are passed on by derivatives at the optimum.
+    partial = {e: s for e, s in sources.items() if not (s.is_affine(model, free) or s.parts(model) <= set(moved.parts))}
+    linearised = linearised | linearise_each(model, partial, huber)
+    factor = stacked(linearised, sources, size)
     _, invisible, scale = visible(rows[:, :-1])
     white = np.concatenate([lin.white.ravel() for lin in linearised.values()])
     count = int(np.count_nonzero(white))
@@ -247,13 +260,18 @@ def linearise_each(
     huber: float = 0.0,
     tangents: Tangents | None = None,
     free: Int[np.ndarray, " p"] | None = None,
+    alone: bool = False,
 ) -> dict[str, Linearised]:
-    """Linearise every experiment at the model, along its cached tangent where it is affine in the free parameters."""
+    """Linearise every experiment at the model, along its cached tangent where it is affine in the free parameters.
+
+    `alone`: whether derivatives by parts of the model without a free parameter are left out, where it is not affine.
+    """
     known = tangents or Tangents()
+    parts = set(Free.at(model, free).parts) if alone and free is not None else None
 
     def one(name: str) -> Linearised:
         s = sources[name]
-        return known.at(name, model, s, huber, free is not None and s.is_affine(model, free))
+        return known.at(name, model, s, huber, free is not None and s.is_affine(model, free), parts)
 
     return dict(zip(sources, side_by_side(one, sources), strict=True))
 

@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.experiments import SAMPLES, TRIALS, blocks, padded_size, predict, prepare, shapes
-from jaxfinger.identify.linearise import _tangent, huber, linearise, residuals_by_tangent, residuals_of, white_rows
+from jaxfinger.identify.linearise import (
+    _tangent,
+    huber,
+    linearise,
+    residuals_by_tangent,
+    residuals_of,
+    tangent,
+    white_rows,
+)
 from jaxfinger.identify.parameters import Free, describe
 from jaxfinger.identify.solve import Tangents, residuals_each
 from jaxfinger.identify.stages import first_noise, sources_of
@@ -92,6 +100,19 @@ def test_the_common_shape_changes_no_residual(stack, short_truth):
         np.testing.assert_allclose(beside[c], stack.batch.y[c] - predicted[c], atol=1e-12)
 
 
+def test_derivatives_by_some_parts_are_those_of_all_of_them(stack, short_truth):
+    model, some = short_truth.model, ("tendon_friction",)
+    positions = [i for i, p in enumerate(describe(model)) if p.group in ("elastic", "moment_arm", "tendon_friction")]
+    free = Free.at(model, np.array(positions))
+    whole, part = (tangent(model, free, stack.batch, CHANNELS, parts) for parts in (None, some))
+    mine = np.repeat([p in some for p in free.parts], [e.size for e in free.entries])
+    for c in CHANNELS:
+        np.testing.assert_array_equal(part.residuals[c], whole.residuals[c])
+        np.testing.assert_array_equal(part.slopes[c], np.where(mine[:, None, None, None], whole.slopes[c], 0.0))
+    assert whole.slopes["joint_torque"][mine].any()
+    assert whole.slopes["joint_torque"][~mine].any()
+
+
 def test_a_trial_that_is_cut_keeps_its_residuals(short, short_truth, monkeypatch):
     monkeypatch.setattr(shapes, "PIECE", SAMPLES)
     moving = prepare(short, [t.name for t in short if t.experiment == "ID.3-dynamic"])["ID.3-dynamic"].batch
@@ -123,7 +144,9 @@ def test_no_program_that_runs_beside_another_calls_lapack(short, short_truth):
     noise = {(e, c): first_noise(stacks[e], c, stacks[e].batch.y[c]) for e in reads for c in reads[e]}
     for source in sources_of(stacks, reads, noise, parameters).values():
         free = Free.at(model, source.positions)
-        program = _tangent.lower(model, free, blocks(source.batch)[0].batch, tuple(source.filters), jnp.asarray(True))
+        program = _tangent.lower(
+            model, free, blocks(source.batch)[0].batch, tuple(source.filters), jnp.ones(len(set(free.parts)), bool)
+        )
         assert "lapack" not in program.as_text()
 
 
