@@ -10,7 +10,6 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import uniform_filter1d
-from scipy.optimize import isotonic_regression
 
 from jaxfinger.data import find_holds
 from jaxfinger.data.motion import RAMP_BLOCKS, slow_ramps, stretches_of
@@ -34,7 +33,8 @@ def reduce(r: PreparedTrial) -> Row:
         tension = uniform_filter1d(tension, max(1, round(1.0 / (r.experiment.rate * r.step))), axis=0, mode="nearest")
     pulled = r.taut(r.mean(tension))
     ramps = slow_ramps(pulled, hold, round(RAMP_BLOCKS / (r.experiment.rate * r.step * r.size)), r.sizes.travel)
-    pulled = _monotonic_ramps(pulled, ramps, r.sizes.travel)
+    if ramps.any():
+        pulled = _monotonic_ramps(pulled, ramps, r.sizes.travel)
     pulled = _clipped_between_holds(pulled, np.where(ramps, RAMP_SAMPLE, hold), slack=True)
     counts = (hold >= 0) | _continues(pulled, hold, r.sizes.travel)
     taut = r.lowest(measured) > r.sizes.slack
@@ -62,6 +62,8 @@ def _monotonic_ramps(tension: Float[np.ndarray, "M n"], ramps: Bool[np.ndarray, 
 
     A held tendon keeps the highest tension that it has seen, so that peaks of noise would add up.
     """
+    from scipy.optimize import isotonic_regression  # takes 0.15 s to import, and few sessions have ramps
+
     out = tension.copy()
     for begin, end in stretches_of(ramps):
         for k in range(tension.shape[1]):
