@@ -161,6 +161,8 @@ class Products:
         """Products with the rows `at` of Z only."""
         out = np.zeros((len(self.blocks), self.shape[0], len(at)))
         for c, (i, j, values) in enumerate(self.blocks):
-            there = np.flatnonzero(np.isin(at, j))
-            out[c, i[:, None], there] = values[:, np.searchsorted(j, at[there])]
+            if j.size:
+                place = np.minimum(np.searchsorted(j, at), j.size - 1)
+                there = np.flatnonzero(j[place] == at)
+                out[c, i[:, None], there] = values[:, place[there]]
         return out

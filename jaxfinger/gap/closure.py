@@ -5,7 +5,7 @@ Each third of the trials is held out in turn, stratified by experiment, joint an
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxfinger.data.schema import CHANNELS, channel_units
 from jaxfinger.effects import Scales
@@ -168,19 +168,23 @@ def _line(e: str, c: str, units: str, values: Float[np.ndarray, "B 4"], diverged
 
     Columns of `values`: mean squares before, after and of the noise, and the number of samples.
     """
-    rng = np.random.default_rng(0)
-    weight = values[:, 3]
-
-    def closed(rows):
-        before, after, noise = (np.average(values[rows, k], weights=weight[rows]) for k in range(3))
-        # A draw that lacks the trials with the gap has none, and `closed` is not defined for it.
-        return 1.0 - (after - noise) / (before - noise) if before > MIN_RESOLVABLE_RATIO * noise else np.nan
-
     rows = np.arange(len(values))
-    before, after, noise = (float(np.average(values[:, k], weights=weight)) for k in range(3))
-    value = closed(rows)
+    sums = values * np.append(values[:, [3, 3, 3]], np.ones((len(values), 1)), axis=1)
+
+    def averages(drawn: Int[np.ndarray, "D B"]) -> Float[np.ndarray, "3 D"]:
+        """Mean squares before, after and of the noise, of each draw of trials."""
+        total = sums[drawn].sum(axis=1)
+        return total[:, :3].T / total[:, 3]
+
+    def closed(before, after, noise):
+        # A draw that lacks the trials with the gap has none, and `closed` is not defined for it.
+        seen = before > MIN_RESOLVABLE_RATIO * noise
+        return np.where(seen, 1.0 - (after - noise) / np.where(seen, before - noise, 1.0), np.nan)
+
+    before, after, noise = (float(x) for x in averages(rows[None])[:, 0])
+    value = float(closed(before, after, noise))
     resolvable = bool(np.isfinite(value))
-    draws = np.array([closed(rng.choice(rows, len(rows))) for _ in range(DRAWS)])
+    draws = closed(*averages(np.random.default_rng(0).choice(rows, (DRAWS, len(rows)))))
     draws = draws[np.isfinite(draws)]
     low, high = np.quantile(draws, (0.025, 0.975)) if resolvable and len(draws) else (0.0, 0.0)
     if diverged:

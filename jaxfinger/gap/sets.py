@@ -386,7 +386,7 @@ class Search:
 
     def _best_offer_of(self, screened: Screened, key: CauseKey) -> tuple[Offer, Float[np.ndarray, " k"]] | None:
         """Best offer of one cause alone on top of a set, with its amplitudes; None where there is none."""
-        mine = [n for n, o in enumerate(self.table.offers) if o.keys == (key,) and np.isfinite(screened.net[n])]
+        mine = [n for n in self.table.numbers_of(key) if np.isfinite(screened.net[n])]
         if not mine:
             return None
         offer = self.table.offers[max(mine, key=lambda n: screened.net[n])]

@@ -68,6 +68,17 @@ class SignatureTable:
     def _offer_of(self) -> dict[tuple[Variant, ...], Offer]:
         return {o.variants: o for o in self.offers}
 
+    @cached_property
+    def _numbers(self) -> dict[tuple[CauseKey, ...], list[int]]:
+        found: dict[tuple[CauseKey, ...], list[int]] = {}
+        for n, offer in enumerate(self.offers):
+            found.setdefault(offer.keys, []).append(n)
+        return found
+
+    def numbers_of(self, key: CauseKey) -> list[int]:
+        """Numbers of the offers of one cause at its site alone."""
+        return self._numbers.get((key,), [])
+
     def neighbours(self, offer: Offer) -> list[Offer]:
         """The offers whose shapes differ from an offer's in one that fits move, by one step of its grid."""
         first, found = offer.variants[0], []
