@@ -89,7 +89,7 @@ def _hide_warning(message, category, filename, lineno, file=None, line=None) -> 
 def _one_heap() -> None:
     """Let all threads share one heap. By default glibc gives each its own, and what one has freed no other can use.
 
-    The peak of `identify` falls by a quarter. Other C libraries have one heap for all, or no such option.
+    Other C libraries have one heap for all, or no such option.
     """
     with suppress(AttributeError, OSError, TypeError):
         ctypes.CDLL(None).mallopt(M_ARENA_MAX, 1)

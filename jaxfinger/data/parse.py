@@ -355,7 +355,7 @@ def _plain(units: str) -> str:
 def _as_kind(value: np.ndarray, entry: Entry, place: str, report: Report) -> np.ndarray | None:
     """Array in the type of its entry; None with the reason reported where a value does not fit.
 
-    Its columns are contiguous: sums, maxima and medians along time are up to forty times as fast then.
+    Its columns are contiguous, since most sums, maxima and medians are taken along time.
     """
     if entry.kind == "float":
         if value.dtype.kind not in "fiu":

@@ -62,7 +62,7 @@ def _monotonic_ramps(tension: Float[np.ndarray, "M n"], ramps: Bool[np.ndarray, 
 
     A held tendon keeps the highest tension that it has seen, so that peaks of noise would add up.
     """
-    from scipy.optimize import isotonic_regression  # takes 0.15 s to import, and few sessions have ramps
+    from scipy.optimize import isotonic_regression  # slow to import, and few sessions have ramps
 
     out = tension.copy()
     for begin, end in stretches_of(ramps):

@@ -164,8 +164,8 @@ def fit_set(
     best = fit_at_nominal(baseline, problem, effects, weights)
     for _ in range(MAX_ROUNDS - 1):
         weights = best.linear_fit.weights
-        problem = _with_nominal_refitted(baseline, best, weights)
-        found = fit_at_nominal(baseline, problem, list(best.effects), weights)
+        problem, nominal = _with_nominal_refitted(baseline, best, weights)
+        found = fit_at_nominal(baseline, problem, list(best.effects), weights, nominal)
         if found.score < best.score + MIN_SCORE_GAIN:
             # A score is that of the optimum of the linearisation. The later round starts from the weights of that
             # optimum, and its values are nearer to it: in low weights, the prior shrinks the amplitudes of the first.
@@ -181,10 +181,11 @@ def refit_from_plain(baseline: Baseline, state: SearchState) -> SearchState:
     close that column, `fit_set` ends before, since every small step costs more in the closed columns than it gains.
     """
     plain = Weights.plain(baseline.columns)
-    problem, effects, there = state.problem, list(state.effects), state
+    problem, nominal, there = state.problem, state.nominal, state
     for _ in range(PLAIN_ROUNDS):
-        there = fit_at_nominal(baseline, problem, effects, plain)
-        problem, effects = _with_nominal_refitted(baseline, there, plain), list(there.effects)
+        there = fit_at_nominal(baseline, problem, list(there.effects), plain, nominal)
+        problem, nominal = _with_nominal_refitted(baseline, there, plain)
+    effects = there.effects
     variants, starts = [as_variant(e, problem.scales) for e in effects], [amplitudes_of(e) for e in effects]
     return max(state, fit_set(baseline, problem, variants, starts, there.linear_fit.weights), key=lambda s: s.score)
 
@@ -200,22 +201,22 @@ def as_variant(effect: CatalogueEffect, scales: Scales) -> Variant:
     return Variant(type(effect), effect.site, shapes, scales=scales)
 
 
-def _with_nominal_refitted(baseline: Baseline, state: SearchState, weights: Weights) -> Problem:
-    """The problem at the nominal model refitted with a set, by one step of the linearisation.
+def _with_nominal_refitted(baseline: Baseline, state: SearchState, weights: Weights) -> tuple[Problem, ByColumn]:
+    """The problem at the nominal model refitted with a set, by one step of the linearisation; and its derivatives.
 
     The step is cut to a third, and again, where its curvature more than doubles the cost.
     """
-    here, none = state.problem, np.empty((0, state.problem.r.size))
-    step, cost = baseline.linear_model(here, state.nominal, state.r, none).base_step(weights)
+    here, nominal, none = state.problem, state.nominal, np.empty((0, state.problem.r.size))
+    step, cost = baseline.linear_model(here, nominal, state.r, none).base_step(weights)
     for _ in range(MAX_TRIES):
         here = moved(state.problem, step)
         left = here.r - np.sum([Signatures(here).white_changes([e])[0] for e in state.effects], axis=0)
         nominal = ByColumn.of(baseline.columns, here.J.T)
         # The constant keeps a cost near zero, as of a perfect fit, from refusing every step.
         if baseline.linear_model(here, nominal, left, none).base_step(weights)[1] < 2.0 * cost + 100.0:
-            return here
+            break
         step = step / 3.0
-    return here
+    return here, nominal
 
 
 @dataclass(frozen=True)
@@ -231,20 +232,26 @@ class _Point:
 
 
 def fit_at_nominal(
-    baseline: Baseline, problem: Problem, effects: list[CatalogueEffect], weights: Weights
+    baseline: Baseline,
+    problem: Problem,
+    effects: list[CatalogueEffect],
+    weights: Weights,
+    nominal: ByColumn | None = None,
 ) -> SearchState:
-    """Fit amplitudes and shapes from `effects` around the problem's nominal model, which is refitted to first order."""
-    signatures, nominal = Signatures(problem), ByColumn.of(baseline.columns, problem.J.T)
+    """Fit amplitudes and shapes from `effects` around the problem's nominal model, which is refitted to first order.
+
+    `nominal`: the problem's derivatives by column, where the caller has them already.
+    """
+    signatures = Signatures(problem)
+    nominal = nominal or ByColumn.of(baseline.columns, problem.J.T)
     coordinates = _coordinates(effects, problem.scales)
     changes, slopes = _evaluate(signatures, effects, coordinates, np.full(len(coordinates), MAX_DIFFERENCE))
     factors = _units_of_the_gap(baseline, baseline.linear_model(problem, nominal, problem.r, slopes), coordinates)
     coordinates = [replace(c, unit=c.unit * f) for c, f in zip(coordinates, factors, strict=True)]
 
     def point(effects: Sequence[CatalogueEffect], changes, slopes) -> _Point:
-        linear, sizes = (
-            baseline.linear_model(problem, nominal, problem.r - changes.sum(axis=0), slopes),
-            _sizes(effects, coordinates),
-        )
+        linear = baseline.linear_model(problem, nominal, problem.r - changes.sum(axis=0), slopes)
+        sizes = _sizes(effects, coordinates)
         return _Point(effects, changes, slopes, sizes, linear, linear.base_step(weights)[1] + float(sizes @ sizes))
 
     def gauss_newton(now: _Point) -> _Point | None:

@@ -172,7 +172,7 @@ def solve(
     ends = _padded(low, room), _padded(high, room)
     at = model
     for _ in range(MAX_STEPS):
-        linearised = linearise_each(at, sources, huber, tangents, free, alone=True)
+        linearised = linearise_each(at, sources, huber, tangents, free)
         factor = stacked(linearised, sources, size)
         offset = prior.root @ (np.asarray(state.trial)[:p] - prior.mean)
         rows = np.concatenate([factor[:, [*free, size]], np.column_stack([prior.root, offset])])
@@ -186,9 +186,11 @@ def solve(
             break
         at = moved.set(model, jax.device_put(np.asarray(state.trial)[:p]))
     model, linearised, _, rows = best
-    # Errors of the other parameters are passed on by derivatives at the optimum.
-    partial = {e: s for e, s in sources.items() if not (s.is_affine(model, free) or s.parts(model) <= set(moved.parts))}
-    linearised = linearised | linearise_each(model, partial, huber)
+    # The errors of parameters that are not free are propagated by their derivatives, which are computed at the optimum.
+    incomplete = {
+        e: s for e, s in sources.items() if not (s.is_affine(model, free) or s.parts(model) <= set(moved.parts))
+    }
+    linearised = linearised | linearise_each(model, incomplete, huber)
     factor = stacked(linearised, sources, size)
     _, invisible, scale = visible(rows[:, :-1])
     white = np.concatenate([lin.white.ravel() for lin in linearised.values()])
@@ -260,14 +262,14 @@ def linearise_each(
     huber: float = 0.0,
     tangents: Tangents | None = None,
     free: Int[np.ndarray, " p"] | None = None,
-    alone: bool = False,
 ) -> dict[str, Linearised]:
-    """Linearise every experiment at the model, along its cached tangent where it is affine in the free parameters.
+    """Linearise every experiment at the model.
 
-    `alone`: whether derivatives by parts of the model without a free parameter are left out, where it is not affine.
+    `free`: parameters that a fit moves. An experiment that is affine in them is linearised along its cached tangent; in
+    others the derivatives by parts of the model without any of them stay zero.
     """
     known = tangents or Tangents()
-    parts = set(Free.at(model, free).parts) if alone and free is not None else None
+    parts = set(Free.at(model, free).parts) if free is not None else None
 
     def one(name: str) -> Linearised:
         s = sources[name]

@@ -26,10 +26,10 @@ from jaxfinger.rig.plan import PlannedTrial
 from jaxfinger.rig.protocols import Covered, Dwell, Mark, Protocol, Reached, Settled, Start, Tare
 from jaxfinger.rig.reader import Reader, tripped
 from jaxfinger.rig.safety import Violation
-from jaxfinger.rig.signals import Interrupts
+from jaxfinger.rig.signals import INTERRUPTED, Interrupts
 from jaxfinger.rig.trips import FULL_COUNT
 from jaxfinger.rig.waits import AtPose, Elapsed, Passes, Steady, reached
-from jaxfinger.rig.watch import INTERRUPTED, Watch
+from jaxfinger.rig.watch import Watch
 
 # s of samples that are still recorded after a stop. The controller needs 0.7 s of them to release all tension.
 AFTER_TRIP_S = 1.0

@@ -8,6 +8,7 @@ from types import FrameType
 from typing import Any
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, kill, a closed terminal
+INTERRUPTED = "the run was interrupted"  # said after one of them
 
 
 class Interrupts:

@@ -24,7 +24,7 @@ from jaxfinger.rig.contract import Trip
 from jaxfinger.rig.operator import Operator
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.safety import Violation
-from jaxfinger.rig.signals import Interrupts
+from jaxfinger.rig.signals import INTERRUPTED, Interrupts
 
 PERIOD_S = 0.02  # s between two checks: the most that it adds to the time from stop key to STOP
 # s between two heartbeats: a fifth of the 0.25 s after which the controller releases the finger, so that one that comes
@@ -34,7 +34,6 @@ BEAT_S = 0.05
 # other threads may have been late for the same reason.
 MAX_COUNTED_S = 0.1
 JOIN_S = 1.0  # s that closing waits for a watch that hangs; the thread is then left behind
-INTERRUPTED = "the run was interrupted"
 
 
 class Watch:
@@ -97,15 +96,15 @@ class Watch:
         passed, self._checked = min(now - self._checked, MAX_COUNTED_S), now
         if self.reader.violation is not None or self.reader.error is not None:
             return  # The rig is being stopped, or nothing reads it: no heartbeat.
-        if (cause := self._key() or self._silence(passed)) is not None:
+        if (cause := self._stop_request() or self._silence(passed)) is not None:
             self.reader.stop(cause)
         elif not self.rig.simulated_time and now - self._beaten >= BEAT_S:
             self._beaten = now
             with suppress(UserError):  # A lost connection is the reader's to report.
                 self.rig.beat()
 
-    def _key(self) -> Violation | None:
-        """OPERATOR once the stop key was pressed or a signal asked the run to end."""
+    def _stop_request(self) -> Violation | None:
+        """Violation OPERATOR once the stop key was pressed or a signal asked the run to end."""
         if self.interrupts.requested:
             return Violation.of_host(Trip.OPERATOR, self.reader.latest_seq, INTERRUPTED)
         if self.operator.stop_requested():

@@ -27,7 +27,9 @@ from .specimens import Specimen
 
 COARSE = {250.0: 25.0, 1000.0: 60.0, 200.0: 40.0}  # Hz by a log's rate: enough for an rms over a trial
 MIN_SEVERITY = 1e-9  # of a departure without any trace: its logarithm has to exist
-SLIDING_SPEED = 0.03  # rad/s: a faster joint slides. Lower than in `closure`, since these speeds carry no noise.
+SLIDING_SPEED = (
+    0.03  # rad/s, a tenth of the slowest sweep of `protocols`. Speeds carry no noise here, as they do in `closure`.
+)
 TAUT_TENSION = 0.3  # N, above which a tendon counts as taut: 15 times the noise of its sensor
 
 

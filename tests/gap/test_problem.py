@@ -142,7 +142,7 @@ def test_the_later_of_two_rounds_of_one_score_is_kept(problem, monkeypatch, scor
     rounds = [replace(baseline.null, linear_fit=fit) for fit in fits]
     left = iter(rounds)
     monkeypatch.setattr("jaxfinger.gap.exact.fit_at_nominal", lambda *_: next(left))
-    monkeypatch.setattr("jaxfinger.gap.exact._with_nominal_refitted", lambda *_: problem)
+    monkeypatch.setattr("jaxfinger.gap.exact._with_nominal_refitted", lambda *_: (problem, fit))
     assert fit_set(baseline, problem, [], [], plain(baseline)) is rounds[kept]
 
 
