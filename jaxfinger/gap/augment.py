@@ -23,7 +23,7 @@ from jaxfinger.identify.cluster_robust import growth, stretch_scores
 from jaxfinger.identify.fit import StageReport
 from jaxfinger.identify.parameters import describe, ravel, units_at
 from jaxfinger.identify.prior import Prior
-from jaxfinger.identify.solve import Solution, Source, linearise_each, residuals_each, solve
+from jaxfinger.identify.solve import Solution, Source, residuals_each, solve, white_tangents
 from jaxfinger.model import Model
 
 WITH_EFFECTS = "with the effects of the diagnosis"
@@ -57,11 +57,11 @@ def augmented_fit(problem: Problem, chosen: SearchState, hold: bool = False) -> 
     sources = {e: _seeing_effects(problem, s, chosen.effects, moving, e) for e, s in problem.sources.items()}
     if hold:
         fitted, solution = solve(model, problem.free, sources, problem.prior)
-        linearised = linearise_each(fitted, sources)
+        white = white_tangents(fitted, sources)
     else:
         fitted, solution = solve(model, free, sources, prior, limits=limits(model, free, problem.scales))
-        linearised = solution.linearised
-    r, J = assemble(linearised, sources, problem.rows, free, ravel(model).size)
+        white = solution.linearised
+    r, J = assemble(white, sources, problem.rows, free, ravel(model).size)
     fit = _fit(problem, fitted, free, _covariance(problem, r, J, prior.root, chosen), r, WITH_EFFECTS, solution)
     return Fitted(fit, r, J, partial(residuals_by, sources))
 

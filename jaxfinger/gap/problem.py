@@ -7,6 +7,7 @@ what they can absorb, which is no evidence (theorem of Frisch, Waugh and Lovell)
 Jacobian; `signatures` makes W ∂ŷ/∂a; `projector` projects.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -24,11 +25,11 @@ from jaxfinger.gap.merged_trials import MergedTrials, merged_trials
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.cluster_robust import stretches
-from jaxfinger.identify.linearise import Linearised
+from jaxfinger.identify.linearise import White
 from jaxfinger.identify.noise import Noise, estimate, history
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.prior import Prior, prior_of
-from jaxfinger.identify.solve import Source, linearise_each, solve
+from jaxfinger.identify.solve import Source, solve, white_tangents
 from jaxfinger.identify.stages import (
     Progress,
     cad_prior,
@@ -233,8 +234,8 @@ def moved(problem: Problem, by: Float[np.ndarray, " p"]) -> Problem:
     """The problem at another nominal model, whose free parameters differ by `by`; residuals and Jacobian are exact."""
     at = Free.at(problem.nominal, problem.free)
     nominal = at.set(problem.nominal, jax.device_put(np.asarray(at.get(problem.nominal)) + by))
-    linearised = linearise_each(nominal, problem.sources)
-    return replace(problem, **_at(nominal, linearised, problem.sources, problem.rows, problem.free, problem.prior))
+    white = white_tangents(nominal, problem.sources)
+    return replace(problem, **_at(nominal, white, problem.sources, problem.rows, problem.free, problem.prior))
 
 
 def imagined(problem: Problem, stacks: dict[str, Stack]) -> Problem:
@@ -253,8 +254,8 @@ def imagined(problem: Problem, stacks: dict[str, Stack]) -> Problem:
         else sources_of({e: stack}, {e: stack.experiment.channels}, known, describe(problem.nominal))[e]
         for e, stack in stacks.items()
     }
-    rows, linearised = _layouts(stacks, sources), linearise_each(problem.nominal, sources)
-    at = _at(problem.nominal, linearised, sources, rows, problem.free, problem.prior)
+    rows, white = _layouts(stacks, sources), white_tangents(problem.nominal, sources)
+    at = _at(problem.nominal, white, sources, rows, problem.free, problem.prior)
     groups = _groups(stacks, rows, problem.nominal)
     return replace(problem, stacks=stacks, sources=sources, rows=rows, groups=groups, noise=known, **at)
 
@@ -275,9 +276,9 @@ def _noise_elsewhere(problem: Problem, channel: str, columns: int) -> Noise:
     return Noise.white(std, "elsewhere")
 
 
-def _at(nominal: Model, linearised: dict[str, Linearised], sources, rows, free, prior: Prior) -> dict[str, Any]:
+def _at(nominal: Model, white: Mapping[str, White], sources, rows, free, prior: Prior) -> dict[str, Any]:
     """The fields of a problem that depend on its nominal model."""
-    r, J = assemble(linearised, sources, rows, free, ravel(nominal).size)
+    r, J = assemble(white, sources, rows, free, ravel(nominal).size)
     return {
         "nominal": nominal,
         "r": r,
@@ -285,8 +286,8 @@ def _at(nominal: Model, linearised: dict[str, Linearised], sources, rows, free, 
         "offset": np.asarray(prior.root) @ (np.asarray(ravel(nominal))[free] - np.asarray(prior.mean)),
         "predicted": {
             (e, c): np.asarray(sources[e].batch.y[c]) - np.asarray(residuals)
-            for e, lin in linearised.items()
-            for c, residuals in lin.residuals.items()
+            for e, x in white.items()
+            for c, residuals in x.residuals.items()
         },
     }
 
@@ -305,18 +306,18 @@ def _layouts(stacks: dict[str, Stack], sources: dict[str, Source]) -> dict[str, 
 
 
 def assemble(
-    linearised: dict[str, Linearised], sources: dict[str, Source], rows: dict[str, Rows], free: np.ndarray, size: int
+    white: Mapping[str, White], sources: dict[str, Source], rows: dict[str, Rows], free: np.ndarray, size: int
 ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N p"]]:
     """Stack white residuals (N,) and the derivatives of white predictions by the free parameters (N, p).
 
     `size` is the length of the flat vector of all parameters, of which `free` are positions.
     """
     r, J = [], []
-    for e, lin in linearised.items():
+    for e, x in white.items():
         keep = rows[e].keep
-        r.append(np.asarray(lin.white).reshape(-1)[keep])
+        r.append(np.asarray(x.white).reshape(-1)[keep])
         full = np.zeros((keep.size, size))
-        full[:, sources[e].positions] = -np.asarray(lin.jacobian).reshape(-1, lin.jacobian.shape[-1])[keep]
+        full[:, sources[e].positions] = -np.asarray(x.jacobian).reshape(-1, x.jacobian.shape[-1])[keep]
         J.append(full[:, free])
     return np.concatenate(r), np.concatenate(J)
 
@@ -340,8 +341,8 @@ def _with_unfitted(
     unfitted = [i for i in unfitted if len(parameters[i].spans) < 2 or can_determine(parameters[i], coverage)]
     start = start_values(fit.model, np.array(unfitted, dtype=int), parameters, sources)
     seen = set()
-    for e, lin in linearise_each(start, sources if unfitted else {}).items():
-        seen |= set(sources[e].positions[np.any(lin.factor[..., :-1] != 0.0, axis=(0, 1))])
+    for e, x in white_tangents(start, sources if unfitted else {}).items():
+        seen |= set(sources[e].positions[np.any(x.jacobian != 0.0, axis=(0, 1))])
     added = np.array([i for i in unfitted if i in seen], dtype=int)
     return start_values(fit.model, added, parameters, sources), np.union1d(free, added).astype(int)
 

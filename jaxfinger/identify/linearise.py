@@ -12,6 +12,7 @@ minimises that cost: the sum of squares of s is 2 Σ H(r), and its gradient is 2
 """
 
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, TypeVar
 
@@ -46,12 +47,19 @@ class Tangent(NamedTuple):
         return Tangent({c: r + np.tensordot(by, self.slopes[c], 1) for c, r in self.residuals.items()}, self.slopes)
 
 
-class Linearised(NamedTuple):
-    """Residuals of one experiment at a model, and its compressed Jacobian by p free parameters."""
+@dataclass(frozen=True)
+class White:
+    """Residuals of one experiment at a model, and its Jacobian by p free parameters, both white."""
 
     residuals: dict[str, Float[np.ndarray, "_columns B T"]]  # measured − predicted, by channel, in the channel's unit
     white: Float[np.ndarray, "B rows"]  # the same, white and flat, before Huber's cost
     jacobian: Float[np.ndarray, "B rows p"]  # J of the white residuals, before Huber's cost
+
+
+@dataclass(frozen=True)
+class Linearised(White):
+    """The same, compressed."""
+
     factor: Float[np.ndarray, "B k p+1"]  # triangular factor of [J r] under Huber's cost
 
     def moved(
@@ -185,9 +193,15 @@ def whitened(
 
     `limit`: Huber's, in standard deviations, 0 for none. `weights`: of the trials, 1 by default.
     """
-    white = white_of(along.residuals, batch, filters)
-    J = _white_jacobian(along.slopes, batch, filters)
-    return Linearised(along.residuals, white, J, factored(white, J, limit, weights))
+    x = white_tangent(along, batch, filters)
+    return Linearised(x.residuals, x.white, x.jacobian, factored(x.white, x.jacobian, limit, weights))
+
+
+def white_tangent(along: Tangent, batch: Batch, filters: Filters) -> White:
+    """Whiten a tangent, without compressing it."""
+    return White(
+        along.residuals, white_of(along.residuals, batch, filters), _white_jacobian(along.slopes, batch, filters)
+    )
 
 
 def factored(

@@ -33,9 +33,11 @@ from jaxfinger.identify.linearise import (
     Filters,
     Linearised,
     Tangent,
+    White,
     residuals_by_tangent,
     tangent,
     triangular,
+    white_tangent,
     whitened,
 )
 from jaxfinger.identify.parameters import Free, describe, ravel
@@ -276,6 +278,17 @@ def linearise_each(
         return known.at(name, model, s, huber, free is not None and s.is_affine(model, free), parts)
 
     return dict(zip(sources, side_by_side(one, sources), strict=True))
+
+
+def white_tangents(model: Model, sources: dict[str, Source]) -> dict[str, White]:
+    """White residuals and Jacobian of every experiment at the model, not compressed."""
+
+    def one(s: Source) -> White:
+        relevant = s.relevant_model(model)
+        along = tangent(relevant, Free.at(relevant, s.positions), s.batch, tuple(s.filters))
+        return white_tangent(along, s.batch, s.filters)
+
+    return dict(zip(sources, side_by_side(one, sources.values()), strict=True))
 
 
 def residuals_each(
