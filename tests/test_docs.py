@@ -1,5 +1,6 @@
-"""Commands in the documentation run, each in a folder that holds the files it names."""
+"""Commands in the documentation run, each in a folder that holds the files it names; what it names is in the code."""
 
+import ast
 import math
 import os
 import pty
@@ -8,6 +9,7 @@ import runpy
 import shlex
 import shutil
 import sys
+from functools import cache
 from pathlib import Path
 
 import matplotlib as mpl
@@ -32,16 +34,16 @@ PATHS = ({"T1": "[0.008, 1e-3]", "T2": "[-0.008, -1e-3]"}, "[terms.joints.MCP]\n
 MEANS = {"SESSION": "session.h5", "SESSION.h5": "session.h5", "B.h5": "session.h5", "C.h5": "unseen.h5"}
 MEANS |= {"FILE": "session.h5", "FIT": "fit.json", "A-fit.json": "fit.json", "LOG": "LOG.csv", "bench.toml": "rig.toml"}
 MEANS |= {"…": ""}  # stands for more arguments of the same kind
+FENCED = r"```(\w*)[^\n]*\n(.*?)```"
 MATRIX = "jaxfinger.rig.matrix"  # tests/rig/test_matrix.py runs it and compares its table with the page
 
 
 def commands(page: Path) -> list[str]:
     """Commands of jaxfinger on a page, from shell blocks and from within sentences."""
     text = page.read_text(encoding="utf-8")
-    fenced = r"```(\w*)[^\n]*\n(.*?)```"
     shells = {"sh", "console"} if page == GUIDE else {"sh", "bash", "console"}  # test_guide runs its `bash` blocks
-    blocks = [block for language, block in re.findall(fenced, text, re.DOTALL) if language in shells]
-    prose = re.sub(fenced, "", text, flags=re.DOTALL)
+    blocks = [block for language, block in re.findall(FENCED, text, re.DOTALL) if language in shells]
+    prose = re.sub(FENCED, "", text, flags=re.DOTALL)
     blocks += re.findall(r"\n\n((?:    [^\n]*\n)+)", prose)
     lines = "".join(blocks).replace("\\\n", " ").replace("&&", "\n").replace(".venv/bin/", "").splitlines()
     lines += [" ".join(inline.split()) for inline in re.findall(r"`([^`]+)`", prose)]
@@ -176,3 +178,116 @@ def test_every_module_that_the_pages_run_says_how(module, monkeypatch, capsys):
         runpy.run_module(module, run_name="__main__")
     assert not end.value.code
     assert "usage" in capsys.readouterr().out
+
+
+# Names ----------------------------------------------------------------------------------------------------------------
+FOLDERS = ("jaxfinger", "benchmarks", "datasets", "docs", "notebooks")
+CODE = [p for folder in FOLDERS for p in sorted((ROOT / folder).rglob("*.py"))]
+TESTS = sorted((ROOT / "tests").rglob("*.py"))
+SETTINGS = [ROOT / "pyproject.toml", *(ROOT / "docs").glob("*.toml"), *(ROOT / "fits").glob("*.toml")]
+CONTROLLER = sorted((ROOT / "docs").glob("*.st"))
+TOLD = [*PAGES, ROOT / "CHANGELOG.md", *CODE]
+COMMAND = r"(?:jaxfinger|python|source|apt-get|\.venv/\S+) "  # other tests run those of ours
+# Words in backticks that are no names of ours: a reader's, those of other programs and of another laboratory's files.
+OTHERS = {"OUT", "TRUTH", "PORT", "NNN", "month", "prox", "m1", "u_c", "stamp_ms", "joint_states", "lint"}
+OTHERS |= {"BSpline", "next_fast_len", "wiener", "qm", "qg", "kp", "vir", "gtau", "pulses_N"}
+WRITTEN = {"drag.py", "mine.py", "commands.md", "causes.md", "table.md", "scores/table.md"}  # by a reader or a command
+
+
+@cache
+def parts(file: Path) -> tuple[str, str]:
+    """Code of a file without comments and docstrings; and these, or the sentences of a page."""
+    text = file.read_text(encoding="utf-8")
+    if file.suffix == ".md":
+        return "", re.sub(FENCED, "", text, flags=re.DOTALL)
+    tree, told = ast.parse(text), re.findall(r"#(.*)", text)
+    for n in ast.walk(tree):
+        if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant) and isinstance(n.value.value, str):
+            told.append(n.value.value)
+            n.value.value = None
+    return ast.unparse(tree), "\n".join(told)
+
+
+def words(text: str) -> list[str]:
+    """Names of two letters and more, in plain letters."""
+    return [w for w in re.findall(r"[^\W\d]\w+", text) if w.isascii()]
+
+
+@cache
+def names(file: Path) -> frozenset[str]:
+    """Words of a file's code."""
+    return frozenset(words(parts(file)[0]))
+
+
+def quoted(file: Path) -> list[str]:
+    """What the sentences of a page, or the docstrings and comments of code, write in backticks, commands left out."""
+    found = (" ".join(x.split()) for x in re.findall(r"`([^`]+)`", parts(file)[1]))
+    return [x for x in found if not re.match(COMMAND, x)]
+
+
+def shown(found: list) -> list[str]:
+    """Each file with what it names, for the message of a test that fails."""
+    return [f"{file.relative_to(ROOT)}: {text}" for file, text, *_ in found]
+
+
+def test_every_name_in_backticks_is_in_the_code():
+    files = " ".join(str(p.relative_to(ROOT)) for p in [*CODE, *TESTS, *TOLD, *CONTROLLER, *ROOT.glob("*.cff")])
+    known = OTHERS.union(words(files), *map(names, CODE))
+    known = known.union(*(words(p.read_text(encoding="utf-8")) for p in [*SETTINGS, *CONTROLLER]))
+    tests = "".join(re.findall(r"def (test_\w+)", "".join(p.read_text(encoding="utf-8") for p in TESTS)))
+    named = [(file, text, word) for file in TOLD for text in quoted(file) for word in words(text)]
+    assert len(named) > 2000
+    assert shown([x for x in named if x[2] not in known and x[2] not in tests]) == []
+
+
+def test_a_dotted_name_is_in_the_module_or_class_that_it_starts_with():
+    homes: dict[str, list[Path]] = {}
+    for p in CODE:
+        classes = re.findall(r"^class (\w+)", p.read_text(encoding="utf-8"), re.MULTILINE)
+        for owner in (p.parent.name if p.stem == "__init__" else p.stem, *classes):
+            homes.setdefault(owner, []).append(p)
+    endings = {"h5", "json", "csv", "py"}
+    dotted = r"(?!S\.)(?:\w+\.)*?(\w+)\.(\w+)(?:\(.*\))?"  # S is a structure of MATLAB
+    named = [(f, text, *m.groups()) for f in TOLD for text in quoted(f) if (m := re.fullmatch(dotted, text))]
+    named = [x for x in named if x[2] in homes and x[3] not in endings]
+    assert len(named) > 50
+    assert shown([x for x in named if x[3] not in homes and not any(x[3] in names(p) for p in homes[x[2]])]) == []
+
+
+def test_every_file_that_is_named_is_there():
+    alone = {p.name for p in [*CODE, *TESTS, *PAGES]}
+    pattern = r"(?<![\w./<>:-])[\w-]+(?:/[\w.-]+)*\.(?:py|md|cff)\b"
+    named = [(f, path) for f in TOLD for path in re.findall(pattern, parts(f)[1]) if path not in WRITTEN | alone]
+    assert len(named) > 100
+    places = (ROOT, ROOT / "jaxfinger")
+    assert shown([x for x in named if not any((p / x[1]).exists() for p in (*places, x[0].parent))]) == []
+
+
+def test_every_option_that_is_named_is_one():
+    pattern = r"(?<![\w-])--[a-z][\w-]*"
+    known = {"--help", *re.findall(pattern, app.generate_docs(recursive=True, include_hidden=True))}
+    known.update(*(re.findall(pattern, parts(p)[0]) for p in CODE))
+    named = [(f, text, option) for f in TOLD for text in quoted(f) for option in re.findall(pattern, text)]
+    assert len(named) > 30
+    assert shown([x for x in named if x[2] not in known]) == []
+
+
+def test_a_name_in_a_file_is_defined_there():
+    """As in `propagate` in `identify/propagate.py`, and for lists of names."""
+    pattern = r"((?:`[\w.]+`(?:, | and )?)+)\s+in\s+`([\w/]+\.py)`"
+    found = [(f, file, w) for f in PAGES for some, file in re.findall(pattern, parts(f)[1]) for w in words(some)]
+    assert len(found) > 10
+    for page, file, name in found:
+        text = (ROOT / "jaxfinger" / file).read_text(encoding="utf-8")
+        assert re.search(rf"^ *(?:(?:def|class) {name}\b|{name} ?[:=])", text, re.MULTILINE), f"{page}: {name}"
+
+
+def test_every_line_of_code_on_a_page_is_in_its_file():
+    """Blocks whose title is a file of the package hold lines of it, in their order."""
+    text = "".join(p.read_text(encoding="utf-8") for p in PAGES)
+    blocks = re.findall(r'```python title="(.+?)"\n(.*?)```', text, re.DOTALL)
+    assert len(blocks) > 10
+    for file, block in blocks:
+        lines = iter((ROOT / "jaxfinger" / file).read_text(encoding="utf-8").splitlines())
+        rest = (line.strip() for line in lines)
+        assert [line for line in block.splitlines() if line.strip() not in rest] == [], file

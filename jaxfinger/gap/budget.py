@@ -1,8 +1,8 @@
 """The share of each cause in the gap of each channel, on trials that no fit has seen.
 
-Each third of the trials is held out in turn. On the others the amplitudes and shapes of the causes are refitted in the
-weights of the formula, and then the nominal parameters to what the causes leave. The same is done with each cause alone
-taken out. With E the mean square of held-out white residuals, the share of cause i is
+Each third of the trials is held out in turn. On the others the amplitudes and shapes of the causes are refitted, where
+a column that they leave open weighs less, and then the nominal parameters to what the causes leave. The same is done
+with each cause alone taken out. With E the mean square of held-out white residuals, the share of cause i is
 
     (E without i − E with all) / (E of the nominal model − 1),
 

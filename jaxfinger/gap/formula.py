@@ -32,7 +32,8 @@ inexact form of its law may leave, and K_u that of what unknown causes leave. Fr
 5. Amplitudes. The unit of an amplitude a changes the prediction by as much as the nominal model misses in all, and its
    prior is N(0, 1). Nominal parameters θ are refitted with every set, under their own prior. The maximum is found by
    iteratively reweighted least squares: −2 ∂log L/∂e_c = 1 / v_c weighs the features, and
-   −2 ∂log L/∂o_c = 1 / (1 + max(o_c − m_c, 0) / ν) all other directions, the bounds of step 3 held fixed.
+   −2 ∂log L/∂o_c = 1 / (1 + max(o_c − m_c, 0) / ν) all other directions, the bounds of step 3 held fixed. Where
+   o_c < m_c, (L) is flat in o_c; there these directions keep the weight 1 of noise.
 
 6. Evidence. Laplace's approximation, with G the information on the amplitudes once θ is refitted, gives
 

@@ -1,10 +1,10 @@
 """The gap as one whitened regression: residuals of all trials after a refit of the nominal parameters to all of them.
 
-    r = y − ŷ(θ̂),   r̃ = (I − Q Qᵀ) W r,   z̃ = (I − Q Qᵀ) W ∂ŷ/∂a
+    r = y − ŷ(θ̂),   r̃ = (I − Q Qᵀ) W r,   z̃ = (I − Q Qᵀ) W Δŷ
 
-W whitens by the noise of each channel. Q spans the whitened Jacobian of the nominal parameters: the projection removes
-what they can absorb, which is no evidence (theorem of Frisch, Waugh and Lovell). This module makes W r and the whitened
-Jacobian; `signatures` makes W ∂ŷ/∂a; `projector` projects.
+W whitens by the noise of each channel. Δŷ is the change of the predictions by a cause. Q spans the whitened Jacobian of
+the nominal parameters: the projection removes what they can absorb, which is no evidence (theorem of Frisch, Waugh and
+Lovell). This module makes W r and the whitened Jacobian; `signatures` makes W Δŷ; `projector` projects.
 """
 
 from collections.abc import Mapping

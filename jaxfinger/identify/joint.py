@@ -1,6 +1,6 @@
 """Joint refinement: every parameter of equation (1) from all trials at once.
 
-    min_θ  Σ_trials ‖white residuals(θ)‖² + ‖Λ^½ (θ − μ)‖²
+    min_θ  Σ_trials Huber(white residuals(θ)) + ½ ‖Λ^½ (θ − μ)‖²
 
 The prior, of mean μ and precision Λ, is an earlier fit of other recordings with its full covariance. Where the earlier
 fit used these same recordings it gives only the start, and the prior is the finger's description, so that no data are
@@ -47,7 +47,7 @@ RESTART_CHI2 = 1.3
 
 
 def refine(session: Session, fit: Fit, progress: Progress = lambda message: None, ahead: bool = False) -> Fit:
-    """Refine a fit on all trials of `recipe.fit.joint_experiments` at once.
+    """Refine a fit on all trials of the recipe's `joint_experiments` at once.
 
     The last stage report says by how much intervals have changed. With `ahead` the fit also reads VD.3, by the angles
     that it predicts a short time ahead (`shooting`).

@@ -3,7 +3,10 @@
 With J_F the white Jacobian of a stage's free parameters, Λ the prior's precision, J_O the Jacobian of the other
 parameters, and Σ_OO their covariance,
 
-    K = (J_Fᵀ J_F + Λ)⁻¹ J_Fᵀ J_O,   Σ_FF = (J_Fᵀ J_F + Λ)⁻¹ + K Σ_OO Kᵀ,   Σ_FO = −K Σ_OO.
+    K = (J_Fᵀ J_F + Λ)⁻¹ J_Fᵀ J_O,   Σ_FF = G (J_Fᵀ J_F + Λ)⁻¹ G + K Σ_OO Kᵀ,   Σ_FO = −K Σ_OO.
+
+Where residuals are larger than the noise, J_F and J_O are taken over √χ². G is diagonal: the factors of
+`cluster_robust.growth`.
 """
 
 import numpy as np
