@@ -10,7 +10,7 @@ Where residuals are larger than the noise, J_F and J_O are taken over √χ². G
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxfinger.identify.cluster_robust import growth, stretch_scores, stretches
 from jaxfinger.identify.prior import Prior
@@ -19,6 +19,9 @@ from jaxfinger.identify.solve import Solution, Source
 # A parameter is undetermined where its entry in an undetermined combination exceeds this. Rounding changes entries by
 # about 1e-9 only (machine precision over the least relative singular value, 1e-7).
 MIN_SHARE = 1e-3
+# An estimate depends on another parameter if it moves by more than this, in standard deviations, where that parameter
+# moves by the unit of its own column. It is small, since an undetermined parameter may be off by many units.
+MIN_DEPENDENCE = 1e-6
 
 
 def laplace(
@@ -68,10 +71,21 @@ def propagate(
     out[np.ix_(others, free)] = out[np.ix_(free, others)].T
     undetermined = np.any(np.abs(solution.invisible) > MIN_SHARE, axis=0)
     # An estimate that depends on an undetermined parameter is undetermined, too.
-    dependence = inverse @ information[np.ix_(free, unknown)] * np.sqrt(np.diag(information)[unknown])
-    undetermined |= np.any(np.abs(dependence) > MIN_SHARE * np.sqrt(np.diag(inverse))[:, None], axis=1)
+    undetermined |= depends(inverse, information[np.ix_(free, unknown)], np.diag(information)[unknown])
     out[free[undetermined], free[undetermined]] = np.inf
     return out
+
+
+def depends(
+    inverse: Float[np.ndarray, "p p"], cross: Float[np.ndarray, "p u"], own: Float[np.ndarray, " u"]
+) -> Bool[np.ndarray, " p"]:
+    """Whether each of p estimates depends on any of u other parameters, whatever their units.
+
+    `inverse`: covariance of the estimates. `cross`: information on both, J_FᵀJ_O. `own`: diagonal of J_OᵀJ_O.
+    """
+    unit = 1.0 / np.sqrt(np.where(own > 0.0, own, np.inf))
+    moves = np.abs(inverse @ cross) * unit
+    return np.any(moves > MIN_DEPENDENCE * np.sqrt(np.diag(inverse))[:, None], axis=1)
 
 
 def _scores(solution: Solution, sources: dict[str, Source], size: int, limit: float) -> Float[np.ndarray, "b P"]:
