@@ -15,6 +15,8 @@ from pathlib import Path
 import matplotlib as mpl
 import pytest
 from cyclopts import MissingArgumentError
+from mkdocs.config import load_config
+from mkdocs.structure.files import get_files
 
 from jaxfinger.cli import main
 from jaxfinger.cli.app import app
@@ -291,3 +293,8 @@ def test_every_line_of_code_on_a_page_is_in_its_file():
         lines = iter((ROOT / "jaxfinger" / file).read_text(encoding="utf-8").splitlines())
         rest = (line.strip() for line in lines)
         assert [line for line in block.splitlines() if line.strip() not in rest] == [], file
+
+
+def test_the_site_holds_pages_and_pictures_alone():
+    files = get_files(load_config(str(ROOT / "mkdocs.yml")))
+    assert {Path(f.src_uri).suffix for f in files if f.inclusion.is_included()} == {".md", ".png"}
