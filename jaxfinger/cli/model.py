@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from json import loads
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +9,7 @@ from cyclopts import Parameter
 
 from jaxfinger.cli.output import Output, print_json, progress, read, refuse_output
 from jaxfinger.errors import UserError, counted
+from jaxfinger.fit_content import read_content
 
 Experiments = Annotated[list[str] | None, Parameter(name=["--experiments", "-e"], consume_multiple=True)]
 
@@ -340,8 +340,8 @@ def show(fit: Path, *, effects: Path | None = None, json: bool = False) -> None:
     json
         Print it as JSON.
     """
-    content = _written_content(fit)
-    if content is None:
+    content = read_content(fit)
+    if "seen" not in content:  # A fit written by `save` lacks what people read.
         from jaxfinger.cli.tables import fit_to_read
         from jaxfinger.identify import load_fit
 
@@ -350,15 +350,6 @@ def show(fit: Path, *, effects: Path | None = None, json: bool = False) -> None:
         _report(content, json)
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise UserError(f"{fit}: is damaged ({error!r}); identify the session again") from None
-
-
-def _written_content(path: Path) -> dict | None:
-    """Content of a fit file with what `fit_to_read` adds, so that JAX is not needed; None for any other file."""
-    try:
-        content = loads(path.read_bytes())
-    except (OSError, ValueError):
-        return None
-    return content if isinstance(content, dict) and "seen" in content else None
 
 
 def _write(fit, output: Path, overwrite: bool) -> dict:

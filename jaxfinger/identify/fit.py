@@ -15,8 +15,6 @@ from jaxfinger.identify.recipe import Recipe
 from jaxfinger.model import Effect, Model
 from jaxfinger.table import Table
 
-SCHEMA = "jaxfinger-fit/2"
-
 
 @dataclass(frozen=True)
 class StageReport:

@@ -6,7 +6,6 @@ Parameters are named as in `describe`. Only rows of the covariance whose varianc
 import json
 import os
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,7 +14,8 @@ import numpy as np
 from jaxfinger.data.atomic import atomic_path
 from jaxfinger.effects import CatalogueEffect, from_dict, load, to_dict
 from jaxfinger.errors import UserError
-from jaxfinger.identify.fit import SCHEMA, Fit, StageReport
+from jaxfinger.fit_content import SCHEMA, read_content
+from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.parameters import describe, units_at
 from jaxfinger.identify.recipe import as_dict, structure
@@ -63,9 +63,6 @@ def write_content(content: dict[str, Any], path: str | os.PathLike, overwrite: b
         part.write_text("{\n" + lines + "\n}\n", encoding="utf-8")
 
 
-HDF5 = b"\x89HDF\r\n\x1a\n"  # first bytes of an HDF5 file, such as a session
-
-
 def load_fit(path: str | os.PathLike, effects: str | os.PathLike | None = None) -> Fit:
     """Read a fit that `save_fit` wrote; `effects` is the Python file of a user's own effects in its model.
 
@@ -76,18 +73,7 @@ def load_fit(path: str | os.PathLike, effects: str | os.PathLike | None = None) 
     Raises:
         UserError: the file cannot be read, is no fit, or has been damaged.
     """
-    try:
-        raw = Path(path).read_bytes()
-        if raw.startswith(HDF5):
-            raise UserError(f"{path}: is an HDF5 file and no fit; `check` a session, or `identify` it first")
-        content = json.loads(raw.decode("utf-8"))
-    except OSError as e:
-        raise UserError(f"{path}: cannot be read ({e.strerror}); give a file that `identify` wrote") from None
-    except ValueError as e:
-        raise UserError(f"{path}: is not a fit ({e}); give a file that `identify` wrote") from None
-    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-        found = content.get("schema") if isinstance(content, dict) else None
-        raise UserError(f"{path}: has schema {found!r} where {SCHEMA!r} is read; identify the session again")
+    content = read_content(path)
     try:
         return _from_dict(content, str(path), effects)
     except KeyError as e:
