@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from jaxfinger.effects import Site
+from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY
 from jaxfinger.gap.result import (
     Cause,
     Change,
@@ -195,6 +196,8 @@ def _no_gap(d: Diagnosis) -> list[str]:
     chance = f"the probability that nothing is at work beyond it is {percent(d.none)}"
     if tolerated(d):
         return [size(d), chance if d.none >= 0.5 else "nothing is missed by more than you tolerate"]
+    if d.unlisted >= MIN_NAMED_PROBABILITY:
+        chance = "all trials together hold traces of something more, too small for any channel to show alone"
     judged = {(x.experiment, x.channel) for x in d.closures} - {(x.experiment, x.channel) for x in d.not_judged}
     return [f"{_subject(d)} predicts {_counted(len(judged))} to within the noise", chance]
 

@@ -82,6 +82,13 @@ def test_what_matters_leads_whatever_comes_first_in_the_file():
     assert "within your tolerance of 5 %" in text
 
 
+def test_traces_that_no_channel_shows_alone_are_said():
+    """A probability of one half for «nothing» would leave the reader to guess what the other half is."""
+    text = sentences.summary(replace(ALL["no_gap"], none=0.5, unlisted=0.5))
+    assert "traces of something more" in text
+    assert "50 %" not in text
+
+
 def test_what_noise_also_gives_is_no_gap_in_the_world():
     d = replace(ALL["no_gap"], relevance=(SMALL,))
     assert sentences.headline(d) == "No gap beyond the noise"
