@@ -103,7 +103,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
                 "the earlier fit led to a poorer optimum",
             ]
 
-    covariance = propagate(fit.covariance, solution, sources, free, prior, huber)
+    covariance = propagate(fit.covariance, model, solution, sources, free, prior, huber)
     warnings += implausible(model, covariance, free, parameter_bounds(start, free)[0])
     refined = replace(
         fit,
@@ -131,7 +131,7 @@ def _on_motion(fit: Fit, starts: Shooting, sources: dict[str, Source], prior: Pr
     first, _ = solve(fit.model, free, sources, prior, huber)
     sources[AHEAD] = sources[AHEAD]._replace(batch=starts.corrected(first))
     model, solution = solve(first, free, sources, prior, huber)
-    covariance = propagate(before, solution, sources, free, prior, huber)
+    covariance = propagate(before, model, solution, sources, free, prior, huber)
     moved, corrected = (np.asarray(ravel(model)) - np.asarray(ravel(m)) for m in (fit.model, first))
     covariance += _contradiction(moved, fit.std**2, np.diag(covariance)) + np.outer(corrected, corrected)
     warnings = name_invisible(parameters, free, solution.invisible)

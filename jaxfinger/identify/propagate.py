@@ -13,8 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxfinger.identify.cluster_robust import growth, stretch_scores, stretches
+from jaxfinger.identify.linearise import Linearised
 from jaxfinger.identify.prior import Prior
-from jaxfinger.identify.solve import Solution, Source
+from jaxfinger.identify.solve import Solution, Source, stacked, with_all_slopes
+from jaxfinger.model import Model
 
 # A parameter is undetermined where its entry in an undetermined combination exceeds this. Rounding changes entries by
 # about 1e-9 only (machine precision over the least relative singular value, 1e-7).
@@ -40,13 +42,14 @@ def laplace(
 
 def propagate(
     covariance: Float[np.ndarray, "P P"],
+    model: Model,
     solution: Solution,
     sources: dict[str, Source],
     free: Int[np.ndarray, " p"],
     prior: Prior | None,
     huber: float,
 ) -> Float[np.ndarray, "P P"]:
-    """Covariance of the flat vector after a stage, by the module's equation.
+    """Covariance of the flat vector after a stage whose optimum is `model`, by the module's equation.
 
     The variance of a free parameter is infinite where trials and prior do not determine it, or where its estimate
     depends on another parameter of infinite variance. Residuals larger than the noise show that the model is wrong.
@@ -55,12 +58,14 @@ def propagate(
     (`cluster_robust`).
     """
     birge = max(1.0, solution.chi2_per_row(free.size))
-    information = solution.information / birge
+    linearised = with_all_slopes(solution.linearised, model, free, sources, huber)
+    factor = stacked(linearised, sources, len(covariance))[:, :-1]
+    information = factor.T @ factor / birge
     variance = np.diag(covariance)
     others = np.setdiff1d(np.flatnonzero((variance > 0) & np.isfinite(variance)), free)
     unknown = np.setdiff1d(np.flatnonzero(np.isinf(variance)), free)
     root = np.zeros((0, free.size)) if prior is None else prior.root
-    scores = _scores(solution, sources, len(covariance), huber or np.inf)[:, free] / birge
+    scores = _scores(linearised, sources, len(covariance), huber or np.inf)[:, free] / birge
     inverse, grow = laplace(information[np.ix_(free, free)], root, scores)
     out = covariance.copy()
     out[free, :] = out[:, free] = 0.0
@@ -88,10 +93,12 @@ def depends(
     return np.any(moves > MIN_DEPENDENCE * np.sqrt(np.diag(inverse))[:, None], axis=1)
 
 
-def _scores(solution: Solution, sources: dict[str, Source], size: int, limit: float) -> Float[np.ndarray, "b P"]:
+def _scores(
+    linearised: dict[str, Linearised], sources: dict[str, Source], size: int, limit: float
+) -> Float[np.ndarray, "b P"]:
     """Scores of all stretches by the flat vector; residuals beyond Huber's limit enter with the limit."""
     out = []
-    for name, lin in solution.linearised.items():
+    for name, lin in linearised.items():
         B, wide, k = lin.jacobian.shape
         time = np.asarray(sources[name].batch.x.time) / sources[name].pace
         time = np.broadcast_to(time[:, None], (B, wide // time.shape[1], time.shape[1])).reshape(B, wide)

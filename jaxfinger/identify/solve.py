@@ -89,10 +89,10 @@ class Solution:
     linearisations: int
     cost: float  # ½ Σ s² of the white residuals under Huber's cost, without the prior
     rows: int  # number of white residuals that are not zero
-    information: Float[np.ndarray, "P P"]  # JᵀJ over the whole flat vector, without the prior
     invisible: Float[np.ndarray, "k p"]  # unit vectors of scaled parameters along the invisible combinations
     scale: Float[np.ndarray, " p"]  # unit of each scaled parameter
     outliers: float  # share of white residuals beyond the robust limit
+    # At the optimum. Derivatives by parts of the model without a free parameter may be zero (`with_all_slopes`).
     linearised: dict[str, Linearised]
 
     @property
@@ -187,13 +187,7 @@ def solve(
         if not bool(state.outcome == Outcome.running):
             break
         at = moved.set(model, jax.device_put(np.asarray(state.trial)[:p]))
-    model, linearised, _, rows = best
-    # The errors of parameters that are not free are propagated by their derivatives, which are computed at the optimum.
-    incomplete = {
-        e: s for e, s in sources.items() if not (s.is_affine(model, free) or s.parts(model) <= set(moved.parts))
-    }
-    linearised = linearised | linearise_each(model, incomplete, huber)
-    factor = stacked(linearised, sources, size)
+    model, linearised, factor, rows = best
     _, invisible, scale = visible(rows[:, :-1])
     white = np.concatenate([lin.white.ravel() for lin in linearised.values()])
     count = int(np.count_nonzero(white))
@@ -203,7 +197,6 @@ def solve(
         int(state.evaluations),
         0.5 * float(factor[:, -1] @ factor[:, -1]),
         count,
-        factor[:, :-1].T @ factor[:, :-1],
         invisible,
         scale,
         float(np.count_nonzero(np.abs(white) > huber)) / max(1, count) if huber else 0.0,
@@ -289,6 +282,19 @@ def white_tangents(model: Model, sources: dict[str, Source]) -> dict[str, White]
         return white_tangent(along, s.batch, s.filters)
 
     return dict(zip(sources, side_by_side(one, sources.values()), strict=True))
+
+
+def with_all_slopes(
+    linearised: dict[str, Linearised],
+    model: Model,
+    free: Int[np.ndarray, " p"],
+    sources: dict[str, Source],
+    huber: float = 0.0,
+) -> dict[str, Linearised]:
+    """Linearisations of `solve` at its optimum, with the derivatives by all parameters, free or not."""
+    moved = set(Free.at(model, free).parts)
+    lacking = {e: s for e, s in sources.items() if not (s.is_affine(model, free) or s.parts(model) <= moved)}
+    return linearised | linearise_each(model, lacking, huber)
 
 
 def residuals_each(

@@ -230,7 +230,7 @@ def run_stage(
     model, solution, sources, noise = estimate_with_noise(
         fit.model, free, stacks, reads, fit.noise, prior, recipe.fit.huber, tangents
     )
-    covariance = propagate(fit.covariance, solution, sources, free, prior, recipe.fit.huber)
+    covariance = propagate(fit.covariance, model, solution, sources, free, prior, recipe.fit.huber)
     warnings = name_invisible(parameters, free, solution.invisible)
     warnings += _unseen(parameters, groups, free, coverage)
     warnings += implausible(model, covariance, free, parameter_bounds(fit.model, free)[0])
