@@ -24,10 +24,25 @@ from jaxfinger.errors import UserError, counted
 _COMMENTS = ("#", "%")
 _DIALECT_LINES = 60  # They decide the dialect, and are taken from the middle of the file, after any header.
 _BOOLEANS = {"true": 1.0, "false": 0.0}
+# What programs write for a missing value: words, errors of spreadsheets, and NaN of Microsoft's C library.
+_SHEET_ERRORS = ("#n/a", "#div/0!", "#value!", "#num!", "#null!", "#ref!", "#name?")
+_MISSING = {"-", "--", "na", "n/a", "null", "none", *_SHEET_ERRORS, "1.#qnan", "-1.#ind", "1.#ind", "-nan(ind)"}
 _UNIT = r"%|°|deg|rad|turn|rev|rpm|k?Hz|[mun]?s|[munc]?m|[mk]?N|[mk]?N[ ·*]?[cm]?m|[mu]?A|[mk]?V|°?C|K|[mk]?g|1|-|bool"
 _UNIT_CELL = re.compile(rf"^[\[(]?({_UNIT}|{_UNIT}/s2?|)[\])]?$")
 _UNIT_SUFFIX = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")  # in brackets after a name
 _DATE = re.compile(r"^\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
+_HOUR = re.compile(r"\d:\d\d")  # in a time of day or a date
+_BLANKS = " \u00a0\u202f'’"  # that group digits, and are never a decimal mark
+# Numbers with groups of three digits, by decimal mark. One group alone behind the other mark is no such number: 1,234
+# may be 1234 or 1.234.
+_GROUPED = {
+    mark: re.compile(
+        rf"^[+-]?\d{{1,3}}(?:(?:[{other}]\d{{3}})+[{mark}]\d*|(?:[{other}]\d{{3}}){{2,}}|"
+        rf"(?:[{_BLANKS}]\d{{3}})+(?:[{mark}]\d*)?)$"
+    )
+    for mark, other in (".,", ",.")
+}
+_ONE_GROUP = re.compile(r"^[+-]?[1-9]\d{0,2}[.,]\d{3}$")
 _SCOPE = "SampleTime[ms]"  # header of TwinCAT Scope, which writes a column of times in ms beside each channel
 
 
@@ -39,12 +54,18 @@ class _Dialect:
     mark: str
 
     def split(self, line: str) -> list[str]:
-        """Cells of a line, with decimal points."""
+        """Cells of a line."""
         cells = line.split() if self.separator is None else next(csv.reader([line], delimiter=self.separator), [])
-        cells = [cell.strip() for cell in cells]
-        if self.mark == ",":
-            cells = [cell.replace(",", ".") if cell.count(",") == 1 else cell for cell in cells]
-        return cells
+        return [cell.strip() for cell in cells]
+
+    def number(self, cell: str) -> float | None:
+        """Number in a cell: NaN where a value is missing, None where the cell holds something else."""
+        comma = self.mark == "," and cell.count(",") == 1 and "." not in cell
+        value = _cell(cell.replace(",", ".") if comma else cell)
+        if value is None and _GROUPED[self.mark].match(cell):
+            other = "." if self.mark == "," else ","
+            return float(re.sub(f"[{other}{_BLANKS}]", "", cell).replace(",", "."))
+        return value
 
 
 # Of equally good dialects the first is taken.
@@ -63,13 +84,14 @@ class _Line:
 def load_csv(path: Path) -> Recording:
     """Load the columns of a CSV file by the names above the numbers, or as `column 0`, `column 1` and so on.
 
-    Empty cells are NaN, True and False are 1 and 0, and dates with a time of day are seconds since 1970.
+    Empty cells and words for a missing value (`-`, `#N/A`) are NaN, True and False are 1 and 0, and dates with a time
+    of day are seconds since 1970.
 
     Raises:
         UserError: the file has no column of numbers, or a line with another number of cells.
     """
     lines = [_Line(number, text) for number, text in enumerate(_lines(_decode(path.read_bytes())), 1) if text.strip()]
-    body = [line for line in lines if not line.text.lstrip().startswith(_COMMENTS)]
+    body = [line for line in lines if not _is_comment(line.text)]
     if not body:
         raise UserError(f"{path}: holds no samples; it needs a line of names, then one line a sample")
     sample = body[len(body) // 2 :][:_DIALECT_LINES]
@@ -77,14 +99,18 @@ def load_csv(path: Path) -> Recording:
     split = dialect.split
     if not any(numeric):
         raise UserError(f"{path}: holds no column of numbers; give a table with one line a sample")
-    first = next(i for i, line in enumerate(body) if _is_sample(split(line.text), numeric))
+    first = next(i for i, line in enumerate(body) if _is_sample(dialect, split(line.text), numeric))
     above = [line for line in lines if line.number < body[first].number]
     names, units, scope = _names(above, dialect, len(numeric))
     if not names and first > 0 and len(split(body[first - 1].text)) != len(numeric):
         given = counted(len(split(body[first - 1].text)), "column")
         raise UserError(f"{path}: names {given} and holds {len(numeric)}; give each column one name")
     body, remarks = body[first:], ()
-    if not names and [_cell(cell) for cell in split(body[0].text)] == list(range(len(numeric))) and len(body) > 1:
+    if (
+        not names
+        and [dialect.number(cell) for cell in split(body[0].text)] == list(range(len(numeric)))
+        and len(body) > 1
+    ):
         names, body = tuple(split(body[0].text)), body[1:]  # pandas writes such a line over unnamed columns.
     if len(body) > 1 and len(split(body[-1].text)) < len(numeric):
         body, remarks = body[:-1], ("its last line is cut short and is left out",)
@@ -92,6 +118,11 @@ def load_csv(path: Path) -> Recording:
     if scope:
         return _pairs(path, columns, faults, names, units)
     return _named(path, columns, faults, names, units, remarks)
+
+
+def _is_comment(text: str) -> bool:
+    text = text.lstrip().lower()
+    return text.startswith(_COMMENTS) and not text.startswith(_SHEET_ERRORS)
 
 
 def _lines(text: str) -> list[str]:
@@ -120,7 +151,7 @@ def _find_dialect(sample: Sequence[str]) -> tuple[_Dialect, list[bool]]:
         widths = [len(row) for row in rows]
         width = max(set(widths), key=widths.count)
         rows = [row for row in rows if len(row) == width]
-        numbers = np.array([[_cell(cell) is not None for cell in row] for row in rows])
+        numbers = np.array([[dialect.number(cell) is not None for cell in row] for row in rows])
         filled = np.array([[bool(cell) for cell in row] for row in rows])
         numeric = ((numbers & filled).sum(axis=0) * 2 > filled.sum(axis=0)) | ~filled.any(axis=0)
         share = float((numbers & filled).sum()) / max(int(filled.sum()), 1) * len(rows) / len(sample)
@@ -132,7 +163,7 @@ def _find_dialect(sample: Sequence[str]) -> tuple[_Dialect, list[bool]]:
 
 
 def _cell(cell: str) -> float | None:
-    """Number in a cell: NaN in an empty cell, None in one that holds something else."""
+    """Number with a decimal point, truth or date: NaN where it is missing, None where the cell holds something else."""
     try:
         return float(cell) if "_" not in cell else None
     except ValueError:
@@ -145,11 +176,11 @@ def _cell(cell: str) -> float | None:
             return (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp()
         except ValueError:
             return None
-    return np.nan if not cell else None
+    return np.nan if not cell or cell.lower() in _MISSING else None
 
 
-def _is_sample(cells: Sequence[str], numeric: Sequence[bool]) -> bool:
-    values = [_cell(cell) for cell, number in zip(cells, numeric, strict=False) if number]
+def _is_sample(dialect: _Dialect, cells: Sequence[str], numeric: Sequence[bool]) -> bool:
+    values = [dialect.number(cell) for cell, number in zip(cells, numeric, strict=False) if number]
     return len(cells) == len(numeric) and None not in values and not all(np.isnan(v) for v in values if v is not None)
 
 
@@ -171,11 +202,16 @@ def _names(above: Sequence[_Line], dialect: _Dialect, width: int) -> tuple[tuple
     labelled = {row[0]: tuple(row) for row in rows if row[::2] == row[:1] * (width // 2) and width % 2 == 0}
     if _SCOPE in labelled and "Name" in labelled:
         return labelled["Name"], labelled.get("Unit", ("",) * width), True
-    words = [row for row in rows if sum(_cell(cell) is None for cell in row) * 2 > width]
+    words = [row for row in rows if sum(_is_word(dialect, cell) for cell in row) * 2 > width]
     units = ("",) * width
     if len(words) > 1 and all(_UNIT_CELL.match(cell) for cell in words[0]):
         units = tuple(cell.strip("[]()") for cell in words.pop(0))
     return tuple(words[0]) if words else (), units, False
+
+
+def _is_word(dialect: _Dialect, cell: str) -> bool:
+    """Whether a cell above the numbers is a name or a unit; `-` is the unit of a ratio."""
+    return dialect.number(cell) is None or cell.lower() in _MISSING
 
 
 def _columns(
@@ -184,6 +220,7 @@ def _columns(
     """Columns as numbers and a fault for each: None with the reason where a cell is no number, else an empty string."""
     separator, width, texts = dialect.separator, len(numeric), [line.text for line in body]
     plain = all(numeric) and separator is not None and not any('"' in text for text in texts)
+    plain = plain and not (dialect.mark == "," and any("." in text for text in texts))
     if plain and all(text.count(str(separator)) == width - 1 for text in texts):
         try:  # numpy reads plain numbers much faster than the loop below.
             if dialect.mark == ",":
@@ -199,18 +236,30 @@ def _columns(
             raise UserError(
                 f"{path}: line {line.number} has {len(rows[-1])} cells, the others have {width}; correct or drop it"
             )
+    # Where both marks stand for decimals in one file, or seem to, a number such as 1,234 is not clear.
+    points = (cell for row in rows for cell in row if "." in cell and not _HOUR.search(cell))
+    mixed = dialect.mark == "," and any(_cell(cell) is not None for cell in points)
     columns: list[np.ndarray | None] = []
     faults = []
     for cells in zip(*rows, strict=True):
-        values = [_cell(cell) for cell in cells]
-        bad = next((k for k, value in enumerate(values) if value is None), None)
-        columns.append(None if bad is not None else np.array(values, np.float64))
-        faults.append(
-            ""
-            if bad is None
-            else f"holds {cells[bad]!r} in line {body[bad].number}, which is no number; correct or drop that line"
-        )
+        values = [None if mixed and _ONE_GROUP.match(cell) else dialect.number(cell) for cell in cells]
+        bad = [k for k, value in enumerate(values) if value is None]
+        columns.append(None if bad else np.array(values, np.float64))
+        faults.append(_fault(cells[bad[0]], body[bad[0]].number, len(bad) - 1) if bad else "")
     return columns, faults
+
+
+def _fault(cell: str, line: int, others: int) -> str:
+    """Why a column cannot be used, by its first cell that is no number and the count of others."""
+    more = f", and {counted(others, 'more cell')} of this kind" if others else ""
+    if _ONE_GROUP.match(cell):
+        whole, part = re.split("[.,]", cell)
+        read = f"which is {whole}.{part} or {whole}{part}"
+        return f"holds {cell!r} in line {line}, {read}{more}; write it without thousands separators"
+    mend = "empty these cells where a value is missing, else write numbers" if others else "correct or drop that line"
+    if _HOUR.search(cell):
+        mend = "write seconds, or dates as 2026-01-31 12:00:00.000"
+    return f"holds {cell!r} in line {line}, which is no number{more}; {mend}"
 
 
 def _named(path, columns, faults, names, units, remarks) -> Recording:

@@ -62,6 +62,61 @@ def test_a_word_among_numbers_is_named_with_its_line(tmp_path):
     assert "holds 'err' in line 5" in found.unusable["a"]
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        't,a\n0.00,"1,234.50"\n0.01,"12,345.0"\n0.02,"1,234,567"\n',
+        "t;a\n0.00;1,234.50\n0.01;12,345.0\n0.02;1,234,567\n",
+        "t;a\n0,00;1.234,50\n0,01;12.345,0\n0,02;1.234.567\n",
+        "t;a\n0,00;1\u202f234,50\n0,01;12\u202f345\n0,02;1\u202f234\u202f567\n",
+        "t;a\n0.00;1'234.50\n0.01;12'345\n0.02;1'234'567\n",
+    ],
+)
+def test_groups_of_three_digits(tmp_path, content):
+    found = load(tmp_path, content).variables
+    np.testing.assert_array_equal([v.values for v in found.values()], [[0.0, 0.01, 0.02], [1234.5, 12345.0, 1234567.0]])
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "t\ta\n0.010\t1,900\n0.020\t1,937\n0.030\t2,011\n",
+        't,a\n0.010,"1,900"\n0.020,"1,937"\n0.030,"2,011"\n',
+        "t;a\n0,010;1.900\n0,020;1.937\n0,030;2.011\n",
+    ],
+)
+def test_one_group_of_three_digits_is_not_taken_for_decimals(tmp_path, content):
+    found = load(tmp_path, content)
+    assert list(found.variables) == ["t"]
+    assert "in line 2, which is 1.900 or 1900, and 2 more cells" in found.unusable["a"]
+    assert "without thousands separators" in found.unusable["a"]
+
+
+def test_decimal_commas_beside_dates_with_a_point(tmp_path):
+    text = "".join(f"2024-03-01 12:00:00.00{k};1,23{k}\n" for k in range(5))
+    np.testing.assert_allclose(load(tmp_path, "t;a\n" + text).variables["a"].values, 1.23 + 0.001 * np.arange(5))
+
+
+@pytest.mark.parametrize(
+    "word", ["-", "--", "#N/A", "NA", "n/a", "NULL", "None", "nan", "#DIV/0!", "1.#QNAN", "-1.#IND"]
+)
+def test_words_for_a_missing_value(tmp_path, word):
+    found = load(tmp_path, f"a,t\n1,0\n{word},1\n3,2\n4,3\n")
+    np.testing.assert_array_equal(found.variables["a"].values, [1, np.nan, 3, 4])
+    assert found.unusable == {}
+
+
+def test_a_ratio_has_the_unit_of_a_dash(tmp_path):
+    assert [v.units for v in load(tmp_path, "t,a,b\ns,-,-\n" + NUMBERS).variables.values()] == ["s", "-", "-"]
+
+
+def test_a_time_of_day_is_told_how_to_be_written(tmp_path):
+    found = load(tmp_path, "t,a\n12:00:00.000,1\n12:00:00.010,2\n12:00:00.020,3\n")
+    assert (
+        "in line 2, which is no number, and 2 more cells of this kind; write seconds, or dates" in found.unusable["t"]
+    )
+
+
 def test_a_line_of_another_width(tmp_path):
     with pytest.raises(UserError, match=r"line 3 has 2 cells, the others have 3"):
         load(tmp_path, "t,a,b\n0,1,2\n1,2\n2,3,4\n3,4,5\n")
