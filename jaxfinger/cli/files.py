@@ -105,6 +105,8 @@ def look(*recordings: Path, finger: Path | None = None, json: bool = False) -> N
             gaps = f"{counted(clock.gaps, 'gap')}, the longest {clock.longest:.3g} s" if clock.gaps else "no gaps"
             odd = counted(clock.disordered, "stamp")
             order = f"; {odd} out of order or repeated, the rate is of sorted ones" if clock.disordered else ""
+            if clock.restarts:
+                order = f"; it begins again or wraps at {counted(clock.restarts, 'place')}"
             print(plain(f"{clock.name}: {clock.duration:.4g} s at {clock.rate:.4g} Hz, {gaps}{order}"))
         for name, reason in recording.unusable.items():
             print(plain(f"{name} {reason}"))

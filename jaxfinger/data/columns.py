@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,11 @@ _MAX_CLOCK_RATIO = 30.0
 _MIN_COVERAGE = 0.5  # of a trial: a clock that covers less is taken to be a wrong one.
 _MIN_SAMPLES = 10  # within the trial: fewer show no motion.
 _MAX_INTERVAL = 0.2  # s: a clock with longer intervals is probably in other units.
+# A stamp that is late is so by less than this, in s and in samples, since loggers write more often; and one that runs
+# back between two longer runs of samples begins another recording, or wraps.
+_MAX_LATE, _MAX_LATE_SAMPLES = 1.0, 10
+_PARTS = "choose one part by `where`, or by `rate_hz` and `span`"
+_OWN_PARTS = "give each part a file of its own"
 
 
 @dataclass(frozen=True)
@@ -132,10 +137,12 @@ class Clock:
     name: str = ""  # name of the clock's variable; empty where the sampling rate is given
     units: str = "s"
     sort: bool = False
+    restarts: bool = False  # whether the recording's times begin again within it
+    origin: float = 0.0  # s, the time from which `span` counts
 
     def keep(self, rows: np.ndarray) -> Clock:
         """Clock of these samples only, by mask or index."""
-        return Clock(self.time[rows], self.rows[rows], self.total, self.source, self.name, self.units, self.sort)
+        return replace(self, time=self.time[rows], rows=self.rows[rows])
 
 
 def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place, report: Report) -> Clock:
@@ -149,8 +156,8 @@ def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place,
     if trial.time is None:
         assert trial.rate_hz is not None
         count = len(_column(source.variable(first.from_, where), first.from_, first.column, where)[0])
-        clock = Clock(np.arange(count) / trial.rate_hz, np.arange(count), count, source)
-        return _cut(clock, trial, where)
+        rows = _chosen(trial, source, np.arange(count), count, where)
+        return _cut(Clock(rows / trial.rate_hz, rows, count, source), trial, where)
     rows_of = _first_rows(first, source, where)
     place = where / "time"
     reading = Reading(trial.time) if isinstance(trial.time, str) else trial.time
@@ -159,8 +166,11 @@ def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place,
     rows = np.arange(len(time))
     if rows_of is not None and len(rows_of) == len(rows):
         rows = rows[rows_of]
-    order = increasing_order(time[rows], f"`{reading.from_}`", trial.sort, place, report)
-    clock = Clock(time[rows][order], rows[order], len(time), source, reading.from_, reading.units or "s", trial.sort)
+    begins_again = len(restarts(time[rows])) > 0
+    rows = _chosen(trial, source, rows, len(time), where)
+    order = increasing_order(time[rows], f"`{reading.from_}`", trial.sort, _PARTS, place, report)
+    rows, units = rows[order], reading.units or "s"
+    clock = Clock(time[rows], rows, len(time), source, reading.from_, units, trial.sort, begins_again)
     return _cut(clock, trial, where)
 
 
@@ -174,38 +184,65 @@ def _first_rows(first: Column, source: Source, where: Place) -> np.ndarray | Non
     return variable.present[:, _column(variable, first.from_, first.column, where)[1]]
 
 
+def _chosen(trial: MappedTrial, source: Source, rows: np.ndarray, total: int, where: Place) -> np.ndarray:
+    """Those of the rows for which the trial's `where`, a condition on the recording's `total` rows, holds."""
+    if trial.where is None:
+        return rows
+    place, text = where / "where", trial.where
+
+    def lookup(name: str, column: Any) -> np.ndarray:
+        return _column(source.variable(name, place), name, column, place)[0]
+
+    try:
+        chosen = np.asarray(evaluate(text, lookup, source.constants))
+    except ExpressionError as error:
+        place.fail(f"{text!r} {error}")
+    if chosen.shape != (total,) or chosen.dtype != bool:
+        place.fail(f"{text!r} is no condition on the {total} samples; write one, as 'phase == 2'")
+    return rows[chosen[rows]]
+
+
 def _cut(clock: Clock, trial: MappedTrial, where: Place) -> Clock:
-    """Cut a clock by the trial's `where`, a condition on rows of the recording, and `span`, s from the first sample."""
-    if trial.where is not None:
-        place, text = where / "where", trial.where
-
-        def lookup(name: str, column: Any) -> np.ndarray:
-            return _column(clock.source.variable(name, place), name, column, place)[0]
-
-        try:
-            chosen = np.asarray(evaluate(text, lookup, clock.source.constants))
-        except ExpressionError as error:
-            place.fail(f"{text!r} {error}")
-        if chosen.shape != (clock.total,) or chosen.dtype != bool:
-            place.fail(f"{text!r} is no condition on the {clock.total} samples; write one, as 'phase == 2'")
-        clock = clock.keep(chosen[clock.rows])
-    if trial.span is not None and len(clock.time):
+    """Cut a clock by the trial's `span`, s from the first sample."""
+    if len(clock.time):
+        clock = replace(clock, origin=float(clock.time[0]))
+    if trial.span is not None:
         begin, end = trial.span
-        clock = clock.keep((clock.time - clock.time[0] >= begin) & (clock.time - clock.time[0] < end))
+        clock = clock.keep((clock.time - clock.origin >= begin) & (clock.time - clock.origin < end))
     if len(clock.time) == 0:
         where.fail("holds no sample; " + ("correct its `where`" if trial.span is None else "widen its `span`"))
     return clock
 
 
-def increasing_order(time: np.ndarray, name: str, sort: bool, where: Place, report: Report) -> np.ndarray:
-    """Indices that put times into increasing order, without repeated ones.
+def restarts(time: np.ndarray) -> np.ndarray:
+    """Indices of the samples after which a clock, s, begins again or wraps: it runs back further than late stamps do,
+    and runs on from there."""
+    steps = np.diff(time)
+    back = np.flatnonzero(steps < 0.0)
+    if not len(back):
+        return back
+    late = max(_MAX_LATE, _MAX_LATE_SAMPLES * float(np.nanmedian(np.abs(steps))))
+    runs = np.diff(np.concatenate([[-1], back, [len(time) - 1]]))
+    return back[(steps[back] < -late) & (np.minimum(runs[:-1], runs[1:]) > _MAX_LATE_SAMPLES)]
+
+
+def increasing_order(time: np.ndarray, name: str, sort: bool, choice: str, where: Place, report: Report) -> np.ndarray:
+    """Indices that put times into increasing order, without repeated ones. `choice` says how to read one part of them.
 
     Raises:
-        UserError: the times do not increase and `sort` is false.
+        UserError: the times begin again, or do not increase and `sort` is false.
     """
     late = np.diff(time) <= 0.0
     if not late.any():
         return np.arange(len(time))
+    begins = restarts(time)
+    if len(begins):
+        far = f"runs back by {time[begins[0]] - time[begins[0] + 1]:.4g} s after sample {begins[0]}"
+        far += f", and at {counted(len(begins), 'place')} in all" if len(begins) > 1 else ""
+        where.fail(
+            f"the clock {name} {far}: it begins again or wraps, and sorting would mix different times; {choice}, or "
+            "unwrap a counter by its period, as time = { from = …, unwrap = 4294967296 }"
+        )
     at, back, twice = int(np.argmax(late)), int((np.diff(time) < 0.0).sum()), int((np.diff(np.sort(time)) == 0.0).sum())
     if not sort:
         count = f"does not increase at {int(late.sum())} of {len(time)} samples, first after sample {at}"
@@ -256,10 +293,15 @@ class ColumnReader:
                 )
             return values[clock.rows]
         own_name, time = own
+        if clock.restarts:
+            where.fail(
+                f"is on the clock {own_name}, and the trial's clock `{clock.name}` begins again within the recording: "
+                f"times do not tell which part it belongs to; {_OWN_PARTS}"
+            )
         if len(time) != len(values):
             where.fail(f"has {len(values)} samples, and its clock {own_name} has {len(time)}; name its own clock")
         time, values = time[present], values[present]
-        order = increasing_order(time, own_name, clock.sort, where, self.report)
+        order = increasing_order(time, own_name, clock.sort, _OWN_PARTS, where, self.report)
         return self._onto(time[order], values[order], own_name, whole, where)
 
     def _own_clock(
@@ -329,7 +371,7 @@ class ColumnReader:
                 "or so"
             )
         if inside.mean() < _MIN_COVERAGE:
-            begin, end = trial[inside][0] - trial[0], trial[inside][-1] - trial[0]
+            begin, end = trial[inside][0] - self.clock.origin, trial[inside][-1] - self.clock.origin
             where.fail(
                 f"{runs}: it covers only a part; name another clock, or cut the trial by span = "
                 f"[{begin:.4g}, {end:.4g}]"
@@ -359,7 +401,7 @@ def _converted(values: np.ndarray, spec: Reading, units: str, source: Source, wh
     if own not in TO_SI or TO_SI[own].si != units:
         fitting = [name for name, unit in TO_SI.items() if unit.si == units]
         where.fail(f"has units {own!r}; it must be one of {listed(fitting)}, after `scale` and `offset`")
-    unwrap = spec.unwrap if isinstance(spec, Column) else False
+    unwrap = spec.unwrap
     if not isinstance(unwrap, bool):
         values = _unwrapped(values, unwrap)
     scale = single(source, spec.scale, where / "scale") if isinstance(spec.scale, str) else spec.scale

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxfinger.data.columns import restarts
 from jaxfinger.data.parse import listed
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.session import FingerDescription
@@ -85,6 +86,7 @@ class ClockSurvey:
     gaps: int  # number of gaps
     longest: float  # s, longest gap
     disordered: int  # number of stamps that do not increase
+    restarts: int  # number of places at which it begins again or wraps
 
 
 def columns_of(recording: Recording, among: Sequence[Recording] = ()) -> list[ColumnSurvey]:
@@ -131,7 +133,8 @@ def clocks_of(recording: Recording, seen: Sequence[ColumnSurvey]) -> list[ClockS
 def _clock_survey(name: str, variable: Variable, units: str) -> ClockSurvey:
     """Survey one clock, with its stamps put into order."""
     time = np.ravel(variable.values) * TO_SI[units].factor
-    steps = _steps(time)
+    begins = restarts(time)
+    steps = np.concatenate([_steps(part) for part in np.split(time, begins + 1)])
     usual = float(np.median(steps)) if len(steps) else np.nan
     gaps = steps > _MIN_GAP * usual
     return ClockSurvey(
@@ -142,6 +145,7 @@ def _clock_survey(name: str, variable: Variable, units: str) -> ClockSurvey:
         int(gaps.sum()),
         float(steps[gaps].max()) if gaps.any() else 0.0,
         int((np.diff(time) <= 0.0).sum()),
+        len(begins),
     )
 
 
@@ -246,7 +250,10 @@ def _trial_proposal(
         lines.append(f"time = {quoted(clock.name)}")
     else:
         lines.append(f'time = {{ from = {quoted(clock.name)}, units = "{clock.units}" }}')
-    if clock is not None and (np.diff(np.ravel(recording.variables[clock.name].values)) <= 0.0).any():
+    time = np.ravel(recording.variables[clock.name].values) * TO_SI[clock.units or "s"].factor if clock else np.zeros(0)
+    if len(begins := restarts(time)):
+        lines.append(f"# the time begins again after sample {begins[0]}: a trial for each part, chosen by `where`")
+    elif (np.diff(time) <= 0.0).any():
         lines.append("sort = true   # its stamps are out of order, or repeated")
     rows = {
         channel: [(name, _column(s)) for name, s in zip(names[channel], columns, strict=False)]

@@ -51,6 +51,7 @@ class Reading:
     scale: float | str = 1.0  # a number, or the name of a variable that holds one number
     offset: float = 0.0
     units: str | None = None
+    unwrap: bool | Positive = False  # true: whole turns are unwrapped; a number: the variable's period
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,6 @@ class Column(Reading):
 
     time: str | Reading | None = None  # the variable's own clock
     file: str | None = None  # the recording that holds it, where it is not the trial's
-    unwrap: bool | Positive = False  # true: whole turns are unwrapped; a number: the variable's period
 
 
 ColumnSpec = str | Column | Annotated[tuple[str | Column, ...], NotEmpty()]  # A list means the sum of its terms.

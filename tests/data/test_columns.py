@@ -30,6 +30,7 @@ def bring_in(tmp_path, torque, extra="", others=(), root="", **changes):
     recorded = {"t": TIME, "q": Q, "slow": SLOW, "tau": 0.01 * np.sin(SLOW), "now": 0.01 * np.cos(TIME)} | changes
     scipy.io.savemat(tmp_path / "log.mat", recorded)
     text = MAPPING.replace("EXTRA", extra).replace("TORQUE", torque)
+    text = text.replace('time = "t"\n', "") if "time = {" in extra else text
     (tmp_path / "m.toml").write_text(text + root)
     report = Report()
     session = import_file([tmp_path / "log.mat", *others], tmp_path / "m.toml", tmp_path / "s.h5", True, report)
@@ -90,6 +91,41 @@ def test_samples_are_sorted_on_request(tmp_path):
     trial, said = bring_in(tmp_path, '"now"', "sort = true", t=TIME[order], q=Q[order], now=0.01 * np.cos(TIME[order]))
     np.testing.assert_allclose(trial.joint_torque[:, 0], 0.01 * np.cos(TIME))
     assert any("was sorted" in text for text in said)
+
+
+AGAIN = TIME % 3.0  # the clock of a logger that was started twice
+
+
+@pytest.mark.parametrize("extra", ["", "sort = true"])
+@pytest.mark.parametrize("period", [3.0, 4.0])
+def test_a_clock_that_begins_again_is_not_sorted(tmp_path, extra, period):
+    said = r"`t` runs back by [\d.]+ s after sample \d+: it begins again or wraps, .* by `where`, .* unwrap = "
+    with pytest.raises(UserError, match=said):
+        bring_in(tmp_path, '"now"', extra, t=TIME % period)
+
+
+def test_a_condition_chooses_a_part_whose_clock_begins_again(tmp_path):
+    part = np.where(np.arange(600) < 300, 1.0, 2.0)
+    trial, _ = bring_in(tmp_path, '"now"', 'where = "part == 2"', t=AGAIN, part=part)
+    np.testing.assert_allclose(trial.time, TIME[:300], atol=1e-9)
+    np.testing.assert_allclose(trial.q[:, 0], Q[300:])
+    with pytest.raises(UserError, match="on the clock `slow`, and the trial's clock `t` begins again"):
+        bring_in(tmp_path, OWN, 'where = "part == 2"', t=AGAIN, part=part)
+
+
+def test_a_counter_that_wraps_is_unwrapped(tmp_path):
+    counts = (TIME * 1e6 + 2**32 - 3e6) % 2**32
+    reading = 'time = { from = "us", units = "us", unwrap = 4294967296 }'
+    trial, _ = bring_in(tmp_path, '"now"', reading, us=counts)
+    np.testing.assert_allclose(trial.time, TIME, atol=1e-6)
+    np.testing.assert_allclose(trial.q[:, 0], Q)
+
+
+def test_a_span_that_is_too_long_is_told_in_its_own_count(tmp_path):
+    """The advised span counts from the recording's first sample, as the given one does."""
+    short = SLOW[SLOW < 3.0]
+    with pytest.raises(UserError, match=r"cut the trial by span = \[1, 2\.95\]"):
+        bring_in(tmp_path, OWN, "span = [1.0, 6.0]", slow=short, tau=0.01 * np.sin(short))
 
 
 def test_a_column_of_another_file(tmp_path):

@@ -54,6 +54,18 @@ def test_a_shuffled_clock_is_said_and_its_rate_is_that_of_sorted_stamps(tmp_path
     assert "sort = true" in said
 
 
+def test_a_clock_that_begins_again_is_said(tmp_path, capsys):
+    path = tmp_path / "log.csv"
+    np.savetxt(path, np.column_stack([TIME % 4000.0, TIME]), "%.6f", ",", header="t,enc", comments="")
+    (clock,) = clocks_of(recording := load_recording(path), columns_of(recording))
+    assert (clock.rate, clock.restarts) == (pytest.approx(200.0), int(TIME[-1] // 4000.0))
+    main(["look", str(path)])
+    said = capsys.readouterr().out
+    assert "it begins again or wraps at" in said
+    assert "# the time begins again after sample 792: a trial for each part, chosen by `where`" in said
+    assert "sort = true" not in said
+
+
 def test_units_that_a_file_states_come_first():
     recording = load_recording(CASES / "csv-as-other-programs-write-it" / "scope.csv")
     assert {s.name: (s.units, s.stated) for s in columns_of(recording)}["tau"] == ("N m", True)
