@@ -21,6 +21,9 @@ MAX_OVERTRAVEL = 0.35  # rad, 20 degrees, that a joint may read beyond its limit
 MAX_TARE_ERROR = 0.03
 MAX_PUSH = 0.1
 COLD = 200.0  # K, −73 °C: no laboratory is colder, so lower values are in °C.
+# A converter's limit is repeated over more samples at once, by this factor, than any value within its range. At the
+# turn of a smooth motion the last step of the resolution is held up to five times as long as the one before it.
+_CLIPPED, _MIN_CLIPPED = 10, 10
 _TAUT = ("ID.2", "VD.1", "VD.3")  # experiments that keep all tendons taut
 _MIN_SAMPLES = 20  # Fewer samples show no typical step.
 _MOVES_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic")
@@ -37,6 +40,8 @@ def check_trial(trial: Trial, finger: FingerDescription, sizes: Sizes, report: R
     _channels(trial, finger, report)
     _motion(trial, finger, sizes, report)
     _constant_columns(trial, finger, report)
+    _clipped_columns(trial, finger, report)
+    _placeholders(trial, finger, report)
     _encoder_wraps(trial, finger, report)
     _magnitudes(trial, finger, sizes, report)
     _holds(trial, report)
@@ -260,11 +265,60 @@ def _constant_columns(trial: Trial, finger: FingerDescription, report: Report) -
             )
 
 
+def _clipped_columns(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Report forces and torques that stay at their highest or lowest value longer than at any other.
+
+    Zero is no limit of a converter: a tendon sensor may read zero while its tendon is slack.
+    """
+    for name in ("tendon_force", "joint_torque", "fingertip_force"):
+        values = getattr(trial, name)
+        for column, x in zip(CHANNELS[name].columns(finger), [] if values is None else values.T, strict=False):
+            if len(x) < _MIN_SAMPLES or not np.isfinite(x).all() or np.ptp(x) == 0.0 or _placeholder(x) is not None:
+                continue
+            starts = np.flatnonzero(np.diff(x, prepend=np.nan) != 0.0)
+            runs, held = np.diff(np.append(starts, len(x))), x[starts]
+            limits = [limit for limit in (x.min(), x.max()) if limit != 0.0]
+            within = int(runs[~np.isin(held, limits)].max(initial=1))
+            for limit in limits:
+                if runs[held == limit].max() > max(_CLIPPED * within, _MIN_CLIPPED):
+                    count = counted(int((x == limit).sum()), "sample")
+                    message = f"column {column} is clipped: it stays at {limit:.4g}, an end of its range, in {count}"
+                    report.warning(
+                        _place(trial, name), f"{message}; record it with a wider range, or cut these samples out"
+                    )
+
+
+def _placeholders(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Report values that stand for a missing one, such as 9999: repeated exactly, and far from all others."""
+    for name in MEASURED:
+        values = getattr(trial, name)
+        for column, x in zip(CHANNELS[name].columns(finger), [] if values is None else values.T, strict=False):
+            found = _placeholder(x)
+            if found is not None:
+                at, count = trial.time[int(np.argmax(x == found))], counted(int((x == found).sum()), "sample")
+                report.warning(
+                    _place(trial, name),
+                    f"column {column} is {found:.6g} in {count}, first at {at:.6g} s, far from all others, as where a "
+                    "number stands for a missing value; cut these samples out (`where` in a mapping)",
+                )
+
+
+def _placeholder(x: np.ndarray) -> float | None:
+    """Value of some samples that lies twice as far from the others as they span; None where there is none."""
+    if len(x) < _MIN_SAMPLES or not np.isfinite(x).all():
+        return None
+    for end in (x.min(), x.max()):
+        others = x[x != end]
+        if 1 < len(x) - len(others) < 0.5 * len(x) and np.abs(others - end).min() > 2.0 * np.ptp(others) > 0.0:
+            return float(end)
+    return None
+
+
 def _encoder_wraps(trial: Trial, finger: FingerDescription, report: Report) -> None:
     """Report encoders that wrap: no joint goes half of the whole trial's travel between two samples."""
     for k, name in enumerate(finger.joint_names):
         x = trial.q[:, k]
-        if len(x) < _MIN_SAMPLES or not np.isfinite(x).all():
+        if len(x) < _MIN_SAMPLES or not np.isfinite(x).all() or _placeholder(x) is not None:
             continue
         steps = np.abs(np.diff(x))
         jumps = steps > 0.5 * np.ptp(x)

@@ -24,6 +24,9 @@ from jaxfinger.data.session import FingerDescription, Session, Trial
 _DEGREE = 3  # of l(q): the moment arm is then a parabola over a joint's range, enough to tell a sign or a unit
 _SAMPLES = 400  # of a trial: slopes of a motion need no more.
 _MIN_ARM_SHARE = 0.25  # of the largest arm at a joint: smaller arms may change sign with the posture.
+# Shares of the largest arm at a joint: a tendon whose excursion shows less than the first stands still, and one whose
+# torque shows more than the second should not. Small arms lie between them.
+_MAX_STILL_SHARE, _MIN_FELT_SHARE = 0.05, 0.5
 # Ratio of the arm that torques show to the arm that excursions show. Friction reduces it: routed tendons lose up to two
 # thirds of their tension (the shipped session). Units that people confuse differ at least fourfold (N and lbf).
 _MIN_ARM_RATIO, _MAX_ARM_RATIO = 0.2, 1.5
@@ -75,11 +78,22 @@ class _Excursions:
     def arm(self, tendon: int, joint: int, angle: float) -> float | None:
         """Moment arm dl/dq, m/rad, at an angle; None where it is unknown or so small that it may change sign."""
         p = self.polynomials.get((tendon, joint))
-        largest = max((abs(arm) for (_, i), arm in self.arms.items() if i == joint), default=0.0)
         if p is None or not p.domain[0] - 0.1 <= angle <= p.domain[1] + 0.1:
             return None
         arm = float(p.deriv()(angle))
-        return arm if abs(arm) > _MIN_ARM_SHARE * largest and arm * self.arms[tendon, joint] > 0.0 else None
+        large = abs(arm) > _MIN_ARM_SHARE * self.largest(joint)
+        return arm if large and arm * self.arms[tendon, joint] > 0.0 else None
+
+    def largest(self, joint: int) -> float:
+        """Size of the largest mean moment arm at a joint, m/rad; 0 where none is known."""
+        return max((abs(arm) for (_, i), arm in self.arms.items() if i == joint), default=0.0)
+
+    def still(self, tendon: int, joint: int) -> bool:
+        """Whether the tendon stands still over the whole range of a joint that it crosses."""
+        p = self.polynomials.get((tendon, joint))
+        if p is None:
+            return False
+        return bool(np.abs(p.deriv()(p.linspace()[0])).max() < _MAX_STILL_SHARE * self.largest(joint))
 
 
 def thinned(x: np.ndarray) -> np.ndarray:
@@ -121,10 +135,12 @@ def _virtual_work(session: Session, kinematic: _Excursions, report: Report) -> N
             continue
         seen = kinematic.arm(k, i, float(np.nanmedian(trial.q[:, i])))
         felt = -slope(thinned(trial.tendon_force[:, k]), thinned(trial.joint_torque[:, i]))
+        still = kinematic.still(k, i) and abs(felt) > _MIN_FELT_SHARE * kinematic.largest(i)
+        seen = kinematic.arms[k, i] if still else seen
         if seen is None or not np.isfinite(felt):
             continue
         said = f"{trial.tendon} at {trial.joint} ({1e3 * seen:.3g} against {1e3 * felt:.3g} mm)"
-        ratio = felt / seen
+        ratio = np.inf if still else felt / seen
         if ratio < -_MIN_ARM_RATIO:
             turned[trial.tendon, trial.joint] = said
         elif not _MIN_ARM_RATIO < ratio < _MAX_ARM_RATIO:
@@ -212,7 +228,7 @@ def _passivity(session: Session, report: Report) -> None:
         report.warning(
             "/trials",
             f"the external motor takes work out of the joint in every cycle: {listed(found, 3)}; check the sign of "
-            "joint_torque and of q",
+            "joint_torque and of q, and whether one of the two is late",
         )
 
 

@@ -196,6 +196,34 @@ def test_temperatures_in_degrees_celsius_are_said(file):
     assert all("273.15" in m for m in said)
 
 
+@pytest.mark.parametrize("least", [True, False])
+def test_a_clipped_force_is_said(file, least):
+    """Neither a quantised force nor one that is zero while its tendon is slack is clipped."""
+    noise = 0.05 * np.random.default_rng(0).standard_normal(900)
+    pull = np.clip(5.0 + 6.0 * np.sin(np.arange(900) / 90.0), 0.0, None)
+    for force, clipped in (
+        (np.round(pull, 2), False),
+        (np.round(pull + noise, 1).clip(0.0), False),
+        (np.clip(pull + noise, 1.5, None) if least else np.clip(pull + noise, None, 8.0), True),
+    ):
+        with h5py.File(file, "r+") as opened:
+            put(opened[ID4], "tendon_force", at((slice(None), 0), force))
+        said = [f.message for f in check_file(file) if f.place == f"/{ID4}/tendon_force"]
+        assert any("column T1 is clipped: it stays at " + ("1.5" if least else "8") in m for m in said) == clipped, said
+
+
+@pytest.mark.parametrize("channel", ["q", "tendon_excursion"])
+def test_a_number_for_a_missing_value_is_said(file, channel):
+    """It is not taken for an encoder that wraps."""
+    with h5py.File(file, "r+") as opened:
+        put(opened[ID2], channel, at((slice(200, 230, 3), 0), 174.5))
+    name = "MCP" if channel == "q" else "T1"
+    said = [f.message for f in check_file(file) if f.place == f"/{ID2}/{channel}"]
+    words = f"column {name} is 174.5 in 10 samples, first at 2 s, far from all others"
+    assert any(words in m and "`where` in a mapping" in m for m in said), said
+    assert not any("wraps" in m for m in said)
+
+
 def test_a_slack_tendons_excursion_may_be_nan(file):
     with h5py.File(file, "r+") as opened:
         put(opened[ID2], "tendon_force", at((slice(0, 50), 0), 0.01))

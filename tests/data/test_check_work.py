@@ -49,6 +49,22 @@ def test_what_contradicts_is_said(sound, experiment, channel, change, words):
     assert any(words in text for text in found), found
 
 
+def test_an_excursion_that_stands_still_is_said_though_it_has_noise(sound):
+    """The tendon crosses the joint, and its pull turns the joint: the column belongs to another sensor, or to none."""
+    trial = sound["01-ID.2-MCP"]
+    excursion = trial.tendon_excursion.copy()
+    excursion[:, 0] = 0.003 + 1e-5 * np.random.default_rng(0).standard_normal(len(excursion))
+    said = complaints(replace(sound, trials={**sound.trials, trial.name: replace(trial, tendon_excursion=excursion)}))
+    assert any("T1 at MCP (" in text and "against 5 mm); check the units or the column" in text for text in said)
+
+
+def test_a_late_torque_is_not_said_to_have_the_wrong_sign_alone(sound):
+    trial = sound["03-ID.3-dynamic-MCP"]
+    late = replace(trial, joint_torque=np.roll(trial.joint_torque, 100, axis=0))
+    said = complaints(replace(sound, trials={**sound.trials, trial.name: late}))
+    assert any("check the sign of joint_torque and of q, and whether one of the two is late" in text for text in said)
+
+
 def test_most_mistakes_of_a_mapping_are_said(sound):
     """Each mistake is made in all trials alike, as a mapping makes it.
 
