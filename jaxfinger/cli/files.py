@@ -92,7 +92,7 @@ def look(*recordings: Path, finger: Path | None = None, json: bool = False) -> N
             (
                 s.name + ("" if s.column is None else f"[{s.column}]"),
                 s.meaning or "–",
-                (s.units or "?") + ("" if s.stated or not s.units else " ?"),
+                (s.units or s.foreign or "?") + ("" if s.stated or not s.units else " ?"),
                 str(s.samples),
                 f"{s.low:.5g}",
                 f"{s.high:.5g}",

@@ -20,6 +20,7 @@ MAX_OVERTRAVEL = 0.35  # rad, 20 degrees, that a joint may read beyond its limit
 # fifth or more (`data.sizes`), so a column of the wrong sign reads at least twice MAX_PUSH below zero.
 MAX_TARE_ERROR = 0.03
 MAX_PUSH = 0.1
+_MAX_DEGREES = 400.0  # Angles in degrees are smaller: a turn, with room.
 COLD = 200.0  # K, −73 °C: no laboratory is colder, so lower values are in °C.
 # A converter's limit is repeated over more samples at once, by this factor, than any value within its range. At the
 # turn of a smooth motion the last step of the resolution is held up to five times as long as the one before it.
@@ -345,7 +346,9 @@ def _magnitudes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: R
         lower, upper = finger.limits[k]
         where = f"column {name} runs from {low:.3g} to {high:.3g} rad"
         if max(-low, high) > 2.0 * np.pi:
-            report.error(_place(trial, "q"), f"{where}, more than a turn; {conversion('deg')}")
+            count = "convert counts to rad (`scale` in a mapping)"
+            mend = conversion("deg") if max(-low, high) < _MAX_DEGREES else count
+            report.error(_place(trial, "q"), f"{where}, more than a turn; {mend}")
         elif low < lower - MAX_OVERTRAVEL or high > upper + MAX_OVERTRAVEL:
             message = f"{where}, far outside its limits {lower:.3g} to {upper:.3g}; correct one or the other"
             report.warning(_place(trial, "q"), message)

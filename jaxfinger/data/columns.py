@@ -15,7 +15,7 @@ from jaxfinger.data.mapping import Column, ColumnSpec, MappedTrial, Reading, ter
 from jaxfinger.data.parse import listed
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.toml import Place
-from jaxfinger.data.units import TO_SI, unit_name
+from jaxfinger.data.units import TO_SI, is_foreign, unit_name
 from jaxfinger.errors import UserError, counted
 
 if TYPE_CHECKING:
@@ -427,6 +427,9 @@ def _compare_units(variable: Variable, spec: Column, units: str, report: Report,
         report.warning(
             where.key, f"the recording states {variable.units}, and the mapping reads {mapped}; correct one of them"
         )
+    if is_foreign(variable.units) and mapped != "1" and spec.scale == 1.0:
+        said = f"the recording states {variable.units}, and the mapping reads {mapped}"
+        report.warning(where.key, f"{said}; write `scale`, the {mapped} in one {variable.units}")
 
 
 def find(name: str, paths: Mapping[Path, Any], where: Place) -> Path:

@@ -13,7 +13,7 @@ from jaxfinger.data.parse import listed
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
-from jaxfinger.data.units import TO_SI, unit_name
+from jaxfinger.data.units import TO_SI, is_foreign, unit_name
 
 _MIN_GAP = 5.0  # times the median interval: well beyond jitter, so samples were lost.
 # Patterns of names for each channel, of which the first that fits counts: common words in logs of robots.
@@ -73,6 +73,7 @@ class ColumnSurvey:
     units: str  # as the recording states them, else a guess; empty where they are unclear
     stated: bool  # whether the recording states the units
     meaning: str  # channel, `time`, or empty
+    foreign: str = ""  # unit that the recording states and no mapping converts, such as counts
 
 
 @dataclass(frozen=True)
@@ -102,14 +103,16 @@ def columns_of(recording: Recording, among: Sequence[Recording] = ()) -> list[Co
             column = None if table.shape[1] == 1 else (variable.columns[k] if variable.columns else k)
             units, stated = unit_name(variable.units), bool(unit_name(variable.units))
             spelt = units or _spelt(name)
+            foreign = variable.units if is_foreign(variable.units) and not spelt else ""
             meaning = _meaning(name, column, x, spelt)
             if spelt:
                 units = spelt
-            elif not stated:
+            elif not stated and not foreign:
                 units = _time_unit(x) if meaning == "time" else _unit(meaning, _sizes(name, k, recording, among))
             finite = x[np.isfinite(x)]
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
-            found.append(ColumnSurvey(name, column, len(x), low, high, len(x) - len(finite), units, stated, meaning))
+            missing = len(x) - len(finite)
+            found.append(ColumnSurvey(name, column, len(x), low, high, missing, units, stated, meaning, foreign))
     return found
 
 
@@ -334,5 +337,6 @@ def _column(seen: ColumnSurvey) -> str:
     fits = {"q": "rad", "joint_torque": "N m", "tendon_force": "N", "fingertip_force": "N", "tendon_excursion": "m"}
     if seen.units and TO_SI[seen.units].si == fits.get(seen.meaning):
         parts.append(f'units = "{seen.units}"')
-    unclear = "" if seen.units else "   # units? SI as it stands"
+    said = f"it states {seen.foreign}: write `scale`" if seen.foreign else "SI as it stands"
+    unclear = "" if seen.units else f"   # units? {said}"
     return "{ " + ", ".join(parts) + " }" + unclear

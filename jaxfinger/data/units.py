@@ -42,6 +42,45 @@ TO_SI = {
 }
 _SPELT = {"°": "deg", "degrees": "deg", "µm": "um", "µs": "us", "rev": "turn", "sec": "s"}
 _SPELT |= {"°c": "degC", "degc": "degC", "celsius": "degC"}
+_SPELT |= {"degree": "deg", "radian": "rad", "radians": "rad", "turns": "turn", "revs": "turn", "revolutions": "turn"}
+_SPELT |= {"second": "s", "seconds": "s", "newton": "N", "newtons": "N"}
+# Units of other systems and of raw signals, without capitals: numbers in them are never in SI.
+_FOREIGN = {
+    "lbf",
+    "lb",
+    "lbs",
+    "ozf",
+    "oz",
+    "g",
+    "kg",
+    "in",
+    "inch",
+    "inches",
+    "ft",
+    "psi",
+    "bar",
+    "pa",
+    "kpa",
+    "v",
+    "mv",
+}
+_FOREIGN |= {
+    "mv/v",
+    "a",
+    "ma",
+    "%",
+    "rpm",
+    "count",
+    "counts",
+    "cnt",
+    "tick",
+    "ticks",
+    "pulses",
+    "bit",
+    "bits",
+    "lsb",
+    "raw",
+}
 
 
 def conversion(unit: str) -> str:
@@ -52,6 +91,11 @@ def conversion(unit: str) -> str:
     spelt = f'units = "{unit}"'
     si = TO_SI[unit].si
     return f"convert {unit} to {si} (`{f'time = {{ from = …, {spelt} }}' if si == 's' else spelt}` in a mapping)"
+
+
+def is_foreign(stated: str) -> bool:
+    """Whether a file states a unit that no mapping converts, such as lbf, V or counts."""
+    return stated.strip().lower() in _FOREIGN and not unit_name(stated)
 
 
 def unit_name(stated: str) -> str:

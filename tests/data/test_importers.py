@@ -185,6 +185,30 @@ def test_what_is_said_of_wrong_units_mends_the_mapping(mapping, tmp_path, channe
     assert [f for f in report if f.severity != "note"] == []
 
 
+@pytest.mark.parametrize(
+    ("stated", "scale", "warned"), [("lbf", 1.0, 1), ("lbf", 4.448, 0), ("N", 1.0, 0), ("x", 1.0, 0)]
+)
+def test_units_that_no_mapping_converts_need_a_scale(mapping, tmp_path, stated, scale, warned):
+    rows = np.column_stack([TIME, 40 + 30 * np.sin(TIME), 2 + 0.01 * np.sin(TIME), 5 + 4 * np.sin(TIME)])
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header=f"t,enc,force [{stated}],pull", comments="")
+    text = MAPPING.split("tendon_force")[0].replace(", column = 1", "")
+    text += f'tendon_force.T1 = {{ from = "force [{stated}]", scale = {scale}, units = "N" }}\n'
+    mapping.write_text(text + 'tendon_excursion.T1 = { from = "pull", units = "mm" }\n')
+    report = Report()
+    import_file([tmp_path / "log.csv"], mapping, tmp_path / "out.h5", report=report)
+    said = [
+        f.message for f in report if "the recording states lbf, and the mapping reads N; write `scale`" in f.message
+    ]
+    assert len(said) == warned
+
+
+def test_encoder_counts_are_not_taken_for_degrees(mapping, tmp_path):
+    scipy.io.savemat(tmp_path / "log.mat", RECORDED | {"enc": RECORDED["enc"] * 4096 / 360})
+    mapping.write_text(MAPPING.replace(', units = "deg"', ""))
+    with pytest.raises(UserError, match="more than a turn; convert counts to rad"):
+        import_file([tmp_path / "log.mat"], mapping, tmp_path / "out.h5")
+
+
 def test_recordings_that_are_not_there_are_said_before_any_is_read(mapping, tmp_path):
     (tmp_path / "logs").mkdir()
     for given, words in (("lag.mat", "lag.mat: does not exist"), ("logs", "is a folder, .*name the recordings in it")):

@@ -66,6 +66,18 @@ def test_a_clock_that_begins_again_is_said(tmp_path, capsys):
     assert "sort = true" not in said
 
 
+def test_units_that_no_mapping_converts_are_said_and_not_guessed_anew(tmp_path, capsys):
+    path = tmp_path / "log.csv"
+    rows = np.column_stack([TIME / 1e3, 0.5 + 0.4 * np.sin(TIME / 1e3), 0.3 + 0.2 * np.sin(TIME / 1e3)])
+    np.savetxt(path, rows, "%.6f", ",", header="t [s],MCP angle [turns],T1 length [in]", comments="")
+    seen = columns_of(load_recording(path))
+    assert [(s.meaning, s.units, s.foreign) for s in seen[1:]] == [("q", "turn", ""), ("tendon_excursion", "", "in")]
+    main(["look", str(path)])
+    said = capsys.readouterr().out
+    assert 'channels.q.J1 = { from = "MCP angle [turns]", units = "turn" }' in said
+    assert 'channels.tendon_excursion.T1 = { from = "T1 length [in]" }   # units? it states in: write `scale`' in said
+
+
 def test_units_that_a_file_states_come_first():
     recording = load_recording(CASES / "csv-as-other-programs-write-it" / "scope.csv")
     assert {s.name: (s.units, s.stated) for s in columns_of(recording)}["tau"] == ("N m", True)
