@@ -168,6 +168,7 @@ def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place,
         rows = rows[rows_of]
     begins_again = len(restarts(time[rows])) > 0
     rows = _chosen(trial, source, rows, len(time), where)
+    rows = rows[_stamped(time[rows], f"`{reading.from_}`", place, report)]
     order = increasing_order(time[rows], f"`{reading.from_}`", trial.sort, _PARTS, place, report)
     rows, units = rows[order], reading.units or "s"
     clock = Clock(time[rows], rows, len(time), source, reading.from_, units, trial.sort, begins_again)
@@ -212,6 +213,15 @@ def _cut(clock: Clock, trial: MappedTrial, where: Place) -> Clock:
     if len(clock.time) == 0:
         where.fail("holds no sample; " + ("correct its `where`" if trial.span is None else "widen its `span`"))
     return clock
+
+
+def _stamped(time: np.ndarray, name: str, where: Place, report: Report) -> np.ndarray:
+    """Mask of the samples that have a time. Others are left out, with a warning."""
+    good = np.isfinite(time)
+    if not good.all():
+        count = counted(int((~good).sum()), "sample")
+        report.warning(where.key, f"the clock {name} gives no time for {count}, left out; mend the recording")
+    return good
 
 
 def restarts(time: np.ndarray) -> np.ndarray:
@@ -300,6 +310,7 @@ class ColumnReader:
             )
         if len(time) != len(values):
             where.fail(f"has {len(values)} samples, and its clock {own_name} has {len(time)}; name its own clock")
+        present = present & _stamped(np.where(present, time, 0.0), own_name, where, self.report)
         time, values = time[present], values[present]
         order = increasing_order(time, own_name, clock.sort, _OWN_PARTS, where, self.report)
         return self._onto(time[order], values[order], own_name, whole, where)
@@ -338,8 +349,6 @@ class ColumnReader:
             UserError: the two clocks do not fit each other.
         """
         trial = self.clock.time
-        good = np.isfinite(time)
-        time, values = time[good], values[good]
         if len(time) < 2:
             where.fail(f"the clock {name} holds {len(time)} samples; name a clock that runs through the trial")
         self._check_clock(time, name, where)

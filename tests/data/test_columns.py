@@ -113,6 +113,15 @@ def test_a_condition_chooses_a_part_whose_clock_begins_again(tmp_path):
         bring_in(tmp_path, OWN, 'where = "part == 2"', t=AGAIN, part=part)
 
 
+def test_samples_without_a_time_are_left_out_and_said(tmp_path):
+    holes = np.where((TIME > 1.0) & (TIME < 1.04), np.nan, TIME)
+    trial, said = bring_in(tmp_path, '"now"', t=holes)
+    np.testing.assert_allclose(trial.q[:, 0], Q[np.isfinite(holes)])
+    assert any("the clock `t` gives no time for 3 samples, left out" in text for text in said)
+    _, said = bring_in(tmp_path, OWN, slow=np.where(SLOW == 1.0, np.nan, SLOW))
+    assert any("the clock `slow` gives no time for 1 sample, left out" in text for text in said)
+
+
 def test_a_counter_that_wraps_is_unwrapped(tmp_path):
     counts = (TIME * 1e6 + 2**32 - 3e6) % 2**32
     reading = 'time = { from = "us", units = "us", unwrap = 4294967296 }'
