@@ -71,9 +71,9 @@ class AtTerminal:
             termios.tcsetattr(sys.stdin, termios.TCSANOW, self._settings)
         self._keys = None
 
-    def _poll(self) -> None:
-        """Read the keys that were pressed, without waiting."""
-        if self._keys is None or not self._reading.acquire(blocking=False):
+    def _poll(self, wait: bool = False) -> None:
+        """Read the keys that were pressed. Where another thread is reading them, `wait` for it or leave it to that."""
+        if self._keys is None or not self._reading.acquire(blocking=wait):
             return
         try:
             while select.select([self._keys], [], [], 0)[0]:
@@ -90,13 +90,17 @@ class AtTerminal:
 
     def key(self, key: str) -> None:
         """Act on one key."""
-        if key in ("q", " ", "\x1b"):
+        if key in ("q", "Q", " ", "\x1b"):
             self._stop.set()
         elif key in ("\n", "\r"):
             self._enter.set()
 
     def ask(self, text: str, keep_waiting: Callable[[], bool]) -> None:
-        """Show the prompt and wait for Enter. A stop key or a false `keep_waiting()` ends the wait too."""
+        """Show the prompt and wait for Enter. A stop key or a false `keep_waiting()` ends the wait too.
+
+        An Enter from before the prompt answers nothing: who pressed it has not read the prompt.
+        """
+        self._poll(wait=True)
         self._enter.clear()
         self._say(f"{text}\n  Enter when done; q, space or Escape stops the rig.")
         while not self._enter.wait(0.05) and not self.stop_requested() and keep_waiting():

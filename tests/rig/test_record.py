@@ -106,7 +106,7 @@ def test_outside_a_terminal_it_is_a_line_a_trial(rig, quiet_block):
     assert text.getvalue().splitlines() == ["1/2 a", "2/2 b"]
 
 
-@pytest.mark.parametrize("key", ["q", " ", "\x1b"])
+@pytest.mark.parametrize("key", ["q", "Q", " ", "\x1b"])
 def test_keys_at_the_terminal(key):
     said = []
     person = AtTerminal(said.append)
@@ -135,6 +135,22 @@ def test_a_terminal_that_is_gone_is_a_stop():
     os.close(theirs)
     assert person.stop_requested()
     os.close(ours)
+
+
+def test_an_enter_from_before_the_prompt_does_not_answer_it():
+    """The second of two Enters on the command line waits in the terminal; "Hands off" must not take it for its own."""
+    ours, theirs = os.pipe()
+    said, person = [], AtTerminal()
+    person._say, person._keys = said.append, ours
+    os.write(theirs, b"\n")
+    looks = iter([True, True, True, False])
+    person.ask("Hands off: the drives are about to be switched on.", lambda: next(looks))
+    assert next(looks, None) is None  # It went on asking until the rig had to be stopped.
+    os.write(theirs, b"q\n")
+    person.ask("again", lambda: True)
+    assert person.stop_requested()  # A stop key counts, whenever it was pressed.
+    os.close(ours)
+    os.close(theirs)
 
 
 def test_a_session_that_cannot_be_written_stays_in_its_log(files, rig, monkeypatch):
