@@ -31,6 +31,7 @@ from jaxfinger.rig.trips import FULL_COUNT
 from jaxfinger.rig.waits import AtPose, Elapsed, Passes, Steady, reached
 from jaxfinger.rig.watch import Watch
 
+DRIVES_ON = (State.ARMED, State.MOVING)
 # s of samples that are still recorded after a stop. The controller needs 0.7 s of them to release all tension.
 AFTER_TRIP_S = 1.0
 # s of samples without a violation before the rig is armed: three times the 0.1 s (clock_offset_s) within which a clock
@@ -96,6 +97,7 @@ class Runner:
         self.t0: int | None = None
         self._place = ("", 0, 0)
         self._id = 0
+        self._was_on = False  # whether a sample has shown the drives on since the rig was armed
         self._setup = Setup("")
         self._start: dict = {}
 
@@ -135,27 +137,30 @@ class Runner:
         If no sample shows the controller stopped and every tendon's measured tension at most RELEASED_TENSION, the
         sentence tells the operator to switch the drives off.
         """
-        reader, rig = self.reader, self.rig.description
-        tensions = rig.columns("tension", rig.finger.tendon_names)
+        reader = self.reader
         trip, seq = (error.trip, error.seq) if isinstance(error, TrialEnded) else (Trip.HOST, None)
         if not (tripped(reader.latest) or isinstance(error, ControllerStopped)):
             reader.stop(Violation.of_host(trip, reader.latest_seq, str(error).rstrip(".")))
-
-        def released() -> bool:
-            block = reader.latest
-            if block is None or not (tripped(block) or int(block.state[-1]) == State.IDLE):
-                return False
-            return bool(np.all(block.x[-1, tensions] <= RELEASED_TENSION))  # NaN is no tension seen
-
-        self._let_pass(AFTER_TRIP_S, released)  # A busy host first has to read the samples before the stop.
+        self._let_pass(AFTER_TRIP_S, self._released)  # A busy host first has to read the samples before the stop.
         self._let_pass(AFTER_TRIP_S)
         cause = str(error).rstrip(".")
-        if reader.latest is not None and not released():
+        if reader.latest is not None and not self._released():
             cause = f"{cause}; {TENSION_NOT_SEEN_TO_FALL}"
         if reader.recording:
             place = {} if seq is None else {"seq": seq}
             reader.end({"complete": False, "cause": cause, "trip": int(trip), **place})
         return cause
+
+    def _released(self) -> bool:
+        """Whether the newest sample shows the controller stopped or idle, and no drive's tension beyond
+        RELEASED_TENSION. A load cell that reads NaN, or that a tendon pushes, sees no tension fall.
+        """
+        block, rig = self.reader.latest, self.rig.description
+        if block is None or not (tripped(block) or int(block.state[-1]) == State.IDLE):
+            return False
+        pulled = [name for name, active in zip(rig.finger.tendon_names, rig.finger.active, strict=True) if active]
+        tensions = block.x[-1, rig.columns("tension", pulled)]
+        return bool(np.all(np.abs(tensions) <= RELEASED_TENSION))
 
     def arm(self, name: str) -> None:
         """Bring the controller to IDLE, wait for samples without a violation, and arm the rig.
@@ -167,7 +172,7 @@ class Runner:
             UserError: something is wrong; nothing was armed.
         """
         rig, status = self.rig, self.rig.status()
-        if status.state in (State.ARMED, State.MOVING):
+        if status.state in DRIVES_ON:
             rig.release()
         if status.state is State.TRIPPED and not rig.prepare(Setup("")):
             self._ask(f"The controller is stopped: {status.cause}. See that finger and hands are safe.")
@@ -194,9 +199,9 @@ class Runner:
         """Release the finger after the last trial. Return what went wrong, or an empty string."""
         try:
             self.rig.release()
-            self._let_pass(AFTER_TRIP_S, lambda: self.rig.status().state in (State.IDLE, State.TRIPPED))
+            self._let_pass(2 * AFTER_TRIP_S, self._released)  # A busy host first has to read the samples before it.
             self._check(None)
-            if self.rig.status().state is not State.IDLE:
+            if self.rig.status().state is not State.IDLE or not self._released():
                 raise TrialEnded("the controller did not release the finger after the last trial", Trip.HOST)
         except UserError as error:
             return self.abort(error)
@@ -228,10 +233,12 @@ class Runner:
 
         def keep_waiting() -> bool:
             self.rig.report_alive()
-            return self.reader.error is None and self.reader.violation is None
+            off = armed and (tripped(self.reader.latest) or self._let_go(self.reader.latest))
+            return self.reader.error is None and self.reader.violation is None and not off
 
+        armed = self.watch.guards
         self.operator.ask(text, keep_waiting)
-        self._check(None)
+        self._check(self.reader.latest if armed else None)
 
     def carry_out(self, protocol: Protocol, place: tuple[str, int, int]) -> None:
         """Carry out the steps of a protocol; `place` is the trial's name, its number and the count of trials.
@@ -363,6 +370,19 @@ class Runner:
             self._raise_stopped(self.rig.status())
         if reader.error is not None:
             raise TrialEnded(str(reader.error), Trip.STALE)
+        if block is not None and self._let_go(block):
+            on = np.flatnonzero(np.isin(block.state, DRIVES_ON))
+            first = int(on[-1]) + 1 if len(on) else 0
+            name = State(int(block.state[-1])).name
+            cause = f"the controller let go of the finger without being told to (state {name}); see who commands it"
+            raise TrialEnded(cause, Trip.HOST, int(block.seq[first]))
+
+    def _let_go(self, block: Block | None) -> bool:
+        """Whether the controller, armed before, has the drives off at a block's end, and has not tripped."""
+        if block is None or not self.watch.guards:
+            return False
+        self._was_on |= bool(np.isin(block.state, DRIVES_ON).any())
+        return self._was_on and int(block.state[-1]) in (State.INIT, State.IDLE, State.RELEASING)
 
     def _raise_stopped(self, status: Status) -> NoReturn:
         """Raise ControllerStopped with its cause; the trip's FULL_COUNT bad samples are left out of the trial."""

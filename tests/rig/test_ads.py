@@ -25,7 +25,7 @@ from jaxfinger.rig.backend import (
     StaleRig,
     TensionRamp,
 )
-from jaxfinger.rig.contract import State, Trip
+from jaxfinger.rig.contract import Kind, State, Trip
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.ams import AmsServer
 from jaxfinger.rig.simulated.controller import Controller
@@ -333,6 +333,29 @@ def test_a_limit_that_only_the_host_has_latches_the_controller_over_the_wire(loc
         assert (status.state, status.trip) == (State.TRIPPED, Trip.TRACKING)
         with pytest.raises(CommandRefused, match="in state TRIPPED"):
             rig.arm()
+
+
+@pytest.mark.parametrize("kind", [Kind.DISARM, Kind.STOP], ids=lambda kind: kind.name)
+def test_a_prompt_ends_where_the_controller_lets_go(lockstep, record, kind):
+    rig, waited = ads_rig(lockstep), []
+    by_itself = rig.prepare
+    rig.prepare = lambda setup: not setup.hand and by_itself(setup)
+
+    class Person:
+        def ask(self, text, keep_waiting):
+            rig._send(kind, index=Trip.HOST)  # as from another panel
+            deadline = time.monotonic() + 5.0
+            while keep_waiting() and time.monotonic() < deadline:
+                time.sleep(0.01)
+            waited.append(keep_waiting())
+
+        def stop_requested(self):
+            return False
+
+    outcome = record(rig, operator=Person())
+    assert waited == [False]
+    assert "01-ID.2-DIP: the controller " in outcome.cause
+    assert outcome.complete == ()
 
 
 def test_a_connection_that_stays_cut_ends_the_trial(lockstep, record):

@@ -14,7 +14,7 @@ from jaxfinger.data import check_file, read_session
 from jaxfinger.errors import UserError
 from jaxfinger.rig import parse_plan, parse_rig, recorder, recover, runner, wal
 from jaxfinger.rig.backends.simulated import SimulatedRig
-from jaxfinger.rig.contract import State, Trip
+from jaxfinger.rig.contract import Kind, State, Trip
 from jaxfinger.rig.operator import Nobody
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
@@ -435,3 +435,31 @@ def test_a_controller_that_does_not_release_is_said(rig, record):
     assert "did not release the finger after the last trial" in outcome.cause
     assert "switch the drives off" in outcome.cause
     assert len(outcome.complete) == 2
+
+
+@pytest.mark.parametrize("pull", [6.0, -6.0])
+def test_tension_that_stays_after_the_last_trial_is_said(rig, record, pull):
+    """The controller is idle, but a tendon is caught in its drive, or its load cell is broken."""
+    machine = SimulatedRig(rig)
+    release = machine.release
+
+    def caught():
+        machine.inject("spike", slot(machine, "tension", "T3"), after=300, amount=pull)
+        return release()
+
+    machine.release = caught
+    outcome = record(machine)
+    assert outcome.cause.startswith("the controller did not release the finger after the last trial")
+    assert TENSION_NOT_SEEN_TO_FALL in outcome.cause
+    assert len(outcome.complete) == 2
+
+
+@pytest.mark.parametrize("kind", [Kind.DISARM, Kind.RELEASE], ids=lambda kind: kind.name)
+def test_a_controller_that_lets_go_by_itself_ends_the_trial(rig, record, kind):
+    """From a panel of its own the controller can be told to let go. What follows is no measurement."""
+    machine = SimulatedRig(rig)
+    outcome = record(machine, lambda m: m.controller._obey(kind, 0, 0.0, 0.0, []), at=("01-ID.2-DIP", "moved by hand"))
+    assert "let go of the finger without being told to" in outcome.cause
+    assert outcome.complete == ()
+    assert not read_session(outcome.session)["01-ID.2-DIP"].complete
+    assert machine.controller.state is State.TRIPPED
