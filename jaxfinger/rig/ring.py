@@ -6,6 +6,7 @@ A subclass only reads and writes the bytes of a symbol: over ADS, or in the memo
 from __future__ import annotations
 
 import math
+import secrets
 import threading
 import time
 from abc import abstractmethod
@@ -41,6 +42,8 @@ OVERWRITE_MARGIN = 64
 MAX_RECORDS = 100  # records in one request: 50 KiB. Copying them delays the controller's task.
 # s that a STOP waits for another thread's command to be acknowledged; then it overwrites that command.
 STOP_WAIT_S = 0.05
+# s in which the heartbeat of another host would change: four times the 0.05 s after which one is due (watch.BEAT_S).
+ALONE_S = 0.2
 REMEDY = (
     "load the program of docs/plc-contract.md"  # of every message about a controller that differs from the contract
 )
@@ -57,7 +60,8 @@ class RingRig(Rig):
         self.next_seq = 0
         self.ring = contract.RING
         self.boot = 0
-        self._id = 0
+        self._id = self._first_id = 0  # ids of the newest command, and before the first one
+        self._found_id = 0  # id that the controller had acknowledged when it was connected
         self._sending = threading.Lock()  # Runner, reader and watch may command at the same time.
         self._beat = 0
         self._program = ""
@@ -115,8 +119,20 @@ class RingRig(Rig):
             self.simulated_time = type(self).simulated_time or bool(self._record("stBench", contract.BENCH)["lockstep"])
         self.status()  # Refuses a state or trip code that the contract does not define.
         status = self._status()
-        self.boot, self.next_seq, self._id = int(status["boot"]), int(status["head"]), int(status["acknowledged"])
+        self.boot, self.next_seq, self._found_id = int(status["boot"]), int(status["head"]), int(status["acknowledged"])
+        # At random, so that no other program has the same: the controller would take a STOP for a command that is done.
+        self._id = self._first_id = secrets.randbits(32)
         self.head_reading = None
+        self._refuse_company()
+
+    def _refuse_company(self) -> None:
+        """Refuse a controller to which another program sends heartbeats: each would move what the other one holds."""
+        if self.simulated_time:
+            return
+        before = self._read("nHostBeat", 0, 8)
+        self._pause(ALONE_S)
+        if self._read("nHostBeat", 0, 8) != before:
+            raise UserError("another program sends heartbeats to the controller, so it records there; end it first.")
 
     def _compare_sizes(self) -> None:
         """Refuse a controller on which the size of a symbol is not the contract's: its fields would lie elsewhere."""
@@ -175,6 +191,7 @@ class RingRig(Rig):
 
         Raises:
             ControllerRestarted: its boot number changed, or the count fell.
+            RigError: it has acknowledged a command of another program.
         """
         asked = time.monotonic()
         status = self._status()
@@ -183,6 +200,9 @@ class RingRig(Rig):
             raise ControllerRestarted(
                 "the controller's program was restarted, so this recording cannot go on; start again with --resume."
             )
+        sent = (int(status["acknowledged"]) - self._first_id) % 2**32 <= (self._id - self._first_id) % 2**32
+        if not sent and int(status["acknowledged"]) != self._found_id:
+            raise RigError("another program commands the controller, so this recording cannot go on; end it first.")
         return self.head_reading.head
 
     def _pull(self, head: int) -> Block:

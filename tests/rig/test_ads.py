@@ -29,6 +29,7 @@ from jaxfinger.rig.contract import Kind, State, Trip
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.ams import AmsServer
 from jaxfinger.rig.simulated.controller import Controller
+from jaxfinger.rig.waits import reached
 from tests.rig.conftest import ads_rig
 
 
@@ -134,7 +135,7 @@ def test_commands_states_and_the_latch(real_time):
         number = rig.command(TensionRamp({"T1": 3.0}, 20.0))
         while True:
             block = rig.read_block(20.0)
-            if np.any((block.acknowledged == number) & (block.state == State.ARMED)):
+            if reached(block, number):
                 break
         rig.inject("spike", rig.description.channels[rig.description.index("tension", "T1")].slot)
         while rig.status().state is not State.TRIPPED:
@@ -166,6 +167,16 @@ def test_a_joint_that_runs_beyond_its_stop_is_let_go_in_the_right_order(lockstep
     np.testing.assert_allclose(share, share[:, [2]] * np.ones(4), atol=0.05)  # together; sensors' noise is 0.02 N
     assert tension[250:].max() < 2.1  # at most 2 N after 0.2 s, and the drives' lag
     assert np.abs(tension[900:]).max() < 0.1  # off
+
+
+def test_a_second_program_on_this_computer_cuts_off_nobody(real_time):
+    with ads_rig(real_time) as rig:
+        with pytest.raises(UserError, match="another program on this computer has the controller"):
+            ads_rig(real_time).connect()
+        rig.status()
+        assert rig.reconnects == 0
+    with ads_rig(real_time) as rig:
+        rig.status()
 
 
 def test_nobody_there(tmp_path):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from jaxfinger.errors import UserError
 from jaxfinger.rig import contract, parse_rig
-from jaxfinger.rig.backend import CommandRefused, ControllerRestarted, StaleRig, TensionRamp
+from jaxfinger.rig.backend import CommandRefused, ControllerRestarted, Hold, RigError, StaleRig, TensionRamp
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.ring import MAX_RECORDS, OVERWRITE_MARGIN
@@ -182,8 +182,6 @@ def test_two_threads_may_command(rig):
         numbers = []
 
         def hold():
-            from jaxfinger.rig.backend import Hold
-
             numbers.extend(machine.command(Hold()) for _ in range(50))
 
         threads = [threading.Thread(target=hold) for _ in range(2)]
@@ -191,7 +189,47 @@ def test_two_threads_may_command(rig):
             t.start()
         for t in threads:
             t.join()
-        assert sorted(numbers) == list(range(2, 102))
+        assert np.diff(sorted(n - numbers[0] for n in numbers)).tolist() == [1] * 99
+
+
+def test_a_stop_is_obeyed_whatever_another_program_has_sent(rig):
+    machine = small(rig)
+    other = SimulatedRig(rig, machine.controller)
+    with machine, other:
+        other.arm()
+        machine.stop(Trip.OPERATOR)
+        assert machine.controller.state is State.TRIPPED
+
+
+def test_a_command_of_another_program_is_noticed(rig):
+    machine = small(rig)
+    other = SimulatedRig(rig, machine.controller)
+    with machine, other:
+        machine.arm()
+        machine.read_block(1.0)
+        other.command(Hold())
+        with pytest.raises(RigError, match="another program commands the controller"):
+            machine.read_block(1.0)
+
+
+@pytest.mark.parametrize("alive", [True, False])
+def test_a_controller_with_another_host_is_refused(rig, alive):
+    class RealTime(SimulatedRig):
+        simulated_time = False
+
+        def _pause(self, seconds):
+            if alive:
+                machine.beat()
+
+    machine = small(rig)
+    with machine:
+        machine.beat()  # The heartbeat of a program that has ended stays where it is.
+        other = RealTime(rig, machine.controller)
+        if alive:
+            with pytest.raises(UserError, match="another program sends heartbeats"):
+                other.connect()
+        else:
+            other.connect()
 
 
 def test_a_stop_waits_for_no_other_command(rig):

@@ -8,10 +8,15 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import fcntl
+import os
+import re
+import tempfile
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 from jaxfinger.data.toml import Fault, Within
@@ -70,9 +75,12 @@ class AdsRig(RingRig):
         self._mending = False  # a call is connecting again
         self._given_up = False  # a call could not connect again, so later calls do not try
         self._closed = False
+        self._claim: int | None = None  # descriptor of the file that keeps other programs of this computer away
 
     def _open(self) -> None:
         where, self._given_up, self._closed = self.description.address, False, False
+        if self._claim is None:
+            self._claim = _claim(f"{where['net_id']} port {where['port']} at {where['ip']}")
         deadline = time.monotonic() + float(where["reconnect_s"])
         while True:  # A router may still hang up on the connection of a program that was killed a moment ago.
             try:
@@ -118,6 +126,9 @@ class AdsRig(RingRig):
                 self._detach()
             finally:
                 self._lock.release()
+        if self._claim is not None:
+            os.close(self._claim)
+            self._claim = None
 
     def _detach(self) -> None:
         if self._connection is not None:
@@ -201,6 +212,29 @@ class AdsRig(RingRig):
 
     def _has_bench(self) -> bool:
         return "stBench" in self._places
+
+
+def _claim(controller: str) -> int:
+    """Claim a controller for this program and return the descriptor to close. It ends with the process, however.
+
+    A router keeps one connection for each computer, so a second program here would cut off the first one.
+
+    Raises:
+        UserError: another program of this computer has claimed it, or no file can be made for it.
+    """
+    path = Path(tempfile.gettempdir(), f"jaxfinger {re.sub(r'[^0-9A-Za-z.:]+', ' ', controller)}")
+    try:
+        with contextlib.suppress(FileExistsError):  # Another user's file may be opened, but not to create it.
+            os.close(os.open(path, os.O_RDONLY | os.O_CREAT | os.O_EXCL, 0o644))
+        claim = os.open(path, os.O_RDONLY)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be made ({error.strerror}); see to the folder's rights.") from error
+    try:
+        fcntl.flock(claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(claim)
+        raise UserError(f"another program on this computer has the controller {controller}; end it first.") from error
+    return claim
 
 
 def make(description: RigDescription) -> AdsRig:
