@@ -6,6 +6,8 @@ blocks of another size trip at the same sample.
 
 from __future__ import annotations
 
+from math import isfinite, nan
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -126,17 +128,21 @@ class UnexplainedExcursion:
         """Unexplained excursion in m of each tendon at each sample.
 
         `angle` holds the joint encoders in rad, `length` and `load` the tendons' excursions in m and tensions in N.
+        Nothing is counted at or from a value that is not finite.
         """
         ran = np.zeros(length.shape)
         if not length.shape[1]:
             return ran
         for row, (q, l, f) in enumerate(zip(angle.tolist(), length.tolist(), load.tolist(), strict=True)):
+            if not all(map(isfinite, q)):
+                continue
             at = self._angle
             if at is None or any(abs(a - b) > self.MAX_STILL_ANGLE for a, b in zip(q, at, strict=True)):
-                self._angle, self._length, self._load = q, l, f
-                continue
+                self._angle, self._load = q, [nan] * len(f)  # Every tendon counts anew.
             for k, tension in enumerate(f):
-                if not tension >= self.MIN_TENSION or abs(tension - self._load[k]) > self.MAX_TENSION_CHANGE:
+                if not (isfinite(tension) and isfinite(l[k])):
+                    continue
+                if tension < self.MIN_TENSION or not abs(tension - self._load[k]) <= self.MAX_TENSION_CHANGE:
                     self._length[k], self._load[k] = l[k], tension
                 else:
                     ran[row, k] = abs(l[k] - self._length[k])

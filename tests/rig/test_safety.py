@@ -97,6 +97,32 @@ def test_a_frozen_encoder_is_found_by_the_tendons_that_run(rig, quiet_block):
     assert [v for k in range(0, 400, 20) for v in supervisor.check(part(moving, k, k + 20))] == []
 
 
+def test_one_odd_sample_does_not_hide_a_frozen_encoder(rig, quiet_block):
+    """The tension changes just where the excursion is not a number; it counts from the next sample."""
+
+    def run(x):
+        x[60:, column(rig, "tension", "T2")] += 1.0
+        x[100:, column(rig, "excursion", "T2")] = np.linspace(0, 0.01, 300)
+        x[60, column(rig, "excursion", "T2")] = np.nan
+
+    found = first(rig, spoil(quiet_block(), run))
+    assert found is not None
+    assert found.trip is Trip.FROZEN
+    assert found.seq < 160
+
+
+@pytest.mark.parametrize(("kind", "of"), [("tension", "T2"), ("joint_position", "MCP"), ("excursion", "T2")])
+def test_one_odd_sample_does_not_make_a_stretched_tendon_a_frozen_encoder(rig, quiet_block, kind, of):
+    rise = np.linspace(0.0, 1.0, 340)
+
+    def stretch(x):
+        for what, by in (("tension", 6.0), ("tension_setpoint", 6.0), ("excursion", 2e-3)):
+            x[60:, column(rig, what, "T2")] += by * rise
+        x[59, column(rig, kind, of)] = np.nan
+
+    assert Supervisor(rig).check(spoil(quiet_block(), stretch)) == []
+
+
 def test_an_encoder_that_does_not_follow_the_motor(rig, quiet_block):
     supervisor = Supervisor(rig)
     supervisor.check(quiet_block(50))
