@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import h5py
 
+from jaxfinger.data.toml import parse_toml
 from jaxfinger.errors import UserError
 from jaxfinger.rig import convert, wal
 from jaxfinger.rig.backend import Rig, Setup, TensionRamp
@@ -80,7 +83,7 @@ def run(
     """
     output, operator = Path(output), operator or Nobody()
     path = log_path(output)
-    log = _log_to_resume(plan, path, output, resume)
+    log = _log_to_resume(plan, rig.description, path, output, resume)
     with rig, Interrupts() as interrupts:
         filters = rig.filters()
         refuse_filtered(plan, rig.description, filters)
@@ -120,7 +123,7 @@ def run(
     return Outcome(output, done, cause, path if cause else None)
 
 
-def _log_to_resume(plan: Plan, path: Path, output: Path, resume: bool) -> convert.Log | None:
+def _log_to_resume(plan: Plan, rig: RigDescription, path: Path, output: Path, resume: bool) -> convert.Log | None:
     """Return the log to resume, or None for a new session.
 
     Raises:
@@ -141,11 +144,30 @@ def _log_to_resume(plan: Plan, path: Path, output: Path, resume: bool) -> conver
         raise UserError(
             f"{path}: was recorded with another plan than {plan.path}; resume with the plan it was begun with."
         )
+    begun, now = (_meaning(head) for head in (log.header, convert.header(rig, plan.text, {}, {})))
+    if differs := next((key for key in now if begun[key] != now[key]), None):
+        raise UserError(
+            f"{path}: was recorded with another rig file than {rig.path}: its {differs} differs; resume with the one "
+            "it was begun with."
+        )
     if output.exists():
         with h5py.File(output, "r") as file:
             if file.attrs.get("created") != log.header["created"]:
                 raise UserError(f"{output}: is not the session that {path.name} belongs to; choose another name.")
     return log
+
+
+def _meaning(head: dict[str, Any]) -> dict[str, str]:
+    """What gives samples their meaning in a log's header, each as text. Limits and times may change between runs."""
+    channels = [[c[k] for k in ("name", "kind", "of", "slot", "unit", "scale", "offset")] for c in head["channels"]]
+    parts = {
+        "specimen": head["specimen"],
+        "finger": head["finger"],
+        "rate": head["rate_hz"],
+        "list of channels": channels,
+        "fingertip sensor": parse_toml(head["rig"], "rig.toml").content.get("fingertip_sensor"),
+    }
+    return {key: json.dumps(value) for key, value in parts.items()}
 
 
 def _close_killed_trial(log: convert.Log, rig: Rig, recorder: Recorder) -> None:

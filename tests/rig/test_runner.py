@@ -24,6 +24,7 @@ from jaxfinger.rig.session import log_path, run
 from jaxfinger.rig.signals import ENDING, Interrupts
 from jaxfinger.rig.simulated.controller import Controller
 from jaxfinger.rig.simulated.examples import rig_toml
+from jaxfinger.rig.simulated.plant import default_truth
 
 
 def serious(path):
@@ -179,6 +180,37 @@ def test_resume_with_another_plan_is_refused(rig, record, short):
     other = parse_plan(short.text.replace("passes = 1", "passes = 2"), rig)
     with pytest.raises(UserError, match="another plan"):
         record(SimulatedRig(rig), plan=other, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("scale = 1.0", "scale = 1.1", "list of channels"),
+        ('of = "T1"\nslot = 0', 'of = "T1"\nslot = 59', "list of channels"),
+        ("mass = ", "mass = 1", "finger"),
+        ('specimen = "', 'specimen = "another ', "specimen"),
+        ("[limits]", "[fingertip_sensor]\nrotation = [0, -1, 0, 1, 0, 0, 0, 0, 1]\n\n[limits]", "fingertip sensor"),
+    ],
+)
+def test_resume_with_another_rig_file_is_refused(rig, record, old, new, says):
+    """The log keeps one description of its channels: samples of others would be read as if they were those."""
+    machine = SimulatedRig(rig)
+    record(machine, lambda m: m.inject("nan", slot(m, "external_torque")))
+    assert old in rig.text
+    other = parse_rig(rig.text.replace(old, new, 1), "other.toml")
+    with pytest.raises(UserError, match=rf"another rig file than other\.toml: its {says} differs"):
+        record(SimulatedRig(other), resume=True)
+
+
+def test_resume_with_other_limits_goes_on(record):
+    """Also where CAD knows the excursion of some tendons alone: it is NaN for the others, which equals nothing."""
+    finger = default_truth().finger
+    known = np.full((finger.n, finger.m, 1), np.nan)
+    known[0] = np.where(finger.crosses[0], 0.008, 0.0)[:, None]
+    rig = parse_rig(rig_toml(finger=replace(finger, excursion=known)))
+    record(SimulatedRig(rig), lambda m: m.inject("nan", slot(m, "external_torque")))
+    tighter = parse_rig(rig.text.replace("temperature_max = 70.0", "temperature_max = 60.0"))
+    assert record(SimulatedRig(tighter), resume=True).cause == ""
 
 
 def test_a_latched_controller_is_reset_before_a_resumed_run(rig, record):
