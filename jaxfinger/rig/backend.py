@@ -130,7 +130,7 @@ Command = TensionRamp | JointMove | Hold
 
 @dataclass(frozen=True)
 class Setup:
-    """Preparation of the finger by the operator; `text` is the prompt.
+    """Preparation of the finger by the operator; `text` says what to do.
 
     Joints are `fixed` at an angle (rad), coupled to the external `motor`, or moved by `hand`; all others are free. With
     `contact` the fingertip rests on its force sensor.
@@ -141,6 +141,11 @@ class Setup:
     motor: str | None = None
     hand: tuple[str, ...] = ()
     contact: bool = False
+
+    @property
+    def prompt(self) -> str:
+        """Prompt for the operator. Unless the finger is to be moved by hand, motors move once it is answered."""
+        return self.text if self.hand else f"{self.text} Then hands off: the finger may move."
 
 
 class Rig(ABC):

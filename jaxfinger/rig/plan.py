@@ -150,8 +150,9 @@ def _check_parameters(experiment: str, parameters: Common, rig: RigDescription, 
     posture = parameters.posture_deg
     if posture and len(posture) != finger.m:
         (place / "posture_deg").fail(f"has {len(posture)} angles; give one for each of the {finger.m} joints")
-    for joint, angle, (low, high) in zip(finger.joint_names, posture, np.degrees(finger.limits), strict=False):
-        if not low <= angle <= high:
+    at = np.degrees(list(parameters.posture(finger).values()))  # also where it is the default
+    for joint, angle, (low, high) in zip(finger.joint_names, at, np.degrees(finger.limits), strict=True):
+        if not low - 1e-9 <= angle <= high + 1e-9:
             (place / "posture_deg").fail(f"{angle:g}° for {joint} is outside its limits {low:.0f}° to {high:.0f}°")
     tendon, joint = values.get("tendon"), values.get("joint")
     if experiment == "ID.4" and not finger.crosses[finger.tendon_names.index(tendon), finger.joint_names.index(joint)]:
@@ -200,7 +201,7 @@ def estimate(trial: PlannedTrial, rig: RigDescription) -> Estimate:
         elif isinstance(step, Covered):
             seconds += HAND_PASS_S * step.passes
         elif isinstance(step, Setup):
-            prompts.append(step.text)
+            prompts.append(step.prompt)
         elif isinstance(step, Start):
             continue
     return Estimate(trial.name, seconds, tuple(prompts), highest)

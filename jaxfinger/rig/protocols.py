@@ -328,7 +328,7 @@ def trajectory(finger: FingerDescription, p: Trajectory) -> Protocol:
     rng = np.random.default_rng(p.seed)
     yield Setup(f"Fix all joints: {_angles(posture)}.", fixed=posture)
     yield from _tension(dict(zip(names, mean.tolist(), strict=True)), p.tension_rate)
-    yield Setup("Remove all fixtures; keep hands off: the tendons move the finger.")
+    yield Setup("Remove all fixtures.")
     yield Dwell(1.0)
     yield Start(loaded=tuple(names))
     for _ in range(round(p.seconds / p.interval)):

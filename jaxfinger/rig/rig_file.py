@@ -118,7 +118,7 @@ class FingertipSensor:
     rotation: tuple[float, float, float, float, float, float, float, float, float]
 
     def __post_init__(self):
-        if not np.allclose(self.matrix @ self.matrix.T, np.eye(3), atol=1e-3):
+        if not np.allclose(self.matrix @ self.matrix.T, np.eye(3), atol=1e-3) or np.linalg.det(self.matrix) < 0:
             raise Fault("must be a rotation matrix (9 numbers, row by row, sensor to base frame)", "rotation")
 
     @property

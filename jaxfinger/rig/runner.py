@@ -303,7 +303,7 @@ class Runner:
         """
         self._setup = setup
         if not self.rig.prepare(setup):
-            self._ask(setup.text)
+            self._ask(setup.prompt)
             return
         self._wait("finger being prepared", AtPose(self.rig.description, setup), 60.0)
 

@@ -105,7 +105,8 @@ class Supervisor:
         self._high[kind == "external_torque"] = limits.joint_torque_max
         self._high[kind == "fingertip_force"] = limits.fingertip_force_max
         self._high[kind == "motor_temperature"] = limits.temperature_max
-        symmetric = (kind == "external_torque") | (kind == "fingertip_force")
+        # A tendon cannot push: a load cell that reads so is wired the wrong way, or broken.
+        symmetric = (kind == "tension") | (kind == "external_torque") | (kind == "fingertip_force")
         self._low[symmetric] = -self._high[symmetric]
         self._high[self._angle] = finger.limits[:, 1]
         self._low[self._angle] = finger.limits[:, 0]

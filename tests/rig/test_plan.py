@@ -1,13 +1,15 @@
 """Plans are checked command by command before anything moves."""
 
+import re
+
 import numpy as np
 import pytest
 
 from jaxfinger.errors import UserError
-from jaxfinger.rig import estimate, parse_plan
+from jaxfinger.rig import estimate, parse_plan, parse_rig
 from jaxfinger.rig.backend import JointMove, Setup, TensionRamp
 from jaxfinger.rig.protocols import PROTOCOLS, Mark, Start
-from jaxfinger.rig.simulated.examples import plan_toml
+from jaxfinger.rig.simulated.examples import plan_toml, rig_toml
 
 HEAD = '[plan]\nname = "p"\n[[trial]]\n'
 
@@ -62,6 +64,23 @@ def test_the_shipped_plan_holds_every_experiment(rig):
     plan = parse_plan(plan_toml(), rig)
     assert {t.experiment for t in plan.trials} == set(PROTOCOLS)
     assert all(estimate(t, rig).seconds > 1.0 for t in plan.trials)
+
+
+def test_the_default_posture_is_checked_too():
+    text = rig_toml()
+    assert "limits = " in text
+    short = parse_rig(re.sub("limits = .*", "limits_deg = [-10.0, 15.0]", text))
+    with pytest.raises(UserError, match=r"plan.toml, line 3: .*posture_deg: 20° for MCP is outside its limits -10° to"):
+        parse_plan(HEAD + 'experiment = "VD.1"', short)
+    parse_plan(HEAD + 'experiment = "VD.1"\nposture_deg = [15.0, -10.0, 5.0]', short)
+
+
+def test_a_prompt_after_which_something_moves_says_hands_off(rig):
+    """The motor, or a tendon, moves as soon as the prompt is answered."""
+    for trial in parse_plan(plan_toml(), rig).trials:
+        for step in trial.protocol(rig):
+            if isinstance(step, Setup):
+                assert ("hands off" in step.prompt) == (not step.hand), trial.name
 
 
 def test_an_estimate_counts_the_time_to_speed_up_and_to_slow_down(rig):

@@ -38,6 +38,7 @@ def spoil(block: Block, change) -> Block:
     ("kind", "of", "value", "trip"),
     [
         ("tension", "T2", 19.0, Trip.TENSION),
+        ("tension", "T2", -19.0, Trip.TENSION),
         ("tension", "T2", np.nan, Trip.INVALID),
         ("tension", "T1", np.inf, Trip.INVALID),
         ("joint_position", "PIP", 3.0, Trip.POSITION),
