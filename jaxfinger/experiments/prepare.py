@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxfinger.data import Predictions, Session, Trial
-from jaxfinger.data.sizes import sizes_of
+from jaxfinger.data.sizes import Sizes, sizes_of
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import driven, held, path, stepped
 from jaxfinger.experiments.reduction import Row, prepared, runs_of_holds
@@ -63,17 +63,19 @@ def prepare(
     reduced: bool = True,
     minus: Predictions | None = None,
     coarse: int = 1,
+    sizes: Sizes | None = None,
 ) -> dict[str, Stack]:
     """Reduce and stack the named trials (default all), one stack for each experiment.
 
     `reduced`: whether trials are averaged to the experiment's rate, for a fit; otherwise every sample is kept.
     `coarse`: factor on the length of the averaging blocks. `minus`: predictions that are subtracted from the
-    measurements; samples without a prediction are invalid.
+    measurements; samples without a prediction are invalid. `sizes`: those of the session (`sizes_of`), where the caller
+    has them already.
 
     Raises:
         UserError: trials of one experiment are sampled at rates too different to be stacked.
     """
-    sizes, stacks = sizes_of(session), {}
+    sizes, stacks = sizes or sizes_of(session), {}
     for experiment in (e.at(sizes.pace if e.kind == "driven" else sizes.slow_pace) for e in EXPERIMENTS.values()):
         chosen = [t for t in session if t.experiment == experiment.name and (names is None or t.name in names)]
         trials = [t for t in chosen if len(t.time) > 1]

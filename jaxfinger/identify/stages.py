@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.data import Session, joints_of, moving_joints
+from jaxfinger.data.sizes import sizes_of
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, Experiment, Stack, not_judged, prepare
 from jaxfinger.identify.fit import Fit, StageReport
@@ -195,7 +196,8 @@ def identify(
     with ThreadPoolExecutor(1) as pool:  # a stage is compiled while the recordings of the next are filtered
         experiments = dict.fromkeys(e for s in wanted for e in STAGES[s].reads) if stacks is None else ()
         named = {e: [t.name for t in session if t.experiment == e] for e in experiments}
-        pending = {e: pool.submit(prepare, session, names) for e, names in named.items()}
+        sizes = sizes_of(session) if named else None
+        pending = {e: pool.submit(prepare, session, names, sizes=sizes) for e, names in named.items()}
         ready, tangents = dict(stacks or {}), Tangents()
         for name in wanted:
             progress(f"fitting {name}")
