@@ -12,9 +12,8 @@ from jaxtyping import Float, Int
 
 from jaxfinger.effects import CatalogueEffect, Scales
 from jaxfinger.experiments import affected_channels
-from jaxfinger.gap.exact import SearchState
-from jaxfinger.gap.formula import Weights
-from jaxfinger.gap.problem import Problem, assemble, moved
+from jaxfinger.gap.exact import Baseline, SearchState, derivatives, settled_plainly
+from jaxfinger.gap.problem import Problem, assemble
 from jaxfinger.gap.projector import Projector
 from jaxfinger.gap.result import Value
 from jaxfinger.gap.signatures import Signatures
@@ -66,23 +65,24 @@ def augmented_fit(problem: Problem, chosen: SearchState, hold: bool = False) -> 
     return Fitted(fit, r, J, partial(residuals_by, sources))
 
 
-def as_refitted(problem: Problem, chosen: SearchState) -> Fitted:
-    """The augmented model at the optimum that the search has found, without a fit of its own: for a quick diagnosis.
+def as_refitted(baseline: Baseline, problem: Problem, chosen: SearchState, hold: bool = False) -> Fitted:
+    """The augmented model after a few linear refits (`settled_plainly`), for a quick diagnosis; `hold` as above.
 
-    It needs only the compiled functions of the nominal model and of signatures. Second derivatives by a parameter of an
-    effect and a nominal one are left out, so that beside a large effect nominal parameters and intervals are biased.
+    It needs only the compiled functions of the nominal model and of signatures. Derivatives of an effect by a nominal
+    parameter are left out of the Jacobian, so that beside a large effect intervals are biased.
     """
-    ones = Weights.plain(chosen.columns)
-    there = moved(chosen.problem, Projector(chosen.problem, chosen.columns, ones).nominal_step(chosen.r))
-    model, moving = _with_effects(there.nominal, chosen.effects)
+    state = settled_plainly(baseline, chosen, hold)
+    there = state.problem
+    model, moving = _with_effects(there.nominal, state.effects)
+    change, slopes = derivatives(Signatures(there), state)
     labels = [p.name for p in describe(model)]
     columns = {}
-    for c, column in zip(chosen.coordinates, chosen.slopes, strict=True):
-        effect = chosen.effects[c.effect]
+    for c, column in zip(state.coordinates, slopes, strict=True):
+        effect = state.effects[c.effect]
         unit = c.unit if c.by_differences else float(getattr(effect, c.name))
         columns[f"{effect.ID} {'-'.join(effect.site)} {c.name}"] = column / unit
     moving = np.array([i for i in moving if labels[i] in columns], int)
-    r = there.r - chosen.changes.sum(axis=0)
+    r = there.r - change
     J = np.column_stack([there.J, *(columns[labels[i]] for i in moving)])
     free, prior = np.concatenate([problem.free, moving]), _prior(problem, model, moving)
     fit = _fit(problem, model, free, _covariance(problem, r, J, prior.root, chosen), r, WITH_EFFECTS)

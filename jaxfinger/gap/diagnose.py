@@ -139,8 +139,8 @@ def diagnose(
     augmented: Fitted | None = None
     if chosen.effects:
         progress("fitting the effects and all nominal parameters together")
-        something_open = found.unlisted > MIN_NAMED_PROBABILITY
-        augmented = as_refitted(problem, chosen) if quick else augmented_fit(problem, chosen, hold=something_open)
+        hold = found.unlisted > MIN_NAMED_PROBABILITY  # Something is open.
+        augmented = as_refitted(baseline, problem, chosen, hold) if quick else augmented_fit(problem, chosen, hold)
     progress("refitting without each third of the trials")
     lines = closures(problem, augmented, not quick)
     status = _explained_or_partly(verdict.status, found, lines, relevance, tolerance)

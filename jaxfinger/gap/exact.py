@@ -164,8 +164,8 @@ def fit_set(
     best = fit_at_nominal(baseline, problem, effects, weights)
     for _ in range(MAX_ROUNDS - 1):
         weights = best.linear_fit.weights
-        problem, nominal = _with_nominal_refitted(baseline, best, weights)
-        found = fit_at_nominal(baseline, problem, list(best.effects), weights, nominal)
+        there = _with_nominal_refitted(baseline, best, weights)
+        found = fit_at_nominal(baseline, there.problem, list(best.effects), weights, there.nominal)
         if found.score < best.score + MIN_SCORE_GAIN:
             # A score is that of the optimum of the linearisation. The later round starts from the weights of that
             # optimum, and its values are nearer to it: in low weights, the prior shrinks the amplitudes of the first.
@@ -180,14 +180,24 @@ def refit_from_plain(baseline: Baseline, state: SearchState) -> SearchState:
     The formula gives a column that is left unexplained little weight. If only a large step of the nominal model would
     close that column, `fit_set` ends before, since every small step costs more in the closed columns than it gains.
     """
+    there = settled_plainly(baseline, state)
+    effects, scales = there.effects, there.problem.scales
+    variants, starts = [as_variant(e, scales) for e in effects], [amplitudes_of(e) for e in effects]
+    found = fit_set(baseline, there.problem, variants, starts, there.linear_fit.weights)
+    return max(state, found, key=lambda s: s.score)
+
+
+def settled_plainly(baseline: Baseline, state: SearchState, hold: bool = False) -> SearchState:
+    """A set and the nominal model where PLAIN_ROUNDS rounds of ordinary least squares take them.
+
+    With `hold` amplitudes and shapes stay as they are. Score, weights and slopes are those of the last fit of the set.
+    """
     plain = Weights.plain(baseline.columns)
-    problem, nominal, there = state.problem, state.nominal, state
     for _ in range(PLAIN_ROUNDS):
-        there = fit_at_nominal(baseline, problem, list(there.effects), plain, nominal)
-        problem, nominal = _with_nominal_refitted(baseline, there, plain)
-    effects = there.effects
-    variants, starts = [as_variant(e, problem.scales) for e in effects], [amplitudes_of(e) for e in effects]
-    return max(state, fit_set(baseline, problem, variants, starts, there.linear_fit.weights), key=lambda s: s.score)
+        if not hold:
+            state = fit_at_nominal(baseline, state.problem, list(state.effects), plain, state.nominal)
+        state = _with_nominal_refitted(baseline, state, plain)
+    return state
 
 
 def amplitudes_of(effect: CatalogueEffect) -> dict[str, float]:
@@ -201,22 +211,25 @@ def as_variant(effect: CatalogueEffect, scales: Scales) -> Variant:
     return Variant(type(effect), effect.site, shapes, scales=scales)
 
 
-def _with_nominal_refitted(baseline: Baseline, state: SearchState, weights: Weights) -> tuple[Problem, ByColumn]:
-    """The problem at the nominal model refitted with a set, by one step of the linearisation; and its derivatives.
+def _with_nominal_refitted(baseline: Baseline, state: SearchState, weights: Weights) -> SearchState:
+    """The set where the nominal model is refitted with it, by one step of the linearisation.
 
-    The step is cut to a third, and again, where its curvature more than doubles the cost.
+    The step is cut to a third, and again, where its curvature more than doubles the cost. Score, weights and slopes are
+    those before the step.
     """
-    here, nominal, none = state.problem, state.nominal, np.empty((0, state.problem.r.size))
-    step, cost = baseline.linear_model(here, nominal, state.r, none).base_step(weights)
+    none = np.empty((0, state.problem.r.size))
+    step, cost = baseline.linear_model(state.problem, state.nominal, state.r, none).base_step(weights)
+    there = state
     for _ in range(MAX_TRIES):
-        here = moved(state.problem, step)
-        left = here.r - np.sum([Signatures(here).white_changes([e])[0] for e in state.effects], axis=0)
-        nominal = ByColumn.of(baseline.columns, here.J.T)
+        problem = moved(state.problem, step)
+        changes = np.reshape([Signatures(problem).white_changes([e])[0] for e in state.effects], state.changes.shape)
+        nominal = ByColumn.of(baseline.columns, problem.J.T)
+        there = replace(state, problem=problem, nominal=nominal, changes=changes)
         # The constant keeps a cost near zero, as of a perfect fit, from refusing every step.
-        if baseline.linear_model(here, nominal, left, none).base_step(weights)[1] < 2.0 * cost + 100.0:
+        if baseline.linear_model(problem, nominal, there.r, none).base_step(weights)[1] < 2.0 * cost + 100.0:
             break
         step = step / 3.0
-    return here, nominal
+    return there
 
 
 @dataclass(frozen=True)

@@ -142,7 +142,7 @@ def test_the_later_of_two_rounds_of_one_score_is_kept(problem, monkeypatch, scor
     rounds = [replace(baseline.null, linear_fit=fit) for fit in fits]
     left = iter(rounds)
     monkeypatch.setattr("jaxfinger.gap.exact.fit_at_nominal", lambda *_: next(left))
-    monkeypatch.setattr("jaxfinger.gap.exact._with_nominal_refitted", lambda *_: (problem, fit))
+    monkeypatch.setattr("jaxfinger.gap.exact._with_nominal_refitted", lambda _, state, weights: state)
     assert fit_set(baseline, problem, [], [], plain(baseline)) is rounds[kept]
 
 
@@ -167,20 +167,15 @@ def test_a_large_effect_is_judged_where_it_leads(scaled):
     assert state.score - baseline.null.score > 0.95 * (there.score - baseline.null.score) > 100.0
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="A quick refit leaves out products of effects and nominal parameters. With a gain error of a fifth, some "
-    "parameters are off by several standard deviations.",
-)
 @pytest.mark.long
 def test_where_a_set_has_led_is_the_exact_fit(scaled):
     """Its parameters lie within the intervals of the exact fit, and its parts miss as much as the whole model does."""
-    _, state = led(scaled)
-    quick, exact = as_refitted(scaled, state), augmented_fit(scaled, state)
+    baseline, state = led(scaled)
+    quick, exact = as_refitted(baseline, scaled, state), augmented_fit(scaled, state)
     np.testing.assert_array_equal(quick.fit.estimated, exact.fit.estimated)
     i, std = exact.fit.estimated, exact.fit.std[exact.fit.estimated]
     shift = np.asarray(ravel(quick.fit.model) - ravel(exact.fit.model))[i]
-    assert np.all(np.abs(shift) < 1.0 * std)
+    assert np.all(np.abs(shift) < 0.3 * std)
     np.testing.assert_allclose(quick.fit.std[i], std, rtol=1.5 * GAIN)
     for key, residuals in exact.residuals_of(quick.fit.model).items():
         np.testing.assert_allclose(quick.residuals_of(quick.fit.model)[key], residuals, atol=1e-12)
