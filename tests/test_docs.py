@@ -9,7 +9,9 @@ import runpy
 import shlex
 import shutil
 import sys
+import tokenize
 from functools import cache
+from io import StringIO
 from pathlib import Path
 
 import matplotlib as mpl
@@ -202,7 +204,8 @@ def parts(file: Path) -> tuple[str, str]:
     text = file.read_text(encoding="utf-8")
     if file.suffix == ".md":
         return "", re.sub(FENCED, "", text, flags=re.DOTALL)
-    tree, told = ast.parse(text), re.findall(r"#(.*)", text)
+    tokens = tokenize.generate_tokens(StringIO(text).readline)
+    tree, told = ast.parse(text), [t.string[1:] for t in tokens if t.type == tokenize.COMMENT]
     for n in ast.walk(tree):
         if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant) and isinstance(n.value.value, str):
             told.append(n.value.value)
