@@ -178,8 +178,9 @@ def kill(count: int, seed: int) -> dict:
                 time.sleep(0.005)
             time.sleep(rng.uniform(0.0, 1.5))
             os.kill(recorder, signal.SIGKILL)
-            with AdsRig(parse_rig(rig_toml("ads", address) + PATIENT)) as rig:
-                head = rig.status().head
+            rig = AdsRig(parse_rig(rig_toml("ads", address) + PATIENT))
+            with rig:
+                head = rig.next_seq  # when it connected: before it waited whether another host is alive
             try:
                 found = recover(path, folder / "rescued.h5")
                 errors = [f for f in check_file(folder / "rescued.h5") if f.severity == "error"]

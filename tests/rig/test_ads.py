@@ -175,8 +175,9 @@ def test_a_second_program_on_this_computer_cuts_off_nobody(real_time):
             ads_rig(real_time).connect()
         rig.status()
         assert rig.reconnects == 0
-    with ads_rig(real_time) as rig:
-        rig.status()
+        threading.Timer(0.2, rig.close).start()
+        with ads_rig(real_time) as other:  # The first one was about to end.
+            other.status()
 
 
 def test_nobody_there(tmp_path):

@@ -32,6 +32,7 @@ TIMEOUT_MS = 500
 LOCK_POLL_S = 0.02  # s between two attempts to get the connection: a fifth of the shortest wait, MAX_BEAT_WAIT_S
 MAX_CALL_S = 0.7  # s after which another thread's call counts as hanging: longer than TIMEOUT_MS
 MAX_BEAT_WAIT_S = 0.1  # s that a heartbeat waits for other calls: two of its periods, `watch.BEAT_S`
+CLAIM_S = 1.0  # s to wait for a program that had the controller and is being killed
 RETRY_S = 0.1  # s between attempts to connect: a router needs some milliseconds to forget a program that was killed
 
 
@@ -229,12 +230,17 @@ def _claim(controller: str) -> int:
         claim = os.open(path, os.O_RDONLY)
     except OSError as error:
         raise UserError(f"{path}: cannot be made ({error.strerror}); see to the folder's rights.") from error
-    try:
-        fcntl.flock(claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(claim)
-        raise UserError(f"another program on this computer has the controller {controller}; end it first.") from error
-    return claim
+    deadline = time.monotonic() + CLAIM_S
+    while True:
+        try:
+            fcntl.flock(claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return claim
+        except OSError as error:
+            if time.monotonic() > deadline:
+                os.close(claim)
+                said = f"another program on this computer has the controller {controller}; end it first."
+                raise UserError(said) from error
+            time.sleep(LOCK_POLL_S)
 
 
 def make(description: RigDescription) -> AdsRig:
