@@ -199,7 +199,7 @@ class Runner:
         """Release the finger after the last trial. Return what went wrong, or an empty string."""
         try:
             self.rig.release()
-            self._let_pass(2 * AFTER_TRIP_S, self._released)  # A busy host first has to read the samples before it.
+            self._let_pass(AFTER_TRIP_S, self._released, since=self.rig.status().head)
             self._check(None)
             if self.rig.status().state is not State.IDLE or not self._released():
                 raise TrialEnded("the controller did not release the finger after the last trial", Trip.HOST)
@@ -207,11 +207,15 @@ class Runner:
             return self.abort(error)
         return ""
 
-    def _let_pass(self, seconds: float, done: Callable[[], bool] = lambda: False) -> None:
-        """Wait for `seconds` of samples, or until `done`, or until the host's limit for that time is over."""
+    def _let_pass(self, seconds: float, done: Callable[[], bool] = lambda: False, since: int | None = None) -> None:
+        """Wait for `seconds` of samples, or until `done`, or until the host's limit for that time is over.
+
+        They count from the sample `since`, by default from the next one that is read. A busy host may have to read many
+        samples before it comes to those that follow a command.
+        """
         reader, rate = self.reader, self.rig.description.rate_hz
         latest = time.monotonic() + self._host_limit(seconds)
-        start: int | None = None
+        start = since
         while reader.reads and time.monotonic() < latest and not done():
             self.rig.report_alive()
             reader.next()
