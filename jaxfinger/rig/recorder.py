@@ -37,10 +37,8 @@ class Recorder:
 
     def __init__(self, path: Path, header: dict[str, Any], resume: bool = False, opener: Callable | None = None):
         self.path = path
-        if not resume and (free := shutil.disk_usage(path.parent).free) < MIN_FREE_BYTES:
-            raise UserError(
-                f"{path.parent}: only {free / 2**20:.0f} MiB are free; a session needs {MIN_FREE_BYTES >> 20} MiB."
-            )
+        if not resume:
+            _refuse_full_disk(path.parent)
         self._log = opener(path) if opener else wal.LogWriter.append(path) if resume else wal.LogWriter.create(path)
         self._queue: queue.SimpleQueue[tuple[bytes, Any] | None] = queue.SimpleQueue()
         self._since: deque[float] = deque()  # when each waiting frame was queued (s, monotonic)
@@ -119,3 +117,13 @@ class Recorder:
 
     def _fail(self, error: OSError) -> None:
         self.failure = self.failure or f"{self.path.name} cannot be written: {error.strerror or error}"
+
+
+def _refuse_full_disk(folder: Path) -> None:
+    """Raise UserError where a folder's disk has less than MIN_FREE_BYTES, or where there is no such folder."""
+    try:
+        free = shutil.disk_usage(folder).free
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written ({error.strerror}); choose a folder that exists.") from None
+    if free < MIN_FREE_BYTES:
+        raise UserError(f"{folder}: only {free / 2**20:.0f} MiB are free; a session needs {MIN_FREE_BYTES >> 20} MiB.")

@@ -3,7 +3,9 @@
 import threading
 
 import numpy as np
+import pytest
 
+from jaxfinger.errors import UserError
 from jaxfinger.rig import recorder as module
 from jaxfinger.rig import wal
 from jaxfinger.rig.backend import Block
@@ -50,3 +52,15 @@ def test_a_disk_too_slow_for_too_long_is_a_reason_to_stop(tmp_path, monkeypatch)
     Slow.go.set()
     log.close()
     assert [f.tag for f in wal.read_log(log.path)][-1] == wal.END
+
+
+def test_a_folder_that_is_missing_is_a_sentence(tmp_path):
+    with pytest.raises(UserError, match="choose a folder that exists"):
+        Recorder(tmp_path / "missing" / "a.wal", {})
+
+
+def test_a_full_disk_is_a_sentence_and_leaves_no_log(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MIN_FREE_BYTES", 1 << 60)
+    with pytest.raises(UserError, match="MiB are free; a session needs"):
+        Recorder(tmp_path / "a.wal", {})
+    assert list(tmp_path.iterdir()) == []
