@@ -135,6 +135,7 @@ class Supervisor:
         self._tail = np.empty((0, n))  # the last VELOCITY_SPAN samples of earlier blocks
         self._tail_seq = np.empty(0, np.int64)  # their numbers
         self._last: np.ndarray | None = None  # the last sample of the previous block
+        self._read = np.full(n, np.nan)  # the last finite value of every channel
         self.latched: tuple[Violation, ...] = ()
 
     def check(self, block: Block) -> list[Violation]:
@@ -157,6 +158,9 @@ class Supervisor:
         self._tail = np.concatenate([self._tail, block.x])[-VELOCITY_SPAN:]
         self._tail_seq = np.concatenate([self._tail_seq, seq])[-VELOCITY_SPAN:]
         self._last = block.x[-1]
+        back = np.argmax(np.isfinite(block.x[::-1]), axis=0)  # samples since the last finite one; 0 where there is none
+        value = block.x[len(block) - 1 - back, np.arange(block.x.shape[1])]
+        self._read = np.where(np.isfinite(value), value, self._read)
         return found
 
     def _name(self, channel: int | np.intp) -> str:
@@ -263,10 +267,10 @@ class Supervisor:
 
     def commanded(self, command: Command) -> None:
         """Take note of a command, to check that the joint's encoder follows a move of the external motor."""
-        if isinstance(command, JointMove) and self._last is not None:
+        if isinstance(command, JointMove):
             column = self.rig.index("joint_position", command.joint)
-            if column is not None and abs(command.target - self._last[column]) > UnfollowedMove.DISTANCE:
-                start, rate = float(self._last[column]), self.rig.rate_hz
+            if column is not None and abs(command.target - self._read[column]) > UnfollowedMove.DISTANCE:
+                start, rate = float(self._read[column]), self.rig.rate_hz
                 self._move = UnfollowedMove(column, start, command.speed, command.acceleration, rate)
         elif not isinstance(command, TensionRamp):
             self._move = None
