@@ -126,7 +126,7 @@ class Fit:
 
             return of(theta), jax.jacfwd(of)(theta)
 
-        value, J = map(np.asarray, value_and_jacobian(flat[positions]))
+        value, J = map(np.asarray, value_and_jacobian(jax.device_put(np.asarray(flat)[positions])))
         variance = np.einsum("...i,ij,...j->...", J, covariance[np.ix_(positions, positions)], J)
         unseen = np.any(J[..., ~seen[positions]] != 0.0, axis=-1)
         return value, np.where(unseen, np.inf, np.sqrt(np.maximum(variance, 0.0)))

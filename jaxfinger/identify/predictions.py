@@ -117,22 +117,23 @@ def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> 
             f"{session.file}: /finger/tendons: is empty, so nothing drives a simulation of VD.3; call these trials "
             "ID.3-dynamic, of which the torques are judged"
         )
-    model = jax.tree.map(lambda *a: jnp.stack(a), *models)
-    x = jax.vmap(lambda model, x: model.true_motion(x), in_axes=(0, -2), out_axes=-2)(model, stack.batch.x)
+    # NumPy stacks and picks: outside of a compiled function each operation of JAX's would be compiled by itself.
+    model = jax.tree.map(lambda *a: np.stack(a), *models)
+    x = jax.tree.map(np.asarray, _true_motions(jax.device_put(model), stack.batch.x))
     steps = np.array([np.median(np.diff(session[name].time)) for name in stack.trials])
     # The simulation takes even steps: each trial gets its own uniform instants, all trials the same number of them.
     longest = max(session[name].duration / step for name, step in zip(stack.trials, steps, strict=True))
     grid = steps[:, None] * np.arange(padded_size(int(np.ceil(longest)) + 1, 512))
-    tension = np.asarray(x.tension)
+    times = _times(stack)
     even = np.stack(
-        [[np.interp(g, t, f) for f in tension[:, b]] for b, (g, t) in enumerate(zip(grid, _times(stack), strict=True))]
+        [[np.interp(g, t, f) for f in x.tension[:, b]] for b, (g, t) in enumerate(zip(grid, times, strict=True))]
     ).reshape(len(steps), session.finger.n, -1)
     starts = (x.session_time - x.time)[:, 0]
     substeps = max(1, int(np.ceil(steps.max() / (MAX_TIME_STEP * stack.experiment.pace) - 1e-6)))
     # Pad to a common shape with the last trial.
     wide = np.minimum(np.arange(padded_size(len(models), 2)), len(models) - 1)
-    each = jax.tree.map(lambda a: jnp.asarray(a)[wide], (model, grid, even, x.q[..., 0].T, x.qd[..., 0].T, starts))
-    q = np.asarray(_simulate(*each, substeps=substeps))[: len(models)]
+    each = jax.tree.map(lambda a: a[wide], (model, grid, even, x.q[..., 0].T, x.qd[..., 0].T, starts))
+    q = np.asarray(_simulate(*jax.device_put(each), substeps=substeps))[: len(models)]
     # A simulation that diverges may overflow; it is clipped where it leaves the range by the range's whole width.
     low, high = session.finger.limits.T[:, :, None]
     span = np.where(np.isfinite(high - low), high - low, 2 * np.pi)
@@ -140,11 +141,17 @@ def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> 
     out = {}
     for b, name in enumerate(stack.trials):
         time = np.asarray(session[name].time)
-        path = jnp.asarray(np.stack([np.interp(time, grid[b], row) for row in q[b]]))
+        path = np.stack([np.interp(time, grid[b], row) for row in q[b]])
         N = len(time)
-        moved = jax.tree.map(lambda a, b=b, N=N: a[..., b, :N], x)
+        path, moved = jax.device_put((path, jax.tree.map(lambda a, b=b, N=N: a[..., b, :N], x)))
         out[name] = {"q": np.array(models[b].reading("q", moved, path)).T}
     return out
+
+
+@quick_jit
+def _true_motions(models: Model, x: Motion) -> Motion:
+    """Motion of each trial as its model takes it to be; every leaf of `models` has the trials first."""
+    return jax.vmap(lambda model, x: model.true_motion(x), in_axes=(0, -2), out_axes=-2)(models, x)
 
 
 def _times(stack: Stack) -> list[np.ndarray]:
