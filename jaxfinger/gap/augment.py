@@ -66,10 +66,11 @@ def augmented_fit(problem: Problem, chosen: SearchState, hold: bool = False) -> 
 
 
 def as_refitted(baseline: Baseline, problem: Problem, chosen: SearchState, hold: bool = False) -> Fitted:
-    """The augmented model after a few linear refits (`settled_plainly`), for a quick diagnosis; `hold` as above.
+    """The augmented model after a few linear refits (`settled_plainly`), for a quick diagnosis.
 
-    It needs only the compiled functions of the nominal model and of signatures. Derivatives of an effect by a nominal
-    parameter are left out of the Jacobian, so that beside a large effect intervals are biased.
+    `hold` is that of `augmented_fit`. The fit needs only the compiled functions of the nominal model and of signatures.
+    Derivatives of an effect by a nominal parameter are left out of the Jacobian, so that beside a large effect
+    intervals are biased.
     """
     state = settled_plainly(baseline, chosen, hold)
     there = state.problem

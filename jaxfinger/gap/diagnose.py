@@ -139,8 +139,11 @@ def diagnose(
     augmented: Fitted | None = None
     if chosen.effects:
         progress("fitting the effects and all nominal parameters together")
-        hold = found.unlisted > MIN_NAMED_PROBABILITY  # Something is open.
-        augmented = as_refitted(baseline, problem, chosen, hold) if quick else augmented_fit(problem, chosen, hold)
+        something_open = found.unlisted > MIN_NAMED_PROBABILITY
+        if quick:
+            augmented = as_refitted(baseline, problem, chosen, hold=something_open)
+        else:
+            augmented = augmented_fit(problem, chosen, hold=something_open)
     progress("refitting without each third of the trials")
     lines = closures(problem, augmented, not quick)
     status = _explained_or_partly(verdict.status, found, lines, relevance, tolerance)

@@ -22,7 +22,8 @@ from jaxfinger.model import Model
 # about 1e-9 only (machine precision over the least relative singular value, 1e-7).
 MIN_SHARE = 1e-3
 # An estimate depends on another parameter if it moves by more than this, in standard deviations, where that parameter
-# moves by the unit of its own column. It is small, since an undetermined parameter may be off by many units.
+# moves by the unit of its own column. It is small, since an undetermined parameter may be off by many units; rounding
+# gives 1e-9 at most, as above.
 MIN_DEPENDENCE = 1e-6
 
 

@@ -68,9 +68,14 @@ class Source(NamedTuple):
         """Model without effects that the experiment does not depend on, so that they are not compiled."""
         return model if self.effects or not model.effects else eqx.tree_at(lambda m: m.effects, model, ())
 
+    def seen(self, model: Model) -> tuple[Model, Free]:
+        """`relevant_model`, and the parameters on which the residuals depend, as free ones."""
+        relevant = self.relevant_model(model)
+        return relevant, Free.at(relevant, self.positions)
+
     def parts(self, model: Model) -> set[str]:
         """Fields of the model on whose parameters the residuals depend."""
-        return set(Free.at(self.relevant_model(model), self.positions).parts)
+        return set(self.seen(model)[1].parts)
 
     def is_affine(self, model: Model, free: Int[np.ndarray, " p"]) -> bool:
         """Whether the residuals are affine in the free parameters, so that one linearisation is exact."""
@@ -119,8 +124,7 @@ class Tangents:
 
         `parts`: as in `linearise.tangent`, where the experiment is not affine.
         """
-        relevant = source.relevant_model(model)
-        free = Free.at(relevant, source.positions)
+        relevant, free = source.seen(model)
         if not affine:
             along = tangent(relevant, free, source.batch, tuple(source.filters), parts)
             return whitened(along, source.batch, source.filters, limit, source.weights)
@@ -277,9 +281,7 @@ def white_tangents(model: Model, sources: dict[str, Source]) -> dict[str, White]
     """White residuals and Jacobian of every experiment at the model, not compressed."""
 
     def one(s: Source) -> White:
-        relevant = s.relevant_model(model)
-        along = tangent(relevant, Free.at(relevant, s.positions), s.batch, tuple(s.filters))
-        return white_tangent(along, s.batch, s.filters)
+        return white_tangent(tangent(*s.seen(model), s.batch, tuple(s.filters)), s.batch, s.filters)
 
     return dict(zip(sources, side_by_side(one, sources.values()), strict=True))
 
@@ -303,8 +305,7 @@ def residuals_each(
     """Measured − predicted of every experiment by channel, in the channel's unit, also at samples whose mask is 0."""
 
     def one(s: Source):
-        relevant = s.relevant_model(model)
-        return residuals_by_tangent(relevant, Free.at(relevant, s.positions), s.batch, tuple(s.filters))
+        return residuals_by_tangent(*s.seen(model), s.batch, tuple(s.filters))
 
     return dict(zip(sources, side_by_side(one, sources.values()), strict=True))
 

@@ -60,8 +60,7 @@ def _highest(model: Model, sources: dict[str, Source]) -> Float[np.ndarray, " n"
 
 def _is_dead(model: Model, k: int, highest: float) -> bool:
     """Whether the tendon loses nothing at any tension up to the highest, or all of the highest."""
-    loss = model.tendon_friction
-    a0, a1 = (float(np.asarray(a)[k]) for a in (loss.constant, loss.proportional))
+    a0, a1 = float(model.tendon_friction.constant[k]), float(model.tendon_friction.proportional[k])
     nothing = a0 <= 0.0 and a0 + a1 * (highest or 1.0) <= 0.0
     return bool(nothing or 0.0 < highest <= a0 + a1 * highest)
 

@@ -32,7 +32,7 @@ TIMEOUT_MS = 500
 LOCK_POLL_S = 0.02  # s between two attempts to get the connection: a fifth of the shortest wait, MAX_BEAT_WAIT_S
 MAX_CALL_S = 0.7  # s after which another thread's call counts as hanging: longer than TIMEOUT_MS
 MAX_BEAT_WAIT_S = 0.1  # s that a heartbeat waits for other calls: two of its periods, `watch.BEAT_S`
-CLAIM_S = 1.0  # s to wait for a program that had the controller and is being killed
+CLAIM_S = 1.0  # s to wait for a program that is being killed: it keeps its claim for some milliseconds
 RETRY_S = 0.1  # s between attempts to connect: a router needs some milliseconds to forget a program that was killed
 
 
