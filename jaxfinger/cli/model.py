@@ -348,8 +348,10 @@ def show(fit: Path, *, effects: Path | None = None, json: bool = False) -> None:
         content = fit_to_read(load_fit(fit, effects))
     try:
         _report(content, json)
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
-        raise UserError(f"{fit}: is damaged ({error!r}); identify the session again") from None
+    except KeyError as error:
+        raise UserError(f"{fit}: is damaged, {error.args[0]!r} is missing; identify the session again") from None
+    except (IndexError, TypeError, ValueError, AttributeError) as error:
+        raise UserError(f"{fit}: is damaged ({error}); identify the session again") from None
 
 
 def _write(fit, output: Path, overwrite: bool) -> dict:

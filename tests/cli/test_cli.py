@@ -64,6 +64,16 @@ def test_what_needs_no_computing_needs_no_jax(folder, command, file):
     assert "loaded []" in out
 
 
+@pytest.mark.parametrize(("content", "says"), [('"seen": {}', "'stages' is missing"), ('"seen": 3', "is damaged")])
+def test_show_says_what_a_damaged_fit_lacks(tmp_path, capsys, content, says):
+    file = tmp_path / "fit.json"
+    file.write_text(f'{{"schema": "jaxfinger-fit/2", {content}}}', encoding="utf-8")
+    assert run("show", file) == 2
+    said = capsys.readouterr().err
+    assert says in said
+    assert "Error" not in said
+
+
 @pytest.mark.parametrize(
     "tokens", [*([c] for c in COMMANDS), *(["fit", s] for s in STAGES), *(["sealed", s] for s in SEALED)]
 )
