@@ -11,10 +11,15 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 # XLA's fusion emitters compile these scalar formulas 50 % slower or worse, and -O2 and above 10 % slower; neither makes
-# them run faster. Options in the environment's XLA_FLAGS take precedence.
+# them run faster. YNNPACK, to which XLA hands sums, takes 30 % of a diagnosis's processor time for those over short
+# axes, where XLA's own loops take few. Options in the environment's XLA_FLAGS take precedence.
 QUICK = {
     name: value
-    for name, value in {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}.items()
+    for name, value in {
+        "xla_cpu_use_fusion_emitters": False,
+        "xla_backend_optimization_level": 1,
+        "xla_cpu_experimental_ynn_fusion_type": "",
+    }.items()
     if name not in os.environ.get("XLA_FLAGS", "")
 }
 

@@ -21,7 +21,8 @@ os.environ["JAX_NUMPY_DTYPE_PROMOTION"] = "strict"
 # Most programs of the tests run once or twice. With these options they compile in a third of the time.
 CHEAP = (
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
-    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
+    "--xla_cpu_experimental_ynn_fusion_type="
 )
 os.environ.setdefault("XLA_FLAGS", CHEAP)
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line sets it: two threads mostly wait

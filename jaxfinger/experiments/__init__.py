@@ -4,7 +4,7 @@ This is the only room that joins data to the model.
 """
 
 from jaxfinger.experiments.affected import affected_channels, refuse_broken
-from jaxfinger.experiments.predict import change, demean, predict
+from jaxfinger.experiments.predict import change, demean, predict, predict_compiled
 from jaxfinger.experiments.prepare import Batch, NotJudged, Stack, not_judged, prepare
 from jaxfinger.experiments.shapes import SAMPLES, TRIALS, Block, blocks, padded, padded_size, split
 from jaxfinger.experiments.table import EXPERIMENTS, Experiment
@@ -26,6 +26,7 @@ __all__ = [
     "padded",
     "padded_size",
     "predict",
+    "predict_compiled",
     "prepare",
     "refuse_broken",
     "split",

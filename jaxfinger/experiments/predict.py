@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfinger.compilation import quick_jit
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.model import (
     Model,
@@ -31,6 +32,9 @@ def predict(model: Model, measured: Motion, channels: tuple[str, ...]) -> dict[s
     """Predict the reading of each channel, by its dataset's name, in the format's units; batch last."""
     x = model.true_motion(measured)
     return {c: model.reading(c, x, _PREDICTORS[c](model, x)) for c in channels}
+
+
+predict_compiled = quick_jit(predict)
 
 
 def change(

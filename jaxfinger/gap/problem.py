@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Predictions, Session
 from jaxfinger.effects import Scales
 from jaxfinger.errors import UserError
@@ -128,7 +128,7 @@ class Problem:
         return [t for e in self.rows for t in self.stacks[e].trials]
 
 
-_terms_without_effects = eqx.filter_jit(terms_without_effects)
+_terms_without_effects = quick_jit(terms_without_effects)
 
 
 def build(

@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxfinger.data import Predictions, Session
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import Stack, predict, prepare
+from jaxfinger.experiments import Stack, predict_compiled, prepare
 from jaxfinger.identify import Recipe
 from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.parameters import Free, describe
@@ -78,7 +78,7 @@ def _rebased(difference: Stack, predicted: dict) -> Stack:
 
 
 def _predict(model: Model, stack: Stack) -> dict:
-    return eqx.filter_jit(predict)(model, stack.batch.x, stack.experiment.channels)
+    return predict_compiled(model, stack.batch.x, stack.experiment.channels)
 
 
 def _measured_noise(stacks: dict[str, Stack], simulated: dict[str, Stack]) -> dict[tuple[str, str], Noise]:

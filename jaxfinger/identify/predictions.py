@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session, Trial, joints_of, low_pass
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import SAMPLES, Stack, padded, padded_size, predict, prepare
+from jaxfinger.experiments import SAMPLES, Stack, padded, padded_size, predict_compiled, prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.model import Model, Motion, simulate
 
@@ -52,7 +52,7 @@ def predict_session(
         for b, name in enumerate(stack.trials):
             N = len(session[name].time)
             x = jax.tree.map(lambda a, b=b: a[..., b : b + 1, :], wide)
-            values = _predict(model, x, stack.experiment.channels)
+            values = predict_compiled(model, x, stack.experiment.channels)
             channels = {c: np.array(v[:, 0, :N]).T for c, v in values.items()}
             if experiment == "VD.3":
                 # No measured channel stands beside it, and above the cut-off it holds only noise of q̈ and tension.
@@ -83,11 +83,6 @@ def model_for(fit: Fit | Model, session: Session) -> Model:
     if not np.any(model.finger.gravity):
         return model  # the recipe leaves gravity out
     return eqx.tree_at(lambda m: m.finger.gravity, model, jnp.asarray(finger.gravity, dtype=float))
-
-
-@quick_jit
-def _predict(model: Model, x: Motion, channels: tuple[str, ...]) -> dict[str, Float[Array, "_columns 1 T"]]:
-    return predict(model, x, channels)
 
 
 def _only_measurable(channels: dict[str, np.ndarray], trial: Trial, session: Session) -> dict[str, np.ndarray]:

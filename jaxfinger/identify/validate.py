@@ -20,7 +20,7 @@ from scipy.signal import butter, sosfilt, sosfilt_zi
 from jaxfinger.data import Session, Trial, low_pass
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import EXPERIMENTS, Stack, not_judged, predict, prepare
+from jaxfinger.experiments import EXPERIMENTS, Stack, not_judged, predict, predict_compiled, prepare
 from jaxfinger.identify.ahead import ahead, diverges, noise_of_simulation
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.linearise import residuals_of
@@ -153,9 +153,6 @@ def _residuals(model: Model, fit: Fit, stack: Stack) -> tuple[dict, dict[str, tu
         residuals[c] = np.where(mask, raw, np.nan)
         floors[c] = _floor(fit, stack, c, raw)
     return residuals, floors
-
-
-_predict = eqx.filter_jit(predict)
 
 
 def _floor(fit: Fit, stack: Stack, channel: str, residual: np.ndarray) -> tuple[np.ndarray, str]:
@@ -312,7 +309,7 @@ def _slopes(fit: Fit, model: Model, session: Session, stack: Stack) -> list[Slop
         return jnp.stack([jnp.asarray(w) @ force[axis, b] for _, _, axis, b, _, w in lines])
 
     values, std = replace(fit, model=model).function(eqx.filter_jit(slopes))
-    predicted = np.asarray(_predict(model, x, ("fingertip_force",))["fingertip_force"])
+    predicted = np.asarray(predict_compiled(model, x, ("fingertip_force",))["fingertip_force"])
     return [
         Slope(
             name,

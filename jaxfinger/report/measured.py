@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.data import Session
-from jaxfinger.experiments import Stack, predict
+from jaxfinger.experiments import Stack, predict_compiled
 from jaxfinger.model import Model, TendonFriction, rigid_body
 
 MIN_ARM = 1e-3  # m: with a shorter moment arm, an error of the torque is a large error of the tension behind it.
@@ -88,7 +88,7 @@ def loss_points(model: Model, session: Session, stack: Stack) -> dict[str, Point
     frictionless = eqx.tree_at(lambda m: m.tendon_friction, model, TendonFriction.zeros(model.finger.n))
     x = stack.batch.x
     y, mask = np.asarray(stack.batch.y["joint_torque"]), np.asarray(stack.batch.mask["joint_torque"])
-    without = np.asarray(_torque(frictionless, x))
+    without = np.asarray(predict_compiled(frictionless, x, ("joint_torque",))["joint_torque"])
     C = np.asarray(model.moment_arm.coupling(x.q))
     found: dict[str, list[tuple[float, float]]] = {}
     for b, name in enumerate(stack.trials):
@@ -105,8 +105,3 @@ def loss_points(model: Model, session: Session, stack: Stack) -> dict[str, Point
                 found.setdefault(trial.tendon, []).append((f[run].mean(), lost))
             highest = max(highest, f[run].mean())
     return {tendon: Points(*np.array(rows).T) for tendon, rows in found.items()}
-
-
-@eqx.filter_jit
-def _torque(model: Model, x):
-    return predict(model, x, ("joint_torque",))["joint_torque"]

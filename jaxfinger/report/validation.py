@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import equinox as eqx
 import numpy as np
 from matplotlib.figure import Figure
 
 from jaxfinger.data import Session, Trial
 from jaxfinger.data.atomic import make_folder
 from jaxfinger.data.sizes import sizes_of
-from jaxfinger.experiments import Stack, predict, prepare
+from jaxfinger.experiments import Stack, predict_compiled, prepare
 from jaxfinger.identify import Fit
 from jaxfinger.identify.predictions import model_for, predict_session
 from jaxfinger.identify.validate import display, excursion_path
@@ -65,7 +64,7 @@ def _vd1(model: Model, session: Session, trial: Trial) -> Figure:
 
 def _vd2(model: Model, session: Session, stack: Stack) -> Figure:
     """Fingertip force against tension, measured and predicted, hold by hold (paper, Fig. 9)."""
-    forces = np.asarray(_predict(model, stack.batch.x, ("fingertip_force",))["fingertip_force"])
+    forces = np.asarray(predict_compiled(model, stack.batch.x, ("fingertip_force",))["fingertip_force"])
     measured, mask = (np.asarray(a["fingertip_force"]) for a in (stack.batch.y, stack.batch.mask))
     figure, (axes,) = grid(1, len(stack.trials), 3.2, 2.8, sharey=True)
     for b, (ax, name) in enumerate(zip(axes, stack.trials, strict=True)):
@@ -91,7 +90,7 @@ def _vd3(model: Model, session: Session, trial: Trial) -> Figure:
     simulated = predict_session(model, session, [trial.name])[trial.name]["q"]
     stack = prepare(session, [trial.name])["VD.3"]
     time, slides = np.asarray(stack.batch.x.time)[0], np.asarray(stack.batch.mask["joint_torque"])[:, 0] > 0
-    lacking = np.asarray(_predict(model, stack.batch.x, ("joint_torque",))["joint_torque"])[:, 0]
+    lacking = np.asarray(predict_compiled(model, stack.batch.x, ("joint_torque",))["joint_torque"])[:, 0]
     joints = session.finger.joint_names
     turn, torque = (np.array([display(session, c, i)[0] for i in range(len(joints))]) for c in ("q", "joint_torque"))
     figure, axes = grid(3, 1, 6.4, 1.8, sharex=True)
@@ -108,6 +107,3 @@ def _vd3(model: Model, session: Session, trial: Trial) -> Figure:
 def _unit(session: Session, channel: str) -> str:
     """Unit in which people read a channel's first column."""
     return display(session, channel, 0)[1].replace("degrees", "°")
-
-
-_predict = eqx.filter_jit(predict)

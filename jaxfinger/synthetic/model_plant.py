@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxfinger.compilation import quick_jit
 from jaxfinger.errors import UserError
-from jaxfinger.experiments.predict import predict
+from jaxfinger.experiments.predict import predict_compiled
 from jaxfinger.model import Model, Motion
 from jaxfinger.model import simulate as simulate_forward
 from jaxfinger.synthetic.plant import Channels, Plant
@@ -40,7 +40,7 @@ class ModelPlant:
         elif plan.held:
             channels += ("fingertip_force",) if plan.experiment == "VD.2" else ("joint_torque",)
         samples = plan.time.size
-        predicted = _predict(self.model, self._motion(plan), channels)
+        predicted = predict_compiled(self.model, self._motion(plan), channels)
         return {
             "q": plan.q,
             "tendon_force": plan.tension,
@@ -59,7 +59,7 @@ class ModelPlant:
         tension, q0 = jnp.asarray(driven["tendon_force"]), jnp.asarray(driven["q"][:, 0])
         start: Any = jnp.asarray(plan.session_start)  # As an array it is traced, so all trials share one compilation.
         q, _ = _simulate(self.model, jnp.asarray(plan.time), tension, q0, jnp.zeros_like(q0), session_start=start)
-        excursion = _predict(
+        excursion = predict_compiled(
             self.model, self._motion(plan, np.asarray(q), driven["tendon_force"]), ("tendon_excursion",)
         )
         return {
@@ -102,8 +102,7 @@ class ModelPlant:
         )
 
 
-_predict = eqx.filter_jit(predict)
-_simulate = eqx.filter_jit(simulate_forward)
+_simulate = quick_jit(simulate_forward)
 
 
 def _derivatives(time: Float[Array, " N"], q: Float[Array, "m N"]) -> tuple[Float[Array, "m N"], Float[Array, "m N"]]:
