@@ -44,7 +44,7 @@ class ByColumn:
         """Split whole rows into columns. Rows of the problem that belong to no column are left out."""
         nonzero = []
         for c in columns.items:
-            there = x[:, c.rows]
+            there = np.take(x, c.rows, axis=1)
             index = np.flatnonzero(there.any(axis=1))
             nonzero.append(NonzeroRows(index, there[index]))
         return cls(columns, len(x), nonzero)

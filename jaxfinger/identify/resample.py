@@ -14,12 +14,12 @@ for: errors, in standard deviations, of what CAD gives and no stage estimates.
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import prepare
@@ -172,7 +172,7 @@ def batching_here(batching: Batching | None) -> Batching:
     return batching or ("map" if jax.default_backend() == "cpu" else "vmap")
 
 
-@eqx.filter_jit
+@quick_jit
 def _refit_all(grams: Grams, sizes: tuple[int, ...], members: tuple[Array, Array], batching: Batching):
     def one(member):
         return _refit(grams, sizes, *member)

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxfinger.compilation import side_by_side
+from jaxfinger.compilation import quick_jit, side_by_side
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch
 from jaxfinger.identify.gauss_newton import (
@@ -247,10 +247,10 @@ def _factor_of(rows: Float[np.ndarray, "N q"], room: int) -> Factor:
     return Factor(*jax.device_put((R, d, np.asarray(T[p, p] ** 2))))
 
 
-_begin = eqx.filter_jit(begin)
+_begin = quick_jit(begin)
 
 
-@eqx.filter_jit
+@quick_jit
 def _advance(tolerance: Float[Array, ""], y, state: Iterate, here: Factor, low, high):
     return VisibleGaussNewton(atol=tolerance, kink=KINK_TOLERANCE).advance(y, state, here, low, high)
 
@@ -346,6 +346,6 @@ def bounded_least_squares(
     return np.asarray(_bounded(_factor_of(np.column_stack([A, b]), room), *ends))[:p]
 
 
-@eqx.filter_jit
+@quick_jit
 def _bounded(here: Factor, low: Float[Array, " p"], high: Float[Array, " p"]) -> Float[Array, " p"]:
     return bounded_step(here, low, high)[0]
