@@ -27,6 +27,7 @@ from jaxfinger.gap.columns import Counts
 from jaxfinger.gap.costs import CauseKey, Costs
 from jaxfinger.gap.diagnose import search_for_causes
 from jaxfinger.gap.formula import Evidence, Parameters, log_likelihood, unexplained, unlisted
+from jaxfinger.gap.posterior import no_imitators
 from jaxfinger.gap.problem import build
 from jaxfinger.gap.signatures import catalogue_for
 from jaxfinger.identify import Recipe
@@ -56,6 +57,8 @@ class Record:
         costs, best = self.costs(self.parameters), {frozenset(): self.evidence[frozenset()]}
         for keys in sorted(self.evidence, key=lambda k: costs.of(k) - self.evidence[k].score)[:MAX_SETS]:
             best[keys] = self.evidence[keys]
+        for keys in list(best):
+            best |= {less: self.evidence[less] for k in keys if (less := keys - {k}) in self.evidence}
         return replace(self, evidence=best)
 
     def costs(self, p: Parameters) -> Costs:
@@ -76,6 +79,8 @@ class Record:
         for keys, v in w.items():
             for key in keys:
                 probability[key] += v
+        for key, sound in no_imitators(costs, self.counts, self.evidence, best).items():
+            probability[key] *= sound
         probability[UNLISTED] = unlisted(self.counts, self.evidence[best], p)
         P = np.clip(np.array(list(probability.values())), CLIP, 1.0 - CLIP)
         true = np.array([key in self.at_work for key in probability])

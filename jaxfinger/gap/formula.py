@@ -135,6 +135,18 @@ def unlisted(counts: Counts, evidence: Evidence, p: Parameters) -> float:
     return float(expit(p.unlisted_slope * (left - p.unlisted_threshold)))
 
 
+def left_share(
+    counts: Counts, without: Evidence, left: Evidence, explainable: Float[np.ndarray, " C"], p: Parameters
+) -> float:
+    """Share of the energy beyond noise that a set leaves where one of its causes acts; 0 where there is none.
+
+    It is Σ_c τ_c ℓ_c / Σ_c τ_c ℓ_c⁰, with ℓ_c = max(e_c − φ K_c, 0) for what the set leaves, ℓ_c⁰ for what it leaves
+    without the cause, and τ_c, `explainable`, as in `costs`.
+    """
+    now, before = (float(explainable @ np.maximum(x.e - p.variance_floor * counts.K, 0.0)) for x in (left, without))
+    return min(now / before, 1.0) if before > 0.0 else 0.0
+
+
 @dataclass(frozen=True)
 class LinearFit:
     """A set of rows Z at its optimum on top of a base (`LinearModel`)."""

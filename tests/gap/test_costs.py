@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from jaxfinger.gap.columns import Counts
 from jaxfinger.gap.costs import Costs
-from jaxfinger.gap.formula import Parameters
+from jaxfinger.gap.formula import Evidence, Parameters
+from jaxfinger.gap.posterior import no_imitators
 
 SITES = {"tendon_stretch": ("T1", "T2", "T3"), "joint_stribeck": ("MCP", "PIP"), "joint_damping": ("MCP", "PIP")}
 EXCURSION, TORQUE = np.eye(2)  # columns
@@ -34,3 +36,21 @@ def test_probabilities_are_shares_of_evidence_beyond_what_each_set_costs():
     w = COSTS.probabilities(sets)
     assert list(w.values()) == pytest.approx([0.5, 0.5, 0.0])
     assert COSTS.probabilities({k: s + 321.0 for k, s in sets.items()}) == pytest.approx(w)
+
+
+def test_what_leaves_more_than_it_explains_where_it_acts_only_imitates_something_unlisted():
+    """Noise and what is left in other columns count for nothing."""
+    counts, nothing = Counts(np.array([10, 10]), np.array([100, 100])), np.zeros(2)
+
+    def left(excursion: float, torque: float) -> Evidence:
+        return Evidence(10.0 + np.array([excursion, torque]), np.full(2, 100.0), nothing, 0.0)
+
+    def of(evidence: dict) -> dict:
+        return no_imitators(COSTS, counts, evidence, max(evidence, key=len))
+
+    both, less = frozenset({STRETCH, STRIBECK}), {STRETCH: frozenset({STRIBECK}), STRIBECK: frozenset({STRETCH})}
+    imitates = {both: left(0.0, 3000.0), less[STRETCH]: left(5000.0, 3000.0), less[STRIBECK]: left(0.0, 4000.0)}
+    assert of(imitates)[STRETCH] == 1.0
+    assert of(imitates)[STRIBECK] == pytest.approx(0.25, abs=0.01)
+    noise = {both: left(0.0, 5.0), less[STRETCH]: left(5000.0, 5.0), less[STRIBECK]: left(0.0, 4000.0)}
+    assert of(noise)[STRIBECK] == pytest.approx(1.0)
