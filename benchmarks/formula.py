@@ -27,7 +27,7 @@ from jaxfinger.gap.columns import Counts
 from jaxfinger.gap.costs import CauseKey, Costs
 from jaxfinger.gap.diagnose import search_for_causes
 from jaxfinger.gap.formula import Evidence, Parameters, log_likelihood, unexplained, unlisted
-from jaxfinger.gap.posterior import no_imitators
+from jaxfinger.gap.posterior import genuine_probabilities
 from jaxfinger.gap.problem import build
 from jaxfinger.gap.signatures import catalogue_for
 from jaxfinger.identify import Recipe
@@ -53,7 +53,7 @@ class Record:
     parameters: Parameters
 
     def likeliest(self) -> "Record":
-        """Keep the likeliest sets only."""
+        """Keep the likeliest sets, and each of them without one of its causes."""
         costs, best = self.costs(self.parameters), {frozenset(): self.evidence[frozenset()]}
         for keys in sorted(self.evidence, key=lambda k: costs.of(k) - self.evidence[k].score)[:MAX_SETS]:
             best[keys] = self.evidence[keys]
@@ -79,9 +79,10 @@ class Record:
         for keys, v in w.items():
             for key in keys:
                 probability[key] += v
-        for key, sound in no_imitators(costs, self.counts, self.evidence, best).items():
-            probability[key] *= sound
-        probability[UNLISTED] = unlisted(self.counts, self.evidence[best], p)
+        other = unlisted(self.counts, self.evidence[best], p)
+        for key, genuine in genuine_probabilities(costs, self.counts, self.evidence, best, other).items():
+            probability[key] *= genuine
+        probability[UNLISTED] = other
         P = np.clip(np.array(list(probability.values())), CLIP, 1.0 - CLIP)
         true = np.array([key in self.at_work for key in probability])
         return float(np.sum(np.log(np.where(true, P, 1.0 - P))))

@@ -12,7 +12,8 @@ Result = TypeVar("Result")
 
 # XLA's fusion emitters compile these scalar formulas 50 % slower or worse, and -O2 and above 10 % slower; neither makes
 # them run faster. YNNPACK, to which XLA hands sums, spends 30 % of a diagnosis's processor time on those over short
-# axes; XLA's own loops spend little on them. Options in the environment's XLA_FLAGS take precedence.
+# axes (Linux's `perf record`); XLA's own loops spend little on them. Options in the environment's XLA_FLAGS take
+# precedence.
 QUICK = {
     name: value
     for name, value in {

@@ -34,7 +34,9 @@ def predict(model: Model, measured: Motion, channels: tuple[str, ...]) -> dict[s
     return {c: model.reading(c, x, _PREDICTORS[c](model, x)) for c in channels}
 
 
-predict_compiled = quick_jit(predict)
+predict_compiled = quick_jit(
+    predict
+)  # Not inside another compiled function: JAX takes compiler options outermost only.
 
 
 def change(

@@ -140,7 +140,7 @@ def left_share(
 ) -> float:
     """Share of the energy beyond noise that a set leaves where one of its causes acts; 0 where there is none.
 
-    It is Σ_c τ_c ℓ_c / Σ_c τ_c ℓ_c⁰, with ℓ_c = max(e_c − φ K_c, 0) for what the set leaves, ℓ_c⁰ for what it leaves
+    It is Σ_c τ_c l_c / Σ_c τ_c l_c⁰, with l_c = max(e_c − φ K_c, 0) for what the set leaves, l_c⁰ for what it leaves
     without the cause, and τ_c, `explainable`, as in `costs`.
     """
     now, before = (float(explainable @ np.maximum(x.e - p.variance_floor * counts.K, 0.0)) for x in (left, without))

@@ -36,48 +36,51 @@ def posterior(search: Search, state: SearchState) -> Posterior:
     costs, scores, counts = search.costs, search.visited.scores, search.baseline.columns.counts
     w = costs.probabilities(scores)
     other = unlisted(counts, state.linear_fit.evidence, costs.parameters)
-    sound = no_imitators(costs, counts, search.visited.evidence, frozenset(state.keys))
+    genuine = genuine_probabilities(costs, counts, search.visited.evidence, frozenset(state.keys), other)
     net = {keys: score - costs.of(keys) for keys, score in scores.items()}
     causes, gains = {}, {}
     for key in search.table.keys:
         inside = [keys for keys in scores if key in keys]
-        causes[key] = sum(w[keys] for keys in inside) * sound.get(key, 1.0)
+        causes[key] = sum(w[keys] for keys in inside) * genuine.get(key, 1.0)
         without = max(net[keys] for keys in scores if key not in keys)
         gains[key] = max((net[keys] for keys in inside), default=-np.inf) - without
-    ambiguous = _ambiguous(w, state, sound)
+    ambiguous = _ambiguous(w, state, genuine)
     named = tuple(k for k in state.keys if causes[k] >= MIN_NAMED_PROBABILITY and not any(k in s for s in ambiguous))
     return Posterior(causes, gains, w[frozenset()] * (1.0 - other), other, named, ambiguous)
 
 
-def no_imitators(
-    costs: Costs, counts: Counts, evidence: Mapping[frozenset[CauseKey], Evidence], best: frozenset[CauseKey]
+def genuine_probabilities(
+    costs: Costs,
+    counts: Counts,
+    evidence: Mapping[frozenset[CauseKey], Evidence],
+    best: frozenset[CauseKey],
+    other: float,
 ) -> dict[CauseKey, float]:
     """Probability of each cause of the best set that it does not merely imitate something unlisted.
 
-    It is 1 − P_u ℓ_i. P_u is the probability that something unlisted is at work. ℓ_i, the share of the energy that the
-    set leaves where cause i acts (`formula.left_share`), is taken for the probability that what leaves this share there
-    leaves all of it. Causes without which no search has weighed the set are left out.
+    It is 1 − P_u ℓ_i. P_u, `other`, is the probability that something unlisted is at work. If it is, it causes the
+    share ℓ_i of the energy where cause i acts that the set leaves (`formula.left_share`); that share is also taken for
+    the probability that it causes the rest there. A cause is left out if the search has not weighed the set without it.
     """
     p, left = costs.parameters, evidence[best]
-    other = unlisted(counts, left, p)
     without = {key: evidence[best - {key}] for key in best if best - {key} in evidence}
     return {key: 1.0 - other * left_share(counts, x, left, costs.explainable[key], p) for key, x in without.items()}
 
 
 def _ambiguous(
-    w: dict[frozenset[CauseKey], float], state: SearchState, sound: dict[CauseKey, float]
+    w: dict[frozenset[CauseKey], float], state: SearchState, genuine: dict[CauseKey, float]
 ) -> tuple[tuple[CauseKey, ...], ...]:
     """Causes of the best set, each with the rivals that could take its place, likeliest first.
 
-    `w` are the posterior probabilities of all visited sets, `sound` those of `no_imitators`. Rivals compare by the
-    probability of the best set with the rival in the cause's place.
+    `w` are the posterior probabilities of all visited sets, `genuine` those of `genuine_probabilities`. Rivals
+    compare by the probability of the best set with the rival in the cause's place.
     """
     out, whole = [], frozenset(state.keys)
     for key in state.keys:
         rest = whole - {key}
         rivals = {next(iter(s - rest)): v for s, v in w.items() if len(s) == len(whole) and rest < s}
         total = sum(rivals.values())
-        if rivals.get(key, 0.0) >= MIN_UNAMBIGUOUS_SHARE * total or total * sound.get(key, 1.0) < MIN_RIVALRY:
+        if rivals.get(key, 0.0) >= MIN_UNAMBIGUOUS_SHARE * total or total * genuine.get(key, 1.0) < MIN_RIVALRY:
             continue
         members, mass = [], 0.0
         for k in sorted(rivals, key=lambda k: -rivals[k]):

@@ -5,8 +5,8 @@ import pytest
 
 from jaxfinger.gap.columns import Counts
 from jaxfinger.gap.costs import Costs
-from jaxfinger.gap.formula import Evidence, Parameters
-from jaxfinger.gap.posterior import no_imitators
+from jaxfinger.gap.formula import Evidence, Parameters, unlisted
+from jaxfinger.gap.posterior import genuine_probabilities
 
 SITES = {"tendon_stretch": ("T1", "T2", "T3"), "joint_stribeck": ("MCP", "PIP"), "joint_damping": ("MCP", "PIP")}
 EXCURSION, TORQUE = np.eye(2)  # columns
@@ -46,7 +46,8 @@ def test_what_leaves_more_than_it_explains_where_it_acts_only_imitates_something
         return Evidence(10.0 + np.array([excursion, torque]), np.full(2, 100.0), nothing, 0.0)
 
     def of(evidence: dict) -> dict:
-        return no_imitators(COSTS, counts, evidence, max(evidence, key=len))
+        best = max(evidence, key=len)
+        return genuine_probabilities(COSTS, counts, evidence, best, unlisted(counts, evidence[best], Parameters()))
 
     both, less = frozenset({STRETCH, STRIBECK}), {STRETCH: frozenset({STRIBECK}), STRIBECK: frozenset({STRETCH})}
     imitates = {both: left(0.0, 3000.0), less[STRETCH]: left(5000.0, 3000.0), less[STRIBECK]: left(0.0, 4000.0)}
