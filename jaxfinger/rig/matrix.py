@@ -20,7 +20,7 @@ from jaxfinger.rig.contract import Flag, State, Trip
 from jaxfinger.rig.safety import Supervisor, Violation
 from jaxfinger.rig.watch import PERIOD_S
 
-BLOCK_SIZES = (1, 2, 3, 10, 50)  # samples
+BLOCK_SIZES = (1, 3, 10, 50)  # samples
 PHASES = ("arming", "ramp", "hold", "letting go")
 # s allowed from where a fault shows to the stop. The slowest way is the controller's heartbeat watchdog, 0.25 s, and
 # one period of the watch.
@@ -30,8 +30,8 @@ OFF_S = STOP_S + RELEASE_S
 LOST_S = 0.2  # s of samples before the fault that may be missing from the file
 END_S = 10.0  # s from the fault until `record` has ended by itself
 
-BEGIN = 400  # number of the sample at which a fault begins
-LENGTH = 1800  # samples of a stream
+BEGIN = 220  # number of the sample at which a fault begins
+LENGTH = 1600  # samples of a stream
 ARMED_BEFORE = 5  # samples from arming to the fault, in the phase "arming"
 
 Spoil = Callable[[Block, np.ndarray, RigDescription], None]

@@ -177,7 +177,7 @@ class Runner:
         if status.state is State.TRIPPED and not rig.prepare(Setup("")):
             self._ask(f"The controller is stopped: {status.cause}. See that finger and hands are safe.")
         if status.state is not State.IDLE:
-            self._let_pass(AFTER_TRIP_S)
+            self._let_pass(AFTER_TRIP_S, since=rig.status().head)
         if status.state is State.TRIPPED:
             rig.reset(name or "operator")
         if not rig.prepare(Setup("", fixed=dict.fromkeys(rig.description.finger.joint_names, 0.0))):

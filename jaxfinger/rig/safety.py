@@ -239,7 +239,7 @@ class Supervisor:
 
         Samples count only in the states ARMED and MOVING: otherwise the tension follows no set-point.
         """
-        on = np.isin(block.state, (State.ARMED, State.MOVING))
+        on = (block.state == State.ARMED) | (block.state == State.MOVING)
         error = block.x[:, self._setpoint] - block.x[:, self._follower]
         off_target = on[:, None] & (np.abs(error) > self.rig.limits.tension_error_max)
         return [

@@ -12,29 +12,19 @@ from jaxfinger.rig.simulated.examples import plan_toml
 from jaxfinger.rig.simulated.plant import Plant, default_truth
 from tests.rig.conftest import ads_rig
 
-
-def recorded(folder, plan):
-    """Return the session of a plan, recorded over ADS as fast as the stand-in runs."""
-    with standin.running(speed=0) as where:
-        rig = ads_rig(where)
-        outcome = run(parse_plan(plan, rig.description), rig, folder / "session.h5")
-    assert outcome.cause == ""
-    assert [f for f in check_file(folder / "session.h5") if f.severity == "error"] == []
-    return read_session(folder / "session.h5")
+pytestmark = pytest.mark.long
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
-    """A session with every experiment, joint and tendon."""
-    return recorded(tmp_path_factory.mktemp("bench"), plan_toml(postures=1))
-
-
-@pytest.fixture(scope="module")
-def static(tmp_path_factory):
-    """A session with the plan's trials of ID.3-static."""
-    head, *trials = plan_toml(postures=1).split("\n[[trial]]\n")
-    kept = [t for t in trials if '"ID.3-static"' in t]
-    return recorded(tmp_path_factory.mktemp("static"), "\n[[trial]]\n".join([head, *kept]))
+    """A session with every experiment, joint and tendon, recorded over ADS as fast as the stand-in runs."""
+    path = tmp_path_factory.mktemp("bench") / "session.h5"
+    with standin.running(speed=0) as where:
+        rig = ads_rig(where)
+        outcome = run(parse_plan(plan_toml(postures=1), rig.description), rig, path)
+    assert outcome.cause == ""
+    assert [f for f in check_file(path) if f.severity == "error"] == []
+    return read_session(path)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +32,6 @@ def fit(session):
     return identify(session)
 
 
-@pytest.mark.long
 def test_every_trial_is_complete_and_free_of_gaps(session):
     assert len(session) == 16
     for trial in session:
@@ -50,12 +39,11 @@ def test_every_trial_is_complete_and_free_of_gaps(session):
         np.testing.assert_allclose(np.diff(trial.time), 1e-3, atol=1e-9)
 
 
-def test_static_torque_against_plain_least_squares(static):
+def test_static_torque_against_plain_least_squares(session):
     """Least squares on the holds, without jaxfinger's fits, finds elastic torque and friction of every joint."""
     truth, plant = default_truth(), Plant()
-    assert len(static) == 3
-    for trial in static.select("ID.3-static"):
-        j = static.finger.joint_names.index(trial.joint)
+    for trial in session.select("ID.3-static"):
+        j = session.finger.joint_names.index(trial.joint)
         rows, torque, angles = [], [], []
         for hold in range(trial.hold.max() + 1):
             at = trial.hold == hold
@@ -71,7 +59,6 @@ def test_static_torque_against_plain_least_squares(static):
             assert np.abs(error).max() < 0.1e-3  # N m; the tare alone is good to 0.01e-3
 
 
-@pytest.mark.long
 def test_identify_finds_the_truth_of_the_finger(fit, session):
     """Moment arms agree to 0.02 mm, torques to 0.15 N mm over the driven angles, tendon friction to 2 %."""
     truth = default_truth()
@@ -92,7 +79,6 @@ def test_identify_finds_the_truth_of_the_finger(fit, session):
         assert found[f"damping {joint}"] == pytest.approx(truth.damping[j], abs=3e-5)
 
 
-@pytest.mark.long
 def test_the_model_predicts_excursion_along_a_free_path(fit, session):
     """VD.1: f(q) − f(q(0)) with the fitted polynomials agrees to 0.02 mm rms."""
     found = {row["name"]: row["value"] for row in fit.table()}
@@ -108,7 +94,6 @@ def test_the_model_predicts_excursion_along_a_free_path(fit, session):
         assert np.std(error) < 0.02e-3
 
 
-@pytest.mark.long
 def test_the_model_predicts_the_fingertips_force(fit, session):
     """VD.2: the slope of the fingertip's force against tension agrees to 3 %. No fit reads VD.2."""
     slopes = {s.axis: s for s in validate(fit, session.select("VD.2"), ("VD.2",)).slopes}

@@ -249,6 +249,24 @@ def test_the_recorder_may_die_and_the_ring_fills_the_trial(rig, record, short, t
     np.testing.assert_allclose(np.diff(cut.time), 1e-3, atol=1e-9)  # no gap where the recorder died
 
 
+def test_a_finger_found_armed_is_released_before_it_is_armed_again(rig, record):
+    """The host may be far behind: the release is over when samples that follow it say so, not earlier ones."""
+    machine = SimulatedRig(rig)
+    for _ in range(300):
+        machine.controller.cycle()
+    machine.controller._obey(Kind.ARM, 0, 0.0, 0.0, [])
+    machine.controller.cycle()
+    release = machine.release
+
+    def late():
+        machine._pause(1.5)
+        return release()
+
+    machine.release = late
+    outcome = record(machine)
+    assert (outcome.cause, len(outcome.complete)) == ("", 2)
+
+
 def test_the_operators_stop_key(rig, record):
     class Presses:
         asked = 0
