@@ -68,18 +68,26 @@ CELLS = [  # one phase and one pause between reads for each row; a pause of 1 ms
     Cell("key", "ramp"), Cell("flicker", "ramp", 0.001), Cell("temperature", "hold", 0.01, ("delay=0.01",)),
     Cell("clock fast", "arming"),
 ]  # fmt: skip
+# Always tried: each of the host's threads, the connection and the operator once. The others are long tests.
+ALWAYS = ("reader", "runner", "watch", "cut", "key", "full", "flicker")
 LANES = 3  # cells at a time; each sleeps most of its time
 
 
 @pytest.fixture(scope="module")
-def over_the_wire():
+def over_the_wire(request):
+    params = [item.callspec.params for item in request.session.items if hasattr(item, "callspec")]
+    wanted = {param["cell"] for param in params if "cell" in param}
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(LANES - 1, context) as pool, ProcessPoolExecutor(1, context) as other:
         # A call that hangs keeps its connection for as long as its process lives.
-        yield {cell: (other if cell.row == "call" else pool).submit(try_cell, cell) for cell in CELLS}
+        yield {cell: (other if cell.row == "call" else pool).submit(try_cell, cell) for cell in CELLS if cell in wanted}
 
 
-@pytest.mark.parametrize("cell", CELLS, ids=lambda cell: f"{cell.row}-{cell.phase}")
+@pytest.mark.parametrize(
+    "cell",
+    [pytest.param(cell, marks=[pytest.mark.long] * (cell.row not in ALWAYS)) for cell in CELLS],
+    ids=lambda cell: f"{cell.row}-{cell.phase}",
+)
 def test_the_recorder_lets_go_over_the_wire(over_the_wire, cell):
     """The rig stops, tension is off, data are kept, the cause is named, and the run ends, each within its time."""
     found, faults = over_the_wire[cell].result()

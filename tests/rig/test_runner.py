@@ -182,24 +182,20 @@ def test_resume_with_another_plan_is_refused(rig, record, short):
         record(SimulatedRig(rig), plan=other, resume=True)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "says"),
-    [
+def test_resume_with_another_rig_file_is_refused(rig, record):
+    """The log keeps one description of its channels: samples of others would be read as if they were those."""
+    record(SimulatedRig(rig), lambda m: m.inject("nan", slot(m, "external_torque")))
+    for old, new, says in (
         ("scale = 1.0", "scale = 1.1", "list of channels"),
         ('of = "T1"\nslot = 0', 'of = "T1"\nslot = 59', "list of channels"),
         ("mass = ", "mass = 1", "finger"),
         ('specimen = "', 'specimen = "another ', "specimen"),
         ("[limits]", "[fingertip_sensor]\nrotation = [0, -1, 0, 1, 0, 0, 0, 0, 1]\n\n[limits]", "fingertip sensor"),
-    ],
-)
-def test_resume_with_another_rig_file_is_refused(rig, record, old, new, says):
-    """The log keeps one description of its channels: samples of others would be read as if they were those."""
-    machine = SimulatedRig(rig)
-    record(machine, lambda m: m.inject("nan", slot(m, "external_torque")))
-    assert old in rig.text
-    other = parse_rig(rig.text.replace(old, new, 1), "other.toml")
-    with pytest.raises(UserError, match=rf"another rig file than other\.toml: its {says} differs"):
-        record(SimulatedRig(other), resume=True)
+    ):
+        assert old in rig.text
+        other = parse_rig(rig.text.replace(old, new, 1), "other.toml")
+        with pytest.raises(UserError, match=rf"another rig file than other\.toml: its {says} differs"):
+            record(SimulatedRig(other), resume=True)
 
 
 def test_resume_with_other_limits_goes_on(record):
