@@ -21,9 +21,8 @@ def axis(tmp_path_factory):
     return read_session(file)
 
 
-@pytest.mark.parametrize(
-    "withheld", [pytest.param(("joint_coulomb",), marks=pytest.mark.long), ("joint_coulomb", "joint_damping")]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("withheld", [("joint_coulomb",), ("joint_coulomb", "joint_damping")])
 def test_what_is_withheld_is_named_with_its_published_value(axis, withheld):
     """Where both frictions are withheld, neither alone is worth its cost, since each hides the other."""
     full = read_recipe(ROOT / "fits/emps.toml")
