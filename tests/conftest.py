@@ -7,6 +7,7 @@ of a test run, and those that tests start, inherit the environment of the first.
 import atexit
 import os
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 from pkgutil import iter_modules
@@ -25,6 +26,9 @@ CHEAP = (
     "--xla_cpu_experimental_ynn_fusion_type="
 )
 os.environ.setdefault("XLA_FLAGS", CHEAP)
+# Hundreds of processes import the same modules: they share their byte code, also where the environment is against it.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line sets it: two threads mostly wait
 # Test processes share compiled programs through a folder of this run.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:

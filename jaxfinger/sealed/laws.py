@@ -31,7 +31,6 @@ class Situation:
     sj: Float[np.ndarray, "... m"]  # direction in which each joint slides; 0 in a fixture
     st: Float[np.ndarray, "... n"] | None = None  # direction in which each tendon slides
     held: bool = False  # Every joint is at rest in a fixture.
-    motor: bool = False  # The external motor with its torque sensor is coupled.
     memory: dict = field(default_factory=dict)  # States (..., k) by id of the departure.
 
 

@@ -108,7 +108,6 @@ def record(finger: Finger, plan: Plan, motion: Motion, rigid: Float[np.ndarray, 
         motion.tension,
         direction,
         held=held,
-        motor=plan.experiment.startswith(("ID.3", "ID.4")),
     )
     if not held:
         s.st = last_direction(finger.speed(s), 1e-6)

@@ -253,9 +253,8 @@ class AsymmetricFriction(Departure):
 
 @dataclass(frozen=True, eq=False)
 class TorqueFriction(Departure):
-    """μ |G + τ_k|: friction of a gear that grows with the torque through it, linearly or as a power.
-
-    The gear sits at the external motor.
+    """μ |τ| s: friction of the external motor's gear, which grows with the torque τ that it passes on to the finger,
+    linearly or as a power.
     """
 
     effect: ClassVar[str] = "joint_torque_friction"
@@ -265,15 +264,12 @@ class TorqueFriction(Departure):
     forms: ClassVar[tuple[str, ...]] = ("linear",)
     foreign: ClassVar[tuple[str, ...]] = ("power",)
 
-    def coulomb(self, finger, s, limit, decided):
-        if not s.motor:
-            return limit, decided
+    def at_motor(self, finger, s, torque):
         j = self.index[0]
-        c = finger.specimen.elastic[j]
-        through = np.abs(finger.plant.gravity_torque(s.q)[..., j] + c[0] + c[1] * s.q[..., j] + c[2] * s.q[..., j] ** 2)
+        through = np.abs(torque[..., j])
         if self.form == "power":
             through = 0.01 * (through / 0.01) ** 0.7
-        return add_at(limit, j, self.size * through), decided
+        return add_at(torque, j, self.size * through * s.sj[..., j])
 
 
 @dataclass(frozen=True, eq=False)
