@@ -26,10 +26,10 @@ CHEAP = (
     "--xla_cpu_experimental_ynn_fusion_type="
 )
 os.environ.setdefault("XLA_FLAGS", CHEAP)
-# Hundreds of processes import the same modules: they share their byte code, also where the environment is against it.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line sets it: two threads mostly wait
+# Hundreds of test processes import the same modules. Each writes byte code for the next, whatever the environment says.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line sets it: two threads mostly wait
 # Test processes share compiled programs through a folder of this run.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="jaxfinger-tests-")

@@ -34,9 +34,8 @@ def predict(model: Model, measured: Motion, channels: tuple[str, ...]) -> dict[s
     return {c: model.reading(c, x, _PREDICTORS[c](model, x)) for c in channels}
 
 
-predict_compiled = quick_jit(
-    predict
-)  # Not inside another compiled function: JAX takes compiler options outermost only.
+# Compiled functions cannot call this one: JAX takes compiler options of the outermost function only.
+predict_compiled = quick_jit(predict)
 
 
 def change(

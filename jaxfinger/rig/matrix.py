@@ -20,7 +20,9 @@ from jaxfinger.rig.contract import Flag, State, Trip
 from jaxfinger.rig.safety import Supervisor, Violation
 from jaxfinger.rig.watch import PERIOD_S
 
-BLOCK_SIZES = (1, 3, 10, 50)  # samples
+# Samples of a block: one alone, as many as fill a count (`trips.FULL_COUNT`), and up to what a poll of a 1 kHz
+# controller every 50 ms brings.
+BLOCK_SIZES = (1, 3, 10, 50)
 PHASES = ("arming", "ramp", "hold", "letting go")
 # s allowed from where a fault shows to the stop. The slowest way is the controller's heartbeat watchdog, 0.25 s, and
 # one period of the watch.
@@ -30,8 +32,8 @@ OFF_S = STOP_S + RELEASE_S
 LOST_S = 0.2  # s of samples before the fault that may be missing from the file
 END_S = 10.0  # s from the fault until `record` has ended by itself
 
-BEGIN = 220  # number of the sample at which a fault begins
-LENGTH = 1600  # samples of a stream
+BEGIN = 200  # number of the sample at which a fault begins: later than any check looks back (`safety.VELOCITY_SPAN`)
+LENGTH = BEGIN + 1200  # samples of a stream; the last fault to show, a frozen channel, does after 1000
 ARMED_BEFORE = 5  # samples from arming to the fault, in the phase "arming"
 
 Spoil = Callable[[Block, np.ndarray, RigDescription], None]
@@ -89,7 +91,7 @@ def _time(rate: float = 1.0, jump: float = 0.0) -> Spoil:
 
 
 def _flicker(block: Block, at: np.ndarray, rig: RigDescription) -> None:
-    block.x[at & (np.arange(len(at)) % 3 > 0), rig.index("external_torque")] = np.nan
+    block.x[np.cumsum(at) % 3 > 0, rig.index("external_torque")] = np.nan
 
 
 def _flag(block: Block, at: np.ndarray, rig: RigDescription) -> None:

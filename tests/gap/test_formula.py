@@ -94,7 +94,7 @@ def test_a_step_of_the_screen_is_close_to_the_likeliest_amplitude(columns, rng):
         assert max(gain, 0.0) == pytest.approx(max(fitted, 0.0), abs=0.1 * abs(fitted) + 1.0)
 
 
-@pytest.mark.xfail(strict=True, reason="(L) is flat where o_c < m_c, and the least squares of step 5 is not")
+@pytest.mark.xfail(strict=True, reason="step 5 keeps the weight 1 where o_c < m_c, though (L) gains nothing there")
 def test_further_rounds_lose_nothing(columns, rng):
     """The nominal model could close what hides below the noise of one column, at the price of another column."""
     basis, outside = columns.items[0].basis, np.zeros(ROWS * COLUMNS)

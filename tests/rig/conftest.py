@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jaxfinger.data import check_file
 from jaxfinger.rig import parse_plan, parse_rig, run
 from jaxfinger.rig.backend import Block
 from jaxfinger.rig.backends.ads import AdsRig
@@ -32,6 +33,16 @@ levels = [3.0, 6.0]
 
 
 PATIENT = "[controller]\nheartbeat_s = 5.0\n"
+
+
+def serious(path):
+    """Errors that `check` finds in a session file."""
+    return [f for f in check_file(path) if f.severity == "error"]
+
+
+def slot(rig, kind, of=""):
+    """Place of a channel in the controller's record."""
+    return rig.description.channels[rig.description.index(kind, of)].slot
 
 
 @pytest.fixture(scope="session")

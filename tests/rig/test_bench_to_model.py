@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from jaxfinger.data import check_file, read_session
+from jaxfinger.data import read_session
 from jaxfinger.identify import identify
 from jaxfinger.identify.validate import validate
 from jaxfinger.rig import parse_plan, run
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.examples import plan_toml
 from jaxfinger.rig.simulated.plant import Plant, default_truth
-from tests.rig.conftest import ads_rig
+from tests.rig.conftest import ads_rig, serious
 
 pytestmark = pytest.mark.long
 
@@ -23,7 +23,7 @@ def session(tmp_path_factory):
         rig = ads_rig(where)
         outcome = run(parse_plan(plan_toml(postures=1), rig.description), rig, path)
     assert outcome.cause == ""
-    assert [f for f in check_file(path) if f.severity == "error"] == []
+    assert serious(path) == []
     return read_session(path)
 
 

@@ -10,11 +10,12 @@ import time
 import numpy as np
 import pytest
 
-from jaxfinger.data import check_file, read_session
+from jaxfinger.data import read_session
 from jaxfinger.rig import recover, wal
 from jaxfinger.rig.session import log_path
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.examples import rig_toml
+from tests.rig.conftest import serious
 
 SAYS = "recorder.txt"  # output of the recorders
 PLAN = '[plan]\nname = "p"\noperator = "t"\n[[trial]]\nexperiment = "VD.1"\nseconds = 2000.0\n'
@@ -72,7 +73,7 @@ def test_killed_at_random_moments(controller, tmp_path):
         path = kill_at(folder, controller, rng.randint(20_000, 300_000))
         found = recover(path, folder / "rescued.h5")
         assert found.trials == found.incomplete == ("01-VD.1",)
-        assert not [f for f in check_file(folder / "rescued.h5") if f.severity == "error"]
+        assert not serious(folder / "rescued.h5")
         trial = read_session(folder / "rescued.h5")["01-VD.1"]
         np.testing.assert_allclose(np.diff(trial.time), 1e-3, atol=1e-9)
         # Each random cut of the log stands for a recorder that died within a write.

@@ -2,6 +2,7 @@
 
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -62,38 +63,60 @@ def test_the_documents_table_is_the_matrix(rig, results):
     assert table(rig, results) in RECORDING.read_text(encoding="utf-8")
 
 
-CELLS = [  # one phase and one pause between reads for each row; a pause of 1 ms gives blocks of a sample or two
-    Cell("disk"), Cell("stall"), Cell("call"), Cell("reader"), Cell("runner"), Cell("watch"), Cell("cut"),
-    Cell("deaf"), Cell("lag"), Cell("slow"), Cell("full"), Cell("restart"), Cell("nan", "letting go"),
-    Cell("key", "ramp"), Cell("flicker", "ramp", 0.001), Cell("temperature", "hold", 0.01, ("delay=0.01",)),
-    Cell("clock fast", "arming"),
+# One phase and one pause between reads for each row; a pause of 1 ms gives blocks of a sample or two. Always tried are
+# each of the host's threads, the connection, the disk, the operator and a bad signal; the others are long tests.
+CELLS = [
+    Cell("reader"), Cell("runner"), Cell("watch"), Cell("cut"), Cell("full"), Cell("key", "ramp"),
+    Cell("flicker", "ramp", 0.001),
 ]  # fmt: skip
-# Always tried: each of the host's threads, the connection and the operator once. The others are long tests.
-ALWAYS = ("reader", "runner", "watch", "cut", "key", "full", "flicker")
+LONG_CELLS = [
+    Cell("disk"), Cell("stall"), Cell("call"), Cell("deaf"), Cell("lag"), Cell("slow"), Cell("restart"),
+    Cell("nan", "letting go"), Cell("temperature", "hold", 0.01, ("delay=0.01",)), Cell("clock fast", "arming"),
+]  # fmt: skip
 LANES = 3  # cells at a time; each sleeps most of its time
 
 
-@pytest.fixture(scope="module")
-def over_the_wire(request):
-    params = [item.callspec.params for item in request.session.items if hasattr(item, "callspec")]
-    wanted = {param["cell"] for param in params if "cell" in param}
+@contextmanager
+def begun(cells):
+    """Begin cells over the wire. Yield the future result of each."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(LANES - 1, context) as pool, ProcessPoolExecutor(1, context) as other:
         # A call that hangs keeps its connection for as long as its process lives.
-        yield {cell: (other if cell.row == "call" else pool).submit(try_cell, cell) for cell in CELLS if cell in wanted}
+        yield {cell: (other if cell.row == "call" else pool).submit(try_cell, cell) for cell in cells}
 
 
-@pytest.mark.parametrize(
-    "cell",
-    [pytest.param(cell, marks=[pytest.mark.long] * (cell.row not in ALWAYS)) for cell in CELLS],
-    ids=lambda cell: f"{cell.row}-{cell.phase}",
-)
+@pytest.fixture(scope="module")
+def over_the_wire():
+    with begun(CELLS) as results:
+        yield results
+
+
+@pytest.fixture(scope="module")
+def long_over_the_wire():
+    with begun(LONG_CELLS) as results:
+        yield results
+
+
+def name(cell):
+    return f"{cell.row}-{cell.phase}"
+
+
+@pytest.mark.parametrize("cell", CELLS, ids=name)
 def test_the_recorder_lets_go_over_the_wire(over_the_wire, cell):
     """The rig stops, tension is off, data are kept, the cause is named, and the run ends, each within its time."""
     found, faults = over_the_wire[cell].result()
     assert not faults, (faults, found)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("cell", LONG_CELLS, ids=name)
+def test_the_recorder_lets_go_over_the_wire_in_every_other_row(long_over_the_wire, cell):
+    found, faults = long_over_the_wire[cell].result()
+    assert not faults, (faults, found)
+
+
 def test_every_row_is_tested_over_the_wire_or_as_a_stream():
     hosts = {"host"}  # test_command_line stops and kills the host
-    assert {row.name for row in MATRIX} == {c.row for c in CELLS} | {row.name for row in STREAMS} | hosts
+    assert {row.name for row in MATRIX} == {c.row for c in (*CELLS, *LONG_CELLS)} | {
+        row.name for row in STREAMS
+    } | hosts

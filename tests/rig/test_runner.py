@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from jaxfinger.data import check_file, read_session
+from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
 from jaxfinger.rig import parse_plan, parse_rig, recorder, recover, runner, wal
 from jaxfinger.rig.backends.simulated import SimulatedRig
@@ -24,15 +24,7 @@ from jaxfinger.rig.session import log_path, run
 from jaxfinger.rig.signals import ENDING, Interrupts
 from jaxfinger.rig.simulated.controller import Controller
 from jaxfinger.rig.simulated.examples import rig_toml
-from jaxfinger.rig.simulated.plant import default_truth
-
-
-def serious(path):
-    return [f for f in check_file(path) if f.severity == "error"]
-
-
-def slot(rig, kind, of=""):
-    return rig.description.channels[rig.description.index(kind, of)].slot
+from tests.rig.conftest import serious, slot
 
 
 def wait_until_written(log, trial):
@@ -154,113 +146,6 @@ def test_a_frozen_encoder_under_the_operators_hand(rig, record):
     outcome = record(machine, strike, at=("01-ID.2-DIP", "moved by hand"))
     assert Trip.FROZEN.sentence in outcome.cause
     assert "encoder" in outcome.cause
-
-
-def test_resume_goes_on_where_the_session_was_interrupted(rig, record, tmp_path):
-    machine = SimulatedRig(rig)
-    first = record(machine, lambda m: m.inject("nan", slot(m, "external_torque")))
-    assert first.log is not None
-    with pytest.raises(UserError, match="exists already"):
-        record(SimulatedRig(rig))
-    second = record(SimulatedRig(rig), resume=True)
-    assert second.cause == ""
-    session = read_session(second.session)
-    assert list(session.trials) == ["01-ID.2-DIP", "02-ID.4-T3-MCP", "02-ID.4-T3-MCP-2"]
-    assert [t.complete for t in session] == [True, False, True]
-    starts = [t.session_start for t in session]
-    assert starts == sorted(starts)
-    assert serious(second.session) == []
-    assert not log_path(second.session).exists()
-    with pytest.raises(UserError, match="no interrupted recording"):
-        record(SimulatedRig(rig), resume=True)
-
-
-def test_resume_with_another_plan_is_refused(rig, record, short):
-    record(SimulatedRig(rig), lambda m: m.inject("nan", slot(m, "external_torque")))
-    other = parse_plan(short.text.replace("passes = 1", "passes = 2"), rig)
-    with pytest.raises(UserError, match="another plan"):
-        record(SimulatedRig(rig), plan=other, resume=True)
-
-
-def test_resume_with_another_rig_file_is_refused(rig, record):
-    """The log keeps one description of its channels: samples of others would be read as if they were those."""
-    record(SimulatedRig(rig), lambda m: m.inject("nan", slot(m, "external_torque")))
-    for old, new, says in (
-        ("scale = 1.0", "scale = 1.1", "list of channels"),
-        ('of = "T1"\nslot = 0', 'of = "T1"\nslot = 59', "list of channels"),
-        ("mass = ", "mass = 1", "finger"),
-        ('specimen = "', 'specimen = "another ', "specimen"),
-        ("[limits]", "[fingertip_sensor]\nrotation = [0, -1, 0, 1, 0, 0, 0, 0, 1]\n\n[limits]", "fingertip sensor"),
-    ):
-        assert old in rig.text
-        other = parse_rig(rig.text.replace(old, new, 1), "other.toml")
-        with pytest.raises(UserError, match=rf"another rig file than other\.toml: its {says} differs"):
-            record(SimulatedRig(other), resume=True)
-
-
-def test_resume_with_other_limits_goes_on(record):
-    """Also where CAD knows the excursion of some tendons alone: it is NaN for the others, which equals nothing."""
-    finger = default_truth().finger
-    known = np.full((finger.n, finger.m, 1), np.nan)
-    known[0] = np.where(finger.crosses[0], 0.008, 0.0)[:, None]
-    rig = parse_rig(rig_toml(finger=replace(finger, excursion=known)))
-    record(SimulatedRig(rig), lambda m: m.inject("nan", slot(m, "external_torque")))
-    tighter = parse_rig(rig.text.replace("temperature_max = 70.0", "temperature_max = 60.0"))
-    assert record(SimulatedRig(tighter), resume=True).cause == ""
-
-
-def test_a_latched_controller_is_reset_before_a_resumed_run(rig, record):
-    machine = SimulatedRig(rig)
-    record(machine, lambda m: m.inject("spike", slot(m, "tension", "T3")))
-    assert machine.controller.state is State.TRIPPED
-    machine.controller.faults.clear()
-    again = SimulatedRig(rig, machine.controller)
-    assert record(again, resume=True).cause == ""
-
-
-def test_the_recorder_may_die_and_the_ring_fills_the_trial(rig, record, short, tmp_path):
-    """A log that ends within a trial gets the samples that the controller's ring still holds."""
-    machine = SimulatedRig(rig)
-    lengths = []
-
-    class Died(BaseException):
-        pass
-
-    def die(m):
-        lengths.append(m.controller.seq)
-        raise Died
-
-    with pytest.raises(Died):
-        record(machine, die, at=("02-ID.4-T3-MCP", "waiting"))
-    path = log_path(tmp_path / "session.h5")
-    for _ in range(700):
-        machine.controller.cycle()
-    again = SimulatedRig(rig, machine.controller)
-    outcome = record(again, resume=True)
-    assert outcome.cause == ""
-    assert not path.exists()
-    session = read_session(outcome.session)
-    cut = session["02-ID.4-T3-MCP"]
-    assert not cut.complete
-    np.testing.assert_allclose(np.diff(cut.time), 1e-3, atol=1e-9)  # no gap where the recorder died
-
-
-def test_a_finger_found_armed_is_released_before_it_is_armed_again(rig, record):
-    """The host may be far behind: the release is over when samples that follow it say so, not earlier ones."""
-    machine = SimulatedRig(rig)
-    for _ in range(300):
-        machine.controller.cycle()
-    machine.controller._obey(Kind.ARM, 0, 0.0, 0.0, [])
-    machine.controller.cycle()
-    release = machine.release
-
-    def late():
-        machine._pause(1.5)
-        return release()
-
-    machine.release = late
-    outcome = record(machine)
-    assert (outcome.cause, len(outcome.complete)) == ("", 2)
 
 
 def test_the_operators_stop_key(rig, record):
