@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 
 from jaxfinger.data.filtering import longest_spike, outlier_mask, smooth, without_spikes
 from jaxfinger.errors import UserError
@@ -124,6 +124,14 @@ def test_a_shrunk_regressor_is_rid_of_most_of_its_bias():
 
     assert slope(seen) < 1.85
     assert slope(shrink(seen, 100)) == pytest.approx(2.0, abs=(2.0 - slope(seen)) / 3)
+
+
+@pytest.mark.parametrize(("cutoff", "rate", "window"), [(10.0, 1000, 100), (40.0, 1000, 25), (10.0, 200, 20)])
+def test_shrinking_leaves_little_of_a_resting_encoders_noise(cutoff, rate, window):
+    """Little more stays of the noise of q̈ than of its running mean."""
+    noise = 2e-4 * np.random.default_rng(0).standard_normal((60_000, 1))
+    qdd = smooth(np.arange(len(noise)) / rate, noise, cutoff)[2]
+    assert shrink(qdd, window).std() < 1.25 * uniform_filter1d(qdd, window, axis=0).std()
 
 
 def test_shrinking_leaves_a_smooth_motion_and_a_constant_alone():
