@@ -64,12 +64,19 @@ class Source:
         elsewhere = "; move what only some recordings hold to their trials" if where.keys[:1] == ("channels",) else ""
         return where.fail(f"{said}, which the recording has not; it has {listed(there, 30)}{elsewhere}")
 
+    def words(self, name: str) -> np.ndarray | None:
+        """Recorded variable of this name that is words; None where it is another one, or a derived one."""
+        return None if name in self.derived else self.recording.texts.get(name)
+
     def _derive(self, name: str, where: Place, within: tuple[str, ...]) -> Variable:
         where = where / "derived" / name
         text = self.derived[name]
         clocks: dict[str, str] = {}
 
         def lookup(inner: str, column: Any) -> np.ndarray:
+            if (words := self.words(inner)) is not None:
+                clocks[inner] = ""
+                return words
             if inner == name and inner in self.recording.variables:
                 variable = self.recording.variables[inner]
             else:
@@ -192,6 +199,8 @@ def _chosen(trial: MappedTrial, source: Source, rows: np.ndarray, total: int, wh
     place, text = where / "where", trial.where
 
     def lookup(name: str, column: Any) -> np.ndarray:
+        if (words := source.words(name)) is not None:
+            return words
         return _column(source.variable(name, place), name, column, place)[0]
 
     try:

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxfinger.data.parse import listed
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.errors import UserError, counted
 
@@ -85,7 +86,7 @@ def load_csv(path: Path) -> Recording:
     """Load the columns of a CSV file by the names above the numbers, or as `column 0`, `column 1` and so on.
 
     Empty cells and words for a missing value (`-`, `#N/A`) are NaN, True and False are 1 and 0, and dates with a time
-    of day are seconds since 1970.
+    of day are seconds since 1970. A column of words can be tested, not computed with.
 
     Raises:
         UserError: the file has no column of numbers, or a line with another number of cells.
@@ -114,10 +115,10 @@ def load_csv(path: Path) -> Recording:
         names, body = tuple(split(body[0].text)), body[1:]  # pandas writes such a line over unnamed columns.
     if len(body) > 1 and len(split(body[-1].text)) < len(numeric):
         body, remarks = body[:-1], ("its last line is cut short and is left out",)
-    columns, faults = _columns(path, body, dialect, numeric)
+    columns, faults, words = _columns(path, body, dialect, numeric)
     if scope:
         return _pairs(path, columns, faults, names, units)
-    return _named(path, columns, faults, names, units, remarks)
+    return _named(path, columns, faults, words, names, units, remarks)
 
 
 def _is_comment(text: str) -> bool:
@@ -216,8 +217,11 @@ def _is_word(dialect: _Dialect, cell: str) -> bool:
 
 def _columns(
     path: Path, body: Sequence[_Line], dialect: _Dialect, numeric: Sequence[bool]
-) -> tuple[list[np.ndarray | None], list[str]]:
-    """Columns as numbers and a fault for each: None with the reason where a cell is no number, else an empty string."""
+) -> tuple[list[np.ndarray | None], list[str], dict[int, np.ndarray]]:
+    """Columns as numbers and a fault for each: None with the reason where a cell is no number, else an empty string.
+
+    The third result holds the columns of words, by number.
+    """
     separator, width, texts = dialect.separator, len(numeric), [line.text for line in body]
     plain = all(numeric) and separator is not None and not any('"' in text for text in texts)
     plain = plain and not (dialect.mark == "," and any("." in text for text in texts))
@@ -226,7 +230,7 @@ def _columns(
             if dialect.mark == ",":
                 texts = [text.replace(",", ".") for text in texts]
             table = np.loadtxt(texts, delimiter=separator, ndmin=2, comments=None)
-            return list(table.T), [""] * width
+            return list(table.T), [""] * width, {}
         except ValueError:
             pass
     rows = []
@@ -240,13 +244,18 @@ def _columns(
     points = (cell for row in rows for cell in row if "." in cell and not _HOUR.search(cell))
     mixed = dialect.mark == "," and any(_cell(cell) is not None for cell in points)
     columns: list[np.ndarray | None] = []
-    faults = []
-    for cells in zip(*rows, strict=True):
+    faults: list[str] = []
+    words: dict[int, np.ndarray] = {}
+    for k, cells in enumerate(zip(*rows, strict=True)):
         values = [None if mixed and _ONE_GROUP.match(cell) else dialect.number(cell) for cell in cells]
-        bad = [k for k, value in enumerate(values) if value is None]
+        bad = [n for n, value in enumerate(values) if value is None]
         columns.append(None if bad else np.array(values, np.float64))
         faults.append(_fault(cells[bad[0]], body[bad[0]].number, len(bad) - 1) if bad else "")
-    return columns, faults
+        if bad and not numeric[k] and not any(form.search(cells[bad[0]]) for form in (_HOUR, _ONE_GROUP)):
+            words[k] = np.array(cells, np.dtypes.StringDType())
+            there = listed([repr(cell) for cell in dict.fromkeys(cells) if cell], 4)
+            faults[k] = f"holds the words {there}; a trial's `where` can test it"
+    return columns, faults, words
 
 
 def _fault(cell: str, line: int, others: int) -> str:
@@ -262,24 +271,25 @@ def _fault(cell: str, line: int, others: int) -> str:
     return f"holds {cell!r} in line {line}, which is no number{more}; {mend}"
 
 
-def _named(path, columns, faults, names, units, remarks) -> Recording:
+def _named(path, columns, faults, words, names, units, remarks) -> Recording:
     """Recording of a table with named columns. Columns that share a name or hold no numbers are unusable."""
     names = names or ("",) * len(columns)
     places: dict[str, list[int]] = defaultdict(list)
     for k, name in enumerate(names):
         if name or (columns[k] is not None and not np.isnan(columns[k]).all()):  # Trailing separators make empty ones.
             places[name or f"column {k}"].append(k)
-    variables, unusable = {}, {}
+    variables, unusable, texts = {}, {}, {}
     for name, (k, *others) in places.items():
         if others:
             numbers = " and ".join(str(place + 1) for place in (k, *others))
             unusable[name] = f"is the name of the columns {numbers}; give each column its own name"
         elif columns[k] is None:
             unusable[name] = faults[k]
+            texts |= {name: words[k]} if k in words else {}
         else:
             suffix = _UNIT_SUFFIX.search(name)
             variables[name] = Variable(columns[k], units=units[k] or (suffix.group(1).strip() if suffix else ""))
-    return Recording(path, variables, unusable, remarks)
+    return Recording(path, variables, unusable, remarks, texts)
 
 
 def _pairs(path, columns, faults, names, units) -> Recording:

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxfinger.data.parse import listed
+
 _OPERATORS: dict[type, Callable] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -49,7 +51,7 @@ def evaluate(text: str, lookup: Callable[[str, Any], Any], constants: Mapping[st
     Variables are `name`, `outer.inner` or, for names that are no identifiers, `'q [deg]'`. Their values are
     `lookup(name, column)`, where `name[1]` and `name['MCP']` choose a column and `name` alone passes None. A constant
     (number or matrix) goes before a variable of the same name. `[a, b]` puts variables beside each other, and `M @ x`
-    multiplies every sample by a matrix.
+    multiplies every sample by a matrix. A variable of words can be compared with one of them, `phase == 'sweep'`.
 
     Raises:
         ExpressionError: the text does not parse, holds something that is not allowed, or its shapes do not fit.
@@ -85,7 +87,10 @@ def _value(node: ast.AST, lookup: Callable[[str, Any], Any], constants: Mapping[
             return np.pi
         case ast.Name() | ast.Attribute() | ast.Constant(value=str()):
             name = _name(node)
-            return np.asarray(constants[name], np.float64) if name in constants else lookup(name, None)
+            value = np.asarray(constants[name], np.float64) if name in constants else lookup(name, None)
+            if _is_text(value):
+                raise ExpressionError(f"holds {name!r}, which is words; compare it with one, as {name} == {value[0]!r}")
+            return value
         case ast.Subscript(slice=ast.Constant(value=int() | str() as column)):
             return lookup(_name(node.value), column)
         case ast.UnaryOp() if type(node.op) in _OPERATORS:
@@ -100,6 +105,15 @@ def _value(node: ast.AST, lookup: Callable[[str, Any], Any], constants: Mapping[
             for value in values[1:]:
                 values[0] = _OPERATORS[type(node.op)](values[0], value)
             return values[0]
+        case ast.Compare(
+            left=ast.Name() | ast.Attribute() | ast.Constant(value=str()) as left,
+            ops=[ast.Eq() | ast.NotEq() as op],
+            comparators=[ast.Constant(value=str() as word)],
+        ) if _name(left) not in constants and _is_text(words := lookup(_name(left), None)):
+            if word not in words:
+                there = listed([repr(str(w)) for w in np.unique(words)], 10)
+                raise ExpressionError(f"asks for {word!r}, which {_name(left)!r} never holds; it holds {there}")
+            return _OPERATORS[type(op)](words, word)
         case ast.Compare(ops=[op], comparators=[right]) if type(op) in _OPERATORS:
             return _OPERATORS[type(op)](inner(node.left), inner(right))
         case ast.List() | ast.Tuple() if node.elts:
@@ -119,6 +133,10 @@ def _aligned(apply: Callable, left: Any, right: Any) -> Any:
         if len(column) == len(table):
             left, right = (value[:, None] if value is column else value for value in (left, right))
     return apply(left, right)
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(getattr(value, "dtype", None), np.dtypes.StringDType)
 
 
 def _name(node: ast.AST) -> str:

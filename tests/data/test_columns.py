@@ -162,6 +162,26 @@ def test_derived_variables_and_rows_by_a_condition(tmp_path):
     np.testing.assert_allclose(trial.joint_torque[:, 0], 0.95 * 0.01 * np.cos(trial.time + 2.0), atol=1e-12)
 
 
+def test_rows_by_a_column_of_words(tmp_path):
+    """A log of two trials says in words which rows are which."""
+    phase = np.where(TIME < 3.0, "rest, or so", "sweep")
+    rows = zip(TIME, Q, phase, strict=True)
+    (tmp_path / "log.csv").write_text("t,q,phase\n" + "".join(f'{t:.2f},{q:.6f},"{p}"\n' for t, q, p in rows))
+    text = MAPPING.replace("log.mat", "log.csv").replace("TORQUE", '"moves"')
+    root = "[derived]\nmoves = \"phase == 'sweep'\"\n"
+
+    def bring(condition):
+        (tmp_path / "m.toml").write_text(text.replace("EXTRA", f'where = "{condition}"') + root)
+        return import_file([tmp_path / "log.csv"], tmp_path / "m.toml", tmp_path / "s.h5", True)["a"]
+
+    for condition in ("phase == 'sweep'", "moves == 1"):
+        trial = bring(condition)
+        np.testing.assert_allclose(trial.q[:, 0], Q[TIME >= 3.0], atol=1e-6)
+        np.testing.assert_array_equal(trial.joint_torque[:, 0], 1.0)
+    with pytest.raises(UserError, match=r"'swep', which 'phase' never holds; it holds 'rest, or so', 'sweep'"):
+        bring("phase == 'swep'")
+
+
 def test_an_encoder_in_counts_is_unwrapped(tmp_path):
     counts = np.round(Q * 4096 / (2 * np.pi) * 10) % 4096  # The encoder is on the motor's side of a gear of 10:1.
     text = '{ from = "counts", unwrap = 4096, scale = 0.00015339807878856412, units = "rad" }'

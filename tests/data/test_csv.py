@@ -54,7 +54,8 @@ def test_truth_dates_and_empty_cells(tmp_path):
 def test_a_text_column_leaves_the_others_usable(tmp_path):
     found = load(tmp_path, "t,what\n0,idle\n1,moves\n2,moves\n")
     assert list(found.variables) == ["t"]
-    assert "'idle' in line 2" in found.unusable["what"]
+    assert found.unusable["what"] == "holds the words 'idle', 'moves'; a trial's `where` can test it"
+    assert found.texts["what"].tolist() == ["idle", "moves", "moves"]
 
 
 def test_a_word_among_numbers_is_named_with_its_line(tmp_path):

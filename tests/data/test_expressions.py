@@ -7,7 +7,8 @@ from jaxfinger.data.expressions import ExpressionError, evaluate
 
 X = np.arange(4.0)
 TABLE = np.column_stack([X, 10 * X])
-VALUES = {"x": X, "q [deg]": 2 * X, "log.y": X + 1, "table": TABLE}
+PHASE = np.array(["rest", "sweep", "sweep", "rest"], np.dtypes.StringDType())
+VALUES = {"phase": PHASE, "x": X, "q [deg]": 2 * X, "log.y": X + 1, "table": TABLE}
 CONSTANTS = {"k": 3.0, "M": [[1, 1], [0, 2], [1, 0]], "gains": [1.0, 0.5]}
 
 
@@ -30,6 +31,8 @@ def lookup(name, column):
         ("deg2rad(180 * sin(x) / pi)", np.sin(X)),
         ("x > 1 and not x == 3", [False, False, True, False]),
         ("-abs(-x)", -X),
+        ("phase == 'sweep' and x < 2", [False, True, False, False]),
+        ("'phase' != 'sweep'", [True, False, False, True]),
     ],
 )
 def test_values(text, expected):
@@ -66,3 +69,16 @@ def test_what_is_refused(text):
 
 def test_powers_of_powers_come_to_an_end():
     assert evaluate("9 ** 9 ** 9 ** 9", lookup, CONSTANTS) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("phase == 'swep'", "'swep', which 'phase' never holds; it holds 'rest', 'sweep'"),
+        ("phase > 'rest'", "holds 'phase', which is words; compare it with one, as phase == 'rest'"),
+        ("2 * phase", "holds 'phase', which is words"),
+    ],
+)
+def test_what_words_cannot_do(text, words):
+    with pytest.raises(ExpressionError, match=words):
+        evaluate(text, lookup, CONSTANTS)
