@@ -4,7 +4,7 @@ With J the Jacobian of a trial's white residuals r, one QR factorisation [J r] =
 squares needs: ‖r + J δ‖² = ‖d + R δ‖² + ρ². A stage, the joint refinement, a bootstrap resample and a leave-one-out
 refit are sums over these small factors, at a cost that does not depend on the number of samples.
 
-Outliers: Huber's cost is H(r) = r²/2 for |r| ≤ k, and k|r| − k²/2 beyond (Huber 1964). Least squares of
+Outliers: Huber's cost is H(r) = r²/2 for |r| ≤ c, and c|r| − c²/2 beyond (Huber 1964). Least squares of
 
     s(r) = sign(r) √(2 H(r)),   ∂s/∂r = ψ(r)/s(r),
 
