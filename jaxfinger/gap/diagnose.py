@@ -135,6 +135,7 @@ def diagnose(
     nominal = nominal_fit(problem)
     chosen = baseline.null
     if verdict.status in (Status.PARTLY, Status.AMBIGUOUS):
+        state = search.likeliest(state, found.ambiguous)
         chosen = search.only(state, (*verdict.named, *(k for s in found.ambiguous for k in s)))
     augmented: Fitted | None = None
     if chosen.effects:

@@ -373,6 +373,16 @@ class Search:
             state = self.fit_exactly(state, others[0])
         return state
 
+    def likeliest(self, state: SearchState, ambiguous: Iterable[Sequence[CauseKey]]) -> SearchState:
+        """The set with the first member of each ambiguous set, its likeliest, in the place of the one that it holds.
+
+        The search swaps a cause only where that gains MIN_SWAP_GAIN, so that a rival can be a little likelier.
+        """
+        for members in ambiguous:
+            if members[0] not in state.keys:
+                state = next((s for s in self.rivals(state, members) if members[0] in s.keys), state)
+        return state
+
     def rivals(self, state: SearchState, members: Iterable[CauseKey]) -> list[SearchState]:
         """The set, which holds one member of an ambiguous set, and the sets with each other member in its place."""
         members, out = list(members), [state]
