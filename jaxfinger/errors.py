@@ -1,6 +1,6 @@
 """Errors that users can mend: one sentence, printed without a traceback."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from difflib import get_close_matches
 
 
@@ -21,3 +21,9 @@ def did_you_mean(said: object, known: Collection[str]) -> str:
 def counted(number: int, noun: str) -> str:
     """Number and noun, as `1 error` or `2 errors`."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def listed(names: Sequence[str], most: int = 8) -> str:
+    """Names as part of a sentence: the first `most` ones, and how many more there are."""
+    shown = ", ".join(names[:most])
+    return f"{shown} and {len(names) - most} more" if len(names) > most else shown or "none"

@@ -17,10 +17,11 @@ from jaxfinger.data.check_work import check_work
 from jaxfinger.data.filtering import longest_spike, outlier_mask
 from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.opening import plain_reason, why_closed
-from jaxfinger.data.parse import listed, parse_file
+from jaxfinger.data.parse import parse_file
 from jaxfinger.data.schema import MEASURED
 from jaxfinger.data.session import EXPERIMENT_NAMES, Session, Trial
 from jaxfinger.data.sizes import sizes_of
+from jaxfinger.errors import listed
 
 # Share of a column's samples from which spikes are a warning instead of a note. Up to this share the mask finds them
 # with certainty; motors driven by a coarse encoder reach 0.09.

@@ -6,12 +6,11 @@ import numpy as np
 
 from jaxfinger.data.findings import Report
 from jaxfinger.data.motion import MIN_HOLD, pulled_slowly
-from jaxfinger.data.parse import listed
 from jaxfinger.data.schema import CHANNELS, DRIVES, MEASURED, MEASURES, NEEDS_JOINT, NEEDS_TENDON
 from jaxfinger.data.session import FingerDescription, Trial
 from jaxfinger.data.sizes import Sizes
 from jaxfinger.data.units import conversion
-from jaxfinger.errors import counted
+from jaxfinger.errors import counted, listed
 
 STILL_ANGLE = 0.01  # rad: five times the noise of a 14-bit encoder
 STILL_DISTANCE = 1e-4  # m, likewise of a prismatic joint: a hundredth of a rad at a radius of 10 mm

@@ -18,8 +18,8 @@ import numpy as np
 from jaxfinger.data.filtering import low_pass, smooth
 from jaxfinger.data.findings import Report
 from jaxfinger.data.motion import CUTOFF_HZ, STILL_SHARE, directions, fitting_cutoff
-from jaxfinger.data.parse import listed
 from jaxfinger.data.session import FingerDescription, Session, Trial
+from jaxfinger.errors import listed
 
 _DEGREE = 3  # of l(q): the moment arm is then a parabola over a joint's range, enough to tell a sign or a unit
 _SAMPLES = 400  # of a trial: slopes of a motion need no more.

@@ -12,11 +12,10 @@ import numpy as np
 from jaxfinger.data.expressions import ExpressionError, evaluate
 from jaxfinger.data.findings import Report
 from jaxfinger.data.mapping import Column, ColumnSpec, MappedTrial, Reading, terms
-from jaxfinger.data.parse import listed
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.toml import Place
 from jaxfinger.data.units import TO_SI, is_foreign, unit_name
-from jaxfinger.errors import UserError, counted
+from jaxfinger.errors import UserError, counted, listed
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -64,9 +63,10 @@ class Source:
         elsewhere = "; move what only some recordings hold to their trials" if where.keys[:1] == ("channels",) else ""
         return where.fail(f"{said}, which the recording has not; it has {listed(there, 30)}{elsewhere}")
 
-    def words(self, name: str) -> np.ndarray | None:
-        """Recorded variable of this name that is words; None where it is another one, or a derived one."""
-        return None if name in self.derived else self.recording.texts.get(name)
+    @property
+    def words(self) -> dict[str, np.ndarray]:
+        """Recorded variables of words that no derived variable replaces."""
+        return {name: words for name, words in self.recording.words.items() if name not in self.derived}
 
     def _derive(self, name: str, where: Place, within: tuple[str, ...]) -> Variable:
         where = where / "derived" / name
@@ -74,9 +74,6 @@ class Source:
         clocks: dict[str, str] = {}
 
         def lookup(inner: str, column: Any) -> np.ndarray:
-            if (words := self.words(inner)) is not None:
-                clocks[inner] = ""
-                return words
             if inner == name and inner in self.recording.variables:
                 variable = self.recording.variables[inner]
             else:
@@ -87,7 +84,7 @@ class Source:
             return variable.values if column is None else _column(variable, inner, column, where)[0]
 
         try:
-            values = np.asarray(evaluate(text, lookup, self.constants), np.float64)
+            values = np.asarray(evaluate(text, lookup, self.constants, self.words), np.float64)
         except ExpressionError as error:
             where.fail(f"{text!r} {error}")
         if len(set(clocks.values())) > 1:
@@ -199,12 +196,10 @@ def _chosen(trial: MappedTrial, source: Source, rows: np.ndarray, total: int, wh
     place, text = where / "where", trial.where
 
     def lookup(name: str, column: Any) -> np.ndarray:
-        if (words := source.words(name)) is not None:
-            return words
         return _column(source.variable(name, place), name, column, place)[0]
 
     try:
-        chosen = np.asarray(evaluate(text, lookup, source.constants))
+        chosen = np.asarray(evaluate(text, lookup, source.constants, source.words))
     except ExpressionError as error:
         place.fail(f"{text!r} {error}")
     if chosen.shape != (total,) or chosen.dtype != bool:

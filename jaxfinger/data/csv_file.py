@@ -18,9 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxfinger.data.parse import listed
 from jaxfinger.data.recording import Recording, Variable
-from jaxfinger.errors import UserError, counted
+from jaxfinger.errors import UserError, counted, listed
 
 _COMMENTS = ("#", "%")
 _DIALECT_LINES = 60  # They decide the dialect, and are taken from the middle of the file, after any header.
@@ -115,10 +114,10 @@ def load_csv(path: Path) -> Recording:
         names, body = tuple(split(body[0].text)), body[1:]  # pandas writes such a line over unnamed columns.
     if len(body) > 1 and len(split(body[-1].text)) < len(numeric):
         body, remarks = body[:-1], ("its last line is cut short and is left out",)
-    columns, faults, words = _columns(path, body, dialect, numeric)
+    columns = _columns(path, body, dialect, numeric)
     if scope:
-        return _pairs(path, columns, faults, names, units)
-    return _named(path, columns, faults, words, names, units, remarks)
+        return _pairs(path, columns, names, units)
+    return _named(path, columns, names, units, remarks)
 
 
 def _is_comment(text: str) -> bool:
@@ -215,25 +214,27 @@ def _is_word(dialect: _Dialect, cell: str) -> bool:
     return dialect.number(cell) is None or cell.lower() in _MISSING
 
 
-def _columns(
-    path: Path, body: Sequence[_Line], dialect: _Dialect, numeric: Sequence[bool]
-) -> tuple[list[np.ndarray | None], list[str], dict[int, np.ndarray]]:
-    """Columns as numbers and a fault for each: None with the reason where a cell is no number, else an empty string.
+@dataclass(frozen=True)
+class _Column:
+    """A column as numbers; without them the reason, and the words where it holds words."""
 
-    The third result holds the columns of words, by number.
-    """
+    values: np.ndarray | None
+    fault: str = ""
+    words: np.ndarray | None = None
+
+
+def _columns(path: Path, body: Sequence[_Line], dialect: _Dialect, numeric: Sequence[bool]) -> list[_Column]:
+    """Columns of a table; `numeric` tells those in which most cells are numbers."""
     separator, width, texts = dialect.separator, len(numeric), [line.text for line in body]
-    plain = all(numeric) and separator is not None and not any('"' in text for text in texts)
-    plain = plain and not (dialect.mark == "," and any("." in text for text in texts))
+    quoted = separator is None or any('"' in text for text in texts)
+    plain = all(numeric) and not quoted and not (dialect.mark == "," and any("." in text for text in texts))
     if plain and all(text.count(str(separator)) == width - 1 for text in texts):
         try:  # numpy reads plain numbers much faster than the loop below.
             if dialect.mark == ",":
                 texts = [text.replace(",", ".") for text in texts]
-            table = np.loadtxt(texts, delimiter=separator, ndmin=2, comments=None)
-            return list(table.T), [""] * width, {}
+            return [_Column(x) for x in np.loadtxt(texts, delimiter=separator, ndmin=2, comments=None).T]
         except ValueError:
             pass
-    quoted = separator is None or any('"' in text for text in texts)
     rows = []
     for line in body:
         rows.append(dialect.split(line.text) if quoted else line.text.split(separator))
@@ -244,25 +245,26 @@ def _columns(
     # Where both marks stand for decimals in one file, or seem to, a number such as 1,234 is not clear.
     points = (cell for row in rows for cell in row if "." in cell and not _HOUR.search(cell))
     mixed = dialect.mark == "," and any(_cell(cell) is not None for cell in points)
-    columns: list[np.ndarray | None] = []
-    faults: list[str] = []
-    words: dict[int, np.ndarray] = {}
-    for k, column in enumerate(zip(*rows, strict=True)):
-        if numeric[k] and not mixed and (values := _plain_numbers(column, dialect.mark)) is not None:
-            columns.append(values)
-            faults.append("")
-            continue
-        cells = [cell.strip() for cell in column]
-        known = {cell: None if mixed and _ONE_GROUP.match(cell) else dialect.number(cell) for cell in set(cells)}
-        values = [known[cell] for cell in cells]
-        bad = [n for n, value in enumerate(values) if value is None]
-        columns.append(None if bad else np.array(values, np.float64))
-        faults.append(_fault(cells[bad[0]], body[bad[0]].number, len(bad) - 1) if bad else "")
-        if bad and not numeric[k] and not any(form.search(cells[bad[0]]) for form in (_HOUR, _ONE_GROUP)):
-            words[k] = np.array(cells, np.dtypes.StringDType())
-            there = listed([repr(cell) for cell in dict.fromkeys(cells) if cell], 4)
-            faults[k] = f"holds the words {there}; a trial's `where` can test it"
-    return columns, faults, words
+    at = [line.number for line in body]
+    return [_column(cells, at, dialect, numeric[k], mixed) for k, cells in enumerate(zip(*rows, strict=True))]
+
+
+def _column(cells: Sequence[str], lines: Sequence[int], dialect: _Dialect, numeric: bool, mixed: bool) -> _Column:
+    """A column from its cells and their line numbers. With `mixed`, a number with one group of digits is not clear."""
+    if numeric and not mixed and (values := _plain_numbers(cells, dialect.mark)) is not None:
+        return _Column(values)
+    cells = [cell.strip() for cell in cells]
+    known = {cell: None if mixed and _ONE_GROUP.match(cell) else dialect.number(cell) for cell in set(cells)}
+    values = [known[cell] for cell in cells]
+    bad = [k for k, value in enumerate(values) if value is None]
+    if not bad:
+        return _Column(np.array(values, np.float64))
+    first = cells[bad[0]]
+    if numeric or _HOUR.search(first) or _ONE_GROUP.match(first):
+        return _Column(None, _fault(first, lines[bad[0]], len(bad) - 1))
+    there = listed([repr(cell) for cell in dict.fromkeys(cells) if cell], 4)
+    fault = f"holds the words {there}; a trial's `where` can test it"
+    return _Column(None, fault, np.array(cells, np.dtypes.StringDType()))
 
 
 def _plain_numbers(cells: Sequence[str], mark: str) -> np.ndarray | None:
@@ -290,42 +292,44 @@ def _fault(cell: str, line: int, others: int) -> str:
     return f"holds {cell!r} in line {line}, which is no number{more}; {mend}"
 
 
-def _named(path, columns, faults, words, names, units, remarks) -> Recording:
+def _named(
+    path: Path, columns: Sequence[_Column], names: Sequence[str], units: Sequence[str], remarks: tuple[str, ...]
+) -> Recording:
     """Recording of a table with named columns. Columns that share a name or hold no numbers are unusable."""
     names = names or ("",) * len(columns)
     places: dict[str, list[int]] = defaultdict(list)
-    for k, name in enumerate(names):
-        if name or (columns[k] is not None and not np.isnan(columns[k]).all()):  # Trailing separators make empty ones.
+    for k, (name, column) in enumerate(zip(names, columns, strict=True)):
+        if name or column.values is None or not np.isnan(column.values).all():  # Trailing separators make empty ones.
             places[name or f"column {k}"].append(k)
-    variables, unusable, texts = {}, {}, {}
+    variables, unusable, words = {}, {}, {}
     for name, (k, *others) in places.items():
+        column = columns[k]
         if others:
             numbers = " and ".join(str(place + 1) for place in (k, *others))
             unusable[name] = f"is the name of the columns {numbers}; give each column its own name"
-        elif columns[k] is None:
-            unusable[name] = faults[k]
-            texts |= {name: words[k]} if k in words else {}
-        else:
+        elif column.values is not None:
             suffix = _UNIT_SUFFIX.search(name)
-            variables[name] = Variable(columns[k], units=units[k] or (suffix.group(1).strip() if suffix else ""))
-    return Recording(path, variables, unusable, remarks, texts)
+            variables[name] = Variable(column.values, units=units[k] or (suffix.group(1).strip() if suffix else ""))
+        else:
+            unusable[name] = column.fault
+            if column.words is not None:
+                words[name] = column.words
+    return Recording(path, variables, unusable, remarks, words)
 
 
-def _pairs(path, columns, faults, names, units) -> Recording:
+def _pairs(path: Path, columns: Sequence[_Column], names: Sequence[str], units: Sequence[str]) -> Recording:
     """Recording of TwinCAT Scope, with a column of times in ms before every channel. It becomes `name.time`, in s."""
     variables: dict[str, Variable] = {}
     unusable: dict[str, str] = {}
     for k in range(0, len(columns), 2):
-        name = names[k + 1]
+        name, clock, channel = names[k + 1], columns[k], columns[k + 1]
         if name in variables or name in unusable:
             variables.pop(name, None)
             unusable[name] = "is the name of two channels; give each channel its own name"
-            continue
-        clock, values = columns[k], columns[k + 1]
-        if clock is None or values is None:
-            unusable[name] = faults[k] or faults[k + 1]
-            continue
-        filled = np.isfinite(clock)  # Channels with a lower sampling rate end earlier.
-        variables[f"{name}.time"] = Variable(clock[filled] * 1e-3, units="s")
-        variables[name] = Variable(values[filled], clock=f"{name}.time", units=units[k + 1])
+        elif clock.values is None or channel.values is None:
+            unusable[name] = clock.fault or channel.fault
+        else:
+            filled = np.isfinite(clock.values)  # Channels with a lower sampling rate end earlier.
+            variables[f"{name}.time"] = Variable(clock.values[filled] * 1e-3, units="s")
+            variables[name] = Variable(channel.values[filled], clock=f"{name}.time", units=units[k + 1])
     return Recording(path, variables, unusable)

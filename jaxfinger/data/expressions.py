@@ -8,11 +8,12 @@ from __future__ import annotations
 import ast
 import operator
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from jaxfinger.data.parse import listed
+from jaxfinger.errors import listed
 
 _OPERATORS: dict[type, Callable] = {
     ast.Add: operator.add,
@@ -45,13 +46,19 @@ class ExpressionError(ValueError):
     """Fault of an expression. The message is the end of a sentence that begins with the expression."""
 
 
-def evaluate(text: str, lookup: Callable[[str, Any], Any], constants: Mapping[str, Any]) -> np.ndarray:
+def evaluate(
+    text: str,
+    lookup: Callable[[str, Any], Any],
+    constants: Mapping[str, Any],
+    words: Mapping[str, np.ndarray] = MappingProxyType({}),
+) -> np.ndarray:
     """Value of an expression over N samples: (N,) or (N, k).
 
     Variables are `name`, `outer.inner` or, for names that are no identifiers, `'q [deg]'`. Their values are
     `lookup(name, column)`, where `name[1]` and `name['MCP']` choose a column and `name` alone passes None. A constant
     (number or matrix) goes before a variable of the same name. `[a, b]` puts variables beside each other, and `M @ x`
-    multiplies every sample by a matrix. A variable of words can be compared with one of them, `phase == 'sweep'`.
+    multiplies every sample by a matrix. `words` are variables (N,) of text. They can be compared with a word alone, as
+    in `phase == 'sweep'`.
 
     Raises:
         ExpressionError: the text does not parse, holds something that is not allowed, or its shapes do not fit.
@@ -61,7 +68,7 @@ def evaluate(text: str, lookup: Callable[[str, Any], Any], constants: Mapping[st
     try:
         tree = ast.parse(text.strip(), mode="eval")
         with np.errstate(all="ignore"):
-            return np.asarray(_value(tree.body, lookup, constants))
+            return np.asarray(_value(tree.body, lookup, constants, words))
     except ExpressionError:
         raise
     except SyntaxError as error:
@@ -72,11 +79,11 @@ def evaluate(text: str, lookup: Callable[[str, Any], Any], constants: Mapping[st
         raise ExpressionError(f"cannot be worked out ({error}); the shapes must fit") from None
 
 
-def _value(node: ast.AST, lookup: Callable[[str, Any], Any], constants: Mapping[str, Any]) -> Any:
+def _value(node: ast.AST, lookup: Callable[[str, Any], Any], constants: Mapping[str, Any], words: Mapping) -> Any:
     """Value of a node of the syntax tree; ExpressionError for a kind of node that is not allowed."""
 
     def inner(child: ast.AST) -> Any:
-        return _value(child, lookup, constants)
+        return _value(child, lookup, constants, words)
 
     match node:
         case ast.Constant(value=bool()):
@@ -87,10 +94,12 @@ def _value(node: ast.AST, lookup: Callable[[str, Any], Any], constants: Mapping[
             return np.pi
         case ast.Name() | ast.Attribute() | ast.Constant(value=str()):
             name = _name(node)
-            value = np.asarray(constants[name], np.float64) if name in constants else lookup(name, None)
-            if _is_text(value):
-                raise ExpressionError(f"holds {name!r}, which is words; compare it with one, as {name} == {value[0]!r}")
-            return value
+            if name in constants:
+                return np.asarray(constants[name], np.float64)
+            if name in words:
+                example = f"{ast.unparse(node)} == {str(words[name][0])!r}"
+                raise ExpressionError(f"computes with {name!r}, which holds words; compare it with one, as {example}")
+            return lookup(name, None)
         case ast.Subscript(slice=ast.Constant(value=int() | str() as column)):
             return lookup(_name(node.value), column)
         case ast.UnaryOp() if type(node.op) in _OPERATORS:
@@ -109,11 +118,11 @@ def _value(node: ast.AST, lookup: Callable[[str, Any], Any], constants: Mapping[
             left=ast.Name() | ast.Attribute() | ast.Constant(value=str()) as left,
             ops=[ast.Eq() | ast.NotEq() as op],
             comparators=[ast.Constant(value=str() as word)],
-        ) if _name(left) not in constants and _is_text(words := lookup(_name(left), None)):
-            if word not in words:
-                there = listed([repr(str(w)) for w in np.unique(words)], 10)
-                raise ExpressionError(f"asks for {word!r}, which {_name(left)!r} never holds; it holds {there}")
-            return _OPERATORS[type(op)](words, word)
+        ) if (name := _name(left)) in words and name not in constants:
+            if word not in words[name]:
+                there = listed([repr(str(w)) for w in np.unique(words[name])], 10)
+                raise ExpressionError(f"asks for {word!r}, which {name!r} never holds; write one of {there}")
+            return _OPERATORS[type(op)](words[name], word)
         case ast.Compare(ops=[op], comparators=[right]) if type(op) in _OPERATORS:
             return _OPERATORS[type(op)](inner(node.left), inner(right))
         case ast.List() | ast.Tuple() if node.elts:
@@ -133,10 +142,6 @@ def _aligned(apply: Callable, left: Any, right: Any) -> Any:
         if len(column) == len(table):
             left, right = (value[:, None] if value is column else value for value in (left, right))
     return apply(left, right)
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(getattr(value, "dtype", None), np.dtypes.StringDType)
 
 
 def _name(node: ast.AST) -> str:

@@ -20,12 +20,13 @@ from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.finger_file import finger_from
 from jaxfinger.data.hdf5 import write_session
 from jaxfinger.data.mapping import Channels, MappedTrial, MappingFile, read_mapping, terms
-from jaxfinger.data.parse import RANGES, listed, sorted_trials
+from jaxfinger.data.parse import RANGES, sorted_trials
 from jaxfinger.data.recording import Recording
 from jaxfinger.data.schema import CHANNELS, DRIVES, TEMPERATURE, Channel, Entry, units_of
 from jaxfinger.data.session import FingerDescription, Session, Trial
 from jaxfinger.data.sources import load_recording, refuse_path
 from jaxfinger.data.toml import Place
+from jaxfinger.errors import listed
 
 
 def import_file(

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxfinger.data.columns import restarts
-from jaxfinger.data.parse import listed
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
 from jaxfinger.data.units import TO_SI, is_foreign, unit_name
+from jaxfinger.errors import listed
 
 _MIN_GAP = 5.0  # times the median interval: well beyond jitter, so samples were lost.
 # Patterns of names for each channel, of which the first that fits counts: common words in logs of robots.

@@ -28,6 +28,7 @@ from jaxfinger.data.schema import (
     units_of,
 )
 from jaxfinger.data.session import EXPERIMENT_NAMES, FingerDescription, Session, Trial
+from jaxfinger.errors import listed
 
 # gzip shrinks a constant by at most about 1:1030, so a dataset that claims more than this cannot be in the file.
 _MAX_COMPRESSION = 1100
@@ -424,9 +425,3 @@ def number_attribute(item: Any, key: str, place: str, report: Report, shape: tup
         report.error(place, f"has an attribute `{key}` that is not finite; write a number")
         return None
     return value
-
-
-def listed(names: Sequence[str], most: int = 8) -> str:
-    """Names as part of a sentence: the first `most` ones, and how many more there are."""
-    shown = ", ".join(names[:most])
-    return f"{shown} and {len(names) - most} more" if len(names) > most else shown or "none"

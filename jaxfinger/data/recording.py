@@ -41,7 +41,7 @@ class Recording:
     """Variables of one file.
 
     `unusable` holds the variables that give no numbers, each with the reason: the end of a sentence that begins with
-    the name. `texts` holds those of them that are words, (N,), which conditions can test. `remarks` are sentences about
+    the name. `words` holds those of them that are text, (N,), which conditions can test. `remarks` are sentences about
     the file as a whole.
     """
 
@@ -49,4 +49,4 @@ class Recording:
     variables: Mapping[str, Variable] = field(default_factory=dict)
     unusable: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
-    texts: Mapping[str, np.ndarray] = field(default_factory=dict)
+    words: Mapping[str, np.ndarray] = field(default_factory=dict)

@@ -39,6 +39,9 @@ BREAKAWAY_WIDTHS = 4.5
 # travel suits compliant contacts, a shorter one stiff contacts (benchmarks/reversals.py).
 REVERSAL_TRAVEL = 2.2
 ACCELERATION_WINDOW = 0.1  # s, at the protocol's pace, over which q̈ is averaged where it does not exceed its noise
+# Degrees of freedom of the variance of q̈'s noise in that window W = 1/f_c: 2 W (∫S df)²/∫S² df, with the spectrum
+# S = f⁴ exp(−ln 2 (f/f_c)²) that an encoder's white noise has behind the low-pass.
+ACCELERATION_DOF = 4.0
 # Largest noise of q̈, in units of that from white encoder noise: an encoder's grid and vibration cause up to eight
 # (datasets/emps), and more than ten is motion.
 MAX_ACCELERATION_NOISE = 10.0
@@ -59,7 +62,7 @@ def reduce(r: PreparedTrial) -> Row:
         # Noise of q̈ biases a fit to less inertia (errors in variables), and adds a spurious torque to a prediction.
         # Where q̈ does not exceed its noise, it is therefore replaced by its running mean.
         most = MAX_ACCELERATION_NOISE * 1.4826 * j.noise * filtered_noise_std(j.cutoff, r.step, 2)
-        qdd = shrink(qdd, round(ACCELERATION_WINDOW * r.experiment.pace / r.step), most)
+        qdd = shrink(qdd, round(ACCELERATION_WINDOW * r.experiment.pace / r.step), ACCELERATION_DOF, most)
     if r.reduced:
         # All other terms pass the low-pass of q̈.
         joint, tendon, tension = (low_pass(r.trial.time, a, j.cutoff) for a in (joint, tendon, tension))

@@ -96,7 +96,7 @@ def _fixture_angles(q: Float[np.ndarray, "M m"], hold: Int[np.ndarray, " M"]) ->
     """
     runs = runs_of_holds(hold)
     if not runs:
-        return shrink(q, RAMP_BLOCKS)
+        return shrink(q, RAMP_BLOCKS, dof=RAMP_BLOCKS)  # Means of blocks are independent but for their common mean.
     if len(runs) < MIN_HOLDS:
         return _clipped_between_holds(q, hold)
     means = np.stack([q[run].mean(axis=0) for run in runs])

@@ -374,7 +374,7 @@ class Search:
         return state
 
     def likeliest(self, state: SearchState, ambiguous: Iterable[Sequence[CauseKey]]) -> SearchState:
-        """The set with the first member of each ambiguous set, its likeliest, in the place of the one that it holds.
+        """The set with the first member of each ambiguous set, the likeliest, in place of the one that it holds.
 
         The search swaps a cause only where that gains MIN_SWAP_GAIN, so that a rival can be a little likelier.
         """

@@ -178,7 +178,7 @@ def test_rows_by_a_column_of_words(tmp_path):
         trial = bring(condition)
         np.testing.assert_allclose(trial.q[:, 0], Q[TIME >= 3.0], atol=1e-6)
         np.testing.assert_array_equal(trial.joint_torque[:, 0], 1.0)
-    with pytest.raises(UserError, match=r"'swep', which 'phase' never holds; it holds 'rest, or so', 'sweep'"):
+    with pytest.raises(UserError, match=r"'swep', which 'phase' never holds; write one of 'rest, or so', 'sweep'"):
         bring("phase == 'swep'")
 
 

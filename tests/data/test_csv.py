@@ -55,7 +55,11 @@ def test_a_text_column_leaves_the_others_usable(tmp_path):
     found = load(tmp_path, "t,what\n0,idle\n1,moves\n2,moves\n")
     assert list(found.variables) == ["t"]
     assert found.unusable["what"] == "holds the words 'idle', 'moves'; a trial's `where` can test it"
-    assert found.texts["what"].tolist() == ["idle", "moves", "moves"]
+    assert found.words["what"].tolist() == ["idle", "moves", "moves"]
+
+
+def test_a_text_column_without_a_name_is_said(tmp_path):
+    assert "'idle', 'moves'" in load(tmp_path, "0,idle\n1,moves\n2,moves\n").unusable["column 1"]
 
 
 def test_a_word_among_numbers_is_named_with_its_line(tmp_path):

@@ -7,8 +7,8 @@ from jaxfinger.data.expressions import ExpressionError, evaluate
 
 X = np.arange(4.0)
 TABLE = np.column_stack([X, 10 * X])
-PHASE = np.array(["rest", "sweep", "sweep", "rest"], np.dtypes.StringDType())
-VALUES = {"phase": PHASE, "x": X, "q [deg]": 2 * X, "log.y": X + 1, "table": TABLE}
+WORDS = {"phase": np.array(["rest", "sweep", "sweep", "rest"], np.dtypes.StringDType())}
+VALUES = {"x": X, "q [deg]": 2 * X, "log.y": X + 1, "table": TABLE}
 CONSTANTS = {"k": 3.0, "M": [[1, 1], [0, 2], [1, 0]], "gains": [1.0, 0.5]}
 
 
@@ -36,7 +36,7 @@ def lookup(name, column):
     ],
 )
 def test_values(text, expected):
-    np.testing.assert_allclose(evaluate(text, lookup, CONSTANTS), expected)
+    np.testing.assert_allclose(evaluate(text, lookup, CONSTANTS, WORDS), expected)
 
 
 @pytest.mark.parametrize(
@@ -74,11 +74,11 @@ def test_powers_of_powers_come_to_an_end():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("phase == 'swep'", "'swep', which 'phase' never holds; it holds 'rest', 'sweep'"),
-        ("phase > 'rest'", "holds 'phase', which is words; compare it with one, as phase == 'rest'"),
-        ("2 * phase", "holds 'phase', which is words"),
+        ("phase == 'swep'", "'swep', which 'phase' never holds; write one of 'rest', 'sweep'"),
+        ("phase > 'rest'", "computes with 'phase', which holds words; compare it with one, as phase == 'rest'"),
+        ("2 * phase", "computes with 'phase'"),
     ],
 )
 def test_what_words_cannot_do(text, words):
     with pytest.raises(ExpressionError, match=words):
-        evaluate(text, lookup, CONSTANTS)
+        evaluate(text, lookup, CONSTANTS, WORDS)
