@@ -260,7 +260,8 @@ def _column(cells: Sequence[str], lines: Sequence[int], dialect: _Dialect, numer
     if not bad:
         return _Column(np.array(values, np.float64))
     first = cells[bad[0]]
-    if numeric or _HOUR.search(first) or _ONE_GROUP.match(first):
+    some_numbers = any(value is not None and not np.isnan(value) for value in known.values())
+    if some_numbers or _HOUR.search(first) or _ONE_GROUP.match(first):
         return _Column(None, _fault(first, lines[bad[0]], len(bad) - 1))
     there = listed([repr(cell) for cell in dict.fromkeys(cells) if cell], 4)
     fault = f"holds the words {there}; a trial's `where` can test it"

@@ -58,6 +58,12 @@ def test_a_text_column_leaves_the_others_usable(tmp_path):
     assert found.words["what"].tolist() == ["idle", "moves", "moves"]
 
 
+def test_numbers_of_which_most_are_spoiled_are_no_words(tmp_path):
+    found = load(tmp_path, "t,a\n0,err\n1,err\n2,3.5\n3,err\n")
+    assert "holds 'err' in line 2, which is no number, and 2 more cells of this kind" in found.unusable["a"]
+    assert not found.words
+
+
 def test_a_text_column_without_a_name_is_said(tmp_path):
     assert "'idle', 'moves'" in load(tmp_path, "0,idle\n1,moves\n2,moves\n").unusable["column 1"]
 
