@@ -141,6 +141,7 @@ def test_a_term_that_the_recipe_left_out_is_fitted_as_an_effect_that_is_known(fo
     assert "for example tendon_stretch:T3" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_first_look_at_the_axis_names_the_friction_that_its_recipe_leaves_out(folder, tmp_path, capsys):
     recipe = ROOT / "fits" / "emps-no-coulomb.toml"
     assert run("diagnose", folder / "emps.h5", "--recipe", recipe, "--quick", "--json", "-o", tmp_path) == 0
@@ -152,6 +153,7 @@ def test_a_first_look_at_the_axis_names_the_friction_that_its_recipe_leaves_out(
     assert "a first look" in verdict["summary"]
 
 
+@pytest.mark.long
 def test_several_sessions_have_a_diagnosis_each_and_a_table_of_their_causes(folder, tmp_path, capsys):
     again = tmp_path / "again.h5"
     shutil.copy(folder / "emps.h5", again)

@@ -61,6 +61,7 @@ def scaled(session):
     return build(replace(session, trials=trials), Recipe())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("missing", [(), ("ID.3-static",)])
 def test_damping_without_its_own_experiment_is_fitted_where_else_it_shows(session, specimen, missing):
     """The stages fit it on the moves between holds; without ID.3-static the diagnosis fits it on the free motion."""

@@ -60,6 +60,7 @@ def test_the_scan_leaves_as_little_as_the_best_of_all_sets_of_periods(effect, se
     assert left(np.vstack([slope, columns(time, found.values())]), r) == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.long
 def test_a_long_session_is_scanned_down_to_a_longer_period(planted, monkeypatch):
     """A session of a day does not need memory in proportion, and one of an instant still has a period to try."""
     monkeypatch.setattr(Signatures, "white_changes", lambda self, members: np.zeros((len(members), 1)))

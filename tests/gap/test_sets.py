@@ -12,6 +12,8 @@ from .conftest import session_with
 
 STOP = ("joint_stop", ("PIP",))
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def found():

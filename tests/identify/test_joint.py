@@ -41,6 +41,7 @@ def test_estimates_lie_within_their_intervals(joint, truth):
     assert 0.9 < joint.stages[-1].chi2_per_row < 1.1
 
 
+@pytest.mark.long
 def test_all_trials_of_one_joint_are_refined_to_their_noise():
     """The external torque of VD.3 is zero throughout.
 
@@ -88,6 +89,7 @@ def test_other_data_are_the_prior(clean, staged, joint):
 GROUPS = ("moment_arm", "elastic", "friction", "damping", "tendon_friction")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("factor", "groups"),
     [

@@ -55,6 +55,7 @@ def stack(short):
 EFFECTS = (("tendon_stretch", {"compliance": 2e-5}), ("tendon_friction_presliding", {"a": 0.5}))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("effects", [(), EFFECTS], ids=["nominal", "with effects"])
 def test_the_common_shape_changes_no_derivative(stack, short_truth, effects):
     """Derivatives computed part by part are exact, too."""

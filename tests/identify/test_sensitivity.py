@@ -16,6 +16,8 @@ from jaxfinger.identify.sensitivity import sensitivity
 from jaxfinger.identify.solve import solve
 from jaxfinger.identify.stages import cad_prior, nominal_model, sources_of
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def one_of_each(session):
@@ -44,7 +46,6 @@ def test_what_a_fit_is_without_a_trial_is_said_without_a_refit(fit, found, one_o
     np.testing.assert_allclose(shifts[k][seen], moved[seen], atol=0.15 * np.abs(moved[seen]).max())
 
 
-@pytest.mark.long
 def test_what_one_trial_alone_tells_of_is_unknown_without_it(fit, found, one_of_each):
     """The only trial of ID.2 at a joint alone determines the moment arms there."""
     (trial,) = [t for t in one_of_each if t.experiment == "ID.2" and t.joint == "DIP"][:1]
@@ -96,7 +97,6 @@ def heavier(session, joint: int, mass: float):
     return replace(session, finger=replace(f, mass=masses, inertia=f.inertia * (masses / f.mass)[:, None, None]))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("kind", ["trials", "sensors", "cad"])
 def test_derivatives_are_those_of_refits_under_the_same_noise(fit, one_of_each, kind):
     """Steps are so short that hardly a sample crosses Huber's limit, where the second derivative jumps."""

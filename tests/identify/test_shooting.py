@@ -44,6 +44,7 @@ def values(fit):
     return np.asarray(ravel(fit.model))
 
 
+@pytest.mark.long
 def test_a_prediction_is_the_simulation_from_its_start(short, staged):
     x = shooting(short).stack.batch.x
     b, k = 1, 7
@@ -54,6 +55,7 @@ def test_a_prediction_is_the_simulation_from_its_start(short, staged):
     np.testing.assert_allclose(simulated_ahead(staged.model, x)[:, b, k], q[:, -1], atol=1e-12)
 
 
+@pytest.mark.long
 def test_a_step_of_the_simulation_costs_less_than_an_encoder(short, staged):
     """Steps a quarter as long change angles half a second ahead by less than an encoder's resolution."""
     rounds = recipe_from(RECIPE).sensors.q.resolution / np.sqrt(12.0)
@@ -65,6 +67,7 @@ def test_a_step_of_the_simulation_costs_less_than_an_encoder(short, staged):
         assert np.all(np.std(coarse - fine, axis=1) < rounds)
 
 
+@pytest.mark.long
 def test_sweeps_over_frictions_leave_less_than_an_encoder(short, staged, monkeypatch):
     """Eight times as many sweeps change angles 0.1 s ahead by less than an encoder's resolution."""
     rounds = recipe_from(RECIPE).sensors.q.resolution / np.sqrt(12.0)

@@ -51,6 +51,7 @@ def test_a_moment_ahead_the_truth_departs_by_the_noise_of_the_sensors(scored):
     assert "% of the samples" in share
 
 
+@pytest.mark.long
 def test_a_weak_spring_shows_a_moment_ahead(short_truth, scored, short):
     """Errors grow with a threefold elastic torque, and a joint pushed out of its range is reported to diverge."""
     elastic = short_truth.model.joint_torque.elastic
