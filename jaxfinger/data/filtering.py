@@ -112,8 +112,8 @@ def _spline(x: Float[np.ndarray, "k N"], rate: float, cutoff_hz: float) -> Float
     turn = 2.0 * np.pi / size * np.arange(size // 2 + 1)  # rad from sample to sample
     B = _B_SPLINE[0, 2] + 2.0 * (_B_SPLINE[0, 3] * np.cos(turn) + _B_SPLINE[0, 4] * np.cos(2.0 * turn))
     H = np.exp(-0.5 * (rate * filter_std(cutoff_hz) * turn) ** 2)
-    found = np.fft.irfft(np.fft.rfft(wide - line, size) * H / B, size)[:, :count] + line
-    return found[:, reach - 2 : reach + N + 3]
+    near = slice(reach - 2, reach + N + 3)
+    return np.fft.irfft(np.fft.rfft(wide - line, size) * (H / B), size)[:, near] + line[:, near]
 
 
 def _derivatives(
@@ -123,25 +123,24 @@ def _derivatives(
 
     They are taken at the N = C - 5 samples, or at `at`, counted in samples. The coefficients are those of `_spline`.
     """
-    last = coefficients.shape[1] - 6
-
-    def at_samples(order: int) -> Float[np.ndarray, "k N"]:
-        near = (coefficients[:, i : i + last + 1] for i in range(6))
-        return np.asarray(sum(w * c for w, c in zip(_B_SPLINE[order], near, strict=True) if w))
-
+    last, orders = coefficients.shape[1] - 6, range(highest + 1)
     if at is None:
-        return np.stack([at_samples(order) for order in range(highest + 1)])
-    before = np.clip(np.floor(at).astype(int), 0, last)
-    away, there = at - before, [at_samples(order)[:, before] for order in range(6)]
-
-    def polynomial(order: int) -> Float[np.ndarray, "k M"]:
-        """Derivative of the interval's polynomial, by Horner's scheme."""
-        out = there[5]
-        for k in range(4, order - 1, -1):
-            out = there[k] + out * away / (k - order + 1)
-        return out
-
-    return np.stack([polynomial(order) for order in range(highest + 1)])
+        before, away = None, np.zeros(1)
+    else:
+        before = np.clip(np.floor(at).astype(int), 0, last)
+        away = at - before
+    out = np.zeros((highest + 1, len(coefficients), last + 1 if at is None else len(at)))
+    # Derivative k of the interval's polynomial Σ_j s⁽ʲ⁾ aʲ/j!, with s⁽ʲ⁾ at the sample before: weights of coefficients.
+    terms = np.ones((6, len(away)))
+    for j in range(1, 6):
+        terms[j] = terms[j - 1] * away / j
+    weights = [_B_SPLINE[k:].T @ terms[: 6 - k] for k in orders]
+    for i in range(6):
+        near = coefficients[:, i : i + last + 1]
+        near = near if before is None else near.take(before, axis=1)
+        for k in orders:
+            out[k] += weights[k][i] * near
+    return out
 
 
 def _fourier_length(size: int) -> int:
