@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfinger.effects import Scales
 from jaxfinger.experiments import EXPERIMENTS, Batch, Stack, affected_channels
 from jaxfinger.gap.exact import SearchState, derivatives
 from jaxfinger.gap.formula import Weights
@@ -34,10 +35,8 @@ MAX_REPEATS = 10  # A trial that needs more repeats to be decisive is not sugges
 # and commanded motions go through more.
 MIN_MOTION = 0.05
 REST_POSITIONS = (0.2, 0.8)  # Shares of the range at which resting joints are tried, well clear of the stops.
-MAX_TENSION = 15.0  # N, the largest tension of the format's protocols: that of VD.2 (docs/experiments.md).
-MAX_TENSION_FACTOR = 3.0  # Where joints are free, tension only keeps tendons taut (about 2 N): no more than threefold.
-FAST_SPEED = 1.5  # rad/s, the fastest sweep of ID.3-dynamic, to which motion without tendons is sped up.
-SLOW_FACTOR = 0.25  # A quarter of the speed brings the sweeps (0.5 to 1.5 rad/s) below their slowest.
+MAX_TENSION_FACTOR = 3.0  # Where joints are free, tension only keeps tendons taut: no more than threefold.
+SLOW_FACTOR = 0.25  # A quarter of the speed brings the protocol's sweeps (0.5 to 1.5 rad/s) below their slowest.
 # The experiment whose motion a missing one borrows. VD.1 and VD.3 have motions of their own.
 MOTION_FROM = {"VD.2": "ID.4", "ID.4": "VD.2", "ID.3-static": "ID.2", "ID.3-dynamic": "ID.2"}
 
@@ -117,7 +116,7 @@ def _short_list(problem: Problem, showing: set[str]) -> Iterator[dict[str, Stack
             for share in (None, *REST_POSITIONS):
                 there = {e: _resting_at(s, problem.nominal.finger, share) for e, s in stacks.items()}
                 yield there
-                yield {e: _harder(s) for e, s in there.items()}
+                yield {e: _harder(s, problem.scales) for e, s in there.items()}
                 yield {e: _slower(s) for e, s in there.items()}
 
 
@@ -156,20 +155,23 @@ def _resting_at(stack: Stack, finger: Finger, share: float | None) -> Stack:
     return _with(stack, q=np.where(_moves(finger, q)[..., None], q, low + share * (high - low)))
 
 
-def _harder(stack: Stack) -> Stack:
+def _harder(stack: Stack, scales: Scales) -> Stack:
     """The stack with tendons pulled further, and at held joints released again in the same steps.
 
-    Without tension it moves faster instead. VD.3 stays as it is, since its motion follows from its tension.
+    Without tension it moves faster instead. No trial goes beyond the tension and the speed that the session has shown
+    the rig to bear. VD.3 stays as it is, since its motion follows from its tension.
     """
     x, experiment = stack.batch.x, stack.experiment
     if experiment.name == "VD.3":
         return stack
     if experiment.slack:
-        return stack if experiment.rests else _sped_up(stack, max(1.0, FAST_SPEED / max(_speed(x.qd), 1e-3)))
+        fastest = scales("speed")
+        return stack if experiment.rests else _sped_up(stack, max(1.0, fastest / (_speed(x.qd) or fastest)))
     f = np.asarray(x.tension)
     top = f.max(axis=(0, -1), keepdims=True)
-    top = np.where(top > 0.0, top, MAX_TENSION)
-    f = f * np.clip(MAX_TENSION / top, 1.0, np.inf if experiment.held else MAX_TENSION_FACTOR)
+    largest = scales("tension")
+    further = largest / np.where(top > 0.0, top, largest)
+    f = f * np.clip(further, 1.0, np.inf if experiment.held else MAX_TENSION_FACTOR)
     falls = f[..., -1].max(axis=0) < 0.5 * f.max(axis=(0, -1))
     if not experiment.held or falls.all():
         return _with(stack, tension=f)
