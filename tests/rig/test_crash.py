@@ -65,6 +65,7 @@ def kill_at(folder, where, size, *more, trial="01-VD.1"):
     return path
 
 
+@pytest.mark.long
 def test_killed_at_random_moments(controller, tmp_path):
     rng = random.Random(7)
     for k in range(2):
