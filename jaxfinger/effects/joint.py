@@ -3,7 +3,9 @@ hardens, relaxes, meets a stop, or couples two joints through a passive tendon."
 
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.effects.base import CatalogueEffect, amplitude, dahl, delta, shape
@@ -95,7 +97,7 @@ class _TowardsAnEnd(CatalogueEffect):
 
     @classmethod
     def constants(cls, finger, site):
-        return {"limits": jnp.asarray(finger.limits[finger.joint_names.index(site[0])])}
+        return {"limits": jax.device_put(np.array(finger.limits[finger.joint_names.index(site[0])]))}
 
 
 class ElasticHardening(_TowardsAnEnd):

@@ -2,7 +2,9 @@
 
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.effects.base import CatalogueEffect, amplitude, dahl, delta, shape
@@ -27,7 +29,7 @@ class TendonFrictionCapstan(CatalogueEffect):
 
     @classmethod
     def constants(cls, finger, site):
-        return {"crossed": jnp.asarray(finger.crosses[finger.tendon_names.index(site[0])], dtype=float)}
+        return {"crossed": jax.device_put(np.array(finger.crosses[finger.tendon_names.index(site[0])], float))}
 
     def loss(self, x, f, C, loss):
         k = self.index[0]

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 from jaxtyping import Array, Float
@@ -71,7 +70,7 @@ class _Nominal(NamedTuple):
         )  # fmt: skip
         finger = Finger.from_description(described)
         model = Model.zeros(finger)
-        joints, tendons, time = jnp.zeros((m, T)), jnp.zeros((n, T)), jnp.zeros(T)
+        joints, tendons, time = jax.device_put((np.zeros((m, T)), np.zeros((n, T)), np.zeros(T)))
         x = Motion(time, joints, joints, joints, tendons, joints, tendons, time, joints, held, temperature=joints)
         shapes = jax.eval_shape(lambda model: (terms_without_effects(model, x), contact_map(model, x)), model)
         terms, contact = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), shapes)
@@ -89,7 +88,11 @@ def _affected_channels(kind, *description) -> dict[str, tuple[str, ...]]:
 
     def depends(held: bool, channel: str) -> bool:
         _, model, x, terms, contact = _Nominal.of(*description, held=held)
-        y0 = {"joint_torque": x.q, "tendon_excursion": x.tension, "fingertip_force": contact[:, 0]}[channel]
+        y0 = {
+            "joint_torque": x.q,
+            "tendon_excursion": x.tension,
+            "fingertip_force": jax.device_put(np.asarray(contact)[:, 0]),
+        }[channel]
         of_force = contact if channel == "fingertip_force" else None
 
         def of(amplitudes):

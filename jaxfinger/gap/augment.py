@@ -142,8 +142,8 @@ def _moving(effect: CatalogueEffect) -> CatalogueEffect:
     Fixed are choices (form, side, place) and shares at their upper limit.
     """
     stays = {n for n, p in effect.shape_parameters().items() if p.moves == "not" or len(p.values) == 1}
-    stays |= {n for n, p in effect.amplitudes().items() if getattr(effect, n) >= p.most}
-    return replace(effect, **{n: jnp.asarray(float(n not in stays)) for n in effect.values()})
+    stays |= {n for n, p in effect.amplitudes().items() if float(getattr(effect, n)) >= p.most}
+    return replace(effect, **{n: jnp.asarray(n not in stays, dtype=float) for n in effect.values()})
 
 
 def limits(model: Model, free: np.ndarray, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
@@ -162,7 +162,7 @@ def without_shapes(model: Model, free: np.ndarray) -> np.ndarray:
 
 def _shapes(effect: CatalogueEffect) -> CatalogueEffect:
     """Mark shapes with 1, amplitudes with 0."""
-    return replace(effect, **{n: jnp.asarray(float(n in effect.shape_parameters())) for n in effect.values()})
+    return replace(effect, **{n: jnp.asarray(n in effect.shape_parameters(), dtype=float) for n in effect.values()})
 
 
 def _limit(side: int, scales: Scales, effect: CatalogueEffect) -> CatalogueEffect:

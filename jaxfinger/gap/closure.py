@@ -3,7 +3,6 @@
 Each third of the trials is held out in turn, stratified by experiment, joint and tendon (`folds`).
 """
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -138,7 +137,7 @@ def _refit(model: Model, free, J, r, training, prior: Prior, scales: Scales) -> 
     room = [(end - theta) / np.where(scale > 0.0, scale, 1.0) for end in limits(model, free, scales)]
     b = np.concatenate([-r[training], offset, np.zeros(len(free))])
     delta = bounded_least_squares(np.vstack([J[training], kept]), b, *room) * scale
-    return Free.at(model, free).set(model, jax.device_put(theta + delta))
+    return Free.at(model, free).set(model, theta + delta)
 
 
 def _misfit(problem: Problem, residuals: Residuals, keep: dict[str, np.ndarray]) -> float:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -218,7 +217,7 @@ def _start_from(session: Session, against: Fit) -> Fit:
             f"{file}: the fit to compare it with holds effects; give one of the nominal model, as `identify` writes it"
         )
     known = np.union1d(against.estimated, np.flatnonzero(np.diag(against.covariance))).astype(int)
-    model = Free.at(model, known).set(model, jax.device_put(np.asarray(ravel(against.model))[known]))
+    model = Free.at(model, known).set(model, np.asarray(ravel(against.model))[known])
     before = Fit.before(session, against.recipe, model)
     return replace(before, covariance=against.covariance, estimated=against.estimated)
 
@@ -233,7 +232,7 @@ def site(problem: Problem, channel: str, column: int) -> str:
 def moved(problem: Problem, by: Float[np.ndarray, " p"]) -> Problem:
     """The problem at another nominal model, whose free parameters differ by `by`; residuals and Jacobian are exact."""
     at = Free.at(problem.nominal, problem.free)
-    nominal = at.set(problem.nominal, jax.device_put(np.asarray(at.get(problem.nominal)) + by))
+    nominal = at.set(problem.nominal, np.asarray(at.get(problem.nominal)) + by)
     white = white_tangents(nominal, problem.sources)
     return replace(problem, **_at(nominal, white, problem.sources, problem.rows, problem.free, problem.prior))
 

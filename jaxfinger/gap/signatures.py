@@ -154,7 +154,7 @@ class Signatures:
             for b in group.of(shown):
                 x, contact = group.x[b], group.contact[b]
                 if by_torque:
-                    none = jnp.zeros_like(x.q)
+                    none = jax.device_put(np.zeros(x.q.shape))
                     torque = np.asarray(_change("joint_torque", stacked, nominal, x, none, terms[b], None, count))
                     raw[:, :, b] = np.einsum("dmbt,kmbt->kdbt", np.asarray(contact), torque[: len(members)])
                 else:

@@ -118,7 +118,7 @@ def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: 
     return Members(values, std, ~sound, steps, template)
 
 
-def _start(session: Session, template: Fit, shared: Model) -> Float[Array, " P"]:
+def _start(session: Session, template: Fit, shared: Model) -> Float[Array | np.ndarray, " P"]:
     """Flat vector from which a session starts: the template's, with the links of the session's own description."""
     own = nominal_model(session, template.recipe)
     if jax.tree.structure(own) != jax.tree.structure(shared):

@@ -112,21 +112,21 @@ class Fit:
         """
         import jax
 
-        from jaxfinger.identify.parameters import with_flat
+        from jaxfinger.identify.parameters import Free
 
-        flat = ravel(self.model)
         seen = np.isfinite(np.diag(self.covariance))
         covariance = np.where(np.outer(seen, seen), self.covariance, 0.0)
         positions = np.flatnonzero((np.diag(covariance) > 0) | ~seen)
+        uncertain = Free.at(self.model, positions)
 
         @jax.jit
         def value_and_jacobian(theta):
             def of(t):
-                return f(with_flat(self.model, flat.at[positions].set(t)))
+                return f(uncertain.set(self.model, t))
 
             return of(theta), jax.jacfwd(of)(theta)
 
-        value, J = map(np.asarray, value_and_jacobian(jax.device_put(np.asarray(flat)[positions])))
+        value, J = map(np.asarray, value_and_jacobian(jax.device_put(uncertain.get(self.model))))
         variance = np.einsum("...i,ij,...j->...", J, covariance[np.ix_(positions, positions)], J)
         unseen = np.any(J[..., ~seen[positions]] != 0.0, axis=-1)
         return value, np.where(unseen, np.inf, np.sqrt(np.maximum(variance, 0.0)))

@@ -10,7 +10,6 @@ positive, and the inertia of a link is proportional to its mass, since CAD gives
 
 from dataclasses import replace
 
-import jax
 import numpy as np
 
 from jaxfinger.data import Session, data_hash
@@ -169,7 +168,7 @@ def _neutral(model: Model, free, parameters) -> Model:
     flat = np.array(ravel(model))
     coefficients = [i for i in free if parameters[i].group not in ("mass", "com")]
     flat[coefficients] = 0.0
-    return Free.at(model, free).set(model, jax.device_put(flat[free]))
+    return Free.at(model, free).set(model, flat[free])
 
 
 def _gain(before: Fit, after: Fit, how: str) -> str:

@@ -1,6 +1,7 @@
 """The model's parameters as one flat vector, with a name and a unit for every entry.
 
 Flat vectors exist only inside a solver call and in a covariance. Elsewhere a parameter is a field of its module.
+NumPy moves concrete values between both, since JAX would compile a program for every structure of a model.
 """
 
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxfinger.data.schema import units_where
@@ -18,19 +20,20 @@ from jaxfinger.effects import CatalogueEffect, Site
 from jaxfinger.model import Finger, Model
 
 
-@eqx.filter_jit
-def ravel(model: Model) -> Float[Array, " P"]:
+def ravel(model: Model) -> Float[Array | np.ndarray, " P"]:
     """Flat vector of the model: its floating-point leaves in order."""
-    return jnp.concatenate([jnp.ravel(leaf) for leaf in _leaves(model)])
+    leaves = _leaves(model)
+    xp = _namespace(leaves)
+    return xp.concatenate([xp.ravel(leaf) for leaf in leaves])
 
 
-def with_flat(model: Model, flat: Float[Array, " P"]) -> Model:
+def with_flat(model: Model, flat: Float[Array | np.ndarray, " P"]) -> Model:
     """Copy of the model with the flat vector `flat`, the inverse of `ravel`."""
     arrays, rest = eqx.partition(model, eqx.is_inexact_array)
     leaves, treedef = jax.tree.flatten(arrays)
     ends = np.cumsum([0] + [leaf.size for leaf in leaves])
     new = [flat[a:b].reshape(leaf.shape) for leaf, (a, b) in zip(leaves, pairwise(ends), strict=True)]
-    return eqx.combine(jax.tree.unflatten(treedef, new), rest)
+    return eqx.combine(jax.tree.unflatten(treedef, jax.device_put(new)), rest)
 
 
 class Free(eqx.Module):
@@ -57,26 +60,32 @@ class Free(eqx.Module):
         parts = tuple(str(getattr(paths[i][0][0], "name", "")) for i in leaves)
         return cls(leaves, parts, tuple(within[i] for i in leaves))
 
-    def values(self, model: Model) -> list[Float[Array, " _k"]]:
+    def values(self, model: Model) -> list[Float[Array | np.ndarray, " _k"]]:
         """Free parameters of a model, leaf by leaf."""
         leaves = _leaves(model)
-        return [leaves[i].ravel()[e] for i, e in zip(self.leaves, self.entries, strict=True)]
+        xp = _namespace(leaves)
+        return [xp.ravel(leaves[i])[e] for i, e in zip(self.leaves, self.entries, strict=True)]
 
-    def put(self, model: Model, values: list[Float[Array, " _k"]]) -> Model:
+    def put(self, model: Model, values: list[Float[Array | np.ndarray, " _k"]]) -> Model:
         """Copy of the model with these free parameters, leaf by leaf."""
         arrays, rest = eqx.partition(model, eqx.is_inexact_array)
         leaves, treedef = jax.tree.flatten(arrays)
+        concrete = _namespace([*leaves, *values]) is np
         for i, e, value in zip(self.leaves, self.entries, values, strict=True):
-            leaves[i] = leaves[i].ravel().at[e].set(value).reshape(leaves[i].shape)
+            if concrete:
+                flat = np.array(leaves[i]).ravel()
+                flat[np.asarray(e)] = value
+                leaves[i] = jax.device_put(flat.reshape(leaves[i].shape))
+            else:
+                leaves[i] = jnp.ravel(leaves[i]).at[e].set(value).reshape(leaves[i].shape)
         return eqx.combine(jax.tree.unflatten(treedef, leaves), rest)
 
-    @eqx.filter_jit
-    def get(self, model: Model) -> Float[Array, " p"]:
+    def get(self, model: Model) -> Float[Array | np.ndarray, " p"]:
         """Free parameters of a model as one vector."""
-        return jnp.concatenate(self.values(model))
+        values = [np.zeros(0), *self.values(model)]
+        return _namespace(values).concatenate(values)
 
-    @eqx.filter_jit
-    def set(self, model: Model, theta: Float[Array, " p"]) -> Model:
+    def set(self, model: Model, theta: Float[Array | np.ndarray, " p"]) -> Model:
         """Copy of the model with its free parameters set to `theta`."""
         ends = np.cumsum([0] + [e.size for e in self.entries])
         return self.put(model, [theta[a:b] for a, b in pairwise(ends)])
@@ -84,6 +93,11 @@ class Free(eqx.Module):
 
 def _leaves(model: Model):
     return jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
+
+
+def _namespace(leaves):
+    """`jax.numpy` where JAX traces any of the leaves, else `numpy`."""
+    return jnp if any(isinstance(leaf, Tracer) for leaf in leaves) else np
 
 
 def units_at(finger: Finger, effect: type[CatalogueEffect], site: Site) -> dict[str, str]:

@@ -190,7 +190,7 @@ def solve(
             raise UserError(f"{Outcome[state.outcome]}: start from other parameters")
         if not bool(state.outcome == Outcome.running):
             break
-        at = moved.set(model, jax.device_put(np.asarray(state.trial)[:p]))
+        at = moved.set(model, np.asarray(state.trial)[:p])
     model, linearised, factor, rows = best
     _, invisible, scale = visible(rows[:, :-1])
     white = np.concatenate([lin.white.ravel() for lin in linearised.values()])
@@ -222,7 +222,7 @@ def parameter_bounds(
 
 def _sentence(state: Iterate) -> str:
     """Message to the user about a search that did not converge; empty where it did."""
-    step = float(state.length * state.size)
+    step = float(state.length) * float(state.size)
     at_rounding = bool(state.outcome == Outcome.rounded) and step <= KINK_TOLERANCE
     if at_rounding or bool(state.outcome == Outcome.converged) or bool(state.outcome == Outcome.kink):
         return ""

@@ -60,7 +60,8 @@ def _highest(model: Model, sources: dict[str, Source]) -> Float[np.ndarray, " n"
 
 def _is_dead(model: Model, k: int, highest: float) -> bool:
     """Whether the tendon loses nothing at any tension up to the highest, or all of the highest."""
-    a0, a1 = float(model.tendon_friction.constant[k]), float(model.tendon_friction.proportional[k])
+    friction = model.tendon_friction
+    a0, a1 = (float(np.asarray(a)[k]) for a in (friction.constant, friction.proportional))
     nothing = a0 <= 0.0 and a0 + a1 * (highest or 1.0) <= 0.0
     return bool(nothing or 0.0 < highest <= a0 + a1 * highest)
 

@@ -3,7 +3,7 @@
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -80,15 +80,14 @@ class Finger(eqx.Module):
     def from_description(cls, d: Description) -> "Finger":
         """Finger from an object with the arrays of ID.1 under the format's names."""
         arrays = {
-            k: jnp.asarray(getattr(d, k), dtype=float)
+            k: np.asarray(getattr(d, k), dtype=float)
             for k in ("gravity", "axis", "origin", "mass", "com", "inertia", "fingertip")
         }
-        gyration = arrays.pop("inertia") / arrays["mass"][:, None, None]
+        arrays["gyration"] = arrays.pop("inertia") / arrays["mass"][:, None, None]
         rotors = getattr(d, "rotor_inertia", None)
+        arrays["rotor_inertia"] = np.diag(np.zeros(len(d.joint_names)) if rotors is None else np.asarray(rotors, float))
         return cls(
-            **arrays,
-            gyration=gyration,
-            rotor_inertia=jnp.diag(jnp.zeros(len(d.joint_names)) if rotors is None else jnp.asarray(rotors, float)),
+            **jax.device_put(arrays),
             limits=tuple((float(a), float(b)) for a, b in d.limits),
             prismatic=tuple(bool(p) for p in d.prismatic),
             joint_names=tuple(d.joint_names),

@@ -5,7 +5,9 @@ drive.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 
@@ -28,8 +30,9 @@ class JointTorque(eqx.Module):
     @classmethod
     def zeros(cls, m: int, elastic_degree: int = 2, friction_degree: int = 2) -> "JointTorque":
         """Joint torques of zero for `m` joints, with polynomials of these degrees."""
-        none = jnp.zeros(m)
-        return cls(jnp.zeros((m, elastic_degree + 1)), none, jnp.zeros((m, friction_degree + 1)), none, none, none)
+        none = np.zeros(m)
+        elastic, friction = np.zeros((m, elastic_degree + 1)), np.zeros((m, friction_degree + 1))
+        return cls(*jax.device_put((elastic, none, friction, none, none, none)))
 
     @classmethod
     def of(

@@ -6,6 +6,7 @@ from itertools import accumulate, combinations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 
@@ -32,7 +33,7 @@ class MomentArm(eqx.Module):
                 for a, b in combinations(range(m), 2)
                 for p, r in ((1, 1), (2, 1), (1, 2))
             ]
-        return cls(jnp.zeros((n, len(exponents))), tuple(exponents))
+        return cls(jax.device_put(np.zeros((n, len(exponents)))), tuple(exponents))
 
     def of(self, tendon: Int[Array, ""]) -> "MomentArm":
         """Moment arms of a single tendon, given its index."""

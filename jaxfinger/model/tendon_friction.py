@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 
@@ -15,7 +16,7 @@ class TendonFriction(eqx.Module):
     @classmethod
     def zeros(cls, n: int) -> "TendonFriction":
         """Frictionless transmission of `n` tendons."""
-        return cls(jnp.zeros(n), jnp.zeros(n))
+        return cls(*jax.device_put((np.zeros(n), np.zeros(n))))
 
     def loss(self, tension: Float[Array, "n *T"]) -> Float[Array, "n *T"]:
         """a₀ + a₁ f_t, N, before it is clipped (`bounded`)."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -88,10 +89,10 @@ def _curves(fit: Fit) -> Curves:
     for i in range(m):
         q[i, i] = np.linspace(limits[i, 0], limits[i, 1], S)
     f = np.linspace(0.0, MAX_TENSION, S)
-    values, std = fit.function(_evaluate(jnp.asarray(q), jnp.asarray(np.tile(f, (finger.n, 1)))))
+    values, std = fit.function(_evaluate(*jax.device_put((q, np.tile(f, (finger.n, 1))))))
     cuts = np.cumsum((finger.n * m * S, m * S, m * S, m))
     arms, elastic, friction, damping, loss = zip(np.split(values, cuts), np.split(std, cuts), strict=True)
-    gravity = np.asarray(rigid_body.gravity_torque(model.finger, jnp.asarray(q)))
+    gravity = np.asarray(rigid_body.gravity_torque(model.finger, jax.device_put(q)))
 
     def shaped(pair, shape):
         return tuple(a.reshape(shape) for a in pair)
@@ -143,7 +144,7 @@ def _estimated(fit: Fit) -> set:
 def _evaluate(q: Float[Array, "m m S"], tension: Float[Array, "n S"]):
     """Function of a model that returns all curves as one flat vector: one derivative gives all standard deviations."""
     m = q.shape[0]
-    own = jnp.arange(m)
+    own = np.arange(m)
 
     @eqx.filter_jit
     def evaluate(model: Model):

@@ -1,0 +1,55 @@
+"""The flat vector of a model: what NumPy does with values is what JAX traces."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxfinger.identify.parameters import Free, ravel, with_flat
+from jaxfinger.synthetic import paper_finger, polynomial_finger, true_model
+
+POSITIONS = ((), (0,), (3, 17, 40), tuple(range(12)))
+
+
+@pytest.fixture(scope="module")
+def model():
+    return true_model(polynomial_finger(paper_finger()))
+
+
+def test_the_flat_vector_and_the_model_are_each_other(model):
+    flat = ravel(model)
+    np.testing.assert_array_equal(flat, jax.jit(ravel)(model))
+    again = with_flat(model, flat[::-1])
+    assert jax.tree.structure(again) == jax.tree.structure(model)
+    np.testing.assert_array_equal(ravel(again), flat[::-1])
+
+
+@pytest.mark.parametrize("positions", POSITIONS, ids=len)
+def test_free_entries_alone_are_set(model, positions):
+    positions = np.array(positions, dtype=int)
+    free, flat = Free.at(model, positions), ravel(model)
+    np.testing.assert_array_equal(free.get(model), flat[positions])
+    theta = np.arange(1.0, 1.0 + len(positions))
+    moved = free.set(model, theta)
+    expected = np.array(flat)
+    expected[positions] = theta
+    np.testing.assert_array_equal(ravel(moved), expected)
+    np.testing.assert_array_equal(ravel(model), flat)  # the model itself is as it was
+    np.testing.assert_array_equal(jax.jit(lambda t: ravel(free.set(model, t)))(theta), expected)
+
+
+def test_moving_values_traces_nothing(model):
+    """JAX would trace and compile programs for every structure of a model, dozens of them in a diagnosis."""
+    steps = []
+
+    def record(name, _, **__):
+        steps.append(name)
+
+    jax.monitoring.register_event_duration_secs_listener(record)
+    try:
+        free = Free.at(model, np.array([1, 5, 7]))
+        free.set(with_flat(model, ravel(model)), free.get(model))
+        assert not steps
+        jax.jit(free.get)(model)
+        assert steps  # the listener hears what JAX does
+    finally:
+        jax.monitoring.unregister_event_duration_listener(record)
