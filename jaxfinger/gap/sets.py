@@ -49,6 +49,7 @@ class Visited:
 
     evidence: dict[frozenset[CauseKey], Evidence] = field(default_factory=dict)
     screened: set[frozenset[CauseKey]] = field(default_factory=set)  # sets that `LinearModel.screen` alone has weighed
+    exact: dict[frozenset[CauseKey], Evidence] = field(default_factory=dict)  # the best exact fit of a set
 
     @property
     def scores(self) -> dict[frozenset[CauseKey], float]:
@@ -70,6 +71,17 @@ class Visited:
             self.screened.remove(key)
             del self.evidence[key]
         self._keep_better(key, evidence)
+
+    def add_exact(self, keys: Iterable[CauseKey], evidence: Evidence) -> None:
+        """Record evidence of an exact fit."""
+        key = frozenset(keys)
+        self.add(key, evidence)
+        if key not in self.exact or evidence.score > self.exact[key].score:
+            self.exact[key] = evidence
+
+    def refute(self, promised_more: Iterable[frozenset[CauseKey]]) -> None:
+        """Give those of the sets that were fitted exactly the evidence of that fit."""
+        self.evidence |= {key: self.exact[key] for key in promised_more if key in self.exact}
 
     def _keep_better(self, key: frozenset[CauseKey], evidence: Evidence) -> None:
         if key not in self.evidence or evidence.score > self.evidence[key].score:
@@ -126,6 +138,9 @@ class Search:
         if state.effects:
             state = max(state, self.fit_exactly(state, None), key=lambda s: s.score)
         self._visit_rivals(state)
+        # A linear fit promises too much where a law is curved or a shape is at its bound.
+        best, scores = self.net_evidence(state), self.visited.scores
+        self.visited.refute([keys for keys, score in scores.items() if score - self.costs.of(keys) > best])
         return state
 
     def net_evidence(self, state: SearchState) -> float:
@@ -193,7 +208,7 @@ class Search:
         best = self.with_best_choices(best, kept)
         if self._leaves_more(best):
             best = refit_from_plain(self.baseline, best)
-            self.visited.add(best.keys, best.linear_fit.evidence)
+            self.visited.add_exact(best.keys, best.linear_fit.evidence)
         return best
 
     def _leaves_more(self, state: SearchState) -> bool:
@@ -341,7 +356,7 @@ class Search:
         self, problem: Problem, variants: Sequence[Variant], starts: Sequence[dict[str, float]], weights: Weights
     ) -> SearchState:
         found = fit_set(self.baseline, problem, variants, starts, weights)
-        self.visited.add(found.keys, found.linear_fit.evidence)
+        self.visited.add_exact(found.keys, found.linear_fit.evidence)
         return found
 
     def with_best_choices(self, state: SearchState, first: int) -> SearchState:
