@@ -16,6 +16,8 @@ from .conftest import PLANTED, RIVALS, TRUTH, session_with
 
 WITHOUT = tuple(sorted(set(CATALOGUE) - {*RIVALS, "payload", "joint_friction_asymmetric"}))
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def earlier():
@@ -42,7 +44,6 @@ def test_nothing_has_changed(earlier):
     assert {*CHANGED} - {c.key.effect for c in found.candidates} == {"changed_tendon_friction"}  # no trial of it
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("truth", "group"),
     [
@@ -68,7 +69,6 @@ def test_one_parameter_has_changed(earlier, truth, group):
     assert change.name.lower() in summary(found).lower()
 
 
-@pytest.mark.long
 def test_an_effect_came_and_a_parameter_changed(earlier):
     """Both are named, each with its value, and `gap.json` holds them."""
     found = beside(earlier, PLANTED, changed("changed_damping", "MCP", d=3e-4))

@@ -58,6 +58,7 @@ def test_a_mass_that_ends_at_its_floor_is_said_to_be_wanted_lighter():
     assert implausible(MODEL, covariance, np.array([mass]), np.array([0.02 * floor])) == []
 
 
+@pytest.mark.long
 def test_a_stage_says_so():
     """The arm's base is pushed along by a negative damping."""
     session, recipe = arm()

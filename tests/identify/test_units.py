@@ -66,7 +66,7 @@ def axis(tmp_path_factory):
     return read_session(file), read_recipe("emps")
 
 
-@pytest.fixture(scope="module", params=["finger", "axis", pytest.param("arm", marks=pytest.mark.long)])
+@pytest.fixture(scope="module", params=["axis", *(pytest.param(m, marks=pytest.mark.long) for m in ("finger", "arm"))])
 def machine(request):
     """Session of a machine and its fit."""
     if request.param == "finger":
