@@ -29,6 +29,7 @@ from jaxfinger.gap.diagnose import search_for_causes
 from jaxfinger.gap.formula import Evidence, Parameters, log_likelihood, unexplained, unlisted
 from jaxfinger.gap.posterior import genuine_probabilities
 from jaxfinger.gap.problem import build
+from jaxfinger.gap.sets import Weighed
 from jaxfinger.gap.signatures import catalogue_for
 from jaxfinger.identify import Recipe
 from jaxfinger.sealed.run import CASES_PER_PROCESS
@@ -101,7 +102,7 @@ def weigh(folder: Path) -> Record:
         folder.name,
         search.baseline.columns.counts,
         visited.evidence,
-        frozenset(visited.screened),
+        frozenset(keys for keys, how in visited.weighed.items() if how is Weighed.SCREENED),
         search.table.explainable,
         read_truth(folder, folder.parent.with_name(f"{folder.parent.name}-truth")).at_work,
         costs.parameters,

@@ -13,6 +13,7 @@ The evidence of every set on the way is kept, and `posterior` makes probabilitie
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import IntEnum, auto
 from typing import NamedTuple
 
 import numpy as np
@@ -43,49 +44,31 @@ MAX_SCORE_GAP = 8.0  # nats. A set whose linear fit is further behind is not fit
 MIN_SWAP_GAIN = 1.0  # nats that a swap must bring, so that two sets of like evidence are not swapped back and forth
 
 
+class Weighed(IntEnum):
+    """How the evidence of a set was found, the roughest way first."""
+
+    SCREENED = auto()  # `LinearModel.screen`, in fixed weights, in which evidence is higher than in settled ones
+    LINEAR = auto()  # `LinearModel.fit`, which promises too much where a law is curved or a shape is at its bound
+    EXACT = auto()  # `exact.fit_set`
+
+
 @dataclass
 class Visited:
     """Evidence of every set that the search has visited; costs are not taken off."""
 
     evidence: dict[frozenset[CauseKey], Evidence] = field(default_factory=dict)
-    screened: set[frozenset[CauseKey]] = field(default_factory=set)  # sets that `LinearModel.screen` alone has weighed
-    exact: dict[frozenset[CauseKey], Evidence] = field(default_factory=dict)  # the best exact fit of a set
+    weighed: dict[frozenset[CauseKey], Weighed] = field(default_factory=dict)
 
     @property
     def scores(self) -> dict[frozenset[CauseKey], float]:
         """Log evidence of every set."""
         return {keys: x.score for keys, x in self.evidence.items()}
 
-    def screen(self, keys: Iterable[CauseKey], evidence: Evidence) -> None:
-        """Record evidence in fixed weights. It is higher than in settled ones, and gives way to them."""
+    def add(self, keys: Iterable[CauseKey], evidence: Evidence, weighed: Weighed) -> None:
+        """Record evidence of a set. A better way replaces a rougher one; of one way the highest evidence counts."""
         key = frozenset(keys)
-        if key not in self.evidence:
-            self.screened.add(key)
-        if key in self.screened:
-            self._keep_better(key, evidence)
-
-    def add(self, keys: Iterable[CauseKey], evidence: Evidence) -> None:
-        """Record evidence in settled weights; the best of a set's records counts."""
-        key = frozenset(keys)
-        if key in self.screened:
-            self.screened.remove(key)
-            del self.evidence[key]
-        self._keep_better(key, evidence)
-
-    def add_exact(self, keys: Iterable[CauseKey], evidence: Evidence) -> None:
-        """Record evidence of an exact fit."""
-        key = frozenset(keys)
-        self.add(key, evidence)
-        if key not in self.exact or evidence.score > self.exact[key].score:
-            self.exact[key] = evidence
-
-    def refute(self, promised_more: Iterable[frozenset[CauseKey]]) -> None:
-        """Give those of the sets that were fitted exactly the evidence of that fit."""
-        self.evidence |= {key: self.exact[key] for key in promised_more if key in self.exact}
-
-    def _keep_better(self, key: frozenset[CauseKey], evidence: Evidence) -> None:
-        if key not in self.evidence or evidence.score > self.evidence[key].score:
-            self.evidence[key] = evidence
+        if key not in self.evidence or (weighed, evidence.score) > (self.weighed[key], self.evidence[key].score):
+            self.evidence[key], self.weighed[key] = evidence, weighed
 
 
 class Reduced(NamedTuple):
@@ -122,7 +105,7 @@ class Search:
         self.baseline, self.table, self.progress = baseline, table, progress
         self.visited = Visited()
         self.costs = Costs(baseline.parameters, baseline.unexplained, table.explainable)
-        self.visited.add((), baseline.null.linear_fit.evidence)
+        self.visited.add((), baseline.null.linear_fit.evidence, Weighed.EXACT)
 
     def run(self) -> SearchState:
         """Search from the empty set, and return the set with the most net evidence."""
@@ -138,9 +121,6 @@ class Search:
         if state.effects:
             state = max(state, self.fit_exactly(state, None), key=lambda s: s.score)
         self._visit_rivals(state)
-        # A linear fit promises too much where a law is curved or a shape is at its bound.
-        best, scores = self.net_evidence(state), self.visited.scores
-        self.visited.refute([keys for keys, score in scores.items() if score - self.costs.of(keys) > best])
         return state
 
     def net_evidence(self, state: SearchState) -> float:
@@ -208,7 +188,7 @@ class Search:
         best = self.with_best_choices(best, kept)
         if self._leaves_more(best):
             best = refit_from_plain(self.baseline, best)
-            self.visited.add_exact(best.keys, best.linear_fit.evidence)
+            self.visited.add(best.keys, best.linear_fit.evidence, Weighed.EXACT)
         return best
 
     def _leaves_more(self, state: SearchState) -> bool:
@@ -246,7 +226,7 @@ class Search:
         if cause is not None:
             model = self.baseline.linear_model(state.problem, state.nominal, r, slopes)
             fit = model.fit(np.arange(len(at)), *state.step_bounds(at), sizes=state.sizes()[at])
-        self.visited.add(keys, fit.evidence)
+        self.visited.add(keys, fit.evidence, Weighed.LINEAR)
         return Reduced(keys, r, slopes, fit.score)
 
     def screen(self, state: SearchState, without: int | None = None) -> Screened:
@@ -269,7 +249,7 @@ class Search:
             if more is not None and not set(o.keys) & set(keys):
                 together = [*keys, *o.keys]
                 net[n] = score + more.score - self.costs.of(together)
-                self.visited.screen(together, more._replace(score=score + more.score))
+                self.visited.add(together, more._replace(score=score + more.score), Weighed.SCREENED)
         return Screened(keys, score, model, now, net)
 
     def best_offers(
@@ -296,7 +276,7 @@ class Search:
             fit = model.fit(o.rows, o.low, o.high, start=now.weights)
             together = [*keys, *o.keys]
             evidence = fit.evidence._replace(score=score + fit.score - now.score)
-            self.visited.add(together, evidence)
+            self.visited.add(together, evidence, Weighed.LINEAR)
             found.append(Addition(evidence.score - self.costs.of(together), o, fit.amplitudes))
         on_grid: dict[tuple, Addition] = {}
         for x in sorted(found, key=lambda x: -x.net):
@@ -356,7 +336,7 @@ class Search:
         self, problem: Problem, variants: Sequence[Variant], starts: Sequence[dict[str, float]], weights: Weights
     ) -> SearchState:
         found = fit_set(self.baseline, problem, variants, starts, weights)
-        self.visited.add_exact(found.keys, found.linear_fit.evidence)
+        self.visited.add(found.keys, found.linear_fit.evidence, Weighed.EXACT)
         return found
 
     def with_best_choices(self, state: SearchState, first: int) -> SearchState:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxfinger.gap.formula import Evidence
-from jaxfinger.gap.sets import Visited
+from jaxfinger.gap.sets import Visited, Weighed
 
 A, B = ("tendon_stretch", ("T1",)), ("joint_stribeck", ("PIP",))
 
@@ -12,21 +12,20 @@ def evidence(score: float) -> Evidence:
     return Evidence(np.ones(2), np.ones(2), np.ones(2), score)
 
 
-def test_settled_weights_replace_those_of_a_screen_and_the_best_of_them_counts():
+def test_of_one_way_the_highest_evidence_counts_and_a_better_way_replaces_a_rougher_one():
     visited = Visited()
-    visited.screen([A], evidence(5.0))
-    visited.add([A], evidence(1.0))
-    visited.add([A], evidence(2.0))
-    visited.add([A], evidence(1.5))
-    visited.screen([A], evidence(9.0))
-    assert visited.scores == {frozenset([A]): 2.0}
-
-
-def test_what_an_exact_fit_does_not_keep_of_a_promise_is_refuted():
-    visited = Visited()
-    for keys, promised, kept in (((A,), 3.0, 2.0), ((A, B), 7.0, -4.0)):
-        visited.add(keys, evidence(promised))
-        visited.add_exact(keys, evidence(kept))
-    visited.add([B], evidence(8.0))  # of this set there is no exact fit
-    visited.refute([frozenset([A, B]), frozenset([B])])
-    assert visited.scores == {frozenset([A]): 3.0, frozenset([A, B]): -4.0, frozenset([B]): 8.0}
+    for score, weighed, counts in (
+        (5.0, Weighed.SCREENED, 5.0),
+        (9.0, Weighed.SCREENED, 9.0),
+        (1.0, Weighed.LINEAR, 1.0),
+        (7.0, Weighed.SCREENED, 1.0),
+        (2.0, Weighed.LINEAR, 2.0),
+        (-4.0, Weighed.EXACT, -4.0),
+        (8.0, Weighed.LINEAR, -4.0),
+        (-6.0, Weighed.EXACT, -4.0),
+        (-3.0, Weighed.EXACT, -3.0),
+    ):
+        visited.add([A], evidence(score), weighed)
+        assert visited.scores == {frozenset([A]): counts}
+    visited.add([A, B], evidence(0.0), Weighed.SCREENED)
+    assert len(visited.scores) == 2
