@@ -250,10 +250,11 @@ class Compressed:
         return float(np.linalg.norm(self.jacobian(b) @ (a - b)))
 
 
-def by_scipy(problem: Compressed, **options) -> np.ndarray:
-    """Optimum by SciPy, without earlier linearisations."""
+def by_scipy(problem: Compressed, **options) -> tuple[np.ndarray, int]:
+    """Optimum by SciPy, without earlier linearisations, and at how many points it needs the residuals."""
     problem.forget()
-    return scipy.optimize.least_squares(problem.residual, problem.start, jac=problem.jacobian, **options).x  # pyright: ignore[reportArgumentType]
+    found = scipy.optimize.least_squares(problem.residual, problem.start, jac=problem.jacobian, **options)  # pyright: ignore[reportArgumentType]
+    return found.x, found.nfev
 
 
 def rivals(problem: Compressed, optimum: np.ndarray, near: float) -> list[dict]:
@@ -262,7 +263,7 @@ def rivals(problem: Compressed, optimum: np.ndarray, near: float) -> list[dict]:
     for method, scale in itertools.product(("lm", "trf"), ("jac", 1.0)):
         for tolerance in 10.0 ** -np.arange(2, 16):
             options = {"method": method, "x_scale": scale} | dict.fromkeys(("ftol", "xtol", "gtol"), tolerance)
-            if problem.apart(by_scipy(problem, **options), optimum) < near:
+            if problem.apart(by_scipy(problem, **options)[0], optimum) < near:
                 out.append(options)
                 break
     return out
@@ -300,11 +301,12 @@ def one_stage(name: str, problem: Compressed, sources: dict[str, Source]) -> Non
     works = [partial(by_scipy, problem, **o) for o in options]
     mine, passing, *theirs = processor(lambda: ours(problem.sources), lambda: ours(sources), *works)
     best = int(np.argmin([np.median(t) for t in theirs]))
-    used, away = options[best], problem.apart(works[best](), found)
+    used, (reached, needed) = options[best], works[best]()
     print(
         f"  {name:13} ours {spread(1e3 * mine)} at {points} points; "
-        f"SciPy {spread(1e3 * theirs[best])} by {used['method']}, x_scale={used['x_scale']}, {used['ftol']:.0e}; "
-        f"SciPy / ours {np.median(theirs[best] / mine):.2f}, {away:.0e} σ apart; "
+        f"SciPy {spread(1e3 * theirs[best])} at {needed}, by {used['method']}, x_scale={used['x_scale']}, "
+        f"{used['ftol']:.0e}; SciPy / ours {np.median(theirs[best] / mine):.2f}, "
+        f"{problem.apart(reached, found):.0e} σ apart; "
         f"ours with the derivatives that errors are passed on by {spread(1e3 * passing)}"
     )
 

@@ -124,17 +124,15 @@ def _derivatives(
     They are taken at the N = C - 5 samples, or at `at`, counted in samples. The coefficients are those of `_spline`.
     """
     last, orders = coefficients.shape[1] - 6, range(highest + 1)
-    if at is None:
-        before, away = None, np.zeros(1)
-    else:
-        before = np.clip(np.floor(at).astype(int), 0, last)
-        away = at - before
-    out = np.zeros((highest + 1, len(coefficients), last + 1 if at is None else len(at)))
-    # Derivative k of the interval's polynomial Σ_j s⁽ʲ⁾ aʲ/j!, with s⁽ʲ⁾ at the sample before: weights of coefficients.
-    terms = np.ones((6, len(away)))
+    before = None if at is None else np.clip(np.floor(at).astype(int), 0, last)
+    away = np.zeros(1) if at is None else at - before
+    # At `away` past a sample derivative k is its Taylor series Σ_j s⁽ᵏ⁺ʲ⁾ awayʲ/j!. Every s⁽ᵏ⁺ʲ⁾ is a weighted sum of
+    # six coefficients, and so is the derivative.
+    powers = np.ones((6, len(away)))  # awayʲ/j!
     for j in range(1, 6):
-        terms[j] = terms[j - 1] * away / j
-    weights = [_B_SPLINE[k:].T @ terms[: 6 - k] for k in orders]
+        powers[j] = powers[j - 1] * away / j
+    weights = [_B_SPLINE[k:].T @ powers[: 6 - k] for k in orders]
+    out = np.zeros((highest + 1, len(coefficients), last + 1 if at is None else len(at)))
     for i in range(6):
         near = coefficients[:, i : i + last + 1]
         near = near if before is None else near.take(before, axis=1)

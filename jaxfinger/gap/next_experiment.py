@@ -35,7 +35,9 @@ MAX_REPEATS = 10  # A trial that needs more repeats to be decisive is not sugges
 # and commanded motions go through more.
 MIN_MOTION = 0.05
 REST_POSITIONS = (0.2, 0.8)  # Shares of the range at which resting joints are tried, well clear of the stops.
-MAX_TENSION_FACTOR = 3.0  # Where joints are free, tension only keeps tendons taut: no more than threefold.
+# Where joints are free, tension only keeps tendons taut, with about 2 N in the protocols (docs/experiments.md). Three
+# times as much is still at the lower end of the 4 to 15 N with which tendons of held joints are pulled.
+MAX_TENSION_FACTOR = 3.0
 SLOW_FACTOR = 0.25  # A quarter of the speed brings the protocol's sweeps (0.5 to 1.5 rad/s) below their slowest.
 # The experiment whose motion a missing one borrows. VD.1 and VD.3 have motions of their own.
 MOTION_FROM = {"VD.2": "ID.4", "ID.4": "VD.2", "ID.3-static": "ID.2", "ID.3-dynamic": "ID.2"}
@@ -158,15 +160,15 @@ def _resting_at(stack: Stack, finger: Finger, share: float | None) -> Stack:
 def _harder(stack: Stack, scales: Scales) -> Stack:
     """The stack with tendons pulled further, and at held joints released again in the same steps.
 
-    Without tension it moves faster instead. No trial goes beyond the tension and the speed that the session has shown
-    the rig to bear. VD.3 stays as it is, since its motion follows from its tension.
+    Without tension it moves faster instead. Tension and speed stay within those of the session (`scales`), which the
+    rig is known to bear. VD.3 stays as it is, since its motion follows from its tension.
     """
     x, experiment = stack.batch.x, stack.experiment
     if experiment.name == "VD.3":
         return stack
     if experiment.slack:
-        fastest = scales("speed")
-        return stack if experiment.rests else _sped_up(stack, max(1.0, fastest / (_speed(x.qd) or fastest)))
+        moves = not experiment.rests and _speed(x.qd) > 0.0
+        return _sped_up(stack, max(1.0, scales("speed") / _speed(x.qd))) if moves else stack
     f = np.asarray(x.tension)
     top = f.max(axis=(0, -1), keepdims=True)
     largest = scales("tension")

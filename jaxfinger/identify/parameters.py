@@ -1,7 +1,8 @@
 """The model's parameters as one flat vector, with a name and a unit for every entry.
 
 Flat vectors exist only inside a solver call and in a covariance. Elsewhere a parameter is a field of its module.
-NumPy moves concrete values between both, since JAX would compile a program for every structure of a model.
+NumPy moves values between both, since JAX would compile a program for every structure of a model. JAX does it where it
+traces.
 """
 
 from dataclasses import dataclass
@@ -70,20 +71,19 @@ class Free(eqx.Module):
         """Copy of the model with these free parameters, leaf by leaf."""
         arrays, rest = eqx.partition(model, eqx.is_inexact_array)
         leaves, treedef = jax.tree.flatten(arrays)
-        concrete = _namespace([*leaves, *values]) is np
         for i, e, value in zip(self.leaves, self.entries, values, strict=True):
-            if concrete:
+            if _namespace([leaves[i], e, value]) is np:
                 flat = np.array(leaves[i]).ravel()
-                flat[np.asarray(e)] = value
-                leaves[i] = jax.device_put(flat.reshape(leaves[i].shape))
+                flat[e] = value
             else:
-                leaves[i] = jnp.ravel(leaves[i]).at[e].set(value).reshape(leaves[i].shape)
+                flat = jnp.ravel(leaves[i]).at[e].set(value)
+            leaves[i] = jax.device_put(flat.reshape(leaves[i].shape))
         return eqx.combine(jax.tree.unflatten(treedef, leaves), rest)
 
     def get(self, model: Model) -> Float[Array | np.ndarray, " p"]:
         """Free parameters of a model as one vector."""
-        values = [np.zeros(0), *self.values(model)]
-        return _namespace(values).concatenate(values)
+        values = self.values(model)
+        return _namespace(values).concatenate([np.zeros(0), *values])  # the empty array, since there may be no value
 
     def set(self, model: Model, theta: Float[Array | np.ndarray, " p"]) -> Model:
         """Copy of the model with its free parameters set to `theta`."""
@@ -96,7 +96,7 @@ def _leaves(model: Model):
 
 
 def _namespace(leaves):
-    """`jax.numpy` where JAX traces any of the leaves, else `numpy`."""
+    """JAX's NumPy where it traces any of the leaves, else NumPy."""
     return jnp if any(isinstance(leaf, Tracer) for leaf in leaves) else np
 
 
