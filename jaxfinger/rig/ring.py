@@ -280,7 +280,8 @@ class RingRig(Rig):
         """Send a command, wait for its acknowledgement, return its id.
 
         Commands of other threads go first, but a STOP waits for them no longer than STOP_WAIT_S and then overwrites the
-        command under way, which raises CommandRefused in its own thread.
+        command under way, which raises CommandRefused in its own thread. That command may still be on its way to the
+        controller and overwrite the STOP in turn, so a STOP is written again until it is acknowledged.
         """
         patience = time.monotonic() + (STOP_WAIT_S if kind is Kind.STOP else self.answer_s)
         while not (mine := self._sending.acquire(timeout=0.02)) and time.monotonic() < patience:
@@ -319,6 +320,8 @@ class RingRig(Rig):
                     order["kind"] = Kind.NONE
                     self._write("stCommand", order.tobytes())
                 raise ConnectionLost(f"the controller did not acknowledge {kind.name} within {self.answer_s:g} s.")
+            if kind is Kind.STOP:
+                self._write("stCommand", order.tobytes())
             self._pause(0.002)
         if reason := int(status["refused"]):
             state = _known(State, int(status["state"]), "state").name

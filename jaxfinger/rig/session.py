@@ -173,7 +173,8 @@ def _meaning(head: dict[str, Any]) -> dict[str, str]:
 def _close_killed_trial(log: convert.Log, rig: Rig, recorder: Recorder) -> None:
     """Close the trial in which an earlier recorder died. Its missing samples are read from the controller's ring.
 
-    Only a controller with the same fingerprint (program, boot number) still has them.
+    Only a controller with the same fingerprint (program, boot number) still has them. No heartbeat is sent meanwhile:
+    the watch does not run yet, and a finger that is still armed is to be released.
     """
     if not log.trials or log.trials[-1].end is not None:
         return
@@ -183,8 +184,7 @@ def _close_killed_trial(log: convert.Log, rig: Rig, recorder: Recorder) -> None:
         status = rig.status()
         until = status.trip_seq if status.state is State.TRIPPED else status.head
         rig.rewind(last + 1)
-        while last < until - 1:
-            block = rig.read_block(rig.description.deadlines.stale_s)
+        while last < until - 1 and (block := rig.poll()) is not None:
             recorder.block(block)
             last = int(block.seq[-1])
         end["seq"] = max(until, log.last_seq + 1) if log.last_seq is not None else until

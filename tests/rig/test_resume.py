@@ -96,6 +96,19 @@ def test_the_recorder_may_die_and_the_ring_fills_the_trial(rig, record, short, t
     for _ in range(700):
         machine.controller.cycle()
     again = SimulatedRig(rig, machine.controller)
+    held, polled, poll, beat = machine.controller.seq, [], again.poll, again.beat
+
+    def noted():
+        if (block := poll()) is not None:
+            polled.append(int(block.seq[-1]))
+        return block
+
+    def refused_before_the_watch():
+        """The finger may still be armed: a heartbeat before these samples are read would keep it so."""
+        assert polled[-1] >= held - 1
+        beat()
+
+    again.poll, again.beat = noted, refused_before_the_watch
     outcome = record(again, resume=True)
     assert outcome.cause == ""
     assert not path.exists()

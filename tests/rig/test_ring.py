@@ -262,6 +262,27 @@ def test_a_stop_waits_for_no_other_command(rig):
         assert machine.status().trip is Trip.OPERATOR
 
 
+def test_a_stop_is_written_again_where_a_command_that_it_overtook_arrives_late(rig):
+    machine = small(rig)
+    with machine:
+        machine.arm()
+        machine._id += 1  # A command that another thread has under way.
+        late = np.zeros((), contract.COMMAND)
+        late["id"], late["kind"], late["rate"], late["target"] = machine._id, contract.Kind.TENSION, 5.0, 5.0
+        write, written = machine._write, []
+
+        def overtaken(symbol, data, mend=True):
+            write(symbol, data, mend)
+            if not written:
+                write(symbol, late.tobytes(), mend)
+            written.append(symbol)
+
+        machine._write = overtaken
+        machine.stop(Trip.OPERATOR)
+        status = machine.status()
+        assert (status.state, status.trip) == (State.TRIPPED, Trip.OPERATOR)
+
+
 def kind_of(machine) -> int:
     record = machine._read("stCommand", 0, contract.COMMAND.itemsize)
     return int(np.frombuffer(record, contract.COMMAND)["kind"][0])
