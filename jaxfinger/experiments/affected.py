@@ -26,7 +26,9 @@ def affected_channels(kind: type[CatalogueEffect], finger: Finger) -> dict[str, 
     trials, as by friction in proportion to tension where all tendons are slack.
     """
     names = finger.joint_names, finger.tendon_names
-    return _affected_channels(kind, *names, finger.prismatic, finger.active, finger.crosses)
+    shown = _reached(kind, *names, finger.prismatic, finger.active, finger.crosses)
+    found = {e.name: tuple(c for c in e.channels if e.predicted_as(c) in shown) for e in EXPERIMENTS.values()}
+    return {e: channels for e, channels in found.items() if channels}
 
 
 def refuse_broken(kind: type[CatalogueEffect], finger: Finger) -> None:
@@ -78,15 +80,16 @@ class _Nominal(NamedTuple):
 
 
 @cache
-def _affected_channels(kind, *description) -> dict[str, tuple[str, ...]]:
+def _reached(kind, *description) -> frozenset[tuple[str, bool]]:
+    """Predictions (`Experiment.predicted_as`) that an effect can change."""
     finger = _Nominal.of(*description, held=False).finger
     sites = kind.sites(finger)
     if not sites:
-        return {}
+        return frozenset()
     effect = kind.at(finger, sites[0])
     amplitudes = {k: getattr(effect, k) for k in kind.amplitudes()}
 
-    def depends(held: bool, channel: str) -> bool:
+    def depends(channel: str, held: bool) -> bool:
         _, model, x, terms, contact = _Nominal.of(*description, held=held)
         y0 = {
             "joint_torque": x.q,
@@ -98,15 +101,13 @@ def _affected_channels(kind, *description) -> dict[str, tuple[str, ...]]:
         def of(amplitudes):
             return change(channel, replace(effect, **amplitudes), model, x, y0, terms, of_force)
 
-        return any(_reached(jax.make_jaxpr(of)(amplitudes).jaxpr))
+        return any(_dependent(jax.make_jaxpr(of)(amplitudes).jaxpr))
 
-    kinds = {(e.held, c) for e in EXPERIMENTS.values() for c in e.channels}
-    shown = {key for key in kinds if depends(*key)}
-    found = {e.name: tuple(c for c in e.channels if (e.held, c) in shown) for e in EXPERIMENTS.values()}
-    return {e: channels for e, channels in found.items() if channels}
+    kinds = {e.predicted_as(c) for e in EXPERIMENTS.values() for c in e.channels}
+    return frozenset(key for key in kinds if depends(*key))
 
 
-def _reached(jaxpr) -> list[bool]:
+def _dependent(jaxpr) -> list[bool]:
     """Whether each result depends on the arguments; an operation's outputs depend on all of its inputs."""
     dependent = set(jaxpr.invars)
 

@@ -51,6 +51,13 @@ class Experiment:
         """Whether most valid samples are holds."""
         return self.kind in ("stepped", "held")
 
+    def predicted_as(self, channel: str) -> tuple[str, bool]:
+        """What predicts a channel: its name, and whether equation (1) is solved for joints that a fixture holds.
+
+        Excursions are predicted alike whether joints are held or not.
+        """
+        return channel, self.held and channel != "tendon_excursion"
+
     def cutoff_at(self, step: float, sharp: bool = False) -> float:
         """Cut-off, Hz, for a trial with a sample every `step` s: at most a fifth of the sampling rate."""
         return min(self.cutoff * (self.sharp_ratio if sharp else 1.0), 0.2 / step)

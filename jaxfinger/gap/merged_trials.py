@@ -33,15 +33,11 @@ class MergedTrials:
 
 
 def merged_trials(stacks: dict[str, Stack], nominal: Model) -> list[MergedTrials]:
-    """One group for each channel of the stacks; experiments with held joints have a group of their own.
-
-    Excursions are predicted alike whether joints are held or not, so they form one group.
-    """
+    """One group for each way in which a channel of the stacks is predicted (`Experiment.predicted_as`)."""
     kinds: dict[tuple, list[str]] = {}
     for e, stack in stacks.items():
         for c in stack.experiment.channels:
-            held = stack.experiment.held and c != "tendon_excursion"
-            kinds.setdefault((c, held), []).append(e)
+            kinds.setdefault(stack.experiment.predicted_as(c), []).append(e)
     return [
         _merged_trials_of(c, held, {e: stacks[e] for e in experiments}, nominal)
         for (c, held), experiments in kinds.items()
