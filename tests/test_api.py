@@ -25,7 +25,12 @@ def axis(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("name", jf.__all__)
+SLOW = {"diagnose", "fit_many", "sensitivity"}  # their examples compile many programs
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.long) if n in SLOW else n for n in jf.__all__], ids=str
+)
 def test_every_name_of_the_package_has_an_example_that_runs(name, axis, monkeypatch):
     monkeypatch.chdir(axis)
     thing = identify if name == "identify" else getattr(jf, name)  # the name is a callable package

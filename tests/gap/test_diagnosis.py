@@ -110,6 +110,7 @@ def test_a_fit_with_the_effect_that_is_known_to_be_there_is_that_of_the_diagnosi
         assert ours.values() == pytest.approx(theirs.values(), rel=1e-2)
 
 
+@pytest.mark.long
 def test_a_fit_with_an_effect_that_cannot_be_there_is_refused():
     session = session_with()
     with pytest.raises(UserError, match="joint_presliding is not at T1; it has MCP, PIP, DIP"):

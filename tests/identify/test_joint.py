@@ -116,6 +116,7 @@ def test_a_start_without_a_slope_is_left(session, staged, joint):
     assert same or found.stages[-1].status == "not converged"
 
 
+@pytest.mark.long
 def test_masses_stay_positive(session, staged):
     """From masses in CAD that are far too large and uncertain, trials reduce them, but not below zero."""
     finger = replace(session.finger, mass=session.finger.mass * 3, mass_std=session.finger.mass * 3)

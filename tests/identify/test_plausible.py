@@ -72,6 +72,7 @@ def test_a_stage_says_so():
     assert any("damping base is -2" in w and "would drive the joint" in w for w in fit.stages[-1].warnings)
 
 
+@pytest.mark.long
 def test_curves_of_what_is_not_seen_are_unknown_and_of_nothing_lost_as_unsure_as_their_law(staged):
     """This holds also at tensions at which the law gives no loss."""
     tendon = staged.model.finger.tendon_names[0]

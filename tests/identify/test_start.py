@@ -33,8 +33,13 @@ RECIPE = recipe_from(
 
 @pytest.mark.parametrize(
     ("a0", "a1"),
-    [(0.2 / 30, 0.2 / 30), (6.0, 0.2), (10.0, 0.2), (0.0, 0.9), (-4.0, 0.9)],
-    ids=["a thirtieth", "thirty times", "all of half the tensions", "nine tenths", "above 4 N alone"],
+    [
+        pytest.param(0.2 / 30, 0.2 / 30, id="a thirtieth"),
+        pytest.param(6.0, 0.2, id="thirty times", marks=pytest.mark.long),
+        pytest.param(10.0, 0.2, id="all of half the tensions", marks=pytest.mark.long),
+        pytest.param(0.0, 0.9, id="nine tenths", marks=pytest.mark.long),
+        pytest.param(-4.0, 0.9, id="above 4 N alone"),
+    ],
 )
 def test_what_is_lost_is_found(a0, a1):
     """Cases range about 0.2 + 0.2 f. The loss is compared, since a few tensions may not determine both a₀ and a₁."""

@@ -233,7 +233,7 @@ def until_the_machine_keeps_up(attempt):
             quiet.set()
 
 
-@pytest.mark.parametrize("terminal", ["Ctrl-S", "nobody reads"])
+@pytest.mark.parametrize("terminal", ["Ctrl-S", pytest.param("nobody reads", marks=pytest.mark.long)])
 def test_the_stop_key_at_a_terminal_that_takes_no_output(tmp_path, terminal):
     """On a real pseudo-terminal the stop key releases the finger as always, and the run ends."""
 
@@ -281,7 +281,7 @@ def fill(terminal: int) -> None:
         os.set_blocking(terminal, True)
 
 
-@pytest.mark.parametrize("end", [signal.SIGSTOP, signal.SIGKILL, signal.SIGHUP])
+@pytest.mark.parametrize("end", [signal.SIGSTOP, signal.SIGKILL, pytest.param(signal.SIGHUP, marks=pytest.mark.long)])
 def test_a_host_that_is_stopped_or_killed_holds_no_tension(tmp_path, end):
     """The host is stopped as by a debugger, killed, or loses its terminal. The finger is released all the same."""
 

@@ -12,8 +12,10 @@ from jaxfinger.sealed.protocols import draw_style, session_plans
 from jaxfinger.sealed.record import Motion, last_direction, needed_torque
 from jaxfinger.sealed.specimens import LAYOUTS, make_specimen
 
+LONG = [pytest.param(e, marks=pytest.mark.long) for e in ("tendon_friction_viscous", "payload")]
 
-@pytest.mark.parametrize("effect", [None, "tendon_friction_viscous", "passive_tendon", "payload"])
+
+@pytest.mark.parametrize("effect", [None, "passive_tendon", *LONG])
 def test_where_everything_slides_the_finger_needs_no_external_torque(effect, specimen, nominal, plans):
     departures = [] if effect is None else [draw(effect, specimen.finger, np.random.default_rng(0))]
     finger = Finger(specimen, departures)

@@ -71,8 +71,8 @@ def test_noise_is_independent_from_trial_to_trial(clean):
     "specimen",
     [
         {"kind": "paper", "passive_tendon": True},
-        {"kind": "polynomial"},
-        {"kind": "random", "seed": 7, "joints": 4, "layout": "abduction"},
+        pytest.param({"kind": "polynomial"}, marks=pytest.mark.long),
+        pytest.param({"kind": "random", "seed": 7, "joints": 4, "layout": "abduction"}, marks=pytest.mark.long),
         {"kind": "random", "seed": 8, "joints": 1, "tendons": "fewest"},
     ],
     ids=lambda s: f"{s['kind']}-{s.get('joints', 3)}",
