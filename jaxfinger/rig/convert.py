@@ -18,6 +18,7 @@ from jaxfinger.errors import UserError
 from jaxfinger.rig import wal
 from jaxfinger.rig.backend import Block
 from jaxfinger.rig.channels import SAFETY_KINDS, SI_UNITS, Filter, RigDescription
+from jaxfinger.rig.contract import Flag
 
 
 @dataclass
@@ -117,8 +118,8 @@ class Samples:
     """The samples of one trial, each once.
 
     `seq` (N,) numbers them, `time` (N,) is in s from the first, `x` (N, C) in SI. Those marked in `kept` (N,) make the
-    trial; the others came after a trip or are not finite in some channel. `clock_jumps` counts the samples at which the
-    device's clock did not increase.
+    trial; the others came after its end, are not finite in some channel, or are flagged by their terminal.
+    `clock_jumps` counts the samples at which the device's clock did not increase.
     """
 
     seq: np.ndarray
@@ -136,9 +137,11 @@ def _samples(logged: LoggedTrial, width: int, rate_hz: float) -> Samples:
     seq = np.concatenate([empty, *(b.seq.astype(np.int64) for b in blocks)])
     t = np.concatenate([empty, *(b.t_ns.astype(np.int64) for b in blocks)])
     x = np.concatenate([np.empty((0, width)), *(b.x for b in blocks)])
+    flags = np.concatenate([empty, *(b.flags.astype(np.int64) for b in blocks)])
     fresh = seq > np.maximum.accumulate(np.concatenate([[-1], seq[:-1]])) if len(seq) else np.empty(0, bool)
     keep = fresh & (seq >= int(logged.start["seq"]))
     seq, t, x = seq[keep], t[keep], x[keep]
+    sound = np.isfinite(x).all(1) & ((flags[keep] & int(Flag.BUS | Flag.ENCODER | Flag.ANALOG)) == 0)
     if not len(seq):
         return Samples(seq, seq * 1.0, x, keep[:0], [], 0)
     steps, jump = np.diff(t), np.diff(seq)
@@ -150,7 +153,7 @@ def _samples(logged: LoggedTrial, width: int, rate_hz: float) -> Samples:
     gaps = [(int(seq[i + 1]), int(jump[i] - 1)) for i in np.flatnonzero(jump > 1)]
     end = logged.end or {}
     last = int(end.get("seq", seq[-1] + 1))
-    return Samples(seq, time, x, (seq < last) & np.isfinite(x).all(1), gaps, int(wrong.sum()))
+    return Samples(seq, time, x, (seq < last) & sound, gaps, int(wrong.sum()))
 
 
 def _trial(logged: LoggedTrial, samples: Samples, head: dict[str, Any], finger: FingerDescription) -> Trial:
@@ -250,7 +253,7 @@ def _write_trial_attributes(attributes: h5py.AttributeManager, logged: LoggedTri
         attributes["clock_jumps"] = samples.clock_jumps
     last = int((logged.end or {}).get("seq", 2**62))
     if broken := int((~samples.kept & (samples.seq < last)).sum()):
-        attributes["dropped_samples"] = broken  # Not finite in some channel; /rig/dropped holds them.
+        attributes["dropped_samples"] = broken  # Not finite, or flagged; /rig/dropped holds them.
     if clocks := (logged.end or {}).get("clocks"):
         attributes["host_minus_device_s"], attributes["device_time_s"] = np.array(clocks) * 1e-9
     if not logged.complete:

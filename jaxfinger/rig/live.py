@@ -35,7 +35,7 @@ class LiveView(AbstractContextManager):
             self._live = Live(console=self._console, auto_refresh=False, redirect_stdout=False, redirect_stderr=False)
         self._trial = ""
         self._view: View | None = None
-        self._said: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._said: queue.SimpleQueue[tuple[str, threading.Event]] = queue.SimpleQueue()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name="jaxfinger-view", daemon=True)
         self.stalled = False
@@ -49,9 +49,11 @@ class LiveView(AbstractContextManager):
         self._thread.join(STALLED_S)
         self.stalled = self._thread.is_alive()
 
-    def say(self, text: str) -> None:
-        """Print a line above the view, without waiting for it."""
-        self._said.put(text)
+    def say(self, text: str) -> threading.Event:
+        """Print a line above the view, without waiting for it. The event is set once it is printed."""
+        printed = threading.Event()
+        self._said.put((text, printed))
+        return printed
 
     def __call__(self, view: View) -> None:
         """Show a View, without waiting for it."""
@@ -69,7 +71,9 @@ class LiveView(AbstractContextManager):
 
     def _print(self) -> None:
         while not self._said.empty():
-            self._console.print(self._said.get(), markup=False)
+            text, printed = self._said.get()
+            self._console.print(text, markup=False)
+            printed.set()
         view, self._view = self._view, None
         if view is not None and self._live is not None:
             self._live.update(self.draw(view), refresh=True)

@@ -6,11 +6,14 @@ import os
 import select
 import sys
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Protocol, runtime_checkable
 
 from jaxfinger.errors import UserError
+
+READ_S = 0.5  # s that a prompt must have been on the screen before Enter answers it: two presses in a row are one
 
 
 @runtime_checkable
@@ -45,7 +48,7 @@ class AtTerminal:
     no output. A terminal that is gone counts as a stop, since its stop key is gone with it.
     """
 
-    def __init__(self, say: Callable[[str], None] = print):
+    def __init__(self, say: Callable[[str], threading.Event | None] = print):
         self._say = say
         self._stop = threading.Event()
         self._enter = threading.Event()
@@ -55,13 +58,12 @@ class AtTerminal:
 
     def __enter__(self) -> AtTerminal:
         import termios
-        import tty
 
         if not sys.stdin.isatty():
             raise UserError("the operator's stop key needs a terminal; run in one, or use --yes on a simulated rig.")
         keys = self._keys = sys.stdin.fileno()
         self._settings = termios.tcgetattr(keys)
-        tty.setcbreak(keys, termios.TCSANOW)  # Other modes wait until the terminal has taken all output: maybe never.
+        _take_keys_at_once(keys)
         return self
 
     def __exit__(self, *_) -> None:
@@ -73,9 +75,12 @@ class AtTerminal:
 
     def _poll(self, wait: bool = False) -> None:
         """Read the keys that were pressed. Where another thread is reading them, `wait` for it or leave it to that."""
+        import termios
+
         if self._keys is None or not self._reading.acquire(blocking=wait):
             return
         try:
+            _take_keys_at_once(self._keys)
             while select.select([self._keys], [], [], 0)[0]:
                 pressed = os.read(self._keys, 64)
                 if not pressed:  # The terminal is gone.
@@ -83,7 +88,7 @@ class AtTerminal:
                     return
                 for key in pressed.decode(errors="replace"):
                     self.key(key)
-        except OSError:
+        except (OSError, termios.error):
             self._stop.set()
         finally:
             self._reading.release()
@@ -102,11 +107,25 @@ class AtTerminal:
         """
         self._poll(wait=True)
         self._enter.clear()
-        self._say(f"{text}\n  Enter when done; q, space or Escape stops the rig.")
-        while not self._enter.wait(0.05) and not self.stop_requested() and keep_waiting():
-            pass
+        printed, shown = self._say(f"{text}\n  Enter when done; q, space or Escape stops the rig."), None
+        while not self.stop_requested() and keep_waiting():
+            if shown is None and (printed is None or printed.is_set()):
+                shown = time.monotonic()
+            if self._enter.wait(0.05):
+                if shown is not None and time.monotonic() - shown >= READ_S:
+                    return
+                self._enter.clear()  # Nobody can have read the prompt yet.
 
     def stop_requested(self) -> bool:
         """Whether q, space or Escape was pressed, or the terminal is gone."""
         self._poll()
         return self._stop.is_set()
+
+
+def _take_keys_at_once(keys: int) -> None:
+    """Have keys arrive without Enter; after Ctrl-Z and fg the terminal is in the shell's mode, where they do not."""
+    import termios
+    import tty
+
+    if os.isatty(keys) and termios.tcgetattr(keys)[3] & termios.ICANON:
+        tty.setcbreak(keys, termios.TCSANOW)  # Other ways wait until the terminal has taken all output: maybe never.

@@ -17,6 +17,7 @@ from typing import Any
 from jaxfinger.errors import UserError
 from jaxfinger.rig import wal
 from jaxfinger.rig.backend import Block
+from jaxfinger.rig.contract import Trip
 
 SYNC_S = 1.0  # s between two fdatasync: a power cut costs at most as much of the recording
 # Samples that may wait for a slow disk before the run ends: 17 min at 1 kHz, 0.5 GB of memory with 60 channels.
@@ -101,6 +102,8 @@ class Recorder:
         self._log.close()
 
     def _write(self, tag: bytes, value: Any) -> None:
+        if tag == wal.END and value.get("complete") and self.failure is not None:  # Samples before it were not written.
+            value = {**value, "complete": False, "cause": self.failure, "trip": int(Trip.RECORDER)}
         try:
             if self.failure is None or tag != wal.DATA:
                 self._log.write(tag, wal.pack_block(value) if tag == wal.DATA else wal.pack_json(value))

@@ -164,6 +164,9 @@ def _rig(document: Document) -> RigDescription:
     backend = import_module(f"jaxfinger.rig.backends.{head.backend}")
     finger = finger_from(file.finger, place / "finger")
     channels = _channels(file.channel, finger, place)
+    axes = sum(c.kind == "fingertip_force" for c in channels)
+    if file.fingertip_sensor is not None and axes != 3:
+        (place / "fingertip_sensor" / "rotation").fail(f"needs forces along x, y and z; the rig has {axes} of them")
     limits = _limits(file.limits, finger, {c.kind for c in channels}, place / "limits")
     return RigDescription(
         name=head.name,

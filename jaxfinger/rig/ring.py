@@ -63,6 +63,7 @@ class RingRig(Rig):
         self._id = self._first_id = 0  # ids of the newest command, and before the first one
         self._found_id = 0  # id that the controller had acknowledged when it was connected
         self._sending = threading.Lock()  # Runner, reader and watch may command at the same time.
+        self._unheeded: Trip | None = None  # cause of a STOP that the controller has not acknowledged
         self._beat = 0
         self._program = ""
 
@@ -122,7 +123,7 @@ class RingRig(Rig):
         self.boot, self.next_seq, self._found_id = int(status["boot"]), int(status["head"]), int(status["acknowledged"])
         # At random, so that no other program has the same: the controller would take a STOP for a command that is done.
         self._id = self._first_id = secrets.randbits(32)
-        self.head_reading = None
+        self.head_reading = self._unheeded = None
         self._refuse_company()
 
     def _refuse_company(self) -> None:
@@ -266,10 +267,14 @@ class RingRig(Rig):
         return self._send(Kind.DISARM)
 
     def release(self) -> int:
+        if self._unheeded is not None:  # RELEASE would overwrite the STOP, and the controller would not latch.
+            return self._send(Kind.STOP, int(self._unheeded))
         return self._send(Kind.RELEASE)
 
     def stop(self, cause: Trip) -> None:
+        self._unheeded = cause  # It stays where no acknowledgement comes.
         self._send(Kind.STOP, int(cause))
+        self._unheeded = None
 
     def reset(self, operator: str) -> int:
         if not operator.strip():
@@ -302,6 +307,8 @@ class RingRig(Rig):
             CommandRefused: the controller refused it, or it gave way to a STOP.
             ConnectionLost: no acknowledgement came.
         """
+        if self._unheeded is not None and kind is not Kind.STOP:
+            raise CommandRefused(f"{kind.name} gave way to a stop.")
         self._id = number = (self._id + 1) % 2**32
         order = np.zeros((), contract.COMMAND)
         order["id"], order["kind"], order["index"] = number, kind, index

@@ -139,6 +139,8 @@ class Runner:
         """
         reader = self.reader
         trip, seq = (error.trip, error.seq) if isinstance(error, TrialEnded) else (Trip.HOST, None)
+        if seq is None:  # What is read from here on shows the release.
+            seq = reader.violation.since if reader.violation is not None else reader.latest_seq + 1
         if not (tripped(reader.latest) or isinstance(error, ControllerStopped)):
             reader.stop(Violation.of_host(trip, reader.latest_seq, str(error).rstrip(".")))
         self._let_pass(AFTER_TRIP_S, self._released)  # A busy host first has to read the samples before the stop.
@@ -147,8 +149,7 @@ class Runner:
         if reader.latest is not None and not self._released():
             cause = f"{cause}; {TENSION_NOT_SEEN_TO_FALL}"
         if reader.recording:
-            place = {} if seq is None else {"seq": seq}
-            reader.end({"complete": False, "cause": cause, "trip": int(trip), **place})
+            reader.end({"complete": False, "cause": cause, "trip": int(trip), "seq": seq})
         return cause
 
     def _released(self) -> bool:
@@ -179,6 +180,7 @@ class Runner:
         if status.state is not State.IDLE:
             self._let_pass(AFTER_TRIP_S, since=rig.status().head)
         if status.state is State.TRIPPED:
+            self._check(None)  # A latch is not cleared for an operator who has pressed the stop key since.
             rig.reset(name or "operator")
         if not rig.prepare(Setup("", fixed=dict.fromkeys(rig.description.finger.joint_names, 0.0))):
             self._ask("Hands off: the drives are about to be switched on.")
@@ -193,7 +195,11 @@ class Runner:
             what = bad.sentence if bad is not None else "too few samples came"
             raise UserError(f"nothing was armed: {what}.")
         self.watch.guard()
-        rig.arm()
+        try:
+            rig.arm()
+        except CommandRefused:  # If the rig has just been stopped, the stop is the cause.
+            self._check(None)
+            raise
 
     def release(self) -> str:
         """Release the finger after the last trial. Return what went wrong, or an empty string."""
@@ -368,6 +374,8 @@ class Runner:
         self.rig.report_alive()
         if self.rig.synchronous:
             self.watch.check()
+        elif (asked := self.watch.stop_request()) is not None:  # The watch may be PERIOD_S behind the key.
+            reader.stop(asked)
         if reader.violation is not None:
             raise TrialEnded(reader.violation.sentence, reader.violation.trip, reader.violation.since)
         if tripped(block):

@@ -207,12 +207,14 @@ class Supervisor:
     def _frozen(self, block: Block, seq: np.ndarray) -> list[Violation]:
         """FROZEN where a channel has repeated one value for its `frozen` time."""
         last = self._last if self._last is not None else np.full(block.x.shape[1], np.nan)
-        late = self._repeats(block.x == np.concatenate([last[None], block.x[:-1]])) >= self._patience
+        runs = self._repeats(block.x == np.concatenate([last[None], block.x[:-1]]))
+        late = runs >= self._patience
         found = []
         for channel in np.flatnonzero(late.any(0)):
             row = int(np.argmax(late[:, channel]))
             value = float(block.x[row, channel])
-            found.append(Violation(Trip.FROZEN, self._name(channel), int(seq[row]), value))
+            since = int(seq[row]) - int(runs[row, channel]) + 1
+            found.append(Violation(Trip.FROZEN, self._name(channel), int(seq[row]), value, max(since, 0)))
         return found
 
     def _rates(self, block: Block, seq: np.ndarray) -> list[Violation]:
@@ -269,6 +271,7 @@ class Supervisor:
         """Take note of a command, to check that the joint's encoder follows a move of the external motor."""
         if isinstance(command, JointMove):
             column = self.rig.index("joint_position", command.joint)
+            self._move = None  # An earlier move is over, and this one may come near its start again.
             if column is not None and abs(command.target - self._read[column]) > UnfollowedMove.DISTANCE:
                 start, rate = float(self._read[column]), self.rig.rate_hz
                 self._move = UnfollowedMove(column, start, command.speed, command.acceleration, rate)

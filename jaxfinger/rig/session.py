@@ -10,20 +10,21 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 
 from jaxfinger.data.toml import parse_toml
 from jaxfinger.errors import UserError
 from jaxfinger.rig import convert, wal
 from jaxfinger.rig.backend import Rig, Setup, TensionRamp
 from jaxfinger.rig.channels import MIN_DYNAMIC_BANDWIDTH, Filter, RigDescription
-from jaxfinger.rig.contract import State, Trip
+from jaxfinger.rig.contract import Trip
 from jaxfinger.rig.operator import Nobody, Operator
 from jaxfinger.rig.plan import Plan
 from jaxfinger.rig.protocols import DYNAMIC, Protocol, Reached, Settled, Tare
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.recover import read_log
-from jaxfinger.rig.runner import Runner, View
+from jaxfinger.rig.runner import DRIVES_ON, Runner, View
 from jaxfinger.rig.safety import Supervisor
 from jaxfinger.rig.signals import Interrupts
 
@@ -162,6 +163,7 @@ def _meaning(head: dict[str, Any]) -> dict[str, str]:
     channels = [[c[k] for k in ("name", "kind", "of", "slot", "unit", "scale", "offset")] for c in head["channels"]]
     parts = {
         "specimen": head["specimen"],
+        "rig or backend": head["source"],
         "finger": head["finger"],
         "rate": head["rate_hz"],
         "list of channels": channels,
@@ -181,13 +183,16 @@ def _close_killed_trial(log: convert.Log, rig: Rig, recorder: Recorder) -> None:
     end = {"complete": False, "cause": "the recorder was killed", "trip": int(Trip.HOST)}
     last = log.last_seq
     if last is not None and rig.fingerprint() == log.header["fingerprint"]:
-        status = rig.status()
-        until = status.trip_seq if status.state is State.TRIPPED else status.head
+        head, end["seq"] = rig.status().head, last + 1
         rig.rewind(last + 1)
-        while last < until - 1 and (block := rig.poll()) is not None:
+        # Only what follows the log without a gap, while the drives stay on: the ring may hold another recording.
+        while last < head - 1 and (block := rig.poll()) is not None and int(block.seq[0]) == last + 1:
+            on, last = np.isin(block.state, DRIVES_ON), int(block.seq[-1])
             recorder.block(block)
-            last = int(block.seq[-1])
-        end["seq"] = max(until, log.last_seq + 1) if log.last_seq is not None else until
+            end["seq"] = last + 1 if on.all() else int(block.seq[np.argmin(on)])
+            if not on.all():
+                break
+        rig.rewind(rig.status().head)
     else:
         end["seq"] = 0 if last is None else last + 1
     recorder.put(wal.END, end)

@@ -96,14 +96,14 @@ class Watch:
         passed, self._checked = min(now - self._checked, MAX_COUNTED_S), now
         if self.reader.violation is not None or self.reader.error is not None:
             return  # The rig is being stopped, or nothing reads it: no heartbeat.
-        if (cause := self._stop_request() or self._silence(passed)) is not None:
+        if (cause := self.stop_request() or self._silence(passed)) is not None:
             self.reader.stop(cause)
         elif not self.rig.simulated_time and now - self._beaten >= BEAT_S:
             self._beaten = now
             with suppress(UserError):  # A lost connection is the reader's to report.
                 self.rig.beat()
 
-    def _stop_request(self) -> Violation | None:
+    def stop_request(self) -> Violation | None:
         """Violation OPERATOR once the stop key was pressed or a signal asked the run to end."""
         if self.interrupts.requested:
             return Violation.of_host(Trip.OPERATOR, self.reader.latest_seq, INTERRUPTED)

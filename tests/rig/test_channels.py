@@ -117,6 +117,10 @@ def test_the_force_sensor_is_turned_into_the_base_frame():
     raw[0, rig.channels[rig.index("fingertip_force", "x")].slot] = 5.0
     force = rig.calibrate(raw)[0, [rig.index("fingertip_force", a) for a in "xyz"]]
     np.testing.assert_allclose(force, [0.0, 5.0, 0.0])
+    first, *others = GOOD.split("[[channel]]")
+    only_z = [c for c in others if 'of = "x"' not in c and 'of = "y"' not in c]
+    with pytest.raises(UserError, match="needs forces along x, y and z; the rig has 1 of them"):
+        parse_rig(quarter + "[[channel]]".join([first, *only_z]))
     for wrong in ("-2.0", "1.0"):  # The second is a mirror: the sensor would be left-handed.
         with pytest.raises(UserError, match="rotation matrix"):
             parse_rig(quarter.replace("-1.0", wrong) + GOOD)

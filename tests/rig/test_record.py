@@ -2,6 +2,8 @@
 
 import io
 import os
+import pty
+import termios
 import threading
 from pathlib import Path
 
@@ -12,7 +14,7 @@ from rich.console import Console
 from jaxfinger.cli.record import record, recover
 from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
-from jaxfinger.rig import Supervisor, open_rig, parse_plan, parse_rig, read_plan, read_rig, run
+from jaxfinger.rig import Supervisor, open_rig, operator, parse_plan, parse_rig, read_plan, read_rig, run
 from jaxfinger.rig.backend import CommandRefused, EndOfReplay, Setup, TensionRamp
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import Trip
@@ -107,7 +109,8 @@ def test_outside_a_terminal_it_is_a_line_a_trial(rig, quiet_block):
 
 
 @pytest.mark.parametrize("key", ["q", "Q", " ", "\x1b"])
-def test_keys_at_the_terminal(key):
+def test_keys_at_the_terminal(key, monkeypatch):
+    monkeypatch.setattr(operator, "READ_S", 0.0)
     said = []
     person = AtTerminal(said.append)
     answered = threading.Thread(target=person.ask, args=("Fix the joints.", lambda: True))
@@ -124,6 +127,38 @@ def test_keys_at_the_terminal(key):
     assert person.stop_requested()
     person.ask("again", lambda: True)  # Returns at once: the rig is being stopped.
     AtTerminal(said.append).ask("dead", lambda: False)
+
+
+@pytest.mark.parametrize("shown", [False, True])
+def test_enter_answers_no_prompt_that_nobody_can_have_read(shown):
+    """The prompt waits for a terminal that takes no output, or has been on the screen for an instant."""
+    printed, looks = threading.Event(), iter([True, True, False])
+    if shown:
+        printed.set()
+    person = AtTerminal(lambda text: printed)
+
+    def press() -> bool:
+        person.key("\n")
+        return next(looks)
+
+    person.ask("Hands off: the drives are about to be switched on.", press)
+    assert next(looks, None) is None  # It went on asking until the rig had to be stopped.
+
+
+def test_the_stop_key_works_after_the_program_was_suspended():
+    """The shell has put the terminal back to lines, where a key waits for Enter."""
+    ours, theirs = pty.openpty()
+    person = AtTerminal()
+    person._keys = theirs
+    assert not person.stop_requested()
+    lines = termios.tcgetattr(theirs)
+    lines[3] |= termios.ICANON
+    termios.tcsetattr(theirs, termios.TCSANOW, lines)
+    assert not person.stop_requested()
+    os.write(ours, b"q")
+    assert person.stop_requested()
+    os.close(ours)
+    os.close(theirs)
 
 
 def test_a_terminal_that_is_gone_is_a_stop():

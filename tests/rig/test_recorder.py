@@ -1,5 +1,6 @@
 """The recorder: a slow disk neither holds up the reader nor loses samples."""
 
+import errno
 import threading
 
 import numpy as np
@@ -52,6 +53,24 @@ def test_a_disk_too_slow_for_too_long_is_a_reason_to_stop(tmp_path, monkeypatch)
     Slow.go.set()
     log.close()
     assert [f.tag for f in wal.read_log(log.path)][-1] == wal.END
+
+
+def test_a_trial_whose_last_samples_the_disk_refused_is_not_complete(tmp_path):
+    """A small frame may still fit where a block of samples does not."""
+
+    class Full(wal.LogWriter):
+        def write(self, tag, payload):
+            if tag == wal.DATA:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            super().write(tag, payload)
+
+    log = Recorder(tmp_path / "a.wal", {}, opener=Full.create)
+    log.block(block(0))
+    log.put(wal.END, {"complete": True})
+    log.close()
+    end = next(f.json for f in wal.read_log(log.path) if f.tag == wal.END)
+    assert not end["complete"]
+    assert "No space left" in end["cause"]
 
 
 def test_a_folder_that_is_missing_is_a_sentence(tmp_path):

@@ -96,7 +96,7 @@ def test_the_recorder_may_die_and_the_ring_fills_the_trial(rig, record, short, t
     for _ in range(700):
         machine.controller.cycle()
     again = SimulatedRig(rig, machine.controller)
-    held, polled, poll, beat = machine.controller.seq, [], again.poll, again.beat
+    tripped, polled, poll, beat = machine.controller.trip_seq, [], again.poll, again.beat
 
     def noted():
         if (block := poll()) is not None:
@@ -105,7 +105,7 @@ def test_the_recorder_may_die_and_the_ring_fills_the_trial(rig, record, short, t
 
     def refused_before_the_watch():
         """The finger may still be armed: a heartbeat before these samples are read would keep it so."""
-        assert polled[-1] >= held - 1
+        assert polled[-1] >= tripped
         beat()
 
     again.poll, again.beat = noted, refused_before_the_watch
@@ -116,6 +116,33 @@ def test_the_recorder_may_die_and_the_ring_fills_the_trial(rig, record, short, t
     cut = session["02-ID.4-T3-MCP"]
     assert not cut.complete
     np.testing.assert_allclose(np.diff(cut.time), 1e-3, atol=1e-9)  # no gap where the recorder died
+
+
+def test_a_killed_trial_gets_no_sample_of_another_recording(rig, record, short, tmp_path):
+    """Somebody records on the same controller before the first session is resumed."""
+    machine = SimulatedRig(rig)
+
+    class Died(BaseException):
+        pass
+
+    def die(m):
+        raise Died
+
+    with pytest.raises(Died):
+        record(machine, die, at=("02-ID.4-T3-MCP", "waiting"))
+    other = parse_plan(short.text.replace('"T3"', '"T1"').replace("[3.0, 6.0]", "[6.0, 9.0]"), rig)
+    record(SimulatedRig(rig, machine.controller), plan=other, output=tmp_path / "other.h5")
+    outcome = record(SimulatedRig(rig, machine.controller), resume=True)
+    cut = read_session(outcome.session)["02-ID.4-T3-MCP"]
+    assert not cut.complete
+    assert cut.tendon_force[:, 0].max() < 4.0  # T1 has its pretension of 2 N at most, and in the other session 9 N.
+
+
+def test_a_simulated_session_is_not_resumed_on_a_rig(rig, record, short):
+    record(SimulatedRig(rig), lambda m: m.inject("nan", slot(m, "external_torque")))
+    other = parse_rig(rig.text.replace('name = "example"', 'name = "bench"'))
+    with pytest.raises(UserError, match="its rig or backend differs"):
+        record(SimulatedRig(other), resume=True)
 
 
 def test_a_finger_found_armed_is_released_before_it_is_armed_again(rig, record):

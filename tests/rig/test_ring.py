@@ -283,6 +283,24 @@ def test_a_stop_is_written_again_where_a_command_that_it_overtook_arrives_late(r
         assert (status.state, status.trip) == (State.TRIPPED, Trip.OPERATOR)
 
 
+def test_a_stop_that_is_not_acknowledged_stays_until_the_controller_obeys_it(rig):
+    """Its task stands still, as at a breakpoint. A release that overwrote the stop would leave nothing latched."""
+    machine = small(rig)
+    with machine:
+        machine.arm()
+        machine.inject("stall")
+        machine._pause(0.01)
+        machine.answer_s = 0.05
+        for send in (lambda: machine.stop(Trip.OPERATOR), machine.release):
+            with pytest.raises(UserError, match="did not acknowledge STOP"):
+                send()
+        with pytest.raises(CommandRefused, match="TENSION gave way to a stop"):
+            machine.command(TensionRamp({"T1": 5.0}, 5.0))
+        machine.controller.faults.clear()
+        machine._pause(0.01)
+        assert (machine.status().state, machine.status().trip) == (State.TRIPPED, Trip.OPERATOR)
+
+
 def kind_of(machine) -> int:
     record = machine._read("stCommand", 0, contract.COMMAND.itemsize)
     return int(np.frombuffer(record, contract.COMMAND)["kind"][0])

@@ -14,7 +14,7 @@ from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
 from jaxfinger.rig import parse_plan, parse_rig, recorder, recover, runner, wal
 from jaxfinger.rig.backends.simulated import SimulatedRig
-from jaxfinger.rig.contract import Kind, State, Trip
+from jaxfinger.rig.contract import Flag, Kind, State, Trip
 from jaxfinger.rig.operator import Nobody
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
@@ -24,7 +24,7 @@ from jaxfinger.rig.session import log_path, run
 from jaxfinger.rig.signals import ENDING, Interrupts
 from jaxfinger.rig.simulated.controller import Controller
 from jaxfinger.rig.simulated.examples import rig_toml
-from tests.rig.conftest import serious, slot
+from tests.rig.conftest import SHORT, serious, slot
 
 
 def wait_until_written(log, trial):
@@ -203,6 +203,64 @@ def test_a_run_that_nothing_reads_ends_at_once(rig, tmp_path):
         assert runner.abort_interrupted() == "the run was interrupted"
         assert time.monotonic() - begun < 10.0  # _host_limit allows 70 s for each of two waits
         recorder.close()
+
+
+def test_a_stop_key_at_a_prompt_is_no_answer_to_it(rig, tmp_path):
+    """The watch may be 20 ms behind the key: the runner looks for itself before it sends the next command."""
+
+    class Stopping(Nobody):
+        def stop_requested(self) -> bool:
+            return True
+
+    machine = SimulatedRig(rig)
+    machine.synchronous = False
+    with machine:
+        machine.stop(Trip.TENSION)
+        recorder = Recorder(tmp_path / "session.h5.wal", {})
+        runner = Runner(machine, Reader(machine, recorder, Supervisor(rig)), Stopping(), Interrupts())
+        with pytest.raises(UserError, match="stop key"):
+            runner.arm("operator")
+        assert machine.controller.state is State.TRIPPED  # The latch was not cleared.
+        recorder.close()
+
+
+def test_a_trial_that_waits_too_long_keeps_no_sample_of_its_release(rig, record):
+    plan = parse_plan(
+        SHORT.split('[[trial]]\nexperiment = "ID.4"')[0].replace("passes = 1", "passes = 50\ntimeout = 2.0"), rig
+    )
+    outcome = record(SimulatedRig(rig), plan=plan)
+    assert "took longer" in outcome.cause
+    (trial,) = read_session(outcome.session)
+    assert trial.tendon_force[-1].max() > 1.0  # the pretension of 2 N, in place of the released 0 N
+
+
+def test_samples_that_their_terminal_flags_are_left_out(rig, record):
+    """One in ten trips nothing, and is no measurement."""
+    machine = SimulatedRig(rig)
+    controller, measure = machine.controller, machine.controller._measure
+    at = controller.slots.tension[2]
+
+    def flagged(fault):
+        flags = measure(fault)
+        if controller.seq % 10 == 0 and controller.setpoint[2] > 2.5:
+            controller._values[at] = 12.0
+            flags |= Flag.ANALOG
+        return flags
+
+    controller._measure = flagged
+    outcome = record(machine)
+    assert outcome.cause == ""
+    assert read_session(outcome.session)["02-ID.4-T3-MCP"].tendon_force[:, 2].max() < 7.0
+
+
+def test_a_short_move_is_not_judged_by_an_earlier_one(rig, record):
+    """Steps of 5° come near the start of the long move that brought the joint there."""
+    plan = parse_plan(
+        '[plan]\nname = "steps"\noperator = "tester"\n'
+        '[[trial]]\nexperiment = "ID.3-static"\njoint = "MCP"\nstep_deg = 5.0\nspeed_deg_s = 30.0\n',
+        rig,
+    )
+    assert record(SimulatedRig(rig), plan=plan).cause == ""
 
 
 def test_a_full_disk_ends_the_trial_and_keeps_what_was_written(rig, record, tmp_path):

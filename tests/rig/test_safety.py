@@ -78,6 +78,7 @@ def test_a_frozen_sensor_trips_after_its_time(rig, quiet_block):
     found = first(rig, spoil(quiet_block(1500), freeze))
     assert found is not None
     assert (found.trip, found.seq) == (Trip.FROZEN, 1300)
+    assert found.since == 301  # The values that repeat are no measurement.
 
 
 def test_a_frozen_encoder_is_found_by_the_tendons_that_run(rig, quiet_block):
