@@ -60,7 +60,7 @@ def diagnose(
     """
     folders = _folders(sessions, output)
     for folder in folders.values():
-        refuse(folder, overwrite)
+        refuse(folder, overwrite, *sessions, against, predictions)
     if predictions is not None:
         _refuse_predictions(predictions, sessions)
     tolerated = _tolerance(tolerance or [])
@@ -142,9 +142,9 @@ def _tolerance(texts: list[str]) -> dict[str, float]:
     return out
 
 
-def refuse(output: Path, overwrite: bool) -> None:
+def refuse(output: Path, overwrite: bool, *reads: Path | None) -> None:
     """Refuse a folder with an earlier diagnosis that may not be overwritten, before anything is read."""
     if output.exists() and not output.is_dir():
         raise UserError(f"{output}: is a file; name a folder")
     for name in FILES if output.is_dir() else ():
-        refuse_output(output / name, overwrite)
+        refuse_output(output / name, overwrite, *reads)

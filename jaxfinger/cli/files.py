@@ -142,7 +142,7 @@ def simulate(
     overwrite
         Replace a file that is already there.
     """
-    refuse_output(output, overwrite)
+    refuse_output(output, overwrite, source, protocol, effects)
     if protocol is not None and source.suffix != ".json":
         raise UserError(f"{source}: a recipe brings its own trials; leave out --protocol, or give a fit")
     from jaxfinger.data import write_session
@@ -189,7 +189,7 @@ def import_(
     """
     if not sources:
         raise UserError(f"{mapping}: no recording was given; name at least one before --mapping")
-    refuse_output(output, overwrite)
+    refuse_output(output, overwrite, mapping, *sources)
     from jaxfinger.data.findings import Report
     from jaxfinger.data.importers import import_file
 

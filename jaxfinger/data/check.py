@@ -20,12 +20,16 @@ from jaxfinger.data.opening import plain_reason, why_closed
 from jaxfinger.data.parse import parse_file
 from jaxfinger.data.schema import MEASURED
 from jaxfinger.data.session import EXPERIMENT_NAMES, Session, Trial
-from jaxfinger.data.sizes import sizes_of
+from jaxfinger.data.sizes import Sizes, sizes_of
+from jaxfinger.data.units import conversion
 from jaxfinger.errors import listed
 
 # Share of a column's samples from which spikes are a warning instead of a note. Up to this share the mask finds them
 # with certainty; motors driven by a coarse encoder reach 0.09.
 _MANY_SPIKES = 0.1
+# Motions that are slower or quicker than the protocol's by these factors are doubtful. A crane may need 30 times as
+# long, a small servo a tenth; ms read as s differ by 1000, minutes read as s by 60.
+_MAX_PACE, _MAX_QUICKNESS = 64.0, 16.0
 _FIRST_SAMPLES = 100  # Most pairs of trials differ in them, so few need to be compared whole.
 
 
@@ -79,6 +83,7 @@ def check_session(session: Session, report: Report) -> None:
                 report.error(f"/trials/{trial.name}", message)
                 continue
             check_trial(trial, session.finger, sizes, report)
+    _check_pace(sizes, report)
     _check_order(session, report)
     _check_motions(session, report)
     _check_copies(session, report)
@@ -93,6 +98,16 @@ def open_file(path: str | os.PathLike, report: Report) -> h5py.File | None:
         report.error("/", reason)
         return None
     return h5py.File(path, "r")
+
+
+def _check_pace(sizes: Sizes, report: Report) -> None:
+    """Report motions so slow or so quick that their times are probably in another unit."""
+    if sizes.pace > _MAX_PACE:
+        said = f"joints move {sizes.pace:.0f} times more slowly than in the protocol; {conversion('ms')}"
+        report.warning("/trials", f"{said} if that is what times are in")
+    if (quick := min(sizes.pace, sizes.slow_pace)) < 1.0 / _MAX_QUICKNESS:
+        said = f"joints move {1.0 / quick:.0f} times more quickly than in the protocol"
+        report.warning("/trials", f"{said}; check the units of times, which are to be in s, not in minutes or days")
 
 
 def _check_order(session: Session, report: Report) -> None:

@@ -25,6 +25,8 @@ COLD = 200.0  # K, −73 °C: no laboratory is colder, so lower values are in °
 # turn of a smooth motion the last step of the resolution is held up to five times as long as the one before it.
 _CLIPPED, _MIN_CLIPPED = 10, 10
 _TAUT = ("ID.2", "VD.1", "VD.3")  # experiments that keep all tendons taut
+_PULLED = ("VD.2", "VD.3")  # experiments in which several tendons pull at once
+_SLACK = ("ID.3-static", "ID.3-dynamic")  # experiments with slack tendons, whose tensions are not used
 _MIN_SAMPLES = 20  # Fewer samples show no typical step.
 _MOVES_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic")
 _STEPPED = ("ID.3-static", "ID.4", "VD.2")
@@ -172,6 +174,11 @@ def _channels(trial: Trial, finger: FingerDescription, report: Report) -> None:
             report.error(_place(trial, name), f"is NaN throughout{lost}", local=True)
         elif name == "joint_torque" and joint is not None and np.isnan(values[:, joint]).all():
             report.error(_place(trial, name), f"column {trial.joint} is NaN throughout{lost}", local=True)
+    if what in _PULLED and trial.tendon_force is not None:
+        for name, active, x in zip(finger.tendon_names, finger.active, trial.tendon_force.T, strict=True):
+            if active and np.isnan(x).all():
+                message = f"column {name} is not measured (NaN), and the tendon is taken for slack; write its tension"
+                report.warning(_place(trial, "tendon_force"), message)
     for k, joint in enumerate(finger.joint_names):
         if np.isnan(trial.q[:, k]).all():
             say = report.error if joint == trial.joint else report.warning
@@ -388,7 +395,7 @@ def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repo
             report.note(place, f"column {name} is measured though the tendon is passive; it is ignored")
             continue
         low = float(np.percentile(x, 5.0))
-        if low < -max(MAX_PUSH * sizes.tension, sizes.slack):
+        if low < -max(MAX_PUSH * sizes.tension, sizes.slack) and trial.experiment not in _SLACK:
             report.error(place, f"column {name} falls to {low:.3g} N, and a tendon cannot push; check sign and tare")
         elif low < -max(MAX_TARE_ERROR * sizes.tension, sizes.slack):
             report.warning(place, f"column {name} falls to {low:.3g} N, below zero by more than noise; check the tare")

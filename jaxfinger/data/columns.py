@@ -165,7 +165,9 @@ def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place,
     rows_of = _first_rows(first, source, where)
     place = where / "time"
     reading = Reading(trial.time) if isinstance(trial.time, str) else trial.time
-    values, _ = _column(source.variable(reading.from_, place), reading.from_, reading.column, place)
+    variable = source.variable(reading.from_, place)
+    values, _ = _column(variable, reading.from_, reading.column, place)
+    _compare_units(variable, reading, "s", report, place)
     time = _converted(values, reading, "s", source, place)
     rows = np.arange(len(time))
     if rows_of is not None and len(rows_of) == len(rows):
@@ -433,14 +435,15 @@ def _unwrapped(values: np.ndarray, period: float) -> np.ndarray:
     return out
 
 
-def _compare_units(variable: Variable, spec: Column, units: str, report: Report, where: Place) -> None:
+def _compare_units(variable: Variable, spec: Reading, units: str, report: Report, where: Place) -> None:
     """Warn where the recording states other units than the mapping."""
     stated, mapped = unit_name(variable.units), spec.units or units
-    if stated and mapped in TO_SI and stated != mapped and spec.scale == 1.0 and TO_SI[stated] != TO_SI[mapped]:
+    as_it_is = spec.scale in (1.0, -1.0)
+    if stated and mapped in TO_SI and stated != mapped and as_it_is and TO_SI[stated] != TO_SI[mapped]:
         report.warning(
             where.key, f"the recording states {variable.units}, and the mapping reads {mapped}; correct one of them"
         )
-    if is_foreign(variable.units) and mapped != "1" and spec.scale == 1.0:
+    if is_foreign(variable.units) and mapped != "1" and as_it_is:
         said = f"the recording states {variable.units}, and the mapping reads {mapped}"
         report.warning(where.key, f"{said}; write `scale`, the {mapped} in one {variable.units}")
 

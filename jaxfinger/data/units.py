@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import NamedTuple
 
 
@@ -31,6 +32,8 @@ TO_SI = {
     "N m": Unit("N m", 1.0),
     "N cm": Unit("N m", 1e-2),
     "N mm": Unit("N m", 1e-3),
+    "cN m": Unit("N m", 1e-2),
+    "dN m": Unit("N m", 1e-1),
     "mN m": Unit("N m", 1e-3),
     "s": Unit("s", 1.0),
     "ms": Unit("s", 1e-3),
@@ -44,43 +47,13 @@ _SPELT = {"°": "deg", "degrees": "deg", "µm": "um", "µs": "us", "rev": "turn"
 _SPELT |= {"°c": "degC", "degc": "degC", "celsius": "degC"}
 _SPELT |= {"degree": "deg", "radian": "rad", "radians": "rad", "turns": "turn", "revs": "turn", "revolutions": "turn"}
 _SPELT |= {"second": "s", "seconds": "s", "newton": "N", "newtons": "N"}
-# Units of other systems and of raw signals, without capitals: numbers in them are never in SI.
+# Units of other systems and of raw signals, without capitals and what joins factors: numbers in them are never in SI.
 _FOREIGN = {
-    "lbf",
-    "lb",
-    "lbs",
-    "ozf",
-    "oz",
-    "g",
-    "kg",
-    "in",
-    "inch",
-    "inches",
-    "ft",
-    "psi",
-    "bar",
-    "pa",
-    "kpa",
-    "v",
-    "mv",
-}
-_FOREIGN |= {
-    "mv/v",
-    "a",
-    "ma",
-    "%",
-    "rpm",
-    "count",
-    "counts",
-    "cnt",
-    "tick",
-    "ticks",
-    "pulses",
-    "bit",
-    "bits",
-    "lsb",
-    "raw",
-}
+    "lbf", "lb", "lbs", "ozf", "oz", "g", "kg", "in", "inch", "inches", "ft", "psi", "bar", "pa", "kpa", "min", "h",
+    "v", "mv", "mv/v", "a", "ma", "%", "rpm", "count", "counts", "cnt", "tick", "ticks", "pulses", "bit", "bits",
+    "lsb", "raw", "kgfcm", "kgcm", "gfcm", "gcm", "ozin", "ozfin", "inoz", "inozf", "lbin", "lbfin", "inlb", "inlbf",
+    "lbft", "lbfft", "ftlb", "ftlbf", "danm",
+}  # fmt: skip
 
 
 def conversion(unit: str) -> str:
@@ -95,12 +68,12 @@ def conversion(unit: str) -> str:
 
 def is_foreign(stated: str) -> bool:
     """Whether a file states a unit that no mapping converts, such as lbf, V or counts."""
-    return stated.strip().lower() in _FOREIGN and not unit_name(stated)
+    return re.sub(r"[\s·*.-]", "", stated).lower() in _FOREIGN and not unit_name(stated)
 
 
 def unit_name(stated: str) -> str:
     """Name in `TO_SI` of a unit as a file spells it; empty where it is not listed there."""
-    plain = stated.strip().replace("·", " ").replace("*", " ").replace("µ", "u")
+    plain = re.sub(r"[·*.-]", " ", stated.strip()).replace("µ", "u")
     plain = _SPELT.get(plain.lower(), plain)
     joined = {name.replace(" ", ""): name for name in TO_SI if name != "1"}
     return joined.get(plain.replace(" ", ""), "")

@@ -196,6 +196,31 @@ def test_temperatures_in_degrees_celsius_are_said(file):
     assert all("273.15" in m for m in said)
 
 
+def test_a_tension_that_is_not_measured_where_tendons_pull_is_said(file):
+    with h5py.File(file, "r+") as opened:
+        put(opened[VD3], "tendon_force", at((slice(None), 0), np.nan))
+    said = [f.message for f in check_file(file) if f.place == f"/{VD3}/tendon_force"]
+    assert any("column T1 is not measured (NaN), and the tendon is taken for slack" in m for m in said), said
+
+
+def test_a_tare_error_of_slack_tendons_is_no_wrong_sign(session, tmp_path):
+    """Their tensions are zero by protocol. A session of such trials alone has no other tension to compare them with."""
+    trials = {t.name: t for t in session if t.experiment.startswith("ID.3")}
+    off = {n: replace(t, tendon_force=np.full((len(t.time), session.finger.n), -0.03)) for n, t in trials.items()}
+    write_session(replace(session, trials=off), tmp_path / "s.h5")
+    found = [f for f in check_file(tmp_path / "s.h5") if "tendon_force" in f.place and "T1" in f.message]
+    assert found
+    assert all(f.severity == "warning" and "check the tare" in f.message for f in found), found
+
+
+@pytest.mark.parametrize(("factor", "words"), [(1.0, ""), (1000.0, "convert ms to s"), (1 / 60, "not in minutes")])
+def test_times_in_another_unit_are_said_by_the_motion(session, tmp_path, factor, words):
+    trials = {t.name: replace(t, time=factor * t.time) for t in session}
+    write_session(replace(session, trials=trials), tmp_path / "s.h5")
+    said = [f.message for f in check_file(tmp_path / "s.h5") if f.message.startswith("joints move")]
+    assert [words in m for m in said] == [True] * bool(words)
+
+
 @pytest.mark.parametrize("least", [True, False])
 def test_a_clipped_force_is_said(file, least):
     """Neither a quantised force nor one that is zero while its tendon is slack is clipped."""

@@ -186,7 +186,8 @@ def test_what_is_said_of_wrong_units_mends_the_mapping(mapping, tmp_path, channe
 
 
 @pytest.mark.parametrize(
-    ("stated", "scale", "warned"), [("lbf", 1.0, 1), ("lbf", 4.448, 0), ("N", 1.0, 0), ("x", 1.0, 0)]
+    ("stated", "scale", "warned"),
+    [("lbf", 1.0, 1), ("lbf", -1.0, 1), ("lbf", 4.448, 0), ("N", 1.0, 0), ("x", 1.0, 0), ("kgf·cm", 1.0, 1)],
 )
 def test_units_that_no_mapping_converts_need_a_scale(mapping, tmp_path, stated, scale, warned):
     rows = np.column_stack([TIME, 40 + 30 * np.sin(TIME), 2 + 0.01 * np.sin(TIME), 5 + 4 * np.sin(TIME)])
@@ -195,11 +196,27 @@ def test_units_that_no_mapping_converts_need_a_scale(mapping, tmp_path, stated, 
     text += f'tendon_force.T1 = {{ from = "force [{stated}]", scale = {scale}, units = "N" }}\n'
     mapping.write_text(text + 'tendon_excursion.T1 = { from = "pull", units = "mm" }\n')
     report = Report()
-    import_file([tmp_path / "log.csv"], mapping, tmp_path / "out.h5", report=report)
+    with suppress(UserError):  # A negative tension is an error too.
+        import_file([tmp_path / "log.csv"], mapping, tmp_path / "out.h5", report=report)
     said = [
-        f.message for f in report if "the recording states lbf, and the mapping reads N; write `scale`" in f.message
+        f.message
+        for f in report
+        if f"the recording states {stated}, and the mapping reads N; write `scale`" in f.message
     ]
     assert len(said) == warned
+
+
+def test_a_clock_in_another_unit_than_the_recording_states_is_said(mapping, tmp_path):
+    rows = np.column_stack([1e3 * TIME, 40 + 30 * np.sin(TIME), 2 + 0.01 * np.sin(TIME), 5 + 4 * np.sin(TIME)])
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header="t [ms],enc,force,pull", comments="")
+    text = MAPPING.replace(", column = 1", "").replace('"t"', '"t [ms]"')
+    for read, warned in ((text, True), (text.replace('"t [ms]"', '{ from = "t [ms]", units = "ms" }'), False)):
+        mapping.write_text(read)
+        report = Report()
+        with suppress(UserError):  # An error is in the report, too.
+            import_file([tmp_path / "log.csv"], mapping, tmp_path / "out.h5", overwrite=True, report=report)
+        said = [f.message for f in report if "the recording states ms, and the mapping reads s" in f.message]
+        assert bool(said) == warned
 
 
 def test_encoder_counts_are_not_taken_for_degrees(mapping, tmp_path):
