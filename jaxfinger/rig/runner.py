@@ -180,7 +180,7 @@ class Runner:
         if status.state is not State.IDLE:
             self._let_pass(AFTER_TRIP_S, since=rig.status().head)
         if status.state is State.TRIPPED:
-            self._check(None)  # A latch is not cleared for an operator who has pressed the stop key since.
+            self._heed_stop_key()  # A latch is not cleared for an operator who has pressed it since.
             rig.reset(name or "operator")
         if not rig.prepare(Setup("", fixed=dict.fromkeys(rig.description.finger.joint_names, 0.0))):
             self._ask("Hands off: the drives are about to be switched on.")
@@ -248,7 +248,17 @@ class Runner:
 
         armed = self.watch.guards
         self.operator.ask(text, keep_waiting)
+        self._heed_stop_key()
         self._check(self.reader.latest if armed else None)
+
+    def _heed_stop_key(self) -> None:
+        """Raise TrialEnded where the stop key was pressed or a signal came: the watch may be PERIOD_S behind it.
+
+        A person who has just been asked counts on that no command follows.
+        """
+        if (asked := self.watch.stop_request()) is not None:
+            self.reader.stop(asked)
+            self._check(None)
 
     def carry_out(self, protocol: Protocol, place: tuple[str, int, int]) -> None:
         """Carry out the steps of a protocol; `place` is the trial's name, its number and the count of trials.
@@ -374,8 +384,6 @@ class Runner:
         self.rig.report_alive()
         if self.rig.synchronous:
             self.watch.check()
-        elif (asked := self.watch.stop_request()) is not None:  # The watch may be PERIOD_S behind the key.
-            reader.stop(asked)
         if reader.violation is not None:
             raise TrialEnded(reader.violation.sentence, reader.violation.trip, reader.violation.since)
         if tripped(block):
