@@ -48,7 +48,7 @@ def identify(
     overwrite
         Replace files that are already there.
     """
-    refuse_output(output, overwrite, file)
+    refuse_output(output, overwrite, file, recipe)
     from jaxfinger.data.atomic import make_folder
     from jaxfinger.identify import identify as run
     from jaxfinger.identify import read_recipe
@@ -72,7 +72,7 @@ def _fit(
     stages: tuple[str, ...], file: Path, output: Path, start: Path | None, recipe: str | None, json: bool, overwrite
 ):
     """Run some stages of the identification on a session, write the fit and print it."""
-    refuse_output(output, overwrite, file, start)
+    refuse_output(output, overwrite, file, start, recipe)
     if start is not None and recipe is not None:
         raise UserError(f"{start}: a fit to start from brings its own recipe; leave out --recipe or --start")
     from jaxfinger.identify import identify as run
@@ -225,7 +225,7 @@ def fit_effects(
     overwrite
         Replace a file that is already there.
     """
-    refuse_output(output, overwrite, file, effects)
+    refuse_output(output, overwrite, file, effects, recipe)
     keys = [_key(text) for text in effect]
     from jaxfinger.effects import load
     from jaxfinger.gap import fit_with

@@ -167,14 +167,15 @@ def print_json(content: Any) -> None:
     print(json.dumps(jsonable(content), indent=1, ensure_ascii=False))
 
 
-def refuse_output(path: Path, overwrite: bool, *reads: Path | None) -> None:
+def refuse_output(path: Path, overwrite: bool, *reads: str | Path | None) -> None:
     """Refuse an output file that cannot be written or may not be replaced, before any work is done.
 
-    `reads` are the files that the command reads: none of them may be replaced, since it may be the only copy.
+    `reads` are the files that the command reads, or names of shipped ones: it replaces none of them, since each may be
+    the only copy.
     """
     from jaxfinger.data.atomic import refuse_existing
 
-    if any(read is not None and read.exists() and path.exists() and path.samefile(read) for read in reads):
+    if path.exists() and any(read is not None and Path(read).exists() and path.samefile(read) for read in reads):
         raise UserError(f"{path}: is read by this command and would be lost; choose another name for the output")
     refuse_existing(path, overwrite)
     if not path.parent.is_dir():

@@ -25,7 +25,7 @@ COLD = 200.0  # K, −73 °C: no laboratory is colder, so lower values are in °
 # turn of a smooth motion the last step of the resolution is held up to five times as long as the one before it.
 _CLIPPED, _MIN_CLIPPED = 10, 10
 _TAUT = ("ID.2", "VD.1", "VD.3")  # experiments that keep all tendons taut
-_PULLED = ("VD.2", "VD.3")  # experiments in which several tendons pull at once
+_SEVERAL_PULL = ("VD.2", "VD.3")  # experiments with the tension of several tendons at once
 _SLACK = ("ID.3-static", "ID.3-dynamic")  # experiments with slack tendons, whose tensions are not used
 _MIN_SAMPLES = 20  # Fewer samples show no typical step.
 _MOVES_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic")
@@ -174,7 +174,7 @@ def _channels(trial: Trial, finger: FingerDescription, report: Report) -> None:
             report.error(_place(trial, name), f"is NaN throughout{lost}", local=True)
         elif name == "joint_torque" and joint is not None and np.isnan(values[:, joint]).all():
             report.error(_place(trial, name), f"column {trial.joint} is NaN throughout{lost}", local=True)
-    if what in _PULLED and trial.tendon_force is not None:
+    if what in _SEVERAL_PULL and trial.tendon_force is not None:
         for name, active, x in zip(finger.tendon_names, finger.active, trial.tendon_force.T, strict=True):
             if active and np.isnan(x).all():
                 message = f"column {name} is not measured (NaN), and the tendon is taken for slack; write its tension"

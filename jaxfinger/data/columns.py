@@ -165,10 +165,7 @@ def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place,
     rows_of = _first_rows(first, source, where)
     place = where / "time"
     reading = Reading(trial.time) if isinstance(trial.time, str) else trial.time
-    variable = source.variable(reading.from_, place)
-    values, _ = _column(variable, reading.from_, reading.column, place)
-    _compare_units(variable, reading, "s", report, place)
-    time = _converted(values, reading, "s", source, place)
+    time = _times(reading, source, place, report)
     rows = np.arange(len(time))
     if rows_of is not None and len(rows_of) == len(rows):
         rows = rows[rows_of]
@@ -179,6 +176,14 @@ def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place,
     rows, units = rows[order], reading.units or "s"
     clock = Clock(time[rows], rows, len(time), source, reading.from_, units, trial.sort, begins_again)
     return _cut(clock, trial, where)
+
+
+def _times(reading: Reading, source: Source, where: Place, report: Report) -> Float[np.ndarray, " N"]:
+    """Times of a clock, s."""
+    variable = source.variable(reading.from_, where)
+    values, _ = _column(variable, reading.from_, reading.column, where)
+    _compare_units(variable, reading, "s", report, where)
+    return _converted(values, reading, "s", source, where)
 
 
 def _first_rows(first: Column, source: Source, where: Place) -> np.ndarray | None:
@@ -329,8 +334,7 @@ class ColumnReader:
         if spec.time is not None:
             place = where / "time"
             reading = Reading(spec.time, units=clock.units) if isinstance(spec.time, str) else spec.time
-            values, _ = _column(source.variable(reading.from_, place), reading.from_, reading.column, place)
-            return f"`{reading.from_}`", _converted(values, reading, "s", source, place)
+            return f"`{reading.from_}`", _times(reading, source, place, self.report)
         known_clocks = source.recording.variables
         main = known_clocks.get(clock.name)
         shared = source.recording is clock.source.recording

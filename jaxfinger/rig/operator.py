@@ -45,7 +45,8 @@ class AtTerminal:
     """A person at the terminal. Enter answers a prompt; q, space or Escape stops the rig at any time.
 
     The thread that asks for keys reads them itself and prints nothing, so keys also arrive from a terminal that takes
-    no output. A terminal that is gone counts as a stop, since its stop key is gone with it.
+    no output. A terminal that is gone counts as a stop, since its stop key is gone with it. `say` prints a prompt, or
+    returns an event that is set once the prompt is printed.
     """
 
     def __init__(self, say: Callable[[str], threading.Event | None] = print):

@@ -195,11 +195,7 @@ class Runner:
             what = bad.sentence if bad is not None else "too few samples came"
             raise UserError(f"nothing was armed: {what}.")
         self.watch.guard()
-        try:
-            rig.arm()
-        except CommandRefused:  # If the rig has just been stopped, the stop is the cause.
-            self._check(None)
-            raise
+        self._sent(rig.arm)
 
     def release(self) -> str:
         """Release the finger after the last trial. Return what went wrong, or an empty string."""
@@ -252,9 +248,9 @@ class Runner:
         self._check(self.reader.latest if armed else None)
 
     def _heed_stop_key(self) -> None:
-        """Raise TrialEnded where the stop key was pressed or a signal came: the watch may be PERIOD_S behind it.
+        """Stop the rig and raise TrialEnded where the stop key was pressed or a signal came.
 
-        A person who has just been asked counts on that no command follows.
+        The watch does so too, but up to PERIOD_S later: the command that follows a prompt would still be sent.
         """
         if (asked := self.watch.stop_request()) is not None:
             self.reader.stop(asked)
@@ -271,7 +267,7 @@ class Runner:
         for step in protocol:
             if isinstance(step, TensionRamp | JointMove | Hold):
                 self.reader.supervisor.commanded(step)
-                self._command(step)
+                self._id = self._sent(lambda command=step: self.rig.command(command))
             elif isinstance(step, Setup):
                 self._prepare(step)
             elif isinstance(step, Tare):
@@ -290,11 +286,11 @@ class Runner:
                 assert isinstance(step, Covered)
                 self._wait("moved by hand", Passes(self.rig.description, step), step.timeout)
 
-    def _command(self, step: TensionRamp | JointMove | Hold) -> None:
-        """Send a command. Raises ControllerStopped where it was refused because the rig has just stopped."""
+    def _sent(self, send: Callable[[], int]) -> int:
+        """Send a command and return its id. Raises TrialEnded where it was refused because the rig has just stopped."""
         try:
-            self._id = self.rig.command(step)
-        except CommandRefused:  # If the rig has just been stopped, the stop is the cause: raise that instead.
+            return send()
+        except CommandRefused:
             self._check(None)
             if (status := self.rig.status()).state is State.TRIPPED:
                 self._raise_stopped(status)

@@ -180,21 +180,16 @@ def _close_killed_trial(log: convert.Log, rig: Rig, recorder: Recorder) -> None:
     """
     if not log.trials or log.trials[-1].end is not None:
         return
-    end = {"complete": False, "cause": "the recorder was killed", "trip": int(Trip.HOST)}
-    last = log.last_seq
-    if last is not None and rig.fingerprint() == log.header["fingerprint"]:
-        head, end["seq"] = rig.status().head, last + 1
-        rig.rewind(last + 1)
+    seq = 0 if log.last_seq is None else log.last_seq + 1
+    if log.last_seq is not None and rig.fingerprint() == log.header["fingerprint"]:
+        head = rig.status().head
+        rig.rewind(seq)
         # Only what follows the log without a gap, while the drives stay on: the ring may hold another recording.
-        while last < head - 1 and (block := rig.poll()) is not None and int(block.seq[0]) == last + 1:
-            on, last = np.isin(block.state, DRIVES_ON), int(block.seq[-1])
+        while seq < head and (block := rig.poll()) is not None and int(block.seq[0]) == seq:
             recorder.block(block)
-            end["seq"] = last + 1 if on.all() else int(block.seq[np.argmin(on)])
-            if not on.all():
-                break
+            seq += int(np.argmin(np.append(np.isin(block.state, DRIVES_ON), False)))  # samples before the drives go off
         rig.rewind(rig.status().head)
-    else:
-        end["seq"] = 0 if last is None else last + 1
+    end = {"complete": False, "cause": "the recorder was killed", "trip": int(Trip.HOST), "seq": seq}
     recorder.put(wal.END, end)
 
 

@@ -212,6 +212,7 @@ def test_a_stage_at_a_time(folder, tmp_path, capsys):
         (("predict", "{f}/fit.json", "{f}/emps.h5", "-o", "{f}/emps.h5"), "is read by this command"),
         (("predict", "{f}/fit.json", "{f}/emps.h5", "-o", "{f}/emps.h5", "--overwrite"), "is read by this command"),
         (("identify", "{f}/emps.h5", "-o", "{f}/emps.h5", "--overwrite"), "is read by this command"),
+        (("identify", "{f}/emps.h5", "-o", "{f}/fit.json", "--recipe", "{f}/fit.json", "--overwrite"), "is read by"),
         (("import", "{f}/emps.h5", "--mapping", "m.toml", "-o", "{f}/emps.h5", "--overwrite"), "is read by this"),
         (("fit", "id3", "{f}/emps.h5", "-o", "{t}/x.json", "--start", "{f}/fit.json", "--recipe", "emps"), "--start"),
         (("simulate", "{f}/none.toml", "-o", "{t}/x.h5"), "none.toml"),

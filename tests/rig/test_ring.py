@@ -236,9 +236,7 @@ def test_a_stop_waits_for_no_other_command(rig):
     """While a command waits for a controller that acknowledges nothing, a STOP is written over it."""
     machine = small(rig)
     with machine:
-        machine.arm()
-        machine.inject("stall")
-        machine._pause(0.01)
+        arm_and_stall(machine)
         machine.answer_s = 20.0
         said = []
 
@@ -287,9 +285,7 @@ def test_a_stop_that_is_not_acknowledged_stays_until_the_controller_obeys_it(rig
     """Its task stands still, as at a breakpoint. A release that overwrote the stop would leave nothing latched."""
     machine = small(rig)
     with machine:
-        machine.arm()
-        machine.inject("stall")
-        machine._pause(0.01)
+        arm_and_stall(machine)
         machine.answer_s = 0.05
         for send in (lambda: machine.stop(Trip.OPERATOR), machine.release):
             with pytest.raises(UserError, match="did not acknowledge STOP"):
@@ -299,6 +295,13 @@ def test_a_stop_that_is_not_acknowledged_stays_until_the_controller_obeys_it(rig
         machine.controller.faults.clear()
         machine._pause(0.01)
         assert (machine.status().state, machine.status().trip) == (State.TRIPPED, Trip.OPERATOR)
+
+
+def arm_and_stall(machine) -> None:
+    """Arm the rig, then let the controller's task stand still: it acknowledges nothing."""
+    machine.arm()
+    machine.inject("stall")
+    machine._pause(0.01)
 
 
 def kind_of(machine) -> int:
