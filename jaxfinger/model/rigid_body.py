@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfinger.model.angles import sin_cos
 from jaxfinger.model.finger import Finger
 
 Scalar = Float[Array, "*#T"]
@@ -58,7 +59,7 @@ def _transposed(R: Matrix) -> Matrix:
 
 def _rotation(axis: Vector, angle: Scalar) -> Matrix:
     """Rodrigues: R = cos θ I + sin θ [a]ₓ + (1 − cos θ) a aᵀ."""
-    c, s = jnp.cos(angle), jnp.sin(angle)
+    s, c = sin_cos(angle)
     if isinstance(axis, tuple):
         (x, y, z), (u, v, w) = (s * a for a in axis), ((1.0 - c) * a for a in axis)
         return (
