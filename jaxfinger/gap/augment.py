@@ -120,7 +120,7 @@ def _with_effects(nominal: Model, effects: tuple[CatalogueEffect, ...]) -> tuple
 def _prior(problem: Problem, model: Model, moving: Int[np.ndarray, " k"]) -> Prior:
     """The problem's prior, and a weak one on amplitudes and shapes about their values, which holds flat directions."""
     mean = np.concatenate([problem.prior.mean, np.asarray(ravel(model))[moving]])
-    (rows, p), std = problem.root.shape, np.asarray(ravel(_on_effects(partial(_prior_std, problem.scales), model)))
+    (rows, p), std = problem.root.shape, np.asarray(ravel(_on_effects(partial(prior_std, problem.scales), model)))
     root = np.zeros((rows + len(moving), p + len(moving)))
     root[:rows, :p], root[rows:, p:] = problem.root, np.diag(1.0 / std[moving])
     return Prior(mean, root)
@@ -172,7 +172,7 @@ def _limit(side: int, scales: Scales, effect: CatalogueEffect) -> CatalogueEffec
     return replace(effect, **{n: jnp.asarray(ends.get(n, free)[side], dtype=float) for n in effect.values()})
 
 
-def _prior_std(scales: Scales, effect: CatalogueEffect) -> CatalogueEffect:
+def prior_std(scales: Scales, effect: CatalogueEffect) -> CatalogueEffect:
     """Standard deviation of the prior of each parameter.
 
     For an amplitude three times the larger of its value and its plausible size; for a shape that moves by differences

@@ -1,13 +1,14 @@
 """Parts of a diagnosis beside its verdict, from the results of the search, of the fits and on held-out trials."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxfinger.data.schema import channel_units
 from jaxfinger.effects import Changed
 from jaxfinger.experiments import not_judged
-from jaxfinger.gap.augment import values_of
+from jaxfinger.gap.augment import prior_std, values_of
 from jaxfinger.gap.budget import MIN_GAP_EVIDENCE, Budget, held_out_gains
 from jaxfinger.gap.closure import centred
 from jaxfinger.gap.columns import Columns
@@ -32,7 +33,7 @@ from jaxfinger.gap.result import (
     Unexplained,
     Value,
 )
-from jaxfinger.gap.sets import Search
+from jaxfinger.gap.sets import Alone, Search
 from jaxfinger.gap.signature_table import Offer, SignatureTable
 from jaxfinger.gap.smooth_laws import SmoothPart
 from jaxfinger.identify import Fit
@@ -188,27 +189,50 @@ def candidates_of(problem: Problem, search: Search, chosen: SearchState, found: 
     gain = dict(zip(chosen.keys, shares.overall[0].tolist(), strict=True))
     others = search.alone(k for k in order if k not in inside)
     likely = [k for k in order if k in others][:MAX_HELD_OUT]
-    signatures = [search.table.signatures.dense(others[k][0].rows, problem.r.size) for k in likely]
+    signatures = [search.table.signatures.dense(others[k].offer.rows, problem.r.size) for k in likely]
     gain |= dict(zip(likely, held_out_gains(problem, signatures), strict=True))
-    values = inside | {k: _alone(problem, search.table, *x) for k, x in others.items()}
+    values = inside | {k: _alone(problem, search.table, x) for k, x in others.items()}
     return tuple(
         Candidate(Key(*k), found.causes[k], found.gains[k], gain.get(k, 0.0), values.get(k, ())) for k in order
     )
 
 
-def _alone(
-    problem: Problem, table: SignatureTable, offer: Offer, amplitudes: np.ndarray, std: np.ndarray
-) -> tuple[Value, ...]:
-    """Values of a cause alone on top of the nominal model: amplitudes by linear least squares, and the best shape."""
-    (variant,), names = offer.variants, list(offer.variants[0].sizes)
+def _alone(problem: Problem, table: SignatureTable, x: Alone) -> tuple[Value, ...]:
+    """Values of a cause alone on top of the nominal model: amplitudes by linear least squares, and the best shape.
+
+    An amplitude that the trials cannot see, and a shape that was tried at one value, are as uncertain as before them.
+    """
+    (variant,), names = x.offer.variants, list(x.offer.variants[0].sizes)
     units = units_at(problem.nominal.finger, variant.effect, variant.site)
-    found = dict.fromkeys(names, (0.0, 0.0))
+    found = dict.fromkeys(names, 0.0)
+    std: dict[str, float] = {}
     of_row = dict(zip(table.rows[variant].tolist(), names, strict=True))
-    for row, a, s in zip(offer.rows.tolist(), amplitudes, std, strict=True):
+    for row, a, s in zip(x.offer.rows.tolist(), x.amplitudes, x.std, strict=True):
         unit = table.units[row] * variant.sizes[of_row[row]]
-        found[of_row[row]] = (float(a * unit), float(s * unit))
-    values = [Value(variant.site, n, a, s, units[n]) for n, (a, s) in found.items()]
-    return tuple([*values, *(Value(variant.site, n, v, 0.0, units[n]) for n, v in variant.shape)])
+        found[of_row[row]], std[of_row[row]] = float(a * unit), float(s * unit)
+    unknown = prior_std(problem.scales, variant.at(problem.nominal.finger, found)).values()
+    fixed = {n: 0.0 for n, p in variant.effect.shape_parameters().items() if p.moves == "not"}
+    std = unknown | {n: min(s, unknown[n]) for n, s in _shape_spread(x.tried, x.net).items()} | std | fixed
+    return tuple(Value(variant.site, n, v, std[n], units[n]) for n, v in (found | dict(variant.shape)).items())
+
+
+def _shape_spread(tried: Sequence[Offer], net: Float[np.ndarray, " tried"]) -> dict[str, float]:
+    """Standard deviation of each shape about its best value, over the values tried of one cause, by their evidence.
+
+    A value stands for the cell of the grid around it, over which the shape is evenly spread. Shapes that were tried at
+    one value are left out.
+    """
+    weight = np.exp(net - net.max())
+    weight /= weight.sum()
+    shapes = [dict(offer.variants[0].shape) for offer in tried]
+    best, out = shapes[int(np.argmax(weight))], {}
+    for name, middle in best.items():
+        values = np.array([s[name] for s in shapes])
+        grid = np.unique(values)
+        if len(grid) > 1:
+            cell = float(np.gradient(grid)[np.searchsorted(grid, middle)])
+            out[name] = float(np.sqrt(weight @ (values - middle) ** 2 + cell**2 / 12.0))
+    return out
 
 
 def absorbed_causes(problem: Problem, table: SignatureTable) -> tuple[Absorbed, ...]:

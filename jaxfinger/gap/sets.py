@@ -98,6 +98,16 @@ class Addition(NamedTuple):
     amplitudes: Float[np.ndarray, " k"]
 
 
+class Alone(NamedTuple):
+    """A cause alone on top of the nominal model, in its best offer, by a linear fit."""
+
+    offer: Offer
+    amplitudes: Float[np.ndarray, " k"]  # in prior standard deviations
+    std: Float[np.ndarray, " k"]  # of the amplitudes
+    tried: list[Offer]
+    net: Float[np.ndarray, " tried"]  # log evidence of each tried offer, less its Occam factor
+
+
 class Search:
     """Search for the causes of one problem."""
 
@@ -391,24 +401,25 @@ class Search:
 
     def _best_offer_of(self, screened: Screened, key: CauseKey) -> tuple[Offer, Float[np.ndarray, " k"]] | None:
         """Best offer of one cause alone on top of a set, with its amplitudes; None where there is none."""
-        mine = [n for n in self.table.numbers_of(key) if np.isfinite(screened.net[n])]
+        mine = self._finite(screened, key)
         if not mine:
             return None
         offer = self.table.offers[max(mine, key=lambda n: screened.net[n])]
         fit = screened.model.fit(offer.rows, offer.low, offer.high, start=screened.now.weights)
         return offer, fit.amplitudes
 
-    def alone(
-        self, keys: Iterable[CauseKey]
-    ) -> dict[CauseKey, tuple[Offer, Float[np.ndarray, " _k"], Float[np.ndarray, " _k"]]]:
-        """Best offer of each cause alone on top of the nominal model, its amplitudes, and their standard deviations.
+    def _finite(self, screened: Screened, key: CauseKey) -> list[int]:
+        """Numbers of the offers of one cause whose evidence on top of a set is finite."""
+        return [n for n in self.table.numbers_of(key) if np.isfinite(screened.net[n])]
 
-        Amplitudes are linear estimates, in prior standard deviations.
-        """
+    def alone(self, keys: Iterable[CauseKey]) -> dict[CauseKey, Alone]:
+        """Each cause alone on top of the nominal model, in the offer with the most evidence."""
         screened, out = self.screen(self.baseline.null), {}
         for key in keys:
             if (best := self._best_offer_of(screened, key)) is not None:
-                out[key] = (*best, screened.model.std(best[0].rows, screened.now.weights))
+                mine = self._finite(screened, key)
+                std = screened.model.std(best[0].rows, screened.now.weights)
+                out[key] = Alone(*best, std, [self.table.offers[n] for n in mine], screened.net[mine])
         return out
 
 

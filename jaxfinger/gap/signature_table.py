@@ -23,6 +23,9 @@ from jaxfinger.gap.signatures import Variant
 MIN_UNABSORBED = 1e-3
 # The energy left, ‖z‖² − ‖Qᵀz‖², is good to 1e-14 of ‖z‖². Less than this share of ‖z‖² is taken for zero.
 MIN_UNABSORBED_ENERGY = (1e-3 * MIN_UNABSORBED) ** 2
+# Norm of a signature in standard deviations of the noise. At a plausible size, less than this is rounding: predictions
+# are up to 1e6 deviations and good to 1e-16, and the rounding of 1e4 samples adds up to 1e-8.
+MIN_NORM = 1e-6
 
 
 @dataclass(frozen=True)
@@ -124,7 +127,7 @@ def table_of(problem: Problem, baseline: Baseline, parts: Iterable[Part], togeth
         start += len(v.sizes)
         rows[v] = at
         imitated = 1.0 - float(np.sum(left[at] ** 2) / max(np.sum(norm[at] ** 2), 1e-300))
-        if imitated < absorbed.get(v.key, np.inf):
+        if norm[at].any() and imitated < absorbed.get(v.key, np.inf):
             absorbed[v.key] = imitated
             hidden[v.key] = {
                 n: size / float(max(left[i], 1e-12 * norm[i]))
@@ -143,7 +146,7 @@ def table_of(problem: Problem, baseline: Baseline, parts: Iterable[Part], togeth
 class Visibility(NamedTuple):
     """Norms of M signatures z and of what the nominal parameters leave of them."""
 
-    norm: Float[np.ndarray, " M"]  # ‖z‖
+    norm: Float[np.ndarray, " M"]  # ‖z‖, zero where it is rounding
     left: Float[np.ndarray, " M"]  # ‖z − Q Qᵀ z‖, what the nominal parameters leave
     units: Float[np.ndarray, " M"]  # amplitude at which what is left is as large as the gap; zero: not visible
     share: Float[np.ndarray, "M C"]  # of each column's gap, that the signature would explain at that amplitude
@@ -159,6 +162,7 @@ def _visibility(baseline: Baseline, project: Projector, Z: ByColumn) -> Visibili
     for c, (index, values) in zip(columns.items, Z.nonzero, strict=True):
         square[index] += np.sum(values**2, axis=1)
         onto[:, index] += Q[c.rows].T @ values.T
+    square[square < MIN_NORM**2] = 0.0
     rest = square - np.sum(onto**2, axis=0)
     norm, left = np.sqrt(square), np.sqrt(np.where(rest > MIN_UNABSORBED_ENERGY * square, rest, 0.0))
     units = np.where(left > MIN_UNABSORBED * norm, baseline.gap / np.maximum(left, 1e-300), 0.0)

@@ -45,6 +45,21 @@ def test_the_planted_cause_its_site_and_its_size_are_named(diagnosis):
     assert diagnosis.candidates[0].key == Key(*TRUTH)
 
 
+def test_no_number_of_a_candidate_is_certain(diagnosis):
+    """Rivals that are not in the fit have intervals, too; a choice of form, side or place, and a full share have none."""
+    for candidate in diagnosis.candidates:
+        effect = CATALOGUE[candidate.key.effect]
+        choices = {n for n, p in effect.shape_parameters().items() if p.moves == "not"}
+        choices |= {
+            v.name
+            for v in candidate.values
+            if v.name in effect.amplitudes() and v.value >= effect.amplitudes()[v.name].most
+        }
+        for v in candidate.values:
+            assert np.isfinite(v.std)
+            assert (v.std == 0.0) == (v.name in choices), (candidate.key, v)
+
+
 def test_the_budget_is_the_gap(diagnosis):
     """The one cause has nearly all of the gap of each column, and little is left."""
     (cause,) = diagnosis.budget

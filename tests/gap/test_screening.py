@@ -100,3 +100,15 @@ def test_what_the_nominal_parameters_imitate_could_hide_at_any_size(planted):
     assert {effect for effect, _ in table.absorbed} == {"joint_offset"}
     assert min(table.absorbed.values()) > 1.0 - 1e-9
     assert min(size for sizes in table.hidden.values() for size in sizes.values()) > 1e5  # N m
+
+
+def test_a_signature_of_rounding_is_not_seen(planted):
+    """A cause that no trial shows is neither offered nor said to be imitated."""
+    baseline = Baseline.of(planted, Parameters())
+    items = variants({"joint_stribeck": CATALOGUE["joint_stribeck"]}, planted.nominal.finger, planted.scales)
+    (part,) = read_parts(planted, items, baseline.columns)
+    assert table_of(planted, baseline, [part]).offers
+    rounding = replace(part, rows=part.rows.scaled(np.full(part.rows.count, 1e-13)))
+    table = table_of(planted, baseline, [rounding])
+    assert table.offers == []
+    assert table.absorbed == {}
