@@ -192,9 +192,7 @@ def candidates_of(problem: Problem, search: Search, chosen: SearchState, found: 
     signatures = [search.table.signatures.dense(others[k].offer.rows, problem.r.size) for k in likely]
     gain |= dict(zip(likely, held_out_gains(problem, signatures), strict=True))
     values = inside | {k: _alone(problem, search.table, x) for k, x in others.items()}
-    return tuple(
-        Candidate(Key(*k), found.causes[k], found.gains[k], gain.get(k, 0.0), values.get(k, ())) for k in order
-    )
+    return tuple(Candidate(Key(*k), found.causes[k], gain.get(k, 0.0), values.get(k, ())) for k in order)
 
 
 def _alone(problem: Problem, table: SignatureTable, x: Alone) -> tuple[Value, ...]:

@@ -116,19 +116,13 @@ def terms(problem: Problem, experiment: str, channel: str, column: int) -> list[
         out += [(f"exp(−|{v}|/{w:g}) {d}", np.exp(-np.abs(qd[i]) / w) * s[i]) for w in speeds]
         travelled = since_reversal(q[i])
         out += [(f"exp(−|Δ{a}|/{w:g}) {d}", np.exp(-np.abs(travelled) / w) * s[i]) for w in lengths]
-        out += [(f"{g}({p} {a})", fun(p * q[i])) for p in HARMONICS for g, fun in (("sin", np.sin), ("cos", np.cos))]
+        out += _harmonics(a, q[i])
         for j in range(finger.m):
             if j != i:
                 b = f"q_{names[j]}"
                 out += [(f"{a} {b}", q[i] * q[j]), (f"{a} {b}²", q[i] * q[j] ** 2), (b, q[j]), (f"{b}²", q[j] ** 2)]
                 out += [(f"q̇_{names[j]}", qd[j])]
-                for sign, name in ((1, "+"), (-1, "−")):
-                    for p in HARMONICS:
-                        angle = p * (q[i] + sign * q[j])
-                        out += [
-                            (f"sin({p} ({a} {name} {b}))", np.sin(angle)),
-                            (f"cos({p} ({a} {name} {b}))", np.cos(angle)),
-                        ]
+                out += _harmonics(f"({a} + {b})", q[i] + q[j]) + _harmonics(f"({a} − {b})", q[i] - q[j])
     for k in taut:
         if f[k].any():
             b = f"f_{tendons[k]}"
@@ -141,6 +135,15 @@ def terms(problem: Problem, experiment: str, channel: str, column: int) -> list[
                 out += [(f"{b} {a}", f[k] * q[i]), (f"{b} {a}²", f[k] * q[i] ** 2), (f"{b}² {a}", f[k] ** 2 * q[i])]
                 out += [(f"{b} sign q̇_{names[i]}", f[k] * s[i])]
     return [(text, np.broadcast_to(values, time.shape)) for text, values in out]
+
+
+def _harmonics(name: str, angle: Float[np.ndarray, "B T"]) -> list[tuple[str, Float[np.ndarray, "B T"]]]:
+    """Sines and cosines of multiples of an angle; the name of a sum stands in parentheses."""
+    out = []
+    for p in HARMONICS:
+        argument = f"{p} {name}" if p > 1 else name[1:-1] if name.startswith("(") else name
+        out += [(f"sin({argument})", np.sin(p * angle)), (f"cos({argument})", np.cos(p * angle))]
+    return out
 
 
 def _rounded(shares: tuple[float, ...], scale: float) -> list[float]:

@@ -136,7 +136,6 @@ class Candidate:
 
     key: Key
     probability: float  # that it is at work, alone or with others
-    log_evidence: float  # of the best set with it, minus that of the best set without it
     held_out: float  # share of the gap that it explains on trials that its fit has not seen
     values: tuple[Value, ...]
 

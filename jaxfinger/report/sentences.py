@@ -321,7 +321,10 @@ def unlisted(d: Diagnosis) -> str:
 def proposal(d: Diagnosis) -> str | None:
     """Sentence on the closed form proposed for what is left; None where there is none."""
     p = d.unexplained.proposal
-    return None if p is None else f"A formula that fits {percent(p.share)} of what is left, unproven: {p.formula}."
+    if p is None:
+        return None
+    fits = f"A formula that fits {percent(p.share)} of what is left, unproven, with angles in rad and tensions in N"
+    return f"{fits}: {p.formula}."
 
 
 def _of(experiment: str, channel: str, column: str | None = None) -> str:

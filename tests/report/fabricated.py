@@ -135,7 +135,7 @@ OPEN = Unexplained(
 
 
 def _candidate(key: Key, probability: float) -> Candidate:
-    return Candidate(key, probability, 40.0, 0.9, (Value(key.site, "compliance", 9.1e-5, 3e-6, "m/N"),))
+    return Candidate(key, probability, 0.9, (Value(key.site, "compliance", 9.1e-5, 3e-6, "m/N"),))
 
 
 @cache
