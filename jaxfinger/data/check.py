@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 
 from jaxfinger.data.check_columns import check_columns
+from jaxfinger.data.check_delay import check_delay
 from jaxfinger.data.check_finger import check_finger
 from jaxfinger.data.check_trial import check_trial
 from jaxfinger.data.check_work import check_work
@@ -158,12 +159,16 @@ def _check_created(created: str, report: Report) -> None:
 
 
 def check_samples(session: Session, report: Report) -> None:
-    """Report spikes, and channels that contradict each other. These checks are slow: they go through every sample."""
+    """Report spikes, and channels that contradict each other or are late.
+
+    These checks are slow: they go through every sample.
+    """
     with np.errstate(all="ignore"):
         check_spikes(session, report)
         if report.fatal is None:
             check_work(session, report)
             check_columns(session, report)
+            check_delay(session, report)
 
 
 def check_spikes(session: Session, report: Report) -> None:

@@ -108,7 +108,7 @@ def _spline(x: Float[np.ndarray, "k N"], rate: float, cutoff_hz: float) -> Float
     count = wide.shape[1]
     # A straight line is its own spline coefficients, so it is added back to them.
     line = wide[:, :1] + (wide[:, -1:] - wide[:, :1]) / (count - 1) * np.arange(count)
-    size = _fourier_length(count)
+    size = fourier_length(count)
     turn = 2.0 * np.pi / size * np.arange(size // 2 + 1)  # rad from sample to sample
     B = _B_SPLINE[0, 2] + 2.0 * (_B_SPLINE[0, 3] * np.cos(turn) + _B_SPLINE[0, 4] * np.cos(2.0 * turn))
     H = np.exp(-0.5 * (rate * filter_std(cutoff_hz) * turn) ** 2)
@@ -141,7 +141,7 @@ def _derivatives(
     return out
 
 
-def _fourier_length(size: int) -> int:
+def fourier_length(size: int) -> int:
     """Shortest even length, at least `size`, with a fast Fourier transform: 1, 3, 5, 9 or 15 times a power of two.
 
     `scipy.fft.next_fast_len` finds such lengths too, but its import takes 0.2 s, for which `check` would have to wait.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxfinger.data.filtering import without_spikes
-from jaxfinger.data.session import Session, Trial
+from jaxfinger.data.session import Session
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -79,9 +79,9 @@ def sizes_of(session: Session) -> Sizes:
             l = np.nan_to_num(trial.tendon_excursion[::every])
             excursions.append(float(np.ptp(np.percentile(l, (1, 99), axis=0), axis=0).max(initial=0.0)))
         if trial.experiment == "ID.3-dynamic":
-            sweeps.append(_travel_time(trial) / SWEEP_TIME)
+            sweeps.append(travel_time(trial.time, trial.q) / SWEEP_TIME)
         if trial.experiment in ("ID.2", "ID.3-static"):
-            steps.append(_travel_time(trial) / STEP_TIME)
+            steps.append(travel_time(trial.time, trial.q) / STEP_TIME)
     pace = _pace(sweeps)
     # Slow motions follow the pace of sweeps, but are quick only where they were measured to be.
     slow = max(pace, min(_pace(steps), 1.0)) if any(steps) else pace
@@ -95,14 +95,14 @@ def _pace(ratios: list[float]) -> float:
     return 1.0 if -1.0 < power < 0.0 else PACE_RATIO ** round(power)
 
 
-def _travel_time(trial: Trial) -> float:
+def travel_time(time: Float[np.ndarray, " N"], q: Float[np.ndarray, "N k"]) -> float:
     """Time, s, in which a joint at its fastest passes a tenth of its travel; 0 where nothing moves.
 
     The slowest joint counts: the travel of a joint at rest is noise and takes no time. Spikes are removed first.
     """
-    every = max(1, len(trial.time) // MAX_PACE_SAMPLES)
-    columns = [x[np.isfinite(x)] for x in without_spikes(trial.q)[::every].T]
-    step = float(np.median(np.diff(trial.time))) * every if len(trial.time) > 1 else 0.0
+    every = max(1, len(time) // MAX_PACE_SAMPLES)
+    columns = [x[np.isfinite(x)] for x in without_spikes(q)[::every].T]
+    step = float(np.median(np.diff(time))) * every if len(time) > 1 else 0.0
     return step * max((_lag(x) for x in columns if x.size and np.ptp(x) > 0.0), default=0)
 
 

@@ -1,0 +1,91 @@
+"""Channels that come late are reported with their delay; friction, play and stretch are not taken for delays."""
+
+import re
+
+import numpy as np
+import pytest
+
+from benchmarks.bad_input import complaints
+from jaxfinger.data.check_delay import check_delay
+from jaxfinger.data.findings import Report
+from tests.data.sweeps import Sweep, alone, late, led, play, pre_sliding, swept
+
+SEVERAL, ONE = Sweep(), Sweep((0.5,), lasts=20.0)
+MACHINES = [
+    SEVERAL,
+    ONE,
+    Sweep((0.3, 1.0), rate=500.0),
+    Sweep((0.02, 0.05), rate=20.0, lasts=100.0),
+    Sweep((2.0, 5.0), lasts=3.0),
+]
+
+
+def delays(session, trial) -> list[str]:
+    report = Report()
+    check_delay(alone(session, trial), report)
+    return [str(finding) for finding in report]
+
+
+@pytest.mark.parametrize("delay", [0.03, 0.1, 0.3])
+@pytest.mark.parametrize(
+    ("channel", "said"),
+    [
+        ("torque", "/sweep/joint_torque: column MCP comes {} ms after q of MCP"),
+        ("angle", "/sweep/q: column MCP comes {} ms after joint_torque of MCP"),
+        ("excursion", "/lead/tendon_excursion: columns T1, T2 come {} ms after q of MCP"),
+        ("led angle", "/lead/q: column MCP comes {} ms after tendon_excursion of T1, T2"),
+    ],
+)
+def test_a_late_channel_is_named_with_its_delay(session, channel, said, delay):
+    q, torque, l = SEVERAL.q, SEVERAL.torque(), SEVERAL.excursion()
+    trial = {
+        "torque": lambda: swept(SEVERAL, q, late(SEVERAL, torque, delay)),
+        "angle": lambda: swept(SEVERAL, late(SEVERAL, q, delay), torque),
+        "excursion": lambda: led(SEVERAL, q, late(SEVERAL, l, delay)),
+        "led angle": lambda: led(SEVERAL, late(SEVERAL, q, delay), l),
+    }[channel]()
+    (found,) = (text for text in complaints(alone(session, trial)) if " ms after " in text)
+    number = re.search(r"(\d+) ms", found)
+    assert number
+    assert float(number[1]) == pytest.approx(1e3 * delay, rel=0.1)
+    assert said.format(number[1]) in found
+
+
+def test_a_filter_of_one_channel_is_a_delay(session):
+    """An exponential filter with a time constant of 80 ms."""
+    kernel = np.exp(-np.arange(200) / (0.08 * SEVERAL.rate))
+    q = np.convolve(np.pad(SEVERAL.q, (199, 0), mode="edge"), kernel / kernel.sum(), "valid")
+    assert (
+        "/q: column MCP comes 6" in delays(session, swept(SEVERAL, q, SEVERAL.torque()))[0]
+    )  # about the time constant
+
+
+@pytest.mark.parametrize("noise", [1.0, 1e-3])
+@pytest.mark.parametrize("machine", MACHINES, ids=str)
+def test_what_depends_on_travel_is_no_delay(session, machine, noise):
+    q, l = machine.q, machine.excursion()
+    for reach in (2e-3, 0.01, 0.05, 0.2):
+        assert delays(session, swept(machine, q, machine.torque(pre_sliding(q, reach)), noise)) == []
+        assert delays(session, led(machine, q, l + 5e-4 * pre_sliding(q, reach), noise)) == []
+    for half in (5e-3, 0.02, 0.1):
+        behind = play(q, half)
+        assert delays(session, swept(machine, q, 0.03 * behind, noise)) == []
+        assert delays(session, led(machine, q, 0.008 * behind, noise)) == []
+
+
+@pytest.mark.parametrize("machine", MACHINES, ids=str)
+def test_sound_channels_are_in_time(session, machine):
+    q, torque, l = machine.q, machine.torque(), machine.excursion()
+    relaxing = q.copy()  # A spring behind a damper: it follows the angle within 0.1 s.
+    for k in range(1, len(q)):
+        relaxing[k] = relaxing[k - 1] + (q[k] - relaxing[k - 1]) / (0.1 * machine.rate + 1.0)
+    for noise in (1.0, 1e-3):
+        assert delays(session, swept(machine, q, torque, noise)) == []
+        assert delays(session, swept(machine, q, torque + 2e-3 * (q - relaxing), noise)) == []
+        assert delays(session, led(machine, q, l, noise)) == []
+
+
+def test_a_stretched_tendon_is_not_late(session):
+    """Friction raises the tension where the tendon is pulled in, and the tendon stretches."""
+    l = SEVERAL.excursion() + 2e-4 * np.sign(np.gradient(SEVERAL.q))
+    assert delays(session, led(SEVERAL, SEVERAL.q, l)) == []
