@@ -13,6 +13,7 @@ import numpy as np
 from jaxfinger.data.check_columns import check_columns
 from jaxfinger.data.check_delay import check_delay
 from jaxfinger.data.check_finger import check_finger
+from jaxfinger.data.check_held import check_held
 from jaxfinger.data.check_trial import check_trial
 from jaxfinger.data.check_work import check_work
 from jaxfinger.data.filtering import longest_spike, outlier_mask
@@ -159,7 +160,7 @@ def _check_created(created: str, report: Report) -> None:
 
 
 def check_samples(session: Session, report: Report) -> None:
-    """Report spikes, and channels that contradict each other or are late.
+    """Report spikes, sensors that stand still, and channels that contradict each other or are late.
 
     These checks are slow: they go through every sample.
     """
@@ -168,6 +169,7 @@ def check_samples(session: Session, report: Report) -> None:
         if report.fatal is None:
             check_work(session, report)
             check_columns(session, report)
+            check_held(session, report)
             check_delay(session, report)
 
 
