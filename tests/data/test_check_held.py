@@ -6,7 +6,7 @@ import pytest
 from benchmarks.bad_input import complaints
 from jaxfinger.data.check_held import check_held
 from jaxfinger.data.findings import Report
-from tests.data.sweeps import Sweep, alone, led, swept
+from tests.data.sweeps import Sweep, alone, led, pre_sliding, swept
 
 SWEEP = Sweep()
 Q, TORQUE, L = SWEEP.q, SWEEP.torque(), SWEEP.excursion()
@@ -43,10 +43,9 @@ def frozen(begin, lasts):
     return change
 
 
-def dwelling(x, at=5.0, lasts=3.0):
+def dwelling(x, at=5.0, lasts=4.0, on=SWEEP.time):
     """x with a rest in it."""
-    t = SWEEP.time
-    return np.interp(np.where(t < at, t, np.maximum(at, t - lasts)), t, x)
+    return np.interp(np.where(on < at, on, np.maximum(at, on - lasts)), on, x)
 
 
 @pytest.mark.parametrize("channel", ["q", "joint_torque"])
@@ -106,3 +105,32 @@ def test_coarse_sensors_rests_and_stops_are_sound(session, noise):
             for channel, step in coarse:
                 if getattr(trial, channel) is not None:
                     assert found(session, changed(trial, channel, by=rounded(step))) == []
+
+
+def test_coarse_sensors_are_not_held(session):
+    """At an even speed a coarse encoder steps evenly, and from a slow to a quick motion in steps of several sizes."""
+    even = Sweep((0.125,), lasts=32.0)
+    q = np.abs((even.time / 4.0) % 2.0 - 1.0)
+    assert found(session, changed(swept(even, q, even.torque(), noise=0.0), "q", by=rounded(0.03))) == []
+    slow, quick = Sweep((0.05,), 50.0, 30.0), Sweep((1.2,), 50.0, 3.0)
+    q = np.concatenate([slow.q, quick.q])
+    trial = swept(Sweep((0.05,), 50.0, 33.0), q, 0.02 * q)
+    assert found(session, changed(trial, "q", by=rounded(0.0175))) == []
+
+
+def test_a_hold_that_is_short_for_the_motion_is_not_said(session):
+    slow = Sweep((0.1, 0.3))
+    assert found(session, changed(swept(slow, slow.q, slow.torque()), "q", by=lambda x: held(x, 3))) == []
+
+
+def test_a_clipped_torque_is_said_once_and_a_dead_band_is_sound(session):
+    for limit in (lambda x: np.minimum(x, 4e-3), lambda x: np.where(np.abs(x) < 4e-3, 0.0, x)):
+        assert found(session, changed(swept(SWEEP, Q, TORQUE), "joint_torque", by=limit)) == []
+
+
+def test_what_happens_within_the_resolution_is_no_fault_of_the_sensor(session):
+    """A tendon that settles while the joint turns within one step of an encoder of 6 degrees."""
+    sweep = Sweep((0.5,), lasts=20.0)
+    q, l = (dwelling(x, on=sweep.time) for x in (sweep.q, sweep.excursion()))
+    trial = led(sweep, q, l + 3e-3 * pre_sliding(q, 0.05))
+    assert found(session, changed(trial, "q", by=rounded(0.1))) == []
