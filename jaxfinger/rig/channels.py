@@ -68,8 +68,8 @@ class RigChannel:
 class Limits:
     """The host's limits. Connecting is refused where one is looser than the controller's own.
 
-    `tension_rate`, `joint_margin` and `joint_velocity` bound commands: one beyond them is refused. The others bound
-    measured values: one beyond them stops the rig.
+    `tension_rate`, `joint_margin`, `joint_velocity` and `joint_acceleration` bound commands: one beyond them is
+    refused. The others bound measured values: one beyond them stops the rig.
     """
 
     tension_max: float  # N, of commands and measured values
@@ -77,6 +77,7 @@ class Limits:
     tension_rate_max: float  # N/s, measured
     joint_margin: float  # rad that commanded angles keep from the joint's mechanical limits
     joint_velocity: float  # rad/s, of commands
+    joint_acceleration: float  # rad/s², of commands
     joint_velocity_max: float  # rad/s, measured
     joint_torque_max: float  # N m, of the external motor
     fingertip_force_max: float  # N, each axis

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxfinger.data.toml import Document, Fault, NotEmpty, Place, one_of, parse_toml, read_toml, structure
 from jaxfinger.errors import UserError
-from jaxfinger.rig.backend import JointMove, Setup, TensionRamp
+from jaxfinger.rig.backend import CommandRefused, JointMove, Setup, TensionRamp
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.protocols import PROTOCOLS, Common, Covered, Dwell, Protocol, Settled, Start, Tare
 from jaxfinger.rig.safety import admit
@@ -111,6 +111,11 @@ def _plan(document: Document, rig: RigDescription) -> Plan:
             for number, _ in enumerate(commands(trial, rig)):
                 if number == MAX_STEPS:
                     raise UserError(f"takes more than {MAX_STEPS} steps; shorten it")
+        except CommandRefused as error:
+            mend = "change this [[trial]], or [limits] of the rig file"
+            raise UserError(
+                f"{document.path}, line {trial.line}: {trial.name}: {str(error).rstrip('.')}; {mend}."
+            ) from error
         except UserError as error:
             raise UserError(f"{document.path}, line {trial.line}: {trial.name}: {error}") from error
     return Plan(file.plan.name, file.plan.operator, named, document.text, str(document.path))

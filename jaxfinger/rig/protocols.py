@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 
 from jaxfinger.data.session import FingerDescription
-from jaxfinger.data.toml import Fault, Positive, Within
+from jaxfinger.data.toml import Fault, NotEmpty, Positive, Within
 from jaxfinger.rig.backend import Command, JointMove, Setup, TensionRamp
 
 
@@ -79,6 +79,8 @@ MIN_TARGET = 0.6  # N, the lowest target of VD.3: tendons stay taut. The control
 # Repeats or passes. A thousand of them give the noise's standard deviation to 2 % (1/√2000); more is a mistake.
 Count = Annotated[int, Within(1, 1000)]
 NotNegative = Annotated[float, Within(0.0)]
+# Two hours, longer than the paper's whole session: more is a mistake, and the finger is armed all the while.
+Seconds = Annotated[float, Within(0.0, 7200.0, "s")]
 Step = Command | Setup | Reached | Dwell | Settled | Covered | Tare | Mark | Start
 Protocol = Iterator[Step]
 
@@ -105,7 +107,7 @@ class MomentArms(Common):
     pretension: NotNegative = 2.0  # N
     share: float = 0.8  # at most 0.85: hands must not run the joint into its stops
     passes: Count = 3
-    timeout: NotNegative = 120.0  # s for all passes
+    timeout: Seconds = 120.0  # s for all passes
 
     def __post_init__(self):
         if not 0.1 <= self.share <= 0.85:
@@ -123,8 +125,9 @@ class StaticTorque(Common):
     range_deg: tuple[float, float] = (0.0, 70.0)
     step_deg: Annotated[float, Within(0.01, unit="deg")] = 10.0  # at least 0.01°: the encoder AA5048B resolves 0.02°
     speed_deg_s: NotNegative = 30.0
-    settle: NotNegative = 0.2  # s
-    dwell: NotNegative = 0.5  # s
+    acceleration_deg_s2: NotNegative = 600.0
+    settle: Seconds = 0.2  # s
+    dwell: Seconds = 0.5  # s
 
 
 @dataclass(frozen=True)
@@ -133,8 +136,8 @@ class DynamicTorque(Common):
 
     joint: str = field(kw_only=True)
     range_deg: tuple[float, float] = (10.0, 65.0)
-    speeds_deg_s: tuple[float, ...] = (28.6, 57.3, 85.9)  # 0.5, 1, 1.5 rad/s
-    acceleration_deg_s2: NotNegative = 600.0
+    speeds_deg_s: Annotated[tuple[float, ...], NotEmpty()] = (28.6, 57.3, 85.9)  # 0.5, 1, 1.5 rad/s
+    acceleration_deg_s2: NotNegative = 600.0  # reaches 1.5 rad/s in 0.14 s
     passes: Count = 2
 
 
@@ -146,8 +149,8 @@ class TendonFriction(Common):
     tendon: str = field(kw_only=True)
     levels: Annotated[tuple[float, ...], Within(0.0, unit="N", above=True)] = (2.0, 4.0, 6.0, 8.0, 10.0)
     down: bool = True
-    settle: NotNegative = 0.3  # s before a hold
-    dwell: NotNegative = 0.5  # s of a hold
+    settle: Seconds = 0.3  # s before a hold
+    dwell: Seconds = 0.5  # s of a hold
 
 
 @dataclass(frozen=True)
@@ -155,7 +158,7 @@ class FreeExcursion(Common):
     """VD.1: all joints moved by hand for `seconds`, with all tendons at `pretension` N."""
 
     pretension: NotNegative = 2.0  # N
-    seconds: NotNegative = 20.0
+    seconds: Seconds = 20.0
 
 
 @dataclass(frozen=True)
@@ -164,8 +167,8 @@ class FingertipForce(Common):
 
     tendon: str = field(kw_only=True)
     levels: Annotated[tuple[float, ...], Within(0.0, unit="N", above=True)] = tuple(float(f) for f in range(4, 16))
-    settle: NotNegative = 0.3
-    dwell: NotNegative = 0.5
+    settle: Seconds = 0.3
+    dwell: Seconds = 0.5
 
 
 @dataclass(frozen=True)
@@ -178,7 +181,7 @@ class Trajectory(Common):
     mean: tuple[float, ...] = ()  # N per active tendon; empty: 2 N each
     amplitude: NotNegative = 0.8  # N
     interval: Positive = 0.5  # s
-    seconds: NotNegative = 10.0
+    seconds: Seconds = 10.0
     seed: Annotated[int, Within(0)] = 0
 
 
@@ -231,11 +234,12 @@ def static_torque(finger: FingerDescription, p: StaticTorque) -> Protocol:
     grid = np.linspace(low, high, max(2, round((p.range_deg[1] - p.range_deg[0]) / p.step_deg) + 1))
     yield from _tared(finger, posture, ("external_torque",), p.tension_rate)
     yield from _coupled(posture, p.joint)
-    speed = float(np.radians(p.speed_deg_s))
+    speed, acceleration = np.radians((p.speed_deg_s, p.acceleration_deg_s2)).tolist()
     approach = min(0.05, float(grid[1] - grid[0]) / 2)
-    yield JointMove(p.joint, float(low), speed)
+    yield JointMove(p.joint, float(low), speed, acceleration)
     yield Reached()
-    yield JointMove(p.joint, float(low) + approach, speed)  # gives friction its direction before the first hold
+    # This one gives friction its direction before the first hold.
+    yield JointMove(p.joint, float(low) + approach, speed, acceleration)
     yield Reached()
     yield Start()
     up = [float(low) + approach + 0.02, *grid[1:].tolist()]
@@ -243,7 +247,7 @@ def static_torque(finger: FingerDescription, p: StaticTorque) -> Protocol:
     for direction, angles in ((+1, up), (-1, [float(high) - 0.05, *grid[-2::-1].tolist()])):
         for angle in angles:
             yield Mark(-1, {p.joint: direction})
-            yield JointMove(p.joint, angle, speed)
+            yield JointMove(p.joint, angle, speed, acceleration)
             yield Reached()
             yield Dwell(p.settle)
             yield Mark(hold, {p.joint: direction})
@@ -256,14 +260,15 @@ def dynamic_torque(finger: FingerDescription, p: DynamicTorque) -> Protocol:
     """ID.3-dynamic: tendons are slack; the external motor drives the joint to and fro at several speeds."""
     posture = p.posture(finger)
     low, high = np.radians(p.range_deg).tolist()
+    acceleration = float(np.radians(p.acceleration_deg_s2))
     yield from _tared(finger, posture, ("external_torque",), p.tension_rate)
     yield from _coupled(posture, p.joint)
-    yield JointMove(p.joint, low, float(np.radians(min(p.speeds_deg_s))))
+    yield JointMove(p.joint, low, float(np.radians(min(p.speeds_deg_s))), acceleration)
     yield Reached()
     yield Start()
     for speed in np.radians(p.speeds_deg_s).tolist():
         for target in (high, low) * p.passes:
-            yield JointMove(p.joint, target, speed, float(np.radians(p.acceleration_deg_s2)))
+            yield JointMove(p.joint, target, speed, acceleration)
             yield Reached()
 
 

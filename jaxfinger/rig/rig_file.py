@@ -19,6 +19,8 @@ from jaxfinger.rig.channels import ANALOG_KINDS, UNITS, Deadlines, Limits, Loose
 # s, default of `frozen_s` for analog channels: a thousand equal values at 1 kHz. Sensor noise prevents them unless the
 # converter's step is much larger than the noise; give a longer `frozen_s` there.
 FROZEN_S = 1.0
+# deg/s², default of `joint_acceleration_deg_s2`: twice what a plan's trials have by default (protocols.py).
+ACCELERATION_DEG_S2 = 1200.0
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,8 @@ class LimitsTable:
     joint_velocity_max_deg_s: Annotated[float, Within(1.0, 5000.0, "deg/s")]
     joint_torque_max: Annotated[float, Within(1e-3, 10.0, "N m")]
     fingertip_force_max: Annotated[float, Within(0.1, 100.0, "N")]
+    # At most the highest `joint_velocity_deg_s` within 0.1 s, in which the host reads samples twice (`poll_s`).
+    joint_acceleration_deg_s2: Annotated[float, Within(1.0, 20000.0, "deg/s2")] = ACCELERATION_DEG_S2
     tension_error_max: Annotated[float, Within(0.1, 100.0, "N")] | None = None
     tension_error_s: Annotated[float, Within(0.01, 10.0, "s")] | None = None
     temperature_max: Annotated[float, Within(30.0, 200.0, "degC")] | None = None
@@ -261,6 +265,7 @@ def _limits(table: LimitsTable, finger: FingerDescription, kinds: set[str], plac
         tension_rate_max=table.tension_rate_max,
         joint_margin=margin,
         joint_velocity=float(np.radians(table.joint_velocity_deg_s)),
+        joint_acceleration=float(np.radians(table.joint_acceleration_deg_s2)),
         joint_velocity_max=float(np.radians(table.joint_velocity_max_deg_s)),
         joint_torque_max=table.joint_torque_max,
         fingertip_force_max=table.fingertip_force_max,

@@ -79,11 +79,13 @@ def admit(command: Command, rig: RigDescription) -> None:
                 f"{np.degrees(command.target):.1f}° for {command.joint} is outside "
                 f"{np.degrees(low):.1f}° to {np.degrees(high):.1f}°."
             )
-        if not 0 < command.speed <= limits.joint_velocity or not 0 < command.acceleration < np.inf:
-            raise CommandRefused(
-                f"{np.degrees(command.speed):.1f}°/s for {command.joint} is outside "
-                f"0 to {np.degrees(limits.joint_velocity):.1f}°/s."
-            )
+        for value, highest, unit in (
+            (command.speed, limits.joint_velocity, "°/s"),
+            (command.acceleration, limits.joint_acceleration, "°/s²"),
+        ):
+            if not 0 < value <= highest:
+                given, most = np.degrees((value, highest))
+                raise CommandRefused(f"{given:.1f}{unit} for {command.joint} is outside 0 to {most:.1f}{unit}.")
 
 
 class Supervisor:

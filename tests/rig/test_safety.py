@@ -296,6 +296,7 @@ def test_the_first_trip_is_the_same_however_samples_arrive(rig, quiet_block, kin
         JointMove("XIP", 0.5, 0.5),
         JointMove("MCP", 0.5, 9.0),
         JointMove("MCP", 0.5, 0.5, float("inf")),
+        JointMove("MCP", 0.5, 0.5, 21.0),
     ],
 )
 def test_a_set_point_beyond_the_limits_is_refused_and_nothing_is_sent(rig, simulated, command):
