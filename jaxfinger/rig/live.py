@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import queue
+import sys
 import threading
-from contextlib import AbstractContextManager, nullcontext
+from collections import deque
+from contextlib import AbstractContextManager, nullcontext, suppress
 
 import numpy as np
 from rich.console import Console, Group
@@ -24,7 +25,8 @@ class LiveView(AbstractContextManager):
     """Shows every View that it is called with. A thread of its own draws the newest one and prints messages.
 
     The caller never waits: a terminal that takes no output stalls only that thread. `stalled` is then true at the end.
-    Without a terminal, one line for each trial is printed.
+    Without a terminal, one line for each trial is printed. Where drawing fails, the view says so and prints messages
+    and these lines to stderr from then on, since the operator needs the prompts. `failure` says why.
     """
 
     def __init__(self, rig: RigDescription, console: Console | None = None):
@@ -35,10 +37,11 @@ class LiveView(AbstractContextManager):
             self._live = Live(console=self._console, auto_refresh=False, redirect_stdout=False, redirect_stderr=False)
         self._trial = ""
         self._view: View | None = None
-        self._said: queue.SimpleQueue[tuple[str, threading.Event]] = queue.SimpleQueue()
+        self._said: deque[tuple[str, threading.Event]] = deque()  # messages to print, with the events to set then
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name="jaxfinger-view", daemon=True)
         self.stalled = False
+        self.failure = ""
 
     def __enter__(self) -> LiveView:
         self._thread.start()
@@ -52,7 +55,7 @@ class LiveView(AbstractContextManager):
     def say(self, text: str) -> threading.Event:
         """Print a line above the view, without waiting for it. The event is set once it is printed."""
         printed = threading.Event()
-        self._said.put((text, printed))
+        self._said.append((text, printed))
         return printed
 
     def __call__(self, view: View) -> None:
@@ -64,15 +67,26 @@ class LiveView(AbstractContextManager):
             self.say(f"{view.number}/{view.count} {view.trial}")
 
     def _work(self) -> None:
-        with self._live if self._live is not None else nullcontext():
-            while not self._closing.wait(REFRESH_S):
-                self._print()
+        try:
+            with self._live if self._live is not None else nullcontext():
+                self._print_until_closed()
+        except Exception as error:  # Of any kind: the view is no safety function, and nothing else may end with it.
+            self.failure = f"the live view has failed ({type(error).__name__}: {error})"
+            self._live, self._console = None, Console(file=sys.stderr, soft_wrap=True)
+            self._said.appendleft((f"{self.failure}; recording goes on, and the stop key works.", threading.Event()))
+            with suppress(Exception):  # Nobody can be told. A prompt that is not printed is answered by nobody.
+                self._print_until_closed()
+
+    def _print_until_closed(self) -> None:
+        while not self._closing.wait(REFRESH_S):
             self._print()
+        self._print()
 
     def _print(self) -> None:
-        while not self._said.empty():
-            text, printed = self._said.get()
+        while self._said:
+            text, printed = self._said[0]
             self._console.print(text, markup=False)
+            self._said.popleft()  # Only now: what could not be printed is printed again elsewhere.
             printed.set()
         view, self._view = self._view, None
         if view is not None and self._live is not None:

@@ -5,6 +5,7 @@ import os
 import pty
 import termios
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -241,3 +242,50 @@ def play(replay, supervisor, tension, column):
         block = replay.read_block(1.0)
         assert supervisor.check(block) == []
         tension.append(block.x[:, column])
+
+
+class Broken(io.StringIO):
+    """A stream that takes no more than its first writes."""
+
+    def __init__(self, writes: int = 0):
+        super().__init__()
+        self.left = writes
+
+    def write(self, text):
+        self.left -= 1
+        if self.left < 0:
+            raise OSError(5, "Input/output error")
+        return super().write(text)
+
+
+@pytest.mark.parametrize("broken", ["drawing", "terminal", "stream"])
+def test_a_live_view_that_fails_is_said_and_prompts_are_still_printed(rig, quiet_block, monkeypatch, capsys, broken):
+    stream = io.StringIO() if broken == "drawing" else Broken()
+    terminal = broken != "stream"
+    view = LiveView(rig, Console(file=stream, force_terminal=terminal, width=100, color_system=None))
+    if broken == "drawing":
+        monkeypatch.setattr(view, "draw", lambda view: 1 / 0)
+    with view:
+        view(View("02-ID.4-T3-MCP", 2, 9, "moving", quiet_block(), 0, True))
+        view.say("before")
+        while not view.failure:
+            time.sleep(0.01)
+        assert view.say("Hands off: [the drives] are about to be switched on.").wait(20)
+        view(View("03-VD.1", 3, 9, "waiting", quiet_block(), 0, True))
+    said = capsys.readouterr().err.splitlines()
+    assert said[0].startswith("the live view has failed (")
+    assert said[0].endswith("; recording goes on, and the stop key works.")
+    assert "Hands off: [the drives] are about to be switched on." in said
+    assert said[-1] == "3/9 03-VD.1"
+    assert not view.stalled
+
+
+def test_a_terminal_and_stderr_that_are_both_gone_do_not_end_the_recording(rig, short, tmp_path, monkeypatch):
+    """Nobody can be told. A prompt counts as unread, so no motor moves for it, and the run goes on without a view."""
+    monkeypatch.setattr("sys.stderr", Broken())
+    with LiveView(rig, Console(file=Broken(), width=100)) as view:
+        view.say("to a terminal that breaks")
+        while not view.failure:
+            time.sleep(0.01)
+        assert run(short, SimulatedRig(rig), tmp_path / "s.h5", observe=view).cause == ""
+        assert not view.say("Hands off.").wait(0.3)
