@@ -110,6 +110,7 @@ class Deadlines:
     lag_s: float  # from a sample to its supervision
     thread_s: float  # without a sign of life of a watched thread of the host
     disk_s: float  # for the disk to take a frame of the log
+    prompt_s: float  # for the operator to answer a prompt while the drives are on
     clock_offset_s: float  # between the device's clock and its samples, and between samples and the host's clock
     clock_rate: float  # relative error of these clocks that is followed without counting as an offset
 

@@ -39,6 +39,9 @@ class RigTable:
     lag_s: Annotated[float, Within(0.01, 60.0, "s")] = 0.25
     thread_s: Annotated[float, Within(0.05, 60.0, "s")] = 0.2
     disk_s: Annotated[float, Within(0.1, 60.0, "s")] = 1.0  # fdatasync took up to 0.29 s on a busy disk
+    # A fixture is fitted in a minute or two. Below 10 s nobody can have read and done what a prompt says; after half an
+    # hour without an answer nobody is at the rig.
+    prompt_s: Annotated[float, Within(10.0, 1800.0, "s")] = 300.0
     clock_offset_s: Annotated[float, Within(0.001, 60.0, "s")] = 0.1  # twice poll_s
     clock_rate: Annotated[float, Within(1e-6, 0.1)] = 1e-3  # twice the 5e-4 of quartz and network time
 
@@ -185,6 +188,7 @@ def _rig(document: Document) -> RigDescription:
             lag_s=head.lag_s,
             thread_s=head.thread_s,
             disk_s=head.disk_s,
+            prompt_s=head.prompt_s,
             clock_offset_s=head.clock_offset_s,
             clock_rate=head.clock_rate,
         ),

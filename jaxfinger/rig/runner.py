@@ -235,17 +235,32 @@ class Runner:
         return 0.5 + (1.0 + self.rig.description.deadlines.clock_rate) * seconds
 
     def _ask(self, text: str) -> None:
-        """Prompt the operator and wait for the answer. Raises TrialEnded where the run must end."""
+        """Prompt the operator and wait for the answer; where the drives are on, for `prompt_s` at most.
+
+        The watch sends heartbeats meanwhile, so without this limit an operator who walks away leaves the finger armed.
+
+        Raises:
+            TrialEnded: nobody answered in time, or the run must end.
+        """
+
+        def late() -> bool:
+            return armed and time.monotonic() - asked > patience
 
         def keep_waiting() -> bool:
             self.rig.report_alive()
             off = armed and (tripped(self.reader.latest) or self._let_go(self.reader.latest))
-            return self.reader.error is None and self.reader.violation is None and not off
+            return self.reader.error is None and self.reader.violation is None and not off and not late()
 
-        armed = self.watch.guards
-        self.operator.ask(text, keep_waiting)
+        armed, patience, asked = self.watch.guards, self.rig.description.deadlines.prompt_s, time.monotonic()
+        limit = f" The finger is armed: without an answer within {patience:g} s it is released." if armed else ""
+        self.operator.ask(text + limit, keep_waiting)
         self._heed_stop_key()
         self._check(self.reader.latest if armed else None)
+        if (
+            late()
+        ):  # Also where Enter came just then: who answers a prompt that is over does not expect a motor to move.
+            said = f"nobody answered the prompt within {patience:g} s (prompt_s of [rig]), so the finger is released"
+            raise TrialEnded(said, Trip.HOST)
 
     def _heed_stop_key(self) -> None:
         """Stop the rig and raise TrialEnded where the stop key was pressed or a signal came.

@@ -332,6 +332,53 @@ def test_a_person_at_a_bench_that_prepares_nothing_itself(rig, record):
     assert rest[-1].startswith("Couple the external motor to MCP")
 
 
+class Away:
+    """A person who answers every prompt at once, until one holds `words`; then in `late` s, or never (None)."""
+
+    def __init__(self, machine, words: str, late: float | None = None):
+        self.machine, self.words, self.late = machine, words, late
+        self.prompts, self.wanted = [], []
+        self.by_itself, machine.prepare = machine.prepare, lambda setup: bool(self.wanted.append(setup))
+
+    def ask(self, text, keep_waiting):
+        self.prompts.append(text)
+        until = time.monotonic() + (30.0 if self.late is None else self.late)
+        while self.words in text and time.monotonic() < until and (keep_waiting() or self.late is not None):
+            time.sleep(0.01)
+        self.by_itself(self.wanted[-1])
+        self.machine._pause(1.0)
+
+    def stop_requested(self):
+        return False
+
+
+def impatient(rig, seconds=0.2):
+    """The rig file with a short limit for prompts."""
+    return replace(rig, deadlines=replace(rig.deadlines, prompt_s=seconds))
+
+
+@pytest.mark.parametrize("late", [None, 0.4], ids=["never", "too late"])
+def test_a_prompt_that_nobody_answers_in_time_releases_an_armed_finger(rig, record, late):
+    """Nobody moves a motor for somebody who comes back later. The trial is repeated when the recording is resumed."""
+    machine = SimulatedRig(impatient(rig))
+    person = Away(machine, "Free DIP and move it", late)
+    outcome = record(machine, operator=person)
+    said = "01-ID.2-DIP: nobody answered the prompt within 0.2 s (prompt_s of [rig]), so the finger is released"
+    assert outcome.cause == said
+    assert "without an answer within 0.2 s it is released" in person.prompts[-1]
+    assert machine.controller.state is State.TRIPPED
+    assert max(machine.controller.setpoint) == 0.0
+    assert outcome.complete == ()
+    assert record(SimulatedRig(rig), resume=True).complete == ("01-ID.2-DIP", "02-ID.4-T3-MCP")
+
+
+def test_a_prompt_while_the_drives_are_off_may_wait(rig, record):
+    machine = SimulatedRig(impatient(rig))
+    person = Away(machine, "Hands off: the drives are about", 0.5)
+    assert record(machine, operator=person).cause == ""
+    assert "is released" not in person.prompts[0]
+
+
 def test_filtered_terminals_are_refused_for_dynamic_experiments(rig, tmp_path):
     filtered = Controller(filtered=True)
     plan = parse_plan('[plan]\nname = "p"\n[[trial]]\nexperiment = "ID.3-dynamic"\njoint = "DIP"\n', rig)
