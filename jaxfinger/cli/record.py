@@ -102,8 +102,8 @@ def recover(log: Path, *, output: Output, overwrite: bool = False) -> None:
 
     found = rescue(log, output, overwrite)
     cut = f", cut short: {', '.join(found.incomplete)}" if found.incomplete else ""
-    torn = f"; {found.torn_bytes} bytes at the log's end were not whole" if found.torn_bytes else ""
-    print(f"{output}: {counted(len(found.trials), 'trial')}{cut}{torn}")
+    torn = [f"{counted(found.torn_bytes, 'byte')} at the log's end were not whole"] if found.torn_bytes else []
+    print("; ".join([f"{output}: {counted(len(found.trials), 'trial')}{cut}", *found.damage, *torn]))
 
 
 def _print_plan(plan, description) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxfinger.data import Session, Trial
 from jaxfinger.data.hdf5 import new_file, write_into
 from jaxfinger.data.session import FingerDescription
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, counted
 from jaxfinger.rig import wal
 from jaxfinger.rig.backend import Block
 from jaxfinger.rig.channels import SAFETY_KINDS, SI_UNITS, Filter, RigDescription
@@ -22,13 +22,42 @@ from jaxfinger.rig.contract import Flag
 
 
 @dataclass
+class Damage:
+    """Bytes of a log that are no sound frame, from byte `at` on.
+
+    They lie within `trial`, which lacks `lost` samples there, or between two trials (""). The `left_out` samples that
+    follow belong to a trial whose beginning is among the damaged bytes, so nobody knows what they mean.
+    """
+
+    at: int
+    size: int
+    trial: str = ""
+    lost: int = 0
+    left_out: int = 0
+
+    def __str__(self) -> str:
+        lacks = counted(self.lost, "sample") if self.lost else "samples, marks or its end"
+        where = f"within {self.trial}, which lacks {lacks} there" if self.trial else "between two trials"
+        rest = (
+            f"; {counted(self.left_out, 'sample')} of the trial that begins there are left out" if self.left_out else ""
+        )
+        return f"the log is damaged for {counted(self.size, 'byte')} from byte {self.at} on, {where}{rest}"
+
+
+@dataclass
 class LoggedTrial:
-    """One trial of the log: its TRIAL frame, its blocks, its marks, and its END frame (None: it was cut short)."""
+    """One trial of the log: its TRIAL frame, its blocks, its marks, and its END frame (None: it was cut short).
+
+    `damage` lies within it. `hidden` is the most samples that the damage since its last block can have held (None: it
+    has no damage since then).
+    """
 
     start: dict[str, Any]
     blocks: list[Block] = field(default_factory=list)
     marks: list[dict[str, Any]] = field(default_factory=list)
     end: dict[str, Any] | None = None
+    damage: list[Damage] = field(default_factory=list)
+    hidden: int | None = None
 
     @property
     def name(self) -> str:
@@ -37,22 +66,52 @@ class LoggedTrial:
 
     @property
     def complete(self) -> bool:
-        """Whether the trial ran to its end."""
-        return bool(self.end and self.end["complete"])
+        """Whether the trial ran to its end, and the log holds all of it."""
+        return bool(self.end and self.end["complete"] and not self.damage)
 
     @property
     def cause(self) -> str:
         """Why the trial was cut short, in words."""
-        return "the recorder was killed" if self.end is None else str(self.end.get("cause", ""))
+        ended = "the recorder was killed" if self.end is None and not self.damage else (self.end or {}).get("cause", "")
+        return "; ".join(filter(None, [str(ended), *map(str, self.damage)]))
+
+    @property
+    def last_seq(self) -> int:
+        """Number of the last sample so far; of the one before the trial where it has none."""
+        return int(self.blocks[-1].seq[-1] if self.blocks else self.start["seq"] - 1)
+
+    def interrupt(self, damage: Damage, most: int) -> None:
+        """Take note of damage after the frames so far, which can have held `most` samples.
+
+        It may have held marks too, so no hold is known until the next one.
+        """
+        self.damage.append(damage)
+        self.hidden = (self.hidden or 0) + most
+        if self.marks:
+            self.marks.append({"seq": self.last_seq + 1, "hold": -1, "joint_direction": {}, "tendon_direction": {}})
+
+    def reaches(self, seq: int, lost: int = 0) -> bool:
+        """Whether sample `seq`, before which `lost` samples never reached the log, can belong to the trial.
+
+        Damage may hide the trial's end and the beginning of another one, which comes seconds later.
+        """
+        return self.hidden is None or self.start["seq"] <= seq <= self.last_seq + 1 + self.hidden + lost
+
+    def add(self, block: Block) -> None:
+        """Append a block."""
+        if self.hidden is not None:
+            self.damage[-1].lost, self.hidden = int(block.seq[0]) - self.last_seq - 1, None
+        self.blocks.append(block)
 
 
 @dataclass
 class Log:
-    """A log, read: its header, its trials in their order, its events."""
+    """A log, read: its header, its trials in their order, its events, and where it is damaged between sound frames."""
 
     header: dict[str, Any]
     trials: list[LoggedTrial]
     events: list[dict[str, Any]]
+    damage: list[Damage] = field(default_factory=list)
 
     @property
     def last_seq(self) -> int | None:
@@ -82,25 +141,38 @@ def read_frames(frames: Iterable[wal.Frame], name: str = "log") -> Log:
     Raises:
         UserError: there is no whole header frame.
     """
-    head: dict[str, Any] | None = None
-    trials: list[LoggedTrial] = []
-    events: list[dict[str, Any]] = []
+    log, trial = Log({}, [], []), None
     for frame in frames:
+        if not log.header and frame.tag != wal.HEADER:
+            raise UserError(f"{name}: the log's first frame is damaged, so nobody can say what its samples mean.")
+        if frame.damaged:
+            log.damage.append(Damage(frame.start - frame.damaged, frame.damaged, trial.name if trial else ""))
+            if trial is not None:
+                trial.interrupt(log.damage[-1], frame.damaged // wal.sample_bytes(len(log.header["channels"])))
         if frame.tag == wal.HEADER:
-            head = frame.json
+            log.header = frame.json
         elif frame.tag == wal.TRIAL:
-            trials.append(LoggedTrial(frame.json))
+            trial = LoggedTrial(frame.json)
+            log.trials.append(trial)
         elif frame.tag == wal.EVENT:
-            events.append(frame.json)
-        elif trials and frame.tag == wal.DATA:
-            trials[-1].blocks.append(frame.block)
-        elif trials and frame.tag == wal.MARK:
-            trials[-1].marks.append(frame.json)
-        elif trials and frame.tag == wal.END:
-            trials[-1].end = frame.json
-    if head is None:
+            log.events.append(frame.json)
+        elif frame.tag == wal.DATA:
+            block = frame.block
+            trial = trial if trial is not None and trial.reaches(int(block.seq[0]), block.lost_before) else None
+            if trial is not None:
+                trial.add(block)
+            elif log.damage:
+                log.damage[-1].left_out += len(block)
+        elif frame.tag in (wal.MARK, wal.END):
+            value = frame.json
+            trial = trial if trial is not None and trial.reaches(int(value["seq"])) else None
+            if trial is not None and frame.tag == wal.MARK:
+                trial.marks.append(value)
+            elif trial is not None:
+                trial.end, trial = value, None
+    if not log.header:
         raise UserError(f"{name}: the log ends within its first frame, before any sample was recorded.")
-    return Log(head, trials, events)
+    return log
 
 
 def _finger(values: dict[str, Any]) -> FingerDescription:
@@ -280,6 +352,11 @@ def _write_rig_group(group: h5py.Group, log: Log, extras: dict[str, tuple[Logged
     table.create_dataset("trial", data=[g[0] for g in gaps] or np.empty(0, object), dtype=text)
     table.create_dataset("seq", data=np.array([g[1] for g in gaps], np.int64))
     table.create_dataset("lost", data=np.array([g[2] for g in gaps], np.int64))
+    if log.damage:
+        table = group.create_group("damage")  # bytes of the log that could not be read
+        table.create_dataset("trial", data=[d.trial for d in log.damage], dtype=text)
+        for key in ("at", "size", "lost", "left_out"):
+            table.create_dataset(key, data=np.array([getattr(d, key) for d in log.damage], np.int64))
     watched = group.create_group("watched")  # channels of SAFETY_KINDS, sample for sample beside the trial
     for i, channel in enumerate(log.header["channels"]):
         if channel["kind"] in SAFETY_KINDS:

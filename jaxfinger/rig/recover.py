@@ -11,10 +11,14 @@ from jaxfinger.rig.convert import Log, publish, read_frames
 
 @dataclass(frozen=True)
 class Recovered:
-    """Names of the trials written, names of those that were cut short, and damaged bytes at the log's end."""
+    """Names of the trials written, names of those that were cut short or damaged, and how much of the log was lost.
+
+    `damage` has a sentence without a full stop for each place before the log's end, `torn_bytes` counts those at it.
+    """
 
     trials: tuple[str, ...]
     incomplete: tuple[str, ...]
+    damage: tuple[str, ...]
     torn_bytes: int
 
 
@@ -29,6 +33,8 @@ def recover(path: str | Path, output: str | Path, overwrite: bool = False) -> Re
     Raises:
         UserError: the log cannot be read, or the session cannot be written.
     """
-    session = publish(read_log(path), output, overwrite)
+    log = read_log(path)
+    session = publish(log, output, overwrite)
     incomplete = tuple(t.name for t in session if not t.complete)
-    return Recovered(tuple(session.trials), incomplete, Path(path).stat().st_size - wal.sound_length(path))
+    torn = Path(path).stat().st_size - wal.sound_length(path)
+    return Recovered(tuple(session.trials), incomplete, tuple(map(str, log.damage)), torn)

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from jaxfinger.data.toml import parse_toml
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, counted
 from jaxfinger.rig import convert, wal
 from jaxfinger.rig.backend import Rig, Setup, TensionRamp
 from jaxfinger.rig.channels import MIN_DYNAMIC_BANDWIDTH, Filter, RigDescription
@@ -85,6 +85,7 @@ def run(
     output, operator = Path(output), operator or Nobody()
     path = log_path(output)
     log = _log_to_resume(plan, rig.description, path, output, resume)
+    torn = path.stat().st_size - wal.sound_length(path) if log else 0
     with rig, Interrupts() as interrupts:
         filters = rig.filters()
         refuse_filtered(plan, rig.description, filters)
@@ -93,6 +94,9 @@ def run(
         recorder = Recorder(path, head, resume=log is not None)
         try:
             if log is not None:
+                if torn:
+                    said = f"{counted(torn, 'byte')} at the log's end were not whole and were cut off"
+                    recorder.put(wal.EVENT, {"seq": log.last_seq or 0, "kind": "damage", "text": said})
                 _close_killed_trial(log, rig, recorder)
             cause = _trials(plan, rig, recorder, operator, interrupts, observe, log)
         except UserError:
@@ -111,6 +115,9 @@ def run(
     for tag, value in recorder.unwritten:
         if tag == wal.END and log.trials and log.trials[-1].end is None:
             log.trials[-1].end = value
+    done = tuple(r.name for r in log.trials if r.complete)
+    if not cause and not {t.name for t in plan.trials} <= {r.start["planned"] for r in log.trials if r.complete}:
+        cause = "; ".join(map(str, log.damage))  # All trials were carried out, but the disk did not keep one whole.
     try:
         convert.publish(log, output, overwrite=resume)
     except UserError as error:
@@ -120,7 +127,6 @@ def run(
         ) from error
     if not cause:
         path.unlink()
-    done = tuple(r.name for r in log.trials if r.complete)
     return Outcome(output, done, cause, path if cause else None)
 
 

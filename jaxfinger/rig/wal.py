@@ -4,7 +4,8 @@
     frame = tag (4 bytes), length (u32), crc32 of tag + length + payload (u32), payload
 
 All numbers are little endian. HDF5 cannot be the log: killed between two flushes, an HDF5 file loses everything or
-cannot be opened (measured). A prefix of this file loses only the frame that was being written.
+cannot be opened (measured). A prefix of this file loses only the frame that was being written. Damage within the file
+costs the frames that it touches: reading goes on at the next tag whose frame has the right checksum.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +34,27 @@ MAX_FRAME_BYTES = 64 * 2**20
 
 # Tags. HEADER is the first frame. TRIAL and END enclose a trial, DATA holds a block of it, MARK a hold or directions.
 # An EVENT may stand anywhere.
-HEADER, TRIAL, DATA, MARK, EVENT, END = b"HEAD", b"TRIA", b"DATA", b"MARK", b"EVNT", b"ENDT"
+HEADER, TRIAL, DATA, MARK, EVENT, END = TAGS = b"HEAD", b"TRIA", b"DATA", b"MARK", b"EVNT", b"ENDT"
+_TAG = re.compile(b"|".join(TAGS))
+_SEARCH_BYTES = 2**20  # bytes of a damaged file that are searched for a tag at a time
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame: its tag, its payload, and the byte of the file at which it ends."""
+    """One frame: its tag, its payload, and the byte of the file at which it ends.
+
+    `damaged` counts the bytes between it and the sound frame before it that are no sound frame.
+    """
 
     tag: bytes
     payload: bytes
     end: int
+    damaged: int = 0
+
+    @property
+    def start(self) -> int:
+        """Byte of the file at which it begins."""
+        return self.end - _HEAD.size - len(self.payload)
 
     @property
     def json(self) -> dict[str, Any]:
@@ -70,6 +83,11 @@ def pack_block(block: Block) -> bytes:
     return _DATA.pack(len(block), block.x.shape[1], block.lost_before) + b"".join(a.tobytes() for a in arrays)
 
 
+def sample_bytes(channels: int) -> int:
+    """Bytes of one sample in the payload of a DATA frame."""
+    return 24 + 8 * channels  # number, time, state, flags, values
+
+
 def pack_json(value: dict[str, Any]) -> bytes:
     """Payload of every frame but DATA."""
     return json.dumps(value, separators=(",", ":")).encode()
@@ -84,7 +102,7 @@ def pack_frame(tag: bytes, payload: bytes) -> bytes:
 class LogWriter:
     """Appends frames. Each is handed to the operating system at once, so the death of this process loses none.
 
-    `end` is the length of the file's sound part.
+    `end` is the byte at which the file's last sound frame ends.
     """
 
     def __init__(self, file: io.RawIOBase | io.BufferedIOBase, end: int = 0):
@@ -141,7 +159,7 @@ class LogWriter:
 
 
 def frames(file: io.BufferedIOBase, name: str = "log") -> Iterator[Frame]:
-    """Yield the sound frames from the start on. A torn or damaged frame ends them without an error.
+    """Yield the sound frames. Damage between two of them is counted in the second; damage at the end ends them.
 
     Raises:
         UserError: the file is not a log.
@@ -149,14 +167,35 @@ def frames(file: io.BufferedIOBase, name: str = "log") -> Iterator[Frame]:
     if file.read(len(MAGIC)) != MAGIC:
         raise UserError(f"{name}: not a recording log of jaxfinger; give the file that ends in .wal.")
     end = len(MAGIC)
-    while len(head := file.read(_HEAD.size)) == _HEAD.size:
-        tag, length, crc = _HEAD.unpack(head)
-        if length > MAX_FRAME_BYTES or len(payload := file.read(length)) < length:
-            return
-        if zlib.crc32(payload, zlib.crc32(head[:8])) != crc:
-            return
-        end += _HEAD.size + length
-        yield Frame(tag, payload, end)
+    while (frame := _frame(file, end) or _next_frame(file, end + 1)) is not None:
+        yield replace(frame, damaged=frame.start - end)
+        end = frame.end
+
+
+def _frame(file: io.BufferedIOBase, at: int) -> Frame | None:
+    """The sound frame that begins at byte `at`, or None."""
+    file.seek(at)
+    if len(head := file.read(_HEAD.size)) < _HEAD.size:
+        return None
+    tag, length, crc = _HEAD.unpack(head)
+    if length > MAX_FRAME_BYTES or len(payload := file.read(length)) < length:
+        return None
+    if zlib.crc32(payload, zlib.crc32(head[:8])) != crc:
+        return None
+    return Frame(tag, payload, at + _HEAD.size + length)
+
+
+def _next_frame(file: io.BufferedIOBase, at: int) -> Frame | None:
+    """The first sound frame with one of TAGS that begins at byte `at` or later, or None."""
+    while True:
+        file.seek(at)
+        part = file.read(_SEARCH_BYTES)
+        for found in _TAG.finditer(part):
+            if (frame := _frame(file, at + found.start())) is not None:
+                return frame
+        if len(part) < _SEARCH_BYTES:
+            return None
+        at += len(part) - len(HEADER) + 1  # A tag may lie across the two parts.
 
 
 def read_log(path: str | Path) -> Iterator[Frame]:
@@ -170,7 +209,7 @@ def read_log(path: str | Path) -> Iterator[Frame]:
 
 
 def sound_length(path: str | Path) -> int:
-    """Length in bytes of the sound part of a log."""
+    """Byte of a log at which its last sound frame ends: what follows is torn."""
     end = len(MAGIC)
     for frame in read_log(path):
         end = frame.end

@@ -1,4 +1,4 @@
-"""The log: every prefix of it can be read, and damage costs only the frames from there on."""
+"""The log: every prefix of it can be read, and damage costs only the frames that it touches."""
 
 import io
 
@@ -69,12 +69,27 @@ def test_killed_at_every_byte_of_a_frame():
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_a_flipped_bit_costs_only_what_follows(data):
+def test_a_flipped_bit_costs_only_the_frame_that_it_hits(data):
     file, ends = a_log()
     image = bytearray(file.getvalue())
     at = data.draw(st.integers(len(wal.MAGIC), len(image) - 1))
     image[at] ^= 1 << data.draw(st.integers(0, 7))
-    assert len(list(frames_in(bytes(image)))) == sum(end <= at for end in ends)
+    hit = sum(end <= at for end in ends)
+    starts = [len(wal.MAGIC), *ends]
+    whole, found = list(frames_in(file.getvalue())), list(frames_in(bytes(image)))
+    assert [f.payload for f in found] == [f.payload for i, f in enumerate(whole) if i != hit]
+    assert [(f.start, f.damaged) for f in found if f.damaged] == [
+        (end, end - start) for start, end in zip(starts, ends, strict=False) if start <= at < end and end != ends[-1]
+    ]
+
+
+@pytest.mark.parametrize("most", [7, 64, 1 << 20])
+def test_the_search_for_the_next_frame_finds_a_tag_wherever_it_lies(monkeypatch, most):
+    monkeypatch.setattr(wal, "_SEARCH_BYTES", most)
+    file, ends = a_log()
+    image = bytearray(file.getvalue())
+    image[ends[3] : ends[4]] = bytes(ends[4] - ends[3])
+    assert [f.damaged for f in frames_in(bytes(image))] == [0, 0, 0, 0, ends[4] - ends[3], *[0] * 7]
 
 
 @settings(max_examples=40, deadline=None)
