@@ -13,7 +13,9 @@ from typing import Protocol, runtime_checkable
 
 from jaxfinger.errors import UserError
 
-READ_S = 0.5  # s that a prompt must have been on the screen before Enter answers it: two presses in a row are one
+# s that a prompt must have been on the screen, without an Enter, before Enter answers it: two presses in a row are one,
+# and a key that is held down, which repeats every 30 ms, answers nothing.
+READ_S = 0.5
 
 
 @runtime_checkable
@@ -115,7 +117,8 @@ class AtTerminal:
             if self._enter.wait(0.05):
                 if shown is not None and time.monotonic() - shown >= READ_S:
                     return
-                self._enter.clear()  # Nobody can have read the prompt yet.
+                self._enter.clear()  # Nobody can have read the prompt yet, or the key is held down.
+                shown = None if shown is None else time.monotonic()
 
     def stop_requested(self) -> bool:
         """Whether q, space or Escape was pressed, or the terminal is gone."""

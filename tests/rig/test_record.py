@@ -130,6 +130,19 @@ def test_keys_at_the_terminal(key, monkeypatch):
     AtTerminal(said.append).ask("dead", lambda: False)
 
 
+def test_an_enter_that_is_held_down_answers_no_prompt(monkeypatch):
+    """Something lies on the keyboard. The key repeats faster than anybody reads."""
+    monkeypatch.setattr(operator, "READ_S", 0.2)
+    person, until = AtTerminal(lambda text: None), time.monotonic() + 0.6
+
+    def repeat() -> bool:
+        person.key("\n")
+        return time.monotonic() < until
+
+    person.ask("Hands off: the drives are about to be switched on.", repeat)
+    assert time.monotonic() >= until
+
+
 @pytest.mark.parametrize("shown", [False, True])
 def test_enter_answers_no_prompt_that_nobody_can_have_read(shown):
     """The prompt waits for a terminal that takes no output, or has been on the screen for an instant."""
