@@ -281,7 +281,7 @@ class Rig(ABC):
 
     def __exit__(self, kind, error, trace) -> None:
         # A rig that does not answer cannot be told to release. It gets no heartbeat either, so it releases by itself.
-        with suppress(UserError):
+        with suppress(Exception):
             if self.status().state in (State.ARMED, State.MOVING):
                 self.release()
         self.close()

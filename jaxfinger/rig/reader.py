@@ -146,7 +146,7 @@ class Reader:
         self.note("stop", violation.sentence)
         try:
             self.rig.stop(violation.trip)
-        except UserError as error:
+        except Exception as error:  # Of any kind: without a heartbeat the controller releases the finger by itself.
             self.note("stop", f"the stop was not acknowledged: {error}")
 
     def note(self, kind: str, text: str) -> None:

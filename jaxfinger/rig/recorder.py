@@ -97,7 +97,7 @@ class Recorder:
             self._since.popleft()
         try:
             self._log.sync()
-        except OSError as error:
+        except Exception as error:
             self._fail(error)
         self._log.close()
 
@@ -110,7 +110,7 @@ class Recorder:
                 if time.monotonic() - self._synced > SYNC_S:
                     self._log.sync()
                     self._synced = time.monotonic()
-        except OSError as error:
+        except Exception as error:  # Of any kind: a thread that ends here would leave every later frame unwritten.
             self._fail(error)
             if tag != wal.DATA:
                 self.unwritten.append((tag, value))
@@ -118,8 +118,9 @@ class Recorder:
             with self._lock:
                 self._waiting -= len(value)
 
-    def _fail(self, error: OSError) -> None:
-        self.failure = self.failure or f"{self.path.name} cannot be written: {error.strerror or error}"
+    def _fail(self, error: Exception) -> None:
+        said = (isinstance(error, OSError) and error.strerror) or f"{type(error).__name__}: {error}"
+        self.failure = self.failure or f"{self.path.name} cannot be written: {said}"
 
 
 def _refuse_full_disk(folder: Path) -> None:

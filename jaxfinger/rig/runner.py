@@ -28,7 +28,7 @@ from jaxfinger.rig.reader import Reader, tripped
 from jaxfinger.rig.safety import Violation
 from jaxfinger.rig.signals import INTERRUPTED, Interrupts
 from jaxfinger.rig.trips import FULL_COUNT
-from jaxfinger.rig.waits import AtPose, Elapsed, Passes, Steady, reached
+from jaxfinger.rig.waits import AtPose, Elapsed, Passes, Steady, pulled, reached, tensions
 from jaxfinger.rig.watch import Watch
 
 DRIVES_ON = (State.ARMED, State.MOVING)
@@ -39,9 +39,6 @@ AFTER_TRIP_S = 1.0
 QUIET_S = 0.3
 QUIET_TIMEOUT_S = 5.0  # s to wait for these samples. Much longer, since the first samples of a busy host come late.
 TIMEOUT_MARGIN_S = 5.0  # s by which a wait of known length may take longer before the trial ends
-# N of measured tension, up to which a tendon counts as released. In 0.7 s the controller ramps to 2 N, then to 0.5 N
-# (docs/plc-contract.md); what lies between is for zeros of load cells and for friction that holds a tendon.
-RELEASED_TENSION = 2.0
 TENSION_NOT_SEEN_TO_FALL = "tension was not seen to fall, so switch the drives off and see that it is off"
 
 
@@ -122,7 +119,7 @@ class Runner:
             self.carry_out(trial.protocol(self.rig.description), (name, number, count))
             self.reader.end({"complete": True})
             return ""
-        except UserError as error:
+        except Exception as error:  # Of any kind: the finger is armed.
             return self.abort(error)
         except KeyboardInterrupt:
             return self.abort_interrupted()
@@ -131,21 +128,22 @@ class Runner:
         """Stop the rig after a KeyboardInterrupt. Return why the run ended."""
         return self.abort(TrialEnded(INTERRUPTED, Trip.OPERATOR))
 
-    def abort(self, error: UserError) -> str:
+    def abort(self, error: Exception) -> str:
         """Stop the rig unless it is stopped, record AFTER_TRIP_S more, end the trial. Return why it ended.
 
-        If no sample shows the controller stopped and every tendon's measured tension at most RELEASED_TENSION, the
-        sentence tells the operator to switch the drives off.
+        If no sample shows the controller stopped and no drive's tension, the sentence tells the operator to switch the
+        drives off.
         """
         reader = self.reader
         trip, seq = (error.trip, error.seq) if isinstance(error, TrialEnded) else (Trip.HOST, None)
+        said = str(error) if isinstance(error, UserError) else f"the recorder failed ({type(error).__name__}: {error})"
+        cause = said.rstrip(".")
         if seq is None:  # What is read from here on shows the release.
             seq = reader.violation.since if reader.violation is not None else reader.latest_seq + 1
         if not (tripped(reader.latest) or isinstance(error, ControllerStopped)):
-            reader.stop(Violation.of_host(trip, reader.latest_seq, str(error).rstrip(".")))
+            reader.stop(Violation.of_host(trip, reader.latest_seq, cause))
         self._let_pass(AFTER_TRIP_S, self._released)  # A busy host first has to read the samples before the stop.
         self._let_pass(AFTER_TRIP_S)
-        cause = str(error).rstrip(".")
         if reader.latest is not None and not self._released():
             cause = f"{cause}; {TENSION_NOT_SEEN_TO_FALL}"
         if reader.recording:
@@ -153,15 +151,10 @@ class Runner:
         return cause
 
     def _released(self) -> bool:
-        """Whether the newest sample shows the controller stopped or idle, and no drive's tension beyond
-        RELEASED_TENSION. A load cell that reads NaN, or that a tendon pushes, sees no tension fall.
-        """
-        block, rig = self.reader.latest, self.rig.description
-        if block is None or not (tripped(block) or int(block.state[-1]) == State.IDLE):
-            return False
-        pulled = [name for name, active in zip(rig.finger.tendon_names, rig.finger.active, strict=True) if active]
-        tensions = block.x[-1, rig.columns("tension", pulled)]
-        return bool(np.all(np.abs(tensions) <= RELEASED_TENSION))
+        """Whether the newest sample shows the controller stopped or idle, and no drive's tension."""
+        block = self.reader.latest
+        idle = block is not None and (tripped(block) or int(block.state[-1]) == State.IDLE)
+        return idle and not pulled(tensions(block, self.rig.description))
 
     def arm(self, name: str) -> None:
         """Bring the controller to IDLE, wait for samples without a violation, and arm the rig.
@@ -194,6 +187,9 @@ class Runner:
             bad = self.reader.unarmed_violation
             what = bad.sentence if bad is not None else "too few samples came"
             raise UserError(f"nothing was armed: {what}.")
+        if still := pulled(tensions(self.reader.latest, rig.description)):
+            mend = "free the tendon, or see its load cell and its offset"
+            raise UserError(f"nothing was armed: with the drives off {still}; {mend}.")
         self.watch.guard()
         self._sent(rig.arm)
 
@@ -205,7 +201,7 @@ class Runner:
             self._check(None)
             if self.rig.status().state is not State.IDLE or not self._released():
                 raise TrialEnded("the controller did not release the finger after the last trial", Trip.HOST)
-        except UserError as error:
+        except Exception as error:  # Of any kind, as in `trial`.
             return self.abort(error)
         return ""
 
@@ -252,13 +248,13 @@ class Runner:
             return self.reader.error is None and self.reader.violation is None and not off and not late()
 
         armed, patience, asked = self.watch.guards, self.rig.description.deadlines.prompt_s, time.monotonic()
-        limit = f" The finger is armed: without an answer within {patience:g} s it is released." if armed else ""
-        self.operator.ask(text + limit, keep_waiting)
+        limit = f"without an answer within {patience:g} s it is released."
+        on = max(map(abs, tensions(self.reader.latest, self.rig.description).values()), default=0.0)
+        self.operator.ask(f"{text} The finger is armed, with {on:.1f} N: {limit}" if armed else text, keep_waiting)
         self._heed_stop_key()
         self._check(self.reader.latest if armed else None)
-        if (
-            late()
-        ):  # Also where Enter came just then: who answers a prompt that is over does not expect a motor to move.
+        # Also where Enter came just then: who answers a prompt that is over does not expect a motor to move.
+        if late():
             said = f"nobody answered the prompt within {patience:g} s (prompt_s of [rig]), so the finger is released"
             raise TrialEnded(said, Trip.HOST)
 

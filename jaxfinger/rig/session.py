@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from jaxfinger.data.toml import parse_toml
-from jaxfinger.errors import UserError, counted
+from jaxfinger.errors import UserError, counted, listed
 from jaxfinger.rig import convert, wal
 from jaxfinger.rig.backend import Rig, Setup, TensionRamp
 from jaxfinger.rig.channels import MIN_DYNAMIC_BANDWIDTH, Filter, RigDescription
@@ -116,8 +116,9 @@ def run(
         if tag == wal.END and log.trials and log.trials[-1].end is None:
             log.trials[-1].end = value
     done = tuple(r.name for r in log.trials if r.complete)
-    if not cause and not {t.name for t in plan.trials} <= {r.start["planned"] for r in log.trials if r.complete}:
-        cause = "; ".join(map(str, log.damage))  # All trials were carried out, but the disk did not keep one whole.
+    whole = {r.start["planned"] for r in log.trials if r.complete}
+    if not cause and (lacking := [t.name for t in plan.trials if t.name not in whole]):
+        cause = "; ".join([f"the disk did not keep {listed(lacking)} whole", *map(str, log.damage)])
     try:
         convert.publish(log, output, overwrite=resume)
     except UserError as error:
@@ -242,10 +243,10 @@ def _trials(
         try:
             runner.arm(plan.operator)
             runner.carry_out(_zero_excursions(rig.description), ("reference", 0, len(plan.trials)))
-        except UserError as error:
-            if not runner.watch.guards and reader.violation is None:  # Nothing was armed.
-                raise UserError(str(error)) from error
-            return runner.abort(error)
+        except Exception as error:  # Of any kind: the finger may be armed.
+            if runner.watch.guards or reader.violation is not None:
+                return runner.abort(error)
+            raise  # Nothing was armed.
         for trial in left:
             name, again = trial.name, 1
             while name in names:

@@ -10,6 +10,26 @@ from jaxfinger.rig.contract import State
 from jaxfinger.rig.protocols import Covered, Settled
 from jaxfinger.rig.reader import Reader
 
+# N of measured tension, up to which a tendon counts as released. In 0.7 s the controller ramps to 2 N, then to 0.5 N
+# (docs/plc-contract.md); what lies between is for zeros of load cells and for friction that holds a tendon.
+RELEASED_TENSION = 2.0
+
+
+def tensions(block: Block | None, rig: RigDescription) -> dict[str, float]:
+    """Newest tension in N of every tendon that a drive pulls, by name of the channel; empty without a block."""
+    if block is None:
+        return {}
+    active = [name for name, active in zip(rig.finger.tendon_names, rig.finger.active, strict=True) if active]
+    return {rig.channels[column].name: float(block.x[-1, column]) for column in rig.columns("tension", active)}
+
+
+def pulled(tension: dict[str, float]) -> str:
+    """What a channel reads beyond RELEASED_TENSION, or an empty string.
+
+    A load cell that reads NaN, or that a tendon pushes, sees no tension fall.
+    """
+    return next((f"'{k}' reads {v:.3g} N" for k, v in tension.items() if not abs(v) <= RELEASED_TENSION), "")
+
 
 class Elapsed:
     """`seconds` of device time have passed since now."""

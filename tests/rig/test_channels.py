@@ -64,12 +64,20 @@ def test_the_line_is_the_very_line():
         parse_rig(text, "bench.toml")
 
 
-@pytest.mark.parametrize("name", asdict(parse_rig(GOOD).limits))
+@pytest.mark.parametrize("name", [k for k in asdict(parse_rig(GOOD).limits) if k != "joint_acceleration"])
 def test_a_missing_limit_is_refused(name):
     name = next(n for n in (name, f"{name}_deg", f"{name}_deg_s") if f"{n} =" in GOOD)
     text = "\n".join(row for row in GOOD.splitlines() if not row.startswith(f"{name} ="))
     with pytest.raises(UserError, match=rf"line \d+: limits\.{name}: is missing; add a line"):
         parse_rig(text)
+
+
+def test_the_limit_on_accelerations_has_a_default():
+    """It admits the moves of every trial that gives none; rig files from before this limit stay good."""
+    assert "joint_acceleration_deg_s2" not in GOOD
+    assert np.degrees(parse_rig(GOOD).limits.joint_acceleration) == pytest.approx(1200.0)
+    lower = GOOD.replace("[limits]\n", "[limits]\njoint_acceleration_deg_s2 = 700.0\n", 1)
+    assert np.degrees(parse_rig(lower).limits.joint_acceleration) == pytest.approx(700.0)
 
 
 @pytest.mark.parametrize(

@@ -73,6 +73,24 @@ def test_a_trial_whose_last_samples_the_disk_refused_is_not_complete(tmp_path):
     assert "No space left" in end["cause"]
 
 
+def test_a_writer_that_fails_for_any_reason_is_a_reason_to_stop_and_goes_on(tmp_path):
+    """A thread that ended would look like a slow disk for a second, and at the end of a run like nothing at all."""
+
+    class Odd(wal.LogWriter):
+        def write(self, tag, payload):
+            if tag == wal.DATA:
+                raise ValueError("write to closed file")
+            super().write(tag, payload)
+
+    log = Recorder(tmp_path / "a.wal", {}, opener=Odd.create)
+    log.block(block(0))
+    log.put(wal.END, {"complete": True})
+    log.close()
+    assert log.failure == "a.wal cannot be written: ValueError: write to closed file"
+    assert (log.waiting, log.waiting_s) == (0, 0.0)
+    assert not next(f.json for f in wal.read_log(log.path) if f.tag == wal.END)["complete"]
+
+
 def test_a_folder_that_is_missing_is_a_sentence(tmp_path):
     with pytest.raises(UserError, match="choose a folder that exists"):
         Recorder(tmp_path / "missing" / "a.wal", {})

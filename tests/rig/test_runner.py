@@ -365,7 +365,7 @@ def test_a_prompt_that_nobody_answers_in_time_releases_an_armed_finger(rig, reco
     outcome = record(machine, operator=person)
     said = "01-ID.2-DIP: nobody answered the prompt within 0.2 s (prompt_s of [rig]), so the finger is released"
     assert outcome.cause == said
-    assert "without an answer within 0.2 s it is released" in person.prompts[-1]
+    assert "The finger is armed, with 2.0 N: without an answer within 0.2 s it is released." in person.prompts[-1]
     assert machine.controller.state is State.TRIPPED
     assert max(machine.controller.setpoint) == 0.0
     assert outcome.complete == ()
@@ -499,3 +499,40 @@ def test_a_controller_that_lets_go_by_itself_ends_the_trial(rig, record, kind):
     assert outcome.complete == ()
     assert not read_session(outcome.session)["01-ID.2-DIP"].complete
     assert machine.controller.state is State.TRIPPED
+
+
+@pytest.mark.parametrize("pull", [6.0, -6.0])
+def test_a_tension_that_stands_with_the_drives_off_arms_nothing(rig, record, pull):
+    """A load cell that is off by this would have the controller pull as much too hard, or too little."""
+    controller = Controller()
+    controller.strike("spike", controller.slots.tension[2], amount=pull, standing=True)
+    with pytest.raises(
+        UserError, match=r"nothing was armed: with the drives off 'tension T3' reads -?\d\.?\d* N; free"
+    ):
+        record(SimulatedRig(rig, controller))
+    assert controller.state is State.IDLE
+
+
+def test_a_load_cell_that_is_off_by_little_arms(rig, record):
+    controller = Controller()
+    controller.strike("spike", controller.slots.tension[2], amount=0.2, standing=True)
+    assert record(SimulatedRig(rig, controller)).cause == ""
+
+
+@pytest.mark.parametrize("where", ["observer", "stop"])
+def test_an_error_of_any_kind_at_an_armed_finger_stops_it_and_looks_whether_tension_falls(rig, record, where):
+    machine = SimulatedRig(rig)
+
+    def fail(m):
+        if where == "stop":
+            m.stop = fail
+        raise OSError("no such socket")
+
+    outcome = record(machine, fail)
+    assert outcome.cause.startswith("02-ID.4-T3-MCP: the recorder failed (OSError: no such socket)")
+    assert (TENSION_NOT_SEEN_TO_FALL in outcome.cause) == (where == "stop")
+    assert not read_session(outcome.session)["02-ID.4-T3-MCP"].complete
+    for _ in range(1200):
+        machine.controller.cycle()
+    assert machine.controller.state is not State.ARMED
+    assert max(machine.controller.setpoint) == 0.0
