@@ -6,14 +6,14 @@ from collections import Counter
 
 import numpy as np
 
+from jaxfinger.data.check_links import check_links
 from jaxfinger.data.findings import Report
 from jaxfinger.data.schema import JOINTS, LINKS
 from jaxfinger.data.session import FingerDescription
 
 UNIT_AXIS_TOLERANCE = 1e-3  # of an axis's length: axes typed with three digits pass.
 _ROUNDING = 1e-5  # relative: 100 times that of float32, for tables that were computed in it
-_LEAD_DENSITY = 11_300.0  # kg/m³
-_MAX_LENGTH = 2.0  # m: longer than any finger or arm, so that a larger number is one in mm.
+_MAX_LENGTH = 2.0  # m: longer than any link of a finger or arm, so that a larger number is one in mm or cm.
 _MAX_ARM = 0.5  # m: larger than any moment arm, so that a larger number is one in mm.
 
 
@@ -26,7 +26,8 @@ def check_finger(finger: FingerDescription, report: Report) -> None:
         _joints(finger, report)
         _links(finger, report)
         _lengths(finger, report)
-        _weight(finger, report)
+        if report.fatal is None:
+            check_links(finger, report)
     _tendons(finger, report)
     _excursion(finger, report)
 
@@ -105,16 +106,6 @@ def _links(finger: FingerDescription, report: Report) -> None:
         report.error("/finger/joints/rotor_inertia", "is missing beside its standard deviation; write both or neither")
 
 
-def _weight(finger: FingerDescription, report: Report) -> None:
-    """Report grams written as kg: no machine is heavier than a cube of lead of its length."""
-    length = float(np.linalg.norm(finger.origin, axis=1).sum() + np.linalg.norm(finger.fingertip))
-    if not any(finger.prismatic) and length > 0.0 and finger.mass.sum() > _LEAD_DENSITY * length**3:
-        report.warning(
-            "/finger/links/mass",
-            f"the links weigh {finger.mass.sum():.4g} kg at {length:.3g} m of length; check that these are no grams",
-        )
-
-
 def _inertia(inertia: np.ndarray, mass: float) -> str | None:
     """Fault of an inertia matrix that no body has, or None."""
     scale = float(np.abs(inertia).max())
@@ -136,11 +127,12 @@ def _inertia(inertia: np.ndarray, mass: float) -> str | None:
 def _lengths(finger: FingerDescription, report: Report) -> None:
     if any(finger.prismatic):
         return
-    lengths = {"joints/origin": finger.origin, "links/com": finger.com, "fingertip": finger.fingertip}
-    for key, value in lengths.items():
-        longest = float(np.linalg.norm(np.atleast_2d(value), axis=1).max())
-        if longest > _MAX_LENGTH:
-            report.error(f"/finger/{key}", f"reaches {longest:.4g} m; convert mm to m")
+    lengths = {"joints/origin": finger.origin, "links/com": finger.com, "fingertip": finger.fingertip[None]}
+    for key, vectors in lengths.items():
+        for i, length in enumerate(np.linalg.norm(vectors, axis=1)):
+            if length > _MAX_LENGTH:
+                at, row = ("", None) if key == "fingertip" else (f" at joint {finger.joint_names[i]}", i)
+                report.error(f"/finger/{key}", f"is {length:.4g} m long{at}; convert mm or cm to m", row=row)
 
 
 def _tendons(finger: FingerDescription, report: Report) -> None:

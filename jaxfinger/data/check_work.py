@@ -197,8 +197,15 @@ def _free_paths(session: Session, kinematic: _Excursions, report: Report) -> Non
 
 
 def _fingertip(session: Session, report: Report) -> None:
-    """Report fingertip forces that are too large or too small for the tension."""
+    """Report fingertip forces that are too large or too small for the tension, or without a lever."""
     found, names = [], session.finger.tendon_names
+    without_lever = not np.cross(session.finger.axis[-1], session.finger.fingertip).any()
+    if without_lever and any(t.fingertip_force is not None for t in session.select("VD.2")):
+        report.warning(
+            "/finger/fingertip",
+            f"lies on the axis of joint {session.finger.joint_names[-1]}, so that no force there turns it, though VD.2 "
+            "presses with the fingertip; write the contact point in the last link's frame",
+        )
     for trial in session.select("VD.2"):
         if trial.tendon not in names or trial.fingertip_force is None or trial.tendon_force is None:
             continue

@@ -75,7 +75,7 @@ ERRORS = {
     "axis twice as long": (values("finger/joints/axis", lambda x: 2 * x), "/finger/joints/axis", "2 long"),
     "limits reversed": (values("finger/joints/limits", lambda x: x[:, ::-1]), "/finger/joints/limits", "swap"),
     "limits in degrees": (values("finger/joints/limits", np.rad2deg), "/finger/joints/limits", "degrees"),
-    "lengths in mm": (values("finger/joints/origin", lambda x: 1e3 * x), "/finger/joints/origin", "mm to m"),
+    "lengths in mm": (values("finger/joints/origin", lambda x: 1e3 * x), "/finger/joints/origin", "mm or cm to m"),
     "mass zero": (values("finger/links/mass", at(0, 0.0)), "/finger/links/mass", "positive"),
     "mass NaN": (values("finger/links/mass", at(0, np.nan)), "/finger/links/mass", "not finite"),
     "inertia skew": (values("finger/links/inertia", at((0, 0, 1), 1e-6)), "/finger/links/inertia", "symmetric"),

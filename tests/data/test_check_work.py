@@ -58,6 +58,17 @@ def test_an_excursion_that_stands_still_is_said_though_it_has_noise(sound):
     assert any("T1 at MCP (" in text and "against 5 mm); check the units or the column" in text for text in said)
 
 
+def test_a_fingertip_on_the_last_axis_is_said_where_it_presses(sound):
+    """Where nothing is pressed, nobody needs the contact point."""
+    axial = replace(sound, finger=replace(sound.finger, fingertip=np.array([0.0, 0.01, 0.0])))
+    pressed = {n: t for n, t in axial.trials.items() if t.experiment == "VD.2"}
+    words = "lies on the axis of joint PIP"
+    assert any(words in text for text in complaints(axial))
+    assert not any(words in text for text in complaints(sound))
+    free = replace(axial, trials={n: t for n, t in axial.trials.items() if n not in pressed})
+    assert not any(words in text for text in complaints(free))
+
+
 def test_a_late_torque_is_not_said_to_have_the_wrong_sign_alone(sound):
     trial = sound["03-ID.3-dynamic-MCP"]
     late = replace(trial, joint_torque=np.roll(trial.joint_torque, 100, axis=0))
