@@ -4,7 +4,7 @@
 2. Where the finger's description holds excursions, ID.2 shows the same ones.
 3. A tendon that is pulled at a held posture (ID.4) stretches, and no other does.
 
-Two columns are reported only if each shows what the other should. A fault in one of them alone has other explanations.
+Two columns are reported only if each shows what the other should. `check_arms` then reports what is wrong of one alone.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from itertools import combinations
 
 import numpy as np
 
-from jaxfinger.data.check_trial import STILL_ANGLE
+from jaxfinger.data.check_arms import MIN_TRAVEL_ARM, Arms, check_arms, measured_arms
 from jaxfinger.data.check_work import slope, thinned
 from jaxfinger.data.findings import Report
 from jaxfinger.data.session import FingerDescription, Session, Trial
 
-# Shares of the largest moment arm at a joint. A tendon with a smaller arm than the first stands still, one with a
-# larger arm than the second travels. An arm between them may be a small one, or a tendon may be dragged along.
-_MAX_STILL_ARM, _MIN_TRAVEL_ARM = 0.05, 0.25
+# Share of the largest moment arm at a joint: a tendon with a smaller arm stands still. Between this arm and that of a
+# tendon that travels, an arm may be a small one, or a tendon may be dragged along.
+_MAX_STILL_ARM = 0.05
 _MAX_CAD_ERROR = 0.2  # of the known arms: CAD is good to a tenth, so columns that miss by less may be right.
 _MAX_EXCHANGED_ERROR = 0.25  # of the error as named: exchanged columns must fit the known arms this much better.
 _MIN_STRETCH_R2 = 0.9  # squared correlation of excursion with tension, from which the tendon is taken to stretch
@@ -33,7 +33,7 @@ def check_columns(session: Session, report: Report) -> None:
     if any(session.finger.prismatic):
         return
     told: set[tuple[int, int]] = set()
-    arms = _arms(session)
+    arms = measured_arms(session)
     for evidence in (_by_crossing(session.finger, arms), _by_description(session.finger, arms), _by_stretch(session)):
         for pair, why in evidence:
             if pair not in told:
@@ -41,26 +41,15 @@ def check_columns(session: Session, report: Report) -> None:
                 first, second = (session.finger.tendon_names[k] for k in pair)
                 message = f"columns {first} and {second} of tendon_excursion look exchanged: {why}"
                 report.warning("/trials", f"{message}; exchange them, or correct what contradicts them")
+    check_arms(session.finger, arms, {k for pair in told for k in pair}, report)
 
 
-def _arms(session: Session) -> dict[int, np.ndarray]:
-    """Moment arms dl/dq of all tendons, m/rad, by joint: medians over the ID.2 trials in which no other joint turns."""
-    found: dict[int, list[np.ndarray]] = defaultdict(list)
-    for trial in session.select("ID.2"):
-        spans = np.ptp(trial.q, axis=0)
-        i = int(np.argmax(np.nan_to_num(spans)))
-        if trial.tendon_excursion is not None and np.all(np.delete(spans, i) < STILL_ANGLE) and spans[i] > STILL_ANGLE:
-            q = thinned(trial.q[:, i])
-            found[i].append(np.array([slope(q, thinned(l)) for l in trial.tendon_excursion.T]))
-    return {i: np.median(arms, axis=0) for i, arms in found.items()}
-
-
-def _by_crossing(finger: FingerDescription, arms: dict[int, np.ndarray]) -> Iterator[tuple[tuple[int, int], str]]:
+def _by_crossing(finger: FingerDescription, arms: dict[int, Arms]) -> Iterator[tuple[tuple[int, int], str]]:
     """Pairs of tendons of which one crosses a joint and stands still there, and the other the other way round."""
-    for i, seen in arms.items():
+    for i, seen in ((i, at.seen) for i, at in arms.items()):
         size = np.abs(seen) / np.nanmax(np.abs(seen[finger.active]), initial=0.0)
         still = np.flatnonzero(finger.active & finger.crosses[:, i] & (size < _MAX_STILL_ARM))
-        travel = np.flatnonzero(finger.active & ~finger.crosses[:, i] & (size > _MIN_TRAVEL_ARM))
+        travel = np.flatnonzero(finger.active & ~finger.crosses[:, i] & (size > MIN_TRAVEL_ARM))
         if len(still) == len(travel) == 1:
             (a,), (b,) = still, travel
             names, joint = finger.tendon_names, finger.joint_names[i]
@@ -71,24 +60,21 @@ def _by_crossing(finger: FingerDescription, arms: dict[int, np.ndarray]) -> Iter
             )
 
 
-def _by_description(finger: FingerDescription, arms: dict[int, np.ndarray]) -> Iterator[tuple[tuple[int, int], str]]:
+def _by_description(finger: FingerDescription, arms: dict[int, Arms]) -> Iterator[tuple[tuple[int, int], str]]:
     """Pairs of tendons whose measured arms fit the known excursions only if they are exchanged."""
-    if finger.excursion is None:
-        return
-    powers = np.arange(1, finger.excursion.shape[2] + 1)
     for a, b in combinations(np.flatnonzero(finger.active), 2):
-        own, crossed, size, said = 0.0, 0.0, 0.0, ""
-        for i, seen in arms.items():
-            middle = finger.limits[i].mean()
-            known = finger.excursion[[a, b], i] @ (powers * middle ** (powers - 1))
-            if np.isfinite([*known, seen[a], seen[b]]).all():
-                own += np.abs(seen[[a, b]] - known).sum()
-                crossed += np.abs(seen[[b, a]] - known).sum()
+        own, crossed, turned, size, said = 0.0, 0.0, 0.0, 0.0, ""
+        for i, at in arms.items():
+            seen, known = at.seen[[a, b]], at.known[[a, b]]
+            if np.isfinite([*known, *seen]).all():
+                own += np.abs(seen - known).sum()
+                crossed += np.abs(seen[::-1] - known).sum()
+                turned += np.abs(seen + known).sum()
                 size += np.abs(known).sum()
-                shown, told = (" and ".join(f"{1e3 * arm:.3g}" for arm in x) for x in (seen[[a, b]], known))
+                shown, told = (" and ".join(f"{1e3 * arm:.3g}" for arm in x) for x in (seen, known))
                 joint = finger.joint_names[i]
                 said = said or f"ID.2 shows {shown} mm a radian at {joint}, the finger's file says {told}"
-        if own > _MAX_CAD_ERROR * size and crossed < _MAX_EXCHANGED_ERROR * own:
+        if own > _MAX_CAD_ERROR * size and crossed < min(_MAX_EXCHANGED_ERROR * own, turned):
             yield (int(a), int(b)), f"{said} (where both are the other way round for each tendon: correct the signs)"
 
 
