@@ -94,7 +94,7 @@ def _standing(trial: Trial, finger: FingerDescription, joint: int, report: Repor
     values = getattr(trial, channel)
     if values is None or len(q) < _MIN_STILL or not np.isfinite(q).all():
         return
-    own, others, shown = _stretches(q), names[joint], []  # stretches of the angle, and the column that shows most
+    own, others, shown = _stretches(q), "", []  # stretches of the angle, and the column that shows most of them
     for k in np.flatnonzero(finger.active & finger.crosses[:, joint]).tolist() if led else [joint]:
         x = values[:, k]
         if np.isfinite(x).all():
