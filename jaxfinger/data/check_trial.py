@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaxfinger.data.check_jumps import check_jumps, placeholder
 from jaxfinger.data.findings import Report
 from jaxfinger.data.motion import MIN_HOLD, pulled_slowly
 from jaxfinger.data.schema import CHANNELS, DRIVES, MEASURED, MEASURES, NEEDS_JOINT, NEEDS_TENDON
 from jaxfinger.data.session import FingerDescription, Trial
 from jaxfinger.data.sizes import Sizes
-from jaxfinger.data.units import conversion
+from jaxfinger.data.units import conversion, whole_turns
 from jaxfinger.errors import counted, listed
 
 STILL_ANGLE = 0.01  # rad: five times the noise of a 14-bit encoder
+_MIN_MOTION = 0.1  # rad: fixtures that hold a joint yield by less.
 STILL_DISTANCE = 1e-4  # m, likewise of a prismatic joint: a hundredth of a rad at a radius of 10 mm
 MAX_OVERTRAVEL = 0.35  # rad, 20 degrees, that a joint may read beyond its limits, since stated limits are approximate
 # Readings below zero, as shares of the highest tension. A good tare is off by a hundredth. A taut tendon is held at a
@@ -44,7 +46,7 @@ def check_trial(trial: Trial, finger: FingerDescription, sizes: Sizes, report: R
     _constant_columns(trial, finger, report)
     _clipped_columns(trial, finger, report)
     _placeholders(trial, finger, report)
-    _encoder_wraps(trial, finger, report)
+    check_jumps(trial, finger, _still_spans(finger), report)
     _magnitudes(trial, finger, sizes, report)
     _holds(trial, report)
 
@@ -227,7 +229,7 @@ def _motion(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repor
         (name, span)
         for name, span, slides in zip(finger.joint_names, spans, finger.prismatic, strict=True)
         if not slides
-        and span > 0.1
+        and span > _MIN_MOTION
         and (trial.experiment in ("ID.4", "VD.2") or (trial.experiment == "ID.2" and trial.joint not in (None, name)))
     ]
     for name, span in held:
@@ -280,7 +282,7 @@ def _clipped_columns(trial: Trial, finger: FingerDescription, report: Report) ->
     for name in ("tendon_force", "joint_torque", "fingertip_force"):
         values = getattr(trial, name)
         for column, x in zip(CHANNELS[name].columns(finger), [] if values is None else values.T, strict=False):
-            if len(x) < _MIN_SAMPLES or not np.isfinite(x).all() or np.ptp(x) == 0.0 or _placeholder(x) is not None:
+            if len(x) < _MIN_SAMPLES or not np.isfinite(x).all() or np.ptp(x) == 0.0 or placeholder(x) is not None:
                 continue
             starts = np.flatnonzero(np.diff(x, prepend=np.nan) != 0.0)
             runs, held = np.diff(np.append(starts, len(x))), x[starts]
@@ -300,7 +302,7 @@ def _placeholders(trial: Trial, finger: FingerDescription, report: Report) -> No
     for name in MEASURED:
         values = getattr(trial, name)
         for column, x in zip(CHANNELS[name].columns(finger), [] if values is None else values.T, strict=False):
-            found = _placeholder(x)
+            found = placeholder(x)
             if found is not None:
                 at, count = trial.time[int(np.argmax(x == found))], counted(int((x == found).sum()), "sample")
                 report.warning(
@@ -308,38 +310,6 @@ def _placeholders(trial: Trial, finger: FingerDescription, report: Report) -> No
                     f"column {column} is {found:.6g} in {count}, first at {at:.6g} s, far from all others, as where a "
                     "number stands for a missing value; cut these samples out (`where` in a mapping)",
                 )
-
-
-def _placeholder(x: np.ndarray) -> float | None:
-    """Value of some samples that lies twice as far from the others as they span; None where there is none."""
-    if len(x) < _MIN_SAMPLES or not np.isfinite(x).all():
-        return None
-    for end in (x.min(), x.max()):
-        others = x[x != end]
-        if 1 < len(x) - len(others) < 0.5 * len(x) and np.abs(others - end).min() > 2.0 * np.ptp(others) > 0.0:
-            return float(end)
-    return None
-
-
-def _encoder_wraps(trial: Trial, finger: FingerDescription, report: Report) -> None:
-    """Report encoders that wrap: no joint goes half of the whole trial's travel between two samples."""
-    for k, name in enumerate(finger.joint_names):
-        x = trial.q[:, k]
-        if len(x) < _MIN_SAMPLES or not np.isfinite(x).all() or _placeholder(x) is not None:
-            continue
-        steps = np.abs(np.diff(x))
-        jumps = steps > 0.5 * np.ptp(x)
-        still = STILL_DISTANCE if finger.prismatic[k] else STILL_ANGLE
-        if not jumps.any() or np.ptp(x) < still or np.percentile(steps, 90.0) > 0.1 * np.ptp(x):
-            continue
-        size, at = float(np.median(steps[jumps])), trial.time[int(np.argmax(jumps))]
-        turn = not finger.prismatic[k] and abs(size / (2.0 * np.pi) - 1.0) < 0.1
-        what, where = "a whole turn" if turn else f"{size:.3g}", counted(int(jumps.sum()), "place")
-        report.warning(
-            _place(trial, "q"),
-            f"column {name} jumps by {what} between two samples at {where}, first at {at:.6g} s: the "
-            "encoder wraps or loses counts; unwrap it (`unwrap = true` in a mapping), or cut these places out",
-        )
 
 
 def _magnitudes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
@@ -351,11 +321,19 @@ def _magnitudes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: R
         low, high = np.percentile(trial.q[:, k], [1.0, 99.0])
         lower, upper = finger.limits[k]
         where = f"column {name} runs from {low:.3g} to {high:.3g} rad"
-        if max(-low, high) > 2.0 * np.pi:
-            count = "convert counts to rad (`scale` in a mapping)"
-            mend = conversion("deg") if max(-low, high) < _MAX_DEGREES else count
+        outside = low < lower - MAX_OVERTRAVEL or high > upper + MAX_OVERTRAVEL
+        turn = whole_turns(0.5 * (low + high), 2.0 * np.pi, finger.limits[k])
+        fits = low + turn >= lower - MAX_OVERTRAVEL and high + turn <= upper + MAX_OVERTRAVEL
+        degrees, unwrap = conversion("deg"), "take a whole turn off (`unwrap = true` in a mapping)"
+        # Degrees of a joint that moves would exceed its limits by more than a turn.
+        if outside and fits and abs(turn) < 4.0 * np.pi and high - low > _MIN_MOTION:
+            say = report.error if max(-low, high) > 2.0 * np.pi else report.warning
+            say(_place(trial, "q"), f"{where}, a turn beside its limits {lower:.3g} to {upper:.3g}; {unwrap}")
+        elif max(-low, high) > 2.0 * np.pi:
+            mend = degrees if max(-low, high) < _MAX_DEGREES else "convert counts to rad (`scale` in a mapping)"
+            mend += f", or {unwrap}" if fits and abs(turn) < 4.0 * np.pi else ""
             report.error(_place(trial, "q"), f"{where}, more than a turn; {mend}")
-        elif low < lower - MAX_OVERTRAVEL or high > upper + MAX_OVERTRAVEL:
+        elif outside:
             message = f"{where}, far outside its limits {lower:.3g} to {upper:.3g}; correct one or the other"
             report.warning(_place(trial, "q"), message)
     if trial.tendon_force is not None:

@@ -12,9 +12,10 @@ import numpy as np
 from jaxfinger.data.expressions import ExpressionError, evaluate
 from jaxfinger.data.findings import Report
 from jaxfinger.data.mapping import Column, ColumnSpec, MappedTrial, Reading, terms
+from jaxfinger.data.readings import compare_units, converted, period
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.toml import Place
-from jaxfinger.data.units import TO_SI, is_foreign, unit_name
+from jaxfinger.data.units import whole_turns
 from jaxfinger.errors import UserError, counted, listed
 
 if TYPE_CHECKING:
@@ -122,8 +123,11 @@ def _column(variable: Variable, name: str, column: Any, where: Place) -> tuple[n
     return values[:, column], column
 
 
-def single(source: Source, name: str, where: Place) -> float:
-    """Single number of this name, from the mapping's constants or else the recording."""
+def scale_of(reading: Reading, source: Source, where: Place) -> float:
+    """Scale of a reading: a number, or the single one of the constant or variable that it names."""
+    name, where = reading.scale, where / "scale"
+    if not isinstance(name, str):
+        return name
     values = np.asarray(source.constants.get(name) if name in source.constants else source.variable(name, where).values)
     if values.size != 1:
         where.fail(f"is scaled by {name!r}, which holds {values.size} values; name a single number")
@@ -182,8 +186,8 @@ def _times(reading: Reading, source: Source, where: Place, report: Report) -> Fl
     """Times of a clock, s."""
     variable = source.variable(reading.from_, where)
     values, _ = _column(variable, reading.from_, reading.column, where)
-    _compare_units(variable, reading, "s", report, where)
-    return _converted(values, reading, "s", source, where)
+    compare_units(variable, reading, "s", report, where)
+    return converted(values, reading, "s", scale_of(reading, source, where), where)
 
 
 def _first_rows(first: Column, source: Source, where: Place) -> np.ndarray | None:
@@ -291,15 +295,30 @@ class ColumnReader:
         """One column in `units` (SI): a term or a sum of terms. `whole` marks labels, which are not interpolated."""
         return np.sum([self._term(term, units, whole, where) for term in terms(spec)], axis=0)
 
+    def position(self, spec: ColumnSpec, units: str, limits: np.ndarray, where: Place) -> Float[np.ndarray, " N"]:
+        """Position of a joint with `limits` (2,), in `units` (SI).
+
+        An encoder that wraps gives it up to whole periods. Where the limits span less than a period, they tell which.
+        """
+        x = self.column(spec, units, False, where)
+        for term in terms(spec):
+            length = period(term, units, scale_of(term, self._source(term, where), where))
+            if length > np.ptp(limits) and np.isfinite(x).any():
+                x = x + whole_turns(0.5 * (np.nanmin(x) + np.nanmax(x)), length, limits)
+        return x
+
+    def _source(self, spec: Column, where: Place) -> Source:
+        return self.clock.source if spec.file is None else self.sources(spec.file, where)
+
     def _term(self, spec: Column, units: str, whole: bool, where: Place) -> np.ndarray:
         """One term, variable · scale + offset, in SI units on the trial's clock."""
         clock = self.clock
-        source = clock.source if spec.file is None else self.sources(spec.file, where)
+        source = self._source(spec, where)
         name = spec.from_
         variable = source.variable(name, where)
         values, k = _column(variable, name, spec.column, where)
-        _compare_units(variable, spec, units, self.report, where)
-        values = _converted(values, spec, units, source, where)
+        compare_units(variable, spec, units, self.report, where)
+        values = converted(values, spec, units, scale_of(spec, source, where), where)
         present = np.ones(len(values), bool) if variable.present is None else variable.present[:, k]
         own = self._own_clock(spec, variable, source, present, where)
         if own is None:
@@ -412,44 +431,6 @@ class ColumnReader:
     def covered(self) -> np.ndarray:
         """Mask of the samples at which every clock runs."""
         return (self.clock.time >= self.begin) & (self.clock.time <= self.end)
-
-
-def _converted(values: np.ndarray, spec: Reading, units: str, source: Source, where: Place) -> np.ndarray:
-    """Convert a variable to SI units: variable · scale + offset, unwrapped where the mapping says so."""
-    own = spec.units or units
-    if own not in TO_SI or TO_SI[own].si != units:
-        fitting = [name for name, unit in TO_SI.items() if unit.si == units]
-        where.fail(f"has units {own!r}; it must be one of {listed(fitting)}, after `scale` and `offset`")
-    unwrap = spec.unwrap
-    if not isinstance(unwrap, bool):
-        values = _unwrapped(values, unwrap)
-    scale = single(source, spec.scale, where / "scale") if isinstance(spec.scale, str) else spec.scale
-    si = (values * scale + spec.offset) * TO_SI[own].factor + TO_SI[own].zero
-    if unwrap is True:
-        if units != "rad":
-            where.fail("is no angle, so a whole turn means nothing; write unwrap = the period of the variable")
-        si = _unwrapped(si, 2.0 * np.pi)
-    return si
-
-
-def _unwrapped(values: np.ndarray, period: float) -> np.ndarray:
-    good = np.isfinite(values)
-    out = np.array(values, np.float64)
-    out[good] = np.unwrap(out[good], period=period)
-    return out
-
-
-def _compare_units(variable: Variable, spec: Reading, units: str, report: Report, where: Place) -> None:
-    """Warn where the recording states other units than the mapping."""
-    stated, mapped = unit_name(variable.units), spec.units or units
-    as_it_is = spec.scale in (1.0, -1.0)
-    if stated and mapped in TO_SI and stated != mapped and as_it_is and TO_SI[stated] != TO_SI[mapped]:
-        report.warning(
-            where.key, f"the recording states {variable.units}, and the mapping reads {mapped}; correct one of them"
-        )
-    if is_foreign(variable.units) and mapped != "1" and as_it_is:
-        said = f"the recording states {variable.units}, and the mapping reads {mapped}"
-        report.warning(where.key, f"{said}; write `scale`, the {mapped} in one {variable.units}")
 
 
 def find(name: str, paths: Mapping[Path, Any], where: Place) -> Path:

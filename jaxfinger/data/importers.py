@@ -187,7 +187,10 @@ def _channel(channel: str, spec: Any, columns: ColumnReader, finger: FingerDescr
             where.fail(f"has a column {name!r}; it must be one of {listed(names)}")
         k = names.index(name)
         here = {"rad": "m", "N m": "N"}.get(units, units) if entry.shape[1] == "m" and finger.prismatic[k] else units
-        values[:, k] = columns.column(column, here, whole, where / name)
+        if channel == "q":
+            values[:, k] = columns.position(column, here, finger.limits[k], where / name)
+        else:
+            values[:, k] = columns.column(column, here, whole, where / name)
     return values
 
 

@@ -107,8 +107,13 @@ def travel_time(time: Float[np.ndarray, " N"], q: Float[np.ndarray, "N k"]) -> f
 
 
 def _lag(x: Float[np.ndarray, " N"]) -> float:
-    """Number of samples over which one in a hundred changes reaches a tenth of the travel, by doubling the lag."""
+    """Number of samples over which one in a hundred changes reaches a tenth of the travel, by doubling the lag.
+
+    0 where less than one sample in a hundred differs from the others: the column rests.
+    """
     way, lag, far = 0.1 * np.ptp(np.percentile(x, (1, 99))), 1, [0.0]
+    if way == 0.0:
+        return 0.0
     while far[-1] < way and lag < len(x):
         far.append(float(np.percentile(np.abs(x[lag:] - x[:-lag]), 99)))
         lag *= 2

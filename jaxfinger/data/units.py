@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Collection
 from typing import NamedTuple
 
 
@@ -77,3 +78,8 @@ def unit_name(stated: str) -> str:
     plain = _SPELT.get(plain.lower(), plain)
     joined = {name.replace(" ", ""): name for name in TO_SI if name != "1"}
     return joined.get(plain.replace(" ", ""), "")
+
+
+def whole_turns(x: float, period: float, limits: Collection[float]) -> float:
+    """Sum of whole periods that brings `x` nearest to the middle of the limits."""
+    return round((sum(limits) / len(limits) - x) / period) * period

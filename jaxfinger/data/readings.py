@@ -1,0 +1,56 @@
+"""Variables of a recording in SI units: scaled, shifted and unwrapped as a mapping says."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxfinger.data.findings import Report
+from jaxfinger.data.mapping import Reading
+from jaxfinger.data.recording import Variable
+from jaxfinger.data.toml import Place
+from jaxfinger.data.units import TO_SI, is_foreign, unit_name
+from jaxfinger.errors import listed
+
+
+def converted(values: np.ndarray, spec: Reading, units: str, scale: float, where: Place) -> np.ndarray:
+    """Convert a variable to `units` (SI): variable · scale + offset, unwrapped where the mapping says so."""
+    own = spec.units or units
+    if own not in TO_SI or TO_SI[own].si != units:
+        fitting = [name for name, unit in TO_SI.items() if unit.si == units]
+        where.fail(f"has units {own!r}; it must be one of {listed(fitting)}, after `scale` and `offset`")
+    unwrap = spec.unwrap
+    if not isinstance(unwrap, bool):
+        values = _unwrapped(values, unwrap)
+    si = (values * scale + spec.offset) * TO_SI[own].factor + TO_SI[own].zero
+    if unwrap is True:
+        if units != "rad":
+            where.fail("is no angle, so a whole turn means nothing; write unwrap = the period of the variable")
+        si = _unwrapped(si, 2.0 * np.pi)
+    return si
+
+
+def _unwrapped(values: np.ndarray, period: float) -> np.ndarray:
+    good = np.isfinite(values)
+    out = np.array(values, np.float64)
+    out[good] = np.unwrap(out[good], period=period)
+    return out
+
+
+def period(spec: Reading, units: str, scale: float) -> float:
+    """Period in `units` (SI) by which a reading is unwrapped; 0 where it is not."""
+    if isinstance(spec.unwrap, bool):
+        return 2.0 * np.pi if spec.unwrap else 0.0
+    return float(spec.unwrap) * abs(scale) * TO_SI[spec.units or units].factor
+
+
+def compare_units(variable: Variable, spec: Reading, units: str, report: Report, where: Place) -> None:
+    """Warn where the recording states other units than the mapping."""
+    stated, mapped = unit_name(variable.units), spec.units or units
+    as_it_is = spec.scale in (1.0, -1.0)
+    if stated and mapped in TO_SI and stated != mapped and as_it_is and TO_SI[stated] != TO_SI[mapped]:
+        report.warning(
+            where.key, f"the recording states {variable.units}, and the mapping reads {mapped}; correct one of them"
+        )
+    if is_foreign(variable.units) and mapped != "1" and as_it_is:
+        said = f"the recording states {variable.units}, and the mapping reads {mapped}"
+        report.warning(where.key, f"{said}; write `scale`, the {mapped} in one {variable.units}")
