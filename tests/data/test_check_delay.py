@@ -89,3 +89,15 @@ def test_a_stretched_tendon_is_not_late(session):
     """Friction raises the tension where the tendon is pulled in, and the tendon stretches."""
     l = SEVERAL.excursion() + 2e-4 * np.sign(np.gradient(SEVERAL.q))
     assert delays(session, led(SEVERAL, SEVERAL.q, l)) == []
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2])
+def test_friction_that_grows_with_load_is_no_delay(session, share):
+    """A geared servo swings a pendulum, a few strokes long: a law without the load improves with some shift."""
+    servo = Sweep((0.8,))
+    time = servo.time
+    q = 1.3 * np.sin(2.0 * np.pi * 0.8 * time + 1.5) * np.sin(0.5 * np.pi * time)
+    rate = np.gradient(q, time)
+    load = 0.3 * np.sin(q) + 0.01 * np.gradient(rate, time)
+    torque = load + 0.02 * rate + share * np.abs(load) * np.tanh(rate / 0.02)
+    assert delays(session, swept(servo, q, torque)) == []
