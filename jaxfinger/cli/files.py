@@ -28,20 +28,24 @@ def check(file: Path, *, json: bool = False) -> None:
     json
         Print the findings as JSON.
     """
-    from jaxfinger.data import check_file
+    from jaxfinger.data.check import read_and_check_all
     from jaxfinger.data.findings import merged
+    from jaxfinger.data.mounting import mounting_in_words
 
     with progress("check") as say:
         say(file.name)
-        findings = check_file(file)
-    count = Counter(f.severity for f in findings)
+        session, report = read_and_check_all(file)
+    mounting = mounting_in_words(session.finger) if session is not None and report.fatal is None else None
+    findings, count = list(report), Counter(f.severity for f in report)
     errors = count["error"]
     if json:
-        print_json({"file": file, "ok": not errors, "findings": [asdict(f) for f in findings]})
+        print_json({"file": file, "ok": not errors, "mounting": mounting, "findings": [asdict(f) for f in findings]})
     else:
         for finding in merged(findings):
             said = f"{finding.severity}: {file}: {finding.message}" if finding.place == "/" else finding
             console().print(plain(said), markup=False, soft_wrap=True)
+        if mounting is not None:
+            print(plain(f"mounting: {mounting}"))
         found = ", ".join(counted(count[s], s) for s in ("error", "warning", "note") if s == "error" or count[s])
         print(f"{file}: {found if findings else 'nothing to complain about'}")
     if errors:
@@ -192,6 +196,7 @@ def import_(
     refuse_output(output, overwrite, mapping, *sources)
     from jaxfinger.data.findings import Report
     from jaxfinger.data.importers import import_file
+    from jaxfinger.data.mounting import mounting_in_words
 
     report = Report()
     try:
@@ -201,3 +206,4 @@ def import_(
     finally:
         print_warnings(report, mapping)
     print(plain(f"{output}: {counted(len(session), 'trial')} of {session.specimen}"))
+    print(plain(f"mounting: {mounting_in_words(session.finger)}"))

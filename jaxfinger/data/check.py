@@ -13,6 +13,7 @@ import numpy as np
 from jaxfinger.data.check_columns import check_columns
 from jaxfinger.data.check_delay import check_delay
 from jaxfinger.data.check_finger import check_finger
+from jaxfinger.data.check_gravity import check_gravity
 from jaxfinger.data.check_held import check_held
 from jaxfinger.data.check_trial import check_trial
 from jaxfinger.data.check_work import check_work
@@ -44,10 +45,15 @@ def check_file(path: str | os.PathLike) -> list[Finding]:
     >>> [finding.severity for finding in jf.check("fit.json")]
     ['error']
     """
+    return list(read_and_check_all(path)[1])
+
+
+def read_and_check_all(path: str | os.PathLike) -> tuple[Session | None, Report]:
+    """Read a file and make all checks: the session, None where it is unusable, and the findings about it."""
     session, report = read_and_check(path)
     if session is not None:
         check_samples(session, report)
-    return list(report)
+    return session, report
 
 
 def read_and_check(path: str | os.PathLike, trials: Collection[str] | None = None) -> tuple[Session | None, Report]:
@@ -169,6 +175,7 @@ def check_samples(session: Session, report: Report) -> None:
         if report.fatal is None:
             check_work(session, report)
             check_columns(session, report)
+            check_gravity(session, report)
             check_held(session, report)
             check_delay(session, report)
 

@@ -97,6 +97,15 @@ def test_check_of_a_sound_file(folder, capsys):
     assert not [f for f in found["findings"] if f["severity"] == "error"]
 
 
+def test_import_and_check_say_how_the_finger_is_mounted(tmp_path, capsys):
+    file, line = tmp_path / "emps.h5", "mounting: gravity acts on no joint: the finger moves in a horizontal plane"
+    for tokens in (("import", EMPS / "DATA_EMPS.mat", "--mapping", EMPS / "emps.toml", "-o", file), ("check", file)):
+        assert run(*tokens) == 0
+        assert line in capsys.readouterr().out.splitlines()
+    assert run("check", file, "--json") == 0
+    assert f"mounting: {json.loads(capsys.readouterr().out)['mounting']}" == line
+
+
 def test_check_names_what_is_wrong(folder, tmp_path, capsys):
     bad = tmp_path / "bad.h5"
     bad.write_bytes((folder / "emps.h5").read_bytes())
