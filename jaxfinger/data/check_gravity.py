@@ -114,8 +114,10 @@ def _motion(trial: Trial, i: int) -> list[_Motion]:
 
 def _postures(motions: list[_Motion], i: int) -> float:
     """Largest change of another joint's angle from trial to trial, rad."""
+    if not motions:
+        return 0.0
     means = np.delete([motion.q.mean(axis=0) for motion in motions], i, axis=1)
-    return float(np.ptp(means, axis=0).max(initial=0.0)) if motions else 0.0
+    return float(np.ptp(means, axis=0).max(initial=0.0))
 
 
 def _equations(finger: FingerDescription, i: int, motions: list[_Motion]) -> _Equations:
