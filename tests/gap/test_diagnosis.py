@@ -46,7 +46,7 @@ def test_the_planted_cause_its_site_and_its_size_are_named(diagnosis):
 
 
 def test_no_number_of_a_candidate_is_certain(diagnosis):
-    """Rivals that are not in the fit have intervals, too; a choice of form, side or place, and a full share have none."""
+    """Rivals outside of the fit have intervals, too; a choice of form, side or place and a full share have none."""
     for candidate in diagnosis.candidates:
         effect = CATALOGUE[candidate.key.effect]
         choices = {n for n, p in effect.shape_parameters().items() if p.moves == "not"}
