@@ -26,8 +26,12 @@ _MEANINGS = (
     ("fingertip_force", r"f?tip|contact|^f[xyz]$|wrench"),
     ("q", r"^q[_\d]*|angle|pos|enc|theta|winkel|deg$"),
 )
-# Names of velocities and commands, which belong to no channel.
-_NO_CHANNEL = r"(?<![a-z])vel|speed|dot|^v$|^dq|cmd|command|ref|desired|set|goal"
+# Names of velocities, which belong to no channel, and of set-points, which are not measured.
+_VELOCITY = r"(?<![a-z])vel|speed|dot|^v$|^dq"
+_SET_POINT = (
+    r"cmd|command|ref(?!l)|desired|set_?p(oin)?t|goal|target|demand|soll|feed_?forward"
+    r"|(?<![a-z])(q|tau|pos)?(des|set(?!\d+\.)|sp|ff|tgt|nominal|planned)(?![a-z])"
+)
 # Largest plausible values of a channel by unit, with room for arms. The first unit whose largest value is not exceeded
 # is the guess. Torques from 5 to 100 may be an arm's in N m or a finger's in N mm, and large tensions may be in mN or
 # gf, so their unit stays open.
@@ -161,13 +165,19 @@ def _meaning(name: str, column: str | int | None, x: np.ndarray, units: str) -> 
     """Channel or `time` by the last word of a name where the units allow it, else by the units; empty where unclear."""
     bare = re.sub(r"[\[(].*", "", name).strip("/ ")  # Units stand in brackets.
     word = re.split(r"[./]", bare)[-1].lower()
-    if re.search(_NO_CHANNEL, word):
+    if re.search(_VELOCITY, word) or is_set_point(name):
         return ""
     for meaning, pattern in _MEANINGS:
         if re.search(pattern, word) and (not units or TO_SI[units].si in _SI_UNITS[meaning]):
             runs = len(x) > 2 and len(np.unique(x)) > 0.5 * len(x)
             return meaning if meaning != "time" or (column is None and runs) else ""
     return _CHANNEL_OF_UNITS.get(TO_SI[units].si, "") if units else ""
+
+
+def is_set_point(name: str) -> bool:
+    """Whether a variable's name, or that of a structure which holds it, says that it is a set-point."""
+    members = re.sub(r"[\[(].*", "", name).strip("/ ").split("/")[-1]
+    return re.search(_SET_POINT, re.sub(r"(?<=[a-z])(?=[A-Z])", "_", members).lower()) is not None
 
 
 def _spelt(name: str) -> str:
@@ -214,9 +224,9 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
         for channel, rows in trial.channels.items():
             if channel not in shared:
                 lines += [f"channels.{channel}.{as_key(name)} = {said}" for name, said in rows]
-        if trial.left_out:
-            named = [quoted(name) for name in trial.left_out]
-            lines.append(f"# in no channel yet: {listed(named, _MAX_LEFT_OUT)}")
+        for what, said in ((False, "in no channel yet"), (True, "set-points by their names, which are not measured")):
+            named = [quoted(name) for name in trial.left_out if is_set_point(name) == what]
+            lines += [f"# {said}: {listed(named, _MAX_LEFT_OUT)}"] if named else []
     return "\n".join(lines) + "\n"
 
 

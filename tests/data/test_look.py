@@ -182,3 +182,32 @@ def test_what_no_channel_reads_and_unclear_units_are_marked(tmp_path):
 @pytest.mark.parametrize(("unit", "newtons"), [("gf", 9.80665e-3), ("kgf", 9.80665)])
 def test_cells_may_read_gram_force(unit, newtons):
     assert TO_SI[unit] == ("N", newtons, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("set_point", "measured"),
+    [("q_des", "q_meas"), ("Winkel_Soll [°]", "Winkel_Ist [°]"), ("target_pos", "actual_pos"), ("qDes", "q"),
+     ("des.q", "q"), ("pos_sp", "pos"), ("goal.joint.position", "joint.position"), ("enc_nominal", "enc_offset"),
+     ("SetPoint.q", "dataset.q"), ("set.angle", "set1.angle"), ("qset", "q_reflex"),
+     ("/hand/goals.position", "/target/joint_states.position")],
+)  # fmt: skip
+def test_a_measured_column_wins_over_its_set_point(tmp_path, set_point, measured):
+    """A torque's feedforward is a set-point as well."""
+    path = tmp_path / "log.csv"
+    angle = 40 + 30 * np.sin(TIME / 1e3)
+    table = np.column_stack([TIME, angle, angle + 0.1, np.cos(TIME / 1e3), np.cos(TIME / 1e3)])
+    header = f"t,{set_point},{measured},tau_ff,tau"
+    np.savetxt(path, table, "%.6f", ",", header=header, comments="", encoding="utf-8")
+    said = proposal([load_recording(path)])
+    assert f'channels.q.J1 = {{ from = "{measured}"' in said
+    assert 'channels.joint_torque.J1 = { from = "tau"' in said
+    assert f'# set-points by their names, which are not measured: "{set_point}", "tau_ff"' in said
+
+
+def test_a_set_point_alone_is_said(tmp_path):
+    path = tmp_path / "log.csv"
+    table = np.column_stack([TIME, 40 + 30 * np.sin(TIME / 1e3), np.cos(TIME / 1e3)])
+    np.savetxt(path, table, "%.6f", ",", header="t,q_soll,tau", comments="")
+    said = proposal([load_recording(path)])
+    assert "channels.q" not in said
+    assert '# set-points by their names, which are not measured: "q_soll"' in said
