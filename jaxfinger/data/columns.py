@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,10 +12,11 @@ import numpy as np
 from jaxfinger.data.expressions import ExpressionError, evaluate
 from jaxfinger.data.findings import Report
 from jaxfinger.data.mapping import Column, ColumnSpec, MappedTrial, Reading, terms
-from jaxfinger.data.readings import compare_units, converted, period
-from jaxfinger.data.recording import Recording, Variable
+from jaxfinger.data.readings import compare_units, converted, is_slower, period
+from jaxfinger.data.recording import Variable
 from jaxfinger.data.toml import Place
 from jaxfinger.data.units import whole_turns
+from jaxfinger.data.variables import Source, column_of, scale_of
 from jaxfinger.errors import UserError, counted, listed
 
 if TYPE_CHECKING:
@@ -32,106 +33,6 @@ _MAX_INTERVAL = 0.2  # s: a clock with longer intervals is probably in other uni
 _MAX_LATE, _MAX_LATE_SAMPLES = 1.0, 10
 _PARTS = "choose one part by `where`, or by `rate_hz` and `span`"
 _OWN_PARTS = "give each part a file of its own"
-
-
-@dataclass(frozen=True)
-class Source:
-    """A recording, with the variables that a mapping derives from it."""
-
-    recording: Recording
-    constants: Mapping[str, Any] = field(default_factory=dict)
-    derived: Mapping[str, str] = field(default_factory=dict)
-
-    def variable(self, name: str, where: Place, within: tuple[str, ...] = ()) -> Variable:
-        """Variable of this name: the derived one, else the recording's.
-
-        `within` are the names of the derived variables that are being computed; `where` is the place to blame.
-
-        Raises:
-            UserError: there is no such variable, or it gives no numbers, or it is derived from itself.
-        """
-        if name in self.derived and name not in within:
-            return self._derive(name, where, within)
-        if name in self.recording.variables:
-            return self.recording.variables[name]
-        said = f"reads the variable {name!r} of {self.recording.path.name}"
-        for candidate in (name, *(name[:i] for i in range(len(name) - 1, 0, -1) if name[i] == ".")):
-            if candidate in self.recording.unusable:
-                where.fail(f"{said}, but {candidate} {self.recording.unusable[candidate]}")
-        if name in within:
-            where.fail(f"derives {name!r} from itself, and the recording has no variable of this name; name another")
-        there = sorted([*self.recording.variables, *self.derived])
-        elsewhere = "; move what only some recordings hold to their trials" if where.keys[:1] == ("channels",) else ""
-        return where.fail(f"{said}, which the recording has not; it has {listed(there, 30)}{elsewhere}")
-
-    @property
-    def words(self) -> dict[str, np.ndarray]:
-        """Recorded variables of words that no derived variable replaces."""
-        return {name: words for name, words in self.recording.words.items() if name not in self.derived}
-
-    def _derive(self, name: str, where: Place, within: tuple[str, ...]) -> Variable:
-        where = where / "derived" / name
-        text = self.derived[name]
-        clocks: dict[str, str] = {}
-
-        def lookup(inner: str, column: Any) -> np.ndarray:
-            if inner == name and inner in self.recording.variables:
-                variable = self.recording.variables[inner]
-            else:
-                variable = self.variable(inner, where, (*within, name))
-            clocks[inner] = variable.clock
-            if variable.present is not None:
-                where.fail(f"uses {inner!r}, whose names change from message to message; map its columns by name")
-            return variable.values if column is None else _column(variable, inner, column, where)[0]
-
-        try:
-            values = np.asarray(evaluate(text, lookup, self.constants, self.words), np.float64)
-        except ExpressionError as error:
-            where.fail(f"{text!r} {error}")
-        if len(set(clocks.values())) > 1:
-            of = ", ".join(f"{inner} on {clock or 'none'}" for inner, clock in clocks.items())
-            where.fail(f"joins variables that have different clocks ({of}); derive one variable for each clock")
-        if values.ndim not in (1, 2):
-            where.fail("gives a single number and no samples; put it into [constants]")
-        return Variable(values, clock=next(iter(clocks.values()), ""))
-
-
-def _column(variable: Variable, name: str, column: Any, where: Place) -> tuple[np.ndarray, int]:
-    """Column of a variable by its number or name, and its number."""
-    values, names = variable.values, variable.columns
-    if values.ndim == 1:
-        if column not in (None, 0):
-            where.fail(f"reads column {column!r} of {name!r}, which has one column; leave `column` out")
-        return np.atleast_1d(values), 0
-    if isinstance(column, str):
-        if column not in names:
-            there = listed(names) if names else "no names of columns"
-            where.fail(f"reads column {column!r} of {name!r}, which has {there}; choose one of them")
-        column = names.index(column)
-    elif variable.present is not None:
-        groups = np.unique(variable.present, axis=0)[::-1]
-        kinds = "; ".join(", ".join(np.array(names)[row]) for row in groups if row.any())
-        where.fail(
-            f"reads {name!r}, whose names change from message to message ({kinds}); choose by name, as column = "
-            f"{names[0]!r}"
-        )
-    elif column is None and values.shape[1] == 1:
-        column = 0
-    if isinstance(column, bool) or not isinstance(column, int) or not 0 <= column < values.shape[1]:
-        called = f" ({listed(names)})" if names else ""
-        where.fail(f"reads {name!r}, which has {values.shape[1]} columns{called}; choose one by `column`, from 0")
-    return values[:, column], column
-
-
-def scale_of(reading: Reading, source: Source, where: Place) -> float:
-    """Scale of a reading: a number, or the single one of the constant or variable that it names."""
-    name, where = reading.scale, where / "scale"
-    if not isinstance(name, str):
-        return name
-    values = np.asarray(source.constants.get(name) if name in source.constants else source.variable(name, where).values)
-    if values.size != 1:
-        where.fail(f"is scaled by {name!r}, which holds {values.size} values; name a single number")
-    return float(values.reshape(-1)[0])
 
 
 @dataclass(frozen=True)
@@ -163,7 +64,7 @@ def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place,
     """
     if trial.time is None:
         assert trial.rate_hz is not None
-        count = len(_column(source.variable(first.from_, where), first.from_, first.column, where)[0])
+        count = len(column_of(source.variable(first.from_, where), first.from_, first.column, where)[0])
         rows = _chosen(trial, source, np.arange(count), count, where)
         return _cut(Clock(rows / trial.rate_hz, rows, count, source), trial, where)
     rows_of = _first_rows(first, source, where)
@@ -185,7 +86,7 @@ def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place,
 def _times(reading: Reading, source: Source, where: Place, report: Report) -> Float[np.ndarray, " N"]:
     """Times of a clock, s."""
     variable = source.variable(reading.from_, where)
-    values, _ = _column(variable, reading.from_, reading.column, where)
+    values, _ = column_of(variable, reading.from_, reading.column, where)
     compare_units(variable, reading, "s", report, where)
     return converted(values, reading, "s", scale_of(reading, source, where), where)
 
@@ -197,7 +98,7 @@ def _first_rows(first: Column, source: Source, where: Place) -> np.ndarray | Non
     variable = source.variable(first.from_, where)
     if variable.present is None:
         return None
-    return variable.present[:, _column(variable, first.from_, first.column, where)[1]]
+    return variable.present[:, column_of(variable, first.from_, first.column, where)[1]]
 
 
 def _chosen(trial: MappedTrial, source: Source, rows: np.ndarray, total: int, where: Place) -> np.ndarray:
@@ -207,7 +108,7 @@ def _chosen(trial: MappedTrial, source: Source, rows: np.ndarray, total: int, wh
     place, text = where / "where", trial.where
 
     def lookup(name: str, column: Any) -> np.ndarray:
-        return _column(source.variable(name, place), name, column, place)[0]
+        return column_of(source.variable(name, place), name, column, place)[0]
 
     try:
         chosen = np.asarray(evaluate(text, lookup, source.constants, source.words))
@@ -316,7 +217,7 @@ class ColumnReader:
         source = self._source(spec, where)
         name = spec.from_
         variable = source.variable(name, where)
-        values, k = _column(variable, name, spec.column, where)
+        values, k = column_of(variable, name, spec.column, where)
         compare_units(variable, spec, units, self.report, where)
         values = converted(values, spec, units, scale_of(spec, source, where), where)
         present = np.ones(len(values), bool) if variable.present is None else variable.present[:, k]
@@ -331,7 +232,10 @@ class ColumnReader:
                 where.fail(
                     f"has {len(values)} samples where the trial's time has {clock.total}; give it its own `time`"
                 )
-            return values[clock.rows]
+            values = values[clock.rows]
+            if not is_slower(clock.time, np.isfinite(values)):
+                return values
+            return self._between(clock.time, values, f"`{clock.name or 'rate_hz'}`", whole, where)
         own_name, time = own
         if clock.restarts:
             where.fail(
@@ -340,10 +244,23 @@ class ColumnReader:
             )
         if len(time) != len(values):
             where.fail(f"has {len(values)} samples, and its clock {own_name} has {len(time)}; name its own clock")
+        present = present & (np.isfinite(time) | np.isfinite(values))  # A shorter column ends in blank cells.
         present = present & _stamped(np.where(present, time, 0.0), own_name, where, self.report)
         time, values = time[present], values[present]
         order = increasing_order(time, own_name, clock.sort, _OWN_PARTS, where, self.report)
-        return self._onto(time[order], values[order], own_name, whole, where)
+        time, values = time[order], values[order]
+        onto = self._between if is_slower(time, np.isfinite(values)) else self._onto
+        return onto(time, values, own_name, whole, where)
+
+    def _between(self, time: np.ndarray, values: np.ndarray, name: str, whole: bool, where: Place) -> np.ndarray:
+        """Values at the trial's times of a slower column, which is blank between its samples."""
+        there = np.isfinite(values)
+        self.report.warning(
+            where.key,
+            f"has a value at {there.sum()} of {len(there)} samples, one every {np.diff(time[there]).mean():.3g} s, "
+            "and is interpolated between them; if the trial is to have these samples only, choose them by `where`",
+        )
+        return self._onto(time[there], values[there], name, whole, where)
 
     def _own_clock(
         self, spec: Column, variable: Variable, source: Source, present: np.ndarray, where: Place
@@ -414,7 +331,7 @@ class ColumnReader:
                 f"{runs}: it covers only a part; name another clock, or cut the trial by span = "
                 f"[{begin:.4g}, {end:.4g}]"
             )
-        if step > _MAX_INTERVAL:
+        if step > _MAX_INTERVAL and name.strip("`") not in (self.clock.name, "rate_hz"):
             self.report.warning(
                 where.key,
                 f"the clock {name} ticks every {step:.3g} s; write time = {{ from = {name.strip('`')!r}, "

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from jaxfinger.data.check import check_samples, check_session
-from jaxfinger.data.columns import ColumnReader, Source, find, trial_clock
+from jaxfinger.data.columns import ColumnReader, find, trial_clock
 from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.finger_file import finger_from
 from jaxfinger.data.hdf5 import write_session
@@ -26,6 +26,7 @@ from jaxfinger.data.schema import CHANNELS, DRIVES, TEMPERATURE, Channel, Entry,
 from jaxfinger.data.session import FingerDescription, Session, Trial
 from jaxfinger.data.sources import load_recording, refuse_path
 from jaxfinger.data.toml import Place
+from jaxfinger.data.variables import Source
 from jaxfinger.errors import listed
 
 

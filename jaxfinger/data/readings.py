@@ -11,6 +11,13 @@ from jaxfinger.data.toml import Place
 from jaxfinger.data.units import TO_SI, is_foreign, unit_name
 from jaxfinger.errors import listed
 
+_MIN_VALUES = 30  # of a column: with fewer, values that are lost at random may look regular.
+# Intervals of a slower column, as shares of the usual one: a rate that is no whole part of the samples' leaves 1 and 2
+# samples, 4/3 of their mean at most. Where a tenth or more of the samples are lost at random, one interval in twenty is
+# at least 1.6 of it.
+_MAX_LONG = 1.5
+_MIN_SLOWER = 1.2  # samples for each value: with fewer, one value in six is blank, as where some are lost.
+
 
 def converted(values: np.ndarray, spec: Reading, units: str, scale: float, where: Place) -> np.ndarray:
     """Convert a variable to `units` (SI): variable · scale + offset, unwrapped where the mapping says so."""
@@ -41,6 +48,20 @@ def period(spec: Reading, units: str, scale: float) -> float:
     if isinstance(spec.unwrap, bool):
         return 2.0 * np.pi if spec.unwrap else 0.0
     return float(spec.unwrap) * abs(scale) * TO_SI[spec.units or units].factor
+
+
+def is_slower(time: np.ndarray, there: np.ndarray) -> bool:
+    """Whether a column with values `there` alone, a mask of the samples at `time`, has a slower clock of its own.
+
+    Its values then come at regular intervals, longer than the samples'. Values that are lost now and then leave mostly
+    intervals of one sample, and long ones among them.
+    """
+    if there.all() or there.sum() < _MIN_VALUES:
+        return False
+    steps, samples = np.diff(time[there]), np.diff(np.flatnonzero(there))
+    long = np.percentile(steps, 95.0)
+    regular = steps <= long
+    return bool(long < _MAX_LONG * steps[regular].mean() and samples[regular].mean() > _MIN_SLOWER)
 
 
 def compare_units(variable: Variable, spec: Reading, units: str, report: Report, where: Place) -> None:

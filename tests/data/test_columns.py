@@ -200,3 +200,65 @@ def test_an_encoder_in_counts_is_unwrapped(tmp_path):
 def test_the_start_of_a_span_is_the_first_sample(tmp_path):
     trial, _ = bring_in(tmp_path, '"now"', "span = [1.0, 3.0]", t=TIME + 1.7e9)
     np.testing.assert_allclose(trial.q[:, 0], Q[100:300])
+
+
+def blanks(tmp_path, there, time='time = "t"', torque='"tau"'):
+    """Import a CSV whose torque has cells where `there` alone."""
+    lines = [f"{t:.4f},{q:.6f},{0.01 * np.sin(t):.9f}" if k else f"{t:.4f},{q:.6f}," for t, q, k in
+             zip(TIME, Q, there, strict=True)]  # fmt: skip
+    (tmp_path / "log.csv").write_text("\n".join(["t,q,tau", *lines]))
+    text = MAPPING.replace("log.mat", "log.csv").replace("EXTRA", "").replace("TORQUE", torque)
+    (tmp_path / "m.toml").write_text(text.replace('time = "t"\nEXTRA', "").replace('time = "t"', time))
+    report = Report()
+    session = import_file([tmp_path / "log.csv"], tmp_path / "m.toml", tmp_path / "s.h5", True, report)
+    return session["a"], [str(f) for f in report if "interpolated" in f.message]
+
+
+EVERY = np.arange(len(TIME))
+
+
+@pytest.mark.parametrize("there", [EVERY % 5 == 0, EVERY % 3 != 1, (EVERY * 2) % 5 < 2, EVERY % 20 == 3])
+@pytest.mark.parametrize("given", [{}, {"time": "rate_hz = 100"}, {"torque": '{ from = "tau", time = "t" }'}])
+def test_a_slower_column_with_blank_cells_is_interpolated(tmp_path, there, given):
+    if "torque" in given:
+        given = given | {"time": 'time = "t"'}
+    trial, said = blanks(tmp_path, there, **given)
+    first, last = np.flatnonzero(there)[[0, -1]]
+    assert len(trial.time) == last - first + 1
+    torque = 0.01 * np.sin(trial.time + TIME[first])
+    np.testing.assert_allclose(trial.joint_torque[:, 0], torque, atol=6e-5)  # 0.01 · 0.2²/8
+    assert len(said) == 1
+    assert f"has a value at {there.sum()} of 600 samples, one every" in said[0]
+    assert "choose them by `where`" in said[0]
+
+
+RANDOM = np.random.default_rng(0).random((len(TIME), 4)) > [0.01, 0.1, 0.3, 0.6]
+
+
+@pytest.mark.parametrize("there", [*RANDOM.T, EVERY % 100 != 50, (EVERY < 200) | (EVERY > 500), EVERY < 400])
+def test_lost_values_are_not_interpolated(tmp_path, there):
+    with pytest.raises(UserError, match=f"column MCP is NaN in {(~there).sum()} of 600 samples"):
+        blanks(tmp_path, there)
+
+
+def test_a_shorter_column_with_a_clock_of_its_own_is_sound(tmp_path):
+    lines = [f"{t:.2f},{q:.6f}," + (f"{t * 5:.2f},{np.sin(t):.6f}" if k < 120 else ",") for k, (t, q) in
+             enumerate(zip(TIME, Q, strict=True))]  # fmt: skip
+    (tmp_path / "log.csv").write_text("\n".join(["t,q,slow,tau", *lines]))
+    (tmp_path / "m.toml").write_text(MAPPING.replace("log.mat", "log.csv").replace("EXTRA", "").replace("TORQUE", OWN))
+    report = Report()
+    import_file([tmp_path / "log.csv"], tmp_path / "m.toml", tmp_path / "s.h5", True, report)
+    assert not [f for f in report if "gives no time" in f.message or "interpolated" in f.message]
+
+
+def test_samples_of_two_sensors_in_rows_of_their_own_are_put_together(tmp_path):
+    """A logger that writes a row for each message of a sensor leaves the cells of the other one blank."""
+    rows = sorted([(t, f"{q:.6f}", "") for t, q in zip(TIME, Q, strict=True)] +
+                  [(t, "", f"{0.01 * np.sin(t):.9f}") for t in np.arange(0.0041, 6.0, 0.03)])  # fmt: skip
+    (tmp_path / "log.csv").write_text("\n".join(["t,q,tau", *(f"{t:.4f},{q},{tau}" for t, q, tau in rows)]))
+    text = MAPPING.replace("log.mat", "log.csv").replace("EXTRA", "").replace("TORQUE", '"tau"')
+    (tmp_path / "m.toml").write_text(text)
+    report = Report()
+    session = import_file([tmp_path / "log.csv"], tmp_path / "m.toml", tmp_path / "s.h5", True, report)
+    assert len([f for f in report if "is interpolated between them" in f.message]) == 2
+    np.testing.assert_allclose(session["a"].joint_torque[:, 0], 0.01 * np.sin(session["a"].time + 0.0041), atol=2e-6)
