@@ -71,7 +71,10 @@ class _Dialect:
 # Of equally good dialects the first is taken.
 _DIALECTS = tuple(
     _Dialect(*pair)
-    for pair in ((",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("|", "."), (None, "."), (None, ","))
+    for pair in (
+        *((",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("|", "."), (None, "."), (None, ",")),
+        (",", ","),  # with quotes around the numbers
+    )
 )
 
 
@@ -135,8 +138,9 @@ def _decode(raw: bytes) -> str:
     for mark, encoding in marks:
         if raw.startswith(mark):
             return raw.decode(encoding, errors="replace")
-    if raw[1:200:2].count(0) > 20:  # Latin text in UTF-16 has a zero in every second byte.
-        return raw.decode("utf-16-le", errors="replace")
+    for first, encoding in ((1, "utf-16-le"), (0, "utf-16-be")):
+        if raw[first:200:2].count(0) > 20:  # Latin text in UTF-16 has a zero in every second byte.
+            return raw.decode(encoding, errors="replace")
     try:
         return raw.decode("utf-8")
     except UnicodeDecodeError:
@@ -151,6 +155,8 @@ def _find_dialect(sample: Sequence[str]) -> tuple[_Dialect, list[bool]]:
         widths = [len(row) for row in rows]
         width = max(set(widths), key=widths.count)
         rows = [row for row in rows if len(row) == width]
+        if dialect.separator == dialect.mark and _has_points(rows):
+            continue  # A quoted cell such as "1,2" is then a list of two.
         numbers = np.array([[dialect.number(cell) is not None for cell in row] for row in rows])
         filled = np.array([[bool(cell) for cell in row] for row in rows])
         numeric = ((numbers & filled).sum(axis=0) * 2 > filled.sum(axis=0)) | ~filled.any(axis=0)
@@ -160,6 +166,11 @@ def _find_dialect(sample: Sequence[str]) -> tuple[_Dialect, list[bool]]:
             best = score, dialect, numeric.tolist()
     assert best is not None
     return best[1], best[2] if best[0][0] > 0.0 else [False]
+
+
+def _has_points(rows: Sequence[Sequence[str]]) -> bool:
+    """Whether a cell is a number with a decimal point."""
+    return any("." in cell and not _HOUR.search(cell) and _cell(cell) is not None for row in rows for cell in row)
 
 
 def _cell(cell: str) -> float | None:
@@ -243,8 +254,9 @@ def _columns(path: Path, body: Sequence[_Line], dialect: _Dialect, numeric: Sequ
                 f"{path}: line {line.number} has {len(rows[-1])} cells, the others have {width}; correct or drop it"
             )
     # Where both marks stand for decimals in one file, or seem to, a number such as 1,234 is not clear.
-    points = (cell for row in rows for cell in row if "." in cell and not _HOUR.search(cell))
-    mixed = dialect.mark == "," and any(_cell(cell) is not None for cell in points)
+    mixed = dialect.mark == "," and _has_points(rows)
+    if separator == dialect.mark == ",":  # Quoted cells such as "1,234" may also hold groups of digits.
+        mixed |= all(_ONE_GROUP.match(cell.strip()) for row in rows for cell in row if "," in cell)
     at = [line.number for line in body]
     return [_column(cells, at, dialect, numeric[k], mixed) for k, cells in enumerate(zip(*rows, strict=True))]
 

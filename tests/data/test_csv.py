@@ -27,6 +27,18 @@ def load(tmp_path, content, name="log.csv"):
         ("t,a,b\r\n" + NUMBERS.replace("\n", "\r\n"), ["t", "a", "b"]),
         ('"t"\t"a"\t"b"\n' + NUMBERS.replace(",", "\t"), ["t", "a", "b"]),
         ("t;a;b\n" + NUMBERS.replace(",", ";").replace(".", ","), ["t", "a", "b"]),
+        ('t,a,b\n"0,00","1,5",-3\n"0,01","1,6","-4"\n"0,02","1,7",-5\n', ["t", "a", "b"]),
+        ('"t";"a";"b"\n"0,00";"1,5";"-3"\n"0,01";"1,6";"-4"\n"0,02";"1,7";"-5"\n', ["t", "a", "b"]),
+        *(
+            (mark + ("t,a,b\n" + NUMBERS).encode(encoding), ["t", "a", "b"])
+            for mark, encoding in (
+                (b"", "utf-8-sig"),
+                (b"", "utf-16-le"),
+                (b"", "utf-16-be"),
+                (b"\xff\xfe", "utf-16-le"),
+                (b"\xfe\xff", "utf-16-be"),
+            )
+        ),
         ("Instrument X\nRun 7, of Monday\n\nt,a,b\n" + NUMBERS, ["t", "a", "b"]),
     ],
 )
@@ -146,3 +158,16 @@ def test_columns_of_one_name(tmp_path):
 def test_what_is_no_table(tmp_path, content):
     with pytest.raises(UserError):
         load(tmp_path, content)
+
+
+def test_quoted_groups_of_digits_are_no_decimals(tmp_path):
+    """Where a decimal comma shows elsewhere in the file, three digits behind a comma are decimals."""
+    groups = load(tmp_path, 't,a\n1,"1,234"\n2,"2,345"\n3,950\n')
+    assert "which is 1.234 or 1234" in groups.unusable["a"]
+    decimals = load(tmp_path, 't,a\n"0,001","1,234"\n"0,002","2,345"\n"0,003","0,950"\n')
+    np.testing.assert_array_equal(decimals.variables["a"].values, [1.234, 2.345, 0.95])
+
+
+def test_lists_in_quotes_are_no_decimals(tmp_path):
+    lists = load(tmp_path, 't,a\n1.5,"1,2"\n2.5,"3,4"\n3.5,"3,5"\n')
+    assert list(lists.words["a"]) == ["1,2", "3,4", "3,5"]
