@@ -55,27 +55,39 @@ class Report(list[Finding]):
         return next((f for f in self if f.severity == "error" and not f.local), None)
 
 
-_TRIAL = re.compile(r"/trials/([^/]+)(.*)")
+# Places that several trials or recordings have alike: what each is, with its name and the rest of the place as groups.
+_PLACES = (
+    ("trial", re.compile(r"/trials/([^/]+)(.*)")),  # of a session
+    ("trial", re.compile(r"trials\.(.+?)(\.(?:channels|time)(?:\..*)?)?")),  # of a mapping; a name may hold dots
+    ("recording", re.compile(r"(?:.*[/\\])?([^/\\]+\.(?:csv|tsv|txt|dat|asc|mat|mcap|db3|bag))()", re.IGNORECASE)),
+)
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.]*(?:e[-+]?\d+)?%?")
 
 
 def merged(findings: Iterable[Finding], named: int = 3) -> list[Finding]:
-    """Merge findings that several trials share: the finding of the first trial, and the names of the next `named` ones.
+    """Merge findings that several trials or recordings share: the finding of the first one, and the names of the next
+    `named` ones.
 
-    Findings are shared if they differ in nothing but trials and numbers.
+    Findings are shared if they differ in nothing but trials, recordings and numbers.
     """
-    alike: dict[object, list[tuple[Finding, str]]] = {}
+    alike: dict[object, list[tuple[Finding, str, str]]] = {}
     for finding in findings:
-        at = _TRIAL.fullmatch(finding.place)
-        # A finding about no trial has a key of its own.
-        key = (finding.severity, finding.local, at[2], _NUMBER.sub("", finding.message)) if at else object()
-        alike.setdefault(key, []).append((finding, at[1] if at else ""))
+        kind, name, rest = _split(finding.place)
+        # A finding about the whole has a key of its own.
+        key = (finding.severity, finding.local, kind, rest, _NUMBER.sub("", finding.message)) if kind else object()
+        alike.setdefault(key, []).append((finding, kind, name))
     out = []
-    for (first, trial), *others in alike.values():
-        names = list(dict.fromkeys(name for _, name in others if name != trial))
+    for (first, kind, own), *others in alike.values():
+        names = list(dict.fromkeys(name for *_, name in others if name != own))
         if names:
             rest = f" and {len(names) - named} more" if len(names) > named else ""
-            also = f" (likewise in {counted(len(names), 'other trial')}: {', '.join(names[:named])}{rest})"
+            also = f" (likewise in {counted(len(names), f'other {kind}')}: {', '.join(names[:named])}{rest})"
             first = replace(first, message=first.message + also)
         out.append(first)
     return out
+
+
+def _split(place: str) -> tuple[str, str, str]:
+    """Kind of a place, the name of its trial or recording, and the rest of the place; empty where it is of neither."""
+    found = ((kind, pattern.fullmatch(place)) for kind, pattern in _PLACES)
+    return next(((kind, at[1], at[2] or "") for kind, at in found if at), ("", "", ""))

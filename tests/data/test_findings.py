@@ -26,6 +26,38 @@ def test_what_trials_have_in_common_is_said_once():
     assert others == report[6:]
 
 
+@pytest.mark.parametrize(
+    ("place", "kind", "name"),
+    [
+        ("/trials/{}/q", "trial", "0{}-ID.2"),
+        ("trials.{}.channels.q.MCP", "trial", "0{}-ID.2-a"),
+        ("trials.{}.time", "trial", "0{}-ID.2.a"),
+        ("trials.{}", "trial", "0{}"),
+        ("logs/{}", "recording", "log {}.csv"),
+        ("/home/{}", "recording", "log-{}.MAT"),
+        ("C:\\logs\\{}", "recording", "{}.mcap"),
+    ],
+)
+def test_findings_are_merged_at_every_kind_of_place(place, kind, name):
+    report = Report()
+    names = [name.format(k) for k in range(5)]
+    for k, called in enumerate(names):
+        report.warning(place.format(called), f"states {k} units")
+    report.warning("finger.mass", "states 3 units")
+    found, other = merged(report)
+    said = f"states 0 units (likewise in 4 other {kind}s: {', '.join(names[1:4])} and 1 more)"
+    assert (found.place, found.message) == (place.format(names[0]), said)
+    assert other == report[-1]
+
+
+def test_findings_of_no_trial_are_not_merged():
+    report = Report()
+    for place in ("/", "/trials", "/finger/mass", "channels.q.MCP", "finger.joints[0]"):
+        report.warning(place, "is empty")
+        report.warning(place, "is empty")
+    assert merged(report) == report
+
+
 def test_what_is_wrong_with_the_whole_file_has_it_as_its_subject(tmp_path, capsys):
     file = tmp_path / "s.h5"
     file.write_bytes(b"")
