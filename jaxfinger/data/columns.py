@@ -31,6 +31,9 @@ _MAX_INTERVAL = 0.2  # s: a clock with longer intervals is probably in other uni
 # A stamp that is late is so by less than this, in s and in samples, since loggers write more often; and one that runs
 # back between two longer runs of samples begins another recording, or wraps.
 _MAX_LATE, _MAX_LATE_SAMPLES = 1.0, 10
+# Coarse stamps repeat regularly: as many samples to each, within one, with room for jitter. Fewer repeated stamps may
+# be samples that were logged twice, and fewer stamps show no regularity.
+_MIN_REPEATED, _MIN_STAMPS, _MIN_REGULAR = 0.1, 10, 0.9
 _PARTS = "choose one part by `where`, or by `rate_hz` and `span`"
 _OWN_PARTS = "give each part a file of its own"
 
@@ -77,6 +80,13 @@ def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place,
     begins_again = len(restarts(time[rows])) > 0
     rows = _chosen(trial, source, rows, len(time), where)
     rows = rows[_stamped(time[rows], f"`{reading.from_}`", place, report)]
+    coarse = None if trial.sort else coarse_rate(time[rows])
+    if coarse is not None:
+        step, rate = coarse
+        place.fail(
+            f"the clock `{reading.from_}` changes every {step:.4g} s only, after {rate * step:.3g} samples on average; "
+            f"write rate_hz = {rate:.4g} in place of `time`, or `sort = true` if samples are repeated with their stamps"
+        )
     order = increasing_order(time[rows], f"`{reading.from_}`", trial.sort, _PARTS, place, report)
     rows, units = rows[order], reading.units or "s"
     clock = Clock(time[rows], rows, len(time), source, reading.from_, units, trial.sort, begins_again)
@@ -150,6 +160,20 @@ def restarts(time: np.ndarray) -> np.ndarray:
     late = max(_MAX_LATE, _MAX_LATE_SAMPLES * float(np.nanmedian(np.abs(steps))))
     runs = np.diff(np.concatenate([[-1], back, [len(time) - 1]]))
     return back[(steps[back] < -late) & (np.minimum(runs[:-1], runs[1:]) > _MAX_LATE_SAMPLES)]
+
+
+def coarse_rate(time: np.ndarray) -> tuple[float, float] | None:
+    """Step, s, of stamps that are coarser than the samples, and the samples' rate, Hz; None where they are not.
+
+    Each coarse stamp is regularly that of several samples, since its last digits are cut.
+    """
+    stamps, counts = np.unique(time, return_counts=True)
+    if (np.diff(time) < 0.0).any() or len(time) < (1.0 + _MIN_REPEATED) * len(stamps) or len(stamps) < _MIN_STAMPS:
+        return None
+    steps, counts = np.diff(stamps), counts[1:-1]  # The recording may begin and end within a stamp.
+    step, shared = float(np.median(steps)), float(counts.mean())
+    regular = (np.abs(counts - shared) <= 1.0).mean() > _MIN_REGULAR and np.ptp(steps) < 0.5 * step
+    return (step, shared / step) if regular else None
 
 
 def increasing_order(time: np.ndarray, name: str, sort: bool, choice: str, where: Place, report: Report) -> np.ndarray:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxfinger.data.columns import restarts
+from jaxfinger.data.columns import coarse_rate, restarts
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
@@ -169,7 +169,7 @@ def _meaning(name: str, column: str | int | None, x: np.ndarray, units: str) -> 
         return ""
     for meaning, pattern in _MEANINGS:
         if re.search(pattern, word) and (not units or TO_SI[units].si in _SI_UNITS[meaning]):
-            runs = len(x) > 2 and len(np.unique(x)) > 0.5 * len(x)
+            runs = len(x) > 2 and (len(np.unique(x)) > 0.5 * len(x) or coarse_rate(x) is not None)
             return meaning if meaning != "time" or (column is None and runs) else ""
     return _CHANNEL_OF_UNITS.get(TO_SI[units].si, "") if units else ""
 
@@ -257,16 +257,19 @@ def _trial_proposal(
     lines = [f'experiment = "{experiment}"   # guessed: ID.2, ID.3-static, ID.3-dynamic, ID.4, VD.1, VD.2 or VD.3']
     lines += [f"joint = {quoted(joint)}   # that is moved, or held by the torque sensor"] if joint else []
     lines += [f"tendon = {quoted(tendon)}   # that is pulled"] if tendon else []
+    time = np.ravel(recording.variables[clock.name].values) * TO_SI[clock.units or "s"].factor if clock else np.zeros(0)
+    coarse = coarse_rate(time)
     if clock is None:
         lines.append("rate_hz = 1000   # no time was found: write samples per second")
+    elif coarse is not None:
+        lines.append(f"rate_hz = {coarse[1]:.4g}   # several samples share each stamp of {quoted(clock.name)}")
     elif clock.units in ("s", ""):
         lines.append(f"time = {quoted(clock.name)}")
     else:
         lines.append(f'time = {{ from = {quoted(clock.name)}, units = "{clock.units}" }}')
-    time = np.ravel(recording.variables[clock.name].values) * TO_SI[clock.units or "s"].factor if clock else np.zeros(0)
     if len(begins := restarts(time)):
         lines.append(f"# the time begins again after sample {begins[0]}: a trial for each part, chosen by `where`")
-    elif (np.diff(time) <= 0.0).any():
+    elif coarse is None and (np.diff(time) <= 0.0).any():
         lines.append("sort = true   # its stamps are out of order, or repeated")
     rows = {
         channel: [(name, _column(s)) for name, s in zip(names[channel], columns, strict=False)]

@@ -1,5 +1,7 @@
 """Columns of a mapping: own clocks, other files, unwrapping, sorting, and rows chosen by a condition."""
 
+import re
+
 import numpy as np
 import pytest
 import scipy.io
@@ -262,3 +264,30 @@ def test_samples_of_two_sensors_in_rows_of_their_own_are_put_together(tmp_path):
     session = import_file([tmp_path / "log.csv"], tmp_path / "m.toml", tmp_path / "s.h5", True, report)
     assert len([f for f in report if "is interpolated between them" in f.message]) == 2
     np.testing.assert_allclose(session["a"].joint_torque[:, 0], 0.01 * np.sin(session["a"].time + 0.0041), atol=2e-6)
+
+
+@pytest.mark.parametrize(("rate", "step"), [(500.0, 0.01), (3000.0, 0.001), (1700.0, 0.001), (250.0, 0.1)])
+def test_coarse_stamps_are_replaced_by_a_rate(tmp_path, rate, step):
+    """The advice gives the right times."""
+    time = np.arange(6000) / rate + 0.3 * step
+    logs = {"t": np.floor(time / step + 1e-9) * step, "q": 0.6 + 0.5 * np.sin(time), "now": 0.01 * np.cos(time)}
+    with pytest.raises(UserError, match=r"changes every .* s only, after .* samples on average; write rate_hz") as said:
+        bring_in(tmp_path, '"now"', **logs)
+    (advised,) = re.findall(r"rate_hz = ([\d.]+) in place of `time`", str(said.value))
+    text = (tmp_path / "m.toml").read_text().replace('time = "t"', f"rate_hz = {advised}")
+    (tmp_path / "m.toml").write_text(text)
+    session = import_file([tmp_path / "log.mat"], tmp_path / "m.toml", tmp_path / "s.h5", True)
+    np.testing.assert_allclose(session["a"].time, time - time[0], rtol=2e-3)
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        np.sort(np.random.default_rng(0).integers(0, 600, 600)),  # with gaps
+        np.sort(np.concatenate([np.arange(600), np.arange(100, 130)])),  # of which some are logged twice
+        np.arange(600) ^ 1,  # in disorder
+    ],
+)
+def test_stamps_that_are_not_coarse_are_to_be_sorted(tmp_path, rows):
+    with pytest.raises(UserError, match="have import do so by `sort = true`"):
+        bring_in(tmp_path, '"now"', t=TIME[rows], q=Q[rows], now=0.01 * np.cos(TIME[rows]))

@@ -211,3 +211,13 @@ def test_a_set_point_alone_is_said(tmp_path):
     said = proposal([load_recording(path)])
     assert "channels.q" not in said
     assert '# set-points by their names, which are not measured: "q_soll"' in said
+
+
+def test_coarse_stamps_are_replaced_by_a_rate(tmp_path):
+    path = tmp_path / "log.csv"
+    stamps = np.arange(6000) // 5 * 0.01
+    np.savetxt(path, np.column_stack([stamps, np.sin(stamps)]), "%.6f", ",", header="t,q", comments="")
+    said = proposal([load_recording(path)])
+    assert 'rate_hz = 500   # several samples share each stamp of "t"' in said
+    assert "time =" not in said
+    assert "sort" not in said
