@@ -187,9 +187,9 @@ def _spelt(name: str) -> str:
 
 
 def _time_unit(x: np.ndarray) -> str:
-    """Guess the unit of a clock from its usual interval."""
-    steps = _steps(x)
-    step = float(np.median(steps)) if len(steps) else np.nan
+    """Guess the unit of a clock from its usual interval between samples."""
+    steps, coarse = _steps(x), coarse_rate(x)
+    step = 1.0 / coarse[1] if coarse else float(np.median(steps)) if len(steps) else np.nan
     return next((unit for unit, low, high in _INTERVALS if low <= step < high), "s")
 
 

@@ -214,9 +214,10 @@ def test_a_set_point_alone_is_said(tmp_path):
     assert '# set-points by their names, which are not measured: "q_soll"' in said
 
 
-def test_coarse_stamps_are_replaced_by_a_rate(tmp_path):
+@pytest.mark.parametrize("shared", [5, 500])
+def test_coarse_stamps_are_replaced_by_a_rate(tmp_path, shared):
     path = tmp_path / "log.csv"
-    stamps = np.arange(6000) // 5 * 0.01
+    stamps = np.arange(10000) // shared * shared / 500
     np.savetxt(path, np.column_stack([stamps, np.sin(stamps)]), "%.6f", ",", header="t,q", comments="")
     said = proposal([load_recording(path)])
     assert 'rate_hz = 500   # several samples share each stamp of "t"' in said
