@@ -172,7 +172,7 @@ def diagnose(
         unlisted=unlisted,
         ambiguous_sets=tuple(tuple(Key(*k) for k in s) for s in found.ambiguous),
         next_experiment=suggestion,
-        absorbed=absorbed_causes(problem, table),
+        absorbed=absorbed_causes(problem, table, {*verdict.named, *(k for s in found.ambiguous for k in s)}),
         changes=retuned_parameters(problem, fit) if against is None else changed_parameters(against, found, fit),
         left=tuple(
             Left(x.experiment, x.channel, site(problem, x.channel, x.column), x.energy, x.by_variable) for x in left

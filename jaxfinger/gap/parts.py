@@ -1,6 +1,6 @@
 """Parts of a diagnosis beside its verdict, from the results of the search, of the fits and on held-out trials."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -12,6 +12,7 @@ from jaxfinger.gap.augment import prior_std, values_of
 from jaxfinger.gap.budget import MIN_GAP_EVIDENCE, Budget, held_out_gains
 from jaxfinger.gap.closure import centred
 from jaxfinger.gap.columns import Columns
+from jaxfinger.gap.costs import CauseKey
 from jaxfinger.gap.exact import Baseline, SearchState
 from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.posterior import Posterior
@@ -233,11 +234,14 @@ def _shape_spread(tried: Sequence[Offer], net: Float[np.ndarray, " tried"]) -> d
     return out
 
 
-def absorbed_causes(problem: Problem, table: SignatureTable) -> tuple[Absorbed, ...]:
-    """Causes whose signatures the nominal parameters imitate, with the amplitudes that could stay hidden."""
+def absorbed_causes(problem: Problem, table: SignatureTable, blamed: Collection[CauseKey]) -> tuple[Absorbed, ...]:
+    """Causes whose signatures the nominal parameters imitate, with the amplitudes that could stay hidden.
+
+    `blamed` are causes that the verdict names or cannot tell apart: these trials do show them.
+    """
     out = []
     for key, share in table.absorbed.items():
-        if share > MIN_ABSORBED:
+        if share > MIN_ABSORBED and key not in blamed:
             hidden = table.hidden.get(key, {})
             effect = next(v.effect for v in table.rows if v.key == key)
             units = units_at(problem.nominal.finger, effect, key[1])

@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 from jaxfinger.effects import CATALOGUE, Scales
-from jaxfinger.gap.closure import _line
+from jaxfinger.gap import smooth_laws
+from jaxfinger.gap.closure import _line, closures
+from jaxfinger.gap.columns import Columns
 from jaxfinger.gap.exact import within_bounds
+from jaxfinger.gap.parts import channels_not_judged
 from jaxfinger.model import Finger
 from jaxfinger.synthetic import paper_finger, polynomial_finger, true_model
 
@@ -56,3 +59,17 @@ def test_a_simulation_that_runs_away_closes_nothing():
     assert _line("VD.3", "q", "rad", rows).closed > 0.9
     line = _line("VD.3", "q", "rad", rows, diverged=True)
     assert (line.closed, line.closed_ci95, line.diverged, line.resolvable) == (0.0, (0.0, 0.0), True, False)
+
+
+def test_a_channel_that_is_not_judged_has_no_closure(planted, monkeypatch):
+    every = {(x.experiment, x.channel) for x in closures(planted, None, False)}
+    rows: dict[tuple[str, str], int] = {}
+    for e, c, _, pick in smooth_laws.measured_columns(planted):
+        rows[e, c] = max(rows.get((e, c), 0), len(pick))
+    fewest = min(rows, key=rows.__getitem__)
+    monkeypatch.setattr(smooth_laws, "MIN_ROWS", rows[fewest] + 1)
+    judged = {(x.experiment, x.channel) for x in closures(planted, None, False)}
+    refused = {(x.experiment, x.channel) for x in channels_not_judged(planted, Columns.of(planted))}
+    assert fewest in refused
+    assert judged | refused == every
+    assert not judged & refused
