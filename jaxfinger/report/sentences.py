@@ -55,6 +55,8 @@ CHANNEL_NAMES = {
     "tendon_force": "tendon force",
     "q": "simulated angle",
 }
+# Sites that the catalogue names, where a name has two words; the others are the user's own names.
+SITE_NAMES = {s: s.replace("_", " ") for s in ("torque_sensor", *(c for c in CHANNEL_NAMES if "_" in c))}
 EXPERIMENT_SENTENCES = {
     "ID.2": "one joint is moved slowly through its range, tendons taut",
     "ID.3-static": "a motor takes a joint from one held angle to the next, tendons slack",
@@ -93,8 +95,8 @@ def channel_name(channel: str) -> str:
 
 
 def site_names(sites: Iterable[Site]) -> str:
-    """Names of sites: «T3», «T3 and T4», «MCP-PIP»."""
-    return joined(["-".join(s) for s in sites])
+    """Names of sites: «T3», «T3 and T4», «MCP-PIP», «torque sensor»."""
+    return joined(["-".join(SITE_NAMES.get(name, name) for name in s) for s in sites])
 
 
 def key_name(key: Key) -> str:
@@ -133,10 +135,22 @@ def headline(d: Diagnosis) -> str:
     if d.status in (Status.EXPLAINED, Status.PARTLY):
         text = f"{text}: {_listed([cause_name(c) for c in named_causes(d)], 'cause')}"
         if d.status is Status.PARTLY:
-            text += f"; {percent(d.unexplained.share)} is left"
+            text += f"; {_rest(d)}"
     elif d.status is Status.AMBIGUOUS and d.ambiguous_sets:
         text = f"{text}: {joined([key_name(k) for k in d.ambiguous_sets[0]], 'or')}"
     return text
+
+
+def _rest(d: Diagnosis) -> str:
+    """What makes a diagnosis partial, in a few words."""
+    if d.unexplained.share >= MIN_SHARE:
+        return f"{percent(d.unexplained.share)} is left"
+    if d.ambiguous_sets:
+        return "other causes cannot be told apart"
+    if stay := still_open(d.closures, d.relevance, d.tolerance):
+        names = [_of(x.experiment, x.channel) for x in stay]
+        return f"{_listed(names, 'channel')} {'stays' if len(stay) == 1 else 'stay'} open"
+    return "something more leaves traces"
 
 
 def summary(d: Diagnosis) -> str:
@@ -198,7 +212,7 @@ def _no_gap(d: Diagnosis) -> list[str]:
         return [size(d), chance if d.none >= 0.5 else "nothing is missed by more than you tolerate"]
     if d.unlisted >= MIN_NAMED_PROBABILITY:
         chance = "all trials together hold traces of something more, too small for any channel to show alone"
-    judged = {(x.experiment, x.channel) for x in d.closures} - {(x.experiment, x.channel) for x in d.not_judged}
+    judged = [x for x in d.closures if x.channel != "q"]  # Simulated angles are not judged by their noise.
     return [f"{_subject(d)} predicts {_counted(len(judged))} to within the noise", chance]
 
 
@@ -213,13 +227,19 @@ def _explained(d: Diagnosis) -> list[str]:
     it = "it" if len(named_causes(d)) < 2 else "them"
     end = "its noise, or to what you tolerate," if any(x.tolerated for x in d.relevance) else "its noise"
     closes = f"every channel comes down to {end} on trials that no fit has seen"
-    return [size(d), f"{_blamed(d)}; with {it} in the model {closes}"]
+    said = [size(d), f"{_blamed(d)}; with {it} in the model {closes}"]
+    if d.relevance and d.unexplained.share > MAX_LEFT:
+        within = "what you tolerate or " if any(x.tolerated for x in d.relevance) else ""
+        left = f"{percent(d.unexplained.share)} of the gap ({percent_range(*d.unexplained.share_ci95)})"
+        said.append(f"what is left, {left}, is within {within}the error of the noise's own estimate")
+    return said
 
 
 def _partly(d: Diagnosis) -> list[str]:
     unknown = [cannot_tell(members) for members in d.ambiguous_sets[:1]]
-    left = [_left(d)]
-    if stay := still_open(d.closures, d.relevance, d.tolerance):
+    stay = still_open(d.closures, d.relevance, d.tolerance)
+    left = [] if stay and d.unexplained.share < MIN_SHARE else [_left(d)]
+    if stay:
         names = [f"{_of(x.experiment, x.channel)} ({number(x.after / x.noise, 2)} times its noise)" for x in stay]
         left.append(f"what stays open on trials that no fit has seen is {_listed(names, 'channel')}")
     if d.unexplained.share > MAX_LEFT and named_causes(d):
@@ -302,6 +322,12 @@ def shared(d: Diagnosis, c: Cause, of: str = "", interval: str = "") -> str:
 def _left(d: Diagnosis) -> str:
     u = d.unexplained
     pattern = _pattern(d) or " has no pattern"
+    if u.share < MIN_SHARE:
+        few = "hardly anything of the gap is left"
+        if d.unlisted < MIN_NAMED_PROBABILITY:
+            return few
+        trace = f": its trace{_pattern(d)}" if _pattern(d) else ""
+        return f"{few}, but something that the catalogue lacks is {certainty(d.unlisted)} at work{trace}"
     return f"what is left, {percent(u.share)} of the gap ({percent_range(*u.share_ci95)}),{pattern}"
 
 
