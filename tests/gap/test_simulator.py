@@ -86,3 +86,13 @@ def test_a_perfect_simulator_leaves_no_gap():
     found = diagnose(session, without=WITHOUT, predictions=simulator(session), quick=True)
     assert found.status is Status.NO_GAP
     assert jnp.isfinite(found.problem.r).all()
+
+
+def test_a_simulator_that_repeats_the_measurements_is_refused(session):
+    """With nothing missed, noise would be of no size, and rounding a gap."""
+    stacks, told = prepare(session), simulator(session)
+    trial = next(t for t in session if t.experiment == "ID.3-dynamic")
+    copied = np.float32(trial.joint_torque).astype(float)
+    told[trial.name] = {**told[trial.name], "joint_torque": copied}
+    with pytest.raises(UserError, match=rf"{trial.name}/joint_torque: repeat the measurements, noise and all"):
+        emulate(session, Recipe(), stacks, told)
