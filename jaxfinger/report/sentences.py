@@ -6,10 +6,9 @@ what is left, and what to do about it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
-from jaxfinger.effects import Site
 from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY
 from jaxfinger.gap.result import (
     Cause,
@@ -26,6 +25,7 @@ from jaxfinger.gap.result import (
     Status,
     still_open,
 )
+from jaxfinger.report.names import VARIABLE_NAMES, cause_name, channel_name, joined, key_name
 from jaxfinger.report.numbers import alike, measured, number, percent, percent_range, quantity
 
 MAX_NAMES = 4  # Causes or channels in one sentence; more make it hard to read, and the page lists all.
@@ -48,15 +48,6 @@ HEADLINES = {
     Status.UNEXPLAINED: "Unexplained by any known cause",
     Status.NOT_JUDGED: "Nothing could be judged",
 }
-CHANNEL_NAMES = {
-    "joint_torque": "joint torque",
-    "tendon_excursion": "tendon excursion",
-    "fingertip_force": "fingertip force",
-    "tendon_force": "tendon force",
-    "q": "simulated angle",
-}
-# Sites that the catalogue names, where a name has two words; the others are the user's own names.
-SITE_NAMES = {s: s.replace("_", " ") for s in ("torque_sensor", *(c for c in CHANNEL_NAMES if "_" in c))}
 EXPERIMENT_SENTENCES = {
     "ID.2": "one joint is moved slowly through its range, tendons taut",
     "ID.3-static": "a motor takes a joint from one held angle to the next, tendons slack",
@@ -66,52 +57,12 @@ EXPERIMENT_SENTENCES = {
     "VD.2": "one tendon pulls the fingertip against a force sensor",
     "VD.3": "tendons move the free finger",
 }
-VARIABLE_NAMES = {
-    "q": "the joint's own position",
-    "qd": "speed",
-    "direction": "the direction of motion",
-    "tension": "tension",
-    "tendon_force": "tension",
-    "distance since reversal": "the distance since the last reversal",
-    "time": "time",
-    "other joints": "the other joints' positions",
-}
 REASONS = {
     Reason.NOTHING_COUNTS: "no sample of it counts: record it with holds or at a speed at which friction is known",
+    Reason.NOT_MEASURED: "no trial measured it: record this channel too",
     Reason.FEW_SAMPLES: "too few of its samples count to tell a law from noise: record it longer or more often",
     Reason.NOT_PREDICTED: "the other simulator does not predict it: add this channel to the file of its predictions",
 }
-
-
-# Names ----------------------------------------------------------------------------------------------------------------
-def effect_name(effect: str) -> str:
-    """Name of an effect: `tendon_stretch` gives «tendon stretch», `changed_damping` «a change of damping»."""
-    return effect.replace("changed_", "a change of ").replace("_", " ").replace("stribeck", "Stribeck")
-
-
-def channel_name(channel: str) -> str:
-    """Name of a channel: `joint_torque` gives «joint torque»."""
-    return CHANNEL_NAMES.get(channel, channel.replace("_", " "))
-
-
-def site_names(sites: Iterable[Site]) -> str:
-    """Names of sites: «T3», «T3 and T4», «MCP-PIP», «torque sensor»."""
-    return joined(["-".join(SITE_NAMES.get(name, name) for name in s) for s in sites])
-
-
-def key_name(key: Key) -> str:
-    """Name of a cause and its site: «tendon stretch at T3»."""
-    return f"{effect_name(key.effect)} at {site_names([key.site])}"
-
-
-def cause_name(cause: Cause) -> str:
-    """Name of a cause and all its sites: «tendon stretch at T3 and T4»."""
-    return f"{effect_name(cause.effect)} at {site_names(cause.sites)}"
-
-
-def joined(parts: Sequence[str], word: str = "and") -> str:
-    """Join parts as a list in a sentence: «a», «a and b», «a, b and c»."""
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} {word} {parts[-1]}" if parts else ""
 
 
 def sentence(text: str) -> str:
@@ -148,8 +99,11 @@ def _rest(d: Diagnosis) -> str:
     if d.ambiguous_sets:
         return "other causes cannot be told apart"
     if stay := still_open(d.closures, d.relevance, d.tolerance):
-        names = [_of(x.experiment, x.channel) for x in stay]
-        return f"{_listed(names, 'channel')} {'stays' if len(stay) == 1 else 'stay'} open"
+        return (
+            f"{len(stay)} channels stay open"
+            if len(stay) > 1
+            else f"{_of(stay[0].experiment, stay[0].channel)} stays open"
+        )
     return "something more leaves traces"
 
 
@@ -197,7 +151,8 @@ def how_large(x: Relevance, tolerance: dict[str, float]) -> str:
 
 
 def _subject(d: Diagnosis) -> str:
-    model = "the simulator" if is_simulator(d) else f"the model of {d.against}" if d.against else "the model"
+    simulator = "the retuned simulator" if d.changes else "the simulator"  # The gap is what retuning leaves.
+    model = simulator if is_simulator(d) else f"the model of {d.against}" if d.against else "the model"
     return f"at a first look {model}" if d.quick else model
 
 

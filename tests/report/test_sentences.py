@@ -6,6 +6,7 @@ import pytest
 
 from jaxfinger.gap.result import Key
 from jaxfinger.report import sentences
+from jaxfinger.report.names import key_name, site_names
 
 from .fabricated import COUPLED, EXCURSION, LARGE, LINES, SMALL, every, explained
 
@@ -169,9 +170,9 @@ def test_a_long_list_of_open_channels_counts_channels():
 
 def test_sites_of_two_words_are_said_as_words():
     drifts = Key("torque_sensor_drift", ("torque_sensor",))
-    assert sentences.key_name(drifts) == "torque sensor drift at torque sensor"
-    assert sentences.key_name(Key("channel_delay", ("tendon_force",))) == "channel delay at tendon force"
-    assert sentences.site_names([("my_joint", "PIP")]) == "my_joint-PIP"  # a user's own name stays as it is
+    assert key_name(drifts) == "torque sensor drift at torque sensor"
+    assert key_name(Key("channel_delay", ("tendon_force",))) == "channel delay at tendon force"
+    assert site_names([("my_joint", "PIP")]) == "my_joint-PIP"  # a user's own name stays as it is
 
 
 def test_simulated_angles_do_not_count_as_predicted_to_within_the_noise():
@@ -192,6 +193,8 @@ def test_a_rest_of_nothing_is_not_given_as_what_makes_the_diagnosis_partial():
     assert sentences.headline(stays).endswith("; tendon excursion of VD.1 stays open")
     assert "What stays open on trials that no fit has seen is tendon excursion of VD.1" in sentences.summary(stays)
     assert "is left" not in sentences.summary(stays)
+    both = replace(stays, closures=tuple(replace(x, after=2.0 * x.noise) for x in LINES[:2]))
+    assert sentences.headline(both).endswith("; 2 channels stay open")
     rivals = replace(ALL["partly_ambiguous"], unexplained=none_left)
     assert sentences.headline(rivals).endswith("; other causes cannot be told apart")
     assert "Hardly anything of the gap is left." in sentences.summary(rivals)

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
 from jaxfinger.gap.result import ChannelBudget, Closure, Diagnosis
+from jaxfinger.report.names import cause_name, channel_name
 from jaxfinger.report.numbers import alike, quantity
-from jaxfinger.report.sentences import cause_name, channel_name
 from jaxfinger.report.theme import (
     AFTER,
     BEFORE,
