@@ -45,7 +45,6 @@ def write_predictions(
                 raise UserError(f"{path}: /trials/{name}: is predicted but not in the session; predict its trials only")
             trial = session.trials[name]
             time = np.asarray(channels.get("time", trial.time))
-            sizes = {"N": len(time), "m": finger.m, "n": finger.n}
             group = trials.create_group(name)
             for key in ("experiment", "joint", "tendon", "complete"):
                 if getattr(trial, key) is not None:
@@ -58,11 +57,7 @@ def write_predictions(
                     raise UserError(
                         f"{path}: /trials/{name}/{channel}: is no channel; it must be one of {', '.join(CHANNELS)}"
                     )
-                wanted = tuple(sizes[axis] if isinstance(axis, str) else axis for axis in CHANNELS[channel].shape)
-                if np.shape(value) != wanted:
-                    raise UserError(
-                        f"{path}: /trials/{name}/{channel}: has shape {np.shape(value)}; it must be {wanted}"
-                    )
+                _refuse_shape(f"{path}: /trials/{name}/{channel}", channel, value, len(time), session)
                 write_dataset(group, CHANNELS[channel], value, finger.prismatic)
 
 
@@ -92,15 +87,48 @@ def read_predictions(path: str | os.PathLike) -> dict[str, dict[str, np.ndarray]
     return found
 
 
-def _complete(place: str, time: np.ndarray, values: np.ndarray, report: Report) -> None:
-    """Report a channel with a column that is NaN in some of its samples: predictions cover all samples or none."""
+def refuse_misfits(session: Session, predictions: Predictions) -> None:
+    """Refuse predictions that do not fit the session's trials; those of other trials are passed over.
+
+    Raises:
+        UserError: a channel has another shape than the measured one or is NaN in some of its samples; a trial's times
+            do not rise, or do not span the trial.
+    """
+    for name, channels in predictions.items():
+        if name not in session.trials:
+            continue
+        place, recorded = f"{session.file or 'the session'}: predictions of /trials/{name}", session.trials[name].time
+        time = np.asarray(channels.get("time", recorded), float)
+        if time.ndim != 1 or not len(time) or not np.all(np.diff(time) > 0):
+            raise UserError(f"{place}: have times that do not rise; give one time a sample, in s")
+        step = float(np.median(np.diff(recorded))) if len(recorded) > 1 else 0.0
+        # A simulator whose own steps start or end between two samples still spans the trial.
+        if time[0] > recorded[0] + step or time[-1] < recorded[-1] - step:
+            spans = f"from {time[0]:.6g} to {time[-1]:.6g} s of {recorded[0]:.6g} to {recorded[-1]:.6g} s"
+            raise UserError(f"{place}: run {spans}; predict the whole trial, in its own time")
+        for channel in CHANNELS.keys() & channels.keys():
+            _refuse_shape(f"{place}/{channel}", channel, channels[channel], len(time), session)
+            if fault := _incomplete(time, np.asarray(channels[channel], float)):
+                raise UserError(f"{place}/{channel}: {fault}")
+
+
+def _refuse_shape(place: str, channel: str, value: np.ndarray, samples: int, session: Session) -> None:
+    """Refuse a channel that has not the shape of the measured one; UserError names the shape that it must have."""
+    sizes = {"N": samples, "m": session.finger.m, "n": session.finger.n}
+    wanted = tuple(sizes[axis] if isinstance(axis, str) else axis for axis in CHANNELS[channel].shape)
+    if np.shape(value) != wanted:
+        raise UserError(f"{place}: has shape {np.shape(value)}; it must be {wanted}")
+
+
+def _incomplete(time: np.ndarray, values: np.ndarray) -> str:
+    """Say in which samples a column is NaN while it is not in others; empty where columns have all samples or none."""
     bad = ~np.isfinite(values).reshape(len(values), -1)
     for column in bad.T:
         if column.any() and not column.all():
             at = time[int(np.argmax(column))]
             count = f"is NaN in {int(column.sum())} of {len(column)} samples, first at {at:.6g} s"
-            report.error(place, f"{count}; predict every sample, or leave the column NaN throughout")
-            return
+            return f"{count}; predict every sample, or leave the column NaN throughout"
+    return ""
 
 
 def _parse(file: h5py.File, report: Report) -> dict[str, dict[str, np.ndarray]]:
@@ -119,7 +147,7 @@ def _parse(file: h5py.File, report: Report) -> dict[str, dict[str, np.ndarray]]:
             c: dataset(group, e, place, sizes, finger.prismatic, report) for c, e in CHANNELS.items() if c in group
         }
         for channel, value in values.items():
-            if value is not None:
-                _complete(f"{place}/{channel}", time, value, report)
+            if value is not None and (fault := _incomplete(time, value)):
+                report.error(f"{place}/{channel}", fault)
         found[name] = {"time": time} | {channel: value for channel, value in values.items() if value is not None}
     return found

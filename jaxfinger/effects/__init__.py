@@ -3,6 +3,7 @@
 import importlib.util
 import inspect
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -48,8 +49,8 @@ def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
     """Load the effects that a user's Python file defines, by id.
 
     Raises:
-        UserError: The file cannot be loaded or defines no effect. An id is taken by the catalogue, or a sentence for
-            people is missing.
+        UserError: The file cannot be loaded or defines no effect. An id is taken by the catalogue or is no plain word,
+            or a sentence for people or the amplitude is missing.
     """
     path = Path(path)
     spec = importlib.util.spec_from_file_location(f"jaxfinger_user_{path.stem}", path)
@@ -66,6 +67,10 @@ def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
     for name, kind in found.items():
         if name in CATALOGUE | NOMINAL_TERMS | CHANGED:
             raise UserError(f"{path}: {kind.__name__} has the ID {name}, which the catalogue has; choose another")
+        if not re.fullmatch("[a-z][a-z0-9_]*", name):
+            raise UserError(f"{path}: {kind.__name__} has the ID {name!r}; use small letters, digits and underscores")
+        if not kind.amplitudes():
+            raise UserError(f"{path}: {kind.__name__} has no amplitude; declare a field with `amplitude`")
         for sentence in ("HAPPENS", "LOOKS", "CHANGE", "__doc__"):
             if not getattr(kind, sentence):
                 raise UserError(f"{path}: {kind.__name__} has no {sentence.strip('_')}; write its sentence")

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxfinger.effects.scales import Scales
+from jaxfinger.effects.scales import Scales, refuse_unknown_scale
 from jaxfinger.model import Effect, Finger
 
 Site = tuple[str, ...]
@@ -48,7 +48,13 @@ def amplitude(units: str, size: float, of: str = "1", *, signed: bool = False, m
     """Declare a field that is an amplitude: `amplitude("N m", 0.1, "torque")` expects a tenth of the joint's torque.
 
     Its lower bound is zero unless `signed`, its upper bound `most`.
+
+    Raises:
+        ValueError: `size` is not positive, or `of` is no product of scales.
     """
+    if not size > 0.0:
+        raise ValueError(f"an amplitude needs the size of an effect worth naming, above zero, where {size!r} stands")
+    refuse_unknown_scale(of)
     return eqx.field(metadata={"parameter": Amplitude(units, size, of, signed, most)})
 
 
@@ -60,8 +66,9 @@ def shape(
     `moves`: how a refit moves it, `by factors`, `by differences`, or `not`.
 
     Raises:
-        ValueError: `moves` is none of the three.
+        ValueError: `moves` is none of the three, or `of` is no product of scales.
     """
+    refuse_unknown_scale(of)
     if moves not in ("by factors", "by differences", "not"):
         raise ValueError(f"a shape moves by factors, by differences or not, where {moves!r} stands")
     return eqx.field(metadata={"parameter": Shape(units, tuple(values), of, moves, period_of)})

@@ -6,7 +6,7 @@ The same physics in other units then has the same catalogue.
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -103,6 +103,17 @@ class Scales:
         names = self.joints if len(values) == len(self.joints) and name in _OF_JOINTS else self.tendons
         here = [float(v) for k, v in zip(names, values, strict=True) if k in site]
         return min(here) if here else float(np.max(values, initial=0.0)) or 1.0
+
+
+def refuse_unknown_scale(of: str) -> None:
+    """Refuse a text that is no product of scales, such as `torque/speed`, `1/tension` or `1`.
+
+    Raises:
+        ValueError: it names no scale, or holds more than names, `*` and `/`.
+    """
+    known = [f.name for f in fields(Scales) if f.name not in ("joints", "tendons")]
+    if not re.fullmatch(r"(1|[a-z]+)([*/][a-z]+)*", of) or set(re.findall("[a-z]+", of)) - set(known):
+        raise ValueError(f"{of!r} is no product of scales such as torque/speed; scales are {', '.join(known)}")
 
 
 _OF_JOINTS = ("torque", "angle", "speed", "acceleration", "mass")

@@ -63,7 +63,8 @@ class Budget:
         n = max(float(weight @ self.n), 1e-9)
         gap = max(float(weight @ (self.before - self.n)), MIN_RELATIVE_GAP * n)
         lost = (self.without - self.after) @ weight
-        left = float(weight @ (self.after - self.n))
+        # Without causes all of a gap is left, also of one that is smaller than the least that shares are relative to.
+        left = float(weight @ (self.after - self.n)) if len(self.without) else gap
         return np.clip(lost / gap, 0.0, 1.0), float(np.clip(left / gap, 0.0, 1.0))
 
     @cached_property

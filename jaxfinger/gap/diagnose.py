@@ -8,6 +8,7 @@ from pathlib import Path
 from jaxfinger.data import Predictions, Session
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError, did_you_mean
+from jaxfinger.experiments import EXPERIMENTS
 from jaxfinger.gap.augment import Fitted, as_refitted, augmented_fit, nominal_fit
 from jaxfinger.gap.budget import budget
 from jaxfinger.gap.closure import MIN_RESOLVABLE_RATIO, closures
@@ -98,9 +99,10 @@ def diagnose(
             changed by more than its interval says: these changes are candidates too.
 
     Raises:
-        UserError: an effect to leave out is unknown; one of the user's own fails in a prediction or changes none;
-            `predictions` has none of the session's trials; `against` is of another finger or recipe, holds effects, or
-            comes with `predictions`.
+        UserError: an effect to leave out or a channel to tolerate is unknown; a tolerance is no share of a signal; one
+            of the user's own effects fails in a prediction or changes none; `predictions` has none of the session's
+            trials, does not fit them, or repeats the measurements; `against` is of another finger or recipe or of the
+            session itself, holds effects, or comes with `predictions`.
     """
     if against is not None and (predictions is not None or recipe not in (None, against.recipe)):
         raise UserError("an earlier fit brings its own recipe and no other simulator; leave the other one out")
@@ -113,6 +115,7 @@ def diagnose(
             f"{did_you_mean(min(unknown), catalogue)}; "
             f"it has {', '.join(sorted(catalogue))}"
         )
+    _refuse_odd_tolerance(tolerance)
     problem = build(session, recipe, progress, predictions, COARSE if quick else 1, against)
     diagnosed = partial(
         Diagnosis,
@@ -172,7 +175,7 @@ def diagnose(
         unlisted=unlisted,
         ambiguous_sets=tuple(tuple(Key(*k) for k in s) for s in found.ambiguous),
         next_experiment=suggestion,
-        absorbed=absorbed_causes(problem, table),
+        absorbed=absorbed_causes(problem, table, {*verdict.named, *(k for s in found.ambiguous for k in s)}),
         changes=retuned_parameters(problem, fit) if against is None else changed_parameters(against, found, fit),
         left=tuple(
             Left(x.experiment, x.channel, site(problem, x.channel, x.column), x.energy, x.by_variable) for x in left
@@ -206,6 +209,17 @@ def _nothing_judged(problem: Problem, diagnosed: Callable[..., Diagnosis]) -> Di
         nominal=fit,
         augmented=fit,
     )
+
+
+def _refuse_odd_tolerance(tolerance: Mapping[str, float]) -> None:
+    """Refuse a tolerance of a channel that no experiment predicts, and one that is no share of a signal."""
+    channels = dict.fromkeys(c for e in EXPERIMENTS.values() for c in e.channels)
+    for channel, share in tolerance.items():
+        if channel not in channels:
+            near, known = did_you_mean(channel, channels), ", ".join(channels)
+            raise UserError(f"tolerance of {channel}{near}: is of no channel that is judged; these are {known}")
+        if not 0.0 <= share < 1.0:
+            raise UserError(f"tolerance of {channel}: is {share:g}; say a share of its signal, such as 0.02")
 
 
 def search_for_causes(

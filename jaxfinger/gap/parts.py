@@ -1,17 +1,18 @@
 """Parts of a diagnosis beside its verdict, from the results of the search, of the fits and on held-out trials."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.data.schema import channel_units
 from jaxfinger.effects import Changed
-from jaxfinger.experiments import not_judged
+from jaxfinger.experiments import EXPERIMENTS, not_judged
 from jaxfinger.gap.augment import prior_std, values_of
 from jaxfinger.gap.budget import MIN_GAP_EVIDENCE, Budget, held_out_gains
 from jaxfinger.gap.closure import centred
 from jaxfinger.gap.columns import Columns
+from jaxfinger.gap.costs import CauseKey
 from jaxfinger.gap.exact import Baseline, SearchState
 from jaxfinger.gap.formula import Weights
 from jaxfinger.gap.posterior import Posterior
@@ -171,11 +172,29 @@ def _signal(problem: Problem, e: str, c: str) -> float:
 
 def channels_not_judged(problem: Problem, columns: Columns) -> tuple[NotJudged, ...]:
     """Channels of which no sample counts, and channels of which too few count to make a column."""
-    why = Reason.NOTHING_COUNTS if problem.simulator is None else Reason.NOT_PREDICTED
-    out = [NotJudged(x.experiment, x.channel, why) for x in not_judged(problem.stacks)]
+    out = [NotJudged(x.experiment, x.channel, _why_nothing(problem, *x[:2])) for x in not_judged(problem.stacks)]
+    # Of another simulator, experiments without any prediction have no stack.
+    for e in dict.fromkeys(t.experiment for t in problem.session if t.experiment not in problem.stacks):
+        channels = EXPERIMENTS[e].channels if problem.simulator is not None and e in EXPERIMENTS else ()
+        out += [NotJudged(e, c, Reason.NOT_PREDICTED) for c in channels if _recorded(problem, e, c)]
     known = {(x.experiment, x.channel) for x in (*out, *columns.items)}
     few = [(e, c) for e, s in problem.stacks.items() for c in s.experiment.channels if (e, c) not in known]
     return (*out, *(NotJudged(e, c, Reason.FEW_SAMPLES) for e, c in few))
+
+
+def _why_nothing(problem: Problem, e: str, c: str) -> Reason:
+    """Why no sample of a channel counts. With another simulator a stack lacks what it does not predict, too."""
+    if problem.stacks[e].measured[c]:
+        return Reason.NOTHING_COUNTS
+    return Reason.NOT_PREDICTED if problem.simulator is not None and _recorded(problem, e, c) else Reason.NOT_MEASURED
+
+
+def _recorded(problem: Problem, e: str, c: str) -> bool:
+    """Whether any trial holds a channel. The torque of a free finger is zero, and known without a sensor."""
+    if c == "joint_torque" and EXPERIMENTS[e].kind == "driven":
+        return True
+    values = (getattr(t, c) for t in problem.session if t.experiment == e)
+    return any(v is not None and bool(np.isfinite(v).any()) for v in values)
 
 
 def candidates_of(problem: Problem, search: Search, chosen: SearchState, found: Posterior, shares: Budget, fit: Fit):
@@ -233,11 +252,14 @@ def _shape_spread(tried: Sequence[Offer], net: Float[np.ndarray, " tried"]) -> d
     return out
 
 
-def absorbed_causes(problem: Problem, table: SignatureTable) -> tuple[Absorbed, ...]:
-    """Causes whose signatures the nominal parameters imitate, with the amplitudes that could stay hidden."""
+def absorbed_causes(problem: Problem, table: SignatureTable, blamed: Collection[CauseKey]) -> tuple[Absorbed, ...]:
+    """Causes whose signatures the nominal parameters imitate, with the amplitudes that could stay hidden.
+
+    `blamed` are causes that the verdict names or cannot tell apart: these trials do show them.
+    """
     out = []
     for key, share in table.absorbed.items():
-        if share > MIN_ABSORBED:
+        if share > MIN_ABSORBED and key not in blamed:
             hidden = table.hidden.get(key, {})
             effect = next(v.effect for v in table.rows if v.key == key)
             units = units_at(problem.nominal.finger, effect, key[1])

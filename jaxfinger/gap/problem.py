@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.compilation import quick_jit
-from jaxfinger.data import Predictions, Session
+from jaxfinger.data import Predictions, Session, data_hash
 from jaxfinger.effects import Scales
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Stack, prepare
@@ -150,7 +150,8 @@ def build(
             prior of the refit.
 
     Raises:
-        UserError: `predictions` has none of the session's trials; `against` is of another finger or holds effects.
+        UserError: `predictions` has none of the session's trials, or does not fit them; `against` is of another finger
+            or of the session itself, or holds effects.
     """
     progress("reading the recordings")
     measured = stacks = prepare(session, coarse=coarse)
@@ -205,7 +206,7 @@ def _start_from(session: Session, against: Fit) -> Fit:
     """A start for `identify`: the session's own finger with the nominal parameters and covariance of an earlier fit.
 
     Raises:
-        UserError: the fit is of another finger, or holds effects.
+        UserError: the fit is of another finger or of the session itself, or holds effects.
     """
     theirs, file = against.model.finger, session.file or "the session"
     model = nominal_model(session, against.recipe)
@@ -215,6 +216,11 @@ def _start_from(session: Session, against: Fit) -> Fit:
     if against.model.effects:
         raise UserError(
             f"{file}: the fit to compare it with holds effects; give one of the nominal model, as `identify` writes it"
+        )
+    if against.data_hash and session.file and against.data_hash == data_hash(session.file):
+        raise UserError(
+            f"{file}: the fit to compare it with was identified from this very session, so that nothing has changed "
+            "since; give a fit of an earlier session, or none"
         )
     known = np.union1d(against.estimated, np.flatnonzero(np.diag(against.covariance))).astype(int)
     model = Free.at(model, known).set(model, np.asarray(ravel(against.model))[known])

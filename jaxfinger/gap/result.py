@@ -29,6 +29,7 @@ class Reason(StrEnum):
     """Why a channel is not judged."""
 
     NOTHING_COUNTS = "nothing_counts"  # no sample passed the experiment's rules
+    NOT_MEASURED = "not_measured"  # no trial measured it
     FEW_SAMPLES = "few_samples"  # too few samples count to tell a law from noise
     NOT_PREDICTED = "not_predicted"  # the other simulator does not predict it
 

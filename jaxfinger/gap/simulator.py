@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfinger.data import Predictions, Session
+from jaxfinger.data.predictions import refuse_misfits
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Stack, predict_compiled, prepare
 from jaxfinger.identify import Recipe
@@ -35,6 +36,9 @@ from jaxfinger.model import Model
 # Share of a channel's range: a term of the emulator that changes no prediction by more is not in the simulator. It is
 # small beside a term that matters, and large beside what a fit makes of a term that the predictions lack.
 MIN_TERM_SHARE = 0.003
+# Share of a channel's rms in one trial. No simulator knows the noise: predictions that miss less repeat the
+# measurements, at most rounded to single precision, which has seven digits.
+MAX_REPEATED = 1e-6
 
 
 def emulate(
@@ -45,8 +49,10 @@ def emulate(
     `stacks` are those of the measurements, `coarse` as in `prepare`.
 
     Raises:
-        UserError: the file predicts no channel of the session's trials.
+        UserError: the file predicts no channel of the session's trials, or the predictions do not fit them or repeat
+            the measurements.
     """
+    refuse_misfits(session, predictions)
     difference = prepare(session, minus=predictions, coarse=coarse)
     difference = {e: s for e, s in difference.items() if any(np.any(m) for m in s.batch.mask.values())}
     if not difference:
@@ -54,6 +60,8 @@ def emulate(
             f"{session.file}: none of its trials is in the predictions; predict its trials under their own names"
         )
     simulated = {e: _simulated(stacks[e], s) for e, s in difference.items()}
+    for e, s in difference.items():
+        _refuse_repeated(session, simulated[e], s)
     noise = _measured_noise(stacks, simulated)
     emulator = _imitate(session, recipe, simulated, noise)
     lacks = {t for t in recipe.model.terms if t in GROUP_OF_TERM and _absent(emulator, GROUP_OF_TERM[t], simulated)}
@@ -62,6 +70,19 @@ def emulate(
         recipe = replace(recipe, model=replace(recipe.model, terms=terms))
         emulator = _imitate(session, recipe, simulated, noise)
     return emulator, recipe, {e: _rebased(s, _predict(emulator, simulated[e])) for e, s in difference.items()}
+
+
+def _refuse_repeated(session: Session, simulated: Stack, difference: Stack) -> None:
+    """Refuse predictions that are the measurements, noise and all; UserError names the first trial and channel."""
+    for c, mask in difference.batch.mask.items():
+        told, missed = (np.asarray(b.y[c] * mask) for b in (simulated.batch, difference.batch))
+        told, missed = (np.sqrt((x**2).sum(axis=(0, 2))) for x in (told, missed))
+        for trial, size, miss in zip(difference.trials, told, missed, strict=True):
+            if size > 0.0 and miss <= MAX_REPEATED * size:
+                raise UserError(
+                    f"{session.file or 'the session'}: predictions of /trials/{trial}/{c}: repeat the measurements, "
+                    "noise and all; give what the simulator computes, and leave out channels that it is given"
+                )
 
 
 def _simulated(measured: Stack, difference: Stack) -> Stack:

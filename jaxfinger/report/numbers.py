@@ -118,9 +118,9 @@ def percent(share: float) -> str:
         return f"{value:.1g} %" if value >= 0.001 else "under 0.001 %"
     if 99.5 <= value < 100:
         return "over 99 %"
-    return f"{value:.0f} %"
+    return f"{round(value)} %"  # An integer has no minus zero.
 
 
 def percent_range(low: float, high: float) -> str:
     """An interval of shares: «35 to 47 %»."""
-    return f"{100 * low:.0f} to {100 * high:.0f} %"
+    return f"{round(100 * low)} to {round(100 * high)} %"

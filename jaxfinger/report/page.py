@@ -19,6 +19,7 @@ from jaxfinger.report import plots, sentences
 from jaxfinger.report.causes import words
 from jaxfinger.report.curves import Curves, curves
 from jaxfinger.report.measured import arm_points
+from jaxfinger.report.names import VARIABLE_NAMES, cause_name, channel_name, effect_name, joined, key_name, site_names
 from jaxfinger.report.numbers import HALF_95, measured, percent, quantity, unbroken
 from jaxfinger.report.plots import gap as gap_plots
 from jaxfinger.report.plots.fit import INTERVAL_ROWS, interval_size
@@ -87,7 +88,7 @@ def render(d: Diagnosis, trace: Trace | None = None, found: Curves | None = None
         rivals=[sentences.sentence(sentences.cannot_tell(s)) for s in d.ambiguous_sets if d.status is Status.PARTLY],
         changes=[change(x) for x in d.changes[:MAX_CHANGES]],
         changed="What the measurements say of the simulator's parameters" if simulator else "What has changed",
-        others=[{"name": sentences.key_name(c.key), "probability": percent(c.probability)} for c in others],
+        others=[{"name": key_name(c.key), "probability": percent(c.probability)} for c in others],
         places=[_place(p, prismatic) for p in d.where if p.share >= MIN_PLACE_SHARE],
         trace=_trace(trace) if trace else "",
         trace_name=f"{trace.trial}: {trace.name}" if trace else "",
@@ -140,9 +141,7 @@ def _picture(draw: Callable[[Axes], object], name: str, label: str, width: float
 
 
 def _budget(d: Diagnosis) -> Markup:
-    label = "Budget of the gap, a bar a channel: " + "; ".join(
-        f"{sentences.cause_name(c)} {percent(c.share)}" for c in d.budget
-    )
+    label = "Budget of the gap, a bar a channel: " + "; ".join(f"{cause_name(c)} {percent(c.share)}" for c in d.budget)
     return _both(
         lambda ax: plots.budget(d, ax), "budget", f"{label}; unexplained {percent(d.unexplained.share)}",
         lambda width: gap_plots.budget_size(d, width),
@@ -212,7 +211,7 @@ def _arms(found: Curves) -> list[Markup]:
 
 # Words and tables -----------------------------------------------------------------------------------------------------
 def _name(experiment: str, channel: str, column: str | None = None) -> str:
-    return f"{experiment} · {sentences.channel_name(channel)}{f' {column}' if column else ''}"
+    return f"{experiment} · {channel_name(channel)}{f' {column}' if column else ''}"
 
 
 def _relevance(x) -> dict:
@@ -239,7 +238,7 @@ def _cards(d: Diagnosis) -> list[dict]:
 def _card(d: Diagnosis, k: int, c: Cause) -> dict:
     says = f"{sentences.shared(d, c, ' of the gap')}; probability {percent(c.probability)}."
     return _texts(d, k, c.effect) | {
-        "name": sentences.sentence(sentences.cause_name(c)).rstrip("."),
+        "name": sentences.sentence(cause_name(c)).rstrip("."),
         "says": says,
         "sizes": [_value(v, len(c.sites) > 1) for v in c.values],
     }
@@ -247,7 +246,7 @@ def _card(d: Diagnosis, k: int, c: Cause) -> dict:
 
 def _rival(d: Diagnosis, k: int, c: Candidate | None, key: Key) -> dict:
     return _texts(d, k, key.effect) | {
-        "name": sentences.sentence(sentences.key_name(key)).rstrip("."),
+        "name": sentences.sentence(key_name(key)).rstrip("."),
         "says": f"Probability {percent(c.probability)}." if c else "",
         "sizes": [_value(v, False) for v in c.values] if c else [],
     }
@@ -265,7 +264,7 @@ def _value(v: Value, sites: bool) -> str:
 
 def _place(p: Place, prismatic: tuple[bool, ...]) -> dict:
     units = units_where(VARIABLE_UNITS.get(p.variable, "1"), prismatic)
-    variable = sentences.VARIABLE_NAMES.get(p.variable, p.variable)
+    variable = VARIABLE_NAMES.get(p.variable, p.variable)
     return {
         "name": _name(p.experiment, p.channel, p.site),
         "trial": p.trial,
@@ -280,8 +279,8 @@ def _line(x: Closure) -> dict:
 
 def _left(x: Left) -> str:
     most = sorted(x.by_variable.items(), key=lambda kv: -kv[1])[:2]
-    named = [sentences.VARIABLE_NAMES.get(k, k) for k, v in most if v > MIN_VARIABLE_SHARE * x.energy]
-    return f"{_name(x.experiment, x.channel, x.column)}" + (f": goes with {sentences.joined(named)}" if named else "")
+    named = [VARIABLE_NAMES.get(k, k) for k, v in most if v > MIN_VARIABLE_SHARE * x.energy]
+    return f"{_name(x.experiment, x.channel, x.column)}" + (f": goes with {joined(named)}" if named else "")
 
 
 def _absorbed(found: Sequence[Absorbed]) -> list[str]:
@@ -295,7 +294,7 @@ def _absorbed(found: Sequence[Absorbed]) -> list[str]:
         for v in (v for x in some for v in x.hidden if math.isfinite(v.std)):
             hidden[v.name, v.units] = max(hidden.get((v.name, v.units), 0.0), HALF_95 * v.std)
         amounts = "".join(f", {_up_to(half, units)} of {name}" for (name, units), half in hidden.items())
-        lines.append(f"{sentences.effect_name(effect)} at {sentences.site_names([x.key.site for x in some])}{amounts}")
+        lines.append(f"{effect_name(effect)} at {site_names([x.key.site for x in some])}{amounts}")
     return lines
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 
 from jaxfinger.gap.result import Cause, ChannelBudget, Closure, Diagnosis, Key
 from jaxfinger.report import sentences
+from jaxfinger.report.names import cause_name, channel_name, effect_name, key_name, site_names
 from jaxfinger.report.numbers import measured, percent, quantity, unbroken
 from jaxfinger.report.plots.gap import rows_of, segments, shown
 
@@ -47,7 +48,7 @@ def comparison(diagnoses: Mapping[str, Diagnosis]) -> tuple[list[str], list[list
     It holds every cause that some session names: its probability in each session, and its first parameter where named.
     """
     named = {key for d in diagnoses.values() for key in d.named}
-    rows = [[sentences.key_name(key), *(_in_session(key, d) for d in diagnoses.values())] for key in sorted(named)]
+    rows = [[key_name(key), *(_in_session(key, d) for d in diagnoses.values())] for key in sorted(named)]
     return ["cause", *diagnoses], rows
 
 
@@ -79,12 +80,12 @@ def _bar(x: ChannelBudget) -> str:
     for share, sign in parts:
         end += share
         text += sign * (round(BAR * end) - len(text))
-    name = f"{x.experiment} {sentences.channel_name(x.channel)} {x.column}"
+    name = f"{x.experiment} {channel_name(x.channel)} {x.column}"
     return f"  {text}  {name}, {quantity(x.gap, x.units)}"
 
 
 def _legend(d: Diagnosis) -> str:
-    parts = [f"{NOISE} noise", *(f"{SIGNS[k % len(SIGNS)]} {sentences.cause_name(c)}" for k, c in enumerate(d.budget))]
+    parts = [f"{NOISE} noise", *(f"{SIGNS[k % len(SIGNS)]} {cause_name(c)}" for k, c in enumerate(d.budget))]
     seen = [segments(x) for x in rows_of(d, MAX_BARS)]
     parts += [f"{TOGETHER} several together"] if any(s[2] > 0.5 / BAR for s in seen) else []
     parts += [f"{OPEN} unexplained"] if any(s[3] > 0.5 / BAR for s in seen) else []
@@ -95,22 +96,22 @@ def _cause(d: Diagnosis, k: int, c: Cause) -> list[str]:
     says = f"{sentences.shared(d, c)}, probability {percent(c.probability)}"
     at = [f" {'-'.join(v.site)}" if len(c.sites) > 1 else "" for v in c.values]
     values = [f"{v.name}{where} {measured(v.value, v.std, v.units)}" for v, where in zip(c.values, at, strict=True)]
-    first, *rest = _wrapped(f"{SIGNS[k % len(SIGNS)]} {sentences.cause_name(c)}: {says}", "  ")
+    first, *rest = _wrapped(f"{SIGNS[k % len(SIGNS)]} {cause_name(c)}: {says}", "  ")
     return [first, *("    " + line for line in rest), *_wrapped("; ".join(values), " " * 6)]
 
 
 def _not_named(effect: str, d: Diagnosis) -> str:
     """Probability of an effect at its most probable site, or why it has none."""
-    name = sentences.effect_name(effect)
+    name = effect_name(effect)
     if tried := [c for c in d.candidates if c.key.effect == effect]:
         likeliest = max(tried, key=lambda c: c.probability)
-        return f"  {name}: probability {percent(likeliest.probability)} at {sentences.site_names([likeliest.key.site])}"
+        return f"  {name}: probability {percent(likeliest.probability)} at {site_names([likeliest.key.site])}"
     if any(x.key.effect == effect for x in d.absorbed):
         return f"  {name}: the model's own parameters imitate it in these trials"
     return f"  {name}: no trial shows it"
 
 
 def _line(x: Closure) -> str:
-    name = f"{x.experiment} {sentences.channel_name(x.channel)}"
+    name = f"{x.experiment} {channel_name(x.channel)}"
     text = sentences.closing(x)
     return f"  {name:<26} {text.noise:>7}  {text.before:>6} → {text.after:<8} {text.unit:<5}  {text.closed}"

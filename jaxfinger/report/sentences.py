@@ -6,10 +6,9 @@ what is left, and what to do about it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
-from jaxfinger.effects import Site
 from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY
 from jaxfinger.gap.result import (
     Cause,
@@ -26,6 +25,7 @@ from jaxfinger.gap.result import (
     Status,
     still_open,
 )
+from jaxfinger.report.names import VARIABLE_NAMES, cause_name, channel_name, joined, key_name
 from jaxfinger.report.numbers import alike, measured, number, percent, percent_range, quantity
 
 MAX_NAMES = 4  # Causes or channels in one sentence; more make it hard to read, and the page lists all.
@@ -48,13 +48,6 @@ HEADLINES = {
     Status.UNEXPLAINED: "Unexplained by any known cause",
     Status.NOT_JUDGED: "Nothing could be judged",
 }
-CHANNEL_NAMES = {
-    "joint_torque": "joint torque",
-    "tendon_excursion": "tendon excursion",
-    "fingertip_force": "fingertip force",
-    "tendon_force": "tendon force",
-    "q": "simulated angle",
-}
 EXPERIMENT_SENTENCES = {
     "ID.2": "one joint is moved slowly through its range, tendons taut",
     "ID.3-static": "a motor takes a joint from one held angle to the next, tendons slack",
@@ -64,52 +57,12 @@ EXPERIMENT_SENTENCES = {
     "VD.2": "one tendon pulls the fingertip against a force sensor",
     "VD.3": "tendons move the free finger",
 }
-VARIABLE_NAMES = {
-    "q": "the joint's own position",
-    "qd": "speed",
-    "direction": "the direction of motion",
-    "tension": "tension",
-    "tendon_force": "tension",
-    "distance since reversal": "the distance since the last reversal",
-    "time": "time",
-    "other joints": "the other joints' positions",
-}
 REASONS = {
     Reason.NOTHING_COUNTS: "no sample of it counts: record it with holds or at a speed at which friction is known",
+    Reason.NOT_MEASURED: "no trial measured it: record this channel too",
     Reason.FEW_SAMPLES: "too few of its samples count to tell a law from noise: record it longer or more often",
     Reason.NOT_PREDICTED: "the other simulator does not predict it: add this channel to the file of its predictions",
 }
-
-
-# Names ----------------------------------------------------------------------------------------------------------------
-def effect_name(effect: str) -> str:
-    """Name of an effect: `tendon_stretch` gives «tendon stretch», `changed_damping` «a change of damping»."""
-    return effect.replace("changed_", "a change of ").replace("_", " ").replace("stribeck", "Stribeck")
-
-
-def channel_name(channel: str) -> str:
-    """Name of a channel: `joint_torque` gives «joint torque»."""
-    return CHANNEL_NAMES.get(channel, channel.replace("_", " "))
-
-
-def site_names(sites: Iterable[Site]) -> str:
-    """Names of sites: «T3», «T3 and T4», «MCP-PIP»."""
-    return joined(["-".join(s) for s in sites])
-
-
-def key_name(key: Key) -> str:
-    """Name of a cause and its site: «tendon stretch at T3»."""
-    return f"{effect_name(key.effect)} at {site_names([key.site])}"
-
-
-def cause_name(cause: Cause) -> str:
-    """Name of a cause and all its sites: «tendon stretch at T3 and T4»."""
-    return f"{effect_name(cause.effect)} at {site_names(cause.sites)}"
-
-
-def joined(parts: Sequence[str], word: str = "and") -> str:
-    """Join parts as a list in a sentence: «a», «a and b», «a, b and c»."""
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} {word} {parts[-1]}" if parts else ""
 
 
 def sentence(text: str) -> str:
@@ -133,10 +86,25 @@ def headline(d: Diagnosis) -> str:
     if d.status in (Status.EXPLAINED, Status.PARTLY):
         text = f"{text}: {_listed([cause_name(c) for c in named_causes(d)], 'cause')}"
         if d.status is Status.PARTLY:
-            text += f"; {percent(d.unexplained.share)} is left"
+            text += f"; {_rest(d)}"
     elif d.status is Status.AMBIGUOUS and d.ambiguous_sets:
         text = f"{text}: {joined([key_name(k) for k in d.ambiguous_sets[0]], 'or')}"
     return text
+
+
+def _rest(d: Diagnosis) -> str:
+    """What makes a diagnosis partial, in a few words."""
+    if d.unexplained.share >= MIN_SHARE:
+        return f"{percent(d.unexplained.share)} is left"
+    if d.ambiguous_sets:
+        return "other causes cannot be told apart"
+    if stay := still_open(d.closures, d.relevance, d.tolerance):
+        return (
+            f"{len(stay)} channels stay open"
+            if len(stay) > 1
+            else f"{_of(stay[0].experiment, stay[0].channel)} stays open"
+        )
+    return "something more leaves traces"
 
 
 def summary(d: Diagnosis) -> str:
@@ -183,7 +151,8 @@ def how_large(x: Relevance, tolerance: dict[str, float]) -> str:
 
 
 def _subject(d: Diagnosis) -> str:
-    model = "the simulator" if is_simulator(d) else f"the model of {d.against}" if d.against else "the model"
+    simulator = "the retuned simulator" if d.changes else "the simulator"  # The gap is what retuning leaves.
+    model = simulator if is_simulator(d) else f"the model of {d.against}" if d.against else "the model"
     return f"at a first look {model}" if d.quick else model
 
 
@@ -198,7 +167,7 @@ def _no_gap(d: Diagnosis) -> list[str]:
         return [size(d), chance if d.none >= 0.5 else "nothing is missed by more than you tolerate"]
     if d.unlisted >= MIN_NAMED_PROBABILITY:
         chance = "all trials together hold traces of something more, too small for any channel to show alone"
-    judged = {(x.experiment, x.channel) for x in d.closures} - {(x.experiment, x.channel) for x in d.not_judged}
+    judged = [x for x in d.closures if x.channel != "q"]  # Simulated angles are not judged by their noise.
     return [f"{_subject(d)} predicts {_counted(len(judged))} to within the noise", chance]
 
 
@@ -213,13 +182,19 @@ def _explained(d: Diagnosis) -> list[str]:
     it = "it" if len(named_causes(d)) < 2 else "them"
     end = "its noise, or to what you tolerate," if any(x.tolerated for x in d.relevance) else "its noise"
     closes = f"every channel comes down to {end} on trials that no fit has seen"
-    return [size(d), f"{_blamed(d)}; with {it} in the model {closes}"]
+    said = [size(d), f"{_blamed(d)}; with {it} in the model {closes}"]
+    if d.relevance and d.unexplained.share > MAX_LEFT:
+        within = "what you tolerate or " if any(x.tolerated for x in d.relevance) else ""
+        left = f"{percent(d.unexplained.share)} of the gap ({percent_range(*d.unexplained.share_ci95)})"
+        said.append(f"what is left, {left}, is within {within}the error of the noise's own estimate")
+    return said
 
 
 def _partly(d: Diagnosis) -> list[str]:
     unknown = [cannot_tell(members) for members in d.ambiguous_sets[:1]]
-    left = [_left(d)]
-    if stay := still_open(d.closures, d.relevance, d.tolerance):
+    stay = still_open(d.closures, d.relevance, d.tolerance)
+    left = [] if stay and d.unexplained.share < MIN_SHARE else [_left(d)]
+    if stay:
         names = [f"{_of(x.experiment, x.channel)} ({number(x.after / x.noise, 2)} times its noise)" for x in stay]
         left.append(f"what stays open on trials that no fit has seen is {_listed(names, 'channel')}")
     if d.unexplained.share > MAX_LEFT and named_causes(d):
@@ -302,6 +277,12 @@ def shared(d: Diagnosis, c: Cause, of: str = "", interval: str = "") -> str:
 def _left(d: Diagnosis) -> str:
     u = d.unexplained
     pattern = _pattern(d) or " has no pattern"
+    if u.share < MIN_SHARE:
+        few = "hardly anything of the gap is left"
+        if d.unlisted < MIN_NAMED_PROBABILITY:
+            return few
+        trace = f": its trace{_pattern(d)}" if _pattern(d) else ""
+        return f"{few}, but something that the catalogue lacks is {certainty(d.unlisted)} at work{trace}"
     return f"what is left, {percent(u.share)} of the gap ({percent_range(*u.share_ci95)}),{pattern}"
 
 

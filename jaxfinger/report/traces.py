@@ -12,8 +12,8 @@ from jaxfinger.gap.problem import Problem, site
 from jaxfinger.gap.result import Diagnosis
 from jaxfinger.identify.linearise import residuals_of
 from jaxfinger.model import Model
+from jaxfinger.report.names import channel_name
 from jaxfinger.report.numbers import HALF_95, scaled
-from jaxfinger.report.sentences import channel_name
 
 
 @dataclass(frozen=True)

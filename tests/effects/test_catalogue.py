@@ -204,6 +204,29 @@ def test_a_file_without_effects_is_refused(tmp_path, content, complaint):
         load(path)
 
 
+@pytest.mark.parametrize(
+    ("there", "here", "complaint"),
+    [
+        ('"joint_drag"', '"Joint drag"', "has the ID 'Joint drag'; use small letters"),
+        ('"torque/speed/speed"', '"torque/velocity"', "'torque/velocity' is no product of scales"),
+        ('"torque/speed/speed"', '"torque / speed"', "'torque / speed' is no product of scales"),  # would multiply
+        ("0.01,", "-0.01,", "above zero, where -0.01 stands"),
+        (
+            '    b: Float[Array, ""] = amplitude("N m s2/rad2", 0.01, "torque/speed/speed")',
+            "    b = 0.1",
+            "no amplitude",
+        ),
+    ],
+)
+def test_a_mistake_in_the_documented_example_is_said(tmp_path, there, here, complaint):
+    code = DOCUMENT.read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
+    assert there in code
+    path = tmp_path / "drag.py"
+    path.write_text(code.replace(there, here), encoding="utf-8")
+    with pytest.raises(UserError, match=complaint):
+        load(path)
+
+
 def test_an_unknown_parameter_is_refused():
     with pytest.raises(TypeError, match="no parameter"):
         CATALOGUE["payload"].at(FINGER, ("MCP",), weight=1.0)

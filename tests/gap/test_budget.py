@@ -60,3 +60,12 @@ def test_a_channel_of_one_trial_has_an_interval_from_the_parts_of_that_trial():
     (share,), ((low, high),), _, _ = budget.overall
     assert low < share - 0.05
     assert high > share + 0.05
+
+
+def test_without_causes_all_of_a_gap_is_left_however_small_it_is():
+    cells = [Cell(trial, 0, trial % FOLDS, 50) for trial in range(6)]
+    before = np.full(6, 51.0)  # 2 % above the noise, below the least gap that shares are relative to
+    budget = Budget(cells, before, before, np.empty((0, 6)), frozenset({0}), CHANNELS)
+    _, _, left, ends = budget.overall
+    assert (left, ends) == (1.0, (1.0, 1.0))
+    assert budget.of({0})[1] == 1.0

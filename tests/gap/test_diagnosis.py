@@ -187,7 +187,7 @@ def test_no_place_stands_out_of_white_noise(planted):
     assert where(replace(planted, r=np.random.default_rng(2).standard_normal(planted.r.size))) == []
 
 
-@pytest.mark.parametrize(("measured", "reason"), [(False, Reason.NOTHING_COUNTS), (True, Reason.FEW_SAMPLES)])
+@pytest.mark.parametrize(("measured", "reason"), [(False, Reason.NOT_MEASURED), (True, Reason.FEW_SAMPLES)])
 def test_a_session_in_which_too_few_samples_count_is_not_judged(measured, reason):
     """Three seconds of ID.2 are 30 rows of a first look, and a column has 50 at least."""
     session = session_with()

@@ -12,6 +12,7 @@ from jaxfinger.effects import CATALOGUE, Scales, amplitude, shape
 from jaxfinger.gap import diagnose
 from jaxfinger.gap.exact import Baseline
 from jaxfinger.gap.formula import Parameters
+from jaxfinger.gap.parts import absorbed_causes
 from jaxfinger.gap.result import Key
 from jaxfinger.gap.screening import MAX_PERIODS, Scan, read_parts
 from jaxfinger.gap.signature_table import table_of
@@ -100,6 +101,9 @@ def test_what_the_nominal_parameters_imitate_could_hide_at_any_size(planted):
     assert {effect for effect, _ in table.absorbed} == {"joint_offset"}
     assert min(table.absorbed.values()) > 1.0 - 1e-9
     assert min(size for sizes in table.hidden.values() for size in sizes.values()) > 1e5  # N m
+    blamed = next(iter(table.absorbed))  # A cause that the verdict names is shown by these trials.
+    listed = {(x.key.effect, x.key.site) for x in absorbed_causes(planted, table, {blamed})}
+    assert listed == set(table.absorbed) - {blamed}
 
 
 def test_a_signature_of_rounding_is_not_seen(planted):

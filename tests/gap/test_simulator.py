@@ -74,6 +74,20 @@ def test_the_shipped_sessions_own_fit_is_imitated_as_a_simulator():
             assert jnp.sqrt(jnp.sum(off**2) / jnp.sum(mask)) < 0.5 * first_noise(stack, c, stack.batch.y[c]).std.max()
 
 
+@pytest.mark.parametrize(
+    ("tolerance", "says"),
+    [
+        ({"torque": 0.1}, r"tolerance of torque \(did you mean 'joint_torque'\?\): is of no channel that is judged"),
+        ({"joint_torque": 5.0}, "tolerance of joint_torque: is 5; say a share"),
+        ({"joint_torque": np.nan}, "tolerance of joint_torque: is nan"),
+        ({"tendon_excursion": -0.1}, "tolerance of tendon_excursion: is -0.1"),
+    ],
+)
+def test_a_tolerance_that_would_be_passed_over_is_refused(tolerance, says, session):
+    with pytest.raises(UserError, match=says):
+        diagnose(session, tolerance=tolerance)
+
+
 def test_predictions_of_other_trials_are_refused(session):
     other = {"somebody": {"time": np.arange(3.0), "joint_torque": np.zeros((3, 3))}}
     with pytest.raises(UserError, match="none of its trials is in the predictions"):
@@ -86,3 +100,13 @@ def test_a_perfect_simulator_leaves_no_gap():
     found = diagnose(session, without=WITHOUT, predictions=simulator(session), quick=True)
     assert found.status is Status.NO_GAP
     assert jnp.isfinite(found.problem.r).all()
+
+
+def test_a_simulator_that_repeats_the_measurements_is_refused(session):
+    """With nothing missed, noise would be of no size, and rounding a gap."""
+    stacks, told = prepare(session), simulator(session)
+    trial = next(t for t in session if t.experiment == "ID.3-dynamic")
+    copied = np.float32(trial.joint_torque).astype(float)
+    told[trial.name] = {**told[trial.name], "joint_torque": copied}
+    with pytest.raises(UserError, match=rf"{trial.name}/joint_torque: repeat the measurements, noise and all"):
+        emulate(session, Recipe(), stacks, told)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import read_predictions, write_predictions
+from jaxfinger.data.predictions import refuse_misfits
 from jaxfinger.errors import UserError
 from jaxfinger.identify.predictions import predict_session
 from jaxfinger.synthetic import recipe_from
@@ -126,3 +127,35 @@ def test_another_finger_is_refused(short_truth, short):
     finger = replace(short.finger, joint_names=("MCP", "PIP", "thumb"))
     with pytest.raises(UserError, match="has MCP, PIP, thumb where the fit has MCP, PIP, DIP"):
         predict_session(short_truth, replace(short, finger=finger))
+
+
+def late(time):
+    return time + 0.5 * (time[-1] - time[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda time, y: {"time": late(time)}, "/trials/{name}: run from"),
+        (lambda time, y: {"time": time[::-1]}, "/trials/{name}: have times that do not rise"),
+        (lambda time, y: {"joint_torque": y[:-5]}, "/trials/{name}/joint_torque: has shape"),
+        (lambda time, y: {"joint_torque": y[:, :1]}, "/trials/{name}/joint_torque: has shape"),
+        (
+            lambda time, y: {"joint_torque": np.where(np.arange(len(y))[:, None] < 9, np.nan, y)},
+            "/trials/{name}/joint_torque: is NaN in 9 of",
+        ),
+    ],
+)
+def test_predictions_that_do_not_fit_a_trial_are_refused(change, says, predicted, short):
+    trial = next(iter(short.select("ID.3-static")))
+    mine = {**predicted, trial.name: predicted[trial.name] | change(trial.time, predicted[trial.name]["joint_torque"])}
+    with pytest.raises(UserError, match=says.format(name=trial.name)):
+        refuse_misfits(short, mine)
+
+
+def test_predictions_that_fit_are_not_refused(predicted, short):
+    """A model's own, those of other trials beside them, and those on times of the simulator's own."""
+    refuse_misfits(short, {**predicted, "of another session": {"joint_torque": np.zeros(3)}})
+    trial = next(iter(short.select("ID.3-static")))
+    time = np.linspace(trial.time[0] + 1e-4, trial.time[-1] - 1e-4, 57)
+    refuse_misfits(short, {trial.name: {"time": time, "joint_torque": np.zeros((57, short.finger.m))}})

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxfinger.report.numbers import measured, percent, quantity, with_error
+from jaxfinger.report.numbers import measured, percent, percent_range, quantity, with_error
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,21 @@ def test_a_value_without_an_interval_says_so():
 
 @pytest.mark.parametrize(
     ("share", "text"),
-    [(0.41, "41 %"), (3e-4, "0.03 %"), (0.0, "0 %"), (1.0, "100 %"), (0.9996, "over 99 %"), (1e-7, "under 0.001 %")],
+    [
+        (0.41, "41 %"),
+        (3e-4, "0.03 %"),
+        (0.0, "0 %"),
+        (-3e-3, "0 %"),
+        (-0.03, "-3 %"),
+        (1.0, "100 %"),
+        (0.9996, "over 99 %"),
+        (1e-7, "under 0.001 %"),
+    ],
 )
 def test_shares(share, text):
     assert percent(share) == text
+
+
+def test_an_interval_about_nothing_has_no_minus_zero():
+    assert percent_range(-3e-3, 0.02) == "0 to 2 %"
+    assert percent_range(-0.37, 0.0) == "-37 to 0 %"

@@ -57,11 +57,21 @@ def test_a_bar_is_whole(bar):
     noise, causes, together, left = segments(bar)
     assert noise + sum(causes) + together + left == pytest.approx(1.0)
     assert min([noise, together, left, *causes]) >= 0.0
-    assert noise == pytest.approx(bar.noise**2 / (bar.noise**2 + bar.gap**2))
-    if bar.by_cause:
-        assert left == pytest.approx(bar.unexplained * (1 - noise))
+    of_noise = bar.noise**2 / (bar.noise**2 + bar.gap**2)
+    assert left == pytest.approx(bar.unexplained * (1 - of_noise))
     if len(bar.by_cause) < 2:
         assert together == 0.0
+        assert sum(causes) == pytest.approx(sum(bar.by_cause) * (1 - of_noise))
+    else:
+        assert noise == pytest.approx(of_noise)
+
+
+def test_one_cause_has_no_more_of_a_bar_than_comes_back_without_it():
+    """What it neither closes nor leaves is a gap that held-out trials do not show."""
+    noise, causes, together, left = segments(replace(BARS[0], by_cause=(0.03,), unexplained=0.0))
+    assert causes[0] < 0.03
+    assert (together, left) == (0.0, 0.0)
+    assert noise > 0.97
 
 
 def test_a_bar_keeps_the_proportion_of_its_causes():

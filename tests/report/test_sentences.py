@@ -6,8 +6,9 @@ import pytest
 
 from jaxfinger.gap.result import Key
 from jaxfinger.report import sentences
+from jaxfinger.report.names import key_name, site_names
 
-from .fabricated import COUPLED, EXCURSION, LARGE, SMALL, every, explained
+from .fabricated import COUPLED, EXCURSION, LARGE, LINES, SMALL, every, explained
 
 ALL = every()
 SIZE = "The model misses the joint torque by 1.2 N mm in 30 N mm (4 %, ID.4) and the tendon excursion by 6 µm in 20 mm"
@@ -165,3 +166,43 @@ def test_a_long_list_of_open_channels_counts_channels():
     d = every()["still_open"]
     lines = tuple(replace(d.closures[1], experiment=e) for e in ("VD.1", "VD.2", "VD.3", "ID.2", "ID.4", "ID.3-static"))
     assert "and 2 more channels" in sentences.summary(replace(d, closures=lines))
+
+
+def test_sites_of_two_words_are_said_as_words():
+    drifts = Key("torque_sensor_drift", ("torque_sensor",))
+    assert key_name(drifts) == "torque sensor drift at torque sensor"
+    assert key_name(Key("channel_delay", ("tendon_force",))) == "channel delay at tendon force"
+    assert site_names([("my_joint", "PIP")]) == "my_joint-PIP"  # a user's own name stays as it is
+
+
+def test_simulated_angles_do_not_count_as_predicted_to_within_the_noise():
+    """They miss many times the spread between repeats, also where nothing is wrong."""
+    angle = replace(LINES[2], noise=0.001, before=0.05, after=0.05)
+    d = replace(ALL["no_gap"], closures=(*ALL["no_gap"].closures, angle))
+    assert "predicts both channels that could be judged" in sentences.summary(d)
+
+
+def test_a_rest_of_nothing_is_not_given_as_what_makes_the_diagnosis_partial():
+    none_left = replace(ALL["partly"].unexplained, share=0.0, share_ci95=(0.0, 0.49))
+    traces = replace(ALL["partly"], unexplained=none_left, closures=LINES, unlisted=0.9987)
+    assert sentences.headline(traces).endswith("; something more leaves traces")
+    text = sentences.summary(traces)
+    assert "0 % of the gap" not in text
+    assert "something that the catalogue lacks is almost certainly at work: its trace lies mostly in" in text
+    stays = replace(ALL["still_open"], unexplained=none_left)
+    assert sentences.headline(stays).endswith("; tendon excursion of VD.1 stays open")
+    assert "What stays open on trials that no fit has seen is tendon excursion of VD.1" in sentences.summary(stays)
+    assert "is left" not in sentences.summary(stays)
+    both = replace(stays, closures=tuple(replace(x, after=2.0 * x.noise) for x in LINES[:2]))
+    assert sentences.headline(both).endswith("; 2 channels stay open")
+    rivals = replace(ALL["partly_ambiguous"], unexplained=none_left)
+    assert sentences.headline(rivals).endswith("; other causes cannot be told apart")
+    assert "Hardly anything of the gap is left." in sentences.summary(rivals)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.44])
+def test_a_large_rest_of_a_small_gap_is_said_where_every_channel_comes_down_to_its_noise(share):
+    d = explained()
+    text = sentences.summary(replace(d, unexplained=replace(d.unexplained, share=share, share_ci95=(0.3, 0.5))))
+    says = "What is left, 44 % of the gap (30 to 50 %), is within the error of the noise's own estimate."
+    assert (says in text) == (share > 0.25)

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
 from jaxfinger.gap.result import ChannelBudget, Closure, Diagnosis
+from jaxfinger.report.names import cause_name, channel_name
 from jaxfinger.report.numbers import alike, quantity
-from jaxfinger.report.sentences import cause_name, channel_name
 from jaxfinger.report.theme import (
     AFTER,
     BEFORE,
@@ -44,7 +44,8 @@ def segments(x: ChannelBudget) -> tuple[float, list[float], float, float]:
     """Segments of a column's bar, as shares of its mean square: noise, causes, several together, unexplained.
 
     The shares of the causes need not sum to what all close. If they sum to less, the rest is closed by several causes
-    together; if they sum to more, they are scaled down in proportion.
+    together; with one cause, held-out trials show no more than its share, and the rest counts as noise. If they sum to
+    more, they are scaled down in proportion.
     """
     noise = x.noise**2 / max(x.noise**2 + x.gap**2, 1e-300)
     causes, left = [max(s, 0.0) for s in x.by_cause], min(max(x.unexplained, 0.0), 1.0)
@@ -52,8 +53,8 @@ def segments(x: ChannelBudget) -> tuple[float, list[float], float, float]:
     over = max(sum(causes) / room, 1.0) if room > 0 else math.inf
     causes = [(s / over) * (1.0 - noise) for s in causes]
     together, left = max(room * (1.0 - noise) - sum(causes), 0.0), left * (1.0 - noise)
-    if len(causes) < 2:  # One cause alone closes all that is closed.
-        causes, left, together = [c + together for c in causes], left + together * (not causes), 0.0
+    if len(causes) < 2:  # What one cause neither closes nor leaves is no gap on held-out trials.
+        noise, together = noise + together, 0.0
     return noise, causes, together, left
 
 
