@@ -32,14 +32,13 @@ from jaxfinger.identify.solve import Source, solve, white_tangents
 from jaxfinger.identify.stages import (
     Progress,
     cad_prior,
-    can_determine,
-    coverage_of,
     free_groups,
     nominal_model,
     residuals_for_noise,
     sources_of,
 )
 from jaxfinger.identify.start import start_values
+from jaxfinger.identify.trial_coverage import can_determine, coverage_of
 from jaxfinger.model import Model, Terms, terms_without_effects
 
 

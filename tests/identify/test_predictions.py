@@ -7,7 +7,7 @@ import pytest
 
 from jaxfinger.data import read_predictions, write_predictions
 from jaxfinger.errors import UserError
-from jaxfinger.identify.predictions import predict_session
+from jaxfinger.identify.predictions import model_for, predict_session
 from jaxfinger.synthetic import recipe_from
 
 NOISE = recipe_from({}).sensors
@@ -126,3 +126,43 @@ def test_another_finger_is_refused(short_truth, short):
     finger = replace(short.finger, joint_names=("MCP", "PIP", "thumb"))
     with pytest.raises(UserError, match="has MCP, PIP, thumb where the fit has MCP, PIP, DIP"):
         predict_session(short_truth, replace(short, finger=finger))
+
+
+def changed(finger, **entries):
+    """The finger with other entries: {field: (index, value)}."""
+    out = {}
+    for field, (index, value) in entries.items():
+        out[field] = np.array(getattr(finger, field))
+        out[field][index] = value
+        if isinstance(getattr(finger, field), tuple):
+            out[field] = tuple(out[field].tolist())
+    return replace(finger, **out)
+
+
+@pytest.mark.parametrize(
+    ("entries", "says"),
+    [
+        ({"origin": ((2, 0), 0.06)}, "joint DIP is elsewhere than in the fit"),
+        ({"axis": (1, (0.0, 0.0, 1.0))}, "joint PIP has another axis than in the fit"),
+        ({"axis": (1, (0.0, -1.0, 0.0))}, "joint PIP has another axis than in the fit"),
+        ({"prismatic": (0, True)}, "joint MCP is of another type than in the fit"),
+        ({"crosses": ((2, 1), True)}, "tendon T3 crosses joint PIP, other than in the fit"),
+    ],
+)
+def test_another_finger_with_the_same_names_is_refused(short_truth, short, entries, says):
+    with pytest.raises(UserError, match=says):
+        model_for(short_truth, replace(short, finger=changed(short.finger, **entries)))
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        {"origin": ((2, 0), 0.026)},  # CAD and ruler disagree by a few per cent
+        {"origin": (0, (0.1, 0.2, 0.3))},  # mounted elsewhere
+        {"mass": (0, 0.1), "com": ((0, 0), 0.02), "limits": ((0, 1), 1.0)},  # weighed anew, and other stops
+        {"gravity": (slice(None), (0.0, 9.81, 0.0))},
+        {"active": (1, False)},  # not measured this time
+    ],
+)
+def test_the_same_finger_described_anew_is_not(short_truth, short, entries):
+    model_for(short_truth, replace(short, finger=changed(short.finger, **entries)))
