@@ -59,7 +59,7 @@ def demo(
         say("reading the sessions")
         session, fresh = read_session(shipped("session.h5")), read_session(shipped("fresh.h5"))
         fit = identify(session, progress=say)
-    print_fit(fit_to_read(fit), parameters=False)
+    print_fit(fit_to_read(fit, session), parameters=False)
     with progress("demo") as say:
         found = diagnose(session, progress=say)
         say("writing the page")

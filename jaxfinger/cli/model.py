@@ -62,7 +62,7 @@ def identify(
         fit = run(session, wanted, progress=say)
         if joint or ahead:
             fit = _refine(fit, session, say, ahead)
-        content = _write(fit, output, overwrite)
+        content = _write(fit, session, output, overwrite)
         if figures is not None:
             _draw(fit, session, figures, overwrite, say)
     _report(content, json)
@@ -77,20 +77,17 @@ def _fit(
         raise UserError(f"{start}: a fit to start from brings its own recipe; leave out --recipe or --start")
     from jaxfinger.identify import identify as run
     from jaxfinger.identify import load_fit, read_recipe
-    from jaxfinger.identify.predictions import model_for
 
     with progress("fit") as say:
         say("reading the file")
         session = read(file)
         first = load_fit(start) if start else None
-        if first is not None:
-            model_for(first, session)  # Refuses the session of another finger.
         fit = run(session, None if first else read_recipe(recipe), stages, first, say)
         if all(s.status == "skipped" for s in fit.stages):
             raise UserError(
                 f"{file}: {'; '.join(s.message for s in fit.stages)}; nothing is fitted, so nothing written"
             )
-        content = _write(fit, output, overwrite)
+        content = _write(fit, session, output, overwrite)
     _report(content, json)
 
 
@@ -185,14 +182,12 @@ def fit_joint(
     """
     refuse_output(output, overwrite, file, start)
     from jaxfinger.identify import load_fit
-    from jaxfinger.identify.predictions import model_for
 
     with progress("fit") as say:
         say("reading the file")
         session, first = read(file), load_fit(start)
-        model_for(first, session)
         fit = _refine(first, session, say, ahead)
-        content = _write(fit, output, overwrite)
+        content = _write(fit, session, output, overwrite)
     _report(content, json)
 
 
@@ -235,8 +230,9 @@ def fit_effects(
         wanted = read_recipe(recipe)
         own = load(effects) if effects is not None else {}
         say("reading the file")
-        fit = fit_with(read(file), keys, wanted, own, say)
-        content = _write(fit, output, overwrite)
+        session = read(file)
+        fit = fit_with(session, keys, wanted, own, say)
+        content = _write(fit, session, output, overwrite)
     _report(content, json)
 
 
@@ -354,12 +350,12 @@ def show(fit: Path, *, effects: Path | None = None, json: bool = False) -> None:
         raise UserError(f"{fit}: is damaged ({error}); identify the session again") from None
 
 
-def _write(fit, output: Path, overwrite: bool) -> dict:
-    """Write a fit, and return the content of its file."""
+def _write(fit, session, output: Path, overwrite: bool) -> dict:
+    """Write a fit made from `session`, and return the content of its file."""
     from jaxfinger.cli.tables import fit_to_read
     from jaxfinger.identify.fit_file import write_content
 
-    content = fit_to_read(fit)
+    content = fit_to_read(fit, session)
     write_content(content, output, overwrite)
     return content
 

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 from jaxfinger.cli.output import console, plain, table
 from jaxfinger.jsonable import jsonable
-from jaxfinger.report.numbers import HALF_95, number, scaled, with_error
+from jaxfinger.report.numbers import HALF_95, extremes, number, quantity, reach, scaled, with_error
 
 if TYPE_CHECKING:
+    from jaxfinger.data import Session
     from jaxfinger.identify import Fit
     from jaxfinger.identify.validate import Validation
 
@@ -17,12 +18,15 @@ if TYPE_CHECKING:
 MAX_CHI2 = 1.5
 
 
-def fit_to_read(fit: Fit) -> dict:
-    """Content of a fit's file, with a part `seen` that people read: parameters, and ranges of the fit's curves."""
-    from jaxfinger.identify.fit_file import content_of
-    from jaxfinger.report.curves import curves
+def fit_to_read(fit: Fit, session: Session | None = None) -> dict:
+    """Content of a fit's file, with a part `seen` that people read: parameters, and ranges of the fit's curves.
 
-    found = curves(fit)
+    `session`: that of the fit, whose highest tension the tendons' losses are said at.
+    """
+    from jaxfinger.identify.fit_file import content_of
+    from jaxfinger.report.curves import lines
+
+    found = lines(fit, session)
     seen = {
         "parameters": list(fit.table()),
         "moment_arms": [[t, j, *c.range()] for (t, j), c in found.moment_arm.items()],
@@ -64,12 +68,12 @@ def print_fit(content: dict, parameters: bool = True) -> None:
     table("Stages", ("stage", "status", "trials", "χ² per row", "outliers"), rows, left=2)
     _warnings(stages)
     if seen["moment_arms"]:
-        _moment_arms(seen["moment_arms"], content["finger"]["joint_names"])
+        _moment_arms(seen["moment_arms"], content["finger"]["joint_names"], content["finger"]["prismatic"])
     if seen["joints"]:
         _joints(seen["joints"])
     if losses := seen["tendon_friction"]:
         rows = [(t, with_error(loss, std), f"{100 * (1 - loss / f):.0f} %") for t, f, loss, std in losses]
-        table(f"Tendon friction at {losses[0][1]:.0f} N", ("tendon", "loss N", "transmitted"), rows)
+        table(f"Tendon friction at {quantity(losses[0][1], 'N')}", ("tendon", "loss N", "transmitted"), rows)
     if parameters and (rows := _parameters(seen["parameters"])):
         table("Parameters", ("parameter", "value", "units"), rows)
     for effect in content["effects"]:
@@ -95,23 +99,20 @@ def _warnings(stages: list[dict]) -> None:
         out.print()
 
 
-def _moment_arms(arms: list, joints: list[str]) -> None:
-    found = {(t, j): _range(*reach) for t, j, *reach in arms}
+def _moment_arms(arms: list, joints: list[str], sliding: list[bool]) -> None:
+    found = {(t, j): reach(*curve) for t, j, *curve in arms}
     rows = [(t, *(found.get((t, j), "–") for j in joints)) for t in dict.fromkeys(t for t, _ in found)]
-    table("Moment arms in mm (max; min)", ("tendon", *joints), rows)
-
-
-def _range(high: float, low: float, std: float | None) -> str:
-    return f"{high:.2f}; {low:.2f} ± {'?' if std is None else f'{HALF_95 * std:.2f}'}"
+    slides = ", of a sliding joint in mm/mm" if any(sliding) else ""
+    table(f"Moment arms in mm{slides} (max; min)", ("tendon", *joints), rows)
 
 
 def _joints(joints: list[dict]) -> None:
     rows = [
         (
             c["joint"],
-            "{:.1f}; {:.1f}".format(*c["gravity"]),
-            _range(*c["elastic"]),
-            _range(*c["friction"]),
+            extremes(*c["gravity"]),
+            reach(*c["elastic"]),
+            reach(*c["friction"]),
             "N" if c["prismatic"] else "N mm",
             with_error(*c["damping"]),
             "N s/m" if c["prismatic"] else "N mm s/rad",

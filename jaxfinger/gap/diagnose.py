@@ -101,8 +101,8 @@ def diagnose(
     Raises:
         UserError: an effect to leave out or a channel to tolerate is unknown; a tolerance is no share of a signal; one
             of the user's own effects fails in a prediction or changes none; `predictions` has none of the session's
-            trials, does not fit them, or repeats the measurements; `against` is of another finger or recipe or of the
-            session itself, holds effects, or comes with `predictions`.
+            trials, does not fit them, or repeats the measurements; `against` is of another finger or recipe, holds
+            effects, or comes with `predictions`.
     """
     if against is not None and (predictions is not None or recipe not in (None, against.recipe)):
         raise UserError("an earlier fit brings its own recipe and no other simulator; leave the other one out")

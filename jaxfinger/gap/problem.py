@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.compilation import quick_jit
-from jaxfinger.data import Predictions, Session, data_hash
+from jaxfinger.data import Predictions, Session
 from jaxfinger.effects import Scales
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Stack, prepare
@@ -32,14 +32,13 @@ from jaxfinger.identify.solve import Source, solve, white_tangents
 from jaxfinger.identify.stages import (
     Progress,
     cad_prior,
-    can_determine,
-    coverage_of,
     free_groups,
     nominal_model,
     residuals_for_noise,
     sources_of,
 )
 from jaxfinger.identify.start import start_values
+from jaxfinger.identify.trial_coverage import can_determine, coverage_of
 from jaxfinger.model import Model, Terms, terms_without_effects
 
 
@@ -151,7 +150,7 @@ def build(
 
     Raises:
         UserError: `predictions` has none of the session's trials, or does not fit them; `against` is of another finger
-            or of the session itself, or holds effects.
+            or holds effects.
     """
     progress("reading the recordings")
     measured = stacks = prepare(session, coarse=coarse)
@@ -206,7 +205,7 @@ def _start_from(session: Session, against: Fit) -> Fit:
     """A start for `identify`: the session's own finger with the nominal parameters and covariance of an earlier fit.
 
     Raises:
-        UserError: the fit is of another finger or of the session itself, or holds effects.
+        UserError: the fit is of another finger, or holds effects.
     """
     theirs, file = against.model.finger, session.file or "the session"
     model = nominal_model(session, against.recipe)
@@ -216,11 +215,6 @@ def _start_from(session: Session, against: Fit) -> Fit:
     if against.model.effects:
         raise UserError(
             f"{file}: the fit to compare it with holds effects; give one of the nominal model, as `identify` writes it"
-        )
-    if against.data_hash and session.file and against.data_hash == data_hash(session.file):
-        raise UserError(
-            f"{file}: the fit to compare it with was identified from this very session, so that nothing has changed "
-            "since; give a fit of an earlier session, or none"
         )
     known = np.union1d(against.estimated, np.flatnonzero(np.diag(against.covariance))).astype(int)
     model = Free.at(model, known).set(model, np.asarray(ravel(against.model))[known])

@@ -49,8 +49,8 @@ class Fit:
     noise: dict[tuple[str, str], Noise] = field(default_factory=dict)  # by experiment and channel
     stages: tuple[StageReport, ...] = ()
     specimen: str = ""
-    data: str = ""  # file name
-    data_hash: str = ""
+    data: str = ""  # name of the file that it was made from; of several, with commas between them
+    data_hash: str = ""  # of that file's content; of several, with spaces between them; empty for a session in memory
     created: str = ""
     versions: dict[str, str] = field(default_factory=dict)
 
@@ -65,10 +65,23 @@ class Fit:
             recipe,
             specimen=session.specimen,
             data=Path(session.file).name,
-            data_hash=data_hash(session.file) if session.file else "",
+            data_hash=_hash(session),
             created=datetime.now(UTC).isoformat(timespec="seconds"),
             versions={p: version(p) for p in ("jaxfinger", "jax", "optimistix", "equinox", "numpy", "h5py")},
         )
+
+    def was_made_from(self, session: Session) -> bool:
+        """Whether the session is among those that the fit was made from; all sessions in memory count as one."""
+        return _hash(session) in self.data_hash.split(" ")
+
+    def made_from(self, session: Session, alone: bool = False) -> "Fit":
+        """Copy of the fit that names the session among those that it was made from, or `alone`."""
+        name, digest = Path(session.file).name, _hash(session)
+        if alone:
+            return replace(self, data=name, data_hash=digest)
+        if self.was_made_from(session):
+            return self
+        return replace(self, data=", ".join(filter(None, (self.data, name))), data_hash=f"{self.data_hash} {digest}")
 
     @property
     def std(self) -> np.ndarray:
@@ -130,3 +143,8 @@ class Fit:
         variance = np.einsum("...i,ij,...j->...", J, covariance[np.ix_(positions, positions)], J)
         unseen = np.any(J[..., ~seen[positions]] != 0.0, axis=-1)
         return value, np.where(unseen, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _hash(session: Session) -> str:
+    """Hash of the content of the session's file; empty for a session in memory."""
+    return data_hash(session.file) if session.file else ""

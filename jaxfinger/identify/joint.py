@@ -3,18 +3,19 @@
     min_θ  Σ_trials Huber(white residuals(θ)) + ½ ‖Λ^½ (θ − μ)‖²
 
 The prior, of mean μ and precision Λ, is an earlier fit of other recordings with its full covariance. Where the earlier
-fit used these same recordings it gives only the start, and the prior is the finger's description, so that no data are
-counted twice. Masses and centres of mass are free wherever the description gives their standard deviations. Masses stay
-positive, and the inertia of a link is proportional to its mass, since CAD gives its shape.
+fit used these same recordings, alone or among others, it gives only the start, and the prior is the finger's
+description, so that no data are counted twice. Masses and centres of mass are free wherever the description gives their
+standard deviations. Masses stay positive, and the inertia of a link is proportional to its mass, since CAD gives its
+shape.
 """
 
 from dataclasses import replace
 
 import numpy as np
 
-from jaxfinger.data import Session, data_hash
+from jaxfinger.data import Session
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import EXPERIMENTS, prepare
+from jaxfinger.experiments import EXPERIMENTS, not_judged, prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.identifiability import name_invisible
 from jaxfinger.identify.noise import LONG_SIGNAL_WINDOW
@@ -29,8 +30,6 @@ from jaxfinger.identify.stages import (
     Progress,
     cad_covariance,
     cad_prior,
-    can_determine,
-    coverage_of,
     estimate_with_noise,
     free_groups,
     report_of,
@@ -38,6 +37,7 @@ from jaxfinger.identify.stages import (
     total_cost,
 )
 from jaxfinger.identify.start import start_values
+from jaxfinger.identify.trial_coverage import can_determine, coverage_of
 from jaxfinger.model import Model
 
 JOINT = "joint"  # name of the stage
@@ -79,7 +79,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
     seen = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and can_determine(p, coverage)]
     free = np.union1d(np.union1d(fit.estimated, cad), seen).astype(int)
 
-    same = fit.data_hash == (data_hash(session.file) if session.file else "")
+    same = fit.was_made_from(session)
     if same:
         prior = cad_prior(session, recipe, parameters, free)
     else:
@@ -89,8 +89,13 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
     model, solution, sources, noise = estimate_with_noise(
         model, free, stacks, reads, known, prior, huber, window=LONG_SIGNAL_WINDOW
     )
-    warnings = name_invisible(parameters, free, solution.invisible)
-    if not solution.converged or warnings or solution.chi2_per_row(free.size) > RESTART_CHI2:
+    lost = [
+        f"no sample of {x.channel} in {x.experiment} counts: {x.reason}"
+        for x in not_judged(stacks)
+        if x.channel in reads[x.experiment]
+    ]
+    warnings = lost + name_invisible(parameters, free, solution.invisible)
+    if not solution.converged or solution.invisible.size or solution.chi2_per_row(free.size) > RESTART_CHI2:
         progress("refining from a neutral start")
         neutral = start_values(_neutral(model, free, parameters), free, parameters, sources)
         other, second = solve(neutral, free, sources, prior, huber)
@@ -98,6 +103,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         if after < before * (1 - 1e-6):  # beyond rounding
             model, solution = other, second
             warnings = [
+                *lost,
                 *name_invisible(parameters, free, solution.invisible),
                 "the earlier fit led to a poorer optimum",
             ]
@@ -105,7 +111,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
     covariance = propagate(fit.covariance, model, solution, sources, free, prior, huber)
     warnings += implausible(model, covariance, free, parameter_bounds(start, free)[0])
     refined = replace(
-        fit,
+        fit.made_from(session, alone=same),
         model=model,
         covariance=covariance,
         estimated=free,

@@ -207,13 +207,22 @@ def _moment_arm(model: Model, k: int, t: int) -> Parameter:
     return Parameter(
         f"excursion {tendon} {label}",
         "moment_arm",
-        _per_rad("m", sum(exponents)),
+        _excursion_units(exponents, model.finger.prismatic),
         joints[spanned[0]] if len(spanned) == 1 else None,
         tendon,
         sum(exponents),
         tuple(joints[i] for i in spanned),
         determinable=crosses and model.finger.active[k],
     )
+
+
+def _excursion_units(exponents: tuple[int, ...], prismatic: tuple[bool, ...]) -> str:
+    """Units of the coefficient of a term in an excursion: m over the product of its angles and travels."""
+    travels = sum(p for p, slides in zip(exponents, prismatic, strict=True) if slides)
+    angles = sum(exponents) - travels
+    if not travels:
+        return _per_rad("m", angles)
+    return _per_rad(_per_rad("1", travels - 1).replace("rad", "m"), angles)
 
 
 def _per_rad(units: str, power: int) -> str:

@@ -41,7 +41,7 @@ def implausible(
 
 def _with_interval(p: Parameter, value: float, std: float) -> str:
     known = f" ± {Z95 * std:.2g}" if np.isfinite(std) else " ± ?"
-    return f"{p.name} is {value:.3g}{known} {p.units}"
+    return f"{p.name} is {value:.3g}{known} {p.units}".removesuffix(" 1")
 
 
 def _negative_friction(model: Model, covariance, free, parameters) -> list[str]:

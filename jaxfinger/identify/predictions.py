@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import equinox as eqx
 import jax
@@ -11,15 +11,18 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
-from jaxfinger.data import Session, Trial, joints_of, low_pass
+from jaxfinger.data import FingerDescription, Session, Trial, joints_of, low_pass
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import SAMPLES, Stack, padded, padded_size, predict_compiled, prepare
 from jaxfinger.identify.fit import Fit
-from jaxfinger.model import Model, Motion, simulate
+from jaxfinger.model import Finger, Model, Motion, simulate
 
 # Longest time step of a forward simulation, in s at the protocol's pace. Steps a quarter as long change angles
 # predicted half a second ahead by less than an encoder's resolution (tests/identify/test_shooting.py).
 MAX_TIME_STEP = 5e-4
+# Distance of two places of one joint over the fingers' length, and angle, rad, between two axes of it. CAD and a ruler
+# know both ten times better, so that joints further apart are those of two fingers.
+MAX_SHARE_APART, MAX_TILT = 0.1, 0.2
 
 
 def predict_session(
@@ -67,7 +70,7 @@ def model_for(fit: Fit | Model, session: Session) -> Model:
     """Model of the fit with the session's `gravity`, which belongs to the rig and not to the finger.
 
     Raises:
-        UserError: the model's joints or tendons are not those of the session.
+        UserError: the model's finger is not that of the session, by its joints or tendons, their names or places.
     """
     model = fit.model if isinstance(fit, Fit) else fit
     finger, file = session.finger, session.file or "the session"
@@ -80,9 +83,32 @@ def model_for(fit: Fit | Model, session: Session) -> Model:
                 f"{file}: /finger/{kind}: has {', '.join(theirs) or 'none'} where the fit has "
                 f"{', '.join(ours) or 'none'}; give a session of the finger that was identified"
             )
+    for what, where in _differences(model.finger, finger):
+        raise UserError(
+            f"{file}: /finger/{where}: {what} than in the fit; give a session of the finger that was identified, or "
+            "identify this one"
+        )
     if not np.any(model.finger.gravity):
         return model  # the recipe leaves gravity out
     return eqx.tree_at(lambda m: m.finger.gravity, model, jnp.asarray(finger.gravity, dtype=float))
+
+
+def _differences(ours: Finger, theirs: FingerDescription) -> Iterator[tuple[str, str]]:
+    """What tells the session's finger from that of the fit, and the dataset that says so. Links may be weighed anew."""
+    origins = np.stack([np.asarray(ours.origin), theirs.origin])
+    apart = np.linalg.norm(origins[1] - origins[0], axis=-1)
+    length = np.linalg.norm(origins, axis=-1).max(initial=0.0)
+    along = np.sum(np.asarray(ours.axis) * theirs.axis, axis=-1)
+    for i, name in enumerate(theirs.joint_names):
+        if ours.prismatic[i] != theirs.prismatic[i]:
+            yield f"joint {name} is of another type", "joints/type"
+        if along[i] < np.cos(MAX_TILT):
+            yield f"joint {name} has another axis", "joints/axis"
+        if i and apart[i] > MAX_SHARE_APART * length:  # the first joint's place is that of the finger in its rig
+            yield f"joint {name} is elsewhere", "joints/origin"
+    for k, i in np.argwhere(np.array(ours.crosses, bool).reshape(theirs.crosses.shape) != theirs.crosses):
+        crosses = "crosses" if theirs.crosses[k, i] else "does not cross"
+        yield f"tendon {theirs.tendon_names[k]} {crosses} joint {theirs.joint_names[i]}, other", "tendons/crosses"
 
 
 def _only_measurable(channels: dict[str, np.ndarray], trial: Trial, session: Session) -> dict[str, np.ndarray]:

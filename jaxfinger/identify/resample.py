@@ -29,7 +29,8 @@ from jaxfinger.identify.linearise import linearise, triangular
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.shooting import AHEAD
 from jaxfinger.identify.solve import visible
-from jaxfinger.identify.stages import STAGES, cad_covariance, cad_prior, coverage_of, sources_of, stage_free
+from jaxfinger.identify.stages import STAGES, cad_covariance, cad_prior, sources_of, stage_free
+from jaxfinger.identify.trial_coverage import coverage_of
 
 Batching = Literal["map", "vmap"]
 # Smallest pivot of a Cholesky factor of H_s[s, s], which is the identity where all weights are 1. A smaller one means

@@ -14,15 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfinger.data import Session, joints_of, moving_joints
+from jaxfinger.data import Session
 from jaxfinger.data.sizes import sizes_of
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import EXPERIMENTS, Experiment, Stack, not_judged, prepare
+from jaxfinger.experiments import Experiment, Stack, not_judged, prepare
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible
 from jaxfinger.identify.noise import MIN_STD, SIGNAL_WINDOW, Noise, estimate
 from jaxfinger.identify.parameters import Parameter, describe, ravel
 from jaxfinger.identify.plausible import implausible
+from jaxfinger.identify.predictions import model_for
 from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.propagate import propagate
 from jaxfinger.identify.recipe import Recipe
@@ -37,6 +38,7 @@ from jaxfinger.identify.solve import (
     solve,
 )
 from jaxfinger.identify.start import start_values
+from jaxfinger.identify.trial_coverage import Coverage, can_determine, coverage_of, name_missing, name_unseen
 from jaxfinger.model import Finger, Model
 
 Progress = Callable[[str], None]
@@ -184,15 +186,18 @@ def identify(
     '95 ± 0.4 kg'
 
     Raises:
-        UserError: `recipe` is another than that of `start`.
+        UserError: `recipe` is another than that of `start`, or `start` is a fit of another finger.
     """
     if start is not None and recipe not in (None, start.recipe):
         raise UserError("a fit to start from brings its own recipe; leave out `recipe` or `start`")
     recipe = recipe or (start.recipe if start else Recipe())
     wanted = stages or recipe.fit.stages
-    fit = start or Fit.before(session, recipe, nominal_model(session, recipe))
     if start is None:
+        fit = Fit.before(session, recipe, nominal_model(session, recipe))
         fit = replace(fit, covariance=cad_covariance(session, describe(fit.model)))
+    else:
+        fit = replace(start, model=model_for(start, session), noise=_noise_here(start, session, wanted))
+        fit = fit.made_from(session)
     with ThreadPoolExecutor(1) as pool:  # a stage is compiled while the recordings of the next are filtered
         experiments = dict.fromkeys(e for s in wanted for e in STAGES[s].reads) if stacks is None else ()
         named = {e: [t.name for t in session if t.experiment == e] for e in experiments}
@@ -205,6 +210,14 @@ def identify(
                 ready |= pending.pop(experiment).result()
             fit = run_stage(fit, STAGES[name], ready, session, tangents)
     return fit
+
+
+def _noise_here(start: Fit, session: Session, stages: tuple[str, ...]) -> dict[tuple[str, str], Noise]:
+    """Noise of a fit to start from, without that which other sensors may have had in trials that these stages read."""
+    if start.was_made_from(session):
+        return start.noise
+    read = {e for s in stages for e in STAGES[s].reads} & {t.experiment for t in session}
+    return {of: noise for of, noise in start.noise.items() if of[0] not in read}
 
 
 def run_stage(
@@ -227,21 +240,25 @@ def run_stage(
     coverage = coverage_of(reads, session)
     free = stage_free(fit, stage, parameters, coverage)
     if not free.size:
-        return skipped("the recipe leaves its terms out of the nominal model")
+        if not groups:
+            return skipped("the recipe leaves its terms out of the nominal model")
+        return skipped("; ".join(name_unseen(parameters, groups, free, coverage)) or "the finger has no active tendon")
     prior = cad_prior(session, recipe, parameters, free)
     model, solution, sources, noise = estimate_with_noise(
         fit.model, free, stacks, reads, fit.noise, prior, recipe.fit.huber, tangents
     )
     covariance = propagate(fit.covariance, model, solution, sources, free, prior, recipe.fit.huber)
-    warnings = name_invisible(parameters, free, solution.invisible)
-    warnings += _unseen(parameters, groups, free, coverage)
+    fitted = np.union1d(fit.estimated, free).astype(int)
+    determined = fitted[np.isfinite(np.diag(covariance)[fitted])]
+    read = np.unique(np.concatenate([s.positions for s in sources.values()]))
+    needed = read[[parameters[i].group in free_groups(recipe) for i in read]]
+    warnings = name_missing(parameters, np.asarray(ravel(model)), determined, needed, coverage)
+    warnings += name_invisible(parameters, free, solution.invisible)
+    warnings += name_unseen(parameters, groups, free, coverage)
     warnings += implausible(model, covariance, free, parameter_bounds(fit.model, free)[0])
     trials = tuple(t for e in reads for t in stacks[e].trials)
     report = report_of(stage.name, solution, free, trials, warnings)
-    estimated = np.union1d(fit.estimated, free).astype(int)
-    return replace(
-        fit, model=model, covariance=covariance, estimated=estimated, noise=noise, stages=(*fit.stages, report)
-    )
+    return replace(fit, model=model, covariance=covariance, estimated=fitted, noise=noise, stages=(*fit.stages, report))
 
 
 def report_of(
@@ -260,7 +277,7 @@ def report_of(
     )
 
 
-def stage_free(fit: Fit, stage: Stage, parameters: list[Parameter], coverage) -> np.ndarray:
+def stage_free(fit: Fit, stage: Stage, parameters: list[Parameter], coverage: Coverage) -> np.ndarray:
     """Positions of the parameters that a stage estimates: those of its groups that its trials can determine."""
     groups = set(stage.frees) & free_groups(fit.recipe)
     prior_groups = {"mass", "com"} if fit.recipe.fit.free_inertia and stage.name.startswith("ID.3") else set()
@@ -315,39 +332,6 @@ def estimate_with_noise(
 def total_cost(model: Model, solution: Solution, free: np.ndarray, prior: Prior | None) -> float:
     """Cost that a fit minimises, the prior included."""
     return solution.cost + (prior.cost(np.asarray(ravel(model))[free]) if prior else 0.0)
-
-
-def coverage_of(reads, session: Session) -> tuple[set[str], set[tuple[str, str]], set[str], list[set[str]]]:
-    """Coverage of the trials read, for `can_determine`.
-
-    Returns:
-        Joints that are instrumented or move; pairs (tendon, joint) recorded together; tendons that are pulled; and for
-        each trial that is not held the set of joints that move.
-    """
-    trials = [t for t in session if t.experiment in reads and len(t.time) > 1]
-    joints = {joint for t in trials for joint in joints_of(t, session.finger)}
-    moved = {(k, joint) for joint in joints for k in session.finger.tendon_names}
-    free = [set(moving_joints(t, session.finger)) for t in trials if not EXPERIMENTS[t.experiment].held]
-    return joints, moved, {t.tendon for t in trials if t.tendon}, free
-
-
-def can_determine(p: Parameter, coverage) -> bool:
-    """Whether trials can determine a parameter, given their `coverage` (`coverage_of`)."""
-    joints, moved, tendons, together = coverage
-    if p.group == "moment_arm" and len(p.spans) > 1:  # a term of two joints needs a trial that moves both
-        return any(joints.issuperset(p.spans) for joints in together)
-    if p.group == "moment_arm":
-        return (p.tendon, p.joint) in moved
-    if p.group == "tendon_friction":
-        return p.tendon in tendons
-    return p.joint in joints
-
-
-def _unseen(parameters, groups, free, coverage) -> list[str]:
-    names = [p.name for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in set(free)]
-    pairs = {" and ".join(p.spans) for p in parameters if p.name in names and len(p.spans) > 1}
-    mend = f"; record a trial that moves {' together, and '.join(sorted(pairs))} together" if pairs else ""
-    return [f"no trial shows {', '.join(names)}: left as given, or at zero{mend}"] if names else []
 
 
 def residuals_for_noise(

@@ -61,7 +61,7 @@ class Slope:
     tendon: str
     axis: str
     measured: float  # N/N
-    measured_std: float  # N/N, from the scatter of the holds about the model's curve
+    measured_std: float  # N/N, from the scatter of the holds about the model's curve; NaN for two holds
     predicted: float  # N/N
     predicted_std: float  # N/N, from the fit's covariance
 
@@ -327,13 +327,18 @@ def _slopes(fit: Fit, model: Model, session: Session, stack: Stack) -> list[Slop
 
 
 def _slope_std(f: np.ndarray, errors: np.ndarray, weights: np.ndarray) -> float:
-    """Standard deviation of a slope, from the scatter of the means of holds about the model's curve."""
+    """Standard deviation of a slope, from the scatter of the means of holds about the model's curve.
+
+    NaN for two holds, through which a line goes without scatter.
+    """
     counts = weights != 0
     levels, hold = np.unique(f[counts], return_inverse=True)  # within a hold the tension is constant, its mean
+    if levels.size < 3:
+        return float("nan")
     mean = np.bincount(hold, errors[counts]) / np.bincount(hold)
     centred = levels - levels.mean()
     rest = mean - mean.mean() - (centred @ mean) / (centred @ centred) * centred
-    return float(np.sqrt(rest @ rest / max(1, levels.size - 2) / (centred @ centred)))
+    return float(np.sqrt(rest @ rest / (levels.size - 2) / (centred @ centred)))
 
 
 # -- VD.3: forward simulation -----------------------------------------------------------------------------------------

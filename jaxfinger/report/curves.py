@@ -11,13 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.data import Session
+from jaxfinger.data.sizes import sizes_of
 from jaxfinger.experiments import prepare
 from jaxfinger.identify import Fit
 from jaxfinger.model import Model, rigid_body
 from jaxfinger.report.measured import Points, arm_points, hold_points, loss_points
 
 SAMPLES = 61  # Points of a curve: two degrees apart over a range of 120°, closer than a figure resolves.
-MAX_TENSION = 12.0  # N, of the tendon friction's curve: the paper's protocol goes to 10 N, its validation to 15 N.
+MAX_TENSION = 12.0  # N, of the loss's curve where no session says how hard the machine pulls: the paper pulls with 10.
 
 
 @dataclass(frozen=True)
@@ -61,10 +62,9 @@ def curves(fit: Fit, session: Session | None = None) -> Curves:
     """Compute the curves of a fit over each joint's range, the other joints in the middle of theirs.
 
     Curves without an estimated parameter are left out. A session adds measured points: slopes of the excursions of
-    ID.2, torques of the holds of ID.3-static, losses of the holds of ID.4.
+    ID.2, torques of the holds of ID.3-static, losses of the holds of ID.4. The loss goes to its highest tension.
     """
-    found = _curves(fit)
-    return found if session is None else _with_points(found, fit, session)
+    return lines(fit) if session is None else _with_points(lines(fit, session), fit, session)
 
 
 def _with_points(found: Curves, fit: Fit, session: Session) -> Curves:
@@ -81,14 +81,16 @@ def _with_points(found: Curves, fit: Fit, session: Session) -> Curves:
     )
 
 
-def _curves(fit: Fit) -> Curves:
+def lines(fit: Fit, session: Session | None = None) -> Curves:
+    """Compute the curves without measured points; the loss up to the highest tension of `session`."""
+    tension = MAX_TENSION if session is None else sizes_of(session).tension or MAX_TENSION
     model, finger = fit.model, fit.model.finger
     limits = np.asarray(finger.limits)
     m, S = finger.m, SAMPLES
     q = np.tile(limits.mean(axis=1)[:, None, None], (1, m, S))
     for i in range(m):
         q[i, i] = np.linspace(limits[i, 0], limits[i, 1], S)
-    f = np.linspace(0.0, MAX_TENSION, S)
+    f = np.linspace(0.0, tension, S)
     values, std = fit.function(_evaluate(*jax.device_put((q, np.tile(f, (finger.n, 1))))))
     cuts = np.cumsum((finger.n * m * S, m * S, m * S, m))
     arms, elastic, friction, damping, loss = zip(np.split(values, cuts), np.split(std, cuts), strict=True)

@@ -65,12 +65,34 @@ def with_error(value: float, std: float | None) -> str:
     if std is None or not math.isfinite(std):
         return f"{value:.4g} ± ?"
     if std == 0:
-        return f"{value:.4g}"
+        return f"{value + 0.0:.4g}"
     half = HALF_95 * std
     decimals = max(0, 1 - math.floor(math.log10(half)))
     if decimals > 8:
         return f"{value:.4g} ± {half:.2g}"
-    return f"{value + 0.0:.{decimals}f} ± {half:.{decimals}f}".replace(f"-{0:.{decimals}f} ", f"{0:.{decimals}f} ")
+    return f"{_fixed(value, decimals)} ± {half:.{decimals}f}"
+
+
+def reach(high: float, low: float, std: float | None) -> str:
+    """`largest; smallest ± half of the 95 % interval` of a curve, in the digits of `with_error`."""
+    smallest = with_error(low, std)
+    value, known, half = smallest.partition(" ± ")
+    if not known or half == "?" or "e" in value:
+        return f"{high + 0.0:.4g}; {smallest}"
+    return f"{_fixed(high, len(value.partition('.')[2]))}; {smallest}"
+
+
+def extremes(high: float, low: float, digits: int = 3) -> str:
+    """`largest; smallest` of a curve without an interval, with so many significant digits of the larger size."""
+    size = max(abs(high), abs(low))
+    decimals = max(0, digits - 1 - math.floor(math.log10(size))) if 0.0 < size < math.inf else 0
+    return f"{_fixed(high, decimals)}; {_fixed(low, decimals)}"
+
+
+def _fixed(value: float, decimals: int) -> str:
+    """The number with so many decimals, and zero without a sign."""
+    text = f"{value:.{decimals}f}"
+    return text.removeprefix("-") if not text.strip("-0.") else text
 
 
 def quantity(value: float, units: str, digits: int = 2) -> str:

@@ -5,9 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jaxfinger.data import read_session, write_session
 from jaxfinger.effects import CATALOGUE
-from jaxfinger.errors import UserError
 from jaxfinger.gap.augment import as_refitted, augmented_fit, nominal_fit
 from jaxfinger.gap.exact import Baseline, fit_at_nominal, fit_set, refit_from_plain
 from jaxfinger.gap.formula import Parameters, Weights
@@ -15,10 +13,9 @@ from jaxfinger.gap.problem import build, moved
 from jaxfinger.gap.projector import orthonormalise
 from jaxfinger.gap.signatures import Signatures, Variant
 from jaxfinger.gap.where import where
-from jaxfinger.identify import Fit, Recipe
+from jaxfinger.identify import Recipe
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.identify.recipe import ModelRecipe
-from jaxfinger.identify.stages import nominal_model
 from jaxfinger.synthetic import SpecimenPlant, recipe_from, simulate, study_finger, true_model
 
 GAIN = 0.2
@@ -228,12 +225,3 @@ def test_a_column_that_is_the_sum_of_others_adds_no_direction():
     Q, _ = orthonormalise(A)
     assert Q.shape == (200, 2)
     np.testing.assert_allclose(Q @ (Q.T @ A), A, atol=1e-12)
-
-
-def test_a_session_is_not_compared_with_its_own_fit(session, tmp_path):
-    """The fit would be the prior of the data that it comes from, which would count twice."""
-    write_session(session, tmp_path / "a.h5")
-    mine = read_session(tmp_path / "a.h5")
-    fit = Fit.before(mine, Recipe(), nominal_model(mine, Recipe()))
-    with pytest.raises(UserError, match=r"a\.h5: the fit to compare it with was identified from this very session"):
-        build(mine, Recipe(), against=fit)

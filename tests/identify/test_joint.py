@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfinger.data import EXPERIMENT_NAMES
+from jaxfinger.data import EXPERIMENT_NAMES, read_session, write_session
 from jaxfinger.errors import UserError
 from jaxfinger.identify import Recipe, identify, refine
 from jaxfinger.identify.parameters import Free, describe, ravel
@@ -84,6 +84,40 @@ def test_other_data_are_the_prior(clean, staged, joint):
     assert abs(np.median(ratio) - np.sqrt(0.5)) < 0.05  # each session estimates its own noise
     assert ratio.min() > 0.55
     assert ratio.max() < 0.9
+
+
+def test_a_fit_remembers_every_session_that_it_was_made_from(session, staged, tmp_path):
+    """Else a second refinement on one of them would count its trials twice."""
+    files = [tmp_path / f"{name}.h5" for name in "ab"]
+    for k, file in enumerate(files):
+        write_session(replace(session, specimen=f"{k}"), file)
+    a, b = map(read_session, files)
+    of_a = replace(staged, data="", data_hash="").made_from(a, alone=True)
+    of_both = of_a.made_from(b)
+    assert (of_a.was_made_from(a), of_a.was_made_from(b)) == (True, False)
+    assert (of_both.was_made_from(a), of_both.was_made_from(b)) == (True, True)
+    assert of_both.made_from(a) is of_both
+    assert of_both.data == "a.h5, b.h5"
+    assert not of_both.made_from(b, alone=True).was_made_from(a)
+    assert not of_both.was_made_from(session)  # of no file
+
+
+@pytest.mark.long
+def test_a_second_refinement_on_other_data_does_not_count_them_twice(clean, joint, tmp_path):
+    write_session(measure(clean, 1), tmp_path / "other.h5")
+    other = read_session(tmp_path / "other.h5")
+    both = refine(other, replace(joint, data_hash="of another file"))
+    again = refine(other, both)
+    free = joint.estimated
+    assert np.median(again.std[free] / both.std[free]) > 1.0  # the first session no longer counts
+    assert "the trials are read once" in again.stages[-1].message
+
+
+def test_what_no_trial_of_a_joint_fit_shows_is_said_with_the_reason(session, staged):
+    """A tendon that is pulled too fast for its friction needs no second tension."""
+    at_rest = {t.name: replace(t, hold=np.full(len(t.time), -1)) for t in session.select("ID.4")}
+    found = refine(replace(session, trials=dict(session.select("ID.2").trials) | at_rest), staged)
+    assert any("no sample of joint_torque in ID.4 counts: no tendon is pulled" in w for w in found.stages[-1].warnings)
 
 
 GROUPS = ("moment_arm", "elastic", "friction", "damping", "tendon_friction")

@@ -1,10 +1,12 @@
 """The flat vector of a model: what NumPy does with values is what JAX traces."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 
-from jaxfinger.identify.parameters import Free, ravel, with_flat
+from jaxfinger.identify.parameters import Free, describe, ravel, with_flat
 from jaxfinger.model import Finger, Model
 from jaxfinger.synthetic import paper_finger, polynomial_finger, true_model
 
@@ -36,6 +38,16 @@ def test_free_entries_alone_are_set(model, positions):
     np.testing.assert_array_equal(ravel(moved), expected)
     np.testing.assert_array_equal(ravel(model), flat)  # the model itself is as it was
     np.testing.assert_array_equal(jax.jit(lambda t: ravel(free.set(model, t)))(theta), expected)
+
+
+def test_units_of_an_excursion_follow_the_kind_of_its_joints(model):
+    """Of a joint that slides they are lengths over lengths, as those of its torque are forces over lengths."""
+    finger = replace(model.finger, prismatic=(True, False, False))
+    mixed = Model.zeros(finger, moment_arm_degree=3, cross=True)
+    units = {p.name.removeprefix("excursion T1 "): p.units for p in describe(mixed) if p.tendon == "T1"}
+    assert [units[f"MCP^{p}"] for p in (1, 2, 3)] == ["1", "1/m", "1/m^2"]
+    assert [units[f"PIP^{p}"] for p in (1, 2, 3)] == ["m/rad", "m/rad^2", "m/rad^3"]
+    assert [units[f"MCP^{a} PIP^{b}"] for a, b in ((1, 1), (1, 2), (2, 1))] == ["1/rad", "1/rad^2", "1/m/rad"]
 
 
 def test_making_a_model_and_moving_its_values_trace_nothing(model):

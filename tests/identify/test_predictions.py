@@ -8,7 +8,7 @@ import pytest
 from jaxfinger.data import read_predictions, write_predictions
 from jaxfinger.data.predictions import refuse_misfits
 from jaxfinger.errors import UserError
-from jaxfinger.identify.predictions import predict_session
+from jaxfinger.identify.predictions import model_for, predict_session
 from jaxfinger.synthetic import recipe_from
 
 NOISE = recipe_from({}).sensors
@@ -159,3 +159,43 @@ def test_predictions_that_fit_are_not_refused(predicted, short):
     trial = next(iter(short.select("ID.3-static")))
     time = np.linspace(trial.time[0] + 1e-4, trial.time[-1] - 1e-4, 57)
     refuse_misfits(short, {trial.name: {"time": time, "joint_torque": np.zeros((57, short.finger.m))}})
+
+
+def changed(finger, **entries):
+    """The finger with other entries: {field: (index, value)}."""
+    out = {}
+    for field, (index, value) in entries.items():
+        out[field] = np.array(getattr(finger, field))
+        out[field][index] = value
+        if isinstance(getattr(finger, field), tuple):
+            out[field] = tuple(out[field].tolist())
+    return replace(finger, **out)
+
+
+@pytest.mark.parametrize(
+    ("entries", "says"),
+    [
+        ({"origin": ((2, 0), 0.06)}, "joint DIP is elsewhere than in the fit"),
+        ({"axis": (1, (0.0, 0.0, 1.0))}, "joint PIP has another axis than in the fit"),
+        ({"axis": (1, (0.0, -1.0, 0.0))}, "joint PIP has another axis than in the fit"),
+        ({"prismatic": (0, True)}, "joint MCP is of another type than in the fit"),
+        ({"crosses": ((2, 1), True)}, "tendon T3 crosses joint PIP, other than in the fit"),
+    ],
+)
+def test_another_finger_with_the_same_names_is_refused(short_truth, short, entries, says):
+    with pytest.raises(UserError, match=says):
+        model_for(short_truth, replace(short, finger=changed(short.finger, **entries)))
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        {"origin": ((2, 0), 0.026)},  # CAD and ruler disagree by a few per cent
+        {"origin": (0, (0.1, 0.2, 0.3))},  # mounted elsewhere
+        {"mass": (0, 0.1), "com": ((0, 0), 0.02), "limits": ((0, 1), 1.0)},  # weighed anew, and other stops
+        {"gravity": (slice(None), (0.0, 9.81, 0.0))},
+        {"active": (1, False)},  # not measured this time
+    ],
+)
+def test_the_same_finger_described_anew_is_not(short_truth, short, entries):
+    model_for(short_truth, replace(short, finger=changed(short.finger, **entries)))

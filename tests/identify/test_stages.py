@@ -1,9 +1,12 @@
 """Stages without valid samples are skipped; parameters that no trial determines are named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from jaxfinger.data import Session, Trial
+from jaxfinger.errors import UserError
 from jaxfinger.identify import Recipe, identify
 from jaxfinger.identify.parameters import describe
 from jaxfinger.identify.recipe import ModelRecipe
@@ -36,3 +39,28 @@ def test_cross_terms_need_a_trial_that_moves_both_joints(moved):
     said = " ".join(fit.stages[0].warnings)
     assert bool(crossed) == (moved == 2)
     assert (f"{' and '.join(both)} together" in said) == (moved == 1)
+
+
+def test_a_stage_that_starts_from_a_fit_is_as_the_session_is_mounted_and_names_both():
+    """Gravity belongs to the rig: with that of the other recording the weight of the links would count as elastic."""
+    trial = ramps(0.1)
+    session = Session("a finger", FINGER, {trial.name: trial})
+    first = replace(identify(session, stages=("ID.4",)), data="first.h5", data_hash="1")
+    turned = replace(session, finger=replace(FINGER, gravity=np.array([0.0, 9.81, 0.0])))
+    second = identify(turned, stages=("ID.4",), start=first)
+    np.testing.assert_array_equal(second.model.finger.gravity, turned.finger.gravity)
+    assert second.was_made_from(turned)
+    assert second.was_made_from(session)
+    other = replace(session, finger=replace(FINGER, joint_names=("a", *FINGER.joint_names[1:])))
+    with pytest.raises(UserError, match="give a session of the finger that was identified"):
+        identify(other, stages=("ID.4",), start=first)
+
+
+def test_the_noise_of_another_session_is_not_taken_over(session, staged):
+    """Other sensors have other noise; the intervals would be those of the wrong one."""
+    noisy = {of: replace(n, std=10 * n.std, innovation=10 * n.innovation) for of, n in staged.noise.items()}
+    start = replace(staged, noise=noisy, data_hash="of another file")
+    again = identify(session.select("ID.2"), stages=("ID.2",), start=start)
+    of = ("ID.2", "tendon_excursion")
+    np.testing.assert_allclose(again.noise[of].std, staged.noise[of].std, rtol=1e-3)
+    assert again.noise["ID.4", "joint_torque"] is noisy["ID.4", "joint_torque"]  # of the fit's own trials

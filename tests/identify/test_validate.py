@@ -119,6 +119,14 @@ def test_slope_of_the_force_and_its_error_from_the_fit(short_truth, short):
     assert slope.predicted_std == pytest.approx(abs(other.predicted - slope.predicted), rel=0.05)
 
 
+def test_a_slope_through_two_holds_has_no_known_error(short_truth, short):
+    """A line goes through two points without scatter, which says nothing of its error."""
+    trials = {t.name: replace(t, hold=np.where(np.isin(t.hold, (0, 1)), t.hold, -1)) for t in short.select("VD.2")}
+    slopes = validate(short_truth, replace(short, trials=trials), ("VD.2",)).slopes
+    assert slopes
+    assert all(np.isfinite(s.measured) and np.isnan(s.measured_std) for s in slopes)
+
+
 def test_what_is_missing_is_said(short_truth, short):
     result = validate(short_truth, short.select("VD.1"))
     assert result.messages == ("the session has no VD.2 trial", "the session has no VD.3 trial")

@@ -1,17 +1,19 @@
 """Curves are those of the model, with standard deviations from its covariance; figures are written whole."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from jaxfinger.cli.tables import fit_to_read, print_fit
 from jaxfinger.data import write_session
 from jaxfinger.errors import UserError
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.fit_file import save_fit
 from jaxfinger.identify.parameters import describe, ravel
-from jaxfinger.report.curves import curves
+from jaxfinger.report.curves import curves, lines
 from jaxfinger.report.identification import draw_identification
 from jaxfinger.report.validation import draw_validation
 from jaxfinger.synthetic import paper_finger, polynomial_finger, recipe_from, simulate, true_model
@@ -91,6 +93,18 @@ def test_figures_are_written_and_not_overwritten(fit, session, tmp_path):
         assert all(w in text for w in words)
     with pytest.raises(UserError, match=r"moment-arms\.svg: exists"):
         draw_identification(fit, session, tmp_path)
+
+
+@pytest.mark.parametrize(("pull", "says"), [(1e-3, "at 10 mN"), (1.0, "at 10 N"), (1e3, "at 10 kN")])
+def test_losses_are_said_at_the_highest_tension_that_was_measured(fit, session, pull, says, capsys):
+    """And not at one that no trial of this machine comes near."""
+    trials = {t.name: replace(t, tendon_force=pull * t.tendon_force) for t in session if t.tendon_force is not None}
+    machine = replace(session, trials=trials)
+    assert lines(fit, machine).tendon_friction["T3"].x[-1] == pytest.approx(10.0 * pull, rel=0.05)
+    print_fit(fit_to_read(fit, machine), parameters=False)
+    said = capsys.readouterr().out
+    assert f"Tendon friction {says}" in said
+    assert not re.search(r"± 0\.0+\s", said)
 
 
 def test_what_was_measured_lies_on_the_lines(fit, session):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxfinger.report.numbers import measured, percent, percent_range, quantity, with_error
+from jaxfinger.report.numbers import extremes, measured, percent, percent_range, quantity, reach, with_error
 
 
 @pytest.mark.parametrize(
@@ -48,6 +48,33 @@ def test_digits_follow_the_interval(value, std, units, text):
 
 def test_a_value_without_an_interval_says_so():
     assert with_error(2.0, None) == "2 ± ?"
+
+
+@pytest.mark.parametrize(
+    ("high", "low", "std", "text"),
+    [
+        (10.914, 4.786, 0.025, "10.914; 4.786 ± 0.049"),
+        (1.00012, 1.0, 6e-4, "1.0001; 1.0000 ± 0.0012"),  # a sliding joint, whose arm is exact to a thousandth
+        (29_850.0, 11_580.0, 2000.0, "29850; 11580 ± 3920"),
+        (0.0, -0.0, 0.0, "0; 0"),
+        (2.0, 1.0, None, "2; 1 ± ?"),
+    ],
+)
+def test_the_reach_of_a_curve_has_the_digits_of_its_interval(high, low, std, text):
+    assert reach(high, low, std) == text
+
+
+@pytest.mark.parametrize(
+    ("high", "low", "text"),
+    [
+        (13.53, -3.04, "13.5; -3.0"),
+        (-1e-17, -0.7, "0.000; -0.700"),
+        (0.0, 0.0, "0; 0"),
+        (4e-4, 1e-4, "0.000400; 0.000100"),
+    ],
+)
+def test_extremes_share_the_digits_of_the_larger(high, low, text):
+    assert extremes(high, low) == text
 
 
 @pytest.mark.parametrize(
