@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -87,6 +88,9 @@ def diagnose(
             name = session.name
             told = say if len(folders) == 1 else lambda message, name=name: say(f"{name}: {message}")
             make_folder(folder)
+            if earlier is not None and earlier.was_made_from(measured[session]):
+                said = f"is a fit of {session} itself, whose data then count twice; give a fit of an earlier session"
+                print(plain(f"{against}: {said}"), file=sys.stderr)
             d = run(measured[session], wanted, quick, own, tuple(without or ()), told, simulated, tolerated, earlier)
             if against is not None:
                 d = replace(d, against=against.name)

@@ -1,8 +1,15 @@
 """`jaxfinger diagnose` refuses mistakes before it starts to work."""
 
+from pathlib import Path
+
 import pytest
 
 from jaxfinger.cli import main
+from jaxfinger.data import read_session
+from jaxfinger.errors import UserError
+from jaxfinger.identify import Fit, Recipe
+from jaxfinger.identify.fit_file import save_fit
+from jaxfinger.identify.stages import nominal_model
 
 
 @pytest.mark.parametrize("name", ["gap.json", "nominal.json", "augmented.json", "report.html"])
@@ -37,3 +44,17 @@ def test_a_file_of_effects_is_loaded_before_the_session(tmp_path, capsys):
             ["diagnose", str(tmp_path / "none.h5"), "-o", str(tmp_path / "out"), "--effects", str(tmp_path / "mine.py")]
         )
     assert "defines no effect" in capsys.readouterr().err
+
+
+def test_a_fit_of_the_session_itself_is_said_to_count_twice(tmp_path, capsys, monkeypatch):
+    path = Path(__file__).parents[2] / "datasets" / "demo-finger" / "fresh.h5"
+    session = read_session(path)
+    save_fit(Fit.before(session, Recipe(), nominal_model(session, Recipe())), tmp_path / "fit.json")
+
+    def ends(*args):
+        raise UserError("ends here")
+
+    monkeypatch.setattr("jaxfinger.gap.diagnose", ends)
+    with pytest.raises(SystemExit):
+        main(["diagnose", str(path), "--against", str(tmp_path / "fit.json"), "-o", str(tmp_path / "out")])
+    assert f"fit.json: is a fit of {path} itself, whose data then count twice" in capsys.readouterr().err
