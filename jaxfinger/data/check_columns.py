@@ -17,6 +17,7 @@ from itertools import combinations
 import numpy as np
 
 from jaxfinger.data.check_arms import MIN_TRAVEL_ARM, Arms, check_arms, measured_arms
+from jaxfinger.data.check_trial import STILL_ANGLE
 from jaxfinger.data.check_work import slope, thinned
 from jaxfinger.data.findings import Report
 from jaxfinger.data.schema import CHANNELS, MEASURED
@@ -72,7 +73,8 @@ def _copies(trial: Trial, finger: FingerDescription, report: Report) -> None:
         for a in range(len(names)):
             later = range(a + 1, len(names))
             copies = [b for b in later if all(np.array_equal(x[:, a], x[:, b], True) for x in (few, values))]
-            if copies and a not in told and _is_noisy(values[:, a]):
+            still = channel == "q" and np.ptp(values[:, a]) < STILL_ANGLE  # One value may stand for all held joints.
+            if copies and a not in told and not still and _is_noisy(values[:, a]):
                 told.update(copies)
                 alike = listed([names[b] for b in (a, *copies)])
                 report.warning(

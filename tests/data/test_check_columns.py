@@ -78,7 +78,7 @@ def test_what_has_other_reasons_is_not_named(session):
 
 @pytest.mark.parametrize(
     ("channel", "columns", "names"),
-    [("q", [0, 0], "MCP, PIP"), ("tendon_force", [0, 0, 2], "T1, T2"), ("tendon_force", [0, 0, 0], "T1, T2, T3")],
+    [("tendon_force", [0, 0, 2], "T1, T2"), ("tendon_force", [0, 0, 0], "T1, T2, T3")],
 )
 @pytest.mark.parametrize("every", [1, 10])
 def test_columns_that_are_copies_of_another_are_said(session, channel, columns, names, every):
@@ -91,6 +91,14 @@ def test_columns_that_are_copies_of_another_are_said(session, channel, columns, 
     )
     assert len([text for text in complaints(of(session, copied)) if words in text]) == 1
     assert not any("same numbers" in text for text in complaints(of(session, trial)))
+
+
+def test_one_angle_may_stand_for_all_joints_that_are_held(session):
+    trial = pulled(1)
+    held = replace(trial, q=trial.q[:, [0, 0]])
+    assert not any("same numbers" in text for text in complaints(of(session, held)))
+    moved = replace(trial, q=300.0 * (trial.q - trial.q.mean(axis=0))[:, [0, 0]])
+    assert any("columns MCP, PIP hold the same numbers" in text for text in complaints(of(session, moved)))
 
 
 def copies(session, trial, force) -> list[str]:
