@@ -267,10 +267,11 @@ def _constant_columns(trial: Trial, finger: FingerDescription, report: Report) -
         if name == "fingertip_force" and not still[columns].all():
             continue  # A planar finger presses along one axis only.
         for k in np.flatnonzero(still):
+            value = values[0, k] + 0.0  # −0 becomes 0.
             report.warning(
                 _place(trial, name),
-                f"column {CHANNELS[name].columns(finger)[k]} is {values[0, k]:.4g} at every sample, as no sensor is; "
-                "check its cable and its column, or leave it out",
+                f"column {CHANNELS[name].columns(finger)[k]} is {value:.4g} at every sample, as no sensor is; check "
+                "its cable and its column, or leave it out",
             )
 
 
