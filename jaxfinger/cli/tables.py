@@ -24,9 +24,9 @@ def fit_to_read(fit: Fit, session: Session | None = None) -> dict:
     `session`: that of the fit, whose highest tension the tendons' losses are said at.
     """
     from jaxfinger.identify.fit_file import content_of
-    from jaxfinger.report.curves import lines
+    from jaxfinger.report.curves import model_curves
 
-    found = lines(fit, session)
+    found = model_curves(fit, session)
     seen = {
         "parameters": list(fit.table()),
         "moment_arms": [[t, j, *c.range()] for (t, j), c in found.moment_arm.items()],

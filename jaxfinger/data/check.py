@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 
 from jaxfinger.data.check_columns import check_columns
+from jaxfinger.data.check_copies import check_copied_columns, check_copied_trials
 from jaxfinger.data.check_delay import check_delay
 from jaxfinger.data.check_finger import check_finger
 from jaxfinger.data.check_gravity import check_gravity
@@ -22,7 +23,7 @@ from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.opening import plain_reason, why_closed
 from jaxfinger.data.parse import parse_file
 from jaxfinger.data.schema import MEASURED
-from jaxfinger.data.session import EXPERIMENT_NAMES, Session, Trial
+from jaxfinger.data.session import EXPERIMENT_NAMES, Session
 from jaxfinger.data.sizes import Sizes, sizes_of
 from jaxfinger.data.units import conversion
 from jaxfinger.errors import listed
@@ -33,7 +34,6 @@ _MANY_SPIKES = 0.1
 # Motions that are slower or quicker than the protocol's by these factors are doubtful. A crane may need 30 times as
 # long, a small servo a tenth; ms read as s differ by 1000, minutes read as s by 60.
 _MAX_PACE, _MAX_QUICKNESS = 64.0, 16.0
-_FIRST_SAMPLES = 100  # Most pairs of trials differ in them, so few need to be compared whole.
 
 
 def check_file(path: str | os.PathLike) -> list[Finding]:
@@ -94,7 +94,7 @@ def check_session(session: Session, report: Report) -> None:
     _check_pace(sizes, report)
     _check_order(session, report)
     _check_motions(session, report)
-    _check_copies(session, report)
+    check_copied_trials(session, report)
     if session.created:
         _check_created(session.created, report)
 
@@ -141,21 +141,6 @@ def _check_motions(session: Session, report: Report) -> None:
             )
 
 
-def _check_copies(session: Session, report: Report) -> None:
-    """Report trials that are copies of another: a copy would pass for a repeat without noise."""
-    alike: dict[tuple, list[Trial]] = defaultdict(list)
-    for trial in session:
-        measured = {name: values for name in MEASURED if (values := getattr(trial, name)) is not None}
-        start = tuple((name, np.ascontiguousarray(x[:_FIRST_SAMPLES]).tobytes()) for name, x in measured.items())
-        earlier = alike[(trial.experiment, len(trial.time), start)]
-        for other in earlier if len(trial.time) > 1 else ():
-            if all(np.array_equal(values, getattr(other, name), equal_nan=True) for name, values in measured.items()):
-                message = f"is the same recording as trial {other.name}, sample for sample; remove one of them"
-                report.error(f"/trials/{trial.name}", message)
-                break
-        earlier.append(trial)
-
-
 def _check_created(created: str, report: Report) -> None:
     try:
         zoned = datetime.fromisoformat(created).tzinfo is not None
@@ -175,6 +160,7 @@ def check_samples(session: Session, report: Report) -> None:
         if report.fatal is None:
             check_work(session, report)
             check_columns(session, report)
+            check_copied_columns(session, report)
             check_gravity(session, report)
             check_held(session, report)
             check_delay(session, report)

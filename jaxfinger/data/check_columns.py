@@ -1,5 +1,4 @@
-"""Check that each column belongs to the joint or tendon of its name: it is no copy of another column, and those of
-tendon_excursion are not exchanged. No model is needed for three tests of the latter:
+"""Check that each column of tendon_excursion belongs to the tendon of its name. No model is needed for three tests:
 
 1. While one joint turns alone (ID.2), a tendon that crosses it travels, and one that does not stands still.
 2. Where the finger's description holds excursions, ID.2 shows the same ones.
@@ -17,33 +16,20 @@ from itertools import combinations
 import numpy as np
 
 from jaxfinger.data.check_arms import MIN_TRAVEL_ARM, Arms, check_arms, measured_arms
-from jaxfinger.data.check_trial import STILL_ANGLE
 from jaxfinger.data.check_work import slope, thinned
 from jaxfinger.data.findings import Report
-from jaxfinger.data.schema import CHANNELS, MEASURED
 from jaxfinger.data.session import FingerDescription, Session, Trial
-from jaxfinger.errors import listed
 
 # Share of the largest moment arm at a joint: a tendon with a smaller arm stands still. Between this arm and that of a
 # tendon that travels, an arm may be a small one, or a tendon may be dragged along.
 _MAX_STILL_ARM = 0.05
 _MAX_CAD_ERROR = 0.2  # of the known arms: CAD is good to a tenth, so columns that miss by less may be right.
 _MAX_EXCHANGED_ERROR = 0.25  # of the error as named: exchanged columns must fit the known arms this much better.
-# Values of a column that turn round more often than both are noisy: a motion needs several samples from turn to turn,
-# while white noise turns round at two of three. Sensors at rest, which switch now and then, may agree in a few turns.
-_MIN_TURNS, _MIN_TURN_SHARE = 20, 0.25
-_MIN_STEP = 1e-6  # of the largest value: smaller steps are rounding errors of single precision.
-_FEW = 20  # samples of a trial
 _MIN_STRETCH_R2 = 0.9  # squared correlation of excursion with tension, from which the tendon is taken to stretch
 
 
 def check_columns(session: Session, report: Report) -> None:
-    """Report columns that are copies of another, and pairs of tendons whose columns look exchanged.
-
-    Each pair of tendons is reported once, by the first test that shows it.
-    """
-    for trial in session:
-        _copies(trial, session.finger, report)
+    """Report pairs of tendons whose columns look exchanged, each pair once, by the first test that shows it."""
     if any(session.finger.prismatic):
         return
     told: set[tuple[int, int]] = set()
@@ -56,43 +42,6 @@ def check_columns(session: Session, report: Report) -> None:
                 message = f"columns {first} and {second} of tendon_excursion look exchanged: {why}"
                 report.warning("/trials", f"{message}; exchange them, or correct what contradicts them")
     check_arms(session.finger, arms, {k for pair in told for k in pair}, report)
-
-
-def _copies(trial: Trial, finger: FingerDescription, report: Report) -> None:
-    """Report columns that are copies of another one: two sensors have noise of their own.
-
-    Tensions of VD.3 are left out: those that a controller gives to symmetric tendons may swing alike in a simulation.
-    """
-    for channel in MEASURED:
-        values = getattr(trial, channel)
-        if values is None or (trial.experiment == "VD.3" and channel == "tendon_force"):
-            continue
-        names = CHANNELS[channel].columns(finger)
-        few = values[:: max(1, len(values) // _FEW)]  # Most pairs differ in them.
-        told: set[int] = set()
-        for a in range(len(names)):
-            later = range(a + 1, len(names))
-            copies = [b for b in later if all(np.array_equal(x[:, a], x[:, b], True) for x in (few, values))]
-            still = channel == "q" and np.ptp(values[:, a]) < STILL_ANGLE  # One value may stand for all held joints.
-            if copies and a not in told and not still and _is_noisy(values[:, a]):
-                told.update(copies)
-                alike = listed([names[b] for b in (a, *copies)])
-                report.warning(
-                    f"/trials/{trial.name}/{channel}",
-                    f"columns {alike} hold the same numbers at every sample, noise included, as no two sensors do; map "
-                    "each from its own column, and leave out those that have no sensor",
-                )
-
-
-def _is_noisy(x: np.ndarray) -> bool:
-    """Whether a column shows the noise of a sensor: its values go up and down without end.
-
-    Computed values, also if they are rounded to steps, turn round with the motion only.
-    """
-    steps = np.diff(x)
-    steps = steps[np.abs(steps) > _MIN_STEP * np.nanmax(np.abs(x), initial=0.0)]
-    turns = np.count_nonzero(np.sign(steps[1:]) != np.sign(steps[:-1]))
-    return bool(turns > max(_MIN_TURNS, _MIN_TURN_SHARE * len(steps)))
 
 
 def _by_crossing(finger: FingerDescription, arms: dict[int, Arms]) -> Iterator[tuple[tuple[int, int], str]]:

@@ -2,6 +2,8 @@
 
 Gravity acts on joint i with the torque aᵢ · Σₖ mₖ (rₖ − pᵢ) × g over the links k from i to the tip. aᵢ is the joint's
 axis, pᵢ its place and rₖ a link's centre of mass. On a sliding joint it acts with the force aᵢ · Σₖ mₖ g.
+
+`model.rigid_body.gravity_torque` gives the same by JAX, which `check` does not import.
 """
 
 from __future__ import annotations

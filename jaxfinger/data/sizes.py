@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxfinger.data.filtering import without_spikes
-from jaxfinger.data.session import Session
+from jaxfinger.data.session import Session, Trial
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -65,16 +65,12 @@ class Sizes:
 
 def sizes_of(session: Session) -> Sizes:
     """Sizes of a session, from all of its trials."""
-    tensions, excursions, noises, sweeps, steps = [0.0], [0.0], [], [], []
+    excursions, noises, sweeps, steps = [0.0], [], [], []
     for trial in session:
         every = max(1, len(trial.time) // MAX_SAMPLES)
-        if trial.tendon_force is not None and len(trial.time) > 3:
-            measured = np.isfinite(trial.tendon_force).all(axis=0)
-            if measured.any():
-                f = trial.tendon_force[:, measured]
-                tensions.append(float(np.percentile(f[::every], 99, axis=0).max()))
-                bend = np.abs(np.diff(f[:MAX_SAMPLES], 2, axis=0))
-                noises.append(1.4826 / np.sqrt(6.0) * float(np.median(bend, axis=0).max()))
+        if (f := _tensions(trial)).size:
+            bend = np.abs(np.diff(f[:MAX_SAMPLES], 2, axis=0))
+            noises.append(1.4826 / np.sqrt(6.0) * float(np.median(bend, axis=0).max()))
         if trial.tendon_excursion is not None and len(trial.time) > 3:
             l = np.nan_to_num(trial.tendon_excursion[::every])
             excursions.append(float(np.ptp(np.percentile(l, (1, 99), axis=0), axis=0).max(initial=0.0)))
@@ -85,7 +81,25 @@ def sizes_of(session: Session) -> Sizes:
     pace = _pace(sweeps)
     # Slow motions follow the pace of sweeps, but are quick only where they were measured to be.
     slow = max(pace, min(_pace(steps), 1.0)) if any(steps) else pace
-    return Sizes(max(tensions), max(excursions), float(np.median(noises)) if noises else 0.0, pace, slow)
+    return Sizes(highest_tension(session), max(excursions), float(np.median(noises)) if noises else 0.0, pace, slow)
+
+
+def highest_tension(session: Session) -> float:
+    """Highest tension, N, that a tendon has in a hundredth of a trial; 0 where no tension is measured."""
+    highest = [0.0]
+    for trial in session:
+        if (f := _tensions(trial)).size:
+            every = max(1, len(f) // MAX_SAMPLES)
+            highest.append(float(np.percentile(f[::every], 99, axis=0).max()))
+    return max(highest)
+
+
+def _tensions(trial: Trial) -> Float[np.ndarray, "N k"]:
+    """Tensions that are measured throughout a trial; none of a trial too short to show noise."""
+    f = trial.tendon_force
+    if f is None or len(f) <= 3:
+        return np.zeros((0, 0))
+    return f[:, np.isfinite(f).all(axis=0)]
 
 
 def _pace(ratios: list[float]) -> float:

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from jaxfinger.data.schema import CHANNELS, channel_units
 from jaxfinger.effects import Scales
 from jaxfinger.experiments import prepare
-from jaxfinger.gap.augment import Fitted, Residuals, limits, nominal_fit, residuals_by, without_shapes
+from jaxfinger.gap.augment import Fitted, Residuals, limits, residuals_by, without_shapes
 from jaxfinger.gap.budget import DRAWS
 from jaxfinger.gap.folds import FOLDS, equilibrated, fold_of_row, folds
 from jaxfinger.gap.problem import Problem
@@ -31,11 +31,8 @@ def closures(problem: Problem, augmented: Fitted | None, forward: bool = True) -
     """One line for each channel that is judged, and with `forward` one for the simulated angles of VD.3.
 
     Before is the nominal model refitted without the held-out trials, or the other simulator as it is; after is the
-    augmented model refitted likewise. With None for `augmented` after equals before; of another simulator it is what
-    retuning alone leaves.
+    augmented model refitted likewise. With None for `augmented` after equals before.
     """
-    if augmented is None and problem.simulator is not None:
-        augmented = nominal_fit(problem)
     fold, of_row = folds(problem), fold_of_row(problem)
     # By experiment and channel, of each trial: mean squares before, after and of the noise, and the number of samples.
     energies: dict[tuple[str, str], list[np.ndarray]] = {}
@@ -44,7 +41,7 @@ def closures(problem: Problem, augmented: Fitted | None, forward: bool = True) -
         seen = {e: f != k for e, f in fold.items()}
         (before, old), (after, new) = _before_and_after(problem, augmented, of_row != k, seen)
         models.append((before, after))
-        for e, c in filter(judged.__contains__, old):
+        for e, c in (of for of in old if of in judged):
             mask = np.asarray(problem.stacks[e].batch.mask[c]) * ~seen[e]
             count = mask.sum(axis=(0, 2))
             energy = [_squares(m[e, c], mask, c) for m in (old, new)]

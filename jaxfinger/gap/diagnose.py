@@ -149,7 +149,8 @@ def diagnose(
         else:
             augmented = augmented_fit(problem, chosen, hold=something_open)
     progress("refitting without each third of the trials")
-    lines = closures(problem, augmented, not quick)
+    # Without causes, what is left of another simulator is what retuning leaves.
+    lines = closures(problem, augmented or (nominal if problem.simulator is not None else None), not quick)
     status = _explained_or_partly(verdict.status, found, lines, relevance, tolerance)
     shares = budget(baseline, chosen, problem, columns_with_gap(baseline))
     suggestion: NextExperiment | None = None

@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.data import Session
-from jaxfinger.data.sizes import sizes_of
+from jaxfinger.data.sizes import highest_tension
 from jaxfinger.experiments import prepare
 from jaxfinger.identify import Fit
 from jaxfinger.model import Model, rigid_body
 from jaxfinger.report.measured import Points, arm_points, hold_points, loss_points
 
 SAMPLES = 61  # Points of a curve: two degrees apart over a range of 120°, closer than a figure resolves.
-MAX_TENSION = 12.0  # N, of the loss's curve where no session says how hard the machine pulls: the paper pulls with 10.
+MAX_TENSION = 12.0  # N, where curves of lost tension end without a session: a fifth above the paper's highest, 10 N
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def curves(fit: Fit, session: Session | None = None) -> Curves:
     Curves without an estimated parameter are left out. A session adds measured points: slopes of the excursions of
     ID.2, torques of the holds of ID.3-static, losses of the holds of ID.4. The loss goes to its highest tension.
     """
-    return lines(fit) if session is None else _with_points(lines(fit, session), fit, session)
+    return model_curves(fit) if session is None else _with_points(model_curves(fit, session), fit, session)
 
 
 def _with_points(found: Curves, fit: Fit, session: Session) -> Curves:
@@ -81,9 +81,9 @@ def _with_points(found: Curves, fit: Fit, session: Session) -> Curves:
     )
 
 
-def lines(fit: Fit, session: Session | None = None) -> Curves:
+def model_curves(fit: Fit, session: Session | None = None) -> Curves:
     """Compute the curves without measured points; the loss up to the highest tension of `session`."""
-    tension = MAX_TENSION if session is None else sizes_of(session).tension or MAX_TENSION
+    tension = MAX_TENSION if session is None else highest_tension(session) or MAX_TENSION
     model, finger = fit.model, fit.model.finger
     limits = np.asarray(finger.limits)
     m, S = finger.m, SAMPLES

@@ -17,7 +17,7 @@ from jaxfinger.gap.parts import MIN_VARIABLE_SHARE
 from jaxfinger.gap.result import Absorbed, Candidate, Cause, Closure, Diagnosis, Key, Left, Place, Status, Value
 from jaxfinger.report import plots, sentences
 from jaxfinger.report.causes import words
-from jaxfinger.report.curves import Curves, lines
+from jaxfinger.report.curves import Curves, model_curves
 from jaxfinger.report.measured import arm_points
 from jaxfinger.report.names import VARIABLE_NAMES, cause_name, channel_name, effect_name, joined, key_name, site_names
 from jaxfinger.report.numbers import HALF_95, measured, percent, quantity, unbroken
@@ -194,7 +194,7 @@ def _parameters(d: Diagnosis) -> list[Markup]:
 
 def _curves(d: Diagnosis) -> Curves:
     """Curves of the augmented model, with moment arms from the measured excursions if the session has ID.2."""
-    found = lines(d.augmented, d.problem and d.problem.session)
+    found = model_curves(d.augmented, d.problem and d.problem.session)
     if d.problem is None or "ID.2" not in d.problem.stacks:
         return found
     return replace(found, arm_points=arm_points(d.problem.session, d.problem.stacks["ID.2"]))

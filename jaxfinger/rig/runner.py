@@ -238,6 +238,7 @@ class Runner:
         Raises:
             TrialEnded: nobody answered in time, or the run must end.
         """
+        armed, patience, asked = self.watch.guards, self.rig.description.deadlines.prompt_s, time.monotonic()
 
         def late() -> bool:
             return armed and time.monotonic() - asked > patience
@@ -247,10 +248,10 @@ class Runner:
             off = armed and (tripped(self.reader.latest) or self._let_go(self.reader.latest))
             return self.reader.error is None and self.reader.violation is None and not off and not late()
 
-        armed, patience, asked = self.watch.guards, self.rig.description.deadlines.prompt_s, time.monotonic()
-        limit = f"without an answer within {patience:g} s it is released."
-        on = max(map(abs, tensions(self.reader.latest, self.rig.description).values()), default=0.0)
-        self.operator.ask(f"{text} The finger is armed, with {on:.1f} N: {limit}" if armed else text, keep_waiting)
+        if armed:
+            on = max(map(abs, tensions(self.reader.latest, self.rig.description).values()), default=0.0)
+            text += f" The finger is armed, with {on:.1f} N: without an answer within {patience:g} s it is released."
+        self.operator.ask(text, keep_waiting)
         self._heed_stop_key()
         self._check(self.reader.latest if armed else None)
         # Also where Enter came just then: who answers a prompt that is over does not expect a motor to move.

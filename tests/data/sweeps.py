@@ -58,15 +58,13 @@ def late(sweep, x, delay):
 def swept(sweep, q, torque, noise=1.0) -> Trial:
     """ID.3-dynamic. `noise` is a multiple of 0.2 mrad and 0.3 N mm, the standard deviations of usual sensors."""
     rng = np.random.default_rng(0)
-    other = np.full(len(q), 0.4) + 1e-4 * rng.standard_normal(len(q))
-    q = q + 2e-4 * noise * rng.standard_normal(len(q))
+    angles, unmeasured = _angles(rng, q, noise)
     torque = torque + 3e-4 * noise * rng.standard_normal(len(q))
-    unmeasured = np.full(len(q), np.nan)
     return Trial(
         "sweep",
         "ID.3-dynamic",
         sweep.time,
-        np.column_stack([q, other]),
+        angles,
         joint_torque=np.column_stack([torque, unmeasured]),
         joint="MCP",
     )
@@ -75,20 +73,24 @@ def swept(sweep, q, torque, noise=1.0) -> Trial:
 def led(sweep, q, excursion, noise=1.0) -> Trial:
     """ID.2. `noise` is a multiple of 0.2 mrad and 10 µm. The tension depends on the direction, as friction makes it."""
     rng = np.random.default_rng(0)
-    other = np.full(len(q), 0.4) + 1e-4 * rng.standard_normal(len(q))
+    angles, unmeasured = _angles(rng, q, noise)
     tension = 2.0 + 0.3 * np.sign(np.gradient(sweep.q)) + 0.02 * rng.standard_normal(len(q))
-    q = q + 2e-4 * noise * rng.standard_normal(len(q))
     excursion = excursion + 1e-5 * noise * rng.standard_normal(len(q))
-    unmeasured = np.full(len(q), np.nan)
     return Trial(
         "lead",
         "ID.2",
         sweep.time,
-        np.column_stack([q, other]),
+        angles,
         np.column_stack([tension, tension, unmeasured]),
         np.column_stack([excursion, -excursion, unmeasured]),
         joint="MCP",
     )
+
+
+def _angles(rng, q, noise):
+    """Angles of both joints, of which the second is held, and a column that is not measured."""
+    other = 0.4 + 1e-4 * rng.standard_normal(len(q))
+    return np.column_stack([q + 2e-4 * noise * rng.standard_normal(len(q)), other]), np.full(len(q), np.nan)
 
 
 def alone(session, trial) -> Session:

@@ -13,7 +13,7 @@ from jaxfinger.errors import UserError
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.fit_file import save_fit
 from jaxfinger.identify.parameters import describe, ravel
-from jaxfinger.report.curves import curves, lines
+from jaxfinger.report.curves import curves, model_curves
 from jaxfinger.report.identification import draw_identification
 from jaxfinger.report.validation import draw_validation
 from jaxfinger.synthetic import paper_finger, polynomial_finger, recipe_from, simulate, true_model
@@ -100,7 +100,7 @@ def test_losses_are_said_at_the_highest_tension_that_was_measured(fit, session, 
     """And not at one that no trial of this machine comes near."""
     trials = {t.name: replace(t, tendon_force=pull * t.tendon_force) for t in session if t.tendon_force is not None}
     machine = replace(session, trials=trials)
-    assert lines(fit, machine).tendon_friction["T3"].x[-1] == pytest.approx(10.0 * pull, rel=0.05)
+    assert model_curves(fit, machine).tendon_friction["T3"].x[-1] == pytest.approx(10.0 * pull, rel=0.05)
     print_fit(fit_to_read(fit, machine), parameters=False)
     said = capsys.readouterr().out
     assert f"Tendon friction {says}" in said
