@@ -65,10 +65,15 @@ def mounting_in_words(finger: FingerDescription) -> str:
     """Where the straight finger points, and how gravity acts on its joints: one line to compare with the rig."""
     if not finger.gravity.any():
         return "there is no gravity"
-    acts = [_acts(finger, q) for q in (np.zeros(finger.m), finger.limits.mean(axis=1))]
-    if acts == [_NONE, _NONE]:
-        return f"{_points(finger)}gravity {_NONE}: the finger moves in a horizontal plane"
-    return f"{_points(finger)}at q = 0 gravity {acts[0]}; in mid-range it {acts[1]}"
+    lowest, highest = finger.limits.T
+    straight, middle, quarter = (
+        _acts(finger, q) for q in (np.zeros(finger.m), (lowest + highest) / 2.0, (3.0 * lowest + highest) / 4.0)
+    )
+    if (straight, middle) != (_NONE, _NONE):
+        return f"{_points(finger)}at q = 0 gravity {straight}; in mid-range it {middle}"
+    if quarter != _NONE:  # A pendulum hangs in the middle of its range.
+        return f"{_points(finger)}at q = 0 and in mid-range gravity {_NONE}; at a quarter of the range it {quarter}"
+    return f"{_points(finger)}gravity {_NONE}: the finger moves in a horizontal plane"
 
 
 def _points(finger: FingerDescription) -> str:

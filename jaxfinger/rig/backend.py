@@ -196,7 +196,7 @@ class Rig(ABC):
         time.sleep(seconds)
 
     def read_block(self, timeout: float) -> Block:
-        """Wait for samples; return those since the last call, at least one. Heartbeats are sent meanwhile.
+        """Wait for samples; return those since the last call, at least one. Heartbeats are sent while none is there.
 
         It serves before arming and where time is simulated. A recording in real time calls `poll` instead: heartbeats
         from this thread would go on while another thread hangs.
@@ -208,12 +208,13 @@ class Rig(ABC):
         deadline = time.monotonic() + timeout
         while True:
             late = time.monotonic() > deadline  # Before the poll: a thread that was held up polls once more.
-            with suppress(ConnectionLost):  # `poll` reconnects, or raises.
-                self.beat()
             if (block := self.poll()) is not None:
                 return block
             if late:
                 raise StaleRig(stale(timeout))
+            # Only where no sample waits: where a heartbeat lets time pass, time never runs ahead of the reading.
+            with suppress(ConnectionLost):  # `poll` reconnects, or raises.
+                self.beat()
             self._pause(self.description.poll_s)
 
     @abstractmethod

@@ -48,6 +48,15 @@ def test_words_say_how_the_finger_is_mounted(gravity, says):
     assert mounting_in_words(replace(make_finger(), gravity=np.array(gravity, float))).startswith(says)
 
 
+def test_a_pendulum_that_hangs_in_the_middle_of_its_range_is_in_no_horizontal_plane():
+    limits = np.array([[-1.0, 1.0], [-1.0, 1.0]])
+    hanging = replace(make_finger(), gravity=np.array([9.81, 0.0, 0.0]), limits=limits)
+    assert mounting_in_words(hanging).startswith(
+        "the straight finger points down; at q = 0 and in mid-range gravity acts on no joint; "
+        "at a quarter of the range it flexes MCP with"
+    )
+
+
 def test_words_of_a_chain_with_a_sliding_joint():
     """A vertical rail carries the finger: gravity pulls both links down the rail."""
     finger = replace(make_finger(), prismatic=(True, False), axis=np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]))

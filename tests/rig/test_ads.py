@@ -80,6 +80,15 @@ def collect(rig, samples, patience=20.0):
     return np.concatenate(seq), np.concatenate(t), lost
 
 
+def test_simulated_time_does_not_run_ahead_of_the_reading(lockstep):
+    """A command lets one cycle pass, so blocks of one sample come between those of a heartbeat."""
+    with ads_rig(lockstep) as rig:
+        for _ in range(100):
+            rig.release()
+            rig.read_block(20.0)
+        assert rig.status().head - rig.next_seq <= standin.BURST
+
+
 def test_every_sample_arrives_also_after_the_host_slept(real_time):
     with ads_rig(real_time) as rig:
         assert rig.fingerprint()["program"] == "jaxfinger stand-in"
