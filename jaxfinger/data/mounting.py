@@ -100,6 +100,11 @@ def _acts(finger: FingerDescription, q: Float[np.ndarray, " m"]) -> str:
     for i in np.flatnonzero(acting):
         slides, positive = finger.prismatic[i], torques[i] > 0.0
         verb = ("pushes forward" if positive else "pushes back") if slides else "flexes" if positive else "extends"
-        size = f"{abs(torques[i]):.3g} N" if slides else f"{1e3 * abs(torques[i]):.3g} N mm"
-        said.setdefault(verb, []).append(f"{finger.joint_names[i]} with {size}")
+        unit = "N" if slides else "N m"
+        said.setdefault(verb, []).append(f"{finger.joint_names[i]} with {_for_people(abs(torques[i]), unit)}")
     return " and ".join(f"{verb} {', '.join(joints)}" for verb, joints in said.items())
+
+
+def _for_people(size: float, unit: str) -> str:
+    """Size of a force (N) or torque (N m) with its unit; small torques in N mm."""
+    return f"{1e3 * size:.3g} N mm" if unit == "N m" and size < 1.0 else f"{size:.3g} {unit}"

@@ -57,6 +57,11 @@ def test_a_pendulum_that_hangs_in_the_middle_of_its_range_is_in_no_horizontal_pl
     )
 
 
+def test_torques_of_an_arm_are_in_newton_metres():
+    arm = replace(make_finger(), mass=1e4 * make_finger().mass)
+    assert "gravity flexes MCP with 98.1 N m, PIP with 14.7 N m" in mounting_in_words(arm)
+
+
 def test_words_of_a_chain_with_a_sliding_joint():
     """A vertical rail carries the finger: gravity pulls both links down the rail."""
     finger = replace(make_finger(), prismatic=(True, False), axis=np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]))
