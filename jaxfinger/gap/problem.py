@@ -10,7 +10,7 @@ Lovell). This module makes W r and the whitened Jacobian; `signatures` makes W Î
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -28,7 +28,7 @@ from jaxfinger.identify.linearise import White
 from jaxfinger.identify.noise import Noise, estimate, history
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.prior import Prior, prior_of
-from jaxfinger.identify.solve import Source, solve, white_tangents
+from jaxfinger.identify.solve import Solution, Source, solve, white_tangents
 from jaxfinger.identify.stages import (
     Progress,
     cad_prior,
@@ -38,8 +38,11 @@ from jaxfinger.identify.stages import (
     sources_of,
 )
 from jaxfinger.identify.start import start_values
-from jaxfinger.identify.trial_coverage import can_determine, coverage_of
+from jaxfinger.identify.trial_coverage import Coverage, can_determine, coverage_of
 from jaxfinger.model import Model, Terms, terms_without_effects
+
+MAX_ROUNDS = 8  # of refits to all trials, each with the noise that the one before leaves
+NOISE_CHANGE = 0.2  # relative, of a channel's standard deviation: less changes no interval by as much as a tenth
 
 
 @dataclass(frozen=True)
@@ -160,28 +163,8 @@ def build(
         simulator, recipe, stacks = emulate(session, recipe, stacks, predictions, coarse)
     earlier = None if against is None else _start_from(session, against)
     fit = identify(session, recipe, start=earlier, progress=progress, stacks=measured)
-    parameters = describe(fit.model)
     progress("refitting the nominal model to all trials")
-    # Masses and centres of mass move within the uncertainty that CAD states.
-    cad = [i for i, p in enumerate(parameters) if p.group in ("mass", "com") and fit.covariance[i, i] > 0]
-    free = np.union1d(fit.estimated, cad).astype(int)
-
-    def prior_on(free: np.ndarray) -> Prior:
-        if against is None:
-            return cad_prior(session, recipe, parameters, free)
-        return prior_of(np.asarray(ravel(against.model)), against.covariance, free)
-
-    noise = _with_missing_noise(fit.noise, stacks, fit.model)
-    reads = {e: stack.experiment.channels for e, stack in stacks.items()}
-    sources = sources_of(stacks, reads, noise, parameters)
-    start, more = _with_unfitted(fit, free, sources, parameters, coverage_of(stacks, session))
-    if more.size > free.size:
-        # Residuals held what the added parameters explain, so noise estimated from them was too large.
-        start, _ = solve(start, more, sources, prior_on(more))
-        noise = _with_missing_noise(fit.noise, stacks, start)
-        sources, free = sources_of(stacks, reads, noise, parameters), more
-    prior = prior_on(free)
-    nominal, solution = solve(start, free, sources, prior)
+    nominal, solution, noise, sources, free, prior = _refitted_to_all(session, recipe, fit, stacks, against)
 
     rows = _layouts(stacks, sources)
     return Problem(
@@ -199,6 +182,49 @@ def build(
         simulator=simulator,
         **_at(nominal, solution.linearised, sources, rows, free, prior),
     )
+
+
+class _Refit(NamedTuple):
+    """The nominal model refitted to all trials."""
+
+    nominal: Model
+    solution: Solution
+    noise: dict[tuple[str, str], Noise]
+    sources: dict[str, Source]
+    free: np.ndarray
+    prior: Prior
+
+
+def _refitted_to_all(
+    session: Session, recipe: Recipe, fit: Fit, stacks: dict[str, Stack], against: Fit | None
+) -> _Refit:
+    """Refit what the stages have estimated, and what they have not but some trial shows, to all trials together."""
+    parameters, coverage = describe(fit.model), coverage_of(stacks, session)
+    # Masses and centres of mass move within the uncertainty that CAD states.
+    cad = [i for i, p in enumerate(parameters) if p.group in ("mass", "com") and fit.covariance[i, i] > 0]
+    free = np.union1d(fit.estimated, cad).astype(int)
+    reads = {e: stack.experiment.channels for e, stack in stacks.items()}
+
+    def prior_on(free: np.ndarray) -> Prior:
+        if against is None:
+            return cad_prior(session, recipe, parameters, free)
+        return prior_of(np.asarray(ravel(against.model)), against.covariance, free)
+
+    nominal, latest, shown = fit.model, _with_missing_noise(fit.noise, stacks, fit.model), free
+    for _ in range(MAX_ROUNDS):
+        noise, known = latest, shown
+        sources = sources_of(stacks, reads, noise, parameters)
+        # Some parameters show only after a refit: a tendon whose moment arms are zero shows no friction.
+        nominal, shown = _with_unfitted(nominal, free_groups(fit.recipe), free, sources, parameters, coverage)
+        prior = prior_on(shown)
+        nominal, solution = solve(nominal, shown, sources, prior)
+        if shown.size == free.size:
+            break
+        # Residuals held what the added parameters explain, so noise estimated from them was too large.
+        latest = _with_missing_noise(fit.noise, stacks, nominal)
+        if shown.size == known.size and _settled(noise, latest):
+            break
+    return _Refit(nominal, solution, noise, sources, shown, prior)
 
 
 def _start_from(session: Session, against: Fit) -> Fit:
@@ -327,23 +353,32 @@ def _with_missing_noise(known: dict[tuple[str, str], Noise], stacks: dict[str, S
     return known | {(e, c): estimate(stacks[e], c, x) for (e, c), x in left.items()}
 
 
+def _settled(before: Mapping[tuple[str, str], Noise], now: Mapping[tuple[str, str], Noise]) -> bool:
+    """Whether no standard deviation of noise has changed by more than `NOISE_CHANGE`."""
+    return all(np.allclose(n.std, before[key].std, rtol=NOISE_CHANGE, atol=0.0) for key, n in now.items())
+
+
 def _with_unfitted(
-    fit: Fit, free: np.ndarray, sources: dict[str, Source], parameters: list[Parameter], coverage
+    model: Model,
+    groups: set[str],
+    free: np.ndarray,
+    sources: dict[str, Source],
+    parameters: list[Parameter],
+    coverage: Coverage,
 ) -> tuple[Model, np.ndarray]:
-    """Add to `free` the recipe's parameters that no stage has fitted but some trial shows; return model and positions.
+    """Add to `free` the other parameters of `groups` that some trial shows; return model and positions.
 
     A stage is skipped where its experiment is missing: without ID.3-dynamic none estimates damping, though VD.3 shows
     it. Left at zero, such a parameter would pass for a gap. The model holds start values of the added parameters.
     """
-    groups = free_groups(fit.recipe)
     unfitted = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in set(free)]
     unfitted = [i for i in unfitted if len(parameters[i].spans) < 2 or can_determine(parameters[i], coverage)]
-    start = start_values(fit.model, np.array(unfitted, dtype=int), parameters, sources)
+    start = start_values(model, np.array(unfitted, dtype=int), parameters, sources)
     seen = set()
     for e, x in white_tangents(start, sources if unfitted else {}).items():
         seen |= set(sources[e].positions[np.any(x.jacobian != 0.0, axis=(0, 1))])
     added = np.array([i for i in unfitted if i in seen], dtype=int)
-    return start_values(fit.model, added, parameters, sources), np.union1d(free, added).astype(int)
+    return start_values(model, added, parameters, sources), np.union1d(free, added).astype(int)
 
 
 def _layout(stack: Stack, filters, start: int) -> Rows:

@@ -225,3 +225,22 @@ def test_a_column_that_is_the_sum_of_others_adds_no_direction():
     Q, _ = orthonormalise(A)
     assert Q.shape == (200, 2)
     np.testing.assert_allclose(Q @ (Q.T @ A), A, atol=1e-12)
+
+
+def test_validation_trials_alone_determine_the_nominal_model():
+    """No stage fits anything, and while moment arms are zero, no trial shows tendon friction."""
+    trials = {
+        "rate": 200.0,
+        "experiments": ["VD.1", "VD.2", "VD.3"],
+        "vd3": {"repeats": 2, "motions": 2, "duration": 8.0, "centre": 0.4, "amplitude": 0.3},
+    }
+    session = simulate(recipe_from({"specimen": {"kind": "polynomial"}, "trials": trials}), seed=1)
+    problem = build(session, Recipe())
+    parameters = describe(problem.nominal)
+    assert {parameters[i].tendon for i in problem.free if parameters[i].group == "tendon_friction"} == {
+        k for k, active in zip(session.finger.tendon_names, session.finger.active, strict=True) if active
+    }
+    for e, rows in problem.rows.items():
+        for number, c in enumerate(problem.stacks[e].experiment.channels):
+            white = problem.r[rows.start + np.flatnonzero(rows.channel == number)]
+            assert np.sqrt(np.mean(white**2)) < 1.2, (e, c)
