@@ -6,6 +6,7 @@ import os
 from collections import defaultdict
 from collections.abc import Collection
 from datetime import datetime
+from itertools import pairwise
 
 import h5py
 import numpy as np
@@ -34,6 +35,7 @@ _MANY_SPIKES = 0.1
 # Motions that are slower or quicker than the protocol's by these factors are doubtful. A crane may need 30 times as
 # long, a small servo a tenth; ms read as s differ by 1000, minutes read as s by 60.
 _MAX_PACE, _MAX_QUICKNESS = 64.0, 16.0
+_MAX_OVERLAP = 0.1  # of a trial's length: starts may be rounded, and trials last a little longer than planned.
 
 
 def check_file(path: str | os.PathLike) -> list[Finding]:
@@ -93,6 +95,7 @@ def check_session(session: Session, report: Report) -> None:
             check_trial(trial, session.finger, sizes, report)
     _check_pace(sizes, report)
     _check_order(session, report)
+    _check_overlap(session, report)
     _check_motions(session, report)
     check_copied_trials(session, report)
     if session.created:
@@ -124,6 +127,16 @@ def _check_order(session: Session, report: Report) -> None:
         report.warning(
             "/trials", f"{listed(without)} lack `session_start`, so trials are ordered by name; give it to all or none"
         )
+
+
+def _check_overlap(session: Session, report: Report) -> None:
+    """Report trials of one rig that overlap in time."""
+    timed = sorted((t for t in session if t.session_start is not None and len(t.time)), key=lambda t: t.session_start or 0)
+    for before, after in pairwise(timed):
+        start, end = float(after.session_start or 0.0), float(before.session_start or 0.0) + float(before.time[-1])
+        if start < end - _MAX_OVERLAP * float(before.time[-1]):
+            said = f"starts at {start:.6g} s of the session, before trial {before.name} ends at {end:.6g} s"
+            report.warning(f"/trials/{after.name}", f"{said}; give `session_start` in s")
 
 
 def _check_motions(session: Session, report: Report) -> None:
