@@ -27,7 +27,7 @@ from jaxfinger.data.schema import MEASURED
 from jaxfinger.data.session import EXPERIMENT_NAMES, Session
 from jaxfinger.data.sizes import Sizes, sizes_of
 from jaxfinger.data.units import conversion
-from jaxfinger.errors import listed
+from jaxfinger.errors import counted, listed
 
 # Share of a column's samples from which spikes are a warning instead of a note. Up to this share the mask finds them
 # with certainty; motors driven by a coarse encoder reach 0.09.
@@ -130,13 +130,18 @@ def _check_order(session: Session, report: Report) -> None:
 
 
 def _check_overlap(session: Session, report: Report) -> None:
-    """Report trials of one rig that overlap in time."""
-    timed = sorted((t for t in session if t.session_start is not None and len(t.time)), key=lambda t: t.session_start or 0)
-    for before, after in pairwise(timed):
-        start, end = float(after.session_start or 0.0), float(before.session_start or 0.0) + float(before.time[-1])
-        if start < end - _MAX_OVERLAP * float(before.time[-1]):
-            said = f"starts at {start:.6g} s of the session, before trial {before.name} ends at {end:.6g} s"
-            report.warning(f"/trials/{after.name}", f"{said}; give `session_start` in s")
+    """Report trials that begin before the one before them has ended."""
+    spans = sorted((t.session_start, float(t.time[-1]), t.name) for t in session if t.session_start is not None)
+    early = [
+        (later, earlier)
+        for (start, lasts, earlier), (begin, _, later) in pairwise(spans)
+        if begin < start + (1.0 - _MAX_OVERLAP) * lasts
+    ]
+    if early:
+        (later, earlier), *more = early
+        also = f", and likewise {counted(len(more), 'other trial')}" if more else ""
+        message = f"{later} begins before {earlier} has ended{also}; write `session_start` in s, as `time`"
+        report.warning("/trials", message)
 
 
 def _check_motions(session: Session, report: Report) -> None:

@@ -45,6 +45,11 @@ _MIN_GAIN = 2.0  # factor by which a shift shrinks the residual: a delay explain
 # gain has to be larger in proportion.
 _USUAL_LEFT = 0.02
 _MIN_SHARE = 1e-8  # of the channel's square, in a residual: a ten-thousandth is below any sensor's noise.
+# Factor by which a filter shrinks what the law leaves: it explains more than half of it.
+_MIN_FILTER_GAIN = 1.5
+# Of stiffness times time constant. A spring behind a damper obeys the same equation, with a damping larger than that,
+# since its torque leads. That of a filtered torque is the joint's own.
+_MAX_LEAD = 0.5
 _WIDTHS = 0.003, 0.01, 0.03, 0.1, 0.3  # of the travel: from the shortest pre-sliding that the filter shows to wide play
 # Where many columns are shifted alike, each may gain less. Without a delay, the median of a session gains up to a sixth.
 _MIN_COLUMNS, _MIN_USUAL_GAIN = 4, 1.25
@@ -66,12 +71,20 @@ def check_delay(session: Session, report: Report) -> None:
     """Report columns that come late, each with the columns that it was compared with."""
     finger = session.finger
     for trial in session.select("ID.2", "ID.3-dynamic"):
-        if trial.joint in finger.joint_names:
-            i = finger.joint_names.index(trial.joint)
-            led = trial.experiment == "ID.2"
-            columns = finger.active & finger.crosses[:, i] if led else np.arange(finger.m) == i
-            channel = "tendon_excursion" if led else "joint_torque"
-            _say(trial, channel, "q", trial.joint, finger, _delays(trial, i, channel, np.flatnonzero(columns)), report)
+        if trial.joint not in finger.joint_names:
+            continue
+        i, led = finger.joint_names.index(trial.joint), trial.experiment == "ID.2"
+        columns = finger.active & finger.crosses[:, i] if led else np.arange(finger.m) == i
+        channel = "tendon_excursion" if led else "joint_torque"
+        motion = _motion(trial, i, channel, np.flatnonzero(columns))
+        if motion is None:
+            continue
+        delays = _delays(motion)
+        _say(trial, channel, "q", trial.joint, finger, delays, report)
+        if not delays and not led and (constant := _time_constant(motion)):
+            said = f"column {trial.joint} has passed a low-pass filter of about {0.5 / (np.pi * constant):.2g} Hz"
+            mend = "record it without, or filter both"
+            report.warning(f"/trials/{trial.name}/{channel}", f"{said}, and q of {trial.joint} has not; {mend}")
     pulled = [pull for trial in session.select("ID.4", "VD.2") if (pull := _pull(trial, finger)) is not None]
     shifts = [pull.shifts(x) for pull, x in zip(pulled, _hysteresis_of([pull.tension for pull in pulled]), strict=True)]
     alike = _alike([shift for of in shifts for _, shift in of])
@@ -103,22 +116,46 @@ def _say(
         report.warning(f"/trials/{trial.name}/{cause}", f"{said} {channel} of {of}; {mend}")
 
 
-def _delays(trial: Trial, joint: int, channel: str, columns: np.ndarray) -> Iterator[tuple[int, float]]:
-    """Columns of a channel that are not in time with the joint's angle, and their delays, s; negative if it is late."""
+class _Motion(NamedTuple):
+    """A trial in which one joint turns, at even steps and filtered: columns y that follow from the motion by X."""
+
+    trial: Trial
+    columns: np.ndarray  # (k,) of the channel
+    cutoff: float  # Hz, of the filter
+    travel: float  # s, `travel_time`
+    longest: int  # samples, delay that is looked for
+    time: np.ndarray  # (N,), s
+    angle: np.ndarray  # (N,), rad, not filtered
+    rate: np.ndarray  # (N,), rad/s
+    moves: np.ndarray  # (N,) mask of the samples that count
+    X: np.ndarray  # (N, p)
+    y: np.ndarray  # (k, N)
+
+    @property
+    def hysteresis(self) -> np.ndarray:
+        """Stop operators of the angle (N, w), filtered as X is."""
+        return low_pass(self.time, _hysteresis(self.angle), self.cutoff)
+
+
+def _motion(trial: Trial, joint: int, channel: str, columns: np.ndarray) -> _Motion | None:
+    """The motion of a trial, and those of the columns of `channel` that are measured; None where there is too little.
+
+    The last columns of X are the joint's speed and acceleration where the channel is its torque.
+    """
     values = getattr(trial, channel)
     if values is None or len(trial.time) < _MIN_SAMPLES or not np.isfinite(trial.q[:, joint]).all():
-        return
+        return None
     columns = columns[np.isfinite(values[:, columns]).all(axis=0) & (np.ptp(values[:, columns], axis=0) > 0.0)]
     travel = travel_time(trial.time, trial.q[:, [joint]])
     if not columns.size or travel <= 0.0:
-        return
+        return None
     tension = trial.tendon_force if channel == "tendon_excursion" else None
     given = np.zeros((len(trial.time), 0)) if tension is None else tension[:, np.isfinite(tension).all(axis=0)]
     # The filter spans the same share of the travel on quick and slow machines.
     cutoff = CUTOFF_HZ * SWEEP_TIME / travel
     time, angle, given, y = _even(cutoff, trial.time, trial.q[:, joint], given, values[:, columns])
     if len(time) < _MIN_SAMPLES:
-        return
+        return None
     cutoff, step = fitting_cutoff(time, cutoff), float(time[1] - time[0])
     q, rate, acceleration = smooth(time, angle, cutoff)
     filtered = low_pass(time, np.column_stack([y, np.sign(rate), given]), cutoff)
@@ -127,23 +164,59 @@ def _delays(trial: Trial, joint: int, channel: str, columns: np.ndarray) -> Iter
     moves = np.abs(rate) > _REST_SHARE * np.percentile(np.abs(rate), 95)
     moves[:longest] = moves[len(time) - longest :] = False
     if moves.sum() < _MIN_SAMPLES:
-        return
+        return None
     powers = np.polynomial.polynomial.polyvander((q - q.mean()) / np.ptp(q), _DEGREE)
     X = np.column_stack([powers, given, *((rate, acceleration) if channel == "joint_torque" else ())])
     y = (y - y[moves].mean(axis=0)).T
-    least = max(_MIN_DELAY / cutoff, float(np.median(np.diff(trial.time)))) / step
-    found = _shifts(y, X, moves, longest)
+    return _Motion(trial, columns, cutoff, travel, longest, time, angle, rate, moves, X, y)
+
+
+def _delays(motion: _Motion) -> list[tuple[int, float]]:
+    """Columns that are not in time with the joint's angle, and their delays, s; negative if it is late."""
+    X, y, moves, longest = motion.X, motion.y, motion.moves, motion.longest
+    step = float(motion.time[1] - motion.time[0])
+    least = max(_MIN_DELAY / motion.cutoff, float(np.median(np.diff(motion.trial.time)))) / step
+    found, out = _shifts(y, X, moves, longest), []
     late = [abs(x.samples) > least and x.gain > _MIN_GAIN * max(1.0, x.left / _USUAL_LEFT) for x in found]
     if not any(late):
-        return
-    beside = _shifts(y, np.column_stack([X, low_pass(time, _hysteresis(angle), cutoff)]), moves, longest)
+        return out
+    beside = _shifts(y, np.column_stack([X, motion.hysteresis]), moves, longest)
     for k in np.flatnonzero(late):
         shift = found[k].samples
         if abs(beside[k].samples - shift) < _MAX_CHANGE * abs(shift) and (
-            (beside[k].gain > _MIN_GAIN and abs(shift) * step < _UNIQUE_TRAVELS * travel)
-            or _same_at_every_speed(y[[k]], X, moves, rate, min(longest, int(2.0 * abs(shift)) + 1))
+            (beside[k].gain > _MIN_GAIN and abs(shift) * step < _UNIQUE_TRAVELS * motion.travel)
+            or _same_at_every_speed(y[[k]], X, moves, motion.rate, min(longest, int(2.0 * abs(shift)) + 1))
         ):
-            yield int(columns[k]), shift * step
+            out.append((int(motion.columns[k]), shift * step))
+    return out
+
+
+def _time_constant(motion: _Motion) -> float:
+    """Time constant, s, of the low-pass that the torque has passed and the angle has not; 0 where there is none.
+
+    Behind a filter of first order with the time constant T, y + T ẏ = X β, so that ẏ adds what the law leaves.
+    """
+    size = max(1, min(_PER_PERIOD, len(motion.time) // (3 * _MIN_SAMPLES)))  # ẏ is to be free of noise.
+    time, X, y = (_means(x, size) for x in (motion.time, motion.X, motion.y[0]))
+    moves, change = _means(motion.moves, size) == 1.0, np.gradient(y, time)
+    if moves.sum() < _MIN_SAMPLES:
+        return 0.0
+    filtered = np.column_stack([X, change])
+    before, (after, beta) = _fit(X, y, moves)[0], _fit(filtered, y, moves)
+    if before <= _MIN_FILTER_GAIN * max(after, np.sqrt(_MIN_SHARE) * float(np.std(y))):
+        return 0.0
+    constant, hysteresis = -float(beta[-1]), _means(motion.hysteresis, size)
+    before, after = (_fit(np.column_stack([x, hysteresis]), y, moves)[0] for x in (X, filtered))
+    # The torque's slope over the angle, between the ends of the motion.
+    low, high = X[[np.argmin(X[:, 1]), np.argmax(X[:, 1])], : _DEGREE + 1] @ beta[: _DEGREE + 1]
+    leads = beta[-3] > _MAX_LEAD * constant * (high - low) / np.ptp(motion.angle)
+    return constant if before > _MIN_FILTER_GAIN * after and constant > 0.0 and not leads else 0.0
+
+
+def _fit(X: np.ndarray, y: np.ndarray, where: np.ndarray) -> tuple[float, np.ndarray]:
+    """Root mean square that is left of y by least squares, and the coefficients."""
+    beta = np.linalg.lstsq(X[where], y[where], rcond=1e-9)[0]
+    return float(np.sqrt(np.mean((y[where] - X[where] @ beta) ** 2))), beta
 
 
 class _Pull(NamedTuple):
@@ -215,13 +288,19 @@ def _even(cutoff: float, time: np.ndarray, *channels: np.ndarray) -> list[np.nda
     """Time and channels at even steps, as means over as many samples as a filter at the cut-off, Hz, allows."""
     grid = uniform_grid(time)
     size = max(1, int(1.0 / (_PER_PERIOD * cutoff * (grid[1] - grid[0]))))
-    out, count = [], len(grid) // size
+    out = []
     for x in (grid, *channels):
         if grid is not time and x is not grid:
             columns = [np.interp(grid, time, column) for column in x.reshape(len(time), -1).T]
             x = np.reshape(np.transpose(columns), (len(grid), *x.shape[1:]))
-        out.append(x[: count * size].reshape(count, size, *x.shape[1:]).mean(axis=1))
+        out.append(_means(x, size))
     return out
+
+
+def _means(x: np.ndarray, size: int) -> np.ndarray:
+    """Means over `size` samples each."""
+    count = len(x) // size
+    return x[: count * size].reshape(count, size, *x.shape[1:]).mean(axis=1)
 
 
 def _shifts(y: np.ndarray, X: np.ndarray, where: np.ndarray, longest: int) -> list[Shift]:

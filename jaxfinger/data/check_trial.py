@@ -381,18 +381,22 @@ def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repo
             report.error(place, f"column {name} falls to {low:.3g} N, and a tendon cannot push; check sign and tare")
         elif low < -max(MAX_TARE_ERROR * sizes.tension, sizes.slack):
             report.warning(place, f"column {name} falls to {low:.3g} N, below zero by more than noise; check the tare")
-        elif trial.experiment in _SLACK and max(MAX_TARE_ERROR * sizes.tension, sizes.slack) < low < 0.5 * sizes.tension:
+        elif (
+            trial.experiment in _SLACK and max(MAX_TARE_ERROR * sizes.tension, sizes.slack) < low < 0.5 * sizes.tension
+        ):
             taut[name] = low
         elif trial.experiment == "ID.2" and np.median(x) <= min(sizes.slack, NOISE_FACTOR * sizes.noise):
             slack.append(name)
         if np.percentile(x, 95.0) > 2000.0:
             report.warning(place, f"column {name} exceeds 2000 N; {conversion('mN')} if that is what it is")
     if slack and trial.tendon_excursion is not None:
-        said = f"{listed(slack)} read no tension in ID.2, where excursions are those of taut tendons"
-        report.warning(place, f"{said}; check the column, or hold the tendons taut and record the trial again")
+        said = f"shows no tension in {listed(slack)}, though ID.2 needs taut tendons to follow the joint"
+        report.warning(place, f"{said}; check the columns, or record the trial again with tension")
     if taut:
-        said = f"never falls below {', '.join(f'{low:.3g}' for low in taut.values())} N in {listed(list(taut))}"
-        report.warning(place, f"{said}, though {trial.experiment} leaves tendons slack; check the tare, or let them go")
+        said = (
+            f"stays above {min(taut.values()):.3g} N in {listed(list(taut))}, though {trial.experiment} leaves tendons"
+        )
+        report.warning(place, f"{said} slack; check the tare, or let the tendons go")
 
 
 def _holds(trial: Trial, report: Report) -> None:

@@ -194,7 +194,7 @@ def _common(node: ast.AST, units: Sequence[str], verb: str) -> str:
     """
     known = list(dict.fromkeys(unit for unit in units if unit))
     if len(known) > 1:
-        raise ExpressionError(f"{verb} {listed(known)} in {ast.unparse(node)!r}; convert one of them first")
+        raise ExpressionError(f"{verb} {' and '.join(known)} in {ast.unparse(node)!r}; convert one of them first")
     return known[0] if known else ""
 
 

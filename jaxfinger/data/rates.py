@@ -35,7 +35,9 @@ def compare_rate(rate: float, clock: Clock, recording: Recording, where: Place, 
         gaps = (steps > _MIN_GAP * usual) & (usual > 0.0)
         if not any(agrees):
             step = usual or mean
-            runs = f"runs at {1.0 / (step * factors[0]):.4g} Hz" if unit else f"goes on by {step:.4g}, which no unit fits"
+            runs = (
+                f"runs at {1.0 / (step * factors[0]):.4g} Hz" if unit else f"goes on by {step:.4g}, which no unit fits"
+            )
             report.warning(where.key, f"the recording's own clock {name!r} {runs}; {mend}, or correct the rate")
         elif gaps.any():
             lost = counted(int(gaps.sum()), "gap")
