@@ -12,11 +12,14 @@ play seem late too, but by a travel instead of a time. A shift is therefore call
 6. it explains most of what hysteresis leaves, or is the same at slow and fast strokes.
 
 Where a joint is held, the tension rests between its steps: what is late then still moves, and hysteresis does not.
+
+A low-pass filter, as of a torque sensor's amplifier, does more than shift. Law 1 shows it by one more term, the rate of
+the torque itself (`_time_constant`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -51,7 +54,7 @@ _MIN_FILTER_GAIN = 1.5
 # since its torque leads. That of a filtered torque is the joint's own.
 _MAX_LEAD = 0.5
 _WIDTHS = 0.003, 0.01, 0.03, 0.1, 0.3  # of the travel: from the shortest pre-sliding that the filter shows to wide play
-# Where many columns are shifted alike, each may gain less. Without a delay, the median of a session gains up to a sixth.
+# Where columns are shifted alike, each may gain less. Without a delay, the median of a session gains up to a sixth.
 _MIN_COLUMNS, _MIN_USUAL_GAIN = 4, 1.25
 _PULL_WIDTHS = 0.01, 0.05, 0.2, 0.4, 0.7  # of the highest tension: routed tendons lose up to two thirds of it
 _MAX_CHANGE = 0.2  # of a delay, where hysteresis is allowed for: what is hysteresis loses its delay or turns it round.
@@ -69,6 +72,12 @@ class Shift(NamedTuple):
 
 def check_delay(session: Session, report: Report) -> None:
     """Report columns that come late, each with the columns that it was compared with."""
+    _check_motions(session, report)
+    _check_pulls(session, report)
+
+
+def _check_motions(session: Session, report: Report) -> None:
+    """Compare torques (ID.3-dynamic) and excursions (ID.2) with the angle of the joint that turns."""
     finger = session.finger
     for trial in session.select("ID.2", "ID.3-dynamic"):
         if trial.joint not in finger.joint_names:
@@ -85,12 +94,18 @@ def check_delay(session: Session, report: Report) -> None:
             said = f"column {trial.joint} has passed a low-pass filter of about {0.5 / (np.pi * constant):.2g} Hz"
             mend = "record it without, or filter both"
             report.warning(f"/trials/{trial.name}/{channel}", f"{said}, and q of {trial.joint} has not; {mend}")
-    pulled = [pull for trial in session.select("ID.4", "VD.2") if (pull := _pull(trial, finger)) is not None]
-    shifts = [pull.shifts(x) for pull, x in zip(pulled, _hysteresis_of([pull.tension for pull in pulled]), strict=True)]
-    alike = _alike([shift for of in shifts for _, shift in of])
-    for pull, of in zip(pulled, shifts, strict=True):
-        delays = [(k, shift.samples) for k, shift in of if abs(shift.samples) > pull.least and alike(shift)]
-        _say(pull.trial, pull.channel, "tendon_force", str(pull.trial.tendon), finger, delays, report)
+
+
+def _check_pulls(session: Session, report: Report) -> None:
+    """Compare torques (ID.4) and fingertip forces (VD.2) with the tension of the tendon that is pulled."""
+    finger = session.finger
+    pulls = [pull for trial in session.select("ID.4", "VD.2") if (pull := _pull(trial, finger)) is not None]
+    hysteresis = _hysteresis_of([pull.tension for pull in pulls])
+    found = [pull.delays(of) for pull, of in zip(pulls, hysteresis, strict=True)]
+    is_sure = _sure([delay for delays in found for delay in delays])
+    for pull, delays in zip(pulls, found, strict=True):
+        late = [(delay.column, delay.time) for delay in delays if abs(delay.time) > pull.least and is_sure(delay)]
+        _say(pull.trial, pull.channel, "tendon_force", str(pull.trial.tendon), finger, late, report)
 
 
 def _say(
@@ -239,30 +254,35 @@ class _Pull(NamedTuple):
         """Shortest delay, s, that is reported."""
         return max(_MIN_DELAY / self.cutoff, float(np.median(np.diff(self.trial.time))))
 
-    def shifts(self, hysteresis: np.ndarray) -> list[tuple[int, Shift]]:
-        """Columns, and their shifts against the tension in s; negative if the tension is late.
-
-        `hysteresis` (N, w) is that of the tension.
-        """
+    def delays(self, hysteresis: np.ndarray) -> list[_Delay]:
+        """Delay of each column by which it follows best from the tension and its `hysteresis` (N, w)."""
         step, f = float(self.time[1] - self.time[0]), self.tension
         X = np.column_stack([np.polynomial.polynomial.polyvander((f - f.mean()) / np.ptp(f), _PULL_DEGREE), hysteresis])
         inner = np.zeros(len(f), bool)
         inner[self.longest : len(f) - self.longest] = True
         found = _shifts((self.values - self.values[inner].mean(axis=0)).T, X, inner, self.longest)
-        return [(k, x._replace(samples=x.samples * step)) for k, x in zip(self.columns.tolist(), found, strict=True)]
+        return [_Delay(int(k), x.samples * step, x.gain) for k, x in zip(self.columns, found, strict=True)]
 
 
-def _alike(shifts: Sequence[Shift]) -> Callable[[Shift], bool]:
-    """Which shifts are delays: those that gain much, or are the usual one where most columns gain by one shift.
+class _Delay(NamedTuple):
+    """Delay of a column against a tension."""
 
-    Noise and hysteresis that the law lacks shift each column by another time.
+    column: int
+    time: float  # s, negative if the tension is late
+    gain: float  # factor by which the delay shrinks what the law leaves
+
+
+def _sure(delays: Sequence[_Delay]) -> Callable[[_Delay], bool]:
+    """Which delays of a session are sure: those that gain much, or are the usual one where most columns show the same.
+
+    Noise, and hysteresis that the law lacks, shift each column by another time.
     """
-    if len(shifts) < _MIN_COLUMNS:
-        return lambda shift: shift.gain > _MIN_GAIN
-    low, usual, high = np.percentile([shift.samples for shift in shifts], (25, 50, 75))
-    gains = float(np.median([shift.gain for shift in shifts])) > _MIN_USUAL_GAIN
+    if len(delays) < _MIN_COLUMNS:
+        return lambda delay: delay.gain > _MIN_GAIN
+    low, usual, high = np.percentile([delay.time for delay in delays], (25, 50, 75))
+    gains = float(np.median([delay.gain for delay in delays])) > _MIN_USUAL_GAIN
     shared = gains and high - low < _MAX_CHANGE * abs(usual)
-    return lambda shift: shift.gain > _MIN_GAIN or (shared and abs(shift.samples - usual) < _MAX_CHANGE * abs(usual))
+    return lambda delay: delay.gain > _MIN_GAIN or (shared and abs(delay.time - usual) < _MAX_CHANGE * abs(usual))
 
 
 def _pull(trial: Trial, finger: FingerDescription) -> _Pull | None:
