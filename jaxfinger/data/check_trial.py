@@ -9,7 +9,7 @@ from jaxfinger.data.findings import Report
 from jaxfinger.data.motion import MIN_HOLD, pulled_slowly
 from jaxfinger.data.schema import CHANNELS, DRIVES, MEASURED, MEASURES, NEEDS_JOINT, NEEDS_TENDON
 from jaxfinger.data.session import FingerDescription, Trial
-from jaxfinger.data.sizes import NOISE_FACTOR, Sizes
+from jaxfinger.data.sizes import MAX_RATE, NOISE_FACTOR, Sizes
 from jaxfinger.data.units import conversion, whole_turns
 from jaxfinger.errors import counted, listed
 
@@ -29,7 +29,6 @@ _CLIPPED, _MIN_CLIPPED = 10, 10
 _TAUT = ("ID.2", "VD.1", "VD.3")  # experiments that keep all tendons taut
 _SEVERAL_PULL = ("VD.2", "VD.3")  # experiments with the tension of several tendons at once
 _SLACK = ("ID.3-static", "ID.3-dynamic")  # experiments with slack tendons, whose tensions are not used
-_MIN_INTERVAL = 1e-5  # s: the rates of sensors of a machine end far below 100 kHz.
 _MIN_SAMPLES = 20  # Fewer samples show no typical step.
 _MOVES_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic")
 _STEPPED = ("ID.3-static", "ID.4", "VD.2")
@@ -120,7 +119,7 @@ def _time(trial: Trial, report: Report) -> None:
         report.warning(place, f"starts at {time[0]:.6g} s; count from 0 in each trial")
     if usual > 0.2:
         report.warning(place, f"has a sample every {usual:.3g} s; {conversion('ms')} if that is what it is")
-    if usual < _MIN_INTERVAL:
+    if usual < 1.0 / MAX_RATE:
         report.warning(place, f"has a sample every {usual:.3g} s; convert times to s, such as days or hours")
     gaps = steps > max(20.0 * usual, 0.02)
     if gaps.any():

@@ -14,6 +14,7 @@ from jaxfinger.data.findings import Report
 from jaxfinger.data.mapping import Column, ColumnSpec, MappedTrial, Reading, terms
 from jaxfinger.data.readings import compare_units, converted, is_slower, period
 from jaxfinger.data.recording import Variable
+from jaxfinger.data.sizes import MAX_RATE
 from jaxfinger.data.toml import Place
 from jaxfinger.data.units import whole_turns
 from jaxfinger.data.variables import Source, column_of, scale_of
@@ -34,7 +35,6 @@ _MAX_LATE, _MAX_LATE_SAMPLES = 1.0, 10
 # Coarse stamps repeat regularly: as many samples to each, within one, with room for jitter. Fewer repeated stamps may
 # be samples that were logged twice, and fewer stamps show no regularity.
 _MIN_REPEATED, _MIN_STAMPS, _MIN_REGULAR = 0.1, 10, 0.9
-MAX_RATE = 1e5  # Hz: the rates of sensors of a machine end far below it.
 _PARTS = "choose one part by `where`, or by `rate_hz` and `span`"
 _OWN_PARTS = "give each part a file of its own"
 

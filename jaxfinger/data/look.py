@@ -253,7 +253,8 @@ def _trial_proposal(
         if s.meaning not in ("", "time") and s.samples > 2:
             channels.setdefault(s.meaning, []).append(s)
     for channel in ("q", "joint_torque"):
-        channels |= {channel: of} if (of := [s for s in channels.get(channel, ()) if not _is_motor(s)]) else {}
+        if own := [s for s in channels.get(channel, ()) if not _is_motor(s)]:
+            channels[channel] = own
     names = {channel: _names(channel, columns, finger) for channel, columns in channels.items()}
     experiment, joint, tendon = _experiment(recording, channels, names)
     if joint and len(channels.get("joint_torque", ())) == 1:

@@ -12,7 +12,7 @@ from jaxfinger.data.expressions import ExpressionError, evaluate, units_of
 from jaxfinger.data.mapping import Reading
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.toml import Place
-from jaxfinger.data.units import unit_name
+from jaxfinger.data.units import TO_SI, unit_name
 from jaxfinger.errors import listed
 
 
@@ -62,7 +62,9 @@ class Source:
                 variable = self.recording.variables[inner]
             else:
                 variable = self.variable(inner, where, (*within, name))
-            clocks[inner], units[inner] = variable.clock, unit_name(variable.units).replace("1", "")
+            clocks[inner], unit = variable.clock, unit_name(variable.units)
+            # A number that is added to a temperature may convert it.
+            units[inner] = unit if unit and TO_SI[unit].si not in ("K", "1") else ""
             if variable.present is not None:
                 where.fail(f"uses {inner!r}, whose names change from message to message; map its columns by name")
             return variable.values if column is None else column_of(variable, inner, column, where)[0]
