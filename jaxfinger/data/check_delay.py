@@ -29,7 +29,7 @@ from jaxfinger.data.findings import Report
 from jaxfinger.data.motion import CUTOFF_HZ, HOLD_CUTOFF_HZ, fitting_cutoff
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.data.session import FingerDescription, Session, Trial
-from jaxfinger.data.sizes import SWEEP_TIME, travel_time
+from jaxfinger.data.sizes import MAX_SAMPLES, SWEEP_TIME, travel_time
 from jaxfinger.errors import listed
 
 _DEGREE = 5  # of torque and excursion as polynomials of the angle, as in `check_work`
@@ -293,7 +293,8 @@ def _pull(trial: Trial, finger: FingerDescription) -> _Pull | None:
         return None
     f = tension[:, finger.tendon_names.index(trial.tendon)]
     columns = np.flatnonzero(np.isfinite(values).all(axis=0) & (np.ptp(values, axis=0) > 0.0))
-    travel = travel_time(trial.time, f[:, None]) if np.isfinite(f).all() else 0.0
+    some = slice(None, None, max(1, len(f) // MAX_SAMPLES))  # A step takes a good part of the trial.
+    travel = travel_time(trial.time[some], f[some, None]) if np.isfinite(f).all() else 0.0
     if not columns.size or travel <= 0.0:
         return None
     cutoff = HOLD_CUTOFF_HZ * SWEEP_TIME / travel
