@@ -354,7 +354,7 @@ def _names(channel: str, columns: Sequence[ColumnSurvey], finger: FingerDescript
 
 
 def _by_number(columns: Sequence[ColumnSurvey], known: Sequence[str]) -> list[str]:
-    """Names for columns that differ in a number alone, such as `q2` and `q1`, by that number; else in their order."""
+    """Names for columns that differ in a number alone, such as q2 and q1, by that number; else in their order."""
     parts = [re.split(r"(\d+)", s.name if s.column is None else f"{s.name} {s.column}") for s in columns]
     places = [k for k in range(len(parts[0])) if len({tuple(part[k : k + 1]) for part in parts}) > 1]
     if len({len(part) for part in parts}) > 1 or len(places) != 1 or places[0] % 2 == 0:
