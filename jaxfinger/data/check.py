@@ -17,7 +17,7 @@ from jaxfinger.data.check_delay import check_delay
 from jaxfinger.data.check_finger import check_finger
 from jaxfinger.data.check_gravity import check_gravity
 from jaxfinger.data.check_held import check_held
-from jaxfinger.data.check_trial import check_trial
+from jaxfinger.data.check_trial import MAX_TARE_ERROR, check_trial
 from jaxfinger.data.check_work import check_work
 from jaxfinger.data.filtering import longest_spike, outlier_mask
 from jaxfinger.data.findings import Finding, Report
@@ -25,7 +25,7 @@ from jaxfinger.data.opening import plain_reason, why_closed
 from jaxfinger.data.parse import parse_file
 from jaxfinger.data.schema import MEASURED
 from jaxfinger.data.session import EXPERIMENT_NAMES, Session
-from jaxfinger.data.sizes import Sizes, sizes_of
+from jaxfinger.data.sizes import MAX_SAMPLES, Sizes, sizes_of
 from jaxfinger.data.units import conversion
 from jaxfinger.errors import counted, listed
 
@@ -93,6 +93,8 @@ def check_session(session: Session, report: Report) -> None:
                 report.error(f"/trials/{trial.name}", message)
                 continue
             check_trial(trial, session.finger, sizes, report)
+    with np.errstate(all="ignore"):
+        _check_tare(session, sizes, report)
     _check_pace(sizes, report)
     _check_order(session, report)
     _check_overlap(session, report)
@@ -119,6 +121,18 @@ def _check_pace(sizes: Sizes, report: Report) -> None:
     if (quick := min(sizes.pace, sizes.slow_pace)) < 1.0 / _MAX_QUICKNESS:
         said = f"joints move {1.0 / quick:.0f} times more quickly than in the protocol"
         report.warning("/trials", f"{said}; check the units of times, which are to be in s, not in minutes or days")
+
+
+def _check_tare(session: Session, sizes: Sizes, report: Report) -> None:
+    """Note where no tendon is ever slack in ID.4, where all but one may be: the zeros of all may be wrong."""
+    lows = [
+        np.percentile(f[:: max(1, len(f) // MAX_SAMPLES)], 5.0, axis=0)[session.finger.active]
+        for trial in session.select("ID.4")
+        if (f := trial.tendon_force) is not None and len(f)
+    ]
+    low = np.nanmin(lows, initial=np.inf) if lows and np.isfinite(lows).any() else 0.0
+    if low > max(MAX_TARE_ERROR * sizes.tension, sizes.slack):
+        report.note("/trials", f"no tendon reads less than {low:.3g} N in ID.4; check the tare if one was ever slack")
 
 
 def _check_order(session: Session, report: Report) -> None:

@@ -334,6 +334,21 @@ def test_slack_tendons_that_read_tension_are_said(session):
     assert not [text for text in said_of(session) if "tare" in text]
 
 
+def test_pulls_without_a_slack_tendon_have_a_note(session):
+    """Where no ID.3 records tensions, a zero that is wrong on all tendons looks like a pretension."""
+
+    def noted(tare):
+        report = Report()
+        pull = session["04-ID.4-T1-MCP"]
+        trials = {pull.name: replace(pull, tendon_force=pull.tendon_force + tare)}
+        check_session(replace(session, trials=trials), report)
+        return [str(f) for f in report if "no tendon reads less" in f.message]
+
+    assert noted(0.0) == []
+    (said,) = noted(2.5)
+    assert said.startswith("note: /trials: no tendon reads less than 2.47 N in ID.4; check the tare if one was ever")
+
+
 def test_excursions_of_slack_tendons_are_said(session):
     trial = session["01-ID.2-MCP"]
     slack = replace(
