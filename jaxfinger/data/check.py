@@ -6,6 +6,7 @@ import os
 from collections import defaultdict
 from collections.abc import Collection
 from datetime import datetime
+from itertools import pairwise
 
 import h5py
 import numpy as np
@@ -16,7 +17,7 @@ from jaxfinger.data.check_delay import check_delay
 from jaxfinger.data.check_finger import check_finger
 from jaxfinger.data.check_gravity import check_gravity
 from jaxfinger.data.check_held import check_held
-from jaxfinger.data.check_trial import check_trial
+from jaxfinger.data.check_trial import MAX_TARE_ERROR, check_trial
 from jaxfinger.data.check_work import check_work
 from jaxfinger.data.filtering import longest_spike, outlier_mask
 from jaxfinger.data.findings import Finding, Report
@@ -24,9 +25,9 @@ from jaxfinger.data.opening import plain_reason, why_closed
 from jaxfinger.data.parse import parse_file
 from jaxfinger.data.schema import MEASURED
 from jaxfinger.data.session import EXPERIMENT_NAMES, Session
-from jaxfinger.data.sizes import Sizes, sizes_of
+from jaxfinger.data.sizes import MAX_SAMPLES, Sizes, sizes_of
 from jaxfinger.data.units import conversion
-from jaxfinger.errors import listed
+from jaxfinger.errors import counted, listed
 
 # Share of a column's samples from which spikes are a warning instead of a note. Up to this share the mask finds them
 # with certainty; motors driven by a coarse encoder reach 0.09.
@@ -34,6 +35,7 @@ _MANY_SPIKES = 0.1
 # Motions that are slower or quicker than the protocol's by these factors are doubtful. A crane may need 30 times as
 # long, a small servo a tenth; ms read as s differ by 1000, minutes read as s by 60.
 _MAX_PACE, _MAX_QUICKNESS = 64.0, 16.0
+_MAX_OVERLAP = 0.1  # of a trial's length: starts may be rounded, and trials last a little longer than planned.
 
 
 def check_file(path: str | os.PathLike) -> list[Finding]:
@@ -91,8 +93,11 @@ def check_session(session: Session, report: Report) -> None:
                 report.error(f"/trials/{trial.name}", message)
                 continue
             check_trial(trial, session.finger, sizes, report)
+    with np.errstate(all="ignore"):
+        _check_tare(session, sizes, report)
     _check_pace(sizes, report)
     _check_order(session, report)
+    _check_overlap(session, report)
     _check_motions(session, report)
     check_copied_trials(session, report)
     if session.created:
@@ -118,12 +123,39 @@ def _check_pace(sizes: Sizes, report: Report) -> None:
         report.warning("/trials", f"{said}; check the units of times, which are to be in s, not in minutes or days")
 
 
+def _check_tare(session: Session, sizes: Sizes, report: Report) -> None:
+    """Note where no tendon is ever slack in ID.4, where all but one may be: the zeros of all may be wrong."""
+    lows = [
+        np.percentile(f[:: max(1, len(f) // MAX_SAMPLES)], 5.0, axis=0)[session.finger.active]
+        for trial in session.select("ID.4")
+        if (f := trial.tendon_force) is not None and len(f)
+    ]
+    low = np.nanmin(lows, initial=np.inf) if lows and np.isfinite(lows).any() else 0.0
+    if low > max(MAX_TARE_ERROR * sizes.tension, sizes.slack):
+        report.note("/trials", f"no tendon reads less than {low:.3g} N in ID.4; check the tare if one was ever slack")
+
+
 def _check_order(session: Session, report: Report) -> None:
     without = [trial.name for trial in session if trial.session_start is None]
     if without and len(without) < len(session):
         report.warning(
             "/trials", f"{listed(without)} lack `session_start`, so trials are ordered by name; give it to all or none"
         )
+
+
+def _check_overlap(session: Session, report: Report) -> None:
+    """Report trials that begin before the one before them has ended."""
+    spans = sorted((t.session_start, float(t.time[-1]), t.name) for t in session if t.session_start is not None)
+    early = [
+        (later, earlier)
+        for (start, lasts, earlier), (begin, _, later) in pairwise(spans)
+        if begin < start + (1.0 - _MAX_OVERLAP) * lasts
+    ]
+    if early:
+        (later, earlier), *more = early
+        also = f", and likewise {counted(len(more), 'other trial')}" if more else ""
+        message = f"{later} begins before {earlier} has ended{also}; write `session_start` in s, as `time`"
+        report.warning("/trials", message)
 
 
 def _check_motions(session: Session, report: Report) -> None:

@@ -26,11 +26,15 @@ def check_copied_trials(session: Session, report: Report) -> None:
     for trial in session:
         measured = {name: values for name in MEASURED if (values := getattr(trial, name)) is not None}
         start = tuple((name, np.ascontiguousarray(x[:_FIRST_SAMPLES]).tobytes()) for name, x in measured.items())
-        earlier = alike[(trial.experiment, len(trial.time), start)]
+        earlier = alike[(len(trial.time), start)]
         for other in earlier if len(trial.time) > 1 else ():
             if all(np.array_equal(values, getattr(other, name), equal_nan=True) for name, values in measured.items()):
-                message = f"is the same recording as trial {other.name}, sample for sample; remove one of them"
-                report.error(f"/trials/{trial.name}", message)
+                said = f"is the same recording as trial {other.name}, sample for sample"
+                if trial.experiment == other.experiment:
+                    report.error(f"/trials/{trial.name}", f"{said}; remove one of them")
+                else:
+                    said = f"{said}, which is {other.experiment}"
+                    report.warning(f"/trials/{trial.name}", f"{said}; give each its own part of the recording")
                 break
         earlier.append(trial)
 

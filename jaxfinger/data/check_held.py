@@ -136,10 +136,14 @@ def _stretches(x: np.ndarray) -> list[slice]:
 def _at_a_limit(x: np.ndarray, part: slice) -> bool:
     """Whether a torque is at an end of its range, which `check_trial` reports, or at a zero that it crosses.
 
-    Small torques may be read as zero.
+    Small torques may be read as zero. A torque that leaps to zero is not small.
     """
     value = x[part.start]
-    return bool((value == 0.0) != (value in (x.min(), x.max())))
+    if value != 0.0:
+        return bool(value in (x.min(), x.max()))
+    steps, beside = np.abs(np.diff(x)), x[[max(part.start - 1, 0), min(part.stop, len(x) - 1)]]
+    small = np.abs(x[x != 0.0]).min(initial=np.inf) + np.percentile(steps[steps > 0.0], 90.0)
+    return bool(x.min() < 0.0 < x.max() and np.abs(beside).max() <= small)
 
 
 def _goes_through(x: np.ndarray, part: slice) -> bool:

@@ -43,12 +43,18 @@ def check_jumps(trial: Trial, finger: FingerDescription, still: np.ndarray, repo
     if len(trial.time) < _MIN_SAMPLES or not np.all(np.diff(trial.time) > 0.0):
         return
     steps = np.diff(trial.time)
-    for channel, name, x, turns, least in _positions(trial, finger, still):
-        jumps = _jumps(x, turns, least)
+    found = [
+        (channel, name, x, turns, _jumps(x, turns, least))
+        for channel, name, x, turns, least in _positions(trial, finger, still)
+    ]
+    places, count = np.unique(np.concatenate([np.zeros(0, int), *(jumps for *_, jumps in found)]), return_counts=True)
+    for channel, name, x, turns, jumps in found:
         if not len(jumps):
             continue
         lasting = _lasting(x, jumps, longest_spike(float(np.median(steps))))
-        period = _period(x, jumps, lasting, turns)
+        # Encoders do not wrap together. Where all jump at once, samples are lost or repeated.
+        together = bool(np.isin(jumps, places[count > 1]).all())
+        period = None if together else _period(x, jumps, lasting, turns)
         if turns and period == _TURN:
             said, mend = "a whole turn", "the encoder wraps; unwrap it (`unwrap = true` in a mapping)"
         elif period is not None:

@@ -9,7 +9,7 @@ from jaxfinger.data.findings import Report
 from jaxfinger.data.motion import MIN_HOLD, pulled_slowly
 from jaxfinger.data.schema import CHANNELS, DRIVES, MEASURED, MEASURES, NEEDS_JOINT, NEEDS_TENDON
 from jaxfinger.data.session import FingerDescription, Trial
-from jaxfinger.data.sizes import Sizes
+from jaxfinger.data.sizes import MAX_RATE, NOISE_FACTOR, Sizes
 from jaxfinger.data.units import conversion, whole_turns
 from jaxfinger.errors import counted, listed
 
@@ -119,6 +119,8 @@ def _time(trial: Trial, report: Report) -> None:
         report.warning(place, f"starts at {time[0]:.6g} s; count from 0 in each trial")
     if usual > 0.2:
         report.warning(place, f"has a sample every {usual:.3g} s; {conversion('ms')} if that is what it is")
+    if usual < 1.0 / MAX_RATE:
+        report.warning(place, f"has a sample every {usual:.3g} s; convert times to s, such as days or hours")
     gaps = steps > max(20.0 * usual, 0.02)
     if gaps.any():
         lost = f"{counted(int(gaps.sum()), 'gap')}, the longest {steps.max():.3g} s"
@@ -364,9 +366,9 @@ def _magnitudes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: R
 
 
 def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
-    """Check that tensions are positive but for noise and tare, and not in mN."""
+    """Check that tensions are positive but for noise and tare, about zero where tendons are slack, and not in mN."""
     assert trial.tendon_force is not None
-    place = _place(trial, "tendon_force")
+    place, taut, slack = _place(trial, "tendon_force"), {}, []
     for name, active, x in zip(finger.tendon_names, finger.active, trial.tendon_force.T, strict=True):
         if not np.isfinite(x).all():
             continue
@@ -378,8 +380,22 @@ def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repo
             report.error(place, f"column {name} falls to {low:.3g} N, and a tendon cannot push; check sign and tare")
         elif low < -max(MAX_TARE_ERROR * sizes.tension, sizes.slack):
             report.warning(place, f"column {name} falls to {low:.3g} N, below zero by more than noise; check the tare")
+        elif (
+            trial.experiment in _SLACK and max(MAX_TARE_ERROR * sizes.tension, sizes.slack) < low < 0.5 * sizes.tension
+        ):
+            taut[name] = low
+        elif trial.experiment == "ID.2" and np.median(x) <= min(sizes.slack, NOISE_FACTOR * sizes.noise):
+            slack.append(name)
         if np.percentile(x, 95.0) > 2000.0:
             report.warning(place, f"column {name} exceeds 2000 N; {conversion('mN')} if that is what it is")
+    if slack and trial.tendon_excursion is not None:
+        said = f"shows no tension in {listed(slack)}, though ID.2 needs taut tendons to follow the joint"
+        report.warning(place, f"{said}; check the columns, or record the trial again with tension")
+    if taut:
+        said = (
+            f"stays above {min(taut.values()):.3g} N in {listed(list(taut))}, though {trial.experiment} leaves tendons"
+        )
+        report.warning(place, f"{said} slack; check the tare, or let the tendons go")
 
 
 def _holds(trial: Trial, report: Report) -> None:

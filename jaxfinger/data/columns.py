@@ -14,6 +14,7 @@ from jaxfinger.data.findings import Report
 from jaxfinger.data.mapping import Column, ColumnSpec, MappedTrial, Reading, terms
 from jaxfinger.data.readings import compare_units, converted, is_slower, period
 from jaxfinger.data.recording import Variable
+from jaxfinger.data.sizes import MAX_RATE
 from jaxfinger.data.toml import Place
 from jaxfinger.data.units import whole_turns
 from jaxfinger.data.variables import Source, column_of, scale_of
@@ -69,7 +70,7 @@ def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place,
         assert trial.rate_hz is not None
         count = len(column_of(source.variable(first.from_, where), first.from_, first.column, where)[0])
         rows = _chosen(trial, source, np.arange(count), count, where)
-        return _cut(Clock(rows / trial.rate_hz, rows, count, source), trial, where)
+        return _cut(Clock(rows / trial.rate_hz, rows, count, source), trial, where, report)
     rows_of = _first_rows(first, source, where)
     place = where / "time"
     reading = Reading(trial.time) if isinstance(trial.time, str) else trial.time
@@ -83,6 +84,11 @@ def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place,
     coarse = None if trial.sort else coarse_rate(time[rows])
     if coarse is not None:
         step, rate = coarse
+        if rate > MAX_RATE:
+            place.fail(
+                f"the clock `{reading.from_}` gives {rate:.3g} samples a second, as no sensor does; it is not in "
+                f"{reading.units or 's'}: write its `units`, or rate_hz in place of `time`"
+            )
         place.fail(
             f"the clock `{reading.from_}` changes every {step:.4g} s only, after {rate * step:.3g} samples on average; "
             f"write rate_hz = {rate:.4g} in place of `time`, or `sort = true` if samples are repeated with their stamps"
@@ -90,14 +96,14 @@ def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place,
     order = increasing_order(time[rows], f"`{reading.from_}`", trial.sort, _PARTS, place, report)
     rows, units = rows[order], reading.units or "s"
     clock = Clock(time[rows], rows, len(time), source, reading.from_, units, trial.sort, begins_again)
-    return _cut(clock, trial, where)
+    return _cut(clock, trial, where, report)
 
 
 def _times(reading: Reading, source: Source, where: Place, report: Report) -> Float[np.ndarray, " N"]:
     """Times of a clock, s."""
     variable = source.variable(reading.from_, where)
     values, _ = column_of(variable, reading.from_, reading.column, where)
-    compare_units(variable, reading, "s", report, where)
+    compare_units(variable, reading, "s", report, where, reading.from_ in source.derived)
     return converted(values, reading, "s", scale_of(reading, source, where), where)
 
 
@@ -129,12 +135,16 @@ def _chosen(trial: MappedTrial, source: Source, rows: np.ndarray, total: int, wh
     return rows[chosen[rows]]
 
 
-def _cut(clock: Clock, trial: MappedTrial, where: Place) -> Clock:
+def _cut(clock: Clock, trial: MappedTrial, where: Place, report: Report) -> Clock:
     """Cut a clock by the trial's `span`, s from the first sample."""
     if len(clock.time):
         clock = replace(clock, origin=float(clock.time[0]))
     if trial.span is not None:
         begin, end = trial.span
+        lasts = float(clock.time[-1] - clock.origin) if len(clock.time) else 0.0
+        if lasts < end <= 1e3 * lasts and end - begin > 100.0 * lasts:
+            said = f"ends at {end:g} s, and the recording at {lasts:.4g} s"
+            report.warning((where / "span").key, f"{said}; write s from its first sample, not ms")
         clock = clock.keep((clock.time - clock.origin >= begin) & (clock.time - clock.origin < end))
     if len(clock.time) == 0:
         where.fail("holds no sample; " + ("correct its `where`" if trial.span is None else "widen its `span`"))
@@ -189,15 +199,19 @@ def increasing_order(time: np.ndarray, name: str, sort: bool, choice: str, where
     if len(begins):
         far = f"runs back by {time[begins[0]] - time[begins[0] + 1]:.4g} s after sample {begins[0]}"
         far += f", and at {counted(len(begins), 'place')} in all" if len(begins) > 1 else ""
+        period = time[begins[0]] - time[begins[0] + 1] + float(np.median(np.diff(time)))
         where.fail(
             f"the clock {name} {far}: it begins again or wraps, and sorting would mix different times; {choice}, or "
-            "unwrap a counter by its period, as time = { from = …, unwrap = 4294967296 }"
+            f"unwrap a clock that wraps after {period:.6g} s by its period in its own units, as time = {{ from = …, "
+            "unwrap = 4294967296 }"
         )
     at, back, twice = int(np.argmax(late)), int((np.diff(time) < 0.0).sum()), int((np.diff(np.sort(time)) == 0.0).sum())
     if not sort:
         count = f"does not increase at {int(late.sum())} of {len(time)} samples, first after sample {at}"
         mend = "the samples must be sorted by their time"
         mend += f", without the {counted(twice, 'sample')} at repeated stamps" if twice else ""
+        if twice > 0.5 * len(time):
+            where.fail(f"the clock {name} {count}: its stamps are too coarse; write rate_hz in place of `time`")
         where.fail(f"the clock {name} {count}: {mend}; have import do so by `sort = true` in the trial")
     order = np.argsort(time, kind="stable")
     first = np.concatenate([[True], np.diff(time[order]) > 0.0])
@@ -242,7 +256,7 @@ class ColumnReader:
         name = spec.from_
         variable = source.variable(name, where)
         values, k = column_of(variable, name, spec.column, where)
-        compare_units(variable, spec, units, self.report, where)
+        compare_units(variable, spec, units, self.report, where, name in source.derived)
         values = converted(values, spec, units, scale_of(spec, source, where), where)
         present = np.ones(len(values), bool) if variable.present is None else variable.present[:, k]
         own = self._own_clock(spec, variable, source, present, where)

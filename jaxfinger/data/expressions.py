@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ast
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -39,6 +39,7 @@ _OPERATORS: dict[type, Callable] = {
 _FUNCTIONS = {
     name: getattr(np, name) for name in ("sin", "cos", "tan", "arctan", "sqrt", "exp", "log", "deg2rad", "rad2deg")
 } | {"abs": np.abs, "sign": np.sign}
+_OF_ANGLES, _ANGLES = ("sin", "cos", "tan"), ("rad", "mrad", "deg", "turn")
 _MAX_LENGTH = 2000  # characters, longer than any formula. Deep nesting fails earlier, with a message of its own.
 
 
@@ -133,6 +134,68 @@ def _value(node: ast.AST, lookup: Callable[[str, Any], Any], constants: Mapping[
         f"holds {ast.unparse(node)!r}, which is not allowed; it may hold variables, constants, + - * / **, "
         f"comparisons, MATRIX @ x, and {', '.join(_FUNCTIONS)}"
     )
+
+
+def units_of(text: str, lookup: Callable[[str], str], constants: Collection[str]) -> str:
+    """Unit in which an expression is, by those of its variables; empty where they do not tell.
+
+    Sums keep the unit of their terms, and deg2rad, rad2deg and arctan give angles. `lookup` gives the unit of a
+    variable (`units.unit_name`), empty where it is unknown; `constants` have none.
+
+    Raises:
+        ExpressionError: different units are added or compared, or an angle that is not in rad has its sine taken.
+    """
+    return _units(ast.parse(text.strip(), mode="eval").body, lookup, constants)
+
+
+def _units(node: ast.AST, lookup: Callable[[str], str], constants: Collection[str]) -> str:
+    """Unit of a node of the syntax tree (`units_of`)."""
+
+    def inner(child: ast.AST) -> str:
+        return _units(child, lookup, constants)
+
+    match node:
+        case ast.Constant(value=int() | float()) | ast.Name(id="pi"):
+            return ""
+        case ast.Name() | ast.Attribute() | ast.Constant(value=str()):
+            name = _name(node)
+            return "" if name in constants else lookup(name)
+        case ast.Subscript():
+            return lookup(_name(node.value))
+        case ast.UnaryOp():
+            return inner(node.operand)
+        case ast.BinOp(op=ast.Add() | ast.Sub()):
+            return _common(node, [inner(node.left), inner(node.right)], "adds")
+        case ast.Compare(comparators=[right]):
+            _common(node, [inner(node.left), inner(right)], "compares")
+        case ast.List() | ast.Tuple():
+            found = {inner(item) for item in node.elts}
+            return found.pop() if len(found) == 1 else ""
+        case ast.Call(func=ast.Name(id=function), args=[argument]):
+            unit = inner(argument)
+            wanted = {"rad2deg": "rad", "deg2rad": "deg"}.get(function, "rad" if function in _OF_ANGLES else unit)
+            if unit in _ANGLES and unit != wanted:
+                mend = "write deg2rad(…) about it" if (unit, wanted) == ("deg", "rad") else "convert it first"
+                raise ExpressionError(f"takes {function} of {unit} in {ast.unparse(argument)!r}; {mend}")
+            given = {"deg2rad": "rad", "rad2deg": "deg", "arctan": "rad", "abs": unit}
+            return given.get(function, "")
+        case _:
+            for child in ast.iter_child_nodes(node):
+                if isinstance(child, ast.expr):
+                    inner(child)
+    return ""
+
+
+def _common(node: ast.AST, units: Sequence[str], verb: str) -> str:
+    """The one unit of several terms, empty where none has one.
+
+    Raises:
+        ExpressionError: the terms have different ones.
+    """
+    known = list(dict.fromkeys(unit for unit in units if unit))
+    if len(known) > 1:
+        raise ExpressionError(f"{verb} {' and '.join(known)} in {ast.unparse(node)!r}; convert one of them first")
+    return known[0] if known else ""
 
 
 def _aligned(apply: Callable, left: Any, right: Any) -> Any:

@@ -21,6 +21,7 @@ from jaxfinger.data.finger_file import finger_from
 from jaxfinger.data.hdf5 import write_session
 from jaxfinger.data.mapping import Channels, MappedTrial, MappingFile, read_mapping, terms
 from jaxfinger.data.parse import RANGES, sorted_trials
+from jaxfinger.data.rates import compare_rate
 from jaxfinger.data.recording import Recording
 from jaxfinger.data.schema import CHANNELS, DRIVES, TEMPERATURE, Channel, Entry, units_of
 from jaxfinger.data.session import FingerDescription, Session, Trial
@@ -141,6 +142,8 @@ def _trial(
     if "q" not in channels:
         where.fail("maps no channel `q`; name the joint positions")
     clock = trial_clock(trial, terms(next(iter(channels["q"].values())))[0], source, where, report)
+    if trial.rate_hz is not None:
+        compare_rate(trial.rate_hz, clock, source.recording, where, report)
     columns = ColumnReader(clock, lambda file, place: recordings.source(file, trial.derived, place), report)
     own = trial.channels.mapped()
     places = {c: (where if c in own else Place(where.file, where.lines)) / "channels" / c for c in channels}

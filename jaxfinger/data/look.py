@@ -32,6 +32,8 @@ _SET_POINT = (
     r"cmd|command|ref(?!l)|desired|set_?p(oin)?t|goal|target|demand|soll|feed_?forward"
     r"|(?<![a-z])(q|tau|pos)?(des|set(?!\d+\.)|sp|ff|tgt|nominal|planned)(?![a-z])"
 )
+# Names of what is in front of a joint's gear or spring.
+_MOTOR = r"(?<![a-z])(motor|mot|drive|actuator|rotor|spool|winch)(?![a-z])"
 # Largest plausible values of a channel by unit, with room for arms. The first unit whose largest value is not exceeded
 # is the guess. Torques from 5 to 100 may be an arm's in N m or a finger's in N mm, and large tensions may be in mN or
 # gf, so their unit stays open.
@@ -250,6 +252,9 @@ def _trial_proposal(
     for s in seen:
         if s.meaning not in ("", "time") and s.samples > 2:
             channels.setdefault(s.meaning, []).append(s)
+    for channel in ("q", "joint_torque"):
+        if own := [s for s in channels.get(channel, ()) if not _is_motor(s)]:
+            channels[channel] = own
     names = {channel: _names(channel, columns, finger) for channel, columns in channels.items()}
     experiment, joint, tendon = _experiment(recording, channels, names)
     if joint and len(channels.get("joint_torque", ())) == 1:
@@ -278,6 +283,12 @@ def _trial_proposal(
     read = {s.name for channel, columns in channels.items() for s in columns[: len(rows[channel])]}
     left_out = dict.fromkeys(s.name for s in seen if s.name not in read and s.meaning != "time")
     return _Proposal(lines, rows, list(left_out))
+
+
+def _is_motor(seen: ColumnSurvey) -> bool:
+    """Whether a column's name says that it belongs to a motor: where the joint has columns of its own, these count."""
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", f"{seen.name} {seen.column or ''}").lower()
+    return re.search(_MOTOR, words) is not None
 
 
 def _experiment(
@@ -339,7 +350,19 @@ def _names(channel: str, columns: Sequence[ColumnSurvey], finger: FingerDescript
     known = list(finger.joint_names if letter == "J" else finger.tendon_names)
     held = [[n for n in known if n.lower() in f"{s.name} {s.column or ''}".lower()] for s in columns]
     own = [max(names, key=len) for names in held if names]
-    return own if len(own) == len(columns) == len(set(own)) else known
+    return own if len(own) == len(columns) == len(set(own)) else _by_number(columns, known)
+
+
+def _by_number(columns: Sequence[ColumnSurvey], known: Sequence[str]) -> list[str]:
+    """Names for columns that differ in a number alone, such as q2 and q1, by that number; else in their order."""
+    parts = [re.split(r"(\d+)", s.name if s.column is None else f"{s.name} {s.column}") for s in columns]
+    places = [k for k in range(len(parts[0])) if len({tuple(part[k : k + 1]) for part in parts}) > 1]
+    if len({len(part) for part in parts}) > 1 or len(places) != 1 or places[0] % 2 == 0:
+        return list(known)
+    numbers = [int(part[places[0]]) for part in parts]
+    if min(numbers) > 0 and max(numbers) <= len(known):
+        return [known[number - 1] for number in numbers]
+    return [known[sorted(numbers).index(number)] for number in numbers] if len(numbers) <= len(known) else list(known)
 
 
 def _column(seen: ColumnSurvey) -> str:

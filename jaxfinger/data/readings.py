@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxfinger.data.findings import Report
+from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.mapping import Reading
 from jaxfinger.data.recording import Variable
 from jaxfinger.data.toml import Place
@@ -64,14 +64,18 @@ def is_slower(time: np.ndarray, there: np.ndarray) -> bool:
     return bool(long < _MAX_LONG * steps[regular].mean() and samples[regular].mean() > _MIN_SLOWER)
 
 
-def compare_units(variable: Variable, spec: Reading, units: str, report: Report, where: Place) -> None:
-    """Warn where the recording states other units than the mapping."""
+def compare_units(
+    variable: Variable, spec: Reading, units: str, report: Report, where: Place, derived: bool = False
+) -> None:
+    """Warn where the recording, or the formula of a derived variable, has other units than the mapping."""
     stated, mapped = unit_name(variable.units), spec.units or units
     as_it_is = spec.scale in (1.0, -1.0)
+    said = ""
     if stated and mapped in TO_SI and stated != mapped and as_it_is and TO_SI[stated] != TO_SI[mapped]:
-        report.warning(
-            where.key, f"the recording states {variable.units}, and the mapping reads {mapped}; correct one of them"
-        )
-    if is_foreign(variable.units) and mapped != "1" and as_it_is:
+        states = f"the formula of {spec.from_!r} gives" if derived else "the recording states"
+        said = f"{states} {variable.units}, and the mapping reads {mapped}; correct one of them"
+    elif is_foreign(variable.units) and mapped != "1" and as_it_is:
         said = f"the recording states {variable.units}, and the mapping reads {mapped}"
-        report.warning(where.key, f"{said}; write `scale`, the {mapped} in one {variable.units}")
+        said += f"; write `scale`, the {mapped} in one {variable.units}"
+    if said and Finding("warning", where.key, said) not in report:  # Trials share columns.
+        report.warning(where.key, said)

@@ -29,6 +29,7 @@ MAX_PACE_SAMPLES = 4000  # of a trial that are read for its pace: in a minute's 
 # tendons would be a poor standard: it sticks, and its slips are fast on every machine.
 SWEEP_TIME = 0.11
 STEP_TIME = 0.27  # s, likewise in the protocol's led and stepped motions (ID.2, ID.3-static)
+MAX_RATE = 1e5  # Hz: the rates of sensors of a machine end far below it.
 # Paces are rounded to powers of this ratio. The rates for one pace serve motions up to twice as slow and four times as
 # quick: fits agree within their errors (tests/identify/test_units.py).
 PACE_RATIO = 4.0

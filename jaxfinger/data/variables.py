@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxfinger.data.expressions import ExpressionError, evaluate
+from jaxfinger.data.expressions import ExpressionError, evaluate, units_of
 from jaxfinger.data.mapping import Reading
 from jaxfinger.data.recording import Recording, Variable
 from jaxfinger.data.toml import Place
+from jaxfinger.data.units import TO_SI, unit_name
 from jaxfinger.errors import listed
 
 
@@ -54,19 +55,23 @@ class Source:
         where = where / "derived" / name
         text = self.derived[name]
         clocks: dict[str, str] = {}
+        units: dict[str, str] = {}
 
         def lookup(inner: str, column: Any) -> np.ndarray:
             if inner == name and inner in self.recording.variables:
                 variable = self.recording.variables[inner]
             else:
                 variable = self.variable(inner, where, (*within, name))
-            clocks[inner] = variable.clock
+            clocks[inner], unit = variable.clock, unit_name(variable.units)
+            # A number that is added to a temperature may convert it.
+            units[inner] = unit if unit and TO_SI[unit].si not in ("K", "1") else ""
             if variable.present is not None:
                 where.fail(f"uses {inner!r}, whose names change from message to message; map its columns by name")
             return variable.values if column is None else column_of(variable, inner, column, where)[0]
 
         try:
             values = np.asarray(evaluate(text, lookup, self.constants, self.words), np.float64)
+            unit = units_of(text, lambda inner: units.get(inner, ""), self.constants)
         except ExpressionError as error:
             where.fail(f"{text!r} {error}")
         if len(set(clocks.values())) > 1:
@@ -74,7 +79,7 @@ class Source:
             where.fail(f"joins variables that have different clocks ({of}); derive one variable for each clock")
         if values.ndim not in (1, 2):
             where.fail("gives a single number and no samples; put it into [constants]")
-        return Variable(values, clock=next(iter(clocks.values()), ""))
+        return Variable(values, clock=next(iter(clocks.values()), ""), units=unit)
 
 
 def column_of(variable: Variable, name: str, column: Any, where: Place) -> tuple[np.ndarray, int]:

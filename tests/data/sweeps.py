@@ -96,3 +96,41 @@ def _angles(rng, q, noise):
 def alone(session, trial) -> Session:
     """Session with this trial only."""
     return Session("test finger", session.finger, {trial.name: trial}, "tests", "2026-01-01T00:00:00+00:00")
+
+
+def tendon(f, constant=0.05, share=0.1):
+    """Tension that arrives behind a tendon's friction, which sticks until its loss is exceeded."""
+    out = np.zeros(len(f))
+    for k in range(1, len(f)):
+        loss = min(constant + share * f[k], f[k])
+        out[k] = np.clip(out[k - 1], f[k] - loss, f[k] + loss)
+    return out
+
+
+def pulled(rate=100.0, late_tension=0.0, late_torque=0.0, share=0.1, noise=1.0, seed=0) -> Trial:
+    """ID.4 of T1 at MCP, up and down in steps of 1 s. `noise` is a multiple of 0.02 N and 0.2 N mm."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(int(22.0 * rate)) / rate
+    levels = np.array([0.0, 4.0, 8.0, 12.0, 8.0, 4.0, 0.0])
+
+    def steps(delay):
+        step, at = np.divmod(np.maximum(time - delay, 0.0), 3.0)
+        k = np.minimum(step.astype(int), len(levels) - 2)
+        at = np.where(step > k, 3.0, at)
+        return levels[k] + np.diff(levels)[k] * (1.0 - np.cos(np.pi * np.clip(at - 1.0, 0.0, 1.0))) / 2.0
+
+    n = len(time)
+    torque = -0.008 * tendon(steps(late_torque), share=share) + 2e-4 * noise * rng.standard_normal(n)
+    f = steps(late_tension) + 0.02 * noise * rng.standard_normal(n)
+    slack, unmeasured = 0.02 * noise * rng.standard_normal(n), np.full(n, np.nan)
+    q = 0.4 + 1e-4 * rng.standard_normal((n, 2))
+    return Trial(
+        "pull",
+        "ID.4",
+        time,
+        q,
+        np.column_stack([f, slack, unmeasured]),
+        joint_torque=np.column_stack([torque, unmeasured]),
+        joint="MCP",
+        tendon="T1",
+    )

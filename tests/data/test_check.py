@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import Session, check_file, read_session, write_session
+from jaxfinger.data.check import check_session
+from jaxfinger.data.findings import Report
 from jaxfinger.errors import UserError
 
 
@@ -315,3 +317,61 @@ def test_a_tendon_that_is_pulled_too_fast_for_its_friction_is_said(session, tmp_
     write_session(replace(session, trials={trial.name: ramped}), tmp_path / "s.h5")
     messages = [str(f) for f in check_file(tmp_path / "s.h5")]
     assert any("nothing of the trial is judged" in m for m in messages) == said
+
+
+def said_of(session) -> list[str]:
+    report = Report()
+    check_session(session, report)
+    return [str(finding) for finding in report if finding.severity != "note"]
+
+
+def test_slack_tendons_that_read_tension_are_said(session):
+    """A tare that is wrong on all tendons at once, which their pulls cannot show."""
+    trials = {t.name: t if t.tendon_force is None else replace(t, tendon_force=t.tendon_force + 0.6) for t in session}
+    (said,) = [text for text in said_of(replace(session, trials=trials)) if "tare" in text]
+    assert "/trials/02-ID.3-static-PIP/tendon_force: stays above 0.5" in said
+    assert "N in T1, T2, though ID.3-static leaves tendons slack; check the tare, or let the tendons go" in said
+    assert not [text for text in said_of(session) if "tare" in text]
+
+
+def test_pulls_without_a_slack_tendon_have_a_note(session):
+    """Where no ID.3 records tensions, a zero that is wrong on all tendons looks like a pretension."""
+
+    def noted(tare):
+        report = Report()
+        pull = session["04-ID.4-T1-MCP"]
+        trials = {pull.name: replace(pull, tendon_force=pull.tendon_force + tare)}
+        check_session(replace(session, trials=trials), report)
+        return [str(f) for f in report if "no tendon reads less" in f.message]
+
+    assert noted(0.0) == []
+    (said,) = noted(2.5)
+    assert said.startswith("note: /trials: no tendon reads less than 2.47 N in ID.4; check the tare if one was ever")
+
+
+def test_excursions_of_slack_tendons_are_said(session):
+    trial = session["01-ID.2-MCP"]
+    slack = replace(
+        session, trials={**session.trials, trial.name: replace(trial, tendon_force=trial.tendon_force - 2.0)}
+    )
+    (said,) = [text for text in said_of(slack) if "no tension" in text]
+    assert "/trials/01-ID.2-MCP/tendon_force: shows no tension in T1, T2" in said
+
+
+def test_trials_that_overlap_are_said_once(session):
+    """Starts in minutes: the trials of 9 s would begin 1 s after each other."""
+
+    def started(apart):
+        trials = {t.name: replace(t, session_start=apart * k) for k, t in enumerate(session)}
+        return [text for text in said_of(replace(session, trials=trials)) if "begins before" in text]
+
+    (said,) = started(1.0)
+    assert "02-ID.3-static-PIP begins before 01-ID.2-MCP has ended, and likewise 6 other trials" in said
+    assert started(9.0) == []
+
+
+def test_times_that_no_sensor_has_are_said(session):
+    trials = {t.name: replace(t, time=t.time / 86400.0) for t in session}
+    assert any(
+        "has a sample every 1.16e-07 s; convert times to s" in x for x in said_of(replace(session, trials=trials))
+    )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.bad_input import complaints
-from jaxfinger.data.check_copies import check_copied_columns
+from jaxfinger.data.check_copies import check_copied_columns, check_copied_trials
 from jaxfinger.data.findings import Report
 from tests.data.test_check_columns import TIME, of, pulled, turning
 
@@ -64,3 +64,14 @@ def test_tensions_of_a_controller_may_swing_alike(session):
     assert copies(session, trial, trial.tendon_force[:, 1])
     driven = replace(trial, experiment="VD.3", joint=None, tendon=None, joint_torque=None)
     assert not copies(session, driven, trial.tendon_force[:, 1])
+
+
+def test_one_recording_given_as_two_experiments_is_said(session):
+    trial = session["03-ID.3-dynamic-MCP"]
+    static = replace(trial, name="a", experiment="ID.3-static")
+    report = Report()
+    check_copied_trials(replace(session, trials={"a": static, trial.name: trial}), report)
+    assert [str(finding) for finding in report] == [
+        "warning: /trials/03-ID.3-dynamic-MCP: is the same recording as trial a, sample for sample, which is "
+        "ID.3-static; give each its own part of the recording"
+    ]

@@ -1,6 +1,7 @@
 """Channels that come late are reported with their delay; friction, play and stretch are not taken for delays."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,8 @@ import pytest
 from benchmarks.bad_input import complaints
 from jaxfinger.data.check_delay import check_delay
 from jaxfinger.data.findings import Report
-from tests.data.sweeps import Sweep, alone, late, led, play, pre_sliding, swept
+from jaxfinger.data.session import Session
+from tests.data.sweeps import Sweep, alone, late, led, play, pre_sliding, pulled, swept
 
 SEVERAL, ONE = Sweep(), Sweep((0.5,), lasts=20.0)
 MACHINES = [
@@ -101,3 +103,77 @@ def test_friction_that_grows_with_load_is_no_delay(session, share):
     load = 0.3 * np.sin(q) + 0.01 * np.gradient(rate, time)
     torque = load + 0.02 * rate + share * np.abs(load) * np.tanh(rate / 0.02)
     assert delays(session, swept(servo, q, torque)) == []
+
+
+def pulls(session, **how) -> list[str]:
+    """What is said of five pulls."""
+    report = Report()
+    trials = {f"{k}": replace(pulled(seed=k, **how), name=f"{k}") for k in range(5)}
+    check_delay(Session("x", session.finger, trials), report)
+    return [str(finding) for finding in report]
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4])
+@pytest.mark.parametrize("delay", [0.1, 0.2])
+def test_a_tension_that_comes_late_is_named(session, delay, share):
+    """Each of several trials shows less than a single one must, and all of them the same."""
+    for said, names in (
+        (
+            pulls(session, late_tension=delay, share=share),
+            "tendon_force: column T1 comes {} ms after joint_torque of MCP",
+        ),
+        (
+            pulls(session, late_torque=delay, share=share),
+            "joint_torque: column MCP comes {} ms after tendon_force of T1",
+        ),
+    ):
+        assert len(said) == 5
+        number = re.search(r"(\d+) ms", said[0])
+        assert number
+        assert float(number[1]) == pytest.approx(1e3 * delay, abs=50.0)
+        assert names.format(number[1]) in said[0]
+
+
+def test_one_pull_alone_shows_a_long_delay(session):
+    (said,) = delays(session, pulled(late_tension=0.2))
+    assert "/pull/tendon_force: column T1 comes 2" in said
+
+
+@pytest.mark.parametrize("rate", [50.0, 1000.0])
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.6])
+@pytest.mark.parametrize("noise", [1e-3, 1.0, 8.0])
+def test_friction_of_a_tendon_is_no_delay(session, rate, share, noise):
+    assert pulls(session, rate=rate, share=share, noise=noise) == []
+
+
+def filtered(sweep, x, cutoff, order=1):
+    """x behind low-passes of first order."""
+    for _ in range(order):
+        out = x.copy()
+        for k in range(1, len(x)):
+            out[k] = out[k - 1] + (1.0 - np.exp(-2.0 * np.pi * cutoff / sweep.rate)) * (x[k] - out[k - 1])
+        x = out
+    return x
+
+
+@pytest.mark.parametrize(("cutoff", "order"), [(0.3, 1), (0.6, 1), (1.0, 1), (1.0, 2)])
+def test_a_torque_behind_a_low_pass_is_named(session, cutoff, order):
+    trial = swept(SEVERAL, SEVERAL.q, filtered(SEVERAL, SEVERAL.torque(), cutoff, order))
+    (said,) = delays(session, trial)
+    number = re.search(r"/sweep/joint_torque: column MCP has passed a low-pass filter of about ([\d.]+) Hz", said)
+    assert number
+    assert float(number[1]) == pytest.approx(cutoff, rel=0.5)
+
+
+@pytest.mark.parametrize("machine", MACHINES, ids=str)
+@pytest.mark.parametrize("stiffness", [0.005, 0.02, 0.1])
+@pytest.mark.parametrize("time_constant", [0.03, 0.1, 0.4])
+def test_a_joint_that_relaxes_is_not_filtered(session, machine, stiffness, time_constant):
+    """A spring behind a damper, beside one of 0.02 N m/rad: its torque leads the angle, as no filter's does."""
+    q, constant = machine.q, time_constant / machine.frequencies[-1]
+    relaxing = q.copy()
+    for k in range(1, len(q)):
+        relaxing[k] = relaxing[k - 1] + (q[k] - relaxing[k - 1]) / (constant * machine.rate + 1.0)
+    for friction in (None, np.zeros(len(q))):
+        torque = machine.torque(friction) + stiffness * (q - relaxing)
+        assert not [text for text in delays(session, swept(machine, q, torque)) if "low-pass" in text]

@@ -7,12 +7,13 @@ import pytest
 import scipy.io
 
 from jaxfinger.data.findings import Report
-from jaxfinger.data.importers import import_file
+from jaxfinger.data.importers import import_file, import_session
 from jaxfinger.errors import UserError
 from tests.data.conftest import ONE_JOINT
 
 TIME = np.arange(600) / 100
 Q = 0.6 + 0.5 * np.sin(TIME)
+RANDOM_STEPS = np.random.default_rng(1).uniform(-1.0, 1.0, len(TIME))
 SLOW = np.arange(120) / 20
 MAPPING = (
     ONE_JOINT
@@ -32,7 +33,7 @@ def bring_in(tmp_path, torque, extra="", others=(), root="", **changes):
     recorded = {"t": TIME, "q": Q, "slow": SLOW, "tau": 0.01 * np.sin(SLOW), "now": 0.01 * np.cos(TIME)} | changes
     scipy.io.savemat(tmp_path / "log.mat", recorded)
     text = MAPPING.replace("EXTRA", extra).replace("TORQUE", torque)
-    text = text.replace('time = "t"\n', "") if "time = {" in extra else text
+    text = text.replace('time = "t"\n', "") if "time = {" in extra or "rate_hz" in extra else text
     (tmp_path / "m.toml").write_text(text + root)
     report = Report()
     session = import_file([tmp_path / "log.mat", *others], tmp_path / "m.toml", tmp_path / "s.h5", True, report)
@@ -291,3 +292,61 @@ def test_coarse_stamps_are_replaced_by_a_rate(tmp_path, rate, step):
 def test_stamps_that_are_not_coarse_are_to_be_sorted(tmp_path, rows):
     with pytest.raises(UserError, match="have import do so by `sort = true`"):
         bring_in(tmp_path, '"now"', t=TIME[rows], q=Q[rows], now=0.01 * np.cos(TIME[rows]))
+
+
+@pytest.mark.parametrize(
+    ("rate", "clock", "said"),
+    [
+        (100.0, TIME, ""),
+        (100.0, 1e3 * TIME, ""),  # Its units are not stated.
+        (100.0, TIME + 0.002 * RANDOM_STEPS, ""),
+        (1000.0, TIME, "the recording's own clock 't' goes on by 0.01, which no unit fits; name it as `time`"),
+        (50.0, 1e3 * TIME, "goes on by 10, which no unit fits; name it as `time` in place of rate_hz = 50"),
+        (100.0, np.where(TIME < 3.0, TIME, TIME + 2.0), "has 1 gap, which the rate closes"),
+        (500.0, np.arange(len(TIME)) * 1.0, ""),  # A count of samples.
+        (100.0, TIME % 3.0, ""),  # It begins again.
+    ],
+)
+def test_a_rate_is_compared_with_the_clock_of_the_file(tmp_path, rate, clock, said):
+    """`rate_hz` alone decides the times, so that a wrong one is silent."""
+    _, warnings = bring_in(tmp_path, '"now"', f"rate_hz = {rate}", t=clock)
+    found = [text for text in warnings if "own clock" in text]
+    assert len(found) == bool(said)
+    assert all(said in text for text in found)
+
+
+def test_a_span_in_ms_is_said(tmp_path):
+    _, warnings = bring_in(tmp_path, '"now"', "span = [0, 5000]")
+    assert any("trials.a.span: ends at 5000 s, and the recording at" in text for text in warnings)
+    for sound in ("[0, 5]", "[1, 1e9]", "[0, 6.5]"):
+        assert not any(".span" in text for text in bring_in(tmp_path, '"now"', f"span = {sound}")[1])
+
+
+@pytest.mark.parametrize(
+    ("clock", "words"),
+    [
+        (np.floor(TIME * 20.0) / 20.0 / 86400.0, "samples a second, as no sensor does; it is not in s"),
+        (np.floor(TIME / 300.0) * 300.0, "its stamps are too coarse; write rate_hz in place of `time`"),
+        ((TIME + 86397.0) % 86400.0, "a clock that wraps after 86400 s by its period"),
+    ],
+)
+def test_a_clock_is_mended_by_what_is_wrong_with_it(tmp_path, clock, words):
+    with pytest.raises(UserError, match=re.escape(words)):
+        bring_in(tmp_path, '"now"', t=clock)
+
+
+@pytest.mark.parametrize(
+    ("torque", "said"),
+    [
+        ("'tau [N mm]' - 0.1", "the formula of 'load' gives N mm, and the mapping reads N m; correct one of them"),
+        ("1e-3 * 'tau [N mm]'", ""),
+    ],
+)
+def test_units_of_a_formula_are_compared(tmp_path, torque, said):
+    rows = np.column_stack([TIME, Q, np.cos(TIME)])
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header="t,q,tau [N mm]", comments="")
+    text = MAPPING.replace("EXTRA", "").replace("TORQUE", '"load"').replace("log.mat", "log.csv")
+    (tmp_path / "m.toml").write_text(text + f'\n[derived]\nload = "{torque}"\n')
+    report = Report()
+    import_session([tmp_path / "log.csv"], tmp_path / "m.toml", report)
+    assert [f.message for f in report if "formula" in f.message] == ([said] if said else [])

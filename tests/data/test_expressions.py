@@ -1,9 +1,11 @@
 """Arithmetic in a mapping: its values, and the refusal of everything else."""
 
+import re
+
 import numpy as np
 import pytest
 
-from jaxfinger.data.expressions import ExpressionError, evaluate
+from jaxfinger.data.expressions import ExpressionError, evaluate, units_of
 
 X = np.arange(4.0)
 TABLE = np.column_stack([X, 10 * X])
@@ -82,3 +84,43 @@ def test_powers_of_powers_come_to_an_end():
 def test_what_words_cannot_do(text, words):
     with pytest.raises(ExpressionError, match=words):
         evaluate(text, lookup, CONSTANTS, WORDS)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("angle - 3", "deg"),
+        ("-angle + offset", "deg"),
+        ("abs(angle) + 'angle'", "deg"),
+        ("deg2rad(angle)", "rad"),
+        ("rad2deg(turned)", "deg"),
+        ("arctan(length / length)", "rad"),
+        ("2 * angle", ""),
+        ("M @ [angle, angle]", ""),
+        ("[angle, angle]", "deg"),
+        ("[angle, length]", ""),
+        ("length[1] - length[0]", "mm"),
+        ("12.5 * (volts - 0.2)", ""),
+        ("sin(deg2rad(angle)) * length", ""),
+        ("sin(volts)", ""),
+        ("(angle > 3) and not length < 2", ""),
+    ],
+)
+def test_sums_keep_the_unit_of_their_terms(text, unit):
+    known = {"angle": "deg", "turned": "rad", "length": "mm"}
+    assert units_of(text, lambda name: known.get(name, ""), ("offset", "M")) == unit
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("2 * (angle + turned)", "adds deg and rad in 'angle + turned'; convert one of them first"),
+        ("angle > length", "compares deg and mm"),
+        ("length * sin(angle)", "takes sin of deg in 'angle'; write deg2rad(…) about it"),
+        ("deg2rad(turned)", "takes deg2rad of rad in 'turned'; convert it first"),
+    ],
+)
+def test_units_that_do_not_fit_are_refused(text, says):
+    known = {"angle": "deg", "turned": "rad", "length": "mm"}
+    with pytest.raises(ExpressionError, match=re.escape(says)):
+        units_of(text, lambda name: known.get(name, ""), ())

@@ -149,3 +149,10 @@ def test_sound_positions_do_not_jump(x):
 def test_sound_angles_do_not_jump(x):
     assert not jumps_of(x, 0.008 * SWING)
     assert not jumps_of(x[::25], 0.008 * SWING[::25])
+
+
+def test_encoders_that_jump_together_do_not_wrap():
+    """A block of samples that is logged twice, from one end of the motion to the other."""
+    twice = np.r_[0:2356, 1571:2215]
+    (said,) = jumps_of(SWING[twice], (0.008 * SWING + 0.003)[twice])
+    assert "samples or counts are lost there" in said

@@ -223,3 +223,27 @@ def test_coarse_stamps_are_replaced_by_a_rate(tmp_path, shared):
     assert 'rate_hz = 500   # several samples share each stamp of "t"' in said
     assert "time =" not in said
     assert "sort" not in said
+
+
+@pytest.mark.parametrize(("motor", "joint"), [("motor_pos [deg]", "joint_pos [deg]"), ("driveAngle", "linkAngle")])
+def test_a_motors_angle_is_no_joints(tmp_path, motor, joint):
+    path, angle = tmp_path / "log.csv", 0.6 + 0.5 * np.sin(TIME / 1e3)
+    table = np.column_stack([TIME, 100.0 * angle, angle, 0.01 * angle])
+    np.savetxt(path, table, "%.6f", ",", header=f"t,{motor},{joint},torque", comments="")
+    said = proposal([load_recording(path)], make_finger())
+    assert f'channels.q.MCP = {{ from = "{joint}"' in said
+    assert "channels.q.PIP" not in said
+    assert f'# in no channel yet: "{motor}"' in said
+
+
+@pytest.mark.parametrize(
+    ("columns", "first", "second"), [("q2,q1", "q1", "q2"), ("enc_1_deg,enc_0_deg", "enc_0_deg", "enc_1_deg")]
+)
+def test_joints_that_are_named_by_number_are_taken_in_its_order(tmp_path, columns, first, second):
+    path = tmp_path / "log.csv"
+    table = np.column_stack([TIME, 20.0 + 0.0 * TIME, 40.0 + 30.0 * np.sin(TIME / 1e3)])
+    np.savetxt(path, table, "%.6f", ",", header=f"t,{columns}", comments="")
+    said = proposal([load_recording(path)], make_finger())
+    assert f'channels.q.MCP = {{ from = "{first}"' in said
+    assert f'channels.q.PIP = {{ from = "{second}"' in said
+    assert 'joint = "MCP"' in said
