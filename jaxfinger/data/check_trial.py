@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaxfinger.data.check_jumps import check_jumps, placeholder
+from jaxfinger.data.constant import constant_columns
 from jaxfinger.data.findings import Report
 from jaxfinger.data.motion import MIN_HOLD, pulled_slowly
 from jaxfinger.data.schema import CHANNELS, DRIVES, MEASURED, MEASURES, NEEDS_JOINT, NEEDS_TENDON
@@ -26,7 +27,6 @@ COLD = 200.0  # K, −73 °C: no laboratory is colder, so lower values are in °
 # A converter's limit is repeated over more samples at once, by this factor, than any value within its range. At the
 # turn of a smooth motion the last step of the resolution is held up to five times as long as the one before it.
 _CLIPPED, _MIN_CLIPPED = 10, 10
-_TAUT = ("ID.2", "VD.1", "VD.3")  # experiments that keep all tendons taut
 _SEVERAL_PULL = ("VD.2", "VD.3")  # experiments with the tension of several tendons at once
 _SLACK = ("ID.3-static", "ID.3-dynamic")  # experiments with slack tendons, whose tensions are not used
 _MIN_SAMPLES = 20  # Fewer samples show no typical step.
@@ -248,28 +248,10 @@ def _motion(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repor
 
 
 def _constant_columns(trial: Trial, finger: FingerDescription, report: Report) -> None:
-    """Report measured columns that never change: every sensor has noise, so such a column is not connected."""
-    if len(trial.time) < _MIN_SAMPLES:
-        return
-    moved = _index(finger.joint_names, trial.joint)
-    crossing = finger.active & (finger.crosses[:, moved] if moved is not None else finger.crosses.any(axis=1))
-    looked_at = {
-        "joint_torque": np.ones(finger.m, bool) if moved is None else np.arange(finger.m) == moved,
-        "tendon_excursion": crossing if trial.experiment != "ID.4" else np.zeros(finger.n, bool),
-        "fingertip_force": np.ones(3, bool),
-        "tendon_force": finger.active if trial.experiment in _TAUT else np.zeros(finger.n, bool),
-    }
-    for name, columns in looked_at.items():
-        values = getattr(trial, name)
-        if values is None:
-            continue
-        still = columns & np.array([np.ptp(column) == 0.0 for column in values.T], bool)  # False for NaN.
-        if name == "tendon_force":
-            still &= values[0] == 0.0
-        if name == "fingertip_force" and not still[columns].all():
-            continue  # A planar finger presses along one axis only.
+    """Report measured columns that never change: such a column is not connected."""
+    for name, still in constant_columns(trial, finger).items():
         for k in np.flatnonzero(still):
-            value = values[0, k] + 0.0  # −0 becomes 0.
+            value = getattr(trial, name)[0, k] + 0.0  # −0 becomes 0.
             report.warning(
                 _place(trial, name),
                 f"column {CHANNELS[name].columns(finger)[k]} is {value:.4g} at every sample, as no sensor is; check "

@@ -115,6 +115,16 @@ def data_hash(path: str | os.PathLike) -> str:
         raise UserError(f"{path}: cannot be read ({error.strerror}); check the name") from None
 
 
+def trial_hash(trial: Trial) -> str:
+    """SHA-256 of a trial's samples and attributes, in hexadecimal; its name does not count."""
+    digest = hashlib.sha256()
+    for key, value in sorted(vars(trial).items()):
+        if key != "name":
+            content = np.ascontiguousarray(value).tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
+            digest.update(f"{key} {np.shape(value)} ".encode() + content)
+    return digest.hexdigest()
+
+
 def write_header(file: h5py.File, session: Session) -> None:
     """Write the root attributes and `/finger`."""
     file.attrs["format"] = FORMAT

@@ -2,7 +2,7 @@
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxfinger.data import Predictions, Session, Trial
+from jaxfinger.data import Predictions, Session, Trial, quantisation
 from jaxfinger.data.sizes import Sizes, sizes_of
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import driven, held, path, stepped
@@ -43,6 +43,9 @@ class Stack:
     holds: Int[np.ndarray, "B T"]  # index of the static hold, −1 between holds
     dt: float  # s, between samples
     measured: dict[str, bool]  # by channel: whether any trial measured it
+    # By channel, of each column: standard deviation of its converter's error, in its unit, and how long that lasts,
+    # s (`quantisation`).
+    coarseness: dict[str, Float[np.ndarray, "2 _columns"]] = field(default_factory=dict)
 
     def samples_of_holds(self, trial: int, counts: np.ndarray) -> list[np.ndarray]:
         """Indices of the valid samples of each hold of a trial; `counts` (T,) is nonzero where a sample is valid."""
@@ -80,9 +83,10 @@ def prepare(
         chosen = [t for t in session if t.experiment == experiment.name and (names is None or t.name in names)]
         trials = [t for t in chosen if len(t.time) > 1]
 
-        def row(trial: Trial, experiment: Experiment = experiment) -> tuple[Row, dict[str, bool]]:
+        def row(trial: Trial, experiment: Experiment = experiment) -> tuple[Row, dict[str, bool], dict]:
             r = prepared(experiment, trial, session, sizes, reduced, minus, coarse)
-            return KINDS[experiment.kind].reduce(r), {c: bool(s.any()) for c, s in r.sound.items()}
+            coarseness = {c: _coarseness(trial, c) for c in experiment.channels if reduced}
+            return KINDS[experiment.kind].reduce(r), {c: bool(s.any()) for c, s in r.sound.items()}, coarseness
 
         long = any(len(t.time) > MIN_THREADED_SAMPLES for t in trials)
         with ThreadPoolExecutor(os.cpu_count() if long else 1) as pool:
@@ -103,10 +107,17 @@ def not_judged(stacks: dict[str, Stack]) -> list[NotJudged]:
     return out
 
 
+def _coarseness(trial: Trial, channel: str) -> Float[np.ndarray, "2 _columns"]:
+    """Standard deviation of the converter's error in each column of a channel, and its duration in s."""
+    values, step = getattr(trial, channel), float(np.median(np.diff(trial.time)))
+    error, samples = np.zeros((2, 1)) if values is None else np.reshape([quantisation(x) for x in values.T], (-1, 2)).T
+    return np.stack([error, samples * step])
+
+
 def _stack(
-    experiment: Experiment, trials: list[Trial], reduced_trials: list[tuple[Row, dict[str, bool]]], reduced
+    experiment: Experiment, trials: list[Trial], reduced_trials: list[tuple[Row, dict[str, bool], dict]], reduced
 ) -> Stack:
-    rows = [row for row, _ in reduced_trials]
+    rows = [row for row, _, _ in reduced_trials]
     steps = {round(r.dt, 6) for r in rows}
     # One noise model serves all trials of a stack, so that their sampling times must be alike.
     if reduced and max(steps) > 1.5 * min(steps):
@@ -136,5 +147,9 @@ def _stack(
         tuple(t.motion for t in trials),
         np.stack([np.pad(r.hold, (0, T - r.hold.size), constant_values=-1) for r in rows]),
         float(np.median([r.dt for r in rows])),
-        {c: any(measured[c] for _, measured in reduced_trials) for c in experiment.channels},
+        {c: any(measured[c] for _, measured, _ in reduced_trials) for c in experiment.channels},
+        {
+            c: np.sqrt(np.mean([np.broadcast_to(k[c], (2, len(y[c]))) ** 2 for _, _, k in reduced_trials], axis=0))
+            for c in (experiment.channels if reduced else ())
+        },
     )

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import Batch, prepare
+from jaxfinger.experiments import Batch
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.gauss_newton import TANGENTS_AT_ONCE, VisibleGaussNewton
 from jaxfinger.identify.linearise import Filters, huber, white_rows
@@ -28,6 +28,7 @@ from jaxfinger.identify.parameters import Free, describe, ravel, with_flat
 from jaxfinger.identify.resample import Batching, Compressed, batching_here, compress, plan_of, staged_step
 from jaxfinger.identify.solve import KINK_TOLERANCE, MAX_STEPS, STEP_TOLERANCE, parameter_bounds
 from jaxfinger.identify.stages import cad_prior, nominal_model, sources_of
+from jaxfinger.identify.trial_coverage import readings_of
 from jaxfinger.model import Model
 
 SESSIONS_AT_ONCE = 10  # in one call, so that the next sessions are read and filtered while the device fits these
@@ -39,7 +40,7 @@ class Members:
     """Fits of S sessions."""
 
     values: Float[np.ndarray, "S P"]  # flat vectors; NaN where a member failed
-    std: Float[np.ndarray, "S P"]
+    std: Float[np.ndarray, "S P"]  # infinite where the template's is
     failed: Bool[np.ndarray, " S"]  # did not converge, or its trials do not determine all parameters
     steps: np.ndarray  # linearisations of each member, summed over stages
     template: Fit
@@ -115,6 +116,7 @@ def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: 
     columns = zip(*(s.result() for s in shares), strict=True)
     values, std, sound, steps = (np.concatenate(a)[: len(sessions)] for a in columns)
     values[~sound], std[~sound] = np.nan, np.nan
+    std[np.ix_(sound, ~np.isfinite(template.std))] = np.inf
     return Members(values, std, ~sound, steps, template)
 
 
@@ -133,7 +135,7 @@ def _stack_sessions(
 ) -> tuple[tuple[_Source, ...], tuple[_Stage, ...]]:
     plan, parameters = plan_of(sessions[0], template), describe(template.model)
     reads = {e: c for r, _ in plan for e, c in r.items()}
-    prepared = [prepare(s, [t.name for t in s if t.experiment in reads]) for s in sessions]
+    prepared = [readings_of(s, [t.name for t in s if t.experiment in reads]) for s in sessions]
     reads = {e: c for e, c in reads.items() if e in compressed.positions}
     for s, stacks in zip(sessions, prepared, strict=True):
         for e in reads:

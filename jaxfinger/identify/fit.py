@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxfinger.data import Session, data_hash
+from jaxfinger.data import Session, data_hash, trial_hash
 from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.identify.recipe import Recipe
@@ -43,14 +43,17 @@ class Fit:
     """
 
     model: Model
-    covariance: np.ndarray  # (P, P); zero for parameters that are given, infinite on the diagonal for undetermined ones
+    # (P, P); zero for parameters that are given. The diagonal is infinite for those that are undetermined, or that the
+    # recipe has and no stage has estimated.
+    covariance: np.ndarray
     estimated: np.ndarray  # positions of the estimated parameters in the flat vector
     recipe: Recipe
     noise: dict[tuple[str, str], Noise] = field(default_factory=dict)  # by experiment and channel
     stages: tuple[StageReport, ...] = ()
     specimen: str = ""
     data: str = ""  # name of the file that it was made from; of several, with commas between them
-    data_hash: str = ""  # of that file's content; of several, with spaces between them; empty for a session in memory
+    # Of that file's content, of each trial of a session in memory; of several, with spaces between them.
+    data_hash: str = ""
     created: str = ""
     versions: dict[str, str] = field(default_factory=dict)
 
@@ -71,17 +74,19 @@ class Fit:
         )
 
     def was_made_from(self, session: Session) -> bool:
-        """Whether the session is among those that the fit was made from; all sessions in memory count as one."""
-        return _hash(session) in self.data_hash.split(" ")
+        """Whether the fit was made from the session's file, or from a trial of a session in memory."""
+        return not {*_hash(session).split()}.isdisjoint(self.data_hash.split())
 
     def made_from(self, session: Session, alone: bool = False) -> "Fit":
         """Copy of the fit that names the session among those that it was made from, or `alone`."""
         name, digest = Path(session.file).name, _hash(session)
         if alone:
             return replace(self, data=name, data_hash=digest)
-        if self.was_made_from(session):
+        new = [x for x in digest.split() if x not in self.data_hash.split()]
+        if not new:
             return self
-        return replace(self, data=", ".join(filter(None, (self.data, name))), data_hash=f"{self.data_hash} {digest}")
+        data = ", ".join(filter(None, (self.data, name)))
+        return replace(self, data=data, data_hash=" ".join(filter(None, (self.data_hash, *new))))
 
     @property
     def std(self) -> np.ndarray:
@@ -146,5 +151,5 @@ class Fit:
 
 
 def _hash(session: Session) -> str:
-    """Hash of the content of the session's file; empty for a session in memory."""
-    return data_hash(session.file) if session.file else ""
+    """Hash of the content of the session's file; of a session in memory, those of its trials with spaces between."""
+    return data_hash(session.file) if session.file else " ".join(trial_hash(t) for t in session)

@@ -70,7 +70,9 @@ def directions(
     for value, v in zip(values / max(values[-1], 1e-300), vectors.T, strict=True):
         shares = _shares(parameters, free, v)
         out.append(
-            Direction(float(value), shares, _remedy(parameters, free, v) if value < MIN_SEEN_SINGULAR_VALUE else "")
+            Direction(
+                float(value), shares, _remedy(parameters, _involved(free, v)) if value < MIN_SEEN_SINGULAR_VALUE else ""
+            )
         )
     return out
 
@@ -78,13 +80,22 @@ def directions(
 def name_invisible(
     parameters: list[Parameter], free: Int[np.ndarray, " p"], invisible: Float[np.ndarray, "k p"]
 ) -> list[str]:
-    """One sentence for each undetermined combination: its parameters and their shares, largest first, and a remedy."""
+    """Sentences on what is undetermined, each with a remedy; the rows of `invisible` are orthonormal.
+
+    Of the space that these rows span any other basis is as good. So parameters that lie in it by themselves are named
+    together, and a combination is one of several parameters that trade off.
+    """
+    alone = np.sum(invisible**2, axis=0) > 1.0 - MIN_SHOWN_ENTRY**2
+    _, kept, rest = np.linalg.svd(np.where(alone, 0.0, invisible), full_matrices=False)  # singular values of 0 or 1
     sentences = []
-    for v in invisible:
+    if alone.any():
+        names = ", ".join(parameters[i].name for i in free[alone])
+        sentences.append(f"the trials do not show {names}; record {_remedy(parameters, free[alone])}")
+    for v in rest[kept > 0.5]:
         names = " ".join(f"{c:+.2f}·[{name}]" for name, c in _shares(parameters, free, v).items())
         sentences.append(
             f"the trials cannot see the combination {names} (in units of each parameter's own column); "
-            f"record {_remedy(parameters, free, v)}"
+            f"record {_remedy(parameters, _involved(free, v))}"
         )
     return sentences
 
@@ -93,12 +104,16 @@ def _shares(parameters, free, v) -> dict[str, float]:
     return {parameters[free[k]].name: float(v[k]) for k in np.argsort(-np.abs(v)) if abs(v[k]) > MIN_SHOWN_ENTRY}
 
 
-def _remedy(parameters, free, v) -> str:
-    """Experiments that determine the parameters with the largest entries in the combination."""
-    involved = [parameters[free[k]] for k in np.argsort(-np.abs(v)) if abs(v[k]) > MIN_ENTRY_OF_REMEDY]
+def _involved(free, v) -> Int[np.ndarray, " k"]:
+    """Positions of the parameters with the largest entries in a combination, the largest first."""
+    return free[[k for k in np.argsort(-np.abs(v)) if abs(v[k]) > MIN_ENTRY_OF_REMEDY]]
+
+
+def _remedy(parameters: list[Parameter], positions: Int[np.ndarray, " k"]) -> str:
+    """Experiments that determine the parameters at these positions."""
     wanted = [
         REMEDIES[p.group].format(joint=p.joint or "by joint, two of them moved together", tendon=p.tendon)
-        for p in involved
+        for p in (parameters[i] for i in positions)
         if p.group in REMEDIES
     ]
     whole = [text for text in dict.fromkeys(wanted) if not any(other.startswith(f"{text},") for other in wanted)]

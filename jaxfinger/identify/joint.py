@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import EXPERIMENTS, not_judged, prepare
+from jaxfinger.experiments import EXPERIMENTS, not_judged
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.identifiability import name_invisible
 from jaxfinger.identify.noise import LONG_SIGNAL_WINDOW
@@ -37,7 +37,7 @@ from jaxfinger.identify.stages import (
     total_cost,
 )
 from jaxfinger.identify.start import start_values
-from jaxfinger.identify.trial_coverage import can_determine, coverage_of
+from jaxfinger.identify.trial_coverage import can_determine, coverage_of, name_constant, readings_of
 from jaxfinger.model import Model
 
 JOINT = "joint"  # name of the stage
@@ -65,7 +65,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
     model = start = model_for(fit, session)
     starts = shooting(session) if ahead else None
     progress("reading the recordings")
-    stacks = prepare(session, [t.name for t in session if t.experiment in recipe.fit.joint_experiments])
+    stacks = readings_of(session, [t.name for t in session if t.experiment in recipe.fit.joint_experiments])
     reads = {e: joint_channels(e) for e in stacks}
     if not reads:
         raise UserError(
@@ -94,6 +94,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         for x in not_judged(stacks)
         if x.channel in reads[x.experiment]
     ]
+    lost = name_constant(reads, session) + lost
     warnings = lost + name_invisible(parameters, free, solution.invisible)
     if not solution.converged or solution.invisible.size or solution.chi2_per_row(free.size) > RESTART_CHI2:
         progress("refining from a neutral start")

@@ -144,7 +144,28 @@ def estimate(
     if stack.experiment.held:
         scale = _between_holds(_repeats(stack, residual, mask & (stack.holds >= 0), demean), ar, innovation)
         std, innovation = std * scale, innovation * scale
-    return Noise(std, innovation, ar, source)
+    return _at_least(Noise(std, innovation, ar, source), stack, channel)
+
+
+def _at_least(noise: Noise, stack: Stack, channel: str) -> Noise:
+    """Noise, or the error of a coarse converter where that is larger.
+
+    Neither holds nor repeats show that error: it is the same at every sample of a hold and in every repeat. Of an error
+    that lasts for L samples, a mean over many has L times the variance that it has where L is 1, as has that of an
+    autoregression of order one with the coefficient (L − 1)/(L + 1).
+    """
+    error, duration = stack.coarseness.get(channel, np.zeros((2, len(noise.std))))
+    L = duration / stack.dt
+    error, a = error * np.sqrt(np.minimum(L, 1.0)), np.maximum(L - 1.0, 0.0) / (L + 1.0)
+    coarse = error > noise.std
+    ar = np.zeros_like(noise.ar)
+    ar[:, 0] = a
+    return Noise(
+        np.where(coarse, error, noise.std),
+        np.where(coarse, error * np.sqrt(1.0 - a**2), noise.innovation),
+        np.where(coarse[:, None], ar, noise.ar),
+        noise.source,
+    )
 
 
 # Values, which of them are valid, and the share of their covariance that removing a mean or a line takes from each lag.

@@ -14,13 +14,13 @@ from jaxtyping import Float
 
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.joint import JOINT
 from jaxfinger.identify.linearise import white_rows
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.resample import compress, plan_of
 from jaxfinger.identify.stages import sources_of
+from jaxfinger.identify.trial_coverage import readings_of
 from jaxfinger.identify.uncertainty import Samples
 
 
@@ -56,7 +56,7 @@ def sampled_posterior(
         raise UserError("a staged fit is not the optimum of one posterior; refine it first")
     compressed = compress(session, fit)
     ((reads, _),) = plan_of(session, fit)
-    stacks = prepare(session, [t.name for t in session if t.experiment in reads])
+    stacks = readings_of(session, [t.name for t in session if t.experiment in reads])
     reads = {e: c for e, c in reads.items() if e in stacks}
     basis, start, prior = jnp.asarray(compressed.basis), ravel(fit.model), compressed.grams.H[-1]
     sources = [

@@ -22,7 +22,6 @@ from jaxtyping import Array, Bool, Float
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.joint import JOINT, joint_channels
 from jaxfinger.identify.linearise import linearise, triangular
@@ -30,7 +29,7 @@ from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.shooting import AHEAD
 from jaxfinger.identify.solve import visible
 from jaxfinger.identify.stages import STAGES, cad_covariance, cad_prior, sources_of, stage_free
-from jaxfinger.identify.trial_coverage import coverage_of
+from jaxfinger.identify.trial_coverage import coverage_of, readings_of
 
 Batching = Literal["map", "vmap"]
 # Smallest pivot of a Cholesky factor of H_s[s, s], which is the identity where all weights are 1. A smaller one means
@@ -64,7 +63,7 @@ def compress(session: Session, fit: Fit) -> Compressed:
     parameters = describe(fit.model)
     plan = plan_of(session, fit)
     names = [t.name for t in session if any(t.experiment in reads for reads, _ in plan)]
-    stacks = prepare(session, names)
+    stacks = readings_of(session, names)
     plan = [({e: c for e, c in reads.items() if e in stacks}, free) for reads, free in plan]
     everything = {e: c for reads, _ in plan for e, c in reads.items()}
     sources = sources_of(stacks, everything, fit.noise, parameters)
@@ -111,12 +110,18 @@ def plan_of(session: Session, fit: Fit) -> list[tuple[dict[str, tuple[str, ...]]
     A stage is left out where later ones estimate all of its parameters again.
 
     Raises:
-        UserError: the fit was refined with `ahead`, whose simulations cannot be refitted.
+        UserError: the session lacks the trials of a stage; or the fit was refined with `ahead`, whose simulations
+            cannot be refitted; or no stage was fitted.
     """
-    parameters = describe(fit.model)
+    parameters, file = describe(fit.model), session.file or "the session"
     done = [s.name for s in fit.stages if s.status != "skipped"]
+    if not done:
+        raise UserError(f"{file}: no stage of the fit was fitted, so no parameter depends on a trial")
     if done[-1:] == [AHEAD]:
-        raise UserError(f"{session.file or 'the session'}: the fit was refined with --ahead; give one without it")
+        raise UserError(f"{file}: the fit was refined with --ahead; give one without it")
+    lacking = {name for name in done if name in STAGES} - {t.experiment for t in session}
+    if lacking and ", " not in fit.data:  # stages of a fit of several sessions may have read another one
+        raise UserError(f"{file}: has no {min(lacking)} trial, of which the fit was made; give the session of the fit")
     if JOINT in done:
         return [({e: joint_channels(e) for e in fit.recipe.fit.joint_experiments}, fit.estimated)]
     coverage = {name: coverage_of(STAGES[name].reads, session) for name in done}

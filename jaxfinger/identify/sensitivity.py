@@ -28,7 +28,7 @@ from jaxtyping import Array, Float, Int
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import Batch, Stack, prepare
+from jaxfinger.experiments import Batch, Stack
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.gauss_newton import scaled_directions
 from jaxfinger.identify.linearise import Filters, huber, white_rows
@@ -38,6 +38,7 @@ from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.resample import plan_of
 from jaxfinger.identify.solve import Source
 from jaxfinger.identify.stages import cad_covariance, cad_prior, sources_of
+from jaxfinger.identify.trial_coverage import readings_of
 from jaxfinger.model import Model
 
 TRIALS, SENSORS, CAD = "trials", "sensors", "cad"
@@ -98,7 +99,7 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
         raise UserError(f"sensitivity to {sorted(unknown)}: it takes some of {list(KINDS)}")
     model_for(fit, session)  # raises for a session of another finger
     parameters, plan = describe(fit.model), plan_of(session, fit)
-    stacks = prepare(session, [t.name for t in session if any(t.experiment in reads for reads, _ in plan)])
+    stacks = readings_of(session, [t.name for t in session if any(t.experiment in reads for reads, _ in plan)])
     plan = [({e: c for e, c in reads.items() if e in stacks}, free) for reads, free in plan]
     reads = {e: c for r, _ in plan for e, c in r.items()}
     if not reads:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from jaxfinger.data import Session
 from jaxfinger.data.sizes import sizes_of
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import Experiment, Stack, not_judged, prepare
+from jaxfinger.experiments import Experiment, Stack, not_judged
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible
 from jaxfinger.identify.noise import MIN_STD, SIGNAL_WINDOW, Noise, estimate
@@ -38,7 +38,15 @@ from jaxfinger.identify.solve import (
     solve,
 )
 from jaxfinger.identify.start import start_values
-from jaxfinger.identify.trial_coverage import Coverage, can_determine, coverage_of, name_missing, name_unseen
+from jaxfinger.identify.trial_coverage import (
+    Coverage,
+    can_determine,
+    coverage_of,
+    name_constant,
+    name_missing,
+    name_unseen,
+    readings_of,
+)
 from jaxfinger.model import Finger, Model
 
 Progress = Callable[[str], None]
@@ -135,8 +143,28 @@ def free_groups(recipe: Recipe) -> set[str]:
     return {"moment_arm"} | {GROUP_OF_TERM[t] for t in recipe.model.terms if t in GROUP_OF_TERM}
 
 
+def covariance_before(session: Session, recipe: Recipe, parameters: list[Parameter]) -> np.ndarray:
+    """Covariance of the flat vector before any fit: `cad_covariance`, infinite for what nothing tells yet.
+
+    That is a parameter of the recipe's terms, or of a moment arm, of which the description gives no value. It stands at
+    zero until a stage estimates it; what rests on it before is undetermined.
+    """
+    finger, groups, covariance = session.finger, free_groups(recipe), cad_covariance(session, parameters)
+    arms = () if finger.excursion is None else finger.excursion
+    known = {name for name, arm in zip(finger.tendon_names, arms, strict=False) if np.isfinite(arm).all()}
+
+    def given(p: Parameter) -> bool:
+        if p.group == "moment_arm":
+            return p.tendon in known
+        return p.group == "rotor_inertia" and finger.rotor_inertia is not None
+
+    unknown = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and not given(p)]
+    covariance[unknown, unknown] = np.inf
+    return covariance
+
+
 def cad_covariance(session: Session, parameters: list[Parameter]) -> np.ndarray:
-    """Covariance of the flat vector before any fit.
+    """Covariance of what the finger's description gives.
 
     It is diagonal: the description's standard deviations of masses, centres of mass, rotors and excursions, else zero.
     """
@@ -194,7 +222,7 @@ def identify(
     wanted = stages or recipe.fit.stages
     if start is None:
         fit = Fit.before(session, recipe, nominal_model(session, recipe))
-        fit = replace(fit, covariance=cad_covariance(session, describe(fit.model)))
+        fit = replace(fit, covariance=covariance_before(session, recipe, describe(fit.model)))
     else:
         fit = replace(start, model=model_for(start, session), noise=_noise_here(start, session, wanted))
         fit = fit.made_from(session)
@@ -202,7 +230,7 @@ def identify(
         experiments = dict.fromkeys(e for s in wanted for e in STAGES[s].reads) if stacks is None else ()
         named = {e: [t.name for t in session if t.experiment == e] for e in experiments}
         sizes = sizes_of(session) if named else None
-        pending = {e: pool.submit(prepare, session, names, sizes=sizes) for e, names in named.items()}
+        pending = {e: pool.submit(readings_of, session, names, sizes) for e, names in named.items()}
         ready, tangents = dict(stacks or {}), Tangents()
         for name in wanted:
             progress(f"fitting {name}")
@@ -232,9 +260,10 @@ def run_stage(
     if stage.name not in stacks:
         return skipped(f"the session has no {stage.name} trial")
     reads = {e: c for e, c in stage.reads.items() if e in stacks}
+    constant = name_constant(reads, session)
     lost = [x for x in not_judged({stage.name: stacks[stage.name]}) if x.channel in stage.reads[stage.name]]
     if lost:
-        return skipped(f"no sample of {lost[0].channel} counts: {lost[0].reason}")
+        return skipped("; ".join([f"no sample of {lost[0].channel} counts: {lost[0].reason}", *constant]))
     parameters = describe(fit.model)
     groups = set(stage.frees) & free_groups(recipe)
     coverage = coverage_of(reads, session)
@@ -252,7 +281,7 @@ def run_stage(
     determined = fitted[np.isfinite(np.diag(covariance)[fitted])]
     read = np.unique(np.concatenate([s.positions for s in sources.values()]))
     needed = read[[parameters[i].group in free_groups(recipe) for i in read]]
-    warnings = name_missing(parameters, np.asarray(ravel(model)), determined, needed, coverage)
+    warnings = constant + name_missing(parameters, np.asarray(ravel(model)), determined, needed, coverage)
     warnings += name_invisible(parameters, free, solution.invisible)
     warnings += name_unseen(parameters, groups, free, coverage)
     warnings += implausible(model, covariance, free, parameter_bounds(fit.model, free)[0])

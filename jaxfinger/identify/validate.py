@@ -26,6 +26,7 @@ from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.linearise import residuals_of
 from jaxfinger.identify.noise import estimate
 from jaxfinger.identify.predictions import model_for, simulate_trials
+from jaxfinger.identify.trial_coverage import name_constant, readings_of
 from jaxfinger.model import Model
 from jaxfinger.table import Table
 
@@ -114,7 +115,7 @@ def validate(
     """
     model = model_for(fit, session)
     wanted = experiments or fit.recipe.validation.experiments
-    stacks = prepare(session, [t.name for t in session if t.experiment in wanted])
+    stacks = readings_of(session, [t.name for t in session if t.experiment in wanted])
     if not stacks:
         has = ", ".join(dict.fromkeys(t.experiment for t in session)) or "no trials"
         raise UserError(
@@ -138,6 +139,7 @@ def validate(
             simulated, diverging = _simulation_scores(model, session, list(stack.trials))
             scores, messages = scores + simulated, messages + diverging
     messages += [f"the session has no {e} trial" for e in wanted if e not in stacks]
+    messages += name_constant({e: stack.experiment.channels for e, stack in stacks.items()}, session)
     messages += [f"{experiment}: no {c} sample is judged: {why}" for experiment, c, why in not_judged(stacks)]
     return Validation(session.specimen, session.file, tuple(scores), tuple(slopes), tuple(messages))
 

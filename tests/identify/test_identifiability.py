@@ -30,6 +30,19 @@ def test_a_combination_that_is_not_seen_is_named():
     assert "ID.3-static of joint MCP" in sentence
 
 
+def test_parameters_that_no_trial_touches_are_named_together_and_not_as_combinations():
+    """Two of them span a plane, of which a solver may give any basis."""
+    turned = np.array([[0.6, 0.8, 0.0], [0.8, -0.6, 0.0]])
+    (sentence,) = name_invisible(PARAMETERS, np.arange(3), turned)
+    assert sentence.startswith("the trials do not show elastic torque MCP^0, elastic torque MCP^1; record ID.3-static")
+    mixed = np.array([[0.0, 1.0, 0.0], [np.sqrt(0.5), 0.0, -np.sqrt(0.5)]])
+    mixed = np.array([[0.6, 0.8], [0.8, -0.6]]) @ mixed
+    alone, traded = name_invisible(PARAMETERS, np.arange(3), mixed)
+    assert alone.startswith("the trials do not show elastic torque MCP^1;")
+    assert "elastic torque MCP^1" not in traded
+    assert "centre of mass MCP x" in traded
+
+
 def test_a_parameter_that_no_trial_touches_is_invisible():
     J = np.column_stack([np.ones(5), np.zeros(5), np.arange(5.0)])
     assert directions(PARAMETERS, np.arange(3), J.T @ J)[0].shares.keys() == {"elastic torque MCP^1"}
