@@ -5,7 +5,8 @@ compiled function for each class of effects and kind of prediction therefore ser
 channels that the effect changes are evaluated.
 """
 
-from collections.abc import Iterator, Mapping
+import inspect
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -16,6 +17,7 @@ from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.effects import CATALOGUE, CatalogueEffect, Changed, Scales, Site, changes, nominal_terms
+from jaxfinger.errors import UserError
 from jaxfinger.experiments import TRIALS, affected_channels, change, refuse_broken
 from jaxfinger.gap.problem import Problem, Rows
 from jaxfinger.identify import Fit, Recipe
@@ -128,6 +130,7 @@ class Signatures:
                 number = self.problem.stacks[e].experiment.channels.index(channel)
                 of_channel = np.flatnonzero(rows.channel == number)
                 white = whitened(raw, self.problem, rows, of_channel, channel)
+                _refuse_no_numbers(members[k : k + CHUNK], white, e, channel)
                 out[k : k + CHUNK, rows.start + of_channel] = white
         return out
 
@@ -173,6 +176,19 @@ class Signatures:
         found = self.white_changes(members).reshape(len(items), len(names), -1)
         found /= np.array([v.size for v in items])[:, None, None]
         return found
+
+
+def _refuse_no_numbers(
+    members: Sequence[CatalogueEffect], white: Float[np.ndarray, "members rows"], experiment: str, channel: str
+) -> None:
+    """Refuse a user's effect whose prediction is NaN or infinite in a row that counts: no evidence could be weighed."""
+    for effect, row in zip(members, white, strict=True):
+        if not type(effect).__module__.startswith("jaxfinger.") and not np.isfinite(row).all():
+            values = ", ".join(f"{n} = {v:.3g}" for n, v in effect.values().items())
+            raise UserError(
+                f"{inspect.getfile(type(effect))}: {effect.ID} at {'-'.join(effect.site)} predicts NaN or infinity in "
+                f"{channel} of {experiment} with {values}; keep every hook finite at each angle, speed and tension"
+            )
 
 
 def whitened(
