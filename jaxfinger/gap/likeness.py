@@ -139,7 +139,6 @@ def check_likeness(session: Session, predictions: Predictions, report: Report) -
 
     `predictions` fit the session's trials (`refuse_misfits`).
     """
-    _report_free_torque(session, predictions, report)
     compared = list(_comparisons(session, predictions))
     for channel in dict.fromkeys(c.channel for c in compared):
         mine = [c for c in compared if c.channel == channel]
@@ -153,6 +152,7 @@ def check_likeness(session: Session, predictions: Predictions, report: Report) -
                 say(f"/trials/{trial}/{channel}", said if mistake.certain else f"{said}, or go on if it is meant so")
             mine = [_unexplained(c, mistake) for c in mine]
         _report_unlike(mine, least, names, report)
+    _report_free_torque(session, predictions, report)
 
 
 def _comparisons(session: Session, predictions: Predictions) -> Iterator[Comparison]:
@@ -260,7 +260,7 @@ def _factors(si: str) -> dict[float, str]:
     """Factors that bring wrong signs and units to those of the session, with the name of the wrong unit."""
     units = {u.factor: name for name, u in reversed(TO_SI.items()) if u.si == si and u.factor != 1.0}
     units |= {TO_SI["deg"].factor: "deg"}
-    units |= {1.0 / f: name for f, name in units.items()}
+    units = {1.0 / f: name for f, name in units.items()} | units
     return {sign * f: name for sign in (1.0, -1.0) for f, name in ({1.0: si} | units).items() if sign * f != 1.0}
 
 

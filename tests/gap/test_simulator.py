@@ -108,5 +108,7 @@ def test_a_simulator_that_repeats_the_measurements_is_refused(session):
     trial = next(t for t in session if t.experiment == "ID.3-dynamic")
     copied = np.float32(trial.joint_torque).astype(float)
     told[trial.name] = {**told[trial.name], "joint_torque": copied}
-    with pytest.raises(UserError, match=rf"{trial.name}/joint_torque: repeat the measurements, noise and all"):
+    with pytest.raises(
+        UserError, match=rf"{trial.name}/joint_torque: predictions of MCP repeat the measurements, noise and all"
+    ):
         emulate(session, Recipe(), stacks, told)
