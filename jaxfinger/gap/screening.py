@@ -115,7 +115,7 @@ def read_parts(
     """Read the signatures of all variants at the problem's nominal model; classes are compiled side by side.
 
     Raises:
-        UserError: an effect of the user's predicts no numbers, acts at zero amplitude, or alike at two of its sites.
+        UserError: an effect of the user's predicts no numbers, acts at zero amplitude, or alike at two joints.
     """
     signatures, groups = Signatures(problem), {}
     for kind in dict.fromkeys(v.effect for v in items if own(v.effect)):

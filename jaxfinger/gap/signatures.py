@@ -184,7 +184,7 @@ class Signatures:
         """Check a user's effect at every site, in one shape and size.
 
         Raises:
-            UserError: it changes a prediction at zero amplitude, or acts alike at two of its sites.
+            UserError: it changes a prediction at zero amplitude, or acts alike at two joints.
         """
         finger, file = self.problem.nominal.finger, inspect.getfile(kind)
         seen: dict[bytes, Site] = {}
@@ -199,11 +199,11 @@ class Signatures:
                     "zero amplitude; let its amplitudes multiply all that it does"
                 )
             other = seen.setdefault(there.tobytes(), site)
-            # Pairs with a joint or tendon in common may differ in what these trials do not move.
-            if not set(other) & set(site) and there.any():
+            # Two tendons over one joint may well do the same in these trials.
+            if kind.PLACE == "joint" and other != site and there.any():
                 raise UserError(
                     f"{file}: {kind.ID} does the same at {'-'.join(other)} and at {'-'.join(site)}; "
-                    "let it act at `self.index` alone, or give it a single place"
+                    "let it act at `self.index` alone, or give it a single PLACE"
                 )
 
     def _where(self, row: int) -> str:
