@@ -38,6 +38,8 @@ MAX_MENDED = 0.1
 # E that a mend leaves where one column shows it. A spring that turns the weight's torque round makes a simulator
 # without it look wrong in sign, but within a tenth only by a rare chance, which two columns do not share.
 MAX_MENDED_ALONE = 0.01
+# Relative to the factor of a unit: predictions that are off by more may be in the unit, or have a gear in between.
+MAX_UNIT_ERROR = 0.1
 # Factor from which predictions are not too large by a wrong parameter.
 MIN_CERTAIN_FACTOR = 30.0
 # Share of the motion that the best factor explains. Friction that is left out can leave four tenths, unrelated motion
@@ -227,7 +229,7 @@ def _largest_mistake(session: Session, predictions: Predictions, compared: list[
 
 def _turned_or_scaled(session: Session, predictions: Predictions, compared: list[Comparison]) -> Iterator[Mistake]:
     """Columns that fit with another sign, in another unit, or with both."""
-    found: dict[tuple[str, float], list[tuple[str, int, float]]] = defaultdict(list)
+    found: dict[tuple[str, float], list[tuple[str, int, float, float]]] = defaultdict(list)
     for c in compared:
         for j in np.flatnonzero(c.unlike):
             slides = c.channel == "joint_torque" and session.finger.prismatic[j]
@@ -235,10 +237,10 @@ def _turned_or_scaled(session: Session, predictions: Predictions, compared: list
             left = {factor: float(c.missed(factor)[j, j]) for factor in _factors(si)}
             factor = min(left, key=left.__getitem__)
             if left[factor] <= MAX_MENDED:
-                found[si, factor].append((c.trials[0], int(j), left[factor]))
+                found[si, factor].append((c.trials[0], int(j), float(c.told[j, j] / abs(c.cross[j, j])), left[factor]))
     as_they_are = {(session.trials[c.trials[0]].experiment, j) for c in compared for j in _fitting(c)}
     for (si, factor), places in found.items():
-        left, columns = max(left for *_, left in places), {j for _, j, _ in places}
+        left, columns = max(left for *_, left in places), {j for _, j, *_ in places}
         alone = len(columns) == 1 and left > MAX_MENDED_ALONE
         # Where most of the torque is left out, the rest may be like it and small. In one column that is no rare chance.
         if alone and abs(factor) > 1.0:
@@ -246,9 +248,11 @@ def _turned_or_scaled(session: Session, predictions: Predictions, compared: list
         surely = len(columns) > 1 and left <= MAX_MENDED_ALONE
         can_be_meant = factor > 1.0 / MIN_CERTAIN_FACTOR and not (factor > MIN_CERTAIN_FACTOR and surely)
         # A moment arm of the wrong sign turns the torque in the trials of one tendon.
-        somewhere_right = any((session.trials[t].experiment, j) in as_they_are for t, j, _ in places)
-        says = _turned_or_scaled_by(factor, si)
-        yield Mistake(tuple(p[:2] for p in places), left, says, can_be_meant or somewhere_right)
+        somewhere_right = any((session.trials[t].experiment, j) in as_they_are for t, j, *_ in places)
+        can_be_meant |= somewhere_right
+        times = float(np.median([times for *_, times, _ in places]))
+        says = _turned_or_scaled_by(factor, si, times)
+        yield Mistake(tuple(p[:2] for p in places), left, says, can_be_meant)
 
 
 def _fitting(c: Comparison) -> list[int]:
@@ -264,18 +268,24 @@ def _factors(si: str) -> dict[float, str]:
     return {sign * f: name for sign in (1.0, -1.0) for f, name in ({1.0: si} | units).items() if sign * f != 1.0}
 
 
-def _turned_or_scaled_by(factor: float, si: str) -> str:
-    unit, size = _factors(si)[factor], abs(factor)
-    wrong, mends = [], []
+def _turned_or_scaled_by(factor: float, si: str, times: float) -> str:
+    """What is wrong and how to mend it, where predictions are `times` as large as measured."""
+    unit, wrong, mends = _factors(si)[factor], [], []
+    if unit_is_sure := abs(times * abs(factor) - 1.0) < MAX_UNIT_ERROR:
+        times = 1.0 / abs(factor)
     if factor < 0.0:
         wrong.append("have the opposite sign of the measurements")
         mends.append("turn the sign, which is to be that of the session")
-    if size != 1.0:
-        times = max(size, 1.0 / size)
-        told = f"{times:.0f}" if times >= MIN_CERTAIN_FACTOR else f"{times:.2g}"
-        wrong.append(f"are about {told} times as {'large' if size < 1.0 else 'small'} as measured")
-        mends.append("give the simulator angles in rad, not degrees" if unit == "deg" else f"give {si}, not {unit}")
+    if abs(factor) != 1.0:
+        size = f"{_number(times)} times as large" if times > 1.0 else f"{_number(1.0 / times)} times as small"
+        wrong.append(f"are about {size} as measured")
+        mend = "give the simulator angles in rad, not degrees" if unit == "deg" else f"give {si}, not {unit}"
+        mends.append(mend if unit_is_sure else "look at units and gear ratios")
     return f"{' and '.join(wrong)}; {', and '.join(mends)}"
+
+
+def _number(x: float) -> str:
+    return f"{x:.0f}" if x >= 10.0 else f"{x:.2g}"
 
 
 def _exchanged_columns(session: Session, predictions: Predictions, compared: list[Comparison]) -> Iterator[Mistake]:
@@ -320,8 +330,9 @@ def _exchanged_trials(session: Session, predictions: Predictions, compared: list
         like = {name: x for name, x in like.items() if x[0] in like and name in sources}
     if like:
         places = tuple((name, int(j)) for name in like for j in np.flatnonzero(bad[name].unlike))
+        mend = "exchange the trials, or what the simulator reads of them"
         pairs = listed([f"those of {other} fit {name}" for name, (other, _) in like.items()])
-        yield Mistake(places, max(left for _, left in like.values()), f"look exchanged: {pairs}; exchange the trials")
+        yield Mistake(places, max(left for _, left in like.values()), f"look exchanged: {pairs}; {mend}", True)
 
 
 def _shifted(session: Session, predictions: Predictions, compared: list[Comparison]) -> Iterator[Mistake]:
@@ -373,7 +384,9 @@ def _report_unlike(compared: list[Comparison], least: float, names: tuple[str, .
     related = np.maximum(np.diag(together.cross), 0.0) ** 2 >= MIN_RELATED * moved * told
     unlike = np.where(related, missed > MAX_MISSED, missed > 1.0) & np.isfinite(missed) & (together.size >= least)
     for j in np.flatnonzero(unlike):
-        said = f"predictions of {names[j]} miss the measured motion by {math.sqrt(missed[j]):.2g} times its own size"
+        said = (
+            f"predictions of {names[j]} miss the measured motion by {_number(math.sqrt(missed[j]))} times its own size"
+        )
         mend = "look at units, signs, columns and times, or go on if it is meant so"
         for c in compared:
             if 1.0 < c.missed()[j, j] < np.inf:

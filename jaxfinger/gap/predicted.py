@@ -1,9 +1,9 @@
 """What another simulator predicts of a session: which trials and columns, in which steps, and whether it can be so."""
 
 from collections import Counter
-from collections.abc import Collection
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxfinger.data import Predictions, Session, Trial
 from jaxfinger.data.findings import Report, merged
@@ -13,6 +13,12 @@ from jaxfinger.data.sizes import sizes_of
 from jaxfinger.errors import UserError, counted, listed
 from jaxfinger.experiments import EXPERIMENTS
 from jaxfinger.gap.likeness import check_likeness
+
+# Share of a column's range: changes below it are rounding of a computation.
+MAX_ROUNDING = 1e-9
+# Values that a rounded column has at least: few values are multiples of some step by chance.
+MIN_VALUES = 6
+MAX_ODD = 0.01  # of a step, by which rounded values are off: written digits are exact but for rounding
 
 
 def check_predictions(session: Session, predictions: Predictions) -> Report:
@@ -27,6 +33,7 @@ def check_predictions(session: Session, predictions: Predictions) -> Report:
     _report_coverage(session, predictions, report)
     _report_unmeasured(session, predictions, report)
     _report_steps(session, predictions, report)
+    _report_digits(session, predictions, report)
     check_likeness(session, predictions, report)
     return Report(merged(report))
 
@@ -43,14 +50,15 @@ def refuse_mistaken(session: Session, predictions: Predictions, file: str) -> Re
     return report
 
 
-def _judged(trial: Trial, channels: Collection[str]) -> list[str]:
-    """Channels among the predicted ones that a diagnosis of the trial reads."""
-    return [c for c in EXPERIMENTS[trial.experiment].channels if c in channels]
+def _judged(trial: Trial, predictions: Predictions) -> list[str]:
+    """Channels of a trial that are predicted, at least in one column, and read by a diagnosis."""
+    told = predictions.get(trial.name, {})
+    return [c for c in EXPERIMENTS[trial.experiment].channels if c in told and np.isfinite(told[c]).any()]
 
 
 def _report_coverage(session: Session, predictions: Predictions, report: Report) -> None:
     """Say which trials count where not all do, and name predicted trials that the session lacks."""
-    counts = {t.name for t in session if _judged(t, predictions.get(t.name, {}).keys())}
+    counts = {t.name for t in session if _judged(t, predictions)}
     if not counts:
         named = next((t for t in session if t.name in predictions), None)
         mend = "predict its trials under their own names"
@@ -71,7 +79,7 @@ def _report_coverage(session: Session, predictions: Predictions, report: Report)
 def _report_unmeasured(session: Session, predictions: Predictions, report: Report) -> None:
     """Report channels of a trial of which only columns are predicted that nobody measured."""
     for trial in session:
-        for channel in _judged(trial, predictions.get(trial.name, {}).keys()):
+        for channel in _judged(trial, predictions):
             values = getattr(trial, channel)
             if values is None:
                 continue
@@ -91,7 +99,7 @@ def _report_steps(session: Session, predictions: Predictions, report: Report) ->
         time = np.asarray(told.get("time", ()))
         experiment = EXPERIMENTS[trial.experiment]
         longest = (sizes.pace if experiment.kind == "driven" else sizes.slow_pace) / experiment.rate
-        if len(time) > 1 and len(trial.time) > 1 and _judged(trial, told.keys()):
+        if len(time) > 1 and len(trial.time) > 1 and _judged(trial, predictions):
             step = float(np.median(np.diff(time)))
             # No step need be shorter than those of the recording.
             if step > max(longest, 1.5 * float(np.median(np.diff(trial.time)))):
@@ -99,3 +107,36 @@ def _report_steps(session: Session, predictions: Predictions, report: Report) ->
                 report.warning(
                     f"/trials/{trial.name}", f"{said}; predict at the session's times, or every {longest:.2g} s"
                 )
+
+
+def _report_digits(session: Session, predictions: Predictions, report: Report) -> None:
+    """Report predictions that were rounded to steps longer than the sensor's noise, which look like a gap."""
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for trial in session:
+        for channel in _judged(trial, predictions):
+            measured = getattr(trial, channel)
+            if measured is not None and len(trial.time) > 2:
+                # Second differences of white noise have six times its variance.
+                noise = np.sqrt(np.mean(np.diff(measured, 2, axis=0) ** 2, axis=0) / 6.0)
+                steps = np.array([_step(x) for x in np.asarray(predictions[trial.name][channel]).T])
+                names = CHANNELS[channel].columns(session.finger)
+                if coarse := {names[k]: float(steps[k]) for k in np.flatnonzero(steps > noise)}:
+                    found.setdefault(channel, {})[trial.name] = coarse
+    for channel, trials in found.items():
+        steps = {name: step for coarse in trials.values() for name, step in coarse.items()}
+        said = (
+            f"predictions of {listed(list(steps))} come in steps of {max(steps.values()):.2g} {CHANNELS[channel].units}"
+        )
+        for name in trials:
+            report.warning(f"/trials/{name}/{channel}", f"{said}, longer than the sensor's noise; write more digits")
+
+
+def _step(x: Float[np.ndarray, " N"]) -> float:
+    """The step of which all changes of x are multiples; zero where there is none, or where few values could be."""
+    values = np.unique(x[np.isfinite(x)])
+    steps = np.diff(values)
+    steps = steps[steps > MAX_ROUNDING * np.ptp(values)] if len(values) > 1 else steps
+    if len(values) < MIN_VALUES or not len(steps):
+        return 0.0
+    multiples = (values - values[0]) / steps.min()
+    return float(steps.min()) if np.abs(multiples - np.round(multiples)).max() < MAX_ODD else 0.0

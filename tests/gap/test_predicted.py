@@ -115,7 +115,7 @@ def test_all_trials_with_the_mistake_are_named(session, predictions):
 def test_trials_that_are_exchanged_are_named(session, predictions):
     a, b = (next(t.name for t in session.select("VD.2") if t.tendon == tendon) for tendon in ("T2", "T3"))
     (sentence,) = said(session, {**predictions, a: predictions[b], b: predictions[a]}, "warning")
-    assert f"look exchanged: those of {b} fit {a}, those of {a} fit {b}; exchange the trials" in sentence
+    assert f"look exchanged: those of {b} fit {a}, those of {a} fit {b}; exchange the trials, or what the" in sentence
 
 
 def test_a_shift_in_time_is_a_warning_since_a_channel_may_be_late(session, predictions):
@@ -238,6 +238,30 @@ def test_steps_too_long_for_the_motion_are_said(session, predictions):
     assert any(
         "predictions come every 0.21 s" in x for x in said(session, {**predictions, trial.name: coarse}, "warning")
     )
+
+
+def test_predictions_with_too_few_digits_are_said(session, predictions):
+    """Steps of 1 mm, a hundred times the noise of the encoder; those of 1 nm do not matter."""
+    coarse = changed(predictions, lambda v: np.round(v, 3), "tendon_excursion")
+    assert any(
+        "come in steps of 0.001 m, longer than the sensor's noise; write" in x for x in said(session, coarse, "warning")
+    )
+    assert list(check_predictions(session, changed(predictions, lambda v: np.round(v, 9)))) == []
+    assert list(check_predictions(session, changed(predictions, lambda v: v.astype(np.float32).astype(float)))) == []
+
+
+@pytest.mark.parametrize(
+    ("gear", "severity", "says"),
+    [
+        (5.0, "warning", "predictions of MCP miss the measured motion by 4 times its own size"),
+        (50.0, "error", "are about 50 times as large as measured; look at units and gear ratios"),
+        (0.02, "warning", "are about 50 times as small as measured; look at units and gear ratios, or go on"),
+    ],
+)
+def test_a_gear_may_be_in_between(session, predictions, gear, severity, says):
+    """No unit has its ratio. A simulator that lacks nearly all of a torque may give a small one."""
+    sentences = said(session, changed(predictions, lambda v: gear * v, "joint_torque"), severity)
+    assert any(says in sentence for sentence in sentences)
 
 
 @pytest.mark.parametrize(("value", "word"), [(np.inf, "infinite"), (np.nan, "NaN")])
