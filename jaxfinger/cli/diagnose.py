@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from jaxfinger.cli.output import Output, console, plain, print_json, progress, read, refuse_output, table
 from jaxfinger.errors import UserError
+
+if TYPE_CHECKING:
+    from jaxfinger.data import Predictions, Session
 
 FILES = ("gap.json", "nominal.json", "augmented.json", "report.html")
 
@@ -67,7 +70,6 @@ def diagnose(
     tolerated = _tolerance(tolerance or [])
     from dataclasses import replace
 
-    from jaxfinger.data import read_predictions
     from jaxfinger.data.atomic import make_folder
     from jaxfinger.effects import load
     from jaxfinger.gap import diagnose as run
@@ -82,8 +84,8 @@ def diagnose(
         earlier = load_fit(against, effects) if against is not None else None
         own = load(effects) if effects is not None else {}
         say("reading the file")
-        simulated = read_predictions(predictions) if predictions is not None else None
         measured = {session: read(session) for session in folders}
+        simulated = None if predictions is None else _predictions(predictions, measured[sessions[0]])
         for session, folder in folders.items():
             name = session.name
             told = say if len(folders) == 1 else lambda message, name=name: say(f"{name}: {message}")
@@ -128,6 +130,19 @@ def _refuse_predictions(predictions: Path, sessions: tuple[Path, ...]) -> None:
         raise UserError(f"{predictions}: holds predictions of one session; give that session alone")
     if predictions.exists() and any(s.exists() and predictions.samefile(s) for s in sessions):
         raise UserError(f"{predictions}: is the session itself; give the simulator's predictions of its trials")
+
+
+def _predictions(file: Path, session: Session) -> Predictions:
+    """Read predictions of a session, print what is doubtful about them, and refuse what can only be a mistake."""
+    from jaxfinger.data import read_predictions
+    from jaxfinger.data.findings import Report
+    from jaxfinger.gap.predicted import refuse_mistaken
+
+    report = Report()
+    simulated = read_predictions(file, session, report)
+    for finding in (*report, *refuse_mistaken(session, simulated, str(file))):
+        print(plain(f"{file}: {finding}"), file=sys.stderr)
+    return simulated
 
 
 def _tolerance(texts: list[str]) -> dict[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -11,10 +12,13 @@ import numpy as np
 from jaxfinger.data.check import open_file
 from jaxfinger.data.findings import Report
 from jaxfinger.data.hdf5 import new_file, write_dataset, write_header
-from jaxfinger.data.parse import child, dataset, parse_finger, parse_version
+from jaxfinger.data.parse import child, dataset, parse_finger, parse_version, text_attribute
 from jaxfinger.data.schema import CHANNELS, TIME
-from jaxfinger.data.session import Session
-from jaxfinger.errors import UserError
+from jaxfinger.data.session import FingerDescription, Session, Trial
+from jaxfinger.errors import UserError, listed
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 Predictions = Mapping[str, Mapping[str, np.ndarray]]  # {trial: {channel: (N, columns)}}, SI units
 
@@ -61,8 +65,12 @@ def write_predictions(
                 write_dataset(group, CHANNELS[channel], value, finger.prismatic)
 
 
-def read_predictions(path: str | os.PathLike) -> dict[str, dict[str, np.ndarray]]:
+def read_predictions(
+    path: str | os.PathLike, session: Session | None = None, report: Report | None = None
+) -> dict[str, dict[str, np.ndarray]]:
     """Read the predicted channels of a file, `{trial: {"time": (N,), channel: array}}`, in SI units.
+
+    `session` is the one that they were made for. Findings go to `report`.
 
     >>> import jaxfinger as jf
     >>> session, fit = jf.read("session.h5"), jf.load("fit.json")
@@ -71,15 +79,15 @@ def read_predictions(path: str | os.PathLike) -> dict[str, dict[str, np.ndarray]
     {'01-ID3-dynamic-axis': ['joint_torque', 'time']}
 
     Raises:
-        UserError: the first fault of the file.
+        UserError: the first fault of the file, or its joints or tendons are not those of the session.
     """
-    report = Report()
+    report = Report() if report is None else report
     found: dict[str, dict[str, np.ndarray]] = {}
     file = open_file(path, report)
     if file is not None:
         try:
             with file:
-                found = _parse(file, report)
+                found = _parse(file, session, report)
         except Exception:  # h5py raises exceptions of many kinds on a damaged file.
             report.error("/", "cannot be read to the end: the file is damaged; predict again")
     if report.fatal is not None:
@@ -112,6 +120,16 @@ def refuse_misfits(session: Session, predictions: Predictions) -> None:
                 raise UserError(f"{place}/{channel}: {fault}")
 
 
+def predicted_at(
+    prediction: Mapping[str, np.ndarray], channel: str, trial: Trial, shape: tuple[int, ...]
+) -> Float[np.ndarray, "N columns"]:
+    """Predicted channel at the trial's times, between samples by straight lines; NaN where there is no prediction."""
+    if channel not in prediction:
+        return np.full(shape, np.nan)
+    columns = np.asarray(prediction[channel], float).T
+    return np.stack([np.interp(trial.time, prediction.get("time", trial.time), a) for a in columns], axis=1)
+
+
 def _refuse_shape(place: str, channel: str, value: np.ndarray, samples: int, session: Session) -> None:
     """Refuse a channel that has not the shape of the measured one; UserError names the shape that it must have."""
     sizes = {"N": samples, "m": session.finger.m, "n": session.finger.n}
@@ -121,18 +139,34 @@ def _refuse_shape(place: str, channel: str, value: np.ndarray, samples: int, ses
 
 
 def _incomplete(time: np.ndarray, values: np.ndarray) -> str:
-    """Say in which samples a column is NaN while it is not in others; empty where columns have all samples or none."""
-    bad = ~np.isfinite(values).reshape(len(values), -1)
-    for column in bad.T:
-        if column.any() and not column.all():
-            at = time[int(np.argmax(column))]
-            count = f"is NaN in {int(column.sum())} of {len(column)} samples, first at {at:.6g} s"
-            return f"{count}; predict every sample, or leave the column NaN throughout"
+    """Say in which samples a column is infinite, or NaN while it is not in others; empty where it is neither."""
+    columns = values.reshape(len(values), -1)
+    for infinite, bad in ((True, np.isinf(columns)), (False, np.isnan(columns))):
+        for column in bad.T:
+            if column.any() and (infinite or not column.all()):
+                at = time[int(np.argmax(column))]
+                count = f"{int(column.sum())} of {len(column)} samples, first at {at:.6g} s"
+                said = f"is {'infinite' if infinite else 'NaN'} in {count}"
+                return f"{said}; predict every sample, or leave the column NaN throughout"
     return ""
 
 
-def _parse(file: h5py.File, report: Report) -> dict[str, dict[str, np.ndarray]]:
+def _report_other_names(finger: FingerDescription, of_session: FingerDescription, report: Report) -> None:
+    """Report joints or tendons that are not those of the session, in its order."""
+    for what in ("joint", "tendon"):
+        told, wanted = (getattr(f, f"{what}_names") for f in (finger, of_session))
+        if told != wanted:
+            said = f"names {listed(told)} where the session has {listed(wanted)}"
+            report.error(f"/finger/{what}s/name", f"{said}; give the columns of the session's {what}s, in its order")
+
+
+def _parse(file: h5py.File, session: Session | None, report: Report) -> dict[str, dict[str, np.ndarray]]:
     finger = parse_finger(file, report) if parse_version(file, report) else None
+    if finger is not None and session is not None:
+        _report_other_names(finger, session.finger, report)
+    if text_attribute(file, "content", "/", Report()) != "predictions":
+        said = "has no attribute `content` that says `predictions`, and may hold recordings"
+        report.warning("/", f"{said}; write it if these are predictions")
     trials = child(file, "trials", "/trials", report, h5py.Group) if finger is not None else None
     if finger is None or trials is None:
         return {}

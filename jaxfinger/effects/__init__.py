@@ -11,7 +11,7 @@ from jaxfinger.effects import body, changed, drive, joint, nominal, sensors, ten
 from jaxfinger.effects.base import Amplitude, CatalogueEffect, Shape, Site, amplitude, shape
 from jaxfinger.effects.changed import Changed
 from jaxfinger.effects.scales import Scales
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, did_you_mean
 from jaxfinger.model import Finger
 
 
@@ -27,6 +27,7 @@ CATALOGUE: dict[str, type[CatalogueEffect]] = {}
 for _module in (joint, drive, tendon, transmission, body, sensors):
     CATALOGUE |= _effects_in(_module)
 NOMINAL_TERMS = _effects_in(nominal)  # candidates only where a recipe leaves the term out
+PLACES = ("joint", "tendon", "joint pair", "tendon pair")  # of several sites; other places are single ones
 CHANGED = _effects_in(changed)  # candidates only beside an earlier fit
 
 
@@ -49,8 +50,8 @@ def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
     """Load the effects that a user's Python file defines, by id.
 
     Raises:
-        UserError: The file cannot be loaded or defines no effect. An id is taken by the catalogue or is no plain word,
-            or a sentence for people or the amplitude is missing.
+        UserError: The file cannot be loaded or defines no effect. An id is missing, taken by the catalogue or by
+            another effect of the file, or no plain word; a sentence for people or the amplitude is missing.
     """
     path = Path(path)
     spec = importlib.util.spec_from_file_location(f"jaxfinger_user_{path.stem}", path)
@@ -61,6 +62,7 @@ def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
         spec.loader.exec_module(module)
     except Exception as e:  # The file is a user's program, which may raise anything.
         raise UserError(f"{path}: cannot be loaded: {type(e).__name__}: {e}") from e
+    _refuse_lost(path, module)
     found = _effects_in(module)
     if not found:
         raise UserError(f"{path}: defines no effect; subclass jaxfinger.effects.CatalogueEffect and give it an ID")
@@ -69,12 +71,28 @@ def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
             raise UserError(f"{path}: {kind.__name__} has the ID {name}, which the catalogue has; choose another")
         if not re.fullmatch("[a-z][a-z0-9_]*", name):
             raise UserError(f"{path}: {kind.__name__} has the ID {name!r}; use small letters, digits and underscores")
+        place, plain = getattr(kind, "PLACE", None), "sites" not in kind.__dict__
+        if plain and place not in PLACES and (near := did_you_mean(place, PLACES)):
+            raise UserError(f"{path}: {kind.__name__} has the PLACE {place!r}{near}")
         if not kind.amplitudes():
             raise UserError(f"{path}: {kind.__name__} has no amplitude; declare a field with `amplitude`")
         for sentence in ("HAPPENS", "LOOKS", "CHANGE", "__doc__"):
             if not getattr(kind, sentence):
                 raise UserError(f"{path}: {kind.__name__} has no {sentence.strip('_')}; write its sentence")
     return found
+
+
+def _refuse_lost(path: Path, module) -> None:
+    """Refuse effects of a user's file that would be passed over: those without an ID of their own, and namesakes."""
+    kinds = [c for _, c in inspect.getmembers(module, inspect.isclass) if issubclass(c, CatalogueEffect)]
+    kinds = [c for c in kinds if c.__module__ == module.__name__]
+    named: dict[str, type] = {}
+    for kind in kinds:
+        own, parents = kind.__dict__.get("ID"), {base for c in kinds for base in c.__mro__[1:]}
+        if own is None and kind not in parents:
+            raise UserError(f"{path}: {kind.__name__} has no ID of its own and would be passed over; give it one")
+        if own is not None and (other := named.setdefault(own, kind)) is not kind:
+            raise UserError(f"{path}: {other.__name__} and {kind.__name__} have the same ID {own}; give each its own")
 
 
 def to_dict(effect: CatalogueEffect, units: dict[str, str]) -> dict:

@@ -21,6 +21,7 @@ from jaxfinger.data import (
     without_spikes,
 )
 from jaxfinger.data.motion import quick_cutoff
+from jaxfinger.data.predictions import predicted_at
 from jaxfinger.data.sizes import Sizes
 from jaxfinger.effects.drive import NOMINAL_TEMPERATURE
 from jaxfinger.experiments.table import Experiment
@@ -130,7 +131,7 @@ def _measured(experiment: Experiment, trial: Trial, finger: FingerDescription, m
         if values is None:
             values = np.full((N, width[c]), np.nan)
         if minus is not None:
-            values = values - _predicted(minus.get(trial.name, {}), c, trial, values)
+            values = values - predicted_at(minus.get(trial.name, {}), c, trial, values.shape)
         measured = np.isfinite(values).all(axis=0)
         counts = np.zeros(values.shape, bool)
         if measured.any():
@@ -140,14 +141,6 @@ def _measured(experiment: Experiment, trial: Trial, finger: FingerDescription, m
             values[:, measured] = bridged(values[:, measured], spikes)
         y[c], sound[c] = np.nan_to_num(values), counts
     return y, sound
-
-
-def _predicted(prediction: Mapping[str, np.ndarray], channel: str, trial: Trial, like: np.ndarray) -> np.ndarray:
-    """Predicted channel at the trial's times, in the shape of `like`; NaN where there is no prediction."""
-    if channel not in prediction:
-        return np.full(like.shape, np.nan)
-    columns = prediction[channel].T
-    return np.stack([np.interp(trial.time, prediction.get("time", trial.time), a) for a in columns], axis=1)
 
 
 @dataclass(frozen=True)

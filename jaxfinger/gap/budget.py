@@ -169,7 +169,7 @@ def _products(
 
 def _weights(cells: list[Cell], full, seen: Int[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
     """Weight of each seen cell: the inverse of its column's mean square with all causes, at most 1."""
-    column = np.array([cells[i].column for i in seen])
+    column = np.array([cells[i].column for i in seen], int)
     n = np.bincount(column, [cells[i].rows for i in seen])
     e = np.bincount(column, full[seen, 0, 0])
     return (np.maximum(n, 1.0) / np.maximum(np.maximum(e, n), 1.0))[column]

@@ -51,7 +51,7 @@ class Costs:
         """
         keys = list(keys)
         effects = {e for e, _ in keys} - set(NOMINAL_TERMS)
-        return len(effects) * np.log(len(self.sites)) + sum(np.log(max(self.sites.get(e, 1), 1)) for e, _ in keys)
+        return len(effects) * np.log(len(self.sites) or 1) + sum(np.log(self.sites.get(e, 1) or 1) for e, _ in keys)
 
     @cached_property
     def _evidence_where_it_acts(self) -> Mapping[CauseKey, float]:

@@ -32,6 +32,7 @@ from jaxfinger.gap.parts import (
     unexplained_part,
 )
 from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY, Posterior, posterior
+from jaxfinger.gap.predicted import refuse_mistaken
 from jaxfinger.gap.problem import Problem, build, site
 from jaxfinger.gap.result import (
     Closure,
@@ -100,9 +101,10 @@ def diagnose(
 
     Raises:
         UserError: an effect to leave out or a channel to tolerate is unknown; a tolerance is no share of a signal; one
-            of the user's own effects fails in a prediction or changes none; `predictions` has none of the session's
-            trials, does not fit them, or repeats the measurements; `against` is of another finger or recipe, holds
-            effects, or comes with `predictions`.
+            of the user's own effects fails in a prediction, changes none, or predicts no numbers; `predictions` has
+            none of the session's trials, does not fit them, repeats the measurements, or can only be a mistake
+            (`check_predictions`); `against` is of another finger or recipe, holds effects, or comes with
+            `predictions`.
     """
     if against is not None and (predictions is not None or recipe not in (None, against.recipe)):
         raise UserError("an earlier fit brings its own recipe and no other simulator; leave the other one out")
@@ -116,6 +118,9 @@ def diagnose(
             f"it has {', '.join(sorted(catalogue))}"
         )
     _refuse_odd_tolerance(tolerance)
+    doubts = ()
+    if predictions is not None:
+        doubts = tuple(x.sentence for x in refuse_mistaken(session, predictions, session.file or "the session"))
     problem = build(session, recipe, progress, predictions, COARSE if quick else 1, against)
     diagnosed = partial(
         Diagnosis,
@@ -124,6 +129,7 @@ def diagnose(
         against=None if against is None else against.data or against.specimen,
         quick=quick,
         tolerance=tolerance,
+        doubts=doubts,
         problem=problem,
     )
     if next(measured_columns(problem), None) is None:

@@ -15,15 +15,19 @@ def folds(problem: Problem) -> dict[str, np.ndarray]:
     """Fold of every sample, (B, T) by experiment.
 
     Trials of one experiment, joint and tendon are dealt to the folds as wholes. One that stands alone is divided into
-    2 FOLDS contiguous blocks of equal duration.
+    2 FOLDS contiguous blocks of equal duration. Trials of which no sample counts, as where another simulator does not
+    predict them, stand beside none.
     """
-    strata = {n: (t.experiment, t.joint, t.tendon) for n in problem.trial_names for t in [problem.session[n]]}
+    counts = {problem.stacks[e].trials[b] for e, rows in problem.rows.items() for b in np.unique(rows.trial)}
+    strata = {n: (t.experiment, t.joint, t.tendon) for n in counts for t in [problem.session[n]]}
     count = {s: list(strata.values()).count(s) for s in strata.values()}
     seen: dict[tuple, int] = {}
     out = {}
     for e, stack in problem.stacks.items():
         out[e] = np.zeros(stack.batch.x.time.shape, dtype=int)
         for b, name in enumerate(stack.trials):
+            if name not in counts:
+                continue
             stratum = strata[name]
             if count[stratum] == 1:
                 time = np.asarray(stack.batch.x.time)[b]

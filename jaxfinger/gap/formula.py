@@ -319,6 +319,8 @@ class LinearModel:
         Its score is the gain over `now`. The evidence is None where every amplitude is zero.
         """
         assert self.null is not None
+        if not candidates:
+            return []
         w, u = now.weights, now.solution[: self.BX.shape[1]]
         HXX = self._weighted(w, self.BX, self.BX, self.XX) + self.prior
         HXZ = self._weighted(w, self.BX, self.BZ, self.XZ)

@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Predictions, Session
+from jaxfinger.data.schema import CHANNELS
 from jaxfinger.effects import Scales
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Stack, prepare
@@ -250,9 +251,7 @@ def _start_from(session: Session, against: Fit) -> Fit:
 
 def site(problem: Problem, channel: str, column: int) -> str:
     """Name of the joint, tendon or axis that is column number `column` of a channel."""
-    finger = problem.nominal.finger
-    names = {"joint_torque": finger.joint_names, "tendon_excursion": finger.tendon_names}.get(channel, ("x", "y", "z"))
-    return names[column]
+    return CHANNELS[channel].columns(problem.session.finger)[column]
 
 
 def moved(problem: Problem, by: Float[np.ndarray, " p"]) -> Problem:

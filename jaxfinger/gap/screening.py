@@ -16,7 +16,7 @@ from jaxfinger.experiments import affected_channels
 from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.columns import Columns
 from jaxfinger.gap.problem import Problem
-from jaxfinger.gap.signatures import CHUNK, Signatures, Variant
+from jaxfinger.gap.signatures import CHUNK, Signatures, Variant, own
 from jaxfinger.identify.stages import Progress
 
 MIN_PERIOD = 20.0  # s. Drifts take minutes; shorter periods are those of the motion itself.
@@ -112,8 +112,14 @@ def by_column(signatures: Signatures, items: list[Variant], columns: Columns) ->
 def read_parts(
     problem: Problem, items: list[Variant], columns: Columns, progress: Progress = lambda message: None
 ) -> Iterator[Part]:
-    """Read the signatures of all variants at the problem's nominal model; classes are compiled side by side."""
+    """Read the signatures of all variants at the problem's nominal model; classes are compiled side by side.
+
+    Raises:
+        UserError: an effect of the user's predicts no numbers, acts at zero amplitude, or alike at two joints.
+    """
     signatures, groups = Signatures(problem), {}
+    for kind in dict.fromkeys(v.effect for v in items if own(v.effect)):
+        signatures.refuse_odd(kind, problem.scales)
     for v in items:
         groups.setdefault(_part(v), []).append(v)
 

@@ -5,7 +5,8 @@ compiled function for each class of effects and kind of prediction therefore ser
 channels that the effect changes are evaluated.
 """
 
-from collections.abc import Iterator, Mapping
+import inspect
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -16,12 +17,15 @@ from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.effects import CATALOGUE, CatalogueEffect, Changed, Scales, Site, changes, nominal_terms
+from jaxfinger.errors import UserError
 from jaxfinger.experiments import TRIALS, affected_channels, change, refuse_broken
 from jaxfinger.gap.problem import Problem, Rows
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.parameters import describe
 from jaxfinger.model import Finger, Model, Motion, Terms
 
+# Share of an effect's signature that it may leave at zero amplitude: more is no rounding.
+MAX_ABSENT = 1e-6
 CHUNK = 8  # effects of one compiled call. Each needs memory of the size of the channel that it changes.
 
 
@@ -127,7 +131,9 @@ class Signatures:
                 rows = self.problem.rows[e]
                 number = self.problem.stacks[e].experiment.channels.index(channel)
                 of_channel = np.flatnonzero(rows.channel == number)
-                white = whitened(raw, self.problem, rows, of_channel, channel)
+                with np.errstate(invalid="ignore"):  # A user's effect may be NaN, which is then said.
+                    white = whitened(raw, self.problem, rows, of_channel, channel)
+                _refuse_no_numbers(members[k : k + CHUNK], white, e, channel)
                 out[k : k + CHUNK, rows.start + of_channel] = white
         return out
 
@@ -173,6 +179,56 @@ class Signatures:
         found = self.white_changes(members).reshape(len(items), len(names), -1)
         found /= np.array([v.size for v in items])[:, None, None]
         return found
+
+    def refuse_odd(self, kind: type[CatalogueEffect], scales: Scales) -> None:
+        """Check a user's effect at every site, in one shape and size.
+
+        Raises:
+            UserError: it changes a prediction at zero amplitude, or acts alike at two joints.
+        """
+        finger, file = self.problem.nominal.finger, inspect.getfile(kind)
+        seen: dict[bytes, Site] = {}
+        tried = variants({kind.ID: kind}, finger, scales)[:1]
+        for site in kind.sites(finger) if tried else ():
+            shape, sizes = dict(tried[0].shape), tried[0].sizes
+            members = [kind.at(finger, site, **shape, **size) for size in (sizes, dict.fromkeys(sizes, 0.0))]
+            there, absent = self.white_changes(members)
+            if np.linalg.norm(absent) > MAX_ABSENT * np.linalg.norm(there):
+                raise UserError(
+                    f"{file}: {kind.ID} at {'-'.join(site)} changes {self._where(int(np.argmax(np.abs(absent))))} at "
+                    "zero amplitude; let its amplitudes multiply all that it does"
+                )
+            other = seen.setdefault(there.tobytes(), site)
+            # Two tendons over one joint may well do the same in these trials.
+            if kind.PLACE == "joint" and other != site and there.any():
+                raise UserError(
+                    f"{file}: {kind.ID} does the same at {'-'.join(other)} and at {'-'.join(site)}; "
+                    "let it act at `self.index` alone, or give it a single PLACE"
+                )
+
+    def _where(self, row: int) -> str:
+        """Channel and experiment of a row."""
+        rows = next(x for x in self.problem.rows.values() if row < x.start + x.size)
+        channels = self.problem.stacks[rows.experiment].experiment.channels
+        return f"{channels[rows.channel[row - rows.start]]} of {rows.experiment}"
+
+
+def own(kind: type[CatalogueEffect]) -> bool:
+    """Whether an effect is a user's, and not one of the catalogue."""
+    return not kind.__module__.startswith("jaxfinger.")
+
+
+def _refuse_no_numbers(
+    members: Sequence[CatalogueEffect], white: Float[np.ndarray, "members rows"], experiment: str, channel: str
+) -> None:
+    """Refuse a user's effect whose prediction is NaN or infinite in a row that counts: no evidence could be weighed."""
+    for effect, row in zip(members, white, strict=True):
+        if own(type(effect)) and not np.isfinite(row).all():
+            values = ", ".join(f"{n} = {v:.3g}" for n, v in effect.values().items())
+            raise UserError(
+                f"{inspect.getfile(type(effect))}: {effect.ID} at {'-'.join(effect.site)} predicts NaN or infinity in "
+                f"{channel} of {experiment} with {values}; keep every hook finite at each angle, speed and tension"
+            )
 
 
 def whitened(

@@ -17,8 +17,9 @@ import numpy as np
 
 from jaxfinger.data import Predictions, Session
 from jaxfinger.data.predictions import refuse_misfits
-from jaxfinger.errors import UserError
-from jaxfinger.experiments import Stack, predict_compiled, prepare
+from jaxfinger.data.schema import CHANNELS
+from jaxfinger.errors import UserError, listed
+from jaxfinger.experiments import Stack, demean, predict_compiled, prepare
 from jaxfinger.identify import Recipe
 from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.parameters import Free, describe
@@ -36,7 +37,7 @@ from jaxfinger.model import Model
 # Share of a channel's range: a term of the emulator that changes no prediction by more is not in the simulator. It is
 # small beside a term that matters, and large beside what a fit makes of a term that the predictions lack.
 MIN_TERM_SHARE = 0.003
-# Share of a channel's rms in one trial. No simulator knows the noise: predictions that miss less repeat the
+# Share of a column's rms in one trial. No simulator knows the noise: predictions that miss less repeat the
 # measurements, at most rounded to single precision, which has seven digits.
 MAX_REPEATED = 1e-6
 
@@ -73,15 +74,17 @@ def emulate(
 
 
 def _refuse_repeated(session: Session, simulated: Stack, difference: Stack) -> None:
-    """Refuse predictions that are the measurements, noise and all; UserError names the first trial and channel."""
+    """Refuse columns that are the measured ones up to a constant, noise and all; UserError names the first."""
     for c, mask in difference.batch.mask.items():
-        told, missed = (np.asarray(b.y[c] * mask) for b in (simulated.batch, difference.batch))
-        told, missed = (np.sqrt((x**2).sum(axis=(0, 2))) for x in (told, missed))
-        for trial, size, miss in zip(difference.trials, told, missed, strict=True):
-            if size > 0.0 and miss <= MAX_REPEATED * size:
+        told, missed = (np.asarray(demean(b.y[c], mask)) for b in (simulated.batch, difference.batch))
+        told, missed = (np.sqrt((x**2).sum(axis=2)) for x in (told, missed))
+        repeats = (told > 0.0) & (missed <= MAX_REPEATED * told)
+        for trial, columns in zip(difference.trials, repeats.T, strict=True):
+            if columns.any():
+                names = listed([CHANNELS[c].columns(session.finger)[k] for k in np.flatnonzero(columns)])
                 raise UserError(
-                    f"{session.file or 'the session'}: predictions of /trials/{trial}/{c}: repeat the measurements, "
-                    "noise and all; give what the simulator computes, and leave out channels that it is given"
+                    f"{session.file or 'the session'}: /trials/{trial}/{c}: predictions of {names} repeat the "
+                    "measurements, noise and all; give what the simulator computes, and leave out what it is given"
                 )
 
 

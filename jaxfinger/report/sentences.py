@@ -330,6 +330,7 @@ def _probability(d: Diagnosis, key: Key) -> float | None:
 def _caveats(d: Diagnosis) -> list[str]:
     """Sentences beside the verdict: diverged simulations, retuned or changed parameters, channels not judged."""
     out = [diverged(x) for x in d.closures if x.diverged]
+    out += d.doubts
     if is_simulator(d):
         out.append(retuned(d.changes))
     elif d.against:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from jaxfinger.cli import main
-from jaxfinger.data import read_session
+from jaxfinger.data import read_session, write_predictions
 from jaxfinger.errors import UserError
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.fit_file import save_fit
@@ -58,3 +58,24 @@ def test_a_fit_of_the_session_itself_is_said_to_count_twice(tmp_path, capsys, mo
     with pytest.raises(SystemExit):
         main(["diagnose", str(path), "--against", str(tmp_path / "fit.json"), "-o", str(tmp_path / "out")])
     assert f"fit.json: is a fit of {path} itself, whose data then count twice" in capsys.readouterr().err
+
+
+def test_predictions_are_checked_before_the_work_begins(tmp_path, capsys, monkeypatch):
+    """What can only be a mistake is refused with the file's name; what is doubtful goes to stderr."""
+    path, file = Path(__file__).parents[2] / "datasets" / "demo-finger" / "fresh.h5", tmp_path / "simulator.h5"
+    session = read_session(path)
+    names = [t.name for t in session.select("ID.3-dynamic")]
+
+    def ends(*args):
+        raise UserError("ends here")
+
+    monkeypatch.setattr("jaxfinger.gap.diagnose", ends)
+    for factor, says in (
+        (-0.9, f"jaxfinger: {file}: /trials/{names[0]}/joint_torque: predictions of"),
+        (0.9, f"{file}: note: {len(names)} of {len(session)} trials are predicted"),
+    ):
+        told = {name: {"joint_torque": factor * session[name].joint_torque} for name in names}
+        write_predictions(file, session, told, overwrite=True)
+        with pytest.raises(SystemExit):
+            main(["diagnose", str(path), "--predictions", str(file), "-o", str(tmp_path / "out")])
+        assert says in capsys.readouterr().err

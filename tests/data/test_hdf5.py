@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import check_file, data_hash, read_predictions, read_session, write_predictions, write_session
+from jaxfinger.data.findings import Report
 from jaxfinger.errors import UserError
 
 
@@ -185,3 +186,23 @@ def test_predictions_describe_themselves(session, tmp_path):
         write_predictions(path, session, {})
     with pytest.raises(UserError, match="not in the session"):
         write_predictions(tmp_path / "b.h5", session, {"99": {}})
+
+
+def test_predictions_of_another_finger_are_refused(session, tmp_path):
+    """Columns have no names of their own, so that joints in another order would be compared with each other."""
+    finger = session.finger
+    turned = replace(session, finger=replace(finger, joint_names=finger.joint_names[::-1]))
+    write_predictions(tmp_path / "p.h5", turned, {"07-VD.3": {"q": session["07-VD.3"].q}})
+    assert set(read_predictions(tmp_path / "p.h5", turned)) == {"07-VD.3"}
+    told, wanted = (", ".join(names) for names in (finger.joint_names[::-1], finger.joint_names))
+    with pytest.raises(
+        UserError, match=rf"p\.h5: /finger/joints/name: names {told} where the session has {wanted}; give"
+    ):
+        read_predictions(tmp_path / "p.h5", session)
+
+
+def test_recordings_in_place_of_predictions_are_doubted(session, tmp_path):
+    path, report = tmp_path / "recorded.h5", Report()
+    write_session(session, path)
+    read_predictions(path, session, report)
+    assert ["has no attribute `content` that says `predictions`" in x.message for x in report] == [True]

@@ -211,6 +211,7 @@ def test_a_file_without_effects_is_refused(tmp_path, content, complaint):
         ('"torque/speed/speed"', '"torque/velocity"', "'torque/velocity' is no product of scales"),
         ('"torque/speed/speed"', '"torque / speed"', "'torque / speed' is no product of scales"),  # would multiply
         ("0.01,", "-0.01,", "above zero, where -0.01 stands"),
+        ('"joint"', '"joints"', r"JointDrag has the PLACE 'joints' \(did you mean 'joint'\?\)"),
         (
             '    b: Float[Array, ""] = amplitude("N m s2/rad2", 0.01, "torque/speed/speed")',
             "    b = 0.1",
@@ -223,6 +224,23 @@ def test_a_mistake_in_the_documented_example_is_said(tmp_path, there, here, comp
     assert there in code
     path = tmp_path / "drag.py"
     path.write_text(code.replace(there, here), encoding="utf-8")
+    with pytest.raises(UserError, match=complaint):
+        load(path)
+
+
+DRAG = DOCUMENT.read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
+
+
+@pytest.mark.parametrize(
+    ("copy", "complaint"),
+    [
+        (DRAG.replace("JointDrag", "Other"), 'JointDrag and Other have the same ID joint_drag; give each its own'),
+        ("class Other(JointDrag):\n    pass\n", "Other has no ID of its own and would be passed over; give it one"),
+    ],
+)  # fmt: skip
+def test_a_second_effect_is_not_passed_over(tmp_path, copy, complaint):
+    path = tmp_path / "drag.py"
+    path.write_text(f"{DRAG}\n{copy}")
     with pytest.raises(UserError, match=complaint):
         load(path)
 
@@ -289,9 +307,6 @@ def test_an_effect_on_a_link_leaves_it_a_body_at_all_that_its_bounds_allow(name,
         assert finger.mass[1] > 0.0
         moments = np.linalg.eigvalsh(finger.gyration[1])
         assert moments[2] <= moments[:2].sum() * (1.0 + 1e-9)
-
-
-DRAG = DOCUMENT.read_text().split("```python\n")[1].split("```")[0]
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,8 @@ from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import demean, prepare
 from jaxfinger.gap import Status, diagnose
+from jaxfinger.gap.folds import fold_of_row
+from jaxfinger.gap.problem import build
 from jaxfinger.gap.result import Key
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Recipe, identify
@@ -108,5 +110,25 @@ def test_a_simulator_that_repeats_the_measurements_is_refused(session):
     trial = next(t for t in session if t.experiment == "ID.3-dynamic")
     copied = np.float32(trial.joint_torque).astype(float)
     told[trial.name] = {**told[trial.name], "joint_torque": copied}
-    with pytest.raises(UserError, match=rf"{trial.name}/joint_torque: repeat the measurements, noise and all"):
+    with pytest.raises(
+        UserError, match=rf"{trial.name}/joint_torque: predictions of MCP repeat the measurements, noise and all"
+    ):
+        emulate(session, Recipe(), stacks, told)
+
+
+def test_a_trial_that_is_predicted_alone_is_divided_into_folds(session):
+    """Trials of its kind that are not predicted hold nothing out: it would be in a single fold, and nothing closed."""
+    name = next(t.name for t in session if t.experiment == "ID.3-dynamic")
+    problem = build(session, Recipe(), predictions={name: simulator(session)[name]})
+    assert set(fold_of_row(problem)) == {0, 1, 2}
+
+
+def test_a_column_that_repeats_the_measurements_up_to_a_constant_is_refused(session):
+    """Beside columns that a simulator computes, and with the zero that it may choose."""
+    stacks, told = prepare(session), simulator(session)
+    trial = next(t for t in session if t.experiment == "ID.2")
+    excursion = told[trial.name]["tendon_excursion"].copy()
+    excursion[:, 1] = trial.tendon_excursion[:, 1] - trial.tendon_excursion[0, 1]
+    told[trial.name] = {**told[trial.name], "tendon_excursion": excursion}
+    with pytest.raises(UserError, match=rf"{trial.name}/tendon_excursion: predictions of T2 repeat the measurements"):
         emulate(session, Recipe(), stacks, told)
