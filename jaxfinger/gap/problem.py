@@ -20,7 +20,7 @@ from jaxfinger.data import Predictions, Session
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.effects import Scales
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import Stack, prepare
+from jaxfinger.experiments import Stack
 from jaxfinger.gap.merged_trials import MergedTrials, merged_trials
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
@@ -39,7 +39,7 @@ from jaxfinger.identify.stages import (
     sources_of,
 )
 from jaxfinger.identify.start import start_values
-from jaxfinger.identify.trial_coverage import Coverage, can_determine, coverage_of
+from jaxfinger.identify.trial_coverage import Coverage, can_determine, coverage_of, readings_of
 from jaxfinger.model import Model, Terms, terms_without_effects
 
 MAX_ROUNDS = 8  # of refits to all trials, each with the noise that the one before leaves
@@ -148,7 +148,7 @@ def build(
         recipe: the nominal model; with `against`, the recipe of that fit.
         progress: called with a message before each step.
         predictions: of another simulator, which then takes the nominal model's place (see `simulator`).
-        coarse: factor by which averages are longer, as in `prepare`.
+        coarse: factor by which averages are longer, as in `experiments.prepare`.
         against: an earlier fit of the same finger. Its values start the identification, and its covariance is the
             prior of the refit.
 
@@ -157,7 +157,7 @@ def build(
             or holds effects.
     """
     progress("reading the recordings")
-    measured = stacks = prepare(session, coarse=coarse)
+    measured = stacks = readings_of(session, coarse=coarse)
     simulator = None
     if predictions is not None:
         progress("imitating the simulator")

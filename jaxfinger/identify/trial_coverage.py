@@ -37,7 +37,9 @@ def coverage_of(reads: Collection[str], session: Session) -> Coverage:
     return Coverage(joints, moved, {t.tendon for t in trials if t.tendon}, free)
 
 
-def readings_of(session: Session, names: list[str], sizes: Sizes | None = None) -> dict[str, Stack]:
+def readings_of(
+    session: Session, names: list[str] | None = None, sizes: Sizes | None = None, coarse: int = 1
+) -> dict[str, Stack]:
     """The named trials as `prepare` reduces them for a fit; columns that never change count as not measured.
 
     Such a column would be fitted exactly, with noise of zero: its parameters would have intervals of zero width.
@@ -45,7 +47,7 @@ def readings_of(session: Session, names: list[str], sizes: Sizes | None = None) 
     Raises:
         UserError: an angle of a trial is not finite, or its trials are sampled at rates too different to be stacked.
     """
-    for t in (session[name] for name in names):
+    for t in session if names is None else (session[name] for name in names):
         lost = ~np.isfinite(t.q).all(axis=1)
         if lost.any():
             raise UserError(
@@ -53,7 +55,8 @@ def readings_of(session: Session, names: list[str], sizes: Sizes | None = None) 
                 f"{counted(int(lost.sum()), 'sample')}, the first at {t.time[np.argmax(lost)]:.4g} s; fill them in, "
                 "cut them off, or leave the trial out"
             )
-    return {e: _without_constant(stack, session) for e, stack in prepare(session, names, sizes=sizes).items()}
+    stacks = prepare(session, names, coarse=coarse, sizes=sizes)
+    return {e: _without_constant(stack, session) for e, stack in stacks.items()}
 
 
 def _without_constant(stack: Stack, session: Session) -> Stack:

@@ -244,3 +244,12 @@ def test_validation_trials_alone_determine_the_nominal_model():
         for number, c in enumerate(problem.stacks[e].experiment.channels):
             white = problem.r[rows.start + np.flatnonzero(rows.channel == number)]
             assert np.sqrt(np.mean(white**2)) < 1.2, (e, c)
+
+
+def test_a_torque_that_never_changes_is_not_judged(session):
+    first = next(iter(session.select("ID.3-static")))
+    dead = replace(first, joint_torque=np.zeros_like(first.joint_torque))
+    problem = build(replace(session, trials=session.trials | {first.name: dead}), Recipe())
+    stack = problem.stacks["ID.3-static"]
+    counts = np.asarray(stack.batch.mask["joint_torque"]).any(axis=(0, 2))
+    assert [name for name, counted in zip(stack.trials, counts, strict=True) if not counted] == [first.name]
