@@ -17,6 +17,7 @@ from jaxfinger.data.check_delay import check_delay
 from jaxfinger.data.check_finger import check_finger
 from jaxfinger.data.check_gravity import check_gravity
 from jaxfinger.data.check_held import check_held
+from jaxfinger.data.check_pulls import check_pulls
 from jaxfinger.data.check_trial import MAX_TARE_ERROR, check_trial
 from jaxfinger.data.check_work import check_work
 from jaxfinger.data.filtering import longest_spike, outlier_mask
@@ -196,6 +197,7 @@ def check_samples(session: Session, report: Report) -> None:
             check_gravity(session, report)
             check_held(session, report)
             check_delay(session, report)
+            check_pulls(session, report)
 
 
 def check_spikes(session: Session, report: Report) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.bad_input import complaints
 from jaxfinger.data.check_delay import check_delay
+from jaxfinger.data.check_pulls import check_pulls
 from jaxfinger.data.findings import Report
 from jaxfinger.data.session import Session
 from tests.data.sweeps import Sweep, alone, late, led, play, pre_sliding, pulled, swept
@@ -25,6 +26,7 @@ MACHINES = [
 def delays(session, trial) -> list[str]:
     report = Report()
     check_delay(alone(session, trial), report)
+    check_pulls(alone(session, trial), report)
     return [str(finding) for finding in report]
 
 
@@ -109,7 +111,7 @@ def pulls(session, **how) -> list[str]:
     """What is said of five pulls."""
     report = Report()
     trials = {f"{k}": replace(pulled(seed=k, **how), name=f"{k}") for k in range(5)}
-    check_delay(Session("x", session.finger, trials), report)
+    check_pulls(Session("x", session.finger, trials), report)
     return [str(finding) for finding in report]
 
 
