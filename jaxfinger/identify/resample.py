@@ -119,11 +119,15 @@ def plan_of(session: Session, fit: Fit) -> list[tuple[dict[str, tuple[str, ...]]
         raise UserError(f"{file}: no stage of the fit was fitted, so no parameter depends on a trial")
     if done[-1:] == [AHEAD]:
         raise UserError(f"{file}: the fit was refined with --ahead; give one without it")
-    lacking = {name for name in done if name in STAGES} - {t.experiment for t in session}
-    if lacking and ", " not in fit.data:  # stages of a fit of several sessions may have read another one
-        raise UserError(f"{file}: has no {min(lacking)} trial, of which the fit was made; give the session of the fit")
+    experiments = fit.recipe.fit.joint_experiments
+    needed = experiments if JOINT in done else [name for name in done if name in STAGES]
+    lacking = [e for e in needed if all(t.experiment != e for t in session)]
+    if JOINT in done and len(lacking) < len(needed):
+        lacking = []  # The refinement was made from what there is.
+    if lacking and ", " not in fit.data:  # Stages of a fit of several sessions may have read another one.
+        raise UserError(f"{file}: has no {lacking[0]} trial, of which the fit was made; give the session of the fit")
     if JOINT in done:
-        return [({e: joint_channels(e) for e in fit.recipe.fit.joint_experiments}, fit.estimated)]
+        return [({e: joint_channels(e) for e in experiments}, fit.estimated)]
     coverage = {name: coverage_of(STAGES[name].reads, session) for name in done}
     plan = [(STAGES[n].reads, stage_free(fit, STAGES[n], parameters, coverage[n])) for n in done]
     later = [np.concatenate([np.zeros(0, int), *(f for _, f in plan[k + 1 :])]) for k in range(len(plan))]
