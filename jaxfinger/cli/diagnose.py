@@ -12,7 +12,8 @@ from jaxfinger.cli.output import Output, console, plain, print_json, progress, r
 from jaxfinger.errors import UserError
 
 if TYPE_CHECKING:
-    from jaxfinger.data import Predictions, Session
+    from jaxfinger.data import Session
+    from jaxfinger.gap.predicted import CheckedPredictions
 
 FILES = ("gap.json", "nominal.json", "augmented.json", "report.html")
 
@@ -132,15 +133,15 @@ def _refuse_predictions(predictions: Path, sessions: tuple[Path, ...]) -> None:
         raise UserError(f"{predictions}: is the session itself; give the simulator's predictions of its trials")
 
 
-def _predictions(file: Path, session: Session) -> Predictions:
+def _predictions(file: Path, session: Session) -> CheckedPredictions:
     """Read predictions of a session, print what is doubtful about them, and refuse what can only be a mistake."""
     from jaxfinger.data import read_predictions
     from jaxfinger.data.findings import Report
-    from jaxfinger.gap.predicted import refuse_mistaken
+    from jaxfinger.gap.predicted import checked
 
     report = Report()
-    simulated = read_predictions(file, session, report)
-    for finding in (*report, *refuse_mistaken(session, simulated, str(file))):
+    simulated = checked(session, read_predictions(file, session, report), str(file))
+    for finding in (*report, *simulated.doubts):
         print(plain(f"{file}: {finding}"), file=sys.stderr)
     return simulated
 

@@ -21,6 +21,7 @@ MAX_OVERTRAVEL = 0.35  # rad, 20 degrees, that a joint may read beyond its limit
 # Readings below zero, as shares of the highest tension. A good tare is off by a hundredth. A taut tendon is held at a
 # fifth or more (`data.sizes`), so a column of the wrong sign reads at least twice MAX_PUSH below zero.
 MAX_TARE_ERROR = 0.03
+_MAX_TARE = 0.5  # of the highest tension: a tendon that reads more is pulled on purpose.
 MAX_PUSH = 0.1
 _MAX_DEGREES = 400.0  # Angles in degrees are smaller: a turn, with room.
 COLD = 200.0  # K, −73 °C: no laboratory is colder, so lower values are in °C.
@@ -350,7 +351,8 @@ def _magnitudes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: R
 def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
     """Check that tensions are positive but for noise and tare, about zero where tendons are slack, and not in mN."""
     assert trial.tendon_force is not None
-    place, taut, slack = _place(trial, "tendon_force"), {}, []
+    place, tare = _place(trial, "tendon_force"), max(MAX_TARE_ERROR * sizes.tension, sizes.slack)
+    unslack, slack = {}, []  # tendons with a tension where they are to be slack, and without one where to be taut
     for name, active, x in zip(finger.tendon_names, finger.active, trial.tendon_force.T, strict=True):
         if not np.isfinite(x).all():
             continue
@@ -360,24 +362,21 @@ def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repo
         low = float(np.percentile(x, 5.0))
         if low < -max(MAX_PUSH * sizes.tension, sizes.slack) and trial.experiment not in _SLACK:
             report.error(place, f"column {name} falls to {low:.3g} N, and a tendon cannot push; check sign and tare")
-        elif low < -max(MAX_TARE_ERROR * sizes.tension, sizes.slack):
+        elif low < -tare:
             report.warning(place, f"column {name} falls to {low:.3g} N, below zero by more than noise; check the tare")
-        elif (
-            trial.experiment in _SLACK and max(MAX_TARE_ERROR * sizes.tension, sizes.slack) < low < 0.5 * sizes.tension
-        ):
-            taut[name] = low
-        elif trial.experiment == "ID.2" and np.median(x) <= min(sizes.slack, NOISE_FACTOR * sizes.noise):
+        elif trial.experiment in _SLACK and tare < low < _MAX_TARE * sizes.tension:
+            unslack[name] = low
+        elif trial.experiment == "ID.2" and np.median(x) <= NOISE_FACTOR * sizes.noise:
             slack.append(name)
         if np.percentile(x, 95.0) > 2000.0:
             report.warning(place, f"column {name} exceeds 2000 N; {conversion('mN')} if that is what it is")
     if slack and trial.tendon_excursion is not None:
         said = f"shows no tension in {listed(slack)}, though ID.2 needs taut tendons to follow the joint"
         report.warning(place, f"{said}; check the columns, or record the trial again with tension")
-    if taut:
-        said = (
-            f"stays above {min(taut.values()):.3g} N in {listed(list(taut))}, though {trial.experiment} leaves tendons"
-        )
-        report.warning(place, f"{said} slack; check the tare, or let the tendons go")
+    if unslack:
+        said = f"stays above {min(unslack.values()):.3g} N in {listed(list(unslack))}"
+        said = f"{said}, though {trial.experiment} leaves tendons slack"
+        report.warning(place, f"{said}; check the tare, or let the tendons go")
 
 
 def _holds(trial: Trial, report: Report) -> None:

@@ -142,7 +142,8 @@ def _cut(clock: Clock, trial: MappedTrial, where: Place, report: Report) -> Cloc
     if trial.span is not None:
         begin, end = trial.span
         lasts = float(clock.time[-1] - clock.origin) if len(clock.time) else 0.0
-        if lasts < end <= 1e3 * lasts and end - begin > 100.0 * lasts:
+        # In ms, a tenth of the recording or more is a hundred times as long as the recording in s.
+        if 100.0 * lasts < end - begin and end <= 1000.0 * lasts:
             said = f"ends at {end:g} s, and the recording at {lasts:.4g} s"
             report.warning((where / "span").key, f"{said}; write s from its first sample, not ms")
         clock = clock.keep((clock.time - clock.origin >= begin) & (clock.time - clock.origin < end))
@@ -199,11 +200,11 @@ def increasing_order(time: np.ndarray, name: str, sort: bool, choice: str, where
     if len(begins):
         far = f"runs back by {time[begins[0]] - time[begins[0] + 1]:.4g} s after sample {begins[0]}"
         far += f", and at {counted(len(begins), 'place')} in all" if len(begins) > 1 else ""
-        period = time[begins[0]] - time[begins[0] + 1] + float(np.median(np.diff(time)))
+        wraps_after = time[begins[0]] - time[begins[0] + 1] + float(np.median(np.diff(time)))
         where.fail(
             f"the clock {name} {far}: it begins again or wraps, and sorting would mix different times; {choice}, or "
-            f"unwrap a clock that wraps after {period:.6g} s by its period in its own units, as time = {{ from = …, "
-            "unwrap = 4294967296 }"
+            f"unwrap a clock that wraps after {wraps_after:.6g} s by its period in its own units, as "
+            "time = { from = …, unwrap = 4294967296 }"
         )
     at, back, twice = int(np.argmax(late)), int((np.diff(time) < 0.0).sum()), int((np.diff(np.sort(time)) == 0.0).sum())
     if not sort:

@@ -80,8 +80,9 @@ def sizes_of(session: Session) -> Sizes:
         if trial.experiment in ("ID.2", "ID.3-static"):
             steps.append(travel_time(trial.time, trial.q) / STEP_TIME)
     pace = _pace(sweeps)
-    # Slow motions are as quick as they were measured to be, whatever the sweeps are; slow ones follow the sweeps' pace.
-    slow = pace if not any(steps) else quick if (quick := _pace(steps)) < 1.0 else max(pace, 1.0)
+    slow = _pace(steps) if any(steps) else pace
+    if slow >= 1.0:  # Quick steps count as measured. Slow ones follow the sweeps' pace, which is better known.
+        slow = max(pace, 1.0)
     return Sizes(highest_tension(session), max(excursions), float(np.median(noises)) if noises else 0.0, pace, slow)
 
 

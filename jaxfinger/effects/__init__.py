@@ -71,8 +71,8 @@ def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
             raise UserError(f"{path}: {kind.__name__} has the ID {name}, which the catalogue has; choose another")
         if not re.fullmatch("[a-z][a-z0-9_]*", name):
             raise UserError(f"{path}: {kind.__name__} has the ID {name!r}; use small letters, digits and underscores")
-        place, plain = getattr(kind, "PLACE", None), "sites" not in kind.__dict__
-        if plain and place not in PLACES and (near := did_you_mean(place, PLACES)):
+        place = getattr(kind, "PLACE", None)
+        if "sites" not in vars(kind) and place not in PLACES and (near := did_you_mean(place, PLACES)):
             raise UserError(f"{path}: {kind.__name__} has the PLACE {place!r}{near}")
         if not kind.amplitudes():
             raise UserError(f"{path}: {kind.__name__} has no amplitude; declare a field with `amplitude`")

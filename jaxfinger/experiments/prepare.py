@@ -32,6 +32,13 @@ class Batch(eqx.Module):
     mask: dict[str, Float[Array, "_columns *B T"]]  # 1 where a sample is valid, else 0
 
 
+class Coarseness(NamedTuple):
+    """Error of the converter of each column of a channel (`quantisation`)."""
+
+    std: Float[np.ndarray, " _columns"]  # in the channel's unit
+    lasts: Float[np.ndarray, " _columns"]  # s
+
+
 @dataclass(frozen=True)
 class Stack:
     """A batch with the names, motions and holds of its trials."""
@@ -43,9 +50,7 @@ class Stack:
     holds: Int[np.ndarray, "B T"]  # index of the static hold, −1 between holds
     dt: float  # s, between samples
     measured: dict[str, bool]  # by channel: whether any trial measured it
-    # By channel, of each column: standard deviation of its converter's error, in its unit, and how long that lasts,
-    # s (`quantisation`).
-    coarseness: dict[str, Float[np.ndarray, "2 _columns"]] = field(default_factory=dict)
+    coarseness: dict[str, Coarseness] = field(default_factory=dict)  # by channel
 
     def samples_of_holds(self, trial: int, counts: np.ndarray) -> list[np.ndarray]:
         """Indices of the valid samples of each hold of a trial; `counts` (T,) is nonzero where a sample is valid."""
@@ -83,10 +88,11 @@ def prepare(
         chosen = [t for t in session if t.experiment == experiment.name and (names is None or t.name in names)]
         trials = [t for t in chosen if len(t.time) > 1]
 
-        def row(trial: Trial, experiment: Experiment = experiment) -> tuple[Row, dict[str, bool], dict]:
+        def row(trial: Trial, experiment: Experiment = experiment) -> _Reduced:
             r = prepared(experiment, trial, session, sizes, reduced, minus, coarse)
-            coarseness = {c: _coarseness(trial, c) for c in experiment.channels if reduced}
-            return KINDS[experiment.kind].reduce(r), {c: bool(s.any()) for c, s in r.sound.items()}, coarseness
+            measured = {c: bool(s.any()) for c, s in r.sound.items()}
+            there = [c for c in experiment.channels if reduced and getattr(trial, c) is not None]
+            return _Reduced(KINDS[experiment.kind].reduce(r), measured, {c: _coarseness(trial, c) for c in there})
 
         long = any(len(t.time) > MIN_THREADED_SAMPLES for t in trials)
         with ThreadPoolExecutor(os.cpu_count() if long else 1) as pool:
@@ -107,17 +113,24 @@ def not_judged(stacks: dict[str, Stack]) -> list[NotJudged]:
     return out
 
 
-def _coarseness(trial: Trial, channel: str) -> Float[np.ndarray, "2 _columns"]:
-    """Standard deviation of the converter's error in each column of a channel, and its duration in s."""
-    values, step = getattr(trial, channel), float(np.median(np.diff(trial.time)))
-    error, samples = np.zeros((2, 1)) if values is None else np.reshape([quantisation(x) for x in values.T], (-1, 2)).T
-    return np.stack([error, samples * step])
+class _Reduced(NamedTuple):
+    row: Row
+    measured: dict[str, bool]  # by channel
+    coarseness: dict[str, Coarseness]  # by channel that is measured
 
 
-def _stack(
-    experiment: Experiment, trials: list[Trial], reduced_trials: list[tuple[Row, dict[str, bool], dict]], reduced
-) -> Stack:
-    rows = [row for row, _, _ in reduced_trials]
+def _coarseness(trial: Trial, channel: str) -> Coarseness:
+    std, samples = np.transpose([quantisation(x) for x in getattr(trial, channel).T])
+    return Coarseness(std, samples * float(np.median(np.diff(trial.time))))
+
+
+def _mean_coarseness(members: list[Coarseness]) -> Coarseness:
+    """Root mean square over several trials."""
+    return Coarseness(*(np.sqrt(np.mean(np.square(values), axis=0)) for values in zip(*members, strict=True)))
+
+
+def _stack(experiment: Experiment, trials: list[Trial], reduced_trials: list[_Reduced], reduced: bool) -> Stack:
+    rows = [x.row for x in reduced_trials]
     steps = {round(r.dt, 6) for r in rows}
     # One noise model serves all trials of a stack, so that their sampling times must be alike.
     if reduced and max(steps) > 1.5 * min(steps):
@@ -147,9 +160,10 @@ def _stack(
         tuple(t.motion for t in trials),
         np.stack([np.pad(r.hold, (0, T - r.hold.size), constant_values=-1) for r in rows]),
         float(np.median([r.dt for r in rows])),
-        {c: any(measured[c] for _, measured, _ in reduced_trials) for c in experiment.channels},
+        {c: any(x.measured[c] for x in reduced_trials) for c in experiment.channels},
         {
-            c: np.sqrt(np.mean([np.broadcast_to(k[c], (2, len(y[c]))) ** 2 for _, _, k in reduced_trials], axis=0))
-            for c in (experiment.channels if reduced else ())
+            c: _mean_coarseness(members)
+            for c in experiment.channels
+            if (members := [x.coarseness[c] for x in reduced_trials if c in x.coarseness])
         },
     )

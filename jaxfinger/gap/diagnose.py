@@ -32,7 +32,7 @@ from jaxfinger.gap.parts import (
     unexplained_part,
 )
 from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY, Posterior, posterior
-from jaxfinger.gap.predicted import refuse_mistaken
+from jaxfinger.gap.predicted import CheckedPredictions, checked
 from jaxfinger.gap.problem import Problem, build, site
 from jaxfinger.gap.result import (
     Closure,
@@ -74,7 +74,7 @@ def diagnose(
     effects: dict[str, type[CatalogueEffect]] | None = None,
     without: tuple[str, ...] = (),
     progress: Progress = lambda message: None,
-    predictions: Predictions | None = None,
+    predictions: Predictions | CheckedPredictions | None = None,
     tolerance: Mapping[str, float] | None = None,
     against: Fit | None = None,
 ) -> Diagnosis:
@@ -94,7 +94,7 @@ def diagnose(
         effects: the user's own effects by id, candidates beside the catalogue's.
         without: ids of effects that are no candidates.
         progress: called with a message before each step.
-        predictions: of another simulator; the gap is then that between the measurements and these.
+        predictions: of another simulator, checked or not; the gap is then that between the measurements and these.
         tolerance: by channel, the share of its signal up to which a gap does not matter.
         against: an earlier fit of the same finger. Its recipe is the nominal model, and each of its parameters may have
             changed by more than its interval says: these changes are candidates too.
@@ -118,10 +118,10 @@ def diagnose(
             f"it has {', '.join(sorted(catalogue))}"
         )
     _refuse_odd_tolerance(tolerance)
-    doubts = ()
-    if predictions is not None:
-        doubts = tuple(x.sentence for x in refuse_mistaken(session, predictions, session.file or "the session"))
-    problem = build(session, recipe, progress, predictions, COARSE if quick else 1, against)
+    if predictions is not None and not isinstance(predictions, CheckedPredictions):
+        predictions = checked(session, predictions, session.file or "the session")
+    told, doubts = predictions or (None, ())
+    problem = build(session, recipe, progress, told, COARSE if quick else 1, against)
     diagnosed = partial(
         Diagnosis,
         data=Path(session.file).name if session.file else "",
@@ -129,7 +129,7 @@ def diagnose(
         against=None if against is None else against.data or against.specimen,
         quick=quick,
         tolerance=tolerance,
-        doubts=doubts,
+        doubts=tuple(x.sentence for x in doubts),
         problem=problem,
     )
     if next(measured_columns(problem), None) is None:

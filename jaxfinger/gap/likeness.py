@@ -15,24 +15,22 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
+from scipy.signal import correlate
 
-from jaxfinger.data import Predictions, Session, Trial, without_spikes
-from jaxfinger.data.filtering import fourier_length
+from jaxfinger.data import Predictions, Session, Trial
 from jaxfinger.data.findings import Report
 from jaxfinger.data.predictions import predicted_at
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.data.units import TO_SI
 from jaxfinger.errors import listed
 from jaxfinger.experiments import EXPERIMENTS
+from jaxfinger.gap.comparison import MIN_MISSED, Comparison, compare, comparisons
 
-# E of predictions that may hold a mistake. Parameters that are off by half miss a quarter of the motion.
-MIN_MISSED = 0.5
 # E that a mend leaves. Predictions within 30 % of the measured motion are those of a poor simulator, mended.
 MAX_MENDED = 0.1
 # E that a mend leaves where one column shows it. A spring that turns the weight's torque round makes a simulator
@@ -47,69 +45,10 @@ MIN_CERTAIN_FACTOR = 30.0
 MIN_RELATED = 0.1
 # E from which predictions miss too much to be called poor: they are four times too large.
 MAX_MISSED = 9.0
-# Motion over the noise between samples, as mean squares. White noise has 1; a column that moves has far more.
-MIN_MOTION = 10.0
 # Share of the channel's largest rms in any trial. What moves less may be a side effect, which simulators leave out.
 MIN_SIZE = 0.1
-# Share of the measured rms. Predictions that move less are constant but for rounding.
-MAX_STILL = 1e-6
 # Share of a trial by which predictions may be shifted: a larger part of the motion would be compared with nothing.
 MAX_SHIFT = 0.25
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A channel of one trial, or of several added up: k measured columns y_j and predicted ones p_i about their means.
-
-    Row j has the samples in which y_j was measured. Columns that were not measured or predicted are zero.
-    """
-
-    channel: str
-    trials: tuple[str, ...]
-    samples: Float[np.ndarray, " k"]
-    moved: Float[np.ndarray, "k k"]  # ‖y_j‖² where p_i is predicted
-    told: Float[np.ndarray, "k k"]  # ‖p_i‖² in the samples of y_j
-    cross: Float[np.ndarray, "k k"]  # y_j · p_i
-    moves: Bool[np.ndarray, " k"]  # whether y_j is motion, and not noise alone
-
-    def missed(self, factor: float = 1.0) -> Float[np.ndarray, "k k"]:
-        """E of every measured column and predicted column times the factor; infinite without a pair that moves."""
-        left = self.moved - 2.0 * factor * self.cross + factor**2 * self.told
-        return np.where((self.moved > 0.0) & self.moves[:, None], left / np.maximum(self.moved, 1e-300), np.inf)
-
-    @property
-    def size(self) -> Float[np.ndarray, " k"]:
-        """Mean square of every measured column that is predicted too."""
-        return np.diag(self.moved) / np.maximum(self.samples, 1.0)
-
-    @property
-    def unlike(self) -> Bool[np.ndarray, " k"]:
-        """Columns of which the predictions miss most of the motion."""
-        own = np.diag(self.missed())
-        return (own >= MIN_MISSED) & np.isfinite(own)
-
-    @property
-    def still(self) -> Bool[np.ndarray, " k"]:
-        """Columns whose predictions are constant while the measured ones move."""
-        return self.moves & (np.diag(self.told) <= MAX_STILL**2 * np.diag(self.moved))
-
-    def without(self, columns: Bool[np.ndarray, " k"]) -> Comparison:
-        """The comparison without some of its measured columns."""
-        kept = ~columns
-        moved, told, cross = (x * kept[:, None] for x in (self.moved, self.told, self.cross))
-        return Comparison(self.channel, self.trials, self.samples * kept, moved, told, cross, self.moves & kept)
-
-    def __add__(self, other: Comparison) -> Comparison:
-        """Both together; a column that does not move in one of them counts there as well."""
-        return Comparison(
-            self.channel,
-            self.trials + other.trials,
-            self.samples + other.samples,
-            self.moved + other.moved,
-            self.told + other.told,
-            self.cross + other.cross,
-            self.moves | other.moves,
-        )
 
 
 class Mistake(NamedTuple):
@@ -141,7 +80,7 @@ def check_likeness(session: Session, predictions: Predictions, report: Report) -
 
     `predictions` fit the session's trials (`refuse_misfits`).
     """
-    compared = list(_comparisons(session, predictions))
+    compared = list(comparisons(session, predictions))
     for channel in dict.fromkeys(c.channel for c in compared):
         mine = [c for c in compared if c.channel == channel]
         names = CHANNELS[channel].columns(session.finger)
@@ -155,40 +94,6 @@ def check_likeness(session: Session, predictions: Predictions, report: Report) -
             mine = [_unexplained(c, mistake) for c in mine]
         _report_unlike(mine, least, names, report)
     _report_free_torque(session, predictions, report)
-
-
-def _comparisons(session: Session, predictions: Predictions) -> Iterator[Comparison]:
-    """Comparisons of every channel and trial that a diagnosis judges.
-
-    The excursions of held joints are not among them: they stretch, and a simulator without stretch predicts none.
-    """
-    for trial in session:
-        experiment, prediction = EXPERIMENTS[trial.experiment], predictions.get(trial.name, {})
-        for channel in experiment.channels:
-            values = getattr(trial, channel)
-            if values is None or channel not in prediction or (experiment.held and channel == "tendon_excursion"):
-                continue
-            yield _compare(trial.name, channel, values, predicted_at(prediction, channel, trial, values.shape))
-
-
-def _compare(
-    trial: str, channel: str, measured: Float[np.ndarray, "N k"], predicted: Float[np.ndarray, "N k"]
-) -> Comparison:
-    k = measured.shape[1]
-    there = np.isfinite(predicted).all(axis=0)
-    moved, told, cross = np.zeros((3, k, k))
-    samples, moves = np.zeros(k), np.zeros(k, bool)
-    for j in range(k):
-        rows = np.isfinite(measured[:, j])
-        if rows.sum() < 3:
-            continue
-        y = without_spikes(measured[rows, j : j + 1])[:, 0]
-        p = np.where(there, predicted[rows], 0.0)
-        y, p = y - y.mean(), p - p.mean(axis=0)
-        square = float(y @ y)
-        samples[j], moves[j] = len(y), square > MIN_MOTION * 0.5 * float(np.sum(np.diff(y) ** 2))
-        moved[j], told[j], cross[j] = np.where(there, square, 0.0), np.sum(p**2, axis=0), y @ p
-    return Comparison(channel, (trial,), samples, moved, told, cross, moves)
 
 
 # What may be wrong ----------------------------------------------------------------------------------------------------
@@ -322,7 +227,7 @@ def _exchanged_trials(session: Session, predictions: Predictions, compared: list
             if other == name or there.experiment != trial.experiment or len(there.time) != len(trial.time):
                 continue
             told = predicted_at(predictions[other], c.channel, there, measured.shape)
-            left = float(np.diag(_compare(name, c.channel, measured, told).missed())[unlike].max())
+            left = float(np.diag(compare(name, c.channel, measured, told).missed())[unlike].max())
             if left <= min(MAX_MENDED, like.get(name, ("", np.inf))[1]):
                 like[name] = other, left
     while set(like) != {other for other, _ in like.values()}:
@@ -360,15 +265,12 @@ def _best_shift(trial: Trial, y: Float[np.ndarray, " N"], p: Float[np.ndarray, "
         return 0.0, np.inf
     grid = np.linspace(trial.time[0], trial.time[-1], len(trial.time))
     y, p = (np.interp(grid, trial.time[rows], x[rows] - x[rows].mean()) for x in (y, p))
-    n, length = len(grid), fourier_length(2 * len(grid))
+    n, most, one = len(grid), int(MAX_SHIFT * len(grid)), np.ones(len(grid))
 
     def over_lags(a: Float[np.ndarray, " N"], b: Float[np.ndarray, " N"]) -> Float[np.ndarray, " L"]:
-        """Σ a(t) b(t + lag) over the samples that both have."""
-        both = np.fft.irfft(np.fft.rfft(a, length).conj() * np.fft.rfft(b, length), length)
-        return np.concatenate([both[-most:], both[: most + 1]])
+        """Σ a(t) b(t + lag) over the samples that both have, for lags from −most to most."""
+        return correlate(b, a, method="fft")[n - 1 - most : n + most]
 
-    most = int(MAX_SHIFT * n)
-    one = np.ones(n)
     moved, told = over_lags(y**2, one), over_lags(one, p**2)
     missed = (moved - 2.0 * over_lags(y, p) + told) / np.maximum(moved, 1e-9 * float(y @ y))
     k = int(np.argmin(missed))

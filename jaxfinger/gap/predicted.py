@@ -1,12 +1,13 @@
 """What another simulator predicts of a session: which trials and columns, in which steps, and whether it can be so."""
 
 from collections import Counter
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.data import Predictions, Session, Trial
-from jaxfinger.data.findings import Report, merged
+from jaxfinger.data.findings import Finding, Report, merged
 from jaxfinger.data.predictions import refuse_misfits
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.data.sizes import sizes_of
@@ -38,7 +39,14 @@ def check_predictions(session: Session, predictions: Predictions) -> Report:
     return Report(merged(report))
 
 
-def refuse_mistaken(session: Session, predictions: Predictions, file: str) -> Report:
+class CheckedPredictions(NamedTuple):
+    """Predictions of a session that may be right, with what is doubtful about them."""
+
+    values: Predictions
+    doubts: tuple[Finding, ...]
+
+
+def checked(session: Session, predictions: Predictions, file: str) -> CheckedPredictions:
     """Check predictions, and refuse those that can only be a mistake; `file` is named in the message.
 
     Raises:
@@ -47,7 +55,7 @@ def refuse_mistaken(session: Session, predictions: Predictions, file: str) -> Re
     report = check_predictions(session, predictions)
     if report.fatal is not None:
         raise UserError(f"{file}: {report.fatal.sentence}")
-    return report
+    return CheckedPredictions(predictions, tuple(report))
 
 
 def _judged(trial: Trial, predictions: Predictions) -> list[str]:

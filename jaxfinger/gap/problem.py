@@ -29,6 +29,7 @@ from jaxfinger.identify.linearise import White
 from jaxfinger.identify.noise import Noise, estimate, history
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.prior import Prior, prior_of
+from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.solve import Solution, Source, solve, white_tangents
 from jaxfinger.identify.stages import (
     Progress,
@@ -39,7 +40,7 @@ from jaxfinger.identify.stages import (
     sources_of,
 )
 from jaxfinger.identify.start import start_values
-from jaxfinger.identify.trial_coverage import Coverage, can_determine, coverage_of, readings_of
+from jaxfinger.identify.trial_coverage import Coverage, can_determine, coverage_of
 from jaxfinger.model import Model, Terms, terms_without_effects
 
 MAX_ROUNDS = 8  # of refits to all trials, each with the noise that the one before leaves

@@ -25,10 +25,10 @@ from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.gauss_newton import TANGENTS_AT_ONCE, VisibleGaussNewton
 from jaxfinger.identify.linearise import Filters, huber, white_rows
 from jaxfinger.identify.parameters import Free, describe, ravel, with_flat
+from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.resample import Batching, Compressed, batching_here, compress, plan_of, staged_step
 from jaxfinger.identify.solve import KINK_TOLERANCE, MAX_STEPS, STEP_TOLERANCE, parameter_bounds
 from jaxfinger.identify.stages import cad_prior, nominal_model, sources_of
-from jaxfinger.identify.trial_coverage import readings_of
 from jaxfinger.model import Model
 
 SESSIONS_AT_ONCE = 10  # in one call, so that the next sessions are read and filtered while the device fits these

@@ -24,6 +24,7 @@ from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.predictions import model_for
 from jaxfinger.identify.prior import Prior, prior_of
 from jaxfinger.identify.propagate import propagate
+from jaxfinger.identify.readings import name_constant, readings_of
 from jaxfinger.identify.shooting import AHEAD, Shooting, shooting
 from jaxfinger.identify.solve import Source, parameter_bounds, solve
 from jaxfinger.identify.stages import (
@@ -37,7 +38,7 @@ from jaxfinger.identify.stages import (
     total_cost,
 )
 from jaxfinger.identify.start import start_values
-from jaxfinger.identify.trial_coverage import can_determine, coverage_of, name_constant, readings_of
+from jaxfinger.identify.trial_coverage import can_determine, coverage_of
 from jaxfinger.model import Model
 
 JOINT = "joint"  # name of the stage

@@ -154,8 +154,10 @@ def _at_least(noise: Noise, stack: Stack, channel: str) -> Noise:
     that lasts for L samples, a mean over many has L times the variance that it has where L is 1, as has that of an
     autoregression of order one with the coefficient (L − 1)/(L + 1).
     """
-    error, duration = stack.coarseness.get(channel, np.zeros((2, len(noise.std))))
-    L = duration / stack.dt
+    if channel not in stack.coarseness:
+        return noise
+    error, lasts = stack.coarseness[channel]
+    L = lasts / stack.dt
     error, a = error * np.sqrt(np.minimum(L, 1.0)), np.maximum(L - 1.0, 0.0) / (L + 1.0)
     coarse = error > noise.std
     ar = np.zeros_like(noise.ar)

@@ -18,9 +18,9 @@ from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.joint import JOINT
 from jaxfinger.identify.linearise import white_rows
 from jaxfinger.identify.parameters import Free, describe, ravel
+from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.resample import compress, plan_of
 from jaxfinger.identify.stages import sources_of
-from jaxfinger.identify.trial_coverage import readings_of
 from jaxfinger.identify.uncertainty import Samples
 
 

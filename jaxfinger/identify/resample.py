@@ -26,10 +26,11 @@ from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.joint import JOINT, joint_channels
 from jaxfinger.identify.linearise import linearise, triangular
 from jaxfinger.identify.parameters import Free, describe, ravel
+from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.shooting import AHEAD
 from jaxfinger.identify.solve import visible
 from jaxfinger.identify.stages import STAGES, cad_covariance, cad_prior, sources_of, stage_free
-from jaxfinger.identify.trial_coverage import coverage_of, readings_of
+from jaxfinger.identify.trial_coverage import coverage_of
 
 Batching = Literal["map", "vmap"]
 # Smallest pivot of a Cholesky factor of H_s[s, s], which is the identity where all weights are 1. A smaller one means
@@ -125,7 +126,8 @@ def plan_of(session: Session, fit: Fit) -> list[tuple[dict[str, tuple[str, ...]]
     if JOINT in done and len(lacking) < len(needed):
         lacking = []  # The refinement was made from what there is.
     if lacking and ", " not in fit.data:  # Stages of a fit of several sessions may have read another one.
-        raise UserError(f"{file}: has no {lacking[0]} trial, of which the fit was made; give the session of the fit")
+        said = f"has no {lacking[0]} trial, and the fit was made from some"
+        raise UserError(f"{file}: {said}; give the session of the fit")
     if JOINT in done:
         return [({e: joint_channels(e) for e in experiments}, fit.estimated)]
     coverage = {name: coverage_of(STAGES[name].reads, session) for name in done}

@@ -35,10 +35,10 @@ from jaxfinger.identify.linearise import Filters, huber, white_rows
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.predictions import model_for
 from jaxfinger.identify.prior import Prior
+from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.resample import plan_of
 from jaxfinger.identify.solve import Source
 from jaxfinger.identify.stages import cad_covariance, cad_prior, sources_of
-from jaxfinger.identify.trial_coverage import readings_of
 from jaxfinger.model import Model
 
 TRIALS, SENSORS, CAD = "trials", "sensors", "cad"

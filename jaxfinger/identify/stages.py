@@ -26,6 +26,7 @@ from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.predictions import model_for
 from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.propagate import propagate
+from jaxfinger.identify.readings import name_constant, readings_of
 from jaxfinger.identify.recipe import Recipe
 from jaxfinger.identify.shooting import AHEAD
 from jaxfinger.identify.solve import (
@@ -38,15 +39,7 @@ from jaxfinger.identify.solve import (
     solve,
 )
 from jaxfinger.identify.start import start_values
-from jaxfinger.identify.trial_coverage import (
-    Coverage,
-    can_determine,
-    coverage_of,
-    name_constant,
-    name_missing,
-    name_unseen,
-    readings_of,
-)
+from jaxfinger.identify.trial_coverage import Coverage, can_determine, coverage_of, name_missing, name_unseen
 from jaxfinger.model import Finger, Model
 
 Progress = Callable[[str], None]

@@ -26,7 +26,7 @@ from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.linearise import residuals_of
 from jaxfinger.identify.noise import estimate
 from jaxfinger.identify.predictions import model_for, simulate_trials
-from jaxfinger.identify.trial_coverage import name_constant, readings_of
+from jaxfinger.identify.readings import name_constant, readings_of
 from jaxfinger.model import Model
 from jaxfinger.table import Table
 

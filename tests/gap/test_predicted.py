@@ -9,7 +9,7 @@ import pytest
 from jaxfinger.data.predictions import refuse_misfits
 from jaxfinger.errors import UserError
 from jaxfinger.gap import diagnose
-from jaxfinger.gap.predicted import check_predictions, refuse_mistaken
+from jaxfinger.gap.predicted import check_predictions, checked
 from jaxfinger.identify.predictions import predict_session
 from jaxfinger.model import Model
 from jaxfinger.synthetic import paper_finger, polynomial_finger, recipe_from, simulate, true_model
@@ -83,7 +83,7 @@ def turned(column):
 )  # fmt: skip
 def test_a_mistake_is_refused_with_its_mend(session, predictions, channel, change, says):
     with pytest.raises(UserError, match=r"^p\.h5: /trials/") as refused:
-        refuse_mistaken(session, changed(predictions, change, channel), "p.h5")
+        checked(session, changed(predictions, change, channel), "p.h5")
     assert says in str(refused.value)
     assert f"/{channel}: " in str(refused.value)
 
@@ -102,7 +102,7 @@ def test_the_rule_has_no_size(session, predictions, scale, quantity):
     assert not said(big, right, "warning")
     assert not said(big, right, "error")
     with pytest.raises(UserError, match="1000 times as large"):
-        refuse_mistaken(big, changed(right, lambda v: 1e3 * v, quantity), "p.h5")
+        checked(big, changed(right, lambda v: 1e3 * v, quantity), "p.h5")
 
 
 def test_all_trials_with_the_mistake_are_named(session, predictions):
@@ -158,7 +158,7 @@ def test_the_torque_of_the_free_finger_is_not_given_as_zero(session, predictions
     with pytest.raises(
         UserError, match=f"/trials/{name}/joint_torque: predictions are zero throughout; give the torque"
     ):
-        refuse_mistaken(session, changed(predictions, lambda v: 0.0 * v, "joint_torque", {name}), "p.h5")
+        checked(session, changed(predictions, lambda v: 0.0 * v, "joint_torque", {name}), "p.h5")
 
 
 POOR = {

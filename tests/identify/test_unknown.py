@@ -96,7 +96,7 @@ def test_an_angle_that_is_missing_is_named_with_its_trial(session):
 @pytest.mark.parametrize("study", [compress, lambda session, fit: sensitivity(fit, session)])
 def test_a_study_of_a_fit_needs_the_trials_of_its_stages(session, staged, study):
     """Else the parameters of the stage that is missing would depend on nothing."""
-    with pytest.raises(UserError, match=r"has no ID\.4 trial, of which the fit was made"):
+    with pytest.raises(UserError, match=r"has no ID\.4 trial, and the fit was made from some"):
         study(session.select("ID.2", "ID.3-static", "ID.3-dynamic"), staged)
     nothing = identify(session.select("VD.1"))
     with pytest.raises(UserError, match="no stage of the fit was fitted"):
