@@ -1,7 +1,6 @@
 """Sessions: read, write and check the HDF5 format; filtering, derivatives, directions, holds."""
 
 from jaxfinger.data.check import check_file as check_file
-from jaxfinger.data.constant import constant_columns as constant_columns
 from jaxfinger.data.filtering import bridged as bridged
 from jaxfinger.data.filtering import filter_std as filter_std
 from jaxfinger.data.filtering import filtered_noise_std as filtered_noise_std
@@ -28,3 +27,4 @@ from jaxfinger.data.session import Session as Session
 from jaxfinger.data.session import Trial as Trial
 from jaxfinger.data.session import joints_of as joints_of
 from jaxfinger.data.session import moving_joints as moving_joints
+from jaxfinger.data.unmeasured import constant_columns as constant_columns

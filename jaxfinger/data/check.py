@@ -18,7 +18,8 @@ from jaxfinger.data.check_finger import check_finger
 from jaxfinger.data.check_gravity import check_gravity
 from jaxfinger.data.check_held import check_held
 from jaxfinger.data.check_pulls import check_pulls
-from jaxfinger.data.check_trial import MAX_TARE_ERROR, check_trial
+from jaxfinger.data.check_trial import check_trial
+from jaxfinger.data.check_values import MAX_TARE_ERROR
 from jaxfinger.data.check_work import check_work
 from jaxfinger.data.filtering import longest_spike, outlier_mask
 from jaxfinger.data.findings import Finding, Report
@@ -88,13 +89,11 @@ def check_session(session: Session, report: Report) -> None:
         sizes = sizes_of(session)
         for trial in session:
             if trial.experiment not in EXPERIMENT_NAMES:
-                message = (
-                    f"has the unknown experiment {trial.experiment!r}; it must be one of {', '.join(EXPERIMENT_NAMES)}"
-                )
-                report.error(f"/trials/{trial.name}", message)
+                known = ", ".join(EXPERIMENT_NAMES)
+                message = f"has the unknown experiment {trial.experiment!r}; it must be one of {known}"
+                report.error(trial.place(), message)
                 continue
             check_trial(trial, session.finger, sizes, report)
-    with np.errstate(all="ignore"):
         _check_tare(session, sizes, report)
     _check_pace(sizes, report)
     _check_order(session, report)
@@ -202,15 +201,10 @@ def check_samples(session: Session, report: Report) -> None:
 
 def check_spikes(session: Session, report: Report) -> None:
     """Report columns that hold spikes (`outlier_mask`)."""
-    for trial, name in ((trial, name) for trial in session for name in MEASURED):
+    for trial in session:
         longest = longest_spike(float(np.median(np.diff(trial.time))) if len(trial.time) > 1 else 0.0)
-        values = getattr(trial, name)
-        if values is None:
-            continue
-        share = float(outlier_mask(values, longest=longest).mean(axis=0).max(initial=0.0))
-        if share > 0.0:
-            say = report.warning if share > _MANY_SPIKES else report.note
-            say(
-                f"/trials/{trial.name}/{name}",
-                f"up to {share:.2%} of a column's samples are spikes; robust fits discount them",
-            )
+        for name in (name for name in MEASURED if getattr(trial, name) is not None):
+            share = float(outlier_mask(getattr(trial, name), longest=longest).mean(axis=0).max(initial=0.0))
+            if share > 0.0:
+                say = report.warning if share > _MANY_SPIKES else report.note
+                say(trial.place(name), f"up to {share:.2%} of a column's samples are spikes; robust fits discount them")

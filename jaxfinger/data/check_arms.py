@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection
-from dataclasses import dataclass
 
 import numpy as np
 
-from jaxfinger.data.check_trial import STILL_ANGLE
-from jaxfinger.data.check_work import slope, thinned
+from jaxfinger.data.arms import Arms
 from jaxfinger.data.findings import Report
-from jaxfinger.data.session import FingerDescription, Session
+from jaxfinger.data.session import FingerDescription
 
 # Share of the largest moment arm, from which a tendon travels. Smaller arms may be those of tendons that are dragged
 # along, or of sensors that feel each other.
@@ -25,35 +23,6 @@ MIN_TRAVEL_ARM = 0.25
 _MAX_RATIO = np.sqrt(2.0)
 _RATIO_ERROR = 1.2  # a tenth, with room: up to this factor a ratio is that of a mistake
 _RATIOS = {2.0: "as a diameter for a radius gives", np.degrees(1.0): "as degrees for rad give"}
-
-
-@dataclass(frozen=True)
-class Arms:
-    """Moment arms (n,) of all tendons at one joint, m/rad: `seen` in ID.2; `known` by the finger's file, or NaN."""
-
-    seen: np.ndarray
-    known: np.ndarray
-
-
-def measured_arms(session: Session) -> dict[int, Arms]:
-    """Moment arms by joint, of its motion: medians over the ID.2 trials in which no other joint turns."""
-    found: dict[int, list[np.ndarray]] = defaultdict(list)
-    for trial in session.select("ID.2"):
-        spans = np.ptp(trial.q, axis=0)
-        i = int(np.argmax(np.nan_to_num(spans)))
-        if trial.tendon_excursion is not None and np.all(np.delete(spans, i) < STILL_ANGLE) and spans[i] > STILL_ANGLE:
-            q = thinned(trial.q[:, i])
-            columns = [thinned(l) for l in trial.tendon_excursion.T] + list(_known(session.finger, i, q))
-            found[i].append(np.reshape([slope(q, l) for l in columns], (2, -1)))
-    return {i: Arms(*np.median(arms, axis=0)) for i, arms in found.items()}
-
-
-def _known(finger: FingerDescription, i: int, q: np.ndarray) -> np.ndarray:
-    """Excursions (n, N) at joint i by the finger's file, m; NaN where they are unknown."""
-    if finger.excursion is None:
-        return np.full((finger.n, len(q)), np.nan)
-    powers = np.arange(1, finger.excursion.shape[2] + 1)
-    return finger.excursion[:, i] @ q ** powers[:, None]
 
 
 def check_arms(finger: FingerDescription, arms: dict[int, Arms], exchanged: Collection[int], report: Report) -> None:

@@ -15,14 +15,11 @@ from itertools import combinations
 
 import numpy as np
 
-from jaxfinger.data.check_arms import MIN_TRAVEL_ARM, Arms, check_arms, measured_arms
-from jaxfinger.data.check_work import slope, thinned
+from jaxfinger.data.arms import MAX_STILL_ARM, Arms, measured_arms, slope, thinned
+from jaxfinger.data.check_arms import MIN_TRAVEL_ARM, check_arms
 from jaxfinger.data.findings import Report
 from jaxfinger.data.session import FingerDescription, Session, Trial
 
-# Share of the largest moment arm at a joint: a tendon with a smaller arm stands still. Between this arm and that of a
-# tendon that travels, an arm may be a small one, or a tendon may be dragged along.
-_MAX_STILL_ARM = 0.05
 _MAX_CAD_ERROR = 0.2  # of the known arms: CAD is good to a tenth, so columns that miss by less may be right.
 _MAX_EXCHANGED_ERROR = 0.25  # of the error as named: exchanged columns must fit the known arms this much better.
 _MIN_STRETCH_R2 = 0.9  # squared correlation of excursion with tension, from which the tendon is taken to stretch
@@ -48,7 +45,7 @@ def _by_crossing(finger: FingerDescription, arms: dict[int, Arms]) -> Iterator[t
     """Pairs of tendons of which one crosses a joint and stands still there, and the other the other way round."""
     for i, seen in ((i, at.seen) for i, at in arms.items()):
         size = np.abs(seen) / np.nanmax(np.abs(seen[finger.active]), initial=0.0)
-        still = np.flatnonzero(finger.active & finger.crosses[:, i] & (size < _MAX_STILL_ARM))
+        still = np.flatnonzero(finger.active & finger.crosses[:, i] & (size < MAX_STILL_ARM))
         travel = np.flatnonzero(finger.active & ~finger.crosses[:, i] & (size > MIN_TRAVEL_ARM))
         if len(still) == len(travel) == 1:
             (a,), (b,) = still, travel
@@ -83,8 +80,7 @@ def _by_stretch(session: Session) -> Iterator[tuple[tuple[int, int], str]]:
     finger = session.finger
     moves: dict[int, set[int]] = defaultdict(set)
     for trial in session.select("ID.4"):
-        if trial.tendon in finger.tendon_names:
-            pulled = finger.tendon_names.index(trial.tendon)
+        if (pulled := finger.tendon(trial.tendon)) is not None:
             moves[pulled] |= _stretched(trial, pulled, finger.active)
     for a, b in combinations(sorted(moves), 2):
         if moves[a] == {b} and moves[b] == {a}:

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from jaxfinger.data.check_trial import STILL_ANGLE
 from jaxfinger.data.findings import Report
+from jaxfinger.data.motion import STILL_ANGLE
 from jaxfinger.data.schema import CHANNELS, MEASURED
 from jaxfinger.data.session import FingerDescription, Session, Trial
 from jaxfinger.errors import listed
@@ -31,10 +31,10 @@ def check_copied_trials(session: Session, report: Report) -> None:
             if all(np.array_equal(values, getattr(other, name), equal_nan=True) for name, values in measured.items()):
                 said = f"is the same recording as trial {other.name}, sample for sample"
                 if trial.experiment == other.experiment:
-                    report.error(f"/trials/{trial.name}", f"{said}; remove one of them")
+                    report.error(trial.place(), f"{said}; remove one of them")
                 else:
                     said = f"{said}, which is {other.experiment}"
-                    report.warning(f"/trials/{trial.name}", f"{said}; give each its own part of the recording")
+                    report.warning(trial.place(), f"{said}; give each its own part of the recording")
                 break
         earlier.append(trial)
 
@@ -50,7 +50,7 @@ def check_copied_columns(session: Session, report: Report) -> None:
             if values is not None and not (trial.experiment == "VD.3" and channel == "tendon_force"):
                 for alike in _copies(channel, values, session.finger):
                     report.warning(
-                        f"/trials/{trial.name}/{channel}",
+                        trial.place(channel),
                         f"columns {listed(alike)} hold the same numbers at every sample, noise included, as no two "
                         "sensors do; map each from its own column, and leave out those that have no sensor",
                     )

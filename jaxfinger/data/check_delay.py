@@ -63,20 +63,20 @@ def check_delay(session: Session, report: Report) -> None:
     """Report torques (ID.3-dynamic) and excursions (ID.2) that come late, and angles that come late against them."""
     finger = session.finger
     for trial in session.select("ID.2", "ID.3-dynamic"):
-        if trial.joint not in finger.joint_names:
+        i, led = finger.joint(trial.joint), trial.experiment == "ID.2"
+        if i is None:
             continue
-        i, led = finger.joint_names.index(trial.joint), trial.experiment == "ID.2"
         columns = finger.active & finger.crosses[:, i] if led else np.arange(finger.m) == i
         channel = "tendon_excursion" if led else "joint_torque"
         motion = _motion(trial, i, channel, np.flatnonzero(columns))
         if motion is None:
             continue
         delays = _delays(motion)
-        say_delays(trial, channel, "q", trial.joint, finger, delays, report)
+        say_delays(trial, channel, "q", finger.joint_names[i], finger, delays, report)
         if not delays and not led and (constant := _time_constant(motion)):
             said = f"column {trial.joint} has passed a low-pass filter of about {0.5 / (np.pi * constant):.2g} Hz"
             mend = "record it without, or filter both"
-            report.warning(f"/trials/{trial.name}/{channel}", f"{said}, and q of {trial.joint} has not; {mend}")
+            report.warning(trial.place(channel), f"{said}, and q of {trial.joint} has not; {mend}")
 
 
 class _Motion(NamedTuple):

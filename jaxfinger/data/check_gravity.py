@@ -60,7 +60,7 @@ def check_gravity(session: Session, report: Report) -> None:
     coupled = _coupled(finger)
     motions: dict[int, list[_Motion]] = defaultdict(list)
     for trial in session.select("ID.3-static", "ID.3-dynamic"):
-        if trial.joint in finger.joint_names and (i := finger.joint_names.index(trial.joint)) not in coupled:
+        if (i := finger.joint(trial.joint)) is not None and i not in coupled:
             motions[i] += _motion(trial, i)
     told = [i for i, of in motions.items() if _postures(of, i) > _MIN_POSTURE]
     parts = [_equations(finger, i, motions[i]) for i in told]

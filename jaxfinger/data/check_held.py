@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaxfinger.data.findings import Report
-from jaxfinger.data.schema import CHANNELS, MEASURED
+from jaxfinger.data.schema import MEASURED, measured_columns
 from jaxfinger.data.session import FingerDescription, Session, Trial
 from jaxfinger.data.sizes import travel_time
 from jaxfinger.errors import counted, listed
@@ -42,22 +42,20 @@ def check_held(session: Session, report: Report) -> None:
     for trial in session.select(*_MOVES):
         _held(trial, session.finger, report)
     for trial in session.select("ID.2", "ID.3-static", "ID.3-dynamic"):
-        if trial.joint in session.finger.joint_names:
-            _standing(trial, session.finger, session.finger.joint_names.index(trial.joint), report)
+        if (joint := session.finger.joint(trial.joint)) is not None:
+            _standing(trial, session.finger, joint, report)
 
 
 def _held(trial: Trial, finger: FingerDescription, report: Report) -> None:
     """Report columns whose values are older than those of other columns by more than the motion allows."""
     found: dict[tuple[str, str], int] = {}  # samples for which a column holds each value
     newest = np.inf  # the shortest time, in samples, for which any column holds its values
-    for name in MEASURED:
-        values = getattr(trial, name)
-        for column, x in zip(CHANNELS[name].columns(finger), [] if values is None else values.T, strict=False):
-            if np.isfinite(x).all():
-                usual, short, regular = _hold_lengths(x)
-                newest = min(newest, short)
-                if regular:
-                    found[name, column] = usual
+    for name, column, x in measured_columns(trial, finger):
+        if np.isfinite(x).all():
+            usual, short, regular = _hold_lengths(x)
+            newest = min(newest, short)
+            if regular:
+                found[name, column] = usual
     if not found or max(found.values()) <= newest:
         return
     step, most = float(np.median(np.diff(trial.time))), _MAX_AGE * travel_time(trial.time, trial.q)
@@ -66,7 +64,7 @@ def _held(trial: Trial, finger: FingerDescription, report: Report) -> None:
         if late:
             n = max(late.values())
             report.warning(
-                f"/trials/{trial.name}/{name}",
+                trial.place(name),
                 f"holds each value of {listed(list(late))} for {n} samples, {0.5e3 * (n - 1) * step:.0f} ms late on "
                 "average; record it at the rate of the other columns, or import it with the clock of its own values "
                 "(`time` of a column in a mapping)",
@@ -113,7 +111,7 @@ def _say(
         first = parts[0]
         lasts = trial.time[first.stop - 1] - trial.time[first.start]
         report.warning(
-            f"/trials/{trial.name}/{channel}",
+            trial.place(channel),
             f"column {column} stands still at {x[first.start]:.4g} while {other} goes on, in "
             f"{counted(len(parts), 'place')}, first from {trial.time[first.start]:.4g} s for {lasts:.3g} s: its sensor "
             "loses its signal or is at an end of its range; cut these samples out (`span` or `where` in a mapping), or "

@@ -14,8 +14,9 @@ import numpy as np
 
 from jaxfinger.data.filtering import longest_spike
 from jaxfinger.data.findings import Report
-from jaxfinger.data.schema import CHANNELS
+from jaxfinger.data.motion import still_spans
 from jaxfinger.data.session import FingerDescription, Trial
+from jaxfinger.data.unmeasured import placeholder
 from jaxfinger.errors import counted
 
 _TURN = 2.0 * np.pi
@@ -27,25 +28,14 @@ _MIN_TRAVEL = 0.2  # of a period: a column that travels less once it is unwrappe
 _MAX_WAIT = 5.0  # usual intervals between two samples: in a longer one a joint may move far.
 
 
-def placeholder(x: np.ndarray) -> float | None:
-    """Value of some samples that lies twice as far from the others as they span; None where there is none."""
-    if len(x) < _MIN_SAMPLES or not np.isfinite(x).all():
-        return None
-    for end in (x.min(), x.max()):
-        others = x[x != end]
-        if 1 < len(x) - len(others) < 0.5 * len(x) and np.abs(others - end).min() > 2.0 * np.ptp(others) > 0.0:
-            return float(end)
-    return None
-
-
-def check_jumps(trial: Trial, finger: FingerDescription, still: np.ndarray, report: Report) -> None:
-    """Report joints and tendons whose position jumps. `still` (m,) is the travel of each joint that stands still."""
+def check_jumps(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Report joints and tendons whose position jumps."""
     if len(trial.time) < _MIN_SAMPLES or not np.all(np.diff(trial.time) > 0.0):
         return
     steps = np.diff(trial.time)
     found = [
         (channel, name, x, turns, _jumps(x, turns, least))
-        for channel, name, x, turns, least in _positions(trial, finger, still)
+        for channel, name, x, turns, least in _positions(trial, finger)
     ]
     places, count = np.unique(np.concatenate([np.zeros(0, int), *(jumps for *_, jumps in found)]), return_counts=True)
     for channel, name, x, turns, jumps in found:
@@ -69,21 +59,17 @@ def check_jumps(trial: Trial, finger: FingerDescription, still: np.ndarray, repo
             continue  # A tendon may slip far between two samples.
         if len(jumps):
             where = f"at {counted(len(jumps), 'place')}, first at {trial.time[jumps[0]]:.6g} s"
-            report.warning(
-                f"/trials/{trial.name}/{channel}", f"column {name} jumps by {said} between two samples {where}: {mend}"
-            )
+            report.warning(trial.place(channel), f"column {name} jumps by {said} between two samples {where}: {mend}")
 
 
-def _positions(
-    trial: Trial, finger: FingerDescription, still: np.ndarray
-) -> Iterator[tuple[str, str, np.ndarray, bool, float]]:
+def _positions(trial: Trial, finger: FingerDescription) -> Iterator[tuple[str, str, np.ndarray, bool, float]]:
     """Every column of positions: channel, name, values, whether they are angles, and the travel below which it stands
     still."""
-    for name, x, slides, least in zip(finger.joint_names, trial.q.T, finger.prismatic, still, strict=True):
+    names = finger.joint_names
+    for name, x, slides, least in zip(names, trial.q.T, finger.prismatic, still_spans(finger), strict=True):
         yield "q", name, x, not slides, float(least)
     if trial.tendon_excursion is not None:
-        names = CHANNELS["tendon_excursion"].columns(finger)
-        for name, x, active in zip(names, trial.tendon_excursion.T, finger.active, strict=True):
+        for name, x, active in zip(finger.tendon_names, trial.tendon_excursion.T, finger.active, strict=True):
             if active:
                 yield "tendon_excursion", name, x, False, 0.0
 

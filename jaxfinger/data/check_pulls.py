@@ -102,10 +102,10 @@ def _sure(delays: Sequence[_Delay]) -> Callable[[_Delay], bool]:
 def _pull(trial: Trial, finger: FingerDescription) -> _Pull | None:
     """The pull of an ID.4 or a VD.2; None where channels are missing or too short to tell."""
     channel = "joint_torque" if trial.experiment == "ID.4" else "fingertip_force"
-    values, tension = getattr(trial, channel), trial.tendon_force
-    if values is None or tension is None or trial.tendon not in finger.tendon_names or len(trial.time) < MIN_SAMPLES:
+    values, tension, pulled = getattr(trial, channel), trial.tendon_force, finger.tendon(trial.tendon)
+    if values is None or tension is None or pulled is None or len(trial.time) < MIN_SAMPLES:
         return None
-    f = tension[:, finger.tendon_names.index(trial.tendon)]
+    f = tension[:, pulled]
     columns = np.flatnonzero(np.isfinite(values).all(axis=0) & (np.ptp(values, axis=0) > 0.0))
     some = slice(None, None, max(1, len(f) // MAX_SAMPLES))  # A step takes a good part of the trial.
     travel = travel_time(trial.time[some], f[some, None]) if np.isfinite(f).all() else 0.0

@@ -15,18 +15,16 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
+from jaxfinger.data.arms import Excursions, slope, thinned
 from jaxfinger.data.filtering import low_pass, smooth
 from jaxfinger.data.findings import Report
 from jaxfinger.data.motion import CUTOFF_HZ, STILL_SHARE, directions, fitting_cutoff
 from jaxfinger.data.session import FingerDescription, Session, Trial
 from jaxfinger.errors import listed
 
-_DEGREE = 3  # of l(q): the moment arm is then a parabola over a joint's range, enough to tell a sign or a unit
-_SAMPLES = 400  # of a trial: slopes of a motion need no more.
-_MIN_ARM_SHARE = 0.25  # of the largest arm at a joint: smaller arms may change sign with the posture.
-# Shares of the largest arm at a joint: a tendon whose excursion shows less than the first stands still, and one whose
-# torque shows more than the second should not. Small arms lie between them.
-_MAX_STILL_SHARE, _MIN_FELT_SHARE = 0.05, 0.5
+# Share of the largest arm at a joint: a tendon whose torque shows more should not stand still. Small arms lie between
+# this one and `MAX_STILL_ARM`.
+_MIN_FELT_SHARE = 0.5
 # Ratio of the arm that torques show to the arm that excursions show. Friction reduces it: routed tendons lose up to two
 # thirds of their tension (the shipped session). Units that people confuse differ at least fourfold (N and lbf).
 _MIN_ARM_RATIO, _MAX_ARM_RATIO = 0.2, 1.5
@@ -37,8 +35,6 @@ _MIN_ARM, _MAX_ARM = 0.004, 0.4
 _MIN_TURNS = 3  # of a motion: with fewer, torque that accelerates the joint looks like friction.
 _MAX_NEGATIVE_FRICTION = 0.05  # of the torque's spread: a delay between the channels makes friction seem this negative.
 
-Arms = Mapping[tuple[int, int], float]  # (tendon, joint): m
-
 
 def check_work(session: Session, report: Report) -> None:
     """Report channels that contradict each other."""
@@ -46,7 +42,7 @@ def check_work(session: Session, report: Report) -> None:
     if any(finger.prismatic) or not finger.n:
         _passivity(session, report)
         return
-    kinematic = _Excursions(session)
+    kinematic = Excursions(session)
     _arm_lengths(kinematic.arms, finger, report)
     _virtual_work(session, kinematic, report)
     _free_paths(session, kinematic, report)
@@ -54,62 +50,8 @@ def check_work(session: Session, report: Report) -> None:
     _passivity(session, report)
 
 
-class _Excursions:
-    """Excursions that ID.2 shows: a polynomial l(q), m, for each pair of tendon and joint, and its mean moment arm."""
-
-    def __init__(self, session: Session):
-        self.polynomials: dict[tuple[int, int], np.polynomial.Polynomial] = {}
-        together: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray]]] = defaultdict(list)
-        finger = session.finger
-        for trial in session.select("ID.2"):
-            if trial.joint not in finger.joint_names or trial.tendon_excursion is None:
-                continue
-            i = finger.joint_names.index(trial.joint)
-            q, l = thinned(trial.q[:, i]), thinned(trial.tendon_excursion)
-            for k in np.flatnonzero(finger.active & finger.crosses[:, i]):
-                good = np.isfinite(q) & np.isfinite(l[:, k])
-                if good.sum() > 10 * _DEGREE and np.ptp(q[good]) > 0.0:
-                    together[int(k), i].append((q[good], l[good, k] - l[good, k].mean()))
-        for key, parts in together.items():
-            q, l = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-            self.polynomials[key] = np.polynomial.Polynomial.fit(q, l, _DEGREE)
-        self.arms = {key: float(np.diff(p(p.domain))[0] / np.diff(p.domain)[0]) for key, p in self.polynomials.items()}
-
-    def arm(self, tendon: int, joint: int, angle: float) -> float | None:
-        """Moment arm dl/dq, m/rad, at an angle; None where it is unknown or so small that it may change sign."""
-        p = self.polynomials.get((tendon, joint))
-        if p is None or not p.domain[0] - 0.1 <= angle <= p.domain[1] + 0.1:
-            return None
-        arm = float(p.deriv()(angle))
-        large = abs(arm) > _MIN_ARM_SHARE * self.largest(joint)
-        return arm if large and arm * self.arms[tendon, joint] > 0.0 else None
-
-    def largest(self, joint: int) -> float:
-        """Size of the largest mean moment arm at a joint, m/rad; 0 where none is known."""
-        return max((abs(arm) for (_, i), arm in self.arms.items() if i == joint), default=0.0)
-
-    def still(self, tendon: int, joint: int) -> bool:
-        """Whether the tendon stands still over the whole range of a joint that it crosses."""
-        p = self.polynomials.get((tendon, joint))
-        if p is None:
-            return False
-        return bool(np.abs(p.deriv()(p.linspace()[0])).max() < _MAX_STILL_SHARE * self.largest(joint))
-
-
-def thinned(x: np.ndarray) -> np.ndarray:
-    """Every k-th sample of a trial, so that some hundreds are left."""
-    return x[:: max(1, len(x) // _SAMPLES)]
-
-
-def slope(x: np.ndarray, y: np.ndarray) -> float:
-    """Slope of y over x by least squares; NaN where x stands still or few samples are finite."""
-    good = np.isfinite(x) & np.isfinite(y)
-    x, y = x[good] - x[good].mean() if good.any() else x[good], y[good]
-    return float(x @ y / (x @ x)) if len(x) > 10 and np.ptp(x) > 0.0 else np.nan
-
-
-def _arm_lengths(arms: Arms, finger: FingerDescription, report: Report) -> None:
-    """Report joints whose largest moment arm does not fit the finger's length."""
+def _arm_lengths(arms: Mapping[tuple[int, int], float], finger: FingerDescription, report: Report) -> None:
+    """Report joints whose largest moment arm does not fit the finger's length; `arms`, m, by tendon and joint."""
     length = float(np.linalg.norm(finger.origin, axis=1)[1:].sum() + np.linalg.norm(finger.fingertip))
     for i, joint in enumerate(finger.joint_names):
         largest = max((abs(arm) for (_, k), arm in arms.items() if k == i), default=np.nan)
@@ -121,17 +63,15 @@ def _arm_lengths(arms: Arms, finger: FingerDescription, report: Report) -> None:
             )
 
 
-def _virtual_work(session: Session, kinematic: _Excursions, report: Report) -> None:
+def _virtual_work(session: Session, kinematic: Excursions, report: Report) -> None:
     """Report moment arms of ID.4 that contradict those of ID.2."""
     finger = session.finger
-    turned: dict[tuple[str, str], str] = {}  # what to say of each tendon and joint
+    turned: dict[tuple[str, str], str] = {}  # by tendon and joint: what is said of them
     far: dict[tuple[str, str], str] = {}
     agreed: list[tuple[str, str]] = []
     for trial in session.select("ID.4"):
-        if trial.joint not in finger.joint_names or trial.tendon not in finger.tendon_names:
-            continue
-        i, k = finger.joint_names.index(trial.joint), finger.tendon_names.index(trial.tendon)
-        if trial.joint_torque is None or trial.tendon_force is None:
+        i, k = finger.joint(trial.joint), finger.tendon(trial.tendon)
+        if i is None or k is None or trial.joint_torque is None or trial.tendon_force is None:
             continue
         seen = kinematic.arm(k, i, float(np.nanmedian(trial.q[:, i])))
         felt = -slope(thinned(trial.tendon_force[:, k]), thinned(trial.joint_torque[:, i]))
@@ -139,14 +79,15 @@ def _virtual_work(session: Session, kinematic: _Excursions, report: Report) -> N
         seen = kinematic.arms[k, i] if still else seen
         if seen is None or not np.isfinite(felt):
             continue
-        said = f"{trial.tendon} at {trial.joint} ({1e3 * seen:.3g} against {1e3 * felt:.3g} mm)"
+        pair = finger.tendon_names[k], finger.joint_names[i]
+        said = f"{pair[0]} at {pair[1]} ({1e3 * seen:.3g} against {1e3 * felt:.3g} mm)"
         ratio = np.inf if still else felt / seen
         if ratio < -_MIN_ARM_RATIO:
-            turned[trial.tendon, trial.joint] = said
+            turned[pair] = said
         elif not _MIN_ARM_RATIO < ratio < _MAX_ARM_RATIO:
-            far[trial.tendon, trial.joint] = said
+            far[pair] = said
         else:
-            agreed.append((trial.tendon, trial.joint))
+            agreed.append(pair)
     for found, what in ((turned, "the sign"), (far, "the units or the column")):
         if found:
             report.warning(
@@ -171,7 +112,7 @@ def _suspects(found: Collection[tuple[str, str]], agreed: Collection[tuple[str, 
     return "joint_torque, tendon_excursion, tendon_force or q"
 
 
-def _free_paths(session: Session, kinematic: _Excursions, report: Report) -> None:
+def _free_paths(session: Session, kinematic: Excursions, report: Report) -> None:
     """Report free motions whose excursions contradict those of ID.2."""
     finger = session.finger
     found = []
@@ -198,18 +139,19 @@ def _free_paths(session: Session, kinematic: _Excursions, report: Report) -> Non
 
 def _fingertip(session: Session, report: Report) -> None:
     """Report fingertip forces that are too large or too small for the tension, or without a lever."""
-    found, names = [], session.finger.tendon_names
-    without_lever = not np.cross(session.finger.axis[-1], session.finger.fingertip).any()
+    finger, found = session.finger, []
+    without_lever = not np.cross(finger.axis[-1], finger.fingertip).any()
     if without_lever and any(t.fingertip_force is not None for t in session.select("VD.2")):
         report.warning(
             "/finger/fingertip",
-            f"lies on the axis of joint {session.finger.joint_names[-1]}, so that no force there turns it, though VD.2 "
+            f"lies on the axis of joint {finger.joint_names[-1]}, so that no force there turns it, though VD.2 "
             "presses with the fingertip; write the contact point in the last link's frame",
         )
     for trial in session.select("VD.2"):
-        if trial.tendon not in names or trial.fingertip_force is None or trial.tendon_force is None:
+        k = finger.tendon(trial.tendon)
+        if k is None or trial.fingertip_force is None or trial.tendon_force is None:
             continue
-        pull = thinned(trial.tendon_force[:, names.index(trial.tendon)])
+        pull = thinned(trial.tendon_force[:, k])
         size = float(np.linalg.norm([slope(pull, thinned(x)) for x in trial.fingertip_force.T]))
         if np.isfinite(size) and not _FORCE_RATIOS[0] < size < _FORCE_RATIOS[1]:
             found.append(f"{size:.3g} N for each N of {trial.tendon} in {trial.name}")
@@ -225,11 +167,12 @@ def _passivity(session: Session, report: Report) -> None:
     finger = session.finger
     shares: dict[str, list[float]] = defaultdict(list)
     for trial in session.select("ID.3-static", "ID.3-dynamic"):
-        if trial.joint not in finger.joint_names or trial.joint_torque is None or len(trial.time) < 50:
+        i = finger.joint(trial.joint)
+        if i is None or trial.joint_torque is None or len(trial.time) < 50:
             continue
-        share = _friction_share(trial, finger.joint_names.index(trial.joint))
+        share = _friction_share(trial, i)
         if np.isfinite(share):
-            shares[trial.joint].append(share)
+            shares[finger.joint_names[i]].append(share)
     found = [joint for joint, of_trials in shares.items() if np.median(of_trials) < -_MAX_NEGATIVE_FRICTION]
     if found:
         report.warning(

@@ -49,11 +49,11 @@ def say_delays(
         columns = [names[k] for k in late]
         said = f"column {columns[0]} comes" if len(late) == 1 else f"columns {listed(columns)} come"
         said = f"{said} {1e3 * np.median([by_name[k] for k in late]):.0f} ms after {cause} of {name}"
-        report.warning(f"/trials/{trial.name}/{channel}", f"{said}; {mend}")
+        report.warning(trial.place(channel), f"{said}; {mend}")
     if early := [k for k, delay in by_name.items() if delay < 0.0]:
         said = f"column {name} comes {-1e3 * np.median([by_name[k] for k in early]):.0f} ms after"
         of = listed([names[k] for k in early])
-        report.warning(f"/trials/{trial.name}/{cause}", f"{said} {channel} of {of}; {mend}")
+        report.warning(trial.place(cause), f"{said} {channel} of {of}; {mend}")
 
 
 def even(cutoff: float, time: np.ndarray, *channels: np.ndarray) -> list[np.ndarray]:

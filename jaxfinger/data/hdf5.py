@@ -207,9 +207,9 @@ def _refuse_misshapen(trial: Trial, finger: FingerDescription, path) -> None:
         value = getattr(trial, name)
         wanted = tuple(sizes[axis] if isinstance(axis, str) else axis for axis in CHANNELS[name].shape)
         if value is not None and np.shape(value) != wanted:
-            raise UserError(f"{path}: /trials/{trial.name}/{name}: has shape {np.shape(value)}; it must be {wanted}")
+            raise UserError(f"{path}: {trial.place(name)}: has shape {np.shape(value)}; it must be {wanted}")
     if trial.temperature is not None:
         wanted = (sizes["N"], len(trial.temperature_names))
         if np.shape(trial.temperature) != wanted:
             shape = np.shape(trial.temperature)
-            raise UserError(f"{path}: /trials/{trial.name}/temperature: has shape {shape}; it must be {wanted}")
+            raise UserError(f"{path}: {trial.place(TEMPERATURE.name)}: has shape {shape}; it must be {wanted}")

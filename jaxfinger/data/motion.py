@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxfinger.data.filtering import smooth
-from jaxfinger.data.session import Trial
+from jaxfinger.data.session import FingerDescription, Trial
 from jaxfinger.data.sizes import Sizes
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
+STILL_ANGLE = 0.01  # rad: five times the noise of a 14-bit encoder
+STILL_DISTANCE = 1e-4  # m, likewise of a prismatic joint: a hundredth of a rad at a radius of 10 mm
+MIN_MOTION = 0.1  # rad: fixtures that hold a joint yield by less.
 CUTOFF_HZ = 10.0  # Faster than any commanded motion of the protocol, slower than most of the sensors' noise.
 HOLD_CUTOFF_HZ = 5.0  # Stillness needs no fast filter, and at half the cut-off the speed has a third of the noise.
 QUICK_CUTOFF_RATIO = 3.0  # A slip that one filter spreads shows in a filter three times as fast.
@@ -26,6 +29,11 @@ MIN_HOLD = 0.2  # s, at the protocol's pace: one length of the filter, 1/HOLD_CU
 # A ramp is at least this many blocks of 1/20 s long. Only the block in which a held tendon slips is uncertain, and in a
 # ramp that is a twentieth.
 RAMP_BLOCKS = 20
+
+
+def still_spans(finger: FingerDescription) -> Float[np.ndarray, " m"]:
+    """Travel of each joint, rad or m, below which it stands still."""
+    return np.where(finger.prismatic, STILL_DISTANCE, STILL_ANGLE)
 
 
 def joint_directions(trial: Trial) -> Float[np.ndarray, "N m"]:

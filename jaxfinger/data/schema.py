@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from jaxfinger.data.session import FingerDescription
+from jaxfinger.data.session import FingerDescription, Trial
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
 
 FORMAT = "jaxfinger-dataset"
 VERSION = "1.1"
@@ -102,6 +106,17 @@ MEASURES = {
     "VD.2": ("fingertip_force",),
     "VD.3": (),
 }
+
+
+def measured_columns(
+    trial: Trial, finger: FingerDescription, channels: Iterable[str] = MEASURED
+) -> Iterator[tuple[str, str, Float[np.ndarray, " N"]]]:
+    """Columns of the channels that a trial holds: channel, name of the joint, tendon or axis, and values."""
+    for channel in channels:
+        values = getattr(trial, channel)
+        if values is not None:
+            for name, x in zip(CHANNELS[channel].columns(finger), values.T, strict=True):
+                yield channel, name, x
 
 
 # Units of a finger with prismatic joints only: lengths and forces take the place of angles and torques.

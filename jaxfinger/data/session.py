@@ -68,6 +68,14 @@ class FingerDescription:
         """Number of tendons, passive ones included."""
         return len(self.tendon_names)
 
+    def joint(self, name: str | None) -> int | None:
+        """Index of the joint of this name; None where there is none."""
+        return self.joint_names.index(name) if name in self.joint_names else None
+
+    def tendon(self, name: str | None) -> int | None:
+        """Index of the tendon of this name; None where there is none."""
+        return self.tendon_names.index(name) if name in self.tendon_names else None
+
 
 @dataclass(frozen=True, repr=False)
 class Trial:
@@ -109,6 +117,10 @@ class Trial:
     def __repr__(self) -> str:
         where = ", ".join(x for x in (self.experiment, self.joint, self.tendon) if x)
         return f"Trial({self.name!r}: {where}; {len(self.time)} samples, {self.duration:.3g} s)"
+
+    def place(self, channel: str = "") -> str:
+        """Path of the trial, or of one of its channels, inside the session's file."""
+        return f"/trials/{self.name}/{channel}".rstrip("/")
 
     @property
     def duration(self) -> float:

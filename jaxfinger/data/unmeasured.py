@@ -1,4 +1,7 @@
-"""Columns that read the same at every sample of a trial. Every sensor has noise, so that none has measured them."""
+"""Values that no sensor has measured: columns that read the same throughout, and numbers that stand for a missing one.
+
+Every sensor has noise, so that the readings of none are the same at every sample of a motion.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,10 @@ import numpy as np
 from jaxfinger.data.session import FingerDescription, Trial
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool
+    from jaxtyping import Bool, Float
 
 _TAUT = ("ID.2", "VD.1", "VD.3")  # experiments that keep all tendons taut
-_MIN_SAMPLES = 20  # A coarse sensor may read the same in a few samples.
+_MIN_SAMPLES = 20  # A coarse sensor may read the same in a few samples, and a few show no typical range.
 
 
 def constant_columns(trial: Trial, finger: FingerDescription) -> dict[str, Bool[np.ndarray, " columns"]]:
@@ -39,3 +42,14 @@ def constant_columns(trial: Trial, finger: FingerDescription) -> dict[str, Bool[
             continue  # A planar finger presses along one axis only.
         out[name] = still
     return out
+
+
+def placeholder(x: Float[np.ndarray, " N"]) -> float | None:
+    """Value of some samples that lies twice as far from the others as they span; None where there is none."""
+    if len(x) < _MIN_SAMPLES or not np.isfinite(x).all():
+        return None
+    for end in (x.min(), x.max()):
+        others = x[x != end]
+        if 1 < len(x) - len(others) < 0.5 * len(x) and np.abs(others - end).min() > 2.0 * np.ptp(others) > 0.0:
+            return float(end)
+    return None
