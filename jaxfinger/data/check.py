@@ -21,13 +21,13 @@ from jaxfinger.data.check_pulls import check_pulls
 from jaxfinger.data.check_trial import check_trial
 from jaxfinger.data.check_values import MAX_TARE_ERROR
 from jaxfinger.data.check_work import check_work
-from jaxfinger.data.filtering import longest_spike, outlier_mask
 from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.opening import plain_reason, why_closed
 from jaxfinger.data.parse import parse_file
 from jaxfinger.data.schema import MEASURED
 from jaxfinger.data.session import EXPERIMENT_NAMES, Session
 from jaxfinger.data.sizes import MAX_SAMPLES, Sizes, sizes_of
+from jaxfinger.data.spikes import longest_spike, outlier_mask
 from jaxfinger.data.units import conversion
 from jaxfinger.errors import counted, listed
 

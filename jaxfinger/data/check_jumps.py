@@ -12,10 +12,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxfinger.data.filtering import longest_spike
 from jaxfinger.data.findings import Report
 from jaxfinger.data.motion import still_spans
 from jaxfinger.data.session import FingerDescription, Trial
+from jaxfinger.data.spikes import longest_spike
 from jaxfinger.data.unmeasured import placeholder
 from jaxfinger.errors import counted
 

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxfinger.data.filtering import without_spikes
+from jaxfinger.data.noise import STD_PER_MAD
 from jaxfinger.data.session import Session, Trial
+from jaxfinger.data.spikes import without_spikes
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -71,7 +72,7 @@ def sizes_of(session: Session) -> Sizes:
         every = max(1, len(trial.time) // MAX_SAMPLES)
         if (f := _tensions(trial)).size:
             bend = np.abs(np.diff(f[:MAX_SAMPLES], 2, axis=0))
-            noises.append(1.4826 / np.sqrt(6.0) * float(np.median(bend, axis=0).max()))
+            noises.append(STD_PER_MAD / np.sqrt(6.0) * float(np.median(bend, axis=0).max()))
         if trial.tendon_excursion is not None and len(trial.time) > 3:
             l = np.nan_to_num(trial.tendon_excursion[::every])
             excursions.append(float(np.ptp(np.percentile(l, (1, 99), axis=0), axis=0).max(initial=0.0)))

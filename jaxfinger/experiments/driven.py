@@ -18,8 +18,10 @@ from jaxfinger.data import (
     without_spikes,
 )
 from jaxfinger.data.motion import quick_cutoff, rest_speed, speed_noise
+from jaxfinger.data.noise import STD_PER_MAD
 from jaxfinger.experiments.reduction import Joints, PreparedTrial, Row, joints, row
 from jaxfinger.experiments.shrink import shrink
+from jaxfinger.experiments.table import highest_cutoff
 
 NONE_VALID = "nowhere do a joint and its tendons slide for long enough that the direction of their friction is known"
 
@@ -61,7 +63,7 @@ def reduce(r: PreparedTrial) -> Row:
     if r.reduced or r.experiment.slack:
         # Noise of q̈ biases a fit to less inertia (errors in variables), and adds a spurious torque to a prediction.
         # Where q̈ does not exceed its noise, it is therefore replaced by its running mean.
-        most = MAX_ACCELERATION_NOISE * 1.4826 * j.noise * filtered_noise_std(j.cutoff, r.step, 2)
+        most = MAX_ACCELERATION_NOISE * STD_PER_MAD * j.noise * filtered_noise_std(j.cutoff, r.step, 2)
         qdd = shrink(qdd, round(ACCELERATION_WINDOW * r.experiment.pace / r.step), ACCELERATION_DOF, most)
     if r.reduced:
         # All other terms pass the low-pass of q̈.
@@ -99,7 +101,7 @@ def tendon_rates(r: PreparedTrial) -> tuple[Float[np.ndarray, "N n"], Float[np.n
     if r.trial.tendon_excursion is None:
         return None
     excursion = without_spikes(np.nan_to_num(r.trial.tendon_excursion))
-    cutoff = min(r.experiment.cutoff / 2.0, 0.2 / r.step)
+    cutoff = min(r.experiment.cutoff / 2.0, highest_cutoff(r.step))
     slow, quick = (smooth(r.trial.time, excursion, c)[1] for c in (cutoff, quick_cutoff(cutoff, r.step)))
     return slow, quick
 
@@ -156,7 +158,7 @@ def sliding(
 
 def _friction_known(r: PreparedTrial, slow, quick) -> Bool[np.ndarray, "N n"]:
     """Whether a tendon is slack, or slides for certain: faster than it stretches, and in both filters."""
-    tension, cutoff = r.tension(), min(r.experiment.cutoff / 2.0, 0.2 / r.step)
+    tension, cutoff = r.tension(), min(r.experiment.cutoff / 2.0, highest_cutoff(r.step))
     stretches = r.sizes.compliance * np.abs(smooth(r.trial.time, tension, cutoff)[1])
     measured = np.isfinite(np.asarray(r.trial.tendon_excursion)).all(axis=0)
     least = MIN_TENDON_SPEED_TO_NOISE * speed_noise(slow, quick)

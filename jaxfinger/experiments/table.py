@@ -59,8 +59,13 @@ class Experiment:
         return channel, self.held and channel != "tendon_excursion"
 
     def cutoff_at(self, step: float, sharp: bool = False) -> float:
-        """Cut-off, Hz, for a trial with a sample every `step` s: at most a fifth of the sampling rate."""
-        return min(self.cutoff * (self.sharp_ratio if sharp else 1.0), 0.2 / step)
+        """Cut-off, Hz, for a trial with a sample every `step` s."""
+        return min(self.cutoff * (self.sharp_ratio if sharp else 1.0), highest_cutoff(step))
+
+
+def highest_cutoff(step: float) -> float:
+    """Highest cut-off, Hz, for a sample every `step` s: a fifth of the rate, so that 0.11 passes at half the rate."""
+    return 0.2 / step
 
 
 EXPERIMENTS = {

@@ -16,6 +16,7 @@ import scipy.linalg
 from jaxtyping import Array, Float
 from scipy.ndimage import uniform_filter1d
 
+from jaxfinger.data.noise import STD_PER_MAD
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.experiments import Batch, Stack
 
@@ -253,7 +254,7 @@ def _autoregression(series: Series) -> tuple[float, float, np.ndarray]:
     if not series or not any(m.any() for _, m, _ in series):
         return 1.0, 1.0, np.zeros(ORDER)
     values = np.concatenate([e[m] for e, m, _ in series])
-    limit = 4.0 * 1.4826 * np.median(np.abs(values)) + 1e-300
+    limit = 4.0 * STD_PER_MAD * np.median(np.abs(values)) + 1e-300
     clipped = [(np.clip(e, -limit, limit), m, lost) for e, m, lost in series]
     covariance = np.array([_lagged(clipped, k) for k in range(ORDER + 1)])
     if covariance[0] <= 0:

@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.data import Trial, filtered_noise_std, low_pass, smooth
+from jaxfinger.data.noise import STD_PER_MAD
 from jaxfinger.experiments import Stack
+from jaxfinger.experiments.table import highest_cutoff
 from jaxfinger.identify.predictions import MAX_TIME_STEP
 from jaxfinger.model import Motion
 
@@ -50,7 +52,7 @@ def measured(trial: Trial, stack: Stack, b: int, x: Motion) -> Measured:
     time, N = np.asarray(trial.time), len(trial.time)
     step = float(np.median(np.diff(time)))
     even = np.arange(int(np.floor((time[-1] - time[0]) / step)) + 1) * step
-    cutoff = min(STATE_CUTOFF_RATIO * stack.experiment.cutoff, 0.2 / step)  # at most as in `Experiment.cutoff_at`
+    cutoff = min(STATE_CUTOFF_RATIO * stack.experiment.cutoff, highest_cutoff(step))
     raw = np.asarray(x.q)[:, b, :N].T
     q, qd, _ = smooth(time, raw, cutoff)
     tension = np.asarray(x.tension)[:, b, :N].T
@@ -61,7 +63,7 @@ def measured(trial: Trial, stack: Stack, b: int, x: Motion) -> Measured:
     encoder = np.std(np.asarray(trial.q) - smooth(time, trial.q, cutoff)[0], axis=0)
     value, rate = (encoder * filtered_noise_std(cutoff, step, k) for k in (0, 1))
     rest = tension - low_pass(time, tension, stack.experiment.cutoff_at(step))
-    most = 4.0 * 1.4826 * np.median(np.abs(rest), axis=0)
+    most = 4.0 * STD_PER_MAD * np.median(np.abs(rest), axis=0)
     noise = resampled(np.clip(rest, -most, most))  # jumps of the tension itself are not noise
     start = float(np.asarray(x.session_time - x.time)[b, 0])
     return Measured(

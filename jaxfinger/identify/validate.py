@@ -21,6 +21,7 @@ from jaxfinger.data import Session, Trial, low_pass
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, Stack, not_judged, predict, predict_compiled, prepare
+from jaxfinger.experiments.table import highest_cutoff
 from jaxfinger.identify.ahead import ahead, diverges, noise_of_simulation
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.linearise import residuals_of
@@ -397,4 +398,4 @@ def _encoder(trial: Trial, k: int) -> float:
     """Standard deviation of an encoder's reading about its low-passed motion, rad."""
     step = float(np.median(np.diff(trial.time)))
     q = trial.q[:, k]
-    return float(np.std(q - low_pass(trial.time, q, min(ENCODER_CUTOFF, 0.2 / step))))
+    return float(np.std(q - low_pass(trial.time, q, min(ENCODER_CUTOFF, highest_cutoff(step)))))

@@ -6,6 +6,7 @@ what is left, and what to do about it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -396,7 +397,7 @@ def next_trial(step: NextExperiment) -> str:
 
 
 def _posture(p: Posture) -> str:
-    low, high = (f"{1e3 * v:.0f} mm" if p.slides else f"{v * 57.29577951308232:.0f}°" for v in (p.low, p.high))
+    low, high = (f"{1e3 * v:.0f} mm" if p.slides else f"{math.degrees(v):.0f}°" for v in (p.low, p.high))
     return f"{p.joint} from {low} to {high}" if p.moves else f"{p.joint} at {low}"
 
 

@@ -6,7 +6,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 
-from jaxfinger.data.filtering import longest_spike, outlier_mask, smooth, without_spikes
+from jaxfinger.data.filtering import smooth
+from jaxfinger.data.spikes import longest_spike, outlier_mask, without_spikes
 from jaxfinger.errors import UserError
 from jaxfinger.experiments.driven import ACCELERATION_DOF
 from jaxfinger.experiments.shrink import PASSED, shrink
