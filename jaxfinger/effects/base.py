@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from jaxfinger.effects.scales import Scales, refuse_unknown_scale
 from jaxfinger.model import Effect, Finger
@@ -233,49 +233,3 @@ def _declared(cls: type[CatalogueEffect]) -> dict[str, Amplitude | Shape]:
     found = {f.name: f.metadata["parameter"] for f in fields(cls) if "parameter" in f.metadata}
     amplitudes = {n: p for n, p in found.items() if isinstance(p, Amplitude)}
     return amplitudes | found
-
-
-def dahl(z: Float[Array, "*T"], dx: Float[Array, "*T"], delta: Float[Array, ""]) -> Float[Array, "*T"]:
-    """Presliding state z in [−1, 1] after the displacement dx: dz = (1 − z sgn dx)^δ dx (Dahl 1968).
-
-    z is the friction over its Coulomb value, dx the displacement over the presliding length. With δ = 1 friction builds
-    up exponentially. With δ = ½ it turns from −1 to 1 within 2√2 lengths, as that of parallel Maxwell-slip elements
-    whose strengths are evenly spread. The solution is exact for a displacement in one direction.
-    """
-    way = jnp.sign(dx)
-    lacking, length = 1.0 - z * way, jnp.abs(dx)
-    root = jnp.sqrt(jnp.maximum(lacking, 1e-12))  # The derivative of a root is infinite at zero.
-    left = jnp.where(delta > 0.75, lacking * jnp.exp(-length), jnp.square(jnp.maximum(root - 0.5 * length, 0.0)))
-    return jnp.where(dx == 0.0, z, way * (1.0 - left))
-
-
-def delta() -> Any:
-    """Declare a shape that chooses the exponent of `dahl`."""
-    return shape("1", (1.0, 0.5), moves="not")
-
-
-# Central differences of the sixth order: distance in samples, and weight (Fornberg, Math. Comp. 51 (1988) 699).
-_SIXTH_ORDER = ((1, 0.75), (2, -0.15), (3, 1 / 60))
-
-
-def rate(y: Float[Array, "*T"], time: Float[Array, "*#T"]) -> Float[Array, "*T"]:
-    """Time derivative along the last axis, 1/s. It is zero where time stands still.
-
-    Evenly spaced samples have central differences of the sixth order, since those of the second order attenuate fast
-    changes of reduced channels. Other samples, and the first and last three, have the second order.
-    """
-    time = jnp.broadcast_to(time, y.shape)
-    dy, dt = (jnp.asarray(jnp.gradient(a, axis=-1)) for a in (y, time))
-    slope = jnp.where(dt > 0, dy / jnp.where(dt > 0, dt, 1.0), 0.0)
-    if y.shape[-1] < 7:
-        return slope
-
-    def wide(a):
-        return sum(
-            w * (a[..., 3 + k : a.shape[-1] - 3 + k] - a[..., 3 - k : a.shape[-1] - 3 - k]) for k, w in _SIXTH_ORDER
-        )
-
-    inner, step = wide(time), dt[..., 3:-3]
-    even = (step > 0) & (jnp.abs(time[..., 6:] - time[..., :-6] - 6.0 * step) < 0.01 * step)
-    smooth = jnp.where(even, wide(y) / jnp.where(even, inner, 1.0), slope[..., 3:-3])
-    return slope.at[..., 3:-3].set(smooth)

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfinger.effects.base import CatalogueEffect, amplitude, dahl, delta, shape
+from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
+from jaxfinger.effects.presliding import dahl, delta
 
 
 class JointStribeck(CatalogueEffect):

@@ -6,7 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfinger.effects.base import CatalogueEffect, amplitude, rate, shape
+from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
+
+# Central differences of the sixth order: distance in samples, and weight (Fornberg, Math. Comp. 51 (1988) 699).
+_SIXTH_ORDER = ((1, 0.75), (2, -0.15), (3, 1 / 60))
 
 
 class TorqueSensorScale(CatalogueEffect):
@@ -185,3 +188,26 @@ class ChannelDelay(CatalogueEffect):
             # rate; the differences at the first and last sample of a hold would reach into the motion beside it.
             return y - self._of(channel) * rate(y, x.time) * jnp.where(x.qd != 0.0, x.motorised, 0.0)
         return y - self._of(channel) * rate(y, x.time)
+
+
+def rate(y: Float[Array, "*T"], time: Float[Array, "*#T"]) -> Float[Array, "*T"]:
+    """Time derivative along the last axis, 1/s. It is zero where time stands still.
+
+    Evenly spaced samples have central differences of the sixth order, since those of the second order attenuate fast
+    changes of reduced channels. Other samples, and the first and last three, have the second order.
+    """
+    time = jnp.broadcast_to(time, y.shape)
+    dy, dt = (jnp.asarray(jnp.gradient(a, axis=-1)) for a in (y, time))
+    slope = jnp.where(dt > 0, dy / jnp.where(dt > 0, dt, 1.0), 0.0)
+    if y.shape[-1] < 7:
+        return slope
+
+    def wide(a):
+        return sum(
+            w * (a[..., 3 + k : a.shape[-1] - 3 + k] - a[..., 3 - k : a.shape[-1] - 3 - k]) for k, w in _SIXTH_ORDER
+        )
+
+    inner, step = wide(time), dt[..., 3:-3]
+    even = (step > 0) & (jnp.abs(time[..., 6:] - time[..., :-6] - 6.0 * step) < 0.01 * step)
+    smooth = jnp.where(even, wide(y) / jnp.where(even, inner, 1.0), slope[..., 3:-3])
+    return slope.at[..., 3:-3].set(smooth)

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from jaxfinger.data import filter_std, low_pass, smooth
 from jaxfinger.effects import CATALOGUE
-from jaxfinger.effects.base import dahl, rate
+from jaxfinger.effects.presliding import dahl
+from jaxfinger.effects.sensors import rate
 from jaxfinger.model import excursion, joint_tension, memories
 from jaxfinger.model.dynamics import terms
 from jaxfinger.model.rigid_body import inverse_dynamics
