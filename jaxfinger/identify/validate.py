@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from html import escape
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -180,14 +181,12 @@ def _channel_scores(session: Session, stack: Stack, channel: str, residual, floo
     methods = {"VD.1": "f(q) − f(q(0))", "VD.3": sliding if channel == "joint_torque" else ""}
     method = methods.get(stack.experiment.name, "")
     scores = []
-    for k, column in enumerate(columns(session, channel)):
+    for k in range(len(columns(session, channel))):
         series = [r[np.isfinite(r)] for r in residual[k]]
         series = [r for r in series if r.size]
         if series:
-            found = _score(series, CHANNELS[channel].free_zero)
-            scores.append(
-                _make_score(session, stack.experiment.name, channel, k, column, *found, (floor[0][k], floor[1]), method)
-            )
+            errors, noise = _errors(series, CHANNELS[channel].free_zero), (float(floor[0][k]), floor[1])
+            scores.append(_score(session, stack.experiment.name, channel, k, errors, noise, method))
     return scores
 
 
@@ -198,30 +197,48 @@ def _share(session: Session, stack: Stack, channel: str) -> float:
     return float(mask.sum() / (len(mask) * max(whole, 1.0)))
 
 
-def _score(series: list[np.ndarray], zeroed: bool) -> tuple[float, float, int, int]:
-    """rms, mean, number of samples and number of trials of the errors of several trials.
+class _Errors(NamedTuple):
+    """What the errors of one column come to, in SI units."""
+
+    rms: float
+    mean: float
+    samples: int
+    trials: int
+
+
+def _errors(series: list[np.ndarray], zeroed: bool) -> _Errors:
+    """Sum up the errors of several trials.
 
     With `zeroed`, the rms is about each trial's mean, and the mean is relative to each trial's first sample.
     """
     mean = float(np.mean(np.concatenate([r - r[0] if zeroed else r for r in series])))
     errors = np.concatenate([r - r.mean() if zeroed else r for r in series])
-    return float(np.sqrt(np.mean(errors**2))), mean, errors.size, len(series)
+    return _Errors(float(np.sqrt(np.mean(errors**2))), mean, errors.size, len(series))
 
 
-def _make_score(session, experiment, channel, k, column, rms, mean, samples, trials, floor, method) -> Score:
+def _score(
+    session: Session,
+    experiment: str,
+    channel: str,
+    k: int,
+    errors: _Errors,
+    noise: tuple[float | None, str],
+    method: str,
+) -> Score:
+    """Score of column k of a channel, in the unit for people. `noise`: its standard deviation, in SI, and source."""
     factor, units = display(session, channel, k)
-    noise = None if floor[0] is None or not np.isfinite(floor[0]) else float(floor[0]) * factor
+    std, source = noise
     return Score(
         experiment,
         channel,
-        column,
+        columns(session, channel)[k],
         units,
-        rms * factor,
-        mean * factor,
-        noise,
-        floor[1],
-        samples,
-        trials,
+        errors.rms * factor,
+        errors.mean * factor,
+        None if std is None or not np.isfinite(std) else std * factor,
+        source,
+        errors.samples,
+        errors.trials,
         method,
     )
 
@@ -274,16 +291,12 @@ def _integral_scores(model: Model, session: Session, stack: Stack, floor) -> lis
     """Scores of the paper's integral form of VD.1; errors are relative to the first sample."""
     paths = [excursion_path(model, session[name], stack.experiment.pace) for name in stack.trials]
     scores = []
-    for k, column in enumerate(columns(session, "tendon_excursion")):
+    for k in range(session.finger.n):
         series = [(p.measured - p.integral)[:, k] for p in paths]
         series = [e[np.isfinite(e)] for e in series if np.isfinite(e).any()]
         if series:
-            errors = np.concatenate(series)
-            found = (float(np.sqrt(np.mean(errors**2))), float(errors.mean()), errors.size, len(series))
-            method = "∫ C q̇ dt, the paper's"
-            scores.append(
-                _make_score(session, "VD.1", "tendon_excursion", k, column, *found, (floor[0][k], floor[1]), method)
-            )
+            noise, method = (float(floor[0][k]), floor[1]), "∫ C q̇ dt, the paper's"
+            scores.append(_score(session, "VD.1", "tendon_excursion", k, _errors(series, False), noise, method))
     return scores
 
 
@@ -319,9 +332,7 @@ def _slopes(fit: Fit, model: Model, session: Session, stack: Stack) -> list[Slop
             tendon,
             "xyz"[axis],
             float(w @ measured[axis, b]),
-            _slope_std(
-                tension[session.finger.tendon_names.index(tendon), b], measured[axis, b] - predicted[axis, b], w
-            ),
+            _slope_std(f, measured[axis, b] - predicted[axis, b], w),
             float(values[k]),
             float(std[k]),
         )
@@ -353,23 +364,22 @@ def _simulation_scores(model: Model, session: Session, names: list[str]) -> tupl
     paths = simulate_trials([model] * len(stack.trials), session, stack)
     scores = []
     for prediction in ahead(model, session, stack):
-        for k, column in enumerate(session.finger.joint_names):
-            errors = [prediction.error[np.isfinite(prediction.error[:, k]), k]]
-            if errors[0].size:
-                rms, mean, samples, _ = _score(errors, False)
-                found = rms, mean, samples, len(stack.trials)
+        for k in range(session.finger.m):
+            series = [prediction.error[np.isfinite(prediction.error[:, k]), k]]
+            if series[0].size:
+                errors = _errors(series, False)._replace(trials=len(stack.trials))
                 noise = _unless_it_diverges(prediction.noise[k], "sensors' noise in state and tension", session, k)
                 method = f"{1e3 * prediction.horizon:.0f} ms ahead of the measured state"
-                scores.append(_make_score(session, "VD.3", "q", k, column, *found, noise, method))
+                scores.append(_score(session, "VD.3", "q", k, errors, noise, method))
     simulated_noise = noise_of_simulation(model, session, stack)
-    for k, column in enumerate(session.finger.joint_names):
+    for k in range(session.finger.m):
         series = [session[name].q[:, k] - paths[name]["q"][:, k] for name in stack.trials]
-        found = _score([e[np.isfinite(e)] for e in series], False)
+        errors = _errors([e[np.isfinite(e)] for e in series], False)
         encoder = float(np.sqrt(np.mean([_encoder(session[name], k) ** 2 for name in stack.trials])))
         method = "simulated forward from the first sample"
         source = "sensors' noise in start, tension and reading"
         noise = _unless_it_diverges(float(np.hypot(encoder, simulated_noise[k])), source, session, k)
-        scores.append(_make_score(session, "VD.3", "q", k, column, *found, noise, method))
+        scores.append(_score(session, "VD.3", "q", k, errors, noise, method))
     return scores, _divergence(session, paths)
 
 

@@ -29,7 +29,7 @@ class Terms(NamedTuple):
     C: Float[Array, "n m *T"]  # coupling matrix, m/rad
     loss: Float[Array, "n *T"]  # tension lost by a sliding tendon, |f_f|, N
     f_j: Float[Array, "n *T"]  # f_t − f_f: tension at the joints, N
-    h: Float[Array, "m *T"]  # τ_k + τ_d, N m
+    h: Float[Array, "m *T"]  # h without friction, τ_k + τ_d, N m
     friction: Float[Array, "m *T"]  # magnitude of τ_f, N m
     direction: Float[Array, "m *T"]  # of τ_f, −1 … 1: sign of q̇, or the share of friction that is built up
     tendon_direction: Float[Array, "n *T"]  # of f_f, likewise
@@ -106,7 +106,12 @@ def resisting_torque(model: Model, x: Motion, nominal: Terms | None = None) -> F
 
 def resisting(e: Terms) -> Float[Array, "m *T"]:
     """h − Cᵀ(f_t − f_f), N m, from the terms `e`."""
-    return e.h + e.direction * e.friction + _shared_torque(e) - jnp.sum(e.C * e.f_j[:, None], axis=0)
+    return _h(e) - jnp.sum(e.C * e.f_j[:, None], axis=0)
+
+
+def _h(e: Terms) -> Float[Array, "m *T"]:
+    """h = τ_k + τ_d + τ_f of (1), N m, with the friction that acts on several joints."""
+    return e.h + e.direction * e.friction + _shared_torque(e)
 
 
 def _shared_torque(e: Terms) -> Float[Array, "m *T"]:
@@ -195,5 +200,4 @@ def joint_tension(model: Model, x: Motion) -> Float[Array, "n *T"]:
 
 def elastic_and_friction(model: Model, x: Motion) -> Float[Array, "m *T"]:
     """h of (1), N m: elastic torque, damping and joint friction."""
-    e = terms(model, x, memories(model, x))
-    return e.h + e.direction * e.friction + _shared_torque(e)
+    return _h(terms(model, x, memories(model, x)))
