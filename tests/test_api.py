@@ -1,6 +1,8 @@
 """The names of `import jaxfinger as jf`, and how results show in a notebook."""
 
 import doctest
+import pkgutil
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -48,6 +50,15 @@ def test_every_name_of_the_package_is_there_and_nothing_loads_jax_before_it_is_n
     assert callable(jf.identify)
     with pytest.raises(AttributeError, match=r"has no 'fit'; it has .*identify"):
         jf.fit  # noqa: B018
+
+
+def test_the_page_of_the_api_has_every_name():
+    page = (Path(__file__).parents[1] / "docs" / "api.md").read_text(encoding="utf-8")
+    found = dict(re.findall(r"::: (\S+)\n    options:\n      heading: jf\.(\w+)", page))
+    assert sorted(found.values()) == jf.__all__
+    for path, name in found.items():
+        thing = identify if name == "identify" else getattr(jf, name)
+        assert pkgutil.resolve_name(path) is thing
 
 
 def test_a_table_prints_and_says_which_columns_there_are():
