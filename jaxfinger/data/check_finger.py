@@ -58,6 +58,7 @@ def _finite(finger: FingerDescription, report: Report) -> bool:
 
 
 def _gravity(finger: FingerDescription, report: Report) -> None:
+    """Check that gravity is in m s⁻², and of a size found on Earth: 9.76 (high mountains) to 9.84 (the poles)."""
     size = float(np.linalg.norm(finger.gravity))
     if size == 0.0:
         report.warning(

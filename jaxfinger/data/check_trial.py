@@ -93,7 +93,7 @@ def _time(trial: Trial, report: Report) -> None:
         report.warning(place, f"has a sample every {usual:.3g} s; {conversion('ms')} if that is what it is")
     if usual < 1.0 / MAX_RATE:
         report.warning(place, f"has a sample every {usual:.3g} s; convert times to s, such as days or hours")
-    gaps = steps > max(20.0 * usual, 0.02)
+    gaps = steps > max(20.0 * usual, 0.02)  # Jitter is shorter than 20 intervals.
     if gaps.any():
         lost = f"{counted(int(gaps.sum()), 'gap')}, the longest {steps.max():.3g} s"
         report.warning(place, f"has {lost}; samples were lost, derivatives bridge them")

@@ -20,6 +20,7 @@ _MAX_OVERTRAVEL = 0.35  # rad, 20 degrees, that a joint may read beyond its limi
 MAX_TARE_ERROR = 0.03
 _MAX_TARE = 0.5  # of the highest tension: a tendon that reads more is pulled on purpose.
 _MAX_PUSH = 0.1
+_MAX_TENSION = 2000.0  # N: in mN these are the 2 N at which tendons are kept taut.
 _MAX_DEGREES = 400.0  # Angles in degrees are smaller: a turn, with room.
 _COLD = 200.0  # K, −73 °C: no laboratory is colder, so lower values are in °C.
 # A converter's limit is repeated over more samples at once, by this factor, than any value within its range. At the
@@ -163,8 +164,8 @@ def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repo
             unslack[name] = low
         elif trial.experiment == "ID.2" and np.median(x) <= NOISE_FACTOR * sizes.noise:
             slack.append(name)
-        if np.percentile(x, 95.0) > 2000.0:
-            report.warning(place, f"column {name} exceeds 2000 N; {conversion('mN')} if that is what it is")
+        if np.percentile(x, 95.0) > _MAX_TENSION:
+            report.warning(place, f"column {name} exceeds {_MAX_TENSION:g} N; {conversion('mN')} if that is what it is")
     if slack and trial.tendon_excursion is not None:
         said = f"shows no tension in {listed(slack)}, though ID.2 needs taut tendons to follow the joint"
         report.warning(place, f"{said}; check the columns, or record the trial again with tension")

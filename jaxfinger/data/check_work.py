@@ -29,6 +29,7 @@ _MIN_FELT_SHARE = 0.5
 # thirds of their tension (the shipped session). Units that people confuse differ at least fourfold (N and lbf).
 _MIN_ARM_RATIO, _MAX_ARM_RATIO = 0.2, 1.5
 _MAX_EXCURSION_RATIO = 3.0  # of two measurements of one excursion: units that people confuse differ by more.
+_MIN_PATH = 1e-3  # m of excursion: over less, stretch and noise decide the ratio of two measurements.
 _FORCE_RATIOS = (0.002, 1.0)  # N at the fingertip for each N of tension: a moment arm over a finger's length, with room
 # Moment arms as shares of the finger's length: neither nearly as long as a finger nor thinner than a hair.
 _MIN_ARM, _MAX_ARM = 0.004, 0.4
@@ -93,11 +94,11 @@ def _virtual_work(session: Session, kinematic: Excursions, report: Report) -> No
             report.warning(
                 "/trials",
                 "moment arms that excursions show (ID.2) and those that torques show (ID.4) contradict each other: "
-                f"{listed(list(found.values()), 3)}; check {what} of {_suspects(found, agreed)}",
+                f"{listed(list(found.values()), 3)}; check {what} of {suspects(found, agreed)}",
             )
 
 
-def _suspects(found: Collection[tuple[str, str]], agreed: Collection[tuple[str, str]]) -> str:
+def suspects(found: Collection[tuple[str, str]], agreed: Collection[tuple[str, str]]) -> str:
     """Channels that may be wrong, given the pairs of tendon and joint that contradict each other and those that agree.
 
     A joint at which another tendon agrees has a sound angle and torque; a tendon that agrees at another joint has sound
@@ -127,7 +128,7 @@ def _free_paths(session: Session, kinematic: Excursions, report: Report) -> None
             expected = np.sum([kinematic.polynomials[int(k), int(i)](q[:, i]) for i in joints], axis=0)
             ratio = slope(expected, l[:, k])
             agree = 1.0 / _MAX_EXCURSION_RATIO < ratio < _MAX_EXCURSION_RATIO
-            if np.isfinite(ratio) and not agree and np.ptp(expected) > 1e-3:
+            if np.isfinite(ratio) and not agree and np.ptp(expected) > _MIN_PATH:
                 found.append(f"{finger.tendon_names[k]} in {trial.name} ({ratio:.2g} times)")
     if found:
         report.warning(

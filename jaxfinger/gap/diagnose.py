@@ -140,7 +140,7 @@ def diagnose(
     search, state = search_for_causes(problem, catalogue, progress)
     baseline, table, found = search.baseline, search.table, posterior(search, state)
     relevance = relevance_of(problem, baseline, tolerance)
-    verdict = _verdict(problem, baseline, state, found, relevance)
+    verdict = _verdict(problem, found, relevance)
     nominal = nominal_fit(problem)
     chosen = baseline.null
     if verdict.status in (Status.PARTLY, Status.AMBIGUOUS):
@@ -242,9 +242,7 @@ def search_for_causes(
     return search, search.run()
 
 
-def _verdict(
-    problem: Problem, baseline: Baseline, state: SearchState, found: Posterior, relevance: tuple[Relevance, ...]
-) -> Verdict:
+def _verdict(problem: Problem, found: Posterior, relevance: tuple[Relevance, ...]) -> Verdict:
     """Verdict of the posterior; held-out trials decide later between `partly` and `explained`.
 
     Without a cause to name it is `unexplained` if some channel's mean square is surely above that of its noise,

@@ -264,7 +264,7 @@ def run_stage(
     if not free.size:
         if not groups:
             return skipped("the recipe leaves its terms out of the nominal model")
-        return skipped("; ".join(name_unseen(parameters, groups, free, coverage)) or "the finger has no active tendon")
+        return skipped("; ".join(name_unseen(parameters, groups, free)) or "the finger has no active tendon")
     prior = cad_prior(session, recipe, parameters, free)
     model, solution, sources, noise = estimate_with_noise(
         fit.model, free, stacks, reads, fit.noise, prior, recipe.fit.huber, tangents
@@ -276,7 +276,7 @@ def run_stage(
     needed = read[[parameters[i].group in free_groups(recipe) for i in read]]
     warnings = constant + name_missing(parameters, np.asarray(ravel(model)), determined, needed, coverage)
     warnings += name_invisible(parameters, free, solution.invisible)
-    warnings += name_unseen(parameters, groups, free, coverage)
+    warnings += name_unseen(parameters, groups, free)
     warnings += implausible(model, covariance, free, parameter_bounds(fit.model, free)[0])
     trials = tuple(t for e in reads for t in stacks[e].trials)
     report = report_of(stage.name, solution, free, trials, warnings)

@@ -43,9 +43,7 @@ def can_determine(p: Parameter, coverage: Coverage) -> bool:
     return p.joint in coverage.joints
 
 
-def name_unseen(
-    parameters: list[Parameter], groups: set[str], free: Int[np.ndarray, " p"], coverage: Coverage
-) -> list[str]:
+def name_unseen(parameters: list[Parameter], groups: set[str], free: Int[np.ndarray, " p"]) -> list[str]:
     """One sentence on the parameters of `groups` that are not `free`, since no trial shows them."""
     known = set(free.tolist())
     names = [p.name for i, p in enumerate(parameters) if p.group in groups and p.determinable and i not in known]

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.bad_input import complaints, mistakes
 from jaxfinger.data import Trial
-from jaxfinger.data.check_work import _suspects
+from jaxfinger.data.check_work import suspects
 
 FRICTION = 0.004  # N m
 
@@ -92,7 +92,7 @@ def test_most_mistakes_of_a_mapping_are_said(sound):
 
 
 @pytest.mark.parametrize(
-    ("found", "agreed", "suspects"),
+    ("found", "agreed", "expected"),
     [
         ([("T1", "MCP")], [("T2", "MCP")], "tendon_excursion or tendon_force of T1"),
         ([("T1", "MCP"), ("T1", "PIP")], [("T2", "MCP"), ("T2", "PIP")], "tendon_excursion or tendon_force of T1"),
@@ -101,5 +101,5 @@ def test_most_mistakes_of_a_mapping_are_said(sound):
         ([("T1", "MCP")], [("T2", "MCP"), ("T1", "PIP")], "joint_torque, tendon_excursion, tendon_force or q"),
     ],
 )
-def test_what_agrees_narrows_down_what_may_be_wrong(found, agreed, suspects):
-    assert _suspects(found, agreed) == suspects
+def test_what_agrees_narrows_down_what_may_be_wrong(found, agreed, expected):
+    assert suspects(found, agreed) == expected
