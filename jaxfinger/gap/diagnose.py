@@ -88,7 +88,8 @@ def diagnose(
 
     Args:
         session: the recordings.
-        recipe: the nominal model; a term that it leaves out is a candidate.
+        recipe: the nominal model; a term that it leaves out is a candidate. Where its elastic torque is constant, the
+            effects of a spring are not.
         quick: take a first look: half the samples, no joint fit of causes and nominal parameters, no forward simulation
             and no next experiment.
         effects: the user's own effects by id, candidates beside the catalogue's.
@@ -135,6 +136,8 @@ def diagnose(
     if next(measured_columns(problem), None) is None:
         return _nothing_judged(problem, diagnosed)
     kept = set(problem.fit.recipe.model.terms) | set(without)
+    if problem.fit.recipe.model.elastic_degree == 0:  # A constant elastic torque is no spring.
+        kept |= {k for k, c in catalogue.items() if c.OF_SPRING}
     laws = {law for c in changed.values() for law in c.__mro__}  # An effect that a change inherits from is its copy.
     catalogue = {k: c for k, c in catalogue.items() if k not in kept and (k in changed or c not in laws)}
     search, state = search_for_causes(problem, catalogue, progress)
