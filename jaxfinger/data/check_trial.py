@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.constants import g as STANDARD_GRAVITY
 
 from jaxfinger.data.check_jumps import check_jumps, placeholder
 from jaxfinger.data.constant import constant_columns
@@ -23,6 +24,12 @@ MAX_OVERTRAVEL = 0.35  # rad, 20 degrees, that a joint may read beyond its limit
 MAX_TARE_ERROR = 0.03
 _MAX_TARE = 0.5  # of the highest tension: a tendon that reads more is pulled on purpose.
 MAX_PUSH = 0.1
+# A tendon's moment arm is smaller than the machine, and joints turn by less than a turn: excursions in mm exceed this
+# share of the machine's reach.
+_MAX_EXCURSION = 5.0
+# Of the torque with which the whole machine weighs on an arm as long as its reach. A motor that leads a light joint
+# with friction and stiff springs gives up to tens of it; torques in N mm of one that only weighs are some 400 of it.
+_MAX_TORQUE = 200.0
 _MAX_DEGREES = 400.0  # Angles in degrees are smaller: a turn, with room.
 COLD = 200.0  # K, −73 °C: no laboratory is colder, so lower values are in °C.
 # A converter's limit is repeated over more samples at once, by this factor, than any value within its range. At the
@@ -333,19 +340,28 @@ def _magnitudes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: R
                 )
     if not turning.all():
         return
-    small = float(finger.mass.sum()) < 5.0
-    # Fingers of less than 5 kg neither pull in half a metre of tendon nor have 5 N m at a joint, except in wrong units.
-    for name, most, unit in (("tendon_excursion", 0.5, "mm"), ("joint_torque", 5.0, "N mm")):
+    reach = _reach(finger)
+    for name, most, unit in (
+        ("tendon_excursion", _MAX_EXCURSION * reach, "mm"),
+        ("joint_torque", _MAX_TORQUE * STANDARD_GRAVITY * float(finger.mass.sum()) * reach, "N mm"),
+    ):
         values = getattr(trial, name)
-        if values is None or not small:
+        if values is None or most == 0.0:
             continue
         for column, x in zip(CHANNELS[name].columns(finger), values.T, strict=True):
-            if np.isfinite(x).all() and np.percentile(np.abs(x), 90.0) > most:
-                size = np.percentile(np.abs(x), 90.0)
+            if np.isfinite(x).all() and (size := float(np.percentile(np.abs(x), 90.0))) > most:
                 report.error(
                     _place(trial, name),
-                    f"column {column} is of size {size:.3g}, too large for a finger; {conversion(unit)}",
+                    f"column {column} is of size {size:.3g}, too large for the lengths and masses of this machine; "
+                    f"{conversion(unit)}",
                 )
+
+
+def _reach(finger: FingerDescription) -> float:
+    """Length, m, of the stretched chain from its first joint to the end of its last link."""
+    gyration = np.sqrt(np.trace(finger.inertia[-1]) / 2.0 / finger.mass[-1])
+    last = max(np.linalg.norm(finger.fingertip), np.linalg.norm(finger.com[-1]), gyration)
+    return float(np.linalg.norm(finger.origin[1:], axis=1).sum() + last)
 
 
 def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:

@@ -142,8 +142,8 @@ def diagnose(
     catalogue = {k: c for k, c in catalogue.items() if k not in kept and (k in changed or c not in laws)}
     search, state = search_for_causes(problem, catalogue, progress)
     baseline, table, found = search.baseline, search.table, posterior(search, state)
-    relevance = relevance_of(problem, baseline, tolerance)
-    verdict = _verdict(problem, baseline, state, found, relevance)
+    sized = partial(relevance_of, problem, baseline.columns, tolerance=tolerance)
+    verdict = _verdict(problem, found, sized(columns_with_gap(baseline, baseline.null)))
     nominal = nominal_fit(problem)
     chosen = baseline.null
     if verdict.status in (Status.PARTLY, Status.AMBIGUOUS):
@@ -157,11 +157,13 @@ def diagnose(
             augmented = as_refitted(baseline, problem, chosen, hold=something_open)
         else:
             augmented = augmented_fit(problem, chosen, hold=something_open)
+    with_gap = columns_with_gap(baseline, chosen)
+    relevance = sized(with_gap)
     progress("refitting without each third of the trials")
     # Without causes, what is left of another simulator is what retuning leaves.
     lines = closures(problem, augmented or (nominal if problem.simulator is not None else None), not quick)
     status = _explained_or_partly(verdict.status, found, lines, relevance, tolerance)
-    shares = budget(baseline, chosen, problem, columns_with_gap(baseline))
+    shares = budget(baseline, chosen, problem, with_gap)
     suggestion: NextExperiment | None = None
     if status is Status.AMBIGUOUS and not quick:
         progress("looking for the trial that would tell them apart")
@@ -245,9 +247,7 @@ def search_for_causes(
     return search, search.run()
 
 
-def _verdict(
-    problem: Problem, baseline: Baseline, state: SearchState, found: Posterior, relevance: tuple[Relevance, ...]
-) -> Verdict:
+def _verdict(problem: Problem, found: Posterior, relevance: tuple[Relevance, ...]) -> Verdict:
     """Verdict of the posterior; held-out trials decide later between `partly` and `explained`.
 
     Without a cause to name it is `unexplained` if some channel's mean square is surely above that of its noise,
