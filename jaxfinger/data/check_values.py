@@ -10,7 +10,7 @@ from jaxfinger.data.motion import MIN_MOTION
 from jaxfinger.data.schema import CHANNELS, measured_columns
 from jaxfinger.data.session import FingerDescription, Trial
 from jaxfinger.data.sizes import NOISE_FACTOR, Sizes
-from jaxfinger.data.units import conversion, whole_turns
+from jaxfinger.data.units import STANDARD_GRAVITY, conversion, whole_turns
 from jaxfinger.data.unmeasured import constant_columns, placeholder
 from jaxfinger.errors import counted, listed
 
@@ -20,6 +20,12 @@ _MAX_OVERTRAVEL = 0.35  # rad, 20 degrees, that a joint may read beyond its limi
 MAX_TARE_ERROR = 0.03
 _MAX_TARE = 0.5  # of the highest tension: a tendon that reads more is pulled on purpose.
 _MAX_PUSH = 0.1
+# A tendon's moment arm is smaller than the machine, and joints turn by less than a turn: excursions in mm exceed this
+# share of the machine's reach.
+_MAX_EXCURSION = 5.0
+# Of the torque with which the whole machine weighs on an arm as long as its reach. A motor that leads a light joint
+# with friction and stiff springs gives up to tens of it; torques in N mm of one that only weighs are some 400 of it.
+_MAX_TORQUE = 200.0
 _MAX_TENSION = 2000.0  # N: in mN these are the 2 N at which tendons are kept taut.
 _MAX_DEGREES = 400.0  # Angles in degrees are smaller: a turn, with room.
 _COLD = 200.0  # K, −73 °C: no laboratory is colder, so lower values are in °C.
@@ -40,7 +46,7 @@ def check_values(trial: Trial, finger: FingerDescription, sizes: Sizes, report: 
     if trial.tendon_force is not None:
         _tension(trial, finger, sizes, report)
     _temperatures(trial, report)
-    _of_a_small_finger(trial, finger, report)
+    _large_for_the_machine(trial, finger, report)
 
 
 def _constant_columns(trial: Trial, finger: FingerDescription, report: Report) -> None:
@@ -127,21 +133,30 @@ def _temperatures(trial: Trial, report: Report) -> None:
             )
 
 
-def _of_a_small_finger(trial: Trial, finger: FingerDescription, report: Report) -> None:
-    """Check that the excursions and torques of a small finger are in m and N m.
-
-    Fingers of less than 5 kg neither pull in half a metre of tendon nor have 5 N m at a joint.
-    """
-    if any(finger.prismatic) or not finger.mass.sum() < 5.0:
+def _large_for_the_machine(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Check that excursions and torques are in m and N m: their sizes fit the machine's lengths and masses."""
+    if any(finger.prismatic):
         return
-    for channel, most, unit in (("tendon_excursion", 0.5, "mm"), ("joint_torque", 5.0, "N mm")):
-        for _, name, x in measured_columns(trial, finger, (channel,)):
-            size = np.percentile(np.abs(x), 90.0) if np.isfinite(x).all() else 0.0
-            if size > most:
+    reach = _reach(finger)
+    weight = STANDARD_GRAVITY * float(finger.mass.sum())
+    for channel, most, unit in (
+        ("tendon_excursion", _MAX_EXCURSION * reach, "mm"),
+        ("joint_torque", _MAX_TORQUE * weight * reach, "N mm"),
+    ):
+        for _, name, x in measured_columns(trial, finger, (channel,)) if most != 0.0 else ():
+            if np.isfinite(x).all() and (size := float(np.percentile(np.abs(x), 90.0))) > most:
                 report.error(
                     trial.place(channel),
-                    f"column {name} is of size {size:.3g}, too large for a finger; {conversion(unit)}",
+                    f"column {name} is of size {size:.3g}, too large for the lengths and masses of this machine; "
+                    f"{conversion(unit)}",
                 )
+
+
+def _reach(finger: FingerDescription) -> float:
+    """Length, m, of the stretched chain from its first joint to the end of its last link."""
+    gyration = np.sqrt(np.trace(finger.inertia[-1]) / 2.0 / finger.mass[-1])
+    last = max(np.linalg.norm(finger.fingertip), np.linalg.norm(finger.com[-1]), gyration)
+    return float(np.linalg.norm(finger.origin[1:], axis=1).sum() + last)
 
 
 def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:

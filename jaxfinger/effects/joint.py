@@ -154,6 +154,7 @@ class ElasticRelaxation(CatalogueEffect):
     HAPPENS: ClassVar = "The elastic torque relaxes while the joint is held, and lags while it moves."
     LOOKS: ClassVar = "Torque creeps at each hold, and the loop of torque against angle is widest at a certain speed."
     CHANGE: ClassVar = "Add a spring and damper in series beside the joint's spring; wait longer at holds."
+    OF_SPRING: ClassVar = True
 
     stiffness: Float[Array, ""] = amplitude("N m/rad", 0.3, "torque/angle")
     T: Float[Array, ""] = shape("s", (0.003, 0.01, 0.03, 0.1, 0.3, 1.0), "trial")

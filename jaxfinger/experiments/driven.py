@@ -6,7 +6,7 @@ a fit both sides of (1) pass the same low-pass; for a prediction of every sample
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import minimum_filter1d
+from scipy.ndimage import binary_opening, minimum_filter1d
 
 from jaxfinger.data import (
     directions,
@@ -31,6 +31,7 @@ MIN_SPEED_SHARE = 0.05  # of the motion's speed, for a joint that tendons drive 
 MIN_SPEED_TO_NOISE = 3.0  # two standard deviations, for a joint that a motor moves; the share above where that is less
 MIN_TENDON_SPEED_TO_NOISE = 2.5  # 1.7 standard deviations, for a tendon, and half of that in the quicker filter
 # A slip between two stops is shorter than the slow filter, which then loses speed against the quick one.
+MIN_REST = 1.5  # times what a reversal looks like a rest for: accelerations change meanwhile
 MAX_LOST_SPEED_SHARE = 0.5  # of a joint's speed that the slow filter may lose; stick and slip lose 1 to 3 times it
 MIN_SLIP_TO_NOISE = 15.0  # ten standard deviations: a smaller loss is not a slip
 ROUNDING_SHARE = 1e-6  # of the motion's speed: a loss by rounding, of a joint at rest in a simulated file
@@ -57,7 +58,7 @@ def reduce(r: PreparedTrial) -> Row:
     joint = joint_directions(r, j, slow)
     rates = None if r.experiment.slack else tendon_rates(r)
     tendon = tendon_directions(r, rates)
-    slides = sliding(r, j.qd, slow, joint, rates, CLEAR_WIDTHS * filter_std(r.experiment.cutoff))
+    slides = sliding(r, j, slow, joint, rates, CLEAR_WIDTHS * filter_std(r.experiment.cutoff))
 
     qdd, tension, y = j.qdd, r.tension(), r.y
     if r.reduced or r.experiment.slack:
@@ -122,7 +123,7 @@ def tendon_directions(r: PreparedTrial, rates) -> Float[np.ndarray, "N n"]:
 
 def sliding(
     r: PreparedTrial,
-    qd: Float[np.ndarray, "N m"],
+    j: Joints,
     slow: Float[np.ndarray, "N m"],
     direction: Float[np.ndarray, "N m"],
     rates: tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]] | None,
@@ -130,15 +131,17 @@ def sliding(
 ) -> Bool[np.ndarray, "N m"]:
     """Whether a joint and every taut tendon across it slide, so that the directions of friction are known.
 
-    `qd`, `slow`: joint speeds, rad/s, in the fit's filter and in a slower one. `rates`: speeds of the tendons, None
-    where all are slack or unmeasured. `clear`: s, left out on either side of samples where they do not slide.
+    `j`, `slow`: motion in the fit's filter, and joint speeds, rad/s, in a slower one. `rates`: speeds of the tendons,
+    None where all are slack or unmeasured. `clear`: s, left out on either side of samples where they do not slide.
     """
+    qd = j.qd
     lost, fast = np.abs(r.quick_rates - slow), np.percentile(np.abs(qd), 95, axis=0)
     noise = np.median(lost, axis=0)
     least = MIN_SPEED_SHARE * fast
     least = np.where(r.motorised, np.minimum(MIN_SPEED_TO_NOISE * noise, least), least)
     slides = (np.abs(qd) > least) & (np.sign(qd) == np.sign(direction))
     slides[1:] &= np.sign(qd[1:]) == np.sign(qd[:-1])  # a quick reversal may have no slow sample
+    slides &= ~(r.motorised & rests(j, ~slides, r.step))
     if rates is not None and r.trial.tendon_force is not None:
         known = _friction_known(r, *rates)
         for i in range(r.finger.m):
@@ -154,6 +157,19 @@ def sliding(
     # The window reaches back only: a free joint breaks away suddenly and moves the others.
     half = round(0.5 * BREAKAWAY_WIDTHS * filter_std(r.experiment.cutoff) / r.step)
     return np.where(r.motorised, apart, minimum_filter1d(apart, 2 * half + 1, axis=0, origin=half))
+
+
+def rests(j: Joints, slow: Bool[np.ndarray, "N m"], step: float) -> Bool[np.ndarray, "N m"]:
+    """Whether a joint rests, up to the instant at which it starts and from that at which it stops.
+
+    The filter shows a motion before it starts. With σ its width, z = t/σ, and φ and Φ the standard normal density and
+    distribution, a start at t = 0 with the acceleration a becomes q̇ = a σ (φ(z) + z Φ(z)) and q̈ = a Φ(z). Their ratio
+    rises, and is σ √(2/π) at the start itself. At a reversal it is below that for 2 √(2/π) σ; only what lasts longer is
+    a rest. `slow`: samples whose speed is within its noise.
+    """
+    start = np.sqrt(2.0 / np.pi) * filter_std(j.cutoff)
+    length = round(MIN_REST * 2.0 * start / step) + 1
+    return binary_opening(slow | (np.abs(j.qd) <= start * np.abs(j.qdd)), np.ones((length, 1)))
 
 
 def _friction_known(r: PreparedTrial, slow, quick) -> Bool[np.ndarray, "N n"]:

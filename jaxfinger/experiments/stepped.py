@@ -4,6 +4,8 @@ A hold is valid where the direction of its approach is known, which gives the di
 motion it is unknown.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -30,8 +32,8 @@ def reduce(r: PreparedTrial) -> Row:
         for samples in runs_of_holds(hold):  # a zero-phase filter shows the next step before it starts
             joint[samples] = joint[samples[len(samples) // 2]]
     moves = (hold < 0)[:, None]  # nothing moves in a hold
-    qd, qdd = j.qd * moves, j.qdd * moves
-    slides = sliding(r, qd, slow, joint, None, CLEAR_TIME * r.experiment.pace)
+    j = replace(j, qd=j.qd * moves, qdd=j.qdd * moves)
+    slides = sliding(r, j, slow, joint, None, CLEAR_TIME * r.experiment.pace)
     at = r.whole(hold)
     known = r.mean(slides.astype(float)) > 1.0 - 1e-9  # all samples of the block
     approached = np.abs(r.mean(joint)) > 1.0 - 1e-9
@@ -39,7 +41,7 @@ def reduce(r: PreparedTrial) -> Row:
     q = _at_rest(r.mean(r.trial.q), at)
     nothing = np.zeros((len(joint), r.finger.n))
     tension = r.taut(r.mean(r.tension()))
-    return row(r, q, (qd, qdd), tension, counting, j.noise, directions=(joint, nothing), hold=at)
+    return row(r, q, (j.qd, j.qdd), tension, counting, j.noise, directions=(joint, nothing), hold=at)
 
 
 def _at_rest(q: Float[np.ndarray, "M m"], hold: Int[np.ndarray, " M"]) -> Float[np.ndarray, "M m"]:

@@ -88,7 +88,8 @@ def diagnose(
 
     Args:
         session: the recordings.
-        recipe: the nominal model; a term that it leaves out is a candidate.
+        recipe: the nominal model; a term that it leaves out is a candidate. Where its elastic torque is constant, the
+            effects of a spring are not.
         quick: take a first look: half the samples, no joint fit of causes and nominal parameters, no forward simulation
             and no next experiment.
         effects: the user's own effects by id, candidates beside the catalogue's.
@@ -135,12 +136,14 @@ def diagnose(
     if next(measured_columns(problem), None) is None:
         return _nothing_judged(problem, diagnosed)
     kept = set(problem.fit.recipe.model.terms) | set(without)
+    if problem.fit.recipe.model.elastic_degree == 0:  # A constant elastic torque is no spring.
+        kept |= {k for k, c in catalogue.items() if c.OF_SPRING}
     laws = {law for c in changed.values() for law in c.__mro__}  # An effect that a change inherits from is its copy.
     catalogue = {k: c for k, c in catalogue.items() if k not in kept and (k in changed or c not in laws)}
     search, state = search_for_causes(problem, catalogue, progress)
     baseline, table, found = search.baseline, search.table, posterior(search, state)
-    relevance = relevance_of(problem, baseline, tolerance)
-    verdict = _verdict(problem, found, relevance)
+    sized = partial(relevance_of, problem, baseline.columns, tolerance=tolerance)
+    verdict = _verdict(problem, found, sized(columns_with_gap(baseline, baseline.null)))
     nominal = nominal_fit(problem)
     chosen = baseline.null
     if verdict.status in (Status.PARTLY, Status.AMBIGUOUS):
@@ -154,11 +157,13 @@ def diagnose(
             augmented = as_refitted(baseline, problem, chosen, hold=something_open)
         else:
             augmented = augmented_fit(problem, chosen, hold=something_open)
+    with_gap = columns_with_gap(baseline, chosen)
+    relevance = sized(with_gap)
     progress("refitting without each third of the trials")
     # Without causes, what is left of another simulator is what retuning leaves.
     lines = closures(problem, augmented or (nominal if problem.simulator is not None else None), not quick)
     status = _explained_or_partly(verdict.status, found, lines, relevance, tolerance)
-    shares = budget(baseline, chosen, problem, columns_with_gap(baseline))
+    shares = budget(baseline, chosen, problem, with_gap)
     suggestion: NextExperiment | None = None
     if status is Status.AMBIGUOUS and not quick:
         progress("looking for the trial that would tell them apart")

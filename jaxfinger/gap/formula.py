@@ -105,11 +105,29 @@ def log_likelihood(
     p: Parameters,
 ) -> tuple[Float[np.ndarray, " *n"], Weights]:
     """Log likelihood (L) of what n sets leave, and the weights of the next least squares."""
+    by_column, weights = _log_likelihoods(counts, e, o, explained, p)
+    return np.asarray(np.sum(by_column, axis=-1)), weights
+
+
+def likelihood_gain(counts: Counts, null: Evidence, now: Evidence, p: Parameters) -> Float[np.ndarray, " C"]:
+    """Log likelihood in every column that a set gains over `null`, nats."""
+    a, b = (_log_likelihoods(counts, x.e, x.o, x.explained, p)[0] for x in (null, now))
+    return b - a
+
+
+def _log_likelihoods(
+    counts: Counts,
+    e: Float[np.ndarray, "*n C"],
+    o: Float[np.ndarray, "*n C"],
+    explained: Float[np.ndarray, "*n C"],
+    p: Parameters,
+) -> tuple[Float[np.ndarray, "*n C"], Weights]:
+    """Log likelihood (L) of every column, and the weights of the next least squares."""
     K, nu = counts.K, p.outside_samples
     v = np.maximum(e / K, _variance_floor(counts, o, explained, p))
     excess = np.maximum(o - counts.outside, 0.0) / nu
-    value = -0.5 * np.sum(K * np.log(v) + e / v + nu * np.log1p(excess), axis=-1)
-    return np.asarray(value), Weights(1.0 / v, 1.0 / (1.0 + excess))
+    value = -0.5 * (K * np.log(v) + e / v + nu * np.log1p(excess))
+    return value, Weights(1.0 / v, 1.0 / (1.0 + excess))
 
 
 def _variance_floor(

@@ -14,7 +14,7 @@ from jaxfinger.gap.closure import centred
 from jaxfinger.gap.columns import Columns
 from jaxfinger.gap.costs import CauseKey
 from jaxfinger.gap.exact import Baseline, SearchState
-from jaxfinger.gap.formula import Weights
+from jaxfinger.gap.formula import Weights, likelihood_gain
 from jaxfinger.gap.posterior import Posterior
 from jaxfinger.gap.problem import Problem, site
 from jaxfinger.gap.projector import Projector
@@ -50,9 +50,19 @@ MAX_HELD_OUT = 12  # Candidates outside of the chosen set, most probable first, 
 MIN_DEVIATION = 3.0  # Standard deviations: the usual three sigma, by which a simulator's parameter must be off.
 
 
-def columns_with_gap(baseline: Baseline) -> frozenset[int]:
-    """Numbers of the columns in which the nominal model alone leaves a gap."""
-    return frozenset(np.flatnonzero(baseline.unexplained > MIN_GAP_EVIDENCE).tolist())
+def columns_with_gap(baseline: Baseline, chosen: SearchState) -> frozenset[int]:
+    """Numbers of the columns in which the nominal model alone leaves a gap.
+
+    There smooth features alone, or the causes of the chosen set, bring evidence that something is at work. Causes that
+    act within short times, as friction does at reversals, show outside of the features.
+    """
+    explained = likelihood_gain(
+        baseline.columns.counts,
+        baseline.null.linear_fit.evidence,
+        chosen.linear_fit.evidence,
+        baseline.parameters,
+    )
+    return frozenset(np.flatnonzero(np.maximum(baseline.unexplained, explained) > MIN_GAP_EVIDENCE).tolist())
 
 
 def by_share(named, chosen: SearchState, shares: Budget) -> list:
@@ -145,9 +155,11 @@ def mean_squares(problem: Problem, e: str, c: str, column: int | None = None) ->
     return float((missed**2).sum()) / count, of_noise
 
 
-def relevance_of(problem: Problem, baseline: Baseline, tolerance: Mapping[str, float]) -> tuple[Relevance, ...]:
+def relevance_of(
+    problem: Problem, columns: Columns, with_gap: Collection[int], tolerance: Mapping[str, float]
+) -> tuple[Relevance, ...]:
     """Size of each channel's gap, and relative to the channel's signal in the experiment that moves it most."""
-    items = [baseline.columns.items[c] for c in columns_with_gap(baseline)]
+    items = [columns.items[c] for c in sorted(with_gap)]
     out = []
     for e, c in dict.fromkeys((x.experiment, x.channel) for x in items):
         missed, noise = mean_squares(problem, e, c)

@@ -15,17 +15,11 @@ from jaxfinger.data.schema import channel_units
 from jaxfinger.gap.problem import Problem, site
 from jaxfinger.gap.projector import Projector
 from jaxfinger.gap.signatures import whitened
-from jaxfinger.gap.smooth_laws import SmoothPart, concerned, since_reversal
+from jaxfinger.gap.smooth_laws import LENGTHS, PULL, SPEEDS, TIMES, SmoothPart, concerned, since_reversal
 
 MAX_TERMS = 3  # A formula of more terms is no law that a person could recognise.
 MIN_GAIN_SHARE = 0.1  # Share of the energy that smooth laws explain which every further term must explain.
 MIN_UNABSORBED = 0.05  # Share of a term's norm that nominal parameters must leave, lest its coefficient be arbitrary.
-# Scales of the library's terms, as shares of the specimen's own (`effects.Scales`), a factor of four or five apart, so
-# that neighbouring terms are clearly distinct.
-SPEEDS = (0.05, 0.2, 0.8)
-LENGTHS = (0.015, 0.08, 0.3)  # of a joint's range
-TENSION_CHANGE = 0.08
-TIMES = (0.03, 0.15)  # of the longest trial
 HARMONICS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16)  # periods a turn
 
 
@@ -128,7 +122,7 @@ def terms(problem: Problem, experiment: str, channel: str, column: int) -> list[
             b = f"f_{tendons[k]}"
             pulled = since_reversal(f[k])
             out += [(b, f[k]), (f"{b}²", f[k] ** 2), (f"√{b}", np.sqrt(np.maximum(f[k], 0.0)))]
-            (w,) = _rounded((TENSION_CHANGE,), scales.tension[k])
+            (w,) = _rounded((PULL,), scales.tension[k])
             out += [(f"exp(−|Δ{b}|/{w:g} N) sign Δ{b}", np.exp(-np.abs(pulled) / w) * np.sign(pulled))]
             for i in own:
                 a = f"q_{names[i]}"

@@ -22,11 +22,12 @@ MIN_RELATIVE_SINGULAR_VALUE = 0.1
 SMOOTHING = 15  # samples. Averages of so many have a quarter of the noise, which would add reversals of its own.
 MIN_REVERSAL = 0.02  # share of a signal's range. A way back that is shorter is noise, or no change of direction.
 
-# Scales of the laws that the features resemble, within the range that the catalogue tries (`effects`).
-CREEPING = 0.1  # rad/s, Stribeck's velocity
-LENGTHS = (0.02, 0.1)  # rad, pre-sliding and backlash of a joint
-PULL = 1.0  # N, pre-sliding of a tendon, as the tension that changes over it
-TIMES = (1.0, 5.0)  # s, creep and relaxation within a trial
+# Scales of laws, as shares of the specimen's own (`effects.Scales`), from the smallest that the catalogue tries. They
+# are a factor of four or five apart, so that neighbouring features and terms (`propose`) are clearly distinct.
+SPEEDS = (0.05, 0.2, 0.8)  # of a joint's highest speed: Stribeck's velocity, and friction that differs by direction
+LENGTHS = (0.015, 0.08, 0.3)  # of a joint's range: its pre-sliding and backlash
+PULL = 0.08  # of the highest tension: pre-sliding of a tendon, as the tension that changes over it
+TIMES = (0.03, 0.15)  # of the longest trial: creep and relaxation within a trial
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def features(
 ) -> dict[str, list[Float[np.ndarray, "_B _T"]]]:
     """Features of one column, each (B, T), grouped by the variable that they depend on."""
     stack = problem.stacks[experiment]
-    x = stack.batch.x
+    x, scales = stack.batch.x, problem.scales
     finger = problem.nominal.finger
     q, qd, f = np.asarray(x.q), np.asarray(x.qd), np.asarray(x.tension)
     direction, time = np.asarray(x.joint_direction), np.asarray(x.time)
@@ -62,10 +63,11 @@ def features(
     for i in own:
         u = _unit(q[i])
         out["q"] += [np.cos(k * np.arccos(u)) for k in range(1, 7)]
-        out["qd"] += [_unit(qd[i]) ** p for p in (1, 2, 3)] + [np.exp(-np.abs(qd[i]) / CREEPING)]
+        out["qd"] += [_unit(qd[i]) ** p for p in (1, 2, 3)]
+        out["qd"] += [np.exp(-np.abs(qd[i]) / v) for v in np.multiply(SPEEDS, scales.speed[i])]
         out["direction"] += [direction[i] * u**p for p in range(3)]
         travelled = since_reversal(_smoothed(q[i]))
-        for length in LENGTHS:
+        for length in np.multiply(LENGTHS, scales.angle[i]):
             out["distance since reversal"] += [
                 np.exp(-np.abs(travelled) / length) * s
                 for s in (1.0, direction[i], np.tanh(travelled / (0.1 * length)))
@@ -74,15 +76,15 @@ def features(
         if f[k].any():
             u = f[k] / max(f[k].max(), 1e-9)
             out["tension"] += [u, u**2, np.sqrt(np.maximum(u, 0))] + [u * _unit(q[i]) for i in own]
-            pulled = since_reversal(_smoothed(f[k]))
-            out["distance since reversal"] += [np.exp(-np.abs(pulled) / PULL) * np.tanh(pulled / (0.1 * PULL))]
+            pulled = since_reversal(_smoothed(f[k])) / (PULL * scales.tension[k])
+            out["distance since reversal"] += [np.exp(-np.abs(pulled)) * np.tanh(10.0 * pulled)]
     for i in range(finger.m):
         if i not in own:
             out["other joints"] += [_unit(q[i]), _unit(q[i]) ** 2] + [_unit(q[i]) * _unit(q[j]) for j in own]
         else:
             out["other joints"] += [_unit(q[i]) * _unit(q[j]) for j in own if j > i]
     span = max(float(time.max()), 1e-9)
-    out["time"] += [(time / span) ** p for p in (1, 2)] + [np.exp(-time / s) for s in TIMES]
+    out["time"] += [(time / span) ** p for p in (1, 2)] + [np.exp(-time / (s * scales.trial)) for s in TIMES]
     out["time"] += [np.asarray(x.session_time) / max(float(np.asarray(x.session_time).max()), 1e-9)]
     return out
 

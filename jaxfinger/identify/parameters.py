@@ -155,7 +155,8 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
             label = f"rotor inertia {joints[a]}" if a == b else f"rotor inertia {joints[a]}-{joints[b]}"
             return Parameter(label, "rotor_inertia", units, joints[a], determinable=a == b)
         case ["finger", field]:
-            return Parameter(f"{field} {index}", field, {"gyration": "m2", "gravity": "m s-2"}.get(field, "m"))
+            units = {"axis": "1", "gyration": "m2", "gravity": "m s-2"}.get(field, "m")
+            return Parameter(f"{field} {index}", field, units)
         case ["moment_arm", _]:
             return _moment_arm(model, *index)
         case ["joint_torque", "damping"]:

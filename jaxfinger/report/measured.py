@@ -13,10 +13,12 @@ from jaxfinger.data import Session
 from jaxfinger.experiments import Stack, predict_compiled
 from jaxfinger.model import Model, TendonFriction, rigid_body
 
-MIN_ARM = 1e-3  # m: with a shorter moment arm, an error of the torque is a large error of the tension behind it.
+# Of the largest moment arm at the joint: with a shorter one an error of the torque is a large error of the tension.
+MIN_ARM_SHARE = 0.1
 STROKE_PARTS = 6  # Parts of a joint's stroke in ID.2, with one slope each: enough to show a moment arm of degree 4.
 MIN_SAMPLES = 8  # Samples of a part: twice the four coefficients that are fitted to them.
-MIN_STEP = 0.1  # N, by which a hold's tension must exceed that of all before it, so that tension was rising.
+# Of the highest tension, by which a hold's must exceed that of all holds before it, so that tension was rising.
+MIN_STEP_SHARE = 0.01
 
 
 @dataclass(frozen=True)
@@ -97,10 +99,11 @@ def loss_points(model: Model, session: Session, stack: Stack) -> dict[str, Point
             continue
         k, i = session.finger.tendon_names.index(trial.tendon), session.finger.joint_names.index(trial.joint)
         f = np.asarray(x.tension)[k, b]
+        min_arm, min_step = MIN_ARM_SHARE * np.abs(C[:, i]).max(), MIN_STEP_SHARE * f.max()
         highest = 0.0
         for run in stack.samples_of_holds(b, mask[i, b]):
             arm = C[k, i, b, run].mean()
-            if f[run].mean() > highest + MIN_STEP and abs(arm) > MIN_ARM:
+            if f[run].mean() > highest + min_step and abs(arm) > min_arm:
                 lost = (y[i, b, run] - without[i, b, run]).mean() / arm
                 found.setdefault(trial.tendon, []).append((f[run].mean(), lost))
             highest = max(highest, f[run].mean())

@@ -234,12 +234,8 @@ class Rig(ABC):
         """Switch the drives on at the present set-points. Only after this call can anything move."""
 
     @abstractmethod
-    def disarm(self) -> int:
-        """Switch the drives off."""
-
-    @abstractmethod
     def release(self) -> int:
-        """Release the finger: external motor to zero torque, all tendons down together, then drives off.
+        """Release the finger: the external motor holds its joint, all tendons go down together, then drives go off.
 
         The controller does this by itself once it has the command; it takes 0.7 s (docs/plc-contract.md, Release).
         """

@@ -1,7 +1,8 @@
 """The paper's experiments as protocols: generators of commands, waits and marks that the runner carries out.
 
-A protocol begins unrecorded (posture, pretension, taring), yields `Start`, and is recorded from there to its end. Plan
-files give angles in degrees, tensions in N, times in s; commands are in SI.
+A protocol begins unrecorded (posture, pretension, taring), yields `Start`, and is recorded from there to its end. The
+runner then carries out `slackened`, so that no tendon pulls when the operator is asked for the next posture. Plan files
+give angles in degrees, tensions in N, times in s; commands are in SI.
 """
 
 from __future__ import annotations
@@ -200,10 +201,15 @@ def _tension(targets: dict[str, float], rate: float) -> Protocol:
     yield Reached()
 
 
+def slackened(finger: FingerDescription, rate: float) -> Protocol:
+    """Take the tension off all tendons. At one rate for all, so no difference between two of them grows meanwhile."""
+    yield from _tension(_all(finger, 0.0), rate)
+
+
 def _tared(finger: FingerDescription, posture: dict[str, float], kinds: tuple[str, ...], rate: float) -> Protocol:
     """Take the tension off, unload the sensors, and tare them: the beginning of every trial that reads them."""
     yield Setup(f"Fix all joints: {_angles(posture)}. Uncouple the external motor, free the fingertip.", fixed=posture)
-    yield from _tension(_all(finger, 0.0), rate)
+    yield from slackened(finger, rate)
     yield Dwell(0.3)
     yield Tare(kinds)
 
@@ -253,7 +259,6 @@ def static_torque(finger: FingerDescription, p: StaticTorque) -> Protocol:
             yield Mark(hold, {p.joint: direction})
             yield Dwell(p.dwell)
             hold += 1
-    yield Mark(-1, {p.joint: -1})
 
 
 def dynamic_torque(finger: FingerDescription, p: DynamicTorque) -> Protocol:
@@ -284,7 +289,6 @@ def tendon_friction(finger: FingerDescription, p: TendonFriction) -> Protocol:
     yield from _tared(finger, posture, ("external_torque",), p.tension_rate)
     yield from _coupled(posture, p.joint)
     yield from _steps(p.tendon, p.levels, p.down, p.settle, p.dwell, p.tension_rate)
-    yield from _tension(_all(finger, 0.0), p.tension_rate)
 
 
 def fingertip_force(finger: FingerDescription, p: FingertipForce) -> Protocol:
@@ -294,7 +298,6 @@ def fingertip_force(finger: FingerDescription, p: FingertipForce) -> Protocol:
     text = f"Bring the force sensor to the fingertip at {_angles(posture)}; only the contact holds the finger."
     yield Setup(text, fixed=posture, contact=True)
     yield from _steps(p.tendon, p.levels, False, p.settle, p.dwell, p.tension_rate)
-    yield from _tension(_all(finger, 0.0), p.tension_rate)
 
 
 def _steps(tendon: str, levels: tuple[float, ...], down: bool, settle: float, dwell: float, rate: float) -> Protocol:
@@ -312,7 +315,6 @@ def _steps(tendon: str, levels: tuple[float, ...], down: bool, settle: float, dw
         yield Dwell(settle)
         yield Mark(hold, {}, {tendon: direction})
         yield Dwell(dwell)
-    yield Mark(-1, {}, {tendon: -1 if down else 1})
 
 
 def free_excursion(finger: FingerDescription, p: FreeExcursion) -> Protocol:
@@ -327,18 +329,25 @@ def free_excursion(finger: FingerDescription, p: FreeExcursion) -> Protocol:
 
 
 def trajectory(finger: FingerDescription, p: Trajectory) -> Protocol:
-    """VD.3: the tendons alone drive the free finger. No target is below MIN_TARGET, so that no tendon falls slack."""
+    """VD.3: the tendons alone drive the free finger. No target is below MIN_TARGET, so that no tendon falls slack.
+
+    Fixtures are removed at MIN_TARGET: more tension would throw a joint that is let go.
+    """
     posture, names = p.posture(finger), list(_all(finger, 0.0))
     mean = np.array(p.mean or (2.0,) * len(names))
     rng = np.random.default_rng(p.seed)
+
+    def at_least_taut(tension: np.ndarray) -> dict[str, float]:
+        return dict(zip(names, np.maximum(tension, MIN_TARGET).tolist(), strict=True))
+
     yield Setup(f"Fix all joints: {_angles(posture)}.", fixed=posture)
-    yield from _tension(dict(zip(names, mean.tolist(), strict=True)), p.tension_rate)
+    yield from _tension(_all(finger, MIN_TARGET), p.tension_rate)
     yield Setup("Remove all fixtures.")
+    yield from _tension(at_least_taut(mean), p.tension_rate)
     yield Dwell(1.0)
     yield Start(loaded=tuple(names))
     for _ in range(round(p.seconds / p.interval)):
-        target = np.maximum(mean + p.amplitude * rng.uniform(-1, 1, len(names)), MIN_TARGET)
-        yield TensionRamp(dict(zip(names, target.tolist(), strict=True)), p.tension_rate)
+        yield TensionRamp(at_least_taut(mean + p.amplitude * rng.uniform(-1, 1, len(names))), p.tension_rate)
         yield Dwell(p.interval)
 
 

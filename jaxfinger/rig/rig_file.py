@@ -19,6 +19,9 @@ from jaxfinger.rig.channels import ANALOG_KINDS, UNITS, Deadlines, Limits, Loose
 # s, default of `frozen_s` for analog channels: a thousand equal values at 1 kHz. Sensor noise prevents them unless the
 # converter's step is much larger than the noise; give a longer `frozen_s` there.
 FROZEN_S = 1.0
+# s, the longest deadline that a rig file may set. The finger may be under tension until it is over, and within 5 s a
+# person at the bench has reached for the switch.
+MAX_DEADLINE_S = 5.0
 # deg/s², default of `joint_acceleration_deg_s2`: twice what a plan's trials have by default (protocols.py).
 ACCELERATION_DEG_S2 = 1200.0
 
@@ -35,15 +38,16 @@ class RigTable:
     allow_filtered: bool = False  # dynamic experiments behind a slow filter
     # stale_s, lag_s and thread_s: four to five times poll_s, and about the 0.25 s after which the controller itself
     # would release the finger for want of a heartbeat.
-    stale_s: Annotated[float, Within(0.01, 60.0, "s")] = 0.2
-    lag_s: Annotated[float, Within(0.01, 60.0, "s")] = 0.25
-    thread_s: Annotated[float, Within(0.05, 60.0, "s")] = 0.2
-    disk_s: Annotated[float, Within(0.1, 60.0, "s")] = 1.0  # fdatasync took up to 0.29 s on a busy disk
+    stale_s: Annotated[float, Within(0.01, MAX_DEADLINE_S, "s")] = 0.2
+    lag_s: Annotated[float, Within(0.01, MAX_DEADLINE_S, "s")] = 0.25
+    thread_s: Annotated[float, Within(0.05, MAX_DEADLINE_S, "s")] = 0.2
+    disk_s: Annotated[float, Within(0.1, MAX_DEADLINE_S, "s")] = 1.0  # fdatasync took up to 0.29 s on a busy disk
     # A fixture is fitted in a minute or two. Below 10 s nobody can have read and done what a prompt says; after half an
     # hour without an answer nobody is at the rig.
     prompt_s: Annotated[float, Within(10.0, 1800.0, "s")] = 300.0
-    clock_offset_s: Annotated[float, Within(0.001, 60.0, "s")] = 0.1  # twice poll_s
-    clock_rate: Annotated[float, Within(1e-6, 0.1)] = 1e-3  # twice the 5e-4 of quartz and network time
+    clock_offset_s: Annotated[float, Within(0.001, MAX_DEADLINE_S, "s")] = 0.1  # twice poll_s
+    # Twice the 5e-4 of quartz and network time. Times and velocities of a session may be wrong by as much: 1 % at most.
+    clock_rate: Annotated[float, Within(1e-6, 0.01)] = 1e-3
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,7 @@ class ChannelTable:
     name: str = ""
     offset: float = 0.0
     source: str = ""
-    frozen_s: Annotated[float, Within(0.0, 60.0, "s")] | None = None
+    frozen_s: Annotated[float, Within(0.0, MAX_DEADLINE_S, "s")] | None = None
 
     def __post_init__(self):
         if self.unit not in UNITS[self.kind]:
@@ -73,22 +77,30 @@ class ChannelTable:
         return self.name or f"{self.kind} {self.of}".strip()
 
 
+# Limits on measured values, which the host and the controller both have.
+Tension = Annotated[float, Within(0.1, 100.0, "N")]
+TensionRate = Annotated[float, Within(1.0, 1e5, "N/s")]
+JointVelocity = Annotated[float, Within(1.0, 5000.0, "deg/s")]
+JointTorque = Annotated[float, Within(1e-3, 10.0, "N m")]
+FingertipForce = Annotated[float, Within(0.1, 100.0, "N")]
+
+
 @dataclass(frozen=True)
 class LimitsTable:
     """Keys of `[limits]`. Those that may be None watch a kind of channel that a rig may lack."""
 
-    tension_max: Annotated[float, Within(0.1, 100.0, "N")]
+    tension_max: Tension
     tension_rate: Annotated[float, Within(0.1, 1000.0, "N/s")]
-    tension_rate_max: Annotated[float, Within(1.0, 1e5, "N/s")]
+    tension_rate_max: TensionRate
     joint_margin_deg: Annotated[float, Within(0.0, 45.0, "deg")]
     joint_velocity_deg_s: Annotated[float, Within(1.0, 2000.0, "deg/s")]
-    joint_velocity_max_deg_s: Annotated[float, Within(1.0, 5000.0, "deg/s")]
-    joint_torque_max: Annotated[float, Within(1e-3, 10.0, "N m")]
-    fingertip_force_max: Annotated[float, Within(0.1, 100.0, "N")]
+    joint_velocity_max_deg_s: JointVelocity
+    joint_torque_max: JointTorque
+    fingertip_force_max: FingertipForce
     # At most the highest `joint_velocity_deg_s` within 0.1 s, in which the host reads samples twice (`poll_s`).
     joint_acceleration_deg_s2: Annotated[float, Within(1.0, 20000.0, "deg/s2")] = ACCELERATION_DEG_S2
     tension_error_max: Annotated[float, Within(0.1, 100.0, "N")] | None = None
-    tension_error_s: Annotated[float, Within(0.01, 10.0, "s")] | None = None
+    tension_error_s: Annotated[float, Within(0.01, MAX_DEADLINE_S, "s")] | None = None
     temperature_max: Annotated[float, Within(30.0, 200.0, "degC")] | None = None
 
     def __post_init__(self):
@@ -110,12 +122,12 @@ _OPTIONAL_LIMITS = {
 class ControllerTable:
     """Keys of `[controller]`: the loosest limits that the controller may have (None: twice the host's)."""
 
-    tension_max: Annotated[float, Within(0.1, unit="N")] | None = None
-    tension_rate_max: Annotated[float, Within(1.0, unit="N/s")] | None = None
-    joint_velocity_max_deg_s: Annotated[float, Within(1.0, unit="deg/s")] | None = None
-    joint_torque_max: Annotated[float, Within(1e-3, unit="N m")] | None = None
-    fingertip_force_max: Annotated[float, Within(0.1, unit="N")] | None = None
-    heartbeat_s: Annotated[float, Within(0.02, 60.0, "s")] = 0.25
+    tension_max: Tension | None = None
+    tension_rate_max: TensionRate | None = None
+    joint_velocity_max_deg_s: JointVelocity | None = None
+    joint_torque_max: JointTorque | None = None
+    fingertip_force_max: FingertipForce | None = None
+    heartbeat_s: Annotated[float, Within(0.02, MAX_DEADLINE_S, "s")] = 0.25
 
 
 @dataclass(frozen=True)

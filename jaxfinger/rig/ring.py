@@ -263,9 +263,6 @@ class RingRig(Rig):
     def arm(self) -> int:
         return self._send(Kind.ARM)
 
-    def disarm(self) -> int:
-        return self._send(Kind.DISARM)
-
     def release(self) -> int:
         if self._unheeded is not None:  # RELEASE would overwrite the STOP, and the controller would not latch.
             return self._send(Kind.STOP, int(self._unheeded))
@@ -301,7 +298,7 @@ class RingRig(Rig):
         """Write a command and poll the status until it is acknowledged.
 
         A command that is not acknowledged within `answer_s` must not take effect later, when nobody expects it, so it
-        is overwritten. RELEASE, STOP and DISARM stay: they only take tension off.
+        is overwritten. RELEASE and STOP stay: they only take tension off.
 
         Raises:
             CommandRefused: the controller refused it, or it gave way to a STOP.
@@ -323,7 +320,7 @@ class RingRig(Rig):
             # Too late only if this status was asked for after the deadline: a host that was held up asks once more.
             late, asked = asked > deadline, time.monotonic()
             if late:
-                if kind not in (Kind.RELEASE, Kind.STOP, Kind.DISARM):
+                if kind not in (Kind.RELEASE, Kind.STOP):
                     order["kind"] = Kind.NONE
                     self._write("stCommand", order.tobytes())
                 raise ConnectionLost(f"the controller did not acknowledge {kind.name} within {self.answer_s:g} s.")

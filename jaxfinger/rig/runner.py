@@ -23,12 +23,12 @@ from jaxfinger.rig.backend import (
 from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.operator import Operator
 from jaxfinger.rig.plan import PlannedTrial
-from jaxfinger.rig.protocols import Covered, Dwell, Mark, Protocol, Reached, Settled, Start, Tare
+from jaxfinger.rig.protocols import Covered, Dwell, Mark, Protocol, Reached, Settled, Start, Tare, slackened
 from jaxfinger.rig.reader import Reader, tripped
 from jaxfinger.rig.safety import Violation
 from jaxfinger.rig.signals import INTERRUPTED, Interrupts
 from jaxfinger.rig.trips import FULL_COUNT
-from jaxfinger.rig.waits import AtPose, Elapsed, Passes, Steady, pulled, reached, tensions
+from jaxfinger.rig.waits import AtPose, Elapsed, Passes, Steady, elsewhere, pulled, reached, tensions
 from jaxfinger.rig.watch import Watch
 
 DRIVES_ON = (State.ARMED, State.MOVING)
@@ -39,6 +39,7 @@ AFTER_TRIP_S = 1.0
 QUIET_S = 0.3
 QUIET_TIMEOUT_S = 5.0  # s to wait for these samples. Much longer, since the first samples of a busy host come late.
 TIMEOUT_MARGIN_S = 5.0  # s by which a wait of known length may take longer before the trial ends
+RELEASED = "the finger is released, and its drives are off"
 TENSION_NOT_SEEN_TO_FALL = "tension was not seen to fall, so switch the drives off and see that it is off"
 
 
@@ -116,8 +117,10 @@ class Runner:
             "begun_s": begun_s,
         }
         try:
-            self.carry_out(trial.protocol(self.rig.description), (name, number, count))
+            place, finger = (name, number, count), self.rig.description.finger
+            self.carry_out(trial.protocol(self.rig.description), place)
             self.reader.end({"complete": True})
+            self.carry_out(slackened(finger, trial.parameters.tension_rate), place)
             return ""
         except Exception as error:  # Of any kind: the finger is armed.
             return self.abort(error)
@@ -129,10 +132,10 @@ class Runner:
         return self.abort(TrialEnded(INTERRUPTED, Trip.OPERATOR))
 
     def abort(self, error: Exception) -> str:
-        """Stop the rig unless it is stopped, record AFTER_TRIP_S more, end the trial. Return why it ended.
+        """Stop the rig unless it is stopped, record AFTER_TRIP_S more, end the trial.
 
-        If no sample shows the controller stopped and no drive's tension, the sentence tells the operator to switch the
-        drives off.
+        Return why it ended and in which state the rig is: where no sample shows the controller stopped and no drive's
+        tension, the operator is to switch the drives off.
         """
         reader = self.reader
         trip, seq = (error.trip, error.seq) if isinstance(error, TrialEnded) else (Trip.HOST, None)
@@ -144,11 +147,11 @@ class Runner:
             reader.stop(Violation.of_host(trip, reader.latest_seq, cause))
         self._let_pass(AFTER_TRIP_S, self._released)  # A busy host first has to read the samples before the stop.
         self._let_pass(AFTER_TRIP_S)
-        if reader.latest is not None and not self._released():
-            cause = f"{cause}; {TENSION_NOT_SEEN_TO_FALL}"
         if reader.recording:
             reader.end({"complete": False, "cause": cause, "trip": int(trip), "seq": seq})
-        return cause
+        if reader.latest is None:
+            return cause
+        return f"{cause}; {RELEASED if self._released() else TENSION_NOT_SEEN_TO_FALL}"
 
     def _released(self) -> bool:
         """Whether the newest sample shows the controller stopped or idle, and no drive's tension."""
@@ -160,7 +163,7 @@ class Runner:
         """Bring the controller to IDLE, wait for samples without a violation, and arm the rig.
 
         An earlier host may have left the finger loaded: it is released. A latched stop is cleared once the operator has
-        agreed. The operator is told to take hands off before the drives are switched on.
+        agreed. The operator fixes the finger straight, and takes hands off, before the drives are switched on.
 
         Raises:
             UserError: something is wrong; nothing was armed.
@@ -175,8 +178,9 @@ class Runner:
         if status.state is State.TRIPPED:
             self._heed_stop_key()  # A latch is not cleared for an operator who has pressed it since.
             rig.reset(name or "operator")
-        if not rig.prepare(Setup("", fixed=dict.fromkeys(rig.description.finger.joint_names, 0.0))):
-            self._ask("Hands off: the drives are about to be switched on.")
+            self._let_pass(AFTER_TRIP_S, lambda: not tripped(self.reader.latest))
+        straight = dict.fromkeys(rig.description.finger.joint_names, 0.0)
+        self._prepare(Setup("Fix the finger straight: all joints at 0°. The drives are switched on next.", straight))
 
         def quiet() -> bool:
             return self.reader.quiet(round(QUIET_S * rig.description.rate_hz))
@@ -256,8 +260,7 @@ class Runner:
         self._check(self.reader.latest if armed else None)
         # Also where Enter came just then: who answers a prompt that is over does not expect a motor to move.
         if late():
-            said = f"nobody answered the prompt within {patience:g} s (prompt_s of [rig]), so the finger is released"
-            raise TrialEnded(said, Trip.HOST)
+            raise TrialEnded(f"nobody answered the prompt within {patience:g} s (prompt_s of [rig])", Trip.HOST)
 
     def _heed_stop_key(self) -> None:
         """Stop the rig and raise TrialEnded where the stop key was pressed or a signal came.
@@ -276,8 +279,10 @@ class Runner:
             CommandRefused: host or controller refused a command.
         """
         self._place = place
+        moved_to: dict[str, float] = {}  # target (rad) of the last command, by joint
         for step in protocol:
             if isinstance(step, TensionRamp | JointMove | Hold):
+                moved_to = {step.joint: step.target} if isinstance(step, JointMove) else {}
                 self.reader.supervisor.commanded(step)
                 self._id = self._sent(lambda command=step: self.rig.command(command))
             elif isinstance(step, Setup):
@@ -290,10 +295,14 @@ class Runner:
                 self.reader.mark(asdict(step))
             elif isinstance(step, Reached):
                 self._wait("moving", lambda b: reached(b, self._id), step.timeout)
+                if wrong := elsewhere(self.reader.latest, self.rig.description, moved_to):
+                    said = f"after its move {wrong}; see the coupling, and unit, scale and offset of the channel"
+                    raise TrialEnded(said, Trip.HOST)
             elif isinstance(step, Dwell):
                 self._wait("waiting", Elapsed(self.reader, step.seconds), step.seconds + TIMEOUT_MARGIN_S)
             elif isinstance(step, Settled):
-                self._wait("tensions settling", Steady(self.rig.description, step), step.timeout)
+                steady = Steady(self.rig.description, step)
+                self._wait("tensions settling", steady, step.timeout, lambda steady=steady: steady.lacks)
             else:
                 assert isinstance(step, Covered)
                 self._wait("moved by hand", Passes(self.rig.description, step), step.timeout)
@@ -326,14 +335,22 @@ class Runner:
     def _prepare(self, setup: Setup) -> None:
         """Have the finger prepared, by a simulated operator or by a person.
 
+        The person is asked again where the encoder of a fixed joint reads another angle.
         The person's hands may be at an armed finger under tension. Meanwhile the runner sends no command; the limits of
         host and controller, the heartbeat and the stop key act as always.
         """
         self._setup = setup
-        if not self.rig.prepare(setup):
-            self._ask(setup.prompt)
+        if self.rig.prepare(setup):
+            self._wait("finger being prepared", AtPose(self.rig.description, setup), 60.0)
             return
-        self._wait("finger being prepared", AtPose(self.rig.description, setup), 60.0)
+        prompt = setup.prompt
+        while True:
+            self._ask(prompt)
+            answered = self.rig.status().head
+            self._wait("reading the joints", lambda b, at=answered: int(b.seq[-1]) + 1 >= at, TIMEOUT_MARGIN_S)
+            if not (wrong := elsewhere(self.reader.latest, self.rig.description, setup.fixed)):
+                return
+            prompt = f"{wrong}; see the fixture, and unit, scale and offset of the channel. {setup.prompt}"
 
     def _tare(self, step: Tare) -> None:
         """Take the mean of the channels as their zero; refuse a torque or force sensor that is loaded or noisy.
@@ -363,8 +380,10 @@ class Runner:
             self.tare[rig.channels[i].name] = float(mean)
 
     # waiting ----------------------------------------------------------------------------------------------------
-    def _wait(self, doing: str, done: Callable[[Block], bool], timeout: float) -> None:
-        """Wait until a block is `done`.
+    def _wait(
+        self, doing: str, done: Callable[[Block], bool], timeout: float, lacks: Callable[[], str] = lambda: ""
+    ) -> None:
+        """Wait until a block is `done`. `lacks` says what it lacks, with a leading separator.
 
         Raises:
             TrialEnded: `timeout` s have passed on the device's clock, or the host's limit for it, or the run must end.
@@ -375,13 +394,14 @@ class Runner:
             block = self.reader.next()
             self._check(block)
             if block is not None:
+                start = start if start >= 0 else int(block.t_ns[0])  # the first block of all
                 self.observe(
                     View(*self._place, doing, block, self.reader.lost, self.reader.recording, self.reader.lag_s)
                 )
                 if done(block):
                     return
             if time.monotonic() > latest or (block is not None and (int(block.t_ns[-1]) - start) * 1e-9 > timeout):
-                raise TrialEnded(f"{doing} took longer than {timeout:g} s", Trip.HOST)
+                raise TrialEnded(f"{doing} took longer than {timeout:g} s{lacks()}", Trip.HOST)
 
     def _check(self, block: Block | None) -> None:
         """Report a sign of life to the watch. Raise TrialEnded where the run must end.

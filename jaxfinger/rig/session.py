@@ -15,12 +15,12 @@ import numpy as np
 from jaxfinger.data.toml import parse_toml
 from jaxfinger.errors import UserError, counted, listed
 from jaxfinger.rig import convert, wal
-from jaxfinger.rig.backend import Rig, Setup, TensionRamp
+from jaxfinger.rig.backend import Rig, TensionRamp
 from jaxfinger.rig.channels import MIN_DYNAMIC_BANDWIDTH, Filter, RigDescription
 from jaxfinger.rig.contract import Trip
 from jaxfinger.rig.operator import Nobody, Operator
 from jaxfinger.rig.plan import Plan
-from jaxfinger.rig.protocols import DYNAMIC, Protocol, Reached, Settled, Tare
+from jaxfinger.rig.protocols import DYNAMIC, Protocol, Reached, Settled, Tare, slackened
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.recover import read_log
@@ -124,7 +124,7 @@ def run(
     except UserError as error:
         ended = f"{cause}; " if cause else ""
         raise UserError(
-            f"{ended}{str(error).rstrip('.')}; jaxfinger recover {path} makes it once there is room."
+            f"{ended}{str(error).rstrip('.')}; jaxfinger recover {path} makes it once that is mended."
         ) from error
     if not cause:
         path.unlink()
@@ -204,15 +204,15 @@ def _zero_excursions(rig: RigDescription) -> Protocol:
     """Protocol that tares the tendon encoders: they read zero with the finger straight and 2 N on its tendons.
 
     2 N is the pretension of the paper's experiments (`MomentArms`). It takes out slack, so that every session's zero is
-    the same.
+    the same. `Runner.arm` has had the finger fixed straight.
     """
-    straight = dict.fromkeys(rig.finger.joint_names, 0.0)
     pretension = {n: 2.0 for n, active in zip(rig.finger.tendon_names, rig.finger.active, strict=True) if active}
-    yield Setup("Fix the finger straight: all joints at 0°.", fixed=straight)
-    yield TensionRamp(pretension, min(10.0, rig.limits.tension_rate))
+    rate = min(10.0, rig.limits.tension_rate)
+    yield TensionRamp(pretension, rate)
     yield Reached()
     yield Settled(pretension)
     yield Tare(("excursion",))
+    yield from slackened(rig.finger, rate)
 
 
 def _trials(

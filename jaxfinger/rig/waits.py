@@ -13,6 +13,9 @@ from jaxfinger.rig.reader import Reader
 # N of measured tension, up to which a tendon counts as released. In 0.7 s the controller ramps to 2 N, then to 0.5 N
 # (docs/plc-contract.md); what lies between is for zeros of load cells and for friction that holds a tendon.
 RELEASED_TENSION = 2.0
+# Of a joint's range: an encoder may differ by so much from the angle that the operator was asked for, or to which the
+# external motor went. A fixture set by eye is nearer; an angle in another unit, or of another joint, seldom is.
+POSE_SHARE = 0.1
 
 
 def tensions(block: Block | None, rig: RigDescription) -> dict[str, float]:
@@ -29,6 +32,18 @@ def pulled(tension: dict[str, float]) -> str:
     A load cell that reads NaN, or that a tendon pushes, sees no tension fall.
     """
     return next((f"'{k}' reads {v:.3g} N" for k, v in tension.items() if not abs(v) <= RELEASED_TENSION), "")
+
+
+def elsewhere(block: Block | None, rig: RigDescription, angles: dict[str, float]) -> str:
+    """Which joint's encoder reads another angle than `angles` (rad) by POSE_SHARE of its range; "" where none does."""
+    for name, angle in angles.items():
+        column = rig.index("joint_position", name)
+        low, high = rig.finger.limits[rig.finger.joint_names.index(name)]
+        assert column is not None  # The rig file is refused without one.
+        read = np.nan if block is None else float(block.x[-1, column])
+        if not abs(read - angle) <= POSE_SHARE * (high - low):
+            return f"'{rig.channels[column].name}' reads {np.degrees(read):.1f}°, not {np.degrees(angle):.1f}°"
+    return ""
 
 
 class Elapsed:
@@ -52,12 +67,19 @@ class Steady:
     def __init__(self, rig: RigDescription, step: Settled):
         self._columns = rig.columns("tension", step.tensions)
         self._targets = np.array(list(step.tensions.values()))
+        self._names = [rig.channels[column].name for column in self._columns]
         self._within, self._need = step.within, round(step.seconds * rig.rate_hz)
         self._good = 0
+        self.lacks = ""  # which tension was last outside of its band
 
     def __call__(self, block: Block) -> bool:
-        good = (np.abs(block.x[:, self._columns] - self._targets) < self._within).all(1)
+        off = ~(np.abs(block.x[:, self._columns] - self._targets) < self._within)
+        good = ~off.any(1)
         bad = np.flatnonzero(~good)
+        if len(bad):
+            k = int(np.argmax(off[bad[-1]]))
+            self.lacks = f": '{self._names[k]}' reads {block.x[bad[-1], self._columns[k]]:.3g} N, not "
+            self.lacks += f"{self._targets[k]:.3g} N; see its unit, scale and offset"
         self._good = self._good + len(block) if not len(bad) else len(block) - 1 - int(bad[-1])
         return self._good >= self._need
 

@@ -10,6 +10,7 @@ costs the frames that it touches: reading goes on at the next tag whose frame ha
 
 from __future__ import annotations
 
+import fcntl
 import io
 import json
 import os
@@ -111,25 +112,15 @@ class LogWriter:
     @classmethod
     def create(cls, path: Path) -> LogWriter:
         """Create a log. Raises UserError where one exists or the file cannot be written."""
-        try:
-            file = open(path, "xb", buffering=0)  # noqa: SIM115 - the writer owns it
-        except FileExistsError as error:
-            raise UserError(
-                f"{path}: a recording was interrupted here; go on with --resume, or rescue it with jaxfinger recover."
-            ) from error
-        except OSError as error:
-            raise UserError(
-                f"{path}: cannot be written ({error.strerror}); choose another place for the session."
-            ) from error
-        writer = cls(file)
+        writer = cls(_opened(path, "x"))
         writer._write(MAGIC)
         return writer
 
     @classmethod
     def append(cls, path: Path) -> LogWriter:
-        """Open a log to append to it, after cutting off a torn last frame."""
+        """Open a log to append to it, after cutting off a torn last frame. Raises UserError as `create` does."""
+        file = _opened(path, "r+")
         end = sound_length(path)
-        file = open(path, "r+b", buffering=0)  # noqa: SIM115 - the writer owns it
         file.truncate(end)
         file.seek(end)
         return cls(file, end)
@@ -156,6 +147,26 @@ class LogWriter:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def _opened(path: Path, mode: str) -> io.FileIO:
+    """Open a log to write, and keep other recorders from it for as long as it is open."""
+    try:
+        file = io.FileIO(path, mode)
+    except FileExistsError as error:
+        raise UserError(
+            f"{path}: a recording was interrupted here; go on with --resume, or rescue it with jaxfinger recover."
+        ) from error
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror}); choose another place, or mend it.") from error
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        file.close()
+        raise UserError(f"{path}: another recorder writes to it; end that one first.") from error
+    except OSError:
+        pass  # A file system without locks: the controller itself refuses a second recorder.
+    return file
 
 
 def frames(file: io.BufferedIOBase, name: str = "log") -> Iterator[Frame]:

@@ -11,6 +11,7 @@ from jaxfinger.data import Session, check_file, read_session, write_session
 from jaxfinger.data.check import check_session
 from jaxfinger.data.findings import Report
 from jaxfinger.errors import UserError
+from tests.units import Scale
 
 
 @pytest.fixture(scope="module")
@@ -323,6 +324,27 @@ def said_of(session) -> list[str]:
     report = Report()
     check_session(session, report)
     return [str(finding) for finding in report if finding.severity != "note"]
+
+
+@pytest.mark.parametrize("size", [0.1, 1.0, 4.0, 20.0])
+def test_torques_and_excursions_are_large_for_their_machine(session, size):
+    """A small arm's springs hold it with more than 5 N m; in N mm the torques of a tiny finger are less."""
+    machine = Scale(mass=0.9 * size**3, length=size, time=size**0.5)(session)
+    if size == 4.0:  # less than 2 kg, with springs
+        machine = raised(machine, "joint_torque", 5.0)
+        assert machine.finger.mass.sum() < 2.0
+        assert max(np.nanmax(t.joint_torque) for t in machine if t.joint_torque is not None) > 5.0
+    assert not [text for text in said_of(machine) if "too large" in text]
+    for channel, mend in (("joint_torque", "convert N mm to N m"), ("tendon_excursion", "convert mm to m")):
+        said = [text for text in said_of(raised(machine, channel, 1e3)) if "too large" in text]
+        assert said
+        assert all(mend in text for text in said)
+
+
+def raised(session: Session, channel: str, factor: float) -> Session:
+    """The session with all values of a channel multiplied."""
+    trials = {t.name: t if (x := getattr(t, channel)) is None else replace(t, **{channel: factor * x}) for t in session}
+    return replace(session, trials=trials)
 
 
 def test_slack_tendons_that_read_tension_are_said(session):

@@ -39,6 +39,26 @@ def stack(*trials: Trial, **options):
     return found
 
 
+@pytest.mark.parametrize("noise", [1e-7, 1e-5, ENCODER])
+def test_a_joint_that_rests_does_not_slide_before_it_starts(noise):
+    """The filter shows a motion before it starts, and where the encoder is quiet that exceeds its noise."""
+    duration, rest, stroke = 1.2, 0.4, 0.6  # s, s, rad
+    begins = np.arange(6) * (duration + rest) + rest
+    time = np.arange(round((begins[-1] + duration + rest) * RATE)) / RATE
+    part = np.clip((time[:, None] - begins) / duration, 0.0, 1.0)
+    way = np.where(part < 0.5, 2.0 * part**2, 1.0 - 2.0 * (1.0 - part) ** 2)  # constant acceleration, there and back
+    q = np.tile(np.radians([10.0, 30.0, 20.0]), (time.size, 1))
+    q[:, 0] += stroke * way @ np.resize([1.0, -1.0], 6)
+    q += noise * np.random.default_rng(0).standard_normal(q.shape)
+    torque = np.where(np.arange(3) == 0, 0.0 * q, np.nan)
+    found = stack(Trial("moves", "ID.3-dynamic", time, q, joint_torque=torque, joint=MCP))
+    counts = np.asarray(found.batch.mask["joint_torque"][0, 0]) > 0
+    at = np.asarray(found.batch.x.time[0])
+    inside = (at[:, None] > begins + CLEAR) & (at[:, None] < begins + duration - CLEAR)
+    assert not np.any(counts & ~inside.any(axis=1))
+    assert np.all(np.sum(counts[:, None] & inside, axis=0) * found.dt > duration - 2.0 * CLEAR - 0.1)
+
+
 def test_averages_twice_as_long_are_those_of_two():
     """Arrays that the model reads are compared over all blocks that both cover."""
     fine, coarse = (stack(sweep(), coarse=c) for c in (1, 2))

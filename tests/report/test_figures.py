@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -12,11 +13,13 @@ from jaxfinger.data import write_session
 from jaxfinger.errors import UserError
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.fit_file import save_fit
-from jaxfinger.identify.parameters import describe, ravel
+from jaxfinger.identify.parameters import describe, ravel, with_flat
+from jaxfinger.model import Finger
 from jaxfinger.report.curves import curves, model_curves
 from jaxfinger.report.identification import draw_identification
 from jaxfinger.report.validation import draw_validation
 from jaxfinger.synthetic import paper_finger, polynomial_finger, recipe_from, simulate, true_model
+from tests.units import Scale
 
 RECIPE = {
     "specimen": {"kind": "polynomial"},
@@ -123,6 +126,21 @@ def test_what_was_measured_lies_on_the_lines(fit, session):
     for c, way, points in ways:
         line = np.interp(points.x, c.elastic.x, c.elastic.y + way * c.friction.y)
         np.testing.assert_allclose(points.y, line, atol=0.6)
+
+
+def test_as_many_losses_are_measured_of_a_machine_of_another_size(fit, session):
+    """A machine a tenth as long and a thousandth as heavy, at the same pace."""
+    scale = Scale(mass=1e-3, length=0.1)
+    ours, theirs = (with_finger_of(s, fit.model) for s in (session, scale(session)))
+    factors = [scale.of(p.units) for p in describe(ours)]
+    its = curves(replace(fit, model=with_flat(theirs, np.asarray(ravel(ours)) * factors)), scale(session)).loss_points
+    for tendon, points in curves(replace(fit, model=ours), session).loss_points.items():
+        np.testing.assert_allclose(its[tendon].x, points.x * scale.force, rtol=1e-6)
+        np.testing.assert_allclose(its[tendon].y, points.y * scale.force, rtol=1e-4)
+
+
+def with_finger_of(session, model):
+    return eqx.tree_at(lambda m: m.finger, model, Finger.from_description(session.finger))
 
 
 def test_the_example_of_the_docs_runs(fit, session, tmp_path, monkeypatch):

@@ -77,7 +77,7 @@ def short(rig):
 def ads_rig(where: str, **rig) -> AdsRig:
     """Return an ADS rig for a stand-in at host:port, with deadlines that a loaded machine keeps."""
     address = {"net_id": standin.NET_ID, "ip": where, "port": 851, "reconnect_s": 20}
-    return AdsRig(parse_rig(rig_toml("ads", address, **{"stale_s": 20.0, "poll_s": 0.002, **rig}) + PATIENT))
+    return AdsRig(parse_rig(rig_toml("ads", address, **{"stale_s": 5.0, "poll_s": 0.002, **rig}) + PATIENT))
 
 
 @pytest.fixture

@@ -58,6 +58,31 @@ def test_a_mistake_names_its_line(old, new, says):
     assert found.startswith(tuple(new.splitlines())), (line, found)
 
 
+@pytest.mark.parametrize(
+    "key",
+    [
+        *("stale_s", "lag_s", "thread_s", "disk_s", "prompt_s", "clock_offset_s"),
+        *("heartbeat_s", "frozen_s", "tension_error_s"),
+    ],
+)
+def test_a_deadline_of_an_hour_is_none(key):
+    if key == "heartbeat_s":
+        text = GOOD + f"[controller]\n{key} = 3600.0\n"
+    elif key == "tension_error_s":
+        text = GOOD.replace("tension_error_s = 0.2", "tension_error_s = 3600.0")
+    else:
+        after = 'kind = "tension"\n' if key == "frozen_s" else "[rig]\n"
+        text = GOOD.replace(after, f"{after}{key} = 3600.0\n", 1)
+    with pytest.raises(UserError, match=rf"line \d+: .*{key}: is 3600 s, which is outside"):
+        parse_rig(text)
+
+
+@pytest.mark.parametrize("key", ["tension_max", "tension_rate_max", "joint_velocity_max_deg_s", "joint_torque_max"])
+def test_a_limit_of_the_controller_that_limits_nothing_is_refused(key):
+    with pytest.raises(UserError, match=f"controller.{key}: is 1e\\+09 .*which is outside"):
+        parse_rig(GOOD + f"[controller]\n{key} = 1e9\n")
+
+
 def test_the_line_is_the_very_line():
     text = GOOD.replace('of = "T3"\nslot = 2', 'of = "T9"\nslot = 2', 1)
     with pytest.raises(UserError, match=f"bench.toml, line {line_of(text, 'T9')}:"):

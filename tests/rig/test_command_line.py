@@ -37,7 +37,7 @@ def controller():
 def bench(controller, tmp_path):
     """A folder with a plan and a rig file for the stand-in."""
     address = {"net_id": standin.NET_ID, "ip": controller, "port": 851, "reconnect_s": 20}
-    (tmp_path / "rig.toml").write_text(rig_toml("ads", address, stale_s=30.0, poll_s=0.002))
+    (tmp_path / "rig.toml").write_text(rig_toml("ads", address, stale_s=5.0, poll_s=0.002))
     (tmp_path / "plan.toml").write_text(SHORT)
     return tmp_path
 

@@ -109,17 +109,71 @@ def test_over_tension_drops_all_at_once(loaded):
 
 
 def test_a_joint_beyond_its_stops_is_let_go_after_three_cycles(loaded):
-    """The stop lies at 92°. The external motor is switched off first, then all tendons go down together."""
+    """The stop lies at 92°. All tendons go down together."""
     loaded.bench(fault=contract.FAULTS.index("spike"), slot=loaded.c.slots.angle[0], amount=1.4)
     before, held = loaded.c.seq, list(loaded.c.setpoint)
     ramp = loaded.run(4)
     assert (loaded.c.state, loaded.c.trip) == (State.TRIPPED, Trip.POSITION)
     assert loaded.c.trip_seq - before == 2
-    assert (loaded.c.trip_slot, loaded.c.motor) == (loaded.c.slots.angle[0], None)
+    assert loaded.c.trip_slot == loaded.c.slots.angle[0]
     np.testing.assert_allclose(ramp[-1] / held, ramp[-1, 0] / held[0])  # in proportion
     loaded.run(800)
     assert max(loaded.c.setpoint) == 0
     assert loaded.send(Kind.ARM) == Refusal.STATE
+
+
+def coupled(tension):
+    """A bench whose external motor holds the PIP while T2 pulls it with `tension` N."""
+    bench = Bench()
+    bench.bench(mode=(1, 2, 1), pose=(0.4, 0.5, 0.3))
+    bench.run(600)
+    bench.send(Kind.ARM)
+    bench.send(Kind.TENSION, target=[0.0, tension, 0.0, 0.0], rate=20.0)
+    bench.run(1000)
+    assert bench.c.state is State.ARMED
+    return bench
+
+
+@pytest.mark.parametrize("cause", ["stop", "release", "heartbeat", "over-tension", "beyond its stop"])
+def test_a_joint_that_holds_tension_is_not_let_go_before_the_tension(cause):
+    """Of ID.4: 14 N on T2 would throw a PIP without torque into its stop within 0.1 s."""
+    bench = coupled(14.0)
+    at, fault = bench.c.plant.q[1], contract.FAULTS.index("spike")
+    if cause in ("stop", "release"):
+        bench.send(Kind.STOP if cause == "stop" else Kind.RELEASE, index=int(Trip.OPERATOR))
+    elif cause == "over-tension":
+        bench.bench(mode=(1, 2, 1), pose=(0.4, 0.5, 0.3), fault=fault, slot=1)
+    elif cause == "beyond its stop":  # The encoder of another joint fails.
+        bench.bench(mode=(1, 2, 1), pose=(0.4, 0.5, 0.3), fault=fault, slot=bench.c.slots.angle[2], amount=1.4)
+    path = []
+    for _ in range(1300):
+        bench.run(1, beat=cause != "heartbeat")
+        path.append((max(bench.c.tension), bench.c.plant.q[1], bench.c.plant.qd[1]))
+    tension, angle, speed = np.array(path).T
+    np.testing.assert_allclose(angle[tension > 0.6], at, atol=1e-9)
+    assert np.abs(speed).max() < 0.5  # The speed limit of a plan is 2 rad/s.
+    assert (bench.c.motor, tension[-1] < 1e-3) == (None, True)
+
+
+def test_a_motor_that_moves_a_joint_with_slack_tendons_loses_its_torque_at_once():
+    """Of ID.3: it may have caught a hand."""
+    bench = coupled(0.0)
+    bench.send(Kind.JOINT, target=[1.2], rate=1.5)
+    bench.run(300)
+    assert bench.c.state is State.MOVING
+    bench.send(Kind.STOP, index=int(Trip.OPERATOR))
+    assert bench.c.motor is None
+
+
+def test_a_motor_that_moves_a_joint_under_tension_brakes():
+    bench = coupled(3.0)
+    bench.send(Kind.JOINT, target=[1.2], rate=1.5, acceleration=20.0)
+    bench.run(300)
+    start = bench.c.plant.q[1]
+    bench.send(Kind.STOP, index=int(Trip.OPERATOR))
+    bench.run(200)
+    assert bench.c.plant.qd[1] == 0.0
+    assert bench.c.plant.q[1] - start == pytest.approx(1.5**2 / (2 * 20.0), abs=5e-3)
 
 
 @pytest.mark.parametrize(("fault", "slot"), [("nan", 9), ("flag", 0)])

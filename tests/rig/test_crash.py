@@ -35,7 +35,7 @@ def controller():
 
 def recorder(folder, where, *more):
     address = {"net_id": standin.NET_ID, "ip": where, "port": 851, "reconnect_s": 20}
-    (folder / "rig.toml").write_text(rig_toml("ads", address, stale_s=30.0, poll_s=0.002))
+    (folder / "rig.toml").write_text(rig_toml("ads", address, stale_s=5.0, poll_s=0.002))
     (folder / "plan.toml").write_text(PLAN)
     files = [str(folder / name) for name in ("plan.toml", "rig.toml", "session.h5")]
     with open(folder / SAYS, "a") as says:

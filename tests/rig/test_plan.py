@@ -135,8 +135,8 @@ def test_tendon_friction_steps_up_and_down_with_the_others_slack(rig):
     done = steps('experiment = "ID.4"\njoint = "MCP"\ntendon = "T2"\nlevels = [2.0, 4.0, 6.0]', rig)
     begin = next(i for i, s in enumerate(done) if isinstance(s, Start))
     pulled = [s.targets for s in done[begin:] if isinstance(s, TensionRamp)]
-    assert [t["T2"] for t in pulled[:-1]] == [2.0, 4.0, 6.0, 4.0, 2.0]
-    assert all(set(t) == {"T2"} for t in pulled[:-1])
+    assert [t["T2"] for t in pulled] == [2.0, 4.0, 6.0, 4.0, 2.0]
+    assert all(set(t) == {"T2"} for t in pulled)
     assert [s.tendon_direction["T2"] for s in done if isinstance(s, Mark) and s.hold >= 0] == [1, 1, 1, -1, -1]
 
 

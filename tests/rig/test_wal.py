@@ -148,3 +148,19 @@ def test_what_is_no_log_is_refused(tmp_path):
         wal.LogWriter.create(tmp_path / "y.wal")
     with pytest.raises(UserError, match="cannot be read"):
         list(wal.read_log(tmp_path / "none.wal"))
+
+
+def test_a_second_recorder_does_not_write_to_the_log(tmp_path):
+    """Two would each write over the other's frames."""
+    path = tmp_path / "s.h5.wal"
+    first = wal.LogWriter.create(path)
+    first.write(wal.HEADER, wal.pack_json({}))
+    with pytest.raises(UserError, match=r"s\.h5\.wal: another recorder writes to it; end that one first"):
+        wal.LogWriter.append(path)
+    first.close()
+    wal.LogWriter.append(path).close()
+
+
+def test_a_log_that_cannot_be_written_is_a_sentence(tmp_path):
+    with pytest.raises(UserError, match=r"none\.wal: cannot be written \(No such file or directory\)"):
+        wal.LogWriter.append(tmp_path / "none.wal")

@@ -81,9 +81,6 @@ class ReplayRig(Rig):
     def arm(self) -> int:
         raise CommandRefused("a recording cannot be armed; use the backend 'simulated' or 'ads'.")
 
-    def disarm(self) -> int:
-        return 0
-
     def release(self) -> int:
         return 0
 

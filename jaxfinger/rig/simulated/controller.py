@@ -28,6 +28,7 @@ FULL_COUNT, LEAK = 3, 0.25  # bad cycles that trip a limit, and what a good one 
 LOADED, SLACK = 1.5, 0.2
 # Release (contract): all tendons in proportion until the highest is at most so many N, each ramp within so many s.
 RELEASE_RAMPS = ((2.0, 0.2), (0.5, 0.5))
+RELEASED = RELEASE_RAMPS[-1][0]  # N; with less on every tendon the external motor need not hold its joint
 FORCE_LAG = 0.015  # s, time constant of the drives' force loop
 
 
@@ -237,8 +238,7 @@ class Controller:
         limits, n = self.limits, self.plant.n
         if kind == Kind.HOLD:
             self.target = self.setpoint[:]
-            if self.motor is not None:
-                self.goal = self.motor[0] + math.copysign(self.motor[1] ** 2 / (2 * self.acceleration), self.motor[1])
+            self._brake()
             return Refusal.NONE
         if not 0 < rate < math.inf:
             return Refusal.RANGE
@@ -266,9 +266,22 @@ class Controller:
         if self.state in (State.ARMED, State.MOVING) and self.beat_age * DT > self.limits.heartbeat_s:
             self._stop(Trip.HEARTBEAT, -1, self.beat_age * DT)
 
+    def _brake(self) -> None:
+        """Let the external motor come to rest as soon as its acceleration allows."""
+        if self.motor is not None:
+            angle, velocity, _ = self.motor
+            self.goal = angle + math.copysign(velocity**2 / (2 * self.acceleration), velocity)
+
     def _release(self) -> None:
-        """Begin a release: the motor loses its torque at once, the tendons begin RELEASE_RAMPS."""
-        self.state, self.motor = State.RELEASING, None
+        """Begin a release: the tendons begin RELEASE_RAMPS.
+
+        The external motor brakes and holds its joint to their end: tendons would throw a joint that is let go before.
+        Where no tendon pulls, it loses its torque at once, since a hand may be caught.
+        """
+        self.state = State.RELEASING
+        self._brake()
+        if max(self.setpoint) <= RELEASED:
+            self.motor = None
         peak = max([*self.setpoint, 1e-9])
         self.ramps = [(min(tension / peak, 1.0), seconds) for tension, seconds in RELEASE_RAMPS]
         self._from, self._ramp_time = self.setpoint[:], 0.0
@@ -280,31 +293,14 @@ class Controller:
         self.trip, self.trip_seq, self.trip_slot, self.trip_value = trip, self.seq, slot, value
         if self.state in (State.ARMED, State.MOVING):
             self._release()
-        if trip in (Trip.TENSION, Trip.SLACK):  # Over-tension or a broken tendon: drives off at once, without a ramp.
-            self.ramps, self.setpoint = [], [0.0] * self.plant.n
+        if trip in (Trip.TENSION, Trip.SLACK):  # Over-tension or a broken tendon: their drives go off without a ramp.
+            self._from = self.setpoint = [0.0] * self.plant.n
         self.target, self.state = self.setpoint[:], State.TRIPPED
 
     def _ramps(self) -> None:
         """Advance the release, or tensions and motor toward their goals. Tensions follow with the drives' lag."""
-        n = self.plant.n
         if self.ramps:
-            share, seconds = self.ramps[0]
-            self._ramp_time += DT
-            part = min(self._ramp_time / seconds, 1.0)
-            start = self._from
-            peak_share = 1.0 + (share - 1.0) * part
-            self.setpoint = [s * peak_share for s in start]
-            if part == 1.0:
-                self.ramps.pop(0)
-                if self.ramps:
-                    peak = max([*self.setpoint, 1e-9])
-                    self._from, self._ramp_time = self.setpoint[:], 0.0
-                    self.ramps[0] = (min(RELEASE_RAMPS[1][0] / peak, 1.0), self.ramps[0][1])
-                else:
-                    self.setpoint = [0.0] * n
-            self.target = self.setpoint[:]
-            if not self.ramps and self.state is State.RELEASING:
-                self.state = State.IDLE
+            self._advance_release()
         elif self.state is State.MOVING:
             step = self.rate * DT
             self.setpoint = [s + min(max(t - s, -step), step) for s, t in zip(self.setpoint, self.target, strict=True)]
@@ -319,6 +315,26 @@ class Controller:
             self.motor = None
         lag = DT / (DT + FORCE_LAG)
         self.tension = [f + lag * (s - f) for f, s in zip(self.tension, self.setpoint, strict=True)]
+
+    def _advance_release(self) -> None:
+        """Advance RELEASE_RAMPS by a cycle: all tendons in proportion. With the last one the drives go off."""
+        share, seconds = self.ramps[0]
+        self._ramp_time += DT
+        part = min(self._ramp_time / seconds, 1.0)
+        self.setpoint = [tension * (1.0 + (share - 1.0) * part) for tension in self._from]
+        if part == 1.0:
+            self.ramps.pop(0)
+            if self.ramps:
+                peak = max([*self.setpoint, 1e-9])
+                self._from, self._ramp_time = self.setpoint[:], 0.0
+                self.ramps[0] = (min(RELEASED / peak, 1.0), self.ramps[0][1])
+            else:
+                self.setpoint = [0.0] * self.plant.n
+        self.target = self.setpoint[:]
+        self._move()
+        if not self.ramps:
+            self.motor = None
+            self.state = State.IDLE if self.state is State.RELEASING else self.state
 
     def _move(self) -> bool:
         """Advance the external motor on a trapezoidal velocity profile. Return False when it is at its goal."""

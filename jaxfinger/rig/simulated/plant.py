@@ -208,7 +208,8 @@ class Plant:
         """Advance by 1 ms under tensions (N); `motor` is the external motor's angle, velocity and acceleration."""
         self._clock += DT
         before = self.q[:]
-        free = [j for j in range(self.m) if self.mode[j] is Mode.FREE and not self.contact]
+        limp = Mode.MOTOR if motor is None else Mode.FREE  # An external motor without torque holds nothing.
+        free = [j for j in range(self.m) if self.mode[j] in (Mode.FREE, limp) and not self.contact]
         acceleration = [0.0] * self.m
         for j in range(self.m):
             if self.mode[j] is Mode.MOTOR and motor is not None:
