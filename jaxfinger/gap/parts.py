@@ -68,7 +68,7 @@ def columns_with_gap(baseline: Baseline, chosen: SearchState) -> frozenset[int]:
 def by_share(named, chosen: SearchState, shares: Budget) -> list:
     """Named causes, largest share of the gap first."""
     value, _, _, _ = shares.overall
-    order = {k: v for k, v in zip(chosen.keys, value, strict=True)}
+    order = dict(zip(chosen.keys, value, strict=True))
     return sorted(named, key=lambda k: -order.get(k, 0.0))
 
 

@@ -173,7 +173,7 @@ def _body(
         com=com,
         inertia=inertia,
         fingertip=np.array([0.9 * length[-1], 0.0, -2e-3]),
-        tendon_names=tuple([*layout.arms, *layout.passive]),
+        tendon_names=(*layout.arms, *layout.passive),
         active=active,
         crosses=arm != 0,
         mass_std=mass * 0.015,

@@ -182,7 +182,7 @@ def test_show_prints_tables_and_what_to_do_about_a_misfit(folder, capsys):
     assert "jaxfinger diagnose" in out
 
 
-def test_validation_on_the_other_recording(folder, tmp_path, capsys):
+def test_validation_on_the_other_recording(folder, capsys):
     assert run("validate", folder / "fit.json", folder / "emps-pulses.h5", "--json") == 0
     (score,) = json.loads(capsys.readouterr().out)["scores"]
     assert (score["experiment"], score["column"], score["units"]) == ("ID.3-dynamic", "axis", "N")

@@ -141,7 +141,7 @@ def spiky(x):
     ],
 )
 def test_sound_positions_do_not_jump(x):
-    assert not [s for s in jumps_of(SWING, 0.008 * x)]
+    assert not jumps_of(SWING, 0.008 * x)
     assert not [s for s in jumps_of(x, 0.008 * SWING) if "wraps" in s]
 
 

@@ -214,7 +214,7 @@ def test_trials_that_the_session_lacks_are_said_to_be_passed_over(session, predi
     assert "predictions of 1 trial that the session lacks (of another) are passed over" in sentence
 
 
-def test_channels_that_are_not_judged_are_not_called_missing_trials(session, predictions):
+def test_channels_that_are_not_judged_are_not_called_missing_trials(session):
     trial = next(iter(session.select("ID.3-dynamic")))
     with pytest.raises(UserError, match=rf"of {trial.name} \(ID.3-dynamic\) predict joint_torque"):
         diagnose(session, predictions={trial.name: {"time": trial.time, "q": trial.q}})

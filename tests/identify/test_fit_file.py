@@ -73,7 +73,7 @@ def test_keeps_the_file_that_is_there(fit, tmp_path):
     assert load_fit(path).specimen == "other"
 
 
-def test_bad_files_get_one_sentence(fit, tmp_path):
+def test_bad_files_get_one_sentence(tmp_path):
     path = tmp_path / "fit.json"
     with pytest.raises(UserError, match="cannot be read"):
         load_fit(path)

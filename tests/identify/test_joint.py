@@ -74,7 +74,7 @@ def test_the_same_data_are_counted_once(session, joint):
 
 
 @pytest.mark.long
-def test_other_data_are_the_prior(clean, staged, joint):
+def test_other_data_are_the_prior(clean, joint):
     """A second session halves the variance of parameters on which CAD has no prior."""
     other = measure(clean, 1)
     both = refine(other, replace(joint, data_hash="of another file"))

@@ -46,7 +46,7 @@ def test_what_a_fit_is_without_a_trial_is_said_without_a_refit(fit, found, one_o
     np.testing.assert_allclose(shifts[k][seen], moved[seen], atol=0.15 * np.abs(moved[seen]).max())
 
 
-def test_what_one_trial_alone_tells_of_is_unknown_without_it(fit, found, one_of_each):
+def test_what_one_trial_alone_tells_of_is_unknown_without_it(one_of_each):
     """The only trial of ID.2 at a joint alone determines the moment arms there."""
     (trial,) = [t for t in one_of_each if t.experiment == "ID.2" and t.joint == "DIP"][:1]
     others = [t for t in one_of_each if t.experiment == "ID.2" and t.joint == "DIP" and t is not trial]
