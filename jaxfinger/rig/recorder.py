@@ -29,8 +29,8 @@ MIN_FREE_BYTES = 500 * 2**20
 class Recorder:
     """Takes frames without waiting.
 
-    `failure` says why the log cannot be written (None: it can), `unwritten` holds the frames of JSON that failed, and
-    after `close` `hangs` is true where the disk did not answer.
+    `failure` says why the log cannot be written (None: it can), `unwritten` holds the frames of JSON that failed,
+    `trials` counts those begun, and after `close` `hangs` is true where the disk did not answer.
 
     Raises:
         UserError: the disk has less than MIN_FREE_BYTES, or the log exists or cannot be created.
@@ -47,6 +47,7 @@ class Recorder:
         self._lock = threading.Lock()
         self.failure: str | None = None
         self.hangs = False
+        self.trials = 0
         self.unwritten: list[tuple[bytes, dict[str, Any]]] = []
         self._thread = threading.Thread(target=self._work, name="jaxfinger-writer", daemon=True)
         self._thread.start()
@@ -55,6 +56,7 @@ class Recorder:
 
     def put(self, tag: bytes, value: Any) -> None:
         """Queue a frame: a block for `wal.DATA`, a dictionary of JSON for the other tags. Never waits."""
+        self.trials += tag == wal.TRIAL
         self._since.append(time.monotonic())
         self._queue.put((tag, value))
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxfinger.rig.backend import Block, Command, CommandRefused, JointMove, TensionRamp
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.contract import Flag, State, Trip
-from jaxfinger.rig.trips import Drift, LeakyCount, RunLength, UnexplainedExcursion, UnfollowedMove
+from jaxfinger.rig.trips import Drift, LeakyCount, RunLength, StillExcursion, UnexplainedExcursion, UnfollowedMove
 
 # Samples over which the host takes joint velocity and tension rate: 20 ms at 1 kHz. One step of a 14-bit encoder
 # (3.8e-4 rad) then reads as 0.02 rad/s; from one sample to the next it would read as 0.4 rad/s.
@@ -131,6 +131,9 @@ class Supervisor:
         self._clock_drift = Drift(rig.deadlines.clock_rate)
         self._unexplained = UnexplainedExcursion(len(self._excursion))
         self._encoder_count = LeakyCount(len(self._excursion))
+        rows = [finger.tendon_names.index(rig.channels[int(i)].of) for i in self._excursion[:, 0]]
+        self._still_excursion = StillExcursion(finger.crosses[rows], np.ptp(finger.limits, 1))
+        self._still_count = LeakyCount(len(self._excursion))
         self._move: UnfollowedMove | None = None
         self._first: tuple[int, int] | None = None  # number and device time (ns) of the first sample
         self._before: tuple[int, int] | None = None  # number and device time (ns) of the previous sample
@@ -254,7 +257,7 @@ class Supervisor:
         ]
 
     def _still(self, block: Block, seq: np.ndarray) -> list[Violation]:
-        """FROZEN where an encoder stays still although the external motor or a tendon must have moved its joint."""
+        """FROZEN where an encoder stays still although the external motor, a tendon or a joint must have moved it."""
         found = []
         if (move := self._move) is not None:
             angle = block.x[:, move.column]
@@ -263,10 +266,15 @@ class Supervisor:
                 name = self._name(move.column)
                 found.append(Violation(Trip.FROZEN, name, int(seq[row]), float(angle[row])))
         channels, tensions = self._excursion.T
-        ran = self._unexplained(block.x[:, self._angle], block.x[:, channels], block.x[:, tensions])
+        angle, length, load = block.x[:, self._angle], block.x[:, channels], block.x[:, tensions]
+        ran = self._unexplained(angle, length, load)
         for k, row, since in self._encoder_count(ran > UnexplainedExcursion.MAX_UNEXPLAINED, seq):
             name = f"joint encoders, while {self._name(channels[k])} ran by m"
             found.append(Violation(Trip.FROZEN, name, int(seq[row]), float(ran[row, k]), since))
+        turned, since_change = self._still_excursion(angle, length, load, seq)
+        for k, row, _ in self._still_count(turned > StillExcursion.MAX_TURN, seq):
+            value, since = float(length[row, k]), int(since_change[row, k]) + 1
+            found.append(Violation(Trip.FROZEN, self._name(channels[k]), int(seq[row]), value, since))
         return found
 
     def commanded(self, command: Command) -> None:
