@@ -38,8 +38,7 @@ class Recorder:
 
     def __init__(self, path: Path, header: dict[str, Any], resume: bool = False, opener: Callable | None = None):
         self.path = path
-        if not resume:
-            _refuse_full_disk(path.parent)
+        _refuse_full_disk(path.parent)
         self._log = opener(path) if opener else wal.LogWriter.append(path) if resume else wal.LogWriter.create(path)
         self._queue: queue.SimpleQueue[tuple[bytes, Any] | None] = queue.SimpleQueue()
         self._since: deque[float] = deque()  # when each waiting frame was queued (s, monotonic)
