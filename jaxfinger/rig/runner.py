@@ -342,7 +342,8 @@ class Runner:
         """
         self._setup = setup
         if self.rig.prepare(setup):
-            self._wait("finger being prepared", AtPose(self.rig.description, setup), 60.0)
+            at_pose, ordered = AtPose(self.rig.description, setup), self.rig.status().head
+            self._wait("finger being prepared", lambda b: int(b.seq[-1]) >= ordered and at_pose(b), 60.0)
             return
         prompt = setup.prompt
         while True:
