@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.constants import g as STANDARD_GRAVITY
 
 from jaxfinger.data.check_jumps import check_jumps, placeholder
 from jaxfinger.data.constant import constant_columns
@@ -27,6 +26,10 @@ MAX_PUSH = 0.1
 # A tendon's moment arm is smaller than the machine, and joints turn by less than a turn: excursions in mm exceed this
 # share of the machine's reach.
 _MAX_EXCURSION = 5.0
+_GRAVITY = 9.81  # m/s², for the weight of machines that are described without gravity, too
+# Of the weight of all links. Strong tendons of a light finger pull with some hundred times; pulls of a finger with 10 N
+# are some ten thousand of it in mN.
+_MAX_TENSION = 5000.0
 # Of the torque with which the whole machine weighs on an arm as long as its reach. A motor that leads a light joint
 # with friction and stiff springs gives up to tens of it; torques in N mm of one that only weighs are some 400 of it.
 _MAX_TORQUE = 200.0
@@ -343,7 +346,7 @@ def _magnitudes(trial: Trial, finger: FingerDescription, sizes: Sizes, report: R
     reach = _reach(finger)
     for name, most, unit in (
         ("tendon_excursion", _MAX_EXCURSION * reach, "mm"),
-        ("joint_torque", _MAX_TORQUE * STANDARD_GRAVITY * float(finger.mass.sum()) * reach, "N mm"),
+        ("joint_torque", _MAX_TORQUE * _GRAVITY * float(finger.mass.sum()) * reach, "N mm"),
     ):
         values = getattr(trial, name)
         if values is None or most == 0.0:
@@ -384,8 +387,9 @@ def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repo
             unslack[name] = low
         elif trial.experiment == "ID.2" and np.median(x) <= NOISE_FACTOR * sizes.noise:
             slack.append(name)
-        if np.percentile(x, 95.0) > 2000.0:
-            report.warning(place, f"column {name} exceeds 2000 N; {conversion('mN')} if that is what it is")
+        if np.percentile(x, 95.0) > (most := _MAX_TENSION * _GRAVITY * float(finger.mass.sum())):
+            said = f"column {name} exceeds {_MAX_TENSION:.0f} times the weight of all links, {most:.2g} N"
+            report.warning(place, f"{said}; {conversion('mN')} if that is what it is")
     if slack and trial.tendon_excursion is not None:
         said = f"shows no tension in {listed(slack)}, though ID.2 needs taut tendons to follow the joint"
         report.warning(place, f"{said}; check the columns, or record the trial again with tension")
