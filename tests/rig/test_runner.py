@@ -500,8 +500,8 @@ def test_a_prompt_that_nobody_answers_in_time_releases_an_armed_finger(rig, reco
 
 
 def test_a_prompt_while_the_drives_are_off_may_wait(rig, record):
-    machine = SimulatedRig(impatient(rig))
-    person = Away(machine, "Fix the finger straight", 0.5)
+    machine = SimulatedRig(impatient(rig, 2.0))
+    person = Away(machine, "Fix the finger straight", 2.5)
     assert record(machine, operator=person).cause == ""
     assert "is released" not in person.prompts[0]
 
