@@ -38,6 +38,7 @@ def record(
     from jaxfinger.rig import open_rig, read_plan, read_rig, run
     from jaxfinger.rig.live import LiveView
     from jaxfinger.rig.operator import AtTerminal, Nobody
+    from jaxfinger.rig.session import log_path
 
     description = read_rig(rig)
     checked = read_plan(plan, description)
@@ -61,6 +62,13 @@ def record(
         if view.stalled:
             _leave(f"jaxfinger: {error}", 2)
         raise
+    except KeyboardInterrupt:
+        log = log_path(output)
+        kept = f"; rescue what reached the disk with jaxfinger recover {log}" if log.exists() else ""
+        said = f"the run was interrupted before its end was seen; see that tension is off{kept}."
+        if view.stalled:
+            _leave(f"jaxfinger: {said}", 2)
+        raise UserError(said) from None
     if view.stalled:
         _leave(said, 0)
     print(said)

@@ -6,16 +6,12 @@ from typing import TYPE_CHECKING
 
 from jaxfinger.cli.output import console, plain, table
 from jaxfinger.jsonable import jsonable
-from jaxfinger.report.numbers import HALF_95, extremes, number, quantity, reach, scaled, with_error
+from jaxfinger.report.numbers import HALF_95, MAX_CHI2, extremes, number, quantity, reach, scaled, with_error
 
 if TYPE_CHECKING:
     from jaxfinger.data import Session
     from jaxfinger.identify import Fit
     from jaxfinger.identify.validate import Validation
-
-
-# χ² per row above which the model or its noise is taken to be wrong: residuals of 1.22 times the noise.
-MAX_CHI2 = 1.5
 
 
 def fit_to_read(fit: Fit, session: Session | None = None) -> dict:
@@ -107,20 +103,22 @@ def _moment_arms(arms: list, joints: list[str], sliding: list[bool]) -> None:
 
 
 def _joints(joints: list[dict]) -> None:
-    rows = [
-        (
-            c["joint"],
-            extremes(*c["gravity"]),
-            reach(*c["elastic"]),
-            reach(*c["friction"]),
-            "N" if c["prismatic"] else "N mm",
-            with_error(*c["damping"]),
-            "N s/m" if c["prismatic"] else "N mm s/rad",
-        )
-        for c in joints
-    ]
+    rows = []
+    for c in joints:
+        torque, damping = ("N", "N s/m") if c["prismatic"] else ("N m", "N m s/rad")
+        terms, unit = _suited([c["gravity"], c["elastic"], c["friction"]], torque, c["prismatic"])
+        (rate,), unit_of_rate = _suited([c["damping"]], damping, c["prismatic"])
+        gravity, elastic, friction = extremes(*terms[0]), reach(*terms[1]), reach(*terms[2])
+        rows.append((c["joint"], gravity, elastic, friction, unit, with_error(*rate), unit_of_rate))
     header = ("joint", "gravity", "elastic", "friction", "", "damping", "")
     table("Torque of the joints over their range (max; min)", header, rows)
+
+
+def _suited(groups: list[list], units: str, prismatic: bool) -> tuple[list[list], str]:
+    """Groups of numbers, N mm (N of a prismatic joint), in the unit that suits the largest; None stays None."""
+    si = 1.0 if prismatic else 1e-3
+    factor, unit = scaled(si * max(abs(x) for group in groups for x in group if x is not None), units)
+    return [[None if x is None else x * si * factor for x in group] for group in groups], unit
 
 
 def _parameters(parameters: list[dict]) -> list[tuple[str, str, str]]:

@@ -26,7 +26,9 @@ _MAX_EXCURSION = 5.0
 # Of the torque with which the whole machine weighs on an arm as long as its reach. A motor that leads a light joint
 # with friction and stiff springs gives up to tens of it; torques in N mm of one that only weighs are some 400 of it.
 _MAX_TORQUE = 200.0
-_MAX_TENSION = 2000.0  # N: in mN these are the 2 N at which tendons are kept taut.
+# Of the weight of all links. Strong tendons of a light finger pull with some hundred times; pulls of a finger with 10 N
+# are some ten thousand of it in mN.
+_MAX_TENSION = 5000.0
 _MAX_DEGREES = 400.0  # Angles in degrees are smaller: a turn, with room.
 _COLD = 200.0  # K, −73 °C: no laboratory is colder, so lower values are in °C.
 # A converter's limit is repeated over more samples at once, by this factor, than any value within its range. At the
@@ -138,10 +140,9 @@ def _large_for_the_machine(trial: Trial, finger: FingerDescription, report: Repo
     if any(finger.prismatic):
         return
     reach = _reach(finger)
-    weight = STANDARD_GRAVITY * float(finger.mass.sum())
     for channel, most, unit in (
         ("tendon_excursion", _MAX_EXCURSION * reach, "mm"),
-        ("joint_torque", _MAX_TORQUE * weight * reach, "N mm"),
+        ("joint_torque", _MAX_TORQUE * _weight(finger) * reach, "N mm"),
     ):
         for _, name, x in measured_columns(trial, finger, (channel,)) if most != 0.0 else ():
             if np.isfinite(x).all() and (size := float(np.percentile(np.abs(x), 90.0))) > most:
@@ -157,6 +158,11 @@ def _reach(finger: FingerDescription) -> float:
     gyration = np.sqrt(np.trace(finger.inertia[-1]) / 2.0 / finger.mass[-1])
     last = max(np.linalg.norm(finger.fingertip), np.linalg.norm(finger.com[-1]), gyration)
     return float(np.linalg.norm(finger.origin[1:], axis=1).sum() + last)
+
+
+def _weight(finger: FingerDescription) -> float:
+    """Weight of all links, N, whatever gravity the description has."""
+    return STANDARD_GRAVITY * float(finger.mass.sum())
 
 
 def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
@@ -179,8 +185,9 @@ def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repo
             unslack[name] = low
         elif trial.experiment == "ID.2" and np.median(x) <= NOISE_FACTOR * sizes.noise:
             slack.append(name)
-        if np.percentile(x, 95.0) > _MAX_TENSION:
-            report.warning(place, f"column {name} exceeds {_MAX_TENSION:g} N; {conversion('mN')} if that is what it is")
+        if np.percentile(x, 95.0) > _MAX_TENSION * _weight(finger):
+            said = f"column {name} exceeds {_MAX_TENSION:.0f} times the weight of all links"
+            report.warning(place, f"{said}; {conversion('mN')} if that is what it is")
     if slack and trial.tendon_excursion is not None:
         said = f"shows no tension in {listed(slack)}, though ID.2 needs taut tendons to follow the joint"
         report.warning(place, f"{said}; check the columns, or record the trial again with tension")

@@ -157,8 +157,8 @@ class CatalogueEffect(Effect):
             defaults |= {n: v[0] for n, v in cls.worth_trying(Scales.of(finger), site).items()}
         if unknown := set(values) - set(cls.parameters()):
             raise TypeError(f"{cls.ID} has no parameter {sorted(unknown)}; it has {sorted(cls.parameters())}")
-        numbers = {k: jnp.asarray(v, dtype=float) for k, v in (defaults | values).items()}
-        index = jax.device_put(np.array(cls.indices(finger, site), dtype=int))
+        numbers = {k: np.asarray(v, dtype=float) for k, v in (defaults | values).items()}
+        numbers, index = jax.device_put((numbers, np.array(cls.indices(finger, site), dtype=int)))
         return cls(site, index, **numbers, **cls.constants(finger, site))
 
     @classmethod

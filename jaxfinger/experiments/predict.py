@@ -57,10 +57,11 @@ def change(
     same = true is x  # false for effects of sensors
     if channel == "tendon_excursion":
         y = excursion(model, true, y0 if same else None)
-    elif effect.moves_rigid_body() and contact is not None:
+    elif contact is not None and true.q is not x.q:
         y = fingertip_force(model, true)
     elif effect.moves_rigid_body():
         y = external_torque(model, true, nominal=terms if same else None)
+        y = y if contact is None else jnp.sum(contact * y[None], axis=1)
     else:
         assert terms is not None
         more = resisting_change(model, x, terms) if same else resisting_torque(model, true) - resisting(terms)

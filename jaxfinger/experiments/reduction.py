@@ -120,7 +120,10 @@ def _despiked(trial: Trial) -> Trial:
 
 
 def _measured(experiment: Experiment, trial: Trial, finger: FingerDescription, minus: Predictions | None, longest: int):
-    """Channels to be predicted, with spikes bridged, and whether each sample is measured and not a spike."""
+    """Channels to be predicted, with spikes bridged, and whether each sample is measured and not a spike.
+
+    Of slack tendons' trials that name a joint no other joint's torque counts: at rest its friction has any value.
+    """
     N = len(trial.time)
     width = {"tendon_excursion": finger.n, "joint_torque": finger.m, "fingertip_force": 3}
     y, sound = {}, {}
@@ -133,6 +136,8 @@ def _measured(experiment: Experiment, trial: Trial, finger: FingerDescription, m
         if minus is not None:
             values = values - predicted_at(minus.get(trial.name, {}), c, trial, values.shape)
         measured = np.isfinite(values).all(axis=0)
+        if c == "joint_torque" and experiment.slack:
+            measured &= np.isin(finger.joint_names, trial.motorised(finger))
         counts = np.zeros(values.shape, bool)
         if measured.any():
             spikes = outlier_mask(values[:, measured], longest=longest)

@@ -143,7 +143,9 @@ def diagnose(
     search, state = search_for_causes(problem, catalogue, progress)
     baseline, table, found = search.baseline, search.table, posterior(search, state)
     sized = partial(relevance_of, problem, baseline.columns, tolerance=tolerance)
-    verdict = _verdict(problem, found, sized(columns_with_gap(baseline, baseline.null)))
+    nothing, counts = baseline.null.linear_fit.evidence, baseline.columns.counts
+    gaps = partial(columns_with_gap, counts, nothing, p=baseline.parameters)
+    verdict = _verdict(problem, found, sized(gaps(nothing)))
     nominal = nominal_fit(problem)
     chosen = baseline.null
     if verdict.status in (Status.PARTLY, Status.AMBIGUOUS):
@@ -157,7 +159,7 @@ def diagnose(
             augmented = as_refitted(baseline, problem, chosen, hold=something_open)
         else:
             augmented = augmented_fit(problem, chosen, hold=something_open)
-    with_gap = columns_with_gap(baseline, chosen)
+    with_gap = gaps(chosen.linear_fit.evidence)
     relevance = sized(with_gap)
     progress("refitting without each third of the trials")
     # Without causes, what is left of another simulator is what retuning leaves.

@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.signal import correlate
 
 from jaxfinger.data import Predictions, Session, Trial
 from jaxfinger.data.findings import Report
@@ -260,6 +259,8 @@ def _shifted(session: Session, predictions: Predictions, compared: list[Comparis
 
 def _best_shift(trial: Trial, y: Float[np.ndarray, " N"], p: Float[np.ndarray, " N"]) -> tuple[float, float]:
     """Time by which p comes after y where E is least, s, and that E."""
+    from scipy.signal import correlate  # slow to import, and few diagnoses have predictions
+
     rows = np.isfinite(y) & np.isfinite(p)
     if rows.sum() < 3:
         return 0.0, np.inf

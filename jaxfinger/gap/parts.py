@@ -11,10 +11,10 @@ from jaxfinger.experiments import EXPERIMENTS, not_judged
 from jaxfinger.gap.augment import prior_std, values_of
 from jaxfinger.gap.budget import MIN_GAP_EVIDENCE, Budget, held_out_gains
 from jaxfinger.gap.closure import centred
-from jaxfinger.gap.columns import Columns
+from jaxfinger.gap.columns import Columns, Counts
 from jaxfinger.gap.costs import CauseKey
 from jaxfinger.gap.exact import Baseline, SearchState
-from jaxfinger.gap.formula import Weights, likelihood_gain
+from jaxfinger.gap.formula import Evidence, Parameters, Weights, likelihood_gain, unexplained
 from jaxfinger.gap.posterior import Posterior
 from jaxfinger.gap.problem import Problem, site
 from jaxfinger.gap.projector import Projector
@@ -50,19 +50,14 @@ MAX_HELD_OUT = 12  # Candidates outside of the chosen set, most probable first, 
 MIN_DEVIATION = 3.0  # Standard deviations: the usual three sigma, by which a simulator's parameter must be off.
 
 
-def columns_with_gap(baseline: Baseline, chosen: SearchState) -> frozenset[int]:
+def columns_with_gap(counts: Counts, null: Evidence, chosen: Evidence, p: Parameters) -> frozenset[int]:
     """Numbers of the columns in which the nominal model alone leaves a gap.
 
     There smooth features alone, or the causes of the chosen set, bring evidence that something is at work. Causes that
     act within short times, as friction does at reversals, show outside of the features.
     """
-    explained = likelihood_gain(
-        baseline.columns.counts,
-        baseline.null.linear_fit.evidence,
-        chosen.linear_fit.evidence,
-        baseline.parameters,
-    )
-    return frozenset(np.flatnonzero(np.maximum(baseline.unexplained, explained) > MIN_GAP_EVIDENCE).tolist())
+    found = np.maximum(unexplained(counts, null, p), likelihood_gain(counts, null, chosen, p))
+    return frozenset(np.flatnonzero(found > MIN_GAP_EVIDENCE).tolist())
 
 
 def by_share(named, chosen: SearchState, shares: Budget) -> list:

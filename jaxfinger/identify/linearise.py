@@ -285,30 +285,36 @@ def _simulated_tangent(model: Model, free: Free, batch: Batch, channels: tuple[s
 def _tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...], wanted: Bool[Array, " parts"]):
     """Residuals and their derivatives, which are zero and not computed for the parts of the model not `wanted`."""
 
-    def f(values):
-        return _residuals(free.put(model, values), batch, channels)
+    def f(leaves):
+        return _residuals(free.put_whole(model, leaves), batch, channels)
 
-    values = free.values(model)
-    residuals, pushforward = jax.linearize(f, values)
-    still = jax.tree.map(jnp.zeros_like, values)
+    whole = free.whole(model)
+    residuals, pushforward = jax.linearize(f, whole)
+    still = jax.tree.map(jnp.zeros_like, whole)
 
     def columns(part: str, wanted: Bool[Array, ""]) -> dict[str, Array]:
-        """Derivatives by the parameters of one part of the model.
+        """Derivatives by the free entries of one part of the model.
 
         The pushforward is linear, so that its derivative at zero is itself. Taking the derivative lets JAX drop the
         operations that only the other parts' zeros pass through, which are most of them.
         """
         mine = [k for k, p in enumerate(free.parts) if p == part]
         zero, split = ravel_pytree([still[k] for k in mine])
+        starts = np.cumsum([0, *(still[k].size for k in mine)])
+        at = jnp.concatenate([start + free.entries[k] for start, k in zip(starts, mine, strict=False)])
 
         def alone(step):
             moved = dict(zip(mine, split(step), strict=True))
             return pushforward([moved.get(k, z) for k, z in enumerate(still)])
 
+        def along(entry) -> dict[str, Array]:
+            unit = (jnp.arange(zero.size) == entry).astype(float)
+            return jax.jvp(alone, (zero,), (unit,))[1]
+
         return jax.lax.cond(
             wanted,
-            lambda: jax.lax.map(lambda unit: jax.jvp(alone, (zero,), (unit,))[1], jnp.eye(zero.size)),
-            lambda: {c: jnp.zeros((zero.size, *r.shape)) for c, r in residuals.items()},
+            lambda: jax.lax.map(along, at),
+            lambda: {c: jnp.zeros((at.size, *r.shape)) for c, r in residuals.items()},
         )
 
     parts = [columns(part, of_part) for part, of_part in zip(dict.fromkeys(free.parts), wanted, strict=True)]

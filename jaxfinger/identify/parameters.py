@@ -69,15 +69,27 @@ class Free(eqx.Module):
 
     def put(self, model: Model, values: list[Float[Array | np.ndarray, " _k"]]) -> Model:
         """Copy of the model with these free parameters, leaf by leaf."""
-        arrays, rest = eqx.partition(model, eqx.is_inexact_array)
-        leaves, treedef = jax.tree.flatten(arrays)
-        for i, e, value in zip(self.leaves, self.entries, values, strict=True):
-            if _namespace([leaves[i], e, value]) is np:
-                flat = np.array(leaves[i]).ravel()
+        leaves = self.whole(model)
+        for i, (leaf, e, value) in enumerate(zip(leaves, self.entries, values, strict=True)):
+            if _namespace([leaf, e, value]) is np:
+                flat = np.array(leaf).ravel()
                 flat[e] = value
             else:
-                flat = jnp.ravel(leaves[i]).at[e].set(value)
-            leaves[i] = jax.device_put(flat.reshape(leaves[i].shape))
+                flat = jnp.ravel(leaf).at[e].set(value)
+            leaves[i] = jax.device_put(flat.reshape(leaf.shape))
+        return self.put_whole(model, leaves)
+
+    def whole(self, model: Model) -> list[Float[Array, "..."]]:
+        """The leaves of a model that hold free entries, with their other entries."""
+        leaves = _leaves(model)
+        return [leaves[i] for i in self.leaves]
+
+    def put_whole(self, model: Model, whole: list[Float[Array, "..."]]) -> Model:
+        """Copy of the model with these leaves."""
+        arrays, rest = eqx.partition(model, eqx.is_inexact_array)
+        leaves, treedef = jax.tree.flatten(arrays)
+        for i, leaf in zip(self.leaves, whole, strict=True):
+            leaves[i] = leaf
         return eqx.combine(jax.tree.unflatten(treedef, leaves), rest)
 
     def get(self, model: Model) -> Float[Array | np.ndarray, " p"]:

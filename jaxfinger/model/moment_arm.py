@@ -49,9 +49,12 @@ class MomentArm(eqx.Module):
     @jax.jit
     def coupling(self, q: Float[Array, "m *T"]) -> Float[Array, "n m *T"]:
         """Coupling matrix C(q) = ∂f/∂q, m/rad; entry [k, i] is the moment arm of tendon k about joint i."""
-        powers = self._powers(q)
-        gradient = jnp.stack([jnp.stack([_derivative(powers, e, i) for i in range(len(q))]) for e in self.exponents])
-        return jnp.tensordot(self.coefficients, gradient, 1)
+        powers, columns = self._powers(q), []
+        for i in range(len(q)):
+            mine = [t for t, e in enumerate(self.exponents) if e[i]]
+            slopes = jnp.stack([_derivative(powers, self.exponents[t], i) for t in mine])
+            columns.append(jnp.tensordot(self.coefficients[:, np.array(mine)], slopes, 1))
+        return jnp.stack(columns, axis=1)
 
     def _powers(self, q: Float[Array, "m *T"]) -> list[Float[Array, "m *T"]]:
         """Powers 1, q, q², … up to the highest exponent."""
@@ -64,7 +67,5 @@ def _monomial(powers: list[Float[Array, "m *T"]], exponents: tuple[int, ...]) ->
 
 
 def _derivative(powers: list[Float[Array, "m *T"]], exponents: tuple[int, ...], i: int) -> Float[Array, "*T"]:
-    p = exponents[i]
-    if p == 0:
-        return jnp.zeros_like(powers[0][0])
-    return p * _monomial(powers, tuple(e - (j == i) for j, e in enumerate(exponents)))
+    """Derivative of a monomial by an angle of which it is a function."""
+    return exponents[i] * _monomial(powers, tuple(e - (j == i) for j, e in enumerate(exponents)))

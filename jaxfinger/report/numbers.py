@@ -10,6 +10,8 @@ import re
 from collections.abc import Sequence
 
 HALF_95 = 1.96  # Standard deviations from the mean to either end of a normal distribution's central 95 % interval.
+# χ² per row above which the model or its noise is taken to be wrong: residuals of 1.22 times the noise.
+MAX_CHI2 = 1.5
 DASH = "–"
 _POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))

@@ -27,7 +27,7 @@ from jaxfinger.gap.result import (
     still_open,
 )
 from jaxfinger.report.names import VARIABLE_NAMES, cause_name, channel_name, joined, key_name
-from jaxfinger.report.numbers import alike, measured, number, percent, percent_range, quantity
+from jaxfinger.report.numbers import MAX_CHI2, alike, measured, number, percent, percent_range, quantity
 
 MAX_NAMES = 4  # Causes or channels in one sentence; more make it hard to read, and the page lists all.
 MIN_SHARE = 0.005  # Share of a gap: `percent` rounds a smaller one to 0 %.
@@ -169,7 +169,16 @@ def _no_gap(d: Diagnosis) -> list[str]:
     if d.unlisted >= MIN_NAMED_PROBABILITY:
         chance = "all trials together hold traces of something more, too small for any channel to show alone"
     judged = [x for x in d.closures if x.channel != "q"]  # Simulated angles are not judged by their noise.
-    return [f"{_subject(d)} predicts {_counted(len(judged))} to within the noise", chance]
+    loud = [x for x in judged if 0.0 < MAX_CHI2 * x.noise**2 < x.before**2]
+    if not loud:
+        return [f"{_subject(d)} predicts {_counted(len(judged))} to within the noise", chance]
+    names = [f"{channel_name(x.channel)} of {x.experiment} ({number(x.before / x.noise, 2)} times)" for x in loud]
+    return [
+        f"{_subject(d)} leaves in {_counted(len(judged))} nothing that a law could explain",
+        f"what it leaves is larger than the channel's own noise in {joined(names)}, as where noise of angles or of "
+        "accelerations moves a prediction",
+        chance,
+    ]
 
 
 def _counted(channels: int) -> str:

@@ -82,9 +82,9 @@ class HeadReading:
 class Status:
     """State of the controller, with the first cause of a trip.
 
-    `trip_seq` is the sample at which it tripped, `trip_value` the value in SI of the channel `trip_channel`, which is
-    empty where no single channel is the cause. `head` counts the samples written, `acknowledged` is the id of the last
-    command processed.
+    `trip_seq` is the sample at which it tripped, `trip_value` the value in `trip_unit` (SI) of the channel
+    `trip_channel`, which is empty where no single channel is the cause. `head` counts the samples written,
+    `acknowledged` is the id of the last command processed.
     """
 
     state: State
@@ -92,14 +92,16 @@ class Status:
     trip_seq: int = 0
     trip_value: float = 0.0
     trip_channel: str = ""
+    trip_unit: str = ""
     head: int = 0
     acknowledged: int = 0
 
     @property
     def cause(self) -> str:
         """Sentence for people, with channel and value where one channel is the cause."""
-        where = f" ({self.trip_channel} = {self.trip_value:.4g})" if self.trip_channel else ""
-        return self.trip.sentence + where
+        return self.trip.said(
+            f"{self.trip_channel} = {self.trip_value:.4g} {self.trip_unit}" if self.trip_channel else ""
+        )
 
 
 @dataclass(frozen=True)

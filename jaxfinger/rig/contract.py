@@ -170,6 +170,10 @@ class Trip(IntEnum):
         """The cause in words, for people."""
         return _SENTENCES[self]
 
+    def said(self, where: str = "") -> str:
+        """The cause in words, with `where` (channel and value) and what the operator should look at."""
+        return self.sentence + (f" ({where})" if where else "") + (f"; see {_SEE[self]}" if self in _SEE else "")
+
 
 _SENTENCES = {
     Trip.NONE: "no trip",
@@ -192,6 +196,28 @@ _SENTENCES = {
     Trip.TEMPERATURE: "motor temperature above its limit",
     Trip.LAG: "the host is too far behind the rig",
     Trip.CONTRACT: "the controller reports a state that the contract does not define",
+}
+
+
+_SEE = {  # what to look at after a trip
+    Trip.TENSION: "the tendon's path, its drive and its load cell",
+    Trip.TENSION_RATE: "whether a tendon slips or a cable is loose",
+    Trip.SLACK: "whether the tendon is torn or off its pulley",
+    Trip.POSITION: "the joint's fixture and its encoder",
+    Trip.VELOCITY: "the joint's fixture or coupling, and its encoder",
+    Trip.TORQUE: "what blocks the joint",
+    Trip.FORCE: "what the fingertip presses on",
+    Trip.INVALID: "the channel's cable and terminal",
+    Trip.HEARTBEAT: "what else this computer does, and the network",
+    Trip.FROZEN: "its cable and terminal",
+    Trip.STALE: "whether its task runs",
+    Trip.CLOCK: "the controller's task and its distributed clock",
+    Trip.RECORDER: "the disk",
+    Trip.HOST: "what else this computer does",
+    Trip.TRACKING: "the tendon's drive and its load cell",
+    Trip.TEMPERATURE: "what loads the motor",
+    Trip.LAG: "what else this computer does, and the network",
+    Trip.CONTRACT: "docs/plc-contract.md",
 }
 
 

@@ -79,6 +79,13 @@ def _run(kind: str, of: str, step: float) -> Spoil:
     return spoil
 
 
+def _still(block: Block, at: np.ndarray, rig: RigDescription) -> None:
+    """The MCP turns by 3 rad/s for 0.2 s, and the encoder of T3 repeats its value."""
+    block.x[:, rig.index("joint_position", "MCP")] += np.minimum(np.cumsum(at), 200) * 3.0 / rig.rate_hz
+    column = rig.index("excursion", "T3")
+    block.x[at, column] = block.x[int(np.argmax(at)), column]
+
+
 def _time(rate: float = 1.0, jump: float = 0.0) -> Spoil:
     """The device's clock jumps by `jump` s and then runs at `rate`."""
 
@@ -131,6 +138,8 @@ MATRIX = (
         shows=lambda rig: max(c.frozen for c in rig.channels)),
     Row("encoder", "joint encoder frozen while a tendon runs by 1.5 mm", HOST, (Trip.FROZEN,),
         _run("excursion", "T2", 1e-4), shows=lambda rig: 0.015, phases=("ramp", "hold")),
+    Row("excursion", "tendon encoder frozen while its joint turns by a quarter of its range", HOST, (Trip.FROZEN,),
+        _still, shows=lambda rig: 0.15, phases=("ramp", "hold")),
     Row("clock back", "the controller's clock runs back", HOST, (Trip.CLOCK,), _time(jump=-0.5), "clock-back"),
     Row("clock frozen", "the controller's clock stands still", HOST, (Trip.CLOCK,), _time(rate=0.0), "clock-frozen"),
     Row("clock slow", "the controller's clock a hundred times too slow", HOST, (Trip.CLOCK,), _time(rate=0.01),

@@ -13,7 +13,18 @@ from jaxfinger.data.toml import Document, Fault, NotEmpty, Place, one_of, parse_
 from jaxfinger.errors import UserError
 from jaxfinger.rig.backend import CommandRefused, JointMove, Setup, TensionRamp
 from jaxfinger.rig.channels import RigDescription
-from jaxfinger.rig.protocols import PROTOCOLS, Common, Covered, Dwell, Protocol, Settled, Start, Tare
+from jaxfinger.rig.protocols import (
+    PROTOCOLS,
+    Common,
+    Covered,
+    Dwell,
+    Protocol,
+    Reached,
+    Settled,
+    StaticTorque,
+    Step,
+    Tare,
+)
 from jaxfinger.rig.safety import admit
 from jaxfinger.rig.trips import time_to_cover
 
@@ -108,9 +119,12 @@ def _plan(document: Document, rig: RigDescription) -> Plan:
     )
     for trial in {trial.line: trial for trial in reversed(named)}.values():  # one of each set of repeats
         try:
-            for number, _ in enumerate(commands(trial, rig)):
+            for number, (step, seconds) in enumerate(timed(trial, rig)):
                 if number == MAX_STEPS:
                     raise UserError(f"takes more than {MAX_STEPS} steps; shorten it")
+                if isinstance(step, TensionRamp | JointMove) and seconds > Reached.timeout:
+                    said = f"takes {seconds:.0f} s for one command, longer than {Reached.timeout:g} s"
+                    raise UserError(f"{said}; see the unit of its rate or speed")
         except CommandRefused as error:
             mend = "change this [[trial]], or [limits] of the rig file"
             raise UserError(
@@ -150,6 +164,8 @@ def _check_parameters(experiment: str, parameters: Common, rig: RigDescription, 
         (place / "levels").fail("must be two or more rising tensions in N")
     if "range_deg" in values and values["range_deg"][0] >= values["range_deg"][1]:
         (place / "range_deg").fail("must be [lower, upper] with lower below upper")
+    if isinstance(p := parameters, StaticTorque) and (span := p.range_deg[1] - p.range_deg[0]) < p.step_deg:
+        (place / "range_deg").fail(f"spans {span:g}°, less than one step of {p.step_deg:g}°; give it in degrees")
     if values.get("mean") and len(values["mean"]) != int(finger.active.sum()):
         (place / "mean").fail(f"must give one tension for each of the {int(finger.active.sum())} active tendons")
     posture = parameters.posture_deg
@@ -170,7 +186,7 @@ def _check_parameters(experiment: str, parameters: Common, rig: RigDescription, 
         (place / "experiment").fail(f"{experiment} needs a channel of kind '{needed[0]}', which the rig file has not")
 
 
-def commands(trial: PlannedTrial, rig: RigDescription) -> Iterator[Any]:
+def commands(trial: PlannedTrial, rig: RigDescription) -> Iterator[Step]:
     """Yield every step of a trial, each command checked against the limits.
 
     The steps of a protocol do not depend on measurements, so those checked here are those of the run.
@@ -184,29 +200,36 @@ def commands(trial: PlannedTrial, rig: RigDescription) -> Iterator[Any]:
         yield step
 
 
-def estimate(trial: PlannedTrial, rig: RigDescription) -> Estimate:
-    """Estimate duration (without the operator's pauses), prompts and highest tension from the commands alone.
+def timed(trial: PlannedTrial, rig: RigDescription) -> Iterator[tuple[Step, float]]:
+    """Yield every step of a trial, as `commands` does, with the time in s that it takes on the controller.
 
     A joint moved by hand is taken to need HAND_PASS_S for each pass to and fro.
     """
-    seconds, highest, prompts = 0.0, 0.0, []
     tension = dict.fromkeys(rig.finger.tendon_names, 0.0)
     angle = trial.parameters.posture(rig.finger)
     for step in commands(trial, rig):
+        seconds = 0.0
         if isinstance(step, TensionRamp):
-            seconds += max((abs(v - tension[k]) for k, v in step.targets.items()), default=0.0) / step.rate
+            seconds = max((abs(v - tension[k]) for k, v in step.targets.items()), default=0.0) / step.rate
             tension.update(step.targets)
-            highest = max(highest, *tension.values())
         elif isinstance(step, JointMove):
             half = abs(step.target - angle[step.joint]) / 2.0  # The motor slows down as it speeds up.
-            seconds += 2.0 * time_to_cover(half, step.speed, step.acceleration)
+            seconds = 2.0 * time_to_cover(half, step.speed, step.acceleration)
             angle[step.joint] = step.target
         elif isinstance(step, Dwell | Settled | Tare):
-            seconds += step.seconds
+            seconds = step.seconds
         elif isinstance(step, Covered):
-            seconds += HAND_PASS_S * step.passes
+            seconds = HAND_PASS_S * step.passes
+        yield step, seconds
+
+
+def estimate(trial: PlannedTrial, rig: RigDescription) -> Estimate:
+    """Estimate duration (without the operator's pauses), prompts and highest tension from the commands alone."""
+    total, highest, prompts = 0.0, 0.0, []
+    for step, seconds in timed(trial, rig):
+        total += seconds
+        if isinstance(step, TensionRamp):
+            highest = max(highest, *step.targets.values())
         elif isinstance(step, Setup):
             prompts.append(step.prompt)
-        elif isinstance(step, Start):
-            continue
-    return Estimate(trial.name, seconds, tuple(prompts), highest)
+    return Estimate(trial.name, total, tuple(prompts), highest)

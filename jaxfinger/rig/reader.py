@@ -229,10 +229,10 @@ class HostClock:
             away = self._drift(now.head / rate - now.answered, (now.head + 1) / rate - now.asked, passed)
             self._last = now
             if abs(away) > self._deadlines.clock_offset_s:
-                found.append(Violation(Trip.CLOCK, "samples ahead of the host's clock, in s", seq, away))
+                found.append(Violation(Trip.CLOCK, "samples ahead of the host's clock", seq, away, unit="s"))
         self.lag_s = (now.head - int(block.seq[0])) / rate + time.monotonic() - now.asked
         if self.lag_s > self._deadlines.lag_s:
-            found.append(Violation(Trip.LAG, "s from a sample to its supervision", seq, self.lag_s))
+            found.append(Violation(Trip.LAG, "time from a sample to its supervision", seq, self.lag_s, unit="s"))
         return found
 
 

@@ -29,8 +29,8 @@ MIN_FREE_BYTES = 500 * 2**20
 class Recorder:
     """Takes frames without waiting.
 
-    `failure` says why the log cannot be written (None: it can), `unwritten` holds the frames of JSON that failed, and
-    after `close` `hangs` is true where the disk did not answer.
+    `failure` says why the log cannot be written (None: it can), `unwritten` holds the frames of JSON that failed,
+    `trials` counts those begun, and after `close` `hangs` is true where the disk did not answer.
 
     Raises:
         UserError: the disk has less than MIN_FREE_BYTES, or the log exists or cannot be created.
@@ -38,8 +38,7 @@ class Recorder:
 
     def __init__(self, path: Path, header: dict[str, Any], resume: bool = False, opener: Callable | None = None):
         self.path = path
-        if not resume:
-            _refuse_full_disk(path.parent)
+        _refuse_full_disk(path.parent)
         self._log = opener(path) if opener else wal.LogWriter.append(path) if resume else wal.LogWriter.create(path)
         self._queue: queue.SimpleQueue[tuple[bytes, Any] | None] = queue.SimpleQueue()
         self._since: deque[float] = deque()  # when each waiting frame was queued (s, monotonic)
@@ -47,6 +46,7 @@ class Recorder:
         self._lock = threading.Lock()
         self.failure: str | None = None
         self.hangs = False
+        self.trials = 0
         self.unwritten: list[tuple[bytes, dict[str, Any]]] = []
         self._thread = threading.Thread(target=self._work, name="jaxfinger-writer", daemon=True)
         self._thread.start()
@@ -55,6 +55,7 @@ class Recorder:
 
     def put(self, tag: bytes, value: Any) -> None:
         """Queue a frame: a block for `wal.DATA`, a dictionary of JSON for the other tags. Never waits."""
+        self.trials += tag == wal.TRIAL
         self._since.append(time.monotonic())
         self._queue.put((tag, value))
 

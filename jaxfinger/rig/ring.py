@@ -32,7 +32,7 @@ from jaxfinger.rig.backend import (
     Status,
     TensionRamp,
 )
-from jaxfinger.rig.channels import Filter, RigDescription
+from jaxfinger.rig.channels import SI_UNITS, Filter, RigDescription
 from jaxfinger.rig.contract import Kind, Mode, State, Trip
 from jaxfinger.rig.safety import admit
 
@@ -342,15 +342,20 @@ class RingRig(Rig):
 
     def status(self) -> Status:
         record = self._status()
-        slot = int(record["trip_slot"])
+        slot, value, unit = int(record["trip_slot"]), float(record["trip_value"]), ""
+        trip = _known(Trip, int(record["trip"]), "trip")
         channel = next((c for c in self.description.channels if c.slot == slot), None)
-        value = float(record["trip_value"])
+        if channel is not None:
+            rate = trip in (Trip.TENSION_RATE, Trip.VELOCITY)  # of the raw value: its offset does not count
+            value = (value * channel.scale + (0.0 if rate else channel.offset)) * channel.factor
+            unit = SI_UNITS[channel.kind] + ("/s" if rate else "")
         return Status(
             state=_known(State, int(record["state"]), "state"),
-            trip=_known(Trip, int(record["trip"]), "trip"),
+            trip=trip,
             trip_seq=int(record["trip_seq"]),
-            trip_value=(value * channel.scale + channel.offset) * channel.factor if channel else value,
+            trip_value=value,
             trip_channel=channel.name if channel else "",
+            trip_unit=unit,
             head=int(record["head"]),
             acknowledged=int(record["acknowledged"]),
         )

@@ -137,6 +137,7 @@ class Runner:
         Return why it ended and in which state the rig is: where no sample shows the controller stopped and no drive's
         tension, the operator is to switch the drives off.
         """
+        self.watch.interrupts.stopping = True
         reader = self.reader
         trip, seq = (error.trip, error.seq) if isinstance(error, TrialEnded) else (Trip.HOST, None)
         said = str(error) if isinstance(error, UserError) else f"the recorder failed ({type(error).__name__}: {error})"
@@ -204,7 +205,7 @@ class Runner:
             self._let_pass(AFTER_TRIP_S, self._released, since=self.rig.status().head)
             self._check(None)
             if self.rig.status().state is not State.IDLE or not self._released():
-                raise TrialEnded("the controller did not release the finger after the last trial", Trip.HOST)
+                raise TrialEnded("the finger was not seen to be released after the last trial", Trip.HOST)
         except Exception as error:  # Of any kind, as in `trial`.
             return self.abort(error)
         return ""
@@ -341,7 +342,8 @@ class Runner:
         """
         self._setup = setup
         if self.rig.prepare(setup):
-            self._wait("finger being prepared", AtPose(self.rig.description, setup), 60.0)
+            at_pose, ordered = AtPose(self.rig.description, setup), self.rig.status().head
+            self._wait("finger being prepared", lambda b: int(b.seq[-1]) >= ordered and at_pose(b), 60.0)
             return
         prompt = setup.prompt
         while True:

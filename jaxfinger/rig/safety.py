@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxfinger.rig.backend import Block, Command, CommandRefused, JointMove, TensionRamp
-from jaxfinger.rig.channels import RigDescription
+from jaxfinger.rig.channels import SI_UNITS, RigDescription
 from jaxfinger.rig.contract import Flag, State, Trip
-from jaxfinger.rig.trips import Drift, LeakyCount, RunLength, UnexplainedExcursion, UnfollowedMove
+from jaxfinger.rig.trips import Drift, LeakyCount, RunLength, StillExcursion, UnexplainedExcursion, UnfollowedMove
 
 # Samples over which the host takes joint velocity and tension rate: 20 ms at 1 kHz. One step of a 14-bit encoder
 # (3.8e-4 rad) then reads as 0.02 rad/s; from one sample to the next it would read as 0.4 rad/s.
@@ -25,7 +25,7 @@ VELOCITY_SPAN = 20
 
 @dataclass(frozen=True)
 class Violation:
-    """One broken limit: its trip code, the channel that broke it, the sample at which it tripped, and the value (SI).
+    """One broken limit: its trip code, the channel that broke it, the sample at which it tripped, the value in `unit`.
 
     `since` is the number of the first bad sample: data from there on do not belong to the trial. Its default is `seq`.
     `cause` is a sentence without a full stop, where no channel broke a limit.
@@ -37,6 +37,7 @@ class Violation:
     value: float
     since: int = -1
     cause: str = ""
+    unit: str = ""
 
     @classmethod
     def of_host(cls, trip: Trip, seq: int, cause: str) -> Violation:
@@ -49,8 +50,9 @@ class Violation:
 
     @property
     def sentence(self) -> str:
-        """Sentence for people, without a full stop."""
-        return self.cause or f"{self.trip.sentence} ({self.channel} = {self.value:.4g} at sample {self.seq})"
+        """Sentence for people, without a full stop: what happened, and where to look."""
+        value = f"{self.value:.4g} {self.unit}".rstrip()
+        return self.cause or self.trip.said(f"{self.channel} = {value} at sample {self.seq}")
 
 
 def admit(command: Command, rig: RigDescription) -> None:
@@ -131,6 +133,9 @@ class Supervisor:
         self._clock_drift = Drift(rig.deadlines.clock_rate)
         self._unexplained = UnexplainedExcursion(len(self._excursion))
         self._encoder_count = LeakyCount(len(self._excursion))
+        rows = [finger.tendon_names.index(rig.channels[int(i)].of) for i in self._excursion[:, 0]]
+        self._still_excursion = StillExcursion(finger.crosses[rows], np.ptp(finger.limits, 1))
+        self._still_count = LeakyCount(len(self._excursion))
         self._move: UnfollowedMove | None = None
         self._first: tuple[int, int] | None = None  # number and device time (ns) of the first sample
         self._before: tuple[int, int] | None = None  # number and device time (ns) of the previous sample
@@ -168,6 +173,11 @@ class Supervisor:
     def _name(self, channel: int | np.intp) -> str:
         return self.rig.channels[int(channel)].name
 
+    def _violation(self, trip: Trip, channel: int | np.intp, seq: int, value: float, since: int = -1, per: str = ""):
+        """Violation by a channel; `per` divides its unit."""
+        unit = SI_UNITS[self.rig.channels[int(channel)].kind] + per
+        return Violation(trip, self._name(channel), seq, value, since, unit=unit)
+
     def _codes(self, block: Block, seq: np.ndarray) -> list[Violation]:
         """CONTRACT at the first sample whose state the contract does not define."""
         unknown = np.flatnonzero(block.state > max(State))
@@ -188,8 +198,9 @@ class Supervisor:
             ahead = (time - self._first[1]) * 1e-9 - passed
             away = self._clock_drift(ahead, ahead, step[0] / self.rig.rate_hz)
             if not found and (step[1] <= 0 or abs(away) > allowed):
-                what = "device time since the sample before, in s" if step[1] <= 0 else "device time ahead, in s"
-                found.append(Violation(Trip.CLOCK, what, number, step[1] * 1e-9 if step[1] <= 0 else away))
+                what = "device time since the sample before" if step[1] <= 0 else "device time ahead"
+                value = step[1] * 1e-9 if step[1] <= 0 else away
+                found.append(Violation(Trip.CLOCK, what, number, value, unit="s"))
         return found
 
     def _values(self, block: Block, seq: np.ndarray) -> list[Violation]:
@@ -199,7 +210,7 @@ class Supervisor:
         for channel, row, since in self._range_count(bad, seq):
             value = float(block.x[row, channel])
             trip = self._trip[channel] if np.isfinite(value) else Trip.INVALID
-            found.append(Violation(trip, self._name(channel), int(seq[row]), value, since))
+            found.append(self._violation(trip, channel, int(seq[row]), value, since))
         flagged = (block.flags & int(Flag.BUS | Flag.ENCODER | Flag.ANALOG)) != 0
         for _, row, since in self._flag_count(flagged[:, None], seq):
             value = float(block.flags[row] & 0xFFFF)
@@ -216,7 +227,7 @@ class Supervisor:
             row = int(np.argmax(late[:, channel]))
             value = float(block.x[row, channel])
             since = int(seq[row]) - int(runs[row, channel]) + 1
-            found.append(Violation(Trip.FROZEN, self._name(channel), int(seq[row]), value, max(since, 0)))
+            found.append(self._violation(Trip.FROZEN, channel, int(seq[row]), value, max(since, 0)))
         return found
 
     def _rates(self, block: Block, seq: np.ndarray) -> list[Violation]:
@@ -235,7 +246,8 @@ class Supervisor:
         ):
             for k, row, since in count(np.abs(rate[:, channels]) > limit, seq[-rows:]):
                 value = float(rate[row, channels[k]])
-                found.append(Violation(trip, self._name(channels[k]), int(seq[len(seq) - rows + row]), value, since))
+                at = int(seq[len(seq) - rows + row])
+                found.append(self._violation(trip, channels[k], at, value, since, per="/s"))
         return found
 
     def _tracking(self, block: Block, seq: np.ndarray) -> list[Violation]:
@@ -246,27 +258,30 @@ class Supervisor:
         on = (block.state == State.ARMED) | (block.state == State.MOVING)
         error = block.x[:, self._setpoint] - block.x[:, self._follower]
         off_target = on[:, None] & (np.abs(error) > self.rig.limits.tension_error_max)
-        return [
-            Violation(
-                Trip.TRACKING, f"set-point minus {self._name(self._follower[k])}", int(seq[row]), float(error[row, k])
-            )
-            for k, row, _ in self._tracking_count(off_target, seq)
-        ]
+        found = []
+        for k, row, _ in self._tracking_count(off_target, seq):
+            what = f"set-point minus {self._name(self._follower[k])}"
+            found.append(Violation(Trip.TRACKING, what, int(seq[row]), float(error[row, k]), unit="N"))
+        return found
 
     def _still(self, block: Block, seq: np.ndarray) -> list[Violation]:
-        """FROZEN where an encoder stays still although the external motor or a tendon must have moved its joint."""
+        """FROZEN where an encoder stays still although the external motor, a tendon or a joint must have moved it."""
         found = []
         if (move := self._move) is not None:
             angle = block.x[:, move.column]
             if (row := move(angle, block.state == State.MOVING)) is not None:
                 self._move = None
-                name = self._name(move.column)
-                found.append(Violation(Trip.FROZEN, name, int(seq[row]), float(angle[row])))
+                found.append(self._violation(Trip.FROZEN, move.column, int(seq[row]), float(angle[row])))
         channels, tensions = self._excursion.T
-        ran = self._unexplained(block.x[:, self._angle], block.x[:, channels], block.x[:, tensions])
+        angle, length, load = block.x[:, self._angle], block.x[:, channels], block.x[:, tensions]
+        ran = self._unexplained(angle, length, load)
         for k, row, since in self._encoder_count(ran > UnexplainedExcursion.MAX_UNEXPLAINED, seq):
-            name = f"joint encoders, while {self._name(channels[k])} ran by m"
-            found.append(Violation(Trip.FROZEN, name, int(seq[row]), float(ran[row, k]), since))
+            name = f"joint encoders, while {self._name(channels[k])} ran by"
+            found.append(Violation(Trip.FROZEN, name, int(seq[row]), float(ran[row, k]), since, unit="m"))
+        turned, since_change = self._still_excursion(angle, length, load, seq)
+        for k, row, _ in self._still_count(turned > StillExcursion.MAX_TURN, seq):
+            value, since = float(length[row, k]), int(since_change[row, k]) + 1
+            found.append(self._violation(Trip.FROZEN, channels[k], int(seq[row]), value, since))
         return found
 
     def commanded(self, command: Command) -> None:

@@ -101,34 +101,39 @@ def run(
             cause = _trials(plan, rig, recorder, operator, interrupts, observe, log)
         except UserError:
             recorder.close()
-            if log is None:  # Nothing was armed or recorded, so there is nothing to resume.
+            if log is None and not recorder.trials:  # Nothing was recorded, so there is nothing to resume.
                 path.unlink(missing_ok=True)
             raise
-        except BaseException:
+        finally:
             recorder.close()
-            raise
-    recorder.close()
+    return _publish(plan, recorder, output, cause, resume)
+
+
+def _publish(plan: Plan, recorder: Recorder, output: Path, cause: str, resume: bool) -> Outcome:
+    """Write the session from the log that a run has left, and delete the log where every trial is complete.
+
+    Raises:
+        UserError: the log cannot be read, or the session cannot be written.
+    """
+    path, cause = recorder.path, cause or recorder.failure or ""
     if recorder.hangs:
-        return Outcome(output, (), cause or recorder.failure or "", path)
-    cause = cause or recorder.failure or ""
-    log = read_log(path)
-    for tag, value in recorder.unwritten:
-        if tag == wal.END and log.trials and log.trials[-1].end is None:
-            log.trials[-1].end = value
-    done = tuple(r.name for r in log.trials if r.complete)
-    whole = {r.start["planned"] for r in log.trials if r.complete}
-    if not cause and (lacking := [t.name for t in plan.trials if t.name not in whole]):
-        cause = "; ".join([f"the disk did not keep {listed(lacking)} whole", *map(str, log.damage)])
+        return Outcome(output, (), cause, path)
     try:
+        log = read_log(path)
+        for tag, value in recorder.unwritten:
+            if tag == wal.END and log.trials and log.trials[-1].end is None:
+                log.trials[-1].end = value
+        whole = {r.start["planned"] for r in log.trials if r.complete}
+        if not cause and (lacking := [t.name for t in plan.trials if t.name not in whole]):
+            cause = "; ".join([f"the disk did not keep {listed(lacking)} whole", *map(str, log.damage)])
         convert.publish(log, output, overwrite=resume)
-    except UserError as error:
+    except (UserError, KeyboardInterrupt) as error:
+        said = str(error).rstrip(".") or f"{output}: interrupted while it was written"
         ended = f"{cause}; " if cause else ""
-        raise UserError(
-            f"{ended}{str(error).rstrip('.')}; jaxfinger recover {path} makes it once that is mended."
-        ) from error
+        raise UserError(f"{ended}{said}; jaxfinger recover {path} makes it once that is mended.") from error
     if not cause:
         path.unlink()
-    return Outcome(output, done, cause, path if cause else None)
+    return Outcome(output, tuple(r.name for r in log.trials if r.complete), cause, path if cause else None)
 
 
 def _log_to_resume(plan: Plan, rig: RigDescription, path: Path, output: Path, resume: bool) -> convert.Log | None:

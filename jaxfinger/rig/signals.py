@@ -16,11 +16,12 @@ class Interrupts:
 
     An exception that strikes at any line of the main thread can leave a lock taken for ever (that of the reader's
     queue, or that of the connection over which STOP goes) and a thread not started. Only the main thread gets signals;
-    in another one nothing is taken.
+    in another one nothing is taken. Once the rig is being stopped, which sets `stopping`, signals change nothing: who
+    presses Ctrl-C again and again must not cut off the look whether tension falls. It takes a few seconds at most.
     """
 
     def __init__(self):
-        self.requested = False
+        self.requested = self.stopping = False
         self._handlers: dict[int, Any] = {}  # handlers from before, by signal
 
     def __enter__(self) -> Interrupts:
@@ -33,6 +34,6 @@ class Interrupts:
             signal.signal(number, handler)
 
     def _take(self, number: int, frame: FrameType | None) -> None:
-        if self.requested:
+        if self.requested and not self.stopping:
             raise KeyboardInterrupt
         self.requested = True

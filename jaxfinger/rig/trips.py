@@ -149,6 +149,42 @@ class UnexplainedExcursion:
         return ran
 
 
+class StillExcursion:
+    """Joints that turn while the encoder of a loaded tendon that crosses them repeats one value.
+
+    A turn by more than MAX_TURN means that the tendon's encoder is frozen. One that works repeats no value for long,
+    since the drive that holds the tension follows the joint. `crosses` tells which tendons cross which joints, `span`
+    (rad) is the joints' range.
+    """
+
+    MAX_TURN = 0.25  # of a joint's range; the moment arm of a tendon may be zero within a part of it
+
+    def __init__(self, crosses: Bool[np.ndarray, "n m"], span: Float[np.ndarray, " m"]):
+        self._share = crosses / span
+        self._length = np.full(len(crosses), nan)
+        self._angle = np.full(crosses.shape, nan)  # of the joints when each encoder last changed, rad
+        self._since = np.zeros(len(crosses), np.int64)  # number of that sample
+
+    def __call__(
+        self,
+        angle: Float[np.ndarray, "N m"],
+        length: Float[np.ndarray, "N n"],
+        load: Float[np.ndarray, "N n"],
+        seq: Int[np.ndarray, " N"],
+    ) -> tuple[Float[np.ndarray, "N n"], Int[np.ndarray, "N n"]]:
+        """Turn of the crossed joints, as a share of their range, since each encoder last changed; and sample of that.
+
+        `angle` (rad), `length` (m) and `load` (N) are as for UnexplainedExcursion, `seq` numbers the samples.
+        """
+        before = np.concatenate([self._length[None], length[:-1]])
+        repeats = (length == before) & (load >= UnexplainedExcursion.MIN_TENSION)
+        last = np.maximum.accumulate(np.where(repeats, -1, np.arange(len(seq))[:, None]), 0)
+        since = np.where(last >= 0, seq[last], self._since)
+        at = np.where(last[..., None] >= 0, angle[last], self._angle)
+        self._length, self._angle, self._since = length[-1], at[-1], since[-1]
+        return np.nan_to_num(np.abs(angle[:, None] - at) * self._share).max(-1, initial=0.0), since
+
+
 class UnfollowedMove:
     """Watch over one commanded move of the external motor: its joint's encoder must follow, or it is frozen.
 

@@ -10,6 +10,7 @@ costs the frames that it touches: reading goes on at the next tag whose frame ha
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import io
 import json
@@ -141,8 +142,10 @@ class LogWriter:
         self._end += len(data)
 
     def sync(self) -> None:
-        """Wait until the disk has what was written."""
+        """Wait until the disk has what was written. Raises OSError where somebody has deleted the file."""
         os.fdatasync(self._file.fileno())
+        if not os.fstat(self._file.fileno()).st_nlink:
+            raise OSError(errno.ENOENT, "somebody has deleted it")
 
     def close(self) -> None:
         """Close the file."""

@@ -124,7 +124,7 @@ class Watch:
             self._silent[me] = self._silent[me] + passed if signs == self._seen[me] else 0.0
             self._seen[me] = signs
             if self._silent[me] > deadlines.thread_s:
-                return Violation(Trip.HOST, f"s of silence of the {name}", seq, self._silent[me])
+                return Violation(Trip.HOST, f"silence of its {name}", seq, self._silent[me], unit="s")
         if (waited := self.reader.recorder.waiting_s) > deadlines.disk_s:
-            return Violation(Trip.RECORDER, "s that the disk has not answered", seq, waited)
+            return Violation(Trip.RECORDER, "silence of the disk", seq, waited, unit="s")
         return None

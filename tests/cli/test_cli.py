@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from jaxfinger.cli import main
+from jaxfinger.cli import main, tables
 from jaxfinger.cli.app import COMMANDS, SEALED, STAGES
 from jaxfinger.report.numbers import number
 
@@ -180,6 +180,33 @@ def test_show_prints_tables_and_what_to_do_about_a_misfit(folder, capsys):
     out = capsys.readouterr().out
     assert "mass axis" in out
     assert "jaxfinger diagnose" in out
+
+
+@pytest.mark.parametrize(
+    ("size", "unit", "elastic", "damping"),
+    [
+        (1.0, " N mm ", "66.3; -13.0 ± 2.0", "1.20 ± 0.20  N mm s/rad"),
+        (1e4, " N m ", "663; -130 ± 20", "12.0 ± 2.0  N m s/rad"),
+    ],
+)
+def test_torques_are_in_a_unit_that_suits_the_machine(capsys, size, unit, elastic, damping):
+    std = size / 1.96
+    tables._joints(
+        [
+            {
+                "joint": "J",
+                "prismatic": False,
+                "gravity": [1.0 * size, -12.0 * size],
+                "elastic": [66.3 * size, -13.0 * size, 2.0 * std],
+                "friction": [6.0 * size, 6.0 * size, None],
+                "damping": [1.2 * size, 0.2 * std],
+            }
+        ]
+    )
+    out = capsys.readouterr().out
+    assert unit in out
+    assert elastic in out
+    assert damping in out
 
 
 def test_validation_on_the_other_recording(folder, capsys):

@@ -327,16 +327,20 @@ def said_of(session) -> list[str]:
 
 
 @pytest.mark.parametrize("size", [0.1, 1.0, 4.0, 20.0])
-def test_torques_and_excursions_are_large_for_their_machine(session, size):
+def test_torques_excursions_and_tensions_are_large_for_their_machine(session, size):
     """A small arm's springs hold it with more than 5 N m; in N mm the torques of a tiny finger are less."""
     machine = Scale(mass=0.9 * size**3, length=size, time=size**0.5)(session)
     if size == 4.0:  # less than 2 kg, with springs
         machine = raised(machine, "joint_torque", 5.0)
         assert machine.finger.mass.sum() < 2.0
         assert max(np.nanmax(t.joint_torque) for t in machine if t.joint_torque is not None) > 5.0
-    assert not [text for text in said_of(machine) if "too large" in text]
-    for channel, mend in (("joint_torque", "convert N mm to N m"), ("tendon_excursion", "convert mm to m")):
-        said = [text for text in said_of(raised(machine, channel, 1e3)) if "too large" in text]
+    assert not [text for text in said_of(machine) if "too large" in text or "exceeds" in text]
+    for channel, fault, mend in (
+        ("joint_torque", "too large", "convert N mm to N m"),
+        ("tendon_excursion", "too large", "convert mm to m"),
+        ("tendon_force", "exceeds 5000 times the weight", "convert mN to N"),
+    ):
+        said = [text for text in said_of(raised(machine, channel, 1e3)) if fault in text]
         assert said
         assert all(mend in text for text in said)
 

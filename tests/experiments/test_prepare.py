@@ -39,6 +39,16 @@ def stack(*trials: Trial, **options):
     return found
 
 
+def test_the_torque_of_a_joint_that_is_not_moved_does_not_count():
+    """An arm's motors hold the other joints, whose friction at rest has any value: their encoders show noise alone."""
+    moved = sweep()
+    torque = np.where(np.isnan(moved.joint_torque), 3e-3, moved.joint_torque)
+    for experiment in ("ID.3-dynamic", "ID.3-static"):
+        one = stack(replace(moved, joint_torque=torque, experiment=experiment))
+        counts = np.asarray(one.batch.mask["joint_torque"]).any(axis=(1, 2))
+        assert counts.tolist() == [True, False, False]
+
+
 @pytest.mark.parametrize("noise", [1e-7, 1e-5, ENCODER])
 def test_a_joint_that_rests_does_not_slide_before_it_starts(noise):
     """The filter shows a motion before it starts, and where the encoder is quiet that exceeds its noise."""

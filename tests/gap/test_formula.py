@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from jaxfinger.gap.budget import MIN_GAP_EVIDENCE
 from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.columns import Column, Columns
 from jaxfinger.gap.formula import LinearModel, Parameters, unexplained, unlisted
+from jaxfinger.gap.parts import columns_with_gap
 
 ROWS, FEATURES, COLUMNS = 400, 20, 6
 
@@ -66,6 +68,18 @@ def test_signatures_gain_nothing_from_noise(columns, rng):
     found = [model.fit(np.array([k])).score - model.null.score for k in range(len(Z))]
     assert max(found) < 6.0
     assert unexplained(columns.counts, model.null.evidence, Parameters()).sum() == 0.0
+
+
+def test_a_cause_beside_the_smooth_features_shows_a_gap_in_its_column_and_in_no_other(columns, rng):
+    """Friction at reversals acts within a few samples, which no smooth feature describes."""
+    z = np.zeros(ROWS * COLUMNS)
+    z[columns.items[2].rows[::40]] = 1.0
+    model = linear(columns, rng.standard_normal(z.size) + 8.0 * z, 8.0 * z[None])
+    found, p = model.fit(np.array([0])), Parameters()
+    null = model.null.evidence
+    assert unexplained(columns.counts, null, p).max() < MIN_GAP_EVIDENCE
+    assert columns_with_gap(columns.counts, null, found.evidence, p) == {2}
+    assert columns_with_gap(columns.counts, null, null, p) == set()
 
 
 def test_a_noise_that_is_larger_than_believed_is_no_gap(columns, rng):

@@ -62,6 +62,16 @@ SAYS = {
 }
 
 
+def test_a_model_that_misses_by_more_than_the_noise_is_not_said_to_predict_to_within_it():
+    """A gap that nothing smooth and no cause explains, as of noisy accelerations, is named with its size."""
+    nothing = ALL["no_gap"]
+    line = replace(nothing.closures[0], before=9.0 * nothing.closures[0].noise)
+    said = sentences.summary(replace(nothing, closures=(line, *nothing.closures[1:])))
+    assert "within the noise" not in said
+    assert "leaves in both channels that could be judged nothing that a law could explain" in said
+    assert f"larger than the channel's own noise in joint torque of {line.experiment} (9 times)" in said
+
+
 @pytest.mark.parametrize("name", ALL)
 def test_headline_and_summary(name):
     headline, parts = SAYS[name]

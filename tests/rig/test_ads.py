@@ -324,8 +324,8 @@ def test_the_controllers_own_trip_ends_the_trial_with_its_cause(lockstep, record
         monkeypatch.setattr(runner, "tripped", lambda block: False)
     rig = ads_rig(lockstep)
     rig.description = parse_rig(re.sub("limits = .*", "limits_deg = [-90.0, 170.0]", rig.description.text))
-    trial = 'experiment = "VD.3"\nmean = [3.0, 3.0, 11.0, 3.0]\namplitude = 2.0\nposture_deg = [75.0, 20.0, 20.0]'
-    plan = parse_plan(f'[plan]\nname = "into the stop"\n[[trial]]\n{trial}\nseconds = 20.0\n', rig.description)
+    trial = 'experiment = "VD.3"\nmean = [2.0, 2.0, 7.0, 2.0]\namplitude = 3.0\nposture_deg = [75.0, 20.0, 20.0]'
+    plan = parse_plan(f'[plan]\nname = "into the stop"\n[[trial]]\n{trial}\ntension_rate = 5.0\n', rig.description)
     outcome = record(rig, plan=plan)
     assert "01-VD.3: the controller stopped: joint beyond its limits (joint_position MCP = 1.6" in outcome.cause
     with h5py.File(outcome.session) as file:

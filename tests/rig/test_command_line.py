@@ -17,6 +17,7 @@ import pytest
 from jaxfinger.data import read_session
 from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.matrix import END_S, OFF_S, STOP_S
+from jaxfinger.rig.runner import RELEASED
 from jaxfinger.rig.session import log_path
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.examples import rig_toml
@@ -125,7 +126,7 @@ def test_control_c_ends_the_run_with_a_sentence(bench, moment):
     output, sentence = bench / "session.h5", said(errors.decode())
     assert process.returncode == 2
     assert sentence.count("\n") == 1
-    assert f"the run was interrupted; {output} holds what was recorded, go on with --resume" in sentence
+    assert f"the run was interrupted; {RELEASED}; {output} holds what was recorded, go on with --resume" in sentence
     session = read_session(output)
     assert [t.complete for t in session] == ([False] if moment == "trial" else [])
 

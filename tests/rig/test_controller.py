@@ -155,6 +155,17 @@ def test_a_joint_that_holds_tension_is_not_let_go_before_the_tension(cause):
     assert (bench.c.motor, tension[-1] < 1e-3) == (None, True)
 
 
+def test_a_move_in_the_cycle_in_which_the_motor_is_coupled_is_carried_out():
+    bench = Bench()
+    bench.bench()
+    bench.run(300)
+    bench.send(Kind.ARM)
+    bench.bench(mode=(1, 2, 1))
+    assert bench.send(Kind.JOINT, target=[0.6], rate=1.5) == Refusal.NONE
+    bench.run(600)
+    assert bench.c.plant.q[1] == pytest.approx(0.6, abs=1e-6)
+
+
 def test_a_motor_that_moves_a_joint_with_slack_tendons_loses_its_torque_at_once():
     """Of ID.3: it may have caught a hand."""
     bench = coupled(0.0)

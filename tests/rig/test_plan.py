@@ -52,6 +52,17 @@ def steps(text, rig):
         ('experiment = "VD.1"\nseconds = 1e9', 5, "which is outside 0 to 7200 s"),
         ('experiment = "ID.4"\njoint = "MCP"\ntendon = "T3"\ndwell = 1e5', 7, "which is outside 0 to 7200 s"),
         ('experiment = "VD.3"\ninterval = 0.0', 5, "must be above 0"),
+        (
+            'experiment = "ID.3-static"\njoint = "MCP"\nrange_deg = [0.0, 1.2]',
+            6,
+            "spans 1.2°, less than one step of 10°",
+        ),
+        (
+            'experiment = "ID.3-dynamic"\njoint = "MCP"\nspeeds_deg_s = [0.5, 1.0, 1.5]',
+            3,
+            "takes 110 s for one command, longer than 60 s; see the unit of its rate or speed",
+        ),
+        ('experiment = "ID.2"\njoint = "MCP"\ntension_rate = 0.01', 3, "takes 200 s for one command"),
     ],
 )
 def test_a_mistake_names_its_line(rig, text, line, says):

@@ -214,6 +214,27 @@ def test_a_session_that_cannot_be_written_stays_in_its_log(files, rig, monkeypat
     assert all(trial.complete for trial in read_session(files / "s.h5"))
 
 
+def test_ctrl_c_while_the_session_is_written_is_a_sentence(files, monkeypatch):
+    def interrupted(log, output, overwrite):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("jaxfinger.rig.convert.publish", interrupted)
+    with pytest.raises(
+        UserError, match=r"s\.h5: interrupted while it was written; jaxfinger recover .*s\.h5\.wal makes"
+    ):
+        record(files / "plan.toml", rig=files / "rig.toml", output=files / "s.h5", yes=True)
+    assert (files / "s.h5.wal").exists()
+
+
+def test_ctrl_c_of_which_the_run_knows_nothing_is_a_sentence(files, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("jaxfinger.rig.run", interrupted)
+    with pytest.raises(UserError, match="the run was interrupted before its end was seen; see that tension is off"):
+        record(files / "plan.toml", rig=files / "rig.toml", output=files / "s.h5", yes=True)
+
+
 def test_a_bench_cannot_prepare_itself(rig, tmp_path, monkeypatch):
     """--yes is refused before arming on a rig that a person must prepare."""
     machine = SimulatedRig(rig)

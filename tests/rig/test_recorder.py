@@ -101,3 +101,5 @@ def test_a_full_disk_is_a_sentence_and_leaves_no_log(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="MiB are free; a session needs"):
         Recorder(tmp_path / "a.wal", {})
     assert list(tmp_path.iterdir()) == []
+    with pytest.raises(UserError, match="MiB are free; a session needs"):
+        Recorder(tmp_path / "a.wal", {}, resume=True)

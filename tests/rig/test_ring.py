@@ -1,5 +1,6 @@
 """Reading the ring: every sample comes once or is counted as lost; torn records and restarts are noticed."""
 
+import re
 import threading
 import time
 
@@ -345,3 +346,23 @@ def test_a_code_that_the_contract_does_not_know_is_a_sentence(rig, field, says):
     machine.controller.memory[at : at + 4] = np.uint32(77).tobytes()
     with pytest.raises(UserError, match=f"the controller's {says}, which the contract does not define"):
         machine.connect()
+
+
+@pytest.mark.parametrize(
+    ("trip", "value", "says"),
+    [
+        (Trip.POSITION, 100.0, "joint beyond its limits (joint_position MCP = 1.658 rad); see the joint's fixture"),
+        (Trip.VELOCITY, 100.0, "joint velocity above its limit (joint_position MCP = 1.745 rad/s); see the joint's"),
+    ],
+)
+def test_the_controllers_trip_is_told_in_si_units(trip, value, says):
+    """The offset of an encoder belongs to its angle, and not to its speed."""
+    text = re.sub(
+        r'(of = "MCP"\nslot = \d+\nunit = )"rad"\nscale = 1.0\noffset = 0.0',
+        r'\1"deg"\nscale = 1.0\noffset = -5.0',
+        rig_toml(),
+    )
+    machine = SimulatedRig(parse_rig(text))
+    machine.controller._stop(trip, machine.controller.slots.angle[0], value)
+    machine.controller._status()
+    assert machine.status().cause.startswith(says)

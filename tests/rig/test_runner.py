@@ -150,6 +150,32 @@ def test_a_frozen_encoder_under_the_operators_hand(rig, record):
     assert "encoder" in outcome.cause
 
 
+def test_a_frozen_tendon_encoder_while_its_joint_is_moved_by_hand(rig, record):
+    """Its excursion would be wrong in the session. None of the samples since it froze belongs to the trial."""
+    machine = SimulatedRig(rig)
+    outcome = record(
+        machine, lambda m: m.inject("freeze", slot(m, "excursion", "T2"), 300), at=("01-ID.2-DIP", "moved by hand")
+    )
+    assert outcome.cause.startswith("01-ID.2-DIP: a channel is frozen (excursion T2 = ")
+    excursion = read_session(outcome.session)["01-ID.2-DIP"].tendon_excursion[:, 1]
+    assert np.all(np.diff(excursion) != 0)
+
+
+def test_a_log_that_is_deleted_ends_the_run(rig, record, tmp_path, monkeypatch):
+    """What follows would be lost, an hour of it with the same care."""
+    monkeypatch.setattr(recorder, "SYNC_S", 0.0)
+    path = tmp_path / "session.h5"
+
+    def delete(m):
+        wait_until_written(log_path(path), "02-ID.4-T3-MCP")
+        log_path(path).unlink()
+
+    with pytest.raises(
+        UserError, match=r"02-ID.4-T3-MCP: session\.h5\.wal cannot be written: somebody has deleted it; the"
+    ):
+        record(SimulatedRig(rig), delete, output=path)
+
+
 def test_the_operators_stop_key(rig, record):
     class Presses:
         asked = 0
@@ -192,6 +218,37 @@ def test_the_first_signal_is_a_wish_and_the_second_an_exception():
         assert interrupts.requested
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGTERM)
+
+
+def test_ctrl_c_again_and_again_does_not_cut_off_the_look_whether_tension_falls(rig, record):
+    machine = SimulatedRig(rig)
+    release = machine.controller._release
+
+    def press(*_):
+        signal.raise_signal(signal.SIGINT)
+
+    def panic():
+        release()
+        machine.report_alive, machine.beat = press, lambda: None  # from every call that waits
+
+    machine.controller._release = panic
+    outcome = record(machine, press)
+    assert outcome.cause == f"02-ID.4-T3-MCP: the run was interrupted; {RELEASED}"
+    assert machine.controller.off >= 0
+
+
+def test_a_session_that_ends_with_a_user_error_keeps_what_it_recorded(rig, record, tmp_path, monkeypatch):
+    """The error is of a kind that otherwise says that nothing was armed."""
+    abort = Runner.abort
+
+    def fail(runner, error):
+        abort(runner, error)
+        raise UserError("the end of the end has failed")
+
+    monkeypatch.setattr(Runner, "abort", fail)
+    with pytest.raises(UserError, match="the end of the end"):
+        record(SimulatedRig(rig), lambda m: m.inject("nan", slot(m, "external_torque")))
+    assert recover(log_path(tmp_path / "session.h5"), tmp_path / "rescued.h5").trials[0] == "01-ID.2-DIP"
 
 
 def test_a_run_that_nothing_reads_ends_at_once(rig, tmp_path):
@@ -537,7 +594,7 @@ def test_a_controller_that_does_not_release_is_said(rig, record):
     """RELEASE after the last trial and STOP are both ignored. The run says so and asks to switch the drives off."""
     machine = SimulatedRig(rig)
     outcome = record(machine, lambda m: m.controller.strike("deaf"))
-    assert "did not release the finger after the last trial" in outcome.cause
+    assert "the finger was not seen to be released after the last trial" in outcome.cause
     assert "switch the drives off" in outcome.cause
     assert len(outcome.complete) == 2
 
@@ -554,7 +611,7 @@ def test_tension_that_stays_after_the_last_trial_is_said(rig, record, pull):
 
     machine.release = caught
     outcome = record(machine)
-    assert outcome.cause.startswith("the controller did not release the finger after the last trial")
+    assert outcome.cause.startswith("the finger was not seen to be released after the last trial")
     assert TENSION_NOT_SEEN_TO_FALL in outcome.cause
     assert len(outcome.complete) == 2
 

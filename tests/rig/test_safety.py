@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from jaxfinger.rig.backend import Block, CommandRefused, JointMove, TensionRamp
 from jaxfinger.rig.contract import Flag, State, Trip
-from jaxfinger.rig.safety import Supervisor, admit
+from jaxfinger.rig.safety import Supervisor, Violation, admit
 
 
 def first(rig, block: Block):
@@ -308,3 +308,11 @@ def test_a_set_point_beyond_the_limits_is_refused_and_nothing_is_sent(rig, simul
         with pytest.raises(CommandRefused):
             simulated.command(command)
         assert simulated.status().acknowledged == before
+
+
+@pytest.mark.parametrize(
+    "trip", [trip for trip in Trip if trip not in (Trip.NONE, Trip.OPERATOR)], ids=lambda t: t.name
+)
+def test_every_trip_says_what_happened_and_where_to_look(trip):
+    sentence = Violation(trip, "tension T3", 12, 30.0, unit="N").sentence
+    assert sentence.startswith(f"{trip.sentence} (tension T3 = 30 N at sample 12); see ")

@@ -162,6 +162,7 @@ class Controller:
             del self.faults["cut"]
         if "stall" in fault:
             return
+        self._couple()
         self._commands("deaf" in fault)
         self._heartbeat()
         self._ramps()
@@ -192,6 +193,14 @@ class Controller:
         """Return the state, and the numbers of the samples where the fault showed, it tripped, and tension was off."""
         return {"head": self.seq, "state": int(self.state), "trip": int(self.trip), "boot": self.boot,
                 "trip_seq": self.trip_seq, "fault_seq": self.struck, "off_seq": self.off}  # fmt: skip
+
+    def _couple(self) -> None:
+        """Have the external motor hold the joint to which it is coupled, once the drives are on."""
+        if Mode.MOTOR not in self.plant.mode:
+            self.motor = None
+        elif self.motor is None and self.state in (State.ARMED, State.MOVING):
+            self.goal = self.plant.q[self.plant.mode.index(Mode.MOTOR)]
+            self.motor = (self.goal, 0.0, 0.0)
 
     def _commands(self, deaf: bool) -> None:
         """Process a new command. A `deaf` controller acknowledges STOP and RELEASE without obeying."""
@@ -308,11 +317,6 @@ class Controller:
                 self.state = State.ARMED
         elif Mode.MOTOR in self.plant.mode and self.motor is not None:
             self.motor = (self.motor[0], 0.0, 0.0)
-        if Mode.MOTOR in self.plant.mode and self.motor is None and self.state in (State.ARMED, State.MOVING):
-            self.goal = self.plant.q[self.plant.mode.index(Mode.MOTOR)]
-            self.motor = (self.goal, 0.0, 0.0)
-        if Mode.MOTOR not in self.plant.mode:
-            self.motor = None
         lag = DT / (DT + FORCE_LAG)
         self.tension = [f + lag * (s - f) for f, s in zip(self.tension, self.setpoint, strict=True)]
 
