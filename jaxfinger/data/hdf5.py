@@ -26,7 +26,7 @@ from jaxfinger.data.schema import (
     TIME,
     VERSION,
     Entry,
-    units_of,
+    entry_units,
 )
 from jaxfinger.data.session import FingerDescription, Session, Trial
 from jaxfinger.errors import UserError
@@ -190,7 +190,7 @@ def write_dataset(group: h5py.Group, entry: Entry, value, prismatic: Sequence[bo
         entry.name, data=value, compression="gzip" if long else None, compression_opts=1 if long else None, shuffle=long
     )
     if entry.units is not None:
-        item.attrs["units"] = units_of(entry, prismatic)
+        item.attrs["units"] = entry_units(entry, prismatic)
 
 
 def _lossless_single(value: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from jaxfinger.data.mapping import Channels, MappedTrial, MappingFile, read_mapp
 from jaxfinger.data.parse import RANGES, sorted_trials
 from jaxfinger.data.rates import compare_rate
 from jaxfinger.data.recording import Recording
-from jaxfinger.data.schema import CHANNELS, DRIVES, TEMPERATURE, Channel, Entry, units_of
+from jaxfinger.data.schema import CHANNELS, DRIVES, TEMPERATURE, Channel, Entry, entry_units
 from jaxfinger.data.session import FingerDescription, Session, Trial
 from jaxfinger.data.sources import load_recording, refuse_path
 from jaxfinger.data.toml import Place
@@ -180,7 +180,7 @@ def _entry(channel: str) -> Entry:
 def _channel(channel: str, spec: Any, columns: ColumnReader, finger: FingerDescription, where: Place) -> np.ndarray:
     """One channel (N, columns). Columns without a mapping are NaN, or 0 in directions."""
     entry = _entry(channel)
-    units = units_of(entry, finger.prismatic) or "1"
+    units = entry_units(entry, finger.prismatic) or "1"
     if channel == "hold":
         return columns.column(spec, units, True, where)
     whole = entry.kind != "float"

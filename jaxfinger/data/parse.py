@@ -25,7 +25,7 @@ from jaxfinger.data.schema import (
     TIME,
     VERSION,
     Entry,
-    units_of,
+    entry_units,
 )
 from jaxfinger.data.session import EXPERIMENT_NAMES, FingerDescription, Session, Trial
 from jaxfinger.errors import listed
@@ -332,7 +332,7 @@ def _right_shape(value: Any, entry: Entry, place: str, sizes: Mapping[str, int |
 def _check_units(item: h5py.Dataset, entry: Entry, place: str, prismatic: Sequence[bool], report: Report) -> None:
     if entry.units is None:
         return
-    wanted = units_of(entry, prismatic)
+    wanted = entry_units(entry, prismatic)
     units = text_attribute(item, "units", place, report) if "units" in item.attrs else None
     if units is None:
         if entry.kind == "float":

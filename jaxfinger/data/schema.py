@@ -137,6 +137,6 @@ def channel_units(channel: str, prismatic: Sequence[bool]) -> str:
     return units_where(CHANNELS[channel].units or "1", prismatic)
 
 
-def units_of(entry: Entry, prismatic: Sequence[bool]) -> str | None:
+def entry_units(entry: Entry, prismatic: Sequence[bool]) -> str | None:
     """Units of a dataset, translated where every joint is prismatic; None for a dataset without units."""
     return None if entry.units is None else units_where(entry.units, prismatic)
