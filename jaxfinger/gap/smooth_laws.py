@@ -73,8 +73,8 @@ def features(
                 for s in (1.0, direction[i], np.tanh(travelled / (0.1 * length)))
             ]
     for k in taut:
-        if f[k].any():
-            u = f[k] / max(f[k].max(), 1e-9)
+        if f[k].max() > 0.0:
+            u = f[k] / f[k].max()
             out["tension"] += [u, u**2, np.sqrt(np.maximum(u, 0))] + [u * _unit(q[i]) for i in own]
             pulled = since_reversal(_smoothed(f[k])) / (PULL * scales.tension[k])
             out["distance since reversal"] += [np.exp(-np.abs(pulled)) * np.tanh(10.0 * pulled)]
@@ -150,9 +150,11 @@ def _energy(features: Float[np.ndarray, "k n"], r: Float[np.ndarray, " n"]) -> f
 
 
 def _unit(u: Float[np.ndarray, "*B T"]) -> Float[np.ndarray, "*B T"]:
-    """Scale a signal linearly onto [−1, 1]; zero where it is constant."""
+    """Scale a signal linearly onto [−1, 1]; zero where it is constant but for rounding."""
     low, high = float(u.min()), float(u.max())
-    return np.zeros_like(u) if high - low < 1e-9 else np.clip(2 * (u - low) / (high - low) - 1, -1, 1)
+    return (
+        np.zeros_like(u) if high - low <= 1e-9 * max(-low, high) else np.clip(2 * (u - low) / (high - low) - 1, -1, 1)
+    )
 
 
 def _smoothed(u: Float[np.ndarray, "*B T"]) -> Float[np.ndarray, "*B T"]:

@@ -10,6 +10,7 @@ MIN_ROWS = 20  # Rows of a column in a trial. With fewer, single samples decide 
 # Energy above the noise, in standard deviations of white noise's, from which a column of a trial stands out. Residuals
 # are never quite white, and a rest of colour adds up to a few.
 MIN_DEVIATIONS = 5.0
+ROUNDING = 1e-9  # relative: a variable that varies by less is constant
 MIN_REGION_SHARE = 0.5  # A region holds at least half of the gap of its trial and column.
 
 
@@ -66,7 +67,7 @@ def _region(problem: Problem, e, c, column, b, time, energy):
     best = ("time", float(variables["time"][time].min()), float(variables["time"][time].max()), 1.0, 0.0)
     for name, values in variables.items():
         v = values[time]
-        if np.ptp(v) < 1e-9:
+        if np.ptp(v) <= ROUNDING * np.abs(v).max():
             continue
         edges = np.unique(np.quantile(v, np.linspace(0, 1, BINS + 1)))
         if len(edges) < 3:
