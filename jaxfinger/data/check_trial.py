@@ -23,9 +23,9 @@ MAX_OVERTRAVEL = 0.35  # rad, 20 degrees, that a joint may read beyond its limit
 MAX_TARE_ERROR = 0.03
 _MAX_TARE = 0.5  # of the highest tension: a tendon that reads more is pulled on purpose.
 MAX_PUSH = 0.1
-# A tendon's moment arm is smaller than the machine, and joints turn by less than a turn: excursions in mm exceed this
-# share of the machine's reach.
-_MAX_EXCURSION = 5.0
+# Of the machine's reach. A moment arm is about a tenth of it, and a joint turns by less than a turn; degrees for rad
+# make 57 times as much, which the check of moment arms names, and mm for m a thousand times.
+_MAX_EXCURSION = 20.0
 _GRAVITY = 9.81  # m/s², for the weight of machines that are described without gravity, too
 # Of the weight of all links. Strong tendons of a light finger pull with some hundred times; pulls of a finger with 10 N
 # are some ten thousand of it in mN.
