@@ -11,12 +11,11 @@ from jaxfinger.model import (
     Model,
     Motion,
     Terms,
+    changed_torque,
     excursion,
     external_torque,
     fingertip_force,
-    resisting,
     resisting_change,
-    resisting_torque,
     simulated_ahead,
 )
 
@@ -64,8 +63,10 @@ def change(
         y = y if contact is None else jnp.sum(contact * y[None], axis=1)
     else:
         assert terms is not None
-        more = resisting_change(model, x, terms) if same else resisting_torque(model, true) - resisting(terms)
-        y = y0 + (more if contact is None else jnp.sum(contact * more[None], axis=1))
+        if contact is None:
+            y = changed_torque(model, x, terms, y0)
+        else:
+            y = y0 + jnp.sum(contact * resisting_change(model, x, terms)[None], axis=1)
     return effect.reading(channel, true, y) - y0
 
 

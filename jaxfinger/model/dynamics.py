@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxfinger.model import rigid_body
 from jaxfinger.model.finger import Finger
-from jaxfinger.model.joint_torque import drive_torque
+from jaxfinger.model.joint_torque import delivered_torque, drive_torque
 from jaxfinger.model.memory import memories
 from jaxfinger.model.model import Memory, Model, SharedFriction
 from jaxfinger.model.motion import Motion
@@ -122,7 +122,10 @@ def _shared_torque(e: Terms) -> Float[Array, "m *T"]:
 
 def resisting_change(model: Model, x: Motion, nominal: Terms) -> Float[Array, "m *T"]:
     """Change of `resisting_torque` by the effects, N m, computed from the terms that they change."""
-    e = terms(model, x, memories(model, x), nominal)
+    return _resisting_change(terms(model, x, memories(model, x), nominal), x, nominal)
+
+
+def _resisting_change(e: Terms, x: Motion, nominal: Terms) -> Float[Array, "m *T"]:
     change = e.h - nominal.h if e.h is not nominal.h else jnp.zeros_like(nominal.h)
     if e.friction is not nominal.friction or e.direction is not x.joint_direction:
         change += e.direction * e.friction - nominal.direction * nominal.friction
@@ -131,6 +134,16 @@ def resisting_change(model: Model, x: Motion, nominal: Terms) -> Float[Array, "m
     if e.C is not nominal.C or e.f_j is not nominal.f_j:
         change -= jnp.sum(e.C * e.f_j[:, None] - nominal.C * nominal.f_j[:, None], axis=0)
     return change
+
+
+def changed_torque(model: Model, x: Motion, nominal: Terms, tau: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
+    """`external_torque`, N m, with effects that leave the rigid body as it is, from that without effects, `tau`."""
+    e = terms(model, x, memories(model, x), nominal)
+    change = _resisting_change(e, x, nominal)
+    if x.held:
+        return tau + change
+    needed = delivered_torque(tau, nominal.direction, nominal.torque_friction) + change
+    return drive_torque(needed, e.direction, e.torque_friction)
 
 
 def external_torque(

@@ -75,6 +75,13 @@ def drive_torque(
     return needed / (1.0 - mu * direction * jnp.sign(needed))
 
 
+def delivered_torque(
+    tau: Float[Array, "m *T"], direction: Float[Array, "m *T"], mu: Float[Array, "m *#T"]
+) -> Float[Array, "m *T"]:
+    """Torque τ − μ|τ| s, N m, that a drive of torque `tau` delivers: the inverse of `drive_torque`."""
+    return tau - mu * jnp.abs(tau) * direction
+
+
 def _polynomial(coefficients: Float[Array, "m powers"], q: Float[Array, "m *T"]) -> Float[Array, "m *T"]:
     """Evaluate one polynomial for each joint by Horner's rule."""
     columns = coefficients.reshape(*coefficients.shape, *(1,) * (q.ndim - 1))

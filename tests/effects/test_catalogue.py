@@ -12,7 +12,7 @@ import pytest
 
 from jaxfinger.effects import CATALOGUE, CHANGED, NOMINAL_TERMS, Scales, from_dict, load, nominal_terms, to_dict
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import EXPERIMENTS, Batch, affected_channels, predict, refuse_broken
+from jaxfinger.experiments import EXPERIMENTS, Batch, affected_channels, change, predict, refuse_broken
 from jaxfinger.identify.parameters import describe, units_at
 from jaxfinger.model import (
     excursion,
@@ -111,6 +111,21 @@ def test_what_an_effect_leaves_alone_need_not_be_computed_again(name):
         np.testing.assert_allclose(resisting_change(model, x, plain), expected, atol=1e-14)
         np.testing.assert_allclose(external_torque(model, x, nominal=plain), external_torque(model, x), atol=1e-14)
         np.testing.assert_array_equal(excursion(model, x, excursion(MODEL, x)), excursion(model, x))
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_the_change_of_a_torque_is_what_predictions_differ_by(name):
+    """Also where the drives lose a share of their torque."""
+    kind = EVERY[name]
+    effect = plausible(kind, kind.sites(FINGER)[0], kind.shapes(FINGER, kind.sites(FINGER)[0], SCALES)[0])
+    losses = jnp.array([0.1, 0.3, 0.2])
+    before, after = (
+        eqx.tree_at(lambda m: m.joint_torque.torque_friction, m, losses) for m in (MODEL, with_effects(effect))
+    )
+    for x, _ in MOTIONS:
+        y0, y = (predict(m, x, ("joint_torque",))["joint_torque"] for m in (before, after))
+        found = change("joint_torque", effect, before, x, y0, terms_without_effects(before, x), None)
+        np.testing.assert_allclose(found, y - y0, atol=1e-13)
 
 
 def test_where_a_joint_slides_its_effects_have_units_of_lengths_and_forces():
