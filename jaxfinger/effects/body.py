@@ -92,8 +92,8 @@ class DriveInertia(CatalogueEffect):
         return h.at[i].add(self.inertia * x.qdd[i] * x.motorised[i])
 
 
-# Periods in a turn of the joint. Steps grow with the number, since a joint's range is a part of a turn and does not
-# resolve neighbours at short periods; a refit moves between them.
+# Periods in a turn of the joint, or in the range of a sliding one. Steps grow with the number, since a joint's range is
+# a part of a turn and does not resolve neighbours at short periods; a refit moves between them.
 RIPPLES_PER_TURN = (4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 14.0, 16.0, 18.0, 20.0, 24.0, 28.0, 32.0)
 
 
@@ -108,7 +108,7 @@ class TorqueRipple(CatalogueEffect):
 
     A: Float[Array, ""] = amplitude("N m", 0.02, "torque", signed=True)
     B: Float[Array, ""] = amplitude("N m", 0.02, "torque", signed=True)
-    p: Float[Array, ""] = shape("1", RIPPLES_PER_TURN, moves="by differences")
+    p: Float[Array, ""] = shape("1/rad", RIPPLES_PER_TURN, "1/turn", moves="by differences")
 
     def torque(self, x, memory, h):
         i = self.index[0]

@@ -38,6 +38,7 @@ class Scales:
 
     torque: Float[np.ndarray, " m"]  # N m, measured; that of the links' weight where nothing was
     angle: Float[np.ndarray, " m"]  # rad, range of the motion
+    turn: Float[np.ndarray, " m"]  # rad, 1: a turn over 2π; of a prismatic joint its range over 2π
     speed: Float[np.ndarray, " m"]  # rad/s
     acceleration: Float[np.ndarray, " m"]  # rad/s²
     mass: Float[np.ndarray, " m"]  # kg, of the link
@@ -70,6 +71,7 @@ class Scales:
 
         travel = each(m, (_range(r.x.q) for r in recorded))
         angle = _filled(travel, high - low)
+        turn = np.where(finger.prismatic, angle / (2.0 * np.pi), 1.0)
         speed = _filled(each(m, (_size(r.x.qd) for r in recorded)), angle / min(trial, 1.0))
         acceleration = _filled(each(m, (_size(r.x.qdd) for r in recorded)), speed**2 / angle)
         mass = _filled(np.asarray(finger.mass), np.ones(m))
@@ -81,7 +83,7 @@ class Scales:
         excursion = _filled(pulled, np.full(n, 0.1 * length))
         pull = excursion * float(np.max(speed / angle, initial=0.0))
         return cls(
-            torque, angle, speed, acceleration, mass, tension, excursion, pull,
+            torque, angle, turn, speed, acceleration, mass, tension, excursion, pull,
             length, trial, session, finger.joint_names, finger.tendon_names,
         )  # fmt: skip
 
@@ -116,7 +118,7 @@ def refuse_unknown_scale(of: str) -> None:
         raise ValueError(f"{of!r} is no product of scales such as torque/speed; scales are {', '.join(known)}")
 
 
-_OF_JOINTS = ("torque", "angle", "speed", "acceleration", "mass")
+_OF_JOINTS = ("torque", "angle", "turn", "speed", "acceleration", "mass")
 
 
 def _filled(found: np.ndarray, otherwise: np.ndarray) -> np.ndarray:

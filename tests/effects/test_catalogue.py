@@ -141,6 +141,17 @@ def test_where_a_joint_slides_its_effects_have_units_of_lengths_and_forces():
     assert set(units_at(axis, CATALOGUE["gravity_tilt"], ("base",)).values()) == {"rad"}
 
 
+def test_ripple_of_a_sliding_joint_is_looked_for_by_periods_of_its_range():
+    """So that the pitch of a screw is found, whatever the length is measured in."""
+    slides = replace(FINGER, prismatic=(True, False, False))
+    for metre in (1.0, 1e3):
+        limits = ((0.0, 0.25 * metre), *FINGER.limits[1:])
+        scales = Scales.of(replace(slides, limits=limits))
+        p = np.array(CATALOGUE["torque_ripple"].worth_trying(scales, ("MCP",))["p"])
+        assert (p.min(), p.max()) == pytest.approx((4 * 2 * np.pi / (0.25 * metre), 32 * 2 * np.pi / (0.25 * metre)))
+        assert CATALOGUE["torque_ripple"].worth_trying(scales, ("PIP",))["p"][0] == 4.0
+
+
 def test_the_catalogue_is_the_published_one():
     published = """joint_stribeck joint_presliding joint_load_friction elastic_hardening elastic_relaxation joint_stop
         passive_tendon tendon_stretch tendon_creep tendon_backlash moment_arm_coupling moment_arm_bowstring
@@ -292,7 +303,8 @@ def test_the_same_machine_in_other_units_has_the_same_catalogue():
     ones = jax.tree.map(jnp.ones_like, torques)
     before, after = Scales.of(FINGER, [Batch(x, y, ones)]), Scales.of(finger, [Batch(other, torques, ones)])
     exponents = {
-        "torque": {"torque": 1}, "angle": {}, "speed": {"time": -1}, "acceleration": {"time": -2}, "mass": {"mass": 1},
+        "torque": {"torque": 1}, "angle": {}, "turn": {}, "mass": {"mass": 1},
+        "speed": {"time": -1}, "acceleration": {"time": -2},
         "tension": {"torque": 1, "length": -1}, "excursion": {"length": 1}, "pull": {"length": 1, "time": -1},
         "length": {"length": 1}, "trial": {"time": 1}, "session": {"time": 1},
     }  # fmt: skip
