@@ -146,8 +146,10 @@ class Runner:
             seq = reader.violation.since if reader.violation is not None else reader.latest_seq + 1
         if not (tripped(reader.latest) or isinstance(error, ControllerStopped)):
             reader.stop(Violation.of_host(trip, reader.latest_seq, cause))
+        heard = reader.latest_seq
         self._let_pass(AFTER_TRIP_S, self._released)  # A busy host first has to read the samples before the stop.
-        self._let_pass(AFTER_TRIP_S)
+        if self._released() or reader.latest_seq > heard:  # Of a silent reader nothing more is to be expected.
+            self._let_pass(AFTER_TRIP_S)
         if reader.recording:
             reader.end({"complete": False, "cause": cause, "trip": int(trip), "seq": seq})
         if reader.latest is None:
