@@ -16,8 +16,8 @@ from pathlib import Path
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 M_ARENA_MAX = -8  # glibc's malloc.h: the option that bounds the number of heaps
-# Collections of young objects for each one of all objects. Python's 10 would search the million objects of JAX's
-# modules and programs several times in a command, and find next to nothing to free.
+# Collections of young objects before one of all objects. With Python's 10 a quick diagnosis spends a second in
+# searching the million objects of JAX's modules and programs, and finds next to nothing to free.
 FULL_COLLECTIONS = 100
 
 

@@ -89,7 +89,7 @@ class CatalogueEffect(Effect):
     # Multiples of the plausible size at which the signature is computed. An effect that decides whether a held tendon
     # slips is not linear in its size, and has several.
     SIZES: ClassVar[tuple[float, ...]] = (1.0,)
-    OF_SPRING: ClassVar[bool] = False  # whether it is what the spring of a joint does; a joint without one has it not
+    OF_SPRING: ClassVar[bool] = False  # whether a joint without a spring cannot have the effect
 
     site: Site = eqx.field(static=True)
     index: Int[Array, " k"]

@@ -30,8 +30,8 @@ NONE_VALID = "nowhere do a joint and its tendons slide for long enough that the 
 MIN_SPEED_SHARE = 0.05  # of the motion's speed, for a joint that tendons drive and that may stick and slip
 MIN_SPEED_TO_NOISE = 3.0  # two standard deviations, for a joint that a motor moves; the share above where that is less
 MIN_TENDON_SPEED_TO_NOISE = 2.5  # 1.7 standard deviations, for a tendon, and half of that in the quicker filter
+MIN_REST = 1.5  # times how long a reversal looks like a rest (`rests`): half as long again, since accelerations change
 # A slip between two stops is shorter than the slow filter, which then loses speed against the quick one.
-MIN_REST = 1.5  # times what a reversal looks like a rest for: accelerations change meanwhile
 MAX_LOST_SPEED_SHARE = 0.5  # of a joint's speed that the slow filter may lose; stick and slip lose 1 to 3 times it
 MIN_SLIP_TO_NOISE = 15.0  # ten standard deviations: a smaller loss is not a slip
 ROUNDING_SHARE = 1e-6  # of the motion's speed: a loss by rounding, of a joint at rest in a simulated file

@@ -122,7 +122,8 @@ def _despiked(trial: Trial) -> Trial:
 def _measured(experiment: Experiment, trial: Trial, finger: FingerDescription, minus: Predictions | None, longest: int):
     """Channels to be predicted, with spikes bridged, and whether each sample is measured and not a spike.
 
-    Of slack tendons' trials that name a joint no other joint's torque counts: at rest its friction has any value.
+    Where tendons are slack and the trial names a joint, the torque of no other joint counts: friction at rest has any
+    value.
     """
     N = len(trial.time)
     width = {"tendon_excursion": finger.n, "joint_torque": finger.m, "fingertip_force": 3}

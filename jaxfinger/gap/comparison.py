@@ -18,7 +18,7 @@ from jaxfinger.experiments import EXPERIMENTS
 # E of predictions that may hold a mistake. Parameters that are off by half miss a quarter of the motion.
 MIN_MISSED = 0.5
 # Motion over the noise between samples, as mean squares. White noise has 1; a column that moves has far more.
-MIN_MOTION = 10.0
+MIN_MOTION_TO_NOISE = 10.0
 # Share of the measured rms. Predictions that move less are constant but for rounding.
 MAX_STILL = 1e-6
 
@@ -108,6 +108,6 @@ def compare(
         p = np.where(there, predicted[rows], 0.0)
         y, p = y - y.mean(), p - p.mean(axis=0)
         square = float(y @ y)
-        samples[j], moves[j] = len(y), square > MIN_MOTION * 0.5 * float(np.sum(np.diff(y) ** 2))
+        samples[j], moves[j] = len(y), square > MIN_MOTION_TO_NOISE * 0.5 * float(np.sum(np.diff(y) ** 2))
         moved[j], told[j], cross[j] = np.where(there, square, 0.0), np.sum(p**2, axis=0), y @ p
     return Comparison(channel, (trial,), samples, moved, told, cross, moves)

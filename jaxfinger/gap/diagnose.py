@@ -143,9 +143,9 @@ def diagnose(
     search, state = search_for_causes(problem, catalogue, progress)
     baseline, table, found = search.baseline, search.table, posterior(search, state)
     sized = partial(relevance_of, problem, baseline.columns, tolerance=tolerance)
-    nothing, counts = baseline.null.linear_fit.evidence, baseline.columns.counts
-    gaps = partial(columns_with_gap, counts, nothing, p=baseline.parameters)
-    verdict = _verdict(problem, found, sized(gaps(nothing)))
+    null = baseline.null.linear_fit.evidence
+    gaps = partial(columns_with_gap, baseline.columns.counts, null, p=baseline.parameters)
+    verdict = _verdict(problem, found, sized(gaps(null)))
     nominal = nominal_fit(problem)
     chosen = baseline.null
     if verdict.status in (Status.PARTLY, Status.AMBIGUOUS):

@@ -103,31 +103,19 @@ def log_likelihood(
     o: Float[np.ndarray, "*n C"],
     explained: Float[np.ndarray, "*n C"],
     p: Parameters,
-) -> tuple[Float[np.ndarray, " *n"], Weights]:
-    """Log likelihood (L) of what n sets leave, and the weights of the next least squares."""
-    by_column, weights = _log_likelihoods(counts, e, o, explained, p)
-    return np.asarray(np.sum(by_column, axis=-1)), weights
-
-
-def likelihood_gain(counts: Counts, null: Evidence, now: Evidence, p: Parameters) -> Float[np.ndarray, " C"]:
-    """Log likelihood in every column that a set gains over `null`, nats."""
-    a, b = (_log_likelihoods(counts, x.e, x.o, x.explained, p)[0] for x in (null, now))
-    return b - a
-
-
-def _log_likelihoods(
-    counts: Counts,
-    e: Float[np.ndarray, "*n C"],
-    o: Float[np.ndarray, "*n C"],
-    explained: Float[np.ndarray, "*n C"],
-    p: Parameters,
 ) -> tuple[Float[np.ndarray, "*n C"], Weights]:
-    """Log likelihood (L) of every column, and the weights of the next least squares."""
+    """Terms of the log likelihood (L), one for each column, and the weights of the next least squares, of n sets."""
     K, nu = counts.K, p.outside_samples
     v = np.maximum(e / K, _variance_floor(counts, o, explained, p))
     excess = np.maximum(o - counts.outside, 0.0) / nu
     value = -0.5 * (K * np.log(v) + e / v + nu * np.log1p(excess))
     return value, Weights(1.0 / v, 1.0 / (1.0 + excess))
+
+
+def likelihood_gain(counts: Counts, null: Evidence, now: Evidence, p: Parameters) -> Float[np.ndarray, " C"]:
+    """Log likelihood in every column that a set gains over `null`, nats."""
+    before, after = (log_likelihood(counts, x.e, x.o, x.explained, p)[0] for x in (null, now))
+    return after - before
 
 
 def _variance_floor(
@@ -246,8 +234,8 @@ class LinearModel:
             e = self.columns.sums(b**2)
             o = np.maximum(np.einsum("i,cij,j->c", u, T, u) - e, 0.0)
             explained = self.columns.sums((b - self.null.b) ** 2) if self.null else np.zeros_like(e)
-            log_l, weights = log_likelihood(self.columns.counts, e, o, explained, self.parameters)
-        log_l = float(log_l) - 0.5 * float(u[:k] @ self.prior @ u[:k])
+            by_column, weights = log_likelihood(self.columns.counts, e, o, explained, self.parameters)
+        log_l = float(by_column.sum()) - 0.5 * float(u[:k] @ self.prior @ u[:k])
         H, a = self._weighted(weights, B, B, T) + prior, sizes - u[k:]
         occam = 0.5 * _log_det_refitted(H, k) + 0.5 * float(a @ a) if n else 0.0
         return LinearFit(Evidence(e, o, explained, log_l - occam), log_l, -u[k:], u, b, weights)
@@ -366,8 +354,8 @@ class LinearModel:
         along = self.XZ.along(u) @ a - np.einsum("i,cij->cj", u, self.XX) @ q
         norms = own.T - 2.0 * self.XZ.bilinear(q, a) + np.stack([np.sum(q * (T @ q), axis=0) for T in self.XX])
         o = np.maximum(now.evidence.e + now.evidence.o - 2.0 * along.T + norms.T - e, 0.0)
-        log_l, _ = log_likelihood(self.columns.counts, e, o, explained, self.parameters)
-        score = log_l - now.log_l - occam
+        by_column, _ = log_likelihood(self.columns.counts, e, o, explained, self.parameters)
+        score = by_column.sum(axis=-1) - now.log_l - occam
         return [
             Evidence(e[n], o[n], explained[n], float(score[n])) if np.any(one) else None
             for n, one in enumerate(amplitudes)

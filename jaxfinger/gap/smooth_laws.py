@@ -152,9 +152,9 @@ def _energy(features: Float[np.ndarray, "k n"], r: Float[np.ndarray, " n"]) -> f
 def _unit(u: Float[np.ndarray, "*B T"]) -> Float[np.ndarray, "*B T"]:
     """Scale a signal linearly onto [−1, 1]; zero where it is constant but for rounding."""
     low, high = float(u.min()), float(u.max())
-    return (
-        np.zeros_like(u) if high - low <= 1e-9 * max(-low, high) else np.clip(2 * (u - low) / (high - low) - 1, -1, 1)
-    )
+    if high - low <= 1e-9 * max(-low, high):
+        return np.zeros_like(u)
+    return np.clip(2 * (u - low) / (high - low) - 1, -1, 1)
 
 
 def _smoothed(u: Float[np.ndarray, "*B T"]) -> Float[np.ndarray, "*B T"]:

@@ -17,7 +17,6 @@ from jaxfinger.model.dynamics import (  # noqa: E402
     fingertip_force,
     joint_tension,
     resisting_change,
-    resisting_torque,
     terms_without_effects,
 )
 from jaxfinger.model.finger import Finger  # noqa: E402
@@ -49,7 +48,6 @@ __all__ = [
     "joint_tension",
     "memories",
     "resisting_change",
-    "resisting_torque",
     "simulate",
     "simulated_ahead",
     "simulated_from",

@@ -99,11 +99,6 @@ def terms_without_effects(model: Model, x: Motion) -> Terms:
     return terms(model, x, ())
 
 
-def resisting_torque(model: Model, x: Motion, nominal: Terms | None = None) -> Float[Array, "m *T"]:
-    """h − Cᵀ(f_t − f_f), N m: (1) without the rigid body and external forces."""
-    return resisting(terms(model, x, memories(model, x), nominal))
-
-
 def resisting(e: Terms) -> Float[Array, "m *T"]:
     """h − Cᵀ(f_t − f_f), N m, from the terms `e`."""
     return _h(e) - jnp.sum(e.C * e.f_j[:, None], axis=0)
@@ -121,7 +116,7 @@ def _shared_torque(e: Terms) -> Float[Array, "m *T"]:
 
 
 def resisting_change(model: Model, x: Motion, nominal: Terms) -> Float[Array, "m *T"]:
-    """Change of `resisting_torque` by the effects, N m, computed from the terms that they change."""
+    """Change of `resisting` by the effects, N m, computed from the terms that they change."""
     return _resisting_change(terms(model, x, memories(model, x), nominal), x, nominal)
 
 
