@@ -1,13 +1,15 @@
 """Calibration of the intervals: bias, coverage and spread of staged and joint fits over simulated sessions.
 
-    python benchmarks/coverage.py [--sessions 200] [--joints 1|3] [--joint]
+    python benchmarks/coverage.py [--sessions 200] [--joints 1|3] [--joint] [--no-repeats]
 
-Every session has new noise, new offsets and new errors of CAD. `z` is (estimate − truth) over the stated standard
-deviation. Coverage is the share of |z| < 1.96. Spread is the standard deviation of the estimates over the mean of the
-stated ones, which is the Cramér–Rao bound of the stage if the noise model is right.
+Every session has new noise, new offsets and new errors of CAD. With `--no-repeats` its trials do not say which of them
+repeat one motion, so that the noise of moved joints is estimated from residuals. `z` is (estimate − truth) over the
+stated standard deviation. Coverage is the share of |z| < 1.96. Spread is the standard deviation of the estimates over
+the mean of the stated ones, which is the Cramér–Rao bound of the stage if the noise model is right.
 """
 
 import argparse
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,7 +26,7 @@ from jaxfinger.synthetic import (
 )
 
 
-def study(sessions: int, joints: int = 1, joint: bool = False):
+def study(sessions: int, joints: int = 1, joint: bool = False, repeats: bool = True):
     """Values of z (sessions, p), ratios of spread to stated standard deviation (p,), and names of the parameters.
 
     The sessions are seeded and of one polynomial specimen.
@@ -37,6 +39,8 @@ def study(sessions: int, joints: int = 1, joint: bool = False):
     z, spread, stated = [], [], []
     for seed in range(sessions):
         session = measure(clean, seed)
+        if not repeats:
+            session = replace(session, trials={t.name: replace(t, motion=None) for t in session})
         fit = identify(session)
         fit = refine(session, fit) if joint else fit
         free, values = fit.estimated, np.asarray(ravel(fit.model))
@@ -53,8 +57,9 @@ def main() -> None:
     parser.add_argument("--sessions", type=int, default=200)
     parser.add_argument("--joints", type=int, default=1, choices=(1, 3))
     parser.add_argument("--joint", action="store_true", help="refine jointly after the stages")
+    parser.add_argument("--no-repeats", action="store_true", help="no trial says that it repeats a motion")
     options = parser.parse_args()
-    z, ratio, names = study(options.sessions, options.joints, options.joint)
+    z, ratio, names = study(options.sessions, options.joints, options.joint, not options.no_repeats)
     print(f"{'parameter':34} {'bias in σ':>10} {'coverage':>9} {'spread/σ':>9}")
     for k, name in enumerate(names):
         print(f"{name:34} {z[:, k].mean():10.2f} {np.mean(np.abs(z[:, k]) < 1.96):9.3f} {ratio[k]:9.2f}")

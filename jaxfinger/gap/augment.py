@@ -18,10 +18,11 @@ from jaxfinger.gap.projector import Projector
 from jaxfinger.gap.result import Value
 from jaxfinger.gap.signatures import Signatures
 from jaxfinger.identify import Fit
-from jaxfinger.identify.cluster_robust import growth, stretch_scores
+from jaxfinger.identify.cluster_robust import stretch_scores
 from jaxfinger.identify.fit import StageReport
 from jaxfinger.identify.parameters import describe, ravel, units_at
 from jaxfinger.identify.prior import Prior
+from jaxfinger.identify.propagate import laplace
 from jaxfinger.identify.solve import Solution, Source, residuals_each, solve, white_tangents
 from jaxfinger.model import Model
 
@@ -204,11 +205,7 @@ def _covariance(
     if chosen is not None:
         project = Projector(problem, chosen.columns, chosen.linear_fit.weights)
         r, J = project.weighted(r[None])[0], project.weighted(J.T).T
-    information = J.T @ J + root.T @ root
-    diagonal = np.diag(information)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-13, hermitian=True) * np.outer(scale, scale)
-    grow = growth(inverse, stretch_scores(r, J, problem.stretch_of_row), root)
+    inverse, _, grow = laplace(J.T @ J, root, stretch_scores(r, J, problem.stretch_of_row))
     return inverse * np.outer(grow, grow)
 
 

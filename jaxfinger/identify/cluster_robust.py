@@ -7,7 +7,8 @@ With the score g_b = J_bᵀ r_b of stretch b,
     V = (JᵀJ)⁻¹ (Σ_b g_b g_bᵀ) (JᵀJ)⁻¹
 
 is the covariance of the estimate over other recordings of similar motions, however residuals are correlated within a
-stretch. V replaces Laplace's covariance where it is larger by more than chance explains.
+stretch. V of a single parameter replaces Laplace's variance where it is larger by more than chance explains. The ratio
+of both, pooled over all parameters, is known better: `dispersion`.
 """
 
 import numpy as np
@@ -34,6 +35,25 @@ def stretch_scores(
     return np.add.reduceat((J * r[:, None])[order], first) if order.size else np.zeros((0, J.shape[1]))
 
 
+def dispersion(
+    covariance: Float[np.ndarray, "p p"], g: Float[np.ndarray, "b p"], information: Float[np.ndarray, "p p"]
+) -> float:
+    """Scatter of the scores over that which the noise explains: Σ_b g_bᵀ C g_b / tr(C JᵀJ), about 1 where it is white.
+
+    `covariance` is C, Laplace's with the prior; `information` is JᵀJ. It is the dispersion of quasi-likelihood
+    (Wedderburn 1974) with a stretch as its unit. Noise that was estimated from residuals lacks its slow part, which the
+    scores of whole stretches show.
+    """
+    explained = float(np.sum(covariance * information))
+    return float(np.sum((_unbiased(g) @ covariance) * _unbiased(g))) / explained if explained > 0 else 1.0
+
+
+def _unbiased(g: Float[np.ndarray, "b p"]) -> Float[np.ndarray, "b p"]:
+    """Scores scaled for their sum, which is zero at the optimum: by √(b/(b − 1)) of the b stretches that count."""
+    seen = np.count_nonzero(g, axis=0)
+    return g * np.sqrt(seen / np.maximum(seen - 1.0, 1.0))
+
+
 def growth(
     covariance: Float[np.ndarray, "p p"], g: Float[np.ndarray, "b p"], root: Float[np.ndarray, "k p"]
 ) -> Float[np.ndarray, " p"]:
@@ -41,8 +61,7 @@ def growth(
 
     `root` holds the prior's rows. They enter with unit variance, since no residuals tell their scatter.
     """
-    seen = np.count_nonzero(g, axis=0)
-    sides = (g * np.sqrt(seen / np.maximum(seen - 1.0, 1.0))) @ covariance
+    sides = _unbiased(g) @ covariance
     squares, fourth = np.sum(sides**2, axis=0), np.sum(sides**4, axis=0)
     laplace = np.diag(covariance)
     ratio = (squares + np.sum((root @ covariance) ** 2, axis=0)) / np.where(laplace > 0, laplace, np.inf)

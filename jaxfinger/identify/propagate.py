@@ -5,14 +5,14 @@ parameters, and Σ_OO their covariance,
 
     K = (J_Fᵀ J_F + Λ)⁻¹ J_Fᵀ J_O,   Σ_FF = G (J_Fᵀ J_F + Λ)⁻¹ G + K Σ_OO Kᵀ,   Σ_FO = −K Σ_OO.
 
-Where residuals are larger than the noise, J_F and J_O are taken over √χ². G is diagonal: the factors of
-`cluster_robust.growth`.
+Where residuals or the scores of stretches scatter more than the noise explains, J_F and J_O are taken over the square
+root of that ratio. G is diagonal: the factors of `cluster_robust.growth`.
 """
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfinger.identify.cluster_robust import growth, stretch_scores, stretches
+from jaxfinger.identify.cluster_robust import dispersion, growth, stretch_scores, stretches
 from jaxfinger.identify.linearise import Linearised
 from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.solve import Solution, Source, stacked, with_all_slopes
@@ -28,17 +28,28 @@ MIN_DEPENDENCE = 1e-6
 
 
 def laplace(
-    information: Float[np.ndarray, "p p"], root: Float[np.ndarray, "k p"], scores: Float[np.ndarray, "b p"]
-) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-    """Pseudo-inverse of JᵀJ + Λ, and the factor on each standard deviation (`cluster_robust.growth`).
+    information: Float[np.ndarray, "p p"],
+    root: Float[np.ndarray, "k p"],
+    scores: Float[np.ndarray, "b p"],
+    chi2_per_row: float = 1.0,
+) -> tuple[Float[np.ndarray, "p p"], float, Float[np.ndarray, " p"]]:
+    """Pseudo-inverse of JᵀJ/β + Λ, the ratio β, and the factor on each standard deviation (`cluster_robust.growth`).
 
-    `information` is JᵀJ, `root` a square root of Λ, `scores` those of the stretches.
+    `information` is JᵀJ, `root` a square root of Λ, `scores` those of the stretches. β is the largest of 1, χ² per row
+    (Birge's ratio, the square of the scale factor S of the Particle Data Group; Review of Particle Physics, §5.2.2) and
+    `cluster_robust.dispersion`.
     """
+    beta = max(1.0, chi2_per_row, dispersion(_inverse(information, root), scores, information))
+    inverse = _inverse(information / beta, root)
+    return inverse, beta, growth(inverse, scores / beta, root)
+
+
+def _inverse(information: Float[np.ndarray, "p p"], root: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "p p"]:
+    """Pseudo-inverse of JᵀJ + Λ, of the matrix scaled to a unit diagonal."""
     N = information + root.T @ root
     diagonal = np.diag(N)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    inverse = np.linalg.pinv(N * np.outer(scale, scale), rcond=1e-14, hermitian=True) * np.outer(scale, scale)
-    return inverse, growth(inverse, scores, root)
+    return np.linalg.pinv(N * np.outer(scale, scale), rcond=1e-14, hermitian=True) * np.outer(scale, scale)
 
 
 def propagate(
@@ -53,21 +64,20 @@ def propagate(
     """Covariance of the flat vector after a stage whose optimum is `model`, by the module's equation.
 
     The variance of a free parameter is infinite where trials and prior do not determine it, or where its estimate
-    depends on another parameter of infinite variance. Residuals larger than the noise show that the model is wrong.
-    Intervals then widen by Birge's ratio (the scale factor S of the Particle Data Group; Review of Particle Physics,
-    §5.2.2). They widen further where the scores of successive stretches vary more than that explains
-    (`cluster_robust`).
+    depends on another parameter of infinite variance. Intervals widen as `laplace` says where residuals are larger than
+    the noise, or keep their sign for longer.
     """
-    birge = max(1.0, solution.chi2_per_row(free.size))
     linearised = with_all_slopes(solution.linearised, model, free, sources, huber)
     factor = stacked(linearised, sources, len(covariance))[:, :-1]
-    information = factor.T @ factor / birge
+    information = factor.T @ factor
     variance = np.diag(covariance)
     others = np.setdiff1d(np.flatnonzero((variance > 0) & np.isfinite(variance)), free)
     unknown = np.setdiff1d(np.flatnonzero(np.isinf(variance)), free)
     root = np.zeros((0, free.size)) if prior is None else prior.root
-    scores = _scores(linearised, sources, len(covariance), huber or np.inf)[:, free] / birge
-    inverse, grow = laplace(information[np.ix_(free, free)], root, scores)
+    scores = _scores(linearised, sources, len(covariance), huber or np.inf)[:, free]
+    chi2 = solution.chi2_per_row(free.size)
+    inverse, beta, grow = laplace(information[np.ix_(free, free)], root, scores, chi2)
+    information = information / beta
     out = covariance.copy()
     out[free, :] = out[:, free] = 0.0
     cross = inverse @ information[np.ix_(free, others)]
