@@ -15,7 +15,7 @@ from jaxfinger.table import Table
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-# Share of the longest travel among the joints: a joint that travels less is held. A fixture yields a little, and a
+# Share of the longest travel among the joints, each over its range: a joint that travels less is held. A fixture yields a little, and a
 # joint that is moved goes through much of its range.
 _MIN_TRAVEL_SHARE = 0.1
 EXPERIMENT_NAMES = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4", "VD.1", "VD.2", "VD.3")
@@ -204,15 +204,21 @@ class Session:
 
 
 def joints_of(trial: Trial, finger: FingerDescription) -> tuple[str, ...]:
-    """Joints that a trial of ID.2, ID.3 or ID.4 moves or instruments; empty for VD.1, VD.2 and VD.3."""
+    """Joints that a trial of ID.2, ID.3 or ID.4 moves or instruments; empty for VD.1, VD.2 and VD.3.
+
+    A trial of ID.2 or ID.3 that names no joint moves those that travel (`moving_joints`), in ID.3 of those whose torque
+    is measured.
+    """
     if not trial.experiment.startswith("ID."):
         return ()
-    if trial.joint is not None or trial.experiment != "ID.2" or not len(trial.time):
-        return trial.motorised(finger)
-    return moving_joints(trial, finger)
+    instrumented = trial.motorised(finger)
+    if trial.joint is not None or trial.experiment == "ID.4" or not len(trial.time):
+        return instrumented
+    moving = moving_joints(trial, finger)
+    return moving if trial.experiment == "ID.2" else tuple(name for name in moving if name in instrumented)
 
 
 def moving_joints(trial: Trial, finger: FingerDescription) -> tuple[str, ...]:
-    """Joints whose travel is more than a tenth of the longest travel among the joints."""
-    span = np.array([np.ptp(column) for column in np.nan_to_num(trial.q).T])
+    """Joints whose travel, as a share of their range, is more than a tenth of the largest among the joints."""
+    span = np.ptp(np.nan_to_num(trial.q), axis=0) / np.maximum(np.ptp(finger.limits, axis=1), 1e-300)
     return tuple(name for name, s in zip(finger.joint_names, span, strict=True) if s > _MIN_TRAVEL_SHARE * span.max())

@@ -122,8 +122,7 @@ def _despiked(trial: Trial) -> Trial:
 def _measured(experiment: Experiment, trial: Trial, finger: FingerDescription, minus: Predictions | None, longest: int):
     """Channels to be predicted, with spikes bridged, and whether each sample is measured and not a spike.
 
-    Where tendons are slack and the trial names a joint, the torque of no other joint counts: friction at rest has any
-    value.
+    Where tendons are slack, the torque of no joint counts that the trial does not move: friction at rest has any value.
     """
     N = len(trial.time)
     width = {"tendon_excursion": finger.n, "joint_torque": finger.m, "fingertip_force": 3}
@@ -138,7 +137,7 @@ def _measured(experiment: Experiment, trial: Trial, finger: FingerDescription, m
             values = values - predicted_at(minus.get(trial.name, {}), c, trial, values.shape)
         measured = np.isfinite(values).all(axis=0)
         if c == "joint_torque" and experiment.slack:
-            measured &= np.isin(finger.joint_names, trial.motorised(finger))
+            measured &= np.isin(finger.joint_names, joints_of(trial, finger))
         counts = np.zeros(values.shape, bool)
         if measured.any():
             spikes = outlier_mask(values[:, measured], longest=longest)

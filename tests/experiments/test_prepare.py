@@ -1,7 +1,7 @@
 """Reduction of recordings: directions, valid samples and averages."""
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -40,11 +40,12 @@ def stack(*trials: Trial, **options):
 
 
 def test_the_torque_of_a_joint_that_is_not_moved_does_not_count():
-    """An arm's motors hold the other joints, whose friction at rest has any value: their encoders show noise alone."""
+    """An arm's motors hold the other joints, which yield a little to the load: their friction at rest has any value."""
     moved = sweep()
+    moved.q[:, 1] += 2e-3 * np.cos(2 * np.pi * moved.time / CYCLE)
     torque = np.where(np.isnan(moved.joint_torque), 3e-3, moved.joint_torque)
-    for experiment in ("ID.3-dynamic", "ID.3-static"):
-        one = stack(replace(moved, joint_torque=torque, experiment=experiment))
+    for experiment, named in product(("ID.3-dynamic", "ID.3-static"), (MCP, None)):
+        one = stack(replace(moved, joint_torque=torque, experiment=experiment, joint=named))
         counts = np.asarray(one.batch.mask["joint_torque"]).any(axis=(1, 2))
         assert counts.tolist() == [True, False, False]
 
