@@ -15,8 +15,8 @@ from jaxfinger.table import Table
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-# Share of the longest travel among the joints, each over its range: a joint that travels less is held. A fixture yields a little, and a
-# joint that is moved goes through much of its range.
+# Share of the longest travel among the joints, each over its range: a joint that travels less is held. A fixture yields
+# a little, and a joint that is moved goes through much of its range.
 _MIN_TRAVEL_SHARE = 0.1
 EXPERIMENT_NAMES = ("ID.2", "ID.3-static", "ID.3-dynamic", "ID.4", "VD.1", "VD.2", "VD.3")
 
