@@ -31,7 +31,7 @@ import scipy.io
 
 from jaxfinger.cli import main as main_of_jaxfinger
 from jaxfinger.data import Session, Trial, check_file, read_session, write_session
-from jaxfinger.data.check import check_samples, check_session
+from jaxfinger.data.checks.session import check_samples, check_session
 from jaxfinger.data.findings import Report
 
 ROOT = Path(__file__).parents[1]

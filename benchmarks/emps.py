@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxfinger.data import Session, read_session
-from jaxfinger.data.importers import import_file
+from jaxfinger.data.importing.by_mapping import import_file
 from jaxfinger.gap import diagnose
 from jaxfinger.gap.columns import Columns
 from jaxfinger.gap.formula import Weights

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import jaxfinger as jf
-from jaxfinger.data.importers import import_file
+from jaxfinger.data.importing.by_mapping import import_file
 from jaxfinger.identify.stages import identify
 from jaxfinger.table import Table
 

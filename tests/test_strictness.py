@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float, TypeCheckError, jaxtyped
 
-from jaxfinger.data.filtering import low_pass
+from jaxfinger.data.signals.filtering import low_pass
 from tests.checks import checked
 
 

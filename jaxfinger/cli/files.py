@@ -15,7 +15,7 @@ from jaxfinger.errors import UserError, counted
 from jaxfinger.progress import Step
 
 if TYPE_CHECKING:
-    from jaxfinger.data.recording import Recording
+    from jaxfinger.data.importing.recording import Recording
 
 
 def check(file: Path, *, json: bool = False) -> None:
@@ -28,8 +28,8 @@ def check(file: Path, *, json: bool = False) -> None:
     json
         Print the findings as JSON.
     """
-    from jaxfinger.data.check import read_and_check_all
     from jaxfinger.data.findings import merged
+    from jaxfinger.data.hdf5 import read_and_check_all
     from jaxfinger.data.mounting import mounting_in_words
 
     with progress("check") as say:
@@ -54,7 +54,7 @@ def check(file: Path, *, json: bool = False) -> None:
 
 def _as_dict(recording: Recording, among: Sequence[Recording]) -> dict:
     """Survey of a recording, one of several of one rig, for JSON."""
-    from jaxfinger.data.look import clocks_of, columns_of
+    from jaxfinger.data.importing.look import clocks_of, columns_of
 
     seen = columns_of(recording, among)
     return {
@@ -81,8 +81,8 @@ def look(*recordings: Path, finger: Path | None = None, json: bool = False) -> N
     if not recordings:
         raise UserError("no recording was given; name at least one")
     from jaxfinger.data.finger_file import finger_from
-    from jaxfinger.data.look import clocks_of, columns_of, proposal
-    from jaxfinger.data.sources import load_recording
+    from jaxfinger.data.importing.look import clocks_of, columns_of, proposal
+    from jaxfinger.data.importing.sources import load_recording
     from jaxfinger.data.toml import Place
 
     described = finger_from(str(finger.resolve()), Place(str(finger))) if finger is not None else None
@@ -195,7 +195,7 @@ def import_(
         raise UserError(f"{mapping}: no recording was given; name at least one before --mapping")
     refuse_output(output, overwrite, mapping, *sources)
     from jaxfinger.data.findings import Report
-    from jaxfinger.data.importers import import_file
+    from jaxfinger.data.importing.by_mapping import import_file
     from jaxfinger.data.mounting import mounting_in_words
 
     report = Report()

@@ -47,9 +47,9 @@ def new(
         raise UserError(f"{finger}: is named twice; give one file for the finger, another for the mapping")
     from jaxfinger.data.atomic import atomic_path
     from jaxfinger.data.finger_file import Finger, finger_from
-    from jaxfinger.data.look import proposal
-    from jaxfinger.data.sources import load_recording
-    from jaxfinger.data.templates import COLUMNS, finger_template, mapping_template
+    from jaxfinger.data.importing.look import proposal
+    from jaxfinger.data.importing.sources import load_recording
+    from jaxfinger.data.importing.templates import COLUMNS, finger_template, mapping_template
     from jaxfinger.data.toml import parse_toml, quoted, structure
 
     specimen = _asked("Name of the finger", specimen, "finger 1")

@@ -133,7 +133,7 @@ def print_warnings(findings: Iterable[Finding], file: Path) -> None:
 def read(path: Path) -> Session:
     """Read a session, and print the checker's warnings about it."""
     from jaxfinger.data import read_session
-    from jaxfinger.data.check import check_samples
+    from jaxfinger.data.checks.session import check_samples
     from jaxfinger.data.findings import Report
 
     report = Report()

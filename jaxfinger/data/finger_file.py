@@ -29,7 +29,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from jaxfinger.data.check_finger import UNIT_AXIS_TOLERANCE, check_finger
+from jaxfinger.data.checks.finger import UNIT_AXIS_TOLERANCE, check_finger
 from jaxfinger.data.findings import Report
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import Fault, Place, Within, as_key, one_of, quoted, read_toml, structure

@@ -1,4 +1,4 @@
-"""Session files: read, write, hash (dataset format, version 1.1)."""
+"""Session files: read, check, write, hash (dataset format, version 1.1)."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ import h5py
 import numpy as np
 
 from jaxfinger.data.atomic import atomic_path
-from jaxfinger.data.check import read_and_check
-from jaxfinger.data.findings import Report
+from jaxfinger.data.checks.session import check_samples, check_session
+from jaxfinger.data.findings import Finding, Report
+from jaxfinger.data.opening import plain_reason, why_closed
+from jaxfinger.data.parse import parse_file
 from jaxfinger.data.schema import (
     CHANNELS,
     FINGERTIP,
@@ -56,6 +58,56 @@ def read_session(
         raise UserError(f"{path}: {fault.sentence}")
     assert session is not None
     return session
+
+
+def check_file(path: str | os.PathLike) -> list[Finding]:
+    """Check a session file: its faults, none for a sound file. Faults of the file are never raised.
+
+    >>> import jaxfinger as jf
+    >>> jf.check("session.h5")
+    []
+    >>> [finding.severity for finding in jf.check("fit.json")]
+    ['error']
+    """
+    return list(read_and_check_all(path)[1])
+
+
+def read_and_check_all(path: str | os.PathLike) -> tuple[Session | None, Report]:
+    """Read a file and make all checks: the session, None where it is unusable, and the findings about it."""
+    session, report = read_and_check(path)
+    if session is not None:
+        check_samples(session, report)
+    return session, report
+
+
+def read_and_check(path: str | os.PathLike, trials: Collection[str] | None = None) -> tuple[Session | None, Report]:
+    """Read a file, or only the named trials: the session, None where it is unusable, and the findings about it.
+
+    The slow checks, for spikes and contradictions, are left to `check_samples`.
+    """
+    report = Report()
+    file = open_file(path, report)
+    if file is None:
+        return None, report
+    try:
+        with file:
+            session = parse_file(file, os.fspath(path), report, trials)
+    except Exception as error:  # h5py raises exceptions of many kinds on a damaged file.
+        said = plain_reason(error)
+        report.error("/", f"cannot be read to the end ({said}): the file is damaged; record or import it again")
+        return None, report
+    if session is not None:
+        check_session(session, report)
+    return session, report
+
+
+def open_file(path: str | os.PathLike, report: Report) -> h5py.File | None:
+    """Open the file; None with the reason reported where it does not open."""
+    reason = why_closed(path)
+    if reason is not None:
+        report.error("/", reason)
+        return None
+    return h5py.File(path, "r")
 
 
 def write_session(session: Session, path: str | os.PathLike, overwrite: bool = False) -> None:

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import h5py
 import numpy as np
 
-from jaxfinger.data.check import open_file
 from jaxfinger.data.findings import Report
-from jaxfinger.data.hdf5 import new_file, write_dataset, write_header
+from jaxfinger.data.hdf5 import new_file, open_file, write_dataset, write_header
 from jaxfinger.data.parse import child, dataset, parse_finger, parse_version, text_attribute
 from jaxfinger.data.schema import CHANNELS, TIME
 from jaxfinger.data.session import FingerDescription, Session, Trial

@@ -17,8 +17,8 @@ from jaxfinger.data import (
     smooth,
     without_spikes,
 )
-from jaxfinger.data.motion import quick_cutoff, rest_speed, speed_noise
-from jaxfinger.data.noise import STD_PER_MAD
+from jaxfinger.data.signals.motion import quick_cutoff, rest_speed, speed_noise
+from jaxfinger.data.signals.noise import STD_PER_MAD
 from jaxfinger.experiments.reduction import Joints, PreparedTrial, Row, joints, row
 from jaxfinger.experiments.shrink import shrink
 from jaxfinger.experiments.table import highest_cutoff
@@ -26,7 +26,7 @@ from jaxfinger.experiments.table import highest_cutoff
 NONE_VALID = "nowhere do a joint and its tendons slide for long enough that the direction of their friction is known"
 
 # A joint or tendon slides for certain above these speeds; below, it may stick and its friction is unknown. The noise of
-# a speed is a median (`data.motion.speed_noise`), two thirds of a standard deviation.
+# a speed is a median (`data.signals.motion.speed_noise`), two thirds of a standard deviation.
 MIN_SPEED_SHARE = 0.05  # of the motion's speed, for a joint that tendons drive and that may stick and slip
 MIN_SPEED_TO_NOISE = 3.0  # two standard deviations, for a joint that a motor moves; the share above where that is less
 MIN_TENDON_SPEED_TO_NOISE = 2.5  # 1.7 standard deviations, for a tendon, and half of that in the quicker filter

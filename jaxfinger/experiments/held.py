@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import uniform_filter1d
 
 from jaxfinger.data import find_holds
-from jaxfinger.data.motion import RAMP_BLOCKS, slow_ramps, stretches_of
+from jaxfinger.data.signals.motion import RAMP_BLOCKS, slow_ramps, stretches_of
 from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, runs_of_holds
 from jaxfinger.experiments.shrink import shrink
 

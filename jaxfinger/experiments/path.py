@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxfinger.data import directions
-from jaxfinger.data.motion import rest_speed
+from jaxfinger.data.signals.motion import rest_speed
 from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row
 
 NONE_VALID = "no sample is measured"

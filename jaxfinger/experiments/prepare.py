@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxfinger.data import Predictions, Session, Trial, quantisation
-from jaxfinger.data.sizes import Sizes, sizes_of
+from jaxfinger.data.signals.sizes import Sizes, sizes_of
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import driven, held, path, stepped
 from jaxfinger.experiments.reduction import Row, prepared, runs_of_holds

@@ -20,9 +20,9 @@ from jaxfinger.data import (
     smooth,
     without_spikes,
 )
-from jaxfinger.data.motion import quick_cutoff
 from jaxfinger.data.predictions import predicted_at
-from jaxfinger.data.sizes import Sizes
+from jaxfinger.data.signals.motion import quick_cutoff
+from jaxfinger.data.signals.sizes import Sizes
 from jaxfinger.effects.drive import NOMINAL_TEMPERATURE
 from jaxfinger.experiments.table import Experiment
 

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from scipy.ndimage import uniform_filter1d
 from scipy.special import gammaincinv
 
-from jaxfinger.data.noise import robust_std
+from jaxfinger.data.signals.noise import robust_std
 
 PASSED = 0.003  # share of the windows of noise alone that pass, as beyond three standard deviations of a Gaussian
 

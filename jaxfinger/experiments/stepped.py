@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfinger.data import directions, find_holds, smooth
-from jaxfinger.data.motion import rest_speed
+from jaxfinger.data.signals.motion import rest_speed
 from jaxfinger.experiments.driven import sliding
 from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, runs_of_holds
 

@@ -33,7 +33,7 @@ class Experiment:
     pace: float = 1.0  # duration of the motions over that of the protocol's, for which rate and cut-off hold
 
     def at(self, pace: float) -> Experiment:
-        """Experiment with rate and cut-off for a session of another pace (`data.sizes`)."""
+        """Experiment with rate and cut-off for a session of another pace (`data.signals.sizes`)."""
         return replace(self, rate=self.rate / pace, cutoff=self.cutoff / pace, pace=pace)
 
     @property

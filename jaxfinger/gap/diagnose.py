@@ -1,7 +1,6 @@
 """`diagnose`: where the gap of a session lies, which causes explain it, how far it shrinks, and what to record next."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -11,9 +10,8 @@ from jaxfinger.errors import UserError, did_you_mean
 from jaxfinger.experiments import EXPERIMENTS
 from jaxfinger.gap.augment import Fitted, as_refitted, augmented_fit, nominal_fit
 from jaxfinger.gap.budget import budget
-from jaxfinger.gap.closure import MIN_RESOLVABLE_RATIO, closures
+from jaxfinger.gap.closure import closures
 from jaxfinger.gap.columns import Columns
-from jaxfinger.gap.costs import CauseKey
 from jaxfinger.gap.exact import Baseline, SearchState
 from jaxfinger.gap.formula import Parameters
 from jaxfinger.gap.next_experiment import next_experiment
@@ -26,7 +24,6 @@ from jaxfinger.gap.parts import (
     channel_budgets,
     channels_not_judged,
     columns_with_gap,
-    mean_squares,
     relevance_of,
     retuned_parameters,
     unexplained_part,
@@ -35,7 +32,6 @@ from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY, Posterior, posterior
 from jaxfinger.gap.predicted import CheckedPredictions, checked
 from jaxfinger.gap.problem import Problem, build, site
 from jaxfinger.gap.result import (
-    Closure,
     Diagnosis,
     Key,
     Left,
@@ -43,28 +39,19 @@ from jaxfinger.gap.result import (
     Relevance,
     Status,
     Unexplained,
-    still_open,
-    tolerated,
 )
 from jaxfinger.gap.screening import read_parts
 from jaxfinger.gap.sets import Search
 from jaxfinger.gap.signature_table import table_of
 from jaxfinger.gap.signatures import catalogue_for, changes_of, variants
 from jaxfinger.gap.smooth_laws import measured_columns, smooth_parts
+from jaxfinger.gap.verdict import confirmed, consistent_with, verdict_of
 from jaxfinger.gap.where import where
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.stages import Progress
 from jaxfinger.model import Finger
 
 COARSE = 2  # A quick diagnosis averages over twice as many samples, which halves the rows.
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Status and named causes (effect and site) that follow from the posterior alone, without held-out trials."""
-
-    status: Status
-    named: tuple[CauseKey, ...]
 
 
 def diagnose(
@@ -112,18 +99,15 @@ def diagnose(
     recipe, tolerance = recipe or (against.recipe if against else Recipe()), dict(tolerance or {})
     changed = changes_of(against) if against else {}
     catalogue = catalogue_for(recipe, effects, Finger.from_description(session.finger)) | changed
-    if unknown := set(without) - set(catalogue):
-        raise UserError(
-            f"the catalogue has no effect {', '.join(sorted(unknown))} to leave out"
-            f"{did_you_mean(min(unknown), catalogue)}; "
-            f"it has {', '.join(sorted(catalogue))}"
-        )
+    _refuse_unknown(without, catalogue)
     _refuse_odd_tolerance(tolerance)
     if predictions is not None and not isinstance(predictions, CheckedPredictions):
         predictions = checked(session, predictions, session.file or "the session")
     told, doubts = predictions or (None, ())
+
+    # The nominal model, and what it misses.
     problem = build(session, recipe, progress, told, COARSE if quick else 1, against)
-    diagnosed = partial(
+    diagnosis = partial(
         Diagnosis,
         data=Path(session.file).name if session.file else "",
         specimen=session.specimen,
@@ -134,47 +118,36 @@ def diagnose(
         problem=problem,
     )
     if next(measured_columns(problem), None) is None:
-        return _nothing_judged(problem, diagnosed)
-    kept = set(problem.fit.recipe.model.terms) | set(without)
-    if problem.fit.recipe.model.elastic_degree == 0:  # A constant elastic torque is no spring.
-        kept |= {k for k, c in catalogue.items() if c.OF_SPRING}
-    laws = {law for c in changed.values() for law in c.__mro__}  # An effect that a change inherits from is its copy.
-    catalogue = {k: c for k, c in catalogue.items() if k not in kept and (k in changed or c not in laws)}
-    search, state = search_for_causes(problem, catalogue, progress)
-    baseline, table, found = search.baseline, search.table, posterior(search, state)
-    sized = partial(relevance_of, problem, baseline.columns, tolerance=tolerance)
-    null = baseline.null.linear_fit.evidence
-    gaps = partial(columns_with_gap, baseline.columns.counts, null, p=baseline.parameters)
-    verdict = _verdict(problem, found, sized(gaps(null)))
+        return _nothing_judged(problem, diagnosis)
+
+    # Signatures of the candidates, sets of them, and their probabilities.
+    search, best = search_for_causes(problem, _candidates(problem, catalogue, changed, without), progress)
+    baseline, found = search.baseline, posterior(search, best)
+    verdict = verdict_of(problem, found, _gaps(problem, baseline, baseline.null, tolerance)[1])
+
+    # The causes that the verdict blames, fitted together with the nominal parameters.
+    best = search.likeliest(best, found.ambiguous)
+    chosen = search.only(best, verdict.blamed) if verdict.blamed else baseline.null
     nominal = nominal_fit(problem)
-    chosen = baseline.null
-    if verdict.status in (Status.PARTLY, Status.AMBIGUOUS):
-        state = search.likeliest(state, found.ambiguous)
-        chosen = search.only(state, (*verdict.named, *(k for s in found.ambiguous for k in s)))
-    augmented: Fitted | None = None
-    if chosen.effects:
-        progress("fitting the effects and all nominal parameters together")
-        something_open = found.unlisted > MIN_NAMED_PROBABILITY
-        if quick:
-            augmented = as_refitted(baseline, problem, chosen, hold=something_open)
-        else:
-            augmented = augmented_fit(problem, chosen, hold=something_open)
-    with_gap = gaps(chosen.linear_fit.evidence)
-    relevance = sized(with_gap)
+    augmented = _with_causes(problem, baseline, chosen, found, quick, progress) if chosen.effects else None
+    fit = (augmented or nominal).fit
+
+    # Confirmation on held-out trials. Without causes, what is left of another simulator is what retuning leaves.
     progress("refitting without each third of the trials")
-    # Without causes, what is left of another simulator is what retuning leaves.
     lines = closures(problem, augmented or (nominal if problem.simulator is not None else None), not quick)
-    status = _explained_or_partly(verdict.status, found, lines, relevance, tolerance)
+    with_gap, relevance = _gaps(problem, baseline, chosen, tolerance)
+    status = confirmed(verdict.status, found, lines, relevance, tolerance)
     shares = budget(baseline, chosen, problem, with_gap)
+
+    # The trial that separates rivals best, and what is left.
     suggestion: NextExperiment | None = None
     if status is Status.AMBIGUOUS and not quick:
         progress("looking for the trial that would tell them apart")
-        suggestion = next_experiment(problem, search.rivals(state, found.ambiguous[0]))
-    fit = augmented.fit if augmented else nominal.fit
+        suggestion = next_experiment(problem, search.rivals(best, found.ambiguous[0]))
     causes = causes_of(chosen, found, shares, fit)
     none, unlisted = consistent_with(status, found, bool(relevance))
     left = smooth_parts(chosen.problem, chosen.r)
-    return diagnosed(
+    return diagnosis(
         status=status,
         named=tuple(Key(*k) for k in by_share(verdict.named, chosen, shares)),
         budget=causes,
@@ -189,7 +162,7 @@ def diagnose(
         unlisted=unlisted,
         ambiguous_sets=tuple(tuple(Key(*k) for k in s) for s in found.ambiguous),
         next_experiment=suggestion,
-        absorbed=absorbed_causes(problem, table, {*verdict.named, *(k for s in found.ambiguous for k in s)}),
+        absorbed=absorbed_causes(problem, search.table, verdict.blamed),
         changes=retuned_parameters(problem, fit) if against is None else changed_parameters(against, found, fit),
         left=tuple(
             Left(x.experiment, x.channel, site(problem, x.channel, x.column), x.energy, x.by_variable) for x in left
@@ -199,10 +172,28 @@ def diagnose(
     )
 
 
-def _nothing_judged(problem: Problem, diagnosed: Callable[..., Diagnosis]) -> Diagnosis:
+def _refuse_unknown(without: tuple[str, ...], catalogue: Mapping[str, type[CatalogueEffect]]) -> None:
+    """Refuse to leave out an effect that is in no catalogue."""
+    if unknown := sorted(set(without) - set(catalogue)):
+        named = f"{', '.join(unknown)} to leave out{did_you_mean(unknown[0], catalogue)}"
+        raise UserError(f"the catalogue has no effect {named}; it has {', '.join(sorted(catalogue))}")
+
+
+def _refuse_odd_tolerance(tolerance: Mapping[str, float]) -> None:
+    """Refuse a tolerance of a channel that no experiment predicts, and one that is no share of a signal."""
+    channels = dict.fromkeys(c for e in EXPERIMENTS.values() for c in e.channels)
+    for channel, share in tolerance.items():
+        if channel not in channels:
+            near, known = did_you_mean(channel, channels), ", ".join(channels)
+            raise UserError(f"tolerance of {channel}{near}: is of no channel that is judged; these are {known}")
+        if not 0.0 <= share < 1.0:
+            raise UserError(f"tolerance of {channel}: is {share:g}; say a share of its signal, such as 0.02")
+
+
+def _nothing_judged(problem: Problem, diagnosis: Callable[..., Diagnosis]) -> Diagnosis:
     """The diagnosis of a session in which no column has enough samples: every probability is one half."""
     fit = nominal_fit(problem).fit
-    return diagnosed(
+    return diagnosis(
         status=Status.NOT_JUDGED,
         named=(),
         budget=(),
@@ -225,15 +216,19 @@ def _nothing_judged(problem: Problem, diagnosed: Callable[..., Diagnosis]) -> Di
     )
 
 
-def _refuse_odd_tolerance(tolerance: Mapping[str, float]) -> None:
-    """Refuse a tolerance of a channel that no experiment predicts, and one that is no share of a signal."""
-    channels = dict.fromkeys(c for e in EXPERIMENTS.values() for c in e.channels)
-    for channel, share in tolerance.items():
-        if channel not in channels:
-            near, known = did_you_mean(channel, channels), ", ".join(channels)
-            raise UserError(f"tolerance of {channel}{near}: is of no channel that is judged; these are {known}")
-        if not 0.0 <= share < 1.0:
-            raise UserError(f"tolerance of {channel}: is {share:g}; say a share of its signal, such as 0.02")
+def _candidates(
+    problem: Problem,
+    catalogue: Mapping[str, type[CatalogueEffect]],
+    changed: Mapping[str, type[CatalogueEffect]],
+    without: tuple[str, ...],
+) -> dict[str, type[CatalogueEffect]]:
+    """Effects of the catalogue that the nominal model lacks; `changed` are changes of an earlier fit's parameters."""
+    nominal = problem.fit.recipe.model
+    excluded = set(nominal.terms) | set(without)
+    if nominal.elastic_degree == 0:  # A constant elastic torque is no spring.
+        excluded |= {k for k, c in catalogue.items() if c.OF_SPRING}
+    laws = {law for c in changed.values() for law in c.__mro__}  # An effect that a change inherits from is its copy.
+    return {k: c for k, c in catalogue.items() if k not in excluded and (k in changed or c not in laws)}
 
 
 def search_for_causes(
@@ -249,54 +244,19 @@ def search_for_causes(
     return search, search.run()
 
 
-def _verdict(problem: Problem, found: Posterior, relevance: tuple[Relevance, ...]) -> Verdict:
-    """Verdict of the posterior; held-out trials decide later between `partly` and `explained`.
-
-    Without a cause to name it is `unexplained` if some channel's mean square is surely above that of its noise,
-    whatever the evidence, or if there is a gap and something unlisted is probable.
-    """
-    if found.named:
-        return Verdict(Status.PARTLY, found.named)
-    if found.ambiguous:
-        return Verdict(Status.AMBIGUOUS, found.ambiguous[0][:1])
-    matters = [x for x in relevance if not x.tolerated]
-    seen = any(
-        missed > MIN_RESOLVABLE_RATIO * noise
-        for missed, noise in (mean_squares(problem, x.experiment, x.channel) for x in matters)
-    )
-    return Verdict(
-        Status.UNEXPLAINED if seen or (matters and found.unlisted > MIN_NAMED_PROBABILITY) else Status.NO_GAP, ()
-    )
+def _gaps(
+    problem: Problem, baseline: Baseline, chosen: SearchState, tolerance: Mapping[str, float]
+) -> tuple[frozenset[int], tuple[Relevance, ...]]:
+    """Columns in which the nominal model alone leaves a gap, as far as the chosen set shows it, and each gap's size."""
+    columns, null = baseline.columns, baseline.null.linear_fit.evidence
+    found = columns_with_gap(columns.counts, null, chosen.linear_fit.evidence, baseline.parameters)
+    return found, relevance_of(problem, columns, found, tolerance)
 
 
-def _explained_or_partly(
-    status: Status,
-    found: Posterior,
-    lines: tuple[Closure, ...],
-    relevance: tuple[Relevance, ...],
-    tolerance: Mapping[str, float],
-) -> Status:
-    """`explained` in place of `partly` where every channel closes to its noise, or to the user's tolerance.
-
-    If something unlisted is probable, only the tolerance counts: what is left of every gap must be within it.
-    """
-    if status is not Status.PARTLY or found.ambiguous or still_open(lines, relevance, tolerance):
-        return status
-    with_gap = {(x.experiment, x.channel) for x in relevance}
-    matter = [x for x in lines if (x.experiment, x.channel) in with_gap and not tolerated(x, relevance, tolerance)]
-    return Status.EXPLAINED if found.unlisted <= MIN_NAMED_PROBABILITY or not matter else status
-
-
-def consistent_with(status: Status, found: Posterior, gaps: bool) -> tuple[float, float]:
-    """Probabilities of «nothing» and «something unlisted» at work, bounded so that they agree with the verdict.
-
-    `gaps` says whether any channel has a gap. Where a gap has no named cause, or the named causes leave it open on
-    held-out trials, «unlisted» is at least one half. Under `no_gap`, where many columns have traces and none has a gap,
-    it is at most one half.
-    """
-    if status is Status.NO_GAP and not gaps:
-        unlisted = min(found.unlisted, 1.0 - MIN_NAMED_PROBABILITY)
-        return max(found.none, 1.0 - unlisted), unlisted
-    left_open = status is Status.UNEXPLAINED or (status is Status.PARTLY and not found.ambiguous)
-    unlisted = max(found.unlisted, MIN_NAMED_PROBABILITY) if left_open else found.unlisted
-    return min(found.none, 1.0 - unlisted), unlisted
+def _with_causes(
+    problem: Problem, baseline: Baseline, chosen: SearchState, found: Posterior, quick: bool, progress: Progress
+) -> Fitted:
+    """The model with the chosen causes in; these keep their sizes where something unlisted is probable beside them."""
+    progress("fitting the effects and all nominal parameters together")
+    hold = found.unlisted > MIN_NAMED_PROBABILITY
+    return as_refitted(baseline, problem, chosen, hold) if quick else augmented_fit(problem, chosen, hold)

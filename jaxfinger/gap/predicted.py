@@ -10,7 +10,7 @@ from jaxfinger.data import Predictions, Session, Trial
 from jaxfinger.data.findings import Finding, Report, merged
 from jaxfinger.data.predictions import refuse_misfits
 from jaxfinger.data.schema import CHANNELS
-from jaxfinger.data.sizes import sizes_of
+from jaxfinger.data.signals.sizes import sizes_of
 from jaxfinger.errors import UserError, counted, listed
 from jaxfinger.experiments import EXPERIMENTS
 from jaxfinger.gap.likeness import check_likeness

@@ -16,8 +16,8 @@ import scipy.linalg
 from jaxtyping import Array, Float
 from scipy.ndimage import uniform_filter1d
 
-from jaxfinger.data.noise import STD_PER_MAD
 from jaxfinger.data.schema import CHANNELS
+from jaxfinger.data.signals.noise import STD_PER_MAD
 from jaxfinger.experiments import Batch, Stack
 
 ORDER = 3  # of the autoregression: describes white noise after a low-pass (tests/identify/test_noise.py)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from jaxfinger.data import Session, Trial, constant_columns
 from jaxfinger.data.schema import CHANNELS
-from jaxfinger.data.sizes import Sizes
+from jaxfinger.data.signals.sizes import Sizes
 from jaxfinger.errors import UserError, counted, listed
 from jaxfinger.experiments import Stack, prepare
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.data import Session
-from jaxfinger.data.sizes import sizes_of
+from jaxfinger.data.signals.sizes import sizes_of
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Experiment, Stack, not_judged
 from jaxfinger.identify.fit import Fit, StageReport

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfinger.data import Trial, filtered_noise_std, low_pass, smooth
-from jaxfinger.data.noise import STD_PER_MAD
+from jaxfinger.data.signals.noise import STD_PER_MAD
 from jaxfinger.experiments import Stack
 from jaxfinger.experiments.table import highest_cutoff
 from jaxfinger.identify.predictions import MAX_TIME_STEP

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.data import Session
-from jaxfinger.data.sizes import highest_tension
+from jaxfinger.data.signals.sizes import highest_tension
 from jaxfinger.experiments import prepare
 from jaxfinger.identify import Fit
 from jaxfinger.model import Model, rigid_body

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from jaxfinger.data import Session, Trial
 from jaxfinger.data.atomic import make_folder
-from jaxfinger.data.sizes import sizes_of
+from jaxfinger.data.signals.sizes import sizes_of
 from jaxfinger.experiments import Stack, predict_compiled, prepare
 from jaxfinger.identify import Fit
 from jaxfinger.identify.predictions import model_for, predict_session

@@ -7,8 +7,7 @@ from jaxfinger.data.findings import Report, merged
 from jaxfinger.data.finger_file import finger_from
 from jaxfinger.data.toml import Place
 from jaxfinger.errors import UserError
-
-from .conftest import ONE_JOINT
+from tests.data.conftest import ONE_JOINT
 
 
 def test_what_trials_have_in_common_is_said_once():

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 
 from jaxfinger.data.finger_file import finger_from
-from jaxfinger.data.mapping import MappingFile
+from jaxfinger.data.importing.mapping import MappingFile
 from jaxfinger.data.toml import NotEmpty, OneOf, Positive, Within, parse_toml, read_toml
 from jaxfinger.errors import UserError
-from tests.data.test_importers import MAPPING
+from tests.data.importing.test_by_mapping import MAPPING
 from tests.mutations import assert_read_or_refused, mutated
 
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import Session, Trial, filter_std
-from jaxfinger.data.check_trial import check_trial
+from jaxfinger.data.checks.trial import check_trial
 from jaxfinger.data.findings import Report
-from jaxfinger.data.sizes import SLACK_SHARE, sizes_of
+from jaxfinger.data.signals.sizes import SLACK_SHARE, sizes_of
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, driven, not_judged, prepare
 from jaxfinger.synthetic import paper_finger

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 
-from jaxfinger.data.filtering import smooth
+from jaxfinger.data.signals.filtering import smooth
 from jaxfinger.experiments.driven import ACCELERATION_DOF
 from jaxfinger.experiments.shrink import PASSED, shrink
 

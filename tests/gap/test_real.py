@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from jaxfinger.data import read_session
-from jaxfinger.data.importers import import_file
+from jaxfinger.data.importing.by_mapping import import_file
 from jaxfinger.gap import Status, diagnose
 from jaxfinger.identify import read_recipe
 

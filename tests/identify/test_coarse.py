@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import quantisation
-from jaxfinger.data.sizes import sizes_of
+from jaxfinger.data.signals.sizes import sizes_of
 from jaxfinger.identify import identify
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.synthetic import (

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import FingerDescription, Session, Trial, read_session
-from jaxfinger.data.importers import import_file
-from jaxfinger.data.sizes import PACE_RATIO
+from jaxfinger.data.importing.by_mapping import import_file
+from jaxfinger.data.signals.sizes import PACE_RATIO
 from jaxfinger.identify import Recipe, identify, read_recipe
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.identify.recipe import FitRecipe, ModelRecipe

@@ -6,7 +6,6 @@ from functools import cache
 import numpy as np
 
 from jaxfinger.effects import CATALOGUE
-from jaxfinger.gap.diagnose import consistent_with
 from jaxfinger.gap.posterior import Posterior
 from jaxfinger.gap.propose import Proposal
 from jaxfinger.gap.result import (
@@ -30,6 +29,7 @@ from jaxfinger.gap.result import (
     Unexplained,
     Value,
 )
+from jaxfinger.gap.verdict import consistent_with
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.report.curves import Curve, Curves

@@ -1,0 +1,137 @@
+"""Check the direction of gravity in the base frame against the torques of ID.3.
+
+At one posture of the other joints the weight of a joint's links cannot be told from its elastic torque: both are curves
+over the joint's angle. At another posture the weight is another curve, and the elastic torque the same one. So torques
+at several postures show the gravity vector g, which acts with levers(q) · g (`gravity_levers`), along the directions
+that the postures tell apart:
+
+    τ = elastic(qᵢ) + zero + friction sign(q̇ᵢ) + damping q̇ᵢ + inertia q̈ᵢ − levers(q) · g
+
+Each trial has its own zero, as of a sensor that is tared, and its own friction. Only the shapes of curves count.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxfinger.data.findings import Report
+from jaxfinger.data.mounting import gravity_levers
+from jaxfinger.data.session import FingerDescription, Session, Trial
+from jaxfinger.data.signals.motion import STILL_SHARE, directions
+from jaxfinger.errors import listed
+
+_BLOCKS = 300  # of a trial, of which means are taken: the protocol's quickest cycle still has ten of them.
+_ANGLES = 30  # Parts of a joint's range. Departures from the model are alike within one, so it counts as one value.
+_DEGREE = 5  # of the elastic torque over the angle: a spring that stiffens towards both of its ends
+_MIN_POSTURE = 0.2  # rad between two postures: the weight's curve moves by as much.
+_MAX_STD = 0.12  # of gravity: the change that is reported is then six standard deviations.
+# Of gravity, the length of its change: that of a turn by 45°, half of the quarter turn that the smallest mistake makes.
+_MIN_TURN = 0.77
+# Of gravity: the largest that torques may show. Masses and their places are right to some per cent, and torques that
+# show more have another reason.
+_MAX_GRAVITY = 1.25
+
+
+class _Motion(NamedTuple):
+    """Means over the blocks of a trial in which a motor moves one joint, without the blocks where it turns round."""
+
+    q: np.ndarray  # (N, m)
+    torque: np.ndarray  # (N,), of the motor
+    dynamics: np.ndarray  # (N, 2): speed and acceleration
+    direction: np.ndarray  # (N,): −1 or 1
+
+
+class _Equations(NamedTuple):
+    """levers · g = torques, without the parts that the other terms explain."""
+
+    levers: np.ndarray  # (N, 3)
+    torques: np.ndarray  # (N,)
+    free: int  # values that differ from each other beyond the number of other terms
+
+
+def check_gravity(session: Session, report: Report) -> None:
+    """Report a gravity vector that contradicts the torques which hold the finger's weight."""
+    finger, size = session.finger, float(np.linalg.norm(session.finger.gravity))
+    if any(finger.prismatic) or size == 0.0:
+        return
+    coupled = _coupled(finger)
+    motions: dict[int, list[_Motion]] = defaultdict(list)
+    for trial in session.select("ID.3-static", "ID.3-dynamic"):
+        if (i := finger.joint(trial.joint)) is not None and i not in coupled:
+            motions[i] += _motion(trial, i)
+    told = [i for i, of in motions.items() if _postures(of, i) > _MIN_POSTURE]
+    parts = [_equations(finger, i, motions[i]) for i in told]
+    if not parts:
+        return
+    levers, torques = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+    _, sizes, ways = np.linalg.svd(levers, full_matrices=False)
+    misfit = torques - levers @ np.linalg.lstsq(levers, torques)[0]
+    noise = np.sqrt(misfit @ misfit / max(sum(part.free for part in parts), 1))
+    # Directions along which torques show gravity. Smaller sizes are rounding.
+    known = ways[(noise < _MAX_STD * size * sizes) & (sizes > 1e-6 * sizes[0])]
+    if not len(known):
+        return
+    seen = np.linalg.lstsq(levers @ known.T, torques)[0]
+    change = seen - known @ finger.gravity
+    if np.linalg.norm(change) > _MIN_TURN * size and np.linalg.norm(seen) < _MAX_GRAVITY * size:
+        way = change @ known / np.linalg.norm(change)
+        names = [finger.joint_names[i] for i in told]
+        report.warning(
+            "/finger",
+            f"has `gravity` with {way @ finger.gravity:.2g} m s-2 along ({', '.join(f'{x:.2f}' for x in way)}), and "
+            f"torques at several postures (ID.3) show {way @ (seen @ known):.2g}: correct `gravity`, `axis` or `com`, "
+            f"or the signs of q and joint_torque of {listed(names)}",
+        )
+
+
+def _coupled(finger: FingerDescription) -> set[int]:
+    """Joints that share a passive tendon with another joint: their elastic torque depends on the other's angle."""
+    shared = ~finger.active & (finger.crosses.sum(axis=1) > 1)
+    return set(np.flatnonzero(finger.crosses[shared].any(axis=0)).tolist())
+
+
+def _motion(trial: Trial, i: int) -> list[_Motion]:
+    """The trial's motion; nothing where values are missing or too few, or the joint stands still."""
+    if trial.joint_torque is None or len(trial.time) < _BLOCKS:
+        return []
+    size = len(trial.time) // _BLOCKS
+    columns = np.column_stack([trial.time, trial.joint_torque[:, i], trial.q])[: _BLOCKS * size]
+    time, torque, *angles = columns.reshape(_BLOCKS, size, -1).mean(axis=1).T
+    q = np.column_stack(angles)
+    rate = np.gradient(q[:, i], time)
+    dynamics = np.column_stack([rate, np.gradient(rate, time)])
+    if not (np.isfinite(columns).all() and np.isfinite(dynamics).all() and np.ptp(q[:, i]) > _MIN_POSTURE):
+        return []
+    # Slow blocks count where the joint goes on in the direction in which it came.
+    least = STILL_SHARE * np.percentile(np.abs(rate), 99, keepdims=True)
+    before, after = (directions(rate[way, None], least)[way, 0] for way in (slice(None), slice(None, None, -1)))
+    goes_on = (before == after) & (before != 0.0)
+    return [_Motion(q[goes_on], torque[goes_on], dynamics[goes_on], before[goes_on])] if goes_on.any() else []
+
+
+def _postures(motions: list[_Motion], i: int) -> float:
+    """Largest change of another joint's angle from trial to trial, rad."""
+    if not motions:
+        return 0.0
+    means = np.delete([motion.q.mean(axis=0) for motion in motions], i, axis=1)
+    return float(np.ptp(means, axis=0).max(initial=0.0))
+
+
+def _equations(finger: FingerDescription, i: int, motions: list[_Motion]) -> _Equations:
+    """What the trials of joint i say of gravity."""
+    q = np.concatenate([motion.q for motion in motions])
+    angle = (q[:, i] - q[:, i].min()) / np.ptp(q[:, i])
+    own, values, end = np.zeros((len(q), 3 * len(motions))), 0, 0  # `own`: zero and friction of each trial
+    for k, motion in enumerate(motions):
+        begin, end = end, end + len(motion.q)
+        x = angle[begin:end]
+        own[begin:end, 3 * k : 3 * k + 3] = np.column_stack([np.ones(len(x)), motion.direction, motion.direction * x])
+        values += len(np.unique((_ANGLES * x).astype(int)))
+    dynamics = np.concatenate([motion.dynamics for motion in motions])
+    others = np.column_stack([np.vander(angle, _DEGREE + 1)[:, :-1], dynamics, own])
+    wanted = np.column_stack([-gravity_levers(finger, q)[:, i], np.concatenate([motion.torque for motion in motions])])
+    wanted -= others @ np.linalg.lstsq(others, wanted)[0]
+    return _Equations(wanted[:, :3], wanted[:, 3], values - others.shape[1])

@@ -1,0 +1,197 @@
+"""Check that the values of a trial's columns are those of a connected sensor, of plausible size in SI units."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxfinger.data.checks.jumps import check_jumps
+from jaxfinger.data.findings import Report
+from jaxfinger.data.schema import CHANNELS, measured_columns
+from jaxfinger.data.session import FingerDescription, Trial
+from jaxfinger.data.signals.motion import MIN_MOTION
+from jaxfinger.data.signals.sizes import NOISE_FACTOR, Sizes
+from jaxfinger.data.signals.unmeasured import constant_columns, placeholder
+from jaxfinger.data.units import STANDARD_GRAVITY, conversion, whole_turns
+from jaxfinger.errors import counted, listed
+
+_MAX_OVERTRAVEL = 0.35  # rad, 20 degrees, that a joint may read beyond its limits, since stated limits are approximate
+# Readings below zero, as shares of the highest tension. A good tare is off by a hundredth. A taut tendon is held at a
+# fifth or more (`data.signals.sizes`), so a column of the wrong sign reads at least twice _MAX_PUSH below zero.
+MAX_TARE_ERROR = 0.03
+_MAX_TARE = 0.5  # of the highest tension: a tendon that reads more is pulled on purpose.
+_MAX_PUSH = 0.1
+# Of the machine's reach. A moment arm is about a tenth of it, and a joint turns by less than a turn; degrees for rad
+# make 57 times as much, which the check of moment arms names, and mm for m a thousand times.
+_MAX_EXCURSION = 20.0
+# Of the torque with which the whole machine weighs on an arm as long as its reach. A motor that leads a light joint
+# with friction and stiff springs gives up to tens of it; torques in N mm of one that only weighs are some 400 of it.
+_MAX_TORQUE = 200.0
+# Of the weight of all links. Strong tendons of a light finger pull with some hundred times; pulls of a finger with 10 N
+# are some ten thousand of it in mN.
+_MAX_TENSION = 5000.0
+_MAX_DEGREES = 400.0  # Angles in degrees are smaller: a turn, with room.
+_COLD = 200.0  # K, −73 °C: no laboratory is colder, so lower values are in °C.
+# A converter's limit is repeated over more samples at once, by this factor, than any value within its range. At the
+# turn of a smooth motion the last step of the resolution is held up to five times as long as the one before it.
+_CLIPPED, _MIN_CLIPPED = 10, 10
+_SLACK = ("ID.3-static", "ID.3-dynamic")  # experiments with slack tendons, whose tensions are not used
+_MIN_SAMPLES = 20  # Fewer samples show no typical step.
+
+
+def check_values(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
+    """Report columns that no sensor reads so, or that are in other units. `sizes` are those of the session."""
+    _constant_columns(trial, finger, report)
+    _clipped_columns(trial, finger, report)
+    _placeholders(trial, finger, report)
+    check_jumps(trial, finger, report)
+    _angles(trial, finger, report)
+    if trial.tendon_force is not None:
+        _tension(trial, finger, sizes, report)
+    _temperatures(trial, report)
+    _large_for_the_machine(trial, finger, report)
+
+
+def _constant_columns(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Report measured columns that never change: such a column is not connected."""
+    for channel, still in constant_columns(trial, finger).items():
+        for k in np.flatnonzero(still):
+            value = getattr(trial, channel)[0, k] + 0.0  # −0 becomes 0.
+            report.warning(
+                trial.place(channel),
+                f"column {CHANNELS[channel].columns(finger)[k]} is {value:.4g} at every sample, as no sensor is; check "
+                "its cable and its column, or leave it out",
+            )
+
+
+def _clipped_columns(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Report forces and torques that stay at their highest or lowest value longer than at any other.
+
+    Zero is no limit of a converter: a tendon sensor may read zero while its tendon is slack.
+    """
+    for channel, name, x in measured_columns(trial, finger, ("tendon_force", "joint_torque", "fingertip_force")):
+        if len(x) < _MIN_SAMPLES or not np.isfinite(x).all() or np.ptp(x) == 0.0 or placeholder(x) is not None:
+            continue
+        starts = np.flatnonzero(np.diff(x, prepend=np.nan) != 0.0)
+        runs, held = np.diff(np.append(starts, len(x))), x[starts]
+        limits = [limit for limit in (x.min(), x.max()) if limit != 0.0]
+        within = int(runs[~np.isin(held, limits)].max(initial=1))
+        for limit in limits:
+            if runs[held == limit].max() > max(_CLIPPED * within, _MIN_CLIPPED):
+                count = counted(int((x == limit).sum()), "sample")
+                message = f"column {name} is clipped: it stays at {limit:.4g}, an end of its range, in {count}"
+                report.warning(
+                    trial.place(channel), f"{message}; record it with a wider range, or cut these samples out"
+                )
+
+
+def _placeholders(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Report values that stand for a missing one, such as 9999: repeated exactly, and far from all others."""
+    for channel, name, x in measured_columns(trial, finger):
+        found = placeholder(x)
+        if found is not None:
+            at, count = trial.time[int(np.argmax(x == found))], counted(int((x == found).sum()), "sample")
+            report.warning(
+                trial.place(channel),
+                f"column {name} is {found:.6g} in {count}, first at {at:.6g} s, far from all others, as where a "
+                "number stands for a missing value; cut these samples out (`where` in a mapping)",
+            )
+
+
+def _angles(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Check that revolute joints stay near their limits, in rad and within a turn."""
+    place = trial.place("q")
+    columns = zip(finger.joint_names, trial.q.T, finger.limits, finger.prismatic, strict=True)
+    for name, q, (lower, upper), slides in columns:
+        if slides or not np.isfinite(q).all():
+            continue
+        low, high = np.percentile(q, [1.0, 99.0])
+        where = f"column {name} runs from {low:.3g} to {high:.3g} rad"
+        outside = low < lower - _MAX_OVERTRAVEL or high > upper + _MAX_OVERTRAVEL
+        turn = whole_turns(0.5 * (low + high), 2.0 * np.pi, (lower, upper))
+        fits = low + turn >= lower - _MAX_OVERTRAVEL and high + turn <= upper + _MAX_OVERTRAVEL
+        degrees, unwrap = conversion("deg"), "take a whole turn off (`unwrap = true` in a mapping)"
+        # Degrees of a joint that moves would exceed its limits by more than a turn.
+        if outside and fits and abs(turn) < 4.0 * np.pi and high - low > MIN_MOTION:
+            say = report.error if max(-low, high) > 2.0 * np.pi else report.warning
+            say(place, f"{where}, a turn beside its limits {lower:.3g} to {upper:.3g}; {unwrap}")
+        elif max(-low, high) > 2.0 * np.pi:
+            mend = degrees if max(-low, high) < _MAX_DEGREES else "convert counts to rad (`scale` in a mapping)"
+            mend += f", or {unwrap}" if fits and abs(turn) < 4.0 * np.pi else ""
+            report.error(place, f"{where}, more than a turn; {mend}")
+        elif outside:
+            message = f"{where}, far outside its limits {lower:.3g} to {upper:.3g}; correct one or the other"
+            report.warning(place, message)
+
+
+def _temperatures(trial: Trial, report: Report) -> None:
+    """Check that temperatures are in K."""
+    if trial.temperature is None:
+        return
+    for name, x in zip(trial.temperature_names, trial.temperature.T, strict=True):
+        if np.nanmax(x, initial=-np.inf) < _COLD:
+            report.warning(
+                trial.place("temperature"),
+                f'column {name} stays below {_COLD:g} K; add 273.15 if it is in °C (`units = "degC"` in a mapping)',
+            )
+
+
+def _large_for_the_machine(trial: Trial, finger: FingerDescription, report: Report) -> None:
+    """Check that excursions and torques are in m and N m: their sizes fit the machine's lengths and masses."""
+    if any(finger.prismatic):
+        return
+    reach = _reach(finger)
+    for channel, most, unit in (
+        ("tendon_excursion", _MAX_EXCURSION * reach, "mm"),
+        ("joint_torque", _MAX_TORQUE * _weight(finger) * reach, "N mm"),
+    ):
+        for _, name, x in measured_columns(trial, finger, (channel,)) if most != 0.0 else ():
+            if np.isfinite(x).all() and (size := float(np.percentile(np.abs(x), 90.0))) > most:
+                report.error(
+                    trial.place(channel),
+                    f"column {name} is of size {size:.3g}, too large for the lengths and masses of this machine; "
+                    f"{conversion(unit)}",
+                )
+
+
+def _reach(finger: FingerDescription) -> float:
+    """Length, m, of the stretched chain from its first joint to the end of its last link."""
+    gyration = np.sqrt(np.trace(finger.inertia[-1]) / 2.0 / finger.mass[-1])
+    last = max(np.linalg.norm(finger.fingertip), np.linalg.norm(finger.com[-1]), gyration)
+    return float(np.linalg.norm(finger.origin[1:], axis=1).sum() + last)
+
+
+def _weight(finger: FingerDescription) -> float:
+    """Weight of all links, N, whatever gravity the description has."""
+    return STANDARD_GRAVITY * float(finger.mass.sum())
+
+
+def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
+    """Check that tensions are positive but for noise and tare, about zero where tendons are slack, and not in mN."""
+    assert trial.tendon_force is not None
+    place, tare = trial.place("tendon_force"), max(MAX_TARE_ERROR * sizes.tension, sizes.slack)
+    unslack, slack = {}, []  # tendons with a tension where they are to be slack, and without one where to be taut
+    for name, active, x in zip(finger.tendon_names, finger.active, trial.tendon_force.T, strict=True):
+        if not np.isfinite(x).all():
+            continue
+        if not active:
+            report.note(place, f"column {name} is measured though the tendon is passive; it is ignored")
+            continue
+        low = float(np.percentile(x, 5.0))
+        if low < -max(_MAX_PUSH * sizes.tension, sizes.slack) and trial.experiment not in _SLACK:
+            report.error(place, f"column {name} falls to {low:.3g} N, and a tendon cannot push; check sign and tare")
+        elif low < -tare:
+            report.warning(place, f"column {name} falls to {low:.3g} N, below zero by more than noise; check the tare")
+        elif trial.experiment in _SLACK and tare < low < _MAX_TARE * sizes.tension:
+            unslack[name] = low
+        elif trial.experiment == "ID.2" and np.median(x) <= NOISE_FACTOR * sizes.noise:
+            slack.append(name)
+        if np.percentile(x, 95.0) > _MAX_TENSION * _weight(finger):
+            said = f"column {name} exceeds {_MAX_TENSION:.0f} times the weight of all links"
+            report.warning(place, f"{said}; {conversion('mN')} if that is what it is")
+    if slack and trial.tendon_excursion is not None:
+        said = f"shows no tension in {listed(slack)}, though ID.2 needs taut tendons to follow the joint"
+        report.warning(place, f"{said}; check the columns, or record the trial again with tension")
+    if unslack:
+        said = f"stays above {min(unslack.values()):.3g} N in {listed(list(unslack))}"
+        said = f"{said}, though {trial.experiment} leaves tendons slack"
+        report.warning(place, f"{said}; check the tare, or let the tendons go")

@@ -1,0 +1,212 @@
+"""Check that the channels of a session agree with each other. Two laws hold for every finger, whatever its model.
+
+1. Virtual work. A tendon that pulls in dl while a joint turns by dq exerts the torque f dl/dq on it. So the encoders
+   (ID.2: dl/dq) and the force sensors (ID.4: −dτ/df, since the motor holds against it) show one moment arm. Friction
+   reduces the torque that arrives at the joint but never changes its sign.
+2. Passivity. Over a cycle the external motor puts work into a joint and never takes any out: ∮ τ dq > 0.
+
+Where a law fails, a sign, a unit or a column is wrong in one of the channels that the finding names.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Mapping
+
+import numpy as np
+
+from jaxfinger.data.findings import Report
+from jaxfinger.data.session import FingerDescription, Session, Trial
+from jaxfinger.data.signals.arms import Excursions, slope, thinned
+from jaxfinger.data.signals.filtering import low_pass, smooth
+from jaxfinger.data.signals.motion import CUTOFF_HZ, STILL_SHARE, directions, fitting_cutoff
+from jaxfinger.errors import listed
+
+# Share of the largest arm at a joint: a tendon whose torque shows more should not stand still. Small arms lie between
+# this one and `MAX_STILL_ARM`.
+_MIN_FELT_SHARE = 0.5
+# Ratio of the arm that torques show to the arm that excursions show. Friction reduces it: routed tendons lose up to two
+# thirds of their tension (the shipped session). Units that people confuse differ at least fourfold (N and lbf).
+_MIN_ARM_RATIO, _MAX_ARM_RATIO = 0.2, 1.5
+_MAX_EXCURSION_RATIO = 3.0  # of two measurements of one excursion: units that people confuse differ by more.
+_MIN_PATH = 1e-3  # m of excursion: over less, stretch and noise decide the ratio of two measurements.
+_FORCE_RATIOS = (0.002, 1.0)  # N at the fingertip for each N of tension: a moment arm over a finger's length, with room
+# Moment arms as shares of the finger's length: neither nearly as long as a finger nor thinner than a hair.
+_MIN_ARM, _MAX_ARM = 0.004, 0.4
+_MIN_TURNS = 3  # of a motion: with fewer, torque that accelerates the joint looks like friction.
+_MAX_NEGATIVE_FRICTION = 0.05  # of the torque's spread: a delay between the channels makes friction seem this negative.
+
+
+def check_work(session: Session, report: Report) -> None:
+    """Report channels that contradict each other."""
+    finger = session.finger
+    if any(finger.prismatic) or not finger.n:
+        _passivity(session, report)
+        return
+    kinematic = Excursions(session)
+    _arm_lengths(kinematic.arms, finger, report)
+    _virtual_work(session, kinematic, report)
+    _free_paths(session, kinematic, report)
+    _fingertip(session, report)
+    _passivity(session, report)
+
+
+def _arm_lengths(arms: Mapping[tuple[int, int], float], finger: FingerDescription, report: Report) -> None:
+    """Report joints whose largest moment arm does not fit the finger's length; `arms`, m, by tendon and joint."""
+    length = float(np.linalg.norm(finger.origin, axis=1)[1:].sum() + np.linalg.norm(finger.fingertip))
+    for i, joint in enumerate(finger.joint_names):
+        largest = max((abs(arm) for (_, k), arm in arms.items() if k == i), default=np.nan)
+        if largest > _MAX_ARM * length or largest < _MIN_ARM * length:
+            report.warning(
+                "/trials",
+                f"ID.2 gives moment arms of {1e3 * largest:.3g} mm at joint {joint} of a finger {1e3 * length:.3g} mm "
+                "long; check the units of tendon_excursion and q",
+            )
+
+
+def _virtual_work(session: Session, kinematic: Excursions, report: Report) -> None:
+    """Report moment arms of ID.4 that contradict those of ID.2."""
+    finger = session.finger
+    turned: dict[tuple[str, str], str] = {}  # by tendon and joint: what is said of them
+    far: dict[tuple[str, str], str] = {}
+    agreed: list[tuple[str, str]] = []
+    for trial in session.select("ID.4"):
+        i, k = finger.joint(trial.joint), finger.tendon(trial.tendon)
+        if i is None or k is None or trial.joint_torque is None or trial.tendon_force is None:
+            continue
+        seen = kinematic.arm(k, i, float(np.nanmedian(trial.q[:, i])))
+        felt = -slope(thinned(trial.tendon_force[:, k]), thinned(trial.joint_torque[:, i]))
+        still = kinematic.still(k, i) and abs(felt) > _MIN_FELT_SHARE * kinematic.largest(i)
+        seen = kinematic.arms[k, i] if still else seen
+        if seen is None or not np.isfinite(felt):
+            continue
+        pair = finger.tendon_names[k], finger.joint_names[i]
+        said = f"{pair[0]} at {pair[1]} ({1e3 * seen:.3g} against {1e3 * felt:.3g} mm)"
+        ratio = np.inf if still else felt / seen
+        if ratio < -_MIN_ARM_RATIO:
+            turned[pair] = said
+        elif not _MIN_ARM_RATIO < ratio < _MAX_ARM_RATIO:
+            far[pair] = said
+        else:
+            agreed.append(pair)
+    for found, what in ((turned, "the sign"), (far, "the units or the column")):
+        if found:
+            report.warning(
+                "/trials",
+                "moment arms that excursions show (ID.2) and those that torques show (ID.4) contradict each other: "
+                f"{listed(list(found.values()), 3)}; check {what} of {suspects(found, agreed)}",
+            )
+
+
+def suspects(found: Collection[tuple[str, str]], agreed: Collection[tuple[str, str]]) -> str:
+    """Channels that may be wrong, given the pairs of tendon and joint that contradict each other and those that agree.
+
+    A joint at which another tendon agrees has a sound angle and torque; a tendon that agrees at another joint has sound
+    tension and excursion.
+    """
+    tendons, joints = ({pair[k] for pair in found} for k in (0, 1))
+    sound_tendons, sound_joints = ({pair[k] for pair in agreed} for k in (0, 1))
+    if len(tendons) == 1 and joints <= sound_joints and not tendons & sound_tendons:
+        return f"tendon_excursion or tendon_force of {min(tendons)}"
+    if len(joints) == 1 and tendons <= sound_tendons and not joints & sound_joints:
+        return f"joint_torque or q of {min(joints)}"
+    return "joint_torque, tendon_excursion, tendon_force or q"
+
+
+def _free_paths(session: Session, kinematic: Excursions, report: Report) -> None:
+    """Report free motions whose excursions contradict those of ID.2."""
+    finger = session.finger
+    found = []
+    for trial in session.select("VD.1", "VD.3"):
+        if trial.tendon_excursion is None:
+            continue
+        q, l = thinned(trial.q), thinned(trial.tendon_excursion)
+        for k in np.flatnonzero(finger.active):
+            joints = np.flatnonzero(finger.crosses[k])
+            if any((int(k), int(i)) not in kinematic.polynomials for i in joints) or not len(joints):
+                continue
+            expected = np.sum([kinematic.polynomials[int(k), int(i)](q[:, i]) for i in joints], axis=0)
+            ratio = slope(expected, l[:, k])
+            agree = 1.0 / _MAX_EXCURSION_RATIO < ratio < _MAX_EXCURSION_RATIO
+            if np.isfinite(ratio) and not agree and np.ptp(expected) > _MIN_PATH:
+                found.append(f"{finger.tendon_names[k]} in {trial.name} ({ratio:.2g} times)")
+    if found:
+        report.warning(
+            "/trials",
+            f"excursions along free paths are not those that ID.2 shows: {listed(found, 3)}; check sign, units and "
+            "columns of tendon_excursion and q in these trials",
+        )
+
+
+def _fingertip(session: Session, report: Report) -> None:
+    """Report fingertip forces that are too large or too small for the tension, or without a lever."""
+    finger, found = session.finger, []
+    without_lever = not np.cross(finger.axis[-1], finger.fingertip).any()
+    if without_lever and any(t.fingertip_force is not None for t in session.select("VD.2")):
+        report.warning(
+            "/finger/fingertip",
+            f"lies on the axis of joint {finger.joint_names[-1]}, so that no force there turns it, though VD.2 "
+            "presses with the fingertip; write the contact point in the last link's frame",
+        )
+    for trial in session.select("VD.2"):
+        k = finger.tendon(trial.tendon)
+        if k is None or trial.fingertip_force is None or trial.tendon_force is None:
+            continue
+        pull = thinned(trial.tendon_force[:, k])
+        size = float(np.linalg.norm([slope(pull, thinned(x)) for x in trial.fingertip_force.T]))
+        if np.isfinite(size) and not _FORCE_RATIOS[0] < size < _FORCE_RATIOS[1]:
+            found.append(f"{size:.3g} N for each N of {trial.tendon} in {trial.name}")
+    if found:
+        report.warning(
+            "/trials",
+            f"the fingertip presses with {listed(found, 3)}; check the units of fingertip_force and tendon_force",
+        )
+
+
+def _passivity(session: Session, report: Report) -> None:
+    """Report joints whose torque has friction of the wrong sign."""
+    finger = session.finger
+    shares: dict[str, list[float]] = defaultdict(list)
+    for trial in session.select("ID.3-static", "ID.3-dynamic"):
+        i = finger.joint(trial.joint)
+        if i is None or trial.joint_torque is None or len(trial.time) < 50:
+            continue
+        share = _friction_share(trial, i)
+        if np.isfinite(share):
+            shares[finger.joint_names[i]].append(share)
+    found = [joint for joint, of_trials in shares.items() if np.median(of_trials) < -_MAX_NEGATIVE_FRICTION]
+    if found:
+        report.warning(
+            "/trials",
+            f"the external motor takes work out of the joint in every cycle: {listed(found, 3)}; check the sign of "
+            "joint_torque and of q, and whether one of the two is late",
+        )
+
+
+def _friction_share(trial: Trial, joint: int) -> float:
+    """Friction torque over the torque's standard deviation, by regression on direction and angle; NaN where unclear."""
+    assert trial.joint_torque is not None
+    q, torque = trial.q[:, [joint]], trial.joint_torque[:, [joint]]
+    if not (np.isfinite(q).all() and np.isfinite(torque).all() and np.ptp(torque) > 0.0):
+        return np.nan
+    cutoff = fitting_cutoff(trial.time, CUTOFF_HZ)
+    direction = _direction(trial, joint, cutoff)
+    q, torque = (low_pass(trial.time, x, cutoff)[:, 0] for x in (q, torque))
+    moves, powers = direction != 0.0, np.polynomial.polynomial.polyvander((q - q.mean()) / np.ptp(q), 5)
+    columns = np.column_stack([direction, powers])[moves]
+    if len(columns) < 50 or np.ptp(columns[:, 0]) == 0.0:
+        return np.nan  # In one direction only, friction and elastic torque cannot be told apart.
+    if trial.experiment != "ID.3-static" and np.count_nonzero(np.diff(columns[:, 0])) < _MIN_TURNS:
+        return np.nan
+    R = np.asarray(np.linalg.qr(np.column_stack([columns, torque[moves]]), mode="r"))
+    # There may be fewer held angles than coefficients, so `lstsq` gives the smallest coefficients that fit.
+    least = np.linalg.lstsq(R[:-1, :-1], R[:-1, -1])[0]
+    return float(least[0] / np.std(torque))
+
+
+def _direction(trial: Trial, joint: int, cutoff: float) -> np.ndarray:
+    """Direction (N,) of a joint's motion: the file's channel, or derived from its filtered speed."""
+    if trial.joint_direction is not None:
+        return trial.joint_direction[:, joint].astype(float)
+    rate = smooth(trial.time, trial.q[:, [joint]], cutoff)[1]
+    return directions(rate, STILL_SHARE * np.percentile(np.abs(rate), 99, axis=0))[:, 0]

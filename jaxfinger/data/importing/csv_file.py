@@ -1,0 +1,348 @@
+"""CSV files of any program. The dialect is the one in which most cells are numbers.
+
+Excel, TwinCAT Scope, oscilloscopes and `numpy.savetxt` differ in separator, decimal mark, quotes, encoding and header.
+The standard library's Sniffer and its successors guess separator and quotes from punctuation, and know neither decimal
+commas nor headers of several lines. Counting numbers finds all of these at once.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from jaxfinger.data.importing.recording import Recording, Variable
+from jaxfinger.errors import UserError, counted, listed
+
+_COMMENTS = ("#", "%")
+_DIALECT_LINES = 60  # They decide the dialect, and are taken from the middle of the file, after any header.
+_BOOLEANS = {"true": 1.0, "false": 0.0}
+# What programs write for a missing value: words, errors of spreadsheets, and NaN of Microsoft's C library.
+_SHEET_ERRORS = ("#n/a", "#div/0!", "#value!", "#num!", "#null!", "#ref!", "#name?")
+_MISSING = {"-", "--", "na", "n/a", "null", "none", *_SHEET_ERRORS, "1.#qnan", "-1.#ind", "1.#ind", "-nan(ind)"}
+_UNIT = r"%|°|deg|rad|turn|rev|rpm|k?Hz|[mun]?s|[munc]?m|[mk]?N|[mk]?N[ ·*]?[cm]?m|[mu]?A|[mk]?V|°?C|K|[mk]?g|1|-|bool"
+_UNIT_CELL = re.compile(rf"^[\[(]?({_UNIT}|{_UNIT}/s2?|)[\])]?$")
+_UNIT_SUFFIX = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")  # in brackets after a name
+_DATE = re.compile(r"^\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
+_HOUR = re.compile(r"\d:\d\d")  # in a time of day or a date
+_BLANKS = " \u00a0\u202f'’"  # that group digits, and are never a decimal mark
+# Numbers with groups of three digits, by decimal mark. One group alone behind the other mark is no such number: 1,234
+# may be 1234 or 1.234.
+_GROUPED = {
+    mark: re.compile(
+        rf"^[+-]?\d{{1,3}}(?:(?:[{other}]\d{{3}})+[{mark}]\d*|(?:[{other}]\d{{3}}){{2,}}|"
+        rf"(?:[{_BLANKS}]\d{{3}})+(?:[{mark}]\d*)?)$"
+    )
+    for mark, other in (".,", ",.")
+}
+_ONE_GROUP = re.compile(r"^[+-]?[1-9]\d{0,2}[.,]\d{3}$")
+_SCOPE = "SampleTime[ms]"  # header of TwinCAT Scope, which writes a column of times in ms beside each channel
+
+
+@dataclass(frozen=True)
+class _Dialect:
+    """Separator of the cells (None is any run of blanks) and decimal mark."""
+
+    separator: str | None
+    mark: str
+
+    def split(self, line: str) -> list[str]:
+        """Cells of a line."""
+        cells = line.split() if self.separator is None else next(csv.reader([line], delimiter=self.separator), [])
+        return [cell.strip() for cell in cells]
+
+    def number(self, cell: str) -> float | None:
+        """Number in a cell: NaN where a value is missing, None where the cell holds something else."""
+        comma = self.mark == "," and cell.count(",") == 1 and "." not in cell
+        value = _cell(cell.replace(",", ".") if comma else cell)
+        if value is None and _GROUPED[self.mark].match(cell):
+            other = "." if self.mark == "," else ","
+            return float(re.sub(f"[{other}{_BLANKS}]", "", cell).replace(",", "."))
+        return value
+
+
+# Of equally good dialects the first is taken.
+_DIALECTS = tuple(
+    _Dialect(*pair)
+    for pair in (
+        *((",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("|", "."), (None, "."), (None, ",")),
+        (",", ","),  # with quotes around the numbers
+    )
+)
+
+
+@dataclass(frozen=True)
+class _Line:
+    number: int  # line number in the file, from 1
+    text: str
+
+
+def load_csv(path: Path) -> Recording:
+    """Load the columns of a CSV file by the names above the numbers, or as `column 0`, `column 1` and so on.
+
+    Empty cells and words for a missing value (`-`, `#N/A`) are NaN, True and False are 1 and 0, and dates with a time
+    of day are seconds since 1970. A column of words can be tested, not computed with.
+
+    Raises:
+        UserError: the file has no column of numbers, or a line with another number of cells.
+    """
+    lines = [_Line(number, text) for number, text in enumerate(_lines(_decode(path.read_bytes())), 1) if text.strip()]
+    body = [line for line in lines if not _is_comment(line.text)]
+    if not body:
+        raise UserError(f"{path}: holds no samples; it needs a line of names, then one line a sample")
+    sample = body[len(body) // 2 :][:_DIALECT_LINES]
+    dialect, numeric = _find_dialect([line.text for line in sample])
+    split = dialect.split
+    if not any(numeric):
+        raise UserError(f"{path}: holds no column of numbers; give a table with one line a sample")
+    first = next(i for i, line in enumerate(body) if _is_sample(dialect, split(line.text), numeric))
+    above = [line for line in lines if line.number < body[first].number]
+    names, units, scope = _names(above, dialect, len(numeric))
+    if not names and first > 0 and len(split(body[first - 1].text)) != len(numeric):
+        given = counted(len(split(body[first - 1].text)), "column")
+        raise UserError(f"{path}: names {given} and holds {len(numeric)}; give each column one name")
+    body, remarks = body[first:], ()
+    if (
+        not names
+        and [dialect.number(cell) for cell in split(body[0].text)] == list(range(len(numeric)))
+        and len(body) > 1
+    ):
+        names, body = tuple(split(body[0].text)), body[1:]  # pandas writes such a line over unnamed columns.
+    if len(body) > 1 and len(split(body[-1].text)) < len(numeric):
+        body, remarks = body[:-1], ("its last line is cut short and is left out",)
+    columns = _columns(path, body, dialect, numeric)
+    if scope:
+        return _pairs(path, columns, names, units)
+    return _named(path, columns, names, units, remarks)
+
+
+def _is_comment(text: str) -> bool:
+    text = text.lstrip().lower()
+    return text.startswith(_COMMENTS) and not text.startswith(_SHEET_ERRORS)
+
+
+def _lines(text: str) -> list[str]:
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+
+
+def _decode(raw: bytes) -> str:
+    """Decode by the byte order mark, as UTF-16 where many bytes are zero, as UTF-8, or else as Western European."""
+    marks = (codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")
+    for mark, encoding in marks:
+        if raw.startswith(mark):
+            return raw.decode(encoding, errors="replace")
+    for first, encoding in ((1, "utf-16-le"), (0, "utf-16-be")):
+        if raw[first:200:2].count(0) > 20:  # Latin text in UTF-16 has a zero in every second byte.
+            return raw.decode(encoding, errors="replace")
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError:
+        return raw.decode("cp1252", errors="replace")
+
+
+def _find_dialect(sample: Sequence[str]) -> tuple[_Dialect, list[bool]]:
+    """Dialect of a file by some of its lines, and a mask of the columns that hold numbers."""
+    best: tuple[tuple[float, int], _Dialect, list[bool]] | None = None
+    for dialect in _DIALECTS:
+        rows = [dialect.split(line) for line in sample]
+        widths = [len(row) for row in rows]
+        width = max(set(widths), key=widths.count)
+        rows = [row for row in rows if len(row) == width]
+        if dialect.separator == dialect.mark and _has_points(rows):
+            continue  # A quoted cell such as "1,2" is then a list of two.
+        numbers = np.array([[dialect.number(cell) is not None for cell in row] for row in rows])
+        filled = np.array([[bool(cell) for cell in row] for row in rows])
+        numeric = ((numbers & filled).sum(axis=0) * 2 > filled.sum(axis=0)) | ~filled.any(axis=0)
+        share = float((numbers & filled).sum()) / max(int(filled.sum()), 1) * len(rows) / len(sample)
+        score = (round(share, 2), width)  # Among dialects with about the same share of numbers, more columns win.
+        if best is None or score > best[0]:
+            best = score, dialect, numeric.tolist()
+    assert best is not None
+    return best[1], best[2] if best[0][0] > 0.0 else [False]
+
+
+def _has_points(rows: Sequence[Sequence[str]]) -> bool:
+    """Whether a cell is a number with a decimal point."""
+    return any("." in cell and not _HOUR.search(cell) and _cell(cell) is not None for row in rows for cell in row)
+
+
+def _cell(cell: str) -> float | None:
+    """Number with a decimal point, truth or date: NaN where it is missing, None where the cell holds something else."""
+    try:
+        return float(cell) if "_" not in cell else None
+    except ValueError:
+        pass
+    if cell.lower() in _BOOLEANS:
+        return _BOOLEANS[cell.lower()]
+    if _DATE.match(cell):
+        try:
+            stamp = datetime.fromisoformat(cell)
+            return (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp()
+        except ValueError:
+            return None
+    return np.nan if not cell or cell.lower() in _MISSING else None
+
+
+def _is_sample(dialect: _Dialect, cells: Sequence[str], numeric: Sequence[bool]) -> bool:
+    values = [dialect.number(cell) for cell, number in zip(cells, numeric, strict=False) if number]
+    return len(cells) == len(numeric) and None not in values and not all(np.isnan(v) for v in values if v is not None)
+
+
+def _names(above: Sequence[_Line], dialect: _Dialect, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
+    """Names of the columns, their units, and whether they are pairs of time and value as TwinCAT Scope writes them.
+
+    The names are the nearest line above the numbers that has a cell for each column and holds no units. They may stand
+    behind a comment mark (numpy.savetxt, gnuplot).
+    """
+    rows = []
+    for line in reversed(above):
+        text = line.text.strip()
+        plain = text.lstrip("".join(_COMMENTS)).strip()
+        cells = dialect.split(line.text if plain == text else plain)
+        if plain != text and len(cells) != width:
+            cells = plain.replace(",", " ").split()
+        if len(cells) == width and any(cells):
+            rows.append(cells)
+    labelled = {row[0]: tuple(row) for row in rows if row[::2] == row[:1] * (width // 2) and width % 2 == 0}
+    if _SCOPE in labelled and "Name" in labelled:
+        return labelled["Name"], labelled.get("Unit", ("",) * width), True
+    words = [row for row in rows if sum(_is_word(dialect, cell) for cell in row) * 2 > width]
+    units = ("",) * width
+    if len(words) > 1 and all(_UNIT_CELL.match(cell) for cell in words[0]):
+        units = tuple(cell.strip("[]()") for cell in words.pop(0))
+    return tuple(words[0]) if words else (), units, False
+
+
+def _is_word(dialect: _Dialect, cell: str) -> bool:
+    """Whether a cell above the numbers is a name or a unit; `-` is the unit of a ratio."""
+    return dialect.number(cell) is None or cell.lower() in _MISSING
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A column as numbers; without them the reason, and the words where it holds words."""
+
+    values: np.ndarray | None
+    fault: str = ""
+    words: np.ndarray | None = None
+
+
+def _columns(path: Path, body: Sequence[_Line], dialect: _Dialect, numeric: Sequence[bool]) -> list[_Column]:
+    """Columns of a table; `numeric` tells those in which most cells are numbers."""
+    separator, width, texts = dialect.separator, len(numeric), [line.text for line in body]
+    quoted = separator is None or any('"' in text for text in texts)
+    plain = all(numeric) and not quoted and not (dialect.mark == "," and any("." in text for text in texts))
+    if plain and all(text.count(str(separator)) == width - 1 for text in texts):
+        try:  # numpy reads plain numbers much faster than the loop below.
+            if dialect.mark == ",":
+                texts = [text.replace(",", ".") for text in texts]
+            return [_Column(x) for x in np.loadtxt(texts, delimiter=separator, ndmin=2, comments=None).T]
+        except ValueError:
+            pass
+    rows = []
+    for line in body:
+        rows.append(dialect.split(line.text) if quoted else line.text.split(separator))
+        if len(rows[-1]) != width:
+            raise UserError(
+                f"{path}: line {line.number} has {len(rows[-1])} cells, the others have {width}; correct or drop it"
+            )
+    # Where both marks stand for decimals in one file, or seem to, a number such as 1,234 is not clear.
+    mixed = dialect.mark == "," and _has_points(rows)
+    if separator == dialect.mark == ",":  # Quoted cells such as "1,234" may also hold groups of digits.
+        mixed |= all(_ONE_GROUP.match(cell.strip()) for row in rows for cell in row if "," in cell)
+    at = [line.number for line in body]
+    return [_column(cells, at, dialect, numeric[k], mixed) for k, cells in enumerate(zip(*rows, strict=True))]
+
+
+def _column(cells: Sequence[str], lines: Sequence[int], dialect: _Dialect, numeric: bool, mixed: bool) -> _Column:
+    """A column from its cells and their line numbers. With `mixed`, a number with one group of digits is not clear."""
+    if numeric and not mixed and (values := _plain_numbers(cells, dialect.mark)) is not None:
+        return _Column(values)
+    cells = [cell.strip() for cell in cells]
+    known = {cell: None if mixed and _ONE_GROUP.match(cell) else dialect.number(cell) for cell in set(cells)}
+    values = [known[cell] for cell in cells]
+    bad = [k for k, value in enumerate(values) if value is None]
+    if not bad:
+        return _Column(np.array(values, np.float64))
+    first = cells[bad[0]]
+    some_numbers = any(value is not None and not np.isnan(value) for value in known.values())
+    if some_numbers or _HOUR.search(first) or _ONE_GROUP.match(first):
+        return _Column(None, _fault(first, lines[bad[0]], len(bad) - 1))
+    there = listed([repr(cell) for cell in dict.fromkeys(cells) if cell], 4)
+    fault = f"holds the words {there}; a trial's `where` can test it"
+    return _Column(None, fault, np.array(cells, np.dtypes.StringDType()))
+
+
+def _plain_numbers(cells: Sequence[str], mark: str) -> np.ndarray | None:
+    """Numbers of a column without groups of digits, dates and words, which are read much faster; None for others."""
+    text = "".join(cells)
+    if "_" in text or (mark == "," and "." in text):
+        return None
+    points = cells if mark == "." else [cell.replace(mark, ".") for cell in cells]
+    try:
+        return np.array([cell or "nan" for cell in points], np.float64)
+    except ValueError:
+        return None
+
+
+def _fault(cell: str, line: int, others: int) -> str:
+    """Why a column cannot be used, by its first cell that is no number and the count of others."""
+    more = f", and {counted(others, 'more cell')} of this kind" if others else ""
+    if _ONE_GROUP.match(cell):
+        whole, part = re.split("[.,]", cell)
+        read = f"which is {whole}.{part} or {whole}{part}"
+        return f"holds {cell!r} in line {line}, {read}{more}; write it without thousands separators"
+    mend = "empty these cells where a value is missing, else write numbers" if others else "correct or drop that line"
+    if _HOUR.search(cell):
+        mend = "write seconds, or dates as 2026-01-31 12:00:00.000"
+    return f"holds {cell!r} in line {line}, which is no number{more}; {mend}"
+
+
+def _named(
+    path: Path, columns: Sequence[_Column], names: Sequence[str], units: Sequence[str], remarks: tuple[str, ...]
+) -> Recording:
+    """Recording of a table with named columns. Columns that share a name or hold no numbers are unusable."""
+    names = names or ("",) * len(columns)
+    places: dict[str, list[int]] = defaultdict(list)
+    for k, (name, column) in enumerate(zip(names, columns, strict=True)):
+        if name or column.values is None or not np.isnan(column.values).all():  # Trailing separators make empty ones.
+            places[name or f"column {k}"].append(k)
+    variables, unusable, words = {}, {}, {}
+    for name, (k, *others) in places.items():
+        column = columns[k]
+        if others:
+            numbers = " and ".join(str(place + 1) for place in (k, *others))
+            unusable[name] = f"is the name of the columns {numbers}; give each column its own name"
+        elif column.values is not None:
+            suffix = _UNIT_SUFFIX.search(name)
+            variables[name] = Variable(column.values, units=units[k] or (suffix.group(1).strip() if suffix else ""))
+        else:
+            unusable[name] = column.fault
+            if column.words is not None:
+                words[name] = column.words
+    return Recording(path, variables, unusable, remarks, words)
+
+
+def _pairs(path: Path, columns: Sequence[_Column], names: Sequence[str], units: Sequence[str]) -> Recording:
+    """Recording of TwinCAT Scope, with a column of times in ms before every channel. It becomes `name.time`, in s."""
+    variables: dict[str, Variable] = {}
+    unusable: dict[str, str] = {}
+    for k in range(0, len(columns), 2):
+        name, clock, channel = names[k + 1], columns[k], columns[k + 1]
+        if name in variables or name in unusable:
+            variables.pop(name, None)
+            unusable[name] = "is the name of two channels; give each channel its own name"
+        elif clock.values is None or channel.values is None:
+            unusable[name] = clock.fault or channel.fault
+        else:
+            filled = np.isfinite(clock.values)  # Channels with a lower sampling rate end earlier.
+            variables[f"{name}.time"] = Variable(clock.values[filled] * 1e-3, units="s")
+            variables[name] = Variable(channel.values[filled], clock=f"{name}.time", units=units[k + 1])
+    return Recording(path, variables, unusable)

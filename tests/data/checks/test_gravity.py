@@ -1,0 +1,106 @@
+"""The direction of gravity against the torques of ID.3."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaxfinger.data import Session, Trial
+from jaxfinger.data.checks.gravity import check_gravity
+from jaxfinger.data.findings import Report
+from jaxfinger.data.mounting import gravity_levers
+from jaxfinger.synthetic.random_finger import random_finger
+from tests.data.conftest import make_finger
+
+POSTURES = (-0.6, 0.2, 1.1)  # rad, of all joints but the one that moves
+
+
+def swept(finger, i, posture, gravity, rng, rate=200.0, noise=2e-4, tare=5e-3, cycles=3.0) -> Trial:
+    """Trial in which a motor sweeps joint i, with all laws of a joint that the check is to leave aside."""
+    time = np.arange(int(8.0 * rate)) / rate
+    q = np.full((len(time), finger.m), posture) + 1e-4 * rng.standard_normal((len(time), finger.m))
+    q[:, i] = 0.7 - 0.6 * np.cos(2.0 * np.pi * cycles * time / time[-1])
+    speed = np.gradient(q[:, i], time)
+    own = 0.02 * (q[:, i] - 0.5) + 0.01 * (q[:, i] - 0.5) ** 3 + 0.002 * np.tanh(speed / 0.02) + 5e-5 * speed
+    torque = np.full_like(q, np.nan)
+    torque[:, i] = own - gravity_levers(finger, q)[:, i] @ gravity + noise * rng.standard_normal(len(q))
+    torque[:, i] += tare * rng.standard_normal()
+    name = f"{finger.joint_names[i]}-{posture}"
+    return Trial(name, "ID.3-dynamic", time, q, joint_torque=torque, joint=finger.joint_names[i])
+
+
+def session_of(finger, postures=POSTURES, seed=0, **how) -> Session:
+    rng = np.random.default_rng(seed)
+    trials = [swept(finger, i, x, finger.gravity, rng, **how) for i in range(finger.m) for x in postures]
+    return Session("finger", finger, {trial.name: trial for trial in trials})
+
+
+def said(session, **changes):
+    """Findings where the finger is described with these changes."""
+    report = Report()
+    check_gravity(replace(session, finger=replace(session.finger, **changes)), report)
+    return [str(finding) for finding in report]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"gravity": np.array([0.0, 0.0, 9.81])},
+        {"gravity": np.array([0.0, -9.81, 0.0])},
+        {"gravity": np.array([-9.81, 0.0, 0.0])},
+        {"axis": np.array([[0.0, -1.0, 0.0], [0.0, -1.0, 0.0]])},
+    ],
+    ids=["up", "sideways", "along the finger", "axes turned round"],
+)
+def test_gravity_turned_round_or_sideways_is_named(changes):
+    (finding,) = said(session_of(make_finger()), **changes)
+    assert "/finger: has `gravity` with" in finding
+    assert "correct `gravity`, `axis` or `com`, or the signs of q and joint_torque of MCP, PIP" in finding
+
+
+@pytest.mark.parametrize(
+    "how",
+    [{}, {"rate": 1000.0}, {"rate": 50.0, "noise": 1e-3}, {"tare": 0.5}, {"noise": 0.0, "tare": 0.0}, {"cycles": 0.5}],
+    ids=repr,
+)
+def test_sound_fingers_are_silent(how):
+    for seed in range(12):
+        layout = ("planar", "abduction", "spatial")[seed % 3]
+        finger = random_finger(seed, 1 + seed % 4, layout).description
+        assert said(session_of(finger, seed=seed, **how)) == []
+
+
+def test_a_small_tilt_is_left_to_the_diagnosis():
+    session = session_of(make_finger())
+    assert said(session, gravity=9.81 * np.array([np.sin(0.35), 0.0, -np.cos(0.35)])) == []
+
+
+TURNED = np.array([0.0, 0.0, 9.81])
+
+
+def test_one_posture_cannot_show_gravity():
+    assert said(session_of(make_finger(), postures=POSTURES[:1]), gravity=TURNED) == []
+
+
+def test_a_passive_tendon_that_couples_joints_makes_the_elastic_torque_depend_on_the_posture():
+    assert said(session_of(make_finger()), gravity=TURNED, active=np.array([False, True, True])) == []
+
+
+def test_torques_that_show_far_more_than_gravity_have_another_reason():
+    session = session_of(replace(make_finger(), gravity=-2.0 * TURNED))
+    assert said(session, gravity=TURNED) == []
+
+
+def test_torques_as_noisy_as_the_weight_do_not_show_it():
+    assert said(session_of(make_finger(), noise=0.1), gravity=TURNED) == []
+
+
+def test_missing_and_standing_torques_do_not_stop_the_check():
+    session = session_of(make_finger())
+    first, *others = session
+    still = replace(first, name="still", q=np.full_like(first.q, 0.3))
+    huge = replace(first, name="huge", q=1e200 * first.q, joint_torque=np.full_like(first.q, 1e300))
+    missing = replace(first, name="missing", joint_torque=None)
+    with np.errstate(all="ignore"):
+        for trials in ((still, huge, missing, *others), (missing,), (still,), (huge,)):
+            assert said(replace(session, trials={t.name: t for t in trials})) == []

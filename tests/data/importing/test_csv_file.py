@@ -1,0 +1,173 @@
+"""CSV files of many programs, and files with wrong lines."""
+
+import numpy as np
+import pytest
+
+from jaxfinger.data.importing.csv_file import load_csv
+from jaxfinger.errors import UserError
+
+NUMBERS = "0.00,1.5,-3\n0.01,1.6,-4\n0.02,1.7,-5\n"
+
+
+def load(tmp_path, content, name="log.csv"):
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return load_csv(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "names"),
+    [
+        ("t,a,b\n" + NUMBERS, ["t", "a", "b"]),
+        ("# made by X\n# t a b\n" + NUMBERS.replace(",", " "), ["t", "a", "b"]),
+        ("t,a,b\ns,deg,N\n" + NUMBERS, ["t", "a", "b"]),
+        (NUMBERS, ["column 0", "column 1", "column 2"]),
+        ("0,1,2\n" + NUMBERS, ["0", "1", "2"]),
+        (",a,b\n" + NUMBERS, ["column 0", "a", "b"]),
+        ("t,a,b\r\n" + NUMBERS.replace("\n", "\r\n"), ["t", "a", "b"]),
+        ('"t"\t"a"\t"b"\n' + NUMBERS.replace(",", "\t"), ["t", "a", "b"]),
+        ("t;a;b\n" + NUMBERS.replace(",", ";").replace(".", ","), ["t", "a", "b"]),
+        ('t,a,b\n"0,00","1,5",-3\n"0,01","1,6","-4"\n"0,02","1,7",-5\n', ["t", "a", "b"]),
+        ('"t";"a";"b"\n"0,00";"1,5";"-3"\n"0,01";"1,6";"-4"\n"0,02";"1,7";"-5"\n', ["t", "a", "b"]),
+        *(
+            (mark + ("t,a,b\n" + NUMBERS).encode(encoding), ["t", "a", "b"])
+            for mark, encoding in (
+                (b"", "utf-8-sig"),
+                (b"", "utf-16-le"),
+                (b"", "utf-16-be"),
+                (b"\xff\xfe", "utf-16-le"),
+                (b"\xfe\xff", "utf-16-be"),
+            )
+        ),
+        ("Instrument X\nRun 7, of Monday\n\nt,a,b\n" + NUMBERS, ["t", "a", "b"]),
+    ],
+)
+def test_names_and_numbers(tmp_path, content, names):
+    found = load(tmp_path, content)
+    assert list(found.variables) == names
+    assert found.unusable == {}
+    values = [v.values for v in found.variables.values()]
+    np.testing.assert_array_equal(values, [[0.0, 0.01, 0.02], [1.5, 1.6, 1.7], [-3, -4, -5]])
+
+
+def test_units_below_the_names_or_in_them(tmp_path):
+    found = load(tmp_path, "t,a [deg],b\ns,,N\n" + NUMBERS).variables
+    assert [v.units for v in found.values()] == ["s", "deg", "N"]
+
+
+def test_truth_dates_and_empty_cells(tmp_path):
+    text = "when,on,x\n2024-03-01 12:00:00.000,True,1\n2024-03-01 12:00:00.005,False,\n2024-03-01T12:00:00.010,True,3\n"
+    found = load(tmp_path, text).variables
+    np.testing.assert_allclose(np.diff(found["when"].values), 0.005, atol=1e-6)
+    np.testing.assert_array_equal(found["on"].values, [1, 0, 1])
+    np.testing.assert_array_equal(found["x"].values, [1, np.nan, 3])
+
+
+def test_a_text_column_leaves_the_others_usable(tmp_path):
+    found = load(tmp_path, "t,what\n0,idle\n1,moves\n2,moves\n")
+    assert list(found.variables) == ["t"]
+    assert found.unusable["what"] == "holds the words 'idle', 'moves'; a trial's `where` can test it"
+    assert found.words["what"].tolist() == ["idle", "moves", "moves"]
+
+
+def test_numbers_of_which_most_are_spoiled_are_no_words(tmp_path):
+    found = load(tmp_path, "t,a\n0,err\n1,err\n2,3.5\n3,err\n")
+    assert "holds 'err' in line 2, which is no number, and 2 more cells of this kind" in found.unusable["a"]
+    assert not found.words
+
+
+def test_a_text_column_without_a_name_is_said(tmp_path):
+    assert "'idle', 'moves'" in load(tmp_path, "0,idle\n1,moves\n2,moves\n").unusable["column 1"]
+
+
+def test_a_word_among_numbers_is_named_with_its_line(tmp_path):
+    found = load(tmp_path, "# made\n\nt,a\n0,1\n1,err\n2,3\n3,3\n4,5\n5,1\n")
+    assert "holds 'err' in line 5" in found.unusable["a"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        't,a\n0.00,"1,234.50"\n0.01,"12,345.0"\n0.02,"1,234,567"\n',
+        "t;a\n0.00;1,234.50\n0.01;12,345.0\n0.02;1,234,567\n",
+        "t;a\n0,00;1.234,50\n0,01;12.345,0\n0,02;1.234.567\n",
+        "t;a\n0,00;1\u202f234,50\n0,01;12\u202f345\n0,02;1\u202f234\u202f567\n",
+        "t;a\n0.00;1'234.50\n0.01;12'345\n0.02;1'234'567\n",
+    ],
+)
+def test_groups_of_three_digits(tmp_path, content):
+    found = load(tmp_path, content).variables
+    np.testing.assert_array_equal([v.values for v in found.values()], [[0.0, 0.01, 0.02], [1234.5, 12345.0, 1234567.0]])
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "t\ta\n0.010\t1,900\n0.020\t1,937\n0.030\t2,011\n",
+        't,a\n0.010,"1,900"\n0.020,"1,937"\n0.030,"2,011"\n',
+        "t;a\n0,010;1.900\n0,020;1.937\n0,030;2.011\n",
+    ],
+)
+def test_one_group_of_three_digits_is_not_taken_for_decimals(tmp_path, content):
+    found = load(tmp_path, content)
+    assert list(found.variables) == ["t"]
+    assert "in line 2, which is 1.900 or 1900, and 2 more cells" in found.unusable["a"]
+    assert "without thousands separators" in found.unusable["a"]
+
+
+def test_decimal_commas_beside_dates_with_a_point(tmp_path):
+    text = "".join(f"2024-03-01 12:00:00.00{k};1,23{k}\n" for k in range(5))
+    np.testing.assert_allclose(load(tmp_path, "t;a\n" + text).variables["a"].values, 1.23 + 0.001 * np.arange(5))
+
+
+@pytest.mark.parametrize(
+    "word", ["-", "--", "#N/A", "NA", "n/a", "NULL", "None", "nan", "#DIV/0!", "1.#QNAN", "-1.#IND"]
+)
+def test_words_for_a_missing_value(tmp_path, word):
+    found = load(tmp_path, f"a,t\n1,0\n{word},1\n3,2\n4,3\n")
+    np.testing.assert_array_equal(found.variables["a"].values, [1, np.nan, 3, 4])
+    assert found.unusable == {}
+
+
+def test_a_ratio_has_the_unit_of_a_dash(tmp_path):
+    assert [v.units for v in load(tmp_path, "t,a,b\ns,-,-\n" + NUMBERS).variables.values()] == ["s", "-", "-"]
+
+
+def test_a_time_of_day_is_told_how_to_be_written(tmp_path):
+    found = load(tmp_path, "t,a\n12:00:00.000,1\n12:00:00.010,2\n12:00:00.020,3\n")
+    assert (
+        "in line 2, which is no number, and 2 more cells of this kind; write seconds, or dates" in found.unusable["t"]
+    )
+
+
+def test_a_line_of_another_width(tmp_path):
+    with pytest.raises(UserError, match=r"line 3 has 2 cells, the others have 3"):
+        load(tmp_path, "t,a,b\n0,1,2\n1,2\n2,3,4\n3,4,5\n")
+    found = load(tmp_path, "t,a,b\n" + NUMBERS + "0.03,1.")
+    assert len(found.variables["t"].values) == 3
+    assert found.remarks == ("its last line is cut short and is left out",)
+
+
+def test_columns_of_one_name(tmp_path):
+    found = load(tmp_path, "t,a,a\n" + NUMBERS)
+    assert list(found.variables) == ["t"]
+    assert "columns 2 and 3" in found.unusable["a"]
+
+
+@pytest.mark.parametrize("content", ["", "t,a\n", "only words\nand words\n", b"\x00\x01\x02"])
+def test_what_is_no_table(tmp_path, content):
+    with pytest.raises(UserError):
+        load(tmp_path, content)
+
+
+def test_quoted_groups_of_digits_are_no_decimals(tmp_path):
+    """Where a decimal comma shows elsewhere in the file, three digits behind a comma are decimals."""
+    groups = load(tmp_path, 't,a\n1,"1,234"\n2,"2,345"\n3,950\n')
+    assert "which is 1.234 or 1234" in groups.unusable["a"]
+    decimals = load(tmp_path, 't,a\n"0,001","1,234"\n"0,002","2,345"\n"0,003","0,950"\n')
+    np.testing.assert_array_equal(decimals.variables["a"].values, [1.234, 2.345, 0.95])
+
+
+def test_lists_in_quotes_are_no_decimals(tmp_path):
+    lists = load(tmp_path, 't,a\n1.5,"1,2"\n2.5,"3,4"\n3.5,"3,5"\n')
+    assert list(lists.words["a"]) == ["1,2", "3,4", "3,5"]

@@ -1,0 +1,249 @@
+"""`look` describes a recording and proposes a mapping that imports it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from jaxfinger.cli import main
+from jaxfinger.data.importing.look import clocks_of, columns_of, proposal
+from jaxfinger.data.importing.mapping import read_mapping
+from jaxfinger.data.importing.sources import load_recording
+from jaxfinger.data.units import TO_SI
+from tests.data.conftest import ONE_JOINT, make_finger
+
+CASES = Path(__file__).parents[1] / "cases"
+TIME = np.delete(np.arange(1000), [500, 501, 502, 503, 504, 505, 506]) * 5.0
+
+
+@pytest.fixture
+def log(tmp_path):
+    """CSV file with a gap, in degrees, N mm and ms, which only its ranges show."""
+    columns = [TIME, 40 + 30 * np.sin(TIME / 1e3), 80 * np.cos(TIME / 1e3), 300 * np.sin(TIME / 1e2)]
+    path = tmp_path / "log.csv"
+    np.savetxt(path, np.column_stack(columns), "%.6f", ",", header="t,enc,dq,tau", comments="")
+    return path
+
+
+def test_units_rates_and_gaps(log):
+    recording = load_recording(log)
+    seen = columns_of(recording)
+    assert [(s.name, s.meaning, s.units) for s in seen] == [
+        ("t", "time", "ms"),
+        ("enc", "q", "deg"),
+        ("dq", "", ""),
+        ("tau", "joint_torque", "N mm"),
+    ]
+    (clock,) = clocks_of(recording, seen)
+    assert (clock.rate, clock.gaps, clock.longest) == (pytest.approx(200.0), 1, pytest.approx(0.04))
+
+
+def test_a_shuffled_clock_is_said_and_its_rate_is_that_of_sorted_stamps(tmp_path, capsys):
+    path, order = tmp_path / "log.csv", np.random.default_rng(5).permutation(len(TIME))
+    table = np.column_stack([TIME, 40 + 30 * np.sin(TIME / 1e3)])[order]
+    np.savetxt(path, table, "%.6f", ",", header="t,enc", comments="")
+    recording = load_recording(path)
+    seen = columns_of(recording)
+    (clock,) = clocks_of(recording, seen)
+    assert (seen[0].units, clock.rate, clock.disordered) == ("ms", pytest.approx(200.0), (np.diff(order) < 0).sum())
+    assert main(["look", str(path)]) in (0, None)
+    said = capsys.readouterr().out
+    assert f"{clock.disordered} stamps out of order or repeated, the rate is of sorted ones" in said
+    assert "sort = true" in said
+
+
+def test_a_clock_that_begins_again_is_said(tmp_path, capsys):
+    path = tmp_path / "log.csv"
+    np.savetxt(path, np.column_stack([TIME % 4000.0, TIME]), "%.6f", ",", header="t,enc", comments="")
+    (clock,) = clocks_of(recording := load_recording(path), columns_of(recording))
+    assert (clock.rate, clock.restarts) == (pytest.approx(200.0), int(TIME[-1] // 4000.0))
+    main(["look", str(path)])
+    said = capsys.readouterr().out
+    assert "it begins again or wraps at" in said
+    assert "# the time begins again after sample 792: a trial for each part, chosen by `where`" in said
+    assert "sort = true" not in said
+
+
+def test_units_that_no_mapping_converts_are_said_and_not_guessed_anew(tmp_path, capsys):
+    path = tmp_path / "log.csv"
+    rows = np.column_stack([TIME / 1e3, 0.5 + 0.4 * np.sin(TIME / 1e3), 0.3 + 0.2 * np.sin(TIME / 1e3)])
+    np.savetxt(path, rows, "%.6f", ",", header="t [s],MCP angle [turns],T1 length [in]", comments="")
+    seen = columns_of(load_recording(path))
+    assert [(s.meaning, s.units, s.foreign) for s in seen[1:]] == [("q", "turn", ""), ("tendon_excursion", "", "in")]
+    main(["look", str(path)])
+    said = capsys.readouterr().out
+    assert 'channels.q.J1 = { from = "MCP angle [turns]", units = "turn" }' in said
+    assert 'channels.tendon_excursion.T1 = { from = "T1 length [in]" }   # units? it states in: write `scale`' in said
+
+
+def test_units_that_a_file_states_come_first():
+    recording = load_recording(CASES / "csv-as-other-programs-write-it" / "scope.csv")
+    assert {s.name: (s.units, s.stated) for s in columns_of(recording)}["tau"] == ("N m", True)
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        "csv-as-other-programs-write-it/latin1.csv",
+        "csv-as-other-programs-write-it/scope.csv",
+        "csv-as-other-programs-write-it/heads.csv",
+        "joint-states-of-two-publishers/log",
+        "one-message-at-time-zero/log.mcap",
+        "simulink-signal-of-two-columns/log.mat",
+        "own-clock-in-ms/log.mat",
+    ],
+)
+@pytest.mark.parametrize("finger", [None, make_finger()])
+def test_what_is_proposed_parses(file, finger, tmp_path):
+    (tmp_path / "m.toml").write_text(proposal([load_recording(CASES / file)], finger))
+    mapping, _ = read_mapping(tmp_path / "m.toml")
+    assert mapping.trials
+
+
+def test_what_is_proposed_imports(log, tmp_path, capsys):
+    (tmp_path / "finger.toml").write_text(ONE_JOINT[ONE_JOINT.index("[finger]") :])
+    main(["look", str(log), "--finger", str(tmp_path / "finger.toml")])
+    said = capsys.readouterr().out
+    (tmp_path / "m.toml").write_text(said[said.index("# a mapping") :])
+    main(["import", str(log), "--mapping", str(tmp_path / "m.toml"), "--output", str(tmp_path / "s.h5")])
+    capsys.readouterr()
+    main(["look", str(log), "--json"])
+    assert json.loads(capsys.readouterr().out)[0]["columns"][1]["high"] == pytest.approx(70, abs=0.1)
+
+
+def test_names_do_not_steer_the_terminal(tmp_path, capsys):
+    path = tmp_path / "log.mcap"
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("s", "jsonschema", b"{}")
+        channel = writer.register_channel("/[/]\x1b[31m", "json", schema)
+        for i in range(5):
+            writer.add_message(channel, log_time=i, publish_time=i, data=json.dumps({"[/]q": i}).encode())
+        writer.finish()
+    main(["look", str(path)])
+    said = capsys.readouterr().out
+    assert "\x1b" not in said
+    assert "[/]q" in said
+
+
+def test_variables_that_give_no_numbers_are_named(tmp_path, capsys):
+    scipy.io.savemat(tmp_path / "log.mat", {"t": TIME, "note": "text", "z": 1j * TIME})
+    main(["look", str(tmp_path / "log.mat")])
+    said = capsys.readouterr().out
+    assert "z is complex" in said
+    assert "note is text" in said
+
+
+@pytest.mark.parametrize(
+    ("columns", "experiment"),
+    [
+        ({"F_A": 2.0, "F_B": 2.0, "A_mm": 1.0}, "ID.2"),
+        ({"A_mm": 1.0, "B_mm": 1.0}, "ID.2"),
+        ({"knob_Nmm": 1.0}, "ID.3-dynamic"),
+    ],
+)
+def test_what_is_measured_of_a_swept_joint_says_which_experiment_it_is(tmp_path, columns, experiment):
+    """Without torque, a swept joint means ID.2. A column F_… is a force."""
+    swing = 40.0 - 40.0 * np.cos(TIME / 1e3)
+    table = np.column_stack([TIME, swing, *(level + 0.1 * swing for level in columns.values())])
+    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header=",".join(["stamp_ms", "a_deg", *columns]), comments="")
+    recording = load_recording(tmp_path / "log.csv")
+    assert f'experiment = "{experiment}"' in proposal([recording])
+    forces = [s.name for s in columns_of(recording) if s.meaning == "tendon_force"]
+    assert forces == [name for name in columns if name.startswith("F_")]
+
+
+def test_a_unit_is_guessed_from_all_recordings_of_a_column(tmp_path):
+    """A joint held at 5 degrees in one recording is in degrees where another recording shows it at 80."""
+    logs = []
+    for name, angle in (("held", np.full(len(TIME), 5.7)), ("moved", 40.0 - 40.0 * np.cos(TIME / 1e3))):
+        logs.append(tmp_path / f"{name}.csv")
+        np.savetxt(logs[-1], np.column_stack([TIME, angle]), "%.6f", ",", header="t,enc", comments="")
+    recordings = [load_recording(log) for log in logs]
+    assert columns_of(recordings[0])[1].units == "rad"
+    assert columns_of(recordings[0], recordings)[1].units == "deg"
+    assert 'units = "rad"' not in proposal(recordings)
+
+
+def test_what_no_channel_reads_and_unclear_units_are_marked(tmp_path):
+    """Tensions of a thousand may be in mN or gf, so no unit is guessed, and the proposal says so."""
+    names = ("enc", "cell_A", "reaction")
+    table = np.column_stack([TIME, 40 + 30 * np.sin(TIME / 1e3), 600 + 600 * np.sin(TIME / 1e3), TIME])
+    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header=f"t,{','.join(names)}", comments="")
+    said = proposal([load_recording(tmp_path / "log.csv")])
+    assert 'channels.tendon_force.T1 = { from = "cell_A" }   # units? SI as it stands' in said
+    assert '# in no channel yet: "reaction"' in said
+
+
+@pytest.mark.parametrize(("unit", "newtons"), [("gf", 9.80665e-3), ("kgf", 9.80665)])
+def test_cells_may_read_gram_force(unit, newtons):
+    assert TO_SI[unit] == ("N", newtons, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("set_point", "measured"),
+    [("q_des", "q_meas"), ("Winkel_Soll [°]", "Winkel_Ist [°]"), ("target_pos", "actual_pos"), ("qDes", "q"),
+     ("des.q", "q"), ("pos_sp", "pos"), ("goal.joint.position", "joint.position"), ("enc_nominal", "enc_offset"),
+     ("SetPoint.q", "dataset.q"), ("set.angle", "set1.angle"), ("qset", "q_reflex"),
+     ("/hand/goals.position", "/target/joint_states.position")],
+)  # fmt: skip
+def test_a_measured_column_wins_over_its_set_point(tmp_path, set_point, measured):
+    """A torque's feedforward is a set-point as well."""
+    path = tmp_path / "log.csv"
+    angle = 40 + 30 * np.sin(TIME / 1e3)
+    table = np.column_stack([TIME, angle, angle + 0.1, np.cos(TIME / 1e3), np.cos(TIME / 1e3)])
+    header = f"t,{set_point},{measured},tau_ff,tau"
+    np.savetxt(path, table, "%.6f", ",", header=header, comments="", encoding="utf-8")
+    said = proposal([load_recording(path)])
+    assert f'channels.q.J1 = {{ from = "{measured}"' in said
+    assert 'channels.joint_torque.J1 = { from = "tau"' in said
+    assert f'# set-points by their names, which are not measured: "{set_point}", "tau_ff"' in said
+
+
+def test_a_set_point_alone_is_said(tmp_path):
+    path = tmp_path / "log.csv"
+    table = np.column_stack([TIME, 40 + 30 * np.sin(TIME / 1e3), np.cos(TIME / 1e3)])
+    np.savetxt(path, table, "%.6f", ",", header="t,q_soll,tau", comments="")
+    said = proposal([load_recording(path)])
+    assert "channels.q" not in said
+    assert '# set-points by their names, which are not measured: "q_soll"' in said
+
+
+@pytest.mark.parametrize("shared", [5, 500])
+def test_coarse_stamps_are_replaced_by_a_rate(tmp_path, shared):
+    path = tmp_path / "log.csv"
+    stamps = np.arange(10000) // shared * shared / 500
+    np.savetxt(path, np.column_stack([stamps, np.sin(stamps)]), "%.6f", ",", header="t,q", comments="")
+    said = proposal([load_recording(path)])
+    assert 'rate_hz = 500   # several samples share each stamp of "t"' in said
+    assert "time =" not in said
+    assert "sort" not in said
+
+
+@pytest.mark.parametrize(("motor", "joint"), [("motor_pos [deg]", "joint_pos [deg]"), ("driveAngle", "linkAngle")])
+def test_a_motors_angle_is_no_joints(tmp_path, motor, joint):
+    path, angle = tmp_path / "log.csv", 0.6 + 0.5 * np.sin(TIME / 1e3)
+    table = np.column_stack([TIME, 100.0 * angle, angle, 0.01 * angle])
+    np.savetxt(path, table, "%.6f", ",", header=f"t,{motor},{joint},torque", comments="")
+    said = proposal([load_recording(path)], make_finger())
+    assert f'channels.q.MCP = {{ from = "{joint}"' in said
+    assert "channels.q.PIP" not in said
+    assert f'# in no channel yet: "{motor}"' in said
+
+
+@pytest.mark.parametrize(
+    ("columns", "first", "second"), [("q2,q1", "q1", "q2"), ("enc_1_deg,enc_0_deg", "enc_0_deg", "enc_1_deg")]
+)
+def test_joints_that_are_named_by_number_are_taken_in_its_order(tmp_path, columns, first, second):
+    path = tmp_path / "log.csv"
+    table = np.column_stack([TIME, 20.0 + 0.0 * TIME, 40.0 + 30.0 * np.sin(TIME / 1e3)])
+    np.savetxt(path, table, "%.6f", ",", header=f"t,{columns}", comments="")
+    said = proposal([load_recording(path)], make_finger())
+    assert f'channels.q.MCP = {{ from = "{first}"' in said
+    assert f'channels.q.PIP = {{ from = "{second}"' in said
+    assert 'joint = "MCP"' in said
