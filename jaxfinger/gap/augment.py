@@ -18,11 +18,10 @@ from jaxfinger.gap.projector import Projector
 from jaxfinger.gap.result import Value
 from jaxfinger.gap.signatures import Signatures
 from jaxfinger.identify import Fit
-from jaxfinger.identify.cluster_robust import stretch_scores
 from jaxfinger.identify.fit import StageReport
+from jaxfinger.identify.intervals import evidence, laplace
 from jaxfinger.identify.parameters import describe, ravel, units_at
 from jaxfinger.identify.prior import Prior
-from jaxfinger.identify.propagate import laplace
 from jaxfinger.identify.solve import Solution, Source, residuals_each, solve, white_tangents
 from jaxfinger.model import Model
 
@@ -200,13 +199,12 @@ def _covariance(
     """Laplace covariance (JᵀJ + prior precision)⁻¹, with causes in the weights of the formula.
 
     Standard deviations grow where the scores of successive stretches vary more than the noise explains
-    (`cluster_robust`).
+    (`intervals`).
     """
     if chosen is not None:
         project = Projector(problem, chosen.columns, chosen.linear_fit.weights)
         r, J = project.weighted(r[None])[0], project.weighted(J.T).T
-    inverse, _, grow = laplace(J.T @ J, root, stretch_scores(r, J, problem.stretch_of_row))
-    return inverse * np.outer(grow, grow)
+    return laplace([evidence(r, J, problem.column_of_row, problem.stretch_of_row)], root).covariance
 
 
 def _fit(problem: Problem, model: Model, free, block, r, what: str, solution: Solution | None = None) -> Fit:

@@ -24,7 +24,7 @@ from jaxfinger.experiments import Stack
 from jaxfinger.gap.merged_trials import MergedTrials, merged_trials
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
-from jaxfinger.identify.cluster_robust import stretches
+from jaxfinger.identify.intervals import stretches
 from jaxfinger.identify.linearise import White
 from jaxfinger.identify.noise import Noise, estimate, history
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
@@ -101,8 +101,14 @@ class Problem:
         return out
 
     @property
+    def column_of_row(self) -> np.ndarray:
+        """(N,) number of each row's column, counted over all channels of all experiments."""
+        kinds = [np.stack([np.full(r.size, e), r.channel, r.column]) for e, r in enumerate(self.rows.values())]
+        return np.unique(np.concatenate(kinds, axis=1), axis=1, return_inverse=True)[1]
+
+    @property
     def stretch_of_row(self) -> np.ndarray:
-        """(N,) number of the stretch of a trial to which each row belongs (`cluster_robust.stretches`)."""
+        """(N,) number of the stretch of a trial to which each row belongs (`intervals.stretches`)."""
         times = []
         for e, rows in self.rows.items():
             source = self.sources[e]

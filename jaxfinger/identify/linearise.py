@@ -145,6 +145,14 @@ def robust_share(r: Float[np.ndarray, "*N"], limit: float) -> Float[np.ndarray, 
     return limit / np.sqrt(limit * (2.0 * a - limit)) if limit else np.ones_like(a)
 
 
+def robust_residuals(r: Float[np.ndarray, "*N"], limit: float) -> Float[np.ndarray, "*N"]:
+    """s(r) of the module's docstring, computed by NumPy; `r` itself where `limit` is 0."""
+    if not limit:
+        return r
+    beyond = np.sign(r) * np.sqrt(np.maximum(limit * (2.0 * np.abs(r) - limit), 0.0))
+    return np.where(np.abs(r) > limit, beyond, r)
+
+
 def residuals_of(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[str, Float[np.ndarray, "_columns B T"]]:
     """Measured − predicted of every trial, in the channels' units, also at samples whose mask is 0."""
     return _by_blocks(lambda block: _residuals_jit(model, block, channels), model, batch)
@@ -212,9 +220,7 @@ def factored(
 ) -> Float[np.ndarray, "B p+1 p+1"]:
     """Triangular factor of [J r] of every trial under Huber's cost, from its rows and columns that are not all zero."""
     B, _, p = J.shape
-    share = robust_share(white, limit)
-    s = np.sign(white) * np.sqrt(np.maximum(limit * (2.0 * np.abs(white) - limit), 0.0)) if limit else white
-    s = np.where(np.abs(white) > limit, s, white) if limit else white
+    share, s = robust_share(white, limit), robust_residuals(white, limit)
     out = np.zeros((B, p + 1, p + 1))
     for b in range(B):
         touched = J[b] != 0.0

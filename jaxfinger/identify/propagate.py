@@ -5,17 +5,16 @@ parameters, and Σ_OO their covariance,
 
     K = (J_Fᵀ J_F + Λ)⁻¹ J_Fᵀ J_O,   Σ_FF = G (J_Fᵀ J_F + Λ)⁻¹ G + K Σ_OO Kᵀ,   Σ_FO = −K Σ_OO.
 
-Where residuals or the scores of stretches scatter more than the noise explains, J_F and J_O are taken over the square
-root of that ratio. G is diagonal: the factors of `cluster_robust.growth`.
+The products of J are sums over the columns of channels, each divided by its ratio β_c; G is diagonal (`intervals`).
 """
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfinger.identify.cluster_robust import dispersion, growth, stretch_scores, stretches
+from jaxfinger.identify.intervals import Evidence, evidence, laplace, stretches
 from jaxfinger.identify.linearise import Linearised
 from jaxfinger.identify.prior import Prior
-from jaxfinger.identify.solve import Solution, Source, stacked, with_all_slopes
+from jaxfinger.identify.solve import Solution, Source, with_all_slopes
 from jaxfinger.model import Model
 
 # A parameter is undetermined where its entry in an undetermined combination exceeds this. Rounding changes entries by
@@ -25,31 +24,6 @@ MIN_SHARE = 1e-3
 # moves by the unit of its own column. It is small, since an undetermined parameter may be off by many units; rounding
 # gives 1e-9 at most, as above.
 MIN_DEPENDENCE = 1e-6
-
-
-def laplace(
-    information: Float[np.ndarray, "p p"],
-    root: Float[np.ndarray, "k p"],
-    scores: Float[np.ndarray, "b p"],
-    chi2_per_row: float = 1.0,
-) -> tuple[Float[np.ndarray, "p p"], float, Float[np.ndarray, " p"]]:
-    """Pseudo-inverse of JᵀJ/β + Λ, the ratio β, and the factor on each standard deviation (`cluster_robust.growth`).
-
-    `information` is JᵀJ, `root` a square root of Λ, `scores` those of the stretches. β is the largest of 1, χ² per row
-    (Birge's ratio, the square of the scale factor S of the Particle Data Group; Review of Particle Physics, §5.2.2) and
-    `cluster_robust.dispersion`.
-    """
-    beta = max(1.0, chi2_per_row, dispersion(_inverse(information, root), scores, information))
-    inverse = _inverse(information / beta, root)
-    return inverse, beta, growth(inverse, scores / beta, root)
-
-
-def _inverse(information: Float[np.ndarray, "p p"], root: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "p p"]:
-    """Pseudo-inverse of JᵀJ + Λ, of the matrix scaled to a unit diagonal."""
-    N = information + root.T @ root
-    diagonal = np.diag(N)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    return np.linalg.pinv(N * np.outer(scale, scale), rcond=1e-14, hermitian=True) * np.outer(scale, scale)
 
 
 def propagate(
@@ -64,20 +38,21 @@ def propagate(
     """Covariance of the flat vector after a stage whose optimum is `model`, by the module's equation.
 
     The variance of a free parameter is infinite where trials and prior do not determine it, or where its estimate
-    depends on another parameter of infinite variance. Intervals widen as `laplace` says where residuals are larger than
-    the noise, or keep their sign for longer.
+    depends on another parameter of infinite variance. Intervals widen where residuals are larger than the noise, or
+    keep their sign for longer (`intervals`).
     """
     linearised = with_all_slopes(solution.linearised, model, free, sources, huber)
-    factor = stacked(linearised, sources, len(covariance))[:, :-1]
-    information = factor.T @ factor
+    told = {e: _evidence(lin, sources[e], huber) for e, lin in linearised.items()}
     variance = np.diag(covariance)
     others = np.setdiff1d(np.flatnonzero((variance > 0) & np.isfinite(variance)), free)
     unknown = np.setdiff1d(np.flatnonzero(np.isinf(variance)), free)
     root = np.zeros((0, free.size)) if prior is None else prior.root
-    scores = _scores(linearised, sources, len(covariance), huber or np.inf)[:, free]
-    chi2 = solution.chi2_per_row(free.size)
-    inverse, beta, grow = laplace(information[np.ix_(free, free)], root, scores, chi2)
-    information = information / beta
+    parts = [_of(x, sources[e].positions, free) for e, x in told.items()]
+    inverse, ratios, grow = laplace(parts, root)
+    information = np.zeros_like(covariance)
+    for (e, x), beta in zip(told.items(), ratios, strict=True):
+        at = sources[e].positions
+        information[np.ix_(at, at)] += np.tensordot(1.0 / beta, x.information, 1)
     out = covariance.copy()
     out[free, :] = out[:, free] = 0.0
     cross = inverse @ information[np.ix_(free, others)]
@@ -104,19 +79,20 @@ def depends(
     return np.any(moves > MIN_DEPENDENCE * np.sqrt(np.diag(inverse))[:, None], axis=1)
 
 
-def _scores(
-    linearised: dict[str, Linearised], sources: dict[str, Source], size: int, limit: float
-) -> Float[np.ndarray, "b P"]:
-    """Scores of all stretches by the flat vector; residuals beyond Huber's limit enter with the limit."""
-    out = []
-    for name, lin in linearised.items():
-        B, wide, k = lin.jacobian.shape
-        time = np.asarray(sources[name].batch.x.time) / sources[name].pace
-        time = np.broadcast_to(time[:, None], (B, wide // time.shape[1], time.shape[1])).reshape(B, wide)
-        counts = np.flatnonzero(lin.white)
-        stretch = stretches(np.repeat(np.arange(B), wide)[counts], time.reshape(-1)[counts])
-        r, J = lin.white.reshape(-1)[counts], lin.jacobian.reshape(-1, k)[counts]
-        block = np.zeros((stretch.max(initial=-1) + 1, size))
-        block[:, sources[name].positions] = stretch_scores(np.clip(r, -limit, limit), J, stretch)
-        out.append(block)
-    return np.concatenate(out)
+def _evidence(lin: Linearised, source: Source, huber: float) -> Evidence:
+    """Evidence of an experiment on the parameters that it depends on."""
+    time = np.asarray(source.batch.x.time) / source.pace  # (B, T)
+    columns = lin.white.shape[1] // time.shape[1]
+    counts = np.flatnonzero(lin.white)
+    trial, column, sample = np.unravel_index(counts, (len(time), columns, time.shape[1]))
+    r, J = lin.white.reshape(-1)[counts], lin.jacobian.reshape(-1, lin.jacobian.shape[-1])[counts]
+    return evidence(r, J, column, stretches(trial, time[trial, sample]), huber)
+
+
+def _of(told: Evidence, positions: Int[np.ndarray, " k"], free: Int[np.ndarray, " p"]) -> Evidence:
+    """The same evidence on the free parameters: zero on those that the experiment does not depend on."""
+    mine, at = np.flatnonzero(np.isin(free, positions)), np.searchsorted(positions, free[np.isin(free, positions)])
+    C, b, _ = told.scores.shape
+    information, scores = np.zeros((C, free.size, free.size)), np.zeros((C, b, free.size))
+    information[:, mine[:, None], mine], scores[..., mine] = told.information[:, at[:, None], at], told.scores[..., at]
+    return told._replace(information=information, scores=scores)

@@ -204,7 +204,7 @@ def identify(
     >>> fit = jf.identify(jf.read("session.h5"), jf.recipe("emps"))
     >>> mass = fit.table()[0]
     >>> f"{mass['value']:.0f} ± {1.96 * mass['std']:.1f} {mass['units']}"
-    '95 ± 0.4 kg'
+    '95 ± 0.9 kg'
 
     Raises:
         UserError: `recipe` is another than that of `start`, or `start` is a fit of another finger.

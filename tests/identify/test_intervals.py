@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxfinger.identify.cluster_robust import STRETCH_DURATION, stretch_scores, stretches
-from jaxfinger.identify.propagate import laplace
+from jaxfinger.identify.intervals import STRETCH_DURATION, evidence, laplace, stretches
 
 RATE, MOVEMENTS = 50.0, 60  # Hz; movements last one stretch each
 
@@ -18,9 +17,10 @@ def records(rng: np.random.Generator, missed: float, count: int = 300):
         J = np.stack([np.ones_like(v), v], axis=1)
         y = J @ [1.0, 2.0] + rng.normal(size=v.size) + missed * np.repeat(rng.normal(size=MOVEMENTS), n)
         estimate, *_ = np.linalg.lstsq(J, y, rcond=None)
-        g = stretch_scores(y - J @ estimate, J, stretches(np.zeros(time.size, int), time))
-        inverse, _, grow = laplace(J.T @ J, np.zeros((0, 2)), g)
-        yield estimate - [1.0, 2.0], np.sqrt(np.diag(np.linalg.inv(J.T @ J))), np.sqrt(np.diag(inverse)) * grow
+        one = np.zeros(time.size, int)
+        told = evidence(y - J @ estimate, J, one, stretches(one, time))
+        stated = laplace([told], np.zeros((0, 2))).covariance
+        yield estimate - [1.0, 2.0], np.sqrt(np.diag(np.linalg.inv(J.T @ J))), np.sqrt(np.diag(stated))
 
 
 def coverage(missed: float, seed: int) -> tuple[float, float, float]:
@@ -58,3 +58,15 @@ def test_stretches_do_not_run_over_from_one_trial_to_the_next():
     for k in range(6):
         assert len(set(trial[number == k])) == 1
         assert np.ptp(time[number == k]) < STRETCH_DURATION
+
+
+def test_a_column_that_the_model_misses_does_not_widen_what_another_column_tells():
+    """Two columns share nothing but their trial; the second has an offset of its own in every movement."""
+    rng, n = np.random.default_rng(3), int(RATE * STRETCH_DURATION) * MOVEMENTS
+    stretch = np.arange(n) // int(RATE * STRETCH_DURATION)
+    r = np.concatenate([rng.normal(size=n), rng.normal(size=n) + rng.normal(size=MOVEMENTS)[stretch]])
+    J = np.kron(np.eye(2), np.ones((n, 1)))
+    told = evidence(r - J @ (J.T @ r) / n, J, np.repeat([0, 1], n), np.tile(stretch, 2))
+    std = np.sqrt(np.diag(laplace([told], np.zeros((0, 2))).covariance) * n)
+    assert 1.0 <= std[0] < 1.3
+    assert 5.0 < std[1] < 10.0  # √(1 + 50) of 50 samples a movement
