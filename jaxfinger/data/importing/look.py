@@ -15,7 +15,7 @@ from jaxfinger.data.toml import as_key, quoted
 from jaxfinger.data.units import TO_SI, is_foreign, unit_name
 from jaxfinger.errors import listed
 
-_MIN_GAP = 5.0  # times the median interval: well beyond jitter, so samples were lost.
+MIN_GAP = 5.0  # usual intervals of a clock that ticks evenly: in a longer one samples were lost.
 # Patterns of names for each channel, of which the first that fits counts: common words in logs of robots.
 _MEANINGS = (
     ("time", r"^t$|time|stamp|clock|zeit|^sec"),
@@ -145,7 +145,7 @@ def _clock_survey(name: str, variable: Variable, units: str) -> ClockSurvey:
     begins = restarts(time)
     steps = np.concatenate([_steps(part) for part in np.split(time, begins + 1)])
     usual = float(np.median(steps)) if len(steps) else np.nan
-    gaps = steps > _MIN_GAP * usual
+    gaps = steps > MIN_GAP * usual
     return ClockSurvey(
         name,
         units,

@@ -224,6 +224,14 @@ def test_times_in_another_unit_are_said_by_the_motion(session, tmp_path, factor,
     assert [words in m for m in said] == [True] * bool(words)
 
 
+def test_a_slow_machine_needs_no_more_samples(session):
+    """A crane that moves 30 times as slowly, with a sample every 0.3 s, shows its motions as well as a finger."""
+    trials = {t.name: replace(t, time=30.0 * t.time, session_start=None) for t in session}
+    assert not [text for text in said_of(replace(session, trials=trials)) if "has a sample every" in text]
+    pulled = {n: t for n, t in trials.items() if t.experiment == "ID.4"}
+    assert [text for text in said_of(replace(session, trials=pulled)) if "has a sample every 0.3 s" in text]
+
+
 @pytest.mark.parametrize("least", [True, False])
 def test_a_clipped_force_is_said(file, least):
     """Neither a quantised force nor one that is zero while its tendon is slack is clipped."""
