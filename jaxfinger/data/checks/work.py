@@ -54,7 +54,7 @@ def check_work(session: Session, report: Report) -> None:
 
 def _arm_lengths(arms: Mapping[tuple[int, int], float], finger: FingerDescription, report: Report) -> None:
     """Report joints whose largest moment arm does not fit the finger's length; `arms`, m, by tendon and joint."""
-    length = float(np.linalg.norm(finger.origin, axis=1)[1:].sum() + np.linalg.norm(finger.fingertip))
+    length = finger.length
     for i, joint in enumerate(finger.joint_names):
         largest = max((abs(arm) for (_, k), arm in arms.items() if k == i), default=np.nan)
         if largest > _MAX_ARM * length or largest < _MIN_ARM * length:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import Session, check_file, read_session, write_session
+from jaxfinger.data.checks.finger import check_finger
 from jaxfinger.data.checks.session import check_session
 from jaxfinger.data.findings import Report
 from jaxfinger.errors import UserError
@@ -214,6 +215,26 @@ def test_a_tare_error_of_slack_tendons_is_no_wrong_sign(session, tmp_path):
     found = [f for f in check_file(tmp_path / "s.h5") if "tendon_force" in f.place and "T1" in f.message]
     assert found
     assert all(f.severity == "warning" and "check the tare" in f.message for f in found), found
+
+
+@pytest.mark.parametrize("size", [0.05, 1.0, 60.0])
+def test_lengths_are_in_other_units_for_their_machine(session, size):
+    """A boom of 3 m is one in m; whatever the size of a machine, its lengths in cm would make it lighter than air."""
+    machine = Scale(mass=size**3, length=size, time=size**0.5)(session).finger
+
+    def faults(**changes):
+        report = Report()
+        check_finger(replace(machine, **changes), report)
+        return [str(f) for f in report if f.severity == "error"]
+
+    assert faults() == []
+    for factor in (1e2, 1e3):
+        (said, *_) = faults(origin=factor * machine.origin, fingertip=factor * machine.fingertip)
+        assert "convert mm or cm to m" in said
+        (said, *_) = faults(excursion=factor * machine.excursion)
+        assert "convert mm to m" in said
+    (said, *_) = faults(inertia=1e6 * machine.inertia)
+    assert "convert to kg m2" in said
 
 
 @pytest.mark.parametrize(("factor", "words"), [(1.0, ""), (1000.0, "convert ms to s"), (1 / 60, "not in minutes")])
