@@ -29,7 +29,7 @@ _MIN_FELT_SHARE = 0.5
 # thirds of their tension (the shipped session). Units that people confuse differ at least fourfold (N and lbf).
 _MIN_ARM_RATIO, _MAX_ARM_RATIO = 0.2, 1.5
 _MAX_EXCURSION_RATIO = 3.0  # of two measurements of one excursion: units that people confuse differ by more.
-_MIN_PATH = 1e-3  # m of excursion: over less, stretch and noise decide the ratio of two measurements.
+_MIN_PATH = 0.01  # of the finger's length, of excursion: over less, stretch and noise decide a ratio of two.
 _FORCE_RATIOS = (0.002, 1.0)  # N at the fingertip for each N of tension: a moment arm over a finger's length, with room
 # Moment arms as shares of the finger's length: neither nearly as long as a finger nor thinner than a hair.
 _MIN_ARM, _MAX_ARM = 0.004, 0.4
@@ -129,7 +129,7 @@ def _free_paths(session: Session, kinematic: Excursions, report: Report) -> None
             expected = np.sum([kinematic.polynomials[int(k), int(i)](q[:, i]) for i in joints], axis=0)
             ratio = slope(expected, l[:, k])
             agree = 1.0 / _MAX_EXCURSION_RATIO < ratio < _MAX_EXCURSION_RATIO
-            if np.isfinite(ratio) and not agree and np.ptp(expected) > _MIN_PATH:
+            if np.isfinite(ratio) and not agree and np.ptp(expected) > _MIN_PATH * finger.length:
                 found.append(f"{finger.tendon_names[k]} in {trial.name} ({ratio:.2g} times)")
     if found:
         report.warning(
