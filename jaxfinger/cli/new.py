@@ -72,7 +72,7 @@ def new(
 def _proposal(recordings: tuple[Path, ...], specimen: str, beside: str, described: str, finger: Path) -> str:
     """A mapping for the recordings, of the finger that the text `described` of the file `finger` describes."""
     from jaxfinger.data.finger_file import Finger, finger_from
-    from jaxfinger.data.importing.look import proposal
+    from jaxfinger.data.importing.proposal import proposal
     from jaxfinger.data.importing.sources import load_recording
     from jaxfinger.data.importing.templates import COLUMNS
     from jaxfinger.data.toml import parse_toml, quoted, structure

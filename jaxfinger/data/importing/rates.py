@@ -8,8 +8,8 @@ import numpy as np
 
 from jaxfinger.data.findings import Report
 from jaxfinger.data.importing.columns import Clock
-from jaxfinger.data.importing.look import MIN_GAP, columns_of
 from jaxfinger.data.importing.recording import Recording
+from jaxfinger.data.importing.survey import MIN_GAP, columns_of
 from jaxfinger.data.toml import Place
 from jaxfinger.data.units import TO_SI, unit_name
 from jaxfinger.errors import counted
