@@ -201,7 +201,7 @@ def _score_of_stage(
 def _information_of(
     trial: int, part: tuple[Int[np.ndarray, " k"], CostGradient] | None, size: int
 ) -> Float[np.ndarray, "P P"]:
-    """JᵀJ of one trial of an experiment over the whole flat vector of P = `size`; zero where the stage does not read it."""
+    """JᵀJ of one trial over the flat vector, P = `size`; zero where its experiment has no `part` in the stage."""
     out = np.zeros((size, size))
     if part is not None:
         at, score = part
