@@ -35,6 +35,8 @@ class Scale:
         slides = np.array(f.prismatic)
         angle = np.where(slides, self.length, 1.0)  # of each joint's coordinate
         torque = np.where(slides, self.force, self.force * self.length)
+        powers = 0 if f.excursion is None else np.arange(1, f.excursion.shape[2] + 1)  # of q in the excursions
+        excursion = self.length / angle[:, None] ** powers
         rotor = np.where(slides, self.mass, self.mass * self.length**2)
         finger = replace(
             f,
@@ -49,6 +51,8 @@ class Scale:
             inertia=f.inertia * self.mass * self.length**2,
             rotor_inertia=_by(rotor, f.rotor_inertia),
             rotor_inertia_std=_by(rotor, f.rotor_inertia_std),
+            excursion=_by(excursion, f.excursion),
+            excursion_std=_by(excursion, f.excursion_std),
         )
 
         def scaled(t: Trial) -> Trial:

@@ -14,6 +14,7 @@ from jaxfinger.errors import UserError
 if TYPE_CHECKING:
     from jaxfinger.data import Session
     from jaxfinger.gap.predicted import CheckedPredictions
+    from jaxfinger.gap.result import Diagnosis
 
 FILES = ("gap.json", "nominal.json", "augmented.json", "report.html")
 
@@ -77,7 +78,7 @@ def diagnose(
     from jaxfinger.identify import load_fit, read_recipe
     from jaxfinger.report.gap_json import as_gap_json, write
     from jaxfinger.report.page import write_page
-    from jaxfinger.report.screen import comparison, summary
+    from jaxfinger.report.screen import summary
 
     texts, gaps, found = {}, {}, {}
     with progress("first look" if quick else "diagnose") as say:
@@ -86,14 +87,15 @@ def diagnose(
         own = load(effects) if effects is not None else {}
         say("reading the file")
         measured = {session: read(session) for session in folders}
+        for session in measured:
+            if earlier is not None and earlier.was_made_from(measured[session]):
+                said = f"is a fit of {session} itself, whose data then count twice; give a fit of an earlier session"
+                print(plain(f"{against}: {said}"), file=sys.stderr)
         simulated = None if predictions is None else _predictions(predictions, measured[sessions[0]])
         for session, folder in folders.items():
             name = session.name
             told = say if len(folders) == 1 else lambda message, name=name: say(f"{name}: {message}")
             make_folder(folder)
-            if earlier is not None and earlier.was_made_from(measured[session]):
-                said = f"is a fit of {session} itself, whose data then count twice; give a fit of an earlier session"
-                print(plain(f"{against}: {said}"), file=sys.stderr)
             d = run(measured[session], wanted, quick, own, tuple(without or ()), told, simulated, tolerated, earlier)
             if against is not None:
                 d = replace(d, against=against.name)
@@ -104,13 +106,8 @@ def diagnose(
             found[name] = replace(d, problem=None)  # The problem holds every row of the session: its memory is freed.
     if json:
         print_json(gaps if len(gaps) > 1 else gaps[sessions[0].name])
-        return
-    for session, folder in folders.items():
-        console().print(plain(texts[session.name]), markup=False, soft_wrap=True)
-        print(f"\n{folder / 'report.html'}: the evidence\n")
-    if len(found) > 1:
-        header, rows = comparison(found)
-        table("Probability of every cause, session by session, and its size", header, rows)
+    else:
+        _print(folders, texts, found)
 
 
 def _folders(sessions: tuple[Path, ...], output: Path) -> dict[Path, Path]:
@@ -160,6 +157,18 @@ def _tolerance(texts: list[str]) -> dict[str, float]:
             raise UserError(f"--tolerance {text}: say a share such as 2%, or joint_torque=5%; channels: {known}")
         out |= dict.fromkeys([channel] if channel else channels, value)
     return out
+
+
+def _print(folders: dict[Path, Path], texts: dict[str, str], found: dict[str, Diagnosis]) -> None:
+    """Print the summary of each diagnosis with the place of its page, and of several the table that compares them."""
+    from jaxfinger.report.screen import comparison
+
+    for session, folder in folders.items():
+        console().print(plain(texts[session.name]), markup=False, soft_wrap=True)
+        print(f"\n{folder / 'report.html'}: the evidence\n")
+    if len(found) > 1:
+        header, rows = comparison(found)
+        table("Probability of every cause, session by session, and its size", header, rows)
 
 
 def refuse(output: Path, overwrite: bool, *reads: Path | None) -> None:

@@ -54,7 +54,7 @@ def check(file: Path, *, json: bool = False) -> None:
 
 def _as_dict(recording: Recording, among: Sequence[Recording]) -> dict:
     """Survey of a recording, one of several of one rig, for JSON."""
-    from jaxfinger.data.importing.look import clocks_of, columns_of
+    from jaxfinger.data.importing.survey import clocks_of, columns_of
 
     seen = columns_of(recording, among)
     return {
@@ -81,8 +81,9 @@ def look(*recordings: Path, finger: Path | None = None, json: bool = False) -> N
     if not recordings:
         raise UserError("no recording was given; name at least one")
     from jaxfinger.data.finger_file import finger_from
-    from jaxfinger.data.importing.look import clocks_of, columns_of, proposal
+    from jaxfinger.data.importing.proposal import proposal
     from jaxfinger.data.importing.sources import load_recording
+    from jaxfinger.data.importing.survey import clocks_of, columns_of
     from jaxfinger.data.toml import Place
 
     described = finger_from(str(finger.resolve()), Place(str(finger))) if finger is not None else None

@@ -4,8 +4,15 @@ from __future__ import annotations
 
 from math import isfinite
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jaxfinger.cli.output import print_json, progress, refuse_figure, table
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from jaxfinger.identify import Fit
+    from jaxfinger.identify.sensitivity import Sensitivity
 
 MAX_INFLUENCES = 3  # strongest influences of each kind for a parameter, so that a row fits the screen
 MAX_NAMES = 40  # rows and columns of the picture: more names are too small to read on a page.
@@ -54,28 +61,31 @@ def influence(
             assert picture is not None
             save(picture, figure, overwrite)
     if json:
-        print_json(
-            {
-                kind: {
-                    "step": STEPS[kind],
-                    "of": list(s.names),
-                    "parameters": names,
-                    "shift_in_std": s.shifts(loaded).tolist(),
-                    "derivative_si": s.values[:, loaded.estimated].tolist(),
-                }
-                for kind, s in found.items()
-            }
-        )
+        print_json({kind: _as_json(s, loaded, names) for kind, s in found.items()})
         return
-    for kind, s in found.items():
-        shifts = s.shifts(loaded)
-        rows = []
-        for j, name in enumerate(names):
-            strongest = sorted(range(len(s.names)), key=lambda k, j=j: -abs(shifts[k, j]))[:MAX_INFLUENCES]
-            rows.append((name, ", ".join(_in_words(s.names[k], shifts[k, j]) for k in strongest if shifts[k, j])))
-        table(
-            f"By {kind}, {STEPS[kind]}: standard deviations that each parameter moves", ("parameter", ""), rows, left=2
-        )
+    for s in found.values():
+        _print(s, s.shifts(loaded), names)
+
+
+def _as_json(s: Sensitivity, fit: Fit, names: list[str]) -> dict:
+    """Derivatives of the parameters `names` by one kind of data."""
+    return {
+        "step": STEPS[s.kind],
+        "of": list(s.names),
+        "parameters": names,
+        "shift_in_std": s.shifts(fit).tolist(),
+        "derivative_si": s.values[:, fit.estimated].tolist(),
+    }
+
+
+def _print(s: Sensitivity, shifts: np.ndarray, names: list[str]) -> None:
+    """Print the strongest influences on each of the parameters `names`; `shifts` in their standard deviations."""
+    rows = []
+    for name, by in zip(names, shifts.T, strict=True):
+        strongest = sorted(range(len(s.names)), key=lambda k, by=by: -abs(by[k]))[:MAX_INFLUENCES]
+        rows.append((name, ", ".join(_in_words(s.names[k], by[k]) for k in strongest if by[k])))
+    title = f"By {s.kind}, {STEPS[s.kind]}: standard deviations that each parameter moves"
+    table(title, ("parameter", ""), rows, left=2)
 
 
 def _in_words(name: str, shift: float) -> str:

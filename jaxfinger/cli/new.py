@@ -46,11 +46,7 @@ def new(
     if finger.resolve() == mapping.resolve():
         raise UserError(f"{finger}: is named twice; give one file for the finger, another for the mapping")
     from jaxfinger.data.atomic import atomic_path
-    from jaxfinger.data.finger_file import Finger, finger_from
-    from jaxfinger.data.importing.look import proposal
-    from jaxfinger.data.importing.sources import load_recording
-    from jaxfinger.data.importing.templates import COLUMNS, finger_template, mapping_template
-    from jaxfinger.data.toml import parse_toml, quoted, structure
+    from jaxfinger.data.importing.templates import finger_template, mapping_template
 
     specimen = _asked("Name of the finger", specimen, "finger 1")
     named = _names("joint", _asked("Joints, base to tip", joints, "MCP, PIP, DIP"))
@@ -61,11 +57,7 @@ def new(
     beside = _from(finger, mapping.parent)
     described = finger_template(named, pulled)
     if recordings:
-        document = parse_toml(described, finger)
-        place = document.place / "finger"
-        known = finger_from(structure(document.content["finger"], Finger, place), place)
-        head = f"{COLUMNS}\nspecimen = {quoted(specimen)}\nfinger = {quoted(beside)}"
-        mapped = proposal([load_recording(path) for path in recordings], known, head)
+        mapped = _proposal(recordings, specimen, beside, described, finger)
     else:
         mapped = mapping_template(specimen, beside, named, pulled)
     for path, text in ((finger, described), (mapping, mapped)):
@@ -75,6 +67,21 @@ def new(
     print(plain(f"{finger}: {count}; replace its numbers by those of your finger"))
     todo = "correct what was guessed" if recordings else "name your recordings and their columns"
     print(plain(f"{mapping}: {todo}, then: jaxfinger import … --mapping {mapping}"))
+
+
+def _proposal(recordings: tuple[Path, ...], specimen: str, beside: str, described: str, finger: Path) -> str:
+    """A mapping for the recordings, of the finger that the text `described` of the file `finger` describes."""
+    from jaxfinger.data.finger_file import Finger, finger_from
+    from jaxfinger.data.importing.proposal import proposal
+    from jaxfinger.data.importing.sources import load_recording
+    from jaxfinger.data.importing.templates import COLUMNS
+    from jaxfinger.data.toml import parse_toml, quoted, structure
+
+    document = parse_toml(described, finger)
+    place = document.place / "finger"
+    known = finger_from(structure(document.content["finger"], Finger, place), place)
+    head = f"{COLUMNS}\nspecimen = {quoted(specimen)}\nfinger = {quoted(beside)}"
+    return proposal([load_recording(path) for path in recordings], known, head)
 
 
 def _asked(question: str, given: str | None, default: str) -> str:

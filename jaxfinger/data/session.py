@@ -68,6 +68,11 @@ class FingerDescription:
         """Number of tendons, passive ones included."""
         return len(self.tendon_names)
 
+    @property
+    def length(self) -> float:
+        """Length, m, of the way from the first joint over all others to the fingertip."""
+        return float(np.linalg.norm([*self.origin[1:], self.fingertip], axis=1).sum())
+
     def joint(self, name: str | None) -> int | None:
         """Index of the joint of this name; None where there is none."""
         return self.joint_names.index(name) if name in self.joint_names else None

@@ -301,8 +301,7 @@ def _noise_elsewhere(problem: Problem, channel: str, columns: int) -> Noise:
     def largest(c: str) -> float | None:
         return max((float(n.std.max()) for (_, k), n in problem.noise.items() if k == c), default=None)
 
-    finger = problem.session.finger
-    length = float(np.linalg.norm([*finger.origin[1:], finger.fingertip], axis=1).sum())
+    length = problem.session.finger.length
     std = np.full(columns, largest(channel) or (largest("joint_torque") or 1e-3) / length)
     return Noise.white(std, "elsewhere")
 

@@ -12,6 +12,7 @@ shape.
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Int
 
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
@@ -26,7 +27,7 @@ from jaxfinger.identify.prior import Prior, prior_of
 from jaxfinger.identify.propagate import propagate
 from jaxfinger.identify.readings import name_constant, readings_of
 from jaxfinger.identify.shooting import AHEAD, Shooting, shooting
-from jaxfinger.identify.solve import Source, parameter_bounds, solve
+from jaxfinger.identify.solve import Solution, Source, parameter_bounds, solve
 from jaxfinger.identify.stages import (
     Progress,
     cad_covariance,
@@ -73,13 +74,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
             f"{session.file or 'the session'}: has no trial of {', '.join(recipe.fit.joint_experiments)}; "
             "name others in fit.joint_experiments of the recipe"
         )
-    parameters = describe(model)
-    cad = np.flatnonzero(np.diag(cad_covariance(session, parameters)))
-    coverage = coverage_of(reads, session)
-    groups = free_groups(recipe)
-    seen = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and can_determine(p, coverage)]
-    free = np.union1d(np.union1d(fit.estimated, cad), seen).astype(int)
-
+    parameters, free = describe(model), _free(fit, model, session, reads)
     same = fit.was_made_from(session)
     if same:
         prior = cad_prior(session, recipe, parameters, free)
@@ -90,26 +85,21 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
     model, solution, sources, noise = estimate_with_noise(
         model, free, stacks, reads, known, prior, huber, window=LONG_SIGNAL_WINDOW
     )
-    lost = [
+    better = None
+    if not solution.converged or solution.invisible.size or solution.chi2_per_row(free.size) > RESTART_CHI2:
+        progress("refining from a neutral start")
+        better = _better_from_neutral_start(model, solution, sources, free, prior, huber)
+    model, solution = better or (model, solution)
+
+    warnings = name_constant(reads, session)
+    warnings += [
         f"no sample of {x.channel} in {x.experiment} counts: {x.reason}"
         for x in not_judged(stacks)
         if x.channel in reads[x.experiment]
     ]
-    lost = name_constant(reads, session) + lost
-    warnings = lost + name_invisible(parameters, free, solution.invisible)
-    if not solution.converged or solution.invisible.size or solution.chi2_per_row(free.size) > RESTART_CHI2:
-        progress("refining from a neutral start")
-        neutral = start_values(_neutral(model, free, parameters), free, parameters, sources)
-        other, second = solve(neutral, free, sources, prior, huber)
-        before, after = (total_cost(*x, free, prior) for x in ((model, solution), (other, second)))
-        if after < before * (1 - 1e-6):  # beyond rounding
-            model, solution = other, second
-            warnings = [
-                *lost,
-                *name_invisible(parameters, free, solution.invisible),
-                "the earlier fit led to a poorer optimum",
-            ]
-
+    warnings += name_invisible(parameters, free, solution.invisible)
+    if better:
+        warnings.append("the earlier fit led to a poorer optimum")
     covariance = propagate(fit.covariance, model, solution, sources, free, prior, huber)
     warnings += implausible(model, covariance, free, parameter_bounds(start, free)[0])
     refined = replace(
@@ -128,6 +118,30 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         return refined
     progress("refining on the motion of VD.3")
     return _on_motion(refined, starts, sources, prior, fit.covariance)
+
+
+def _free(fit: Fit, model: Model, session: Session, reads: dict[str, tuple[str, ...]]) -> Int[np.ndarray, " p"]:
+    """Positions of what the fit estimated, of values of CAD with an uncertainty, and of what the trials determine."""
+    parameters, groups, coverage = describe(model), free_groups(fit.recipe), coverage_of(reads, session)
+    cad = np.flatnonzero(np.diag(cad_covariance(session, parameters)))
+    seen = [i for i, p in enumerate(parameters) if p.group in groups and p.determinable and can_determine(p, coverage)]
+    return np.union1d(np.union1d(fit.estimated, cad), seen).astype(int)
+
+
+def _better_from_neutral_start(
+    model: Model,
+    solution: Solution,
+    sources: dict[str, Source],
+    free: Int[np.ndarray, " p"],
+    prior: Prior,
+    huber: float,
+) -> tuple[Model, Solution] | None:
+    """The optimum from a neutral start; None where its cost is not less than that of the given one."""
+    parameters = describe(model)
+    neutral = start_values(_neutral(model, free, parameters), free, parameters, sources)
+    other = solve(neutral, free, sources, prior, huber)
+    before, after = (total_cost(*x, free, prior) for x in ((model, solution), other))
+    return other if after < before * (1 - 1e-6) else None  # beyond rounding
 
 
 def _on_motion(fit: Fit, starts: Shooting, sources: dict[str, Source], prior: Prior, before: np.ndarray) -> Fit:

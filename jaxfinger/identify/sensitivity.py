@@ -124,12 +124,9 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
         _require_optimum(basis.T @ S[free], session)
         right = by[free] + H[np.ix_(free, others)] @ derivatives[others]
         derivatives[free] = -basis @ np.linalg.solve(basis.T @ own @ basis, basis.T @ right)
+        total = np.diag(H)[free] - np.diag(precision)
         for j, (e, name) in enumerate(data.trials):
-            mine = np.zeros((P, P))
-            if e in parts:
-                at, score = parts[e]
-                mine[np.ix_(at, at)] = score.information[stacks[e].trials.index(name)]
-            total = np.diag(H)[free] - np.diag(precision)
+            mine = _information_of(stacks[e].trials.index(name), parts.get(e), P)
             left = total - np.diag(mine)[free]
             alone[free, j] = (np.diag(precision) == 0.0) & (left < MIN_SHARE_OF_OTHERS * total)
             kept = np.flatnonzero(~alone[free, j])
@@ -199,6 +196,17 @@ def _score_of_stage(
     known = np.diag(precision) > 0.0
     by[np.ix_(free, data.columns_of_cad(free[known]))] -= precision[:, known]
     return H, S, by
+
+
+def _information_of(
+    trial: int, part: tuple[Int[np.ndarray, " k"], CostGradient] | None, size: int
+) -> Float[np.ndarray, "P P"]:
+    """JᵀJ of one trial over the flat vector, P = `size`; zero where its experiment has no `part` in the stage."""
+    out = np.zeros((size, size))
+    if part is not None:
+        at, score = part
+        out[np.ix_(at, at)] = score.information[trial]
+    return out
 
 
 def _step_without(

@@ -205,7 +205,7 @@ def test_a_platform_that_is_not_there(monkeypatch, capsys):
 
 def test_import_repeats_what_check_warns_of(tmp_path, capsys):
     assert bring_in("time-in-ms-taken-for-s", "log.csv", "m.toml", tmp_path / "s.h5") == 0
-    assert "a sample every 2 s; convert ms to s" in capsys.readouterr().err
+    assert "times more slowly than in the protocol; convert ms to s" in capsys.readouterr().err
 
 
 def test_identify_on_an_output_without_greek_of_torques_that_trade_off_exactly(tmp_path, capsys, monkeypatch):

@@ -18,7 +18,8 @@ import numpy as np
 from jaxfinger.data.checks.arms import MIN_TRAVEL_ARM, check_arms
 from jaxfinger.data.findings import Report
 from jaxfinger.data.session import FingerDescription, Session, Trial
-from jaxfinger.data.signals.arms import MAX_STILL_ARM, Arms, measured_arms, slope, thinned
+from jaxfinger.data.signals.arms import Arms, measured_arms, slope, thinned
+from jaxfinger.data.signals.sizes import STRETCH_SHARE
 
 _MAX_CAD_ERROR = 0.2  # of the known arms: CAD is good to a tenth, so columns that miss by less may be right.
 _MAX_EXCHANGED_ERROR = 0.25  # of the error as named: exchanged columns must fit the known arms this much better.
@@ -45,7 +46,7 @@ def _by_crossing(finger: FingerDescription, arms: dict[int, Arms]) -> Iterator[t
     """Pairs of tendons of which one crosses a joint and stands still there, and the other the other way round."""
     for i, seen in ((i, at.seen) for i, at in arms.items()):
         size = np.abs(seen) / np.nanmax(np.abs(seen[finger.active]), initial=0.0)
-        still = np.flatnonzero(finger.active & finger.crosses[:, i] & (size < MAX_STILL_ARM))
+        still = np.flatnonzero(finger.active & finger.crosses[:, i] & (size < STRETCH_SHARE))
         travel = np.flatnonzero(finger.active & ~finger.crosses[:, i] & (size > MIN_TRAVEL_ARM))
         if len(still) == len(travel) == 1:
             (a,), (b,) = still, travel

@@ -13,8 +13,10 @@ from jaxfinger.data.session import FingerDescription
 
 UNIT_AXIS_TOLERANCE = 1e-3  # of an axis's length: axes typed with three digits pass.
 _ROUNDING = 1e-5  # relative: 100 times that of float32, for tables that were computed in it
-_MAX_LENGTH = 2.0  # m: longer than any link of a finger or arm, so that a larger number is one in mm or cm.
-_MAX_ARM = 0.5  # m: larger than any moment arm, so that a larger number is one in mm.
+# kg/m³, of the finger's mass in a cube as wide as one of its lengths: a hundredth of air. Fingers have hundreds, and an
+# arm of thin tubes still a tenth. Lengths in cm make a millionth of it, in mm a billionth.
+_MIN_DENSITY = 0.01
+_MAX_ARM = 2.0  # of the finger's length: moment arms are about a tenth of it, and ten times it in cm.
 
 
 def check_finger(finger: FingerDescription, report: Report) -> None:
@@ -93,7 +95,7 @@ def _links(finger: FingerDescription, report: Report) -> None:
         if mass <= 0.0:
             message = f"the link of joint {name} weighs {mass:.4g} kg; a mass must be positive"
             report.error("/finger/links/mass", message, row=i)
-        if (fault := _inertia(finger.inertia[i], mass)) is not None:
+        if (fault := _inertia(finger.inertia[i], mass, finger)) is not None:
             report.error("/finger/links/inertia", f"the link of joint {name} has {fault}", row=i)
     for key in ("mass_std", "com_std"):
         value = getattr(finger, key)
@@ -107,8 +109,8 @@ def _links(finger: FingerDescription, report: Report) -> None:
         report.error("/finger/joints/rotor_inertia", "is missing beside its standard deviation; write both or neither")
 
 
-def _inertia(inertia: np.ndarray, mass: float) -> str | None:
-    """Fault of an inertia matrix that no body has, or None."""
+def _inertia(inertia: np.ndarray, mass: float, finger: FingerDescription) -> str | None:
+    """Fault of the inertia matrix of a link that no body has, or None."""
     scale = float(np.abs(inertia).max())
     if np.abs(inertia - inertia.T).max() > _ROUNDING * scale:
         return "an inertia that is not symmetric; write the full matrix with both halves equal"
@@ -120,9 +122,14 @@ def _inertia(inertia: np.ndarray, mass: float) -> str | None:
             f"principal inertias {small:.3g}, {middle:.3g}, {large:.3g} kg m2; no body has one larger than the sum of "
             "the others; check frame, signs and units"
         )
-    if mass > 0.0 and large / mass > _MAX_LENGTH**2:
-        return f"a radius of gyration of {np.sqrt(large / mass):.3g} m; convert to kg m2"
+    if mass > 0.0 and _too_long(gyration := float(np.sqrt(large / mass)), finger):
+        return f"a radius of gyration of {gyration:.3g} m; convert to kg m2"
     return None
+
+
+def _too_long(length: float, finger: FingerDescription) -> bool:
+    """Whether a length, m, is too long for what the finger weighs, as one in mm or cm is."""
+    return bool(0.0 < finger.mass.sum() < _MIN_DENSITY * length**3)
 
 
 def _lengths(finger: FingerDescription, report: Report) -> None:
@@ -131,7 +138,7 @@ def _lengths(finger: FingerDescription, report: Report) -> None:
     lengths = {"joints/origin": finger.origin, "links/com": finger.com, "fingertip": finger.fingertip[None]}
     for key, vectors in lengths.items():
         for i, length in enumerate(np.linalg.norm(vectors, axis=1)):
-            if length > _MAX_LENGTH:
+            if _too_long(float(length), finger):
                 at, row = ("", None) if key == "fingertip" else (f" at joint {finger.joint_names[i]}", i)
                 report.error(f"/finger/{key}", f"is {length:.4g} m long{at}; convert mm or cm to m", row=row)
 
@@ -174,7 +181,5 @@ def _excursion(finger: FingerDescription, report: Report) -> None:
             report.error(
                 place, f"tendon {name} is pulled in by joint {joint}, which it does not cross; correct one", row=k
             )
-        elif np.abs(known[:, 0]).max(initial=0.0) > _MAX_ARM and not any(finger.prismatic):
-            report.error(
-                place, f"tendon {name} has a moment arm of {np.abs(known[:, 0]).max():.4g} m; convert mm to m", row=k
-            )
+        elif (arm := np.abs(known[:, 0]).max()) > _MAX_ARM * finger.length > 0.0 and not any(finger.prismatic):
+            report.error(place, f"tendon {name} has a moment arm of {arm:.4g} m; convert mm to m", row=k)

@@ -25,6 +25,8 @@ _MIN_JUMP = 0.5  # of a column's range: no motion passes half of it between two 
 _MAX_STEP = 0.1  # where nine in ten of its steps are shorter than a tenth of it.
 _MAX_SPREAD = 0.1  # of a period: jumps over the end of one range differ by what is moved in the meantime.
 _MIN_TRAVEL = 0.2  # of a period: a column that travels less once it is unwrapped may as well switch between two values.
+_MIN_ALIKE = 0.9  # of the jumps are as large as the period: the others are spikes.
+_MIN_RETURNS = 6  # jumps, where none lasts: three times there and back. Fewer are as well spikes as large as a turn.
 _MAX_WAIT = 5.0  # usual intervals between two samples: in a longer one a joint may move far.
 
 
@@ -102,7 +104,8 @@ def _period(x: np.ndarray, jumps: np.ndarray, lasting: np.ndarray, turns: bool) 
     beside = 0.5 * (usual[np.maximum(jumps - 1, 0)] + usual[np.minimum(jumps + 1, len(usual) - 1)])
     sizes = np.abs(steps[jumps] - beside)  # without the motion between the two samples
     period = float(np.median(sizes))
-    if np.mean(np.abs(sizes / period - 1.0) < _MAX_SPREAD) < 0.9 or (not len(lasting) and len(jumps) < 6):
+    alike = np.mean(np.abs(sizes / period - 1.0) < _MAX_SPREAD) >= _MIN_ALIKE
+    if not alike or (not len(lasting) and len(jumps) < _MIN_RETURNS):
         return None
     if turns and abs(period / _TURN - 1.0) < _MAX_SPREAD:
         return _TURN

@@ -8,8 +8,9 @@ from jaxfinger.data.checks.values import check_values
 from jaxfinger.data.findings import Report
 from jaxfinger.data.schema import CHANNELS, DRIVES, MEASURED, MEASURES, NEEDS_JOINT, NEEDS_TENDON
 from jaxfinger.data.session import FingerDescription, Trial
+from jaxfinger.data.signals.clock import gaps, longest_interval
 from jaxfinger.data.signals.motion import MIN_HOLD, MIN_MOTION, pulled_slowly, still_spans
-from jaxfinger.data.signals.sizes import MAX_RATE, Sizes
+from jaxfinger.data.signals.sizes import MAX_RATE, STEP_TIME, Sizes
 from jaxfinger.data.units import conversion
 from jaxfinger.errors import counted, listed
 
@@ -21,7 +22,7 @@ _STEPPED = ("ID.3-static", "ID.4", "VD.2")
 def check_trial(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
     """Report every fault of one trial. `sizes` are those of its session."""
     _attributes(trial, finger, report)
-    _time(trial, report)
+    _time(trial, sizes, report)
     for name in MEASURED:
         if getattr(trial, name) is not None:
             _nan(trial, name, finger, sizes, report)
@@ -66,8 +67,8 @@ def _several_joints(trial: Trial, finger: FingerDescription) -> bool:
     return len(trial.motorised(finger)) > 1
 
 
-def _time(trial: Trial, report: Report) -> None:
-    """Check that time increases from 0 in s, without gaps."""
+def _time(trial: Trial, sizes: Sizes, report: Report) -> None:
+    """Check that time increases from 0 in s, without gaps, and often enough to show the session's motions."""
     place, time = trial.place("time"), trial.time
     if not np.isfinite(time).all():
         report.error(
@@ -87,16 +88,16 @@ def _time(trial: Trial, report: Report) -> None:
         )
         return
     usual = float(np.median(steps))
-    if abs(time[0]) > max(10.0 * usual, 0.01):
+    if abs(time[0]) > longest_interval(steps):
         report.warning(place, f"starts at {time[0]:.6g} s; count from 0 in each trial")
-    if usual > 0.2:
+    # In this time a joint passes a tenth of its travel, so that longer intervals show no motion.
+    if usual > STEP_TIME * max(sizes.slow_pace, 1.0):
         report.warning(place, f"has a sample every {usual:.3g} s; {conversion('ms')} if that is what it is")
     if usual < 1.0 / MAX_RATE:
         report.warning(place, f"has a sample every {usual:.3g} s; convert times to s, such as days or hours")
-    gaps = steps > max(20.0 * usual, 0.02)  # Jitter is shorter than 20 intervals.
-    if gaps.any():
-        lost = f"{counted(int(gaps.sum()), 'gap')}, the longest {steps.max():.3g} s"
-        report.warning(place, f"has {lost}; samples were lost, derivatives bridge them")
+    if (lost := gaps(steps)).any():
+        said = f"{counted(int(lost.sum()), 'gap')}, the longest {steps.max():.3g} s"
+        report.warning(place, f"has {said}; samples were lost, derivatives bridge them")
 
 
 def _nan(trial: Trial, name: str, finger: FingerDescription, sizes: Sizes, report: Report) -> None:

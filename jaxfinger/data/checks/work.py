@@ -22,17 +22,18 @@ from jaxfinger.data.signals.filtering import low_pass, smooth
 from jaxfinger.data.signals.motion import CUTOFF_HZ, STILL_SHARE, directions, fitting_cutoff
 from jaxfinger.errors import listed
 
-# Share of the largest arm at a joint: a tendon whose torque shows more should not stand still. Small arms lie between
-# this one and `MAX_STILL_ARM`.
+# Share of the largest arm at a joint: a tendon whose torque shows more should not stand still, but for its stretch
+# (`Excursions.still`). Small arms lie between.
 _MIN_FELT_SHARE = 0.5
 # Ratio of the arm that torques show to the arm that excursions show. Friction reduces it: routed tendons lose up to two
 # thirds of their tension (the shipped session). Units that people confuse differ at least fourfold (N and lbf).
 _MIN_ARM_RATIO, _MAX_ARM_RATIO = 0.2, 1.5
 _MAX_EXCURSION_RATIO = 3.0  # of two measurements of one excursion: units that people confuse differ by more.
-_MIN_PATH = 1e-3  # m of excursion: over less, stretch and noise decide the ratio of two measurements.
+_MIN_PATH = 0.01  # of the finger's length, of excursion: over less, stretch and noise decide a ratio of two.
 _FORCE_RATIOS = (0.002, 1.0)  # N at the fingertip for each N of tension: a moment arm over a finger's length, with room
 # Moment arms as shares of the finger's length: neither nearly as long as a finger nor thinner than a hair.
 _MIN_ARM, _MAX_ARM = 0.004, 0.4
+_MIN_SAMPLES = 70  # ten for each of the regressors of a torque
 _MIN_TURNS = 3  # of a motion: with fewer, torque that accelerates the joint looks like friction.
 _MAX_NEGATIVE_FRICTION = 0.05  # of the torque's spread: a delay between the channels makes friction seem this negative.
 
@@ -53,7 +54,7 @@ def check_work(session: Session, report: Report) -> None:
 
 def _arm_lengths(arms: Mapping[tuple[int, int], float], finger: FingerDescription, report: Report) -> None:
     """Report joints whose largest moment arm does not fit the finger's length; `arms`, m, by tendon and joint."""
-    length = float(np.linalg.norm(finger.origin, axis=1)[1:].sum() + np.linalg.norm(finger.fingertip))
+    length = finger.length
     for i, joint in enumerate(finger.joint_names):
         largest = max((abs(arm) for (_, k), arm in arms.items() if k == i), default=np.nan)
         if largest > _MAX_ARM * length or largest < _MIN_ARM * length:
@@ -128,7 +129,7 @@ def _free_paths(session: Session, kinematic: Excursions, report: Report) -> None
             expected = np.sum([kinematic.polynomials[int(k), int(i)](q[:, i]) for i in joints], axis=0)
             ratio = slope(expected, l[:, k])
             agree = 1.0 / _MAX_EXCURSION_RATIO < ratio < _MAX_EXCURSION_RATIO
-            if np.isfinite(ratio) and not agree and np.ptp(expected) > _MIN_PATH:
+            if np.isfinite(ratio) and not agree and np.ptp(expected) > _MIN_PATH * finger.length:
                 found.append(f"{finger.tendon_names[k]} in {trial.name} ({ratio:.2g} times)")
     if found:
         report.warning(
@@ -169,7 +170,7 @@ def _passivity(session: Session, report: Report) -> None:
     shares: dict[str, list[float]] = defaultdict(list)
     for trial in session.select("ID.3-static", "ID.3-dynamic"):
         i = finger.joint(trial.joint)
-        if i is None or trial.joint_torque is None or len(trial.time) < 50:
+        if i is None or trial.joint_torque is None or len(trial.time) < _MIN_SAMPLES:
             continue
         share = _friction_share(trial, i)
         if np.isfinite(share):
@@ -194,7 +195,7 @@ def _friction_share(trial: Trial, joint: int) -> float:
     q, torque = (low_pass(trial.time, x, cutoff)[:, 0] for x in (q, torque))
     moves, powers = direction != 0.0, np.polynomial.polynomial.polyvander((q - q.mean()) / np.ptp(q), 5)
     columns = np.column_stack([direction, powers])[moves]
-    if len(columns) < 50 or np.ptp(columns[:, 0]) == 0.0:
+    if len(columns) < _MIN_SAMPLES or np.ptp(columns[:, 0]) == 0.0:
         return np.nan  # In one direction only, friction and elastic torque cannot be told apart.
     if trial.experiment != "ID.3-static" and np.count_nonzero(np.diff(columns[:, 0])) < _MIN_TURNS:
         return np.nan

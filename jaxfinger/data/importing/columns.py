@@ -15,6 +15,7 @@ from jaxfinger.data.importing.mapping import Column, ColumnSpec, MappedTrial, Re
 from jaxfinger.data.importing.readings import compare_units, converted, is_slower, period
 from jaxfinger.data.importing.recording import Variable
 from jaxfinger.data.importing.variables import Source, column_of, scale_of
+from jaxfinger.data.signals.clock import gaps
 from jaxfinger.data.signals.sizes import MAX_RATE
 from jaxfinger.data.toml import Place
 from jaxfinger.data.units import whole_turns
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 _MAX_CLOCK_RATIO = 30.0
 _MIN_COVERAGE = 0.5  # of a trial: a clock that covers less is taken to be a wrong one.
 _MIN_SAMPLES = 10  # within the trial: fewer show no motion.
-_MAX_INTERVAL = 0.2  # s: a clock with longer intervals is probably in other units.
 # A stamp that is late is so by less than this, in s and in samples, since loggers write more often; and one that runs
 # back between two longer runs of samples begins another recording, or wraps.
 _MAX_LATE, _MAX_LATE_SAMPLES = 1.0, 10
@@ -370,15 +370,8 @@ class ColumnReader:
                 f"{runs}: it covers only a part; name another clock, or cut the trial by span = "
                 f"[{begin:.4g}, {end:.4g}]"
             )
-        if step > _MAX_INTERVAL and name.strip("`") not in (self.clock.name, "rate_hz"):
-            self.report.warning(
-                where.key,
-                f"the clock {name} ticks every {step:.3g} s; write time = {{ from = {name.strip('`')!r}, "
-                "units = 'ms' }} if that is what it is",
-            )
-        gaps = steps > max(20.0 * step, 0.1)  # Jitter is shorter than 20 intervals, commanded motion slower than 0.1 s.
-        if gaps.any():
-            count = f"{counted(int(gaps.sum()), 'gap')}, the longest {float(steps.max()):.3g} s"
+        if (lost := gaps(steps)).any():
+            count = f"{counted(int(lost.sum()), 'gap')}, the longest {float(steps.max()):.3g} s"
             self.report.warning(where.key, f"the clock {name} has {count}; values in gaps are interpolated")
         if max(time[0] - trial[0], trial[-1] - time[-1]) > 2.0 * step:
             self.report.warning(where.key, f"{runs}; the trial is cut to what both cover")

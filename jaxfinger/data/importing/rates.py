@@ -8,15 +8,14 @@ import numpy as np
 
 from jaxfinger.data.findings import Report
 from jaxfinger.data.importing.columns import Clock
-from jaxfinger.data.importing.look import columns_of
 from jaxfinger.data.importing.recording import Recording
+from jaxfinger.data.importing.survey import MIN_GAP, columns_of
 from jaxfinger.data.toml import Place
 from jaxfinger.data.units import TO_SI, unit_name
 from jaxfinger.errors import counted
 
 _MAX_ERROR = 0.05  # of a rate: oscillators are right to a ten-thousandth, and round numbers of rates to some per cent.
 _MIN_STEPS = 20  # Fewer show no usual step.
-_MIN_GAP = 5.0  # times the usual step: well beyond jitter, so samples were lost.
 
 
 def compare_rate(rate: float, clock: Clock, recording: Recording, where: Place, report: Report) -> None:
@@ -32,7 +31,7 @@ def compare_rate(rate: float, clock: Clock, recording: Recording, where: Place, 
         # Coarse stamps have no usual step, and gaps lengthen the mean one.
         agrees = [any(abs(np.log(rate * step * f)) < _MAX_ERROR for step in (usual, mean) if step) for f in factors]
         mend = f"name it as `time` in place of rate_hz = {rate:g}"
-        gaps = (steps > _MIN_GAP * usual) & (usual > 0.0)
+        gaps = (steps > MIN_GAP * usual) & (usual > 0.0)
         if not any(agrees):
             step = usual or mean
             runs = (

@@ -10,14 +10,14 @@ import numpy as np
 
 from jaxfinger.data.session import FingerDescription, Session
 from jaxfinger.data.signals.motion import STILL_ANGLE
+from jaxfinger.data.signals.sizes import STRETCH_SHARE
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-# Share of the largest arm at a joint: a tendon with a smaller arm stands still, or is dragged along.
-MAX_STILL_ARM = 0.05
 _DEGREE = 3  # of l(q): the moment arm is then a parabola over a joint's range, enough to tell a sign or a unit
 _MIN_ARM_SHARE = 0.25  # of the largest arm at a joint: smaller arms may change sign with the posture.
+_MAX_BEYOND = 0.1  # of the range that ID.2 sweeps, by which an angle may lie outside: there l(q) still holds.
 _SAMPLES = 400  # of a trial: slopes of a motion need no more.
 
 
@@ -74,7 +74,8 @@ class Excursions:
     def arm(self, tendon: int, joint: int, angle: float) -> float | None:
         """Moment arm dl/dq, m/rad, at an angle; None where it is unknown or so small that it may change sign."""
         p = self.polynomials.get((tendon, joint))
-        if p is None or not p.domain[0] - 0.1 <= angle <= p.domain[1] + 0.1:
+        beyond = 0.0 if p is None else _MAX_BEYOND * np.ptp(p.domain)
+        if p is None or not p.domain[0] - beyond <= angle <= p.domain[1] + beyond:
             return None
         arm = float(p.deriv()(angle))
         large = abs(arm) > _MIN_ARM_SHARE * self.largest(joint)
@@ -85,11 +86,11 @@ class Excursions:
         return max((abs(arm) for (_, i), arm in self.arms.items() if i == joint), default=0.0)
 
     def still(self, tendon: int, joint: int) -> bool:
-        """Whether the tendon stands still over the whole range of a joint that it crosses."""
+        """Whether the tendon stands still over the whole range of a joint that it crosses, but for its stretch."""
         p = self.polynomials.get((tendon, joint))
         if p is None:
             return False
-        return bool(np.abs(p.deriv()(p.linspace()[0])).max() < MAX_STILL_ARM * self.largest(joint))
+        return bool(np.abs(p.deriv()(p.linspace()[0])).max() < STRETCH_SHARE * self.largest(joint))
 
 
 def thinned(x: Float[np.ndarray, "N *k"]) -> Float[np.ndarray, "M *k"]:

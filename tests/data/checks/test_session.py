@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import Session, check_file, read_session, write_session
+from jaxfinger.data.checks.finger import check_finger
 from jaxfinger.data.checks.session import check_session
 from jaxfinger.data.findings import Report
 from jaxfinger.errors import UserError
@@ -216,12 +217,40 @@ def test_a_tare_error_of_slack_tendons_is_no_wrong_sign(session, tmp_path):
     assert all(f.severity == "warning" and "check the tare" in f.message for f in found), found
 
 
+@pytest.mark.parametrize("size", [0.05, 1.0, 60.0])
+def test_lengths_are_in_other_units_for_their_machine(session, size):
+    """A boom of 3 m is one in m; whatever the size of a machine, its lengths in cm would make it lighter than air."""
+    machine = Scale(mass=size**3, length=size, time=size**0.5)(session).finger
+
+    def faults(**changes):
+        report = Report()
+        check_finger(replace(machine, **changes), report)
+        return [str(f) for f in report if f.severity == "error"]
+
+    assert faults() == []
+    for factor in (1e2, 1e3):
+        (said, *_) = faults(origin=factor * machine.origin, fingertip=factor * machine.fingertip)
+        assert "convert mm or cm to m" in said
+        (said, *_) = faults(excursion=factor * machine.excursion)
+        assert "convert mm to m" in said
+    (said, *_) = faults(inertia=1e6 * machine.inertia)
+    assert "convert to kg m2" in said
+
+
 @pytest.mark.parametrize(("factor", "words"), [(1.0, ""), (1000.0, "convert ms to s"), (1 / 60, "not in minutes")])
 def test_times_in_another_unit_are_said_by_the_motion(session, tmp_path, factor, words):
     trials = {t.name: replace(t, time=factor * t.time) for t in session}
     write_session(replace(session, trials=trials), tmp_path / "s.h5")
     said = [f.message for f in check_file(tmp_path / "s.h5") if f.message.startswith("joints move")]
     assert [words in m for m in said] == [True] * bool(words)
+
+
+def test_a_slow_machine_needs_no_more_samples(session):
+    """A crane that moves 30 times as slowly, with a sample every 0.3 s, shows its motions as well as a finger."""
+    trials = {t.name: replace(t, time=30.0 * t.time, session_start=None) for t in session}
+    assert not [text for text in said_of(replace(session, trials=trials)) if "has a sample every" in text]
+    pulled = {n: t for n, t in trials.items() if t.experiment == "ID.4"}
+    assert [text for text in said_of(replace(session, trials=pulled)) if "has a sample every 0.3 s" in text]
 
 
 @pytest.mark.parametrize("least", [True, False])

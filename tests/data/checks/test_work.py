@@ -8,6 +8,7 @@ import pytest
 from benchmarks.bad_input import complaints, mistakes
 from jaxfinger.data import Trial
 from jaxfinger.data.checks.work import suspects
+from tests.units import Scale
 
 FRICTION = 0.004  # N m
 
@@ -47,6 +48,17 @@ def test_what_contradicts_is_said(sound, experiment, channel, change, words):
 
     found = complaints(replace(sound, trials={t.name: wrong(t) for t in sound})) - complaints(sound)
     assert any(words in text for text in found), found
+
+
+@pytest.mark.parametrize("size", [0.05, 1.0, 20.0])
+def test_free_paths_are_long_for_their_machine(sound, size):
+    machine = Scale(mass=size**3, length=size, time=size**0.5)(sound)
+    turned = {
+        t.name: replace(t, tendon_excursion=-t.tendon_excursion) if t.experiment == "VD.1" else t for t in machine
+    }
+    words = "not those that ID.2 shows"
+    assert not any(words in text for text in complaints(machine))
+    assert any(words in text for text in complaints(replace(machine, trials=turned)))
 
 
 def test_an_excursion_that_stands_still_is_said_though_it_has_noise(sound):

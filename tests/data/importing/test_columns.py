@@ -50,6 +50,13 @@ def test_a_slower_clock_is_interpolated_and_the_trial_cut_to_it(tmp_path):
     assert not any("cut" in text for text in said)  # Less than two intervals are cut, which is no finding.
 
 
+def test_a_slow_sensor_is_in_no_other_units(tmp_path):
+    """A thermocouple or a camera may give a value every 0.4 s."""
+    rare = np.arange(16) * 0.4
+    _, said = bring_in(tmp_path, OWN, slow=rare, tau=0.01 * np.sin(rare))
+    assert not any("slow" in text for text in said)
+
+
 def test_a_clock_that_covers_a_part(tmp_path):
     trial, said = bring_in(tmp_path, OWN, slow=SLOW[:100], tau=0.01 * np.sin(SLOW[:100]))
     assert trial.time[-1] == pytest.approx(SLOW[99])

@@ -8,9 +8,10 @@ import pytest
 import scipy.io
 
 from jaxfinger.cli import main
-from jaxfinger.data.importing.look import clocks_of, columns_of, proposal
 from jaxfinger.data.importing.mapping import read_mapping
+from jaxfinger.data.importing.proposal import proposal
 from jaxfinger.data.importing.sources import load_recording
+from jaxfinger.data.importing.survey import clocks_of, columns_of
 from jaxfinger.data.units import TO_SI
 from tests.data.conftest import ONE_JOINT, make_finger
 

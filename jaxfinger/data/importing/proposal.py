@@ -1,4 +1,4 @@
-"""Survey of a recording (names, ranges, rates, gaps, guessed units), and a proposal of a mapping that reads it."""
+"""Proposal of a mapping that reads some recordings, by a survey of their columns."""
 
 from __future__ import annotations
 
@@ -9,196 +9,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxfinger.data.importing.columns import coarse_rate, restarts
-from jaxfinger.data.importing.recording import Recording, Variable
+from jaxfinger.data.importing.recording import Recording
+from jaxfinger.data.importing.survey import ColumnSurvey, columns_of, is_set_point
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
-from jaxfinger.data.units import TO_SI, is_foreign, unit_name
+from jaxfinger.data.units import TO_SI
 from jaxfinger.errors import listed
 
-_MIN_GAP = 5.0  # times the median interval: well beyond jitter, so samples were lost.
-# Patterns of names for each channel, of which the first that fits counts: common words in logs of robots.
-_MEANINGS = (
-    ("time", r"^t$|time|stamp|clock|zeit|^sec"),
-    ("temperature", r"temp"),
-    ("joint_torque", r"(^|_)tau|torque|effort|moment"),
-    ("tendon_excursion", r"excursion|^l\d*$|length|pull|spool|linear|travel"),
-    ("tendon_force", r"tension|tendon.*force|^f_?t|^f(\d|_(?!([xyz]|tip)$))|cable|loadcell|(^|_)cell(_|\d|$)|^force"),
-    ("fingertip_force", r"f?tip|contact|^f[xyz]$|wrench"),
-    ("q", r"^q[_\d]*|angle|pos|enc|theta|winkel|deg$"),
-)
-# Names of velocities, which belong to no channel, and of set-points, which are not measured.
-_VELOCITY = r"(?<![a-z])vel|speed|dot|^v$|^dq"
-_SET_POINT = (
-    r"cmd|command|ref(?!l)|desired|set_?p(oin)?t|goal|target|demand|soll|feed_?forward"
-    r"|(?<![a-z])(q|tau|pos)?(des|set(?!\d+\.)|sp|ff|tgt|nominal|planned)(?![a-z])"
-)
 # Names of what is in front of a joint's gear or spring.
 _MOTOR = r"(?<![a-z])(motor|mot|drive|actuator|rotor|spool|winch)(?![a-z])"
-# Largest plausible values of a channel by unit, with room for arms. The first unit whose largest value is not exceeded
-# is the guess. Torques from 5 to 100 may be an arm's in N m or a finger's in N mm, and large tensions may be in mN or
-# gf, so their unit stays open.
-_MAX_VALUES = {
-    "q": (("rad", 7.0), ("deg", 400.0)),
-    "joint_torque": (("N m", 5.0), ("", 100.0), ("N mm", 5e3)),
-    "tendon_force": (("N", 500.0), ("", 1e6)),
-    "tendon_excursion": (("m", 0.2), ("mm", 200.0)),
-    "fingertip_force": (("N", 100.0), ("mN", 1e5)),
-    "temperature": (("degC", 200.0), ("K", 1e3)),
-}
-_SI_UNITS = {
-    "time": ("s",),
-    "temperature": ("K",),
-    "joint_torque": ("N m", "N"),
-    "tendon_excursion": ("m",),
-    "tendon_force": ("N",),
-    "fingertip_force": ("N",),
-    "q": ("rad", "m"),
-}
-_CHANNEL_OF_UNITS = {"rad": "q", "N m": "joint_torque", "N": "tendon_force", "m": "tendon_excursion"}
 _MIN_TRAVEL = {"rad": 0.1, "m": 1e-3}  # Less is the yield of a fixture.
-# Ranges of the usual interval, 10 µs to 0.5 s, in each unit. Where they overlap the first one counts.
-_INTERVALS = (("s", 1e-5, 0.5), ("ms", 0.01, 500.0), ("us", 10.0, 5e5), ("ns", 1e4, 5e8))
 _PARTS = 400  # of a recording: a step of a protocol lasts several of them, and each averages noise.
 _MAX_STILL_CHANGE = 0.1  # of the quickest change between parts: with less a joint stands still.
 _MIN_STILL_SHARE = 0.4  # of the parts: a stepped joint stands still in more of them, a swinging one in a sixteenth.
 _MIN_TENSION_CHANGE = 0.5  # of the highest tension: larger where tendons drive the finger (VD.3), smaller in VD.1.
 _MAX_LEFT_OUT = 12  # variables that are named, so that the line of a large bag stays readable.
 _HEAD = 'specimen = "my finger"\nfinger = "finger.toml"'
-
-
-@dataclass(frozen=True)
-class ColumnSurvey:
-    """Survey of one column of a recording."""
-
-    name: str
-    column: str | int | None  # name or number, None for a variable with one column
-    samples: int
-    low: float  # smallest value
-    high: float  # largest value
-    missing: int  # number of values that are NaN or infinite
-    units: str  # as the recording states them, else a guess; empty where they are unclear
-    stated: bool  # whether the recording states the units
-    meaning: str  # channel, `time`, or empty
-    foreign: str = ""  # unit that the recording states and no mapping converts, such as counts
-
-
-@dataclass(frozen=True)
-class ClockSurvey:
-    """Survey of one clock of a recording: a variable that increases as times do."""
-
-    name: str
-    units: str
-    duration: float  # s
-    rate: float  # Hz
-    gaps: int  # number of gaps
-    longest: float  # s, longest gap
-    disordered: int  # number of stamps that do not increase
-    restarts: int  # number of places at which it begins again or wraps
-
-
-def columns_of(recording: Recording, among: Sequence[Recording] = ()) -> list[ColumnSurvey]:
-    """Survey every column of every variable of a recording.
-
-    A unit is guessed from the largest values that the column has in any recording `among` these: a joint that is held
-    at 5 degrees could be one at 5 rad, until another recording shows it at 80.
-    """
-    found = []
-    for name, variable in recording.variables.items():
-        table = variable.values.reshape(len(variable.values), -1)
-        for k, x in enumerate(table.T):
-            column = None if table.shape[1] == 1 else (variable.columns[k] if variable.columns else k)
-            units, stated = unit_name(variable.units), bool(unit_name(variable.units))
-            spelt = units or _spelt(name)
-            foreign = variable.units if is_foreign(variable.units) and not spelt else ""
-            meaning = _meaning(name, column, x, spelt)
-            if spelt:
-                units = spelt
-            elif not stated and not foreign:
-                units = _time_unit(x) if meaning == "time" else _unit(meaning, _sizes(name, k, recording, among))
-            finite = x[np.isfinite(x)]
-            low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
-            missing = len(x) - len(finite)
-            found.append(ColumnSurvey(name, column, len(x), low, high, missing, units, stated, meaning, foreign))
-    return found
-
-
-def _sizes(name: str, k: int, recording: Recording, among: Sequence[Recording]) -> list[float]:
-    """Sizes of column `k` of a variable, in its recording and in those of `among` with the same columns and units."""
-    variable = recording.variables[name]
-    alike = [variable, *(v for other in among if (v := other.variables.get(name)) is not None)]
-    same = [v for v in alike if (v.columns, v.units) == (variable.columns, variable.units)]
-    return [v.sizes[k] for v in same if k < len(v.sizes)]
-
-
-def clocks_of(recording: Recording, seen: Sequence[ColumnSurvey]) -> list[ClockSurvey]:
-    """Survey every clock among the columns of a recording."""
-    return [
-        _clock_survey(s.name, recording.variables[s.name], s.units or "s")
-        for s in seen
-        if s.meaning == "time" and s.samples > 2
-    ]
-
-
-def _clock_survey(name: str, variable: Variable, units: str) -> ClockSurvey:
-    """Survey one clock, with its stamps put into order."""
-    time = np.ravel(variable.values) * TO_SI[units].factor
-    begins = restarts(time)
-    steps = np.concatenate([_steps(part) for part in np.split(time, begins + 1)])
-    usual = float(np.median(steps)) if len(steps) else np.nan
-    gaps = steps > _MIN_GAP * usual
-    return ClockSurvey(
-        name,
-        units,
-        float(steps.sum()),
-        1.0 / usual,
-        int(gaps.sum()),
-        float(steps[gaps].max()) if gaps.any() else 0.0,
-        int((np.diff(time) <= 0.0).sum()),
-        len(begins),
-    )
-
-
-def _steps(time: np.ndarray) -> np.ndarray:
-    """Intervals between the distinct stamps in order of time, since stamps in the file may be out of order."""
-    return np.diff(np.unique(time[np.isfinite(time)]))
-
-
-def _meaning(name: str, column: str | int | None, x: np.ndarray, units: str) -> str:
-    """Channel or `time` by the last word of a name where the units allow it, else by the units; empty where unclear."""
-    bare = re.sub(r"[\[(].*", "", name).strip("/ ")  # Units stand in brackets.
-    word = re.split(r"[./]", bare)[-1].lower()
-    if re.search(_VELOCITY, word) or is_set_point(name):
-        return ""
-    for meaning, pattern in _MEANINGS:
-        if re.search(pattern, word) and (not units or TO_SI[units].si in _SI_UNITS[meaning]):
-            runs = len(x) > 2 and (len(np.unique(x)) > 0.5 * len(x) or coarse_rate(x) is not None)
-            return meaning if meaning != "time" or (column is None and runs) else ""
-    return _CHANNEL_OF_UNITS.get(TO_SI[units].si, "") if units else ""
-
-
-def is_set_point(name: str) -> bool:
-    """Whether a variable's name, or that of a structure which holds it, says that it is a set-point."""
-    members = re.sub(r"[\[(].*", "", name).strip("/ ").split("/")[-1]
-    return re.search(_SET_POINT, re.sub(r"(?<=[a-z])(?=[A-Z])", "_", members).lower()) is not None
-
-
-def _spelt(name: str) -> str:
-    """Unit at the end of a name such as `stamp_ms`. A single letter is not taken for one."""
-    last = re.split(r"[\s_./]", name.strip())[-1]
-    return unit_name(last) if len(last) > 1 else ""
-
-
-def _time_unit(x: np.ndarray) -> str:
-    """Guess the unit of a clock from its usual interval between samples."""
-    steps, coarse = _steps(x), coarse_rate(x)
-    step = 1.0 / coarse[1] if coarse else float(np.median(steps)) if len(steps) else np.nan
-    return next((unit for unit, low, high in _INTERVALS if low <= step < high), "s")
-
-
-def _unit(meaning: str, sizes: Sequence[float]) -> str:
-    """Guess the unit of a channel from the sizes of its values in several recordings."""
-    size = max((size for size in sizes if not np.isnan(size)), default=np.nan)
-    return next((unit for unit, largest in _MAX_VALUES.get(meaning, ()) if size <= largest), "")
 
 
 def proposal(recordings: Sequence[Recording], finger: FingerDescription | None = None, head: str = _HEAD) -> str:
