@@ -26,7 +26,15 @@ from jaxfinger.identify.gauss_newton import TANGENTS_AT_ONCE, VisibleGaussNewton
 from jaxfinger.identify.linearise import Filters, huber, white_rows
 from jaxfinger.identify.parameters import Free, describe, ravel, with_flat
 from jaxfinger.identify.readings import readings_of
-from jaxfinger.identify.resample import Batching, Compressed, batching_here, compress, plan_of, staged_step
+from jaxfinger.identify.resample import (
+    Batching,
+    Compressed,
+    batching_here,
+    compress,
+    plan_of,
+    staged_step,
+    std_from_noise,
+)
 from jaxfinger.identify.solve import KINK_TOLERANCE, MAX_STEPS, STEP_TOLERANCE, parameter_bounds
 from jaxfinger.identify.stages import cad_prior, nominal_model, sources_of
 from jaxfinger.model import Model
@@ -40,7 +48,8 @@ class Members:
     """Fits of S sessions."""
 
     values: Float[np.ndarray, "S P"]  # flat vectors; NaN where a member failed
-    std: Float[np.ndarray, "S P"]  # infinite where the template's is
+    # From the noise, widened as much as the template's are (`intervals`); infinite where these are.
+    std: Float[np.ndarray, "S P"]
     failed: Bool[np.ndarray, " S"]  # did not converge, or its trials do not determine all parameters
     steps: np.ndarray  # linearisations of each member, summed over stages
     template: Fit
@@ -116,6 +125,8 @@ def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: 
     columns = zip(*(s.result() for s in shares), strict=True)
     values, std, sound, steps = (np.concatenate(a)[: len(sessions)] for a in columns)
     values[~sound], std[~sound] = np.nan, np.nan
+    noise = std_from_noise(compressed)
+    std *= np.divide(template.std, noise, out=np.ones_like(noise), where=noise > 0.0)
     std[np.ix_(sound, ~np.isfinite(template.std))] = np.inf
     return Members(values, std, ~sound, steps, template)
 

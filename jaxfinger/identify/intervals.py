@@ -9,8 +9,8 @@ therefore cut into stretches, each about one movement long. With the score g_b =
 
 is the covariance of the estimate over other recordings of similar motions, however residuals are correlated within a
 stretch. Its ratio to Laplace's is well known for all parameters together that a column of a channel tells of: `laplace`
-divides the information of each column by that. V of a single parameter replaces the rest where chance does not explain
-that it is larger: `growth`.
+divides the information of each column by that. V of a single parameter may be larger still, by more than chance
+explains: `growth`.
 """
 
 from collections.abc import Sequence
@@ -22,8 +22,8 @@ from jaxtyping import Float, Int
 from jaxfinger.identify.linearise import robust_residuals, robust_share
 
 STRETCH_DURATION = 1.0  # s, at the protocol's pace: about the duration of one movement
-# V replaces Laplace's variance only where it exceeds it by so many of its own standard deviations. At 4, chance widens
-# fewer than 1 % of intervals where the model is right (tests/identify/test_intervals.py).
+# V exceeds Laplace's variance by more than so many of its own standard deviations, or it does not count. At 4, chance
+# widens fewer than 1 % of intervals where the model is right (tests/identify/test_intervals.py).
 MIN_EXCESS = 4.0
 
 
@@ -131,4 +131,4 @@ def growth(
     # A sum of b squares of Gaussians has the relative standard deviation √(2/b). Their fourth powers sum to 3/b of the
     # square of that sum, which gives b also where the scores are of unequal size.
     chance = np.sqrt(2.0 / 3.0 * fourth) / np.where(squares > 0, squares, np.inf)
-    return np.where(ratio > 1.0 + MIN_EXCESS * chance, np.sqrt(np.maximum(ratio, 1.0)), 1.0)
+    return np.sqrt(np.maximum(1.0, ratio - MIN_EXCESS * chance))

@@ -179,6 +179,12 @@ def refit(
     return theta, failed
 
 
+def std_from_noise(compressed: Compressed) -> Float[np.ndarray, " P"]:
+    """Standard deviations in SI units of all trials' fit, from their noise alone; zero where nothing is estimated."""
+    covariance = np.asarray(_covariance(compressed.grams, compressed.sizes))
+    return np.sqrt(np.maximum(np.sum((compressed.basis @ covariance) * compressed.basis, axis=1), 0.0))
+
+
 def batching_here(batching: Batching | None) -> Batching:
     """The batching asked for, else the one that suits the device."""
     return batching or ("map" if jax.default_backend() == "cpu" else "vmap")
@@ -190,6 +196,11 @@ def _refit_all(grams: Grams, sizes: tuple[int, ...], members: tuple[Array, Array
         return _refit(grams, sizes, *member)
 
     return jax.lax.map(one, members) if batching == "map" else jax.vmap(one)(members)
+
+
+@quick_jit
+def _covariance(grams: Grams, sizes: tuple[int, ...]) -> Float[Array, "q q"]:
+    return staged_step(jnp.tensordot(grams.reads, grams.H, 1), sizes, jnp.zeros(sizes[0]))[1]
 
 
 def _refit(grams: Grams, sizes: tuple[int, ...], weights: Float[Array, " K"], given: Float[Array, " k"]):
