@@ -190,7 +190,7 @@ class Rig(ABC):
     def beat(self) -> None:
         """Send one heartbeat. The controller releases the finger if none comes for its heartbeat time (`heartbeat_s`).
 
-        It means that the whole host is well, so in a recording in real time only the watch sends it (watch.py).
+        It means that the whole host is well, so in a recording in real time only the watch has it sent (watch.py).
         """
 
     def _pause(self, seconds: float) -> None:

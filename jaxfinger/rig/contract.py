@@ -213,7 +213,7 @@ _SEE = {  # what to look at after a trip
     Trip.STALE: "whether its task runs",
     Trip.CLOCK: "the controller's task and its distributed clock",
     Trip.RECORDER: "the disk",
-    Trip.HOST: "what else this computer does",
+    Trip.HOST: "what else this computer does, and the network",
     Trip.TRACKING: "the tendon's drive and its load cell",
     Trip.TEMPERATURE: "what loads the motor",
     Trip.LAG: "what else this computer does, and the network",

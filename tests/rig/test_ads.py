@@ -7,6 +7,7 @@ import re
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -219,6 +220,45 @@ def test_one_call_that_never_ends_hangs_and_many_slow_ones_do_not(calls):
         else:
             assert rig._call(lambda: b"mine") == b"mine"
     finally:
+        other.join()
+
+
+@pytest.mark.parametrize("hangs", ["call", "connecting again"])
+def test_a_call_that_hangs_is_waited_for_once(monkeypatch, hangs):
+    """A stop, the look whether tension falls, and the end of the run would each wait for it again."""
+    rig, begun, go = ads_rig("127.0.0.1:1"), threading.Event(), threading.Event()
+
+    def hang():
+        begun.set()
+        go.wait(60.0)
+        return b""
+
+    def cut():
+        raise pyads.ADSError(text="cut")
+
+    monkeypatch.setattr(rig, "_attach", hang)
+
+    def call():
+        with contextlib.suppress(ConnectionLost):
+            rig._call(hang if hangs == "call" else cut)
+
+    other = threading.Thread(target=call)
+    other.start()
+    try:
+        begun.wait()
+        with pytest.raises(ConnectionLost, match="hangs"):
+            rig._call(lambda: b"")
+        attempts = []
+        wait = rig._lock.acquire
+        rig._lock = SimpleNamespace(
+            acquire=lambda timeout: attempts.append(timeout) or wait(timeout=timeout), release=rig._lock.release
+        )
+        with pytest.raises(ConnectionLost, match="hangs"):
+            rig._call(lambda: b"")
+        rig.close()
+        assert len(attempts) == 2
+    finally:
+        go.set()
         other.join()
 
 

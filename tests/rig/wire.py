@@ -23,7 +23,7 @@ from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
 from jaxfinger.rig import matrix, parse_plan, parse_rig, run, wal
 from jaxfinger.rig.backends.ads import AdsRig
-from jaxfinger.rig.contract import State
+from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.examples import rig_toml
 
@@ -35,7 +35,7 @@ CALM = {"stale_s": 3.0, "lag_s": 3.0, "thread_s": 3.0, "disk_s": 5.0, "clock_off
 # The deadline that a row tests; it keeps its default.
 TESTED_DEADLINE = {
     "slow": "clock_offset_s", "stall": "stale_s", "lag": "lag_s", "reader": "thread_s", "runner": "thread_s",
-    "disk": "disk_s", "clock slow": "clock_offset_s",
+    "disk": "disk_s", "clock slow": "clock_offset_s", "call": "thread_s", "beat": "thread_s",
 }  # fmt: skip
 
 
@@ -133,10 +133,10 @@ def once(cell: Cell) -> Found | str:
                 armed.set()
             return block
 
-        call = rig._call
+        call, in_call = rig._call, {"jaxfinger-reader": "call", "jaxfinger-heartbeat": "beat"}
 
         def called(request, mend=True):
-            return call(lambda: (host.hang("call"), request())[1], mend)
+            return call(lambda: (host.hang(in_call.get(threading.current_thread().name, "")), request())[1], mend)
 
         rig.poll, rig._call = polled, called
         reached, views = threading.Event(), []
@@ -197,7 +197,7 @@ def once(cell: Cell) -> Found | str:
         )  # fmt: skip
 
 
-HANGS = ("reader", "call", "runner", "watch", "disk", "full")
+HANGS = ("reader", "call", "beat", "runner", "watch", "disk", "full")
 HOSTS = ("key", "deaf", *HANGS)
 
 
@@ -211,6 +211,8 @@ def judge(found: Found) -> list[str]:
         faults.append(f"stopped after {found.stop_s} s")
     if row.off and (found.off_s is None or not found.off_s <= shows + matrix.OFF_S):
         faults.append(f"tension off after {found.off_s} s")
+    if row.by == matrix.CONTROLLER and found.cell.phase != "letting go" and found.trip != Trip.HEARTBEAT:
+        faults.append(f"not stopped by the controller's watchdog but by trip {found.trip}")
     if found.end_s > matrix.END_S:
         faults.append(f"ended after {found.end_s} s")
     if found.missing_s is not None and found.missing_s > matrix.LOST_S:
@@ -228,6 +230,7 @@ SAYS = {
     "restart": ["program was restarted"],
     "cut": ["connection to the controller is lost"],
     "call": ["a call to the controller hangs"],
+    "beat": ["a call to the controller hangs"],
     "disk": ["disk does not answer"],
     "full": ["No space left"],
     "deaf": ["the operator pressed the stop key"],

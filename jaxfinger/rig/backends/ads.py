@@ -72,8 +72,8 @@ class AdsRig(RingRig):
         self._lock = threading.Lock()
         self._places: dict[str, tuple[int, int, int]] = {}  # symbol: group, offset, size in bytes
         self.reconnects = 0
-        self._calls = 0  # calls that have had the connection
-        self._mending = False  # a call is connecting again
+        self._calls = 0  # calls that have had the connection, and attempts to connect again
+        self._hanging = -1  # the newest of them that was found to hang
         self._given_up = False  # a call could not connect again, so later calls do not try
         self._closed = False
         self._claim: int | None = None  # descriptor of the file that keeps other programs of this computer away
@@ -121,8 +121,8 @@ class AdsRig(RingRig):
 
     def close(self) -> None:
         self._closed = self._given_up = True  # A thread that was left behind must not connect again.
-        # Where the lock is not free, another thread hangs in a call; it closes the connection when it comes back.
-        if self._lock.acquire(timeout=MAX_CALL_S):
+        with contextlib.suppress(ConnectionLost):  # A thread that hangs closes the connection when it comes back.
+            self._acquire(patient=True)
             try:
                 self._detach()
             finally:
@@ -148,10 +148,10 @@ class AdsRig(RingRig):
         try:
             return request()
         except self._failures as first:
-            self._mending = mend
             deadline = time.monotonic() + patience
             while mend and not self._given_up and time.monotonic() < deadline:
                 self.report_alive()
+                self._calls += 1
                 self._detach()
                 try:
                     self._attach()
@@ -163,7 +163,6 @@ class AdsRig(RingRig):
             self._given_up |= mend
             raise ConnectionLost(f"the connection to the controller is lost ({first}).") from first
         finally:
-            self._mending = False
             if self._closed:
                 self._detach()
             self._lock.release()
@@ -171,9 +170,9 @@ class AdsRig(RingRig):
     def _acquire(self, patient: bool) -> None:
         """Take the connection, which another thread may be using.
 
-        A patient call waits MAX_CALL_S for any one call of others, and without limit while one is connecting again. A
-        heartbeat is not patient: it waits MAX_BEAT_WAIT_S in all. The waits are counted, not measured by the clock: a
-        machine that held up this thread also held up the other's call.
+        A patient call waits MAX_CALL_S for any one call or attempt to connect of others, and not at all for one that
+        was found to hang before. A heartbeat is not patient: it waits MAX_BEAT_WAIT_S in all. The waits are counted,
+        not measured by the clock: a machine that held up this thread also held up the other's call.
 
         Raises:
             ConnectionLost: the other call hangs.
@@ -184,7 +183,9 @@ class AdsRig(RingRig):
             if patient and self._calls != call:
                 call, waits = self._calls, 0
             waits += 1
-            if waits * LOCK_POLL_S > (MAX_CALL_S if patient else MAX_BEAT_WAIT_S) and not (patient and self._mending):
+            if patient and waits * LOCK_POLL_S > MAX_CALL_S:
+                self._hanging = call
+            if self._hanging == call or waits * LOCK_POLL_S > (MAX_CALL_S if patient else MAX_BEAT_WAIT_S):
                 raise ConnectionLost("a call to the controller hangs.")
         self._calls += 1
 
