@@ -5,6 +5,8 @@ import json
 import os
 import re
 import socket
+import subprocess
+import sys
 import threading
 import time
 from types import SimpleNamespace
@@ -190,14 +192,32 @@ def test_a_second_program_on_this_computer_cuts_off_nobody(real_time):
             other.status()
 
 
+def test_a_second_program_is_refused_whatever_its_folders_and_its_name_for_the_controller(real_time, tmp_path):
+    """The controller would keep the newer connection, and the first program would lose its trial."""
+    second = (
+        "import sys\nfrom tests.rig.conftest import ads_rig\n"
+        "try:\n    ads_rig(sys.argv[1]).connect()\nexcept Exception as error:\n    print(error)\n"
+    )
+    name = real_time.replace("127.0.0.1", "localhost")
+    with ads_rig(real_time) as rig:
+        done = subprocess.run(
+            [sys.executable, "-c", second, name],
+            env={**os.environ, "TMPDIR": str(tmp_path), "HOME": str(tmp_path)},
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        assert f"another program on this computer has the controller at {name}" in done.stdout
+        rig.status()
+        assert rig.reconnects == 0
+
+
 def test_nobody_there(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     rig = ads_rig(f"127.0.0.1:{port}")
     rig.description.address["reconnect_s"] = 0
-    with pytest.raises(ConnectionLost, match="route back"):
-        rig.connect()
+    with pytest.raises(ConnectionLost, match="route back"), rig:
+        pass
 
 
 @pytest.mark.parametrize("calls", [1, 8])
@@ -289,8 +309,8 @@ def test_a_program_without_the_symbols_is_refused():
     lock = threading.Lock()
     server = AmsServer(bytearray(64), {"MAIN.x": (0, 8)}, lock)
     try:
-        with pytest.raises(UserError, match=r"no symbol GVL_Jaxfinger\.stInfo"):
-            ads_rig(f"127.0.0.1:{server.port}").connect()
+        with pytest.raises(UserError, match=r"no symbol GVL_Jaxfinger\.stInfo"), ads_rig(f"127.0.0.1:{server.port}"):
+            pass
     finally:
         server.close()
 
