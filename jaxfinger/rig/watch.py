@@ -136,7 +136,11 @@ class Watch:
             self._silent[me] = self._silent[me] + passed if signs == self._seen[me] else 0.0
             self._seen[me] = signs
             if self._silent[me] > deadlines.thread_s:
-                return Violation(Trip.HOST, f"silence of its {name}", seq, self._silent[me], unit="s")
+                said = f"the host's {name} was silent for {self._silent[me]:.2g} s"
+                cause = f"{said}; see what else this computer does, and the network"
+                return Violation.of_host(Trip.HOST, seq, cause)
         if (waited := self.reader.recorder.waiting_s) > deadlines.disk_s:
-            return Violation(Trip.RECORDER, "silence of the disk", seq, waited, unit="s")
+            return Violation.of_host(
+                Trip.RECORDER, seq, Trip.RECORDER.said(f"no answer of the disk for {waited:.2g} s")
+            )
         return None

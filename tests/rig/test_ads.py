@@ -169,7 +169,7 @@ def test_a_joint_that_runs_beyond_its_stop_is_let_go_in_the_right_order(lockstep
             blocks.append(rig.read_block(20.0))
         assert status.trip is Trip.POSITION
         assert status.trip_channel == "joint_position MCP"
-        assert "joint beyond its limits (joint_position MCP = 1.6" in status.cause
+        assert "joint beyond its limits (joint_position MCP = 92." in status.cause
         with pytest.raises(CommandRefused, match="in state TRIPPED"):
             rig.arm()
         columns = rig.description.columns("tension", rig.description.finger.tendon_names)
@@ -387,7 +387,7 @@ def test_the_controllers_own_trip_ends_the_trial_with_its_cause(lockstep, record
     trial = 'experiment = "VD.3"\nmean = [2.0, 2.0, 7.0, 2.0]\namplitude = 3.0\nposture_deg = [75.0, 20.0, 20.0]'
     plan = parse_plan(f'[plan]\nname = "into the stop"\n[[trial]]\n{trial}\ntension_rate = 5.0\n', rig.description)
     outcome = record(rig, plan=plan)
-    assert "01-VD.3: the controller stopped: joint beyond its limits (joint_position MCP = 1.6" in outcome.cause
+    assert "01-VD.3: the controller stopped: joint beyond its limits (joint_position MCP = 92." in outcome.cause
     with h5py.File(outcome.session) as file:
         attributes, angle = file["trials/01-VD.3"].attrs, file["trials/01-VD.3/q"][:, 0]
         assert attributes["trip"] == Trip.POSITION
