@@ -183,7 +183,8 @@ class Runner:
         if status.state in DRIVES_ON:
             rig.release()
         if status.state is State.TRIPPED and not rig.prepare(Setup("")):
-            self._ask(f"The controller is stopped: {status.cause}. See that finger and hands are safe.")
+            safe = "See that finger and hands are safe; Enter then clears the stop."
+            self._ask(f"The controller is stopped: {status.cause}. {safe}")
         if status.state is not State.IDLE:
             self._let_pass(AFTER_TRIP_S, since=rig.status().head)
         if status.state is State.TRIPPED:
@@ -433,21 +434,22 @@ class Runner:
         """Wait until a block is `done`. `lacks` says what it lacks, with a leading separator.
 
         Raises:
-            TrialEnded: `timeout` s have passed on the device's clock, or the host's limit for it, or the run must end.
+            TrialEnded: `timeout` s of samples have come, or the host's limit for them is over, or the run must end.
         """
         self.reader.forget()
-        start, latest = self.reader.latest_t, time.monotonic() + self._host_limit(timeout)
+        start, latest = self.reader.latest_seq, time.monotonic() + self._host_limit(timeout)
         while True:
             block = self.reader.next()
             self._check(block)
             if block is not None:
-                start = start if start >= 0 else int(block.t_ns[0])  # the first block of all
+                start = start if start >= 0 else int(block.seq[0])  # the first block of all
                 self.observe(
                     View(*self._place, doing, block, self.reader.lost, self.reader.recording, self.reader.lag_s)
                 )
                 if done(block):
                     return
-            if time.monotonic() > latest or (block is not None and (int(block.t_ns[-1]) - start) * 1e-9 > timeout):
+            passed = (int(block.seq[-1]) - start) / self.rig.description.rate_hz if block is not None else 0.0
+            if passed > timeout or time.monotonic() > latest:
                 raise TrialEnded(f"{doing} took longer than {timeout:g} s{lacks()}", Trip.HOST)
 
     def _check(self, block: Block | None) -> None:

@@ -94,8 +94,7 @@ def admit(command: Command, rig: RigDescription) -> None:
 class Supervisor:
     """The host's limits on samples. Blocks must be given in order and without exception.
 
-    State is kept from block to block, so that the size of blocks makes no difference. `latched` holds the violations of
-    the first block that had any.
+    State is kept from block to block, so that the size of blocks makes no difference.
     """
 
     def __init__(self, rig: RigDescription):
@@ -144,7 +143,6 @@ class Supervisor:
         self._tail_seq = np.empty(0, np.int64)  # their numbers
         self._last: np.ndarray | None = None  # the last sample of the previous block
         self._read = np.full(n, np.nan)  # the last finite value of every channel
-        self.latched: tuple[Violation, ...] = ()
 
     def check(self, block: Block) -> list[Violation]:
         """Return the violations in a block, in the order of their samples."""
@@ -161,8 +159,6 @@ class Supervisor:
             *self._still(block, seq),
         ]
         found.sort(key=lambda v: v.seq)
-        if found and not self.latched:
-            self.latched = tuple(found)
         self._tail = np.concatenate([self._tail, block.x])[-VELOCITY_SPAN:]
         self._tail_seq = np.concatenate([self._tail_seq, seq])[-VELOCITY_SPAN:]
         self._last = block.x[-1]

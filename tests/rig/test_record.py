@@ -100,6 +100,14 @@ def test_the_live_view_shows_tension_and_angle(rig, quiet_block):
         assert part in shown
 
 
+def test_the_live_view_shows_a_channel_that_is_no_number(rig, quiet_block):
+    text, block = io.StringIO(), quiet_block()
+    block.x[7, rig.index("tension", "T3")] = block.x[:, rig.index("tension", "T4")] = np.nan
+    console = Console(file=text, width=100)
+    console.print(LiveView(rig, console).draw(View("02-ID.4-T3-MCP", 2, 9, "moving", block, 0, True)))
+    assert text.getvalue().count("nan N") == 2
+
+
 def test_outside_a_terminal_it_is_a_line_a_trial(rig, quiet_block):
     text = io.StringIO()
     with LiveView(rig, Console(file=text, width=100)) as view:

@@ -572,6 +572,24 @@ def test_filtered_terminals_are_refused_for_dynamic_experiments(rig, tmp_path):
         assert bandwidth["tension T1"] == 22.0
 
 
+def test_a_clock_that_jumps_while_the_drives_are_off_is_named_and_arms_nothing(rig, record):
+    machine = SimulatedRig(rig)
+    person = Away(machine, "nothing")
+    ask = person.ask
+
+    def ask_and_jump(text, keep_waiting):
+        ask(text, keep_waiting)
+        if "Couple the external motor" in text:
+            machine.inject("clock-jump", amount=3600.0)
+            machine._pause(0.3)
+
+    person.ask = ask_and_jump
+    outcome = record(machine, operator=person)
+    assert f"nothing was armed: {Trip.CLOCK.sentence}" in outcome.cause
+    assert machine.controller.state is State.TRIPPED
+    assert outcome.complete == ("01-ID.2-DIP",)
+
+
 def test_static_experiments_may_be_filtered(rig, record):
     machine = SimulatedRig(rig, Controller(filtered=True))
     assert record(machine).cause == ""
