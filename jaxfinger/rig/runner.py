@@ -233,7 +233,8 @@ class Runner:
         if (status := self.rig.status()).state is State.TRIPPED:
             self._raise_stopped(status)
         if status.state is not State.IDLE or not self._released():
-            raise TrialEnded("the finger was not seen to be released", Trip.HOST)
+            still = pulled(tensions(self.reader.latest, self.rig.description)) or f"state {status.state.name}"
+            raise TrialEnded(f"the finger was not seen to be released ({still})", Trip.HOST)
         self.watch.guards = self._was_on = False
         self._off = True
 

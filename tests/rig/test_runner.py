@@ -663,7 +663,7 @@ def test_a_controller_that_does_not_release_is_said(rig, record):
     """RELEASE after the last trial and STOP are both ignored. The run says so and asks to switch the drives off."""
     machine = SimulatedRig(rig)
     outcome = record(machine, lambda m: m.controller.strike("deaf"))
-    assert "after the last trial: the finger was not seen to be released" in outcome.cause
+    assert "after the last trial: the finger was not seen to be released (state ARMED)" in outcome.cause
     assert "switch the drives off" in outcome.cause
     assert len(outcome.complete) == 2
 
@@ -679,7 +679,7 @@ def test_tension_that_stays_after_the_last_trial_is_said(rig, record, pull):
         return release()
 
     outcome = record(machine, lambda m: setattr(m, "release", caught))
-    assert outcome.cause.startswith("after the last trial: the finger was not seen to be released")
+    assert outcome.cause.startswith("after the last trial: the finger was not seen to be released ('tension T3' reads ")
     assert TENSION_NOT_SEEN_TO_FALL in outcome.cause
     assert len(outcome.complete) == 2
 
