@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt
 
 from jaxfinger.errors import UserError
-from jaxfinger.rig.channels import Filter, RigDescription
+from jaxfinger.rig.channels import Filter, RigDescription, for_people
 from jaxfinger.rig.contract import State, Trip
 
 
@@ -100,7 +100,7 @@ class Status:
     def cause(self) -> str:
         """Sentence for people, with channel and value where one channel is the cause."""
         return self.trip.said(
-            f"{self.trip_channel} = {self.trip_value:.4g} {self.trip_unit}" if self.trip_channel else ""
+            f"{self.trip_channel} = {for_people(self.trip_value, self.trip_unit)}" if self.trip_channel else ""
         )
 
 
@@ -135,7 +135,8 @@ class Setup:
     """Preparation of the finger by the operator; `text` says what to do.
 
     Joints are `fixed` at an angle (rad), coupled to the external `motor`, or moved by `hand`; all others are free. With
-    `contact` the fingertip rests on its force sensor.
+    `contact` the fingertip rests on its force sensor. What is moved by hand is moved under tension; everything else is
+    done with the drives off.
     """
 
     text: str
@@ -146,8 +147,8 @@ class Setup:
 
     @property
     def prompt(self) -> str:
-        """Prompt for the operator. Unless the finger is to be moved by hand, motors move once it is answered."""
-        return self.text if self.hand else f"{self.text} Then hands off: the finger may move."
+        """Prompt for the operator. Unless the finger is to be moved by hand, the answer switches the drives on."""
+        return self.text if self.hand else f"The drives are off. {self.text} Then hands off: Enter switches them on."
 
 
 class Rig(ABC):
@@ -190,7 +191,7 @@ class Rig(ABC):
     def beat(self) -> None:
         """Send one heartbeat. The controller releases the finger if none comes for its heartbeat time (`heartbeat_s`).
 
-        It means that the whole host is well, so in a recording in real time only the watch sends it (watch.py).
+        It means that the whole host is well, so in a recording in real time only the watch has it sent (watch.py).
         """
 
     def _pause(self, seconds: float) -> None:

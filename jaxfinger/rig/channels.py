@@ -25,11 +25,19 @@ UNITS: Mapping[str, Mapping[str, float]] = {
 }
 SAFETY_KINDS = ("tension_setpoint", "motor_temperature")  # watched, but no part of a session; a rig may lack them
 SI_UNITS = {kind: next(iter(units)) for kind, units in UNITS.items()}
+# Factor from SI, and name, of the units in which rig files give limits, where these are not SI.
+_PEOPLE = {"rad": (180 / np.pi, "°"), "rad/s": (180 / np.pi, " °/s"), "m": (1e3, " mm"), "m/s": (1e3, " mm/s")}
 # Kinds behind an analog input. Its noise changes every value, so a value that repeats for long is a fault.
 ANALOG_KINDS = ("tension", "external_torque", "fingertip_force")
 # Hz, −3 dB. Channels with less are refused for dynamic experiments. A first-order filter of 100 Hz delays a signal by
 # 1.6 ms, in which a joint at 1.5 rad/s (ID.3-dynamic) turns by 0.14°. The factory filter of an EL3008 has 22 Hz.
 MIN_DYNAMIC_BANDWIDTH = 100.0
+
+
+def for_people(value: float, unit: str) -> str:
+    """A value in an SI unit as people read it, in the unit of the rig file's limits."""
+    factor, name = _PEOPLE.get(unit, (1.0, f" {unit}"))
+    return f"{value * factor:.4g}{name}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -138,6 +146,12 @@ class RigDescription:
     def fail(self, table: str, key: str, message: str) -> NoReturn:
         """Raise UserError at the line of a key of the rig file."""
         (parse_toml(self.text, self.path).place / table / key).fail(message)
+
+    @cached_property
+    def hindsight_s(self) -> float:
+        """Longest time in s that a fault of a measured value needs to show: so far back it spoils samples."""
+        tracking = self.limits.tension_error_s
+        return max([c.frozen for c in self.channels] + [tracking if np.isfinite(tracking) else 0.0])
 
     @cached_property
     def slots(self) -> list[int]:

@@ -10,7 +10,7 @@ from enum import IntEnum, IntFlag
 
 import numpy as np
 
-VERSION = 1
+VERSION = 2  # of the demands on the program (docs/plc-contract.md, Versions), not of the layout alone
 VALUES = 60  # LREAL values in one sample
 TARGETS = 18  # targets in one command: the rig has 18 actuation modules
 RING = 16384  # samples in the ring: 16 s at 1 kHz, 8 MiB. A host that stalls for less loses none.
@@ -112,7 +112,7 @@ class State(IntEnum):
 
     INIT = 0
     IDLE = 1
-    ARMED = 2  # drives are on; tensions and external motor hold their set-points
+    ARMED = 2  # drives are on; tensions and external motor hold their set-points, which begin at 0 N and where it is
     MOVING = 3  # drives are on; a ramp or a move is under way
     RELEASING = 4  # tensions ramp down, then the drives go off
     TRIPPED = 5  # latched: tension is released, and nothing can be armed until RESET
@@ -191,7 +191,7 @@ _SENTENCES = {
     Trip.CLOCK: "the controller's clock jumps or runs at another rate than it should",
     Trip.OPERATOR: "the operator pressed the stop key",
     Trip.RECORDER: "the recorder can no longer write",
-    Trip.HOST: "the host gave up",
+    Trip.HOST: "the host ended the run",
     Trip.TRACKING: "tendon tension does not follow its set-point",
     Trip.TEMPERATURE: "motor temperature above its limit",
     Trip.LAG: "the host is too far behind the rig",
@@ -213,7 +213,7 @@ _SEE = {  # what to look at after a trip
     Trip.STALE: "whether its task runs",
     Trip.CLOCK: "the controller's task and its distributed clock",
     Trip.RECORDER: "the disk",
-    Trip.HOST: "what else this computer does",
+    Trip.HOST: "the cause that it gave then",
     Trip.TRACKING: "the tendon's drive and its load cell",
     Trip.TEMPERATURE: "what loads the motor",
     Trip.LAG: "what else this computer does, and the network",
@@ -233,9 +233,18 @@ class Refusal(IntEnum):
 class Flag(IntFlag):
     """Low half of a sample's flags. The high half is the id of the last command processed, modulo 65536."""
 
-    BUS = 1  # working counter or device state not OK
-    ENCODER = 2  # parity or magnet error of a joint encoder
-    ANALOG = 4  # over- or under-range of an analog input
+    BUS = 1
+    ENCODER = 2
+    ANALOG = 4
+
+    @property
+    def says(self) -> str:
+        """What a terminal reports with this flag, for people."""
+        return {
+            Flag.BUS: "working counter or device state bad",
+            Flag.ENCODER: "parity or magnet error of a joint encoder",
+            Flag.ANALOG: "an analog input over or under its range",
+        }[self]
 
 
 def layout(ring: int = RING) -> dict[str, tuple[int, int]]:

@@ -170,6 +170,8 @@ def read_frames(frames: Iterable[wal.Frame], name: str = "log") -> Log:
                 trial.marks.append(value)
             elif trial is not None:
                 trial.end, trial = value, None
+            elif frame.tag == wal.END and log.trials and value.get("trial") == log.trials[-1].name:
+                log.trials[-1].end = {**(log.trials[-1].end or {}), **value}  # a fault that showed after the end
     if not log.header:
         raise UserError(f"{name}: the log ends within its first frame, before any sample was recorded.")
     return log

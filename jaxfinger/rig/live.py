@@ -99,7 +99,7 @@ class LiveView(AbstractContextManager):
         table.add_column(justify="right")
         table.add_column(width=30)
         if view.block is not None:
-            mean = np.nanmean(view.block.x, axis=0)
+            mean = view.block.x.mean(axis=0)  # nan where any sample of the block is no number
             finger, limits = self._rig.finger, self._rig.limits
             for channel, value in zip(self._rig.channels, mean, strict=True):
                 if channel.kind == "tension":

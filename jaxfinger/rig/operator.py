@@ -27,7 +27,7 @@ class Operator(Protocol):
         ...
 
     def stop_requested(self) -> bool:
-        """Whether the operator wants the rig stopped. Must not wait: the heartbeat comes from the same thread."""
+        """Whether the operator wants the rig stopped. Must not wait: the same thread allows the heartbeats."""
         ...
 
 

@@ -1,12 +1,14 @@
 """The paper's experiments as protocols: generators of commands, waits and marks that the runner carries out.
 
 A protocol begins unrecorded (posture, pretension, taring), yields `Start`, and is recorded from there to its end. The
-runner then carries out `slackened`, so that no tendon pulls when the operator is asked for the next posture. Plan files
-give angles in degrees, tensions in N, times in s; commands are in SI.
+runner then carries out `slackened`. It switches the drives off for every `Setup` but those of a finger that is moved by
+hand, and on again afterwards, with all set-points of tension at zero. Plan files give angles in degrees, tensions in N,
+times in s; commands are in SI.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -15,6 +17,7 @@ import numpy as np
 
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import Fault, NotEmpty, Positive, Within
+from jaxfinger.errors import counted
 from jaxfinger.rig.backend import Command, JointMove, Setup, TensionRamp
 
 
@@ -76,7 +79,9 @@ class Start:
     loaded: tuple[str, ...] = ()
 
 
-MIN_TARGET = 0.6  # N, the lowest target of VD.3: tendons stay taut. The controller takes less than 0.2 N for slack.
+# N, the lowest target of VD.3, at which the free finger also begins: tendons stay taut, and no joint is thrown. The
+# controller takes less than 0.2 N for slack.
+MIN_TARGET = 0.6
 # Repeats or passes. A thousand of them give the noise's standard deviation to 2 % (1/√2000); more is a mistake.
 Count = Annotated[int, Within(1, 1000)]
 NotNegative = Annotated[float, Within(0.0)]
@@ -176,7 +181,8 @@ class FingertipForce(Common):
 class Trajectory(Common):
     """VD.3: the free finger under random tensions about `mean` N, with new targets every `interval` s.
 
-    Targets lie within `amplitude` N of the mean; `seed` chooses them.
+    Targets lie within `amplitude` N of the mean; `seed` chooses them. The operator lets the finger go near
+    `posture_deg`.
     """
 
     mean: tuple[float, ...] = ()  # N per active tendon; empty: 2 N each
@@ -195,6 +201,13 @@ def _angles(posture: dict[str, float]) -> str:
     return ", ".join(f"{name} {np.degrees(angle):.0f}°" for name, angle in posture.items())
 
 
+def swept(finger: FingerDescription, joint: str, share: float) -> tuple[float, float]:
+    """Lower and upper end, rad, of the middle `share` of a joint's range."""
+    low, high = finger.limits[finger.joint_names.index(joint)]
+    margin = (1.0 - share) / 2.0 * (high - low)
+    return float(low + margin), float(high - margin)
+
+
 def _tension(targets: dict[str, float], rate: float) -> Protocol:
     """Ramp tensions and wait until the controller has done it."""
     yield TensionRamp(targets, rate)
@@ -207,7 +220,7 @@ def slackened(finger: FingerDescription, rate: float) -> Protocol:
 
 
 def _tared(finger: FingerDescription, posture: dict[str, float], kinds: tuple[str, ...], rate: float) -> Protocol:
-    """Take the tension off, unload the sensors, and tare them: the beginning of every trial that reads them."""
+    """Unload the sensors and tare them, the drives on as when they are read: the beginning of every trial with them."""
     yield Setup(f"Fix all joints: {_angles(posture)}. Uncouple the external motor, free the fingertip.", fixed=posture)
     yield from slackened(finger, rate)
     yield Dwell(0.3)
@@ -222,9 +235,9 @@ def moment_arms(finger: FingerDescription, p: MomentArms) -> Protocol:
     yield from _tension(pretension, p.tension_rate)
     yield Settled(pretension)
     others = {name: angle for name, angle in posture.items() if name != p.joint}
-    yield Setup(
-        f"Free {p.joint} and move it slowly by hand, to and fro through its range.", fixed=others, hand=(p.joint,)
-    )
+    low, high = np.degrees(swept(finger, p.joint, p.share))
+    far = f"from {math.floor(low)}° to {math.ceil(high)}° and back, {counted(p.passes, 'time')}"
+    yield Setup(f"Hold {p.joint}, free it, and move it slowly by hand: {far}.", fixed=others, hand=(p.joint,))
     yield Start(loaded=tuple(pretension))
     yield Covered((p.joint,), p.share, p.passes, p.timeout)
 
@@ -323,7 +336,7 @@ def free_excursion(finger: FingerDescription, p: FreeExcursion) -> Protocol:
     yield Setup(f"Fix all joints: {_angles(posture)}.", fixed=posture)
     yield from _tension(pretension, p.tension_rate)
     yield Settled(pretension)
-    yield Setup("Hold the fingertip and move the finger gently about.", hand=finger.joint_names)
+    yield Setup("Hold the fingertip, remove all fixtures, and move the finger gently about.", hand=finger.joint_names)
     yield Start(loaded=tuple(pretension))
     yield Dwell(p.seconds)
 
@@ -331,18 +344,19 @@ def free_excursion(finger: FingerDescription, p: FreeExcursion) -> Protocol:
 def trajectory(finger: FingerDescription, p: Trajectory) -> Protocol:
     """VD.3: the tendons alone drive the free finger. No target is below MIN_TARGET, so that no tendon falls slack.
 
-    Fixtures are removed at MIN_TARGET: more tension would throw a joint that is let go.
+    The finger lies free before the drives are switched on, and every tendon is seen to be taut before it is moved.
     """
-    posture, names = p.posture(finger), list(_all(finger, 0.0))
+    posture, taut = p.posture(finger), _all(finger, MIN_TARGET)
+    names = list(taut)
     mean = np.array(p.mean or (2.0,) * len(names))
     rng = np.random.default_rng(p.seed)
 
     def at_least_taut(tension: np.ndarray) -> dict[str, float]:
         return dict(zip(names, np.maximum(tension, MIN_TARGET).tolist(), strict=True))
 
-    yield Setup(f"Fix all joints: {_angles(posture)}.", fixed=posture)
-    yield from _tension(_all(finger, MIN_TARGET), p.tension_rate)
-    yield Setup("Remove all fixtures.")
+    yield Setup(f"Remove all fixtures, and let the finger go near {_angles(posture)}.")
+    yield from _tension(taut, p.tension_rate)
+    yield Settled(taut)
     yield from _tension(at_least_taut(mean), p.tension_rate)
     yield Dwell(1.0)
     yield Start(loaded=tuple(names))

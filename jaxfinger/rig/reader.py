@@ -164,12 +164,18 @@ class Reader:
         with self._news:
             self.recorder.put(wal.MARK, {**mark, "seq": self.latest_seq + 1})
 
-    def end(self, end: dict[str, Any]) -> None:
-        """End the trial in the log. Samples before number `end["seq"]` belong to it; without it, all so far."""
+    def end(self, end: dict[str, Any]) -> int:
+        """End the trial in the log. Samples before number `end["seq"]` belong to it, by default all. Return it."""
         with self._news:
             clocks = {"clocks": self._clocks} if self._clocks and not self.rig.synchronous else {}
-            self.recorder.put(wal.END, {"seq": self.latest_seq + 1, **clocks, **end})
+            end = {"seq": self.latest_seq + 1, **clocks, **end}
+            self.recorder.put(wal.END, end)
             self._recording = False
+            return end["seq"]
+
+    def amend(self, name: str, end: dict[str, Any]) -> None:
+        """Replace the end of the trial `name`, the last one of the log: its last samples were bad."""
+        self.recorder.put(wal.END, {"trial": name, **end})
 
     @property
     def reads(self) -> bool:

@@ -30,7 +30,8 @@ class Recorder:
     """Takes frames without waiting.
 
     `failure` says why the log cannot be written (None: it can), `unwritten` holds the frames of JSON that failed,
-    `trials` counts those begun, and after `close` `hangs` is true where the disk did not answer.
+    `waiting` counts the samples that are queued and not yet written, `trials` those begun, and after `close` `hangs` is
+    true where the disk did not answer.
 
     Raises:
         UserError: the disk has less than MIN_FREE_BYTES, or the log exists or cannot be created.
@@ -42,7 +43,7 @@ class Recorder:
         self._log = opener(path) if opener else wal.LogWriter.append(path) if resume else wal.LogWriter.create(path)
         self._queue: queue.SimpleQueue[tuple[bytes, Any] | None] = queue.SimpleQueue()
         self._since: deque[float] = deque()  # when each waiting frame was queued (s, monotonic)
-        self._waiting = 0
+        self.waiting = 0
         self._lock = threading.Lock()
         self.failure: str | None = None
         self.hangs = False
@@ -62,9 +63,9 @@ class Recorder:
     def block(self, block: Block) -> None:
         """Queue a block of samples. Never waits."""
         with self._lock:
-            self._waiting += len(block)
-            if self._waiting > QUEUE_LIMIT and self.failure is None:
-                self.failure = f"the disk is too slow: {self._waiting} samples wait to be written to {self.path.name}"
+            self.waiting += len(block)
+            if self.waiting > QUEUE_LIMIT and self.failure is None:
+                self.failure = f"the disk is too slow: {self.waiting} samples wait to be written to {self.path.name}"
         self.put(wal.DATA, block)
 
     @property
@@ -75,16 +76,14 @@ class Recorder:
         except IndexError:
             return 0.0
 
-    @property
-    def waiting(self) -> int:
-        """Number of samples that are queued and not yet written."""
-        return self._waiting
-
     def close(self, timeout: float = 5.0) -> None:
         """Write what is queued, force it to the disk, and end the thread.
 
-        Where the disk does not answer for `timeout` s, the thread is left behind and `hangs` is true.
+        Where the disk does not answer for `timeout` s, the thread is left behind and `hangs` is true. Then a second
+        call does nothing.
         """
+        if self.hangs:
+            return
         self._queue.put(None)
         self._thread.join(timeout)
         self.hangs = self._thread.is_alive()
@@ -117,7 +116,7 @@ class Recorder:
                 self.unwritten.append((tag, value))
         if tag == wal.DATA:
             with self._lock:
-                self._waiting -= len(value)
+                self.waiting -= len(value)
 
     def _fail(self, error: Exception) -> None:
         said = (isinstance(error, OSError) and error.strerror) or f"{type(error).__name__}: {error}"

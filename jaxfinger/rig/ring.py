@@ -199,7 +199,7 @@ class RingRig(Rig):
         self.head_reading = HeadReading(asked, time.monotonic(), int(status["head"]))
         if int(status["boot"]) != self.boot or self.head_reading.head < self.next_seq:
             raise ControllerRestarted(
-                "the controller's program was restarted, so this recording cannot go on; start again with --resume."
+                "the controller's program was restarted, so this recording cannot go on; see its power and its task."
             )
         sent = (int(status["acknowledged"]) - self._first_id) % 2**32 <= (self._id - self._first_id) % 2**32
         if not sent and int(status["acknowledged"]) != self._found_id:

@@ -95,9 +95,11 @@ class Runner:
         self.t0: int | None = None
         self._place = ("", 0, 0)
         self._id = 0
-        self._was_on = False  # whether a sample has shown the drives on since the rig was armed
+        self._was_on = False  # whether a sample has shown the drives on since they were switched on
+        self._off = False  # the drives were seen off, so that hands may be at the finger
         self._setup = Setup("")
         self._start: dict = {}
+        self._ended: int | None = None  # number of the sample at which the trial ended whose faults may still show
 
     # one trial --------------------------------------------------------------------------------------------------
     def trial(self, trial: PlannedTrial, name: str, number: int, count: int, begun_s: float) -> str:
@@ -119,8 +121,11 @@ class Runner:
         try:
             place, finger = (name, number, count), self.rig.description.finger
             self.carry_out(trial.protocol(self.rig.description), place)
-            self.reader.end({"complete": True})
+            self._check(None)
+            self._ended = self.reader.end({"complete": True})
             self.carry_out(slackened(finger, trial.parameters.tension_rate), place)
+            self.carry_out(iter([Dwell(self.rig.description.hindsight_s)]), place)
+            self._ended = None
             return ""
         except Exception as error:  # Of any kind: the finger is armed.
             return self.abort(error)
@@ -150,8 +155,11 @@ class Runner:
         self._let_pass(AFTER_TRIP_S, self._released)  # A busy host first has to read the samples before the stop.
         if self._released() or reader.latest_seq > heard:  # Of a silent reader nothing more is to be expected.
             self._let_pass(AFTER_TRIP_S)
+        end = {"complete": False, "cause": cause, "trip": int(trip), "seq": seq}
         if reader.recording:
-            reader.end({"complete": False, "cause": cause, "trip": int(trip), "seq": seq})
+            reader.end(end)
+        elif self._ended is not None and seq < self._ended:
+            reader.amend(self._start["name"], end)
         if reader.latest is None:
             return cause
         return f"{cause}; {RELEASED if self._released() else TENSION_NOT_SEEN_TO_FALL}"
@@ -163,10 +171,10 @@ class Runner:
         return idle and not pulled(tensions(block, self.rig.description))
 
     def arm(self, name: str) -> None:
-        """Bring the controller to IDLE, wait for samples without a violation, and arm the rig.
+        """Bring the controller to IDLE, have the finger fixed straight, and switch the drives on.
 
         An earlier host may have left the finger loaded: it is released. A latched stop is cleared once the operator has
-        agreed. The operator fixes the finger straight, and takes hands off, before the drives are switched on.
+        agreed.
 
         Raises:
             UserError: something is wrong; nothing was armed.
@@ -175,21 +183,33 @@ class Runner:
         if status.state in DRIVES_ON:
             rig.release()
         if status.state is State.TRIPPED and not rig.prepare(Setup("")):
-            self._ask(f"The controller is stopped: {status.cause}. See that finger and hands are safe.")
+            safe = "See that finger and hands are safe; Enter then clears the stop."
+            self._ask(f"The controller is stopped: {status.cause}. {safe}")
         if status.state is not State.IDLE:
             self._let_pass(AFTER_TRIP_S, since=rig.status().head)
         if status.state is State.TRIPPED:
             self._heed_stop_key()  # A latch is not cleared for an operator who has pressed it since.
             rig.reset(name or "operator")
             self._let_pass(AFTER_TRIP_S, lambda: not tripped(self.reader.latest))
+        if (state := rig.status().state) is not State.IDLE:
+            raise UserError(f"nothing was armed: the controller is in state {state.name}, not IDLE; see its program.")
+        self._off = True
         straight = dict.fromkeys(rig.description.finger.joint_names, 0.0)
-        self._prepare(Setup("Fix the finger straight: all joints at 0°. The drives are switched on next.", straight))
+        self._prepare(Setup("Fix the finger straight: all joints at 0°.", straight))
+
+    def _switch_on(self) -> None:
+        """Arm the rig once samples have come without a violation, and no tendon pulls.
+
+        Raises:
+            UserError: something is wrong; nothing was armed.
+        """
+        rig = self.rig
 
         def quiet() -> bool:
             return self.reader.quiet(round(QUIET_S * rig.description.rate_hz))
 
         self._let_pass(QUIET_TIMEOUT_S, lambda: quiet() or self.reader.violation is not None)
-        self._check(None)
+        self._check(self.reader.latest)
         if not quiet():
             bad = self.reader.unarmed_violation
             what = bad.sentence if bad is not None else "too few samples came"
@@ -197,19 +217,33 @@ class Runner:
         if still := pulled(tensions(self.reader.latest, rig.description)):
             mend = "free the tendon, or see its load cell and its offset"
             raise UserError(f"nothing was armed: with the drives off {still}; {mend}.")
+        self._off = False
         self.watch.guard()
         self._sent(rig.arm)
+
+    def _switch_off(self) -> None:
+        """Release the finger, and see that the drives are off and no tendon pulls.
+
+        Raises:
+            TrialEnded: that was not seen.
+        """
+        self.rig.release()
+        self._let_pass(AFTER_TRIP_S, self._released, since=self.rig.status().head)
+        self._check(None)
+        if (status := self.rig.status()).state is State.TRIPPED:
+            self._raise_stopped(status)
+        if status.state is not State.IDLE or not self._released():
+            still = pulled(tensions(self.reader.latest, self.rig.description)) or f"state {status.state.name}"
+            raise TrialEnded(f"the finger was not seen to be released ({still})", Trip.HOST)
+        self.watch.guards = self._was_on = False
+        self._off = True
 
     def release(self) -> str:
         """Release the finger after the last trial. Return what went wrong, or an empty string."""
         try:
-            self.rig.release()
-            self._let_pass(AFTER_TRIP_S, self._released, since=self.rig.status().head)
-            self._check(None)
-            if self.rig.status().state is not State.IDLE or not self._released():
-                raise TrialEnded("the finger was not seen to be released after the last trial", Trip.HOST)
+            self._switch_off()
         except Exception as error:  # Of any kind, as in `trial`.
-            return self.abort(error)
+            return f"after the last trial: {self.abort(error)}"
         return ""
 
     def _let_pass(self, seconds: float, done: Callable[[], bool] = lambda: False, since: int | None = None) -> None:
@@ -246,21 +280,23 @@ class Runner:
             TrialEnded: nobody answered in time, or the run must end.
         """
         armed, patience, asked = self.watch.guards, self.rig.description.deadlines.prompt_s, time.monotonic()
+        as_told = armed or self._off  # Otherwise the controller is still stopped from before.
 
         def late() -> bool:
             return armed and time.monotonic() - asked > patience
 
         def keep_waiting() -> bool:
             self.rig.report_alive()
-            off = armed and (tripped(self.reader.latest) or self._let_go(self.reader.latest))
-            return self.reader.error is None and self.reader.violation is None and not off and not late()
+            latest, reader = self.reader.latest, self.reader
+            strays = as_told and (tripped(latest) or self._let_go(latest) or self._took_hold(latest))
+            return reader.error is None and reader.violation is None and not strays and not late()
 
         if armed:
             on = max(map(abs, tensions(self.reader.latest, self.rig.description).values()), default=0.0)
             text += f" The finger is armed, with {on:.1f} N: without an answer within {patience:g} s it is released."
         self.operator.ask(text, keep_waiting)
         self._heed_stop_key()
-        self._check(self.reader.latest if armed else None)
+        self._check(self.reader.latest if as_told else None)
         # Also where Enter came just then: who answers a prompt that is over does not expect a motor to move.
         if late():
             raise TrialEnded(f"nobody answered the prompt within {patience:g} s (prompt_s of [rig])", Trip.HOST)
@@ -308,7 +344,8 @@ class Runner:
                 self._wait("tensions settling", steady, step.timeout, lambda steady=steady: steady.lacks)
             else:
                 assert isinstance(step, Covered)
-                self._wait("moved by hand", Passes(self.rig.description, step), step.timeout)
+                passes = Passes(self.rig.description, step)
+                self._wait("moving by hand", passes, step.timeout, lambda passes=passes: passes.lacks)
 
     def _sent(self, send: Callable[[], int]) -> int:
         """Send a command and return its id. Raises TrialEnded where it was refused because the rig has just stopped."""
@@ -338,15 +375,23 @@ class Runner:
     def _prepare(self, setup: Setup) -> None:
         """Have the finger prepared, by a simulated operator or by a person.
 
-        The person is asked again where the encoder of a fixed joint reads another angle.
-        The person's hands may be at an armed finger under tension. Meanwhile the runner sends no command; the limits of
-        host and controller, the heartbeat and the stop key act as always.
+        The drives are off while hands are at the finger, and are switched on afterwards. Only a finger that is to be
+        moved by hand stays armed: the runner then sends no command, and the limits of host and controller, the
+        heartbeat and the stop key act as always.
         """
         self._setup = setup
+        if not setup.hand and self.watch.guards:
+            self._switch_off()
         if self.rig.prepare(setup):
             at_pose, ordered = AtPose(self.rig.description, setup), self.rig.status().head
             self._wait("finger being prepared", lambda b: int(b.seq[-1]) >= ordered and at_pose(b), 60.0)
-            return
+        else:
+            self._ask_until_fixed(setup)
+        if not setup.hand:
+            self._switch_on()
+
+    def _ask_until_fixed(self, setup: Setup) -> None:
+        """Ask a person to prepare the finger, again while the encoder of a fixed joint reads another angle."""
         prompt = setup.prompt
         while True:
             self._ask(prompt)
@@ -390,21 +435,22 @@ class Runner:
         """Wait until a block is `done`. `lacks` says what it lacks, with a leading separator.
 
         Raises:
-            TrialEnded: `timeout` s have passed on the device's clock, or the host's limit for it, or the run must end.
+            TrialEnded: `timeout` s of samples have come, or the host's limit for them is over, or the run must end.
         """
         self.reader.forget()
-        start, latest = self.reader.latest_t, time.monotonic() + self._host_limit(timeout)
+        start, latest = self.reader.latest_seq, time.monotonic() + self._host_limit(timeout)
         while True:
             block = self.reader.next()
             self._check(block)
             if block is not None:
-                start = start if start >= 0 else int(block.t_ns[0])  # the first block of all
+                start = start if start >= 0 else int(block.seq[0])  # the first block of all
                 self.observe(
                     View(*self._place, doing, block, self.reader.lost, self.reader.recording, self.reader.lag_s)
                 )
                 if done(block):
                     return
-            if time.monotonic() > latest or (block is not None and (int(block.t_ns[-1]) - start) * 1e-9 > timeout):
+            passed = (int(block.seq[-1]) - start) / self.rig.description.rate_hz if block is not None else 0.0
+            if passed > timeout or time.monotonic() > latest:
                 raise TrialEnded(f"{doing} took longer than {timeout:g} s{lacks()}", Trip.HOST)
 
     def _check(self, block: Block | None) -> None:
@@ -428,6 +474,13 @@ class Runner:
             name = State(int(block.state[-1])).name
             cause = f"the controller let go of the finger without being told to (state {name}); see who commands it"
             raise TrialEnded(cause, Trip.HOST, int(block.seq[first]))
+        if self._took_hold(block):
+            cause = "the controller switched the drives on without being told to; see who commands it"
+            raise TrialEnded(cause, Trip.HOST)
+
+    def _took_hold(self, block: Block | None) -> bool:
+        """Whether the drives are on at a block's end although hands may be at the finger."""
+        return block is not None and self._off and int(block.state[-1]) in DRIVES_ON
 
     def _let_go(self, block: Block | None) -> bool:
         """Whether the controller, armed before, has the drives off at a block's end, and has not tripped."""

@@ -10,11 +10,12 @@ limits second, these last.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import nan
 
 import numpy as np
 
 from jaxfinger.rig.backend import Block, Command, CommandRefused, JointMove, TensionRamp
-from jaxfinger.rig.channels import SI_UNITS, RigDescription
+from jaxfinger.rig.channels import SI_UNITS, RigDescription, for_people
 from jaxfinger.rig.contract import Flag, State, Trip
 from jaxfinger.rig.trips import Drift, LeakyCount, RunLength, StillExcursion, UnexplainedExcursion, UnfollowedMove
 
@@ -42,7 +43,7 @@ class Violation:
     @classmethod
     def of_host(cls, trip: Trip, seq: int, cause: str) -> Violation:
         """Violation that the host states in a sentence of its own, found at sample `seq`."""
-        return cls(trip, "host", seq, float("nan"), cause=cause)
+        return cls(trip, "host", seq, nan, cause=cause)
 
     def __post_init__(self):
         if self.since < 0:
@@ -51,7 +52,7 @@ class Violation:
     @property
     def sentence(self) -> str:
         """Sentence for people, without a full stop: what happened, and where to look."""
-        value = f"{self.value:.4g} {self.unit}".rstrip()
+        value = for_people(self.value, self.unit)
         return self.cause or self.trip.said(f"{self.channel} = {value} at sample {self.seq}")
 
 
@@ -93,8 +94,7 @@ def admit(command: Command, rig: RigDescription) -> None:
 class Supervisor:
     """The host's limits on samples. Blocks must be given in order and without exception.
 
-    State is kept from block to block, so that the size of blocks makes no difference. `latched` holds the violations of
-    the first block that had any.
+    State is kept from block to block, so that the size of blocks makes no difference.
     """
 
     def __init__(self, rig: RigDescription):
@@ -143,7 +143,6 @@ class Supervisor:
         self._tail_seq = np.empty(0, np.int64)  # their numbers
         self._last: np.ndarray | None = None  # the last sample of the previous block
         self._read = np.full(n, np.nan)  # the last finite value of every channel
-        self.latched: tuple[Violation, ...] = ()
 
     def check(self, block: Block) -> list[Violation]:
         """Return the violations in a block, in the order of their samples."""
@@ -160,8 +159,6 @@ class Supervisor:
             *self._still(block, seq),
         ]
         found.sort(key=lambda v: v.seq)
-        if found and not self.latched:
-            self.latched = tuple(found)
         self._tail = np.concatenate([self._tail, block.x])[-VELOCITY_SPAN:]
         self._tail_seq = np.concatenate([self._tail_seq, seq])[-VELOCITY_SPAN:]
         self._last = block.x[-1]
@@ -213,8 +210,9 @@ class Supervisor:
             found.append(self._violation(trip, channel, int(seq[row]), value, since))
         flagged = (block.flags & int(Flag.BUS | Flag.ENCODER | Flag.ANALOG)) != 0
         for _, row, since in self._flag_count(flagged[:, None], seq):
-            value = float(block.flags[row] & 0xFFFF)
-            found.append(Violation(Trip.INVALID, "terminal flags", int(seq[row]), value, since))
+            flags = [flag.says for flag in Flag if block.flags[row] & int(flag)]
+            cause = Trip.INVALID.said(f"{' and '.join(flags)} at sample {int(seq[row])}")
+            found.append(Violation(Trip.INVALID, "terminal", int(seq[row]), nan, since, cause))
         return found
 
     def _frozen(self, block: Block, seq: np.ndarray) -> list[Violation]:
@@ -276,8 +274,9 @@ class Supervisor:
         angle, length, load = block.x[:, self._angle], block.x[:, channels], block.x[:, tensions]
         ran = self._unexplained(angle, length, load)
         for k, row, since in self._encoder_count(ran > UnexplainedExcursion.MAX_UNEXPLAINED, seq):
-            name = f"joint encoders, while {self._name(channels[k])} ran by"
-            found.append(Violation(Trip.FROZEN, name, int(seq[row]), float(ran[row, k]), since, unit="m"))
+            name, far, at = self._name(channels[k]), float(ran[row, k]), int(seq[row])
+            cause = Trip.FROZEN.said(f"a joint encoder, since {name} ran by {for_people(far, 'm')} up to sample {at}")
+            found.append(Violation(Trip.FROZEN, name, at, far, since, cause, "m"))
         turned, since_change = self._still_excursion(angle, length, load, seq)
         for k, row, _ in self._still_count(turned > StillExcursion.MAX_TURN, seq):
             value, since = float(length[row, k]), int(since_change[row, k]) + 1

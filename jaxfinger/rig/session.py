@@ -121,8 +121,9 @@ def _publish(plan: Plan, recorder: Recorder, output: Path, cause: str, resume: b
     try:
         log = read_log(path)
         for tag, value in recorder.unwritten:
-            if tag == wal.END and log.trials and log.trials[-1].end is None:
-                log.trials[-1].end = value
+            last = log.trials[-1] if log.trials else None
+            if tag == wal.END and last is not None and (last.end is None or value.get("trial") == last.name):
+                last.end = value
         whole = {r.start["planned"] for r in log.trials if r.complete}
         if not cause and (lacking := [t.name for t in plan.trials if t.name not in whole]):
             cause = "; ".join([f"the disk did not keep {listed(lacking)} whole", *map(str, log.damage)])

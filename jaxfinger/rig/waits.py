@@ -7,7 +7,7 @@ import numpy as np
 from jaxfinger.rig.backend import Block, Setup
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.contract import State
-from jaxfinger.rig.protocols import Covered, Settled
+from jaxfinger.rig.protocols import Covered, Settled, swept
 from jaxfinger.rig.reader import Reader
 
 # N of measured tension, up to which a tendon counts as released. In 0.7 s the controller ramps to 2 N, then to 0.5 N
@@ -89,10 +89,10 @@ class Passes:
 
     def __init__(self, rig: RigDescription, step: Covered):
         self._columns = rig.columns("joint_position", step.joints)
-        limits = rig.finger.limits[[rig.finger.joint_names.index(name) for name in step.joints]]
-        slack = (1 - step.share) / 2 * (limits[:, 1] - limits[:, 0])
-        self._low, self._high = limits[:, 0] + slack, limits[:, 1] - slack
-        self._side, self._turns, self._need = [0] * len(limits), [0] * len(limits), 2 * step.passes
+        self._joints = step.joints
+        self._low, self._high = np.transpose([swept(rig.finger, name, step.share) for name in step.joints])
+        self._side, self._turns = [0] * len(step.joints), [0] * len(step.joints)
+        self._need = 2 * step.passes
 
     def __call__(self, block: Block) -> bool:
         for j, column in enumerate(self._columns):
@@ -101,6 +101,14 @@ class Passes:
                     self._turns[j] += self._side[j] != 0
                     self._side[j] = side
         return min(self._turns) >= self._need
+
+    @property
+    def lacks(self) -> str:
+        """Which joint has gone through its range too seldom, and where it must go."""
+        j = int(np.argmin(self._turns))
+        low, high = np.degrees((self._low[j], self._high[j]))
+        times = f"{self._turns[j]} times of {self._need}"
+        return f": {self._joints[j]} went between {low:.1f}° and {high:.1f}° {times}; see that it reaches both"
 
 
 class AtPose:

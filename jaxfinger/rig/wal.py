@@ -35,7 +35,7 @@ _DATA = struct.Struct("<IIQ")  # samples, channels, samples lost before
 MAX_FRAME_BYTES = 64 * 2**20
 
 # Tags. HEADER is the first frame. TRIAL and END enclose a trial, DATA holds a block of it, MARK a hold or directions.
-# An EVENT may stand anywhere.
+# An EVENT may stand anywhere. An END that names a trial, after that trial's own, replaces what it says.
 HEADER, TRIAL, DATA, MARK, EVENT, END = TAGS = b"HEAD", b"TRIA", b"DATA", b"MARK", b"EVNT", b"ENDT"
 _TAG = re.compile(b"|".join(TAGS))
 _SEARCH_BYTES = 2**20  # bytes of a damaged file that are searched for a tag at a time

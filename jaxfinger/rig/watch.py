@@ -1,11 +1,13 @@
-"""The watch: checks that the whole host is well, and sends the heartbeat to the controller only while it is.
+"""The watch: checks that the whole host is well, and allows heartbeats to the controller only while it is.
 
 Who watches whom, in a recording in real time:
 
 - The watch is one thread. Every PERIOD_S it checks the stop key and the signals that end a program (Ctrl-C, SIGTERM,
-  SIGHUP), and from just before the rig is armed also the reader and the runner (a sign of life within `thread_s`) and
-  the disk (no frame waits for `disk_s`).
-- If a check fails, the watch stops the rig with the cause and sends no more heartbeats.
+  SIGHUP), and from just before the rig is armed also reader, runner and heartbeat (a sign of life within `thread_s`)
+  and the disk (no frame waits for `disk_s`).
+- A second thread sends the heartbeats, each after the watch has allowed it. No call to the controller, which may hang,
+  ever holds up the watch; a heartbeat that hangs in its call is a silent thread like any other.
+- If a check fails, the watch stops the rig with the cause and allows no more heartbeats.
 - If the watch itself hangs, or the whole process, the heartbeats end too.
 - The controller releases the finger by itself when no heartbeat has come for `heartbeat_s` (0.25 s).
 
@@ -33,7 +35,7 @@ BEAT_S = 0.05
 # s, the most that one check adds to a thread's silence. If the watch itself ran late, the machine was busy, and the
 # other threads may have been late for the same reason.
 MAX_COUNTED_S = 0.1
-JOIN_S = 1.0  # s that closing waits for a watch that hangs; the thread is then left behind
+JOIN_S = 1.0  # s that closing waits for each thread; one that hangs is then left behind
 
 
 class Watch:
@@ -48,23 +50,25 @@ class Watch:
         self._signs: dict[int, int] = {}  # signs of life so far, by thread
         self._seen: dict[int, int] = {}  # signs at the last check
         self._silent: dict[int, float] = {}  # s without a new sign
-        self._checked = self._beaten = time.monotonic()  # when it last checked, and last sent a heartbeat
+        self._checked = self._beaten = time.monotonic()  # when it last checked, and last allowed a heartbeat
         self.guards = False
+        self._allowed = threading.Event()  # one heartbeat
         self._closing = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._threads: list[threading.Thread] = []
         rig.report_alive = self.report_alive
 
     def start(self) -> None:
-        """Start the watch's thread. A synchronous rig has none: the runner calls `check` between blocks."""
+        """Start the threads. A synchronous rig has none: the runner calls `check` between blocks."""
         if not self.rig.synchronous:
-            self._thread = threading.Thread(target=self._loop, name="jaxfinger-watch", daemon=True)
-            self._thread.start()
+            for work, name in ((self._loop, "watch"), (self._beat, "heartbeat")):
+                self._threads.append(threading.Thread(target=work, name=f"jaxfinger-{name}", daemon=True))
+                self._threads[-1].start()
 
     def close(self) -> None:
         """Stop checking. No heartbeat follows."""
         self._closing.set()
-        if self._thread is not None:
-            self._thread.join(JOIN_S)
+        for thread in self._threads:
+            thread.join(JOIN_S)
 
     def join(self, name: str) -> None:
         """Watch the calling thread from now on."""
@@ -90,8 +94,17 @@ class Watch:
         while not self._closing.wait(PERIOD_S):
             self.check()
 
+    def _beat(self) -> None:
+        self.join("heartbeat")
+        while not self._closing.is_set():
+            if self._allowed.wait(PERIOD_S):
+                self._allowed.clear()
+                with suppress(UserError):  # A lost connection is the reader's to report.
+                    self.rig.beat()
+            self.report_alive()
+
     def check(self) -> None:
-        """Check stop key, signals, threads, disk: stop the rig where one fails, else send a heartbeat if it is due."""
+        """Check stop key, signals, threads, disk: stop the rig where one fails, else allow a heartbeat if it is due."""
         now = time.monotonic()
         passed, self._checked = min(now - self._checked, MAX_COUNTED_S), now
         if self.reader.violation is not None or self.reader.error is not None:
@@ -100,8 +113,7 @@ class Watch:
             self.reader.stop(cause)
         elif not self.rig.simulated_time and now - self._beaten >= BEAT_S:
             self._beaten = now
-            with suppress(UserError):  # A lost connection is the reader's to report.
-                self.rig.beat()
+            self._allowed.set()
 
     def stop_request(self) -> Violation | None:
         """Violation OPERATOR once the stop key was pressed or a signal asked the run to end."""
@@ -124,7 +136,11 @@ class Watch:
             self._silent[me] = self._silent[me] + passed if signs == self._seen[me] else 0.0
             self._seen[me] = signs
             if self._silent[me] > deadlines.thread_s:
-                return Violation(Trip.HOST, f"silence of its {name}", seq, self._silent[me], unit="s")
+                said = f"the host's {name} was silent for {self._silent[me]:.2g} s"
+                cause = f"{said}; see what else this computer does, and the network"
+                return Violation.of_host(Trip.HOST, seq, cause)
         if (waited := self.reader.recorder.waiting_s) > deadlines.disk_s:
-            return Violation(Trip.RECORDER, "silence of the disk", seq, waited, unit="s")
+            return Violation.of_host(
+                Trip.RECORDER, seq, Trip.RECORDER.said(f"no answer of the disk for {waited:.2g} s")
+            )
         return None

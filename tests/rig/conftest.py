@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -44,17 +43,6 @@ def serious(path):
 def slot(rig, kind, of=""):
     """Place of a channel in the controller's record."""
     return rig.description.channels[rig.description.index(kind, of)].slot
-
-
-@pytest.fixture(scope="session", autouse=True)
-def own_claims(tmp_path_factory):
-    """Claims of controllers lie in the folder of this run: another run may use the same port a moment later."""
-    folder, before = str(tmp_path_factory.mktemp("claims")), tempfile.tempdir
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TMPDIR", folder)
-        tempfile.tempdir = None
-        yield
-    tempfile.tempdir = before
 
 
 @pytest.fixture(scope="session")

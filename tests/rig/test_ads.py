@@ -5,8 +5,11 @@ import json
 import os
 import re
 import socket
+import subprocess
+import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -166,7 +169,7 @@ def test_a_joint_that_runs_beyond_its_stop_is_let_go_in_the_right_order(lockstep
             blocks.append(rig.read_block(20.0))
         assert status.trip is Trip.POSITION
         assert status.trip_channel == "joint_position MCP"
-        assert "joint beyond its limits (joint_position MCP = 1.6" in status.cause
+        assert "joint beyond its limits (joint_position MCP = 92." in status.cause
         with pytest.raises(CommandRefused, match="in state TRIPPED"):
             rig.arm()
         columns = rig.description.columns("tension", rig.description.finger.tendon_names)
@@ -189,14 +192,32 @@ def test_a_second_program_on_this_computer_cuts_off_nobody(real_time):
             other.status()
 
 
+def test_a_second_program_is_refused_whatever_its_folders_and_its_name_for_the_controller(real_time, tmp_path):
+    """The controller would keep the newer connection, and the first program would lose its trial."""
+    second = (
+        "import sys\nfrom tests.rig.conftest import ads_rig\n"
+        "try:\n    ads_rig(sys.argv[1]).connect()\nexcept Exception as error:\n    print(error)\n"
+    )
+    name = real_time.replace("127.0.0.1", "localhost")
+    with ads_rig(real_time) as rig:
+        done = subprocess.run(
+            [sys.executable, "-c", second, name],
+            env={**os.environ, "TMPDIR": str(tmp_path), "HOME": str(tmp_path)},
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        assert f"another program on this computer has the controller at {name}" in done.stdout
+        rig.status()
+        assert rig.reconnects == 0
+
+
 def test_nobody_there(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     rig = ads_rig(f"127.0.0.1:{port}")
     rig.description.address["reconnect_s"] = 0
-    with pytest.raises(ConnectionLost, match="route back"):
-        rig.connect()
+    with pytest.raises(ConnectionLost, match="route back"), rig:
+        pass
 
 
 @pytest.mark.parametrize("calls", [1, 8])
@@ -219,6 +240,45 @@ def test_one_call_that_never_ends_hangs_and_many_slow_ones_do_not(calls):
         else:
             assert rig._call(lambda: b"mine") == b"mine"
     finally:
+        other.join()
+
+
+@pytest.mark.parametrize("hangs", ["call", "connecting again"])
+def test_a_call_that_hangs_is_waited_for_once(monkeypatch, hangs):
+    """A stop, the look whether tension falls, and the end of the run would each wait for it again."""
+    rig, begun, go = ads_rig("127.0.0.1:1"), threading.Event(), threading.Event()
+
+    def hang():
+        begun.set()
+        go.wait(60.0)
+        return b""
+
+    def cut():
+        raise pyads.ADSError(text="cut")
+
+    monkeypatch.setattr(rig, "_attach", hang)
+
+    def call():
+        with contextlib.suppress(ConnectionLost):
+            rig._call(hang if hangs == "call" else cut)
+
+    other = threading.Thread(target=call)
+    other.start()
+    try:
+        begun.wait()
+        with pytest.raises(ConnectionLost, match="hangs"):
+            rig._call(lambda: b"")
+        attempts = []
+        wait = rig._lock.acquire
+        rig._lock = SimpleNamespace(
+            acquire=lambda timeout: attempts.append(timeout) or wait(timeout=timeout), release=rig._lock.release
+        )
+        with pytest.raises(ConnectionLost, match="hangs"):
+            rig._call(lambda: b"")
+        rig.close()
+        assert len(attempts) == 2
+    finally:
+        go.set()
         other.join()
 
 
@@ -249,8 +309,8 @@ def test_a_program_without_the_symbols_is_refused():
     lock = threading.Lock()
     server = AmsServer(bytearray(64), {"MAIN.x": (0, 8)}, lock)
     try:
-        with pytest.raises(UserError, match=r"no symbol GVL_Jaxfinger\.stInfo"):
-            ads_rig(f"127.0.0.1:{server.port}").connect()
+        with pytest.raises(UserError, match=r"no symbol GVL_Jaxfinger\.stInfo"), ads_rig(f"127.0.0.1:{server.port}"):
+            pass
     finally:
         server.close()
 
@@ -327,7 +387,7 @@ def test_the_controllers_own_trip_ends_the_trial_with_its_cause(lockstep, record
     trial = 'experiment = "VD.3"\nmean = [2.0, 2.0, 7.0, 2.0]\namplitude = 3.0\nposture_deg = [75.0, 20.0, 20.0]'
     plan = parse_plan(f'[plan]\nname = "into the stop"\n[[trial]]\n{trial}\ntension_rate = 5.0\n', rig.description)
     outcome = record(rig, plan=plan)
-    assert "01-VD.3: the controller stopped: joint beyond its limits (joint_position MCP = 1.6" in outcome.cause
+    assert "01-VD.3: the controller stopped: joint beyond its limits (joint_position MCP = 92." in outcome.cause
     with h5py.File(outcome.session) as file:
         attributes, angle = file["trials/01-VD.3"].attrs, file["trials/01-VD.3/q"][:, 0]
         assert attributes["trip"] == Trip.POSITION

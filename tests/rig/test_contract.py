@@ -76,6 +76,14 @@ def test_the_document_has_the_codes():
         assert trip.sentence
 
 
+def test_document_and_skeleton_state_the_adapters_version():
+    text, skeleton = ((DOCS / name).read_text(encoding="utf-8") for name in ("plc-contract.md", "JaxfingerRing.st"))
+    assert f"`nVersion` UDINT = {contract.VERSION} " in text
+    assert re.search(r"stInfo\.nVersion +:= (\d+);", skeleton)[1] == str(contract.VERSION)
+    versions = [int(row) for row in re.findall(r"^\| (\d+) \| Release", text, re.MULTILINE)]
+    assert versions == list(range(contract.VERSION, 0, -1))
+
+
 def test_every_field_lies_on_its_natural_boundary():
     for dtype, _ in contract.SYMBOLS.values():
         for kind, offset, *_ in (dtype.fields or {}).values():

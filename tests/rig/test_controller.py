@@ -166,6 +166,22 @@ def test_a_move_in_the_cycle_in_which_the_motor_is_coupled_is_carried_out():
     assert bench.c.plant.q[1] == pytest.approx(0.6, abs=1e-6)
 
 
+def test_arming_keeps_no_set_point_from_before():
+    """While the drives are off somebody may turn the joint, or couple the motor to another one."""
+    bench = coupled(3.0)
+    bench.send(Kind.JOINT, target=[1.0], rate=1.5)
+    bench.run(1000)
+    bench.send(Kind.RELEASE)
+    bench.run(1500)  # The joint falls.
+    bench.c.setpoint = bench.c.target = [1.0] * 4  # of a program that keeps them
+    fallen = bench.c.plant.q[1]
+    assert abs(fallen - 1.0) > 0.1
+    bench.send(Kind.ARM)
+    setpoint = bench.run(300)
+    assert bench.c.plant.q[1] == pytest.approx(fallen, abs=1e-2)
+    assert setpoint.max() == 0.0
+
+
 def test_a_motor_that_moves_a_joint_with_slack_tendons_loses_its_torque_at_once():
     """Of ID.3: it may have caught a hand."""
     bench = coupled(0.0)

@@ -68,7 +68,7 @@ def test_the_documents_table_is_the_matrix(rig, results):
 CELLS = [Cell("cut"), Cell("key", "ramp")]
 LONG_CELLS = [
     Cell("reader"), Cell("runner"), Cell("watch"), Cell("full"), Cell("disk"), Cell("stall"), Cell("call"),
-    Cell("deaf"), Cell("lag"), Cell("slow"), Cell("restart"), Cell("flicker", "ramp", 0.001),
+    Cell("beat"), Cell("deaf"), Cell("lag"), Cell("slow"), Cell("restart"), Cell("flicker", "ramp", 0.001),
     Cell("nan", "letting go"), Cell("temperature", "hold", 0.01, ("delay=0.01",)), Cell("clock fast", "arming"),
 ]  # fmt: skip
 LANES = 3  # cells at a time; each sleeps most of its time
@@ -80,7 +80,7 @@ def begun(cells):
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(LANES - 1, context) as pool, ProcessPoolExecutor(1, context) as other:
         # A call that hangs keeps its connection for as long as its process lives.
-        yield {cell: (other if cell.row == "call" else pool).submit(try_cell, cell) for cell in cells}
+        yield {cell: (other if cell.row in ("call", "beat") else pool).submit(try_cell, cell) for cell in cells}
 
 
 @pytest.fixture(scope="module")

@@ -100,6 +100,14 @@ def test_the_live_view_shows_tension_and_angle(rig, quiet_block):
         assert part in shown
 
 
+def test_the_live_view_shows_a_channel_that_is_no_number(rig, quiet_block):
+    text, block = io.StringIO(), quiet_block()
+    block.x[7, rig.index("tension", "T3")] = block.x[:, rig.index("tension", "T4")] = np.nan
+    console = Console(file=text, width=100)
+    console.print(LiveView(rig, console).draw(View("02-ID.4-T3-MCP", 2, 9, "moving", block, 0, True)))
+    assert text.getvalue().count("nan N") == 2
+
+
 def test_outside_a_terminal_it_is_a_line_a_trial(rig, quiet_block):
     text = io.StringIO()
     with LiveView(rig, Console(file=text, width=100)) as view:
@@ -251,10 +259,9 @@ def test_a_recording_played_back(files, rig):
     trial = read_session(files / "s.h5")["02-ID.4-T3-MCP"]
     with open_rig(read_rig(files / "replay.toml")) as replay:
         assert "fingertip_force x" not in [c.name for c in replay.description.channels]
-        supervisor, tension = Supervisor(replay.description), []
         column = replay.description.index("tension", "T3")
-        with pytest.raises(EndOfReplay):
-            play(replay, supervisor, tension, column)
+        tension, found = play(replay, column)
+        assert found == []
         np.testing.assert_array_equal(np.concatenate(tension), trial.tendon_force[:, 2])
         for refused in (replay.arm, lambda: replay.command(TensionRamp({"T1": 1.0}, 1.0))):
             with pytest.raises(CommandRefused):
@@ -264,18 +271,21 @@ def test_a_recording_played_back(files, rig):
     )
     (files / "replay.toml").write_text(tight)
     with open_rig(read_rig(files / "replay.toml")) as replay:
-        supervisor = Supervisor(replay.description)
-        with pytest.raises(AssertionError):
-            play(replay, supervisor, [], 0)
-        assert supervisor.latched[0].trip is Trip.TENSION
-        assert trial.tendon_force[supervisor.latched[0].seq, 2] > 5.0
+        _, found = play(replay, 0)
+        assert found[0].trip is Trip.TENSION
+        assert trial.tendon_force[found[0].seq, 2] > 5.0
 
 
-def play(replay, supervisor, tension, column):
+def play(replay, column):
+    """Play to the end. Return the blocks of a column, and the violations."""
+    supervisor, values, found = Supervisor(replay.description), [], []
     while True:
-        block = replay.read_block(1.0)
-        assert supervisor.check(block) == []
-        tension.append(block.x[:, column])
+        try:
+            block = replay.read_block(1.0)
+        except EndOfReplay:
+            return values, found
+        found += supervisor.check(block)
+        values.append(block.x[:, column])
 
 
 class Broken(io.StringIO):

@@ -2,6 +2,7 @@
 
 import errno
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -39,6 +40,17 @@ def test_a_disk_that_stands_still_does_not_hold_up_the_reader(tmp_path):
     assert log.failure is None
     seq = np.concatenate([f.block.seq for f in wal.read_log(log.path) if f.tag == wal.DATA])
     np.testing.assert_array_equal(seq, np.arange(20_000))
+
+
+def test_a_disk_that_does_not_answer_is_waited_for_once(tmp_path):
+    Slow.go = threading.Event()
+    log = Recorder(tmp_path / "a.wal", {}, opener=Slow.create)
+    log.close(0.1)
+    assert log.hangs
+    begun = time.monotonic()
+    log.close(30.0)
+    assert time.monotonic() - begun < 15.0
+    Slow.go.set()
 
 
 def test_a_disk_too_slow_for_too_long_is_a_reason_to_stop(tmp_path, monkeypatch):

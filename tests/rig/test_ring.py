@@ -111,7 +111,7 @@ def test_a_controller_that_stands_still_is_stale(rig):
 
 @pytest.mark.parametrize(
     ("field", "value", "says"),
-    [("version", 2, "contract version"), ("sample_size", 504, "size of ST_Sample"), ("cycle_ns", 2_000_000, "rate_hz")],
+    [("version", 1, "contract version"), ("sample_size", 504, "size of ST_Sample"), ("cycle_ns", 2_000_000, "rate_hz")],
 )
 def test_another_program_is_refused(rig, field, value, says):
     machine = small(rig)
@@ -351,11 +351,11 @@ def test_a_code_that_the_contract_does_not_know_is_a_sentence(rig, field, says):
 @pytest.mark.parametrize(
     ("trip", "value", "says"),
     [
-        (Trip.POSITION, 100.0, "joint beyond its limits (joint_position MCP = 1.658 rad); see the joint's fixture"),
-        (Trip.VELOCITY, 100.0, "joint velocity above its limit (joint_position MCP = 1.745 rad/s); see the joint's"),
+        (Trip.POSITION, 100.0, "joint beyond its limits (joint_position MCP = 95°); see the joint's fixture"),
+        (Trip.VELOCITY, 100.0, "joint velocity above its limit (joint_position MCP = 100 °/s); see the joint's"),
     ],
 )
-def test_the_controllers_trip_is_told_in_si_units(trip, value, says):
+def test_the_controllers_trip_is_told_in_the_units_of_the_rig_files_limits(trip, value, says):
     """The offset of an encoder belongs to its angle, and not to its speed."""
     text = re.sub(
         r'(of = "MCP"\nslot = \d+\nunit = )"rad"\nscale = 1.0\noffset = 0.0',

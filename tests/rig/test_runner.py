@@ -17,7 +17,6 @@ from jaxfinger.rig import parse_plan, parse_rig, recorder, recover, runner, wal
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import Flag, Kind, State, Trip
 from jaxfinger.rig.operator import Nobody
-from jaxfinger.rig.protocols import MIN_TARGET
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.runner import RELEASED, TENSION_NOT_SEEN_TO_FALL, Runner
@@ -145,7 +144,7 @@ def test_a_frozen_encoder_under_the_operators_hand(rig, record):
     def strike(m):
         m.inject("freeze", slot(m, "joint_position", "DIP"))
 
-    outcome = record(machine, strike, at=("01-ID.2-DIP", "moved by hand"))
+    outcome = record(machine, strike, at=("01-ID.2-DIP", "moving by hand"))
     assert Trip.FROZEN.sentence in outcome.cause
     assert "encoder" in outcome.cause
 
@@ -154,11 +153,33 @@ def test_a_frozen_tendon_encoder_while_its_joint_is_moved_by_hand(rig, record):
     """Its excursion would be wrong in the session. None of the samples since it froze belongs to the trial."""
     machine = SimulatedRig(rig)
     outcome = record(
-        machine, lambda m: m.inject("freeze", slot(m, "excursion", "T2"), 300), at=("01-ID.2-DIP", "moved by hand")
+        machine, lambda m: m.inject("freeze", slot(m, "excursion", "T2"), 300), at=("01-ID.2-DIP", "moving by hand")
     )
     assert outcome.cause.startswith("01-ID.2-DIP: a channel is frozen (excursion T2 = ")
     excursion = read_session(outcome.session)["01-ID.2-DIP"].tendon_excursion[:, 1]
     assert np.all(np.diff(excursion) != 0)
+
+
+@pytest.mark.parametrize("before", [300, -100], ids=["within the trial", "after its end"])
+def test_a_fault_that_shows_after_the_trials_end_takes_its_bad_samples_out(rig, record, tmp_path, monkeypatch, before):
+    """A frozen sensor shows after a second. The simulated rig repeats itself, so a sound run says where the end is."""
+    ends, begun, end = [], [], Reader.end
+    monkeypatch.setattr(Reader, "end", lambda reader, value: ends.append(end(reader, value)) or ends[-1])
+    record(SimulatedRig(rig), lambda m: begun.append(m.controller.seq), output=tmp_path / "sound.h5")
+    after = ends[-1] - begun[0] - before
+
+    outcome = record(SimulatedRig(rig), lambda m: m.inject("freeze", slot(m, "external_torque"), after))
+    assert Trip.FROZEN.sentence in outcome.cause
+    whole = before < 0
+    assert outcome.complete == ("01-ID.2-DIP", "02-ID.4-T3-MCP")[: 1 + whole]
+    trial = read_session(outcome.session)["02-ID.4-T3-MCP"]
+    assert trial.complete == whole
+    assert np.all(np.diff(trial.joint_torque[:, 0]) != 0.0)
+    with h5py.File(outcome.session) as file:
+        attributes = file["trials/02-ID.4-T3-MCP"].attrs
+        assert attributes.get("trip") == (None if whole else Trip.FROZEN)
+        if not whole:
+            assert file["rig/dropped/02-ID.4-T3-MCP/seq"].shape == (before,)
 
 
 def test_a_log_that_is_deleted_ends_the_run(rig, record, tmp_path, monkeypatch):
@@ -231,8 +252,11 @@ def test_ctrl_c_again_and_again_does_not_cut_off_the_look_whether_tension_falls(
         release()
         machine.report_alive, machine.beat = press, lambda: None  # from every call that waits
 
-    machine.controller._release = panic
-    outcome = record(machine, press)
+    def begin(m):
+        m.controller._release = panic
+        press()
+
+    outcome = record(machine, begin)
     assert outcome.cause == f"02-ID.4-T3-MCP: the run was interrupted; {RELEASED}"
     assert machine.controller.off >= 0
 
@@ -288,7 +312,7 @@ def test_a_trial_that_waits_too_long_keeps_no_sample_of_its_release(rig, record)
         SHORT.split('[[trial]]\nexperiment = "ID.4"')[0].replace("passes = 1", "passes = 50\ntimeout = 2.0"), rig
     )
     outcome = record(SimulatedRig(rig), plan=plan)
-    assert "took longer" in outcome.cause
+    assert "moving by hand took longer than 2 s: DIP went between 1.0° and 73.0° " in outcome.cause
     (trial,) = read_session(outcome.session)
     assert trial.tendon_force[-1].max() > 1.0  # the pretension of 2 N, in place of the released 0 N
 
@@ -385,31 +409,58 @@ def test_a_person_at_a_bench_that_prepares_nothing_itself(rig, record):
     assert outcome.cause == ""
     assert len(outcome.complete) == 2
     straight, *rest = prompts
-    assert straight.startswith("Fix the finger straight: all joints at 0°. The drives are switched on next. Then hands")
-    assert any("Free DIP and move it slowly by hand" in text for text in rest)
-    assert rest[-1].startswith("Couple the external motor to MCP")
+    off, on = "The drives are off.", "Then hands off: Enter switches them on."
+    assert straight == f"{off} Fix the finger straight: all joints at 0°. {on}"
+    assert any(text.startswith("Hold DIP, free it, and move it slowly by hand") for text in rest)
+    assert rest[-1] == f"{off} Couple the external motor to MCP; the other joints stay fixed. {on}"
 
 
-def test_nobody_is_asked_for_a_fixture_at_a_tendon_that_pulls(rig, record):
-    """Also after trials that end with 2 N on a finger held by hand, and on a free one."""
-    plan = parse_plan(
-        SHORT + '[[trial]]\nexperiment = "VD.3"\nmean = [4.0, 2.5, 3.0, 3.0]\nseconds = 1.0\n'
-        '[[trial]]\nexperiment = "VD.1"\nseconds = 1.0\n[[trial]]\nexperiment = "ID.2"\njoint = "MCP"\npasses = 1\n',
-        rig,
-    )
+def test_the_drives_are_off_while_hands_are_at_the_finger_unless_it_is_moved_by_hand(rig, record):
+    """In every experiment. The simulated operator acts within the prompt, and the drives go on only after it."""
+    trials = [
+        'experiment = "ID.2"\njoint = "MCP"\npasses = 1',
+        'experiment = "ID.3-static"\njoint = "MCP"\nstep_deg = 35.0',
+        'experiment = "ID.4"\njoint = "MCP"\ntendon = "T3"\nlevels = [3.0, 6.0]',
+        'experiment = "VD.3"\nmean = [4.0, 2.5, 3.0, 3.0]\nseconds = 1.0',
+        'experiment = "VD.1"\nseconds = 1.0',
+        'experiment = "VD.2"\ntendon = "T2"\nlevels = [4.0, 6.0]\nposture_deg = [10.0, 40.0, 35.0]',
+        'experiment = "ID.3-dynamic"\njoint = "MCP"\npasses = 1',
+    ]
+    text = '[plan]\nname = "all"\noperator = "tester"\n' + "".join(f"[[trial]]\n{t}\n" for t in trials)
     machine, asked = SimulatedRig(rig), []
     by_itself = machine.prepare
 
     def prepare(setup):
-        asked.append((setup.hand, max(machine.controller.setpoint), int(machine.controller.state)))
+        controller = machine.controller
+        asked.append((bool(setup.hand), controller.state, controller.motor, max(controller.setpoint)))
         return by_itself(setup)
 
     machine.prepare = prepare
-    assert record(machine, plan=plan).cause == ""
-    assert len(asked) == 11
-    for hand, tension, state in asked:
-        assert tension <= (2.0 if hand else MIN_TARGET)
-        assert state != State.MOVING
+    assert record(machine, plan=parse_plan(text, rig)).cause == ""
+    assert len(asked) == 14
+    assert [hand for hand, *_ in asked].count(True) == 2
+    for hand, state, motor, tension in asked:
+        assert motor is None
+        assert (state, tension) == ((State.ARMED, 2.0) if hand else (State.IDLE, 0.0))
+
+
+def test_drives_that_come_on_while_hands_are_at_the_finger_stop_the_rig(rig, record):
+    """From a panel of its own the controller can be told to arm. The prompt ends, and nothing else moves."""
+    machine = SimulatedRig(rig)
+    person = Away(machine, "nothing")
+    ask = person.ask
+
+    def ask_and_arm(text, keep_waiting):
+        ask(text, keep_waiting)
+        if "Fix all joints" in text:
+            machine.controller._obey(Kind.ARM, 0, 0.0, 0.0, [])
+            machine._pause(0.2)
+
+    person.ask = ask_and_arm
+    outcome = record(machine, operator=person)
+    assert "01-ID.2-DIP: the controller switched the drives on without being told to" in outcome.cause
+    assert machine.controller.state is State.TRIPPED
+    assert len(person.prompts) == 2
 
 
 def test_a_joint_that_is_not_fixed_as_asked_is_asked_for_again(rig, record):
@@ -428,7 +479,7 @@ def test_a_joint_that_is_not_fixed_as_asked_is_asked_for_again(rig, record):
             return len(prompts) > 4
 
     outcome = record(machine, operator=Person())
-    assert prompts[1].startswith("Fix all joints: MCP 20°, PIP 20°")
+    assert prompts[1].startswith("The drives are off. Fix all joints: MCP 20°, PIP 20°")
     assert prompts[2].startswith(
         "'joint_position PIP' reads 0.3°, not 20.0°; see the fixture, and unit, scale and offset"
     )
@@ -489,7 +540,7 @@ def impatient(rig, seconds=0.2):
 def test_a_prompt_that_nobody_answers_in_time_releases_an_armed_finger(rig, record, late):
     """Nobody moves a motor for somebody who comes back later. The trial is repeated when the recording is resumed."""
     machine = SimulatedRig(impatient(rig))
-    person = Away(machine, "Free DIP and move it", late)
+    person = Away(machine, "Hold DIP, free it", late)
     outcome = record(machine, operator=person)
     assert outcome.cause == f"01-ID.2-DIP: nobody answered the prompt within 0.2 s (prompt_s of [rig]); {RELEASED}"
     assert "The finger is armed, with 2.0 N: without an answer within 0.2 s it is released." in person.prompts[-1]
@@ -521,6 +572,24 @@ def test_filtered_terminals_are_refused_for_dynamic_experiments(rig, tmp_path):
         assert bandwidth["tension T1"] == 22.0
 
 
+def test_a_clock_that_jumps_while_the_drives_are_off_is_named_and_arms_nothing(rig, record):
+    machine = SimulatedRig(rig)
+    person = Away(machine, "nothing")
+    ask = person.ask
+
+    def ask_and_jump(text, keep_waiting):
+        ask(text, keep_waiting)
+        if "Couple the external motor" in text:
+            machine.inject("clock-jump", amount=3600.0)
+            machine._pause(0.3)
+
+    person.ask = ask_and_jump
+    outcome = record(machine, operator=person)
+    assert f"nothing was armed: {Trip.CLOCK.sentence}" in outcome.cause
+    assert machine.controller.state is State.TRIPPED
+    assert outcome.complete == ("01-ID.2-DIP",)
+
+
 def test_static_experiments_may_be_filtered(rig, record):
     machine = SimulatedRig(rig, Controller(filtered=True))
     assert record(machine).cause == ""
@@ -542,7 +611,7 @@ def test_a_gap_is_counted_and_written(rig, record, tmp_path):
     def sleep(m):
         m._pause(3.0)
 
-    outcome = record(machine, sleep, at=("01-ID.2-DIP", "moved by hand"))
+    outcome = record(machine, sleep, at=("01-ID.2-DIP", "moving by hand"))
     assert outcome.cause == ""
     with h5py.File(outcome.session) as file:
         lost = int(file["trials/01-ID.2-DIP"].attrs["lost_samples"])
@@ -594,7 +663,7 @@ def test_a_controller_that_does_not_release_is_said(rig, record):
     """RELEASE after the last trial and STOP are both ignored. The run says so and asks to switch the drives off."""
     machine = SimulatedRig(rig)
     outcome = record(machine, lambda m: m.controller.strike("deaf"))
-    assert "the finger was not seen to be released after the last trial" in outcome.cause
+    assert "after the last trial: the finger was not seen to be released (state ARMED)" in outcome.cause
     assert "switch the drives off" in outcome.cause
     assert len(outcome.complete) == 2
 
@@ -609,9 +678,8 @@ def test_tension_that_stays_after_the_last_trial_is_said(rig, record, pull):
         machine.inject("spike", slot(machine, "tension", "T3"), after=300, amount=pull)
         return release()
 
-    machine.release = caught
-    outcome = record(machine)
-    assert outcome.cause.startswith("the finger was not seen to be released after the last trial")
+    outcome = record(machine, lambda m: setattr(m, "release", caught))
+    assert outcome.cause.startswith("after the last trial: the finger was not seen to be released ('tension T3' reads ")
     assert TENSION_NOT_SEEN_TO_FALL in outcome.cause
     assert len(outcome.complete) == 2
 
@@ -620,7 +688,7 @@ def test_tension_that_stays_after_the_last_trial_is_said(rig, record, pull):
 def test_a_controller_that_lets_go_by_itself_ends_the_trial(rig, record, kind):
     """From a panel of its own the controller can be told to let go. What follows is no measurement."""
     machine = SimulatedRig(rig)
-    outcome = record(machine, lambda m: m.controller._obey(kind, 0, 0.0, 0.0, []), at=("01-ID.2-DIP", "moved by hand"))
+    outcome = record(machine, lambda m: m.controller._obey(kind, 0, 0.0, 0.0, []), at=("01-ID.2-DIP", "moving by hand"))
     assert "let go of the finger without being told to" in outcome.cause
     assert outcome.complete == ()
     assert not read_session(outcome.session)["01-ID.2-DIP"].complete

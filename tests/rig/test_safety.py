@@ -1,5 +1,6 @@
 """The supervisor finds each fault and no other, at the same sample in blocks of any size."""
 
+import re
 from dataclasses import replace
 from itertools import pairwise
 
@@ -308,6 +309,19 @@ def test_a_set_point_beyond_the_limits_is_refused_and_nothing_is_sent(rig, simul
         with pytest.raises(CommandRefused):
             simulated.command(command)
         assert simulated.status().acknowledged == before
+
+
+def test_a_sentence_has_the_units_of_the_rig_files_limits(rig, quiet_block):
+    block = quiet_block(400)
+    block.x[200:, rig.index("joint_position", "MCP")] = np.radians(93.5)
+    block.flags[300:] = int(Flag.ANALOG) | int(Flag.BUS) | 0xABCD << 16
+    position, velocity, flagged = (
+        next(v for v in Supervisor(rig).check(block) if v.trip is trip).sentence
+        for trip in (Trip.POSITION, Trip.VELOCITY, Trip.INVALID)
+    )
+    assert "(joint_position MCP = 93.5° at sample 202); see" in position
+    assert re.search(r"\(joint_position MCP = \d+ °/s at sample 202\); see", velocity)
+    assert "(working counter or device state bad and an analog input over or under its range at sample 302)" in flagged
 
 
 @pytest.mark.parametrize(

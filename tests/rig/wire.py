@@ -23,7 +23,7 @@ from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
 from jaxfinger.rig import matrix, parse_plan, parse_rig, run, wal
 from jaxfinger.rig.backends.ads import AdsRig
-from jaxfinger.rig.contract import State
+from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.examples import rig_toml
 
@@ -35,7 +35,7 @@ CALM = {"stale_s": 3.0, "lag_s": 3.0, "thread_s": 3.0, "disk_s": 5.0, "clock_off
 # The deadline that a row tests; it keeps its default.
 TESTED_DEADLINE = {
     "slow": "clock_offset_s", "stall": "stale_s", "lag": "lag_s", "reader": "thread_s", "runner": "thread_s",
-    "disk": "disk_s", "clock slow": "clock_offset_s",
+    "disk": "disk_s", "clock slow": "clock_offset_s", "call": "thread_s", "beat": "thread_s",
 }  # fmt: skip
 
 
@@ -113,58 +113,86 @@ def stalls(stop: threading.Event, worst: list[float]) -> None:
         worst.append(time.monotonic() - asked - 0.005)
 
 
+class Recording:
+    """A recording in a thread of its own. Its calls and views pass by `host`, where they may hang.
+
+    `armed` and `reached` are set once a sample has shown the drives on, and once the cell's phase has begun. `begun` is
+    the number of the first sample of the trial, `ended` holds the run's sentence and when it came (s, monotonic).
+    """
+
+    def __init__(self, cell: Cell, rig: AdsRig, host: Host, path: Path):
+        self._cell, self._rig, self._host, self._path = cell, rig, host, path
+        self.armed, self.reached = threading.Event(), threading.Event()
+        self.begun: int | None = None
+        self.ended: tuple[str, float] | None = None
+        self._views = 0
+        self._poll, self._call = rig.poll, rig._call
+        rig.poll, rig._call = self._polled, self._called
+        self.thread = threading.Thread(target=self._work, daemon=True)
+        self.thread.start()
+
+    def _polled(self):
+        self._host.hang("reader")
+        block = self._poll()
+        if block is not None and (block.state == State.ARMED).any():
+            self.armed.set()
+        return block
+
+    def _called(self, request, mend=True):
+        caller = {"jaxfinger-reader": "call", "jaxfinger-heartbeat": "beat"}.get(threading.current_thread().name, "")
+        return self._call(lambda: (self._host.hang(caller), request())[1], mend)
+
+    def _observe(self, view) -> None:
+        if view.recording:
+            self.begun = int(view.block.seq[0]) if self.begun is None else self.begun
+            self._views += 1
+        holds, moves = self._views > 5, view.trial == "01-VD.1" and view.block.state[-1] == State.MOVING
+        if holds if self._cell.phase == "hold" else moves:
+            self.reached.set()
+        self._host.hang("runner")
+
+    def _work(self) -> None:
+        try:
+            plan = parse_plan(PLAN, self._rig.description)
+            said = run(plan, self._rig, self._path, operator=self._host, observe=self._observe).cause
+        except UserError as error:
+            said = str(error)
+        self.ended = said, time.monotonic()
+
+    def wait_for_phase(self) -> bool:
+        """Wait until the cell's phase has begun. Return False where the run ended before."""
+        begun = self.armed if self._cell.phase == "arming" else self.reached
+        while not begun.wait(0.005) and self.thread.is_alive():
+            pass
+        return self.thread.is_alive()
+
+    def missing_s(self, fault: int) -> float | None:
+        """Seconds of samples before number `fault` that are not in the file; None where there is no file."""
+        if self.begun is None or not self._path.exists():
+            return None
+        with h5py.File(self._path) as file:
+            rest = file.get("rig/dropped/01-VD.1/seq", np.empty(0))[()]
+        return max(fault - self.begun - len(read_session(self._path)["01-VD.1"].time) - len(rest), 0) * 1e-3
+
+
+def rig_of(cell: Cell, where: str) -> AdsRig:
+    """The rig of a cell, with calm deadlines but for the one that its row tests."""
+    deadlines = {k: v for k, v in CALM.items() if k != TESTED_DEADLINE.get(cell.row)}
+    address = {"net_id": standin.NET_ID, "ip": where, "port": 851, "reconnect_s": 3}
+    return AdsRig(parse_rig(rig_toml("ads", address, poll_s=cell.poll_s, **deadlines)))
+
+
 def once(cell: Cell) -> Found | str:
     """Run a cell. Return only the run's sentence where it ended before the fault struck: the machine was too busy."""
     row = next(r for r in matrix.MATRIX if r.name == cell.row)
-    deadlines = {k: v for k, v in CALM.items() if k != TESTED_DEADLINE.get(cell.row)}
     with contextlib.ExitStack() as stack:
         bench = stack.enter_context(standin.started(faults=cell.also))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         host = Host(stack)
-        address = {"net_id": standin.NET_ID, "ip": bench.where, "port": 851, "reconnect_s": 3}
-        rig = AdsRig(parse_rig(rig_toml("ads", address, poll_s=cell.poll_s, **deadlines)))
-        plan = parse_plan(PLAN, rig.description)
-        poll, armed, began, done = rig.poll, threading.Event(), [], []
-
-        def polled():
-            host.hang("reader")
-            block = poll()
-            if block is not None and (block.state == State.ARMED).any():
-                armed.set()
-            return block
-
-        call = rig._call
-
-        def called(request, mend=True):
-            return call(lambda: (host.hang("call"), request())[1], mend)
-
-        rig.poll, rig._call = polled, called
-        reached, views = threading.Event(), []
-
-        def observe(view):
-            if view.recording and not began:
-                began.append(int(view.block.seq[0]))
-            ready = view.recording and len(views) > 4 if cell.phase == "hold" else view.block.state[-1] == State.MOVING
-            if view.recording:
-                views.append(view)
-            if ready and (cell.phase == "hold" or view.trial == "01-VD.1"):
-                reached.set()
-            host.hang("runner")
-
-        def record():
-            try:
-                outcome = run(plan, rig, folder / "s.h5", operator=host, observe=observe)
-                done.append((outcome.cause, time.monotonic()))
-            except UserError as error:
-                done.append((str(error), time.monotonic()))
-
-        recorder = threading.Thread(target=record, daemon=True)
-        recorder.start()
-        wait_for = armed if cell.phase == "arming" else reached
-        while not wait_for.wait(0.005) and recorder.is_alive():
-            pass
-        if not recorder.is_alive():
-            return done[0][0]
+        recording = Recording(cell, rig_of(cell, bench.where), host, folder / "s.h5")
+        if not recording.wait_for_phase():
+            assert recording.ended is not None
+            return recording.ended[0]
         quiet, worst = threading.Event(), [0.0]
         stack.callback(quiet.set)
         threading.Thread(target=stalls, args=(quiet, worst), daemon=True).start()
@@ -174,30 +202,25 @@ def once(cell: Cell) -> Found | str:
                 time.sleep(0.001)
         struck_at = time.monotonic()
         report = host.strike(bench, row.wire)
-        boot = report["boot"]
-        while recorder.is_alive() and time.monotonic() - struck_at < 15.0:
-            recorder.join(0.02)
+        boot, fault = report["boot"], report["fault_seq"]
+        while recording.thread.is_alive() and time.monotonic() - struck_at < 15.0:
+            recording.thread.join(0.02)
             if "runner" in host.hangs and bench.report()["off_seq"] >= 0:
                 host.go.set()  # Let the runner go on, so that the run can end.
-        report, fault = bench.report(), report["fault_seq"] if row.wire in HOSTS else bench.report()["fault_seq"]
+        report = bench.report()
+        if row.wire not in HOSTS:
+            fault = report["head"] if report["fault_seq"] is None else report["fault_seq"]
         restarted = report["boot"] != boot
-        fault = report["head"] if fault is None else fault
         stopped = report["trip"] and not restarted
-        missing = None
-        if began and (folder / "s.h5").exists():
-            with h5py.File(folder / "s.h5") as file:
-                trial = read_session(folder / "s.h5")["01-VD.1"]
-                rest = file.get("rig/dropped/01-VD.1/seq", np.empty(0))[()]
-            missing = max(fault - began[0] - len(trial.time) - len(rest), 0) * 1e-3
-        cause, ended = done[0] if done else ("", time.monotonic())
+        cause, ended = recording.ended or ("", time.monotonic())
         return Found(
             cell, cause, report["trip"], (report["trip_seq"] - fault) * 1e-3 if stopped else None,
             0.0 if restarted else (report["off_seq"] - fault) * 1e-3 if report["off_seq"] >= 0 else None,
-            ended - struck_at, missing, max(worst),
+            ended - struck_at, recording.missing_s(fault), max(worst),
         )  # fmt: skip
 
 
-HANGS = ("reader", "call", "runner", "watch", "disk", "full")
+HANGS = ("reader", "call", "beat", "runner", "watch", "disk", "full")
 HOSTS = ("key", "deaf", *HANGS)
 
 
@@ -211,6 +234,8 @@ def judge(found: Found) -> list[str]:
         faults.append(f"stopped after {found.stop_s} s")
     if row.off and (found.off_s is None or not found.off_s <= shows + matrix.OFF_S):
         faults.append(f"tension off after {found.off_s} s")
+    if row.by == matrix.CONTROLLER and found.cell.phase != "letting go" and found.trip != Trip.HEARTBEAT:
+        faults.append(f"not stopped by the controller's watchdog but by trip {found.trip}")
     if found.end_s > matrix.END_S:
         faults.append(f"ended after {found.end_s} s")
     if found.missing_s is not None and found.missing_s > matrix.LOST_S:
@@ -227,7 +252,10 @@ SAYS = {
     "slow": ["wrote no sample"],
     "restart": ["program was restarted"],
     "cut": ["connection to the controller is lost"],
-    "call": ["a call to the controller hangs"],
+    "reader": ["the host's reader was silent"],
+    "runner": ["the host's runner was silent"],
+    "call": ["a call to the controller hangs", "the host's reader was silent"],
+    "beat": ["a call to the controller hangs", "the host's heartbeat was silent"],
     "disk": ["disk does not answer"],
     "full": ["No space left"],
     "deaf": ["the operator pressed the stop key"],

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import fcntl
-import os
-import re
-import tempfile
+import errno
+import hashlib
+import socket
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 from jaxfinger.data.toml import Fault, Within
@@ -32,6 +30,8 @@ TIMEOUT_MS = 500
 LOCK_POLL_S = 0.02  # s between two attempts to get the connection: a fifth of the shortest wait, MAX_BEAT_WAIT_S
 MAX_CALL_S = 0.7  # s after which another thread's call counts as hanging: longer than TIMEOUT_MS
 MAX_BEAT_WAIT_S = 0.1  # s that a heartbeat waits for other calls: two of its periods, `watch.BEAT_S`
+ADS_PORT = 48898  # TCP port of a router where `ip` gives none
+CLAIM_PORTS = range(20_000, 32_768)  # UDP ports of claims: below those that systems give to programs that ask for any
 CLAIM_S = 1.0  # s to wait for a program that is being killed: it keeps its claim for some milliseconds
 RETRY_S = 0.1  # s between attempts to connect: a router needs some milliseconds to forget a program that was killed
 
@@ -72,16 +72,16 @@ class AdsRig(RingRig):
         self._lock = threading.Lock()
         self._places: dict[str, tuple[int, int, int]] = {}  # symbol: group, offset, size in bytes
         self.reconnects = 0
-        self._calls = 0  # calls that have had the connection
-        self._mending = False  # a call is connecting again
+        self._calls = 0  # calls that have had the connection, and attempts to connect again
+        self._hanging = -1  # the newest of them that was found to hang
         self._given_up = False  # a call could not connect again, so later calls do not try
         self._closed = False
-        self._claim: int | None = None  # descriptor of the file that keeps other programs of this computer away
+        self._claim: socket.socket | None = None  # keeps other programs of this computer away
 
     def _open(self) -> None:
         where, self._given_up, self._closed = self.description.address, False, False
         if self._claim is None:
-            self._claim = _claim(f"{where['net_id']} port {where['port']} at {where['ip']}")
+            self._claim = _claim(str(where["ip"]))
         deadline = time.monotonic() + float(where["reconnect_s"])
         while True:  # A router may still hang up on the connection of a program that was killed a moment ago.
             try:
@@ -121,14 +121,14 @@ class AdsRig(RingRig):
 
     def close(self) -> None:
         self._closed = self._given_up = True  # A thread that was left behind must not connect again.
-        # Where the lock is not free, another thread hangs in a call; it closes the connection when it comes back.
-        if self._lock.acquire(timeout=MAX_CALL_S):
+        with contextlib.suppress(ConnectionLost):  # A thread that hangs closes the connection when it comes back.
+            self._acquire(patient=True)
             try:
                 self._detach()
             finally:
                 self._lock.release()
         if self._claim is not None:
-            os.close(self._claim)
+            self._claim.close()
             self._claim = None
 
     def _detach(self) -> None:
@@ -148,10 +148,10 @@ class AdsRig(RingRig):
         try:
             return request()
         except self._failures as first:
-            self._mending = mend
             deadline = time.monotonic() + patience
             while mend and not self._given_up and time.monotonic() < deadline:
                 self.report_alive()
+                self._calls += 1
                 self._detach()
                 try:
                     self._attach()
@@ -163,7 +163,6 @@ class AdsRig(RingRig):
             self._given_up |= mend
             raise ConnectionLost(f"the connection to the controller is lost ({first}).") from first
         finally:
-            self._mending = False
             if self._closed:
                 self._detach()
             self._lock.release()
@@ -171,9 +170,9 @@ class AdsRig(RingRig):
     def _acquire(self, patient: bool) -> None:
         """Take the connection, which another thread may be using.
 
-        A patient call waits MAX_CALL_S for any one call of others, and without limit while one is connecting again. A
-        heartbeat is not patient: it waits MAX_BEAT_WAIT_S in all. The waits are counted, not measured by the clock: a
-        machine that held up this thread also held up the other's call.
+        A patient call waits MAX_CALL_S for any one call or attempt to connect of others, and not at all for one that
+        was found to hang before. A heartbeat is not patient: it waits MAX_BEAT_WAIT_S in all. The waits are counted,
+        not measured by the clock: a machine that held up this thread also held up the other's call.
 
         Raises:
             ConnectionLost: the other call hangs.
@@ -184,7 +183,9 @@ class AdsRig(RingRig):
             if patient and self._calls != call:
                 call, waits = self._calls, 0
             waits += 1
-            if waits * LOCK_POLL_S > (MAX_CALL_S if patient else MAX_BEAT_WAIT_S) and not (patient and self._mending):
+            if patient and waits * LOCK_POLL_S > MAX_CALL_S:
+                self._hanging = call
+            if self._hanging == call or waits * LOCK_POLL_S > (MAX_CALL_S if patient else MAX_BEAT_WAIT_S):
                 raise ConnectionLost("a call to the controller hangs.")
         self._calls += 1
 
@@ -215,32 +216,35 @@ class AdsRig(RingRig):
         return "stBench" in self._places
 
 
-def _claim(controller: str) -> int:
-    """Claim a controller for this program and return the descriptor to close. It ends with the process, however.
+def _claim(ip: str) -> socket.socket:
+    """Claim the controller at `ip` (host or host:port) for this program, until it ends or closes the socket.
 
-    A router keeps one connection for each computer, so a second program here would cut off the first one.
+    A router keeps one connection for each computer, so a second program here would cut off the first one. The claim is
+    a UDP port on a loopback address of its own, which one program can bind at a time; nothing is sent. Both follow from
+    the controller's address alone, so programs of any user, in any folder, agree on them.
 
     Raises:
-        UserError: another program of this computer has claimed it, or no file can be made for it.
+        UserError: another program of this computer has claimed it.
     """
-    path = Path(tempfile.gettempdir(), f"jaxfinger {re.sub(r'[^0-9A-Za-z.:]+', ' ', controller)}")
-    try:
-        with contextlib.suppress(FileExistsError):  # Another user's file may be opened, but not to create it.
-            os.close(os.open(path, os.O_RDONLY | os.O_CREAT | os.O_EXCL, 0o644))
-        claim = os.open(path, os.O_RDONLY)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be made ({error.strerror}); see to the folder's rights.") from error
-    deadline = time.monotonic() + CLAIM_S
+    host, _, port = ip.partition(":")
+    with contextlib.suppress(OSError):  # A name that nobody knows is the connection's to report.
+        host = socket.gethostbyname(host)
+    key = hashlib.sha256(f"jaxfinger {host}:{port or ADS_PORT}".encode()).digest()
+    place = f"127.{key[0]}.{key[1]}.{key[2]}", CLAIM_PORTS[int.from_bytes(key[3:5]) % len(CLAIM_PORTS)]
+    claim, deadline = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), time.monotonic() + CLAIM_S
     while True:
         try:
-            fcntl.flock(claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            claim.bind(place)
             return claim
         except OSError as error:
-            if time.monotonic() > deadline:
-                os.close(claim)
-                said = f"another program on this computer has the controller {controller}; end it first."
-                raise UserError(said) from error
-            time.sleep(LOCK_POLL_S)
+            if error.errno == errno.EADDRNOTAVAIL:  # macOS has one loopback address.
+                place = "127.0.0.1", place[1]
+            elif time.monotonic() > deadline:
+                claim.close()
+                said = f"another program on this computer has the controller at {ip} (or holds UDP port {place[1]})"
+                raise UserError(f"{said}; end it first.") from error
+            else:
+                time.sleep(LOCK_POLL_S)
 
 
 def make(description: RigDescription) -> AdsRig:

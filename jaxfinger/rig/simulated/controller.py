@@ -221,11 +221,11 @@ class Controller:
             if self.state is not State.TRIPPED or self.ramps:
                 return Refusal.STATE
             self.state, self.trip, self.trip_slot = State.IDLE, Trip.NONE, -1
-            self.target = self.setpoint[:]
         elif kind == Kind.ARM:
             if self.state is not State.IDLE:
                 return Refusal.STATE
-            self.state, self.beat_age = State.ARMED, 0
+            self.state, self.beat_age, self.motor = State.ARMED, 0, None  # `_couple` takes the motor's angle.
+            self.setpoint, self.target = [0.0] * self.plant.n, [0.0] * self.plant.n
         elif kind == Kind.DISARM:
             if not on and self.state is not State.IDLE:
                 return Refusal.STATE
