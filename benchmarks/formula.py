@@ -1,4 +1,4 @@
-"""Fit the nine numbers of the diagnosis's formula (`jaxfinger/gap/formula.py`) by log score on sealed cases.
+"""Fit the ten numbers of the diagnosis's formula (`jaxfinger/gap/formula.py`) by log score on sealed cases.
 
     jaxfinger sealed make cases --split develop --count 40
     python benchmarks/formula.py weigh records cases           # a minute per case; resumes after a stop

@@ -73,6 +73,7 @@ class Parameters:
     form_error_unlisted: float = 0.27  # ρ² in `unlisted`: less than that share of E_c may be the listed causes' own.
     unlisted_threshold: float = 6.0  # nats left unexplained at which something unlisted is as likely as not
     unlisted_slope: float = 1.0  # change of the log odds that something is unlisted, per nat left unexplained
+    imitator_odds: float = 2.0  # λ: prior odds that a cause beside something unlisted only imitates it (`imitates`)
 
 
 @dataclass(frozen=True)
@@ -144,13 +145,24 @@ def unlisted(counts: Counts, evidence: Evidence, p: Parameters) -> float:
 def left_share(
     counts: Counts, without: Evidence, left: Evidence, explainable: Float[np.ndarray, " C"], p: Parameters
 ) -> float:
-    """Share of the energy beyond noise that a set leaves where one of its causes acts; 0 where there is none.
+    """Share of the energy beyond noise that a set leaves in the channels where one of its causes acts; 0 without any.
 
-    It is Σ_c τ_c l_c / Σ_c τ_c l_c⁰, with l_c = max(e_c − φ K_c, 0) for what the set leaves, l_c⁰ for what it leaves
-    without the cause, and τ_c, `explainable`, as in `costs`.
+    It is Σ_c t_c l_c / Σ_c t_c l_c⁰, with l_c = max(e_c − φ K_c, 0) for what the set leaves, l_c⁰ for what it leaves
+    without the cause, and t_c the largest τ_c, `explainable` (`costs`), in any column of the channel. What is unlisted
+    need not keep to the one tendon or joint where a listed cause imitates it.
     """
-    now, before = (float(explainable @ np.maximum(x.e - p.variance_floor * counts.K, 0.0)) for x in (left, without))
+    acts = counts.largest_of_channel(explainable)
+    now, before = (float(acts @ np.maximum(x.e - p.variance_floor * counts.K, 0.0)) for x in (left, without))
     return min(now / before, 1.0) if before > 0.0 else 0.0
+
+
+def imitates(left: float, p: Parameters) -> float:
+    """Probability that a cause beside something unlisted only imitates it.
+
+    The odds are λ ℓ / (1 − ℓ), with ℓ the `left_share`: λ is the odds before the trials. ℓ / (1 − ℓ) is the energy that
+    is surely not the cause's, over that which the cause takes away.
+    """
+    return p.imitator_odds * left / (p.imitator_odds * left + 1.0 - left)
 
 
 @dataclass(frozen=True)

@@ -38,20 +38,31 @@ def test_probabilities_are_shares_of_evidence_beyond_what_each_set_costs():
     assert COSTS.probabilities({k: s + 321.0 for k, s in sets.items()}) == pytest.approx(w)
 
 
-def test_what_leaves_more_than_it_explains_where_it_acts_only_imitates_something_unlisted():
-    """Noise and what is left in other columns count for nothing."""
-    counts, nothing = Counts(np.array([10, 10]), np.array([100, 100])), np.zeros(2)
+def genuine(left: dict[frozenset, tuple[float, float]], channel: tuple[int, int]) -> dict:
+    """Probabilities that causes imitate nothing, where sets leave these energies beyond noise in the two columns."""
+    counts, nothing = Counts(np.array([10, 10]), np.array([100, 100]), np.array(channel)), np.zeros(2)
+    noise = Parameters().variance_floor * counts.K
+    evidence = {keys: Evidence(noise + np.array(e), np.full(2, 100.0), nothing, 0.0) for keys, e in left.items()}
+    best = max(evidence, key=len)
+    return genuine_probabilities(COSTS, counts, evidence, best, unlisted(counts, evidence[best], Parameters()))
 
-    def left(excursion: float, torque: float) -> Evidence:
-        return Evidence(10.0 + np.array([excursion, torque]), np.full(2, 100.0), nothing, 0.0)
 
-    def of(evidence: dict) -> dict:
-        best = max(evidence, key=len)
-        return genuine_probabilities(COSTS, counts, evidence, best, unlisted(counts, evidence[best], Parameters()))
+BOTH, WITHOUT_STRETCH, WITHOUT_STRIBECK = (frozenset(s) for s in ({STRETCH, STRIBECK}, {STRIBECK}, {STRETCH}))
 
-    both, less = frozenset({STRETCH, STRIBECK}), {STRETCH: frozenset({STRIBECK}), STRIBECK: frozenset({STRETCH})}
-    imitates = {both: left(0.0, 3000.0), less[STRETCH]: left(5000.0, 3000.0), less[STRIBECK]: left(0.0, 4000.0)}
-    assert of(imitates)[STRETCH] == 1.0
-    assert of(imitates)[STRIBECK] == pytest.approx(0.25, abs=0.01)
-    noise = {both: left(0.0, 5.0), less[STRETCH]: left(5000.0, 5.0), less[STRIBECK]: left(0.0, 4000.0)}
-    assert of(noise)[STRIBECK] == pytest.approx(1.0)
+
+def test_what_leaves_more_than_it_explains_in_its_channels_only_imitates_something_unlisted():
+    """Noise and what is left in other channels count for nothing."""
+    of = genuine({BOTH: (0.0, 3000.0), WITHOUT_STRETCH: (5000.0, 3000.0), WITHOUT_STRIBECK: (0.0, 4000.0)}, (0, 1))
+    assert of[STRETCH] == 1.0
+    odds = Parameters().imitator_odds * 3000.0 / 1000.0
+    assert of[STRIBECK] == pytest.approx(1.0 / (1.0 + odds))
+    assert of[STRIBECK] < 0.5
+    of = genuine({BOTH: (0.0, 0.0), WITHOUT_STRETCH: (5000.0, 0.0), WITHOUT_STRIBECK: (0.0, 4000.0)}, (0, 1))
+    assert of[STRIBECK] == pytest.approx(1.0)
+
+
+def test_a_cause_that_closes_one_column_and_leaves_another_of_its_channel_open_may_imitate():
+    """A base that yields lengthens all tendons, of which a stretch explains one."""
+    left = {BOTH: (0.0, 3000.0), WITHOUT_STRETCH: (1000.0, 3000.0), WITHOUT_STRIBECK: (0.0, 9000.0)}
+    assert genuine(left, (0, 0))[STRETCH] == pytest.approx(1.0 / (1.0 + 3.0 * Parameters().imitator_odds))
+    assert genuine(left, (0, 1))[STRETCH] == 1.0
