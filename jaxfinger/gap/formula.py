@@ -73,7 +73,7 @@ class Parameters:
     form_error_unlisted: float = 0.27  # ρ² in `unlisted`: less than that share of E_c may be the listed causes' own.
     unlisted_threshold: float = 6.0  # nats left unexplained at which something unlisted is as likely as not
     unlisted_slope: float = 1.0  # change of the log odds that something is unlisted, per nat left unexplained
-    imitator_odds: float = 2.0  # λ: prior odds that a cause beside something unlisted only imitates it (`imitates`)
+    imitator_odds: float = 20.0  # λ: what is left beside a cause raises its odds to be an imitator up to 1 + λ times
 
 
 @dataclass(frozen=True)
@@ -142,27 +142,30 @@ def unlisted(counts: Counts, evidence: Evidence, p: Parameters) -> float:
     return float(expit(p.unlisted_slope * (left - p.unlisted_threshold)))
 
 
-def left_share(
+def imitates(
     counts: Counts, without: Evidence, left: Evidence, explainable: Float[np.ndarray, " C"], p: Parameters
 ) -> float:
-    """Share of the energy beyond noise that a set leaves in the channels where one of its causes acts; 0 without any.
+    """Probability that a cause of a set, beside something unlisted, only imitates it.
 
-    It is Σ_c t_c l_c / Σ_c t_c l_c⁰, with l_c = max(e_c − φ K_c, 0) for what the set leaves, l_c⁰ for what it leaves
-    without the cause, and t_c the largest τ_c, `explainable` (`costs`), in any column of the channel. What is unlisted
-    need not keep to the one tendon or joint where a listed cause imitates it.
+    With l_c = max(e_c − φ K_c, 0) the energy beyond noise that the set leaves, l_c⁰ that without the cause, τ_c,
+    `explainable`, as in `costs`, and τ'_c the largest τ_c in any column of the channel,
+
+        A = Σ_c τ_c (l_c⁰ − l_c),    L = Σ_c τ_c l_c,    B = Σ_c (τ'_c − τ_c) l_c
+
+    are the energies that the cause takes away, that it leaves where it acts, and that is left beside it. The odds are
+    (1 + λ B / (A + B)) L / A. A true cause of another form leaves something where it acts, but nothing beside it; one
+    that leaves nothing where it acts has the right law, whatever is left beside it. What is unlisted follows another
+    law, and seldom keeps to the one tendon or joint, or to the experiment, where a listed cause imitates it.
     """
-    acts = counts.largest_of_channel(explainable)
-    now, before = (float(acts @ np.maximum(x.e - p.variance_floor * counts.K, 0.0)) for x in (left, without))
-    return min(now / before, 1.0) if before > 0.0 else 0.0
-
-
-def imitates(left: float, p: Parameters) -> float:
-    """Probability that a cause beside something unlisted only imitates it.
-
-    The odds are λ ℓ / (1 − ℓ), with ℓ the `left_share`: λ is the odds before the trials. ℓ / (1 − ℓ) is the energy that
-    is surely not the cause's, over that which the cause takes away.
-    """
-    return p.imitator_odds * left / (p.imitator_odds * left + 1.0 - left)
+    now, before = (np.maximum(x.e - p.variance_floor * counts.K, 0.0) for x in (left, without))
+    own, taken = float(explainable @ now), float(explainable @ (before - now))
+    beside = float((counts.largest_of_channel(explainable) - explainable) @ now)
+    if own == 0.0 or own + taken <= 0.0:
+        return 0.0
+    if taken <= 0.0:
+        return 1.0
+    odds = (1.0 + p.imitator_odds * beside / (taken + beside)) * own / taken
+    return odds / (1.0 + odds)
 
 
 @dataclass(frozen=True)
