@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from benchmarks.formula import CLIP, Record
 from jaxfinger.gap.columns import Counts
 from jaxfinger.gap.costs import Costs
 from jaxfinger.gap.formula import Evidence, Parameters, unlisted
@@ -70,3 +71,15 @@ def test_what_leaves_little_where_it_acts_and_much_beside_it_imitates_something_
 def test_what_leaves_nothing_where_it_acts_is_at_work_whatever_is_left_beside_it():
     beside = {BOTH: (0.0, 3000.0), WITHOUT_STRETCH: (1000.0, 3000.0), WITHOUT_STRIBECK: (0.0, 9000.0)}
     assert genuine(beside, (0, 0))[STRETCH] == 1.0
+
+
+def test_the_log_score_of_a_record_is_that_of_its_probabilities():
+    """A cause that is worth its cost is as likely as not; the others and «unlisted» are unlikely, and rightly so."""
+    counts, none, p = Counts(np.array([10, 10]), np.array([100, 100]), np.array([0, 1])), np.zeros(2), Parameters()
+    noise, outside = p.variance_floor * counts.K, np.full(2, 100.0)
+    evidence = {frozenset(): Evidence(noise + 5000.0 * EXCURSION, outside, none, 0.0)}
+    record = Record("case", counts, evidence, frozenset(), EXPLAINABLE, frozenset({STRETCH}), p)
+    cost = record.costs(p).of([STRETCH])
+    evidence[frozenset({STRETCH})] = Evidence(noise, outside, none, cost + 1e-6)
+    unlikely = [CLIP] * (len(EXPLAINABLE) - 1) + [1.0 / (1.0 + np.exp(p.unlisted_slope * p.unlisted_threshold))]
+    assert record.log_score(p) == pytest.approx(np.log(0.5) + np.log1p(-np.array(unlikely)).sum(), abs=1e-5)
