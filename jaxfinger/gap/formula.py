@@ -60,7 +60,8 @@ class Parameters:
     """Numbers of the formula that no recording gives.
 
     `benchmarks/formula.py fit` chose `imitator_gain`, `form_error_unlisted`, `unlisted_threshold` and `unlisted_slope`,
-    rounded, from sealed cases, and an earlier fit chose `cause_cost`. The others are set for the reasons beside them.
+    rounded, from sealed cases, and an earlier fit chose `cause_cost`. `imitator_odds` is less than the 52 that it chose
+    from eight cases, which hardly determine it. The others are set for the reasons beside them.
     The fit found no values that do better on cases it had not seen (docs/results.md).
     """
 
