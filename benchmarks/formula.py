@@ -1,4 +1,4 @@
-"""Fit the nine numbers of the diagnosis's formula (`jaxfinger/gap/formula.py`) by log score on sealed cases.
+"""Fit the ten numbers of the diagnosis's formula (`jaxfinger/gap/formula.py`) by log score on sealed cases.
 
     jaxfinger sealed make cases --split develop --count 40
     python benchmarks/formula.py weigh records cases           # a minute per case; resumes after a stop
@@ -71,7 +71,7 @@ class Record:
         costs, sets = self.costs(p), list(self.evidence)
         # The causes' values stay. They are at an optimum, so the evidence changes with them in second order only.
         e, o, explained, score = (np.array(x) for x in zip(*self.evidence.values(), strict=True))
-        was, is_now = (log_likelihood(self.counts, e, o, explained, q)[0] for q in (self.parameters, p))
+        was, is_now = (log_likelihood(self.counts, e, o, explained, q)[0].sum(axis=-1) for q in (self.parameters, p))
         scores = score + is_now - was
         w = costs.probabilities(dict(zip(sets, scores.tolist(), strict=True)))
         settled = [(s - costs.of(k), k) for k, s in zip(sets, scores, strict=True) if k not in self.screened]

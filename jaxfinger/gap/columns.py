@@ -28,10 +28,17 @@ class Column:
 
 @dataclass(frozen=True)
 class Counts:
-    """Dimensions of every column: K_c on the features, m_c = n_c − K_c outside of them."""
+    """Dimensions of every column: K_c on the features, m_c = n_c − K_c outside of them; and which channel it is of."""
 
     K: Int[np.ndarray, " C"]
     outside: Int[np.ndarray, " C"]
+    channel: Int[np.ndarray, " C"]  # number of the experiment and quantity, from 0
+
+    def largest_of_channel(self, values: Float[np.ndarray, " C"]) -> Float[np.ndarray, " C"]:
+        """For every column, the largest value in any column of its channel; values are zero or more."""
+        most = np.zeros(len(self.channel))
+        np.maximum.at(most, self.channel, values)
+        return most[self.channel]
 
 
 @dataclass(frozen=True)
@@ -51,9 +58,11 @@ class Columns:
 
     @cached_property
     def counts(self) -> Counts:
-        """Dimensions of every column."""
+        """Dimensions and channel of every column."""
         K = np.array([c.basis.shape[1] for c in self.items], int)
-        return Counts(K, np.array([len(c.rows) for c in self.items], int) - K)
+        channels = list(dict.fromkeys((c.experiment, c.channel) for c in self.items))
+        channel = np.array([channels.index((c.experiment, c.channel)) for c in self.items], int)
+        return Counts(K, np.array([len(c.rows) for c in self.items], int) - K, channel)
 
     def sums(self, values: Float[np.ndarray, "features *n"]) -> Float[np.ndarray, "C *n"]:
         """Sum a value of every feature over each column's features."""

@@ -8,7 +8,7 @@ import numpy as np
 from jaxfinger.gap.columns import Counts
 from jaxfinger.gap.costs import CauseKey, Costs
 from jaxfinger.gap.exact import SearchState
-from jaxfinger.gap.formula import Evidence, left_share, unlisted
+from jaxfinger.gap.formula import Evidence, imitates, unlisted
 from jaxfinger.gap.sets import Search
 
 MIN_NAMED_PROBABILITY = 0.5  # More likely at work than not.
@@ -58,13 +58,13 @@ def genuine_probabilities(
 ) -> dict[CauseKey, float]:
     """Probability of each cause of the best set that it does not merely imitate something unlisted.
 
-    It is 1 − P_u ℓ_i. P_u, `other`, is the probability that something unlisted is at work. If it is, it causes the
-    share ℓ_i of the energy where cause i acts that the set leaves (`formula.left_share`); that share is also taken for
-    the probability that it causes the rest there. A cause is left out if the search has not weighed the set without it.
+    It is 1 − P_u I_i. P_u, `other`, is the probability that something unlisted is at work. If it is, cause i imitates
+    it with the probability I_i (`formula.imitates`), which grows with what the set leaves where the cause acts. A cause
+    is left out if the search has not weighed the set without it.
     """
     p, left = costs.parameters, evidence[best]
     without = {key: evidence[best - {key}] for key in best if best - {key} in evidence}
-    return {key: 1.0 - other * left_share(counts, x, left, costs.explainable[key], p) for key, x in without.items()}
+    return {key: 1.0 - other * imitates(counts, x, left, costs.explainable[key], p) for key, x in without.items()}
 
 
 def _ambiguous(

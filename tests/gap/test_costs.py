@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from benchmarks.formula import CLIP, Record
 from jaxfinger.gap.columns import Counts
 from jaxfinger.gap.costs import Costs
 from jaxfinger.gap.formula import Evidence, Parameters, unlisted
@@ -38,20 +39,47 @@ def test_probabilities_are_shares_of_evidence_beyond_what_each_set_costs():
     assert COSTS.probabilities({k: s + 321.0 for k, s in sets.items()}) == pytest.approx(w)
 
 
+def genuine(left: dict[frozenset, tuple[float, float]], channel: tuple[int, int]) -> dict:
+    """Probabilities that causes imitate nothing, where sets leave these energies beyond noise in the two columns."""
+    counts, nothing = Counts(np.array([10, 10]), np.array([100, 100]), np.array(channel)), np.zeros(2)
+    noise = Parameters().variance_floor * counts.K
+    evidence = {keys: Evidence(noise + np.array(e), np.full(2, 100.0), nothing, 0.0) for keys, e in left.items()}
+    best = max(evidence, key=len)
+    return genuine_probabilities(COSTS, counts, evidence, best, unlisted(counts, evidence[best], Parameters()))
+
+
+BOTH, WITHOUT_STRETCH, WITHOUT_STRIBECK = (frozenset(s) for s in ({STRETCH, STRIBECK}, {STRIBECK}, {STRETCH}))
+
+
 def test_what_leaves_more_than_it_explains_where_it_acts_only_imitates_something_unlisted():
-    """Noise and what is left in other columns count for nothing."""
-    counts, nothing = Counts(np.array([10, 10]), np.array([100, 100])), np.zeros(2)
+    """Noise and what is left in other channels count for nothing."""
+    of = genuine({BOTH: (0.0, 3000.0), WITHOUT_STRETCH: (5000.0, 3000.0), WITHOUT_STRIBECK: (0.0, 4000.0)}, (0, 1))
+    assert of[STRETCH] == 1.0
+    assert of[STRIBECK] == pytest.approx(0.25)
+    of = genuine({BOTH: (0.0, 0.0), WITHOUT_STRETCH: (5000.0, 0.0), WITHOUT_STRIBECK: (0.0, 4000.0)}, (0, 1))
+    assert of[STRIBECK] == pytest.approx(1.0)
 
-    def left(excursion: float, torque: float) -> Evidence:
-        return Evidence(10.0 + np.array([excursion, torque]), np.full(2, 100.0), nothing, 0.0)
 
-    def of(evidence: dict) -> dict:
-        best = max(evidence, key=len)
-        return genuine_probabilities(COSTS, counts, evidence, best, unlisted(counts, evidence[best], Parameters()))
+def test_what_leaves_little_where_it_acts_and_much_beside_it_imitates_something_unlisted():
+    """A base that yields lengthens all tendons: a stretch explains most of one in most trials, and no other."""
+    beside = {BOTH: (200.0, 3000.0), WITHOUT_STRETCH: (1000.0, 3000.0), WITHOUT_STRIBECK: (200.0, 9000.0)}
+    odds = 0.25 * (1.0 + Parameters().imitator_odds * 3000.0 / 3800.0)
+    assert genuine(beside, (0, 0))[STRETCH] == pytest.approx(1.0 / (1.0 + odds))
+    assert genuine(beside, (0, 0))[STRETCH] < 0.5 < genuine(beside, (0, 1))[STRETCH] == pytest.approx(0.8)
 
-    both, less = frozenset({STRETCH, STRIBECK}), {STRETCH: frozenset({STRIBECK}), STRIBECK: frozenset({STRETCH})}
-    imitates = {both: left(0.0, 3000.0), less[STRETCH]: left(5000.0, 3000.0), less[STRIBECK]: left(0.0, 4000.0)}
-    assert of(imitates)[STRETCH] == 1.0
-    assert of(imitates)[STRIBECK] == pytest.approx(0.25, abs=0.01)
-    noise = {both: left(0.0, 5.0), less[STRETCH]: left(5000.0, 5.0), less[STRIBECK]: left(0.0, 4000.0)}
-    assert of(noise)[STRIBECK] == pytest.approx(1.0)
+
+def test_what_leaves_nothing_where_it_acts_is_at_work_whatever_is_left_beside_it():
+    beside = {BOTH: (0.0, 3000.0), WITHOUT_STRETCH: (1000.0, 3000.0), WITHOUT_STRIBECK: (0.0, 9000.0)}
+    assert genuine(beside, (0, 0))[STRETCH] == 1.0
+
+
+def test_the_log_score_of_a_record_is_that_of_its_probabilities():
+    """A cause that is worth its cost is as likely as not; the others and «unlisted» are unlikely, and rightly so."""
+    counts, none, p = Counts(np.array([10, 10]), np.array([100, 100]), np.array([0, 1])), np.zeros(2), Parameters()
+    noise, outside = p.variance_floor * counts.K, np.full(2, 100.0)
+    evidence = {frozenset(): Evidence(noise + 5000.0 * EXCURSION, outside, none, 0.0)}
+    record = Record("case", counts, evidence, frozenset(), EXPLAINABLE, frozenset({STRETCH}), p)
+    cost = record.costs(p).of([STRETCH])
+    evidence[frozenset({STRETCH})] = Evidence(noise, outside, none, cost + 1e-6)
+    unlikely = [CLIP] * (len(EXPLAINABLE) - 1) + [1.0 / (1.0 + np.exp(p.unlisted_slope * p.unlisted_threshold))]
+    assert record.log_score(p) == pytest.approx(np.log(0.5) + np.log1p(-np.array(unlikely)).sum(), abs=1e-5)
