@@ -7,6 +7,8 @@ from typing import TypeVar
 
 import equinox as eqx
 
+from jaxfinger.programs import Program
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -26,6 +28,11 @@ QUICK = {
 
 # Equinox passes compiler options on to jax.jit, but its annotated overloads lack them.
 quick_jit = eqx.filter_jit(compiler_options=QUICK)  # type: ignore[call-overload]
+
+
+def kept_jit(f: Callable) -> Program:
+    """As `quick_jit`, for functions without linear algebra, whose programs later processes load."""
+    return Program(f, QUICK)
 
 
 def side_by_side(f: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:

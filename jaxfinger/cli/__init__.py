@@ -117,3 +117,5 @@ def _environment() -> None:
         if os.access(folder, os.W_OK):
             os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    if cached := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        os.environ.setdefault("JAXFINGER_PROGRAMS", str(Path(cached, "programs")))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfinger.compilation import quick_jit
+from jaxfinger.compilation import kept_jit
 from jaxfinger.data import FingerDescription, Session, Trial, joints_of, low_pass
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import SAMPLES, Stack, padded, padded_size, predict_compiled, prepare
@@ -154,7 +154,7 @@ def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> 
     # Pad to a common shape with the last trial.
     wide = np.minimum(np.arange(padded_size(len(models), 2)), len(models) - 1)
     each = jax.tree.map(lambda a: a[wide], (model, grid, even, x.q[..., 0].T, x.qd[..., 0].T, starts))
-    q = np.asarray(_simulate(*jax.device_put(each), substeps=substeps))[: len(models)]
+    q = np.asarray(_simulate(*jax.device_put(each), substeps))[: len(models)]
     # A simulation that diverges may overflow; it is clipped where it leaves the range by the range's whole width.
     low, high = session.finger.limits.T[:, :, None]
     span = np.where(np.isfinite(high - low), high - low, 2 * np.pi)
@@ -169,7 +169,7 @@ def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> 
     return out
 
 
-@quick_jit
+@kept_jit
 def _true_motions(models: Model, x: Motion) -> Motion:
     """Motion of each trial as its model takes it to be; every leaf of `models` has the trials first."""
     return jax.vmap(lambda model, x: model.true_motion(x), in_axes=(0, -2), out_axes=-2)(models, x)
@@ -181,7 +181,7 @@ def _times(stack: Stack) -> list[np.ndarray]:
     return [row - row[0] for row in time]
 
 
-@quick_jit
+@kept_jit
 def _simulate(
     model: Model,  # every leaf with the trials first
     time: Float[Array, "B T"],
@@ -189,7 +189,6 @@ def _simulate(
     q0: Float[Array, "B m"],
     qd0: Float[Array, "B m"],
     start: Float[Array, " B"],
-    *,
     substeps: int,
 ) -> Float[Array, "B m T"]:
     def one(model, t, f, q, qd, s):
