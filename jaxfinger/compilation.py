@@ -5,8 +5,6 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-import equinox as eqx
-
 from jaxfinger.programs import Program
 
 Item = TypeVar("Item")
@@ -26,12 +24,9 @@ QUICK = {
     if name not in os.environ.get("XLA_FLAGS", "")
 }
 
-# Equinox passes compiler options on to jax.jit, but its annotated overloads lack them.
-quick_jit = eqx.filter_jit(compiler_options=QUICK)  # type: ignore[call-overload]
 
-
-def kept_jit(f: Callable) -> Program:
-    """As `quick_jit`, for functions without linear algebra, whose programs later processes load."""
+def quick_jit(f: Callable) -> Program:
+    """Compile a function quickly, and keep its programs for later processes."""
     return Program(f, QUICK)
 
 

@@ -11,6 +11,7 @@ Whoever may write there can run code in this process, as is true of JAX's cache.
 import hashlib
 import os
 import pickle
+import re
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -25,6 +26,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
+from jaxlib.lapack import prepare_lapack_call
 from jaxlib.xla_client import get_topology_for_devices
 
 LIBRARIES = ("jax", "jaxlib", "equinox", "numpy")
@@ -57,7 +59,7 @@ class Program:
     def _made(self, key: tuple, leaves: list, arrays: list) -> Callable[[list], Any]:
         structure, constants = key
         nodes = list(_nodes(structure))
-        said = repr([f"{self._f.__module__}.{self._f.__qualname__}", nodes, constants])
+        said = repr([f"{self._f.__module__}.{self._f.__qualname__}", self._options, nodes, constants])
         if " at 0x" in said or not all(_is_own(node[0]) for node in nodes):
             return lambda arrays: self._jitted(*_filled(structure, leaves, arrays))
         name = _digest(said)
@@ -78,7 +80,8 @@ class Program:
         flat.__name__ = flat.__qualname__ = unique = f"{self._f.__name__}_{uuid4().hex}"
         lowered = jax.jit(flat, compiler_options=self._options).lower(*arrays)
         text = lowered.as_text()
-        if "custom_call" in text:  # of LAPACK, which JAX readies where it traces: loaded elsewhere it would crash
+        if not all(target.startswith("lapack_") for target in re.findall(r"custom_call @(\w+)", text)):
+            # JAX may ready what is called only where it traces; where it is not ready, the loaded program would crash.
             return lambda arrays: self._jitted(*_filled(structure, leaves, arrays))
         code = _digest(text.replace(unique, ""))
         _write(name, pickle.dumps((code, jax.tree.unflatten(results, [0] * results.num_leaves))))
@@ -92,6 +95,7 @@ class Program:
 
 def _loaded(name: str, arrays: int) -> Callable[[list], Any] | None:
     """The program of that name, which takes so many arrays; None where there is none, or a damaged one."""
+    prepare_lapack_call("gesdd_ffi", np.dtype(float))  # JAX does so where it traces a call of LAPACK
     try:
         code, results = pickle.loads((_folder() / name).read_bytes())
         results = jax.tree.structure(results)

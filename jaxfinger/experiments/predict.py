@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfinger.compilation import kept_jit
+from jaxfinger.compilation import quick_jit
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.model import (
     Model,
@@ -34,7 +34,7 @@ def predict(model: Model, measured: Motion, channels: tuple[str, ...]) -> dict[s
 
 
 # Compiled functions cannot call this one: JAX takes compiler options of the outermost function only.
-predict_compiled = kept_jit(predict)
+predict_compiled = quick_jit(predict)
 
 
 def change(

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfinger.compilation import kept_jit
+from jaxfinger.compilation import quick_jit
 from jaxfinger.experiments import SAMPLES, TRIALS, Stack, padded, padded_size, split
 from jaxfinger.model import Model, Motion, contact_map
 
@@ -54,7 +54,7 @@ def _merged_trials_of(channel: str, held: bool, stacks: dict[str, Stack], nomina
     return MergedTrials(channel, held, trials, x, contact)
 
 
-_contact = kept_jit(contact_map)
+_contact = quick_jit(contact_map)
 
 
 def _merged(parts: Sequence) -> list:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.compilation import kept_jit
+from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Predictions, Session
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.effects import Scales
@@ -131,7 +131,7 @@ class Problem:
         return [t for e in self.rows for t in self.stacks[e].trials]
 
 
-_terms_without_effects = kept_jit(terms_without_effects)
+_terms_without_effects = quick_jit(terms_without_effects)
 
 
 def build(

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfinger.compilation import kept_jit
+from jaxfinger.compilation import quick_jit
 from jaxfinger.effects import CATALOGUE, CatalogueEffect, Changed, Scales, Site, changes, nominal_terms
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import TRIALS, affected_channels, change, refuse_broken
@@ -93,7 +93,7 @@ def variants(effects: Mapping[str, type[CatalogueEffect]], finger, scales: Scale
     ]
 
 
-@kept_jit
+@quick_jit
 def _change(
     channel: str,
     effects: CatalogueEffect,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxfinger.compilation import kept_jit
+from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session
 from jaxfinger.experiments import Stack, padded_size
 from jaxfinger.identify.starts import Measured, angles, measured, starts
@@ -97,4 +97,4 @@ def _changed(
     return exact, noisy - exact
 
 
-_simulate = kept_jit(simulated_from)
+_simulate = quick_jit(simulated_from)

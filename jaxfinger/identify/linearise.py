@@ -23,7 +23,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 from scipy.linalg import get_lapack_funcs
 
-from jaxfinger.compilation import kept_jit
+from jaxfinger.compilation import quick_jit
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.experiments import Batch, Block, blocks, predict
 from jaxfinger.identify.noise import whiten
@@ -261,10 +261,10 @@ def _put(block: Block, out: Float[np.ndarray, "*k B T"], part: Float[Array, "*k 
     room[...] = np.asarray(part)[..., : room.shape[-2], : room.shape[-1]]
 
 
-_residuals_jit = kept_jit(_residuals)
+_residuals_jit = quick_jit(_residuals)
 
 
-@kept_jit
+@quick_jit
 def _simulated_tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> tuple[dict, dict]:
     """Residuals of simulations and their derivatives, one start at a time, in reverse mode.
 
@@ -281,7 +281,7 @@ def _simulated_tangent(model: Model, free: Free, batch: Batch, channels: tuple[s
     return residuals, {c: jnp.moveaxis(J, 1, 0) for c, J in slopes.items()}
 
 
-@kept_jit
+@quick_jit
 def _tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...], wanted: Bool[Array, " parts"]):
     """Residuals and their derivatives, which are zero and not computed for the parts of the model not `wanted`."""
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfinger.compilation import kept_jit
+from jaxfinger.compilation import quick_jit
 from jaxfinger.data import FingerDescription, Session, Trial, joints_of, low_pass
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import SAMPLES, Stack, padded, padded_size, predict_compiled, prepare
@@ -169,7 +169,7 @@ def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> 
     return out
 
 
-@kept_jit
+@quick_jit
 def _true_motions(models: Model, x: Motion) -> Motion:
     """Motion of each trial as its model takes it to be; every leaf of `models` has the trials first."""
     return jax.vmap(lambda model, x: model.true_motion(x), in_axes=(0, -2), out_axes=-2)(models, x)
@@ -181,7 +181,7 @@ def _times(stack: Stack) -> list[np.ndarray]:
     return [row - row[0] for row in time]
 
 
-@kept_jit
+@quick_jit
 def _simulate(
     model: Model,  # every leaf with the trials first
     time: Float[Array, "B T"],
