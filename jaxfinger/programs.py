@@ -15,10 +15,10 @@ import re
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from functools import cache, update_wrapper
+from functools import cache, update_wrapper, wraps
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from uuid import uuid4
 
 import equinox as eqx
@@ -28,6 +28,8 @@ from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 from jaxlib.lapack import prepare_lapack_call
 from jaxlib.xla_client import get_topology_for_devices
+
+Result = TypeVar("Result")
 
 LIBRARIES = ("jax", "jaxlib", "equinox", "numpy")
 OWN = ("builtins", "jaxfinger", *LIBRARIES)  # packages whose code a key holds
@@ -51,7 +53,7 @@ class Program:
         if not _are_kept() or any(isinstance(leaf, Tracer) for leaf in leaves):
             return self._jitted(*args)
         arrays = [leaf for leaf in leaves if _is_array(leaf)]
-        key = structure, tuple(_constant(leaf) for leaf in leaves)
+        key = structure, tuple(map(_constant, leaves))
         if key not in self._ready:
             self._ready[key] = self._made(key, leaves, arrays)
         return self._ready[key](arrays)
@@ -93,6 +95,25 @@ class Program:
         return lambda arrays: jax.tree.unflatten(results, compiled(*arrays))
 
 
+def kept(f: Callable[..., Result]) -> Callable[..., Result]:
+    """Keep the results of a function of classes and constants, which must be costly, in memory and on disk."""
+
+    @cache
+    @wraps(f)
+    def recalled(*args):
+        said = repr([f"{f.__module__}.{f.__qualname__}", args])
+        if not _are_kept() or " at 0x" in said or not all(_is_own(a) for a in args if isinstance(a, type)):
+            return f(*args)
+        name = _digest(said)
+        with suppress(Exception):  # There is no file, or a damaged one, which raises exceptions of many kinds.
+            return pickle.loads((_folder() / name).read_bytes())
+        result = f(*args)
+        _write(name, pickle.dumps(result))
+        return result
+
+    return recalled
+
+
 def _loaded(name: str, arrays: int) -> Callable[[list], Any] | None:
     """The program of that name, which takes so many arrays; None where there is none, or a damaged one."""
     prepare_lapack_call("gesdd_ffi", np.dtype(float))  # JAX does so where it traces a call of LAPACK
@@ -129,7 +150,7 @@ def _is_array(leaf: Any) -> bool:
 
 def _constant(leaf: Any) -> Any:
     """What a program depends on of a leaf: all of it, but of an array its shape and type alone."""
-    return (leaf.shape, str(leaf.dtype), getattr(leaf, "weak_type", False)) if _is_array(leaf) else leaf
+    return (leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)) if _is_array(leaf) else leaf
 
 
 def _filled(structure, leaves: list, arrays) -> Any:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.model import Model
-from jaxfinger.programs import Program
+from jaxfinger.programs import Program, kept
 from jaxfinger.synthetic import paper_finger, polynomial_finger, true_model
 
 
@@ -92,6 +92,24 @@ def test_other_libraries_or_options_lead_to_other_programs(folder, scaled, trace
     assert here() != programs._surroundings()
     monkeypatch.setenv("XLA_FLAGS", "--xla_llvm_disable_expensive_passes=true")
     assert programs._surroundings.__wrapped__() != programs._surroundings()
+
+
+def test_results_of_constants_are_kept(folder):
+    asked = []
+
+    def sites(kind, names):
+        asked.append(kind)
+        return frozenset(names)
+
+    for kind, names in (
+        (Model, ("a", "b")),
+        (Model, ("a", "b")),
+        (Model, ("c",)),
+        (Users, ("a", "b")),
+        (Users, ("a", "b")),
+    ):
+        assert kept(sites)(kind, names) == set(names)
+    assert asked == [Model, Model, Users, Users]
 
 
 class Users(NamedTuple):
