@@ -5,6 +5,7 @@ from jaxfinger.data.filtering import filter_std as filter_std
 from jaxfinger.data.filtering import filtered_noise_std as filtered_noise_std
 from jaxfinger.data.filtering import low_pass as low_pass
 from jaxfinger.data.filtering import smooth as smooth
+from jaxfinger.data.filtering import smooth_rate as smooth_rate
 from jaxfinger.data.findings import Finding as Finding
 from jaxfinger.data.hdf5 import data_hash as data_hash
 from jaxfinger.data.hdf5 import read_session as read_session

@@ -16,7 +16,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from jaxfinger.data.arms import Excursions, slope, thinned
-from jaxfinger.data.filtering import low_pass, smooth
+from jaxfinger.data.filtering import low_pass, smooth_rate
 from jaxfinger.data.findings import Report
 from jaxfinger.data.motion import CUTOFF_HZ, STILL_SHARE, directions, fitting_cutoff
 from jaxfinger.data.session import FingerDescription, Session, Trial
@@ -208,5 +208,5 @@ def _direction(trial: Trial, joint: int, cutoff: float) -> np.ndarray:
     """Direction (N,) of a joint's motion: the file's channel, or derived from its filtered speed."""
     if trial.joint_direction is not None:
         return trial.joint_direction[:, joint].astype(float)
-    rate = smooth(trial.time, trial.q[:, [joint]], cutoff)[1]
+    rate = smooth_rate(trial.time, trial.q[:, [joint]], cutoff)
     return directions(rate, STILL_SHARE * np.percentile(np.abs(rate), 99, axis=0))[:, 0]
