@@ -15,9 +15,9 @@ from contextlib import suppress
 from pathlib import Path
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-# Options of glibc's malloc.h: the number of heaps, the size from which a block is mapped apart (at most 32 MiB), and the
-# free memory from which a heap is given back. By default each array of a channel is mapped anew, and the kernel clears
-# its pages, which takes a tenth of the time of `identify`.
+# Options of glibc's malloc.h: the number of heaps, the size from which a block is mapped apart (32 MiB at most), and
+# the free memory from which a heap is given back. By default each array of a channel is mapped anew, and the kernel
+# clears its pages, which takes a tenth of the time of `identify`.
 M_ARENA_MAX, M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -8, -3, -1
 HEAPS, MAPPED, KEPT_FREE = 1, 2**25, 2**29
 # Collections of young objects before one of all objects. With Python's 10 a quick diagnosis spends a second in
