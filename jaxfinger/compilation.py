@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-import equinox as eqx
+from jaxfinger.programs import Program
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -24,8 +24,10 @@ QUICK = {
     if name not in os.environ.get("XLA_FLAGS", "")
 }
 
-# Equinox passes compiler options on to jax.jit, but its annotated overloads lack them.
-quick_jit = eqx.filter_jit(compiler_options=QUICK)  # type: ignore[call-overload]
+
+def quick_jit(f: Callable) -> Program:
+    """Compile a function quickly, and keep its programs for later processes."""
+    return Program(f, QUICK)
 
 
 def side_by_side(f: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:

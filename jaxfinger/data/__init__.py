@@ -19,6 +19,7 @@ from jaxfinger.data.signals.filtering import filter_std as filter_std
 from jaxfinger.data.signals.filtering import filtered_noise_std as filtered_noise_std
 from jaxfinger.data.signals.filtering import low_pass as low_pass
 from jaxfinger.data.signals.filtering import smooth as smooth
+from jaxfinger.data.signals.filtering import smooth_rate as smooth_rate
 from jaxfinger.data.signals.motion import directions as directions
 from jaxfinger.data.signals.motion import directions_from_turning_points as directions_from_turning_points
 from jaxfinger.data.signals.motion import find_holds as find_holds

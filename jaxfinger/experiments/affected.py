@@ -17,6 +17,7 @@ from jaxfinger.errors import UserError, did_you_mean
 from jaxfinger.experiments.predict import change
 from jaxfinger.experiments.table import EXPERIMENTS
 from jaxfinger.model import Effect, Finger, Model, Motion, Terms, contact_map, terms_without_effects
+from jaxfinger.programs import kept
 
 
 def affected_channels(kind: type[CatalogueEffect], finger: Finger) -> dict[str, tuple[str, ...]]:
@@ -79,7 +80,7 @@ class _Nominal(NamedTuple):
         return cls(finger, model, x, *jax.device_put((terms, contact)))
 
 
-@cache
+@kept
 def _reached(kind, *description) -> frozenset[tuple[str, bool]]:
     """Predictions (`Experiment.predicted_as`) that an effect can change."""
     finger = _Nominal.of(*description, held=False).finger

@@ -14,7 +14,7 @@ from jaxfinger.data import (
     filter_std,
     filtered_noise_std,
     low_pass,
-    smooth,
+    smooth_rate,
     without_spikes,
 )
 from jaxfinger.data.signals.motion import quick_cutoff, rest_speed, speed_noise
@@ -54,7 +54,7 @@ def reduce(r: PreparedTrial) -> Row:
     """Reduce a trial: torque is valid where joints and tendons slide, excursion everywhere."""
     j = joints(r, sharp=not r.reduced)
     # Reversals are taken from the slow filter: noise of q̇ moves the time of a reversal.
-    slow = j.qd if r.reduced else smooth(r.trial.time, r.trial.q, r.experiment.cutoff_at(r.step))[1]
+    slow = j.qd if r.reduced else smooth_rate(r.trial.time, r.trial.q, r.experiment.cutoff_at(r.step))
     joint = joint_directions(r, j, slow)
     rates = None if r.experiment.slack else tendon_rates(r)
     tendon = tendon_directions(r, rates)
@@ -103,7 +103,7 @@ def tendon_rates(r: PreparedTrial) -> tuple[Float[np.ndarray, "N n"], Float[np.n
         return None
     excursion = without_spikes(np.nan_to_num(r.trial.tendon_excursion))
     cutoff = min(r.experiment.cutoff / 2.0, highest_cutoff(r.step))
-    slow, quick = (smooth(r.trial.time, excursion, c)[1] for c in (cutoff, quick_cutoff(cutoff, r.step)))
+    slow, quick = (smooth_rate(r.trial.time, excursion, c) for c in (cutoff, quick_cutoff(cutoff, r.step)))
     return slow, quick
 
 
@@ -175,7 +175,7 @@ def rests(j: Joints, slow: Bool[np.ndarray, "N m"], step: float) -> Bool[np.ndar
 def _friction_known(r: PreparedTrial, slow, quick) -> Bool[np.ndarray, "N n"]:
     """Whether a tendon is slack, or slides for certain: faster than it stretches, and in both filters."""
     tension, cutoff = r.tension(), min(r.experiment.cutoff / 2.0, highest_cutoff(r.step))
-    stretches = r.sizes.compliance * np.abs(smooth(r.trial.time, tension, cutoff)[1])
+    stretches = r.sizes.compliance * np.abs(smooth_rate(r.trial.time, tension, cutoff))
     measured = np.isfinite(np.asarray(r.trial.tendon_excursion)).all(axis=0)
     least = MIN_TENDON_SPEED_TO_NOISE * speed_noise(slow, quick)
     moves = (np.abs(slow) > least + stretches) & (np.sign(slow) * quick > 0.5 * least)

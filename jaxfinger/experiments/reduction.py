@@ -18,6 +18,7 @@ from jaxfinger.data import (
     longest_spike,
     outlier_mask,
     smooth,
+    smooth_rate,
     without_spikes,
 )
 from jaxfinger.data.predictions import predicted_at
@@ -48,7 +49,7 @@ class PreparedTrial:
     @cached_property
     def quick_rates(self) -> Float[np.ndarray, "N m"]:
         """Joint speeds, rad/s, in a filter quick enough to resolve a stop between two slips."""
-        return smooth(self.trial.time, self.trial.q, quick_cutoff(self.experiment.cutoff_at(self.step), self.step))[1]
+        return smooth_rate(self.trial.time, self.trial.q, quick_cutoff(self.experiment.cutoff_at(self.step), self.step))
 
     @property
     def motorised(self) -> Bool[np.ndarray, " m"]:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxfinger.data import directions, find_holds, smooth
+from jaxfinger.data import directions, find_holds, smooth_rate
 from jaxfinger.data.signals.motion import rest_speed
 from jaxfinger.experiments.driven import sliding
 from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, runs_of_holds
@@ -24,7 +24,7 @@ def reduce(r: PreparedTrial) -> Row:
     """Reduce a trial: valid are holds of known approach, and motion in which the joint slides."""
     j = joints(r, sharp=True)
     hold = find_holds(r.trial, r.experiment.pace)
-    slow = smooth(r.trial.time, r.trial.q, r.experiment.cutoff_at(r.step))[1]
+    slow = smooth_rate(r.trial.time, r.trial.q, r.experiment.cutoff_at(r.step))
     if r.trial.joint_direction is not None:
         joint = r.trial.joint_direction.astype(float)
     else:

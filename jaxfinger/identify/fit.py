@@ -126,25 +126,19 @@ class Fit:
     def function(self, f) -> tuple[np.ndarray, np.ndarray]:
         """Value and standard deviation of a function `f` of the model that returns an array, by the delta method.
 
-        The standard deviation is infinite where the value depends on an undetermined parameter.
+        The standard deviation is infinite where the value depends on an undetermined parameter. A program is compiled
+        for each `f`; one of an `equinox.Module` that holds its arrays serves later processes, too.
         """
         import jax
 
-        from jaxfinger.identify.parameters import Free
+        from jaxfinger.identify.parameters import Free, value_and_jacobian
 
         seen = np.isfinite(np.diag(self.covariance))
         covariance = np.where(np.outer(seen, seen), self.covariance, 0.0)
         positions = np.flatnonzero((np.diag(covariance) > 0) | ~seen)
         uncertain = Free.at(self.model, positions)
-
-        @jax.jit
-        def value_and_jacobian(theta):
-            def of(t):
-                return f(uncertain.set(self.model, t))
-
-            return of(theta), jax.jacfwd(of)(theta)
-
-        value, J = map(np.asarray, value_and_jacobian(jax.device_put(uncertain.get(self.model))))
+        theta = jax.device_put(uncertain.get(self.model))
+        value, J = map(np.asarray, value_and_jacobian(f, self.model, uncertain, theta))
         variance = np.einsum("...i,ij,...j->...", J, covariance[np.ix_(positions, positions)], J)
         unseen = np.any(J[..., ~seen[positions]] != 0.0, axis=-1)
         return value, np.where(unseen, np.inf, np.sqrt(np.maximum(variance, 0.0)))

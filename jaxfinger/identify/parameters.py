@@ -5,6 +5,7 @@ NumPy moves values between both, since JAX would compile a program for every str
 traces.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -16,6 +17,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+from jaxfinger.compilation import quick_jit
 from jaxfinger.data.schema import units_where
 from jaxfinger.effects import CatalogueEffect, Site
 from jaxfinger.model import Finger, Model
@@ -101,6 +103,18 @@ class Free(eqx.Module):
         """Copy of the model with its free parameters set to `theta`."""
         ends = np.cumsum([0] + [e.size for e in self.entries])
         return self.put(model, [theta[a:b] for a, b in pairwise(ends)])
+
+
+@quick_jit
+def value_and_jacobian(
+    f: Callable[[Model], Float[Array, "*k"]], model: Model, free: Free, theta: Float[Array, " p"]
+) -> tuple[Float[Array, "*k"], Float[Array, "*k p"]]:
+    """Value of a function of the model, and its derivatives by the free parameters, at `theta`."""
+
+    def of(theta):
+        return f(free.set(model, theta))
+
+    return of(theta), jax.jacfwd(of)(theta)
 
 
 def _leaves(model: Model):

@@ -154,7 +154,7 @@ def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> 
     # Pad to a common shape with the last trial.
     wide = np.minimum(np.arange(padded_size(len(models), 2)), len(models) - 1)
     each = jax.tree.map(lambda a: a[wide], (model, grid, even, x.q[..., 0].T, x.qd[..., 0].T, starts))
-    q = np.asarray(_simulate(*jax.device_put(each), substeps=substeps))[: len(models)]
+    q = np.asarray(_simulate(*jax.device_put(each), substeps))[: len(models)]
     # A simulation that diverges may overflow; it is clipped where it leaves the range by the range's whole width.
     low, high = session.finger.limits.T[:, :, None]
     span = np.where(np.isfinite(high - low), high - low, 2 * np.pi)
@@ -189,7 +189,6 @@ def _simulate(
     q0: Float[Array, "B m"],
     qd0: Float[Array, "B m"],
     start: Float[Array, " B"],
-    *,
     substeps: int,
 ) -> Float[Array, "B m T"]:
     def one(model, t, f, q, qd, s):

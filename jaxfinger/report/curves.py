@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session
 from jaxfinger.data.signals.sizes import highest_tension
 from jaxfinger.experiments import prepare
@@ -91,10 +92,10 @@ def model_curves(fit: Fit, session: Session | None = None) -> Curves:
     for i in range(m):
         q[i, i] = np.linspace(limits[i, 0], limits[i, 1], S)
     f = np.linspace(0.0, tension, S)
-    values, std = fit.function(_evaluate(*jax.device_put((q, np.tile(f, (finger.n, 1))))))
+    values, std = fit.function(_Values(*jax.device_put((q, np.tile(f, (finger.n, 1))))))
     cuts = np.cumsum((finger.n * m * S, m * S, m * S, m))
     arms, elastic, friction, damping, loss = zip(np.split(values, cuts), np.split(std, cuts), strict=True)
-    gravity = np.asarray(rigid_body.gravity_torque(model.finger, jax.device_put(q)))
+    gravity = np.asarray(_gravity_torque(model.finger, jax.device_put(q)))
 
     def shaped(pair, shape):
         return tuple(a.reshape(shape) for a in pair)
@@ -143,22 +144,23 @@ def _estimated(fit: Fit) -> set:
     return found
 
 
-def _evaluate(q: Float[Array, "m m S"], tension: Float[Array, "n S"]):
+class _Values(eqx.Module):
     """Function of a model that returns all curves as one flat vector: one derivative gives all standard deviations."""
-    m = q.shape[0]
-    own = np.arange(m)
 
-    @eqx.filter_jit
-    def evaluate(model: Model):
-        h = model.joint_torque
-        C = model.moment_arm.coupling(q)  # (n, m, m, S); a joint's own angle varies in its own row
+    q: Float[Array, "m m S"]
+    tension: Float[Array, "n S"]
+
+    def __call__(self, model: Model) -> Float[Array, " k"]:
+        own, h = np.arange(len(self.q)), model.joint_torque
+        C = model.moment_arm.coupling(self.q)  # (n, m, m, S); a joint's own angle varies in its own row
         parts = (
             C[:, own, own],
-            h.elastic_torque(q)[own, own],
-            h.friction_magnitude(q)[own, own],
+            h.elastic_torque(self.q)[own, own],
+            h.friction_magnitude(self.q)[own, own],
             h.damping,
-            model.tendon_friction.loss(tension),
+            model.tendon_friction.loss(self.tension),
         )
         return jnp.concatenate([jnp.ravel(p) for p in parts])
 
-    return evaluate
+
+_gravity_torque = quick_jit(rigid_body.gravity_torque)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxfinger.data.findings import Report
 from jaxfinger.data.session import FingerDescription, Session, Trial
 from jaxfinger.data.signals.arms import Excursions, slope, thinned
-from jaxfinger.data.signals.filtering import low_pass, smooth
+from jaxfinger.data.signals.filtering import low_pass, smooth_rate
 from jaxfinger.data.signals.motion import CUTOFF_HZ, STILL_SHARE, directions, fitting_cutoff
 from jaxfinger.errors import listed
 
@@ -209,5 +209,5 @@ def _direction(trial: Trial, joint: int, cutoff: float) -> np.ndarray:
     """Direction (N,) of a joint's motion: the file's channel, or derived from its filtered speed."""
     if trial.joint_direction is not None:
         return trial.joint_direction[:, joint].astype(float)
-    rate = smooth(trial.time, trial.q[:, [joint]], cutoff)[1]
+    rate = smooth_rate(trial.time, trial.q[:, [joint]], cutoff)
     return directions(rate, STILL_SHARE * np.percentile(np.abs(rate), 99, axis=0))[:, 0]

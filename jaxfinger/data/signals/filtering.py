@@ -58,22 +58,29 @@ def smooth(
     Raises:
         UserError: the cut-off is not between zero and half the sampling rate.
     """
-    value, rate, acceleration = _smoothed(time, x, cutoff_hz, 2)
+    value, rate, acceleration = _smoothed(time, x, cutoff_hz, (0, 1, 2))
     return value, rate, acceleration
+
+
+def smooth_rate(
+    time: Float[np.ndarray, " N"], x: Float[np.ndarray, "N *k"], cutoff_hz: float
+) -> Float[np.ndarray, "N *k"]:
+    """Low-passed ẋ alone, as `smooth` gives it, in less time."""
+    return _smoothed(time, x, cutoff_hz, (1,))[0]
 
 
 def low_pass(
     time: Float[np.ndarray, " N"], x: Float[np.ndarray, "N *k"], cutoff_hz: float
 ) -> Float[np.ndarray, "N *k"]:
     """Low-pass x as `smooth` does, without derivatives."""
-    return _smoothed(time, x, cutoff_hz, 0)[0]
+    return _smoothed(time, x, cutoff_hz, (0,))[0]
 
 
-def _smoothed(time: np.ndarray, x: np.ndarray, cutoff_hz: float, highest: int) -> np.ndarray:
-    """Filtered x and its derivatives up to the order `highest`, stacked along the first axis."""
+def _smoothed(time: np.ndarray, x: np.ndarray, cutoff_hz: float, orders: tuple[int, ...]) -> np.ndarray:
+    """Derivatives of these orders of the filtered x, stacked along the first axis."""
     time, x = np.asarray(time, np.float64), np.asarray(x, np.float64)
     if len(time) < 3:
-        return np.stack([x, *[np.zeros_like(x)] * highest])
+        return np.stack([np.zeros_like(x) if k else x for k in orders])
     grid = uniform_grid(time)
     rate = (len(grid) - 1) / (grid[-1] - grid[0])
     if not 0.0 < cutoff_hz < 0.5 * rate:
@@ -81,15 +88,15 @@ def _smoothed(time: np.ndarray, x: np.ndarray, cutoff_hz: float, highest: int) -
             f"a cut-off of {cutoff_hz:g} Hz must lie between 0 and half the sampling rate, {0.5 * rate:.4g} Hz"
         )
     columns = x.reshape(len(time), -1).T
-    out, finite = np.full((highest + 1, *columns.shape), np.nan), np.isfinite(columns)
+    out, finite = np.full((len(orders), *columns.shape), np.nan), np.isfinite(columns)
     usable = np.flatnonzero(finite.sum(axis=1) >= 3)
     if usable.size:
         even = np.stack([_on_grid(time, columns[k], grid) for k in usable])
         coefficients = _spline(even, rate, cutoff_hz)
         at = None if grid is time else (time - grid[0]) * rate
-        out[:, usable] = rate ** np.arange(highest + 1)[:, None, None] * _derivatives(coefficients, highest, at)
+        out[:, usable] = rate ** np.array(orders)[:, None, None] * _derivatives(coefficients, orders, at)
         out[:, ~finite] = np.nan
-    return np.moveaxis(out, 1, 2).reshape(highest + 1, *x.shape)
+    return np.moveaxis(out, 1, 2).reshape(len(orders), *x.shape)
 
 
 def _spline(x: Float[np.ndarray, "k N"], rate: float, cutoff_hz: float) -> Float[np.ndarray, "k N+5"]:
@@ -111,13 +118,13 @@ def _spline(x: Float[np.ndarray, "k N"], rate: float, cutoff_hz: float) -> Float
 
 
 def _derivatives(
-    coefficients: Float[np.ndarray, "k C"], highest: int, at: Float[np.ndarray, " M"] | None
+    coefficients: Float[np.ndarray, "k C"], orders: tuple[int, ...], at: Float[np.ndarray, " M"] | None
 ) -> Float[np.ndarray, "d k M"]:
-    """Values of a spline and of its derivatives up to the order `highest` (d = highest + 1), per sample interval.
+    """Derivatives of d orders of a spline, per sample interval; that of order 0 is its value.
 
     They are taken at the N = C - 5 samples, or at `at`, counted in samples. The coefficients are those of `_spline`.
     """
-    last, orders = coefficients.shape[1] - 6, range(highest + 1)
+    last = coefficients.shape[1] - 6
     before = None if at is None else np.clip(np.floor(at).astype(int), 0, last)
     away = np.zeros(1) if at is None else at - before
     # At `away` past a sample derivative k is its Taylor series Σ_j s⁽ᵏ⁺ʲ⁾ awayʲ/j!. Every s⁽ᵏ⁺ʲ⁾ is a weighted sum of
@@ -126,12 +133,12 @@ def _derivatives(
     for j in range(1, 6):
         powers[j] = powers[j - 1] * away / j
     weights = [_B_SPLINE[k:].T @ powers[: 6 - k] for k in orders]
-    out = np.zeros((highest + 1, len(coefficients), last + 1 if at is None else len(at)))
+    out = np.zeros((len(orders), len(coefficients), last + 1 if at is None else len(at)))
     for i in range(6):
         near = coefficients[:, i : i + last + 1]
         near = near if before is None else near.take(before, axis=1)
-        for k in orders:
-            out[k] += weights[k][i] * near
+        for derivative, weight in zip(out, weights, strict=True):
+            derivative += weight[i] * near
     return out
 
 

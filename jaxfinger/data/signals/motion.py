@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxfinger.data.session import FingerDescription, Trial
-from jaxfinger.data.signals.filtering import smooth
+from jaxfinger.data.signals.filtering import smooth_rate
 from jaxfinger.data.signals.sizes import Sizes
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def joint_directions(trial: Trial) -> Float[np.ndarray, "N m"]:
         return trial.joint_direction.astype(float)
     cutoff = fitting_cutoff(trial.time, CUTOFF_HZ)
     step = float(np.median(np.diff(trial.time))) if len(trial.time) > 1 else 1.0
-    slow, quick = (smooth(trial.time, trial.q, c)[1] for c in (cutoff, quick_cutoff(cutoff, step)))
+    slow, quick = (smooth_rate(trial.time, trial.q, c) for c in (cutoff, quick_cutoff(cutoff, step)))
     return directions(slow, rest_speed(slow, quick))
 
 
@@ -113,7 +113,7 @@ def find_holds(trial: Trial, pace: float = 1.0) -> Int[np.ndarray, " N"]:
     if x is None or len(x) < 3:
         return hold
     cutoff = fitting_cutoff(trial.time, HOLD_CUTOFF_HZ / pace)
-    rate = np.abs(smooth(trial.time, x, cutoff)[1])
+    rate = np.abs(smooth_rate(trial.time, x, cutoff))
     still = rate < STILL_SHARE * np.nanpercentile(rate, 99) if np.isfinite(rate).any() else np.zeros(len(x), bool)
     index = 0
     for first, stop in stretches_of(still):

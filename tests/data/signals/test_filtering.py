@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxfinger.data.signals.filtering import smooth
+from jaxfinger.data.signals.filtering import smooth, smooth_rate
 from jaxfinger.errors import UserError
 
 
@@ -78,3 +78,11 @@ def test_short_recordings_give_finite_derivatives(count):
     for x in smooth(time, np.cos(time)[:, None], 20.0):
         assert x.shape == (count, 1)
         assert np.isfinite(x).all()
+
+
+@pytest.mark.parametrize("even", [True, False])
+@pytest.mark.parametrize("count", [2, 500])
+def test_the_rate_alone_is_that_of_all_derivatives(even, count):
+    time = np.arange(count) / 1000 if even else jittered(count, 1000)
+    x = np.random.default_rng(0).standard_normal((count, 2))
+    np.testing.assert_array_equal(smooth_rate(time, x, 20.0), smooth(time, x, 20.0)[1])
