@@ -48,7 +48,9 @@ class Program:
         self._ready: dict[Any, Callable[[list], Any]] = {}
         self.lower = self._jitted.lower
 
-    def __call__(self, *args):
+    def __call__(self, *args, **named):
+        if named:  # not looked up on disk
+            return self._jitted(*args, **named)
         leaves, structure = jax.tree.flatten(args)
         if not _are_kept() or any(isinstance(leaf, Tracer) for leaf in leaves):
             return self._jitted(*args)
