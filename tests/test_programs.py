@@ -51,6 +51,10 @@ def test_a_later_process_loads_the_program(folder, scaled, traced):
     assert len(traced) == 1
 
 
+def test_named_arguments_are_taken_as_by_any_function(folder, scaled):
+    np.testing.assert_array_equal(scaled()("torque", values={"x": np.ones(3)})["scaled"], 2.0)
+
+
 def test_another_constant_shape_type_or_structure_is_another_program(folder, scaled, traced):
     for channel, values in (
         ("torque", {"x": np.ones(3)}),
