@@ -87,7 +87,8 @@ class Program:
         if not all(target.startswith("lapack_") for target in re.findall(r"custom_call @(\w+)", text)):
             # JAX may ready what is called only where it traces; where it is not ready, the loaded program would crash.
             return lambda arrays: self._jitted(*_filled(structure, leaves, arrays))
-        code = _digest(text.replace(unique, ""))
+        # The text lacks arguments that the function ignores, and the program checks their shapes, too.
+        code = _digest(text.replace(unique, "") + repr([_constant(a) for a in arrays]))
         _write(name, pickle.dumps((code, jax.tree.unflatten(results, [0] * results.num_leaves))))
         if (known := _loaded(name, len(arrays))) is not None:
             return known

@@ -51,6 +51,14 @@ def test_a_later_process_loads_the_program(folder, scaled, traced):
     assert len(traced) == 1
 
 
+def test_an_argument_that_is_ignored_may_have_any_shape(folder):
+    def doubled(x, ignored):
+        return 2.0 * x
+
+    for count in (2, 3):
+        np.testing.assert_array_equal(Program(doubled, {})(np.ones(4), np.ones(count)), 2.0)
+
+
 def test_named_arguments_are_taken_as_by_any_function(folder, scaled):
     np.testing.assert_array_equal(scaled()("torque", values={"x": np.ones(3)})["scaled"], 2.0)
 

@@ -98,9 +98,10 @@ class Watch:
         self.join("heartbeat")
         while not self._closing.is_set():
             if self._allowed.wait(PERIOD_S):
-                self._allowed.clear()
                 with suppress(UserError):  # A lost connection is the reader's to report.
                     self.rig.beat()
+                # What was allowed during a slow call is old, and the reader waits for the connection.
+                self._allowed.clear()
             self.report_alive()
 
     def check(self) -> None:
