@@ -22,8 +22,8 @@ from jaxtyping import Float, Int
 from jaxfinger.identify.linearise import robust_residuals, robust_share
 
 STRETCH_DURATION = 1.0  # s, at the protocol's pace: about the duration of one movement
-# V exceeds Laplace's variance by more than so many of its own standard deviations, or it does not count. At 4, chance
-# widens fewer than 1 % of intervals where the model is right (tests/identify/test_intervals.py).
+# Standard deviations of V's ratio to Laplace's variance that chance may explain, and that are taken off the ratio. At 4
+# chance widens fewer than 1 % of intervals where the model is right (tests/identify/test_intervals.py).
 MIN_EXCESS = 4.0
 
 

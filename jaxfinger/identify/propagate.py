@@ -48,21 +48,21 @@ def propagate(
     unknown = np.setdiff1d(np.flatnonzero(np.isinf(variance)), free)
     root = np.zeros((0, free.size)) if prior is None else prior.root
     parts = [_of(x, sources[e].positions, free) for e, x in told.items()]
-    inverse, ratios, grow = laplace(parts, root)
+    found = laplace(parts, root)
     information = np.zeros_like(covariance)
-    for (e, x), beta in zip(told.items(), ratios, strict=True):
+    for (e, x), beta in zip(told.items(), found.ratios, strict=True):
         at = sources[e].positions
         information[np.ix_(at, at)] += np.tensordot(1.0 / beta, x.information, 1)
     out = covariance.copy()
     out[free, :] = out[:, free] = 0.0
-    cross = inverse @ information[np.ix_(free, others)]
+    cross = found.inverse @ information[np.ix_(free, others)]
     inherited = covariance[np.ix_(others, others)]
-    out[np.ix_(free, free)] = inverse * np.outer(grow, grow) + cross @ inherited @ cross.T
+    out[np.ix_(free, free)] = found.covariance + cross @ inherited @ cross.T
     out[np.ix_(free, others)] = -cross @ inherited
     out[np.ix_(others, free)] = out[np.ix_(free, others)].T
     undetermined = np.any(np.abs(solution.invisible) > MIN_SHARE, axis=0)
     # An estimate that depends on an undetermined parameter is undetermined, too.
-    undetermined |= depends(inverse, information[np.ix_(free, unknown)], np.diag(information)[unknown])
+    undetermined |= depends(found.inverse, information[np.ix_(free, unknown)], np.diag(information)[unknown])
     out[free[undetermined], free[undetermined]] = np.inf
     return out
 

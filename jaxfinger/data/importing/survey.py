@@ -12,7 +12,9 @@ from jaxfinger.data.importing.columns import coarse_rate, restarts
 from jaxfinger.data.importing.recording import Recording, Variable
 from jaxfinger.data.units import TO_SI, is_foreign, unit_name
 
-MIN_GAP = 5.0  # usual intervals of a clock that ticks evenly: in a longer one samples were lost.
+# Usual intervals of a clock that ticks evenly. A late sample makes one up to twice as long; in a longer one than this,
+# samples were lost. It decides what counts as the rate, not what is a fault (`signals.clock`).
+MIN_GAP = 5.0
 # Patterns of names for each channel, of which the first that fits counts: common words in logs of robots.
 _MEANINGS = (
     ("time", r"^t$|time|stamp|clock|zeit|^sec"),
