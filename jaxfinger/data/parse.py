@@ -333,7 +333,7 @@ def _check_units(item: h5py.Dataset, entry: Entry, place: str, prismatic: Sequen
     if entry.units is None:
         return
     wanted = entry_units(entry, prismatic)
-    units = text_attribute(item, "units", place, report) if "units" in item.attrs else None
+    units = text_attribute(item, "units", place, report)
     if units is None:
         if entry.kind == "float":
             report.error(place, f"carries no `units`; write {wanted!r} if that is what the numbers are")
@@ -364,11 +364,8 @@ def _as_kind(value: np.ndarray, entry: Entry, place: str, report: Report) -> np.
             return None
         with np.errstate(invalid="ignore", over="ignore"):  # The checks report extreme values.
             return np.asfortranarray(value, np.float64)
-    if (
-        value.dtype.kind not in "biuf"
-        or not np.all(np.isfinite(value))
-        or np.any(value != np.round(value.astype(float)))
-    ):
+    whole = value.dtype.kind in "biu" or (value.dtype.kind == "f" and bool(np.all(np.round(value) == value)))
+    if not whole or not np.all(np.isfinite(value)):
         report.error(place, f"holds values that are not whole numbers; write it as {entry.kind}")
         return None
     lowest, highest, allowed = RANGES[entry.kind]

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxfinger.data import Predictions, Session, Trial, quantisation
+from jaxfinger.data.signals.quantiles import median
 from jaxfinger.data.signals.sizes import Sizes, sizes_of
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import driven, held, path, stepped
@@ -121,7 +122,7 @@ class _Reduced(NamedTuple):
 
 def _coarseness(trial: Trial, channel: str) -> Coarseness:
     std, samples = np.transpose([quantisation(x) for x in getattr(trial, channel).T])
-    return Coarseness(std, samples * float(np.median(np.diff(trial.time))))
+    return Coarseness(std, samples * median(np.diff(trial.time)))
 
 
 def _mean_coarseness(members: list[Coarseness]) -> Coarseness:

@@ -23,6 +23,7 @@ from jaxfinger.data import (
 )
 from jaxfinger.data.predictions import predicted_at
 from jaxfinger.data.signals.motion import quick_cutoff
+from jaxfinger.data.signals.quantiles import median
 from jaxfinger.data.signals.sizes import Sizes
 from jaxfinger.effects.drive import NOMINAL_TEMPERATURE
 from jaxfinger.experiments.table import Experiment
@@ -109,7 +110,7 @@ def prepared(
 
     `minus`, `coarse`: as in `prepare`.
     """
-    step = float(np.median(np.diff(trial.time)))
+    step = median(np.diff(trial.time))
     size = max(1, round(coarse / (experiment.rate * step))) if reduced else 1
     y, sound = _measured(experiment, trial, session.finger, minus, longest_spike(step))
     return PreparedTrial(experiment, _despiked(trial), session.finger, sizes, reduced, step, size, y, sound)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxfinger.data.findings import Report
 from jaxfinger.data.schema import MEASURED, measured_columns
 from jaxfinger.data.session import FingerDescription, Session, Trial
+from jaxfinger.data.signals.quantiles import median
 from jaxfinger.data.signals.sizes import travel_time
 from jaxfinger.errors import counted, listed
 
@@ -58,7 +59,7 @@ def _held(trial: Trial, finger: FingerDescription, report: Report) -> None:
                 found[name, column] = usual
     if not found or max(found.values()) <= newest:
         return
-    step, most = float(np.median(np.diff(trial.time))), _MAX_AGE * travel_time(trial.time, trial.q)
+    step, most = median(np.diff(trial.time)), _MAX_AGE * travel_time(trial.time, trial.q)
     for name in MEASURED:
         late = {c: n for (channel, c), n in found.items() if channel == name and 0.5 * (n - newest) * step > most}
         if late:

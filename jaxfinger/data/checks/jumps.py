@@ -15,6 +15,7 @@ import numpy as np
 from jaxfinger.data.findings import Report
 from jaxfinger.data.session import FingerDescription, Trial
 from jaxfinger.data.signals.motion import still_spans
+from jaxfinger.data.signals.quantiles import median, quantile
 from jaxfinger.data.signals.spikes import longest_spike
 from jaxfinger.data.signals.unmeasured import placeholder
 from jaxfinger.errors import counted
@@ -43,7 +44,7 @@ def check_jumps(trial: Trial, finger: FingerDescription, report: Report) -> None
     for channel, name, x, turns, jumps in found:
         if not len(jumps):
             continue
-        lasting = _lasting(x, jumps, longest_spike(float(np.median(steps))))
+        lasting = _lasting(x, jumps, longest_spike(median(steps)))
         # Encoders do not wrap together. Where all jump at once, samples are lost or repeated.
         together = bool(np.isin(jumps, places[count > 1]).all())
         period = None if together else _period(x, jumps, lasting, turns)
@@ -54,7 +55,7 @@ def check_jumps(trial: Trial, finger: FingerDescription, report: Report) -> None
             own = "4096 for the counts of an encoder with 4096 a turn, 360 for its degrees"
             mend = f"the encoder wraps; unwrap it by the variable's own period (`unwrap` in a mapping: {own})"
         elif channel == "q":
-            jumps = lasting[steps[lasting] < _MAX_WAIT * np.median(steps)]
+            jumps = lasting[steps[lasting] < _MAX_WAIT * median(steps)]
             said = f"{np.max(np.abs(np.diff(x)[jumps]), initial=0.0):.3g} {'rad' if turns else 'm'}"
             mend = "samples or counts are lost there; cut these places out (`span` or `where` in a mapping)"
         else:
@@ -86,7 +87,7 @@ def _jumps(x: np.ndarray, turns: bool, least: float) -> np.ndarray:
     if turns and np.all(np.abs(steps[jumps] / _TURN - 1.0) < _MAX_SPREAD):
         return jumps  # A joint that rests at the end of the encoder's range jumps at every other sample.
     usual = steps[steps > 0.0]  # not of an encoder that rests, nor of samples that repeat the one before
-    return jumps if np.percentile(usual, 90.0) < _MAX_STEP * span else jumps[:0]
+    return jumps if quantile(usual, 0.9) < _MAX_STEP * span else jumps[:0]
 
 
 def _lasting(x: np.ndarray, jumps: np.ndarray, longest: int) -> np.ndarray:
@@ -103,7 +104,7 @@ def _period(x: np.ndarray, jumps: np.ndarray, lasting: np.ndarray, turns: bool) 
     usual[jumps] = 0.0
     beside = 0.5 * (usual[np.maximum(jumps - 1, 0)] + usual[np.minimum(jumps + 1, len(usual) - 1)])
     sizes = np.abs(steps[jumps] - beside)  # without the motion between the two samples
-    period = float(np.median(sizes))
+    period = median(sizes)
     alike = np.mean(np.abs(sizes / period - 1.0) < _MAX_SPREAD) >= _MIN_ALIKE
     if not alike or (not len(lasting) and len(jumps) < _MIN_RETURNS):
         return None

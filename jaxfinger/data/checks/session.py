@@ -21,6 +21,7 @@ from jaxfinger.data.checks.work import check_work
 from jaxfinger.data.findings import Report
 from jaxfinger.data.schema import MEASURED
 from jaxfinger.data.session import EXPERIMENT_NAMES, Session
+from jaxfinger.data.signals.quantiles import median
 from jaxfinger.data.signals.sizes import MAX_SAMPLES, Sizes, sizes_of
 from jaxfinger.data.signals.spikes import longest_spike, outlier_mask
 from jaxfinger.data.units import conversion
@@ -147,7 +148,7 @@ def check_samples(session: Session, report: Report) -> None:
 def check_spikes(session: Session, report: Report) -> None:
     """Report columns that hold spikes (`outlier_mask`)."""
     for trial in session:
-        longest = longest_spike(float(np.median(np.diff(trial.time))) if len(trial.time) > 1 else 0.0)
+        longest = longest_spike(median(np.diff(trial.time)) if len(trial.time) > 1 else 0.0)
         for name in (name for name in MEASURED if getattr(trial, name) is not None):
             share = float(outlier_mask(getattr(trial, name), longest=longest).mean(axis=0).max(initial=0.0))
             if share > 0.0:

@@ -10,6 +10,7 @@ from jaxfinger.data.schema import CHANNELS, DRIVES, MEASURED, MEASURES, NEEDS_JO
 from jaxfinger.data.session import FingerDescription, Trial
 from jaxfinger.data.signals.clock import gaps, longest_interval
 from jaxfinger.data.signals.motion import MIN_HOLD, MIN_MOTION, pulled_slowly, still_spans
+from jaxfinger.data.signals.quantiles import median, quantile
 from jaxfinger.data.signals.sizes import MAX_RATE, STEP_TIME, Sizes
 from jaxfinger.data.units import conversion
 from jaxfinger.errors import counted, listed
@@ -87,7 +88,7 @@ def _time(trial: Trial, sizes: Sizes, report: Report) -> None:
             place, f"{what} after sample {at} ({time[at]:.6g} s), at {count} of {len(time)}; sort or drop these samples"
         )
         return
-    usual = float(np.median(steps))
+    usual = median(steps)
     if abs(time[0]) > longest_interval(steps):
         report.warning(place, f"starts at {time[0]:.6g} s; count from 0 in each trial")
     # In this time a joint passes a tenth of its travel, so that longer intervals show no motion.
@@ -172,8 +173,7 @@ def _span(values: np.ndarray) -> float:
     """Travel of a column, from its first to its 99th percentile; NaN where a sample is not finite."""
     if len(values) == 0 or not np.isfinite(values).all():
         return np.nan
-    low, high = np.percentile(values, [1.0, 99.0])
-    return float(high - low)
+    return quantile(values, 0.99) - quantile(values, 0.01)
 
 
 def _spans(trial: Trial) -> np.ndarray:

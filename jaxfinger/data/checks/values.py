@@ -9,6 +9,7 @@ from jaxfinger.data.findings import Report
 from jaxfinger.data.schema import CHANNELS, measured_columns
 from jaxfinger.data.session import FingerDescription, Trial
 from jaxfinger.data.signals.motion import MIN_MOTION
+from jaxfinger.data.signals.quantiles import median, quantile
 from jaxfinger.data.signals.sizes import NOISE_FACTOR, Sizes
 from jaxfinger.data.signals.unmeasured import constant_columns, placeholder
 from jaxfinger.data.units import STANDARD_GRAVITY, conversion, whole_turns
@@ -104,7 +105,7 @@ def _angles(trial: Trial, finger: FingerDescription, report: Report) -> None:
     for name, q, (lower, upper), slides in columns:
         if slides or not np.isfinite(q).all():
             continue
-        low, high = np.percentile(q, [1.0, 99.0])
+        low, high = quantile(q, 0.01), quantile(q, 0.99)
         where = f"column {name} runs from {low:.3g} to {high:.3g} rad"
         outside = low < lower - _MAX_OVERTRAVEL or high > upper + _MAX_OVERTRAVEL
         turn = whole_turns(0.5 * (low + high), 2.0 * np.pi, (lower, upper))
@@ -145,7 +146,7 @@ def _large_for_the_machine(trial: Trial, finger: FingerDescription, report: Repo
         ("joint_torque", _MAX_TORQUE * _weight(finger) * reach, "N mm"),
     ):
         for _, name, x in measured_columns(trial, finger, (channel,)) if most != 0.0 else ():
-            if np.isfinite(x).all() and (size := float(np.percentile(np.abs(x), 90.0))) > most:
+            if np.isfinite(x).all() and (size := quantile(np.abs(x), 0.9)) > most:
                 report.error(
                     trial.place(channel),
                     f"column {name} is of size {size:.3g}, too large for the lengths and masses of this machine; "
@@ -176,16 +177,16 @@ def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repo
         if not active:
             report.note(place, f"column {name} is measured though the tendon is passive; it is ignored")
             continue
-        low = float(np.percentile(x, 5.0))
+        low = quantile(x, 0.05)
         if low < -max(_MAX_PUSH * sizes.tension, sizes.slack) and trial.experiment not in _SLACK:
             report.error(place, f"column {name} falls to {low:.3g} N, and a tendon cannot push; check sign and tare")
         elif low < -tare:
             report.warning(place, f"column {name} falls to {low:.3g} N, below zero by more than noise; check the tare")
         elif trial.experiment in _SLACK and tare < low < _MAX_TARE * sizes.tension:
             unslack[name] = low
-        elif trial.experiment == "ID.2" and np.median(x) <= NOISE_FACTOR * sizes.noise:
+        elif trial.experiment == "ID.2" and median(x) <= NOISE_FACTOR * sizes.noise:
             slack.append(name)
-        if np.percentile(x, 95.0) > _MAX_TENSION * _weight(finger):
+        if quantile(x, 0.95) > _MAX_TENSION * _weight(finger):
             said = f"column {name} exceeds {_MAX_TENSION:.0f} times the weight of all links"
             report.warning(place, f"{said}; {conversion('mN')} if that is what it is")
     if slack and trial.tendon_excursion is not None:

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxfinger.data.signals.quantiles import median
+
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
@@ -19,7 +21,7 @@ _MAX_DELAY = 0.02
 
 def longest_interval(steps: Float[np.ndarray, " M"]) -> float:
     """Longest interval, s, that late samples explain, given all intervals of a clock, s: longer ones are gaps."""
-    return max(_MAX_JITTER * float(np.median(steps)), _MAX_DELAY)
+    return max(_MAX_JITTER * median(steps), _MAX_DELAY)
 
 
 def gaps(steps: Float[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:

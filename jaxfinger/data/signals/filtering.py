@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxfinger.data.signals.quantiles import median
 from jaxfinger.errors import UserError
 
 if TYPE_CHECKING:
@@ -153,7 +154,7 @@ def fourier_length(size: int) -> int:
 def uniform_grid(time: Float[np.ndarray, " N"]) -> Float[np.ndarray, " K"]:
     """Evenly spaced times over the recording, at about its median interval; `time` itself where it is even."""
     steps = np.diff(time)
-    interval = float(np.median(steps))
+    interval = median(steps)
     if np.all(np.abs(steps - interval) <= _EVEN * interval):
         return time
     return np.linspace(time[0], time[-1], max(3, 1 + round((time[-1] - time[0]) / interval)))

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxfinger.data.session import FingerDescription, Trial
 from jaxfinger.data.signals.filtering import smooth_rate
+from jaxfinger.data.signals.quantiles import median
 from jaxfinger.data.signals.sizes import Sizes
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def joint_directions(trial: Trial) -> Float[np.ndarray, "N m"]:
     if trial.joint_direction is not None:
         return trial.joint_direction.astype(float)
     cutoff = fitting_cutoff(trial.time, CUTOFF_HZ)
-    step = float(np.median(np.diff(trial.time))) if len(trial.time) > 1 else 1.0
+    step = median(np.diff(trial.time)) if len(trial.time) > 1 else 1.0
     slow, quick = (smooth_rate(trial.time, trial.q, c) for c in (cutoff, quick_cutoff(cutoff, step)))
     return directions(slow, rest_speed(slow, quick))
 
@@ -137,7 +138,7 @@ def fitting_cutoff(time: Float[np.ndarray, " N"], cutoff_hz: float) -> float:
     """Cut-off, Hz, lowered to a quarter of the sampling rate where the recording is too slow for it."""
     if len(time) < 3:
         return cutoff_hz
-    return min(cutoff_hz, 0.25 / float(np.median(np.diff(time))))
+    return min(cutoff_hz, 0.25 / median(np.diff(time)))
 
 
 def slow_ramps(
@@ -170,7 +171,7 @@ def pulled_slowly(trial: Trial, pulled: Float[np.ndarray, " N"], sizes: Sizes) -
     """
     if len(pulled) < 3 or not np.isfinite(pulled).all():
         return True
-    hold, step = find_holds(trial, sizes.slow_pace), float(np.median(np.diff(trial.time)))
+    hold, step = find_holds(trial, sizes.slow_pace), median(np.diff(trial.time))
     if (hold >= 0).any():
         return True
     size = max(1, round(sizes.slow_pace / (RAMP_BLOCKS * step)))

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxfinger.data.signals.quantiles import median
+
 if TYPE_CHECKING:
     from jaxtyping import Float
 
@@ -14,7 +16,7 @@ STD_PER_MAD = 1.4826  # standard deviation of Gaussian values, per median absolu
 
 def robust_std(values: Float[np.ndarray, " N"]) -> float:
     """Robust standard deviation, from the median absolute deviation: exact for Gaussian values."""
-    return STD_PER_MAD * float(np.median(np.abs(values - np.median(values))))
+    return STD_PER_MAD * median(np.abs(values - median(values)))
 
 
 def quantisation(values: Float[np.ndarray, " N"]) -> tuple[float, float]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxfinger.data.session import Session, Trial
 from jaxfinger.data.signals.noise import STD_PER_MAD
+from jaxfinger.data.signals.quantiles import median, quantile
 from jaxfinger.data.signals.spikes import without_spikes
 
 if TYPE_CHECKING:
@@ -72,10 +73,10 @@ def sizes_of(session: Session) -> Sizes:
         every = max(1, len(trial.time) // MAX_SAMPLES)
         if (f := _tensions(trial)).size:
             bend = np.abs(np.diff(f[:MAX_SAMPLES], 2, axis=0))
-            noises.append(STD_PER_MAD / np.sqrt(6.0) * float(np.median(bend, axis=0).max()))
+            noises.append(STD_PER_MAD / np.sqrt(6.0) * max(map(median, bend.T)))
         if trial.tendon_excursion is not None and len(trial.time) > 3:
             l = np.nan_to_num(trial.tendon_excursion[::every])
-            excursions.append(float(np.ptp(np.percentile(l, (1, 99), axis=0), axis=0).max(initial=0.0)))
+            excursions.append(max((quantile(x, 0.99) - quantile(x, 0.01) for x in l.T), default=0.0))
         if trial.experiment == "ID.3-dynamic":
             sweeps.append(travel_time(trial.time, trial.q) / SWEEP_TIME)
         if trial.experiment in ("ID.2", "ID.3-static"):
@@ -93,7 +94,7 @@ def highest_tension(session: Session) -> float:
     for trial in session:
         if (f := _tensions(trial)).size:
             every = max(1, len(f) // MAX_SAMPLES)
-            highest.append(float(np.percentile(f[::every], 99, axis=0).max()))
+            highest.append(max(quantile(x, 0.99) for x in f[::every].T))
     return max(highest)
 
 
@@ -119,7 +120,7 @@ def travel_time(time: Float[np.ndarray, " N"], q: Float[np.ndarray, "N k"]) -> f
     """
     every = max(1, len(time) // MAX_PACE_SAMPLES)
     columns = [x[np.isfinite(x)] for x in without_spikes(q)[::every].T]
-    step = float(np.median(np.diff(time))) * every if len(time) > 1 else 0.0
+    step = median(np.diff(time)) * every if len(time) > 1 else 0.0
     return step * max((_lag(x) for x in columns if x.size and np.ptp(x) > 0.0), default=0)
 
 
@@ -128,10 +129,10 @@ def _lag(x: Float[np.ndarray, " N"]) -> float:
 
     0 where less than one sample in a hundred differs from the others: the column rests.
     """
-    way, lag, far = 0.1 * np.ptp(np.percentile(x, (1, 99))), 1, [0.0]
+    way, lag, far = 0.1 * (quantile(x, 0.99) - quantile(x, 0.01)), 1, [0.0]
     if way == 0.0:
         return 0.0
     while far[-1] < way and lag < len(x):
-        far.append(float(np.percentile(np.abs(x[lag:] - x[:-lag]), 99)))
+        far.append(quantile(np.abs(x[lag:] - x[:-lag]), 0.99))
         lag *= 2
     return float(np.interp(way, far[-2:], (lag / 4.0, lag / 2.0)))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxfinger.data.signals.noise import resolution, robust_std
+from jaxfinger.data.signals.quantiles import median
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -76,15 +77,17 @@ def _spikes(values: Float[np.ndarray, " N"], threshold: float, longest: int) -> 
     # Second differences show the noise in motion and at rest. Their variance is 6 σ².
     noise = max(robust_std(np.diff(values, 2)) / np.sqrt(6.0), resolution(values), _MIN_SPIKE_SHARE * np.ptp(values))
     spikes, least = np.zeros(len(values), bool), threshold * noise
+    sound = values
     for _ in range(_MAX_PASSES):  # A spike bends the lines beside it, so its neighbours are judged again without it.
-        found = _beyond(bridged(values[:, None], spikes[:, None])[:, 0], least, longest) & ~spikes
+        found = _beyond(sound, least, longest) & ~spikes
         if not found.any():
             break
         spikes |= found
+        sound = bridged(values[:, None], spikes[:, None])[:, 0]
     if not spikes.any():
         return spikes
     # A sound sample between two spikes is outside the range of both. Without them it is not, so it is unmarked here.
-    x = np.pad(bridged(values[:, None], spikes[:, None])[:, 0], 2, mode="edge")
+    x = np.pad(sound, 2, mode="edge")
     k = np.arange(len(values)) + 2
     lines = 2.0 * x[k - 1] - x[k - 2], 2.0 * x[k + 1] - x[k + 2]
     allowed = np.stack([*lines, x[k - 1], x[k], x[k + 1]])
@@ -93,7 +96,7 @@ def _spikes(values: Float[np.ndarray, " N"], threshold: float, longest: int) -> 
 
 def _beyond(values: Float[np.ndarray, " N"], least: float, longest: int) -> Bool[np.ndarray, " N"]:
     """Mark samples that lie outside the range of their surroundings by more than `least`."""
-    x = np.concatenate([[np.median(values[:5])] * 2, values, [np.median(values[-5:])] * 2])
+    x = np.concatenate([[median(values[:5])] * 2, values, [median(values[-5:])] * 2])
     spikes = np.zeros(len(x), bool)
     bend = np.abs(np.diff(x, 2))
     sharp = bend > least  # A spike bends most about the sample before its first and the one after its last.
