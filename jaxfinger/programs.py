@@ -5,6 +5,7 @@ times as long as loading it. Here a program is looked up by the structure and th
 else that it could depend on: this package's code, the libraries, XLA's options, and the kind of processor.
 
 Programs are kept where the environment variable `JAXFINGER_PROGRAMS` names a folder, as the command line sets it.
+A file that no process has read for a month is removed from it, as those of older code.
 Whoever may write there can run code in this process, as is true of JAX's cache.
 """
 
@@ -13,17 +14,18 @@ import os
 import pickle
 import re
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache, update_wrapper, wraps
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
-from uuid import uuid4
 
 import equinox as eqx
 import jax
 import numpy as np
+from jax._src.config import persistent_cache_min_compile_time_secs
 from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 from jaxlib.lapack import prepare_lapack_call
@@ -32,6 +34,7 @@ from jaxlib.xla_client import get_topology_for_devices
 Result = TypeVar("Result")
 
 LIBRARIES = ("jax", "jaxlib", "equinox", "numpy")
+MONTH = 30 * 86_400.0  # s
 OWN = ("builtins", "jaxfinger", *LIBRARIES)  # packages whose code a key holds
 
 
@@ -80,19 +83,20 @@ class Program:
             out, results = jax.tree.flatten(self._f(*_filled(structure, leaves, arrays)))
             return out
 
-        # A name of its own keeps JAX's cache out, since XLA cannot save again what that cache has loaded.
-        flat.__name__ = flat.__qualname__ = unique = f"{self._f.__name__}_{uuid4().hex}"
+        flat.__name__ = flat.__qualname__ = f"kept_{self._f.__name__}"
         lowered = jax.jit(flat, compiler_options=self._options).lower(*arrays)
         text = lowered.as_text()
         if not all(target.startswith("lapack_") for target in re.findall(r"custom_call @(\w+)", text)):
             # JAX may ready what is called only where it traces; where it is not ready, the loaded program would crash.
             return lambda arrays: self._jitted(*_filled(structure, leaves, arrays))
         # The text lacks arguments that the function ignores, and the program checks their shapes, too.
-        code = _digest(text.replace(unique, "") + repr([_constant(a) for a in arrays]))
+        code = _digest(text + repr([_constant(a) for a in arrays]))
         _write(name, pickle.dumps((code, jax.tree.unflatten(results, [0] * results.num_leaves))))
         if (known := _loaded(name, len(arrays))) is not None:
             return known
-        compiled = lowered.compile()
+        # JAX's cache would keep it a second time; and XLA cannot save again what that cache has loaded.
+        with persistent_cache_min_compile_time_secs(float("inf")):
+            compiled = lowered.compile()
         with suppress(ValueError, NotImplementedError, jax.errors.JaxRuntimeError):  # a program that cannot be saved
             _write(code, serialize(compiled)[0])
         return lambda arrays: jax.tree.unflatten(results, compiled(*arrays))
@@ -109,7 +113,7 @@ def kept(f: Callable[..., Result]) -> Callable[..., Result]:
             return f(*args)
         name = _digest(said)
         with suppress(Exception):  # There is no file, or a damaged one, which raises exceptions of many kinds.
-            return pickle.loads((_folder() / name).read_bytes())
+            return pickle.loads(_read(name))
         result = f(*args)
         _write(name, pickle.dumps(result))
         return result
@@ -121,22 +125,40 @@ def _loaded(name: str, arrays: int) -> Callable[[list], Any] | None:
     """The program of that name, which takes so many arrays; None where there is none, or a damaged one."""
     prepare_lapack_call("gesdd_ffi", np.dtype(float))  # JAX does so where it traces a call of LAPACK
     try:
-        code, results = pickle.loads((_folder() / name).read_bytes())
+        code, results = pickle.loads(_read(name))
         results = jax.tree.structure(results)
         takes, returns = (jax.tree.structure(tree) for tree in (((0,) * arrays, {}), [0] * results.num_leaves))
-        compiled = deserialize_and_load((_folder() / code).read_bytes(), takes, returns)
+        compiled = deserialize_and_load(_read(code), takes, returns)
     except Exception:  # A damaged file raises exceptions of many kinds.
         return None
     return lambda arrays: jax.tree.unflatten(results, compiled(*arrays))
+
+
+def _read(name: str) -> bytes:
+    """Content of a file; its time becomes that of its last use."""
+    content = (_folder() / name).read_bytes()
+    with suppress(OSError):  # The folder takes no changes.
+        os.utime(_folder() / name)
+    return content
 
 
 def _write(name: str, content: bytes) -> None:
     """Write a file whole, or not at all where the folder takes none."""
     with suppress(OSError):
         _folder().mkdir(parents=True, exist_ok=True)
+        _remove_unused(_folder())
         with tempfile.NamedTemporaryFile(dir=_folder(), delete=False) as part:
             part.write(content)
         os.replace(part.name, _folder() / name)
+
+
+@cache
+def _remove_unused(folder: Path) -> None:
+    """Remove the files that have not been of use for a month, once in a process that writes new ones."""
+    for file in folder.iterdir():
+        with suppress(OSError):  # Another process has removed it.
+            if file.stat().st_mtime < time.time() - MONTH:
+                file.unlink()
 
 
 def _are_kept() -> bool:

@@ -1,5 +1,6 @@
 """Programs on disk: found again by whatever led to them, and by nothing else."""
 
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 
+from jaxfinger import programs
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.model import Model
 from jaxfinger.programs import Program, kept
@@ -92,9 +94,33 @@ def test_a_damaged_file_is_made_again(folder, scaled, traced):
     assert len(traced) == 2
 
 
-def test_other_libraries_or_options_lead_to_other_programs(folder, scaled, traced, monkeypatch):
-    from jaxfinger import programs
+def test_what_nobody_has_used_for_a_month_is_removed(folder, scaled):
+    scaled()("torque", {"x": np.ones(3)})
+    before = set(folder.iterdir())
+    for file in before:
+        os.utime(file, (0.0, 0.0))
+    scaled()("torque", {"x": np.ones(3)})  # reads its files, so that they are new
+    old = folder / "of older code"
+    old.write_bytes(b"")
+    os.utime(old, (0.0, 0.0))
+    programs._remove_unused.cache_clear()  # as in a new process
+    scaled()("angle", {"x": np.ones(3)})
+    assert not old.exists()
+    assert before < set(folder.iterdir())
 
+
+def test_jax_keeps_no_copy_of_a_program(tmp_path):
+    env = os.environ | {
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAXFINGER_PROGRAMS": str(tmp_path / "programs"),
+    }
+    subprocess.run([sys.executable, "-c", LAPACK], check=True, capture_output=True, env=env)
+    assert len(list((tmp_path / "programs").iterdir())) == 2
+    assert not list(tmp_path.glob("*kept_values*"))
+
+
+def test_other_libraries_or_options_lead_to_other_programs(folder, scaled, traced, monkeypatch):
     scaled()("torque", {"x": np.ones(3)})
     monkeypatch.setattr(programs, "_surroundings", lambda: b"another processor")
     scaled()("torque", {"x": np.ones(3)})
