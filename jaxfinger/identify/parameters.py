@@ -71,15 +71,15 @@ class Free(eqx.Module):
 
     def put(self, model: Model, values: list[Float[Array | np.ndarray, " _k"]]) -> Model:
         """Copy of the model with these free parameters, leaf by leaf."""
-        leaves = self.whole(model)
-        for i, (leaf, e, value) in enumerate(zip(leaves, self.entries, values, strict=True)):
+        new = []
+        for leaf, e, value in zip(self.whole(model), self.entries, values, strict=True):
             if _namespace([leaf, e, value]) is np:
                 flat = np.array(leaf).ravel()
                 flat[e] = value
             else:
                 flat = jnp.ravel(leaf).at[e].set(value)
-            leaves[i] = jax.device_put(flat.reshape(leaf.shape))
-        return self.put_whole(model, leaves)
+            new.append(flat.reshape(leaf.shape))
+        return self.put_whole(model, jax.device_put(new))
 
     def whole(self, model: Model) -> list[Float[Array, "..."]]:
         """The leaves of a model that hold free entries, with their other entries."""
