@@ -8,18 +8,22 @@ that the postures tell apart:
     τ = elastic(qᵢ) + zero + friction sign(q̇ᵢ) + damping q̇ᵢ + inertia q̈ᵢ − levers(q) · g
 
 Each trial has its own zero, as of a sensor that is tared, and its own friction. Only the shapes of curves count.
+
+Where one trial moves several joints, as of an arm, other joints' angles change all the time, and each torque shows its
+own multiple of levers · g: far from one it has another unit, a wrong sign, or belongs to a motor before its gear.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxfinger.data.findings import Report
 from jaxfinger.data.mounting import gravity_levers
-from jaxfinger.data.session import FingerDescription, Session, Trial
+from jaxfinger.data.session import FingerDescription, Session, Trial, moving_joints
 from jaxfinger.data.signals.motion import STILL_SHARE, directions
 from jaxfinger.errors import listed
 
@@ -33,6 +37,7 @@ _MIN_TURN = 0.77
 # Of gravity: the largest that torques may show. Masses and their places are right to some per cent, and torques that
 # show more have another reason.
 _MAX_GRAVITY = 1.25
+_MAX_SCALE = 2.0  # of a torque, up or down: masses and their places are known better than that.
 
 
 class _Motion(NamedTuple):
@@ -40,7 +45,7 @@ class _Motion(NamedTuple):
 
     q: np.ndarray  # (N, m)
     torque: np.ndarray  # (N,), of the motor
-    dynamics: np.ndarray  # (N, 2): speed and acceleration
+    dynamics: np.ndarray  # (N, 1 + k): speed, and accelerations of all joints that move
     direction: np.ndarray  # (N,): −1 or 1
 
 
@@ -61,7 +66,7 @@ def check_gravity(session: Session, report: Report) -> None:
     motions: dict[int, list[_Motion]] = defaultdict(list)
     for trial in session.select("ID.3-static", "ID.3-dynamic"):
         if (i := finger.joint(trial.joint)) is not None and i not in coupled:
-            motions[i] += _motion(trial, i)
+            motions[i] += _motion(trial, i, [i])
     told = [i for i, of in motions.items() if _postures(of, i) > _MIN_POSTURE]
     parts = [_equations(finger, i, motions[i]) for i in told]
     if not parts:
@@ -87,14 +92,46 @@ def check_gravity(session: Session, report: Report) -> None:
         )
 
 
+def check_torque_scales(session: Session, report: Report) -> None:
+    """Report torques that are no plausible multiple of what gravity takes, in trials that move several joints."""
+    finger = session.finger
+    if not finger.gravity.any():
+        return
+    coupled = _coupled(finger)
+    for trial in session.select("ID.3-static", "ID.3-dynamic"):
+        moving = [i for name in moving_joints(trial, finger) if (i := finger.joint(name)) is not None]
+        if trial.joint is not None or len(moving) < 2:
+            continue
+        wrong = []
+        for i in (i for i in moving if i not in coupled and not finger.prismatic[i]):
+            for motion in _motion(trial, i, moving):
+                levers, torques, free = _equations(finger, i, [motion])
+                weight = levers @ finger.gravity
+                size = float(weight @ weight)
+                scale = float(weight @ torques) / size if size else 1.0
+                misfit = torques - scale * weight
+                noise = np.sqrt(misfit @ misfit / max(free, 1) / size) if size else np.inf
+                if noise < _MAX_STD and not 1.0 / _MAX_SCALE < scale < _MAX_SCALE:
+                    wrong.append(f"{finger.joint_names[i]} {scale:.2g}")
+        if wrong:
+            report.warning(
+                trial.place("joint_torque"),
+                f"is this multiple of what gravity takes: {listed(wrong)}; correct scale and sign, or `mass` and `com` "
+                "(a motor's current or its torque before the gear needs `scale`)",
+            )
+
+
 def _coupled(finger: FingerDescription) -> set[int]:
     """Joints that share a passive tendon with another joint: their elastic torque depends on the other's angle."""
     shared = ~finger.active & (finger.crosses.sum(axis=1) > 1)
     return set(np.flatnonzero(finger.crosses[shared].any(axis=0)).tolist())
 
 
-def _motion(trial: Trial, i: int) -> list[_Motion]:
-    """The trial's motion; nothing where values are missing or too few, or the joint stands still."""
+def _motion(trial: Trial, i: int, moving: Sequence[int]) -> list[_Motion]:
+    """The trial's motion as joint i sees it, where joints `moving` move.
+
+    There is none where values are missing or too few, or the joint stands still.
+    """
     if trial.joint_torque is None or len(trial.time) < _BLOCKS:
         return []
     size = len(trial.time) // _BLOCKS
@@ -102,7 +139,8 @@ def _motion(trial: Trial, i: int) -> list[_Motion]:
     time, torque, *angles = columns.reshape(_BLOCKS, size, -1).mean(axis=1).T
     q = np.column_stack(angles)
     rate = np.gradient(q[:, i], time)
-    dynamics = np.column_stack([rate, np.gradient(rate, time)])
+    accelerations = [np.gradient(np.gradient(q[:, k], time), time) for k in moving]
+    dynamics = np.column_stack([rate, *accelerations])
     if not (np.isfinite(columns).all() and np.isfinite(dynamics).all() and np.ptp(q[:, i]) > _MIN_POSTURE):
         return []
     # Slow blocks count where the joint goes on in the direction in which it came.

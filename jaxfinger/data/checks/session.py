@@ -12,7 +12,7 @@ from jaxfinger.data.checks.columns import check_columns
 from jaxfinger.data.checks.copies import check_copied_columns, check_copied_trials
 from jaxfinger.data.checks.delay import check_delay
 from jaxfinger.data.checks.finger import check_finger
-from jaxfinger.data.checks.gravity import check_gravity
+from jaxfinger.data.checks.gravity import check_gravity, check_torque_scales
 from jaxfinger.data.checks.held import check_held
 from jaxfinger.data.checks.pulls import check_pulls
 from jaxfinger.data.checks.trial import check_trial
@@ -140,6 +140,7 @@ def check_samples(session: Session, report: Report) -> None:
             check_columns(session, report)
             check_copied_columns(session, report)
             check_gravity(session, report)
+            check_torque_scales(session, report)
             check_held(session, report)
             check_delay(session, report)
             check_pulls(session, report)

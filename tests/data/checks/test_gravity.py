@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import Session, Trial
-from jaxfinger.data.checks.gravity import check_gravity
+from jaxfinger.data.checks.gravity import check_gravity, check_torque_scales
 from jaxfinger.data.findings import Report
 from jaxfinger.data.mounting import gravity_levers
+from jaxfinger.model import Finger
+from jaxfinger.model.rigid_body import inverse_dynamics
 from jaxfinger.synthetic.random_finger import random_finger
 from tests.data.conftest import make_finger
 
@@ -104,3 +106,58 @@ def test_missing_and_standing_torques_do_not_stop_the_check():
     with np.errstate(all="ignore"):
         for trials in ((still, huge, missing, *others), (missing,), (still,), (huge,)):
             assert said(replace(session, trials={t.name: t for t in trials})) == []
+
+
+def excited(finger, rng, rate=100.0, noise=0.01, friction=0.2) -> Session:
+    """Session of one trial in which motors move all joints at once, as an arm is excited.
+
+    `noise` and `friction` are multiples of the torque with which gravity acts on each joint.
+    """
+    time = np.arange(int(40.0 * rate)) / rate
+    q = np.empty((len(time), finger.m))
+    for i in range(finger.m):
+        frequency, phase = rng.uniform(0.05, 0.3, 3), rng.uniform(0.0, 2.0 * np.pi, 3)
+        q[:, i] = 0.6 + 0.25 * np.sin(2.0 * np.pi * frequency * time[:, None] + phase).sum(axis=1)
+    speed = np.gradient(q, time, axis=0)
+    motion = (q.T, speed.T, np.gradient(speed, time, axis=0).T)
+    torque = np.asarray(inverse_dynamics(Finger.from_description(finger), *motion)).T
+    size = np.abs(gravity_levers(finger, q) @ finger.gravity).mean(axis=0)
+    torque = torque + size * (friction * np.tanh(speed / 0.01) + 0.1 * rng.standard_normal(finger.m))
+    torque += noise * size * rng.standard_normal(torque.shape)
+    q = q + 1e-4 * rng.standard_normal(q.shape)
+    return Session("arm", finger, {"all": Trial("all", "ID.3-dynamic", time, q, joint_torque=torque)})
+
+
+def scales_said(session: Session) -> list[str]:
+    report = Report()
+    check_torque_scales(session, report)
+    return [str(finding) for finding in report]
+
+
+def test_torques_of_joints_that_move_at_once_are_silent_where_they_are_right():
+    for seed in range(12):
+        finger = random_finger(seed, 2 + seed % 4, ("planar", "abduction", "spatial")[seed % 3]).description
+        assert scales_said(excited(finger, np.random.default_rng(seed))) == []
+
+
+@pytest.mark.parametrize("scale", [-1.0, 0.07, 20.0])
+def test_a_current_for_a_torque_and_a_wrong_sign_are_named_with_their_joint(scale):
+    finger = random_finger(4, 3, "spatial").description
+    session = excited(finger, np.random.default_rng(0))
+    wrong = session["all"].joint_torque * [1.0, scale, 1.0]
+    (finding,) = scales_said(replace(session, trials={"all": replace(session["all"], joint_torque=wrong)}))
+    name, found = finding.split("takes: ")[1].split(";")[0].rsplit(" ", 1)
+    assert "/trials/all/joint_torque" in finding
+    assert name == finger.joint_names[1]
+    assert float(found) == pytest.approx(scale, rel=0.3)
+
+
+def test_torques_that_drown_in_noise_or_lie_in_a_horizontal_plane_show_no_scale():
+    finger = random_finger(4, 3, "spatial").description
+    noisy = excited(finger, np.random.default_rng(0), noise=20.0)
+    wrong = replace(noisy["all"], joint_torque=-noisy["all"].joint_torque)
+    assert scales_said(replace(noisy, trials={"all": wrong})) == []
+    flat = replace(random_finger(3, 3, "planar").description, gravity=np.array([0.0, 9.81, 0.0]))
+    session = excited(replace(flat, gravity=np.array([0.0, 0.0, -9.81])), np.random.default_rng(1))
+    wrong = replace(session["all"], joint_torque=-session["all"].joint_torque)
+    assert scales_said(Session("flat", flat, {"all": wrong})) == []
