@@ -17,7 +17,7 @@ from jaxfinger.data.units import TO_SI, is_foreign, unit_name
 MIN_GAP = 5.0
 # Patterns of names for each channel, of which the first that fits counts: common words in logs of robots.
 _MEANINGS = (
-    ("time", r"^t$|time|stamp|clock|zeit|^sec"),
+    ("time", r"^t(_?(s|sec|ms|us|ns))?$|time|stamp|clock|zeit|^sec"),
     ("temperature", r"temp"),
     ("joint_torque", r"(^|_)tau|torque|effort|moment"),
     ("tendon_excursion", r"excursion|^l\d*$|length|pull|spool|linear|travel"),
@@ -25,6 +25,9 @@ _MEANINGS = (
     ("fingertip_force", r"f?tip|contact|^f[xyz]$|wrench"),
     ("q", r"^q[_\d]*|angle|pos|enc|theta|winkel|deg$"),
 )
+# Of a clock's values or steps: more values differ, also out of order, or more steps go on, also of a recording that was
+# pasted twice.
+_MIN_RUNNING = 0.5
 # Names of velocities, which belong to no channel, and of set-points, which are not measured.
 _VELOCITY = r"(?<![a-z])vel|speed|dot|^v$|^dq"
 _SET_POINT = (
@@ -161,7 +164,8 @@ def _meaning(name: str, column: str | int | None, x: np.ndarray, units: str) -> 
         return ""
     for meaning, pattern in _MEANINGS:
         if re.search(pattern, word) and (not units or TO_SI[units].si in _SI_UNITS[meaning]):
-            runs = len(x) > 2 and (len(np.unique(x)) > 0.5 * len(x) or coarse_rate(x) is not None)
+            shares = (len(np.unique(x)) / len(x), np.mean(np.diff(x) > 0.0)) if len(x) > 2 else (0.0,)
+            runs = max(shares) > _MIN_RUNNING or coarse_rate(x) is not None
             return meaning if meaning != "time" or (column is None and runs) else ""
     return _CHANNEL_OF_UNITS.get(TO_SI[units].si, "") if units else ""
 
