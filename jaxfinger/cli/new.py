@@ -16,11 +16,13 @@ def new(
     specimen: str | None = None,
     joints: str | None = None,
     tendons: str | None = None,
+    robot: Path | None = None,
+    tip: str | None = None,
     overwrite: bool = False,
 ) -> None:
     """Write a finger and a mapping to fill in: TOML with comments, which is read as it stands.
 
-    On a terminal, asks for what is not given.
+    On a terminal, asks for what is not given. With `--robot` the finger is complete.
 
     Parameters
     ----------
@@ -36,6 +38,10 @@ def new(
         Names of the joints, base to tip, with commas between.
     tendons
         Names of the tendons, with commas between; `none` for a finger without.
+    robot
+        A URDF or MJCF file to take the finger from: the named joints, by default all, and the tendons that cross them.
+    tip
+        The link or site of the robot that is the fingertip.
     overwrite
         Replace files that are already there.
     """
@@ -49,13 +55,22 @@ def new(
     from jaxfinger.data.importing.templates import finger_template, mapping_template
 
     specimen = _asked("Name of the finger", specimen, "finger 1")
-    named = _names("joint", _asked("Joints, base to tip", joints, "MCP, PIP, DIP"))
-    if not named:
-        raise UserError("new: no joint is named; give --joints MCP,PIP,DIP, or so")
-    answer = _asked("Tendons, or none", tendons, "T1, T2, T3, T4")
-    pulled = [] if answer.strip() == "none" else _names("tendon", answer)
+    if robot is not None:
+        if tendons is not None:
+            raise UserError(
+                "new: a robot brings its own tendons; leave out --tendons, and add others in the finger's file"
+            )
+        described, named, pulled = _of_robot(robot, joints, tip or "")
+    else:
+        if tip is not None:
+            raise UserError("new: --tip names a place of a robot; give its file with --robot")
+        named = _names("joint", _asked("Joints, base to tip", joints, "MCP, PIP, DIP"))
+        if not named:
+            raise UserError("new: no joint is named; give --joints MCP,PIP,DIP, or so")
+        answer = _asked("Tendons, or none", tendons, "T1, T2, T3, T4")
+        pulled = [] if answer.strip() == "none" else _names("tendon", answer)
+        described = finger_template(named, pulled)
     beside = _from(finger, mapping.parent)
-    described = finger_template(named, pulled)
     if recordings:
         mapped = _proposal(recordings, specimen, beside, described, finger)
     else:
@@ -64,9 +79,22 @@ def new(
         with atomic_path(path, overwrite) as part:
             part.write_text(text, encoding="utf-8")
     count = f"{counted(len(named), 'joint')}, {counted(len(pulled), 'tendon')}"
-    print(plain(f"{finger}: {count}; replace its numbers by those of your finger"))
+    left = "replace its numbers by those of your finger" if robot is None else f"from {robot.name}"
+    print(plain(f"{finger}: {count}; {left}"))
     todo = "correct what was guessed" if recordings else "name your recordings and their columns"
     print(plain(f"{mapping}: {todo}, then: jaxfinger import … --mapping {mapping}"))
+
+
+def _of_robot(robot: Path, joints: str | None, tip: str) -> tuple[str, list[str], list[str]]:
+    """Text of the finger's file, and the names of its joints and tendons; prints what the finger cannot take over."""
+    from jaxfinger.data.finger_file import finger_toml
+    from jaxfinger.data.importing.robot import robot_finger
+    from jaxfinger.data.importing.templates import robot_head
+
+    found, remarks = robot_finger(robot, _names("joint", joints or ""), tip)
+    for remark in remarks:
+        print(plain(f"{robot}: {remark}"))
+    return robot_head(robot.name) + finger_toml(found), list(found.joint_names), list(found.tendon_names)
 
 
 def _proposal(recordings: tuple[Path, ...], specimen: str, beside: str, described: str, finger: Path) -> str:

@@ -24,17 +24,21 @@ _MAX_STILL_CHANGE = 0.1  # of the quickest change between parts: with less a joi
 _MIN_STILL_SHARE = 0.4  # of the parts: a stepped joint stands still in more of them, a swinging one in a sixteenth.
 _MIN_TENSION_CHANGE = 0.5  # of the highest tension: larger where tendons drive the finger (VD.3), smaller in VD.1.
 _MAX_LEFT_OUT = 12  # variables that are named, so that the line of a large bag stays readable.
+_TOGETHER = 0.9  # of the time of two logs: with more in common they show one trial.
 _HEAD = 'specimen = "my finger"\nfinger = "finger.toml"'
 
 
 def proposal(recordings: Sequence[Recording], finger: FingerDescription | None = None, head: str = _HEAD) -> str:
     """Propose a mapping (TOML) with one trial for each recording, to be corrected by someone who knows the rig.
 
-    Columns are assigned to the finger's joints and tendons by name, or in order where names do not match. Without a
-    finger, joints and tendons are named as in the recordings. Channels that all recordings map alike are shared. `head`
-    holds the lines of specimen and finger.
+    A recording without angles, such as the log of a torque sensor alone, belongs to the trial of the recording with
+    angles that was made at the same time. Columns are assigned to the finger's joints and tendons by name, or in order
+    where names do not match. Without a finger, joints and tendons are named as in the recordings. Channels that all
+    recordings map alike are shared. `head` holds the lines of specimen and finger.
     """
-    proposed = [_trial_proposal(recording, recordings, finger) for recording in recordings]
+    seen = [columns_of(recording, recordings) for recording in recordings]
+    trials = _trials([_Log(*pair) for pair in zip(recordings, seen, strict=True)])
+    proposed = [_trial_proposal(logs, finger) for logs in trials]
     channels = {channel: None for trial in proposed for channel in trial.channels}
     shared = {}
     for channel in channels if len(proposed) > 1 else ():
@@ -45,7 +49,7 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
     if shared:
         lines += ["", "[channels]   # of all trials"]
         lines += [f"{channel}.{as_key(name)} = {said}" for channel, rows in shared.items() for name, said in rows]
-    for number, (recording, trial) in enumerate(zip(recordings, proposed, strict=True), 1):
+    for number, (recording, trial) in enumerate(zip([logs[0].recording for logs in trials], proposed, strict=True), 1):
         stem = re.sub(r"[^A-Za-z0-9_-]+", "-", recording.path.stem).strip("-") or "log"
         stem = stem if re.match(r"\d", stem) else f"{number:02}-{stem}"
         lines += ["", f"[trials.{as_key(stem)}]", f"file = {quoted(recording.path.name)}", *trial.lines]
@@ -67,15 +71,66 @@ class _Proposal:
     left_out: list[str]  # names of variables that no channel reads
 
 
-def _trial_proposal(
-    recording: Recording, recordings: Sequence[Recording], finger: FingerDescription | None
-) -> _Proposal:
-    """Propose a trial for a recording, one of several of one rig."""
-    seen = columns_of(recording, recordings)
-    clock = next((s for s in seen if s.meaning == "time" and s.name.endswith(".stamp")), None)
-    clock = clock or next((s for s in seen if s.meaning == "time"), None)
+@dataclass(frozen=True)
+class _Log:
+    """A recording and the survey of its columns."""
+
+    recording: Recording
+    seen: list[ColumnSurvey]
+
+    @property
+    def clock(self) -> ColumnSurvey | None:
+        """Column with the times of its samples: stamps of headers before other clocks."""
+        clocks = [s for s in self.seen if s.meaning == "time"]
+        return next((s for s in clocks if s.name.endswith(".stamp")), clocks[0] if clocks else None)
+
+    @property
+    def time(self) -> np.ndarray:
+        """Times of its samples, s; empty where it has no clock."""
+        if (clock := self.clock) is None:
+            return np.zeros(0)
+        return np.ravel(self.recording.variables[clock.name].values) * TO_SI[clock.units or "s"].factor
+
+    @property
+    def channels(self) -> set[str]:
+        """Channels that its columns may be."""
+        return {s.meaning for s in self.seen if s.meaning not in ("", "time") and s.samples > 2}
+
+
+def _trials(logs: Sequence[_Log]) -> list[list[_Log]]:
+    """Logs of each trial: one without angles joins the only one with angles that shares its time and no channel."""
+    trials = {i: [log] for i, log in enumerate(logs)}
+    for i, log in enumerate(logs):
+        if "q" in log.channels:
+            continue
+        beside = [
+            k
+            for k, other in enumerate(logs)
+            if "q" in other.channels
+            and not log.channels & other.channels
+            and _overlap(log.time, other.time) > _TOGETHER
+        ]
+        if len(beside) == 1:
+            trials[beside[0]].append(log)
+            del trials[i]
+    return list(trials.values())
+
+
+def _overlap(a: np.ndarray, b: np.ndarray) -> float:
+    """Share of the time of two clocks that both cover."""
+    ends = [(np.nanmin(x), np.nanmax(x)) for x in (a, b) if np.isfinite(x).any()]
+    if len(ends) < 2:
+        return 0.0
+    (first, last), (begin, end) = ends
+    return (min(last, end) - max(first, begin)) / max(max(last, end) - min(first, begin), np.finfo(float).tiny)
+
+
+def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _Proposal:
+    """Propose a trial for the logs that were made at one time; the first one gives its times."""
+    recording, clock, time = logs[0].recording, logs[0].clock, logs[0].time
+    elsewhere = {s: log for log in logs[1:] for s in log.seen}
     channels: dict[str, list[ColumnSurvey]] = {}
-    for s in seen:
+    for s in (s for log in logs for s in log.seen):
         if s.meaning not in ("", "time") and s.samples > 2:
             channels.setdefault(s.meaning, []).append(s)
     for channel in ("q", "joint_torque"):
@@ -88,10 +143,9 @@ def _trial_proposal(
     lines = [f'experiment = "{experiment}"   # guessed: ID.2, ID.3-static, ID.3-dynamic, ID.4, VD.1, VD.2 or VD.3']
     lines += [f"joint = {quoted(joint)}   # that is moved, or held by the torque sensor"] if joint else []
     lines += [f"tendon = {quoted(tendon)}   # that is pulled"] if tendon else []
-    time = np.ravel(recording.variables[clock.name].values) * TO_SI[clock.units or "s"].factor if clock else np.zeros(0)
     coarse = coarse_rate(time)
     if clock is None:
-        lines.append("rate_hz = 1000   # no time was found: write samples per second")
+        lines.append('time = "?"   # no time was found: name its variable, or write `rate_hz`, samples per second')
     elif coarse is not None:
         lines.append(f"rate_hz = {coarse[1]:.4g}   # several samples share each stamp of {quoted(clock.name)}")
     elif clock.units in ("s", ""):
@@ -102,12 +156,16 @@ def _trial_proposal(
         lines.append(f"# the time begins again after sample {begins[0]}: a trial for each part, chosen by `where`")
     elif coarse is None and (np.diff(time) <= 0.0).any():
         lines.append("sort = true   # its stamps are out of order, or repeated")
+    slides = dict(zip(finger.joint_names, finger.prismatic, strict=True)) if finger is not None else {}
     rows = {
-        channel: [(name, _column(s)) for name, s in zip(names[channel], columns, strict=False)]
+        channel: [
+            (name, _column(s, elsewhere.get(s), slides.get(name, False)))
+            for name, s in zip(names[channel], columns, strict=False)
+        ]
         for channel, columns in channels.items()
     }
-    read = {s.name for channel, columns in channels.items() for s in columns[: len(rows[channel])]}
-    left_out = dict.fromkeys(s.name for s in seen if s.name not in read and s.meaning != "time")
+    read = {s for channel, columns in channels.items() for s in columns[: len(rows[channel])]}
+    left_out = dict.fromkeys(s.name for log in logs for s in log.seen if s not in read and s.meaning != "time")
     return _Proposal(lines, rows, list(left_out))
 
 
@@ -144,7 +202,8 @@ def _experiment(
         stem = recording.path.stem.lower()
         named = [name for name in names["q"] if name.lower() in stem] if len(names["q"]) > 1 else names["q"]
         return "ID.4", named[0] if len(named) == 1 else "?", tendon
-    if torque or not moved or not (force or excursion):  # A motor moves a joint.
+    if torque or not moved or not (force or excursion):  # A motor moves a joint, or several do, each with its torque.
+        joint = joint if len(moved) <= 1 or len(torque) <= 1 else ""
         return ("ID.3-static" if moved and _stepped(recording, q[most]) else "ID.3-dynamic"), joint, ""
     if len(moved) == 1:
         return "ID.2", joint, ""
@@ -191,14 +250,21 @@ def _by_number(columns: Sequence[ColumnSurvey], known: Sequence[str]) -> list[st
     return [known[sorted(numbers).index(number)] for number in numbers] if len(numbers) <= len(known) else list(known)
 
 
-def _column(seen: ColumnSurvey) -> str:
-    """Inline table (TOML) that reads a column."""
+def _column(seen: ColumnSurvey, log: _Log | None, slides: bool) -> str:
+    """Inline table (TOML) that reads a column, of another log than the trial's where one is given."""
     parts = [f"from = {quoted(seen.name)}"]
     if seen.column is not None:
         parts.append(f"column = {quoted(seen.column) if isinstance(seen.column, str) else seen.column}")
+    if log is not None:
+        parts.append(f"file = {quoted(log.recording.path.name)}")
+        if log.clock is not None:
+            units = f', units = "{log.clock.units}"' if log.clock.units not in ("s", "") else ""
+            parts.append(f"time = {{ from = {quoted(log.clock.name)}{units} }}")
     fits = {"q": "rad", "joint_torque": "N m", "tendon_force": "N", "fingertip_force": "N", "tendon_excursion": "m"}
-    if seen.units and TO_SI[seen.units].si == fits.get(seen.meaning):
+    fits |= {"q": "m", "joint_torque": "N"} if slides else {}
+    known = bool(seen.units) and TO_SI[seen.units].si == fits.get(seen.meaning)
+    if known:
         parts.append(f'units = "{seen.units}"')
     said = f"it states {seen.foreign}: write `scale`" if seen.foreign else "SI as it stands"
-    unclear = "" if seen.units else f"   # units? {said}"
+    unclear = "" if seen.units and (known or not slides) else f"   # units? {said}"
     return "{ " + ", ".join(parts) + " }" + unclear

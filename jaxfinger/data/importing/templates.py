@@ -56,6 +56,16 @@ active = true                   # false: a passive tendon, whose force and excur
     return text
 
 
+def robot_head(robot: str) -> str:
+    """Comment above a finger that was read from a robot's description."""
+    return f"""# The finger as {robot} describes it.
+# All frames are parallel at zero angles, and the base lies at the first joint. Compare masses with a scale, and say how
+# well they are known (`mass_std`, `com_std`): without that they are taken for exact. `gravity` is the file's: if the
+# finger was mounted otherwise, correct it.
+
+"""
+
+
 def _length(i: int) -> float:
     return _LENGTHS[min(i, len(_LENGTHS) - 1)]
 

@@ -55,6 +55,39 @@ def test_a_shuffled_clock_is_said_and_its_rate_is_that_of_sorted_stamps(tmp_path
     assert "sort = true" in said
 
 
+@pytest.mark.parametrize(
+    ("name", "time", "said"),
+    [
+        ("t_ms", np.cumsum(np.random.default_rng(0).choice([9, 10, 10, 10, 11], 500)), 'time = { from = "t_ms"'),
+        ("time_s", np.tile(np.arange(300) / 100, 2), "the time begins again after sample 299"),
+        ("counter", np.zeros(500), 'time = "?"'),
+    ],
+    ids=["uneven", "pasted twice", "none"],
+)
+def test_a_clock_is_told_or_asked_for_and_no_rate_is_invented(tmp_path, name, time, said):
+    path = tmp_path / "log.csv"
+    table = np.column_stack([time, 40 + 30 * np.sin(np.arange(len(time)) / 50)])
+    np.savetxt(path, table, "%.6f", ",", header=f"{name},angle_deg", comments="")
+    text = proposal([load_recording(path)])
+    assert said in text
+    assert "rate_hz =" not in text
+
+
+def test_a_log_without_angles_belongs_to_the_angles_of_its_time(tmp_path):
+    """The torque sensor's logger runs on its own clock; two sweeps at other times are two trials."""
+    for k, start in enumerate((0.0, 100.0), 1):
+        time, cell = start + np.arange(1000) / 100, start + 0.002 + np.arange(2000) / 200
+        angles = np.column_stack([time, 40 + 30 * np.sin(time)])
+        np.savetxt(tmp_path / f"angle{k}.csv", angles, "%.6f", ",", header="stamp,angle_deg", comments="")
+        torques = np.column_stack([cell, 5 * np.sin(cell)])
+        np.savetxt(tmp_path / f"cell{k}.csv", torques, "%.6f", ",", header="time_s,torque_Nmm", comments="")
+    files = [tmp_path / f"{name}{k}.csv" for name in ("cell", "angle") for k in (1, 2)]
+    text = proposal([load_recording(path) for path in files])
+    assert text.count("[trials.") == 2
+    assert 'file = "cell1.csv", time = { from = "time_s" }' in text.split("[trials.")[1]
+    assert 'file = "cell2.csv", time = { from = "time_s" }' in text.split("[trials.")[2]
+
+
 def test_a_clock_that_begins_again_is_said(tmp_path, capsys):
     path = tmp_path / "log.csv"
     np.savetxt(path, np.column_stack([TIME % 4000.0, TIME]), "%.6f", ",", header="t,enc", comments="")
