@@ -174,6 +174,11 @@ class Closure:
         judged = self.resolvable and not self.diverged and self.channel != "q"
         return judged and self.noise > 0 and self.after > MAX_CLOSED_RMS * self.noise
 
+    @property
+    def gets_worse(self) -> bool:
+        """Whether the causes surely make the predictions of held-out trials worse."""
+        return self.resolvable and not self.diverged and self.closed_ci95[1] < 0.0
+
 
 def tolerated(line: Closure, relevance: Sequence[Relevance], tolerance: Mapping[str, float]) -> bool:
     """Whether the rest of a channel's gap, relative to its signal, is within the user's tolerance."""

@@ -18,6 +18,7 @@ from jaxfinger.identify import Fit
 from jaxfinger.model import Model, rigid_body
 from jaxfinger.report.measured import Points, arm_points, hold_points, loss_points
 
+ROUNDING = 1e-12  # of the largest torque of gravity: less is what rounding leaves of none
 SAMPLES = 61  # Points of a curve: two degrees apart over a range of 120°, closer than a figure resolves.
 MAX_TENSION = 12.0  # N, where curves of lost tension end without a session: a fifth above the paper's highest, 10 N
 
@@ -96,6 +97,7 @@ def model_curves(fit: Fit, session: Session | None = None) -> Curves:
     cuts = np.cumsum((finger.n * m * S, m * S, m * S, m))
     arms, elastic, friction, damping, loss = zip(np.split(values, cuts), np.split(std, cuts), strict=True)
     gravity = np.asarray(_gravity_torque(model.finger, jax.device_put(q)))
+    gravity = np.where(np.abs(gravity) > ROUNDING * np.abs(gravity).max(initial=0.0), gravity, 0.0)
 
     def shaped(pair, shape):
         return tuple(a.reshape(shape) for a in pair)

@@ -207,9 +207,20 @@ def _partly(d: Diagnosis) -> list[str]:
     if stay:
         names = [f"{_of(x.experiment, x.channel)} ({number(x.after / x.noise, 2)} times its noise)" for x in stay]
         left.append(f"what stays open on trials that no fit has seen is {_listed(names, 'channel')}")
-    if d.unexplained.share > MAX_LEFT and named_causes(d):
-        left.append("so much is left that what is named may only imitate a law that nobody listed")
+    worse = [x for x in d.closures if x.gets_worse] if named_causes(d) else []
+    if worse:
+        names = [f"{_of(x.experiment, x.channel)} ({_rms(x)})" for x in worse]
+        left.append(f"with what is named, trials that no fit has seen are predicted worse: {_listed(names, 'channel')}")
+    if worse or (d.unexplained.share > MAX_LEFT and named_causes(d)):
+        so = "so" if worse else "so much is left that"
+        left.append(f"{so} what is named may only imitate a law that nobody listed")
     return [size(d), "; ".join([_blamed(d), *unknown]), "; ".join(left)]
+
+
+def _rms(x: Closure) -> str:
+    """Held-out rms of a channel without and with the causes: «624 instead of 608 N mm»."""
+    (before, after), unit = alike((x.before, x.after), x.units)
+    return f"{after} instead of {before} {unit}"
 
 
 def cannot_tell(members: Sequence[Key]) -> str:

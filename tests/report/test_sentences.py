@@ -192,6 +192,19 @@ def test_simulated_angles_do_not_count_as_predicted_to_within_the_noise():
     assert "predicts both channels that could be judged" in sentences.summary(d)
 
 
+def test_causes_that_make_unseen_trials_worse_may_only_imitate_another_law():
+    """In one channel they close the gap, and in another they open one, or the model is extrapolated."""
+    worse = replace(LINES[0], before=6.08e-4, after=6.24e-4, closed=-0.07, closed_ci95=(-0.12, -0.01))
+    text = sentences.summary(replace(ALL["partly"], closures=(worse, *LINES[1:])))
+    assert (
+        "with what is named, trials that no fit has seen are predicted worse: joint torque of ID.4 (0.62 instead of "
+        "0.61 N mm); so what is named may only imitate a law that nobody listed" in text
+    )
+    unsure = replace(worse, closed_ci95=(-0.12, 0.01))
+    assert "predicted worse" not in sentences.summary(replace(ALL["partly"], closures=(unsure, *LINES[1:])))
+    assert "predicted worse" not in sentences.summary(ALL["partly"])
+
+
 def test_a_rest_of_nothing_is_not_given_as_what_makes_the_diagnosis_partial():
     none_left = replace(ALL["partly"].unexplained, share=0.0, share_ci95=(0.0, 0.49))
     traces = replace(ALL["partly"], unexplained=none_left, closures=LINES, unlisted=0.9987)
