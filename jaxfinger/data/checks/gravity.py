@@ -38,6 +38,9 @@ _MIN_TURN = 0.77
 # show more have another reason.
 _MAX_GRAVITY = 1.25
 _MAX_SCALE = 2.0  # of a torque, up or down: masses and their places are known better than that.
+# Of the weight's torque: what must be left of it beside curves over the joint's own angle. With less, as where joints
+# move in proportion, any other small torque passes for a wrong scale.
+_MIN_REST = 0.1
 
 
 class _Motion(NamedTuple):
@@ -107,10 +110,12 @@ def check_torque_scales(session: Session, report: Report) -> None:
             for motion in _motion(trial, i, moving):
                 levers, torques, free = _equations(finger, i, [motion])
                 weight = levers @ finger.gravity
-                size = float(weight @ weight)
-                scale = float(weight @ torques) / size if size else 1.0
+                size, whole = weight @ weight, np.var(gravity_levers(finger, motion.q)[:, i] @ finger.gravity)
+                if size < _MIN_REST**2 * whole * len(weight) or size == 0.0:
+                    continue
+                scale = weight @ torques / size
                 misfit = torques - scale * weight
-                noise = np.sqrt(misfit @ misfit / max(free, 1) / size) if size else np.inf
+                noise = np.sqrt(misfit @ misfit / max(free, 1) / size)
                 if noise < _MAX_STD and not 1.0 / _MAX_SCALE < scale < _MAX_SCALE:
                     wrong.append(f"{finger.joint_names[i]} {scale:.2g}")
         if wrong:
