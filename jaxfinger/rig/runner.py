@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import NoReturn
 
@@ -257,7 +258,10 @@ class Runner:
         start = since
         while reader.reads and time.monotonic() < latest and not done():
             self.rig.report_alive()
-            reader.next()
+            block = reader.next()
+            if block is not None:
+                with suppress(Exception):  # A view that fails must not cut off a stop.
+                    self._show("waiting for the controller", block)
             start = reader.latest_seq if start is None and reader.latest_seq >= 0 else start
             if start is not None and reader.latest_seq - start >= seconds * rate:
                 break
@@ -288,6 +292,7 @@ class Runner:
         def keep_waiting() -> bool:
             self.rig.report_alive()
             latest, reader = self.reader.latest, self.reader
+            self._show("waiting for Enter", latest)  # Who has a hand at the finger sees the tension that it has now.
             strays = as_told and (tripped(latest) or self._let_go(latest) or self._took_hold(latest))
             return reader.error is None and reader.violation is None and not strays and not late()
 
@@ -429,6 +434,11 @@ class Runner:
             self.tare[rig.channels[i].name] = float(mean)
 
     # waiting ----------------------------------------------------------------------------------------------------
+    def _show(self, doing: str, block: Block | None) -> None:
+        """Hand the state of the run to the live view."""
+        reader = self.reader
+        self.observe(View(*self._place, doing, block, reader.lost, reader.recording, reader.lag_s))
+
     def _wait(
         self, doing: str, done: Callable[[Block], bool], timeout: float, lacks: Callable[[], str] = lambda: ""
     ) -> None:
@@ -444,9 +454,7 @@ class Runner:
             self._check(block)
             if block is not None:
                 start = start if start >= 0 else int(block.seq[0])  # the first block of all
-                self.observe(
-                    View(*self._place, doing, block, self.reader.lost, self.reader.recording, self.reader.lag_s)
-                )
+                self._show(doing, block)
                 if done(block):
                     return
             passed = (int(block.seq[-1]) - start) / self.rig.description.rate_hz if block is not None else 0.0

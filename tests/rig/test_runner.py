@@ -463,6 +463,20 @@ def test_drives_that_come_on_while_hands_are_at_the_finger_stop_the_rig(rig, rec
     assert len(person.prompts) == 2
 
 
+def test_the_view_at_a_prompt_and_after_a_stop_shows_the_newest_samples(rig, short, tmp_path):
+    """Hands are at an armed finger, and then it is stopped: an old tension on the screen would be a wrong one."""
+    machine, views = SimulatedRig(rig), []
+    person = Away(machine, "Hold DIP", late=0.2)
+    person.stop_requested = lambda: "Hold DIP" in person.prompts[-1] if person.prompts else False
+    outcome = run(short, machine, tmp_path / "s.h5", operator=person, observe=views.append)
+    assert outcome.cause.endswith(RELEASED)
+    at_prompt = [v for v in views if v.doing == "waiting for Enter" and int(v.block.state[-1]) == State.ARMED]
+    before = [v for v in views if v.doing == "tensions settling"]
+    assert int(at_prompt[-1].block.seq[-1]) >= int(before[-1].block.seq[-1])
+    assert int(views[-1].block.state[-1]) == State.TRIPPED
+    assert views[-1].block.x[-1, rig.index("tension", "T3")] < 1.0
+
+
 def test_a_joint_that_is_not_fixed_as_asked_is_asked_for_again(rig, record):
     """The PIP's angle is in radians, and the rig file says degrees."""
     wrong = re.sub(r'(kind = "joint_position"\nof = "PIP"\nslot = \d+\nunit = )"rad"', r'\1"deg"', rig.text)
