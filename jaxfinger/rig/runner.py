@@ -194,33 +194,44 @@ class Runner:
             self._let_pass(AFTER_TRIP_S, lambda: not tripped(self.reader.latest))
         if (state := rig.status().state) is not State.IDLE:
             raise UserError(f"nothing was armed: the controller is in state {state.name}, not IDLE; see its program.")
+        self._refuse_unready()  # Before a prompt has hands at the finger.
         self._off = True
         straight = dict.fromkeys(rig.description.finger.joint_names, 0.0)
         self._prepare(Setup("Fix the finger straight: all joints at 0°.", straight))
 
     def _switch_on(self) -> None:
-        """Arm the rig once samples have come without a violation, and no tendon pulls.
+        """Arm the rig once it is ready.
 
         Raises:
             UserError: something is wrong; nothing was armed.
         """
-        rig = self.rig
-
-        def quiet() -> bool:
-            return self.reader.quiet(round(QUIET_S * rig.description.rate_hz))
-
-        self._let_pass(QUIET_TIMEOUT_S, lambda: quiet() or self.reader.violation is not None)
-        self._check(self.reader.latest)
-        if not quiet():
-            bad = self.reader.unarmed_violation
-            what = bad.sentence if bad is not None else "too few samples came"
-            raise UserError(f"nothing was armed: {what}.")
-        if still := pulled(tensions(self.reader.latest, rig.description)):
-            mend = "free the tendon, or see its load cell and its offset"
-            raise UserError(f"nothing was armed: with the drives off {still}; {mend}.")
+        self._refuse_unready()
         self._off = False
         self.watch.guard()
-        self._sent(rig.arm)
+        self._sent(self.rig.arm)
+
+    def _refuse_unready(self) -> None:
+        """Wait for samples from now on, and for QUIET_S of them without a violation; see that no tendon pulls.
+
+        The drives are off.
+
+        Raises:
+            UserError: such samples did not come, or a tendon pulls; nothing was armed.
+        """
+        reader, rig, head = self.reader, self.rig.description, self.rig.status().head
+
+        def quiet() -> bool:
+            return reader.latest_seq >= head and reader.quiet(round(QUIET_S * rig.rate_hz))
+
+        self._let_pass(QUIET_TIMEOUT_S, lambda: quiet() or reader.violation is not None)
+        self._check(reader.latest)
+        if not quiet():
+            bad = reader.unarmed_violation
+            what = bad.sentence if bad is not None else "too few samples came"
+            raise UserError(f"nothing was armed: {what}.")
+        if still := pulled(tensions(reader.latest, rig)):
+            mend = "free the tendon, or see its load cell and its offset"
+            raise UserError(f"nothing was armed: with the drives off {still}; {mend}.")
 
     def _switch_off(self) -> None:
         """Release the finger, and see that the drives are off and no tendon pulls.

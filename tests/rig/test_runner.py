@@ -17,6 +17,7 @@ from jaxfinger.rig import parse_plan, parse_rig, recorder, recover, runner, wal
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import Flag, Kind, State, Trip
 from jaxfinger.rig.operator import Nobody
+from jaxfinger.rig.protocols import Settled
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.runner import RELEASED, TENSION_NOT_SEEN_TO_FALL, Runner
@@ -557,7 +558,9 @@ def test_a_prompt_that_nobody_answers_in_time_releases_an_armed_finger(rig, reco
     person = Away(machine, "Hold DIP, free it", late)
     outcome = record(machine, operator=person)
     assert outcome.cause == f"01-ID.2-DIP: nobody answered the prompt within 0.2 s (prompt_s of [rig]); {RELEASED}"
-    assert "The finger is armed, with 2.0 N: without an answer within 0.2 s it is released." in person.prompts[-1]
+    said = r"The finger is armed, with (\d\.\d) N: without an answer within 0\.2 s it is released\."
+    (newton,) = re.findall(said, person.prompts[-1])
+    assert float(newton) == pytest.approx(2.0, abs=Settled.within)  # the largest of four pretensions, with their noise
     assert machine.controller.state is State.TRIPPED
     assert max(machine.controller.setpoint) == 0.0
     assert outcome.complete == ()
@@ -719,6 +722,17 @@ def test_a_tension_that_stands_with_the_drives_off_arms_nothing(rig, record, pul
     ):
         record(SimulatedRig(rig, controller))
     assert controller.state is State.IDLE
+
+
+def test_no_prompt_has_hands_at_a_finger_that_a_tendon_pulls(rig, record):
+    """The controller is idle, but a tendon is caught in its drive: the first prompt must not come."""
+    controller = Controller()
+    controller.strike("spike", controller.slots.tension[2], amount=6.0, standing=True)
+    machine = SimulatedRig(rig, controller)
+    person = Away(machine, "nothing")
+    with pytest.raises(UserError, match="with the drives off 'tension T3' reads"):
+        record(machine, operator=person)
+    assert person.prompts == []
 
 
 def test_a_load_cell_that_is_off_by_little_arms(rig, record):
