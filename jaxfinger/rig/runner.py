@@ -200,11 +200,16 @@ class Runner:
         self._prepare(Setup("Fix the finger straight: all joints at 0°.", straight))
 
     def _switch_on(self) -> None:
-        """Arm the rig once it is ready.
+        """Arm the rig once the log has taken a frame and the rig is ready.
+
+        The disk may have failed while nothing was written, as during a prompt.
 
         Raises:
             UserError: something is wrong; nothing was armed.
         """
+        self.reader.note("arm", "the drives are to be switched on")
+        if failed := self.reader.recorder.lacks(self._host_limit(self.rig.description.deadlines.disk_s)):
+            raise TrialEnded(f"nothing was armed: {failed}; make room on the disk, or mend it", Trip.RECORDER)
         self._refuse_unready()
         self._off = False
         self.watch.guard()

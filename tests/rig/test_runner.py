@@ -1,5 +1,6 @@
 """Whole sessions on the simulated rig: complete ones, and ones that a fault ends."""
 
+import errno
 import json
 import re
 import resource
@@ -722,6 +723,34 @@ def test_a_tension_that_stands_with_the_drives_off_arms_nothing(rig, record, pul
     ):
         record(SimulatedRig(rig, controller))
     assert controller.state is State.IDLE
+
+
+@pytest.mark.parametrize("words", ["Fix the finger straight", "Couple the external motor"])
+def test_a_disk_that_fills_while_the_drives_are_off_arms_nothing(rig, record, tmp_path, monkeypatch, words):
+    """Nothing is written during a prompt, so that only a frame of its own shows it before the motors may move."""
+    machine, written, armed = SimulatedRig(rig), wal.LogWriter.write, []
+    person = Away(machine, "nothing")
+    arm = machine.arm
+
+    def full(log, tag, payload):
+        if any(words in prompt for prompt in person.prompts):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written(log, tag, payload)
+
+    def count():
+        armed.append(person.prompts[-1])
+        return arm()
+
+    monkeypatch.setattr(wal.LogWriter, "write", full)
+    machine.arm = count
+    says = r"nothing was armed: session.h5.wal cannot be written: No space left on device; make room on the disk"
+    if words.startswith("Fix"):
+        with pytest.raises(UserError, match=says):
+            record(machine, operator=person)
+        assert list(tmp_path.iterdir()) == []
+    else:
+        assert re.search(says, record(machine, operator=person).cause)
+    assert not any(words in prompt for prompt in armed)
 
 
 def test_no_prompt_has_hands_at_a_finger_that_a_tendon_pulls(rig, record):
