@@ -76,8 +76,9 @@ def record(
 
 @contextmanager
 def _signals_as_interrupts() -> Iterator[None]:
-    """Treat SIGTERM and SIGHUP (a closed terminal) like Ctrl-C: release the finger and keep the recording."""
-    signals = (signal.SIGTERM, signal.SIGHUP) if threading.current_thread() is threading.main_thread() else ()
+    """Treat SIGTERM, SIGHUP (a closed terminal) and SIGQUIT (Ctrl-\\) like Ctrl-C: the recording is kept."""
+    main = threading.current_thread() is threading.main_thread()
+    signals = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT) if main else ()
     handlers = [signal.signal(number, signal.default_int_handler) for number in signals]
     try:
         yield

@@ -10,14 +10,16 @@ from typing import Annotated, Any
 import numpy as np
 
 from jaxfinger.data.toml import Document, Fault, NotEmpty, Place, one_of, parse_toml, read_toml, structure
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, counted
 from jaxfinger.rig.backend import CommandRefused, JointMove, Setup, TensionRamp
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.protocols import (
+    POSE_SHARE,
     PROTOCOLS,
     Common,
     Covered,
     Dwell,
+    DynamicTorque,
     Protocol,
     Reached,
     Settled,
@@ -125,6 +127,9 @@ def _plan(document: Document, rig: RigDescription) -> Plan:
                 if isinstance(step, TensionRamp | JointMove) and seconds > Reached.timeout:
                     said = f"takes {seconds:.0f} s for one command, longer than {Reached.timeout:g} s"
                     raise UserError(f"{said}; see the unit of its rate or speed")
+                if isinstance(step, Covered) and seconds > step.timeout:
+                    said = f"to and fro by hand {counted(step.passes, 'time')} takes {seconds:g} s, longer than the"
+                    raise UserError(f"{said} timeout of {step.timeout:g} s; give at least {seconds:g} s")
         except CommandRefused as error:
             mend = "change this [[trial]], or [limits] of the rig file"
             raise UserError(
@@ -164,8 +169,13 @@ def _check_parameters(experiment: str, parameters: Common, rig: RigDescription, 
         (place / "levels").fail("must be two or more rising tensions in N")
     if "range_deg" in values and values["range_deg"][0] >= values["range_deg"][1]:
         (place / "range_deg").fail("must be [lower, upper] with lower below upper")
-    if isinstance(p := parameters, StaticTorque) and (span := p.range_deg[1] - p.range_deg[0]) < p.step_deg:
-        (place / "range_deg").fail(f"spans {span:g}°, less than one step of {p.step_deg:g}°; give it in degrees")
+    if isinstance(p := parameters, StaticTorque | DynamicTorque):
+        span, (low, high) = p.range_deg[1] - p.range_deg[0], finger.limits[finger.joint_names.index(p.joint)]
+        if isinstance(p, StaticTorque) and span < p.step_deg:
+            (place / "range_deg").fail(f"spans {span:g}°, less than one step of {p.step_deg:g}°; give it in degrees")
+        if span < (least := POSE_SHARE * np.degrees(high - low)):  # The encoder's check could not see such a motion.
+            said = f"spans {span:g}°, less than {100 * POSE_SHARE:g} % of the range of {p.joint}"
+            (place / "range_deg").fail(f"{said}; give it in degrees, and at least {least:.1f}° wide")
     if values.get("mean") and len(values["mean"]) != int(finger.active.sum()):
         (place / "mean").fail(f"must give one tension for each of the {int(finger.active.sum())} active tendons")
     posture = parameters.posture_deg

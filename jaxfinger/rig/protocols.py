@@ -16,6 +16,7 @@ from typing import Annotated
 import numpy as np
 
 from jaxfinger.data.session import FingerDescription
+from jaxfinger.data.signals.motion import MIN_HOLD
 from jaxfinger.data.toml import Fault, NotEmpty, Positive, Within
 from jaxfinger.errors import counted
 from jaxfinger.rig.backend import Command, JointMove, Setup, TensionRamp
@@ -79,14 +80,20 @@ class Start:
     loaded: tuple[str, ...] = ()
 
 
-# N, the lowest target of VD.3, at which the free finger also begins: tendons stay taut, and no joint is thrown. The
-# controller takes less than 0.2 N for slack.
+# Of a joint's range: an encoder may differ by so much from the angle that the operator was asked for, or to which the
+# external motor went. A fixture set by eye is nearer; an angle in another unit, or of another joint, seldom is.
+POSE_SHARE = 0.1
+# N, the lowest tension of a plan, at which the free finger of VD.3 also begins: tendons stay taut, and no joint is
+# thrown. The controller takes less than 0.2 N for slack.
 MIN_TARGET = 0.6
 # Repeats or passes. A thousand of them give the noise's standard deviation to 2 % (1/√2000); more is a mistake.
 Count = Annotated[int, Within(1, 1000)]
 NotNegative = Annotated[float, Within(0.0)]
+Taut = Annotated[float, Within(MIN_TARGET, unit="N")]
 # Two hours, longer than the paper's whole session: more is a mistake, and the finger is armed all the while.
-Seconds = Annotated[float, Within(0.0, 7200.0, "s")]
+MAX_S = 7200.0
+Seconds = Annotated[float, Within(0.0, MAX_S, "s")]
+Recorded = Annotated[float, Within(MIN_HOLD, MAX_S, "s")]  # a shorter hold or recording gives no sample to a fit
 Step = Command | Setup | Reached | Dwell | Settled | Covered | Tare | Mark | Start
 Protocol = Iterator[Step]
 
@@ -110,7 +117,7 @@ class MomentArms(Common):
     """ID.2: a joint moved by hand through `share` of its range `passes` times, all tendons at `pretension` N."""
 
     joint: str = field(kw_only=True)
-    pretension: NotNegative = 2.0  # N
+    pretension: Taut = 2.0  # N
     share: float = 0.8  # at most 0.85: hands must not run the joint into its stops
     passes: Count = 3
     timeout: Seconds = 120.0  # s for all passes
@@ -133,7 +140,7 @@ class StaticTorque(Common):
     speed_deg_s: NotNegative = 30.0
     acceleration_deg_s2: NotNegative = 600.0
     settle: Seconds = 0.2  # s
-    dwell: Seconds = 0.5  # s
+    dwell: Recorded = 0.5  # s
 
 
 @dataclass(frozen=True)
@@ -153,18 +160,18 @@ class TendonFriction(Common):
 
     joint: str = field(kw_only=True)
     tendon: str = field(kw_only=True)
-    levels: Annotated[tuple[float, ...], Within(0.0, unit="N", above=True)] = (2.0, 4.0, 6.0, 8.0, 10.0)
+    levels: tuple[Taut, ...] = (2.0, 4.0, 6.0, 8.0, 10.0)
     down: bool = True
     settle: Seconds = 0.3  # s before a hold
-    dwell: Seconds = 0.5  # s of a hold
+    dwell: Recorded = 0.5  # s of a hold
 
 
 @dataclass(frozen=True)
 class FreeExcursion(Common):
     """VD.1: all joints moved by hand for `seconds`, with all tendons at `pretension` N."""
 
-    pretension: NotNegative = 2.0  # N
-    seconds: Seconds = 20.0
+    pretension: Taut = 2.0  # N
+    seconds: Recorded = 20.0
 
 
 @dataclass(frozen=True)
@@ -172,9 +179,9 @@ class FingertipForce(Common):
     """VD.2: fingertip on its force sensor, one tendon pulled through `levels` N, the others slack."""
 
     tendon: str = field(kw_only=True)
-    levels: Annotated[tuple[float, ...], Within(0.0, unit="N", above=True)] = tuple(float(f) for f in range(4, 16))
+    levels: tuple[Taut, ...] = tuple(float(f) for f in range(4, 16))
     settle: Seconds = 0.3
-    dwell: Seconds = 0.5
+    dwell: Recorded = 0.5
 
 
 @dataclass(frozen=True)
@@ -185,10 +192,10 @@ class Trajectory(Common):
     `posture_deg`.
     """
 
-    mean: tuple[float, ...] = ()  # N per active tendon; empty: 2 N each
+    mean: tuple[Taut, ...] = ()  # N per active tendon; empty: 2 N each
     amplitude: NotNegative = 0.8  # N
     interval: Positive = 0.5  # s
-    seconds: Seconds = 10.0
+    seconds: Recorded = 10.0
     seed: Annotated[int, Within(0)] = 0
 
 

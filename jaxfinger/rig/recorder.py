@@ -19,6 +19,7 @@ from jaxfinger.rig import wal
 from jaxfinger.rig.backend import Block
 from jaxfinger.rig.contract import Trip
 
+POLL_S = 0.002  # s between two looks whether the queue is empty
 SYNC_S = 1.0  # s between two fdatasync: a power cut costs at most as much of the recording
 # Samples that may wait for a slow disk before the run ends: 17 min at 1 kHz, 0.5 GB of memory with 60 channels.
 QUEUE_LIMIT = 1_000_000
@@ -75,6 +76,14 @@ class Recorder:
             return time.monotonic() - self._since[0]
         except IndexError:
             return 0.0
+
+    def lacks(self, timeout: float) -> str:
+        """Why the log cannot be written, or an empty string. Waits at most `timeout` s for the frames queued so far."""
+        limit = time.monotonic() + timeout
+        while self._since and self.failure is None and time.monotonic() < limit:
+            time.sleep(POLL_S)
+        late = f"{self.path.name}: the disk does not answer within {timeout:g} s" if self._since else ""
+        return self.failure or late
 
     def close(self, timeout: float = 5.0) -> None:
         """Write what is queued, force it to the disk, and end the thread.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import NoReturn
 
@@ -193,33 +194,49 @@ class Runner:
             self._let_pass(AFTER_TRIP_S, lambda: not tripped(self.reader.latest))
         if (state := rig.status().state) is not State.IDLE:
             raise UserError(f"nothing was armed: the controller is in state {state.name}, not IDLE; see its program.")
+        self._refuse_unready()  # Before a prompt has hands at the finger.
         self._off = True
         straight = dict.fromkeys(rig.description.finger.joint_names, 0.0)
         self._prepare(Setup("Fix the finger straight: all joints at 0°.", straight))
 
     def _switch_on(self) -> None:
-        """Arm the rig once samples have come without a violation, and no tendon pulls.
+        """Arm the rig once the log has taken a frame and the rig is ready.
+
+        The disk may have failed while nothing was written, as during a prompt.
 
         Raises:
             UserError: something is wrong; nothing was armed.
         """
-        rig = self.rig
-
-        def quiet() -> bool:
-            return self.reader.quiet(round(QUIET_S * rig.description.rate_hz))
-
-        self._let_pass(QUIET_TIMEOUT_S, lambda: quiet() or self.reader.violation is not None)
-        self._check(self.reader.latest)
-        if not quiet():
-            bad = self.reader.unarmed_violation
-            what = bad.sentence if bad is not None else "too few samples came"
-            raise UserError(f"nothing was armed: {what}.")
-        if still := pulled(tensions(self.reader.latest, rig.description)):
-            mend = "free the tendon, or see its load cell and its offset"
-            raise UserError(f"nothing was armed: with the drives off {still}; {mend}.")
+        self.reader.note("arm", "the drives are to be switched on")
+        if failed := self.reader.recorder.lacks(self._host_limit(self.rig.description.deadlines.disk_s)):
+            raise TrialEnded(f"nothing was armed: {failed}; make room on the disk, or mend it", Trip.RECORDER)
+        self._refuse_unready()
         self._off = False
         self.watch.guard()
-        self._sent(rig.arm)
+        self._sent(self.rig.arm)
+
+    def _refuse_unready(self) -> None:
+        """Wait for samples from now on, and for QUIET_S of them without a violation; see that no tendon pulls.
+
+        The drives are off.
+
+        Raises:
+            UserError: such samples did not come, or a tendon pulls; nothing was armed.
+        """
+        reader, rig, head = self.reader, self.rig.description, self.rig.status().head
+
+        def quiet() -> bool:
+            return reader.latest_seq >= head and reader.quiet(round(QUIET_S * rig.rate_hz))
+
+        self._let_pass(QUIET_TIMEOUT_S, lambda: quiet() or reader.violation is not None)
+        self._check(reader.latest)
+        if not quiet():
+            bad = reader.unarmed_violation
+            what = bad.sentence if bad is not None else "too few samples came"
+            raise UserError(f"nothing was armed: {what}.")
+        if still := pulled(tensions(reader.latest, rig)):
+            mend = "free the tendon, or see its load cell and its offset"
+            raise UserError(f"nothing was armed: with the drives off {still}; {mend}.")
 
     def _switch_off(self) -> None:
         """Release the finger, and see that the drives are off and no tendon pulls.
@@ -257,7 +274,10 @@ class Runner:
         start = since
         while reader.reads and time.monotonic() < latest and not done():
             self.rig.report_alive()
-            reader.next()
+            block = reader.next()
+            if block is not None:
+                with suppress(Exception):  # A view that fails must not cut off a stop.
+                    self._show("waiting for the controller", block)
             start = reader.latest_seq if start is None and reader.latest_seq >= 0 else start
             if start is not None and reader.latest_seq - start >= seconds * rate:
                 break
@@ -288,6 +308,7 @@ class Runner:
         def keep_waiting() -> bool:
             self.rig.report_alive()
             latest, reader = self.reader.latest, self.reader
+            self._show("waiting for Enter", latest)  # Who has a hand at the finger sees the tension that it has now.
             strays = as_told and (tripped(latest) or self._let_go(latest) or self._took_hold(latest))
             return reader.error is None and reader.violation is None and not strays and not late()
 
@@ -429,6 +450,11 @@ class Runner:
             self.tare[rig.channels[i].name] = float(mean)
 
     # waiting ----------------------------------------------------------------------------------------------------
+    def _show(self, doing: str, block: Block | None) -> None:
+        """Hand the state of the run to the live view."""
+        reader = self.reader
+        self.observe(View(*self._place, doing, block, reader.lost, reader.recording, reader.lag_s))
+
     def _wait(
         self, doing: str, done: Callable[[Block], bool], timeout: float, lacks: Callable[[], str] = lambda: ""
     ) -> None:
@@ -444,9 +470,7 @@ class Runner:
             self._check(block)
             if block is not None:
                 start = start if start >= 0 else int(block.seq[0])  # the first block of all
-                self.observe(
-                    View(*self._place, doing, block, self.reader.lost, self.reader.recording, self.reader.lag_s)
-                )
+                self._show(doing, block)
                 if done(block):
                     return
             passed = (int(block.seq[-1]) - start) / self.rig.description.rate_hz if block is not None else 0.0

@@ -165,9 +165,15 @@ def _log_to_resume(plan: Plan, rig: RigDescription, path: Path, output: Path, re
             "it was begun with."
         )
     if output.exists():
-        with h5py.File(output, "r") as file:
-            if file.attrs.get("created") != log.header["created"]:
-                raise UserError(f"{output}: is not the session that {path.name} belongs to; choose another name.")
+        try:
+            with h5py.File(output, "r") as file:
+                created = file.attrs.get("created")
+        except OSError:  # Damaged, or no session at all: the log does not say which, so it is not overwritten.
+            created = None
+        if created != log.header["created"]:
+            raise UserError(
+                f"{output}: is not the session that {path.name} belongs to, or is damaged; move it away, then resume."
+            )
     return log
 
 

@@ -7,7 +7,7 @@ import threading
 from types import FrameType
 from typing import Any
 
-ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, kill, a closed terminal
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)  # Ctrl-C, kill, closed terminal, Ctrl-\
 INTERRUPTED = "the run was interrupted"  # said after one of them
 
 

@@ -7,15 +7,12 @@ import numpy as np
 from jaxfinger.rig.backend import Block, Setup
 from jaxfinger.rig.channels import RigDescription
 from jaxfinger.rig.contract import State
-from jaxfinger.rig.protocols import Covered, Settled, swept
+from jaxfinger.rig.protocols import POSE_SHARE, Covered, Settled, swept
 from jaxfinger.rig.reader import Reader
 
 # N of measured tension, up to which a tendon counts as released. In 0.7 s the controller ramps to 2 N, then to 0.5 N
 # (docs/plc-contract.md); what lies between is for zeros of load cells and for friction that holds a tendon.
 RELEASED_TENSION = 2.0
-# Of a joint's range: an encoder may differ by so much from the angle that the operator was asked for, or to which the
-# external motor went. A fixture set by eye is nearer; an angle in another unit, or of another joint, seldom is.
-POSE_SHARE = 0.1
 
 
 def tensions(block: Block | None, rig: RigDescription) -> dict[str, float]:

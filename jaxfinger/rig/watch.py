@@ -2,9 +2,9 @@
 
 Who watches whom, in a recording in real time:
 
-- The watch is one thread. Every PERIOD_S it checks the stop key and the signals that end a program (Ctrl-C, SIGTERM,
-  SIGHUP), and from just before the rig is armed also reader, runner and heartbeat (a sign of life within `thread_s`)
-  and the disk (no frame waits for `disk_s`).
+- The watch is one thread. Every PERIOD_S it checks the stop key and the signals that end a program (signals.py), and
+  from just before the rig is armed also reader, runner and heartbeat (a sign of life within `thread_s`) and the disk
+  (no frame waits for `disk_s`).
 - A second thread sends the heartbeats, each after the watch has allowed it. No call to the controller, which may hang,
   ever holds up the watch; a heartbeat that hangs in its call is a silent thread like any other.
 - If a check fails, the watch stops the rig with the cause and allows no more heartbeats.

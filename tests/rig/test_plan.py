@@ -49,8 +49,8 @@ def steps(text, rig):
         ('experiment = "ID.3-dynamic"\njoint = "MCP"\npasses = 1000000000', 6, "outside 1 to 1000"),
         ('experiment = "ID.3-static"\njoint = "MCP"\nstep_deg = 1e-9', 6, "it must be at least 0.01 deg"),
         ('experiment = "VD.3"\nseconds = 7000.0\ninterval = 0.01', 3, "more than 100000 steps"),
-        ('experiment = "VD.1"\nseconds = 1e9', 5, "which is outside 0 to 7200 s"),
-        ('experiment = "ID.4"\njoint = "MCP"\ntendon = "T3"\ndwell = 1e5', 7, "which is outside 0 to 7200 s"),
+        ('experiment = "VD.1"\nseconds = 1e9', 5, "which is outside 0.2 to 7200 s"),
+        ('experiment = "ID.4"\njoint = "MCP"\ntendon = "T3"\ndwell = 1e5', 7, "which is outside 0.2 to 7200 s"),
         ('experiment = "VD.3"\ninterval = 0.0', 5, "must be above 0"),
         (
             'experiment = "ID.3-static"\njoint = "MCP"\nrange_deg = [0.0, 1.2]',
@@ -63,6 +63,28 @@ def steps(text, rig):
             "takes 110 s for one command, longer than 60 s; see the unit of its rate or speed",
         ),
         ('experiment = "ID.2"\njoint = "MCP"\ntension_rate = 0.01', 3, "takes 200 s for one command"),
+        (
+            'experiment = "ID.3-dynamic"\njoint = "MCP"\nrange_deg = [0.2, 1.1]',
+            6,
+            "spans 0.9°, less than 10 % of the range of MCP; give it in degrees, and at least 10.2° wide",
+        ),
+        (
+            'experiment = "ID.3-static"\njoint = "MCP"\nrange_deg = [0.0, 1.2]\nstep_deg = 0.2',
+            6,
+            "spans 1.2°, less than",
+        ),
+        (
+            'experiment = "ID.2"\njoint = "MCP"\ntimeout = 0',
+            3,
+            "by hand 3 times takes 12 s, longer than the timeout of 0 s",
+        ),
+        ('experiment = "ID.2"\njoint = "MCP"\npasses = 40', 3, "of 120 s; give at least 160 s"),
+        ('experiment = "ID.2"\njoint = "MCP"\npretension = 1e-9', 6, "is 1e-09 N; it must be at least 0.6 N"),
+        ('experiment = "ID.4"\njoint = "MCP"\ntendon = "T3"\ndwell = 0', 7, "is 0 s, which is outside 0.2 to 7200 s"),
+        ('experiment = "VD.1"\nseconds = 0', 5, "is 0 s, which is outside 0.2 to 7200 s"),
+        ('experiment = "VD.1"\npretension = 0.0', 5, "must be at least 0.6 N"),
+        ('experiment = "ID.4"\njoint = "MCP"\ntendon = "T3"\nlevels = [1e-9, 2.0]', 7, "must be at least 0.6 N"),
+        ('experiment = "VD.3"\nmean = [2.0, 2.0, -2.0, 2.0]', 5, "is -2 N; it must be at least 0.6 N"),
     ],
 )
 def test_a_mistake_names_its_line(rig, text, line, says):

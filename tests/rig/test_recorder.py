@@ -115,3 +115,12 @@ def test_a_full_disk_is_a_sentence_and_leaves_no_log(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(UserError, match="MiB are free; a session needs"):
         Recorder(tmp_path / "a.wal", {}, resume=True)
+
+
+def test_a_log_that_has_taken_its_frames_lacks_nothing_and_one_that_hangs_is_said(tmp_path):
+    Slow.go = threading.Event()
+    log = Recorder(tmp_path / "a.wal", {}, opener=Slow.create)
+    assert log.lacks(0.05) == "a.wal: the disk does not answer within 0.05 s"
+    Slow.go.set()
+    assert log.lacks(60.0) == ""
+    log.close(60.0)

@@ -42,6 +42,16 @@ def test_resume_with_another_plan_is_refused(rig, record, short):
         record(SimulatedRig(rig), plan=other, resume=True)
 
 
+def test_resume_does_not_overwrite_a_file_that_is_no_session(rig, record):
+    outcome = record(SimulatedRig(rig), lambda m: m.inject("nan", slot(m, "external_torque")))
+    outcome.session.write_bytes(b"damaged")
+    with pytest.raises(UserError, match="or is damaged; move it away, then resume"):
+        record(SimulatedRig(rig), resume=True)
+    assert outcome.session.read_bytes() == b"damaged"
+    outcome.session.unlink()
+    assert record(SimulatedRig(rig), resume=True).cause == ""
+
+
 def test_resume_with_another_rig_file_is_refused(rig, record):
     """The log keeps one description of its channels: samples of others would be read as if they were those."""
     record(SimulatedRig(rig), lambda m: m.inject("nan", slot(m, "external_torque")))
