@@ -222,7 +222,7 @@ class _Robot:
         """Remarks on links of the finger whose inertia is not the file's."""
         of_finger = {self.model.body(b).name for b in np.flatnonzero(link_of >= 0)}
         return [
-            f"{name}: no body has the inertia in the file; the nearest one of a body is written, {100 * share:.2g} % away"
+            f"{name}: no body has the inertia in the file; that of a body is written, {100 * share:.2g} % away"
             for name, share in self.changed.items()
             if name in of_finger
         ]
