@@ -392,7 +392,7 @@ def test_the_controllers_own_trip_ends_the_trial_with_its_cause(lockstep, record
         attributes, angle = file["trials/01-VD.3"].attrs, file["trials/01-VD.3/q"][:, 0]
         assert attributes["trip"] == Trip.POSITION
         assert attributes["cause"] in outcome.cause
-        events = [json.loads(e) for e in file["rig/events"].asstr()[()]]
+        events = [e for e in map(json.loads, file["rig/events"].asstr()[()]) if e["kind"] != "arm"]
     assert np.degrees(angle[-1]) == pytest.approx(92.0, abs=0.5)
     assert [(e["kind"], "joint beyond its limits" in e["text"]) for e in events] == [("trip", True)]
 
@@ -404,7 +404,7 @@ def test_a_limit_that_only_the_host_has_latches_the_controller_over_the_wire(loc
     assert Trip.TRACKING.sentence in outcome.cause
     with h5py.File(outcome.session) as file:
         assert file["trials/02-ID.4-T3-MCP"].attrs["trip"] == Trip.TRACKING
-        events = [json.loads(e) for e in file["rig/events"].asstr()[()]]
+        events = [e for e in map(json.loads, file["rig/events"].asstr()[()]) if e["kind"] != "arm"]
         assert [e["kind"] for e in events] == ["stop"]
         assert events[0]["text"] in outcome.cause
         held = file["rig/dropped/02-ID.4-T3-MCP/value"][-1, rig.description.columns("tension_setpoint", ["T3"])]
