@@ -92,6 +92,11 @@ def shelf(tmp_path_factory):
     columns = "time,angle knuckle,angle middle,force A,force B,length A,length B"
     swing = [40.0 - 30.0 * math.cos(0.02 * k) for k in range(1200)]
     rows = [f"{0.02 * k:.2f},{q:.4f},20,2,2,{0.14 * q:.5f},{-0.14 * q:.5f}" for k, q in enumerate(swing)]
+    hand = "<worldbody>{}</worldbody>"
+    for name in ("MCP", "PIP", "DIP"):
+        body = f'<body pos="0.03 0 0"><joint name="{name}" axis="0 1 0" range="0 90"/>'
+        hand = hand.format(body + '<geom type="capsule" fromto="0 0 0 0.03 0 0" size="0.006" mass="0.02"/>{}</body>')
+    (folder / "hand.xml").write_text(f"<mujoco>{hand.format('')}</mujoco>", encoding="utf-8")
     (folder / "LOG.csv").write_text("\n".join([columns, *rows]), encoding="utf-8")
     (folder / "plan.toml").write_text(SHORT, encoding="utf-8")
     (folder / "rig.toml").write_text(rig_toml(), encoding="utf-8")
