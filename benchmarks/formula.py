@@ -1,7 +1,7 @@
 """Fit the ten numbers of the diagnosis's formula (`jaxfinger/gap/formula.py`) by log score on sealed cases.
 
     jaxfinger sealed make cases --split develop --count 40
-    python benchmarks/formula.py weigh records cases           # a minute per case; resumes after a stop
+    python benchmarks/formula.py weigh records cases           # one to five minutes a case; resumes after a stop
     python benchmarks/formula.py fit records
 
 `weigh` searches every case and stores the evidence of every set of causes that the search weighs. `fit` maximises the

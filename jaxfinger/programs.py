@@ -34,7 +34,7 @@ from jaxlib.xla_client import get_topology_for_devices
 Result = TypeVar("Result")
 
 LIBRARIES = ("jax", "jaxlib", "equinox", "numpy")
-MONTH = 30 * 86_400.0  # s
+MONTH = 30 * 86_400.0  # s: whoever comes back later waits for one compilation.
 OWN = ("builtins", "jaxfinger", *LIBRARIES)  # packages whose code a key holds
 
 

@@ -19,7 +19,7 @@ from jaxfinger.rig import wal
 from jaxfinger.rig.backend import Block
 from jaxfinger.rig.contract import Trip
 
-POLL_S = 0.002  # s between two looks whether the queue is empty
+POLL_S = 0.002  # s between two looks whether the queue is empty: a frame is written within milliseconds.
 SYNC_S = 1.0  # s between two fdatasync: a power cut costs at most as much of the recording
 # Samples that may wait for a slow disk before the run ends: 17 min at 1 kHz, 0.5 GB of memory with 60 channels.
 QUEUE_LIMIT = 1_000_000

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -102,3 +104,28 @@ def record(short, tmp_path) -> Callable:
         return run(options.pop("plan", short), rig, path, observe=observe, **options)
 
     return go
+
+
+class Away:
+    """A person who answers every prompt at once, until one holds `words`; then in `late` s, or never (None)."""
+
+    def __init__(self, machine, words: str, late: float | None = None):
+        self.machine, self.words, self.late = machine, words, late
+        self.prompts, self.wanted = [], []
+        self.by_itself, machine.prepare = machine.prepare, lambda setup: bool(self.wanted.append(setup))
+
+    def ask(self, text, keep_waiting):
+        self.prompts.append(text)
+        until = time.monotonic() + (30.0 if self.late is None else self.late)
+        while self.words in text and time.monotonic() < until and (keep_waiting() or self.late is not None):
+            time.sleep(0.01)
+        self.by_itself(self.wanted[-1])
+        self.machine._pause(1.0)
+
+    def stop_requested(self):
+        return False
+
+
+def impatient(rig, seconds=0.2):
+    """The rig file with a short limit for prompts."""
+    return replace(rig, deadlines=replace(rig.deadlines, prompt_s=seconds))

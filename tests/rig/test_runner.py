@@ -1,6 +1,5 @@
 """Whole sessions on the simulated rig: complete ones, and ones that a fault ends."""
 
-import errno
 import json
 import re
 import resource
@@ -14,11 +13,10 @@ import pytest
 
 from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
-from jaxfinger.rig import parse_plan, parse_rig, recorder, recover, runner, wal
+from jaxfinger.rig import parse_plan, parse_rig, recorder, recover, wal
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import Flag, Kind, State, Trip
 from jaxfinger.rig.operator import Nobody
-from jaxfinger.rig.protocols import Settled
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.runner import RELEASED, TENSION_NOT_SEEN_TO_FALL, Runner
@@ -27,7 +25,7 @@ from jaxfinger.rig.session import log_path, run
 from jaxfinger.rig.signals import ENDING, Interrupts
 from jaxfinger.rig.simulated.controller import Controller
 from jaxfinger.rig.simulated.examples import rig_toml
-from tests.rig.conftest import SHORT, serious, slot
+from tests.rig.conftest import SHORT, Away, serious, slot
 
 
 def wait_until_written(log, trial):
@@ -290,25 +288,6 @@ def test_a_run_that_nothing_reads_ends_at_once(rig, tmp_path):
         recorder.close()
 
 
-def test_a_stop_key_at_a_prompt_is_no_answer_to_it(rig, tmp_path):
-    """The watch may be 20 ms behind the key: the runner looks for itself before it sends the next command."""
-
-    class Stopping(Nobody):
-        def stop_requested(self) -> bool:
-            return True
-
-    machine = SimulatedRig(rig)
-    machine.synchronous = False
-    with machine:
-        machine.stop(Trip.TENSION)
-        recorder = Recorder(tmp_path / "session.h5.wal", {})
-        runner = Runner(machine, Reader(machine, recorder, Supervisor(rig)), Stopping(), Interrupts())
-        with pytest.raises(UserError, match="stop key"):
-            runner.arm("operator")
-        assert machine.controller.state is State.TRIPPED  # The latch was not cleared.
-        recorder.close()
-
-
 def test_a_trial_that_waits_too_long_keeps_no_sample_of_its_release(rig, record):
     """The simulated hand does not come as near to the stops as this share of the range asks for."""
     first = SHORT.split('[[trial]]\nexperiment = "ID.4"')[0]
@@ -391,80 +370,6 @@ def test_a_disk_that_stays_too_slow_ends_the_trial_and_keeps_what_was_written(ri
     np.testing.assert_allclose(np.diff(cut.time), 1e-3, atol=1e-9)
 
 
-def test_a_person_at_a_bench_that_prepares_nothing_itself(rig, record):
-    """Every setup of the plan becomes a prompt. The run goes on once it is answered."""
-    machine, prompts, wanted = SimulatedRig(rig), [], []
-    by_itself = machine.prepare
-    machine.prepare = lambda setup: bool(wanted.append(setup))
-
-    class Person:
-        def ask(self, text, keep_waiting):
-            assert keep_waiting()
-            prompts.append(text)
-            by_itself(wanted[-1])
-            machine._pause(1.0)
-
-        def stop_requested(self):
-            return False
-
-    outcome = record(machine, operator=Person())
-    assert outcome.cause == ""
-    assert len(outcome.complete) == 2
-    straight, *rest = prompts
-    off, on = "The drives are off.", "Then hands off: Enter switches them on."
-    assert straight == f"{off} Fix the finger straight: all joints at 0°. {on}"
-    assert any(text.startswith("Hold DIP, free it, and move it slowly by hand") for text in rest)
-    assert rest[-1] == f"{off} Couple the external motor to MCP; the other joints stay fixed. {on}"
-
-
-def test_the_drives_are_off_while_hands_are_at_the_finger_unless_it_is_moved_by_hand(rig, record):
-    """In every experiment. The simulated operator acts within the prompt, and the drives go on only after it."""
-    trials = [
-        'experiment = "ID.2"\njoint = "MCP"\npasses = 1',
-        'experiment = "ID.3-static"\njoint = "MCP"\nstep_deg = 35.0',
-        'experiment = "ID.4"\njoint = "MCP"\ntendon = "T3"\nlevels = [3.0, 6.0]',
-        'experiment = "VD.3"\nmean = [4.0, 2.5, 3.0, 3.0]\nseconds = 1.0',
-        'experiment = "VD.1"\nseconds = 1.0',
-        'experiment = "VD.2"\ntendon = "T2"\nlevels = [4.0, 6.0]\nposture_deg = [10.0, 40.0, 35.0]',
-        'experiment = "ID.3-dynamic"\njoint = "MCP"\npasses = 1',
-    ]
-    text = '[plan]\nname = "all"\noperator = "tester"\n' + "".join(f"[[trial]]\n{t}\n" for t in trials)
-    machine, asked = SimulatedRig(rig), []
-    by_itself = machine.prepare
-
-    def prepare(setup):
-        controller = machine.controller
-        asked.append((bool(setup.hand), controller.state, controller.motor, max(controller.setpoint)))
-        return by_itself(setup)
-
-    machine.prepare = prepare
-    assert record(machine, plan=parse_plan(text, rig)).cause == ""
-    assert len(asked) == 14
-    assert [hand for hand, *_ in asked].count(True) == 2
-    for hand, state, motor, tension in asked:
-        assert motor is None
-        assert (state, tension) == ((State.ARMED, 2.0) if hand else (State.IDLE, 0.0))
-
-
-def test_drives_that_come_on_while_hands_are_at_the_finger_stop_the_rig(rig, record):
-    """From a panel of its own the controller can be told to arm. The prompt ends, and nothing else moves."""
-    machine = SimulatedRig(rig)
-    person = Away(machine, "nothing")
-    ask = person.ask
-
-    def ask_and_arm(text, keep_waiting):
-        ask(text, keep_waiting)
-        if "Fix all joints" in text:
-            machine.controller._obey(Kind.ARM, 0, 0.0, 0.0, [])
-            machine._pause(0.2)
-
-    person.ask = ask_and_arm
-    outcome = record(machine, operator=person)
-    assert "01-ID.2-DIP: the controller switched the drives on without being told to" in outcome.cause
-    assert machine.controller.state is State.TRIPPED
-    assert len(person.prompts) == 2
-
-
 def test_the_view_at_a_prompt_and_after_a_stop_shows_the_newest_samples(rig, short, tmp_path):
     """Hands are at an armed finger, and then it is stopped: an old tension on the screen would be a wrong one."""
     machine, views = SimulatedRig(rig), []
@@ -477,29 +382,6 @@ def test_the_view_at_a_prompt_and_after_a_stop_shows_the_newest_samples(rig, sho
     assert int(at_prompt[-1].block.seq[-1]) >= int(before[-1].block.seq[-1])
     assert int(views[-1].block.state[-1]) == State.TRIPPED
     assert views[-1].block.x[-1, rig.index("tension", "T3")] < 1.0
-
-
-def test_a_joint_that_is_not_fixed_as_asked_is_asked_for_again(rig, record):
-    """The PIP's angle is in radians, and the rig file says degrees."""
-    wrong = re.sub(r'(kind = "joint_position"\nof = "PIP"\nslot = \d+\nunit = )"rad"', r'\1"deg"', rig.text)
-    machine, prompts, wanted = SimulatedRig(parse_rig(wrong)), [], []
-    by_itself, machine.prepare = machine.prepare, lambda setup: bool(wanted.append(setup))
-
-    class Person:
-        def ask(self, text, keep_waiting):
-            prompts.append(text)
-            by_itself(wanted[-1])
-            machine._pause(1.0)
-
-        def stop_requested(self):
-            return len(prompts) > 4
-
-    outcome = record(machine, operator=Person())
-    assert prompts[1].startswith("The drives are off. Fix all joints: MCP 20°, PIP 20°")
-    assert prompts[2].startswith(
-        "'joint_position PIP' reads 0.3°, not 20.0°; see the fixture, and unit, scale and offset"
-    )
-    assert outcome.complete == ()
 
 
 def test_an_angle_that_does_not_follow_its_move_ends_the_trial(rig, record):
@@ -515,66 +397,6 @@ def test_an_angle_that_does_not_follow_its_move_ends_the_trial(rig, record):
     )
 
 
-def test_a_tension_in_another_unit_is_named(rig, record):
-    """The load cell of T2 gives mN, and the rig file says N; the controller has its own calibration."""
-    text = rig.text.replace(
-        'of = "T2"\nslot = 1\nunit = "N"\nscale = 1.0', 'of = "T2"\nslot = 1\nunit = "N"\nscale = 1e-3'
-    )
-    outcome = record(SimulatedRig(parse_rig(text)))
-    assert re.match(
-        r"tensions settling took longer than 20 s: 'tension T2' reads 0\.00\d+ N, not 2 N; see its unit", outcome.cause
-    )
-    assert outcome.cause.endswith(RELEASED)
-
-
-class Away:
-    """A person who answers every prompt at once, until one holds `words`; then in `late` s, or never (None)."""
-
-    def __init__(self, machine, words: str, late: float | None = None):
-        self.machine, self.words, self.late = machine, words, late
-        self.prompts, self.wanted = [], []
-        self.by_itself, machine.prepare = machine.prepare, lambda setup: bool(self.wanted.append(setup))
-
-    def ask(self, text, keep_waiting):
-        self.prompts.append(text)
-        until = time.monotonic() + (30.0 if self.late is None else self.late)
-        while self.words in text and time.monotonic() < until and (keep_waiting() or self.late is not None):
-            time.sleep(0.01)
-        self.by_itself(self.wanted[-1])
-        self.machine._pause(1.0)
-
-    def stop_requested(self):
-        return False
-
-
-def impatient(rig, seconds=0.2):
-    """The rig file with a short limit for prompts."""
-    return replace(rig, deadlines=replace(rig.deadlines, prompt_s=seconds))
-
-
-@pytest.mark.parametrize("late", [None, 0.4], ids=["never", "too late"])
-def test_a_prompt_that_nobody_answers_in_time_releases_an_armed_finger(rig, record, late):
-    """Nobody moves a motor for somebody who comes back later. The trial is repeated when the recording is resumed."""
-    machine = SimulatedRig(impatient(rig))
-    person = Away(machine, "Hold DIP, free it", late)
-    outcome = record(machine, operator=person)
-    assert outcome.cause == f"01-ID.2-DIP: nobody answered the prompt within 0.2 s (prompt_s of [rig]); {RELEASED}"
-    said = r"The finger is armed, with (\d\.\d) N: without an answer within 0\.2 s it is released\."
-    (newton,) = re.findall(said, person.prompts[-1])
-    assert float(newton) == pytest.approx(2.0, abs=Settled.within)  # the largest of four pretensions, with their noise
-    assert machine.controller.state is State.TRIPPED
-    assert max(machine.controller.setpoint) == 0.0
-    assert outcome.complete == ()
-    assert record(SimulatedRig(rig), resume=True).complete == ("01-ID.2-DIP", "02-ID.4-T3-MCP")
-
-
-def test_a_prompt_while_the_drives_are_off_may_wait(rig, record):
-    machine = SimulatedRig(impatient(rig, 2.0))
-    person = Away(machine, "Fix the finger straight", 2.5)
-    assert record(machine, operator=person).cause == ""
-    assert "is released" not in person.prompts[0]
-
-
 def test_filtered_terminals_are_refused_for_dynamic_experiments(rig, tmp_path):
     filtered = Controller(filtered=True)
     plan = parse_plan('[plan]\nname = "p"\n[[trial]]\nexperiment = "ID.3-dynamic"\njoint = "DIP"\n', rig)
@@ -588,24 +410,6 @@ def test_filtered_terminals_are_refused_for_dynamic_experiments(rig, tmp_path):
     with h5py.File(outcome.session) as file:
         bandwidth = dict(zip(file["rig/filters/channel"].asstr()[()], file["rig/filters/bandwidth"][()], strict=True))
         assert bandwidth["tension T1"] == 22.0
-
-
-def test_a_clock_that_jumps_while_the_drives_are_off_is_named_and_arms_nothing(rig, record):
-    machine = SimulatedRig(rig)
-    person = Away(machine, "nothing")
-    ask = person.ask
-
-    def ask_and_jump(text, keep_waiting):
-        ask(text, keep_waiting)
-        if "Couple the external motor" in text:
-            machine.inject("clock-jump", amount=3600.0)
-            machine._pause(0.3)
-
-    person.ask = ask_and_jump
-    outcome = record(machine, operator=person)
-    assert f"nothing was armed: {Trip.CLOCK.sentence}" in outcome.cause
-    assert machine.controller.state is State.TRIPPED
-    assert outcome.complete == ("01-ID.2-DIP",)
 
 
 def test_static_experiments_may_be_filtered(rig, record):
@@ -637,31 +441,6 @@ def test_a_gap_is_counted_and_written(rig, record, tmp_path):
         assert file["rig/gaps/lost"][()].tolist() == [lost]
         time = file["trials/01-ID.2-DIP/time"][()]
         assert np.diff(time).max() == pytest.approx((lost + 1) * 1e-3)
-
-
-@pytest.mark.parametrize(
-    ("fault", "says"),
-    [
-        ("nan", "nothing was armed: a channel is not a number or was flagged by its terminal (tension T1 = nan"),
-        ("clock-frozen", "nothing was armed: the controller's clock jumps or runs at another rate than it should"),
-        ("clock-rate", "nothing was armed: the controller's clock"),
-        ("flag", "nothing was armed: a channel is not a number or was flagged"),
-        ("stall", "wrote no sample"),
-        ("ring", "the controller's ring holds 1 samples, but a host that may lag by 0.25 s needs 414"),
-    ],
-)
-def test_what_is_wrong_before_arming_is_a_sentence_and_nothing_moves(rig, record, tmp_path, monkeypatch, fault, says):
-    monkeypatch.setattr(runner, "QUIET_TIMEOUT_S", 0.3)
-    controller = Controller()
-    if fault == "ring":
-        controller.tell_ring(1)
-    else:
-        controller.strike(fault, standing=True)
-    with pytest.raises(UserError) as error:
-        record(SimulatedRig(rig, controller))
-    assert says in str(error.value)
-    assert controller.state is State.IDLE
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_tension_that_cannot_be_seen_was_not_seen_to_fall(rig, record):
@@ -711,63 +490,6 @@ def test_a_controller_that_lets_go_by_itself_ends_the_trial(rig, record, kind):
     assert outcome.complete == ()
     assert not read_session(outcome.session)["01-ID.2-DIP"].complete
     assert machine.controller.state is State.TRIPPED
-
-
-@pytest.mark.parametrize("pull", [6.0, -6.0])
-def test_a_tension_that_stands_with_the_drives_off_arms_nothing(rig, record, pull):
-    """A load cell that is off by this would have the controller pull as much too hard, or too little."""
-    controller = Controller()
-    controller.strike("spike", controller.slots.tension[2], amount=pull, standing=True)
-    with pytest.raises(
-        UserError, match=r"nothing was armed: with the drives off 'tension T3' reads -?\d\.?\d* N; free"
-    ):
-        record(SimulatedRig(rig, controller))
-    assert controller.state is State.IDLE
-
-
-@pytest.mark.parametrize("words", ["Fix the finger straight", "Couple the external motor"])
-def test_a_disk_that_fills_while_the_drives_are_off_arms_nothing(rig, record, tmp_path, monkeypatch, words):
-    """Nothing is written during a prompt, so that only a frame of its own shows it before the motors may move."""
-    machine, written, armed = SimulatedRig(rig), wal.LogWriter.write, []
-    person = Away(machine, "nothing")
-    arm = machine.arm
-
-    def full(log, tag, payload):
-        if any(words in prompt for prompt in person.prompts):
-            raise OSError(errno.ENOSPC, "No space left on device")
-        written(log, tag, payload)
-
-    def count():
-        armed.append(person.prompts[-1])
-        return arm()
-
-    monkeypatch.setattr(wal.LogWriter, "write", full)
-    machine.arm = count
-    says = r"nothing was armed: session.h5.wal cannot be written: No space left on device; make room on the disk"
-    if words.startswith("Fix"):
-        with pytest.raises(UserError, match=says):
-            record(machine, operator=person)
-        assert list(tmp_path.iterdir()) == []
-    else:
-        assert re.search(says, record(machine, operator=person).cause)
-    assert not any(words in prompt for prompt in armed)
-
-
-def test_no_prompt_has_hands_at_a_finger_that_a_tendon_pulls(rig, record):
-    """The controller is idle, but a tendon is caught in its drive: the first prompt must not come."""
-    controller = Controller()
-    controller.strike("spike", controller.slots.tension[2], amount=6.0, standing=True)
-    machine = SimulatedRig(rig, controller)
-    person = Away(machine, "nothing")
-    with pytest.raises(UserError, match="with the drives off 'tension T3' reads"):
-        record(machine, operator=person)
-    assert person.prompts == []
-
-
-def test_a_load_cell_that_is_off_by_little_arms(rig, record):
-    controller = Controller()
-    controller.strike("spike", controller.slots.tension[2], amount=0.2, standing=True)
-    assert record(SimulatedRig(rig, controller)).cause == ""
 
 
 @pytest.mark.parametrize("where", ["observer", "stop"])

@@ -38,8 +38,8 @@ _MIN_TURN = 0.77
 # show more have another reason.
 _MAX_GRAVITY = 1.25
 _MAX_SCALE = 2.0  # of a torque, up or down: masses and their places are known better than that.
-# Of the weight's torque: what must be left of it beside curves over the joint's own angle. With less, as where joints
-# move in proportion, any other small torque passes for a wrong scale.
+# Of the weight's torque: what must be left of it beside curves over the joint's own angle. At this share, another
+# torque of a twentieth of the weight passes for half of its scale. Less is left where joints move in proportion.
 _MIN_REST = 0.1
 
 
@@ -102,28 +102,35 @@ def check_torque_scales(session: Session, report: Report) -> None:
         return
     coupled = _coupled(finger)
     for trial in session.select("ID.3-static", "ID.3-dynamic"):
-        moving = [i for name in moving_joints(trial, finger) if (i := finger.joint(name)) is not None]
+        moving = [finger.joint_names.index(name) for name in moving_joints(trial, finger)]
         if trial.joint is not None or len(moving) < 2:
             continue
-        wrong = []
-        for i in (i for i in moving if i not in coupled and not finger.prismatic[i]):
-            for motion in _motion(trial, i, moving):
-                levers, torques, free = _equations(finger, i, [motion])
-                weight = levers @ finger.gravity
-                size, whole = weight @ weight, np.var(gravity_levers(finger, motion.q)[:, i] @ finger.gravity)
-                if size < _MIN_REST**2 * whole * len(weight) or size == 0.0:
-                    continue
-                scale = weight @ torques / size
-                misfit = torques - scale * weight
-                noise = np.sqrt(misfit @ misfit / max(free, 1) / size)
-                if noise < _MAX_STD and not 1.0 / _MAX_SCALE < scale < _MAX_SCALE:
-                    wrong.append(f"{finger.joint_names[i]} {scale:.2g}")
+        told = [i for i in moving if i not in coupled and not finger.prismatic[i]]
+        scales = {i: _torque_scale(finger, i, motion) for i in told for motion in _motion(trial, i, moving)}
+        wrong = [
+            f"{scale:.2g} of it at {finger.joint_names[i]}"
+            for i, scale in scales.items()
+            if scale is not None and not 1.0 / _MAX_SCALE < scale < _MAX_SCALE
+        ]
         if wrong:
             report.warning(
                 trial.place("joint_torque"),
-                f"is this multiple of what gravity takes: {listed(wrong)}; correct scale and sign, or `mass` and `com` "
-                "(a motor's current or its torque before the gear needs `scale`)",
+                f"is not what gravity takes, with {listed(wrong)}: correct its scale (of a motor's current, or of its "
+                "torque before the gear) or its sign, or `mass` and `com`",
             )
+
+
+def _torque_scale(finger: FingerDescription, i: int, motion: _Motion) -> float | None:
+    """Torque of joint i over the one that gravity takes; None where the motion does not tell."""
+    levers, torques, free = _equations(finger, i, [motion])
+    weight = levers @ finger.gravity
+    size, whole = weight @ weight, np.var(gravity_levers(finger, motion.q)[:, i] @ finger.gravity)
+    if size == 0.0 or size < _MIN_REST**2 * whole * len(weight):
+        return None
+    scale = weight @ torques / size
+    misfit = torques - scale * weight
+    noise = np.sqrt(misfit @ misfit / max(free, 1) / size)
+    return float(scale) if noise < _MAX_STD else None
 
 
 def _coupled(finger: FingerDescription) -> set[int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -24,7 +25,9 @@ _MAX_STILL_CHANGE = 0.1  # of the quickest change between parts: with less a joi
 _MIN_STILL_SHARE = 0.4  # of the parts: a stepped joint stands still in more of them, a swinging one in a sixteenth.
 _MIN_TENSION_CHANGE = 0.5  # of the highest tension: larger where tendons drive the finger (VD.3), smaller in VD.1.
 _MAX_LEFT_OUT = 12  # variables that are named, so that the line of a large bag stays readable.
-_TOGETHER = 0.9  # of the time of two logs: with more in common they show one trial.
+# Of the time of two logs: with more in common they show one trial. Loggers that are started by hand begin and end a
+# little apart.
+_TOGETHER = 0.9
 _HEAD = 'specimen = "my finger"\nfinger = "finger.toml"'
 
 
@@ -49,7 +52,8 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
     if shared:
         lines += ["", "[channels]   # of all trials"]
         lines += [f"{channel}.{as_key(name)} = {said}" for channel, rows in shared.items() for name, said in rows]
-    for number, (recording, trial) in enumerate(zip([logs[0].recording for logs in trials], proposed, strict=True), 1):
+    for number, (logs, trial) in enumerate(zip(trials, proposed, strict=True), 1):
+        recording = logs[0].recording
         stem = re.sub(r"[^A-Za-z0-9_-]+", "-", recording.path.stem).strip("-") or "log"
         stem = stem if re.match(r"\d", stem) else f"{number:02}-{stem}"
         lines += ["", f"[trials.{as_key(stem)}]", f"file = {quoted(recording.path.name)}", *trial.lines]
@@ -84,17 +88,27 @@ class _Log:
         clocks = [s for s in self.seen if s.meaning == "time"]
         return next((s for s in clocks if s.name.endswith(".stamp")), clocks[0] if clocks else None)
 
-    @property
+    @cached_property
     def time(self) -> np.ndarray:
         """Times of its samples, s; empty where it has no clock."""
         if (clock := self.clock) is None:
             return np.zeros(0)
         return np.ravel(self.recording.variables[clock.name].values) * TO_SI[clock.units or "s"].factor
 
+    @cached_property
+    def span(self) -> tuple[float, float] | None:
+        """First and last time, s; None where it has none."""
+        return (float(np.nanmin(self.time)), float(np.nanmax(self.time))) if np.isfinite(self.time).any() else None
+
+    @property
+    def columns(self) -> list[ColumnSurvey]:
+        """Columns that may belong to a channel."""
+        return [s for s in self.seen if s.meaning not in ("", "time") and s.samples > 2]
+
     @property
     def channels(self) -> set[str]:
-        """Channels that its columns may be."""
-        return {s.meaning for s in self.seen if s.meaning not in ("", "time") and s.samples > 2}
+        """Channels that its columns may belong to."""
+        return {s.meaning for s in self.columns}
 
 
 def _trials(logs: Sequence[_Log]) -> list[list[_Log]]:
@@ -108,7 +122,7 @@ def _trials(logs: Sequence[_Log]) -> list[list[_Log]]:
             for k, other in enumerate(logs)
             if "q" in other.channels
             and not log.channels & other.channels
-            and _overlap(log.time, other.time) > _TOGETHER
+            and _overlap(log.span, other.span) > _TOGETHER
         ]
         if len(beside) == 1:
             trials[beside[0]].append(log)
@@ -116,13 +130,11 @@ def _trials(logs: Sequence[_Log]) -> list[list[_Log]]:
     return list(trials.values())
 
 
-def _overlap(a: np.ndarray, b: np.ndarray) -> float:
-    """Share of the time of two clocks that both cover."""
-    ends = [(np.nanmin(x), np.nanmax(x)) for x in (a, b) if np.isfinite(x).any()]
-    if len(ends) < 2:
+def _overlap(a: tuple[float, float] | None, b: tuple[float, float] | None) -> float:
+    """Share of the time of two spans that both cover."""
+    if a is None or b is None or (whole := max(a[1], b[1]) - min(a[0], b[0])) <= 0.0:
         return 0.0
-    (first, last), (begin, end) = ends
-    return (min(last, end) - max(first, begin)) / max(max(last, end) - min(first, begin), np.finfo(float).tiny)
+    return (min(a[1], b[1]) - max(a[0], b[0])) / whole
 
 
 def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _Proposal:
@@ -130,9 +142,8 @@ def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _
     recording, clock, time = logs[0].recording, logs[0].clock, logs[0].time
     elsewhere = {s: log for log in logs[1:] for s in log.seen}
     channels: dict[str, list[ColumnSurvey]] = {}
-    for s in (s for log in logs for s in log.seen):
-        if s.meaning not in ("", "time") and s.samples > 2:
-            channels.setdefault(s.meaning, []).append(s)
+    for s in (s for log in logs for s in log.columns):
+        channels.setdefault(s.meaning, []).append(s)
     for channel in ("q", "joint_torque"):
         if own := [s for s in channels.get(channel, ()) if not _is_motor(s)]:
             channels[channel] = own
@@ -262,9 +273,7 @@ def _column(seen: ColumnSurvey, log: _Log | None, slides: bool) -> str:
             parts.append(f"time = {{ from = {quoted(log.clock.name)}{units} }}")
     fits = {"q": "rad", "joint_torque": "N m", "tendon_force": "N", "fingertip_force": "N", "tendon_excursion": "m"}
     fits |= {"q": "m", "joint_torque": "N"} if slides else {}
-    known = bool(seen.units) and TO_SI[seen.units].si == fits.get(seen.meaning)
-    if known:
-        parts.append(f'units = "{seen.units}"')
+    if seen.units and TO_SI[seen.units].si == fits.get(seen.meaning):
+        return "{ " + ", ".join([*parts, f'units = "{seen.units}"']) + " }"
     said = f"it states {seen.foreign}: write `scale`" if seen.foreign else "SI as it stands"
-    unclear = "" if seen.units and (known or not slides) else f"   # units? {said}"
-    return "{ " + ", ".join(parts) + " }" + unclear
+    return "{ " + ", ".join(parts) + " }" + f"   # units? {said}"

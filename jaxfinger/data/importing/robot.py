@@ -29,10 +29,10 @@ _INERTIA = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
 _ROUNDING = 1e-3  # of an inertia: files are written with few digits.
 # Share of its neighbour that stands between two joints of one body, since every joint of a finger carries a link.
 _BETWEEN_JOINTS = 1e-6
-_DEGREE = 4  # of the polynomials of excursions
-_STEPS = 61  # angles through the range of a joint, to which they are fitted
-_MIN_LEVER = 1e-9  # m of excursion over the range of a joint: with less a tendon does not cross it.
-_MAX_DEVIATION = 0.02  # of a tendon's excursion: more is pointed out.
+_DEGREE = 4  # of the polynomials of excursions, as of the recipes' moment arms (`moment_arm_degree`)
+_ANGLES = 61  # through the range of a joint, to which a polynomial is fitted: 2° apart in 120°
+_SAME_PLACE = 1e-9  # m: places that are nearer differ by rounding.
+_MAX_DEVIATION = 0.02  # of a tendon's excursion: paths drawn by hand are hardly truer than that.
 _DIGITS = 9  # that are written
 
 
@@ -46,8 +46,8 @@ class RobotFinger(NamedTuple):
 def robot_finger(path: Path, joints: Sequence[str] = (), tip: str = "") -> RobotFinger:
     """Read a finger from a robot's description.
 
-    Spatial tendons (MJCF) that cross its joints are its tendons, active where an actuator pulls one. Their excursions
-    are polynomials of degree four of each joint alone, the others at zero.
+    Spatial tendons (MJCF) that cross its joints are its tendons. Those that an actuator pulls are active; all are
+    where none pulls one. Excursions are polynomials of each joint alone, the others at zero.
 
     Args:
         path: URDF or MJCF.
@@ -90,8 +90,8 @@ def _compiled(path: Path) -> tuple[Any, dict[str, float]]:
 def _make_readable(robot: ElementTree.Element) -> dict[str, float]:
     """Change a URDF so that MuJoCo reads it.
 
-    Meshes are left out, since they are not needed and often lie elsewhere. An inertia that no body has, since one of
-    its principal values is larger than the sum of the others, is changed to the nearest one that a body has.
+    Meshes are left out, since they are not needed and often lie elsewhere. No body has a principal inertia that is
+    negative, or larger than the sum of the other two: such a one is set to that bound.
 
     Returns:
         By link, the change of its inertia relative to its largest principal value, where that is more than rounding.
@@ -222,7 +222,7 @@ class _Robot:
         """Remarks on links of the finger whose inertia is not the file's."""
         of_finger = {self.model.body(b).name for b in np.flatnonzero(link_of >= 0)}
         return [
-            f"{name}: no body has the inertia in the file; that of a body is written, {100 * share:.2g} % away"
+            f"{name}: its inertia in the file is impossible; one that is possible is written, {100 * share:.2g} % away"
             for name, share in self.changed.items()
             if name in of_finger
         ]
@@ -286,7 +286,7 @@ class _Robot:
                 raise UserError(f"{self.path}: the last link has no {tip}{near}; it has {listed(list(places), 40)}")
             return places[tip] - anchor, ()
         far = max(places, key=lambda name: np.linalg.norm(places[name] - anchor), default="")
-        if not far or np.linalg.norm(places[far] - anchor) < _MIN_LEVER:
+        if not far or np.linalg.norm(places[far] - anchor) < _SAME_PLACE:
             said = "the file has no frame beyond the last joint; the centre of mass is written: correct it for VD.2"
             return com, (f"fingertip: {said}",)
         return places[far] - anchor, (f"fingertip: taken to be at {far}; name another one with --tip",)
@@ -314,14 +314,14 @@ class _Robot:
 
         coefficients = np.zeros((len(spatial), m, _DEGREE))
         for i, (low, high) in enumerate(limits):
-            q = np.linspace(low, high, _STEPS)
+            q = np.linspace(low, high, _ANGLES)
             x = pulled_in(q[:, None] * np.eye(m)[i])
-            crossed = np.ptp(x, axis=0) > _MIN_LEVER
+            crossed = np.ptp(x, axis=0) > _SAME_PLACE
             unit = np.abs(limits[i]).max() ** np.arange(1, _DEGREE + 1)
             fitted = np.linalg.lstsq(q[:, None] ** np.arange(1, _DEGREE + 1) / unit, x, rcond=None)[0].T / unit
             coefficients[crossed, i] = fitted[crossed]
         kept = [row for row in range(len(spatial)) if coefficients[row].any()]
-        anywhere = np.random.default_rng(0).uniform(*limits.T, size=(_STEPS * m, m))
+        anywhere = np.random.default_rng(0).uniform(*limits.T, size=(_ANGLES * m, m))
         powers = anywhere[..., None] ** np.arange(1, _DEGREE + 1)
         measured, told = pulled_in(anywhere), np.einsum("sip,kip->sk", powers, coefficients)
         remarks = []

@@ -146,7 +146,7 @@ def test_a_current_for_a_torque_and_a_wrong_sign_are_named_with_their_joint(scal
     session = excited(finger, np.random.default_rng(0))
     wrong = session["all"].joint_torque * [1.0, scale, 1.0]
     (finding,) = scales_said(replace(session, trials={"all": replace(session["all"], joint_torque=wrong)}))
-    name, found = finding.split("takes: ")[1].split(";")[0].rsplit(" ", 1)
+    found, name = finding.split("with ")[1].split(":")[0].split(" of it at ")
     assert "/trials/all/joint_torque" in finding
     assert name == finger.joint_names[1]
     assert float(found) == pytest.approx(scale, rel=0.3)

@@ -163,7 +163,7 @@ def test_a_link_that_no_body_could_be_is_changed_and_named(tmp_path):
         text = f'<robot name="x">{link("base")}{joint("j", "base", "rod")}<link name="rod"><inertial>'
         path.write_text(f'{text}<mass value="0.1"/>{given}</inertial></link></robot>')
         finger, remarks = robot_finger(path)
-        assert any("rod: no body has the inertia" in x for x in remarks) == named
+        assert any("rod: its inertia in the file is impossible" in x for x in remarks) == named
         small, middle, large = np.linalg.eigvalsh(finger.inertia[0])
         assert small > 0.0
         assert large <= (small + middle) * (1.0 + 1e-6)
