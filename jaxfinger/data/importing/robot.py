@@ -16,7 +16,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from jaxfinger.data.opening import plain_reason
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.errors import UserError, did_you_mean, listed
 
@@ -71,7 +70,7 @@ def _compiled(path: Path) -> tuple[Any, dict[str, float]]:
     try:
         root = ElementTree.parse(path).getroot()
     except OSError as error:
-        raise UserError(f"{path}: cannot be opened: {plain_reason(error)}") from None
+        raise UserError(f"{path}: cannot be read ({error.strerror}); give a URDF or an MJCF file") from None
     except ElementTree.ParseError as error:
         raise UserError(f"{path}: is no XML ({error}); give a URDF or an MJCF file") from None
     if root.tag not in ("robot", "mujoco"):

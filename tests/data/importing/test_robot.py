@@ -213,6 +213,11 @@ def test_a_file_that_gives_no_finger_is_refused(tmp_path, text, says):
     assert says in str(error.value)
 
 
+def test_a_file_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(UserError, match=r"gone\.urdf: cannot be read \(No such file"):
+        robot_finger(tmp_path / "gone.urdf")
+
+
 def test_joints_that_follow_others_or_have_no_limits_are_named(tmp_path, urdf):
     follow = MJCF.replace("<actuator>", '<equality><joint joint1="pip" joint2="mcp"/></equality><actuator>')
     path = tmp_path / "hand.xml"
