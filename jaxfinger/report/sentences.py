@@ -207,16 +207,18 @@ def _partly(d: Diagnosis) -> list[str]:
     if stay:
         names = [f"{_of(x.experiment, x.channel)} ({number(x.after / x.noise, 2)} times its noise)" for x in stay]
         left.append(f"what stays open on trials that no fit has seen is {_listed(names, 'channel')}")
-    worse = [x for x in d.closures if x.gets_worse] if named_causes(d) else []
-    if worse:
+    said = [size(d), "; ".join([_blamed(d), *unknown])]
+    if named_causes(d) and (worse := [x for x in d.closures if x.gets_worse]):
         names = [f"{_of(x.experiment, x.channel)} ({_held_out(x)})" for x in worse]
-        left.append(
-            "but trials that no fit has seen are predicted worse with what is named, "
-            f"{_listed(names, 'channel')}: it may only imitate a law that nobody listed"
-        )
-    elif d.unexplained.share > MAX_LEFT and named_causes(d):
+        return [
+            *said,
+            "; ".join(left),
+            f"but trials that no fit has seen are predicted worse with what is named, {_listed(names, 'channel')}: "
+            "it may only imitate a law that nobody listed",
+        ]
+    if named_causes(d) and d.unexplained.share > MAX_LEFT:
         left.append("so much is left that what is named may only imitate a law that nobody listed")
-    return [size(d), "; ".join([_blamed(d), *unknown]), "; ".join(left)]
+    return [*said, "; ".join(left)]
 
 
 def _held_out(x: Closure) -> str:

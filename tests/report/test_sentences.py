@@ -197,8 +197,8 @@ def test_causes_that_make_unseen_trials_worse_may_only_imitate_another_law():
     worse = replace(LINES[0], before=6.08e-4, after=6.24e-4, closed=-0.07, closed_ci95=(-0.12, -0.01))
     text = sentences.summary(replace(ALL["partly"], closures=(worse, *LINES[1:])))
     assert (
-        "but trials that no fit has seen are predicted worse with what is named, joint torque of ID.4 (0.62 instead of "
-        "0.61 N mm): it may only imitate a law that nobody listed" in text
+        ". But trials that no fit has seen are predicted worse with what is named, joint torque of ID.4 (0.62 instead "
+        "of 0.61 N mm): it may only imitate a law that nobody listed" in text
     )
     unsure = replace(worse, closed_ci95=(-0.12, 0.01))
     assert "predicted worse" not in sentences.summary(replace(ALL["partly"], closures=(unsure, *LINES[1:])))
