@@ -10,6 +10,7 @@ where 1 is the mean square of the noise. All refits are linear about the causes'
 of rows (residual, Jacobian, slopes, changes) by trial and column.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -55,42 +56,53 @@ class Budget:
         """Rows of each cell, which is also the sum of squares that the noise leaves."""
         return np.array([c.rows for c in self.cells], float)
 
-    def of(self, columns: set[int]) -> tuple[Float[np.ndarray, " causes"], float]:
-        """Share of the columns' gap that comes back without each cause, and the share that is left with all causes."""
-        return self._shares(np.isin([c.column for c in self.cells], list(columns)).astype(float))
+    def of(self, columns: Collection[int]) -> tuple[Float[np.ndarray, " causes"], float]:
+        """Mean shares over columns: of each cause what comes back without it, and what is left with all causes.
 
-    def _shares(self, weight: Float[np.ndarray, " cells"]) -> tuple[Float[np.ndarray, " causes"], float]:
-        n = max(float(weight @ self.n), 1e-9)
-        gap = max(float(weight @ (self.before - self.n)), MIN_RELATIVE_GAP * n)
-        lost = (self.without - self.after) @ weight
+        A joint with much noise, or with few samples, counts as much as any other.
+        """
+        shares = self._shares(self._in(columns)).mean(axis=0)
+        return shares[:-1], float(shares[-1])
+
+    def _in(self, columns: Collection[int]) -> Float[np.ndarray, "columns cells"]:
+        """For each of the columns, 1 for its cells and 0 for others."""
+        return np.array([[c.column == column for c in self.cells] for column in columns], float)
+
+    def _shares(self, weights: Float[np.ndarray, "columns cells"]) -> Float[np.ndarray, "columns shares"]:
+        """Share of each column's gap that comes back without each cause, then the share left with all causes."""
+        n = np.maximum(weights @ self.n, 1e-9)
+        gap = np.maximum(weights @ (self.before - self.n), MIN_RELATIVE_GAP * n)
+        lost = weights @ (self.without - self.after).T
         # Without causes all of a gap is left, also of one that is smaller than the least that shares are relative to.
-        left = float(weight @ (self.after - self.n)) if len(self.without) else gap
-        return np.clip(lost / gap, 0.0, 1.0), float(np.clip(left / gap, 0.0, 1.0))
+        left = weights @ (self.after - self.n) if len(self.without) else gap
+        return np.clip(np.column_stack([lost, left]) / gap[:, None], 0.0, 1.0)
 
     @cached_property
     def overall(self) -> tuple[np.ndarray, np.ndarray, float, tuple[float, float]]:
-        """Mean shares over the channels with a gap, with 95 % intervals from a bootstrap over trials.
+        """Mean shares over the channels with a gap, of each the mean over its columns with a gap.
 
-        The interval says how the mean depends on the trials that were recorded, and not how channels differ. Returns
-        the share of each cause (causes,), its interval (causes, 2), the share left with all causes, and its interval.
+        Their 95 % intervals, from a bootstrap over trials, say how the mean depends on the trials that were recorded,
+        and not how channels differ. Returns the share of each cause (causes,), its interval (causes, 2), the share left
+        with all causes, and its interval.
         """
+        if not self.open:
+            none = np.zeros(len(self.without))
+            return none, np.zeros((len(none), 2)), 0.0, (0.0, 0.0)
         rng = np.random.default_rng(0)
         unit, strata = self._drawn()
         inside = [
-            np.array([c.column in self.open and self.channels[c.column] == channel for c in self.cells], float)
+            self._in([c for c in sorted(self.open) if self.channels[c] == channel])
             for channel in sorted({self.channels[c] for c in self.open})
         ]
 
-        def means(weights: list[Float[np.ndarray, " cells"]]) -> np.ndarray:
-            if not weights:
-                return np.zeros(len(self.without) + 1)
-            return np.mean([np.append(*self._shares(w)) for w in weights], axis=0)
+        def means(channels: list[Float[np.ndarray, "_columns cells"]]) -> Float[np.ndarray, " shares"]:
+            return np.mean([self._shares(weights).mean(axis=0) for weights in channels], axis=0)
 
         value, draws = means(inside), []
-        for _ in range(DRAWS if inside else 0):
+        for _ in range(DRAWS):
             count = np.bincount(np.concatenate([rng.choice(s, len(s)) for s in strata]), minlength=unit.max() + 1)
             weights = [w * count[unit] for w in inside]
-            if all(w @ self.n > 0 for w in weights):  # Without one of the channels the mean is another quantity.
+            if all(np.all(w @ self.n > 0) for w in weights):  # Without one of the columns the mean is another quantity.
                 draws.append(means(weights))
         low, high = np.quantile([value, *draws], (0.025, 0.975), axis=0)
         low, high = np.minimum(low, value), np.maximum(high, value)
@@ -99,13 +111,13 @@ class Budget:
     def _drawn(self) -> tuple[Int[np.ndarray, " cells"], list[np.ndarray]]:
         """What the bootstrap draws: the unit to which each cell belongs, and strata of units.
 
-        Units are trials. A stratum holds those that show the same channels with a gap, so that each draw holds each
-        channel as often as the session does. The parts of a trial that is alone in its stratum are drawn in its place:
+        Units are trials. A stratum holds those that show the same columns with a gap, so that each draw holds each
+        column as often as the session does. The parts of a trial that is alone in its stratum are drawn in its place:
         a trial drawn from itself would give an interval of no width.
         """
-        shown: dict[int, set[tuple[str, str]]] = {}
+        shown: dict[int, set[int]] = {}
         for c in self.cells:
-            shown.setdefault(c.trial, set()).update({self.channels[c.column]} if c.column in self.open else ())
+            shown.setdefault(c.trial, set()).update({c.column} & self.open)
         alike: dict[frozenset, list[int]] = {}
         for trial in sorted(shown):
             alike.setdefault(frozenset(shown[trial]), []).append(trial)

@@ -123,7 +123,7 @@ def channel_budgets(
     for c in sorted(shares.open):
         column = baseline.columns.items[c]
         missed, noise = mean_squares(problem, column.experiment, column.channel, column.column)
-        lost, after = shares.of({c})
+        lost, after = shares.of([c])
         found.append(
             ChannelBudget(
                 column.experiment,

@@ -71,7 +71,7 @@ class Cause:
     probability: float  # that it is at work; with several sites, the smallest of theirs
     share: float  # of the gap that comes back on held-out trials without it: mean over channels with a gap
     share_ci95: tuple[float, float]
-    channels: dict[ExperimentChannel, float]  # share of each channel's gap, all its columns together
+    channels: dict[ExperimentChannel, float]  # share of each channel's gap, mean over its columns with a gap
     values: tuple[Value, ...]
 
     @property

@@ -44,6 +44,19 @@ def test_intervals_are_the_same_whether_or_not_a_trial_lacks_another_channel():
         np.testing.assert_allclose(mine, theirs)
 
 
+def test_a_joint_whose_noise_is_small_does_not_hide_another_joint_of_its_channel():
+    """The cause closes joint 0, a hundred times the noise, and nothing of joint 1, three times the noise."""
+    cells = [Cell(trial, column, trial % FOLDS, 50) for trial in range(6) for column in (0, 1)]
+    before = np.tile([50.0 * 100.0**2, 50.0 * 3.0**2], 6)
+    after = np.tile([50.0, 50.0 * 3.0**2], 6)
+    budget = Budget(cells, before, after, before[None], frozenset({0, 1}), (CHANNELS[0], CHANNELS[0]))
+    share, ends, left, _ = budget.overall
+    assert share == pytest.approx([0.5])
+    assert left == pytest.approx(0.5)
+    np.testing.assert_allclose(ends, [[0.5, 0.5]], atol=1e-12)
+    assert budget.of([0, 1])[1] == pytest.approx(0.5)
+
+
 def test_channels_that_disagree_do_not_widen_the_interval_of_their_mean():
     """Two trials of twelve show the channel that the cause closes: no draw may lack it."""
     cells = [(trial, 0) for trial in range(12)] + [(0, 1), (1, 1)]
@@ -68,4 +81,4 @@ def test_without_causes_all_of_a_gap_is_left_however_small_it_is():
     budget = Budget(cells, before, before, np.empty((0, 6)), frozenset({0}), CHANNELS)
     _, _, left, ends = budget.overall
     assert (left, ends) == (1.0, (1.0, 1.0))
-    assert budget.of({0})[1] == 1.0
+    assert budget.of([0])[1] == 1.0
