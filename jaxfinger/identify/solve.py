@@ -171,26 +171,26 @@ def solve(
     moved, theta, size = Free.at(model, free), flat[free], flat.size
     low, high = parameter_bounds(model, free, limits)
     prior = prior or Prior.none(theta)
-    least = jax.device_put(tolerance)
+    least = np.asarray(tolerance)
     room = -(-max(p, 1) // PADDING) * PADDING
     y = _padded(theta, room)
-    state = _begin(y)
+    state = jax.device_get(_begin(y))
     ends = _padded(low, room), _padded(high, room)
     at = model
     for _ in range(MAX_STEPS):
         linearised = linearise_each(at, sources, huber, tangents, free)
         factor = stacked(linearised, sources, size)
-        offset = prior.root @ (np.asarray(state.trial)[:p] - prior.mean)
+        offset = prior.root @ (state.trial[:p] - prior.mean)
         rows = np.concatenate([factor[:, [*free, size]], np.column_stack([prior.root, offset])])
         trial = state.trial
-        y, state = _advance(least, y, state, _factor_of(rows, room), *ends)
-        if np.array_equal(np.asarray(y), np.asarray(trial)):
+        y, state = jax.device_get(_advance(least, y, state, _factor_of(rows, room), *ends))
+        if np.array_equal(y, trial):
             best = at, linearised, factor, rows
         if state.outcome == Outcome.undefined_start:
             raise UserError(f"{Outcome[state.outcome]}: start from other parameters")
         if not bool(state.outcome == Outcome.running):
             break
-        at = moved.set(model, np.asarray(state.trial)[:p])
+        at = moved.set(model, state.trial[:p])
     model, linearised, factor, rows = best
     _, invisible, scale = visible(rows[:, :-1])
     white = np.concatenate([lin.white.ravel() for lin in linearised.values()])
@@ -232,8 +232,8 @@ def _sentence(state: Iterate) -> str:
     return f"{Outcome[state.outcome]}; {last}"
 
 
-def _padded(values: np.ndarray, room: int) -> Float[Array, " room"]:
-    return jax.device_put(np.pad(values, (0, room - values.size)))
+def _padded(values: np.ndarray, room: int) -> Float[np.ndarray, " room"]:
+    return np.pad(values, (0, room - values.size))
 
 
 def _factor_of(rows: Float[np.ndarray, "N q"], room: int) -> Factor:
@@ -244,7 +244,7 @@ def _factor_of(rows: Float[np.ndarray, "N q"], room: int) -> Factor:
     T[: len(small)] = small
     R, d = np.zeros((room, room)), np.zeros(room)
     R[:p, :p], d[:p] = T[:p, :p], T[:p, p]
-    return Factor(*jax.device_put((R, d, np.asarray(T[p, p] ** 2))))
+    return Factor(R, d, np.asarray(T[p, p] ** 2))
 
 
 _begin = quick_jit(begin)
