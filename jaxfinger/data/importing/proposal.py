@@ -272,7 +272,7 @@ def _column(seen: ColumnSurvey, log: _Log | None, slides: bool) -> str:
             units = f', units = "{log.clock.units}"' if log.clock.units not in ("s", "") else ""
             parts.append(f"time = {{ from = {quoted(log.clock.name)}{units} }}")
     fits = {"q": "rad", "joint_torque": "N m", "tendon_force": "N", "fingertip_force": "N", "tendon_excursion": "m"}
-    fits |= {"q": "m", "joint_torque": "N"} if slides else {}
+    fits |= {"temperature": "K"} | ({"q": "m", "joint_torque": "N"} if slides else {})
     if seen.units and TO_SI[seen.units].si == fits.get(seen.meaning):
         return "{ " + ", ".join([*parts, f'units = "{seen.units}"']) + " }"
     said = f"it states {seen.foreign}: write `scale`" if seen.foreign else "SI as it stands"
