@@ -44,7 +44,7 @@ COMMANDS = {
     "effects": ("effects:effects", "What may make a finger differ from its model: the catalogue of causes, in words."),
     "simulate": ("files:simulate", "A simulated session, of a described finger, a recipe or a fit."),
     "look": ("files:look", "Say what a recording holds, and propose a mapping for it."),
-    "import": ("files:import_", "Turn MATLAB, CSV or bag recordings into a session."),
+    "import": ("files:import_", "Turn recordings of other programs into a session."),
     "record": ("record:record", "Run a plan on the rig."),
     "recover": ("record:recover", "Rescue a recording that was killed."),
 }

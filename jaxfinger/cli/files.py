@@ -72,7 +72,7 @@ def look(*recordings: Path, finger: Path | None = None, json: bool = False) -> N
     Parameters
     ----------
     recordings
-        MATLAB, CSV, rosbag2 or MCAP.
+        CSV, MATLAB, JSON, NumPy, HDF5, rosbag2 or MCAP.
     finger
         The finger's description (TOML) or a session: the mapping then names its joints and tendons.
     json
@@ -179,7 +179,7 @@ def import_(
     output: Output,
     overwrite: bool = False,
 ) -> None:
-    """Turn recordings (MATLAB v5 and v7.3, CSV, rosbag2, MCAP) into one session.
+    """Turn recordings (CSV, MATLAB, JSON, NumPy, HDF5, rosbag2, MCAP) into one session.
 
     Parameters
     ----------

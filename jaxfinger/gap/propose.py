@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxfinger.data.schema import channel_units
 from jaxfinger.gap.problem import Problem, site
@@ -31,7 +31,7 @@ class Proposal:
     site: str
     terms: tuple[tuple[float, str], ...]  # coefficient in the channel's unit (angles rad, forces N), and term
     units: str
-    share: float  # share of the energy that smooth laws could explain there
+    share: float  # of the energy beyond the noise that the causes leave in the column
 
     @property
     def formula(self) -> str:
@@ -54,8 +54,10 @@ def propose(
     for x in left:
         by_column[x.channel, x.column] = by_column.get((x.channel, x.column), 0.0) + max(x.energy, 0.0)
     (channel, column), most = max(by_column.items(), key=lambda kv: kv[1])
-    names, rows = _library_rows(problem, channel, column)
+    names, rows, there = _library_rows(problem, channel, column)
     Z, r = project(rows), project.residual(residual)
+    energy_there = float(np.sum(r[: there.size][there] ** 2))
+    missed = max(energy_there - there.sum(), most)  # White noise has an energy of one a row.
     norm = np.linalg.norm(Z, axis=1)
     usable = norm > MIN_UNABSORBED * np.linalg.norm(rows, axis=1)
     found: list[int] = []
@@ -73,23 +75,27 @@ def propose(
         return None
     named = tuple((float(v), names[i]) for v, i in zip(coefficients, found, strict=True))
     units = channel_units(channel, problem.session.finger.prismatic)
-    return Proposal(channel, site(problem, channel, column), named, units, min(1.0, energy / most))
+    return Proposal(channel, site(problem, channel, column), named, units, min(1.0, energy / missed))
 
 
-def _library_rows(problem: Problem, channel: str, column: int) -> tuple[list[str], Float[np.ndarray, "terms N"]]:
-    """Terms of the library, and their white rows (terms, N) in every experiment that reads the channel."""
+def _library_rows(
+    problem: Problem, channel: str, column: int
+) -> tuple[list[str], Float[np.ndarray, "terms N"], Bool[np.ndarray, " N"]]:
+    """Terms of the library, their white rows in every experiment that reads the channel, and a mask of these rows."""
     found: dict[str, np.ndarray] = {}
+    there = np.zeros(problem.r.size, bool)
     for e, rows in problem.rows.items():
         channels = problem.stacks[e].experiment.channels
         if channel not in channels:
             continue
         pick = np.flatnonzero((rows.channel == channels.index(channel)) & (rows.column == column))
+        there[rows.start + pick] = True
         library = terms(problem, e, channel, column)
         raw = np.zeros((len(library), len(problem.stacks[e].batch.y[channel]), *library[0][1].shape))
         raw[:, column] = np.stack([values for _, values in library])
         for (name, _), white in zip(library, whitened(raw, problem, rows, pick, channel), strict=True):
             found.setdefault(name, np.zeros(problem.r.size))[rows.start + pick] = white
-    return list(found), np.stack(list(found.values()))
+    return list(found), np.stack(list(found.values())), there
 
 
 def terms(problem: Problem, experiment: str, channel: str, column: int) -> list[tuple[str, Float[np.ndarray, "B T"]]]:

@@ -1,1 +1,1 @@
-"""Import of other tools' recordings (CSV, MATLAB, bags) as sessions, by a mapping file."""
+"""Import of other tools' recordings as sessions, by a mapping file."""

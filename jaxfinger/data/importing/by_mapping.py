@@ -19,9 +19,9 @@ from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.finger_file import finger_from
 from jaxfinger.data.hdf5 import write_session
 from jaxfinger.data.importing.columns import ColumnReader, find, trial_clock
-from jaxfinger.data.importing.mapping import Channels, MappedTrial, MappingFile, read_mapping, terms
+from jaxfinger.data.importing.mapping import Channels, Files, MappedTrial, MappingFile, read_mapping, terms
 from jaxfinger.data.importing.rates import compare_rate
-from jaxfinger.data.importing.recording import Recording
+from jaxfinger.data.importing.recording import Recording, side_by_side
 from jaxfinger.data.importing.sources import load_recording, refuse_path
 from jaxfinger.data.importing.variables import Source
 from jaxfinger.data.parse import RANGES, sorted_trials
@@ -94,21 +94,35 @@ class _Recordings:
         self._constants, self._derived = mapping.constants, mapping.derived
         self._report = report
         self._loaded: dict[Path, Recording] = {}
-        self._sources: dict[tuple[Path, str], Source] = {}
+        self._joined: dict[tuple[Path, ...], Recording] = {}
+        self._sources: dict[tuple[tuple[Path, ...], str], Source] = {}
 
-    def source(self, name: str | None, derived: Mapping[str, str], where: Place) -> Source:
-        """Recording of this name, or the only one, with the variables that mapping and trial derive from it."""
+    def source(self, name: Files | None, derived: Mapping[str, str], where: Place) -> Source:
+        """Recording of this name, or of these names side by side, or the only one; with what is derived from it."""
         if name is None and len(self.paths) > 1:
             where.fail(f"has no `file`; name one of {listed([str(path) for path in self.paths])}")
-        path = self.paths[0] if name is None else find(name, dict.fromkeys(self.paths), where)
-        if path not in self._loaded:
-            self._loaded[path] = load_recording(path)
-            for remark in self._loaded[path].remarks:
-                self._report.warning(str(path), remark)
+        names = (name,) if isinstance(name, str) else name or ()
+        paths = tuple(find(n, dict.fromkeys(self.paths), where) for n in names) or (self.paths[0],)
         return self._sources.setdefault(
-            (path, where.key if derived else ""),
-            Source(self._loaded[path], self._constants, {**self._derived, **derived}),
+            (paths, where.key if derived else ""),
+            Source(self._recording(paths, where), self._constants, {**self._derived, **derived}),
         )
+
+    def _recording(self, paths: tuple[Path, ...], where: Place) -> Recording:
+        """The recording of one path, or those of several side by side."""
+        for path in paths:
+            if path not in self._loaded:
+                self._loaded[path] = load_recording(path)
+                for remark in self._loaded[path].remarks:
+                    self._report.warning(str(path), remark)
+        if len(paths) == 1:
+            return self._loaded[paths[0]]
+        if paths not in self._joined:
+            try:
+                self._joined[paths] = side_by_side([self._loaded[path] for path in paths])
+            except ValueError as error:
+                (where / "file").fail(str(error))
+        return self._joined[paths]
 
     def unread(self) -> None:
         """Warn of recordings that no trial reads."""

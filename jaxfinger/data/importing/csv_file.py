@@ -23,6 +23,7 @@ from jaxfinger.errors import UserError, counted, listed
 
 _COMMENTS = ("#", "%")
 _DIALECT_LINES = 60  # They decide the dialect, and are taken from the middle of the file, after any header.
+_MIN_NUMBERED = 3  # columns, from which on a first line of 0, 1, 2 … numbers them
 _BOOLEANS = {"true": 1.0, "false": 0.0}
 # What programs write for a missing value: words, errors of spreadsheets, and NaN of Microsoft's C library.
 _SHEET_ERRORS = ("#n/a", "#div/0!", "#value!", "#num!", "#null!", "#ref!", "#name?")
@@ -109,18 +110,23 @@ def load_csv(path: Path) -> Recording:
         given = counted(len(split(body[first - 1].text)), "column")
         raise UserError(f"{path}: names {given} and holds {len(numeric)}; give each column one name")
     body, remarks = body[first:], ()
-    if (
-        not names
-        and [dialect.number(cell) for cell in split(body[0].text)] == list(range(len(numeric)))
-        and len(body) > 1
-    ):
-        names, body = tuple(split(body[0].text)), body[1:]  # pandas writes such a line over unnamed columns.
+    if not names and _numbers_columns(dialect, body):
+        names, body = tuple(split(body[0].text)), body[1:]
     if len(body) > 1 and len(split(body[-1].text)) < len(numeric):
         body, remarks = body[:-1], ("its last line is cut short and is left out",)
     columns = _columns(path, body, dialect, numeric)
     if scope:
         return _pairs(path, columns, names, units)
     return _named(path, columns, names, units, remarks)
+
+
+def _numbers_columns(dialect: _Dialect, body: Sequence[_Line]) -> bool:
+    """Whether the first line numbers the columns, 0, 1, 2 and so on, as pandas writes it over columns without names.
+
+    With one column or two such a line is a sample: a clock begins with 0, and 1 may stand beside it.
+    """
+    first = [dialect.number(cell) for cell in dialect.split(body[0].text)]
+    return len(body) > 1 and len(first) >= _MIN_NUMBERED and first == list(range(len(first)))
 
 
 def _is_comment(text: str) -> bool:

@@ -65,6 +65,8 @@ class Column(Reading):
 ColumnSpec = str | Column | Annotated[tuple[str | Column, ...], NotEmpty()]  # A list means the sum of its terms.
 Columns = Mapping[str, ColumnSpec]
 
+Files = str | Annotated[tuple[str, ...], NotEmpty()]  # Files of a list lie side by side, sample by sample.
+
 
 def terms(spec: ColumnSpec) -> tuple[Column, ...]:
     """Terms whose sum is the column."""
@@ -101,7 +103,7 @@ class MappedTrial:
     """`[trials.<name>]`: the part of a recording that is a trial."""
 
     experiment: Annotated[str, OneOf(EXPERIMENT_NAMES)]
-    file: str | None = None  # optional where only one recording is given
+    file: Files | None = None  # optional where only one recording is given
     joint: str | None = None
     tendon: str | None = None
     complete: bool = True

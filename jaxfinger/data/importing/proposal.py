@@ -28,6 +28,7 @@ _MAX_LEFT_OUT = 12  # variables that are named, so that the line of a large bag 
 # Of the time of two logs: with more in common they show one trial. Loggers that are started by hand begin and end a
 # little apart.
 _TOGETHER = 0.9
+_MIN_ALIKE = 10  # samples: shorter files of one length may be tables of parameters.
 _HEAD = 'specimen = "my finger"\nfinger = "finger.toml"'
 
 
@@ -48,7 +49,7 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
         first = proposed[0].channels.get(channel)
         if first is not None and all(trial.channels.get(channel) == first for trial in proposed):
             shared[channel] = first
-    lines = [head]
+    lines = [head, *_side_by_side([log for logs in trials for log in logs])]
     if shared:
         lines += ["", "[channels]   # of all trials"]
         lines += [f"{channel}.{as_key(name)} = {said}" for channel, rows in shared.items() for name, said in rows]
@@ -64,6 +65,20 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
             named = [quoted(name) for name in trial.left_out if is_set_point(name) == what]
             lines += [f"# {said}: {listed(named, _MAX_LEFT_OUT)}"] if named else []
     return "\n".join(lines) + "\n"
+
+
+def _side_by_side(logs: Sequence[_Log]) -> list[str]:
+    """A comment for logs with as many samples as one without a clock: each may hold an array of one recording."""
+    lines = []
+    for count in dict.fromkeys(log.count for log in logs if log.clock is None):
+        names = [quoted(log.recording.path.name) for log in logs if log.count == count]
+        if len(names) > 1 and count > _MIN_ALIKE:
+            lines += [
+                "",
+                f"# {listed(names)} hold {count} samples each. If these are the same samples, write one trial",
+            ]
+            lines += [f"# of them: file = [{', '.join(names)}]"]
+    return lines
 
 
 @dataclass(frozen=True)
@@ -87,6 +102,11 @@ class _Log:
         """Column with the times of its samples: stamps of headers before other clocks."""
         clocks = [s for s in self.seen if s.meaning == "time"]
         return next((s for s in clocks if s.name.endswith(".stamp")), clocks[0] if clocks else None)
+
+    @property
+    def count(self) -> int:
+        """Number of samples of its longest column."""
+        return max((s.samples for s in self.seen), default=0)
 
     @cached_property
     def time(self) -> np.ndarray:
@@ -272,7 +292,7 @@ def _column(seen: ColumnSurvey, log: _Log | None, slides: bool) -> str:
             units = f', units = "{log.clock.units}"' if log.clock.units not in ("s", "") else ""
             parts.append(f"time = {{ from = {quoted(log.clock.name)}{units} }}")
     fits = {"q": "rad", "joint_torque": "N m", "tendon_force": "N", "fingertip_force": "N", "tendon_excursion": "m"}
-    fits |= {"q": "m", "joint_torque": "N"} if slides else {}
+    fits |= {"temperature": "K"} | ({"q": "m", "joint_torque": "N"} if slides else {})
     if seen.units and TO_SI[seen.units].si == fits.get(seen.meaning):
         return "{ " + ", ".join([*parts, f'units = "{seen.units}"']) + " }"
     said = f"it states {seen.foreign}: write `scale`" if seen.foreign else "SI as it stands"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,3 +50,32 @@ class Recording:
     unusable: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     words: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+def side_by_side(recordings: Sequence[Recording]) -> Recording:
+    """Recordings of the same samples, as of loggers that write each array to a file of its own, as one recording.
+
+    Its variables are named `file.variable`, by the names of the files without their endings.
+
+    Raises:
+        ValueError: two files have one name, or another number of samples; the end of a sentence.
+    """
+    variables: dict[str, Variable] = {}
+    unusable: dict[str, str] = {}
+    words: dict[str, np.ndarray] = {}
+    counts: dict[str, int] = {}
+    for r in recordings:
+        name = r.path.stem
+        if name in counts:
+            raise ValueError(f"names two files {name!r}; rename one of them")
+        counts[name] = max((len(v.values) for v in r.variables.values() if not v.clock), default=0)
+        variables |= {f"{name}.{k}": replace(v, clock=v.clock and f"{name}.{v.clock}") for k, v in r.variables.items()}
+        unusable |= {f"{name}.{k}": reason for k, reason in r.unusable.items()}
+        words |= {f"{name}.{k}": values for k, values in r.words.items()}
+    if len(set(counts.values())) > 1:
+        said = ", ".join(f"{name} {count}" for name, count in counts.items())
+        raise ValueError(
+            f"names files with different numbers of samples ({said}), which do not lie side by side; leave one here, "
+            "and give columns of the others their `file` and `time`"
+        )
+    return Recording(recordings[0].path, variables, unusable, words=words)

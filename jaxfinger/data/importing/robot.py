@@ -79,11 +79,41 @@ def _compiled(path: Path) -> tuple[Any, dict[str, float]]:
         raise UserError(f"{path}: still has macros; run `xacro {path.name} > robot.urdf`, and give that file")
     try:
         if root.tag == "mujoco":
-            return mujoco.MjModel.from_xml_path(str(path)), {}
+            return _compiled_mjcf(path), {}
         changed = _make_readable(root)
         return mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode")), changed
     except ValueError as error:
         raise UserError(f"{path}: MuJoCo cannot read it: {' '.join(str(error).split())}") from None
+
+
+def _compiled_mjcf(path: Path) -> Any:
+    """Compiled MJCF file; without its meshes and pictures where these are not there, if no link has its mass from one.
+
+    Raises:
+        UserError: a link has its mass from a mesh that is not there.
+    """
+    import mujoco
+
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        if "opening file" not in str(error):
+            raise
+    spec = mujoco.MjSpec.from_file(str(path))
+    weighed = spec.compiler.inertiafromgeom != mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    for geom in [geom for geom in spec.geoms if geom.meshname]:
+        body = geom.parent
+        if body.name != "world" and not (weighed and body.explicitinertial):
+            raise UserError(
+                f"{path}: link {body.name!r} has its mass from the mesh {geom.meshname!r}, which is not there; put the "
+                "meshes where the file names them, or give the link an <inertial>"
+            )
+        spec.delete(geom)
+    for item in (*spec.geoms, *spec.sites, *spec.tendons):
+        item.material = ""
+    for item in (*spec.meshes, *spec.skins, *spec.materials, *spec.textures):
+        spec.delete(item)
+    return spec.compile()
 
 
 def _make_readable(robot: ElementTree.Element) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Loading of recordings of other tools by the kind of file: MATLAB .mat (v4 to v7.3), CSV, rosbag2 and MCAP."""
+"""Loading of recordings of other tools by the kind of file."""
 
 from __future__ import annotations
 
@@ -7,6 +7,16 @@ from pathlib import Path
 from jaxfinger.data.importing.recording import Recording
 from jaxfinger.data.opening import plain_reason
 from jaxfinger.errors import UserError
+
+# Functions of pandas for tables that are not read here.
+_FRAMES = {
+    ".parquet": "read_parquet",
+    ".feather": "read_feather",
+    ".pkl": "read_pickle",
+    ".xls": "read_excel",
+    ".xlsx": "read_excel",
+    ".ods": "read_excel",
+}
 
 
 def load_recording(path: Path) -> Recording:
@@ -28,6 +38,18 @@ def load_recording(path: Path) -> Recording:
             from jaxfinger.data.importing.csv_file import load_csv
 
             return load_csv(path)
+        if kind in (".json", ".jsonl", ".ndjson"):
+            from jaxfinger.data.importing.json_file import load_json
+
+            return load_json(path)
+        if kind in (".npy", ".npz"):
+            from jaxfinger.data.importing.arrays import load_numpy
+
+            return load_numpy(path)
+        if kind in (".h5", ".hdf5"):
+            from jaxfinger.data.importing.arrays import load_hdf5
+
+            return load_hdf5(path)
         if path.is_dir() or kind in (".mcap", ".db3", ".bag"):
             from jaxfinger.data.importing.bags import load_bag
 
@@ -39,7 +61,10 @@ def load_recording(path: Path) -> Recording:
     except Exception as error:  # Readers of foreign formats raise exceptions of many kinds.
         said = f"{type(error).__name__}: {plain_reason(error)}"
         raise UserError(f"{path}: cannot be read ({said}); export the recording again") from error
-    raise UserError(f"{path}: is of an unknown kind; give .mat, .csv, .mcap or a rosbag2 folder")
+    if kind in _FRAMES:
+        call = f"pandas.{_FRAMES[kind]}({path.name!r}).to_csv({path.stem + '.csv'!r}, index=False)"
+        raise UserError(f"{path}: is a table of a kind that is not read; write it as CSV, in Python: {call}")
+    raise UserError(f"{path}: is of an unknown kind; give .csv, .mat, .json, .npz, .h5, .mcap or a rosbag2 folder")
 
 
 def refuse_path(path: Path) -> None:

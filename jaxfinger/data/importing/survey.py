@@ -28,8 +28,9 @@ _MEANINGS = (
 # Of a clock's values or steps: more values differ, also out of order, or more steps go on, also of a recording that was
 # pasted twice.
 _MIN_RUNNING = 0.5
-# Names of velocities, which belong to no channel, and of set-points, which are not measured.
+# Names of velocities, which belong to no channel, of set-points, which are not measured, and of switches and states.
 _VELOCITY = r"(?<![a-z])vel|speed|dot|^v$|^dq"
+_STATE = r"enable|flag|status|valid|(^|_)(on|off|ok|mode|err|error|fault|alarm)(_|\d|$)"
 _SET_POINT = (
     r"cmd|command|ref(?!l)|desired|set_?p(oin)?t|goal|target|demand|soll|feed_?forward"
     r"|(?<![a-z])(q|tau|pos)?(des|set(?!\d+\.)|sp|ff|tgt|nominal|planned)(?![a-z])"
@@ -160,7 +161,7 @@ def _meaning(name: str, column: str | int | None, x: np.ndarray, units: str) -> 
     """Channel or `time` by the last word of a name where the units allow it, else by the units; empty where unclear."""
     bare = re.sub(r"[\[(].*", "", name).strip("/ ")  # Units stand in brackets.
     word = re.split(r"[./]", bare)[-1].lower()
-    if re.search(_VELOCITY, word) or is_set_point(name):
+    if len(x) == 1 or re.search(_VELOCITY, word) or re.search(_STATE, word) or is_set_point(name):
         return ""
     for meaning, pattern in _MEANINGS:
         if re.search(pattern, word) and (not units or TO_SI[units].si in _SI_UNITS[meaning]):

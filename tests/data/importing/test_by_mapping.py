@@ -13,6 +13,8 @@ from jaxfinger.data import check_file, read_session, smooth
 from jaxfinger.data.findings import Report
 from jaxfinger.data.importing.by_mapping import import_file
 from jaxfinger.data.importing.matlab import load_mat
+from jaxfinger.data.importing.proposal import proposal
+from jaxfinger.data.importing.sources import load_recording
 from jaxfinger.errors import UserError
 from tests.data.conftest import ONE_JOINT
 
@@ -92,6 +94,36 @@ def test_matlab_version_7_3_with_a_structure(mapping, tmp_path):
     mapping.write_text(text)
     import_file([tmp_path / "log.mat"], mapping, tmp_path / "out.h5")
     assert_imported(tmp_path / "out.h5")
+
+
+def write_apart(folder, columns, only=slice(None)):
+    """Each group of columns in a file of its own, without names."""
+    for name, values in columns.items():
+        np.savetxt(folder / f"{name}.txt", values[only], "%.17g")
+    return [folder / f"{name}.txt" for name in columns]
+
+
+def test_files_of_the_same_samples_lie_side_by_side(tmp_path):
+    text = MAPPING.replace("[trials.01-ID2]", '[trials.01-ID2]\nfile = ["t.txt", "enc.txt", "rest.txt"]')
+    text = text.replace('"t"', '"t.column 0"').replace('"enc", column = 1', '"enc.column 1"').replace('"gain"', "10.0")
+    for k, name in enumerate(("volts", "extra", "pull", "warm")):
+        text = text.replace(f'from = "{name}"', f'from = "rest.column {k}"')
+    (tmp_path / "map.toml").write_text(text)
+    rest = np.column_stack([RECORDED[name] for name in ("volts", "extra", "pull", "warm")])
+    columns = {"t": RECORDED["t"], "enc": RECORDED["enc"], "rest": rest}
+    files = write_apart(tmp_path, columns)
+    import_file(files, tmp_path / "map.toml", tmp_path / "out.h5")
+    assert_imported(tmp_path / "out.h5")
+    write_apart(tmp_path, {"rest": rest}, slice(1, None))
+    with pytest.raises(UserError, match=r"trials.01-ID2.file: names files with different numbers .*rest 499.*`time`"):
+        import_file(files, tmp_path / "map.toml", tmp_path / "other.h5")
+
+
+def test_files_of_as_many_samples_as_one_without_a_clock_are_pointed_out(tmp_path):
+    columns = {"t": RECORDED["t"], "enc": RECORDED["enc"]}
+    said = proposal([load_recording(path) for path in write_apart(tmp_path, columns)])
+    assert '# "t.txt", "enc.txt" hold 500 samples each.' in said
+    assert 'file = ["t.txt", "enc.txt"]' in said
 
 
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])

@@ -50,6 +50,13 @@ def test_names_and_numbers(tmp_path, content, names):
     np.testing.assert_array_equal(values, [[0.0, 0.01, 0.02], [1.5, 1.6, 1.7], [-3, -4, -5]])
 
 
+@pytest.mark.parametrize("rows", ["0\n0.001\n0.002\n", "0 1\n0.001 1.5\n0.002 1.7\n"])
+def test_a_clock_that_begins_with_zero_is_no_line_of_names(tmp_path, rows):
+    found = load(tmp_path, rows)
+    assert list(found.variables) == [f"column {k}" for k in range(len(found.variables))]
+    np.testing.assert_array_equal(found.variables["column 0"].values, [0.0, 0.001, 0.002])
+
+
 def test_units_below_the_names_or_in_them(tmp_path):
     found = load(tmp_path, "t,a [deg],b\ns,,N\n" + NUMBERS).variables
     assert [v.units for v in found.values()] == ["s", "deg", "N"]

@@ -248,6 +248,21 @@ def test_a_set_point_alone_is_said(tmp_path):
     assert '# set-points by their names, which are not measured: "q_soll"' in said
 
 
+def test_a_switch_and_a_single_number_are_no_measurements(tmp_path):
+    """A temperature in the units that its range shows is no temperature in K."""
+    path = tmp_path / "log.json"
+    steady = [20.0 + 0.1 * (k % 3) for k in range(len(TIME))]
+    angle = (40 + 30 * np.sin(TIME / 1e3)).tolist()
+    on = [True] * len(TIME)
+    log = {"length": 0.12, "t": TIME.tolist(), "enc": angle, "torque_enable": on, "force_ok": on, "temp": steady}
+    path.write_text(json.dumps(log))
+    said = proposal([load_recording(path)])
+    assert "joint_torque" not in said
+    assert "tendon" not in said
+    assert '# in no channel yet: "length", "torque_enable", "force_ok"' in said
+    assert 'channels.temperature.temp = { from = "temp", units = "degC" }' in said
+
+
 @pytest.mark.parametrize("shared", [5, 500])
 def test_coarse_stamps_are_replaced_by_a_rate(tmp_path, shared):
     path = tmp_path / "log.csv"

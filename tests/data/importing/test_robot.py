@@ -6,6 +6,7 @@ import pytest
 
 from jaxfinger.cli import main
 from jaxfinger.data import FingerDescription, read_session
+from jaxfinger.data.finger_file import finger_toml
 from jaxfinger.data.importing.robot import robot_finger
 from jaxfinger.errors import UserError
 from jaxfinger.model import Finger
@@ -126,6 +127,34 @@ def test_an_mjcf_has_the_dynamics_that_mujoco_gives_it(mjcf):
     expected = mujoco_torques(model, finger.joint_names, *moved)
     found = inverse_dynamics(Finger.from_description(finger), *(x.T for x in moved)).T
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+
+
+SHAPES = """<asset><texture name="wood" type="2d" file="wood.png"/><material name="oak" texture="wood"/>
+<mesh name="bone" file="bone.stl"/></asset>"""
+BONE = '<geom type="mesh" mesh="bone"/><geom type="sphere" size="0.01" material="oak"/>'
+WEIGHED = '<inertial mass="0.02" pos="0.02 0 0" diaginertia="1e-6 2e-6 2e-6"/>'
+
+
+def skeleton(tmp_path, weighed: str, bones: str):
+    path = tmp_path / "bones.xml"
+    joint = '<joint name="mcp" axis="0 1 0" range="0 1.5"/>'
+    path.write_text(
+        f'<mujoco><compiler autolimits="true"/>{SHAPES if bones else ""}<worldbody>{bones}'
+        f'<body name="first">{joint}{weighed}{bones}</body></worldbody></mujoco>'
+    )
+    return path
+
+
+def test_an_mjcf_whose_meshes_and_pictures_are_not_there_has_the_links_that_it_states(tmp_path):
+    found = robot_finger(skeleton(tmp_path, WEIGHED, BONE)).finger
+    stated = robot_finger(skeleton(tmp_path, WEIGHED, "")).finger
+    assert finger_toml(found) == finger_toml(stated)
+    np.testing.assert_array_equal(found.mass, [0.02])
+
+
+def test_a_mass_that_only_a_mesh_would_give_is_refused(tmp_path):
+    with pytest.raises(UserError, match="link 'first' has its mass from the mesh 'bone', which is not there; put"):
+        robot_finger(skeleton(tmp_path, "", BONE))
 
 
 def test_tendons_pull_in_what_their_paths_say(mjcf):

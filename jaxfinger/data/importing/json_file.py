@@ -1,0 +1,49 @@
+"""JSON recordings: lists of numbers by name, or one object a sample, as a list or as JSON Lines."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from jaxfinger.data.importing.arrays import named_arrays
+from jaxfinger.data.importing.recording import Recording
+from jaxfinger.errors import UserError
+
+_LINES = (".jsonl", ".ndjson")
+
+
+def load_json(path: Path) -> Recording:
+    """Load every list of numbers, samples first.
+
+    Members of objects are named `outer.inner`, and so are those of the objects in a list, one object a sample. What a
+    sample lacks is NaN, true and false are 1 and 0.
+
+    Raises:
+        UserError: the file is no JSON, or holds two variables of one name.
+    """
+    text = path.read_text(encoding="utf-8-sig")
+    try:
+        if path.suffix.lower() in _LINES:
+            tree = [json.loads(line) for line in text.splitlines() if line.strip()]
+        else:
+            tree = json.loads(text)
+    except json.JSONDecodeError as error:
+        where = f"line {error.lineno}, column {error.colno}"
+        lines = "; a file with one object a line is to end in .jsonl" if error.msg == "Extra data" else ""
+        raise UserError(f"{path}: is no JSON ({error.msg}, {where}){lines or '; export the recording again'}") from None
+    return named_arrays(path, _leaves(tree, ""))
+
+
+def _leaves(tree: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """Names and values of the lists and numbers in the tree."""
+    if isinstance(tree, list) and any(isinstance(item, Mapping) for item in tree):
+        objects = [item if isinstance(item, Mapping) else {} for item in tree]
+        members = dict.fromkeys(key for item in objects for key in item)
+        tree = {key: [item.get(key) for item in objects] for key in members}
+    if isinstance(tree, Mapping):
+        for key, value in tree.items():
+            yield from _leaves(value, f"{name}.{key}" if name else str(key))
+    else:
+        yield name or "values", tree

@@ -1,0 +1,111 @@
+"""JSON, NumPy's files and HDF5 of other programs as recordings."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from jaxfinger.data.importing.sources import load_recording
+from jaxfinger.errors import UserError
+
+NAN = float("nan")
+SAMPLES = [
+    {"t": 0.0, "q": [0.1, 0.2], "on": True, "mode": "up", "cell": {"raw": 3}},
+    {"t": 0.1, "q": [0.3, 0.4], "on": False, "mode": "up", "cell": {"raw": None}},
+    {"t": 0.2, "on": True, "mode": "down", "cell": {"raw": 5}},
+]
+EXPECTED = {
+    "t": [0.0, 0.1, 0.2],
+    "q": [[0.1, 0.2], [0.3, 0.4], [NAN, NAN]],
+    "on": [1.0, 0.0, 1.0],
+    "cell.raw": [3.0, NAN, 5.0],
+}
+
+
+def written(path, content):
+    path.write_text(content)
+    return load_recording(path)
+
+
+def same(found, expected):
+    assert set(found.variables) == set(expected)
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found.variables[name].values, values)
+
+
+def test_json_with_an_object_a_sample(tmp_path):
+    for name, content in (
+        ("log.json", json.dumps(SAMPLES)),
+        ("log.jsonl", "\n".join(map(json.dumps, SAMPLES)) + "\n"),
+    ):
+        found = written(tmp_path / name, content)
+        same(found, EXPECTED)
+        assert list(found.words["mode"]) == ["up", "up", "down"]
+
+
+def test_json_with_samples_inside_an_object_or_lists_by_name(tmp_path):
+    found = written(tmp_path / "log.json", json.dumps({"mass": 1.5, "motor": "x", "entries": SAMPLES}))
+    same(found, {"mass": [1.5], **{f"entries.{name}": values for name, values in EXPECTED.items()}})
+    same(written(tmp_path / "log.json", json.dumps({"t": [0, 1], "q": [0.5, None]})), {"t": [0, 1], "q": [0.5, NAN]})
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("log.json", '{"t": [0, 1}', "is no JSON"),
+        ("log.json", '{"t": 0}\n{"t": 1}\n', ".jsonl"),
+        ("log.json", '{"a.b": [1], "a": {"b": [2]}}', "two variables 'a.b'"),
+    ],
+)
+def test_json_that_cannot_be_read_is_named_with_the_mend(tmp_path, name, content, said):
+    with pytest.raises(UserError, match=f"log.json: .*{said}"):
+        written(tmp_path / name, content)
+
+
+def test_json_values_that_are_no_variables_have_reasons(tmp_path):
+    content = {"ragged": [[1, 2], [3]], "wide": [[1, 2, 3], [4, 5, 6]], "mixed": [1, "x"], "none": [], "t": [0, 1]}
+    found = written(tmp_path / "log.json", json.dumps(content))
+    assert set(found.variables) == {"t"}
+    said = {"ragged": "different lengths", "wide": "2 rows and 3 columns", "mixed": "mixes", "none": "is empty"}
+    assert set(found.unusable) == set(said)
+    assert all(said[name] in reason for name, reason in found.unusable.items())
+
+
+def test_numpy(tmp_path):
+    q = np.arange(6.0).reshape(3, 2)
+    when = np.array(["2026-01-31T12:00:00.000", "2026-01-31T12:00:00.005", "NaT"], "datetime64[ns]")
+    table = np.array([(0, 1.5), (1, 2.5)], [("n", int), ("tau", float)])
+    np.savez(tmp_path / "log.npz", q=q, when=when, table=table, bad=np.array([{}, {}, {}], object), z=q + 1j)
+    found = load_recording(tmp_path / "log.npz")
+    assert set(found.variables) == {"q", "when", "table.n", "table.tau"}
+    np.testing.assert_allclose(np.diff(found.variables["when"].values), [0.005, NAN], atol=1e-6)
+    assert "Python objects" in found.unusable["bad"]
+    assert "complex" in found.unusable["z"]
+    np.save(tmp_path / "q.npy", q)
+    np.testing.assert_array_equal(load_recording(tmp_path / "q.npy").variables["values"].values, q)
+    np.save(tmp_path / "q.npy", table)
+    assert set(load_recording(tmp_path / "q.npy").variables) == {"n", "tau"}
+
+
+def test_hdf5_of_another_program(tmp_path):
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file["obs/q"] = np.arange(6.0).reshape(3, 2)
+        file["obs/mode"] = ["up", "down", "up"]
+        file["t"] = [0.0, 0.1, 0.2]
+    found = load_recording(tmp_path / "log.h5")
+    same(found, {"obs.q": [[0, 1], [2, 3], [4, 5]], "t": [0.0, 0.1, 0.2]})
+    assert list(found.words["obs.mode"]) == ["up", "down", "up"]
+
+
+def test_a_session_is_no_recording(tmp_path):
+    with h5py.File(tmp_path / "session.h5", "w") as file:
+        file.attrs["format"] = "jaxfinger-dataset"
+    with pytest.raises(UserError, match="is a session already; look at it with: jaxfinger check"):
+        load_recording(tmp_path / "session.h5")
+
+
+def test_a_table_that_is_not_read_is_answered_with_the_line_that_writes_it_as_csv(tmp_path):
+    (tmp_path / "log.parquet").write_bytes(b"PAR1")
+    with pytest.raises(UserError, match=r"pandas.read_parquet\('log.parquet'\).to_csv\('log.csv', index=False\)"):
+        load_recording(tmp_path / "log.parquet")
