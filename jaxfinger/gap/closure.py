@@ -24,6 +24,7 @@ from jaxfinger.model import Model
 # Mean square before, relative to that of the noise, from which a gap is said to close. With less, `closed` divides a
 # difference of two nearly equal numbers, of which the noise is itself an estimate.
 MIN_RESOLVABLE_RATIO = 1.1
+MAX_LENGTH_DIFFERENCE = 0.1  # Share of its length by which a repeat may be longer or shorter: it was then not cut off.
 MIN_SAMPLES = 10  # A trial with fewer held-out samples of a channel has no mean square worth the name.
 
 
@@ -121,7 +122,7 @@ def _spread(problem: Problem, name: str) -> float:
     squares = [
         np.mean((trial.q[: len(t.q)] - t.q[: len(trial.q)]) ** 2)
         for t in repeats
-        if abs(len(t.q) - len(trial.q)) < 0.1 * len(trial.q)
+        if abs(len(t.q) - len(trial.q)) < MAX_LENGTH_DIFFERENCE * len(trial.q)
     ]
     return float(0.5 * np.mean(squares)) if squares else 0.0
 

@@ -19,6 +19,7 @@ from jaxfinger.gap.likeness import check_likeness
 MAX_ROUNDING = 1e-9
 # Values that a rounded column has at least: few values are multiples of some step by chance.
 MIN_VALUES = 6
+MAX_STEP_RATIO = 1.5  # Median step of predictions over that of the recording: more are fewer samples, and no jitter.
 MAX_ODD = 0.01  # of a step, by which rounded values are off: written digits are exact but for rounding
 
 
@@ -110,7 +111,7 @@ def _report_steps(session: Session, predictions: Predictions, report: Report) ->
         if len(time) > 1 and len(trial.time) > 1 and _judged(trial, predictions):
             step = float(np.median(np.diff(time)))
             # No step need be shorter than those of the recording.
-            if step > max(longest, 1.5 * float(np.median(np.diff(trial.time)))):
+            if step > max(longest, MAX_STEP_RATIO * float(np.median(np.diff(trial.time)))):
                 said = f"predictions come every {step:.2g} s, and lines between them hide quicker motion"
                 report.warning(
                     f"/trials/{trial.name}", f"{said}; predict at the session's times, or every {longest:.2g} s"
