@@ -1,5 +1,6 @@
 """Figures as functions: they draw on the axes that they are given, and show their arguments."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -100,6 +101,19 @@ def test_correlated_neighbours_are_shown():
     ax = plots.correlation(fits()[0], 6)
     assert len(ax.get_yticklabels()) == 6
     assert sum(len(c.get_offsets()) for c in ax.collections) >= 5
+
+
+def test_squares_of_parameters_with_long_names_do_not_touch(monkeypatch):
+    names = [f"elastic_relaxation joint{k} stiffness" for k in range(10)]
+    monkeypatch.setattr("jaxfinger.report.plots.fit.correlations", lambda fit: (names, np.ones((10, 10))))
+    ax = plots.correlation(fits()[0], 10, axes_or_new(None, 3.35, 3.0))
+    ax.figure.draw_without_rendering()
+    numbers = [t.get_window_extent() for t in ax.get_xticklabels()]
+    assert all(left.x1 < right.x0 for left, right in itertools.pairwise(numbers))
+    cells = np.abs(np.diff(ax.transData.transform([(0.0, 0.0), (1.0, 1.0)]), axis=0)) * 72.0 / ax.figure.dpi
+    assert np.sqrt(max(c.get_sizes().max(initial=0.0) for c in ax.collections)) < cells.min()
+    legend = ax.get_legend().get_window_extent()
+    assert 0.0 <= legend.x0 < legend.x1 <= ax.figure.bbox.width
 
 
 def test_of_many_influences_the_largest_are_shown():

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 
 from jaxfinger.identify import Fit
 from jaxfinger.identify.parameters import describe
@@ -18,6 +19,7 @@ MAX_SIDE = 0.8  # Side of the largest square in that of its cell, so that neighb
 X_LIMIT = 2.1  # Relative to the scale of a row: a value of 1 with a half-width of 1 reaches 2.
 INTERVAL_ROWS = 10  # Rows in one panel of a page, which then fits on a phone's screen.
 ROW_HEIGHT = 0.36  # Inches that a parameter and its name take.
+MAX_NAME_SHARE = 0.45  # of a figure's width that names beside squares take
 # Letters are on average 0.6 of the font's 9 points (`theme.FONT`) wide, which makes 13; one is left for the gap between
 # name and value.
 CHARACTERS_PER_INCH = 12.0
@@ -107,7 +109,8 @@ def correlation(fit: Fit, most: int = 16, ax: Axes | None = None) -> Axes:
     names, R = [names[i] for i in chosen], R[np.ix_(chosen, chosen)]
     ax = axes_or_new(ax, 2.0 + 0.2 * len(names), 1.0 + 0.2 * len(names))
     numbers = [str(k + 1) for k in range(len(names))]
-    rows = [f"{name}  {k}" for name, k in zip(names, numbers, strict=True)]
+    room = int(MAX_NAME_SHARE * ax.figure.bbox.width / ax.figure.dpi * CHARACTERS_PER_INCH)
+    rows = [f"{_shortened(name, room)}  {k}" for name, k in zip(names, numbers, strict=True)]
     _squares(ax, np.tril(R, -1), rows, numbers, "ρ = 1", "ρ = −1")
     return ax
 
@@ -146,15 +149,18 @@ def influence(found: Sensitivity | Mapping[str, Sensitivity], fit: Fit, most: in
 
 def _squares(ax: Axes, values, rows: Sequence[str], columns: Sequence[str], up: str, down: str) -> None:
     """Draw values from −1 to 1 as squares whose area is their magnitude."""
-    at = ax.get_window_extent().transformed(ax.figure.dpi_scale_trans.inverted())  # inches
-    cell = 72.0 * min(at.width / max(len(columns), 1), at.height / max(len(rows), 1))
-    size = (MAX_SIDE * cell) ** 2
-    for sign, colour, label in ((1, COLOURS[0], up), (-1, COLOURS[1], down)):
-        i, j = np.nonzero(sign * values > 0.02)
-        ax.scatter(j, i, s=size * np.abs(values[i, j]), marker="s", color=colour, linewidths=0, label=label)
     ax.set(xticks=range(len(columns)), yticks=range(len(rows)), xticklabels=columns, yticklabels=rows)
     ax.set(xlim=(-0.6, len(columns) - 0.4), ylim=(len(rows) - 0.4, -0.6))
     ax.xaxis.tick_top()
     ax.spines[["left", "bottom"]].set_visible(False)
     ax.tick_params(length=0)
-    legend_below(ax, 2)
+    signs = ((1, COLOURS[0], up), (-1, COLOURS[1], down))
+    legend_below(ax, 2, handles=[Line2D([], [], marker="s", linestyle="", color=c, label=text) for _, c, text in signs])
+    if (figure := ax.get_figure(root=True)) is not None:
+        figure.draw_without_rendering()  # Names and legend leave the axes less room than the figure has.
+    at = ax.get_window_extent().transformed(ax.figure.dpi_scale_trans.inverted())  # inches
+    cell = 72.0 * min(at.width / max(len(columns), 1), at.height / max(len(rows), 1))
+    size = (MAX_SIDE * cell) ** 2
+    for sign, colour, _ in signs:
+        i, j = np.nonzero(sign * values > 0.02)
+        ax.scatter(j, i, s=size * np.abs(values[i, j]), marker="s", color=colour, linewidths=0)
