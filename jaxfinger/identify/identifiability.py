@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from jaxfinger.identify.gauss_newton import MIN_RELATIVE_SINGULAR_VALUE
 from jaxfinger.identify.parameters import Parameter
+from jaxfinger.identify.plausible import Z95
 from jaxfinger.model import Finger, rigid_body
 
 # A combination whose relative singular value is smaller is weak: its interval is more than 1000 times as wide as that
@@ -17,6 +18,7 @@ MIN_SEEN_SINGULAR_VALUE = 1e-3
 # Entries of a unit vector. Smaller ones hold less than 0.25 % of its square and are not shown, or less than 9 % and
 # need no remedy.
 MIN_SHOWN_ENTRY, MIN_ENTRY_OF_REMEDY = 0.05, 0.3
+WIDER = 10.0  # times, from which on an interval is wide because another parameter is unknown, not for noise
 RANK_TOLERANCE = 1e-9  # relative, of a regressor's columns and singular values, far above rounding
 
 # Experiment of the format that determines each group of parameters.
@@ -98,6 +100,31 @@ def name_invisible(
             f"record {_remedy(parameters, _involved(free, v))}"
         )
     return sentences
+
+
+def name_traded(
+    parameters: list[Parameter],
+    values: Float[np.ndarray, " P"],
+    covariance: Float[np.ndarray, "P P"],
+    free: Int[np.ndarray, " p"],
+) -> list[str]:
+    """One sentence for each two laws of which the trials determine the sum alone, with a remedy.
+
+    The intervals of their parameters then hold zero, and each would be `WIDER` times as narrow if the other were known.
+    Coefficients of one polynomial trade off in any trial of a short range, and say nothing of a law.
+    """
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    unsure = [i for i in free if np.isfinite(std[i]) and std[i] > 0.0 and abs(values[i]) < Z95 * std[i]]
+    out: dict[tuple, str] = {}
+    for k, i in enumerate(unsure):
+        for j in unsure[:k]:
+            a, b = parameters[j], parameters[i]
+            laws = (a.group, a.joint, a.tendon), (b.group, b.joint, b.tendon)
+            if laws[0] != laws[1] and (covariance[i, j] / std[i] / std[j]) ** 2 > 1.0 - WIDER**-2:
+                remedies = dict.fromkeys(_remedy(parameters, np.array([m])) for m in (j, i))
+                said = f"the trials show {a.name} and {b.name} only together, so the interval of each is wide"
+                out.setdefault(laws, f"{said}; record {', or '.join(remedies)}")
+    return list(out.values())
 
 
 def _shares(parameters, free, v) -> dict[str, float]:

@@ -18,7 +18,7 @@ from jaxfinger.data import Session
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, not_judged
 from jaxfinger.identify.fit import Fit
-from jaxfinger.identify.identifiability import name_invisible
+from jaxfinger.identify.identifiability import name_invisible, name_traded
 from jaxfinger.identify.noise import LONG_SIGNAL_WINDOW
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.plausible import implausible
@@ -101,6 +101,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
     if better:
         warnings.append("the earlier fit led to a poorer optimum")
     covariance = propagate(fit.covariance, model, solution, sources, free, prior, huber)
+    warnings += name_traded(parameters, np.asarray(ravel(model)), covariance, free)
     warnings += implausible(model, covariance, free, parameter_bounds(start, free)[0])
     refined = replace(
         fit.made_from(session, alone=same),
@@ -156,6 +157,7 @@ def _on_motion(fit: Fit, starts: Shooting, sources: dict[str, Source], prior: Pr
     moved, corrected = (np.asarray(ravel(model)) - np.asarray(ravel(m)) for m in (fit.model, first))
     covariance += _contradiction(moved, fit.std**2, np.diag(covariance)) + np.outer(corrected, corrected)
     warnings = name_invisible(parameters, free, solution.invisible)
+    warnings += name_traded(parameters, np.asarray(ravel(model)), covariance, free)
     warnings += implausible(model, covariance, free, parameter_bounds(fit.model, free)[0])
     refined = replace(fit, model=model, covariance=covariance)
     report = report_of(

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data import FingerDescription, Session, Trial, joints_of, low_pass
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, counted
 from jaxfinger.experiments import SAMPLES, Stack, padded, padded_size, predict_compiled, prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.model import Finger, Model, Motion, simulate
@@ -47,7 +47,7 @@ def predict_session(
     model = model_for(fit, session)
     out: dict[str, dict[str, np.ndarray]] = {}
     for experiment, stack in prepare(session, names, reduced=False).items():
-        progress(f"predicting {len(stack.trials)} trials of {experiment}")
+        progress(f"predicting {counted(len(stack.trials), 'trial')} of {experiment}")
         driven = experiment == "VD.3" and session.finger.n > 0
         free = simulate_trials([model] * len(stack.trials), session, stack) if driven else {}
         T = stack.batch.x.time.shape[-1]

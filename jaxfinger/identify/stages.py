@@ -19,7 +19,7 @@ from jaxfinger.data.signals.sizes import sizes_of
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Experiment, Stack, not_judged
 from jaxfinger.identify.fit import Fit, StageReport
-from jaxfinger.identify.identifiability import name_invisible
+from jaxfinger.identify.identifiability import name_invisible, name_traded
 from jaxfinger.identify.noise import MIN_STD, SIGNAL_WINDOW, Noise, estimate
 from jaxfinger.identify.parameters import Parameter, describe, ravel
 from jaxfinger.identify.plausible import implausible
@@ -277,6 +277,7 @@ def run_stage(
     warnings = constant + name_missing(parameters, np.asarray(ravel(model)), determined, needed, coverage)
     warnings += name_invisible(parameters, free, solution.invisible)
     warnings += name_unseen(parameters, groups, free)
+    warnings += name_traded(parameters, np.asarray(ravel(model)), covariance, free)
     warnings += implausible(model, covariance, free, parameter_bounds(fit.model, free)[0])
     trials = tuple(t for e in reads for t in stacks[e].trials)
     report = report_of(stage.name, solution, free, trials, warnings)

@@ -175,10 +175,20 @@ def _no_gap(d: Diagnosis) -> list[str]:
     names = [f"{channel_name(x.channel)} of {x.experiment} ({number(x.before / x.noise, 2)} times)" for x in loud]
     return [
         f"{_subject(d)} leaves in {_counted(len(judged))} nothing that a law could explain",
-        f"what it leaves is larger than the channel's own noise in {joined(names)}, as where noise of angles or of "
-        "accelerations moves a prediction",
+        f"what it leaves is larger than the channel's own noise in {joined(names)}, as where {_why_loud(d, loud)}",
         chance,
     ]
+
+
+def _why_loud(d: Diagnosis, loud: Sequence[Closure]) -> str:
+    """What may make the held-out errors of these channels larger than their noise, where no law does."""
+    trials = {} if d.problem is None else {e: len(stack.trials) for e, stack in d.problem.stacks.items()}
+    if any(trials.get(x.experiment) != 1 for x in loud):
+        return "noise of angles or of accelerations moves a prediction"
+    return (
+        "a trial stands alone, and each part of it shows what no other part does: repeat it, and record it at other "
+        "speeds and ranges"
+    )
 
 
 def _counted(channels: int) -> str:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.identify import base_parameters
-from jaxfinger.identify.identifiability import directions, name_invisible
+from jaxfinger.identify.identifiability import directions, name_invisible, name_traded
 from jaxfinger.identify.parameters import Parameter
 from jaxfinger.model import Finger
 from tests.model.fingers import description
@@ -66,3 +66,32 @@ def test_base_parameters_of_a_planar_finger():
     )
     base = base_parameters(Finger.from_description(type(d)(**{**vars(d), **planar})))
     assert base.rank == 9
+
+
+def alike(correlation: float) -> np.ndarray:
+    """Covariance of friction and damping with a correlation, and of two further coefficients of friction with 1."""
+    R = np.eye(4)
+    R[0, 1] = R[1, 0] = correlation
+    R[2, 3] = R[3, 2] = 0.9999
+    return R
+
+
+TRADED = [
+    Parameter("friction torque MCP^0", "friction", "N m", "MCP"),
+    Parameter("damping MCP", "damping", "N m s/rad", "MCP"),
+    Parameter("friction torque MCP^1", "friction", "N m/rad", "MCP"),
+    Parameter("friction torque MCP^2", "friction", "N m/rad²", "MCP"),
+]
+
+
+@pytest.mark.parametrize(
+    ("correlation", "value", "named"),
+    [(-0.9997, 0.2, True), (0.9997, 0.2, True), (-0.97, 0.2, False), (-0.9997, 4.0, False)],
+)
+def test_two_laws_that_show_only_together_are_named_with_the_trial_that_parts_them(correlation, value, named):
+    """Where an interval does not hold zero, the law is known to be there; coefficients of one law say nothing."""
+    found = name_traded(TRADED, np.array([value, 0.1, 0.0, 0.0]), alike(correlation), np.arange(4))
+    assert len(found) == named
+    for sentence in found:
+        assert "friction torque MCP^0 and damping MCP only together" in sentence
+        assert "or ID.3-dynamic of joint MCP at two speeds or more" in sentence

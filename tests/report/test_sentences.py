@@ -1,6 +1,7 @@
 """Sentences say how large the gap is, then why, then what is left, and are never more sure than the numbers."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -70,6 +71,20 @@ def test_a_model_that_misses_by_more_than_the_noise_is_not_said_to_predict_to_wi
     assert "within the noise" not in said
     assert "leaves in both channels that could be judged nothing that a law could explain" in said
     assert f"larger than the channel's own noise in joint torque of {line.experiment} (9 times)" in said
+    assert "as where noise of angles or of accelerations moves a prediction" in said
+
+
+@pytest.mark.parametrize(("trials", "alone"), [(("a",), True), (("a", "b"), False)])
+def test_a_lone_trial_whose_parts_predict_each_other_badly_is_to_be_repeated(trials, alone):
+    """Its held-out parts say nothing of noise."""
+    nothing = ALL["no_gap"]
+    line = replace(nothing.closures[0], before=9.0 * nothing.closures[0].noise)
+    stacks = {line.experiment: SimpleNamespace(trials=trials)}
+    found = replace(nothing, closures=(line,))
+    object.__setattr__(found, "problem", SimpleNamespace(stacks=stacks, simulator=None))  # all that a summary reads
+    said = sentences.summary(found)
+    assert ("as where a trial stands alone" in said) == alone
+    assert ("as where noise of angles" in said) != alone
 
 
 @pytest.mark.parametrize("name", ALL)

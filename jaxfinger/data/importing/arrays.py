@@ -25,16 +25,15 @@ _MIXED = Unusable("mixes numbers with text or lists; give each sample as many nu
 
 
 def load_numpy(path: Path) -> Recording:
-    """Load every array of numbers of a .npz file, or the one of a .npy file as `values`, samples first.
+    """Load every array of numbers of a .npz file, or the one of a .npy file by the name of the file, samples first.
 
-    The fields of a structured array are named `array.field`, those of a .npy file `field`. Dates and durations are
-    seconds.
+    The fields of a structured array are named `array.field`. Dates and durations are seconds.
 
     Raises:
         UserError: the file holds two variables of one name.
     """
     if path.suffix.lower() == ".npy":
-        return named_arrays(path, _fields("", _one(lambda: np.load(path, allow_pickle=False))))
+        return named_arrays(path, _fields(path.stem, _one(lambda: np.load(path, allow_pickle=False))))
     with np.load(path, allow_pickle=False) as file:
         read = [(name, _one(lambda name=name: file[name])) for name in file.files]
     return named_arrays(path, (leaf for name, value in read for leaf in _fields(name, value)))
@@ -53,9 +52,9 @@ def _one(read: Any) -> Any:
 def _fields(name: str, value: Any) -> Iterator[tuple[str, Any]]:
     if isinstance(value, np.ndarray) and value.dtype.names is not None:
         for field in value.dtype.names:
-            yield f"{name}.{field}" if name else field, value[field]
+            yield f"{name}.{field}", value[field]
     else:
-        yield name or "values", value
+        yield name, value
 
 
 def load_hdf5(path: Path) -> Recording:

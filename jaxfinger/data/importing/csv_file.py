@@ -32,6 +32,8 @@ _UNIT = r"%|°|deg|rad|turn|rev|rpm|k?Hz|[mun]?s|[munc]?m|[mk]?N|[mk]?N[ ·*]?[c
 _UNIT_CELL = re.compile(rf"^[\[(]?({_UNIT}|{_UNIT}/s2?|)[\])]?$")
 _UNIT_SUFFIX = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")  # in brackets after a name
 _DATE = re.compile(r"^\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
+_LIST = re.compile(r"^\[.*\]$", re.DOTALL)
+_LIST_IN_QUOTES = re.compile(r'"\[[^"\]]*\]"')  # pandas breaks the lines of a long array
 _HOUR = re.compile(r"\d:\d\d")  # in a time of day or a date
 _BLANKS = " \u00a0\u202f'’"  # that group digits, and are never a decimal mark
 # Numbers with groups of three digits, by decimal mark. One group alone behind the other mark is no such number: 1,234
@@ -89,7 +91,8 @@ def load_csv(path: Path) -> Recording:
     """Load the columns of a CSV file by the names above the numbers, or as `column 0`, `column 1` and so on.
 
     Empty cells and words for a missing value (`-`, `#N/A`) are NaN, True and False are 1 and 0, and dates with a time
-    of day are seconds since 1970. A column of words can be tested, not computed with.
+    of day are seconds since 1970. A column of lists in brackets, one a sample, is an array. A column of words can be
+    tested, not computed with.
 
     Raises:
         UserError: the file has no column of numbers, or a line with another number of cells.
@@ -135,6 +138,7 @@ def _is_comment(text: str) -> bool:
 
 
 def _lines(text: str) -> list[str]:
+    text = _LIST_IN_QUOTES.sub(lambda found: " ".join(found.group().split()), text)
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
@@ -278,12 +282,27 @@ def _column(cells: Sequence[str], lines: Sequence[int], dialect: _Dialect, numer
     if not bad:
         return _Column(np.array(values, np.float64))
     first = cells[bad[0]]
+    if all(_LIST.match(cell) for cell in cells if cell):
+        return _lists(cells)
     some_numbers = any(value is not None and not np.isnan(value) for value in known.values())
     if some_numbers or _HOUR.search(first) or _ONE_GROUP.match(first):
         return _Column(None, _fault(first, lines[bad[0]], len(bad) - 1))
     there = listed([repr(cell) for cell in dict.fromkeys(cells) if cell], 4)
     fault = f"holds the words {there}; a trial's `where` can test it"
     return _Column(None, fault, np.array(cells, np.dtypes.StringDType()))
+
+
+def _lists(cells: Sequence[str]) -> _Column:
+    """A column of lists such as `[0.1, 0.2]`, one a sample, as arrays; an empty cell is a list of NaN."""
+    try:
+        rows = [np.array(cell[1:-1].replace(",", " ").split(), np.float64) for cell in cells]
+    except ValueError:
+        return _Column(None, "holds lists of words; give lists of numbers")
+    widths = {len(row) for row, cell in zip(rows, cells, strict=True) if cell}
+    if len(widths) != 1 or 0 in widths:
+        return _Column(None, "holds lists of different lengths; give each sample as many numbers")
+    missing = np.full(next(iter(widths)), np.nan)
+    return _Column(np.array([row if cell else missing for row, cell in zip(rows, cells, strict=True)]))
 
 
 def _plain_numbers(cells: Sequence[str], mark: str) -> np.ndarray | None:

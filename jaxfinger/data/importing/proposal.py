@@ -234,7 +234,7 @@ def _experiment(
         named = [name for name in names["q"] if name.lower() in stem] if len(names["q"]) > 1 else names["q"]
         return "ID.4", named[0] if len(named) == 1 else "?", tendon
     if torque or not moved or not (force or excursion):  # A motor moves a joint, or several do, each with its torque.
-        joint = joint if len(moved) <= 1 or len(torque) <= 1 else ""
+        joint = joint if len(moved) <= 1 or len(torque) == 1 else ""
         return ("ID.3-static" if moved and _stepped(recording, q[most]) else "ID.3-dynamic"), joint, ""
     if len(moved) == 1:
         return "ID.2", joint, ""

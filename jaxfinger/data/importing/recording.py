@@ -55,7 +55,8 @@ class Recording:
 def side_by_side(recordings: Sequence[Recording]) -> Recording:
     """Recordings of the same samples, as of loggers that write each array to a file of its own, as one recording.
 
-    Its variables are named `file.variable`, by the names of the files without their endings.
+    Its variables are named `file.variable`, by the names of the files without their endings, and one that has the name
+    of its file by that alone.
 
     Raises:
         ValueError: two files have one name, or another number of samples; the end of a sentence.
@@ -69,9 +70,10 @@ def side_by_side(recordings: Sequence[Recording]) -> Recording:
         if name in counts:
             raise ValueError(f"names two files {name!r}; rename one of them")
         counts[name] = max((len(v.values) for v in r.variables.values() if not v.clock), default=0)
-        variables |= {f"{name}.{k}": replace(v, clock=v.clock and f"{name}.{v.clock}") for k, v in r.variables.items()}
-        unusable |= {f"{name}.{k}": reason for k, reason in r.unusable.items()}
-        words |= {f"{name}.{k}": values for k, values in r.words.items()}
+        called = {k: k if k == name else f"{name}.{k}" for k in (*r.variables, *r.unusable)}
+        variables |= {called[k]: replace(v, clock=called.get(v.clock, "")) for k, v in r.variables.items()}
+        unusable |= {called[k]: reason for k, reason in r.unusable.items()}
+        words |= {called[k]: values for k, values in r.words.items()}
     if len(set(counts.values())) > 1:
         said = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise ValueError(

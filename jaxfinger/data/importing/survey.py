@@ -23,16 +23,17 @@ _MEANINGS = (
     ("tendon_excursion", r"excursion|^l\d*$|length|pull|spool|linear|travel"),
     ("tendon_force", r"tension|tendon.*force|^f_?t|^f(\d|_(?!([xyz]|tip)$))|cable|loadcell|(^|_)cell(_|\d|$)|^force"),
     ("fingertip_force", r"f?tip|contact|^f[xyz]$|wrench"),
-    ("q", r"^q[_\d]*|angle|pos|enc|theta|winkel|deg$"),
+    ("q", r"^q[_\d]*|_q(_|\d|$)|angle|pos|enc|theta|winkel|deg$"),
 )
 # Of a clock's values or steps: more values differ, also out of order, or more steps go on, also of a recording that was
 # pasted twice.
 _MIN_RUNNING = 0.5
 # Names of velocities, which belong to no channel, of set-points, which are not measured, and of switches and states.
-_VELOCITY = r"(?<![a-z])vel|speed|dot|^v$|^dq"
+_VELOCITY = r"(?<![a-z])vel|speed|dot|^v$|^dq|(^|_)(d+q|qd+)(_|\d|$)"
 _STATE = r"enable|flag|status|valid|(^|_)(on|off|ok|mode|err|error|fault|alarm)(_|\d|$)"
 _SET_POINT = (
     r"cmd|command|ref(?!l)|desired|set_?p(oin)?t|goal|target|demand|soll|feed_?forward"
+    r"|(?<![a-z])(q|tau|tau_j)_d(?![a-z])"
     r"|(?<![a-z])(q|tau|pos)?(des|set(?!\d+\.)|sp|ff|tgt|nominal|planned)(?![a-z])"
 )
 # Largest plausible values of a channel by unit, with room for arms. The first unit whose largest value is not exceeded

@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
+from jaxfinger.data.importing.recording import side_by_side
 from jaxfinger.data.importing.sources import load_recording
 from jaxfinger.errors import UserError
 
@@ -83,9 +84,9 @@ def test_numpy(tmp_path):
     assert "Python objects" in found.unusable["bad"]
     assert "complex" in found.unusable["z"]
     np.save(tmp_path / "q.npy", q)
-    np.testing.assert_array_equal(load_recording(tmp_path / "q.npy").variables["values"].values, q)
+    np.testing.assert_array_equal(load_recording(tmp_path / "q.npy").variables["q"].values, q)
     np.save(tmp_path / "q.npy", table)
-    assert set(load_recording(tmp_path / "q.npy").variables) == {"n", "tau"}
+    assert set(load_recording(tmp_path / "q.npy").variables) == {"q.n", "q.tau"}
 
 
 def test_hdf5_of_another_program(tmp_path):
@@ -109,3 +110,10 @@ def test_a_table_that_is_not_read_is_answered_with_the_line_that_writes_it_as_cs
     (tmp_path / "log.parquet").write_bytes(b"PAR1")
     with pytest.raises(UserError, match=r"pandas.read_parquet\('log.parquet'\).to_csv\('log.csv', index=False\)"):
         load_recording(tmp_path / "log.parquet")
+
+
+def test_arrays_in_files_of_their_own_lie_side_by_side_by_their_names(tmp_path):
+    np.save(tmp_path / "times.npy", np.arange(3.0))
+    np.savez(tmp_path / "log.npz", q=np.arange(6.0).reshape(3, 2))
+    found = side_by_side([load_recording(tmp_path / name) for name in ("times.npy", "log.npz")])
+    assert set(found.variables) == {"times", "log.q"}

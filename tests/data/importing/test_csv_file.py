@@ -62,6 +62,17 @@ def test_units_below_the_names_or_in_them(tmp_path):
     assert [v.units for v in found.values()] == ["s", "deg", "N"]
 
 
+def test_lists_in_cells_are_arrays(tmp_path):
+    text = 't,q,tau,mode\n0,"[0.1, 0.2]","[1 2\n 3]","[up]"\n1,,"[4 5\n 6]","[up]"\n2,"[0.5, 0.6]","[7 8]","[up]"\n'
+    found = load(tmp_path, text)
+    np.testing.assert_array_equal(found.variables["q"].values, [[0.1, 0.2], [np.nan, np.nan], [0.5, 0.6]])
+    assert set(found.variables) == {"t", "q"}
+    assert "different lengths" in found.unusable["tau"]
+    assert "lists of words" in found.unusable["mode"]
+    found = load(tmp_path, text.replace("[7 8]", "[7 8 9]"))
+    np.testing.assert_array_equal(found.variables["tau"].values, [[1, 2, 3], [4, 5, 6], [7, 8, 9]])
+
+
 def test_truth_dates_and_empty_cells(tmp_path):
     text = "when,on,x\n2024-03-01 12:00:00.000,True,1\n2024-03-01 12:00:00.005,False,\n2024-03-01T12:00:00.010,True,3\n"
     found = load(tmp_path, text).variables

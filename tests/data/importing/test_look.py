@@ -224,7 +224,8 @@ def test_cells_may_read_gram_force(unit, newtons):
     [("q_des", "q_meas"), ("Winkel_Soll [°]", "Winkel_Ist [°]"), ("target_pos", "actual_pos"), ("qDes", "q"),
      ("des.q", "q"), ("pos_sp", "pos"), ("goal.joint.position", "joint.position"), ("enc_nominal", "enc_offset"),
      ("SetPoint.q", "dataset.q"), ("set.angle", "set1.angle"), ("qset", "q_reflex"),
-     ("/hand/goals.position", "/target/joint_states.position")],
+     ("/hand/goals.position", "/target/joint_states.position"), ("state.q_d", "state.q"),
+     ("target_q_0", "actual_q_0")],
 )  # fmt: skip
 def test_a_measured_column_wins_over_its_set_point(tmp_path, set_point, measured):
     """A torque's feedforward is a set-point as well."""
@@ -246,6 +247,18 @@ def test_a_set_point_alone_is_said(tmp_path):
     said = proposal([load_recording(path)])
     assert "channels.q" not in said
     assert '# set-points by their names, which are not measured: "q_soll"' in said
+
+
+def test_robots_that_name_their_angles_q_have_no_angles_in_their_speeds(tmp_path):
+    """Several joints move, and no torque says that one of them is led."""
+    angles = [0.5 * np.sin(TIME / 1e3), 0.5 * np.cos(TIME / 1e3)]
+    names = ["t", "actual_q_0", "actual_q_1", "actual_qd_0", "actual_qdd_1", "state.dq_0"]
+    path = tmp_path / "log.csv"
+    np.savetxt(path, np.column_stack([TIME, *angles, *angles, angles[0]]), header=" ".join(names), comments="")
+    said = proposal([load_recording(path)])
+    assert 'channels.q.J2 = { from = "actual_q_1"' in said
+    assert "channels.q.J3" not in said
+    assert "\njoint = " not in said
 
 
 def test_a_switch_and_a_single_number_are_no_measurements(tmp_path):
