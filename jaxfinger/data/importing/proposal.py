@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxfinger.data.importing.columns import coarse_rate, restarts
 from jaxfinger.data.importing.recording import Recording
+from jaxfinger.data.importing.speeds import speeds
 from jaxfinger.data.importing.survey import ColumnSurvey, columns_of, is_set_point
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
@@ -28,6 +29,7 @@ _MAX_LEFT_OUT = 12  # variables that are named, so that the line of a large bag 
 # Of the time of two logs: with more in common they show one trial. Loggers that are started by hand begin and end a
 # little apart.
 _TOGETHER = 0.9
+_MAX_SPEEDS = 4  # that are named
 _MIN_ALIKE = 10  # samples: shorter files of one length may be tables of parameters.
 _HEAD = 'specimen = "my finger"\nfinger = "finger.toml"'
 
@@ -177,6 +179,7 @@ def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _
     coarse = coarse_rate(time)
     if clock is None:
         lines.append('time = "?"   # no time was found: name its variable, or write `rate_hz`, samples per second')
+        lines += _rate_by_speeds(logs[0])
     elif coarse is not None:
         lines.append(f"rate_hz = {coarse[1]:.4g}   # several samples share each stamp of {quoted(clock.name)}")
     elif clock.units in ("s", ""):
@@ -198,6 +201,30 @@ def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _
     read = {s for channel, columns in channels.items() for s in columns[: len(rows[channel])]}
     left_out = dict.fromkeys(s.name for log in logs for s in log.seen if s not in read and s.meaning != "time")
     return _Proposal(lines, rows, list(left_out))
+
+
+def _rate_by_speeds(log: _Log) -> list[str]:
+    """A comment on the sampling rate at which some columns of a log without a clock are the speeds of others."""
+    seen = [s for s in log.seen if s.samples == log.count and s.meaning in ("", "q")]
+    found = speeds([_values(log.recording, s) for s in seen])
+    if not found:
+        return []
+    named = [f"{_called(seen[x.speed])} of {_called(seen[x.of])} at {float(f'{x.rate:.3g}'):g}" for x in found]
+    return [
+        f"# speeds, if in the units of their angles by s, tell the samples per second: {listed(named, _MAX_SPEEDS)}"
+    ]
+
+
+def _called(seen: ColumnSurvey) -> str:
+    return quoted(seen.name if seen.column is None else f"{seen.name}[{seen.column}]")
+
+
+def _values(recording: Recording, seen: ColumnSurvey) -> np.ndarray:
+    """Values of a column, (N,)."""
+    variable = recording.variables[seen.name]
+    table = variable.values.reshape(len(variable.values), -1)
+    named = variable.columns
+    return table[:, 0 if seen.column is None else named.index(seen.column) if named else int(seen.column)]
 
 
 def _is_motor(seen: ColumnSurvey) -> bool:
@@ -245,10 +272,7 @@ def _experiment(
 
 def _stepped(recording: Recording, seen: ColumnSurvey) -> bool:
     """Whether a joint stands still for much of the time between its moves."""
-    values = recording.variables[seen.name].values
-    table = values.reshape(len(values), -1)
-    columns = recording.variables[seen.name].columns
-    x = table[:, 0 if seen.column is None else columns.index(seen.column) if columns else int(seen.column)]
+    x = _values(recording, seen)
     x = x[np.isfinite(x)]
     steps = np.abs(np.diff([part.mean() for part in np.array_split(x, min(len(x), _PARTS))]))
     return float(np.mean(steps < _MAX_STILL_CHANGE * np.percentile(steps, 95.0))) > _MIN_STILL_SHARE

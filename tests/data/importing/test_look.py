@@ -1,6 +1,7 @@
 """`look` describes a recording and proposes a mapping that imports it."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -259,6 +260,23 @@ def test_robots_that_name_their_angles_q_have_no_angles_in_their_speeds(tmp_path
     assert 'channels.q.J2 = { from = "actual_q_1"' in said
     assert "channels.q.J3" not in said
     assert "\njoint = " not in said
+
+
+@pytest.mark.parametrize("rate", [50.0, 1000.0])
+def test_speeds_tell_the_rate_of_a_log_without_a_clock(tmp_path, rate):
+    """A joint beside them, a torque and a constant column have no speed, nor are they one."""
+    t, rng = np.arange(4000) / rate, np.random.default_rng(2)
+    angles = [0.5 * np.sin(3.0 * t) + 0.2 * np.sin(5.1 * t), 0.4 * np.cos(2.2 * t)]
+    rates = [1.5 * np.cos(3.0 * t) + 1.02 * np.cos(5.1 * t), -0.88 * np.sin(2.2 * t)]
+    columns = [*angles, np.sin(1.1 * t), *(x + 0.03 * rng.standard_normal(t.size) for x in rates), np.sign(rates[0])]
+    path = tmp_path / "log.csv"
+    np.savetxt(path, np.column_stack([*columns, 0.0 * t]), delimiter=",")
+    said = proposal([load_recording(path)])
+    found = re.findall(r'"column (\d)" of "column (\d)" at ([\d.]+)', said)
+    assert [pair[:2] for pair in found] == [("3", "0"), ("4", "1")]
+    assert [float(pair[2]) for pair in found] == pytest.approx([rate, rate], rel=0.01)
+    np.savetxt(path, np.column_stack([t, *columns]), delimiter=",", header="t,a,b,c,d,e,f", comments="")
+    assert "# speeds" not in proposal([load_recording(path)])
 
 
 def test_a_switch_and_a_single_number_are_no_measurements(tmp_path):
