@@ -92,7 +92,7 @@ class JointLoadFriction(CatalogueEffect):
 
 
 class _TowardsAnEnd(CatalogueEffect):
-    """Base class of effects near one end of a joint's range. `end` is +1 for the upper end, −1 for the lower."""
+    """Base class of effects near the ends of a joint's range. `end` is +1 for the upper end, −1 for the lower."""
 
     limits: Float[Array, "2"]
 
@@ -102,22 +102,27 @@ class _TowardsAnEnd(CatalogueEffect):
 
 
 class ElasticHardening(_TowardsAnEnd):
-    """± τ_end exp(−d/width), d the angle to an end of the range: an exponential spring (Esteki 1996)."""
+    """± τ_end exp(−d/width), d the angle to an end: an exponential spring at one or both ends (Esteki 1996).
+
+    `end` is 0 for a joint that stiffens alike towards both ends.
+    """
 
     ID: ClassVar = "elastic_hardening"
     PLACE: ClassVar = "joint"
-    HAPPENS: ClassVar = "The joint's elastic torque stiffens towards an end of its range."
-    LOOKS: ClassVar = "Torque against angle bends upwards near one end, the same both ways."
-    CHANGE: ClassVar = "Add an exponential spring at that end, or free what is compressed there."
+    HAPPENS: ClassVar = "The joint's elastic torque stiffens towards one end of its range, or towards both."
+    LOOKS: ClassVar = "Torque against angle bends away near an end, the same both ways."
+    CHANGE: ClassVar = "Add an exponential spring at each end that stiffens, or free what is compressed there."
 
     tau_end: Float[Array, ""] = amplitude("N m", 0.4, "torque")
     width: Float[Array, ""] = shape("rad", (0.07, 0.15, 0.3, 0.5), "angle")
-    end: Float[Array, ""] = shape("1", (1.0, -1.0), moves="not")
+    end: Float[Array, ""] = shape("1", (1.0, -1.0, 0.0), moves="not")
 
     def torque(self, x, memory, h):
         i = self.index[0]
-        distance = jnp.where(self.end > 0, self.limits[1] - x.q[i], x.q[i] - self.limits[0])
-        return h.at[i].add(self.end * self.tau_end * jnp.exp(-distance / self.width))
+        low, high = self.limits
+        upper = jnp.where(self.end >= 0, jnp.exp(-(high - x.q[i]) / self.width), 0.0)
+        lower = jnp.where(self.end <= 0, jnp.exp(-(x.q[i] - low) / self.width), 0.0)
+        return h.at[i].add(self.tau_end * (upper - lower))
 
 
 class JointStop(_TowardsAnEnd):

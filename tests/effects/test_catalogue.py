@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -312,6 +313,22 @@ def test_the_same_machine_in_other_units_has_the_same_catalogue():
     for name, powers in exponents.items():
         factor = np.prod([unit[u] ** p for u, p in powers.items()])
         np.testing.assert_allclose(getattr(after, name), factor * getattr(before, name), rtol=1e-12, err_msg=name)
+
+
+def test_a_joint_that_stiffens_at_both_ends_does_so_alike():
+    """Its torque is that of a spring at each end: it is odd about the middle of the range, and resists either way."""
+    kind, site = CATALOGUE["elastic_hardening"], FINGER.joint_names[:1]
+    low, high = np.asarray(FINGER.limits[0])
+    q = jnp.linspace(low, high, 9)
+    x = SimpleNamespace(q=q[None])
+    torque = {
+        end: np.asarray(kind.at(FINGER, site, tau_end=0.1, width=0.2, end=end).torque(x, None, jnp.zeros((1, 9)))[0])
+        for end in (1.0, -1.0, 0.0)
+    }
+    np.testing.assert_allclose(torque[0.0], torque[1.0] + torque[-1.0], rtol=1e-12)
+    np.testing.assert_allclose(torque[0.0], -torque[0.0][::-1], atol=1e-15)
+    np.testing.assert_allclose([torque[1.0][-1], torque[-1.0][0]], [0.1, -0.1], rtol=1e-12)
+    assert np.all(np.diff(torque[0.0]) > 0.0)
 
 
 def test_a_scale_is_a_product_at_its_site():

@@ -130,3 +130,15 @@ def test_what_the_finger_decides_of_an_effect_is_not_fitted():
     assert [name for name in fitted if name.startswith("joint_stop")] == [
         f"joint_stop PIP {n}" for n in ("stiffness", "place")
     ]
+
+
+@pytest.mark.parametrize("end", [0.0, -1.0], ids=["both", "one"])
+def test_a_joint_that_stiffens_at_both_ends_is_told_from_one_that_stiffens_at_one(end):
+    keep = {*RIVALS, "elastic_hardening", "joint_stop"}
+    truth = ("elastic_hardening", ("PIP",), {"tau_end": 0.01, "width": 0.15, "end": end})
+    found = diagnose(session_with(truth), without=tuple(sorted(set(CATALOGUE) - keep)), quick=True)
+    assert (found.status, found.named) == (Status.EXPLAINED, (Key(*truth[:2]),))
+    values = {v.name: v for v in found.budget[0].values}
+    assert values["end"].value == end
+    for name in ("tau_end", "width"):
+        assert abs(values[name].value - truth[2][name]) < 3.0 * values[name].std
