@@ -409,6 +409,12 @@ def test_slow_ramps_of_tension_count_without_holds(reduced):
     assert not_judged({"ID.4": found}) == [("ID.4", "tendon_excursion", "no trial measured it")]
 
 
+def test_the_torque_of_a_motor_that_was_not_recorded_is_not_taken_for_zero():
+    """No external torque acts on a finger that tendons drive, but a motor that sweeps a joint does exert one."""
+    found = stack(replace(sweep(), joint_torque=None))
+    assert not_judged({"ID.3-dynamic": found}) == [("ID.3-dynamic", "joint_torque", "no trial measured it")]
+
+
 def test_quick_ramps_without_holds_are_not_judged_and_said_not_to_be():
     found = stack(ramps(0.1))
     assert not np.asarray(found.batch.mask["joint_torque"]).any()
