@@ -181,6 +181,8 @@ def import_(
 ) -> None:
     """Turn recordings (CSV, MATLAB, JSON, NumPy, HDF5, rosbag2, MCAP) into one session.
 
+    Exits 2, as `check` does, where the session that it wrote breaks the format.
+
     Parameters
     ----------
     sources
@@ -208,3 +210,5 @@ def import_(
         print_warnings(report, mapping)
     print(plain(f"{output}: {counted(len(session), 'trial')} of {session.specimen}"))
     print(plain(f"mounting: {mounting_in_words(session.finger)}"))
+    if any(finding.severity == "error" for finding in report):
+        raise SystemExit(2)

@@ -55,11 +55,12 @@ class Report(list[Finding]):
         return next((f for f in self if f.severity == "error" and not f.local), None)
 
 
+_ENDINGS = "csv|tsv|txt|dat|asc|mat|jsonl?|ndjson|np[yz]|h5|hdf5|mcap|db3|bag"  # of recordings
 # Places that several trials or recordings have alike: what each is, with its name and the rest of the place as groups.
 _PLACES = (
     ("trial", re.compile(r"/trials/([^/]+)(.*)")),  # of a session
     ("trial", re.compile(r"trials\.(.+?)(\.(?:channels|time)(?:\..*)?)?")),  # of a mapping; a name may hold dots
-    ("recording", re.compile(r"(?:.*[/\\])?([^/\\]+\.(?:csv|tsv|txt|dat|asc|mat|mcap|db3|bag))()", re.IGNORECASE)),
+    ("recording", re.compile(rf"(?:.*[/\\])?([^/\\]+\.(?:{_ENDINGS}))()", re.IGNORECASE)),
 )
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.]*(?:e[-+]?\d+)?%?")
 

@@ -131,8 +131,8 @@ def _measured(experiment: Experiment, trial: Trial, finger: FingerDescription, m
     y, sound = {}, {}
     for c in experiment.channels:
         values = getattr(trial, c)
-        if values is None and c == "joint_torque" and experiment.kind == "driven" and not experiment.slack:
-            values = np.zeros((N, finger.m))  # no external torque acts on the free finger
+        if values is None and c == "joint_torque" and experiment.unloaded:
+            values = np.zeros((N, finger.m))
         if values is None:
             values = np.full((N, width[c]), np.nan)
         if minus is not None:

@@ -51,6 +51,11 @@ class Experiment:
         """Whether most valid samples are holds."""
         return self.kind in ("stepped", "held")
 
+    @property
+    def unloaded(self) -> bool:
+        """Whether tendons alone move the joints: no motor's torque acts, which is known without a sensor."""
+        return self.kind == "driven" and not self.slack
+
     def predicted_as(self, channel: str) -> tuple[str, bool]:
         """What predicts a channel: its name, and whether equation (1) is solved for joints that a fixture holds.
 

@@ -199,7 +199,7 @@ def _why_nothing(problem: Problem, e: str, c: str) -> Reason:
 
 def _recorded(problem: Problem, e: str, c: str) -> bool:
     """Whether any trial holds a channel. The torque of a free finger is zero, and known without a sensor."""
-    if c == "joint_torque" and EXPERIMENTS[e].kind == "driven":
+    if c == "joint_torque" and EXPERIMENTS[e].unloaded:
         return True
     values = (getattr(t, c) for t in problem.session if t.experiment == e)
     return any(v is not None and bool(np.isfinite(v).any()) for v in values)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -104,6 +105,16 @@ def test_import_and_check_say_how_the_finger_is_mounted(tmp_path, capsys):
         assert line in capsys.readouterr().out.splitlines()
     assert run("check", file, "--json") == 0
     assert f"mounting: {json.loads(capsys.readouterr().out)['mounting']}" == line
+
+
+def test_import_of_an_experiment_without_its_torque_says_so_and_exits_as_check_does(tmp_path, capsys):
+    mapping, file = tmp_path / "m.toml", tmp_path / "s.h5"
+    shutil.copy(EMPS / "axis.toml", tmp_path)
+    lines = (EMPS / "emps.toml").read_text().splitlines()
+    mapping.write_text("\n".join(line for line in lines if not line.startswith("channels.joint_torque")))
+    assert run("import", EMPS / "DATA_EMPS.mat", "--mapping", mapping, "-o", file) == 2
+    assert re.search(r"error: .*/joint_torque: is missing", capsys.readouterr().err)
+    assert run("check", file) == 2
 
 
 def test_check_names_what_is_wrong(folder, tmp_path, capsys):
