@@ -55,8 +55,11 @@ def confirmed(
     """`explained` in place of `partly` where every channel closes to its noise, or to the user's tolerance.
 
     `lines` are the channels' gaps on held-out trials. If something unlisted is probable, only the tolerance counts:
-    what is left of every gap must be within it.
+    what is left of every gap must be within it. Another simulator that has no gap once it is retuned is `unexplained`
+    where held-out trials are predicted worse with the new parameters, and not to the noise.
     """
+    if status is Status.NO_GAP and any(x.gets_worse for x in still_open(lines, relevance, tolerance)):
+        return Status.UNEXPLAINED
     if status is not Status.PARTLY or found.ambiguous or still_open(lines, relevance, tolerance):
         return status
     with_gap = {(x.experiment, x.channel) for x in relevance}

@@ -137,6 +137,8 @@ def size(d: Diagnosis) -> str:
     for x in sorted(d.relevance, key=lambda x: (x.tolerated, -x.relative)):
         largest.setdefault(x.channel, x)
     lines = list(largest.values())[:2]
+    if not lines and (worse := _worse(d)):
+        return f"{_subject(d)} predicts trials that no fit has seen worse than before, {worse}"
     if not lines:
         return f"all trials together show that {_subject(d)} misses something, but no channel by more than its noise"
     return f"{_subject(d)} misses {joined([how_large(x, d.tolerance) for x in lines])}"
@@ -169,10 +171,10 @@ def _no_gap(d: Diagnosis) -> list[str]:
     if d.unlisted >= MIN_NAMED_PROBABILITY:
         chance = "all trials together hold traces of something more, too small for any channel to show alone"
     judged = [x for x in d.closures if x.channel != "q"]  # Simulated angles are not judged by their noise.
-    loud = [x for x in judged if 0.0 < MAX_CHI2 * x.noise**2 < x.before**2]
+    loud = [x for x in judged if 0.0 < MAX_CHI2 * x.noise**2 < x.after**2]
     if not loud:
         return [f"{_subject(d)} predicts {_counted(len(judged))} to within the noise", chance]
-    names = [f"{channel_name(x.channel)} of {x.experiment} ({number(x.before / x.noise, 2)} times)" for x in loud]
+    names = [f"{channel_name(x.channel)} of {x.experiment} ({number(x.after / x.noise, 2)} times)" for x in loud]
     return [
         f"{_subject(d)} leaves in {_counted(len(judged))} nothing that a law could explain",
         f"what it leaves is larger than the channel's own noise in {joined(names)}, as where {_why_loud(d, loud)}",
@@ -218,23 +220,22 @@ def _partly(d: Diagnosis) -> list[str]:
         names = [f"{_of(x.experiment, x.channel)} ({number(x.after / x.noise, 2)} times its noise)" for x in stay]
         left.append(f"what stays open on trials that no fit has seen is {_listed(names, 'channel')}")
     said = [size(d), "; ".join([_blamed(d), *unknown])]
-    if named_causes(d) and (worse := [x for x in d.closures if x.gets_worse]):
-        names = [f"{_of(x.experiment, x.channel)} ({_held_out(x)})" for x in worse]
-        return [
-            *said,
-            "; ".join(left),
-            f"but trials that no fit has seen are predicted worse with what is named, {_listed(names, 'channel')}: "
-            "it may only imitate a law that nobody listed",
-        ]
+    if named_causes(d) and (worse := _worse(d)):
+        doubt = f"but trials that no fit has seen are predicted worse with what is named, {worse}"
+        return [*said, "; ".join(left), f"{doubt}: it may only imitate a law that nobody listed"]
     if named_causes(d) and d.unexplained.share > MAX_LEFT:
         left.append("so much is left that what is named may only imitate a law that nobody listed")
     return [*said, "; ".join(left)]
 
 
-def _held_out(x: Closure) -> str:
-    """Held-out rms of a channel with and without the causes: «0.62 instead of 0.61 N mm»."""
-    (before, after), unit = alike((x.before, x.after), x.units)
-    return f"{after} instead of {before} {unit}"
+def _worse(d: Diagnosis) -> str:
+    """Channels that are surely predicted worse on held-out trials, each with its rms then and before; else empty."""
+    names = []
+    for x in d.closures:
+        if x.gets_worse:
+            (before, after), unit = alike((x.before, x.after), x.units)
+            names.append(f"{_of(x.experiment, x.channel)} ({after} instead of {before} {unit})")
+    return _listed(names, "channel") if names else ""
 
 
 def cannot_tell(members: Sequence[Key]) -> str:
@@ -368,6 +369,8 @@ def _caveats(d: Diagnosis) -> list[str]:
     out += d.doubts
     if is_simulator(d):
         out.append(retuned(d.changes))
+        if d.relevance and not d.named and (worse := _worse(d)):
+            out.append(f"but trials that no fit has seen are predicted worse with these parameters, {worse}")
     elif d.against:
         out += [change(x) for x in d.changes if x.probability >= 0.5][:2]
     if d.not_judged and d.status is not Status.NOT_JUDGED:

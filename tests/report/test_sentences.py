@@ -66,7 +66,7 @@ SAYS = {
 def test_a_model_that_misses_by_more_than_the_noise_is_not_said_to_predict_to_within_it():
     """A gap that nothing smooth and no cause explains, as of noisy accelerations, is named with its size."""
     nothing = ALL["no_gap"]
-    line = replace(nothing.closures[0], before=9.0 * nothing.closures[0].noise)
+    line = replace(nothing.closures[0], after=9.0 * nothing.closures[0].noise)
     said = sentences.summary(replace(nothing, closures=(line, *nothing.closures[1:])))
     assert "within the noise" not in said
     assert "leaves in both channels that could be judged nothing that a law could explain" in said
@@ -78,7 +78,7 @@ def test_a_model_that_misses_by_more_than_the_noise_is_not_said_to_predict_to_wi
 def test_a_lone_trial_whose_parts_predict_each_other_badly_is_to_be_repeated(trials, alone):
     """Its held-out parts say nothing of noise."""
     nothing = ALL["no_gap"]
-    line = replace(nothing.closures[0], before=9.0 * nothing.closures[0].noise)
+    line = replace(nothing.closures[0], after=9.0 * nothing.closures[0].noise)
     stacks = {line.experiment: SimpleNamespace(trials=trials)}
     found = replace(nothing, closures=(line,))
     object.__setattr__(found, "problem", SimpleNamespace(stacks=stacks, simulator=None))  # all that a summary reads
@@ -135,6 +135,17 @@ def test_another_simulator_is_told_which_of_its_parameters_are_off():
         "retuned, most of all damping MCP, 12 N mm s/rad to 16.00 ± 0.98 N mm s/rad"
     )
     assert "agree" in sentences.retuned(())
+
+
+@pytest.mark.parametrize("gap", [True, False])
+def test_a_retuned_simulator_that_predicts_unseen_trials_worse_is_said_to(gap):
+    d, worse = ALL["unexplained"], replace(LINES[0], before=5.66e-4, after=9.48e-4, closed=-1.0, closed_ci95=(-1, -1))
+    d = replace(d, changes=ALL["against"].changes, closures=(worse,), relevance=d.relevance if gap else ())
+    object.__setattr__(d, "problem", SimpleNamespace(simulator=True))  # all that a summary reads
+    text = sentences.summary(d)
+    assert text.count("joint torque of ID.4 (0.95 instead of 0.57 N mm)") == 1
+    assert ("predicted worse with these parameters" in text) == gap
+    assert ("The retuned simulator predicts trials that no fit has seen worse than before" in text) == (not gap)
 
 
 def test_a_signal_of_nothing_has_no_relative_size():
