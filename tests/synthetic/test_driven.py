@@ -190,7 +190,7 @@ def _tracks(specimen):
 
 @pytest.mark.parametrize(
     ("mass", "length", "rotor", "slides"),
-    [(1.0, 1.0, 500.0, (False, False)), (0.01, 0.01, 0.0, (False, False)), (100.0, 100.0, 0.01, (True, False))],
+    [(1.0, 1.0, 500.0, (True, False)), (0.01, 0.01, 0.0, (False, False)), (100.0, 100.0, 0.01, (True, False))],
 )
 def test_fingers_of_any_size_are_driven(mass, length, rotor, slides):
     """With 500 times the inertia of a link, 0.01 kg m², the rotors are those of a robot's geared motors."""
