@@ -58,12 +58,12 @@ class Outcome(eqx.Enumeration):
 class Factor(NamedTuple):
     """Compressed linearisation at a point: ‖r + J δ‖² = ‖d + R δ‖² + ρ²."""
 
-    R: Float[Array, "p p"]
-    d: Float[Array, " p"]
-    rho2: Float[Array, ""]
+    R: Float[Array | np.ndarray, "p p"]
+    d: Float[Array | np.ndarray, " p"]
+    rho2: Float[Array | np.ndarray, ""]
 
     @property
-    def cost(self) -> Float[Array, ""]:
+    def cost(self) -> Float[Array | np.ndarray, ""]:
         """½ ‖r‖²."""
         return 0.5 * (self.d @ self.d + self.rho2)
 
