@@ -1,7 +1,7 @@
 """Fit the ten numbers of the diagnosis's formula (`jaxfinger/gap/formula.py`) by log score on sealed cases.
 
     jaxfinger sealed make cases --split develop --count 40
-    python benchmarks/formula.py weigh records cases           # one to five minutes a case; resumes after a stop
+    python benchmarks/formula.py weigh records cases           # 1.5 to 8 minutes a case; resumes after a stop
     python benchmarks/formula.py fit records
 
 `weigh` searches every case and stores the evidence of every set of causes that the search weighs. `fit` maximises the
@@ -74,14 +74,15 @@ class Record:
         was, is_now = (log_likelihood(self.counts, e, o, explained, q)[0].sum(axis=-1) for q in (self.parameters, p))
         scores = score + is_now - was
         w = costs.probabilities(dict(zip(sets, scores.tolist(), strict=True)))
-        settled = [(s - costs.of(k), k) for k, s in zip(sets, scores, strict=True) if k not in self.screened]
+        evidence = {k: self.evidence[k]._replace(score=s) for k, s in zip(sets, scores.tolist(), strict=True)}
+        settled = [(x.score - costs.of(k), k) for k, x in evidence.items() if k not in self.screened]
         _, best = max(settled, key=lambda x: x[0])
         probability = dict.fromkeys(self.explainable, 0.0)
         for keys, v in w.items():
             for key in keys:
                 probability[key] += v
-        other = unlisted(self.counts, self.evidence[best], p)
-        for key, genuine in genuine_probabilities(costs, self.counts, self.evidence, best, other).items():
+        other = unlisted(self.counts, evidence[best], p)
+        for key, genuine in genuine_probabilities(costs, self.counts, evidence, best, other).items():
             probability[key] *= genuine
         probability[UNLISTED] = other
         P = np.clip(np.array(list(probability.values())), CLIP, 1.0 - CLIP)

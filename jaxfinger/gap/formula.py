@@ -60,8 +60,8 @@ class Parameters:
     """Numbers of the formula that no recording gives.
 
     `benchmarks/formula.py fit` chose `imitator_gain`, `form_error_unlisted`, `unlisted_threshold` and `unlisted_slope`,
-    rounded, from sealed cases, and an earlier fit chose `cause_cost`. `imitator_odds` is less than the 52 that it chose
-    from eight cases, which hardly determine it. The others are set for the reasons beside them.
+    rounded, from sealed cases, and an earlier fit chose `cause_cost`. The log score of cases with something unlisted
+    chose `imitator_odds`; it hardly changes between 6 and 10. The others are set for the reasons beside them.
     The fit found no values that do better on cases it had not seen (docs/results.md).
     """
 
@@ -74,7 +74,7 @@ class Parameters:
     form_error_unlisted: float = 0.27  # ρ² in `unlisted`: less than that share of E_c may be the listed causes' own.
     unlisted_threshold: float = 6.0  # nats left unexplained at which something unlisted is as likely as not
     unlisted_slope: float = 1.0  # change of the log odds that something is unlisted, per nat left unexplained
-    imitator_odds: float = 20.0  # λ: what is left beside a cause raises its odds to be an imitator up to 1 + λ times
+    imitator_odds: float = 8.0  # λ: odds that a cause imitates, if it leaves all energy and the evidence that it brings
 
 
 @dataclass(frozen=True)
@@ -139,8 +139,13 @@ def unexplained(counts: Counts, evidence: Evidence, p: Parameters) -> Float[np.n
 
 def unlisted(counts: Counts, evidence: Evidence, p: Parameters) -> float:
     """Probability that a cause is at work which is not in the set."""
-    left = unexplained(counts, evidence, replace(p, form_error=p.form_error_unlisted)).sum()
+    left = _beyond_listed(counts, evidence, p).sum()
     return float(expit(p.unlisted_slope * (left - p.unlisted_threshold)))
+
+
+def _beyond_listed(counts: Counts, evidence: Evidence, p: Parameters) -> Float[np.ndarray, " C"]:
+    """`unexplained`, where the listed causes may leave more of what they explain (`form_error_unlisted`)."""
+    return unexplained(counts, evidence, replace(p, form_error=p.form_error_unlisted))
 
 
 def imitates(
@@ -149,23 +154,22 @@ def imitates(
     """Probability that a cause of a set, beside something unlisted, only imitates it.
 
     With l_c = max(e_c − φ K_c, 0) the energy beyond noise that the set leaves, l_c⁰ that without the cause, τ_c,
-    `explainable`, as in `costs`, and τ'_c the largest τ_c in any column of the channel,
+    `explainable`, as in `costs`, τ'_c the largest τ_c in any column of the channel, and u_c as in `unlisted`,
 
-        A = Σ_c τ_c (l_c⁰ − l_c),    L = Σ_c τ_c l_c,    B = Σ_c (τ'_c − τ_c) l_c
+        A = Σ_c τ_c (l_c⁰ − l_c),    L = Σ_c τ'_c l_c,    U = Σ_c τ'_c u_c
 
-    are the energies that the cause takes away, that it leaves where it acts, and that is left beside it. The odds are
-    (1 + λ B / (A + B)) L / A. A true cause of another form leaves something where it acts, but nothing beside it; one
-    that leaves nothing where it acts has the right law, whatever is left beside it. What is unlisted follows another
-    law, and seldom keeps to the one tendon or joint, or to the experiment, where a listed cause imitates it.
+    are the energy that the cause takes away, and the energy and the evidence that stay in the channels where it acts.
+    With G the log evidence that it brings, the odds are λ L / (A + L) · U / G. What is unlisted follows another law and
+    seldom keeps to the one tendon or joint, or to the experiment, where a listed cause imitates it: an imitator leaves
+    a good share of it in the same channels, and brings little more evidence than it leaves there.
     """
     now, before = (np.maximum(x.e - p.variance_floor * counts.K, 0.0) for x in (left, without))
-    own, taken = float(explainable @ now), float(explainable @ (before - now))
-    beside = float((counts.largest_of_channel(explainable) - explainable) @ now)
-    if own == 0.0 or own + taken <= 0.0:
-        return 0.0
-    if taken <= 0.0:
+    concerned = counts.largest_of_channel(explainable)
+    taken, stays, gain = float(explainable @ (before - now)), float(concerned @ now), left.score - without.score
+    if taken <= 0.0 or gain <= 0.0:
         return 1.0
-    odds = (1.0 + p.imitator_odds * beside / (taken + beside)) * own / taken
+    evidence = float(concerned @ _beyond_listed(counts, left, p))
+    odds = p.imitator_odds * stays / (taken + stays) * evidence / gain
     return odds / (1.0 + odds)
 
 

@@ -1,5 +1,7 @@
 """Costs of sets of causes, and the probabilities that follow from them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -39,38 +41,45 @@ def test_probabilities_are_shares_of_evidence_beyond_what_each_set_costs():
     assert COSTS.probabilities({k: s + 321.0 for k, s in sets.items()}) == pytest.approx(w)
 
 
-def genuine(left: dict[frozenset, tuple[float, float]], channel: tuple[int, int]) -> dict:
-    """Probabilities that causes imitate nothing, where sets leave these energies beyond noise in the two columns."""
-    counts, nothing = Counts(np.array([10, 10]), np.array([100, 100]), np.array(channel)), np.zeros(2)
-    noise = Parameters().variance_floor * counts.K
-    evidence = {keys: Evidence(noise + np.array(e), np.full(2, 100.0), nothing, 0.0) for keys, e in left.items()}
+BOTH, WITHOUT_STRETCH, WITHOUT_STRIBECK = (frozenset(s) for s in ({STRETCH, STRIBECK}, {STRIBECK}, {STRETCH}))
+COUNTS = Counts(np.array([10, 10]), np.array([100, 100]), np.array([0, 1]))
+
+
+def genuine(left: dict[frozenset, tuple[float, float]], gain: float = 50.0, counts: Counts = COUNTS) -> dict:
+    """Probabilities that causes imitate nothing.
+
+    Sets leave the energies `left` beyond noise in the two columns, and every cause brings the log evidence `gain`.
+    """
+    nothing, noise = np.zeros(2), Parameters().variance_floor * counts.K
+    evidence = {
+        keys: Evidence(noise + np.array(e), np.full(2, 100.0), nothing, gain * len(keys)) for keys, e in left.items()
+    }
     best = max(evidence, key=len)
     return genuine_probabilities(COSTS, counts, evidence, best, unlisted(counts, evidence[best], Parameters()))
 
 
-BOTH, WITHOUT_STRETCH, WITHOUT_STRIBECK = (frozenset(s) for s in ({STRETCH, STRIBECK}, {STRIBECK}, {STRETCH}))
-
-
-def test_what_leaves_more_than_it_explains_where_it_acts_only_imitates_something_unlisted():
-    """Noise and what is left in other channels count for nothing."""
-    of = genuine({BOTH: (0.0, 3000.0), WITHOUT_STRETCH: (5000.0, 3000.0), WITHOUT_STRIBECK: (0.0, 4000.0)}, (0, 1))
+def test_a_cause_imitates_what_is_unlisted_by_what_stays_in_its_channels():
+    """What is left in other channels counts for nothing, and neither does noise."""
+    left = {BOTH: (0.0, 3000.0), WITHOUT_STRETCH: (5000.0, 3000.0), WITHOUT_STRIBECK: (0.0, 4000.0)}
+    of, p = genuine(left), Parameters()
     assert of[STRETCH] == 1.0
-    assert of[STRIBECK] == pytest.approx(0.25)
-    of = genuine({BOTH: (0.0, 0.0), WITHOUT_STRETCH: (5000.0, 0.0), WITHOUT_STRIBECK: (0.0, 4000.0)}, (0, 1))
-    assert of[STRIBECK] == pytest.approx(1.0)
+    U = 5.0 * np.log(302.0 / p.variance_floor)
+    assert of[STRIBECK] == pytest.approx(1.0 / (1.0 + p.imitator_odds * 0.75 * U / 50.0))
+    nothing = {BOTH: (0.0, 0.0), WITHOUT_STRETCH: (5000.0, 0.0), WITHOUT_STRIBECK: (0.0, 4000.0)}
+    assert genuine(nothing)[STRIBECK] == 1.0
 
 
-def test_what_leaves_little_where_it_acts_and_much_beside_it_imitates_something_unlisted():
-    """A base that yields lengthens all tendons: a stretch explains most of one in most trials, and no other."""
-    beside = {BOTH: (200.0, 3000.0), WITHOUT_STRETCH: (1000.0, 3000.0), WITHOUT_STRIBECK: (200.0, 9000.0)}
-    odds = 0.25 * (1.0 + Parameters().imitator_odds * 3000.0 / 3800.0)
-    assert genuine(beside, (0, 0))[STRETCH] == pytest.approx(1.0 / (1.0 + odds))
-    assert genuine(beside, (0, 0))[STRETCH] < 0.5 < genuine(beside, (0, 1))[STRETCH] == pytest.approx(0.8)
-
-
-def test_what_leaves_nothing_where_it_acts_is_at_work_whatever_is_left_beside_it():
+def test_what_stays_in_another_column_of_the_channel_counts_as_much():
+    """A base that yields lengthens all tendons: a stretch explains one of them and leaves the others."""
     beside = {BOTH: (0.0, 3000.0), WITHOUT_STRETCH: (1000.0, 3000.0), WITHOUT_STRIBECK: (0.0, 9000.0)}
-    assert genuine(beside, (0, 0))[STRETCH] == 1.0
+    assert genuine(beside)[STRETCH] == 1.0
+    assert genuine(beside, counts=replace(COUNTS, channel=np.zeros(2, int)))[STRETCH] < 0.5
+
+
+def test_a_cause_that_brings_much_more_evidence_than_is_left_is_at_work():
+    left = {BOTH: (0.0, 3000.0), WITHOUT_STRETCH: (5000.0, 3000.0), WITHOUT_STRIBECK: (0.0, 9000.0)}
+    assert genuine(left, gain=10.0)[STRIBECK] < 0.5 < 0.9 < genuine(left, gain=1000.0)[STRIBECK]
+    assert genuine(left, gain=-1.0)[STRIBECK] == pytest.approx(0.0, abs=1e-3)
 
 
 def test_the_log_score_of_a_record_is_that_of_its_probabilities():
