@@ -2,13 +2,15 @@
 
     jaxfinger sealed make cases --split develop --count 40
     python benchmarks/formula.py weigh records cases           # 1.5 to 8 minutes a case; resumes after a stop
+    python benchmarks/formula.py score records
     python benchmarks/formula.py fit records
 
-`weigh` searches every case and stores the evidence of every set of causes that the search weighs. `fit` maximises the
-log score of these records: the mean over cases of Σ log P of what is true, over all causes that a session's trials can
-show and «something unlisted». Probabilities are clipped by `CLIP`, since no search visits every set. Each number has a
-log-normal prior around its present value, a factor of `PRIOR_FACTOR` per standard deviation. Scores are
-cross-validated over `FOLDS` parts of the cases.
+`weigh` searches every case and stores the evidence of every set of causes that the search weighs. `score` prints, by
+kind of case, the log score of these records: the mean over cases of Σ log P of what is true, over all causes that a
+session's trials can show and «something unlisted»; their Brier score Σ (P − truth)²; and how many of the causes with
+`MIN_NAMED_PROBABILITY` are at work. `fit` maximises the log score. Probabilities are clipped by `CLIP`, since no search
+visits every set. Each number has a log-normal prior around its present value, a factor of `PRIOR_FACTOR` per standard
+deviation. Scores are cross-validated over `FOLDS` parts of the cases.
 """
 
 import argparse
@@ -27,7 +29,7 @@ from jaxfinger.gap.columns import Counts
 from jaxfinger.gap.costs import CauseKey, Costs
 from jaxfinger.gap.diagnose import search_for_causes
 from jaxfinger.gap.formula import Evidence, Parameters, log_likelihood, unexplained, unlisted
-from jaxfinger.gap.posterior import genuine_probabilities
+from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY, genuine_probabilities
 from jaxfinger.gap.problem import build
 from jaxfinger.gap.sets import Weighed
 from jaxfinger.gap.signatures import catalogue_for
@@ -66,8 +68,8 @@ class Record:
         """Costs of sets under other parameters."""
         return Costs(p, unexplained(self.counts, self.evidence[frozenset()], p), self.explainable)
 
-    def log_score(self, p: Parameters) -> float:
-        """Σ log P of the truth about every cause and «unlisted»."""
+    def probabilities(self, p: Parameters) -> dict[CauseKey, float]:
+        """Probability that each cause, and «something unlisted», is at work."""
         costs, sets = self.costs(p), list(self.evidence)
         # The causes' values stay. They are at an optimum, so the evidence changes with them in second order only.
         e, o, explained, score = (np.array(x) for x in zip(*self.evidence.values(), strict=True))
@@ -85,6 +87,11 @@ class Record:
         for key, genuine in genuine_probabilities(costs, self.counts, evidence, best, other).items():
             probability[key] *= genuine
         probability[UNLISTED] = other
+        return probability
+
+    def log_score(self, p: Parameters) -> float:
+        """Σ log P of the truth about every cause and «unlisted»."""
+        probability = self.probabilities(p)
         P = np.clip(np.array(list(probability.values())), CLIP, 1.0 - CLIP)
         true = np.array([key in self.at_work for key in probability])
         return float(np.sum(np.log(np.where(true, P, 1.0 - P))))
@@ -133,10 +140,29 @@ def mean(records: list[Record], p: Parameters) -> float:
     return float(np.mean([r.log_score(p) for r in records]))
 
 
+def score(records: list[Record], p: Parameters) -> None:
+    """Print the scores of the cases, those with and without an unlisted effect and with several causes apart."""
+    kinds: dict[str, list[Record]] = {}
+    for r in records:
+        beside = "with an unlisted effect" if UNLISTED in r.at_work else "without an unlisted effect"
+        kinds.setdefault(f"{'several' if len(r.at_work) > 1 else 'at most one'}, {beside}", []).append(r)
+    for kind, some in sorted(kinds.items()):
+        found = [(r, r.probabilities(p)) for r in some]
+        brier = np.mean([sum((P - (k in r.at_work)) ** 2 for k, P in of.items()) for r, of in found])
+        probable = [(r, k) for r, of in found for k, P in of.items() if k != UNLISTED and P >= MIN_NAMED_PROBABILITY]
+        right = sum(k in r.at_work for r, k in probable)
+        listed = sum(len(r.at_work - {UNLISTED}) for r in some)
+        called = sum(of[UNLISTED] >= MIN_NAMED_PROBABILITY for _, of in found)
+        print(
+            f"{kind}: {len(some)} cases; log score {mean(some, p):.2f}, Brier score {brier:.2f}; probable causes "
+            f"{right} of {listed} at work, {len(probable) - right} not; something unlisted probable in {called}"
+        )
+
+
 def main() -> None:
-    """Weigh cases; or print present and fitted numbers, and their log scores on the cases that did not choose them."""
+    """Weigh cases, or score them; or print present and fitted numbers, and log scores on cases that did not choose."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("what", choices=["weigh", "fit"])
+    parser.add_argument("what", choices=["weigh", "score", "fit"])
     parser.add_argument("records", type=Path)
     parser.add_argument("cases", type=Path, nargs="*")
     parser.add_argument("--workers", type=int, default=1)
@@ -154,6 +180,9 @@ def main() -> None:
                     print(f"{folder.name}: log score {record.log_score(record.parameters):.2f}", flush=True)
         return
     records = [pickle.loads(f.read_bytes()).likeliest() for f in sorted(options.records.glob("*.pickle"))]
+    if options.what == "score":
+        score(records, Parameters())
+        return
     whole = fit(records)
     print(
         f"{len(records)} cases; log score a case {mean(records, Parameters()):.2f}, fitted {mean(records, whole):.2f}"
