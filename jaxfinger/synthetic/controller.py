@@ -2,8 +2,8 @@
 
 The joints are to get the torque τ = τ_ff + K (e + 2 T ė), with the error e = q_d − q and the tension loop's lag T. A
 joint that has inertia alone gets the natural frequency ω and the damping ratio ω T from K = M ω². Springs, gravity and
-friction have torques of the size of the plan's, which K gives at an error of a quarter of the plan's travel. So the
-gains follow from the finger and its motion.
+friction have torques of the size of the plan's, which K gives at an error as large as the plan's travel. So the gains
+follow from the finger and its motion.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from jaxfinger.synthetic.specimen import Specimen
 Array = Any  # NumPy or JAX
 TENSION_LAG = 0.01  # s, time constant T of the tension loop
 DAMPING_RATIO = 0.6  # of a joint that has inertia alone: its natural frequency is DAMPING_RATIO / TENSION_LAG, 9.5 Hz.
-ERROR_SHARE = 0.25  # of the plan's travel: the error at which feedback gives the plan's pull
 CROSSOVER = 0.7  # rad from sample to sample, of a joint of little inertia. A quicker loop would be unstable.
 # Of the plan's pull: tension at the joints, so that no tendon falls slack. At the actuator it is at least half of that.
 MIN_SHARE = 0.18
@@ -97,7 +96,7 @@ def controller(
     pull = np.max(np.abs(torque).max(axis=1) / arm)  # N
     travel = np.maximum(np.ptp(plan.q, axis=1), 1e-3 * np.ptp(specimen.description.limits, axis=1))
     most = 0.5 * np.diagonal(mass_matrix) * (CROSSOVER / (plan.time[1] - plan.time[0])) ** 2
-    held = np.minimum(np.where(np.isfinite(arm), pull * arm, 0.0) / (ERROR_SHARE * travel), most)
+    held = np.minimum(np.where(np.isfinite(arm), pull * arm, 0.0) / travel, most)
     stiffness = mass_matrix * (DAMPING_RATIO / TENSION_LAG) ** 2 + np.diag(held)
     return TensionController(Targets(plan.q, plan.qd, torque), stiffness, arm, fade, MIN_SHARE * pull * active)
 
