@@ -63,7 +63,7 @@ def propose(
     found: list[int] = []
     coefficients, rest, energy = np.empty(0), r, 0.0
     while len(found) < MAX_TERMS:
-        gain = np.where(usable, (Z @ rest) ** 2 / np.maximum(norm, 1e-300) ** 2, 0.0)
+        gain = np.where(usable, (Z @ rest) ** 2 / np.maximum(norm**2, 1e-300), 0.0)
         gain[found] = 0.0
         trial = [*found, int(np.argmax(gain))]
         a = np.linalg.lstsq(Z[trial].T, r, rcond=1e-10)[0]

@@ -36,10 +36,12 @@ def session_of_model(
 def describe_finger(finger: Finger) -> FingerDescription:
     """Return the model's finger as a file describes it."""
     arrays = ("gravity", "axis", "origin", "limits", "mass", "com", "inertia", "fingertip")
+    rotors = np.diagonal(np.array(finger.rotor_inertia))
     return FingerDescription(
         **{k: np.array(getattr(finger, k)) for k in arrays},
         joint_names=finger.joint_names,
         prismatic=finger.prismatic,
+        rotor_inertia=rotors if rotors.any() else None,
         tendon_names=finger.tendon_names,
         active=np.array(finger.active, bool),
         crosses=np.array(finger.crosses, bool).reshape(finger.n, finger.m),

@@ -1,5 +1,7 @@
 """A model as a plant agrees with the specimen whose parameters it has."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import pytest
 from jaxfinger.data import EXPERIMENT_NAMES
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.errors import UserError
+from jaxfinger.model import Finger
 from jaxfinger.synthetic import (
     ModelPlant,
     SpecimenPlant,
@@ -18,6 +21,7 @@ from jaxfinger.synthetic import (
     simulate,
     true_model,
 )
+from jaxfinger.synthetic.fitted import describe_finger
 
 SPECIMEN = polynomial_finger(paper_finger())
 TRIALS = {"rate": 40.0, "vd3": {"motions": 1, "duration": 2.0, "rate": 1000.0}, "vd1": {"motions": 1}}
@@ -78,3 +82,9 @@ def test_a_sensor_drifts_on_between_repeats_of_one_motion():
     difference = (b["joint_torque"] - a["joint_torque"])[first.joint]
     np.testing.assert_allclose(difference, drifted(again) - drifted(first), atol=1e-9)
     assert np.ptp(difference) > 1e-4
+
+
+def test_the_session_of_a_model_says_its_rotors():
+    """Else the file of a simulated session would describe another finger than the one that moved."""
+    described = replace(SPECIMEN.description, rotor_inertia=np.array([1e-5, 0.0, 2e-5]))
+    assert describe_finger(Finger.from_description(described)).rotor_inertia == pytest.approx([1e-5, 0.0, 2e-5])
