@@ -37,9 +37,5 @@ def side_by_side(f: Callable[[Item], Result], items: Iterable[Item]) -> Iterator
     two programs that do can hold all of XLA's processor threads and deadlock (8,192 systems of three equations do).
     NumPy's LAPACK calls are safe.
     """
-    items = list(items)
-    if len(items) < 2:
-        yield from map(f, items)
-        return
     with ThreadPoolExecutor(2) as pool:
         yield from pool.map(f, items)

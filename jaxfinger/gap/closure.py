@@ -24,7 +24,8 @@ from jaxfinger.model import Model
 # Mean square before, relative to that of the noise, from which a gap is said to close. With less, `closed` divides a
 # difference of two nearly equal numbers, of which the noise is itself an estimate.
 MIN_RESOLVABLE_RATIO = 1.1
-MAX_LENGTH_DIFFERENCE = 0.1  # Share of its length by which a repeat may be longer or shorter: it was then not cut off.
+# Of a trial's length. A repeat whose length differs by more was cut off, and is not compared.
+MAX_LENGTH_DIFFERENCE = 0.1
 MIN_SAMPLES = 10  # A trial with fewer held-out samples of a channel has no mean square worth the name.
 
 

@@ -20,6 +20,7 @@ from jaxfinger.gap.problem import Problem, site
 from jaxfinger.gap.projector import Projector
 from jaxfinger.gap.propose import propose
 from jaxfinger.gap.result import (
+    MIN_SHARE,
     Absorbed,
     Candidate,
     Cause,
@@ -45,7 +46,6 @@ from jaxfinger.identify.stages import Progress
 # Share of a signature's energy that the nominal parameters imitate, from which a cause is listed as absorbed: of what
 # it changes, a tenth in rms is then left to see.
 MIN_ABSORBED = 0.99
-MIN_CHANNEL_SHARE = 0.005  # Share of a channel's gap from which a cause lists it: less is 0 % in whole percents.
 MIN_VARIABLE_SHARE = 0.2  # Share of the smooth law's energy that one variable must explain to be listed.
 MAX_HELD_OUT = 12  # Candidates outside of the chosen set, most probable first, that are tried on held-out trials.
 MIN_DEVIATION = 3.0  # Standard deviations: the usual three sigma, by which a simulator's parameter must be off.
@@ -88,7 +88,7 @@ def causes_of(chosen: SearchState, found: Posterior, shares: Budget, fit: Fit) -
                 {
                     ExperimentChannel(e, c): float(min(lost[at].sum(), 1.0))
                     for (e, c), lost in of_channel.items()
-                    if lost[at].sum() > MIN_CHANNEL_SHARE
+                    if lost[at].sum() > MIN_SHARE
                 },
                 tuple(v for i in at for v in values_of(fit, i)),
             )

@@ -19,7 +19,8 @@ from jaxfinger.gap.likeness import check_likeness
 MAX_ROUNDING = 1e-9
 # Values that a rounded column has at least: few values are multiples of some step by chance.
 MIN_VALUES = 6
-MAX_STEP_RATIO = 1.5  # Median step of predictions over that of the recording: more are fewer samples, and no jitter.
+# Of median steps, predictions over recording. Up to it clocks may jitter; beyond, samples are lacking.
+MAX_STEP_RATIO = 1.5
 MAX_ODD = 0.01  # of a step, by which rounded values are off: written digits are exact but for rounding
 
 

@@ -56,8 +56,8 @@ def propose(
     (channel, column), most = max(by_column.items(), key=lambda kv: kv[1])
     names, rows, there = _library_rows(problem, channel, column)
     Z, r = project(rows), project.residual(residual)
-    energy_there = float(np.sum(r[: there.size][there] ** 2))
-    missed = max(energy_there - there.sum(), most)  # White noise has an energy of one a row.
+    own = r[: there.size][there]  # Rows of the prior stand behind those of the trials.
+    missed = max(float(own @ own) - own.size, most)  # White noise has an energy of one a row.
     norm = np.linalg.norm(Z, axis=1)
     usable = norm > MIN_UNABSORBED * np.linalg.norm(rows, axis=1)
     found: list[int] = []

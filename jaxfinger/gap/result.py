@@ -12,6 +12,7 @@ from jaxfinger.identify import Fit
 # A channel stays open where its rms with the causes in exceeds that of its noise by this factor. The noise itself is
 # known to a fifth, so that a smaller excess may be an error of its estimate.
 MAX_CLOSED_RMS = 1.3
+MIN_SHARE = 0.005  # Share of a gap: in whole percents a smaller one is 0 %.
 
 
 class Status(StrEnum):

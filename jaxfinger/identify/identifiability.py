@@ -18,7 +18,9 @@ MIN_SEEN_SINGULAR_VALUE = 1e-3
 # Entries of a unit vector. Smaller ones hold less than 0.25 % of its square and are not shown, or less than 9 % and
 # need no remedy.
 MIN_SHOWN_ENTRY, MIN_ENTRY_OF_REMEDY = 0.05, 0.3
-WIDER = 10.0  # times, from which on an interval is wide because another parameter is unknown, not for noise
+# Width of an interval over its width if another parameter were known, from which on the sentence names both. The other
+# parameter then makes 99 % of its variance, and noise the rest.
+MIN_WIDENING = 10.0
 RANK_TOLERANCE = 1e-9  # relative, of a regressor's columns and singular values, far above rounding
 
 # Experiment of the format that determines each group of parameters.
@@ -110,8 +112,8 @@ def name_traded(
 ) -> list[str]:
     """One sentence for each two laws of which the trials determine the sum alone, with a remedy.
 
-    The intervals of their parameters then hold zero, and each would be `WIDER` times as narrow if the other were known.
-    Coefficients of one polynomial trade off in any trial of a short range, and say nothing of a law.
+    The intervals of their parameters then hold zero, and each would be `MIN_WIDENING` times as narrow if the other were
+    known. Coefficients of one polynomial trade off in any trial of a short range, and say nothing of a law.
     """
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     unsure = [i for i in free if np.isfinite(std[i]) and std[i] > 0.0 and abs(values[i]) < Z95 * std[i]]
@@ -120,7 +122,7 @@ def name_traded(
         for j in unsure[:k]:
             a, b = parameters[j], parameters[i]
             laws = (a.group, a.joint, a.tendon), (b.group, b.joint, b.tendon)
-            if laws[0] != laws[1] and (covariance[i, j] / std[i] / std[j]) ** 2 > 1.0 - WIDER**-2:
+            if laws[0] != laws[1] and (covariance[i, j] / std[i] / std[j]) ** 2 > 1.0 - MIN_WIDENING**-2:
                 remedies = dict.fromkeys(_remedy(parameters, np.array([m])) for m in (j, i))
                 said = f"the trials show {a.name} and {b.name} only together, so the interval of each is wide"
                 out.setdefault(laws, f"{said}; record {', or '.join(remedies)}")

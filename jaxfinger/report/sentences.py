@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY
 from jaxfinger.gap.result import (
+    MIN_SHARE,
     Cause,
     Change,
     Closure,
@@ -30,7 +31,6 @@ from jaxfinger.report.names import VARIABLE_NAMES, cause_name, channel_name, joi
 from jaxfinger.report.numbers import MAX_CHI2, alike, measured, number, percent, percent_range, quantity
 
 MAX_NAMES = 4  # Causes or channels in one sentence; more make it hard to read, and the page lists all.
-MIN_SHARE = 0.005  # Share of a gap: `percent` rounds a smaller one to 0 %.
 # Share of a gap: with more left, what is named may imitate a law that nobody listed. Imitators left 28 to 48 %, true
 # single causes 20 % at most (`fresh` in docs/results.md).
 MAX_LEFT = 0.25
@@ -369,7 +369,7 @@ def _caveats(d: Diagnosis) -> list[str]:
     out += d.doubts
     if is_simulator(d):
         out.append(retuned(d.changes))
-        if d.relevance and not d.named and (worse := _worse(d)):
+        if d.relevance and not d.named and (worse := _worse(d)):  # Without a gap, `size` says it.
             out.append(f"but trials that no fit has seen are predicted worse with these parameters, {worse}")
     elif d.against:
         out += [change(x) for x in d.changes if x.probability >= 0.5][:2]

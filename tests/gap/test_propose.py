@@ -24,3 +24,15 @@ def test_its_share_is_that_of_all_that_is_left_and_not_of_what_smooth_laws_expla
     found = propose(planted, project, residual, [SmoothPart("ID.3-dynamic", "joint_torque", 0, smooth, {})])
     assert found is not None
     assert low < found.share <= high
+
+
+def test_a_term_that_changes_nothing_is_passed_over(planted, monkeypatch):
+    """As one of tension where the tendons are slack: its gain would be zero by zero."""
+    project = Projector(planted, columns := Columns.of(planted), Weights.plain(columns))
+    names, rows, there = _library_rows(planted, "joint_torque", 0)
+    more = [*names, "nothing"], np.vstack([rows, np.zeros(there.size)]), there
+    monkeypatch.setattr("jaxfinger.gap.propose._library_rows", lambda *of: more)
+    residual = np.random.default_rng(2).standard_normal(there.size)
+    with np.errstate(all="raise", under="ignore"):
+        found = propose(planted, project, residual, [SmoothPart("ID.3-dynamic", "joint_torque", 0, 1.0, {})])
+    assert found is None or "nothing" not in [name for _, name in found.terms]

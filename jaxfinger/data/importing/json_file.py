@@ -24,16 +24,21 @@ def load_json(path: Path) -> Recording:
         UserError: the file is no JSON, or holds two variables of one name.
     """
     text = path.read_text(encoding="utf-8-sig")
-    try:
-        if path.suffix.lower() in _LINES:
-            tree = [json.loads(line) for line in text.splitlines() if line.strip()]
-        else:
-            tree = json.loads(text)
-    except json.JSONDecodeError as error:
-        where = f"line {error.lineno}, column {error.colno}"
-        lines = "; a file with one object a line is to end in .jsonl" if error.msg == "Extra data" else ""
-        raise UserError(f"{path}: is no JSON ({error.msg}, {where}){lines or '; export the recording again'}") from None
+    if path.suffix.lower() in _LINES:
+        lines = enumerate(text.splitlines(), start=1)
+        tree = [_parsed(path, line, number, "export the recording again") for number, line in lines if line.strip()]
+    else:
+        tree = _parsed(path, text, 1, "export the recording again, with the ending .jsonl if each line is an object")
     return named_arrays(path, _leaves(tree, ""))
+
+
+def _parsed(path: Path, text: str, first: int, mend: str) -> Any:
+    """Parse text whose first line has the number `first` in the file."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        where = f"line {first + error.lineno - 1}, column {error.colno}"
+        raise UserError(f"{path}: is no JSON ({error.msg}, {where}); {mend}") from None
 
 
 def _leaves(tree: Any, name: str) -> Iterator[tuple[str, Any]]:

@@ -30,7 +30,7 @@ _MAX_LEFT_OUT = 12  # variables that are named, so that the line of a large bag 
 # little apart.
 _TOGETHER = 0.9
 _MAX_SPEEDS = 4  # that are named
-_MIN_ALIKE = 10  # samples: shorter files of one length may be tables of parameters.
+_MAX_TABLE = 10  # samples: files that are no longer may be tables of parameters, and of one length by chance.
 _HEAD = 'specimen = "my finger"\nfinger = "finger.toml"'
 
 
@@ -74,12 +74,12 @@ def _side_by_side(logs: Sequence[_Log]) -> list[str]:
     lines = []
     for count in dict.fromkeys(log.count for log in logs if log.clock is None):
         names = [quoted(log.recording.path.name) for log in logs if log.count == count]
-        if len(names) > 1 and count > _MIN_ALIKE:
+        if len(names) > 1 and count > _MAX_TABLE:
             lines += [
                 "",
                 f"# {listed(names)} hold {count} samples each. If these are the same samples, write one trial",
+                f"# of them: file = [{', '.join(names)}]",
             ]
-            lines += [f"# of them: file = [{', '.join(names)}]"]
     return lines
 
 

@@ -19,7 +19,8 @@ MAX_SIDE = 0.8  # Side of the largest square in that of its cell, so that neighb
 X_LIMIT = 2.1  # Relative to the scale of a row: a value of 1 with a half-width of 1 reaches 2.
 INTERVAL_ROWS = 10  # Rows in one panel of a page, which then fits on a phone's screen.
 ROW_HEIGHT = 0.36  # Inches that a parameter and its name take.
-MAX_NAME_SHARE = 0.45  # of a figure's width that names beside squares take
+# Of a figure's width. Longer names are shortened, so that at least half of the width is left for the squares.
+MAX_NAME_SHARE = 0.45
 # Letters are on average 0.6 of the font's 9 points (`theme.FONT`) wide, which makes 13; one is left for the gap between
 # name and value.
 CHARACTERS_PER_INCH = 12.0
