@@ -56,12 +56,12 @@ def test_json_with_samples_inside_an_object_or_lists_by_name(tmp_path):
     [
         ("log.json", '{"t": [0, 1}', "is no JSON"),
         ("log.json", '{"t": 0}\n{"t": 1}\n', ".jsonl"),
-        ("log.jsonl", '{"t": 0}\n\n{"t": \n', r"line 3, column 7\); export"),
+        ("log.jsonl", '{"t": 0}\n\n{"t": \n', "line 3, column"),
         ("log.json", '{"a.b": [1], "a": {"b": [2]}}', "two variables 'a.b'"),
     ],
 )
 def test_json_that_cannot_be_read_is_named_with_the_mend(tmp_path, name, content, said):
-    with pytest.raises(UserError, match=f"log.json: .*{said}"):
+    with pytest.raises(UserError, match=f"{name}: .*{said}"):
         written(tmp_path / name, content)
 
 
