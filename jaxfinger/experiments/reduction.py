@@ -81,9 +81,14 @@ class PreparedTrial:
         return np.zeros((len(self.trial.time), self.finger.n)) if force is None else np.nan_to_num(force)
 
     def taut(self, tension: Float[np.ndarray, "M n"]) -> Float[np.ndarray, "M n"]:
-        """Tension, N, set to zero for tendons that are slack throughout the trial."""
-        slack = np.percentile(tension, 95, axis=0) < self.sizes.slack
-        return np.where(slack | self.experiment.slack, 0.0, tension)
+        """Tension, N, set to zero where the protocol leaves a tendon slack: a sensor then reads the error of its tare.
+
+        So it is with all tendons in ID.3, and where joints are held with those that are not pulled. Tendons that move
+        the finger pull as measured, however little that is.
+        """
+        if not self.experiment.held:
+            return np.zeros_like(tension) if self.experiment.slack else tension
+        return np.where(np.percentile(tension, 95, axis=0) < self.sizes.slack, 0.0, tension)
 
 
 @dataclass(frozen=True)

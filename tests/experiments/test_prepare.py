@@ -326,13 +326,21 @@ def test_a_hold_keeps_the_direction_that_led_to_it_though_nothing_says_so():
         assert np.all(direction[held] == sign)
 
 
-def test_a_slack_tendon_pulls_with_nothing():
+@pytest.mark.parametrize(
+    ("experiment", "pulled"),
+    [("VD.3", [1.0, 1.0]), ("VD.1", [1.0, 1.0]), ("ID.4", [1.0, 0.0]), ("ID.3-dynamic", [0.0, 0.0])],
+)
+def test_a_little_tension_counts_unless_the_protocol_leaves_its_tendon_slack(experiment, pulled):
     tension = np.full((9000, FINGER.n), 0.5 * SLACK_SHARE * 5.0)
     tension[:, 0] = 5.0
-    trial = replace(sweep(tendon_force=tension), experiment="VD.3", joint_torque=None, joint=None)
-    found = np.asarray(stack(trial).batch.x.tension)[:, 0]
-    np.testing.assert_allclose(found[0], 5.0)
-    np.testing.assert_array_equal(found[1:], 0.0)
+    trial = replace(sweep(tendon_force=tension), experiment=experiment)
+    if experiment == "VD.3":
+        trial = replace(trial, joint_torque=None, joint=None)
+    if experiment == "VD.1":
+        trial = replace(trial, tendon_excursion=np.zeros((9000, FINGER.n)))
+    found = np.asarray(stack(trial).batch.x.tension)[:2, 0]
+    expected = np.array(pulled)[:, None] * tension[0, :2, None]
+    np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape))
 
 
 def test_spikes_do_not_count_and_do_not_spread():
