@@ -60,12 +60,7 @@ def reduce(r: PreparedTrial) -> Row:
     tendon = tendon_directions(r, rates)
     slides = sliding(r, j, slow, joint, rates, CLEAR_WIDTHS * filter_std(r.experiment.cutoff))
 
-    qdd, tension, y = j.qdd, r.tension(), r.y
-    if r.reduced or r.experiment.slack:
-        # Noise of q̈ biases a fit to less inertia (errors in variables), and adds a spurious torque to a prediction.
-        # Where q̈ does not exceed its noise, it is therefore replaced by its running mean.
-        most = MAX_ACCELERATION_NOISE * STD_PER_MAD * j.noise * filtered_noise_std(j.cutoff, r.step, 2)
-        qdd = shrink(qdd, round(ACCELERATION_WINDOW * r.experiment.pace / r.step), ACCELERATION_DOF, most)
+    qdd, tension, y = less_noise(r, j) if r.reduced or r.experiment.slack else j.qdd, r.tension(), r.y
     if r.reduced:
         # All other terms pass the low-pass of q̈.
         joint, tendon, tension = (low_pass(r.trial.time, a, j.cutoff) for a in (joint, tendon, tension))
@@ -83,6 +78,15 @@ def reduce(r: PreparedTrial) -> Row:
         blur=filter_std(j.cutoff),
         y=y,
     )
+
+
+def less_noise(r: PreparedTrial, j: Joints) -> Float[np.ndarray, "N m"]:
+    """q̈, rad/s², or its running mean where it does not exceed its noise (`shrink`).
+
+    Noise of q̈ biases a fit to less inertia (errors in variables), and adds a spurious torque to a prediction.
+    """
+    most = MAX_ACCELERATION_NOISE * STD_PER_MAD * j.noise * filtered_noise_std(j.cutoff, r.step, 2)
+    return shrink(j.qdd, round(ACCELERATION_WINDOW * r.experiment.pace / r.step), ACCELERATION_DOF, most)
 
 
 def joint_directions(r: PreparedTrial, j: Joints, slow: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:

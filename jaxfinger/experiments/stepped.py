@@ -1,28 +1,24 @@
 """Reduction of trials in which a motor steps a joint from hold to hold (ID.3-static).
 
-A hold is valid where the direction of its approach is known, which gives the direction of friction. Before the first
-motion it is unknown.
+A sample is valid in a hold whose direction of approach is known, which gives the direction of friction, and in motion
+in which the joint slides. For a fit both sides of (1) pass the same low-pass; for a prediction they do not.
 """
 
-from dataclasses import replace
-
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from jaxfinger.data import directions, find_holds, smooth_rate
+from jaxfinger.data import directions, filter_std, find_holds, low_pass, smooth_rate
 from jaxfinger.data.signals.motion import rest_speed
-from jaxfinger.experiments.driven import sliding
+from jaxfinger.experiments.driven import CLEAR_WIDTHS, less_noise, sliding
 from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, runs_of_holds
 
 NONE_VALID = "there is no hold whose direction of approach is known, and no motion in which the joint slides"
-# s at the protocol's pace, left out on either side of samples where a joint may stick. It is short, since no measured
-# channel is filtered.
-CLEAR_TIME = 0.01
 
 
 def reduce(r: PreparedTrial) -> Row:
     """Reduce a trial: valid are holds of known approach, and motion in which the joint slides."""
-    j = joints(r, sharp=True)
+    j = joints(r, sharp=not r.reduced)
     hold = find_holds(r.trial, r.experiment.pace)
     slow = smooth_rate(r.trial.time, r.trial.q, r.experiment.cutoff_at(r.step))
     if r.trial.joint_direction is not None:
@@ -31,17 +27,35 @@ def reduce(r: PreparedTrial) -> Row:
         joint = directions(slow, rest_speed(slow, r.quick_rates))
         for samples in runs_of_holds(hold):  # a zero-phase filter shows the next step before it starts
             joint[samples] = joint[samples[len(samples) // 2]]
-    moves = (hold < 0)[:, None]  # nothing moves in a hold
-    j = replace(j, qd=j.qd * moves, qdd=j.qdd * moves)
-    slides = sliding(r, j, slow, joint, None, CLEAR_TIME * r.experiment.pace)
+    clear = CLEAR_WIDTHS * filter_std(j.cutoff)
+    slides, approached = sliding(r, j, slow, joint, None, clear), _constant(joint, round(clear / r.step))
     at = r.whole(hold)
-    known = r.mean(slides.astype(float)) > 1.0 - 1e-9  # all samples of the block
-    approached = np.abs(r.mean(joint)) > 1.0 - 1e-9
-    counting = dict.fromkeys(r.y, ((at >= 0)[:, None] & approached) | known)
-    q = _at_rest(r.mean(r.trial.q), at)
-    nothing = np.zeros((len(joint), r.finger.n))
-    tension = r.taut(r.mean(r.tension()))
-    return row(r, q, (j.qd, j.qdd), tension, counting, j.noise, directions=(joint, nothing), hold=at)
+    known, led = (r.mean(a.astype(float)) > 1.0 - 1e-9 for a in (slides, approached))  # all samples of the block
+    counting = dict.fromkeys(r.y, ((at >= 0)[:, None] & led) | known)
+    qd, qdd, y = j.qd, less_noise(r, j), r.y
+    if not r.reduced:
+        qd, qdd = (np.where(hold[:, None] < 0, a, 0.0) for a in (qd, qdd))  # nothing moves in a hold
+    else:
+        joint, *filtered = (low_pass(r.trial.time, a, j.cutoff) for a in (joint, *y.values()))
+        y = dict(zip(y, filtered, strict=True))
+    return row(
+        r,
+        _at_rest(r.mean(j.q if r.reduced else r.trial.q), at),
+        (qd, qdd),
+        r.taut(r.mean(r.tension())),
+        counting,
+        j.noise,
+        directions=(joint, np.zeros((len(joint), r.finger.n))),
+        hold=at,
+        blur=filter_std(j.cutoff) if r.reduced else 0.0,
+        y=y,
+    )
+
+
+def _constant(direction: Float[np.ndarray, "N m"], reach: int) -> Bool[np.ndarray, "N m"]:
+    """Whether a direction is known and does not change within `reach` samples on either side."""
+    least, most = (f(direction, 2 * reach + 1, axis=0) for f in (minimum_filter1d, maximum_filter1d))
+    return (least == most) & (direction != 0.0)
 
 
 def _at_rest(q: Float[np.ndarray, "M m"], hold: Int[np.ndarray, " M"]) -> Float[np.ndarray, "M m"]:

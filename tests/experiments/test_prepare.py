@@ -6,7 +6,7 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 
-from jaxfinger.data import Session, Trial, filter_std
+from jaxfinger.data import Session, Trial, filter_std, low_pass
 from jaxfinger.data.checks.trial import check_trial
 from jaxfinger.data.findings import Report
 from jaxfinger.data.signals.sizes import SLACK_SHARE, sizes_of
@@ -245,14 +245,12 @@ def test_between_holds_counts_a_tension_that_goes_on_or_a_joint_that_slides():
     between = {k: counts[20 * k : 20 * k + 6] for k in range(7)}  # the 0.3 s before hold number k
     assert [bool(x.all()) for x in between.values()] == [False, False, True, True, False, True, True]
     assert not between[4].any()
-    moves = np.asarray(static.batch.mask["joint_torque"])[0, 0] > 0
-    still = static.holds[0] >= 0
-    np.testing.assert_array_equal(moves[still], True)
-    assert all(moves[20 * k + 1 : 20 * k + 5].all() and not moves[20 * k + 6] for k in range(7))
-    speed = np.asarray(static.batch.x.qd)[0, 0]
-    assert (speed[still] == 0.0).all()
-    middle = np.concatenate([np.arange(20 * k + 1, 20 * k + 5) for k in range(7)])
-    np.testing.assert_allclose(np.abs(speed[middle]), 0.05 / 0.3, rtol=0.01)
+    moves, at = np.asarray(static.batch.mask["joint_torque"])[0, 0] > 0, np.asarray(static.batch.x.time)[0]
+    turns = np.abs(at - 4.0) < 0.1  # the filter spreads the jump of friction
+    np.testing.assert_array_equal(moves[(static.holds[0] >= 0) & ~turns], True)
+    assert all(moves[20 * k + 2 : 20 * k + 4].all() and not moves[20 * k + 6] for k in range(7))
+    rate = low_pass(time, np.where(time - second < 0.3, np.diff(heights)[second] * 0.05 / 0.3, 0.0), 5.0)
+    np.testing.assert_allclose(np.asarray(static.batch.x.qd)[0, 0, :140], rate.reshape(140, 50).mean(axis=1), atol=1e-3)
     assert [len(k) for k in held.samples_of_holds(0, counts)] == [13] * 7
 
 
@@ -323,7 +321,7 @@ def test_a_hold_keeps_the_direction_that_led_to_it_though_nothing_says_so():
     for begin, end, sign in ((2.6, 3.9, 1.0), (4.6, 5.9, 1.0), (6.6, 7.9, -1.0)):
         held = counts & (at > begin) & (at < end)
         assert held.sum() > 10
-        assert np.all(direction[held] == sign)
+        np.testing.assert_allclose(direction[held], sign, atol=0.02)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from jaxfinger.errors import UserError
 from jaxfinger.identify import Recipe, identify
 from jaxfinger.identify.parameters import describe
 from jaxfinger.identify.recipe import ModelRecipe
+from jaxfinger.synthetic import recipe_from, simulate
 from tests.experiments.test_prepare import FINGER, ramps
 
 
@@ -64,3 +65,16 @@ def test_the_noise_of_another_session_is_not_taken_over(session, staged):
     of = ("ID.2", "tendon_excursion")
     np.testing.assert_allclose(again.noise[of].std, staged.noise[of].std, rtol=1e-3)
     assert again.noise["ID.4", "joint_torque"] is noisy["ID.4", "joint_torque"]  # of the fit's own trials
+
+
+def test_noise_of_accelerations_is_no_sign_of_a_wrong_model():
+    """A rotor of 0.01 kg m² makes an encoder's noise, differentiated twice, a torque far above its sensor's noise."""
+    body = {"mass": 0.05, "com": [0.02, 0.0, 0.0], "inertia": np.diag([1e-6, 8e-6, 8e-6]).tolist()}
+    joint = {"name": "MCP", "axis": [0, 1, 0], "origin": [0, 0, 0], "limits_deg": [-10, 90], "rotor_inertia": 0.01}
+    finger = {"gravity": [0.0, 0.0, -9.81], "fingertip": [0.03, 0.0, 0.0], "joints": [joint | body]}
+    terms = {"joints": {"MCP": {"elastic": [-0.01, 0.3], "friction": [0.02], "damping": 0.01}}}
+    trials = {"experiments": ["ID.3-static"]}
+    session = simulate(recipe_from({"finger": finger, "terms": terms, "trials": trials}), seed=0)
+    (report,) = identify(session, stages=("ID.3-static",)).stages
+    assert report.chi2_per_row < 1.5
+    assert report.outliers < 0.05
