@@ -15,7 +15,7 @@ from jaxfinger.compilation import QUICK
 from jaxfinger.errors import UserError
 from jaxfinger.model import rigid_body
 from jaxfinger.model.finger import Finger
-from jaxfinger.synthetic.controller import TensionController, feedforward
+from jaxfinger.synthetic.controller import TensionController, controller
 from jaxfinger.synthetic.driven import Simulator
 from jaxfinger.synthetic.protocols import TrialPlan
 from jaxfinger.synthetic.specimen import Specimen
@@ -106,7 +106,9 @@ class SpecimenPlant:
 
     def controller(self, plan: TrialPlan) -> TensionController:
         """Return the rig's tension controller for a VD.3 plan."""
-        return feedforward(self.specimen, plan, self._rigid_body(plan.q, plan.qd, plan.qdd))
+        middle = jnp.asarray(plan.q.mean(axis=1, keepdims=True))
+        M = np.asarray(self._mass_matrix(self.finger, middle))[:, :, 0]
+        return controller(self.specimen, plan, self._rigid_body(plan.q, plan.qd, plan.qdd), M)
 
     @cached_property
     def simulator(self) -> Simulator:
@@ -116,6 +118,10 @@ class SpecimenPlant:
     @cached_property
     def _inverse_dynamics(self) -> Callable:
         return jax.jit(rigid_body.inverse_dynamics, compiler_options=QUICK)
+
+    @cached_property
+    def _mass_matrix(self) -> Callable:
+        return jax.jit(rigid_body.mass_matrix, compiler_options=QUICK)
 
     @cached_property
     def _fingertip(self) -> Callable:

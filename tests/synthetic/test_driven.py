@@ -6,13 +6,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from jaxfinger.errors import UserError
 from jaxfinger.model import Finger, rigid_body
-from jaxfinger.synthetic import SpecimenPlant, paper_finger, recipe_from, session_plan
-from jaxfinger.synthetic.controller import MIN_ACTUATOR_TENSION
+from jaxfinger.synthetic import (
+    SpecimenPlant,
+    paper_finger,
+    polynomial_finger,
+    random_finger,
+    recipe_from,
+    session_plan,
+)
 from jaxfinger.synthetic.driven import QUICK, at_rest, friction_impulse, step
-from jaxfinger.synthetic.specimen import GrowingFriction
+from jaxfinger.synthetic.routes import PolynomialRoute
+from jaxfinger.synthetic.specimen import GrowingFriction, PolynomialFriction, PolynomialSpring
 
 SPECIMEN = paper_finger()
 FINGER = Finger.from_description(SPECIMEN.description)
@@ -50,7 +59,7 @@ def test_tendons_move_every_joint_along_the_plan(driven):
     assert (np.ptp(q, axis=1) > 0.15).all()
     assert (np.mean(np.abs(v) > 1e-3, axis=1) > 0.6).all()  # it sticks at reversals
     active = SPECIMEN.description.active
-    assert (tension[active] >= 0.99 * MIN_ACTUATOR_TENSION).all()
+    assert (tension[active] > 0.1).all()
     assert tension[active].max() < 20.0
     assert not tension[~active].any()
 
@@ -127,6 +136,77 @@ def test_friction_impulses_oppose_sliding_and_nothing_else(seed):
     sliding = np.abs(left) > 1e-6
     assert np.abs(impulse[sliding]) == pytest.approx(limit[sliding], rel=1e-6)
     assert (np.sign(impulse[sliding]) == np.sign(left[sliding])).all()
+
+
+def _resized(mass, length, rotor, slides):
+    """A finger of two joints and four tendons with other masses, lengths and rotors.
+
+    Torques of springs and friction keep their ratio to that of the weight. A joint that slides has 40 mm of travel for
+    each rad, times `length`. `rotor` is the inertia of the joints' rotors over that of a link.
+    """
+    s, slides = polynomial_finger(random_finger(3, 2)), np.array(slides)
+    d, (spring,), friction = s.description, s.springs, s.friction
+    assert isinstance(spring, PolynomialSpring)
+    assert isinstance(friction, PolynomialFriction)
+    unit = np.where(slides, 0.04 * length, 1.0)  # of a joint's coordinate
+
+    def rows(coefficients, factor):
+        """Coefficients of polynomials in the joints' coordinates."""
+        return tuple(
+            tuple(factor * c / u**p for p, c in enumerate(row, 1)) for u, row in zip(unit, coefficients, strict=True)
+        )
+
+    def route(old, u):
+        return old and PolynomialRoute(tuple(length * c / u**p for p, c in enumerate(old.coefficients, 1)))
+
+    return replace(
+        s,
+        description=replace(
+            d,
+            origin=length * d.origin,
+            mass=mass * d.mass,
+            com=length * d.com,
+            inertia=mass * length**2 * d.inertia,
+            rotor_inertia=rotor * 2e-5 * mass * length**2 / unit**2,
+            limits=d.limits * unit[:, None],
+            prismatic=tuple(slides.tolist()),
+        ),
+        routes=tuple(tuple(map(route, routes, unit)) for routes in s.routes),
+        springs=(PolynomialSpring(rows(spring.coefficients, mass * length)),),
+        friction=PolynomialFriction(rows(friction.coefficients, mass * length)),
+        damping=tuple(mass * length * np.array(s.damping) / unit**2),
+        loss_constant=tuple(mass * np.array(s.loss_constant)),
+    )
+
+
+def _tracks(specimen):
+    """Whether VD.3 keeps within a fifth of its travel of the plan, and no tendon falls slack."""
+    recipe = recipe_from({"trials": {"experiments": ["VD.3"], "vd3": {"motions": 1, "duration": 2.0}}})
+    plan = session_plan(specimen.description, recipe.trials)[0]
+    channels = SpecimenPlant(specimen).driven(plan)
+    error = np.abs(channels["q"] - plan.q).max(axis=1)
+    return (error < 0.2 * np.ptp(plan.q, axis=1)).all() and channels["tendon_force"].min() > 0.0
+
+
+@pytest.mark.parametrize(
+    ("mass", "length", "rotor", "slides"),
+    [(1.0, 1.0, 500.0, (True, False)), (0.01, 0.1, 0.0, (False, False)), (100.0, 100.0, 0.01, (True, False))],
+)
+def test_fingers_of_any_size_are_driven(mass, length, rotor, slides):
+    """With 500 times the inertia of a link, 0.01 kg m², the rotors are those of a robot's geared motors."""
+    assert _tracks(_resized(mass, length, rotor, slides))
+
+
+@pytest.mark.long
+@given(
+    st.floats(-2.0, 2.0).map(lambda p: 10.0**p),
+    st.floats(-1.0, 2.0).map(lambda p: 10.0**p),
+    st.floats(-2.0, 3.0).map(lambda p: 10.0**p),
+    st.tuples(st.booleans(), st.booleans()),
+)
+@settings(max_examples=20, deadline=None)
+def test_fingers_of_every_size_are_driven(mass, length, rotor, slides):
+    assert _tracks(_resized(mass, length, rotor, slides))
 
 
 def test_motion_beyond_the_limits_is_refused(driven):
