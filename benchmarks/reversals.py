@@ -1,8 +1,10 @@
 """Errors of the predicted torque of swept joints (ID.3-dynamic), near their reversals and elsewhere.
 
-    python benchmarks/reversals.py [FOLDER ...]
+    python benchmarks/reversals.py [--causes] [FOLDER ...]
 
-Each folder has `fit.h5`, from which the model is identified, and `fresh.h5`, whose trials are predicted. A reversal is
+Each folder has `fit.h5`, from which the model is identified, and `fresh.h5`, whose trials are predicted. With
+`--causes` they are predicted once more, by the model with the causes that a first look of the diagnosis names: an
+effect that the nominal model lacks may show at reversals most. A reversal is
 an instant at which the joint's angle, slowly filtered, turns back. The last line is a simulated finger with its true
 model, whose friction changes its sign at once; a real contact yields before it slides.
 """
@@ -14,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxfinger.data import Session, Trial, read_session, smooth
+from jaxfinger.gap import diagnose
 from jaxfinger.identify import Fit, identify
 from jaxfinger.identify.predictions import predict_session
 from jaxfinger.model import Model
@@ -59,13 +62,21 @@ def main() -> None:
     """Print a line for each folder."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folders", nargs="*", type=Path)
-    print(f"{'':24s} rms error, N mm: within {1e3 * NEAR:.0f} ms of a reversal, elsewhere")
-    for folder in parser.parse_args().folders:
-        fit = identify(read_session(folder / "fit.h5"))
-        near, far = (np.sqrt(np.mean(e**2)) for e in errors(fit, read_session(folder / "fresh.h5")))
-        print(f"{folder.name:24s} {near:6.2f} {far:6.2f}")
-    near, far = (np.sqrt(np.mean(e**2)) for e in errors(*simulated()))
-    print(f"{'contacts that do not give':24s} {near:6.2f} {far:6.2f}")
+    parser.add_argument("--causes", action="store_true", help="predict with the causes that a diagnosis names, too")
+    args = parser.parse_args()
+    print(f"{'':32s} rms error, N mm: within {1e3 * NEAR:.0f} ms of a reversal, elsewhere")
+    for folder in args.folders:
+        session, fresh = read_session(folder / "fit.h5"), read_session(folder / "fresh.h5")
+        _print(folder.name, identify(session), fresh)
+        if args.causes:
+            found = diagnose(session, quick=True)
+            _print("  with " + (", ".join(k.effect for k in found.named) or "no cause"), found.augmented, fresh)
+    _print("contacts that do not give", *simulated())
+
+
+def _print(name: str, model: Fit | Model, session: Session) -> None:
+    near, far = (np.sqrt(np.mean(e**2)) for e in errors(model, session))
+    print(f"{name:32s} {near:6.2f} {far:6.2f}")
 
 
 if __name__ == "__main__":
