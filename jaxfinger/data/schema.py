@@ -132,8 +132,10 @@ def units_where(units: str, prismatic: Sequence[bool]) -> str:
     return _SLIDING.get(units, units) if prismatic and all(prismatic) else units
 
 
-def channel_units(channel: str, prismatic: Sequence[bool]) -> str:
-    """Units of a trial's channel, translated where every joint is prismatic."""
+def channel_units(channel: str, prismatic: Sequence[bool], column: int | None = None) -> str:
+    """Units of a trial's channel, translated where every joint is prismatic, or the joint of the one `column`."""
+    if column is not None and CHANNELS[channel].shape[1] == "m":
+        prismatic = prismatic[column : column + 1]
     return units_where(CHANNELS[channel].units or "1", prismatic)
 
 

@@ -130,7 +130,7 @@ def channel_budgets(
                 column.experiment,
                 column.channel,
                 site(problem, column.channel, column.column),
-                channel_units(column.channel, problem.session.finger.prismatic),
+                channel_units(column.channel, problem.session.finger.prismatic, column.column),
                 noise**0.5,
                 max(missed - noise, 0.0) ** 0.5,
                 tuple(float(lost[at].sum()) for at in lines),

@@ -74,7 +74,7 @@ def propose(
     if not found:
         return None
     named = tuple((float(v), names[i]) for v, i in zip(coefficients, found, strict=True))
-    units = channel_units(channel, problem.session.finger.prismatic)
+    units = channel_units(channel, problem.session.finger.prismatic, column)
     return Proposal(channel, site(problem, channel, column), named, units, min(1.0, energy / missed))
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from jaxfinger.data import check_file, data_hash, read_predictions, read_session, write_predictions, write_session
 from jaxfinger.data.findings import Report
+from jaxfinger.data.schema import channel_units
 from jaxfinger.errors import UserError
 
 
@@ -206,3 +207,10 @@ def test_recordings_in_place_of_predictions_are_doubted(session, tmp_path):
     write_session(session, path)
     read_predictions(path, session, report)
     assert ["has no attribute `content` that says `predictions`" in x.message for x in report] == [True]
+
+
+def test_a_column_of_a_finger_with_joints_of_both_kinds_has_the_units_of_its_joint():
+    assert [channel_units("joint_torque", (True, False), k) for k in (0, 1)] == ["N", "N m"]
+    assert [channel_units("q", (True, False), k) for k in (0, 1)] == ["m", "rad"]
+    assert channel_units("tendon_force", (True,), 2) == "N"  # of the third tendon
+    assert channel_units("joint_torque", (True, True)) == "N"
