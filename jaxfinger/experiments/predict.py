@@ -2,7 +2,9 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
+from equinox import tree_at
 from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
@@ -15,13 +17,37 @@ from jaxfinger.model import (
     excursion,
     external_torque,
     fingertip_force,
+    memories,
     resisting_change,
     simulated_ahead,
 )
 
+
+def _joint_torque(model: Model, x: Motion) -> Float[Array, "m *T"]:
+    """τ_ext of (1), N m, behind the low-pass of a fit (`Motion.blur`) and the means of its blocks.
+
+    Their variances add up to σ² (of a block of length Δ it is Δ²/12). The mean of a smooth function of time g about t
+    is nearly (g(t − σ) + g(t + σ))/2, by the Gauss–Hermite rule with two nodes. Terms that are not linear in the
+    low-passed angles and speeds, such as gravity, are therefore evaluated at q ± σ q̇ and q̇ ± σ q̈. States of effects
+    are low-passed already.
+    """
+    if x.blur is None or x.held:
+        return external_torque(model, x)
+    std = jnp.sqrt(x.blur**2 + jnp.diff(x.time)[..., :1] ** 2 / 12.0)
+    memory = jax.tree.map(_twice, memories(model, x))
+    aside = jnp.stack([-std, std], axis=-3)[None]
+    two = jax.tree.map(_twice, x)
+    nodes = tree_at(lambda m: (m.q, m.qd), two, (two.q + aside * two.qd, two.qd + aside * two.qdd))
+    return jnp.mean(external_torque(model, nodes, memory=memory), axis=-3)
+
+
+def _twice(a: Float[Array, "*more B T"]) -> Float[Array, "*more 2 B T"]:
+    return jnp.stack([a, a], axis=-3)
+
+
 _PREDICTORS = {
     "tendon_excursion": excursion,
-    "joint_torque": external_torque,
+    "joint_torque": _joint_torque,
     "fingertip_force": fingertip_force,
     "q": simulated_ahead,
 }
@@ -59,8 +85,10 @@ def change(
     elif contact is not None and true.q is not x.q:
         y = fingertip_force(model, true)
     elif effect.moves_rigid_body():
-        y = external_torque(model, true, nominal=terms if same else None)
-        y = y if contact is None else jnp.sum(contact * y[None], axis=1)
+        if contact is None:
+            y = _joint_torque(model, true)
+        else:
+            y = jnp.sum(contact * external_torque(model, true, nominal=terms if same else None)[None], axis=1)
     else:
         assert terms is not None
         if contact is None:

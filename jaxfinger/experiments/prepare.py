@@ -85,7 +85,7 @@ def prepare(
         UserError: trials of one experiment are sampled at rates too different to be stacked.
     """
     sizes, stacks = sizes or sizes_of(session), {}
-    for experiment in (e.at(sizes.pace if e.kind == "driven" else sizes.slow_pace) for e in EXPERIMENTS.values()):
+    for experiment in (e.at(sizes) for e in EXPERIMENTS.values()):
         chosen = [t for t in session if t.experiment == experiment.name and (names is None or t.name in names)]
         trials = [t for t in chosen if len(t.time) > 1]
 

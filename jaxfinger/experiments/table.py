@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
+
+from jaxfinger.data.signals.sizes import Sizes
+
+MOST_HALVINGS = 2  # of a cut-off for noise: at a quarter of the protocol's, the filter still shows a sweep's reversals
 
 Kind = Literal["path", "driven", "stepped", "held"]
 
@@ -32,9 +37,16 @@ class Experiment:
     slack: bool = False  # whether the tendons are slack by protocol
     pace: float = 1.0  # duration of the motions over that of the protocol's, for which rate and cut-off hold
 
-    def at(self, pace: float) -> Experiment:
-        """Experiment with rate and cut-off for a session of another pace (`data.signals.sizes`)."""
-        return replace(self, rate=self.rate / pace, cutoff=self.cutoff / pace, pace=pace)
+    def at(self, sizes: Sizes) -> Experiment:
+        """Experiment with rate and cut-off for the pace and the noise of a session.
+
+        The cut-off of sweeps is halved, at most twice, to about the frequency above which the torque of inertia is
+        noisier than the measured torque (`Sizes.crossing`).
+        """
+        pace = sizes.pace if self.kind == "driven" else sizes.slow_pace
+        excess = self.cutoff / pace / sizes.crossing if self.kind == "driven" and self.slack else 0.0
+        scale = 0.5 ** min(round(math.log2(max(excess, 1.0))), MOST_HALVINGS) / pace
+        return replace(self, rate=self.rate * scale, cutoff=self.cutoff * scale, pace=pace)
 
     @property
     def held(self) -> bool:

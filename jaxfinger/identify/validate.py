@@ -160,9 +160,12 @@ def _residuals(model: Model, fit: Fit, stack: Stack) -> tuple[dict, dict[str, tu
 
 
 def _floor(fit: Fit, stack: Stack, channel: str, residual: np.ndarray) -> tuple[np.ndarray, str]:
-    """Noise of each column: from repeats or holds, else the fit's of the same sensor, else from fast residuals."""
+    """Noise of each column: from repeats or holds, else the fit's of the same sensor, else from fast residuals.
+
+    The torque of a free finger is measured by no sensor: it is zero.
+    """
     here = estimate(stack, channel, residual)
-    if here.source == "residuals":
+    if here.source == "residuals" and not (channel == "joint_torque" and stack.experiment.unloaded):
         rate = stack.experiment.rate
         for (experiment, c), noise in fit.noise.items():
             if c == channel and noise.source != "residuals" and _rate(experiment) == rate:

@@ -142,10 +142,17 @@ def changed_torque(model: Model, x: Motion, nominal: Terms, tau: Float[Array, "m
 
 
 def external_torque(
-    model: Model, x: Motion, f_ext: Float[Array, "3 *T"] | None = None, nominal: Terms | None = None
+    model: Model,
+    x: Motion,
+    f_ext: Float[Array, "3 *T"] | None = None,
+    nominal: Terms | None = None,
+    memory: tuple[Memory, ...] | None = None,
 ) -> Float[Array, "m *T"]:
-    """τ_ext of (1), N m: the external torque on the joints that the motion requires."""
-    e = terms(model, x, memories(model, x), nominal)
+    """τ_ext of (1), N m: the external torque on the joints that the motion requires.
+
+    `memory`: states of the effects, where they are known.
+    """
+    e = terms(model, x, memories(model, x) if memory is None else memory, nominal)
     tau = rigid_body.inverse_dynamics(e.finger, x.q, x.qd, x.qdd) + resisting(e)
     if f_ext is not None:
         _, J = rigid_body.fingertip(model.finger, x.q)

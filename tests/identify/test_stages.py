@@ -73,8 +73,11 @@ def test_noise_of_accelerations_is_no_sign_of_a_wrong_model():
     joint = {"name": "MCP", "axis": [0, 1, 0], "origin": [0, 0, 0], "limits_deg": [-10, 90], "rotor_inertia": 0.01}
     finger = {"gravity": [0.0, 0.0, -9.81], "fingertip": [0.03, 0.0, 0.0], "joints": [joint | body]}
     terms = {"joints": {"MCP": {"elastic": [-0.01, 0.3], "friction": [0.02], "damping": 0.01}}}
-    trials = {"experiments": ["ID.3-static"]}
+    trials = {"experiments": ["ID.3-static", "ID.3-dynamic"]}
     session = simulate(recipe_from({"finger": finger, "terms": terms, "trials": trials}), seed=0)
-    (report,) = identify(session, stages=("ID.3-static",)).stages
-    assert report.chi2_per_row < 1.5
-    assert report.outliers < 0.05
+    fit = identify(session, stages=("ID.3-static", "ID.3-dynamic"))
+    for report in fit.stages:
+        assert report.chi2_per_row < 1.3
+        assert report.outliers < 0.03
+    damping = next(p for p in fit.table() if p["name"] == "damping MCP")
+    assert abs(damping["value"] - 0.01) < 4.0 * damping["std"] < 4e-4

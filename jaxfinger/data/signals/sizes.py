@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxfinger.data.session import Session, Trial
+from jaxfinger.data.signals.crossing import crossing_of
 from jaxfinger.data.signals.noise import STD_PER_MAD
 from jaxfinger.data.signals.quantiles import median, quantile
 from jaxfinger.data.signals.spikes import without_spikes
@@ -49,6 +50,7 @@ class Sizes:
     noise: float  # N, standard deviation of a tension sensor
     pace: float = 1.0  # of sweeps (ID.3-dynamic)
     slow_pace: float = 1.0  # of led, stepped and held motions, which need not be as quick as sweeps
+    crossing: float = np.inf  # Hz: above it noise of angles hides a sweep's inertia (`crossing_of`)
 
     @property
     def slack(self) -> float:
@@ -85,7 +87,8 @@ def sizes_of(session: Session) -> Sizes:
     slow = _pace(steps) if any(steps) else pace
     if slow >= 1.0:  # Quick steps count as measured. Slow ones follow the sweeps' pace, which is better known.
         slow = max(pace, 1.0)
-    return Sizes(highest_tension(session), max(excursions), float(np.median(noises)) if noises else 0.0, pace, slow)
+    noise = float(np.median(noises)) if noises else 0.0
+    return Sizes(highest_tension(session), max(excursions), noise, pace, slow, crossing_of(session, pace))
 
 
 def highest_tension(session: Session) -> float:
