@@ -428,5 +428,6 @@ def test_trials_that_overlap_are_said_once(session):
 def test_times_that_no_sensor_has_are_said(session):
     trials = {t.name: replace(t, time=t.time / 86400.0) for t in session}
     assert any(
-        "has a sample every 1.16e-07 s; convert times to s" in x for x in said_of(replace(session, trials=trials))
+        "has a sample every 1.16e-07 s, as no sensor has; correct the units" in x
+        for x in said_of(replace(session, trials=trials))
     )
