@@ -374,6 +374,14 @@ def test_torques_excursions_and_tensions_are_large_for_their_machine(session, si
         assert all(mend in text for text in said)
 
 
+def test_torques_that_tendons_can_give_are_plausible_however_light_the_links(session):
+    """Forceps of a gram bear the pull of their cables."""
+    finger = session.finger
+    light = replace(session, finger=replace(finger, mass=finger.mass / 500.0, inertia=finger.inertia / 500.0))
+    assert not [text for text in said_of(light) if "too large" in text]
+    assert any("convert N mm to N m" in text for text in said_of(raised(light, "joint_torque", 1e3)))
+
+
 def raised(session: Session, channel: str, factor: float) -> Session:
     """The session with all values of a channel multiplied."""
     trials = {t.name: t if (x := getattr(t, channel)) is None else replace(t, **{channel: factor * x}) for t in session}
