@@ -84,6 +84,7 @@ def look(*recordings: Path, finger: Path | None = None, json: bool = False) -> N
     from jaxfinger.data.importing.proposal import proposal
     from jaxfinger.data.importing.sources import load_recording
     from jaxfinger.data.importing.survey import clocks_of, columns_of
+    from jaxfinger.data.signals.sizes import MAX_RATE
     from jaxfinger.data.toml import Place
 
     described = finger_from(str(finger.resolve()), Place(str(finger))) if finger is not None else None
@@ -112,6 +113,8 @@ def look(*recordings: Path, finger: Path | None = None, json: bool = False) -> N
             order = f"; {odd} out of order or repeated, the rate is of sorted ones" if clock.disordered else ""
             if clock.restarts:
                 order = f"; it begins again or wraps at {counted(clock.restarts, 'place')}"
+            if clock.rate > MAX_RATE:
+                order += "; no sensor is so fast, so the times are in other units"
             print(plain(f"{clock.name}: {clock.duration:.4g} s at {clock.rate:.4g} Hz, {gaps}{order}"))
         for name, reason in recording.unusable.items():
             print(plain(f"{name} {reason}"))

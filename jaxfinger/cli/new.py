@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jaxfinger.cli.output import plain, refuse_output
 from jaxfinger.errors import UserError, counted
+
+if TYPE_CHECKING:
+    from jaxfinger.data.session import FingerDescription
 
 
 def new(
@@ -60,7 +64,9 @@ def new(
             raise UserError(
                 "new: a robot brings its own tendons; leave out --tendons, and add others in the finger's file"
             )
-        described, named, pulled = _of_robot(robot, joints, tip or "")
+        described, finger_of_robot = _of_robot(robot, joints, tip or "")
+        named, all_tendons = list(finger_of_robot.joint_names), finger_of_robot.tendon_names
+        pulled = _last_joints(finger_of_robot)
     else:
         if tip is not None:
             raise UserError("new: --tip names a place of a robot; give its file with --robot")
@@ -68,8 +74,8 @@ def new(
         if not named:
             raise UserError("new: no joint is named; give --joints MCP,PIP,DIP, or so")
         answer = _asked("Tendons, or none", tendons, "T1, T2, T3, T4")
-        pulled = [] if answer.strip() == "none" else _names("tendon", answer)
-        described = finger_template(named, pulled)
+        all_tendons = [] if answer.strip() == "none" else _names("tendon", answer)
+        described, pulled = finger_template(named, all_tendons), dict.fromkeys(all_tendons, named[-1])
     beside = _from(finger, mapping.parent)
     if recordings:
         mapped = _proposal(recordings, specimen, beside, described, finger)
@@ -78,23 +84,29 @@ def new(
     for path, text in ((finger, described), (mapping, mapped)):
         with atomic_path(path, overwrite) as part:
             part.write_text(text, encoding="utf-8")
-    count = f"{counted(len(named), 'joint')}, {counted(len(pulled), 'tendon')}"
+    count = f"{counted(len(named), 'joint')}, {counted(len(all_tendons), 'tendon')}"
     left = "replace its numbers by those of your finger" if robot is None else f"from {robot.name}"
     print(plain(f"{finger}: {count}; {left}"))
     todo = "correct what was guessed" if recordings else "name your recordings and their columns"
     print(plain(f"{mapping}: {todo}, then: jaxfinger import … --mapping {mapping}"))
 
 
-def _of_robot(robot: Path, joints: str | None, tip: str) -> tuple[str, list[str], list[str]]:
-    """Text of the finger's file, and the names of its joints and tendons; prints what the finger cannot take over."""
+def _of_robot(robot: Path, joints: str | None, tip: str) -> tuple[str, FingerDescription]:
+    """Text of the finger's file, and the finger; prints what it cannot take over."""
     from jaxfinger.data.finger_file import finger_toml
     from jaxfinger.data.importing.robot import robot_finger
-    from jaxfinger.data.importing.templates import robot_head
+    from jaxfinger.data.importing.templates import robot_head, robot_terms
 
-    found, remarks = robot_finger(robot, _names("joint", joints or ""), tip)
-    for remark in remarks:
+    found = robot_finger(robot, _names("joint", joints or ""), tip)
+    for remark in found.remarks:
         print(plain(f"{robot}: {remark}"))
-    return robot_head(robot.name) + finger_toml(found), list(found.joint_names), list(found.tendon_names)
+    return robot_head(robot.name) + finger_toml(found.finger) + robot_terms(found), found.finger
+
+
+def _last_joints(finger: FingerDescription) -> dict[str, str]:
+    """By active tendon, the last joint that it crosses."""
+    rows = zip(finger.tendon_names, finger.active, finger.crosses, strict=True)
+    return {name: finger.joint_names[max(crosses.nonzero()[0])] for name, active, crosses in rows if active}
 
 
 def _proposal(recordings: tuple[Path, ...], specimen: str, beside: str, described: str, finger: Path) -> str:

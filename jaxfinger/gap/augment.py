@@ -198,13 +198,16 @@ def _covariance(
 ) -> Float[np.ndarray, "p p"]:
     """Laplace covariance (JᵀJ + prior precision)⁻¹, with causes in the weights of the formula.
 
-    Standard deviations grow where the scores of successive stretches vary more than the noise explains
-    (`intervals`).
+    The variance of a parameter on which neither depends is infinite, as in any fit. Standard deviations grow where the
+    scores of successive stretches vary more than the noise explains (`intervals`).
     """
+    unseen = np.flatnonzero(~J.any(axis=0) & ~root.any(axis=0))
     if chosen is not None:
         project = Projector(problem, chosen.columns, chosen.linear_fit.weights)
         r, J = project.weighted(r[None])[0], project.weighted(J.T).T
-    return laplace([evidence(r, J, problem.column_of_row, problem.stretch_of_row)], root).covariance
+    covariance = laplace([evidence(r, J, problem.column_of_row, problem.stretch_of_row)], root).covariance
+    covariance[unseen, unseen] = np.inf
+    return covariance
 
 
 def _fit(problem: Problem, model: Model, free, block, r, what: str, solution: Solution | None = None) -> Fit:

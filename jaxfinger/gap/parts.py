@@ -297,17 +297,22 @@ def changed_parameters(against: Fit, found: Posterior, fit: Fit) -> tuple[Change
 
 
 def retuned_parameters(problem: Problem, fit: Fit) -> tuple[Change, ...]:
-    """Parameters of another simulator that the measurements contradict; the one that changes predictions most first."""
+    """Parameters of another simulator that the measurements contradict; the law that changes predictions most first.
+
+    A law's coefficients trade off: what it changes is the change by all of them together.
+    """
     if problem.simulator is None:
         return ()
     old, new = (np.asarray(ravel(model))[problem.free] for model in (problem.simulator, fit.model))
-    std = fit.std[problem.free]
-    off = np.abs(new - old)
-    weight = off * np.linalg.norm(problem.J, axis=0) * (off > MIN_DEVIATION * std)
-    parameters = describe(problem.nominal)
+    change, std, every = new - old, fit.std[problem.free], describe(problem.nominal)
+    parameters = [every[i] for i in problem.free]
+    laws = [(p.group, p.joint, p.tendon) for p in parameters]
+    moves = problem.J * change  # the predictions, by each parameter alone
+    alone = np.linalg.norm(moves, axis=0)
+    together = {law: np.linalg.norm(moves[:, [x == law for x in laws]].sum(axis=1)) for law in set(laws)}
+    contradicted = np.flatnonzero((np.abs(change) > MIN_DEVIATION * std) & (alone > 0.0))
     return tuple(
-        Change(p.name, p.group, p.units, float(old[i]), 0.0, float(new[i]), float(std[i]), 1.0)
-        for i in np.argsort(-weight)
-        if weight[i] > 0
-        for p in [parameters[problem.free[i]]]
+        Change(p.name, p.group, p.units, float(old[k]), 0.0, float(new[k]), float(std[k]), 1.0)
+        for k in sorted(contradicted, key=lambda k: (together[laws[k]], alone[k]), reverse=True)
+        for p in [parameters[k]]
     )

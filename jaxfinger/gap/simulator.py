@@ -26,6 +26,7 @@ from jaxfinger.identify.parameters import Free, describe
 from jaxfinger.identify.solve import solve
 from jaxfinger.identify.stages import (
     GROUP_OF_TERM,
+    STAGES,
     first_noise,
     free_groups,
     nominal_model,
@@ -125,14 +126,22 @@ def _measured_noise(stacks: dict[str, Stack], simulated: dict[str, Stack]) -> di
 def _imitate(
     session: Session, recipe: Recipe, simulated: dict[str, Stack], noise: dict[tuple[str, str], Noise]
 ) -> Model:
-    """The nominal model nearest to the predictions; masses and centres of mass keep the values of CAD."""
+    """The nominal model nearest to the predictions; masses and centres of mass keep the values of CAD.
+
+    It is fitted stage by stage, as to recordings: what a simulator has and the nominal model lacks, such as another
+    mass, then stays out of the moment arms. Last come the terms that no stage has read, by all predictions.
+    """
     model = nominal_model(session, recipe)
-    parameters = describe(model)
-    reads = {e: s.experiment.channels for e, s in simulated.items()}
-    groups = free_groups(recipe)
-    free = np.array([i for i, p in enumerate(parameters) if p.group in groups and p.determinable], dtype=int)
-    sources = sources_of(simulated, reads, noise, parameters)
-    return solve(start_values(model, free, parameters, sources), free, sources)[0]
+    parameters, left = describe(model), free_groups(recipe)
+    stages = [(s.reads, left & set(s.frees)) for s in STAGES.values() if s.name in simulated]
+    left -= set().union(*(groups for _, groups in stages))
+    everything = {e: s.experiment.channels for e, s in simulated.items()}
+    for reads, groups in [*stages, (everything, left)]:
+        free = np.array([i for i, p in enumerate(parameters) if p.group in groups and p.determinable], dtype=int)
+        if free.size:
+            sources = sources_of(simulated, {e: c for e, c in reads.items() if e in simulated}, noise, parameters)
+            model = solve(start_values(model, free, parameters, sources), free, sources)[0]
+    return model
 
 
 def _absent(emulator: Model, group: str, simulated: dict[str, Stack]) -> bool:

@@ -47,7 +47,9 @@ from jaxfinger.model import Model
 # Lengths of a step, in standard deviations of the estimate, that end a search.
 STEP_TOLERANCE = 1e-6  # a millionth of an interval's half width, and still above rounding
 ROUGH_TOLERANCE = 0.02  # where residuals alone are wanted, for their noise: all white ones change by 0.02 in norm
-KINK_TOLERANCE = 0.1  # of a rejected step: it lies within a kink of the cost, as where a tendon slips or a joint turns
+# Of a rejected step: it lies within a kink of the cost, as where a tendon slips or a joint turns. Also of the whole way
+# that is left when the last of `MAX_STEPS` has been made.
+KINK_TOLERANCE = 0.1
 MAX_STEPS = 60  # linearisations; it bounds the time of a fit, whose report says when it was reached
 MIN_MASS_SHARE = 0.02  # lower bound of a mass over its starting value: no link is fifty times lighter than CAD says
 PADDING = 48  # problems are padded to a multiple of so many parameters, so that they share compiled programs
@@ -102,7 +104,10 @@ class Solution:
 
     @property
     def converged(self) -> bool:
-        """Whether the search ended at an optimum, to rounding, or in a kink a tenth of a standard deviation wide."""
+        """Whether the search ended at an optimum, to rounding, or in a kink a tenth of a standard deviation wide.
+
+        A search that is out of steps did so, too, if its last steps tell that no more than that is left of its way.
+        """
         return not self.message
 
     def chi2_per_row(self, estimated: int) -> float:
@@ -176,7 +181,7 @@ def solve(
     y = _padded(theta, room)
     state = jax.device_get(_begin(y))
     ends = _padded(low, room), _padded(high, room)
-    at = model
+    at, sizes = model, [np.inf]  # lengths of the full steps, in standard deviations
     for _ in range(MAX_STEPS):
         linearised = linearise_each(at, sources, huber, tangents, free)
         factor = stacked(linearised, sources, size)
@@ -184,6 +189,7 @@ def solve(
         rows = np.concatenate([factor[:, [*free, size]], np.column_stack([prior.root, offset])])
         trial = state.trial
         y, state = jax.device_get(_advance(least, y, state, _factor_of(rows, room), *ends))
+        sizes.append(float(state.size))
         if np.array_equal(y, trial):
             best = at, linearised, factor, rows
         if state.outcome == Outcome.undefined_start:
@@ -197,7 +203,7 @@ def solve(
     count = int(np.count_nonzero(white))
     return model, Solution(
         state.outcome,
-        _sentence(state),
+        _sentence(state, _way_left(sizes[-2], sizes[-1])),
         int(state.evaluations),
         0.5 * float(factor[:, -1] @ factor[:, -1]),
         count,
@@ -220,11 +226,20 @@ def parameter_bounds(
     return np.where(masses, np.maximum(low, MIN_MASS_SHARE * theta), low), high
 
 
-def _sentence(state: Iterate) -> str:
-    """Message to the user about a search that did not converge; empty where it did."""
+def _way_left(before: float, last: float) -> float:
+    """Length of `last` and all later steps if each is shorter than the one before it by the ratio of these two."""
+    return last / (1.0 - last / before) if last < before else np.inf
+
+
+def _sentence(state: Iterate, left: float) -> str:
+    """Message to the user about a search that did not converge; empty where it did.
+
+    `left`: the way to the optimum that full steps would go, in standard deviations.
+    """
     step = float(state.length) * float(state.size)
+    near = bool(state.outcome == Outcome.running) and left <= KINK_TOLERANCE
     at_rounding = bool(state.outcome == Outcome.rounded) and step <= KINK_TOLERANCE
-    if at_rounding or bool(state.outcome == Outcome.converged) or bool(state.outcome == Outcome.kink):
+    if near or at_rounding or bool(state.outcome == Outcome.converged) or bool(state.outcome == Outcome.kink):
         return ""
     last = f"the last step was {step:.2g} standard deviations"
     if bool(state.outcome == Outcome.running):

@@ -253,3 +253,13 @@ def test_a_torque_that_never_changes_is_not_judged(session):
     stack = problem.stacks["ID.3-static"]
     counts = np.asarray(stack.batch.mask["joint_torque"]).any(axis=(0, 2))
     assert [name for name, counted in zip(stack.trials, counts, strict=True) if not counted] == [first.name]
+
+
+def test_what_no_trial_shows_at_the_optimum_is_undetermined(problem):
+    """A tendon's loss that is zero at every tension depends on neither of its two parameters."""
+    parameters = [describe(problem.nominal)[i] for i in problem.free]
+    to_dead = np.array([-100.0 if p.group == "tendon_friction" and "a0" in p.name else 0.0 for p in parameters])
+    fit = nominal_fit(moved(problem, to_dead)).fit
+    unseen = np.array([p.group == "tendon_friction" for p in parameters])
+    assert unseen.any()
+    np.testing.assert_array_equal(np.isinf(fit.std[problem.free]), unseen)

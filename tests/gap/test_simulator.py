@@ -13,13 +13,23 @@ from jaxfinger.errors import UserError
 from jaxfinger.experiments import demean, prepare
 from jaxfinger.gap import Status, diagnose
 from jaxfinger.gap.folds import fold_of_row
+from jaxfinger.gap.parts import retuned_parameters
 from jaxfinger.gap.problem import build
 from jaxfinger.gap.result import Key
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Recipe, identify
+from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.predictions import predict_session
 from jaxfinger.identify.stages import first_noise
-from jaxfinger.synthetic import paper_finger, polynomial_finger, true_model
+from jaxfinger.synthetic import (
+    SpecimenPlant,
+    paper_finger,
+    polynomial_finger,
+    recipe_from,
+    simulate,
+    study_finger,
+    true_model,
+)
 
 from .conftest import PLANTED, TRUTH, WITHOUT, session_with
 
@@ -51,6 +61,38 @@ def test_the_missing_effect_is_named_and_the_wrong_parameters_retuned(session):
     own = next(x for x in diagnose(session, without=WITHOUT, quick=True).closures if x.experiment == "ID.3-dynamic")
     assert line.before > 1.2 * own.before
     assert line.after == pytest.approx(own.after, rel=0.1)
+
+
+def test_another_mass_of_the_simulator_stays_out_of_its_moment_arms():
+    """The imitation keeps the masses of CAD, so that it misses torques of the free finger."""
+    specimen = study_finger()
+    trials = {"experiments": ["ID.2", "ID.3-static", "VD.3"], "rate": 100.0, "id2": {"strokes": 2, "stroke_time": 3.0}}
+    trials["vd3"] = {"repeats": 1, "motions": 2, "duration": 6.0, "centre": 0.4, "amplitude": 0.3}
+    recipe = recipe_from({"specimen": {"kind": "random", "joints": 1}, "trials": trials})
+    session = simulate(recipe, seed=0, plant=SpecimenPlant(specimen))
+    true = true_model(specimen)
+    heavy = eqx.tree_at(lambda m: m.finger.mass, true, 3.0 * true.finger.mass)
+    emulator, _, _ = emulate(session, Recipe(), prepare(session), predict_session(heavy, session))
+    q = jnp.linspace(*session.finger.limits[0], 20)[None]
+    expected = true.moment_arm.coupling(q)
+    np.testing.assert_allclose(emulator.moment_arm.coupling(q), expected, atol=1e-3 * float(jnp.abs(expected).max()))
+
+
+def test_parameters_are_listed_by_what_their_law_changes(planted):
+    """Coefficients of one tendon's excursion, each far off, may leave the excursion as it is."""
+    parameters, J = [describe(planted.nominal)[i] for i in planted.free], planted.J
+    size = np.linalg.norm(J, axis=0)
+    damping = next(k for k, p in enumerate(parameters) if p.group == "damping" and p.joint == "PIP")
+    law = [k for k, p in enumerate(parameters) if (p.group, p.tendon, p.joint) == ("moment_arm", "T1", "MCP")]
+    off = np.zeros(len(parameters))
+    off[damping] = 1.0 / size[damping]
+    off[law] = 10.0 * np.linalg.svd(J[:, law] / size[law])[2][-1] / size[law]
+    free = Free.at(planted.nominal, planted.free)
+    model = free.set(planted.nominal, np.asarray(free.get(planted.nominal)) + off)
+    known = replace(planted.fit, model=model, covariance=1e-30 * np.eye(ravel(model).size))
+    first, *others = retuned_parameters(replace(planted, simulator=planted.nominal), known)
+    assert first.name == "damping PIP"
+    assert {c.name for c in others} == {parameters[k].name for k in law}
 
 
 @pytest.mark.long

@@ -14,7 +14,7 @@ from jaxfinger.effects import CatalogueEffect, amplitude
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import predict, prepare
 from jaxfinger.identify.parameters import describe, ravel
-from jaxfinger.identify.solve import ROUGH_TOLERANCE, bounded_least_squares, solve
+from jaxfinger.identify.solve import KINK_TOLERANCE, ROUGH_TOLERANCE, bounded_least_squares, solve
 from jaxfinger.identify.stages import first_noise, sources_of
 
 EXPERIMENT, CHANNEL = "ID.3-static", "joint_torque"
@@ -92,18 +92,38 @@ def test_a_step_to_where_the_model_is_not_defined_is_cut(problem):
     assert float(ravel(found)[position]) == pytest.approx(-0.95, abs=1e-3)
 
 
-def test_steps_that_overshoot_settle_in_the_light_of_those_before(short, short_truth):
+def _overshoot(first, short, short_truth):
+    """Problem whose data are `first` and −`first` in turn, in the unit of `Bend`."""
     model, position, source = _problem_of(Overshoot, short, short_truth, start=0.3, true=0.0)
     joint = source.batch.y[CHANNEL][model.effects[0].index[0]]
-    side = jnp.where(jnp.sin(3.0 * source.batch.x.time) > 0.0, -1e-2, 1e-2)
+    side = 1e-2 * jnp.where(jnp.sin(3.0 * source.batch.x.time) > 0.0, first, -first)
     shifted = source.batch.y[CHANNEL].at[model.effects[0].index[0]].set(joint + side) * source.batch.mask[CHANNEL]
-    source = source._replace(batch=eqx.tree_at(lambda b: b.y[CHANNEL], source.batch, shifted))
+    return model, position, source._replace(batch=eqx.tree_at(lambda b: b.y[CHANNEL], source.batch, shifted))
+
+
+def test_steps_that_overshoot_settle_in_the_light_of_those_before(short, short_truth):
+    model, position, source = _overshoot(-1.0, short, short_truth)
     found, solution = solve(model, np.array([position]), {EXPERIMENT: source}, tolerance=ROUGH_TOLERANCE)
     assert solution.converged
     assert solution.linearisations <= 10
     settled, exact = solve(model, np.array([position]), {EXPERIMENT: source})
     std = _std(exact, source, position)
     assert abs(float(ravel(found)[position] - ravel(settled)[position])) < 2 * ROUGH_TOLERANCE * std
+
+
+@pytest.mark.parametrize(("steps", "near"), [(9, True), (6, False)])
+def test_a_search_out_of_steps_has_converged_where_its_last_ones_tell_that_the_optimum_is_near(
+    steps, near, short, short_truth, monkeypatch
+):
+    """With these data every step is a third of the one before it, on the same side of the optimum."""
+    model, position, source = _overshoot(0.3, short, short_truth)
+    settled, exact = solve(model, np.array([position]), {EXPERIMENT: source})
+    monkeypatch.setattr("jaxfinger.identify.solve.MAX_STEPS", steps)
+    found, solution = solve(model, np.array([position]), {EXPERIMENT: source})
+    assert solution.linearisations == steps < exact.linearisations
+    assert solution.converged == near
+    away = abs(float(ravel(found)[position] - ravel(settled)[position]))
+    assert (away < KINK_TOLERANCE * _std(exact, source, position)) == near
 
 
 def _std(solution, source, position) -> float:

@@ -95,7 +95,8 @@ def _time(trial: Trial, sizes: Sizes, report: Report) -> None:
     if usual > STEP_TIME * max(sizes.slow_pace, 1.0):
         report.warning(place, f"has a sample every {usual:.3g} s; {conversion('ms')} if that is what it is")
     if usual < 1.0 / MAX_RATE:
-        report.warning(place, f"has a sample every {usual:.3g} s; convert times to s, such as days or hours")
+        mend = "correct the units of the times, such as days, or ms of times that are in s"
+        report.warning(place, f"has a sample every {usual:.3g} s, as no sensor has; {mend}")
     if (lost := gaps(steps)).any():
         said = f"{counted(int(lost.sum()), 'gap')}, the longest {steps.max():.3g} s"
         report.warning(place, f"has {said}; samples were lost, derivatives bridge them")

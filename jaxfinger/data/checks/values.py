@@ -49,7 +49,7 @@ def check_values(trial: Trial, finger: FingerDescription, sizes: Sizes, report: 
     if trial.tendon_force is not None:
         _tension(trial, finger, sizes, report)
     _temperatures(trial, report)
-    _large_for_the_machine(trial, finger, report)
+    _large_for_the_machine(trial, finger, sizes, report)
 
 
 def _constant_columns(trial: Trial, finger: FingerDescription, report: Report) -> None:
@@ -136,14 +136,17 @@ def _temperatures(trial: Trial, report: Report) -> None:
             )
 
 
-def _large_for_the_machine(trial: Trial, finger: FingerDescription, report: Report) -> None:
-    """Check that excursions and torques are in m and N m: their sizes fit the machine's lengths and masses."""
+def _large_for_the_machine(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
+    """Check that excursions and torques are in m and N m: their sizes fit the machine's lengths and masses.
+
+    A torque may also be that of a tendon, of which no arm is longer than the machine.
+    """
     if any(finger.prismatic):
         return
     reach = _reach(finger)
     for channel, most, unit in (
         ("tendon_excursion", _MAX_EXCURSION * reach, "mm"),
-        ("joint_torque", _MAX_TORQUE * _weight(finger) * reach, "N mm"),
+        ("joint_torque", max(_MAX_TORQUE * _weight(finger), sizes.tension) * reach, "N mm"),
     ):
         for _, name, x in measured_columns(trial, finger, (channel,)) if most != 0.0 else ():
             if np.isfinite(x).all() and (size := quantile(np.abs(x), 0.9)) > most:

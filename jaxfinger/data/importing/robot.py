@@ -20,7 +20,7 @@ from jaxfinger.data.session import FingerDescription
 from jaxfinger.errors import UserError, did_you_mean, listed
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
 
 # kg and kg m²: MuJoCo gives at least these to links of which the file says less, such as frames and point masses.
 _WITHOUT_MASS, _WITHOUT_INERTIA = 1e-9, 1e-12
@@ -35,10 +35,20 @@ _MAX_DEVIATION = 0.02  # of a tendon's excursion: paths drawn by hand are hardly
 _DIGITS = 9  # that are written
 
 
+class Terms(NamedTuple):
+    """The linear springs, the damping and the friction of a robot's joints and tendons, as `[terms]` has them."""
+
+    elastic: Float[np.ndarray, "m 2"]  # N m and N m/rad (N and N/m of a sliding joint): τ_k = a₀ + a₁ q
+    friction: Float[np.ndarray, " m"]  # N m
+    damping: Float[np.ndarray, " m"]  # N m s/rad
+    tendon_friction: Float[np.ndarray, " n"]  # N: the part of the loss that does not grow with the tension
+
+
 class RobotFinger(NamedTuple):
-    """A finger from a robot's description, and sentences on what the finger cannot take over."""
+    """A finger from a robot's description, its terms, and sentences on what they cannot take over."""
 
     finger: FingerDescription
+    terms: Terms
     remarks: tuple[str, ...]
 
 
@@ -196,8 +206,8 @@ class _Robot:
         first = int(self.model.body_jntadr[body])
         return [] if first < 0 else list(range(first, first + int(self.model.body_jntnum[body])))
 
-    def finger(self, chain: Sequence[int], tip: str) -> tuple[FingerDescription, tuple[str, ...]]:
-        """The finger that a chain of joints makes, and remarks."""
+    def finger(self, chain: Sequence[int], tip: str) -> tuple[FingerDescription, Terms, tuple[str, ...]]:
+        """The finger that a chain of joints makes, its terms, and remarks."""
         import mujoco
 
         model = self.model
@@ -231,7 +241,37 @@ class _Robot:
             rotor_inertia=_tidy(rotors) if rotors.any() else None,
             excursion=excursion if tendons else None,
         )
-        return finger, (*remarks, *said, *about_tip, *about_tendons)
+        terms, about_terms = self._terms(chain, tendons)
+        return finger, terms, (*remarks, *said, *about_tip, *about_tendons, *about_terms)
+
+    def _terms(self, chain: Sequence[int], tendons: Sequence[int]) -> tuple[Terms, tuple[str, ...]]:
+        """Terms of the joints and tendons, and remarks on those that have no such form."""
+        model, joints, k = self.model, np.array(chain), np.array(tendons, int)
+        dof, spring = model.jnt_dofadr[joints], model.jnt_stiffness[joints]
+        terms = Terms(
+            _tidy(np.column_stack([-spring * model.qpos_spring[model.jnt_qposadr[joints]], spring])),
+            _tidy(model.dof_frictionloss[dof]),
+            _tidy(model.dof_damping[dof]),
+            _tidy(model.tendon_frictionloss[k]),
+        )
+        bent = [self._has("jnt_stiffnesspoly", joints), self._has("dof_dampingpoly", dof)]
+        along = [model.tendon_stiffness[k], model.tendon_damping[k]]
+        remarks = [
+            f"{self.names[j]}: of its spring and damping in the file only the linear parts are written"
+            for j, has in zip(joints, np.any(bent, axis=0), strict=True)
+            if has
+        ]
+        remarks += [
+            f"{model.tendon(t).name}: a spring or damper along its path in the file is no part of a finger"
+            for t, has in zip(k, np.any(along, axis=0), strict=True)
+            if has
+        ]
+        return terms, tuple(remarks)
+
+    def _has(self, table: str, rows: Int[np.ndarray, " r"]) -> Bool[np.ndarray, " r"]:
+        """Whether each of the rows of a table of MuJoCo's has a number; none has where this MuJoCo lacks the table."""
+        whole = getattr(self.model, table, None)
+        return np.zeros(len(rows), bool) if whole is None else np.any(whole[rows], axis=1)
 
     def _held(self, chain: Sequence[int]) -> tuple[str, ...]:
         """Remarks on joints that the finger does not have, and on joints that follow others."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+import numpy as np
+
+from jaxfinger.data.importing.robot import RobotFinger
 from jaxfinger.data.toml import as_key, quoted
 
 # Links of an adult's finger, taken for rods, give the example's numbers.
@@ -66,6 +69,28 @@ def robot_head(robot: str) -> str:
 """
 
 
+def robot_terms(found: RobotFinger) -> str:
+    """Text of `[terms]`: the springs, damping and friction of a robot; empty where it has none."""
+    finger, terms = found.finger, found.terms
+    text = ""
+    for i, name in enumerate(finger.joint_names):
+        rows = {"elastic": terms.elastic[i], "friction": terms.friction[i : i + 1], "damping": terms.damping[i]}
+        text += _table(f"terms.joints.{as_key(name)}", rows)
+    for k, name in enumerate(finger.tendon_names):
+        text += _table(f"terms.tendons.{as_key(name)}", {"constant": terms.tendon_friction[k]})
+    head = """
+# Springs, damping and friction of the file, in N m and rad: `jaxfinger simulate` reads them, and `jaxfinger identify`
+# does not. Compare them with what it finds.
+"""
+    return head + text if text else ""
+
+
+def _table(name: str, rows: Mapping[str, np.ndarray | np.floating]) -> str:
+    """A table of the rows that are not zero; empty if none is left."""
+    lines = [f"{key} = {np.asarray(values).tolist()}" for key, values in rows.items() if np.any(values)]
+    return "\n".join([f"\n[{name}]", *lines, ""]) if lines else ""
+
+
 def _length(i: int) -> float:
     return _LENGTHS[min(i, len(_LENGTHS) - 1)]
 
@@ -78,11 +103,14 @@ COLUMNS = """# Which column of which recording is what. Import with:
 """
 
 
-def mapping_template(specimen: str, finger: str, joints: Sequence[str], tendons: Sequence[str]) -> str:
-    """Text of a `mapping.toml` for a rig without recordings: channels of all joints and tendons, and example trials."""
+def mapping_template(specimen: str, finger: str, joints: Sequence[str], tendons: Mapping[str, str]) -> str:
+    """Text of a `mapping.toml` for a rig without recordings: channels of all joints and tendons, and example trials.
+
+    `tendons`: those that are pulled, each with the joint at which the torque sensor feels it.
+    """
     trials = [(f"{joint}", "ID.2", joint, "") for joint in joints] if tendons else []
     trials += [(f"{joint}", "ID.3-dynamic", joint, "") for joint in joints]
-    trials += [(f"{tendon}-{joints[-1]}", "ID.4", joints[-1], tendon) for tendon in tendons]
+    trials += [(f"{tendon}-{joint}", "ID.4", joint, tendon) for tendon, joint in tendons.items()]
     text = f"""{COLUMNS}
 specimen = {quoted(specimen)}
 finger = {quoted(finger)}

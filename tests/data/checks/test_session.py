@@ -374,6 +374,14 @@ def test_torques_excursions_and_tensions_are_large_for_their_machine(session, si
         assert all(mend in text for text in said)
 
 
+def test_torques_that_tendons_can_give_are_plausible_however_light_the_links(session):
+    """Forceps of a gram bear the pull of their cables."""
+    finger = session.finger
+    light = replace(session, finger=replace(finger, mass=finger.mass / 500.0, inertia=finger.inertia / 500.0))
+    assert not [text for text in said_of(light) if "too large" in text]
+    assert any("convert N mm to N m" in text for text in said_of(raised(light, "joint_torque", 1e3)))
+
+
 def raised(session: Session, channel: str, factor: float) -> Session:
     """The session with all values of a channel multiplied."""
     trials = {t.name: t if (x := getattr(t, channel)) is None else replace(t, **{channel: factor * x}) for t in session}
@@ -428,5 +436,6 @@ def test_trials_that_overlap_are_said_once(session):
 def test_times_that_no_sensor_has_are_said(session):
     trials = {t.name: replace(t, time=t.time / 86400.0) for t in session}
     assert any(
-        "has a sample every 1.16e-07 s; convert times to s" in x for x in said_of(replace(session, trials=trials))
+        "has a sample every 1.16e-07 s, as no sensor has; correct the units" in x
+        for x in said_of(replace(session, trials=trials))
     )

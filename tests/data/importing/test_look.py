@@ -89,6 +89,16 @@ def test_a_log_without_angles_belongs_to_the_angles_of_its_time(tmp_path):
     assert 'file = "cell2.csv", time = { from = "time_s" }' in text.split("[trials.")[2]
 
 
+@pytest.mark.parametrize(("units", "says"), [("ms", True), ("s", False)])
+def test_a_clock_whose_stated_units_make_it_too_fast_is_said(tmp_path, units, says, capsys):
+    path = tmp_path / "log.csv"
+    time = np.arange(2000) / 1000.0
+    header = f"time [{units}],angle [deg]"
+    np.savetxt(path, np.column_stack([time, 40 + 30 * np.sin(time)]), delimiter=",", header=header, comments="")
+    main(["look", str(path)])
+    assert ("no sensor is so fast, so the times are in other units" in capsys.readouterr().out) == says
+
+
 def test_a_clock_that_begins_again_is_said(tmp_path, capsys):
     path = tmp_path / "log.csv"
     np.savetxt(path, np.column_stack([TIME % 4000.0, TIME]), "%.6f", ",", header="t,enc", comments="")

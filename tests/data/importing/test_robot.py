@@ -1,5 +1,7 @@
 """Fingers from robots' descriptions, beside MuJoCo's own dynamics and tendons."""
 
+import tomllib
+
 import mujoco
 import numpy as np
 import pytest
@@ -11,6 +13,8 @@ from jaxfinger.data.importing.robot import robot_finger
 from jaxfinger.errors import UserError
 from jaxfinger.model import Finger
 from jaxfinger.model.rigid_body import inverse_dynamics
+from jaxfinger.synthetic.fingers import specimen_of
+from jaxfinger.synthetic.recipe import read_session_recipe
 
 INERTIAL = (
     '<inertial><origin xyz="{at}" rpy="0.3 -0.2 0.1"/><mass value="{mass}"/>'
@@ -110,7 +114,7 @@ def motion(finger: FingerDescription, rng):
 )
 def test_a_urdf_has_the_dynamics_that_mujoco_gives_it(urdf, joints):
     """Also where a joint within the chain or beyond it is held."""
-    finger, _ = robot_finger(urdf, joints)
+    finger = robot_finger(urdf, joints).finger
     bare = URDF.replace(MESH, "").replace("</robot>", '<mujoco><compiler fusestatic="false"/></mujoco></robot>')
     model = mujoco.MjModel.from_xml_string(bare)
     moved = motion(finger, np.random.default_rng(1))
@@ -121,7 +125,7 @@ def test_a_urdf_has_the_dynamics_that_mujoco_gives_it(urdf, joints):
 
 def test_an_mjcf_has_the_dynamics_that_mujoco_gives_it(mjcf):
     """Two joints of one body have a link of a millionth of it between them."""
-    finger, _ = robot_finger(mjcf)
+    finger = robot_finger(mjcf).finger
     model = mujoco.MjModel.from_xml_path(str(mjcf))
     moved = motion(finger, np.random.default_rng(2))
     expected = mujoco_torques(model, finger.joint_names, *moved)
@@ -158,7 +162,7 @@ def test_a_mass_that_only_a_mesh_would_give_is_refused(tmp_path):
 
 
 def test_tendons_pull_in_what_their_paths_say(mjcf):
-    finger, remarks = robot_finger(mjcf)
+    finger, _, remarks = robot_finger(mjcf)
     assert finger.joint_names == ("abduction", "mcp", "pip")
     assert finger.tendon_names == ("flexor", "extensor")
     assert finger.active.tolist() == [True, False]
@@ -183,6 +187,52 @@ def test_tendons_pull_in_what_their_paths_say(mjcf):
     assert [x.split(":")[0] for x in remarks if "cross_terms" in x] == ["extensor"]
 
 
+SPRUNG = MJCF.replace(PIP, PIP + ' stiffness="0.02" springref="0.3" damping="1e-3" frictionloss="4e-3"').replace(
+    '<spatial name="flexor">', '<spatial name="flexor" frictionloss="0.2">'
+)
+
+
+def passive_torque(model, q, rate) -> float:
+    """Torque of the spring, the damper and the dry friction of pip, on the left of the equation of motion (1)."""
+    data = mujoco.MjData(model)
+    dof = model.joint("pip").dofadr[0]
+    data.qpos[model.joint("pip").qposadr[0]], data.qvel[dof] = q, rate
+    mujoco.mj_forward(model, data)
+    dry = np.sign(rate) * model.dof_frictionloss[dof]
+    return dry - data.qfrc_spring[dof] - data.qfrc_damper[dof]
+
+
+def test_springs_damping_and_friction_of_a_robot_are_the_terms_of_its_simulation(tmp_path):
+    """`jaxfinger simulate` reads them beside the finger."""
+    path = tmp_path / "sprung.xml"
+    path.write_text(SPRUNG)
+    main(["new", f"{tmp_path}/f.toml", f"{tmp_path}/m.toml", "--robot", str(path)])
+    finger = specimen_of(read_session_recipe(tmp_path / "f.toml").specimen)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    for angle, rate in ((1.2, 0.7), (0.1, -2.0)):
+        q = np.array([0.0, 0.0, angle])
+        found = finger.elastic(q) + np.sign(rate) * finger.friction.magnitude(q) + rate * np.array(finger.damping)
+        np.testing.assert_allclose(found, [0.0, 0.0, passive_torque(model, angle, rate)], rtol=1e-9, atol=1e-15)
+    assert "[terms.joints.mcp]" not in (tmp_path / "f.toml").read_text()
+    assert "[terms.tendons.flexor]\nconstant = 0.2\n" in (tmp_path / "f.toml").read_text()
+
+
+def test_the_mapping_pulls_each_active_tendon_at_the_last_joint_that_it_crosses(tmp_path):
+    path = tmp_path / "hand.xml"
+    path.write_text(MJCF.replace("</actuator>", '<general tendon="extensor"/></actuator>'))
+    main(["new", f"{tmp_path}/f.toml", f"{tmp_path}/m.toml", "--robot", str(path)])
+    trials = tomllib.loads((tmp_path / "m.toml").read_text())["trials"].values()
+    pulled = {trial["tendon"]: trial["joint"] for trial in trials if trial["experiment"] == "ID.4"}
+    assert pulled == {"flexor": "pip", "extensor": "mcp"}
+
+
+def test_what_terms_cannot_say_of_a_robot_is_named(tmp_path):
+    path = tmp_path / "sprung.xml"
+    path.write_text(SPRUNG.replace('name="extensor"', 'name="extensor" stiffness="300"'))
+    said = [x for x in robot_finger(path).remarks if "spring" in x]
+    assert said == ["extensor: a spring or damper along its path in the file is no part of a finger"]
+
+
 def test_a_link_that_no_body_could_be_is_changed_and_named(tmp_path):
     """The inertias of vendors' files are rounded, zero for frames, and now and then impossible."""
     path = tmp_path / "hand.urdf"
@@ -191,7 +241,7 @@ def test_a_link_that_no_body_could_be_is_changed_and_named(tmp_path):
     for given, named in ((thin, False), (wrong, True)):
         text = f'<robot name="x">{link("base")}{joint("j", "base", "rod")}<link name="rod"><inertial>'
         path.write_text(f'{text}<mass value="0.1"/>{given}</inertial></link></robot>')
-        finger, remarks = robot_finger(path)
+        finger, _, remarks = robot_finger(path)
         assert any("rod: its inertia in the file is impossible" in x for x in remarks) == named
         small, middle, large = np.linalg.eigvalsh(finger.inertia[0])
         assert small > 0.0
