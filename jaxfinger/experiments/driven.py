@@ -35,7 +35,7 @@ MIN_REST = 1.5  # times how long a reversal looks like a rest (`rests`): half as
 MAX_LOST_SPEED_SHARE = 0.5  # of a joint's speed that the slow filter may lose; stick and slip lose 1 to 3 times it
 MIN_SLIP_TO_NOISE = 15.0  # ten standard deviations: a smaller loss is not a slip
 ROUNDING_SHARE = 1e-6  # of the motion's speed: a loss by rounding, of a joint at rest in a simulated file
-CLEAR_WIDTHS = 3.1  # widths of the filter left out on either side of unknown friction: 0.1 % of a jump remains beyond
+CLEAR_WIDTHS = 2.3  # widths of the filter left out on either side of unknown friction: 1 % of a jump remains beyond
 # Widths left out after a joint that no motor moves has broken away: it does so suddenly.
 BREAKAWAY_WIDTHS = 4.5
 # Travel over which friction reverses, in median residuals of the encoder: 1.5 of its standard deviations. A longer
