@@ -33,16 +33,14 @@ def _joint_torque(model: Model, x: Motion) -> Float[Array, "m *T"]:
     """
     if x.blur is None or x.held:
         return external_torque(model, x)
-    std = jnp.sqrt(x.blur**2 + jnp.diff(x.time)[..., :1] ** 2 / 12.0)
-    memory = jax.tree.map(_twice, memories(model, x))
-    aside = jnp.stack([-std, std], axis=-3)[None]
-    two = jax.tree.map(_twice, x)
-    nodes = tree_at(lambda m: (m.q, m.qd), two, (two.q + aside * two.qd, two.qd + aside * two.qdd))
-    return jnp.mean(external_torque(model, nodes, memory=memory), axis=-3)
+    std, memory = jnp.sqrt(x.blur**2 + jnp.diff(x.time)[..., :1] ** 2 / 12.0), memories(model, x)
 
+    def at(side: Float[Array, ""]) -> Float[Array, "m *T"]:
+        away = (side * std)[None]
+        there = tree_at(lambda m: (m.q, m.qd), x, (x.q + away * x.qd, x.qd + away * x.qdd))
+        return external_torque(model, there, memory=memory)
 
-def _twice(a: Float[Array, "*more B T"]) -> Float[Array, "*more 2 B T"]:
-    return jnp.stack([a, a], axis=-3)
+    return jnp.mean(jax.vmap(at)(jnp.array([-1.0, 1.0])), axis=0)
 
 
 _PREDICTORS = {
