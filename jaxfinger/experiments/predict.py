@@ -23,17 +23,18 @@ from jaxfinger.model import (
 )
 
 
-def _joint_torque(model: Model, x: Motion) -> Float[Array, "m *T"]:
+def _joint_torque(model: Model, x: Motion, nominal: Terms | None = None) -> Float[Array, "m *T"]:
     """τ_ext of (1), N m, behind the low-pass of a fit (`Motion.blur`) and the means of its blocks.
 
     Their variances add up to σ² (of a block of length Δ it is Δ²/12). The mean of a smooth function of time g about t
     is nearly (g(t − σ) + g(t + σ))/2, by the Gauss–Hermite rule with two nodes. Terms that are not linear in the
     low-passed angles and speeds, such as gravity, are therefore evaluated at q ± σ q̇ and q̇ ± σ q̈. States of effects
-    are low-passed already.
+    are low-passed already. `nominal`: as of `external_torque`, for motion without a low-pass.
     """
     if x.blur is None or x.held:
-        return external_torque(model, x)
-    std, memory = jnp.sqrt(x.blur**2 + jnp.diff(x.time)[..., :1] ** 2 / 12.0), memories(model, x)
+        return external_torque(model, x, nominal=nominal)
+    std = jnp.sqrt(x.blur**2 + (x.time[..., 1:2] - x.time[..., :1]) ** 2 / 12.0)
+    memory = memories(model, x)
 
     def at(side: Float[Array, ""]) -> Float[Array, "m *T"]:
         away = (side * std)[None]
@@ -83,10 +84,8 @@ def change(
     elif contact is not None and true.q is not x.q:
         y = fingertip_force(model, true)
     elif effect.moves_rigid_body():
-        if contact is None:
-            y = _joint_torque(model, true)
-        else:
-            y = jnp.sum(contact * external_torque(model, true, nominal=terms if same else None)[None], axis=1)
+        y = _joint_torque(model, true, terms if same else None)
+        y = y if contact is None else jnp.sum(contact * y[None], axis=1)
     else:
         assert terms is not None
         if contact is None:

@@ -13,6 +13,8 @@ from jaxfinger.data.signals.motion import rest_speed
 from jaxfinger.experiments.driven import CLEAR_WIDTHS, less_noise, sliding
 from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, runs_of_holds
 
+# Widths of the filter from the ends of a hold: beyond, 3e-5 of the motion beside the hold is left, and nothing moves.
+FAR_WIDTHS = 4.0
 NONE_VALID = "there is no hold whose direction of approach is known, and no motion in which the joint slides"
 
 
@@ -32,10 +34,10 @@ def reduce(r: PreparedTrial) -> Row:
     at = r.whole(hold)
     known, led = (r.mean(a.astype(float)) > 1.0 - 1e-9 for a in (slides, approached))  # all samples of the block
     counting = dict.fromkeys(r.y, ((at >= 0)[:, None] & led) | known)
-    qd, qdd, y = j.qd, less_noise(r, j), r.y
-    if not r.reduced:
-        qd, qdd = (np.where(hold[:, None] < 0, a, 0.0) for a in (qd, qdd))  # nothing moves in a hold
-    else:
+    y, reach = r.y, round(FAR_WIDTHS * filter_std(j.cutoff) / r.step) if r.reduced else 0
+    rests = minimum_filter1d(hold >= 0, 2 * reach + 1)[:, None]
+    qd, qdd = (np.where(rests, 0.0, a) for a in (j.qd, less_noise(r, j)))
+    if r.reduced:
         joint, *filtered = (low_pass(r.trial.time, a, j.cutoff) for a in (joint, *y.values()))
         y = dict(zip(y, filtered, strict=True))
     return row(

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import nnls
 
 from jaxfinger.synthetic.protocols import TrialPlan
 from jaxfinger.synthetic.specimen import Specimen
@@ -21,30 +21,28 @@ from jaxfinger.synthetic.specimen import Specimen
 Array = Any  # NumPy or JAX
 TENSION_LAG = 0.01  # s, time constant T of the tension loop
 DAMPING_RATIO = 0.6  # of a joint that has inertia alone: its natural frequency is DAMPING_RATIO / TENSION_LAG, 9.5 Hz.
-ERROR_SHARE = 0.25  # of the plan's travel: the error at which feedback gives the plan's pull
-CROSSOVER = 0.7  # rad from sample to sample, of a joint of little inertia. A quicker loop would be unstable.
+# Of the plan's travel: the error at which feedback gives the plan's pull. Friction of a tenth of the pull, which fades
+# from the feed-forward at a reversal, is then made up for at a fortieth of the travel.
+ERROR_SHARE = 0.25
+# rad from sample to sample: highest frequency at which feedback, whose gain above the loop's lag is 2 K, may equal a
+# joint's inertia. The half sample for which a tension is held on average is a phase of 0.35 rad there.
+CROSSOVER = 0.7
 # Of the plan's pull: tension at the joints, so that no tendon falls slack. At the actuator it is at least half of that.
+# The paper's finger, whose DIP has no flexor, can hold 0.15 at most.
 MIN_SHARE = 0.1
 # Of a joint's fastest planned motion: below it the feed-forward of friction fades, so that tension does not jump at a
 # reversal.
 FADE_SHARE = 0.1
-RIDGE = 1e-3  # of the largest Σ c² of a tendon. Small beside the torque, it keeps antagonists from pulling in vain.
-SWEEPS, FIRST_SWEEPS = 10, 300  # of `distribute`: from the last sample's tensions, and from none
+# Error of the torques, over their arms, that a tension may cost, in N per N. It keeps antagonists from pulling in vain.
+RIDGE = 1e-4
 
 
 class Targets(NamedTuple):
-    """Desired motion and the torque that it takes. Time is the last axis."""
+    """Desired motion and feed-forward tension. Time is the last axis."""
 
     q: Float[Array, "m N"]  # rad
     qd: Float[Array, "m N"]  # rad/s
-    torque: Float[Array, "m N"]  # N m
-
-
-class Tensions(NamedTuple):
-    """Tensions of the tendons, N."""
-
-    joint: Float[Array, " n"]  # as the joints are to get them
-    actuator: Float[Array, " n"]
+    tension: Float[Array, "n N"]  # N, at the actuators
 
 
 class TensionController(NamedTuple):
@@ -53,31 +51,19 @@ class TensionController(NamedTuple):
     targets: Targets
     stiffness: Float[Array, "m m"]  # K, N m/rad
     arm: Float[Array, " m"]  # m: a joint's moment arms, root of their sum of squares
-    fade: Float[Array, " m"]  # rad/s
-    least: Float[Array, " n"]  # N at the joints; 0 for tendons that are not active
+    least: Float[Array, " n"]  # N at the actuators; 0 for tendons that are not active
 
-    def at_rest(self, specimen: Specimen, target: Targets) -> Tensions:
-        """Return the tensions that hold the finger in the first sample's posture."""
-        f = self._distributed(specimen, target.q, target.torque, self.least, FIRST_SWEEPS)
-        return Tensions(f, self._command(specimen, target.q, f, target))
+    def tension(self, specimen: Specimen, q, v, before, target: Targets, dt):
+        """Return the next tension (n,), N. The tension loop follows its command with a first-order lag.
 
-    def tension(self, specimen: Specimen, q, v, before: Tensions, target: Targets, dt) -> Tensions:
-        """Return the next tensions. The tension loop follows its command with a first-order lag."""
-        torque = target.torque + self.stiffness @ (target.q - q + 2.0 * TENSION_LAG * (target.qd - v))
-        f = self._distributed(specimen, q, torque, before.joint, SWEEPS)
-        share = 1.0 - jnp.exp(-dt / TENSION_LAG)
-        return Tensions(f, before.actuator + share * (self._command(specimen, q, f, target) - before.actuator))
-
-    def _distributed(self, specimen: Specimen, q, torque, start, sweeps: int):
-        """Tensions at the joints. Torques over their arms are in N for joints that turn and for those that slide."""
-        C = jnp.where(self.least[:, None] > 0.0, specimen.moment_arm(q), 0.0)
-        return distribute(C / self.arm[None], torque / self.arm, self.least, start, sweeps)
-
-    def _command(self, specimen: Specimen, q, f, target: Targets):
-        """Tension at the actuators that gives the joints the tension f while the tendons slide as planned."""
-        C = specimen.moment_arm(q)
-        direction = jnp.tanh(C @ target.qd / (jnp.abs(C) @ self.fade + 1e-300))
-        return jnp.where(self.least > 0.0, jnp.maximum(at_actuator(specimen, f, direction), 0.5 * self.least), 0.0)
+        The feedback's torques become the smallest tensions that give them, positive or negative. Torques over their
+        arms are in N for joints that turn and for those that slide.
+        """
+        torque = self.stiffness @ (target.q - q + 2.0 * TENSION_LAG * (target.qd - v))
+        C = jnp.where(self.least[:, None] > 0.0, specimen.moment_arm(q), 0.0) / self.arm[None]
+        feedback = C @ jnp.linalg.solve(C.T @ C + RIDGE * jnp.eye(len(torque)), torque / self.arm)
+        command = jnp.maximum(target.tension + feedback, self.least)
+        return before + (1.0 - jnp.exp(-dt / TENSION_LAG)) * (command - before)
 
 
 def controller(
@@ -99,35 +85,35 @@ def controller(
     most = 0.5 * np.diagonal(mass_matrix) * (CROSSOVER / (plan.time[1] - plan.time[0])) ** 2
     held = np.minimum(np.where(np.isfinite(arm), pull * arm, 0.0) / (ERROR_SHARE * travel), most)
     stiffness = mass_matrix * (DAMPING_RATIO / TENSION_LAG) ** 2 + np.diag(held)
-    return TensionController(Targets(plan.q, plan.qd, torque), stiffness, arm, fade, MIN_SHARE * pull * active)
+    C = specimen.moment_arm(plan.q) * active[:, None, None]
+    at_joint = distribute(C / arm[:, None], torque / arm[:, None], MIN_SHARE * pull * active)
+    direction = np.tanh(np.einsum("nmt,mt->nt", C, plan.qd) / (np.einsum("nmt,m->nt", np.abs(C), fade) + 1e-300))
+    least = 0.5 * MIN_SHARE * pull * active
+    tension = np.maximum(at_actuator(specimen, at_joint, direction) * active[:, None], least[:, None])
+    return TensionController(Targets(plan.q, plan.qd, tension), stiffness, arm, least)
 
 
 def distribute(
-    C: Float[Array, "n m"],
-    torque: Float[Array, " m"],
-    least: Float[Array, " n"],
-    start: Float[Array, " n"],
-    sweeps: int,
-) -> Float[Array, " n"]:
-    """Return tensions f ≥ `least`, N, that nearly minimise ‖Cᵀ f − τ‖² + ε ‖f‖², by projected coordinate descent."""
-    A = C @ C.T
-    A = A + RIDGE * jnp.max(jnp.diagonal(A)) * jnp.eye(len(A))
-    pull = C @ torque
-
-    def project(k, f):
-        return f.at[k].set(jnp.maximum(f[k] + (pull[k] - A[k] @ f) / (A[k, k] + 1e-300), least[k]))
-
-    return jax.lax.fori_loop(0, sweeps, lambda _, f: jax.lax.fori_loop(0, len(A), project, f), start)
+    C: Float[np.ndarray, "n m N"], torque: Float[np.ndarray, "m N"], least: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n N"]:
+    """Return tensions f ≥ `least`, N, that minimise ‖Cᵀ f − τ‖² + ε² ‖f‖² at each sample, with ε `RIDGE`."""
+    f = np.empty((len(least), torque.shape[1]))
+    for t, (arms, wanted) in enumerate(zip(np.moveaxis(C, 2, 0), torque.T, strict=True)):
+        A = np.concatenate([arms.T, RIDGE * np.eye(len(least))])
+        f[:, t] = least + nnls(A, np.append(wanted, 0.0 * least) - A @ least)[0]
+    return f
 
 
-def at_actuator(specimen: Specimen, tension: Float[Array, " n"], direction: Float[Array, " n"]) -> Float[Array, " n"]:
+def at_actuator(
+    specimen: Specimen, tension: Float[Array, "n N"], direction: Float[Array, "n N"]
+) -> Float[Array, "n N"]:
     """Tension f_t at the actuator, N, that gives `tension` f_j at the joints while the tendons slide.
 
     `direction` is 1 for a tendon that is pulled in, f_j = f_t − loss, and −1 for one that runs out, f_j = f_t + loss;
     values between are interpolated. The loss a₀ + a₁ f_t is never negative.
     """
-    a0, a1 = np.asarray(specimen.loss_constant), np.asarray(specimen.loss_proportional)
-    pulled = jnp.maximum(tension, (tension + a0) / (1.0 - a1))
-    released = jnp.minimum(tension, (tension - a0) / (1.0 + a1))
+    a0, a1 = (np.asarray(a)[:, None] for a in (specimen.loss_constant, specimen.loss_proportional))
+    pulled = np.maximum(tension, (tension + a0) / (1.0 - a1))
+    released = np.minimum(tension, (tension - a0) / (1.0 + a1))
     share = 0.5 * (1.0 + direction)
     return share * pulled + (1.0 - share) * released

@@ -56,12 +56,11 @@ class Simulator:
             tension = controller.tension(self.specimen, state.q, state.v, tension, target, dt)
 
             def substep(_, state):
-                return step(self.specimen, self.finger, state, tension.actuator, dt / SUBSTEPS)
+                return step(self.specimen, self.finger, state, tension, dt / SUBSTEPS)
 
-            return (jax.lax.fori_loop(0, SUBSTEPS, substep, state), tension), (state.q, state.v, tension.actuator)
+            return (jax.lax.fori_loop(0, SUBSTEPS, substep, state), tension), (state.q, state.v, tension)
 
-        first = Targets(*(x[0] for x in controller.targets))
-        start = at_rest(self.finger, q0), controller.at_rest(self.specimen, first)
+        start = at_rest(self.finger, q0), controller.targets.tension[0]
         return jax.lax.scan(sample, start, controller.targets)[1]
 
 

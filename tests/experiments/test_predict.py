@@ -17,10 +17,8 @@ def motion(t, blur=None) -> Motion:
     q = 0.6 + SPEED * t + 0.5 * ACCELERATION * (t**2 + (0.0 if blur is None else blur**2))
     qd, qdd, none = SPEED + ACCELERATION * t, ACCELERATION + 0.0 * t, np.zeros((MODEL.finger.n, *np.shape(t)))
     arrays = (t, q, qd, qdd, none, 0.0 * q, none, t, 0.0 * q)
-    x = Motion(*(jnp.asarray(a)[..., None, :] for a in arrays))
-    return (
-        x if blur is None else Motion(*(jnp.asarray(a)[..., None, :] for a in arrays), blur=jnp.full((1, t.size), blur))
-    )
+    width = None if blur is None else jnp.full((1, t.size), blur)
+    return Motion(*(jnp.asarray(a)[..., None, :] for a in arrays), blur=width)
 
 
 def test_terms_that_are_not_linear_pass_the_low_pass_as_the_measured_torque_does():
@@ -29,7 +27,7 @@ def test_terms_that_are_not_linear_pass_the_low_pass_as_the_measured_torque_does
     at = np.arange(-6.0, 6.0, 0.01) * std
     weight = np.exp(-0.5 * (at / std) ** 2) / np.exp(-0.5 * (at / std) ** 2).sum()
     true = np.asarray(external_torque(MODEL, motion(at)))[:, 0] @ weight
-    t, k = np.arange(3) * step, 0  # blocks are short beside the low-pass
-    found = np.asarray(predict(MODEL, motion(t, std), ("joint_torque",))["joint_torque"])[:, 0, k]
-    plain = np.asarray(external_torque(MODEL, motion(t, std)))[:, 0, k]
+    x = motion(np.arange(3) * step, std)  # blocks are short beside the low-pass
+    found = np.asarray(predict(MODEL, x, ("joint_torque",))["joint_torque"])[:, 0, 0]
+    plain = np.asarray(external_torque(MODEL, x))[:, 0, 0]
     assert np.abs(found - true).max() < 0.05 * np.abs(plain - true).max()

@@ -31,10 +31,10 @@ class Logarithm(Mine):
 
 
 class Quotient(Mine):
-    """Infinite where a tendon is slack."""
+    """Infinite where a joint is at rest."""
 
     def torque(self, x, memory, h):
-        return h.at[self.index[0]].add(self.b / x.tension[self.index[0]])
+        return h.at[self.index[0]].add(self.b / x.qd[self.index[0]])
 
 
 class Offset(Mine):

@@ -11,7 +11,8 @@ from jaxfinger.identify import Recipe, identify
 from jaxfinger.identify.parameters import describe
 from jaxfinger.identify.recipe import ModelRecipe
 from jaxfinger.synthetic import recipe_from, simulate
-from tests.experiments.test_prepare import FINGER, ramps
+from tests.experiments.test_held import ramps
+from tests.experiments.test_prepare import FINGER
 
 
 def test_a_stage_of_which_nothing_counts_is_skipped_and_says_why():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
 
 from jaxfinger.errors import UserError
 from jaxfinger.model import Finger, rigid_body
@@ -19,6 +20,7 @@ from jaxfinger.synthetic import (
     recipe_from,
     session_plan,
 )
+from jaxfinger.synthetic.controller import distribute
 from jaxfinger.synthetic.driven import QUICK, at_rest, friction_impulse, step
 from jaxfinger.synthetic.routes import PolynomialRoute
 from jaxfinger.synthetic.specimen import GrowingFriction, PolynomialFriction, PolynomialSpring
@@ -54,12 +56,14 @@ def driven():
 
 
 def test_tendons_move_every_joint_along_the_plan(driven):
-    plan, _, (q, v, tension) = driven
+    plan, plant, (q, v, tension) = driven
     assert np.abs(q - plan.q).max() < 0.1
     assert (np.ptp(q, axis=1) > 0.15).all()
     assert (np.mean(np.abs(v) > 1e-3, axis=1) > 0.6).all()  # it sticks at reversals
     active = SPECIMEN.description.active
-    assert (tension[active] > 0.1).all()
+    least = plant.controller(plan).least[:, None]
+    assert (least[active] > 0.0).all()
+    assert (tension >= 0.99 * least).all()
     assert tension[active].max() < 20.0
     assert not tension[~active].any()
 
@@ -207,6 +211,21 @@ def test_fingers_of_any_size_are_driven(mass, length, rotor, slides):
 @settings(max_examples=20, deadline=None)
 def test_fingers_of_every_size_are_driven(mass, length, rotor, slides):
     assert _tracks(_resized(mass, length, rotor, slides))
+
+
+@pytest.mark.parametrize("fewest", [False, True])
+def test_tensions_give_every_torque_that_pulling_can(fewest):
+    """The reference is SciPy's least squares with bounds. With one tendon more than joints it pulls against all."""
+    rng = np.random.default_rng(0)
+    C = rng.standard_normal((6, 3, 20))
+    if fewest:
+        C = np.concatenate([C[:3], -np.einsum("n,nmt->mt", [0.05, 0.3, 1.0], C[:3])[None]])
+    torque, least = rng.standard_normal((3, 20)), np.full(len(C), 0.1)
+    found = distribute(C, torque, least)
+    for t in range(20):
+        best = lsq_linear(C[..., t].T, torque[:, t], (least, np.inf), method="bvls")
+        np.testing.assert_allclose(C[..., t].T @ found[:, t], C[..., t].T @ best.x, atol=1e-3)
+    assert (found >= least[:, None]).all()
 
 
 def test_motion_beyond_the_limits_is_refused(driven):

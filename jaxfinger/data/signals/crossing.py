@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 MAX_SAMPLES = 8192  # of a sweep that are read, from its middle. Limits the time; at 1 kHz the joint turns back twice.
 CUTOFF = 5.0  # Hz, at the protocol's pace: the inertia is told by motion below it
 NOISE_RATIO = 4.0  # times that cut-off: what lies above is noise, 20 Hz at the protocol's pace
-ROUNDING = 1e-6  # of a column's range: less is no noise of a sensor
+ROUNDING = 1e-6  # of a column's range, as of a converter of 20 bits: less is no noise of a sensor
 HIGHEST = 0.05  # of the sampling rate: leaves three fifths of the spectrum above the cut-off of noise
 
 
 def crossing_of(session: Session, pace: float) -> float:
-    """The frequency, Hz: the low median over sweeps (ID.3-dynamic), and of a sweep the median over its joints.
+    """The frequency, Hz: the low median over all sweeps (ID.3-dynamic) of the median over a sweep's joints.
 
     Infinite where no sweep tells it. `pace`: duration of the sweeps over that of the protocol's.
     """
@@ -57,8 +57,8 @@ def _crossings(trial: Trial, pace: float) -> list[float]:
         q, qd, qdd = smooth(time, angle, cutoff)
         friction, smoothed = (low_pass(time, x, cutoff) for x in (np.sign(qd), torque))
         laws = np.column_stack([np.ones_like(q), q, friction, qd, qdd])
-        inertia = abs(np.linalg.lstsq(laws / np.maximum(np.abs(laws).max(axis=0), 1e-300), smoothed, rcond=None)[0][-1])
-        inertia /= max(np.abs(qdd).max(), 1e-300)
+        size = np.maximum(np.abs(laws).max(axis=0), 1e-300)  # for rounding, in whatever units
+        inertia = abs(np.linalg.lstsq(laws / size, smoothed, rcond=None)[0] / size)[-1]
         of_angle, of_torque = (_noise(time, x, NOISE_RATIO * cutoff) for x in (angle, torque))
         told = of_angle > ROUNDING * np.ptp(angle) and of_torque > ROUNDING * np.ptp(torque)
         if told and inertia > 0.0:
