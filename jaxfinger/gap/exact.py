@@ -267,11 +267,15 @@ def fit_at_nominal(
         sizes = _sizes(effects, coordinates)
         return _Point(effects, changes, slopes, sizes, linear, linear.base_step(weights)[1] + float(sizes @ sizes))
 
-    def gauss_newton(now: _Point) -> _Point | None:
-        """The point after one step within the bounds, cut until the cost falls; None where it never does."""
+    def step(now: _Point) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+        """The next step, and the finite differences that suit its precision."""
         delta, information = now.linear.step(weights, *_step_bounds(now.effects, coordinates), now.sizes)
         std = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-        difference = np.clip(std, MIN_DIFFERENCE, MAX_DIFFERENCE)
+        return delta, np.clip(std, MIN_DIFFERENCE, MAX_DIFFERENCE)
+
+    def gauss_newton(now: _Point) -> _Point | None:
+        """The point after one step within the bounds, cut until the cost falls; None where it never does."""
+        delta, difference = step(now)
         for _ in range(MAX_TRIES):
             there = _stepped(now.effects, coordinates, delta)
             new = point(there, *_evaluate(signatures, there, coordinates, difference))
@@ -281,6 +285,9 @@ def fit_at_nominal(
         return None
 
     here = point(effects, changes, slopes * factors[:, None])
+    if not all(c.amplitude for c in coordinates):
+        # Without them the evidence of a fit that starts at its optimum is off by nats where a law has kinks.
+        here = point(effects, *_evaluate(signatures, effects, coordinates, step(here)[1]))
     for _ in range(MAX_STEPS):
         new = gauss_newton(here)
         if new is None:

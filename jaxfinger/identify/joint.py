@@ -19,7 +19,6 @@ from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, not_judged
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.identifiability import name_invisible, name_traded
-from jaxfinger.identify.noise import LONG_SIGNAL_WINDOW
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.predictions import model_for
@@ -82,9 +81,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         prior = prior_of(np.asarray(ravel(fit.model)), fit.covariance, free)
     progress("refining on all trials at once")
     known, huber = (fit.noise if same else {}), recipe.fit.huber
-    model, solution, sources, noise = estimate_with_noise(
-        model, free, stacks, reads, known, prior, huber, window=LONG_SIGNAL_WINDOW
-    )
+    model, solution, sources, noise = estimate_with_noise(model, free, stacks, reads, known, prior, huber, fitted=True)
     better = None
     if not solution.converged or solution.invisible.size or solution.chi2_per_row(free.size) > RESTART_CHI2:
         progress("refining from a neutral start")

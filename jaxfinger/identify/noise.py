@@ -244,8 +244,9 @@ def _fast_part(residual, mask, window: int) -> list[Series]:
         e, counts = np.where(mask[c, b], residual[c, b], 0.0), mask[c, b]
         if counts.any():
             near, share = (uniform_filter1d(x, window, mode="constant") for x in (e, counts.astype(float)))
-            mean = near / np.maximum(share, 1.0 / window)
-            series[c].append((np.where(counts, e - mean, 0.0), counts, 1 / window))
+            share = np.maximum(share, 1 / window)
+            lost = float(np.mean(1 / (window * share[counts])))  # of the valid samples in a window
+            series[c].append((np.where(counts, e - near / share, 0.0), counts, lost))
     return series
 
 

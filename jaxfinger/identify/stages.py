@@ -7,6 +7,7 @@ others. The parameters of earlier stages stay fixed, and their errors are propag
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -20,7 +21,7 @@ from jaxfinger.errors import UserError
 from jaxfinger.experiments import Experiment, Stack, not_judged
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible, name_traded
-from jaxfinger.identify.noise import MIN_STD, SIGNAL_WINDOW, Noise, estimate
+from jaxfinger.identify.noise import LONG_SIGNAL_WINDOW, MIN_STD, SIGNAL_WINDOW, Noise, estimate
 from jaxfinger.identify.parameters import Parameter, describe, ravel
 from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.predictions import model_for
@@ -322,20 +323,21 @@ def estimate_with_noise(
     prior: Prior | None,
     huber: float,
     tangents: Tangents | None = None,
-    window: int = SIGNAL_WINDOW,
+    fitted: bool = False,
 ) -> tuple[Model, Solution, dict[str, Source], dict[tuple[str, str], Noise]]:
     """Fit the free parameters, after estimating the noise of the channels read unless all of it is `known`.
 
-    Unknown noise is guessed first. Then the noise of all channels is estimated twice, each time from the residuals of a
-    fit. The last fit uses Huber's cost. `window`: as in `noise.estimate`.
+    Unknown noise is guessed first, or, where the model is `fitted` and taken to be right, estimated from its residuals:
+    the guess is white, with which a fit would follow coloured noise. Then the noise of all channels is estimated twice,
+    each time from the residuals of a fit. The last fit uses Huber's cost.
 
     Returns:
         The model, the solution, the sources and the noise.
     """
     tangents, parameters, noise = tangents or Tangents(), describe(model), dict(known)
-    unknown = {
-        (e, c): first_noise(stacks[e], c, x) for (e, c), x in residuals_for_noise(model, stacks, reads, noise).items()
-    }
+    window = LONG_SIGNAL_WINDOW if fitted else SIGNAL_WINDOW
+    first = partial(estimate, window=window) if fitted else first_noise
+    unknown = {(e, c): first(stacks[e], c, x) for (e, c), x in residuals_for_noise(model, stacks, reads, noise).items()}
     model = start_values(model, free, parameters, sources_of(stacks, reads, noise | unknown, parameters))
     for _ in range(2 if unknown else 0):
         sources = sources_of(stacks, reads, noise | unknown, parameters)
@@ -367,16 +369,16 @@ def residuals_for_noise(
     reads = {e: channels for e, channels in reads.items() if any((e, c) not in known for c in channels)}
     white = {(e, c): Noise.white(np.ones(len(stacks[e].batch.y[c])), "none") for e in reads for c in reads[e]}
     residuals = residuals_each(model, sources_of(stacks, reads, white, describe(model)))
-    return {(e, c): residuals[e][c] for e, c in white if (e, c) not in known}
+    return {(e, c): np.asarray(residuals[e][c]) for e, c in white if (e, c) not in known}
 
 
-def first_noise(stack: Stack, channel: str, residual: Float[Array | np.ndarray, "columns B T"]) -> Noise:
+def first_noise(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B T"]) -> Noise:
     """First guess of a channel's noise: white, as large as the median step of its residuals from sample to sample.
 
     It serves for a first fit, from whose residuals the noise is estimated. Residuals are used since the channel itself
     may be zero throughout, as the torque on a free finger.
     """
-    residual, mask = np.asarray(residual), np.asarray(stack.batch.mask[channel]) > 0
+    mask = np.asarray(stack.batch.mask[channel]) > 0
     step = np.diff(residual, axis=-1)[mask[..., 1:] & mask[..., :-1]]
     size = float(np.median(np.abs(step))) if step.size else 1.0
     return Noise.white(np.full(len(residual), max(size, MIN_STD)), "first guess")

@@ -30,6 +30,9 @@ CROSSOVER = 0.7
 # Of the plan's pull: tension at the joints, so that no tendon falls slack. At the actuator it is at least half of that.
 # The paper's finger, whose DIP has no flexor, can hold 0.15 at most.
 MIN_SHARE = 0.1
+# Times the dead zone of a tendon's friction: the other lower bound of the tension at the joints. What a tendon loses
+# within that zone does not depend on a₀ and a₁, which a recording is to show.
+MIN_TO_DEAD = 3.0
 # Of a joint's fastest planned motion: below it the feed-forward of friction fades, so that tension does not jump at a
 # reversal.
 FADE_SHARE = 0.1
@@ -86,11 +89,18 @@ def controller(
     held = np.minimum(np.where(np.isfinite(arm), pull * arm, 0.0) / (ERROR_SHARE * travel), most)
     stiffness = mass_matrix * (DAMPING_RATIO / TENSION_LAG) ** 2 + np.diag(held)
     C = specimen.moment_arm(plan.q) * active[:, None, None]
-    at_joint = distribute(C / arm[:, None], torque / arm[:, None], MIN_SHARE * pull * active)
+    taut = np.maximum(MIN_SHARE * pull, MIN_TO_DEAD * dead_zone(specimen)) * active
+    at_joint = distribute(C / arm[:, None], torque / arm[:, None], taut)
     direction = np.tanh(np.einsum("nmt,mt->nt", C, plan.qd) / (np.einsum("nmt,m->nt", np.abs(C), fade) + 1e-300))
-    least = 0.5 * MIN_SHARE * pull * active
+    least = 0.5 * taut
     tension = np.maximum(at_actuator(specimen, at_joint, direction) * active[:, None], least[:, None])
     return TensionController(Targets(plan.q, plan.qd, tension), stiffness, arm, least)
+
+
+def dead_zone(specimen: Specimen) -> Float[np.ndarray, " n"]:
+    """Tension, N, below which friction keeps the pull of a tendon from the joints: a₀ / (1 − a₁)."""
+    a0, a1 = (np.asarray(a) for a in (specimen.loss_constant, specimen.loss_proportional))
+    return np.maximum(a0, 0.0) / (1.0 - a1)
 
 
 def distribute(

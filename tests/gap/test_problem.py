@@ -40,7 +40,7 @@ def session(specimen):
                 "rate": 200.0,
                 "id2": {"strokes": 2, "stroke_time": 3.0},
                 "id3_static": {"step": 20.0},
-                "vd3": {"repeats": 2, "motions": 2, "duration": 8.0, "centre": 0.4, "amplitude": 0.3},
+                "vd3": {"repeats": 3, "motions": 2, "duration": 8.0, "centre": 0.4, "amplitude": 0.3},
             },
         }
     )
@@ -232,7 +232,7 @@ def test_validation_trials_alone_determine_the_nominal_model():
     trials = {
         "rate": 200.0,
         "experiments": ["VD.1", "VD.2", "VD.3"],
-        "vd3": {"repeats": 2, "motions": 2, "duration": 8.0, "centre": 0.4, "amplitude": 0.3},
+        "vd3": {"repeats": 3, "motions": 2, "duration": 8.0, "centre": 0.4, "amplitude": 0.3},
     }
     session = simulate(recipe_from({"specimen": {"kind": "polynomial"}, "trials": trials}), seed=1)
     problem = build(session, Recipe())

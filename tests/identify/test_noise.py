@@ -56,6 +56,17 @@ def test_every_column_with_samples_of_its_own_comes_out_white(estimates):
     assert np.abs(energy[:, :2] - 1.0).max() < 0.35  # of 300 rows, in a single estimate
 
 
+@pytest.mark.parametrize("valid", [40, 12])
+def test_noise_that_nothing_repeats_keeps_its_size_where_few_samples_count(valid):
+    energy = []
+    for seed in range(12):
+        residual = np.random.default_rng(seed).standard_normal((1, 2, LENGTH))
+        mask = np.tile(np.arange(LENGTH) % 80 < valid, (1, 2, 1)).astype(float)
+        noise = estimate(stack_of(residual, mask, (None, None), 0.02), "joint_torque", residual, LONG_SIGNAL_WINDOW)
+        energy.append(noise.std[0] ** 2)
+    assert np.mean(energy) == pytest.approx(1.0, abs=0.02)
+
+
 def test_noise_that_nothing_repeats_keeps_its_slow_part():
     """The long-run variance determines the interval of a constant; the moving average may remove a third at most."""
     energy, long_run, true = [], [], 1.0 / (1.0 - COLOUR.sum()) ** 2
