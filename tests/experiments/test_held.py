@@ -114,3 +114,10 @@ def test_a_tendon_that_was_taut_before_the_recording_counts_from_its_first_chang
     at, counts = np.asarray(found.batch.x.time)[0], np.asarray(found.batch.mask["joint_torque"])[0, 0] > 0
     assert not counts[at < 2.0].any()
     assert counts[(at > 3.5) & (at < 17.5)].all()
+
+
+def test_another_unit_of_force_leaves_what_counts_alone():
+    pull = ramps(4.0)
+    trials = pull, replace(pull, tendon_force=1e3 * pull.tendon_force)
+    for a, b in zip(*(stack(t).batch.mask.values() for t in trials), strict=True):
+        np.testing.assert_array_equal(a, b)

@@ -30,8 +30,7 @@ def specimen():
     return study_finger()
 
 
-@pytest.fixture(scope="module")
-def session(specimen):
+def recorded(specimen, repeats=2):
     recipe = recipe_from(
         {
             "specimen": {"kind": "random", "joints": 1},
@@ -40,11 +39,16 @@ def session(specimen):
                 "rate": 200.0,
                 "id2": {"strokes": 2, "stroke_time": 3.0},
                 "id3_static": {"step": 20.0},
-                "vd3": {"repeats": 3, "motions": 2, "duration": 8.0, "centre": 0.4, "amplitude": 0.3},
+                "vd3": {"repeats": repeats, "motions": 2, "duration": 8.0, "centre": 0.4, "amplitude": 0.3},
             },
         }
     )
     return simulate(recipe, seed=0, plant=SpecimenPlant(specimen))
+
+
+@pytest.fixture(scope="module")
+def session(specimen):
+    return recorded(specimen)
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +67,9 @@ def scaled(session):
 
 @pytest.mark.long
 @pytest.mark.parametrize("missing", [(), ("ID.3-static",)])
-def test_damping_without_its_own_experiment_is_fitted_where_else_it_shows(session, specimen, missing):
+def test_damping_without_its_own_experiment_is_fitted_where_else_it_shows(specimen, missing):
     """The stages fit it on the moves between holds; without ID.3-static the diagnosis fits it on the free motion."""
+    session = recorded(specimen, repeats=4)
     trials = {t.name: t for t in session if t.experiment not in missing}
     problem = build(replace(session, trials=trials), Recipe())
     damping = [i for i, p in enumerate(describe(problem.nominal)) if p.group == "damping"]
@@ -232,7 +237,7 @@ def test_validation_trials_alone_determine_the_nominal_model():
     trials = {
         "rate": 200.0,
         "experiments": ["VD.1", "VD.2", "VD.3"],
-        "vd3": {"repeats": 3, "motions": 2, "duration": 8.0, "centre": 0.4, "amplitude": 0.3},
+        "vd3": {"repeats": 2, "motions": 2, "duration": 8.0, "centre": 0.4, "amplitude": 0.3},
     }
     session = simulate(recipe_from({"specimen": {"kind": "polynomial"}, "trials": trials}), seed=1)
     problem = build(session, Recipe())
