@@ -47,8 +47,8 @@ from jaxfinger.model import Model
 # Lengths of a step, in standard deviations of the estimate, that end a search.
 STEP_TOLERANCE = 1e-6  # a millionth of an interval's half width, and still above rounding
 ROUGH_TOLERANCE = 0.02  # where residuals alone are wanted, for their noise: all white ones change by 0.02 in norm
-# Of a rejected step: it lies within a kink of the cost, as where a tendon slips or a joint turns. Also of the whole way
-# that is left when the last of `MAX_STEPS` has been made.
+# Of a rejected step, a twentieth of an interval's half width: it lies within a kink of the cost, as where a tendon
+# slips or a joint turns. Also of the whole way that is left when the last of `MAX_STEPS` has been made.
 KINK_TOLERANCE = 0.1
 MAX_STEPS = 60  # linearisations; it bounds the time of a fit, whose report says when it was reached
 MIN_MASS_SHARE = 0.02  # lower bound of a mass over its starting value: no link is fifty times lighter than CAD says
