@@ -30,7 +30,7 @@ from jaxfinger.gap.parts import (
 )
 from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY, Posterior, posterior
 from jaxfinger.gap.predicted import CheckedPredictions, checked
-from jaxfinger.gap.problem import Problem, build, site
+from jaxfinger.gap.problem import Problem, build, site, without_recurring_noise
 from jaxfinger.gap.result import (
     Diagnosis,
     Key,
@@ -115,13 +115,37 @@ def diagnose(
         quick=quick,
         tolerance=tolerance,
         doubts=tuple(x.sentence for x in doubts),
-        problem=problem,
     )
     if next(measured_columns(problem), None) is None:
-        return _nothing_judged(problem, diagnosis)
+        return _nothing_judged(problem, partial(diagnosis, problem=problem))
 
+    def judged(problem: Problem) -> Diagnosis:
+        candidates = _candidates(problem, catalogue, changed, without)
+        record = partial(diagnosis, problem=problem)
+        return _judged(problem, candidates, record, quick, tolerance, against, progress)
+
+    found = judged(problem)
+    if found.status is Status.NO_GAP and (quieter := without_recurring_noise(problem, against)) is not None:
+        progress("looking for a gap that counted as noise")
+        found = judged(quieter)
+    return found
+
+
+def _judged(
+    problem: Problem,
+    candidates: dict[str, type[CatalogueEffect]],
+    diagnosis: Callable[..., Diagnosis],
+    quick: bool,
+    tolerance: Mapping[str, float],
+    against: Fit | None,
+    progress: Progress,
+) -> Diagnosis:
+    """Search for the causes among the candidates, confirm them, and say what they explain.
+
+    `diagnosis`: makes the record, of the results. The other arguments are those of `diagnose`.
+    """
     # Signatures of the candidates, sets of them, and their probabilities.
-    search, best = search_for_causes(problem, _candidates(problem, catalogue, changed, without), progress)
+    search, best = search_for_causes(problem, candidates, progress)
     baseline, found = search.baseline, posterior(search, best)
     verdict = verdict_of(problem, found, _gaps(problem, baseline, baseline.null, tolerance)[1])
 

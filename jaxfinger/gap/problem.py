@@ -7,7 +7,7 @@ the nominal parameters: the projection removes what they can absorb, which is no
 Lovell). This module makes W r and the whitened Jacobian; `signatures` makes W Δŷ; `projector` projects.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.intervals import stretches
 from jaxfinger.identify.linearise import White
-from jaxfinger.identify.noise import Noise, estimate, history
+from jaxfinger.identify.noise import Noise, estimate, history, without_recurring_laws
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.prior import Prior, prior_of
 from jaxfinger.identify.readings import readings_of
@@ -45,6 +45,7 @@ from jaxfinger.model import Model, Terms, terms_without_effects
 
 MAX_ROUNDS = 8  # of refits to all trials, each with the noise that the one before leaves
 NOISE_CHANGE = 0.2  # relative, of a channel's standard deviation: less changes no interval by as much as a tenth
+Noises = dict[tuple[str, str], Noise]  # by experiment and channel
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Problem:
 
     session: Session
     stacks: dict[str, Stack]
-    noise: dict[tuple[str, str], Noise]
+    noise: Noises
     nominal: Model
     free: np.ndarray  # positions of the free nominal parameters in the flat vector
     rows: dict[str, Rows]
@@ -172,24 +173,45 @@ def build(
     earlier = None if against is None else _start_from(session, against)
     fit = identify(session, recipe, start=earlier, progress=progress, stacks=measured)
     progress("refitting the nominal model to all trials")
-    nominal, solution, noise, sources, free, prior = _refitted_to_all(session, recipe, fit, stacks, against)
-
-    rows = _layouts(stacks, sources)
+    refit = _refitted_to_all(session, fit, stacks, against, _with_missing_noise)
+    rows = _layouts(stacks, refit.sources)
     return Problem(
         session=session,
         stacks=stacks,
-        noise=noise,
-        free=free,
         rows=rows,
-        groups=_groups(stacks, rows, nominal),
-        root=np.asarray(prior.root),
+        groups=_groups(stacks, rows, refit.nominal),
         fit=fit,
-        sources=sources,
-        prior=prior,
-        scales=Scales.of(nominal.finger, [s.batch for s in measured.values()]),
+        scales=Scales.of(refit.nominal.finger, [s.batch for s in measured.values()]),
         simulator=simulator,
-        **_at(nominal, solution.linearised, sources, rows, free, prior),
+        **_refitted_at(refit, rows),
     )
+
+
+def without_recurring_noise(problem: Problem, against: Fit | None = None) -> Problem | None:
+    """The problem with less noise: without the laws of the state that count as noise where no trial repeats a motion.
+
+    None where no noise becomes less by `NOISE_CHANGE`. `against`: as in `build`.
+    """
+
+    def recurring(known: Noises, stacks: dict[str, Stack], model: Model) -> Noises:
+        noise = _with_missing_noise(known, stacks, model)
+        sure = {key: n for key, n in noise.items() if n.source != "residuals"}
+        left = residuals_for_noise(model, stacks, {e: s.experiment.channels for e, s in stacks.items()}, sure)
+        return noise | {(e, c): without_recurring_laws(noise[e, c], stacks[e], c, x) for (e, c), x in left.items()}
+
+    if _settled(problem.noise, recurring(problem.noise, problem.stacks, problem.nominal)):
+        return None
+    refit = _refitted_to_all(problem.session, problem.fit, problem.stacks, against, recurring)
+    rows = _layouts(problem.stacks, refit.sources)
+    groups = _groups(problem.stacks, rows, refit.nominal)
+    return replace(problem, rows=rows, groups=groups, **_refitted_at(refit, rows))
+
+
+def _refitted_at(refit: "_Refit", rows: dict[str, Rows]) -> dict[str, Any]:
+    """Fields of a `Problem` that depend on a refit."""
+    nominal, solution, noise, sources, free, prior = refit
+    at = _at(nominal, solution.linearised, sources, rows, free, prior)
+    return {"noise": noise, "free": free, "root": np.asarray(prior.root), "sources": sources, "prior": prior, **at}
 
 
 class _Refit(NamedTuple):
@@ -197,16 +219,23 @@ class _Refit(NamedTuple):
 
     nominal: Model
     solution: Solution
-    noise: dict[tuple[str, str], Noise]
+    noise: Noises
     sources: dict[str, Source]
     free: np.ndarray
     prior: Prior
 
 
 def _refitted_to_all(
-    session: Session, recipe: Recipe, fit: Fit, stacks: dict[str, Stack], against: Fit | None
+    session: Session,
+    fit: Fit,
+    stacks: dict[str, Stack],
+    against: Fit | None,
+    noise_of: Callable[[Noises, dict[str, Stack], Model], Noises],
 ) -> _Refit:
-    """Refit what the stages have estimated, and what they have not but some trial shows, to all trials together."""
+    """Refit what the stages have estimated, and what they have not but some trial shows, to all trials together.
+
+    `noise_of`: gives the noise of all channels, of the noise known, the trials and a model.
+    """
     parameters, coverage = describe(fit.model), coverage_of(stacks, session)
     # Masses and centres of mass move within the uncertainty that CAD states.
     cad = [i for i, p in enumerate(parameters) if p.group in ("mass", "com") and fit.covariance[i, i] > 0]
@@ -215,10 +244,10 @@ def _refitted_to_all(
 
     def prior_on(free: np.ndarray) -> Prior:
         if against is None:
-            return cad_prior(session, recipe, parameters, free)
+            return cad_prior(session, fit.recipe, parameters, free)
         return prior_of(np.asarray(ravel(against.model)), against.covariance, free)
 
-    nominal, latest, shown = fit.model, _with_missing_noise(fit.noise, stacks, fit.model), free
+    nominal, latest, shown = fit.model, noise_of(fit.noise, stacks, fit.model), free
     for _ in range(MAX_ROUNDS):
         noise, known = latest, shown
         sources = sources_of(stacks, reads, noise, parameters)
@@ -229,7 +258,7 @@ def _refitted_to_all(
         if shown.size == free.size:
             break
         # Residuals held what the added parameters explain, so noise estimated from them was too large.
-        latest = _with_missing_noise(fit.noise, stacks, nominal)
+        latest = noise_of(fit.noise, stacks, nominal)
         if shown.size == known.size and _settled(noise, latest):
             break
     return _Refit(nominal, solution, noise, sources, shown, prior)
@@ -352,13 +381,13 @@ def assemble(
     return np.concatenate(r), np.concatenate(J)
 
 
-def _with_missing_noise(known: dict[tuple[str, str], Noise], stacks: dict[str, Stack], model: Model):
+def _with_missing_noise(known: Noises, stacks: dict[str, Stack], model: Model) -> Noises:
     """Noise of all channels: as known, and estimated from the model's residuals where no stage has read the channel."""
     left = residuals_for_noise(model, stacks, {e: stack.experiment.channels for e, stack in stacks.items()}, known)
     return known | {(e, c): estimate(stacks[e], c, x) for (e, c), x in left.items()}
 
 
-def _settled(before: Mapping[tuple[str, str], Noise], now: Mapping[tuple[str, str], Noise]) -> bool:
+def _settled(before: Noises, now: Noises) -> bool:
     """Whether no standard deviation of noise has changed by more than `NOISE_CHANGE`."""
     return all(np.allclose(n.std, before[key].std, rtol=NOISE_CHANGE, atol=0.0) for key, n in now.items())
 

@@ -6,15 +6,17 @@ them is generalised least squares.
 
 The noise is estimated from the best source that the trials offer. From best to worst these are differences between
 trials that repeat one motion (pure error, which includes the noise of the inputs), the scatter within holds, and the
-residuals of a fit, which may hide part of a gap.
+residuals of a fit, which may hide part of a gap. `without_recurring_laws` takes from these what recurs with the state.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 from scipy.ndimage import uniform_filter1d
+from scipy.spatial.distance import cdist
 
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.data.signals.noise import STD_PER_MAD
@@ -25,7 +27,7 @@ ORDER = 3  # of the autoregression: describes white noise after a low-pass (test
 # more than the second for coefficients a_k of its own, known to 0.03 from 1000 (1/√n).
 MIN_SAMPLES_FOR_STD, MIN_SAMPLES_FOR_COEFFICIENTS = 50, 1000
 MIN_SAMPLES_OF_SOURCE = 100  # of repeats or holds, below which residuals are used; 100 give a standard deviation to 7 %
-MIN_SAMPLES_OF_REPEAT = 20  # common samples of trials that repeat one motion; fewer add little to an autocovariance
+MIN_SAMPLES_OF_REPEAT = 20  # common samples of two trials, or runs, alike; fewer add little to an autocovariance
 MIN_SAMPLES_OF_HOLD = 5  # a hold needs more: a straight line takes two of them
 MIN_HOLDS = 20  # more are needed to scale the noise of holds, whose standard deviation is then known to 16 %
 MAX_LAG = 400  # samples over which the means of holds are correlated: 20 s at the rate of held experiments
@@ -148,6 +150,26 @@ def estimate(
     return _at_least(Noise(std, innovation, ar, source), stack, channel)
 
 
+def without_recurring_laws(
+    noise: Noise, stack: Stack, channel: str, residual: Float[np.ndarray, "columns B T"]
+) -> Noise:
+    """Noise from residuals of a model, or in columns where these are less, differences where the same state recurs.
+
+    A law that the model lacks counts as noise in the first, the more so the quicker it is. In the second a law of the
+    state cancels.
+    """
+    if noise.source != "residuals":
+        return noise
+    mask, demean = np.asarray(stack.batch.mask[channel]) > 0, CHANNELS[channel].free_zero
+    std, innovation, ar = (np.array(x) for x in (noise.std, noise.innovation, noise.ar))
+    for directed in (0.0, 1.0):
+        for c, column in enumerate(_recurring(stack, residual, mask, demean, directed)):
+            size, sigma, a = _autoregression(column)
+            if _count(column) > MIN_SAMPLES_FOR_STD and size < std[c]:
+                std[c], innovation[c], ar[c] = size, sigma, a
+    return _at_least(Noise(std, innovation, ar, noise.source), stack, channel)
+
+
 def _at_least(noise: Noise, stack: Stack, channel: str) -> Noise:
     """Noise, or the error of a coarse converter where that is larger.
 
@@ -248,6 +270,46 @@ def _fast_part(residual, mask, window: int) -> list[Series]:
             lost = float(np.mean(1 / (window * share[counts])))  # of the valid samples in a window
             series[c].append((np.where(counts, e - near / share, 0.0), counts, lost))
     return series
+
+
+def _recurring(stack: Stack, residual, mask, demean: bool, directed: float) -> list[Series]:
+    """Differences between samples of two runs through the same states, scaled to the noise of a single sample.
+
+    Each run is compared with the one whose states are nearest to its own. Samples count whose states are each other's
+    nearest, and which are too far apart in time for the moving average to read both. What depends on the state alone
+    cancels. `directed`: weight of the joints' directions in a state; at 1 they differ more than anything else can.
+    """
+    x, series = stack.batch.x, [[] for _ in range(len(residual))]
+    sizes = [np.asarray(a) for a in (x.q, np.abs(x.qd), x.tension)]
+    scaled = [a / max(np.ptp(a, axis=(1, 2)).max(initial=0.0), 1e-300) for a in sizes]
+    states = np.concatenate([*scaled, directed * x.joint_direction])
+    for c, column in enumerate(series):
+        e = np.array([_centred(r, m, demean) for r, m in zip(residual[c], mask[c], strict=True)])
+        b, t, runs = _runs(mask[c], np.asarray(x.joint_direction))
+        here = states[:, b, t].T
+        for n, run in enumerate(runs):
+            if run.stop - run.start < MIN_SAMPLES_OF_REPEAT or len(runs) < 2:
+                continue
+            distance = cdist(here[run], here)
+            unlike = [np.inf if k == n else np.mean(distance[:, r].min(axis=1) ** 2) for k, r in enumerate(runs)]
+            other = runs[int(np.argmin(unlike))]
+            nearest, back = (np.argmin(distance[:, other], axis=axis) for axis in (1, 0))
+            at = other.start + nearest
+            counts = (b[at] != b[run]) | (np.abs(t[at] - t[run]) > SIGNAL_WINDOW)
+            counts &= back[nearest] == np.arange(len(nearest))
+            if counts.sum() < MIN_SAMPLES_OF_REPEAT:
+                continue
+            difference = (e[b[run], t[run]] - e[b[at], t[at]]) / np.sqrt(2.0)
+            column.append((np.where(counts, difference, 0.0), counts, 0.0))
+    return series
+
+
+def _runs(mask: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[slice]]:
+    """Trial and time of the samples that count, and the runs among them: without a gap, and without a joint's turn."""
+    b, t = np.nonzero(mask)
+    turns = np.any(np.diff(np.sign(direction[:, b, t])) != 0.0, axis=0)
+    first = np.flatnonzero((np.diff(b) != 0) | (np.diff(t) != 1) | turns) + 1
+    return b, t, [slice(i, j) for i, j in itertools.pairwise((0, *first.tolist(), len(b)))]
 
 
 def _autoregression(series: Series) -> tuple[float, float, np.ndarray]:

@@ -1,12 +1,22 @@
 """Noise of a channel, from repeats and from residuals, with columns that have few samples."""
 
+from dataclasses import replace
+
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
 
 from jaxfinger.experiments import EXPERIMENTS, Batch, Stack
-from jaxfinger.identify.noise import LONG_SIGNAL_WINDOW, MIN_SAMPLES_FOR_STD, Noise, estimate, whiten
+from jaxfinger.identify.noise import (
+    LONG_SIGNAL_WINDOW,
+    MIN_SAMPLES_FOR_STD,
+    Noise,
+    estimate,
+    whiten,
+    without_recurring_laws,
+)
 from jaxfinger.model import Motion
 
 SIZES, COUNTS, LENGTH = np.array([1.0, 5.0, 0.2]), (2000, 150, 20), 2400
@@ -106,3 +116,52 @@ def test_a_column_with_few_samples_borrows_the_colour_of_all(estimates):
 
 def test_a_column_that_hardly_counts_borrows_the_size_of_the_channel(estimates):
     assert all(0.2 * SIZES[0] < noise.innovation[2] < SIZES[1] for noise, _ in estimates)
+
+
+def swept(law, seed, passes=4, samples=120):
+    """A trial that sweeps a joint to and fro, with a law of its angle and direction in coloured noise."""
+    forth = np.linspace(-1.0, 1.0, samples)
+    q = np.concatenate([forth * (-1.0) ** k for k in range(passes)])
+    direction = np.repeat((-1.0) ** np.arange(passes), samples)
+    e = coloured(np.random.default_rng(seed), (1, 1))[..., : q.size]
+    residual, mask = e + law(q, direction), np.ones((1, 1, q.size))
+    mask[..., ::samples] = 0.0
+    stack = stack_of(residual, mask, (None,), 0.02)
+    x = eqx.tree_at(lambda x: (x.q, x.joint_direction), stack.batch.x, (q[None, None], direction[None, None]))
+    return replace(stack, trials=("1",), batch=eqx.tree_at(lambda b: b.x, stack.batch, x)), residual, e
+
+
+def recurring(stack, residual):
+    return without_recurring_laws(estimate(stack, "joint_torque", residual), stack, "joint_torque", residual)
+
+
+@pytest.mark.parametrize("cycles", [1, 6])
+@pytest.mark.parametrize("odd", [False, True])
+def test_a_law_that_recurs_within_a_trial_is_no_noise(cycles, odd):
+    """However large it is: the same way of the joint shows it again, and noise of the same state differs."""
+    size, long_run, true = [], [], 1.0 / (1.0 - COLOUR.sum())
+    for seed in range(8):
+
+        def law(q, direction):
+            return 20.0 * np.sin(np.pi * cycles * q + 1.0) * (direction if odd else 1.0)
+
+        stack, residual, e = swept(law, seed)
+        noise = recurring(stack, residual)
+        assert noise.source == "residuals"
+        size.append(noise.std[0] / e.std())
+        long_run.append(noise.innovation[0] / (1.0 - noise.ar[0].sum()) / true)
+    assert np.mean(size) == pytest.approx(1.0, abs=0.1)
+    assert np.mean(long_run) == pytest.approx(1.0, abs=0.3)
+
+
+def test_without_a_law_recurrence_takes_nothing_from_the_noise():
+    """The least of several estimates is less than each, by chance."""
+    ratio = []
+    for seed in range(12):
+        stack, residual, _ = swept(lambda q, _: 0.0 * q, seed)
+        still = eqx.tree_at(lambda x: x.joint_direction, stack.batch.x, np.zeros((1, 1, residual.shape[-1])))
+        alone = replace(stack, batch=eqx.tree_at(lambda b: b.x, stack.batch, still))
+        ratio.append(
+            estimate(stack, "joint_torque", residual).std[0] / estimate(alone, "joint_torque", residual).std[0]
+        )
+    assert 0.97 < np.mean(ratio) <= 1.0
