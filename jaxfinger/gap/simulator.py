@@ -115,7 +115,7 @@ def _measured_noise(stacks: dict[str, Stack], simulated: dict[str, Stack]) -> di
     largest: dict[str, float] = {}
     for stack in stacks.values():
         for c in stack.experiment.channels:
-            largest[c] = max(largest.get(c, 0.0), float(first_noise(stack, c, np.asarray(stack.batch.y[c])).std.max()))
+            largest[c] = max(largest.get(c, 0.0), float(first_noise(stack, c, stack.batch.y[c]).std.max()))
     return {
         (e, c): Noise.white(np.full(len(y), largest[c]), "measured")
         for e, s in simulated.items()

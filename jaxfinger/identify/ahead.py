@@ -67,7 +67,7 @@ def _ends(limits: Float[np.ndarray, "m 2"]) -> tuple[Float[np.ndarray, " m"], Fl
 
 def _trials(model: Model, session: Session, stack: Stack) -> list[Measured]:
     x = model.true_motion(stack.batch.x)
-    return [measured(session[name], stack, b, x) for b, name in enumerate(stack.trials)]
+    return [measured(session, stack, b, x) for b in range(len(stack.trials))]
 
 
 def _errors(model: Model, m: Measured, limits: Float[np.ndarray, "m 2"], rng: np.random.Generator):

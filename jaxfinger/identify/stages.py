@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxfinger.data import Session
 from jaxfinger.data.signals.sizes import sizes_of
@@ -372,13 +372,13 @@ def residuals_for_noise(
     return {(e, c): np.asarray(residuals[e][c]) for e, c in white if (e, c) not in known}
 
 
-def first_noise(stack: Stack, channel: str, residual: Float[np.ndarray, "columns B T"]) -> Noise:
+def first_noise(stack: Stack, channel: str, residual: Float[Array | np.ndarray, "columns B T"]) -> Noise:
     """First guess of a channel's noise: white, as large as the median step of its residuals from sample to sample.
 
     It serves for a first fit, from whose residuals the noise is estimated. Residuals are used since the channel itself
     may be zero throughout, as the torque on a free finger.
     """
-    mask = np.asarray(stack.batch.mask[channel]) > 0
+    residual, mask = np.asarray(residual), np.asarray(stack.batch.mask[channel]) > 0
     step = np.diff(residual, axis=-1)[mask[..., 1:] & mask[..., :-1]]
     size = float(np.median(np.abs(step))) if step.size else 1.0
     return Noise.white(np.full(len(residual), max(size, MIN_STD)), "first guess")

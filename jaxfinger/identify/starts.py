@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.data import Trial, filtered_noise_std, low_pass, smooth
+from jaxfinger.data import Session, filtered_noise_std, low_pass, smooth
 from jaxfinger.data.signals.noise import STD_PER_MAD
-from jaxfinger.experiments import Stack
+from jaxfinger.data.signals.sizes import sizes_of
+from jaxfinger.experiments import EXPERIMENTS, Stack
 from jaxfinger.experiments.table import highest_cutoff
 from jaxfinger.identify.predictions import MAX_TIME_STEP
 from jaxfinger.model import Motion
@@ -34,7 +35,7 @@ class Measured(NamedTuple):
     pace: float  # duration of its motions over that of the protocol's
     q_std: Float[np.ndarray, "m 1"]  # rad, noise of q after the filter
     qd_std: Float[np.ndarray, "m 1"]  # rad/s, likewise of q̇
-    tension_noise: Float[np.ndarray, "n T"]  # N, the part of the tension above the experiment's cut-off
+    tension_noise: Float[np.ndarray, "n T"]  # N: the tension above the experiment's cut-off, `slow_noise` below it
 
     @property
     def horizons(self) -> tuple[float, ...]:
@@ -47,8 +48,9 @@ class Measured(NamedTuple):
         return MAX_TIME_STEP * self.pace
 
 
-def measured(trial: Trial, stack: Stack, b: int, x: Motion) -> Measured:
+def measured(session: Session, stack: Stack, b: int, x: Motion) -> Measured:
     """Resample trial number `b` of a full-rate stack of VD.3, whose motion is `x`, at even instants."""
+    trial = session[stack.trials[b]]
     time, N = np.asarray(trial.time), len(trial.time)
     step = float(np.median(np.diff(time)))
     even = np.arange(int(np.floor((time[-1] - time[0]) / step)) + 1) * step
@@ -62,7 +64,8 @@ def measured(trial: Trial, stack: Stack, b: int, x: Motion) -> Measured:
 
     encoder = np.std(np.asarray(trial.q) - smooth(time, trial.q, cutoff)[0], axis=0)
     value, rate = (encoder * filtered_noise_std(cutoff, step, k) for k in (0, 1))
-    rest = tension - low_pass(time, tension, stack.experiment.cutoff_at(step))
+    slowest = stack.experiment.cutoff_at(step)
+    rest = tension - low_pass(time, tension, slowest)
     most = 4.0 * STD_PER_MAD * np.median(np.abs(rest), axis=0)
     noise = resampled(np.clip(rest, -most, most))  # jumps of the tension itself are not noise
     start = float(np.asarray(x.session_time - x.time)[b, 0])
@@ -75,8 +78,26 @@ def measured(trial: Trial, stack: Stack, b: int, x: Motion) -> Measured:
         stack.experiment.pace,
         value[:, None],
         rate[:, None],
-        noise,
+        noise + slow_noise(session, slowest, even),
     )
+
+
+def slow_noise(session: Session, cutoff: float, time: Float[np.ndarray, " T"]) -> Float[np.ndarray, "n T"]:
+    """Noise of the load cells below `cutoff`, Hz, in N: what slack tendons read (ID.3), at even instants `time`, s.
+
+    Zero for tendons of which no trial shows it. A constant reading is the error of a tare, and no noise.
+    """
+    slack, step = sizes_of(session).slack, time[1] - time[0]
+    readings: list[list[np.ndarray]] = [[] for _ in range(session.finger.n)]
+    for trial in session:
+        if trial.tendon_force is None or not EXPERIMENTS[trial.experiment].slack:
+            continue
+        at = np.arange(trial.time[0], trial.time[-1], step)
+        for of_tendon, force in zip(readings, trial.tendon_force.T, strict=True):
+            if np.percentile(np.abs(force), 95) < slack:  # false where it was not measured
+                slow = low_pass(trial.time, force[:, None] - force.mean(), cutoff)[:, 0]
+                of_tendon.append(np.interp(at, trial.time, slow))
+    return np.stack([np.resize(np.concatenate(x), time.size) if x else np.zeros(time.size) for x in readings])
 
 
 def starts(

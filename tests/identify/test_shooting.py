@@ -19,7 +19,7 @@ from jaxfinger.identify.shooting import AHEAD, shooting
 from jaxfinger.identify.stages import first_noise, sources_of
 from jaxfinger.identify.starts import starts
 from jaxfinger.model import Motion, external_torque, simulate, simulated_ahead
-from jaxfinger.synthetic import recipe_from
+from jaxfinger.synthetic import recipe_from, specimen_of, true_model
 from jaxfinger.synthetic import simulate as simulated
 
 from .conftest import RECIPE
@@ -53,6 +53,23 @@ def test_a_prediction_is_the_simulation_from_its_start(short, staged):
         staged.model, jnp.asarray(time), x.tension_ahead[:, :, b, k].T, x.q[:, b, k], x.qd[:, b, k], substeps=1
     )
     np.testing.assert_allclose(simulated_ahead(staged.model, x)[:, b, k], q[:, -1], atol=1e-12)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("correlation_time", [0.03, 0.1])
+def test_coloured_noise_of_load_cells_is_part_of_what_predictions_may_miss(correlation_time):
+    """The true model misses nothing else. Slack tendons show the noise that no filter parts from the tension."""
+    ratios = []
+    for seed in range(3):
+        trials = RECIPE["trials"] | {"experiments": ["ID.3-static", "VD.3"], "vd3": {"duration": 3.0, "rate": 500.0}}
+        cell = {"std": 0.05, "resolution": 0.01, "coloured": 0.8, "correlation_time": correlation_time}
+        recipe = recipe_from(RECIPE | {"trials": trials, "sensors": RECIPE["sensors"] | {"tendon_force": cell}})
+        session = simulated(recipe, seed=seed)
+        whole = prepare(session, [t.name for t in session if t.experiment == "VD.3"], reduced=False)["VD.3"]
+        found = ahead(true_model(specimen_of(recipe.specimen)), session, whole)
+        ratios.append([np.sqrt(np.nanmean(a.error**2)) / np.sqrt(np.mean(a.noise**2)) for a in found])
+    assert (np.mean(ratios, axis=0) > 0.5).all()
+    assert (np.mean(ratios, axis=0) < 1.5).all()
 
 
 @pytest.mark.long
