@@ -34,12 +34,14 @@ def reduce(r: PreparedTrial) -> Row:
     at = r.whole(hold)
     known, led = (r.mean(a.astype(float)) > 1.0 - 1e-9 for a in (slides, approached))  # all samples of the block
     counting = dict.fromkeys(r.y, ((at >= 0)[:, None] & led) | known)
-    y, reach = r.y, round(FAR_WIDTHS * filter_std(j.cutoff) / r.step) if r.reduced else 0
+    reach = round(FAR_WIDTHS * filter_std(j.cutoff) / r.step) if r.reduced else 0
     rests = minimum_filter1d(hold >= 0, 2 * reach + 1)[:, None]
-    qd, qdd = (np.where(rests, 0.0, a) for a in (j.qd, less_noise(r, j)))
-    if r.reduced:
+    qd, qdd, y = np.where(rests, 0.0, j.qd), less_noise(r, j), r.y
+    if r.reduced:  # q̈ keeps its noise in holds, since a channel has one noise in all of its samples
         joint, *filtered = (low_pass(r.trial.time, a, j.cutoff) for a in (joint, *y.values()))
         y = dict(zip(y, filtered, strict=True))
+    else:
+        qdd = np.where(rests, 0.0, qdd)
     return row(
         r,
         _at_rest(r.mean(j.q if r.reduced else r.trial.q), at),
