@@ -17,6 +17,8 @@ from jaxfinger.experiments import Stack, padded_size
 from jaxfinger.identify.starts import Measured, angles, measured, starts
 from jaxfinger.model import Model, simulated_from
 
+FAR = 1e3  # rad or m: an angle beyond has diverged, and its square may overflow
+
 
 @dataclass(frozen=True)
 class Ahead:
@@ -92,8 +94,7 @@ def _changed(
     W = time.size
     padded = time[np.minimum(np.arange(padded_size(W, 2)), W - 1)]  # pad to a common shape with the last start
     two = (np.asarray(_simulate(model, starts(m, padded, horizon, noise)))[..., :W] for noise in (None, rng))
-    # A simulation that overflows counts as far out of range.
-    exact, noisy = (np.nan_to_num(q, nan=1e3, posinf=1e3, neginf=-1e3) for q in two)
+    exact, noisy = (np.clip(np.nan_to_num(q, nan=FAR), -FAR, FAR) for q in two)
     return exact, noisy - exact
 
 
