@@ -37,7 +37,8 @@ def reduce(r: PreparedTrial) -> Row:
     reach = round(FAR_WIDTHS * filter_std(j.cutoff) / r.step) if r.reduced else 0
     rests = minimum_filter1d(hold >= 0, 2 * reach + 1)[:, None]
     qd, qdd, y = np.where(rests, 0.0, j.qd), less_noise(r, j), r.y
-    if r.reduced:  # q̈ keeps its noise in holds, since a channel has one noise in all of its samples
+    if r.reduced:
+        # q̈ keeps its noise in holds, where it is zero, since one noise stands for all samples of a channel.
         joint, *filtered = (low_pass(r.trial.time, a, j.cutoff) for a in (joint, *y.values()))
         y = dict(zip(y, filtered, strict=True))
     else:

@@ -286,7 +286,8 @@ def fit_at_nominal(
 
     here = point(effects, changes, slopes * factors[:, None])
     if not all(c.amplitude for c in coordinates):
-        # Without them the evidence of a fit that starts at its optimum is off by nats where a law has kinks.
+        # A fit that starts at its optimum makes no step. With the first, long differences of a law with kinks its
+        # evidence would be off by nats.
         here = point(effects, *_evaluate(signatures, effects, coordinates, step(here)[1]))
     for _ in range(MAX_STEPS):
         new = gauss_newton(here)

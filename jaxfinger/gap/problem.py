@@ -7,10 +7,10 @@ the nominal parameters: the projection removes what they can absorb, which is no
 Lovell). This module makes W r and the whitened Jacobian; `signatures` makes W Δŷ; `projector` projects.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -30,7 +30,7 @@ from jaxfinger.identify.noise import Noise, estimate, history, without_recurring
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.prior import Prior, prior_of
 from jaxfinger.identify.readings import readings_of
-from jaxfinger.identify.solve import Solution, Source, solve, white_tangents
+from jaxfinger.identify.solve import Source, solve, white_tangents
 from jaxfinger.identify.stages import (
     Progress,
     cad_prior,
@@ -173,56 +173,25 @@ def build(
     earlier = None if against is None else _start_from(session, against)
     fit = identify(session, recipe, start=earlier, progress=progress, stacks=measured)
     progress("refitting the nominal model to all trials")
-    refit = _refitted_to_all(session, fit, stacks, against, _with_missing_noise)
-    rows = _layouts(stacks, refit.sources)
     return Problem(
         session=session,
         stacks=stacks,
-        rows=rows,
-        groups=_groups(stacks, rows, refit.nominal),
         fit=fit,
-        scales=Scales.of(refit.nominal.finger, [s.batch for s in measured.values()]),
+        scales=Scales.of(fit.model.finger, [s.batch for s in measured.values()]),
         simulator=simulator,
-        **_refitted_at(refit, rows),
+        **_refitted_to_all(session, fit, stacks, against),
     )
 
 
 def without_recurring_noise(problem: Problem, against: Fit | None = None) -> Problem | None:
-    """The problem with less noise: without the laws of the state that count as noise where no trial repeats a motion.
+    """The problem with the noise of passes through the same states, where no trial repeats a motion.
 
-    None where no noise becomes less by `NOISE_CHANGE`. `against`: as in `build`.
+    The noise of such trials is otherwise that of residuals, in which a quick law of the state counts as noise. None
+    where no standard deviation becomes less by the share `NOISE_CHANGE`. `against`: as in `build`.
     """
-
-    def recurring(known: Noises, stacks: dict[str, Stack], model: Model) -> Noises:
-        noise = _with_missing_noise(known, stacks, model)
-        sure = {key: n for key, n in noise.items() if n.source != "residuals"}
-        left = residuals_for_noise(model, stacks, {e: s.experiment.channels for e, s in stacks.items()}, sure)
-        return noise | {(e, c): without_recurring_laws(noise[e, c], stacks[e], c, x) for (e, c), x in left.items()}
-
-    if _settled(problem.noise, recurring(problem.noise, problem.stacks, problem.nominal)):
+    if _settled(problem.noise, _noise_of_all(problem.noise, problem.stacks, problem.nominal, recurring=True)):
         return None
-    refit = _refitted_to_all(problem.session, problem.fit, problem.stacks, against, recurring)
-    rows = _layouts(problem.stacks, refit.sources)
-    groups = _groups(problem.stacks, rows, refit.nominal)
-    return replace(problem, rows=rows, groups=groups, **_refitted_at(refit, rows))
-
-
-def _refitted_at(refit: "_Refit", rows: dict[str, Rows]) -> dict[str, Any]:
-    """Fields of a `Problem` that depend on a refit."""
-    nominal, solution, noise, sources, free, prior = refit
-    at = _at(nominal, solution.linearised, sources, rows, free, prior)
-    return {"noise": noise, "free": free, "root": np.asarray(prior.root), "sources": sources, "prior": prior, **at}
-
-
-class _Refit(NamedTuple):
-    """The nominal model refitted to all trials."""
-
-    nominal: Model
-    solution: Solution
-    noise: Noises
-    sources: dict[str, Source]
-    free: np.ndarray
-    prior: Prior
+    return replace(problem, **_refitted_to_all(problem.session, problem.fit, problem.stacks, against, recurring=True))
 
 
 def _refitted_to_all(
@@ -230,11 +199,11 @@ def _refitted_to_all(
     fit: Fit,
     stacks: dict[str, Stack],
     against: Fit | None,
-    noise_of: Callable[[Noises, dict[str, Stack], Model], Noises],
-) -> _Refit:
+    recurring: bool = False,
+) -> dict[str, Any]:
     """Refit what the stages have estimated, and what they have not but some trial shows, to all trials together.
 
-    `noise_of`: gives the noise of all channels, of the noise known, the trials and a model.
+    `recurring`: as in `_noise_of_all`. Returns the fields of a `Problem` that follow from the refit.
     """
     parameters, coverage = describe(fit.model), coverage_of(stacks, session)
     # Masses and centres of mass move within the uncertainty that CAD states.
@@ -247,7 +216,7 @@ def _refitted_to_all(
             return cad_prior(session, fit.recipe, parameters, free)
         return prior_of(np.asarray(ravel(against.model)), against.covariance, free)
 
-    nominal, latest, shown = fit.model, noise_of(fit.noise, stacks, fit.model), free
+    nominal, latest, shown = fit.model, _noise_of_all(fit.noise, stacks, fit.model, recurring), free
     for _ in range(MAX_ROUNDS):
         noise, known = latest, shown
         sources = sources_of(stacks, reads, noise, parameters)
@@ -258,10 +227,20 @@ def _refitted_to_all(
         if shown.size == free.size:
             break
         # Residuals held what the added parameters explain, so noise estimated from them was too large.
-        latest = noise_of(fit.noise, stacks, nominal)
+        latest = _noise_of_all(fit.noise, stacks, nominal, recurring)
         if shown.size == known.size and _settled(noise, latest):
             break
-    return _Refit(nominal, solution, noise, sources, shown, prior)
+    rows = _layouts(stacks, sources)
+    return {
+        "noise": noise,
+        "free": shown,
+        "rows": rows,
+        "groups": _groups(stacks, rows, nominal),
+        "root": np.asarray(prior.root),
+        "sources": sources,
+        "prior": prior,
+        **_at(nominal, solution.linearised, sources, rows, shown, prior),
+    }
 
 
 def _start_from(session: Session, against: Fit) -> Fit:
@@ -381,10 +360,17 @@ def assemble(
     return np.concatenate(r), np.concatenate(J)
 
 
-def _with_missing_noise(known: Noises, stacks: dict[str, Stack], model: Model) -> Noises:
-    """Noise of all channels: as known, and estimated from the model's residuals where no stage has read the channel."""
-    left = residuals_for_noise(model, stacks, {e: stack.experiment.channels for e, stack in stacks.items()}, known)
-    return known | {(e, c): estimate(stacks[e], c, x) for (e, c), x in left.items()}
+def _noise_of_all(known: Noises, stacks: dict[str, Stack], model: Model, recurring: bool) -> Noises:
+    """Noise of all channels: as known, and estimated from the model's residuals where no stage has read the channel.
+
+    `recurring`: what comes from residuals is without the laws that recur with the state.
+    """
+    sure = {key: n for key, n in known.items() if not (recurring and n.source == "residuals")}
+    left = residuals_for_noise(model, stacks, {e: stack.experiment.channels for e, stack in stacks.items()}, sure)
+    noise = known | {(e, c): estimate(stacks[e], c, x) for (e, c), x in left.items() if (e, c) not in known}
+    if recurring:
+        noise |= {(e, c): without_recurring_laws(noise[e, c], stacks[e], c, x) for (e, c), x in left.items()}
+    return noise
 
 
 def _settled(before: Noises, now: Noises) -> bool:

@@ -67,9 +67,9 @@ def _ends(limits: Float[np.ndarray, "m 2"]) -> tuple[Float[np.ndarray, " m"], Fl
     return low - half, high + half
 
 
-def _trials(model: Model, session: Session, stack: Stack) -> list[Measured]:
+def _trials(model: Model, session: Session, stack: Stack) -> tuple[Measured, ...]:
     x = model.true_motion(stack.batch.x)
-    return [measured(session, stack, b, x) for b in range(len(stack.trials))]
+    return measured(session, stack, x)
 
 
 def _errors(model: Model, m: Measured, limits: Float[np.ndarray, "m 2"], rng: np.random.Generator):

@@ -275,9 +275,9 @@ def _fast_part(residual, mask, window: int) -> list[Series]:
 def _recurring(stack: Stack, residual, mask, demean: bool, directed: float) -> list[Series]:
     """Differences between samples of two runs through the same states, scaled to the noise of a single sample.
 
-    Each run is compared with the one whose states are nearest to its own. Samples count whose states are each other's
-    nearest, and which are too far apart in time for the moving average to read both. What depends on the state alone
-    cancels. `directed`: weight of the joints' directions in a state; at 1 they differ more than anything else can.
+    Each run is compared with the one whose states are nearest to a few of its own. Samples count whose states are each
+    other's nearest, and which are too far apart in time for the moving average to read both. What depends on the state
+    alone cancels. `directed`: weight of the joints' directions in a state; at 1 they differ more than all else can.
     """
     x, series = stack.batch.x, [[] for _ in range(len(residual))]
     sizes = [np.asarray(a) for a in (x.q, np.abs(x.qd), x.tension)]
@@ -290,10 +290,13 @@ def _recurring(stack: Stack, residual, mask, demean: bool, directed: float) -> l
         for n, run in enumerate(runs):
             if run.stop - run.start < MIN_SAMPLES_OF_REPEAT or len(runs) < 2:
                 continue
-            distance = cdist(here[run], here)
-            unlike = [np.inf if k == n else np.mean(distance[:, r].min(axis=1) ** 2) for k, r in enumerate(runs)]
+            probes = here[np.linspace(run.start, run.stop - 1, MIN_SAMPLES_OF_REPEAT).astype(int)]
+            nearest_in_runs = np.minimum.reduceat(cdist(probes, here), [r.start for r in runs], axis=1)
+            unlike = np.mean(nearest_in_runs**2, axis=0)
+            unlike[n] = np.inf
             other = runs[int(np.argmin(unlike))]
-            nearest, back = (np.argmin(distance[:, other], axis=axis) for axis in (1, 0))
+            distance = cdist(here[run], here[other])
+            nearest, back = (np.argmin(distance, axis=axis) for axis in (1, 0))
             at = other.start + nearest
             counts = (b[at] != b[run]) | (np.abs(t[at] - t[run]) > SIGNAL_WINDOW)
             counts &= back[nearest] == np.arange(len(nearest))

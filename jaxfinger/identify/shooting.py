@@ -80,7 +80,7 @@ def shooting(session: Session) -> Shooting:
         raise UserError(f"{file}: has no VD.3 trial that tendons drive; refine without --ahead")
     whole = prepare(session, names, reduced=False)["VD.3"]
     horizon = HORIZON * whole.experiment.pace
-    trials = tuple(measured(session, whole, b, whole.batch.x) for b in range(len(whole.trials)))
+    trials = measured(session, whole, whole.batch.x)
     short = [name for name, m in zip(whole.trials, trials, strict=True) if m.time[-1] <= horizon]
     if short:
         raise UserError(f"{file}: trial {short[0]} is shorter than {horizon:g} s; leave it out")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.data import Session, filtered_noise_std, low_pass, smooth
+from jaxfinger.data import Session, Trial, filtered_noise_std, low_pass, smooth, without_spikes
 from jaxfinger.data.signals.noise import STD_PER_MAD
 from jaxfinger.data.signals.sizes import sizes_of
 from jaxfinger.experiments import EXPERIMENTS, Stack
@@ -48,9 +48,13 @@ class Measured(NamedTuple):
         return MAX_TIME_STEP * self.pace
 
 
-def measured(session: Session, stack: Stack, b: int, x: Motion) -> Measured:
-    """Resample trial number `b` of a full-rate stack of VD.3, whose motion is `x`, at even instants."""
-    trial = session[stack.trials[b]]
+def measured(session: Session, stack: Stack, x: Motion) -> tuple[Measured, ...]:
+    """Resample the trials of a full-rate stack of VD.3, whose motion is `x`, at even instants."""
+    slow = slow_noise(session, stack.experiment.cutoff_at(stack.dt), stack.dt)
+    return tuple(_measured(session[name], stack, b, x, slow) for b, name in enumerate(stack.trials))
+
+
+def _measured(trial: Trial, stack: Stack, b: int, x: Motion, slow: list[Float[np.ndarray, " _"]]) -> Measured:
     time, N = np.asarray(trial.time), len(trial.time)
     step = float(np.median(np.diff(time)))
     even = np.arange(int(np.floor((time[-1] - time[0]) / step)) + 1) * step
@@ -64,8 +68,7 @@ def measured(session: Session, stack: Stack, b: int, x: Motion) -> Measured:
 
     encoder = np.std(np.asarray(trial.q) - smooth(time, trial.q, cutoff)[0], axis=0)
     value, rate = (encoder * filtered_noise_std(cutoff, step, k) for k in (0, 1))
-    slowest = stack.experiment.cutoff_at(step)
-    rest = tension - low_pass(time, tension, slowest)
+    rest = tension - low_pass(time, tension, stack.experiment.cutoff_at(step))
     most = 4.0 * STD_PER_MAD * np.median(np.abs(rest), axis=0)
     noise = resampled(np.clip(rest, -most, most))  # jumps of the tension itself are not noise
     start = float(np.asarray(x.session_time - x.time)[b, 0])
@@ -78,26 +81,27 @@ def measured(session: Session, stack: Stack, b: int, x: Motion) -> Measured:
         stack.experiment.pace,
         value[:, None],
         rate[:, None],
-        noise + slow_noise(session, slowest, even),
+        noise + np.stack([np.resize(column, even.size) for column in slow]),
     )
 
 
-def slow_noise(session: Session, cutoff: float, time: Float[np.ndarray, " T"]) -> Float[np.ndarray, "n T"]:
-    """Noise of the load cells below `cutoff`, Hz, in N: what slack tendons read (ID.3), at even instants `time`, s.
+def slow_noise(session: Session, cutoff: float, step: float) -> list[Float[np.ndarray, " _"]]:
+    """Noise of each load cell below `cutoff`, Hz, in N, every `step` s: what slack tendons read (ID.3).
 
-    Zero for tendons of which no trial shows it. A constant reading is the error of a tare, and no noise.
+    It is as long as these trials are, and zero for a tendon of which none shows it. A constant reading is the error of
+    a tare, and no noise.
     """
-    slack, step = sizes_of(session).slack, time[1] - time[0]
-    readings: list[list[np.ndarray]] = [[] for _ in range(session.finger.n)]
+    slack, readings = sizes_of(session).slack, [[np.zeros(0)] for _ in range(session.finger.n)]
     for trial in session:
         if trial.tendon_force is None or not EXPERIMENTS[trial.experiment].slack:
             continue
         at = np.arange(trial.time[0], trial.time[-1], step)
-        for of_tendon, force in zip(readings, trial.tendon_force.T, strict=True):
-            if np.percentile(np.abs(force), 95) < slack:  # false where it was not measured
-                slow = low_pass(trial.time, force[:, None] - force.mean(), cutoff)[:, 0]
-                of_tendon.append(np.interp(at, trial.time, slow))
-    return np.stack([np.resize(np.concatenate(x), time.size) if x else np.zeros(time.size) for x in readings])
+        reads = np.percentile(np.abs(trial.tendon_force), 95, axis=0) < slack  # false where it was not measured
+        force = without_spikes(trial.tendon_force[:, reads])
+        slow = low_pass(trial.time, force - force.mean(axis=0), cutoff)
+        for k, column in zip(np.flatnonzero(reads), slow.T, strict=True):
+            readings[k].append(np.interp(at, trial.time, column))
+    return [np.concatenate(x) for x in readings]
 
 
 def starts(

@@ -30,13 +30,14 @@ CROSSOVER = 0.7
 # Of the plan's pull: tension at the joints, so that no tendon falls slack. At the actuator it is at least half of that.
 # The paper's finger, whose DIP has no flexor, can hold 0.15 at most.
 MIN_SHARE = 0.1
-# Times the dead zone of a tendon's friction: the other lower bound of the tension at the joints. What a tendon loses
-# within that zone does not depend on a₀ and a₁, which a recording is to show.
+# Times the dead zone of a tendon's friction: the other lower bound of the tension at the joints. Half of it at the
+# actuator is still outside of that zone, in which the loss shows neither a₀ nor a₁.
 MIN_TO_DEAD = 3.0
 # Of a joint's fastest planned motion: below it the feed-forward of friction fades, so that tension does not jump at a
 # reversal.
 FADE_SHARE = 0.1
-# Error of the torques, over their arms, that a tension may cost, in N per N. It keeps antagonists from pulling in vain.
+# ε, beside moment arms that are scaled to about one. It keeps antagonists from pulling in vain, and the feedback of
+# joints that no tendon crosses defined. The torques, over their arms, are off by ε N per N of tension at most.
 RIDGE = 1e-4
 
 

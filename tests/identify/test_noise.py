@@ -155,13 +155,9 @@ def test_a_law_that_recurs_within_a_trial_is_no_noise(cycles, odd):
 
 
 def test_without_a_law_recurrence_takes_nothing_from_the_noise():
-    """The least of several estimates is less than each, by chance."""
+    """The least of three estimates is a little less than each, by chance."""
     ratio = []
     for seed in range(12):
         stack, residual, _ = swept(lambda q, _: 0.0 * q, seed)
-        still = eqx.tree_at(lambda x: x.joint_direction, stack.batch.x, np.zeros((1, 1, residual.shape[-1])))
-        alone = replace(stack, batch=eqx.tree_at(lambda b: b.x, stack.batch, still))
-        ratio.append(
-            estimate(stack, "joint_torque", residual).std[0] / estimate(alone, "joint_torque", residual).std[0]
-        )
-    assert 0.97 < np.mean(ratio) <= 1.0
+        ratio.append(recurring(stack, residual).std[0] / estimate(stack, "joint_torque", residual).std[0])
+    assert 0.9 < np.mean(ratio) <= 1.0
