@@ -23,7 +23,10 @@ from jaxfinger.experiments.reduction import Joints, PreparedTrial, Row, joints, 
 from jaxfinger.experiments.shrink import shrink
 from jaxfinger.experiments.table import highest_cutoff
 
-NONE_VALID = "nowhere do a joint and its tendons slide for long enough that the direction of their friction is known"
+NONE_VALID = (
+    "nowhere do a joint and its tendons slide for long enough that the direction of their friction is known, with "
+    "tensions that are clear of its dead zone"
+)
 
 # A joint or tendon slides for certain above these speeds; below, it may stick and its friction is unknown. The noise of
 # a speed is a median (`data.signals.motion.speed_noise`), two thirds of a standard deviation.

@@ -29,7 +29,7 @@ from jaxfinger.identify.linearise import White
 from jaxfinger.identify.noise import Noise, estimate, history, without_recurring_laws
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.prior import Prior, prior_of
-from jaxfinger.identify.readings import readings_of
+from jaxfinger.identify.readings import clear_of_dead_zones, readings_of
 from jaxfinger.identify.solve import Source, solve, white_tangents
 from jaxfinger.identify.stages import (
     Progress,
@@ -172,6 +172,7 @@ def build(
         simulator, recipe, stacks = emulate(session, recipe, stacks, predictions, coarse)
     earlier = None if against is None else _start_from(session, against)
     fit = identify(session, recipe, start=earlier, progress=progress, stacks=measured)
+    stacks = clear_of_dead_zones(stacks, fit.model, session)
     progress("refitting the nominal model to all trials")
     return Problem(
         session=session,

@@ -66,7 +66,8 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
     model = start = model_for(fit, session)
     starts = shooting(session) if ahead else None
     progress("reading the recordings")
-    stacks = readings_of(session, [t.name for t in session if t.experiment in recipe.fit.joint_experiments])
+    names = [t.name for t in session if t.experiment in recipe.fit.joint_experiments]
+    stacks = readings_of(session, names, model=model)
     reads = {e: joint_channels(e) for e in stacks}
     if not reads:
         raise UserError(

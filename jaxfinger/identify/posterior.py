@@ -56,7 +56,7 @@ def sampled_posterior(
         raise UserError("a staged fit is not the optimum of one posterior; refine it first")
     compressed = compress(session, fit)
     ((reads, _),) = plan_of(session, fit)
-    stacks = readings_of(session, [t.name for t in session if t.experiment in reads])
+    stacks = readings_of(session, [t.name for t in session if t.experiment in reads], model=fit.model)
     reads = {e: c for e, c in reads.items() if e in stacks}
     basis, start, prior = jnp.asarray(compressed.basis), ravel(fit.model), compressed.grams.H[-1]
     sources = [

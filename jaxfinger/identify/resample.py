@@ -64,7 +64,7 @@ def compress(session: Session, fit: Fit) -> Compressed:
     parameters = describe(fit.model)
     plan = plan_of(session, fit)
     names = [t.name for t in session if any(t.experiment in reads for reads, _ in plan)]
-    stacks = readings_of(session, names)
+    stacks = readings_of(session, names, model=fit.model)
     plan = [({e: c for e, c in reads.items() if e in stacks}, free) for reads, free in plan]
     everything = {e: c for reads, _ in plan for e, c in reads.items()}
     sources = sources_of(stacks, everything, fit.noise, parameters)

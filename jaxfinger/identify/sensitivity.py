@@ -99,7 +99,8 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
         raise UserError(f"sensitivity to {sorted(unknown)}: it takes some of {list(KINDS)}")
     model_for(fit, session)  # raises for a session of another finger
     parameters, plan = describe(fit.model), plan_of(session, fit)
-    stacks = readings_of(session, [t.name for t in session if any(t.experiment in reads for reads, _ in plan)])
+    names = [t.name for t in session if any(t.experiment in reads for reads, _ in plan)]
+    stacks = readings_of(session, names, model=fit.model)
     plan = [({e: c for e, c in reads.items() if e in stacks}, free) for reads, free in plan]
     reads = {e: c for r, _ in plan for e, c in r.items()}
     if not reads:
