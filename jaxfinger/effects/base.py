@@ -25,8 +25,13 @@ class Amplitude:
     units: str  # for revolute joints
     size: float  # of an effect worth naming, in units of the scale `of`
     of: str  # a product of `Scales`
-    signed: bool
-    most: float  # upper bound: 1 for a share
+    signed: bool  # whether it may be negative
+    most: float  # of its magnitude: 1 for a share
+
+    @property
+    def least(self) -> float:
+        """Lower bound."""
+        return -self.most if self.signed else 0.0
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,7 @@ class Shape:
 def amplitude(units: str, size: float, of: str = "1", *, signed: bool = False, most: float = np.inf) -> Any:
     """Declare a field that is an amplitude: `amplitude("N m", 0.1, "torque")` expects a tenth of the joint's torque.
 
-    Its lower bound is zero unless `signed`, its upper bound `most`.
+    Its magnitude is at most `most`. It is not negative unless `signed`.
 
     Raises:
         ValueError: `size` is not positive, or `of` is no product of scales.
@@ -207,10 +212,10 @@ class CatalogueEffect(Effect):
     def bounds(self, scales: Scales) -> dict[str, tuple[float, float]]:
         """Lower and upper bound of every parameter that a refit moves, in its own unit.
 
-        Amplitudes without a sign start at zero, and shares end at their upper limit. A shape that moves by factors may
+        Amplitudes end at the largest magnitude, those without a sign at zero. A shape that moves by factors may
         leave the range of values to try by a factor of two; one that moves by differences stays within it.
         """
-        ends = {n: (-np.inf if p.signed else 0.0, p.most) for n, p in self.amplitudes().items()}
+        ends = {n: (p.least, p.most) for n, p in self.amplitudes().items()}
         for n, values in self.worth_trying(scales, self.site).items():
             moves = self.shape_parameters()[n].moves
             if moves != "not" and len(values) > 1:

@@ -108,7 +108,10 @@ class EncoderOffset(_Encoder):
 
 
 class EncoderEccentricity(_Encoder):
-    """q_measured = q + A sin q + B cos q: once-per-turn error of an off-axis magnet."""
+    """q_measured = q + A sin q + B cos q: once-per-turn error of an off-axis magnet.
+
+    The law holds to first order in A and B, about the magnet's offset over its radius; beyond a half it says nothing.
+    """
 
     ID: ClassVar = "encoder_eccentricity"
     PLACE: ClassVar = "joint"
@@ -116,8 +119,8 @@ class EncoderEccentricity(_Encoder):
     LOOKS: ClassVar = "Excursion and torque are off by a sine of the angle."
     CHANGE: ClassVar = "Centre the magnet, or subtract this sine from the angle."
 
-    A: Float[Array, ""] = amplitude("rad", 0.01, "angle", signed=True)
-    B: Float[Array, ""] = amplitude("rad", 0.01, "angle", signed=True)
+    A: Float[Array, ""] = amplitude("rad", 0.01, "angle", signed=True, most=0.5)
+    B: Float[Array, ""] = amplitude("rad", 0.01, "angle", signed=True, most=0.5)
 
     def error(self, q):
         return self.A * jnp.sin(q) + self.B * jnp.cos(q)

@@ -139,10 +139,10 @@ def _on_effects(change: Callable[[CatalogueEffect], CatalogueEffect], model: Mod
 def _moving(effect: CatalogueEffect) -> CatalogueEffect:
     """Mark with 1 the parameters that a refit moves, with 0 the others.
 
-    Fixed are choices (form, side, place) and shares at their upper limit.
+    Fixed are choices (form, side, place) and amplitudes of the largest magnitude.
     """
     stays = {n for n, p in effect.shape_parameters().items() if p.moves == "not" or len(p.values) == 1}
-    stays |= {n for n, p in effect.amplitudes().items() if float(getattr(effect, n)) >= p.most}
+    stays |= {n for n, p in effect.amplitudes().items() if abs(float(getattr(effect, n))) >= p.most}
     return replace(effect, **{n: jnp.asarray(n not in stays, dtype=float) for n in effect.values()})
 
 

@@ -174,8 +174,8 @@ def _visibility(baseline: Baseline, project: Projector, Z: ByColumn) -> Visibili
 
 def _bounds(v: Variant, name: str, unit: float) -> tuple[float, float]:
     """Bounds of an amplitude, in prior standard deviations."""
-    amplitude = v.effect.amplitudes()[name]
-    return -np.inf if amplitude.signed else 0.0, amplitude.most / (v.sizes[name] * unit)
+    amplitude, one = v.effect.amplitudes()[name], v.sizes[name] * unit
+    return amplitude.least / one, amplitude.most / one
 
 
 def _at_all_sites(offers: list[Offer]) -> list[Offer]:

@@ -83,6 +83,16 @@ def test_a_little_friction_of_the_wrap_is_seen_though_a_lot_would_slip_elsewhere
     np.testing.assert_allclose(float(capstan.mu), 0.01, rtol=0.2)
 
 
+def test_no_cause_is_larger_than_its_law_holds():
+    """A magnet is never three radii off its axis: the law of a small eccentricity says nothing there."""
+    truth = ("encoder_eccentricity", ("PIP",), {"A": 3.0, "B": -2.0})
+    bounds = CATALOGUE[truth[0]].amplitudes()
+    found = diagnose(session_with(truth), without=tuple(sorted(set(CATALOGUE) - {*RIVALS, truth[0]})), quick=True)
+    values = [v for c in found.candidates if c.key == Key(*truth[:2]) for v in c.values]
+    assert values
+    assert all(abs(v.value) <= bounds[v.name].most + 1e-9 for v in values)
+
+
 def test_the_order_of_the_trials_in_a_file_says_nothing():
     """A sensor drifts with the clock, not with the order of the trials in a file."""
     keep = {*RIVALS, "torque_sensor_drift"}
