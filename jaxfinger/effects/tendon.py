@@ -6,6 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfinger.effects import spectrum
 from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
 
 
@@ -29,29 +30,37 @@ class TendonStretch(CatalogueEffect):
 
 
 class TendonCreep(CatalogueEffect):
-    """compliance · y, T ẏ = f − y: the tendon creeps under held tension (Kelvin–Voigt)."""
+    """compliance · y, T ẏ = f − y: the tendon creeps under held tension (Kelvin–Voigt).
+
+    With `decades` y is the mean over a spectrum of times about T, and creep goes on with the logarithm of time.
+    """
 
     ID: ClassVar = "tendon_creep"
     PLACE: ClassVar = "tendon"
     HAPPENS: ClassVar = "The tendon goes on lengthening while its tension is held."
     LOOKS: ClassVar = "Excursion drifts during each hold, more and more slowly."
-    CHANGE: ClassVar = "Pre-stretch the tendon, wait longer at holds, or add a Kelvin-Voigt element."
+    CHANGE: ClassVar = "Pre-stretch the tendon, wait longer at holds, or add Kelvin-Voigt elements."
 
     compliance: Float[Array, ""] = amplitude("m/N", 0.01, "excursion/tension")
     T: Float[Array, ""] = shape("s", (0.015, 0.05, 0.15, 0.5, 1.5), "trial")
+    decades: Float[Array, ""] = spectrum.width()
+
+    @classmethod
+    def shapes(cls, finger, site, scales):
+        return spectrum.thinned(super().shapes(finger, site, scales))
 
     def drive(self, model, x):
         return x.time, x.tension[self.index[0]]
 
     def initial_memory(self, drive):
-        return jnp.zeros_like(drive[1])
+        return spectrum.at_rest(drive[1])
 
     def next_memory(self, memory, before, drive):
         (t0, _), (t, f) = before, drive
-        return f + (memory - f) * jnp.exp(-(t - t0) / self.T)
+        return f + (memory - f) * spectrum.decay(self.T, self.decades, t - t0)
 
     def excursion(self, x, memory, f, l):
-        return l.at[self.index[0]].add(self.compliance * memory)
+        return l.at[self.index[0]].add(self.compliance * memory.mean(axis=0))
 
 
 class TendonBacklash(CatalogueEffect):

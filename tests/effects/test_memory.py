@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import exp1
 
 from jaxfinger.data import filter_std, low_pass, smooth
 from jaxfinger.effects import CATALOGUE
@@ -170,13 +171,13 @@ def test_maxwell_branch_relaxes():
     z = np.zeros(q.size)
     for t in range(1, q.size):
         z[t] = z[t - 1] + (q[t] - q[t - 1]) - dt * z[t - 1] / 0.3
-    found = state(CATALOGUE["elastic_relaxation"].at(FINGER, (FINGER.joint_names[0],), T=0.3))
+    found = state(CATALOGUE["elastic_relaxation"].at(FINGER, (FINGER.joint_names[0],), T=0.3)).mean(axis=0)
     np.testing.assert_allclose(found, z[::FINE], atol=2e-3 * np.ptp(z))
 
 
 def test_kelvin_voigt_creeps_to_the_tension():
     k = FINGER.tendon_names.index("T2")
-    found = state(CATALOGUE["tendon_creep"].at(FINGER, ("T2",), T=0.5))
+    found = state(CATALOGUE["tendon_creep"].at(FINGER, ("T2",), T=0.5)).mean(axis=0)
     f, dt = np.asarray(X.tension)[k], (TIME[1] - TIME[0]) / FINE
     y = [0.0]
     for held in np.concatenate([[f[0]], f[1:]])[1:]:  # The operator holds tension over a sample.
@@ -186,6 +187,19 @@ def test_kelvin_voigt_creeps_to_the_tension():
         y.append(creeping)
     # At the first sample there is no step yet.
     np.testing.assert_allclose(found, y, atol=1e-3 * np.ptp(f))
+
+
+def test_a_wide_spectrum_creeps_with_the_logarithm_of_time():
+    """The step response of a spectrum that is constant in log T over two decades, from the exponential integral."""
+    effect = CATALOGUE["tendon_creep"].at(FINGER, ("T2",), T=2.0, decades=2.0)
+    t, step = jnp.geomspace(0.1, 20.0, 40), jnp.ones(())
+    memory = jnp.stack(
+        [effect.next_memory(effect.initial_memory((0.0, step)), (jnp.zeros(()), step), (x, step)) for x in t]
+    )
+    exact = 1.0 - (exp1(t / 20.0) - exp1(t / 0.2)) / np.log(100.0)
+    np.testing.assert_allclose(memory.mean(axis=1), exact, atol=0.01)
+    after = np.interp([0.7, 2.0, 5.7], t, memory.mean(axis=1))
+    assert after[1] - after[0] == pytest.approx(after[2] - after[1], rel=0.2)  # as much in every factor of time
 
 
 def test_tendon_presliding_follows_its_excursion():
