@@ -54,22 +54,25 @@ MAX_ACCELERATION_NOISE = 10.0
 
 
 def reduce(r: PreparedTrial) -> Row:
-    """Reduce a trial: torque is valid where joints and tendons slide, excursion everywhere."""
+    """Reduce a trial: torque is valid where joints and tendons slide, excursion wherever the filter reads samples."""
     j = joints(r, sharp=not r.reduced)
     # Reversals are taken from the slow filter: noise of q̇ moves the time of a reversal.
     slow = j.qd if r.reduced else smooth_rate(r.trial.time, r.trial.q, r.experiment.cutoff_at(r.step))
     joint = joint_directions(r, j, slow)
     rates = None if r.experiment.slack else tendon_rates(r)
     tendon = tendon_directions(r, rates)
-    slides = sliding(r, j, slow, joint, rates, CLEAR_WIDTHS * filter_std(r.experiment.cutoff))
+    clear = CLEAR_WIDTHS * filter_std(r.experiment.cutoff)
+    valid = {
+        "joint_torque": sliding(r, j, slow, joint, rates, clear),
+        "tendon_excursion": _apart(np.ones((len(slow), 1), bool), clear, r.step),
+    }
 
     qdd, tension, y = less_noise(r, j) if r.reduced or r.experiment.slack else j.qdd, r.tension(), r.y
     if r.reduced:
         # All other terms pass the low-pass of q̈.
         joint, tendon, tension = (low_pass(r.trial.time, a, j.cutoff) for a in (joint, tendon, tension))
         y = {c: low_pass(r.trial.time, values, j.cutoff) for c, values in y.items()}
-    known = r.mean(slides.astype(float)) > 1.0 - 1e-9  # all samples of the block
-    counting = {c: known if c == "joint_torque" else np.ones((len(known), 1), bool) for c in y}
+    counting = {c: r.mean(valid[c].astype(float)) > 1.0 - 1e-9 for c in y}  # all samples of the block
     return row(
         r,
         r.mean(j.q),
@@ -159,11 +162,18 @@ def sliding(
         most = np.maximum(MAX_LOST_SPEED_SHARE * pace, MIN_SLIP_TO_NOISE * noise)
         slides &= np.all(lost <= most + ROUNDING_SHARE * pace.max(initial=0.0), axis=1)[:, None]
     # The filter spreads the jump of friction at a reversal, and reads samples of unknown friction before a slide.
-    # Beyond the ends of a recording it reads extrapolated samples.
-    apart = minimum_filter1d(slides, 2 * round(clear / r.step) + 1, axis=0, mode="constant", cval=False)
+    apart = _apart(slides, clear, r.step)
     # The window reaches back only: a free joint breaks away suddenly and moves the others.
     half = round(0.5 * BREAKAWAY_WIDTHS * filter_std(r.experiment.cutoff) / r.step)
     return np.where(r.motorised, apart, minimum_filter1d(apart, 2 * half + 1, axis=0, origin=half))
+
+
+def _apart(valid: Bool[np.ndarray, "N k"], clear: float, step: float) -> Bool[np.ndarray, "N k"]:
+    """Samples with valid ones alone within `clear`, s, on either side.
+
+    Beyond the ends of a recording none is valid: the filter reads extrapolated samples there, and their noise.
+    """
+    return minimum_filter1d(valid, 2 * round(clear / step) + 1, axis=0, mode="constant", cval=False)
 
 
 def rests(j: Joints, slow: Bool[np.ndarray, "N m"], step: float) -> Bool[np.ndarray, "N m"]:

@@ -2,7 +2,8 @@
 
 A held tendon slips only where its loss is exceeded, and otherwise keeps its tension at the joints
 (`tendon_friction.held`, from slack on). Valid samples are holds, and changes in which the model knows where the tendon
-slips: a step in the direction of the one before, and ramps so slow that the tension hardly changes within a block.
+slips: a step in the direction of one in which it has slipped, and ramps so slow that the tension hardly changes within
+a block.
 """
 
 from itertools import pairwise
@@ -11,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import uniform_filter1d
 
-from jaxfinger.data import find_holds
+from jaxfinger.data import find_holds, quantisation
 from jaxfinger.data.signals.motion import RAMP_BLOCKS, slow_ramps, stretches_of
 from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, runs_of_holds
 from jaxfinger.experiments.shrink import shrink
@@ -20,6 +21,9 @@ NONE_VALID = "no tendon is pulled from slack in holds, or in ramps slow enough t
 HOLD_PARTS = 6  # of a hold, whose means give the noise of its mean; encoder noise is correlated over less than one part
 MIN_OVERSHOOT = 4.0  # standard deviations of noise beyond both holds; tension beyond that is a real overshoot
 MIN_HOLDS = 3  # to see from the spread of holds whether a fixture yields; two leave a single degree of freedom
+# Of the change of load per newton of tension, relative to the quickest step: less is that of noise, or of a fixture
+# that yields under a tendon that sticks.
+MIN_SLIP_SHARE = 0.1
 RAMP_SAMPLE = -2  # marks the samples of a ramp among the numbers of holds
 
 
@@ -35,8 +39,8 @@ def reduce(r: PreparedTrial) -> Row:
     ramps = slow_ramps(pulled, hold, round(RAMP_BLOCKS / (r.experiment.rate * r.step * r.size)), r.sizes.travel)
     if ramps.any():
         pulled = _monotonic_ramps(pulled, ramps, r.sizes.travel)
+    counts = (hold >= 0) | _continues(pulled, hold, r.sizes.travel, *_load(r))
     pulled = _clipped_between_holds(pulled, np.where(ramps, RAMP_SAMPLE, hold), slack=True)
-    counts = (hold >= 0) | _continues(pulled, hold, r.sizes.travel)
     taut = r.lowest(measured) > r.sizes.slack
     known = ((counts | ramps) & _from_slack(r, pulled))[:, None]
     counting = {c: counts[:, None] | taut if c == "tendon_excursion" else known for c in r.y}
@@ -134,17 +138,47 @@ def _clipped_between_holds(values: Float[np.ndarray, "M k"], hold: Int[np.ndarra
     return out
 
 
-def _continues(tension: Float[np.ndarray, "M n"], hold: Int[np.ndarray, " M"], travel: float) -> Bool[np.ndarray, " M"]:
+def _load(r: PreparedTrial) -> tuple[Float[np.ndarray, "M k"], Float[np.ndarray, " k"]]:
+    """Measured torques of the joints, N m, or force at the fingertip, N, zero where there is none.
+
+    Returns:
+        The load block by block, and the error of each column's converter (`quantisation`).
+    """
+    load = next(getattr(r.trial, c) for c in r.y if c != "tendon_excursion")
+    load = np.zeros((len(r.trial.time), 1)) if load is None else np.nan_to_num(load)
+    return r.mean(load), np.array([quantisation(column)[0] for column in load.T])
+
+
+def _continues(
+    tension: Float[np.ndarray, "M n"],
+    hold: Int[np.ndarray, " M"],
+    travel: float,
+    load: Float[np.ndarray, "M k"],
+    error: Float[np.ndarray, " k"],
+) -> Bool[np.ndarray, " M"]:
     """Whether a sample lies between holds in a step that every tendon takes in the direction of its last one.
 
     A tendon that turns back or leaves slack sticks first and then slips within one block, whose mean tension does not
-    tell when.
+    tell when. Once released it may stick for several steps. It slips all through a step if it slipped in the one
+    before, as the change of the `load` tells.
+
+    The noise of the tension enters a step, and not the mean of a hold. Where its load exceeds the noise of the load,
+    which includes the `error` of a converter, the step does not count: one noise stands for all samples of a channel.
     """
     out = np.zeros(len(hold), bool)
     runs = runs_of_holds(hold)
-    steps = np.diff([tension[run].mean(axis=0) for run in runs], axis=0)
+    if len(runs) < MIN_HOLDS:
+        return out
+    steps, changes = (np.diff([x[run].mean(axis=0) for run in runs], axis=0) for x in (tension, load))
     ways = np.where(np.abs(steps) > travel, np.sign(steps), 0.0)
+    released = np.logical_or.accumulate((ways < 0.0).any(axis=1))
+    per_newton = np.linalg.norm(changes, axis=1) / np.maximum(np.linalg.norm(steps, axis=1), travel)
+    slipped = per_newton > MIN_SLIP_SHARE * per_newton.max()
+    of_tension, of_load = (np.sqrt(np.mean([x[run].var(axis=0) for run in runs], axis=0)) for x in (tension, load))
+    noise = per_newton * np.linalg.norm(of_tension * np.abs(ways), axis=1)
+    quiet = noise <= np.linalg.norm(np.hypot(of_load, error))
     for k in range(1, len(ways)):
-        if np.all((ways[k] == ways[k - 1]) | (ways[k] == 0)):
+        goes_on = np.all((ways[k] == ways[k - 1]) | (ways[k] == 0))
+        if goes_on and quiet[k] and (slipped[k - 1] or not released[k]):
             out[runs[k][-1] + 1 : runs[k + 1][0]] = True
     return out

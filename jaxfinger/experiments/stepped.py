@@ -58,8 +58,11 @@ def reduce(r: PreparedTrial) -> Row:
 
 
 def _constant(direction: Float[np.ndarray, "N m"], reach: int) -> Bool[np.ndarray, "N m"]:
-    """Whether a direction is known and does not change within `reach` samples on either side."""
-    least, most = (f(direction, 2 * reach + 1, axis=0) for f in (minimum_filter1d, maximum_filter1d))
+    """Whether a direction is known and does not change within `reach` samples on either side.
+
+    Beyond the ends of a recording it is not known: the filter reads extrapolated samples there, and their noise.
+    """
+    least, most = (f(direction, 2 * reach + 1, axis=0, mode="constant") for f in (minimum_filter1d, maximum_filter1d))
     return (least == most) & (direction != 0.0)
 
 

@@ -44,7 +44,7 @@ def posterior(search: Search, state: SearchState) -> Posterior:
         causes[key] = sum(w[keys] for keys in inside) * genuine.get(key, 1.0)
         without = max(net[keys] for keys in scores if key not in keys)
         gains[key] = max((net[keys] for keys in inside), default=-np.inf) - without
-    ambiguous = _ambiguous(w, state, genuine)
+    ambiguous = ambiguous_sets(w, state.keys, genuine)
     named = tuple(k for k in state.keys if causes[k] >= MIN_NAMED_PROBABILITY and not any(k in s for s in ambiguous))
     return Posterior(causes, gains, w[frozenset()] * (1.0 - other), other, named, ambiguous)
 
@@ -67,16 +67,17 @@ def genuine_probabilities(
     return {key: 1.0 - other * imitates(counts, x, left, costs.explainable[key], p) for key, x in without.items()}
 
 
-def _ambiguous(
-    w: dict[frozenset[CauseKey], float], state: SearchState, genuine: dict[CauseKey, float]
+def ambiguous_sets(
+    w: Mapping[frozenset[CauseKey], float], best: tuple[CauseKey, ...], genuine: Mapping[CauseKey, float]
 ) -> tuple[tuple[CauseKey, ...], ...]:
-    """Causes of the best set, each with the rivals that could take its place, likeliest first.
+    """Causes of the `best` set, each with the rivals that could take its place, likeliest first.
 
     `w` are the posterior probabilities of all visited sets, `genuine` those of `genuine_probabilities`. Rivals
-    compare by the probability of the best set with the rival in the cause's place.
+    compare by the probability of the best set with the rival in the cause's place. A cause that is less likely than
+    as many rivals as there is room for comes last.
     """
-    out, whole = [], frozenset(state.keys)
-    for key in state.keys:
+    out, whole = [], frozenset(best)
+    for key in best:
         rest = whole - {key}
         rivals = {next(iter(s - rest)): v for s, v in w.items() if len(s) == len(whole) and rest < s}
         total = sum(rivals.values())
@@ -88,6 +89,8 @@ def _ambiguous(
                 break
             members.append(k)
             mass += rivals[k]
+        if key not in members:
+            members = [*members[: MAX_MEMBERS - 1], key]
         if len(members) > 1 and not any(set(members) == set(s) for s in out):
             out.append(tuple(members))
     return tuple(out)

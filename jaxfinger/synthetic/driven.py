@@ -43,7 +43,8 @@ class Simulator:
     ) -> tuple[Float[Array, "m N"], Float[Array, "m N"], Float[Array, "n N"]]:
         """Return q (rad), q̇ (rad/s) and tension (N) every `dt` s, from rest at `q0` (rad).
 
-        The tension is constant between two samples.
+        The tension changes at each sample, and is constant between two. The tension of a sample is the mean of those
+        before and after it, as a linear interpolation of the samples needs it.
         """
         targets = Targets(*(jnp.asarray(x.T) for x in controller.targets))
         outputs = self._run(jnp.asarray(q0), dt, controller._replace(targets=targets))
@@ -52,13 +53,14 @@ class Simulator:
 
     def _simulate(self, q0, dt, controller: TensionController):
         def sample(carry, target):
-            state, tension = carry
-            tension = controller.tension(self.specimen, state.q, state.v, tension, target, dt)
+            state, before = carry
+            tension = controller.tension(self.specimen, state.q, state.v, before, target, dt)
 
             def substep(_, state):
                 return step(self.specimen, self.finger, state, tension, dt / SUBSTEPS)
 
-            return (jax.lax.fori_loop(0, SUBSTEPS, substep, state), tension), (state.q, state.v, tension)
+            after = jax.lax.fori_loop(0, SUBSTEPS, substep, state)
+            return (after, tension), (state.q, state.v, 0.5 * (before + tension))
 
         start = at_rest(self.finger, q0), controller.targets.tension[0]
         return jax.lax.scan(sample, start, controller.targets)[1]

@@ -17,6 +17,7 @@ from jaxfinger.synthetic.plant import Channels, Plant
 from jaxfinger.synthetic.protocols import TrialPlan
 
 Array = np.ndarray
+READINGS = 3  # steps by which an encoder's reading is found: its error changes little over an angle as small as itself
 MIN_SAMPLES = 1024  # Trials are padded to a power of two, at least this, so that few lengths are compiled.
 
 
@@ -50,23 +51,38 @@ class ModelPlant:
     def driven(self, plan: TrialPlan) -> Channels:
         """Return the channels of VD.3 under the driver's tensions, from rest at its first position.
 
+        These tensions are what the load cells read. Sensors with errors read other tensions and angles than the true
+        ones, by which the finger moves.
+
         Raises:
             UserError: there is no driver.
         """
         if self.driver is None:
             raise UserError(f"recipe: trial {plan.name} needs tensions that the model alone does not give; drop VD.3")
         driven = self.driver.driven(plan)
-        tension, q0 = jnp.asarray(driven["tendon_force"]), jnp.asarray(driven["q"][:, 0])
+        cells = driven["tendon_force"]
+        true, tension = self._true(plan, driven["q"], cells)
         start: Any = jnp.asarray(plan.session_start)  # As an array it is traced, so all trials share one compilation.
-        q, _ = _simulate(self.model, jnp.asarray(plan.time), tension, q0, jnp.zeros_like(q0), session_start=start)
-        excursion = predict_compiled(
-            self.model, self._motion(plan, np.asarray(q), driven["tendon_force"]), ("tendon_excursion",)
+        q0 = jnp.asarray(true[:, 0])
+        path, _ = _simulate(
+            self.model, jnp.asarray(plan.time), jnp.asarray(tension), q0, jnp.zeros_like(q0), session_start=start
         )
+        read = q = np.asarray(path)
+        for _ in range(READINGS):
+            read = read + (q - self._true(plan, read, cells)[0])
+        excursion = predict_compiled(self.model, self._motion(plan, read, cells), ("tendon_excursion",))
         return {
-            "q": np.asarray(q),
-            "tendon_force": driven["tendon_force"],
+            "q": read,
+            "tendon_force": cells,
             "tendon_excursion": np.asarray(excursion["tendon_excursion"])[:, : plan.time.size],
         }
+
+    def _true(
+        self, plan: TrialPlan, q: Float[Array, "m N"], tension: Float[Array, "n N"]
+    ) -> tuple[Float[Array, "m N"], Float[Array, "n N"]]:
+        """True angles, rad, and tensions, N, where the sensors read `q` and `tension`."""
+        x = _true_motion(self.model, self._motion(plan, q, tension))
+        return np.asarray(x.q)[:, : plan.time.size], np.asarray(x.tension)[:, : plan.time.size]
 
     def _motion(
         self, plan: TrialPlan, q: Float[Array, "m N"] | None = None, tension: Float[Array, "n N"] | None = None
@@ -103,6 +119,7 @@ class ModelPlant:
 
 
 _simulate = quick_jit(simulate_forward)
+_true_motion = quick_jit(Model.true_motion)
 
 
 def _derivatives(time: Float[Array, " N"], q: Float[Array, "m N"]) -> tuple[Float[Array, "m N"], Float[Array, "m N"]]:

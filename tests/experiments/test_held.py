@@ -11,6 +11,7 @@ from jaxfinger.data.checks.trial import check_trial
 from jaxfinger.data.findings import Report
 from jaxfinger.data.signals.sizes import SLACK_SHARE, sizes_of
 from jaxfinger.experiments import not_judged
+from jaxfinger.synthetic.plant import joint_tension
 from tests.experiments.test_prepare import ENCODER, FINGER, MCP, RATE, stack
 
 
@@ -59,6 +60,30 @@ def ramps(rise: float, start: float = 0.0, rest: float = 0.0) -> Trial:
     q = np.radians([40.0, 30.0, 20.0]) + ENCODER * rng.standard_normal((time.size, 3))
     torque = np.where(np.arange(3) == 0, 1e-2, np.nan) * np.ones_like(q)
     return Trial("pull", "ID.4", time, q, tension, joint_torque=torque, joint=MCP, tendon="T1")
+
+
+@pytest.mark.parametrize(("noise", "counting"), [(0.3, True), (3.0, False)])
+def test_steps_count_where_the_noise_of_the_tension_is_less_than_that_of_the_load(noise, counting):
+    """One noise stands for all samples of a channel, and the mean tension of a hold has hardly any.
+
+    `noise`: torque by the noise of the tension, over that of the torque sensor.
+    """
+    time, rng, arm, torque_noise = np.arange(7000) / RATE, np.random.default_rng(4), 6e-3, 3e-4
+    level = np.floor(time) + np.interp(time % 1.0, [0.0, 0.3], [-1.0, 0.0])
+    hold = np.where(time % 1.0 > 0.35, np.floor(time), -1).astype(np.int32)
+    true = np.maximum(level, 0.0)[:, None] * (np.arange(FINGER.n) == 0)
+    torque = np.full((time.size, 3), np.nan)
+    torque[:, 0] = -arm * joint_tension(true.T, 0.1 * true.T)[0] + torque_noise * rng.standard_normal(time.size)
+    tension = true + noise * torque_noise / arm * rng.standard_normal(true.shape)
+    q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
+    found = stack(Trial("pull", "ID.4", time, q, tension, joint_torque=torque, joint=MCP, tendon="T1", hold=hold))
+    counts = np.asarray(found.batch.mask["joint_torque"])[0, 0, :140] > 0
+    rests = found.holds[0, :140] >= 0
+    assert counts[rests].all()
+    assert counts[60:][~rests[60:]].all() == counting
+    pulled, y = np.asarray(found.batch.x.tension)[0, 0, :140], np.asarray(found.batch.y["joint_torque"])[0, 0, :140]
+    residual = np.where(counts, y + arm * 0.9 * pulled, 0.0)
+    assert np.std(residual[60:][counts[60:]]) < 1.5 * np.std(residual[rests])
 
 
 @pytest.mark.parametrize("reduced", [True, False])

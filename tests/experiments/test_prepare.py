@@ -11,6 +11,7 @@ from jaxfinger.data.signals.sizes import SLACK_SHARE
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, driven, not_judged, prepare
 from jaxfinger.synthetic import paper_finger
+from jaxfinger.synthetic.plant import joint_tension
 
 RATE, ENCODER = 1000.0, 2e-4  # Hz, rad
 CYCLE = 3.0  # s
@@ -224,8 +225,12 @@ def test_a_tendon_that_stands_still_for_a_moment_has_no_known_friction():
     assert counts[(at > 2.3) & (at < 3.8)].all()
 
 
-def test_between_holds_counts_a_tension_that_goes_on_or_a_joint_that_slides():
-    """A tendon sticks where its tension turns back; a joint may stick at the ends of a move."""
+@pytest.mark.parametrize(("loss", "second_release_counts"), [(0.05, True), (0.3, False)])
+def test_between_holds_counts_a_tension_that_goes_on_or_a_joint_that_slides(loss, second_release_counts):
+    """A tendon sticks where its tension turns back; a joint may stick at the ends of a move.
+
+    With more friction the tendon sticks all through its first release, and slips at some time in the second.
+    """
     time = np.arange(7000) / RATE
     heights = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 3.0, 2.0, 1.0])
     second = np.floor(time).astype(int)
@@ -233,23 +238,47 @@ def test_between_holds_counts_a_tension_that_goes_on_or_a_joint_that_slides():
     level = heights[second] + step * (heights[second + 1] - heights[second])
     hold = np.where(time - second > 0.33, second, -1).astype(np.int32)
     q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
-    torque = np.where(np.arange(3) == 0, 1e-2, np.nan) * np.ones_like(q)
     tension = 2.0 * level[:, None] * (np.arange(FINGER.n) == 0)
+    at_joint = joint_tension(tension.T, loss * tension.T)[0]
+    torque = np.where(np.arange(3) == 0, -6e-3 * at_joint[:, None], np.nan)
     fixed = Trial("pull", "ID.4", time, q, tension, joint_torque=torque, joint=MCP, tendon="T1", hold=hold)
     moved = q + 0.05 * level[:, None] * (np.arange(3) == 0)
     stepped = Trial("steps", "ID.3-static", time, moved, joint_torque=torque, joint=MCP, hold=hold)
     held, static = (stack(t) for t in (fixed, stepped))
     counts = np.asarray(held.batch.mask["joint_torque"])[0, 0] > 0
     between = {k: counts[20 * k : 20 * k + 6] for k in range(7)}  # the 0.3 s before hold number k
-    assert [bool(x.all()) for x in between.values()] == [False, False, True, True, False, True, True]
+    whole = [False, False, True, True, False, second_release_counts, True]
+    assert [bool(x.all()) for x in between.values()] == whole
     assert not between[4].any()
     moves, at = np.asarray(static.batch.mask["joint_torque"])[0, 0] > 0, np.asarray(static.batch.x.time)[0]
-    turns = np.abs(at - 4.0) < 0.1  # the filter spreads the jump of friction
-    np.testing.assert_array_equal(moves[(static.holds[0] >= 0) & ~turns], True)
+    turns, end = np.abs(at - 4.0) < 0.1, at > 6.9  # the filter spreads the jump of friction and the last sample's noise
+    np.testing.assert_array_equal(moves[(static.holds[0] >= 0) & ~turns & ~end], True)
     assert all(moves[20 * k + 2 : 20 * k + 4].all() and not moves[20 * k + 6] for k in range(7))
     rate = low_pass(time, np.where(time - second < 0.3, np.diff(heights)[second] * 0.05 / 0.3, 0.0), 5.0)
     np.testing.assert_allclose(np.asarray(static.batch.x.qd)[0, 0, :140], rate.reshape(140, 50).mean(axis=1), atol=1e-3)
     assert [len(k) for k in held.samples_of_holds(0, counts)] == [13] * 7
+
+
+@pytest.mark.parametrize(("experiment", "channel"), [("ID.3-static", "joint_torque"), ("VD.3", "tendon_excursion")])
+def test_noise_is_as_small_at_the_ends_of_a_recording_as_elsewhere(experiment, channel):
+    """Beyond the ends the filter mirrors the signal about the last sample, whose noise no average reduces."""
+    rng, rate = np.random.default_rng(3), 5e3
+    time = np.arange(round(8 * rate)) / rate
+    second, hold = np.floor(time).astype(int), np.where(time % 1.0 > 0.5, np.floor(time), -1).astype(np.int32)
+    level = second + np.interp(time - second, [0.0, 0.4], [0.0, 1.0])
+    q = np.radians([10.0, 30.0, 20.0]) + 0.1 * level[:, None] * (np.arange(3) == 0)
+    noise, largest = 1e-2, []
+    for k in range(10):
+        torque = np.where(np.arange(3) == 0, noise * rng.standard_normal(q.shape), np.nan)
+        excursion = noise * rng.standard_normal((time.size, FINGER.n))
+        tension = np.ones_like(excursion)
+        trial = Trial(f"steps {k}", experiment, time, q, tension, excursion, torque, joint=MCP, hold=hold)
+        if experiment == "VD.3":
+            trial = replace(trial, hold=None, joint=None)
+        found = stack(trial)
+        y, mask = np.asarray(found.batch.y[channel])[0, 0], np.asarray(found.batch.mask[channel])[0, 0] > 0
+        largest.append(np.abs(y[mask]).max())
+    assert max(largest) < 5.0 * noise / np.sqrt(rate * found.dt)
 
 
 def test_a_slow_sweep_of_the_motor_slides_and_a_finger_as_slow_may_stick():

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -10,6 +11,7 @@ from jaxfinger.data import EXPERIMENT_NAMES
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.errors import UserError
 from jaxfinger.model import Finger
+from jaxfinger.model import simulate as forward
 from jaxfinger.synthetic import (
     ModelPlant,
     SpecimenPlant,
@@ -51,6 +53,26 @@ def test_driven_motion_agrees_under_the_same_tension(plans):
     second = ModelPlant(true_model(SPECIMEN), driver=ours).driven(plans["VD.3"])
     assert np.array_equal(first["tendon_force"], second["tendon_force"])
     assert np.abs(first["q"] - second["q"]).max() < np.deg2rad(0.1)
+
+
+def test_a_driven_finger_moves_by_the_true_tension_and_its_sensors_read_their_own(plans):
+    """A load cell that reads 2 % too much, and an encoder that reads 0.01 rad too much."""
+    plan, driver, model = plans["VD.3"], SpecimenPlant(SPECIMEN), true_model(SPECIMEN)
+    given = driver.driven(plan)["tendon_force"]
+    weaker = given.copy()
+    weaker[2] /= 1.02
+    errors = (
+        CATALOGUE["tension_sensor_scale"].at(model.finger, (SPECIMEN.description.tendon_names[2],), gain=0.02),
+        CATALOGUE["encoder_offset"].at(model.finger, (SPECIMEN.description.joint_names[1],), offset=0.01),
+    )
+    wrong = eqx.tree_at(lambda m: m.effects, model, errors, is_leaf=lambda v: isinstance(v, tuple))
+    found = ModelPlant(wrong, driver=driver).driven(plan)
+    assert np.array_equal(found["tendon_force"], given)
+    time, q0 = jnp.asarray(plan.time), jnp.asarray(plan.q[:, 0] - [0.0, 0.01, 0.0])
+    q, _ = forward(model, time, jnp.asarray(weaker), q0, jnp.zeros(3))
+    np.testing.assert_allclose(found["q"] - np.asarray(q), np.tile([[0.0], [0.01], [0.0]], plan.time.size), atol=1e-6)
+    excursion = np.asarray(model.moment_arm.excursion(q))
+    np.testing.assert_allclose(found["tendon_excursion"][:4], excursion[:4], atol=1e-7)
 
 
 def test_model_without_a_driver_cannot_be_driven(plans):
