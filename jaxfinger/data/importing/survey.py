@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,18 +21,24 @@ _MEANINGS = (
     ("temperature", r"temp"),
     ("joint_torque", r"(^|_)tau|torque|effort|moment"),
     ("tendon_excursion", r"excursion|^l\d*$|length|pull|spool|linear|travel"),
-    ("tendon_force", r"tension|tendon.*force|^f_?t|^f(\d|_(?!([xyz]|tip)$))|cable|loadcell|(^|_)cell(_|\d|$)|^force"),
+    (
+        "tendon_force",
+        r"tension|tendon.*force|^f_?t|^f(\d|_(?!([xyz]|tip)$))|cable|load[ _-]?cell|(^|_)cell(_|\d|$)|^force",
+    ),
     ("fingertip_force", r"f?tip|contact|^f[xyz]$|wrench"),
     ("q", r"^q[_\d]*|_q(_|\d|$)|angle|pos|enc|theta|winkel|deg$"),
 )
 # Of a clock's values or steps: more values differ, also out of order, or more steps go on, also of a recording that was
 # pasted twice.
 _MIN_RUNNING = 0.5
+# Name of a column of a table without names, and share of a clock's steps that its usual one is not twice or half of.
+_NAMELESS = r"column \d+"
+_MIN_EVEN = 0.9
 # Names of velocities, which belong to no channel, of set-points, which are not measured, and of switches and states.
 _VELOCITY = r"(?<![a-z])vel|speed|dot|^v$|^dq|(^|_)(d+q|qd+)(_|\d|$)"
 _STATE = r"enable|flag|status|valid|(^|_)(on|off|ok|mode|err|error|fault|alarm)(_|\d|$)"
 _SET_POINT = (
-    r"cmd|command|ref(?!l)|desired|set_?p(oin)?t|goal|target|demand|soll|feed_?forward"
+    r"cmd|command|cmptd|computed|ref(?!l)|desired|set_?p(oin)?t|goal|target|demand|soll|feed_?forward"
     r"|(?<![a-z])(q|tau|tau_j)_d(?![a-z])"
     r"|(?<![a-z])(q|tau|pos)?(des|set(?!\d+\.)|sp|ff|tgt|nominal|planned)(?![a-z])"
 )
@@ -114,7 +120,27 @@ def columns_of(recording: Recording, among: Sequence[Recording] = ()) -> list[Co
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
             missing = len(x) - len(finite)
             found.append(ColumnSurvey(name, column, len(x), low, high, missing, units, stated, meaning, foreign))
+    if not any(s.meaning == "time" for s in found):
+        for k, s in enumerate(found):
+            x = np.ravel(recording.variables[s.name].values)
+            if is_nameless(s.name) and _rises_evenly(x):
+                found[k] = replace(s, meaning="time", units=_time_unit(x))
+                break
     return found
+
+
+def is_nameless(name: str) -> bool:
+    """Whether a column has no name in its recording, so that its values alone say what it may be."""
+    return re.fullmatch(_NAMELESS, name) is not None
+
+
+def _rises_evenly(x: np.ndarray) -> bool:
+    """Whether values rise by similar steps throughout, as times do. A count of samples does not show their times."""
+    steps = np.diff(x)
+    if len(x) < 3 or not np.all(steps > 0.0) or np.all(steps == 1.0):
+        return False
+    ratio = steps / np.median(steps)
+    return bool(np.mean((ratio > 0.5) & (ratio < 2.0)) > _MIN_EVEN)
 
 
 def _sizes(name: str, k: int, recording: Recording, among: Sequence[Recording]) -> list[float]:
