@@ -31,6 +31,7 @@ _MEANINGS = (
 # Of a clock's values or steps: more values differ, also out of order, or more steps go on, also of a recording that was
 # pasted twice.
 _MIN_RUNNING = 0.5
+_NO_WORDS = "value", "data"  # at the end of a name, which say nothing of what they are: the word before them does
 # Name of a column of a table without names, and share of a clock's steps that its usual one is not twice or half of.
 _NAMELESS = r"column \d+"
 _MIN_EVEN = 0.9
@@ -108,10 +109,13 @@ def columns_of(recording: Recording, among: Sequence[Recording] = ()) -> list[Co
         table = variable.values.reshape(len(variable.values), -1)
         for k, x in enumerate(table.T):
             column = None if table.shape[1] == 1 else (variable.columns[k] if variable.columns else k)
-            units, stated = unit_name(variable.units), bool(unit_name(variable.units))
+            units = unit_name(variable.units)
             spelt = units or _spelt(name)
             foreign = variable.units if is_foreign(variable.units) and not spelt else ""
             meaning = _meaning(name, column, x, spelt)
+            if meaning == "q" and not (spelt or foreign):
+                units = spelt = recording.angles
+            stated = bool(units)
             if spelt:
                 units = spelt
             elif not stated and not foreign:
@@ -187,7 +191,8 @@ def _steps(time: np.ndarray) -> np.ndarray:
 def _meaning(name: str, column: str | int | None, x: np.ndarray, units: str) -> str:
     """Channel or `time` by the last word of a name where the units allow it, else by the units; empty where unclear."""
     bare = re.sub(r"[\[(].*", "", name).strip("/ ")  # Units stand in brackets.
-    word = re.split(r"[./]", bare)[-1].lower()
+    *before, word = re.split(r"[./]", bare.lower())
+    word = before[-1] if before and word in _NO_WORDS else word
     if len(x) == 1 or re.search(_VELOCITY, word) or re.search(_STATE, word) or is_set_point(name):
         return ""
     for meaning, pattern in _MEANINGS:

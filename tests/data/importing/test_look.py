@@ -371,3 +371,21 @@ def test_joints_that_are_named_by_number_are_taken_in_its_order(tmp_path, column
     assert f'channels.q.MCP = {{ from = "{first}"' in said
     assert f'channels.q.PIP = {{ from = "{second}"' in said
     assert 'joint = "MCP"' in said
+
+
+@pytest.mark.parametrize(
+    ("degrees", "units", "stated"),
+    [("inDegrees=yes", "deg", True), ("inDegrees=no", "rad", True), ("DataType=double", "rad", False)],
+)
+def test_the_header_of_a_table_of_opensim_states_the_units_of_its_angles(degrees, units, stated, tmp_path):
+    """Small angles could be in rad. Speeds, lengths and forces in the same table are in no such unit."""
+    path = tmp_path / "ik.mot"
+    head = f"Coordinates\nversion=1\nnRows=40\nnColumns=4\n{degrees}\n\nendheader\n"
+    names = "time\t/jointset/knee/knee_angle/value\t/jointset/knee/knee_angle/speed\tsoleus_force\n"
+    rows = "".join(f"{0.1 * k:.2f}\t{0.05 * k:.3f}\t{k}\t{k}\n" for k in range(40))
+    path.write_text(head + names + rows)
+    time, angle, speed, force = columns_of(load_recording(path))
+    assert (time.meaning, time.units) == ("time", "s")
+    assert (angle.meaning, angle.units, angle.stated) == ("q", units, stated)
+    assert (speed.meaning, speed.units, force.units) == ("", "", "")
+    assert f'from = "{angle.name}", units = "{units}"' in proposal([load_recording(path)])
