@@ -30,6 +30,7 @@ def fit_to_read(fit: Fit, session: Session | None = None) -> dict:
             {
                 "joint": name,
                 "prismatic": c.prismatic,
+                "range": [float(c.elastic.x[0]), float(c.elastic.x[-1])],
                 "gravity": [float(c.gravity.max()), float(c.gravity.min())],
                 "elastic": c.elastic.range(),
                 "friction": c.friction.range(),
@@ -99,7 +100,7 @@ def _moment_arms(arms: list, joints: list[str], sliding: list[bool]) -> None:
     found = {(t, j): reach(*curve) for t, j, *curve in arms}
     rows = [(t, *(found.get((t, j), "–") for j in joints)) for t in dict.fromkeys(t for t, _ in found)]
     slides = ", of a sliding joint in mm/mm" if any(sliding) else ""
-    table(f"Moment arms in mm{slides} (max; min)", ("tendon", *joints), rows)
+    table(f"Moment arms in mm{slides} over the range of the trials (max; min)", ("tendon", *joints), rows)
 
 
 def _joints(joints: list[dict]) -> None:
@@ -109,9 +110,11 @@ def _joints(joints: list[dict]) -> None:
         terms, unit = _suited([c["gravity"], c["elastic"], c["friction"]], torque, c["prismatic"])
         (rate,), unit_of_rate = _suited([c["damping"]], damping, c["prismatic"])
         gravity, elastic, friction = extremes(*terms[0]), reach(*terms[1]), reach(*terms[2])
-        rows.append((c["joint"], gravity, elastic, friction, unit, with_error(*rate), unit_of_rate))
-    header = ("joint", "gravity", "elastic", "friction", "", "damping", "")
-    table("Torque of the joints over their range (max; min)", header, rows)
+        low, high = c["range"]
+        reaches = f"{round(low)} to {round(high)}" + (" mm" if c["prismatic"] else "°")
+        rows.append((c["joint"], reaches, gravity, elastic, friction, unit, with_error(*rate), unit_of_rate))
+    header = ("joint", "range", "gravity", "elastic", "friction", "", "damping", "")
+    table("Torque of the joints over the range of the trials (max; min)", header, rows)
 
 
 def _suited(groups: list[list], units: str, prismatic: bool) -> tuple[list[list], str]:

@@ -17,7 +17,7 @@ from jaxfinger.data import (
     smooth_rate,
     without_spikes,
 )
-from jaxfinger.data.signals.motion import quick_cutoff, rest_speed, speed_noise
+from jaxfinger.data.signals.motion import from_the_start, quick_cutoff, rest_speed, speed_noise
 from jaxfinger.data.signals.noise import STD_PER_MAD
 from jaxfinger.experiments.reduction import Joints, PreparedTrial, Row, joints, row
 from jaxfinger.experiments.shrink import shrink
@@ -70,6 +70,7 @@ def reduce(r: PreparedTrial) -> Row:
     qdd, tension, y = less_noise(r, j) if r.reduced or r.experiment.slack else j.qdd, r.tension(), r.y
     if r.reduced:
         # All other terms pass the low-pass of q̈.
+        joint, tendon = from_the_start(joint), from_the_start(tendon)
         joint, tendon, tension = (low_pass(r.trial.time, a, j.cutoff) for a in (joint, tendon, tension))
         y = {c: low_pass(r.trial.time, values, j.cutoff) for c, values in y.items()}
     counting = {c: r.mean(valid[c].astype(float)) > 1.0 - 1e-9 for c in y}  # all samples of the block

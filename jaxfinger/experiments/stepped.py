@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from jaxfinger.data import directions, filter_std, find_holds, low_pass, smooth_rate
-from jaxfinger.data.signals.motion import rest_speed
+from jaxfinger.data.signals.motion import from_the_start, rest_speed
 from jaxfinger.experiments.driven import CLEAR_WIDTHS, less_noise, sliding
 from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, runs_of_holds
 
@@ -39,7 +39,7 @@ def reduce(r: PreparedTrial) -> Row:
     qd, qdd, y = np.where(rests, 0.0, j.qd), less_noise(r, j), r.y
     if r.reduced:
         # q̈ keeps its noise in holds, where it is zero, since one noise stands for all samples of a channel.
-        joint, *filtered = (low_pass(r.trial.time, a, j.cutoff) for a in (joint, *y.values()))
+        joint, *filtered = (low_pass(r.trial.time, a, j.cutoff) for a in (from_the_start(joint), *y.values()))
         y = dict(zip(y, filtered, strict=True))
     else:
         qdd = np.where(rests, 0.0, qdd)

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse.csgraph import connected_components
 
 from jaxfinger.identify.gauss_newton import MIN_RELATIVE_SINGULAR_VALUE
 from jaxfinger.identify.parameters import Parameter
@@ -87,21 +88,37 @@ def name_invisible(
     """Sentences on what is undetermined, each with a remedy; the rows of `invisible` are orthonormal.
 
     Of the space that these rows span any other basis is as good. So parameters that lie in it by themselves are named
-    together, and a combination is one of several parameters that trade off.
+    together. Others are named by combinations of those that trade off, in one sentence for each remedy; parameters that
+    do not trade off with each other share no combination.
     """
     alone = np.sum(invisible**2, axis=0) > 1.0 - MIN_SHOWN_ENTRY**2
-    _, kept, rest = np.linalg.svd(np.where(alone, 0.0, invisible), full_matrices=False)  # singular values of 0 or 1
-    sentences = []
+    sentences, combinations = [], {}
     if alone.any():
         names = ", ".join(parameters[i].name for i in free[alone])
         sentences.append(f"the trials do not show {names}; record {_remedy(parameters, free[alone])}")
-    for v in rest[kept > 0.5]:
+    for v in _apart(np.where(alone, 0.0, invisible)):
         names = " ".join(f"{c:+.2f}·[{name}]" for name, c in _shares(parameters, free, v).items())
+        combinations.setdefault(_remedy(parameters, _involved(free, v)), []).append(names)
+    for remedy, names in combinations.items():
         sentences.append(
-            f"the trials cannot see the combination {names} (in units of each parameter's own column); "
-            f"record {_remedy(parameters, _involved(free, v))}"
+            f"the trials cannot see the combination{'s' * (len(names) > 1)} {', '.join(names)} "
+            f"(in units of each parameter's own column); record {remedy}"
         )
     return sentences
+
+
+def _apart(rows: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "r p"]:
+    """Basis of the space that orthonormal rows span, some columns set to zero, each vector in one group of entries.
+
+    Entries are in one group where the projection onto that space carries one into the other, directly or by others.
+    """
+    projection = rows.T @ rows
+    count, group = connected_components(np.abs(projection) > MIN_SHOWN_ENTRY**2)
+    found = [np.zeros((0, len(group)))]
+    for here in (group == k for k in range(count)):
+        shares, vectors = np.linalg.eigh(np.where(np.outer(here, here), projection, 0.0))
+        found.append(vectors.T[shares > 0.5])  # 0 or 1, but for what links groups by less than is shown
+    return np.concatenate(found)
 
 
 def name_traded(
@@ -130,7 +147,9 @@ def name_traded(
 
 
 def _shares(parameters, free, v) -> dict[str, float]:
-    return {parameters[free[k]].name: float(v[k]) for k in np.argsort(-np.abs(v)) if abs(v[k]) > MIN_SHOWN_ENTRY}
+    """Entries that are shown, the largest first and positive; those of one size in the order of the parameters."""
+    order = [k for k in np.argsort(-np.abs(v).round(2), kind="stable") if abs(v[k]) > MIN_SHOWN_ENTRY]
+    return {parameters[free[k]].name: float(v[k] * np.sign(v[order[0]])) for k in order}
 
 
 def _involved(free, v) -> Int[np.ndarray, " k"]:

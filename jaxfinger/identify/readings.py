@@ -104,15 +104,18 @@ def _constant(trial: Trial, session: Session) -> dict[str, Bool[np.ndarray, " co
 
 
 def name_constant(reads: Mapping[str, Collection[str]], session: Session) -> list[str]:
-    """One sentence for each column of the channels `reads`, by experiment, that never changes in some trials."""
+    """One sentence for the columns of each channel that `reads` has that never change in the same trials."""
     found: dict[tuple[str, str, float], list[str]] = {}
     for t in (t for t in session if t.experiment in reads):
         for channel, still in _constant(t, session).items():
             for k in np.flatnonzero(still) if channel in reads[t.experiment] else ():
                 column, value = CHANNELS[channel].columns(session.finger)[k], getattr(t, channel)[0, k] + 0.0
                 found.setdefault((channel, column, float(value)), []).append(t.name)
+    alike: dict[tuple, list[str]] = {}
+    for (channel, column, value), names in found.items():
+        alike.setdefault((channel, value, tuple(names)), []).append(column)
     return [
-        f"{channel} {column} is {value:.4g} at every sample of {listed(names)}, as no sensor is, and is not read "
-        "there: check its cable and its column"
-        for (channel, column, value), names in found.items()
+        f"{channel} {listed(columns)} {'is' if len(columns) == 1 else 'are'} {value:.4g} at every sample of "
+        f"{listed(names)}, as no sensor is, and not read there: check cable and column"
+        for (channel, value, names), columns in alike.items()
     ]

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
-from jaxfinger.data import Session
+from jaxfinger.data import Session, joints_of
+from jaxfinger.data.signals.quantiles import quantile
 from jaxfinger.data.signals.sizes import highest_tension
 from jaxfinger.experiments import prepare
 from jaxfinger.identify import Fit
@@ -20,6 +21,7 @@ from jaxfinger.report.measured import Points, arm_points, hold_points, loss_poin
 
 ROUNDING = 1e-12  # of the largest torque of gravity: less is what rounding leaves of none
 SAMPLES = 61  # Points of a curve: two degrees apart over a range of 120°, closer than a figure resolves.
+EXTREME = 0.01  # share of a trial's angles that spikes may be: a curve leaves out as many at either end
 MAX_TENSION = 12.0  # N, where curves of lost tension end without a session: a fifth above the paper's highest, 10 N
 
 
@@ -38,7 +40,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class JointCurves:
-    """One joint over its range, torques in N mm (N for a prismatic joint) against degrees (mm)."""
+    """One joint where ID.3 moved it, torques in N mm (N for a prismatic joint) against degrees (mm)."""
 
     elastic: Curve
     friction: Curve
@@ -64,7 +66,8 @@ def curves(fit: Fit, session: Session | None = None) -> Curves:
     """Compute the curves of a fit over each joint's range, the other joints in the middle of theirs.
 
     Curves without an estimated parameter are left out. A session adds measured points: slopes of the excursions of
-    ID.2, torques of the holds of ID.3-static, losses of the holds of ID.4. The loss goes to its highest tension.
+    ID.2, torques of the holds of ID.3-static, losses of the holds of ID.4. The loss goes to its highest tension, and
+    the other curves end where its trials do that the fit has read: a polynomial says nothing beyond.
     """
     return model_curves(fit) if session is None else _with_points(model_curves(fit, session), fit, session)
 
@@ -84,19 +87,16 @@ def _with_points(found: Curves, fit: Fit, session: Session) -> Curves:
 
 
 def model_curves(fit: Fit, session: Session | None = None) -> Curves:
-    """Compute the curves without measured points; the loss up to the highest tension of `session`."""
+    """Compute the curves without measured points, over the angles and tensions of `session` (`curves`)."""
     tension = MAX_TENSION if session is None else highest_tension(session) or MAX_TENSION
     model, finger = fit.model, fit.model.finger
-    limits = np.asarray(finger.limits)
     m, S = finger.m, SAMPLES
-    q = np.tile(limits.mean(axis=1)[:, None, None], (1, m, S))
-    for i in range(m):
-        q[i, i] = np.linspace(limits[i, 0], limits[i, 1], S)
+    led, swept = (_each_through(_moved(fit, session, stage)) for stage in ("ID.2", "ID.3"))
     f = np.linspace(0.0, tension, S)
-    values, std = fit.function(_Values(*jax.device_put((q, np.tile(f, (finger.n, 1))))))
+    values, std = fit.function(_Values(*jax.device_put((led, swept, np.tile(f, (finger.n, 1))))))
     cuts = np.cumsum((finger.n * m * S, m * S, m * S, m))
     arms, elastic, friction, damping, loss = zip(np.split(values, cuts), np.split(std, cuts), strict=True)
-    gravity = np.asarray(_gravity_torque(model.finger, jax.device_put(q)))
+    gravity = np.asarray(_gravity_torque(model.finger, jax.device_put(swept)))
     gravity = np.where(np.abs(gravity) > ROUNDING * np.abs(gravity).max(initial=0.0), gravity, 0.0)
 
     def shaped(pair, shape):
@@ -110,15 +110,15 @@ def model_curves(fit: Fit, session: Session | None = None) -> Curves:
     estimated = _estimated(fit)
     return Curves(
         {
-            (t, j): Curve(q[i, i] * angle[i], arms[0][k, i] * torque[i], arms[1][k, i] * torque[i])
+            (t, j): Curve(led[i, i] * angle[i], arms[0][k, i] * torque[i], arms[1][k, i] * torque[i])
             for k, t in enumerate(finger.tendon_names)
             for i, j in enumerate(finger.joint_names)
             if (t, j) in estimated
         },
         {
             j: JointCurves(
-                Curve(q[i, i] * angle[i], elastic[0][i] * torque[i], elastic[1][i] * torque[i]),
-                Curve(q[i, i] * angle[i], friction[0][i] * torque[i], friction[1][i] * torque[i]),
+                Curve(swept[i, i] * angle[i], elastic[0][i] * torque[i], elastic[1][i] * torque[i]),
+                Curve(swept[i, i] * angle[i], friction[0][i] * torque[i], friction[1][i] * torque[i]),
                 gravity[i, i] * torque[i],
                 (float(damping[0][i] * torque[i]), float(damping[1][i] * torque[i])),
                 finger.prismatic[i],
@@ -128,6 +128,29 @@ def model_curves(fit: Fit, session: Session | None = None) -> Curves:
         },
         {t: Curve(f, loss[0][k], loss[1][k]) for k, t in enumerate(finger.tendon_names) if t in estimated},
     )
+
+
+def _moved(fit: Fit, session: Session | None, experiment: str) -> Float[np.ndarray, "m 2"]:
+    """Range of each joint in the trials of an experiment that the fit has read, rad or m; its limits without one."""
+    ranges = np.asarray(fit.model.finger.limits).copy()
+    if session is None:
+        return ranges
+    read = {name for stage in fit.stages for name in stage.trials}
+    trials = [t for t in session if t.name in read and t.experiment.startswith(experiment) and len(t.time)]
+    for i, joint in enumerate(fit.model.finger.joint_names):
+        seen = [t.q[:, i] for t in trials if joint in joints_of(t, session.finger)]
+        if seen:
+            ranges[i] = min(quantile(q, EXTREME) for q in seen), max(quantile(q, 1.0 - EXTREME) for q in seen)
+    return ranges
+
+
+def _each_through(ranges: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m m S"]:
+    """Angles of all joints, one joint after another through its range and the others in the middle of theirs."""
+    m = len(ranges)
+    q = np.tile(ranges.mean(axis=1)[:, None, None], (1, m, SAMPLES))
+    for i, (low, high) in enumerate(ranges):
+        q[i, i] = np.linspace(low, high, SAMPLES)
+    return q
 
 
 def _estimated(fit: Fit) -> set:
@@ -149,16 +172,17 @@ def _estimated(fit: Fit) -> set:
 class _Values(eqx.Module):
     """Function of a model that returns all curves as one flat vector: one derivative gives all standard deviations."""
 
-    q: Float[Array, "m m S"]
+    led: Float[Array, "m m S"]  # angles at which moment arms are wanted
+    swept: Float[Array, "m m S"]  # and torques
     tension: Float[Array, "n S"]
 
     def __call__(self, model: Model) -> Float[Array, " k"]:
-        own, h = np.arange(len(self.q)), model.joint_torque
-        C = model.moment_arm.coupling(self.q)  # (n, m, m, S); a joint's own angle varies in its own row
+        own, h = np.arange(len(self.led)), model.joint_torque
+        C = model.moment_arm.coupling(self.led)  # (n, m, m, S); a joint's own angle varies in its own row
         parts = (
             C[:, own, own],
-            h.elastic_torque(self.q)[own, own],
-            h.friction_magnitude(self.q)[own, own],
+            h.elastic_torque(self.swept)[own, own],
+            h.friction_magnitude(self.swept)[own, own],
             h.damping,
             model.tendon_friction.loss(self.tension),
         )

@@ -207,6 +207,7 @@ def test_torques_are_in_a_unit_that_suits_the_machine(capsys, size, unit, elasti
             {
                 "joint": "J",
                 "prismatic": False,
+                "range": [-10.0, 90.0],
                 "gravity": [1.0 * size, -12.0 * size],
                 "elastic": [66.3 * size, -13.0 * size, 2.0 * std],
                 "friction": [6.0 * size, 6.0 * size, None],

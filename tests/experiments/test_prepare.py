@@ -111,6 +111,19 @@ def test_a_joint_that_stops_turns_when_it_moves_again():
     assert abs(time[turned] - 2.5) < 0.1
 
 
+@pytest.mark.parametrize("experiment", ["ID.3-dynamic", "ID.3-static"])
+def test_friction_is_not_less_where_a_joint_starts_whose_direction_was_not_known_before(experiment):
+    """A joint that turns one way shows friction and elasticity together, and a filter must not tell them apart."""
+    time = np.arange(4000) / RATE
+    q = np.tile(np.interp(time, [0.0, 1.0, 3.0, 4.0], [0.2, 0.2, 0.8, 0.8])[:, None], (1, 3))
+    q += ENCODER * np.random.default_rng(6).standard_normal(q.shape)
+    torque = np.where(np.arange(3) == 0, 1e-2, np.nan) * np.ones_like(q)
+    batch = stack(Trial("one way", experiment, time, q, joint_torque=torque, joint=MCP)).batch
+    counts = np.asarray(batch.mask["joint_torque"])[0, 0] > 0
+    assert counts.sum() > 40
+    np.testing.assert_allclose(np.asarray(batch.x.joint_direction)[0, 0, counts], 1.0, atol=1e-12)
+
+
 def test_where_a_prediction_reads_no_acceleration_there_is_none():
     """At constant speed q̈ is the encoder's noise, 2 rad/s² after a filter that resolves reversals."""
     time = np.arange(6000) / RATE

@@ -43,6 +43,26 @@ def test_parameters_that_no_trial_touches_are_named_together_and_not_as_combinat
     assert "centre of mass MCP x" in traded
 
 
+def test_laws_of_different_joints_are_not_mixed_into_one_combination():
+    """Joints that turn one way only: each one's friction is its elastic torque. Any basis of that space may come."""
+    joints = ("MCP", "PIP", "DIP")
+    parameters = [
+        Parameter(f"{group} {j}^{power}", group, "N m", j)
+        for group in ("elastic", "friction")
+        for j in joints
+        for power in range(2)
+    ]
+    pairs = (np.eye(12)[:6] - np.eye(12)[6:]) / np.sqrt(2.0)
+    turn, _ = np.linalg.qr(np.random.default_rng(0).standard_normal((6, 6)))
+    said = name_invisible(parameters, np.arange(12), turn @ pairs)
+    assert len(said) == 3
+    for joint, sentence in zip(joints, said, strict=True):
+        for power in range(2):
+            assert f"+0.71·[elastic {joint}^{power}] -0.71·[friction {joint}^{power}]" in sentence
+        assert f"record ID.3-static of joint {joint}, every hold approached from both sides" in sentence
+        assert not any(other in sentence for other in joints if other != joint)
+
+
 def test_a_parameter_that_no_trial_touches_is_invisible():
     J = np.column_stack([np.ones(5), np.zeros(5), np.arange(5.0)])
     assert directions(PARAMETERS, np.arange(3), J.T @ J)[0].shares.keys() == {"elastic torque MCP^1"}

@@ -82,7 +82,7 @@ def test_a_stuck_encoder_is_no_moment_arm_of_zero(session):
 def test_validation_says_which_column_never_changes(short, short_truth):
     dead = changed(short, "tendon_excursion", lambda x: 0 * x, "VD.1")
     result = validate(short_truth, dead, ("VD.1",))
-    assert any("tendon_excursion T1 is 0 at every sample" in m for m in result.messages)
+    assert any("tendon_excursion T1, T2, T3, T4 are 0 at every sample" in m for m in result.messages)
     assert not [s for s in result.scores if s.channel == "tendon_excursion" and not s.method.startswith("∫")]
 
 

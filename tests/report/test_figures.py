@@ -11,7 +11,7 @@ import pytest
 from jaxfinger.cli.tables import fit_to_read, print_fit
 from jaxfinger.data import write_session
 from jaxfinger.errors import UserError
-from jaxfinger.identify import Fit, Recipe
+from jaxfinger.identify import Fit, Recipe, StageReport
 from jaxfinger.identify.fit_file import save_fit
 from jaxfinger.identify.parameters import describe, ravel, with_flat
 from jaxfinger.model import Finger
@@ -108,6 +108,28 @@ def test_losses_are_said_at_the_highest_tension_that_was_measured(fit, session, 
     said = capsys.readouterr().out
     assert f"Tendon friction {says}" in said
     assert not re.search(r"± 0\.0+\s", said)
+
+
+def test_curves_end_where_the_trials_of_the_fit_do(fit, session, capsys):
+    """A polynomial says nothing beyond them; the limits of a joint may lie far outside."""
+    wide = replace(session.finger, limits=20.0 * session.finger.limits)
+    finger, seen = Finger.from_description(wide), replace(session, finger=wide)
+    read = replace(
+        fit,
+        model=eqx.tree_at(lambda m: m.finger, fit.model, finger),
+        stages=(StageReport("ID.3-dynamic", "fitted", trials=tuple(session.trials)),),
+    )
+    found = model_curves(read, seen)
+    for i, joint in enumerate(finger.joint_names):
+        arm = next(c for (_, j), c in found.moment_arm.items() if j == joint)
+        for experiment, x in (("ID.3", found.joints[joint].elastic.x), ("ID.2", arm.x)):
+            q = np.concatenate([t.q[:, i] for t in session.select(joint=joint) if t.experiment.startswith(experiment)])
+            np.testing.assert_allclose([x[0], x[-1]], np.degrees([q.min(), q.max()]), atol=3.0)
+    print_fit(fit_to_read(read, seen), parameters=False)
+    (row,) = re.findall(r"^MCP +(\S+) to (\S+)° ", capsys.readouterr().out, re.M)
+    np.testing.assert_allclose(np.array(row, float), found.joints["MCP"].elastic.x[[0, -1]], atol=0.5)
+    outside = model_curves(replace(read, stages=()), seen).joints["MCP"].elastic.x
+    np.testing.assert_allclose(outside[[0, -1]], np.degrees(wide.limits[0]))
 
 
 def test_what_was_measured_lies_on_the_lines(fit, session):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+
 import numpy as np
 
 from jaxfinger.data.checks.jumps import check_jumps
@@ -55,12 +57,15 @@ def check_values(trial: Trial, finger: FingerDescription, sizes: Sizes, report: 
 def _constant_columns(trial: Trial, finger: FingerDescription, report: Report) -> None:
     """Report measured columns that never change: such a column is not connected."""
     for channel, still in constant_columns(trial, finger).items():
+        names, of_value = CHANNELS[channel].columns(finger), defaultdict(list)
         for k in np.flatnonzero(still):
-            value = getattr(trial, channel)[0, k] + 0.0  # −0 becomes 0.
+            of_value[getattr(trial, channel)[0, k] + 0.0].append(names[k])  # −0 becomes 0.
+        for value, alike in of_value.items():
+            columns, are, them = ("column", "is", "it") if len(alike) == 1 else ("columns", "are", "them")
             report.warning(
                 trial.place(channel),
-                f"column {CHANNELS[channel].columns(finger)[k]} is {value:.4g} at every sample, as no sensor is; check "
-                "its cable and its column, or leave it out",
+                f"{columns} {listed(alike)} {are} {value:.4g} at every sample, as no sensor is; check cable and "
+                f"column, or leave {them} out",
             )
 
 

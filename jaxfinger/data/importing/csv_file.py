@@ -12,7 +12,7 @@ import csv
 import re
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -46,6 +46,9 @@ _GROUPED = {
     for mark, other in (".,", ",.")
 }
 _ONE_GROUP = re.compile(r"^[+-]?[1-9]\d{0,2}[.,]\d{3}$")
+# What OpenSim's tables of motion say in their header, of the angles among their columns, and the unit that it means.
+_IN_DEGREES = re.compile(r"^\s*inDegrees\s*=\s*(yes|no)\s*$", re.IGNORECASE | re.MULTILINE)
+_ANGLES = {"yes": "deg", "no": "rad"}
 _SCOPE = "SampleTime[ms]"  # header of TwinCAT Scope, which writes a column of times in ms beside each channel
 
 
@@ -120,7 +123,9 @@ def load_csv(path: Path) -> Recording:
     columns = _columns(path, body, dialect, numeric)
     if scope:
         return _pairs(path, columns, names, units)
-    return _named(path, columns, names, units, remarks)
+    degrees = _IN_DEGREES.search("\n".join(line.text for line in above))
+    angles = _ANGLES[degrees[1].lower()] if degrees else ""
+    return replace(_named(path, columns, names, units, remarks), angles=angles)
 
 
 def _numbers_columns(dialect: _Dialect, body: Sequence[_Line]) -> bool:

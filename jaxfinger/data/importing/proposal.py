@@ -12,7 +12,7 @@ import numpy as np
 from jaxfinger.data.importing.columns import coarse_rate, restarts
 from jaxfinger.data.importing.recording import Recording
 from jaxfinger.data.importing.speeds import speeds
-from jaxfinger.data.importing.survey import ColumnSurvey, columns_of, is_set_point
+from jaxfinger.data.importing.survey import ColumnSurvey, columns_of, is_nameless, is_set_point
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
 from jaxfinger.data.units import TO_SI
@@ -169,6 +169,10 @@ def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _
     for channel in ("q", "joint_torque"):
         if own := [s for s in channels.get(channel, ()) if not _is_motor(s)]:
             channels[channel] = own
+    rivals, joints = {}, 0 if finger is None else len(finger.joint_names)
+    for channel in ("q", "joint_torque"):
+        if families := _families(channels.get(channel, ()), joints):
+            channels[channel], *rivals[channel] = families
     names = {channel: _names(channel, columns, finger) for channel, columns in channels.items()}
     experiment, joint, tendon = _experiment(recording, channels, names)
     if joint and len(channels.get("joint_torque", ())) == 1:
@@ -177,15 +181,19 @@ def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _
     lines += [f"joint = {quoted(joint)}   # that is moved, or held by the torque sensor"] if joint else []
     lines += [f"tendon = {quoted(tendon)}   # that is pulled"] if tendon else []
     coarse = coarse_rate(time)
+    guessed = "   # guessed: its values rise evenly" if clock is not None and is_nameless(clock.name) else ""
     if clock is None:
         lines.append('time = "?"   # no time was found: name its variable, or write `rate_hz`, samples per second')
         lines += _rate_by_speeds(logs[0])
     elif coarse is not None:
         lines.append(f"rate_hz = {coarse[1]:.4g}   # several samples share each stamp of {quoted(clock.name)}")
     elif clock.units in ("s", ""):
-        lines.append(f"time = {quoted(clock.name)}")
+        lines.append(f"time = {quoted(clock.name)}{guessed}")
     else:
-        lines.append(f'time = {{ from = {quoted(clock.name)}, units = "{clock.units}" }}')
+        lines.append(f'time = {{ from = {quoted(clock.name)}, units = "{clock.units}" }}{guessed}')
+    for channel, families in rivals.items():
+        named = [f"{_called(family[0])} to {_called(family[-1])}" for family in families]
+        lines.append(f"# {channel} could also be {' or '.join(named)}: take what was measured")
     if len(begins := restarts(time)):
         lines.append(f"# the time begins again after sample {begins[0]}: a trial for each part, chosen by `where`")
     elif coarse is None and (np.diff(time) <= 0.0).any():
@@ -199,8 +207,22 @@ def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _
         for channel, columns in channels.items()
     }
     read = {s for channel, columns in channels.items() for s in columns[: len(rows[channel])]}
+    read |= {s for families in rivals.values() for family in families for s in family}
     left_out = dict.fromkeys(s.name for log in logs for s in log.seen if s not in read and s.meaning != "time")
     return _Proposal(lines, rows, list(left_out))
+
+
+def _families(columns: Sequence[ColumnSurvey], count: int) -> list[list[ColumnSurvey]]:
+    """Sets of `count` columns each whose names differ in numbers alone, if these are all; those that change first.
+
+    None where there is one set only, or where some column is in no set: then they may be of different joints.
+    """
+    sets: dict[str, list[ColumnSurvey]] = {}
+    for s in columns:
+        sets.setdefault(re.sub(r"\d+", "#", f"{s.name} {s.column}"), []).append(s)
+    if len(sets) < 2 or any(len(family) != count for family in sets.values()):
+        return []
+    return sorted(sets.values(), key=lambda family: all(s.low == s.high for s in family))
 
 
 def _rate_by_speeds(log: _Log) -> list[str]:

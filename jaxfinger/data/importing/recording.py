@@ -42,7 +42,7 @@ class Recording:
 
     `unusable` holds the variables that give no numbers, each with the reason: the end of a sentence that begins with
     the name. `words` holds those of them that are text, (N,), which conditions can test. `remarks` are sentences about
-    the file as a whole.
+    the file as a whole. `angles` is the unit that it states of angles, whichever of its variables these are.
     """
 
     path: Path
@@ -50,6 +50,7 @@ class Recording:
     unusable: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     words: Mapping[str, np.ndarray] = field(default_factory=dict)
+    angles: str = ""
 
 
 def side_by_side(recordings: Sequence[Recording]) -> Recording:

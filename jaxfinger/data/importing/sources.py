@@ -34,7 +34,7 @@ def load_recording(path: Path) -> Recording:
             from jaxfinger.data.importing.matlab import load_mat
 
             return load_mat(path)
-        if kind in (".csv", ".txt", ".tsv", ".dat", ".asc"):
+        if kind in (".csv", ".txt", ".tsv", ".dat", ".asc", ".sto", ".mot"):
             from jaxfinger.data.importing.csv_file import load_csv
 
             return load_csv(path)

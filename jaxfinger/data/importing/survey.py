@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,18 +21,25 @@ _MEANINGS = (
     ("temperature", r"temp"),
     ("joint_torque", r"(^|_)tau|torque|effort|moment"),
     ("tendon_excursion", r"excursion|^l\d*$|length|pull|spool|linear|travel"),
-    ("tendon_force", r"tension|tendon.*force|^f_?t|^f(\d|_(?!([xyz]|tip)$))|cable|loadcell|(^|_)cell(_|\d|$)|^force"),
+    (
+        "tendon_force",
+        r"tension|tendon.*force|^f_?t|^f(\d|_(?!([xyz]|tip)$))|cable|load[ _-]?cell|(^|_)cell(_|\d|$)|^force",
+    ),
     ("fingertip_force", r"f?tip|contact|^f[xyz]$|wrench"),
     ("q", r"^q[_\d]*|_q(_|\d|$)|angle|pos|enc|theta|winkel|deg$"),
 )
 # Of a clock's values or steps: more values differ, also out of order, or more steps go on, also of a recording that was
 # pasted twice.
 _MIN_RUNNING = 0.5
+_NO_WORDS = "value", "data"  # at the end of a name, which say nothing of what they are: the word before them does
+# Name of a column of a table without names, and share of a clock's steps that its usual one is not twice or half of.
+_NAMELESS = r"column \d+"
+_MIN_EVEN = 0.9
 # Names of velocities, which belong to no channel, of set-points, which are not measured, and of switches and states.
 _VELOCITY = r"(?<![a-z])vel|speed|dot|^v$|^dq|(^|_)(d+q|qd+)(_|\d|$)"
 _STATE = r"enable|flag|status|valid|(^|_)(on|off|ok|mode|err|error|fault|alarm)(_|\d|$)"
 _SET_POINT = (
-    r"cmd|command|ref(?!l)|desired|set_?p(oin)?t|goal|target|demand|soll|feed_?forward"
+    r"cmd|command|cmptd|computed|ref(?!l)|desired|set_?p(oin)?t|goal|target|demand|soll|feed_?forward"
     r"|(?<![a-z])(q|tau|tau_j)_d(?![a-z])"
     r"|(?<![a-z])(q|tau|pos)?(des|set(?!\d+\.)|sp|ff|tgt|nominal|planned)(?![a-z])"
 )
@@ -102,10 +109,13 @@ def columns_of(recording: Recording, among: Sequence[Recording] = ()) -> list[Co
         table = variable.values.reshape(len(variable.values), -1)
         for k, x in enumerate(table.T):
             column = None if table.shape[1] == 1 else (variable.columns[k] if variable.columns else k)
-            units, stated = unit_name(variable.units), bool(unit_name(variable.units))
+            units = unit_name(variable.units)
             spelt = units or _spelt(name)
             foreign = variable.units if is_foreign(variable.units) and not spelt else ""
             meaning = _meaning(name, column, x, spelt)
+            if meaning == "q" and not (spelt or foreign):
+                units = spelt = recording.angles
+            stated = bool(units)
             if spelt:
                 units = spelt
             elif not stated and not foreign:
@@ -114,7 +124,27 @@ def columns_of(recording: Recording, among: Sequence[Recording] = ()) -> list[Co
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
             missing = len(x) - len(finite)
             found.append(ColumnSurvey(name, column, len(x), low, high, missing, units, stated, meaning, foreign))
+    if not any(s.meaning == "time" for s in found):
+        for k, s in enumerate(found):
+            x = np.ravel(recording.variables[s.name].values)
+            if is_nameless(s.name) and _rises_evenly(x):
+                found[k] = replace(s, meaning="time", units=_time_unit(x))
+                break
     return found
+
+
+def is_nameless(name: str) -> bool:
+    """Whether a column has no name in its recording, so that its values alone say what it may be."""
+    return re.fullmatch(_NAMELESS, name) is not None
+
+
+def _rises_evenly(x: np.ndarray) -> bool:
+    """Whether values rise by similar steps throughout, as times do. A count of samples does not show their times."""
+    steps = np.diff(x)
+    if len(x) < 3 or not np.all(steps > 0.0) or np.all(steps == 1.0):
+        return False
+    ratio = steps / np.median(steps)
+    return bool(np.mean((ratio > 0.5) & (ratio < 2.0)) > _MIN_EVEN)
 
 
 def _sizes(name: str, k: int, recording: Recording, among: Sequence[Recording]) -> list[float]:
@@ -161,7 +191,8 @@ def _steps(time: np.ndarray) -> np.ndarray:
 def _meaning(name: str, column: str | int | None, x: np.ndarray, units: str) -> str:
     """Channel or `time` by the last word of a name where the units allow it, else by the units; empty where unclear."""
     bare = re.sub(r"[\[(].*", "", name).strip("/ ")  # Units stand in brackets.
-    word = re.split(r"[./]", bare)[-1].lower()
+    *before, word = re.split(r"[./]", bare.lower())
+    word = before[-1] if before and word in _NO_WORDS else word
     if len(x) == 1 or re.search(_VELOCITY, word) or re.search(_STATE, word) or is_set_point(name):
         return ""
     for meaning, pattern in _MEANINGS:

@@ -76,6 +76,16 @@ def directions(rate: Float[np.ndarray, "N k"], threshold: Float[np.ndarray, " k"
     return np.where(known < 0, 0.0, np.sign(np.take_along_axis(rate, np.maximum(known, 0), axis=0)))
 
 
+def from_the_start(direction: Float[np.ndarray, "N k"]) -> Float[np.ndarray, "N k"]:
+    """Directions with the first known one also before it, for a filter: unknown friction is not absent friction.
+
+    With zeros there, a filter would show friction growing in the first known samples. In a joint that turns one way
+    only, nothing else tells friction from elasticity, and a fit would tell them by that.
+    """
+    first = np.argmax(direction != 0.0, axis=0)
+    return np.where(np.arange(len(direction))[:, None] < first, direction[first, np.arange(len(first))], direction)
+
+
 def directions_from_turning_points(
     sure: Float[np.ndarray, "N k"], x: Float[np.ndarray, "N k"], distance: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "N k"]:

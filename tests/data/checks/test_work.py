@@ -37,7 +37,7 @@ def test_a_sound_session_has_no_contradiction(sound):
         ("ID.3-dynamic", "joint_torque", lambda x: -x, "takes work out of the joint in every cycle: MCP"),
         ("ID.2", "tendon_excursion", lambda x: 1e-3 * x, "moment arms of 0.0"),
         ("ID.3-dynamic", "joint_torque", lambda x: 0 * x, "is 0 at every sample, as no sensor is"),
-        ("ID.2", "tendon_excursion", lambda x: 0 * x, "is 0 at every sample, as no sensor is"),
+        ("ID.2", "tendon_excursion", lambda x: 0 * x, "columns T1, T2 are 0 at every sample, as no sensor is"),
         ("VD.2", "fingertip_force", lambda x: 1e3 * x, "the fingertip presses with"),
     ],
 )

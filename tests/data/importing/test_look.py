@@ -74,6 +74,40 @@ def test_a_clock_is_told_or_asked_for_and_no_rate_is_invented(tmp_path, name, ti
     assert "rate_hz =" not in text
 
 
+def test_a_clock_without_a_name_is_the_column_that_rises_evenly(tmp_path):
+    """A count of samples does not show their times, and a joint that turns one way does so at several speeds."""
+    path, n = tmp_path / "log.csv", np.arange(500)
+    time = 1297.5 + np.cumsum(np.random.default_rng(0).choice([0.008, 0.010, 0.012], 500))
+    angle = np.cos(np.pi * (1.0 - n / 500))
+    for before, clock in (([], None), ([time], "column 2"), ([0.2 * n], "column 2")):
+        np.savetxt(path, np.column_stack([n, angle, *before, np.sin(n / 20)]), "%.6f", ",")
+        said = proposal([load_recording(path)])
+        assert (f'time = "{clock}"   # guessed' if clock else 'time = "?"') in said, said
+    np.savetxt(path, np.column_stack([n, angle, time, np.sin(n / 20)]), header="n q t tau", comments="")
+    assert 'time = "t"\n' in proposal([load_recording(path)])
+
+
+@pytest.mark.parametrize("name", ["Load Cell1", "load_cell_2", "LoadCell"])
+def test_a_load_cell_shows_a_tension(name, tmp_path):
+    path = tmp_path / "log.csv"
+    np.savetxt(path, np.column_stack([TIME, 5 + np.sin(TIME)]), "%.6f", ",", header=f"t,{name}", comments="")
+    assert columns_of(load_recording(path))[1].meaning == "tendon_force"
+
+
+def test_of_several_sets_of_torques_one_that_changes_is_read_and_the_others_are_named(tmp_path):
+    """A robot's log has torques of sensors, of currents and of its own model, without a word on which is which."""
+    path, torques = tmp_path / "log.csv", [np.sin(TIME / 1e3), np.cos(TIME / 1e3)]
+    angles, dead = [0.5 + 0.5 * np.sin(TIME / 1e3), 0.5 + 0.5 * np.cos(TIME / 1e3)], [0.0 * TIME, 0.0 * TIME]
+    names = "t,Position1,Position2,TorqueSm1,TorqueSm2,Torque1,Torque2,TorqueCur1,TorqueCur2"
+    table = np.column_stack([TIME, *angles, *dead, *torques, *torques])
+    np.savetxt(path, table, "%.6f", ",", header=names, comments="")
+    said = proposal([load_recording(path)], make_finger())
+    assert 'channels.joint_torque.PIP = { from = "Torque2"' in said
+    others = '"TorqueCur1" to "TorqueCur2" or "TorqueSm1" to "TorqueSm2"'
+    assert f"# joint_torque could also be {others}: take what was measured" in said
+    assert "in no channel yet" not in said
+
+
 def test_a_log_without_angles_belongs_to_the_angles_of_its_time(tmp_path):
     """The torque sensor's logger runs on its own clock; two sweeps at other times are two trials."""
     for k, start in enumerate((0.0, 100.0), 1):
@@ -236,7 +270,7 @@ def test_cells_may_read_gram_force(unit, newtons):
      ("des.q", "q"), ("pos_sp", "pos"), ("goal.joint.position", "joint.position"), ("enc_nominal", "enc_offset"),
      ("SetPoint.q", "dataset.q"), ("set.angle", "set1.angle"), ("qset", "q_reflex"),
      ("/hand/goals.position", "/target/joint_states.position"), ("state.q_d", "state.q"),
-     ("target_q_0", "actual_q_0")],
+     ("target_q_0", "actual_q_0"), ("PositionCmptd1", "Position1")],
 )  # fmt: skip
 def test_a_measured_column_wins_over_its_set_point(tmp_path, set_point, measured):
     """A torque's feedforward is a set-point as well."""
@@ -337,3 +371,21 @@ def test_joints_that_are_named_by_number_are_taken_in_its_order(tmp_path, column
     assert f'channels.q.MCP = {{ from = "{first}"' in said
     assert f'channels.q.PIP = {{ from = "{second}"' in said
     assert 'joint = "MCP"' in said
+
+
+@pytest.mark.parametrize(
+    ("degrees", "units", "stated"),
+    [("inDegrees=yes", "deg", True), ("inDegrees=no", "rad", True), ("DataType=double", "rad", False)],
+)
+def test_the_header_of_a_table_of_opensim_states_the_units_of_its_angles(degrees, units, stated, tmp_path):
+    """Small angles could be in rad. Speeds, lengths and forces in the same table are in no such unit."""
+    path = tmp_path / "ik.mot"
+    head = f"Coordinates\nversion=1\nnRows=40\nnColumns=4\n{degrees}\n\nendheader\n"
+    names = "time\t/jointset/knee/knee_angle/value\t/jointset/knee/knee_angle/speed\tsoleus_force\n"
+    rows = "".join(f"{0.1 * k:.2f}\t{0.05 * k:.3f}\t{k}\t{k}\n" for k in range(40))
+    path.write_text(head + names + rows)
+    time, angle, speed, force = columns_of(load_recording(path))
+    assert (time.meaning, time.units) == ("time", "s")
+    assert (angle.meaning, angle.units, angle.stated) == ("q", units, stated)
+    assert (speed.meaning, speed.units, force.units) == ("", "", "")
+    assert f'from = "{angle.name}", units = "{units}"' in proposal([load_recording(path)])
