@@ -182,7 +182,7 @@ class ElasticRelaxation(CatalogueEffect):
     def next_memory(self, memory, before, drive):
         (t0, q0), (t, q) = before, drive
         halfway = spectrum.decay(self.T, self.decades, 0.5 * (t - t0))
-        return memory * halfway**2 + (q - q0) * halfway
+        return memory * halfway**2 + (q - q0)[None] * halfway
 
     def torque(self, x, memory, h):
         return h.at[self.index[0]].add(self.stiffness * memory.mean(axis=0))

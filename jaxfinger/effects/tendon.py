@@ -57,7 +57,7 @@ class TendonCreep(CatalogueEffect):
 
     def next_memory(self, memory, before, drive):
         (t0, _), (t, f) = before, drive
-        return f + (memory - f) * spectrum.decay(self.T, self.decades, t - t0)
+        return f[None] + (memory - f[None]) * spectrum.decay(self.T, self.decades, t - t0)
 
     def excursion(self, x, memory, f, l):
         return l.at[self.index[0]].add(self.compliance * memory.mean(axis=0))

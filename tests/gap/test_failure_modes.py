@@ -152,3 +152,13 @@ def test_a_joint_that_stiffens_at_both_ends_is_told_from_one_that_stiffens_at_on
     assert values["end"].value == end
     for name in ("tau_end", "width"):
         assert abs(values[name].value - truth[2][name]) < 3.0 * values[name].std
+
+
+def test_a_wide_spectrum_is_told_from_one_relaxation_time():
+    truth = ("elastic_relaxation", ("PIP",), {"stiffness": 0.01, "T": 1.0, "decades": 2.0})
+    found = diagnose(session_with(truth), without=tuple(sorted(set(CATALOGUE) - {*RIVALS, truth[0]})))
+    assert found.status is Status.EXPLAINED
+    assert found.named == (Key(*truth[:2]),)
+    (relaxation,) = found.augmented.model.effects
+    assert float(relaxation.decades) == 2.0
+    np.testing.assert_allclose([float(relaxation.stiffness), float(relaxation.T)], [0.01, 1.0], rtol=0.2)
