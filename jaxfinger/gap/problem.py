@@ -207,8 +207,8 @@ def _refitted_to_all(
     `recurring`: as in `_noise_of_all`. Returns the fields of a `Problem` that follow from the refit.
     """
     parameters, coverage = describe(fit.model), coverage_of(stacks, session)
-    # Masses and centres of mass move within the uncertainty that CAD states.
-    cad = [i for i, p in enumerate(parameters) if p.group in ("mass", "com") and fit.covariance[i, i] > 0]
+    variance = np.diag(fit.covariance)
+    cad = np.flatnonzero((variance > 0.0) & np.isfinite(variance))  # what the description gives with an uncertainty
     free = np.union1d(fit.estimated, cad).astype(int)
     reads = {e: stack.experiment.channels for e, stack in stacks.items()}
 

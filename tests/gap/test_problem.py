@@ -81,6 +81,15 @@ def test_damping_without_its_own_experiment_is_fitted_where_else_it_shows(specim
     assert np.all(truth[damping] > 3.0 * fit.std[damping])  # The trials do determine it.
 
 
+def test_a_rotor_moves_within_the_uncertainty_that_the_description_states(session):
+    """As masses do: else a mass, or a cause, would make up for what is known to be uncertain. The finger has none."""
+    finger = replace(session.finger, rotor_inertia=np.array([1e-4]), rotor_inertia_std=np.array([1e-4]))
+    fit = nominal_fit(build(replace(session, finger=finger), Recipe())).fit
+    (rotor,) = [i for i, p in enumerate(describe(fit.model)) if p.group == "rotor_inertia"]
+    assert fit.std[rotor] < 2e-5
+    assert abs(np.asarray(ravel(fit.model))[rotor]) < 4.0 * fit.std[rotor]
+
+
 def test_a_problem_moves_along_its_own_jacobian(problem):
     """For steps of a thousandth of a standard deviation, exact residuals change as the Jacobian says."""
     step = 1e-3 / np.linalg.norm(np.vstack([problem.J, problem.root]), axis=0)

@@ -184,13 +184,14 @@ def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _
     guessed = "   # guessed: its values rise evenly" if clock is not None and is_nameless(clock.name) else ""
     if clock is None:
         lines.append('time = "?"   # no time was found: name its variable, or write `rate_hz`, samples per second')
-        lines += _rate_by_speeds(logs[0])
     elif coarse is not None:
         lines.append(f"rate_hz = {coarse[1]:.4g}   # several samples share each stamp of {quoted(clock.name)}")
     elif clock.units in ("s", ""):
         lines.append(f"time = {quoted(clock.name)}{guessed}")
     else:
         lines.append(f'time = {{ from = {quoted(clock.name)}, units = "{clock.units}" }}{guessed}')
+    if clock is None or is_nameless(clock.name):
+        lines += _rate_by_speeds(logs[0])
     for channel, families in rivals.items():
         named = [f"{_called(family[0])} to {_called(family[-1])}" for family in families]
         lines.append(f"# {channel} could also be {' or '.join(named)}: take what was measured")
@@ -226,7 +227,7 @@ def _families(columns: Sequence[ColumnSurvey], count: int) -> list[list[ColumnSu
 
 
 def _rate_by_speeds(log: _Log) -> list[str]:
-    """A comment on the sampling rate at which some columns of a log without a clock are the speeds of others."""
+    """A comment on the sampling rate at which some columns of a log without a named clock are the speeds of others."""
     seen = [s for s in log.seen if s.samples == log.count and s.meaning in ("", "q")]
     found = speeds([_values(log.recording, s) for s in seen])
     if not found:

@@ -319,6 +319,8 @@ def test_speeds_tell_the_rate_of_a_log_without_a_clock(tmp_path, rate):
     found = re.findall(r'"column (\d)" of "column (\d)" at ([\d.]+)', said)
     assert [pair[:2] for pair in found] == [("3", "0"), ("4", "1")]
     assert [float(pair[2]) for pair in found] == pytest.approx([rate, rate], rel=0.01)
+    np.savetxt(path, np.column_stack([t, *columns]), delimiter=",")  # a guessed clock, which the speeds confirm
+    assert '"column 4" of "column 1" at ' in proposal([load_recording(path)])
     np.savetxt(path, np.column_stack([t, *columns]), delimiter=",", header="t,a,b,c,d,e,f", comments="")
     assert "# speeds" not in proposal([load_recording(path)])
 
