@@ -1,7 +1,8 @@
 """Reduction of trials in which a motor steps a joint from hold to hold (ID.3-static).
 
 A sample is valid in a hold whose direction of approach is known, which gives the direction of friction, and in motion
-in which the joint slides. For a fit both sides of (1) pass the same low-pass; for a prediction they do not.
+in which the joint slides. For a fit both sides of (1) pass the same low-pass; for a prediction they do not. Motion does
+not count for a fit where noise of angles hides its inertia (`Sizes.crossing`): one noise stands for all samples.
 """
 
 import numpy as np
@@ -33,6 +34,7 @@ def reduce(r: PreparedTrial) -> Row:
     slides, approached = sliding(r, j, slow, joint, None, clear), _constant(joint, round(clear / r.step))
     at = r.whole(hold)
     known, led = (r.mean(a.astype(float)) > 1.0 - 1e-9 for a in (slides, approached))  # all samples of the block
+    known &= not r.reduced or r.sizes.crossing >= r.experiment.cutoff
     counting = dict.fromkeys(r.y, ((at >= 0)[:, None] & led) | known)
     reach = round(FAR_WIDTHS * filter_std(j.cutoff) / r.step) if r.reduced else 0
     rests = minimum_filter1d(hold >= 0, 2 * reach + 1)[:, None]

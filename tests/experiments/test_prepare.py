@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import Session, Trial, filter_std, low_pass
-from jaxfinger.data.signals.sizes import SLACK_SHARE
+from jaxfinger.data.signals.sizes import SLACK_SHARE, sizes_of
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, driven, not_judged, prepare
 from jaxfinger.synthetic import paper_finger
@@ -379,6 +379,18 @@ def stairs(first: float, duration=8.0, seed=2):
     q += ENCODER * np.random.default_rng(seed).normal(size=q.shape)
     torque = np.where(np.arange(3) == 0, 1e-2, np.nan) * np.ones_like(q)
     return Trial("steps", "ID.3-static", time, q, joint_torque=torque, joint=MCP)
+
+
+@pytest.mark.parametrize(("crossing", "moves"), [(6.0, True), (4.0, False)])
+def test_holds_alone_count_for_a_fit_where_noise_of_angles_hides_the_inertia(crossing, moves):
+    """Noise of q̈, times an inertia, is in motion alone. The cut-off is at 5 Hz."""
+    session = Session("a finger", FINGER, {"stairs": stairs(1.0)})
+    sizes = replace(sizes_of(session), crossing=crossing)
+    for reduced, expected in ((True, moves), (False, True)):
+        found = prepare(session, sizes=sizes, reduced=reduced)["ID.3-static"]
+        counts = np.asarray(found.batch.mask["joint_torque"])[0, 0] > 0
+        assert counts[found.holds[0] >= 0].mean() > 0.5
+        assert counts[found.holds[0] < 0].any() == expected
 
 
 @pytest.mark.parametrize("given", [True, False])

@@ -44,12 +44,12 @@ def machine(mass: float, length: float, rotor: float, rate: float, noise: float,
     ]
     terms = {
         "joints": {
-            j: {"elastic": [-0.2 * w, 1.5 * w], "friction": [0.15 * w], "damping": 0.02 * w}
-            for j, w in zip(JOINTS, weight, strict=True)
+            j: {"elastic": [-0.2 * w, 2.0 * w], "friction": [friction * w], "damping": 0.02 * w}
+            for j, w, friction in zip(JOINTS, weight, (0.15, 0.03), strict=True)
         },
         "tendons": {
-            t: {"constant": 0.01 * pull, "proportional": a}
-            for t, a in zip(TENDONS, (0.05, 0.14, 0.1, 0.02), strict=True)
+            t: {"constant": 0.015 * pull, "proportional": a}
+            for t, a in zip(TENDONS, (0.01, 0.12, 0.08, 0.12), strict=True)
         },
     }
     steps = {"tensions": [0.4 * pull, 0.6 * pull, 0.8 * pull, pull]}
@@ -81,7 +81,7 @@ def machine(mass: float, length: float, rotor: float, rate: float, noise: float,
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("mass", "length", "rotor", "rate", "noise", "encoder"),
-    [(9.0, 2.8, 30.0, 200.0, 2e-3, 3e-4), (8.0, 0.2, 2.5, 500.0, 9e-4, 1e-4)],
+    [(9.0, 2.8, 30.0, 200.0, 1e-3, 3e-4), (0.08, 0.25, 30.0, 1000.0, 1e-3, 5e-4)],
 )
 def test_a_machine_that_lacks_nothing_has_no_gap(mass, length, rotor, rate, noise, encoder):
     session = simulate(recipe_from(machine(mass, length, rotor, rate, noise, encoder)), seed=1)
