@@ -2,8 +2,8 @@
 
 A held tendon slips only where its loss is exceeded, and otherwise keeps its tension at the joints
 (`tendon_friction.held`, from slack on). Valid samples are holds, and changes in which the model knows where the tendon
-slips: a step in the direction of one in which it has slipped, and ramps so slow that the tension hardly changes within
-a block.
+slips: a step that goes on in one direction and in which it slips or sticks all through, and ramps so slow that the
+tension hardly changes within a block.
 """
 
 from itertools import pairwise
@@ -159,8 +159,8 @@ def _continues(
     """Whether a sample lies between holds in a step that every tendon takes in the direction of its last one.
 
     A tendon that turns back or leaves slack sticks first and then slips within one block, whose mean tension does not
-    tell when. Once released it may stick for several steps. It slips all through a step if it slipped in the one
-    before, as the change of the `load` tells.
+    tell when. Once released it may stick for several steps. Within a step it sticks all through if the `load` after it
+    is that before it, and slips all through if it slipped in the one before, as the change of the load tells.
 
     The noise of the tension enters a step, and not the mean of a hold. Where its load exceeds the noise of the load,
     which includes the `error` of a converter, the step does not count: one noise stands for all samples of a channel.
@@ -176,9 +176,10 @@ def _continues(
     slipped = per_newton > MIN_SLIP_SHARE * per_newton.max()
     of_tension, of_load = (np.sqrt(np.mean([x[run].var(axis=0) for run in runs], axis=0)) for x in (tension, load))
     noise = per_newton * np.linalg.norm(of_tension * np.abs(ways), axis=1)
-    quiet = noise <= np.linalg.norm(np.hypot(of_load, error))
+    least = np.linalg.norm(np.hypot(of_load, error))
+    quiet, sticks = noise <= least, np.linalg.norm(changes, axis=1) <= least
     for k in range(1, len(ways)):
         goes_on = np.all((ways[k] == ways[k - 1]) | (ways[k] == 0))
-        if goes_on and quiet[k] and (slipped[k - 1] or not released[k]):
+        if goes_on and quiet[k] and (sticks[k] or slipped[k - 1] or not released[k]):
             out[runs[k][-1] + 1 : runs[k + 1][0]] = True
     return out

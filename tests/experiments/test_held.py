@@ -86,6 +86,28 @@ def test_steps_count_where_the_noise_of_the_tension_is_less_than_that_of_the_loa
     assert np.std(residual[60:][counts[60:]]) < 1.5 * np.std(residual[rests])
 
 
+def test_a_released_tendon_counts_while_it_sticks_all_through_a_step_and_once_it_slips():
+    """It sticks until the tension has fallen by the friction of both directions; that step is not known."""
+    rng, loss, arm = np.random.default_rng(6), 0.3, 6e-3
+    heights = np.array([0.0, 2.0, 3.0, 4.0, 3.75, 3.5, 3.25, 3.0, 2.75, 2.5, 2.25, 2.0, 1.75, 1.5])
+    time = np.arange(round((heights.size - 1) * RATE)) / RATE
+    second = np.floor(time).astype(int)
+    level = heights[second] + np.interp(time - second, [0.0, 0.3], [0.0, 1.0]) * np.diff(heights)[second]
+    hold = np.where(time - second > 0.35, second, -1).astype(np.int32)
+    tension = level[:, None] * (np.arange(FINGER.n) == 0)
+    q = np.tile(np.radians([40.0, 30.0, 20.0]), (time.size, 1))
+    torque = np.full(q.shape, np.nan)
+    torque[:, 0] = -arm * joint_tension(tension.T, loss * tension.T)[0] + 1e-5 * rng.standard_normal(time.size)
+    found = stack(Trial("pull", "ID.4", time, q, tension, joint_torque=torque, joint=MCP, tendon="T1", hold=hold))
+    counts = np.asarray(found.batch.mask["joint_torque"])[0, 0] > 0
+    between = [counts[20 * k : 20 * k + 6].all() for k in range(heights.size - 1)]
+    falls = np.diff(heights) < 0.0
+    turns, slips = (int(np.argmax(x)) for x in (falls, falls & (heights[1:] * (1 + loss) < 4.0 * (1 - loss))))
+    sticking, slipping = range(turns + 1, slips), range(slips + 1, heights.size - 1)
+    assert len(sticking) > 3
+    assert [k for k in range(turns, len(between)) if between[k]] == [*sticking, *slipping]
+
+
 @pytest.mark.parametrize("reduced", [True, False])
 def test_slow_ramps_of_tension_count_without_holds(reduced):
     trial = ramps(4.0)
