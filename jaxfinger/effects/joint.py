@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfinger.effects import spectrum
 from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
 from jaxfinger.effects.presliding import dahl, delta
+from jaxfinger.effects.spectrum import RelaxingEffect
 
 
 class JointStribeck(CatalogueEffect):
@@ -152,7 +152,7 @@ class JointStop(_TowardsAnEnd):
         return h.at[i].add(self.end * force)
 
 
-class ElasticRelaxation(CatalogueEffect):
+class ElasticRelaxation(RelaxingEffect):
     """stiffness · z, ż = q̇ − z/T: a Maxwell branch beside the elastic torque, which relaxes at a hold.
 
     With `decades` z is the mean over a spectrum of times about T.
@@ -167,21 +167,13 @@ class ElasticRelaxation(CatalogueEffect):
 
     stiffness: Float[Array, ""] = amplitude("N m/rad", 0.3, "torque/angle")
     T: Float[Array, ""] = shape("s", (0.003, 0.01, 0.03, 0.1, 0.3, 1.0), "trial")
-    decades: Float[Array, ""] = spectrum.width()
-
-    @classmethod
-    def shapes(cls, finger, site, scales):
-        return spectrum.thinned(super().shapes(finger, site, scales))
 
     def drive(self, model, x):
         return x.time, x.q[self.index[0]]
 
-    def initial_memory(self, drive):
-        return spectrum.at_rest(drive[1])
-
     def next_memory(self, memory, before, drive):
         (t0, q0), (t, q) = before, drive
-        halfway = spectrum.decay(self.T, self.decades, 0.5 * (t - t0))
+        halfway = self.decay(0.5 * (t - t0))
         return memory * halfway**2 + (q - q0)[None] * halfway
 
     def torque(self, x, memory, h):

@@ -6,8 +6,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfinger.effects import spectrum
 from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
+from jaxfinger.effects.spectrum import RelaxingEffect
 
 
 class TendonStretch(CatalogueEffect):
@@ -29,7 +29,7 @@ class TendonStretch(CatalogueEffect):
         return l.at[k].add(self.compliance * (taut + self.toe * self.f0 * (1.0 - jnp.exp(-taut / self.f0))))
 
 
-class TendonCreep(CatalogueEffect):
+class TendonCreep(RelaxingEffect):
     """compliance · y, T ẏ = f − y: the tendon creeps under held tension (Kelvin–Voigt).
 
     With `decades` y is the mean over a spectrum of times about T, and creep goes on with the logarithm of time.
@@ -43,21 +43,13 @@ class TendonCreep(CatalogueEffect):
 
     compliance: Float[Array, ""] = amplitude("m/N", 0.01, "excursion/tension")
     T: Float[Array, ""] = shape("s", (0.015, 0.05, 0.15, 0.5, 1.5), "trial")
-    decades: Float[Array, ""] = spectrum.width()
-
-    @classmethod
-    def shapes(cls, finger, site, scales):
-        return spectrum.thinned(super().shapes(finger, site, scales))
 
     def drive(self, model, x):
         return x.time, x.tension[self.index[0]]
 
-    def initial_memory(self, drive):
-        return spectrum.at_rest(drive[1])
-
     def next_memory(self, memory, before, drive):
         (t0, _), (t, f) = before, drive
-        return f[None] + (memory - f[None]) * spectrum.decay(self.T, self.decades, t - t0)
+        return f[None] + (memory - f[None]) * self.decay(t - t0)
 
     def excursion(self, x, memory, f, l):
         return l.at[self.index[0]].add(self.compliance * memory.mean(axis=0))

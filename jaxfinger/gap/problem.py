@@ -24,12 +24,13 @@ from jaxfinger.experiments import Stack
 from jaxfinger.gap.merged_trials import MergedTrials, merged_trials
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
+from jaxfinger.identify.dead_zone import clear_of_dead_zones
 from jaxfinger.identify.intervals import stretches
 from jaxfinger.identify.linearise import White
 from jaxfinger.identify.noise import Noise, estimate, history, without_recurring_laws
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.prior import Prior, prior_of
-from jaxfinger.identify.readings import clear_of_dead_zones, readings_of
+from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.solve import Source, solve, white_tangents
 from jaxfinger.identify.stages import (
     Progress,
