@@ -123,7 +123,7 @@ class Search:
         if not self.table.offers:
             return state
         for _ in range(MAX_CHANGES):
-            better = self._better(state)
+            better = self._better(state) or self._with_other_choices(state)
             if better is None:
                 break
             state = self._pruned(better)
@@ -200,6 +200,13 @@ class Search:
             best = refit_from_plain(self.baseline, best)
             self.visited.add(best.keys, best.linear_fit.evidence, Weighed.EXACT)
         return best
+
+    def _with_other_choices(self, state: SearchState) -> SearchState | None:
+        """The set with better choices of several causes, if there are any: the first were chosen without the others."""
+        if len(state.effects) < 2:
+            return None
+        found = self.with_best_choices(state, 0)
+        return found if found.score > state.score + MIN_SWAP_GAIN else None
 
     def _leaves_more(self, state: SearchState) -> bool:
         """Whether a set leaves more than the formula takes for noise and inexact laws."""

@@ -1,14 +1,15 @@
-"""The search fits those offers exactly that may win, wherever their shapes lie."""
+"""The search fits those offers exactly that may win, wherever their shapes lie, and in whatever order it finds them."""
 
 import pytest
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap.diagnose import search_for_causes
+from jaxfinger.gap.exact import amplitudes_of, as_variant, fit_set
 from jaxfinger.gap.problem import build
-from jaxfinger.gap.sets import MAX_SCORE_GAP
+from jaxfinger.gap.sets import MAX_SCORE_GAP, MIN_SWAP_GAIN
 from jaxfinger.identify import Recipe
 
-from .conftest import session_with
+from .conftest import TRUTH, session_with
 
 STOP = ("joint_stop", ("PIP",))
 
@@ -48,3 +49,25 @@ def test_what_could_replace_a_cause_is_another(found):
     offers = search.best_offers(search.screen(state, 0), most=1, other_than=STOP)
     assert offers
     assert all(x.offer.keys != (STOP,) for x in offers)
+
+
+def test_a_form_that_was_chosen_before_the_other_causes_is_chosen_again(monkeypatch):
+    """Friction builds up after a reversal by one of two laws, and the search came by the wrong one."""
+    presliding, stop = (*TRUTH, {"a": 1.0, "x0": 0.1, "delta": 1.0}), (*STOP, {"stiffness": 0.05, "place": 0.75})
+    problem = build(session_with(presliding, stop), Recipe())
+    search, state = search_for_causes(problem, {k: CATALOGUE[k] for k in (TRUTH[0], STOP[0])})
+    assert set(state.keys) == {TRUTH, STOP}
+
+    def with_delta(delta):
+        scales = problem.scales
+        variants = [as_variant(e, scales) for e in state.effects]
+        variants = [v.with_shape(delta=delta) if TRUTH[0] == v.effect.ID else v for v in variants]
+        starts = [amplitudes_of(e) for e in state.effects]
+        return fit_set(search.baseline, state.problem, variants, starts, state.linear_fit.weights)
+
+    wrong = with_delta(0.5)
+    assert wrong.score < with_delta(1.0).score - MIN_SWAP_GAIN
+    found = iter([wrong])
+    monkeypatch.setattr(search, "_better", lambda _: next(found, None))
+    (law,) = (e for e in search.run().effects if TRUTH[0] == e.ID)
+    assert law.delta == 1.0
