@@ -124,13 +124,13 @@ class Search:
             return state
         for _ in range(MAX_CHANGES):
             better = self._better(state) or self._with_other_choices(state)
+            if better is None and state.effects:
+                # Rivals are fitted from the set's optimum. So is the set once more, so that none of them is favoured.
+                state = max(state, self.fit_exactly(state, None), key=lambda s: s.score)
+                better = self._best_rival(state)
             if better is None:
                 break
             state = self._pruned(better)
-        # Rivals are fitted from the state's optimum; so is the state once more, so that none of them is favoured.
-        if state.effects:
-            state = max(state, self.fit_exactly(state, None), key=lambda s: s.score)
-        self._visit_rivals(state)
         return state
 
     def net_evidence(self, state: SearchState) -> float:
@@ -202,7 +202,10 @@ class Search:
         return best
 
     def _with_other_choices(self, state: SearchState) -> SearchState | None:
-        """The set with better choices of several causes, if there are any: the first were chosen without the others."""
+        """The set with better choices of its causes, if there are any: the first were chosen without the others.
+
+        Choices of the only cause have been compared when it was added.
+        """
         if len(state.effects) < 2:
             return None
         found = self.with_best_choices(state, 0)
@@ -228,10 +231,12 @@ class Search:
             state = found
         return state
 
-    def _visit_rivals(self, state: SearchState) -> None:
-        """Fit the best others in the place of each cause, for the posterior."""
-        for _, found in self._replaced(state, -np.inf, MAX_EXACT):
-            self.with_best_choices(found, len(state.effects) - 1)
+    def _best_rival(self, state: SearchState) -> SearchState | None:
+        """Fit the best others in the place of each cause, for the posterior; the best such set, if it is better."""
+        replaced = self._replaced(state, -np.inf, MAX_EXACT)
+        found = [self.with_best_choices(x, len(state.effects) - 1) for _, x in replaced]
+        best = max(found, key=self.net_evidence, default=state)
+        return best if self.net_evidence(best) > self.net_evidence(state) + MIN_SWAP_GAIN else None
 
     # Linear: all offers at once ---------------------------------------------------------------------------------------
     def without(self, state: SearchState, cause: int | None) -> Reduced:
