@@ -160,7 +160,8 @@ def _continues(
 
     A tendon that turns back or leaves slack sticks first and then slips within one block, whose mean tension does not
     tell when. Once released it may stick for several steps. Within a step it sticks all through if the `load` after it
-    is that before it, and slips all through if it slipped in the one before, as the change of the load tells.
+    is that before it, but for a sample's noise, and slips all through if it slipped in the one before, as the change of
+    the load tells.
 
     The noise of the tension enters a step, and not the mean of a hold. Where its load exceeds the noise of the load,
     which includes the `error` of a converter, the step does not count: one noise stands for all samples of a channel.
