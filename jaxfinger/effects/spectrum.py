@@ -18,7 +18,7 @@ WIDE = 2.0  # decades. A trial shows hardly more, between its samples and its en
 class RelaxingEffect(CatalogueEffect):
     """An effect with a time constant T, or with the mean over a spectrum that is `decades` wide about it.
 
-    A subclass declares T and drives with (time, value).
+    A subclass declares T, and its `drive` returns (time, value).
     """
 
     T: Float[Array, ""]

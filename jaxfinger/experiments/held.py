@@ -177,8 +177,8 @@ def _continues(
     slipped = per_newton > MIN_SLIP_SHARE * per_newton.max()
     of_tension, of_load = (np.sqrt(np.mean([x[run].var(axis=0) for run in runs], axis=0)) for x in (tension, load))
     noise = per_newton * np.linalg.norm(of_tension * np.abs(ways), axis=1)
-    least = np.linalg.norm(np.hypot(of_load, error))
-    quiet, sticks = noise <= least, np.linalg.norm(changes, axis=1) <= least
+    load_noise = np.linalg.norm(np.hypot(of_load, error))
+    quiet, sticks = noise <= load_noise, np.linalg.norm(changes, axis=1) <= load_noise
     for k in range(1, len(ways)):
         goes_on = np.all((ways[k] == ways[k - 1]) | (ways[k] == 0))
         if goes_on and quiet[k] and (sticks[k] or slipped[k - 1] or not released[k]):

@@ -112,28 +112,20 @@ class Baseline:
 
     @classmethod
     def of(cls, problem: Problem, parameters: Parameters) -> "Baseline":
-        """Refit the nominal parameters in the weights of the formula, by the steps of a set with causes."""
+        """Refit the nominal parameters in the weights of the formula."""
         columns = Columns.of(problem)
-        start = cls._at(problem, columns, parameters)
-        alone = fit_set(start, problem, [], [], start.null.linear_fit.weights)
-        return max(start, cls._at(alone.problem, columns, parameters, alone.nominal), key=lambda b: b.null.score)
-
-    @classmethod
-    def _at(
-        cls, problem: Problem, columns: Columns, parameters: Parameters, nominal: ByColumn | None = None
-    ) -> "Baseline":
-        """The baseline whose null is linearised at the problem's nominal model."""
-        nominal = nominal or ByColumn.of(columns, problem.J.T)
         empty = np.empty((0, problem.r.size))
-        residual, none = ByColumn.of(columns, problem.r[None]), ByColumn.of(columns, empty)
-        fit = LinearModel(columns, (residual, nominal), prior_products(problem, 0), none, parameters).null
-        assert fit is not None
+        nominal, none = ByColumn.of(columns, problem.J.T), ByColumn.of(columns, empty)
+        residual = ByColumn.of(columns, problem.r[None])
+        model = LinearModel(columns, (residual, nominal), prior_products(problem, 0), none, parameters)
+        assert model.null is not None
+        evidence = model.null.evidence
         return cls(
             columns,
             parameters,
-            SearchState(problem, columns, nominal, (), (), empty, empty, fit),
-            unexplained(columns.counts, fit.evidence, parameters),
-            float(np.sqrt(np.sum(fit.evidence.e + fit.evidence.o))),
+            SearchState(problem, columns, nominal, (), (), empty, empty, model.null),
+            unexplained(columns.counts, evidence, parameters),
+            float(np.sqrt(np.sum(evidence.e + evidence.o))),
         )
 
     def linear_model(

@@ -123,19 +123,28 @@ class Search:
         if not self.table.offers:
             return state
         for _ in range(MAX_CHANGES):
-            better = self._better(state) or self._with_other_choices(state)
-            if better is None and state.effects:
-                # Rivals are fitted from the set's optimum. So is the set once more, so that none of them is favoured.
-                state = max(state, self.fit_exactly(state, None), key=lambda s: s.score)
-                better = self._best_rival(state)
-            if better is None:
+            state = self._climbed(state)
+            rival = self._best_rival(state)
+            if rival is None:
                 break
-            state = self._pruned(better)
+            state = self._pruned(rival)
         return state
 
     def net_evidence(self, state: SearchState) -> float:
         """Log evidence of a set less its cost."""
         return state.score - self.costs.of(state.keys)
+
+    def _climbed(self, state: SearchState) -> SearchState:
+        """The set after changes until none makes it better.
+
+        It is fitted once more at the end, since its rivals are fitted from there, and none of them may be favoured.
+        """
+        for _ in range(MAX_CHANGES):
+            better = self._better(state) or self._with_other_choices(state)
+            if better is None:
+                break
+            state = self._pruned(better)
+        return max(state, self.fit_exactly(state, None), key=lambda s: s.score) if state.effects else state
 
     # One change of a set ----------------------------------------------------------------------------------------------
     def _better(self, state: SearchState) -> SearchState | None:

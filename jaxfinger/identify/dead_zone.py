@@ -13,7 +13,7 @@ from jaxfinger.model import Model
 
 # Standard deviations of one sample of a load cell, the usual three sigma. Behind the low-pass a tension has less white
 # noise, but all of its slow noise, and the error of the converter where it hardly changes.
-MIN_CLEAR_OF_DEAD_ZONE = 3.0
+MIN_STDS_TO_DEAD_ZONE = 3.0
 
 
 def clear_of_dead_zones(
@@ -27,7 +27,7 @@ def clear_of_dead_zones(
     """
     if not any(stack.experiment.unloaded for stack in stacks.values()):
         return stacks
-    margin, friction = MIN_CLEAR_OF_DEAD_ZONE * (sizes or sizes_of(session)).noise, model.tendon_friction
+    margin, friction = MIN_STDS_TO_DEAD_ZONE * (sizes or sizes_of(session)).noise, model.tendon_friction
     drives = np.asarray(session.finger.crosses) & np.asarray(session.finger.active)[:, None]
 
     def cleared(stack: Stack) -> Stack:
