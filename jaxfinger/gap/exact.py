@@ -106,27 +106,34 @@ class Baseline:
 
     columns: Columns
     parameters: Parameters
-    null: SearchState  # no cause, the nominal parameters refitted in the weights of the formula
+    null: SearchState  # no cause, the nominal parameters where they have most evidence
+    start: SearchState  # no cause, the nominal parameters at least squares and reweighted a little: no channel given up
     unexplained: Float[np.ndarray, " C"]  # u_c, nats: log evidence that something is at work in column c
-    gap: float  # norm of the null's white residual, the unit of all amplitudes
+    gap: float  # norm of the white residual at the start, the unit of all amplitudes
 
     @classmethod
     def of(cls, problem: Problem, parameters: Parameters) -> "Baseline":
-        """Refit the nominal parameters in the weights of the formula."""
+        """Refit the nominal parameters in the weights of the formula.
+
+        A search begins at `start`. Where the gap is large, the null gives up the channels of a large cause for the
+        others, and from there a search does not find that cause.
+        """
         columns = Columns.of(problem)
-        empty = np.empty((0, problem.r.size))
-        nominal, none = ByColumn.of(columns, problem.J.T), ByColumn.of(columns, empty)
-        residual = ByColumn.of(columns, problem.r[None])
-        model = LinearModel(columns, (residual, nominal), prior_products(problem, 0), none, parameters)
-        assert model.null is not None
-        evidence = model.null.evidence
-        return cls(
-            columns,
-            parameters,
-            SearchState(problem, columns, nominal, (), (), empty, empty, model.null),
-            unexplained(columns.counts, evidence, parameters),
-            float(np.sqrt(np.sum(evidence.e + evidence.o))),
-        )
+        nominal = ByColumn.of(columns, problem.J.T)
+        start = _without_causes(problem, columns, nominal, parameters)
+        evidence = start.linear_fit.evidence
+        gap = float(np.sqrt(np.sum(evidence.e + evidence.o)))
+        baseline = cls(columns, parameters, start, start, unexplained(columns.counts, evidence, parameters), gap)
+        best = fit_set(baseline, problem, [], [], start.linear_fit.weights)
+        null = _without_causes(best.problem, columns, best.nominal, parameters, best.linear_fit.weights)
+        if null.score <= start.score:
+            return baseline
+        left = unexplained(columns.counts, null.linear_fit.evidence, parameters)
+        baseline = replace(baseline, null=null, unexplained=left)
+        # What causes explain counts from the null.
+        again = baseline.linear_model(problem, nominal, problem.r, start.slopes)
+        fit = again.fit(np.empty(0, int), start=Weights.plain(columns))
+        return replace(baseline, start=replace(start, linear_fit=fit))
 
     def linear_model(
         self, problem: Problem, nominal: ByColumn, r: Float[np.ndarray, " N"], slopes: Float[np.ndarray, "k N"]
@@ -140,6 +147,17 @@ class Baseline:
             self.parameters,
             self.null.linear_fit,
         )
+
+
+def _without_causes(
+    problem: Problem, columns: Columns, nominal: ByColumn, parameters: Parameters, start: Weights | None = None
+) -> SearchState:
+    """The empty set, linearised at the problem's nominal model; weights begin at `start`, or at one."""
+    empty = np.empty((0, problem.r.size))
+    rows, none = (ByColumn.of(columns, problem.r[None]), nominal), ByColumn.of(columns, empty)
+    fit = LinearModel(columns, rows, prior_products(problem, 0), none, parameters, start=start).null
+    assert fit is not None
+    return SearchState(problem, columns, nominal, (), (), empty, empty, fit)
 
 
 def prior_products(problem: Problem, k: int) -> Float[np.ndarray, "d d"]:

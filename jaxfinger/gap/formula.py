@@ -206,6 +206,7 @@ class LinearModel:
         prior: (k, k) P with −2 log prior(θ) = uᵀ P u, but for a constant, for the coefficients u = (1, −δ).
         Z: rows that sets choose from.
         null: the optimum without any cause, from which E_c counts; fitted on this base if none is given.
+        start: weights of the first round of that fit, one by default.
     """
 
     def __init__(
@@ -216,6 +217,7 @@ class LinearModel:
         Z: ByColumn,
         parameters: Parameters,
         null: LinearFit | None = None,
+        start: Weights | None = None,
     ):
         self.columns, self.prior, self.Z, self.parameters = columns, prior, Z, parameters
         # Coefficients on the features, and products X_c X_cᵀ and X_c Z_cᵀ over all rows of a column.
@@ -224,7 +226,7 @@ class LinearModel:
         self.XZ = Products.stacked([x.products(Z) for x in base])
         self.null = null
         if null is None:
-            self.null = self.fit(np.empty(0, int))
+            self.null = self.fit(np.empty(0, int), start=start)
 
     def fit(
         self,

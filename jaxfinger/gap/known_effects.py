@@ -57,7 +57,7 @@ def fit_with(
         (effect, site), file = unseen[0], session.file or "the session"
         shown = ", ".join(affected_channels(catalogue[effect], problem.nominal.finger))
         raise UserError(f"{file}: no trial shows {effect} at {'-'.join(site)}; record {shown}, or leave it out")
-    search, state = Search(baseline, table, progress), baseline.null
+    search, state = Search(baseline, table, progress), baseline.start
     for _ in wanted:
         screened = search.screen(state)
         _, offer, amplitudes = search.best_offers(screened, 1)[0]

@@ -118,8 +118,19 @@ class Search:
         self.visited.add((), baseline.null.linear_fit.evidence, Weighed.EXACT)
 
     def run(self) -> SearchState:
-        """Search from the empty set, and return the set with the most net evidence."""
-        state = self.baseline.null
+        """Search from the empty set, and return the set with the most net evidence.
+
+        The nominal model of the empty set is at least squares, and at its most evidence if nothing is found from there.
+        """
+        null = self.baseline.null
+        for start in (self.baseline.start, null):
+            found = self._found_from(start)
+            if self.net_evidence(found) > null.score:
+                return found
+        return null
+
+    def _found_from(self, state: SearchState) -> SearchState:
+        """The set with the most net evidence that a search from an empty set meets."""
         if not self.table.offers:
             return state
         for _ in range(MAX_CHANGES):
@@ -435,7 +446,7 @@ class Search:
 
     def alone(self, keys: Iterable[CauseKey]) -> dict[CauseKey, Alone]:
         """Each cause alone on top of the nominal model, in the offer with the most evidence."""
-        screened, out = self.screen(self.baseline.null), {}
+        screened, out = self.screen(self.baseline.start), {}
         for key in keys:
             if (best := self._best_offer_of(screened, key)) is not None:
                 mine = self._finite(screened, key)

@@ -7,7 +7,7 @@ import pytest
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.gap.augment import as_refitted, augmented_fit, nominal_fit
-from jaxfinger.gap.exact import Baseline, fit_at_nominal, fit_set, refit_from_plain
+from jaxfinger.gap.exact import MIN_SCORE_GAIN, Baseline, fit_at_nominal, fit_set, refit_from_plain
 from jaxfinger.gap.formula import Parameters, Weights
 from jaxfinger.gap.problem import build, moved
 from jaxfinger.gap.projector import orthonormalise
@@ -59,10 +59,12 @@ def problem(session):
 @pytest.fixture(scope="module")
 def scaled(session):
     """The same session recorded with a torque sensor whose gain is off by a fifth."""
-    trials = {
-        t.name: t if t.joint_torque is None else replace(t, joint_torque=(1.0 + GAIN) * t.joint_torque) for t in session
-    }
-    return build(replace(session, trials=trials), Recipe())
+    return build(with_gain(session, GAIN), Recipe())
+
+
+def with_gain(session, gain):
+    scaled = (t if t.joint_torque is None else replace(t, joint_torque=(1.0 + gain) * t.joint_torque) for t in session)
+    return replace(session, trials={t.name: t for t in scaled})
 
 
 @pytest.mark.long
@@ -159,6 +161,17 @@ def test_the_later_of_two_rounds_of_one_score_is_kept(problem, monkeypatch, scor
     monkeypatch.setattr("jaxfinger.gap.exact.fit_at_nominal", lambda *_: next(left))
     monkeypatch.setattr("jaxfinger.gap.exact._with_nominal_refitted", lambda _, state, weights: state)
     assert fit_set(baseline, problem, [], [], plain(baseline)) is rounds[kept]
+
+
+@pytest.mark.parametrize("gain", [0.02, 0.1])
+def test_the_nominal_model_alone_is_fitted_as_well_as_with_causes(session, gain):
+    """Otherwise any cause could name itself by the moves of the nominal model that it brings."""
+    problem = build(with_gain(session, gain), Recipe())
+    baseline = Baseline.of(problem, Parameters())
+    assert baseline.unexplained.sum() > 20.0
+    assert baseline.null.score >= baseline.start.score
+    none = fit_set(baseline, problem, [], [], baseline.null.linear_fit.weights)
+    assert none.score < baseline.null.score + MIN_SCORE_GAIN
 
 
 def led(scaled):

@@ -1,5 +1,7 @@
 """The search fits those offers exactly that may win, wherever their shapes lie, and in whatever order it finds them."""
 
+from dataclasses import replace
+
 import pytest
 
 from jaxfinger.effects import CATALOGUE
@@ -26,7 +28,7 @@ def found():
 def test_an_offer_is_ranked_by_what_its_exact_fit_may_bring(found):
     search, state = found
     assert state.keys == (STOP,)
-    screened = search.screen(search.baseline.null)
+    screened = search.screen(search.baseline.start)
     best = search.best_offers(screened)[0]
     exact = search.net_evidence(state)
     assert exact - MAX_SCORE_GAP < best.net < exact + 0.5 * (exact - search.net_evidence(search.baseline.null))
@@ -49,6 +51,27 @@ def test_what_could_replace_a_cause_is_another(found):
     offers = search.best_offers(search.screen(state, 0), most=1, other_than=STOP)
     assert offers
     assert all(x.offer.keys != (STOP,) for x in offers)
+
+
+@pytest.mark.parametrize(
+    ("of_null", "of_start", "expected"), [(1.0, 2.0, "start"), (1.0, -1.0, "null"), (-1.0, -2.0, None)]
+)
+def test_a_search_begins_at_the_null_too_where_it_finds_nothing_from_least_squares(
+    found, monkeypatch, of_null, of_start, expected
+):
+    search, state = found
+    null, start = search.baseline.null, replace(search.baseline.start)
+    monkeypatch.setattr(search, "baseline", replace(search.baseline, start=start))
+
+    def with_net(gain):
+        score = null.score + search.costs.of(state.keys) + gain
+        return replace(
+            state, linear_fit=replace(state.linear_fit, evidence=state.linear_fit.evidence._replace(score=score))
+        )
+
+    ends = {"null": with_net(of_null), "start": with_net(of_start), None: null}
+    monkeypatch.setattr(search, "_found_from", lambda s: ends["start" if s is start else "null"])
+    assert search.run() is ends[expected]
 
 
 def test_a_form_that_was_chosen_before_the_other_causes_is_chosen_again(monkeypatch):
