@@ -1,14 +1,17 @@
-"""Compilation and concurrent runs of JAX functions; most run only a few times, so compile time matters most."""
+"""Compilation and threads of JAX functions; most run only a few times, so compile time matters most."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
+from threadpoolctl import threadpool_limits
+
 from jaxfinger.programs import Program
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Function = TypeVar("Function", bound=Callable)
 
 # XLA's fusion emitters compile these scalar formulas 50 % slower or worse, and -O2 and above 10 % slower; neither makes
 # them run faster. YNNPACK, to which XLA hands sums, spends 30 % of a diagnosis's processor time on those over short
@@ -39,3 +42,12 @@ def side_by_side(f: Callable[[Item], Result], items: Iterable[Item]) -> Iterator
     """
     with ThreadPoolExecutor(2) as pool:
         yield from pool.map(f, items)
+
+
+def one_blas_thread(f: Function) -> Function:
+    """Decorate a function that calls programs and NumPy's linear algebra in turn.
+
+    Threads of both wait busily for their next work, and take the processors from each other. With one thread for
+    NumPy and SciPy a fit takes half the time (`benchmarks/identify.py`); matrices are too small for more to be of use.
+    """
+    return threadpool_limits.wrap(limits=1, user_api="blas")(f)

@@ -1,8 +1,17 @@
-"""Options with which programs are compiled."""
+"""Options with which programs are compiled, and the threads beside them."""
 
 import os
 import subprocess
 import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+import jaxfinger as jf
+
+DEMO = Path(__file__).parents[1] / "datasets" / "demo-finger" / "session.h5"
 
 PROGRAM = """
 import jax.numpy as jnp
@@ -20,3 +29,25 @@ def test_sums_over_short_axes_are_xlas_own():
     ).stdout
     assert "ENTRY" in text
     assert "ynn_fusion" not in text
+
+
+@pytest.mark.parametrize("work", ["identify", "diagnose"])
+def test_numpy_has_one_thread_beside_xlas_while_a_fit_runs(work):
+    """Both wait busily, and would take the processors from each other. Afterwards the caller has all threads again."""
+
+    class Stop(Exception):
+        pass
+
+    def threads():
+        return {lib["num_threads"] for lib in threadpool_info() if lib["user_api"] == "blas"}
+
+    def seen(message):
+        assert threads() == {1}
+        raise Stop
+
+    session = jf.read(DEMO)
+    import_module("jaxfinger.gap.diagnose")  # loads SciPy's linear algebra
+    with threadpool_limits(limits=2, user_api="blas"):
+        with pytest.raises(Stop):
+            getattr(jf, work)(session, progress=seen)
+        assert threads() == {2}

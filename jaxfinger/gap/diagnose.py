@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
+from jaxfinger.compilation import one_blas_thread
 from jaxfinger.data import Predictions, Session
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError, did_you_mean
@@ -54,6 +55,7 @@ from jaxfinger.model import Finger
 COARSE = 2  # A quick diagnosis averages over twice as many samples, which halves the rows.
 
 
+@one_blas_thread
 def diagnose(
     session: Session,
     recipe: Recipe | None = None,

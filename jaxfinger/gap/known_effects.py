@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from jaxfinger.compilation import one_blas_thread
 from jaxfinger.data import Session
 from jaxfinger.effects import CatalogueEffect
 from jaxfinger.errors import UserError, did_you_mean
@@ -20,6 +21,7 @@ from jaxfinger.identify.stages import Progress
 from jaxfinger.model import Finger
 
 
+@one_blas_thread
 def fit_with(
     session: Session,
     keys: Sequence[CauseKey],

@@ -17,7 +17,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfinger.compilation import quick_jit
+from jaxfinger.compilation import one_blas_thread, quick_jit
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch
@@ -92,6 +92,7 @@ class _Stage(eqx.Module):
     high: Float[Array, "S p"]
 
 
+@one_blas_thread
 def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: Batching | None = None) -> Members:
     """Fit every session as `template` was fitted to the session `of`.
 

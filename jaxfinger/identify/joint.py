@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Int
 
+from jaxfinger.compilation import one_blas_thread
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, not_judged
@@ -46,6 +47,7 @@ JOINT = "joint"  # name of the stage
 RESTART_CHI2 = 1.3
 
 
+@one_blas_thread
 def refine(session: Session, fit: Fit, progress: Progress = lambda message: None, ahead: bool = False) -> Fit:
     """Refine a fit on all trials of the recipe's `joint_experiments` at once.
 

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxfinger.compilation import quick_jit
+from jaxfinger.compilation import one_blas_thread, quick_jit
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Batch, Stack
@@ -75,6 +75,7 @@ class Sensitivity:
         return np.where(sure, self.moves[:, fit.estimated] / np.where(sure, std, 1.0), 0.0)
 
 
+@one_blas_thread
 def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> dict[str, Sensitivity]:
     """Derivatives of the fit's parameters by the weight of each trial, the gain of each sensor, each value of CAD.
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfinger.compilation import one_blas_thread
 from jaxfinger.data import Session
 from jaxfinger.data.signals.sizes import sizes_of
 from jaxfinger.errors import UserError
@@ -185,6 +186,7 @@ def cad_prior(session: Session, recipe: Recipe, parameters: list[Parameter], fre
     return Prior(np.asarray(ravel(nominal_model(session, recipe)))[free], root)
 
 
+@one_blas_thread
 def identify(
     session: Session,
     recipe: Recipe | None = None,

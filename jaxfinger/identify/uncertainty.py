@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxfinger.compilation import one_blas_thread
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
 from jaxfinger.identify.fit import Fit
@@ -41,6 +42,7 @@ class Samples:
         return np.percentile(self.values[~self.failed], [tail, 100 - tail], axis=0)
 
 
+@one_blas_thread
 def bootstrap(
     session: Session,
     fit: Fit,

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.signal import butter, sosfilt, sosfilt_zi
 
+from jaxfinger.compilation import one_blas_thread
 from jaxfinger.data import Session, Trial, low_pass
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.errors import UserError
@@ -96,6 +97,7 @@ class Validation:
         return asdict(self)
 
 
+@one_blas_thread
 def validate(
     fit: Fit,
     session: Session,
