@@ -340,7 +340,11 @@ def _column(seen: ColumnSurvey, log: _Log | None, slides: bool) -> str:
             parts.append(f"time = {{ from = {quoted(log.clock.name)}{units} }}")
     fits = {"q": "rad", "joint_torque": "N m", "tendon_force": "N", "fingertip_force": "N", "tendon_excursion": "m"}
     fits |= {"temperature": "K"} | ({"q": "m", "joint_torque": "N"} if slides else {})
+    doubts = []
     if seen.units and TO_SI[seen.units].si == fits.get(seen.meaning):
-        return "{ " + ", ".join([*parts, f'units = "{seen.units}"']) + " }"
-    said = f"it states {seen.foreign}: write `scale`" if seen.foreign else "SI as it stands"
-    return "{ " + ", ".join(parts) + " }" + f"   # units? {said}"
+        parts.append(f'units = "{seen.units}"')
+    else:
+        doubts.append(f"units? it states {seen.foreign}: write `scale`" if seen.foreign else "units? SI as it stands")
+    if seen.meaning == "tendon_excursion" and "length" in f"{seen.name} {seen.column or ''}".lower():
+        doubts.append("a length that falls as the tendon is pulled in needs scale = -1")
+    return "{ " + ", ".join(parts) + " }" + (f"   # {'; '.join(doubts)}" if doubts else "")

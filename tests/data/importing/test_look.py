@@ -157,6 +157,19 @@ def test_units_that_no_mapping_converts_are_said_and_not_guessed_anew(tmp_path, 
     assert 'channels.tendon_excursion.T1 = { from = "T1 length [in]" }   # units? it states in: write `scale`' in said
 
 
+def test_the_sign_of_a_tendons_own_length_is_said(tmp_path, capsys):
+    """An excursion is positive where the tendon is pulled in, and its length falls then."""
+    path = tmp_path / "log.csv"
+    rows = np.column_stack([TIME / 1e3, 0.4 * np.sin(TIME / 1e3), *(0.2 + 0.01 * np.sin(TIME / 1e3) for _ in "12")])
+    header = "t [s],q1 [rad],Muscle Length 1 [m],excursion 2 [m]"
+    np.savetxt(path, rows, "%.6f", ",", header=header, comments="")
+    main(["look", str(path)])
+    said = capsys.readouterr().out
+    length = '{ from = "Muscle Length 1 [m]", units = "m" }   # a length that falls as the tendon is pulled in needs'
+    assert f"{length} scale = -1\n" in said
+    assert '{ from = "excursion 2 [m]", units = "m" }\n' in said
+
+
 def test_units_that_a_file_states_come_first():
     recording = load_recording(CASES / "csv-as-other-programs-write-it" / "scope.csv")
     assert {s.name: (s.units, s.stated) for s in columns_of(recording)}["tau"] == ("N m", True)
