@@ -47,7 +47,7 @@ def side_by_side(f: Callable[[Item], Result], items: Iterable[Item]) -> Iterator
 def one_blas_thread(f: Function) -> Function:
     """Decorate a function that calls programs and NumPy's linear algebra in turn.
 
-    Threads of both wait busily for their next work, and take the processors from each other. With one thread for
-    NumPy and SciPy a fit takes half the time (`benchmarks/identify.py`); matrices are too small for more to be of use.
+    Threads of both wait busily for their next work, and take the processors from each other. NumPy and SciPy get one
+    thread: our matrices are too small for more to be of use.
     """
     return threadpool_limits.wrap(limits=1, user_api="blas")(f)

@@ -107,7 +107,7 @@ def _one_heap() -> None:
 
 def _environment() -> None:
     """Set environment variables before NumPy and JAX are imported: one thread for BLAS, and a cache of compilations."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # Threads slow small factorisations down.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `compilation.one_blas_thread` for callers from Python
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA writes to stderr without Python's logging.
     # Programs are lowered an eighth quicker where operations do not carry the lines of Python that they come from.
     os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")

@@ -106,34 +106,39 @@ class Baseline:
 
     columns: Columns
     parameters: Parameters
-    null: SearchState  # no cause, the nominal parameters where they have most evidence
-    start: SearchState  # no cause, the nominal parameters at least squares and reweighted a little: no channel given up
-    unexplained: Float[np.ndarray, " C"]  # u_c, nats: log evidence that something is at work in column c
-    gap: float  # norm of the white residual at the start, the unit of all amplitudes
+    null: SearchState  # no cause, at the best fit of the nominal parameters: what causes explain counts from it
+    start: SearchState  # no cause, near the least squares of the nominal parameters: a search begins here
 
     @classmethod
     def of(cls, problem: Problem, parameters: Parameters) -> "Baseline":
         """Refit the nominal parameters in the weights of the formula.
 
-        A search begins at `start`. Where the gap is large, the null gives up the channels of a large cause for the
-        others, and from there a search does not find that cause.
+        Where the gap is large, the best fit gives up the channels of a large cause for the others, and from there a
+        search does not find that cause. Where the best fit brings less than MIN_SCORE_GAIN, it is the start itself.
         """
         columns = Columns.of(problem)
         nominal = ByColumn.of(columns, problem.J.T)
         start = _without_causes(problem, columns, nominal, parameters)
-        evidence = start.linear_fit.evidence
-        gap = float(np.sqrt(np.sum(evidence.e + evidence.o)))
-        baseline = cls(columns, parameters, start, start, unexplained(columns.counts, evidence, parameters), gap)
+        baseline = cls(columns, parameters, start, start)
         best = fit_set(baseline, problem, [], [], start.linear_fit.weights)
         null = _without_causes(best.problem, columns, best.nominal, parameters, best.linear_fit.weights)
-        if null.score <= start.score:
+        if null.score < start.score + MIN_SCORE_GAIN:
             return baseline
-        left = unexplained(columns.counts, null.linear_fit.evidence, parameters)
-        baseline = replace(baseline, null=null, unexplained=left)
-        # What causes explain counts from the null.
-        again = baseline.linear_model(problem, nominal, problem.r, start.slopes)
-        fit = again.fit(np.empty(0, int), start=Weights.plain(columns))
+        baseline = replace(baseline, null=null)
+        from_null = baseline.linear_model(problem, nominal, problem.r, start.slopes)
+        fit = from_null.fit(np.empty(0, int), start=Weights.plain(columns))
         return replace(baseline, start=replace(start, linear_fit=fit))
+
+    @property
+    def unexplained(self) -> Float[np.ndarray, " C"]:
+        """Log evidence that something is at work in each column, u_c, nats."""
+        return unexplained(self.columns.counts, self.null.linear_fit.evidence, self.parameters)
+
+    @property
+    def gap(self) -> float:
+        """Norm of the white residual at the start, the unit of all amplitudes."""
+        evidence = self.start.linear_fit.evidence
+        return float(np.sqrt(np.sum(evidence.e + evidence.o)))
 
     def linear_model(
         self, problem: Problem, nominal: ByColumn, r: Float[np.ndarray, " N"], slopes: Float[np.ndarray, "k N"]

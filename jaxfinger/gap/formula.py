@@ -190,7 +190,9 @@ class LinearFit:
         return self.evidence.score
 
 
-ROUNDS = 6  # rounds of reweighting. Scores then change by less than one nat.
+# Rounds of reweighting. Scores of most sets then change by less than one nat. Where the gap is large they do not, and
+# `exact.fit_set` goes on.
+ROUNDS = 6
 RIDGE = 1e-10  # relative. Keeps products of nearly collinear derivatives of the nominal parameters invertible.
 
 

@@ -120,17 +120,16 @@ class Search:
     def run(self) -> SearchState:
         """Search from the empty set, and return the set with the most net evidence.
 
-        The nominal model of the empty set is at least squares, and at its most evidence if nothing is found from there.
+        It begins near the least squares of the nominal model, and at its best fit if nothing is found from there.
         """
-        null = self.baseline.null
-        for start in (self.baseline.start, null):
-            found = self._found_from(start)
-            if self.net_evidence(found) > null.score:
-                return found
-        return null
+        start, null = self.baseline.start, self.baseline.null
+        found = self._found_from(start)
+        if start is not null and self.net_evidence(found) <= null.score:
+            found = self._found_from(null)
+        return max(found, null, key=self.net_evidence)
 
     def _found_from(self, state: SearchState) -> SearchState:
-        """The set with the most net evidence that a search from an empty set meets."""
+        """The set with the most net evidence that is found from an empty one."""
         if not self.table.offers:
             return state
         for _ in range(MAX_CHANGES):
