@@ -6,7 +6,7 @@ This is the only room that joins data to the model.
 from jaxfinger.experiments.affected import affected_channels, refuse_broken
 from jaxfinger.experiments.predict import change, demean, predict, predict_compiled
 from jaxfinger.experiments.prepare import Batch, NotJudged, Stack, not_judged, prepare
-from jaxfinger.experiments.shapes import SAMPLES, TRIALS, Block, blocks, padded, padded_size, split
+from jaxfinger.experiments.shapes import SAMPLES, TRIALS, Block, blocks, in_rows, padded, padded_size, split
 from jaxfinger.experiments.table import EXPERIMENTS, Experiment
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "blocks",
     "change",
     "demean",
+    "in_rows",
     "not_judged",
     "padded",
     "padded_size",

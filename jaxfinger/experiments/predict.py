@@ -31,9 +31,9 @@ def _joint_torque(model: Model, x: Motion, nominal: Terms | None = None) -> Floa
     low-passed angles and speeds, such as gravity, are therefore evaluated at q ± σ q̇ and q̇ ± σ q̈. States of effects
     are low-passed already. `nominal`: as of `external_torque`, for motion without a low-pass.
     """
-    if x.blur is None or x.held:
+    if x.blur is None or x.block is None or x.held:
         return external_torque(model, x, nominal=nominal)
-    std = jnp.sqrt(x.blur**2 + (x.time[..., 1:2] - x.time[..., :1]) ** 2 / 12.0)
+    std = jnp.sqrt(x.blur**2 + x.block**2 / 12.0)
     memory = memories(model, x)
 
     def at(side: Float[Array, ""]) -> Float[Array, "m *T"]:

@@ -214,7 +214,7 @@ def row(
         "jitter": np.repeat(JITTER * (1.0 if r.reduced else 2.0) * noise[:, None], M, axis=1),
     }
     if r.reduced:
-        motion["blur"] = np.full(M, blur)
+        motion |= {"blur": np.full(M, blur), "block": np.full(M, r.size * r.step)}
     values, mask = {}, {}
     for c in y:
         counts = (r.mean(r.sound[c].astype(float)) > 0.5) & counting[c]

@@ -1,7 +1,8 @@
 """Padding to a few common shapes, so that sessions of similar fingers share compiled programs."""
 
-from typing import NamedTuple, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -51,6 +52,23 @@ def blocks(batch: Batch, pointwise: bool = False) -> list[Block]:
         for k, part in enumerate(split(wide))
         for first in range(0, T, length)
     ]
+
+
+def in_rows(batch: Batch) -> Batch:
+    """The samples of all trials one after the other in TRIALS rows, for predictions that are pointwise in time.
+
+    Rows are of one length; padding repeats the last values with mask 0.
+    """
+
+    (B, T), n = batch.x.time.shape, -(-batch.x.time.size // TRIALS)
+
+    def rows(a, mode: Literal["edge", "constant"] = "edge"):
+        flat = np.reshape(a, (*np.shape(a)[:-2], B * T))
+        fill = np.pad(flat, [(0, 0)] * (flat.ndim - 1) + [(0, TRIALS * n - B * T)], mode)
+        return fill.reshape(*flat.shape[:-1], TRIALS, n)
+
+    counting = {c: rows(a, "constant") for c, a in batch.mask.items()}
+    return eqx.tree_at(lambda b: b.mask, jax.tree.map(rows, batch), counting)
 
 
 def padded(tree: Tree, trials: int, samples: int) -> Tree:

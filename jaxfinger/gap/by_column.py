@@ -42,7 +42,7 @@ class ByColumn:
     @classmethod
     def of(cls, columns: Columns, x: Float[np.ndarray, "k N"]) -> "ByColumn":
         """Split whole rows into columns. Rows of the problem that belong to no column are left out."""
-        nonzero = []
+        nonzero, x = [], np.ascontiguousarray(x)  # `take` would copy all of a transposed array at every call
         for c in columns.items:
             there = np.take(x, c.rows, axis=1)
             index = np.flatnonzero(there.any(axis=1))

@@ -183,7 +183,8 @@ def fit_set(
 ) -> SearchState:
     """Fit a set of causes from amplitudes `start`, in their own units, and from the problem's nominal model."""
     finger = problem.nominal.finger
-    effects = [within_bounds(v.at(finger, s), v.scales) for v, s in zip(variants, start, strict=True)]
+    placed = [within_bounds(v.at(finger, s), v.scales) for v, s in zip(variants, start, strict=True)]
+    effects = jax.device_put(placed)
     best = fit_at_nominal(baseline, problem, effects, weights)
     for _ in range(MAX_ROUNDS - 1):
         weights = best.linear_fit.weights
@@ -380,13 +381,13 @@ def _shifted(effect: CatalogueEffect, c: Coordinate, by: float) -> CatalogueEffe
         value = value + by * c.unit
     else:
         value = value * float(np.exp(np.clip(by, -MAX_LOG_FACTOR, MAX_LOG_FACTOR)))
-    return within_bounds(replace(effect, **{c.name: jax.device_put(value)}), c.scales)
+    return within_bounds(effect.with_values(**{c.name: value}), c.scales)
 
 
 def within_bounds(effect: CatalogueEffect, scales: Scales) -> CatalogueEffect:
-    """Clip every parameter of an effect to its bounds."""
+    """Clip every parameter of an effect to its bounds; the result has arrays of NumPy."""
     values = {n: np.clip(float(getattr(effect, n)), *ends) for n, ends in effect.bounds(scales).items()}
-    return replace(effect, **jax.device_put(values))
+    return effect.with_values(**values)
 
 
 def _step_bounds(effects: Sequence[CatalogueEffect], coordinates: Sequence[Coordinate]) -> Bounds:
@@ -408,7 +409,7 @@ def _stepped(
     out = list(effects)
     for c, d in zip(coordinates, delta, strict=True):
         out[c.effect] = _shifted(out[c.effect], c, float(d))
-    return out
+    return jax.device_put(out)
 
 
 def _evaluate(

@@ -31,7 +31,7 @@ from jaxfinger.identify.noise import Noise, estimate, history, without_recurring
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.prior import Prior, prior_of
 from jaxfinger.identify.readings import readings_of
-from jaxfinger.identify.solve import Source, solve, white_tangents
+from jaxfinger.identify.solve import ROUGH_TOLERANCE, Source, solve, white_tangents
 from jaxfinger.identify.stages import (
     Progress,
     cad_prior,
@@ -225,7 +225,7 @@ def _refitted_to_all(
         # Some parameters show only after a refit: a tendon whose moment arms are zero shows no friction.
         nominal, shown = _with_unfitted(nominal, free_groups(fit.recipe), free, sources, parameters, coverage)
         prior = prior_on(shown)
-        nominal, solution = solve(nominal, shown, sources, prior)
+        nominal, solution = solve(nominal, shown, sources, prior, tolerance=ROUGH_TOLERANCE)
         if shown.size == free.size:
             break
         # Residuals held what the added parameters explain, so noise estimated from them was too large.
@@ -352,14 +352,15 @@ def assemble(
 
     `size` is the length of the flat vector of all parameters, of which `free` are positions.
     """
-    r, J = [], []
+    N, column = sum(rows[e].size for e in white), np.full(size, -1)
+    column[free] = np.arange(free.size)
+    r, J = np.empty(N), np.zeros((N, free.size))
     for e, x in white.items():
-        keep = rows[e].keep
-        r.append(np.asarray(x.white).reshape(-1)[keep])
-        full = np.zeros((keep.size, size))
-        full[:, sources[e].positions] = -np.asarray(x.jacobian).reshape(-1, x.jacobian.shape[-1])[keep]
-        J.append(full[:, free])
-    return np.concatenate(r), np.concatenate(J)
+        keep, at = rows[e].keep, slice(rows[e].start, rows[e].start + rows[e].size)
+        r[at] = x.white.reshape(-1)[keep]
+        mine = np.flatnonzero(column[sources[e].positions] >= 0)
+        J[at, column[sources[e].positions[mine]]] = -x.jacobian.reshape(-1, x.jacobian.shape[-1])[keep[:, None], mine]
+    return r, J
 
 
 def _noise_of_all(known: Noises, stacks: dict[str, Stack], model: Model, recurring: bool) -> Noises:

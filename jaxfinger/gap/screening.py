@@ -16,7 +16,7 @@ from jaxfinger.experiments import affected_channels
 from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.columns import Columns
 from jaxfinger.gap.problem import Problem
-from jaxfinger.gap.signatures import CHUNK, Signatures, Variant, own
+from jaxfinger.gap.signatures import CHUNK, Signatures, Variant, own, placed
 from jaxfinger.identify.stages import Progress
 
 MIN_PERIOD = 20.0  # s. Drifts take minutes; shorter periods are those of the motion itself.
@@ -77,7 +77,8 @@ class Scan:
         without = set(size).difference(*effect.periods().values())
         members = [shape | {a: size[a]} for a in size if a in without]
         members += [shape | {name: period, a: size[a]} for period in periods for a in pair]
-        rows = signatures.white_changes([effect.at(finger, site, **values) for values in members])
+        there, none = placed(items, finger)[site], dict.fromkeys(size, 0.0)
+        rows = signatures.white_changes([there.with_values(**none | values) for values in members])
         return cls(signatures, items, periods, middle, rows)
 
     def variant_rows(self, project: Project, rt: Float[np.ndarray, " rows"], columns: Columns) -> VariantRows:

@@ -93,6 +93,11 @@ def variants(effects: Mapping[str, type[CatalogueEffect]], finger, scales: Scale
     ]
 
 
+def placed(items: Sequence[Variant], finger: Finger) -> dict[Site, CatalogueEffect]:
+    """The class of some variants at each of their sites, in arrays of NumPy."""
+    return jax.device_get({site: v.at(finger, {}) for site, v in {v.site: v for v in items}.items()})
+
+
 @quick_jit
 def _change(
     channel: str,
@@ -144,7 +149,9 @@ class Signatures:
         """
         kind, nominal = type(members[0]), self.problem.nominal
         padded = members + members[:1] * (CHUNK - len(members))
-        stacked = jax.tree.map(lambda *a: np.stack(a), *[replace(m, site=()) for m in padded])
+        leaves = zip(*map(jax.tree.leaves, padded), strict=True)
+        anywhere = jax.tree.structure(replace(jax.device_put(members[0]), site=()))
+        stacked = jax.tree.unflatten(anywhere, [np.stack(a) for a in leaves])
         count = jax.device_put(len(members))
         where = affected_channels(kind, nominal.finger)
         for group in self.problem.groups:
@@ -173,9 +180,12 @@ class Signatures:
 
     def per_amplitude(self, items: list[Variant]) -> Float[np.ndarray, "variants amplitudes N"]:
         """Signatures of variants of one class, for each amplitude alone, in units of its plausible size."""
-        effect, finger = items[0].effect, self.problem.nominal.finger
-        names = list(effect.amplitudes())
-        members = [v.at(finger, {n: v.size * v.sizes[n]}) for v, n in product(items, names)]
+        names = list(items[0].effect.amplitudes())
+        none = dict.fromkeys(names, 0.0)
+        there = placed(items, self.problem.nominal.finger)
+        values = [dict(v.shape) | none | {n: v.size * v.sizes[n]} for v, n in product(items, names)]
+        sites = [v.site for v, _ in product(items, names)]
+        members = [there[site].with_values(**value) for site, value in zip(sites, values, strict=True)]
         found = self.white_changes(members).reshape(len(items), len(names), -1)
         found /= np.array([v.size for v in items])[:, None, None]
         return found

@@ -252,7 +252,8 @@ def _fit_stage(model: Model, flat: Float[Array, " P"], sources: list[_Source], s
         moved = [r + J @ (y - start) for r, J in along]
         return huber(jnp.concatenate([*moved, *white(y, curved)]), limit), stage.root @ (y - stage.mean)
 
-    options = {"lower": stage.low, "upper": stage.high}
+    linear_beyond = jnp.where(limit > 0.0, limit, jnp.inf), jnp.inf
+    options = {"lower": stage.low, "upper": stage.high, "linear_beyond": linear_beyond}
     return optx.least_squares(rows, SOLVER, start, None, options, max_steps=MAX_STEPS, throw=False)
 
 

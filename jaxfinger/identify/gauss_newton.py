@@ -11,7 +11,9 @@
 3. Bounds hold exactly: the quadratic problem is solved by active sets (Nocedal and Wright 2006, §16.5), so that an
    optimum on a bound costs no more iterations than another. A change of variables would have zero slope at the bound
    and converge slowly.
-4. Where the cost falls by too little, the step is shortened to the minimum of a parabola (ibid., §3.5). The next step
+4. Rows whose cost is linear, as Huber's is beyond its limit, have no curvature (`with_linear_rows`). Gauss–Newton would
+   give them some, and where they are many each of its steps leaves a good share of the way, always the same.
+5. Where the cost falls by too little, the step is shortened to the minimum of a parabola (ibid., §3.5). The next step
    starts with the same length, which doubles where the cost falls as predicted. A linear problem ends in one step,
    whatever its conditioning.
 """
@@ -32,6 +34,8 @@ MIN_RELATIVE_SINGULAR_VALUE = 1e-7
 # Actual descent over predicted descent. Below the first a step is rejected, below the second the next one is shorter,
 # above the third it is longer (Nocedal and Wright 2006, algorithm 4.1, with a small η).
 MIN_DESCENT_RATIO, POOR_DESCENT_RATIO, GOOD_DESCENT_RATIO = 1e-3, 0.25, 0.75
+# Least eigenvalue of the Hessian in the coordinates z: a step is at most ten times as long as that of Gauss–Newton.
+MIN_CURVATURE = 0.1
 # A shortened step over the last one, as in a backtracking line search (Dennis and Schnabel 1996, §6.3.2).
 MIN_SHORTENING, MAX_SHORTENING = 0.1, 0.5
 # Where rounding hides the descent, a step counts as progress if it is at most this share of the last one. A search that
@@ -68,6 +72,13 @@ class Factor(NamedTuple):
         return 0.5 * (self.d @ self.d + self.rho2)
 
 
+class LinearRows(NamedTuple):
+    """Rows A of J whose cost is linear, as that of rows beyond Huber's limit."""
+
+    gram: Float[Array | np.ndarray, "p p"]  # Aᵀ A
+    count: int  # of all rows of J
+
+
 class Iterate(eqx.Module):
     """State of a search: its next trial point, the linearisation at the best point so far, and the step from there."""
 
@@ -90,6 +101,7 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
     rejected, or where rounding hides the change of the cost and steps become no shorter.
 
     Options: `lower` and `upper`, shaped like y. An entry that starts outside of its bounds moves only towards them.
+    `linear_beyond`, a number for each leaf of the residual: beyond it a row is a square root of Huber's cost (`huber`).
     Jacobians are always computed forwards.
     """
 
@@ -107,7 +119,7 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
         """Linearise at the trial point, then accept it or shorten the step."""
         del tags
         at, unravel = ravel_pytree(state.trial)
-        here, aux = _linearised(lambda v: fn(unravel(v), args), at)
+        here, aux = _linearised(lambda v: fn(unravel(v), args), at, options.get("linear_beyond"))
         low, high = (
             jnp.broadcast_to(ravel_pytree(options[k])[0], at.shape) if k in options else jnp.full_like(at, infinite)
             for k, infinite in (("lower", -jnp.inf), ("upper", jnp.inf))
@@ -205,14 +217,19 @@ def state_of_vector(state: Iterate, trial: Float[Array, " p"]) -> Iterate:
     return eqx.tree_at(lambda s: s.trial, state, trial, is_leaf=lambda s: s is state.trial)
 
 
-def _linearised(fn, at: Float[Array, " p"]) -> tuple[Factor, Any]:
+def _linearised(fn, at: Float[Array, " p"], limits: PyTree | None) -> tuple[Factor, Any]:
     def flat(v):
         r, aux = fn(v)
-        return ravel_pytree(r)[0], aux
+        return ravel_pytree(r)[0], (r, aux)
 
-    r, push, aux = jax.linearize(flat, at, has_aux=True)
+    r, push, (tree, aux) = jax.linearize(flat, at, has_aux=True)
     J = jax.lax.map(push, jnp.eye(at.size), batch_size=TANGENTS_AT_ONCE) if at.size else jnp.zeros((0, r.size))
-    return factor_of(jnp.concatenate([J, r[None]]).T), aux
+    here = factor_of(jnp.concatenate([J, r[None]]).T)
+    if limits is not None and at.size:
+        beyond = jnp.abs(r) > ravel_pytree(jax.tree.map(jnp.full_like, tree, limits))[0]
+        linear = jnp.where(beyond[None], J, 0.0)
+        here = with_linear_rows(here, LinearRows(linear @ linear.T, r.size))
+    return here, aux
 
 
 def factor_of(rows: Float[Array, "N q"]) -> Factor:
@@ -220,6 +237,23 @@ def factor_of(rows: Float[Array, "N q"]) -> Factor:
     p = rows.shape[1] - 1
     T = jnp.linalg.qr(jnp.concatenate([rows, jnp.zeros((max(0, p + 1 - len(rows)), p + 1))]), mode="r")
     return Factor(T[:p, :p], T[:p, p], T[p, p] ** 2)
+
+
+def with_linear_rows(here: Factor, linear: LinearRows) -> Factor:
+    """The factor for Newton's step, where the cost of some rows A is linear.
+
+    In the coordinates z the Hessian is H = I − Bᵀ B, with B = A · basis (`scaled_directions`). With H = W diag(h) Wᵀ
+    the factor [diag(√h) Wᵀ Uᵀ R, diag(1/√h) Wᵀ Uᵀ d] has that Hessian, and the gradient and cost of `here`. Where the
+    step of Gauss–Newton changes all rows by more than one in rms, others will be linear there, and H = I.
+    """
+    xp = here.R.__array_namespace__()
+    basis, U, seen, *_ = scaled_directions(here.R)
+    to_z = xp.where(seen[None], U, 0.0).T
+    near = xp.sum((to_z @ here.d) ** 2) < linear.count
+    h, W = xp.linalg.eigh(xp.eye(seen.size) - xp.where(near, 1.0, 0.0) * (basis.T @ linear.gram @ basis))
+    root, turned = xp.sqrt(xp.clip(h, MIN_CURVATURE, 1.0)), W.T @ to_z
+    d = turned @ here.d / root
+    return Factor(root[:, None] * (turned @ here.R), d, here.rho2 + here.d @ here.d - d @ d)
 
 
 def scaled_directions(A: Float[Array | np.ndarray, "k p"]) -> tuple:

@@ -11,6 +11,7 @@ Outliers: Huber's cost is H(r) = r²/2 for |r| ≤ c, and c|r| − c²/2 beyond 
 minimises that cost: the sum of squares of s is 2 Σ H(r), and its gradient is 2 Σ J ψ(r), with ψ = H′.
 """
 
+import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
@@ -25,7 +26,7 @@ from scipy.linalg import get_lapack_funcs
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data.schema import CHANNELS
-from jaxfinger.experiments import Batch, Block, blocks, predict
+from jaxfinger.experiments import Batch, Block, blocks, in_rows, predict
 from jaxfinger.identify.noise import whiten
 from jaxfinger.identify.parameters import Free
 from jaxfinger.model import Model
@@ -234,6 +235,19 @@ def factored(
     return out if weights is None else np.sqrt(weights)[:, None, None] * out
 
 
+def gram_of_linear_rows(
+    white: Float[np.ndarray, "B rows"],
+    J: Float[np.ndarray, "B rows p"],
+    limit: float,
+    weights: Float[np.ndarray, " B"] | None = None,
+) -> Float[np.ndarray, "p p"]:
+    """Gram matrix of the rows of `factored` beyond Huber's limit, whose cost is linear."""
+    trial, row = np.nonzero(np.abs(white) > limit)
+    share = robust_share(white[trial, row], limit) * (1.0 if weights is None else np.sqrt(weights[trial]))
+    A = J[trial, row] * share[:, None]
+    return A.T @ A
+
+
 def triangular(A: Float[np.ndarray, "N p"]) -> Float[np.ndarray, "k p"]:
     """R of A = Q R, k = min(N, p).
 
@@ -251,13 +265,18 @@ def _by_blocks(f: Callable[[Batch], Tree], model: Model, batch: Batch) -> Tree:
     joints that are not held is pointwise in time.
     """
     (B, T), out = batch.x.time.shape, None
-    for block in blocks(batch, pointwise=not (model.effects or batch.x.held)):
+    pointwise = not (model.effects or batch.x.held or batch.x.simulated)
+    batch = in_rows(batch) if pointwise else batch
+    for block in blocks(batch, pointwise):
         part = f(block.batch)
         if out is None:
-            out = jax.tree.map(lambda a: np.empty((*a.shape[:-2], B, T)), part)
+            out = jax.tree.map(lambda a: np.empty((*a.shape[:-2], *batch.x.time.shape)), part)
         jax.tree.map(partial(_put, block), out, part)
     assert out is not None
-    return out
+    if not pointwise:
+        return out
+    rows = math.prod(batch.x.time.shape)
+    return jax.tree.map(lambda a: a.reshape(*a.shape[:-2], rows)[..., : B * T].reshape(*a.shape[:-2], B, T), out)
 
 
 def _put(block: Block, out: Float[np.ndarray, "*k B T"], part: Float[Array, "*k b t"]) -> None:

@@ -23,17 +23,20 @@ from jaxfinger.experiments import Batch
 from jaxfinger.identify.gauss_newton import (
     Factor,
     Iterate,
+    LinearRows,
     Outcome,
     VisibleGaussNewton,
     begin,
     bounded_step,
     scaled_directions,
+    with_linear_rows,
 )
 from jaxfinger.identify.linearise import (
     Filters,
     Linearised,
     Tangent,
     White,
+    gram_of_linear_rows,
     residuals_by_tangent,
     tangent,
     triangular,
@@ -188,7 +191,8 @@ def solve(
         offset = prior.root @ (state.trial[:p] - prior.mean)
         rows = np.concatenate([factor[:, [*free, size]], np.column_stack([prior.root, offset])])
         trial = state.trial
-        y, state = jax.device_get(_advance(least, y, state, _factor_of(rows, room), *ends))
+        here = _factor_of(rows, room, _linear_rows(linearised, sources, free, size, huber))
+        y, state = jax.device_get(_advance(least, y, state, here, *ends))
         sizes.append(float(state.size))
         if np.array_equal(y, trial):
             best = at, linearised, factor, rows
@@ -251,15 +255,36 @@ def _padded(values: np.ndarray, room: int) -> Float[np.ndarray, " room"]:
     return np.pad(values, (0, room - values.size))
 
 
-def _factor_of(rows: Float[np.ndarray, "N q"], room: int) -> Factor:
+def _factor_of(rows: Float[np.ndarray, "N q"], room: int, linear: LinearRows | None = None) -> Factor:
     """Compress the rows of [J r], q = p + 1 columns, and pad them with columns of zero to `room` parameters."""
     p = rows.shape[1] - 1
     T = np.zeros((p + 1, p + 1))
     small = triangular(rows)
     T[: len(small)] = small
+    here = Factor(T[:p, :p], T[:p, p], np.asarray(T[p, p] ** 2))
+    if linear is not None and linear.gram.any() and np.isfinite(T).all():
+        here = with_linear_rows(here, linear)
     R, d = np.zeros((room, room)), np.zeros(room)
-    R[:p, :p], d[:p] = T[:p, :p], T[:p, p]
-    return Factor(R, d, np.asarray(T[p, p] ** 2))
+    R[:p, :p], d[:p] = here.R, here.d
+    return Factor(R, d, np.asarray(here.rho2))
+
+
+def _linear_rows(
+    linearised: dict[str, Linearised],
+    sources: dict[str, Source],
+    free: Int[np.ndarray, " p"],
+    size: int,
+    huber: float,
+) -> LinearRows | None:
+    """The linear rows of all experiments together, by the free parameters of the flat vector of `size` entries."""
+    if not huber:
+        return None
+    gram, count = np.zeros((size, size)), 0
+    for name, lin in linearised.items():
+        s = sources[name]
+        gram[np.ix_(s.positions, s.positions)] += gram_of_linear_rows(lin.white, lin.jacobian, huber, s.weights)
+        count += int(np.count_nonzero(lin.white))
+    return LinearRows(gram[np.ix_(free, free)], count)
 
 
 _begin = quick_jit(begin)

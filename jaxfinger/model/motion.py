@@ -26,6 +26,7 @@ class Motion(eqx.Module):
     # Recordings only.
     jitter: Float[Array, "m *T"] | None = None  # rad, largest reversal of an angle by the encoder's noise alone
     blur: Float[Array, "*T"] | None = None  # s, standard deviation of the low-pass before averaging; 0 for none
+    block: Float[Array, "*T"] | None = None  # s, length of the block that is averaged
     # Starts of simulations only.
     tension_ahead: Float[Array, "L n *T"] | None = None  # N, at L even instants from the start to the horizon
     horizon: Float[Array, "*T"] | None = None  # s, duration of the simulation

@@ -273,6 +273,19 @@ def test_a_second_effect_is_not_passed_over(tmp_path, copy, complaint):
         load(path)
 
 
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_other_values_make_the_effect_that_has_them(name):
+    """Whether an effect has them from the start or afterwards, in arrays of NumPy."""
+    kind = CATALOGUE[name]
+    site = kind.sites(FINGER)[-1]
+    there, values = kind.at(FINGER, site), dict.fromkeys(kind.parameters(), 0.25)
+    found, expected = there.with_values(**values), kind.at(FINGER, site, **values)
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert isinstance(a, np.ndarray)
+        np.testing.assert_array_equal(a, b)
+
+
 def test_an_unknown_parameter_is_refused():
     with pytest.raises(TypeError, match="no parameter"):
         CATALOGUE["payload"].at(FINGER, ("MCP",), weight=1.0)

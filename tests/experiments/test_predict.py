@@ -17,8 +17,8 @@ def motion(t, blur=None) -> Motion:
     q = 0.6 + SPEED * t + 0.5 * ACCELERATION * (t**2 + (0.0 if blur is None else blur**2))
     qd, qdd, none = SPEED + ACCELERATION * t, ACCELERATION + 0.0 * t, np.zeros((MODEL.finger.n, *np.shape(t)))
     arrays = (t, q, qd, qdd, none, 0.0 * q, none, t, 0.0 * q)
-    width = None if blur is None else jnp.full((1, t.size), blur)
-    return Motion(*(jnp.asarray(a)[..., None, :] for a in arrays), blur=width)
+    width, block = (None, None) if blur is None else (jnp.full((1, t.size), a) for a in (blur, t[1] - t[0]))
+    return Motion(*(jnp.asarray(a)[..., None, :] for a in arrays), blur=width, block=block)
 
 
 def test_terms_that_are_not_linear_pass_the_low_pass_as_the_measured_torque_does():

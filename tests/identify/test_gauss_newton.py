@@ -8,6 +8,7 @@ import pytest
 import scipy.optimize
 
 from jaxfinger.identify.gauss_newton import COST_ROUNDING, Outcome, VisibleGaussNewton
+from jaxfinger.identify.linearise import huber
 
 SOLVER = VisibleGaussNewton(atol=1e-9)
 
@@ -82,3 +83,31 @@ def test_it_ends_where_rounding_hides_what_steps_do_to_the_cost():
             cost = 0.5 * float(jnp.sum(bare(there.value, *rows) ** 2))
             assert cost - further.cost <= COST_ROUNDING * 0.5 * np.sum(rest**2)
     assert rounded > 10
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.1, 0.4])
+def test_a_robust_fit_takes_few_steps_however_many_rows_are_outliers(outliers):
+    """It ends at SciPy's optimum of Huber's cost, from the plain fit and from zero."""
+    rng, limit = np.random.default_rng(1), 1.5
+    A, truth = rng.standard_normal((400, 6)) * 10.0 ** np.arange(-3, 3), 10.0 ** -np.arange(-3.0, 3.0)
+    y = A @ truth + rng.standard_normal(400) + 40.0 * (rng.random(400) < outliers) * rng.exponential(size=400)
+    prior = jnp.full(2, 9.0)  # beyond the limit, and no row of Huber's cost
+
+    def rows(theta, _):
+        return huber(jnp.asarray(y - A @ theta), limit), prior * (1.0 + 1e-3 * theta[:2])
+
+    @jax.jit
+    def solved(start):
+        options = {"linear_beyond": (jnp.asarray(limit), jnp.inf)}
+        return optx.least_squares(rows, SOLVER, start, None, options, max_steps=60, throw=False)
+
+    def flat(theta):
+        return np.concatenate([np.asarray(a) for a in rows(jnp.asarray(theta), None)])
+
+    expected = scipy.optimize.least_squares(flat, truth, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+    std = np.sqrt(np.diag(np.linalg.inv(A.T @ A)))
+    for start, most in ((np.linalg.lstsq(A, y, rcond=None)[0], 8), (np.zeros(6), 14)):
+        found = solved(jnp.asarray(start))
+        assert found.result == optx.RESULTS.successful
+        assert found.stats["linearisations"] <= most
+        np.testing.assert_allclose((found.value - expected) / std, 0.0, atol=1e-4)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxfinger.effects import CATALOGUE
-from jaxfinger.experiments import SAMPLES, TRIALS, blocks, padded_size, predict, prepare, shapes
+from jaxfinger.experiments import SAMPLES, TRIALS, blocks, in_rows, padded_size, predict, prepare, shapes
 from jaxfinger.identify.linearise import (
     _tangent,
     huber,
@@ -45,6 +45,17 @@ def test_blocks_hold_every_trial_once_and_count_no_other(stack):
         np.testing.assert_array_equal(mask[:, :B, :T], batch.mask[c])
         np.testing.assert_array_equal(y[:, :B, :T], batch.y[c])
         assert mask.sum() == np.sum(batch.mask[c])
+
+
+@pytest.mark.parametrize("count", [1, 3, 17])
+def test_rows_hold_every_sample_once_and_in_order(stack, count):
+    some = jax.tree.map(lambda a: a[..., :1, :7].repeat(count, axis=-2), stack.batch)
+    rows, (B, T) = in_rows(some), some.x.time.shape
+    assert rows.x.time.shape == (TRIALS, -(-B * T // TRIALS))
+    for c in CHANNELS:
+        whole = rows.y[c].reshape(len(rows.y[c]), -1)[:, : B * T]
+        np.testing.assert_array_equal(whole.reshape(some.y[c].shape), some.y[c])
+        assert rows.mask[c].sum() == some.mask[c].sum()
 
 
 @pytest.fixture(scope="module")
