@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxfinger.errors import UserError
 from jaxfinger.model import Finger, JointTorque, Model, MomentArm, TendonFriction
@@ -90,23 +92,37 @@ def study_finger(joints: int = 1) -> Specimen:
 def true_model(specimen: Specimen) -> Model:
     """Return the nominal model with the true parameters of a polynomial specimen.
 
-    A passive tendon keeps a zero moment arm: it is no part of the nominal model.
+    A passive tendon keeps a zero moment arm: it is no part of the nominal model. Powers that the specimen lacks are
+    zero.
     """
     (spring,), friction, finger = specimen.springs, specimen.friction, Finger.from_description(specimen.description)
     assert isinstance(spring, PolynomialSpring)
     assert isinstance(friction, PolynomialFriction)
-    moment_arm = MomentArm.zeros(finger.n, finger.m, EXCURSION_DEGREE)
-    coefficients = np.zeros((finger.n, finger.m, EXCURSION_DEGREE))
-    for k in np.flatnonzero(finger.active):
-        for i, route in enumerate(specimen.routes[k]):
-            if isinstance(route, PolynomialRoute):
-                coefficients[k, i] = route.coefficients
+    routes = {
+        (k, i): route.coefficients
+        for k in np.flatnonzero(finger.active)
+        for i, route in enumerate(specimen.routes[k])
+        if isinstance(route, PolynomialRoute)
+    }
+    degree = max([EXCURSION_DEGREE, *map(len, routes.values())])
+    arms = np.zeros((finger.n, finger.m, degree))
+    for at, coefficients in routes.items():
+        arms[at][: len(coefficients)] = coefficients
     return Model(
         finger,
-        MomentArm(jnp.asarray(coefficients.reshape(finger.n, -1)), moment_arm.exponents),
-        JointTorque.of(*(jnp.asarray(x) for x in (spring.coefficients, specimen.damping, friction.coefficients))),
+        MomentArm(jnp.asarray(arms.reshape(finger.n, -1)), MomentArm.zeros(finger.n, finger.m, degree).exponents),
+        JointTorque.of(_table(spring.coefficients), jnp.asarray(specimen.damping), _table(friction.coefficients)),
         TendonFriction(jnp.asarray(specimen.loss_constant), jnp.asarray(specimen.loss_proportional)),
     )
+
+
+def _table(rows: Sequence[Sequence[float]]) -> Float[Array, "m powers"]:
+    """Coefficients of polynomials, one row a joint, with zeros for the powers that a joint lacks.
+
+    All powers of the paper are there, so that a fit has them to vary.
+    """
+    width = max([TORQUE_DEGREE + 1, *map(len, rows)])
+    return jnp.asarray([[*row, *[0.0] * (width - len(row))] for row in rows])
 
 
 def _fitted(q, values, powers) -> tuple[float, ...]:

@@ -1,5 +1,7 @@
 """Routes and specimens: derivatives, energies, random and polynomial fingers."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxfinger.model import Motion, external_torque, rigid_body
-from jaxfinger.synthetic import paper_finger, polynomial_finger, random_finger, true_model
+from jaxfinger.synthetic import paper_finger, polynomial_finger, random_finger, specimen_of, true_model
+from jaxfinger.synthetic.recipe import DescribedFinger, JointTerms, Terms
 from jaxfinger.synthetic.routes import WrappedRoute
+from tests.data.conftest import make_finger
 
 LAYOUTS = st.sampled_from(["planar", "abduction", "spatial"])
 TENDONS = st.sampled_from(["antagonists", "fewest"])
@@ -105,3 +109,18 @@ def test_polynomial_finger_is_exactly_the_nominal_model():
     expected = moving + specimen.viscous(0.3 + zero) + specimen.coulomb(q)
     expected -= np.einsum("nmt,nt->mt", specimen.moment_arm(q), f - specimen.loss(f))
     assert difference == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("powers", [1, 2, 6])
+def test_a_described_finger_may_have_fewer_or_more_powers_than_the_papers_and_joints_may_differ(powers):
+    finger = make_finger()
+    rng = np.random.default_rng(0)
+    arms = 1e-3 * rng.standard_normal((3, 2, powers)) * finger.crosses[..., None]
+    finger = replace(finger, excursion=arms, excursion_std=None)
+    terms = {"MCP": JointTerms(elastic=(0.0, 0.03), friction=(1e-3,)), "PIP": JointTerms((0.0, 0.02, 0.0, 0.01))}
+    specimen = specimen_of(DescribedFinger(finger, Terms(terms)))
+    model, q = true_model(specimen), _inside(specimen, 20)
+    excursion = np.asarray(model.moment_arm.excursion(jnp.asarray(q)))
+    assert excursion[finger.active] == pytest.approx(specimen.excursion(q)[finger.active], abs=1e-15)
+    assert np.asarray(model.joint_torque.elastic_torque(jnp.asarray(q))) == pytest.approx(specimen.elastic(q))
+    assert np.asarray(model.joint_torque.friction_magnitude(jnp.asarray(q))) == pytest.approx(specimen.coulomb(q))
