@@ -20,6 +20,8 @@ from jaxfinger.errors import listed
 
 # Names of what is in front of a joint's gear or spring.
 _MOTOR = r"(?<![a-z])(motor|mot|drive|actuator|rotor|spool|winch)(?![a-z])"
+# Where a log has both, q is a joint's angle, and theta that of the motor in front of its elastic gear.
+_LINK, _MOTOR_BESIDE_LINK = r"(?<![a-z])q(?![a-z])", r"(?<![a-z])theta(?![a-z])"
 _MIN_TRAVEL = {"rad": 0.1, "m": 1e-3}  # Less is the yield of a fixture.
 _PARTS = 400  # of a recording: a step of a protocol lasts several of them, and each averages noise.
 _MAX_STILL_CHANGE = 0.1  # of the quickest change between parts: with less a joint stands still.
@@ -169,8 +171,12 @@ def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _
     for channel in ("q", "joint_torque"):
         if own := [s for s in channels.get(channel, ()) if not _is_motor(s)]:
             channels[channel] = own
-    rivals, joints = {}, 0 if finger is None else len(finger.joint_names)
+    if any(_has(_LINK, s) for s in channels.get("q", ())):
+        channels["q"] = [s for s in channels["q"] if not _has(_MOTOR_BESIDE_LINK, s)]
+    rivals = {}
     for channel in ("q", "joint_torque"):
+        # Without a finger, the angles tell how many joints have a torque.
+        joints = len(finger.joint_names) if finger is not None else len(channels.get("q", ()))
         if families := _families(channels.get(channel, ()), joints):
             channels[channel], *rivals[channel] = families
     names = {channel: _names(channel, columns, finger) for channel, columns in channels.items()}
@@ -252,8 +258,13 @@ def _values(recording: Recording, seen: ColumnSurvey) -> np.ndarray:
 
 def _is_motor(seen: ColumnSurvey) -> bool:
     """Whether a column's name says that it belongs to a motor: where the joint has columns of its own, these count."""
+    return _has(_MOTOR, seen)
+
+
+def _has(pattern: str, seen: ColumnSurvey) -> bool:
+    """Whether a pattern of words fits a column's name."""
     words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", f"{seen.name} {seen.column or ''}").lower()
-    return re.search(_MOTOR, words) is not None
+    return re.search(pattern, words) is not None
 
 
 def _experiment(

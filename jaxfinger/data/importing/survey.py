@@ -17,13 +17,13 @@ from jaxfinger.data.units import TO_SI, is_foreign, unit_name
 MIN_GAP = 5.0
 # Patterns of names for each channel, of which the first that fits counts: common words in logs of robots.
 _MEANINGS = (
-    ("time", r"^t(_?(s|sec|ms|us|ns))?$|time|stamp|clock|zeit|^sec"),
+    ("time", r"^t(_?(s|sec|ms|us|ns))?$|time|stamp|clock|zeit|^sec|^duration$"),
     ("temperature", r"temp"),
     ("joint_torque", r"(^|_)tau|torque|effort|moment"),
     ("tendon_excursion", r"excursion|^l\d*$|length|pull|spool|linear|travel"),
     (
         "tendon_force",
-        r"tension|tendon.*force|^f_?t|^f(\d|_(?!([xyz]|tip)$))|cable|load[ _-]?cell|(^|_)cell(_|\d|$)|^force",
+        r"tension|tendon.*force|^f_?t|^f(\d|_(?!([xyz](_|\d|$)|tip$)))|cable|load[ _-]?cell|(^|_)cell(_|\d|$)|^force",
     ),
     ("fingertip_force", r"f?tip|contact|^f[xyz]$|wrench"),
     ("q", r"^q[_\d]*|_q(_|\d|$)|angle|pos|enc|theta|winkel|deg$"),
@@ -36,11 +36,11 @@ _NO_WORDS = "value", "data"  # at the end of a name, which say nothing of what t
 _NAMELESS = r"column \d+"
 _MIN_EVEN = 0.9
 # Names of velocities, which belong to no channel, of set-points, which are not measured, and of switches and states.
-_VELOCITY = r"(?<![a-z])vel|speed|dot|^v$|^dq|(^|_)(d+q|qd+)(_|\d|$)"
-_STATE = r"enable|flag|status|valid|(^|_)(on|off|ok|mode|err|error|fault|alarm)(_|\d|$)"
+_VELOCITY = r"(?<![a-z])vel|speed|dot|^v$|^dq|(^|_)(d+(q|theta)|(q|theta)d+)(_|\d|$)"
+_STATE = r"enable|flag|status|valid|(^|_)(on|off|ok|mode|err|error|fault|alarm)(_|\d|$)|collision|joint_contact"
 _SET_POINT = (
     r"cmd|command|cmptd|computed|ref(?!l)|desired|set_?p(oin)?t|goal|target|demand|soll|feed_?forward"
-    r"|(?<![a-z])(q|tau|tau_j)_d(?![a-z])"
+    r"|(?<![a-z])d*(q|theta|tau|tau_j)_d(?![a-z])"
     r"|(?<![a-z])(q|tau|pos)?(des|set(?!\d+\.)|sp|ff|tgt|nominal|planned)(?![a-z])"
 )
 # Largest plausible values of a channel by unit, with room for arms. The first unit whose largest value is not exceeded

@@ -404,3 +404,38 @@ def test_the_header_of_a_table_of_opensim_states_the_units_of_its_angles(degrees
     assert (angle.meaning, angle.units, angle.stated) == ("q", units, stated)
     assert (speed.meaning, speed.units, force.units) == ("", "", "")
     assert f'from = "{angle.name}", units = "{units}"' in proposal([load_recording(path)])
+
+
+def _franka(before: str, number: str) -> tuple[list[str], np.ndarray]:
+    """Names and samples of some arrays of libfranka's state, as its own log and those of franka_ros have them."""
+    time = np.arange(500) / 1e3
+    wave = np.stack([np.sin((3.0 + k) * time) for k in range(2)], axis=1)
+    arrays = ["q_d", "theta", "theta_d", "q", "dq", "dq_d", "dtheta", "tau_J_d", "tau_J", "dtau_J"]
+    arrays += ["tau_ext_hat_filtered", "joint_contact", "joint_collision", "F_x_Cee"]
+    names = [f"{before}{name}{number.format(k)}" for name in arrays for k in range(2)]
+    return ["time", *names], np.column_stack([1e3 * time, *[wave + 0.01 * k for k in range(len(arrays))]])
+
+
+@pytest.mark.parametrize(("before", "number"), [("state.", "[{}]"), ("field.", "{}")])
+@pytest.mark.parametrize("finger", [None, make_finger()])
+def test_an_elastic_robots_joints_are_read_and_not_its_motors_nor_what_is_desired(tmp_path, before, number, finger):
+    path, (names, table) = tmp_path / "log.csv", _franka(before, number)
+    np.savetxt(path, table, "%.6f", ",", header=", ".join(names), comments="")
+    said = proposal([load_recording(path)], finger)
+    read = re.findall(r'channels\.(\w+)\.\w+ = \{ from = "([^"]+)"', said)
+    assert read == [
+        (c, f"{before}{n}{number.format(k)}") for c, n in (("q", "q"), ("joint_torque", "tau_J")) for k in (0, 1)
+    ]
+    ends = " to ".join(f'"{before}tau_ext_hat_filtered{number.format(k)}"' for k in (0, 1))
+    assert f"# joint_torque could also be {ends}: take what was measured" in said
+    desired = ", ".join(f'"{before}{n}_d{number.format(k)}"' for n in ("q", "theta", "dq", "tau_J") for k in (0, 1))
+    assert f"# set-points by their names, which are not measured: {desired}\n" in said
+
+
+def test_theta_alone_is_a_joints_angle(tmp_path):
+    table = np.column_stack([TIME, np.sin(TIME / 1e3), np.cos(TIME / 1e3)])
+    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="duration,theta,theta_d", comments="")
+    said = proposal([load_recording(tmp_path / "log.csv")])
+    assert 'time = { from = "duration", units = "ms" }' in said
+    assert 'channels.q.J1 = { from = "theta", units = "rad" }' in said
+    assert "channels.q.J2" not in said
