@@ -85,3 +85,8 @@ def unit_name(stated: str) -> str:
 def whole_turns(x: float, period: float, limits: Collection[float]) -> float:
     """Sum of whole periods that brings `x` nearest to the middle of the limits."""
     return round((sum(limits) / len(limits) - x) / period) * period
+
+
+def beyond_a_turn(limits: Collection[float]) -> bool:
+    """Whether the limits of a joint, rad, leave it more than a turn to one side. Limits of one turn may be rounded."""
+    return bool(max(map(abs, limits)) > 2.0 * math.pi + 0.1)

@@ -54,7 +54,7 @@ def test_it_may_be_in_another_file(tmp_path, session):
         ("[-0.3, 1.6]", "[1.6, -0.3]", "line 9: finger.joints[0].limits: must be [lower, upper]"),
         ("[0.0, 1.0, 0.0]", "[0.0, 2.0, 0.0]", "line 7: finger.joints[0].axis: is 2 long"),
         ("limits = [-0.3, 1.6]\n", "", "limits: must be given once: `limits` in rad, or `limits_deg`"),
-        ("limits = [-0.3, 1.6]", "limits = [-30.0, 160.0]", "line 2: finger: joints/limits: reaches 160 rad"),
+        ("limits = [-0.3, 1.6]", "limits = [-30.0, 160.0]", "line 9: finger.joints[0].limits: joint MCP reaches 160"),
         ("1e-6, 0.0, 0.0", "1e-6, 0.0", "line 12: finger.joints[0].inertia[0]: must be a list of 3 numbers, not 2"),
         ("1e-6, 0.0, 0.0", "9e-6, 0.0, 0.0", "no body has one larger"),
         ('["MCP"]', '["MPC"]', "finger.tendons[0].crosses[0]: is 'MPC' (did you mean 'MCP'?)"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,12 +11,19 @@ from jaxfinger.data.checks.links import check_links
 from jaxfinger.data.findings import Report
 from jaxfinger.data.schema import JOINTS, LINKS
 from jaxfinger.data.session import FingerDescription
+from jaxfinger.data.units import beyond_a_turn
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 UNIT_AXIS_TOLERANCE = 1e-3  # of an axis's length: axes typed with three digits pass.
 _ROUNDING = 1e-5  # relative: 100 times that of float32, for tables that were computed in it
 # kg/m³, of the finger's mass in a cube as wide as one of its lengths: a hundredth of air. Fingers have hundreds, and an
 # arm of thin tubes still a tenth. Lengths in cm make a millionth of it, in mm a billionth.
 _MIN_DENSITY = 0.01
+# Degrees, which single precision keeps up to 5 turns. No whole number of degrees up to 360 is this near to a whole one
+# again when it is read as rad, so limits of several turns that are whole degrees are not degrees read as rad.
+_WHOLE = 1e-4
 _MAX_ARM = 2.0  # of the finger's length: moment arms are about a tenth of it, and ten times it in cm.
 
 
@@ -81,12 +89,18 @@ def _joints(finger: FingerDescription, report: Report) -> None:
         if lower >= upper:
             message = f"joint {name} has its lower limit {lower:.4g} at or above its upper {upper:.4g}; swap them"
             report.error("/finger/joints/limits", message, row=i)
-    angles = np.abs(finger.limits[~np.array(finger.prismatic)])
-    if angles.size and angles.max() > 2 * np.pi + 0.1:
-        report.error(
-            "/finger/joints/limits",
-            f"reaches {angles.max():.4g} rad, more than a turn; convert degrees to rad, or write `limits_deg`",
-        )
+        if not finger.prismatic[i] and beyond_a_turn((lower, upper)) and not _whole_degrees(finger.limits[i]):
+            message = (
+                f"joint {name} reaches {max(-lower, upper):.4g} rad, more than a turn; convert degrees to rad, or "
+            )
+            message += "write `limits_deg`, in whole degrees where a joint turns several times"
+            report.error("/finger/joints/limits", message, row=i)
+
+
+def _whole_degrees(angles: Float[np.ndarray, " a"]) -> bool:
+    """Whether angles, rad, are whole degrees."""
+    degrees = np.degrees(angles)
+    return bool(np.abs(degrees - np.round(degrees)).max() < _WHOLE)
 
 
 def _links(finger: FingerDescription, report: Report) -> None:

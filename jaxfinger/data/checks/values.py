@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from jaxfinger.data.signals.sizes import NOISE_FACTOR, Sizes
 from jaxfinger.data.signals.unmeasured import constant_columns, placeholder
 from jaxfinger.data.units import STANDARD_GRAVITY, conversion, whole_turns
 from jaxfinger.errors import counted, listed
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 _MAX_OVERTRAVEL = 0.35  # rad, 20 degrees, that a joint may read beyond its limits, since stated limits are approximate
 # Readings below zero, as shares of the highest tension. A good tare is off by a hundredth. A taut tendon is held at a
@@ -104,7 +108,7 @@ def _placeholders(trial: Trial, finger: FingerDescription, report: Report) -> No
 
 
 def _angles(trial: Trial, finger: FingerDescription, report: Report) -> None:
-    """Check that revolute joints stay near their limits, in rad and within a turn."""
+    """Check that revolute joints stay near their limits, and are in rad if these leave them no more than a turn."""
     place = trial.place("q")
     columns = zip(finger.joint_names, trial.q.T, finger.limits, finger.prismatic, strict=True)
     for name, q, (lower, upper), slides in columns:
@@ -115,18 +119,29 @@ def _angles(trial: Trial, finger: FingerDescription, report: Report) -> None:
         outside = low < lower - _MAX_OVERTRAVEL or high > upper + _MAX_OVERTRAVEL
         turn = whole_turns(0.5 * (low + high), 2.0 * np.pi, (lower, upper))
         fits = low + turn >= lower - _MAX_OVERTRAVEL and high + turn <= upper + _MAX_OVERTRAVEL
-        degrees, unwrap = conversion("deg"), "take a whole turn off (`unwrap = true` in a mapping)"
+        unwrap = "take a whole turn off (`unwrap = true` in a mapping)"
         # Degrees of a joint that moves would exceed its limits by more than a turn.
         if outside and fits and abs(turn) < 4.0 * np.pi and high - low > MIN_MOTION:
             say = report.error if max(-low, high) > 2.0 * np.pi else report.warning
             say(place, f"{where}, a turn beside its limits {lower:.3g} to {upper:.3g}; {unwrap}")
-        elif max(-low, high) > 2.0 * np.pi:
-            mend = degrees if max(-low, high) < _MAX_DEGREES else "convert counts to rad (`scale` in a mapping)"
-            mend += f", or {unwrap}" if fits and abs(turn) < 4.0 * np.pi else ""
+        elif outside and max(-low, high) > 2.0 * np.pi:
+            mend = _mend_of_turns(q, low, high) + (f", or {unwrap}" if fits and abs(turn) < 4.0 * np.pi else "")
             report.error(place, f"{where}, more than a turn; {mend}")
         elif outside:
             message = f"{where}, far outside its limits {lower:.3g} to {upper:.3g}; correct one or the other"
             report.warning(place, message)
+
+
+def _mend_of_turns(q: Float[np.ndarray, " N"], low: float, high: float) -> str:
+    """What to do about an angle that runs from `low` to `high` rad, more than a turn, which its limits forbid.
+
+    It is in degrees or in counts, or the joint turns on and on. Counts are whole numbers, and angles in rad are not.
+    """
+    other = conversion("deg") if max(-low, high) < _MAX_DEGREES else "convert counts to rad (`scale` in a mapping)"
+    if np.all(q == np.round(q)):
+        return other
+    first, last = 360.0 * np.floor(low / (2.0 * np.pi)), 360.0 * np.ceil(high / (2.0 * np.pi))
+    return f"{other}, or, if the joint turns on, write `limits_deg = [{first:.0f}, {last:.0f}]` in the finger's file"
 
 
 def _temperatures(trial: Trial, report: Report) -> None:

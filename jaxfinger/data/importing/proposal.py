@@ -15,7 +15,7 @@ from jaxfinger.data.importing.speeds import speeds
 from jaxfinger.data.importing.survey import ColumnSurvey, columns_of, is_nameless, is_set_point
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
-from jaxfinger.data.units import TO_SI
+from jaxfinger.data.units import TO_SI, beyond_a_turn
 from jaxfinger.errors import listed
 
 # Names of what is in front of a joint's gear or spring.
@@ -206,9 +206,10 @@ def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _
     elif coarse is None and (np.diff(time) <= 0.0).any():
         lines.append("sort = true   # its stamps are out of order, or repeated")
     slides = dict(zip(finger.joint_names, finger.prismatic, strict=True)) if finger is not None else {}
+    turns = {} if finger is None else dict(zip(finger.joint_names, map(beyond_a_turn, finger.limits), strict=True))
     rows = {
         channel: [
-            (name, _column(s, elsewhere.get(s), slides.get(name, False)))
+            (name, _column(s, elsewhere.get(s), slides.get(name, False), turns.get(name, False)))
             for name, s in zip(names[channel], columns, strict=False)
         ]
         for channel, columns in channels.items()
@@ -339,8 +340,11 @@ def _by_number(columns: Sequence[ColumnSurvey], known: Sequence[str]) -> list[st
     return [known[sorted(numbers).index(number)] for number in numbers] if len(numbers) <= len(known) else list(known)
 
 
-def _column(seen: ColumnSurvey, log: _Log | None, slides: bool) -> str:
-    """Inline table (TOML) that reads a column, of another log than the trial's where one is given."""
+def _column(seen: ColumnSurvey, log: _Log | None, slides: bool, turns: bool) -> str:
+    """Inline table (TOML) that reads a column, of another log than the trial's where one is given.
+
+    A joint that slides is in m; where one turns several times, the size of its angle does not tell rad from degrees.
+    """
     parts = [f"from = {quoted(seen.name)}"]
     if seen.column is not None:
         parts.append(f"column = {quoted(seen.column) if isinstance(seen.column, str) else seen.column}")
@@ -352,7 +356,8 @@ def _column(seen: ColumnSurvey, log: _Log | None, slides: bool) -> str:
     fits = {"q": "rad", "joint_torque": "N m", "tendon_force": "N", "fingertip_force": "N", "tendon_excursion": "m"}
     fits |= {"temperature": "K"} | ({"q": "m", "joint_torque": "N"} if slides else {})
     doubts = []
-    if seen.units and TO_SI[seen.units].si == fits.get(seen.meaning):
+    guessed = seen.meaning == "q" and turns and not seen.stated
+    if seen.units and TO_SI[seen.units].si == fits.get(seen.meaning) and not guessed:
         parts.append(f'units = "{seen.units}"')
     else:
         doubts.append(f"units? it states {seen.foreign}: write `scale`" if seen.foreign else "units? SI as it stands")

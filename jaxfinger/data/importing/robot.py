@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from jaxfinger.data.session import FingerDescription
+from jaxfinger.data.units import beyond_a_turn
 from jaxfinger.errors import UserError, did_you_mean, listed
 
 if TYPE_CHECKING:
@@ -337,7 +338,10 @@ class _Robot:
                 if self.model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE:
                     raise UserError(f"{self.path}: {self.names[j]} slides without limits; write its range")
                 limits[i] = -np.pi, np.pi
-                remarks.append(f"{self.names[j]}: has no limits in the file; half a turn to each side is written")
+                said = "half a turn to each side is written; give it more by `limits_deg` if it turns on"
+                remarks.append(f"{self.names[j]}: has no limits in the file; {said}")
+            elif self.model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE and beyond_a_turn(limits[i]):
+                limits[i] = _in_whole_degrees(limits[i])
         return limits, tuple(remarks)
 
     def _fingertip(
@@ -403,6 +407,17 @@ class _Robot:
                 )
         excursion = np.array([_tidy(coefficients[row]) for row in kept]).reshape(len(kept), m, _DEGREE)
         return [spatial[row] for row in kept], excursion, tuple(remarks)
+
+
+def _in_whole_degrees(limits: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+    """Limits of several turns, rad, moved outward to whole degrees, as the format has them.
+
+    Whole numbers stay, and are refused: they are degrees in a file that should hold rad.
+    """
+    if np.all(limits == np.round(limits)):
+        return limits
+    lower, upper = np.degrees(limits)
+    return np.radians([np.floor(lower), np.ceil(upper)])
 
 
 def _tidy(x: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -439,3 +440,14 @@ def test_theta_alone_is_a_joints_angle(tmp_path):
     assert 'time = { from = "duration", units = "ms" }' in said
     assert 'channels.q.J1 = { from = "theta", units = "rad" }' in said
     assert "channels.q.J2" not in said
+
+
+@pytest.mark.parametrize(("upper", "said"), [(90.0, 'units = "deg" }'), (1800.0, "}   # units? SI as it stands")])
+def test_the_size_of_an_angle_does_not_tell_degrees_of_a_joint_that_turns_on(tmp_path, upper, said):
+    finger = make_finger()
+    finger = replace(finger, limits=np.radians([[-10.0, upper], [0.0, 90.0]]))
+    table = np.column_stack([TIME, 12.0 + 12.0 * np.sin(TIME / 1e3), np.cos(TIME / 1e3)])
+    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="t,q1,q2", comments="")
+    text = proposal([load_recording(tmp_path / "log.csv")], finger)
+    assert f'channels.q.MCP = {{ from = "q1", {said}' in text or f'channels.q.MCP = {{ from = "q1" {said}' in text
+    assert 'channels.q.PIP = { from = "q2", units = "rad" }' in text

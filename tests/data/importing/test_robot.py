@@ -8,6 +8,8 @@ import pytest
 
 from jaxfinger.cli import main
 from jaxfinger.data import FingerDescription, read_session
+from jaxfinger.data.checks.finger import check_finger
+from jaxfinger.data.findings import Report
 from jaxfinger.data.finger_file import finger_toml
 from jaxfinger.data.importing.robot import robot_finger
 from jaxfinger.errors import UserError
@@ -305,6 +307,19 @@ def test_joints_that_follow_others_or_have_no_limits_are_named(tmp_path, urdf):
     assert any("pip: follows mcp in the file, and is a joint of its own here" in x for x in robot_finger(path).remarks)
     assert any("thumb: has no limits" in x for x in robot_finger(urdf, ["thumb"]).remarks)
     assert any("flex: held where the file has it" in x for x in robot_finger(urdf, ["spread", "slide"]).remarks)
+
+
+@pytest.mark.parametrize(("limit", "degrees"), [("12.57", 721.0), ("7.94", 455.0), ("90", 5156.62)])
+def test_limits_of_several_turns_are_written_in_whole_degrees_and_those_in_degrees_stay(tmp_path, limit, degrees):
+    """The format takes the one for an arm's last joint, and refuses the other."""
+    text = joint("flex", "root", "middle", limits=f"-{limit} {limit}")
+    text = "".join(['<robot name="arm">', link("root"), text, link("middle", 0.03), "</robot>"])
+    path = tmp_path / "turns.urdf"
+    path.write_text(text)
+    finger = robot_finger(path).finger
+    assert np.degrees(finger.limits[0]) == pytest.approx([-degrees, degrees], abs=0.01)
+    check_finger(finger, report := Report())
+    assert [f.place for f in report] == ([] if degrees < 5000.0 else ["/finger/joints/limits"])
 
 
 def test_new_writes_the_finger_of_a_robot_and_reads_logs_of_one_time(urdf, tmp_path, capsys):
