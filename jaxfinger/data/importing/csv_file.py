@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxfinger.data.importing.joint_states import JointStates, joint_states
 from jaxfinger.data.importing.recording import Recording, Variable
 from jaxfinger.errors import UserError, counted, listed
 
@@ -95,7 +96,7 @@ def load_csv(path: Path) -> Recording:
 
     Empty cells and words for a missing value (`-`, `#N/A`) are NaN, True and False are 1 and 0, and dates with a time
     of day are seconds since 1970. A column of lists in brackets, one a sample, is an array. A column of words can be
-    tested, not computed with.
+    tested, not computed with. Messages of a JointState that `ros2 topic echo --csv` wrote have the names of its fields.
 
     Raises:
         UserError: the file has no column of numbers, or a line with another number of cells.
@@ -112,7 +113,9 @@ def load_csv(path: Path) -> Recording:
     first = next(i for i, line in enumerate(body) if _is_sample(dialect, split(line.text), numeric))
     above = [line for line in lines if line.number < body[first].number]
     names, units, scope = _names(above, dialect, len(numeric))
-    if not names and first > 0 and len(split(body[first - 1].text)) != len(numeric):
+    rows = [row for line in sample if len(row := split(line.text)) == len(numeric)]
+    states = None if names else joint_states(rows, dialect.number)
+    if not names and states is None and first > 0 and len(split(body[first - 1].text)) != len(numeric):
         given = counted(len(split(body[first - 1].text)), "column")
         raise UserError(f"{path}: names {given} and holds {len(numeric)}; give each column one name")
     body, remarks = body[first:], ()
@@ -121,6 +124,8 @@ def load_csv(path: Path) -> Recording:
     if len(body) > 1 and len(split(body[-1].text)) < len(numeric):
         body, remarks = body[:-1], ("its last line is cut short and is left out",)
     columns = _columns(path, body, dialect, numeric)
+    if states is not None:
+        return _of_states(path, columns, states, remarks)
     if scope:
         return _pairs(path, columns, names, units)
     degrees = _IN_DEGREES.search("\n".join(line.text for line in above))
@@ -358,6 +363,23 @@ def _named(
             if column.words is not None:
                 words[name] = column.words
     return Recording(path, variables, unusable, remarks, words)
+
+
+def _of_states(path: Path, columns: Sequence[_Column], states: JointStates, remarks: tuple[str, ...]) -> Recording:
+    """Recording of the messages of a JointState.
+
+    Raises:
+        UserError: the names of the joints change, or a cell is no number.
+    """
+    where, no_numbers = f"{path}: is of `ros2 topic echo --csv`, and", np.zeros(0)
+    for column in columns:
+        if column.words is not None and len(set(column.words)) > 1:
+            said = column.fault.split(";")[0]
+            raise UserError(f"{where} a place {said}; echo the topic of one publisher alone, or record a bag")
+        if column.values is None and column.words is None:
+            raise UserError(f"{where} a column {column.fault}")
+    values = [no_numbers if column.values is None else column.values for column in columns]
+    return Recording(path, states.variables(values), remarks=remarks)
 
 
 def _pairs(path: Path, columns: Sequence[_Column], names: Sequence[str], units: Sequence[str]) -> Recording:

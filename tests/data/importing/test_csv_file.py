@@ -189,3 +189,50 @@ def test_quoted_groups_of_digits_are_no_decimals(tmp_path):
 def test_lists_in_quotes_are_no_decimals(tmp_path):
     lists = load(tmp_path, 't,a\n1.5,"1,2"\n2.5,"3,4"\n3.5,"3,5"\n')
     assert list(lists.words["a"]) == ["1,2", "3,4", "3,5"]
+
+
+def _echoed(joints=("mcp", "pip"), fields=("position", "velocity", "effort"), frame="", nan=(), count=40):
+    """Lines of `ros2 topic echo --csv` on a JointState, and the values of its fields."""
+    rng = np.random.default_rng(0)
+    values = {field: rng.standard_normal((count, len(joints))) for field in fields}
+    values |= {field: np.full((count, len(joints)), np.nan) for field in nan}
+    lines = []
+    for k in range(count):
+        arrays = [
+            ",".join(map(repr, values[f][k].tolist())) if f in values else ""
+            for f in ("position", "velocity", "effort")
+        ]
+        lines.append(",".join([str(1700000000 + k // 10), str(k % 10 * 10**8), frame, *joints, *arrays]))
+    return "\n".join(lines) + "\n", values
+
+
+@pytest.mark.parametrize("joints", [("mcp",), ("mcp", "pip"), tuple(f"joint_{k}" for k in range(7))])
+@pytest.mark.parametrize("fields", [("position", "velocity", "effort"), ("position", "effort"), ("position",)])
+@pytest.mark.parametrize("frame", ["", "base_link"])
+def test_joint_states_that_ros2_topic_echo_wrote_have_their_names(tmp_path, joints, fields, frame):
+    text, values = _echoed(joints, fields, frame)
+    found = load(tmp_path, "WARNING: topic [/joint_states] does not appear to be published yet\n" + text).variables
+    assert set(found) == {"stamp", *fields}
+    np.testing.assert_allclose(found["stamp"].values - 1.7e9, np.arange(40) / 10.0, atol=1e-6)
+    for field in fields:
+        assert found[field].columns == joints
+        np.testing.assert_array_equal(found[field].values, values[field])
+
+
+def test_efforts_that_a_driver_does_not_know_are_nan_and_no_empty_array(tmp_path):
+    found = load(tmp_path, _echoed(fields=("position", "velocity"), nan=("effort",))[0]).variables
+    assert set(found) == {"stamp", "position", "velocity", "effort"}
+    assert np.isnan(found["effort"].values).all()
+
+
+def test_joint_states_whose_names_change_are_refused(tmp_path):
+    one, other = _echoed()[0], _echoed(("index_mcp", "index_pip"))[0]
+    mixed = "".join(a + "\n" + b + "\n" for a, b in zip(one.splitlines(), other.splitlines(), strict=True))
+    with pytest.raises(UserError, match=r"holds the words 'mcp', 'index_mcp'; echo the topic of one publisher alone"):
+        load(tmp_path, mixed)
+
+
+@pytest.mark.parametrize("before", ["1,{}", "{},1", "0.5,{}00000000"])
+def test_other_tables_without_names_are_no_joint_states(tmp_path, before):
+    text = "".join(f"{before.format(k)},left,walk,0.1,0.2,{k}\n" for k in range(9))
+    assert "column 4" in load(tmp_path, text).variables

@@ -10,6 +10,7 @@ import pytest
 import scipy.io
 
 from jaxfinger.cli import main
+from jaxfinger.data import read_session
 from jaxfinger.data.importing.mapping import read_mapping
 from jaxfinger.data.importing.proposal import proposal
 from jaxfinger.data.importing.sources import load_recording
@@ -451,3 +452,20 @@ def test_the_size_of_an_angle_does_not_tell_degrees_of_a_joint_that_turns_on(tmp
     text = proposal([load_recording(tmp_path / "log.csv")], finger)
     assert f'channels.q.MCP = {{ from = "q1", {said}' in text or f'channels.q.MCP = {{ from = "q1" {said}' in text
     assert 'channels.q.PIP = { from = "q2", units = "rad" }' in text
+
+
+def test_messages_that_ros2_topic_echo_wrote_are_proposed_and_imported(tmp_path, capsys):
+    angle, torque = 0.5 + 0.4 * np.sin(TIME / 1e3), 0.01 * np.cos(TIME / 1e3)
+    sec, beyond = (TIME // 1e3).astype(int), (TIME % 1e3 * 1e6).astype(int)
+    rows = zip(sec, beyond, angle.tolist(), torque.tolist(), strict=True)
+    log, mapping = tmp_path / "log.csv", tmp_path / "m.toml"
+    log.write_text("".join(f"{1700000000 + s},{ns},,MCP,{q!r},,{tau!r}\n" for s, ns, q, tau in rows))
+    (tmp_path / "finger.toml").write_text(ONE_JOINT[ONE_JOINT.index("[finger]") :])
+    main(["look", str(log), "--finger", str(tmp_path / "finger.toml")])
+    said = capsys.readouterr().out
+    mapping.write_text(said[said.index("# a mapping") :])
+    main(["import", str(log), "--mapping", str(mapping), "--output", str(tmp_path / "s.h5")])
+    (trial,) = read_session(tmp_path / "s.h5")
+    np.testing.assert_allclose(trial.time, (TIME - TIME[0]) / 1e3, atol=1e-6)
+    np.testing.assert_array_equal(trial.q[:, 0], angle)
+    np.testing.assert_array_equal(trial.joint_torque[:, 0], torque)

@@ -1,0 +1,56 @@
+"""CSV of `ros2 topic echo --csv` on a topic of sensor_msgs/JointState, whose lines say what their cells are.
+
+The command writes no names of columns. Each line is a message with its fields one after another, an array as its
+values and an empty array or text as one empty cell:
+
+    sec, nanosec, frame_id, the names, then as many positions, velocities and efforts
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import takewhile
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxfinger.data.importing.recording import Variable
+
+_BEFORE_NAMES = 3  # cells: sec, nanosec and frame_id
+_FIELDS = ("position", "velocity", "effort")
+_NS = 1e-9
+_MIN_NS = 10**6  # that some stamp holds beyond its second: clocks tick by a ms or less, and small numbers are counts.
+
+
+class JointStates(NamedTuple):
+    """Names of the joints, and the first column of each field that is there; each has a column a joint."""
+
+    names: tuple[str, ...]
+    fields: Mapping[str, int]
+
+    def variables(self, columns: Sequence[Float[np.ndarray, " N"]]) -> dict[str, Variable]:
+        """Stamps, s, and fields of the messages, of the columns of the table. Those of words are not read."""
+        tables = {field: columns[first : first + len(self.names)] for field, first in self.fields.items()}
+        stamp = Variable(columns[0] + _NS * columns[1], units="s")
+        return {"stamp": stamp, **{field: Variable(np.stack(x, axis=1), self.names) for field, x in tables.items()}}
+
+
+def joint_states(rows: Sequence[Sequence[str]], number: Callable[[str], float | None]) -> JointStates | None:
+    """What the cells of some lines are, if each is a JointState; None if not. `number` gives the number in a cell."""
+    cells = rows[0]
+    if len(cells) < _BEFORE_NAMES or not all(cell.isdecimal() for row in rows for cell in row[:2]):
+        return None
+    beyond = [int(row[1]) for row in rows]
+    names = tuple(takewhile(lambda cell: number(cell) is None, cells[_BEFORE_NAMES:]))
+    values = cells[_BEFORE_NAMES + len(names) :]
+    if not _MIN_NS <= max(beyond) < 1.0 / _NS or (cells[2] and number(cells[2]) is not None):
+        return None
+    if not names or len(set(names)) < len(names) or any(number(cell) is None for cell in values):
+        return None
+    at, fields = 0, {}
+    for field in _FIELDS:
+        if at < len(values) and values[at]:
+            fields[field] = _BEFORE_NAMES + len(names) + at
+        at += len(names) if field in fields else 1
+    return JointStates(names, fields) if at == len(values) and fields else None
