@@ -25,7 +25,7 @@ _MAX_OVERTRAVEL = 0.35  # rad, 20 degrees, that a joint may read beyond its limi
 # Readings below zero, as shares of the highest tension. A good tare is off by a hundredth. A taut tendon is held at a
 # fifth or more (`data.signals.sizes`), so a column of the wrong sign reads at least twice _MAX_PUSH below zero.
 MAX_TARE_ERROR = 0.03
-_MAX_TARE = 0.5  # of the highest tension: a tendon that reads more is pulled on purpose.
+_MAX_TARE = 0.5  # of the highest tension: a tendon that reads more is pulled.
 _MAX_PUSH = 0.1
 # Of the machine's reach. A moment arm is about a tenth of it, and a joint turns by less than a turn; degrees for rad
 # make 57 times as much, which the check of moment arms names, and mm for m a thousand times.
@@ -193,23 +193,26 @@ def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repo
     """Check that tensions are positive but for noise and tare, about zero where tendons are slack, and not in mN."""
     assert trial.tendon_force is not None
     place, tare = trial.place("tendon_force"), max(MAX_TARE_ERROR * sizes.tension, sizes.slack)
-    unslack, slack = {}, []  # tendons with a tension where they are to be slack, and without one where to be taut
+    unslack, pulled = {}, {}  # tensions of tendons that are to be slack: read throughout, and pulled
+    slack = []  # tendons without tension where they are to be taut
     for name, active, x in zip(finger.tendon_names, finger.active, trial.tendon_force.T, strict=True):
         if not np.isfinite(x).all():
             continue
         if not active:
             report.note(place, f"column {name} is measured though the tendon is passive; it is ignored")
             continue
-        low = quantile(x, 0.05)
+        low, high = quantile(x, 0.05), quantile(x, 0.95)
         if low < -max(_MAX_PUSH * sizes.tension, sizes.slack) and trial.experiment not in _SLACK:
             report.error(place, f"column {name} falls to {low:.3g} N, and a tendon cannot push; check sign and tare")
+        elif trial.experiment in _SLACK and high > tare:
+            # The tare shifts all readings alike, and by less than a pull.
+            of_tare = high - low < tare and low < _MAX_TARE * sizes.tension
+            (unslack if of_tare else pulled)[name] = low if of_tare else high
         elif low < -tare:
             report.warning(place, f"column {name} falls to {low:.3g} N, below zero by more than noise; check the tare")
-        elif trial.experiment in _SLACK and tare < low < _MAX_TARE * sizes.tension:
-            unslack[name] = low
         elif trial.experiment == "ID.2" and median(x) <= NOISE_FACTOR * sizes.noise:
             slack.append(name)
-        if quantile(x, 0.95) > _MAX_TENSION * _weight(finger):
+        if high > _MAX_TENSION * _weight(finger):
             said = f"column {name} exceeds {_MAX_TENSION:.0f} times the weight of all links"
             report.warning(place, f"{said}; {conversion('mN')} if that is what it is")
     if slack and trial.tendon_excursion is not None:
@@ -219,3 +222,7 @@ def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repo
         said = f"stays above {min(unslack.values()):.3g} N in {listed(list(unslack))}"
         said = f"{said}, though {trial.experiment} leaves tendons slack"
         report.warning(place, f"{said}; check the tare, or let the tendons go")
+    if pulled:
+        said = f"reaches {max(pulled.values()):.3g} N in {listed(list(pulled))}, though {trial.experiment} leaves"
+        said = f"{said} tendons slack, and what they pull is taken for a torque of the joints"
+        report.warning(place, f"{said}; let them go, and record the trial again")

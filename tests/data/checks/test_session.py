@@ -1,5 +1,6 @@
 """Faults in session files: the checker names each with its place, and the reader refuses it without a traceback."""
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -395,6 +396,26 @@ def test_slack_tendons_that_read_tension_are_said(session):
     assert "/trials/02-ID.3-static-PIP/tendon_force: stays above 0.5" in said
     assert "N in T1, T2, though ID.3-static leaves tendons slack; check the tare, or let the tendons go" in said
     assert not [text for text in said_of(session) if "tare" in text]
+
+
+@pytest.mark.parametrize(("held", "stepped"), [(9.0, 0.0), (0.0, 1.5), (2.0, 6.0)], ids=["held", "stepped", "both"])
+@pytest.mark.parametrize("trial", ["02-ID.3-static-PIP", "07-VD.3"])
+def test_tendons_that_are_pulled_where_they_are_to_be_slack_are_said(session, trial, held, stepped):
+    """By a motor that holds one, or one that follows the joint's steps. Tensions of other experiments are no fault."""
+    old = session[trial]
+    force = old.tendon_force.copy()
+    force[:, 1] += held + stepped * (old.time > 0.3 * old.time[-1])
+    changed = replace(session, trials={**session.trials, trial: replace(old, tendon_force=force)})
+    found = [text for text in said_of(changed) if "leaves tendons slack" in text]
+    if trial == "07-VD.3":
+        assert found == []
+        return
+    (said,) = found
+    place, reached, rest = re.split(r" reaches (\S+) N in ", said)
+    assert place == f"warning: /trials/{trial}/tendon_force:"
+    assert float(reached) == pytest.approx(held + stepped, abs=0.05)
+    assert rest.startswith("T2, though ID.3-static leaves tendons slack, and what they pull is taken for a torque")
+    assert rest.endswith("; let them go, and record the trial again")
 
 
 def test_pulls_without_a_slack_tendon_have_a_note(session):
