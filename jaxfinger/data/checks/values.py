@@ -125,20 +125,25 @@ def _angles(trial: Trial, finger: FingerDescription, report: Report) -> None:
             say = report.error if max(-low, high) > 2.0 * np.pi else report.warning
             say(place, f"{where}, a turn beside its limits {lower:.3g} to {upper:.3g}; {unwrap}")
         elif outside and max(-low, high) > 2.0 * np.pi:
-            mend = _mend_of_turns(q, low, high) + (f", or {unwrap}" if fits and abs(turn) < 4.0 * np.pi else "")
+            mend = _mend_of_turns(q, low, high, np.array((lower, upper)))
+            mend += f", or {unwrap}" if fits and abs(turn) < 4.0 * np.pi else ""
             report.error(place, f"{where}, more than a turn; {mend}")
         elif outside:
             message = f"{where}, far outside its limits {lower:.3g} to {upper:.3g}; correct one or the other"
             report.warning(place, message)
 
 
-def _mend_of_turns(q: Float[np.ndarray, " N"], low: float, high: float) -> str:
+def _mend_of_turns(q: Float[np.ndarray, " N"], low: float, high: float, limits: Float[np.ndarray, "2"]) -> str:
     """What to do about an angle that runs from `low` to `high` rad, more than a turn, which its limits forbid.
 
-    It is in degrees or in counts, or the joint turns on and on. Counts are whole numbers, and angles in rad are not.
+    1. It is in counts, if it has whole numbers beyond 400, and otherwise in degrees if it has whole numbers.
+    2. It is in degrees, if these lie within limits of less than a turn.
+    3. Else the joint may also turn on and on.
     """
     other = conversion("deg") if max(-low, high) < _MAX_DEGREES else "convert counts to rad (`scale` in a mapping)"
-    if np.all(q == np.round(q)):
+    lower, upper = limits[0] - _MAX_OVERTRAVEL, limits[1] + _MAX_OVERTRAVEL
+    fits = lower <= np.radians(low) and np.radians(high) <= upper and np.ptp(limits) < 2.0 * np.pi - _MAX_OVERTRAVEL
+    if fits or np.all(q == np.round(q)):
         return other
     first, last = 360.0 * np.floor(low / (2.0 * np.pi)), 360.0 * np.ceil(high / (2.0 * np.pi))
     return f"{other}, or, if the joint turns on, write `limits_deg = [{first:.0f}, {last:.0f}]` in the finger's file"

@@ -481,7 +481,7 @@ def _said_of_angles(session: Session) -> list[str]:
 def test_a_joint_that_turns_on_within_its_limits_is_sound_and_others_have_its_mend(session):
     assert _said_of_angles(_turning(session, 5.5, (-360.0, 2160.0))) == []
     for turns, other, upper in ((5.5, "convert deg to rad", 2160), (90.0, "convert counts to rad", 32040)):
-        (said,) = _said_of_angles(_turning(session, turns))
+        (said,) = _said_of_angles(_turning(session, turns, (-180.0, 180.0)))
         assert f"{other} " in said
         assert f"if the joint turns on, write `limits_deg = [0, {upper}]` in the finger's file" in said
         assert _said_of_angles(_turning(session, turns, (0.0, upper))) == []
