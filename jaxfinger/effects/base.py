@@ -166,10 +166,7 @@ class CatalogueEffect(Effect):
         return cls(site, index, **numbers, **cls.constants(finger, site))
 
     def with_values(self: Kind, **values: float) -> Kind:
-        """Copy with other values of some parameters, as arrays of NumPy: many effects are made before they are stacked.
-
-        `jax.device_put` takes a hundred times as long as all else here.
-        """
+        """Copy with other values of some parameters, in arrays of NumPy: hundreds of effects are stacked at once."""
         leaves, structure = jax.tree_util.tree_flatten_with_path(self)
         fields = [(path[0].name, leaf) for path, leaf in leaves]
         new = [np.asarray(values.get(name, leaf), float if name in values else None) for name, leaf in fields]

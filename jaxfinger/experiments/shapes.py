@@ -59,7 +59,6 @@ def in_rows(batch: Batch) -> Batch:
 
     Rows are of one length; padding repeats the last values with mask 0.
     """
-
     (B, T), n = batch.x.time.shape, -(-batch.x.time.size // TRIALS)
 
     def rows(a, mode: Literal["edge", "constant"] = "edge"):

@@ -306,11 +306,12 @@ class LinearModel:
     def _weighted(self, w: Weights, B, B2, T):
         """Weighted products Σ_c X_c Ω_c Y_cᵀ, Ω_c = w_outside I + (w_feature − w_outside) U_c U_cᵀ.
 
-        B and B2 are the coefficients of X and Y on the features, T their products in every column.
+        B and B2 are the coefficients of X and Y on the features, T their products in every column; or of several X and
+        Y, which B and B2 have along their first axis and T along its second.
         """
         outside = T.summed(w.outside) if isinstance(T, Products) else np.tensordot(w.outside, T, 1)
         on_features = np.repeat(w.feature - w.outside, self.columns.counts.K)
-        return outside + (B * on_features[:, None]).T @ B2
+        return outside + np.swapaxes(B * on_features[:, None], -1, -2) @ B2
 
     def _optimum(self, H, low, high):
         """Coefficients u = (1, −δ, −a) that minimise uᵀ H u, with amplitudes beyond a bound fixed at it.
@@ -357,14 +358,19 @@ class LinearModel:
         absorbed = _ridge_solve(HXX[1:, 1:], HXZ[1:])  # coefficients of J that absorb each row of Z, (k − 1, l)
         # What is left is orthogonal to J in these weights, so that its products with Z need no projection.
         gradient = u @ HXZ
-        amplitudes, occam, own = [], np.zeros(len(candidates)), np.zeros((len(candidates), len(self.columns.items)))
-        for n, (at, (low, high)) in enumerate(zip(candidates, bounds, strict=True)):
-            T, B = self.Z.among(at), self.BZ[:, at]
-            G = self._weighted(w, B, B, T) - HXZ[1:, at].T @ absorbed[:, at]
-            a = np.clip(np.linalg.solve(G + np.eye(len(at)), gradient[at]), low, high)
-            amplitudes.append(a)
-            occam[n] = 0.5 * np.linalg.slogdet(np.eye(len(at)) + G)[1] + 0.5 * float(a @ a)
-            own[n] = (T @ a) @ a
+        amplitudes = [np.empty(0)] * len(candidates)
+        occam, own = np.zeros(len(candidates)), np.zeros((len(candidates), len(self.columns.items)))
+        for alike in _by_size(candidates):
+            at = np.array([candidates[n] for n in alike])  # (candidates, rows of each)
+            T, B = np.stack([self.Z.among(x) for x in at], axis=1), np.moveaxis(self.BZ[:, at], 0, 1)
+            low, high = (np.array([bounds[n][side] for n in alike]) for side in (0, 1))
+            absorbs = np.einsum("ink,inl->nkl", HXZ[1:, at], absorbed[:, at])
+            G, eye = self._weighted(w, B, B, T) - absorbs, np.eye(at.shape[1])
+            a = np.clip(np.linalg.solve(G + eye, gradient[at][:, :, None])[:, :, 0], low, high)
+            occam[alike] = 0.5 * np.linalg.slogdet(eye + G)[1] + 0.5 * np.sum(a**2, axis=1)
+            own[alike] = np.einsum("nk,cnkl,nl->nc", a, T, a)
+            for n, one in zip(alike, a, strict=True):
+                amplitudes[n] = one
         starts = np.cumsum([0, *(len(a) for a in amplitudes)])
         shape = self.BZ.shape[1], len(candidates)
         a = csc_array((np.concatenate(amplitudes), np.concatenate(candidates), starts), shape)
@@ -396,6 +402,12 @@ class LinearModel:
         scale = 1.0 / np.sqrt(np.maximum(np.diag(H)[1:], 1e-300))
         inverse = np.linalg.pinv(H[1:, 1:] * np.outer(scale, scale), rcond=1e-12, hermitian=True)
         return (np.sqrt(np.maximum(np.diag(inverse), 0.0)) * scale)[k - 1 :]
+
+
+def _by_size(candidates: Sequence[Int[np.ndarray, " _k"]]) -> list[Int[np.ndarray, " _n"]]:
+    """Numbers of the candidates that have as many rows, for every number of rows."""
+    sizes = np.array([len(at) for at in candidates])
+    return [np.flatnonzero(sizes == k) for k in np.unique(sizes)]
 
 
 def _log_det_refitted(H: Float[np.ndarray, "d d"], k: int) -> float:
