@@ -183,9 +183,8 @@ def fit_set(
 ) -> SearchState:
     """Fit a set of causes from amplitudes `start`, in their own units, and from the problem's nominal model."""
     finger = problem.nominal.finger
-    placed = [within_bounds(v.at(finger, s), v.scales) for v, s in zip(variants, start, strict=True)]
-    effects = jax.device_put(placed)
-    best = fit_at_nominal(baseline, problem, effects, weights)
+    effects = [within_bounds(v.at(finger, s), v.scales) for v, s in zip(variants, start, strict=True)]
+    best = fit_at_nominal(baseline, problem, jax.device_put(effects), weights)
     for _ in range(MAX_ROUNDS - 1):
         weights = best.linear_fit.weights
         there = _with_nominal_refitted(baseline, best, weights)

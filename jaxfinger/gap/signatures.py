@@ -183,9 +183,10 @@ class Signatures:
         names = list(items[0].effect.amplitudes())
         none = dict.fromkeys(names, 0.0)
         there = placed(items, self.problem.nominal.finger)
-        values = [dict(v.shape) | none | {n: v.size * v.sizes[n]} for v, n in product(items, names)]
-        sites = [v.site for v, _ in product(items, names)]
-        members = [there[site].with_values(**value) for site, value in zip(sites, values, strict=True)]
+        members = [
+            there[v.site].with_values(**dict(v.shape) | none | {n: v.size * v.sizes[n]})
+            for v, n in product(items, names)
+        ]
         found = self.white_changes(members).reshape(len(items), len(names), -1)
         found /= np.array([v.size for v in items])[:, None, None]
         return found

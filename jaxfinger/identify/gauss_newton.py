@@ -34,7 +34,8 @@ MIN_RELATIVE_SINGULAR_VALUE = 1e-7
 # Actual descent over predicted descent. Below the first a step is rejected, below the second the next one is shorter,
 # above the third it is longer (Nocedal and Wright 2006, algorithm 4.1, with a small η).
 MIN_DESCENT_RATIO, POOR_DESCENT_RATIO, GOOD_DESCENT_RATIO = 1e-3, 0.25, 0.75
-# Least eigenvalue of the Hessian in the coordinates z: a step is at most ten times as long as that of Gauss–Newton.
+# Least eigenvalue of the Hessian in the coordinates z. Where nearly all rows are linear it would be zero, and the step
+# without end. So a step is at most ten times as long as that of Gauss–Newton, and is shortened where that is too long.
 MIN_CURVATURE = 0.1
 # A shortened step over the last one, as in a backtracking line search (Dennis and Schnabel 1996, §6.3.2).
 MIN_SHORTENING, MAX_SHORTENING = 0.1, 0.5

@@ -90,11 +90,9 @@ def _joints(finger: FingerDescription, report: Report) -> None:
             message = f"joint {name} has its lower limit {lower:.4g} at or above its upper {upper:.4g}; swap them"
             report.error("/finger/joints/limits", message, row=i)
         if not finger.prismatic[i] and beyond_a_turn((lower, upper)) and not _whole_degrees(finger.limits[i]):
-            message = (
-                f"joint {name} reaches {max(-lower, upper):.4g} rad, more than a turn; convert degrees to rad, or "
-            )
-            message += "write `limits_deg`, in whole degrees where a joint turns several times"
-            report.error("/finger/joints/limits", message, row=i)
+            said = f"joint {name} reaches {max(-lower, upper):.4g} rad, more than a turn"
+            mend = "convert degrees to rad, or write `limits_deg`, in whole degrees where a joint turns several times"
+            report.error("/finger/joints/limits", f"{said}; {mend}", row=i)
 
 
 def _whole_degrees(angles: Float[np.ndarray, " a"]) -> bool:

@@ -20,7 +20,9 @@ from jaxfinger.data.importing.recording import Variable
 _BEFORE_NAMES = 3  # cells: sec, nanosec and frame_id
 _FIELDS = ("position", "velocity", "effort")
 _NS = 1e-9
-_MIN_NS = 10**6  # that some stamp holds beyond its second: clocks tick by a ms or less, and small numbers are counts.
+# ns. A clock of messages ticks by a millisecond or less, so that some stamp is so far beyond its second. In a table of
+# other numbers the second column may count from zero, and stays below.
+_MIN_NS = 10**6
 
 
 class JointStates(NamedTuple):
