@@ -3,7 +3,7 @@
 This is the only room that joins data to the model.
 """
 
-from jaxfinger.experiments.affected import affected_channels, refuse_broken
+from jaxfinger.experiments.affected import affected_channels, differs_in_repeats, refuse_broken
 from jaxfinger.experiments.predict import change, demean, predict, predict_compiled
 from jaxfinger.experiments.prepare import Batch, NotJudged, Stack, not_judged, prepare
 from jaxfinger.experiments.shapes import SAMPLES, TRIALS, Block, blocks, in_rows, padded, padded_size, split
@@ -22,6 +22,7 @@ __all__ = [
     "blocks",
     "change",
     "demean",
+    "differs_in_repeats",
     "in_rows",
     "not_judged",
     "padded",

@@ -19,6 +19,9 @@ from jaxfinger.experiments.table import EXPERIMENTS
 from jaxfinger.model import Effect, Finger, Model, Motion, Terms, contact_map, terms_without_effects
 from jaxfinger.programs import kept
 
+# Fields of `Motion` in which repeats of one motion differ.
+DIFFER_IN_REPEATS = ("session_time", "temperature")
+
 
 def affected_channels(kind: type[CatalogueEffect], finger: Finger) -> dict[str, tuple[str, ...]]:
     """Channels of each experiment that an effect can change; experiments without one are left out.
@@ -26,10 +29,19 @@ def affected_channels(kind: type[CatalogueEffect], finger: Finger) -> dict[str, 
     The effect changes no other channel in any trial. A channel that it can change may still be unchanged in some
     trials, as by friction in proportion to tension where all tendons are slack.
     """
-    names = finger.joint_names, finger.tendon_names
-    shown = _reached(kind, *names, finger.prismatic, finger.active, finger.crosses)
+    shown = _reached_at(kind, finger).by_amplitudes
     found = {e.name: tuple(c for c in e.channels if e.predicted_as(c) in shown) for e in EXPERIMENTS.values()}
     return {e: channels for e, channels in found.items() if channels}
+
+
+def differs_in_repeats(kind: type[CatalogueEffect], finger: Finger) -> bool:
+    """Whether what an effect does depends on `DIFFER_IN_REPEATS`, so that repeats of one motion may differ."""
+    return bool(_reached_at(kind, finger).by_session)
+
+
+def _reached_at(kind: type[CatalogueEffect], finger: Finger) -> "_Reached":
+    names = finger.joint_names, finger.tendon_names
+    return _Reached(*_reached(kind, *names, finger.prismatic, finger.active, finger.crosses))
 
 
 def refuse_broken(kind: type[CatalogueEffect], finger: Finger) -> None:
@@ -80,17 +92,24 @@ class _Nominal(NamedTuple):
         return cls(finger, model, x, *jax.device_put((terms, contact)))
 
 
-@kept
-def _reached(kind, *description) -> frozenset[tuple[str, bool]]:
+class _Reached(NamedTuple):
     """Predictions (`Experiment.predicted_as`) that an effect can change."""
+
+    by_amplitudes: frozenset[tuple[str, bool]]
+    by_session: frozenset[tuple[str, bool]]  # differently in repeats of one motion
+
+
+@kept
+def _reached(kind, *description) -> tuple[frozenset[tuple[str, bool]], frozenset[tuple[str, bool]]]:
+    """Fields of `_Reached`."""
     finger = _Nominal.of(*description, held=False).finger
     sites = kind.sites(finger)
     if not sites:
-        return frozenset()
+        return frozenset(), frozenset()
     effect = kind.at(finger, sites[0])
     amplitudes = {k: getattr(effect, k) for k in kind.amplitudes()}
 
-    def depends(channel: str, held: bool) -> bool:
+    def depends(channel: str, held: bool) -> tuple[bool, bool]:
         _, model, x, terms, contact = _Nominal.of(*description, held=held)
         y0 = {
             "joint_torque": x.q,
@@ -99,18 +118,21 @@ def _reached(kind, *description) -> frozenset[tuple[str, bool]]:
         }[channel]
         of_force = contact if channel == "fingertip_force" else None
 
-        def of(amplitudes):
-            return change(channel, replace(effect, **amplitudes), model, x, y0, terms, of_force)
+        def of(amplitudes, session):
+            return change(channel, replace(effect, **amplitudes), model, replace(x, **session), y0, terms, of_force)
 
-        return any(_dependent(jax.make_jaxpr(of)(amplitudes).jaxpr))
+        jaxpr = jax.make_jaxpr(of)(amplitudes, {k: getattr(x, k) for k in DIFFER_IN_REPEATS}).jaxpr
+        n = len(amplitudes)
+        return _dependent(jaxpr, jaxpr.invars[:n]), _dependent(jaxpr, jaxpr.invars[n:])
 
     kinds = {e.predicted_as(c) for e in EXPERIMENTS.values() for c in e.channels}
-    return frozenset(key for key in kinds if depends(*key))
+    found = {key: depends(*key) for key in kinds}
+    return frozenset(k for k, (a, _) in found.items() if a), frozenset(k for k, (_, s) in found.items() if s)
 
 
-def _dependent(jaxpr) -> list[bool]:
-    """Whether each result depends on the arguments; an operation's outputs depend on all of its inputs."""
-    dependent = set(jaxpr.invars)
+def _dependent(jaxpr, arguments) -> bool:
+    """Whether a result depends on some of the arguments; an operation's outputs depend on all of its inputs."""
+    dependent = set(arguments)
 
     def tainted(v) -> bool:
         return not isinstance(v, Literal) and v in dependent
@@ -118,4 +140,4 @@ def _dependent(jaxpr) -> list[bool]:
     for equation in jaxpr.eqns:
         if any(map(tainted, equation.invars)):
             dependent.update(equation.outvars)
-    return [tainted(v) for v in jaxpr.outvars]
+    return any(map(tainted, jaxpr.outvars))

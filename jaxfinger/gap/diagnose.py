@@ -15,6 +15,7 @@ from jaxfinger.gap.closure import closures
 from jaxfinger.gap.columns import Columns
 from jaxfinger.gap.exact import Baseline, SearchState
 from jaxfinger.gap.formula import Parameters
+from jaxfinger.gap.laws_of_time import without_laws_of_time
 from jaxfinger.gap.next_experiment import next_experiment
 from jaxfinger.gap.parts import (
     absorbed_causes,
@@ -121,8 +122,10 @@ def diagnose(
     if next(measured_columns(problem), None) is None:
         return _nothing_judged(problem, partial(diagnosis, problem=problem))
 
+    candidates = _candidates(problem, catalogue, changed, without)
+    problem = without_laws_of_time(problem, candidates, against)
+
     def judged(problem: Problem) -> Diagnosis:
-        candidates = _candidates(problem, catalogue, changed, without)
         record = partial(diagnosis, problem=problem)
         return _judged(problem, candidates, record, quick, tolerance, against, progress)
 

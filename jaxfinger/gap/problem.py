@@ -181,7 +181,7 @@ def build(
         fit=fit,
         scales=Scales.of(fit.model.finger, [s.batch for s in measured.values()]),
         simulator=simulator,
-        **_refitted_to_all(session, fit, stacks, against),
+        **_refitted_to_all(session, fit, stacks, fit.noise, against),
     )
 
 
@@ -193,19 +193,32 @@ def without_recurring_noise(problem: Problem, against: Fit | None = None) -> Pro
     """
     if _settled(problem.noise, _noise_of_all(problem.noise, problem.stacks, problem.nominal, recurring=True)):
         return None
-    return replace(problem, **_refitted_to_all(problem.session, problem.fit, problem.stacks, against, recurring=True))
+    known = problem.fit.noise
+    return replace(problem, **_refitted_to_all(problem.session, problem.fit, problem.stacks, known, against, True))
+
+
+def with_noise(problem: Problem, noise: Noises, against: Fit | None = None) -> Problem:
+    """The problem with other noise in some channels; itself where no standard deviation changes by `NOISE_CHANGE`.
+
+    `against`: as in `build`.
+    """
+    if _settled(problem.noise, noise):
+        return problem
+    known = problem.fit.noise | noise
+    return replace(problem, **_refitted_to_all(problem.session, problem.fit, problem.stacks, known, against))
 
 
 def _refitted_to_all(
     session: Session,
     fit: Fit,
     stacks: dict[str, Stack],
+    known: Noises,
     against: Fit | None,
     recurring: bool = False,
 ) -> dict[str, Any]:
     """Refit what the stages have estimated, and what they have not but some trial shows, to all trials together.
 
-    `recurring`: as in `_noise_of_all`. Returns the fields of a `Problem` that follow from the refit.
+    `known`, `recurring`: as in `_noise_of_all`. Returns the fields of a `Problem` that follow from the refit.
     """
     parameters, coverage = describe(fit.model), coverage_of(stacks, session)
     variance = np.diag(fit.covariance)
@@ -218,9 +231,9 @@ def _refitted_to_all(
             return cad_prior(session, fit.recipe, parameters, free)
         return prior_of(np.asarray(ravel(against.model)), against.covariance, free)
 
-    nominal, latest, shown = fit.model, _noise_of_all(fit.noise, stacks, fit.model, recurring), free
+    nominal, latest, shown = fit.model, _noise_of_all(known, stacks, fit.model, recurring), free
     for _ in range(MAX_ROUNDS):
-        noise, known = latest, shown
+        noise, before = latest, shown
         sources = sources_of(stacks, reads, noise, parameters)
         # Some parameters show only after a refit: a tendon whose moment arms are zero shows no friction.
         nominal, shown = _with_unfitted(nominal, free_groups(fit.recipe), free, sources, parameters, coverage)
@@ -229,8 +242,8 @@ def _refitted_to_all(
         if shown.size == free.size:
             break
         # Residuals held what the added parameters explain, so noise estimated from them was too large.
-        latest = _noise_of_all(fit.noise, stacks, nominal, recurring)
-        if shown.size == known.size and _settled(noise, latest):
+        latest = _noise_of_all(known, stacks, nominal, recurring)
+        if shown.size == before.size and _settled(noise, latest):
             break
     rows = _layouts(stacks, sources)
     return {

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxfinger.compilation import side_by_side
 from jaxfinger.experiments import affected_channels
@@ -87,18 +87,38 @@ class Scan:
         items = [v.with_shape(**shape) for v in self.items]
         return items, by_column(self.signatures, items, columns)
 
+    @property
+    def sets(self) -> Int[np.ndarray, "S k"]:
+        """Rows of every set of periods: the amplitudes without a period, and the pairs of its periods."""
+        n, each = len(self.periods), len(self.items[0].effect.periods())
+        sets = np.array(list(combinations(range(n), each)))
+        k = len(self.rows) - 2 * n  # The first k rows have no period.
+        pairs = (k + 2 * sets[:, :, None] + np.arange(2)).reshape(len(sets), -1)
+        return np.column_stack([np.tile(np.arange(k), (len(sets), 1)), pairs])
+
+    def periods_of(self, chosen: Int[np.ndarray, " k"]) -> dict[str, float]:
+        """Periods, s, by shape, of one of the `sets`."""
+        names, n = list(self.items[0].effect.periods()), len(self.periods)
+        pairs = chosen[-2 * len(names) :: 2] - (len(self.rows) - 2 * n)
+        return dict(zip(names, self.periods[pairs // 2].tolist(), strict=True))
+
     def best(self, project: Project, rt: Float[np.ndarray, " rows"]) -> dict[str, float]:
         """Periods, s, by shape: of all sets of the scan's periods that which explains most of `rt` by least squares."""
-        names, n = list(self.items[0].effect.periods()), len(self.periods)
         A = project(self.rows)
         A = A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300)
-        G, b, k = A @ A.T + RIDGE * np.eye(len(A)), A @ rt, len(A) - 2 * n  # The first k rows have no period.
-        sets = np.array(list(combinations(range(n), len(names))))
-        pairs = (k + 2 * sets[:, :, None] + np.arange(2)).reshape(len(sets), -1)
-        rows = np.column_stack([np.tile(np.arange(k), (len(sets), 1)), pairs])
-        amplitudes = np.linalg.solve(G[rows[:, :, None], rows[:, None, :]], b[rows][:, :, None])[:, :, 0]
-        most = np.argmax(np.sum(b[rows] * amplitudes, axis=1))
-        return dict(zip(names, self.periods[sets[most]].tolist(), strict=True))
+        return self.periods_of(self.sets[np.argmax(explained(A @ A.T, A @ rt, self.sets, RIDGE)[0])])
+
+
+def explained(
+    G: Float[np.ndarray, "M M"], b: Float[np.ndarray, " M"], sets: Int[np.ndarray, "S k"], precision: float
+) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, "S k"]]:
+    """What each set of rows A explains of r by least squares, and its amplitudes, from G = A Aᵀ and b = A r.
+
+    `precision`: of the amplitudes' prior, whose mean is zero.
+    """
+    within = G[sets[:, :, None], sets[:, None, :]] + precision * np.eye(sets.shape[1])
+    amplitudes = np.linalg.solve(within, b[sets][:, :, None])[:, :, 0]
+    return np.sum(b[sets] * amplitudes, axis=1), amplitudes
 
 
 Part = FixedShapes | Scan

@@ -209,12 +209,16 @@ def _centred(e: np.ndarray, mask: np.ndarray, demean: bool) -> np.ndarray:
     return np.where(mask, e - (e[mask].mean() if demean and mask.any() else 0.0), 0.0)
 
 
+def repeated_motions(stack: Stack) -> list[list[int]]:
+    """Trials of each motion that is repeated, by their numbers in the stack."""
+    motions = [m for m in dict.fromkeys(stack.motions) if m is not None and stack.motions.count(m) > 1]
+    return [[b for b, name in enumerate(stack.motions) if name == motion] for motion in motions]
+
+
 def _repeats(stack: Stack, residual, mask, demean) -> list[Series]:
     """Deviations of trials that repeat one motion from their mean, scaled to the noise of a single trial."""
     series: list[Series] = [[] for _ in range(len(residual))]
-    motions = [m for m in dict.fromkeys(stack.motions) if m is not None and stack.motions.count(m) > 1]
-    for motion in motions:
-        members = [b for b, name in enumerate(stack.motions) if name == motion]
+    for members in repeated_motions(stack):
         for c, column in enumerate(series):
             both = mask[c, members].all(axis=0)
             if both.sum() < MIN_SAMPLES_OF_REPEAT:

@@ -77,10 +77,6 @@ def test_a_long_session_is_scanned_down_to_a_longer_period(planted, monkeypatch)
         assert np.all(scan.periods > 0.0)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="A drift by which repeats differ is taken for noise, and what lies below the noise is no evidence.",
-)
 @pytest.mark.long
 def test_a_wandering_sensor_is_named_with_its_period():
     """The period lies between two of the scan, and far from the first value that is tried."""
