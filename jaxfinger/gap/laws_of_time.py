@@ -91,10 +91,9 @@ class Deviations:
         honest, whatever the noise of the deviations. From half of their sum Schwarz's (1978) cost of the amplitudes
         and the logarithm of the number of choices are taken.
         """
-        G, b = [A @ A.T for A in self.rows], [A @ x for A, x in zip(self.rows, r, strict=True)]
-        all_G, all_b, gain = sum(G), sum(b), 0.0
-        for mine, A, x in zip(range(len(r)), self.rows, r, strict=True):
-            energy, amplitudes = explained(all_G - G[mine], all_b - b[mine], self.sets, 1.0)
+        (G, b), gain = _products(self.rows, r), 0.0
+        for A, x in zip(self.rows, r, strict=True):
+            energy, amplitudes = explained(G - A @ A.T, b - A @ x, self.sets, 1.0)
             best = np.argmax(energy)
             gain += float(x @ x - np.sum((x - amplitudes[best] @ A[self.sets[best]]) ** 2))
         S, k = self.sets.shape
@@ -106,29 +105,25 @@ class Deviations:
         """The effect in its best shapes, fitted to the deviations by least squares, and what it leaves of them."""
         best = _best(signatures, repeats, self.items_with_periods(r), r)
         if self.scan is not None:
-            best = _best(signatures, repeats, self.periods_near(best.variant, FINER_STEP), r)
-        v, sizes = best.variant, dict(zip(best.variant.sizes, best.amplitudes, strict=True))
-        effect = v.at(signatures.problem.nominal.finger, {n: a * v.sizes[n] for n, a in sizes.items()})
-        return effect, [x - best.amplitudes @ A for x, A in zip(r, best.rows, strict=True)]
+            best = _best(signatures, repeats, self.periods_near(best.variant, self.scan.periods[0]), r)
+        v = best.variant
+        sizes = {n: a * size for a, (n, size) in zip(best.amplitudes, v.sizes.items(), strict=True)}
+        left = [x - best.amplitudes @ A for x, A in zip(r, best.rows, strict=True)]
+        return v.at(signatures.problem.nominal.finger, sizes), left
 
     def items_with_periods(self, r: list[Float[np.ndarray, " _n"]]) -> list[Variant]:
         """The cause in all shapes, with the periods of the scan that explain most of the deviations."""
         if self.scan is None:
             return self.items
-        energy, _ = explained(sum(A @ A.T for A in self.rows), sum(map(np.matmul, self.rows, r)), self.sets, 1.0)
+        energy, _ = explained(*_products(self.rows, r), self.sets, 1.0)
         shape = {"middle": self.scan.middle} | self.scan.periods_of(self.sets[np.argmax(energy)])
         return [v.with_shape(**shape) for v in self.items]
 
-    def periods_near(self, v: Variant, step: float) -> list[Variant]:
-        """A variant with frequencies up to two steps away, in units of the scan's steps."""
-        assert self.scan is not None
-        names, shape, longest = list(v.effect.periods()), dict(v.shape), self.scan.periods[0]
-        return [
-            v.with_shape(
-                **{n: float(longest / (longest / shape[n] + k * step)) for n, k in zip(names, ks, strict=True)}
-            )
-            for ks in product((-2 * step, -step, 0.0, step, 2 * step), repeat=len(names))
-        ]
+    def periods_near(self, v: Variant, longest: float) -> list[Variant]:
+        """A variant with frequencies up to half a step of the scan away, whose step is 1 / `longest`."""
+        steps = {name: longest / dict(v.shape)[name] for name in v.effect.periods()}
+        near = product(*([n + k * FINER_STEP for k in (-2, -1, 0, 1, 2)] for n in steps.values()))
+        return [v.with_shape(**{name: longest / n for name, n in zip(steps, ns, strict=True)}) for ns in near]
 
 
 class Fitted(NamedTuple):
@@ -145,11 +140,18 @@ def _best(signatures: Signatures, repeats: Repeats, items: list[Variant], r: lis
     fits = []
     for v, white in zip(items, signatures.per_amplitude(items), strict=True):
         rows = repeats.deviations(white)
-        G, b = sum(A @ A.T for A in rows), sum(map(np.matmul, rows, r))
+        G, b = _products(rows, r)
         amplitudes = np.linalg.solve(G + np.eye(len(b)), b)
         left = sum(float(np.sum((x - amplitudes @ A) ** 2)) for x, A in zip(r, rows, strict=True))
         fits.append(Fitted(left, v, amplitudes, rows))
     return min(fits, key=lambda fit: fit.left)
+
+
+def _products(
+    rows: list[Float[np.ndarray, "M _n"]], r: list[Float[np.ndarray, " _n"]]
+) -> tuple[Float[np.ndarray, "M M"], Float[np.ndarray, " M"]]:
+    """A Aᵀ and A r over all motions."""
+    return np.sum([A @ A.T for A in rows], axis=0), np.sum([A @ x for A, x in zip(rows, r, strict=True)], axis=0)
 
 
 def without_laws_of_time(
