@@ -28,11 +28,12 @@ class TorqueSensorScale(CatalogueEffect):
 
 
 class TorqueSensorDrift(CatalogueEffect):
-    """o(s) − o(tare), o = −slope T exp(−s/T) + A cos(2π (s − m)/P) + B sin(2π (s − m)/P): a thermal offset.
+    """o(s) − o(tare), o = −slope T exp(−s/T) + A cos(φ/P) + B sin(φ/P) + A_2 cos(φ/P_2) + B_2 sin(φ/P_2), where φ is
+    2π times the time from the session's middle: a thermal offset.
 
-    The gauge warms up from the session's start, s = 0; its offset changes by `slope` a second at first. The room heats
-    and cools with a period P; m is the middle of the session. A tare, `tare` seconds before the trial, subtracts the
-    offset of that time.
+    The gauge warms up from the session's start, s = 0; its offset changes by `slope` a second at first. The room's
+    temperature wanders without a period, but over one session the two strongest lines of its spectrum come near to it.
+    A tare, `tare` seconds before the trial, subtracts the offset of that time.
     """
 
     ID: ClassVar = "torque_sensor_drift"
@@ -44,15 +45,19 @@ class TorqueSensorDrift(CatalogueEffect):
     slope: Float[Array, ""] = amplitude("N m/s", 0.02, "torque/trial", signed=True)
     A: Float[Array, ""] = amplitude("N m", 0.006, "torque", signed=True)
     B: Float[Array, ""] = amplitude("N m", 0.006, "torque", signed=True)
+    A_2: Float[Array, ""] = amplitude("N m", 0.006, "torque", signed=True)
+    B_2: Float[Array, ""] = amplitude("N m", 0.006, "torque", signed=True)
     T: Float[Array, ""] = shape("s", (30.0, 0.3), "session")
     P: Float[Array, ""] = shape("s", (0.25, 0.04, 10.0), "session", period_of=("A", "B"))
+    P_2: Float[Array, ""] = shape("s", (0.1, 0.02, 10.0), "session", period_of=("A_2", "B_2"))
     tare: Float[Array, ""] = shape("s", (0.1, 0.03), "trial")
     middle: Float[Array, ""] = shape("s", (0.0,), "session", moves="not")
 
     def _offset(self, s):
-        phase = 2.0 * jnp.pi * (s - self.middle) / self.P
         warm = -self.slope * self.T * jnp.expm1(-s / self.T)
-        return warm + self.A * jnp.cos(phase) + self.B * jnp.sin(phase)
+        lines = ((self.A, self.B, self.P), (self.A_2, self.B_2, self.P_2))
+        turns = [2.0 * jnp.pi * (s - self.middle) / P for _, _, P in lines]
+        return warm + sum(A * jnp.cos(t) + B * jnp.sin(t) for t, (A, B, _) in zip(turns, lines, strict=True))
 
     def reading(self, channel, x, y):
         if channel != "joint_torque":

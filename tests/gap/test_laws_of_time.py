@@ -9,8 +9,10 @@ from scipy.signal import lfilter
 from jaxfinger.data import Session
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.experiments import differs_in_repeats
+from jaxfinger.gap import diagnose
 from jaxfinger.gap.laws_of_time import Repeats, without_laws_of_time
 from jaxfinger.gap.problem import build
+from jaxfinger.gap.result import Key
 from jaxfinger.identify import Recipe
 
 from .conftest import session_with
@@ -45,6 +47,22 @@ def with_red_noise(session: Session, seconds: float, std: float, seed: int) -> S
     return replace(session, trials={t.name: noisy(t) for t in session})
 
 
+def with_wander(session: Session, seconds: float, std: float, seed: int) -> Session:
+    """Add to torques what a smooth random offset has changed since a tare 3 s before each trial."""
+    t = np.arange(-10.0 * seconds, 1000.0, seconds / 20.0)
+    kernel = np.exp(-0.5 * (np.arange(-100, 101) / 20.0) ** 2)
+    white = np.random.default_rng(seed).standard_normal(t.size)
+    offset = std * np.convolve(white, kernel / np.linalg.norm(kernel), "same")
+
+    def drifting(trial):
+        if trial.joint_torque is None:
+            return trial
+        since = np.interp(trial.session_start + trial.time, t, offset) - np.interp(trial.session_start - 3.0, t, offset)
+        return replace(trial, joint_torque=trial.joint_torque + since[:, None])
+
+    return replace(session, trials={t.name: drifting(t) for t in session})
+
+
 def test_only_laws_of_the_sessions_time_differ_in_repeats(quiet):
     finger = quiet.nominal.finger
     found = {name for name, kind in CATALOGUE.items() if differs_in_repeats(kind, finger)}
@@ -59,6 +77,13 @@ def test_a_law_of_time_is_no_noise(quiet, effect):
     before, after, expected = (p.noise[DYNAMIC].std[column] for p in (loud, found, quiet))
     assert np.all(before > 1.5 * expected)
     assert after == pytest.approx(expected, rel=0.3)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_wander_without_a_period_is_named(seed):
+    found = diagnose(with_wander(session_with(), 60.0, 2e-3, seed), quick=True)
+    assert Key("torque_sensor_drift", ("torque_sensor",)) in found.named
 
 
 def test_repeats_that_differ_by_noise_alone_keep_their_noise(quiet, planted):
