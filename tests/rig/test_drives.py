@@ -6,14 +6,16 @@ import re
 import pytest
 
 from jaxfinger.errors import UserError
-from jaxfinger.rig import parse_plan, parse_rig, runner, wal
+from jaxfinger.rig import drives, parse_plan, parse_rig, wal
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import Kind, State, Trip
+from jaxfinger.rig.course import Course
+from jaxfinger.rig.drives import Drives
 from jaxfinger.rig.operator import Nobody
 from jaxfinger.rig.protocols import Settled
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
-from jaxfinger.rig.runner import RELEASED, Runner
+from jaxfinger.rig.runner import RELEASED
 from jaxfinger.rig.safety import Supervisor
 from jaxfinger.rig.signals import Interrupts
 from jaxfinger.rig.simulated.controller import Controller
@@ -32,9 +34,9 @@ def test_a_stop_key_at_a_prompt_is_no_answer_to_it(rig, tmp_path):
     with machine:
         machine.stop(Trip.TENSION)
         recorder = Recorder(tmp_path / "session.h5.wal", {})
-        runner = Runner(machine, Reader(machine, recorder, Supervisor(rig)), Stopping(), Interrupts())
+        course = Course(machine, Reader(machine, recorder, Supervisor(rig)), Stopping(), Interrupts())
         with pytest.raises(UserError, match="stop key"):
-            runner.arm("operator")
+            Drives(course).arm("operator")
         assert machine.controller.state is State.TRIPPED  # The latch was not cleared.
         recorder.close()
 
@@ -201,7 +203,7 @@ def test_a_clock_that_jumps_while_the_drives_are_off_is_named_and_arms_nothing(r
     ],
 )
 def test_what_is_wrong_before_arming_is_a_sentence_and_nothing_moves(rig, record, tmp_path, monkeypatch, fault, says):
-    monkeypatch.setattr(runner, "QUIET_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(drives, "QUIET_TIMEOUT_S", 0.3)
     controller = Controller()
     if fault == "ring":
         controller.tell_ring(1)
