@@ -1,4 +1,9 @@
-"""What has the drives on, and hands at the finger only while they are off: arming, prompts, release."""
+"""What has the drives on, and hands at the finger only while they are off: arming, prompts, release.
+
+A tendon that begins to pull at a prompt with the drives off pulls at a finger in somebody's hands, and the host cannot
+switch off what the controller says is off already. It latches a stop at the controller, so that nothing can be armed
+from anywhere, says so at once, and takes no Enter until the tendon no longer pulls.
+"""
 
 from __future__ import annotations
 
@@ -9,19 +14,27 @@ from jaxfinger.rig.backend import Setup
 from jaxfinger.rig.contract import DRIVES_ON, State, Trip
 from jaxfinger.rig.course import RELEASE_S, TIMEOUT_MARGIN_S, Course, TrialEnded
 from jaxfinger.rig.reader import tripped
-from jaxfinger.rig.waits import AtPose, elsewhere, pulled, tensions
+from jaxfinger.rig.waits import AtPose, Pulls, elsewhere, pulled, tensions
 
 # s of samples without a violation before the rig is armed: three times the 0.1 s (clock_offset_s) within which a clock
 # that runs wrong shows.
 QUIET_S = 0.3
 QUIET_TIMEOUT_S = 5.0  # s to wait for these samples. Much longer, since the first samples of a busy host come late.
+CLEARS = "See that finger and hands are safe; Enter then clears the stop."  # end of a prompt
+# s for which a tendon must pull at a prompt with the drives off before a stop is latched: the hand that fixes a joint
+# jerks a tendon for less, and nobody is slower to let go for this delay.
+PULL_S = 0.2
 
 
 class Drives:
-    """Switches the drives on and off, and has the operator prepare the finger meanwhile."""
+    """Switches the drives on and off, and has the operator prepare the finger meanwhile.
+
+    `name` is the operator's, in which a latched stop is cleared.
+    """
 
     def __init__(self, course: Course):
         self.course, self.rig, self.reader = course, course.rig, course.reader
+        self.name = "operator"
 
     def arm(self, name: str) -> None:
         """Bring the controller to IDLE, have the finger fixed straight, and switch the drives on.
@@ -33,23 +46,28 @@ class Drives:
             UserError: something is wrong; nothing was armed.
         """
         rig, status = self.rig, self.rig.status()
+        self.name = name or self.name
         if status.state in DRIVES_ON:
             rig.release()
         if status.state is State.TRIPPED and not rig.prepare(Setup("")):
-            safe = "See that finger and hands are safe; Enter then clears the stop."
-            self._ask(f"The controller is stopped: {status.cause}. {safe}")
+            self._ask(f"The controller is stopped: {status.cause}. {CLEARS}")
         if status.state is not State.IDLE:
             self.course.let_pass(RELEASE_S, since=rig.status().head)
         if status.state is State.TRIPPED:
-            self.course.heed_stop_key()  # A latch is not cleared for an operator who has pressed it since.
-            rig.reset(name or "operator")
-            self.course.let_pass(RELEASE_S, lambda: not tripped(self.reader.latest))
+            self._clear_stop()
         if (state := rig.status().state) is not State.IDLE:
             raise UserError(f"nothing was armed: the controller is in state {state.name}, not IDLE; see its program.")
         self._refuse_unready()  # Before a prompt has hands at the finger.
         self.course.drives_are_off()
         straight = dict.fromkeys(rig.description.finger.joint_names, 0.0)
         self.prepare(Setup("Fix the finger straight: all joints at 0°.", straight))
+
+    def _clear_stop(self) -> None:
+        """Clear a latched stop, in the operator's name. The operator has just agreed."""
+        self.course.heed_stop_key()  # Not for an operator who has pressed it since.
+        self.rig.reset(self.name)
+        cleared, reader = self.rig.status().head, self.reader
+        self.course.let_pass(RELEASE_S, lambda: reader.latest_seq >= cleared and not tripped(reader.latest))
 
     def prepare(self, setup: Setup) -> None:
         """Have the finger prepared, by a simulated operator or by a person.
@@ -132,33 +150,58 @@ class Drives:
         """Ask a person to prepare the finger, again while the encoder of a fixed joint reads another angle."""
         prompt = setup.prompt
         while True:
-            self._ask(prompt)
+            while not self._ask(prompt):
+                self._stop_pull()
             answered = self.rig.status().head
             self.course.wait("reading the joints", lambda b, at=answered: int(b.seq[-1]) + 1 >= at, TIMEOUT_MARGIN_S)
             if not (wrong := elsewhere(self.reader.latest, self.rig.description, setup.fixed)):
                 return
             prompt = f"{wrong}; see the fixture, and unit, scale and offset of the channel. {setup.prompt}"
 
-    def _ask(self, text: str) -> None:
+    def _stop_pull(self) -> None:
+        """Latch a stop, since a tendon pulls where hands may be; clear it once it no longer does and somebody agrees.
+
+        The cause is TENSION, after which the controller takes all torque off without a ramp.
+        """
+        still = pulled(tensions(self.reader.latest, self.rig.description)) or "a tendon pulled just now"
+        self.reader.note("pull", f"with the drives off {still}")
+        self.course.drives_off = False  # The controller is stopped, as the host told it.
+        self.rig.stop(Trip.TENSION)
+        while still:
+            away = (
+                f"HANDS AWAY FROM THE FINGER: {still}, and the drives are off. Unless a hand pulls the tendon, switch"
+            )
+            self._ask(f"{away} the drives off by hand. The controller is stopped. Once no tendon pulls: {CLEARS}")
+            still = pulled(tensions(self.reader.latest, self.rig.description))
+        self._clear_stop()
+        self.course.drives_are_off()
+
+    def _ask(self, text: str) -> bool:
         """Prompt the operator and wait for the answer; where the drives are on, for `prompt_s` at most.
 
         The watch sends heartbeats meanwhile, so without this limit an operator who walks away leaves the finger armed.
+        Return False, whatever the answer, where a tendon pulls although the drives are off.
 
         Raises:
             TrialEnded: nobody answered in time, or the run must end.
         """
         armed, patience, asked = self.course.drives_on, self.rig.description.deadlines.prompt_s, time.monotonic()
-        as_told = armed or self.course.drives_off  # Otherwise the controller is still stopped from before.
+        off, pulls = self.course.drives_off, Pulls(self.rig.description, PULL_S)
+        as_told, lasting = armed or off, False  # Not as told: the controller is still stopped from before.
 
         def late() -> bool:
             return armed and time.monotonic() - asked > patience
 
         def keep_waiting() -> bool:
+            nonlocal lasting
             self.rig.report_alive()
+            if self.rig.synchronous:
+                self.reader.next()
             latest, reader = self.reader.latest, self.reader
+            lasting = lasting or (off and pulls(latest))
             self.course.show("waiting for Enter", latest)  # Whose hand is at the finger sees the tension it has now.
             strays = as_told and self.course.astray(latest)
-            return reader.error is None and reader.violation is None and not strays and not late()
+            return reader.error is None and reader.violation is None and not (strays or lasting or late())
 
         if armed:
             on = max(map(abs, tensions(self.reader.latest, self.rig.description).values()), default=0.0)
@@ -169,3 +212,4 @@ class Drives:
         # Also where Enter came just then: who answers a prompt that is over does not expect a motor to move.
         if late():
             raise TrialEnded(f"nobody answered the prompt within {patience:g} s (prompt_s of [rig])", Trip.HOST)
+        return not (lasting or (off and pulled(tensions(self.reader.latest, self.rig.description))))
