@@ -19,6 +19,8 @@ from jaxfinger.rig.signals import INTERRUPTED
 from jaxfinger.rig.waits import Elapsed, Passes, Steady, elsewhere, reached
 
 RELEASED = "the finger is released, and its drives are off"
+# Cause in the log until the hindsight is over: a recorder that is killed before has not seen whether a sensor froze.
+NO_HINDSIGHT = "the recorder was killed before a sensor that froze at the end would have shown"
 TENSION_NOT_SEEN_TO_FALL = "tension was not seen to fall, so switch the drives off and see that it is off"
 
 
@@ -59,9 +61,10 @@ class Runner:
             place, finger = (name, number, count), self.rig.description.finger
             self.carry_out(trial.protocol(self.rig.description), place)
             self.course.check(None)
-            self._ended = self.reader.end({"complete": True})
+            self._ended = self.reader.end({"complete": False, "cause": NO_HINDSIGHT, "trip": int(Trip.HOST)})
             self.carry_out(slackened(finger, trial.parameters.tension_rate), place)
             self.carry_out(iter([Dwell(self.rig.description.hindsight_s)]), place)
+            self.reader.amend(name, {"complete": True, "seq": self._ended})
             self._ended = None
             return ""
         except Exception as error:  # Of any kind: the finger is armed.
@@ -105,8 +108,10 @@ class Runner:
         end = {"complete": False, "cause": cause, "trip": int(trip), "seq": seq}
         if reader.recording:
             reader.end(end)
-        elif self._ended is not None and seq < self._ended:
-            reader.amend(self._start["name"], end)
+        elif self._ended is not None:
+            hindsight = self.rig.description.hindsight_s * self.rig.description.rate_hz
+            whole = seq >= self._ended and heard >= self._ended + hindsight
+            reader.amend(self._start["name"], {**end, "complete": whole, "seq": min(seq, self._ended)})
         if reader.latest is None:
             return cause
         return f"{cause}; {RELEASED if self.drives.released() else TENSION_NOT_SEEN_TO_FALL}"

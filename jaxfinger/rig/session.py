@@ -124,7 +124,7 @@ def _publish(plan: Plan, recorder: Recorder, output: Path, cause: str, resume: b
         for tag, value in recorder.unwritten:
             last = log.trials[-1] if log.trials else None
             if tag == wal.END and last is not None and (last.end is None or value.get("trial") == last.name):
-                last.end = value
+                last.end = {**(last.end or {}), **value}
         whole = {r.start["planned"] for r in log.trials if r.complete}
         if not cause and (lacking := [t.name for t in plan.trials if t.name not in whole]):
             cause = "; ".join([f"the disk did not keep {listed(lacking)} whole", *map(str, log.damage)])

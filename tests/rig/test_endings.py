@@ -2,6 +2,7 @@
 
 import json
 import resource
+import shutil
 import signal
 import time
 
@@ -18,9 +19,9 @@ from jaxfinger.rig.course import Course
 from jaxfinger.rig.operator import Nobody
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
-from jaxfinger.rig.runner import RELEASED, TENSION_NOT_SEEN_TO_FALL, Runner
+from jaxfinger.rig.runner import NO_HINDSIGHT, RELEASED, TENSION_NOT_SEEN_TO_FALL, Runner
 from jaxfinger.rig.safety import Supervisor
-from jaxfinger.rig.session import log_path
+from jaxfinger.rig.session import log_path, run
 from jaxfinger.rig.signals import ENDING, Interrupts
 from tests.rig.conftest import serious, slot
 
@@ -126,6 +127,28 @@ def test_a_fault_that_shows_after_the_trials_end_takes_its_bad_samples_out(rig, 
         assert attributes.get("trip") == (None if whole else Trip.FROZEN)
         if not whole:
             assert file["rig/dropped/02-ID.4-T3-MCP/seq"].shape == (before,)
+
+
+@pytest.mark.parametrize("stopped", [False, True], ids=["killed", "stopped"])
+def test_a_trial_is_complete_only_once_a_sensor_that_froze_at_its_end_would_have_shown(rig, short, tmp_path, stopped):
+    """The log is copied as `kill -9` leaves it, right after the end of the first trial; or the run is interrupted."""
+    log, copy, seen = log_path(tmp_path / "session.h5"), tmp_path / "killed.wal", []
+
+    def observe(view):
+        if (view.trial, view.doing, view.recording) == ("01-ID.2-DIP", "waiting", False) and not seen:
+            seen.append(wait_until_written(log, "ENDT"))
+            shutil.copy(log, copy)
+            if stopped:
+                signal.raise_signal(signal.SIGINT)
+
+    outcome = run(short, SimulatedRig(rig), tmp_path / "session.h5", observe=observe)
+    assert recover(copy, tmp_path / "killed.h5").incomplete == ("01-ID.2-DIP",)
+    with h5py.File(tmp_path / "killed.h5") as file:
+        assert file["trials/01-ID.2-DIP"].attrs["cause"] == NO_HINDSIGHT
+    assert outcome.complete == (() if stopped else ("01-ID.2-DIP", "02-ID.4-T3-MCP"))
+    if stopped:
+        again = run(short, SimulatedRig(rig), tmp_path / "session.h5", resume=True)
+        assert again.complete == ("01-ID.2-DIP-2", "02-ID.4-T3-MCP")
 
 
 def test_a_log_that_is_deleted_ends_the_run(rig, record, tmp_path, monkeypatch):
