@@ -120,7 +120,7 @@ class Drives:
             bad = reader.unarmed_violation
             what = bad.sentence if bad is not None else "too few samples came"
             raise UserError(f"nothing was armed: {what}.")
-        if still := pulled(tensions(reader.latest, rig)):
+        if still := self._pulled():
             mend = "free the tendon, or see its load cell and its offset"
             raise UserError(f"nothing was armed: with the drives off {still}; {mend}.")
 
@@ -136,7 +136,7 @@ class Drives:
         if (status := self.rig.status()).state is State.TRIPPED:
             self.course.raise_stopped(status)
         if status.state is not State.IDLE or not self.released():
-            still = pulled(tensions(self.reader.latest, self.rig.description)) or f"state {status.state.name}"
+            still = self._pulled() or f"state {status.state.name}"
             raise TrialEnded(f"the finger was not seen to be released ({still})", Trip.HOST)
         self.course.drives_are_off()
 
@@ -144,7 +144,7 @@ class Drives:
         """Whether the newest sample shows the controller stopped or idle, and no drive's tension."""
         block = self.reader.latest
         idle = block is not None and (tripped(block) or int(block.state[-1]) == State.IDLE)
-        return idle and not pulled(tensions(block, self.rig.description))
+        return idle and not self._pulled()
 
     def _ask_until_fixed(self, setup: Setup) -> None:
         """Ask a person to prepare the finger, again while the encoder of a fixed joint reads another angle."""
@@ -161,20 +161,29 @@ class Drives:
     def _stop_pull(self) -> None:
         """Latch a stop, since a tendon pulls where hands may be; clear it once it no longer does and somebody agrees.
 
-        The cause is TENSION, after which the controller takes all torque off without a ramp.
+        The cause is TENSION, after which the controller takes all torque off without a ramp. The view says so before,
+        since a controller that does not answer STOP is waited for.
         """
-        still = pulled(tensions(self.reader.latest, self.rig.description)) or "a tendon pulled just now"
+        away, still = "HANDS AWAY FROM THE FINGER", self._pulled() or "a tendon pulled just now"
         self.reader.note("pull", f"with the drives off {still}")
+        self.course.show(f"{away}: {still}", self.reader.latest)
         self.course.drives_off = False  # The controller is stopped, as the host told it.
-        self.rig.stop(Trip.TENSION)
+        stopped = "is stopped"
+        try:
+            self.rig.stop(Trip.TENSION)
+        except Exception as error:  # Of any kind: the operator must be told in any case.
+            self.reader.note("stop", f"the stop was not acknowledged: {error}")
+            stopped = "DOES NOT ANSWER"
         while still:
-            away = (
-                f"HANDS AWAY FROM THE FINGER: {still}, and the drives are off. Unless a hand pulls the tendon, switch"
-            )
-            self._ask(f"{away} the drives off by hand. The controller is stopped. Once no tendon pulls: {CLEARS}")
-            still = pulled(tensions(self.reader.latest, self.rig.description))
+            said = f"{away}: {still}, and the drives are off. Unless a hand pulls the tendon, switch them off by hand"
+            self._ask(f"{said}. The controller {stopped}. Once no tendon pulls: {CLEARS}")
+            still = self._pulled()
         self._clear_stop()
         self.course.drives_are_off()
+
+    def _pulled(self) -> str:
+        """What a driven tendon reads beyond RELEASED_TENSION in the newest sample, or an empty string."""
+        return pulled(tensions(self.reader.latest, self.rig.description))
 
     def _ask(self, text: str) -> bool:
         """Prompt the operator and wait for the answer; where the drives are on, for `prompt_s` at most.
@@ -212,4 +221,4 @@ class Drives:
         # Also where Enter came just then: who answers a prompt that is over does not expect a motor to move.
         if late():
             raise TrialEnded(f"nobody answered the prompt within {patience:g} s (prompt_s of [rig])", Trip.HOST)
-        return not (lasting or (off and pulled(tensions(self.reader.latest, self.rig.description))))
+        return not (lasting or (off and self._pulled()))

@@ -7,6 +7,7 @@ import pytest
 
 from jaxfinger.errors import UserError
 from jaxfinger.rig import drives, parse_plan, parse_rig, wal
+from jaxfinger.rig.backend import ConnectionLost
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import Kind, Refusal, State, Trip
 from jaxfinger.rig.course import Course
@@ -17,6 +18,7 @@ from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.runner import RELEASED, TENSION_NOT_SEEN_TO_FALL
 from jaxfinger.rig.safety import Supervisor
+from jaxfinger.rig.session import run
 from jaxfinger.rig.signals import Interrupts
 from jaxfinger.rig.simulated.controller import Controller
 from tests.rig.conftest import Away, impatient, slot
@@ -294,7 +296,7 @@ class Handy(Away):
             self.prompts.append(text)
         elif "HANDS AWAY" in text:
             self.states.append(controller.state)
-            self.armed.append(controller._obey(Kind.ARM, 0, 0.0, 0.0, []))
+            self.armed.append(self.states[-1] is State.TRIPPED and controller._obey(Kind.ARM, 0, 0.0, 0.0, []))
             self.prompts.append(text)
             if len(self.armed) > 1:
                 controller.faults.clear()
@@ -314,14 +316,31 @@ def test_a_tendon_that_begins_to_pull_while_hands_are_at_the_finger(rig, record,
     assert person.states == [State.IDLE, State.TRIPPED, State.TRIPPED]
     assert person.armed == [Refusal.STATE] * 2
     at = next(i for i, text in enumerate(person.prompts) if "HANDS AWAY" in text)
-    says = (
-        r"HANDS AWAY FROM THE FINGER: 'tension T3' reads -?[56]\.?\d* N, and the drives are off\. .* switch the drives"
-    )
+    says = r"HANDS AWAY FROM THE FINGER: 'tension T3' reads -?[56]\.?\d* N, and the drives are off\. .* switch them off"
     assert re.match(says, person.prompts[at])
     assert "HANDS AWAY" in person.prompts[at + 1]  # An Enter while it pulls is none.
     assert person.prompts[at + 2] == person.prompts[at - 1]  # Nothing is armed before hands are off again.
     assert outcome.cause == ""
     assert outcome.complete == ("01-ID.2-DIP", "02-ID.4-T3-MCP")
+
+
+def test_a_controller_that_does_not_answer_its_stop_at_a_finger_that_a_tendon_pulls(rig, short, tmp_path):
+    """The operator is told all the same, in the view even before the stop is waited for; and nothing is armed."""
+    machine, views = SimulatedRig(rig), []
+    person = Handy(machine, 6.0, 20)
+    seen = []
+
+    def silent(cause):
+        machine._unheeded = cause
+        seen.append(views[-1].doing)
+        raise ConnectionLost("no answer.")
+
+    machine.stop = silent
+    outcome = run(short, machine, tmp_path / "s.h5", operator=person, observe=views.append)
+    assert re.match(r"HANDS AWAY FROM THE FINGER: 'tension T3' reads", seen[0])
+    assert "The controller DOES NOT ANSWER." in person.prompts[-1]
+    assert "RESET gave way to a stop" in outcome.cause
+    assert outcome.complete == ("01-ID.2-DIP",)
 
 
 def test_the_stop_key_at_a_finger_that_a_tendon_pulls(rig, record):
