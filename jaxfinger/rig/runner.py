@@ -21,6 +21,7 @@ from jaxfinger.rig.waits import Elapsed, Passes, Steady, elsewhere, reached
 RELEASED = "the finger is released, and its drives are off"
 # Cause in the log until the hindsight is over: a recorder that is killed before has not seen whether a sensor froze.
 NO_HINDSIGHT = "the recorder was killed before a sensor that froze at the end would have shown"
+WHOLE = {"complete": True, "cause": "", "trip": int(Trip.NONE)}
 TENSION_NOT_SEEN_TO_FALL = "tension was not seen to fall, so switch the drives off and see that it is off"
 
 
@@ -64,7 +65,7 @@ class Runner:
             self._ended = self.reader.end({"complete": False, "cause": NO_HINDSIGHT, "trip": int(Trip.HOST)})
             self.carry_out(slackened(finger, trial.parameters.tension_rate), place)
             self.carry_out(iter([Dwell(self.rig.description.hindsight_s)]), place)
-            self.reader.amend(name, {"complete": True, "seq": self._ended})
+            self.reader.amend(name, {**WHOLE, "seq": self._ended})
             self._ended = None
             return ""
         except Exception as error:  # Of any kind: the finger is armed.
@@ -111,7 +112,7 @@ class Runner:
         elif self._ended is not None:
             hindsight = self.rig.description.hindsight_s * self.rig.description.rate_hz
             whole = seq >= self._ended and heard >= self._ended + hindsight
-            reader.amend(self._start["name"], {**end, "complete": whole, "seq": min(seq, self._ended)})
+            reader.amend(self._start["name"], {**(WHOLE if whole else end), "seq": min(seq, self._ended)})
         if reader.latest is None:
             return cause
         return f"{cause}; {RELEASED if self.drives.released() else TENSION_NOT_SEEN_TO_FALL}"
