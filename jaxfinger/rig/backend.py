@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, UInt
 
 from jaxfinger.errors import UserError
 from jaxfinger.rig.channels import Filter, RigDescription, for_people
-from jaxfinger.rig.contract import State, Trip
+from jaxfinger.rig.contract import DRIVES_ON, State, Trip
 
 
 class RigError(UserError):
@@ -282,7 +282,7 @@ class Rig(ABC):
     def __exit__(self, kind, error, trace) -> None:
         # A rig that does not answer cannot be told to release. It gets no heartbeat either, so it releases by itself.
         with suppress(Exception):
-            if self.status().state in (State.ARMED, State.MOVING):
+            if self.status().state in DRIVES_ON:
                 self.release()
         self.close()
 

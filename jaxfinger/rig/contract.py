@@ -118,6 +118,9 @@ class State(IntEnum):
     TRIPPED = 5  # latched: tension is released, and nothing can be armed until RESET
 
 
+DRIVES_ON = (State.ARMED, State.MOVING)
+
+
 class Mode(IntEnum):
     """Way in which a joint of the stand-in's finger is held."""
 

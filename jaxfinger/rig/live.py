@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jaxfinger.rig.channels import RigDescription
-from jaxfinger.rig.runner import View
+from jaxfinger.rig.course import View
 
 REFRESH_S = 0.1  # s between two drawings
 STALLED_S = 2.0  # s that closing waits for a terminal that takes no output

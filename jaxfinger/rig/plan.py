@@ -33,6 +33,7 @@ from jaxfinger.rig.trips import time_to_cover
 # Steps of one trial (commands, marks and waits). The paper's longest trial has a hundred. More than this is a mistake
 # in the plan, and checking it would seem to hang.
 MAX_STEPS = 100_000
+RADIANS = 2.0  # rad, 115°: a finger's joint bends by no more. Postures beyond it are in degrees.
 HAND_PASS_S = 4.0  # s, as the simulated operator takes: a range of 100° at 50 °/s
 
 
@@ -181,6 +182,10 @@ def _check_parameters(experiment: str, parameters: Common, rig: RigDescription, 
     posture = parameters.posture_deg
     if posture and len(posture) != finger.m:
         (place / "posture_deg").fail(f"has {len(posture)} angles; give one for each of the {finger.m} joints")
+    if posture and _are_radians(posture, rig):
+        given, meant = (", ".join(f"{a:g}" for a in angles) for angles in (posture, np.round(np.degrees(posture))))
+        said = f"{given} are fractions of a degree, which no fixture is set to, so these seem to be radians"
+        (place / "posture_deg").fail(f"{said}; give it in degrees ({meant})")
     at = np.degrees(list(parameters.posture(finger).values()))  # also where it is the default
     for joint, angle, (low, high) in zip(finger.joint_names, at, np.degrees(finger.limits), strict=True):
         if not low - 1e-9 <= angle <= high + 1e-9:
@@ -194,6 +199,17 @@ def _check_parameters(experiment: str, parameters: Common, rig: RigDescription, 
         needed = {"VD.2": ("fingertip_force", "x")}.get(experiment, ("excursion", finger.tendon_names[0]))
     if needed[0] not in {c.kind for c in rig.channels}:
         (place / "experiment").fail(f"{experiment} needs a channel of kind '{needed[0]}', which the rig file has not")
+
+
+def _are_radians(posture: tuple[float, ...], rig: RigDescription) -> bool:
+    """Whether angles given as degrees can only be meant in rad.
+
+    All are within RADIANS, and within the limits if read as rad; and one is no multiple of half a degree. A prompt asks
+    for whole degrees, and a fixture is set by eye, so nobody who means degrees loses anything by giving them.
+    """
+    low, high = rig.finger.limits.T
+    small = np.abs(posture) <= RADIANS
+    return bool(np.all(small & (low <= posture) & (posture <= high)) and np.any(np.mod(posture, 0.5)))
 
 
 def commands(trial: PlannedTrial, rig: RigDescription) -> Iterator[Step]:

@@ -174,7 +174,7 @@ class Reader:
             return end["seq"]
 
     def amend(self, name: str, end: dict[str, Any]) -> None:
-        """Replace the end of the trial `name`, the last one of the log: its last samples were bad."""
+        """Replace the end of the trial `name`, the last one of the log: what has shown since decides."""
         self.recorder.put(wal.END, {"trial": name, **end})
 
     @property

@@ -20,7 +20,8 @@ from jaxfinger.rig.backend import Block
 from jaxfinger.rig.contract import Trip
 
 POLL_S = 0.002  # s between two looks whether the queue is empty: a frame is written within milliseconds.
-SYNC_S = 1.0  # s between two fdatasync: a power cut costs at most as much of the recording
+# s between two fdatasync: a power cut costs at most as much of the recording. Ends of trials are forced at once.
+SYNC_S = 1.0
 # Samples that may wait for a slow disk before the run ends: 17 min at 1 kHz, 0.5 GB of memory with 60 channels.
 QUEUE_LIMIT = 1_000_000
 # Free bytes that a new session demands: 17 min at 1 kHz with 60 channels, 0.5 MB/s.
@@ -116,7 +117,7 @@ class Recorder:
         try:
             if self.failure is None or tag != wal.DATA:
                 self._log.write(tag, wal.pack_block(value) if tag == wal.DATA else wal.pack_json(value))
-                if time.monotonic() - self._synced > SYNC_S:
+                if tag == wal.END or time.monotonic() - self._synced > SYNC_S:
                     self._log.sync()
                     self._synced = time.monotonic()
         except Exception as error:  # Of any kind: a thread that ends here would leave every later frame unwritten.

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxfinger.rig.backend import Block, Command, CommandRefused, JointMove, TensionRamp
 from jaxfinger.rig.channels import SI_UNITS, RigDescription, for_people
-from jaxfinger.rig.contract import Flag, State, Trip
+from jaxfinger.rig.contract import DRIVES_ON, Flag, State, Trip
 from jaxfinger.rig.trips import Drift, LeakyCount, RunLength, StillExcursion, UnexplainedExcursion, UnfollowedMove
 
 # Samples over which the host takes joint velocity and tension rate: 20 ms at 1 kHz. One step of a 14-bit encoder
@@ -297,7 +297,7 @@ class Supervisor:
 
 def armed(block: Block) -> bool:
     """Whether any sample has the drives on (ARMED, MOVING), or a state that the contract does not define."""
-    return bool((np.isin(block.state, (State.ARMED, State.MOVING)) | (block.state > max(State))).any())
+    return bool((np.isin(block.state, DRIVES_ON) | (block.state > max(State))).any())
 
 
 # The trip code of a finite value out of its limits, by kind of channel.

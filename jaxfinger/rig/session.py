@@ -17,14 +17,15 @@ from jaxfinger.errors import UserError, counted, listed
 from jaxfinger.rig import convert, wal
 from jaxfinger.rig.backend import Rig, TensionRamp
 from jaxfinger.rig.channels import MIN_DYNAMIC_BANDWIDTH, Filter, RigDescription
-from jaxfinger.rig.contract import Trip
+from jaxfinger.rig.contract import DRIVES_ON, Trip
+from jaxfinger.rig.course import Course, View
 from jaxfinger.rig.operator import Nobody, Operator
 from jaxfinger.rig.plan import Plan
 from jaxfinger.rig.protocols import DYNAMIC, Protocol, Reached, Settled, Tare, slackened
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.recover import read_log
-from jaxfinger.rig.runner import DRIVES_ON, Runner, View
+from jaxfinger.rig.runner import Runner
 from jaxfinger.rig.safety import Supervisor
 from jaxfinger.rig.signals import Interrupts
 
@@ -123,7 +124,7 @@ def _publish(plan: Plan, recorder: Recorder, output: Path, cause: str, resume: b
         for tag, value in recorder.unwritten:
             last = log.trials[-1] if log.trials else None
             if tag == wal.END and last is not None and (last.end is None or value.get("trial") == last.name):
-                last.end = value
+                last.end = {**(last.end or {}), **value}
         whole = {r.start["planned"] for r in log.trials if r.complete}
         if not cause and (lacking := [t.name for t in plan.trials if t.name not in whole]):
             cause = "; ".join([f"the disk did not keep {listed(lacking)} whole", *map(str, log.damage)])
@@ -216,7 +217,7 @@ def _zero_excursions(rig: RigDescription) -> Protocol:
     """Protocol that tares the tendon encoders: they read zero with the finger straight and 2 N on its tendons.
 
     2 N is the pretension of the paper's experiments (`MomentArms`). It takes out slack, so that every session's zero is
-    the same. `Runner.arm` has had the finger fixed straight.
+    the same. `Drives.arm` has had the finger fixed straight.
     """
     pretension = {n: 2.0 for n, active in zip(rig.finger.tendon_names, rig.finger.active, strict=True) if active}
     rate = min(10.0, rig.limits.tension_rate)
@@ -248,15 +249,16 @@ def _trials(
     begun = max(ends, default=0.0)
     left = [t for t in plan.trials if t.name not in done]
     reader = Reader(rig, recorder, Supervisor(rig.description))
-    runner = Runner(rig, reader, operator, interrupts, observe)
+    course = Course(rig, reader, operator, interrupts, observe)
+    runner = Runner(course)
     try:
-        runner.watch.start()
-        reader.start(lambda: runner.watch.join("reader"))
+        course.watch.start()
+        reader.start(lambda: course.watch.join("reader"))
         try:
-            runner.arm(plan.operator)
+            runner.drives.arm(plan.operator)
             runner.carry_out(_zero_excursions(rig.description), ("reference", 0, len(plan.trials)))
         except Exception as error:  # Of any kind: the finger may be armed.
-            if runner.watch.guards or reader.violation is not None:
+            if course.drives_on or reader.violation is not None:
                 return runner.abort(error)
             raise  # Nothing was armed.
         for trial in left:
@@ -270,5 +272,5 @@ def _trials(
     except KeyboardInterrupt:
         return runner.abort_interrupted()
     finally:
-        runner.watch.close()
+        course.watch.close()
         reader.close()

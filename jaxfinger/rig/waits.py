@@ -31,6 +31,22 @@ def pulled(tension: dict[str, float]) -> str:
     return next((f"'{k}' reads {v:.3g} N" for k, v in tension.items() if not abs(v) <= RELEASED_TENSION), "")
 
 
+class Pulls:
+    """A driven tendon has read more than RELEASED_TENSION at every look for `seconds` of samples."""
+
+    def __init__(self, rig: RigDescription, seconds: float):
+        self._rig, self._need = rig, round(seconds * rig.rate_hz)
+        self._since: int | None = None  # number of the sample at which it was first seen
+
+    def __call__(self, block: Block | None) -> bool:
+        if block is None or not pulled(tensions(block, self._rig)):
+            self._since = None
+            return False
+        newest = int(block.seq[-1])
+        self._since = newest if self._since is None else self._since
+        return newest - self._since >= self._need
+
+
 def elsewhere(block: Block | None, rig: RigDescription, angles: dict[str, float]) -> str:
     """Which joint's encoder reads another angle than `angles` (rad) by POSE_SHARE of its range; "" where none does."""
     for name, angle in angles.items():

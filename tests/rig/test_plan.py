@@ -44,6 +44,12 @@ def steps(text, rig):
         ('experiment = "ID.3-static"\njoint = "MCP"\nacceleration_deg_s2 = 0.0', 3, "0.0°/s² for MCP is outside"),
         ('experiment = "ID.3-dynamic"\njoint = "MCP"\nspeeds_deg_s = []', 6, "speeds_deg_s: is empty"),
         ('experiment = "ID.2"\njoint = "MCP"\nposture_deg = [0.0, 190.0, 0.0]', 6, "outside its limits"),
+        (
+            'experiment = "ID.2"\njoint = "MCP"\nposture_deg = [0.35, 0.52, 0.0]',
+            6,
+            "0.35, 0.52, 0 are fractions of a degree, which no fixture is set to, so these seem to be radians; "
+            "give it in degrees (20, 30, 0)",
+        ),
         ('experiment = "VD.3"\nmean = [1.0]', 5, "4 active tendons"),
         ('experiment = "ID.2"\njoint = "MCP"\nrepeats = 1000000000', 6, "outside 1 to 1000"),
         ('experiment = "ID.3-dynamic"\njoint = "MCP"\npasses = 1000000000', 6, "outside 1 to 1000"),
@@ -106,6 +112,15 @@ def test_the_shipped_plan_holds_every_experiment(rig):
     plan = parse_plan(plan_toml(), rig)
     assert {t.experiment for t in plan.trials} == set(PROTOCOLS)
     assert all(estimate(t, rig).seconds > 1.0 for t in plan.trials)
+
+
+@pytest.mark.parametrize(
+    "posture",
+    ["0.0, 0.0, 0.0", "0.5, 1.0, 1.5", "0.0, 2.0, 0.0", "0.35, 20.0, 30.0", "2.25, 0.0, 0.0", "-1.0, 0.0, 0.35"],
+)
+def test_small_postures_in_degrees_are_taken(rig, posture):
+    """Whole and half degrees; or one beyond 2 rad, or beyond a joint's lower end if read as rad."""
+    assert parse_plan(HEAD + f'experiment = "ID.2"\njoint = "MCP"\nposture_deg = [{posture}]', rig).trials
 
 
 def test_the_default_posture_is_checked_too():

@@ -19,9 +19,9 @@ from jaxfinger.rig import Supervisor, open_rig, operator, parse_plan, parse_rig,
 from jaxfinger.rig.backend import CommandRefused, EndOfReplay, Setup, TensionRamp
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import Trip
+from jaxfinger.rig.course import View
 from jaxfinger.rig.live import LiveView
 from jaxfinger.rig.operator import AtTerminal, Nobody
-from jaxfinger.rig.runner import View
 from jaxfinger.rig.simulated.examples import plan_toml, rig_toml
 from tests.rig.conftest import SHORT
 

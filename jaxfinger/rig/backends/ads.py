@@ -58,6 +58,12 @@ class AdsRig(RingRig):
     """A controller behind one ADS connection.
 
     Requests go one at a time, since AdsLib allows no second one on a port. `reconnects` counts mended cuts.
+
+    STOP takes its turn too. A call that keeps it waiting keeps the heartbeat waiting as well, so the controller
+    releases the finger by itself `heartbeat_s` after the last beat that came: no stop is later than that. A second port
+    would be no second way. AdsLib sends every port's requests to one address over the same TCP connection, of which a
+    router keeps one for each computer; and pyads deletes that route, under the other port too, when either closes, as
+    it must to connect again after a cut.
     """
 
     def __init__(self, description: RigDescription):

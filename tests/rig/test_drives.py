@@ -6,18 +6,22 @@ import re
 import pytest
 
 from jaxfinger.errors import UserError
-from jaxfinger.rig import parse_plan, parse_rig, runner, wal
+from jaxfinger.rig import drives, parse_plan, parse_rig, wal
+from jaxfinger.rig.backend import ConnectionLost
 from jaxfinger.rig.backends.simulated import SimulatedRig
-from jaxfinger.rig.contract import Kind, State, Trip
+from jaxfinger.rig.contract import Kind, Refusal, State, Trip
+from jaxfinger.rig.course import Course
+from jaxfinger.rig.drives import Drives
 from jaxfinger.rig.operator import Nobody
 from jaxfinger.rig.protocols import Settled
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
-from jaxfinger.rig.runner import RELEASED, Runner
+from jaxfinger.rig.runner import RELEASED, TENSION_NOT_SEEN_TO_FALL
 from jaxfinger.rig.safety import Supervisor
+from jaxfinger.rig.session import run
 from jaxfinger.rig.signals import Interrupts
 from jaxfinger.rig.simulated.controller import Controller
-from tests.rig.conftest import Away, impatient
+from tests.rig.conftest import Away, impatient, slot
 
 
 def test_a_stop_key_at_a_prompt_is_no_answer_to_it(rig, tmp_path):
@@ -32,9 +36,9 @@ def test_a_stop_key_at_a_prompt_is_no_answer_to_it(rig, tmp_path):
     with machine:
         machine.stop(Trip.TENSION)
         recorder = Recorder(tmp_path / "session.h5.wal", {})
-        runner = Runner(machine, Reader(machine, recorder, Supervisor(rig)), Stopping(), Interrupts())
+        course = Course(machine, Reader(machine, recorder, Supervisor(rig)), Stopping(), Interrupts())
         with pytest.raises(UserError, match="stop key"):
-            runner.arm("operator")
+            Drives(course).arm("operator")
         assert machine.controller.state is State.TRIPPED  # The latch was not cleared.
         recorder.close()
 
@@ -201,7 +205,7 @@ def test_a_clock_that_jumps_while_the_drives_are_off_is_named_and_arms_nothing(r
     ],
 )
 def test_what_is_wrong_before_arming_is_a_sentence_and_nothing_moves(rig, record, tmp_path, monkeypatch, fault, says):
-    monkeypatch.setattr(runner, "QUIET_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(drives, "QUIET_TIMEOUT_S", 0.3)
     controller = Controller()
     if fault == "ring":
         controller.tell_ring(1)
@@ -269,3 +273,101 @@ def test_a_load_cell_that_is_off_by_little_arms(rig, record):
     controller = Controller()
     controller.strike("spike", controller.slots.tension[2], amount=0.2, standing=True)
     assert record(SimulatedRig(rig, controller)).cause == ""
+
+
+class Handy(Away):
+    """A person who looks at the finger `looks` times with a tendon pulling by `pull` N, and then presses Enter.
+
+    At the alarm the tendon still pulls at the first Enter, and is free at the second. `states` are the controller's.
+    """
+
+    def __init__(self, machine, pull, looks):
+        super().__init__(machine, "nothing")
+        self.pull, self.looks, self.states, self.armed, self.given_way = pull, looks, [], [], False
+
+    def ask(self, text, keep_waiting):
+        controller, first = self.machine.controller, "Couple the external motor" in text and not self.states
+        if first:
+            self.machine.inject("spike", slot(self.machine, "tension", "T3"), amount=self.pull)
+            self.given_way = not all(keep_waiting() for _ in range(self.looks))
+            self.states.append(controller.state)
+            if abs(self.pull) < 2.0:
+                super().ask(text, keep_waiting)
+            self.prompts.append(text)
+        elif "HANDS AWAY" in text:
+            self.states.append(controller.state)
+            self.armed.append(self.states[-1] is State.TRIPPED and controller._obey(Kind.ARM, 0, 0.0, 0.0, []))
+            self.prompts.append(text)
+            if len(self.armed) > 1:
+                controller.faults.clear()
+            assert all(keep_waiting() for _ in range(4))
+        else:
+            super().ask(text, keep_waiting)
+
+
+@pytest.mark.parametrize("pull", [6.0, -6.0])
+@pytest.mark.parametrize("looks", [1, 20], ids=["Enter at once", "no Enter"])
+def test_a_tendon_that_begins_to_pull_while_hands_are_at_the_finger(rig, record, looks, pull):
+    """The prompt ends by itself, and the controller is latched until nothing pulls and somebody agrees."""
+    machine = SimulatedRig(rig)
+    person = Handy(machine, pull, looks)
+    outcome = record(machine, operator=person)
+    assert person.given_way == (looks > 1)
+    assert person.states == [State.IDLE, State.TRIPPED, State.TRIPPED]
+    assert person.armed == [Refusal.STATE] * 2
+    at = next(i for i, text in enumerate(person.prompts) if "HANDS AWAY" in text)
+    says = r"HANDS AWAY FROM THE FINGER: 'tension T3' reads -?[56]\.?\d* N, and the drives are off\. .* switch them off"
+    assert re.match(says, person.prompts[at])
+    assert "HANDS AWAY" in person.prompts[at + 1]  # An Enter while it pulls is none.
+    assert person.prompts[at + 2] == person.prompts[at - 1]  # Nothing is armed before hands are off again.
+    assert outcome.cause == ""
+    assert outcome.complete == ("01-ID.2-DIP", "02-ID.4-T3-MCP")
+
+
+def test_a_controller_that_does_not_answer_its_stop_at_a_finger_that_a_tendon_pulls(rig, short, tmp_path):
+    """The operator is told all the same, in the view even before the stop is waited for; and nothing is armed."""
+    machine, views = SimulatedRig(rig), []
+    person = Handy(machine, 6.0, 20)
+    seen = []
+
+    def silent(cause):
+        machine._unheeded = cause
+        seen.append(views[-1].doing)
+        raise ConnectionLost("no answer.")
+
+    machine.stop = silent
+    outcome = run(short, machine, tmp_path / "s.h5", operator=person, observe=views.append)
+    assert re.match(r"HANDS AWAY FROM THE FINGER: 'tension T3' reads", seen[0])
+    assert "The controller DOES NOT ANSWER." in person.prompts[-1]
+    assert "RESET gave way to a stop" in outcome.cause
+    assert outcome.complete == ("01-ID.2-DIP",)
+
+
+def test_the_stop_key_at_a_finger_that_a_tendon_pulls(rig, record):
+    machine = SimulatedRig(rig)
+    person = Handy(machine, 6.0, 20)
+    person.stop_requested = lambda: bool(person.armed)
+    outcome = record(machine, operator=person)
+    assert outcome.cause == f"02-ID.4-T3-MCP: the operator pressed the stop key; {TENSION_NOT_SEEN_TO_FALL}"
+    assert machine.controller.state is State.TRIPPED
+
+
+def test_a_hand_that_tugs_a_tendon_stops_nothing(rig, record):
+    """By little for long, or by much for a moment; and the hand that moves a finger under its pretension."""
+    machine = SimulatedRig(rig)
+    person = Handy(machine, 1.5, 20)
+    ask = person.ask
+
+    def ask_and_jerk(text, keep_waiting):
+        if "Fix all joints" in text:
+            machine.inject("spike", slot(machine, "tension", "T1"), amount=8.0)
+            assert keep_waiting()
+            machine.controller.faults.clear()
+            assert keep_waiting()
+        if "Hold DIP" in text:
+            assert all(keep_waiting() for _ in range(20))
+        ask(text, keep_waiting)
+
+    person.ask = ask_and_jerk
+    assert record(machine, operator=person).cause == ""
+    assert not any("HANDS AWAY" in text for text in person.prompts)
