@@ -1,0 +1,79 @@
+"""`look` and `new` give the columns of a log to the finger's joints and tendons by the names of both."""
+
+import re
+
+import numpy as np
+import pytest
+
+from jaxfinger.data.importing.proposal import proposal
+from jaxfinger.data.importing.sources import load_recording
+from tests.data.conftest import make_finger
+
+TIME = np.arange(1000) / 100.0
+JOINTS = make_finger().joint_names
+
+
+def _proposed(tmp_path, names):
+    """What is proposed for a log with columns of these names, which all change, and what it reads by channel."""
+    path = tmp_path / "log.csv"
+    table = np.column_stack([TIME, *(0.6 + 0.5 * np.sin((1.0 + 0.1 * k) * TIME) for k in range(len(names)))])
+    np.savetxt(path, table, "%.6f", ",", header=",".join(["t", *names]), comments="")
+    said = proposal([load_recording(path)], make_finger())
+    return said, {f"{c}.{n}": name for c, n, name in re.findall(r'channels\.(\w+)\.(\w+) = \{ from = "([^"]+)"', said)}
+
+
+@pytest.mark.parametrize("form", ["{} position", "q_{}", "q{}", "arm.{}.pos", "{} Angle [rad]"])
+def test_of_a_whole_robots_log_the_columns_with_the_fingers_names_are_read(form, tmp_path):
+    """They stand behind those of other joints, and before some."""
+    names = [form.format(name) for name in ("WristYaw", "WristPitch", *JOINTS, "Thumb")]
+    said, read = _proposed(tmp_path, [*names, *(f"torque {name}" for name in ("WristYaw", *JOINTS))])
+    assert read == {f"q.{name}": form.format(name) for name in JOINTS} | {
+        f"joint_torque.{name}": f"torque {name}" for name in JOINTS
+    }
+    assert "in their order" not in said
+
+
+def test_a_number_is_no_part_of_a_longer_one(tmp_path):
+    names = [f"q_J{k}" for k in (10, 11, 12, 1, 2)]
+    path = tmp_path / "log.csv"
+    np.savetxt(
+        path, np.column_stack([TIME, *(np.sin(TIME) for _ in names)]), header=" ".join(["t", *names]), comments=""
+    )
+    finger = make_finger()
+    finger = type(finger)(**{**vars(finger), "joint_names": ("J1", "J2")})
+    said = proposal([load_recording(path)], finger)
+    assert 'channels.q.J1 = { from = "q_J1"' in said
+    assert 'channels.q.J2 = { from = "q_J2"' in said
+
+
+def test_a_column_without_a_name_of_the_finger_gets_one_that_is_left(tmp_path):
+    """PIP is named, whatever its place, so that the other column is of the other joint."""
+    _, read = _proposed(tmp_path, ["PIP angle", "knuckle angle"])
+    assert read == {"q.PIP": "PIP angle", "q.MCP": "knuckle angle"}
+
+
+def test_several_sets_of_columns_with_the_fingers_names_are_told_apart(tmp_path):
+    said, read = _proposed(tmp_path, ["MCP pos", "PIP pos", "MCP enc", "PIP enc", "thumb pos"])
+    assert read == {"q.MCP": "MCP pos", "q.PIP": "PIP pos"}
+    assert '# q could also be "MCP enc" to "PIP enc": take what was measured' in said
+    assert '# in no channel yet: "thumb pos"' in said
+
+
+def test_more_columns_than_joints_without_a_name_in_common_are_said(tmp_path):
+    said, read = _proposed(tmp_path, ["hip angle", "knee angle", "ankle angle", "tau knee"])
+    assert read == {"q.MCP": "hip angle", "q.PIP": "knee angle", "joint_torque.MCP": "tau knee"}
+    assert "# q: 3 columns for MCP, PIP, in their order: correct" in said
+
+
+def test_a_torque_with_a_joints_name_is_not_given_to_the_joint_that_moves_most(tmp_path):
+    path = tmp_path / "log.csv"
+    table = np.column_stack([TIME, 1.4 * np.sin(TIME), 0.3 * np.sin(TIME), np.cos(TIME)])
+    np.savetxt(path, table, "%.6f", ",", header="t,MCP angle,PIP angle,PIP torque", comments="")
+    assert 'channels.joint_torque.PIP = { from = "PIP torque"' in proposal([load_recording(path)], make_finger())
+
+
+def test_what_could_be_read_is_named_first_of_what_is_left_out(tmp_path):
+    """A long list is cut, and a torque sensor must not be among what is cut off."""
+    names = ["MCP pos", "PIP pos", "MCP torque", "PIP torque", *(f"voltage {k}" for k in range(20)), "transducer [Nm]"]
+    said, _ = _proposed(tmp_path, names)
+    assert '# in no channel yet: "transducer [Nm]", "voltage 0"' in said
