@@ -74,6 +74,12 @@ def is_foreign(stated: str) -> bool:
     return re.sub(r"[\s·*.-]", "", stated).lower() in _FOREIGN and not unit_name(stated)
 
 
+def is_ratio(stated: str) -> bool:
+    """Whether a file states a unit of one quantity by another, such as rad/s or N m/A, which no channel has."""
+    parts = re.sub(r"(\^|\*\*)?[2²]$", "", stated.strip()).split("/")
+    return len(parts) > 1 and not is_foreign(stated) and all(unit_name(x) or is_foreign(x) for x in parts)
+
+
 def unit_name(stated: str) -> str:
     """Name in `TO_SI` of a unit as a file spells it; empty where it is not listed there."""
     plain = re.sub(r"[·*.-]", " ", stated.strip()).replace("µ", "u")

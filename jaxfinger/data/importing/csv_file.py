@@ -108,12 +108,14 @@ def load_csv(path: Path) -> Recording:
     sample = body[len(body) // 2 :][:_DIALECT_LINES]
     dialect, numeric = _find_dialect([line.text for line in sample])
     split = dialect.split
+    if not any(numeric) and len(body) == 1:
+        raise UserError(f"{path}: holds names and no samples; record it again, or leave it out")
     if not any(numeric):
         raise UserError(f"{path}: holds no column of numbers; give a table with one line a sample")
     first = next(i for i, line in enumerate(body) if _is_sample(dialect, split(line.text), numeric))
     above = [line for line in lines if line.number < body[first].number]
-    names, units, scope = _names(above, dialect, len(numeric))
     rows = [row for line in sample if len(row := split(line.text)) == len(numeric)]
+    names, units, scope = _names(above, dialect, len(numeric), blank=not any(row[-1] for row in rows))
     states = None if names else joint_states(rows, dialect.number)
     if not names and states is None and first > 0 and len(split(body[first - 1].text)) != len(numeric):
         given = counted(len(split(body[first - 1].text)), "column")
@@ -215,11 +217,14 @@ def _is_sample(dialect: _Dialect, cells: Sequence[str], numeric: Sequence[bool])
     return len(cells) == len(numeric) and None not in values and not all(np.isnan(v) for v in values if v is not None)
 
 
-def _names(above: Sequence[_Line], dialect: _Dialect, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
+def _names(
+    above: Sequence[_Line], dialect: _Dialect, width: int, blank: bool
+) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
     """Names of the columns, their units, and whether they are pairs of time and value as TwinCAT Scope writes them.
 
     The names are the nearest line above the numbers that has a cell for each column and holds no units. They may stand
-    behind a comment mark (numpy.savetxt, gnuplot).
+    behind a comment mark (numpy.savetxt, gnuplot). Either they or the numbers may end with a separator, after which the
+    last column is `blank`.
     """
     rows = []
     for line in reversed(above):
@@ -228,6 +233,10 @@ def _names(above: Sequence[_Line], dialect: _Dialect, width: int) -> tuple[tuple
         cells = dialect.split(line.text if plain == text else plain)
         if plain != text and len(cells) != width:
             cells = plain.replace(",", " ").split()
+        while len(cells) > width and not cells[-1]:
+            cells.pop()
+        if blank and len(cells) == width - 1:
+            cells.append("")
         if len(cells) == width and any(cells):
             rows.append(cells)
     labelled = {row[0]: tuple(row) for row in rows if row[::2] == row[:1] * (width // 2) and width % 2 == 0}

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxfinger.data.importing.columns import coarse_rate, restarts
 from jaxfinger.data.importing.recording import Recording, Variable
-from jaxfinger.data.units import TO_SI, is_foreign, unit_name
+from jaxfinger.data.units import TO_SI, is_foreign, is_ratio, unit_name
 
 # Usual intervals of a clock that ticks evenly. A late sample makes one up to twice as long; in a longer one than this,
 # samples were lost. It decides what counts as the rate, not what is a fault (`signals.clock`).
@@ -112,7 +112,7 @@ def columns_of(recording: Recording, among: Sequence[Recording] = ()) -> list[Co
             units = unit_name(variable.units)
             spelt = units or _spelt(name)
             foreign = variable.units if is_foreign(variable.units) and not spelt else ""
-            meaning = _meaning(name, column, x, spelt)
+            meaning = "" if is_ratio(variable.units) else _meaning(name, column, x, spelt)
             if meaning == "q" and not (spelt or foreign):
                 units = spelt = recording.angles
             stated = bool(units)

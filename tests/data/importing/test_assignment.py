@@ -77,3 +77,12 @@ def test_what_could_be_read_is_named_first_of_what_is_left_out(tmp_path):
     names = ["MCP pos", "PIP pos", "MCP torque", "PIP torque", *(f"voltage {k}" for k in range(20)), "transducer [Nm]"]
     said, _ = _proposed(tmp_path, names)
     assert '# in no channel yet: "transducer [Nm]", "voltage 0"' in said
+
+
+@pytest.mark.parametrize("unit", ["Nm/A", "N m/rad", "rad/s", "deg/s^2", "rad/s²"])
+def test_a_quantity_by_another_is_no_channel(unit, tmp_path):
+    """Not even where its name has the word of one. A bridge's mV/V and a name of two sides are none of these."""
+    name = f"torque constant or angle [{unit}]"
+    said, read = _proposed(tmp_path, ["MCP angle (left/right)", "PIP angle", name, "tau MCP [mV/V]"])
+    assert read == {"q.MCP": "MCP angle (left/right)", "q.PIP": "PIP angle", "joint_torque.MCP": "tau MCP [mV/V]"}
+    assert f'in no channel yet: "{name}"' in said

@@ -40,6 +40,9 @@ def load(tmp_path, content, name="log.csv"):
             )
         ),
         ("Instrument X\nRun 7, of Monday\n\nt,a,b\n" + NUMBERS, ["t", "a", "b"]),
+        ("t,a,b,\n" + NUMBERS, ["t", "a", "b"]),
+        ("# t,a,b,\n" + NUMBERS, ["t", "a", "b"]),
+        ("t,a,b\n" + NUMBERS.replace("\n", ",\n"), ["t", "a", "b"]),
     ],
 )
 def test_names_and_numbers(tmp_path, content, names):
@@ -48,6 +51,11 @@ def test_names_and_numbers(tmp_path, content, names):
     assert found.unusable == {}
     values = [v.values for v in found.variables.values()]
     np.testing.assert_array_equal(values, [[0.0, 0.01, 0.02], [1.5, 1.6, 1.7], [-3, -4, -5]])
+
+
+def test_names_without_samples_are_said(tmp_path):
+    with pytest.raises(UserError, match=r"log\.csv: holds names and no samples; record it again, or leave it out"):
+        load(tmp_path, "# made by X\nt [s],a [deg]\n")
 
 
 @pytest.mark.parametrize("rows", ["0\n0.001\n0.002\n", "0 1\n0.001 1.5\n0.002 1.7\n"])
