@@ -33,7 +33,7 @@ _UNIT = r"%|°|deg|rad|turn|rev|rpm|k?Hz|[mun]?s|[munc]?m|[mk]?N|[mk]?N[ ·*]?[c
 _UNIT_CELL = re.compile(rf"^[\[(]?({_UNIT}|{_UNIT}/s2?|)[\])]?$")
 _UNIT_SUFFIX = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")  # in brackets after a name
 _DATE = re.compile(r"^\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
-_LIST = re.compile(r"^\[.*\]$", re.DOTALL)
+_LIST = re.compile(r"^(\[.*\]|\(.*\))$", re.DOTALL)
 _LIST_IN_QUOTES = re.compile(r'"\[[^"\]]*\]"')  # pandas breaks the lines of a long array
 _HOUR = re.compile(r"\d:\d\d")  # in a time of day or a date
 _BLANKS = " \u00a0\u202f'’"  # that group digits, and are never a decimal mark
@@ -62,7 +62,12 @@ class _Dialect:
 
     def split(self, line: str) -> list[str]:
         """Cells of a line."""
-        cells = line.split() if self.separator is None else next(csv.reader([line], delimiter=self.separator), [])
+        if self.separator is None:
+            return line.split()
+        try:
+            cells = next(csv.reader([line], delimiter=self.separator), [])
+        except csv.Error:  # a cell of more than 128 KiB, which no table has
+            cells = [line]
         return [cell.strip() for cell in cells]
 
     def number(self, cell: str) -> float | None:
@@ -312,7 +317,7 @@ def _column(cells: Sequence[str], lines: Sequence[int], dialect: _Dialect, numer
 
 
 def _lists(cells: Sequence[str]) -> _Column:
-    """A column of lists such as `[0.1, 0.2]`, one a sample, as arrays; an empty cell is a list of NaN."""
+    """A column of lists such as `[0.1, 0.2]` or `(0.1, 0.2)`, one a sample, as arrays; an empty cell is one of NaN."""
     try:
         rows = [np.array(cell[1:-1].replace(",", " ").split(), np.float64) for cell in cells]
     except ValueError:

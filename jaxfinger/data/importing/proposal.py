@@ -13,7 +13,7 @@ from jaxfinger.data.importing.assignment import assigned, held_names, known_name
 from jaxfinger.data.importing.columns import coarse_rate, restarts
 from jaxfinger.data.importing.recording import Recording
 from jaxfinger.data.importing.speeds import speeds
-from jaxfinger.data.importing.survey import ColumnSurvey, columns_of, is_nameless, is_set_point
+from jaxfinger.data.importing.survey import ColumnSurvey, columns_of, is_nameless, is_set_point, is_speed
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
 from jaxfinger.data.units import TO_SI, beyond_a_turn
@@ -127,8 +127,10 @@ class _Log:
 
     @property
     def columns(self) -> list[ColumnSurvey]:
-        """Columns that may belong to a channel."""
-        return [s for s in self.seen if s.meaning not in ("", "time") and s.samples > 2]
+        """Columns that may belong to a channel: those that the log's clock, or one of their own, gives times."""
+        samples = self.clock.samples if self.clock is not None else self.count
+        timed = [s for s in self.seen if s.samples == samples or self.recording.variables[s.name].clock]
+        return [s for s in timed if s.meaning not in ("", "time") and s.samples > 2]
 
     @property
     def channels(self) -> set[str]:
@@ -268,7 +270,7 @@ def _families(columns: Sequence[ColumnSurvey], count: int, known: Sequence[str])
 def _rate_by_speeds(log: _Log) -> list[str]:
     """A comment on the sampling rate at which some columns of a log without a named clock are the speeds of others."""
     seen = [s for s in log.seen if s.samples == log.count and s.meaning in ("", "q")]
-    found = speeds([_values(log.recording, s) for s in seen])
+    found = [x for x in speeds([_values(log.recording, s) for s in seen]) if is_speed(seen[x.speed].name)]
     if not found:
         return []
     named = [f"{_called(seen[x.speed])} of {_called(seen[x.of])} at {float(f'{x.rate:.3g}'):g}" for x in found]

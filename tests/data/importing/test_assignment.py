@@ -13,6 +13,14 @@ TIME = np.arange(1000) / 100.0
 JOINTS = make_finger().joint_names
 
 
+def _said(tmp_path, names, columns, clock=True):
+    """What is proposed for a log of these columns without a finger, and its path."""
+    path = tmp_path / "log.csv"
+    table = np.column_stack([*([TIME] if clock else []), *columns])
+    np.savetxt(path, table, "%.6f", ",", header=("t," if clock else "") + names, comments="")
+    return proposal([load_recording(path)]), path
+
+
 def _proposed(tmp_path, names):
     """What is proposed for a log with columns of these names, which all change, and what it reads by channel."""
     path = tmp_path / "log.csv"
@@ -86,3 +94,46 @@ def test_a_quantity_by_another_is_no_channel(unit, tmp_path):
     said, read = _proposed(tmp_path, ["MCP angle (left/right)", "PIP angle", name, "tau MCP [mV/V]"])
     assert read == {"q.MCP": "MCP angle (left/right)", "q.PIP": "PIP angle", "joint_torque.MCP": "tau MCP [mV/V]"}
     assert f'in no channel yet: "{name}"' in said
+
+
+def _proposed_of(tmp_path, suffix, write):
+    path = tmp_path / f"log{suffix}"
+    write(path)
+    return proposal([load_recording(path)])
+
+
+def test_joints_that_are_numbered_have_one_unit(tmp_path):
+    """A joint that is moved by 3 degrees beside others in degrees is not in rad."""
+    angles = [40.0 * np.sin(TIME), 3.0 * np.sin(TIME), 60.0 * np.cos(TIME)]
+    said, _ = _said(tmp_path, "q1,q2,q3", angles)
+    assert re.findall(r'from = "q\d", units = "(\w+)"', said) == ["deg", "deg", "deg"]
+
+
+def test_a_unit_that_one_joint_of_several_needs_leaves_the_others_open(tmp_path):
+    """It may slide, in mm, or turn several times."""
+    said, _ = _said(tmp_path, "q1,q2,q3", [0.5 * np.sin(TIME), 0.3 * np.sin(TIME), 200.0 * np.cos(TIME)])
+    assert said.count("}   # units? SI as it stands") == 2
+
+
+def test_parameters_beside_a_clock_are_no_channels(tmp_path):
+    """A file of MATLAB often holds the model beside the samples, or the samples at a lower rate."""
+    angle = 0.5 * np.sin(TIME)
+    data = {
+        "time": TIME,
+        "q_raw": angle,
+        "q_thinned": angle[::10],
+        "f_coul": np.arange(6.0),
+        "pos_gain": np.arange(6.0),
+    }
+    for clock in (True, False):
+        rest = {k: v for k, v in data.items() if clock or k != "time"}
+        said = _proposed_of(tmp_path, ".npz", lambda path, rest=rest: np.savez(path, **rest))
+        assert re.findall(r'channels.*from = "(\w+)"', said) == ["q_raw"]
+        assert '# in no channel yet: "q_thinned", "f_coul", "pos_gain"' in said
+
+
+def test_a_force_that_goes_as_the_speed_is_none(tmp_path):
+    """Of a joint that is damped the torque goes as the speed, and tells no sampling rate."""
+    said, _ = _said(tmp_path, "Joint1_Pos,Joint1_Force", [np.sin(TIME), 12.0 * np.cos(TIME)], clock=False)
+    assert 'channels.joint_torque.J1 = { from = "Joint1_Force" }' in said
+    assert "# speeds" not in said

@@ -70,6 +70,17 @@ def test_units_below_the_names_or_in_them(tmp_path):
     assert [v.units for v in found.values()] == ["s", "deg", "N"]
 
 
+def test_tuples_of_python_in_cells_are_arrays(tmp_path):
+    found = load(tmp_path, 't,q\n0,"(0.1, 0.2)"\n1,"(0.3, 0.4)"\n2,"(0.5, 0.6)"\n').variables
+    np.testing.assert_array_equal(found["q"].values, [[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])
+
+
+def test_a_line_as_long_as_a_file_is_no_table(tmp_path):
+    """A controller's program lists its set-points in one line each."""
+    with pytest.raises(UserError, match=r"log\.csv: names 1 column"):
+        load(tmp_path, f"n : UDINT := 3;\nphi : ARRAY[1..3] OF REAL := [{', '.join(['0.1'] * 40000)}]\n")
+
+
 def test_lists_in_cells_are_arrays(tmp_path):
     text = 't,q,tau,mode\n0,"[0.1, 0.2]","[1 2\n 3]","[up]"\n1,,"[4 5\n 6]","[up]"\n2,"[0.5, 0.6]","[7 8]","[up]"\n'
     found = load(tmp_path, text)
