@@ -50,6 +50,7 @@ _ONE_GROUP = re.compile(r"^[+-]?[1-9]\d{0,2}[.,]\d{3}$")
 # What OpenSim's tables of motion say in their header, of the angles among their columns, and the unit that it means.
 _IN_DEGREES = re.compile(r"^\s*inDegrees\s*=\s*(yes|no)\s*$", re.IGNORECASE | re.MULTILINE)
 _ANGLES = {"yes": "deg", "no": "rad"}
+_LOST = "A message was lost!!!", "\ttotal count"  # how lines begin that `ros2 topic echo` writes between messages
 _SCOPE = "SampleTime[ms]"  # header of TwinCAT Scope, which writes a column of times in ms beside each channel
 
 
@@ -107,7 +108,7 @@ def load_csv(path: Path) -> Recording:
         UserError: the file has no column of numbers, or a line with another number of cells.
     """
     lines = [_Line(number, text) for number, text in enumerate(_lines(_decode(path.read_bytes())), 1) if text.strip()]
-    body = [line for line in lines if not _is_comment(line.text)]
+    body = [line for line in lines if not _is_comment(line.text) and not line.text.startswith(_LOST)]
     if not body:
         raise UserError(f"{path}: holds no samples; it needs a line of names, then one line a sample")
     sample = body[len(body) // 2 :][:_DIALECT_LINES]
@@ -125,11 +126,13 @@ def load_csv(path: Path) -> Recording:
     if not names and states is None and first > 0 and len(split(body[first - 1].text)) != len(numeric):
         given = counted(len(split(body[first - 1].text)), "column")
         raise UserError(f"{path}: names {given} and holds {len(numeric)}; give each column one name")
-    body, remarks = body[first:], ()
+    lost = sum(line.text.startswith(_LOST[0]) for line in lines)
+    remarks = (f"says {counted(lost, 'time')} that messages were lost",) if lost else ()
+    body = body[first:]
     if not names and _numbers_columns(dialect, body):
         names, body = tuple(split(body[0].text)), body[1:]
     if len(body) > 1 and len(split(body[-1].text)) < len(numeric):
-        body, remarks = body[:-1], ("its last line is cut short and is left out",)
+        body, remarks = body[:-1], (*remarks, "its last line is cut short and is left out")
     columns = _columns(path, body, dialect, numeric)
     if states is not None:
         return _of_states(path, columns, states, remarks)

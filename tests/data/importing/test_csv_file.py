@@ -244,6 +244,27 @@ def test_efforts_that_a_driver_does_not_know_are_nan_and_no_empty_array(tmp_path
     assert np.isnan(found["effort"].values).all()
 
 
+def test_joint_states_may_have_what_the_middleware_says_of_them(tmp_path):
+    """`--include-message-info` writes four more cells, of which some middlewares leave counts out."""
+    text, values = _echoed()
+    info = [f"{1700000000000000000 + 10**7 * k},{1700000000000300000 + 10**7 * k},None,{k}," for k in range(40)]
+    lines = [before + line for before, line in zip(info, text.splitlines(), strict=True)]
+    found = load(tmp_path, "\n".join(lines) + "\n").variables
+    assert set(found) == {"stamp", *values}
+    for field, x in values.items():
+        np.testing.assert_array_equal(found[field].values, x)
+        assert found[field].columns == ("mcp", "pip")
+    np.testing.assert_array_equal(found["stamp"].values, load(tmp_path, text).variables["stamp"].values)
+
+
+def test_lost_messages_are_no_samples(tmp_path):
+    first, *rest = _echoed()[0].splitlines()
+    lost = "A message was lost!!!\n\ttotal count change:1\n\ttotal count: 1---"
+    found = load(tmp_path, "\n".join([first, lost, *rest[:30], lost, *rest[30:]]) + "\n")
+    assert found.remarks == ("says 2 times that messages were lost",)
+    assert len(found.variables["stamp"].values) == 40
+
+
 def test_joint_states_whose_names_change_are_refused(tmp_path):
     one, other = _echoed()[0], _echoed(("index_mcp", "index_pip"))[0]
     mixed = "".join(a + "\n" + b + "\n" for a, b in zip(one.splitlines(), other.splitlines(), strict=True))
