@@ -93,6 +93,12 @@ def whole_turns(x: float, period: float, limits: Collection[float]) -> float:
     return round((sum(limits) / len(limits) - x) / period) * period
 
 
+def limits_of_turns(low: float, high: float) -> str:
+    """The limits, as the finger's file has them, of a joint that turns on from `low` to `high` rad."""
+    first, last = 360.0 * math.floor(low / (2.0 * math.pi)), 360.0 * math.ceil(high / (2.0 * math.pi))
+    return f"`limits_deg = [{first:.0f}, {last:.0f}]` in the finger's file"
+
+
 def beyond_a_turn(limits: Collection[float]) -> bool:
     """Whether the limits of a joint, rad, leave it more than a turn to one side. Limits of one turn may be rounded."""
     return bool(max(map(abs, limits)) > 2.0 * math.pi + 0.1)
