@@ -57,7 +57,7 @@ def assigned(
 def held_names(columns: Sequence[ColumnSurvey], known: Sequence[str]) -> list[str]:
     """The longest of the `known` names that each column's name holds, first as words of it; empty where it holds none.
 
-    `J1` is not a part of `J12`.
+    A joint with number 1 is no part of one with number 12.
     """
     held = []
     for s in columns:
@@ -80,7 +80,7 @@ def _part(name: str) -> re.Pattern[str]:
 
 
 def words(name: str) -> str:
-    """A name in small letters, with a mark where a capital begins a word: `qDes` is `q_des`."""
+    """A name in small letters, with a mark where a capital begins a word."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
 
 

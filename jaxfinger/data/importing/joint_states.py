@@ -5,7 +5,7 @@ values and an empty array or text as one empty cell:
 
     sec, nanosec, frame_id, the names, then as many positions, velocities and efforts
 
-With `--include-message-info` four cells of the middleware stand before them: the times of sending and receipt, and two
+With the option `-i` four cells of the middleware stand before them: the times of sending and receipt, and two
 counts.
 """
 
