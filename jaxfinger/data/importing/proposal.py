@@ -247,6 +247,12 @@ def _assign(
         if known and len(columns) > len(known) and not any(held_names(columns, known)):
             said = f"{counted(len(columns), 'column')} for {listed(known)}, in their order"
             comments.append(f"# {channel}: {said}: correct this, or give the finger the names of the recording")
+    counts = [len(channels.get(channel, ())) for channel in ("q", "joint_torque")]
+    if finger is None and min(counts) > 1 and counts[0] != counts[1]:
+        said = " and ".join(
+            f"{count} of {channel}" for count, channel in zip(counts, ("q", "joint_torque"), strict=True)
+        )
+        comments.append(f"# {said}, named in their order: give those of one joint the same name")
     return names, comments
 
 

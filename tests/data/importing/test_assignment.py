@@ -137,3 +137,13 @@ def test_a_force_that_goes_as_the_speed_is_none(tmp_path):
     said, _ = _said(tmp_path, "Joint1_Pos,Joint1_Force", [np.sin(TIME), 12.0 * np.cos(TIME)], clock=False)
     assert 'channels.joint_torque.J1 = { from = "Joint1_Force" }' in said
     assert "# speeds" not in said
+
+
+@pytest.mark.parametrize(("angles", "said"), [(2, True), (3, False)])
+def test_more_torques_than_angles_are_not_paired_in_silence(angles, said, tmp_path):
+    """Without a finger the columns are named by their order, and the angle of a joint may be missing."""
+    names = [f"position {k}" for k in range(3)][-angles:] + [f"torque {k}" for k in range(3)]
+    text, _ = _said(tmp_path, ",".join(names), [np.sin(TIME) for _ in names])
+    comment = "# 2 of q and 3 of joint_torque, named in their order: give those of one joint the same name"
+    assert (comment in text) == said
+    assert 'channels.joint_torque.J3 = { from = "torque 2"' in text
