@@ -206,10 +206,10 @@ def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _
     elif coarse is None and (np.diff(time) <= 0.0).any():
         lines.append("sort = true   # its stamps are out of order, or repeated")
     slides = dict(zip(finger.joint_names, finger.prismatic, strict=True)) if finger is not None else {}
-    turns = {} if finger is None else dict(zip(finger.joint_names, map(beyond_a_turn, finger.limits), strict=True))
+    turns = finger is not None and any(map(beyond_a_turn, finger.limits))
     rows = {
         channel: [
-            (name, _column(s, elsewhere.get(s), slides.get(name, False), turns.get(name, False)))
+            (name, _column(s, elsewhere.get(s), slides.get(name, False), turns))
             for name, s in zip(names[channel], columns, strict=True)
         ]
         for channel, columns in channels.items()
@@ -355,7 +355,7 @@ def _stepped(recording: Recording, seen: ColumnSurvey) -> bool:
 def _column(seen: ColumnSurvey, log: _Log | None, slides: bool, turns: bool) -> str:
     """Inline table (TOML) that reads a column, of another log than the trial's where one is given.
 
-    A joint that slides is in m; where one turns several times, the size of its angle does not tell rad from degrees.
+    A joint that slides is in m; where one turns several times, the sizes of angles do not tell rad from degrees.
     """
     parts = [f"from = {quoted(seen.name)}"]
     if seen.column is not None:

@@ -158,8 +158,8 @@ def _rises_evenly(x: np.ndarray) -> bool:
 def _agreed(found: Sequence[ColumnSurvey], guessed: Mapping[int, float]) -> list[ColumnSurvey]:
     """Columns whose names differ in numbers alone, with one guess of their unit: that of the largest value.
 
-    Where only few of them need that unit they may have several, as joints that slide or turn on, so that it is open for
-    the others. `guessed` has the sizes of the columns whose unit is guessed, by their places.
+    Where less than half of them need that unit they may have several, as joints that slide or turn on, and all are left
+    open. `guessed` has the sizes of the columns whose unit is guessed, by their places.
     """
     agreed = list(found)
     groups: dict[tuple[str, str], list[int]] = {}
@@ -167,10 +167,9 @@ def _agreed(found: Sequence[ColumnSurvey], guessed: Mapping[int, float]) -> list
         groups.setdefault((found[i].meaning, re.sub(r"\d+", "#", found[i].name)), []).append(i)
     for (meaning, _), group in groups.items():
         largest = _unit(meaning, [guessed[i] for i in group])
-        most = sum(found[i].units == largest for i in group) > len(group) / 2
+        many = sum(found[i].units == largest for i in group) >= len(group) / 2
         for i in group:
-            if found[i].units != largest:
-                agreed[i] = replace(found[i], units=largest if most else "")
+            agreed[i] = replace(found[i], units=largest if many else "")
     return agreed
 
 

@@ -109,10 +109,10 @@ def test_joints_that_are_numbered_have_one_unit(tmp_path):
     assert re.findall(r'from = "q\d", units = "(\w+)"', said) == ["deg", "deg", "deg"]
 
 
-def test_a_unit_that_one_joint_of_several_needs_leaves_the_others_open(tmp_path):
+def test_a_unit_that_one_joint_of_several_needs_leaves_all_open(tmp_path):
     """It may slide, in mm, or turn several times."""
     said, _ = _said(tmp_path, "q1,q2,q3", [0.5 * np.sin(TIME), 0.3 * np.sin(TIME), 200.0 * np.cos(TIME)])
-    assert said.count("}   # units? SI as it stands") == 2
+    assert said.count("}   # units? SI as it stands") == 3
 
 
 def test_parameters_beside_a_clock_are_no_channels(tmp_path):
