@@ -74,6 +74,12 @@ def is_foreign(stated: str) -> bool:
     return re.sub(r"[\s·*.-]", "", stated).lower() in _FOREIGN and not unit_name(stated)
 
 
+def is_ratio(stated: str) -> bool:
+    """Whether a file states a unit of one quantity by another, such as rad/s or N m/A, which no channel has."""
+    parts = re.sub(r"(\^|\*\*)?[2²]$", "", stated.strip()).split("/")
+    return len(parts) > 1 and not is_foreign(stated) and all(unit_name(x) or is_foreign(x) for x in parts)
+
+
 def unit_name(stated: str) -> str:
     """Name in `TO_SI` of a unit as a file spells it; empty where it is not listed there."""
     plain = re.sub(r"[·*.-]", " ", stated.strip()).replace("µ", "u")
@@ -85,6 +91,12 @@ def unit_name(stated: str) -> str:
 def whole_turns(x: float, period: float, limits: Collection[float]) -> float:
     """Sum of whole periods that brings `x` nearest to the middle of the limits."""
     return round((sum(limits) / len(limits) - x) / period) * period
+
+
+def limits_of_turns(low: float, high: float) -> str:
+    """The limits, as the finger's file has them, of a joint that turns on from `low` to `high` rad."""
+    first, last = 360.0 * math.floor(low / (2.0 * math.pi)), 360.0 * math.ceil(high / (2.0 * math.pi))
+    return f"`limits_deg = [{first:.0f}, {last:.0f}]` in the finger's file"
 
 
 def beyond_a_turn(limits: Collection[float]) -> bool:

@@ -39,6 +39,12 @@ def test_templates_import_once_the_files_are_there(written, capsys):
     assert session.finger.tendon_names == ("T1",)
     assert not [f for f in check_file(written / "session.h5") if f.severity == "error"]
     np.testing.assert_allclose(session["01-ID.2-MCP"].q[:, 0].max(), np.radians(70), rtol=1e-3)
+    example = "finger: has the masses and centres of mass of the template; write those of your finger"
+    assert example in capsys.readouterr().err
+    finger = written / "finger.toml"
+    finger.write_text(finger.read_text().replace("mass = 0.022 ", "mass = 0.0221"))
+    main(["import", *files, "--mapping", f"{written}/mapping.toml", "-o", f"{written}/other.h5"])
+    assert example not in capsys.readouterr().err
 
 
 def test_nothing_is_overwritten_unless_asked_and_names_differ(written, capsys):

@@ -10,7 +10,9 @@ that the postures tell apart:
 Each trial has its own zero, as of a sensor that is tared, and its own friction. Only the shapes of curves count.
 
 Where one trial moves several joints, as of an arm, other joints' angles change all the time, and each torque shows its
-own multiple of levers · g: far from one it has another unit, a wrong sign, or belongs to a motor before its gear.
+own multiple of levers · g: far from one it has another unit, a wrong sign, or belongs to a motor before its gear. Where
+too little is left of the weight beside curves over the joint's own angle, as of an upright arm, springs could explain
+torques that go against it; but hardly at several joints at once, each with about twice the weight.
 """
 
 from __future__ import annotations
@@ -41,6 +43,8 @@ _MAX_SCALE = 2.0  # of a torque, up or down: masses and their places are known b
 # Of the weight's torque: what must be left of it beside curves over the joint's own angle. At this share, another
 # torque of a twentieth of the weight passes for half of its scale. Less is left where joints move in proportion.
 _MIN_REST = 0.1
+# Of a torque's variance, what the weight explains where the torque follows it.
+_MIN_FOLLOWED = 0.9
 
 
 class _Motion(NamedTuple):
@@ -118,6 +122,33 @@ def check_torque_scales(session: Session, report: Report) -> None:
                 f"is not what gravity takes, with {listed(wrong)}: correct its scale (of a motor's current, or of its "
                 "torque before the gear) or its sign, or `mass` and `com`",
             )
+            continue
+        against = _against_gravity(finger, trial, [i for i, scale in scales.items() if scale is None], moving)
+        if len(against) > 1:
+            named = listed([f"{scale:.2g} of what it takes at {name}" for name, scale in against.items()])
+            report.warning(
+                trial.place("joint_torque"),
+                f"goes against gravity, with {named}: correct its sign, that of q, or `gravity`, unless springs of "
+                "twice the weight act at each of these joints",
+            )
+
+
+def _against_gravity(
+    finger: FingerDescription, trial: Trial, joints: Sequence[int], moving: Sequence[int]
+) -> dict[str, float]:
+    """Joints whose torque follows the weight in the wrong direction, with its multiple; none if one follows rightly."""
+    follows = {}
+    for i in joints:
+        for motion in _motion(trial, i, moving):
+            weight = -gravity_levers(finger, motion.q)[:, i] @ finger.gravity
+            own = np.column_stack([np.ones(len(weight)), motion.direction])
+            wanted = np.column_stack([weight, motion.torque])
+            left = wanted - own @ np.linalg.lstsq(own, wanted)[0]
+            (size, product), (_, whole) = left.T @ left
+            if product**2 > _MIN_FOLLOWED * size * whole:
+                follows[finger.joint_names[i]] = float(product / size)
+    plausible = {name: scale for name, scale in follows.items() if 1.0 / _MAX_SCALE < abs(scale) < _MAX_SCALE}
+    return plausible if all(scale < 0.0 for scale in follows.values()) else {}
 
 
 def _torque_scale(finger: FingerDescription, i: int, motion: _Motion) -> float | None:

@@ -15,7 +15,7 @@ from jaxfinger.data.signals.motion import MIN_MOTION
 from jaxfinger.data.signals.quantiles import median, quantile
 from jaxfinger.data.signals.sizes import NOISE_FACTOR, Sizes
 from jaxfinger.data.signals.unmeasured import constant_columns, placeholder
-from jaxfinger.data.units import STANDARD_GRAVITY, conversion, whole_turns
+from jaxfinger.data.units import STANDARD_GRAVITY, conversion, limits_of_turns, whole_turns
 from jaxfinger.errors import counted, listed
 
 if TYPE_CHECKING:
@@ -145,8 +145,7 @@ def _mend_of_turns(q: Float[np.ndarray, " N"], low: float, high: float, limits: 
     fits = lower <= np.radians(low) and np.radians(high) <= upper and np.ptp(limits) < 2.0 * np.pi - _MAX_OVERTRAVEL
     if fits or np.all(q == np.round(q)):
         return other
-    first, last = 360.0 * np.floor(low / (2.0 * np.pi)), 360.0 * np.ceil(high / (2.0 * np.pi))
-    return f"{other}, or, if the joint turns on, write `limits_deg = [{first:.0f}, {last:.0f}]` in the finger's file"
+    return f"{other}, or, if the joint turns on, write {limits_of_turns(low, high)}"
 
 
 def _temperatures(trial: Trial, report: Report) -> None:

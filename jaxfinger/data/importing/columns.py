@@ -18,7 +18,7 @@ from jaxfinger.data.importing.variables import Source, column_of, scale_of
 from jaxfinger.data.signals.clock import gaps
 from jaxfinger.data.signals.sizes import MAX_RATE
 from jaxfinger.data.toml import Place
-from jaxfinger.data.units import whole_turns
+from jaxfinger.data.units import limits_of_turns, unit_name, whole_turns
 from jaxfinger.errors import UserError, counted, listed
 
 if TYPE_CHECKING:
@@ -245,7 +245,22 @@ class ColumnReader:
             length = period(term, units, scale_of(term, self._source(term, where), where))
             if length > np.ptp(limits) and np.isfinite(x).any():
                 x = x + whole_turns(0.5 * (np.nanmin(x) + np.nanmax(x)), length, limits)
+        if units == "rad" and np.isfinite(x).any():
+            self._refuse_turns(spec, x, limits, where)
         return x
+
+    def _refuse_turns(self, spec: ColumnSpec, x: Float[np.ndarray, " N"], limits: np.ndarray, where: Place) -> None:
+        """Refuse an angle beyond a turn and the range of its limits in the recording's own units, which are right."""
+        low, high = np.nanquantile(x, (0.01, 0.99))
+        if max(-low, high) < 2.0 * np.pi or high - low < np.ptp(limits):
+            return
+        of = [(term, self._source(term, where).variable(term.from_, where)) for term in terms(spec)]
+        if all(unit_name(v.units) == (term.units or "rad") and term.scale in (1.0, -1.0) for term, v in of):
+            stated = listed(list(dict.fromkeys(variable.units for _, variable in of)))
+            where.fail(
+                f"runs from {low:.3g} to {high:.3g} rad, more than a turn, and the recording states {stated}; if the "
+                f"joint turns on, write {limits_of_turns(low, high)}"
+            )
 
     def _source(self, spec: Column, where: Place) -> Source:
         return self.clock.source if spec.file is None else self.sources(spec.file, where)

@@ -33,7 +33,7 @@ _UNIT = r"%|°|deg|rad|turn|rev|rpm|k?Hz|[mun]?s|[munc]?m|[mk]?N|[mk]?N[ ·*]?[c
 _UNIT_CELL = re.compile(rf"^[\[(]?({_UNIT}|{_UNIT}/s2?|)[\])]?$")
 _UNIT_SUFFIX = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")  # in brackets after a name
 _DATE = re.compile(r"^\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
-_LIST = re.compile(r"^\[.*\]$", re.DOTALL)
+_LIST = re.compile(r"^(\[.*\]|\(.*\))$", re.DOTALL)
 _LIST_IN_QUOTES = re.compile(r'"\[[^"\]]*\]"')  # pandas breaks the lines of a long array
 _HOUR = re.compile(r"\d:\d\d")  # in a time of day or a date
 _BLANKS = " \u00a0\u202f'’"  # that group digits, and are never a decimal mark
@@ -50,6 +50,7 @@ _ONE_GROUP = re.compile(r"^[+-]?[1-9]\d{0,2}[.,]\d{3}$")
 # What OpenSim's tables of motion say in their header, of the angles among their columns, and the unit that it means.
 _IN_DEGREES = re.compile(r"^\s*inDegrees\s*=\s*(yes|no)\s*$", re.IGNORECASE | re.MULTILINE)
 _ANGLES = {"yes": "deg", "no": "rad"}
+_LOST = "A message was lost!!!", "\ttotal count"  # how lines begin that `ros2 topic echo` writes between messages
 _SCOPE = "SampleTime[ms]"  # header of TwinCAT Scope, which writes a column of times in ms beside each channel
 
 
@@ -62,7 +63,12 @@ class _Dialect:
 
     def split(self, line: str) -> list[str]:
         """Cells of a line."""
-        cells = line.split() if self.separator is None else next(csv.reader([line], delimiter=self.separator), [])
+        if self.separator is None:
+            return line.split()
+        try:
+            cells = next(csv.reader([line], delimiter=self.separator), [])
+        except csv.Error:  # a cell of more than 128 KiB, which no table has
+            cells = [line]
         return [cell.strip() for cell in cells]
 
     def number(self, cell: str) -> float | None:
@@ -102,27 +108,31 @@ def load_csv(path: Path) -> Recording:
         UserError: the file has no column of numbers, or a line with another number of cells.
     """
     lines = [_Line(number, text) for number, text in enumerate(_lines(_decode(path.read_bytes())), 1) if text.strip()]
-    body = [line for line in lines if not _is_comment(line.text)]
+    body = [line for line in lines if not _is_comment(line.text) and not line.text.startswith(_LOST)]
     if not body:
         raise UserError(f"{path}: holds no samples; it needs a line of names, then one line a sample")
     sample = body[len(body) // 2 :][:_DIALECT_LINES]
     dialect, numeric = _find_dialect([line.text for line in sample])
     split = dialect.split
+    if not any(numeric) and len(body) == 1:
+        raise UserError(f"{path}: holds names and no samples; record it again, or leave it out")
     if not any(numeric):
         raise UserError(f"{path}: holds no column of numbers; give a table with one line a sample")
     first = next(i for i, line in enumerate(body) if _is_sample(dialect, split(line.text), numeric))
     above = [line for line in lines if line.number < body[first].number]
-    names, units, scope = _names(above, dialect, len(numeric))
     rows = [row for line in sample if len(row := split(line.text)) == len(numeric)]
+    names, units, scope = _names(above, dialect, len(numeric), blank=not any(row[-1] for row in rows))
     states = None if names else joint_states(rows, dialect.number)
     if not names and states is None and first > 0 and len(split(body[first - 1].text)) != len(numeric):
         given = counted(len(split(body[first - 1].text)), "column")
         raise UserError(f"{path}: names {given} and holds {len(numeric)}; give each column one name")
-    body, remarks = body[first:], ()
+    lost = sum(line.text.startswith(_LOST[0]) for line in lines)
+    remarks = (f"says {counted(lost, 'time')} that messages were lost",) if lost else ()
+    body = body[first:]
     if not names and _numbers_columns(dialect, body):
         names, body = tuple(split(body[0].text)), body[1:]
     if len(body) > 1 and len(split(body[-1].text)) < len(numeric):
-        body, remarks = body[:-1], ("its last line is cut short and is left out",)
+        body, remarks = body[:-1], (*remarks, "its last line is cut short and is left out")
     columns = _columns(path, body, dialect, numeric)
     if states is not None:
         return _of_states(path, columns, states, remarks)
@@ -215,11 +225,14 @@ def _is_sample(dialect: _Dialect, cells: Sequence[str], numeric: Sequence[bool])
     return len(cells) == len(numeric) and None not in values and not all(np.isnan(v) for v in values if v is not None)
 
 
-def _names(above: Sequence[_Line], dialect: _Dialect, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
+def _names(
+    above: Sequence[_Line], dialect: _Dialect, width: int, blank: bool
+) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
     """Names of the columns, their units, and whether they are pairs of time and value as TwinCAT Scope writes them.
 
     The names are the nearest line above the numbers that has a cell for each column and holds no units. They may stand
-    behind a comment mark (numpy.savetxt, gnuplot).
+    behind a comment mark (numpy.savetxt, gnuplot). Either they or the numbers may end with a separator, after which the
+    last column is `blank`.
     """
     rows = []
     for line in reversed(above):
@@ -228,6 +241,10 @@ def _names(above: Sequence[_Line], dialect: _Dialect, width: int) -> tuple[tuple
         cells = dialect.split(line.text if plain == text else plain)
         if plain != text and len(cells) != width:
             cells = plain.replace(",", " ").split()
+        while len(cells) > width and not cells[-1]:
+            cells.pop()
+        if blank and len(cells) == width - 1:
+            cells.append("")
         if len(cells) == width and any(cells):
             rows.append(cells)
     labelled = {row[0]: tuple(row) for row in rows if row[::2] == row[:1] * (width // 2) and width % 2 == 0}
@@ -303,7 +320,7 @@ def _column(cells: Sequence[str], lines: Sequence[int], dialect: _Dialect, numer
 
 
 def _lists(cells: Sequence[str]) -> _Column:
-    """A column of lists such as `[0.1, 0.2]`, one a sample, as arrays; an empty cell is a list of NaN."""
+    """A column of lists such as `[0.1, 0.2]` or `(0.1, 0.2)`, one a sample, as arrays; an empty cell is one of NaN."""
     try:
         rows = [np.array(cell[1:-1].replace(",", " ").split(), np.float64) for cell in cells]
     except ValueError:

@@ -9,14 +9,15 @@ from functools import cached_property
 
 import numpy as np
 
+from jaxfinger.data.importing.assignment import assigned, held_names, known_names, named_columns, words
 from jaxfinger.data.importing.columns import coarse_rate, restarts
 from jaxfinger.data.importing.recording import Recording
 from jaxfinger.data.importing.speeds import speeds
-from jaxfinger.data.importing.survey import ColumnSurvey, columns_of, is_nameless, is_set_point
+from jaxfinger.data.importing.survey import ColumnSurvey, columns_of, is_nameless, is_set_point, is_speed
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
 from jaxfinger.data.units import TO_SI, beyond_a_turn
-from jaxfinger.errors import listed
+from jaxfinger.errors import counted, listed
 
 # Names of what is in front of a joint's gear or spring.
 _MOTOR = r"(?<![a-z])(motor|mot|drive|actuator|rotor|spool|winch)(?![a-z])"
@@ -126,8 +127,10 @@ class _Log:
 
     @property
     def columns(self) -> list[ColumnSurvey]:
-        """Columns that may belong to a channel."""
-        return [s for s in self.seen if s.meaning not in ("", "time") and s.samples > 2]
+        """Columns that may belong to a channel: those that the log's clock, or one of their own, gives times."""
+        samples = self.clock.samples if self.clock is not None else self.count
+        timed = [s for s in self.seen if s.samples == samples or self.recording.variables[s.name].clock]
+        return [s for s in timed if s.meaning not in ("", "time") and s.samples > 2]
 
     @property
     def channels(self) -> set[str]:
@@ -173,15 +176,11 @@ def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _
             channels[channel] = own
     if any(_has(_LINK, s) for s in channels.get("q", ())):
         channels["q"] = [s for s in channels["q"] if not _has(_MOTOR_BESIDE_LINK, s)]
-    rivals = {}
-    for channel in ("q", "joint_torque"):
-        # Without a finger, the angles tell how many joints have a torque.
-        joints = len(finger.joint_names) if finger is not None else len(channels.get("q", ()))
-        if families := _families(channels.get(channel, ()), joints):
-            channels[channel], *rivals[channel] = families
-    names = {channel: _names(channel, columns, finger) for channel, columns in channels.items()}
+    rivals = _choose_families(channels, finger)
+    names, surplus = _assign(channels, finger)
     experiment, joint, tendon = _experiment(recording, channels, names)
-    if joint and len(channels.get("joint_torque", ())) == 1:
+    torques = channels.get("joint_torque", ())
+    if joint and len(torques) == 1 and not any(held_names(torques, known_names("joint_torque", finger))):
         names["joint_torque"] = [joint]  # A single torque sensor belongs to the joint that the motor moves.
     lines = [f'experiment = "{experiment}"   # guessed: ID.2, ID.3-static, ID.3-dynamic, ID.4, VD.1, VD.2 or VD.3']
     lines += [f"joint = {quoted(joint)}   # that is moved, or held by the torque sensor"] if joint else []
@@ -201,33 +200,74 @@ def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _
     for channel, families in rivals.items():
         named = [f"{_called(family[0])} to {_called(family[-1])}" for family in families]
         lines.append(f"# {channel} could also be {' or '.join(named)}: take what was measured")
+    lines += surplus
     if len(begins := restarts(time)):
         lines.append(f"# the time begins again after sample {begins[0]}: a trial for each part, chosen by `where`")
     elif coarse is None and (np.diff(time) <= 0.0).any():
         lines.append("sort = true   # its stamps are out of order, or repeated")
     slides = dict(zip(finger.joint_names, finger.prismatic, strict=True)) if finger is not None else {}
-    turns = {} if finger is None else dict(zip(finger.joint_names, map(beyond_a_turn, finger.limits), strict=True))
+    turns = finger is not None and any(map(beyond_a_turn, finger.limits))
     rows = {
         channel: [
-            (name, _column(s, elsewhere.get(s), slides.get(name, False), turns.get(name, False)))
-            for name, s in zip(names[channel], columns, strict=False)
+            (name, _column(s, elsewhere.get(s), slides.get(name, False), turns))
+            for name, s in zip(names[channel], columns, strict=True)
         ]
         for channel, columns in channels.items()
     }
-    read = {s for channel, columns in channels.items() for s in columns[: len(rows[channel])]}
+    read = {s for columns in channels.values() for s in columns}
     read |= {s for families in rivals.values() for family in families for s in family}
-    left_out = dict.fromkeys(s.name for log in logs for s in log.seen if s not in read and s.meaning != "time")
+    unread = [s for log in logs for s in log.seen if s not in read and s.meaning != "time"]
+    left_out = dict.fromkeys(s.name for s in sorted(unread, key=lambda s: not s.meaning))  # what could be read first
     return _Proposal(lines, rows, list(left_out))
 
 
-def _families(columns: Sequence[ColumnSurvey], count: int) -> list[list[ColumnSurvey]]:
-    """Sets of `count` columns each whose names differ in numbers alone, if these are all; those that change first.
+def _choose_families(
+    channels: dict[str, list[ColumnSurvey]], finger: FingerDescription | None
+) -> dict[str, list[list[ColumnSurvey]]]:
+    """Keep one set of columns of angles and of torques in `channels`, and return the other sets by channel."""
+    rivals = {}
+    for channel in ("q", "joint_torque"):
+        known = known_names(channel, finger)
+        columns = named_columns(channels.get(channel, ()), known)
+        # Without a finger, the angles tell how many joints have a torque.
+        if families := _families(columns, len(known) or len(channels.get("q", ())), known):
+            columns, *rivals[channel] = families
+        channels |= {channel: columns} if columns else {}
+    return rivals
+
+
+def _assign(
+    channels: dict[str, list[ColumnSurvey]], finger: FingerDescription | None
+) -> tuple[dict[str, list[str]], list[str]]:
+    """Names of the columns of each channel, of which `channels` keeps those with one; and comments on the others."""
+    names, comments = {}, []
+    for channel, columns in channels.items():
+        known = known_names(channel, finger)
+        names[channel], channels[channel] = assigned(channel, columns, finger)
+        if known and len(columns) > len(known) and not any(held_names(columns, known)):
+            said = f"{counted(len(columns), 'column')} for {listed(known)}, in their order"
+            comments.append(f"# {channel}: {said}: correct this, or give the finger the names of the recording")
+    counts = [len(channels.get(channel, ())) for channel in ("q", "joint_torque")]
+    if finger is None and min(counts) > 1 and counts[0] != counts[1]:
+        said = " and ".join(
+            f"{count} of {channel}" for count, channel in zip(counts, ("q", "joint_torque"), strict=True)
+        )
+        comments.append(f"# {said}, named in their order: give those of one joint the same name")
+    return names, comments
+
+
+def _families(columns: Sequence[ColumnSurvey], count: int, known: Sequence[str]) -> list[list[ColumnSurvey]]:
+    """Sets of `count` columns each whose names differ in `known` names or numbers alone, if these are all.
+
+    Those that change come first.
 
     None where there is one set only, or where some column is in no set: then they may be of different joints.
     """
     sets: dict[str, list[ColumnSurvey]] = {}
-    for s in columns:
-        sets.setdefault(re.sub(r"\d+", "#", f"{s.name} {s.column}"), []).append(s)
+    for s, name in zip(columns, held_names(columns, known), strict=True):
+        text = f"{s.name} {s.column}"
+        text = re.sub(re.escape(name), "#", text, flags=re.IGNORECASE) if name else text
+        sets.setdefault(re.sub(r"\d+", "#", text), []).append(s)
     if len(sets) < 2 or any(len(family) != count for family in sets.values()):
         return []
     return sorted(sets.values(), key=lambda family: all(s.low == s.high for s in family))
@@ -236,7 +276,7 @@ def _families(columns: Sequence[ColumnSurvey], count: int) -> list[list[ColumnSu
 def _rate_by_speeds(log: _Log) -> list[str]:
     """A comment on the sampling rate at which some columns of a log without a named clock are the speeds of others."""
     seen = [s for s in log.seen if s.samples == log.count and s.meaning in ("", "q")]
-    found = speeds([_values(log.recording, s) for s in seen])
+    found = [x for x in speeds([_values(log.recording, s) for s in seen]) if is_speed(seen[x.speed].name)]
     if not found:
         return []
     named = [f"{_called(seen[x.speed])} of {_called(seen[x.of])} at {float(f'{x.rate:.3g}'):g}" for x in found]
@@ -264,8 +304,7 @@ def _is_motor(seen: ColumnSurvey) -> bool:
 
 def _has(pattern: str, seen: ColumnSurvey) -> bool:
     """Whether a pattern of words fits a column's name."""
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", f"{seen.name} {seen.column or ''}").lower()
-    return re.search(pattern, words) is not None
+    return re.search(pattern, words(f"{seen.name} {seen.column or ''}")) is not None
 
 
 def _experiment(
@@ -313,37 +352,10 @@ def _stepped(recording: Recording, seen: ColumnSurvey) -> bool:
     return float(np.mean(steps < _MAX_STILL_CHANGE * np.percentile(steps, 95.0))) > _MIN_STILL_SHARE
 
 
-def _names(channel: str, columns: Sequence[ColumnSurvey], finger: FingerDescription | None) -> list[str]:
-    """Names of joints, tendons, axes or sensors for the columns of a channel."""
-    if channel == "temperature":
-        return [s.name for s in columns]
-    if channel == "fingertip_force":
-        return ["x", "y", "z"]
-    letter = "J" if channel in ("q", "joint_torque") else "T"
-    if finger is None:
-        return [s.column if isinstance(s.column, str) else f"{letter}{k}" for k, s in enumerate(columns, 1)]
-    known = list(finger.joint_names if letter == "J" else finger.tendon_names)
-    held = [[n for n in known if n.lower() in f"{s.name} {s.column or ''}".lower()] for s in columns]
-    own = [max(names, key=len) for names in held if names]
-    return own if len(own) == len(columns) == len(set(own)) else _by_number(columns, known)
-
-
-def _by_number(columns: Sequence[ColumnSurvey], known: Sequence[str]) -> list[str]:
-    """Names for columns that differ in a number alone, such as q2 and q1, by that number; else in their order."""
-    parts = [re.split(r"(\d+)", s.name if s.column is None else f"{s.name} {s.column}") for s in columns]
-    places = [k for k in range(len(parts[0])) if len({tuple(part[k : k + 1]) for part in parts}) > 1]
-    if len({len(part) for part in parts}) > 1 or len(places) != 1 or places[0] % 2 == 0:
-        return list(known)
-    numbers = [int(part[places[0]]) for part in parts]
-    if min(numbers) > 0 and max(numbers) <= len(known):
-        return [known[number - 1] for number in numbers]
-    return [known[sorted(numbers).index(number)] for number in numbers] if len(numbers) <= len(known) else list(known)
-
-
 def _column(seen: ColumnSurvey, log: _Log | None, slides: bool, turns: bool) -> str:
     """Inline table (TOML) that reads a column, of another log than the trial's where one is given.
 
-    A joint that slides is in m; where one turns several times, the size of its angle does not tell rad from degrees.
+    A joint that slides is in m; where one turns several times, the sizes of angles do not tell rad from degrees.
     """
     parts = [f"from = {quoted(seen.name)}"]
     if seen.column is not None:

@@ -78,7 +78,7 @@ def side_by_side(recordings: Sequence[Recording]) -> Recording:
     if len(set(counts.values())) > 1:
         said = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise ValueError(
-            f"names files with different numbers of samples ({said}), which do not lie side by side; leave one here, "
-            "and give columns of the others their `file` and `time`"
+            f"names files with different numbers of samples ({said}), which do not lie side by side; delete "
+            "the samples that only some have, or leave one here and give columns of the others their `file` and `time`"
         )
     return Recording(recordings[0].path, variables, unusable, words=words)

@@ -329,7 +329,7 @@ class _Robot:
         return mass, com, inertia
 
     def _limits(self, chain: Sequence[int]) -> tuple[Float[np.ndarray, "m 2"], tuple[str, ...]]:
-        """Limits of the joints, and remarks on those that have none."""
+        """Limits of the joints, and remarks on those that have none, or several turns."""
         import mujoco
 
         remarks, limits = [], np.array(self.model.jnt_range[list(chain)])
@@ -341,7 +341,10 @@ class _Robot:
                 said = "half a turn to each side is written; give it more by `limits_deg` if it turns on"
                 remarks.append(f"{self.names[j]}: has no limits in the file; {said}")
             elif self.model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE and beyond_a_turn(limits[i]):
+                turns = f"{np.ptp(limits[i]) / (2.0 * np.pi):.3g} turns"
                 limits[i] = _in_whole_degrees(limits[i])
+                said = f"the file's limits, read as rad, leave it {turns}"
+                remarks.append(f"{self.names[j]}: {said}; if they are degrees, write them as `limits_deg`")
         return limits, tuple(remarks)
 
     def _fingertip(

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from jaxfinger.data.importing.columns import coarse_rate, restarts
 from jaxfinger.data.importing.recording import Recording, Variable
-from jaxfinger.data.units import TO_SI, is_foreign, unit_name
+from jaxfinger.data.units import TO_SI, is_foreign, is_ratio, unit_name
 
 # Usual intervals of a clock that ticks evenly. A late sample makes one up to twice as long; in a longer one than this,
 # samples were lost. It decides what counts as the rate, not what is a fault (`signals.clock`).
@@ -19,7 +19,7 @@ MIN_GAP = 5.0
 _MEANINGS = (
     ("time", r"^t(_?(s|sec|ms|us|ns))?$|time|stamp|clock|zeit|^sec|^duration$"),
     ("temperature", r"temp"),
-    ("joint_torque", r"(^|_)tau|torque|effort|moment"),
+    ("joint_torque", r"(^|_)tau|torque|effort|moment|joint[_ ]?\d*[_ ]?force"),
     ("tendon_excursion", r"excursion|^l\d*$|length|pull|spool|linear|travel"),
     (
         "tendon_force",
@@ -101,10 +101,10 @@ class ClockSurvey:
 def columns_of(recording: Recording, among: Sequence[Recording] = ()) -> list[ColumnSurvey]:
     """Survey every column of every variable of a recording.
 
-    A unit is guessed from the largest values that the column has in any recording `among` these: a joint that is held
-    at 5 degrees could be one at 5 rad, until another recording shows it at 80.
+    A unit is guessed from the largest values that the column has in any recording `among` these, and its like in this
+    one: a joint that is held at 5 degrees could be one at 5 rad, until it or the others are seen at 80.
     """
-    found = []
+    found, guessed = [], {}
     for name, variable in recording.variables.items():
         table = variable.values.reshape(len(variable.values), -1)
         for k, x in enumerate(table.T):
@@ -112,18 +112,21 @@ def columns_of(recording: Recording, among: Sequence[Recording] = ()) -> list[Co
             units = unit_name(variable.units)
             spelt = units or _spelt(name)
             foreign = variable.units if is_foreign(variable.units) and not spelt else ""
-            meaning = _meaning(name, column, x, spelt)
+            meaning = "" if is_ratio(variable.units) else _meaning(name, column, x, spelt)
             if meaning == "q" and not (spelt or foreign):
                 units = spelt = recording.angles
             stated = bool(units)
             if spelt:
                 units = spelt
             elif not stated and not foreign:
-                units = _time_unit(x) if meaning == "time" else _unit(meaning, _sizes(name, k, recording, among))
+                sizes = _sizes(name, k, recording, among)
+                units = _time_unit(x) if meaning == "time" else _unit(meaning, sizes)
+                guessed |= {len(found): np.nanmax(sizes)} if meaning in _MAX_VALUES and np.isfinite(sizes).any() else {}
             finite = x[np.isfinite(x)]
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
             missing = len(x) - len(finite)
             found.append(ColumnSurvey(name, column, len(x), low, high, missing, units, stated, meaning, foreign))
+    found = _agreed(found, guessed)
     if not any(s.meaning == "time" for s in found):
         for k, s in enumerate(found):
             x = np.ravel(recording.variables[s.name].values)
@@ -138,6 +141,11 @@ def is_nameless(name: str) -> bool:
     return re.fullmatch(_NAMELESS, name) is not None
 
 
+def is_speed(name: str) -> bool:
+    """Whether a column may hold speeds by its name; one without a name may hold anything."""
+    return is_nameless(name) or re.search(_VELOCITY, name.lower()) is not None
+
+
 def _rises_evenly(x: np.ndarray) -> bool:
     """Whether values rise by similar steps throughout, as times do. A count of samples does not show their times."""
     steps = np.diff(x)
@@ -145,6 +153,24 @@ def _rises_evenly(x: np.ndarray) -> bool:
         return False
     ratio = steps / np.median(steps)
     return bool(np.mean((ratio > 0.5) & (ratio < 2.0)) > _MIN_EVEN)
+
+
+def _agreed(found: Sequence[ColumnSurvey], guessed: Mapping[int, float]) -> list[ColumnSurvey]:
+    """Columns whose names differ in numbers alone, with one guess of their unit: that of the largest value.
+
+    Where less than half of them need that unit they may have several, as joints that slide or turn on, and all are left
+    open. `guessed` has the sizes of the columns whose unit is guessed, by their places.
+    """
+    agreed = list(found)
+    groups: dict[tuple[str, str], list[int]] = {}
+    for i in guessed:
+        groups.setdefault((found[i].meaning, re.sub(r"\d+", "#", found[i].name)), []).append(i)
+    for (meaning, _), group in groups.items():
+        largest = _unit(meaning, [guessed[i] for i in group])
+        many = sum(found[i].units == largest for i in group) >= len(group) / 2
+        for i in group:
+            agreed[i] = replace(found[i], units=largest if many else "")
+    return agreed
 
 
 def _sizes(name: str, k: int, recording: Recording, among: Sequence[Recording]) -> list[float]:

@@ -161,3 +161,40 @@ def test_torques_that_drown_in_noise_or_lie_in_a_horizontal_plane_show_no_scale(
     session = excited(replace(flat, gravity=np.array([0.0, 0.0, -9.81])), np.random.default_rng(1))
     wrong = replace(session["all"], joint_torque=-session["all"].joint_torque)
     assert scales_said(Session("flat", flat, {"all": wrong})) == []
+
+
+def upright(sign: float, spring: float, seed: int = 0) -> Session:
+    """Session of an arm that points up and moves its joints in proportion, so that springs could explain each torque.
+
+    `sign` is that of the torques, and `spring` a stiffness as a multiple of the one that the weight imitates.
+    """
+    finger = replace(make_finger(), gravity=np.array([-9.81, 0.0, 0.0]))
+    session = excited(finger, np.random.default_rng(seed))
+    trial = session["all"]
+    q = 0.4 * (trial.q[:, :1] - trial.q[:, :1].mean()) * [1.0, 0.8]
+    weight = -gravity_levers(finger, q) @ finger.gravity
+    size = np.abs(weight).mean(axis=0)
+    speed = np.gradient(q, trial.time, axis=0)
+    torque = weight + spring * size / np.abs(q).mean(axis=0) * q + 0.05 * size * np.sign(speed)
+    torque += 0.02 * size * np.random.default_rng(seed).standard_normal(q.shape)
+    return replace(session, trials={"all": replace(trial, q=q, joint_torque=sign * torque)})
+
+
+def test_torques_of_an_upright_arm_with_a_wrong_sign_are_named():
+    """A weight that turns an arm over, held with the wrong sign, looks like springs that hold it up."""
+    (finding,) = scales_said(upright(-1.0, 0.0))
+    assert "/trials/all/joint_torque: goes against gravity, with -1" in finding
+    assert "of what it takes at PIP: correct its sign, that of q, or `gravity`" in finding
+
+
+@pytest.mark.parametrize("spring", [0.0, 0.3, 1.0, 5.0, 20.0])
+def test_torques_of_an_upright_arm_with_the_right_sign_are_silent_with_other_springs(spring):
+    """Springs of twice the weight at all joints are what the warning names as its exception."""
+    for seed in range(3):
+        assert scales_said(upright(1.0, spring, seed)) == []
+
+
+def test_one_joint_that_goes_against_gravity_has_a_spring():
+    session = upright(-1.0, 0.0)
+    torque = session["all"].joint_torque * [1.0, -1.0]
+    assert scales_said(replace(session, trials={"all": replace(session["all"], joint_torque=torque)})) == []

@@ -207,6 +207,26 @@ def test_an_encoder_in_counts_is_unwrapped(tmp_path):
     np.testing.assert_allclose(np.diff(q), np.diff(Q), atol=2e-3 / 10 + 2e-4)
 
 
+@pytest.mark.parametrize(
+    ("stated", "mend"),
+    [
+        ("[rad]", r"runs from 2.51 to 8.7 rad, more than a turn, and the recording states rad; if the joint turns on,"),
+        ("", r'convert deg to rad \(`units = "deg"` in a mapping\)'),
+    ],
+)
+def test_an_angle_of_more_than_a_turn_in_stated_units_is_not_to_be_converted(tmp_path, stated, mend):
+    """Small numbers of degrees would fit the limits; but the recording says what they are."""
+    log, name = tmp_path / "log.csv", f"position {stated}".strip()
+    table = np.column_stack([TIME, 5.6 - 3.1 * np.cos(TIME), 0.01 * np.sin(TIME)])
+    np.savetxt(log, table, "%.6f", ",", header=f"t [s],{name},tau", comments="")
+    text = MAPPING.replace("EXTRA", "").replace("TORQUE", '"tau"').replace("log.mat", "log.csv")
+    text = text.replace('time = "t"', 'time = "t [s]"').replace('MCP = "q"', f'MCP = "{name}"')
+    (tmp_path / "m.toml").write_text(text)
+    with pytest.raises(UserError, match=mend) as caught:
+        import_file([log], tmp_path / "m.toml", tmp_path / "s.h5", True, Report())
+    assert ("`limits_deg = [0, 720]` in the finger's file" in str(caught.value)) == bool(stated)
+
+
 def test_the_start_of_a_span_is_the_first_sample(tmp_path):
     trial, _ = bring_in(tmp_path, '"now"', "span = [1.0, 3.0]", t=TIME + 1.7e9)
     np.testing.assert_allclose(trial.q[:, 0], Q[100:300])

@@ -40,6 +40,9 @@ def load(tmp_path, content, name="log.csv"):
             )
         ),
         ("Instrument X\nRun 7, of Monday\n\nt,a,b\n" + NUMBERS, ["t", "a", "b"]),
+        ("t,a,b,\n" + NUMBERS, ["t", "a", "b"]),
+        ("# t,a,b,\n" + NUMBERS, ["t", "a", "b"]),
+        ("t,a,b\n" + NUMBERS.replace("\n", ",\n"), ["t", "a", "b"]),
     ],
 )
 def test_names_and_numbers(tmp_path, content, names):
@@ -48,6 +51,11 @@ def test_names_and_numbers(tmp_path, content, names):
     assert found.unusable == {}
     values = [v.values for v in found.variables.values()]
     np.testing.assert_array_equal(values, [[0.0, 0.01, 0.02], [1.5, 1.6, 1.7], [-3, -4, -5]])
+
+
+def test_names_without_samples_are_said(tmp_path):
+    with pytest.raises(UserError, match=r"log\.csv: holds names and no samples; record it again, or leave it out"):
+        load(tmp_path, "# made by X\nt [s],a [deg]\n")
 
 
 @pytest.mark.parametrize("rows", ["0\n0.001\n0.002\n", "0 1\n0.001 1.5\n0.002 1.7\n"])
@@ -60,6 +68,17 @@ def test_a_clock_that_begins_with_zero_is_no_line_of_names(tmp_path, rows):
 def test_units_below_the_names_or_in_them(tmp_path):
     found = load(tmp_path, "t,a [deg],b\ns,,N\n" + NUMBERS).variables
     assert [v.units for v in found.values()] == ["s", "deg", "N"]
+
+
+def test_tuples_of_python_in_cells_are_arrays(tmp_path):
+    found = load(tmp_path, 't,q\n0,"(0.1, 0.2)"\n1,"(0.3, 0.4)"\n2,"(0.5, 0.6)"\n').variables
+    np.testing.assert_array_equal(found["q"].values, [[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])
+
+
+def test_a_line_as_long_as_a_file_is_no_table(tmp_path):
+    """A controller's program lists its set-points in one line each."""
+    with pytest.raises(UserError, match=r"log\.csv: names 1 column"):
+        load(tmp_path, f"n : UDINT := 3;\nphi : ARRAY[1..3] OF REAL := [{', '.join(['0.1'] * 40000)}]\n")
 
 
 def test_lists_in_cells_are_arrays(tmp_path):
@@ -223,6 +242,27 @@ def test_efforts_that_a_driver_does_not_know_are_nan_and_no_empty_array(tmp_path
     found = load(tmp_path, _echoed(fields=("position", "velocity"), nan=("effort",))[0]).variables
     assert set(found) == {"stamp", "position", "velocity", "effort"}
     assert np.isnan(found["effort"].values).all()
+
+
+def test_joint_states_may_have_what_the_middleware_says_of_them(tmp_path):
+    """`--include-message-info` writes four more cells, of which some middlewares leave counts out."""
+    text, values = _echoed()
+    info = [f"{1700000000000000000 + 10**7 * k},{1700000000000300000 + 10**7 * k},None,{k}," for k in range(40)]
+    lines = [before + line for before, line in zip(info, text.splitlines(), strict=True)]
+    found = load(tmp_path, "\n".join(lines) + "\n").variables
+    assert set(found) == {"stamp", *values}
+    for field, x in values.items():
+        np.testing.assert_array_equal(found[field].values, x)
+        assert found[field].columns == ("mcp", "pip")
+    np.testing.assert_array_equal(found["stamp"].values, load(tmp_path, text).variables["stamp"].values)
+
+
+def test_lost_messages_are_no_samples(tmp_path):
+    first, *rest = _echoed()[0].splitlines()
+    lost = "A message was lost!!!\n\ttotal count change:1\n\ttotal count: 1---"
+    found = load(tmp_path, "\n".join([first, lost, *rest[:30], lost, *rest[30:]]) + "\n")
+    assert found.remarks == ("says 2 times that messages were lost",)
+    assert len(found.variables["stamp"].values) == 40
 
 
 def test_joint_states_whose_names_change_are_refused(tmp_path):

@@ -451,7 +451,7 @@ def test_the_size_of_an_angle_does_not_tell_degrees_of_a_joint_that_turns_on(tmp
     np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="t,q1,q2", comments="")
     text = proposal([load_recording(tmp_path / "log.csv")], finger)
     assert f'channels.q.MCP = {{ from = "q1", {said}' in text or f'channels.q.MCP = {{ from = "q1" {said}' in text
-    assert 'channels.q.PIP = { from = "q2", units = "rad" }' in text
+    assert f'channels.q.PIP = {{ from = "q2", {said}' in text or f'channels.q.PIP = {{ from = "q2" {said}' in text
 
 
 def test_messages_that_ros2_topic_echo_wrote_are_proposed_and_imported(tmp_path, capsys):

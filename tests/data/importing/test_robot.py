@@ -309,17 +309,23 @@ def test_joints_that_follow_others_or_have_no_limits_are_named(tmp_path, urdf):
     assert any("flex: held where the file has it" in x for x in robot_finger(urdf, ["spread", "slide"]).remarks)
 
 
-@pytest.mark.parametrize(("limit", "degrees"), [("12.57", 721.0), ("7.94", 455.0), ("90", 5156.62)])
+@pytest.mark.parametrize(("limit", "degrees"), [("12.57", 721.0), ("7.94", 455.0), ("114.6", 6567.0), ("90", 5156.62)])
 def test_limits_of_several_turns_are_written_in_whole_degrees_and_those_in_degrees_stay(tmp_path, limit, degrees):
-    """The format takes the one for an arm's last joint, and refuses the other."""
+    """The format takes the one for an arm's last joint, and refuses the other; of fractions only a person can tell."""
     text = joint("flex", "root", "middle", limits=f"-{limit} {limit}")
     text = "".join(['<robot name="arm">', link("root"), text, link("middle", 0.03), "</robot>"])
     path = tmp_path / "turns.urdf"
     path.write_text(text)
-    finger = robot_finger(path).finger
+    finger, _, remarks = robot_finger(path)
     assert np.degrees(finger.limits[0]) == pytest.approx([-degrees, degrees], abs=0.01)
+    (said,) = [remark for remark in remarks if "limits" in remark]
+    turns = f"{float(limit) / np.pi:.3g} turns"
+    assert (
+        said
+        == f"flex: the file's limits, read as rad, leave it {turns}; if they are degrees, write them as `limits_deg`"
+    )
     check_finger(finger, report := Report())
-    assert [f.place for f in report] == ([] if degrees < 5000.0 else ["/finger/joints/limits"])
+    assert [f.place for f in report] == (["/finger/joints/limits"] if limit == "90" else [])
 
 
 def test_new_writes_the_finger_of_a_robot_and_reads_logs_of_one_time(urdf, tmp_path, capsys):
