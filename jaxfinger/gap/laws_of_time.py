@@ -38,18 +38,13 @@ class Repeats:
         found = []
         for e, rows in problem.rows.items():
             stack = problem.stacks[e]
-            told = ["repeats" in problem.noise[e, c].source for c in stack.experiment.channels]
-            samples = np.stack([rows.channel, rows.column, rows.time])
+            told = np.array(["repeats" in problem.noise[e, c].source for c in stack.experiment.channels])
+            number = np.where(told[rows.channel], rows.start + np.arange(rows.size), -1)
+            place = np.full((len(stack.trials), len(told), rows.column.max(initial=0) + 1, stack.holds.shape[1]), -1)
+            place[rows.trial, rows.channel, rows.column, rows.time] = number
             for members in repeated_motions(stack):
-                mine = [np.flatnonzero((rows.trial == b) & np.array(told)[rows.channel]) for b in members]
-                numbers = np.unique(samples[:, np.concatenate(mine)], axis=1, return_inverse=True)[1].ravel()
-                count = np.bincount(numbers, minlength=1)
-                place = np.full((len(members), len(count)), -1)
-                first = 0
-                for k, at in enumerate(mine):
-                    place[k, numbers[first : first + len(at)]] = rows.start + at
-                    first += len(at)
-                common = place[:, count == len(members)]
+                mine = place[members].reshape(len(members), -1)
+                common = mine[:, (mine >= 0).all(axis=0)]
                 if common.shape[1] >= MIN_SAMPLES_OF_REPEAT:
                     found.append(common)
         return cls(tuple(found))
