@@ -101,9 +101,8 @@ class Runner:
         if not (tripped(reader.latest) or isinstance(error, ControllerStopped)):
             reader.stop(Violation.of_host(trip, reader.latest_seq, cause))
         heard = reader.latest_seq
-        self.course.let_pass(
-            RELEASE_S, self.drives.released
-        )  # A busy host first has to read the samples before the stop.
+        # A busy host first has to read the samples before the stop.
+        self.course.let_pass(RELEASE_S, self.drives.released)
         if self.drives.released() or reader.latest_seq > heard:  # Of a silent reader nothing more is to be expected.
             self.course.let_pass(RELEASE_S)
         end = {"complete": False, "cause": cause, "trip": int(trip), "seq": seq}
