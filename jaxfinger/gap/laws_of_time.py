@@ -38,7 +38,7 @@ class Repeats:
         found = []
         for e, rows in problem.rows.items():
             stack = problem.stacks[e]
-            told = np.array(["repeats" in problem.noise[e, c].source for c in stack.experiment.channels])
+            told = np.array([problem.noise[e, c].of_repeats for c in stack.experiment.channels])
             number = np.where(told[rows.channel], rows.start + np.arange(rows.size), -1)
             place = np.full((len(stack.trials), len(told), rows.column.max(initial=0) + 1, stack.holds.shape[1]), -1)
             place[rows.trial, rows.channel, rows.column, rows.time] = number
@@ -56,19 +56,19 @@ class Repeats:
 
 
 @dataclass(frozen=True)
-class Deviations:
-    """Signatures of one cause in the deviations of repeats, and the sets of them that one choice of shapes uses.
+class LawOfTime:
+    """One cause that may make repeats differ: its signatures in their deviations, by choices of its shapes.
 
-    They are in plausible sizes of the amplitudes, whose prior is N(0, 1).
+    Signatures are per plausible size of an amplitude, and the prior of that is N(0, 1).
     """
 
     items: list[Variant]
     scan: Scan | None  # of its periods, if it has any
-    rows: list[Float[np.ndarray, "M _n"]]  # for each motion
-    sets: Int[np.ndarray, "S k"]
+    rows: list[Float[np.ndarray, "M _n"]]  # signatures in the deviations of each motion
+    sets: Int[np.ndarray, "S k"]  # the rows of each choice of shapes
 
     @classmethod
-    def of(cls, signatures: Signatures, repeats: Repeats, items: list[Variant]) -> "Deviations":
+    def of(cls, signatures: Signatures, repeats: Repeats, items: list[Variant]) -> "LawOfTime":
         """Read the signatures of a cause in all shapes; of one with periods, in its first other shapes."""
         scan = Scan.of(signatures, items) if items[0].effect.periods() else None
         if scan is None:
@@ -80,11 +80,11 @@ class Deviations:
         return cls(items, scan, repeats.deviations(white), sets)
 
     def evidence(self, r: list[Float[np.ndarray, " _n"]]) -> float:
-        """Log evidence of the cause in the deviations r of each motion, as far as the other motions foretell it.
+        """Log evidence of the cause in the deviations r of each motion, as far as the other motions foretell them.
 
-        For each motion the choice of shapes and the amplitudes are fitted to all others. What these explain of it is
-        honest, whatever the noise of the deviations. From half of their sum Schwarz's (1978) cost of the amplitudes
-        and the logarithm of the number of choices are taken.
+        Shapes and amplitudes that are fitted to all other motions take an energy from this one, which is honest however
+        slow the noise is. Half of the sum over motions counts, less Schwarz's (1978) cost of the amplitudes and the
+        logarithm of the number of choices.
         """
         (G, b), gain = _products(self.rows, r), 0.0
         for A, x in zip(self.rows, r, strict=True):
@@ -164,44 +164,36 @@ def without_laws_of_time(
     if not of_time or len(repeats.rows) < 2:
         return problem
     for _ in range(MAX_ROUNDS):
-        quieter = with_noise(problem, _noise_without_laws(problem, repeats, of_time), against)
+        quieter = with_noise(problem, _noise_without(problem, _laws(problem, repeats, of_time)), against)
         if quieter is problem:
             break
         problem = quieter
     return problem
 
 
-def _noise_without_laws(
-    problem: Problem, repeats: Repeats, of_time: Mapping[str, type[CatalogueEffect]]
-) -> dict[tuple[str, str], Noise]:
-    """Noise of the channels that laws of the session's time change."""
+def _laws(problem: Problem, repeats: Repeats, of_time: Mapping[str, type[CatalogueEffect]]) -> list[CatalogueEffect]:
+    """The effects that make repeats differ, each fitted to what those before it leave."""
     signatures, groups = Signatures(problem), {}
     for v in variants(of_time, problem.nominal.finger, problem.scales):
         groups.setdefault(v.key, []).append(v)
-    causes = {key: Deviations.of(signatures, repeats, items) for key, items in groups.items()}
-    r, laws = repeats.deviations(problem.r), []
+    causes = {key: LawOfTime.of(signatures, repeats, items) for key, items in groups.items()}
+    r, found = repeats.deviations(problem.r), []
     while causes:
         evidence = {key: cause.evidence(r) for key, cause in causes.items()}
         best = max(causes, key=evidence.__getitem__)
         if evidence[best] <= 0.0:
             break
         law, r = causes.pop(best).fitted(signatures, repeats, r)
-        laws.append(law)
-    return _noise_without(problem, signatures, laws)
+        found.append(law)
+    return found
 
 
-def _noise_without(
-    problem: Problem, signatures: Signatures, laws: list[CatalogueEffect]
-) -> dict[tuple[str, str], Noise]:
-    """Noise of the channels that these effects change, estimated from repeats without them."""
-    residual = {key: np.asarray(problem.stacks[key[0]].batch.y[key[1]]) - y for key, y in problem.predicted.items()}
-    changed = set()
+def _noise_without(problem: Problem, laws: list[CatalogueEffect]) -> dict[tuple[str, str], Noise]:
+    """Noise of the channels that these effects change and repeats tell, estimated without the effects."""
+    left = {}
     for law in laws:
-        for e, c, change in signatures.changes([law]):
-            residual[e, c] = residual[e, c] - change[0]
-            changed.add((e, c))
-    return {
-        (e, c): estimate(problem.stacks[e], c, residual[e, c])
-        for e, c in changed
-        if "repeats" in problem.noise[e, c].source
-    }
+        for e, c, change in Signatures(problem).changes([law]):
+            if problem.noise[e, c].of_repeats:
+                y = np.asarray(problem.stacks[e].batch.y[c])
+                left[e, c] = left.get((e, c), y - problem.predicted[e, c]) - change[0]
+    return {(e, c): estimate(problem.stacks[e], c, residual) for (e, c), residual in left.items()}

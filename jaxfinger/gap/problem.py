@@ -193,7 +193,7 @@ def without_recurring_noise(problem: Problem, against: Fit | None = None) -> Pro
     """
     if _settled(problem.noise, _noise_of_all(problem.noise, problem.stacks, problem.nominal, recurring=True)):
         return None
-    known = problem.fit.noise
+    known = problem.fit.noise | {key: n for key, n in problem.noise.items() if n.of_repeats}
     return replace(problem, **_refitted_to_all(problem.session, problem.fit, problem.stacks, known, against, True))
 
 

@@ -54,6 +54,11 @@ class Noise:
         return cls(std, std, np.zeros((len(std), ORDER)), source)
 
     @property
+    def of_repeats(self) -> bool:
+        """Whether trials that repeat a motion tell the noise, alone or together with holds."""
+        return "repeats" in self.source
+
+    @property
     def coefficients(self) -> Float[np.ndarray, "columns lags lags"]:
         """Whitening filters [1, −a₁, …] / σ; row j uses j past samples, as at the start of a trial or after a gap.
 

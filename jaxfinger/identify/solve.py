@@ -49,9 +49,8 @@ from jaxfinger.model import Model
 
 # Lengths of a step, in standard deviations of the estimate, that end a search.
 STEP_TOLERANCE = 1e-6  # a millionth of an interval's half width, and still above rounding
-ROUGH_TOLERANCE = (
-    0.02  # where residuals are wanted, for their noise or for a diagnosis: all white ones change by 0.02 in norm
-)
+# Where residuals are wanted, for their noise or for a diagnosis: all white ones change by so much in norm.
+ROUGH_TOLERANCE = 0.02
 # Of a rejected step, a twentieth of an interval's half width: it lies within a kink of the cost, as where a tendon
 # slips or a joint turns. Also of the whole way that is left when the last of `MAX_STEPS` has been made.
 KINK_TOLERANCE = 0.1

@@ -24,6 +24,18 @@ from jaxfinger.rig.simulated.controller import Controller
 from tests.rig.conftest import Away, impatient, slot
 
 
+def after_answer(person, words, act):
+    """Let `act` happen right after a person has answered a prompt that holds `words`."""
+    ask = person.ask
+
+    def ask_and_act(text, keep_waiting):
+        ask(text, keep_waiting)
+        if words in text:
+            act()
+
+    person.ask = ask_and_act
+
+
 def test_a_stop_key_at_a_prompt_is_no_answer_to_it(rig, tmp_path):
     """The watch may be 20 ms behind the key: the runner looks for itself before it sends the next command."""
 
@@ -102,15 +114,12 @@ def test_drives_that_come_on_while_hands_are_at_the_finger_stop_the_rig(rig, rec
     """From a panel of its own the controller can be told to arm. The prompt ends, and nothing else moves."""
     machine = SimulatedRig(rig)
     person = Away(machine, "nothing")
-    ask = person.ask
 
-    def ask_and_arm(text, keep_waiting):
-        ask(text, keep_waiting)
-        if "Fix all joints" in text:
-            machine.controller._obey(Kind.ARM, 0, 0.0, 0.0, [])
-            machine._pause(0.2)
+    def arm():
+        machine.controller._obey(Kind.ARM, 0, 0.0, 0.0, [])
+        machine._pause(0.2)
 
-    person.ask = ask_and_arm
+    after_answer(person, "Fix all joints", arm)
     outcome = record(machine, operator=person)
     assert "01-ID.2-DIP: the controller switched the drives on without being told to" in outcome.cause
     assert machine.controller.state is State.TRIPPED
@@ -178,15 +187,12 @@ def test_a_prompt_while_the_drives_are_off_may_wait(rig, record):
 def test_a_clock_that_jumps_while_the_drives_are_off_is_named_and_arms_nothing(rig, record):
     machine = SimulatedRig(rig)
     person = Away(machine, "nothing")
-    ask = person.ask
 
-    def ask_and_jump(text, keep_waiting):
-        ask(text, keep_waiting)
-        if "Couple the external motor" in text:
-            machine.inject("clock-jump", amount=3600.0)
-            machine._pause(0.3)
+    def jump():
+        machine.inject("clock-jump", amount=3600.0)
+        machine._pause(0.3)
 
-    person.ask = ask_and_jump
+    after_answer(person, "Couple the external motor", jump)
     outcome = record(machine, operator=person)
     assert f"nothing was armed: {Trip.CLOCK.sentence}" in outcome.cause
     assert machine.controller.state is State.TRIPPED
