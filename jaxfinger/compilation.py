@@ -3,8 +3,10 @@
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import TypeVar
 
+import jax
 from threadpoolctl import threadpool_limits
 
 from jaxfinger.programs import Program
@@ -15,22 +17,31 @@ Function = TypeVar("Function", bound=Callable)
 
 # XLA's fusion emitters compile these scalar formulas 50 % slower or worse, and -O2 and above 10 % slower; neither makes
 # them run faster. YNNPACK, to which XLA hands sums, spends 30 % of a diagnosis's processor time on those over short
-# axes (Linux's `perf record`); XLA's own loops spend little on them. Options in the environment's XLA_FLAGS take
-# precedence.
+# axes (Linux's `perf record`); XLA's own loops spend little on them.
 QUICK = {
-    name: value
-    for name, value in {
-        "xla_cpu_use_fusion_emitters": False,
-        "xla_backend_optimization_level": 1,
-        "xla_cpu_experimental_ynn_fusion_type": "",
-    }.items()
-    if name not in os.environ.get("XLA_FLAGS", "")
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_backend_optimization_level": 1,
+    "xla_cpu_experimental_ynn_fusion_type": "",
 }
+
+
+@cache
+def quick_options() -> dict[str, bool | int | str]:
+    """`QUICK` without the options that this version of XLA lacks, and those that the environment's XLA_FLAGS sets."""
+    return {k: v for k, v in QUICK.items() if k not in os.environ.get("XLA_FLAGS", "") and _has_option(k, v)}
+
+
+def _has_option(option: str, value: bool | int | str) -> bool:
+    try:
+        jax.jit(lambda: 0.0, compiler_options={option: value}).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 def quick_jit(f: Callable) -> Program:
     """Compile a function quickly, and keep its programs for later processes."""
-    return Program(f, QUICK)
+    return Program(f, quick_options)
 
 
 def side_by_side(f: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:

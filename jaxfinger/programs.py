@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from functools import cache, update_wrapper, wraps
+from functools import cache, cached_property, update_wrapper, wraps
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
@@ -44,12 +44,18 @@ class Program:
     Arrays are traced, and all other leaves of the arguments are constants, as for `equinox.filter_jit`.
     """
 
-    def __init__(self, f: Callable, options: dict[str, Any]):
+    def __init__(self, f: Callable, options: Callable[[], dict[str, Any]]):
         update_wrapper(self, f)
         self._f, self._options = f, options
-        self._jitted = eqx.filter_jit(f, compiler_options=options)  # type: ignore[call-overload]
         self._ready: dict[Any, Callable[[list], Any]] = {}
-        self.lower = self._jitted.lower
+
+    @cached_property
+    def _jitted(self):
+        return eqx.filter_jit(self._f, compiler_options=self._options())  # type: ignore[call-overload]
+
+    def lower(self, *args, **named):
+        """Lower the function for arguments like these, as `equinox.filter_jit` does."""
+        return self._jitted.lower(*args, **named)
 
     def __call__(self, *args, **named):
         if named:  # not looked up on disk
@@ -66,7 +72,7 @@ class Program:
     def _made(self, key: tuple, leaves: list, arrays: list) -> Callable[[list], Any]:
         structure, constants = key
         nodes = list(_nodes(structure))
-        said = repr([f"{self._f.__module__}.{self._f.__qualname__}", self._options, nodes, constants])
+        said = repr([_name(self._f), _name(self._options), nodes, constants])
         if " at 0x" in said or not all(_is_own(node[0]) for node in nodes):
             return lambda arrays: self._jitted(*_filled(structure, leaves, arrays))
         name = _digest(said)
@@ -84,7 +90,7 @@ class Program:
             return out
 
         flat.__name__ = flat.__qualname__ = f"kept_{self._f.__name__}"
-        lowered = jax.jit(flat, compiler_options=self._options).lower(*arrays)
+        lowered = jax.jit(flat, compiler_options=self._options()).lower(*arrays)
         text = lowered.as_text()
         if not all(target.startswith("lapack_") for target in re.findall(r"custom_call @(\w+)", text)):
             # JAX may ready what is called only where it traces; where it is not ready, the loaded program would crash.
@@ -108,7 +114,7 @@ def kept(f: Callable[..., Result]) -> Callable[..., Result]:
     @cache
     @wraps(f)
     def recalled(*args):
-        said = repr([f"{f.__module__}.{f.__qualname__}", args])
+        said = repr([_name(f), args])
         if not _are_kept() or " at 0x" in said or not all(_is_own(a) for a in args if isinstance(a, type)):
             return f(*args)
         name = _digest(said)
@@ -167,6 +173,10 @@ def _are_kept() -> bool:
 
 def _folder() -> Path:
     return Path(os.environ["JAXFINGER_PROGRAMS"])
+
+
+def _name(f: Callable) -> str:
+    return f"{f.__module__}.{f.__qualname__}"
 
 
 def _is_array(leaf: Any) -> bool:

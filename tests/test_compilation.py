@@ -10,6 +10,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import jaxfinger as jf
+from jaxfinger import compilation
 
 DEMO = Path(__file__).parents[1] / "datasets" / "demo-finger" / "session.h5"
 
@@ -29,6 +30,15 @@ def test_sums_over_short_axes_are_xlas_own():
     ).stdout
     assert "ENTRY" in text
     assert "ynn_fusion" not in text
+
+
+def test_options_that_this_version_of_xla_lacks_are_left_out(monkeypatch):
+    """Versions of XLA drop options, and refuse to compile with one that they do not know."""
+    monkeypatch.delenv("XLA_FLAGS")
+    monkeypatch.setitem(compilation.QUICK, "xla_no_such_option", True)
+    options = compilation.quick_options.__wrapped__()
+    assert "xla_no_such_option" not in options
+    assert options["xla_backend_optimization_level"] == 1
 
 
 @pytest.mark.parametrize("work", ["identify", "diagnose"])

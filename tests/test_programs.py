@@ -40,7 +40,7 @@ def scaled(traced):
             traced.append(channel)
             return {"scaled": {"torque": 2.0, "angle": 3.0}[channel] * values["x"], "none": ()}
 
-        return Program(scaled, {})
+        return Program(scaled, dict)
 
     return program
 
@@ -58,7 +58,7 @@ def test_an_argument_that_is_ignored_may_have_any_shape(folder):
         return 2.0 * x
 
     for count in (2, 3):
-        np.testing.assert_array_equal(Program(doubled, {})(np.ones(4), np.ones(count)), 2.0)
+        np.testing.assert_array_equal(Program(doubled, dict)(np.ones(4), np.ones(count)), 2.0)
 
 
 def test_named_arguments_are_taken_as_by_any_function(folder, scaled):
@@ -163,7 +163,7 @@ def test_what_has_a_users_code_is_traced_in_each_process(folder, traced):
             traced.append(values)
             return 2.0 * values.x
 
-        np.testing.assert_array_equal(Program(doubled, {})(Users(jnp.ones(3))), 2.0)
+        np.testing.assert_array_equal(Program(doubled, dict)(Users(jnp.ones(3))), 2.0)
     assert len(traced) == 2
 
 
@@ -202,7 +202,7 @@ def test_models_go_in_and_come_out(folder, traced):
     other = replace(model, finger=replace(model.finger, joint_names=("a", "b", "c")))
     q = jnp.asarray(np.random.default_rng(0).uniform(0.0, 1.0, (3, 4)))
     for m in (model, other, model, other):
-        out, excursion = Program(moved, {})(m, q)
+        out, excursion = Program(moved, dict)(m, q)
         assert out.finger.joint_names == m.finger.joint_names
         np.testing.assert_array_equal(out.finger.mass, 2.0 * m.finger.mass)
         np.testing.assert_allclose(excursion, m.moment_arm.excursion(q), rtol=1e-12)

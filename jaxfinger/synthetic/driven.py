@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.compilation import QUICK
+from jaxfinger.compilation import quick_options
 from jaxfinger.model import rigid_body
 from jaxfinger.model.finger import Finger
 from jaxfinger.synthetic.controller import Targets, TensionController
@@ -36,7 +36,7 @@ class Simulator:
 
     def __init__(self, specimen: Specimen, finger: Finger):
         self.specimen, self.finger = specimen, finger
-        self._run = jax.jit(self._simulate, compiler_options=QUICK)
+        self._run = jax.jit(self._simulate, compiler_options=quick_options())
 
     def __call__(
         self, q0: Float[Array, " m"], dt: float, controller: TensionController

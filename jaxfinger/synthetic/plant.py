@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxfinger.compilation import QUICK
+from jaxfinger.compilation import quick_options
 from jaxfinger.errors import UserError
 from jaxfinger.model import rigid_body
 from jaxfinger.model.finger import Finger
@@ -117,15 +117,15 @@ class SpecimenPlant:
 
     @cached_property
     def _inverse_dynamics(self) -> Callable:
-        return jax.jit(rigid_body.inverse_dynamics, compiler_options=QUICK)
+        return jax.jit(rigid_body.inverse_dynamics, compiler_options=quick_options())
 
     @cached_property
     def _mass_matrix(self) -> Callable:
-        return jax.jit(rigid_body.mass_matrix, compiler_options=QUICK)
+        return jax.jit(rigid_body.mass_matrix, compiler_options=quick_options())
 
     @cached_property
     def _fingertip(self) -> Callable:
-        return jax.jit(rigid_body.fingertip, compiler_options=QUICK)
+        return jax.jit(rigid_body.fingertip, compiler_options=quick_options())
 
     def _rigid_body(self, *state: Float[Array, "m N"]) -> Float[Array, "m N"]:
         """M q̈ + N + G, N m, computed in blocks of BLOCK_SAMPLES."""

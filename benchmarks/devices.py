@@ -1,0 +1,73 @@
+"""Times of a fit, of bootstrap refits and of inverse dynamics on every kind of device that JAX has here.
+
+    python benchmarks/devices.py
+
+It is run on the processor first, and then on a GPU where there is one: the same code, and results that are compared
+with the processor's. First times include compilation.
+"""
+
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfinger.identify import compress, identify, refit
+from jaxfinger.identify.parameters import ravel
+from jaxfinger.identify.uncertainty import draw_weights
+from jaxfinger.model import Finger, rigid_body
+from jaxfinger.synthetic import SHORT, clean_session, measure, recipe_from
+
+RECIPE = {"specimen": {"kind": "polynomial"}, "trials": SHORT}
+RESAMPLES = 1000
+SAMPLES = (10**5, 10**6, 10**7)  # of inverse dynamics
+
+Result = TypeVar("Result")
+
+
+def timed(what: str, work: Callable[[], Result]) -> Result:
+    """Do the work twice, and print the seconds of both."""
+    seconds = []
+    for _ in range(2):
+        start = time.perf_counter()
+        result = jax.block_until_ready(work())
+        seconds.append(time.perf_counter() - start)
+    print(f"  {what:<44s}{seconds[0]:8.3f} s, again {seconds[1]:8.4f} s", flush=True)
+    return result
+
+
+def devices() -> list[jax.Device]:
+    """The first device of every kind, the processor first."""
+    others = [] if jax.default_backend() == "cpu" else jax.devices()[:1]
+    return [*jax.devices("cpu")[:1], *others]
+
+
+def main() -> None:
+    """Print times and differences of every device."""
+    with jax.default_device(jax.devices("cpu")[0]):
+        session = measure(clean_session(recipe_from(RECIPE)), 0)
+    finger, rng = Finger.from_description(session.finger), np.random.default_rng(0)
+    reference = None
+    for device in devices():
+        with jax.default_device(device):
+            print(device)
+            fit = timed("identify a session", lambda: identify(session))
+            compressed = compress(session, fit)
+            weights = draw_weights(compressed.strata, RESAMPLES, np.random.default_rng(0))
+            refits, _ = timed(f"{RESAMPLES} refits", lambda c=compressed, w=weights: refit(c, w))
+            for samples in SAMPLES:
+                moving = jax.device_put([jnp.asarray(x) for x in rng.uniform(-1, 1, (3, finger.m, samples))])
+                inverse = eqx.filter_jit(rigid_body.inverse_dynamics)
+                timed(f"inverse dynamics, {samples:,} samples", lambda f=inverse, x=moving: f(finger, *x))
+            estimates = np.stack([np.asarray(ravel(fit.model)), *np.asarray(refits)])[:, fit.estimated]
+            reference = reference if reference is not None else estimates
+            difference = np.abs((estimates - reference) / fit.std[fit.estimated]).max(axis=1)
+            print(f"  largest difference of an estimate from the processor's: {difference[0]:.0e} standard deviations,")
+            print(f"  of a refit {difference[1:].max():.0e}")
+
+
+if __name__ == "__main__":
+    main()
