@@ -2,10 +2,12 @@
 
     jaxfinger sealed make cases --split develop --count 40
     python benchmarks/formula.py weigh records cases           # 1.5 to 8 minutes a case; resumes after a stop
+    python benchmarks/formula.py weigh records cases --withheld
     python benchmarks/formula.py score records
     python benchmarks/formula.py fit records
 
-`weigh` searches every case and stores the evidence of every set of causes that the search weighs. `score` prints, by
+`weigh` searches every case and stores the evidence of every set of causes that the search weighs. With `--withheld`
+the first of its effects is taken out of the catalogue, so that something unlisted is at work. `score` prints, by
 kind of case, the log score of these records: the mean over cases of Σ log P of what is true, over all causes that a
 session's trials can show and «something unlisted»; their Brier score Σ (P − truth)²; and how many of the causes with
 `MIN_NAMED_PROBABILITY` are at work. `fit` maximises the log score. Probabilities are clipped by `CLIP`, since no search
@@ -18,6 +20,7 @@ import pickle
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, astuple, dataclass, replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -29,6 +32,7 @@ from jaxfinger.gap.columns import Counts
 from jaxfinger.gap.costs import CauseKey, Costs
 from jaxfinger.gap.diagnose import search_for_causes
 from jaxfinger.gap.formula import Evidence, Parameters, log_likelihood, unexplained, unlisted
+from jaxfinger.gap.laws_of_time import without_laws_of_time
 from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY, genuine_probabilities
 from jaxfinger.gap.problem import build
 from jaxfinger.gap.sets import Weighed
@@ -97,14 +101,16 @@ class Record:
         return float(np.sum(np.log(np.where(true, P, 1.0 - P))))
 
 
-def weigh(folder: Path) -> Record:
-    """Search one case and record its evidence."""
-    recipe = Recipe()
+def weigh(folder: Path, withheld: bool) -> Record | None:
+    """Search one case and record its evidence; None if its first effect is to be withheld, and it has none."""
+    recipe, truth = Recipe(), read_truth(folder, folder.parent.with_name(f"{folder.parent.name}-truth"))
+    if withheld and not truth.listed:
+        return None
+    out = {truth.listed[0][0]} if withheld else set()
     problem = build(read_session(folder / "fit.h5"), recipe)
-    effects = {
-        k: v for k, v in catalogue_for(recipe, None, problem.nominal.finger).items() if k not in recipe.model.terms
-    }
-    search, _ = search_for_causes(problem, effects)
+    catalogue = catalogue_for(recipe, None, problem.nominal.finger)
+    effects = {k: v for k, v in catalogue.items() if k not in out | set(recipe.model.terms)}
+    search, _ = search_for_causes(without_laws_of_time(problem, effects), effects)
     costs, visited = search.costs, search.visited
     return Record(
         folder.name,
@@ -112,7 +118,7 @@ def weigh(folder: Path) -> Record:
         visited.evidence,
         frozenset(keys for keys, how in visited.weighed.items() if how is Weighed.SCREENED),
         search.table.explainable,
-        read_truth(folder, folder.parent.with_name(f"{folder.parent.name}-truth")).at_work,
+        frozenset(UNLISTED if effect in out else (effect, site) for effect, site in truth.at_work),
         costs.parameters,
     )
 
@@ -165,19 +171,22 @@ def main() -> None:
     parser.add_argument("what", choices=["weigh", "score", "fit"])
     parser.add_argument("records", type=Path)
     parser.add_argument("cases", type=Path, nargs="*")
+    parser.add_argument("--withheld", action="store_true", help="take the first effect of a case out of the catalogue")
     parser.add_argument("--workers", type=int, default=1)
     options = parser.parse_args()
     if options.what == "weigh":
         options.records.mkdir(parents=True, exist_ok=True)
         folders = sorted(f.parent for cases in options.cases for f in cases.glob("*/fit.h5"))
-        files = {f: options.records / f"{f.parent.name}-{f.name}.pickle" for f in folders}
+        what = "withheld.pickle" if options.withheld else "pickle"
+        files = {f: options.records / f"{f.parent.name}-{f.name}.{what}" for f in folders}
         todo = [f for f, file in files.items() if not file.exists()]
         at_once = options.workers * CASES_PER_PROCESS
         for some in (todo[i : i + at_once] for i in range(0, len(todo), at_once)):
             with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
-                for folder, record in zip(some, pool.map(weigh, some), strict=True):
-                    files[folder].write_bytes(pickle.dumps(record))
-                    print(f"{folder.name}: log score {record.log_score(record.parameters):.2f}", flush=True)
+                for folder, record in zip(some, pool.map(partial(weigh, withheld=options.withheld), some), strict=True):
+                    if record is not None:
+                        files[folder].write_bytes(pickle.dumps(record))
+                        print(f"{folder.name}: log score {record.log_score(record.parameters):.2f}", flush=True)
         return
     records = [pickle.loads(f.read_bytes()).likeliest() for f in sorted(options.records.glob("*.pickle"))]
     if options.what == "score":
