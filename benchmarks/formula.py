@@ -10,9 +10,10 @@
 the first of its effects is taken out of the catalogue, so that something unlisted is at work. `score` prints, by
 kind of case, the log score of these records: the mean over cases of Σ log P of what is true, over all causes that a
 session's trials can show and «something unlisted»; their Brier score Σ (P − truth)²; and how many of the causes with
-`MIN_NAMED_PROBABILITY` are at work. `fit` maximises the log score. Probabilities are clipped by `CLIP`, since no search
-visits every set. Each number has a log-normal prior around its present value, a factor of `PRIOR_FACTOR` per standard
-deviation. Scores are cross-validated over `FOLDS` parts of the cases.
+the probability `NAMED`, and of those with less than that but `DOUBTED`, are at work. `fit` maximises the log score.
+Probabilities are clipped by `CLIP`, since no search visits every set. Each number has a log-normal prior around its
+present value, a factor of `PRIOR_FACTOR` per standard deviation. Scores are cross-validated over `FOLDS` parts of the
+cases.
 """
 
 import argparse
@@ -33,7 +34,8 @@ from jaxfinger.gap.costs import CauseKey, Costs
 from jaxfinger.gap.diagnose import search_for_causes
 from jaxfinger.gap.formula import Evidence, Parameters, log_likelihood, unexplained, unlisted
 from jaxfinger.gap.laws_of_time import without_laws_of_time
-from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY, genuine_probabilities
+from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY as NAMED
+from jaxfinger.gap.posterior import genuine_probabilities
 from jaxfinger.gap.problem import build
 from jaxfinger.gap.sets import Weighed
 from jaxfinger.gap.signatures import catalogue_for
@@ -42,6 +44,7 @@ from jaxfinger.sealed.run import CASES_PER_PROCESS
 from jaxfinger.sealed.truth import UNLISTED, read_truth
 
 CLIP = 1e-3  # least probability: a cause that no visited set has costs at most 7 nats
+DOUBTED = 0.1  # least probability of a cause that counts as doubted
 PRIOR_FACTOR = 3.0  # wide: it only keeps numbers that the cases do not determine
 FOLDS = 5
 MAX_SETS = 100  # likeliest sets of a case that `fit` keeps, for speed
@@ -155,13 +158,15 @@ def score(records: list[Record], p: Parameters) -> None:
     for kind, some in sorted(kinds.items()):
         found = [(r, r.probabilities(p)) for r in some]
         brier = np.mean([sum((P - (k in r.at_work)) ** 2 for k, P in of.items()) for r, of in found])
-        probable = [(r, k) for r, of in found for k, P in of.items() if k != UNLISTED and P >= MIN_NAMED_PROBABILITY]
-        right = sum(k in r.at_work for r, k in probable)
+        causes = [(P, k in r.at_work) for r, of in found for k, P in of.items() if k != UNLISTED]
+        probable = [true for P, true in causes if P >= NAMED]
+        doubted = [true for P, true in causes if DOUBTED <= P < NAMED]
         listed = sum(len(r.at_work - {UNLISTED}) for r in some)
-        called = sum(of[UNLISTED] >= MIN_NAMED_PROBABILITY for _, of in found)
+        called = sum(of[UNLISTED] >= NAMED for _, of in found)
         print(
-            f"{kind}: {len(some)} cases; log score {mean(some, p):.2f}, Brier score {brier:.2f}; probable causes "
-            f"{right} of {listed} at work, {len(probable) - right} not; something unlisted probable in {called}"
+            f"{kind}: {len(some)} cases; log score {mean(some, p):.2f}, Brier score {brier:.2f}; of {listed} causes at "
+            f"work {sum(probable)} probable, {sum(doubted)} doubted; of others {len(probable) - sum(probable)} "
+            f"probable, {len(doubted) - sum(doubted)} doubted; something unlisted probable in {called}"
         )
 
 
