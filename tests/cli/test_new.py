@@ -39,8 +39,10 @@ def test_templates_import_once_the_files_are_there(written, capsys):
     assert session.finger.tendon_names == ("T1",)
     assert not [f for f in check_file(written / "session.h5") if f.severity == "error"]
     np.testing.assert_allclose(session["01-ID.2-MCP"].q[:, 0].max(), np.radians(70), rtol=1e-3)
-    example = "finger: has the masses and centres of mass of the template; write those of your finger"
+    example = "/finger/links: has the masses and centres of mass that `jaxfinger new` writes as an example"
     assert example in capsys.readouterr().err
+    main(["check", f"{written}/session.h5"])
+    assert example in capsys.readouterr().out
     finger = written / "finger.toml"
     finger.write_text(finger.read_text().replace("mass = 0.022 ", "mass = 0.0221"))
     main(["import", *files, "--mapping", f"{written}/mapping.toml", "-o", f"{written}/other.h5"])
