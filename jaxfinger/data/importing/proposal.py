@@ -15,6 +15,7 @@ from jaxfinger.data.importing.recording import Recording
 from jaxfinger.data.importing.speeds import speeds
 from jaxfinger.data.importing.survey import ColumnSurvey, columns_of, is_nameless, is_set_point, is_speed
 from jaxfinger.data.session import FingerDescription
+from jaxfinger.data.signals.pace import speed
 from jaxfinger.data.toml import as_key, quoted
 from jaxfinger.data.units import TO_SI, beyond_a_turn
 from jaxfinger.errors import counted, listed
@@ -34,6 +35,7 @@ _MAX_LEFT_OUT = 12  # variables that are named, so that the line of a large bag 
 _TOGETHER = 0.9
 _MAX_SPEEDS = 4  # that are named
 _MAX_TABLE = 10  # samples: files that are no longer may be tables of parameters, and of one length by chance.
+_USUAL_RATES = 100, 1000  # Hz
 _HEAD = 'specimen = "my finger"\nfinger = "finger.toml"'
 
 
@@ -189,6 +191,7 @@ def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _
     guessed = "   # guessed: its values rise evenly" if clock is not None and is_nameless(clock.name) else ""
     if clock is None:
         lines.append('time = "?"   # no time was found: name its variable, or write `rate_hz`, samples per second')
+        lines += _pace(logs[0], channels.get("q", ()))
     elif coarse is not None:
         lines.append(f"rate_hz = {coarse[1]:.4g}   # several samples share each stamp of {quoted(clock.name)}")
     elif clock.units in ("s", ""):
@@ -283,6 +286,19 @@ def _rate_by_speeds(log: _Log) -> list[str]:
     return [
         f"# speeds, if in the units of their angles by s, tell the samples per second: {listed(named, _MAX_SPEEDS)}"
     ]
+
+
+def _pace(log: _Log, angles: Sequence[ColumnSurvey]) -> list[str]:
+    """A comment on how long a log without a clock lasts, and how fast its joints move, at two usual sampling rates."""
+    count = np.arange(float(log.count))
+    moves = [(speed(count, _values(log.recording, s)), _called(s), s.units) for s in angles if s.samples == log.count]
+    fastest, name, units = max(moves, default=(0.0, "", ""))
+    said = [
+        f"at {rate} Hz they last {len(count) / rate:.3g} s"
+        + (f" and {name} moves by up to {fastest * rate:.3g} {units or 'of its units'} in 1 s" if fastest else "")
+        for rate in _USUAL_RATES
+    ]
+    return [f"# {len(count)} samples: {'; '.join(said)}"]
 
 
 def _called(seen: ColumnSurvey) -> str:

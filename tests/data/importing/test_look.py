@@ -76,6 +76,16 @@ def test_a_clock_is_told_or_asked_for_and_no_rate_is_invented(tmp_path, name, ti
     assert "rate_hz =" not in text
 
 
+def test_a_log_without_a_clock_is_said_to_be_as_fast_as_its_rate(tmp_path):
+    """A rate that is wrong by ten shows in how long the log lasts and how fast its joint moves."""
+    path = tmp_path / "log.csv"
+    angles = 40.0 + 30.0 * np.sin(np.arange(2000) / 50.0)
+    np.savetxt(path, angles, "%.6f", header="angle_deg", comments="")
+    said = proposal([load_recording(path)])
+    assert '# 2000 samples: at 100 Hz they last 20 s and "angle_deg" moves by up to 59.9 deg in 1 s; at 1000 Hz' in said
+    assert 'last 2 s and "angle_deg" moves by up to 599 deg in 1 s' in said
+
+
 def test_a_clock_without_a_name_is_the_column_that_rises_evenly(tmp_path):
     """A count of samples does not show their times, and a joint that turns one way does so at several speeds."""
     path, n = tmp_path / "log.csv", np.arange(500)
