@@ -17,6 +17,7 @@ from jaxfinger.progress import Step
 if TYPE_CHECKING:
     from jaxfinger.data import Session
     from jaxfinger.data.importing.recording import Recording
+    from jaxfinger.data.importing.survey import ColumnSurvey
 
 _NOTHING = {"mounting": None, "motion": None}
 
@@ -63,11 +64,10 @@ def _to_compare(session: Session) -> dict[str, str | None]:
     return {"mounting": mounting_in_words(session.finger), "motion": pace_in_words(session)}
 
 
-def _as_dict(recording: Recording, among: Sequence[Recording]) -> dict:
-    """Survey of a recording, one of several of one rig, for JSON."""
-    from jaxfinger.data.importing.survey import clocks_of, columns_of
+def _as_dict(recording: Recording, seen: Sequence[ColumnSurvey]) -> dict:
+    """Survey of a recording for JSON."""
+    from jaxfinger.data.importing.survey import clocks_of
 
-    seen = columns_of(recording, among)
     return {
         "file": recording.path,
         "columns": [asdict(s) for s in seen],
@@ -100,11 +100,12 @@ def look(*recordings: Path, finger: Path | None = None, json: bool = False) -> N
 
     described = finger_from(str(finger.resolve()), Place(str(finger))) if finger is not None else None
     loaded = [load_recording(path) for path in recordings]
+    names = (described.joint_names, described.tendon_names) if described is not None else ()
+    surveys = [(recording, columns_of(recording, loaded, *names)) for recording in loaded]
     if json:
-        print_json([_as_dict(recording, loaded) for recording in loaded])
+        print_json([_as_dict(recording, seen) for recording, seen in surveys])
         return
-    for recording in loaded:
-        seen = columns_of(recording, loaded)
+    for recording, seen in surveys:
         rows = [
             (
                 s.name + ("" if s.column is None else f"[{s.column}]"),

@@ -9,11 +9,12 @@ from functools import cached_property
 
 import numpy as np
 
-from jaxfinger.data.importing.assignment import assigned, held_names, known_names, named_columns, words
+from jaxfinger.data.importing.assignment import assigned, held_names, known_names, named_columns
 from jaxfinger.data.importing.columns import coarse_rate, restarts
+from jaxfinger.data.importing.names import is_nameless, is_set_point, is_speed, words
 from jaxfinger.data.importing.recording import Recording
 from jaxfinger.data.importing.speeds import speeds
-from jaxfinger.data.importing.survey import ColumnSurvey, columns_of, is_nameless, is_set_point, is_speed
+from jaxfinger.data.importing.survey import ColumnSurvey, columns_of
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.signals.pace import speed
 from jaxfinger.data.toml import as_key, quoted
@@ -47,7 +48,8 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
     where names do not match. Without a finger, joints and tendons are named as in the recordings. Channels that all
     recordings map alike are shared. `head` holds the lines of specimen and finger.
     """
-    seen = [columns_of(recording, recordings) for recording in recordings]
+    names = (finger.joint_names, finger.tendon_names) if finger is not None else ()
+    seen = [columns_of(recording, recordings, *names) for recording in recordings]
     trials = _trials([_Log(*pair) for pair in zip(recordings, seen, strict=True)])
     proposed = [_trial_proposal(logs, finger) for logs in trials]
     channels = {channel: None for trial in proposed for channel in trial.channels}
