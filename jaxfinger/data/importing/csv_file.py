@@ -33,6 +33,8 @@ _UNIT = r"%|°|deg|rad|turn|rev|rpm|k?Hz|[mun]?s|[munc]?m|[mk]?N|[mk]?N[ ·*]?[c
 _UNIT_CELL = re.compile(rf"^[\[(]?({_UNIT}|{_UNIT}/s2?|)[\])]?$")
 _UNIT_SUFFIX = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")  # in brackets after a name
 _DATE = re.compile(r"^\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
+_DOTTED_DATE = re.compile(r"^(\d\d)\.(\d\d)\.(\d{4}),? +(\d\d:\d\d.*)$")  # the day first, as everywhere with dots
+_TIME_OF_DAY = re.compile(r"^(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,]\d+)?)$")
 _LIST = re.compile(r"^(\[.*\]|\(.*\))$", re.DOTALL)
 _LIST_IN_QUOTES = re.compile(r'"\[[^"\]]*\]"')  # pandas breaks the lines of a long array
 _HOUR = re.compile(r"\d:\d\d")  # in a time of day or a date
@@ -100,9 +102,10 @@ class _Line:
 def load_csv(path: Path) -> Recording:
     """Load the columns of a CSV file by the names above the numbers, or as `column 0`, `column 1` and so on.
 
-    Empty cells and words for a missing value (`-`, `#N/A`) are NaN, True and False are 1 and 0, and dates with a time
-    of day are seconds since 1970. A column of lists in brackets, one a sample, is an array. A column of words can be
-    tested, not computed with. Messages of a JointState that `ros2 topic echo --csv` wrote have the names of its fields.
+    Empty cells and words for a missing value (`-`, `#N/A`) are NaN, True and False are 1 and 0, dates with a time of
+    day are seconds since 1970, and times of day seconds since midnight. A column of lists in brackets, one a sample, is
+    an array. A column of words can be tested, not computed with. Messages of a JointState that `ros2 topic echo --csv`
+    wrote have the names of its fields.
 
     Raises:
         UserError: the file has no column of numbers, or a line with another number of cells.
@@ -211,6 +214,9 @@ def _cell(cell: str) -> float | None:
         pass
     if cell.lower() in _BOOLEANS:
         return _BOOLEANS[cell.lower()]
+    if at := _TIME_OF_DAY.match(cell):
+        return 3600.0 * int(at[1]) + 60.0 * int(at[2]) + float(at[3].replace(",", "."))
+    cell = _DOTTED_DATE.sub(r"\3-\2-\1 \4", cell)
     if _DATE.match(cell):
         try:
             stamp = datetime.fromisoformat(cell)
@@ -269,6 +275,7 @@ class _Column:
     values: np.ndarray | None
     fault: str = ""
     words: np.ndarray | None = None
+    units: str = ""  # of dates and times of day, whatever the header says
 
 
 def _columns(path: Path, body: Sequence[_Line], dialect: _Dialect, numeric: Sequence[bool]) -> list[_Column]:
@@ -307,7 +314,8 @@ def _column(cells: Sequence[str], lines: Sequence[int], dialect: _Dialect, numer
     values = [known[cell] for cell in cells]
     bad = [k for k, value in enumerate(values) if value is None]
     if not bad:
-        return _Column(np.array(values, np.float64))
+        timed = any(_HOUR.search(cell) for cell in known)
+        return _Column(np.array(values, np.float64), units="s" if timed else "")
     first = cells[bad[0]]
     if all(_LIST.match(cell) for cell in cells if cell):
         return _lists(cells)
@@ -374,7 +382,8 @@ def _named(
             unusable[name] = f"is the name of the columns {numbers}; give each column its own name"
         elif column.values is not None:
             suffix = _UNIT_SUFFIX.search(name)
-            variables[name] = Variable(column.values, units=units[k] or (suffix.group(1).strip() if suffix else ""))
+            stated = column.units or units[k] or (suffix.group(1).strip() if suffix else "")
+            variables[name] = Variable(column.values, units=stated)
         else:
             unusable[name] = column.fault
             if column.words is not None:

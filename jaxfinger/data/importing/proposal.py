@@ -70,6 +70,9 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
         for channel, rows in trial.channels.items():
             if channel not in shared:
                 lines += [f"channels.{channel}.{as_key(name)} = {said}" for name, said in rows]
+        for log in logs:
+            unread = [f"# {quoted(name)} {reason}" for name, reason in log.recording.unusable.items()]
+            lines += unread[:_MAX_LEFT_OUT]
         for what, said in ((False, "in no channel yet"), (True, "set-points by their names, which are not measured")):
             named = [quoted(name) for name in trial.left_out if is_set_point(name) == what]
             lines += [f"# {said}: {listed(named, _MAX_LEFT_OUT)}"] if named else []

@@ -159,6 +159,8 @@ def test_sampling_rate_span_and_own_clock(mapping, tmp_path):
             'from = "encoder"',
             r"'encoder' of log.mat, which the recording has not; it has enc, extra, gain",
         ),
+        ('from = "enc"', 'from = "?"', r"is still to be filled in; name a variable of log.mat: enc, extra"),
+        ('time = "t"', 'time = "?"', r"time: is still to be filled in; .* or write `rate_hz` in place of `time`: enc"),
         (", column = 1", "", "has 2 columns; choose one by `column`"),
         ('from = "pull"', 'from = "gain"', "has 1 samples where the trial's time has 500"),
         ('units = "deg"', 'units = "mm"', "units 'mm'; it must be one of rad, mrad, deg"),

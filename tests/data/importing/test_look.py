@@ -86,6 +86,15 @@ def test_a_log_without_a_clock_is_said_to_be_as_fast_as_its_rate(tmp_path):
     assert 'last 2 s and "angle_deg" moves by up to 599 deg in 1 s' in said
 
 
+def test_words_that_tell_trials_apart_are_named_in_the_proposal(tmp_path):
+    path = tmp_path / "log.csv"
+    rows = [f"{name},{t:.2f},{80.0 * np.sin(t):.4f}" for name in ("first", "second") for t in np.arange(300) / 100]
+    path.write_text("\n".join(["trial,t,angle_deg", *rows, ""]))
+    assert "# \"trial\" holds the words 'first', 'second'; a trial's `where` can test it" in proposal(
+        [load_recording(path)]
+    )
+
+
 def test_a_clock_without_a_name_is_the_column_that_rises_evenly(tmp_path):
     """A count of samples does not show their times, and a joint that turns one way does so at several speeds."""
     path, n = tmp_path / "log.csv", np.arange(500)
