@@ -71,6 +71,23 @@ def conversion(unit: str) -> str:
     return f"convert {unit} to {si} (`{f'time = {{ from = …, {spelt} }}' if si == 's' else spelt}` in a mapping)"
 
 
+def without_units(name: str) -> str:
+    """A column's name without the units that end it, in brackets as `q [rad]` or behind a stroke as `q/rad`."""
+    return (_behind_a_stroke(name) or [re.sub(r"[\[(].*", "", name).strip("/ ")])[0]
+
+
+def stated_units(name: str) -> str:
+    """Units that end a column's name, as it spells them; empty where none do."""
+    in_brackets = re.search(r"[\[(]([^\[\]()]*)[\])]\s*$", name)
+    return in_brackets[1].strip() if in_brackets else (*_behind_a_stroke(name), "", "")[1]
+
+
+def _behind_a_stroke(name: str) -> tuple[str, ...]:
+    """Quantity and unit of a name such as `q/rad`; nothing of other names, as of the path of a topic."""
+    quantity, _, unit = (part.strip() for part in name.partition("/"))
+    return (quantity, unit) if quantity and unit_name(unit) else ()
+
+
 def weight_unit(stated: str) -> str:
     """Unit of force where a file states g or kg of a force; empty where it states another."""
     return {"g": "gf", "kg": "kgf"}.get(stated.strip(), "")

@@ -114,6 +114,11 @@ def test_which_joint_a_sensor_holds_is_not_guessed(tmp_path, capsys):
     assert not (tmp_path / "s.h5").exists()
 
 
+def test_names_may_be_separated_by_semicolons(tmp_path, capsys):
+    main(["new", f"{tmp_path}/f.toml", f"{tmp_path}/m.toml", "--joints", "MCP; PIP", "--tendons", "T1;T2;T3"])
+    assert "2 joints, 3 tendons" in capsys.readouterr().out
+
+
 def test_a_finger_may_lack_tendons(tmp_path):
     main(["new", f"{tmp_path}/f.toml", f"{tmp_path}/m.toml", "--joints", "J", "--tendons", "none"])
     assert "tendons" not in (tmp_path / "f.toml").read_text()

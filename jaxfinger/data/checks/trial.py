@@ -126,7 +126,7 @@ def _nan(trial: Trial, name: str, finger: FingerDescription, sizes: Sizes, repor
             report.error(
                 trial.place(name),
                 f"column {column} is NaN in {count} of {len(bad)} samples, first at {at:.6g} s; cut these samples out "
-                "(`span` in a mapping), or make the whole column NaN if it was not measured",
+                "(`span` or `where` in a mapping), or make the whole column NaN if it was not measured",
             )
 
 

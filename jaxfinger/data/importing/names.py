@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxfinger.data.importing.columns import coarse_rate
-from jaxfinger.data.units import TO_SI, unit_name, weight_unit
+from jaxfinger.data.units import TO_SI, unit_name, weight_unit, without_units
 
 # Patterns of names for each channel, of which the first that fits counts: common words in logs of robots.
 _MEANINGS = (
@@ -74,11 +74,6 @@ def words(name: str) -> str:
 def as_word(name: str) -> re.Pattern[str]:
     """Pattern of a name as one word or several."""
     return re.compile(rf"(?<![a-z0-9]){re.escape(name)}(?![a-z0-9])")
-
-
-def without_units(name: str) -> str:
-    """A name without the units in brackets that end it."""
-    return re.sub(r"[\[(].*", "", name).strip("/ ")
 
 
 def is_nameless(name: str) -> bool:

@@ -295,6 +295,8 @@ def _rate_by_speeds(log: _Log) -> list[str]:
 
 def _pace(log: _Log, angles: Sequence[ColumnSurvey]) -> list[str]:
     """A comment on how long a log without a clock lasts, and how fast its joints move, at two usual sampling rates."""
+    if not angles:
+        return []
     count = np.arange(float(log.count))
     moves = [(speed(count, _values(log.recording, s)), _called(s), s.units) for s in angles if s.samples == log.count]
     fastest, name, units = max(moves, default=(0.0, "", ""))

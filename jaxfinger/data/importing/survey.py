@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jaxfinger.data.importing.columns import coarse_rate, restarts
-from jaxfinger.data.importing.names import Owners, as_word, is_joint, is_nameless, meaning_of, without_units, words
+from jaxfinger.data.importing.names import Owners, as_word, is_joint, is_nameless, meaning_of, words
 from jaxfinger.data.importing.recording import Recording, Variable
-from jaxfinger.data.units import TO_SI, is_foreign, is_ratio
+from jaxfinger.data.units import TO_SI, is_foreign, is_ratio, without_units
 
 # Usual intervals of a clock that ticks evenly. A late sample makes one up to twice as long; in a longer one than this,
 # samples were lost. It decides what counts as the rate, not what is a fault (`signals.clock`).

@@ -9,6 +9,7 @@ import pytest
 
 from jaxfinger.data.importing.csv_file import load_csv
 from jaxfinger.data.importing.proposal import proposal
+from jaxfinger.data.units import without_units
 from jaxfinger.errors import UserError
 
 NUMBERS = "0.00,1.5,-3\n0.01,1.6,-4\n0.02,1.7,-5\n"
@@ -300,3 +301,27 @@ def test_joint_states_whose_names_change_are_refused(tmp_path):
 def test_other_tables_without_names_are_no_joint_states(tmp_path, before):
     text = "".join(f"{before.format(k)},left,walk,0.1,0.2,{k}\n" for k in range(9))
     assert "column 4" in load(tmp_path, text).variables
+
+
+def test_lines_of_numbers_above_the_first_whole_sample_are_said(tmp_path):
+    """Nothing that was recorded is left out without a word."""
+    rows = [f"{k / 100},{k},{k}" for k in range(20)]
+    assert load(tmp_path, "\n".join(["t,a,b", *rows])).remarks == ()
+    found = load(tmp_path, "\n".join(["t,a,b", "0.0,?,0", "0.01,?,1", *rows[2:]]))
+    assert found.remarks == ("has numbers in line 2 above its first whole sample, which are left out",)
+    assert len(found.variables["t"].values) == 18
+
+
+def test_a_minus_sign_of_typesetters_is_one(tmp_path):
+    found = load(tmp_path, "t,a\n" + "".join(f"{k},\u2212{k}.5\n" for k in range(20)))
+    np.testing.assert_array_equal(found.variables["a"].values, -0.5 - np.arange(20))
+
+
+@pytest.mark.parametrize(
+    ("name", "units"),
+    [("q/rad", "rad"), ("F / N", "N"), ("Zeit/ms", "ms"), ("speed/(rad/s)", "rad/s"), ("/hand/m", ""), ("a/b", "")],
+)
+def test_units_may_stand_behind_a_stroke(tmp_path, name, units):
+    found = load(tmp_path, f"x,{name}\n" + "1,2\n2,3\n3,4\n")
+    assert found.variables[name].units == units
+    assert without_units(name) == {"/hand/m": "hand/m", "a/b": "a/b"}.get(name, re.split(" ?/", name)[0])
