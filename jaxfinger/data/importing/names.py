@@ -92,7 +92,7 @@ def meaning_of(name: str, column: str | int | None, x: np.ndarray, stated: str, 
     Both are empty where they are unclear. A joint's or tendon's name says nothing of the channel: the words beside it,
     or before it, do. A force that is stated in g or kg is a weight.
     """
-    units = unit_name(stated) or _spelt(name)
+    units = unit_name(stated) or spelt_unit(name)
     *before, word = re.split(r"[./]", without_units(name))
     word = before.pop() if before and word.lower() in _NO_WORDS else word
     owner, rest = owners.of(words(word))
@@ -126,7 +126,7 @@ def is_set_point(name: str) -> bool:
     return re.search(_SET_POINT, words(without_units(name).split("/")[-1])) is not None
 
 
-def _spelt(name: str) -> str:
+def spelt_unit(name: str) -> str:
     """Unit at the end of a name such as `stamp_ms`. No single letter is taken for one, nor `min` of a lowest value."""
     last = re.split(r"[\s_./]", name.strip())[-1]
     return unit_name(last) if len(last) > 1 and last != "min" else ""

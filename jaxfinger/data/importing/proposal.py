@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxfinger.data.importing.assignment import assigned, held_names, known_names, named_columns
 from jaxfinger.data.importing.columns import coarse_rate, restarts
-from jaxfinger.data.importing.names import is_nameless, is_set_point, is_speed, words
+from jaxfinger.data.importing.names import is_nameless, is_set_point, is_speed, spelt_unit, words
 from jaxfinger.data.importing.recording import Recording
 from jaxfinger.data.importing.speeds import speeds
 from jaxfinger.data.importing.survey import ColumnSurvey, columns_of
@@ -111,9 +111,14 @@ class _Log:
 
     @property
     def clock(self) -> ColumnSurvey | None:
-        """Column with the times of its samples: stamps of headers before other clocks."""
+        """Column with the times of its samples: stamps of headers before other clocks, and these before counts."""
         clocks = [s for s in self.seen if s.meaning == "time"]
-        return next((s for s in clocks if s.name.endswith(".stamp")), clocks[0] if clocks else None)
+        return min(clocks, key=lambda s: (not s.name.endswith(".stamp"), self.counts(s)), default=None)
+
+    def counts(self, clock: ColumnSurvey) -> bool:
+        """Whether a clock without units goes on by one from sample to sample, as an index does and ms may."""
+        steps = np.diff(np.ravel(self.recording.variables[clock.name].values))
+        return not (clock.stated or spelt_unit(clock.name)) and bool(np.all(steps == 1.0))
 
     @property
     def count(self) -> int:
@@ -134,9 +139,15 @@ class _Log:
 
     @property
     def columns(self) -> list[ColumnSurvey]:
-        """Columns that may belong to a channel: those that the log's clock, or one of their own, gives times."""
+        """Columns that may belong to a channel: those that the log's clock, or one of their own, gives times.
+
+        Families of columns without any value are left out.
+        """
         samples = self.clock.samples if self.clock is not None else self.count
-        timed = [s for s in self.seen if s.samples == samples or self.recording.variables[s.name].clock]
+        family = lambda s: re.sub(r"\d+", "#", s.name)  # noqa: E731
+        filled = {family(s) for s in self.seen if s.missing < s.samples}
+        timed = [s for s in self.seen if family(s) in filled]
+        timed = [s for s in timed if s.samples == samples or self.recording.variables[s.name].clock]
         return [s for s in timed if s.meaning not in ("", "time") and s.samples > 2]
 
     @property
@@ -194,6 +205,8 @@ def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _
     lines += [f"tendon = {quoted(tendon)}   # that is pulled"] if tendon else []
     coarse = coarse_rate(time)
     guessed = "   # guessed: its values rise evenly" if clock is not None and is_nameless(clock.name) else ""
+    if clock is not None and logs[0].counts(clock):
+        guessed = "   # it counts by one: if it counts samples, write `rate_hz`, samples per second, in its place"
     if clock is None:
         lines.append('time = "?"   # no time was found: name its variable, or write `rate_hz`, samples per second')
         lines += _pace(logs[0], channels.get("q", ()))
