@@ -15,7 +15,11 @@ from jaxfinger.errors import UserError, counted
 from jaxfinger.progress import Step
 
 if TYPE_CHECKING:
+    from jaxfinger.data import Session
     from jaxfinger.data.importing.recording import Recording
+    from jaxfinger.data.importing.survey import ColumnSurvey
+
+_NOTHING = {"mounting": None, "motion": None}
 
 
 def check(file: Path, *, json: bool = False) -> None:
@@ -30,33 +34,40 @@ def check(file: Path, *, json: bool = False) -> None:
     """
     from jaxfinger.data.findings import merged
     from jaxfinger.data.hdf5 import read_and_check_all
-    from jaxfinger.data.mounting import mounting_in_words
 
     with progress("check") as say:
         say(file.name)
         session, report = read_and_check_all(file)
-    mounting = mounting_in_words(session.finger) if session is not None and report.fatal is None else None
+    to_compare = _to_compare(session) if session is not None and report.fatal is None else _NOTHING
     findings, count = list(report), Counter(f.severity for f in report)
     errors = count["error"]
     if json:
-        print_json({"file": file, "ok": not errors, "mounting": mounting, "findings": [asdict(f) for f in findings]})
+        print_json({"file": file, "ok": not errors, **to_compare, "findings": [asdict(f) for f in findings]})
     else:
         for finding in merged(findings):
             said = f"{finding.severity}: {file}: {finding.message}" if finding.place == "/" else finding
             console().print(plain(said), markup=False, soft_wrap=True)
-        if mounting is not None:
-            print(plain(f"mounting: {mounting}"))
+        for what, said in to_compare.items():
+            if said is not None:
+                print(plain(f"{what}: {said}"))
         found = ", ".join(counted(count[s], s) for s in ("error", "warning", "note") if s == "error" or count[s])
         print(f"{file}: {found if findings else 'nothing to complain about'}")
     if errors:
         raise SystemExit(2)
 
 
-def _as_dict(recording: Recording, among: Sequence[Recording]) -> dict:
-    """Survey of a recording, one of several of one rig, for JSON."""
-    from jaxfinger.data.importing.survey import clocks_of, columns_of
+def _to_compare(session: Session) -> dict[str, str | None]:
+    """What no check can judge of a session, and a person can compare with the rig: one line each."""
+    from jaxfinger.data.mounting import mounting_in_words
+    from jaxfinger.data.signals.pace import pace_in_words
 
-    seen = columns_of(recording, among)
+    return {"mounting": mounting_in_words(session.finger), "motion": pace_in_words(session)}
+
+
+def _as_dict(recording: Recording, seen: Sequence[ColumnSurvey]) -> dict:
+    """Survey of a recording for JSON."""
+    from jaxfinger.data.importing.survey import clocks_of
+
     return {
         "file": recording.path,
         "columns": [asdict(s) for s in seen],
@@ -89,11 +100,12 @@ def look(*recordings: Path, finger: Path | None = None, json: bool = False) -> N
 
     described = finger_from(str(finger.resolve()), Place(str(finger))) if finger is not None else None
     loaded = [load_recording(path) for path in recordings]
+    names = (described.joint_names, described.tendon_names) if described is not None else ()
+    surveys = [(recording, columns_of(recording, loaded, *names)) for recording in loaded]
     if json:
-        print_json([_as_dict(recording, loaded) for recording in loaded])
+        print_json([_as_dict(recording, seen) for recording, seen in surveys])
         return
-    for recording in loaded:
-        seen = columns_of(recording, loaded)
+    for recording, seen in surveys:
         rows = [
             (
                 s.name + ("" if s.column is None else f"[{s.column}]"),
@@ -202,7 +214,6 @@ def import_(
     refuse_output(output, overwrite, mapping, *sources)
     from jaxfinger.data.findings import Report
     from jaxfinger.data.importing.by_mapping import import_file
-    from jaxfinger.data.mounting import mounting_in_words
 
     report = Report()
     try:
@@ -212,6 +223,7 @@ def import_(
     finally:
         print_warnings(report, mapping)
     print(plain(f"{output}: {counted(len(session), 'trial')} of {session.specimen}"))
-    print(plain(f"mounting: {mounting_in_words(session.finger)}"))
+    for what, said in _to_compare(session).items():
+        print(plain(f"{what}: {said}"))
     if any(finding.severity == "error" for finding in report):
         raise SystemExit(2)

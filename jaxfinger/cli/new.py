@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -134,8 +135,8 @@ def _asked(question: str, given: str | None, default: str) -> str:
 
 
 def _names(what: str, text: str) -> list[str]:
-    """Names in a list with commas; UserError where one occurs twice."""
-    names = [name.strip() for name in text.split(",") if name.strip()]
+    """Names in a list with commas or semicolons; UserError where one occurs twice."""
+    names = [name.strip() for name in re.split("[,;]", text) if name.strip()]
     for i, name in enumerate(names):
         if name in names[:i]:
             raise UserError(f"new: the {what} {name} is named twice; give each its own name")

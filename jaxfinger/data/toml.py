@@ -144,6 +144,14 @@ def read_toml(path: str | Path, mend: str = "give the path of a TOML file") -> D
     return parse_toml(text, path)
 
 
+# What is often wrong in a line that is no TOML, and its mend.
+_MENDS = (
+    (r"[“”„‟‘’‚«»]", "write straight quotes"),
+    (r'"[^"]*\\[^"]*"', "write this path in single quotes, or with / in place of \\"),
+    (r"=\s*[+-]?\d+,\d+\s*[,}]", "write decimals with a point"),
+)
+
+
 def parse_toml(text: str, path: str | Path) -> Document:
     """Parse the text of the file `path`.
 
@@ -158,7 +166,9 @@ def parse_toml(text: str, path: str | Path) -> Document:
         found = re.search(r" \(at (?:line (\d+), column \d+|end of document)\)", str(error))
         line = int(found[1]) if found and found[1] else len(text.splitlines()) or 1
         said = str(error)[: found.start()] if found else str(error)
-        raise UserError(f"{path}, line {line}: is not valid TOML ({said}); mend this line") from None
+        wrong = text.splitlines()[line - 1 : line]
+        mend = next((m for pattern, m in _MENDS if any(re.search(pattern, x) for x in wrong)), "mend this line")
+        raise UserError(f"{path}, line {line}: is not valid TOML ({said}); {mend}") from None
     return Document(Path(path), text, content, Place(str(path), _lines(text)))
 
 

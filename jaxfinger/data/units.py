@@ -42,6 +42,8 @@ TO_SI = {
     "ms": Unit("s", 1e-3),
     "us": Unit("s", 1e-6),
     "ns": Unit("s", 1e-9),
+    "min": Unit("s", 60.0),
+    "h": Unit("s", 3600.0),
     "K": Unit("K", 1.0),
     "degC": Unit("K", 1.0, 273.15),
     "1": Unit("1", 1.0),
@@ -52,7 +54,7 @@ _SPELT |= {"degree": "deg", "radian": "rad", "radians": "rad", "turns": "turn", 
 _SPELT |= {"second": "s", "seconds": "s", "newton": "N", "newtons": "N"}
 # Units of other systems and of raw signals, without capitals and what joins factors: numbers in them are never in SI.
 _FOREIGN = {
-    "lbf", "lb", "lbs", "ozf", "oz", "g", "kg", "in", "inch", "inches", "ft", "psi", "bar", "pa", "kpa", "min", "h",
+    "lbf", "lb", "lbs", "ozf", "oz", "g", "kg", "in", "inch", "inches", "ft", "psi", "bar", "pa", "kpa",
     "v", "mv", "mv/v", "a", "ma", "%", "rpm", "count", "counts", "cnt", "tick", "ticks", "pulses", "bit", "bits",
     "lsb", "raw", "kgfcm", "kgcm", "gfcm", "gcm", "ozin", "ozfin", "inoz", "inozf", "lbin", "lbfin", "inlb", "inlbf",
     "lbft", "lbfft", "ftlb", "ftlbf", "danm",
@@ -67,6 +69,28 @@ def conversion(unit: str) -> str:
     spelt = f'units = "{unit}"'
     si = TO_SI[unit].si
     return f"convert {unit} to {si} (`{f'time = {{ from = …, {spelt} }}' if si == 's' else spelt}` in a mapping)"
+
+
+def without_units(name: str) -> str:
+    """A column's name without the units that end it, in brackets as `q [rad]` or behind a stroke as `q/rad`."""
+    return (_behind_a_stroke(name) or [re.sub(r"[\[(].*", "", name).strip("/ ")])[0]
+
+
+def stated_units(name: str) -> str:
+    """Units that end a column's name, as it spells them; empty where none do."""
+    in_brackets = re.search(r"[\[(]([^\[\]()]*)[\])]\s*$", name)
+    return in_brackets[1].strip() if in_brackets else (*_behind_a_stroke(name), "", "")[1]
+
+
+def _behind_a_stroke(name: str) -> tuple[str, ...]:
+    """Quantity and unit of a name such as `q/rad`; nothing of other names, as of the path of a topic."""
+    quantity, _, unit = (part.strip() for part in name.partition("/"))
+    return (quantity, unit) if quantity and unit_name(unit) else ()
+
+
+def weight_unit(stated: str) -> str:
+    """Unit of force where a file states g or kg of a force; empty where it states another."""
+    return {"g": "gf", "kg": "kgf"}.get(stated.strip(), "")
 
 
 def is_foreign(stated: str) -> bool:

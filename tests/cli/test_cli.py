@@ -98,13 +98,18 @@ def test_check_of_a_sound_file(folder, capsys):
     assert not [f for f in found["findings"] if f["severity"] == "error"]
 
 
-def test_import_and_check_say_how_the_finger_is_mounted(tmp_path, capsys):
-    file, line = tmp_path / "emps.h5", "mounting: gravity acts on no joint: the finger moves in a horizontal plane"
+def test_import_and_check_say_how_the_finger_is_mounted_and_how_fast_it_moves(tmp_path, capsys):
+    file = tmp_path / "emps.h5"
+    mounting = "mounting: gravity acts on no joint: the finger moves in a horizontal plane"
+    motion = "motion: 1 trial of 24.8 s; axis slides fastest, at 125 mm/s in 01-ID3-dynamic-axis"
     for tokens in (("import", EMPS / "DATA_EMPS.mat", "--mapping", EMPS / "emps.toml", "-o", file), ("check", file)):
         assert run(*tokens) == 0
-        assert line in capsys.readouterr().out.splitlines()
+        said = capsys.readouterr().out.splitlines()
+        assert mounting in said
+        assert motion in said
     assert run("check", file, "--json") == 0
-    assert f"mounting: {json.loads(capsys.readouterr().out)['mounting']}" == line
+    found = json.loads(capsys.readouterr().out)
+    assert [f"{what}: {found[what]}" for what in ("mounting", "motion")] == [mounting, motion]
 
 
 def test_import_of_an_experiment_without_its_torque_says_so_and_exits_as_check_does(tmp_path, capsys):

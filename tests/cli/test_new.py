@@ -39,8 +39,10 @@ def test_templates_import_once_the_files_are_there(written, capsys):
     assert session.finger.tendon_names == ("T1",)
     assert not [f for f in check_file(written / "session.h5") if f.severity == "error"]
     np.testing.assert_allclose(session["01-ID.2-MCP"].q[:, 0].max(), np.radians(70), rtol=1e-3)
-    example = "finger: has the masses and centres of mass of the template; write those of your finger"
+    example = "/finger/links: has the masses and centres of mass that `jaxfinger new` writes as an example"
     assert example in capsys.readouterr().err
+    main(["check", f"{written}/session.h5"])
+    assert example in capsys.readouterr().out
     finger = written / "finger.toml"
     finger.write_text(finger.read_text().replace("mass = 0.022 ", "mass = 0.0221"))
     main(["import", *files, "--mapping", f"{written}/mapping.toml", "-o", f"{written}/other.h5"])
@@ -110,6 +112,11 @@ def test_which_joint_a_sensor_holds_is_not_guessed(tmp_path, capsys):
     assert stopped.value.code == 2
     assert "'?'" in capsys.readouterr().err
     assert not (tmp_path / "s.h5").exists()
+
+
+def test_names_may_be_separated_by_semicolons(tmp_path, capsys):
+    main(["new", f"{tmp_path}/f.toml", f"{tmp_path}/m.toml", "--joints", "MCP; PIP", "--tendons", "T1;T2;T3"])
+    assert "2 joints, 3 tendons" in capsys.readouterr().out
 
 
 def test_a_finger_may_lack_tendons(tmp_path):

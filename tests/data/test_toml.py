@@ -65,6 +65,15 @@ def test_a_table_becomes_a_record():
         ("sensors = 2024-05-01", "1: sensors: must be a table, not 2024-05-01"),
         ("\n[sensors", "2: is not valid TOML (Expected"),
         ("a = 1\n\na = 2", "3: is not valid TOML (Cannot overwrite a value"),
+        ("a = 1\nb = “x”", "2: is not valid TOML (Invalid value); write straight quotes"),
+        (
+            'a = "C:\\logs\\x.csv"',
+            "1: is not valid TOML (Unescaped '\\' in a string); write this path in single quotes",
+        ),
+        (
+            "a = { b = 1,5, c = 2 }",
+            "1: is not valid TOML (Expected '=' after a key in a key/value pair); write decimals",
+        ),
         ("a = " + "[" * 5000, "1: is nested too deeply"),
         ("a = " + "9" * 5000, "1: is not valid TOML"),
     ],

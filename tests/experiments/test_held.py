@@ -136,7 +136,7 @@ def test_quick_ramps_without_holds_are_not_judged_and_said_not_to_be():
 @pytest.mark.parametrize("newton", [1e-2, 1.0, 1e2])
 @pytest.mark.parametrize(
     ("rise", "pulled", "said"),
-    [(4.0, 1.0, ""), (0.1, 1.0, "nothing of the trial is judged"), (4.0, 0.01, "T1 is never pulled")],
+    [(4.0, 1.0, ""), (0.1, 1.0, "next to nothing of the trial is judged"), (4.0, 0.01, "T1 is never pulled")],
 )
 def test_the_checker_says_what_a_fit_counts(rise, pulled, said, newton):
     """The size of the forces does not matter; another trial gives their scale."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxfinger.data.checks.links import check_links
+from jaxfinger.data.example import is_example
 from jaxfinger.data.findings import Report
 from jaxfinger.data.schema import JOINTS, LINKS
 from jaxfinger.data.session import FingerDescription
@@ -38,6 +39,9 @@ def check_finger(finger: FingerDescription, report: Report) -> None:
         _lengths(finger, report)
         if report.fatal is None:
             check_links(finger, report)
+        if is_example(finger):
+            said = "has the masses and centres of mass that `jaxfinger new` writes as an example"
+            report.warning("/finger/links", f"{said}; write those of your finger")
     _tendons(finger, report)
     _excursion(finger, report)
 

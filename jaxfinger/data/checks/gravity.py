@@ -12,7 +12,7 @@ Each trial has its own zero, as of a sensor that is tared, and its own friction.
 Where one trial moves several joints, as of an arm, other joints' angles change all the time, and each torque shows its
 own multiple of levers · g: far from one it has another unit, a wrong sign, or belongs to a motor before its gear. Where
 too little is left of the weight beside curves over the joint's own angle, as of an upright arm, springs could explain
-torques that go against it; but hardly at several joints at once, each with about twice the weight.
+torques that go against it; but hardly at several joints at once, each with about twice the weight. One alone is noted.
 """
 
 from __future__ import annotations
@@ -123,20 +123,27 @@ def check_torque_scales(session: Session, report: Report) -> None:
                 "torque before the gear) or its sign, or `mass` and `com`",
             )
             continue
-        against = _against_gravity(finger, trial, [i for i, scale in scales.items() if scale is None], moving)
-        if len(against) > 1:
-            named = listed([f"{scale:.2g} of what it takes at {name}" for name, scale in against.items()])
+        follows = _following_gravity(finger, trial, [i for i, scale in scales.items() if scale is None], moving)
+        against = {name: s for name, s in follows.items() if -_MAX_SCALE < s < -1.0 / _MAX_SCALE}
+        named = listed([f"{scale:.2g} of what it takes at {name}" for name, scale in against.items()])
+        if len(against) > 1 and all(scale < 0.0 for scale in follows.values()):
             report.warning(
                 trial.place("joint_torque"),
                 f"goes against gravity, with {named}: correct its sign, that of q, or `gravity`, unless springs of "
                 "twice the weight act at each of these joints",
             )
+        elif against:
+            report.note(
+                trial.place("joint_torque"),
+                f"goes against gravity, with {named}: springs of twice the weight act there, or its sign or that of q "
+                "is wrong",
+            )
 
 
-def _against_gravity(
+def _following_gravity(
     finger: FingerDescription, trial: Trial, joints: Sequence[int], moving: Sequence[int]
 ) -> dict[str, float]:
-    """Joints whose torque follows the weight in the wrong direction, with its multiple; none if one follows rightly."""
+    """Joints whose torque goes as the weight or against it, with its multiple."""
     follows = {}
     for i in joints:
         for motion in _motion(trial, i, moving):
@@ -147,8 +154,7 @@ def _against_gravity(
             (size, product), (_, whole) = left.T @ left
             if product**2 > _MIN_FOLLOWED * size * whole:
                 follows[finger.joint_names[i]] = float(product / size)
-    plausible = {name: scale for name, scale in follows.items() if 1.0 / _MAX_SCALE < abs(scale) < _MAX_SCALE}
-    return plausible if all(scale < 0.0 for scale in follows.values()) else {}
+    return follows
 
 
 def _torque_scale(finger: FingerDescription, i: int, motion: _Motion) -> float | None:

@@ -9,7 +9,7 @@ from jaxfinger.data.findings import Report
 from jaxfinger.data.schema import CHANNELS, DRIVES, MEASURED, MEASURES, NEEDS_JOINT, NEEDS_TENDON
 from jaxfinger.data.session import FingerDescription, Trial
 from jaxfinger.data.signals.clock import gaps, longest_interval
-from jaxfinger.data.signals.motion import MIN_HOLD, MIN_MOTION, pulled_slowly, still_spans
+from jaxfinger.data.signals.motion import HOLD_CUTOFF_HZ, MIN_HOLD, MIN_MOTION, pulled_slowly, still_spans
 from jaxfinger.data.signals.quantiles import median, quantile
 from jaxfinger.data.signals.sizes import MAX_RATE, STEP_TIME, Sizes
 from jaxfinger.data.units import conversion
@@ -126,7 +126,7 @@ def _nan(trial: Trial, name: str, finger: FingerDescription, sizes: Sizes, repor
             report.error(
                 trial.place(name),
                 f"column {column} is NaN in {count} of {len(bad)} samples, first at {at:.6g} s; cut these samples out "
-                "(`span` in a mapping), or make the whole column NaN if it was not measured",
+                "(`span` or `where` in a mapping), or make the whole column NaN if it was not measured",
             )
 
 
@@ -209,9 +209,10 @@ def _motion(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repor
         message = f"tendon {trial.tendon} is never pulled; check the attribute `tendon`"
         report.warning(trial.place("tendon_force"), message)
     elif trial.experiment in NEEDS_TENDON and not pulled_slowly(trial, _pulled(trial, finger), sizes):
-        slowly = f"holds of {MIN_HOLD * sizes.slow_pace:g} s nor in ramps of {sizes.slow_pace:g} s"
-        message = f"tendon {trial.tendon} is pulled neither in {slowly}"
-        report.warning(trial.place("tendon_force"), f"{message}: nothing of the trial is judged; pull it slower")
+        shortest = (MIN_HOLD + 2.0 / HOLD_CUTOFF_HZ) * sizes.slow_pace  # with both ends, which the filter blurs
+        slowly = f"in two holds of {shortest:.2g} s nor in ramps of {sizes.slow_pace:g} s"
+        message = f"tendon {trial.tendon} is pulled neither {slowly}: next to nothing of the trial is judged"
+        report.warning(trial.place("tendon_force"), f"{message}; pull it slower, or map the channel `hold`")
 
 
 def _holds(trial: Trial, report: Report) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from jaxfinger.data.importing.names import as_word, words
 from jaxfinger.data.importing.survey import ColumnSurvey
 from jaxfinger.data.session import FingerDescription
 
@@ -62,26 +63,16 @@ def held_names(columns: Sequence[ColumnSurvey], known: Sequence[str]) -> list[st
     held = []
     for s in columns:
         text = f"{s.name} {s.column or ''}"
-        whole = [name for name in known if _word(words(name)).search(words(text))]
+        whole = [name for name in known if as_word(words(name)).search(words(text))]
         parts = [name for name in known if len(name) >= _MIN_PART and _part(name.lower()).search(text.lower())]
         held.append(max(whole or parts, key=len, default=""))
     return held
-
-
-def _word(name: str) -> re.Pattern[str]:
-    """Pattern of a name as one word or several."""
-    return re.compile(rf"(?<![a-z0-9]){re.escape(name)}(?![a-z0-9])")
 
 
 def _part(name: str) -> re.Pattern[str]:
     """Pattern of a name that may be a part of a word, while digits at its ends are whole numbers."""
     before, after = r"(?<!\d)" if name[0].isdigit() else "", r"(?!\d)" if name[-1].isdigit() else ""
     return re.compile(before + re.escape(name) + after)
-
-
-def words(name: str) -> str:
-    """A name in small letters, with a mark where a capital begins a word."""
-    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
 
 
 def _by_number(columns: Sequence[ColumnSurvey], known: Sequence[str]) -> list[str]:

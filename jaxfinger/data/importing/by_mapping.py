@@ -23,7 +23,6 @@ from jaxfinger.data.importing.mapping import Channels, Files, MappedTrial, Mappi
 from jaxfinger.data.importing.rates import compare_rate
 from jaxfinger.data.importing.recording import Recording, side_by_side
 from jaxfinger.data.importing.sources import load_recording, refuse_path
-from jaxfinger.data.importing.templates import is_example
 from jaxfinger.data.importing.variables import Source
 from jaxfinger.data.parse import RANGES, sorted_trials
 from jaxfinger.data.schema import CHANNELS, DRIVES, TEMPERATURE, Channel, Entry, entry_units
@@ -63,9 +62,6 @@ def import_session(
     report = Report() if report is None else report
     mapping, where = read_mapping(Path(mapping_path))
     finger = finger_from(mapping.finger, where / "finger")
-    if is_example(finger):
-        said = "has the masses and centres of mass of the template; write those of your finger"
-        report.warning((where / "finger").key, said)
     recordings = _Recordings(sources, mapping, where, report)
     trials = {
         name: _trial(name, trial, mapping.channels, recordings, finger, where / "trials" / name, report)

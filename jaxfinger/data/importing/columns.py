@@ -408,7 +408,7 @@ def find(name: str, paths: Mapping[Path, Any], where: Place) -> Path:
     parts = Path(name).parts
     found = [path for path in paths if path.parts[-len(parts) :] == parts]
     if not found:
-        where.fail(f"reads the file {name!r}, which was not given; there are {listed([str(path) for path in paths])}")
+        where.fail(f"reads the file '{name}', which was not given; there are {listed([str(path) for path in paths])}")
     if len(found) > 1:
         raise UserError(
             f"{where.file}: {where.key}: {len(found)} of the recordings are called {name} "

@@ -20,6 +20,7 @@ import numpy as np
 
 from jaxfinger.data.importing.joint_states import JointStates, joint_states
 from jaxfinger.data.importing.recording import Recording, Variable
+from jaxfinger.data.units import stated_units
 from jaxfinger.errors import UserError, counted, listed
 
 _COMMENTS = ("#", "%")
@@ -31,8 +32,9 @@ _SHEET_ERRORS = ("#n/a", "#div/0!", "#value!", "#num!", "#null!", "#ref!", "#nam
 _MISSING = {"-", "--", "na", "n/a", "null", "none", *_SHEET_ERRORS, "1.#qnan", "-1.#ind", "1.#ind", "-nan(ind)"}
 _UNIT = r"%|°|deg|rad|turn|rev|rpm|k?Hz|[mun]?s|[munc]?m|[mk]?N|[mk]?N[ ·*]?[cm]?m|[mu]?A|[mk]?V|°?C|K|[mk]?g|1|-|bool"
 _UNIT_CELL = re.compile(rf"^[\[(]?({_UNIT}|{_UNIT}/s2?|)[\])]?$")
-_UNIT_SUFFIX = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")  # in brackets after a name
 _DATE = re.compile(r"^\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
+_DOTTED_DATE = re.compile(r"^(\d\d)\.(\d\d)\.(\d{4}),? +(\d\d:\d\d.*)$")  # the day first, as everywhere with dots
+_TIME_OF_DAY = re.compile(r"^(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,]\d+)?)$")
 _LIST = re.compile(r"^(\[.*\]|\(.*\))$", re.DOTALL)
 _LIST_IN_QUOTES = re.compile(r'"\[[^"\]]*\]"')  # pandas breaks the lines of a long array
 _HOUR = re.compile(r"\d:\d\d")  # in a time of day or a date
@@ -73,6 +75,7 @@ class _Dialect:
 
     def number(self, cell: str) -> float | None:
         """Number in a cell: NaN where a value is missing, None where the cell holds something else."""
+        cell = cell.replace("\u2212", "-")  # a minus sign as typesetters write it
         comma = self.mark == "," and cell.count(",") == 1 and "." not in cell
         value = _cell(cell.replace(",", ".") if comma else cell)
         if value is None and _GROUPED[self.mark].match(cell):
@@ -100,9 +103,10 @@ class _Line:
 def load_csv(path: Path) -> Recording:
     """Load the columns of a CSV file by the names above the numbers, or as `column 0`, `column 1` and so on.
 
-    Empty cells and words for a missing value (`-`, `#N/A`) are NaN, True and False are 1 and 0, and dates with a time
-    of day are seconds since 1970. A column of lists in brackets, one a sample, is an array. A column of words can be
-    tested, not computed with. Messages of a JointState that `ros2 topic echo --csv` wrote have the names of its fields.
+    Empty cells and words for a missing value (`-`, `#N/A`) are NaN, True and False are 1 and 0, dates with a time of
+    day are seconds since 1970, and times of day seconds since midnight. A column of lists in brackets, one a sample, is
+    an array. A column of words can be tested, not computed with. Messages of a JointState that `ros2 topic echo --csv`
+    wrote have the names of its fields.
 
     Raises:
         UserError: the file has no column of numbers, or a line with another number of cells.
@@ -133,6 +137,8 @@ def load_csv(path: Path) -> Recording:
         names, body = tuple(split(body[0].text)), body[1:]
     if len(body) > 1 and len(split(body[-1].text)) < len(numeric):
         body, remarks = body[:-1], (*remarks, "its last line is cut short and is left out")
+    if skipped := [line.number for line in above if _holds_numbers(dialect, split(line.text), numeric)]:
+        remarks = (*remarks, f"has numbers in line {skipped[0]} above its first whole sample, which are left out")
     columns = _columns(path, body, dialect, numeric)
     if states is not None:
         return _of_states(path, columns, states, remarks)
@@ -211,6 +217,9 @@ def _cell(cell: str) -> float | None:
         pass
     if cell.lower() in _BOOLEANS:
         return _BOOLEANS[cell.lower()]
+    if at := _TIME_OF_DAY.match(cell):
+        return 3600.0 * int(at[1]) + 60.0 * int(at[2]) + float(at[3].replace(",", "."))
+    cell = _DOTTED_DATE.sub(r"\3-\2-\1 \4", cell)
     if _DATE.match(cell):
         try:
             stamp = datetime.fromisoformat(cell)
@@ -223,6 +232,13 @@ def _cell(cell: str) -> float | None:
 def _is_sample(dialect: _Dialect, cells: Sequence[str], numeric: Sequence[bool]) -> bool:
     values = [dialect.number(cell) for cell, number in zip(cells, numeric, strict=False) if number]
     return len(cells) == len(numeric) and None not in values and not all(np.isnan(v) for v in values if v is not None)
+
+
+def _holds_numbers(dialect: _Dialect, cells: Sequence[str], numeric: Sequence[bool]) -> bool:
+    """Whether most of a line's cells are numbers where a sample has numbers."""
+    values = [dialect.number(cell) for cell, number in zip(cells, numeric, strict=False) if number]
+    count = sum(value is not None and not np.isnan(value) for value in values)
+    return len(cells) == len(numeric) and 2 * count > len(values)
 
 
 def _names(
@@ -269,6 +285,7 @@ class _Column:
     values: np.ndarray | None
     fault: str = ""
     words: np.ndarray | None = None
+    units: str = ""  # of dates and times of day, whatever the header says
 
 
 def _columns(path: Path, body: Sequence[_Line], dialect: _Dialect, numeric: Sequence[bool]) -> list[_Column]:
@@ -307,7 +324,8 @@ def _column(cells: Sequence[str], lines: Sequence[int], dialect: _Dialect, numer
     values = [known[cell] for cell in cells]
     bad = [k for k, value in enumerate(values) if value is None]
     if not bad:
-        return _Column(np.array(values, np.float64))
+        timed = any(_HOUR.search(cell) for cell in known)
+        return _Column(np.array(values, np.float64), units="s" if timed else "")
     first = cells[bad[0]]
     if all(_LIST.match(cell) for cell in cells if cell):
         return _lists(cells)
@@ -373,8 +391,7 @@ def _named(
             numbers = " and ".join(str(place + 1) for place in (k, *others))
             unusable[name] = f"is the name of the columns {numbers}; give each column its own name"
         elif column.values is not None:
-            suffix = _UNIT_SUFFIX.search(name)
-            variables[name] = Variable(column.values, units=units[k] or (suffix.group(1).strip() if suffix else ""))
+            variables[name] = Variable(column.values, units=column.units or units[k] or stated_units(name))
         else:
             unusable[name] = column.fault
             if column.words is not None:

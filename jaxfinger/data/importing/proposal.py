@@ -9,12 +9,14 @@ from functools import cached_property
 
 import numpy as np
 
-from jaxfinger.data.importing.assignment import assigned, held_names, known_names, named_columns, words
+from jaxfinger.data.importing.assignment import assigned, held_names, known_names, named_columns
 from jaxfinger.data.importing.columns import coarse_rate, restarts
+from jaxfinger.data.importing.names import is_nameless, is_set_point, is_speed, spelt_unit, words
 from jaxfinger.data.importing.recording import Recording
 from jaxfinger.data.importing.speeds import speeds
-from jaxfinger.data.importing.survey import ColumnSurvey, columns_of, is_nameless, is_set_point, is_speed
+from jaxfinger.data.importing.survey import ColumnSurvey, columns_of
 from jaxfinger.data.session import FingerDescription
+from jaxfinger.data.signals.pace import speed
 from jaxfinger.data.toml import as_key, quoted
 from jaxfinger.data.units import TO_SI, beyond_a_turn
 from jaxfinger.errors import counted, listed
@@ -34,6 +36,7 @@ _MAX_LEFT_OUT = 12  # variables that are named, so that the line of a large bag 
 _TOGETHER = 0.9
 _MAX_SPEEDS = 4  # that are named
 _MAX_TABLE = 10  # samples: files that are no longer may be tables of parameters, and of one length by chance.
+_USUAL_RATES = 100, 1000  # Hz
 _HEAD = 'specimen = "my finger"\nfinger = "finger.toml"'
 
 
@@ -45,7 +48,8 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
     where names do not match. Without a finger, joints and tendons are named as in the recordings. Channels that all
     recordings map alike are shared. `head` holds the lines of specimen and finger.
     """
-    seen = [columns_of(recording, recordings) for recording in recordings]
+    names = (finger.joint_names, finger.tendon_names) if finger is not None else ()
+    seen = [columns_of(recording, recordings, *names) for recording in recordings]
     trials = _trials([_Log(*pair) for pair in zip(recordings, seen, strict=True)])
     proposed = [_trial_proposal(logs, finger) for logs in trials]
     channels = {channel: None for trial in proposed for channel in trial.channels}
@@ -66,6 +70,9 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
         for channel, rows in trial.channels.items():
             if channel not in shared:
                 lines += [f"channels.{channel}.{as_key(name)} = {said}" for name, said in rows]
+        for log in logs:
+            unread = [f"# {quoted(name)} {reason}" for name, reason in log.recording.unusable.items()]
+            lines += unread[:_MAX_LEFT_OUT]
         for what, said in ((False, "in no channel yet"), (True, "set-points by their names, which are not measured")):
             named = [quoted(name) for name in trial.left_out if is_set_point(name) == what]
             lines += [f"# {said}: {listed(named, _MAX_LEFT_OUT)}"] if named else []
@@ -104,9 +111,14 @@ class _Log:
 
     @property
     def clock(self) -> ColumnSurvey | None:
-        """Column with the times of its samples: stamps of headers before other clocks."""
+        """Column with the times of its samples: stamps of headers before other clocks, and these before counts."""
         clocks = [s for s in self.seen if s.meaning == "time"]
-        return next((s for s in clocks if s.name.endswith(".stamp")), clocks[0] if clocks else None)
+        return min(clocks, key=lambda s: (not s.name.endswith(".stamp"), self.counts(s)), default=None)
+
+    def counts(self, clock: ColumnSurvey) -> bool:
+        """Whether a clock without units goes on by one from sample to sample, as an index does and ms may."""
+        steps = np.diff(np.ravel(self.recording.variables[clock.name].values))
+        return not (clock.stated or spelt_unit(clock.name)) and bool(np.all(steps == 1.0))
 
     @property
     def count(self) -> int:
@@ -127,9 +139,15 @@ class _Log:
 
     @property
     def columns(self) -> list[ColumnSurvey]:
-        """Columns that may belong to a channel: those that the log's clock, or one of their own, gives times."""
+        """Columns that may belong to a channel: those that the log's clock, or one of their own, gives times.
+
+        Families of columns without any value are left out.
+        """
         samples = self.clock.samples if self.clock is not None else self.count
-        timed = [s for s in self.seen if s.samples == samples or self.recording.variables[s.name].clock]
+        family = lambda s: re.sub(r"\d+", "#", s.name)  # noqa: E731
+        filled = {family(s) for s in self.seen if s.missing < s.samples}
+        timed = [s for s in self.seen if family(s) in filled]
+        timed = [s for s in timed if s.samples == samples or self.recording.variables[s.name].clock]
         return [s for s in timed if s.meaning not in ("", "time") and s.samples > 2]
 
     @property
@@ -187,8 +205,11 @@ def _trial_proposal(logs: Sequence[_Log], finger: FingerDescription | None) -> _
     lines += [f"tendon = {quoted(tendon)}   # that is pulled"] if tendon else []
     coarse = coarse_rate(time)
     guessed = "   # guessed: its values rise evenly" if clock is not None and is_nameless(clock.name) else ""
+    if clock is not None and logs[0].counts(clock):
+        guessed = "   # it counts by one: if it counts samples, write `rate_hz`, samples per second, in its place"
     if clock is None:
         lines.append('time = "?"   # no time was found: name its variable, or write `rate_hz`, samples per second')
+        lines += _pace(logs[0], channels.get("q", ()))
     elif coarse is not None:
         lines.append(f"rate_hz = {coarse[1]:.4g}   # several samples share each stamp of {quoted(clock.name)}")
     elif clock.units in ("s", ""):
@@ -283,6 +304,21 @@ def _rate_by_speeds(log: _Log) -> list[str]:
     return [
         f"# speeds, if in the units of their angles by s, tell the samples per second: {listed(named, _MAX_SPEEDS)}"
     ]
+
+
+def _pace(log: _Log, angles: Sequence[ColumnSurvey]) -> list[str]:
+    """A comment on how long a log without a clock lasts, and how fast its joints move, at two usual sampling rates."""
+    if not angles:
+        return []
+    count = np.arange(float(log.count))
+    moves = [(speed(count, _values(log.recording, s)), _called(s), s.units) for s in angles if s.samples == log.count]
+    fastest, name, units = max(moves, default=(0.0, "", ""))
+    said = [
+        f"at {rate} Hz they last {len(count) / rate:.3g} s"
+        + (f" and {name} moves by up to {fastest * rate:.3g} {units or 'of its units'} in 1 s" if fastest else "")
+        for rate in _USUAL_RATES
+    ]
+    return [f"# {len(count)} samples: {'; '.join(said)}"]
 
 
 def _called(seen: ColumnSurvey) -> str:

@@ -9,40 +9,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jaxfinger.data.importing.columns import coarse_rate, restarts
+from jaxfinger.data.importing.names import Owners, as_word, is_joint, is_nameless, meaning_of, words
 from jaxfinger.data.importing.recording import Recording, Variable
-from jaxfinger.data.units import TO_SI, is_foreign, is_ratio, unit_name
+from jaxfinger.data.units import TO_SI, is_foreign, is_ratio, without_units
 
 # Usual intervals of a clock that ticks evenly. A late sample makes one up to twice as long; in a longer one than this,
 # samples were lost. It decides what counts as the rate, not what is a fault (`signals.clock`).
 MIN_GAP = 5.0
-# Patterns of names for each channel, of which the first that fits counts: common words in logs of robots.
-_MEANINGS = (
-    ("time", r"^t(_?(s|sec|ms|us|ns))?$|time|stamp|clock|zeit|^sec|^duration$"),
-    ("temperature", r"temp"),
-    ("joint_torque", r"(^|_)tau|torque|effort|moment|joint[_ ]?\d*[_ ]?force"),
-    ("tendon_excursion", r"excursion|^l\d*$|length|pull|spool|linear|travel"),
-    (
-        "tendon_force",
-        r"tension|tendon.*force|^f_?t|^f(\d|_(?!([xyz](_|\d|$)|tip$)))|cable|load[ _-]?cell|(^|_)cell(_|\d|$)|^force",
-    ),
-    ("fingertip_force", r"f?tip|contact|^f[xyz]$|wrench"),
-    ("q", r"^q[_\d]*|_q(_|\d|$)|angle|pos|enc|theta|winkel|deg$"),
-)
-# Of a clock's values or steps: more values differ, also out of order, or more steps go on, also of a recording that was
-# pasted twice.
-_MIN_RUNNING = 0.5
-_NO_WORDS = "value", "data"  # at the end of a name, which say nothing of what they are: the word before them does
-# Name of a column of a table without names, and share of a clock's steps that its usual one is not twice or half of.
-_NAMELESS = r"column \d+"
+# Share of a clock's steps that its usual one is not twice or half of.
 _MIN_EVEN = 0.9
-# Names of velocities, which belong to no channel, of set-points, which are not measured, and of switches and states.
-_VELOCITY = r"(?<![a-z])vel|speed|dot|^v$|^dq|(^|_)(d+(q|theta)|(q|theta)d+)(_|\d|$)"
-_STATE = r"enable|flag|status|valid|(^|_)(on|off|ok|mode|err|error|fault|alarm)(_|\d|$)|collision|joint_contact"
-_SET_POINT = (
-    r"cmd|command|cmptd|computed|ref(?!l)|desired|set_?p(oin)?t|goal|target|demand|soll|feed_?forward"
-    r"|(?<![a-z])d*(q|theta|tau|tau_j)_d(?![a-z])"
-    r"|(?<![a-z])(q|tau|pos)?(des|set(?!\d+\.)|sp|ff|tgt|nominal|planned)(?![a-z])"
-)
 # Largest plausible values of a channel by unit, with room for arms. The first unit whose largest value is not exceeded
 # is the guess. Torques from 5 to 100 may be an arm's in N m or a finger's in N mm, and large tensions may be in mN or
 # gf, so their unit stays open.
@@ -54,16 +29,6 @@ _MAX_VALUES = {
     "fingertip_force": (("N", 100.0), ("mN", 1e5)),
     "temperature": (("degC", 200.0), ("K", 1e3)),
 }
-_SI_UNITS = {
-    "time": ("s",),
-    "temperature": ("K",),
-    "joint_torque": ("N m", "N"),
-    "tendon_excursion": ("m",),
-    "tendon_force": ("N",),
-    "fingertip_force": ("N",),
-    "q": ("rad", "m"),
-}
-_CHANNEL_OF_UNITS = {"rad": "q", "N m": "joint_torque", "N": "tendon_force", "m": "tendon_excursion"}
 # Ranges of the usual interval, 10 µs to 0.5 s, in each unit. Where they overlap the first one counts.
 _INTERVALS = (("s", 1e-5, 0.5), ("ms", 0.01, 500.0), ("us", 10.0, 5e5), ("ns", 1e4, 5e8))
 
@@ -98,27 +63,28 @@ class ClockSurvey:
     restarts: int  # number of places at which it begins again or wraps
 
 
-def columns_of(recording: Recording, among: Sequence[Recording] = ()) -> list[ColumnSurvey]:
+def columns_of(
+    recording: Recording, among: Sequence[Recording] = (), joints: Sequence[str] = (), tendons: Sequence[str] = ()
+) -> list[ColumnSurvey]:
     """Survey every column of every variable of a recording.
 
     A unit is guessed from the largest values that the column has in any recording `among` these, and its like in this
-    one: a joint that is held at 5 degrees could be one at 5 rad, until it or the others are seen at 80.
+    one: a joint that is held at 5 degrees could be one at 5 rad, until it or the others are seen at 80. `joints` and
+    `tendons` are the finger's. Where no column is an angle by its name, those with a joint's name alone are.
     """
+    owners = Owners(joints, tendons)
+    said = _said(recording, owners)
     found, guessed = [], {}
     for name, variable in recording.variables.items():
         table = variable.values.reshape(len(variable.values), -1)
         for k, x in enumerate(table.T):
-            column = None if table.shape[1] == 1 else (variable.columns[k] if variable.columns else k)
-            units = unit_name(variable.units)
-            spelt = units or _spelt(name)
-            foreign = variable.units if is_foreign(variable.units) and not spelt else ""
-            meaning = "" if is_ratio(variable.units) else _meaning(name, column, x, spelt)
-            if meaning == "q" and not (spelt or foreign):
-                units = spelt = recording.angles
-            stated = bool(units)
-            if spelt:
-                units = spelt
-            elif not stated and not foreign:
+            column = _column(variable, k)
+            meaning, units = said[name, k]
+            angles = recording.angles if meaning == "q" and not (units or is_foreign(variable.units)) else ""
+            units = units or angles
+            stated = bool(units and (variable.units or angles))
+            foreign = variable.units if is_foreign(variable.units) and not units else ""
+            if not units and not foreign:
                 sizes = _sizes(name, k, recording, among)
                 units = _time_unit(x) if meaning == "time" else _unit(meaning, sizes)
                 guessed |= {len(found): np.nanmax(sizes)} if meaning in _MAX_VALUES and np.isfinite(sizes).any() else {}
@@ -126,24 +92,43 @@ def columns_of(recording: Recording, among: Sequence[Recording] = ()) -> list[Co
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
             missing = len(x) - len(finite)
             found.append(ColumnSurvey(name, column, len(x), low, high, missing, units, stated, meaning, foreign))
-    found = _agreed(found, guessed)
+    found = _agreed(found, guessed, owners)
     if not any(s.meaning == "time" for s in found):
         for k, s in enumerate(found):
             x = np.ravel(recording.variables[s.name].values)
-            if is_nameless(s.name) and _rises_evenly(x):
-                found[k] = replace(s, meaning="time", units=_time_unit(x))
+            if _is_clock(s, x):
+                found[k] = replace(s, meaning="time", units=s.units or _time_unit(x))
                 break
     return found
 
 
-def is_nameless(name: str) -> bool:
-    """Whether a column has no name in its recording, so that its values alone say what it may be."""
-    return re.fullmatch(_NAMELESS, name) is not None
+def _said(recording: Recording, owners: Owners) -> dict[tuple[str, int], tuple[str, str]]:
+    """What the name and units of each column say: its channel and its units, by variable and place."""
+    said = {}
+    for name, variable in recording.variables.items():
+        for k, x in enumerate(variable.values.reshape(len(variable.values), -1).T):
+            ratio = is_ratio(variable.units)
+            said[name, k] = ("", "") if ratio else meaning_of(name, _column(variable, k), x, variable.units, owners)
+    if not any(channel == "q" for channel, _ in said.values()):
+        for (name, k), (channel, units) in said.items():
+            variable = recording.variables[name]
+            if not channel and not units and is_joint(name, owners) and not is_ratio(variable.units):
+                said[name, k] = ("q" if variable.values.ndim == 1 and len(variable.values) > 1 else "", "")
+    return said
 
 
-def is_speed(name: str) -> bool:
-    """Whether a column may hold speeds by its name; one without a name may hold anything."""
-    return is_nameless(name) or re.search(_VELOCITY, name.lower()) is not None
+def _column(variable: Variable, k: int) -> str | int | None:
+    """Name or number of a variable's column k; None where it has one column."""
+    if np.ndim(variable.values) == 1 or variable.values.shape[1] == 1:
+        return None
+    return variable.columns[k] if variable.columns else k
+
+
+def _is_clock(seen: ColumnSurvey, x: np.ndarray) -> bool:
+    """Whether a column that no name calls a clock is one: it rises, evenly or in units of time."""
+    if seen.units and TO_SI[seen.units].si == "s":
+        return len(x) > 2 and bool(np.all(np.diff(x) > 0.0))
+    return is_nameless(seen.name) and _rises_evenly(x)
 
 
 def _rises_evenly(x: np.ndarray) -> bool:
@@ -155,22 +140,44 @@ def _rises_evenly(x: np.ndarray) -> bool:
     return bool(np.mean((ratio > 0.5) & (ratio < 2.0)) > _MIN_EVEN)
 
 
-def _agreed(found: Sequence[ColumnSurvey], guessed: Mapping[int, float]) -> list[ColumnSurvey]:
-    """Columns whose names differ in numbers alone, with one guess of their unit: that of the largest value.
+def _agreed(found: Sequence[ColumnSurvey], guessed: Mapping[int, float], owners: Owners) -> list[ColumnSurvey]:
+    """Columns of one quantity, with one guess of their unit: that of the largest value.
 
-    Where less than half of them need that unit they may have several, as joints that slide or turn on, and all are left
-    open. `guessed` has the sizes of the columns whose unit is guessed, by their places.
+    Where too few of them need that unit they may have several, as joints that slide or turn on, and all are left open.
+    `guessed` has the sizes of the columns whose unit is guessed, by their places.
     """
     agreed = list(found)
-    groups: dict[tuple[str, str], list[int]] = {}
-    for i in guessed:
-        groups.setdefault((found[i].meaning, re.sub(r"\d+", "#", found[i].name)), []).append(i)
-    for (meaning, _), group in groups.items():
-        largest = _unit(meaning, [guessed[i] for i in group])
-        many = sum(found[i].units == largest for i in group) >= len(group) / 2
+    for group, least in _of_one_quantity(found, list(guessed), owners):
+        largest = _unit(found[group[0]].meaning, [guessed[i] for i in group])
+        many = sum(found[i].units == largest for i in group) >= least
         for i in group:
             agreed[i] = replace(found[i], units=largest if many else "")
     return agreed
+
+
+def _of_one_quantity(
+    found: Sequence[ColumnSurvey], places: Sequence[int], owners: Owners
+) -> list[tuple[list[int], float]]:
+    """Groups of columns at these places whose names differ in numbers or in known joints and tendons alone, else in one
+    word; and how many of each must need a unit. Words also tell raw and other values apart, so most must need it."""
+    texts = {i: words(without_units(found[i].name)) for i in places}
+    numbered: dict[tuple, list[int]] = {}
+    for i, text in texts.items():
+        owner, _ = owners.of(text)
+        masked = as_word(owner).sub("#", text, count=1) if owner else text
+        numbered.setdefault((found[i].meaning, re.sub(r"\d+", "#", masked)), []).append(i)
+    groups = [(group, len(group) / 2.0) for group in numbered.values() if len(group) > 1]
+    worded: dict[tuple, list[int]] = {}
+    for (i,) in (group for group in numbered.values() if len(group) == 1):
+        parts = re.findall(r"[^\W_]+", texts[i])
+        for k in range(len(parts) if len(parts) > 1 else 0):
+            worded.setdefault((found[i].meaning, k, *parts[:k], *parts[k + 1 :]), []).append(i)
+    taken: set[int] = set()
+    for group in sorted(worded.values(), key=len, reverse=True):
+        if len(group) > 1 and not taken & set(group):
+            taken |= set(group)
+            groups.append((group, (len(group) + 1.0) / 2.0))
+    return groups
 
 
 def _sizes(name: str, k: int, recording: Recording, among: Sequence[Recording]) -> list[float]:
@@ -212,33 +219,6 @@ def _clock_survey(name: str, variable: Variable, units: str) -> ClockSurvey:
 def _steps(time: np.ndarray) -> np.ndarray:
     """Intervals between the distinct stamps in order of time, since stamps in the file may be out of order."""
     return np.diff(np.unique(time[np.isfinite(time)]))
-
-
-def _meaning(name: str, column: str | int | None, x: np.ndarray, units: str) -> str:
-    """Channel or `time` by the last word of a name where the units allow it, else by the units; empty where unclear."""
-    bare = re.sub(r"[\[(].*", "", name).strip("/ ")  # Units stand in brackets.
-    *before, word = re.split(r"[./]", bare.lower())
-    word = before[-1] if before and word in _NO_WORDS else word
-    if len(x) == 1 or re.search(_VELOCITY, word) or re.search(_STATE, word) or is_set_point(name):
-        return ""
-    for meaning, pattern in _MEANINGS:
-        if re.search(pattern, word) and (not units or TO_SI[units].si in _SI_UNITS[meaning]):
-            shares = (len(np.unique(x)) / len(x), np.mean(np.diff(x) > 0.0)) if len(x) > 2 else (0.0,)
-            runs = max(shares) > _MIN_RUNNING or coarse_rate(x) is not None
-            return meaning if meaning != "time" or (column is None and runs) else ""
-    return _CHANNEL_OF_UNITS.get(TO_SI[units].si, "") if units else ""
-
-
-def is_set_point(name: str) -> bool:
-    """Whether a variable's name, or that of a structure which holds it, says that it is a set-point."""
-    members = re.sub(r"[\[(].*", "", name).strip("/ ").split("/")[-1]
-    return re.search(_SET_POINT, re.sub(r"(?<=[a-z])(?=[A-Z])", "_", members).lower()) is not None
-
-
-def _spelt(name: str) -> str:
-    """Unit at the end of a name such as `stamp_ms`. A single letter is not taken for one."""
-    last = re.split(r"[\s_./]", name.strip())[-1]
-    return unit_name(last) if len(last) > 1 else ""
 
 
 def _time_unit(x: np.ndarray) -> str:

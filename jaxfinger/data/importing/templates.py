@@ -6,14 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from jaxfinger.data.example import RADIUS, link_length, link_mass, link_middle
 from jaxfinger.data.importing.robot import RobotFinger
-from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
-
-# Links of an adult's finger, taken for rods, give the example's numbers.
-_RADIUS = 0.007  # m
-_LENGTHS = (0.045, 0.028, 0.023)  # m, base to tip
-_MASS = 1e4  # kg/m³, over length · radius²: rods of 3200 kg/m³, a little more than aluminium
 
 
 def finger_template(joints: Sequence[str], tendons: Sequence[str]) -> str:
@@ -25,12 +20,12 @@ def finger_template(joints: Sequence[str], tendons: Sequence[str]) -> str:
 [finger]
 gravity = [0.0, 0.0, -9.81]     # m/s², in the frame of the base: how the finger is mounted
 """
-    text += f"fingertip = [{_length(len(joints) - 1)}, 0.0, 0.0]  # m, the contact point, from the last joint\n"
+    text += f"fingertip = [{link_length(len(joints) - 1)}, 0.0, 0.0]  # m, the contact point, from the last joint\n"
     for i, name in enumerate(joints):
-        length, before = _length(i), _length(i - 1) if i else 0.0
-        mass = _mass(i)
-        along = float(f"{mass * _RADIUS**2 / 2:.2g}")
-        across = float(f"{mass * (length**2 / 12 + _RADIUS**2 / 4):.2g}")
+        length, before = link_length(i), link_length(i - 1) if i else 0.0
+        mass = link_mass(i)
+        along = float(f"{mass * RADIUS**2 / 2:.2g}")
+        across = float(f"{mass * (length**2 / 12 + RADIUS**2 / 4):.2g}")
         text += f"""
 [[finger.joints]]               # joint {i + 1} of {len(joints)} from the base, and the link that moves with it
 name = {quoted(name)}
@@ -38,7 +33,7 @@ axis = [0.0, 1.0, 0.0]          # of length 1; [0, 0, 1] for abduction
 origin = [{before}, 0.0, 0.0]   # m, from the joint before it
 limits_deg = [-10.0, 90.0]      # or limits = [-0.17, 1.57] in rad
 mass = {mass}                   # kg
-com = [{_middle(i)}, 0.0, 0.0]  # m, the centre of mass, from this joint
+com = [{link_middle(i)}, 0.0, 0.0]  # m, the centre of mass, from this joint
 inertia = [                     # kg m², about the centre of mass, in the link's frame
     [{along}, 0.0, 0.0],
     [0.0, {across}, 0.0],
@@ -58,13 +53,6 @@ active = true                   # false: a passive tendon, whose force and excur
 # excursion = {{ {as_key(joints[0])} = [0.008, 1e-3] }}  # m/rad, m/rad², of every joint crossed, where CAD knows them
 """
     return text
-
-
-def is_example(finger: FingerDescription) -> bool:
-    """Whether all links of a finger still have the template's masses and centres of mass."""
-    masses = [_mass(i) for i in range(finger.m)]
-    centres = [[_middle(i), 0.0, 0.0] for i in range(finger.m)]
-    return bool(np.array_equal(finger.mass, masses) and np.array_equal(finger.com, centres))
 
 
 def robot_head(robot: str) -> str:
@@ -99,22 +87,10 @@ def _table(name: str, rows: Mapping[str, np.ndarray | np.floating]) -> str:
     return "\n".join([f"\n[{name}]", *lines, ""]) if lines else ""
 
 
-def _length(i: int) -> float:
-    return _LENGTHS[min(i, len(_LENGTHS) - 1)]
-
-
-def _mass(i: int) -> float:
-    return float(f"{_MASS * _length(i) * _RADIUS**2:.2g}")
-
-
-def _middle(i: int) -> float:
-    return round(_length(i) / 2, 4)
-
-
 COLUMNS = """# Which column of which recording is what. Import with:
 #     jaxfinger import RECORDING … --mapping THIS_FILE --output session.h5
 # A column is { from = NAME, scale = 1.0, offset = 0.0, units = UNITS }: (column · scale + offset) in these units.
-# Units: rad, mrad, deg, turn; m, cm, mm, um; N, mN, kN, gf, kgf; N m, N cm, N mm; s, ms, us, ns.
+# Units: rad, mrad, deg, turn; m, cm, mm, um; N, mN, kN, gf, kgf; N m, N cm, N mm; s, ms, us, ns, min, h.
 # Leave out what was not measured.
 """
 

@@ -15,6 +15,8 @@ from jaxfinger.data.toml import Place
 from jaxfinger.data.units import TO_SI, unit_name
 from jaxfinger.errors import listed
 
+UNKNOWN = "?"  # what a proposal writes in place of a name that it cannot guess
+
 
 @dataclass(frozen=True)
 class Source:
@@ -43,6 +45,11 @@ class Source:
         if name in within:
             where.fail(f"derives {name!r} from itself, and the recording has no variable of this name; name another")
         there = sorted([*self.recording.variables, *self.derived])
+        if name == UNKNOWN:
+            rate = ", or write `rate_hz` in place of `time`" if where.keys[-1:] == ("time",) else ""
+            where.fail(
+                f"is still to be filled in; name a variable of {self.recording.path.name}{rate}: {listed(there, 30)}"
+            )
         elsewhere = "; move what only some recordings hold to their trials" if where.keys[:1] == ("channels",) else ""
         return where.fail(f"{said}, which the recording has not; it has {listed(there, 30)}{elsewhere}")
 

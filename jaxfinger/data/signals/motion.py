@@ -175,14 +175,15 @@ def stretches_of(inside: Bool[np.ndarray, " M"]) -> list[tuple[int, int]]:
 
 
 def pulled_slowly(trial: Trial, pulled: Float[np.ndarray, " N"], sizes: Sizes) -> bool:
-    """Whether a tendon is pulled in holds or in slow ramps, so that its friction can be identified.
+    """Whether a tendon is pulled in several holds or in slow ramps, so that its friction can be identified.
 
-    True as well for a tension that is not measured or too short to tell. `sizes` are those of the session.
+    One hold alone is the rest before steps that are too quick. True as well for a tension that is not measured or too
+    short to tell. `sizes` are those of the session.
     """
     if len(pulled) < 3 or not np.isfinite(pulled).all():
         return True
     hold, step = find_holds(trial, sizes.slow_pace), median(np.diff(trial.time))
-    if (hold >= 0).any():
+    if hold.max() >= (1 if trial.hold is None else 0):
         return True
     size = max(1, round(sizes.slow_pace / (RAMP_BLOCKS * step)))
     means = pulled[: len(pulled) // size * size].reshape(-1, size).mean(axis=1)[:, None]

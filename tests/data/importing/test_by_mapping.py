@@ -15,6 +15,7 @@ from jaxfinger.data.importing.by_mapping import import_file
 from jaxfinger.data.importing.matlab import load_mat
 from jaxfinger.data.importing.proposal import proposal
 from jaxfinger.data.importing.sources import load_recording
+from jaxfinger.data.units import TO_SI
 from jaxfinger.errors import UserError
 from tests.data.conftest import ONE_JOINT
 
@@ -158,6 +159,8 @@ def test_sampling_rate_span_and_own_clock(mapping, tmp_path):
             'from = "encoder"',
             r"'encoder' of log.mat, which the recording has not; it has enc, extra, gain",
         ),
+        ('from = "enc"', 'from = "?"', r"is still to be filled in; name a variable of log.mat: enc, extra"),
+        ('time = "t"', 'time = "?"', r"time: is still to be filled in; .* or write `rate_hz` in place of `time`: enc"),
         (", column = 1", "", "has 2 columns; choose one by `column`"),
         ('from = "pull"', 'from = "gain"', "has 1 samples where the trial's time has 500"),
         ('units = "deg"', 'units = "mm"', "units 'mm'; it must be one of rad, mrad, deg"),
@@ -236,6 +239,21 @@ def test_units_that_no_mapping_converts_need_a_scale(mapping, tmp_path, stated, 
         if f"the recording states {stated}, and the mapping reads N; write `scale`" in f.message
     ]
     assert len(said) == warned
+
+
+@pytest.mark.parametrize(("units", "warned"), [("N", ['write units = "kgf"']), ("kgf", [])])
+def test_a_tension_in_kg_is_read_in_kgf(mapping, tmp_path, units, warned):
+    rows = np.column_stack([TIME, 40 + 30 * np.sin(TIME), 2 + 0.01 * np.sin(TIME), 5 + 4 * np.sin(TIME)])
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header="t,enc,force [kg],pull", comments="")
+    text = MAPPING.split("tendon_force")[0].replace(", column = 1", "")
+    text += f'tendon_force.T1 = {{ from = "force [kg]", units = "{units}" }}\n'
+    mapping.write_text(text + 'tendon_excursion.T1 = { from = "pull", units = "mm" }\n')
+    report = Report()
+    session = import_file([tmp_path / "log.csv"], mapping, tmp_path / "out.h5", report=report)
+    assert [f.message.split("; ")[-1] for f in report if "states kg" in f.message] == warned
+    force = session["01-ID2"].tendon_force
+    assert force is not None
+    np.testing.assert_allclose(force[0, 0], 2.0 * TO_SI[units].factor, rtol=1e-6)
 
 
 def test_a_clock_in_another_unit_than_the_recording_states_is_said(mapping, tmp_path):

@@ -1,9 +1,15 @@
 """CSV files of many programs, and files with wrong lines."""
 
+import re
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from jaxfinger.data.importing.csv_file import load_csv
+from jaxfinger.data.importing.proposal import proposal
+from jaxfinger.data.units import without_units
 from jaxfinger.errors import UserError
 
 NUMBERS = "0.00,1.5,-3\n0.01,1.6,-4\n0.02,1.7,-5\n"
@@ -170,11 +176,30 @@ def test_a_ratio_has_the_unit_of_a_dash(tmp_path):
     assert [v.units for v in load(tmp_path, "t,a,b\ns,-,-\n" + NUMBERS).variables.values()] == ["s", "-", "-"]
 
 
-def test_a_time_of_day_is_told_how_to_be_written(tmp_path):
-    found = load(tmp_path, "t,a\n12:00:00.000,1\n12:00:00.010,2\n12:00:00.020,3\n")
+@pytest.mark.parametrize(
+    ("header", "rows"),
+    [
+        ("t [ms],a", ["12:00:59.990,1", "12:01:00.000,2", "12:01:00.010,3"]),
+        ("t;a", ["0:00:59,990;1,5", "0:01:00;2,5", "0:01:00,010;3,5"]),
+        ("t;a", ["31.01.2026 12:00:59,990;1,5", "31.01.2026 12:01:00;2,5", "31.01.2026 12:01:00,010;3,5"]),
+        ("t\ta", ["31.01.2026, 12:00:59.990\t1.5", "31.01.2026, 12:01:00\t2.5", "31.01.2026, 12:01:00.010\t3.5"]),
+    ],
+    ids=["of day", "a comma", "dotted", "dotted, a comma"],
+)
+def test_times_of_day_and_dotted_dates_are_seconds(tmp_path, header, rows):
+    """Whatever unit the header states."""
+    time = load(tmp_path, "\n".join([header, *rows, ""])).variables[re.split("[,;\t]", header)[0]]
+    np.testing.assert_allclose(np.diff(time.values), 0.01, atol=1e-6)
+    assert time.units == "s"
+
+
+@pytest.mark.parametrize("cell", ["01/31/2026 12:00:00.0", "12:00", "11:59:58 PM", "12:61:00"])
+def test_a_time_that_is_not_clear_is_told_how_to_be_written(tmp_path, cell):
+    found = load(tmp_path, "t,a\n" + "".join(f"{cell},{k}\n" for k in range(3)))
     assert (
         "in line 2, which is no number, and 2 more cells of this kind; write seconds, or dates" in found.unusable["t"]
     )
+    assert f'# "t" holds {cell!r} in line 2' in proposal([replace(found, path=Path("log.csv"))])
 
 
 def test_a_line_of_another_width(tmp_path):
@@ -276,3 +301,27 @@ def test_joint_states_whose_names_change_are_refused(tmp_path):
 def test_other_tables_without_names_are_no_joint_states(tmp_path, before):
     text = "".join(f"{before.format(k)},left,walk,0.1,0.2,{k}\n" for k in range(9))
     assert "column 4" in load(tmp_path, text).variables
+
+
+def test_lines_of_numbers_above_the_first_whole_sample_are_said(tmp_path):
+    """Nothing that was recorded is left out without a word."""
+    rows = [f"{k / 100},{k},{k}" for k in range(20)]
+    assert load(tmp_path, "\n".join(["t,a,b", *rows])).remarks == ()
+    found = load(tmp_path, "\n".join(["t,a,b", "0.0,?,0", "0.01,?,1", *rows[2:]]))
+    assert found.remarks == ("has numbers in line 2 above its first whole sample, which are left out",)
+    assert len(found.variables["t"].values) == 18
+
+
+def test_a_minus_sign_of_typesetters_is_one(tmp_path):
+    found = load(tmp_path, "t,a\n" + "".join(f"{k},\u2212{k}.5\n" for k in range(20)))
+    np.testing.assert_array_equal(found.variables["a"].values, -0.5 - np.arange(20))
+
+
+@pytest.mark.parametrize(
+    ("name", "units"),
+    [("q/rad", "rad"), ("F / N", "N"), ("Zeit/ms", "ms"), ("speed/(rad/s)", "rad/s"), ("/hand/m", ""), ("a/b", "")],
+)
+def test_units_may_stand_behind_a_stroke(tmp_path, name, units):
+    found = load(tmp_path, f"x,{name}\n" + "1,2\n2,3\n3,4\n")
+    assert found.variables[name].units == units
+    assert without_units(name) == {"/hand/m": "hand/m", "a/b": "a/b"}.get(name, re.split(" ?/", name)[0])

@@ -76,6 +76,48 @@ def test_a_clock_is_told_or_asked_for_and_no_rate_is_invented(tmp_path, name, ti
     assert "rate_hz =" not in text
 
 
+def test_a_log_without_a_clock_is_said_to_be_as_fast_as_its_rate(tmp_path):
+    """A rate that is wrong by ten shows in how long the log lasts and how fast its joint moves."""
+    path = tmp_path / "log.csv"
+    angles = 40.0 + 30.0 * np.sin(np.arange(2000) / 50.0)
+    np.savetxt(path, angles, "%.6f", header="angle_deg", comments="")
+    said = proposal([load_recording(path)])
+    assert '# 2000 samples: at 100 Hz they last 20 s and "angle_deg" moves by up to 59.9 deg in 1 s; at 1000 Hz' in said
+    assert 'last 2 s and "angle_deg" moves by up to 599 deg in 1 s' in said
+
+
+def test_words_that_tell_trials_apart_are_named_in_the_proposal(tmp_path):
+    path = tmp_path / "log.csv"
+    rows = [f"{name},{t:.2f},{80.0 * np.sin(t):.4f}" for name in ("first", "second") for t in np.arange(300) / 100]
+    path.write_text("\n".join(["trial,t,angle_deg", *rows, ""]))
+    assert "# \"trial\" holds the words 'first', 'second'; a trial's `where` can test it" in proposal(
+        [load_recording(path)]
+    )
+
+
+def test_a_count_of_samples_is_no_clock_where_there_is_another(tmp_path):
+    """As in logs of robots that write an index before the stamp; alone it may be a clock in ms."""
+    path, count = tmp_path / "log.csv", np.arange(900)
+    columns = {"time_index": count, "timestamp": 5e7 + count / 200, "q": np.sin(count / 50)}
+    rows = np.column_stack(list(columns.values()))
+    np.savetxt(path, rows, "%.6f", ",", header=",".join(columns), comments="")
+    assert 'time = "timestamp"\n' in proposal([load_recording(path)])
+    np.savetxt(path, rows[:, [0, 2]], "%.6f", ",", header="time_index,q", comments="")
+    said = 'time = { from = "time_index", units = "ms" }   # it counts by one: if it counts samples, write `rate_hz`'
+    assert said in proposal([load_recording(path)])
+    np.savetxt(path, rows[:, [0, 2]], "%.6f", ",", header="time [ms],q", comments="")
+    assert "it counts by one" not in proposal([load_recording(path)])
+
+
+def test_columns_without_a_value_are_no_channel(tmp_path):
+    """Unless others of their family have values: then they keep the places of these."""
+    path, rows = tmp_path / "log.csv", [f"{k / 100},{np.sin(k / 50):.5f},,,,0.1" for k in range(900)]
+    path.write_text("\n".join(["t,q_1,pos_1,pos_2,tau_1,tau_2", *rows, ""]))
+    said = proposal([load_recording(path)])
+    assert "channels.q.J2" not in said
+    assert 'channels.joint_torque.J2 = { from = "tau_2"' in said
+
+
 def test_a_clock_without_a_name_is_the_column_that_rises_evenly(tmp_path):
     """A count of samples does not show their times, and a joint that turns one way does so at several speeds."""
     path, n = tmp_path / "log.csv", np.arange(500)
