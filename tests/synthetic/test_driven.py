@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
+from jaxfinger.compilation import quick_options
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import prepare
 from jaxfinger.experiments.predict import predict_compiled
@@ -25,7 +26,7 @@ from jaxfinger.synthetic import (
     true_model,
 )
 from jaxfinger.synthetic.controller import distribute
-from jaxfinger.synthetic.driven import QUICK, at_rest, friction_impulse, step
+from jaxfinger.synthetic.driven import at_rest, friction_impulse, step
 from jaxfinger.synthetic.routes import PolynomialRoute
 from jaxfinger.synthetic.specimen import GrowingFriction, PolynomialFriction, PolynomialSpring
 
@@ -45,7 +46,7 @@ def _potential(q):
 
 
 def _energy(q, v):
-    M = np.asarray(jax.jit(rigid_body.mass_matrix, compiler_options=QUICK)(FINGER, jnp.asarray(q)))
+    M = np.asarray(jax.jit(rigid_body.mass_matrix, compiler_options=quick_options())(FINGER, jnp.asarray(q)))
     return 0.5 * np.einsum("it,ijt,jt->t", v, M, v) + _potential(q)
 
 
@@ -115,7 +116,7 @@ def test_frictionless_undriven_finger_keeps_its_energy():
     )
 
     start = at_rest(FINGER, jnp.array([0.6, 0.4, 0.7]))
-    advance = jax.jit(lambda state, h: step(free, FINGER, state, jnp.zeros(5), h), compiler_options=QUICK)
+    advance = jax.jit(lambda state, h: step(free, FINGER, state, jnp.zeros(5), h), compiler_options=quick_options())
 
     def drift(h):
         """Change of energy over 50 ms of free motion, as a share of the potential energy that became kinetic."""
@@ -132,7 +133,7 @@ def test_frictionless_undriven_finger_keeps_its_energy():
 
 def test_finger_sticks_where_friction_can_hold_it():
     """Nothing moves under tensions between the one that pulls the finger up and the one that lets it down."""
-    advance = jax.jit(lambda state, f: step(SPECIMEN, FINGER, state, f, 5e-4), compiler_options=QUICK)
+    advance = jax.jit(lambda state, f: step(SPECIMEN, FINGER, state, f, 5e-4), compiler_options=quick_options())
     q0 = np.deg2rad([[55.0], [50.0], [40.0]])
     zero = np.zeros_like(q0)
     resisting = np.asarray(rigid_body.inverse_dynamics(FINGER, q0, zero, zero)) + SPECIMEN.elastic(q0)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfinger.compilation import quick_options
 from jaxfinger.model import Motion, external_torque, fingertip_force
 from jaxfinger.synthetic import (
     SpecimenPlant,
@@ -14,7 +15,6 @@ from jaxfinger.synthetic import (
     session_plan,
     true_model,
 )
-from jaxfinger.synthetic.driven import QUICK
 from jaxfinger.synthetic.plant import BLOCK_SAMPLES, joint_tension
 
 SPECIMEN = polynomial_finger(paper_finger())
@@ -32,8 +32,8 @@ def plans():
 
 
 SAMPLES = 300
-TORQUE = jax.jit(external_torque, compiler_options=QUICK)
-FORCE = jax.jit(fingertip_force, compiler_options=QUICK)
+TORQUE = jax.jit(external_torque, compiler_options=quick_options())
+FORCE = jax.jit(fingertip_force, compiler_options=quick_options())
 
 
 def _sampled(plan, x):
