@@ -2,8 +2,8 @@
 
     python benchmarks/devices.py
 
-It is run on the processor first, and then on a GPU where there is one: the same code, and results that are compared
-with the processor's. First times include compilation.
+The same code runs on the processor first, and then on a GPU where there is one. Its results are compared with the
+processor's. Each work is done twice: the first time includes compilation.
 """
 
 import time
@@ -40,9 +40,8 @@ def timed(what: str, work: Callable[[], Result]) -> Result:
 
 
 def devices() -> list[jax.Device]:
-    """The first device of every kind, the processor first."""
-    others = [] if jax.default_backend() == "cpu" else jax.devices()[:1]
-    return [*jax.devices("cpu")[:1], *others]
+    """The processor, and the first device of another kind that JAX uses here."""
+    return list(dict.fromkeys([jax.devices("cpu")[0], jax.devices()[0]]))
 
 
 def main() -> None:
@@ -50,7 +49,7 @@ def main() -> None:
     with jax.default_device(jax.devices("cpu")[0]):
         session = measure(clean_session(recipe_from(RECIPE)), 0)
     finger, rng = Finger.from_description(session.finger), np.random.default_rng(0)
-    reference = None
+    inverse_dynamics, on_processor = eqx.filter_jit(rigid_body.inverse_dynamics), None
     for device in devices():
         with jax.default_device(device):
             print(device)
@@ -59,12 +58,12 @@ def main() -> None:
             weights = draw_weights(compressed.strata, RESAMPLES, np.random.default_rng(0))
             refits, _ = timed(f"{RESAMPLES} refits", lambda c=compressed, w=weights: refit(c, w))
             for samples in SAMPLES:
-                moving = jax.device_put([jnp.asarray(x) for x in rng.uniform(-1, 1, (3, finger.m, samples))])
-                inverse = eqx.filter_jit(rigid_body.inverse_dynamics)
-                timed(f"inverse dynamics, {samples:,} samples", lambda f=inverse, x=moving: f(finger, *x))
+                moving = [jnp.asarray(x) for x in rng.uniform(-1, 1, (3, finger.m, samples))]
+                timed(f"inverse dynamics, {samples:,} samples", lambda x=moving: inverse_dynamics(finger, *x))
             estimates = np.stack([np.asarray(ravel(fit.model)), *np.asarray(refits)])[:, fit.estimated]
-            reference = reference if reference is not None else estimates
-            difference = np.abs((estimates - reference) / fit.std[fit.estimated]).max(axis=1)
+            if on_processor is None:
+                on_processor = estimates
+            difference = np.abs((estimates - on_processor) / fit.std[fit.estimated]).max(axis=1)
             print(f"  largest difference of an estimate from the processor's: {difference[0]:.0e} standard deviations,")
             print(f"  of a refit {difference[1:].max():.0e}")
 

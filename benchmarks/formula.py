@@ -9,11 +9,11 @@
 `weigh` searches every case and stores the evidence of every set of causes that the search weighs. With `--withheld`
 the first of its effects is taken out of the catalogue, so that something unlisted is at work. `score` prints, by
 kind of case, the log score of these records: the mean over cases of Σ log P of what is true, over all causes that a
-session's trials can show and «something unlisted»; their Brier score Σ (P − truth)²; and how many of the causes with
-the probability `NAMED`, and of those with less than that but `DOUBTED`, are at work. `fit` maximises the log score.
-Probabilities are clipped by `CLIP`, since no search visits every set. Each number has a log-normal prior around its
-present value, a factor of `PRIOR_FACTOR` per standard deviation. Scores are cross-validated over `FOLDS` parts of the
-cases.
+session's trials can show and «something unlisted»; their Brier score Σ (P − truth)²; and how many causes are probable
+(`MIN_NAMED_PROBABILITY`) or doubted (less, but `MIN_DOUBTED_PROBABILITY`), of those that are at work and of others.
+`fit` maximises the log score. Probabilities are clipped by `CLIP`, since no search visits every set. Each number has a
+log-normal prior around its present value, a factor of `PRIOR_FACTOR` per standard deviation. Scores are cross-validated
+over `FOLDS` parts of the cases.
 """
 
 import argparse
@@ -31,11 +31,10 @@ from scipy.optimize import minimize
 from jaxfinger.data import read_session
 from jaxfinger.gap.columns import Counts
 from jaxfinger.gap.costs import CauseKey, Costs
-from jaxfinger.gap.diagnose import search_for_causes
+from jaxfinger.gap.diagnose import candidate_effects, search_for_causes
 from jaxfinger.gap.formula import Evidence, Parameters, log_likelihood, unexplained, unlisted
 from jaxfinger.gap.laws_of_time import without_laws_of_time
-from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY as NAMED
-from jaxfinger.gap.posterior import genuine_probabilities
+from jaxfinger.gap.posterior import MIN_NAMED_PROBABILITY, genuine_probabilities
 from jaxfinger.gap.problem import build
 from jaxfinger.gap.sets import Weighed
 from jaxfinger.gap.signatures import catalogue_for
@@ -44,7 +43,8 @@ from jaxfinger.sealed.run import CASES_PER_PROCESS
 from jaxfinger.sealed.truth import UNLISTED, read_truth
 
 CLIP = 1e-3  # least probability: a cause that no visited set has costs at most 7 nats
-DOUBTED = 0.1  # least probability of a cause that counts as doubted
+# Least probability of a cause that `score` counts as doubted: most causes that were never likely have less than 0.01.
+MIN_DOUBTED_PROBABILITY = 0.1
 PRIOR_FACTOR = 3.0  # wide: it only keeps numbers that the cases do not determine
 FOLDS = 5
 MAX_SETS = 100  # likeliest sets of a case that `fit` keeps, for speed
@@ -109,10 +109,9 @@ def weigh(folder: Path, withheld: bool) -> Record | None:
     recipe, truth = Recipe(), read_truth(folder, folder.parent.with_name(f"{folder.parent.name}-truth"))
     if withheld and not truth.listed:
         return None
-    out = {truth.listed[0][0]} if withheld else set()
+    without = (truth.listed[0][0],) if withheld else ()
     problem = build(read_session(folder / "fit.h5"), recipe)
-    catalogue = catalogue_for(recipe, None, problem.nominal.finger)
-    effects = {k: v for k, v in catalogue.items() if k not in out | set(recipe.model.terms)}
+    effects = candidate_effects(problem, catalogue_for(recipe, None, problem.nominal.finger), {}, without)
     search, _ = search_for_causes(without_laws_of_time(problem, effects), effects)
     costs, visited = search.costs, search.visited
     return Record(
@@ -121,7 +120,7 @@ def weigh(folder: Path, withheld: bool) -> Record | None:
         visited.evidence,
         frozenset(keys for keys, how in visited.weighed.items() if how is Weighed.SCREENED),
         search.table.explainable,
-        frozenset(UNLISTED if effect in out else (effect, site) for effect, site in truth.at_work),
+        frozenset(UNLISTED if effect in without else (effect, site) for effect, site in truth.at_work),
         costs.parameters,
     )
 
@@ -159,10 +158,10 @@ def score(records: list[Record], p: Parameters) -> None:
         found = [(r, r.probabilities(p)) for r in some]
         brier = np.mean([sum((P - (k in r.at_work)) ** 2 for k, P in of.items()) for r, of in found])
         causes = [(P, k in r.at_work) for r, of in found for k, P in of.items() if k != UNLISTED]
-        probable = [true for P, true in causes if P >= NAMED]
-        doubted = [true for P, true in causes if DOUBTED <= P < NAMED]
+        probable = [true for P, true in causes if P >= MIN_NAMED_PROBABILITY]
+        doubted = [true for P, true in causes if MIN_DOUBTED_PROBABILITY <= P < MIN_NAMED_PROBABILITY]
         listed = sum(len(r.at_work - {UNLISTED}) for r in some)
-        called = sum(of[UNLISTED] >= NAMED for _, of in found)
+        called = sum(of[UNLISTED] >= MIN_NAMED_PROBABILITY for _, of in found)
         print(
             f"{kind}: {len(some)} cases; log score {mean(some, p):.2f}, Brier score {brier:.2f}; of {listed} causes at "
             f"work {sum(probable)} probable, {sum(doubted)} doubted; of others {len(probable) - sum(probable)} "
@@ -182,8 +181,8 @@ def main() -> None:
     if options.what == "weigh":
         options.records.mkdir(parents=True, exist_ok=True)
         folders = sorted(f.parent for cases in options.cases for f in cases.glob("*/fit.h5"))
-        what = "withheld.pickle" if options.withheld else "pickle"
-        files = {f: options.records / f"{f.parent.name}-{f.name}.{what}" for f in folders}
+        suffix = ".withheld.pickle" if options.withheld else ".pickle"
+        files = {f: options.records / f"{f.parent.name}-{f.name}{suffix}" for f in folders}
         todo = [f for f, file in files.items() if not file.exists()]
         at_once = options.workers * CASES_PER_PROCESS
         for some in (todo[i : i + at_once] for i in range(0, len(todo), at_once)):

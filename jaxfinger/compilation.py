@@ -27,7 +27,7 @@ QUICK = {
 
 @cache
 def quick_options() -> dict[str, bool | int | str]:
-    """`QUICK` without the options that this version of XLA lacks, and those that the environment's XLA_FLAGS sets."""
+    """`QUICK`, without what the environment's XLA_FLAGS sets itself and what this version of XLA does not know."""
     return {k: v for k, v in QUICK.items() if k not in os.environ.get("XLA_FLAGS", "") and _has_option(k, v)}
 
 

@@ -41,7 +41,8 @@ OWN = ("builtins", "jaxfinger", *LIBRARIES)  # packages whose code a key holds
 class Program:
     """A function compiled by XLA for each structure of its arguments, and kept on disk.
 
-    Arrays are traced, and all other leaves of the arguments are constants, as for `equinox.filter_jit`.
+    Arrays are traced, and all other leaves of the arguments are constants, as for `equinox.filter_jit`. `options` gives
+    XLA's options. It is called where a program is compiled, since what XLA knows is found out by compiling.
     """
 
     def __init__(self, f: Callable, options: Callable[[], dict[str, Any]]):

@@ -9,7 +9,7 @@ import numpy as np
 if TYPE_CHECKING:
     from jaxfinger.data.session import FingerDescription
 
-# Links of an adult's finger, taken for rods, give the example's numbers.
+# Links of an adult's finger, taken for rods of this radius, give the example's numbers.
 RADIUS = 0.007  # m
 _LENGTHS = (0.045, 0.028, 0.023)  # m, base to tip
 _MASS = 1e4  # kg/m³, over length · radius²: rods of 3200 kg/m³, a little more than aluminium

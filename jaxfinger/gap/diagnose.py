@@ -122,7 +122,7 @@ def diagnose(
     if next(measured_columns(problem), None) is None:
         return _nothing_judged(problem, partial(diagnosis, problem=problem))
 
-    candidates = _candidates(problem, catalogue, changed, without)
+    candidates = candidate_effects(problem, catalogue, changed, without)
     problem = without_laws_of_time(problem, candidates, against)
 
     def judged(problem: Problem) -> Diagnosis:
@@ -245,7 +245,7 @@ def _nothing_judged(problem: Problem, diagnosis: Callable[..., Diagnosis]) -> Di
     )
 
 
-def _candidates(
+def candidate_effects(
     problem: Problem,
     catalogue: Mapping[str, type[CatalogueEffect]],
     changed: Mapping[str, type[CatalogueEffect]],

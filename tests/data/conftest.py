@@ -101,6 +101,7 @@ def session() -> Session:
 
 
 # The start of a mapping file, up to the end of the finger.
+GAPPED_MS = np.delete(np.arange(1000), [500, 501, 502, 503, 504, 505, 506]) * 5.0  # stamps, ms, with a gap
 ONE_JOINT = """
 specimen = "bench finger"
 [finger]

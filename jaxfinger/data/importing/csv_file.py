@@ -229,14 +229,19 @@ def _cell(cell: str) -> float | None:
     return np.nan if not cell or cell.lower() in _MISSING else None
 
 
+def _numbers(dialect: _Dialect, cells: Sequence[str], numeric: Sequence[bool]) -> list[float | None]:
+    """Numbers of a line in the columns of numbers, as far as it reaches."""
+    return [dialect.number(cell) for cell, number in zip(cells, numeric, strict=False) if number]
+
+
 def _is_sample(dialect: _Dialect, cells: Sequence[str], numeric: Sequence[bool]) -> bool:
-    values = [dialect.number(cell) for cell, number in zip(cells, numeric, strict=False) if number]
+    values = _numbers(dialect, cells, numeric)
     return len(cells) == len(numeric) and None not in values and not all(np.isnan(v) for v in values if v is not None)
 
 
 def _holds_numbers(dialect: _Dialect, cells: Sequence[str], numeric: Sequence[bool]) -> bool:
     """Whether most of a line's cells are numbers where a sample has numbers."""
-    values = [dialect.number(cell) for cell, number in zip(cells, numeric, strict=False) if number]
+    values = _numbers(dialect, cells, numeric)
     count = sum(value is not None and not np.isnan(value) for value in values)
     return len(cells) == len(numeric) and 2 * count > len(values)
 

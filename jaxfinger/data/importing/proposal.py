@@ -144,11 +144,9 @@ class _Log:
         Families of columns without any value are left out.
         """
         samples = self.clock.samples if self.clock is not None else self.count
-        family = lambda s: re.sub(r"\d+", "#", s.name)  # noqa: E731
-        filled = {family(s) for s in self.seen if s.missing < s.samples}
-        timed = [s for s in self.seen if family(s) in filled]
-        timed = [s for s in timed if s.samples == samples or self.recording.variables[s.name].clock]
-        return [s for s in timed if s.meaning not in ("", "time") and s.samples > 2]
+        filled = {_family(s) for s in self.seen if s.missing < s.samples}
+        timed = [s for s in self.seen if s.samples == samples or self.recording.variables[s.name].clock]
+        return [s for s in timed if s.meaning not in ("", "time") and s.samples > 2 and _family(s) in filled]
 
     @property
     def channels(self) -> set[str]:
@@ -319,6 +317,11 @@ def _pace(log: _Log, angles: Sequence[ColumnSurvey]) -> list[str]:
         for rate in _USUAL_RATES
     ]
     return [f"# {len(count)} samples: {'; '.join(said)}"]
+
+
+def _family(seen: ColumnSurvey) -> str:
+    """What the names of columns that differ in numbers alone have in common."""
+    return re.sub(r"\d+", "#", seen.name)
 
 
 def _called(seen: ColumnSurvey) -> str:

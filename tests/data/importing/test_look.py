@@ -16,16 +16,20 @@ from jaxfinger.data.importing.proposal import proposal
 from jaxfinger.data.importing.sources import load_recording
 from jaxfinger.data.importing.survey import clocks_of, columns_of
 from jaxfinger.data.units import TO_SI
-from tests.data.conftest import ONE_JOINT, make_finger
+from tests.data.conftest import GAPPED_MS, ONE_JOINT, make_finger
 
 CASES = Path(__file__).parents[1] / "cases"
-TIME = np.delete(np.arange(1000), [500, 501, 502, 503, 504, 505, 506]) * 5.0
 
 
 @pytest.fixture
 def log(tmp_path):
     """CSV file with a gap, in degrees, N mm and ms, which only its ranges show."""
-    columns = [TIME, 40 + 30 * np.sin(TIME / 1e3), 80 * np.cos(TIME / 1e3), 300 * np.sin(TIME / 1e2)]
+    columns = [
+        GAPPED_MS,
+        40 + 30 * np.sin(GAPPED_MS / 1e3),
+        80 * np.cos(GAPPED_MS / 1e3),
+        300 * np.sin(GAPPED_MS / 1e2),
+    ]
     path = tmp_path / "log.csv"
     np.savetxt(path, np.column_stack(columns), "%.6f", ",", header="t,enc,dq,tau", comments="")
     return path
@@ -44,48 +48,6 @@ def test_units_rates_and_gaps(log):
     assert (clock.rate, clock.gaps, clock.longest) == (pytest.approx(200.0), 1, pytest.approx(0.04))
 
 
-def test_a_shuffled_clock_is_said_and_its_rate_is_that_of_sorted_stamps(tmp_path, capsys):
-    path, order = tmp_path / "log.csv", np.random.default_rng(5).permutation(len(TIME))
-    table = np.column_stack([TIME, 40 + 30 * np.sin(TIME / 1e3)])[order]
-    np.savetxt(path, table, "%.6f", ",", header="t,enc", comments="")
-    recording = load_recording(path)
-    seen = columns_of(recording)
-    (clock,) = clocks_of(recording, seen)
-    assert (seen[0].units, clock.rate, clock.disordered) == ("ms", pytest.approx(200.0), (np.diff(order) < 0).sum())
-    assert main(["look", str(path)]) in (0, None)
-    said = capsys.readouterr().out
-    assert f"{clock.disordered} stamps out of order or repeated, the rate is of sorted ones" in said
-    assert "sort = true" in said
-
-
-@pytest.mark.parametrize(
-    ("name", "time", "said"),
-    [
-        ("t_ms", np.cumsum(np.random.default_rng(0).choice([9, 10, 10, 10, 11], 500)), 'time = { from = "t_ms"'),
-        ("time_s", np.tile(np.arange(300) / 100, 2), "the time begins again after sample 299"),
-        ("counter", np.zeros(500), 'time = "?"'),
-    ],
-    ids=["uneven", "pasted twice", "none"],
-)
-def test_a_clock_is_told_or_asked_for_and_no_rate_is_invented(tmp_path, name, time, said):
-    path = tmp_path / "log.csv"
-    table = np.column_stack([time, 40 + 30 * np.sin(np.arange(len(time)) / 50)])
-    np.savetxt(path, table, "%.6f", ",", header=f"{name},angle_deg", comments="")
-    text = proposal([load_recording(path)])
-    assert said in text
-    assert "rate_hz =" not in text
-
-
-def test_a_log_without_a_clock_is_said_to_be_as_fast_as_its_rate(tmp_path):
-    """A rate that is wrong by ten shows in how long the log lasts and how fast its joint moves."""
-    path = tmp_path / "log.csv"
-    angles = 40.0 + 30.0 * np.sin(np.arange(2000) / 50.0)
-    np.savetxt(path, angles, "%.6f", header="angle_deg", comments="")
-    said = proposal([load_recording(path)])
-    assert '# 2000 samples: at 100 Hz they last 20 s and "angle_deg" moves by up to 59.9 deg in 1 s; at 1000 Hz' in said
-    assert 'last 2 s and "angle_deg" moves by up to 599 deg in 1 s' in said
-
-
 def test_words_that_tell_trials_apart_are_named_in_the_proposal(tmp_path):
     path = tmp_path / "log.csv"
     rows = [f"{name},{t:.2f},{80.0 * np.sin(t):.4f}" for name in ("first", "second") for t in np.arange(300) / 100]
@@ -93,20 +55,6 @@ def test_words_that_tell_trials_apart_are_named_in_the_proposal(tmp_path):
     assert "# \"trial\" holds the words 'first', 'second'; a trial's `where` can test it" in proposal(
         [load_recording(path)]
     )
-
-
-def test_a_count_of_samples_is_no_clock_where_there_is_another(tmp_path):
-    """As in logs of robots that write an index before the stamp; alone it may be a clock in ms."""
-    path, count = tmp_path / "log.csv", np.arange(900)
-    columns = {"time_index": count, "timestamp": 5e7 + count / 200, "q": np.sin(count / 50)}
-    rows = np.column_stack(list(columns.values()))
-    np.savetxt(path, rows, "%.6f", ",", header=",".join(columns), comments="")
-    assert 'time = "timestamp"\n' in proposal([load_recording(path)])
-    np.savetxt(path, rows[:, [0, 2]], "%.6f", ",", header="time_index,q", comments="")
-    said = 'time = { from = "time_index", units = "ms" }   # it counts by one: if it counts samples, write `rate_hz`'
-    assert said in proposal([load_recording(path)])
-    np.savetxt(path, rows[:, [0, 2]], "%.6f", ",", header="time [ms],q", comments="")
-    assert "it counts by one" not in proposal([load_recording(path)])
 
 
 def test_columns_without_a_value_are_no_channel(tmp_path):
@@ -118,32 +66,22 @@ def test_columns_without_a_value_are_no_channel(tmp_path):
     assert 'channels.joint_torque.J2 = { from = "tau_2"' in said
 
 
-def test_a_clock_without_a_name_is_the_column_that_rises_evenly(tmp_path):
-    """A count of samples does not show their times, and a joint that turns one way does so at several speeds."""
-    path, n = tmp_path / "log.csv", np.arange(500)
-    time = 1297.5 + np.cumsum(np.random.default_rng(0).choice([0.008, 0.010, 0.012], 500))
-    angle = np.cos(np.pi * (1.0 - n / 500))
-    for before, clock in (([], None), ([time], "column 2"), ([0.2 * n], "column 2")):
-        np.savetxt(path, np.column_stack([n, angle, *before, np.sin(n / 20)]), "%.6f", ",")
-        said = proposal([load_recording(path)])
-        assert (f'time = "{clock}"   # guessed' if clock else 'time = "?"') in said, said
-    np.savetxt(path, np.column_stack([n, angle, time, np.sin(n / 20)]), header="n q t tau", comments="")
-    assert 'time = "t"\n' in proposal([load_recording(path)])
-
-
 @pytest.mark.parametrize("name", ["Load Cell1", "load_cell_2", "LoadCell"])
 def test_a_load_cell_shows_a_tension(name, tmp_path):
     path = tmp_path / "log.csv"
-    np.savetxt(path, np.column_stack([TIME, 5 + np.sin(TIME)]), "%.6f", ",", header=f"t,{name}", comments="")
+    np.savetxt(path, np.column_stack([GAPPED_MS, 5 + np.sin(GAPPED_MS)]), "%.6f", ",", header=f"t,{name}", comments="")
     assert columns_of(load_recording(path))[1].meaning == "tendon_force"
 
 
 def test_of_several_sets_of_torques_one_that_changes_is_read_and_the_others_are_named(tmp_path):
     """A robot's log has torques of sensors, of currents and of its own model, without a word on which is which."""
-    path, torques = tmp_path / "log.csv", [np.sin(TIME / 1e3), np.cos(TIME / 1e3)]
-    angles, dead = [0.5 + 0.5 * np.sin(TIME / 1e3), 0.5 + 0.5 * np.cos(TIME / 1e3)], [0.0 * TIME, 0.0 * TIME]
+    path, torques = tmp_path / "log.csv", [np.sin(GAPPED_MS / 1e3), np.cos(GAPPED_MS / 1e3)]
+    angles, dead = (
+        [0.5 + 0.5 * np.sin(GAPPED_MS / 1e3), 0.5 + 0.5 * np.cos(GAPPED_MS / 1e3)],
+        [0.0 * GAPPED_MS, 0.0 * GAPPED_MS],
+    )
     names = "t,Position1,Position2,TorqueSm1,TorqueSm2,Torque1,Torque2,TorqueCur1,TorqueCur2"
-    table = np.column_stack([TIME, *angles, *dead, *torques, *torques])
+    table = np.column_stack([GAPPED_MS, *angles, *dead, *torques, *torques])
     np.savetxt(path, table, "%.6f", ",", header=names, comments="")
     said = proposal([load_recording(path)], make_finger())
     assert 'channels.joint_torque.PIP = { from = "Torque2"' in said
@@ -167,31 +105,9 @@ def test_a_log_without_angles_belongs_to_the_angles_of_its_time(tmp_path):
     assert 'file = "cell2.csv", time = { from = "time_s" }' in text.split("[trials.")[2]
 
 
-@pytest.mark.parametrize(("units", "says"), [("ms", True), ("s", False)])
-def test_a_clock_whose_stated_units_make_it_too_fast_is_said(tmp_path, units, says, capsys):
-    path = tmp_path / "log.csv"
-    time = np.arange(2000) / 1000.0
-    header = f"time [{units}],angle [deg]"
-    np.savetxt(path, np.column_stack([time, 40 + 30 * np.sin(time)]), delimiter=",", header=header, comments="")
-    main(["look", str(path)])
-    assert ("no sensor is so fast, so the times are in other units" in capsys.readouterr().out) == says
-
-
-def test_a_clock_that_begins_again_is_said(tmp_path, capsys):
-    path = tmp_path / "log.csv"
-    np.savetxt(path, np.column_stack([TIME % 4000.0, TIME]), "%.6f", ",", header="t,enc", comments="")
-    (clock,) = clocks_of(recording := load_recording(path), columns_of(recording))
-    assert (clock.rate, clock.restarts) == (pytest.approx(200.0), int(TIME[-1] // 4000.0))
-    main(["look", str(path)])
-    said = capsys.readouterr().out
-    assert "it begins again or wraps at" in said
-    assert "# the time begins again after sample 792: a trial for each part, chosen by `where`" in said
-    assert "sort = true" not in said
-
-
 def test_units_that_no_mapping_converts_are_said_and_not_guessed_anew(tmp_path, capsys):
     path = tmp_path / "log.csv"
-    rows = np.column_stack([TIME / 1e3, 0.5 + 0.4 * np.sin(TIME / 1e3), 0.3 + 0.2 * np.sin(TIME / 1e3)])
+    rows = np.column_stack([GAPPED_MS / 1e3, 0.5 + 0.4 * np.sin(GAPPED_MS / 1e3), 0.3 + 0.2 * np.sin(GAPPED_MS / 1e3)])
     np.savetxt(path, rows, "%.6f", ",", header="t [s],MCP angle [turns],T1 length [in]", comments="")
     seen = columns_of(load_recording(path))
     assert [(s.meaning, s.units, s.foreign) for s in seen[1:]] == [("q", "turn", ""), ("tendon_excursion", "", "in")]
@@ -204,7 +120,9 @@ def test_units_that_no_mapping_converts_are_said_and_not_guessed_anew(tmp_path, 
 def test_the_sign_of_a_tendons_own_length_is_said(tmp_path, capsys):
     """An excursion is positive where the tendon is pulled in, and its length falls then."""
     path = tmp_path / "log.csv"
-    rows = np.column_stack([TIME / 1e3, 0.4 * np.sin(TIME / 1e3), *(0.2 + 0.01 * np.sin(TIME / 1e3) for _ in "12")])
+    rows = np.column_stack(
+        [GAPPED_MS / 1e3, 0.4 * np.sin(GAPPED_MS / 1e3), *(0.2 + 0.01 * np.sin(GAPPED_MS / 1e3) for _ in "12")]
+    )
     header = "t [s],q1 [rad],Muscle Length 1 [m],excursion 2 [m]"
     np.savetxt(path, rows, "%.6f", ",", header=header, comments="")
     main(["look", str(path)])
@@ -268,7 +186,7 @@ def test_names_do_not_steer_the_terminal(tmp_path, capsys):
 
 
 def test_variables_that_give_no_numbers_are_named(tmp_path, capsys):
-    scipy.io.savemat(tmp_path / "log.mat", {"t": TIME, "note": "text", "z": 1j * TIME})
+    scipy.io.savemat(tmp_path / "log.mat", {"t": GAPPED_MS, "note": "text", "z": 1j * GAPPED_MS})
     main(["look", str(tmp_path / "log.mat")])
     said = capsys.readouterr().out
     assert "z is complex" in said
@@ -285,8 +203,8 @@ def test_variables_that_give_no_numbers_are_named(tmp_path, capsys):
 )
 def test_what_is_measured_of_a_swept_joint_says_which_experiment_it_is(tmp_path, columns, experiment):
     """Without torque, a swept joint means ID.2. A column F_… is a force."""
-    swing = 40.0 - 40.0 * np.cos(TIME / 1e3)
-    table = np.column_stack([TIME, swing, *(level + 0.1 * swing for level in columns.values())])
+    swing = 40.0 - 40.0 * np.cos(GAPPED_MS / 1e3)
+    table = np.column_stack([GAPPED_MS, swing, *(level + 0.1 * swing for level in columns.values())])
     np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header=",".join(["stamp_ms", "a_deg", *columns]), comments="")
     recording = load_recording(tmp_path / "log.csv")
     assert f'experiment = "{experiment}"' in proposal([recording])
@@ -297,9 +215,9 @@ def test_what_is_measured_of_a_swept_joint_says_which_experiment_it_is(tmp_path,
 def test_a_unit_is_guessed_from_all_recordings_of_a_column(tmp_path):
     """A joint held at 5 degrees in one recording is in degrees where another recording shows it at 80."""
     logs = []
-    for name, angle in (("held", np.full(len(TIME), 5.7)), ("moved", 40.0 - 40.0 * np.cos(TIME / 1e3))):
+    for name, angle in (("held", np.full(len(GAPPED_MS), 5.7)), ("moved", 40.0 - 40.0 * np.cos(GAPPED_MS / 1e3))):
         logs.append(tmp_path / f"{name}.csv")
-        np.savetxt(logs[-1], np.column_stack([TIME, angle]), "%.6f", ",", header="t,enc", comments="")
+        np.savetxt(logs[-1], np.column_stack([GAPPED_MS, angle]), "%.6f", ",", header="t,enc", comments="")
     recordings = [load_recording(log) for log in logs]
     assert columns_of(recordings[0])[1].units == "rad"
     assert columns_of(recordings[0], recordings)[1].units == "deg"
@@ -309,7 +227,9 @@ def test_a_unit_is_guessed_from_all_recordings_of_a_column(tmp_path):
 def test_what_no_channel_reads_and_unclear_units_are_marked(tmp_path):
     """Tensions of a thousand may be in mN or gf, so no unit is guessed, and the proposal says so."""
     names = ("enc", "cell_A", "reaction")
-    table = np.column_stack([TIME, 40 + 30 * np.sin(TIME / 1e3), 600 + 600 * np.sin(TIME / 1e3), TIME])
+    table = np.column_stack(
+        [GAPPED_MS, 40 + 30 * np.sin(GAPPED_MS / 1e3), 600 + 600 * np.sin(GAPPED_MS / 1e3), GAPPED_MS]
+    )
     np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header=f"t,{','.join(names)}", comments="")
     said = proposal([load_recording(tmp_path / "log.csv")])
     assert 'channels.tendon_force.T1 = { from = "cell_A" }   # units? SI as it stands' in said
@@ -332,8 +252,8 @@ def test_cells_may_read_gram_force(unit, newtons):
 def test_a_measured_column_wins_over_its_set_point(tmp_path, set_point, measured):
     """A torque's feedforward is a set-point as well."""
     path = tmp_path / "log.csv"
-    angle = 40 + 30 * np.sin(TIME / 1e3)
-    table = np.column_stack([TIME, angle, angle + 0.1, np.cos(TIME / 1e3), np.cos(TIME / 1e3)])
+    angle = 40 + 30 * np.sin(GAPPED_MS / 1e3)
+    table = np.column_stack([GAPPED_MS, angle, angle + 0.1, np.cos(GAPPED_MS / 1e3), np.cos(GAPPED_MS / 1e3)])
     header = f"t,{set_point},{measured},tau_ff,tau"
     np.savetxt(path, table, "%.6f", ",", header=header, comments="", encoding="utf-8")
     said = proposal([load_recording(path)])
@@ -344,7 +264,7 @@ def test_a_measured_column_wins_over_its_set_point(tmp_path, set_point, measured
 
 def test_a_set_point_alone_is_said(tmp_path):
     path = tmp_path / "log.csv"
-    table = np.column_stack([TIME, 40 + 30 * np.sin(TIME / 1e3), np.cos(TIME / 1e3)])
+    table = np.column_stack([GAPPED_MS, 40 + 30 * np.sin(GAPPED_MS / 1e3), np.cos(GAPPED_MS / 1e3)])
     np.savetxt(path, table, "%.6f", ",", header="t,q_soll,tau", comments="")
     said = proposal([load_recording(path)])
     assert "channels.q" not in said
@@ -353,42 +273,23 @@ def test_a_set_point_alone_is_said(tmp_path):
 
 def test_robots_that_name_their_angles_q_have_no_angles_in_their_speeds(tmp_path):
     """Several joints move, and no torque says that one of them is led."""
-    angles = [0.5 * np.sin(TIME / 1e3), 0.5 * np.cos(TIME / 1e3)]
+    angles = [0.5 * np.sin(GAPPED_MS / 1e3), 0.5 * np.cos(GAPPED_MS / 1e3)]
     names = ["t", "actual_q_0", "actual_q_1", "actual_qd_0", "actual_qdd_1", "state.dq_0"]
     path = tmp_path / "log.csv"
-    np.savetxt(path, np.column_stack([TIME, *angles, *angles, angles[0]]), header=" ".join(names), comments="")
+    np.savetxt(path, np.column_stack([GAPPED_MS, *angles, *angles, angles[0]]), header=" ".join(names), comments="")
     said = proposal([load_recording(path)])
     assert 'channels.q.J2 = { from = "actual_q_1"' in said
     assert "channels.q.J3" not in said
     assert "\njoint = " not in said
 
 
-@pytest.mark.parametrize("rate", [50.0, 1000.0])
-def test_speeds_tell_the_rate_of_a_log_without_a_clock(tmp_path, rate):
-    """A joint beside them, a torque and a constant column have no speed, nor are they one."""
-    t, rng = np.arange(4000) / rate, np.random.default_rng(2)
-    angles = [0.5 * np.sin(3.0 * t) + 0.2 * np.sin(5.1 * t), 0.4 * np.cos(2.2 * t)]
-    rates = [1.5 * np.cos(3.0 * t) + 1.02 * np.cos(5.1 * t), -0.88 * np.sin(2.2 * t)]
-    columns = [*angles, np.sin(1.1 * t), *(x + 0.03 * rng.standard_normal(t.size) for x in rates), np.sign(rates[0])]
-    path = tmp_path / "log.csv"
-    np.savetxt(path, np.column_stack([*columns, 0.0 * t]), delimiter=",")
-    said = proposal([load_recording(path)])
-    found = re.findall(r'"column (\d)" of "column (\d)" at ([\d.]+)', said)
-    assert [pair[:2] for pair in found] == [("3", "0"), ("4", "1")]
-    assert [float(pair[2]) for pair in found] == pytest.approx([rate, rate], rel=0.01)
-    np.savetxt(path, np.column_stack([t, *columns]), delimiter=",")  # a guessed clock, which the speeds confirm
-    assert '"column 4" of "column 1" at ' in proposal([load_recording(path)])
-    np.savetxt(path, np.column_stack([t, *columns]), delimiter=",", header="t,a,b,c,d,e,f", comments="")
-    assert "# speeds" not in proposal([load_recording(path)])
-
-
 def test_a_switch_and_a_single_number_are_no_measurements(tmp_path):
     """A temperature in the units that its range shows is no temperature in K."""
     path = tmp_path / "log.json"
-    steady = [20.0 + 0.1 * (k % 3) for k in range(len(TIME))]
-    angle = (40 + 30 * np.sin(TIME / 1e3)).tolist()
-    on = [True] * len(TIME)
-    log = {"length": 0.12, "t": TIME.tolist(), "enc": angle, "torque_enable": on, "force_ok": on, "temp": steady}
+    steady = [20.0 + 0.1 * (k % 3) for k in range(len(GAPPED_MS))]
+    angle = (40 + 30 * np.sin(GAPPED_MS / 1e3)).tolist()
+    on = [True] * len(GAPPED_MS)
+    log = {"length": 0.12, "t": GAPPED_MS.tolist(), "enc": angle, "torque_enable": on, "force_ok": on, "temp": steady}
     path.write_text(json.dumps(log))
     said = proposal([load_recording(path)])
     assert "joint_torque" not in said
@@ -397,21 +298,10 @@ def test_a_switch_and_a_single_number_are_no_measurements(tmp_path):
     assert 'channels.temperature.temp = { from = "temp", units = "degC" }' in said
 
 
-@pytest.mark.parametrize("shared", [5, 500])
-def test_coarse_stamps_are_replaced_by_a_rate(tmp_path, shared):
-    path = tmp_path / "log.csv"
-    stamps = np.arange(10000) // shared * shared / 500
-    np.savetxt(path, np.column_stack([stamps, np.sin(stamps)]), "%.6f", ",", header="t,q", comments="")
-    said = proposal([load_recording(path)])
-    assert 'rate_hz = 500   # several samples share each stamp of "t"' in said
-    assert "time =" not in said
-    assert "sort" not in said
-
-
 @pytest.mark.parametrize(("motor", "joint"), [("motor_pos [deg]", "joint_pos [deg]"), ("driveAngle", "linkAngle")])
 def test_a_motors_angle_is_no_joints(tmp_path, motor, joint):
-    path, angle = tmp_path / "log.csv", 0.6 + 0.5 * np.sin(TIME / 1e3)
-    table = np.column_stack([TIME, 100.0 * angle, angle, 0.01 * angle])
+    path, angle = tmp_path / "log.csv", 0.6 + 0.5 * np.sin(GAPPED_MS / 1e3)
+    table = np.column_stack([GAPPED_MS, 100.0 * angle, angle, 0.01 * angle])
     np.savetxt(path, table, "%.6f", ",", header=f"t,{motor},{joint},torque", comments="")
     said = proposal([load_recording(path)], make_finger())
     assert f'channels.q.MCP = {{ from = "{joint}"' in said
@@ -424,7 +314,7 @@ def test_a_motors_angle_is_no_joints(tmp_path, motor, joint):
 )
 def test_joints_that_are_named_by_number_are_taken_in_its_order(tmp_path, columns, first, second):
     path = tmp_path / "log.csv"
-    table = np.column_stack([TIME, 20.0 + 0.0 * TIME, 40.0 + 30.0 * np.sin(TIME / 1e3)])
+    table = np.column_stack([GAPPED_MS, 20.0 + 0.0 * GAPPED_MS, 40.0 + 30.0 * np.sin(GAPPED_MS / 1e3)])
     np.savetxt(path, table, "%.6f", ",", header=f"t,{columns}", comments="")
     said = proposal([load_recording(path)], make_finger())
     assert f'channels.q.MCP = {{ from = "{first}"' in said
@@ -477,7 +367,7 @@ def test_an_elastic_robots_joints_are_read_and_not_its_motors_nor_what_is_desire
 
 
 def test_theta_alone_is_a_joints_angle(tmp_path):
-    table = np.column_stack([TIME, np.sin(TIME / 1e3), np.cos(TIME / 1e3)])
+    table = np.column_stack([GAPPED_MS, np.sin(GAPPED_MS / 1e3), np.cos(GAPPED_MS / 1e3)])
     np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="duration,theta,theta_d", comments="")
     said = proposal([load_recording(tmp_path / "log.csv")])
     assert 'time = { from = "duration", units = "ms" }' in said
@@ -489,7 +379,7 @@ def test_theta_alone_is_a_joints_angle(tmp_path):
 def test_the_size_of_an_angle_does_not_tell_degrees_of_a_joint_that_turns_on(tmp_path, upper, said):
     finger = make_finger()
     finger = replace(finger, limits=np.radians([[-10.0, upper], [0.0, 90.0]]))
-    table = np.column_stack([TIME, 12.0 + 12.0 * np.sin(TIME / 1e3), np.cos(TIME / 1e3)])
+    table = np.column_stack([GAPPED_MS, 12.0 + 12.0 * np.sin(GAPPED_MS / 1e3), np.cos(GAPPED_MS / 1e3)])
     np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="t,q1,q2", comments="")
     text = proposal([load_recording(tmp_path / "log.csv")], finger)
     assert f'channels.q.MCP = {{ from = "q1", {said}' in text or f'channels.q.MCP = {{ from = "q1" {said}' in text
@@ -497,8 +387,8 @@ def test_the_size_of_an_angle_does_not_tell_degrees_of_a_joint_that_turns_on(tmp
 
 
 def test_messages_that_ros2_topic_echo_wrote_are_proposed_and_imported(tmp_path, capsys):
-    angle, torque = 0.5 + 0.4 * np.sin(TIME / 1e3), 0.01 * np.cos(TIME / 1e3)
-    sec, beyond = (TIME // 1e3).astype(int), (TIME % 1e3 * 1e6).astype(int)
+    angle, torque = 0.5 + 0.4 * np.sin(GAPPED_MS / 1e3), 0.01 * np.cos(GAPPED_MS / 1e3)
+    sec, beyond = (GAPPED_MS // 1e3).astype(int), (GAPPED_MS % 1e3 * 1e6).astype(int)
     rows = zip(sec, beyond, angle.tolist(), torque.tolist(), strict=True)
     log, mapping = tmp_path / "log.csv", tmp_path / "m.toml"
     log.write_text("".join(f"{1700000000 + s},{ns},,MCP,{q!r},,{tau!r}\n" for s, ns, q, tau in rows))
@@ -508,6 +398,6 @@ def test_messages_that_ros2_topic_echo_wrote_are_proposed_and_imported(tmp_path,
     mapping.write_text(said[said.index("# a mapping") :])
     main(["import", str(log), "--mapping", str(mapping), "--output", str(tmp_path / "s.h5")])
     (trial,) = read_session(tmp_path / "s.h5")
-    np.testing.assert_allclose(trial.time, (TIME - TIME[0]) / 1e3, atol=1e-6)
+    np.testing.assert_allclose(trial.time, (GAPPED_MS - GAPPED_MS[0]) / 1e3, atol=1e-6)
     np.testing.assert_array_equal(trial.q[:, 0], angle)
     np.testing.assert_array_equal(trial.joint_torque[:, 0], torque)
