@@ -30,16 +30,15 @@ Result = TypeVar("Result")
 
 def timed(what: str, work: Callable[[], Result]) -> Result:
     """Do the work twice, and print the seconds of both."""
-    seconds = []
-    for _ in range(2):
-        start = time.perf_counter()
-        result = jax.block_until_ready(work())
-        seconds.append(time.perf_counter() - start)
-    print(f"  {what:<44s}{seconds[0]:8.3f} s, again {seconds[1]:8.4f} s", flush=True)
+    start = time.perf_counter()
+    jax.block_until_ready(work())
+    between = time.perf_counter()
+    result = jax.block_until_ready(work())
+    print(f"  {what:<44s}{between - start:8.3f} s, again {time.perf_counter() - between:8.4f} s", flush=True)
     return result
 
 
-def devices() -> list[jax.Device]:
+def devices() -> list:
     """The processor, and the first device of another kind that JAX uses here."""
     return list(dict.fromkeys([jax.devices("cpu")[0], jax.devices()[0]]))
 
