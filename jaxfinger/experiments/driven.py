@@ -17,9 +17,9 @@ from jaxfinger.data import (
     smooth_rate,
     without_spikes,
 )
-from jaxfinger.data.signals.motion import from_the_start, quick_cutoff, rest_speed, speed_noise
+from jaxfinger.data.signals.motion import from_the_start, quick_cutoff, rest_speed, speed_noise, stretches_of
 from jaxfinger.data.signals.noise import STD_PER_MAD
-from jaxfinger.experiments.reduction import Joints, PreparedTrial, Row, joints, row
+from jaxfinger.experiments.reduction import Joints, PreparedTrial, Reversals, Row, joints, row
 from jaxfinger.experiments.shrink import shrink
 from jaxfinger.experiments.table import highest_cutoff
 
@@ -44,6 +44,9 @@ BREAKAWAY_WIDTHS = 4.5
 # Travel over which friction reverses, in median residuals of the encoder: 1.5 of its standard deviations. A longer
 # travel suits compliant contacts, a shorter one stiff contacts (benchmarks/reversals.py).
 REVERSAL_TRAVEL = 2.2
+# Largest change of a low-passed direction by one standard deviation of a reversal's time: a quarter of all that it can
+# change. Beyond, it is not linear in that time.
+MAX_CHANGE_AT_REVERSAL = 0.5
 ACCELERATION_WINDOW = 0.1  # s, at the protocol's pace, over which q̈ is averaged where it does not exceed its noise
 # Degrees of freedom of the variance of q̈'s noise in that window W = 1/f_c: 2 W (∫S df)²/∫S² df, with the spectrum
 # S = f⁴ exp(−ln 2 (f/f_c)²) that an encoder's white noise has behind the low-pass.
@@ -62,10 +65,12 @@ def reduce(r: PreparedTrial) -> Row:
     rates = None if r.experiment.slack else tendon_rates(r)
     tendon = tendon_directions(r, rates)
     clear = CLEAR_WIDTHS * filter_std(r.experiment.cutoff)
+    slides = sliding(r, j, slow, joint, rates)
     valid = {
-        "joint_torque": sliding(r, j, slow, joint, rates, clear),
+        "joint_torque": clear_of_unknown(r, slides, clear),
         "tendon_excursion": _apart(np.ones((len(slow), 1), bool), clear, r.step),
     }
+    beside = reversals(r, j, slow, slides, clear)
 
     qdd, tension, y = less_noise(r, j) if r.reduced or r.experiment.slack else j.qdd, r.tension(), r.y
     if r.reduced:
@@ -84,6 +89,7 @@ def reduce(r: PreparedTrial) -> Row:
         directions=(joint, tendon),
         blur=filter_std(j.cutoff),
         y=y,
+        reversals=beside,
     )
 
 
@@ -99,13 +105,47 @@ def less_noise(r: PreparedTrial, j: Joints) -> Float[np.ndarray, "N m"]:
 def joint_directions(r: PreparedTrial, j: Joints, slow: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
     """Directions of the joints: the protocol's, else those of the filtered motion.
 
-    For a fit they reverse where the motion back is certain, since samples near a reversal are left out. For a
-    prediction they reverse where the motion back began.
+    They reverse where the motion back began.
     """
     if r.trial.joint_direction is not None:
         return r.trial.joint_direction.astype(float)
-    sure = directions(slow, rest_speed(slow, r.quick_rates))
-    return sure if r.reduced else directions_from_turning_points(sure, j.q, REVERSAL_TRAVEL * j.noise)
+    return _directions(r, j, slow, (0.25 if r.reduced else 1.0) * REVERSAL_TRAVEL)
+
+
+def _directions(r: PreparedTrial, j: Joints, slow: Float[np.ndarray, "N m"], travel: float) -> Float[np.ndarray, "N m"]:
+    """Directions that reverse over a `travel`, in median residuals of the encoder; before the turn if it is negative.
+
+    The filter of a fit shifts the turning point between two speeds, towards the slower.
+    """
+    q = low_pass(r.trial.time, r.trial.q, quick_cutoff(j.cutoff, r.step)) if r.reduced else j.q
+    sure, distance = directions(slow, rest_speed(slow, r.quick_rates)), abs(travel) * j.noise
+    if travel >= 0.0:
+        return directions_from_turning_points(sure, q, distance)
+    return -directions_from_turning_points(-from_the_start(sure)[::-1], q[::-1], distance)[::-1]
+
+
+def reversals(
+    r: PreparedTrial, j: Joints, slow: Float[np.ndarray, "N m"], slides: Bool[np.ndarray, "N m"], clear: float
+) -> Reversals | None:
+    """Reversals of the joints that a motor moves, which slide before and after: their time alone is uncertain.
+
+    One standard deviation of that time is a sample, and the time in which the joint travels by `REVERSAL_TRAVEL`.
+    `slides`, `clear`: as of `sliding`. None where the protocol gives the directions, or tendons may hold a joint.
+    """
+    if not (r.reduced and r.experiment.slack) or r.trial.joint_direction is not None:
+        return None
+    earlier, at_once, later = (_directions(r, j, slow, k * REVERSAL_TRAVEL) for k in (-1.0, 0.0, 1.0))
+    earlier[:-1], later[1:] = earlier[1:].copy(), later[:-1].copy()
+    changes = [np.where(r.motorised, changed - at_once, 0.0) for changed in (earlier, later)]
+    changes = np.stack([low_pass(r.trial.time, change, j.cutoff) for change in changes])
+    unclear = rests(j, ~slides, r.step) | np.any(np.abs(changes) > MAX_CHANGE_AT_REVERSAL, axis=0)
+    turns = np.zeros_like(slides)
+    for i in np.flatnonzero(r.motorised):
+        for begin, end in stretches_of(~slides[:, i]):
+            within = begin > 0 and end < len(slides) and not unclear[begin:end, i].any()
+            turns[begin:end, i] = within and at_once[begin - 1, i] * at_once[end, i] < 0.0
+    either, certain = (r.mean(_apart(a, clear, r.step).astype(float)) > 1.0 - 1e-9 for a in (slides | turns, slides))
+    return Reversals((either & ~certain).T, np.stack([r.mean(change).T for change in changes]))
 
 
 def tendon_rates(r: PreparedTrial) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]] | None:
@@ -138,12 +178,11 @@ def sliding(
     slow: Float[np.ndarray, "N m"],
     direction: Float[np.ndarray, "N m"],
     rates: tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]] | None,
-    clear: float,
 ) -> Bool[np.ndarray, "N m"]:
     """Whether a joint and every taut tendon across it slide, so that the directions of friction are known.
 
     `j`, `slow`: motion in the fit's filter, and joint speeds, rad/s, in a slower one. `rates`: speeds of the tendons,
-    None where all are slack or unmeasured. `clear`: s, left out on either side of samples where they do not slide.
+    None where all are slack or unmeasured.
     """
     qd = j.qd
     lost, fast = np.abs(r.quick_rates - slow), np.percentile(np.abs(qd), 95, axis=0)
@@ -162,6 +201,11 @@ def sliding(
         pace = np.percentile(np.abs(slow), 95, axis=0)
         most = np.maximum(MAX_LOST_SPEED_SHARE * pace, MIN_SLIP_TO_NOISE * noise)
         slides &= np.all(lost <= most + ROUNDING_SHARE * pace.max(initial=0.0), axis=1)[:, None]
+    return slides
+
+
+def clear_of_unknown(r: PreparedTrial, slides: Bool[np.ndarray, "N m"], clear: float) -> Bool[np.ndarray, "N m"]:
+    """Samples that slide, as do all that the filter reads. `clear`: s, left out on either side of those that do not."""
     # The filter spreads the jump of friction at a reversal, and reads samples of unknown friction before a slide.
     apart = _apart(slides, clear, r.step)
     # The window reaches back only: a free joint breaks away suddenly and moves the others.

@@ -15,7 +15,7 @@ from jaxfinger.data.signals.quantiles import median
 from jaxfinger.data.signals.sizes import Sizes, sizes_of
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import driven, held, path, stepped
-from jaxfinger.experiments.reduction import Row, prepared, runs_of_holds
+from jaxfinger.experiments.reduction import Reversals, Row, prepared, runs_of_holds
 from jaxfinger.experiments.table import EXPERIMENTS, Experiment
 from jaxfinger.model import Motion
 
@@ -29,8 +29,10 @@ class Batch(eqx.Module):
     """B trials of one experiment, reduced and padded to T samples."""
 
     x: Motion  # (…, B, T)
-    y: dict[str, Float[Array, "_columns *B T"]]  # measured channels, zero where the mask is 0
+    y: dict[str, Float[Array, "_columns *B T"]]  # measured channels, zero where nothing can be judged
     mask: dict[str, Float[Array, "_columns *B T"]]  # 1 where a sample is valid, else 0
+    # Change of a channel if every reversal came one std of its time earlier, and later; not zero beside reversals.
+    uncertain: dict[str, Float[np.ndarray, "2 _columns *B T"]] = eqx.field(default_factory=dict)
 
 
 class Coarseness(NamedTuple):
@@ -50,6 +52,7 @@ class Stack:
     motions: tuple[str | None, ...]  # trials of the same name of a motion repeat it
     holds: Int[np.ndarray, "B T"]  # index of the static hold, −1 between holds
     dt: float  # s, between samples
+    reversals: Reversals | None  # (m, B, T); None where friction's direction is known or unknown, whatever their time
     measured: dict[str, bool]  # by channel: whether any trial measured it
     coarseness: dict[str, Coarseness] = field(default_factory=dict)  # by channel
 
@@ -161,6 +164,7 @@ def _stack(experiment: Experiment, trials: list[Trial], reduced_trials: list[_Re
         tuple(t.motion for t in trials),
         np.stack([np.pad(r.hold, (0, T - r.hold.size), constant_values=-1) for r in rows]),
         float(np.median([r.dt for r in rows])),
+        _stacked([r.reversals for r in rows], T),
         {c: any(x.measured[c] for x in reduced_trials) for c in experiment.channels},
         {
             c: _mean_coarseness(members)
@@ -168,3 +172,15 @@ def _stack(experiment: Experiment, trials: list[Trial], reduced_trials: list[_Re
             if (members := [x.coarseness[c] for x in reduced_trials if c in x.coarseness])
         },
     )
+
+
+def _stacked(reversals: list[Reversals | None], T: int) -> Reversals | None:
+    """Reversals of all trials, padded to T samples; None where there are none."""
+    there = [x for x in reversals if x is not None]
+    if not there:
+        return None
+    out = Reversals(*(np.zeros((*a.shape[:-1], len(reversals), T), a.dtype) for a in there[0]))
+    for b, x in enumerate(reversals):
+        for whole, a in zip(out, x or (), strict=False):
+            whole[..., b, : a.shape[-1]] = a
+    return out

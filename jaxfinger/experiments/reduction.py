@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -91,6 +92,15 @@ class PreparedTrial:
         return np.where(np.percentile(tension, 95, axis=0) < self.sizes.slack, 0.0, tension)
 
 
+class Reversals(NamedTuple):
+    """Samples whose friction would be known if the time of a reversal beside them were; time last, as in `Row`."""
+
+    beside: Bool[np.ndarray, "m *T"]
+    later: Float[
+        np.ndarray, "m *T"
+    ]  # change of the joints' directions if every reversal came one std of its time later
+
+
 @dataclass(frozen=True)
 class Row:
     """One reduced trial: NumPy arrays with time last, by field of `Motion` or by channel."""
@@ -100,6 +110,7 @@ class Row:
     mask: dict[str, np.ndarray]
     hold: np.ndarray
     dt: float  # s, length of a block
+    reversals: Reversals | None
 
 
 def prepared(
@@ -187,12 +198,14 @@ def row(
     hold: Int[np.ndarray, " M"] | None = None,
     blur: float = 0.0,
     y: dict[str, Float[np.ndarray, "N k"]] | None = None,
+    reversals: Reversals | None = None,
 ) -> Row:
     """Assemble a reduced trial of M blocks.
 
     `q`, rad, `tension`, N, and `hold` are of the blocks, `rates`, rad/s and rad/s², `directions` and `y` of the
     samples, which are averaged here. `counting`: blocks of each channel that are valid where measured. `noise`: rad, of
-    the encoder. `blur`: s, width of the low-pass of all arrays.
+    the encoder. `blur`: s, width of the low-pass of all arrays. `reversals`: those whose
+    torque is read, too.
     """
     y = r.y if y is None else y
     M = len(q)
@@ -217,10 +230,14 @@ def row(
         motion |= {"blur": np.full(M, blur), "block": np.full(M, r.size * r.step)}
     values, mask = {}, {}
     for c in y:
-        counts = (r.mean(r.sound[c].astype(float)) > 0.5) & counting[c]
-        mask[c] = counts.astype(float).T
-        values[c] = r.mean(y[c]).T * mask[c]  # mean of all samples, as of the other arrays
-    return Row(motion, values, mask, np.full(M, -1) if hold is None else hold, r.size * r.step)
+        sound = r.mean(r.sound[c].astype(float)).T > 0.5
+        counts = sound & counting[c].T
+        mask[c] = counts.astype(float)
+        if reversals is not None and c == "joint_torque":
+            reversals = reversals._replace(beside=reversals.beside & sound)
+            counts = counts | reversals.beside
+        values[c] = r.mean(y[c]).T * counts  # mean of all samples, as of the other arrays
+    return Row(motion, values, mask, np.full(M, -1) if hold is None else hold, r.size * r.step, reversals)
 
 
 def _temperatures(r: PreparedTrial) -> Float[np.ndarray, "M m"]:

@@ -11,7 +11,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from jaxfinger.data import directions, filter_std, find_holds, low_pass, smooth_rate
 from jaxfinger.data.signals.motion import from_the_start, rest_speed
-from jaxfinger.experiments.driven import CLEAR_WIDTHS, less_noise, sliding
+from jaxfinger.experiments.driven import CLEAR_WIDTHS, clear_of_unknown, less_noise, sliding
 from jaxfinger.experiments.reduction import PreparedTrial, Row, joints, row, runs_of_holds
 
 # Widths of the filter from the ends of a hold: beyond, 3e-5 of the motion beside the hold is left, and nothing moves.
@@ -31,7 +31,8 @@ def reduce(r: PreparedTrial) -> Row:
         for samples in runs_of_holds(hold):  # a zero-phase filter shows the next step before it starts
             joint[samples] = joint[samples[len(samples) // 2]]
     clear = CLEAR_WIDTHS * filter_std(j.cutoff)
-    slides, approached = sliding(r, j, slow, joint, None, clear), _constant(joint, round(clear / r.step))
+    slides = clear_of_unknown(r, sliding(r, j, slow, joint, None), clear)
+    approached = _constant(joint, round(clear / r.step))
     at = r.whole(hold)
     known, led = (r.mean(a.astype(float)) > 1.0 - 1e-9 for a in (slides, approached))  # all samples of the block
     known &= not r.reduced or r.sizes.crossing >= r.experiment.cutoff

@@ -8,11 +8,12 @@ Lovell). This module makes W r and the whitened Jacobian; `signatures` makes W Î
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy.sparse
 from jaxtyping import Float
 
 from jaxfinger.compilation import quick_jit
@@ -22,12 +23,13 @@ from jaxfinger.effects import Scales
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Stack
 from jaxfinger.gap.merged_trials import MergedTrials, merged_trials
+from jaxfinger.gap.reversals import with_reversals
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.dead_zone import clear_of_dead_zones
 from jaxfinger.identify.intervals import stretches
 from jaxfinger.identify.linearise import White
-from jaxfinger.identify.noise import Noise, estimate, history, without_recurring_laws
+from jaxfinger.identify.noise import Noise, estimate, history, reversals_out, whiten, without_recurring_laws
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.prior import Prior, prior_of
 from jaxfinger.identify.readings import readings_of
@@ -61,6 +63,8 @@ class Rows:
     trial: np.ndarray  # (rows,) index of the trial in the stack
     time: np.ndarray  # (rows,) index of the sample
     history: np.ndarray  # (rows,) number of preceding samples that the whitening filter reads
+    # (rows, rows) by channel: what is added to white rows since the times of reversals are uncertain
+    reversals: dict[str, scipy.sparse.csr_array] = field(default_factory=dict)
 
     @property
     def size(self) -> int:
@@ -225,6 +229,7 @@ def _refitted_to_all(
     cad = np.flatnonzero((variance > 0.0) & np.isfinite(variance))  # what the description gives with an uncertainty
     free = np.union1d(fit.estimated, cad).astype(int)
     reads = {e: stack.experiment.channels for e, stack in stacks.items()}
+    counted = {e: with_reversals(stack, fit.model) for e, stack in stacks.items()}
 
     def prior_on(free: np.ndarray) -> Prior:
         if against is None:
@@ -234,7 +239,7 @@ def _refitted_to_all(
     nominal, latest, shown = fit.model, _noise_of_all(known, stacks, fit.model, recurring), free
     for _ in range(MAX_ROUNDS):
         noise, before = latest, shown
-        sources = sources_of(stacks, reads, noise, parameters)
+        sources = sources_of(counted, reads, noise, parameters)
         # Some parameters show only after a refit: a tendon whose moment arms are zero shows no friction.
         nominal, shown = _with_unfitted(nominal, free_groups(fit.recipe), free, sources, parameters, coverage)
         prior = prior_on(shown)
@@ -245,7 +250,7 @@ def _refitted_to_all(
         latest = _noise_of_all(known, stacks, nominal, recurring)
         if shown.size == before.size and _settled(noise, latest):
             break
-    rows = _layouts(stacks, sources)
+    rows = _layouts(sources)
     return {
         "noise": noise,
         "free": shown,
@@ -308,7 +313,7 @@ def imagined(problem: Problem, stacks: dict[str, Stack]) -> Problem:
         else sources_of({e: stack}, {e: stack.experiment.channels}, known, describe(problem.nominal))[e]
         for e, stack in stacks.items()
     }
-    rows, white = _layouts(stacks, sources), white_tangents(problem.nominal, sources)
+    rows, white = _layouts(sources), white_tangents(problem.nominal, sources)
     at = _at(problem.nominal, white, sources, rows, problem.free, problem.prior)
     groups = _groups(stacks, rows, problem.nominal)
     return replace(problem, stacks=stacks, sources=sources, rows=rows, groups=groups, noise=known, **at)
@@ -349,11 +354,11 @@ def _groups(stacks: dict[str, Stack], rows: dict[str, Rows], nominal: Model) -> 
     return merged_trials({e: stack for e, stack in stacks.items() if rows[e].size}, nominal)
 
 
-def _layouts(stacks: dict[str, Stack], sources: dict[str, Source]) -> dict[str, Rows]:
+def _layouts(sources: dict[str, Source]) -> dict[str, Rows]:
     """Rows of all experiments, each experiment's after those of the one before."""
     rows, start = {}, 0
-    for e in sources:
-        rows[e] = _layout(stacks[e], sources[e].filters, start)
+    for e, source in sources.items():
+        rows[e] = _layout(e, source, start)
         start += rows[e].size
     return rows
 
@@ -417,25 +422,29 @@ def _with_unfitted(
     return start_values(model, added, parameters, sources), np.union1d(free, added).astype(int)
 
 
-def _layout(stack: Stack, filters, start: int) -> Rows:
+def _layout(experiment: str, source: Source, start: int) -> Rows:
     """Rows of the samples that count, in the order of `white_rows`: trial, column of a channel, time."""
     counts, before, channel, column = [], [], [], []
-    for number, c in enumerate(filters):
-        mask = np.asarray(stack.batch.mask[c])
+    for number, (c, filters) in enumerate(source.filters.items()):
+        mask = np.asarray(source.batch.mask[c])
         counts.append(np.moveaxis(mask, 1, 0))
-        before.append(np.moveaxis(np.asarray(history(mask, filters[c].shape[1] - 1), int), 1, 0))
+        before.append(np.moveaxis(np.asarray(history(mask, filters.shape[1] - 1), int), 1, 0))
         channel += [number] * len(mask)
         column += list(range(len(mask)))
     block = np.concatenate(counts, axis=1)  # (B, columns of all channels, T)
     keep = np.flatnonzero(block)
     trial, wide, time = np.unravel_index(keep, block.shape)
-    return Rows(
-        stack.experiment.name,
-        start,
-        keep,
-        np.array(channel)[wide],
-        np.array(column)[wide],
-        trial,
-        time,
-        np.concatenate(before, axis=1).reshape(-1)[keep],
-    )
+    channel, column = np.array(channel)[wide], np.array(column)[wide]
+    reversals = {}
+    for number, (c, filters) in enumerate(source.filters.items()):
+        if c in source.batch.uncertain:
+            mask = np.asarray(source.batch.mask[c])
+            later = whiten(source.batch.uncertain[c], mask, filters, CHANNELS[c].free_zero)
+            at = np.flatnonzero(channel == number)
+            place = scipy.sparse.csr_array(
+                (np.ones(at.size), (at, np.ravel_multi_index((column[at], trial[at], time[at]), mask.shape))),
+                (keep.size, mask.size),
+            )
+            reversals[c] = scipy.sparse.csr_array(place @ reversals_out(later) @ place.T)
+    before = np.concatenate(before, axis=1).reshape(-1)[keep]
+    return Rows(experiment, start, keep, channel, column, trial, time, before, reversals)

@@ -260,4 +260,6 @@ def whitened(
         energy = np.bincount(series, constant**2, count)
         share = np.stack([np.bincount(series, constant * w, count) for w in white]) / np.maximum(energy, 1e-300)
         white = white - constant * share[:, series]
+    if channel in rows.reversals:
+        white = white + (rows.reversals[channel][of_channel][:, of_channel] @ white.T).T
     return white

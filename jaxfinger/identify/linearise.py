@@ -101,7 +101,8 @@ def _residuals(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[st
 
 
 def _white(r, batch: Batch, filters: Filters, channel: str):
-    return whiten(r, batch.mask[channel], filters[channel], demean=CHANNELS[channel].free_zero)
+    free_zero = CHANNELS[channel].free_zero
+    return whiten(r, batch.mask[channel], filters[channel], free_zero, batch.uncertain.get(channel))
 
 
 def _white_jacobian(
@@ -114,11 +115,12 @@ def _white_jacobian(
     p, _, B, T = next(iter(slopes.values())).shape
     out, row = np.zeros((B, sum(slopes[c].shape[1] for c in filters), T, p)), 0
     for c in filters:
-        coefficients, mask = np.asarray(filters[c]), np.asarray(batch.mask[c])
+        coefficients, mask, uncertain = np.asarray(filters[c]), np.asarray(batch.mask[c]), batch.uncertain.get(c)
         for k, by_parameter in enumerate(np.moveaxis(slopes[c], 1, 0)):
             at, column = np.flatnonzero(by_parameter.any(axis=(1, 2))), slice(k, k + 1)
             with np.errstate(invalid="ignore"):
-                white = whiten(by_parameter[at, None], mask[column], coefficients[column], CHANNELS[c].free_zero)
+                doubt = None if uncertain is None else uncertain[:, column]
+                white = whiten(by_parameter[at, None], mask[column], coefficients[column], CHANNELS[c].free_zero, doubt)
             out[:, row, :, at] = white[:, 0]
             row += 1
     return out.reshape(B, -1, p)
