@@ -1,6 +1,7 @@
 """Reduction of trials in which a motor or tendons drive the joints (ID.3-dynamic, VD.3).
 
-A torque sample is valid where the joint and its tendons slide, since only then the direction of friction is known. For
+A torque sample is valid where the joint and its tendons slide, since only then the direction of friction is known.
+Beside the reversals of a joint that slides before and after, it is known but for their time (`Reversals`). For
 a fit both sides of (1) pass the same low-pass; for a prediction of every sample they do not.
 """
 
@@ -70,7 +71,7 @@ def reduce(r: PreparedTrial) -> Row:
         "joint_torque": clear_of_unknown(r, slides, clear),
         "tendon_excursion": _apart(np.ones((len(slow), 1), bool), clear, r.step),
     }
-    beside = reversals(r, j, slow, slides, clear)
+    reversals, joint = beside_reversals(r, j, slow, joint, slides, clear)
 
     qdd, tension, y = less_noise(r, j) if r.reduced or r.experiment.slack else j.qdd, r.tension(), r.y
     if r.reduced:
@@ -89,7 +90,7 @@ def reduce(r: PreparedTrial) -> Row:
         directions=(joint, tendon),
         blur=filter_std(j.cutoff),
         y=y,
-        reversals=beside,
+        reversals=reversals,
     )
 
 
@@ -105,47 +106,58 @@ def less_noise(r: PreparedTrial, j: Joints) -> Float[np.ndarray, "N m"]:
 def joint_directions(r: PreparedTrial, j: Joints, slow: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
     """Directions of the joints: the protocol's, else those of the filtered motion.
 
-    They reverse where the motion back began.
+    For a fit they reverse at the turning point, and for a prediction over `REVERSAL_TRAVEL` from there.
     """
     if r.trial.joint_direction is not None:
         return r.trial.joint_direction.astype(float)
-    return _directions(r, j, slow, (0.25 if r.reduced else 1.0) * REVERSAL_TRAVEL)
+    sure, q, travel = _sure(r, j, slow)
+    return directions_from_turning_points(sure, q, (0.0 if r.reduced else 1.0) * travel)
 
 
-def _directions(r: PreparedTrial, j: Joints, slow: Float[np.ndarray, "N m"], travel: float) -> Float[np.ndarray, "N m"]:
-    """Directions that reverse over a `travel`, in median residuals of the encoder; before the turn if it is negative.
+def _sure(
+    r: PreparedTrial, j: Joints, slow: Float[np.ndarray, "N m"]
+) -> tuple[Float[np.ndarray, "N m"], Float[np.ndarray, "N m"], Float[np.ndarray, " m"]]:
+    """Directions that change once the motion back is certain, angles that show where it began, and the travel, rad.
 
-    The filter of a fit shifts the turning point between two speeds, towards the slower.
+    The filter of a fit would move the turning point between two speeds towards the slower one.
     """
-    q = low_pass(r.trial.time, r.trial.q, quick_cutoff(j.cutoff, r.step)) if r.reduced else j.q
-    sure, distance = directions(slow, rest_speed(slow, r.quick_rates)), abs(travel) * j.noise
-    if travel >= 0.0:
-        return directions_from_turning_points(sure, q, distance)
-    return -directions_from_turning_points(-from_the_start(sure)[::-1], q[::-1], distance)[::-1]
+    q, noise = j.q, j.noise
+    if r.reduced:
+        q = low_pass(r.trial.time, r.trial.q, r.experiment.cutoff_at(r.step, sharp=True))
+        noise = np.median(np.abs(r.trial.q - q), axis=0)
+    return directions(slow, rest_speed(slow, r.quick_rates)), q, REVERSAL_TRAVEL * noise
 
 
-def reversals(
-    r: PreparedTrial, j: Joints, slow: Float[np.ndarray, "N m"], slides: Bool[np.ndarray, "N m"], clear: float
-) -> Reversals | None:
-    """Reversals of the joints that a motor moves, which slide before and after: their time alone is uncertain.
+def beside_reversals(
+    r: PreparedTrial,
+    j: Joints,
+    slow: Float[np.ndarray, "N m"],
+    direction: Float[np.ndarray, "N m"],
+    slides: Bool[np.ndarray, "N m"],
+    clear: float,
+) -> tuple[Reversals | None, Float[np.ndarray, "N m"]]:
+    """Reversals of the joints that a motor moves, which slide before and after, so that their time alone is uncertain.
 
-    One standard deviation of that time is a sample, and the time in which the joint travels by `REVERSAL_TRAVEL`.
-    `slides`, `clear`: as of `sliding`. None where the protocol gives the directions, or tendons may hold a joint.
+    One standard deviation of that time is the time in which the joint travels by `REVERSAL_TRAVEL`, and a sample.
+    `slides`, `clear`: as of `sliding`. Also returns the directions, which reverse there at the turning point.
     """
-    if not (r.reduced and r.experiment.slack) or r.trial.joint_direction is not None:
-        return None
-    earlier, at_once, later = (_directions(r, j, slow, k * REVERSAL_TRAVEL) for k in (-1.0, 0.0, 1.0))
-    earlier[:-1], later[1:] = earlier[1:].copy(), later[:-1].copy()
-    changes = [np.where(r.motorised, changed - at_once, 0.0) for changed in (earlier, later)]
+    if not (r.reduced and r.experiment.slack):  # Tendons may hold a joint where it turns back.
+        return None, direction
+    sure, q, travel = _sure(r, j, slow)
+    at_once, later = (directions_from_turning_points(sure, q, d) for d in (0.0 * travel, travel))
+    earlier = -directions_from_turning_points(-from_the_start(sure)[::-1], q[::-1], travel)[::-1]  # back in time
+    earlier, later = (np.concatenate(x) for x in ((earlier[1:], earlier[-1:]), (later[:1], later[:-1])))
+    changes = [r.motorised * (moved - at_once) for moved in (earlier, later)]
     changes = np.stack([low_pass(r.trial.time, change, j.cutoff) for change in changes])
-    unclear = rests(j, ~slides, r.step) | np.any(np.abs(changes) > MAX_CHANGE_AT_REVERSAL, axis=0)
+    unclear = np.any(np.abs(changes) > MAX_CHANGE_AT_REVERSAL, axis=0)  # as where the joint rests
     turns = np.zeros_like(slides)
     for i in np.flatnonzero(r.motorised):
         for begin, end in stretches_of(~slides[:, i]):
             within = begin > 0 and end < len(slides) and not unclear[begin:end, i].any()
             turns[begin:end, i] = within and at_once[begin - 1, i] * at_once[end, i] < 0.0
-    either, certain = (r.mean(_apart(a, clear, r.step).astype(float)) > 1.0 - 1e-9 for a in (slides | turns, slides))
-    return Reversals((either & ~certain).T, np.stack([r.mean(change).T for change in changes]))
+    either, known = (r.mean(_apart(a, clear, r.step).astype(float)) > 1.0 - 1e-9 for a in (slides | turns, slides))
+    found = Reversals((either & ~known).T, np.stack([r.mean(change).T for change in changes]))
+    return found, np.where(turns, at_once, direction)
 
 
 def tendon_rates(r: PreparedTrial) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]] | None:

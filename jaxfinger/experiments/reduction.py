@@ -96,9 +96,8 @@ class Reversals(NamedTuple):
     """Samples whose friction would be known if the time of a reversal beside them were; time last, as in `Row`."""
 
     beside: Bool[np.ndarray, "m *T"]
-    later: Float[
-        np.ndarray, "m *T"
-    ]  # change of the joints' directions if every reversal came one std of its time later
+    # Change of the joints' directions if every reversal came one standard deviation of its time earlier, and later.
+    changes: Float[np.ndarray, "2 m *T"]
 
 
 @dataclass(frozen=True)

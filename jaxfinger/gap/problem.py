@@ -8,7 +8,7 @@ Lovell). This module makes W r and the whitened Jacobian; `signatures` makes W Î
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -23,16 +23,16 @@ from jaxfinger.effects import Scales
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import Stack
 from jaxfinger.gap.merged_trials import MergedTrials, merged_trials
-from jaxfinger.gap.reversals import with_reversals
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.dead_zone import clear_of_dead_zones
 from jaxfinger.identify.intervals import stretches
 from jaxfinger.identify.linearise import White
-from jaxfinger.identify.noise import Noise, estimate, history, reversals_out, whiten, without_recurring_laws
+from jaxfinger.identify.noise import Noise, estimate, history, whiten, without_recurring_laws
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.prior import Prior, prior_of
 from jaxfinger.identify.readings import readings_of
+from jaxfinger.identify.reversals import change_by_reversals, with_reversals
 from jaxfinger.identify.solve import ROUGH_TOLERANCE, Source, solve, white_tangents
 from jaxfinger.identify.stages import (
     Progress,
@@ -63,8 +63,7 @@ class Rows:
     trial: np.ndarray  # (rows,) index of the trial in the stack
     time: np.ndarray  # (rows,) index of the sample
     history: np.ndarray  # (rows,) number of preceding samples that the whitening filter reads
-    # (rows, rows) by channel: what is added to white rows since the times of reversals are uncertain
-    reversals: dict[str, scipy.sparse.csr_array] = field(default_factory=dict)
+    reversals: dict[str, scipy.sparse.csr_array]  # (rows, rows) C of `identify.reversals`, of channels that have any
 
     @property
     def size(self) -> int:
@@ -434,17 +433,29 @@ def _layout(experiment: str, source: Source, start: int) -> Rows:
     block = np.concatenate(counts, axis=1)  # (B, columns of all channels, T)
     keep = np.flatnonzero(block)
     trial, wide, time = np.unravel_index(keep, block.shape)
-    channel, column = np.array(channel)[wide], np.array(column)[wide]
-    reversals = {}
+    rows = Rows(
+        experiment,
+        start,
+        keep,
+        np.array(channel)[wide],
+        np.array(column)[wide],
+        trial,
+        time,
+        np.concatenate(before, axis=1).reshape(-1)[keep],
+        {},
+    )
+    return replace(rows, reversals=_changes_by_reversals(source, rows))
+
+
+def _changes_by_reversals(source: Source, rows: Rows) -> dict[str, scipy.sparse.csr_array]:
+    """C of `identify.reversals`, by channel, in the order of the rows."""
+    out = {}
     for number, (c, filters) in enumerate(source.filters.items()):
         if c in source.batch.uncertain:
             mask = np.asarray(source.batch.mask[c])
-            later = whiten(source.batch.uncertain[c], mask, filters, CHANNELS[c].free_zero)
-            at = np.flatnonzero(channel == number)
-            place = scipy.sparse.csr_array(
-                (np.ones(at.size), (at, np.ravel_multi_index((column[at], trial[at], time[at]), mask.shape))),
-                (keep.size, mask.size),
-            )
-            reversals[c] = scipy.sparse.csr_array(place @ reversals_out(later) @ place.T)
-    before = np.concatenate(before, axis=1).reshape(-1)[keep]
-    return Rows(experiment, start, keep, channel, column, trial, time, before, reversals)
+            v = np.asarray(whiten(source.batch.uncertain[c], mask, filters, CHANNELS[c].free_zero))
+            mine = np.flatnonzero(rows.channel == number)
+            at = np.ravel_multi_index((rows.column[mine], rows.trial[mine], rows.time[mine]), mask.shape)
+            place = scipy.sparse.csr_array((np.ones(at.size), (mine, at)), (rows.size, mask.size))
+            out[c] = scipy.sparse.csr_array(place @ change_by_reversals(v) @ place.T)
+    return out

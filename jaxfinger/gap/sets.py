@@ -41,6 +41,9 @@ MAX_PER_CHOICE = 2  # of the short list, for one cause and one choice of its fix
 MAX_EXACT = 3  # offers that are fitted exactly: each fit takes seconds
 MAX_CHANGES = 12  # changes of the set in one search
 MAX_SCORE_GAP = 8.0  # nats. A set whose linear fit is further behind is not fitted exactly: each fit takes seconds.
+# Share of the gain that the best offer promises, by which others may promise less: where a law is curved, or a large
+# cause bends the nominal model, a linear fit promises half of what the exact one brings, or twice as much.
+MAX_GAIN_SHORTFALL = 0.5
 MIN_SWAP_GAIN = 1.0  # nats that a swap must bring, so that two sets of like evidence are not swapped back and forth
 
 
@@ -299,9 +302,11 @@ class Search:
         """Offers that may be best once they are fitted, each of another cause or choice, best first.
 
         They are the best `most` with shapes of the grid, and the best `most` with shapes between those; each without
-        offers that are MAX_SCORE_GAP behind the first. Weights are settled. The cause `other_than` is left out.
+        offers that are both MAX_SCORE_GAP and MAX_GAIN_SHORTFALL behind the first. Weights are settled. The cause
+        `other_than` is left out.
         """
         keys, score, model, now, net = screened
+        empty = score - self.costs.of(keys)
         found, taken = [], {}
         for n in np.argsort(-net)[: 4 * SHORT_LIST]:
             o = self.table.offers[n]
@@ -323,7 +328,7 @@ class Search:
         for x in sorted(found, key=lambda x: -x.net):
             on_grid.setdefault((x.offer.keys, x.offer.choices), x)
         fitted = {form: self._with_fitted_shapes(screened, x) for form, x in on_grid.items()}
-        chosen = _nearest_best(on_grid, most) | _nearest_best(fitted, most)
+        chosen = _nearest_best(on_grid, most, empty) | _nearest_best(fitted, most, empty)
         return sorted((fitted[form] for form in chosen), key=lambda x: -x.net)
 
     def _with_fitted_shapes(self, screened: Screened, found: Addition) -> Addition:
@@ -454,7 +459,13 @@ class Search:
         return out
 
 
-def _nearest_best(found: Mapping[tuple, Addition], most: int) -> set[tuple]:
-    """Keys of the `most` additions with the most net evidence, without those MAX_SCORE_GAP behind the best."""
+def _nearest_best(found: Mapping[tuple, Addition], most: int, empty: float) -> set[tuple]:
+    """Keys of the `most` additions with the most net evidence that are not far behind the best.
+
+    `empty`: net evidence without any of them.
+    """
     order = sorted(found, key=lambda k: -found[k].net)[:most]
-    return {k for k in order if found[k].net > found[order[0]].net - MAX_SCORE_GAP}
+    if not order:
+        return set()
+    best = found[order[0]].net
+    return {k for k in order if found[k].net > best - max(MAX_SCORE_GAP, MAX_GAIN_SHORTFALL * (best - empty))}

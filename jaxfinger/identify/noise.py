@@ -14,15 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-import scipy.sparse
 from jaxtyping import Array, Float
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.distance import cdist
 
 from jaxfinger.data.schema import CHANNELS
-from jaxfinger.data.signals.motion import stretches_of
 from jaxfinger.data.signals.noise import STD_PER_MAD
 from jaxfinger.experiments import Batch, Stack
+from jaxfinger.identify.reversals import change_by_reversals
 
 ORDER = 3  # of the autoregression: describes white noise after a low-pass (tests/identify/test_noise.py)
 # A column needs more samples than the first for a standard deviation of its own, known to 10 % from 50 (1/√(2 n)), and
@@ -94,38 +93,9 @@ def whiten(
     white = _filtered(r, mask, coefficients, demean)
     if uncertain is None:
         return white
-    change = reversals_out(_filtered(uncertain, mask, coefficients, demean))
-    flat = np.reshape(white, (-1, mask.size))
-    return np.reshape(flat + (change @ flat.T).T, white.shape)
-
-
-def reversals_out(white: Float[np.ndarray, "2 columns B T"]) -> scipy.sparse.csr_array:
-    """Matrix C, for which x + C x is white where the times of reversals are uncertain, of rows in order of the columns.
-
-    `white`: change of white rows by one standard deviation of a reversal's time, earlier and later. With v_k the
-    changes beside reversal k of a column in a trial, by the noise of the encoder, and with the sum of the later ones,
-    since a contact's travel delays all reversals alike, as the columns of V,
-
-        cov x = I + V Vᵀ,   V = U S Wᵀ,   C = U ((I + S²)^−½ − I) Uᵀ.
-    """
-    _, *shape, T = white.shape
-    blocks, at = [scipy.sparse.csr_array((np.prod(shape) * T,) * 2)], []
-    for series in np.ndindex(*shape):
-        v = white[(slice(None), *series)]
-        some = np.any(v != 0.0, axis=0)
-        if some.any():
-            each = [np.where((np.arange(T) >= i) & (np.arange(T) < j), v, 0.0) for i, j in stretches_of(some)]
-            U, S, _ = np.linalg.svd(np.concatenate([*each, v[1:]])[:, some].T, full_matrices=False)
-            at.append(np.ravel_multi_index(series, shape) * T + np.flatnonzero(some))
-            blocks.append((U * ((1.0 + S**2) ** -0.5 - 1.0)) @ U.T)
-    size = blocks[0].shape
-    return sum(
-        (
-            scipy.sparse.csr_array((b.ravel(), (np.repeat(i, i.size), np.tile(i, i.size))), size)
-            for b, i in zip(blocks[1:], at, strict=True)
-        ),
-        blocks[0],
-    )
+    change = change_by_reversals(_filtered(uncertain, mask, coefficients, demean))
+    rows = np.reshape(white, (-1, mask.size))
+    return np.reshape(rows + (change @ rows.T).T, white.shape)
 
 
 def _filtered(r, mask, coefficients, demean: bool):
