@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
-from jaxfinger.data.importing.recording import Recording
+from jaxfinger.data.importing.dates import packed, texts
+from jaxfinger.data.importing.recording import Recording, Variable
 from jaxfinger.data.opening import plain_reason
 from jaxfinger.errors import UserError
 
@@ -20,11 +22,27 @@ _FRAMES = {
 
 
 def load_recording(path: Path) -> Recording:
-    """Load every numeric variable of a recording, and the reasons why others cannot be used.
+    """Load every numeric variable of a recording, and the reasons why others cannot be used. Dates are seconds.
 
     Raises:
         UserError: the file is missing, empty, of an unknown kind, or damaged.
     """
+    return _with_dates(_load(path))
+
+
+def _with_dates(recording: Recording) -> Recording:
+    """Recording with dates and times of day, as texts or packed into numbers, as variables in s."""
+    read = {name: texts(column.tolist()) for name, column in recording.words.items()}
+    read |= {name: packed(v.values) for name, v in recording.variables.items() if v.values.ndim == 1}
+    stamps = {name: seconds for name, seconds in read.items() if seconds is not None}
+    variables = dict(recording.variables)
+    for name, seconds in stamps.items():
+        variables[name] = replace(variables.get(name, Variable(seconds)), values=seconds, units="s")
+    unusable, words = ({k: v for k, v in of.items() if k not in stamps} for of in (recording.unusable, recording.words))
+    return replace(recording, variables=variables, unusable=unusable, words=words)
+
+
+def _load(path: Path) -> Recording:
     refuse_path(path)
     kind = path.suffix.lower()
     try:

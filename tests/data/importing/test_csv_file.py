@@ -164,12 +164,20 @@ def test_decimal_commas_beside_dates_with_a_point(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "word", ["-", "--", "#N/A", "NA", "n/a", "NULL", "None", "nan", "#DIV/0!", "1.#QNAN", "-1.#IND"]
+    "word", ["-", "--", "#N/A", "NA", "n/a", "NULL", "None", "nan", "#DIV/0!", "1.#QNAN", "-1.#IND", "1.#INF"]
 )
 def test_words_for_a_missing_value(tmp_path, word):
     found = load(tmp_path, f"a,t\n1,0\n{word},1\n3,2\n4,3\n")
     np.testing.assert_array_equal(found.variables["a"].values, [1, np.nan, 3, 4])
     assert found.unusable == {}
+
+
+def test_exponents_of_double_precision_are_numbers(tmp_path):
+    """As Fortran writes them. A code such as 1D3 is a word."""
+    found = load(tmp_path, " t a b\n" + "".join(f" 0.{k}D+00 -.15d-02 1D{k}\n" for k in range(1, 9)))
+    np.testing.assert_allclose(found.variables["t"].values, np.arange(1, 9) / 10.0)
+    np.testing.assert_array_equal(found.variables["a"].values, -0.0015)
+    assert "'1D1', '1D2'" in found.unusable["b"]
 
 
 def test_a_ratio_has_the_unit_of_a_dash(tmp_path):
@@ -193,7 +201,7 @@ def test_times_of_day_and_dotted_dates_are_seconds(tmp_path, header, rows):
     assert time.units == "s"
 
 
-@pytest.mark.parametrize("cell", ["01/31/2026 12:00:00.0", "12:00", "11:59:58 PM", "12:61:00"])
+@pytest.mark.parametrize("cell", ["31/31/2026 12:00:00.0", "12:00", "13:59:58 PM", "12:61:00"])
 def test_a_time_that_is_not_clear_is_told_how_to_be_written(tmp_path, cell):
     found = load(tmp_path, "t,a\n" + "".join(f"{cell},{k}\n" for k in range(3)))
     assert (
