@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime, timedelta, timezone
 from typing import TYPE_CHECKING
 
@@ -57,20 +57,25 @@ def seconds(cell: str, month_first: bool | None = None) -> float | None:
     fraction = int(digits) / 10.0 ** len(digits)
     if "year" not in at:
         return 3600.0 * hour + 60.0 * int(at["minute"]) + int(at["second"]) + fraction
-    day, month = at.get("day"), at.get("month")
-    if name := at.get("name"):
-        month = _MONTHS.index(name.lower()) + 1
-    elif first := at.get("first"):
-        day, month = (at["next"], first) if month_first and at["mark"] != "." else (first, at["next"])
-    year = int(at["year"]) + (2000 if len(at["year"]) == 2 else 0)
     try:
-        whole = datetime(year, int(month), int(day), hour, int(at["minute"]), int(at["second"]), tzinfo=_zone(at))
+        whole = datetime(*_date(at, month_first), hour, int(at["minute"]), int(at["second"]), tzinfo=_zone(at))
     except ValueError:
         return None
     return whole.timestamp() + fraction
 
 
-def _zone(at: dict[str, str | None]) -> timezone:
+def _date(at: Mapping[str, str], month_first: bool) -> tuple[int, int, int]:
+    """Year, month and day."""
+    year = int(at["year"]) + (2000 if len(at["year"]) == 2 else 0)
+    if name := at.get("name"):
+        return year, _MONTHS.index(name.lower()) + 1, int(at["day"])
+    if first := at.get("first"):
+        pair = int(first), int(at["next"])
+        return (year, *pair) if month_first and at["mark"] != "." else (year, *pair[::-1])
+    return year, int(at["month"]), int(at["day"])
+
+
+def _zone(at: Mapping[str, str]) -> timezone:
     text = at.get("zone")
     if not text:
         return UTC
@@ -180,7 +185,7 @@ def _days(date: Int[np.ndarray, " N"]) -> np.ndarray | None:
 def texts(cells: Collection[str]) -> Float[np.ndarray, " N"] | None:
     """Seconds of texts that are all dates or times of day, NaN of empty ones; None where any is something else."""
     months, _ = month_first(set(cells))
-    read = {cell: seconds(cell.strip(), months) if cell.strip() else np.nan for cell in set(cells)}
-    if any(value is None for value in read.values()) or np.isnan(list(read.values())).all():
+    read = {cell: seconds(cell.strip(), months) for cell in set(cells) if cell.strip()}
+    if not read or None in read.values():
         return None
-    return np.array([read[cell] for cell in cells], np.float64)
+    return np.array([read.get(cell, np.nan) for cell in cells], np.float64)

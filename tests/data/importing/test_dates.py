@@ -7,7 +7,6 @@ import pytest
 
 from jaxfinger.data.importing.dates import seconds
 from jaxfinger.data.importing.sources import load_recording
-from jaxfinger.errors import UserError
 
 NOON = 1769860799.23  # 2026-01-31T11:59:59.23Z
 
