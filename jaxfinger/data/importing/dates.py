@@ -32,6 +32,7 @@ _EITHER = re.compile(r"(\d\d?)([-/])(\d\d?)\2(?:\d{4}|\d\d),? ")  # day or month
 _PACKED = re.compile(r"(\d{14})(\d{3}|[.,]\d*)?")
 _YEARS = 1970, 2099  # in which a packed date lies; other numbers of 14 digits are none
 _MAX_DISORDER = 0.1  # of a clock's steps that run back: late stamps, and midnight
+_MIN_JUMP = 1.5  # usual steps: those of an even clock are 1
 _MAX_STEP = 5.0  # usual steps: as long as a clock's step from one minute to the next may be
 
 
@@ -70,8 +71,8 @@ def _date(at: Mapping[str, str], month_first: bool) -> tuple[int, int, int]:
     if name := at.get("name"):
         return year, _MONTHS.index(name.lower()) + 1, int(at["day"])
     if first := at.get("first"):
-        pair = int(first), int(at["next"])
-        return (year, *pair) if month_first and at["mark"] != "." else (year, *pair[::-1])
+        one, other = int(first), int(at["next"])
+        return (year, one, other) if month_first and at["mark"] != "." else (year, other, one)
     return year, int(at["month"]), int(at["day"])
 
 
@@ -158,10 +159,13 @@ def _unpacked(whole: Int[np.ndarray, " N"], fraction: Float[np.ndarray, " N"]) -
     if date.min() >= 10**7:
         return read
     steps, raw = np.diff(read), np.diff(whole + fraction)
-    turns = ~np.isclose(steps, raw, atol=1e-3)
+    turns, goes_on = ~np.isclose(steps, raw, atol=1e-3), raw > 0.0
+    usual = np.median(raw[goes_on & ~turns]) if (goes_on & ~turns).any() else np.inf
     if not turns.any() or np.mean(steps < 0.0) > _MAX_DISORDER:
         return None
-    return read if np.median(steps[turns]) < _MAX_STEP * np.median(steps[steps > 0.0]) else None
+    # The numbers jump by 40 or more from minute to minute, and the times go on evenly.
+    even = np.median(steps[turns]) < _MAX_STEP * usual < _MAX_STEP * np.median(raw[turns]) / _MIN_JUMP
+    return read if even else None
 
 
 def _days(date: Int[np.ndarray, " N"]) -> np.ndarray | None:

@@ -104,6 +104,8 @@ def test_dates_are_read_from_other_files_too(tmp_path, kind):
     "values",
     [
         np.arange(0, 300000, 10),  # ms
+        np.arange(0, 3700, 100),
+        np.arange(0, 5500, 50),
         115900.0 + np.arange(5900) / 100.0,  # seconds
         1000.0 * np.arange(60),
         1.7e9 + np.arange(500.0),
