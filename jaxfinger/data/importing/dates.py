@@ -13,8 +13,9 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 _CLOCK = (
-    r"(?P<hour>\d{1,2}):(?P<minute>[0-5]\d):(?P<second>[0-5]\d)(?:[.,](?P<fraction>\d*)|:(?P<milli>\d{3}))?"
-    r"(?: ?(?P<half>[AP])\.?M\.?)?(?: ?(?:Z|UTC|GMT|(?P<zone>[+-]\d\d(?::?\d\d)?)))?"
+    r"(?:(?P<days>\d+) days? )?(?P<hour>\d{1,2}):(?P<minute>[0-5]\d):(?P<second>[0-5]\d)"
+    r"(?:[.,](?P<fraction>\d*)|:(?P<milli>\d{3}))?(?: ?(?P<half>[AP])\.?M\.?)?"
+    r"(?: ?(?:Z|UTC|GMT|(?P<zone>[+-]\d\d(?::?\d\d)?)))?"
 )
 _PACKED_CLOCK = r"(?P<hour>\d\d)(?P<minute>[0-5]\d)(?P<second>[0-5]\d)(?:[.,]?(?P<fraction>\d+))?"
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
@@ -57,7 +58,9 @@ def seconds(cell: str, month_first: bool | None = None) -> float | None:
     digits = at.get("milli") or at["fraction"] or "0"
     fraction = int(digits) / 10.0 ** len(digits)
     if "year" not in at:
-        return 3600.0 * hour + 60.0 * int(at["minute"]) + int(at["second"]) + fraction
+        return (
+            86400.0 * int(at.get("days") or 0) + 3600.0 * hour + 60.0 * int(at["minute"]) + int(at["second"]) + fraction
+        )
     try:
         whole = datetime(*_date(at, month_first), hour, int(at["minute"]), int(at["second"]), tzinfo=_zone(at))
     except ValueError:

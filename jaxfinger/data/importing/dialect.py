@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxfinger.data.importing.dates import seconds
+from jaxfinger.data.units import is_foreign, unit_name
 
 _BOOLEANS = {"true": 1.0, "false": 0.0}
 # What programs write for a missing value: words, errors of spreadsheets, and NaN of Microsoft's C library.
@@ -35,6 +36,7 @@ MISSING = {
     "-1.#inf",
 }
 _FORTRAN = re.compile(r"([+-]?(?:\d+\.\d*|\.\d+))[dD]([+-]?\d+)$")  # a number of double precision
+_QUANTITY = re.compile(r"[+-]?\d[\d.,]*(?:[eE][+-]?\d+)?\s*([A-Za-zµ°%][A-Za-z °·*/]*)")
 _BLANKS = " \u00a0\u202f'’"  # that group digits, and are never a decimal mark
 # Numbers with groups of three digits, by decimal mark. One group alone behind the other mark is no such number: 1,234
 # may be 1234 or 1.234.
@@ -71,12 +73,19 @@ class Dialect:
         stamp = seconds(cell, month_first)
         if stamp is not None:
             return stamp
+        unit = self.unit(cell)
+        cell = cell.removesuffix(unit).rstrip() if unit else cell
         comma = self.mark == "," and cell.count(",") == 1 and "." not in cell
         value = _cell(cell.replace(",", ".") if comma else cell)
         if value is None and _GROUPED[self.mark].match(cell):
             other = "." if self.mark == "," else ","
             return float(re.sub(f"[{other}{_BLANKS}]", "", cell).replace(",", "."))
         return value
+
+    def unit(self, cell: str) -> str:
+        """Unit behind the number in a cell, as `ms` of `10 ms`; empty where there is none."""
+        at = _QUANTITY.fullmatch(cell)
+        return at[1] if at and (unit_name(at[1]) or is_foreign(at[1])) else ""
 
 
 # Of equally good dialects the first is taken.

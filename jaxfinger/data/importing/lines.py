@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxfinger.data.importing.logs import Log
-from jaxfinger.data.importing.names import is_speed
+from jaxfinger.data.importing.names import is_speed, spelt_unit
 from jaxfinger.data.importing.speeds import speeds
 from jaxfinger.data.importing.survey import ColumnSurvey, values_of
 from jaxfinger.data.signals.pace import speed
@@ -19,6 +19,7 @@ from jaxfinger.errors import listed
 _MAX_SPEEDS = 4  # that are named
 # SI units of a sliding joint's position and force, and their largest plausible values, with room for gantries.
 _MAX_SLIDING = {"q": ("m", 2.0), "joint_torque": ("N", 500.0)}
+_MAX_OVERTRAVEL = 0.35  # rad beyond a joint's limits, since stated limits are approximate
 _USUAL_RATES = 100, 1000  # Hz
 
 
@@ -55,7 +56,7 @@ def column_line(seen: ColumnSurvey, log: Log | None, slides: bool, turns: bool) 
 
 def torque_line(columns: Sequence[ColumnSurvey], weight: float) -> list[str]:
     """A comment on the unit of torques that their recording does not state, by the finger's own `weight`, N m."""
-    sizes = [max(-s.low, s.high) for s in columns if not s.stated and not s.foreign and s.missing < s.samples]
+    sizes = [max(-s.low, s.high) for s in columns if _is_guessed(s) and not s.foreign]
     if not sizes or not weight:
         return []
     times = max(sizes) / weight
@@ -63,6 +64,27 @@ def torque_line(columns: Sequence[ColumnSurvey], weight: float) -> list[str]:
         f"# joint_torque reaches {times:.2g} times the torque with which the whole finger weighs on an arm as long "
         f"as its reach, if in N m, and {1e-3 * times:.2g} times, if in N mm"
     ]
+
+
+def turns_line(columns: Sequence[ColumnSurvey], limits: np.ndarray) -> list[str]:
+    """A comment on angles that are taken for rad, where they lie within the joints' `limits` (m, 2), rad, in turns too.
+
+    Some motor drives count turns.
+    """
+    guessed = [s for s in columns if _is_guessed(s) and s.units == "rad"]
+    if not guessed:
+        return []
+    low, high = min(s.low for s in guessed), max(s.high for s in guessed)
+    turn = TO_SI["turn"].factor
+    if turn * low < limits.min() - _MAX_OVERTRAVEL or turn * high > limits.max() + _MAX_OVERTRAVEL:
+        return []
+    said = [f"{np.degrees(low * f):.0f} to {np.degrees(high * f):.0f} degrees" for f in (1.0, turn)]
+    return [f"# q runs from {said[0]} if in rad, and from {said[1]} if in turns, as some motor drives count"]
+
+
+def _is_guessed(seen: ColumnSurvey) -> bool:
+    """Whether neither the recording nor the column's name states the unit of its values."""
+    return not (seen.stated or spelt_unit(seen.name)) and seen.missing < seen.samples
 
 
 def rate_by_speeds(log: Log) -> list[str]:

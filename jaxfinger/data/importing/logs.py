@@ -28,14 +28,20 @@ class Log:
 
     @property
     def clock(self) -> ColumnSurvey | None:
-        """Column with the times of its samples: stamps of headers before other clocks, and these before counts."""
+        """Column with the times of its samples: stamps of headers before other clocks, these before counts, and those
+        that never run back before others."""
         clocks = [s for s in self.seen if s.meaning == "time"]
-        return min(clocks, key=lambda s: (not s.name.endswith(".stamp"), self.counts(s)), default=None)
+        return min(
+            clocks, key=lambda s: (not s.name.endswith(".stamp"), self.counts(s), self._runs_back(s)), default=None
+        )
 
     def counts(self, clock: ColumnSurvey) -> bool:
         """Whether a clock without units goes on by one from sample to sample, as an index does and ms may."""
         steps = np.diff(np.ravel(self.recording.variables[clock.name].values))
         return not (clock.stated or spelt_unit(clock.name)) and bool(np.all(steps == 1.0))
+
+    def _runs_back(self, clock: ColumnSurvey) -> bool:
+        return bool(np.any(np.diff(np.ravel(self.recording.variables[clock.name].values)) < 0.0))
 
     @property
     def count(self) -> int:

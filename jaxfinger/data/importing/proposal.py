@@ -11,7 +11,7 @@ import numpy as np
 from jaxfinger.data.importing.assignment import assigned, held_names, known_names, named_columns
 from jaxfinger.data.importing.columns import coarse_rate, restarts
 from jaxfinger.data.importing.experiment import guessed_experiment
-from jaxfinger.data.importing.lines import called, column_line, pace_line, rate_by_speeds, torque_line
+from jaxfinger.data.importing.lines import called, column_line, pace_line, rate_by_speeds, torque_line, turns_line
 from jaxfinger.data.importing.logs import Log, trials_of
 from jaxfinger.data.importing.names import is_nameless, is_set_point, words
 from jaxfinger.data.importing.recording import Recording
@@ -27,6 +27,7 @@ _MOTOR = r"(?<![a-z])(motor|mot|drive|actuator|rotor|spool|winch)(?![a-z])"
 _LINK, _MOTOR_BESIDE_LINK = r"(?<![a-z])q(?![a-z])", r"(?<![a-z])theta(?![a-z])"
 _MAX_LEFT_OUT = 12  # variables that are named, so that the line of a large bag stays readable.
 _MAX_TABLE = 10  # samples: files that are no longer may be tables of parameters, and of one length by chance.
+_ANGLES = np.array([[-1.6, 1.6]])  # rad: of a joint whose limits are not known
 _HEAD = 'specimen = "my finger"\nfinger = "finger.toml"'
 
 
@@ -132,7 +133,9 @@ def _trial_proposal(logs: Sequence[Log], finger: FingerDescription | None, weigh
     for channel, families in rivals.items():
         named = [f"{called(family[0])} to {called(family[-1])}" for family in families]
         lines.append(f"# {channel} could also be {' or '.join(named)}: take what was measured")
-    lines += [*surplus, *torque_line(channels.get("joint_torque", ()), weight)]
+    limits = finger.limits[~np.array(finger.prismatic, bool)] if finger is not None else _ANGLES
+    lines += [*surplus, *turns_line(channels.get("q", ()), limits if limits.size else _ANGLES)]
+    lines += torque_line(channels.get("joint_torque", ()), weight)
     if len(begins := restarts(time)):
         lines.append(f"# the time begins again after sample {begins[0]}: a trial for each part, chosen by `where`")
     elif coarse is None and (np.diff(time) <= 0.0).any():
@@ -179,6 +182,10 @@ def _assign(
         if known and len(columns) > len(known) and not any(held_names(columns, known)):
             said = f"{counted(len(columns), 'column')} for {listed(known)}, in their order"
             comments.append(f"# {channel}: {said}: correct this, or give the finger the names of the recording")
+        elif len(known) > 1 and not any(held_names(columns, known)) and (channel == "q" or len(columns) > 1):
+            pairs = zip(names[channel], channels[channel], strict=True)
+            order = listed([f"{called(s)} of {name}" for name, s in pairs])
+            comments.append(f"# {channel} by numbers or in their order, {order}: correct this if it is another")
     counts = [len(channels.get(channel, ())) for channel in ("q", "joint_torque")]
     if finger is None and min(counts) > 1 and counts[0] != counts[1]:
         said = " and ".join(

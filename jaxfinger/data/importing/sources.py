@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from jaxfinger.data.importing.dates import packed, texts
 from jaxfinger.data.importing.recording import Recording, Variable
@@ -15,10 +19,16 @@ _FRAMES = {
     ".parquet": "read_parquet",
     ".feather": "read_feather",
     ".pkl": "read_pickle",
+    ".pickle": "read_pickle",
     ".xls": "read_excel",
     ".xlsx": "read_excel",
     ".ods": "read_excel",
 }
+_PACKED = (".gz", ".zip", ".bz2", ".xz", ".7z", ".zst", ".tgz")
+# Names of seconds and of the rest of a stamp, behind the name of the stamp, and the rest's unit in s.
+_WHOLE = re.compile(r"(.*?)(?:secs?|seconds)", re.IGNORECASE)
+_REST = (("(?i:n(ano)?sec(ond)?s?)", 1e-9), ("(?i:(u|micro)sec(ond)?s?)", 1e-6))
+_TEXT = 4096  # bytes at the beginning, which show whether a file is text
 
 
 def load_recording(path: Path) -> Recording:
@@ -35,11 +45,31 @@ def _with_dates(recording: Recording) -> Recording:
     read = {name: texts(column.tolist()) for name, column in recording.words.items()}
     read |= {name: packed(v.values) for name, v in recording.variables.items() if v.values.ndim == 1}
     stamps = {name: seconds for name, seconds in read.items() if seconds is not None}
-    variables = dict(recording.variables)
+    variables = {**recording.variables, **_joined(recording.variables)}
     for name, seconds in stamps.items():
         variables[name] = replace(variables.get(name, Variable(seconds)), values=seconds, units="s")
     unusable, words = ({k: v for k, v in of.items() if k not in stamps} for of in (recording.unusable, recording.words))
     return replace(recording, variables=variables, unusable=unusable, words=words)
+
+
+def _joined(variables: Mapping[str, Variable]) -> dict[str, Variable]:
+    """Stamps, s, that a recording splits into whole seconds and the rest, as `stamp.secs` and `stamp.nsecs`."""
+    joined = {}
+    for name, whole in variables.items():
+        if (at := _WHOLE.fullmatch(name)) is None or whole.values.ndim > 1:
+            continue
+        stamp = at[1].rstrip("._/ ") or "stamp"
+        for ending, factor in _REST:
+            rest = next((v for k, v in variables.items() if re.fullmatch(re.escape(at[1]) + ending, k)), None)
+            if rest is not None and stamp not in variables and _splits(whole, rest, factor):
+                joined[stamp] = replace(whole, values=whole.values + factor * rest.values, units="s")
+    return joined
+
+
+def _splits(whole: Variable, rest: Variable, factor: float) -> bool:
+    """Whether two variables are whole seconds and what is beyond them."""
+    x, beyond = whole.values, factor * rest.values
+    return x.shape == beyond.shape and bool(np.all((np.floor(x) == x) & (beyond >= 0.0) & (beyond < 1.0)))
 
 
 def _load(path: Path) -> Recording:
@@ -72,6 +102,10 @@ def _load(path: Path) -> Recording:
             from jaxfinger.data.importing.bags import load_bag
 
             return load_bag(path)
+        if kind not in (*_FRAMES, *_PACKED, ".tdms") and _is_text(path):
+            from jaxfinger.data.importing.csv_file import load_csv
+
+            return load_csv(path)
     except UserError:
         raise
     except PermissionError:
@@ -79,10 +113,22 @@ def _load(path: Path) -> Recording:
     except Exception as error:  # Readers of foreign formats raise exceptions of many kinds.
         said = f"{type(error).__name__}: {plain_reason(error)}"
         raise UserError(f"{path}: cannot be read ({said}); export the recording again") from error
+    if kind in _PACKED:
+        raise UserError(f"{path}: is compressed; unpack it, and give the file in it")
+    if kind == ".tdms":
+        call = f"nptdms.TdmsFile.read({path.name!r}).as_dataframe(time_index=True).to_csv({path.stem + '.csv'!r})"
+        raise UserError(f"{path}: is a binary file of LabVIEW, which is not read; write it as CSV, in Python: {call}")
     if kind in _FRAMES:
         call = f"pandas.{_FRAMES[kind]}({path.name!r}).to_csv({path.stem + '.csv'!r}, index=False)"
         raise UserError(f"{path}: is a table of a kind that is not read; write it as CSV, in Python: {call}")
     raise UserError(f"{path}: is of an unknown kind; give .csv, .mat, .json, .npz, .h5, .mcap or a rosbag2 folder")
+
+
+def _is_text(path: Path) -> bool:
+    """Whether a file of an unknown ending is text, as `.log` and `.lvm`: no byte at its beginning is a control's."""
+    with path.open("rb") as file:
+        begin = file.read(_TEXT)
+    return begin.startswith((b"\xff\xfe", b"\xfe\xff")) or not re.search(rb"[\x00-\x08\x0e-\x1f]", begin)
 
 
 def refuse_path(path: Path) -> None:

@@ -37,7 +37,7 @@ _MAX_VALUES = {
 # `check` refuses them in N m. Between them the unit stays open.
 _WEIGHTS = 10.0, 200.0
 # Ranges of the usual interval, 10 µs to 0.5 s, in each unit. Where they overlap the first one counts.
-_INTERVALS = (("s", 1e-5, 0.5), ("ms", 0.01, 500.0), ("us", 10.0, 5e5), ("ns", 1e4, 5e8))
+_INTERVALS = (("day", 1e-10, 6e-6), ("s", 1e-5, 0.5), ("ms", 0.01, 500.0), ("us", 10.0, 5e5), ("ns", 1e4, 5e8))
 
 
 @dataclass(frozen=True)
