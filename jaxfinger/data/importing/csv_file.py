@@ -15,7 +15,7 @@ from jaxfinger.data.importing.joint_states import JointStates, joint_states
 from jaxfinger.data.importing.recording import Recording, Variable
 from jaxfinger.data.importing.text_columns import Column, read_columns
 from jaxfinger.data.importing.text_lines import COMMENTS, Line, is_comment, read_lines
-from jaxfinger.data.units import stated_units
+from jaxfinger.data.units import is_foreign, is_ratio, stated_units, unit_name
 from jaxfinger.errors import UserError, counted
 
 _DIALECT_LINES = 60  # They decide the dialect, and are taken from the middle of the file, after any header.
@@ -46,6 +46,8 @@ def load_csv(path: Path) -> Recording:
     body = [line for line in lines if not is_comment(line.text) and not line.text.startswith(_LOST)]
     if not body:
         raise UserError(f"{path}: holds no samples; it needs a line of names, then one line a sample")
+    if any(line.text.strip() == "---" for line in body) and any(line.text.strip() == "header:" for line in body):
+        raise UserError(f"{path}: holds messages as `ros2 topic echo` prints them; echo with --csv, or record a bag")
     sample = body[len(body) // 2 :][:_DIALECT_LINES]
     dialect, numeric = find_dialect([line.text for line in sample])
     split = dialect.split
@@ -152,9 +154,15 @@ def _names(
         return labelled["Name"], labelled.get("Unit", ("",) * width), True
     words = [row for row in rows if sum(_is_word(dialect, cell) for cell in row) * 2 > width]
     units = ("",) * width
-    if len(words) > 1 and all(_UNIT_CELL.match(cell) for cell in words[0]):
+    if len(words) > 1 and all(_is_unit(cell) for cell in words[0]):
         units = tuple(cell.strip("[]()") for cell in words.pop(0))
     return tuple(words[0]) if words else (), units, False
+
+
+def _is_unit(cell: str) -> bool:
+    """Whether a cell below a name is a unit, with or without brackets; it may be empty."""
+    unit = cell.strip("[]()")
+    return bool(_UNIT_CELL.match(cell) or unit_name(unit) or is_foreign(unit) or is_ratio(unit))
 
 
 def _is_word(dialect: Dialect, cell: str) -> bool:

@@ -23,6 +23,7 @@ _FORMS = tuple(
     re.compile(form, re.IGNORECASE)
     for form in (
         _CLOCK,
+        r"(?P<minute>\d\d?):(?P<second>[0-5]\d)\.(?P<fraction>\d+)",
         rf"(?P<year>\d{{4}})([-/._])(?P<month>\d\d?)\2(?P<day>\d\d?)(?:,? +|[T_]){_CLOCK}",
         rf"(?P<first>\d\d?)(?P<mark>[-/.])(?P<next>\d\d?)(?P=mark)(?P<year>\d{{4}}|\d\d),? +{_CLOCK}",
         rf"(?P<day>\d\d?)[- ](?P<name>{'|'.join(_MONTHS)})[- ](?P<year>\d{{4}}),? +{_CLOCK}",
@@ -51,7 +52,7 @@ def seconds(cell: str, month_first: bool | None = None) -> float | None:
     if found is None:
         return None
     at = found.groupdict()
-    hour, half = int(at["hour"]), at.get("half")
+    hour, half = int(at.get("hour") or 0), at.get("half")
     if half and not 1 <= hour <= 12:
         return None
     hour = hour % 12 + 12 * (half in ("P", "p")) if half else hour

@@ -62,7 +62,7 @@ class Dialect:
         if self.separator is None:
             return line.split()
         try:
-            cells = next(csv.reader([line], delimiter=self.separator), [])
+            cells = next(csv.reader([line], delimiter=self.separator, skipinitialspace=True), [])
         except csv.Error:  # a cell of more than 128 KiB, which no table has
             cells = [line]
         return [cell.strip() for cell in cells]

@@ -17,6 +17,7 @@ from jaxfinger.data.units import TO_SI
 # Of the time of two logs: with more in common they show one trial. Loggers that are started by hand begin and end a
 # little apart.
 _TOGETHER = 0.9
+_MIN_REPEATED = 0.9  # of the samples with the stamp of the one before: with its values too they are no other samples.
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,14 @@ class Log:
         """Whether a clock without units goes on by one from sample to sample, as an index does and ms may."""
         steps = np.diff(np.ravel(self.recording.variables[clock.name].values))
         return not (clock.stated or spelt_unit(clock.name)) and bool(np.all(steps == 1.0))
+
+    @cached_property
+    def repeats(self) -> bool:
+        """Whether samples are repeated with their stamps, rather than stamps being coarser than samples."""
+        same = np.flatnonzero(np.diff(self.time) == 0.0)
+        tables = [v.values for v in self.recording.variables.values() if len(v.values) == len(self.time)]
+        alike = [np.all(x[same] == x[same + 1], axis=tuple(range(1, x.ndim))) for x in tables]
+        return bool(len(same)) and bool(np.mean(np.all(alike, axis=0)) > _MIN_REPEATED)
 
     def _runs_back(self, clock: ColumnSurvey) -> bool:
         return bool(np.any(np.diff(np.ravel(self.recording.variables[clock.name].values)) < 0.0))

@@ -115,7 +115,7 @@ def _trial_proposal(logs: Sequence[Log], finger: FingerDescription | None, weigh
     lines = [f'experiment = "{experiment}"   # guessed: ID.2, ID.3-static, ID.3-dynamic, ID.4, VD.1, VD.2 or VD.3']
     lines += [f"joint = {quoted(joint)}   # that is moved, or held by the torque sensor"] if joint else []
     lines += [f"tendon = {quoted(tendon)}   # that is pulled"] if tendon else []
-    coarse = coarse_rate(time)
+    coarse = None if logs[0].repeats else coarse_rate(time)
     guessed = "   # guessed: its values rise evenly" if clock is not None and is_nameless(clock.name) else ""
     if clock is not None and logs[0].counts(clock):
         guessed = "   # it counts by one: if it counts samples, write `rate_hz`, samples per second, in its place"

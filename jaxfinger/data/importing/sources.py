@@ -28,7 +28,9 @@ _PACKED = (".gz", ".zip", ".bz2", ".xz", ".7z", ".zst", ".tgz")
 # Names of seconds and of the rest of a stamp, behind the name of the stamp, and the rest's unit in s.
 _WHOLE = re.compile(r"(.*?)(?:secs?|seconds)", re.IGNORECASE)
 _REST = (("(?i:n(ano)?sec(ond)?s?)", 1e-9), ("(?i:(u|micro)sec(ond)?s?)", 1e-6))
-_TEXT = 4096  # bytes at the beginning, which show whether a file is text
+_TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".sto", ".mot", ".log")
+_OTHERS = (".mat", ".npy", ".npz", ".h5", ".hdf5", ".mcap", ".db3", ".bag", ".tdms", *_FRAMES, *_PACKED)
+_BEGIN = 4096  # bytes, which show whether a file is text
 
 
 def load_recording(path: Path) -> Recording:
@@ -76,17 +78,14 @@ def _load(path: Path) -> Recording:
     refuse_path(path)
     kind = path.suffix.lower()
     try:
+        text = kind in _TEXTS or (kind not in _OTHERS and _is_text(path))
         if path.is_file() and path.stat().st_size == 0:
             raise UserError(f"{path}: is empty; export the recording again")
         if kind == ".mat":
             from jaxfinger.data.importing.matlab import load_mat
 
             return load_mat(path)
-        if kind in (".csv", ".txt", ".tsv", ".dat", ".asc", ".sto", ".mot"):
-            from jaxfinger.data.importing.csv_file import load_csv
-
-            return load_csv(path)
-        if kind in (".json", ".jsonl", ".ndjson"):
+        if kind in (".json", ".jsonl", ".ndjson") or (text and _begin(path).startswith(b"{")):
             from jaxfinger.data.importing.json_file import load_json
 
             return load_json(path)
@@ -102,7 +101,7 @@ def _load(path: Path) -> Recording:
             from jaxfinger.data.importing.bags import load_bag
 
             return load_bag(path)
-        if kind not in (*_FRAMES, *_PACKED, ".tdms") and _is_text(path):
+        if text:
             from jaxfinger.data.importing.csv_file import load_csv
 
             return load_csv(path)
@@ -124,10 +123,17 @@ def _load(path: Path) -> Recording:
     raise UserError(f"{path}: is of an unknown kind; give .csv, .mat, .json, .npz, .h5, .mcap or a rosbag2 folder")
 
 
-def _is_text(path: Path) -> bool:
-    """Whether a file of an unknown ending is text, as `.log` and `.lvm`: no byte at its beginning is a control's."""
+def _begin(path: Path) -> bytes:
+    """The first bytes of a file."""
     with path.open("rb") as file:
-        begin = file.read(_TEXT)
+        return file.read(_BEGIN)
+
+
+def _is_text(path: Path) -> bool:
+    """Whether a file of an unknown ending is text, as `.lvm`: it begins without bytes of control."""
+    if not path.is_file():
+        return False
+    begin = _begin(path)
     return begin.startswith((b"\xff\xfe", b"\xfe\xff")) or not re.search(rb"[\x00-\x08\x0e-\x1f]", begin)
 
 

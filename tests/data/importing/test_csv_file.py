@@ -27,6 +27,9 @@ def load(tmp_path, content, name="log.csv"):
         ("t,a,b\n" + NUMBERS, ["t", "a", "b"]),
         ("# made by X\n# t a b\n" + NUMBERS.replace(",", " "), ["t", "a", "b"]),
         ("t,a,b\ns,deg,N\n" + NUMBERS, ["t", "a", "b"]),
+        ("t,a,b\nsec,degrees,degrees\n" + NUMBERS, ["t", "a", "b"]),
+        ("t,a,b\n(s),(rad),(rad/s)\n" + NUMBERS, ["t", "a", "b"]),
+        ('"t", "a", "b"\n' + NUMBERS, ["t", "a", "b"]),
         (NUMBERS, ["column 0", "column 1", "column 2"]),
         ("0,1,2\n" + NUMBERS, ["0", "1", "2"]),
         (",a,b\n" + NUMBERS, ["column 0", "a", "b"]),
@@ -222,6 +225,12 @@ def test_columns_of_one_name(tmp_path):
     found = load(tmp_path, "t,a,a\n" + NUMBERS)
     assert list(found.variables) == ["t"]
     assert "columns 2 and 3" in found.unusable["a"]
+
+
+def test_what_ros2_topic_echo_prints_is_told_how_to_be_written(tmp_path):
+    message = "header:\n  stamp:\n    sec: 1\n    nanosec: {k}\nname:\n- MCP\nposition:\n- 0.{k}\n---\n"
+    with pytest.raises(UserError, match=r"log\.csv: holds messages as `ros2 topic echo` prints them; echo with --csv"):
+        load(tmp_path, "".join(message.format(k=k) for k in range(90)))
 
 
 @pytest.mark.parametrize("content", ["", "t,a\n", "only words\nand words\n", b"\x00\x01\x02"])

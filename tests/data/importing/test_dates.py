@@ -41,10 +41,15 @@ def test_half_days_are_read(cell, hour):
 
 
 @pytest.mark.parametrize(
-    "cell", ["12:00", "12:61:00", "13:00:00 PM", "31/31/2026 12:00:00", "2026-02-30 12:00:00", "1"]
+    "cell", ["12:00", "12:61:00", "12:61.5", "13:00:00 PM", "31/31/2026 12:00:00", "2026-02-30 12:00:00", "1"]
 )
 def test_what_is_no_clear_time_is_none(cell):
     assert seconds(cell) is None
+
+
+def test_minutes_and_seconds_are_read_where_a_fraction_tells_them():
+    """As spreadsheets show times of parts of a second. 12:30 alone may be hours and minutes."""
+    assert seconds("12:30.5") == 750.5
 
 
 def stamps(path):

@@ -141,7 +141,7 @@ def test_joints_that_only_their_numbers_tell_are_said(tmp_path):
     table = np.column_stack([TIME, np.sin(TIME), np.cos(TIME)])
     np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="time,FFJ2.position,FFJ1.position", comments="")
     text = proposal([load_recording(tmp_path / "log.csv")], make_finger())
-    assert '# q by numbers or in their order, "FFJ2.position" of PIP and "FFJ1.position" of MCP: correct this' in text
+    assert '# q by numbers or in their order, "FFJ2.position" of PIP, "FFJ1.position" of MCP: correct this' in text
 
 
 @pytest.mark.parametrize(
