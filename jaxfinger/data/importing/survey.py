@@ -36,8 +36,9 @@ _MAX_VALUES = {
 # since in N mm they would be a hundredth of it, less than any load moves them. Larger ones than the second are in N mm:
 # `check` refuses them in N m. Between them the unit stays open.
 _WEIGHTS = 10.0, 200.0
+_MIN_DATE = 1e4  # days: spreadsheets count them from 1900, and MATLAB from the year 0.
 # Ranges of the usual interval, 10 µs to 0.5 s, in each unit. Where they overlap the first one counts.
-_INTERVALS = (("day", 1e-10, 6e-6), ("s", 1e-5, 0.5), ("ms", 0.01, 500.0), ("us", 10.0, 5e5), ("ns", 1e4, 5e8))
+_INTERVALS = (("s", 1e-5, 0.5), ("ms", 0.01, 500.0), ("us", 10.0, 5e5), ("ns", 1e4, 5e8))
 
 
 @dataclass(frozen=True)
@@ -256,6 +257,8 @@ def _time_unit(x: np.ndarray) -> str:
     """Guess the unit of a clock from its usual interval between samples."""
     steps, coarse = _steps(x), coarse_rate(x)
     step = 1.0 / coarse[1] if coarse else float(np.median(steps)) if len(steps) else np.nan
+    if step < _INTERVALS[0][1] and np.nanmin(x) > _MIN_DATE:
+        return "day"
     return next((unit for unit, low, high in _INTERVALS if low <= step < high), "s")
 
 

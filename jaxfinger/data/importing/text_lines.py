@@ -17,8 +17,10 @@ _MIN_SHARE = 0.8  # of them
 _STAMP = "time"  # name of the column of stamps beside labelled numbers
 _STAMPED = re.compile(r"\s*(?:\[([^\]]+)\]\s*(?:->)?|(\S+(?: \S+)?)\s*->)\s*(\S.*)")
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
-_LABELLED = re.compile(
-    rf"([A-Za-z_µ][^\s:=,;|\"'{{}}]*)\s*[:=]\s*({_NUMBER.pattern}|nan|[+-]?inf)(?![^\s,;|])", re.IGNORECASE
+_LABELLED = re.compile(  # a label, a number and perhaps its unit
+    rf"([A-Za-z_µ][^\s:=,;|\"'{{}}]*)\s*[:=]\s*"
+    rf"((?:{_NUMBER.pattern}|nan|[+-]?inf)(?: ?[A-Za-zµ°%][A-Za-zµ°%/·]*)?)(?![^\s,;|])(?!\s*[:=])",
+    re.IGNORECASE,
 )
 COMMENTS = ("#", "%")
 _LIST_IN_QUOTES = re.compile(r'"\[[^"\]]*\]"')  # pandas breaks the lines of a long array
@@ -72,9 +74,9 @@ def _labelled(text: str) -> dict[str, str]:
     found = list(_LABELLED.finditer(text))
     before, *between = (part.strip(" \t,;|") for part in _LABELLED.sub("\0", text).split("\0"))
     stamp = seconds(before) is not None or _NUMBER.fullmatch(before)
-    if not found or any(between) or (before and not stamp):
-        return {}
-    return ({_STAMP: before} if before else {}) | {at[1].strip(): at[2] for at in found}
+    cells = ([(_STAMP, before)] if before else []) + [(at[1], at[2]) for at in found]
+    named = dict(cells)
+    return {} if not found or any(between) or (before and not stamp) or len(named) < len(cells) else named
 
 
 def is_comment(text: str) -> bool:

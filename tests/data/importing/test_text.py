@@ -44,6 +44,7 @@ def written(tmp_path, line, head="", name="log.txt"):
         ("t_ms:{ms:.0f},angle:{a},force:{f}", "Ready\n", ["t_ms", "angle", "force"]),
         ("time={t:.2f} angle={a} force={f}", "", ["time", "angle", "force"]),
         ("[{t:.2f}] angle: {a}; force: {f}", "", ["time", "angle", "force"]),
+        ("time={t:.2f}s angle={a}° force={f} N", "", ["time", "angle", "force"]),
         ("14:23:0{t:.3f} -> angle={a} force={f}", "", ["time", "angle", "force"]),
         ("14:23:0{t:.3f} -> {a},{f}", "", ["column 0", "column 1", "column 2"]),
         ("[14:23:0{t:.3f}] {a};{f}", "", ["column 0", "column 1", "column 2"]),
@@ -85,6 +86,11 @@ def test_lines_without_numbers_between_samples_are_left_out_and_said(tmp_path, s
     assert found.remarks == (
         f"has 2 lines without numbers among its samples, the first in line 102 ({said!r}), left out",
     )
+
+
+def test_labels_that_occur_twice_are_no_names(tmp_path):
+    with pytest.raises(UserError, match="holds no column of numbers"):
+        written(tmp_path, "t={t:.2f},x={a},x={f}")
 
 
 def test_a_line_with_a_number_and_another_width_is_no_prompt(tmp_path):
