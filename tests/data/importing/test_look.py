@@ -402,6 +402,21 @@ def test_the_finger_s_weight_tells_the_unit_of_a_torque(tmp_path, size, units):
     assert 'channels.joint_torque.MCP = { from = "tau_MCP", units = "N m" }' in proposal(recordings, arm)
 
 
+def test_units_that_no_size_tells_are_asked_for(tmp_path, capsys):
+    """Encoders that count, as those of servos, are in no unit of angles."""
+    log, mapping = tmp_path / "log.csv", tmp_path / "m.toml"
+    table = np.column_stack([GAPPED_MS, 2048 + 600 * np.sin(GAPPED_MS / 1e3), 0.01 * np.cos(GAPPED_MS / 1e3)])
+    np.savetxt(log, table, ["%.1f", "%.0f", "%.6f"], ",", header="Time(ms),Present Position,torque", comments="")
+    (tmp_path / "finger.toml").write_text(ONE_JOINT[ONE_JOINT.index("[finger]") :])
+    main(["look", str(log), "--finger", str(tmp_path / "finger.toml")])
+    said = capsys.readouterr().out
+    mapping.write_text(said[said.index("# a mapping") :])
+    with pytest.raises(SystemExit):
+        main(["import", str(log), "--mapping", str(mapping), "--output", str(tmp_path / "s.h5")])
+    said = capsys.readouterr().err
+    assert "channels.q.MCP: has units that are still to be filled in; write one of rad, mrad, deg, turn, and for" in said
+
+
 def test_messages_that_ros2_topic_echo_wrote_are_proposed_and_imported(tmp_path, capsys):
     angle, torque = 0.5 + 0.4 * np.sin(GAPPED_MS / 1e3), 0.01 * np.cos(GAPPED_MS / 1e3)
     sec, beyond = (GAPPED_MS // 1e3).astype(int), (GAPPED_MS % 1e3 * 1e6).astype(int)
