@@ -34,8 +34,9 @@ _EITHER = re.compile(r"(\d\d?)([-/])(\d\d?)\2(?:\d{4}|\d\d),? ")  # day or month
 _PACKED = re.compile(r"(\d{14})(\d{3}|[.,]\d*)?")
 _YEARS = 1970, 2099  # in which a packed date lies; other numbers of 14 digits are none
 _MAX_DISORDER = 0.1  # of a clock's steps that run back: late stamps, and midnight
-_MIN_JUMP = 1.5  # usual steps: those of an even clock are 1
-_MAX_STEP = 5.0  # usual steps: as long as a clock's step from one minute to the next may be
+# Usual steps of a packed clock: from one minute to the next its number jumps by more than the first, and its time goes
+# on by less than the second.
+_MIN_JUMP, _MAX_STEP = 1.5, 5.0
 
 
 def seconds(cell: str, month_first: bool | None = None) -> float | None:
@@ -59,9 +60,8 @@ def seconds(cell: str, month_first: bool | None = None) -> float | None:
     digits = at.get("milli") or at["fraction"] or "0"
     fraction = int(digits) / 10.0 ** len(digits)
     if "year" not in at:
-        return (
-            86400.0 * int(at.get("days") or 0) + 3600.0 * hour + 60.0 * int(at["minute"]) + int(at["second"]) + fraction
-        )
+        hours = 24.0 * int(at.get("days") or 0) + hour
+        return 3600.0 * hours + 60.0 * int(at["minute"]) + int(at["second"]) + fraction
     try:
         whole = datetime(*_date(at, month_first), hour, int(at["minute"]), int(at["second"]), tzinfo=_zone(at))
     except ValueError:

@@ -414,7 +414,9 @@ def test_units_that_no_size_tells_are_asked_for(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["import", str(log), "--mapping", str(mapping), "--output", str(tmp_path / "s.h5")])
     said = capsys.readouterr().err
-    assert "channels.q.MCP: has units that are still to be filled in; write one of rad, mrad, deg, turn, and for" in said
+    assert (
+        "channels.q.MCP: has units that are still to be filled in; write one of rad, mrad, deg, turn, and for" in said
+    )
 
 
 def test_messages_that_ros2_topic_echo_wrote_are_proposed_and_imported(tmp_path, capsys):
