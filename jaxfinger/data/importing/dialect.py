@@ -121,7 +121,11 @@ def find_dialect(sample: Sequence[str]) -> tuple[Dialect, list[bool]]:
 
 def has_points(rows: Sequence[Sequence[str]]) -> bool:
     """Whether a cell is a number with a decimal point."""
-    return any("." in cell and seconds(cell) is None and _cell(cell) is not None for row in rows for cell in row)
+    return any(
+        "." in cell and ":" not in cell and seconds(cell) is None and _cell(cell) is not None
+        for row in rows
+        for cell in row
+    )
 
 
 def _cell(cell: str) -> float | None:
