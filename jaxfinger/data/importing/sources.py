@@ -55,7 +55,7 @@ def _with_dates(recording: Recording) -> Recording:
 
 
 def _joined(variables: Mapping[str, Variable]) -> dict[str, Variable]:
-    """Stamps, s, that a recording splits into whole seconds and the rest, as `stamp.secs` and `stamp.nsecs`."""
+    """Stamps, s, that a recording splits into whole seconds and the rest, as ROS prints them."""
     joined = {}
     for name, whole in variables.items():
         if (at := _WHOLE.fullmatch(name)) is None or whole.values.ndim > 1:
