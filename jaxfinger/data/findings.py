@@ -55,7 +55,7 @@ class Report(list[Finding]):
         return next((f for f in self if f.severity == "error" and not f.local), None)
 
 
-_ENDINGS = "csv|tsv|txt|dat|asc|mat|jsonl?|ndjson|np[yz]|h5|hdf5|mcap|db3|bag"  # of recordings
+_ENDINGS = "csv|tsv|txt|log|lvm|dat|asc|sto|mot|mat|jsonl?|ndjson|np[yz]|h5|hdf5|mcap|db3|bag"  # of recordings
 # Places that several trials or recordings have alike: what each is, with its name and the rest of the place as groups.
 _PLACES = (
     ("trial", re.compile(r"/trials/([^/]+)(.*)")),  # of a session

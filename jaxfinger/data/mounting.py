@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxfinger.data.session import FingerDescription
+from jaxfinger.data.units import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -22,6 +23,18 @@ if TYPE_CHECKING:
 _NO_TORQUE = 0.05
 _NONE = "acts on no joint"
 _LEVEL = 5.0  # degrees: a straight finger that points less far up or down is called level.
+
+
+def reach_of(finger: FingerDescription) -> float:
+    """Length, m, of the stretched chain from its first joint to the end of its last link."""
+    gyration = np.sqrt(np.trace(finger.inertia[-1]) / 2.0 / finger.mass[-1])
+    last = max(np.linalg.norm(finger.fingertip), np.linalg.norm(finger.com[-1]), gyration)
+    return float(np.linalg.norm(finger.origin[1:], axis=1).sum() + last)
+
+
+def weight_of(finger: FingerDescription) -> float:
+    """Weight of all links, N, whatever gravity the description has."""
+    return STANDARD_GRAVITY * float(finger.mass.sum())
 
 
 def gravity_levers(finger: FingerDescription, q: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m 3"]:

@@ -44,6 +44,7 @@ TO_SI = {
     "ns": Unit("s", 1e-9),
     "min": Unit("s", 60.0),
     "h": Unit("s", 3600.0),
+    "day": Unit("s", 86400.0),
     "K": Unit("K", 1.0),
     "degC": Unit("K", 1.0, 273.15),
     "1": Unit("1", 1.0),
@@ -51,7 +52,7 @@ TO_SI = {
 _SPELT = {"°": "deg", "degrees": "deg", "µm": "um", "µs": "us", "rev": "turn", "sec": "s"}
 _SPELT |= {"°c": "degC", "degc": "degC", "celsius": "degC"}
 _SPELT |= {"degree": "deg", "radian": "rad", "radians": "rad", "turns": "turn", "revs": "turn", "revolutions": "turn"}
-_SPELT |= {"second": "s", "seconds": "s", "newton": "N", "newtons": "N"}
+_SPELT |= {"second": "s", "seconds": "s", "days": "day", "newton": "N", "newtons": "N"}
 # Units of other systems and of raw signals, without capitals and what joins factors: numbers in them are never in SI.
 _FOREIGN = {
     "lbf", "lb", "lbs", "ozf", "oz", "g", "kg", "in", "inch", "inches", "ft", "psi", "bar", "pa", "kpa",
@@ -73,7 +74,7 @@ def conversion(unit: str) -> str:
 
 def without_units(name: str) -> str:
     """A column's name without the units that end it, in brackets as `q [rad]` or behind a stroke as `q/rad`."""
-    return (_behind_a_stroke(name) or [re.sub(r"[\[(].*", "", name).strip("/ ")])[0]
+    return (_behind_a_stroke(name) or [re.sub(r"\s*[\[(][^\[\]()]*[\])]\s*$", "", name).strip("/ ")])[0]
 
 
 def stated_units(name: str) -> str:

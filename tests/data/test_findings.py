@@ -33,6 +33,7 @@ def test_what_trials_have_in_common_is_said_once():
         ("trials.{}.time", "trial", "0{}-ID.2.a"),
         ("trials.{}", "trial", "0{}"),
         ("logs/{}", "recording", "log {}.csv"),
+        ("logs/{}", "recording", "log {}.lvm"),
         ("/home/{}", "recording", "log-{}.MAT"),
         ("C:\\logs\\{}", "recording", "{}.mcap"),
     ],

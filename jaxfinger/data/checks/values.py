@@ -9,13 +9,14 @@ import numpy as np
 
 from jaxfinger.data.checks.jumps import check_jumps
 from jaxfinger.data.findings import Report
+from jaxfinger.data.mounting import reach_of, weight_of
 from jaxfinger.data.schema import CHANNELS, measured_columns
 from jaxfinger.data.session import FingerDescription, Trial
 from jaxfinger.data.signals.motion import MIN_MOTION
 from jaxfinger.data.signals.quantiles import median, quantile
 from jaxfinger.data.signals.sizes import NOISE_FACTOR, Sizes
 from jaxfinger.data.signals.unmeasured import constant_columns, placeholder
-from jaxfinger.data.units import STANDARD_GRAVITY, conversion, limits_of_turns, whole_turns
+from jaxfinger.data.units import conversion, limits_of_turns, whole_turns
 from jaxfinger.errors import counted, listed
 
 if TYPE_CHECKING:
@@ -167,10 +168,10 @@ def _large_for_the_machine(trial: Trial, finger: FingerDescription, sizes: Sizes
     """
     if any(finger.prismatic):
         return
-    reach = _reach(finger)
+    reach = reach_of(finger)
     for channel, most, unit in (
         ("tendon_excursion", _MAX_EXCURSION * reach, "mm"),
-        ("joint_torque", max(_MAX_TORQUE * _weight(finger), sizes.tension) * reach, "N mm"),
+        ("joint_torque", max(_MAX_TORQUE * weight_of(finger), sizes.tension) * reach, "N mm"),
     ):
         for _, name, x in measured_columns(trial, finger, (channel,)) if most != 0.0 else ():
             if np.isfinite(x).all() and (size := quantile(np.abs(x), 0.9)) > most:
@@ -179,18 +180,6 @@ def _large_for_the_machine(trial: Trial, finger: FingerDescription, sizes: Sizes
                     f"column {name} is of size {size:.3g}, too large for the lengths and masses of this machine; "
                     f"{conversion(unit)}",
                 )
-
-
-def _reach(finger: FingerDescription) -> float:
-    """Length, m, of the stretched chain from its first joint to the end of its last link."""
-    gyration = np.sqrt(np.trace(finger.inertia[-1]) / 2.0 / finger.mass[-1])
-    last = max(np.linalg.norm(finger.fingertip), np.linalg.norm(finger.com[-1]), gyration)
-    return float(np.linalg.norm(finger.origin[1:], axis=1).sum() + last)
-
-
-def _weight(finger: FingerDescription) -> float:
-    """Weight of all links, N, whatever gravity the description has."""
-    return STANDARD_GRAVITY * float(finger.mass.sum())
 
 
 def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
@@ -216,7 +205,7 @@ def _tension(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repo
             report.warning(place, f"column {name} falls to {low:.3g} N, below zero by more than noise; check the tare")
         elif trial.experiment == "ID.2" and median(x) <= NOISE_FACTOR * sizes.noise:
             slack.append(name)
-        if high > _MAX_TENSION * _weight(finger):
+        if high > _MAX_TENSION * weight_of(finger):
             said = f"column {name} exceeds {_MAX_TENSION:.0f} times the weight of all links"
             report.warning(place, f"{said}; {conversion('mN')} if that is what it is")
     if slack and trial.tendon_excursion is not None:

@@ -32,9 +32,9 @@ _MIN_SAMPLES = 10  # within the trial: fewer show no motion.
 # A stamp that is late is so by less than this, in s and in samples, since loggers write more often; and one that runs
 # back between two longer runs of samples begins another recording, or wraps.
 _MAX_LATE, _MAX_LATE_SAMPLES = 1.0, 10
-# Coarse stamps repeat regularly: as many samples to each, within one, with room for jitter. Fewer repeated stamps may
-# be samples that were logged twice, and fewer stamps show no regularity.
-_MIN_REPEATED, _MIN_STAMPS, _MIN_REGULAR = 0.1, 10, 0.9
+# Coarse stamps repeat regularly: as many samples to each, within one or a fifth, with room for jitter. Fewer repeated
+# stamps may be samples that were logged twice, and fewer stamps show no regularity.
+_MIN_REPEATED, _MIN_STAMPS, _MIN_REGULAR, _MAX_UNEVEN = 0.1, 10, 0.9, 0.2
 _PARTS = "choose one part by `where`, or by `rate_hz` and `span`"
 _OWN_PARTS = "give each part a file of its own"
 
@@ -183,7 +183,9 @@ def coarse_rate(time: np.ndarray) -> tuple[float, float] | None:
         return None
     steps, counts = np.diff(stamps), counts[1:-1]  # The recording may begin and end within a stamp.
     step, shared = float(np.median(steps)), float(counts.mean())
-    regular = (np.abs(counts - shared) <= 1.0).mean() > _MIN_REGULAR and np.ptp(steps) < 0.5 * step
+    regular = (np.abs(counts - shared) <= max(1.0, _MAX_UNEVEN * shared)).mean() > _MIN_REGULAR and np.ptp(
+        steps
+    ) < 0.5 * step
     return (step, shared / step) if regular else None
 
 

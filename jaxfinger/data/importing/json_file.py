@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from jaxfinger.data.importing.arrays import named_arrays
 from jaxfinger.data.importing.recording import Recording
 from jaxfinger.errors import UserError
-
-_LINES = (".jsonl", ".ndjson")
 
 
 def load_json(path: Path) -> Recording:
@@ -24,25 +23,42 @@ def load_json(path: Path) -> Recording:
         UserError: the file is no JSON, or holds two variables of one name.
     """
     text = path.read_text(encoding="utf-8-sig")
-    if path.suffix.lower() in _LINES:
-        lines = enumerate(text.splitlines(), start=1)
-        tree = [_parsed(path, line, number, "export the recording again") for number, line in lines if line.strip()]
-    else:
-        tree = _parsed(path, text, 1, "export the recording again, with the ending .jsonl if each line is an object")
-    return named_arrays(path, _leaves(tree, ""))
+    if path.suffix.lower() == ".json" and not _is_object_in_each_line(text):
+        return named_arrays(path, _leaves(_parsed(path, text, 1), ""))
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    remarks = ()
+    if len(lines) > 1 and not lines[-1][1].rstrip().endswith(("}", "]")):
+        lines, remarks = lines[:-1], ("its last line is cut short and is left out",)
+    tree = [_parsed(path, line, number) for number, line in lines]
+    return replace(named_arrays(path, _leaves(tree, "")), remarks=remarks)
 
 
-def _parsed(path: Path, text: str, first: int, mend: str) -> Any:
+def _is_object_in_each_line(text: str) -> bool:
+    """Whether the first two lines are objects each, as in JSON Lines."""
+    lines = [line.strip() for line in text.lstrip().split("\n", 2)[:2]]
+    return len(lines) == 2 and all(line.startswith("{") and line.endswith("}") for line in lines)
+
+
+def _parsed(path: Path, text: str, first: int) -> Any:
     """Parse text whose first line has the number `first` in the file."""
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
         where = f"line {first + error.lineno - 1}, column {error.colno}"
-        raise UserError(f"{path}: is no JSON ({error.msg}, {where}); {mend}") from None
+        raise UserError(f"{path}: is no JSON ({error.msg}, {where}); export the recording again") from None
 
 
 def _leaves(tree: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """Names and values of the lists and numbers in the tree."""
+    """Names and values of the lists and numbers in the tree.
+
+    Objects whose members are numbered are lists, and those of names, `columns`, and rows, `data`, tables: pandas writes
+    both.
+    """
+    if isinstance(tree, Mapping) and len(tree) > 1 and all(str(key) == str(k) for k, key in enumerate(tree)):
+        tree = list(tree.values())
+    if isinstance(tree, Mapping) and isinstance(tree.get("columns"), list) and isinstance(tree.get("data"), list):
+        columns = zip(*tree["data"], strict=True)
+        tree = dict(zip(map(str, tree["columns"]), map(list, columns), strict=True))
     if isinstance(tree, list) and any(isinstance(item, Mapping) for item in tree):
         objects = [item if isinstance(item, Mapping) else {} for item in tree]
         members = dict.fromkeys(key for item in objects for key in item)

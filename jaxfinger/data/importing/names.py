@@ -28,8 +28,8 @@ _MEANINGS = (
 # pasted twice.
 _MIN_RUNNING = 0.5
 _NO_WORDS = "value", "data"  # at the end of a name, which say nothing of what they are: the word before them does
-# Name of a column of a table without names.
-_NAMELESS = r"column \d+"
+# Name of a column of a table without names, or one that says no more: programs that draw curves call times x.
+_NAMELESS = r"column \d+|x([ _-]?(value|axis)s?)?"
 # Names of velocities, which belong to no channel, of set-points, which are not measured, and of switches and states.
 _VELOCITY = r"(?<![a-z])vel|speed|dot|^v$|^dq|(^|_)(d+(q|theta)|(q|theta)d+)(_|\d|$)"
 _STATE = r"enable|flag|status|valid|(^|_)(on|off|ok|mode|err|error|fault|alarm)(_|\d|$)|collision|joint_contact"
@@ -78,7 +78,7 @@ def as_word(name: str) -> re.Pattern[str]:
 
 def is_nameless(name: str) -> bool:
     """Whether a column has no name in its recording, so that its values alone say what it may be."""
-    return re.fullmatch(_NAMELESS, name) is not None
+    return re.fullmatch(_NAMELESS, name.lower()) is not None
 
 
 def is_speed(name: str) -> bool:

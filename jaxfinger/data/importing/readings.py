@@ -24,6 +24,11 @@ def converted(values: np.ndarray, spec: Reading, units: str, scale: float, where
     own = spec.units or units
     if own not in TO_SI or TO_SI[own].si != units:
         fitting = [name for name, unit in TO_SI.items() if unit.si == units]
+        if own == "?":
+            where.fail(
+                f"has units that are still to be filled in; write one of {listed(fitting)}, and for others, such as "
+                "counts, a `scale` too"
+            )
         where.fail(f"has units {own!r}; it must be one of {listed(fitting)}, after `scale` and `offset`")
     unwrap = spec.unwrap
     if not isinstance(unwrap, bool):

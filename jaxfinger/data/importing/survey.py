@@ -8,9 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jaxfinger.data.example import is_example
 from jaxfinger.data.importing.columns import coarse_rate, restarts
 from jaxfinger.data.importing.names import Owners, as_word, is_joint, is_nameless, meaning_of, words
 from jaxfinger.data.importing.recording import Recording, Variable
+from jaxfinger.data.mounting import reach_of, weight_of
+from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.units import TO_SI, is_foreign, is_ratio, without_units
 
 # Usual intervals of a clock that ticks evenly. A late sample makes one up to twice as long; in a longer one than this,
@@ -20,7 +23,7 @@ MIN_GAP = 5.0
 _MIN_EVEN = 0.9
 # Largest plausible values of a channel by unit, with room for arms. The first unit whose largest value is not exceeded
 # is the guess. Torques from 5 to 100 may be an arm's in N m or a finger's in N mm, and large tensions may be in mN or
-# gf, so their unit stays open.
+# gf, so their unit stays open. The finger's own weight tells more of torques.
 _MAX_VALUES = {
     "q": (("rad", 7.0), ("deg", 400.0)),
     "joint_torque": (("N m", 5.0), ("", 100.0), ("N mm", 5e3)),
@@ -29,6 +32,11 @@ _MAX_VALUES = {
     "fingertip_force": (("N", 100.0), ("mN", 1e5)),
     "temperature": (("degC", 200.0), ("K", 1e3)),
 }
+# Of the torque with which the whole finger weighs on an arm as long as its reach: torques up to the first are in N m,
+# since in N mm they would be a hundredth of it, less than any load moves them. Larger ones than the second are in N mm:
+# `check` refuses them in N m. Between them the unit stays open.
+_WEIGHTS = 10.0, 200.0
+_MIN_DATE = 1e4  # days: spreadsheets count them from 1900, and MATLAB from the year 0.
 # Ranges of the usual interval, 10 µs to 0.5 s, in each unit. Where they overlap the first one counts.
 _INTERVALS = (("s", 1e-5, 0.5), ("ms", 0.01, 500.0), ("us", 10.0, 5e5), ("ns", 1e4, 5e8))
 
@@ -63,14 +71,28 @@ class ClockSurvey:
     restarts: int  # number of places at which it begins again or wraps
 
 
+def weight_on_reach(finger: FingerDescription | None) -> float:
+    """Torque, N m, with which the whole finger weighs on an arm as long as its reach.
+
+    It is 0 where it is not known: without a finger, with an example's masses, and with sliding joints.
+    """
+    known = finger is not None and not is_example(finger) and not any(finger.prismatic)
+    return weight_of(finger) * reach_of(finger) if finger is not None and known else 0.0
+
+
 def columns_of(
-    recording: Recording, among: Sequence[Recording] = (), joints: Sequence[str] = (), tendons: Sequence[str] = ()
+    recording: Recording,
+    among: Sequence[Recording] = (),
+    joints: Sequence[str] = (),
+    tendons: Sequence[str] = (),
+    weight: float = 0.0,
 ) -> list[ColumnSurvey]:
     """Survey every column of every variable of a recording.
 
     A unit is guessed from the largest values that the column has in any recording `among` these, and its like in this
     one: a joint that is held at 5 degrees could be one at 5 rad, until it or the others are seen at 80. `joints` and
-    `tendons` are the finger's. Where no column is an angle by its name, those with a joint's name alone are.
+    `tendons` are the finger's, and `weight` is its own (`weight_on_reach`). Where no column is an angle by its name,
+    those with a joint's name alone are.
     """
     owners = Owners(joints, tendons)
     said = _said(recording, owners)
@@ -86,13 +108,13 @@ def columns_of(
             foreign = variable.units if is_foreign(variable.units) and not units else ""
             if not units and not foreign:
                 sizes = _sizes(name, k, recording, among)
-                units = _time_unit(x) if meaning == "time" else _unit(meaning, sizes)
+                units = _time_unit(x) if meaning == "time" else _unit(meaning, sizes, weight)
                 guessed |= {len(found): np.nanmax(sizes)} if meaning in _MAX_VALUES and np.isfinite(sizes).any() else {}
             finite = x[np.isfinite(x)]
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
             missing = len(x) - len(finite)
             found.append(ColumnSurvey(name, column, len(x), low, high, missing, units, stated, meaning, foreign))
-    found = _agreed(found, guessed, owners)
+    found = _agreed(found, guessed, owners, weight)
     if not any(s.meaning == "time" for s in found):
         for k, s in enumerate(found):
             x = np.ravel(recording.variables[s.name].values)
@@ -124,6 +146,14 @@ def _column(variable: Variable, k: int) -> str | int | None:
     return variable.columns[k] if variable.columns else k
 
 
+def values_of(recording: Recording, seen: ColumnSurvey) -> np.ndarray:
+    """Values of a column, (N,)."""
+    variable = recording.variables[seen.name]
+    table = variable.values.reshape(len(variable.values), -1)
+    named = variable.columns
+    return table[:, 0 if seen.column is None else named.index(seen.column) if named else int(seen.column)]
+
+
 def _is_clock(seen: ColumnSurvey, x: np.ndarray) -> bool:
     """Whether a column that no name calls a clock is one: it rises, evenly or in units of time."""
     if seen.units and TO_SI[seen.units].si == "s":
@@ -140,7 +170,9 @@ def _rises_evenly(x: np.ndarray) -> bool:
     return bool(np.mean((ratio > 0.5) & (ratio < 2.0)) > _MIN_EVEN)
 
 
-def _agreed(found: Sequence[ColumnSurvey], guessed: Mapping[int, float], owners: Owners) -> list[ColumnSurvey]:
+def _agreed(
+    found: Sequence[ColumnSurvey], guessed: Mapping[int, float], owners: Owners, weight: float
+) -> list[ColumnSurvey]:
     """Columns of one quantity, with one guess of their unit: that of the largest value.
 
     Where too few of them need that unit they may have several, as joints that slide or turn on, and all are left open.
@@ -148,7 +180,7 @@ def _agreed(found: Sequence[ColumnSurvey], guessed: Mapping[int, float], owners:
     """
     agreed = list(found)
     for group, least in _of_one_quantity(found, list(guessed), owners):
-        largest = _unit(found[group[0]].meaning, [guessed[i] for i in group])
+        largest = _unit(found[group[0]].meaning, [guessed[i] for i in group], weight)
         many = sum(found[i].units == largest for i in group) >= least
         for i in group:
             agreed[i] = replace(found[i], units=largest if many else "")
@@ -225,10 +257,15 @@ def _time_unit(x: np.ndarray) -> str:
     """Guess the unit of a clock from its usual interval between samples."""
     steps, coarse = _steps(x), coarse_rate(x)
     step = 1.0 / coarse[1] if coarse else float(np.median(steps)) if len(steps) else np.nan
+    if step < _INTERVALS[0][1] and np.nanmin(x) > _MIN_DATE:
+        return "day"
     return next((unit for unit, low, high in _INTERVALS if low <= step < high), "s")
 
 
-def _unit(meaning: str, sizes: Sequence[float]) -> str:
-    """Guess the unit of a channel from the sizes of its values in several recordings."""
+def _unit(meaning: str, sizes: Sequence[float], weight: float) -> str:
+    """Guess the unit of a channel from the sizes of its values in several recordings, a torque's by the weight."""
     size = max((size for size in sizes if not np.isnan(size)), default=np.nan)
+    if meaning == "joint_torque" and weight and size:
+        least, most = (share * weight for share in _WEIGHTS)
+        return "N m" if size < least else "N mm" if size > most else ""
     return next((unit for unit, largest in _MAX_VALUES.get(meaning, ()) if size <= largest), "")

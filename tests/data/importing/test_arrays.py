@@ -55,8 +55,8 @@ def test_json_with_samples_inside_an_object_or_lists_by_name(tmp_path):
     ("name", "content", "said"),
     [
         ("log.json", '{"t": [0, 1}', "is no JSON"),
-        ("log.json", '{"t": 0}\n{"t": 1}\n', ".jsonl"),
-        ("log.jsonl", '{"t": 0}\n\n{"t": \n', "line 3, column"),
+        ("log.json", '{"t": 0}\n{"t": 1,}\n{"t": 2}\n', "line 2, column"),
+        ("log.jsonl", '{"t": 0}\n\n{"t": \n{"t": 1}\n', "line 3, column"),
         ("log.json", '{"a.b": [1], "a": {"b": [2]}}', "two variables 'a.b'"),
     ],
 )
@@ -118,3 +118,23 @@ def test_arrays_in_files_of_their_own_lie_side_by_side_by_their_names(tmp_path):
     np.savez(tmp_path / "log.npz", q=np.arange(6.0).reshape(3, 2))
     found = side_by_side([load_recording(tmp_path / name) for name in ("times.npy", "log.npz")])
     assert set(found.variables) == {"times", "log.q"}
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("log.json", '{"t": {"0": 0.0, "1": 0.1, "2": 0.2}, "q": {"0": 1.0, "1": null, "2": 3.0}}'),
+        ("log.json", '{"columns": ["t", "q"], "index": [0, 1, 2], "data": [[0.0, 1.0], [0.1, null], [0.2, 3.0]]}'),
+        ("log.json", '{"t": 0.0, "q": 1.0}\n{"t": 0.1, "q": null}\n{"t": 0.2, "q": 3.0}\n'),
+        ("log.log", '{"t": 0.0, "q": 1.0}\n{"t": 0.1, "q": null}\n{"t": 0.2, "q": 3.0}\n'),
+        ("log.jsonl", '{"t": 0.0, "q": 1.0}\n{"t": 0.1, "q": null}\n{"t": 0.2, "q": 3.0}\n{"t": 0.3, "q'),
+    ],
+    ids=["columns", "split", "lines", "log", "cut"],
+)
+def test_json_as_pandas_and_loggers_write_it(tmp_path, name, text):
+    path = tmp_path / name
+    path.write_text(text)
+    found = load_recording(path)
+    np.testing.assert_array_equal(found.variables["t"].values, [0.0, 0.1, 0.2])
+    np.testing.assert_array_equal(found.variables["q"].values, [1.0, np.nan, 3.0])
+    assert found.remarks == (("its last line is cut short and is left out",) if text.endswith("q") else ())

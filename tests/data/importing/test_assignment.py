@@ -112,7 +112,7 @@ def test_joints_that_are_numbered_have_one_unit(tmp_path):
 def test_a_unit_that_one_joint_of_several_needs_leaves_all_open(tmp_path):
     """It may slide, in mm, or turn several times."""
     said, _ = _said(tmp_path, "q1,q2,q3", [0.5 * np.sin(TIME), 0.3 * np.sin(TIME), 200.0 * np.cos(TIME)])
-    assert said.count("}   # units? SI as it stands") == 3
+    assert said.count('units = "?" }   # its size does not tell') == 3
 
 
 def test_parameters_beside_a_clock_are_no_channels(tmp_path):
@@ -135,7 +135,7 @@ def test_parameters_beside_a_clock_are_no_channels(tmp_path):
 def test_a_force_that_goes_as_the_speed_is_none(tmp_path):
     """Of a joint that is damped the torque goes as the speed, and tells no sampling rate."""
     said, _ = _said(tmp_path, "Joint1_Pos,Joint1_Force", [np.sin(TIME), 12.0 * np.cos(TIME)], clock=False)
-    assert 'channels.joint_torque.J1 = { from = "Joint1_Force" }' in said
+    assert 'channels.joint_torque.J1 = { from = "Joint1_Force", units = "?" }' in said
     assert "# speeds" not in said
 
 

@@ -122,11 +122,27 @@ def test_speeds_tell_the_rate_of_a_log_without_a_clock(tmp_path, rate):
     assert "# speeds" not in proposal([load_recording(path)])
 
 
+@pytest.mark.parametrize("often", [2, 3])
+def test_samples_that_are_logged_several_times_are_left_out(tmp_path, often):
+    """They tell no rate, unlike other samples with a stamp in common."""
+    path, stamps = tmp_path / "log.csv", np.repeat(np.arange(500) / 100.0, often)
+    np.savetxt(path, np.column_stack([stamps, np.sin(stamps)]), "%.6f", ",", header="t,q", comments="")
+    said = proposal([load_recording(path)])
+    assert 'time = "t"\nsort = true' in said
+    assert "rate_hz" not in said
+
+
+def test_coarse_stamps_may_be_rounded_unevenly(tmp_path):
+    path, time = tmp_path / "log.csv", np.arange(2000) / 100.0 + 0.002 * np.random.default_rng(0).standard_normal(2000)
+    np.savetxt(path, np.column_stack([time.round(1), np.sin(time)]), ["%.1f", "%.6f"], ",", header="t,q", comments="")
+    assert "rate_hz = 100" in proposal([load_recording(path)])
+
+
 @pytest.mark.parametrize("shared", [5, 500])
 def test_coarse_stamps_are_replaced_by_a_rate(tmp_path, shared):
     path = tmp_path / "log.csv"
     stamps = np.arange(10000) // shared * shared / 500
-    np.savetxt(path, np.column_stack([stamps, np.sin(stamps)]), "%.6f", ",", header="t,q", comments="")
+    np.savetxt(path, np.column_stack([stamps, np.sin(np.arange(10000) / 500)]), "%.6f", ",", header="t,q", comments="")
     said = proposal([load_recording(path)])
     assert 'rate_hz = 500   # several samples share each stamp of "t"' in said
     assert "time =" not in said

@@ -27,6 +27,9 @@ def load(tmp_path, content, name="log.csv"):
         ("t,a,b\n" + NUMBERS, ["t", "a", "b"]),
         ("# made by X\n# t a b\n" + NUMBERS.replace(",", " "), ["t", "a", "b"]),
         ("t,a,b\ns,deg,N\n" + NUMBERS, ["t", "a", "b"]),
+        ("t,a,b\nsec,degrees,degrees\n" + NUMBERS, ["t", "a", "b"]),
+        ("t,a,b\n(s),(rad),(rad/s)\n" + NUMBERS, ["t", "a", "b"]),
+        ('"t", "a", "b"\n' + NUMBERS, ["t", "a", "b"]),
         (NUMBERS, ["column 0", "column 1", "column 2"]),
         ("0,1,2\n" + NUMBERS, ["0", "1", "2"]),
         (",a,b\n" + NUMBERS, ["column 0", "a", "b"]),
@@ -164,12 +167,20 @@ def test_decimal_commas_beside_dates_with_a_point(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "word", ["-", "--", "#N/A", "NA", "n/a", "NULL", "None", "nan", "#DIV/0!", "1.#QNAN", "-1.#IND"]
+    "word", ["-", "--", "#N/A", "NA", "n/a", "NULL", "None", "nan", "#DIV/0!", "1.#QNAN", "-1.#IND", "1.#INF"]
 )
 def test_words_for_a_missing_value(tmp_path, word):
     found = load(tmp_path, f"a,t\n1,0\n{word},1\n3,2\n4,3\n")
     np.testing.assert_array_equal(found.variables["a"].values, [1, np.nan, 3, 4])
     assert found.unusable == {}
+
+
+def test_exponents_of_double_precision_are_numbers(tmp_path):
+    """As Fortran writes them. A code such as 1D3 is a word."""
+    found = load(tmp_path, " t a b\n" + "".join(f" 0.{k}D+00 -.15d-02 1D{k}\n" for k in range(1, 9)))
+    np.testing.assert_allclose(found.variables["t"].values, np.arange(1, 9) / 10.0)
+    np.testing.assert_array_equal(found.variables["a"].values, -0.0015)
+    assert "'1D1', '1D2'" in found.unusable["b"]
 
 
 def test_a_ratio_has_the_unit_of_a_dash(tmp_path):
@@ -193,7 +204,7 @@ def test_times_of_day_and_dotted_dates_are_seconds(tmp_path, header, rows):
     assert time.units == "s"
 
 
-@pytest.mark.parametrize("cell", ["01/31/2026 12:00:00.0", "12:00", "11:59:58 PM", "12:61:00"])
+@pytest.mark.parametrize("cell", ["31/31/2026 12:00:00.0", "12:00", "13:59:58 PM", "12:61:00"])
 def test_a_time_that_is_not_clear_is_told_how_to_be_written(tmp_path, cell):
     found = load(tmp_path, "t,a\n" + "".join(f"{cell},{k}\n" for k in range(3)))
     assert (
@@ -214,6 +225,12 @@ def test_columns_of_one_name(tmp_path):
     found = load(tmp_path, "t,a,a\n" + NUMBERS)
     assert list(found.variables) == ["t"]
     assert "columns 2 and 3" in found.unusable["a"]
+
+
+def test_what_ros2_topic_echo_prints_is_told_how_to_be_written(tmp_path):
+    message = "header:\n  stamp:\n    sec: 1\n    nanosec: {k}\nname:\n- MCP\nposition:\n- 0.{k}\n---\n"
+    with pytest.raises(UserError, match=r"log\.csv: holds messages as `ros2 topic echo` prints them; echo with --csv"):
+        load(tmp_path, "".join(message.format(k=k) for k in range(90)))
 
 
 @pytest.mark.parametrize("content", ["", "t,a\n", "only words\nand words\n", b"\x00\x01\x02"])

@@ -232,7 +232,7 @@ def test_what_no_channel_reads_and_unclear_units_are_marked(tmp_path):
     )
     np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header=f"t,{','.join(names)}", comments="")
     said = proposal([load_recording(tmp_path / "log.csv")])
-    assert 'channels.tendon_force.T1 = { from = "cell_A" }   # units? SI as it stands' in said
+    assert 'channels.tendon_force.T1 = { from = "cell_A", units = "?" }   # its size does not tell' in said
     assert '# in no channel yet: "reaction"' in said
 
 
@@ -375,15 +375,48 @@ def test_theta_alone_is_a_joints_angle(tmp_path):
     assert "channels.q.J2" not in said
 
 
-@pytest.mark.parametrize(("upper", "said"), [(90.0, 'units = "deg" }'), (1800.0, "}   # units? SI as it stands")])
+@pytest.mark.parametrize(
+    ("upper", "said"), [(90.0, 'units = "deg" }'), (1800.0, 'units = "?" }   # its size does not tell')]
+)
 def test_the_size_of_an_angle_does_not_tell_degrees_of_a_joint_that_turns_on(tmp_path, upper, said):
     finger = make_finger()
     finger = replace(finger, limits=np.radians([[-10.0, upper], [0.0, 90.0]]))
     table = np.column_stack([GAPPED_MS, 12.0 + 12.0 * np.sin(GAPPED_MS / 1e3), np.cos(GAPPED_MS / 1e3)])
     np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="t,q1,q2", comments="")
     text = proposal([load_recording(tmp_path / "log.csv")], finger)
-    assert f'channels.q.MCP = {{ from = "q1", {said}' in text or f'channels.q.MCP = {{ from = "q1" {said}' in text
-    assert f'channels.q.PIP = {{ from = "q2", {said}' in text or f'channels.q.PIP = {{ from = "q2" {said}' in text
+    assert f'channels.q.MCP = {{ from = "q1", {said}' in text
+    assert f'channels.q.PIP = {{ from = "q2", {said}' in text
+
+
+@pytest.mark.parametrize(
+    ("size", "units"), [(0.05, "N m"), (3.0, "?"), (60.0, "N mm"), (300.0, "N mm")], ids=["0.05", "3", "60", "300"]
+)
+def test_the_finger_s_weight_tells_the_unit_of_a_torque(tmp_path, size, units):
+    """The finger weighs 22 N mm on an arm as long as its reach."""
+    table = np.column_stack([GAPPED_MS, np.cos(GAPPED_MS / 1e3), size * np.sin(GAPPED_MS / 1e3)])
+    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="t,q_MCP,tau_MCP", comments="")
+    recordings, arm = [load_recording(tmp_path / "log.csv")], replace(make_finger(), mass=np.array([200.0, 100.0]))
+    said = proposal(recordings, make_finger())
+    assert f'channels.joint_torque.MCP = {{ from = "tau_MCP", units = "{units}" }}' in said
+    assert "# joint_torque reaches " in said
+    assert 'channels.joint_torque.MCP = { from = "tau_MCP", units = "N m" }' in proposal(recordings, arm)
+
+
+def test_units_that_no_size_tells_are_asked_for(tmp_path, capsys):
+    """Encoders that count, as those of servos, are in no unit of angles."""
+    log, mapping = tmp_path / "log.csv", tmp_path / "m.toml"
+    table = np.column_stack([GAPPED_MS, 2048 + 600 * np.sin(GAPPED_MS / 1e3), 0.01 * np.cos(GAPPED_MS / 1e3)])
+    np.savetxt(log, table, ["%.1f", "%.0f", "%.6f"], ",", header="Time(ms),Present Position,torque", comments="")
+    (tmp_path / "finger.toml").write_text(ONE_JOINT[ONE_JOINT.index("[finger]") :])
+    main(["look", str(log), "--finger", str(tmp_path / "finger.toml")])
+    said = capsys.readouterr().out
+    mapping.write_text(said[said.index("# a mapping") :])
+    with pytest.raises(SystemExit):
+        main(["import", str(log), "--mapping", str(mapping), "--output", str(tmp_path / "s.h5")])
+    said = capsys.readouterr().err
+    assert (
+        "channels.q.MCP: has units that are still to be filled in; write one of rad, mrad, deg, turn, and for" in said
+    )
 
 
 def test_messages_that_ros2_topic_echo_wrote_are_proposed_and_imported(tmp_path, capsys):
