@@ -41,8 +41,8 @@ MAX_PER_CHOICE = 2  # of the short list, for one cause and one choice of its fix
 MAX_EXACT = 3  # offers that are fitted exactly: each fit takes seconds
 MAX_CHANGES = 12  # changes of the set in one search
 MAX_SCORE_GAP = 8.0  # nats. A set whose linear fit is further behind is not fitted exactly: each fit takes seconds.
-# Share of the gain that the best offer promises, by which others may promise less: where a law is curved, or a large
-# cause bends the nominal model, a linear fit promises half of what the exact one brings, or twice as much.
+# Share of the best offer's promised gain by which others may promise less. Where a law is curved, or a large cause has
+# bent the nominal model, a linear fit promises a part of what the exact one brings.
 MAX_GAIN_SHORTFALL = 0.5
 MIN_SWAP_GAIN = 1.0  # nats that a swap must bring, so that two sets of like evidence are not swapped back and forth
 
