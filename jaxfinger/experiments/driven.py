@@ -106,26 +106,13 @@ def less_noise(r: PreparedTrial, j: Joints) -> Float[np.ndarray, "N m"]:
 def joint_directions(r: PreparedTrial, j: Joints, slow: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
     """Directions of the joints: the protocol's, else those of the filtered motion.
 
-    For a fit they reverse at the turning point, and for a prediction over `REVERSAL_TRAVEL` from there.
+    For a fit they reverse where the motion back is certain, but for `beside_reversals`, since other samples near a
+    reversal are left out. For a prediction they reverse where the motion back began.
     """
     if r.trial.joint_direction is not None:
         return r.trial.joint_direction.astype(float)
-    sure, q, travel = _sure(r, j, slow)
-    return directions_from_turning_points(sure, q, (0.0 if r.reduced else 1.0) * travel)
-
-
-def _sure(
-    r: PreparedTrial, j: Joints, slow: Float[np.ndarray, "N m"]
-) -> tuple[Float[np.ndarray, "N m"], Float[np.ndarray, "N m"], Float[np.ndarray, " m"]]:
-    """Directions that change once the motion back is certain, angles that show where it began, and the travel, rad.
-
-    The filter of a fit would move the turning point between two speeds towards the slower one.
-    """
-    q, noise = j.q, j.noise
-    if r.reduced:
-        q = low_pass(r.trial.time, r.trial.q, r.experiment.cutoff_at(r.step, sharp=True))
-        noise = np.median(np.abs(r.trial.q - q), axis=0)
-    return directions(slow, rest_speed(slow, r.quick_rates)), q, REVERSAL_TRAVEL * noise
+    sure = directions(slow, rest_speed(slow, r.quick_rates))
+    return sure if r.reduced else directions_from_turning_points(sure, j.q, REVERSAL_TRAVEL * j.noise)
 
 
 def beside_reversals(
@@ -141,9 +128,12 @@ def beside_reversals(
     One standard deviation of that time is the time in which the joint travels by `REVERSAL_TRAVEL`, and a sample.
     `slides`, `clear`: as of `sliding`. Also returns the directions, which reverse there at the turning point.
     """
-    if not (r.reduced and r.experiment.slack):  # Tendons may hold a joint where it turns back.
+    if not (r.reversals and r.experiment.slack):  # Tendons may hold a joint where it turns back.
         return None, direction
-    sure, q, travel = _sure(r, j, slow)
+    # The filter of a fit would move the turning point between two speeds towards the slower one.
+    q = low_pass(r.trial.time, r.trial.q, r.experiment.cutoff_at(r.step, sharp=True))
+    travel = REVERSAL_TRAVEL * np.median(np.abs(r.trial.q - q), axis=0)
+    sure = directions(slow, rest_speed(slow, r.quick_rates))
     at_once, later = (directions_from_turning_points(sure, q, d) for d in (0.0 * travel, travel))
     earlier = -directions_from_turning_points(-from_the_start(sure)[::-1], q[::-1], travel)[::-1]  # back in time
     earlier, later = (np.concatenate(x) for x in ((earlier[1:], earlier[-1:]), (later[:1], later[:-1])))

@@ -52,7 +52,7 @@ class Stack:
     motions: tuple[str | None, ...]  # trials of the same name of a motion repeat it
     holds: Int[np.ndarray, "B T"]  # index of the static hold, −1 between holds
     dt: float  # s, between samples
-    reversals: Reversals | None  # (m, B, T); None where friction's direction is known or unknown, whatever their time
+    reversals: Reversals | None  # (m, B, T); None where they are not looked for
     measured: dict[str, bool]  # by channel: whether any trial measured it
     coarseness: dict[str, Coarseness] = field(default_factory=dict)  # by channel
 
@@ -76,13 +76,14 @@ def prepare(
     minus: Predictions | None = None,
     coarse: int = 1,
     sizes: Sizes | None = None,
+    reversals: bool = False,
 ) -> dict[str, Stack]:
     """Reduce and stack the named trials (default all), one stack for each experiment.
 
     `reduced`: whether trials are averaged to the experiment's rate, for a fit; otherwise every sample is kept.
     `coarse`: factor on the length of the averaging blocks. `minus`: predictions that are subtracted from the
     measurements; samples without a prediction are invalid. `sizes`: those of the session (`sizes_of`), where the caller
-    has them already.
+    has them already. `reversals`: whether to find the times of reversals (`Stack.reversals`), for reduced trials.
 
     Raises:
         UserError: trials of one experiment are sampled at rates too different to be stacked.
@@ -93,7 +94,7 @@ def prepare(
         trials = [t for t in chosen if len(t.time) > 1]
 
         def row(trial: Trial, experiment: Experiment = experiment) -> _Reduced:
-            r = prepared(experiment, trial, session, sizes, reduced, minus, coarse)
+            r = prepared(experiment, trial, session, sizes, reduced, minus, coarse, reversals)
             measured = {c: bool(s.any()) for c, s in r.sound.items()}
             there = [c for c in experiment.channels if reduced and getattr(trial, c) is not None]
             return _Reduced(KINDS[experiment.kind].reduce(r), measured, {c: _coarseness(trial, c) for c in there})

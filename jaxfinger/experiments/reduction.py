@@ -43,6 +43,7 @@ class PreparedTrial:
     finger: FingerDescription
     sizes: Sizes
     reduced: bool  # whether blocks are averaged for a fit; otherwise each sample is a block
+    reversals: bool  # whether the times of reversals are to be found
     step: float  # s, between samples
     size: int  # samples of a block
     y: dict[str, Float[np.ndarray, "N columns"]]  # channels to be predicted, spikes bridged
@@ -120,15 +121,16 @@ def prepared(
     reduced: bool = True,
     minus: Predictions | None = None,
     coarse: int = 1,
+    reversals: bool = False,
 ) -> PreparedTrial:
     """Prepare a trial for its reduction: bridge spikes and find valid samples.
 
-    `minus`, `coarse`: as in `prepare`.
+    `minus`, `coarse`, `reversals`: as in `prepare`.
     """
     step = median(np.diff(trial.time))
     size = max(1, round(coarse / (experiment.rate * step))) if reduced else 1
     y, sound = _measured(experiment, trial, session.finger, minus, longest_spike(step))
-    return PreparedTrial(experiment, _despiked(trial), session.finger, sizes, reduced, step, size, y, sound)
+    return PreparedTrial(experiment, _despiked(trial), session.finger, sizes, reduced, reversals, step, size, y, sound)
 
 
 def _despiked(trial: Trial) -> Trial:

@@ -169,7 +169,7 @@ def build(
             or holds effects.
     """
     progress("reading the recordings")
-    measured = stacks = readings_of(session, coarse=coarse)
+    measured = stacks = readings_of(session, coarse=coarse, reversals=True)
     simulator = None
     if predictions is not None:
         progress("imitating the simulator")

@@ -24,11 +24,13 @@ def readings_of(
     sizes: Sizes | None = None,
     coarse: int = 1,
     model: Model | None = None,
+    reversals: bool = False,
 ) -> dict[str, Stack]:
     """The named trials as `prepare` reduces them for a fit; columns that never change count as not measured.
 
     Such a column would be fitted exactly, with noise of zero: its parameters would have intervals of zero width. With
     an earlier fit's `model` no torque counts whose tensions are near the end of a dead zone (`clear_of_dead_zones`).
+    `reversals`: as in `prepare`.
 
     Raises:
         UserError: an angle of a trial is not finite, or its trials are sampled at rates too different to be stacked.
@@ -41,7 +43,7 @@ def readings_of(
                 f"{counted(int(lost.sum()), 'sample')}, the first at {t.time[np.argmax(lost)]:.4g} s; fill them in, "
                 "cut them off, or leave the trial out"
             )
-    stacks = prepare(session, names, coarse=coarse, sizes=sizes)
+    stacks = prepare(session, names, coarse=coarse, sizes=sizes, reversals=reversals)
     stacks = {e: _without_constant(stack, session) for e, stack in stacks.items()}
     return stacks if model is None else clear_of_dead_zones(stacks, model, session, sizes)
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import Trial
-from tests.experiments.test_prepare import CLEAR, ENCODER, MCP, RATE, stack
+from tests.experiments.test_prepare import CLEAR, ENCODER, MCP, RATE
+from tests.experiments.test_prepare import stack as stacked
 
 CYCLE, PHASE, DURATION = 1.0, 0.3, 4.0  # s, rad, s
 TURNS = (np.arange(1, 8) - PHASE / np.pi) * CYCLE / 2  # s, at which the sweep turns back, but for the last time
@@ -21,6 +22,10 @@ def sweep(noise=ENCODER, cycle=CYCLE, late=0.0) -> Trial:
     torque = np.full(q.shape, np.nan)
     torque[:, 0] = 1e-2 * np.sign(-np.sin(2 * np.pi * (time - late) / cycle + PHASE))
     return Trial("sweep", "ID.3-dynamic", time, q, joint_torque=torque, joint=MCP)
+
+
+def stack(trial):
+    return stacked(trial, reversals=True)
 
 
 def near(found, width):
