@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from jaxfinger.data import Trial
+from jaxfinger.experiments import Stack
+from jaxfinger.experiments.reduction import Reversals
 from tests.experiments.test_prepare import CLEAR, ENCODER, MCP, RATE
 from tests.experiments.test_prepare import stack as stacked
 
@@ -24,8 +26,13 @@ def sweep(noise=ENCODER, cycle=CYCLE, late=0.0) -> Trial:
     return Trial("sweep", "ID.3-dynamic", time, q, joint_torque=torque, joint=MCP)
 
 
-def stack(trial):
+def stack(trial: Trial) -> Stack:
     return stacked(trial, reversals=True)
+
+
+def reversals_of(found: Stack) -> Reversals:
+    assert found.reversals is not None
+    return found.reversals
 
 
 def near(found, width):
@@ -40,7 +47,7 @@ def test_samples_count_either_for_certain_or_beside_a_reversal_of_a_motor(experi
     if experiment == "VD.3":
         assert found.reversals is None
         return
-    beside, known = found.reversals.beside[0, 0], np.asarray(found.batch.mask["joint_torque"])[0, 0] > 0
+    beside, known = reversals_of(found).beside[0, 0], np.asarray(found.batch.mask["joint_torque"])[0, 0] > 0
     inside = (np.asarray(found.batch.x.time)[0] > CLEAR + 0.05) & (
         np.asarray(found.batch.x.time)[0] < DURATION - CLEAR - 0.05
     )
@@ -48,14 +55,14 @@ def test_samples_count_either_for_certain_or_beside_a_reversal_of_a_motor(experi
     assert (beside | known)[inside].all()
     assert beside[near(found, 0.02)].all()
     assert not beside[~near(found, 0.15) & inside].any()
-    assert not found.reversals.beside[1:].any()
+    assert not reversals_of(found).beside[1:].any()
 
 
 def test_directions_change_as_they_do_when_the_joint_turns_back_later():
     delay = 0.002  # s
     now, later = stack(sweep(noise=1e-5)), stack(sweep(noise=1e-5, late=delay))
     moved = np.asarray(later.batch.x.joint_direction - now.batch.x.joint_direction)[0, 0]
-    earlier, change = now.reversals.changes[:, 0, 0]
+    earlier, change = reversals_of(now).changes[:, 0, 0]
     for way, expected in ((earlier, -moved), (change, moved)):
         beside = near(now, 0.06)
         share = way[beside] @ expected[beside] / (np.linalg.norm(way[beside]) * np.linalg.norm(expected[beside]))
@@ -74,13 +81,13 @@ def test_a_reversal_at_which_the_joint_rests_does_not_count():
     at = (np.asarray(found.batch.x.time)[0] > TURNS[1] - CLEAR) & (
         np.asarray(found.batch.x.time)[0] < TURNS[1] + rest + CLEAR
     )
-    assert not found.reversals.beside[0, 0][at].any()
-    assert found.reversals.beside[0, 0].any()
+    assert not reversals_of(found).beside[0, 0][at].any()
+    assert reversals_of(found).beside[0, 0].any()
 
 
 def test_a_reversal_whose_time_the_encoder_does_not_show_does_not_count():
-    assert stack(sweep(cycle=1.5)).reversals.beside.any()
-    assert not stack(sweep(cycle=4.0, noise=5.0 * ENCODER)).reversals.beside.any()
+    assert reversals_of(stack(sweep(cycle=1.5))).beside.any()
+    assert not reversals_of(stack(sweep(cycle=4.0, noise=5.0 * ENCODER))).beside.any()
 
 
 def test_commanded_directions_change_where_the_joint_turns_back():
@@ -90,7 +97,7 @@ def test_commanded_directions_change_where_the_joint_turns_back():
     commanded[:, 0] = np.sign(sweep(late=-0.01).joint_torque[:, 0])
     told = stack(replace(plain, joint_direction=commanded))
     free = stack(plain)
-    beside = told.reversals.beside[0, 0]
+    beside = reversals_of(told).beside[0, 0]
     assert beside.any()
     np.testing.assert_allclose(
         np.asarray(told.batch.x.joint_direction)[0, 0][beside],
