@@ -15,6 +15,10 @@ CYCLE, PHASE, DURATION = 1.0, 0.3, 4.0  # s, rad, s
 TURNS = (np.arange(1, 8) - PHASE / np.pi) * CYCLE / 2  # s, at which the sweep turns back, but for the last time
 
 
+def direction(time, cycle=CYCLE):
+    return np.sign(-np.sin(2 * np.pi * time / cycle + PHASE))
+
+
 def sweep(noise=ENCODER, cycle=CYCLE, late=0.0) -> Trial:
     """Trial in which the external motor sweeps the MCP, `late` by so many s; noise in rad."""
     time = np.arange(round(DURATION * RATE)) / RATE
@@ -22,7 +26,7 @@ def sweep(noise=ENCODER, cycle=CYCLE, late=0.0) -> Trial:
     q[:, 0] += 0.5 * np.cos(2 * np.pi * (time - late) / cycle + PHASE)
     q += noise * np.random.default_rng(0).standard_normal(q.shape)
     torque = np.full(q.shape, np.nan)
-    torque[:, 0] = 1e-2 * np.sign(-np.sin(2 * np.pi * (time - late) / cycle + PHASE))
+    torque[:, 0] = 1e-2 * direction(time - late, cycle)
     return Trial("sweep", "ID.3-dynamic", time, q, joint_torque=torque, joint=MCP)
 
 
@@ -75,9 +79,11 @@ def test_a_reversal_at_which_the_joint_rests_does_not_count():
     trial, rest = sweep(noise=1e-5), 0.4
     begin = int(np.searchsorted(trial.time, TURNS[1]))
     pause = round(rest * RATE)
-    q, torque = (np.insert(a, [begin] * pause, a[begin], axis=0) for a in (trial.q, trial.joint_torque))
-    time = np.arange(len(q)) / RATE
-    found = stack(replace(trial, time=time, q=q, joint_torque=torque))
+    still = np.insert(np.arange(len(trial.time)), begin, [begin] * pause)
+    paused = {"time": np.arange(still.size) / RATE, "q": trial.q[still]}
+    found = stack(
+        replace(trial, **paused, joint_torque=np.where(np.arange(3) == 0, 1e-2, np.full((still.size, 3), np.nan)))
+    )
     at = (np.asarray(found.batch.x.time)[0] > TURNS[1] - CLEAR) & (
         np.asarray(found.batch.x.time)[0] < TURNS[1] + rest + CLEAR
     )
@@ -94,7 +100,7 @@ def test_commanded_directions_change_where_the_joint_turns_back():
     """A joint turns back later than its command; friction follows the joint."""
     plain = sweep()
     commanded = np.zeros(plain.q.shape, np.int8)
-    commanded[:, 0] = np.sign(sweep(late=-0.01).joint_torque[:, 0])
+    commanded[:, 0] = direction(plain.time + 0.01)
     told = stack(replace(plain, joint_direction=commanded))
     free = stack(plain)
     beside = reversals_of(told).beside[0, 0]
