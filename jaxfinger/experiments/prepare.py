@@ -52,9 +52,9 @@ class Stack:
     motions: tuple[str | None, ...]  # trials of the same name of a motion repeat it
     holds: Int[np.ndarray, "B T"]  # index of the static hold, −1 between holds
     dt: float  # s, between samples
-    reversals: Reversals | None  # (m, B, T); None where they are not looked for
     measured: dict[str, bool]  # by channel: whether any trial measured it
     coarseness: dict[str, Coarseness] = field(default_factory=dict)  # by channel
+    reversals: Reversals | None = None  # (m, B, T); None where they are not looked for
 
     def samples_of_holds(self, trial: int, counts: np.ndarray) -> list[np.ndarray]:
         """Indices of the valid samples of each hold of a trial; `counts` (T,) is nonzero where a sample is valid."""
@@ -165,13 +165,13 @@ def _stack(experiment: Experiment, trials: list[Trial], reduced_trials: list[_Re
         tuple(t.motion for t in trials),
         np.stack([np.pad(r.hold, (0, T - r.hold.size), constant_values=-1) for r in rows]),
         float(np.median([r.dt for r in rows])),
-        _stacked([r.reversals for r in rows], T),
         {c: any(x.measured[c] for x in reduced_trials) for c in experiment.channels},
         {
             c: _mean_coarseness(members)
             for c in experiment.channels
             if (members := [x.coarseness[c] for x in reduced_trials if c in x.coarseness])
         },
+        _stacked([r.reversals for r in rows], T),
     )
 
 

@@ -145,7 +145,7 @@ def _borrowed(problem: Problem, name: str, like: Stack) -> Stack:
         y[c] = jnp.zeros_like(mask[c])
     x = replace(x, motorised=jnp.asarray(motor), held=experiment.held)
     measured = dict.fromkeys(experiment.channels, True)
-    return Stack(experiment, Batch(x, y, mask), like.trials, like.motions, like.holds, like.dt, None, measured)
+    return Stack(experiment, Batch(x, y, mask), like.trials, like.motions, like.holds, like.dt, measured)
 
 
 def _resting_at(stack: Stack, finger: Finger, share: float | None) -> Stack:
