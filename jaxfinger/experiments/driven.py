@@ -45,8 +45,8 @@ BREAKAWAY_WIDTHS = 4.5
 # Travel over which friction reverses, in median residuals of the encoder: 1.5 of its standard deviations. A longer
 # travel suits compliant contacts, a shorter one stiff contacts (benchmarks/reversals.py).
 REVERSAL_TRAVEL = 2.2
-# Largest change of a low-passed direction by one standard deviation of a reversal's time: a quarter of all that it can
-# change. Beyond, it is not linear in that time.
+# Largest change of a low-passed direction by one standard deviation of a reversal's time. A reversal is a step of 2, of
+# which a delay of d widths of the filter changes up to 2 d/√(2π): 0.5 is that of d = 0.63, linear in d to 2 %.
 MAX_CHANGE_AT_REVERSAL = 0.5
 ACCELERATION_WINDOW = 0.1  # s, at the protocol's pace, over which q̈ is averaged where it does not exceed its noise
 # Degrees of freedom of the variance of q̈'s noise in that window W = 1/f_c: 2 W (∫S df)²/∫S² df, with the spectrum
@@ -146,7 +146,8 @@ def beside_reversals(
             within = begin > 0 and end < len(slides) and not unclear[begin:end, i].any()
             turns[begin:end, i] = within and at_once[begin - 1, i] * at_once[end, i] < 0.0
     either, known = (r.mean(_apart(a, clear, r.step).astype(float)) > 1.0 - 1e-9 for a in (slides | turns, slides))
-    found = Reversals((either & ~known).T, np.stack([r.mean(change).T for change in changes]))
+    beside = either & ~known & r.blocks_are_sound("joint_torque")
+    found = Reversals(beside.T, np.stack([r.mean(change).T for change in changes]))
     return found, np.where(turns, at_once, direction)
 
 

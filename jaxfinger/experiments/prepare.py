@@ -29,10 +29,8 @@ class Batch(eqx.Module):
     """B trials of one experiment, reduced and padded to T samples."""
 
     x: Motion  # (…, B, T)
-    y: dict[str, Float[Array, "_columns *B T"]]  # measured channels, zero where nothing can be judged
+    y: dict[str, Float[Array, "_columns *B T"]]  # measured channels, zero where nothing is measured
     mask: dict[str, Float[Array, "_columns *B T"]]  # 1 where a sample is valid, else 0
-    # Change of a channel if every reversal came one std of its time earlier, and later; not zero beside reversals.
-    uncertain: dict[str, Float[np.ndarray, "2 _columns *B T"]] = eqx.field(default_factory=dict)
 
 
 class Coarseness(NamedTuple):
@@ -171,17 +169,14 @@ def _stack(experiment: Experiment, trials: list[Trial], reduced_trials: list[_Re
             for c in experiment.channels
             if (members := [x.coarseness[c] for x in reduced_trials if c in x.coarseness])
         },
-        _stacked([r.reversals for r in rows], T),
+        _stacked(found, T) if (found := [r.reversals for r in rows if r.reversals is not None]) else None,
     )
 
 
-def _stacked(reversals: list[Reversals | None], T: int) -> Reversals | None:
-    """Reversals of all trials, padded to T samples; None where there are none."""
-    there = [x for x in reversals if x is not None]
-    if not there:
-        return None
-    out = Reversals(*(np.zeros((*a.shape[:-1], len(reversals), T), a.dtype) for a in there[0]))
-    for b, x in enumerate(reversals):
-        for whole, a in zip(out, x or (), strict=False):
-            whole[..., b, : a.shape[-1]] = a
-    return out
+def _stacked(reversals: list[Reversals], T: int) -> Reversals:
+    """Reversals of all trials, padded to T samples."""
+    padded = (
+        np.stack([np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, T - a.shape[-1])]) for a in arrays], axis=-2)
+        for arrays in zip(*reversals, strict=True)
+    )
+    return Reversals(*padded)

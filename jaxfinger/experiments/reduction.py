@@ -67,6 +67,10 @@ class PreparedTrial:
         blocks = a[: M * self.size].reshape(M, self.size, math.prod(a.shape[1:]))
         return (np.ones(self.size) @ blocks / self.size).reshape(M, *a.shape[1:])
 
+    def blocks_are_sound(self, channel: str) -> Bool[np.ndarray, "M columns"]:
+        """Whether most samples of a block are measured and no spikes."""
+        return self.mean(self.sound[channel].astype(float)) > 0.5
+
     def lowest(self, a: Float[np.ndarray, "N k"]) -> Float[np.ndarray, "M k"]:
         """Minima of blocks."""
         M = len(a) // self.size
@@ -205,8 +209,8 @@ def row(
 
     `q`, rad, `tension`, N, and `hold` are of the blocks, `rates`, rad/s and rad/s², `directions` and `y` of the
     samples, which are averaged here. `counting`: blocks of each channel that are valid where measured. `noise`: rad, of
-    the encoder. `blur`: s, width of the low-pass of all arrays. `reversals`: those whose
-    torque is read, too.
+    the encoder. `blur`: s, width of the low-pass of all arrays. `reversals`: where they
+    are looked for.
     """
     y = r.y if y is None else y
     M = len(q)
@@ -231,13 +235,9 @@ def row(
         motion |= {"blur": np.full(M, blur), "block": np.full(M, r.size * r.step)}
     values, mask = {}, {}
     for c in y:
-        sound = r.mean(r.sound[c].astype(float)).T > 0.5
-        counts = sound & counting[c].T
-        mask[c] = counts.astype(float)
-        if reversals is not None and c == "joint_torque":
-            reversals = reversals._replace(beside=reversals.beside & sound)
-            counts = counts | reversals.beside
-        values[c] = r.mean(y[c]).T * counts  # mean of all samples, as of the other arrays
+        sound = r.blocks_are_sound(c).T
+        mask[c] = (sound & counting[c].T).astype(float)
+        values[c] = r.mean(y[c]).T * sound  # mean of all samples, as of the other arrays
     return Row(motion, values, mask, np.full(M, -1) if hold is None else hold, r.size * r.step, reversals)
 
 

@@ -13,8 +13,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.sparse
 from jaxtyping import Float
+from scipy.sparse import block_diag, csr_array
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Predictions, Session
@@ -28,11 +28,11 @@ from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.dead_zone import clear_of_dead_zones
 from jaxfinger.identify.intervals import stretches
 from jaxfinger.identify.linearise import White
-from jaxfinger.identify.noise import Noise, estimate, history, whiten, without_recurring_laws
+from jaxfinger.identify.noise import Noise, estimate, history, without_recurring_laws
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.prior import Prior, prior_of
 from jaxfinger.identify.readings import readings_of
-from jaxfinger.identify.reversals import change_by_reversals, with_reversals
+from jaxfinger.identify.reversals import torque_changes, with_reversals
 from jaxfinger.identify.solve import ROUGH_TOLERANCE, Source, solve, white_tangents
 from jaxfinger.identify.stages import (
     Progress,
@@ -63,7 +63,7 @@ class Rows:
     trial: np.ndarray  # (rows,) index of the trial in the stack
     time: np.ndarray  # (rows,) index of the sample
     history: np.ndarray  # (rows,) number of preceding samples that the whitening filter reads
-    reversals: dict[str, scipy.sparse.csr_array]  # (rows, rows) C of `identify.reversals`, of channels that have any
+    reversals: dict[str, csr_array]  # (rows, rows) C of `identify.reversals`, of channels that have any
 
     @property
     def size(self) -> int:
@@ -228,7 +228,7 @@ def _refitted_to_all(
     cad = np.flatnonzero((variance > 0.0) & np.isfinite(variance))  # what the description gives with an uncertainty
     free = np.union1d(fit.estimated, cad).astype(int)
     reads = {e: stack.experiment.channels for e, stack in stacks.items()}
-    counted = {e: with_reversals(stack, fit.model) for e, stack in stacks.items()}
+    changes = {e: torque_changes(stack, fit.model) for e, stack in stacks.items()}
 
     def prior_on(free: np.ndarray) -> Prior:
         if against is None:
@@ -238,7 +238,8 @@ def _refitted_to_all(
     nominal, latest, shown = fit.model, _noise_of_all(known, stacks, fit.model, recurring), free
     for _ in range(MAX_ROUNDS):
         noise, before = latest, shown
-        sources = sources_of(counted, reads, noise, parameters)
+        sources = sources_of(stacks, reads, noise, parameters)
+        sources = {e: with_reversals(source, changes[e]) for e, source in sources.items()}
         # Some parameters show only after a refit: a tendon whose moment arms are zero shows no friction.
         nominal, shown = _with_unfitted(nominal, free_groups(fit.recipe), free, sources, parameters, coverage)
         prior = prior_on(shown)
@@ -444,18 +445,16 @@ def _layout(experiment: str, source: Source, start: int) -> Rows:
         np.concatenate(before, axis=1).reshape(-1)[keep],
         {},
     )
-    return replace(rows, reversals=_changes_by_reversals(source, rows))
+    return replace(rows, reversals=_reversals(source, rows))
 
 
-def _changes_by_reversals(source: Source, rows: Rows) -> dict[str, scipy.sparse.csr_array]:
+def _reversals(source: Source, rows: Rows) -> dict[str, csr_array]:
     """C of `identify.reversals`, by channel, in the order of the rows."""
     out = {}
-    for number, (c, filters) in enumerate(source.filters.items()):
-        if c in source.batch.uncertain:
-            mask = np.asarray(source.batch.mask[c])
-            v = np.asarray(whiten(source.batch.uncertain[c], mask, filters, CHANNELS[c].free_zero))
-            mine = np.flatnonzero(rows.channel == number)
-            at = np.ravel_multi_index((rows.column[mine], rows.trial[mine], rows.time[mine]), mask.shape)
-            place = scipy.sparse.csr_array((np.ones(at.size), (mine, at)), (rows.size, mask.size))
-            out[c] = scipy.sparse.csr_array(place @ change_by_reversals(v) @ place.T)
+    for c, columns in source.reversals.items():
+        mine = np.flatnonzero(rows.channel == list(source.filters).index(c))
+        where = rows.column[mine], rows.trial[mine], rows.time[mine]
+        at = np.ravel_multi_index(where, source.batch.mask[c].shape)
+        place = csr_array((np.ones(at.size), (mine, at)), (rows.size, source.batch.mask[c].size))
+        out[c] = csr_array(place @ block_diag(columns, "csr") @ place.T)
     return out

@@ -261,5 +261,7 @@ def whitened(
         share = np.stack([np.bincount(series, constant * w, count) for w in white]) / np.maximum(energy, 1e-300)
         white = white - constant * share[:, series]
     if channel in rows.reversals:
-        white = white + (rows.reversals[channel][of_channel][:, of_channel] @ white.T).T
+        every = np.zeros((rows.size, len(white)))
+        every[of_channel] = white.T
+        white = white + (rows.reversals[channel] @ every)[of_channel].T
     return white

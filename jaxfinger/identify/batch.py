@@ -205,8 +205,7 @@ def _padded(batch: Batch, T: int) -> Batch:
         return jnp.asarray(np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, more)], mode=mode))
 
     x = jax.tree.map(lambda a: pad(a, "edge"), batch.x)
-    y, mask = ({c: pad(v, "constant") for c, v in d.items()} for d in (batch.y, batch.mask))
-    return Batch(x, y, mask)
+    return Batch(x, *({c: pad(v, "constant") for c, v in d.items()} for d in (batch.y, batch.mask)))
 
 
 @quick_jit

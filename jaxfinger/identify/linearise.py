@@ -12,7 +12,7 @@ minimises that cost: the sum of squares of s is 2 Σ H(r), and its gradient is 2
 """
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, TypeVar
@@ -23,6 +23,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 from scipy.linalg import get_lapack_funcs
+from scipy.sparse import csr_array
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data.schema import CHANNELS
@@ -33,6 +34,9 @@ from jaxfinger.model import Model
 
 Tree = TypeVar("Tree")
 Filters = dict[str, Float[Array, "_columns lags lags"]]  # `Noise.coefficients` of every channel
+# By channel with torques beside reversals, for every column the matrix C that makes them white (`identify.reversals`).
+Reversals = Mapping[str, Sequence[csr_array]]
+NO_REVERSALS: Reversals = {}
 PANEL = 32  # columns of a panel of ?geqrt: LAPACK's own choice for ?geqrf
 (_geqrt,) = get_lapack_funcs(("geqrt",), dtype=np.float64)
 
@@ -89,10 +93,14 @@ def white_rows(model: Model, batch: Batch, filters: Filters) -> tuple[dict, Floa
     return residuals, white_of(residuals, batch, filters)
 
 
-def white_of(residuals: dict, batch: Batch, filters: Filters):
-    """Whiten residuals by channel, (…, columns, B, T), into rows (…, B, rows); entries that are not finite stay so."""
+def white_of(residuals: dict, batch: Batch, filters: Filters, reversals: Reversals = NO_REVERSALS):
+    """Whiten residuals by channel, (…, columns, B, T), into rows (…, B, rows); entries that are not finite stay so.
+
+    `reversals`: for NumPy's arrays only.
+    """
     with np.errstate(invalid="ignore"):
-        return _flat({c: _white(residuals[c], batch, filters, c) for c in filters})
+        white = {c: _white(residuals[c], batch, filters, c) for c in filters}
+    return _flat(white | {c: _with_reversals(np.asarray(white[c]), C) for c, C in reversals.items()})
 
 
 def _residuals(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[str, Array]:
@@ -101,12 +109,21 @@ def _residuals(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[st
 
 
 def _white(r, batch: Batch, filters: Filters, channel: str):
-    free_zero = CHANNELS[channel].free_zero
-    return whiten(r, batch.mask[channel], filters[channel], free_zero, batch.uncertain.get(channel))
+    return whiten(r, batch.mask[channel], filters[channel], demean=CHANNELS[channel].free_zero)
+
+
+def _with_reversals(
+    white: Float[np.ndarray, "*more columns B T"], C: Sequence[csr_array]
+) -> Float[np.ndarray, "*more columns B T"]:
+    """x + C x of the rows x of every column."""
+    columns = np.moveaxis(white, -3, 0)
+    rows = columns.reshape(len(C), -1, white.shape[-2] * white.shape[-1])
+    added = np.stack([(c @ x.T).T for c, x in zip(C, rows, strict=True)])
+    return np.moveaxis(columns + added.reshape(columns.shape), 0, -3)
 
 
 def _white_jacobian(
-    slopes: dict[str, Float[np.ndarray, "p columns B T"]], batch: Batch, filters: Filters
+    slopes: dict[str, Float[np.ndarray, "p columns B T"]], batch: Batch, filters: Filters, reversals: Reversals
 ) -> Float[np.ndarray, "B rows p"]:
     """Whiten derivatives, in the order of `white_rows`.
 
@@ -115,12 +132,13 @@ def _white_jacobian(
     p, _, B, T = next(iter(slopes.values())).shape
     out, row = np.zeros((B, sum(slopes[c].shape[1] for c in filters), T, p)), 0
     for c in filters:
-        coefficients, mask, uncertain = np.asarray(filters[c]), np.asarray(batch.mask[c]), batch.uncertain.get(c)
+        coefficients, mask = np.asarray(filters[c]), np.asarray(batch.mask[c])
         for k, by_parameter in enumerate(np.moveaxis(slopes[c], 1, 0)):
             at, column = np.flatnonzero(by_parameter.any(axis=(1, 2))), slice(k, k + 1)
             with np.errstate(invalid="ignore"):
-                doubt = None if uncertain is None else uncertain[:, column]
-                white = whiten(by_parameter[at, None], mask[column], coefficients[column], CHANNELS[c].free_zero, doubt)
+                white = whiten(by_parameter[at, None], mask[column], coefficients[column], CHANNELS[c].free_zero)
+            if c in reversals:
+                white = _with_reversals(np.asarray(white), reversals[c][column])
             out[:, row, :, at] = white[:, 0]
             row += 1
     return out.reshape(B, -1, p)
@@ -199,20 +217,20 @@ def whitened(
     filters: Filters,
     limit: float = 0.0,
     weights: Float[np.ndarray, " B"] | None = None,
+    reversals: Reversals = NO_REVERSALS,
 ) -> Linearised:
     """Whiten and compress a tangent.
 
     `limit`: Huber's, in standard deviations, 0 for none. `weights`: of the trials, 1 by default.
     """
-    x = white_tangent(along, batch, filters)
+    x = white_tangent(along, batch, filters, reversals)
     return Linearised(x.residuals, x.white, x.jacobian, factored(x.white, x.jacobian, limit, weights))
 
 
-def white_tangent(along: Tangent, batch: Batch, filters: Filters) -> White:
+def white_tangent(along: Tangent, batch: Batch, filters: Filters, reversals: Reversals = NO_REVERSALS) -> White:
     """Whiten a tangent, without compressing it."""
-    return White(
-        along.residuals, white_of(along.residuals, batch, filters), _white_jacobian(along.slopes, batch, filters)
-    )
+    white = white_of(along.residuals, batch, filters, reversals)
+    return White(along.residuals, white, _white_jacobian(along.slopes, batch, filters, reversals))
 
 
 def factored(

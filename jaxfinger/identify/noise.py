@@ -21,7 +21,6 @@ from scipy.spatial.distance import cdist
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.data.signals.noise import STD_PER_MAD
 from jaxfinger.experiments import Batch, Stack
-from jaxfinger.identify.reversals import change_by_reversals
 
 ORDER = 3  # of the autoregression: describes white noise after a low-pass (tests/identify/test_noise.py)
 # A column needs more samples than the first for a standard deviation of its own, known to 10 % from 50 (1/√(2 n)), and
@@ -83,22 +82,12 @@ def whiten(
     mask: Float[Array | np.ndarray, "columns B T"],
     coefficients: Float[Array | np.ndarray, "columns lags lags"],
     demean: bool,
-    uncertain: Float[np.ndarray, "2 columns B T"] | None = None,
 ) -> Float[Array | np.ndarray, "*more columns B T"]:
     """Whiten residuals to unit variance, in their array type; zero where `mask` is 0.
 
     `coefficients`: `Noise.coefficients`. With `demean`, one constant for each trial and column is projected out, since
-    the zero of an encoder is arbitrary. `uncertain`: `Batch.uncertain` of the channel, for NumPy's arrays only.
+    the zero of an encoder is arbitrary.
     """
-    white = _filtered(r, mask, coefficients, demean)
-    if uncertain is None:
-        return white
-    change = change_by_reversals(_filtered(uncertain, mask, coefficients, demean))
-    rows = np.reshape(white, (-1, mask.size))
-    return np.reshape(rows + (change @ rows.T).T, white.shape)
-
-
-def _filtered(r, mask, coefficients, demean: bool):
     xp = r.__array_namespace__()
     mask, coefficients = xp.asarray(mask), xp.asarray(coefficients)
     order = coefficients.shape[1] - 1

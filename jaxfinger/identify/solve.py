@@ -32,8 +32,10 @@ from jaxfinger.identify.gauss_newton import (
     with_linear_rows,
 )
 from jaxfinger.identify.linearise import (
+    NO_REVERSALS,
     Filters,
     Linearised,
+    Reversals,
     Tangent,
     White,
     gram_of_linear_rows,
@@ -69,6 +71,7 @@ class Source(NamedTuple):
     affine: Int[np.ndarray, " a"] = np.zeros(0, int)  # positions in which its residuals are jointly affine
     weights: Float[np.ndarray, " B"] | None = None  # of its trials, 1 by default
     pace: float = 1.0  # duration of its motions over that of the protocol's
+    reversals: Reversals = NO_REVERSALS
 
     def relevant_model(self, model: Model) -> Model:
         """Model without effects that the experiment does not depend on, so that they are not compiled."""
@@ -136,7 +139,7 @@ class Tangents:
         relevant, free = source.seen(model)
         if not affine:
             along = tangent(relevant, free, source.batch, tuple(source.filters), parts)
-            return whitened(along, source.batch, source.filters, limit, source.weights)
+            return whitened(along, source.batch, source.filters, limit, source.weights, source.reversals)
         values = np.asarray(free.get(relevant))
         known, along = self._known.get(name, (values, None))
         by = values - known
@@ -149,7 +152,7 @@ class Tangents:
         if white is not None and of is source and under == limit:
             white = white.moved(values - there, along.residuals, limit, source.weights)
         else:
-            white = whitened(along, source.batch, source.filters, limit, source.weights)
+            white = whitened(along, source.batch, source.filters, limit, source.weights, source.reversals)
         self._white[name] = source, limit, values, white
         return white
 
@@ -322,7 +325,7 @@ def white_tangents(model: Model, sources: dict[str, Source]) -> dict[str, White]
     """White residuals and Jacobian of every experiment at the model, not compressed."""
 
     def one(s: Source) -> White:
-        return white_tangent(tangent(*s.seen(model), s.batch, tuple(s.filters)), s.batch, s.filters)
+        return white_tangent(tangent(*s.seen(model), s.batch, tuple(s.filters)), s.batch, s.filters, s.reversals)
 
     return dict(zip(sources, side_by_side(one, sources.values()), strict=True))
 

@@ -78,7 +78,7 @@ def _costs(model: Model, sources: dict[str, Source], tendons: list[int]) -> Floa
     out = np.zeros(len(tendons))
     for e, residuals in residuals_each(model, sources).items():
         s = sources[e]
-        cost = 0.5 * np.sum(white_of(residuals, s.batch, s.filters) ** 2, axis=1)
+        cost = 0.5 * np.sum(white_of(residuals, s.batch, s.filters, s.reversals) ** 2, axis=1)
         pulls = np.asarray(s.batch.x.tension).max(axis=2) > 0.0  # (n, B)
         out += np.array([cost[pulls[k]].sum() for k in tendons])
     return out
