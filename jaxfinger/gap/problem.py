@@ -27,7 +27,7 @@ from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.dead_zone import clear_of_dead_zones
 from jaxfinger.identify.intervals import stretches
-from jaxfinger.identify.linearise import White
+from jaxfinger.identify.linearise import NO_REVERSALS, White
 from jaxfinger.identify.noise import Noise, estimate, history, without_recurring_laws
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.prior import Prior, prior_of
@@ -308,7 +308,7 @@ def imagined(problem: Problem, stacks: dict[str, Stack]) -> Problem:
             if (e, c) not in known:
                 known[e, c] = _noise_elsewhere(problem, c, len(stack.batch.y[c]))
     sources = {
-        e: problem.sources[e]._replace(batch=stack.batch)
+        e: problem.sources[e]._replace(batch=stack.batch, reversals=NO_REVERSALS)
         if e in problem.sources
         else sources_of({e: stack}, {e: stack.experiment.channels}, known, describe(problem.nominal))[e]
         for e, stack in stacks.items()
